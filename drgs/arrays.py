@@ -1,0 +1,91 @@
+"""Dr.Jit types that belong together, and row access to flat arrays.
+
+Layer 0. Every stage is written once for all array types (float32 and float64, LLVM and CUDA):
+it asks this module for the companions of the float type that it was given.
+"""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import drjit as dr
+
+
+@dataclass(frozen=True)
+class ArrayTypes:
+    """The Dr.Jit types of one backend and one floating point precision."""
+
+    Float: type
+    UInt32: type
+    UInt64: type
+    Int32: type
+    Bool: type
+    Array2f: type
+    Array3f: type
+    Array4f: type
+    Array4u: type
+    Matrix3f: type
+    TensorXf: type
+
+
+@cache
+def types_of(float_type: type) -> ArrayTypes:
+    """Companions of a flat Dr.Jit array type such as ``drjit.llvm.ad.Float`` or ``UInt32``."""
+    module = sys.modules[float_type.__module__]
+    if not dr.is_float_v(float_type):
+        float_type = module.Float
+    suffix = "64" if dr.type_v(float_type) == dr.VarType.Float64 else ""
+    return ArrayTypes(
+        Float=float_type,
+        UInt32=module.UInt32,
+        UInt64=module.UInt64,
+        Int32=module.Int32,
+        Bool=module.Bool,
+        Array2f=getattr(module, "Array2f" + suffix),
+        Array3f=getattr(module, "Array3f" + suffix),
+        Array4f=getattr(module, "Array4f" + suffix),
+        Array4u=module.Array4u,
+        Matrix3f=getattr(module, "Matrix3f" + suffix),
+        TensorXf=getattr(module, "TensorXf" + suffix),
+    )
+
+
+def is_float64(float_type: type) -> bool:
+    """Whether ``float_type`` is a double precision array."""
+    return dr.type_v(float_type) == dr.VarType.Float64
+
+
+def interleave(columns: list[Any]) -> Any:
+    """Columns of equal length as one row-major flat array, not evaluated.
+
+    Loop results must be evaluated before: storing them unevaluated runs the loop once more for
+    each column.
+    """
+    return dr.ravel(_dynamic_vector(columns))
+
+
+def scatter_rows(columns: list[Any], rows: Any, num_rows: int) -> Any:
+    """Columns as one row-major flat array of ``num_rows`` rows; lane i fills row ``rows[i]``.
+
+    Rows that no lane fills are undefined; no two lanes may fill the same row. The same holds
+    for loop results as in :func:`interleave`.
+    """
+    flat = dr.empty(type(columns[0]), num_rows * len(columns))
+    dr.scatter(flat, _dynamic_vector(columns), rows)
+    return flat
+
+
+def _dynamic_vector(columns: list[Any]) -> Any:
+    flat_type = type(columns[0])
+    module = sys.modules[flat_type.__module__]
+    return getattr(module, _VECTORS[dr.type_v(flat_type)])(columns)
+
+
+_VECTORS = {
+    dr.VarType.Float32: "ArrayXf",
+    dr.VarType.Float64: "ArrayXf64",
+    dr.VarType.UInt32: "ArrayXu",
+}

@@ -1,0 +1,48 @@
+"""Errors that a user can repair, and how commands report them.
+
+Layer 0. A message says where, which name, what was expected, what was got and what to do:
+``scenes/lego.yml: densify.every must be >= 1, got 0``.
+"""
+
+from __future__ import annotations
+
+import difflib
+import sys
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+
+from drgs.llvm import LLVMVersionError
+
+USER_ERROR_STATUS = 2
+"""Exit status of a command that the user has to call differently (as argparse's)."""
+
+
+class UserError(ValueError):
+    """A wrong input: a configuration, a dataset, a file. Its text is all that the user needs."""
+
+
+@contextmanager
+def exit_on_user_error() -> Iterator[None]:
+    """Around (or, as a decorator, on) a command: print the error in one line, exit with 2.
+
+    Only errors that the user can repair; any other keeps its traceback.
+    """
+    try:
+        yield
+    except (UserError, LLVMVersionError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        sys.exit(USER_ERROR_STATUS)
+
+
+def did_you_mean(name: str, candidates: Iterable[str]) -> str:
+    """``"; did you mean X?"`` with the candidate nearest to ``name``, or ``""`` if none is near.
+
+    Of dotted names, one whose last part is near will do: a key in the wrong section.
+    """
+    candidates = list(candidates)
+    nearest = difflib.get_close_matches(name, candidates, n=1, cutoff=0.7)
+    if not nearest:
+        by_leaf = {candidate.rpartition(".")[2]: candidate for candidate in reversed(candidates)}
+        leaf = difflib.get_close_matches(name.rpartition(".")[2], by_leaf, n=1, cutoff=0.7)
+        nearest = [by_leaf[leaf[0]]] if leaf else []
+    return f"; did you mean {nearest[0]}?" if nearest else ""

@@ -1,0 +1,44 @@
+"""The numbers that define the image model, each with its source.
+
+Layer 0. Nothing here is tuned: a value either comes from the 3DGS paper and its reference
+implementation (Kerbl et al. 2023, "3D Gaussian Splatting for Real-Time Radiance Field
+Rendering") or states the numerical reason for which it exists.
+"""
+
+from __future__ import annotations
+
+import math
+
+ALPHA_MAX = 0.99
+"""Upper clamp of a splat's alpha (3DGS reference rasterizer): keeps 1 / (1 - alpha) below 100.
+Where it is active, the derivative of alpha is zero."""
+
+ALPHA_CUT = 1.0 / 255.0
+"""A splat contributes to a pixel only where its alpha reaches this value (3DGS reference
+rasterizer): below it an 8-bit image cannot tell. Below it, the derivative is zero."""
+
+TRANSMITTANCE_STOP = 1e-4
+"""A pixel is finished *before* the splat that would take its transmittance below this value
+(3DGS reference rasterizer)."""
+
+LOW_PASS = 0.3
+"""px^2 added to the diagonal of the projected covariance (3DGS reference rasterizer): every
+splat is at least about a pixel wide. It also bounds the conic by 1 / LOW_PASS."""
+
+TAN_CLAMP = 0.3
+"""In the projection's Jacobian only, x/z and y/z are clamped to the frustum widened by this
+fraction of its half extents on each side (1.3 times the half extents for a centred principal
+point, as in the 3DGS reference). The affine approximation diverges beyond."""
+
+NEAR = 0.01
+"""Default near plane, scene units: means closer than this are culled (gsplat's default)."""
+
+LOG2_ALPHA_CUT = math.log2(ALPHA_CUT)
+
+CULL_MARGIN = 1e-3
+"""Added to the exponent (base 2) when a splat is tested against tiles, so that rounding in the
+tile test never drops a pixel that compositing would accept: 1e-3 is a thousand times the
+rounding error of an exponent near the cut."""
+
+WHITENING_SCALE = math.sqrt(0.5 * math.log2(math.e))
+"""exp(-|u|^2 / 2) = exp2(-|WHITENING_SCALE u|^2)."""

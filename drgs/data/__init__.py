@@ -1,0 +1,47 @@
+"""Datasets: photographs with cameras, read into :class:`drgs.data.types.Dataset`. Layer 1."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from drgs.checks import UserError
+from drgs.config import DataConfig
+from drgs.data import nerf_synthetic, nerfstudio
+from drgs.data.points import initial_gaussians
+from drgs.data.types import Dataset, View
+
+__all__ = ["Dataset", "View", "initial_gaussians", "load_dataset"]
+
+_LOADERS: dict[str, Callable[[DataConfig], Dataset]] = {
+    "nerf_synthetic": nerf_synthetic.load,
+    "nerfstudio": nerfstudio.load,
+}
+
+_MARKERS = {
+    "nerf_synthetic": "transforms_train.json",
+    "nerfstudio": "transforms.json",
+}
+
+
+def load_dataset(config: DataConfig) -> Dataset:
+    """Read all views of the dataset that ``config`` names.
+
+    Raises :class:`UserError` naming the file, the key, what was expected and what was got; where
+    the folder is missing, it says where to get the data.
+    """
+    return _LOADERS[_layout(config)](config)
+
+
+def _layout(config: DataConfig) -> str:
+    if not config.path.is_dir():
+        remedy = f"; get it from {config.source}" if config.source else ""
+        raise UserError(f"data.path: there is no folder {config.path}{remedy}")
+    if config.type != "auto":
+        return config.type
+    for layout, marker in _MARKERS.items():
+        if (config.path / marker).is_file():
+            return layout
+    raise UserError(
+        f"{config.path}: neither {' nor '.join(_MARKERS.values())} is there; data.path must be a "
+        "folder in the layout of NeRF-synthetic or of nerfstudio / instant-ngp"
+    )

@@ -1,0 +1,97 @@
+"""The NeRF-synthetic ("Blender") layout: ``transforms_{train,val,test}.json`` and RGBA images.
+
+Mildenhall et al. 2020. Pinhole cameras with the principal point in the middle and one horizontal
+field of view, ``camera_angle_x``, for all; images with straight alpha.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from drgs.checks import UserError
+from drgs.config import DataConfig
+from drgs.data.frames import (
+    focal_from_angle,
+    image_path,
+    in_parallel,
+    opencv_camera_to_world,
+    read_transforms,
+    unique_names,
+)
+from drgs.data.images import composite, downscale, read_image
+from drgs.data.types import Dataset, View
+
+START_HALF_EXTENT = 1.3
+"""The 3DGS reference starts from random points in [-1.3, 1.3]^3 for these scenes
+(``readNerfSyntheticInfo``)."""
+
+
+def load(config: DataConfig) -> Dataset:
+    """Read split ``train`` and the split to measure on.
+
+    That is ``config.test_split``, by default ``test`` if its transforms file is there, else
+    ``val``.
+    """
+    test_split = _test_split(config)
+    train, test = (_load_split(config, split) for split in ("train", test_split))
+    width, height = train[0].width, train[0].height
+    return Dataset(
+        train=train,
+        test=test,
+        test_split=test_split,
+        background=config.background_rgb,
+        start_half_extent=START_HALF_EXTENT,
+        description=(
+            f"{config.path.name} (NeRF-synthetic layout): {len(train)} train views, measured on "
+            f"{len(test)} views of split {test_split}, {width}x{height}, "
+            f"background {config.background}"
+        ),
+    )
+
+
+def _test_split(config: DataConfig) -> str:
+    if config.test_split is not None:
+        return config.test_split
+    for split in ("test", "val"):
+        if _transforms_path(config.path, split).is_file():
+            return split
+    raise UserError(
+        f"{config.path}: there are no test views: neither transforms_test.json nor "
+        "transforms_val.json is there; data.test_split: train measures on the training views"
+    )
+
+
+def _transforms_path(folder: Path, split: str) -> Path:
+    return folder / f"transforms_{split}.json"
+
+
+def _load_split(config: DataConfig, split: str) -> tuple[View, ...]:
+    path = _transforms_path(config.path, split)
+    meta = read_transforms(path)
+
+    frames = meta["frames"]
+    locations = [f"{path}: frames[{index}]." for index in range(len(frames))]
+    files = [
+        image_path(config.path, frame, at) for frame, at in zip(frames, locations, strict=True)
+    ]
+
+    def load_view(index: int, name: str) -> View:
+        camera_to_world = opencv_camera_to_world(frames[index], locations[index])
+        image = composite(read_image(files[index]), config.background_rgb)
+        image = downscale(image, config.image_size)
+        height, width = image.shape[:2]
+        # The angle spans the full width, so the focal length in pixels follows the image's size.
+        focal = focal_from_angle(meta, "camera_angle_x", width, f"{path}: ")
+        return View(
+            name=name,
+            image=image,
+            camera_to_world=camera_to_world,
+            fx=focal,
+            fy=focal,
+            cx=width / 2,
+            cy=height / 2,
+            width=width,
+            height=height,
+        )
+
+    return in_parallel(load_view, range(len(frames)), unique_names(frames))

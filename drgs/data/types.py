@@ -1,0 +1,54 @@
+"""What every dataset loader returns."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """One photograph and the pinhole camera that took it."""
+
+    name: str  # unique in its split; a file name without folders or suffix
+    image: np.ndarray  # (height, width, 3) float32, display space 0..1, opaque
+    camera_to_world: np.ndarray  # (4, 4) float64, rigid, OpenCV axes: x right, y down, z forward
+    fx: float  # px
+    fy: float  # px
+    cx: float  # px; pixel centres are at (i + 0.5, j + 0.5)
+    cy: float  # px
+    width: int  # px
+    height: int  # px
+
+    @property
+    def center(self) -> np.ndarray:
+        """(3,) position of the camera, world."""
+        return self.camera_to_world[:3, 3]
+
+    @property
+    def K(self) -> np.ndarray:  # noqa: N802
+        """(3, 3) float64: camera coordinates to homogeneous pixel coordinates."""
+        return np.array([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1]], np.float64)
+
+
+@dataclass(frozen=True, eq=False)
+class Dataset:
+    """Views to train on and views to measure on."""
+
+    train: tuple[View, ...]
+    test: tuple[View, ...]
+    test_split: str  # name of the split that ``test`` is
+    background: tuple[float, float, float]  # display space, what the images were composited over
+    start_half_extent: float | None  # of the layout's own start box [-h, h]^3; None: it has none
+    description: str  # one line: what was read, and what was assumed
+
+    @property
+    def extent(self) -> float:
+        """Scale of the scene: 1.1 x the largest distance of a train camera from their centroid.
+
+        As the 3DGS reference defines it (``getNerfppNorm``); 1 where all cameras share a centre.
+        """
+        centers = np.stack([view.center for view in self.train])
+        distances = np.linalg.norm(centers - centers.mean(axis=0), axis=1)
+        return float(1.1 * distances.max()) or 1.0

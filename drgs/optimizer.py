@@ -1,0 +1,186 @@
+"""Adam over the parameters of the Gaussians, and row surgery on them.
+
+Layer 4. ``drjit.opt.Adam`` keeps, for each parameter, ``(value, promoted, rate, (t, m, v,
+v_max))``: the step count t and the moments m, v (flat arrays as long as the value). Assigning a
+value of another shape to it discards moments, step count and rate, so every change of the
+number of Gaussians goes through :func:`edit_rows`, which moves a row's value and moments
+together and leaves everything else as it was.
+
+Parameters are named as in ``gaussians.PARAMETER_NAMES``; in the optimizer (and in Mitsuba's
+parameter tables) a prefix such as ``integrator.`` precedes the name. Entries without the prefix
+are left alone. A parameter of zero size, ``shN`` at degree 0, cannot be registered and is not.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+from drjit.opt import Adam
+
+
+def make_optimizer(
+    parameters: Mapping[str, Any],
+    rates: Mapping[str, float],
+    prefix: str = "",
+    beta_1: float = 0.9,
+    beta_2: float = 0.999,
+    epsilon: float = 1e-15,
+) -> Adam:
+    """Return an Adam optimizer (Kingma and Ba 2015) with a learning rate for each parameter.
+
+    parameters: tensors by name, without the prefix; those of zero size are left out.
+    rates: learning rate per step by name. A fixed rate of 0 is allowed.
+    epsilon: 3DGS uses 1e-15, because gradients of a mean over pixels are far below 1e-8.
+    """
+    optimizer = Adam(lr=0.0, beta_1=beta_1, beta_2=beta_2, epsilon=epsilon)
+    for name, value in parameters.items():
+        if name not in rates:
+            raise ValueError(
+                f"make_optimizer(): no learning rate for parameter {name}; rates are given for "
+                f"{', '.join(sorted(rates)) or 'none'}"
+            )
+        if dr.width(value) == 0:
+            continue
+        optimizer[prefix + name] = value
+        optimizer.set_learning_rate({prefix + name: float(rates[name])})
+    return optimizer
+
+
+@dataclass(frozen=True)
+class ExponentialDecay:
+    """A learning rate that falls by the same factor at every iteration.
+
+    rate(i) = initial^(1 - s) final^s with s = i / num_iterations clamped to [0, 1]: the
+    reference 3DGS schedule of the means.
+    """
+
+    initial: float
+    final: float
+    num_iterations: int
+
+    def __post_init__(self) -> None:
+        """Refuse rates that have no logarithm."""
+        if not (self.initial > 0 and self.final > 0 and self.num_iterations >= 1):
+            raise ValueError(
+                "ExponentialDecay(): initial and final must be > 0 and num_iterations >= 1, got "
+                f"{self.initial}, {self.final} and {self.num_iterations}"
+            )
+
+    def __call__(self, iteration: int) -> float:
+        """Return the learning rate of an iteration."""
+        s = min(max(iteration / self.num_iterations, 0.0), 1.0)
+        return math.exp((1 - s) * math.log(self.initial) + s * math.log(self.final))
+
+
+def num_rows(optimizer: Adam, prefix: str = "") -> int:
+    """Return the number of Gaussians N, the first dimension that all parameters share."""
+    lengths = {
+        name: optimizer.state[prefix + name][0].shape[0] for name in _names(optimizer, prefix)
+    }
+    if len(set(lengths.values())) != 1:
+        raise ValueError(
+            f'num_rows(): the optimizer\'s parameters with prefix "{prefix}" must share one '
+            f"number of rows, got {lengths or 'no parameters'}"
+        )
+    return next(iter(lengths.values()))
+
+
+def edit_rows(
+    optimizer: Adam, keep: Any, append: Mapping[str, Any] | None = None, prefix: str = ""
+) -> None:
+    """Keep some rows of every parameter, in the order given, and append new ones.
+
+    keep: (K,) ``UInt32``, the rows that stay. append: M new rows of every parameter by name,
+    without the prefix; ``None``: none are appended. Afterwards row i is former row keep[i] for
+    i < K, and appended row i - K from there on.
+
+    Kept rows take their moments along bit by bit, appended rows start with moments of zero, and
+    step counts and learning rates stay: the next steps move a kept row as if nothing had
+    happened. Detached; waits for the device once, to check ``keep``.
+    """
+    total = num_rows(optimizer, prefix)
+    if not dr.all(keep < total):
+        raise ValueError(f"edit_rows(): keep must hold row numbers below {total}")
+    added = _check_rows(optimizer, append, prefix)
+    if dr.width(keep) + added == 0:
+        raise ValueError("edit_rows(): at least one row must remain, but none is kept or appended")
+
+    for name in _names(optimizer, prefix):
+        value, promoted, rate, (step, *moments) = optimizer.state[prefix + name]
+        row_shape = tuple(value.shape[1:])
+        width = math.prod(row_shape)
+        elements = _elements(keep, width)
+        new_rows = dr.detach(append[name]).array if added else None
+        no_moments = dr.zeros(type(new_rows), added * width) if added else None
+
+        flat = _gather_and_append(dr.detach(value).array, elements, new_rows)
+        moments = [
+            None if m is None else _gather_and_append(m, elements, no_moments) for m in moments
+        ]
+        if row_shape:
+            flat = type(value)(flat, (dr.width(flat) // width, *row_shape))
+        dr.enable_grad(flat)
+        dr.schedule(flat, moments)
+        optimizer.state[prefix + name] = flat, promoted, rate, (step, *moments)
+    dr.eval()
+
+
+def replace_values(optimizer: Adam, name: str, value: Any, prefix: str = "") -> None:
+    """Give a parameter new values of the same shape, and moments of zero.
+
+    The step count and the learning rate stay: as in the reference's opacity reset, Adam's bias
+    correction does not start again.
+    """
+    key = prefix + name
+    old, promoted, rate, (step, *moments) = optimizer.state[key]
+    if tuple(value.shape) != tuple(old.shape):
+        raise ValueError(
+            f"replace_values(): {key} has shape {tuple(old.shape)}, the new values "
+            f"{tuple(value.shape)}: edit_rows() adds and removes rows"
+        )
+    value = type(old)(dr.detach(value))
+    dr.make_opaque(value)
+    dr.enable_grad(value)
+    moments = [None if m is None else dr.opaque(type(m), 0, m.shape) for m in moments]
+    optimizer.state[key] = value, promoted, rate, (step, *moments)
+
+
+def _names(optimizer: Adam, prefix: str) -> list[str]:
+    """Names without the prefix, in the order of registration."""
+    return [key[len(prefix) :] for key in optimizer.state if key.startswith(prefix)]
+
+
+def _check_rows(optimizer: Adam, rows: Mapping[str, Any] | None, prefix: str) -> int:
+    """The number of ``rows``, which must be given for every parameter in its shape."""
+    if rows is None:
+        return 0
+    counts = set()
+    for name in _names(optimizer, prefix):
+        expected = tuple(optimizer.state[prefix + name][0].shape[1:])
+        got = tuple(rows[name].shape) if name in rows else None
+        if got is None or got[1:] != expected:
+            raise ValueError(
+                f"edit_rows(): appended rows of {name} must have the shape (M, "
+                f"{', '.join(map(str, expected))}), got {got or 'none'}"
+            )
+        counts.add(got[0])
+    if len(counts) != 1:
+        raise ValueError(
+            f"edit_rows(): every parameter must get the same number of rows, got {sorted(counts)}"
+        )
+    return counts.pop()
+
+
+def _elements(rows: Any, width: int) -> Any:
+    """Where the elements of ``rows`` lie in a flat row-major array of ``width`` columns."""
+    element = dr.arange(type(rows), dr.width(rows) * width)
+    return dr.gather(type(rows), rows, element // width) * width + element % width
+
+
+def _gather_and_append(flat: Any, elements: Any, added: Any | None) -> Any:
+    kept = dr.gather(type(flat), flat, elements)
+    return kept if added is None else dr.concat([kept, added])

@@ -1,0 +1,680 @@
+r"""Compositing splats front to back, its adjoint and its tangent.
+
+Layer 2, the last stage: ``TileBins`` + features -> planes of pixels. The image model is
+equation 3 of the 3DGS paper: with splats i = 1, 2, ... in front-to-back order,
+
+    a_i = min(0.99, o_i exp(-|U_i d_i|^2 / 2)),  d_i = pixel centre - mean_i
+    T_1 = 1,  T_{i+1} = T_i (1 - a_i),  w_i = T_i a_i
+    C = sum_i w_i c_i,  T = T_last
+
+where splats with a_i < 1/255 are skipped and a pixel stops before the splat that would take T
+below 1e-4. c_i is a vector of any length, the splat's *features*: colour, depth, or whatever
+else is to be composited. The background is added by the caller, from T.
+
+**Adjoint.** Let g = dL/dC and G = dL/dT. Whatever lies behind splat i contributes to the loss
+through the factor (1 - a_i) only, so with
+
+    S_i = sum_{j > i} w_j (c_j . g) + T G        (what is seen past splat i)
+
+    dL/dc_i = w_i g,   dL/da_i = T_i (c_i . g) - S_i / (1 - a_i).
+
+S_0 = C . g + T G is known from the finished picture, and S_i = S_{i-1} - w_i (c_i . g): the
+adjoint walks the splats in the same order as the forward pass, as Mitsuba's path replay does
+(Vicini et al. 2021), replays all of its decisions exactly, and stores nothing per pixel pair.
+
+**Mapping to the machine.** One SIMD lane is one micro-tile of 4x4 pixels, its pixels unrolled:
+the load of a splat's record is paid once for 16 pixels. A packet of 16 lanes is one tile.
+
+**No atomics.** In the adjoint, a lane sums each splat's partial derivatives over its 16 pixels
+and writes them into a slot that belongs to this (splat, micro-tile) alone; the slots of a splat
+are contiguous, and one lane per splat adds them up in order. The result is the same to the
+last bit in every run.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+
+from drgs.arrays import interleave, is_float64, scatter_rows, types_of
+from drgs.constants import (
+    ALPHA_MAX,
+    LOG2_ALPHA_CUT,
+    TRANSMITTANCE_STOP,
+    WHITENING_SCALE,
+)
+from drgs.tiles import GRID, MICRO, MICROS, TILE, WORD, TileBins, TileGrid
+
+PIXELS = MICRO * MICRO
+
+
+@dataclass(frozen=True)
+class Layers:
+    """What compositing makes of the splats, stored one row per micro-tile."""
+
+    values: Any  # Float (tiles * 16 * (1 + C) * 16,): row: transmittance, then each feature
+    stop: Any  # UInt32 (tiles * 16,): sorted entry behind which a micro-tile visited nothing
+    count: int  # C
+    grid: TileGrid
+
+    def planes(self) -> list[Any]:
+        """1 + C planes in row-major pixel order, Float (H * W,), not evaluated.
+
+        The first is T, the transmittance left for the background; then sum_i w_i c_i for each
+        feature.
+        """
+        t = types_of(type(self.values))
+        pixel = dr.arange(t.UInt32, self.grid.width * self.grid.height)
+        width = dr.opaque(t.UInt32, self.grid.width)
+        y = pixel // width
+        x = pixel - y * width
+        tile = (y // TILE) * dr.opaque(t.UInt32, self.grid.columns) + x // TILE
+        micro = ((y % TILE) // MICRO) * GRID + (x % TILE) // MICRO
+        base = (tile * MICROS + micro) * (PIXELS * (1 + self.count))
+        index = base + (y % MICRO) * MICRO + x % MICRO
+        return [dr.gather(t.Float, self.values, index + PIXELS * k) for k in range(1 + self.count)]
+
+
+# ----------------------------------------------------------------------------------------------
+# Lanes: which micro-tile, which pixels, which splat next
+# ----------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _Lanes:
+    """One lane per micro-tile, in the order in which Dr.Jit starts them."""
+
+    micro_tile: Any  # UInt32: tile * 16 + micro-tile within the tile
+    micro: Any  # UInt32: micro-tile within the tile
+    tile: Any  # UInt32
+    x: Any  # UInt32: first pixel column
+    y: Any  # UInt32: first pixel row
+
+
+def _make_lanes(Float: type, grid: TileGrid) -> _Lanes:
+    """Lanes such that neighbours in time are far apart on the film.
+
+    Dr.Jit cuts a small launch into few blocks of consecutive lanes. Tiles are visited with a
+    stride near the golden section, so that each block gets its share of the busy centre.
+    """
+    t = types_of(Float)
+    stride = _coprime_stride(grid.num_tiles)
+    lane = dr.arange(t.UInt32, grid.num_tiles * MICROS)
+    turn, micro = lane // MICROS, lane % MICROS
+    tile = t.UInt32(
+        (t.UInt64(turn) * dr.opaque(t.UInt64, stride)) % dr.opaque(t.UInt64, grid.num_tiles)
+    )
+    columns = dr.opaque(t.UInt32, grid.columns)
+    row = tile // columns
+    return _Lanes(
+        micro_tile=tile * MICROS + micro,
+        micro=micro,
+        tile=tile,
+        x=(tile - row * columns) * TILE + (micro % GRID) * MICRO,
+        y=row * TILE + (micro // GRID) * MICRO,
+    )
+
+
+def _coprime_stride(count: int) -> int:
+    stride = max(1, round(count * (math.sqrt(5) - 1) / 2))
+    while math.gcd(stride, count) != 1:
+        stride += 1
+    return stride
+
+
+@dataclass
+class _Cursor:
+    """Walks the set bits of a micro-tile's words: the splats that touch it, front to back.
+
+    Not frozen: Dr.Jit assigns the fields of a loop's state.
+    """
+
+    word: Any  # UInt32: bits of the current group that are still to come
+    group: Any  # UInt32: index of the current group of 32 entries
+
+
+class _Entries:
+    """The entries [start, end) of each lane's tile, as seen by its micro-tile."""
+
+    def __init__(self, bins: TileBins, lanes: _Lanes, end: Any) -> None:
+        UInt32 = type(lanes.tile)
+        self.words, self.micro = bins.words, lanes.micro
+        start = dr.gather(UInt32, bins.tile_start, lanes.tile)
+        occupied = start < end
+        # An empty lane gets group == last and no bits: it is over before it begins.
+        self.last = dr.select(occupied, (end - 1) // WORD, 0)
+        self.tail = dr.select(occupied, UInt32(0xFFFFFFFF) >> (WORD - 1 - (end - 1) % WORD), 0)
+        group = dr.select(occupied, start // WORD, 0)
+        word = self._load(group, occupied) & (UInt32(0xFFFFFFFF) << (start % WORD))
+        self.begin = _Cursor(word=word, group=group)
+
+    def _load(self, group: Any, active: Any) -> Any:
+        word = dr.gather(type(group), self.words, group * MICROS + self.micro, active)
+        return dr.select(group == self.last, word & self.tail, word)
+
+    def pending(self, cursor: _Cursor) -> Any:
+        """Whether entries may be left."""
+        return (cursor.word != 0) | (cursor.group < self.last)
+
+    @staticmethod
+    def current(cursor: _Cursor) -> tuple[Any, Any]:
+        """The current sorted entry, and whether there is one (a word may be empty)."""
+        return cursor.group * WORD + dr.tzcnt(cursor.word), cursor.word != 0
+
+    def advance(self, cursor: _Cursor) -> _Cursor:
+        """Drop the current entry; open the next group when this one is used up."""
+        word = cursor.word & (cursor.word - 1)
+        used_up = (word == 0) & (cursor.group < self.last)
+        group = dr.select(used_up, cursor.group + 1, cursor.group)
+        return _Cursor(
+            word=dr.select(used_up, self._load(group, used_up), word),
+            group=group,
+        )
+
+
+def _load_pixels(plane: Any, lanes: _Lanes, grid: TileGrid) -> list[Any]:
+    """The 16 values of a row-major plane of pixels in each micro-tile; 0 off the film."""
+    UInt32 = type(lanes.x)
+    width, height = dr.opaque(UInt32, grid.width), dr.opaque(UInt32, grid.height)
+    values = []
+    for pixel in range(PIXELS):
+        row, column = divmod(pixel, MICRO)
+        x, y = lanes.x + column, lanes.y + row
+        inside = (x < width) & (y < height)
+        values.append(dr.gather(type(plane), plane, y * width + x, inside))
+    return values
+
+
+# ----------------------------------------------------------------------------------------------
+# One splat at the 16 pixels of a micro-tile
+# ----------------------------------------------------------------------------------------------
+
+
+def _exp2_short(x: Any) -> Any:
+    """2^x for float32 x in [-126, 127]; relative error below 2.2e-7.
+
+    x = n + f with |f| <= 1/2; 2^f by a minimax polynomial of degree 5 (coefficients from a
+    Remez exchange on the relative error, 7.5e-8), 2^n by adding n to the exponent bits. Adding
+    1.5 * 2^23 rounds x and leaves n in the low bits of the sum.
+    """
+    t = types_of(type(x))
+    shifted = x + 12582912.0
+    f = x - (shifted - 12582912.0)
+    p = t.Float(0.0013276471979479397)
+    for c in (
+        0.009675541334216184,
+        0.05550713273542589,
+        0.24022119723848476,
+        0.6931469670647331,
+        1.0000000716546822,
+    ):
+        p = dr.fma(p, f, c)
+    exponent = dr.reinterpret_array(t.Int32, shifted) << 23
+    return dr.reinterpret_array(t.Float, dr.reinterpret_array(t.Int32, p) + exponent)
+
+
+def _exp2_function(Float: type) -> Any:
+    return dr.exp2 if is_float64(Float) else _exp2_short
+
+
+@dataclass(frozen=True)
+class _Footprint:
+    """A splat's record and its offsets from the rows and columns of a micro-tile."""
+
+    dx: list[Any]  # 4: pixel column centres - mean, px
+    dy: list[Any]  # 4: pixel row centres - mean, px
+    u: list[list[Any]]  # [row][column]: first component of U d (scaled to base 2)
+    log2_alpha: list[list[Any]]  # [row][column]: unclamped
+
+    @staticmethod
+    def load(bins: TileBins, lanes: _Lanes, rank: Any, active: Any) -> _Footprint:
+        """Evaluate the exponent of splat ``rank`` at the 16 pixels."""
+        t = types_of(type(bins.geometry))
+        mean_x, mean_y, p, r = dr.gather(t.Array4f, bins.geometry, rank * 2, active)
+        s, log2_opacity, _, _ = dr.gather(t.Array4f, bins.geometry, rank * 2 + 1, active)
+        first_x, first_y = t.Float(lanes.x) + 0.5 - mean_x, t.Float(lanes.y) + 0.5 - mean_y
+        dx = [first_x + i for i in range(MICRO)]
+        dy = [first_y + j for j in range(MICRO)]
+        p_dx = [p * d for d in dx]
+        u, log2_alpha = [], []
+        for d in dy:
+            r_dy, v = r * d, s * d
+            row = dr.fma(-v, v, log2_opacity)
+            u.append([a + r_dy for a in p_dx])
+            log2_alpha.append([dr.fma(-a, a, row) for a in u[-1]])
+        return _Footprint(dx=dx, dy=dy, u=u, log2_alpha=log2_alpha)
+
+
+@dataclass(frozen=True)
+class _Alpha:
+    """Alpha at one pixel, with the decisions taken on the way."""
+
+    value: Any  # 0 where the splat is skipped
+    smooth: Any  # Bool: not clamped, so that the derivative flows
+
+    @staticmethod
+    def at(log2_alpha: Any, exp2: Any, active: Any) -> _Alpha:
+        """alpha = min(0.99, 2^log2_alpha), or 0 below the cut or on an inactive lane."""
+        # Far below the cut the short exp2 returns garbage; the selection discards it.
+        unclamped = exp2(log2_alpha)
+        smooth = unclamped < ALPHA_MAX
+        value = dr.select(smooth, unclamped, ALPHA_MAX)
+        return _Alpha(
+            value=dr.select((log2_alpha >= LOG2_ALPHA_CUT) & active, value, 0), smooth=smooth
+        )
+
+
+def _step(transmittance: Any, alpha: Any) -> tuple[Any, Any, Any]:
+    """Composite one alpha: (weight, next transmittance, whether the pixel goes on).
+
+    A finished pixel keeps its transmittance with a negative sign, which fails the comparison
+    ever after.
+    """
+    after = dr.fma(-alpha, transmittance, transmittance)
+    goes_on = after >= TRANSMITTANCE_STOP
+    weight = dr.select(goes_on, alpha * transmittance, 0)
+    return weight, dr.select(goes_on, after, -dr.abs(transmittance)), goes_on
+
+
+def _load_features(features: Any, count: int, rank: Any, active: Any) -> list[Any]:
+    """The ``count`` features of a splat, stored in packets of four."""
+    t = types_of(type(features))
+    packets = -(-count // 4)
+    values: list[Any] = []
+    for k in range(packets):
+        values.extend(dr.gather(t.Array4f, features, rank * packets + k, active))
+    return values[:count]
+
+
+def pack_features(columns: list[Any], order: Any) -> Any:
+    """Feature columns (one value per Gaussian) as packets of four by rank; flat, evaluated."""
+    columns = [dr.gather(type(c), c, order) for c in columns]
+    padding = dr.zeros(type(columns[0]), dr.width(order))
+    packets = interleave(columns + [padding] * (-len(columns) % 4))
+    dr.eval(packets)
+    return packets
+
+
+# ----------------------------------------------------------------------------------------------
+# Forward
+# ----------------------------------------------------------------------------------------------
+
+
+def composite(bins: TileBins, features: Any, count: int) -> Layers:
+    """Composite ``count`` features of all splats.
+
+    bins: from ``bin_splats``; features: from :func:`pack_features`.
+    """
+    t = types_of(type(bins.geometry))
+    lanes = _make_lanes(t.Float, bins.grid)
+    end = dr.gather(t.UInt32, bins.tile_start, lanes.tile + 1)
+    entries = _Entries(bins, lanes, end)
+    exp2 = _exp2_function(t.Float)
+
+    def body(cursor: _Cursor, T: list, C: list, stop: Any, unfinished: Any) -> tuple:
+        entry, active = entries.current(cursor)
+        rank = dr.gather(t.UInt32, bins.ranks, entry, active)
+        footprint = _Footprint.load(bins, lanes, rank, active)
+        color = _load_features(features, count, rank, active)
+        T, C = list(T), [list(c) for c in C]
+        for pixel in range(PIXELS):
+            row, column = divmod(pixel, MICRO)
+            alpha = _Alpha.at(footprint.log2_alpha[row][column], exp2, active)
+            weight, T[pixel], _ = _step(T[pixel], alpha.value)
+            for k in range(count):
+                C[k][pixel] = dr.fma(weight, color[k], C[k][pixel])
+        stop = dr.select(active, entry + 1, stop)
+        return entries.advance(cursor), T, C, stop, _any_positive(T)
+
+    size = dr.width(lanes.tile)
+    one, zero = dr.ones(t.Float, size), dr.zeros(t.Float, size)
+    _, T, C, stop, _ = dr.while_loop(
+        state=(
+            entries.begin,
+            [t.Float(one) for _ in range(PIXELS)],
+            [[t.Float(zero) for _ in range(PIXELS)] for _ in range(count)],
+            dr.gather(t.UInt32, bins.tile_start, lanes.tile),
+            dr.full(t.Bool, True, size),
+        ),
+        cond=lambda cursor, T, C, stop, unfinished: entries.pending(cursor) & unfinished,
+        body=body,
+    )
+    dr.eval(T, C, stop)
+    columns = [dr.abs(v) for v in T] + [v for plane in C for v in plane]
+    dr.eval(columns)
+    return Layers(
+        values=scatter_rows(columns, lanes.micro_tile, size),
+        stop=scatter_rows([stop], lanes.micro_tile, size),
+        count=count,
+        grid=bins.grid,
+    )
+
+
+def _any_positive(values: list[Any]) -> Any:
+    largest = values[0]
+    for v in values[1:]:
+        largest = dr.select(v > largest, v, largest)
+    return largest > 0
+
+
+# ----------------------------------------------------------------------------------------------
+# Adjoint
+# ----------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class SplatGradients:
+    """Derivatives of the loss with respect to the 2D splats, in the order of the Gaussians."""
+
+    means2d: Any  # Array2f, loss per px
+    whitening: Any  # Array3f
+    opacities: Any  # Float
+    features: list[Any]  # C of Float
+
+
+@dataclass(frozen=True)
+class _Slots:
+    """Where each (entry, micro-tile) pair that was composited stores its partial derivatives.
+
+    Pairs behind a micro-tile's stop have no slot, so that every slot is written exactly once.
+    """
+
+    first: Any  # UInt32 (M + 1,): unsorted entry -> its first slot
+    records: Any  # UInt32 (M padded * 4,): sorted -> rank, first slot, bit per micro-tile, -
+    count: int
+
+
+def _assign_slots(bins: TileBins, layers: Layers) -> _Slots:
+    """The slots of a Gaussian are contiguous: they follow the unsorted entries.
+
+    The host reads one value, the number of slots.
+    """
+    t = types_of(type(bins.geometry))
+    entry = dr.arange(t.UInt32, dr.width(bins.masks))
+    composited = t.UInt32(0)
+    for k in range(MICROS // 4):
+        stops = dr.gather(t.Array4u, layers.stop, bins.tiles * (MICROS // 4) + k)
+        for m, stop in enumerate(stops):
+            composited |= dr.select(entry < stop, t.UInt32(1 << (4 * k + m)), 0)
+    composited &= bins.masks
+    counts = dr.zeros(t.UInt32, bins.num_entries + 1)
+    is_entry = entry < dr.opaque(t.UInt32, bins.num_entries)
+    dr.scatter(counts, dr.popcnt(composited), bins.source, is_entry)
+    dr.eval(counts, composited)
+    first = dr.prefix_sum(counts)
+    count = int(first[bins.num_entries])
+    records = interleave(
+        [bins.ranks, dr.gather(t.UInt32, first, bins.source), composited, dr.zeros(t.UInt32)]
+    )
+    return _Slots(first=first, records=records, count=count)
+
+
+MOMENTS = 6
+"""Sums over pixels that give the derivatives of a splat's geometry; see :func:`_sum_slots`."""
+
+
+def composite_adjoint(
+    bins: TileBins,
+    features: Any,
+    layers: Layers,
+    d_features: list[Any],
+    d_transmittance: Any,
+) -> SplatGradients:
+    """Derivatives with respect to the splats, given those with respect to the planes.
+
+    layers: what :func:`composite` returned for the same bins and features; d_features: C planes
+    (H * W,); d_transmittance: plane (H * W,). Not differentiated: the order, the decisions
+    (cut, clamp, stop).
+    """
+    t = types_of(type(bins.geometry))
+    count = layers.count
+    lanes = _make_lanes(t.Float, bins.grid)
+    slots = _assign_slots(bins, layers)
+    entries = _Entries(bins, lanes, dr.gather(t.UInt32, layers.stop, lanes.micro_tile))
+    exp2 = _exp2_function(t.Float)
+
+    g = [_load_pixels(plane, lanes, bins.grid) for plane in d_features]
+    G = _load_pixels(d_transmittance, lanes, bins.grid)
+    row = lanes.micro_tile * ((1 + count) * PIXELS)
+    final = [dr.gather(t.Float, layers.values, row + k) for k in range((1 + count) * PIXELS)]
+    behind = []
+    for pixel in range(PIXELS):
+        S = final[pixel] * G[pixel]
+        for k in range(count):
+            S = dr.fma(final[(k + 1) * PIXELS + pixel], g[k][pixel], S)
+        behind.append(S)
+
+    width = 4 * -(-(MOMENTS + count) // 4)
+    partials = dr.empty(t.Float, max(slots.count, 1) * width)
+
+    def body(cursor: _Cursor, T: list, S: list) -> tuple:
+        entry, active = entries.current(cursor)
+        rank, slot, composited, _ = dr.gather(t.Array4u, slots.records, entry, active)
+        footprint = _Footprint.load(bins, lanes, rank, active)
+        color = _load_features(features, count, rank, active)
+        T, S = list(T), list(S)
+        d_color = [t.Float(0) for _ in range(count)]
+        d_log_alpha = []
+        for pixel in range(PIXELS):
+            row, column = divmod(pixel, MICRO)
+            alpha = _Alpha.at(footprint.log2_alpha[row][column], exp2, active)
+            weight, T[pixel], goes_on = _step(T[pixel], alpha.value)
+            seen = color[0] * g[0][pixel]
+            for k in range(1, count):
+                seen = dr.fma(color[k], g[k][pixel], seen)
+            for k in range(count):
+                d_color[k] = dr.fma(weight, g[k][pixel], d_color[k])
+            contribution = weight * seen
+            S[pixel] = S[pixel] - contribution
+            # d loss / d ln(alpha) = a (T c.g - S / (1 - a)), zero where a decision is active.
+            occlusion = S[pixel] * alpha.value * dr.rcp(1 - alpha.value)
+            d_log_alpha.append(dr.select(goes_on & alpha.smooth, contribution - occlusion, 0))
+        moments = _moments(footprint, d_log_alpha)
+        below = (t.UInt32(1) << lanes.micro) - 1
+        slot += dr.popcnt(composited & below)
+        values = moments + d_color
+        values += [t.Float(0)] * (width - len(values))
+        for k in range(width // 4):
+            packet = t.Array4f(values[4 * k : 4 * k + 4])
+            dr.scatter(partials, packet, slot * (width // 4) + k, active)
+        return entries.advance(cursor), T, S
+
+    size = dr.width(lanes.tile)
+    one = dr.ones(t.Float, size)
+    loop = dr.while_loop(
+        state=(entries.begin, [t.Float(one) for _ in range(PIXELS)], behind),
+        cond=lambda cursor, T, S: entries.pending(cursor),
+        body=body,
+    )
+    dr.eval(loop, partials)
+    return _sum_slots(bins, slots, partials, width, count)
+
+
+def _moments(footprint: _Footprint, v: list[Any]) -> list[Any]:
+    """Sums over the 16 pixels of v = d loss / d ln(alpha), times 1, u, u dx, u dy, dy, dy^2.
+
+    dx is shared by a column and dy by a row, so rows and columns are summed first.
+    """
+    rows = [v[MICRO * j : MICRO * j + MICRO] for j in range(MICRO)]
+    z = [
+        [a * b for a, b in zip(*pair, strict=True)] for pair in zip(rows, footprint.u, strict=True)
+    ]
+    v_rows, z_rows = [_sum(row) for row in rows], [_sum(row) for row in z]
+    z_columns = [_sum(list(column)) for column in zip(*z, strict=True)]
+    v_dy = [a * b for a, b in zip(v_rows, footprint.dy, strict=True)]
+    return [
+        _sum(v_rows),
+        _sum(z_rows),
+        _dot(z_columns, footprint.dx),
+        _dot(z_rows, footprint.dy),
+        _sum(v_dy),
+        _dot(v_dy, footprint.dy),
+    ]
+
+
+def _sum(values: list[Any]) -> Any:
+    """Pairwise: the shortest chain of dependent additions."""
+    while len(values) > 1:
+        values = [a + b for a, b in zip(values[::2], values[1::2], strict=True)]
+    return values[0]
+
+
+def _dot(a: list[Any], b: list[Any]) -> Any:
+    total = a[0] * b[0]
+    for x, y in zip(a[1:], b[1:], strict=True):
+        total = dr.fma(x, y, total)
+    return total
+
+
+def _sum_slots(
+    bins: TileBins, slots: _Slots, partials: Any, width: int, count: int
+) -> SplatGradients:
+    """Add up each splat's slots in order, then turn the sums into derivatives."""
+    t = types_of(type(bins.geometry))
+    rank = dr.arange(t.UInt32, dr.width(bins.order))
+    bounds = [dr.gather(t.UInt32, bins.first_entry, rank + k) for k in (0, 1)]
+    begin, end = (dr.gather(t.UInt32, slots.first, bound) for bound in bounds)
+
+    def body(slot: Any, totals: list) -> tuple:
+        values: list[Any] = []
+        for k in range(width // 4):
+            values.extend(dr.gather(t.Array4f, partials, slot * (width // 4) + k))
+        return slot + 1, [a + b for a, b in zip(totals, values, strict=False)]
+
+    zero = dr.zeros(t.Float, dr.width(rank))
+    _, totals = dr.while_loop(
+        state=(begin, [t.Float(zero) for _ in range(MOMENTS + count)]),
+        cond=lambda slot, totals: slot < end,
+        body=body,
+    )
+    _, _, p, r = dr.gather(t.Array4f, bins.geometry, rank * 2)
+    s, log2_opacity, _, _ = dr.gather(t.Array4f, bins.geometry, rank * 2 + 1)
+    v, v_u, v_u_dx, v_u_dy, v_dy, v_dy_dy = totals[:MOMENTS]
+    # log2_alpha = log2_opacity - u^2 - (s dy)^2, u = p dx + r dy, dx = x - mean: hence
+    # d ln(alpha) / d(anything) = ln(2) * d log2_alpha / d(anything).
+    scale = 2 * math.log(2)
+    columns = [
+        scale * p * v_u,
+        scale * dr.fma(r, v_u, s * s * v_dy),
+        -scale * WHITENING_SCALE * v_u_dx,
+        -scale * WHITENING_SCALE * v_u_dy,
+        -scale * WHITENING_SCALE * s * v_dy_dy,
+        v * dr.exp2(-log2_opacity),
+        *totals[MOMENTS:],
+    ]
+    dr.eval(columns)
+    size = dr.width(rank)
+    flat = scatter_rows(columns, bins.order, size)
+    row = [dr.gather(t.Float, flat, rank * len(columns) + k) for k in range(len(columns))]
+    return SplatGradients(
+        means2d=t.Array2f(row[0:2]),
+        whitening=t.Array3f(row[2:5]),
+        opacities=row[5],
+        features=row[6:],
+    )
+
+
+# ----------------------------------------------------------------------------------------------
+# Tangent (forward mode)
+# ----------------------------------------------------------------------------------------------
+
+
+def composite_tangent(
+    bins: TileBins, features: Any, layers: Layers, tangents: SplatGradients
+) -> Layers:
+    """Directional derivatives of the planes along ``tangents`` of the 2D splats.
+
+    tangents: the same fields as the gradients, holding the direction. Returns the tangents of
+    the planes that :func:`composite` made. Not differentiated: the order, the decisions.
+    """
+    t = types_of(type(bins.geometry))
+    count = layers.count
+    lanes = _make_lanes(t.Float, bins.grid)
+    entries = _Entries(bins, lanes, dr.gather(t.UInt32, layers.stop, lanes.micro_tile))
+    exp2 = _exp2_function(t.Float)
+    d_geometry, d_features = _pack_tangents(bins, tangents)
+
+    def body(cursor: _Cursor, T: list, dT: list, dC: list) -> tuple:
+        entry, active = entries.current(cursor)
+        rank = dr.gather(t.UInt32, bins.ranks, entry, active)
+        footprint = _Footprint.load(bins, lanes, rank, active)
+        d_log_alpha = _footprint_tangent(bins, footprint, d_geometry, rank, active)
+        color = _load_features(features, count, rank, active)
+        d_color = _load_features(d_features, count, rank, active)
+        T, dT, dC = list(T), list(dT), [list(c) for c in dC]
+        for pixel in range(PIXELS):
+            row, column = divmod(pixel, MICRO)
+            alpha = _Alpha.at(footprint.log2_alpha[row][column], exp2, active)
+            before, d_before = dr.abs(T[pixel]), dT[pixel]
+            weight, T[pixel], goes_on = _step(T[pixel], alpha.value)
+            d_alpha = dr.select(goes_on & alpha.smooth, alpha.value * d_log_alpha[row][column], 0)
+            d_weight = dr.select(goes_on, dr.fma(before, d_alpha, alpha.value * d_before), 0)
+            dT[pixel] = d_before - d_weight
+            for k in range(count):
+                change = dr.fma(d_weight, color[k], weight * d_color[k])
+                dC[k][pixel] = dC[k][pixel] + change
+        return entries.advance(cursor), T, dT, dC
+
+    size = dr.width(lanes.tile)
+    one, zero = dr.ones(t.Float, size), dr.zeros(t.Float, size)
+    _, _, dT, dC = dr.while_loop(
+        state=(
+            entries.begin,
+            [t.Float(one) for _ in range(PIXELS)],
+            [t.Float(zero) for _ in range(PIXELS)],
+            [[t.Float(zero) for _ in range(PIXELS)] for _ in range(count)],
+        ),
+        cond=lambda cursor, T, dT, dC: entries.pending(cursor),
+        body=body,
+    )
+    columns = dT + [v for plane in dC for v in plane]
+    dr.eval(columns)
+    return Layers(
+        values=scatter_rows(columns, lanes.micro_tile, size),
+        stop=layers.stop,
+        count=count,
+        grid=bins.grid,
+    )
+
+
+def _pack_tangents(bins: TileBins, tangents: SplatGradients) -> tuple[Any, Any]:
+    """Tangents by rank: geometry (mean, p, r, s, ln(opacity); unscaled) and features."""
+    t = types_of(type(bins.geometry))
+    rank = dr.arange(t.UInt32, dr.width(bins.order))
+    _, log2_opacity, _, _ = dr.gather(t.Array4f, bins.geometry, rank * 2 + 1)
+    d_log_opacity = dr.gather(t.Float, tangents.opacities, bins.order) * dr.exp2(-log2_opacity)
+    columns = [
+        dr.gather(t.Float, column, bins.order)
+        for column in (*tangents.means2d, *tangents.whitening)
+    ]
+    padding = dr.zeros(t.Float, dr.width(rank))
+    geometry = interleave([*columns, d_log_opacity, padding, padding])
+    return geometry, pack_features(list(tangents.features), bins.order)
+
+
+def _footprint_tangent(
+    bins: TileBins, footprint: _Footprint, d_geometry: Any, rank: Any, active: Any
+) -> list[list[Any]]:
+    """Tangent of ln(alpha) at the 16 pixels, [row][column]."""
+    t = types_of(type(d_geometry))
+    _, _, p, r = dr.gather(t.Array4f, bins.geometry, rank * 2, active)
+    s, _, _, _ = dr.gather(t.Array4f, bins.geometry, rank * 2 + 1, active)
+    d_x, d_y, d_p, d_r = dr.gather(t.Array4f, d_geometry, rank * 2, active)
+    d_s, d_log_opacity, _, _ = dr.gather(t.Array4f, d_geometry, rank * 2 + 1, active)
+    d_p, d_r, d_s = d_p * WHITENING_SCALE, d_r * WHITENING_SCALE, d_s * WHITENING_SCALE
+    scale = 2 * math.log(2)
+    result = []
+    for j, dy in enumerate(footprint.dy):
+        dv = dr.fma(d_s, dy, -s * d_y)
+        d_row = dr.fma(-scale * s * dy, dv, d_log_opacity)
+        du_row = dr.fma(d_r, dy, -dr.fma(p, d_x, r * d_y))
+        result.append(
+            [
+                dr.fma(-scale * footprint.u[j][i], dr.fma(d_p, dx, du_row), d_row)
+                for i, dx in enumerate(footprint.dx)
+            ]
+        )
+    return result

@@ -1,0 +1,194 @@
+"""The stages composed: from Gaussians and a camera to planes of pixels, and back.
+
+Layer 3. A :class:`Pipeline` says what a scene calls for: which SH degree, which opacity rule,
+which features are composited. It does so by naming functions, and Dr.Jit traces only what is
+called: what is not composed in leaves no instruction in any kernel.
+
+The chain is  Gaussians -> ``project`` -> Splats2D -> ``bin_splats`` -> TileBins
+-> ``composite`` -> Layers.  The adjoint runs it backwards: the hand-written adjoint of
+compositing gives the derivatives of the 2D splats, and Dr.Jit differentiates projection and SH,
+which are traced again, one Gaussian per lane, so that no gradient is ever scattered.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+
+from drgs.arrays import interleave, types_of
+from drgs.camera import Camera
+from drgs.gaussians import Gaussians
+from drgs.projection import GaussianRows, Splats2D, load_rows, plain_opacity, project
+from drgs.rasterize import (
+    Layers,
+    SplatGradients,
+    composite,
+    composite_adjoint,
+    composite_tangent,
+    pack_features,
+)
+from drgs.tiles import TileBins, TileGrid, bin_splats
+
+
+def color_features(splats: Splats2D) -> list[Any]:
+    """Red, green and blue in display space: three planes."""
+    return list(splats.colors)
+
+
+def depth_feature(splats: Splats2D) -> list[Any]:
+    """z in the camera, scene units: one plane, the alpha-weighted sum of the depths."""
+    return [splats.depths]
+
+
+@dataclass(frozen=True)
+class Pipeline:
+    """What is rendered, and how; see the module's description."""
+
+    sh_degree: int = 3
+    opacity_rule: Callable[[Any, Any, Any], Any] = plain_opacity
+    features: tuple[Callable[[Splats2D], list[Any]], ...] = (color_features,)
+
+    def project(self, rows: GaussianRows, camera: Camera) -> Splats2D:
+        """The first stage with this pipeline's choices."""
+        return project(rows, camera, self.sh_degree, self.opacity_rule)
+
+    def feature_columns(self, splats: Splats2D) -> list[Any]:
+        """The columns of all features, in order."""
+        return [column for feature in self.features for column in feature(splats)]
+
+
+@dataclass(frozen=True)
+class Frame:
+    """A rendered frame: its planes, and what the adjoint and the tangent replay."""
+
+    pipeline: Pipeline
+    camera: Camera
+    bins: TileBins
+    features: Any  # packed by rank
+    layers: Layers
+
+    def planes(self) -> list[Any]:
+        """Transmittance, then the pipeline's features, each Float (H * W,), unevaluated."""
+        return self.layers.planes()
+
+
+@dataclass(frozen=True)
+class GaussianGradients:
+    """Derivatives of the loss, shaped like the parameters, and what densification needs."""
+
+    parameters: Gaussians
+    means2d: Any  # Array2f (N,): loss per px
+    visible: Any  # Bool (N,): the Gaussian's extent touches the film
+
+
+def render(gaussians: Gaussians, camera: Camera, pipeline: Pipeline) -> Frame:
+    """Render ``gaussians`` as seen by ``camera``. Parameters may be attached; they are detached.
+
+    The host reads one value, the number of (splat, tile) entries.
+    """
+    splats = pipeline.project(load_rows(gaussians, pipeline.sh_degree), camera)
+    columns = pipeline.feature_columns(splats)
+    dr.eval(splats, columns)
+    bins = bin_splats(splats, TileGrid(camera.width, camera.height))
+    features = pack_features(columns, bins.order)
+    layers = composite(bins, features, len(columns))
+    return Frame(pipeline=pipeline, camera=camera, bins=bins, features=features, layers=layers)
+
+
+def render_adjoint(
+    gaussians: Gaussians, frame: Frame, d_features: list[Any], d_transmittance: Any
+) -> GaussianGradients:
+    """Derivatives of a loss with respect to all parameters.
+
+    gaussians: those that ``frame`` was rendered from; d_features: derivative of the loss with
+    respect to each feature plane, Float (H * W,); d_transmittance: the same for T.
+
+    Not differentiated: visibility, the order of the splats, the decisions of compositing.
+    """
+    gradients = composite_adjoint(
+        frame.bins, frame.features, frame.layers, d_features, d_transmittance
+    )
+    rows = load_rows(gaussians, frame.pipeline.sh_degree)
+    with dr.resume_grad():
+        dr.enable_grad(rows)
+        splats = frame.pipeline.project(rows, frame.camera)
+        outputs, cotangents = _differentiable(frame.pipeline, splats, gradients)
+        for output, cotangent in zip(outputs, cotangents, strict=True):
+            dr.accum_grad(output, cotangent)
+        dr.enqueue(dr.ADMode.Backward, outputs)
+        dr.traverse(dr.ADMode.Backward)
+        d_rows = dr.grad(rows)
+    return GaussianGradients(
+        parameters=_as_tensors(d_rows, gaussians),
+        means2d=gradients.means2d,
+        visible=_on_film(frame.bins),
+    )
+
+
+def render_tangent(gaussians: Gaussians, frame: Frame, tangents: Gaussians) -> list[Any]:
+    """Directional derivatives of ``frame.planes()`` along ``tangents`` of the parameters.
+
+    Not differentiated: visibility, the order of the splats, the decisions of compositing.
+    """
+    rows = load_rows(gaussians, frame.pipeline.sh_degree)
+    with dr.resume_grad():
+        dr.enable_grad(rows)
+        splats = frame.pipeline.project(rows, frame.camera)
+        dr.set_grad(rows, load_rows(tangents, frame.pipeline.sh_degree))
+        outputs, _ = _differentiable(frame.pipeline, splats, None)
+        dr.forward_to(outputs)
+        columns = [dr.grad(output) for output in outputs]
+    direction = SplatGradients(*columns[:3], features=columns[3:])
+    return composite_tangent(frame.bins, frame.features, frame.layers, direction).planes()
+
+
+def _differentiable(
+    pipeline: Pipeline, splats: Splats2D, gradients: SplatGradients | None
+) -> tuple[list[Any], list[Any]]:
+    """What compositing reads of the splats, and the derivatives with respect to it, aligned."""
+    outputs = [splats.means2d, splats.whitening, splats.opacities]
+    outputs += pipeline.feature_columns(splats)
+    if gradients is None:
+        return outputs, []
+    cotangents = [gradients.means2d, gradients.whitening, gradients.opacities]
+    return outputs, cotangents + list(gradients.features)
+
+
+def _as_tensors(d_rows: GaussianRows, gaussians: Gaussians) -> Gaussians:
+    """Per-lane derivatives as tensors shaped like the parameters, evaluated.
+
+    SH coefficients above the pipeline's degree have zero gradient.
+    """
+    t = types_of(type(d_rows.logit_opacities))
+    zero = dr.zeros(t.Float, dr.width(d_rows.logit_opacities))
+    higher = [component for vector in d_rows.sh[1:] for component in vector]
+    missing = 3 * gaussians.shN.shape[1] - len(higher)
+
+    def tensor(columns: list[Any], like: Any) -> Any:
+        if not columns:
+            return dr.zeros(t.TensorXf, like.shape)
+        return t.TensorXf(interleave([column + zero for column in columns]), like.shape)
+
+    gradients = Gaussians(
+        means=tensor(list(d_rows.means), gaussians.means),
+        quats=tensor(list(d_rows.quats), gaussians.quats),
+        log_scales=tensor(list(d_rows.log_scales), gaussians.log_scales),
+        logit_opacities=d_rows.logit_opacities,
+        sh0=tensor(list(d_rows.sh[0]), gaussians.sh0),
+        shN=tensor(higher + [zero] * missing, gaussians.shN),
+    )
+    dr.eval(gradients)
+    return gradients
+
+
+def _on_film(bins: TileBins) -> Any:
+    """Bool per Gaussian: it has entries."""
+    t = types_of(type(bins.geometry))
+    rank = dr.arange(t.UInt32, dr.width(bins.order))
+    first, end = (dr.gather(t.UInt32, bins.first_entry, rank + k) for k in (0, 1))
+    visible = dr.empty(t.Bool, dr.width(bins.order))
+    dr.scatter(visible, first < end, bins.order)
+    return visible

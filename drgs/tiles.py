@@ -1,0 +1,296 @@
+"""Integer binning: which splats touch which tile, front to back.
+
+Layer 2, the second stage: ``Splats2D`` -> ``TileBins``. The film is cut into tiles of 16x16
+pixels, each a 4x4 grid of micro-tiles of 4x4 pixels. Every (splat, tile) pair of a splat's
+bounding box is one *entry*; an entry carries 16 bits that say which micro-tiles its ellipse
+touches. All steps are flat: no lane loops over a splat's tiles, so a giant splat does not hold
+up its neighbours, and the only value that the host reads is the number of entries.
+
+1. Sort the splats by depth.
+2. Count the tiles of each bounding box; a prefix sum gives each splat its run of entries.
+3. For each entry: its tile, and the exact ellipse-against-rectangle test of its micro-tiles.
+4. Stable sort of the entries by tile; within a tile they stay front to back.
+5. Transpose the bits: for each group of 32 entries and each micro-tile one 32-bit word, so that
+   compositing finds a micro-tile's next splat by counting trailing zeros.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+
+from drgs.arrays import interleave, types_of
+from drgs.constants import ALPHA_CUT, CULL_MARGIN, LOG2_ALPHA_CUT, WHITENING_SCALE
+from drgs.projection import Splats2D
+
+MICRO = 4
+"""Pixels on a micro-tile's side. A micro-tile is one SIMD lane of the compositing kernels."""
+
+GRID = 4
+"""Micro-tiles on a tile's side."""
+
+TILE = MICRO * GRID
+"""Pixels on a tile's side."""
+
+MICROS = GRID * GRID
+"""Micro-tiles in a tile: the bits of an entry's mask."""
+
+WORD = 32
+"""Entries in a word of the transposed masks."""
+
+GEOMETRY = 8
+"""Numbers per splat in the geometry records: two packets of four."""
+
+
+@dataclass(frozen=True)
+class TileGrid:
+    """The tiles of a film of ``width`` x ``height`` px, in rows from the upper left corner."""
+
+    width: int
+    height: int
+
+    @property
+    def columns(self) -> int:
+        """Tiles in a row."""
+        return -(-self.width // TILE)
+
+    @property
+    def rows(self) -> int:
+        """Tiles in a column."""
+        return -(-self.height // TILE)
+
+    @property
+    def num_tiles(self) -> int:
+        """Tiles on the film."""
+        return self.columns * self.rows
+
+
+@dataclass(frozen=True)
+class TileBins:
+    """Entries sorted by tile, then by depth.
+
+    N splats in depth order are *ranks*; M entries in the order in which they are made, run by
+    run, are *unsorted*; in the order of the tiles they are *sorted*. Sorted arrays are padded
+    to a multiple of 32 with entries that touch nothing.
+    """
+
+    order: Any  # UInt32 (N,): rank -> index of the Gaussian
+    geometry: Any  # Float (N * 8,): the records of pack_geometry, by rank
+    first_entry: Any  # UInt32 (N + 1,): rank -> first of its run of unsorted entries
+    source: Any  # UInt32 (M padded,): sorted -> unsorted
+    ranks: Any  # UInt32 (M padded,): sorted -> rank
+    tiles: Any  # UInt32 (M padded,): sorted -> tile
+    masks: Any  # UInt32 (M padded,): sorted -> bit per micro-tile that the splat touches
+    words: Any  # UInt32 (M padded / 32 * 16,): (group of 32, micro-tile) -> bit per entry
+    tile_start: Any  # UInt32 (tiles + 1,): tile -> first sorted entry
+    num_entries: int  # M
+    grid: TileGrid
+
+
+@dataclass(frozen=True)
+class _Entries:
+    """Unsorted (splat, tile) pairs."""
+
+    ranks: Any  # UInt32 (M,)
+    tiles: Any  # UInt32 (M,)
+    masks: Any  # UInt32 (M,)
+
+
+def bin_splats(splats: Splats2D, grid: TileGrid) -> TileBins:
+    """Distribute the visible ``splats`` over the tiles of ``grid``, front to back.
+
+    Not differentiated: integer work. The host reads one value, the number of entries.
+    """
+    t = types_of(type(splats.depths))
+    # A stable sort: equal depths stay in the order of the Gaussians.
+    order = dr.argsort(dr.select(splats.visible, splats.depths, dr.inf))
+    in_order = dr.gather(Splats2D, splats, order)
+    geometry = interleave(_geometry_columns(in_order))
+    first_entry, boxes = _tile_boxes(in_order, grid)
+    dr.eval(geometry, boxes)
+    num_entries = int(first_entry[dr.width(order)])
+
+    entries = _make_entries(first_entry, boxes, geometry, num_entries, grid)
+    source = dr.argsort(entries.tiles)
+
+    padded = -(-max(num_entries, 1) // WORD) * WORD
+    position = dr.arange(t.UInt32, padded)
+    active = position < dr.opaque(t.UInt32, num_entries)
+    source = dr.gather(t.UInt32, source, position, active)
+    ranks, tiles, masks = (
+        dr.gather(t.UInt32, column, source, active)
+        for column in (entries.ranks, entries.tiles, entries.masks)
+    )
+    dr.eval(source, ranks, tiles, masks)
+    words = _transpose_masks(masks)
+    tile_start = _lower_bounds(tiles, num_entries, grid.num_tiles)
+    dr.eval(words, tile_start)
+    return TileBins(
+        order=order,
+        geometry=geometry,
+        first_entry=first_entry,
+        source=source,
+        ranks=ranks,
+        tiles=tiles,
+        masks=masks,
+        words=words,
+        tile_start=tile_start,
+        num_entries=num_entries,
+        grid=grid,
+    )
+
+
+def _geometry_columns(splats: Splats2D) -> list[Any]:
+    """Six numbers per splat (and padding) that decide its alpha at a pixel.
+
+    Mean x, y (px); then p, r, s of U and log2_opacity, scaled such that
+    alpha = exp2(log2_opacity - |U d|^2).
+    """
+    p, r, s = splats.whitening * WHITENING_SCALE
+    log2_opacity = dr.log2(splats.opacities)
+    padding = dr.zeros(type(p), dr.width(p))
+    return [*splats.means2d, p, r, s, log2_opacity, padding, padding]
+
+
+def _tile_boxes(splats: Splats2D, grid: TileGrid) -> tuple[Any, Any]:
+    """Each rank's box of tiles, and the run of entries that it needs.
+
+    Returns first_entry (N + 1,) and boxes, flat, four a rank: first entry, first tile column,
+    first tile row, columns.
+    """
+    t = types_of(type(splats.depths))
+    # alpha >= cut inside |U d|^2 <= 2 ln(opacity / cut); its bounding box follows from the
+    # variances (the opacity-aware radius, instead of 3 standard deviations).
+    reach = 2 * dr.log(splats.opacities / ALPHA_CUT) + CULL_MARGIN
+    radius = dr.sqrt(reach * splats.variances)
+    size = t.Array2f(dr.opaque(t.Float, grid.width), dr.opaque(t.Float, grid.height))
+    # The first and last pixel whose centre lies within the radius, clamped to the film while
+    # still in floating point: a splat may be arbitrarily far away.
+    first = dr.ceil(splats.means2d - radius - 0.5)
+    last = dr.floor(splats.means2d + radius - 0.5)
+    first = dr.select(first < 0, 0, first)
+    last = dr.select(last > size - 1, size - 1, last)
+    visible = splats.visible & (first.x <= last.x) & (first.y <= last.y)
+
+    Pixel = dr.uint32_array_t(type(first))
+    first_tile = Pixel(dr.select(visible, first, 0)) // TILE
+    last_tile = Pixel(dr.select(visible, last, 0)) // TILE
+    extent = last_tile - first_tile + 1
+    count = dr.select(visible, extent.x * extent.y, 0)
+
+    num_splats = dr.width(count)
+    rank = dr.arange(t.UInt32, num_splats + 1)
+    counts = dr.gather(t.UInt32, count, rank, rank < dr.opaque(t.UInt32, num_splats))
+    first_entry = dr.prefix_sum(counts)
+    first = dr.gather(t.UInt32, first_entry, dr.arange(t.UInt32, num_splats))
+    boxes = interleave([first, first_tile.x, first_tile.y, extent.x])
+    return first_entry, boxes
+
+
+def _make_entries(
+    first_entry: Any, boxes: Any, geometry: Any, num_entries: int, grid: TileGrid
+) -> _Entries:
+    """One entry per lane: its rank, tile and micro-tile mask."""
+    t = types_of(type(geometry))
+    # Rank of each entry: write each rank at the start of its run, then a running maximum.
+    rank = dr.arange(t.UInt32, dr.width(first_entry) - 1)
+    start, end = dr.gather(t.UInt32, first_entry, rank), dr.gather(t.UInt32, first_entry, rank + 1)
+    starts = dr.zeros(t.UInt32, max(num_entries, 1))
+    dr.scatter(starts, rank, start, start < end)
+    ranks = dr.prefix_reduce(dr.ReduceOp.Max, starts, exclusive=False)
+
+    first, tile_x, tile_y, columns = dr.gather(t.Array4u, boxes, ranks)
+    local = dr.arange(t.UInt32, max(num_entries, 1)) - first
+    # Exact while a splat covers fewer than 2^22 tiles; an integer division by a varying number
+    # has no vector instruction.
+    row = t.UInt32((t.Float(local) + 0.5) / t.Float(columns))
+    tile_x = tile_x + (local - row * columns)
+    tile_y = tile_y + row
+    tiles = dr.fma(tile_y, dr.opaque(t.UInt32, grid.columns), tile_x)
+    masks = _touched_micros(geometry, ranks, tile_x, tile_y)
+    dr.eval(ranks, tiles, masks)
+    return _Entries(ranks=ranks, tiles=tiles, masks=masks)
+
+
+def _touched_micros(geometry: Any, ranks: Any, tile_x: Any, tile_y: Any) -> Any:
+    """Bit m is set where the ellipse alpha >= cut reaches a pixel centre of micro-tile m.
+
+    |U d|^2 is convex, so its minimum over a rectangle that does not contain the mean lies on
+    one of the (at most two) sides that face the mean: for such a side, one coordinate is given
+    and the best other coordinate is clamped to the rectangle.
+    """
+    t = types_of(type(geometry))
+    mean_x, mean_y, p, r = dr.gather(t.Array4f, geometry, ranks * 2)
+    s, log2_opacity, _, _ = dr.gather(t.Array4f, geometry, ranks * 2 + 1)
+    reach = log2_opacity - LOG2_ALPHA_CUT + CULL_MARGIN
+    dx_per_dy = -r / p
+    dy_per_dx = -(p * r) / dr.fma(r, r, s * s)
+
+    def intervals(tile: Any, mean: Any) -> list[tuple[Any, Any]]:
+        first = dr.fma(t.Float(tile), TILE, 0.5) - mean
+        return [(first + MICRO * k, first + (MICRO * k + MICRO - 1)) for k in range(GRID)]
+
+    def exponent(dx: Any, dy: Any) -> Any:
+        u = dr.fma(p, dx, r * dy)
+        v = s * dy
+        return dr.fma(u, u, v * v)
+
+    columns, rows = intervals(tile_x, mean_x), intervals(tile_y, mean_y)
+    nearest_dx = [_clamp(t.Float(0), lo, hi) for lo, hi in columns]
+    nearest_dy = [_clamp(t.Float(0), lo, hi) for lo, hi in rows]
+    mask = t.UInt32(0)
+    for j, (y_range, dy) in enumerate(zip(rows, nearest_dy, strict=True)):
+        for i, (x_range, dx) in enumerate(zip(columns, nearest_dx, strict=True)):
+            facing_x = exponent(dx, _clamp(dy_per_dx * dx, *y_range))
+            facing_y = exponent(_clamp(dx_per_dy * dy, *x_range), dy)
+            touched = (facing_x <= reach) | (facing_y <= reach)
+            mask |= dr.select(touched, t.UInt32(1 << (j * GRID + i)), 0)
+    return mask
+
+
+def _clamp(x: Any, lo: Any, hi: Any) -> Any:
+    """Unlike dr.clip this maps to two vector instructions; a NaN becomes ``lo`` or stays NaN."""
+    x = dr.select(x < lo, lo, x)
+    return dr.select(x > hi, hi, x)
+
+
+def _transpose_masks(masks: Any) -> Any:
+    """From 16 bits per entry to 32 bits per (group of 32 entries, micro-tile).
+
+    Two 16x16 bit matrices side by side in each word, transposed by exchanging ever smaller
+    blocks (Warren, "Hacker's Delight", 2nd ed., section 7-3).
+    """
+    UInt32 = type(masks)
+    Array4u = types_of(UInt32).Array4u
+    group = dr.arange(UInt32, dr.width(masks) // WORD)
+    packets = WORD // 4
+    m = [v for k in range(packets) for v in dr.gather(Array4u, masks, group * packets + k)]
+    m = [m[k] | (m[k + MICROS] << MICROS) for k in range(MICROS)]
+    for step, keep in ((8, 0x00FF00FF), (4, 0x0F0F0F0F), (2, 0x33333333), (1, 0x55555555)):
+        for k in range(MICROS):
+            if not k & step:
+                swap = ((m[k] >> step) ^ m[k + step]) & keep
+                m[k + step] ^= swap
+                m[k] ^= swap << step
+    return interleave(m)
+
+
+def _lower_bounds(sorted_tiles: Any, num_entries: int, num_tiles: int) -> Any:
+    """(num_tiles + 1,): the first sorted position whose tile is not smaller; binary search."""
+    UInt32 = type(sorted_tiles)
+    tile = dr.arange(UInt32, num_tiles + 1)
+
+    def body(first: Any, last: Any) -> tuple[Any, Any]:
+        middle = (first + last) >> 1
+        smaller = dr.gather(UInt32, sorted_tiles, middle) < tile
+        return dr.select(smaller, middle + 1, first), dr.select(smaller, last, middle)
+
+    first, _ = dr.while_loop(
+        state=(dr.zeros(UInt32, num_tiles + 1), dr.opaque(UInt32, num_entries, num_tiles + 1)),
+        cond=lambda first, last: first < last,
+        body=body,
+        labels=("first", "last"),
+    )
+    return first

@@ -1,0 +1,32 @@
+"""Mitsuba plugins of drgs, one file each; importable as ``drgs.plugins``. Layer 5.
+
+A plugin file reads like one of Mitsuba's own: a class that derives from a class of the active
+variant, and a registration that closes the file. Such a class belongs to one variant, so the
+files are executed once for each variant that becomes active, and the results are kept.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import sys
+from pathlib import Path
+
+PLUGINS = ("splats",)
+
+
+def register(variant: str) -> None:
+    """Register all plugins for ``variant``, which must be the active one."""
+    for name in PLUGINS:
+        module_name = f"{__name__}.{variant}.{name}"
+        if module_name in sys.modules:
+            continue
+        spec = importlib.util.spec_from_file_location(
+            module_name, Path(__file__).with_name(f"{name}.py")
+        )
+        module = importlib.util.module_from_spec(spec)
+        sys.modules[module_name] = module
+        try:
+            spec.loader.exec_module(module)
+        except BaseException:
+            del sys.modules[module_name]
+            raise
