@@ -9,13 +9,16 @@ from __future__ import annotations
 
 import math
 
-ALPHA_MAX = 0.99
+ALPHA_MAX = 0.9900000095367432
 """Upper clamp of a splat's alpha (3DGS reference rasterizer): keeps 1 / (1 - alpha) below 100.
-Where it is active, the derivative of alpha is zero."""
+Where it is active, the derivative of alpha is zero. The value is 0.99 rounded to float32, in both
+precisions: behind two clamped splats the transmittance, (1 - 0.99)^2, is TRANSMITTANCE_STOP but
+for that rounding, and float64 would otherwise decide differently."""
 
-ALPHA_CUT = 1.0 / 255.0
+ALPHA_CUT = 0.003921568859368563
 """A splat contributes to a pixel only where its alpha reaches this value (3DGS reference
-rasterizer): below it an 8-bit image cannot tell. Below it, the derivative is zero."""
+rasterizer; 1/255 rounded to float32): below it an 8-bit image cannot tell, and the derivative
+is zero."""
 
 TRANSMITTANCE_STOP = 1e-4
 """A pixel is finished *before* the splat that would take its transmittance below this value

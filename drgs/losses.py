@@ -24,7 +24,7 @@ from typing import Any
 
 import drjit as dr
 
-from drgs.arrays import is_float64, types_of
+from drgs.arrays import interleave, is_float64, types_of
 
 C1 = 0.01**2
 """(K1 L)^2 with K1 = 0.01, dynamic range L = 1 (Wang et al. 2004): stabilises luminance."""
@@ -397,13 +397,8 @@ def _blur_three(records: dict[int, Any], weights: tuple[float, ...]) -> list[lis
 
 
 def _store(values: list[list[Any]]) -> Any:
-    """Each lane's values side by side in a flat array: one packet scatter, hence one kernel."""
-    packet = [value for record in values for value in record]
-    float_type = type(packet[0])
-    lane = dr.arange(dr.uint32_array_t(float_type), dr.width(packet))
-    flat = dr.empty(float_type, len(packet) * dr.width(packet))
-    dr.scatter(flat, _packet_type(float_type)(packet), lane)
-    return flat
+    """Each lane's values side by side in a flat array: one packet store, hence one kernel."""
+    return interleave([value for record in values for value in record])
 
 
 def _tiling(target: Target) -> _Tiling:

@@ -103,7 +103,7 @@ def edit_rows(
     happened. Detached; waits for the device once, to check ``keep``.
     """
     total = num_rows(optimizer, prefix)
-    if not dr.all(keep < total):
+    if dr.width(keep) > 0 and dr.max(keep)[0] >= total:
         raise ValueError(f"edit_rows(): keep must hold row numbers below {total}")
     added = _check_rows(optimizer, append, prefix)
     if dr.width(keep) + added == 0:
@@ -121,12 +121,25 @@ def edit_rows(
         moments = [
             None if m is None else _gather_and_append(m, elements, no_moments) for m in moments
         ]
-        if row_shape:
+        if dr.is_tensor_v(value):
             flat = type(value)(flat, (dr.width(flat) // width, *row_shape))
         dr.enable_grad(flat)
         dr.schedule(flat, moments)
         optimizer.state[prefix + name] = flat, promoted, rate, (step, *moments)
     dr.eval()
+
+
+def take_rows(optimizer: Adam, rows: Any, prefix: str = "") -> dict[str, Any]:
+    """Return copies of some rows of every parameter by name, detached; rows: (M,) ``UInt32``."""
+    result = {}
+    for name in _names(optimizer, prefix):
+        value = dr.detach(optimizer.state[prefix + name][0])
+        row_shape = tuple(value.shape[1:])
+        flat = value.array
+        flat = dr.gather(type(flat), flat, _elements(rows, math.prod(row_shape)))
+        is_tensor = dr.is_tensor_v(value)
+        result[name] = type(value)(flat, (dr.width(rows), *row_shape)) if is_tensor else flat
+    return result
 
 
 def replace_values(optimizer: Adam, name: str, value: Any, prefix: str = "") -> None:
@@ -164,8 +177,8 @@ def _check_rows(optimizer: Adam, rows: Mapping[str, Any] | None, prefix: str) ->
         got = tuple(rows[name].shape) if name in rows else None
         if got is None or got[1:] != expected:
             raise ValueError(
-                f"edit_rows(): appended rows of {name} must have the shape (M, "
-                f"{', '.join(map(str, expected))}), got {got or 'none'}"
+                f"edit_rows(): appended rows of {name} must have the shape "
+                f"({', '.join(map(str, ('M', *expected)))}), got {got or 'none'}"
             )
         counts.add(got[0])
     if len(counts) != 1:
@@ -183,4 +196,12 @@ def _elements(rows: Any, width: int) -> Any:
 
 def _gather_and_append(flat: Any, elements: Any, added: Any | None) -> Any:
     kept = dr.gather(type(flat), flat, elements)
-    return kept if added is None else dr.concat([kept, added])
+    if added is None:
+        return kept
+    index_type, num_kept, num_added = type(elements), dr.width(kept), dr.width(added)
+    result = dr.empty(type(flat), num_kept + num_added)
+    dr.scatter(result, kept, dr.arange(index_type, num_kept))
+    # Opaque: as a literal (and in dr.concat) the offset would make each call a new kernel.
+    offset = dr.opaque(index_type, num_kept)
+    dr.scatter(result, added, dr.arange(index_type, num_added) + offset)
+    return result

@@ -1,0 +1,95 @@
+"""From a dataset to Mitsuba objects: sensors for the views, a scene with the integrator.
+
+Layer 4. The trainer and the commands reach the integrator through these dictionaries, as any
+Mitsuba scene would.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+
+from drgs.checks import UserError
+from drgs.config import ModelConfig
+from drgs.data.types import View
+from drgs.gaussians import PARAMETER_NAMES, Gaussians
+
+SQUARE_PIXEL_TOLERANCE = 0.5
+"""px: largest shift at the image's border that may come from treating pixels as square."""
+
+
+def make_scene(
+    gaussians: Gaussians, model: ModelConfig, background: tuple[float, float, float]
+) -> mi.Scene:
+    """A scene that holds nothing but the ``splats`` integrator, working in display space.
+
+    gaussians: numpy or Dr.Jit arrays; background: display space.
+    """
+    uploaded = gaussians.to(mi.TensorXf)
+    tensors = {name: getattr(uploaded, name) for name in PARAMETER_NAMES}
+    integrator = {
+        "type": "splats",
+        "background": list(background),
+        "antialiased": model.antialiased,
+        "near": model.near,
+        "srgb_primitives": False,
+        **tensors,
+    }
+    return mi.load_dict({"type": "scene", "integrator": integrator})
+
+
+def make_sensors(views: Iterable[View]) -> list[mi.Sensor]:
+    """One ``perspective`` sensor per view: box filter, one sample, RGB.
+
+    Views of one size share a film. Raises UserError for pixels that are far from square, which
+    Mitsuba's sensors cannot express.
+    """
+    films: dict[tuple[int, int], mi.Film] = {}
+    sensors = []
+    for view in views:
+        size = (view.width, view.height)
+        if size not in films:
+            films[size] = mi.load_dict(_film(*size))
+        sensors.append(mi.load_dict(_sensor(view, films[size])))
+    return sensors
+
+
+def _film(width: int, height: int) -> dict[str, Any]:
+    return {
+        "type": "hdrfilm",
+        "width": width,
+        "height": height,
+        "pixel_format": "rgb",
+        "component_format": "float32",
+        "rfilter": {"type": "box"},
+    }
+
+
+def _sensor(view: View, film: mi.Film) -> dict[str, Any]:
+    focal = math.sqrt(view.fx * view.fy)
+    shift = max(
+        abs(view.fx / focal - 1) * max(view.cx, view.width - view.cx),
+        abs(view.fy / focal - 1) * max(view.cy, view.height - view.cy),
+    )
+    if shift > SQUARE_PIXEL_TOLERANCE:
+        raise UserError(
+            f"{view.name}: fl_x and fl_y must agree (square pixels), got {view.fx:g} and "
+            f"{view.fy:g}, which moves pixels by up to {shift:.1f}; resample the image"
+        )
+    # Mitsuba's camera has x to the left and y up.
+    to_world = view.camera_to_world @ np.diag([-1.0, -1.0, 1.0, 1.0])
+    return {
+        "type": "perspective",
+        "fov": math.degrees(2 * math.atan(0.5 * view.width / focal)),
+        "fov_axis": "x",
+        "principal_point_offset_x": 0.5 - view.cx / view.width,
+        "principal_point_offset_y": 0.5 - view.cy / view.height,
+        "near_clip": 1e-3,  # the integrator's own near plane decides
+        "to_world": mi.ScalarTransform4f(to_world),
+        "film": film,
+        "sampler": {"type": "independent", "sample_count": 1},
+    }

@@ -1,0 +1,189 @@
+"""The training loop: photographs in, Gaussians out.
+
+Layer 4. Everything between two optimizer steps is visible in :meth:`Trainer.step`. The picture
+and its gradients come from ``mi.render`` with the ``splats`` integrator, the steps from
+``drjit.opt.Adam``, changes of the population from ``drgs.densify``.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from drgs import densify
+from drgs.config import FitConfig, OptimizerConfig
+from drgs.data.types import Dataset, View
+from drgs.gaussians import PARAMETER_NAMES, Gaussians
+from drgs.losses import PhotometricLoss, Target, prepare_target
+from drgs.optimizer import ExponentialDecay, make_optimizer
+from drgs.scene import make_scene, make_sensors
+
+PREFIX = "integrator."
+"""What precedes a parameter's name when the scene is traversed."""
+
+
+@dataclass(frozen=True, eq=False)
+class TrainingView:
+    """A view as training needs it."""
+
+    sensor: mi.Sensor
+    target: Target
+    width: int  # px
+    height: int  # px
+
+
+@dataclass(frozen=True)
+class StepReport:
+    """What one iteration did; numbers that cost a wait for the device are read on demand."""
+
+    iteration: int
+    num_gaussians: int
+    means_lr: float
+    density: densify.DensityReport | None
+    loss_array: Any  # Float, one entry
+    squared_error: Any  # Float, one entry: mean over pixels and channels
+
+    @property
+    def loss(self) -> float:
+        """The loss of this iteration's view."""
+        return float(self.loss_array[0])
+
+    @property
+    def psnr(self) -> float:
+        """dB, of this iteration's view before the step."""
+        return -10 * math.log10(max(float(self.squared_error[0]), 1e-10))
+
+
+class Trainer:
+    """Fits ``gaussians`` to the training views of ``dataset``."""
+
+    def __init__(self, config: FitConfig, dataset: Dataset, gaussians: Gaussians) -> None:
+        self.config, self.extent = config, dataset.extent
+        self.scene = make_scene(gaussians, config.model, dataset.background)
+        self.integrator = self.scene.integrator()
+        self.params = mi.traverse(self.scene)
+        self.params.keep([PREFIX + name for name in PARAMETER_NAMES])
+        initial = {key.removeprefix(PREFIX): value for key, value in self.params.items()}
+        self.optimizer = make_optimizer(
+            initial,
+            learning_rates(config.optimizer, self.extent),
+            prefix=PREFIX,
+            beta_1=config.optimizer.beta_1,
+            beta_2=config.optimizer.beta_2,
+            epsilon=config.optimizer.epsilon,
+        )
+        self.means_lr = ExponentialDecay(
+            config.optimizer.means_lr * self.extent,
+            config.optimizer.means_lr_final * self.extent,
+            config.iterations,
+        )
+        self.loss = PhotometricLoss(config.loss.dssim_weight)
+        self.white_background = tuple(dataset.background) == (1.0, 1.0, 1.0)
+        self.views = make_training_views(dataset.train, config)
+        self.order = shuffled_forever(len(self.views), config.seed)
+        self.statistics = self._no_statistics()
+        self.iteration = 0
+
+    def step(self) -> StepReport:
+        """One iteration: one view, one optimizer step, now and then a change of the population."""
+        self.iteration += 1
+        view = self.views[next(self.order)]
+        self.integrator.sh_degree = self.sh_degree
+        self.optimizer.set_learning_rate({PREFIX + "means": self.means_lr(self.iteration)})
+        self.params.update(self.optimizer)
+
+        image = mi.render(self.scene, self.params, sensor=view.sensor, spp=1)
+        loss = self.loss(image, view.target)
+        dr.backward(loss)
+        error = dr.mean(dr.square(dr.detach(image).array - view.target.image.array))
+        self.optimizer.step()
+
+        report = self._control_density(view)
+        return StepReport(
+            iteration=self.iteration,
+            num_gaussians=self.num_gaussians,
+            means_lr=self.means_lr(self.iteration),
+            density=report,
+            loss_array=dr.detach(loss),
+            squared_error=error,
+        )
+
+    @property
+    def sh_degree(self) -> int:
+        """The degree in use: one more every ``model.sh_increase_every`` iterations."""
+        model = self.config.model
+        return min(model.sh_degree, self.iteration // model.sh_increase_every)
+
+    @property
+    def num_gaussians(self) -> int:
+        """N at the moment."""
+        return self.optimizer[PREFIX + "means"].shape[0]
+
+    def gaussians(self) -> Gaussians:
+        """The Gaussians as numpy arrays."""
+        self.params.update(self.optimizer)
+        return dr.detach(self.integrator.gaussians).numpy()
+
+    def _control_density(self, view: TrainingView) -> densify.DensityReport | None:
+        config, i = self.config.densify, self.iteration
+        if densify.gathers_statistics(config, i):
+            last = self.integrator.last
+            self.statistics = densify.accumulate(
+                self.statistics, last.means2d_grad, last.visible, view.width, view.height
+            )
+        report = None
+        if densify.should_densify(config, i):
+            report = densify.densify_and_prune(
+                self.optimizer, self.statistics, config, self.extent, i, self.config.seed, PREFIX
+            )
+            self.statistics = self._no_statistics()
+        if densify.should_reset(config, i, self.white_background):
+            densify.reset_opacities(self.optimizer, config, PREFIX)
+        return report
+
+    def _no_statistics(self) -> densify.DensityStatistics:
+        return densify.DensityStatistics.zeros(mi.Float, self.num_gaussians)
+
+
+def learning_rates(config: OptimizerConfig, extent: float) -> dict[str, float]:
+    """Rate per step of each parameter; extent: world units."""
+    return {
+        "means": config.means_lr * extent,
+        "quats": config.quats_lr,
+        "log_scales": config.scales_lr,
+        "logit_opacities": config.opacities_lr,
+        "sh0": config.sh0_lr,
+        "shN": config.shN_lr,
+    }
+
+
+def make_training_views(views: tuple[View, ...], config: FitConfig) -> list[TrainingView]:
+    """Sensors and loss targets for ``views``."""
+    targets = [
+        prepare_target(mi.TensorXf(view.image), config.loss.window, config.loss.sigma)
+        for view in views
+    ]
+    return [
+        TrainingView(sensor, target, view.width, view.height)
+        for view, sensor, target in zip(views, make_sensors(views), targets, strict=True)
+    ]
+
+
+def shuffled_forever(count: int, seed: int) -> Iterator[int]:
+    """0 .. count - 1 in a new random order in every round."""
+    rng = np.random.default_rng(seed)
+    while True:
+        yield from rng.permutation(count).tolist()
+
+
+def render_views(scene: mi.Scene, views: tuple[View, ...]) -> Iterator[np.ndarray]:
+    """Pictures (H, W, 3) of ``views``, display space, clamped to [0, 1]."""
+    for sensor in make_sensors(views):
+        with dr.suspend_grad():
+            yield np.clip(np.array(mi.render(scene, sensor=sensor, spp=1)), 0, 1)

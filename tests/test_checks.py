@@ -1,0 +1,37 @@
+import sys
+
+import pytest
+
+from drgs.checks import UserError, did_you_mean, exit_on_user_error
+from drgs.llvm import LLVMVersionError
+
+
+def test_did_you_mean_names_the_nearest_candidate():
+    assert did_you_mean("evry", ["start", "every"]) == "; did you mean every?"
+
+
+def test_did_you_mean_finds_a_key_in_another_section():
+    names = ["model.near", "densify.every"]
+    assert did_you_mean("every", names) == "; did you mean densify.every?"
+
+
+def test_did_you_mean_is_silent_when_nothing_is_near():
+    assert did_you_mean("xyzzy", ["start", "every"]) == ""
+
+
+@pytest.mark.parametrize("error", [UserError("a.yml: wrong"), LLVMVersionError("a.yml: wrong")])
+def test_commands_report_user_errors_in_one_line(error, capsys):
+    @exit_on_user_error()
+    def command():
+        raise error
+
+    with pytest.raises(SystemExit) as exit_info:
+        command()
+    assert exit_info.value.code == 2
+    captured = capsys.readouterr()
+    assert (captured.out, captured.err) == ("", "error: a.yml: wrong\n")
+
+
+def test_commands_keep_the_traceback_of_other_errors():
+    with pytest.raises(ZeroDivisionError), exit_on_user_error():
+        print(1 / 0, file=sys.stderr)

@@ -1,0 +1,623 @@
+import json
+import math
+
+import imageio.v3 as iio
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from drgs.checks import UserError
+from drgs.config import DataConfig, FitConfig
+from drgs.data import initial_gaussians, load_dataset
+from drgs.data.images import downscale
+from drgs.data.points import focus_of, mean_squared_neighbour_distance, points_in_view
+from drgs.data.types import Dataset, View
+from drgs.io import write_ply
+
+
+def look_at(center, target, up=(0, 0, 1)):
+    """(4, 4) camera to world in OpenGL axes (x right, y up, z backward)."""
+    center, target = np.asarray(center, float), np.asarray(target, float)
+    back = (center - target) / np.linalg.norm(center - target)
+    right = np.cross(up, back)
+    right /= np.linalg.norm(right)
+    matrix = np.eye(4)
+    matrix[:3] = np.stack([right, np.cross(back, right), back, center], axis=1)
+    return matrix
+
+
+def view_at(center, target, width=40, height=30):
+    matrix = look_at(center, target)
+    matrix[:3, 1:3] *= -1
+    image = np.zeros((height, width, 3), np.float32)
+    return View("v", image, matrix, width, width, width / 2, height / 2, width, height)
+
+
+def dataset_of(views, half_extent=None):
+    return Dataset(tuple(views), tuple(views), "test", (1.0, 1.0, 1.0), half_extent, "")
+
+
+CENTERS = [(4, 0, 0), (0, 4, 1), (-3, 0, 2)]
+
+
+@pytest.fixture
+def blender(tmp_path):
+    """A NeRF-synthetic folder of 3 random 6x4 RGBA views a split; returns (folder, images)."""
+    rng = np.random.default_rng(0)
+    images = {}
+    for split in ("train", "val"):
+        (tmp_path / split).mkdir()
+        frames = []
+        for i, center in enumerate(CENTERS):
+            images[split, i] = rng.integers(0, 256, (4, 6, 4), np.uint8)
+            iio.imwrite(tmp_path / split / f"r_{i}.png", images[split, i])
+            matrix = look_at(center, (0, 0, 0)).tolist()
+            frames.append({"file_path": f"./{split}/r_{i}", "transform_matrix": matrix})
+        meta = {"camera_angle_x": 0.8, "frames": frames}
+        (tmp_path / f"transforms_{split}.json").write_text(json.dumps(meta))
+    return tmp_path, images
+
+
+@pytest.fixture
+def photographs(tmp_path):
+    """A nerfstudio folder of 10 grey 8x6 photographs, frames in reverse order of names."""
+    (tmp_path / "images").mkdir()
+    frames = []
+    for i in reversed(range(10)):
+        iio.imwrite(tmp_path / "images" / f"{i:02d}.png", np.full((6, 8, 3), 20 * i, np.uint8))
+        center = (4 * math.cos(i), 4 * math.sin(i), 1)
+        matrix = look_at(center, (0, 0, 0)).tolist()
+        frames.append({"file_path": f"images/{i:02d}.png", "transform_matrix": matrix})
+    meta = {"fl_x": 9.0, "fl_y": 8.0, "cx": 3.5, "cy": 3.25, "w": 8, "h": 6, "frames": frames}
+    (tmp_path / "transforms.json").write_text(json.dumps(meta))
+    return tmp_path
+
+
+def edit(path, change):
+    """Apply ``change`` to the parsed JSON of ``path``."""
+    meta = json.loads(path.read_text())
+    change(meta)
+    path.write_text(json.dumps(meta))
+
+
+def load(folder, **options):
+    return load_dataset(DataConfig(path=folder, **options))
+
+
+def refusal(folder, **options):
+    with pytest.raises(UserError) as error:
+        load(folder, **options)
+    return str(error.value)
+
+
+# NeRF-synthetic
+
+
+def test_rgba_is_composited_over_the_background_in_display_space(blender):
+    folder, images = blender
+    for name, color in (("white", 1.0), ("black", 0.0)):
+        view = load(folder, background=name).train[1]
+        pixels = images["train", 1].astype(np.float64) / 255
+        expected = pixels[..., :3] * pixels[..., 3:] + color * (1 - pixels[..., 3:])
+        # Four float32 roundings of numbers <= 1.
+        np.testing.assert_allclose(view.image, expected, atol=4 * 6e-8)
+        assert view.image.dtype == np.float32
+
+
+def test_a_background_colour_is_used_channel_by_channel(blender):
+    folder, images = blender
+    dataset = load(folder, background=(0.0, 0.5, 1.0))
+    assert dataset.background == (0.0, 0.5, 1.0)
+    alpha = images["train", 0][..., 3] / 255
+    expected = images["train", 0][..., 1] / 255 * alpha + 0.5 * (1 - alpha)
+    np.testing.assert_allclose(dataset.train[0].image[..., 1], expected, atol=4 * 6e-8)
+
+
+def test_the_horizontal_angle_gives_the_focal_length(blender):
+    view = load(blender[0]).train[0]
+    assert (view.width, view.height, view.cx, view.cy) == (6, 4, 3, 2)
+    assert view.fx == view.fy
+    assert 2 * math.atan(view.width / 2 / view.fx) == pytest.approx(0.8, abs=1e-12)
+
+
+def test_cameras_look_at_the_origin_with_y_down(blender):
+    for view, center in zip(load(blender[0]).train, CENTERS, strict=True):
+        assert view.name.startswith("r_")
+        np.testing.assert_allclose(view.center, center)
+        # In OpenCV axes the origin lies straight ahead, and world up is at negative y.
+        rotation = view.camera_to_world[:3, :3]
+        ahead = rotation.T @ (np.zeros(3) - center)
+        np.testing.assert_allclose(ahead, [0, 0, np.linalg.norm(center)], atol=1e-12)
+        assert (rotation.T @ [0, 0, 1])[1] < 0
+        assert np.linalg.det(rotation) == pytest.approx(1)
+
+
+def test_val_is_measured_on_where_there_is_no_test_split(blender):
+    dataset = load(blender[0])
+    assert dataset.test_split == "val"
+    assert "measured on 3 views of split val" in dataset.description
+
+
+def test_a_test_split_is_preferred_and_test_split_names_another(blender):
+    folder, images = blender
+    (folder / "transforms_test.json").write_text((folder / "transforms_train.json").read_text())
+    assert load(folder).test_split == "test"
+    dataset = load(folder, test_split="val", background="black")
+    assert dataset.test_split == "val"
+    pixels = images["val", 2] / 255
+    np.testing.assert_allclose(
+        dataset.test[2].image, pixels[..., :3] * pixels[..., 3:], atol=4 * 6e-8
+    )
+
+
+def test_a_suffix_in_file_path_is_accepted(blender):
+    edit(
+        blender[0] / "transforms_train.json",
+        lambda m: m["frames"][0].update(file_path="train/r_0.png"),
+    )
+    assert load(blender[0]).train[0].name == "r_0"
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda m: m.update(frames=[]), "frames is empty; there must be at least one view"),
+        (lambda m: m.update(frames=3), "frames must be a list of objects"),
+        (lambda m: m.pop("camera_angle_x"), "camera_angle_x must be a finite number, got null"),
+        (lambda m: m.update(camera_angle_x=0), "camera_angle_x must be > 0, got 0"),
+        (lambda m: m.update(camera_angle_x=40), "camera_angle_x must be < pi (radians), got 40"),
+        (
+            lambda m: m["frames"][1].pop("file_path"),
+            "frames[1].file_path must be text, got null",
+        ),
+        (
+            lambda m: m["frames"][1].pop("transform_matrix"),
+            "frames[1].transform_matrix is missing",
+        ),
+        (
+            lambda m: m["frames"][1].update(transform_matrix=[[1, 2], [3, 4]]),
+            "frames[1].transform_matrix must be 4 x 4 numbers, got shape (2, 2)",
+        ),
+        (
+            lambda m: m["frames"][1].update(transform_matrix=[[1, 2], [3]]),
+            "frames[1].transform_matrix must be 4 x 4 numbers",
+        ),
+        (
+            lambda m: m["frames"][2]["transform_matrix"][0].__setitem__(3, math.nan),
+            "frames[2].transform_matrix must be finite",
+        ),
+        (
+            lambda m: m["frames"][0].update(transform_matrix=np.diag([2, 2, 2, 1]).tolist()),
+            "frames[0].transform_matrix must be rigid (rotation and translation): "
+            "|R R^T - I| is 3, det R is 8",
+        ),
+        (
+            lambda m: m["frames"][0].update(transform_matrix=np.diag([1, 1, -1, 1]).tolist()),
+            "frames[0].transform_matrix must be rigid (rotation and translation): "
+            "|R R^T - I| is 0, det R is -1",
+        ),
+        (
+            lambda m: m["frames"][0].update(transform_matrix=np.diag([1, 1, 1, 2]).tolist()),
+            "frames[0].transform_matrix must end in the row 0 0 0 1, got [0.0, 0.0, 0.0, 2.0]",
+        ),
+    ],
+)
+def test_a_wrong_transforms_file_is_refused_with_file_and_key(blender, change, message):
+    path = blender[0] / "transforms_train.json"
+    edit(path, change)
+    assert refusal(blender[0]) == f"{path}: {message}"
+
+
+def test_a_missing_image_is_named(blender):
+    folder = blender[0]
+    (folder / "train" / "r_1.png").unlink()
+    assert refusal(folder) == (
+        f"{folder / 'transforms_train.json'}: frames[1].file_path: there is no image "
+        f"{folder / 'train' / 'r_1'} (or with .png added)"
+    )
+
+
+def test_a_broken_image_is_named(blender):
+    broken = blender[0] / "train" / "r_1.png"
+    broken.write_bytes(b"not a picture")
+    assert refusal(blender[0]).startswith(f"{broken}: cannot read the image: ")
+
+
+def test_malformed_json_names_file_and_line(blender):
+    path = blender[0] / "transforms_train.json"
+    path.write_text('{"frames": [\n')
+    assert refusal(blender[0]).startswith(f"{path}: not valid JSON: Expecting value: line 2")
+
+
+def test_no_test_views_is_an_error(blender):
+    (blender[0] / "transforms_val.json").unlink()
+    assert refusal(blender[0]) == (
+        f"{blender[0]}: there are no test views: neither transforms_test.json nor "
+        "transforms_val.json is there; data.test_split: train measures on the training views"
+    )
+
+
+def test_a_missing_split_is_an_error(blender):
+    assert refusal(blender[0], test_split="test") == (
+        f"{blender[0] / 'transforms_test.json'}: cannot read the file: No such file or directory"
+    )
+
+
+# nerfstudio
+
+
+def test_every_eighth_view_by_file_name_is_test(photographs):
+    dataset = load(photographs)
+    assert [view.name for view in dataset.test] == ["00", "08"]
+    assert [view.name for view in dataset.train] == ["01", "02", "03", "04", "05", "06", "07", "09"]
+    assert dataset.test_split == "test"
+    # Each view kept its own picture and its own camera.
+    for view in (*dataset.train, *dataset.test):
+        i = int(view.name)
+        np.testing.assert_allclose(view.image, 20 * i / 255, rtol=1e-6)
+        np.testing.assert_allclose(view.center, (4 * math.cos(i), 4 * math.sin(i), 1))
+
+
+def test_test_every_chooses_the_test_views(photographs):
+    assert [view.name for view in load(photographs, test_every=5).test] == ["00", "05"]
+
+
+def test_intrinsics_are_read(photographs):
+    view = load(photographs).train[0]
+    np.testing.assert_array_equal(view.K, [[9, 0, 3.5], [0, 8, 3.25], [0, 0, 1]])
+    assert (view.width, view.height) == (8, 6)
+
+
+def test_a_frame_overrides_the_intrinsics_at_the_top(photographs):
+    edit(photographs / "transforms.json", lambda m: m["frames"][8].update(fl_x=11.0, cx=4.5))
+    view = next(view for view in load(photographs).train if view.name == "01")
+    np.testing.assert_array_equal(view.K, [[11, 0, 4.5], [0, 8, 3.25], [0, 0, 1]])
+
+
+def test_angles_replace_missing_focal_lengths(photographs):
+    def change(meta):
+        for key in ("fl_x", "fl_y", "cx", "cy", "w", "h"):
+            del meta[key]
+        meta.update(camera_angle_x=0.8)
+
+    edit(photographs / "transforms.json", change)
+    view = load(photographs).train[0]
+    assert view.fx == view.fy == pytest.approx(4 / math.tan(0.4))
+    assert (view.cx, view.cy) == (4, 3)
+    edit(photographs / "transforms.json", lambda m: m.update(camera_angle_y=0.5))
+    assert load(photographs).train[0].fy == pytest.approx(3 / math.tan(0.25))
+
+
+@pytest.mark.parametrize("place", ["top", "frame"])
+def test_lens_distortion_is_refused_by_name(photographs, place):
+    path = photographs / "transforms.json"
+    coefficients = {"k1": 0.1, "k2": 0.0, "p1": -0.02}
+    edit(path, lambda m: (m if place == "top" else m["frames"][0]).update(coefficients))
+    assert refusal(photographs) == (
+        f"{path}: frames[0] has lens distortion (k1 = 0.1, p1 = -0.02), which is not supported: "
+        "undistort the images, or set data.ignore_distortion: true"
+    )
+    description = load(photographs, ignore_distortion=True).description
+    assert description.endswith("; lens distortion (k1, p1) ignored")
+
+
+def test_distortion_coefficients_of_zero_are_accepted(photographs):
+    edit(photographs / "transforms.json", lambda m: m.update(k1=0, k2=0.0, p1=0))
+    assert "distortion" not in load(photographs).description
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda m: m.pop("fl_x"), "fl_x is missing, and there is no camera_angle_x either"),
+        (lambda m: m.update(fl_y=-1), "fl_y must be > 0, got -1"),
+        (lambda m: m.update(cx="4"), 'cx must be a finite number, got "4"'),
+        (
+            lambda m: m.update(camera_model="OPENCV_FISHEYE"),
+            "camera_model must be one of SIMPLE_PINHOLE, PINHOLE, SIMPLE_RADIAL, RADIAL, OPENCV, "
+            "FULL_OPENCV, got OPENCV_FISHEYE",
+        ),
+        (
+            lambda m: m.update(is_fisheye=True),
+            "is_fisheye must be false: only pinhole cameras are supported",
+        ),
+    ],
+)
+def test_wrong_intrinsics_are_refused_with_file_and_key(photographs, change, message):
+    path = photographs / "transforms.json"
+    edit(path, change)
+    # The first view by name is the last frame, and views are checked in the order of names.
+    assert refusal(photographs) == f"{path}: frames[9].{message}"
+
+
+def test_an_image_size_that_disagrees_is_refused(photographs):
+    path = photographs / "transforms.json"
+    edit(path, lambda m: m.update(w=16))
+    assert refusal(photographs) == (
+        f"{path}: frames[9].w must be the image's size, 8 px ({photographs}/images/00.png), "
+        "got 16; scale the intrinsics or the images"
+    )
+
+
+def test_a_split_name_of_the_other_layout_is_refused(photographs):
+    message = refusal(photographs, test_split="val")
+    assert message.endswith(
+        "this layout has no split val; leave data.test_split out "
+        "(data.test_every chooses the test views)"
+    )
+
+
+def test_one_view_is_too_few(photographs):
+    edit(photographs / "transforms.json", lambda m: m.update(frames=m["frames"][:1]))
+    assert refusal(photographs).endswith("at least 2 views are needed, one of them to test; got 1")
+
+
+def test_equal_file_names_in_two_folders_stay_apart(photographs):
+    (photographs / "more").mkdir()
+    iio.imwrite(photographs / "more" / "01.png", np.zeros((6, 8, 3), np.uint8))
+    edit(
+        photographs / "transforms.json",
+        lambda m: m["frames"].append(dict(m["frames"][0], file_path="more/01.png")),
+    )
+    names = [view.name for view in load(photographs).train]
+    assert {"images_01", "more_01"} <= set(names)
+
+
+# Either layout
+
+
+def test_a_missing_folder_is_an_error_that_says_where_to_get_the_data(tmp_path):
+    folder = tmp_path / "none"
+    assert refusal(folder, source="our server") == (
+        f"data.path: there is no folder {folder}; get it from our server"
+    )
+    assert refusal(folder) == f"data.path: there is no folder {folder}"
+
+
+def test_a_folder_of_neither_layout_is_refused(tmp_path):
+    assert refusal(tmp_path) == (
+        f"{tmp_path}: neither transforms_train.json nor transforms.json is there; data.path must "
+        "be a folder in the layout of NeRF-synthetic or of nerfstudio / instant-ngp"
+    )
+
+
+@pytest.mark.parametrize(
+    ("pixels", "expected"),
+    [
+        (np.full((2, 2), 51, np.uint8), 0.2),
+        (np.full((2, 2), 13107, np.uint16), 0.2),
+        (np.full((2, 2, 2), (51, 255), np.uint8), 0.2),
+    ],
+    ids=["grey", "grey16", "grey-alpha"],
+)
+def test_grey_images_become_rgb(photographs, pixels, expected):
+    def change(meta):
+        del meta["w"], meta["h"]
+
+    edit(photographs / "transforms.json", change)
+    iio.imwrite(photographs / "images" / "01.png", pixels)
+    image = load(photographs).train[0].image
+    assert image.shape == (2, 2, 3)
+    np.testing.assert_allclose(image, expected, rtol=1e-6)
+
+
+def test_image_size_scales_pictures_and_intrinsics_together(photographs):
+    full, half = load(photographs), load(photographs, image_size=4)
+    a, b = full.train[0], half.train[0]
+    assert (b.width, b.height, b.image.shape) == (4, 3, (3, 4, 3))
+    np.testing.assert_allclose(b.K[:2], a.K[:2] / 2)
+    assert "4x3" in half.description
+
+
+def test_images_are_never_enlarged(photographs):
+    assert load(photographs, image_size=100).train[0].width == 8
+
+
+@pytest.mark.parametrize("shape", [(6, 8), (7, 9), (5, 11)])
+def test_downscaling_averages_over_each_pixels_area(shape):
+    image = np.random.default_rng(1).random((*shape, 3)).astype(np.float32)
+    actual = downscale(image, 4)
+    height, width = actual.shape[:2]
+    assert (height, width) == (round(shape[0] * 4 / shape[1]), 4)
+    # Each source pixel repeated until old and new pixel edges coincide, then plain means.
+    repeated = image.astype(np.float64).repeat(height, axis=0).repeat(width, axis=1)
+    blocks = repeated.reshape(height, shape[0], width, shape[1], 3)
+    np.testing.assert_allclose(actual, blocks.mean(axis=(1, 3)), rtol=1e-6)
+
+
+@given(st.integers(1, 12), st.integers(1, 12), st.integers(1, 12))
+def test_downscaling_keeps_a_constant_image(height, width, new_width):
+    actual = downscale(np.full((height, width, 3), 0.7, np.float32), new_width)
+    assert actual.shape[1] == min(width, new_width)
+    np.testing.assert_allclose(actual, 0.7, rtol=1e-6)
+
+
+def test_scaling_a_composite_equals_compositing_scaled_premultiplied_colours(blender):
+    folder, images = blender
+    actual = load(folder, image_size=3, background=(0.25, 0.5, 0.75)).train[0].image
+    pixels = images["train", 0].astype(np.float64) / 255
+    pixels[..., :3] *= pixels[..., 3:]
+    small = pixels.reshape(2, 2, 3, 2, 4).mean(axis=(1, 3))
+    expected = small[..., :3] + np.array([0.25, 0.5, 0.75]) * (1 - small[..., 3:])
+    np.testing.assert_allclose(actual, expected, atol=5e-7)
+
+
+def test_extent_is_1_1_times_the_largest_distance_from_the_centroid():
+    views = [view_at(c, (0, 0, 0)) for c in [(3, 0, 0), (0, 3, 0), (0, 0.1, 6)]]
+    # Centroid (1, 1.0333, 2); the farthest is the third.
+    expected = 1.1 * math.dist((1, 3.1 / 3, 2), (0, 0.1, 6))
+    assert dataset_of(views).extent == pytest.approx(expected)
+
+
+def test_extent_is_1_where_all_cameras_share_a_centre():
+    views = [view_at((1, 2, 3), (0, 0, 0)), view_at((1, 2, 3), (5, 0, 0))]
+    assert dataset_of(views).extent == 1
+
+
+# Starting points
+
+
+def config(**sections):
+    return FitConfig(data={"path": "unused"}, **sections)
+
+
+def test_random_points_fill_the_reference_box_and_repeat_with_the_seed(blender):
+    dataset = load(blender[0])
+    a = initial_gaussians(config(init={"num_points": 2000}), dataset)
+    b = initial_gaussians(config(init={"num_points": 2000}), dataset)
+    c = initial_gaussians(config(init={"num_points": 2000}, seed=1), dataset)
+    np.testing.assert_array_equal(a.means, b.means)
+    assert not np.array_equal(a.means, c.means)
+    assert np.abs(a.means).max() <= 1.3
+    # The largest of 6000 uniform numbers falls short of 1.3 by 1.3 / 6000 on average.
+    assert np.abs(a.means).max() > 1.3 * (1 - 20 / 6000)
+
+
+def test_starting_gaussians_have_the_reference_values(blender):
+    g = initial_gaussians(config(init={"num_points": 50, "opacity": 0.2}), load(blender[0]))
+    assert g.num_gaussians == 50
+    assert g.sh_degree == 3
+    np.testing.assert_allclose(g.opacities, 0.2, rtol=1e-6)
+    np.testing.assert_array_equal(g.quats, np.tile([1, 0, 0, 0], (50, 1)))
+    assert not g.sh0.any()  # grey: colour is SH + 0.5
+    assert not g.shN.any()
+    np.testing.assert_array_equal(g.log_scales, g.log_scales[:, :1].repeat(3, axis=1))
+
+
+def test_scales_are_the_rms_distance_to_the_three_nearest_points():
+    points = np.random.default_rng(0).random((40, 3))
+    squared = ((points[:, None] - points[None]) ** 2).sum(-1)
+    expected = np.sort(squared, axis=1)[:, 1:4].mean(axis=1)
+    np.testing.assert_allclose(mean_squared_neighbour_distance(points), expected, rtol=1e-12)
+
+
+def points_file(path, rgb=None, positions=None):
+    """A PLY of 4 points at the corners of a unit tetrahedron's bounding cube."""
+    from plyfile import PlyData, PlyElement
+
+    if positions is None:
+        positions = [(0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1)]
+    names = "xyz" if rgb is None else ["x", "y", "z", "red", "green", "blue"]
+    rows = [tuple(p) + (tuple(rgb) if rgb else ()) for p in positions]
+    kinds = [(name, "u1" if len(name) > 1 else "f4") for name in names]
+    vertex = PlyElement.describe(np.array(rows, kinds), "vertex")
+    PlyData([vertex]).write(str(path))
+    return path
+
+
+def test_a_point_cloud_gives_positions_colours_and_scales(tmp_path):
+    path = points_file(tmp_path / "p.ply", rgb=(255, 0, 51))
+    g = initial_gaussians(
+        config(init={"point_cloud": path}, model={"sh_degree": 1}), dataset_of([])
+    )
+    assert (g.num_gaussians, g.sh_degree) == (4, 1)
+    # Colour 0.5 + C0 sh0, C0 = sqrt(1 / (4 pi)).
+    colors = 0.5 + math.sqrt(1 / (4 * math.pi)) * g.sh0[:, 0]
+    np.testing.assert_allclose(colors, np.tile([1, 0, 0.2], (4, 1)), atol=2e-7)
+    # Neighbours of the corner at distance 1, 1, 1; of the others at 1, sqrt(2), sqrt(2).
+    np.testing.assert_allclose(g.scales[0], 1, rtol=1e-6)
+    np.testing.assert_allclose(g.scales[1:], math.sqrt(5 / 3), rtol=1e-6)
+
+
+def test_coinciding_points_keep_a_positive_scale(tmp_path):
+    path = points_file(tmp_path / "p.ply", positions=[(1, 2, 3)] * 5)
+    g = initial_gaussians(config(init={"point_cloud": path}), dataset_of([]))
+    np.testing.assert_allclose(g.scales, math.sqrt(1e-7), rtol=1e-6)
+
+
+def test_a_point_cloud_of_the_wrong_size_is_refused(tmp_path):
+    path = points_file(tmp_path / "p.ply", positions=[(0, 0, 0)] * 3)
+    with pytest.raises(UserError, match=r"p.ply: at least 4 points, got 3"):
+        initial_gaussians(config(init={"point_cloud": path}), dataset_of([]))
+    path = points_file(tmp_path / "p.ply", positions=[(0, 0, 0)] * 9)
+    with pytest.raises(UserError) as error:
+        initial_gaussians(
+            config(init={"point_cloud": path}, densify={"max_gaussians": 8}), dataset_of([])
+        )
+    assert str(error.value) == (
+        f"{path}: must hold at most densify.max_gaussians (8) points, got 9"
+    )
+
+
+def test_the_focus_is_what_the_cameras_look_at():
+    target = np.array([1.0, -2.0, 0.5])
+    centers = [(5, 0, 0), (0, 6, 1), (4, 3, 2)]
+    focus, distance = focus_of([view_at(center, target) for center in centers])
+    np.testing.assert_allclose(focus, target, atol=1e-12)
+    assert distance == pytest.approx(np.median([math.dist(c, target) for c in centers]))
+
+
+def test_points_in_view_are_seen_and_not_in_front_of_a_lens():
+    views = [view_at(c, (1, 0, 0)) for c in [(5, 0, 0), (4, 2, 0), (4, -2, 1)]]
+    points = points_in_view(views, 500, np.random.default_rng(0))
+    assert points.shape == (500, 3)
+    seen = np.zeros(500, bool)
+    for view in views:
+        camera = (points - view.center) @ view.camera_to_world[:3, :3]
+        pixel = camera @ view.K.T
+        with np.errstate(divide="ignore"):
+            pixel = pixel[:, :2] / pixel[:, 2:]
+        inside = (pixel >= 0) & (pixel <= [view.width, view.height])
+        seen |= inside.all(axis=1) & (camera[:, 2] > 0)
+        assert np.linalg.norm(points - view.center, axis=1).min() >= 0.25 * focus_of(views)[1]
+    assert seen.all()
+
+
+def test_half_extent_wins_over_the_layouts_and_the_cameras_box(blender):
+    g = initial_gaussians(config(init={"half_extent": 0.25, "num_points": 99}), load(blender[0]))
+    assert np.abs(g.means).max() <= 0.25
+    views = [view_at((5, 0, 0), (0, 0, 0)), view_at((0, 5, 0), (0, 0, 0))]
+    g = initial_gaussians(config(init={"half_extent": 9.0, "num_points": 99}), dataset_of(views))
+    assert 8 < np.abs(g.means).max() <= 9
+
+
+@pytest.mark.parametrize(
+    ("views", "reason"),
+    [
+        ([view_at((5, y, 0), (0, y, 0)) for y in range(3)], "whose optical axes are parallel"),
+        (
+            [view_at(c, 2 * np.array(c)) for c in [(1, 0, 0), (0, 1, 0), (-1, -1, 1)]],
+            "which look away from each other",
+        ),
+    ],
+    ids=["parallel", "outward"],
+)
+def test_cameras_that_determine_no_box_are_refused(views, reason):
+    with pytest.raises(UserError) as error:
+        initial_gaussians(config(), dataset_of(views))
+    assert str(error.value) == (
+        f"init.half_extent: no start box can be derived from the cameras, {reason}; set "
+        "init.half_extent, or give a point cloud (init.point_cloud)"
+    )
+
+
+def test_starting_gaussians_can_be_written(blender, tmp_path):
+    g = initial_gaussians(config(init={"num_points": 5}), load(blender[0]))
+    write_ply(tmp_path / "start.ply", g)
+    assert (tmp_path / "start.ply").is_file()
+
+
+# The real data
+
+
+def test_lego_is_read(lego_folder):
+    dataset = load(lego_folder, image_size=200)
+    assert (len(dataset.train), len(dataset.test), dataset.test_split) == (100, 100, "val")
+    view = dataset.train[0]
+    assert (view.width, view.height) == (200, 200)
+    assert view.fx == pytest.approx(555.5555 / 2, rel=1e-6)
+    np.testing.assert_array_equal(view.image[0, 0], 1)  # background
+    # All cameras of this scene look at the origin from one distance.
+    focus, distance = focus_of(dataset.train)
+    np.testing.assert_allclose(focus, 0, atol=1e-5)
+    assert distance == pytest.approx(4.0311, abs=1e-3)
+
+
+def test_fox_is_read(fox_folder):
+    dataset = load(fox_folder, ignore_distortion=True)
+    assert (len(dataset.train), len(dataset.test)) == (43, 7)
+    assert (dataset.train[0].width, dataset.train[0].height) == (270, 480)
+    assert "k1, k2, p1, p2" in refusal(fox_folder).replace(" = 0.0578421", "").replace(
+        " = -0.0805099", ""
+    ).replace(" = -0.000980296", "")
