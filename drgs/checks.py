@@ -23,7 +23,7 @@ class UserError(ValueError):
 
 @contextmanager
 def exit_on_user_error() -> Iterator[None]:
-    """Around (or, as a decorator, on) a command: print the error in one line, exit with 2.
+    """Around (or, as a decorator, on) a command: print the error without a traceback, exit with 2.
 
     Only errors that the user can repair; any other keeps its traceback.
     """

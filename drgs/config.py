@@ -162,8 +162,10 @@ class LossConfig(_Section):
 class DensifyConfig(_Section):
     """Adaptive density control: clone, split, prune, opacity reset."""
 
-    start: int = Field(500, ge=0, description="Iteration after which the population may change.")
-    stop: int = Field(15_000, ge=1, description="Iteration after which it no longer does.")
+    start: int = Field(500, ge=0, description="The population changes only after this iteration.")
+    stop: int = Field(
+        15_000, ge=1, description="It changes, and is reset, only before this iteration."
+    )
     every: int = Field(100, ge=1, description="Iterations between two changes.")
     grad_threshold: float = Field(
         2e-4,
@@ -185,7 +187,7 @@ class DensifyConfig(_Section):
         description="Removed after the first reset if its largest scale is larger; x extent.",
     )
     reset_every: int = Field(
-        3000, ge=1, description="Iterations between opacity resets; none comes after stop."
+        3000, ge=1, description="Iterations between opacity resets, which end with densify.stop."
     )
     reset_opacity: float = Field(0.01, gt=0, lt=1, description="A reset lowers opacities to this.")
     white_background_reset: int | None = Field(

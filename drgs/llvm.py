@@ -120,6 +120,7 @@ def version_from_name(path: str | Path) -> Version | None:
     for pattern, text in (
         (r"libLLVM-([\d.]+)\.(so|dylib)", name),
         (r"libLLVM\.so\.(\d[\d.]*)", os.path.basename(os.path.realpath(path))),
+        (r"libLLVM\.so\.(\d[\d.]*)", name),
         (r"/llvm[-@/](\d[\d.]*)", path),
     ):
         match = re.search(pattern, text)

@@ -190,6 +190,8 @@ def _check_rows(optimizer: Adam, rows: Mapping[str, Any] | None, prefix: str) ->
 
 def _elements(rows: Any, width: int) -> Any:
     """Where the elements of ``rows`` lie in a flat row-major array of ``width`` columns."""
+    if dr.width(rows) == 0:
+        return rows  # Dr.Jit does not compute with empty arrays
     element = dr.arange(type(rows), dr.width(rows) * width)
     return dr.gather(type(rows), rows, element // width) * width + element % width
 
@@ -200,7 +202,8 @@ def _gather_and_append(flat: Any, elements: Any, added: Any | None) -> Any:
         return kept
     index_type, num_kept, num_added = type(elements), dr.width(kept), dr.width(added)
     result = dr.empty(type(flat), num_kept + num_added)
-    dr.scatter(result, kept, dr.arange(index_type, num_kept))
+    if num_kept > 0:
+        dr.scatter(result, kept, dr.arange(index_type, num_kept))
     # Opaque: as a literal (and in dr.concat) the offset would make each call a new kernel.
     offset = dr.opaque(index_type, num_kept)
     dr.scatter(result, added, dr.arange(index_type, num_added) + offset)

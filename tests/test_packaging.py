@@ -30,9 +30,9 @@ def installed(tmp_path):
     checkout = tmp_path / "checkout"
     checkout.mkdir()
     copy_checkout(checkout)
+    build = ["-q", "build", "--build-lib", str(tmp_path / "installed")]
     result = subprocess.run(
-        [sys.executable, "-c", "from setuptools import setup; setup()"]
-        + ["-q", "build", "--build-lib", str(tmp_path / "installed")],
+        [sys.executable, "-c", "from setuptools import setup; setup()", *build],
         cwd=checkout,
         capture_output=True,
         text=True,

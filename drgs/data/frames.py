@@ -55,7 +55,7 @@ def positive(values: dict[str, Any], key: str, where: str) -> float:
     return value
 
 
-def focal_from_angle(values: dict[str, Any], key: str, size: int, where: str) -> float:
+def focal_from_angle(values: dict[str, Any], key: str, where: str, size: int) -> float:
     """Focal length in px from a full field of view in radians across ``size`` px."""
     angle = positive(values, key, where)
     if angle >= math.pi:

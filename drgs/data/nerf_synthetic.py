@@ -81,7 +81,7 @@ def _load_split(config: DataConfig, split: str) -> tuple[View, ...]:
         image = downscale(image, config.image_size)
         height, width = image.shape[:2]
         # The angle spans the full width, so the focal length in pixels follows the image's size.
-        focal = focal_from_angle(meta, "camera_angle_x", width, f"{path}: ")
+        focal = focal_from_angle(meta, "camera_angle_x", f"{path}: ", width)
         return View(
             name=name,
             image=image,

@@ -7,6 +7,7 @@ name, and every ``data.test_every``-th is for testing, as in Mip-NeRF 360 and 3D
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -40,20 +41,22 @@ def load(config: DataConfig) -> Dataset:
             f"{path}: this layout has no split {config.test_split}; leave data.test_split out "
             "(data.test_every chooses the test views)"
         )
-    frames = meta["frames"]
-    if len(frames) < 2:
+    if len(meta["frames"]) < 2:
         raise UserError(f"{path}: at least 2 views are needed, one of them to test; got 1")
-    locations = [f"{path}: frames[{index}]." for index in range(len(frames))]
-    files = [
-        image_path(config.path, frame, at) for frame, at in zip(frames, locations, strict=True)
+    frames = [
+        _Frame(meta, own, path, f"{path}: frames[{index}].")
+        for index, own in enumerate(meta["frames"])
     ]
+    files = [image_path(config.path, frame.own, frame.where) for frame in frames]
+    if not config.ignore_distortion:
+        for frame in frames:
+            _refuse_distortion(frame)
 
     def load_view(index: int, name: str) -> View:
-        # A frame's own values override those at the top.
-        return _load_view(config, meta | frames[index], files[index], name, locations[index])
+        return _load_view(config, frames[index], files[index], name)
 
-    order = sorted(range(len(frames)), key=lambda index: frames[index]["file_path"])
-    names = unique_names([frames[index] for index in order])
+    order = sorted(range(len(frames)), key=lambda index: frames[index].own["file_path"])
+    names = unique_names([frames[index].own for index in order])
     views = in_parallel(load_view, order, names)
     test = views[:: config.test_every]
     train = tuple(v for i, v in enumerate(views) if i % config.test_every != 0)
@@ -66,32 +69,50 @@ def load(config: DataConfig) -> Dataset:
         description=(
             f"{config.path.name} (nerfstudio layout): {len(train)} train views, measured on "
             f"{len(test)} views (every {config.test_every}th by file name), "
-            f"{views[0].width}x{views[0].height}, background {config.background}"
-            + _ignored(meta, frames, config)
+            f"{views[0].width}x{views[0].height}, background {config.background}" + _ignored(frames)
         ),
     )
 
 
-def _load_view(
-    config: DataConfig, values: dict[str, Any], file: Path, name: str, where: str
-) -> View:
-    """The view of one frame, whose values are merged over those at the top of the file."""
-    _refuse_other_lenses(values, where)
-    if not config.ignore_distortion:
-        _refuse_distortion(values, where)
-    camera_to_world = opencv_camera_to_world(values, where)
+@dataclass(frozen=True)
+class _Frame:
+    """One frame's values and, for those that it does not have, the file's."""
+
+    meta: dict[str, Any]
+    own: dict[str, Any]
+    path: Path
+    where: str  # how messages name the frame: prefix of a key
+
+    def __contains__(self, key: str) -> bool:
+        return key in self.own or key in self.meta
+
+    def get(self, key: str, default: Any = None) -> Any:
+        return self.own.get(key, self.meta.get(key, default))
+
+    def at(self, key: str) -> tuple[dict[str, Any], str, str]:
+        """The object that holds ``key``, the key, and the prefix that messages name it with."""
+        return (self.own, key, self.where) if key in self.own else (self.meta, key, self.top)
+
+    @property
+    def top(self) -> str:
+        return f"{self.path}: "
+
+
+def _load_view(config: DataConfig, frame: _Frame, file: Path, name: str) -> View:
+    _refuse_other_lenses(frame)
+    camera_to_world = opencv_camera_to_world(frame.own, frame.where)
     image = composite(read_image(file), config.background_rgb)
     height, width = image.shape[:2]
     for key, size in (("w", width), ("h", height)):
-        if key in values and positive(values, key, where) != size:
+        if key in frame and positive(*frame.at(key)) != size:
             raise UserError(
-                f"{where}{key} must be the image's size, {size} px ({file}), got {values[key]:g}; "
-                "scale the intrinsics or the images"
+                f"{frame.at(key)[2]}{key} must be the image's size, {size} px ({file}), got "
+                f"{frame.get(key):g}; scale the intrinsics or the images"
             )
-    fx = _focal(values, "x", width, where)
-    fy = _focal(values, "y", height, where) if _has_focal(values, "y") else fx
-    cx = number(values, "cx", where) if "cx" in values else width / 2
-    cy = number(values, "cy", where) if "cy" in values else height / 2
+    fx = _focal(frame, "x", width)
+    fy = _focal(frame, "y", height) if "fl_y" in frame or "camera_angle_y" in frame else fx
+    cx = number(*frame.at("cx")) if "cx" in frame else width / 2
+    cy = number(*frame.at("cy")) if "cy" in frame else height / 2
 
     image = downscale(image, config.image_size)
     scale_x, scale_y = image.shape[1] / width, image.shape[0] / height
@@ -108,50 +129,50 @@ def _load_view(
     )
 
 
-def _has_focal(values: dict[str, Any], axis: str) -> bool:
-    return f"fl_{axis}" in values or f"camera_angle_{axis}" in values
+def _focal(frame: _Frame, axis: str, size: int) -> float:
+    if f"fl_{axis}" in frame:
+        return positive(*frame.at(f"fl_{axis}"))
+    if f"camera_angle_{axis}" in frame:
+        return focal_from_angle(*frame.at(f"camera_angle_{axis}"), size)
+    raise UserError(f"{frame.top}fl_{axis} is missing, and there is no camera_angle_{axis} either")
 
 
-def _focal(values: dict[str, Any], axis: str, size: int, where: str) -> float:
-    if f"fl_{axis}" in values:
-        return positive(values, f"fl_{axis}", where)
-    if f"camera_angle_{axis}" in values:
-        return focal_from_angle(values, f"camera_angle_{axis}", size, where)
-    raise UserError(f"{where}fl_{axis} is missing, and there is no camera_angle_{axis} either")
-
-
-def _coefficients(values: dict[str, Any], where: str) -> dict[str, float]:
+def _coefficients(frame: _Frame) -> dict[str, float]:
     """The distortion coefficients that are not zero."""
-    given = {key: number(values, key, where) for key in DISTORTION if key in values}
+    given = {key: number(*frame.at(key)) for key in DISTORTION if key in frame}
     return {key: value for key, value in given.items() if value != 0}
 
 
-def _refuse_distortion(values: dict[str, Any], where: str) -> None:
-    found = _coefficients(values, where)
+def _refuse_distortion(frame: _Frame) -> None:
+    found = _coefficients(frame)
     if found:
         listed = ", ".join(f"{key} = {value:g}" for key, value in found.items())
         raise UserError(
-            f"{where.rstrip('.')} has lens distortion ({listed}), which is not supported: "
-            "undistort the images, or set data.ignore_distortion: true"
+            f"{frame.where.rstrip('.')}: lens distortion ({listed}) is not supported: undistort "
+            "the images, or set data.ignore_distortion: true"
         )
 
 
-def _refuse_other_lenses(values: dict[str, Any], where: str) -> None:
-    model = values.get("camera_model", "OPENCV")
+def _refuse_other_lenses(frame: _Frame) -> None:
+    model = frame.get("camera_model", PINHOLE_MODELS[0])
     if model not in PINHOLE_MODELS:
         raise UserError(
-            f"{where}camera_model must be one of {', '.join(PINHOLE_MODELS)}, got {model}"
+            f"{frame.at('camera_model')[2]}camera_model must be one of "
+            f"{', '.join(PINHOLE_MODELS)}, got {model}"
         )
-    if values.get("is_fisheye"):
-        raise UserError(f"{where}is_fisheye must be false: only pinhole cameras are supported")
+    if frame.get("is_fisheye"):
+        raise UserError(
+            f"{frame.at('is_fisheye')[2]}is_fisheye must be false: only pinhole cameras are "
+            "supported"
+        )
 
 
-def _ignored(meta: dict[str, Any], frames: list[dict[str, Any]], config: DataConfig) -> str:
+def _ignored(frames: list[_Frame]) -> str:
     """What the dataset has and the loader leaves out, for the description."""
     notes = ""
-    keys = sorted({key for frame in frames for key in _coefficients({**meta, **frame}, "")})
+    keys = {key for frame in frames for key in _coefficients(frame)}
     if keys:
-        notes += f"; lens distortion ({', '.join(keys)}) ignored"
+        notes += f"; lens distortion ({', '.join(sorted(keys))}) ignored"
     if any("mask_path" in frame for frame in frames):
         notes += "; masks (mask_path) ignored"
     return notes
