@@ -197,7 +197,7 @@ def _choose_rows(
     transparent = ~(opacities >= config.prune_opacity)
     too_large = ~(scales <= largest_scale)
     candidate = (gradient_norms >= config.grad_threshold) & ~transparent & np.isfinite(scales)
-    candidate &= ~(small & too_large)
+    candidate &= ~(small & too_large)  # a clone would be as large
 
     # Room is what is left if every candidate survives, so that no choice can exceed it.
     survivors = np.count_nonzero(candidate | ~(transparent | too_large))
@@ -209,9 +209,8 @@ def _choose_rows(
     taken = np.zeros_like(candidate)
     taken[affordable] = True
     split = taken & ~small
-    pruned = transparent | (too_large & ~split)
     return _ChosenRows(
-        keep=_row_numbers(~(split | pruned)),
+        keep=_row_numbers(~(split | transparent | too_large)),
         clone=_row_numbers(taken & small),
         split=_row_numbers(split),
         num_refused=len(rows) - len(affordable),
