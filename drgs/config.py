@@ -155,7 +155,7 @@ class LossConfig(_Section):
     """(1 - w) L1 + w (1 - SSIM), in display space."""
 
     dssim_weight: float = Field(0.2, ge=0, le=1, description="w; 0 leaves D-SSIM out.")
-    window: int = Field(11, ge=3, description="px: width of SSIM's Gaussian window; odd.")
+    window: int = Field(11, ge=3, le=17, description="px: width of SSIM's Gaussian window; odd.")
     sigma: float = Field(1.5, gt=0, description="px: its standard deviation.")
 
 

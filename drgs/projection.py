@@ -175,7 +175,7 @@ def quat_to_rotation(quats: Any) -> Any:
     """
     t = types_of(type(quats.x))
     size = dr.detach(dr.max(dr.abs(quats)))
-    usable = size > 0
+    usable = ~(size <= 0)  # a NaN goes through: projection then drops the Gaussian
     q = dr.select(usable, quats, t.Array4f(1, 0, 0, 0)) / dr.select(usable, size, 1)
     w, x, y, z = q
     two = 2 / dr.squared_norm(q)
@@ -197,5 +197,6 @@ def _normalize(vector: Any) -> Any:
 
 def _sigmoid(x: Any) -> Any:
     """1 / (1 + e^-x) without overflow for large |x|."""
-    decayed = dr.exp(-dr.abs(x))
+    # Not dr.abs: its derivative at 0 is 0, and a logit of exactly 0 would never move.
+    decayed = dr.exp(dr.select(x >= 0, -x, x))
     return dr.select(x >= 0, 1, decayed) / (1 + decayed)

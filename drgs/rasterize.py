@@ -235,6 +235,8 @@ class _Footprint:
         t = types_of(type(bins.geometry))
         mean_x, mean_y, p, r = dr.gather(t.Array4f, bins.geometry, rank * 2, active)
         s, log2_opacity, _, _ = dr.gather(t.Array4f, bins.geometry, rank * 2 + 1, active)
+        # On an inactive lane every alpha is below the cut.
+        log2_opacity = dr.select(active, log2_opacity, -dr.inf)
         first_x, first_y = t.Float(lanes.x) + 0.5 - mean_x, t.Float(lanes.y) + 0.5 - mean_y
         dx = [first_x + i for i in range(MICRO)]
         dy = [first_y + j for j in range(MICRO)]
@@ -256,15 +258,13 @@ class _Alpha:
     smooth: Any  # Bool: not clamped, so that the derivative flows
 
     @staticmethod
-    def at(log2_alpha: Any, exp2: Any, active: Any) -> _Alpha:
-        """alpha = min(0.99, 2^log2_alpha), or 0 below the cut or on an inactive lane."""
+    def at(log2_alpha: Any, exp2: Any) -> _Alpha:
+        """alpha = min(0.99, 2^log2_alpha), or 0 below the cut."""
         # Far below the cut the short exp2 returns garbage; the selection discards it.
         unclamped = exp2(log2_alpha)
         smooth = unclamped < ALPHA_MAX
         value = dr.select(smooth, unclamped, ALPHA_MAX)
-        return _Alpha(
-            value=dr.select((log2_alpha >= LOG2_ALPHA_CUT) & active, value, 0), smooth=smooth
-        )
+        return _Alpha(value=dr.select(log2_alpha >= LOG2_ALPHA_CUT, value, 0), smooth=smooth)
 
 
 def _step(transmittance: Any, alpha: Any) -> tuple[Any, Any, Any]:
@@ -322,7 +322,7 @@ def composite(bins: TileBins, features: Any, count: int) -> Layers:
         T, C = list(T), [list(c) for c in C]
         for pixel in range(PIXELS):
             row, column = divmod(pixel, MICRO)
-            alpha = _Alpha.at(footprint.log2_alpha[row][column], exp2, active)
+            alpha = _Alpha.at(footprint.log2_alpha[row][column], exp2)
             weight, T[pixel], _ = _step(T[pixel], alpha.value)
             for k in range(count):
                 C[k][pixel] = dr.fma(weight, color[k], C[k][pixel])
@@ -457,10 +457,10 @@ def composite_adjoint(
         color = _load_features(features, count, rank, active)
         T, S = list(T), list(S)
         d_color = [t.Float(0) for _ in range(count)]
+        alphas = [_Alpha.at(log2_alpha, exp2) for row in footprint.log2_alpha for log2_alpha in row]
+        inverse = _reciprocals([1 - alpha.value for alpha in alphas])
         d_log_alpha = []
-        for pixel in range(PIXELS):
-            row, column = divmod(pixel, MICRO)
-            alpha = _Alpha.at(footprint.log2_alpha[row][column], exp2, active)
+        for pixel, alpha in enumerate(alphas):
             weight, T[pixel], goes_on = _step(T[pixel], alpha.value)
             seen = color[0] * g[0][pixel]
             for k in range(1, count):
@@ -470,7 +470,7 @@ def composite_adjoint(
             contribution = weight * seen
             S[pixel] = S[pixel] - contribution
             # d loss / d ln(alpha) = a (T c.g - S / (1 - a)), zero where a decision is active.
-            occlusion = S[pixel] * alpha.value * dr.rcp(1 - alpha.value)
+            occlusion = S[pixel] * (alpha.value * inverse[pixel])
             d_log_alpha.append(dr.select(goes_on & alpha.smooth, contribution - occlusion, 0))
         moments = _moments(footprint, d_log_alpha)
         below = (t.UInt32(1) << lanes.micro) - 1
@@ -491,6 +491,21 @@ def composite_adjoint(
     )
     dr.eval(loop, partials)
     return _sum_slots(bins, slots, partials, width, count)
+
+
+def _reciprocals(values: list[Any]) -> list[Any]:
+    """1 / x for values in [0.01, 1], four at a time with one division, which is slow.
+
+    From r = 1 / (a b c d): 1 / (a b) = r (c d), 1 / a = b / (a b), and so on (Montgomery 1987,
+    "Speeding the Pollard and elliptic curve methods of factorization", section 10.3.1).
+    """
+    result = []
+    for a, b, c, d in zip(*[iter(values)] * 4, strict=True):
+        ab, cd = a * b, c * d
+        r = 1 / (ab * cd)
+        inverse_ab, inverse_cd = r * cd, r * ab
+        result += [inverse_ab * b, inverse_ab * a, inverse_cd * d, inverse_cd * c]
+    return result
 
 
 def _moments(footprint: _Footprint, v: list[Any]) -> list[Any]:
@@ -607,7 +622,7 @@ def composite_tangent(
         T, dT, dC = list(T), list(dT), [list(c) for c in dC]
         for pixel in range(PIXELS):
             row, column = divmod(pixel, MICRO)
-            alpha = _Alpha.at(footprint.log2_alpha[row][column], exp2, active)
+            alpha = _Alpha.at(footprint.log2_alpha[row][column], exp2)
             before, d_before = dr.abs(T[pixel]), dT[pixel]
             weight, T[pixel], goes_on = _step(T[pixel], alpha.value)
             d_alpha = dr.select(goes_on & alpha.smooth, alpha.value * d_log_alpha[row][column], 0)

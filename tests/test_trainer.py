@@ -1,0 +1,142 @@
+"""The parts of the training loop that can be stated without running a whole fit."""
+
+import time
+from itertools import islice
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from drgs.config import FitConfig
+from drgs.data.points import gaussians_from_points
+from drgs.data.types import Dataset, View
+from drgs.gaussians import PARAMETER_NAMES
+from drgs.io.ply import write_ply
+
+
+@pytest.fixture(scope="module", autouse=True)
+def variant():
+    mi.set_variant("llvm_ad_rgb")
+
+
+def small_view(name, angle):
+    """A 20x16 picture of random colours, from a circle of radius 3 in the plane z = 0."""
+    center = 3 * np.array([np.cos(angle), np.sin(angle), 0.0])
+    pose = np.eye(4)
+    forward = -center / 3
+    right = np.cross(forward, [0, 0, 1])
+    pose[:3, :3] = np.stack([right, np.cross(forward, right), forward], axis=1)
+    pose[:3, 3] = center
+    image = np.random.default_rng(int(10 * angle)).uniform(size=(16, 20, 3)).astype(np.float32)
+    return View(name, image, pose, 24.0, 24.0, 10.0, 8.0, 20, 16)
+
+
+def small_dataset():
+    views = tuple(small_view(f"v{i}", angle) for i, angle in enumerate((0.0, 1.0, 2.0, 4.0)))
+    return Dataset(views, views[:1], "test", (1.0, 1.0, 1.0), 1.0, "four random pictures")
+
+
+def make_trainer(**changes):
+    from drgs.trainer import Trainer
+
+    values = {"data": {"path": "."}, "iterations": 50, **changes}
+    config = FitConfig.model_validate(values)
+    points = np.random.default_rng(0).uniform(-0.5, 0.5, (40, 3))
+    gaussians = gaussians_from_points(points, None, 0.5, config.model.sh_degree)
+    return Trainer(config, small_dataset(), gaussians)
+
+
+def test_views_come_in_a_new_random_order_every_round():
+    from drgs.trainer import shuffled_forever
+
+    rounds = np.array(list(islice(shuffled_forever(10, seed=3), 50))).reshape(5, 10)
+    assert np.array_equal(np.sort(rounds, axis=1), np.tile(np.arange(10), (5, 1)))
+    assert len({tuple(r) for r in rounds}) == 5
+    assert list(islice(shuffled_forever(10, seed=3), 50)) == rounds.ravel().tolist()
+
+
+def test_sh_degree_rises_by_one_every_so_many_iterations():
+    trainer = make_trainer(model={"sh_degree": 2, "sh_increase_every": 3})
+    degrees = []
+    for _ in range(10):
+        trainer.step()
+        degrees.append(trainer.integrator.sh_degree)
+    assert degrees == [0, 0, 1, 1, 1, 2, 2, 2, 2, 2]
+
+
+def test_each_parameter_moves_by_its_rate_in_the_first_step():
+    """Adam's first step is rate * sign(gradient) wherever the gradient is not zero."""
+    trainer = make_trainer()
+    before = trainer.gaussians()
+    trainer.step()
+    after = trainer.gaussians()
+    extent = small_dataset().extent
+    rates = {
+        "means": 1.6e-4 * extent * 100 ** (-1 / 50),
+        "quats": 1e-3,
+        "log_scales": 5e-3,
+        "logit_opacities": 0.05,
+        "sh0": 2.5e-3,
+    }
+    for name, rate in rates.items():
+        moved = np.abs(getattr(after, name) - getattr(before, name)).ravel()
+        # Values of order 1 to 10 are stored in float32: 5e-7 absolute.
+        assert moved.max() == pytest.approx(rate, abs=1e-6 + 1e-3 * rate), name
+    assert np.array_equal(after.shN, before.shN)  # degree 0 is in use
+
+
+def test_reported_loss_and_psnr_are_those_of_the_view_before_the_step():
+    trainer = make_trainer(loss={"dssim_weight": 0.0})
+    report = trainer.step()
+    first = int(np.random.default_rng(0).permutation(4)[0])
+    untouched = make_trainer(loss={"dssim_weight": 0.0})
+    image = np.array(mi.render(untouched.scene, sensor=untouched.views[first].sensor, spp=1))
+    photo = small_dataset().train[first].image
+    assert report.loss == pytest.approx(np.abs(image - photo).mean(), rel=1e-5)
+    psnr = -10 * np.log10(np.mean((image.astype(float) - photo) ** 2))
+    assert report.psnr == pytest.approx(psnr, rel=1e-5)
+
+
+def test_gaussians_are_returned_as_plain_numpy_arrays():
+    gaussians = make_trainer().gaussians()
+    for name in PARAMETER_NAMES:
+        assert type(getattr(gaussians, name)) is np.ndarray
+        assert len(getattr(gaussians, name)) == 40
+
+
+def test_sensors_refuse_pixels_that_are_not_square():
+    from drgs.checks import UserError
+    from drgs.scene import make_sensors
+
+    view = small_view("stretched", 0.0)
+    stretched = View(**{**vars(view), "fy": 30.0})
+    with pytest.raises(UserError, match="stretched: fl_x and fl_y must agree"):
+        make_sensors([stretched])
+
+
+def test_first_frame_after_a_cold_start_comes_within_15_seconds(run_python, tmp_path):
+    """No kernel cache (it lives in the home folder), import included."""
+    points = np.random.default_rng(0).uniform(-1, 1, (20_000, 3))
+    write_ply(tmp_path / "points.ply", gaussians_from_points(points, None, 0.5, 3))
+    program = f"""
+import drgs, drjit as dr, mitsuba as mi
+mi.set_variant("llvm_ad_rgb")
+look = mi.ScalarTransform4f().look_at([0, 0, 4], [0, 0, 0], [0, 1, 0])
+film = {{"type": "hdrfilm", "width": 400, "height": 400, "rfilter": {{"type": "box"}}}}
+scene = mi.load_dict({{
+    "type": "scene",
+    "integrator": {{"type": "splats", "filename": {str(tmp_path / "points.ply")!r}}},
+    "sensor": {{"type": "perspective", "to_world": look, "film": film}},
+}})
+image = mi.render(scene, spp=1)
+dr.eval(image)
+dr.sync_thread()
+assert dr.all(dr.isfinite(image.array))
+"""
+    (tmp_path / "home").mkdir()
+    started = time.perf_counter()
+    result = run_python(program, HOME=str(tmp_path / "home"))
+    elapsed = time.perf_counter() - started
+    assert result.returncode == 0, result.stderr
+    assert any((tmp_path / "home" / ".drjit").iterdir())  # the cache was empty and is there
+    assert elapsed < 15
