@@ -177,15 +177,19 @@ class _Entries:
 
 def _load_pixels(plane: Any, lanes: _Lanes, grid: TileGrid) -> list[Any]:
     """The 16 values of a row-major plane of pixels in each micro-tile; 0 off the film."""
+    return [dr.gather(type(plane), plane, index, inside) for index, inside in _pixels(lanes, grid)]
+
+
+def _pixels(lanes: _Lanes, grid: TileGrid) -> list[tuple[Any, Any]]:
+    """For the 16 pixels of each micro-tile: row-major index, and whether it is on the film."""
     UInt32 = type(lanes.x)
     width, height = dr.opaque(UInt32, grid.width), dr.opaque(UInt32, grid.height)
-    values = []
+    pixels = []
     for pixel in range(PIXELS):
         row, column = divmod(pixel, MICRO)
         x, y = lanes.x + column, lanes.y + row
-        inside = (x < width) & (y < height)
-        values.append(dr.gather(type(plane), plane, y * width + x, inside))
-    return values
+        pixels.append((y * width + x, (x < width) & (y < height)))
+    return pixels
 
 
 # ----------------------------------------------------------------------------------------------
@@ -330,11 +334,12 @@ def composite(bins: TileBins, features: Any, count: int) -> Layers:
         return entries.advance(cursor), T, C, stop, _any_positive(T)
 
     size = dr.width(lanes.tile)
-    one, zero = dr.ones(t.Float, size), dr.zeros(t.Float, size)
+    zero = dr.zeros(t.Float, size)
     _, T, C, stop, _ = dr.while_loop(
         state=(
             entries.begin,
-            [t.Float(one) for _ in range(PIXELS)],
+            # Pixels off the film are finished before they begin.
+            [dr.select(inside, t.Float(1), -1) for _, inside in _pixels(lanes, bins.grid)],
             [[t.Float(zero) for _ in range(PIXELS)] for _ in range(count)],
             dr.gather(t.UInt32, bins.tile_start, lanes.tile),
             dr.full(t.Bool, True, size),
@@ -437,16 +442,7 @@ def composite_adjoint(
     exp2 = _exp2_function(t.Float)
 
     g = [_load_pixels(plane, lanes, bins.grid) for plane in d_features]
-    G = _load_pixels(d_transmittance, lanes, bins.grid)
-    row = lanes.micro_tile * ((1 + count) * PIXELS)
-    final = [dr.gather(t.Float, layers.values, row + k) for k in range((1 + count) * PIXELS)]
-    behind = []
-    for pixel in range(PIXELS):
-        S = final[pixel] * G[pixel]
-        for k in range(count):
-            S = dr.fma(final[(k + 1) * PIXELS + pixel], g[k][pixel], S)
-        behind.append(S)
-
+    behind = _seen_past_nothing(layers, lanes, g, _load_pixels(d_transmittance, lanes, bins.grid))
     width = 4 * -(-(MOMENTS + count) // 4)
     partials = dr.empty(t.Float, max(slots.count, 1) * width)
 
@@ -491,6 +487,23 @@ def composite_adjoint(
     )
     dr.eval(loop, partials)
     return _sum_slots(bins, slots, partials, width, count)
+
+
+def _seen_past_nothing(layers: Layers, lanes: _Lanes, g: list[list[Any]], G: list[Any]) -> list:
+    """S_0 = C . g + T G at the 16 pixels, from the finished planes."""
+    Float, count = type(layers.values), layers.count
+    row = lanes.micro_tile * ((1 + count) * PIXELS)
+    T, *C = (
+        [dr.gather(Float, layers.values, row + (plane * PIXELS + k)) for k in range(PIXELS)]
+        for plane in range(1 + count)
+    )
+    result = []
+    for pixel in range(PIXELS):
+        S = T[pixel] * G[pixel]
+        for plane, cotangent in zip(C, g, strict=True):
+            S = dr.fma(plane[pixel], cotangent[pixel], S)
+        result.append(S)
+    return result
 
 
 def _reciprocals(values: list[Any]) -> list[Any]:

@@ -139,7 +139,9 @@ def render_tangent(gaussians: Gaussians, frame: Frame, tangents: Gaussians) -> l
         splats = frame.pipeline.project(rows, frame.camera)
         dr.set_grad(rows, load_rows(tangents, frame.pipeline.sh_degree))
         outputs, _ = _differentiable(frame.pipeline, splats, None)
-        dr.forward_to(outputs)
+        # Some outputs (depths, p of the whitening) are inputs of others: the default would clear
+        # the derivatives of such interior variables on the way.
+        dr.forward_to(outputs, flags=dr.ADFlag.ClearEdges)
         columns = [dr.grad(output) for output in outputs]
     direction = SplatGradients(*columns[:3], features=columns[3:])
     return composite_tangent(frame.bins, frame.features, frame.layers, direction).planes()

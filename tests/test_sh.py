@@ -125,9 +125,3 @@ def test_nan_stays_nan(precision):
     coefficient = precision.Array3f([np.nan, 0.0, 0.0])
     color = rows(sh.sh_color([coefficient], precision.Array3f(0, 0, 1), 0))
     assert np.isnan(color[0, 0]) and np.isfinite(color[0, 1:]).all()
-
-
-def test_number_of_coefficients_must_fit_the_degree():
-    ones = dr.llvm.ad.Array3f(1)
-    with pytest.raises(ValueError, match=r"zip\(\) argument"):
-        sh.sh_color([ones] * 3, dr.llvm.ad.Array3f(0, 0, 1), 1)
