@@ -19,6 +19,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
+import numpy as np
 from drjit.opt import Adam
 
 
@@ -160,6 +161,32 @@ def replace_values(optimizer: Adam, name: str, value: Any, prefix: str = "") -> 
     dr.enable_grad(value)
     moments = [None if m is None else dr.opaque(type(m), 0, m.shape) for m in moments]
     optimizer.state[key] = value, promoted, rate, (step, *moments)
+
+
+def optimizer_state(optimizer: Adam, prefix: str = "") -> dict[str, np.ndarray]:
+    """Values, moments and step counts as numpy arrays: ``NAME.value``, ``.m``, ``.v``, ``.t``.
+
+    Learning rates are not part of it: they follow from the configuration and the iteration.
+    """
+    state = {}
+    for name in _names(optimizer, prefix):
+        value, _, _, (step, first, second, _) = optimizer.state[prefix + name]
+        state[f"{name}.value"] = np.array(dr.detach(value))
+        state[f"{name}.m"], state[f"{name}.v"] = np.array(first), np.array(second)
+        state[f"{name}.t"] = np.array(step)
+    return state
+
+
+def restore_optimizer(optimizer: Adam, state: Mapping[str, np.ndarray], prefix: str = "") -> None:
+    """Continue from :func:`optimizer_state`, bit by bit; rates stay as they are."""
+    for name in _names(optimizer, prefix):
+        old, promoted, rate, (step, first, second, maximum) = optimizer.state[prefix + name]
+        value = type(old)(state[f"{name}.value"])
+        dr.make_opaque(value)
+        dr.enable_grad(value)
+        moments = type(first)(state[f"{name}.m"]), type(second)(state[f"{name}.v"])
+        extra = (type(step)(state[f"{name}.t"]), *moments, maximum)
+        optimizer.state[prefix + name] = value, promoted, rate, extra
 
 
 def _names(optimizer: Adam, prefix: str) -> list[str]:

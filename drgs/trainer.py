@@ -21,7 +21,12 @@ from drgs.config import FitConfig, OptimizerConfig
 from drgs.data.types import Dataset, View
 from drgs.gaussians import PARAMETER_NAMES, Gaussians
 from drgs.losses import PhotometricLoss, Target, prepare_target
-from drgs.optimizer import ExponentialDecay, make_optimizer
+from drgs.optimizer import (
+    ExponentialDecay,
+    make_optimizer,
+    optimizer_state,
+    restore_optimizer,
+)
 from drgs.scene import make_scene, make_sensors
 
 PREFIX = "integrator."
@@ -86,14 +91,13 @@ class Trainer:
         self.loss = PhotometricLoss(config.loss.dssim_weight)
         self.white_background = tuple(dataset.background) == (1.0, 1.0, 1.0)
         self.views = make_training_views(dataset.train, config)
-        self.order = shuffled_forever(len(self.views), config.seed)
         self.statistics = self._no_statistics()
         self.iteration = 0
 
     def step(self) -> StepReport:
         """One iteration: one view, one optimizer step, now and then a change of the population."""
         self.iteration += 1
-        view = self.views[next(self.order)]
+        view = self.views[view_of(self.iteration, len(self.views), self.config.seed)]
         self.integrator.sh_degree = self.sh_degree
         self.optimizer.set_learning_rate({PREFIX + "means": self.means_lr(self.iteration)})
         self.params.update(self.optimizer)
@@ -129,6 +133,27 @@ class Trainer:
         """The Gaussians as numpy arrays."""
         self.params.update(self.optimizer)
         return dr.detach(self.integrator.gaussians).numpy()
+
+    def state(self) -> dict[str, np.ndarray]:
+        """Everything that the coming iterations depend on, as numpy arrays.
+
+        Random numbers are functions of seed and iteration: they have no state.
+        """
+        return {
+            "iteration": np.array(self.iteration),
+            "gradient_norms": np.array(self.statistics.gradient_norms),
+            "views": np.array(self.statistics.views),
+            **optimizer_state(self.optimizer, PREFIX),
+        }
+
+    def restore(self, state: dict[str, np.ndarray]) -> None:
+        """Continue where :meth:`state` was taken, to the same bytes."""
+        self.iteration = int(state["iteration"])
+        restore_optimizer(self.optimizer, state, PREFIX)
+        self.statistics = densify.DensityStatistics(
+            mi.Float(state["gradient_norms"]), mi.Float(state["views"])
+        )
+        self.params.update(self.optimizer)
 
     def _control_density(self, view: TrainingView) -> densify.DensityReport | None:
         config, i = self.config.densify, self.iteration
@@ -175,11 +200,14 @@ def make_training_views(views: tuple[View, ...], config: FitConfig) -> list[Trai
     ]
 
 
-def shuffled_forever(count: int, seed: int) -> Iterator[int]:
-    """0 .. count - 1 in a new random order in every round."""
-    rng = np.random.default_rng(seed)
-    while True:
-        yield from rng.permutation(count).tolist()
+def view_of(iteration: int, num_views: int, seed: int) -> int:
+    """Which view an iteration trains on: every round visits all views in an order of its own.
+
+    A function of its arguments alone, so that a fit can be resumed at any iteration.
+    """
+    which_round, position = divmod(iteration - 1, num_views)
+    order = np.random.default_rng([seed, which_round]).permutation(num_views)
+    return int(order[position])
 
 
 def render_views(scene: mi.Scene, views: tuple[View, ...]) -> Iterator[np.ndarray]:
