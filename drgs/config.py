@@ -206,6 +206,9 @@ class OutputConfig(_Section):
     )
     save_renders: bool = Field(True, description="Write renders/<split>/*.png.")
     history_every: int = Field(10, ge=1, description="Iterations between rows of history.csv.")
+    checkpoint_every: int | None = Field(
+        500, ge=1, description="Iterations between checkpoints, for --resume; null: none."
+    )
 
 
 class FitConfig(_Section):

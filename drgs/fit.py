@@ -8,6 +8,8 @@ result on the test views and writes the output folder:
 - ``history.csv``: loss, PSNR, population and rate over the iterations
 - ``renders/<split>/*.png``: the test views as fitted
 - ``config.yml``: every value that the fit used
+
+While it runs there is also ``checkpoint.npz``, from which ``--resume`` continues.
 """
 
 from __future__ import annotations
@@ -16,6 +18,7 @@ import argparse
 import csv
 import json
 import platform
+import sys
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -28,10 +31,12 @@ import mitsuba as mi
 import numpy as np
 
 import drgs
+from drgs.checkpoint import Checkpoint, load_checkpoint, remove_checkpoint, save_checkpoint
 from drgs.checks import exit_on_user_error
 from drgs.config import FitConfig, dump_config, load_config
 from drgs.data import Dataset, initial_gaussians, load_dataset
 from drgs.files import atomic_path
+from drgs.interrupts import INTERRUPTED_STATUS, StopRequest
 from drgs.io.ply import write_ply
 from drgs.metrics import Quality, mean_quality
 from drgs.progress import FitProgress
@@ -57,30 +62,43 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Entry point of the command."""
     args = _parse(arguments)
     with exit_on_user_error():
-        config = load_config(args.config, args.overrides + _shorthands(args))
+        path = args.config or args.resume / "config.yml"
+        config = load_config(path, args.overrides + _shorthands(args))
+        out = config.output.dir or Path("out") / Path(path).stem
         dataset = load_dataset(config.data)
-        out = config.output.dir or Path("out") / Path(args.config).stem
         mi.set_variant(args.variant)
-        print(f"{args.config}: {dataset.description}")
+        print(f"{path}: {dataset.description}")
         print(
             f"{len(dataset.train)} views to train on, {len(dataset.test)} of split "
             f"'{dataset.test_split}' to measure on; background {config.data.background}"
         )
-        run(config, dataset, out)
+        finished = run(config, dataset, out, resume=args.resume is not None)
+    if not finished:
+        print(f"stopped; continue with: python -m drgs.fit --resume {out}")
+        sys.exit(INTERRUPTED_STATUS)
 
 
-def run(config: FitConfig, dataset: Dataset, out: Path) -> Quality:
-    """Fit, measure, and write the output folder ``out``."""
+def run(config: FitConfig, dataset: Dataset, out: Path, resume: bool) -> bool:
+    """Fit, measure, and write the output folder ``out``; False if stopped by Ctrl-C.
+
+    resume: go on from the checkpoint in ``out``, if there is one.
+    """
+    checkpoint = load_checkpoint(out, config) if resume else None
     out.mkdir(parents=True, exist_ok=True)
     dump_config(config, out / "config.yml")
     trainer = Trainer(config, dataset, initial_gaussians(config, dataset))
-    started = time.perf_counter()
-    history = train(trainer, config, started)
-    wall_s = time.perf_counter() - started
+    log = History()
+    if checkpoint is not None:
+        trainer.restore(checkpoint.trainer)
+        log = History.from_array(checkpoint.history, checkpoint.wall_s)
+        print(f"resumed at iteration {trainer.iteration}")
+    if not train(trainer, config, log, out):
+        return False
+    wall_s = log.wall_s
 
     gaussians = trainer.gaussians()
     write_ply(out / "point_cloud.ply", gaussians)
-    write_history(out / "history.csv", history)
+    write_history(out / "history.csv", log.rows)
     images = list(render_views(trainer.scene, dataset.test))
     quality = mean_quality(
         (image, view.image) for image, view in zip(images, dataset.test, strict=True)
@@ -88,32 +106,80 @@ def run(config: FitConfig, dataset: Dataset, out: Path) -> Quality:
     if config.output.save_renders:
         write_renders(out / "renders" / dataset.test_split, dataset, images)
     write_metrics(out / "metrics.json", config, dataset, gaussians.num_gaussians, wall_s, quality)
+    remove_checkpoint(out)
     print(
         f"{quality.num_views} {dataset.test_split} views: PSNR {quality.psnr:.2f} dB, "
         f"SSIM {quality.ssim:.4f}; {gaussians.num_gaussians:,} Gaussians; "
         f"{config.iterations} iterations in {wall_s:.0f} s"
     )
     print(f"written: {out}")
-    return quality
+    return True
 
 
-def train(trainer: Trainer, config: FitConfig, started: float) -> list[HistoryRow]:
-    """Run all iterations, showing progress; returns the history."""
-    history: list[HistoryRow] = []
+class History:
+    """Rows of ``history.csv`` and the time spent, also before an interruption."""
+
+    def __init__(self) -> None:
+        self.rows: list[HistoryRow] = []
+        self._before = 0.0
+        self._started = time.perf_counter()
+
+    @staticmethod
+    def from_array(rows: np.ndarray, wall_s: float) -> History:
+        """What :meth:`as_array` gave; the clock goes on from ``wall_s``."""
+        history = History()
+        history.rows = [
+            HistoryRow(int(i), loss, psnr, int(n), lr, at) for i, loss, psnr, n, lr, at in rows
+        ]
+        history._before = wall_s
+        return history
+
+    def as_array(self) -> np.ndarray:
+        """(rows, columns) float64."""
+        columns = len(HistoryRow.__dataclass_fields__)
+        return np.array([tuple(vars(r).values()) for r in self.rows], float).reshape(-1, columns)
+
+    @property
+    def wall_s(self) -> float:
+        """Seconds spent so far."""
+        return self._before + time.perf_counter() - self._started
+
+    def add(self, report: StepReport) -> HistoryRow:
+        """Read the numbers of one iteration; waits for the device."""
+        row = HistoryRow(
+            iteration=report.iteration,
+            loss=report.loss,
+            psnr=report.psnr,
+            num_gaussians=report.num_gaussians,
+            means_lr=report.means_lr,
+            wall_s=self.wall_s,
+        )
+        self.rows.append(row)
+        return row
+
+
+def train(trainer: Trainer, config: FitConfig, log: History, out: Path) -> bool:
+    """Run the iterations that are left, showing progress and saving checkpoints.
+
+    False if Ctrl-C stopped it; the state is saved then.
+    """
+    every = config.output.checkpoint_every
     smooth_psnr = None
-    with FitProgress(config.iterations) as progress:
-        for _ in range(config.iterations):
+    with FitProgress(config.iterations) as progress, StopRequest() as stop:
+        while trainer.iteration < config.iterations:
             report = trainer.step()
-            if report.iteration % config.output.history_every and (
-                report.iteration != config.iterations
-            ):
-                continue
-            row = _history_row(report, time.perf_counter() - started)
-            history.append(row)
-            smooth_psnr = row.psnr if smooth_psnr is None else smooth_psnr
-            smooth_psnr = SMOOTHING * smooth_psnr + (1 - SMOOTHING) * row.psnr
-            progress.update(row.iteration, row.loss, smooth_psnr, row.num_gaussians)
-    return history
+            last = report.iteration == config.iterations
+            if last or report.iteration % config.output.history_every == 0:
+                row = log.add(report)
+                smooth_psnr = row.psnr if smooth_psnr is None else smooth_psnr
+                smooth_psnr = SMOOTHING * smooth_psnr + (1 - SMOOTHING) * row.psnr
+                progress.update(row.iteration, row.loss, smooth_psnr, row.num_gaussians)
+            if stop.requested or (every and report.iteration % every == 0 and not last):
+                state = Checkpoint(trainer.state(), log.as_array(), log.wall_s)
+                save_checkpoint(out, config, state)
+            if stop.requested:
+                return False
+    return True
 
 
 def write_history(path: Path, history: list[HistoryRow]) -> None:
@@ -168,22 +234,14 @@ def write_metrics(
         temporary.write_text(json.dumps(metrics, indent=2) + "\n")
 
 
-def _history_row(report: StepReport, wall_s: float) -> HistoryRow:
-    return HistoryRow(
-        iteration=report.iteration,
-        loss=report.loss,
-        psnr=report.psnr,
-        num_gaussians=report.num_gaussians,
-        means_lr=report.means_lr,
-        wall_s=wall_s,
-    )
-
-
 def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(
         prog="python -m drgs.fit", description="Fit 3D Gaussians to posed photographs."
     )
-    parser.add_argument("config", metavar="CONFIG.yml", help="what to fit, and how")
+    parser.add_argument("config", nargs="?", metavar="CONFIG.yml", help="what to fit, and how")
+    parser.add_argument(
+        "--resume", type=Path, metavar="OUT_DIR", help="go on with a fit that was stopped"
+    )
     parser.add_argument("--data", metavar="DIR", help="dataset folder (data.path)")
     parser.add_argument("--out", metavar="DIR", help="output folder (default: out/NAME)")
     parser.add_argument(
@@ -197,11 +255,16 @@ def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument(
         "--variant", default="llvm_ad_rgb", help="Mitsuba variant (default: llvm_ad_rgb)"
     )
-    return parser.parse_args(arguments)
+    args = parser.parse_args(arguments)
+    if (args.config is None) == (args.resume is None):
+        parser.error("give either CONFIG.yml or --resume OUT_DIR")
+    if args.resume is not None and (args.overrides or args.data or args.out):
+        parser.error("--resume takes its configuration from OUT_DIR/config.yml, and nothing else")
+    return args
 
 
 def _shorthands(args: argparse.Namespace) -> list[str]:
-    given = {"data.path": args.data, "output.dir": args.out}
+    given = {"data.path": args.data, "output.dir": args.out or args.resume}
     return [f"{key}={value}" for key, value in given.items() if value is not None]
 
 

@@ -14,8 +14,8 @@ LAYERS = {
     1: ["camera", "data", "gaussians", "io"],
     2: ["projection", "rasterize", "sh", "tiles"],
     3: ["rendering"],
-    4: ["densify", "losses", "metrics", "optimizer", "scene", "trainer"],
-    5: ["bench", "capture", "fit", "plugins", "progress", "registration", "render"],
+    4: ["checkpoint", "densify", "losses", "metrics", "optimizer", "scene", "trainer"],
+    5: ["bench", "capture", "fit", "interrupts", "plugins", "progress", "registration", "render"],
 }
 
 LAYER_OF = {name: layer for layer, names in LAYERS.items() for name in names}
