@@ -57,14 +57,17 @@ class Gaussians:
         return Gaussians(**arrays)
 
     def to(self, tensor_type: type) -> Gaussians:
-        """Upload to Dr.Jit tensors of type ``tensor_type`` (``TensorXf`` or ``TensorXf64``)."""
+        """Copy to Dr.Jit tensors of type ``tensor_type`` (``TensorXf`` or ``TensorXf64``)."""
         flat_type = dr.array_t(tensor_type)
 
         def upload(name: str) -> Any:
             values = np.ascontiguousarray(getattr(self, name), dtype=_numpy_dtype(flat_type))
-            if name == "logit_opacities":
-                return flat_type(values)
-            return tensor_type(flat_type(values.ravel()), values.shape)
+            # Dr.Jit wraps numpy's memory on the CPU: a gather makes the copy that it owns.
+            wrapped = flat_type(values.ravel())
+            index = dr.arange(dr.uint32_array_t(flat_type), values.size)
+            flat = dr.gather(flat_type, wrapped, index)
+            dr.eval(flat)
+            return flat if name == "logit_opacities" else tensor_type(flat, values.shape)
 
         return Gaussians(**{name: upload(name) for name in PARAMETER_NAMES})
 

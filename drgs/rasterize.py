@@ -285,16 +285,21 @@ def _step(transmittance: Any, alpha: Any) -> tuple[Any, Any, Any]:
 
 def _load_features(features: Any, count: int, rank: Any, active: Any) -> list[Any]:
     """The ``count`` features of a splat, stored in packets of four."""
-    t = types_of(type(features))
     packets = -(-count // 4)
     values: list[Any] = []
     for k in range(packets):
-        values.extend(dr.gather(t.Array4f, features, rank * packets + k, active))
+        packet_type = types_of(type(features)).Array4f
+        values.extend(dr.gather(packet_type, features, rank * packets + k, active))
     return values[:count]
 
 
 def pack_features(columns: list[Any], order: Any) -> Any:
-    """Feature columns (one value per Gaussian) as packets of four by rank; flat, evaluated."""
+    """Feature columns (one value per Gaussian) as packets of four by rank; flat, evaluated.
+
+    None if there are no features: transmittance alone is composited then.
+    """
+    if not columns:
+        return None
     columns = [dr.gather(type(c), c, order) for c in columns]
     padding = dr.zeros(type(columns[0]), dr.width(order))
     packets = interleave(columns + [padding] * (-len(columns) % 4))
@@ -458,8 +463,8 @@ def composite_adjoint(
         d_log_alpha = []
         for pixel, alpha in enumerate(alphas):
             weight, T[pixel], goes_on = _step(T[pixel], alpha.value)
-            seen = color[0] * g[0][pixel]
-            for k in range(1, count):
+            seen = t.Float(0)
+            for k in range(count):
                 seen = dr.fma(color[k], g[k][pixel], seen)
             for k in range(count):
                 d_color[k] = dr.fma(weight, g[k][pixel], d_color[k])
@@ -590,7 +595,8 @@ def _sum_slots(
         -scale * WHITENING_SCALE * v_u_dx,
         -scale * WHITENING_SCALE * v_u_dy,
         -scale * WHITENING_SCALE * s * v_dy_dy,
-        v * dr.exp2(-log2_opacity),
+        # An opacity that underflows to 0 is invisible: 0 and not 0 * inf.
+        dr.select(v == 0, 0, v * dr.exp2(-log2_opacity)),
         *totals[MOMENTS:],
     ]
     dr.eval(columns)

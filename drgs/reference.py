@@ -804,7 +804,7 @@ def sh_colors_gradients(
     """
     directions, distances = _view_directions(gaussians, camera)
     coefficients = _sh_coefficients(gaussians, degree)
-    d_colors = np.where(_unclamped_colors(gaussians, directions, degree) > 0, d_colors, 0.0)
+    d_colors = np.where(_unclamped_colors(gaussians, directions, degree) >= 0, d_colors, 0.0)
 
     d_coefficients = np.einsum("nk,nc->nkc", sh_basis(directions, degree), d_colors)
     d_sh = np.zeros((len(gaussians.means), 1 + gaussians.shN.shape[1], 3))

@@ -120,9 +120,9 @@ def render_adjoint(
             dr.accum_grad(output, cotangent)
         dr.enqueue(dr.ADMode.Backward, outputs)
         dr.traverse(dr.ADMode.Backward)
-        d_rows = dr.grad(rows)
+        d_rows, visible = dr.grad(rows), dr.detach(splats.visible)
     return GaussianGradients(
-        parameters=_as_tensors(d_rows, gaussians),
+        parameters=_as_tensors(d_rows, gaussians, visible),
         means2d=gradients.means2d,
         visible=_on_film(frame.bins),
     )
@@ -143,6 +143,7 @@ def render_tangent(gaussians: Gaussians, frame: Frame, tangents: Gaussians) -> l
         # the derivatives of such interior variables on the way.
         dr.forward_to(outputs, flags=dr.ADFlag.ClearEdges)
         columns = [dr.grad(output) for output in outputs]
+    dr.eval(columns)
     direction = SplatGradients(*columns[:3], features=columns[3:])
     return composite_tangent(frame.bins, frame.features, frame.layers, direction).planes()
 
@@ -159,28 +160,29 @@ def _differentiable(
     return outputs, cotangents + list(gradients.features)
 
 
-def _as_tensors(d_rows: GaussianRows, gaussians: Gaussians) -> Gaussians:
+def _as_tensors(d_rows: GaussianRows, gaussians: Gaussians, visible: Any) -> Gaussians:
     """Per-lane derivatives as tensors shaped like the parameters, evaluated.
 
-    SH coefficients above the pipeline's degree have zero gradient.
+    Rows that are not visible have zero gradient, also where their values are not finite; so have
+    SH coefficients above the pipeline's degree.
     """
     t = types_of(type(d_rows.logit_opacities))
-    zero = dr.zeros(t.Float, dr.width(d_rows.logit_opacities))
     higher = [component for vector in d_rows.sh[1:] for component in vector]
     missing = 3 * gaussians.shN.shape[1] - len(higher)
 
     def tensor(columns: list[Any], like: Any) -> Any:
         if not columns:
             return dr.zeros(t.TensorXf, like.shape)
-        return t.TensorXf(interleave([column + zero for column in columns]), like.shape)
+        columns = [dr.select(visible, column, t.Float(0)) for column in columns]
+        return t.TensorXf(interleave(columns), like.shape)
 
     gradients = Gaussians(
         means=tensor(list(d_rows.means), gaussians.means),
         quats=tensor(list(d_rows.quats), gaussians.quats),
         log_scales=tensor(list(d_rows.log_scales), gaussians.log_scales),
-        logit_opacities=d_rows.logit_opacities,
+        logit_opacities=dr.select(visible, d_rows.logit_opacities, 0),
         sh0=tensor(list(d_rows.sh[0]), gaussians.sh0),
-        shN=tensor(higher + [zero] * missing, gaussians.shN),
+        shN=tensor(higher + [t.Float(0)] * missing, gaussians.shN),
     )
     dr.eval(gradients)
     return gradients

@@ -48,9 +48,7 @@ class Precision:
         return vector_type([self.array(column) for column in values.T])
 
 
-FLOAT32 = Precision(
-    llvm.Float, llvm.Array2f, llvm.Array3f, llvm.Array4f, llvm.TensorXf, np.float32
-)
+FLOAT32 = Precision(llvm.Float, llvm.Array2f, llvm.Array3f, llvm.Array4f, llvm.TensorXf, np.float32)
 FLOAT64 = Precision(
     llvm.Float64, llvm.Array2f64, llvm.Array3f64, llvm.Array4f64, llvm.TensorXf64, np.float64
 )
@@ -109,11 +107,14 @@ def _gaussians(rng, camera, film, z, sizes, logits, degree) -> reference.Gaussia
     )
 
 
-def random_scene(seed, width, height, degree, count) -> tuple[reference.Gaussians, reference.Camera]:
+def random_scene(
+    seed, width, height, degree, count
+) -> tuple[reference.Gaussians, reference.Camera]:
     """Splats of a fraction of a pixel to a fifth of the film, on and around the film.
 
-    The first seven: behind the camera; nearer than the near plane; too transparent; and four
-    large ones so far beyond each side of the film that the Jacobian's slope is clamped.
+    The first eight: behind the camera; nearer than the near plane; too transparent; four large
+    ones so far beyond each side of the film that the Jacobian's slope is clamped; and one whose
+    parameters are those of a fresh Gaussian: a logit and colours of exactly zero, unrotated, round.
     """
     rng = np.random.default_rng(seed)
     camera = _random_camera(rng, width, height)
@@ -122,16 +123,23 @@ def random_scene(seed, width, height, degree, count) -> tuple[reference.Gaussian
     z = rng.uniform(1.0, 4.0, count)
     sizes = np.minimum(rng.lognormal(np.log(1.5), 0.9, (count, 3)), 0.2 * max(width, height) + 1)
     logits = rng.normal(0.5, 1.7, count)
-    if count >= 7:
+    if count >= 8:
         z[:2] = [-1.0, 0.1]
         logits[2] = -6.0
         film[3:7] = size * np.array([[-0.6, 0.5], [1.6, 0.4], [0.3, -0.6], [0.6, 1.6]])
         sizes[3:7] = 0.3 * max(width, height)
         logits[3:7] = 2.0
-    return _gaussians(rng, camera, film, z, sizes, logits, degree), camera
+        film[7], sizes[7], logits[7] = 0.4 * size, 2.0, 0.0
+    gaussians = _gaussians(rng, camera, film, z, sizes, logits, degree)
+    if count >= 8:
+        gaussians.quats[7] = [1, 0, 0, 0]
+        gaussians.sh0[7] = 0
+    return gaussians, camera
 
 
-def stacked_scene(seed, width, height, degree, count) -> tuple[reference.Gaussians, reference.Camera]:
+def stacked_scene(
+    seed, width, height, degree, count
+) -> tuple[reference.Gaussians, reference.Camera]:
     """Large, mostly opaque splats behind each other: pixels stop, and alphas are clamped."""
     rng = np.random.default_rng(seed)
     camera = _random_camera(rng, width, height)
@@ -280,7 +288,9 @@ class Cotangents:
         shape = case.height, case.width
         kept = ~case.picture.near_threshold
         image, alpha, depth = (rng.normal(0, 1, s) for s in ((*shape, 3), shape, shape))
-        return Cotangents(single(image) * kept[..., None], single(alpha) * kept, single(depth) * kept)
+        return Cotangents(
+            single(image) * kept[..., None], single(alpha) * kept, single(depth) * kept
+        )
 
 
 def reference_gradients(case: Case, cotangents: Cotangents) -> dict[str, np.ndarray]:
@@ -352,7 +362,9 @@ def assert_arrays_agree(actual, expected, tolerance) -> None:
 def assert_pictures_agree(actual, picture: reference.Picture, tolerance) -> None:
     """Compare planes, leaving out only marked pixels that do differ, at most 1e-4 of all (or 1)."""
     differs = np.zeros(picture.near_threshold.shape, dtype=bool)
-    expected = {name: getattr(picture, name) for name in ("image", "alpha", "depth", "transmittance")}
+    expected = {
+        name: getattr(picture, name) for name in ("image", "alpha", "depth", "transmittance")
+    }
     for name, values in expected.items():
         errors = np.abs(actual[name] - values)
         bad = ~(errors <= tolerance * np.abs(values).max())

@@ -12,9 +12,20 @@ import drjit as dr
 import drjit.llvm.ad as llvm
 import numpy as np
 import pytest
-from helpers import Case, Cotangents, both_precisions, clear, plane_cotangents, render
+from helpers import (
+    FLOAT32,
+    Case,
+    Cotangents,
+    both_precisions,
+    clear,
+    device_camera,
+    device_gaussians,
+    plane_cotangents,
+    render,
+)
 
 from drgs import rendering
+from drgs.projection import compensated_opacity
 
 # ----------------------------------------------------------------------------------------------
 # Kernel history
@@ -64,8 +75,6 @@ def drain_kernels() -> list[list]:
 
 def kernels_of_a_frame(pipeline, case=None) -> dict[str, list]:
     """Kernels of the forward pass, the adjoint and the tangent of one scene of degree 3."""
-    from helpers import FLOAT32, device_camera, device_gaussians
-
     case = case or Case("composition", 37, 29, 3)
     gaussians = device_gaussians(case.gaussians, FLOAT32)
     camera = device_camera(case.camera, FLOAT32)
@@ -109,6 +118,7 @@ PLAIN = {"rule": "projection.plain_opacity", "features": "(rendering.color_featu
 @pytest.mark.parametrize(
     ("degree", "forbidden"),
     [(0, NOT_CALLED_FOR_BY_DEGREE_0), (1, NOT_CALLED_FOR_BY_DEGREE_1)],
+    ids=["degree 0", "degree 1"],
 )
 def test_kernels_are_the_same_when_everything_else_is_removed(run_python, degree, forbidden):
     whole = kernels_in_a_new_process(run_python, degree, **PLAIN)
@@ -124,6 +134,7 @@ def test_kernels_are_the_same_when_everything_else_is_removed(run_python, degree
         (1, {"rule": "projection.compensated_opacity"}, "compensated_opacity was used"),
         (1, {"features": "(rendering.color_features, rendering.depth_feature)"}, "depth_feature"),
     ],
+    ids=["degree 2", "compensation", "depth"],
 )
 def test_what_was_removed_is_missed_when_it_is_called_for(run_python, degree, change, used):
     with pytest.raises(RuntimeError, match=used):
@@ -150,17 +161,13 @@ def operations(kernels) -> dict[str, int]:
     ("change", "in_compositing"),
     [
         ({"sh_degree": 2}, False),
-        ({"opacity_rule": rendering.plain_opacity, "sh_degree": 3}, False),
-        ({"opacity_rule": "compensated"}, False),
+        ({"sh_degree": 3}, False),
+        ({"opacity_rule": compensated_opacity}, False),
         ({"features": (rendering.color_features, rendering.depth_feature)}, True),
     ],
     ids=["degree 2", "degree 3", "compensation", "depth"],
 )
 def test_what_is_called_for_adds_operations_where_it_belongs(plain_kernels, change, in_compositing):
-    from drgs.projection import compensated_opacity
-
-    if change.get("opacity_rule") == "compensated":
-        change = {"opacity_rule": compensated_opacity}
     more = kernels_of_a_frame(rendering.Pipeline(**{"sh_degree": 1, **change}))
     before, after = operations(plain_kernels), operations(more)
     assert all(after[name] > before[name] for name in before), (before, after)

@@ -32,9 +32,9 @@ from drgs.tiles import MICROS, TileGrid, bin_splats
 # 1e-6, so alpha 1e-6 and a pixel a few of them; measured 1e-6. In the adjoint, S is the
 # difference of numbers of the size of C.g + T G, off by some 1e-7 of them, and is divided by
 # 1 - a >= 0.01: behind an opaque splat a pixel may be off by 1e-5, and a derivative sums pixels
-# of both signs. Measured: 1e-14, 2e-5.
+# of both signs. Measured: 3e-15 and 5e-6.
 PLANES = {FLOAT64: 1e-12, FLOAT32: 1e-5}
-GRADIENTS = {FLOAT64: 1e-12, FLOAT32: 2e-4}
+GRADIENTS = {FLOAT64: 1e-12, FLOAT32: 5e-5}
 
 
 @dataclass(frozen=True)
@@ -239,9 +239,7 @@ def test_scenes_enter_every_branch():
 @both_precisions
 @all_scenes
 def test_planes_equal_the_reference(precision, scene):
-    assert_arrays_agree(
-        scene.kernel_planes(precision), scene.reference_planes(), PLANES[precision]
-    )
+    assert_arrays_agree(scene.kernel_planes(precision), scene.reference_planes(), PLANES[precision])
 
 
 @both_precisions
@@ -302,7 +300,7 @@ def test_tangents_equal_central_differences_of_the_reference(precision, scene):
 
     forward, backward = moved(1), moved(-1)
     expected = {name: (forward[name] - backward[name]) / (2 * step) for name in forward}
-    tolerance = max(GRADIENTS[precision], 1e-8)
+    tolerance = max(GRADIENTS[precision], 1e-7)
     assert_arrays_agree(kernel_tangents(scene, precision, tangents), expected, tolerance)
 
 
@@ -372,7 +370,9 @@ def test_a_clamped_alpha_has_no_derivative_but_the_colour_has(precision):
         assert not gradients[name][0].any() and gradients[name][1].any(), name
     np.testing.assert_allclose(gradients["features"][:, 0], [0.99, 0.005], rtol=1e-3)
     tangents = random_tangents(scene)
-    tangents = {name: v * np.array([1, 0]).reshape(2, *[1] * (v.ndim - 1)) for name, v in tangents.items()}
+    tangents = {
+        name: v * np.array([1, 0]).reshape(2, *[1] * (v.ndim - 1)) for name, v in tangents.items()
+    }
     tangents["features"] *= 0
     images = kernel_tangents(scene, precision, tangents)
     assert not images["features"].any() and not images["transmittance"].any()
@@ -393,9 +393,7 @@ def test_lists_around_a_word_of_32_entries(precision, count):
     """On four tiles, so that three of the lists begin within a word."""
     opacities = np.random.default_rng(count).uniform(0.01, 0.06, count)
     scene = stack(opacities, 20, 20, sigma=9.0)
-    assert_arrays_agree(
-        scene.kernel_planes(precision), scene.reference_planes(), PLANES[precision]
-    )
+    assert_arrays_agree(scene.kernel_planes(precision), scene.reference_planes(), PLANES[precision])
     # Isotropic splats on a symmetric film: eight pixels may be near the cut at once.
     kept = ~scene.near_threshold()
     assert kept.sum() >= kept.size - 16
@@ -486,7 +484,8 @@ def test_lanes_visit_every_micro_tile_once(size):
     grid = TileGrid(*size)
     lanes = rasterize._make_lanes(FLOAT32.Float, grid)
     micro_tile, micro, tile, x, y = (
-        np.array(getattr(lanes, name)).astype(int) for name in ("micro_tile", "micro", "tile", "x", "y")
+        np.array(getattr(lanes, name)).astype(int)
+        for name in ("micro_tile", "micro", "tile", "x", "y")
     )
     np.testing.assert_array_equal(np.sort(micro_tile), np.arange(grid.num_tiles * MICROS))
     np.testing.assert_array_equal(micro_tile, tile * MICROS + micro)

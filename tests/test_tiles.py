@@ -322,7 +322,9 @@ def test_a_giant_splat_touches_everything(precision, sigma):
 def test_equal_depths_stay_in_the_order_of_the_gaussians(precision):
     """Enough of them that a sort which is not stable would reorder them."""
     depths = np.tile([2.0, 1.0, 3.0], 100)
-    bins = bin_splats(round_splats(precision, np.full((300, 2), 8.0), depths=depths), TileGrid(9, 9))
+    bins = bin_splats(
+        round_splats(precision, np.full((300, 2), 8.0), depths=depths), TileGrid(9, 9)
+    )
     expected = np.argsort(depths, kind="stable")
     np.testing.assert_array_equal(np.array(bins.order), expected)
     np.testing.assert_array_equal(np.array(bins.ranks)[:300], np.arange(300))
