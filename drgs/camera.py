@@ -28,7 +28,8 @@ class Camera:
     center: Any  # Array3f, world
     focal: Any  # Array2f (fx, fy), px
     principal: Any  # Array2f (cx, cy), px
-    size: Any  # Array2f (width, height), px: the same numbers as below, on the device
+    film_start: Any  # Array2f, px: where the whole film begins, (0, 0) unless this is a crop window
+    film_end: Any  # Array2f, px: where it ends, (width, height) unless this is a crop window
     near: Any  # Float, scene units: means with smaller z are culled
     width: int
     height: int
@@ -55,7 +56,8 @@ class Camera:
             center=t.Array3f([scalar(v) for v in center]),
             focal=t.Array2f(scalar(K[0, 0]), scalar(K[1, 1])),
             principal=t.Array2f(scalar(K[0, 2]), scalar(K[1, 2])),
-            size=t.Array2f(scalar(width), scalar(height)),
+            film_start=t.Array2f(scalar(0), scalar(0)),
+            film_end=t.Array2f(scalar(width), scalar(height)),
             near=scalar(near),
             width=int(width),
             height=int(height),
@@ -64,17 +66,19 @@ class Camera:
 
 @dataclass(frozen=True)
 class SensorState:
-    """What the camera of a Mitsuba ``perspective`` sensor depends on, film and crop included.
+    """All that the camera of a Mitsuba ``perspective`` sensor depends on, film and crop included.
 
     Holding it keeps the variables of ``device`` alive, so that equal indices mean equal values.
     """
 
     device: tuple[Any, ...]  # to_world (4 x 4), horizontal field of view (degrees), offsets x, y
-    host: tuple[float, ...]  # film width and height, crop offset x and y, crop size, near clip
+    host: tuple[float, ...]  # film width and height, crop offset x and y, crop size, near
 
 
-def read_sensor(sensor: Any) -> SensorState:
+def read_sensor(sensor: Any, near: float) -> SensorState:
     """Collect a sensor's state without reading anything back from the device.
+
+    near: near plane, scene units; the sensor's ``near_clip`` applies as well, the larger wins.
 
     Raises TypeError for sensors other than ``perspective``.
     """
@@ -93,19 +97,18 @@ def read_sensor(sensor: Any) -> SensorState:
         params["principal_point_offset_x"],
         params["principal_point_offset_y"],
     )
-    host = (*film.size(), *film.crop_offset(), *film.crop_size(), sensor.near_clip())
+    near = max(near, sensor.near_clip())
+    host = (*film.size(), *film.crop_offset(), *film.crop_size(), near)
     return SensorState(device=dr.detach(device), host=host)
 
 
-def camera_from_sensor(state: SensorState, near: float) -> Camera:
+def camera_from_sensor(state: SensorState) -> Camera:
     """The pinhole camera of a Mitsuba ``perspective`` sensor's crop window.
-
-    near: near plane, scene units; the sensor's ``near_clip`` applies as well, the larger wins.
 
     Not differentiated: the sensor's parameters.
     """
     to_world, x_fov, offset_x, offset_y = state.device
-    width, height, crop_x, crop_y, crop_width, crop_height, near_clip = state.host
+    width, height, crop_x, crop_y, crop_width, crop_height, near = state.host
     t = types_of(type(x_fov))
     # Mitsuba's camera has x to the left and y up, OpenCV's x to the right and y down. A camera
     # has no unit of length: if to_world scales, its axes are normalised.
@@ -120,8 +123,9 @@ def camera_from_sensor(state: SensorState, near: float) -> Camera:
         principal=t.Array2f(
             width / 2 - offset_x * width - crop_x, height / 2 - offset_y * height - crop_y
         ),
-        size=t.Array2f(crop_width, crop_height),
-        near=t.Float(max(near, near_clip)),
+        film_start=t.Array2f(-crop_x, -crop_y),
+        film_end=t.Array2f(width - crop_x, height - crop_y),
+        near=t.Float(near),
         width=int(crop_width),
         height=int(crop_height),
     )

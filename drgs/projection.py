@@ -140,12 +140,11 @@ def compensated_opacity(opacity: Any, det_sharp: Any, det: Any) -> Any:
 def _screen_space_sqrt_cov(rows: GaussianRows, camera: Camera, position: Any) -> tuple[Any, Any]:
     """The rows of M = J R_camera R(q) diag(s), 2 x 3: the projected covariance is M M^T."""
     z = position.z
-    limits = [
-        _tan_limits(focal, principal, extent)
-        for focal, principal, extent in zip(
-            camera.focal, camera.principal, camera.size, strict=True
-        )
-    ]
+    # Of the whole film: a crop window is a part of the same picture.
+    start = (camera.film_start - camera.principal) / camera.focal
+    end = (camera.film_end - camera.principal) / camera.focal
+    margin = TAN_CLAMP * (end - start) / 2
+    limits = zip(start - margin, end + margin, strict=True)
     scales = dr.exp(rows.log_scales)
     world_from_splat = quat_to_rotation(rows.quats)
     right, down, forward = camera.rotation
@@ -159,12 +158,6 @@ def _screen_space_sqrt_cov(rows: GaussianRows, camera: Camera, position: Any) ->
         gradient = (axis - slope * forward) * (focal / z)
         sqrt_cov.append((world_from_splat.T @ gradient) * scales)
     return sqrt_cov[0], sqrt_cov[1]
-
-
-def _tan_limits(focal: Any, principal: Any, extent: Any) -> tuple[Any, Any]:
-    """Range of x/z (or y/z) within the frustum widened by TAN_CLAMP of its half extent."""
-    margin = TAN_CLAMP * (extent / focal) / 2
-    return -principal / focal - margin, (extent - principal) / focal + margin
 
 
 def quat_to_rotation(quats: Any) -> Any:

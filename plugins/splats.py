@@ -74,6 +74,7 @@ class SplatsIntegrator(mi.CppADIntegrator):
      * - background
        - |rgb|
        - Constant colour behind the splats, in display space (sRGB-encoded). (Default: black)
+       - |exposed|, |differentiable|
 
      * - antialiased
        - |bool|
@@ -105,6 +106,12 @@ class SplatsIntegrator(mi.CppADIntegrator):
 
     Both the picture and the gradients are the same to the last bit in every run.
 
+    As with Mitsuba's other integrators, a backward pass differentiates the scene as it is then:
+    a parameter that was changed after ``mi.render()`` is differentiated at its new value. After
+    the pass, the attribute ``last`` holds the derivatives with respect to the splats' positions
+    on the film, and which of them were visible. The attribute ``sh_degree`` may be changed from
+    one rendering to the next.
+
     .. note:: Not differentiated: visibility, the order of the splats, the cut-offs of alpha and
         transmittance, and the sensor's parameters.
 
@@ -125,29 +132,21 @@ class SplatsIntegrator(mi.CppADIntegrator):
     """
 
     def __init__(self, props: mi.Properties) -> None:
-        super().__init__(props)
+        # Before the base class, which has a warning of its own about scalar variants.
         if mi.variant() not in SUPPORTED_VARIANTS:
             raise ValueError(
                 f"splats: the variant '{mi.variant()}' is not supported, "
                 f"use mi.set_variant('{SUPPORTED_VARIANTS[0]}')"
             )
+        super().__init__(props)
         gaussians = _load_gaussians(props)
         for name in PARAMETER_NAMES:
             setattr(self, name, getattr(gaussians, name))
-        stored = gaussians.sh_degree
-        self.sh_degree = props.get("sh_degree", stored)
-        if not 0 <= self.sh_degree <= stored:
-            raise ValueError(
-                f"splats: sh_degree must be between 0 and {stored}, the degree of the "
-                f"Gaussians, got {self.sh_degree}"
-            )
-        self.background = mi.Color3f(props.get("background", 0.0))
-        self.antialiased = props.get("antialiased", False)
-        self.near = props.get("near", NEAR)
-        if not self.near > 0:
-            raise ValueError(f"splats: near must be positive, got {self.near}")
-        self.srgb_primitives = props.get("srgb_primitives", True)
-        dr.make_opaque(self.background)
+        self.sh_degree = props.get("sh_degree", gaussians.sh_degree)
+        self.background = _color(props, "background", 0.0)
+        self.antialiased = _boolean(props, "antialiased", False)
+        self.near = _positive(props, "near", NEAR)
+        self.srgb_primitives = _boolean(props, "srgb_primitives", True)
 
         self.last: LastBackward | None = None
         self._rendered: _Rendered | None = None
@@ -166,9 +165,25 @@ class SplatsIntegrator(mi.CppADIntegrator):
         callback.put("background", self.background, mi.ParamFlags.Differentiable)
 
     def parameters_changed(self, keys: list[str]) -> None:
-        """Check that the parameters still fit together."""
-        del keys
+        """Check that the parameters still fit together, and forget a frame of former ones.
+
+        The frame's key does not tell that an array was written in place through a view, which
+        is what ``SceneParameters.set_dirty`` announces.
+        """
+        if keys != ["background"]:
+            self._rendered = None
         _check_shapes(self.gaussians)
+        _check_degree(self.sh_degree, self.gaussians)
+
+    @property
+    def sh_degree(self) -> int:
+        """Highest spherical harmonics degree that is evaluated."""
+        return self._sh_degree
+
+    @sh_degree.setter
+    def sh_degree(self, degree: int) -> None:
+        _check_degree(degree, self.gaussians)
+        self._sh_degree = int(degree)
 
     @property
     def gaussians(self) -> Gaussians:
@@ -219,7 +234,7 @@ class SplatsIntegrator(mi.CppADIntegrator):
         with dr.suspend_grad():
             self._warn_about_sampling(sensor, spp)
             frame = self._frame(sensor)
-            image = self._develop(sensor.film(), frame.planes(), dr.detach(self.background))
+            image = self._develop(sensor.film(), frame.planes(), self._detached_background())
             if evaluate:
                 dr.eval(image)
         return image if develop else mi.TensorXf()
@@ -242,7 +257,7 @@ class SplatsIntegrator(mi.CppADIntegrator):
         sensor = _resolve_sensor(scene, sensor)
         with dr.suspend_grad():
             frame = self._frame(sensor)
-            planes, background = frame.planes(), mi.Color3f(dr.detach(self.background))
+            planes, background = frame.planes(), self._detached_background()
             dr.eval(planes)
             # Film, colour conversion and background are a few operations per pixel, traced
             # again and differentiated by Dr.Jit.
@@ -254,14 +269,16 @@ class SplatsIntegrator(mi.CppADIntegrator):
                 dr.traverse(dr.ADMode.Backward)
                 d_transmittance, *d_features = dr.grad(planes)
                 d_background = dr.grad(background)
+            sensor.film().clear()  # it holds the attached block
             dr.eval(d_transmittance, d_features, d_background)
             gradients = rendering.render_adjoint(self.gaussians, frame, d_features, d_transmittance)
             self.last = LastBackward(
                 means2d_grad=_rows(gradients.means2d), visible=gradients.visible
             )
-        for name in PARAMETER_NAMES:
-            _accumulate(getattr(self, name), getattr(gradients.parameters, name))
-        _accumulate(self.background, d_background)
+            with dr.resume_grad():
+                for name in PARAMETER_NAMES:
+                    _accumulate(getattr(self, name), getattr(gradients.parameters, name))
+                _accumulate(self.background, d_background)
 
     def render_forward(
         self,
@@ -278,11 +295,11 @@ class SplatsIntegrator(mi.CppADIntegrator):
             frame = self._frame(sensor)
             with dr.resume_grad():
                 tangents = Gaussians(
-                    **{name: dr.grad(getattr(self, name)) for name in PARAMETER_NAMES}
+                    **{name: _tangent(getattr(self, name)) for name in PARAMETER_NAMES}
                 )
                 d_background = dr.grad(self.background)
             d_planes = rendering.render_tangent(self.gaussians, frame, tangents)
-            planes, background = frame.planes(), mi.Color3f(dr.detach(self.background))
+            planes, background = frame.planes(), self._detached_background()
             dr.eval(planes, d_planes)
             with dr.resume_grad():
                 dr.enable_grad(planes, background)
@@ -290,7 +307,9 @@ class SplatsIntegrator(mi.CppADIntegrator):
                 dr.set_grad(background, d_background)
                 image = self._develop(sensor.film(), planes, background)
                 dr.forward_to(image)
-                return dr.grad(image)
+                d_image = dr.grad(image)
+            sensor.film().clear()  # it holds the attached block
+        return d_image
 
     def sample(self, *args: Any, **kwargs: Any) -> Any:
         """Refused: splats are composited over whole images, not along single rays."""
@@ -306,11 +325,17 @@ class SplatsIntegrator(mi.CppADIntegrator):
         other renders possibly in between.
         """
         pipeline, gaussians = self.pipeline, dr.detach(self.gaussians)
-        state = read_sensor(sensor)
+        state = read_sensor(sensor, self.near)
         if self._rendered is None or not self._rendered.matches(pipeline, state, gaussians):
-            frame = rendering.render(gaussians, camera_from_sensor(state, self.near), pipeline)
+            frame = rendering.render(gaussians, camera_from_sensor(state), pipeline)
             self._rendered = _Rendered(frame, pipeline, state, gaussians)
         return self._rendered.frame
+
+    def _detached_background(self) -> mi.Color3f:
+        """The background without gradients; no literal, or every colour would be a new kernel."""
+        background = mi.Color3f(dr.detach(self.background))
+        dr.make_opaque(background)
+        return background
 
     def _develop(self, film: mi.Film, planes: list[mi.Float], background: mi.Color3f) -> Any:
         """Put the planes into ``film`` as one block of the whole image, and develop it.
@@ -352,44 +377,91 @@ def _load_gaussians(props: mi.Properties) -> Gaussians:
     given = [name for name in PARAMETER_NAMES if name in props]
     if "filename" in props:
         if given:
-            raise ValueError(f"splats: give either 'filename' or tensors, got both ({given[0]})")
-        path = mi.file_resolver().resolve(props["filename"])
-        return read_ply(path).to(mi.TensorXf)
-    missing = [name for name in PARAMETER_NAMES if name not in given and name != "shN"]
-    if missing:
-        raise ValueError(
-            f"splats: give 'filename', or the Gaussians as tensors {', '.join(PARAMETER_NAMES)}; "
-            f"missing: {', '.join(missing)}"
-        )
-    values = {name: props[name] for name in given}
-    num = values["means"].shape[0]
-    if "shN" not in given:
-        values["shN"] = dr.zeros(mi.TensorXf, (num, 0, 3))
-    values["logit_opacities"] = mi.Float(dr.ravel(values["logit_opacities"]))
-    gaussians = Gaussians(**values)
+            raise ValueError(
+                f"splats: give either 'filename' or tensors, got both ({', '.join(given)})"
+            )
+        path = mi.file_resolver().resolve(str(props["filename"]))
+        gaussians = read_ply(str(path)).to(mi.TensorXf)
+    else:
+        missing = [name for name in PARAMETER_NAMES if name not in given and name != "shN"]
+        if missing:
+            raise ValueError(
+                "splats: give 'filename', or the Gaussians as tensors "
+                f"{', '.join(PARAMETER_NAMES)}; missing: {', '.join(missing)}"
+            )
+        values = {name: _tensor(props, name) for name in given}
+        if "shN" not in given:
+            values["shN"] = dr.zeros(mi.TensorXf, (values["means"].shape[0], 0, 3))
+        values["logit_opacities"] = mi.Float(values["logit_opacities"].array)
+        gaussians = Gaussians(**values)
     _check_shapes(gaussians)
     return gaussians
 
 
+def _tensor(props: mi.Properties, name: str) -> mi.TensorXf:
+    """A tensor of the integrator's own: parameters are assigned in place, the caller's are not."""
+    value = props[name]
+    if not dr.is_array_v(value):
+        raise TypeError(f"splats: {name} must be a tensor, got {type(value).__name__}")
+    if not dr.is_jit_v(value):
+        # Three numbers, which a property set turns into a vector on the host.
+        value = mi.Float(list(value))
+    return mi.TensorXf(value)
+
+
+def _color(props: mi.Properties, name: str, default: float) -> mi.Color3f:
+    value = props.get(name, default)
+    try:
+        return mi.Color3f(value)
+    except TypeError:
+        raise TypeError(
+            f"splats: {name} must be an RGB colour, such as [1, 1, 1] or <rgb value='1, 1, 1'/>, "
+            f"got {type(value).__name__}"
+        ) from None
+
+
+def _boolean(props: mi.Properties, name: str, default: bool) -> bool:
+    value = props.get(name, default)
+    if not isinstance(value, bool):
+        raise TypeError(f"splats: {name} must be true or false, got {value!r}")
+    return value
+
+
+def _positive(props: mi.Properties, name: str, default: float) -> float:
+    value = props.get(name, default)
+    if not (isinstance(value, int | float) and value > 0):
+        raise ValueError(f"splats: {name} must be a positive number, got {value!r}")
+    return float(value)
+
+
 def _check_shapes(gaussians: Gaussians) -> None:
-    num = gaussians.means.shape[0]
-    expected = {"means": (num, 3), "quats": (num, 4), "log_scales": (num, 3), "sh0": (num, 1, 3)}
-    for name, shape in expected.items():
-        if tuple(getattr(gaussians, name).shape) != shape:
+    num = next(iter(gaussians.means.shape), 0)
+    if num == 0:
+        raise ValueError("splats: at least one Gaussian is needed, got none")
+    rows = {
+        "means": [(3,)],
+        "quats": [(4,)],
+        "log_scales": [(3,)],
+        "logit_opacities": [()],
+        "sh0": [(1, 3)],
+        "shN": [((degree + 1) ** 2 - 1, 3) for degree in range(4)],
+    }
+    for name, allowed in rows.items():
+        got = tuple(getattr(gaussians, name).shape)
+        if got not in [(num, *row) for row in allowed]:
+            expected = " or ".join(f"({', '.join(map(str, ('N', *row)))})" for row in allowed)
             raise ValueError(
-                f"splats: {name} must have the shape {shape}, "
-                f"got {tuple(getattr(gaussians, name).shape)}"
+                f"splats: {name} must have the shape {expected}, with N = {num} the rows of "
+                f"means, got {got}"
             )
-    if dr.width(gaussians.logit_opacities) != num:
+
+
+def _check_degree(degree: int, gaussians: Gaussians) -> None:
+    stored = gaussians.sh_degree
+    if degree not in range(stored + 1):
         raise ValueError(
-            f"splats: logit_opacities must have {num} entries, "
-            f"got {dr.width(gaussians.logit_opacities)}"
-        )
-    shape = tuple(gaussians.shN.shape)
-    if len(shape) != 3 or shape[0] != num or shape[1] not in (0, 3, 8, 15) or shape[2] != 3:
-        raise ValueError(
-            f"splats: shN must have the shape ({num}, K - 1, 3) with K - 1 in 0, 3, 8, 15 "
-            f"(degrees 0 to 3), got {shape}"
+            f"splats: sh_degree must be an integer from 0 to {stored}, the degree of the "
+            f"Gaussians, got {degree!r}"
         )
 
 
@@ -399,6 +471,11 @@ def _resolve_sensor(scene: mi.Scene, sensor: int | mi.Sensor) -> mi.Sensor:
 
 def _rows(vector: Any) -> mi.TensorXf:
     return mi.TensorXf(interleave(list(vector)), (dr.width(vector), len(vector)))
+
+
+def _tangent(parameter: Any) -> Any:
+    """The gradient set on a parameter; an empty one is its own, as dr.grad drops its shape."""
+    return dr.grad(parameter) if dr.width(parameter) > 0 else parameter
 
 
 def _accumulate(parameter: Any, gradient: Any) -> None:
