@@ -34,6 +34,14 @@ def exit_on_user_error() -> Iterator[None]:
         sys.exit(USER_ERROR_STATUS)
 
 
+def one_line(text: object, limit: int = 300) -> str:
+    """``text`` as one line of at most ``limit`` characters: what a library's error says, or a value
+    from a file, within a message of ours.
+    """
+    line = " ".join(str(text).split())
+    return line if len(line) <= limit else f"{line[: limit - 3]}..."
+
+
 def did_you_mean(name: str, candidates: Iterable[str]) -> str:
     """``"; did you mean X?"`` with the candidate nearest to ``name``, or ``""`` if none is near.
 

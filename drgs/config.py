@@ -24,13 +24,25 @@ from pydantic import (
     model_validator,
 )
 
-from drgs.checks import UserError, did_you_mean
-from drgs.files import atomic_path
+from drgs.checks import UserError, did_you_mean, one_line
+from drgs.files import atomic_path, read_text
 
 Color = str | tuple[float, float, float]
 
 PATH_KEYS = ("data.path", "init.point_cloud", "output.dir")
 """Values that are made absolute when a configuration is loaded."""
+
+MAX_BYTES = 1 << 20
+"""Of a configuration file: a thousand times what every value with a comment takes."""
+
+MAX_DEPTH = 20
+"""Of nested lists and sections in YAML; a configuration has 3. Python's stack ends at about 100."""
+
+MAX_EXPLAINED = 20
+"""Wrong values that an error lists; the rest are counted."""
+
+MAX_INT = 2**31 - 1
+"""The counters of Mitsuba and Dr.Jit are of 32 bits."""
 
 NAMED_COLORS = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0)}
 
@@ -50,6 +62,7 @@ def _color_to_yaml(color: Color) -> Any:
 
 
 ColorField = Annotated[Color, PlainValidator(_color), PlainSerializer(_color_to_yaml)]
+Count = Annotated[int, Field(le=MAX_INT)]
 PathField = Annotated[Path, Field(strict=False)]
 
 
@@ -71,7 +84,7 @@ class DataConfig(_Section):
         description="Layout of the folder. auto: nerf_synthetic if there is a "
         "transforms_train.json, nerfstudio if there is a transforms.json.",
     )
-    image_size: int | None = Field(
+    image_size: Count | None = Field(
         None,
         ge=1,
         description="px. Wider images are scaled down to this width by area averaging; null: "
@@ -81,7 +94,7 @@ class DataConfig(_Section):
         None,
         description="NeRF-synthetic split to measure on; null: test if it is there, else val.",
     )
-    test_every: int = Field(
+    test_every: Count = Field(
         8, ge=2, description="nerfstudio: images 0, n, 2n, ... by file name are the test split."
     )
     background: ColorField = Field(
@@ -102,10 +115,11 @@ class DataConfig(_Section):
 class InitConfig(_Section):
     """The Gaussians at iteration 0."""
 
-    num_points: int = Field(100_000, ge=4, description="Random points in the start box.")
+    num_points: Count = Field(100_000, ge=4, description="Random points in the start box.")
     half_extent: float | None = Field(
         None,
         gt=0,
+        le=1e9,
         description="Scene units: the start box is [-h, h]^3. null: the reference's 1.3 for the "
         "NeRF-synthetic layout, otherwise a box derived from the cameras.",
     )
@@ -119,7 +133,7 @@ class ModelConfig(_Section):
     """What is fitted and how it is rendered."""
 
     sh_degree: int = Field(3, ge=0, le=3, description="Degree of the spherical harmonics.")
-    sh_increase_every: int = Field(
+    sh_increase_every: Count = Field(
         1000, ge=1, description="Iterations between +1 of the degree in use, which starts at 0."
     )
     antialiased: bool = Field(
@@ -162,11 +176,11 @@ class LossConfig(_Section):
 class DensifyConfig(_Section):
     """Adaptive density control: clone, split, prune, opacity reset."""
 
-    start: int = Field(500, ge=0, description="The population changes only after this iteration.")
-    stop: int = Field(
+    start: Count = Field(500, ge=0, description="The population changes only after this iteration.")
+    stop: Count = Field(
         15_000, ge=1, description="It changes, and is reset, only before this iteration."
     )
-    every: int = Field(100, ge=1, description="Iterations between two changes.")
+    every: Count = Field(100, ge=1, description="Iterations between two changes.")
     grad_threshold: float = Field(
         2e-4,
         gt=0,
@@ -178,7 +192,9 @@ class DensifyConfig(_Section):
         gt=0,
         description="Cloned if its largest scale is at most this, split if larger; x extent.",
     )
-    split_count: int = Field(2, ge=2, description="Samples that replace a Gaussian that is split.")
+    split_count: int = Field(
+        2, ge=2, le=100, description="Samples that replace a Gaussian that is split."
+    )
     split_shrink: float = Field(1.6, gt=1, description="Their scales are the parent's / this.")
     prune_opacity: float = Field(0.005, ge=0, lt=1, description="Removed if less opaque.")
     prune_scale: float = Field(
@@ -186,14 +202,16 @@ class DensifyConfig(_Section):
         gt=0,
         description="Removed after the first reset if its largest scale is larger; x extent.",
     )
-    reset_every: int = Field(
+    reset_every: Count = Field(
         3000, ge=1, description="Iterations between opacity resets, which end with densify.stop."
     )
     reset_opacity: float = Field(0.01, gt=0, lt=1, description="A reset lowers opacities to this.")
-    white_background_reset: int | None = Field(
+    white_background_reset: Count | None = Field(
         500, ge=1, description="Iteration of an extra reset if the background is white; null: none."
     )
-    max_gaussians: int = Field(1_000_000, ge=4, description="Cap that is never exceeded.")
+    max_gaussians: int = Field(
+        1_000_000, ge=4, le=100_000_000, description="Cap that is never exceeded."
+    )
 
 
 class OutputConfig(_Section):
@@ -205,8 +223,8 @@ class OutputConfig(_Section):
         "folder, NAME being that of the configuration file.",
     )
     save_renders: bool = Field(True, description="Write renders/<split>/*.png.")
-    history_every: int = Field(10, ge=1, description="Iterations between rows of history.csv.")
-    checkpoint_every: int | None = Field(
+    history_every: Count = Field(10, ge=1, description="Iterations between rows of history.csv.")
+    checkpoint_every: Count | None = Field(
         500, ge=1, description="Iterations between checkpoints, for --resume; null: none."
     )
 
@@ -221,8 +239,8 @@ class FitConfig(_Section):
     loss: LossConfig = Field(default_factory=LossConfig)
     densify: DensifyConfig = Field(default_factory=DensifyConfig)
     output: OutputConfig = Field(default_factory=OutputConfig)
-    iterations: int = Field(30_000, ge=1, description="Optimizer steps; one view each.")
-    seed: int = Field(0, ge=0, description="Seed of everything random.")
+    iterations: Count = Field(30_000, ge=1, description="Optimizer steps; one view each.")
+    seed: Count = Field(0, ge=0, description="Seed of everything random.")
 
     @model_validator(mode="after")
     def _check_relations(self) -> FitConfig:
@@ -262,7 +280,7 @@ def load_config(path: str | Path, overrides: Iterable[str] = ()) -> FitConfig:
     """
     path = Path(path)
     values = _read_yaml(path)
-    _resolve_paths(values, path.resolve().parent)
+    _resolve_paths(values, path)
     overridden = set()
     for override in overrides:
         key, value = _parse_override(override)
@@ -271,7 +289,10 @@ def load_config(path: str | Path, overrides: Iterable[str] = ()) -> FitConfig:
     try:
         return FitConfig.model_validate(values)
     except ValidationError as error:
-        lines = [_explain(str(path), item, overridden) for item in error.errors()]
+        errors = error.errors()
+        lines = [_explain(str(path), item, overridden) for item in errors[:MAX_EXPLAINED]]
+        if len(errors) > MAX_EXPLAINED:
+            lines.append(f"{path}: {len(errors) - MAX_EXPLAINED} more values are wrong")
         raise UserError("\n".join(lines)) from None
 
 
@@ -295,11 +316,30 @@ def _fields(model: type[BaseModel], prefix: str = "") -> Iterator[tuple[str, Any
 
 
 class _Loader(yaml.SafeLoader):
-    """YAML with the two changes that a configuration needs.
+    """YAML with the changes that a configuration needs.
 
-    1e-15 is a number (YAML 1.1 wants 1.0e-15 and would read text), and a key that is given twice
-    in one section is an error (the first would be dropped silently).
+    1e-15 is a number (YAML 1.1 wants 1.0e-15 and would read text). A key that is given twice in
+    one section is an error (the first would be dropped silently), and so are aliases and deep
+    nesting: a few lines of either could take all memory or Python's whole stack.
     """
+
+    depth = 0
+
+    def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node:
+        event = self.peek_event()
+        if isinstance(event, yaml.AliasEvent):
+            raise yaml.MarkedYAMLError(
+                problem=f"aliases such as *{event.anchor} are not supported; write the value out",
+                problem_mark=event.start_mark,
+            )
+        if self.depth >= MAX_DEPTH:
+            raise yaml.MarkedYAMLError(
+                problem=f"more than {MAX_DEPTH} levels of nesting", problem_mark=event.start_mark
+            )
+        self.depth += 1
+        node = super().compose_node(parent, index)
+        self.depth -= 1
+        return node
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict:
         seen = set()
@@ -321,19 +361,15 @@ _Loader.add_implicit_resolver(
 
 
 def _read_yaml(path: Path) -> dict:
-    try:
-        text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        reason = getattr(error, "strerror", None) or "not UTF-8 text"
-        raise UserError(f"{path}: cannot read the configuration: {reason}") from None
+    text = read_text(path, "configuration", MAX_BYTES)
     try:
         values = yaml.load(text, Loader=_Loader)
     except yaml.MarkedYAMLError as error:
         line = f"line {error.problem_mark.line + 1}: " if error.problem_mark else ""
-        raise UserError(f"{path}: {line}not valid YAML: {error.problem}") from None
-    except (yaml.YAMLError, ValueError) as error:
-        # ValueError: a date or a number that YAML's syntax allows and Python does not.
-        raise UserError(f"{path}: not valid YAML: {error}") from None
+        raise UserError(f"{path}: {line}not valid YAML: {one_line(error.problem)}") from None
+    except Exception as error:  # a date or number that YAML's syntax allows: PyYAML raises anything
+        reason = one_line(error) or type(error).__name__
+        raise UserError(f"{path}: not valid YAML: {reason}") from None
     if not isinstance(values, dict):
         raise UserError(f"{path}: must hold sections such as 'data:', got {_show(values)}")
     return values
@@ -347,11 +383,11 @@ def _parse_override(override: str) -> tuple[str, Any]:
     if key not in known_keys():
         raise UserError(f"--set {key}: unknown key {key}{did_you_mean(key, known_keys())}")
     if key in PATH_KEYS:
-        return key, None if text == "null" else str(Path(text).expanduser().resolve())
+        return key, None if text == "null" else _absolute(Path(), text, f"--set {key}")
     try:
         return key, yaml.load(text, Loader=_Loader)
-    except (yaml.YAMLError, ValueError):
-        raise UserError(f"--set {key}: not a YAML value: {text}") from None
+    except Exception:  # as in _read_yaml
+        raise UserError(f"--set {key}: not a YAML value: {one_line(text)}") from None
 
 
 def _insert(values: dict, key: str, value: Any) -> None:
@@ -363,17 +399,29 @@ def _insert(values: dict, key: str, value: Any) -> None:
     values[leaf] = value
 
 
-def _resolve_paths(values: dict, folder: Path) -> None:
+def _resolve_paths(values: dict, file: Path) -> None:
+    folder = file.resolve().parent
     for key in PATH_KEYS:
         section, leaf = key.split(".")
         entries = values.get(section)
         if isinstance(entries, dict) and isinstance(entries.get(leaf), str):
-            entries[leaf] = str((folder / Path(entries[leaf]).expanduser()).resolve())
+            entries[leaf] = _absolute(folder, entries[leaf], f"{file}: {key}")
+
+
+def _absolute(folder: Path, text: str, where: str) -> str:
+    try:
+        path = str((folder / Path(text).expanduser()).resolve())
+        path.encode()  # what UTF-8 cannot express could not be written to config.yml
+    except (OSError, ValueError, RuntimeError) as error:  # of these, RuntimeError: no such user
+        raise UserError(
+            f"{where} must be a path, got {_show(text)} ({one_line(error, 100)})"
+        ) from None
+    return path
 
 
 def _explain(file: str, item: Any, overridden: set[str]) -> str:
     """One line for one of pydantic's errors: where, name, expected, got, remedy."""
-    key = ".".join(str(part) for part in item["loc"])
+    key = one_line(".".join(str(part) for part in item["loc"]), limit=60)
     given = [k for k in overridden if key == k or key.startswith(f"{k}.")]
     where = f"--set {given[0]}" if given else file
     kind, limits = item["type"], item.get("ctx", {})
@@ -390,7 +438,7 @@ def _explain(file: str, item: Any, overridden: set[str]) -> str:
         return f"{where}: {key} {limits['error']}{got}"
     for relation, sign in _RELATIONS.items():
         if relation in limits:
-            return f"{where}: {key} must be {sign} {limits[relation]:g}{got}"
+            return f"{where}: {key} must be {sign} {limits[relation]:.10g}{got}"
     if kind == "literal_error":
         return f"{where}: {key} must be one of {limits['expected']}{got}"
     return f"{where}: {key} must be {_EXPECTED.get(kind.split('_')[0], item['msg'])}{got}"
@@ -419,9 +467,11 @@ def _description(key: str) -> str:
 
 
 def _show(value: Any) -> str:
-    """The value as YAML writes it, shortened."""
-    text = yaml.safe_dump(value, default_flow_style=True, width=math.inf)
-    text = text.removesuffix("\n").removesuffix("\n...")
+    """The value as YAML writes it, on one line and shortened."""
     if isinstance(value, str):
-        text = repr(value)
-    return text if len(text) <= 60 else text[:57] + "..."
+        return one_line(repr(value), limit=60)
+    try:
+        text = yaml.safe_dump(value, default_flow_style=True, width=math.inf)
+    except ValueError:  # Python writes no integer of more than 4300 digits
+        return "a number of thousands of digits"
+    return one_line(text.removesuffix("\n").removesuffix("\n..."), limit=60)

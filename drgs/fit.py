@@ -7,6 +7,9 @@ result on the test views and writes the output folder:
 - ``metrics.json``: quality on the test views, time, population, versions
 - ``history.csv``: loss, PSNR, population and rate over the iterations
 - ``renders/<split>/*.png``: the test views as fitted
+- ``side_by_side/<split>/*.png``: fitted, photograph and difference
+- ``curves.png``, ``orbit.webp``, ``orbit.gif``
+- ``report.html``: all of it on one page that needs no other file
 - ``config.yml``: every value that the fit used
 
 While it runs there is also ``checkpoint.npz``, from which ``--resume`` continues.
@@ -26,20 +29,28 @@ from pathlib import Path
 from typing import Any
 
 import drjit as dr
-import imageio.v3 as iio
 import mitsuba as mi
 import numpy as np
 
 import drgs
 from drgs.checkpoint import Checkpoint, load_checkpoint, remove_checkpoint, save_checkpoint
-from drgs.checks import exit_on_user_error
-from drgs.config import FitConfig, dump_config, load_config
+from drgs.checks import UserError, exit_on_user_error, one_line
+from drgs.config import FitConfig, load_config
 from drgs.data import Dataset, initial_gaussians, load_dataset
 from drgs.files import atomic_path
 from drgs.interrupts import INTERRUPTED_STATUS, StopRequest
 from drgs.io.ply import write_ply
 from drgs.metrics import Quality, mean_quality
+from drgs.output import (
+    LAST_FILE,
+    claim_output_folder,
+    is_finished,
+    load_run_config,
+    remove_run,
+)
+from drgs.pictures import write_png
 from drgs.progress import FitProgress
+from drgs.report import write_results
 from drgs.trainer import StepReport, Trainer, render_views
 
 SMOOTHING = 0.9
@@ -62,36 +73,51 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Entry point of the command."""
     args = _parse(arguments)
     with exit_on_user_error():
-        path = args.config or args.resume / "config.yml"
-        config = load_config(path, args.overrides + _shorthands(args))
-        out = config.output.dir or Path("out") / Path(path).stem
+        if args.resume is not None:
+            config, out = load_run_config(args.resume), args.resume
+        else:
+            config = load_config(args.config, args.overrides + _shorthands(args))
+            out = config.output.dir or Path("out") / Path(args.config).stem
+        if is_finished(out, config) and not args.overwrite:
+            print(f"{out}: this fit is finished; --overwrite does it again")
+            return
         dataset = load_dataset(config.data)
-        mi.set_variant(args.variant)
-        print(f"{path}: {dataset.description}")
+        select_variant(args.variant)
+        print(dataset.description)
         print(
             f"{len(dataset.train)} views to train on, {len(dataset.test)} of split "
             f"'{dataset.test_split}' to measure on; background {config.data.background}"
         )
-        finished = run(config, dataset, out, resume=args.resume is not None)
+        # The folder is touched when all of the input has been found to be usable.
+        trainer = Trainer(config, dataset, initial_gaussians(config, dataset))
+        if args.overwrite:
+            remove_run(out)
+        claim_output_folder(out, config)
+        finished = run(trainer, config, dataset, out)
     if not finished:
         print(f"stopped; continue with: python -m drgs.fit --resume {out}")
         sys.exit(INTERRUPTED_STATUS)
 
 
-def run(config: FitConfig, dataset: Dataset, out: Path, resume: bool) -> bool:
-    """Fit, measure, and write the output folder ``out``; False if stopped by Ctrl-C.
+def select_variant(name: str) -> None:
+    """Make ``name`` the active Mitsuba variant."""
+    try:
+        mi.set_variant(name)
+    except ImportError as error:
+        raise UserError(f"--variant {name}: not usable here: {one_line(error)}") from None
 
-    resume: go on from the checkpoint in ``out``, if there is one.
+
+def run(trainer: Trainer, config: FitConfig, dataset: Dataset, out: Path) -> bool:
+    """Fit, measure, and write into the folder ``out``; False if stopped by Ctrl-C.
+
+    Goes on from the checkpoint in ``out``, if there is one.
     """
-    checkpoint = load_checkpoint(out, config) if resume else None
-    out.mkdir(parents=True, exist_ok=True)
-    dump_config(config, out / "config.yml")
-    trainer = Trainer(config, dataset, initial_gaussians(config, dataset))
+    checkpoint = load_checkpoint(out, config)
     log = History()
     if checkpoint is not None:
         trainer.restore(checkpoint.trainer)
         log = History.from_array(checkpoint.history, checkpoint.wall_s)
-        print(f"resumed at iteration {trainer.iteration}")
+        print(f"continues at iteration {trainer.iteration}")
     if not train(trainer, config, log, out):
         return False
     wall_s = log.wall_s
@@ -104,8 +130,12 @@ def run(config: FitConfig, dataset: Dataset, out: Path, resume: bool) -> bool:
         (image, view.image) for image, view in zip(images, dataset.test, strict=True)
     )
     if config.output.save_renders:
-        write_renders(out / "renders" / dataset.test_split, dataset, images)
-    write_metrics(out / "metrics.json", config, dataset, gaussians.num_gaussians, wall_s, quality)
+        for view, image in zip(dataset.test, images, strict=True):
+            write_png(out / "renders" / dataset.test_split / f"{view.name}.png", image)
+    metrics = summarize(config, dataset, gaussians.num_gaussians, wall_s, quality)
+    write_results(out, dataset, trainer.scene, gaussians, images, log.rows, metrics)
+    with atomic_path(out / LAST_FILE) as temporary:
+        temporary.write_text(json.dumps(metrics, indent=2) + "\n")
     remove_checkpoint(out)
     print(
         f"{quality.num_views} {dataset.test_split} views: PSNR {quality.psnr:.2f} dB, "
@@ -191,23 +221,11 @@ def write_history(path: Path, history: list[HistoryRow]) -> None:
             writer.writerow([f"{v:.6g}" if isinstance(v, float) else v for v in vars(row).values()])
 
 
-def write_renders(folder: Path, dataset: Dataset, images: list[np.ndarray]) -> None:
-    """Write one 8-bit PNG per test view."""
-    for view, image in zip(dataset.test, images, strict=True):
-        with atomic_path(folder / f"{view.name}.png") as temporary:
-            iio.imwrite(temporary, np.round(image * 255).astype(np.uint8))
-
-
-def write_metrics(
-    path: Path,
-    config: FitConfig,
-    dataset: Dataset,
-    num_gaussians: int,
-    wall_s: float,
-    quality: Quality,
-) -> None:
-    """Write ``metrics.json``."""
-    metrics: dict[str, Any] = {
+def summarize(
+    config: FitConfig, dataset: Dataset, num_gaussians: int, wall_s: float, quality: Quality
+) -> dict[str, Any]:
+    """What ``metrics.json`` holds."""
+    return {
         "iterations": config.iterations,
         "num_gaussians": num_gaussians,
         "wall_s": round(wall_s, 2),
@@ -230,8 +248,6 @@ def write_metrics(
         "threads": dr.thread_count(),
         "config": config.model_dump(mode="json"),
     }
-    with atomic_path(path) as temporary:
-        temporary.write_text(json.dumps(metrics, indent=2) + "\n")
 
 
 def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
@@ -245,6 +261,9 @@ def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--data", metavar="DIR", help="dataset folder (data.path)")
     parser.add_argument("--out", metavar="DIR", help="output folder (default: out/NAME)")
     parser.add_argument(
+        "--overwrite", action="store_true", help="replace the run that the output folder holds"
+    )
+    parser.add_argument(
         "--set",
         dest="overrides",
         action="append",
@@ -253,18 +272,21 @@ def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
         help="override a value of the configuration, as in densify.every=200; repeatable",
     )
     parser.add_argument(
-        "--variant", default="llvm_ad_rgb", help="Mitsuba variant (default: llvm_ad_rgb)"
+        "--variant",
+        default="llvm_ad_rgb",
+        choices=("llvm_ad_rgb", "cuda_ad_rgb"),
+        help="Mitsuba variant (default: llvm_ad_rgb)",
     )
     args = parser.parse_args(arguments)
     if (args.config is None) == (args.resume is None):
         parser.error("give either CONFIG.yml or --resume OUT_DIR")
-    if args.resume is not None and (args.overrides or args.data or args.out):
+    if args.resume and (args.overrides or args.data or args.out or args.overwrite):
         parser.error("--resume takes its configuration from OUT_DIR/config.yml, and nothing else")
     return args
 
 
 def _shorthands(args: argparse.Namespace) -> list[str]:
-    given = {"data.path": args.data, "output.dir": args.out or args.resume}
+    given = {"data.path": args.data, "output.dir": args.out}
     return [f"{key}={value}" for key, value in given.items() if value is not None]
 
 

@@ -2,7 +2,7 @@ import sys
 
 import pytest
 
-from drgs.checks import UserError, did_you_mean, exit_on_user_error
+from drgs.checks import UserError, did_you_mean, exit_on_user_error, one_line
 from drgs.llvm import LLVMVersionError
 
 
@@ -35,3 +35,8 @@ def test_commands_report_user_errors_in_one_line(error, capsys):
 def test_commands_keep_the_traceback_of_other_errors():
     with pytest.raises(ZeroDivisionError), exit_on_user_error():
         print(1 / 0, file=sys.stderr)
+
+
+def test_what_others_say_fits_on_one_line():
+    assert one_line("a\n  b\tc") == "a b c"
+    assert one_line("x" * 10, limit=9) == "xxxxxx..."

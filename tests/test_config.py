@@ -79,6 +79,12 @@ def test_a_configuration_is_frozen(load):
         ("iterations: 1.5", "iterations must be an integer, got 1.5"),
         ("iterations: true", "iterations must be an integer, got true"),
         ("iterations: '7'", "iterations must be an integer, got '7'"),
+        ("seed: 3000000000", "seed must be <= 2147483647, got 3000000000"),
+        (
+            "output: {dir: ~not-a-user/x}",
+            "output.dir must be a path, got '~not-a-user/x' (Could not determine home directory.)",
+        ),
+        ('output: {dir: "a\\0b"}', "output.dir must be a path, got 'a\\x00b' (embedded null byte)"),
         ("seed: -1", "seed must be >= 0, got -1"),
         ("loss: {sigma: 0}", "loss.sigma must be > 0, got 0"),
         ("loss: {sigma: big}", "loss.sigma must be a number, got 'big'"),
@@ -140,6 +146,19 @@ def test_a_wrong_value_is_refused_with_file_key_expected_and_got(load, text, mes
         ("", "must hold sections such as 'data:', got null"),
         ("- 1", "must hold sections such as 'data:', got [1]"),
         ("seed: 1\nseed: 2", "line 2: not valid YAML: key seed is given twice"),
+        (
+            "a: &a 1\nb: *a",
+            "line 2: not valid YAML: aliases such as *a are not supported; write the value out",
+        ),
+        ("a: " + "[" * 50_000, "line 1: not valid YAML: more than 20 levels of nesting"),
+        ("seed: 2001-02-31", "not valid YAML: day is out of range for month"),
+        ("seed: !!int ''", "not valid YAML: string index out of range"),
+        (
+            "seed: \0",
+            "not valid YAML: unacceptable character #x0000: special characters are not "
+            'allowed in "<unicode string>", position 6',
+        ),
+        ("#" * 2**20 + "#", "cannot read the configuration: more than 1,048,576 bytes"),
         ("a:\n  - [1\nb: 2", "line 3: not valid YAML: expected ',' or ']', but got ':'"),
     ],
 )
@@ -155,6 +174,23 @@ def test_every_wrong_value_gets_its_own_line(load):
     assert str(error.value) == (
         "scenes/x.yml: densify.every must be >= 1, got 0\n"
         "scenes/x.yml: densify.split_count must be >= 2, got 1"
+    )
+
+
+def test_a_long_list_of_wrong_values_is_cut(load):
+    with pytest.raises(UserError) as error:
+        load(MINIMAL + "".join(f"k{i}: 1\n" for i in range(50_000)))
+    lines = str(error.value).splitlines()
+    assert len(lines) == 21
+    assert lines[-1] == "scenes/x.yml: 49980 more values are wrong"
+
+
+def test_a_wrong_value_is_shown_on_one_line(load):
+    with pytest.raises(UserError) as error:
+        load(MINIMAL + 'seed: ["a\\nb", 0x' + "f" * 9000 + ']\n"k\\ny": 2')
+    assert str(error.value) == (
+        "scenes/x.yml: seed must be an integer, got a number of thousands of digits\n"
+        "scenes/x.yml: unknown key k y"
     )
 
 
@@ -233,9 +269,11 @@ def test_a_dumped_configuration_reloads_equal(load, tmp_path, text):
 
 @pytest.mark.parametrize("scene", SCENES, ids=lambda path: path.stem)
 def test_shipped_configurations_load(scene):
+    """Of the shipped scene, or of data that is told where to get."""
     config = load_config(scene)
-    assert config.data.path.is_relative_to(REPOSITORY / "data")
-    assert config.data.source
+    shipped = config.data.path == REPOSITORY / "scenes" / "lego"
+    assert shipped or config.data.path.is_relative_to(REPOSITORY / "data")
+    assert shipped or config.data.source
 
 
 @pytest.mark.parametrize("name", ["lego", "lego_mini", "fox"])

@@ -163,9 +163,22 @@ def test_a_suffix_in_file_path_is_accepted(blender):
     ("change", "message"),
     [
         (lambda m: m.update(frames=[]), "frames is empty; there must be at least one view"),
-        (lambda m: m.update(frames=3), "frames must be a list of objects"),
+        (lambda m: m.update(frames=3), "frames must be a list of objects, got 3"),
+        (
+            lambda m: m.pop("frames"),
+            "frames is missing; it must be a list of objects, one per view",
+        ),
+        (lambda m: m["frames"].append(7), "frames[3] must be an object, got 7"),
         (lambda m: m.pop("camera_angle_x"), "camera_angle_x must be a finite number, got null"),
         (lambda m: m.update(camera_angle_x=0), "camera_angle_x must be > 0, got 0"),
+        (
+            lambda m: m.update(camera_angle_x=1e-5),
+            "camera_angle_x must be between 0.0001 and 3.102 (radians), got 1e-05",
+        ),
+        (
+            lambda m: m.update(camera_angle_x=10**400),
+            "camera_angle_x must be a finite number, got an integer beyond it",
+        ),
         (lambda m: m.update(camera_angle_x=40), "camera_angle_x must be < pi (radians), got 40"),
         (
             lambda m: m["frames"][1].pop("file_path"),
@@ -181,20 +194,34 @@ def test_a_suffix_in_file_path_is_accepted(blender):
         ),
         (
             lambda m: m["frames"][1].update(transform_matrix=[[1, 2], [3]]),
-            "frames[1].transform_matrix must be 4 x 4 numbers",
+            "frames[1].transform_matrix must be 4 x 4 numbers, got [[1, 2], [3]]",
+        ),
+        (
+            lambda m: m["frames"][1].update(transform_matrix=np.eye(4)[:3].tolist()),
+            "frames[1].transform_matrix must be 4 x 4 numbers, got shape (3, 4)",
+        ),
+        (
+            lambda m: m["frames"][1].update(transform_matrix=[["1"] * 4] * 4),
+            "frames[1].transform_matrix must be 4 x 4 numbers, got "
+            '[["1", "1", "1", "1"], ["1", "1", "1", "1"], ["1", "1", "...',
+        ),
+        (
+            lambda m: m["frames"][1]["transform_matrix"][2].__setitem__(3, -2e9),
+            "frames[1].transform_matrix[2][3] must be at most 1e+09 in size, got -2e+09; scale the "
+            "scene down",
         ),
         (
             lambda m: m["frames"][2]["transform_matrix"][0].__setitem__(3, math.nan),
-            "frames[2].transform_matrix must be finite",
+            "frames[2].transform_matrix[0][3] must be finite, got nan",
         ),
         (
             lambda m: m["frames"][0].update(transform_matrix=np.diag([2, 2, 2, 1]).tolist()),
-            "frames[0].transform_matrix must be rigid (rotation and translation): "
+            "frames[0].transform_matrix must be rigid (rotation and translation) to 0.0001: "
             "|R R^T - I| is 3, det R is 8",
         ),
         (
             lambda m: m["frames"][0].update(transform_matrix=np.diag([1, 1, -1, 1]).tolist()),
-            "frames[0].transform_matrix must be rigid (rotation and translation): "
+            "frames[0].transform_matrix must be rigid (rotation and translation) to 0.0001: "
             "|R R^T - I| is 0, det R is -1",
         ),
         (
@@ -207,6 +234,37 @@ def test_a_wrong_transforms_file_is_refused_with_file_and_key(blender, change, m
     path = blender[0] / "transforms_train.json"
     edit(path, change)
     assert refusal(blender[0]) == f"{path}: {message}"
+
+
+@pytest.mark.parametrize(("shear", "is_accepted"), [(0.9e-4, True), (1.1e-4, False)])
+def test_a_matrix_is_rigid_to_1e_4(blender, shear, is_accepted):
+    # R = [[1, shear, 0], [0, 1, 0], [0, 0, 1]] has |R R^T - I| = shear (and its square).
+    matrix = np.eye(4)
+    matrix[0, 1] = shear
+    path = blender[0] / "transforms_train.json"
+    edit(path, lambda m: m["frames"][0].update(transform_matrix=matrix.tolist()))
+    if is_accepted:
+        load(blender[0])
+    else:
+        assert "must be rigid (rotation and translation) to 0.0001" in refusal(blender[0])
+
+
+def test_a_picture_without_alpha_is_refused(blender):
+    path = blender[0] / "val" / "r_2.png"
+    iio.imwrite(path, np.zeros((4, 6, 3), np.uint8))
+    assert refusal(blender[0]) == (
+        f"{path}: must have an alpha channel (RGBA), as the NeRF-synthetic layout promises, got "
+        "an opaque image; save it with alpha, or use the nerfstudio layout (transforms.json)"
+    )
+
+
+def test_a_picture_of_another_size_is_refused(blender):
+    path = blender[0] / "train" / "r_2.png"
+    iio.imwrite(path, np.zeros((6, 4, 4), np.uint8))
+    assert refusal(blender[0]) == (
+        f"{path}: must be 6 x 4 px, as r_0.png is, got 4 x 6; scale the images of a split to one "
+        "size"
+    )
 
 
 def test_a_missing_image_is_named(blender):
@@ -312,6 +370,11 @@ def test_distortion_coefficients_of_zero_are_accepted(photographs):
     [
         (lambda m: m.pop("fl_x"), "fl_x is missing, and there is no camera_angle_x either"),
         (lambda m: m.update(fl_y=-1), "fl_y must be > 0, got -1"),
+        (
+            lambda m: m.update(fl_x=1e-3),
+            "fl_x must be between 0.08 and 80000 px for 8 px, got 0.001",
+        ),
+        (lambda m: m.update(cy=-700), "cy must be within 600 px of the picture, got -700"),
         (lambda m: m.update(cx="4"), 'cx must be a finite number, got "4"'),
         (
             lambda m: m.update(camera_model="OPENCV_FISHEYE"),

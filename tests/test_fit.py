@@ -19,7 +19,10 @@ from drgs.io.ply import read_ply
 
 SIZE = 32
 FIELD_OF_VIEW = 0.7
-OUTPUTS = ("point_cloud.ply", "metrics.json", "history.csv", "config.yml")
+OUTPUTS = (
+    *("point_cloud.ply", "metrics.json", "history.csv", "config.yml"),
+    *("curves.png", "orbit.webp", "orbit.gif", "report.html"),
+)
 
 
 def random_blobs(num, rng):
@@ -122,7 +125,8 @@ def test_fit_writes_its_outputs_and_nothing_temporary(fitted):
     result, out = fitted
     assert result.returncode == 0, result.stderr
     names = {str(p.relative_to(out)) for p in out.rglob("*") if p.is_file()}
-    assert names == {*OUTPUTS, *(f"renders/test/r_{i}.png" for i in range(3))}
+    pictures = {f"{kind}/test/r_{i}.png" for kind in ("renders", "side_by_side") for i in range(3)}
+    assert names == {*OUTPUTS, *pictures}
 
 
 def test_fit_reaches_a_good_picture_of_views_it_has_not_seen(fitted):
@@ -212,7 +216,7 @@ def test_stopped_fit_resumes_to_the_same_bytes(fitted, configuration, tmp_path, 
 
     resumed = fit("--resume", out)
     assert resumed.returncode == 0, resumed.stderr
-    assert "resumed at iteration" in resumed.stdout
+    assert "continues at iteration" in resumed.stdout
     for name in ("point_cloud.ply", "renders/test/r_0.png"):
         assert (out / name).read_bytes() == (first / name).read_bytes(), name
     with (out / "history.csv").open() as file:

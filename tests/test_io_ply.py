@@ -45,9 +45,11 @@ def test_written_gaussians_are_read_back_bitwise(tmp_path, degree):
         np.testing.assert_array_equal(values, getattr(expected, name), err_msg=name)
 
 
-def test_no_gaussians_are_written_and_read(tmp_path):
+def test_a_file_without_gaussians_is_refused(tmp_path):
     write_ply(tmp_path / "a.ply", random_gaussians(0, 3))
-    assert read_ply(tmp_path / "a.ply").num_gaussians == 0
+    with pytest.raises(UserError) as error:
+        read_ply(tmp_path / "a.ply")
+    assert str(error.value) == f"{tmp_path}/a.ply: element vertex must have at least 1 row, got 0"
 
 
 def test_the_file_is_laid_out_as_the_3dgs_reference_writes_it(tmp_path):
@@ -166,7 +168,7 @@ def test_a_failed_write_leaves_the_old_file(tmp_path, monkeypatch):
         raise OSError("disk full")
 
     monkeypatch.setattr(PlyData, "write", fail)
-    with pytest.raises(OSError, match="disk full"):
+    with pytest.raises(UserError, match=r"a.ply: cannot write the file: disk full"):
         write_ply(path, random_gaussians(2, 0))
     assert path.read_bytes() == before
     assert [p.name for p in tmp_path.iterdir()] == ["a.ply"]
@@ -203,16 +205,75 @@ def test_point_colours_are_scaled_to_0_1(tmp_path, values):
 
 def test_point_colours_out_of_range_are_refused(tmp_path):
     write_elements(tmp_path / "a.ply", vertex=points(**channels(np.array([0, 255], "f4"))))
-    with pytest.raises(UserError, match=r"red, green, blue must be integers or floats in 0..1"):
+    with pytest.raises(
+        UserError,
+        match=r"row 1: red, green, blue must be integers or floats in 0..1, got red = 255.0",
+    ):
         read_points(tmp_path / "a.ply")
 
 
-def test_points_that_are_not_finite_are_refused(tmp_path):
+@pytest.mark.parametrize("value", [np.nan, np.inf, 1e39])
+def test_points_that_are_not_finite_are_refused(tmp_path, value):
     rows = points()
-    rows["y"][1] = np.nan
+    rows["y"][1] = value
     write_elements(tmp_path / "a.ply", vertex=rows)
-    with pytest.raises(UserError, match=r"a.ply: 1 of 2 points have positions that are not finite"):
+    with pytest.raises(UserError) as error:
         read_points(tmp_path / "a.ply")
+    assert str(error.value) == (
+        f"{tmp_path}/a.ply: element vertex, row 1: y must be a finite float32 number, got {value} "
+        "(1 of 2 rows are not finite; remove them)"
+    )
+
+
+def test_the_first_row_that_is_not_finite_is_named(tmp_path):
+    g = random_gaussians(9, 1)
+    g.means[7, 0] = np.nan
+    g.quats[3, 2] = g.quats[5, 1] = -np.inf
+    write_ply(tmp_path / "a.ply", g)
+    with pytest.raises(UserError) as error:
+        read_ply(tmp_path / "a.ply")
+    assert str(error.value) == (
+        f"{tmp_path}/a.ply: element vertex, row 3: rot_2 must be a finite float32 number, got "
+        "-inf (3 of 9 rows are not finite; remove them)"
+    )
+
+
+def test_a_property_that_is_not_read_may_be_anything(tmp_path):
+    write_elements(tmp_path / "a.ply", vertex=points(weight=np.full(2, np.nan)))
+    assert len(read_points(tmp_path / "a.ply")[0]) == 2
+
+
+@pytest.mark.parametrize("text", [False, True], ids=["binary", "text"])
+@pytest.mark.parametrize("change", [-1, 1], ids=["fewer", "more"])
+def test_another_number_of_rows_than_the_header_says_is_refused(tmp_path, text, change):
+    path = tmp_path / "a.ply"
+    write_elements(path, text, vertex=points())
+    content = path.read_bytes()
+    path.write_bytes(content.replace(b"vertex 2", b"vertex %d" % (2 + change)))
+    message = (
+        "element vertex must have the 3 rows that the header promises, got 2: the file is cut off"
+        if change > 0
+        else r"must end after the rows that its header promises \(1 of vertex\), got \d+ bytes more"
+    )
+    with pytest.raises(UserError, match=message):
+        read_points(path)
+
+
+@pytest.mark.parametrize("count", [10**4, 10**12, 10**30])
+@pytest.mark.parametrize("text", [False, True], ids=["binary", "text"])
+def test_rows_that_the_file_cannot_hold_take_no_memory(tmp_path, text, count):
+    path = tmp_path / "a.ply"
+    write_elements(path, text, vertex=points())
+    path.write_bytes(path.read_bytes().replace(b"vertex 2", b"vertex %d" % count))
+    with pytest.raises(UserError, match=rf"its header promises {count:,} rows of element vertex"):
+        read_points(path)
+
+
+def test_a_header_without_an_end_is_refused(tmp_path):
+    path = tmp_path / "a.ply"
+    path.write_bytes(b"ply\nformat ascii 1.0\n" + b"comment x\n" * 200_000)
+    with pytest.raises(UserError, match="the header must end with end_header within the first"):
+        read_points(path)
 
 
 def test_reading_and_writing_needs_no_libllvm(tmp_path, run_python):

@@ -11,11 +11,21 @@ from conftest import REPOSITORY
 
 LAYERS = {
     0: ["_plugin_path", "arrays", "checks", "config", "constants", "files", "llvm", "reference"],
-    1: ["camera", "data", "gaussians", "io"],
+    1: ["camera", "data", "gaussians", "io", "pictures", "viewpoints"],
     2: ["projection", "rasterize", "sh", "tiles"],
     3: ["rendering"],
-    4: ["checkpoint", "densify", "losses", "metrics", "optimizer", "scene", "trainer"],
-    5: ["bench", "capture", "fit", "interrupts", "plugins", "progress", "registration", "render"],
+    4: ["checkpoint", "densify", "losses", "metrics", "optimizer", "output", "scene", "trainer"],
+    5: [
+        "bench",
+        "capture",
+        "fit",
+        "interrupts",
+        "plugins",
+        "progress",
+        "registration",
+        "render",
+        "report",
+    ],
 }
 
 LAYER_OF = {name: layer for layer, names in LAYERS.items() for name in names}

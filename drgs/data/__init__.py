@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 
 from drgs.checks import UserError
@@ -33,13 +34,19 @@ def load_dataset(config: DataConfig) -> Dataset:
 
 
 def _layout(config: DataConfig) -> str:
-    if not config.path.is_dir():
+    try:
+        names = os.listdir(config.path)
+    except FileNotFoundError:
         remedy = f"; get it from {config.source}" if config.source else ""
-        raise UserError(f"data.path: there is no folder {config.path}{remedy}")
+        raise UserError(f"data.path: there is no folder {config.path}{remedy}") from None
+    except OSError as error:
+        raise UserError(
+            f"data.path: cannot open the folder {config.path}: {error.strerror}"
+        ) from None
     if config.type != "auto":
         return config.type
     for layout, marker in _MARKERS.items():
-        if (config.path / marker).is_file():
+        if marker in names:
             return layout
     raise UserError(
         f"{config.path}: neither {' nor '.join(_MARKERS.values())} is there; data.path must be a "

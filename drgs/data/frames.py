@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path, PurePosixPath
@@ -14,26 +15,46 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from drgs.checks import UserError
+from drgs.checks import UserError, one_line
+from drgs.files import read_text
 
-RIGID_TOLERANCE = 1e-3
-"""Largest entry of |R R^T - I|: a thousand times what float32 files show, far below any shear
-or scale that matters."""
+MAX_BYTES = 1 << 28
+"""Of a transforms file: 268 MB, a thousand bytes for each of a quarter of a million views."""
+
+RIGID_TOLERANCE = 1e-4
+"""Largest entry of |R R^T - I|: eighty times what files written with float32 show (1.3e-6), far
+below any shear or scale that matters."""
+
+MAX_COORDINATE = 1e9
+"""Scene units, of a camera's position: far beyond what float32 can tell apart within a scene."""
+
+FOCAL_RANGE = (1e-2, 1e4)
+"""Focal lengths, in image sizes, that a pinhole camera can have: full angles of view from 178
+degrees down to 0.006."""
+
+MAX_OFFSET = 100
+"""Image sizes: how far the principal point may lie from the picture."""
 
 T = TypeVar("T")
 
 
 def read_transforms(path: Path) -> dict[str, Any]:
     """The content of a transforms file, with at least one frame."""
+    text = read_text(path, "file", MAX_BYTES)
     try:
-        meta = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise UserError(f"{path}: cannot read the file: {error.strerror}") from None
-    except ValueError as error:  # JSON, or UTF-8
-        raise UserError(f"{path}: not valid JSON: {error}") from None
-    frames = meta.get("frames") if isinstance(meta, dict) else None
-    if not isinstance(frames, list) or not all(isinstance(frame, dict) for frame in frames):
-        raise UserError(f"{path}: frames must be a list of objects")
+        meta = json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise UserError(f"{path}: not valid JSON: {one_line(error)}") from None
+    if not isinstance(meta, dict):
+        raise UserError(f"{path}: must hold an object with frames, got {_show(meta)}")
+    if "frames" not in meta:
+        raise UserError(f"{path}: frames is missing; it must be a list of objects, one per view")
+    frames = meta["frames"]
+    if not isinstance(frames, list):
+        raise UserError(f"{path}: frames must be a list of objects, got {_show(frames)}")
+    for index, frame in enumerate(frames):
+        if not isinstance(frame, dict):
+            raise UserError(f"{path}: frames[{index}] must be an object, got {_show(frame)}")
     if not frames:
         raise UserError(f"{path}: frames is empty; there must be at least one view")
     return meta
@@ -42,9 +63,12 @@ def read_transforms(path: Path) -> dict[str, Any]:
 def number(values: dict[str, Any], key: str, where: str) -> float:
     """``values[key]``, a finite number."""
     value = values.get(key)
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
-        raise UserError(f"{where}{key} must be a finite number, got {json.dumps(value)}")
-    return float(value)
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) < math.inf:
+        raise UserError(f"{where}{key} must be a finite number, got {_show(value)}")
+    try:
+        return float(value)
+    except OverflowError:
+        raise UserError(f"{where}{key} must be a finite number, got an integer beyond it") from None
 
 
 def positive(values: dict[str, Any], key: str, where: str) -> float:
@@ -60,30 +84,58 @@ def focal_from_angle(values: dict[str, Any], key: str, where: str, size: int) ->
     angle = positive(values, key, where)
     if angle >= math.pi:
         raise UserError(f"{where}{key} must be < pi (radians), got {angle:g}")
+    low, high = (2 * math.atan(0.5 / focal) for focal in reversed(FOCAL_RANGE))
+    if not low <= angle <= high:
+        raise UserError(
+            f"{where}{key} must be between {low:.2g} and {high:.4g} (radians), got {angle:g}"
+        )
     return 0.5 * size / math.tan(0.5 * angle)
+
+
+def focal_length(values: dict[str, Any], key: str, where: str, size: int) -> float:
+    """Focal length in px of a picture of ``size`` px."""
+    focal = positive(values, key, where)
+    low, high = (size * factor for factor in FOCAL_RANGE)
+    if not low <= focal <= high:
+        raise UserError(
+            f"{where}{key} must be between {low:g} and {high:g} px for {size} px, got {focal:g}"
+        )
+    return focal
+
+
+def principal_point(values: dict[str, Any], key: str, where: str, size: int) -> float:
+    """Coordinate in px of the principal point along ``size`` px."""
+    value = number(values, key, where)
+    if abs(value) > MAX_OFFSET * size:
+        raise UserError(
+            f"{where}{key} must be within {MAX_OFFSET * size} px of the picture, got {value:g}"
+        )
+    return value
 
 
 def opencv_camera_to_world(frame: dict[str, Any], where: str) -> np.ndarray:
     """(4, 4) float64 camera to world in OpenCV axes: columns y and z of the file's change sign."""
     key = f"{where}transform_matrix"
-    try:
-        matrix = np.array(frame["transform_matrix"], np.float64)
-    except KeyError:
-        raise UserError(f"{key} is missing") from None
-    except (TypeError, ValueError):
-        raise UserError(f"{key} must be 4 x 4 numbers") from None
-    if matrix.shape == (3, 4):
-        matrix = np.concatenate([matrix, [[0.0, 0.0, 0.0, 1.0]]])
+    if "transform_matrix" not in frame:
+        raise UserError(f"{key} is missing")
+    matrix = _numbers(frame["transform_matrix"], key)
     if matrix.shape != (4, 4):
         raise UserError(f"{key} must be 4 x 4 numbers, got shape {matrix.shape}")
     if not np.isfinite(matrix).all():
-        raise UserError(f"{key} must be finite")
+        row, column = np.argwhere(~np.isfinite(matrix))[0]
+        raise UserError(f"{key}[{row}][{column}] must be finite, got {matrix[row, column]}")
+    if np.abs(matrix).max() > MAX_COORDINATE:
+        row, column = np.unravel_index(np.abs(matrix).argmax(), matrix.shape)
+        raise UserError(
+            f"{key}[{row}][{column}] must be at most {MAX_COORDINATE:g} in size, got "
+            f"{matrix[row, column]:g}; scale the scene down"
+        )
     rotation = matrix[:3, :3]
     error = np.abs(rotation @ rotation.T - np.eye(3)).max()
     if error > RIGID_TOLERANCE or np.linalg.det(rotation) < 0:
         raise UserError(
-            f"{key} must be rigid (rotation and translation): |R R^T - I| is {error:.2g}, "
-            f"det R is {np.linalg.det(rotation):.2g}"
+            f"{key} must be rigid (rotation and translation) to {RIGID_TOLERANCE:g}: "
+            f"|R R^T - I| is {error:.2g}, det R is {np.linalg.det(rotation):.2g}"
         )
     if np.abs(matrix[3] - [0, 0, 0, 1]).max() > RIGID_TOLERANCE:
         raise UserError(f"{key} must end in the row 0 0 0 1, got {matrix[3].tolist()}")
@@ -95,11 +147,29 @@ def image_path(folder: Path, frame: dict[str, Any], where: str) -> Path:
     """The file that ``frame`` names, with ``.png`` added where its name has no suffix."""
     name = frame.get("file_path")
     if not isinstance(name, str) or not name:
-        raise UserError(f"{where}file_path must be text, got {json.dumps(name)}")
+        raise UserError(f"{where}file_path must be text, got {_show(name)}")
     for candidate in (folder / name, folder / f"{name}.png"):
-        if candidate.is_file():
+        if os.path.isfile(candidate):  # False, not an error, for a name that no file can have
             return candidate
-    raise UserError(f"{where}file_path: there is no image {folder / name} (or with .png added)")
+    raise UserError(
+        f"{where}file_path: there is no image {one_line(folder / name)} (or with .png added)"
+    )
+
+
+def _numbers(values: Any, key: str) -> np.ndarray:
+    """Nested lists of numbers, float64."""
+    try:
+        array = np.array(values)
+    except ValueError:  # rows of different lengths
+        raise UserError(f"{key} must be 4 x 4 numbers, got {_show(values)}") from None
+    if array.dtype.kind not in "iuf":
+        raise UserError(f"{key} must be 4 x 4 numbers, got {_show(values)}")
+    return array.astype(np.float64)
+
+
+def _show(value: Any) -> str:
+    """The value as JSON writes it, shortened."""
+    return one_line(json.dumps(value), limit=60)
 
 
 def unique_names(frames: Sequence[dict[str, Any]]) -> list[str]:

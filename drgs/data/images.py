@@ -2,12 +2,27 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
-import imageio.v3 as iio
 import numpy as np
+from PIL import Image
 
-from drgs.checks import UserError
+from drgs.checks import UserError, one_line
+
+MAX_PIXELS = 1 << 26
+"""67 million, as 8192 x 8192: 0.8 GB once decoded to float32."""
+
+MODES = {"L": 8, "LA": 8, "RGB": 8, "RGBA": 8, "I;16": 16, "I;16B": 16, "I": 16}
+"""Pillow's modes that are read -> bits of a channel. ``I`` holds 32, but is what some versions of
+Pillow make of a grey PNG of 16."""
+
+
+def image_size(path: Path) -> tuple[int, int]:
+    """(width, height) in px, from the file's header."""
+    with _opened(path) as image:
+        return image.size
 
 
 def read_image(path: Path) -> np.ndarray:
@@ -15,24 +30,39 @@ def read_image(path: Path) -> np.ndarray:
 
     C is 3, or 4 with straight (not premultiplied) alpha; grey images become RGB.
     """
-    try:
-        pixels = iio.imread(path, plugin="pillow")
-    except Exception as error:  # Pillow raises many types for a broken file
-        raise UserError(f"{path}: cannot read the image: {error}") from None
+    with _opened(path) as image:
+        if image.width * image.height > MAX_PIXELS:  # before memory is allocated for them
+            raise UserError(
+                f"{path}: must have at most {MAX_PIXELS:,} pixels, got {image.width} x "
+                f"{image.height}; scale the images down"
+            )
+        if image.mode == "P":
+            image = image.convert("RGBA" if "transparency" in image.info else "RGB")
+        if image.mode not in MODES:
+            raise UserError(
+                f"{path}: must be a grey, RGB or RGBA image of 8 or 16 bits, got one of Pillow's "
+                f"mode {image.mode}; convert it"
+            )
+        pixels = np.asarray(image)
+        white = 2 ** MODES[image.mode] - 1
     if pixels.ndim == 2:
         pixels = pixels[:, :, None]
-    if (
-        pixels.ndim != 3
-        or pixels.shape[2] > 4
-        or not np.issubdtype(pixels.dtype, np.unsignedinteger)
-    ):
-        raise UserError(
-            f"{path}: must be a grey, RGB or RGBA image of 8 or 16 bits, got an array of shape "
-            f"{pixels.shape} and type {pixels.dtype}"
-        )
     if pixels.shape[2] < 3:
         pixels = np.concatenate([pixels[:, :, :1]] * 3 + [pixels[:, :, 1:]], axis=2)
-    return pixels.astype(np.float32) / np.float32(np.iinfo(pixels.dtype).max)
+    return pixels.astype(np.float32) / np.float32(white)
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[Image.Image]:
+    """The image before decoding; errors of the file, also within the block, are the user's."""
+    try:
+        with Image.open(path) as image:
+            yield image
+    except UserError:
+        raise
+    except Exception as error:  # Pillow raises many types for a broken file
+        reason = getattr(error, "strerror", None) or one_line(error) or type(error).__name__
+        raise UserError(f"{path}: cannot read the image: {reason}") from None
 
 
 def composite(image: np.ndarray, background: tuple[float, float, float]) -> np.ndarray:

@@ -1,12 +1,17 @@
 """The NeRF-synthetic ("Blender") layout: ``transforms_{train,val,test}.json`` and RGBA images.
 
 Mildenhall et al. 2020. Pinhole cameras with the principal point in the middle and one horizontal
-field of view, ``camera_angle_x``, for all; images with straight alpha.
+field of view, ``camera_angle_x``, for all; images of one size in a split, with straight alpha. A
+picture without alpha is refused: what it shows behind the object would be fitted as part of it.
+Opaque photographs belong into the nerfstudio layout.
 """
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
+
+import numpy as np
 
 from drgs.checks import UserError
 from drgs.config import DataConfig
@@ -18,7 +23,7 @@ from drgs.data.frames import (
     read_transforms,
     unique_names,
 )
-from drgs.data.images import composite, downscale, read_image
+from drgs.data.images import composite, downscale, image_size, read_image
 from drgs.data.types import Dataset, View
 
 START_HALF_EXTENT = 1.3
@@ -53,7 +58,7 @@ def _test_split(config: DataConfig) -> str:
     if config.test_split is not None:
         return config.test_split
     for split in ("test", "val"):
-        if _transforms_path(config.path, split).is_file():
+        if os.path.isfile(_transforms_path(config.path, split)):
             return split
     raise UserError(
         f"{config.path}: there are no test views: neither transforms_test.json nor "
@@ -75,10 +80,13 @@ def _load_split(config: DataConfig, split: str) -> tuple[View, ...]:
         image_path(config.path, frame, at) for frame, at in zip(frames, locations, strict=True)
     ]
 
+    size = image_size(files[0])
+
     def load_view(index: int, name: str) -> View:
         camera_to_world = opencv_camera_to_world(frames[index], locations[index])
-        image = composite(read_image(files[index]), config.background_rgb)
-        image = downscale(image, config.image_size)
+        rgba = read_image(files[index])
+        _check_promises(rgba, size, files[index], files[0])
+        image = downscale(composite(rgba, config.background_rgb), config.image_size)
         height, width = image.shape[:2]
         # The angle spans the full width, so the focal length in pixels follows the image's size.
         focal = focal_from_angle(meta, "camera_angle_x", f"{path}: ", width)
@@ -95,3 +103,19 @@ def _load_split(config: DataConfig, split: str) -> tuple[View, ...]:
         )
 
     return in_parallel(load_view, range(len(frames)), unique_names(frames))
+
+
+def _check_promises(image: np.ndarray, size: tuple[int, int], file: Path, first: Path) -> None:
+    """Refuse an image (H, W, C) without alpha, or of another (width, height) than the first's."""
+    if image.shape[2] != 4:
+        raise UserError(
+            f"{file}: must have an alpha channel (RGBA), as the NeRF-synthetic layout promises, "
+            "got an opaque image; save it with alpha, or use the nerfstudio layout "
+            "(transforms.json)"
+        )
+    height, width = image.shape[:2]
+    if (width, height) != size:
+        raise UserError(
+            f"{file}: must be {size[0]} x {size[1]} px, as {first.name} is, got "
+            f"{width} x {height}; scale the images of a split to one size"
+        )

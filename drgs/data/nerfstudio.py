@@ -11,15 +11,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from drgs.checks import UserError
+from drgs.checks import UserError, one_line
 from drgs.config import DataConfig
 from drgs.data.frames import (
     focal_from_angle,
+    focal_length,
     image_path,
     in_parallel,
     number,
     opencv_camera_to_world,
     positive,
+    principal_point,
     read_transforms,
     unique_names,
 )
@@ -104,15 +106,15 @@ def _load_view(config: DataConfig, frame: _Frame, file: Path, name: str) -> View
     image = composite(read_image(file), config.background_rgb)
     height, width = image.shape[:2]
     for key, size in (("w", width), ("h", height)):
-        if key in frame and positive(*frame.at(key)) != size:
+        if key in frame and (given := positive(*frame.at(key))) != size:
             raise UserError(
                 f"{frame.at(key)[2]}{key} must be the image's size, {size} px ({file}), got "
-                f"{frame.get(key):g}; scale the intrinsics or the images"
+                f"{given:g}; scale the intrinsics or the images"
             )
     fx = _focal(frame, "x", width)
     fy = _focal(frame, "y", height) if "fl_y" in frame or "camera_angle_y" in frame else fx
-    cx = number(*frame.at("cx")) if "cx" in frame else width / 2
-    cy = number(*frame.at("cy")) if "cy" in frame else height / 2
+    cx = principal_point(*frame.at("cx"), width) if "cx" in frame else width / 2
+    cy = principal_point(*frame.at("cy"), height) if "cy" in frame else height / 2
 
     image = downscale(image, config.image_size)
     scale_x, scale_y = image.shape[1] / width, image.shape[0] / height
@@ -131,7 +133,7 @@ def _load_view(config: DataConfig, frame: _Frame, file: Path, name: str) -> View
 
 def _focal(frame: _Frame, axis: str, size: int) -> float:
     if f"fl_{axis}" in frame:
-        return positive(*frame.at(f"fl_{axis}"))
+        return focal_length(*frame.at(f"fl_{axis}"), size)
     if f"camera_angle_{axis}" in frame:
         return focal_from_angle(*frame.at(f"camera_angle_{axis}"), size)
     raise UserError(f"{frame.top}fl_{axis} is missing, and there is no camera_angle_{axis} either")
@@ -158,7 +160,7 @@ def _refuse_other_lenses(frame: _Frame) -> None:
     if model not in PINHOLE_MODELS:
         raise UserError(
             f"{frame.at('camera_model')[2]}camera_model must be one of "
-            f"{', '.join(PINHOLE_MODELS)}, got {model}"
+            f"{', '.join(PINHOLE_MODELS)}, got {one_line(model)}"
         )
     if frame.get("is_fisheye"):
         raise UserError(

@@ -1,0 +1,403 @@
+"""``python -m drgs.render WHAT --out DIR``: pictures of Gaussians, of a fit, of a Mitsuba scene.
+
+Layer 5. ``WHAT`` is one of
+
+- ``MODEL.ply``: Gaussians in the layout of the 3DGS reference implementation
+- ``OUT_DIR``: the output folder of a fit; its ``point_cloud.ply`` under its own ``config.yml``
+- ``SCENE.xml``: any Mitsuba scene; Mitsuba's own binary cannot load the plugins, which are Python
+
+Gaussians are seen from the photographs' cameras (``--split``; the pictures are then measured
+against the photographs), from an orbit (``--orbit``), from the cameras of a file (``--camera``) or
+from one placed by hand (``--origin``). A Mitsuba scene brings its own sensors.
+
+The output folder then holds one PNG per picture, and ``metrics.json`` (``--split``), an animation
+``orbit.webp`` and ``orbit.gif`` (``--orbit``), or one EXR per picture (scenes).
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+
+from drgs.checks import UserError, exit_on_user_error
+from drgs.config import NAMED_COLORS, DataConfig, FitConfig, ModelConfig, load_config
+from drgs.data import Dataset, load_dataset
+from drgs.files import atomic_path
+from drgs.gaussians import Gaussians
+from drgs.io.ply import read_ply
+from drgs.metrics import Quality, psnr, ssim
+from drgs.pictures import write_animation, write_png
+from drgs.scene import make_scene
+from drgs.trainer import render_views
+from drgs.viewpoints import (
+    FIELD_OF_VIEW,
+    Viewpoint,
+    field_of_view,
+    look_at,
+    orbit_of_gaussians,
+    orbit_of_views,
+    orbit_size,
+    pinhole,
+    read_viewpoints,
+)
+
+MODEL, CONFIG, METRICS = "point_cloud.ply", "config.yml", "metrics.json"
+"""What a fit's output folder holds."""
+
+DEFAULT_SIZE = (400, 400)
+"""px, where nothing else says how large a picture should be."""
+
+UP = (0.0, 0.0, 1.0)
+"""World: the convention of both dataset layouts."""
+
+SPLATS_VARIANTS = ("llvm_ad_rgb", "cuda_ad_rgb")
+
+
+@dataclass(frozen=True, eq=False)
+class Model:
+    """Gaussians, and how they are to be rendered."""
+
+    gaussians: Gaussians
+    settings: ModelConfig
+    background: tuple[float, float, float]  # display space
+    config: FitConfig | None  # names the dataset
+
+    def scene(self) -> mi.Scene:
+        """A Mitsuba scene that renders in display space."""
+        return make_scene(self.gaussians, self.settings, self.background)
+
+    def dataset(self, option: str) -> Dataset:
+        """The photographs, without which ``option`` is impossible."""
+        if self.config is None:
+            raise UserError(
+                f"{option}: needs photographs: give the configuration of a fit (--scene CONFIG.yml)"
+            )
+        return load_dataset(self.config.data)
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Entry point of the command."""
+    args = _parse(arguments)
+    with exit_on_user_error():
+        _check(args)
+        mi.set_variant(args.variant)
+        if args.what.suffix == ".xml":
+            render_mitsuba_scene(args.what, args.out)
+        else:
+            model = load_model(args)
+            if args.orbit is not None:
+                render_orbit(model, args)
+            elif args.camera is not None or args.origin is not None:
+                for _ in render_cameras(model, cameras(args), args.out):
+                    pass
+            else:
+                render_split(model, args.split or "test", args.out)
+        print(f"written: {args.out}")
+
+
+# ----------------------------------------------------------------------------------------------
+# What is rendered
+# ----------------------------------------------------------------------------------------------
+
+
+def load_model(args: argparse.Namespace) -> Model:
+    """The Gaussians that the command line names, with the settings of their configuration."""
+    what, config_path = args.what, args.scene
+    if what.is_dir():
+        for name in (CONFIG, MODEL):
+            if not (what / name).is_file():
+                raise UserError(
+                    f"{what}: must be the output folder of a fit that has ended, but there is no "
+                    f"{name} in it"
+                )
+        config_path = config_path or what / CONFIG
+        what = what / MODEL
+    config = _load_config(config_path, args) if config_path is not None else None
+    gaussians = read_ply(what)
+    if config is not None:
+        return Model(gaussians, config.model, config.data.background_rgb, config)
+    default = DataConfig.model_fields["background"].default
+    background = NAMED_COLORS[default] if args.background is None else _background(args)
+    return Model(gaussians, ModelConfig(), background, config=None)
+
+
+def _load_config(path: Path, args: argparse.Namespace) -> FitConfig:
+    overrides = list(args.overrides)
+    if args.data is not None:
+        overrides.append(f"data.path={args.data}")
+    if args.background is not None:
+        # Photographs with alpha are composited over it as well.
+        overrides.append(f"data.background={list(_background(args))}")
+    return load_config(path, overrides)
+
+
+def render_split(model: Model, split: str, out: Path) -> Quality:
+    """Render the views of a dataset's split, measure them, and print and write the result."""
+    dataset = model.dataset(f"--split {split}")
+    print(dataset.description)
+    views = dataset.train if split == "train" else dataset.test
+    column = max(len("view"), *(len(view.name) for view in views))
+    print(f"{'view':{column}}  PSNR [dB]    SSIM")
+    scores = []
+    for view, image in zip(views, render_views(model.scene(), views), strict=True):
+        write_png(out / f"{view.name}.png", image)
+        scores.append({"psnr": psnr(image, view.image), "ssim": ssim(image, view.image)})
+        print(f"{view.name:{column}}  {_line(**scores[-1])}", flush=True)
+    quality = Quality(
+        psnr=float(np.mean([score["psnr"] for score in scores])),
+        ssim=float(np.mean([score["ssim"] for score in scores])),
+        num_views=len(views),
+    )
+    print(f"{'mean':{column}}  {_line(quality.psnr, quality.ssim)}")
+    report = {
+        "split": dataset.test_split if split == "test" else "train",
+        "num_views": quality.num_views,
+        "num_gaussians": model.gaussians.num_gaussians,
+        "mean": {"psnr": quality.psnr, "ssim": quality.ssim},
+        "views": {view.name: score for view, score in zip(views, scores, strict=True)},
+    }
+    with atomic_path(out / METRICS) as temporary:
+        temporary.write_text(json.dumps(_without_infinities(report), indent=2) + "\n")
+    return quality
+
+
+def render_orbit(model: Model, args: argparse.Namespace) -> None:
+    """Render frames around the scene, and animations of them."""
+    if model.config is None:
+        fov, size = args.fov or FIELD_OF_VIEW, args.size or DEFAULT_SIZE
+        orbit = orbit_of_gaussians(model.gaussians, np.array(args.up or UP), fov)
+    else:
+        views = model.dataset("--orbit").train
+        fov, size = args.fov or field_of_view(views), args.size or orbit_size(views)
+        orbit = orbit_of_views(views, model.gaussians)
+    viewpoints = orbit.viewpoints(args.orbit, *size, fov)
+    write_animation(args.out / "orbit.webp", render_cameras(model, viewpoints, args.out))
+
+
+def render_cameras(
+    model: Model, viewpoints: Sequence[Viewpoint], out: Path
+) -> Iterator[np.ndarray]:
+    """Write and yield pictures that no photographs belong to."""
+    for camera, image in zip(viewpoints, render_views(model.scene(), viewpoints), strict=True):
+        write_png(out / f"{camera.name}.png", image)
+        print(f"{camera.name}: {camera.width}x{camera.height}", flush=True)
+        yield image
+
+
+def cameras(args: argparse.Namespace) -> list[Viewpoint]:
+    """The cameras of ``--camera``, or the one of ``--origin``."""
+    size = tuple(args.size) if args.size else None
+    if args.camera is not None:
+        return read_viewpoints(args.camera, size)
+    pose = look_at(args.origin, args.target or (0.0, 0.0, 0.0), args.up or UP)
+    return [pinhole("camera", pose, *(size or DEFAULT_SIZE), args.fov or FIELD_OF_VIEW)]
+
+
+def render_mitsuba_scene(path: Path, out: Path) -> None:
+    """Render every sensor of a Mitsuba scene with the scene's own integrator.
+
+    The EXR holds all channels as the film has them, the PNG the colours alone, sRGB-encoded. What
+    a ``splats`` integrator with ``srgb_primitives`` false returns is display space already.
+    """
+    try:
+        scene = mi.load_file(str(path))
+    except RuntimeError as error:
+        raise UserError(f"{path}: {_first_and_last(str(error))}") from None
+    if scene.integrator() is None or not scene.sensors():
+        raise UserError(f"{path}: the scene must hold an integrator and at least one sensor")
+    linear = getattr(scene.integrator(), "srgb_primitives", True)
+    for index, sensor in enumerate(scene.sensors()):
+        name = path.stem if len(scene.sensors()) == 1 else f"{path.stem}_{index}"
+        _render_sensor(path, scene, index)
+        bitmap = sensor.film().bitmap()
+        width, height = bitmap.size()
+        _write_exr(out / f"{name}.exr", bitmap)
+        # As floats: Mitsuba's own conversion to 8 bits rounds down.
+        colors = bitmap.split()[0][1].convert(
+            mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.Float32, srgb_gamma=linear
+        )
+        write_png(out / f"{name}.png", np.array(colors))
+        print(f"{name}: {width}x{height}")
+
+
+def _render_sensor(path: Path, scene: mi.Scene, index: int) -> None:
+    """Leave the picture in the sensor's film."""
+    try:
+        scene.integrator().render(scene, sensor=index)
+    except (RuntimeError, TypeError, ValueError) as error:
+        # What the plugin refuses is the scene's fault; anything else is not.
+        if not str(error).startswith("splats: "):
+            raise
+        raise UserError(f"{path}: {_first_and_last(str(error))}") from None
+
+
+# ----------------------------------------------------------------------------------------------
+# Arguments, messages, files
+# ----------------------------------------------------------------------------------------------
+
+
+def _check(args: argparse.Namespace) -> None:
+    """Refuse what does not go together, before anything is read or written."""
+    if not args.what.exists():
+        raise UserError(f"{args.what}: there is no such file or folder")
+    if (args.out / CONFIG).exists():
+        raise UserError(f"--out {args.out}: holds a fit, whose {METRICS} would be overwritten")
+    if args.what.suffix == ".xml":
+        reason = "is not used with a Mitsuba scene, which brings its own cameras and settings"
+        _check_unused(args, reason, _OPTIONS)
+        _check_variant(args, mi.variants())
+    elif args.what.suffix == ".ply" or args.what.is_dir():
+        _check_variant(args, SPLATS_VARIANTS)
+        _check_cameras(args)
+        _check_numbers(args)
+    else:
+        raise UserError(
+            f"{args.what}: must be a PLY file, a Mitsuba scene (.xml) or the output folder of a fit"
+        )
+
+
+def _check_variant(args: argparse.Namespace, allowed: Sequence[str]) -> None:
+    if args.variant not in allowed:
+        raise UserError(f"--variant: must be one of {', '.join(allowed)}, got {args.variant}")
+
+
+def _check_cameras(args: argparse.Namespace) -> None:
+    """Exactly one way of placing cameras, and no option that it does not use."""
+    modes = {f"--{name}": getattr(args, name) for name in ("split", "orbit", "camera", "origin")}
+    given = [mode for mode, value in modes.items() if value is not None]
+    has_photographs = args.scene is not None or args.what.is_dir()
+    if len(given) > 1:
+        raise UserError(f"{' and '.join(given)} exclude each other")
+    if not given and not has_photographs:
+        raise UserError(
+            f"{args.what}: say what to render: --orbit N, --camera FILE.json, --origin X Y Z, "
+            "or --split with --scene CONFIG.yml"
+        )
+    mode = given[0] if given else "--split"
+    _check_unused(args, f"is not used with {mode}", _UNUSED[mode])
+    if has_photographs and mode == "--orbit":
+        _check_unused(args, "is not used here: it follows from the photographs' cameras", ("up",))
+    if not has_photographs:
+        _check_unused(args, "needs --scene CONFIG.yml", ("data", "overrides"))
+
+
+def _check_numbers(args: argparse.Namespace) -> None:
+    if args.size is not None and min(args.size) < 1:
+        raise UserError(f"--size: must be >= 1 px, got {args.size[0]} {args.size[1]}")
+    if args.orbit is not None and args.orbit < 1:
+        raise UserError(f"--orbit: must be >= 1 frame, got {args.orbit}")
+    if args.fov is not None and not 0 < args.fov < 180:
+        raise UserError(f"--fov: must be between 0 and 180 degrees, got {args.fov:g}")
+    for name in ("origin", "target", "up"):
+        vector = getattr(args, name)
+        if vector is not None and not np.isfinite(vector).all():
+            raise UserError(f"--{name}: must be three finite numbers, got {vector}")
+
+
+_OPTIONS = (
+    *("scene", "data", "overrides", "split", "orbit", "camera", "origin"),
+    *("target", "up", "fov", "size", "background"),
+)
+"""All options that concern Gaussians."""
+
+_UNUSED = {
+    "--split": ("target", "up", "fov", "size"),
+    "--orbit": ("target",),
+    "--camera": ("target", "up", "fov"),
+    "--origin": (),
+}
+
+
+def _check_unused(args: argparse.Namespace, reason: str, names: Sequence[str]) -> None:
+    for name in names:
+        if getattr(args, name) not in (None, []):
+            option = "--set" if name == "overrides" else f"--{name}"
+            raise UserError(f"{option}: {reason}")
+
+
+def _background(args: argparse.Namespace) -> tuple[float, float, float]:
+    """Display space: a colour by name, or three numbers."""
+    words = args.background
+    if len(words) == 1 and words[0] in NAMED_COLORS:
+        return NAMED_COLORS[words[0]]
+    try:
+        color = tuple(float(word) for word in words)
+    except ValueError:
+        color = ()
+    if len(color) != 3 or not all(0 <= value <= 1 for value in color):
+        raise UserError(
+            f"--background: must be white, black or three numbers in 0..1, got {' '.join(words)}"
+        )
+    return color
+
+
+def _line(psnr: float, ssim: float) -> str:
+    return f"{psnr:9.2f}  {ssim:.4f}"
+
+
+def _without_infinities(value: Any) -> Any:
+    """The PSNR of equal pictures is infinite, for which JSON has no number: null."""
+    if isinstance(value, dict):
+        return {key: _without_infinities(item) for key, item in value.items()}
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _first_and_last(message: str) -> str:
+    """One line of Mitsuba's message: where, and the error itself, without a traceback between."""
+    head, *rest = re.sub(r"^\[[\w.]+:\d+\] ", "", message.strip()).splitlines()
+    head = head.removesuffix("Traceback (most recent call last):").strip()
+    last = re.sub(r"^\w*(Error|Exception): ", "", rest[-1].strip()) if rest else ""
+    return f"{head} {last}".strip()
+
+
+def _write_exr(path: Path, bitmap: mi.Bitmap) -> None:
+    """Write through memory: an error of the disk is then Python's, and names the file."""
+    stream = mi.MemoryStream()
+    bitmap.write(stream, mi.Bitmap.FileFormat.OpenEXR)
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(stream.raw_buffer())
+
+
+def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(
+        prog="python -m drgs.render",
+        description="Render Gaussians, a fit, or a Mitsuba scene with the splats integrator.",
+    )
+    add = parser.add_argument
+    add("what", type=Path, metavar="MODEL.ply|SCENE.xml|OUT_DIR", help="what to render")
+    add("--out", type=Path, required=True, metavar="DIR", help="output folder")
+    add("--split", choices=("test", "train"), help="the photographs' cameras, with PSNR and SSIM")
+    add("--orbit", type=int, metavar="N", help="N frames around the scene, and an animation")
+    add("--camera", type=Path, metavar="FILE.json", help="cameras in the layout of transforms.json")
+    vector = {"type": float, "nargs": 3, "metavar": ("X", "Y", "Z")}
+    add("--origin", **vector, help="one camera, here")
+    add("--target", **vector, help="what it looks at (default: 0 0 0)")
+    add("--up", **vector, help="up in the picture, of --origin or --orbit (default: 0 0 1)")
+    add("--fov", type=float, metavar="DEGREES", help="horizontal field of view (default: 40)")
+    add("--size", type=int, nargs=2, metavar=("W", "H"), help="px (default: 400 400)")
+    add("--background", nargs="+", metavar="COLOR", help="white, black or R G B in 0..1")
+    add("--scene", type=Path, metavar="CONFIG.yml", help="configuration that names the photographs")
+    add("--data", metavar="DIR", help="dataset folder (data.path)")
+    add(
+        "--set",
+        dest="overrides",
+        action="append",
+        default=[],
+        metavar="KEY=VALUE",
+        help="override a value of the configuration, as in data.image_size=200; repeatable",
+    )
+    add("--variant", default="llvm_ad_rgb", help="Mitsuba variant (default: llvm_ad_rgb)")
+    return parser.parse_args(arguments)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,435 @@
+"""What a fit shows of itself: comparisons, curves, an orbit, and a page that holds all of it.
+
+Layer 5. The fit command calls :func:`write_results` at its end. Everything is computed from what
+the fit already has: its pictures of the test views, its history, its scene.
+"""
+
+from __future__ import annotations
+
+import base64
+import html
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from string import Template
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+import yaml
+
+from drgs.data.images import downscale
+from drgs.data.types import Dataset
+from drgs.files import atomic_path
+from drgs.gaussians import Gaussians
+from drgs.metrics import psnr, ssim
+from drgs.pictures import encode, write_animation, write_png
+from drgs.trainer import render_views
+from drgs.viewpoints import field_of_view, orbit_of_views, orbit_size
+
+DIFFERENCE_GAIN = 5.0
+"""Of difference pictures, 0.5 + gain (fitted - photograph): saturates at 10 % of the range."""
+
+GAP = 4
+"""px between the pictures of a comparison, white."""
+
+ORBIT_FRAMES = 60
+
+PANEL_WIDTH = 360
+"""px: of each of the three pictures of a comparison in the page, at most."""
+
+SMOOTHING_PARTS = 50
+"""The smooth line of a curve is a running mean over this part of all rows."""
+
+
+# ----------------------------------------------------------------------------------------------
+# Files
+# ----------------------------------------------------------------------------------------------
+
+
+def write_results(
+    out: Path,
+    dataset: Dataset,
+    scene: mi.Scene,
+    gaussians: Gaussians,
+    images: Sequence[np.ndarray],
+    history: Sequence[Any],
+    metrics: dict[str, Any],
+) -> None:
+    """Write ``side_by_side/``, ``curves.png``, ``orbit.webp`` and ``.gif``, ``report.html``.
+
+    scene: renders ``gaussians``, in display space; images: (H, W, 3) display space, of the test
+    views, in their order; history: rows as of ``history.csv``; metrics: as of ``metrics.json``.
+    """
+    write_side_by_side(out / "side_by_side" / dataset.test_split, dataset, images)
+    write_curves(out / "curves.png", history)
+    write_orbit(out / "orbit.webp", scene, dataset, gaussians)
+    orbit = (out / "orbit.webp").read_bytes()
+    write_report(out / "report.html", out.name, dataset, images, history, metrics, orbit)
+
+
+def write_side_by_side(folder: Path, dataset: Dataset, images: Iterable[np.ndarray]) -> None:
+    """Write one PNG per test view: fitted, photograph, difference."""
+    for view, image in zip(dataset.test, images, strict=True):
+        write_png(folder / f"{view.name}.png", side_by_side(image, view.image))
+
+
+def side_by_side(image: np.ndarray, photograph: np.ndarray) -> np.ndarray:
+    """(H, 3 W + 2 gaps, 3): fitted, photograph, 0.5 + 5 (fitted - photograph)."""
+    difference = np.clip(0.5 + DIFFERENCE_GAIN * (image - photograph), 0, 1)
+    gap = np.ones((len(image), GAP, 3), np.float32)
+    return np.concatenate([image, gap, photograph, gap, difference], axis=1)
+
+
+def write_curves(path: Path, history: Sequence[Any]) -> None:
+    """Write a picture of the loss, the PSNR, the population and the rates over the iterations."""
+    with atomic_path(path) as temporary:
+        _curves(history, LIGHT).savefig(temporary)
+
+
+def write_orbit(path: Path, scene: mi.Scene, dataset: Dataset, gaussians: Gaussians) -> None:
+    """Write an animation around what the training cameras look at: ``path`` (WebP) and a GIF."""
+    orbit = orbit_of_views(dataset.train, gaussians)
+    cameras = orbit.viewpoints(
+        ORBIT_FRAMES, *orbit_size(dataset.train), field_of_view(dataset.train)
+    )
+    write_animation(path, render_views(scene, cameras))
+
+
+def write_report(
+    path: Path,
+    title: str,
+    dataset: Dataset,
+    images: Sequence[np.ndarray],
+    history: Sequence[Any],
+    metrics: dict[str, Any],
+    orbit: bytes,
+) -> None:
+    """Write one HTML file with everything in it, which needs no network and no other file.
+
+    images: of the test views, in their order; metrics: as of ``metrics.json``; orbit: the bytes
+    of an animated WebP.
+    """
+    scores = [psnr(image, view.image) for image, view in zip(images, dataset.test, strict=True)]
+    light, dark = (_data_uri(_pixels(_curves(history, theme)), lossless=True) for theme in THEMES)
+    page = PAGE.substitute(
+        title=html.escape(title),
+        description=html.escape(dataset.description),
+        tiles="".join(_tile(*tile) for tile in _headline(metrics)),
+        facts="".join(_row(*fact) for fact in _facts(dataset, metrics)),
+        split=html.escape(dataset.test_split),
+        orbit=_uri("image/webp", orbit),
+        comparisons="".join(
+            _comparison(dataset, images, scores, *choice) for choice in choose_views(scores)
+        ),
+        gain=f"{DIFFERENCE_GAIN:g}",
+        curves_light=light,
+        curves_dark=dark,
+        views="".join(
+            _row(view.name, f"{score:.2f}")
+            for view, score in zip(dataset.test, scores, strict=True)
+        ),
+        config=html.escape(yaml.safe_dump(metrics["config"], sort_keys=False)),
+    )
+    with atomic_path(path) as temporary:
+        temporary.write_text(page, encoding="utf-8")
+
+
+def choose_views(scores: Sequence[float]) -> list[tuple[str, int]]:
+    """(label, index) of the best, the median and the worst of the views; of all if they are few."""
+    order = sorted(range(len(scores)), key=lambda index: -scores[index])
+    if len(order) < 3:
+        return [("View", index) for index in order]
+    return [("Best", order[0]), ("Median", order[len(order) // 2]), ("Worst", order[-1])]
+
+
+# ----------------------------------------------------------------------------------------------
+# Curves
+# ----------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Theme:
+    """Colours of the curves."""
+
+    paper: str
+    ink: str
+    faint: str
+    raw: str  # single iterations
+    line: str
+
+
+LIGHT = Theme(paper="#ffffff", ink="#1d2330", faint="#e3e6ec", raw="#b9cdf0", line="#1f5fd0")
+DARK = Theme(paper="#1a1e27", ink="#d8dde8", faint="#333a48", raw="#34507f", line="#7fb0ff")
+THEMES = (LIGHT, DARK)
+
+
+@dataclass(frozen=True)
+class Panel:
+    """One curve."""
+
+    title: str
+    x: np.ndarray  # (n,) iterations
+    y: np.ndarray  # (n,)
+    scale: str = "linear"  # of y: "linear" or "log"
+    bottom: float | None = None  # of y's range; None: as the values have it
+    noisy: bool = False  # drawn with its running mean
+
+
+def _panels(history: Sequence[Any]) -> list[Panel]:
+    def column(name: str) -> np.ndarray:
+        return np.array([getattr(row, name) for row in history], np.float64)
+
+    x, wall_s = column("iteration"), column("wall_s")
+    # Two rows may carry one time: the clock's resolution, or a run that was resumed.
+    speed = np.diff(x) / np.maximum(np.diff(wall_s), 1e-3)
+    return [
+        Panel("Loss", x, column("loss"), scale="log", noisy=True),
+        Panel("PSNR of the training view [dB]", x, column("psnr"), noisy=True),
+        Panel("Gaussians", x, column("num_gaussians"), bottom=0),
+        Panel("Learning rate of the means", x, column("means_lr"), scale="log"),
+        Panel("Iterations per second", x[1:], speed, bottom=0, noisy=True),
+        Panel("Time [min]", x, wall_s / 60, bottom=0),
+    ]
+
+
+def _curves(history: Sequence[Any], theme: Theme) -> Any:
+    """A matplotlib figure of six panels over the iterations."""
+    # Imported here because it takes half a second, which a command that fails early should not.
+    # Without pyplot no window system is looked for.
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(11, 5.8), dpi=110, facecolor=theme.paper, layout="constrained")
+    figure.get_layout_engine().set(w_pad=0.1, h_pad=0.1)
+    FigureCanvasAgg(figure)
+    axes = figure.subplots(2, 3)
+    for axis, panel in zip(axes.flat, _panels(history), strict=True):
+        _draw(axis, panel, theme)
+    axes[0, 2].yaxis.set_major_formatter("{x:,.0f}")
+    for axis in axes[-1]:
+        axis.set_xlabel("iteration", fontsize=8.5, color=theme.ink)
+    return figure
+
+
+def _draw(axis: Any, panel: Panel, theme: Theme) -> None:
+    y = panel.y
+    axis.set_title(panel.title, fontsize=10, color=theme.ink, loc="left")
+    axis.set_yscale(panel.scale)
+    if panel.noisy:
+        axis.plot(panel.x, y, color=theme.raw, linewidth=0.7)
+        y = _running_mean(y)
+    axis.plot(panel.x, y, color=theme.line, linewidth=1.7)
+    if panel.bottom is not None:
+        axis.set_ylim(bottom=panel.bottom)
+    axis.set_facecolor(theme.paper)
+    axis.grid(color=theme.faint, linewidth=0.7)
+    axis.tick_params(colors=theme.ink, labelsize=8, length=0, which="both")
+    axis.spines[:].set_visible(False)
+
+
+def _running_mean(values: np.ndarray) -> np.ndarray:
+    """Centred, over a 50th of all rows; narrower at the ends."""
+    reach = len(values) // (2 * SMOOTHING_PARTS)
+    total = np.concatenate([[0.0], np.cumsum(values)])
+    index = np.arange(len(values))
+    first, end = np.maximum(index - reach, 0), np.minimum(index + reach + 1, len(values))
+    return (total[end] - total[first]) / (end - first)
+
+
+def _pixels(figure: Any) -> np.ndarray:
+    """(H, W, 3) 0..1."""
+    figure.canvas.draw()
+    return np.asarray(figure.canvas.buffer_rgba())[:, :, :3] / 255
+
+
+# ----------------------------------------------------------------------------------------------
+# Page
+# ----------------------------------------------------------------------------------------------
+
+
+def _headline(metrics: dict[str, Any]) -> list[tuple[str, str, str]]:
+    """(value, unit, label) of the four numbers at the top."""
+    test = metrics["test"]
+    return [
+        (f"{test['psnr']:.2f}", "dB", f"PSNR, mean of {test['num_views']} {test['split']} views"),
+        (f"{test['ssim']:.4f}", "", "SSIM"),
+        (f"{metrics['num_gaussians']:,}", "", "Gaussians"),
+        (duration(metrics["wall_s"]), "", f"for {metrics['iterations']:,} iterations"),
+    ]
+
+
+def _facts(dataset: Dataset, metrics: dict[str, Any]) -> list[tuple[str, str]]:
+    versions = metrics["versions"]
+    names = {"mitsuba": "Mitsuba", "drjit": "Dr.Jit", "numpy": "NumPy", "python": "Python"}
+    names["llvm"] = "LLVM"
+    speed = metrics["iterations"] / max(metrics["wall_s"], 1e-9)
+    return [
+        ("Training views", f"{len(dataset.train)}"),
+        ("Test views", f"{len(dataset.test)} (split {dataset.test_split})"),
+        ("Iterations per second", f"{speed:.1f}"),
+        ("Threads", f"{metrics['threads']}"),
+        ("Mitsuba variant", metrics["variant"]),
+        ("Seed", f"{metrics['seed']}"),
+        ("Versions", ", ".join(f"{names.get(k, k)} {v}" for k, v in versions.items())),
+    ]
+
+
+def duration(seconds: float) -> str:
+    """``9 min 51 s``."""
+    minutes, rest = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    if hours:
+        return f"{hours} h {minutes} min"
+    return f"{minutes} min {rest} s" if minutes else f"{rest} s"
+
+
+def _comparison(
+    dataset: Dataset,
+    images: Sequence[np.ndarray],
+    scores: Sequence[float],
+    label: str,
+    index: int,
+) -> str:
+    view, image = dataset.test[index], images[index]
+    panels = {
+        "Fitted": image,
+        "Photograph": view.image,
+        "Difference": 0.5 + DIFFERENCE_GAIN * (image - view.image),
+    }
+    pictures = "".join(
+        f'<img alt="{name} {html.escape(view.name)}" '
+        f'src="{_data_uri(downscale(np.clip(picture, 0, 1), PANEL_WIDTH), quality=88)}">'
+        for name, picture in panels.items()
+    )
+    caption = (
+        f"<b>{label}: {html.escape(view.name)}</b> PSNR {_decibels(scores[index])}, "
+        f"SSIM {ssim(image, view.image):.4f}"
+    )
+    return f'<figure><figcaption>{caption}</figcaption><div class="three">{pictures}</div></figure>'
+
+
+def _decibels(value: float) -> str:
+    return f"{value:.2f} dB" if math.isfinite(value) else "infinite"
+
+
+def _tile(value: str, unit: str, label: str) -> str:
+    unit = f" <small>{unit}</small>" if unit else ""
+    return (
+        f"<div><strong>{html.escape(value)}{unit}</strong><span>{html.escape(label)}</span></div>"
+    )
+
+
+def _row(name: str, value: str) -> str:
+    return f"<tr><th>{html.escape(name)}</th><td>{html.escape(value)}</td></tr>"
+
+
+def _data_uri(image: np.ndarray, **options: Any) -> str:
+    return _uri("image/webp", encode(image, "WEBP", **options))
+
+
+def _uri(kind: str, data: bytes) -> str:
+    return f"data:{kind};base64,{base64.b64encode(data).decode('ascii')}"
+
+
+PAGE = Template("""<!DOCTYPE html>
+<html lang="en">
+<head>
+<meta charset="utf-8">
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<title>$title: Gaussian splats</title>
+<link rel="icon" href="data:,">
+<style>
+:root {
+  color-scheme: light dark;
+  --page: #f3f5f8; --card: #ffffff; --ink: #1d2330; --soft: #5c6577; --line: #e3e6ec;
+}
+@media (prefers-color-scheme: dark) {
+  :root { --page: #11141a; --card: #1a1e27; --ink: #e2e6ee; --soft: #98a2b5; --line: #2c3340; }
+}
+* { box-sizing: border-box; }
+body {
+  margin: 0; padding: 2.5rem 1.25rem 3rem; background: var(--page); color: var(--ink);
+  font: 16px/1.5 system-ui, -apple-system, "Segoe UI", Roboto, "DejaVu Sans", sans-serif;
+}
+main { max-width: 1120px; margin: 0 auto; }
+h1 { font-size: 2rem; line-height: 1.2; margin: 0; letter-spacing: -0.01em; }
+h2 { font-size: 1.15rem; margin: 2.5rem 0 0.8rem; }
+p { margin: 0.4rem 0 0; color: var(--soft); }
+img { display: block; max-width: 100%; height: auto; border-radius: 6px; }
+.card {
+  background: var(--card); border: 1px solid var(--line); border-radius: 12px; padding: 1rem;
+}
+.top {
+  display: grid; grid-template-columns: minmax(0, 432px) minmax(0, 1fr); gap: 1.25rem;
+  margin-top: 1.5rem;
+}
+.top > .card:first-child { display: grid; place-items: center; }
+.top > .card:first-child img { width: 100%; }
+.tiles { display: grid; grid-template-columns: 1fr 1fr; gap: 1.25rem; margin-bottom: 1rem; }
+.tiles strong { display: block; font-size: 1.7rem; line-height: 1.2; white-space: nowrap; }
+.tiles small { font-size: 1rem; font-weight: 500; }
+.tiles span { color: var(--soft); font-size: 0.88rem; }
+table { border-collapse: collapse; width: 100%; font-size: 0.9rem; }
+th, td { text-align: left; padding: 0.4rem 0; border-top: 1px solid var(--line); }
+th { font-weight: 400; color: var(--soft); padding-right: 1.25rem; white-space: nowrap; }
+th, td { vertical-align: top; font-variant-numeric: tabular-nums; }
+figure { margin: 0 0 1.25rem; }
+figure:last-of-type { margin: 0; }
+figcaption { margin-bottom: 0.5rem; color: var(--soft); font-size: 0.9rem; }
+figcaption b { color: var(--ink); margin-right: 0.6rem; }
+.three { display: grid; grid-template-columns: repeat(3, minmax(0, 1fr)); gap: 0.6rem; }
+.three img { width: 100%; }
+.labels { color: var(--soft); font-size: 0.85rem; margin-bottom: 0.9rem; }
+details { margin-top: 1.25rem; }
+summary { cursor: pointer; font-weight: 600; }
+pre { overflow-x: auto; font-size: 0.84rem; line-height: 1.45; margin: 0.8rem 0 0; }
+.columns { columns: 4 11rem; column-gap: 2rem; margin-top: 0.8rem; }
+.columns td { text-align: right; }
+@media (max-width: 820px) { .top { grid-template-columns: minmax(0, 1fr); } }
+</style>
+</head>
+<body>
+<main>
+<h1>$title</h1>
+<p>3D Gaussian splats fitted by drgs to $description.</p>
+
+<div class="top">
+<div class="card"><img alt="orbit around the fitted scene" src="$orbit"></div>
+<div class="card">
+<div class="tiles">$tiles</div>
+<table>$facts</table>
+</div>
+</div>
+
+<h2>Views of split $split</h2>
+<div class="card">
+<div class="three labels">
+<div>Fitted</div><div>Photograph</div>
+<div>Difference: 0.5 + $gain (fitted &minus; photograph), grey where equal</div>
+</div>
+$comparisons
+</div>
+
+<h2>Training</h2>
+<div class="card">
+<picture>
+<source media="(prefers-color-scheme: dark)" srcset="$curves_dark">
+<img alt="loss, PSNR, population and rates over the iterations" src="$curves_light">
+</picture>
+</div>
+
+<details class="card">
+<summary>PSNR of every test view [dB]</summary>
+<div class="columns"><table>$views</table></div>
+</details>
+
+<details class="card">
+<summary>Configuration, every value</summary>
+<pre>$config</pre>
+</details>
+</main>
+</body>
+</html>
+""")

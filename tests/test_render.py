@@ -1,0 +1,352 @@
+"""``python -m drgs.render``, against the float64 reference and PSNR computed plainly."""
+
+import json
+import subprocess
+import sys
+
+import imageio.v3 as iio
+import mitsuba as mi
+import numpy as np
+import pytest
+import yaml
+from conftest import REPOSITORY
+from small_capture import (
+    FIELD_OF_VIEW,
+    FOCUS,
+    HEIGHT,
+    WIDTH,
+    assert_pictures_agree,
+    blobs,
+    decibels,
+    make_dataset,
+    photograph,
+    pose_around,
+    write_dataset,
+)
+from small_capture import view as small_view
+
+from drgs import render
+from drgs.io.ply import write_ply
+from drgs.viewpoints import orbit_of_gaussians, orbit_of_views
+
+WHITE = (1.0, 1.0, 1.0)
+
+
+@pytest.fixture(scope="module")
+def fit(tmp_path_factory):
+    """A folder as a fit leaves it, with its dataset."""
+    folder = tmp_path_factory.mktemp("fit")
+    write_dataset(folder / "data", make_dataset())
+    write_ply(folder / "run" / "point_cloud.ply", blobs())
+    config = {"data": {"path": str(folder / "data"), "background": "white"}}
+    (folder / "run" / "config.yml").write_text(yaml.safe_dump(config))
+    return folder / "run"
+
+
+def photo(fit, name, background, split="test"):
+    """A photograph of the dataset over a background."""
+    rgba = iio.imread(fit.parent / "data" / split / f"{name}.png") / 255
+    return rgba[:, :, :3] * rgba[:, :, 3:] + np.array(background) * (1 - rgba[:, :, 3:])
+
+
+def picture(path):
+    return iio.imread(path) / 255
+
+
+def run(*arguments):
+    render.main([str(argument) for argument in arguments])
+
+
+def fails(capsys, *arguments):
+    """The one line that the command prints before it exits with 2."""
+    with pytest.raises(SystemExit) as exit_info:
+        run(*arguments)
+    assert exit_info.value.code == 2
+    (line,) = capsys.readouterr().err.strip().splitlines()
+    return line.removeprefix("error: ")
+
+
+# A picture of 8 bits is within half a level of what was rendered; the renderer is within 1e-4.
+EIGHT_BITS = 0.5 / 255 + 1e-4
+
+
+def assert_shows(path, camera, background):
+    """The file is the picture that the reference makes of the blobs."""
+    expected = photograph(blobs(), camera, background)
+    assert_pictures_agree(picture(path), np.clip(expected.image, 0, 1), expected, EIGHT_BITS)
+    return np.clip(expected.image, 0, 1)
+
+
+# ----------------------------------------------------------------------------------------------
+# Views with photographs
+# ----------------------------------------------------------------------------------------------
+
+
+def test_a_fit_is_rendered_from_its_test_views_and_measured(fit, tmp_path, capsys):
+    run(fit, "--out", tmp_path)
+    metrics = json.loads((tmp_path / "metrics.json").read_text())
+    printed = {line.split()[0]: line.split()[1:] for line in capsys.readouterr().out.splitlines()}
+    scores = []
+    for view in make_dataset().test:
+        expected = assert_shows(tmp_path / f"{view.name}.png", view, WHITE)
+        scores.append(decibels(expected, photo(fit, view.name, WHITE)))
+        # float32 against float64.
+        assert metrics["views"][view.name]["psnr"] == pytest.approx(scores[-1], abs=1e-3)
+        assert float(printed[view.name][0]) == pytest.approx(scores[-1], abs=0.006)
+    assert metrics["mean"]["psnr"] == pytest.approx(np.mean(scores), abs=1e-3)
+    assert float(printed["mean"][0]) == pytest.approx(np.mean(scores), abs=0.006)
+    ssims = [score["ssim"] for score in metrics["views"].values()]
+    assert metrics["mean"]["ssim"] == pytest.approx(np.mean(ssims))
+    assert (metrics["split"], metrics["num_views"], metrics["num_gaussians"]) == ("test", 4, 30)
+
+
+def test_a_ply_is_rendered_under_a_configuration(fit, tmp_path):
+    run(fit, "--split", "train", "--out", tmp_path / "fit")
+    ply = fit / "point_cloud.ply"
+    run(ply, "--scene", fit / "config.yml", "--split", "train", "--out", tmp_path / "ply")
+    names = {path.name for path in (tmp_path / "fit").iterdir()}
+    assert names == {"metrics.json", *(f"r_{i}.png" for i in range(8))}
+    for name in names:
+        assert (tmp_path / "fit" / name).read_bytes() == (tmp_path / "ply" / name).read_bytes()
+
+
+def test_a_background_is_behind_splats_and_photographs(fit, tmp_path):
+    background = (0.0, 0.5, 0.25)
+    run(fit, "--background", *background, "--out", tmp_path)
+    expected = assert_shows(tmp_path / "r_1.png", make_dataset().test[1], background)
+    score = decibels(expected, photo(fit, "r_1", background))
+    metrics = json.loads((tmp_path / "metrics.json").read_text())
+    assert metrics["views"]["r_1"]["psnr"] == pytest.approx(score, abs=1e-3)
+
+
+def test_values_of_the_configuration_can_be_set(fit, tmp_path):
+    run(fit, "--set", "data.image_size=16", "--out", tmp_path)
+    assert picture(tmp_path / "r_0.png").shape == (HEIGHT // 2, WIDTH // 2, 3)
+
+
+def test_a_picture_equal_to_its_photograph_has_no_number_in_json():
+    quality = {"psnr": float("inf"), "views": {"a": {"psnr": 3.5}}}
+    assert render._without_infinities(quality) == {"psnr": None, "views": {"a": {"psnr": 3.5}}}
+
+
+# ----------------------------------------------------------------------------------------------
+# Views without
+# ----------------------------------------------------------------------------------------------
+
+
+def test_an_orbit_is_around_what_the_photographs_show(fit, tmp_path):
+    run(fit, "--orbit", "5", "--out", tmp_path)
+    names = [f"orbit_{i:03d}.png" for i in range(5)]
+    assert {path.name for path in tmp_path.iterdir()} == {"orbit.webp", "orbit.gif", *names}
+    fov = float(np.degrees(FIELD_OF_VIEW))
+    cameras = orbit_of_views(make_dataset().train, blobs()).viewpoints(5, WIDTH, HEIGHT, fov)
+    for name, camera in zip(names, cameras, strict=True):
+        assert_shows(tmp_path / name, camera, WHITE)
+
+
+def test_an_orbit_of_a_ply_needs_no_photographs(fit, tmp_path):
+    arguments = ("--orbit", "3", "--size", "30", "20", "--background", "black", "--fov", "60")
+    run(fit / "point_cloud.ply", *arguments, "--out", tmp_path)
+    orbit = orbit_of_gaussians(blobs(), np.array([0, 0, 1]), 60)
+    for index, camera in enumerate(orbit.viewpoints(3, 30, 20, 60)):
+        assert_shows(tmp_path / f"orbit_{index:03d}.png", camera, (0, 0, 0))
+
+
+def test_cameras_of_a_transforms_file_give_the_pictures_of_the_split(fit, tmp_path):
+    run(fit, "--out", tmp_path / "split")
+    transforms = fit.parent / "data" / "transforms_test.json"
+    size = ("--size", WIDTH, HEIGHT)
+    run(fit, "--camera", transforms, *size, "--out", tmp_path / "cameras")
+    for index in range(4):
+        expected = (tmp_path / "split" / f"r_{index}.png").read_bytes()
+        assert (tmp_path / "cameras" / f"camera_{index}.png").read_bytes() == expected
+
+
+def test_a_camera_placed_by_hand_is_that_camera(fit, tmp_path):
+    pose = pose_around(0.8, 0.3)
+    fov = np.degrees(FIELD_OF_VIEW)
+    arguments = ["--origin", *pose[:3, 3], "--target", *FOCUS, "--fov", fov]
+    size = ("--size", WIDTH, HEIGHT)
+    run(fit / "point_cloud.ply", *arguments, *size, "--out", tmp_path)
+    assert_shows(tmp_path / "camera.png", small_view("", pose, None), WHITE)
+
+
+# ----------------------------------------------------------------------------------------------
+# Mitsuba scenes
+# ----------------------------------------------------------------------------------------------
+
+
+def sensor(pose, pixel_format="rgb"):
+    origin, target = (", ".join(map(repr, v)) for v in (pose[:3, 3].tolist(), FOCUS.tolist()))
+    return f"""
+    <sensor type="perspective">
+        <float name="fov" value="{np.degrees(FIELD_OF_VIEW)}"/>
+        <float name="near_clip" value="0.2"/>
+        <transform name="to_world"><lookat origin="{origin}" target="{target}" up="0, 0, 1"/>
+        </transform>
+        <film type="hdrfilm">
+            <integer name="width" value="{WIDTH}"/><integer name="height" value="{HEIGHT}"/>
+            <string name="pixel_format" value="{pixel_format}"/><rfilter type="box"/>
+            <string name="component_format" value="float32"/>
+        </film>
+        <sampler type="independent"><integer name="sample_count" value="1"/></sampler>
+    </sensor>"""
+
+
+def write_scene(folder, *sensors, settings=""):
+    write_ply(folder / "model.ply", blobs())
+    path = folder / "blobs.xml"
+    path.write_text(
+        f"""<scene version="3.0.0">
+        <integrator type="splats">
+            <string name="filename" value="model.ply"/>
+            <rgb name="background" value="1, 1, 1"/>
+            {settings}
+        </integrator>
+        {"".join(sensors)}
+        </scene>"""
+    )
+    return path
+
+
+def to_linear(x):
+    return np.where(x <= 0.04045, x / 12.92, ((x + 0.055) / 1.055) ** 2.4)
+
+
+def to_srgb(x):
+    return np.where(x <= 0.0031308, x * 12.92, 1.055 * x ** (1 / 2.4) - 0.055)
+
+
+def test_a_mitsuba_scene_becomes_linear_exr_and_srgb_png(tmp_path):
+    pose = pose_around(0.8, 0.3)
+    run(write_scene(tmp_path, sensor(pose)), "--out", tmp_path / "out")
+    assert {p.name for p in (tmp_path / "out").iterdir()} == {"blobs.exr", "blobs.png"}
+    # The integrator decodes premultiplied splats and background apart; white stays 1.
+    picture_on_black = photograph(blobs(), small_view("", pose, None), (0, 0, 0))
+    linear = to_linear(picture_on_black.image) + picture_on_black.transmittance[..., None]
+    exr = np.array(mi.Bitmap(str(tmp_path / "out" / "blobs.exr")))
+    assert_pictures_agree(exr, linear, picture_on_black, 1e-4)
+    encoded = np.clip(to_srgb(linear), 0, 1)
+    png = picture(tmp_path / "out" / "blobs.png")
+    assert_pictures_agree(png, encoded, picture_on_black, EIGHT_BITS)
+
+
+def test_a_scene_in_display_space_is_not_encoded_again(tmp_path):
+    pose = pose_around(0.8, 0.3)
+    settings = '<boolean name="srgb_primitives" value="false"/>'
+    run(write_scene(tmp_path, sensor(pose), settings=settings), "--out", tmp_path / "out")
+    camera = small_view("", pose, None)
+    assert_shows(tmp_path / "out" / "blobs.png", camera, WHITE)
+    expected = photograph(blobs(), camera, WHITE)
+    exr = np.array(mi.Bitmap(str(tmp_path / "out" / "blobs.exr")))
+    assert_pictures_agree(exr, expected.image, expected, 1e-4)
+
+
+def test_every_sensor_of_a_scene_is_rendered(tmp_path):
+    sensors = sensor(pose_around(0.8, 0.3)), sensor(pose_around(2.0, 0.3), "rgba")
+    run(write_scene(tmp_path, *sensors), "--out", tmp_path / "out")
+    expected = {f"blobs_{i}.{suffix}" for i in range(2) for suffix in ("exr", "png")}
+    assert {p.name for p in (tmp_path / "out").iterdir()} == expected
+    assert np.array(mi.Bitmap(str(tmp_path / "out" / "blobs_1.exr"))).shape == (HEIGHT, WIDTH, 4)
+    assert picture(tmp_path / "out" / "blobs_1.png").shape == (HEIGHT, WIDTH, 3)
+
+
+def test_a_scene_of_mitsubas_own_is_rendered_too(tmp_path):
+    path = tmp_path / "sphere.xml"
+    path.write_text(
+        f"""<scene version="3.0.0"><integrator type="direct"/>{sensor(pose_around(0.0, 0.2))}
+        <shape type="sphere"/><emitter type="constant"/></scene>"""
+    )
+    run(path, "--out", tmp_path / "out")
+    assert picture(tmp_path / "out" / "sphere.png").shape == (HEIGHT, WIDTH, 3)
+
+
+# ----------------------------------------------------------------------------------------------
+# Errors
+# ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("what", "arguments", "message"),
+    [
+        ("nowhere.ply", [], "there is no such file or folder"),
+        ("../data", [], "there is no config.yml in it"),
+        ("config.yml", [], "must be a PLY file, a Mitsuba scene (.xml) or the output folder"),
+        ("point_cloud.ply", [], "say what to render: --orbit N"),
+        ("point_cloud.ply", ["--split", "test"], "needs photographs"),
+        ("point_cloud.ply", ["--orbit", "2", "--data", "x"], "--data: needs --scene"),
+        ("point_cloud.ply", ["--orbit", "0"], "--orbit: must be >= 1 frame, got 0"),
+        ("point_cloud.ply", ["--orbit", "2", "--up", "0", "0", "0"], "up must not be zero"),
+        ("point_cloud.ply", ["--orbit", "2", "--variant", "scalar_rgb"], "--variant: must be"),
+        ("", ["--orbit", "2", "--split", "test"], "--split and --orbit exclude each other"),
+        ("", ["--orbit", "2", "--up", "0", "0", "1"], "--up: is not used here"),
+        ("", ["--size", "8", "8"], "--size: is not used with --split"),
+        ("", ["--origin", "0", "0", "0"], "must not be zero or parallel"),
+        ("", ["--origin", "0", "0", "nan"], "--origin: must be three finite numbers"),
+        ("", ["--origin", "3", "0", "0", "--fov", "180"], "--fov: must be between 0 and 180"),
+        ("", ["--origin", "3", "0", "0", "--size", "0", "9"], "--size: must be >= 1 px, got 0 9"),
+        ("", ["--background", "pink"], "must be white, black or three numbers in 0..1, got pink"),
+        ("", ["--background", "0", "0", "1.5"], "got 0 0 1.5"),
+        ("", ["--camera", "nowhere.json", "--size", "8", "8"], "nowhere.json: cannot read"),
+        ("", ["--data", "nowhere"], "data.path: there is no folder"),
+        ("", ["--set", "data.imagesize=3"], "did you mean data.image_size?"),
+    ],
+)
+def test_user_errors_are_one_line_and_write_nothing(
+    fit, tmp_path, capsys, what, arguments, message
+):
+    assert message in fails(capsys, fit / what, *arguments, "--out", tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_the_folder_of_a_fit_is_not_overwritten(fit, capsys):
+    assert "holds a fit" in fails(capsys, fit, "--out", fit)
+
+
+def test_an_output_folder_that_is_a_file_is_an_error(fit, tmp_path, capsys):
+    (tmp_path / "out").write_text("mine")
+    assert "cannot write" in fails(capsys, fit, "--out", tmp_path / "out")
+    assert (tmp_path / "out").read_text() == "mine"
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ("no xml", "blobs.xml: "),
+        ('<scene version="3.0.0"/>', "must hold an integrator and at least one sensor"),
+        (
+            '<scene version="3.0.0"><integrator type="splats">'
+            '<string name="filename" value="nowhere.ply"/></integrator></scene>',
+            "nowhere.ply: cannot read the file",
+        ),
+        (
+            '<scene version="3.0.0"><integrator type="splats">'
+            '<string name="filename" value="model.ply"/></integrator>'
+            '<sensor type="orthographic"/></scene>',
+            "the sensor must be of type 'perspective'",
+        ),
+    ],
+    ids=["not XML", "empty", "model missing", "wrong sensor"],
+)
+def test_errors_of_a_mitsuba_scene_are_one_line(tmp_path, capsys, content, message):
+    path = write_scene(tmp_path)
+    path.write_text(content)
+    assert message in fails(capsys, path, "--out", tmp_path / "out")
+
+
+def test_options_for_gaussians_are_refused_with_a_scene(tmp_path, capsys):
+    path = write_scene(tmp_path, sensor(pose_around(0.8, 0.3)))
+    message = fails(capsys, path, "--orbit", "3", "--out", tmp_path / "out")
+    assert message.startswith("--orbit: is not used with a Mitsuba scene")
+
+
+def test_it_is_a_command(fit, tmp_path):
+    result = subprocess.run(
+        [sys.executable, "-m", "drgs.render", fit, "--orbit", "1", "--out", tmp_path / "out"],
+        cwd=REPOSITORY,
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+    assert result.returncode == 0, result.stderr
+    assert f"orbit_000: {WIDTH}x{HEIGHT}" in result.stdout
