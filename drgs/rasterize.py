@@ -456,23 +456,7 @@ def composite_adjoint(
         rank, slot, composited, _ = dr.gather(t.Array4u, slots.records, entry, active)
         footprint = _Footprint.load(bins, lanes, rank, active)
         color = _load_features(features, count, rank, active)
-        T, S = list(T), list(S)
-        d_color = [t.Float(0) for _ in range(count)]
-        alphas = [_Alpha.at(log2_alpha, exp2) for row in footprint.log2_alpha for log2_alpha in row]
-        inverse = _reciprocals([1 - alpha.value for alpha in alphas])
-        d_log_alpha = []
-        for pixel, alpha in enumerate(alphas):
-            weight, T[pixel], goes_on = _step(T[pixel], alpha.value)
-            seen = t.Float(0)
-            for k in range(count):
-                seen = dr.fma(color[k], g[k][pixel], seen)
-            for k in range(count):
-                d_color[k] = dr.fma(weight, g[k][pixel], d_color[k])
-            contribution = weight * seen
-            S[pixel] = S[pixel] - contribution
-            # d loss / d ln(alpha) = a (T c.g - S / (1 - a)), zero where a decision is active.
-            occlusion = S[pixel] * (alpha.value * inverse[pixel])
-            d_log_alpha.append(dr.select(goes_on & alpha.smooth, contribution - occlusion, 0))
+        T, S, d_log_alpha, d_color = _adjoint_step(footprint, color, T, S, g, exp2)
         moments = _moments(footprint, d_log_alpha)
         below = (t.UInt32(1) << lanes.micro) - 1
         slot += dr.popcnt(composited & below)
@@ -492,6 +476,33 @@ def composite_adjoint(
     )
     dr.eval(loop, partials)
     return _sum_slots(bins, slots, partials, width, count)
+
+
+def _adjoint_step(
+    footprint: _Footprint, color: list[Any], T: list[Any], S: list[Any], g: list, exp2: Any
+) -> tuple[list, list, list, list]:
+    """One splat at 16 pixels: next T and S, d loss / d ln(alpha), and d loss / d color (summed).
+
+    color: C features of the splat; g: [feature][pixel] derivative of the loss with respect to C.
+    """
+    T, S = list(T), list(S)
+    alphas = [_Alpha.at(log2_alpha, exp2) for row in footprint.log2_alpha for log2_alpha in row]
+    inverse = _reciprocals([1 - alpha.value for alpha in alphas])
+    zero = type(inverse[0])(0)
+    d_color = [zero for _ in color]
+    d_log_alpha = []
+    for pixel, alpha in enumerate(alphas):
+        weight, T[pixel], goes_on = _step(T[pixel], alpha.value)
+        seen = zero
+        for k, c in enumerate(color):
+            seen = dr.fma(c, g[k][pixel], seen)
+            d_color[k] = dr.fma(weight, g[k][pixel], d_color[k])
+        contribution = weight * seen
+        S[pixel] = S[pixel] - contribution
+        # d loss / d ln(alpha) = a (T c.g - S / (1 - a)), zero where a decision is active.
+        occlusion = S[pixel] * (alpha.value * inverse[pixel])
+        d_log_alpha.append(dr.select(goes_on & alpha.smooth, contribution - occlusion, 0))
+    return T, S, d_log_alpha, d_color
 
 
 def _seen_past_nothing(layers: Layers, lanes: _Lanes, g: list[list[Any]], G: list[Any]) -> list:
