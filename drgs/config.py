@@ -193,7 +193,7 @@ class DensifyConfig(_Section):
         description="Cloned if its largest scale is at most this, split if larger; x extent.",
     )
     split_count: int = Field(
-        2, ge=2, le=100, description="Samples that replace a Gaussian that is split."
+        2, ge=2, le=1_000_000, description="Samples that replace a Gaussian that is split."
     )
     split_shrink: float = Field(1.6, gt=1, description="Their scales are the parent's / this.")
     prune_opacity: float = Field(0.005, ge=0, lt=1, description="Removed if less opaque.")
