@@ -168,6 +168,8 @@ class Trainer:
                 self.optimizer, self.statistics, config, self.extent, i, self.config.seed, PREFIX
             )
             self.statistics = self._no_statistics()
+            # Freed arrays of sizes that will not come again would stay with Dr.Jit's allocator.
+            dr.flush_malloc_cache()
         if densify.should_reset(config, i, self.white_background):
             densify.reset_opacities(self.optimizer, config, PREFIX)
         return report
