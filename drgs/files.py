@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import errno
 import os
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -47,6 +48,10 @@ def read_text(path: Path, what: str, max_bytes: int) -> str:
         ) from None
 
 
+_TEMPORARY_NAME = re.compile(r"\..*\.\d+\.tmp(\.[^.]*)?")
+"""Names that :func:`atomic_path` makes: .STEM.PROCESS.tmp.SUFFIX."""
+
+
 @contextmanager
 def atomic_path(path: str | Path) -> Iterator[Path]:
     """A temporary path beside ``path`` that replaces it when the block ends without an error.
@@ -68,6 +73,14 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
     finally:
         with suppress(OSError):
             temporary.unlink(missing_ok=True)
+
+
+def remove_stale_temporaries(folder: Path) -> None:
+    """Remove what writers that were killed have left behind, in ``folder`` and below it."""
+    for path in folder.rglob(".*.tmp*"):
+        if _TEMPORARY_NAME.fullmatch(path.name):
+            with suppress(OSError):
+                path.unlink()
 
 
 def why_refused(error: OSError) -> str:

@@ -14,7 +14,7 @@ from typing import Any
 
 from drgs.checks import UserError, one_line
 from drgs.config import FitConfig, dump_config, load_config
-from drgs.files import why_refused
+from drgs.files import remove_stale_temporaries, why_refused
 
 CONFIG_NAME = "config.yml"
 
@@ -59,6 +59,7 @@ def claim_output_folder(folder: Path, config: FitConfig) -> None:
             f"{folder}: already holds {_which_run(folder, config)}; choose another folder with "
             f"--out, continue that run with --resume {folder}, or replace it with --overwrite"
         )
+    remove_stale_temporaries(folder)
     dump_config(config, folder / CONFIG_NAME)
 
 

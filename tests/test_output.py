@@ -75,6 +75,15 @@ def test_a_run_is_finished_when_its_last_file_is_there_and_the_configuration_is_
     assert not is_finished(finished, config)
 
 
+def test_what_a_killed_run_was_writing_is_removed_and_nothing_else(finished, config):
+    kept = {".DS_Store", ".notes.tmp.txt", "point_cloud.ply", "renders/r_0.png"}
+    for name in (".checkpoint.4711.tmp.npz", "renders/.r_1.4711.tmp.png", *kept):
+        (finished / name).write_text("half")
+    claim_output_folder(finished, config)
+    left = {str(path) for path in contents(finished)}
+    assert left == {"config.yml", *kept}
+
+
 def test_another_run_is_named_by_what_differs(finished, config):
     other = FitConfig(
         data=config.data, seed=7, init={"half_extent": 2.0}, iterations=9, loss={"sigma": 2.0}
