@@ -90,6 +90,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         )
         # The folder is touched when all of the input has been found to be usable.
         trainer = Trainer(config, dataset, initial_gaussians(config, dataset))
+        dataset = dataset.without_training_images()
         if args.overwrite:
             remove_run(out)
         claim_output_folder(out, config)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -42,6 +42,14 @@ class Dataset:
     background: tuple[float, float, float]  # display space, what the images were composited over
     start_half_extent: float | None  # of the layout's own start box [-h, h]^3; None: it has none
     description: str  # one line: what was read, and what was assumed
+
+    def without_training_images(self) -> Dataset:
+        """The same, but that the pictures of the training views are empty: frees their memory.
+
+        For a fit, whose trainer has them on the device.
+        """
+        empty = np.empty((0, 0, 3), np.float32)
+        return replace(self, train=tuple(replace(view, image=empty) for view in self.train))
 
     @property
     def extent(self) -> float:
