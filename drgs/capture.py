@@ -48,13 +48,12 @@ from plyfile import PlyData, PlyElement
 from drgs.checks import UserError, exit_on_user_error, one_line
 from drgs.data.images import read_image
 from drgs.files import atomic_path, why_refused
+from drgs.interrupts import INTERRUPTED_STATUS
+from drgs.progress import LOG_SECONDS
 from drgs.viewpoints import look_at
 
 NERF_SYNTHETIC_FOV = 0.6911112070083618
 """Radians: the original's ``camera_angle_x``."""
-
-INTERRUPTED_STATUS = 130
-"""Exit status after Ctrl-C: 128 + SIGINT."""
 
 SPLITS = ("train", "val", "test")
 MANIFEST = "capture.json"
@@ -77,9 +76,6 @@ NEAR_CLIP, FAR_CLIP = 1e-5, 1e5
 
 MAX_LAMPS_IN_A_ROW = 16
 """Surfaces that shine are passed through on the way to the first hit, this many at most."""
-
-LOG_SECONDS = 10.0
-"""Seconds between two lines of progress where there is no terminal."""
 
 
 @dataclass(frozen=True)
