@@ -12,15 +12,20 @@ below 1e-4. c_i is a vector of any length, the splat's *features*: colour, depth
 else is to be composited. The background is added by the caller, from T.
 
 **Adjoint.** Let g = dL/dC and G = dL/dT. Whatever lies behind splat i contributes to the loss
-through the factor (1 - a_i) only, so with
+through the factor T_{i+1} = T_i (1 - a_i) only. Let R_i be what one unit of light that passes
+splat i is worth: R_last = G, since it reaches the background, and
 
-    S_i = sum_{j > i} w_j (c_j . g) + T G        (what is seen past splat i)
+    R_{i-1} = a_i (c_i . g) + (1 - a_i) R_i.
 
-    dL/dc_i = w_i g,   dL/da_i = T_i (c_i . g) - S_i / (1 - a_i).
+    dL/dc_i = w_i g,   dL/da_i = T_i (c_i . g - R_i).
 
-S_0 = C . g + T G is known from the finished picture, and S_i = S_{i-1} - w_i (c_i . g): the
-adjoint walks the splats in the same order as the forward pass, as Mitsuba's path replay does
-(Vicini et al. 2021), replays all of its decisions exactly, and stores nothing per pixel pair.
+The adjoint walks the splats back to front, from the last one that the pixel composited, and
+recovers T_i = T_{i+1} / (1 - a_i) (3DGS, section 6), which alpha <= 0.99 keeps accurate. R is a
+convex combination of the values behind it: its rounding errors do not grow, and a splat that is
+seen through little transmittance has a gradient as accurate, relative to its own size, as the
+first. (The equivalent sums from front to back, S_i = S_{i-1} - w_i (c_i . g) and dL/da_i =
+T_i (c_i . g) - S_i / (1 - a_i), cancel: they carry the error of the whole sum to the last splat.)
+Nothing is stored per pixel pair, and all decisions of the forward pass are taken again exactly.
 
 **Mapping to the machine.** One SIMD lane is one micro-tile of 4x4 pixels, its pixels unrolled:
 the load of a splat's record is paid once for 16 pixels. A packet of 16 lanes is one tile.
@@ -56,7 +61,8 @@ class Layers:
     """What compositing makes of the splats, stored one row per micro-tile."""
 
     values: Any  # Float (tiles * 16 * (1 + C) * 16,): row: transmittance, then each feature
-    stop: Any  # UInt32 (tiles * 16,): sorted entry behind which a micro-tile visited nothing
+    ends: Any  # UInt32 (tiles * 16 * 16,): sorted entry from which on a pixel composited nothing
+    stop: Any  # UInt32 (tiles * 16,): the largest of them in each micro-tile
     count: int  # C
     grid: TileGrid
 
@@ -127,7 +133,7 @@ def _coprime_stride(count: int) -> int:
 
 @dataclass
 class _Cursor:
-    """Walks the set bits of a micro-tile's words: the splats that touch it, front to back.
+    """Walks the set bits of a micro-tile's words: the splats that touch it.
 
     Not frozen: Dr.Jit assigns the fields of a loop's state.
     """
@@ -137,23 +143,23 @@ class _Cursor:
 
 
 class _Entries:
-    """The entries [start, end) of each lane's tile, as seen by its micro-tile."""
+    """The entries [start, end) of each lane's tile that touch its micro-tile, front to back."""
 
     def __init__(self, bins: TileBins, lanes: _Lanes, end: Any) -> None:
         UInt32 = type(lanes.tile)
         self.words, self.micro = bins.words, lanes.micro
         start = dr.gather(UInt32, bins.tile_start, lanes.tile)
         occupied = start < end
-        # An empty lane gets group == last and no bits: it is over before it begins.
+        # An empty lane gets first == last and no bits: it is over before it begins.
+        self.first = dr.select(occupied, start // WORD, 0)
         self.last = dr.select(occupied, (end - 1) // WORD, 0)
-        self.tail = dr.select(occupied, UInt32(0xFFFFFFFF) >> (WORD - 1 - (end - 1) % WORD), 0)
-        group = dr.select(occupied, start // WORD, 0)
-        word = self._load(group, occupied) & (UInt32(0xFFFFFFFF) << (start % WORD))
-        self.begin = _Cursor(word=word, group=group)
+        ones = UInt32(0xFFFFFFFF)
+        self.head = dr.select(occupied, ones << (start % WORD), 0)
+        self.tail = dr.select(occupied, ones >> (WORD - 1 - (end - 1) % WORD), 0)
 
-    def _load(self, group: Any, active: Any) -> Any:
-        word = dr.gather(type(group), self.words, group * MICROS + self.micro, active)
-        return dr.select(group == self.last, word & self.tail, word)
+    def begin(self) -> _Cursor:
+        """The cursor at the first entry."""
+        return self._open(self.first, True)
 
     def pending(self, cursor: _Cursor) -> Any:
         """Whether entries may be left."""
@@ -161,18 +167,54 @@ class _Entries:
 
     @staticmethod
     def current(cursor: _Cursor) -> tuple[Any, Any]:
-        """The current sorted entry, and whether there is one (a word may be empty)."""
+        """The current sorted entry, and whether there is one (a word may be empty).
+
+        Where there is none, the index lies between the entries before and those to come.
+        """
         return cursor.group * WORD + dr.tzcnt(cursor.word), cursor.word != 0
 
     def advance(self, cursor: _Cursor) -> _Cursor:
         """Drop the current entry; open the next group when this one is used up."""
         word = cursor.word & (cursor.word - 1)
-        used_up = (word == 0) & (cursor.group < self.last)
-        group = dr.select(used_up, cursor.group + 1, cursor.group)
-        return _Cursor(
-            word=dr.select(used_up, self._load(group, used_up), word),
-            group=group,
-        )
+        return self._go_on(cursor, word, cursor.group + 1, cursor.group < self.last)
+
+    def _go_on(self, cursor: _Cursor, word: Any, neighbor: Any, has_neighbor: Any) -> _Cursor:
+        used_up = (word == 0) & has_neighbor
+        opened = self._open(dr.select(used_up, neighbor, cursor.group), used_up)
+        return _Cursor(word=dr.select(used_up, opened.word, word), group=opened.group)
+
+    def _open(self, group: Any, active: Any) -> _Cursor:
+        word = dr.gather(type(group), self.words, group * MICROS + self.micro, active)
+        word &= dr.select(group == self.first, self.head, 0xFFFFFFFF)
+        word &= dr.select(group == self.last, self.tail, 0xFFFFFFFF)
+        return _Cursor(word=word, group=group)
+
+
+class _EntriesBackToFront(_Entries):
+    """The same entries in the opposite order."""
+
+    def begin(self) -> _Cursor:
+        """The cursor at the last entry."""
+        return self._open(self.last, True)
+
+    def pending(self, cursor: _Cursor) -> Any:
+        """Whether entries may be left."""
+        return (cursor.word != 0) | (cursor.group > self.first)
+
+    @staticmethod
+    def current(cursor: _Cursor) -> tuple[Any, Any]:
+        """The current sorted entry, and whether there is one (a word may be empty)."""
+        return cursor.group * WORD + _highest_bit(cursor.word), cursor.word != 0
+
+    def advance(self, cursor: _Cursor) -> _Cursor:
+        """Drop the current entry; open the group before when this one is used up."""
+        bit = (type(cursor.word)(1) << (WORD - 1)) >> dr.lzcnt(cursor.word)
+        word = cursor.word & ~bit
+        return self._go_on(cursor, word, cursor.group - 1, cursor.group > self.first)
+
+
+def _highest_bit(word: Any) -> Any:
+    return (WORD - 1) - dr.lzcnt(word)
 
 
 def _load_pixels(plane: Any, lanes: _Lanes, grid: TileGrid) -> list[Any]:
@@ -323,40 +365,43 @@ def composite(bins: TileBins, features: Any, count: int) -> Layers:
     entries = _Entries(bins, lanes, end)
     exp2 = _exp2_function(t.Float)
 
-    def body(cursor: _Cursor, T: list, C: list, stop: Any, unfinished: Any) -> tuple:
+    def body(cursor: _Cursor, T: list, C: list, ends: list, unfinished: Any) -> tuple:
         entry, active = entries.current(cursor)
         rank = dr.gather(t.UInt32, bins.ranks, entry, active)
         footprint = _Footprint.load(bins, lanes, rank, active)
         color = _load_features(features, count, rank, active)
-        T, C = list(T), [list(c) for c in C]
+        T, C, ends = list(T), [list(c) for c in C], list(ends)
+        behind = dr.select(active, entry + 1, entry)
         for pixel in range(PIXELS):
             row, column = divmod(pixel, MICRO)
             alpha = _Alpha.at(footprint.log2_alpha[row][column], exp2)
-            weight, T[pixel], _ = _step(T[pixel], alpha.value)
+            weight, T[pixel], goes_on = _step(T[pixel], alpha.value)
+            ends[pixel] = dr.select(goes_on, behind, ends[pixel])
             for k in range(count):
                 C[k][pixel] = dr.fma(weight, color[k], C[k][pixel])
-        stop = dr.select(active, entry + 1, stop)
-        return entries.advance(cursor), T, C, stop, _any_positive(T)
+        return entries.advance(cursor), T, C, ends, _any_positive(T)
 
     size = dr.width(lanes.tile)
     zero = dr.zeros(t.Float, size)
-    _, T, C, stop, _ = dr.while_loop(
+    _, T, C, ends, _ = dr.while_loop(
         state=(
-            entries.begin,
+            entries.begin(),
             # Pixels off the film are finished before they begin.
             [dr.select(inside, t.Float(1), -1) for _, inside in _pixels(lanes, bins.grid)],
             [[t.Float(zero) for _ in range(PIXELS)] for _ in range(count)],
-            dr.gather(t.UInt32, bins.tile_start, lanes.tile),
+            [dr.zeros(t.UInt32, size) for _ in range(PIXELS)],
             dr.full(t.Bool, True, size),
         ),
-        cond=lambda cursor, T, C, stop, unfinished: entries.pending(cursor) & unfinished,
+        cond=lambda cursor, T, C, ends, unfinished: entries.pending(cursor) & unfinished,
         body=body,
     )
-    dr.eval(T, C, stop)
+    dr.eval(T, C, ends)
     columns = [dr.abs(v) for v in T] + [v for plane in C for v in plane]
-    dr.eval(columns)
+    stop = _largest(ends)
+    dr.eval(columns, stop)
     return Layers(
         values=scatter_rows(columns, lanes.micro_tile, size),
+        ends=scatter_rows(ends, lanes.micro_tile, size),
         stop=scatter_rows([stop], lanes.micro_tile, size),
         count=count,
         grid=bins.grid,
@@ -364,10 +409,14 @@ def composite(bins: TileBins, features: Any, count: int) -> Layers:
 
 
 def _any_positive(values: list[Any]) -> Any:
+    return _largest(values) > 0
+
+
+def _largest(values: list[Any]) -> Any:
     largest = values[0]
     for v in values[1:]:
         largest = dr.select(v > largest, v, largest)
-    return largest > 0
+    return largest
 
 
 # ----------------------------------------------------------------------------------------------
@@ -443,20 +492,23 @@ def composite_adjoint(
     count = layers.count
     lanes = _make_lanes(t.Float, bins.grid)
     slots = _assign_slots(bins, layers)
-    entries = _Entries(bins, lanes, dr.gather(t.UInt32, layers.stop, lanes.micro_tile))
+    stop = dr.gather(t.UInt32, layers.stop, lanes.micro_tile)
+    entries = _EntriesBackToFront(bins, lanes, stop)
     exp2 = _exp2_function(t.Float)
 
     g = [_load_pixels(plane, lanes, bins.grid) for plane in d_features]
-    behind = _seen_past_nothing(layers, lanes, g, _load_pixels(d_transmittance, lanes, bins.grid))
+    ends = _load_row(layers.ends, lanes.micro_tile, 1)
+    transmittance = _load_row(layers.values, lanes.micro_tile, 1 + count)
     width = 4 * -(-(MOMENTS + count) // 4)
     partials = dr.empty(t.Float, max(slots.count, 1) * width)
 
-    def body(cursor: _Cursor, T: list, S: list) -> tuple:
+    def body(cursor: _Cursor, T: list, R: list) -> tuple:
         entry, active = entries.current(cursor)
         rank, slot, composited, _ = dr.gather(t.Array4u, slots.records, entry, active)
         footprint = _Footprint.load(bins, lanes, rank, active)
         color = _load_features(features, count, rank, active)
-        T, S, d_log_alpha, d_color = _adjoint_step(footprint, color, T, S, g, exp2)
+        reached = [entry < end for end in ends]
+        T, R, d_log_alpha, d_color = _adjoint_step(footprint, reached, color, T, R, g, exp2)
         moments = _moments(footprint, d_log_alpha)
         below = (t.UInt32(1) << lanes.micro) - 1
         slot += dr.popcnt(composited & below)
@@ -465,13 +517,15 @@ def composite_adjoint(
         for k in range(width // 4):
             packet = t.Array4f(values[4 * k : 4 * k + 4])
             dr.scatter(partials, packet, slot * (width // 4) + k, active)
-        return entries.advance(cursor), T, S
+        return entries.advance(cursor), T, R
 
-    size = dr.width(lanes.tile)
-    one = dr.ones(t.Float, size)
     loop = dr.while_loop(
-        state=(entries.begin, [t.Float(one) for _ in range(PIXELS)], behind),
-        cond=lambda cursor, T, S: entries.pending(cursor),
+        state=(
+            entries.begin(),
+            transmittance,
+            _load_pixels(d_transmittance, lanes, bins.grid),
+        ),
+        cond=lambda cursor, T, R: entries.pending(cursor),
         body=body,
     )
     dr.eval(loop, partials)
@@ -479,62 +533,44 @@ def composite_adjoint(
 
 
 def _adjoint_step(
-    footprint: _Footprint, color: list[Any], T: list[Any], S: list[Any], g: list, exp2: Any
+    footprint: _Footprint,
+    reached: list[Any],
+    color: list[Any],
+    T: list[Any],
+    R: list[Any],
+    g: list[list[Any]],
+    exp2: Any,
 ) -> tuple[list, list, list, list]:
-    """One splat at 16 pixels: next T and S, d loss / d ln(alpha), and d loss / d color (summed).
+    """One splat at 16 pixels: T and R before it, d loss / d ln(alpha), d loss / d color (summed).
 
-    color: C features of the splat; g: [feature][pixel] derivative of the loss with respect to C.
+    reached: whether each pixel was still unfinished; color: C features of the splat; T, R: past
+    the splat; g: [feature][pixel] derivative of the loss with respect to C.
     """
-    T, S = list(T), list(S)
-    alphas = [_Alpha.at(log2_alpha, exp2) for row in footprint.log2_alpha for log2_alpha in row]
-    inverse = _reciprocals([1 - alpha.value for alpha in alphas])
-    zero = type(inverse[0])(0)
+    T, R = list(T), list(R)
+    log2_alphas = [value for row in footprint.log2_alpha for value in row]
+    zero = type(T[0])(0)
     d_color = [zero for _ in color]
     d_log_alpha = []
-    for pixel, alpha in enumerate(alphas):
-        weight, T[pixel], goes_on = _step(T[pixel], alpha.value)
+    for pixel, log2_alpha in enumerate(log2_alphas):
+        alpha = _Alpha.at(log2_alpha, exp2)
+        value = dr.select(reached[pixel], alpha.value, 0)
+        T[pixel] = T[pixel] / (1 - value)
+        weight = value * T[pixel]
         seen = zero
         for k, c in enumerate(color):
             seen = dr.fma(c, g[k][pixel], seen)
             d_color[k] = dr.fma(weight, g[k][pixel], d_color[k])
-        contribution = weight * seen
-        S[pixel] = S[pixel] - contribution
-        # d loss / d ln(alpha) = a (T c.g - S / (1 - a)), zero where a decision is active.
-        occlusion = S[pixel] * (alpha.value * inverse[pixel])
-        d_log_alpha.append(dr.select(goes_on & alpha.smooth, contribution - occlusion, 0))
-    return T, S, d_log_alpha, d_color
+        gain = seen - R[pixel]
+        R[pixel] = dr.fma(value, gain, R[pixel])
+        # d loss / d ln(alpha) = a T (c.g - R), zero where alpha is clamped.
+        d_log_alpha.append(dr.select(alpha.smooth, weight * gain, 0))
+    return T, R, d_log_alpha, d_color
 
 
-def _seen_past_nothing(layers: Layers, lanes: _Lanes, g: list[list[Any]], G: list[Any]) -> list:
-    """S_0 = C . g + T G at the 16 pixels, from the finished planes."""
-    Float, count = type(layers.values), layers.count
-    row = lanes.micro_tile * ((1 + count) * PIXELS)
-    T, *C = (
-        [dr.gather(Float, layers.values, row + (plane * PIXELS + k)) for k in range(PIXELS)]
-        for plane in range(1 + count)
-    )
-    result = []
-    for pixel in range(PIXELS):
-        S = T[pixel] * G[pixel]
-        for plane, cotangent in zip(C, g, strict=True):
-            S = dr.fma(plane[pixel], cotangent[pixel], S)
-        result.append(S)
-    return result
-
-
-def _reciprocals(values: list[Any]) -> list[Any]:
-    """1 / x for values in [0.01, 1], four at a time with one division, which is slow.
-
-    From r = 1 / (a b c d): 1 / (a b) = r (c d), 1 / a = b / (a b), and so on (Montgomery 1987,
-    "Speeding the Pollard and elliptic curve methods of factorization", section 10.3.1).
-    """
-    result = []
-    for a, b, c, d in zip(*[iter(values)] * 4, strict=True):
-        ab, cd = a * b, c * d
-        r = 1 / (ab * cd)
-        inverse_ab, inverse_cd = r * cd, r * ab
-        result += [inverse_ab * b, inverse_ab * a, inverse_cd * d, inverse_cd * c]
-    return result
+def _load_row(values: Any, micro_tile: Any, planes: int) -> list[Any]:
+    """The first 16 values of each micro-tile's row of ``planes`` x 16."""
+    first = micro_tile * (planes * PIXELS)
+    return [dr.gather(type(values), values, first + k) for k in range(PIXELS)]
 
 
 def _moments(footprint: _Footprint, v: list[Any]) -> list[Any]:
@@ -667,7 +703,7 @@ def composite_tangent(
     one, zero = dr.ones(t.Float, size), dr.zeros(t.Float, size)
     _, _, dT, dC = dr.while_loop(
         state=(
-            entries.begin,
+            entries.begin(),
             [t.Float(one) for _ in range(PIXELS)],
             [t.Float(zero) for _ in range(PIXELS)],
             [[t.Float(zero) for _ in range(PIXELS)] for _ in range(count)],
@@ -679,6 +715,7 @@ def composite_tangent(
     dr.eval(columns)
     return Layers(
         values=scatter_rows(columns, lanes.micro_tile, size),
+        ends=layers.ends,
         stop=layers.stop,
         count=count,
         grid=bins.grid,
