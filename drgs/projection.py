@@ -95,18 +95,18 @@ def project(rows: GaussianRows, camera: Camera, sh_degree: int, opacity_rule: An
     z = dr.select(in_front, z, 1)
 
     m0, m1 = _screen_space_sqrt_cov(rows, camera, t.Array3f(x, y, z))
-    xx, xy, yy = dr.dot(m0, m0), dr.dot(m0, m1), dr.dot(m1, m1)
-    # det(M M^T) by Cauchy-Binet, the sum of the squared 2x2 minors of M: never negative and
-    # free of the cancellation of xx yy - xy^2.
-    minors = dr.cross(m0, m1)
-    det_sharp = dr.dot(minors, minors)
-    det = det_sharp + LOW_PASS * (xx + yy) + LOW_PASS * LOW_PASS
-    xx, yy = xx + LOW_PASS, yy + LOW_PASS
-
-    p = dr.sqrt(yy / det)
-    whitening = t.Array3f(p, -p * (xy / yy), dr.rsqrt(yy))
+    xx, xy, yy = dr.dot(m0, m0), dr.dot(m0, m1), dr.dot(m1, m1) + LOW_PASS
+    # U needs det / yy, the variance of x where y is given. det(M M^T) is the sum of the squared
+    # 2x2 minors of M (Cauchy-Binet): never negative and free of the cancellation of
+    # xx yy - xy^2. Its minors are divided by sqrt(yy) first, or the square of a giant's overflows.
+    s = dr.rsqrt(yy)
+    minors = dr.cross(m0, m1 * s)
+    sharp, added = dr.dot(minors, minors), LOW_PASS * (xx / yy + 1)
+    p = dr.rsqrt(sharp + added)
+    whitening = t.Array3f(p, -p * (xy / yy), s)
+    xx = xx + LOW_PASS
     means2d = camera.focal * t.Array2f(x, y) / z + camera.principal
-    opacities = opacity_rule(_sigmoid(rows.logit_opacities), det_sharp, det)
+    opacities = opacity_rule(_sigmoid(rows.logit_opacities), sharp, added)
     colors = sh.sh_color(rows.sh, _normalize(offset), sh_degree)
     finite = dr.isfinite(dr.detach(dr.sum(means2d) + dr.sum(whitening) + dr.sum(colors)))
     return Splats2D(
@@ -120,21 +120,23 @@ def project(rows: GaussianRows, camera: Camera, sh_degree: int, opacity_rule: An
     )
 
 
-def plain_opacity(opacity: Any, det_sharp: Any, det: Any) -> Any:
+def plain_opacity(opacity: Any, sharp: Any, added: Any) -> Any:
     """The opacity as it is: low-pass filtering makes small splats larger and thus brighter."""
-    del det_sharp, det
+    del sharp, added
     return opacity
 
 
-def compensated_opacity(opacity: Any, det_sharp: Any, det: Any) -> Any:
+def compensated_opacity(opacity: Any, sharp: Any, added: Any) -> Any:
     """Opacity scaled by sqrt(det without / det with low-pass): the splat's integral is kept.
+
+    sharp, added: in the ratio of the determinant without low-pass to what the low-pass adds.
 
     Mip-Splatting (Yu et al. 2024), section 5; gsplat's "antialiased" mode. The derivative of
     the square root at 0 (a splat of no area) is taken as 0.
     """
-    ratio = det_sharp / det
-    thin = ratio < 1e-12
-    return dr.select(thin, 0, opacity * dr.sqrt(dr.select(thin, 1, ratio)))
+    thin = sharp < 1e-12 * added
+    # Not sharp / (sharp + added), whose derivative is a difference that cancels for giants.
+    return dr.select(thin, 0, opacity * dr.rsqrt(1 + added / dr.select(thin, 1, sharp)))
 
 
 def _screen_space_sqrt_cov(rows: GaussianRows, camera: Camera, position: Any) -> tuple[Any, Any]:

@@ -164,6 +164,7 @@ class Case:
     sh_degree: int | None = None  # rendered; None for all that is stored
     recipe: object = random_scene
     seed: int = 0
+    threshold_width: float = NEAR_THRESHOLD  # within which a pixel is marked
 
     @property
     def scene(self) -> tuple[reference.Gaussians, reference.Camera]:
@@ -188,7 +189,7 @@ class Case:
 
     @property
     def picture(self) -> reference.Picture:
-        """By the reference; marked pixels are those of ``NEAR_THRESHOLD``."""
+        """By the reference; marked pixels are those within ``threshold_width``."""
         return _picture(self)
 
     @property
@@ -210,7 +211,7 @@ def _scene(case):
 def _picture(case):
     return reference.render(
         case.gaussians, case.camera, case.background, case.rendered_degree, case.antialiased,
-        threshold_width=NEAR_THRESHOLD,
+        threshold_width=case.threshold_width,
     )  # fmt: skip
 
 

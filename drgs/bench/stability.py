@@ -1,0 +1,338 @@
+"""``python -m drgs.bench stability``: what single precision costs in accuracy, and why.
+
+Layer 5. Four families of scenes become harder step by step: more layers, longer needles, larger
+distances, coordinates farther from the origin. For each step the float32 kernels are compared with
+the float64 reference (``drgs.reference``), and their error is set beside the *noise*: how much the
+reference's own result changes when every input is moved by one rounding of single precision. The
+noise is the conditioning of the problem; no single-precision program can be expected to do
+better. An error that grows faster than the noise would be the kernels' own fault.
+
+Pixels at which a decision (cut, clamp, stop) may fall either way in single precision are left out;
+the reference marks them.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import drjit.llvm.ad as llvm
+import numpy as np
+
+from drgs import reference, rendering
+from drgs.bench.output import machine, markdown_table, new_figure, write_csv, write_figure
+from drgs.camera import Camera
+from drgs.gaussians import PARAMETER_NAMES, Gaussians
+
+DESCRIPTION = "error of float32 against float64 as scenes become harder"
+
+WIDTH, HEIGHT, FOCAL = 48, 40, 60.0
+"""px: small pictures, since the reference draws each of them many times."""
+
+COUNT = 60
+"""Gaussians in a scene, but for the stacks."""
+
+UNIT_ROUNDOFF = 2.0**-24
+
+MARKED_WITHIN = 3e-3
+"""Relative distance from a threshold within which a pixel is left out."""
+
+Scene = tuple[reference.Gaussians, reference.Camera]
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """A family of scenes that one number makes harder."""
+
+    name: str
+    axis: str
+    values: tuple[float, ...]
+    scene: Callable[[float], Scene]  # in float64, not yet rounded
+
+
+@dataclass(frozen=True)
+class Measurement:
+    """Errors at one step of a sweep, relative to the largest value of each array."""
+
+    value: float
+    picture: float  # largest error of any pixel
+    picture_noise: float
+    gradient: float  # largest error of any derivative, over the five parameters
+    gradient_noise: float
+    storage: float  # largest change of any pixel by storing the scene in float32
+    left_out: float  # part of the pixels
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Options besides ``--out``."""
+    parser.add_argument("--quick", action="store_true", help="fewer steps and samples")
+
+
+def run(args: argparse.Namespace) -> None:
+    """Measure, print the table, write CSV and plot."""
+    samples = 4 if args.quick else 12
+    results = {}
+    print(f"float32 kernels against the float64 reference; {machine()}")
+    for sweep in sweeps():
+        values = sweep.values[:: 3 if args.quick else 1]
+        results[sweep.name] = [measure(sweep, value, samples) for value in values]
+        print(f"\n{sweep.name}\n{_table(sweep, results[sweep.name])}", flush=True)
+    columns = list(Measurement.__dataclass_fields__)
+    rows = [[name, *vars(m).values()] for name, steps in results.items() for m in steps]
+    write_csv(args.out / "stability.csv", ["sweep", *columns], rows)
+    write_figure(args.out / "stability.png", plot(results))
+    print(f"\nwritten: {args.out / 'stability.csv'}, {args.out / 'stability.png'}")
+
+
+# ----------------------------------------------------------------------------------------------
+# Scenes
+# ----------------------------------------------------------------------------------------------
+
+
+def sweeps() -> list[Sweep]:
+    """The four families."""
+    return [
+        Sweep("Stack depth", "layers", (1, 3, 10, 30, 100, 300, 1000), _stack),
+        Sweep("Anisotropy", "longest over shortest axis", (2, *_decades(1, 8)), _needles),
+        Sweep("Distance", "distance of the scene over its size", _decades(0, 6), _distant),
+        Sweep("Coordinate offset", "scene units from the origin", _decades(0, 6), _offset),
+    ]
+
+
+def _decades(first: int, last: int) -> tuple[float, ...]:
+    return tuple(10.0**k for k in range(first, last + 1))
+
+
+def _camera(center: np.ndarray) -> reference.Camera:
+    """Turned about all axes, so that no coordinate is exact by chance."""
+    return reference.Camera(
+        rotation=reference.quat_to_rotation(np.array([[0.9, 0.2, -0.3, 0.1]]))[0],
+        center=center,
+        fx=FOCAL,
+        fy=FOCAL,
+        cx=WIDTH / 2,
+        cy=HEIGHT / 2,
+        width=WIDTH,
+        height=HEIGHT,
+    )
+
+
+def _gaussians(
+    camera: reference.Camera,
+    film: np.ndarray,
+    z: np.ndarray,
+    sizes: np.ndarray,
+    logit_opacities: np.ndarray,
+) -> reference.Gaussians:
+    """Means at film positions (N, 2) px and depths z (N,); standard deviations (N, 3) in px."""
+    rng = np.random.default_rng(1)
+    count = len(z)
+    slopes = (film - [camera.cx, camera.cy]) / [camera.fx, camera.fy]
+    points = np.column_stack([slopes * z[:, None], z])
+    return reference.Gaussians(
+        means=points @ camera.rotation + camera.center,
+        quats=rng.normal(size=(count, 4)),
+        log_scales=np.log(sizes * z[:, None] / camera.fx),
+        logit_opacities=logit_opacities,
+        sh0=rng.normal(0, 1, (count, 1, 3)),
+        shN=rng.normal(0, 0.2, (count, 3, 3)),
+    )
+
+
+def _ordinary(camera: reference.Camera, near: float, far: float) -> reference.Gaussians:
+    rng = np.random.default_rng(2)
+    return _gaussians(
+        camera,
+        rng.uniform(0, 1, (COUNT, 2)) * [WIDTH, HEIGHT],
+        rng.uniform(near, far, COUNT),
+        rng.uniform(1, 6, (COUNT, 3)),
+        rng.normal(0, 1, COUNT),
+    )
+
+
+def _stack(layers: float) -> Scene:
+    """Large splats behind each other, faint enough that all of them are seen."""
+    rng = np.random.default_rng(3)
+    camera, count = _camera(np.zeros(3)), int(layers)
+    alpha = np.clip(4.0 / count, 1.2 / 255, 0.6)
+    gaussians = _gaussians(
+        camera,
+        rng.normal([WIDTH / 2, HEIGHT / 2], 4, (count, 2)),
+        np.sort(rng.uniform(1, 4, count)),
+        rng.uniform(100, 200, (count, 3)),
+        np.full(count, np.log(alpha / (1 - alpha))),
+    )
+    return gaussians, camera
+
+
+def _needles(ratio: float) -> Scene:
+    """The longest axis has 8 px, the others are ``ratio`` times shorter."""
+    rng = np.random.default_rng(4)
+    camera = _camera(np.zeros(3))
+    gaussians = _gaussians(
+        camera,
+        rng.uniform(0, 1, (COUNT, 2)) * [WIDTH, HEIGHT],
+        rng.uniform(1, 4, COUNT),
+        8 * np.array([[1, 1 / ratio, 1 / ratio]] * COUNT),
+        rng.normal(1, 1, COUNT),
+    )
+    return gaussians, camera
+
+
+def _distant(distance: float) -> Scene:
+    """A scene one unit deep, seen through a lens that keeps its size on the film."""
+    camera = replace(_camera(np.zeros(3)), fx=FOCAL * distance, fy=FOCAL * distance)
+    return _ordinary(camera, distance, distance + 1), camera
+
+
+def _offset(offset: float) -> Scene:
+    """Scene and camera together, away from the origin."""
+    camera = _camera(offset * np.array([1.0, -0.7, 0.4]))
+    return _ordinary(camera, 1, 4), camera
+
+
+# ----------------------------------------------------------------------------------------------
+# Errors
+# ----------------------------------------------------------------------------------------------
+
+
+def measure(sweep: Sweep, value: float, samples: int) -> Measurement:
+    """Errors and noise of one scene; both sides start from the same, rounded numbers."""
+    exact = sweep.scene(value)
+    gaussians, camera = _stored(*exact)
+    picture = reference.render(gaussians, camera, threshold_width=MARKED_WITHIN)
+    kept = ~picture.near_threshold
+    cotangent = np.random.default_rng(5).normal(size=picture.image.shape) * kept[..., None]
+    image, gradients = _by_reference(gaussians, camera, cotangent)
+    image32, gradients32 = _by_kernels(gaussians, camera, cotangent)
+
+    def picture_error(other: np.ndarray) -> float:
+        return np.abs(other - image)[kept].max(initial=0) / np.abs(image).max()
+
+    def gradient_error(other: dict[str, np.ndarray]) -> float:
+        return max(
+            np.abs(other[name] - exact_one).max() / np.abs(exact_one).max()
+            for name, exact_one in gradients.items()
+        )
+
+    moved = [
+        _by_reference(*_moved(gaussians, camera, sample), cotangent) for sample in range(samples)
+    ]
+    return Measurement(
+        value=value,
+        picture=picture_error(image32),
+        picture_noise=_root_mean_square([picture_error(one) for one, _ in moved]),
+        gradient=gradient_error(gradients32),
+        gradient_noise=_root_mean_square([gradient_error(one) for _, one in moved]),
+        storage=picture_error(_by_reference(*exact, cotangent)[0]),
+        left_out=float(np.mean(~kept)),
+    )
+
+
+def _root_mean_square(values: list[float]) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
+def _stored(gaussians: reference.Gaussians, camera: reference.Camera) -> Scene:
+    """As single precision stores them."""
+
+    def single(values: Any) -> np.ndarray:
+        return np.asarray(values, dtype=np.float32).astype(np.float64)
+
+    fields = {name: single(getattr(gaussians, name)) for name in PARAMETER_NAMES}
+    camera = replace(camera, rotation=single(camera.rotation), center=single(camera.center))
+    return reference.Gaussians(**fields), camera
+
+
+def _moved(gaussians: reference.Gaussians, camera: reference.Camera, seed: int) -> Scene:
+    """Every number moved by up to one rounding; means and camera relative to each other."""
+    rng = np.random.default_rng([6, seed])
+
+    def moved(values: Any) -> np.ndarray:
+        values = np.asarray(values)
+        return values * (1 + UNIT_ROUNDOFF * rng.uniform(-1, 1, values.shape))
+
+    fields = {name: moved(getattr(gaussians, name)) for name in PARAMETER_NAMES}
+    fields["means"] = camera.center + moved(gaussians.means - camera.center)
+    numbers = {name: float(moved(getattr(camera, name))) for name in ("fx", "fy", "cx", "cy")}
+    camera = replace(camera, rotation=moved(camera.rotation), **numbers)
+    return reference.Gaussians(**fields), camera
+
+
+def _by_reference(
+    gaussians: reference.Gaussians, camera: reference.Camera, cotangent: np.ndarray
+) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    image = reference.render(gaussians, camera).image
+    gradients = reference.render_gradients(gaussians, camera, np.zeros(3), cotangent)
+    return image, {name: gradients[name] for name in PARAMETER_NAMES}
+
+
+def _by_kernels(
+    gaussians: reference.Gaussians, camera: reference.Camera, cotangent: np.ndarray
+) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    fields = {name: getattr(gaussians, name) for name in PARAMETER_NAMES}
+    device = Gaussians(**fields).to(llvm.TensorXf)
+    K = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
+    device_camera = Camera.create(
+        llvm.Float, camera.rotation, camera.center, K, camera.width, camera.height, camera.near
+    )
+    frame = rendering.render(device, device_camera, rendering.Pipeline(gaussians.sh_degree))
+    _, *color = frame.planes()
+    image = np.stack([np.array(plane).reshape(HEIGHT, WIDTH) for plane in color], axis=-1)
+    planes = [llvm.Float(np.ascontiguousarray(w, np.float32)) for w in _planes(cotangent)]
+    nothing = llvm.Float(np.zeros(HEIGHT * WIDTH, np.float32))
+    gradients = rendering.render_adjoint(device, frame, planes, nothing).parameters
+    return image, {name: np.array(getattr(gradients, name)) for name in PARAMETER_NAMES}
+
+
+def _planes(image: np.ndarray) -> list[np.ndarray]:
+    return [image[..., channel].ravel() for channel in range(3)]
+
+
+# ----------------------------------------------------------------------------------------------
+# Output
+# ----------------------------------------------------------------------------------------------
+
+
+def _table(sweep: Sweep, steps: list[Measurement]) -> str:
+    header = [sweep.axis, "picture", "noise", "gradients", "noise", "stored in float32"]
+    rows = [
+        [f"{m.value:g}"]
+        + [
+            f"{number:.1e}"
+            for number in (
+                m.picture,
+                m.picture_noise,
+                m.gradient,
+                m.gradient_noise,
+                m.storage,
+            )
+        ]
+        for m in steps
+    ]
+    return markdown_table(header, rows)
+
+
+def plot(results: dict[str, list[Measurement]]) -> Any:
+    """One panel a sweep: errors as lines, their noise dashed in the same colour."""
+    figure = new_figure(11, 6)
+    axes = figure.subplots(2, 2, sharey=True).ravel()
+    for panel, sweep in zip(axes, sweeps(), strict=True):
+        steps = results[sweep.name]
+        x = [m.value for m in steps]
+        for color, what in (("tab:blue", "picture"), ("tab:orange", "gradient")):
+            label = {"picture": "picture", "gradient": "gradients"}[what]
+            panel.loglog(x, [getattr(m, what) for m in steps], "o-", color=color, label=label)
+            noise = [getattr(m, f"{what}_noise") for m in steps]
+            panel.loglog(x, noise, "--", color=color, label=f"{label}: one rounding of the inputs")
+        storage = [m.storage for m in steps]
+        panel.loglog(x, storage, ":", color="0.4", label="picture: scene stored in float32")
+        panel.set(title=sweep.name, xlabel=sweep.axis)
+        panel.grid(alpha=0.3)
+    for panel in axes[::2]:
+        panel.set_ylabel("error / largest value")
+    axes[0].legend(fontsize=8)
+    figure.suptitle("float32 kernels against the float64 reference")
+    return figure
