@@ -12,6 +12,8 @@ from typing import Any
 
 import drjit as dr
 
+from drgs.constants import COLOR_MIN
+
 C0 = 0.28209479177387814
 C1 = 0.4886025119029199
 C2 = (
@@ -69,10 +71,10 @@ def sh_color(coefficients: list[Any], direction: Any, degree: int) -> Any:
     """Display-space colour max(0, sum_k basis_k(direction) c_k + 0.5), an Array3f.
 
     coefficients: (degree + 1)^2 of Array3f; direction: Array3f, unit, world, from the camera
-    centre to the mean. Where the colour is clamped, its derivative is zero. A NaN stays NaN:
-    projection then drops the Gaussian.
+    centre to the mean. Where the colour is clamped, its derivative is zero; at exactly 0 it passes.
+    A NaN stays NaN: projection then drops the Gaussian.
     """
     color = coefficients[0] * C0 + 0.5
     for basis, coefficient in zip(sh_basis(direction, degree)[1:], coefficients[1:], strict=True):
         color = dr.fma(coefficient, basis, color)
-    return dr.select(color < 0, 0, color)
+    return dr.select(color < COLOR_MIN, COLOR_MIN, color)

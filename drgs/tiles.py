@@ -16,13 +16,20 @@ up its neighbours, and the only value that the host reads is the number of entri
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
 
 from drgs.arrays import interleave, types_of
-from drgs.constants import ALPHA_CUT, CULL_MARGIN, LOG2_ALPHA_CUT, WHITENING_SCALE
+from drgs.constants import (
+    ALPHA_CUT,
+    CULL_MARGIN,
+    CULL_MARGIN_PER_PX,
+    LOG2_ALPHA_CUT,
+    WHITENING_SCALE,
+)
 from drgs.projection import Splats2D
 
 MICRO = 4
@@ -65,6 +72,11 @@ class TileGrid:
     def num_tiles(self) -> int:
         """Tiles on the film."""
         return self.columns * self.rows
+
+    @property
+    def cull_margin(self) -> float:
+        """What rounding may take from an exponent (base 2) on this film."""
+        return CULL_MARGIN + CULL_MARGIN_PER_PX * max(self.width, self.height)
 
 
 @dataclass(frozen=True)
@@ -163,7 +175,8 @@ def _tile_boxes(splats: Splats2D, grid: TileGrid) -> tuple[Any, Any]:
     t = types_of(type(splats.depths))
     # alpha >= cut inside |U d|^2 <= 2 ln(opacity / cut); its bounding box follows from the
     # variances (the opacity-aware radius, instead of 3 standard deviations).
-    reach = 2 * dr.log(splats.opacities / ALPHA_CUT) + CULL_MARGIN
+    margin = dr.opaque(t.Float, grid.cull_margin)
+    reach = 2 * dr.log(splats.opacities / ALPHA_CUT) + 2 * math.log(2) * margin
     radius = dr.sqrt(reach * splats.variances)
     size = t.Array2f(dr.opaque(t.Float, grid.width), dr.opaque(t.Float, grid.height))
     # The first and last pixel whose centre lies within the radius, clamped to the film while
@@ -209,13 +222,16 @@ def _make_entries(
     tile_x = tile_x + (local - row * columns)
     tile_y = tile_y + row
     tiles = dr.fma(tile_y, dr.opaque(t.UInt32, grid.columns), tile_x)
-    masks = _touched_micros(geometry, ranks, tile_x, tile_y)
+    margin = dr.opaque(t.Float, grid.cull_margin)
+    masks = _touched_micros(geometry, ranks, tile_x, tile_y, margin)
     dr.eval(ranks, tiles, masks)
     return _Entries(ranks=ranks, tiles=tiles, masks=masks)
 
 
-def _touched_micros(geometry: Any, ranks: Any, tile_x: Any, tile_y: Any) -> Any:
+def _touched_micros(geometry: Any, ranks: Any, tile_x: Any, tile_y: Any, margin: Any) -> Any:
     """Bit m is set where the ellipse alpha >= cut reaches a pixel centre of micro-tile m.
+
+    margin: added to the exponent (base 2).
 
     |U d|^2 is convex, so its minimum over a rectangle that does not contain the mean lies on
     one of the (at most two) sides that face the mean: for such a side, one coordinate is given
@@ -224,7 +240,7 @@ def _touched_micros(geometry: Any, ranks: Any, tile_x: Any, tile_y: Any) -> Any:
     t = types_of(type(geometry))
     mean_x, mean_y, p, r = dr.gather(t.Array4f, geometry, ranks * 2)
     s, log2_opacity, _, _ = dr.gather(t.Array4f, geometry, ranks * 2 + 1)
-    reach = log2_opacity - LOG2_ALPHA_CUT + CULL_MARGIN
+    reach = log2_opacity - LOG2_ALPHA_CUT + margin
     dx_per_dy = -r / p
     dy_per_dx = -(p * r) / dr.fma(r, r, s * s)
 

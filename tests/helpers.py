@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from drgs import reference, rendering
+from drgs.bench import scenes
 from drgs.camera import Camera
 from drgs.gaussians import PARAMETER_NAMES, Gaussians
 from drgs.projection import compensated_opacity, plain_opacity
@@ -238,11 +239,7 @@ def device_gaussians(gaussians: reference.Gaussians, precision: Precision) -> Ga
 
 def device_camera(camera: reference.Camera, precision: Precision) -> Camera:
     """The same camera as Dr.Jit scalars."""
-    K = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
-    return Camera.create(
-        precision.Float, camera.rotation, camera.center, K, camera.width, camera.height,
-        camera.near,
-    )  # fmt: skip
+    return scenes.device_camera(camera, precision.Float)
 
 
 def render(case: Case, precision: Precision, pipeline=None) -> tuple[Gaussians, rendering.Frame]:

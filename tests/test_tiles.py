@@ -16,7 +16,7 @@ from helpers import (
     stacked_scene,
 )
 
-from drgs import constants, reference, tiles
+from drgs import reference, tiles
 from drgs.projection import compensated_opacity, load_rows, plain_opacity, project
 from drgs.tiles import GRID, MICRO, MICROS, TILE, WORD, TileGrid, bin_splats
 
@@ -124,7 +124,7 @@ def test_masks_equal_a_brute_force_ellipse_test(precision, case):
     """The smallest exponent over each micro-tile's rectangle of pixel centres.
 
     A quadratic's minimum over a rectangle that does not hold its centre lies on the border: here
-    all four sides are tried. ``CULL_MARGIN`` (base 2) is the documented margin; beyond it a
+    all four sides are tried. ``cull_margin`` (base 2) is the documented margin; beyond it a
     rounding error of a tenth is allowed for float32.
     """
     binned = bin_case(case, precision)
@@ -152,7 +152,7 @@ def test_masks_equal_a_brute_force_ellipse_test(precision, case):
         reach = log2_opacity - np.log2(reference.ALPHA_CUT)
 
         actual = (table[binned.order[rank]][:, None] >> micro & 1).astype(bool)
-        slack = constants.CULL_MARGIN
+        slack = grid.cull_margin
         must_not = smallest > reach + slack * 1.1
         assert not (actual & must_not).any(), f"rank {rank}: bits outside the ellipse"
         # A micro-tile that reaches over the border may be touched off the film only: then the
@@ -184,7 +184,7 @@ def test_number_of_entries_is_that_of_the_boxes(precision, case):
             hit = splats.visible & (first <= last).all(axis=1)
             return np.where(hit, tiles_per_axis.prod(axis=1), 0)
 
-        fewest, most = count(0), count(2 * constants.CULL_MARGIN)
+        fewest, most = count(0), count(2 * binned.bins.grid.cull_margin)
     runs = np.zeros(len(fewest), dtype=np.int64)
     runs[binned.order] = np.diff(binned.first_entry)
     assert (fewest <= runs).all() and (runs <= most).all()

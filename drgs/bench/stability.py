@@ -23,7 +23,7 @@ import numpy as np
 
 from drgs import reference, rendering
 from drgs.bench.output import machine, markdown_table, new_figure, write_csv, write_figure
-from drgs.camera import Camera
+from drgs.bench.scenes import device_camera
 from drgs.gaussians import PARAMETER_NAMES, Gaussians
 
 DESCRIPTION = "error of float32 against float64 as scenes become harder"
@@ -274,11 +274,8 @@ def _by_kernels(
 ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     fields = {name: getattr(gaussians, name) for name in PARAMETER_NAMES}
     device = Gaussians(**fields).to(llvm.TensorXf)
-    K = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
-    device_camera = Camera.create(
-        llvm.Float, camera.rotation, camera.center, K, camera.width, camera.height, camera.near
-    )
-    frame = rendering.render(device, device_camera, rendering.Pipeline(gaussians.sh_degree))
+    pipeline = rendering.Pipeline(gaussians.sh_degree)
+    frame = rendering.render(device, device_camera(camera, llvm.Float), pipeline)
     _, *color = frame.planes()
     image = np.stack([np.array(plane).reshape(HEIGHT, WIDTH) for plane in color], axis=-1)
     planes = [llvm.Float(np.ascontiguousarray(w, np.float32)) for w in _planes(cotangent)]

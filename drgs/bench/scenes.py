@@ -1,0 +1,73 @@
+"""Scenes that measurements share. Layer 5.
+
+Cameras are :class:`drgs.reference.Camera`: plain numbers, from which :func:`device_camera` makes
+the kernels' camera in any precision.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from drgs import reference
+from drgs.camera import Camera
+from drgs.gaussians import Gaussians
+
+BENCH_TO_WORLD = np.array(
+    [
+        [-1.0, 0.0, 0.0, 0.0],
+        [0.0, -0.73411, 0.679031, 2.73726],
+        [0.0, 0.679031, 0.73411, 2.959292],
+    ]
+)
+"""Camera to world in OpenGL axes: the first test camera of the NeRF-synthetic Lego."""
+
+BENCH_FIELD_OF_VIEW = 0.691111
+"""rad, horizontal."""
+
+
+def bench_gaussians(count: int, seed: int = 0) -> Gaussians:
+    """``count`` Gaussians in and on the box [-1, 1]^3, as numpy arrays.
+
+    80 % lie on a random face, moved inwards by |N(0, 0.05)|, the others uniformly inside. Scales
+    are log-normal around 0.01, rotations uniform, opacities uniform in [0.1, 0.95]; SH of degree
+    3, with base colours uniform in [0, 1].
+    """
+    rng = np.random.default_rng(seed)
+    means = rng.uniform(-1, 1, (count, 3))
+    on_face = np.flatnonzero(rng.random(count) < 0.8)
+    axis, side = rng.integers(0, 3, count), rng.choice([-1, 1], count)
+    inwards = np.abs(rng.normal(0, 0.05, count))
+    means[on_face, axis[on_face]] = (side * (1 - inwards))[on_face]
+    opacities = rng.uniform(0.1, 0.95, count)
+    values = {
+        "means": means,
+        "quats": rng.normal(size=(count, 4)),
+        "log_scales": rng.normal(np.log(0.01), 0.5, (count, 3)),
+        "logit_opacities": np.log(opacities / (1 - opacities)),
+        "sh0": (rng.uniform(0, 1, (count, 1, 3)) - 0.5) / reference.C_00,
+        "shN": rng.normal(0, 0.05, (count, 15, 3)),
+    }
+    return Gaussians(**{name: value.astype(np.float32) for name, value in values.items()})
+
+
+def bench_camera(size: int) -> reference.Camera:
+    """The bench scene's camera with a square film of ``size`` px."""
+    focal = size / (2 * np.tan(BENCH_FIELD_OF_VIEW / 2))
+    return reference.Camera(
+        rotation=(BENCH_TO_WORLD[:, :3] * [1, -1, -1]).T.astype(np.float32),
+        center=BENCH_TO_WORLD[:, 3].astype(np.float32),
+        fx=float(np.float32(focal)),
+        fy=float(np.float32(focal)),
+        cx=size / 2,
+        cy=size / 2,
+        width=size,
+        height=size,
+    )
+
+
+def device_camera(camera: reference.Camera, float_type: type) -> Camera:
+    """The same camera as Dr.Jit scalars of ``float_type``."""
+    K = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
+    return Camera.create(
+        float_type, camera.rotation, camera.center, K, camera.width, camera.height, camera.near
+    )
