@@ -83,6 +83,7 @@ def run(args: argparse.Namespace) -> None:
     rows = [[name, *vars(m).values()] for name, steps in results.items() for m in steps]
     write_csv(args.out / "stability.csv", ["sweep", *columns], rows)
     write_figure(args.out / "stability.png", plot(results))
+    print(f"\nall of it in short\n{_summary(results)}")
     print(f"\nwritten: {args.out / 'stability.csv'}, {args.out / 'stability.png'}")
 
 
@@ -95,8 +96,8 @@ def sweeps() -> list[Sweep]:
     """The four families."""
     return [
         Sweep("Stack depth", "layers", (1, 3, 10, 30, 100, 300, 1000), _stack),
-        Sweep("Anisotropy", "longest over shortest axis", (2, *_decades(1, 8)), _needles),
-        Sweep("Distance", "distance of the scene over its size", _decades(0, 6), _distant),
+        Sweep("Anisotropy", "times longer than wide", (2, *_decades(1, 8)), _needles),
+        Sweep("Distance", "times as far as the scene is deep", _decades(0, 6), _distant),
         Sweep("Coordinate offset", "scene units from the origin", _decades(0, 6), _offset),
     ]
 
@@ -308,6 +309,18 @@ def _table(sweep: Sweep, steps: list[Measurement]) -> str:
             )
         ]
         for m in steps
+    ]
+    return markdown_table(header, rows)
+
+
+def _summary(results: dict[str, list[Measurement]]) -> str:
+    """The first and the last step of each sweep."""
+    header = ["", "picture", "its noise", "gradients", "their noise"]
+    rows = [
+        [f"{sweep.name}: {m.value:g} {sweep.axis}"]
+        + [f"{v:.1e}" for v in (m.picture, m.picture_noise, m.gradient, m.gradient_noise)]
+        for sweep in sweeps()
+        for m in (results[sweep.name][0], results[sweep.name][-1])
     ]
     return markdown_table(header, rows)
 
