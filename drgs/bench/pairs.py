@@ -1,0 +1,57 @@
+"""How much work a frame is: entries, and (pixel, Gaussian) pairs. Layer 5."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+
+from drgs import rasterize
+from drgs.arrays import types_of
+from drgs.rasterize import MICRO, PIXELS
+from drgs.rendering import Frame
+
+
+@dataclass(frozen=True)
+class Work:
+    """What the compositing kernels visit, and what of it shows."""
+
+    entries: int  # (Gaussian, tile)
+    micro_entries: int  # (Gaussian, micro-tile)
+    evaluated: int  # (pixel, Gaussian) pairs whose alpha compositing computes
+    useful: int  # pairs with alpha >= 1/255 at a pixel that is not finished
+
+
+def count_work(frame: Frame) -> Work:
+    """Count by walking the entries once more."""
+    bins, layers = frame.bins, frame.layers
+    t = types_of(type(bins.geometry))
+    lanes = rasterize._make_lanes(t.Float, bins.grid)
+    stop = dr.gather(t.UInt32, layers.stop, lanes.micro_tile)
+    entries = rasterize._Entries(bins, lanes, stop)
+    ends = rasterize._load_row(layers.ends, lanes.micro_tile, 1)
+
+    def body(cursor: Any, visited: Any, useful: Any) -> tuple:
+        entry, active = entries.current(cursor)
+        rank = dr.gather(t.UInt32, bins.ranks, entry, active)
+        footprint = rasterize._Footprint.load(bins, lanes, rank, active)
+        for pixel in range(PIXELS):
+            row, column = divmod(pixel, MICRO)
+            alpha = rasterize._Alpha.at(footprint.log2_alpha[row][column], dr.exp2)
+            useful = useful + dr.select((alpha.value > 0) & (entry < ends[pixel]), t.UInt32(1), 0)
+        return entries.advance(cursor), visited + dr.select(active, t.UInt32(1), 0), useful
+
+    zero = dr.zeros(t.UInt32, dr.width(lanes.tile))
+    _, visited, useful = dr.while_loop(
+        state=(entries.begin(), zero, t.UInt32(zero)),
+        cond=lambda cursor, visited, useful: entries.pending(cursor),
+        body=body,
+    )
+    dr.eval(visited, useful)
+    return Work(
+        entries=bins.num_entries,
+        micro_entries=int(dr.sum(dr.popcnt(bins.masks))[0]),
+        evaluated=int(dr.sum(visited)[0]) * PIXELS,
+        useful=int(dr.sum(useful)[0]),
+    )

@@ -1,0 +1,162 @@
+"""Other implementations, given the same Gaussians, camera and loss. Layer 5.
+
+A :class:`Renderer` renders a frame, and renders one and differentiates the loss
+sum(weights * image) / pixels with respect to all of its parameters. Each call returns when the
+device has finished.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib.util import find_spec
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from drgs import reference
+from drgs.config import ModelConfig
+from drgs.gaussians import PARAMETER_NAMES, Gaussians
+from drgs.scene import make_scene
+
+SHELL = 3.0
+"""Standard deviations at which Mitsuba's ellipsoids end (its default, and 3DGS's extent)."""
+
+
+@dataclass(frozen=True)
+class Renderer:
+    """One implementation with a scene loaded."""
+
+    name: str
+    forward: Callable[[], None]
+    forward_backward: Callable[[], None]
+    seconds: float  # roughly, for both: how often it can be repeated
+
+
+@dataclass(frozen=True)
+class Problem:
+    """What every implementation is given."""
+
+    gaussians: Gaussians  # numpy
+    camera: reference.Camera
+    weights: np.ndarray  # (H, W, 3): the loss is sum(weights * image) / (H W)
+
+
+def drgs_renderer(problem: Problem) -> Renderer:
+    """The ``splats`` integrator through ``mi.render``, as a user of Mitsuba calls it."""
+    scene = make_scene(problem.gaussians, ModelConfig(), (1.0, 1.0, 1.0))
+    return _mitsuba_renderer("drgs", scene, problem, "integrator.", 0.1)
+
+
+def volprim_renderer(problem: Problem, shape: str, seconds: float) -> Renderer:
+    """Mitsuba's ``volprim_rf_basic`` on ``ellipsoids`` or ``ellipsoidsmesh``."""
+    gaussians = problem.gaussians
+    quats_xyzw = gaussians.quats / np.linalg.norm(gaussians.quats, axis=1, keepdims=True)
+    quats_xyzw = np.roll(quats_xyzw, -1, axis=1)
+    sh = np.concatenate([gaussians.sh0, gaussians.shN], axis=1)
+    attributes = {
+        "data": np.concatenate([gaussians.means, gaussians.scales, quats_xyzw], axis=1),
+        "opacities": gaussians.opacities[:, None],
+        "sh_coeffs": sh.reshape(len(sh), -1),
+    }
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "integrator": {
+                "type": "volprim_rf_basic",
+                "srgb_primitives": False,
+                "max_depth": 256,
+            },
+            "emitter": {"type": "constant"},
+            "shapes": {
+                "type": shape,
+                "extent": SHELL,
+                **{name: mi.TensorXf(v.astype(np.float32)) for name, v in attributes.items()},
+            },
+        }
+    )
+    return _mitsuba_renderer(f"volprim_rf_basic, {shape}", scene, problem, "shapes.", seconds)
+
+
+def _mitsuba_renderer(
+    name: str, scene: mi.Scene, problem: Problem, prefix: str, seconds: float
+) -> Renderer:
+    camera = problem.camera
+    sensor = mi.load_dict(_sensor(camera))
+    params = mi.traverse(scene)
+    names = ("means", "quats", "log_scales", "logit_opacities", "sh0", "shN")
+    names += ("data", "opacities", "sh_coeffs")
+    params.keep([prefix + name for name in names if prefix + name in params])
+    weights = mi.TensorXf(problem.weights.astype(np.float32) / (camera.width * camera.height))
+
+    def forward() -> None:
+        with dr.suspend_grad():
+            dr.eval(mi.render(scene, sensor=sensor, spp=1))
+        dr.sync_thread()
+
+    def forward_backward() -> None:
+        for key in params.keys():  # noqa: SIM118  (not a dictionary)
+            dr.enable_grad(params[key])
+            dr.clear_grad(params[key])
+        image = mi.render(scene, params, sensor=sensor, spp=1)
+        dr.backward(dr.sum(image * weights, axis=None))
+        gradients = [dr.grad(params[key]) for key in params.keys()]  # noqa: SIM118
+        dr.eval(gradients)
+        dr.sync_thread()
+        for key in params.keys():  # noqa: SIM118
+            dr.disable_grad(params[key])
+
+    return Renderer(name, forward, forward_backward, seconds)
+
+
+def _sensor(camera: reference.Camera) -> dict[str, Any]:
+    to_world = np.eye(4)
+    to_world[:3, :3] = camera.rotation.T * [-1, -1, 1]  # Mitsuba's x is to the left, its y up
+    to_world[:3, 3] = camera.center
+    return {
+        "type": "perspective",
+        "fov": float(np.degrees(2 * np.arctan(camera.width / 2 / camera.fx))),
+        "fov_axis": "x",
+        "near_clip": 1e-3,
+        "to_world": mi.ScalarTransform4f(to_world),
+        "film": {
+            "type": "hdrfilm",
+            "width": camera.width,
+            "height": camera.height,
+            "pixel_format": "rgb",
+            "component_format": "float32",
+            "rfilter": {"type": "box"},
+        },
+        "sampler": {"type": "independent", "sample_count": 1},
+    }
+
+
+def reference_renderer(problem: Problem) -> Renderer:
+    """The float64 numpy reference."""
+    fields = [getattr(problem.gaussians, name) for name in PARAMETER_NAMES]
+    gaussians, white = reference.Gaussians(*fields), np.ones(3)
+    d_image = problem.weights / problem.weights[..., 0].size
+
+    def forward() -> None:
+        reference.render(gaussians, problem.camera, white)
+
+    def forward_backward() -> None:
+        reference.render(gaussians, problem.camera, white)
+        reference.render_gradients(gaussians, problem.camera, white, d_image)
+
+    seconds = 6e-4 * len(gaussians.means)
+    return Renderer("numpy reference, float64", forward, forward_backward, seconds)
+
+
+def why_no_gsplat() -> str:
+    """Why gsplat's PyTorch implementation, which its tests compare with, is not measured.
+
+    Version 1.5 lists the (pixel, Gaussian) pairs by a CUDA kernel even there
+    (``rasterize_to_indices_in_range``), and composites them with the package nerfacc.
+    """
+    missing = [name for name in ("torch", "gsplat", "nerfacc") if find_spec(name) is None]
+    if missing:
+        return f"gsplat's PyTorch code: not measured, {' and '.join(missing)} not installed"
+    return "gsplat's PyTorch code: not measured, it needs a CUDA kernel of its own to rasterize"

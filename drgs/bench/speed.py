@@ -1,0 +1,366 @@
+"""``python -m drgs.bench speed``: drgs, other renderers, and the machine's limits, side by side.
+
+Layer 5. Everything is measured in one process, on the same Gaussians and camera, with the same
+loss, in turns: each round times every implementation once, so that whatever else the machine does
+meets all of them. Medians are reported, and ratios of medians.
+
+For the compositing kernels the command also says how much of their work shows (pairs of a pixel
+and a Gaussian whose alpha reaches 1/255 before the pixel is finished), and what part of the
+machine's vector instructions that work would need: see :data:`INSTRUCTIONS`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import statistics
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import drjit as dr
+import drjit.llvm.ad as llvm
+import mitsuba as mi
+import numpy as np
+
+from drgs import reference, rendering
+from drgs.bench import peers
+from drgs.bench.limits import MachineLimits, measure_limits
+from drgs.bench.output import machine, markdown_table, new_figure, write_csv, write_figure
+from drgs.bench.pairs import Work, count_work
+from drgs.bench.profile import STAGES, StageClock, stage_clock
+from drgs.bench.scenes import bench_camera, bench_gaussians, device_camera
+from drgs.config import FitConfig
+from drgs.data.types import Dataset, View
+from drgs.files import atomic_path
+from drgs.gaussians import Gaussians
+from drgs.io.ply import read_ply
+from drgs.trainer import Trainer
+
+DESCRIPTION = "times of drgs and of other renderers on the same scene, in one run"
+
+SIZE = 400
+"""px: width and height of all pictures."""
+
+INSTRUCTIONS = {"compositing": 22.0, "adjoint": 42.0}
+"""Vector instructions that one (pixel, Gaussian) pair needs, three colours, counted by hand in
+``rasterize.composite`` and ``composite_adjoint``; loads of a record, loop control and what is
+shared by the 16 pixels of a micro-tile are not counted as useful.
+
+Compositing, 22: u (1) and exponent (1); exp2: round, difference, 6 multiply-adds, shift, add (10);
+clamp and cut: 2 comparisons, 2 selections (4); next T and weight: multiply-add, comparison,
+multiply (3); colour: 3 multiply-adds.
+
+Adjoint, 42: the same up to the cut (16); reached: comparison, selection (2); 1 - alpha and
+division (2, though one division costs several); weight (1); c.g and d_color: 6 multiply-adds;
+gain, R, derivative and selection (4); and the sums over the pixels: u v (1), sums of v and u v by
+row, u v by column (3), the column's and the rows' shares of the moments and of the slots (7)."""
+
+ROUNDS, QUICK_ROUNDS = 15, 5
+SLOW_ROUNDS = 3
+"""Rounds of implementations that need more than ``SLOW`` seconds."""
+
+SLOW = 0.5
+VERY_SLOW = 15.0
+"""s: measured once."""
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Gaussians, camera, and what they are called."""
+
+    name: str
+    gaussians: Gaussians  # numpy
+    camera: reference.Camera
+
+
+@dataclass(frozen=True)
+class Timing:
+    """Medians, seconds, of one implementation on one scene."""
+
+    scene: str
+    renderer: str
+    forward: float
+    forward_backward: float
+    rounds: int
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Options besides ``--out``."""
+    parser.add_argument("--quick", action="store_true", help="10,000 Gaussians only; two minutes")
+    parser.add_argument(
+        "--trained",
+        type=Path,
+        default=Path("out/lego/point_cloud.ply"),
+        metavar="PLY",
+        help="a fitted scene to measure as well (default: out/lego/point_cloud.ply, if it exists)",
+    )
+
+
+def run(args: argparse.Namespace) -> None:
+    """Measure all scenes; write tables, CSV, JSON and a plot."""
+    mi.set_variant("llvm_ad_rgb")
+    limits = measure_limits()
+    print(
+        f"{machine()}\n{limits.multiply_adds / 1e9:.1f} G multiply-adds/s in vectors of "
+        f"{limits.width}, {limits.bytes_moved / 1e9:.1f} GB/s"
+    )
+    print(peers.why_no_gsplat())
+    timings, reports = [], []
+    for scene in scenes_of(args):
+        found = measure_scene(scene, QUICK_ROUNDS if args.quick else ROUNDS)
+        report = profile_training(scene, limits, QUICK_ROUNDS if args.quick else ROUNDS)
+        timings += found
+        reports.append(report)
+        print(f"\n{scene.name}: {_work_line(report.work)}")
+        print(f"\n{_comparison(found)}\n\n{_stages(report)}", flush=True)
+    _write(args.out, limits, timings, reports)
+
+
+def scenes_of(args: argparse.Namespace) -> list[Scene]:
+    """The bench scene at one or two sizes, and a trained one if there is one."""
+    camera = bench_camera(SIZE)
+    counts = (10_000,) if args.quick else (10_000, 100_000)
+    scenes = [Scene(f"bench scene, {n:,}", bench_gaussians(n), camera) for n in counts]
+    if args.trained.exists():
+        gaussians = read_ply(args.trained)
+        scenes.append(Scene(f"trained, {gaussians.num_gaussians:,}", gaussians, camera))
+    else:
+        print(f"{args.trained}: not there; fit a scene, or name one with --trained, to measure it")
+    return scenes
+
+
+# ----------------------------------------------------------------------------------------------
+# Side by side
+# ----------------------------------------------------------------------------------------------
+
+
+def measure_scene(scene: Scene, rounds: int) -> list[Timing]:
+    """Time every implementation in turns."""
+    rng = np.random.default_rng(0)
+    weights = rng.normal(size=(scene.camera.height, scene.camera.width, 3))
+    problem = peers.Problem(scene.gaussians, scene.camera, weights)
+    count = scene.gaussians.num_gaussians
+    renderers = [
+        peers.drgs_renderer(problem),
+        peers.volprim_renderer(problem, "ellipsoids", 7e-5 * count),
+        peers.volprim_renderer(problem, "ellipsoidsmesh", 1.5e-4 * count),
+        peers.reference_renderer(problem),
+    ]
+    times: dict[str, list[tuple[float, float]]] = {r.name: [] for r in renderers}
+    for renderer in renderers:  # compiles the kernels
+        if renderer.seconds < VERY_SLOW:
+            renderer.forward_backward()
+            renderer.forward()
+    for turn in range(rounds):
+        for renderer in renderers:
+            if turn < _rounds(renderer, rounds):
+                times[renderer.name].append(
+                    (_seconds(renderer.forward), _seconds(renderer.forward_backward))
+                )
+    return [
+        Timing(
+            scene.name,
+            name,
+            statistics.median(forward for forward, _ in pairs),
+            statistics.median(both for _, both in pairs),
+            len(pairs),
+        )
+        for name, pairs in times.items()
+    ]
+
+
+def _rounds(renderer: peers.Renderer, rounds: int) -> int:
+    if renderer.seconds > VERY_SLOW:
+        return 1
+    return SLOW_ROUNDS if renderer.seconds > SLOW else rounds
+
+
+def _seconds(function: Callable[[], None]) -> float:
+    started = time.perf_counter()
+    function()
+    return time.perf_counter() - started
+
+
+# ----------------------------------------------------------------------------------------------
+# A training iteration, stage by stage
+# ----------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class IterationReport:
+    """Where the time of a training iteration goes."""
+
+    scene: str
+    work: Work
+    stage_ms: dict[str, float]  # kernels, medians; see profile.STAGES
+    wall_ms: float  # a whole iteration that nobody looks into, median
+    vector_share: dict[str, float]  # of the machine's vector instructions, by useful pairs
+
+    @property
+    def kernel_ms(self) -> float:
+        """All kernels."""
+        return sum(self.stage_ms.values())
+
+
+def profile_training(scene: Scene, limits: MachineLimits, rounds: int) -> IterationReport:
+    """Train on one view of the scene itself, with all SH degrees and no change of population."""
+    trainer = _trainer_of(scene)
+    for _ in range(3):
+        trainer.step()
+    dr.sync_thread()
+    walls, clocks = [], []
+    for _ in range(rounds):
+        walls.append(_seconds(lambda: _steps(trainer, 4)) / 4)
+        clocks.append(_clocked_step(trainer))
+    stage_ms = {
+        stage: statistics.median(clock.kernel_ms.get(stage, 0.0) for clock in clocks)
+        for stage in STAGES
+    }
+    work = count_work(_frame_of(scene))
+    share = {
+        stage: work.useful * count / limits.width / limits.vector_instructions / stage_ms[stage]
+        * 1e3
+        for stage, count in INSTRUCTIONS.items()
+    }  # fmt: skip
+    return IterationReport(scene.name, work, stage_ms, 1e3 * statistics.median(walls), share)
+
+
+def _steps(trainer: Trainer, count: int) -> None:
+    for _ in range(count):
+        trainer.step()
+    dr.sync_thread()
+
+
+def _clocked_step(trainer: Trainer) -> StageClock:
+    with stage_clock() as clock:
+        report = trainer.step()
+        dr.eval(report.loss_array, report.squared_error)
+        clock.end("optimizer and statistics")
+    return clock
+
+
+def _frame_of(scene: Scene) -> rendering.Frame:
+    pipeline = rendering.Pipeline(scene.gaussians.sh_degree)
+    camera = device_camera(scene.camera, llvm.Float)
+    return rendering.render(scene.gaussians.to(llvm.TensorXf), camera, pipeline)
+
+
+def _trainer_of(scene: Scene) -> Trainer:
+    """Its target is the scene's own picture, moved by a pixel: a gradient of realistic size."""
+    camera = scene.camera
+    _, *planes = _frame_of(scene).planes()
+    image = np.stack([np.array(p).reshape(camera.height, camera.width) for p in planes], axis=-1)
+    to_world = np.eye(4)
+    to_world[:3, :3], to_world[:3, 3] = camera.rotation.T, camera.center
+    view = View(
+        "bench", np.clip(np.roll(image, 1, axis=1), 0, 1).astype(np.float32), to_world,
+        camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height,
+    )  # fmt: skip
+    dataset = Dataset((view,), (view,), "bench", (1.0, 1.0, 1.0), None, "bench")
+    config = FitConfig(
+        data={"path": "."},
+        model={"sh_degree": scene.gaussians.sh_degree, "sh_increase_every": 1},
+        # Statistics are gathered as in a fit, but the population stays.
+        densify={"start": 1_000_000, "stop": 1_000_001, "reset_every": 1_000_000},
+        iterations=2_000_000,
+    )
+    trainer = Trainer(config, dataset, scene.gaussians)
+    trainer.iteration = 10  # all SH degrees are in use
+    return trainer
+
+
+# ----------------------------------------------------------------------------------------------
+# Output
+# ----------------------------------------------------------------------------------------------
+
+
+def _work_line(work: Work) -> str:
+    return (
+        f"{work.entries:,} (Gaussian, tile) entries, {work.evaluated:,} (pixel, Gaussian) pairs "
+        f"evaluated, {work.useful:,} of them useful"
+    )
+
+
+def _comparison(timings: list[Timing]) -> str:
+    ours = timings[0]
+    header = ["400x400", "forward", "forward + backward", "ratio", "ratio, both", "rounds"]
+    rows = [
+        [
+            timing.renderer,
+            _milliseconds(timing.forward),
+            _milliseconds(timing.forward_backward),
+            f"{timing.forward / ours.forward:.1f}",
+            f"{timing.forward_backward / ours.forward_backward:.1f}",
+            str(timing.rounds),
+        ]
+        for timing in timings
+    ]
+    return markdown_table(header, rows)
+
+
+def _milliseconds(seconds: float) -> str:
+    return f"{1e3 * seconds:.1f} ms" if seconds < 1 else f"{seconds:.2f} s"
+
+
+def _stages(report: IterationReport) -> str:
+    rows = [
+        [
+            stage,
+            f"{report.stage_ms[stage]:.1f} ms",
+            f"{100 * report.vector_share[stage]:.0f} %" if stage in report.vector_share else "",
+        ]
+        for stage in STAGES
+    ]
+    rest = report.wall_ms - report.kernel_ms
+    rows.append(["rest of wall time", f"{rest:.1f} ms", ""])
+    rows.append(["a training iteration", f"{report.wall_ms:.1f} ms", ""])
+    return markdown_table(["stage", "kernels", "useful part of the vector limit"], rows)
+
+
+def _write(
+    out: Path, limits: MachineLimits, timings: list[Timing], reports: list[IterationReport]
+) -> None:
+    write_csv(
+        out / "speed.csv",
+        list(Timing.__dataclass_fields__),
+        [list(vars(timing).values()) for timing in timings],
+    )
+    values = {
+        "machine": machine(),
+        "limits": vars(limits),
+        "timings": [vars(timing) for timing in timings],
+        "iterations": [{**vars(report), "work": vars(report.work)} for report in reports],
+    }
+    with atomic_path(out / "speed.json") as temporary:
+        temporary.write_text(json.dumps(values, indent=2) + "\n")
+    write_figure(out / "speed.png", plot(timings, reports))
+    print(f"\nwritten: {', '.join(str(out / f'speed.{kind}') for kind in ('csv', 'json', 'png'))}")
+
+
+def plot(timings: list[Timing], reports: list[IterationReport]) -> Any:
+    """Times of all implementations, and the stages of an iteration."""
+    figure = new_figure(11, 4.5)
+    left, right = figure.subplots(1, 2)
+    scenes = list(dict.fromkeys(timing.scene for timing in timings))
+    names = list(dict.fromkeys(timing.renderer for timing in timings))
+    for k, name in enumerate(names):
+        values = [t.forward_backward for t in timings if t.renderer == name]
+        left.barh(
+            np.arange(len(values)) + 0.8 * k / len(names), values, 0.8 / len(names), label=name
+        )
+    left.set_yticks(np.arange(len(scenes)) + 0.3, scenes)
+    left.set(xscale="log", xlabel="s", title="forward + backward")
+    left.legend(fontsize=8)
+    bottoms = np.zeros(len(reports))
+    for stage in STAGES:
+        values = np.array([report.stage_ms[stage] for report in reports])
+        right.bar(scenes, values, bottom=bottoms, label=stage)
+        bottoms += values
+    rest = np.array([max(report.wall_ms - report.kernel_ms, 0) for report in reports])
+    right.bar(scenes, rest, bottom=bottoms, label="rest of wall time", color="0.8")
+    right.set(ylabel="ms", title="a training iteration")
+    right.legend(fontsize=8)
+    return figure

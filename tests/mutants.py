@@ -1,0 +1,697 @@
+"""Mutants of derivative code, made from its source and switched at run time.
+
+A *site* is a place in a function's source where a partial derivative comes into being or is
+handed over. :class:`Instrumented` executes a copy of a module's source in which the value at each
+site passes through a switch: multiplied by a factor, or, for a condition, forced. The switches are
+read from the device's memory, so that all mutants run in the same kernels and none is compiled on
+its own (Untch et al. 1993, "Mutation analysis using mutant schemata"). Multiplication by a factor
+of one is exact.
+
+Sites are found by syntax, so that a partial derivative which is written tomorrow has its mutants:
+
+- the right-hand side of an assignment and what is returned; each component where that is a
+  vector, a tuple or a dataclass, while a list is one partial, evaluated at many pixels;
+- each term of a sum, a difference or an ``fma`` (the whole is no site of its own);
+- each element of a list, and each argument that is given by name or to ``append``;
+- what is given to Dr.Jit as a gradient;
+- each operand of the condition of a ``select``, and each comparison.
+
+No sites are, since the value came into being elsewhere:
+
+- names, attributes, subscripts and copies of lists;
+- results of functions of this package, where they are assigned or returned: they are either
+  instrumented themselves or belong to the forward pass, whose own tests compare its values.
+
+Mutated are floating point arrays. Not so are integers and selections between integers, as they
+address memory; and numbers of the host, as every product that they enter is a site.
+"""
+
+from __future__ import annotations
+
+import ast
+import dataclasses
+import inspect
+import operator
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from enum import Enum, auto
+from functools import cache
+from types import GeneratorType, ModuleType
+from typing import Any
+
+import drjit as dr
+
+SCALED, NEGATED = "x 1.01", "x -1"
+ALWAYS, NEVER, AT_EQUALITY = "always", "never", "at equality"
+
+_FACTORS = {SCALED: 1.01, NEGATED: -1.0, None: 1.0}
+
+LITERAL_ZERO = "a constant zero stays zero: padding, the start of a sum"
+EVALUATED_ONLY = "a result that is evaluated and not read"
+UNNAMED = "a result that is assigned to _"
+SAME_AT_EQUALITY = "where two numbers are equal, either may be selected"
+NO_NUMBERS = "a function that returns no floating point numbers, hence no derivatives"
+
+_COMPARISONS: dict[type, Callable] = {
+    ast.Lt: operator.lt,
+    ast.LtE: operator.le,
+    ast.Gt: operator.gt,
+    ast.GtE: operator.ge,
+    ast.Eq: operator.eq,
+    ast.NotEq: operator.ne,
+}
+_AT_EQUALITY = {ast.Lt: ast.LtE, ast.LtE: ast.Lt, ast.Gt: ast.GtE, ast.GtE: ast.Gt}
+_HAND_OVERS = {"accum_grad", "set_grad", "set_grad_in", "set_grad_out"}
+
+
+class _Switch:
+    """What the kernels read at one part of a site: a factor, or flags that force a condition."""
+
+    def __init__(self) -> None:
+        self.changes: list[str] = []
+        self.change: str | None = None
+        self.reached = False
+        self._variables: dict[Any, Any] = {}
+
+    def set(self, change: str | None) -> None:
+        """Apply one change, or none."""
+        assert change is None or change in self.changes
+        if change != self.change:
+            self.change = change
+            self._variables.clear()
+
+    def factor(self, flat_type: type) -> Any:
+        """A variable of this switch alone: Dr.Jit would merge equal ones, and kernels differ."""
+        if flat_type not in self._variables:
+            self._variables[flat_type] = dr.opaque(flat_type, _FACTORS[self.change])
+        return self._variables[flat_type]
+
+    def flag(self, bool_type: type, change: str) -> Any:
+        """Whether ``change`` is applied."""
+        if change not in self._variables:
+            self._variables[change] = dr.opaque(bool_type, self.change == change)
+        return self._variables[change]
+
+
+@dataclass(eq=False)
+class Site:
+    """A place in the source, and the switches of what has been evaluated there."""
+
+    function: str  # module.name or module.class.name
+    line: int
+    text: str  # the source there
+    parts: tuple[str, ...] = ()  # names of operands, or that the value is unpacked to
+    comparison: type | None = None  # the operator, of a comparison
+    reason: str = ""  # to leave out its values; of a comparison, the change at equality
+    evaluated: bool = False
+    switches: dict[str, _Switch] = field(default_factory=dict)  # by part
+    left_out: dict[str, str] = field(default_factory=dict)  # part -> reason
+
+    def switch(self, part: str, changes: tuple[str, ...]) -> _Switch:
+        """The switch of one part, with at least the given changes."""
+        switch = self.switches.get(part)
+        if switch is None:
+            switch = self.switches[part] = _Switch()
+        if changes[0] not in switch.changes:
+            switch.changes += changes
+        switch.reached = True
+        return switch
+
+
+@dataclass(frozen=True)
+class Mutant:
+    """One change of one part of one site."""
+
+    site: Site
+    part: str  # a component of a value, an operand of a condition; "" for the whole
+    change: str
+
+    def __str__(self) -> str:
+        site = self.site
+        return f"{site.function}:{site.line}  {site.text}{self.part and f'  [{self.part}]'}"
+
+    @property
+    def switch(self) -> _Switch:
+        return self.site.switches[self.part]
+
+
+class Switchboard:
+    """What the instrumented code calls; knows the mutants of all that has been evaluated."""
+
+    def __init__(self) -> None:
+        self.sites: list[Site] = []
+        self.applied: Mutant | None = None
+        self._conditions: dict[int, tuple] = {}  # variable -> itself, comparisons it is made of
+        self._returns_numbers: dict[str, bool] = {}  # by function
+
+    @property
+    def mutants(self) -> list[Mutant]:
+        """In the order of the source."""
+        return [
+            Mutant(site, part, change)
+            for site in self.sites
+            if self._returns_numbers.get(site.function, True)
+            for part, switch in site.switches.items()
+            for change in switch.changes
+        ]
+
+    @property
+    def left_out(self) -> list[tuple[Site, str, str]]:
+        """(site, part, reason) of what was evaluated and has no mutant."""
+        result = []
+        for site in self.sites:
+            reasons = {p: r for p, r in site.left_out.items() if p not in site.switches}
+            if not self._returns_numbers.get(site.function, True):
+                reasons |= dict.fromkeys(site.switches, NO_NUMBERS)
+            result += [(site, part, reason) for part, reason in reasons.items()]
+        return result
+
+    def apply(self, mutant: Mutant | None) -> None:
+        """Apply one mutant and no other, or none."""
+        self._conditions.clear()
+        if self.applied is not None:
+            self.applied.switch.set(None)
+        self.applied = mutant
+        if mutant is not None:
+            mutant.switch.set(mutant.change)
+
+    def record(self, function: Callable[[], Any]) -> tuple[Any, set[_Switch]]:
+        """What ``function`` returns, and the switches that it reads."""
+        before = self._take_reached()
+        result = function()
+        reached = self._take_reached()
+        for switch in before | reached:
+            switch.reached = True
+        return result, reached
+
+    def _take_reached(self) -> set[_Switch]:
+        reached = {s for site in self.sites for s in site.switches.values() if s.reached}
+        for switch in reached:
+            switch.reached = False
+        return reached
+
+    # ------------------------------------------------------------------------------------------
+    # Called by the instrumented code
+    # ------------------------------------------------------------------------------------------
+
+    def scale(self, index: int, value: Any) -> Any:
+        """A value that is scaled, component by component."""
+        site = self._evaluated(index)
+        if isinstance(value, GeneratorType):
+            value = tuple(value)
+        return _scale(site, "", value, site.parts)
+
+    def returned(self, function: str, value: Any) -> Any:
+        """What a function returns: unchanged."""
+        found = _has_float(value)
+        self._returns_numbers[function] = self._returns_numbers.get(function, False) or found
+        return value
+
+    def add(self, left: int | None, right: int | None, a: Any, b: Any) -> Any:
+        """A sum whose terms are scaled; None for a term that is a sum itself."""
+        a, b = self._terms(left, right, a, b)
+        return a + b
+
+    def subtract(self, left: int | None, right: int | None, a: Any, b: Any) -> Any:
+        """A difference whose terms are scaled."""
+        a, b = self._terms(left, right, a, b)
+        return a - b
+
+    def _terms(self, left: int | None, right: int | None, a: Any, b: Any) -> tuple[Any, Any]:
+        # A number beside an array is a term, too.
+        if isinstance(a, (int, float)) and _is_float(b):
+            a = _flat_type(type(b))(a)
+        if isinstance(b, (int, float)) and _is_float(a):
+            b = _flat_type(type(a))(b)
+        a = a if left is None else _scale(self._evaluated(left), "", a)
+        b = b if right is None else _scale(self._evaluated(right), "", b)
+        return a, b
+
+    def select(self, index: int, conditions: list[Any], a: Any, b: Any) -> Any:
+        """A selection by the conjunction of ``conditions``: each is dropped, the whole forced."""
+        site = self._evaluated(index)
+        if _is_float(a) or _is_float(b):
+            conditions = [self._at_equality(condition) for condition in conditions]
+            if len(conditions) > 1:
+                parts = zip(site.parts, conditions, strict=True)
+                conditions = [_force(site, part, value, (ALWAYS,)) for part, value in parts]
+        condition = _conjunction(conditions)
+        if _is_float(a) or _is_float(b):
+            condition = _force(site, "", condition, (ALWAYS, NEVER)[len(conditions) > 1 :])
+        return dr.select(condition, a, b)
+
+    def compare(self, index: int, a: Any, b: Any) -> Any:
+        """A comparison: of numbers, forced, or decided the other way at equality.
+
+        One of integers is only remembered: it is mutated where it selects between numbers.
+        """
+        site = self._evaluated(index)
+        result = _COMPARISONS[site.comparison](a, b)
+        if not dr.is_array_v(result):
+            return result
+        self._conditions[result.index] = result, [(result, site, a, b)]
+        if not (_is_float(a) or _is_float(b)):
+            return result
+        return _force(site, "", self._at_equality(result), (ALWAYS, NEVER))
+
+    def both(self, a: Any, b: Any) -> Any:
+        """A conjunction, of comparisons that are remembered."""
+        result = a & b
+        if not (dr.is_array_v(a) and dr.is_array_v(b)):
+            return result
+        operands = [self._conditions.get(c.index, (c, [(c, None, None, None)])) for c in (a, b)]
+        self._conditions[result.index] = result, [c for _, parts in operands for c in parts]
+        return result
+
+    def _at_equality(self, condition: Any) -> Any:
+        """A condition; the comparisons that it is made of are mutated at equality."""
+        _, parts = self._conditions.pop(condition.index, (None, []))
+        mutated = [_mutated_at_equality(*part) for part in parts]
+        return _conjunction(mutated) if mutated else condition
+
+    def _evaluated(self, index: int) -> Site:
+        site = self.sites[index]
+        site.evaluated = True
+        return site
+
+
+def _mutated_at_equality(condition: Any, site: Site | None, a: Any, b: Any) -> Any:
+    if site is None or site.comparison not in _AT_EQUALITY:
+        return condition
+    if site.reason:
+        site.left_out[AT_EQUALITY] = site.reason
+        return condition
+    flag = site.switch("", (AT_EQUALITY,)).flag(type(condition), AT_EQUALITY)
+    return dr.select(flag, _COMPARISONS[_AT_EQUALITY[site.comparison]](a, b), condition)
+
+
+def _conjunction(conditions: list[Any]) -> Any:
+    result = conditions[0]
+    for condition in conditions[1:]:
+        result = result & condition
+    return result
+
+
+def _scale(site: Site, part: str, value: Any, names: tuple[str, ...] = ()) -> Any:
+    """``names``: of the components of ``value``, where it is unpacked."""
+    kind = _kind(type(value))
+    if kind is _Kind.OTHER:
+        return value
+    if kind in (_Kind.FLAT, _Kind.PACKED):
+        return _scale_array(site, part, value, kind)
+    if kind is _Kind.LIST:
+        return [_scale(site, part, element) for element in value]
+    if kind is _Kind.DICT:
+        return {key: _scale(site, part, element) for key, element in value.items()}
+    if kind is _Kind.DATACLASS:
+        return _scale_fields(site, part, value)
+    named = zip(_names(names, len(value)), value, strict=True)
+    return type(value)([_scale(site, _join(part, name), v) for name, v in named])
+
+
+def _scale_fields(site: Site, part: str, value: Any) -> Any:
+    """Each field of a dataclass, and each element of a field that is a list."""
+    fields = {}
+    for name in (f.name for f in dataclasses.fields(value)):
+        content, name_here = getattr(value, name), _join(part, name)
+        if isinstance(content, list):
+            content = [_scale(site, f"{name_here}[{k}]", v) for k, v in enumerate(content)]
+        else:
+            content = _scale(site, name_here, content)
+        fields[name] = content
+    return type(value)(**fields)
+
+
+def _scale_array(site: Site, part: str, value: Any, kind: _Kind) -> Any:
+    reason = site.reason or (UNNAMED if part == "_" else "")
+    if kind is _Kind.FLAT and value.state == dr.VarState.Literal:
+        reason = LITERAL_ZERO if dr.width(value) > 0 and value[0] == 0 else reason
+    if reason:
+        site.left_out[part] = reason
+        return value
+    return value * site.switch(part, (SCALED, NEGATED)).factor(_flat_type(type(value)))
+
+
+def _force(site: Site, part: str, condition: Any, changes: tuple[str, ...]) -> Any:
+    switch = site.switch(part, changes)
+    if ALWAYS in changes:
+        condition = condition | switch.flag(type(condition), ALWAYS)
+    if NEVER in changes:
+        condition = condition & ~switch.flag(type(condition), NEVER)
+    return condition
+
+
+class _Kind(Enum):
+    """How a value consists of floating point arrays."""
+
+    FLAT = auto()
+    PACKED = auto()  # a tensor, or any number of components that belong together
+    VECTOR = auto()
+    TUPLE = auto()
+    LIST = auto()
+    DICT = auto()
+    DATACLASS = auto()
+    OTHER = auto()  # it does not
+
+
+@cache
+def _kind(cls: type) -> _Kind:
+    if dr.is_array_v(cls):
+        if not dr.is_float_v(cls):
+            return _Kind.OTHER
+        if dr.is_tensor_v(cls):
+            return _Kind.PACKED
+        if dr.depth_v(cls) == 1:
+            return _Kind.FLAT
+        return _Kind.PACKED if dr.size_v(cls) == dr.Dynamic else _Kind.VECTOR
+    if dataclasses.is_dataclass(cls):
+        return _Kind.DATACLASS
+    return {tuple: _Kind.TUPLE, list: _Kind.LIST, dict: _Kind.DICT}.get(cls, _Kind.OTHER)
+
+
+def _is_float(value: Any) -> bool:
+    return _kind(type(value)) in (_Kind.FLAT, _Kind.PACKED, _Kind.VECTOR)
+
+
+def _has_float(value: Any) -> bool:
+    if isinstance(value, (list, tuple)):
+        return any(map(_has_float, value))
+    if _kind(type(value)) is _Kind.DATACLASS:
+        return any(_has_float(getattr(value, f.name)) for f in dataclasses.fields(value))
+    return _is_float(value)
+
+
+@cache
+def _flat_type(cls: type) -> type:
+    return dr.array_t(cls) if dr.is_tensor_v(cls) else dr.leaf_t(cls)
+
+
+def _join(part: str, name: str) -> str:
+    return f"{part}.{name}" if part else name
+
+
+def _names(names: tuple[str, ...], count: int) -> list[str]:
+    """Names for ``count`` components: those of the targets, of which one may be starred."""
+    if not names:
+        return [str(k) for k in range(count)]
+    starred = [k for k, name in enumerate(names) if name.startswith("*")]
+    if not starred:
+        return list(names)
+    k, rest = starred[0], count - len(names) + 1
+    return [*names[:k], *(f"{names[k][1:]}[{i}]" for i in range(rest)), *names[k + 1 :]]
+
+
+# ----------------------------------------------------------------------------------------------
+# Source
+# ----------------------------------------------------------------------------------------------
+
+
+class Instrumented:
+    """A copy of a module whose derivative functions pass their values through switches.
+
+    derivatives: names of the functions or methods with which derivatives are entered; forward:
+    those of the forward pass. What is reached from the former alone is instrumented. Of what both
+    reach, comparisons are: such a mutant is a decision of the forward pass that the derivative,
+    which alone is run from the copy, does not replay.
+
+    names: to be replaced in the copy's namespace.
+    """
+
+    def __init__(
+        self,
+        switchboard: Switchboard,
+        module: ModuleType | str,
+        derivatives: Iterable[str],
+        forward: Iterable[str],
+        **names: Any,
+    ) -> None:
+        is_source = isinstance(module, str)
+        self.namespace = {"__name__": "sample" if is_source else module.__name__}
+        tree = ast.parse(module if is_source else inspect.getsource(module))
+        reached, shared = (_reachable(tree, roots) for roots in (derivatives, forward))
+        short_name = self.namespace["__name__"].rpartition(".")[2]
+        package = _package_functions(tree)
+        for name, node in _definitions(tree).items():
+            if name in reached:
+                label, is_derivative = f"{short_name}.{name}", name not in shared
+                _Instrumenter(switchboard.sites, label, node, package, is_derivative)
+        ast.fix_missing_locations(tree)
+        self.namespace["__switchboard__"] = switchboard
+        exec(compile(tree, "sample" if is_source else module.__file__, "exec"), self.namespace)
+        self.namespace.update(names)
+
+    def __getitem__(self, name: str) -> Any:
+        return self.namespace[name]
+
+
+def _definitions(tree: ast.Module) -> dict[str, ast.FunctionDef]:
+    """Functions and methods of a module by qualified name."""
+    result = {}
+    for node in tree.body:
+        if isinstance(node, ast.FunctionDef):
+            result[node.name] = node
+        if isinstance(node, ast.ClassDef):
+            for method in node.body:
+                if isinstance(method, ast.FunctionDef):
+                    result[f"{node.name}.{method.name}"] = method
+    return result
+
+
+def _imports(tree: ast.Module) -> list[tuple[str, str]]:
+    """(module, name in this module's namespace)."""
+    return [
+        (getattr(node, "module", None) or alias.name, alias.asname or alias.name)
+        for node in tree.body
+        if isinstance(node, (ast.Import, ast.ImportFrom))
+        for alias in node.names
+    ]
+
+
+def _package_functions(tree: ast.Module) -> set[str]:
+    """Names of functions and methods that the module defines or has from its package."""
+    imported = {name for module, name in _imports(tree) if module.startswith("drgs")}
+    return imported | {name.rpartition(".")[2] for name in _definitions(tree)}
+
+
+def _reachable(tree: ast.Module, roots: Iterable[str]) -> set[str]:
+    """Functions and methods that ``roots`` may call, by the names that they mention."""
+    definitions, imported = _definitions(tree), {name for _, name in _imports(tree)}
+    by_mention: dict[str, list[str]] = {}
+    for name in definitions:
+        owner, _, method = name.rpartition(".")
+        for mention in {owner or name, method}:
+            by_mention.setdefault(mention, []).append(name)
+    reached: set[str] = set()
+    pending = list(roots)
+    assert set(pending) <= set(definitions), set(pending) - set(definitions)
+    while pending:
+        name = pending.pop()
+        if name in reached:
+            continue
+        reached.add(name)
+        for node in ast.walk(definitions[name]):
+            if isinstance(node, ast.Name):
+                pending += by_mention.get(node.id, [])
+            elif isinstance(node, ast.Attribute) and ast.unparse(node.value) not in imported:
+                pending += by_mention.get(node.attr, [])
+    return reached
+
+
+class _Instrumenter(ast.NodeTransformer):
+    """Rewrites the body of one function in place."""
+
+    def __init__(
+        self,
+        sites: list[Site],
+        function: str,
+        node: ast.FunctionDef,
+        package: set[str],
+        is_derivative: bool,
+    ) -> None:
+        self.sites, self.function = sites, function
+        self.package, self.is_derivative = package, is_derivative
+        self.only_evaluated = _only_evaluated(node)
+        self.nesting = 0
+        node.body = [self.visit(statement) for statement in node.body]
+
+    def _site(self, node: ast.expr, text: str = "", **fields: Any) -> int:
+        text = " ".join((text or ast.unparse(node)).split())
+        self.sites.append(Site(self.function, node.lineno, text, **fields))
+        return len(self.sites) - 1
+
+    @staticmethod
+    def _call(method: str, *args: Any) -> ast.Call:
+        nodes = [a if isinstance(a, ast.AST) else ast.Constant(a) for a in args]
+        board = ast.Name("__switchboard__", ast.Load())
+        return ast.Call(ast.Attribute(board, method, ast.Load()), nodes, [])
+
+    def _scaled(self, node: ast.expr, text: str = "", **fields: Any) -> ast.expr:
+        """Visit ``node`` and make its value a site."""
+        if isinstance(node, ast.Starred):
+            node.value = self._scaled(node.value)
+            return node
+        if not self.is_derivative or _has_own_sites(node):
+            return self.visit(node)
+        index = self._site(node, text, **fields)
+        return ast.copy_location(self._call("scale", index, self.visit(node)), node)
+
+    def _made_here(self, node: ast.expr, text: str = "", **fields: Any) -> ast.expr:
+        """The same, unless the value came into being elsewhere."""
+        if isinstance(node, (ast.Name, ast.Attribute, ast.Subscript)):
+            return self.visit(node)
+        if isinstance(node, ast.Call) and _called(node) in {"list", *self.package}:
+            return self.visit(node)
+        return self._scaled(node, text, **fields)
+
+    # Statements
+
+    def visit_FunctionDef(self, node: ast.FunctionDef) -> ast.FunctionDef:
+        self.nesting += 1
+        node.body = [self.visit(statement) for statement in node.body]
+        self.nesting -= 1
+        return node
+
+    def visit_Assign(self, node: ast.Assign) -> ast.Assign:
+        (target,) = node.targets
+        fields = {}
+        if isinstance(target, ast.Tuple):
+            fields["parts"] = tuple(ast.unparse(element) for element in target.elts)
+        if isinstance(target, ast.Name) and target.id in self.only_evaluated:
+            fields["reason"] = EVALUATED_ONLY
+        node.value = self._made_here(node.value, ast.unparse(node), **fields)
+        return node
+
+    def visit_Raise(self, node: ast.Raise) -> ast.Raise:
+        return node  # a message
+
+    def visit_AnnAssign(self, node: ast.AnnAssign) -> ast.AnnAssign:
+        if node.value is not None:
+            node.value = self._made_here(node.value, ast.unparse(node))
+        return node
+
+    def visit_AugAssign(self, node: ast.AugAssign) -> ast.AugAssign:
+        node.value = self._scaled(node.value, ast.unparse(node))
+        return node
+
+    def visit_Return(self, node: ast.Return) -> ast.Return:
+        if node.value is not None:
+            node.value = self._made_here(node.value, ast.unparse(node))
+        if node.value is not None and self.is_derivative and not self.nesting:
+            call = self._call("returned", self.function, node.value)
+            node.value = ast.copy_location(call, node.value)
+        return node
+
+    # Expressions
+
+    def visit_Subscript(self, node: ast.Subscript) -> ast.Subscript:
+        node.value = self.visit(node.value)  # and no site in an index
+        return node
+
+    def visit_List(self, node: ast.List) -> ast.List:
+        node.elts = [self._scaled(element) for element in node.elts]
+        return node
+
+    def visit_Tuple(self, node: ast.Tuple) -> ast.Tuple:
+        node.elts = [self._made_here(element) for element in node.elts]
+        return node
+
+    def visit_BinOp(self, node: ast.BinOp) -> ast.expr:
+        if isinstance(node.op, ast.BitAnd) and any(
+            isinstance(operand, ast.Compare) for operand in _operands(node)
+        ):
+            call = self._call("both", self.visit(node.left), self.visit(node.right))
+            return ast.copy_location(call, node)
+        if not self.is_derivative or not isinstance(node.op, (ast.Add, ast.Sub)):
+            return self.generic_visit(node)
+        whole = ast.unparse(node)
+        indices = [
+            None
+            if _has_own_sites(term) and not isinstance(term, ast.Constant)
+            else self._site(term, f"term {ast.unparse(term)} of {whole}")
+            for term in (node.left, node.right)
+        ]
+        method = "add" if isinstance(node.op, ast.Add) else "subtract"
+        call = self._call(method, *indices, self.visit(node.left), self.visit(node.right))
+        return ast.copy_location(call, node)
+
+    def visit_Compare(self, node: ast.Compare, reason: str = "") -> ast.expr:
+        if len(node.ops) > 1 or type(node.ops[0]) not in _COMPARISONS:
+            return self.generic_visit(node)
+        index = self._site(node, comparison=type(node.ops[0]), reason=reason)
+        operands = self.visit(node.left), self.visit(node.comparators[0])
+        return ast.copy_location(self._call("compare", index, *operands), node)
+
+    def visit_Call(self, node: ast.Call) -> ast.expr:
+        name, whole = _called(node), ast.unparse(node)
+        if name == "select":
+            return self._visit_select(node)
+        sites = {"append": [0], "fma": [0, 2]}.get(name, [])
+        if name in _HAND_OVERS:
+            sites = [len(node.args) - 1]
+        node.func = self.visit(node.func)
+        for k, argument in enumerate(node.args):
+            text = f"term {ast.unparse(argument)} of {whole}" if name == "fma" else whole
+            node.args[k] = self._scaled(argument, text) if k in sites else self.visit(argument)
+        for keyword in node.keywords:
+            text = f"{keyword.arg}={ast.unparse(keyword.value)}"
+            keyword.value = self._scaled(keyword.value, text)
+        return node
+
+    def _visit_select(self, node: ast.Call) -> ast.expr:
+        if not self.is_derivative:
+            return self.generic_visit(node)
+        whole = ast.unparse(node)
+        condition, *branches = node.args
+        operands = _operands(condition)
+        parts = tuple(ast.unparse(operand) for operand in operands)
+        values = {ast.dump(branch) for branch in branches}
+        visited = []
+        for operand in operands:
+            if isinstance(operand, ast.Compare):
+                is_same = {ast.dump(operand.left), ast.dump(operand.comparators[0])} == values
+                visited.append(self.visit_Compare(operand, SAME_AT_EQUALITY if is_same else ""))
+            else:
+                visited.append(self.visit(operand))
+        index = self._site(node, whole, parts=parts)
+        branches = [self.visit(branch) for branch in branches]
+        call = self._call("select", index, ast.List(visited, ast.Load()), *branches)
+        return ast.copy_location(call, node)
+
+
+def _called(node: ast.Call) -> str:
+    """The name of the function or method that is called."""
+    return node.func.attr if isinstance(node.func, ast.Attribute) else ast.unparse(node.func)
+
+
+def _has_own_sites(node: ast.expr) -> bool:
+    """Whether the value is no site: a constant, or its elements, terms or arguments are sites."""
+    if isinstance(node, (ast.Constant, ast.Lambda, ast.List, ast.Tuple)):
+        return True
+    if isinstance(node, ast.ListComp):
+        return _has_own_sites(node.elt)
+    if isinstance(node, ast.BinOp):
+        return isinstance(node.op, (ast.Add, ast.Sub))
+    if isinstance(node, ast.Call):
+        name = _called(node)
+        return name in {"fma", "zeros", "empty"} or bool(node.keywords and not node.args)
+    return False
+
+
+def _operands(condition: ast.expr) -> list[ast.expr]:
+    if isinstance(condition, ast.BinOp) and isinstance(condition.op, ast.BitAnd):
+        return [*_operands(condition.left), *_operands(condition.right)]
+    return [condition]
+
+
+def _only_evaluated(function: ast.FunctionDef) -> set[str]:
+    """Names that are read by ``dr.eval`` and by nothing else."""
+    evaluated: set[int] = set()
+    for node in ast.walk(function):
+        if isinstance(node, ast.Call) and ast.unparse(node.func) == "dr.eval":
+            evaluated |= {id(n) for argument in node.args for n in ast.walk(argument)}
+    reads = [
+        node
+        for node in ast.walk(function)
+        if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Load)
+    ]
+    return {n.id for n in reads} - {n.id for n in reads if id(n) not in evaluated}
