@@ -6,10 +6,10 @@ import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
-from drgs.bench import speed, stability
+from drgs.bench import scaling, speed, stability
 from drgs.checks import exit_on_user_error
 
-COMMANDS = {"speed": speed, "stability": stability}
+COMMANDS = {"speed": speed, "scaling": scaling, "stability": stability}
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

@@ -6,11 +6,17 @@ the kernels' camera in any precision.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
+import drjit.llvm.ad as llvm
 import numpy as np
 
-from drgs import reference
+from drgs import reference, rendering
 from drgs.camera import Camera
+from drgs.config import FitConfig
+from drgs.data.types import Dataset, View
 from drgs.gaussians import Gaussians
+from drgs.trainer import Trainer
 
 BENCH_TO_WORLD = np.array(
     [
@@ -71,3 +77,43 @@ def device_camera(camera: reference.Camera, float_type: type) -> Camera:
     return Camera.create(
         float_type, camera.rotation, camera.center, K, camera.width, camera.height, camera.near
     )
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Gaussians, camera, and what they are called."""
+
+    name: str
+    gaussians: Gaussians  # numpy
+    camera: reference.Camera
+
+
+def frame_of(scene: Scene) -> rendering.Frame:
+    """The scene rendered by the kernels in single precision."""
+    pipeline = rendering.Pipeline(scene.gaussians.sh_degree)
+    camera = device_camera(scene.camera, llvm.Float)
+    return rendering.render(scene.gaussians.to(llvm.TensorXf), camera, pipeline)
+
+
+def trainer_of(scene: Scene) -> Trainer:
+    """Its target is the scene's own picture, moved by a pixel: a gradient of realistic size."""
+    camera = scene.camera
+    _, *planes = frame_of(scene).planes()
+    image = np.stack([np.array(p).reshape(camera.height, camera.width) for p in planes], axis=-1)
+    to_world = np.eye(4)
+    to_world[:3, :3], to_world[:3, 3] = camera.rotation.T, camera.center
+    view = View(
+        "bench", np.clip(np.roll(image, 1, axis=1), 0, 1).astype(np.float32), to_world,
+        camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height,
+    )  # fmt: skip
+    dataset = Dataset((view,), (view,), "bench", (1.0, 1.0, 1.0), None, "bench")
+    config = FitConfig(
+        data={"path": "."},
+        model={"sh_degree": scene.gaussians.sh_degree, "sh_increase_every": 1},
+        # Statistics are gathered as in a fit, but the population stays.
+        densify={"start": 1_000_000, "stop": 1_000_001, "reset_every": 1_000_000},
+        iterations=2_000_000,
+    )
+    trainer = Trainer(config, dataset, scene.gaussians)
+    trainer.iteration = 10  # all SH degrees are in use
+    return trainer

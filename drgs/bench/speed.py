@@ -21,21 +21,16 @@ from pathlib import Path
 from typing import Any
 
 import drjit as dr
-import drjit.llvm.ad as llvm
 import mitsuba as mi
 import numpy as np
 
-from drgs import reference, rendering
 from drgs.bench import peers
 from drgs.bench.limits import MachineLimits, measure_limits
 from drgs.bench.output import machine, markdown_table, new_figure, write_csv, write_figure
 from drgs.bench.pairs import Work, count_work
 from drgs.bench.profile import STAGES, StageClock, stage_clock
-from drgs.bench.scenes import bench_camera, bench_gaussians, device_camera
-from drgs.config import FitConfig
-from drgs.data.types import Dataset, View
+from drgs.bench.scenes import Scene, bench_camera, bench_gaussians, frame_of, trainer_of
 from drgs.files import atomic_path
-from drgs.gaussians import Gaussians
 from drgs.io.ply import read_ply
 from drgs.trainer import Trainer
 
@@ -65,15 +60,6 @@ SLOW_ROUNDS = 3
 SLOW = 0.5
 VERY_SLOW = 15.0
 """s: measured once."""
-
-
-@dataclass(frozen=True)
-class Scene:
-    """Gaussians, camera, and what they are called."""
-
-    name: str
-    gaussians: Gaussians  # numpy
-    camera: reference.Camera
 
 
 @dataclass(frozen=True)
@@ -207,7 +193,7 @@ class IterationReport:
 
 def profile_training(scene: Scene, limits: MachineLimits, rounds: int) -> IterationReport:
     """Train on one view of the scene itself, with all SH degrees and no change of population."""
-    trainer = _trainer_of(scene)
+    trainer = trainer_of(scene)
     for _ in range(3):
         trainer.step()
     dr.sync_thread()
@@ -219,7 +205,7 @@ def profile_training(scene: Scene, limits: MachineLimits, rounds: int) -> Iterat
         stage: statistics.median(clock.kernel_ms.get(stage, 0.0) for clock in clocks)
         for stage in STAGES
     }
-    work = count_work(_frame_of(scene))
+    work = count_work(frame_of(scene))
     share = {
         stage: work.useful * count / limits.width / limits.vector_instructions / stage_ms[stage]
         * 1e3
@@ -240,36 +226,6 @@ def _clocked_step(trainer: Trainer) -> StageClock:
         dr.eval(report.loss_array, report.squared_error)
         clock.end("optimizer and statistics")
     return clock
-
-
-def _frame_of(scene: Scene) -> rendering.Frame:
-    pipeline = rendering.Pipeline(scene.gaussians.sh_degree)
-    camera = device_camera(scene.camera, llvm.Float)
-    return rendering.render(scene.gaussians.to(llvm.TensorXf), camera, pipeline)
-
-
-def _trainer_of(scene: Scene) -> Trainer:
-    """Its target is the scene's own picture, moved by a pixel: a gradient of realistic size."""
-    camera = scene.camera
-    _, *planes = _frame_of(scene).planes()
-    image = np.stack([np.array(p).reshape(camera.height, camera.width) for p in planes], axis=-1)
-    to_world = np.eye(4)
-    to_world[:3, :3], to_world[:3, 3] = camera.rotation.T, camera.center
-    view = View(
-        "bench", np.clip(np.roll(image, 1, axis=1), 0, 1).astype(np.float32), to_world,
-        camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height,
-    )  # fmt: skip
-    dataset = Dataset((view,), (view,), "bench", (1.0, 1.0, 1.0), None, "bench")
-    config = FitConfig(
-        data={"path": "."},
-        model={"sh_degree": scene.gaussians.sh_degree, "sh_increase_every": 1},
-        # Statistics are gathered as in a fit, but the population stays.
-        densify={"start": 1_000_000, "stop": 1_000_001, "reset_every": 1_000_000},
-        iterations=2_000_000,
-    )
-    trainer = Trainer(config, dataset, scene.gaussians)
-    trainer.iteration = 10  # all SH degrees are in use
-    return trainer
 
 
 # ----------------------------------------------------------------------------------------------

@@ -1,0 +1,210 @@
+"""``python -m drgs.bench scaling``: time and memory against Gaussians, pixels and threads.
+
+Layer 5. Each point is a training iteration (render, loss, gradients, optimizer) on a scene of its
+own, measured in a fresh process, so that its peak of memory is its own.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import multiprocessing
+import os
+import resource
+import statistics
+import time
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass, replace
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+import drgs  # noqa: F401  (registers the plugin, in the fresh process too)
+from drgs.bench.output import machine, markdown_table, new_figure, write_csv, write_figure
+from drgs.bench.pairs import Work, count_work
+from drgs.bench.scenes import Scene, bench_camera, bench_gaussians, frame_of, trainer_of
+
+DESCRIPTION = "time and memory of a training iteration against the size of the problem"
+
+STEPS, QUICK_STEPS = 12, 4
+
+DENSITY = 100_000 / 400**2
+"""Gaussians per pixel of the bench scene, which the sweep over N keeps."""
+
+
+@dataclass(frozen=True)
+class Point:
+    """One problem to measure."""
+
+    sweep: str
+    count: int  # Gaussians
+    size: int  # px, width and height
+    threads: int
+    scale: float = 1.0  # of the Gaussians
+
+    def x(self) -> int:
+        """What the sweep varies."""
+        return {"pixels": self.size**2, "threads": self.threads}.get(self.sweep, self.count)
+
+
+@dataclass(frozen=True)
+class Result:
+    """What one process measured."""
+
+    point: Point
+    milliseconds: float  # of an iteration, median
+    device_bytes: int  # peak of Dr.Jit's allocations in a training step
+    process_bytes: int  # peak resident, interpreter and libraries included
+    work: Work
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Options besides ``--out``."""
+    parser.add_argument("--quick", action="store_true", help="fewer and smaller problems")
+
+
+def run(args: argparse.Namespace) -> None:
+    """Measure, fit exponents, write table, CSV and plot."""
+    steps = QUICK_STEPS if args.quick else STEPS
+    print(machine())
+    results: dict[str, list[Result]] = {}
+    for point in points(args.quick):
+        result = in_a_new_process(point, steps)
+        results.setdefault(point.sweep, []).append(result)
+        print(
+            f"{point.sweep}: {point.count:,} Gaussians, {point.size} px, {point.threads} threads: "
+            f"{result.milliseconds:.1f} ms, {result.device_bytes / 2**20:.0f} MiB",
+            flush=True,
+        )
+    for name, found in results.items():
+        print(f"\n{name}{_exponents(found)}\n{_table(found)}")
+    fields = ("milliseconds", "device_bytes", "process_bytes")
+    rows = [
+        [*vars(r.point).values(), *(getattr(r, f) for f in fields), *vars(r.work).values()]
+        for found in results.values()
+        for r in found
+    ]
+    header = [*Point.__dataclass_fields__, *fields, *Work.__dataclass_fields__]
+    write_csv(args.out / "scaling.csv", header, rows)
+    write_figure(args.out / "scaling.png", plot(results))
+    print(f"\nwritten: {args.out / 'scaling.csv'}, {args.out / 'scaling.png'}")
+
+
+def points(quick: bool) -> list[Point]:
+    """The sweeps. With N, the film grows so that each pixel keeps its number of Gaussians, and
+    the Gaussians shrink so that each keeps its number of pixels."""
+    threads = os.cpu_count() or 1
+    counts = (10_000, 30_000) if quick else (10_000, 30_000, 100_000, 300_000, 1_000_000)
+    sizes = (100, 200) if quick else (200, 400, 800, 1600)
+    base = 30_000 if quick else 100_000
+    scales = {n: math.sqrt(100_000 / n) for n in counts}
+    found = [
+        Point("constant entries per Gaussian", n, round(math.sqrt(n / DENSITY)), threads, scales[n])
+        for n in counts
+    ]
+    found += [Point("bench scene as it is", n, 400, threads) for n in counts]
+    found += [Point("pixels", base, size, threads) for size in sizes]
+    found += [Point("threads", base, 400, t) for t in _powers_of_two(threads)]
+    return found
+
+
+def _powers_of_two(largest: int) -> list[int]:
+    return sorted(
+        {1 << k for k in range(largest.bit_length())} & set(range(largest + 1)) | {largest}
+    )
+
+
+def in_a_new_process(point: Point, steps: int) -> Result:
+    """Measure where nothing else was ever allocated."""
+    with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:
+        return pool.submit(measure, point, steps).result()
+
+
+def measure(point: Point, steps: int) -> Result:
+    """Time ``steps`` iterations of one problem, after a few to warm up."""
+    dr.set_thread_count(point.threads)
+    mi.set_variant("llvm_ad_rgb")
+    gaussians = bench_gaussians(point.count)
+    shrunk = gaussians.log_scales + np.float32(math.log(point.scale))
+    scene = Scene(point.sweep, replace(gaussians, log_scales=shrunk), bench_camera(point.size))
+    work = count_work(frame_of(scene))
+    trainer = trainer_of(scene)
+    for _ in range(3):
+        trainer.step()
+    dr.sync_thread()
+    dr.detail.malloc_clear_statistics()
+    times = []
+    for _ in range(steps):
+        started = time.perf_counter()
+        trainer.step()
+        dr.sync_thread()
+        times.append(time.perf_counter() - started)
+    return Result(
+        point=point,
+        milliseconds=1e3 * statistics.median(times),
+        device_bytes=dr.detail.malloc_watermark(dr.JitBackend.LLVM),
+        process_bytes=1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss,
+        work=work,
+    )
+
+
+# ----------------------------------------------------------------------------------------------
+# Output
+# ----------------------------------------------------------------------------------------------
+
+
+def exponent(results: list[Result], what: str) -> float:
+    """e of the best fit value = c x^e: the slope of a line through the logarithms."""
+    x = np.log([result.point.x() for result in results])
+    y = np.log([getattr(result, what) for result in results])
+    return float(np.polyfit(x, y, 1)[0])
+
+
+def _exponents(results: list[Result]) -> str:
+    return (
+        f": time ~ x^{exponent(results, 'milliseconds'):.2f}, "
+        f"memory ~ x^{exponent(results, 'device_bytes'):.2f}"
+        if len(results) > 1
+        else ""
+    )
+
+
+def _table(results: list[Result]) -> str:
+    header = ["Gaussians", "film", "threads", "iteration", "Dr.Jit's peak", "a Gaussian", "process"]
+    header += ["entries", "useful pairs"]
+    rows = [
+        [
+            f"{r.point.count:,}",
+            f"{r.point.size}x{r.point.size}",
+            r.point.threads,
+            f"{r.milliseconds:.1f} ms",
+            f"{r.device_bytes / 2**20:.0f} MiB",
+            f"{r.device_bytes / r.point.count:,.0f} B",
+            f"{r.process_bytes / 2**20:.0f} MiB",
+            f"{r.work.entries:,}",
+            f"{r.work.useful:,}",
+        ]
+        for r in results
+    ]
+    return markdown_table(header, rows)
+
+
+def plot(results: dict[str, list[Result]]) -> Any:
+    """Time and memory of each sweep, with the fitted exponents."""
+    figure = new_figure(11, 5.5)
+    panels = figure.subplots(2, len(results))
+    for column, (name, found) in enumerate(results.items()):
+        x = [result.point.x() for result in found]
+        for row, (what, unit, factor) in enumerate(
+            [("milliseconds", "ms", 1), ("device_bytes", "MiB", 2**-20)]
+        ):
+            panel = panels[row][column]
+            panel.loglog(x, [factor * getattr(result, what) for result in found], "o-")
+            if len(found) > 1:
+                panel.set_title(f"{name}: x^{exponent(found, what):.2f}", fontsize=8)
+            panel.set_xlabel(name if name in ("pixels", "threads") else "Gaussians")
+            panel.set_ylabel(unit)
+            panel.grid(alpha=0.3)
+    return figure
