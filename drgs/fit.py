@@ -23,7 +23,7 @@ import json
 import platform
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -33,11 +33,19 @@ import mitsuba as mi
 import numpy as np
 
 import drgs
-from drgs.checkpoint import Checkpoint, load_checkpoint, remove_checkpoint, save_checkpoint
+from drgs.checkpoint import (
+    FILE_NAME,
+    Checkpoint,
+    load_checkpoint,
+    remove_checkpoint,
+    save_checkpoint,
+)
 from drgs.checks import UserError, exit_on_user_error, one_line
 from drgs.config import FitConfig, load_config
 from drgs.data import Dataset, initial_gaussians, load_dataset
+from drgs.execution import add_options, execution
 from drgs.files import atomic_path
+from drgs.guards import NonFiniteError
 from drgs.interrupts import INTERRUPTED_STATUS, StopRequest
 from drgs.io.ply import write_ply
 from drgs.metrics import Quality, mean_quality
@@ -72,7 +80,7 @@ class HistoryRow:
 def main(arguments: Sequence[str] | None = None) -> None:
     """Entry point of the command."""
     args = _parse(arguments)
-    with exit_on_user_error():
+    with exit_on_user_error(), execution(args.threads, args.debug) as check_ranges:
         if args.resume is not None:
             config, out = load_run_config(args.resume), args.resume
         else:
@@ -94,7 +102,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         if args.overwrite:
             remove_run(out)
         claim_output_folder(out, config)
-        finished = run(trainer, config, dataset, out)
+        finished = run(trainer, config, dataset, out, check_ranges)
     if not finished:
         print(f"stopped; continue with: python -m drgs.fit --resume {out}")
         sys.exit(INTERRUPTED_STATUS)
@@ -108,10 +116,16 @@ def select_variant(name: str) -> None:
         raise UserError(f"--variant {name}: not usable here: {one_line(error)}") from None
 
 
-def run(trainer: Trainer, config: FitConfig, dataset: Dataset, out: Path) -> bool:
+def run(
+    trainer: Trainer,
+    config: FitConfig,
+    dataset: Dataset,
+    out: Path,
+    check_ranges: Callable[[], None],
+) -> bool:
     """Fit, measure, and write into the folder ``out``; False if stopped by Ctrl-C.
 
-    Goes on from the checkpoint in ``out``, if there is one.
+    Goes on from the checkpoint in ``out``, if there is one. check_ranges: raises ``UserError``.
     """
     checkpoint = load_checkpoint(out, config)
     log = History()
@@ -119,11 +133,13 @@ def run(trainer: Trainer, config: FitConfig, dataset: Dataset, out: Path) -> boo
         trainer.restore(checkpoint.trainer)
         log = History.from_array(checkpoint.history, checkpoint.wall_s)
         print(f"continues at iteration {trainer.iteration}")
-    if not train(trainer, config, log, out):
-        return False
-    wall_s = log.wall_s
-
-    gaussians = trainer.gaussians()
+    try:
+        if not train(trainer, config, log, out, check_ranges):
+            return False
+        wall_s = log.wall_s
+        gaussians = trainer.gaussians()
+    except NonFiniteError as error:
+        raise UserError(f"{error}; {_remedy(out)}") from None
     write_ply(out / "point_cloud.ply", gaussians)
     write_history(out / "history.csv", log.rows)
     images = list(render_views(trainer.scene, dataset.test))
@@ -189,7 +205,13 @@ class History:
         return row
 
 
-def train(trainer: Trainer, config: FitConfig, log: History, out: Path) -> bool:
+def train(
+    trainer: Trainer,
+    config: FitConfig,
+    log: History,
+    out: Path,
+    check_ranges: Callable[[], None],
+) -> bool:
     """Run the iterations that are left, showing progress and saving checkpoints.
 
     False if Ctrl-C stopped it; the state is saved then.
@@ -199,9 +221,11 @@ def train(trainer: Trainer, config: FitConfig, log: History, out: Path) -> bool:
     with FitProgress(config.iterations) as progress, StopRequest() as stop:
         while trainer.iteration < config.iterations:
             report = trainer.step()
+            check_ranges()
             last = report.iteration == config.iterations
             if last or report.iteration % config.output.history_every == 0:
                 row = log.add(report)
+                trainer.watch.check()  # reading the row has waited for the device
                 smooth_psnr = row.psnr if smooth_psnr is None else smooth_psnr
                 smooth_psnr = SMOOTHING * smooth_psnr + (1 - SMOOTHING) * row.psnr
                 progress.update(row.iteration, row.loss, smooth_psnr, row.num_gaussians)
@@ -211,6 +235,15 @@ def train(trainer: Trainer, config: FitConfig, log: History, out: Path) -> bool:
             if stop.requested:
                 return False
     return True
+
+
+def _remedy(out: Path) -> str:
+    """What to do about numbers that are not finite."""
+    kept = "the last checkpoint is kept" if (out / FILE_NAME).exists() else "nothing was saved yet"
+    return (
+        f"{kept}. --resume {out} --debug repeats this with range checks; lower learning rates "
+        "(--set optimizer.means_lr=..., and so on) may avoid it"
+    )
 
 
 def write_history(path: Path, history: list[HistoryRow]) -> None:
@@ -278,6 +311,7 @@ def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
         choices=("llvm_ad_rgb", "cuda_ad_rgb"),
         help="Mitsuba variant (default: llvm_ad_rgb)",
     )
+    add_options(parser)
     args = parser.parse_args(arguments)
     if (args.config is None) == (args.resume is None):
         parser.error("give either CONFIG.yml or --resume OUT_DIR")

@@ -31,6 +31,7 @@ import numpy as np
 from drgs.checks import UserError, exit_on_user_error
 from drgs.config import NAMED_COLORS, DataConfig, FitConfig, ModelConfig, load_config
 from drgs.data import Dataset, load_dataset
+from drgs.execution import add_options, execution
 from drgs.files import atomic_path
 from drgs.gaussians import Gaussians
 from drgs.io.ply import read_ply
@@ -87,7 +88,7 @@ class Model:
 def main(arguments: Sequence[str] | None = None) -> None:
     """Entry point of the command."""
     args = _parse(arguments)
-    with exit_on_user_error():
+    with exit_on_user_error(), execution(args.threads, args.debug):
         _check(args)
         mi.set_variant(args.variant)
         if args.what.suffix == ".xml":
@@ -396,6 +397,7 @@ def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
         help="override a value of the configuration, as in data.image_size=200; repeatable",
     )
     add("--variant", default="llvm_ad_rgb", help="Mitsuba variant (default: llvm_ad_rgb)")
+    add_options(parser)
     return parser.parse_args(arguments)
 
 

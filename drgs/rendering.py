@@ -20,7 +20,7 @@ import drjit as dr
 
 from drgs.arrays import interleave, types_of
 from drgs.camera import Camera
-from drgs.gaussians import Gaussians
+from drgs.gaussians import PARAMETER_NAMES, Gaussians
 from drgs.projection import GaussianRows, Splats2D, load_rows, plain_opacity, project
 from drgs.rasterize import (
     Layers,
@@ -82,6 +82,7 @@ class GaussianGradients:
     parameters: Gaussians
     means2d: Any  # Array2f (N,): loss per px
     visible: Any  # Bool (N,): the Gaussian's extent touches the film
+    first_fault: Any  # UInt32 (1,): of ``parameters``, see :func:`decode_fault`
 
 
 def render(gaussians: Gaussians, camera: Camera, pipeline: Pipeline) -> Frame:
@@ -121,11 +122,28 @@ def render_adjoint(
         dr.enqueue(dr.ADMode.Backward, outputs)
         dr.traverse(dr.ADMode.Backward)
         d_rows, visible = dr.grad(rows), dr.detach(splats.visible)
+    parameters, first_fault = _as_tensors(d_rows, gaussians, visible)
     return GaussianGradients(
-        parameters=_as_tensors(d_rows, gaussians, visible),
+        parameters=parameters,
         means2d=gradients.means2d,
         visible=_on_film(frame.bins),
+        first_fault=first_fault,
     )
+
+
+def decode_fault(fault: int) -> tuple[int, str] | None:
+    """The row and the parameter of :attr:`GaussianGradients.first_fault`; None if there is none.
+
+    A row's gradient of a parameter is at fault if its squared norm is not finite: it is NaN or
+    infinite, or Adam's second moment, which holds squares, would be.
+    """
+    if fault == _NO_FAULT:
+        return None
+    row, parameter = divmod(fault, len(PARAMETER_NAMES))
+    return row, PARAMETER_NAMES[parameter]
+
+
+_NO_FAULT = 2**32 - 1
 
 
 def render_tangent(gaussians: Gaussians, frame: Frame, tangents: Gaussians) -> list[Any]:
@@ -160,8 +178,8 @@ def _differentiable(
     return outputs, cotangents + list(gradients.features)
 
 
-def _as_tensors(d_rows: GaussianRows, gaussians: Gaussians, visible: Any) -> Gaussians:
-    """Per-lane derivatives as tensors shaped like the parameters, evaluated.
+def _as_tensors(d_rows: GaussianRows, gaussians: Gaussians, visible: Any) -> tuple[Gaussians, Any]:
+    """Per-lane derivatives as tensors shaped like the parameters, and their first fault, evaluated.
 
     Rows that are not visible have zero gradient, also where their values are not finite; so have
     SH coefficients above the pipeline's degree.
@@ -184,8 +202,30 @@ def _as_tensors(d_rows: GaussianRows, gaussians: Gaussians, visible: Any) -> Gau
         sh0=tensor(list(d_rows.sh[0]), gaussians.sh0),
         shN=tensor(higher + [t.Float(0)] * missing, gaussians.shN),
     )
-    dr.eval(gradients)
-    return gradients
+    faults = dr.select(visible, _faults(d_rows), _NO_FAULT)
+    dr.eval(gradients, faults)
+    return gradients, dr.min(faults)
+
+
+def _faults(d_rows: GaussianRows) -> Any:
+    """UInt32 (N,): row * 6 + number of the first parameter at fault there, or ``_NO_FAULT``."""
+    UInt32 = types_of(type(d_rows.logit_opacities)).UInt32
+    row = dr.arange(UInt32, dr.width(d_rows.logit_opacities))
+    higher = [component for vector in d_rows.sh[1:] for component in vector]
+    columns = {
+        "means": d_rows.means,
+        "quats": d_rows.quats,
+        "log_scales": d_rows.log_scales,
+        "logit_opacities": [d_rows.logit_opacities],
+        "sh0": d_rows.sh[0],
+        "shN": higher,
+    }
+    faults = UInt32(_NO_FAULT)
+    for number, name in reversed(list(enumerate(PARAMETER_NAMES))):
+        squared_norm = sum(dr.square(component) for component in columns[name])
+        # Written such that NaN is a fault.
+        faults = dr.select(squared_norm < dr.inf, faults, row * len(PARAMETER_NAMES) + number)
+    return faults
 
 
 def _on_film(bins: TileBins) -> Any:

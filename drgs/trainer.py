@@ -20,6 +20,7 @@ from drgs import densify
 from drgs.config import FitConfig, OptimizerConfig
 from drgs.data.types import Dataset, View
 from drgs.gaussians import PARAMETER_NAMES, Gaussians
+from drgs.guards import GradientWatch, check_values
 from drgs.losses import PhotometricLoss, Target, prepare_target
 from drgs.optimizer import (
     ExponentialDecay,
@@ -37,6 +38,7 @@ PREFIX = "integrator."
 class TrainingView:
     """A view as training needs it."""
 
+    name: str
     sensor: mi.Sensor
     target: Target
     width: int  # px
@@ -92,6 +94,7 @@ class Trainer:
         self.white_background = tuple(dataset.background) == (1.0, 1.0, 1.0)
         self.views = make_training_views(dataset.train, config)
         self.statistics = self._no_statistics()
+        self.watch = GradientWatch()
         self.iteration = 0
 
     def step(self) -> StepReport:
@@ -105,7 +108,9 @@ class Trainer:
         image = mi.render(self.scene, self.params, sensor=view.sensor, spp=1)
         loss = self.loss(image, view.target)
         dr.backward(loss)
-        error = dr.mean(dr.square(dr.detach(image).array - view.target.image.array))
+        image, loss = dr.detach(image), dr.detach(loss)
+        error = dr.mean(dr.square(image.array - view.target.image.array))
+        self.watch.add(self.iteration, view.name, loss, self.integrator.last.first_fault)
         self.optimizer.step()
 
         report = self._control_density(view)
@@ -114,7 +119,7 @@ class Trainer:
             num_gaussians=self.num_gaussians,
             means_lr=self.means_lr(self.iteration),
             density=report,
-            loss_array=dr.detach(loss),
+            loss_array=loss,
             squared_error=error,
         )
 
@@ -129,8 +134,18 @@ class Trainer:
         """N at the moment."""
         return self.optimizer[PREFIX + "means"].shape[0]
 
+    def check(self) -> None:
+        """Raise ``NonFiniteError`` if a loss, a gradient or a value is not; waits for the device.
+
+        Called before anything that saves, returns or edits the state.
+        """
+        self.watch.check()
+        values = {key.removeprefix(PREFIX): value for key, value in self.optimizer.items()}
+        check_values(self.iteration, {**values, "gradient_norms": self.statistics.gradient_norms})
+
     def gaussians(self) -> Gaussians:
         """The Gaussians as numpy arrays."""
+        self.check()
         self.params.update(self.optimizer)
         return dr.detach(self.integrator.gaussians).numpy()
 
@@ -139,6 +154,7 @@ class Trainer:
 
         Random numbers are functions of seed and iteration: they have no state.
         """
+        self.check()
         return {
             "iteration": np.array(self.iteration),
             "gradient_norms": np.array(self.statistics.gradient_norms),
@@ -153,6 +169,7 @@ class Trainer:
         self.statistics = densify.DensityStatistics(
             mi.Float(state["gradient_norms"]), mi.Float(state["views"])
         )
+        self.watch = GradientWatch()
         self.params.update(self.optimizer)
 
     def _control_density(self, view: TrainingView) -> densify.DensityReport | None:
@@ -162,15 +179,19 @@ class Trainer:
             self.statistics = densify.accumulate(
                 self.statistics, last.means2d_grad, last.visible, view.width, view.height
             )
+        densifies = densify.should_densify(config, i)
+        resets = densify.should_reset(config, i, self.white_background)
+        if densifies or resets:
+            self.check()
         report = None
-        if densify.should_densify(config, i):
+        if densifies:
             report = densify.densify_and_prune(
                 self.optimizer, self.statistics, config, self.extent, i, self.config.seed, PREFIX
             )
             self.statistics = self._no_statistics()
             # Freed arrays of sizes that will not come again would stay with Dr.Jit's allocator.
             dr.flush_malloc_cache()
-        if densify.should_reset(config, i, self.white_background):
+        if resets:
             densify.reset_opacities(self.optimizer, config, PREFIX)
         return report
 
@@ -197,7 +218,7 @@ def make_training_views(views: tuple[View, ...], config: FitConfig) -> list[Trai
         for view in views
     ]
     return [
-        TrainingView(sensor, target, view.width, view.height)
+        TrainingView(view.name, sensor, target, view.width, view.height)
         for view, sensor, target in zip(views, make_sensors(views), targets, strict=True)
     ]
 

@@ -51,6 +51,7 @@ class LastBackward:
 
     means2d_grad: Any  # TensorXf (N, 2): derivative of the loss with respect to the pixel position
     visible: Any  # Bool (N,): the Gaussian's extent touches the film
+    first_fault: Any  # UInt32 (1,): of the gradients, for rendering.decode_fault
 
 
 class SplatsIntegrator(mi.CppADIntegrator):
@@ -109,7 +110,8 @@ class SplatsIntegrator(mi.CppADIntegrator):
     As with Mitsuba's other integrators, a backward pass differentiates the scene as it is then:
     a parameter that was changed after ``mi.render()`` is differentiated at its new value. After
     the pass, the attribute ``last`` holds the derivatives with respect to the splats' positions
-    on the film, and which of them were visible. The attribute ``sh_degree`` may be changed from
+    on the film, which of them were visible, and the first Gaussian whose derivatives are not
+    finite, if there is one. The attribute ``sh_degree`` may be changed from
     one rendering to the next.
 
     .. note:: Not differentiated: visibility, the order of the splats, the cut-offs of alpha and
@@ -273,7 +275,9 @@ class SplatsIntegrator(mi.CppADIntegrator):
             dr.eval(d_transmittance, d_features, d_background)
             gradients = rendering.render_adjoint(self.gaussians, frame, d_features, d_transmittance)
             self.last = LastBackward(
-                means2d_grad=_rows(gradients.means2d), visible=gradients.visible
+                means2d_grad=_rows(gradients.means2d),
+                visible=gradients.visible,
+                first_fault=gradients.first_fault,
             )
             with dr.resume_grad():
                 for name in PARAMETER_NAMES:

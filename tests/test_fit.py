@@ -8,6 +8,7 @@ import sys
 import time
 
 import imageio.v3 as iio
+import mitsuba as mi
 import numpy as np
 import pytest
 import yaml
@@ -15,7 +16,9 @@ from conftest import REPOSITORY
 
 from drgs import reference
 from drgs.config import dump_config, load_config
-from drgs.io.ply import read_ply
+from drgs.data import initial_gaussians, load_dataset
+from drgs.execution import execution
+from drgs.io.ply import read_ply, write_ply
 
 SIZE = 32
 FIELD_OF_VIEW = 0.7
@@ -166,12 +169,65 @@ def test_population_changes_and_never_exceeds_its_cap(fitted):
     assert float(rows[-1]["loss"]) < 0.5 * float(rows[0]["loss"])
 
 
-def test_same_configuration_and_seed_give_the_same_bytes(fitted, configuration, tmp_path):
+def make_trainer(config):
+    mi.set_variant("llvm_ad_rgb")
+    from drgs.trainer import Trainer
+
+    dataset = load_dataset(config.data)
+    return Trainer(config, dataset, initial_gaussians(config, dataset))
+
+
+def test_the_configuration_changes_all_that_a_fit_can_change(fitted, configuration):
+    """The tests below compare the bytes of such fits, this one with those of a longer process."""
+    config = load_config(configuration)
+    reports, degrees, opacities = [], set(), {}
+    with execution(threads=None, debug=False):
+        trainer = make_trainer(config)
+        for iteration in range(1, config.iterations + 1):
+            reports.append(trainer.step().density)
+            degrees.add(trainer.sh_degree)
+            if iteration in (79, 80, 149, 150):
+                opacities[iteration] = trainer.gaussians().opacities.max()
+    densified = [report for report in reports if report is not None]
+    assert len(densified) == 6  # after 80, 100, ..., 180
+    for change in ("cloned", "split", "pruned"):
+        assert sum(getattr(report, change) for report in densified) > 0, change
+    for reset in (80, 150):  # white_background_reset, reset_every
+        assert opacities[reset - 1] > 0.02
+        assert opacities[reset] == pytest.approx(0.01)
+    assert degrees == {0, 1}
+
     _, first = fitted
-    again = fit(configuration, "--out", tmp_path / "again")
+    write_ply(first.parent / "in_process.ply", trainer.gaussians())
+    expected = (first / "point_cloud.ply").read_bytes()
+    assert (first.parent / "in_process.ply").read_bytes() == expected
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_same_configuration_and_seed_give_the_same_bytes(fitted, configuration, tmp_path, threads):
+    """On any number of threads; the first fit ran on one a core."""
+    _, first = fitted
+    again = fit(configuration, "--out", tmp_path / "again", "--threads", threads)
     assert again.returncode == 0, again.stderr
+    assert json.loads((tmp_path / "again" / "metrics.json").read_text())["threads"] == threads
     for name in ("point_cloud.ply", "renders/test/r_0.png"):
         assert (tmp_path / "again" / name).read_bytes() == (first / name).read_bytes(), name
+
+
+def test_shipped_scene_gives_the_same_bytes_on_any_number_of_threads():
+    """Of 30,000 Gaussians, a few have moments that are denormal numbers from the start."""
+    config = load_config(REPOSITORY / "scenes" / "lego_mini.yml")
+    trainer = make_trainer(config)
+    start, results = trainer.state(), {}
+    for threads in (1, 2, 5):
+        with execution(threads, debug=False):
+            trainer.restore(start)
+            for _ in range(8):
+                trainer.step()
+            results[threads] = trainer.state()
+    for name, values in results[1].items():
+        for threads in (2, 5):
+            assert results[threads][name].tobytes() == values.tobytes(), (name, threads)
 
 
 def test_resolved_configuration_gives_the_same_bytes(fitted, tmp_path):

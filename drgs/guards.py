@@ -1,0 +1,80 @@
+"""What stops a fit whose numbers are no longer finite, before it saves them.
+
+Layer 4. To ask the device is to wait for it. So the trainer writes down what every iteration
+computed, and looks at it when the host waits anyhow: before the state is saved, returned or
+changed row by row, and when the numbers of an iteration are read for the history. What it names is
+where the trouble began, not where it was noticed.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import numpy as np
+
+from drgs.checks import UserError
+from drgs.rendering import decode_fault
+
+
+class NonFiniteError(UserError):
+    """A loss, a gradient or a value is NaN or infinite: what the fit has become is of no use."""
+
+
+@dataclass(frozen=True)
+class _Iteration:
+    number: int
+    view: str
+    loss: Any  # Float (1,)
+    first_fault: Any  # UInt32 (1,), of the gradients
+
+
+class GradientWatch:
+    """The losses and gradients of the iterations that nobody has looked at yet."""
+
+    def __init__(self) -> None:
+        self._iterations: list[_Iteration] = []
+
+    def add(self, iteration: int, view: str, loss: Any, first_fault: Any) -> None:
+        """Write down an iteration on the view of that name; waits for nothing.
+
+        loss: Float (1,). first_fault: see :func:`drgs.rendering.decode_fault`.
+        """
+        self._iterations.append(_Iteration(iteration, view, loss, first_fault))
+
+    def check(self) -> None:
+        """Raise :class:`NonFiniteError` for the first iteration at fault; waits for the device."""
+        for iteration in self._iterations:
+            if faults := list(_faults(iteration)):
+                where = f"iteration {iteration.number}, view {iteration.view}"
+                raise NonFiniteError(f"{where}: {' and '.join(faults)}")
+        self._iterations.clear()
+
+
+def _faults(iteration: _Iteration) -> Any:
+    loss, fault = float(iteration.loss[0]), decode_fault(int(iteration.first_fault[0]))
+    if not math.isfinite(loss):
+        yield f"the loss is {loss}"
+    if fault is not None:
+        row, name = fault
+        yield f"the gradient of {name} in row {row} is not finite, or too large to be squared"
+
+
+def check_values(iteration: int, values: Mapping[str, Any]) -> None:
+    """Raise :class:`NonFiniteError` for the first value that is not finite; waits for the device.
+
+    values: arrays by name, one row a Gaussian. A Gaussian of such values is invisible, so that no
+    loss and no gradient ever tells.
+    """
+    for name, array in values.items():
+        array = dr.detach(array)
+        if dr.all(dr.isfinite(array.array)):
+            continue
+        host = np.array(array)
+        first = tuple(np.argwhere(~np.isfinite(host))[0])
+        raise NonFiniteError(
+            f"after iteration {iteration}: {name} is {host[first]} in row {first[0]}"
+        )
