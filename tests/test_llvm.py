@@ -19,7 +19,9 @@ from drgs.llvm import (
 @pytest.fixture
 def machine(tmp_path, monkeypatch):
     """machine(*names): a Linux machine with these libraries, where Dr.Jit is not loaded yet."""
-    monkeypatch.delenv(llvm.PATH_VARIABLE, raising=False)
+    # Set before it is deleted, so that what a test makes of it is undone even if it is not set.
+    monkeypatch.setenv(llvm.PATH_VARIABLE, "")
+    monkeypatch.delenv(llvm.PATH_VARIABLE)
     monkeypatch.delitem(sys.modules, "drjit", raising=False)
     monkeypatch.setattr(sys, "platform", "linux")
     monkeypatch.setattr(llvm, "_library_folders", lambda: [str(tmp_path)])
@@ -68,12 +70,11 @@ def test_libraries_are_listed_newest_first_without_dangling_links(machine):
     assert [version for version, _ in installed_libraries()] == [(100, 1), (19, 1), (15,), (9,)]
 
 
-def test_the_newest_library_is_selected_even_if_it_is_a_link(machine, monkeypatch):
+def test_the_newest_library_is_selected_even_if_it_is_a_link(machine):
     folder = machine("libLLVM-15.so.1", "libLLVM.so.17.0", "target")
     (folder / "libLLVM.so.22.1").symlink_to("target")
     select_newest_llvm()
     assert os.environ[llvm.PATH_VARIABLE] == str(folder / "libLLVM.so.22.1")
-    monkeypatch.delenv(llvm.PATH_VARIABLE)
 
 
 def test_the_users_choice_of_a_library_is_kept(machine, monkeypatch):

@@ -41,7 +41,7 @@ examples = settings(
     derandomize=True,
     database=None,
     deadline=None,
-    max_examples=20,
+    max_examples=25,
     phases=[Phase.generate, Phase.shrink],
 )
 
