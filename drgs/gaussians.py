@@ -62,14 +62,18 @@ class Gaussians:
 
         def upload(name: str) -> Any:
             values = np.ascontiguousarray(getattr(self, name), dtype=_numpy_dtype(flat_type))
-            # Dr.Jit wraps numpy's memory on the CPU: a gather makes the copy that it owns.
-            wrapped = flat_type(values.ravel())
-            index = dr.arange(dr.uint32_array_t(flat_type), values.size)
-            flat = dr.gather(flat_type, wrapped, index)
-            dr.eval(flat)
+            # Dr.Jit wraps numpy's memory on the CPU, and may drop a gather of all of it: only
+            # what is written to memory of its own is a copy.
+            flat = dr.empty(flat_type, values.size)
+            if values.size > 0:
+                index = dr.arange(dr.uint32_array_t(flat_type), values.size)
+                dr.scatter(flat, flat_type(values.ravel()), index)
+                dr.eval(flat)
             return flat if name == "logit_opacities" else tensor_type(flat, values.shape)
 
-        return Gaussians(**{name: upload(name) for name in PARAMETER_NAMES})
+        uploaded = Gaussians(**{name: upload(name) for name in PARAMETER_NAMES})
+        dr.sync_thread()  # the source may change from here on
+        return uploaded
 
 
 def _exp(x: Any) -> Any:

@@ -90,13 +90,16 @@ def _mitsuba_renderer(
     names += ("data", "opacities", "sh_coeffs")
     params.keep([prefix + name for name in names if prefix + name in params])
     weights = mi.TensorXf(problem.weights.astype(np.float32) / (camera.width * camera.height))
+    integrator = scene.integrator()
 
     def forward() -> None:
+        integrator.parameters_changed([])  # no frame of an earlier call may be used again
         with dr.suspend_grad():
             dr.eval(mi.render(scene, sensor=sensor, spp=1))
         dr.sync_thread()
 
     def forward_backward() -> None:
+        integrator.parameters_changed([])
         for key in params.keys():  # noqa: SIM118  (not a dictionary)
             dr.enable_grad(params[key])
             dr.clear_grad(params[key])
