@@ -108,8 +108,10 @@ def camera_from_sensor(state: SensorState) -> Camera:
     Not differentiated: the sensor's parameters.
     """
     to_world, x_fov, offset_x, offset_y = state.device
-    width, height, crop_x, crop_y, crop_width, crop_height, near = state.host
     t = types_of(type(x_fov))
+    # No number may be compiled into a kernel: each film, crop or view would compile its own.
+    width, height, crop_x, crop_y, *_, near = [dr.opaque(t.Float, v) for v in state.host]
+    *_, crop_width, crop_height, _ = state.host
     # Mitsuba's camera has x to the left and y up, OpenCV's x to the right and y down. A camera
     # has no unit of length: if to_world scales, its axes are normalised.
     columns = [t.Array3f([to_world[row, column] for row in range(3)]) for column in range(4)]
@@ -125,10 +127,9 @@ def camera_from_sensor(state: SensorState) -> Camera:
         ),
         film_start=t.Array2f(-crop_x, -crop_y),
         film_end=t.Array2f(width - crop_x, height - crop_y),
-        near=t.Float(near),
+        near=near,
         width=int(crop_width),
         height=int(crop_height),
     )
-    # No number may be compiled into a kernel: each view would compile its own.
     dr.make_opaque(camera)
     return camera

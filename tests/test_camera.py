@@ -134,3 +134,22 @@ def test_create_uploads_a_camera():
         "near": 0.25,
     }
     assert (camera.width, camera.height) == (19, 15)
+
+
+def test_films_of_all_sizes_share_their_kernels():
+    """No number of the film or the crop window is compiled into a kernel."""
+
+    def kernels(**film):
+        sensor = mi.load_dict(
+            {"type": "perspective", "film": {"type": "hdrfilm", **film}, "fov": 40.0}
+        )
+        with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
+            dr.kernel_history_clear()
+            camera = camera_from_sensor(read_sensor(sensor, 0.01))
+            dr.eval(camera)
+            return {k["hash"] for k in dr.kernel_history() if k["type"] == dr.KernelType.JIT}
+
+    first = kernels(width=33, height=21)
+    assert first and kernels(width=57, height=40) == first
+    window = {"crop_offset_x": 3, "crop_offset_y": 2, "crop_width": 11, "crop_height": 9}
+    assert kernels(width=33, height=21, **window) == first
