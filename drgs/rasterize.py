@@ -691,7 +691,7 @@ def composite_tangent(
             alpha = _Alpha.at(footprint.log2_alpha[row][column], exp2)
             before, d_before = dr.abs(T[pixel]), dT[pixel]
             weight, T[pixel], goes_on = _step(T[pixel], alpha.value)
-            d_alpha = dr.select(goes_on & alpha.smooth, alpha.value * d_log_alpha[row][column], 0)
+            d_alpha = dr.select(alpha.smooth, alpha.value * d_log_alpha[row][column], 0)
             d_weight = dr.select(goes_on, dr.fma(before, d_alpha, alpha.value * d_before), 0)
             dT[pixel] = d_before - d_weight
             for k in range(count):

@@ -48,12 +48,6 @@ from drgs.gaussians import PARAMETER_NAMES
 
 EQUIVALENT = {
     (
-        "rasterize.composite_tangent",
-        "dr.select(goes_on & alpha.smooth, alpha.value * d_log_alpha[row][column], 0)",
-        "goes_on",
-        ALWAYS,
-    ): "d_weight, the only reader of d_alpha, is itself zero where the pixel does not go on",
-    (
         "rendering._as_tensors",
         "dr.select(visible, d_rows.logit_opacities, 0)",
         "",
