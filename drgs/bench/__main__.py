@@ -6,10 +6,15 @@ import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
-from drgs.bench import scaling, speed, stability
+from drgs.bench import population, scaling, speed, stability
 from drgs.checks import exit_on_user_error
 
-COMMANDS = {"speed": speed, "scaling": scaling, "stability": stability}
+COMMANDS = {
+    "speed": speed,
+    "scaling": scaling,
+    "stability": stability,
+    "population": population,
+}
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
