@@ -26,6 +26,7 @@ class ArrayTypes:
     Array2f: type
     Array3f: type
     Array4f: type
+    Array2u: type
     Array4u: type
     Matrix3f: type
     TensorXf: type
@@ -47,6 +48,7 @@ def types_of(float_type: type) -> ArrayTypes:
         Array2f=getattr(module, "Array2f" + suffix),
         Array3f=getattr(module, "Array3f" + suffix),
         Array4f=getattr(module, "Array4f" + suffix),
+        Array2u=module.Array2u,
         Array4u=module.Array4u,
         Matrix3f=getattr(module, "Matrix3f" + suffix),
         TensorXf=getattr(module, "TensorXf" + suffix),

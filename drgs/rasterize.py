@@ -30,16 +30,20 @@ Nothing is stored per pixel pair, and all decisions of the forward pass are take
 **Mapping to the machine.** One SIMD lane is one micro-tile of 4x4 pixels, its pixels unrolled:
 the load of a splat's record is paid once for 16 pixels. A packet of 16 lanes is one tile.
 
+**Memory.** A lane's arithmetic takes less time than a read or a write that no cache foresees, so
+that lanes walk through memory: splats are copied into the order of the entries, and what a lane
+of the adjoint writes is contiguous.
+
 **No atomics.** In the adjoint, a lane sums each splat's partial derivatives over its 16 pixels
-and writes them into a slot that belongs to this (splat, micro-tile) alone; the slots of a splat
-are contiguous, and one lane per splat adds them up in order. The result is the same to the
-last bit in every run.
+and writes them into a slot that belongs to this (splat, micro-tile) alone. One lane per entry
+adds up its slots, one lane per splat its entries, in an order of their own. The result is the
+same to the last bit in every run.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import drjit as dr
@@ -51,9 +55,21 @@ from drgs.constants import (
     TRANSMITTANCE_STOP,
     WHITENING_SCALE,
 )
-from drgs.tiles import GRID, MICRO, MICROS, TILE, WORD, TileBins, TileGrid
+from drgs.tiles import (
+    GRID,
+    MICRO,
+    MICROS,
+    TILE,
+    WORD,
+    TileBins,
+    TileGrid,
+    transpose_masks,
+)
 
 PIXELS = MICRO * MICRO
+
+GEOMETRY = 6
+"""Numbers per splat that decide its alpha at a pixel: mean x, y, p, r, s, log2_opacity."""
 
 
 @dataclass(frozen=True)
@@ -276,11 +292,10 @@ class _Footprint:
     log2_alpha: list[list[Any]]  # [row][column]: unclamped
 
     @staticmethod
-    def load(bins: TileBins, lanes: _Lanes, rank: Any, active: Any) -> _Footprint:
-        """Evaluate the exponent of splat ``rank`` at the 16 pixels."""
-        t = types_of(type(bins.geometry))
-        mean_x, mean_y, p, r = dr.gather(t.Array4f, bins.geometry, rank * 2, active)
-        s, log2_opacity, _, _ = dr.gather(t.Array4f, bins.geometry, rank * 2 + 1, active)
+    def of(geometry: list[Any], lanes: _Lanes, active: Any) -> _Footprint:
+        """Evaluate the exponent of a splat at the 16 pixels."""
+        mean_x, mean_y, p, r, s, log2_opacity = geometry
+        t = types_of(type(mean_x))
         # On an inactive lane every alpha is below the cut.
         log2_opacity = dr.select(active, log2_opacity, -dr.inf)
         first_x, first_y = t.Float(lanes.x) + 0.5 - mean_x, t.Float(lanes.y) + 0.5 - mean_y
@@ -325,23 +340,47 @@ def _step(transmittance: Any, alpha: Any) -> tuple[Any, Any, Any]:
     return weight, dr.select(goes_on, after, -dr.abs(transmittance)), goes_on
 
 
-def _load_features(features: Any, count: int, rank: Any, active: Any) -> list[Any]:
-    """The ``count`` features of a splat, stored in packets of four."""
-    packets = -(-count // 4)
-    values: list[Any] = []
-    for k in range(packets):
-        packet_type = types_of(type(features)).Array4f
-        values.extend(dr.gather(packet_type, features, rank * packets + k, active))
-    return values[:count]
+@dataclass(frozen=True)
+class Records:
+    """What compositing loads for each sorted entry: its splat's geometry and features.
 
-
-def pack_features(columns: list[Any], order: Any) -> Any:
-    """Feature columns (one value per Gaussian) as packets of four by rank; flat, evaluated.
-
-    None if there are no features: transmittance alone is composited then.
+    A splat that touches several tiles is stored several times, so that the lanes of a tile read
+    memory in order instead of jumping from splat to splat.
     """
-    if not columns:
-        return None
+
+    values: Any  # Float (M padded * packets * 4,): geometry, features, padding
+    count: int  # C, features
+
+    @property
+    def packets(self) -> int:
+        """Groups of four numbers per entry."""
+        return -(-(GEOMETRY + self.count) // 4)
+
+    def load(self, entry: Any, active: Any) -> tuple[list[Any], list[Any]]:
+        """Geometry (6) and features (C) of a sorted entry."""
+        numbers = _load_packets(self.values, self.packets, entry, active)
+        return numbers[:GEOMETRY], numbers[GEOMETRY : GEOMETRY + self.count]
+
+
+def pack_records(bins: TileBins, columns: list[Any]) -> Records:
+    """The records of all entries, evaluated.
+
+    columns: C features, one value per Gaussian each; without any, transmittance alone is
+    composited.
+    """
+    t = types_of(type(bins.geometry))
+    numbers = _load_packets(bins.geometry, 2, bins.ranks, True)[:GEOMETRY]
+    if columns:
+        by_rank = _pack_by_rank(columns, bins.order)
+        numbers += _load_packets(by_rank, -(-len(columns) // 4), bins.ranks, True)[: len(columns)]
+    numbers += [dr.zeros(t.Float, dr.width(bins.ranks))] * (-len(numbers) % 4)
+    values = interleave(numbers)
+    dr.eval(values)
+    return Records(values=values, count=len(columns))
+
+
+def _pack_by_rank(columns: list[Any], order: Any) -> Any:
+    """Columns (one value per Gaussian) as packets of four by rank; flat, evaluated."""
     columns = [dr.gather(type(c), c, order) for c in columns]
     padding = dr.zeros(type(columns[0]), dr.width(order))
     packets = interleave(columns + [padding] * (-len(columns) % 4))
@@ -349,17 +388,28 @@ def pack_features(columns: list[Any], order: Any) -> Any:
     return packets
 
 
+def _load_packets(values: Any, packets: int, row: Any, active: Any) -> list[Any]:
+    """A row of ``packets`` times four numbers."""
+    Array4f = types_of(type(values)).Array4f
+    return [
+        number
+        for k in range(packets)
+        for number in dr.gather(Array4f, values, row * packets + k, active)
+    ]
+
+
 # ----------------------------------------------------------------------------------------------
 # Forward
 # ----------------------------------------------------------------------------------------------
 
 
-def composite(bins: TileBins, features: Any, count: int) -> Layers:
-    """Composite ``count`` features of all splats.
+def composite(bins: TileBins, records: Records) -> Layers:
+    """Composite the features of all splats.
 
-    bins: from ``bin_splats``; features: from :func:`pack_features`.
+    bins: from ``bin_splats``; records: from :func:`pack_records`.
     """
     t = types_of(type(bins.geometry))
+    count = records.count
     lanes = _make_lanes(t.Float, bins.grid)
     end = dr.gather(t.UInt32, bins.tile_start, lanes.tile + 1)
     entries = _Entries(bins, lanes, end)
@@ -367,9 +417,8 @@ def composite(bins: TileBins, features: Any, count: int) -> Layers:
 
     def body(cursor: _Cursor, T: list, C: list, ends: list, unfinished: Any) -> tuple:
         entry, active = entries.current(cursor)
-        rank = dr.gather(t.UInt32, bins.ranks, entry, active)
-        footprint = _Footprint.load(bins, lanes, rank, active)
-        color = _load_features(features, count, rank, active)
+        geometry, color = records.load(entry, active)
+        footprint = _Footprint.of(geometry, lanes, active)
         T, C, ends = list(T), [list(c) for c in C], list(ends)
         behind = dr.select(active, entry + 1, entry)
         for pixel in range(PIXELS):
@@ -436,21 +485,26 @@ class SplatGradients:
 
 @dataclass(frozen=True)
 class _Slots:
-    """Where each (entry, micro-tile) pair that was composited stores its partial derivatives.
+    """Where each composited (entry, micro-tile) pair stores its partial derivatives.
 
-    Pairs behind a micro-tile's stop have no slot, so that every slot is written exactly once.
+    First come the pairs of all tiles' first micro-tiles, in the order of the sorted entries, then
+    those of the second ones, and so on: what a lane writes is contiguous. (In the order in which
+    the slots are added up, each write would wait for memory of its own.) Pairs behind a
+    micro-tile's stop have no slot, so that every slot is written exactly once.
     """
 
-    first: Any  # UInt32 (M + 1,): unsorted entry -> its first slot
-    records: Any  # UInt32 (M padded * 4,): sorted -> rank, first slot, bit per micro-tile, -
+    pairs: Any  # UInt32 (M padded / 32 * 16 * 2,): (group of 32, micro-tile) -> first slot, bits
+    composited: Any  # UInt32 (M padded,): sorted -> bit per micro-tile
+    groups: int  # M padded / 32
     count: int
+
+    def at(self, group: Any, micro: Any, active: Any = True) -> tuple[Any, Any]:
+        """First slot of a group of entries in a micro-tile, and the word of its composited bits."""
+        return dr.gather(types_of(type(group)).Array2u, self.pairs, group * MICROS + micro, active)
 
 
 def _assign_slots(bins: TileBins, layers: Layers) -> _Slots:
-    """The slots of a Gaussian are contiguous: they follow the unsorted entries.
-
-    The host reads one value, the number of slots.
-    """
+    """Number the slots. The host reads one value, how many there are."""
     t = types_of(type(bins.geometry))
     entry = dr.arange(t.UInt32, dr.width(bins.masks))
     composited = t.UInt32(0)
@@ -459,16 +513,23 @@ def _assign_slots(bins: TileBins, layers: Layers) -> _Slots:
         for m, stop in enumerate(stops):
             composited |= dr.select(entry < stop, t.UInt32(1 << (4 * k + m)), 0)
     composited &= bins.masks
-    counts = dr.zeros(t.UInt32, bins.num_entries + 1)
-    is_entry = entry < dr.opaque(t.UInt32, bins.num_entries)
-    dr.scatter(counts, dr.popcnt(composited), bins.source, is_entry)
-    dr.eval(counts, composited)
-    first = dr.prefix_sum(counts)
-    count = int(first[bins.num_entries])
-    records = interleave(
-        [bins.ranks, dr.gather(t.UInt32, first, bins.source), composited, dr.zeros(t.UInt32)]
-    )
-    return _Slots(first=first, records=records, count=count)
+    dr.eval(composited)
+    words = transpose_masks(composited)
+
+    groups = dr.width(composited) // WORD
+    index = dr.arange(t.UInt32, MICROS * groups + 1)
+    micro = index // dr.opaque(t.UInt32, groups)
+    transposed = (index - micro * groups) * MICROS + micro
+    exists = index < dr.opaque(t.UInt32, MICROS * groups)
+    first = dr.prefix_sum(dr.popcnt(dr.gather(t.UInt32, words, transposed, exists)))
+    count = int(first[MICROS * groups])
+
+    index = dr.arange(t.UInt32, MICROS * groups)
+    group, micro = index // MICROS, index % MICROS
+    first = dr.gather(t.UInt32, first, micro * dr.opaque(t.UInt32, groups) + group)
+    pairs = interleave([first, words])
+    dr.eval(pairs)
+    return _Slots(pairs=pairs, composited=composited, groups=groups, count=count)
 
 
 MOMENTS = 6
@@ -477,14 +538,14 @@ MOMENTS = 6
 
 def composite_adjoint(
     bins: TileBins,
-    features: Any,
+    records: Records,
     layers: Layers,
     d_features: list[Any],
     d_transmittance: Any,
 ) -> SplatGradients:
     """Derivatives with respect to the splats, given those with respect to the planes.
 
-    layers: what :func:`composite` returned for the same bins and features; d_features: C planes
+    layers: what :func:`composite` returned for the same bins and records; d_features: C planes
     (H * W,); d_transmittance: plane (H * W,). Not differentiated: the order, the decisions
     (cut, clamp, stop).
     """
@@ -495,6 +556,8 @@ def composite_adjoint(
     stop = dr.gather(t.UInt32, layers.stop, lanes.micro_tile)
     entries = _EntriesBackToFront(bins, lanes, stop)
     exp2 = _exp2_function(t.Float)
+    first_slot, word = slots.at(entries.last, lanes.micro)
+    end_slot = first_slot + dr.popcnt(word & entries.tail)
 
     g = [_load_pixels(plane, lanes, bins.grid) for plane in d_features]
     ends = _load_row(layers.ends, lanes.micro_tile, 1)
@@ -502,30 +565,29 @@ def composite_adjoint(
     width = 4 * -(-(MOMENTS + count) // 4)
     partials = dr.empty(t.Float, max(slots.count, 1) * width)
 
-    def body(cursor: _Cursor, T: list, R: list) -> tuple:
+    def body(cursor: _Cursor, slot: Any, T: list, R: list) -> tuple:
         entry, active = entries.current(cursor)
-        rank, slot, composited, _ = dr.gather(t.Array4u, slots.records, entry, active)
-        footprint = _Footprint.load(bins, lanes, rank, active)
-        color = _load_features(features, count, rank, active)
+        slot = dr.select(active, slot - 1, slot)
+        geometry, color = records.load(entry, active)
+        footprint = _Footprint.of(geometry, lanes, active)
         reached = [entry < end for end in ends]
         T, R, d_log_alpha, d_color = _adjoint_step(footprint, reached, color, T, R, g, exp2)
         moments = _moments(footprint, d_log_alpha)
-        below = (t.UInt32(1) << lanes.micro) - 1
-        slot += dr.popcnt(composited & below)
         values = moments + d_color
         values += [t.Float(0)] * (width - len(values))
         for k in range(width // 4):
             packet = t.Array4f(values[4 * k : 4 * k + 4])
             dr.scatter(partials, packet, slot * (width // 4) + k, active)
-        return entries.advance(cursor), T, R
+        return entries.advance(cursor), slot, T, R
 
     loop = dr.while_loop(
         state=(
             entries.begin(),
+            end_slot,
             transmittance,
             _load_pixels(d_transmittance, lanes, bins.grid),
         ),
-        cond=lambda cursor, T, R: entries.pending(cursor),
+        cond=lambda cursor, slot, T, R: entries.pending(cursor),
         body=body,
     )
     dr.eval(loop, partials)
@@ -612,22 +674,19 @@ def _dot(a: list[Any], b: list[Any]) -> Any:
 def _sum_slots(
     bins: TileBins, slots: _Slots, partials: Any, width: int, count: int
 ) -> SplatGradients:
-    """Add up each splat's slots in order, then turn the sums into derivatives."""
+    """Add up the slots of each entry, the entries of each splat, and turn sums into derivatives."""
     t = types_of(type(bins.geometry))
+    by_entry = _sum_entries(bins, slots, partials, width)
     rank = dr.arange(t.UInt32, dr.width(bins.order))
-    bounds = [dr.gather(t.UInt32, bins.first_entry, rank + k) for k in (0, 1)]
-    begin, end = (dr.gather(t.UInt32, slots.first, bound) for bound in bounds)
+    begin, end = (dr.gather(t.UInt32, bins.first_entry, rank + k) for k in (0, 1))
 
-    def body(slot: Any, totals: list) -> tuple:
-        values: list[Any] = []
-        for k in range(width // 4):
-            values.extend(dr.gather(t.Array4f, partials, slot * (width // 4) + k))
-        return slot + 1, [a + b for a, b in zip(totals, values, strict=False)]
+    def body(entry: Any, totals: list) -> tuple:
+        return entry + 1, _add_row(totals, by_entry, width, entry)
 
     zero = dr.zeros(t.Float, dr.width(rank))
     _, totals = dr.while_loop(
         state=(begin, [t.Float(zero) for _ in range(MOMENTS + count)]),
-        cond=lambda slot, totals: slot < end,
+        cond=lambda entry, totals: entry < end,
         body=body,
     )
     _, _, p, r = dr.gather(t.Array4f, bins.geometry, rank * 2)
@@ -658,13 +717,42 @@ def _sum_slots(
     )
 
 
+def _sum_entries(bins: TileBins, slots: _Slots, partials: Any, width: int) -> Any:
+    """Sums over the micro-tiles of each entry: rows of ``width`` numbers by unsorted entry."""
+    t = types_of(type(bins.geometry))
+    entry = dr.arange(t.UInt32, max(bins.num_entries, 1))
+    group, below = entry // WORD, (t.UInt32(1) << (entry % WORD)) - 1
+
+    def body(micros: Any, totals: list) -> tuple:
+        first, word = slots.at(group, dr.tzcnt(micros))
+        slot = first + dr.popcnt(word & below)
+        return micros & (micros - 1), _add_row(totals, partials, width, slot)
+
+    zero = dr.zeros(t.Float, dr.width(entry))
+    _, totals = dr.while_loop(
+        state=(
+            dr.gather(t.UInt32, slots.composited, entry),
+            [t.Float(zero) for _ in range(width)],
+        ),
+        cond=lambda micros, totals: micros != 0,
+        body=body,
+    )
+    dr.eval(totals)
+    return scatter_rows(totals, dr.gather(t.UInt32, bins.source, entry), dr.width(entry))
+
+
+def _add_row(totals: list[Any], values: Any, width: int, row: Any) -> list[Any]:
+    numbers = _load_packets(values, width // 4, row, True)
+    return [a + b for a, b in zip(totals, numbers, strict=False)]
+
+
 # ----------------------------------------------------------------------------------------------
 # Tangent (forward mode)
 # ----------------------------------------------------------------------------------------------
 
 
 def composite_tangent(
-    bins: TileBins, features: Any, layers: Layers, tangents: SplatGradients
+    bins: TileBins, records: Records, layers: Layers, tangents: SplatGradients
 ) -> Layers:
     """Directional derivatives of the planes along ``tangents`` of the 2D splats.
 
@@ -676,15 +764,14 @@ def composite_tangent(
     lanes = _make_lanes(t.Float, bins.grid)
     entries = _Entries(bins, lanes, dr.gather(t.UInt32, layers.stop, lanes.micro_tile))
     exp2 = _exp2_function(t.Float)
-    d_geometry, d_features = _pack_tangents(bins, tangents)
+    d_records = _pack_tangents(bins, tangents)
 
     def body(cursor: _Cursor, T: list, dT: list, dC: list) -> tuple:
         entry, active = entries.current(cursor)
-        rank = dr.gather(t.UInt32, bins.ranks, entry, active)
-        footprint = _Footprint.load(bins, lanes, rank, active)
-        d_log_alpha = _footprint_tangent(bins, footprint, d_geometry, rank, active)
-        color = _load_features(features, count, rank, active)
-        d_color = _load_features(d_features, count, rank, active)
+        geometry, color = records.load(entry, active)
+        footprint = _Footprint.of(geometry, lanes, active)
+        d_geometry, d_color = d_records.load(entry, active)
+        d_log_alpha = _footprint_tangent(geometry, footprint, d_geometry)
         T, dT, dC = list(T), list(dT), [list(c) for c in dC]
         for pixel in range(PIXELS):
             row, column = divmod(pixel, MICRO)
@@ -722,8 +809,8 @@ def composite_tangent(
     )
 
 
-def _pack_tangents(bins: TileBins, tangents: SplatGradients) -> tuple[Any, Any]:
-    """Tangents by rank: geometry (mean, p, r, s, ln(opacity); unscaled) and features."""
+def _pack_tangents(bins: TileBins, tangents: SplatGradients) -> Records:
+    """The records' tangents: of mean, p, r, s (unscaled), ln(opacity), and of the features."""
     t = types_of(type(bins.geometry))
     rank = dr.arange(t.UInt32, dr.width(bins.order))
     _, log2_opacity, _, _ = dr.gather(t.Array4f, bins.geometry, rank * 2 + 1)
@@ -734,18 +821,16 @@ def _pack_tangents(bins: TileBins, tangents: SplatGradients) -> tuple[Any, Any]:
     ]
     padding = dr.zeros(t.Float, dr.width(rank))
     geometry = interleave([*columns, d_log_opacity, padding, padding])
-    return geometry, pack_features(list(tangents.features), bins.order)
+    dr.eval(geometry)
+    return pack_records(replace(bins, geometry=geometry), list(tangents.features))
 
 
 def _footprint_tangent(
-    bins: TileBins, footprint: _Footprint, d_geometry: Any, rank: Any, active: Any
+    geometry: list[Any], footprint: _Footprint, d_geometry: list[Any]
 ) -> list[list[Any]]:
     """Tangent of ln(alpha) at the 16 pixels, [row][column]."""
-    t = types_of(type(d_geometry))
-    _, _, p, r = dr.gather(t.Array4f, bins.geometry, rank * 2, active)
-    s, _, _, _ = dr.gather(t.Array4f, bins.geometry, rank * 2 + 1, active)
-    d_x, d_y, d_p, d_r = dr.gather(t.Array4f, d_geometry, rank * 2, active)
-    d_s, d_log_opacity, _, _ = dr.gather(t.Array4f, d_geometry, rank * 2 + 1, active)
+    _, _, p, r, s, _ = geometry
+    d_x, d_y, d_p, d_r, d_s, d_log_opacity = d_geometry
     d_p, d_r, d_s = d_p * WHITENING_SCALE, d_r * WHITENING_SCALE, d_s * WHITENING_SCALE
     scale = 2 * math.log(2)
     result = []

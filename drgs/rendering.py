@@ -24,11 +24,12 @@ from drgs.gaussians import PARAMETER_NAMES, Gaussians
 from drgs.projection import GaussianRows, Splats2D, load_rows, plain_opacity, project
 from drgs.rasterize import (
     Layers,
+    Records,
     SplatGradients,
     composite,
     composite_adjoint,
     composite_tangent,
-    pack_features,
+    pack_records,
 )
 from drgs.tiles import TileBins, TileGrid, bin_splats
 
@@ -67,7 +68,7 @@ class Frame:
     pipeline: Pipeline
     camera: Camera
     bins: TileBins
-    features: Any  # packed by rank
+    records: Records
     layers: Layers
 
     def planes(self) -> list[Any]:
@@ -94,9 +95,9 @@ def render(gaussians: Gaussians, camera: Camera, pipeline: Pipeline) -> Frame:
     columns = pipeline.feature_columns(splats)
     dr.eval(splats, columns)
     bins = bin_splats(splats, TileGrid(camera.width, camera.height))
-    features = pack_features(columns, bins.order)
-    layers = composite(bins, features, len(columns))
-    return Frame(pipeline=pipeline, camera=camera, bins=bins, features=features, layers=layers)
+    records = pack_records(bins, columns)
+    layers = composite(bins, records)
+    return Frame(pipeline=pipeline, camera=camera, bins=bins, records=records, layers=layers)
 
 
 def render_adjoint(
@@ -110,7 +111,7 @@ def render_adjoint(
     Not differentiated: visibility, the order of the splats, the decisions of compositing.
     """
     gradients = composite_adjoint(
-        frame.bins, frame.features, frame.layers, d_features, d_transmittance
+        frame.bins, frame.records, frame.layers, d_features, d_transmittance
     )
     rows = load_rows(gaussians, frame.pipeline.sh_degree)
     with dr.resume_grad():
@@ -163,7 +164,7 @@ def render_tangent(gaussians: Gaussians, frame: Frame, tangents: Gaussians) -> l
         columns = [dr.grad(output) for output in outputs]
     dr.eval(columns)
     direction = SplatGradients(*columns[:3], features=columns[3:])
-    return composite_tangent(frame.bins, frame.features, frame.layers, direction).planes()
+    return composite_tangent(frame.bins, frame.records, frame.layers, direction).planes()
 
 
 def _differentiable(

@@ -136,7 +136,7 @@ def bin_splats(splats: Splats2D, grid: TileGrid) -> TileBins:
         for column in (entries.ranks, entries.tiles, entries.masks)
     )
     dr.eval(source, ranks, tiles, masks)
-    words = _transpose_masks(masks)
+    words = transpose_masks(masks)
     tile_start = _lower_bounds(tiles, num_entries, grid.num_tiles)
     dr.eval(words, tile_start)
     return TileBins(
@@ -272,7 +272,7 @@ def _clamp(x: Any, lo: Any, hi: Any) -> Any:
     return dr.select(x > hi, hi, x)
 
 
-def _transpose_masks(masks: Any) -> Any:
+def transpose_masks(masks: Any) -> Any:
     """From 16 bits per entry to 32 bits per (group of 32 entries, micro-tile).
 
     Two 16x16 bit matrices side by side in each word, transposed by exchanging ever smaller

@@ -24,7 +24,7 @@ from drgs.rasterize import (
     composite,
     composite_adjoint,
     composite_tangent,
-    pack_features,
+    pack_records,
 )
 from drgs.tiles import MICROS, TileGrid, bin_splats
 
@@ -146,8 +146,8 @@ class FlatScene:
     def composite(self, precision):
         bins = bin_splats(self.splats(precision), TileGrid(self.width, self.height))
         columns = [precision.array(column) for column in self.features.T]
-        features = pack_features(columns, bins.order)
-        return bins, features, composite(bins, features, len(columns))
+        records = pack_records(bins, columns)
+        return bins, records, composite(bins, records)
 
     def as_images(self, planes) -> dict[str, np.ndarray]:
         planes = [rows(plane).reshape(self.height, self.width) for plane in planes]
@@ -494,12 +494,44 @@ def test_lanes_visit_every_micro_tile_once(size):
 
 
 @both_precisions
-def test_features_are_packed_by_rank_in_fours(precision):
-    columns = [precision.array(np.arange(3) + 10 * k) for k in range(5)]
-    packed = np.array(pack_features(columns, dr.llvm.ad.UInt32(2, 0, 1))).reshape(3, 8)
-    expected = np.zeros((3, 8))
-    expected[:, :5] = np.array([[2, 0, 1]]).T + 10 * np.arange(5)
-    np.testing.assert_array_equal(packed, expected)
+@pytest.mark.parametrize("count", [0, 1, 2, 3, 7])
+def test_records_hold_geometry_and_features_of_each_entry(precision, count):
+    scene = SCENES["37x29"]
+    features = np.random.default_rng(0).normal(size=(count, len(scene.depths)))
+    bins, _, _ = scene.composite(precision)
+    columns = [precision.array(column) for column in features]
+    packed = pack_records(bins, columns)
+    packed = np.array(packed.values).reshape(-1, 4 * packed.packets)[: bins.num_entries]
+
+    ranks = np.array(bins.ranks)[: bins.num_entries]
+    gaussians = np.array(bins.order)[ranks]
+    geometry = np.array(bins.geometry).reshape(-1, 8)[ranks, :6]
+    np.testing.assert_array_equal(packed[:, :6], geometry)
+    np.testing.assert_array_equal(packed[:, :2], rows(precision.vectors(scene.means2d))[gaussians])
+    for k, column in enumerate(columns):
+        np.testing.assert_array_equal(packed[:, 6 + k], np.array(column)[gaussians])
+    assert packed.shape[1] == -(-(6 + count) // 4) * 4 and not packed[:, 6 + count :].any()
+
+
+@both_precisions
+def test_slots_are_a_numbering_of_the_composited_pairs(precision):
+    """Every pair that is composited has a slot of its own, and a lane's slots are contiguous."""
+    scene = SCENES["opaque"]
+    bins, _, layers = scene.composite(precision)
+    slots = rasterize._assign_slots(bins, layers)
+    composited = np.array(slots.composited)
+    pairs = np.array(slots.pairs).astype(np.int64).reshape(-1, MICROS, 2)
+    tiles, stop = np.array(bins.tiles), np.array(layers.stop).reshape(-1, MICROS)
+    masks, found = np.array(bins.masks), {}
+    for micro in range(MICROS):
+        for entry in range(bins.num_entries):
+            expected = masks[entry] >> micro & 1 and entry < stop[tiles[entry], micro]
+            assert composited[entry] >> micro & 1 == expected
+            if expected:
+                first, word = pairs[entry // 32, micro]
+                found[micro, entry] = first + bin(word & ((1 << entry % 32) - 1)).count("1")
+    assert list(found.values()) == list(range(slots.count)) and slots.count > 0
+    assert slots.count < sum(bin(mask).count("1") for mask in masks), "some pairs are behind a stop"
 
 
 def test_comparison_is_relative_to_each_array():

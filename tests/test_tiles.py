@@ -246,7 +246,7 @@ def test_words_are_the_masks_transposed(precision, case):
 def test_random_bits_are_transposed():
     bits = np.random.default_rng(0).integers(0, 2, (7, WORD, MICROS))
     masks = (bits << np.arange(MICROS)).sum(axis=-1).ravel()
-    words = tiles._transpose_masks(dr.llvm.ad.UInt32(masks.astype(np.uint32)))
+    words = tiles.transpose_masks(dr.llvm.ad.UInt32(masks.astype(np.uint32)))
     expected = (bits << np.arange(WORD)[None, :, None]).sum(axis=1)
     np.testing.assert_array_equal(np.array(words).reshape(-1, MICROS), expected)
 

@@ -34,8 +34,8 @@ def count_work(frame: Frame) -> Work:
 
     def body(cursor: Any, visited: Any, useful: Any) -> tuple:
         entry, active = entries.current(cursor)
-        rank = dr.gather(t.UInt32, bins.ranks, entry, active)
-        footprint = rasterize._Footprint.load(bins, lanes, rank, active)
+        geometry, _ = frame.records.load(entry, active)
+        footprint = rasterize._Footprint.of(geometry, lanes, active)
         for pixel in range(PIXELS):
             row, column = divmod(pixel, MICRO)
             alpha = rasterize._Alpha.at(footprint.log2_alpha[row][column], dr.exp2)
