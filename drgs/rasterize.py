@@ -495,7 +495,6 @@ class _Slots:
 
     pairs: Any  # UInt32 (M padded / 32 * 16 * 2,): (group of 32, micro-tile) -> first slot, bits
     composited: Any  # UInt32 (M padded,): sorted -> bit per micro-tile
-    groups: int  # M padded / 32
     count: int
 
     def at(self, group: Any, micro: Any, active: Any = True) -> tuple[Any, Any]:
@@ -516,20 +515,20 @@ def _assign_slots(bins: TileBins, layers: Layers) -> _Slots:
     dr.eval(composited)
     words = transpose_masks(composited)
 
-    groups = dr.width(composited) // WORD
-    index = dr.arange(t.UInt32, MICROS * groups + 1)
-    micro = index // dr.opaque(t.UInt32, groups)
+    num_words = dr.width(words)
+    groups = dr.opaque(t.UInt32, num_words // MICROS)
+    index = dr.arange(t.UInt32, num_words + 1)
+    micro = index // groups
     transposed = (index - micro * groups) * MICROS + micro
-    exists = index < dr.opaque(t.UInt32, MICROS * groups)
+    exists = index < dr.opaque(t.UInt32, num_words)
     first = dr.prefix_sum(dr.popcnt(dr.gather(t.UInt32, words, transposed, exists)))
-    count = int(first[MICROS * groups])
+    count = int(first[num_words])
 
-    index = dr.arange(t.UInt32, MICROS * groups)
+    index = dr.arange(t.UInt32, num_words)
     group, micro = index // MICROS, index % MICROS
-    first = dr.gather(t.UInt32, first, micro * dr.opaque(t.UInt32, groups) + group)
-    pairs = interleave([first, words])
+    pairs = interleave([dr.gather(t.UInt32, first, micro * groups + group), words])
     dr.eval(pairs)
-    return _Slots(pairs=pairs, composited=composited, groups=groups, count=count)
+    return _Slots(pairs=pairs, composited=composited, count=count)
 
 
 MOMENTS = 6
@@ -681,7 +680,8 @@ def _sum_slots(
     begin, end = (dr.gather(t.UInt32, bins.first_entry, rank + k) for k in (0, 1))
 
     def body(entry: Any, totals: list) -> tuple:
-        return entry + 1, _add_row(totals, by_entry, width, entry)
+        numbers = _load_packets(by_entry, width // 4, entry, True)
+        return entry + 1, [a + b for a, b in zip(totals, numbers, strict=False)]
 
     zero = dr.zeros(t.Float, dr.width(rank))
     _, totals = dr.while_loop(
@@ -726,7 +726,8 @@ def _sum_entries(bins: TileBins, slots: _Slots, partials: Any, width: int) -> An
     def body(micros: Any, totals: list) -> tuple:
         first, word = slots.at(group, dr.tzcnt(micros))
         slot = first + dr.popcnt(word & below)
-        return micros & (micros - 1), _add_row(totals, partials, width, slot)
+        numbers = _load_packets(partials, width // 4, slot, True)
+        return micros & (micros - 1), [a + b for a, b in zip(totals, numbers, strict=True)]
 
     zero = dr.zeros(t.Float, dr.width(entry))
     _, totals = dr.while_loop(
@@ -739,11 +740,6 @@ def _sum_entries(bins: TileBins, slots: _Slots, partials: Any, width: int) -> An
     )
     dr.eval(totals)
     return scatter_rows(totals, dr.gather(t.UInt32, bins.source, entry), dr.width(entry))
-
-
-def _add_row(totals: list[Any], values: Any, width: int, row: Any) -> list[Any]:
-    numbers = _load_packets(values, width // 4, row, True)
-    return [a + b for a, b in zip(totals, numbers, strict=False)]
 
 
 # ----------------------------------------------------------------------------------------------
