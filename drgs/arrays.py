@@ -66,7 +66,8 @@ def interleave(columns: list[Any]) -> Any:
     Loop results must be evaluated before: storing them unevaluated runs the loop once more for
     each column.
     """
-    return dr.ravel(_dynamic_vector(columns))
+    num_rows = dr.width(columns)
+    return scatter_rows(columns, dr.arange(types_of(type(columns[0])).UInt32, num_rows), num_rows)
 
 
 def scatter_rows(columns: list[Any], rows: Any, num_rows: int) -> Any:

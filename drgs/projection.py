@@ -71,7 +71,7 @@ def load_rows(gaussians: Gaussians, sh_degree: int) -> GaussianRows:
     higher = range(sh.num_coefficients(sh_degree) - 1)
     return GaussianRows(
         means=t.Array3f(load(gaussians.means, 0, 3, 3)),
-        quats=t.Array4f(load(gaussians.quats, 0, 4, 4)),
+        quats=dr.gather(t.Array4f, dr.detach(gaussians.quats).array, row),
         log_scales=t.Array3f(load(gaussians.log_scales, 0, 3, 3)),
         logit_opacities=flat,
         sh=[t.Array3f(load(gaussians.sh0, 0, 3, 3))]
