@@ -7,6 +7,7 @@ it asks this module for the companions of the float type that it was given.
 from __future__ import annotations
 
 import sys
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from typing import Any
@@ -79,6 +80,23 @@ def scatter_rows(columns: list[Any], rows: Any, num_rows: int) -> Any:
     flat = dr.empty(type(columns[0]), num_rows * len(columns))
     dr.scatter(flat, _dynamic_vector(columns), rows)
     return flat
+
+
+PACKET = 4
+"""Numbers that a lane loads at once: such a load costs about as much as one of a single number."""
+
+
+def pack_rows(columns: Sequence[Any]) -> Any:
+    """Columns of equal length as rows that fill whole packets, flat, not evaluated."""
+    padding = dr.zeros(type(columns[0]), dr.width(columns[0]))
+    return interleave([*columns, *[padding] * (-len(columns) % PACKET)])
+
+
+def load_row(rows: Any, width: int, row: Any, active: Any = True) -> list[Any]:
+    """The ``width`` numbers of one row a lane of what :func:`pack_rows` made; 0 if not active."""
+    packet, packets = types_of(type(rows)).Array4f, -(-width // PACKET)
+    loaded = [dr.gather(packet, rows, row * packets + k, active) for k in range(packets)]
+    return [number for packet in loaded for number in packet][:width]
 
 
 def _dynamic_vector(columns: list[Any]) -> Any:

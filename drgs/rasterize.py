@@ -43,12 +43,12 @@ same to the last bit in every run.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
 
-from drgs.arrays import interleave, is_float64, scatter_rows, types_of
+from drgs.arrays import interleave, is_float64, load_row, pack_rows, scatter_rows, types_of
 from drgs.constants import (
     ALPHA_MAX,
     LOG2_ALPHA_CUT,
@@ -56,6 +56,7 @@ from drgs.constants import (
     WHITENING_SCALE,
 )
 from drgs.tiles import (
+    GEOMETRY,
     GRID,
     MICRO,
     MICROS,
@@ -67,9 +68,6 @@ from drgs.tiles import (
 )
 
 PIXELS = MICRO * MICRO
-
-GEOMETRY = 6
-"""Numbers per splat that decide its alpha at a pixel: mean x, y, p, r, s, log2_opacity."""
 
 
 @dataclass(frozen=True)
@@ -348,54 +346,20 @@ class Records:
     memory in order instead of jumping from splat to splat.
     """
 
-    values: Any  # Float (M padded * packets * 4,): geometry, features, padding
+    rows: Any  # Float (M padded * packets * 4,): geometry, features, padding
     count: int  # C, features
 
-    @property
-    def packets(self) -> int:
-        """Groups of four numbers per entry."""
-        return -(-(GEOMETRY + self.count) // 4)
+    @staticmethod
+    def of(bins: TileBins, rows: Any) -> Records:
+        """Copies, evaluated, of one row per Gaussian: ``bins.rows``, or others of their length."""
+        copies = pack_rows(load_row(rows, GEOMETRY + bins.num_features, bins.gaussians))
+        dr.eval(copies)
+        return Records(rows=copies, count=bins.num_features)
 
     def load(self, entry: Any, active: Any) -> tuple[list[Any], list[Any]]:
         """Geometry (6) and features (C) of a sorted entry."""
-        numbers = _load_packets(self.values, self.packets, entry, active)
-        return numbers[:GEOMETRY], numbers[GEOMETRY : GEOMETRY + self.count]
-
-
-def pack_records(bins: TileBins, columns: list[Any]) -> Records:
-    """The records of all entries, evaluated.
-
-    columns: C features, one value per Gaussian each; without any, transmittance alone is
-    composited.
-    """
-    t = types_of(type(bins.geometry))
-    numbers = _load_packets(bins.geometry, 2, bins.ranks, True)[:GEOMETRY]
-    if columns:
-        by_rank = _pack_by_rank(columns, bins.order)
-        numbers += _load_packets(by_rank, -(-len(columns) // 4), bins.ranks, True)[: len(columns)]
-    numbers += [dr.zeros(t.Float, dr.width(bins.ranks))] * (-len(numbers) % 4)
-    values = interleave(numbers)
-    dr.eval(values)
-    return Records(values=values, count=len(columns))
-
-
-def _pack_by_rank(columns: list[Any], order: Any) -> Any:
-    """Columns (one value per Gaussian) as packets of four by rank; flat, evaluated."""
-    columns = [dr.gather(type(c), c, order) for c in columns]
-    padding = dr.zeros(type(columns[0]), dr.width(order))
-    packets = interleave(columns + [padding] * (-len(columns) % 4))
-    dr.eval(packets)
-    return packets
-
-
-def _load_packets(values: Any, packets: int, row: Any, active: Any) -> list[Any]:
-    """A row of ``packets`` times four numbers."""
-    Array4f = types_of(type(values)).Array4f
-    return [
-        number
-        for k in range(packets)
-        for number in dr.gather(Array4f, values, row * packets + k, active)
-    ]
+        numbers = load_row(self.rows, GEOMETRY + self.count, entry, active)
+        return numbers[:GEOMETRY], numbers[GEOMETRY:]
 
 
 # ----------------------------------------------------------------------------------------------
@@ -406,9 +370,9 @@ def _load_packets(values: Any, packets: int, row: Any, active: Any) -> list[Any]
 def composite(bins: TileBins, records: Records) -> Layers:
     """Composite the features of all splats.
 
-    bins: from ``bin_splats``; records: from :func:`pack_records`.
+    bins: from ``bin_splats``; records: ``Records.of(bins, bins.rows)``.
     """
-    t = types_of(type(bins.geometry))
+    t = types_of(type(bins.rows))
     count = records.count
     lanes = _make_lanes(t.Float, bins.grid)
     end = dr.gather(t.UInt32, bins.tile_start, lanes.tile + 1)
@@ -504,7 +468,7 @@ class _Slots:
 
 def _assign_slots(bins: TileBins, layers: Layers) -> _Slots:
     """Number the slots. The host reads one value, how many there are."""
-    t = types_of(type(bins.geometry))
+    t = types_of(type(bins.rows))
     entry = dr.arange(t.UInt32, dr.width(bins.masks))
     composited = t.UInt32(0)
     for k in range(MICROS // 4):
@@ -548,7 +512,7 @@ def composite_adjoint(
     (H * W,); d_transmittance: plane (H * W,). Not differentiated: the order, the decisions
     (cut, clamp, stop).
     """
-    t = types_of(type(bins.geometry))
+    t = types_of(type(bins.rows))
     count = layers.count
     lanes = _make_lanes(t.Float, bins.grid)
     slots = _assign_slots(bins, layers)
@@ -674,13 +638,13 @@ def _sum_slots(
     bins: TileBins, slots: _Slots, partials: Any, width: int, count: int
 ) -> SplatGradients:
     """Add up the slots of each entry, the entries of each splat, and turn sums into derivatives."""
-    t = types_of(type(bins.geometry))
+    t = types_of(type(bins.rows))
     by_entry = _sum_entries(bins, slots, partials, width)
     rank = dr.arange(t.UInt32, dr.width(bins.order))
     begin, end = (dr.gather(t.UInt32, bins.first_entry, rank + k) for k in (0, 1))
 
     def body(entry: Any, totals: list) -> tuple:
-        numbers = _load_packets(by_entry, width // 4, entry, True)
+        numbers = load_row(by_entry, width, entry)
         return entry + 1, [a + b for a, b in zip(totals, numbers, strict=False)]
 
     zero = dr.zeros(t.Float, dr.width(rank))
@@ -689,8 +653,8 @@ def _sum_slots(
         cond=lambda entry, totals: entry < end,
         body=body,
     )
-    _, _, p, r = dr.gather(t.Array4f, bins.geometry, rank * 2)
-    s, log2_opacity, _, _ = dr.gather(t.Array4f, bins.geometry, rank * 2 + 1)
+    row = load_row(bins.rows, GEOMETRY + count, dr.gather(t.UInt32, bins.order, rank))
+    _, _, p, r, s, log2_opacity = row[:GEOMETRY]
     v, v_u, v_u_dx, v_u_dy, v_dy, v_dy_dy = totals[:MOMENTS]
     # log2_alpha = log2_opacity - u^2 - (s dy)^2, u = p dx + r dy, dx = x - mean: hence
     # d ln(alpha) / d(anything) = ln(2) * d log2_alpha / d(anything).
@@ -719,14 +683,14 @@ def _sum_slots(
 
 def _sum_entries(bins: TileBins, slots: _Slots, partials: Any, width: int) -> Any:
     """Sums over the micro-tiles of each entry: rows of ``width`` numbers by unsorted entry."""
-    t = types_of(type(bins.geometry))
+    t = types_of(type(bins.rows))
     entry = dr.arange(t.UInt32, max(bins.num_entries, 1))
     group, below = entry // WORD, (t.UInt32(1) << (entry % WORD)) - 1
 
     def body(micros: Any, totals: list) -> tuple:
         first, word = slots.at(group, dr.tzcnt(micros))
         slot = first + dr.popcnt(word & below)
-        numbers = _load_packets(partials, width // 4, slot, True)
+        numbers = load_row(partials, width, slot)
         return micros & (micros - 1), [a + b for a, b in zip(totals, numbers, strict=True)]
 
     zero = dr.zeros(t.Float, dr.width(entry))
@@ -755,7 +719,7 @@ def composite_tangent(
     tangents: the same fields as the gradients, holding the direction. Returns the tangents of
     the planes that :func:`composite` made. Not differentiated: the order, the decisions.
     """
-    t = types_of(type(bins.geometry))
+    t = types_of(type(bins.rows))
     count = layers.count
     lanes = _make_lanes(t.Float, bins.grid)
     entries = _Entries(bins, lanes, dr.gather(t.UInt32, layers.stop, lanes.micro_tile))
@@ -807,18 +771,13 @@ def composite_tangent(
 
 def _pack_tangents(bins: TileBins, tangents: SplatGradients) -> Records:
     """The records' tangents: of mean, p, r, s (unscaled), ln(opacity), and of the features."""
-    t = types_of(type(bins.geometry))
-    rank = dr.arange(t.UInt32, dr.width(bins.order))
-    _, log2_opacity, _, _ = dr.gather(t.Array4f, bins.geometry, rank * 2 + 1)
-    d_log_opacity = dr.gather(t.Float, tangents.opacities, bins.order) * dr.exp2(-log2_opacity)
-    columns = [
-        dr.gather(t.Float, column, bins.order)
-        for column in (*tangents.means2d, *tangents.whitening)
-    ]
-    padding = dr.zeros(t.Float, dr.width(rank))
-    geometry = interleave([*columns, d_log_opacity, padding, padding])
-    dr.eval(geometry)
-    return pack_records(replace(bins, geometry=geometry), list(tangents.features))
+    t = types_of(type(bins.rows))
+    gaussian = dr.arange(t.UInt32, dr.width(bins.order))
+    log2_opacity = load_row(bins.rows, GEOMETRY + bins.num_features, gaussian)[GEOMETRY - 1]
+    d_log_opacity = tangents.opacities * dr.exp2(-log2_opacity)
+    rows = pack_rows([*tangents.means2d, *tangents.whitening, d_log_opacity, *tangents.features])
+    dr.eval(rows)
+    return Records.of(bins, rows)
 
 
 def _footprint_tangent(

@@ -29,7 +29,6 @@ from drgs.rasterize import (
     composite,
     composite_adjoint,
     composite_tangent,
-    pack_records,
 )
 from drgs.tiles import TileBins, TileGrid, bin_splats
 
@@ -93,9 +92,8 @@ def render(gaussians: Gaussians, camera: Camera, pipeline: Pipeline) -> Frame:
     """
     splats = pipeline.project(load_rows(gaussians, pipeline.sh_degree), camera)
     columns = pipeline.feature_columns(splats)
-    dr.eval(splats, columns)
-    bins = bin_splats(splats, TileGrid(camera.width, camera.height))
-    records = pack_records(bins, columns)
+    bins = bin_splats(splats, TileGrid(camera.width, camera.height), columns)
+    records = Records.of(bins, bins.rows)
     layers = composite(bins, records)
     return Frame(pipeline=pipeline, camera=camera, bins=bins, records=records, layers=layers)
 
@@ -231,7 +229,7 @@ def _faults(d_rows: GaussianRows) -> Any:
 
 def _on_film(bins: TileBins) -> Any:
     """Bool per Gaussian: it has entries."""
-    t = types_of(type(bins.geometry))
+    t = types_of(type(bins.rows))
     rank = dr.arange(t.UInt32, dr.width(bins.order))
     first, end = (dr.gather(t.UInt32, bins.first_entry, rank + k) for k in (0, 1))
     visible = dr.empty(t.Bool, dr.width(bins.order))

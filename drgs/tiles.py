@@ -6,8 +6,8 @@ bounding box is one *entry*; an entry carries 16 bits that say which micro-tiles
 touches. All steps are flat: no lane loops over a splat's tiles, so a giant splat does not hold
 up its neighbours, and the only value that the host reads is the number of entries.
 
-1. Sort the splats by depth.
-2. Count the tiles of each bounding box; a prefix sum gives each splat its run of entries.
+1. Store each splat's numbers as a row and count the tiles of its bounding box.
+2. Sort the splats by depth; a prefix sum gives each one its run of entries.
 3. For each entry: its tile, and the exact ellipse-against-rectangle test of its micro-tiles.
 4. Stable sort of the entries by tile; within a tile they stay front to back.
 5. Transpose the bits: for each group of 32 entries and each micro-tile one 32-bit word, so that
@@ -17,12 +17,14 @@ up its neighbours, and the only value that the host reads is the number of entri
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import drjit as dr
 
-from drgs.arrays import interleave, types_of
+from drgs.arrays import interleave, load_row, pack_rows, types_of
 from drgs.constants import (
     ALPHA_CUT,
     CULL_MARGIN,
@@ -47,8 +49,8 @@ MICROS = GRID * GRID
 WORD = 32
 """Entries in a word of the transposed masks."""
 
-GEOMETRY = 8
-"""Numbers per splat in the geometry records: two packets of four."""
+GEOMETRY = 6
+"""Numbers per splat that decide its alpha at a pixel: mean x, y, p, r, s, log2_opacity."""
 
 
 @dataclass(frozen=True)
@@ -88,11 +90,12 @@ class TileBins:
     to a multiple of 32 with entries that touch nothing.
     """
 
+    rows: Any  # Float (N * packets * 4,): by Gaussian: geometry, features, padding
+    num_features: int
     order: Any  # UInt32 (N,): rank -> index of the Gaussian
-    geometry: Any  # Float (N * 8,): the records of pack_geometry, by rank
     first_entry: Any  # UInt32 (N + 1,): rank -> first of its run of unsorted entries
     source: Any  # UInt32 (M padded,): sorted -> unsorted
-    ranks: Any  # UInt32 (M padded,): sorted -> rank
+    gaussians: Any  # UInt32 (M padded,): sorted -> index of the Gaussian
     tiles: Any  # UInt32 (M padded,): sorted -> tile
     masks: Any  # UInt32 (M padded,): sorted -> bit per micro-tile that the splat touches
     words: Any  # UInt32 (M padded / 32 * 16,): (group of 32, micro-tile) -> bit per entry
@@ -101,50 +104,45 @@ class TileBins:
     grid: TileGrid
 
 
-@dataclass(frozen=True)
-class _Entries:
-    """Unsorted (splat, tile) pairs."""
-
-    ranks: Any  # UInt32 (M,)
-    tiles: Any  # UInt32 (M,)
-    masks: Any  # UInt32 (M,)
-
-
-def bin_splats(splats: Splats2D, grid: TileGrid) -> TileBins:
+def bin_splats(splats: Splats2D, grid: TileGrid, features: Sequence[Any] = ()) -> TileBins:
     """Distribute the visible ``splats`` over the tiles of ``grid``, front to back.
+
+    features: columns, one value per Gaussian, that compositing will read beside the geometry.
+    Neither they nor the splats need to be evaluated: the kernel that computes them stores rows.
 
     Not differentiated: integer work. The host reads one value, the number of entries.
     """
     t = types_of(type(splats.depths))
+    rows, boxes, keys = _store_rows(splats, grid, features)
     # A stable sort: equal depths stay in the order of the Gaussians.
-    order = dr.argsort(dr.select(splats.visible, splats.depths, dr.inf))
-    in_order = dr.gather(Splats2D, splats, order)
-    geometry = interleave(_geometry_columns(in_order))
-    first_entry, boxes = _tile_boxes(in_order, grid)
-    dr.eval(geometry, boxes)
-    num_entries = int(first_entry[dr.width(order)])
+    order = dr.argsort(keys)
+    num_splats = dr.width(order)
+    rank = dr.arange(t.UInt32, num_splats + 1)
+    exists = rank < dr.opaque(t.UInt32, num_splats)
+    counts = dr.gather(t.UInt32, boxes, dr.gather(t.UInt32, order, rank, exists) * 4 + 3, exists)
+    first_entry = dr.prefix_sum(counts)
+    num_entries = int(first_entry[num_splats])
 
-    entries = _make_entries(first_entry, boxes, geometry, num_entries, grid)
-    source = dr.argsort(entries.tiles)
+    touched = partial(_touched_micros, rows, GEOMETRY + len(features), grid)
+    tile, entries = _make_entries(first_entry, order, boxes, num_entries, grid, touched)
+    source = dr.argsort(tile)
 
     padded = -(-max(num_entries, 1) // WORD) * WORD
     position = dr.arange(t.UInt32, padded)
     active = position < dr.opaque(t.UInt32, num_entries)
     source = dr.gather(t.UInt32, source, position, active)
-    ranks, tiles, masks = (
-        dr.gather(t.UInt32, column, source, active)
-        for column in (entries.ranks, entries.tiles, entries.masks)
-    )
-    dr.eval(source, ranks, tiles, masks)
+    gaussians, tiles, masks, _ = dr.gather(t.Array4u, entries, source, active)
+    dr.eval(source, gaussians, tiles, masks)
     words = transpose_masks(masks)
     tile_start = _lower_bounds(tiles, num_entries, grid.num_tiles)
     dr.eval(words, tile_start)
     return TileBins(
+        rows=rows,
+        num_features=len(features),
         order=order,
-        geometry=geometry,
         first_entry=first_entry,
         source=source,
-        ranks=ranks,
+        gaussians=gaussians,
         tiles=tiles,
         masks=masks,
         words=words,
@@ -154,24 +152,27 @@ def bin_splats(splats: Splats2D, grid: TileGrid) -> TileBins:
     )
 
 
+def _store_rows(splats: Splats2D, grid: TileGrid, features: Sequence[Any]) -> tuple[Any, Any, Any]:
+    """By Gaussian, evaluated at once: rows of numbers, boxes of tiles, keys to sort by."""
+    rows = pack_rows([*_geometry_columns(splats), *features])
+    boxes = _tile_boxes(splats, grid)
+    keys = dr.select(splats.visible, splats.depths, dr.inf)
+    dr.eval(rows, boxes, keys)
+    return rows, boxes, keys
+
+
 def _geometry_columns(splats: Splats2D) -> list[Any]:
-    """Six numbers per splat (and padding) that decide its alpha at a pixel.
+    """The numbers that decide a splat's alpha at a pixel.
 
     Mean x, y (px); then p, r, s of U and log2_opacity, scaled such that
     alpha = exp2(log2_opacity - |U d|^2).
     """
     p, r, s = splats.whitening * WHITENING_SCALE
-    log2_opacity = dr.log2(splats.opacities)
-    padding = dr.zeros(type(p), dr.width(p))
-    return [*splats.means2d, p, r, s, log2_opacity, padding, padding]
+    return [*splats.means2d, p, r, s, dr.log2(splats.opacities)]
 
 
-def _tile_boxes(splats: Splats2D, grid: TileGrid) -> tuple[Any, Any]:
-    """Each rank's box of tiles, and the run of entries that it needs.
-
-    Returns first_entry (N + 1,) and boxes, flat, four a rank: first entry, first tile column,
-    first tile row, columns.
-    """
+def _tile_boxes(splats: Splats2D, grid: TileGrid) -> Any:
+    """Each splat's box of tiles: first column, first row, columns, number of tiles; flat."""
     t = types_of(type(splats.depths))
     # alpha >= cut inside |U d|^2 <= 2 ln(opacity / cut); its bounding box follows from the
     # variances (the opacity-aware radius, instead of 3 standard deviations).
@@ -193,54 +194,58 @@ def _tile_boxes(splats: Splats2D, grid: TileGrid) -> tuple[Any, Any]:
     extent = last_tile - first_tile + 1
     count = dr.select(visible, extent.x * extent.y, 0)
 
-    num_splats = dr.width(count)
-    rank = dr.arange(t.UInt32, num_splats + 1)
-    counts = dr.gather(t.UInt32, count, rank, rank < dr.opaque(t.UInt32, num_splats))
-    first_entry = dr.prefix_sum(counts)
-    first = dr.gather(t.UInt32, first_entry, dr.arange(t.UInt32, num_splats))
-    boxes = interleave([first, first_tile.x, first_tile.y, extent.x])
-    return first_entry, boxes
+    return interleave([first_tile.x, first_tile.y, extent.x, count])
 
 
 def _make_entries(
-    first_entry: Any, boxes: Any, geometry: Any, num_entries: int, grid: TileGrid
-) -> _Entries:
-    """One entry per lane: its rank, tile and micro-tile mask."""
-    t = types_of(type(geometry))
+    first_entry: Any,
+    order: Any,
+    boxes: Any,
+    num_entries: int,
+    grid: TileGrid,
+    touched: Callable[[Any, Any, Any], Any],
+) -> tuple[Any, Any]:
+    """Of each entry its tile; and four numbers: Gaussian, tile, mask of micro-tiles, 0.
+
+    touched: the mask of a Gaussian in a tile, given by column and row.
+    """
+    t = types_of(type(order))
     # Rank of each entry: write each rank at the start of its run, then a running maximum.
-    rank = dr.arange(t.UInt32, dr.width(first_entry) - 1)
+    rank = dr.arange(t.UInt32, dr.width(order))
     start, end = dr.gather(t.UInt32, first_entry, rank), dr.gather(t.UInt32, first_entry, rank + 1)
     starts = dr.zeros(t.UInt32, max(num_entries, 1))
     dr.scatter(starts, rank, start, start < end)
-    ranks = dr.prefix_reduce(dr.ReduceOp.Max, starts, exclusive=False)
+    rank = dr.prefix_reduce(dr.ReduceOp.Max, starts, exclusive=False)
 
-    first, tile_x, tile_y, columns = dr.gather(t.Array4u, boxes, ranks)
-    local = dr.arange(t.UInt32, max(num_entries, 1)) - first
+    gaussian = dr.gather(t.UInt32, order, rank)
+    tile_x, tile_y, columns, _ = dr.gather(t.Array4u, boxes, gaussian)
+    local = dr.arange(t.UInt32, max(num_entries, 1)) - dr.gather(t.UInt32, first_entry, rank)
     # Exact while a splat covers fewer than 2^22 tiles; an integer division by a varying number
     # has no vector instruction.
     row = t.UInt32((t.Float(local) + 0.5) / t.Float(columns))
     tile_x = tile_x + (local - row * columns)
     tile_y = tile_y + row
-    tiles = dr.fma(tile_y, dr.opaque(t.UInt32, grid.columns), tile_x)
-    margin = dr.opaque(t.Float, grid.cull_margin)
-    masks = _touched_micros(geometry, ranks, tile_x, tile_y, margin)
-    dr.eval(ranks, tiles, masks)
-    return _Entries(ranks=ranks, tiles=tiles, masks=masks)
+    tile = dr.fma(tile_y, dr.opaque(t.UInt32, grid.columns), tile_x)
+    mask = touched(gaussian, tile_x, tile_y)
+    entries = interleave([gaussian, tile, mask, dr.zeros(t.UInt32, dr.width(tile))])
+    dr.eval(tile, entries)
+    return tile, entries
 
 
-def _touched_micros(geometry: Any, ranks: Any, tile_x: Any, tile_y: Any, margin: Any) -> Any:
+def _touched_micros(
+    rows: Any, width: int, grid: TileGrid, gaussian: Any, tile_x: Any, tile_y: Any
+) -> Any:
     """Bit m is set where the ellipse alpha >= cut reaches a pixel centre of micro-tile m.
 
-    margin: added to the exponent (base 2).
+    width: numbers in a row of ``rows``.
 
     |U d|^2 is convex, so its minimum over a rectangle that does not contain the mean lies on
     one of the (at most two) sides that face the mean: for such a side, one coordinate is given
     and the best other coordinate is clamped to the rectangle.
     """
-    t = types_of(type(geometry))
-    mean_x, mean_y, p, r = dr.gather(t.Array4f, geometry, ranks * 2)
-    s, log2_opacity, _, _ = dr.gather(t.Array4f, geometry, ranks * 2 + 1)
-    reach = log2_opacity - LOG2_ALPHA_CUT + margin
+    t = types_of(type(rows))
+    mean_x, mean_y, p, r, s, log2_opacity = load_row(rows, width, gaussian)[:GEOMETRY]
+    reach = log2_opacity - LOG2_ALPHA_CUT + dr.opaque(t.Float, grid.cull_margin)
     dx_per_dy = -r / p
     dy_per_dx = -(p * r) / dr.fma(r, r, s * s)
 

@@ -216,7 +216,7 @@ def outcome():
         board,
         rasterize,
         derivatives=["composite_adjoint", "composite_tangent"],
-        forward=["composite", "pack_records", "Layers.planes"],
+        forward=["composite", "Records.of", "Layers.planes"],
     )
     chain = Instrumented(
         board,

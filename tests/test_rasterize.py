@@ -18,13 +18,13 @@ from helpers import (
 )
 
 from drgs import rasterize, reference
+from drgs.constants import WHITENING_SCALE
 from drgs.projection import Splats2D
 from drgs.rasterize import (
     SplatGradients,
     composite,
     composite_adjoint,
     composite_tangent,
-    pack_records,
 )
 from drgs.tiles import MICROS, TileGrid, bin_splats
 
@@ -144,9 +144,9 @@ class FlatScene:
         )
 
     def composite(self, precision):
-        bins = bin_splats(self.splats(precision), TileGrid(self.width, self.height))
         columns = [precision.array(column) for column in self.features.T]
-        records = pack_records(bins, columns)
+        bins = bin_splats(self.splats(precision), TileGrid(self.width, self.height), columns)
+        records = rasterize.Records.of(bins, bins.rows)
         return bins, records, composite(bins, records)
 
     def as_images(self, planes) -> dict[str, np.ndarray]:
@@ -497,19 +497,20 @@ def test_lanes_visit_every_micro_tile_once(size):
 @pytest.mark.parametrize("count", [0, 1, 2, 3, 7])
 def test_records_hold_geometry_and_features_of_each_entry(precision, count):
     scene = SCENES["37x29"]
-    features = np.random.default_rng(0).normal(size=(count, len(scene.depths)))
-    bins, _, _ = scene.composite(precision)
-    columns = [precision.array(column) for column in features]
-    packed = pack_records(bins, columns)
-    packed = np.array(packed.values).reshape(-1, 4 * packed.packets)[: bins.num_entries]
-
-    ranks = np.array(bins.ranks)[: bins.num_entries]
-    gaussians = np.array(bins.order)[ranks]
-    geometry = np.array(bins.geometry).reshape(-1, 8)[ranks, :6]
-    np.testing.assert_array_equal(packed[:, :6], geometry)
-    np.testing.assert_array_equal(packed[:, :2], rows(precision.vectors(scene.means2d))[gaussians])
-    for k, column in enumerate(columns):
-        np.testing.assert_array_equal(packed[:, 6 + k], np.array(column)[gaussians])
+    features = np.random.default_rng(0).normal(size=(len(scene.depths), count))
+    scene = replace(scene, features=single(features))
+    bins, records, _ = scene.composite(precision)
+    packed = np.array(records.rows).reshape(len(bins.gaussians), -1)[: bins.num_entries]
+    gaussians = np.array(bins.gaussians)[: bins.num_entries]
+    expected = np.column_stack(
+        [
+            rows(precision.vectors(scene.means2d)),
+            rows(precision.vectors(scene.whitening) * WHITENING_SCALE),
+            np.array(dr.log2(precision.array(scene.opacities))),
+            *(np.array(precision.array(column)) for column in scene.features.T),
+        ]
+    )
+    np.testing.assert_array_equal(packed[:, : 6 + count], expected[gaussians])
     assert packed.shape[1] == -(-(6 + count) // 4) * 4 and not packed[:, 6 + count :].any()
 
 

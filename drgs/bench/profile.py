@@ -16,7 +16,7 @@ from typing import Any
 
 import drjit as dr
 
-from drgs import rasterize, rendering
+from drgs import rasterize, rendering, tiles
 
 STAGES = (
     "projection and SH",
@@ -72,7 +72,8 @@ def stage_clock() -> Iterator[StageClock]:
         return wrap
 
     borders = [
-        (rendering, "bin_splats", ends("projection and SH", "binning")),
+        (tiles, "_store_rows", ends(None, "projection and SH")),
+        (rendering, "bin_splats", ends(None, "binning")),
         (rendering, "composite", ends(None, "compositing")),
         (rendering, "composite_adjoint", ends("image and loss", None)),
         (rasterize, "_sum_slots", ends("adjoint", "reduction")),
