@@ -351,8 +351,8 @@ class Records:
 
     @staticmethod
     def of(bins: TileBins, rows: Any) -> Records:
-        """Copies, evaluated, of one row per Gaussian: ``bins.rows``, or others of their length."""
-        copies = pack_rows(load_row(rows, GEOMETRY + bins.num_features, bins.gaussians))
+        """Copies, evaluated, of one row per rank: ``bins.rows``, or others of their length."""
+        copies = pack_rows(load_row(rows, GEOMETRY + bins.num_features, bins.ranks))
         dr.eval(copies)
         return Records(rows=copies, count=bins.num_features)
 
@@ -653,7 +653,7 @@ def _sum_slots(
         cond=lambda entry, totals: entry < end,
         body=body,
     )
-    row = load_row(bins.rows, GEOMETRY + count, dr.gather(t.UInt32, bins.order, rank))
+    row = load_row(bins.rows, GEOMETRY + count, rank)
     _, _, p, r, s, log2_opacity = row[:GEOMETRY]
     v, v_u, v_u_dx, v_u_dy, v_dy, v_dy_dy = totals[:MOMENTS]
     # log2_alpha = log2_opacity - u^2 - (s dy)^2, u = p dx + r dy, dx = x - mean: hence
@@ -772,10 +772,16 @@ def composite_tangent(
 def _pack_tangents(bins: TileBins, tangents: SplatGradients) -> Records:
     """The records' tangents: of mean, p, r, s (unscaled), ln(opacity), and of the features."""
     t = types_of(type(bins.rows))
-    gaussian = dr.arange(t.UInt32, dr.width(bins.order))
-    log2_opacity = load_row(bins.rows, GEOMETRY + bins.num_features, gaussian)[GEOMETRY - 1]
-    d_log_opacity = tangents.opacities * dr.exp2(-log2_opacity)
-    rows = pack_rows([*tangents.means2d, *tangents.whitening, d_log_opacity, *tangents.features])
+    rank = dr.arange(t.UInt32, dr.width(bins.order))
+    log2_opacity = load_row(bins.rows, GEOMETRY + bins.num_features, rank)[GEOMETRY - 1]
+    numbers = [
+        dr.gather(t.Float, column, bins.order)
+        for column in (
+            *tangents.means2d, *tangents.whitening, tangents.opacities, *tangents.features
+        )
+    ]  # fmt: skip
+    numbers[GEOMETRY - 1] *= dr.exp2(-log2_opacity)
+    rows = pack_rows(numbers)
     dr.eval(rows)
     return Records.of(bins, rows)
 

@@ -90,12 +90,12 @@ class TileBins:
     to a multiple of 32 with entries that touch nothing.
     """
 
-    rows: Any  # Float (N * packets * 4,): by Gaussian: geometry, features, padding
-    num_features: int
     order: Any  # UInt32 (N,): rank -> index of the Gaussian
+    rows: Any  # Float (N * packets * 4,): by rank: geometry, features, padding
+    num_features: int
     first_entry: Any  # UInt32 (N + 1,): rank -> first of its run of unsorted entries
     source: Any  # UInt32 (M padded,): sorted -> unsorted
-    gaussians: Any  # UInt32 (M padded,): sorted -> index of the Gaussian
+    ranks: Any  # UInt32 (M padded,): sorted -> rank
     tiles: Any  # UInt32 (M padded,): sorted -> tile
     masks: Any  # UInt32 (M padded,): sorted -> bit per micro-tile that the splat touches
     words: Any  # UInt32 (M padded / 32 * 16,): (group of 32, micro-tile) -> bit per entry
@@ -113,36 +113,41 @@ def bin_splats(splats: Splats2D, grid: TileGrid, features: Sequence[Any] = ()) -
     Not differentiated: integer work. The host reads one value, the number of entries.
     """
     t = types_of(type(splats.depths))
+    width = GEOMETRY + len(features)
     rows, boxes, keys = _store_rows(splats, grid, features)
     # A stable sort: equal depths stay in the order of the Gaussians.
     order = dr.argsort(keys)
+    # A kernel of its own: where many loads depend on no arithmetic, they wait together.
+    rows = pack_rows(load_row(rows, width, order))
+    first_column, first_row, columns, count = dr.gather(t.Array4u, boxes, order)
+    boxes = interleave([first_column, first_row, columns, count])
+    dr.eval(rows, boxes, count)
     num_splats = dr.width(order)
     rank = dr.arange(t.UInt32, num_splats + 1)
-    exists = rank < dr.opaque(t.UInt32, num_splats)
-    counts = dr.gather(t.UInt32, boxes, dr.gather(t.UInt32, order, rank, exists) * 4 + 3, exists)
+    counts = dr.gather(t.UInt32, count, rank, rank < dr.opaque(t.UInt32, num_splats))
     first_entry = dr.prefix_sum(counts)
     num_entries = int(first_entry[num_splats])
 
-    touched = partial(_touched_micros, rows, GEOMETRY + len(features), grid)
-    tile, entries = _make_entries(first_entry, order, boxes, num_entries, grid, touched)
+    touched = partial(_touched_micros, rows, width, grid)
+    tile, entries = _make_entries(first_entry, boxes, num_entries, grid, touched)
     source = dr.argsort(tile)
 
     padded = -(-max(num_entries, 1) // WORD) * WORD
     position = dr.arange(t.UInt32, padded)
     active = position < dr.opaque(t.UInt32, num_entries)
     source = dr.gather(t.UInt32, source, position, active)
-    gaussians, tiles, masks, _ = dr.gather(t.Array4u, entries, source, active)
-    dr.eval(source, gaussians, tiles, masks)
+    ranks, tiles, masks, _ = dr.gather(t.Array4u, entries, source, active)
+    dr.eval(source, ranks, tiles, masks)
     words = transpose_masks(masks)
     tile_start = _lower_bounds(tiles, num_entries, grid.num_tiles)
     dr.eval(words, tile_start)
     return TileBins(
+        order=order,
         rows=rows,
         num_features=len(features),
-        order=order,
         first_entry=first_entry,
         source=source,
-        gaussians=gaussians,
+        ranks=ranks,
         tiles=tiles,
         masks=masks,
         words=words,
@@ -199,26 +204,24 @@ def _tile_boxes(splats: Splats2D, grid: TileGrid) -> Any:
 
 def _make_entries(
     first_entry: Any,
-    order: Any,
     boxes: Any,
     num_entries: int,
     grid: TileGrid,
     touched: Callable[[Any, Any, Any], Any],
 ) -> tuple[Any, Any]:
-    """Of each entry its tile; and four numbers: Gaussian, tile, mask of micro-tiles, 0.
+    """Of each entry its tile; and four numbers: rank, tile, mask of micro-tiles, 0.
 
-    touched: the mask of a Gaussian in a tile, given by column and row.
+    touched: the mask of a rank in a tile, given by column and row.
     """
-    t = types_of(type(order))
+    t = types_of(type(first_entry))
     # Rank of each entry: write each rank at the start of its run, then a running maximum.
-    rank = dr.arange(t.UInt32, dr.width(order))
+    rank = dr.arange(t.UInt32, dr.width(first_entry) - 1)
     start, end = dr.gather(t.UInt32, first_entry, rank), dr.gather(t.UInt32, first_entry, rank + 1)
     starts = dr.zeros(t.UInt32, max(num_entries, 1))
     dr.scatter(starts, rank, start, start < end)
     rank = dr.prefix_reduce(dr.ReduceOp.Max, starts, exclusive=False)
 
-    gaussian = dr.gather(t.UInt32, order, rank)
-    tile_x, tile_y, columns, _ = dr.gather(t.Array4u, boxes, gaussian)
+    tile_x, tile_y, columns, _ = dr.gather(t.Array4u, boxes, rank)
     local = dr.arange(t.UInt32, max(num_entries, 1)) - dr.gather(t.UInt32, first_entry, rank)
     # Exact while a splat covers fewer than 2^22 tiles; an integer division by a varying number
     # has no vector instruction.
@@ -226,14 +229,14 @@ def _make_entries(
     tile_x = tile_x + (local - row * columns)
     tile_y = tile_y + row
     tile = dr.fma(tile_y, dr.opaque(t.UInt32, grid.columns), tile_x)
-    mask = touched(gaussian, tile_x, tile_y)
-    entries = interleave([gaussian, tile, mask, dr.zeros(t.UInt32, dr.width(tile))])
+    mask = touched(rank, tile_x, tile_y)
+    entries = interleave([rank, tile, mask, dr.zeros(t.UInt32, dr.width(tile))])
     dr.eval(tile, entries)
     return tile, entries
 
 
 def _touched_micros(
-    rows: Any, width: int, grid: TileGrid, gaussian: Any, tile_x: Any, tile_y: Any
+    rows: Any, width: int, grid: TileGrid, rank: Any, tile_x: Any, tile_y: Any
 ) -> Any:
     """Bit m is set where the ellipse alpha >= cut reaches a pixel centre of micro-tile m.
 
@@ -244,7 +247,7 @@ def _touched_micros(
     and the best other coordinate is clamped to the rectangle.
     """
     t = types_of(type(rows))
-    mean_x, mean_y, p, r, s, log2_opacity = load_row(rows, width, gaussian)[:GEOMETRY]
+    mean_x, mean_y, p, r, s, log2_opacity = load_row(rows, width, rank)[:GEOMETRY]
     reach = log2_opacity - LOG2_ALPHA_CUT + dr.opaque(t.Float, grid.cull_margin)
     dx_per_dy = -r / p
     dy_per_dx = -(p * r) / dr.fma(r, r, s * s)

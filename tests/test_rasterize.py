@@ -500,8 +500,8 @@ def test_records_hold_geometry_and_features_of_each_entry(precision, count):
     features = np.random.default_rng(0).normal(size=(len(scene.depths), count))
     scene = replace(scene, features=single(features))
     bins, records, _ = scene.composite(precision)
-    packed = np.array(records.rows).reshape(len(bins.gaussians), -1)[: bins.num_entries]
-    gaussians = np.array(bins.gaussians)[: bins.num_entries]
+    packed = np.array(records.rows).reshape(len(bins.ranks), -1)[: bins.num_entries]
+    gaussians = np.array(bins.order)[np.array(bins.ranks)[: bins.num_entries]]
     expected = np.column_stack(
         [
             rows(precision.vectors(scene.means2d)),
