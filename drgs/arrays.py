@@ -13,6 +13,7 @@ from functools import cache
 from typing import Any
 
 import drjit as dr
+import numpy as np
 
 
 @dataclass(frozen=True)
@@ -59,6 +60,30 @@ def types_of(float_type: type) -> ArrayTypes:
 def is_float64(float_type: type) -> bool:
     """Whether ``float_type`` is a double precision array."""
     return dr.type_v(float_type) == dr.VarType.Float64
+
+
+def from_host(flat_type: type, values: Any) -> Any:
+    """A copy of numbers of the host, aligned as Dr.Jit's own memory is.
+
+    Dr.Jit wraps numpy's memory on the CPU, and loads from memory that is not aligned are another
+    kernel: whether one has to be compiled would depend on where numpy put the numbers.
+    """
+    values = np.asarray(values, dtype=_NUMPY_TYPES[dr.type_v(flat_type)]).ravel()
+    storage = np.empty(values.nbytes + _ALIGNMENT, np.uint8)
+    start = -storage.ctypes.data % _ALIGNMENT
+    aligned = storage[start : start + values.nbytes].view(values.dtype)
+    aligned[:] = values
+    return flat_type(aligned)
+
+
+_ALIGNMENT = 64
+"""Bytes: what the widest vectors ask for."""
+
+_NUMPY_TYPES = {
+    dr.VarType.Float32: np.float32,
+    dr.VarType.Float64: np.float64,
+    dr.VarType.UInt32: np.uint32,
+}
 
 
 def interleave(columns: list[Any]) -> Any:

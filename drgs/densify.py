@@ -21,7 +21,7 @@ import numpy as np
 from drjit.opt import Adam
 from scipy.special import expit
 
-from drgs.arrays import types_of
+from drgs.arrays import from_host, types_of
 from drgs.checks import UserError
 from drgs.config import DensifyConfig
 from drgs.optimizer import edit_rows, num_rows, replace_values, take_rows
@@ -147,7 +147,7 @@ def densify_and_prune(
             f"= {config.prune_scale} x {scene_extent:g}): do the cameras see the start points?"
         )
     if num_added > 0 or len(chosen.keep) < num_before:
-        keep = dr.uint32_array_t(type(statistics.views))(chosen.keep)
+        keep = from_host(dr.uint32_array_t(type(statistics.views)), chosen.keep)
         key = [seed, iteration]
         append = _new_rows(optimizer, chosen, config, key, prefix) if num_added > 0 else None
         edit_rows(optimizer, keep, append, prefix)
@@ -233,16 +233,16 @@ def _new_rows(
     log_shrink[num_clones:] = math.log(config.split_shrink)
 
     t = types_of(type(optimizer[prefix + "means"].array))
-    rows = take_rows(optimizer, t.UInt32(np.append(chosen.clone, samples_of)), prefix)
+    rows = take_rows(optimizer, from_host(t.UInt32, np.append(chosen.clone, samples_of)), prefix)
     mean, log_scale, quat = (
         dr.unravel(vector, rows[name].array)
         for vector, name in ((t.Array3f, "means"), (t.Array3f, "log_scales"), (t.Array4f, "quats"))
     )
-    normal = dr.unravel(t.Array3f, t.Float(normals.ravel()))
+    normal = dr.unravel(t.Array3f, from_host(t.Float, normals))
     mean += quat_to_rotation(quat) @ (dr.exp(log_scale) * normal)
     shape = normals.shape
     rows["means"] = t.TensorXf(dr.ravel(mean), shape)
-    rows["log_scales"] = rows["log_scales"] - t.TensorXf(t.Float(log_shrink.ravel()), shape)
+    rows["log_scales"] = rows["log_scales"] - t.TensorXf(from_host(t.Float, log_shrink), shape)
     return rows
 
 

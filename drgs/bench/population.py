@@ -28,6 +28,7 @@ import numpy as np
 from scipy.special import expit
 
 from drgs import capture, densify, fit, optimizer
+from drgs.arrays import from_host
 from drgs.bench.output import markdown_table, new_figure, write_csv, write_figure
 from drgs.config import DensifyConfig, FitConfig, load_config
 from drgs.data import load_dataset
@@ -92,7 +93,7 @@ def _prune_added_rows_at_once() -> Iterator[None]:
         keep = np.flatnonzero((opacities >= config.prune_opacity) & (scales <= limit))
         if len(keep) == report.num_gaussians:
             return report
-        rows = dr.uint32_array_t(type(statistics.views))(keep.astype(np.uint32))
+        rows = from_host(dr.uint32_array_t(type(statistics.views)), keep)
         optimizer.edit_rows(opt, rows, None, prefix)
         pruned = report.pruned + report.num_gaussians - len(keep)
         return replace(report, pruned=pruned, num_gaussians=len(keep))
