@@ -130,7 +130,7 @@ def bin_splats(splats: Splats2D, grid: TileGrid, features: Sequence[Any] = ()) -
 
     touched = partial(_touched_micros, rows, width, grid)
     tile, entries = _make_entries(first_entry, boxes, num_entries, grid, touched)
-    source = dr.argsort(tile)
+    source = _stable_order(tile, grid.num_tiles)
 
     padded = -(-max(num_entries, 1) // WORD) * WORD
     position = dr.arange(t.UInt32, padded)
@@ -233,6 +233,15 @@ def _make_entries(
     entries = interleave([rank, tile, mask, dr.zeros(t.UInt32, dr.width(tile))])
     dr.eval(tile, entries)
     return tile, entries
+
+
+def _stable_order(keys: Any, bound: int) -> Any:
+    """The stable order of ``keys``, all below ``bound``: one pass with a bucket for each key.
+
+    ``dr.argsort`` does not know the bound and needs three passes for 32 bits.
+    """
+    buckets = 1 << (bound - 1).bit_length()
+    return dr.detail.block_mkperm(keys, dr.width(keys), max(buckets, 2))
 
 
 def _touched_micros(
