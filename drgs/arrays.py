@@ -117,11 +117,18 @@ def pack_rows(columns: Sequence[Any]) -> Any:
     return interleave([*columns, *[padding] * (-len(columns) % PACKET)])
 
 
-def load_row(rows: Any, width: int, row: Any, active: Any = True) -> list[Any]:
-    """The ``width`` numbers of one row a lane of what :func:`pack_rows` made; 0 if not active."""
-    packet, packets = types_of(type(rows)).Array4f, -(-width // PACKET)
-    loaded = [dr.gather(packet, rows, row * packets + k, active) for k in range(packets)]
-    return [number for packet in loaded for number in packet][:width]
+def load_row(
+    rows: Any, width: int, row: Any, active: Any = True, *, start: int = 0, end: int | None = None
+) -> list[Any]:
+    """Numbers ``start`` to ``end`` (None: all) of a row a lane of what :func:`pack_rows` made.
+
+    width: of the rows; start: where a packet begins. 0 if not active.
+    """
+    end = width if end is None else end
+    packet, stride = types_of(type(rows)).Array4f, -(-width // PACKET)
+    packets = range(start // PACKET, -(-end // PACKET))
+    loaded = [dr.gather(packet, rows, row * stride + k, active) for k in packets]
+    return [number for packet in loaded for number in packet][: end - start]
 
 
 def _dynamic_vector(columns: list[Any]) -> Any:

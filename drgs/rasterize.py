@@ -43,7 +43,9 @@ same to the last bit in every run.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import drjit as dr
@@ -350,11 +352,11 @@ class Records:
     count: int  # C, features
 
     @staticmethod
-    def of(bins: TileBins, rows: Any) -> Records:
-        """Copies, evaluated, of one row per rank: ``bins.rows``, or others of their length."""
-        copies = pack_rows(load_row(rows, GEOMETRY + bins.num_features, bins.ranks))
-        dr.eval(copies)
-        return Records(rows=copies, count=bins.num_features)
+    def of(bins: TileBins, numbers: Callable[[Any], list[Any]]) -> Records:
+        """Copies, evaluated, of each rank's ``numbers``, such as those of ``bins.splats``."""
+        rows = pack_rows(numbers(bins.ranks))
+        dr.eval(rows)
+        return Records(rows=rows, count=bins.num_features)
 
     def load(self, entry: Any, active: Any) -> tuple[list[Any], list[Any]]:
         """Geometry (6) and features (C) of a sorted entry."""
@@ -370,7 +372,7 @@ class Records:
 def composite(bins: TileBins, records: Records) -> Layers:
     """Composite the features of all splats.
 
-    bins: from ``bin_splats``; records: ``Records.of(bins, bins.rows)``.
+    bins: from ``bin_splats``; records: ``Records.of(bins, bins.splats)``.
     """
     t = types_of(type(bins.rows))
     count = records.count
@@ -653,8 +655,7 @@ def _sum_slots(
         cond=lambda entry, totals: entry < end,
         body=body,
     )
-    row = load_row(bins.rows, GEOMETRY + count, rank)
-    _, _, p, r, s, log2_opacity = row[:GEOMETRY]
+    _, _, p, r, s, log2_opacity = bins.splats(rank)[:GEOMETRY]
     v, v_u, v_u_dx, v_u_dy, v_dy, v_dy_dy = totals[:MOMENTS]
     # log2_alpha = log2_opacity - u^2 - (s dy)^2, u = p dx + r dy, dx = x - mean: hence
     # d ln(alpha) / d(anything) = ln(2) * d log2_alpha / d(anything).
@@ -773,7 +774,7 @@ def _pack_tangents(bins: TileBins, tangents: SplatGradients) -> Records:
     """The records' tangents: of mean, p, r, s (unscaled), ln(opacity), and of the features."""
     t = types_of(type(bins.rows))
     rank = dr.arange(t.UInt32, dr.width(bins.order))
-    log2_opacity = load_row(bins.rows, GEOMETRY + bins.num_features, rank)[GEOMETRY - 1]
+    log2_opacity = bins.splats(rank)[GEOMETRY - 1]
     numbers = [
         dr.gather(t.Float, column, bins.order)
         for column in (
@@ -783,7 +784,7 @@ def _pack_tangents(bins: TileBins, tangents: SplatGradients) -> Records:
     numbers[GEOMETRY - 1] *= dr.exp2(-log2_opacity)
     rows = pack_rows(numbers)
     dr.eval(rows)
-    return Records.of(bins, rows)
+    return Records.of(bins, partial(load_row, rows, len(numbers)))
 
 
 def _footprint_tangent(

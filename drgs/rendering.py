@@ -93,7 +93,7 @@ def render(gaussians: Gaussians, camera: Camera, pipeline: Pipeline) -> Frame:
     splats = pipeline.project(load_rows(gaussians, pipeline.sh_degree), camera)
     columns = pipeline.feature_columns(splats)
     bins = bin_splats(splats, TileGrid(camera.width, camera.height), columns)
-    records = Records.of(bins, bins.rows)
+    records = Records.of(bins, bins.splats)
     layers = composite(bins, records)
     return Frame(pipeline=pipeline, camera=camera, bins=bins, records=records, layers=layers)
 

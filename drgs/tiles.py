@@ -17,9 +17,8 @@ up its neighbours, and the only value that the host reads is the number of entri
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 import drjit as dr
@@ -33,6 +32,9 @@ from drgs.constants import (
     WHITENING_SCALE,
 )
 from drgs.projection import Splats2D
+
+BOX = 4
+"""Numbers of a splat's box of tiles: first column, first row, columns, number of tiles."""
 
 MICRO = 4
 """Pixels on a micro-tile's side. A micro-tile is one SIMD lane of the compositing kernels."""
@@ -91,7 +93,7 @@ class TileBins:
     """
 
     order: Any  # UInt32 (N,): rank -> index of the Gaussian
-    rows: Any  # Float (N * packets * 4,): by rank: geometry, features, padding
+    rows: Any  # Float (N * packets * 4,): by rank: box of tiles, geometry, features, padding
     num_features: int
     first_entry: Any  # UInt32 (N + 1,): rank -> first of its run of unsorted entries
     source: Any  # UInt32 (M padded,): sorted -> unsorted
@@ -103,6 +105,10 @@ class TileBins:
     num_entries: int  # M
     grid: TileGrid
 
+    def splats(self, rank: Any) -> list[Any]:
+        """Geometry (6) and features of a splat."""
+        return load_row(self.rows, BOX + GEOMETRY + self.num_features, rank, start=BOX)
+
 
 def bin_splats(splats: Splats2D, grid: TileGrid, features: Sequence[Any] = ()) -> TileBins:
     """Distribute the visible ``splats`` over the tiles of ``grid``, front to back.
@@ -113,23 +119,21 @@ def bin_splats(splats: Splats2D, grid: TileGrid, features: Sequence[Any] = ()) -
     Not differentiated: integer work. The host reads one value, the number of entries.
     """
     t = types_of(type(splats.depths))
-    width = GEOMETRY + len(features)
-    rows, boxes, keys = _store_rows(splats, grid, features)
+    width = BOX + GEOMETRY + len(features)
+    rows, keys = _store_rows(splats, grid, features)
     # A stable sort: equal depths stay in the order of the Gaussians.
     order = dr.argsort(keys)
-    # A kernel of its own: where many loads depend on no arithmetic, they wait together.
-    rows = pack_rows(load_row(rows, width, order))
-    first_column, first_row, columns, count = dr.gather(t.Array4u, boxes, order)
-    boxes = interleave([first_column, first_row, columns, count])
-    dr.eval(rows, boxes, count)
+    # A kernel of its own: loads that wait for memory, and for no arithmetic, wait together.
+    numbers = load_row(rows, width, order)
+    rows, counts = pack_rows(numbers), t.UInt32(numbers[BOX - 1])
+    dr.eval(rows, counts)
     num_splats = dr.width(order)
     rank = dr.arange(t.UInt32, num_splats + 1)
-    counts = dr.gather(t.UInt32, count, rank, rank < dr.opaque(t.UInt32, num_splats))
+    counts = dr.gather(t.UInt32, counts, rank, rank < dr.opaque(t.UInt32, num_splats))
     first_entry = dr.prefix_sum(counts)
     num_entries = int(first_entry[num_splats])
 
-    touched = partial(_touched_micros, rows, width, grid)
-    tile, entries = _make_entries(first_entry, boxes, num_entries, grid, touched)
+    tile, entries = _make_entries(first_entry, rows, width, num_entries, grid)
     source = _stable_order(tile, grid.num_tiles)
 
     padded = -(-max(num_entries, 1) // WORD) * WORD
@@ -157,13 +161,12 @@ def bin_splats(splats: Splats2D, grid: TileGrid, features: Sequence[Any] = ()) -
     )
 
 
-def _store_rows(splats: Splats2D, grid: TileGrid, features: Sequence[Any]) -> tuple[Any, Any, Any]:
-    """By Gaussian, evaluated at once: rows of numbers, boxes of tiles, keys to sort by."""
-    rows = pack_rows([*_geometry_columns(splats), *features])
-    boxes = _tile_boxes(splats, grid)
+def _store_rows(splats: Splats2D, grid: TileGrid, features: Sequence[Any]) -> tuple[Any, Any]:
+    """By Gaussian, evaluated at once: rows of all numbers, and keys to sort by."""
+    rows = pack_rows([*_tile_box(splats, grid), *_geometry_columns(splats), *features])
     keys = dr.select(splats.visible, splats.depths, dr.inf)
-    dr.eval(rows, boxes, keys)
-    return rows, boxes, keys
+    dr.eval(rows, keys)
+    return rows, keys
 
 
 def _geometry_columns(splats: Splats2D) -> list[Any]:
@@ -176,8 +179,8 @@ def _geometry_columns(splats: Splats2D) -> list[Any]:
     return [*splats.means2d, p, r, s, dr.log2(splats.opacities)]
 
 
-def _tile_boxes(splats: Splats2D, grid: TileGrid) -> Any:
-    """Each splat's box of tiles: first column, first row, columns, number of tiles; flat."""
+def _tile_box(splats: Splats2D, grid: TileGrid) -> list[Any]:
+    """First column and row, columns, and number of tiles: whole numbers, exact up to 2^24."""
     t = types_of(type(splats.depths))
     # alpha >= cut inside |U d|^2 <= 2 ln(opacity / cut); its bounding box follows from the
     # variances (the opacity-aware radius, instead of 3 standard deviations).
@@ -198,22 +201,14 @@ def _tile_boxes(splats: Splats2D, grid: TileGrid) -> Any:
     last_tile = Pixel(dr.select(visible, last, 0)) // TILE
     extent = last_tile - first_tile + 1
     count = dr.select(visible, extent.x * extent.y, 0)
-
-    return interleave([first_tile.x, first_tile.y, extent.x, count])
+    return [t.Float(number) for number in (*first_tile, extent.x, count)]
 
 
 def _make_entries(
-    first_entry: Any,
-    boxes: Any,
-    num_entries: int,
-    grid: TileGrid,
-    touched: Callable[[Any, Any, Any], Any],
+    first_entry: Any, rows: Any, width: int, num_entries: int, grid: TileGrid
 ) -> tuple[Any, Any]:
-    """Of each entry its tile; and four numbers: rank, tile, mask of micro-tiles, 0.
-
-    touched: the mask of a rank in a tile, given by column and row.
-    """
-    t = types_of(type(first_entry))
+    """Of each entry its tile; and four numbers: rank, tile, mask of micro-tiles, 0."""
+    t = types_of(type(rows))
     # Rank of each entry: write each rank at the start of its run, then a running maximum.
     rank = dr.arange(t.UInt32, dr.width(first_entry) - 1)
     start, end = dr.gather(t.UInt32, first_entry, rank), dr.gather(t.UInt32, first_entry, rank + 1)
@@ -221,7 +216,8 @@ def _make_entries(
     dr.scatter(starts, rank, start, start < end)
     rank = dr.prefix_reduce(dr.ReduceOp.Max, starts, exclusive=False)
 
-    tile_x, tile_y, columns, _ = dr.gather(t.Array4u, boxes, rank)
+    numbers = load_row(rows, width, rank, end=BOX + GEOMETRY)
+    tile_x, tile_y, columns = (t.UInt32(number) for number in numbers[: BOX - 1])
     local = dr.arange(t.UInt32, max(num_entries, 1)) - dr.gather(t.UInt32, first_entry, rank)
     # Exact while a splat covers fewer than 2^22 tiles; an integer division by a varying number
     # has no vector instruction.
@@ -229,7 +225,7 @@ def _make_entries(
     tile_x = tile_x + (local - row * columns)
     tile_y = tile_y + row
     tile = dr.fma(tile_y, dr.opaque(t.UInt32, grid.columns), tile_x)
-    mask = touched(rank, tile_x, tile_y)
+    mask = _touched_micros(numbers[BOX:], tile_x, tile_y, grid)
     entries = interleave([rank, tile, mask, dr.zeros(t.UInt32, dr.width(tile))])
     dr.eval(tile, entries)
     return tile, entries
@@ -244,19 +240,15 @@ def _stable_order(keys: Any, bound: int) -> Any:
     return dr.detail.block_mkperm(keys, dr.width(keys), max(buckets, 2))
 
 
-def _touched_micros(
-    rows: Any, width: int, grid: TileGrid, rank: Any, tile_x: Any, tile_y: Any
-) -> Any:
+def _touched_micros(geometry: list[Any], tile_x: Any, tile_y: Any, grid: TileGrid) -> Any:
     """Bit m is set where the ellipse alpha >= cut reaches a pixel centre of micro-tile m.
-
-    width: numbers in a row of ``rows``.
 
     |U d|^2 is convex, so its minimum over a rectangle that does not contain the mean lies on
     one of the (at most two) sides that face the mean: for such a side, one coordinate is given
     and the best other coordinate is clamped to the rectangle.
     """
-    t = types_of(type(rows))
-    mean_x, mean_y, p, r, s, log2_opacity = load_row(rows, width, rank)[:GEOMETRY]
+    mean_x, mean_y, p, r, s, log2_opacity = geometry
+    t = types_of(type(mean_x))
     reach = log2_opacity - LOG2_ALPHA_CUT + dr.opaque(t.Float, grid.cull_margin)
     dx_per_dy = -r / p
     dy_per_dx = -(p * r) / dr.fma(r, r, s * s)

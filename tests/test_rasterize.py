@@ -146,7 +146,7 @@ class FlatScene:
     def composite(self, precision):
         columns = [precision.array(column) for column in self.features.T]
         bins = bin_splats(self.splats(precision), TileGrid(self.width, self.height), columns)
-        records = rasterize.Records.of(bins, bins.rows)
+        records = rasterize.Records.of(bins, bins.splats)
         return bins, records, composite(bins, records)
 
     def as_images(self, planes) -> dict[str, np.ndarray]:

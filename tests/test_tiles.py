@@ -130,7 +130,8 @@ def test_masks_equal_a_brute_force_ellipse_test(precision, case):
     binned = bin_case(case, precision)
     grid = binned.bins.grid
     table = binned.mask_table()
-    geometry = np.array(binned.bins.rows).astype(float).reshape(-1, 8)[:, : tiles.GEOMETRY]
+    rank = dr.arange(dr.llvm.ad.UInt32, len(binned.order))
+    geometry = np.stack([np.array(v, float) for v in binned.bins.splats(rank)], axis=1)
     undecided = total = 0
     tile = np.arange(grid.num_tiles)[:, None]
     micro = np.arange(MICROS)[None, :]
