@@ -140,6 +140,23 @@ def _make_lanes(Float: type, grid: TileGrid) -> _Lanes:
     )
 
 
+def _similar_together(lanes: _Lanes, work: Any) -> _Lanes:
+    """The same lanes, in each block of some tiles ordered by how many splats they visit.
+
+    Lanes that share a vector wait for the last of them. In larger blocks the lanes of a tile,
+    which read the same records, would be too far apart.
+    """
+    level = work // 4
+    level = dr.select(level < _LEVELS, level, _LEVELS - 1)
+    dr.eval(level)
+    order = dr.detail.block_mkperm(level, min(_BLOCK, dr.width(level)), _LEVELS)
+    return dr.gather(_Lanes, lanes, order)
+
+
+_BLOCK = 8 * MICROS
+_LEVELS = 256
+
+
 def _coprime_stride(count: int) -> int:
     stride = max(1, round(count * (math.sqrt(5) - 1) / 2))
     while math.gcd(stride, count) != 1:
@@ -467,6 +484,17 @@ class _Slots:
         """First slot of a group of entries in a micro-tile, and the word of its composited bits."""
         return dr.gather(types_of(type(group)).Array2u, self.pairs, group * MICROS + micro, active)
 
+    def end(self, entries: _Entries) -> Any:
+        """Where each lane's slots end."""
+        first, word = self.at(entries.last, entries.micro)
+        return first + dr.popcnt(word & entries.tail)
+
+    def number(self, entries: _Entries) -> Any:
+        """How many slots each lane has."""
+        first, word = self.at(entries.first, entries.micro)
+        begin = first + dr.popcnt(word & ~entries.head)
+        return dr.select(entries.head == 0, 0, self.end(entries) - begin)
+
 
 def _assign_slots(bins: TileBins, layers: Layers) -> _Slots:
     """Number the slots. The host reads one value, how many there are."""
@@ -516,13 +544,13 @@ def composite_adjoint(
     """
     t = types_of(type(bins.rows))
     count = layers.count
-    lanes = _make_lanes(t.Float, bins.grid)
     slots = _assign_slots(bins, layers)
+    lanes = _make_lanes(t.Float, bins.grid)
+    stop = dr.gather(t.UInt32, layers.stop, lanes.micro_tile)
+    lanes = _similar_together(lanes, slots.number(_Entries(bins, lanes, stop)))
     stop = dr.gather(t.UInt32, layers.stop, lanes.micro_tile)
     entries = _EntriesBackToFront(bins, lanes, stop)
     exp2 = _exp2_function(t.Float)
-    first_slot, word = slots.at(entries.last, lanes.micro)
-    end_slot = first_slot + dr.popcnt(word & entries.tail)
 
     g = [_load_pixels(plane, lanes, bins.grid) for plane in d_features]
     ends = _load_row(layers.ends, lanes.micro_tile, 1)
@@ -548,7 +576,7 @@ def composite_adjoint(
     loop = dr.while_loop(
         state=(
             entries.begin(),
-            end_slot,
+            slots.end(entries),
             transmittance,
             _load_pixels(d_transmittance, lanes, bins.grid),
         ),
@@ -689,10 +717,13 @@ def _sum_entries(bins: TileBins, slots: _Slots, partials: Any, width: int) -> An
     group, below = entry // WORD, (t.UInt32(1) << (entry % WORD)) - 1
 
     def body(micros: Any, totals: list) -> tuple:
-        first, word = slots.at(group, dr.tzcnt(micros))
-        slot = first + dr.popcnt(word & below)
-        numbers = load_row(partials, width, slot)
-        return micros & (micros - 1), [a + b for a, b in zip(totals, numbers, strict=True)]
+        for _ in range(2):  # two at a time wait for memory together
+            active = micros != 0
+            first, word = slots.at(group, dr.tzcnt(micros), active)
+            numbers = load_row(partials, width, first + dr.popcnt(word & below), active)
+            totals = [a + b for a, b in zip(totals, numbers, strict=True)]
+            micros = micros & (micros - 1)
+        return micros, totals
 
     zero = dr.zeros(t.Float, dr.width(entry))
     _, totals = dr.while_loop(

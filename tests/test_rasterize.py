@@ -532,6 +532,21 @@ def test_slots_are_a_numbering_of_the_composited_pairs(precision):
                 first, word = pairs[entry // 32, micro]
                 found[micro, entry] = first + bin(word & ((1 << entry % 32) - 1)).count("1")
     assert list(found.values()) == list(range(slots.count)) and slots.count > 0
+
+    lanes = rasterize._make_lanes(precision.Float, bins.grid)
+    lane_stop = dr.gather(dr.llvm.ad.UInt32, layers.stop, lanes.micro_tile)
+    number = np.array(slots.number(rasterize._Entries(bins, lanes, lane_stop)))
+    begins = np.searchsorted(tiles[: bins.num_entries], np.arange(bins.grid.num_tiles))
+    expected = [
+        sum(1 for m, entry in found if m == micro and begins[tile] <= entry < stop[tile, micro])
+        for tile, micro in zip(np.array(lanes.tile), np.array(lanes.micro), strict=True)
+    ]
+    np.testing.assert_array_equal(number, expected)
+    assert len(set(expected)) > 3
+    similar = rasterize._similar_together(
+        lanes, slots.number(rasterize._Entries(bins, lanes, lane_stop))
+    )
+    np.testing.assert_array_equal(np.sort(similar.micro_tile), np.sort(lanes.micro_tile))
     assert slots.count < sum(bin(mask).count("1") for mask in masks), "some pairs are behind a stop"
 
 

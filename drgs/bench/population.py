@@ -40,6 +40,9 @@ SCENES = Path(__file__).parents[2] / "scenes"
 CONFIG = SCENES / "lego_paper.yml"
 GENERATOR = SCENES / "brick_crane.py"
 
+ITERATIONS = 30_000
+"""Of the recipe."""
+
 SMALL, MEDIUM, LARGE = 200, 400, 800
 """px, width and height of the pictures."""
 
@@ -105,12 +108,17 @@ def _prune_added_rows_at_once() -> Iterator[None]:
 
 @contextmanager
 def _reset_until_the_end() -> Iterator[None]:
-    """Opacities go on being lowered when the population no longer changes."""
+    """Opacities go on being lowered when the population no longer changes.
+
+    But not in the last iteration, which would leave nothing to see.
+    """
 
     def should_reset(config: DensifyConfig, iteration: int, white_background: bool) -> bool:
-        extra = white_background and iteration == config.white_background_reset
-        return iteration % config.reset_every == 0 or extra
+        if config.stop <= iteration < ITERATIONS:
+            return iteration % config.reset_every == 0
+        return original(config, iteration, white_background)
 
+    original = densify.should_reset
     with patch.object(densify, "should_reset", should_reset):
         yield
 
