@@ -153,7 +153,7 @@ def _similar_together(lanes: _Lanes, work: Any) -> _Lanes:
     return dr.gather(_Lanes, lanes, order)
 
 
-_BLOCK = 8 * MICROS
+_BLOCK = 32 * MICROS
 _LEVELS = 256
 
 
@@ -193,6 +193,18 @@ class _Entries:
     def begin(self) -> _Cursor:
         """The cursor at the first entry."""
         return self._open(self.first, True)
+
+    def lengths(self) -> Any:
+        """How many entries each lane has."""
+        _, number = dr.while_loop(
+            state=(type(self.first)(self.first), dr.zeros(type(self.first), dr.width(self.first))),
+            cond=lambda group, number: group <= self.last,
+            body=lambda group, number: (
+                group + 1,
+                number + dr.popcnt(self._open(group, True).word),
+            ),
+        )
+        return number
 
     def pending(self, cursor: _Cursor) -> Any:
         """Whether entries may be left."""
@@ -395,7 +407,8 @@ def composite(bins: TileBins, records: Records) -> Layers:
     count = records.count
     lanes = _make_lanes(t.Float, bins.grid)
     end = dr.gather(t.UInt32, bins.tile_start, lanes.tile + 1)
-    entries = _Entries(bins, lanes, end)
+    lanes = _similar_together(lanes, _Entries(bins, lanes, end).lengths())
+    entries = _Entries(bins, lanes, dr.gather(t.UInt32, bins.tile_start, lanes.tile + 1))
     exp2 = _exp2_function(t.Float)
 
     def body(cursor: _Cursor, T: list, C: list, ends: list, unfinished: Any) -> tuple:
