@@ -194,18 +194,6 @@ class _Entries:
         """The cursor at the first entry."""
         return self._open(self.first, True)
 
-    def lengths(self) -> Any:
-        """How many entries each lane has."""
-        _, number = dr.while_loop(
-            state=(type(self.first)(self.first), dr.zeros(type(self.first), dr.width(self.first))),
-            cond=lambda group, number: group <= self.last,
-            body=lambda group, number: (
-                group + 1,
-                number + dr.popcnt(self._open(group, True).word),
-            ),
-        )
-        return number
-
     def pending(self, cursor: _Cursor) -> Any:
         """Whether entries may be left."""
         return (cursor.word != 0) | (cursor.group < self.last)
@@ -256,6 +244,21 @@ class _EntriesBackToFront(_Entries):
         bit = (type(cursor.word)(1) << (WORD - 1)) >> dr.lzcnt(cursor.word)
         word = cursor.word & ~bit
         return self._go_on(cursor, word, cursor.group - 1, cursor.group > self.first)
+
+
+def _count_entries(entries: _Entries) -> Any:
+    """How many entries each lane has."""
+
+    def body(group: Any, count: Any) -> tuple[Any, Any]:
+        return group + 1, count + dr.popcnt(entries._open(group, True).word)
+
+    UInt32 = type(entries.first)
+    _, count = dr.while_loop(
+        state=(UInt32(entries.first), dr.zeros(UInt32, dr.width(entries.first))),
+        cond=lambda group, count: group <= entries.last,
+        body=body,
+    )
+    return count
 
 
 def _highest_bit(word: Any) -> Any:
@@ -407,7 +410,7 @@ def composite(bins: TileBins, records: Records) -> Layers:
     count = records.count
     lanes = _make_lanes(t.Float, bins.grid)
     end = dr.gather(t.UInt32, bins.tile_start, lanes.tile + 1)
-    lanes = _similar_together(lanes, _Entries(bins, lanes, end).lengths())
+    lanes = _similar_together(lanes, _count_entries(_Entries(bins, lanes, end)))
     entries = _Entries(bins, lanes, dr.gather(t.UInt32, bins.tile_start, lanes.tile + 1))
     exp2 = _exp2_function(t.Float)
 
