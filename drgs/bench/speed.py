@@ -302,21 +302,23 @@ def plot(timings: list[Timing], reports: list[IterationReport]) -> Any:
     left, right = figure.subplots(1, 2)
     scenes = list(dict.fromkeys(timing.scene for timing in timings))
     names = list(dict.fromkeys(timing.renderer for timing in timings))
+    labels = [scene.replace(", ", "\n") for scene in scenes]
     for k, name in enumerate(names):
         values = [t.forward_backward for t in timings if t.renderer == name]
-        left.barh(
-            np.arange(len(values)) + 0.8 * k / len(names), values, 0.8 / len(names), label=name
-        )
-    left.set_yticks(np.arange(len(scenes)) + 0.3, scenes)
-    left.set(xscale="log", xlabel="s", title="forward + backward")
-    left.legend(fontsize=8)
+        places = np.arange(len(values)) + 0.8 * k / len(names)
+        bars = left.barh(places, values, 0.8 / len(names), label=name)
+        left.bar_label(bars, [_milliseconds(value) for value in values], padding=3, fontsize=7)
+    fastest, slowest = (f(t.forward_backward for t in timings) for f in (min, max))
+    left.set_yticks(np.arange(len(scenes)) + 0.3, labels)
+    left.set(xscale="log", xlim=(fastest / 3, slowest * 5), xlabel="s", title="forward + backward")
+    left.legend(fontsize=8, loc="upper center", bbox_to_anchor=(0.5, -0.15), ncols=2)
     bottoms = np.zeros(len(reports))
     for stage in STAGES:
         values = np.array([report.stage_ms[stage] for report in reports])
-        right.bar(scenes, values, bottom=bottoms, label=stage)
+        right.bar(labels, values, bottom=bottoms, label=stage)
         bottoms += values
     rest = np.array([max(report.wall_ms - report.kernel_ms, 0) for report in reports])
-    right.bar(scenes, rest, bottom=bottoms, label="rest of wall time", color="0.8")
+    right.bar(labels, rest, bottom=bottoms, label="rest of wall time", color="0.8")
     right.set(ylabel="ms", title="a training iteration")
-    right.legend(fontsize=8)
+    right.legend(fontsize=8, loc="upper left", bbox_to_anchor=(1.02, 1))
     return figure
