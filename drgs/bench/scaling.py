@@ -191,6 +191,19 @@ def _table(results: list[Result]) -> str:
     return markdown_table(header, rows)
 
 
+def _short(number: int) -> str:
+    for factor, suffix in ((1_000_000, "M"), (1000, "k")):
+        if number >= factor:
+            return f"{number / factor:.3g}{suffix}"
+    return str(number)
+
+
+def _ticks() -> Any:
+    from matplotlib.ticker import LogLocator
+
+    return LogLocator(subs=(1, 2, 5))
+
+
 def plot(results: dict[str, list[Result]]) -> Any:
     """Time and memory of each sweep, with the fitted exponents."""
     figure = new_figure(11, 5.5)
@@ -206,5 +219,10 @@ def plot(results: dict[str, list[Result]]) -> Any:
                 panel.set_title(f"{name}: x^{exponent(found, what):.2f}", fontsize=8)
             panel.set_xlabel(name if name in ("pixels", "threads") else "Gaussians")
             panel.set_ylabel(unit)
+            panel.set_xticks(x, [_short(value) for value in x], fontsize=7)
+            panel.tick_params(axis="y", which="both", labelsize=7)
+            panel.minorticks_off()
+            panel.yaxis.set_major_locator(_ticks())
+            panel.yaxis.set_major_formatter("{x:g}")
             panel.grid(alpha=0.3)
     return figure
