@@ -28,11 +28,12 @@ T_i (c_i . g) - S_i / (1 - a_i), cancel: they carry the error of the whole sum t
 Nothing is stored per pixel pair, and all decisions of the forward pass are taken again exactly.
 
 **Mapping to the machine.** One SIMD lane is one micro-tile of 4x4 pixels, its pixels unrolled:
-the load of a splat's record is paid once for 16 pixels. A packet of 16 lanes is one tile.
+the load of a splat's record is paid once for 16 pixels. Lanes that share a vector wait for the
+last of them, so that lanes with similarly many splats are put together.
 
-**Memory.** A lane's arithmetic takes less time than a read or a write that no cache foresees, so
-that lanes walk through memory: splats are copied into the order of the entries, and what a lane
-of the adjoint writes is contiguous.
+**Memory.** A read or a write that no cache foresees takes as long as a lane's arithmetic. Lanes
+therefore walk through memory in order: splats are copied into the order of the entries, and what
+a lane of the adjoint writes is contiguous.
 
 **No atomics.** In the adjoint, a lane sums each splat's partial derivatives over its 16 pixels
 and writes them into a slot that belongs to this (splat, micro-tile) alone. One lane per entry
@@ -141,11 +142,7 @@ def _make_lanes(Float: type, grid: TileGrid) -> _Lanes:
 
 
 def _similar_together(lanes: _Lanes, work: Any) -> _Lanes:
-    """The same lanes, in each block of some tiles ordered by how many splats they visit.
-
-    Lanes that share a vector wait for the last of them. In larger blocks the lanes of a tile,
-    which read the same records, would be too far apart.
-    """
+    """The same lanes, in each block ordered by how many splats they visit, roughly."""
     level = work // 4
     level = dr.select(level < _LEVELS, level, _LEVELS - 1)
     dr.eval(level)
@@ -154,6 +151,9 @@ def _similar_together(lanes: _Lanes, work: Any) -> _Lanes:
 
 
 _BLOCK = 32 * MICROS
+"""Lanes that are ordered together. In larger blocks the lanes of a tile, which read the same
+records, are too far apart; in smaller ones they are less alike."""
+
 _LEVELS = 256
 
 
