@@ -11,6 +11,7 @@ from typing import Any
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from drgs import rendering
 from drgs.arrays import interleave
@@ -152,6 +153,7 @@ class SplatsIntegrator(mi.CppADIntegrator):
 
         self.last: LastBackward | None = None
         self._rendered: _Rendered | None = None
+        self._film_maps: dict[str, np.ndarray] = {}  # by description of the film
         self._warned = False
 
     # ------------------------------------------------------------------------------------------
@@ -236,7 +238,9 @@ class SplatsIntegrator(mi.CppADIntegrator):
         with dr.suspend_grad():
             self._warn_about_sampling(sensor, spp)
             frame = self._frame(sensor)
-            image = self._develop(sensor.film(), frame.planes(), self._detached_background())
+            film = sensor.film()
+            channels = self._channels(film, frame.planes(), self._detached_background())
+            image = _develop(film, channels)
             if evaluate:
                 dr.eval(image)
         return image if develop else mi.TensorXf()
@@ -261,17 +265,18 @@ class SplatsIntegrator(mi.CppADIntegrator):
             frame = self._frame(sensor)
             planes, background = frame.planes(), self._detached_background()
             dr.eval(planes)
-            # Film, colour conversion and background are a few operations per pixel, traced
-            # again and differentiated by Dr.Jit.
+            d_channels = self._film_adjoint(sensor.film(), grad_in)
+            # Colour conversion and background are a few operations per pixel, traced again and
+            # differentiated by Dr.Jit.
             with dr.resume_grad():
                 dr.enable_grad(planes, background)
-                image = self._develop(sensor.film(), planes, background)
-                dr.set_grad(image, grad_in)
-                dr.enqueue(dr.ADMode.Backward, image)
+                channels = self._channels(sensor.film(), planes, background)
+                for channel, derivative in zip(channels, d_channels, strict=True):
+                    dr.accum_grad(channel, derivative)
+                dr.enqueue(dr.ADMode.Backward, channels)
                 dr.traverse(dr.ADMode.Backward)
                 d_transmittance, *d_features = dr.grad(planes)
                 d_background = dr.grad(background)
-            sensor.film().clear()  # it holds the attached block
             dr.eval(d_transmittance, d_features, d_background)
             gradients = rendering.render_adjoint(self.gaussians, frame, d_features, d_transmittance)
             self.last = LastBackward(
@@ -309,7 +314,8 @@ class SplatsIntegrator(mi.CppADIntegrator):
                 dr.enable_grad(planes, background)
                 dr.set_grad(planes, d_planes)
                 dr.set_grad(background, d_background)
-                image = self._develop(sensor.film(), planes, background)
+                film = sensor.film()
+                image = _develop(film, self._channels(film, planes, background))
                 dr.forward_to(image)
                 d_image = dr.grad(image)
             sensor.film().clear()  # it holds the attached block
@@ -341,27 +347,41 @@ class SplatsIntegrator(mi.CppADIntegrator):
         dr.make_opaque(background)
         return background
 
-    def _develop(self, film: mi.Film, planes: list[mi.Float], background: mi.Color3f) -> Any:
-        """Put the planes into ``film`` as one block of the whole image, and develop it.
-
-        A film reconstructs an image from blocks without filtering them again, so the picture is
-        exact whatever the film's filter, and differentiable.
-        """
+    def _channels(
+        self, film: mi.Film, planes: list[mi.Float], background: mi.Color3f
+    ) -> list[mi.Float]:
+        """What the film gets, each a plane of pixels: red, green, blue, perhaps alpha."""
         transmittance, *color = planes
         color = mi.Color3f(color)
         if self.srgb_primitives:
             color = mi.math.srgb_to_linear(color)
             background = mi.math.srgb_to_linear(background)
-        color = dr.fma(transmittance, background, color)
-        channels = list(color)
+        channels = list(dr.fma(transmittance, background, color))
         if mi.has_flag(film.flags(), mi.FilmFlags.Alpha):
             channels.append(1 - transmittance)
-        weight = dr.ones(mi.Float, dr.width(transmittance))
-        size = film.crop_size()
-        raw = mi.TensorXf(interleave([*channels, weight]), (size[1], size[0], len(channels) + 1))
-        film.prepare(self.aov_names())
-        film.put_block(mi.ImageBlock(raw, mi.ScalarPoint2i(film.crop_offset())))
-        return film.develop()
+        return channels
+
+    def _film_adjoint(self, film: mi.Film, grad_in: mi.TensorXf) -> list[mi.Float]:
+        """Derivatives of the loss with respect to the channels, given those of the image.
+
+        A film develops each pixel by the same linear map, found once by developing unit images.
+        (The derivative of ``develop`` itself would be scattered by atomic additions.)
+        """
+        key = str(film)
+        if key not in self._film_maps:
+            self._film_maps[key] = _film_map(film)
+        matrix = self._film_maps[key]
+        pixel = dr.arange(mi.UInt32, grad_in.shape[0] * grad_in.shape[1])
+        developed = [
+            dr.gather(mi.Float, grad_in.array, pixel * len(matrix) + k) for k in range(len(matrix))
+        ]
+        return [
+            sum(
+                (float(weight) * d for weight, d in zip(column, developed, strict=True) if weight),
+                start=mi.Float(0),
+            )
+            for column in matrix.T
+        ]
 
     def _warn_about_sampling(self, sensor: mi.Sensor, spp: int) -> None:
         spp = spp or sensor.sampler().sample_count()
@@ -374,6 +394,44 @@ class SplatsIntegrator(mi.CppADIntegrator):
             f"({spp}) and the film's reconstruction filter are not used. Set sample_count to 1 "
             "and rfilter to 'box' to silence this warning.",
         )
+
+
+def _develop(film: mi.Film, channels: list[mi.Float]) -> mi.TensorXf:
+    """Put the channels into ``film`` as one block of the whole image, and develop it.
+
+    A film reconstructs an image from blocks without filtering them again, so the picture is
+    exact whatever the film's filter.
+    """
+    weight = dr.ones(mi.Float, dr.width(channels[0]))
+    size = film.crop_size()
+    raw = mi.TensorXf(interleave([*channels, weight]), (size[1], size[0], len(channels) + 1))
+    film.prepare([])
+    film.put_block(mi.ImageBlock(raw, mi.ScalarPoint2i(film.crop_offset())))
+    return film.develop()
+
+
+def _film_map(film: mi.Film) -> np.ndarray:
+    """(developed channels, channels): the linear map that a film applies to each pixel."""
+    count = 4 if mi.has_flag(film.flags(), mi.FilmFlags.Alpha) else 3
+    num_pixels = film.crop_size()[0] * film.crop_size()[1]
+
+    def develop(channels: np.ndarray) -> np.ndarray:
+        planes = [mi.Float(np.ascontiguousarray(plane)) for plane in channels.T]
+        developed = np.array(_develop(film, planes))
+        return developed.reshape(num_pixels, -1)
+
+    unit = np.eye(count, dtype=np.float32)
+    units = [develop(np.tile(channel, (num_pixels, 1)))[0] for channel in unit]
+    matrix = np.stack(units, axis=1)
+    mixed = np.linspace(0.1, 2, num_pixels * count, dtype=np.float32).reshape(num_pixels, count)
+    linear = np.allclose(develop(mixed), mixed @ matrix.T, rtol=1e-3, atol=1e-4)
+    film.clear()
+    if not linear:
+        raise NotImplementedError(
+            f"splats: gradients through this film are not supported: {film} does not map each "
+            "pixel's channels linearly"
+        )
+    return matrix
 
 
 def _load_gaussians(props: mi.Properties) -> Gaussians:

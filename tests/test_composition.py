@@ -10,6 +10,7 @@ from pathlib import Path
 
 import drjit as dr
 import drjit.llvm.ad as llvm
+import mitsuba as mi
 import numpy as np
 import pytest
 from helpers import (
@@ -25,6 +26,7 @@ from helpers import (
 )
 
 from drgs import rendering
+from drgs.bench import scenes
 from drgs.projection import compensated_opacity
 
 # ----------------------------------------------------------------------------------------------
@@ -262,3 +264,13 @@ def test_no_kernel_reduces_floats_in_memory(precision, antialiased):
     for stage in (forward, adjoint, tangent):
         found, count = float_reductions(stage)
         assert not found and count >= 3, stage.__name__
+
+
+def test_no_kernel_of_a_training_iteration_reduces_floats_in_memory():
+    """With film, loss, optimizer and statistics: where Dr.Jit differentiates a gather, it would."""
+    mi.set_variant("llvm_ad_rgb")
+    scene = scenes.Scene("small", scenes.bench_gaussians(300), scenes.bench_camera(48))
+    trainer = scenes.trainer_of(scene)
+    trainer.step()
+    found, count = float_reductions(lambda: (trainer.step(), dr.sync_thread()))
+    assert not found and count > 30

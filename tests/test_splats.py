@@ -1,6 +1,7 @@
 """The ``splats`` integrator as a user of Mitsuba meets it, against the float64 reference."""
 
 import gc
+import sys
 import weakref
 from dataclasses import replace
 from functools import cache
@@ -535,6 +536,37 @@ def test_gradients_of_a_film_without_alpha(srgb_primitives):
     weights = scene.weights() * [1, 1, 1, 0]
     actual = gradients_of(scene.load(pixel_format="rgb"), weights[..., :3])
     assert_gradients_agree(actual, scene.gradients(weights))
+
+
+# Rec. 709 primaries and white point D65 (Mitsuba's color.h).
+XYZ = np.array(
+    [
+        [0.412453, 0.357580, 0.180423],
+        [0.212671, 0.715160, 0.072169],
+        [0.019334, 0.119193, 0.950227],
+    ]
+)
+
+
+@pytest.mark.parametrize(
+    ("pixel_format", "matrix"), [("luminance", XYZ[1:2]), ("xyz", XYZ)], ids=["luminance", "xyz"]
+)
+def test_gradients_of_a_film_that_converts_colors(pixel_format, matrix):
+    scene = clear(Scene(srgb_primitives=True))
+    weights = scene.weights()[..., : len(matrix)]
+    actual = gradients_of(scene.load(pixel_format=pixel_format), weights)
+    of_rgba = np.concatenate([weights @ matrix, np.zeros_like(weights[..., :1])], axis=-1)
+    assert_gradients_agree(actual, scene.gradients(of_rgba))
+
+
+def test_a_film_that_is_not_linear_refuses_gradients(monkeypatch):
+    scene = Scene()
+    loaded = scene.load()
+    module = sys.modules[type(loaded.integrator()).__module__]
+    develop = module._develop
+    monkeypatch.setattr(module, "_develop", lambda *args: dr.square(develop(*args)))
+    with pytest.raises(Exception, match="does not map each pixel's channels linearly"):
+        gradients_of(loaded, scene.weights())
 
 
 def test_the_gradient_tests_would_notice_one_percent():
