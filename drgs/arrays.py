@@ -131,6 +131,21 @@ def load_row(
     return [number for packet in loaded for number in packet][: end - start]
 
 
+def empty_rows(float_type: type, width: int, num_rows: int) -> Any:
+    """Memory, not initialised, for rows of ``width`` numbers."""
+    return dr.empty(float_type, num_rows * -(-width // PACKET) * PACKET)
+
+
+def store_row(rows: Any, numbers: Sequence[Any], row: Any, active: Any = True) -> None:
+    """Fill one row a lane of what :func:`empty_rows` made; no two lanes may fill the same."""
+    t = types_of(type(rows))
+    padded = [*numbers, *[t.Float(0)] * (-len(numbers) % PACKET)]
+    packets = len(padded) // PACKET
+    for k in range(packets):
+        packet = t.Array4f(padded[PACKET * k : PACKET * (k + 1)])
+        dr.scatter(rows, packet, row * packets + k, active)
+
+
 def _dynamic_vector(columns: list[Any]) -> Any:
     flat_type = type(columns[0])
     module = sys.modules[flat_type.__module__]

@@ -51,7 +51,16 @@ from typing import Any
 
 import drjit as dr
 
-from drgs.arrays import interleave, is_float64, load_row, pack_rows, scatter_rows, types_of
+from drgs.arrays import (
+    empty_rows,
+    interleave,
+    is_float64,
+    load_row,
+    pack_rows,
+    scatter_rows,
+    store_row,
+    types_of,
+)
 from drgs.constants import (
     ALPHA_MAX,
     LOG2_ALPHA_CUT,
@@ -571,8 +580,7 @@ def composite_adjoint(
     g = [_load_pixels(plane, lanes, bins.grid) for plane in d_features]
     ends = _load_row(layers.ends, lanes.micro_tile, 1)
     transmittance = _load_row(layers.values, lanes.micro_tile, 1 + count)
-    width = 4 * -(-(MOMENTS + count) // 4)
-    partials = dr.empty(t.Float, max(slots.count, 1) * width)
+    partials = empty_rows(t.Float, MOMENTS + count, max(slots.count, 1))
 
     def body(cursor: _Cursor, slot: Any, T: list, R: list) -> tuple:
         entry, active = entries.current(cursor)
@@ -583,10 +591,7 @@ def composite_adjoint(
         T, R, d_log_alpha, d_color = _adjoint_step(footprint, reached, color, T, R, g, exp2)
         moments = _moments(footprint, d_log_alpha)
         values = moments + d_color
-        values += [t.Float(0)] * (width - len(values))
-        for k in range(width // 4):
-            packet = t.Array4f(values[4 * k : 4 * k + 4])
-            dr.scatter(partials, packet, slot * (width // 4) + k, active)
+        store_row(partials, values, slot, active)
         return entries.advance(cursor), slot, T, R
 
     loop = dr.while_loop(
@@ -600,7 +605,7 @@ def composite_adjoint(
         body=body,
     )
     dr.eval(loop, partials)
-    return _sum_slots(bins, slots, partials, width, count)
+    return _sum_slots(bins, slots, partials, count)
 
 
 def _adjoint_step(
@@ -680,22 +685,21 @@ def _dot(a: list[Any], b: list[Any]) -> Any:
     return total
 
 
-def _sum_slots(
-    bins: TileBins, slots: _Slots, partials: Any, width: int, count: int
-) -> SplatGradients:
+def _sum_slots(bins: TileBins, slots: _Slots, partials: Any, count: int) -> SplatGradients:
     """Add up the slots of each entry, the entries of each splat, and turn sums into derivatives."""
     t = types_of(type(bins.rows))
+    width = MOMENTS + count
     by_entry = _sum_entries(bins, slots, partials, width)
     rank = dr.arange(t.UInt32, dr.width(bins.order))
     begin, end = (dr.gather(t.UInt32, bins.first_entry, rank + k) for k in (0, 1))
 
     def body(entry: Any, totals: list) -> tuple:
         numbers = load_row(by_entry, width, entry)
-        return entry + 1, [a + b for a, b in zip(totals, numbers, strict=False)]
+        return entry + 1, [a + b for a, b in zip(totals, numbers, strict=True)]
 
     zero = dr.zeros(t.Float, dr.width(rank))
     _, totals = dr.while_loop(
-        state=(begin, [t.Float(zero) for _ in range(MOMENTS + count)]),
+        state=(begin, [t.Float(zero) for _ in range(width)]),
         cond=lambda entry, totals: entry < end,
         body=body,
     )
@@ -751,7 +755,9 @@ def _sum_entries(bins: TileBins, slots: _Slots, partials: Any, width: int) -> An
         body=body,
     )
     dr.eval(totals)
-    return scatter_rows(totals, dr.gather(t.UInt32, bins.source, entry), dr.width(entry))
+    rows = empty_rows(t.Float, width, dr.width(entry))
+    store_row(rows, totals, dr.gather(t.UInt32, bins.source, entry))
+    return rows
 
 
 # ----------------------------------------------------------------------------------------------

@@ -5,7 +5,15 @@ import numpy as np
 import pytest
 from helpers import both_precisions
 
-from drgs.arrays import from_host, interleave, load_row, pack_rows, scatter_rows
+from drgs.arrays import (
+    empty_rows,
+    from_host,
+    interleave,
+    load_row,
+    pack_rows,
+    scatter_rows,
+    store_row,
+)
 
 UInt32 = dr.llvm.ad.UInt32
 
@@ -37,6 +45,18 @@ def test_rows_are_loaded_as_they_were_packed(precision, count):
     lanes, active = UInt32(4, 4, 0, 2), dr.llvm.ad.Bool(True, False, True, True)
     loaded = np.stack([np.array(v) for v in load_row(rows, count, lanes, active)], axis=1)
     np.testing.assert_array_equal(loaded, table(count)[[4, 4, 0, 2]] * [[1], [0], [1], [1]])
+
+
+@both_precisions
+@pytest.mark.parametrize("count", [1, 4, 6, 9, 12])
+def test_rows_are_stored_where_a_lane_is_active(precision, count):
+    rows = empty_rows(precision.Float, count, 6)
+    store_row(rows, [precision.array(np.full(6, -1.0))] * count, dr.arange(UInt32, 6))
+    lanes, active = UInt32(5, 0, 2, 3, 1), dr.llvm.ad.Bool(True, True, True, False, True)
+    store_row(rows, numbered(precision, count), lanes, active)
+    stored = np.stack([np.array(v) for v in load_row(rows, count, dr.arange(UInt32, 6))], axis=1)
+    np.testing.assert_array_equal(stored[[5, 0, 2, 1]], table(count)[[0, 1, 2, 4]])
+    assert (stored[[3, 4]] == -1).all()
 
 
 @both_precisions
