@@ -559,6 +559,18 @@ def test_gradients_of_a_film_that_converts_colors(pixel_format, matrix):
     assert_gradients_agree(actual, scene.gradients(of_rgba))
 
 
+def test_a_derivative_that_is_not_a_number_reaches_the_parameters():
+    """Dr.Jit's derivative of a gather, such as of the film's pixels, would drop it."""
+    scene = Scene()
+    weights = scene.weights()
+    weights[tuple(np.array(weights.shape[:2]) // 2)] = np.nan
+    loaded = scene.load()
+    actual = gradients_of(loaded, weights)
+    assert not np.isfinite(actual["means"]).all()
+    fault = rendering.decode_fault(int(loaded.integrator().last.first_fault[0]))
+    assert fault is not None and fault[1] in PARAMETER_NAMES
+
+
 def test_a_film_that_is_not_linear_refuses_gradients(monkeypatch):
     scene = Scene()
     loaded = scene.load()
