@@ -13,6 +13,8 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
+from drgs.arrays import from_host
+
 PARAMETER_NAMES = ("means", "quats", "log_scales", "logit_opacities", "sh0", "shN")
 
 
@@ -61,24 +63,12 @@ class Gaussians:
         flat_type = dr.array_t(tensor_type)
 
         def upload(name: str) -> Any:
-            values = np.ascontiguousarray(getattr(self, name), dtype=_numpy_dtype(flat_type))
-            # Dr.Jit wraps numpy's memory on the CPU, and may drop a gather of all of it: only
-            # what is written to memory of its own is a copy.
-            flat = dr.empty(flat_type, values.size)
-            if values.size > 0:
-                index = dr.arange(dr.uint32_array_t(flat_type), values.size)
-                dr.scatter(flat, flat_type(values.ravel()), index)
-                dr.eval(flat)
+            values = np.asarray(getattr(self, name))
+            flat = from_host(flat_type, values)
             return flat if name == "logit_opacities" else tensor_type(flat, values.shape)
 
-        uploaded = Gaussians(**{name: upload(name) for name in PARAMETER_NAMES})
-        dr.sync_thread()  # the source may change from here on
-        return uploaded
+        return Gaussians(**{name: upload(name) for name in PARAMETER_NAMES})
 
 
 def _exp(x: Any) -> Any:
     return np.exp(x) if isinstance(x, np.ndarray) else dr.exp(x)
-
-
-def _numpy_dtype(flat_type: type) -> type:
-    return np.float64 if dr.type_v(flat_type) == dr.VarType.Float64 else np.float32

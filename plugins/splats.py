@@ -14,7 +14,7 @@ import mitsuba as mi
 import numpy as np
 
 from drgs import rendering
-from drgs.arrays import interleave
+from drgs.arrays import from_host, interleave
 from drgs.camera import SensorState, camera_from_sensor, read_sensor
 from drgs.constants import NEAR
 from drgs.gaussians import PARAMETER_NAMES, Gaussians
@@ -277,6 +277,7 @@ class SplatsIntegrator(mi.CppADIntegrator):
                 dr.traverse(dr.ADMode.Backward)
                 d_transmittance, *d_features = dr.grad(planes)
                 d_background = dr.grad(background)
+            sensor.film().clear()  # as after any backward pass of Mitsuba's own integrators
             dr.eval(d_transmittance, d_features, d_background)
             gradients = rendering.render_adjoint(self.gaussians, frame, d_features, d_transmittance)
             self.last = LastBackward(
@@ -416,16 +417,14 @@ def _film_map(film: mi.Film) -> np.ndarray:
     num_pixels = film.crop_size()[0] * film.crop_size()[1]
 
     def develop(channels: np.ndarray) -> np.ndarray:
-        planes = [mi.Float(np.ascontiguousarray(plane)) for plane in channels.T]
-        developed = np.array(_develop(film, planes))
-        return developed.reshape(num_pixels, -1)
+        planes = [from_host(mi.Float, plane) for plane in channels.T]
+        return np.array(_develop(film, planes)).reshape(num_pixels, -1)
 
     unit = np.eye(count, dtype=np.float32)
     units = [develop(np.tile(channel, (num_pixels, 1)))[0] for channel in unit]
     matrix = np.stack(units, axis=1)
     mixed = np.linspace(0.1, 2, num_pixels * count, dtype=np.float32).reshape(num_pixels, count)
     linear = np.allclose(develop(mixed), mixed @ matrix.T, rtol=1e-3, atol=1e-4)
-    film.clear()
     if not linear:
         raise NotImplementedError(
             f"splats: gradients through this film are not supported: {film} does not map each "
