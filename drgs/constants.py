@@ -45,7 +45,9 @@ COLOR_MIN = 0.0
 """Colours from spherical harmonics are not negative (3DGS reference). Gradient: zero where a colour
 is clamped; at exactly this value it passes, so that black splats can learn."""
 
-LOG2_ALPHA_CUT = math.log2(ALPHA_CUT)
+NEGLIGIBLE_ALPHA = 2.0**-60
+"""Where alpha is not cut, splats end here: thousands of layers of such an alpha change no rounding,
+in either precision, and the short exp2 of the kernels is exact to well below it."""
 
 CULL_MARGIN = 1e-3
 """Added to the exponent (base 2) when a splat is tested against tiles, so that rounding in the

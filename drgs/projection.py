@@ -4,10 +4,14 @@ Layer 2, the first stage: ``Gaussians`` + ``Camera`` -> ``Splats2D``. One lane i
 every line is plain arithmetic, so Dr.Jit differentiates it. The equations are those of Zwicker
 et al. 2002 ("EWA splatting") as used in section 4 of the 3DGS paper, written so that they do not
 cancel in single precision.
+
+How a Gaussian's shape comes to the film is a function, :func:`ewa` or one of another module
+(``drgs.unscented``, ``drgs.perspective``).
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,7 +20,8 @@ import drjit as dr
 from drgs import sh
 from drgs.arrays import types_of
 from drgs.camera import Camera
-from drgs.constants import ALPHA_CUT, LOW_PASS, TAN_CLAMP
+from drgs.constants import LOW_PASS, TAN_CLAMP
+from drgs.cutoffs import Cutoffs
 from drgs.gaussians import Gaussians
 
 
@@ -35,15 +40,28 @@ class Splats2D:
     whitening: Any  # Array3f (p, r, s), 1 / px
     depths: Any  # Float, z in the camera, scene units
     opacities: Any  # Float in (0, 1)
-    colors: Any  # Array3f, display space
+    colors: Any  # Array3f, display space; or whatever else :func:`project`'s ``color`` gave
     variances: Any  # Array2f, px^2: diagonal of the projected covariance, low-pass included
     visible: Any  # Bool: in front of the near plane, above the alpha cut, finite
+    perspective: Any = None  # Array3f, only where a choice needs it: see drgs.perspective
 
     @property
     def conics(self) -> Any:
         """Array3f (a, b, c) of the exponent -(a dx^2 + 2 b dx dy + c dy^2) / 2, px^-2."""
         p, r, s = self.whitening
         return type(self.whitening)(p * p, p * r, r * r + s * s)
+
+
+@dataclass(frozen=True)
+class FilmShape:
+    """What a Gaussian's mean and covariance are on the film."""
+
+    means2d: Any  # Array2f, px
+    whitening: Any  # Array3f (p, r, s), 1 / px
+    variances: Any  # Array2f, px^2, low-pass included
+    sharp: Any  # Float: determinant of the covariance without low-pass; and what the low-pass
+    added: Any  # Float: adds to it, both divided by the variance in y
+    perspective: Any = None  # Array3f
 
 
 @dataclass(frozen=True)
@@ -79,11 +97,23 @@ def load_rows(gaussians: Gaussians, sh_degree: int) -> GaussianRows:
     )
 
 
-def project(rows: GaussianRows, camera: Camera, sh_degree: int, opacity_rule: Any) -> Splats2D:
+def project(
+    rows: GaussianRows,
+    camera: Camera,
+    sh_degree: int,
+    opacity_rule: Any,
+    shape: Callable | None = None,
+    color: Callable | None = None,
+    low_pass: float = LOW_PASS,
+    least_alpha: float = Cutoffs().least_alpha,
+) -> Splats2D:
     """Project Gaussians onto the image plane of ``camera``.
 
     opacity_rule: how low-pass filtering affects opacity: :func:`plain_opacity` or
-    :func:`compensated_opacity`.
+    :func:`compensated_opacity`; shape: how mean and covariance are projected, by default
+    :func:`ewa`; color: what is known of a splat's colour, by default :func:`color_at_mean`;
+    low_pass: px^2 added to the covariance; least_alpha: Gaussians whose opacity does
+    not reach it are not visible.
 
     Differentiable in ``rows`` and in the camera's numbers. Not differentiated: visibility.
     """
@@ -93,31 +123,65 @@ def project(rows: GaussianRows, camera: Camera, sh_degree: int, opacity_rule: An
     in_front = z >= camera.near
     # A masked lane must not divide by zero: 0 * inf would poison the gradient of its neighbours.
     z = dr.select(in_front, z, 1)
+    film = (shape or ewa)(rows, camera, t.Array3f(x, y, z), low_pass)
+    opacities = opacity_rule(_sigmoid(rows.logit_opacities), film.sharp, film.added)
+    colors = (color or color_at_mean)(rows, offset, sh_degree)
+    numbers = [*film.means2d, *film.whitening, *colors]
+    numbers += [] if film.perspective is None else [*film.perspective]
+    finite = dr.isfinite(dr.detach(sum(numbers[1:], numbers[0])))
+    return Splats2D(
+        means2d=film.means2d,
+        whitening=film.whitening,
+        depths=z,
+        opacities=opacities,
+        colors=colors,
+        variances=film.variances,
+        visible=in_front & (opacities > least_alpha) & finite & dr.isfinite(dr.sum(film.variances)),
+        perspective=film.perspective,
+    )
 
-    m0, m1 = _screen_space_sqrt_cov(rows, camera, t.Array3f(x, y, z))
-    xx, xy, yy = dr.dot(m0, m0), dr.dot(m0, m1), dr.dot(m1, m1) + LOW_PASS
+
+def ewa(rows: GaussianRows, camera: Camera, position: Any, low_pass: float) -> FilmShape:
+    """The affine approximation of the projection at the mean (Zwicker et al. 2002, section 4).
+
+    position: Array3f, camera axes, the mean. With M = J R_camera R(q) diag(s), 2 x 3, the
+    covariance on the film is M M^T + low_pass I.
+    """
+    m0, m1, _ = film_axes(rows, camera, position, clamped_slopes(camera, position))
+    return whiten(film_point(camera, position), m0, m1, low_pass)
+
+
+def film_point(camera: Camera, position: Any) -> Any:
+    """Where a point in camera axes is on the film, Array2f, px."""
+    x, y, z = position
+    return camera.focal * types_of(type(z)).Array2f(x, y) / z + camera.principal
+
+
+def whiten(means2d: Any, m0: Any, m1: Any, low_pass: float) -> FilmShape:
+    """The shape of a Gaussian whose covariance on the film is M M^T + low_pass I.
+
+    m0, m1: the rows of M, vectors of the same length, px.
+    """
+    xx, xy, yy = dr.dot(m0, m0), dr.dot(m0, m1), dr.dot(m1, m1) + low_pass
     # U needs det / yy, the variance of x where y is given. det(M M^T) is the sum of the squared
     # 2x2 minors of M (Cauchy-Binet): never negative and free of the cancellation of
     # xx yy - xy^2. Its minors are divided by sqrt(yy) first, or the square of a giant's overflows.
     s = dr.rsqrt(yy)
     minors = dr.cross(m0, m1 * s)
-    sharp, added = dr.dot(minors, minors), LOW_PASS * (xx / yy + 1)
+    sharp, added = dr.dot(minors, minors), low_pass * (xx / yy + 1)
     p = dr.rsqrt(sharp + added)
-    whitening = t.Array3f(p, -p * (xy / yy), s)
-    xx = xx + LOW_PASS
-    means2d = camera.focal * t.Array2f(x, y) / z + camera.principal
-    opacities = opacity_rule(_sigmoid(rows.logit_opacities), sharp, added)
-    colors = sh.sh_color(rows.sh, _normalize(offset), sh_degree)
-    finite = dr.isfinite(dr.detach(dr.sum(means2d) + dr.sum(whitening) + dr.sum(colors)))
-    return Splats2D(
+    return FilmShape(
         means2d=means2d,
-        whitening=whitening,
-        depths=z,
-        opacities=opacities,
-        colors=colors,
-        variances=t.Array2f(xx, yy),
-        visible=in_front & (opacities > ALPHA_CUT) & finite & dr.isfinite(xx + yy),
+        whitening=type(m0)(p, -p * (xy / yy), s),
+        variances=types_of(type(s)).Array2f(xx + low_pass, yy),
+        sharp=sharp,
+        added=added,
     )
+
+
+def color_at_mean(rows: GaussianRows, offset: Any, sh_degree: int) -> Any:
+    """The colour (Array3f) in the direction ``offset`` from the camera's centre to the mean."""
+    return sh.sh_color(rows.sh, _normalize(offset), sh_degree)
 
 
 def plain_opacity(opacity: Any, sharp: Any, added: Any) -> Any:
@@ -139,27 +203,43 @@ def compensated_opacity(opacity: Any, sharp: Any, added: Any) -> Any:
     return dr.select(thin, 0, opacity * dr.rsqrt(1 + added / dr.select(thin, 1, sharp)))
 
 
-def _screen_space_sqrt_cov(rows: GaussianRows, camera: Camera, position: Any) -> tuple[Any, Any]:
-    """The rows of M = J R_camera R(q) diag(s), 2 x 3: the projected covariance is M M^T."""
-    z = position.z
+def clamped_slopes(camera: Camera, position: Any) -> list[Any]:
+    """x / z and y / z of the mean, not far outside the film: see ``constants.TAN_CLAMP``."""
     # Of the whole film: a crop window is a part of the same picture.
     start = (camera.film_start - camera.principal) / camera.focal
     end = (camera.film_end - camera.principal) / camera.focal
     margin = TAN_CLAMP * (end - start) / 2
-    limits = zip(start - margin, end + margin, strict=True)
-    scales = dr.exp(rows.log_scales)
-    world_from_splat = quat_to_rotation(rows.quats)
+    slopes = []
+    for slope, lo, hi in zip(true_slopes(position), start - margin, end + margin, strict=True):
+        slopes.append(dr.select(slope < lo, lo, dr.select(slope > hi, hi, slope)))
+    return slopes
+
+
+def true_slopes(position: Any) -> list[Any]:
+    """x / z and y / z of the mean."""
+    return [position.x / position.z, position.y / position.z]
+
+
+def film_axes(
+    rows: GaussianRows, camera: Camera, position: Any, slopes: list[Any]
+) -> tuple[Any, Any, Any]:
+    """The half axes of a Gaussian as rows of two matrices: on the film, and in depth.
+
+    The first two are those of M = J R_camera R(q) diag(s), px; the third the same for the depth
+    divided by that of the mean.
+    """
     right, down, forward = camera.rotation
-    sqrt_cov = []
-    for axis, coordinate, focal, (lo, hi) in zip(
-        (right, down), (position.x, position.y), camera.focal, limits, strict=True
-    ):
-        slope = coordinate / z
-        slope = dr.select(slope < lo, lo, dr.select(slope > hi, hi, slope))
-        # J's row is focal / z (e_axis - slope e_z).
-        gradient = (axis - slope * forward) * (focal / z)
-        sqrt_cov.append((world_from_splat.T @ gradient) * scales)
-    return sqrt_cov[0], sqrt_cov[1]
+    world_from_splat, scales = quat_to_rotation(rows.quats), dr.exp(rows.log_scales)
+
+    def along(direction: Any) -> Any:
+        return (world_from_splat.T @ direction) * scales
+
+    # J's rows are focal / z (e_axis - slope e_z).
+    m0, m1 = (
+        along((axis - slope * forward) * (focal / position.z))
+        for axis, focal, slope in zip((right, down), camera.focal, slopes, strict=True)
+    )
+    return m0, m1, along(forward / position.z)
 
 
 def quat_to_rotation(quats: Any) -> Any:

@@ -1,8 +1,9 @@
 """The stages composed: from Gaussians and a camera to planes of pixels, and back.
 
 Layer 3. A :class:`Pipeline` says what a scene calls for: which SH degree, which opacity rule,
-which features are composited. It does so by naming functions, and Dr.Jit traces only what is
-called: what is not composed in leaves no instruction in any kernel.
+which features are composited, which approximations are made. It does so by naming functions and
+objects, and Dr.Jit traces only what is called: what is not composed in leaves no instruction in
+any kernel. ``drgs.choices`` makes a pipeline from names.
 
 The chain is  Gaussians -> ``project`` -> Splats2D -> ``bin_splats`` -> TileBins
 -> ``composite`` -> Layers.  The adjoint runs it backwards: the hand-written adjoint of
@@ -13,15 +14,25 @@ which are traced again, one Gaussian per lane, so that no gradient is ever scatt
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import drjit as dr
 
 from drgs.arrays import interleave, types_of
 from drgs.camera import Camera
+from drgs.constants import LOW_PASS
 from drgs.gaussians import PARAMETER_NAMES, Gaussians
-from drgs.projection import GaussianRows, Splats2D, load_rows, plain_opacity, project
+from drgs.image_model import DEFAULT, ImageModel
+from drgs.projection import (
+    GaussianRows,
+    Splats2D,
+    color_at_mean,
+    ewa,
+    load_rows,
+    plain_opacity,
+    project,
+)
 from drgs.rasterize import (
     Layers,
     Records,
@@ -44,16 +55,52 @@ def depth_feature(splats: Splats2D) -> list[Any]:
 
 
 @dataclass(frozen=True)
+class CenterOrder:
+    """One order of the splats for the whole image: by the depth of their means."""
+
+    def keys(self, splats: Splats2D) -> list[Any]:
+        """Columns that compositing needs for the order, besides the order of the entries."""
+        del splats
+        return []
+
+    def composite(self, bins: TileBins, records: Records) -> Layers:
+        """Composite front to back."""
+        return composite(bins, records)
+
+    def adjoint(self, *arguments: Any) -> SplatGradients:
+        """See :func:`drgs.rasterize.composite_adjoint`."""
+        return composite_adjoint(*arguments)
+
+    def tangent(self, *arguments: Any) -> Layers:
+        """See :func:`drgs.rasterize.composite_tangent`."""
+        return composite_tangent(*arguments)
+
+
+@dataclass(frozen=True)
 class Pipeline:
     """What is rendered, and how; see the module's description."""
 
     sh_degree: int = 3
     opacity_rule: Callable[[Any, Any, Any], Any] = plain_opacity
     features: tuple[Callable[[Splats2D], list[Any]], ...] = (color_features,)
+    shape: Callable = ewa  # how a Gaussian's mean and covariance come to the film
+    color: Callable = color_at_mean  # what is stored of a splat's colour
+    low_pass: float = LOW_PASS  # px^2
+    model: ImageModel = DEFAULT
+    order: Any = CenterOrder()
 
     def project(self, rows: GaussianRows, camera: Camera) -> Splats2D:
         """The first stage with this pipeline's choices."""
-        return project(rows, camera, self.sh_degree, self.opacity_rule)
+        return project(
+            rows,
+            camera,
+            self.sh_degree,
+            self.opacity_rule,
+            self.shape,
+            self.color,
+            self.low_pass,
+            self.model.cutoffs.least_alpha,
+        )
 
     def feature_columns(self, splats: Splats2D) -> list[Any]:
         """The columns of all features, in order."""
@@ -92,9 +139,11 @@ def render(gaussians: Gaussians, camera: Camera, pipeline: Pipeline) -> Frame:
     """
     splats = pipeline.project(load_rows(gaussians, pipeline.sh_degree), camera)
     columns = pipeline.feature_columns(splats)
-    bins = bin_splats(splats, TileGrid(camera.width, camera.height), columns)
+    model = replace(pipeline.model, features=pipeline.model.features.seen_by(camera))
+    grid = TileGrid(camera.width, camera.height)
+    bins = bin_splats(splats, grid, columns, model, pipeline.order.keys(splats))
     records = Records.of(bins, bins.splats)
-    layers = composite(bins, records)
+    layers = pipeline.order.composite(bins, records)
     return Frame(pipeline=pipeline, camera=camera, bins=bins, records=records, layers=layers)
 
 
@@ -108,7 +157,7 @@ def render_adjoint(
 
     Not differentiated: visibility, the order of the splats, the decisions of compositing.
     """
-    gradients = composite_adjoint(
+    gradients = frame.pipeline.order.adjoint(
         frame.bins, frame.records, frame.layers, d_features, d_transmittance
     )
     rows = load_rows(gaussians, frame.pipeline.sh_degree)
@@ -161,20 +210,20 @@ def render_tangent(gaussians: Gaussians, frame: Frame, tangents: Gaussians) -> l
         dr.forward_to(outputs, flags=dr.ADFlag.ClearEdges)
         columns = [dr.grad(output) for output in outputs]
     dr.eval(columns)
-    direction = SplatGradients(*columns[:3], features=columns[3:])
-    return composite_tangent(frame.bins, frame.records, frame.layers, direction).planes()
+    count = frame.bins.model.response.num_geometry
+    direction = SplatGradients(geometry=columns[:count], features=columns[count:])
+    order = frame.pipeline.order
+    return order.tangent(frame.bins, frame.records, frame.layers, direction).planes()
 
 
 def _differentiable(
     pipeline: Pipeline, splats: Splats2D, gradients: SplatGradients | None
 ) -> tuple[list[Any], list[Any]]:
     """What compositing reads of the splats, and the derivatives with respect to it, aligned."""
-    outputs = [splats.means2d, splats.whitening, splats.opacities]
-    outputs += pipeline.feature_columns(splats)
+    outputs = pipeline.model.response.differentiable(splats) + pipeline.feature_columns(splats)
     if gradients is None:
         return outputs, []
-    cotangents = [gradients.means2d, gradients.whitening, gradients.opacities]
-    return outputs, cotangents + list(gradients.features)
+    return outputs, gradients.geometry + gradients.features
 
 
 def _as_tensors(d_rows: GaussianRows, gaussians: Gaussians, visible: Any) -> tuple[Gaussians, Any]:

@@ -16,7 +16,6 @@ up its neighbours, and the only value that the host reads is the number of entri
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -24,20 +23,12 @@ from typing import Any
 import drjit as dr
 
 from drgs.arrays import interleave, load_row, pack_rows, types_of
-from drgs.constants import (
-    ALPHA_CUT,
-    CULL_MARGIN,
-    CULL_MARGIN_PER_PX,
-    LOG2_ALPHA_CUT,
-    WHITENING_SCALE,
-)
+from drgs.constants import CULL_MARGIN, CULL_MARGIN_PER_PX
+from drgs.image_model import DEFAULT, MICRO, ImageModel
 from drgs.projection import Splats2D
 
 BOX = 4
 """Numbers of a splat's box of tiles: first column, first row, columns, number of tiles."""
-
-MICRO = 4
-"""Pixels on a micro-tile's side. A micro-tile is one SIMD lane of the compositing kernels."""
 
 GRID = 4
 """Micro-tiles on a tile's side."""
@@ -50,9 +41,6 @@ MICROS = GRID * GRID
 
 WORD = 32
 """Entries in a word of the transposed masks."""
-
-GEOMETRY = 6
-"""Numbers per splat that decide its alpha at a pixel: mean x, y, p, r, s, log2_opacity."""
 
 
 @dataclass(frozen=True)
@@ -93,8 +81,9 @@ class TileBins:
     """
 
     order: Any  # UInt32 (N,): rank -> index of the Gaussian
-    rows: Any  # Float (N * packets * 4,): by rank: box of tiles, geometry, features, padding
+    rows: Any  # Float (N * packets * 4,): by rank: box of tiles, geometry, features, keys
     num_features: int
+    num_keys: int
     first_entry: Any  # UInt32 (N + 1,): rank -> first of its run of unsorted entries
     source: Any  # UInt32 (M padded,): sorted -> unsorted
     ranks: Any  # UInt32 (M padded,): sorted -> rank
@@ -104,25 +93,35 @@ class TileBins:
     tile_start: Any  # UInt32 (tiles + 1,): tile -> first sorted entry
     num_entries: int  # M
     grid: TileGrid
+    model: ImageModel
 
     def splats(self, rank: Any) -> list[Any]:
-        """Geometry (6) and features of a splat."""
-        return load_row(self.rows, BOX + GEOMETRY + self.num_features, rank, start=BOX)
+        """Geometry, features and keys of a splat."""
+        width = BOX + self.model.response.num_geometry + self.num_features + self.num_keys
+        return load_row(self.rows, width, rank, start=BOX)
 
 
-def bin_splats(splats: Splats2D, grid: TileGrid, features: Sequence[Any] = ()) -> TileBins:
+def bin_splats(
+    splats: Splats2D,
+    grid: TileGrid,
+    features: Sequence[Any] = (),
+    model: ImageModel = DEFAULT,
+    keys: Sequence[Any] = (),
+) -> TileBins:
     """Distribute the visible ``splats`` over the tiles of ``grid``, front to back.
 
-    features: columns, one value per Gaussian, that compositing will read beside the geometry.
-    Neither they nor the splats need to be evaluated: the kernel that computes them stores rows.
+    features: columns, one value per Gaussian, that compositing will read beside the geometry;
+    keys: more of them, that it will not composite. Neither they nor the splats need to be
+    evaluated: the kernel that computes them stores rows.
 
     Not differentiated: integer work. The host reads one value, the number of entries.
     """
     t = types_of(type(splats.depths))
-    width = BOX + GEOMETRY + len(features)
-    rows, keys = _store_rows(splats, grid, features)
+    stored = [*features, *keys]
+    width = BOX + model.response.num_geometry + len(stored)
+    rows, depths = _store_rows(splats, grid, stored, model)
     # A stable sort: equal depths stay in the order of the Gaussians.
-    order = dr.argsort(keys)
+    order = dr.argsort(depths)
     # A kernel of its own: loads that wait for memory, and for no arithmetic, wait together.
     numbers = load_row(rows, width, order)
     rows, counts = pack_rows(numbers), t.UInt32(numbers[BOX - 1])
@@ -133,7 +132,7 @@ def bin_splats(splats: Splats2D, grid: TileGrid, features: Sequence[Any] = ()) -
     first_entry = dr.prefix_sum(counts)
     num_entries = int(first_entry[num_splats])
 
-    tile, entries = _make_entries(first_entry, rows, width, num_entries, grid)
+    tile, entries = _make_entries(first_entry, rows, width, num_entries, grid, model)
     source = _stable_order(tile, grid.num_tiles)
 
     padded = -(-max(num_entries, 1) // WORD) * WORD
@@ -149,6 +148,7 @@ def bin_splats(splats: Splats2D, grid: TileGrid, features: Sequence[Any] = ()) -
         order=order,
         rows=rows,
         num_features=len(features),
+        num_keys=len(keys),
         first_entry=first_entry,
         source=source,
         ranks=ranks,
@@ -158,40 +158,45 @@ def bin_splats(splats: Splats2D, grid: TileGrid, features: Sequence[Any] = ()) -
         tile_start=tile_start,
         num_entries=num_entries,
         grid=grid,
+        model=model,
     )
 
 
-def _store_rows(splats: Splats2D, grid: TileGrid, features: Sequence[Any]) -> tuple[Any, Any]:
-    """By Gaussian, evaluated at once: rows of all numbers, and keys to sort by."""
-    rows = pack_rows([*_tile_box(splats, grid), *_geometry_columns(splats), *features])
-    keys = dr.select(splats.visible, splats.depths, dr.inf)
-    dr.eval(rows, keys)
-    return rows, keys
+def _store_rows(
+    splats: Splats2D, grid: TileGrid, stored: Sequence[Any], model: ImageModel
+) -> tuple[Any, Any]:
+    """By Gaussian, evaluated at once: rows of all numbers, and depths to sort by."""
+    geometry = model.response.geometry(splats)
+    rows = pack_rows([*_tile_box(splats, geometry, grid, model), *geometry, *stored])
+    depths = dr.select(splats.visible, splats.depths, dr.inf)
+    dr.eval(rows, depths)
+    return rows, depths
 
 
-def _geometry_columns(splats: Splats2D) -> list[Any]:
-    """The numbers that decide a splat's alpha at a pixel.
+def _reach(geometry: list[Any], grid: TileGrid, model: ImageModel) -> Any:
+    """What |U d|^2 may be (base 2) where a splat ends, and a margin for rounding.
 
-    Mean x, y (px); then p, r, s of U and log2_opacity, scaled such that
-    alpha = exp2(log2_opacity - |U d|^2).
+    For the default cut-offs, sqrt(2 ln(opacity / alpha_cut)) standard deviations: the
+    opacity-aware radius, instead of 3.
     """
-    p, r, s = splats.whitening * WHITENING_SCALE
-    return [*splats.means2d, p, r, s, dr.log2(splats.opacities)]
+    t = types_of(type(geometry[0]))
+    log2_opacity = geometry[5]
+    floor = model.cutoffs.log2_floor(log2_opacity)
+    return log2_opacity - floor + dr.opaque(t.Float, grid.cull_margin)
 
 
-def _tile_box(splats: Splats2D, grid: TileGrid) -> list[Any]:
+def _tile_box(
+    splats: Splats2D, geometry: list[Any], grid: TileGrid, model: ImageModel
+) -> list[Any]:
     """First column and row, columns, and number of tiles: whole numbers, exact up to 2^24."""
     t = types_of(type(splats.depths))
-    # alpha >= cut inside |U d|^2 <= 2 ln(opacity / cut); its bounding box follows from the
-    # variances (the opacity-aware radius, instead of 3 standard deviations).
-    margin = dr.opaque(t.Float, grid.cull_margin)
-    reach = 2 * dr.log(splats.opacities / ALPHA_CUT) + 2 * math.log(2) * margin
-    radius = dr.sqrt(reach * splats.variances)
+    center, radius = model.response.bounds(splats, geometry, _reach(geometry, grid, model))
+    radius = radius + model.positions.margin
     size = t.Array2f(dr.opaque(t.Float, grid.width), dr.opaque(t.Float, grid.height))
     # The first and last pixel whose centre lies within the radius, clamped to the film while
     # still in floating point: a splat may be arbitrarily far away.
-    first = dr.ceil(splats.means2d - radius - 0.5)
-    last = dr.floor(splats.means2d + radius - 0.5)
+    first = dr.ceil(center - radius - 0.5)
+    last = dr.floor(center + radius - 0.5)
     first = dr.select(first < 0, 0, first)
     last = dr.select(last > size - 1, size - 1, last)
     visible = splats.visible & (first.x <= last.x) & (first.y <= last.y)
@@ -205,7 +210,7 @@ def _tile_box(splats: Splats2D, grid: TileGrid) -> list[Any]:
 
 
 def _make_entries(
-    first_entry: Any, rows: Any, width: int, num_entries: int, grid: TileGrid
+    first_entry: Any, rows: Any, width: int, num_entries: int, grid: TileGrid, model: ImageModel
 ) -> tuple[Any, Any]:
     """Of each entry its tile; and four numbers: rank, tile, mask of micro-tiles, 0."""
     t = types_of(type(rows))
@@ -216,7 +221,7 @@ def _make_entries(
     dr.scatter(starts, rank, start, start < end)
     rank = dr.prefix_reduce(dr.ReduceOp.Max, starts, exclusive=False)
 
-    numbers = load_row(rows, width, rank, end=BOX + GEOMETRY)
+    numbers = load_row(rows, width, rank, end=BOX + model.response.num_geometry)
     tile_x, tile_y, columns = (t.UInt32(number) for number in numbers[: BOX - 1])
     local = dr.arange(t.UInt32, max(num_entries, 1)) - dr.gather(t.UInt32, first_entry, rank)
     # Exact while a splat covers fewer than 2^22 tiles; an integer division by a varying number
@@ -225,7 +230,7 @@ def _make_entries(
     tile_x = tile_x + (local - row * columns)
     tile_y = tile_y + row
     tile = dr.fma(tile_y, dr.opaque(t.UInt32, grid.columns), tile_x)
-    mask = _touched_micros(numbers[BOX:], tile_x, tile_y, grid)
+    mask = _touched_micros(numbers[BOX:], tile_x, tile_y, grid, model)
     entries = interleave([rank, tile, mask, dr.zeros(t.UInt32, dr.width(tile))])
     dr.eval(tile, entries)
     return tile, entries
@@ -240,22 +245,26 @@ def _stable_order(keys: Any, bound: int) -> Any:
     return dr.detail.block_mkperm(keys, dr.width(keys), max(buckets, 2))
 
 
-def _touched_micros(geometry: list[Any], tile_x: Any, tile_y: Any, grid: TileGrid) -> Any:
+def _touched_micros(
+    geometry: list[Any], tile_x: Any, tile_y: Any, grid: TileGrid, model: ImageModel
+) -> Any:
     """Bit m is set where the ellipse alpha >= cut reaches a pixel centre of micro-tile m.
 
     |U d|^2 is convex, so its minimum over a rectangle that does not contain the mean lies on
     one of the (at most two) sides that face the mean: for such a side, one coordinate is given
     and the best other coordinate is clamped to the rectangle.
     """
-    mean_x, mean_y, p, r, s, log2_opacity = geometry
+    reach = _reach(geometry, grid, model)
+    mean_x, mean_y, p, r, s = model.response.outline(geometry, reach)
     t = types_of(type(mean_x))
-    reach = log2_opacity - LOG2_ALPHA_CUT + dr.opaque(t.Float, grid.cull_margin)
+    margin = model.positions.margin
     dx_per_dy = -r / p
     dy_per_dx = -(p * r) / dr.fma(r, r, s * s)
 
     def intervals(tile: Any, mean: Any) -> list[tuple[Any, Any]]:
-        first = dr.fma(t.Float(tile), TILE, 0.5) - mean
-        return [(first + MICRO * k, first + (MICRO * k + MICRO - 1)) for k in range(GRID)]
+        first = dr.fma(t.Float(tile), TILE, 0.5 - margin) - mean
+        size = MICRO - 1 + 2 * margin
+        return [(first + MICRO * k, first + (MICRO * k + size)) for k in range(GRID)]
 
     def exponent(dx: Any, dy: Any) -> Any:
         u = dr.fma(p, dx, r * dy)

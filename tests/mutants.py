@@ -30,6 +30,7 @@ from __future__ import annotations
 
 import ast
 import dataclasses
+import importlib
 import inspect
 import operator
 from collections.abc import Callable, Iterable
@@ -468,9 +469,16 @@ def _imports(tree: ast.Module) -> list[tuple[str, str]]:
 
 
 def _package_functions(tree: ast.Module) -> set[str]:
-    """Names of functions and methods that the module defines or has from its package."""
-    imported = {name for module, name in _imports(tree) if module.startswith("drgs")}
-    return imported | {name.rpartition(".")[2] for name in _definitions(tree)}
+    """Names of functions and methods that the module defines or has from its package.
+
+    Those of methods include all of the modules that it imports from.
+    """
+    ours = [(module, name) for module, name in _imports(tree) if module.startswith("drgs.")]
+    defined = set(_definitions(tree))
+    for module in {module for module, _ in ours}:
+        source = inspect.getsource(importlib.import_module(module))
+        defined |= {name for name in _definitions(ast.parse(source)) if "." in name}
+    return {name for _, name in ours} | {name.rpartition(".")[2] for name in defined}
 
 
 def _reachable(tree: ast.Module, roots: Iterable[str]) -> set[str]:

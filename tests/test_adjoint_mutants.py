@@ -43,8 +43,13 @@ from helpers import (
 )
 from mutants import ALWAYS, AT_EQUALITY, NEGATED, NEVER, SCALED, Instrumented, Mutant, Switchboard
 
-from drgs import losses, rasterize, reference, rendering
+from drgs import image_model, losses, rasterize, reference, rendering
+from drgs.cutoffs import Cutoffs
 from drgs.gaussians import PARAMETER_NAMES
+
+STAGES = ("composite_adjoint", "composite_tangent")
+
+RESPONSE_DERIVATIVES = ("moments", "derivatives", "pack_tangents", "tangent")
 
 EQUIVALENT = {
     (
@@ -86,11 +91,12 @@ class _EqualsThresholds(test_rasterize.FlatScene):
 
 def _scene_at_thresholds() -> _EqualsThresholds:
     """In the middle pixel alpha equals the cut, then the clamp, and T the stop: 3/4 3/8 3/4."""
-    return _EqualsThresholds(**vars(test_rasterize.stack([0.25, 0.5, 0.25, 0.25], 3, 1, 2.0)))
+    scene = test_rasterize.stack([0.25, 0.5, 0.25, 0.25], 3, 1, 2.0)
+    cutoffs = Cutoffs(**{name.lower(): value for name, value in THRESHOLDS.items()})
+    return _EqualsThresholds(**{**vars(scene), "cutoffs": cutoffs})
 
 
-THRESHOLDS = {"ALPHA_CUT": 0.25, "LOG2_ALPHA_CUT": -2.0, "ALPHA_MAX": 0.5}
-THRESHOLDS["TRANSMITTANCE_STOP"] = 0.75 * 0.5 * 0.75
+THRESHOLDS = {"ALPHA_CUT": 0.25, "ALPHA_MAX": 0.5, "TRANSMITTANCE_STOP": 0.75 * 0.5 * 0.75}
 
 
 def _flat_scene() -> test_rasterize.FlatScene:
@@ -223,9 +229,28 @@ def outcome():
         rendering,
         derivatives=["render_adjoint", "render_tangent"],
         forward=["render", "Frame.planes"],
-        composite_adjoint=kernels["composite_adjoint"],
-        composite_tangent=kernels["composite_tangent"],
     )
+    model = Instrumented(
+        board,
+        image_model,
+        derivatives=[
+            "ImageModel.footprint",
+            "ImageModel.alphas",
+            *(f"AffineResponse.{name}" for name in RESPONSE_DERIVATIVES),
+            *(f"PixelCenters.{name}" for name in ("sum", "sum_dx", "sum_dy", "sum_dy_dy")),
+            *(f"SplatFeatures.{name}" for name in ("add_derivatives", "tangents")),
+        ],
+        forward=["ImageModel.footprint", "ImageModel.alphas"],
+    )
+
+    def on_instrumented_model(name):
+        def run(bins, *arguments):
+            copy = model["ImageModel"](cutoffs=bins.model.cutoffs)
+            return kernels[name](replace(bins, model=copy), *arguments)
+
+        return run
+
+    stages = {name: on_instrumented_model(name) for name in STAGES}
     # All of the loss: its forward pass evaluates the partial derivatives, too.
     loss = Instrumented(
         board,
@@ -237,10 +262,8 @@ def outcome():
     def at_thresholds(check):
         def run():
             with pytest.MonkeyPatch.context() as patch:
-                for namespace in (vars(rasterize), vars(reference), kernels.namespace):
-                    for name, value in THRESHOLDS.items():
-                        if name in namespace:
-                            patch.setitem(namespace, name, value)
+                for name, value in THRESHOLDS.items():
+                    patch.setattr(reference, name, value)
                 check()
 
         return run
@@ -248,7 +271,8 @@ def outcome():
     with pytest.MonkeyPatch.context() as patch:
         for module, names, copy in (
             (rendering, ("render_adjoint", "render_tangent"), chain),
-            (test_rasterize, ("composite_adjoint", "composite_tangent"), kernels),
+            (test_rasterize, STAGES, stages),
+            (rendering, STAGES, stages),
             (test_losses, ("PhotometricLoss", "l1_loss"), loss),
         ):
             for name in names:
@@ -333,9 +357,11 @@ def test_every_detector_notices_a_mutant(outcome):
 def test_derivatives_have_mutants(outcome):
     """Of these at least; what belongs to the derivative is found by who calls whom."""
     expected = """
-        rasterize.composite_adjoint rasterize._adjoint_step rasterize._moments
-        rasterize._sum_slots rasterize.composite_tangent rasterize._pack_tangents
-        rasterize._footprint_tangent rendering.render_adjoint rendering.render_tangent
+        rasterize.composite_adjoint rasterize._adjoint_step rasterize._sum_slots
+        rasterize.composite_tangent rasterize._pack_tangents image_model.AffineResponse.moments
+        image_model.AffineResponse.derivatives image_model.AffineResponse.tangent
+        image_model.AffineResponse.pack_tangents image_model.SplatFeatures.add_derivatives
+        image_model.PixelCenters.sum_dx rendering.render_adjoint rendering.render_tangent
         rendering._differentiable rendering._as_tensors losses._ssim_and_partials
         losses._assemble_gradient losses._PhotometricOp.backward losses._PhotometricOp.forward
         losses.l1_loss

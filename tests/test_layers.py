@@ -10,9 +10,20 @@ import pytest
 from conftest import REPOSITORY
 
 LAYERS = {
-    0: ["_plugin_path", "arrays", "checks", "config", "constants", "files", "llvm", "reference"],
+    0: [
+        "_plugin_path",
+        "arrays",
+        "checks",
+        "config",
+        "constants",
+        "cutoffs",
+        "files",
+        "llvm",
+        "reference",
+        "reference_rays",
+    ],
     1: ["camera", "data", "gaussians", "io", "pictures", "viewpoints"],
-    2: ["projection", "rasterize", "sh", "tiles"],
+    2: ["image_model", "lanes", "projection", "rasterize", "sh", "tiles"],
     3: ["rendering"],
     4: [
         "checkpoint",

@@ -1,7 +1,7 @@
 """Compositing, its adjoint and its tangent against the float64 reference, stage alone."""
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import drjit as dr
 import numpy as np
@@ -17,8 +17,11 @@ from helpers import (
     single,
 )
 
-from drgs import rasterize, reference
+from drgs import image_model, rasterize, reference
+from drgs import lanes as lanes_module
 from drgs.constants import WHITENING_SCALE
+from drgs.cutoffs import Cutoffs
+from drgs.image_model import ImageModel
 from drgs.projection import Splats2D
 from drgs.rasterize import (
     SplatGradients,
@@ -48,6 +51,7 @@ class FlatScene:
     depths: np.ndarray  # (N,)
     width: int
     height: int
+    cutoffs: Cutoffs = field(default_factory=Cutoffs)
 
     @property
     def conics(self) -> np.ndarray:
@@ -145,7 +149,8 @@ class FlatScene:
 
     def composite(self, precision):
         columns = [precision.array(column) for column in self.features.T]
-        bins = bin_splats(self.splats(precision), TileGrid(self.width, self.height), columns)
+        grid, model = TileGrid(self.width, self.height), ImageModel(cutoffs=self.cutoffs)
+        bins = bin_splats(self.splats(precision), grid, columns, model)
         records = rasterize.Records.of(bins, bins.splats)
         return bins, records, composite(bins, records)
 
@@ -278,9 +283,11 @@ def random_tangents(scene, seed=5) -> dict[str, np.ndarray]:
 
 def kernel_tangents(scene, precision, tangents) -> dict[str, np.ndarray]:
     direction = SplatGradients(
-        precision.vectors(tangents["means2d"]),
-        precision.vectors(tangents["whitening"]),
-        precision.array(tangents["opacities"]),
+        [
+            *precision.vectors(tangents["means2d"]),
+            *precision.vectors(tangents["whitening"]),
+            precision.array(tangents["opacities"]),
+        ],
         [precision.array(column) for column in tangents["features"].T],
     )
     return scene.as_images(composite_tangent(*scene.composite(precision), direction).planes())
@@ -474,7 +481,7 @@ def test_memory_that_was_never_written_is_never_read(precision):
 def test_short_exp2_is_accurate_to_single_precision():
     x = np.linspace(-126, 127, 2_000_001).astype(np.float32)
     x = np.concatenate([x, np.float32([-126, -0.5, 0.5, 0, 127, -1e-30, -125.5])])
-    actual = np.array(rasterize._exp2_short(FLOAT32.Float(x))).astype(np.float64)
+    actual = np.array(image_model.exp2_short(FLOAT32.Float(x))).astype(np.float64)
     exact = np.exp2(x.astype(np.float64))
     assert np.abs(actual / exact - 1).max() < 2.2e-7
 
@@ -482,7 +489,7 @@ def test_short_exp2_is_accurate_to_single_precision():
 @pytest.mark.parametrize("size", [(1, 1), (37, 29), (64, 48), (160, 16), (100, 90)])
 def test_lanes_visit_every_micro_tile_once(size):
     grid = TileGrid(*size)
-    lanes = rasterize._make_lanes(FLOAT32.Float, grid)
+    lanes = lanes_module.make_lanes(FLOAT32.Float, grid)
     micro_tile, micro, tile, x, y = (
         np.array(getattr(lanes, name)).astype(int)
         for name in ("micro_tile", "micro", "tile", "x", "y")
@@ -533,20 +540,20 @@ def test_slots_are_a_numbering_of_the_composited_pairs(precision):
                 found[micro, entry] = first + bin(word & ((1 << entry % 32) - 1)).count("1")
     assert list(found.values()) == list(range(slots.count)) and slots.count > 0
 
-    lanes = rasterize._make_lanes(precision.Float, bins.grid)
+    lanes = lanes_module.make_lanes(precision.Float, bins.grid)
     lane_stop = dr.gather(dr.llvm.ad.UInt32, layers.stop, lanes.micro_tile)
-    number = np.array(slots.number(rasterize._Entries(bins, lanes, lane_stop)))
+    number = np.array(slots.number(lanes_module.Entries(bins, lanes, lane_stop)))
     begins = np.searchsorted(tiles[: bins.num_entries], np.arange(bins.grid.num_tiles))
     expected = [
         sum(1 for m, entry in found if m == micro and begins[tile] <= entry < stop[tile, micro])
         for tile, micro in zip(np.array(lanes.tile), np.array(lanes.micro), strict=True)
     ]
     np.testing.assert_array_equal(number, expected)
-    counted = rasterize._count_entries(rasterize._Entries(bins, lanes, lane_stop))
+    counted = lanes_module.count_entries(lanes_module.Entries(bins, lanes, lane_stop))
     np.testing.assert_array_equal(counted, expected)
     assert len(set(expected)) > 3
-    similar = rasterize._similar_together(
-        lanes, slots.number(rasterize._Entries(bins, lanes, lane_stop))
+    similar = lanes_module.similar_together(
+        lanes, slots.number(lanes_module.Entries(bins, lanes, lane_stop))
     )
     np.testing.assert_array_equal(np.sort(similar.micro_tile), np.sort(lanes.micro_tile))
     assert slots.count < sum(bin(mask).count("1") for mask in masks), "some pairs are behind a stop"

@@ -7,9 +7,9 @@ from typing import Any
 
 import drjit as dr
 
-from drgs import rasterize
 from drgs.arrays import types_of
-from drgs.rasterize import MICRO, PIXELS
+from drgs.image_model import PIXELS
+from drgs.lanes import Entries, load_lane_row, make_lanes
 from drgs.rendering import Frame
 
 
@@ -27,18 +27,17 @@ def count_work(frame: Frame) -> Work:
     """Count by walking the entries once more."""
     bins, layers = frame.bins, frame.layers
     t = types_of(type(bins.rows))
-    lanes = rasterize._make_lanes(t.Float, bins.grid)
+    lanes = make_lanes(t.Float, bins.grid)
     stop = dr.gather(t.UInt32, layers.stop, lanes.micro_tile)
-    entries = rasterize._Entries(bins, lanes, stop)
-    ends = rasterize._load_row(layers.ends, lanes.micro_tile, 1)
+    entries = Entries(bins, lanes, stop)
+    ends = load_lane_row(layers.ends, lanes.micro_tile, 1)
+    model = bins.model.bind(lanes, bins.grid)
 
     def body(cursor: Any, visited: Any, useful: Any) -> tuple:
         entry, active = entries.current(cursor)
         geometry, _ = frame.records.load(entry, active)
-        footprint = rasterize._Footprint.of(geometry, lanes, active)
-        for pixel in range(PIXELS):
-            row, column = divmod(pixel, MICRO)
-            alpha = rasterize._Alpha.at(footprint.log2_alpha[row][column], dr.exp2)
+        footprint = model.footprint(geometry, lanes, active)
+        for pixel, alpha in enumerate(model.alphas(geometry, footprint)):
             useful = useful + dr.select((alpha.value > 0) & (entry < ends[pixel]), t.UInt32(1), 0)
         return entries.advance(cursor), visited + dr.select(active, t.UInt32(1), 0), useful
 
