@@ -136,10 +136,41 @@ class ModelConfig(_Section):
     sh_increase_every: Count = Field(
         1000, ge=1, description="Iterations between +1 of the degree in use, which starts at 0."
     )
+    near: float = Field(0.2, gt=0, description="Near plane, scene units: closer means are culled.")
+    projection: Literal["ewa", "unscented", "exact"] = Field(
+        "ewa",
+        description="ewa: the affine approximation at the mean; unscented: of projected sigma "
+        "points; exact: the peak of the 3D Gaussian along each pixel's ray.",
+    )
+    order: Literal["center", "pixel"] = Field(
+        "center",
+        description="center: splats are ordered by the depth of their means; pixel: by that of "
+        "their peaks along each pixel's ray.",
+    )
+    order_window: int = Field(
+        4, ge=1, le=64, description="Of order pixel: splats that a pixel keeps waiting."
+    )
+    sh_direction: Literal["mean", "pixel"] = Field(
+        "mean", description="Where colours are seen from: towards the mean, or along each ray."
+    )
+    alpha_max: float = Field(0.99, gt=0, lt=1, description="Upper clamp of a splat's alpha.")
+    alpha_cut: float = Field(
+        1 / 255, ge=0, lt=1, description="Splats end where their alpha is smaller; 0: they do not."
+    )
+    transmittance_stop: float = Field(
+        1e-4, ge=0, lt=1, description="A pixel ends before its transmittance is smaller; 0: never."
+    )
+    extent: float | None = Field(
+        None,
+        gt=0,
+        description="Standard deviations at which splats end; null: where alpha_cut ends them.",
+    )
+    low_pass: float = Field(
+        0.3, ge=0, description="px^2 added to the variance of a splat on the film; 0: none."
+    )
     antialiased: bool = Field(
         False, description="Compensate opacities for the low-pass filter (Yu et al. 2024)."
     )
-    near: float = Field(0.2, gt=0, description="Near plane, scene units: closer means are culled.")
 
 
 class OptimizerConfig(_Section):

@@ -30,6 +30,10 @@ LOW_PASS = 0.3
 """px^2 added to the diagonal of the projected covariance (3DGS reference rasterizer): every
 splat is at least about a pixel wide. It also bounds the conic by 1 / LOW_PASS."""
 
+LEAST_LOW_PASS = 1e-18
+"""px^2: what is left of the low-pass where it is switched off. A splat is at least a billionth of a
+pixel wide, so that the conic of a flat one stays finite, also squared and times a film's width."""
+
 TAN_CLAMP = 0.3
 """In the projection's Jacobian only, x/z and y/z are clamped to the frustum widened by this
 fraction of its half extents on each side (1.3 times the half extents for a centred principal

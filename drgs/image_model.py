@@ -94,6 +94,11 @@ class PixelCenters:
     margin: ClassVar[float] = 0.0
     """px: how far from its centre a pixel may be evaluated."""
 
+    def points(self, lanes: Any, Float: type) -> list[tuple[Any, Any]]:
+        """x and y (px) of the 16 pixels."""
+        x, y = Float(lanes.x) + 0.5, Float(lanes.y) + 0.5
+        return [(x + i, y + j) for j in range(MICRO) for i in range(MICRO)]
+
     def offsets(self, lanes: Any, mean_x: Any, mean_y: Any) -> tuple[list, list]:
         """Grids of x and y, from the splat's mean to the pixels, px."""
         t = types_of(type(mean_x))
@@ -104,11 +109,11 @@ class PixelCenters:
 
     def sum(self, values: list[Any]) -> Any:
         """Of 16 values."""
-        return _sum(self._rows(values))
+        return total(self._rows(values))
 
     def sum_dx(self, values: list[Any], dx: list) -> Any:
         """Of values times dx: dx is shared by a column, so columns are summed first."""
-        columns = [_sum([values[MICRO * j + i] for j in range(MICRO)]) for i in range(MICRO)]
+        columns = [total([values[MICRO * j + i] for j in range(MICRO)]) for i in range(MICRO)]
         return _dot(columns, dx[0])
 
     def sum_dy(self, values: list[Any], dy: list) -> Any:
@@ -127,14 +132,14 @@ class PixelCenters:
 
     @staticmethod
     def _rows(values: list[Any]) -> list[Any]:
-        return [_sum(values[MICRO * j : MICRO * j + MICRO]) for j in range(MICRO)]
+        return [total(values[MICRO * j : MICRO * j + MICRO]) for j in range(MICRO)]
 
 
 def _first_of_rows(rows: list) -> list[Any]:
     return [row[0] for row in rows]
 
 
-def _sum(values: list[Any]) -> Any:
+def total(values: list[Any]) -> Any:
     """Pairwise: the shortest chain of dependent additions."""
     while len(values) > 1:
         values = [a + b for a, b in zip(values[::2], values[1::2], strict=True)]
@@ -142,10 +147,10 @@ def _sum(values: list[Any]) -> Any:
 
 
 def _dot(a: list[Any], b: list[Any]) -> Any:
-    total = a[0] * b[0]
+    result = a[0] * b[0]
     for x, y in zip(a[1:], b[1:], strict=True):
-        total = dr.fma(x, y, total)
-    return total
+        result = dr.fma(x, y, result)
+    return result
 
 
 # ----------------------------------------------------------------------------------------------
@@ -287,9 +292,9 @@ class SplatFeatures:
         del camera
         return self
 
-    def bind(self, lanes: Any, grid: Any) -> SplatFeatures:
-        """For the lanes of one kernel: nothing has to be loaded."""
-        del lanes, grid
+    def bind(self, lanes: Any, positions: Any) -> SplatFeatures:
+        """For the lanes of one kernel: nothing depends on where the pixels are."""
+        del lanes, positions
         return self
 
     def at(self, stored: list[Any], pixel: int) -> list[Any]:
@@ -326,10 +331,11 @@ class ImageModel:
 
     def bind(self, lanes: Any, grid: Any) -> ImageModel:
         """This model for the lanes of one kernel: loads what a lane needs before its loop."""
+        positions = self.positions.bind(lanes, grid)
         return ImageModel(
             response=self.response,
-            positions=self.positions.bind(lanes, grid),
-            features=self.features.bind(lanes, grid),
+            positions=positions,
+            features=self.features.bind(lanes, positions),
             cutoffs=self.cutoffs,
         )
 

@@ -11,8 +11,9 @@ How a Gaussian's shape comes to the film is a function, :func:`ewa` or one of an
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import combinations
 from typing import Any
 
 import drjit as dr
@@ -20,7 +21,7 @@ import drjit as dr
 from drgs import sh
 from drgs.arrays import types_of
 from drgs.camera import Camera
-from drgs.constants import LOW_PASS, TAN_CLAMP
+from drgs.constants import LEAST_LOW_PASS, LOW_PASS, TAN_CLAMP
 from drgs.cutoffs import Cutoffs
 from drgs.gaussians import Gaussians
 
@@ -123,6 +124,7 @@ def project(
     in_front = z >= camera.near
     # A masked lane must not divide by zero: 0 * inf would poison the gradient of its neighbours.
     z = dr.select(in_front, z, 1)
+    low_pass = max(low_pass, LEAST_LOW_PASS)
     film = (shape or ewa)(rows, camera, t.Array3f(x, y, z), low_pass)
     opacities = opacity_rule(_sigmoid(rows.logit_opacities), film.sharp, film.added)
     colors = (color or color_at_mean)(rows, offset, sh_degree)
@@ -148,7 +150,7 @@ def ewa(rows: GaussianRows, camera: Camera, position: Any, low_pass: float) -> F
     covariance on the film is M M^T + low_pass I.
     """
     m0, m1, _ = film_axes(rows, camera, position, clamped_slopes(camera, position))
-    return whiten(film_point(camera, position), m0, m1, low_pass)
+    return whiten(film_point(camera, position), [*m0], [*m1], low_pass)
 
 
 def film_point(camera: Camera, position: Any) -> Any:
@@ -157,26 +159,36 @@ def film_point(camera: Camera, position: Any) -> Any:
     return camera.focal * types_of(type(z)).Array2f(x, y) / z + camera.principal
 
 
-def whiten(means2d: Any, m0: Any, m1: Any, low_pass: float) -> FilmShape:
+def whiten(means2d: Any, m0: Sequence[Any], m1: Sequence[Any], low_pass: float) -> FilmShape:
     """The shape of a Gaussian whose covariance on the film is M M^T + low_pass I.
 
-    m0, m1: the rows of M, vectors of the same length, px.
+    m0, m1: the rows of M, equally many numbers, px.
     """
-    xx, xy, yy = dr.dot(m0, m0), dr.dot(m0, m1), dr.dot(m1, m1) + low_pass
+    xx, xy, yy = dot(m0, m0), dot(m0, m1), dot(m1, m1) + low_pass
     # U needs det / yy, the variance of x where y is given. det(M M^T) is the sum of the squared
     # 2x2 minors of M (Cauchy-Binet): never negative and free of the cancellation of
     # xx yy - xy^2. Its minors are divided by sqrt(yy) first, or the square of a giant's overflows.
     s = dr.rsqrt(yy)
-    minors = dr.cross(m0, m1 * s)
-    sharp, added = dr.dot(minors, minors), low_pass * (xx / yy + 1)
+    m1 = [component * s for component in m1]
+    minors = [dr.fma(m0[i], m1[j], -(m0[j] * m1[i])) for i, j in combinations(range(len(m0)), 2)]
+    sharp, added = dot(minors, minors), low_pass * (xx / yy + 1)
     p = dr.rsqrt(sharp + added)
+    t = types_of(type(s))
     return FilmShape(
         means2d=means2d,
-        whitening=type(m0)(p, -p * (xy / yy), s),
-        variances=types_of(type(s)).Array2f(xx + low_pass, yy),
+        whitening=t.Array3f(p, -p * (xy / yy), s),
+        variances=t.Array2f(xx + low_pass, yy),
         sharp=sharp,
         added=added,
     )
+
+
+def dot(a: Sequence[Any], b: Sequence[Any]) -> Any:
+    """The inner product of two vectors of the same length."""
+    total = a[0] * b[0]
+    for x, y in zip(a[1:], b[1:], strict=True):
+        total = dr.fma(x, y, total)
+    return total
 
 
 def color_at_mean(rows: GaussianRows, offset: Any, sh_degree: int) -> Any:

@@ -102,7 +102,7 @@ class Layers:
         return [dr.gather(t.Float, self.values, index + PIXELS * k) for k in range(1 + self.count)]
 
 
-def _step(transmittance: Any, alpha: Any, stop: float) -> tuple[Any, Any, Any]:
+def composite_step(transmittance: Any, alpha: Any, stop: float) -> tuple[Any, Any, Any]:
     """Composite one alpha: (weight, next transmittance, whether the pixel goes on).
 
     stop: the last transmittance that a pixel may have.
@@ -175,7 +175,7 @@ def composite(bins: TileBins, records: Records) -> Layers:
         T, C, ends = list(T), [list(c) for c in C], list(ends)
         behind = dr.select(active, entry + 1, entry)
         for pixel, alpha in enumerate(model.alphas(geometry, footprint)):
-            weight, T[pixel], goes_on = _step(T[pixel], alpha.value, stop)
+            weight, T[pixel], goes_on = composite_step(T[pixel], alpha.value, stop)
             ends[pixel] = dr.select(goes_on, behind, ends[pixel])
             for k, c in enumerate(model.features.at(features, pixel)):
                 C[k][pixel] = dr.fma(weight, c, C[k][pixel])
@@ -198,7 +198,7 @@ def composite(bins: TileBins, records: Records) -> Layers:
     )
     dr.eval(T, C, ends)
     columns = [dr.abs(v) for v in T] + [v for plane in C for v in plane]
-    last = _largest(ends)
+    last = largest(ends)
     dr.eval(columns, last)
     return Layers(
         values=scatter_rows(columns, lanes.micro_tile, size),
@@ -210,14 +210,15 @@ def composite(bins: TileBins, records: Records) -> Layers:
 
 
 def _any_positive(values: list[Any]) -> Any:
-    return _largest(values) > 0
+    return largest(values) > 0
 
 
-def _largest(values: list[Any]) -> Any:
-    largest = values[0]
+def largest(values: list[Any]) -> Any:
+    """The largest of several numbers, lane by lane."""
+    result = values[0]
     for v in values[1:]:
-        largest = dr.select(v > largest, v, largest)
-    return largest
+        result = dr.select(v > result, v, result)
+    return result
 
 
 # ----------------------------------------------------------------------------------------------
@@ -249,7 +250,7 @@ class SplatGradients:
 
 
 @dataclass(frozen=True)
-class _Slots:
+class Slots:
     """Where each composited (entry, micro-tile) pair stores its partial derivatives.
 
     First come the pairs of all tiles' first micro-tiles, in the order of the sorted entries, then
@@ -278,7 +279,7 @@ class _Slots:
         return dr.select(entries.head == 0, 0, self.end(entries) - begin)
 
 
-def _assign_slots(bins: TileBins, layers: Layers) -> _Slots:
+def assign_slots(bins: TileBins, layers: Layers) -> Slots:
     """Number the slots. The host reads one value, how many there are."""
     t = types_of(type(bins.rows))
     entry = dr.arange(t.UInt32, dr.width(bins.masks))
@@ -304,7 +305,7 @@ def _assign_slots(bins: TileBins, layers: Layers) -> _Slots:
     group, micro = index // MICROS, index % MICROS
     pairs = interleave([dr.gather(t.UInt32, first, micro * groups + group), words])
     dr.eval(pairs)
-    return _Slots(pairs=pairs, composited=composited, count=count)
+    return Slots(pairs=pairs, composited=composited, count=count)
 
 
 def composite_adjoint(
@@ -321,7 +322,7 @@ def composite_adjoint(
     (cut, clamp, stop).
     """
     t = types_of(type(bins.rows))
-    slots = _assign_slots(bins, layers)
+    slots = assign_slots(bins, layers)
     lanes = make_lanes(t.Float, bins.grid)
     stop = dr.gather(t.UInt32, layers.stop, lanes.micro_tile)
     lanes = similar_together(lanes, slots.number(Entries(bins, lanes, stop)))
@@ -360,7 +361,7 @@ def composite_adjoint(
         body=body,
     )
     dr.eval(loop, partials)
-    return _sum_slots(bins, slots, partials, width)
+    return sum_slots(bins, slots, partials, width)
 
 
 def _adjoint_step(
@@ -398,13 +399,12 @@ def _adjoint_step(
     return T, R, d_log_alpha, d_stored
 
 
-def _sum_slots(bins: TileBins, slots: _Slots, partials: Any, width: int) -> SplatGradients:
+def sum_slots(bins: TileBins, slots: Slots, partials: Any, width: int) -> SplatGradients:
     """Add up the slots of each entry, the entries of each splat, and turn sums into derivatives.
 
     width: numbers in a slot.
     """
     t = types_of(type(bins.rows))
-    response = bins.model.response
     by_entry = _sum_entries(bins, slots, partials, width)
     rank = dr.arange(t.UInt32, dr.width(bins.order))
     begin, end = (dr.gather(t.UInt32, bins.first_entry, rank + k) for k in (0, 1))
@@ -419,6 +419,16 @@ def _sum_slots(bins: TileBins, slots: _Slots, partials: Any, width: int) -> Spla
         cond=lambda entry, totals: entry < end,
         body=body,
     )
+    return splat_gradients(bins, totals)
+
+
+def splat_gradients(bins: TileBins, totals: list[Any]) -> SplatGradients:
+    """From each splat's sums, by rank, to its derivatives, by Gaussian.
+
+    totals: moments, and derivatives of the features.
+    """
+    t, response = types_of(type(bins.rows)), bins.model.response
+    rank = dr.arange(t.UInt32, dr.width(bins.order))
     geometry = bins.splats(rank)[: response.num_geometry]
     columns = response.derivatives(geometry, totals[: response.num_moments])
     columns += totals[response.num_moments :]
@@ -430,7 +440,7 @@ def _sum_slots(bins: TileBins, slots: _Slots, partials: Any, width: int) -> Spla
     return SplatGradients(geometry=row[:count], features=row[count:])
 
 
-def _sum_entries(bins: TileBins, slots: _Slots, partials: Any, width: int) -> Any:
+def _sum_entries(bins: TileBins, slots: Slots, partials: Any, width: int) -> Any:
     """Sums over the micro-tiles of each entry: rows of ``width`` numbers by unsorted entry."""
     t = types_of(type(bins.rows))
     entry = dr.arange(t.UInt32, max(bins.num_entries, 1))
@@ -479,7 +489,7 @@ def composite_tangent(
     entries = Entries(bins, lanes, dr.gather(t.UInt32, layers.stop, lanes.micro_tile))
     model = bins.model.bind(lanes, bins.grid)
     stop = model.cutoffs.transmittance_stop
-    d_records = _pack_tangents(bins, tangents)
+    d_records = pack_tangents(bins, tangents)
 
     def body(cursor: Cursor, T: list, dT: list, dC: list) -> tuple:
         entry, active = entries.current(cursor)
@@ -490,7 +500,7 @@ def composite_tangent(
         T, dT, dC = list(T), list(dT), [list(c) for c in dC]
         for pixel, alpha in enumerate(model.alphas(geometry, footprint)):
             before, d_before = dr.abs(T[pixel]), dT[pixel]
-            weight, T[pixel], goes_on = _step(T[pixel], alpha.value, stop)
+            weight, T[pixel], goes_on = composite_step(T[pixel], alpha.value, stop)
             d_alpha = dr.select(alpha.smooth, alpha.value * d_log_alpha[pixel], 0)
             d_weight = dr.select(goes_on, dr.fma(before, d_alpha, alpha.value * d_before), 0)
             dT[pixel] = d_before - d_weight
@@ -524,7 +534,7 @@ def composite_tangent(
     )
 
 
-def _pack_tangents(bins: TileBins, tangents: SplatGradients) -> Records:
+def pack_tangents(bins: TileBins, tangents: SplatGradients) -> Records:
     """The records' tangents: of the geometry as the response wants it, and of the features."""
     t = types_of(type(bins.rows))
     rank = dr.arange(t.UInt32, dr.width(bins.order))
@@ -535,6 +545,7 @@ def _pack_tangents(bins: TileBins, tangents: SplatGradients) -> Records:
     geometry = bins.splats(rank)[: bins.model.response.num_geometry]
     numbers = bins.model.response.pack_tangents(geometry, by_rank(tangents.geometry))
     numbers += by_rank(tangents.features)
+    numbers += [dr.zeros(t.Float, dr.width(rank))] * bins.num_keys  # they have no derivatives
     rows = pack_rows(numbers)
     dr.eval(rows)
     return Records.of(bins, partial(load_row, rows, len(numbers)))

@@ -141,9 +141,10 @@ def render(gaussians: Gaussians, camera: Camera, pipeline: Pipeline) -> Frame:
     columns = pipeline.feature_columns(splats)
     model = replace(pipeline.model, features=pipeline.model.features.seen_by(camera))
     grid = TileGrid(camera.width, camera.height)
-    bins = bin_splats(splats, grid, columns, model, pipeline.order.keys(splats))
+    order = pipeline.order
+    bins = bin_splats(splats, grid, columns, model, order.keys(splats))
     records = Records.of(bins, bins.splats)
-    layers = pipeline.order.composite(bins, records)
+    layers = order.composite(bins, records)
     return Frame(pipeline=pipeline, camera=camera, bins=bins, records=records, layers=layers)
 
 

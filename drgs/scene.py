@@ -8,12 +8,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
+from dataclasses import fields
 from typing import Any
 
 import mitsuba as mi
 import numpy as np
 
 from drgs.checks import UserError
+from drgs.choices import Choices
 from drgs.config import ModelConfig
 from drgs.data.types import View
 from drgs.gaussians import PARAMETER_NAMES, Gaussians
@@ -34,12 +36,19 @@ def make_scene(
     integrator = {
         "type": "splats",
         "background": list(background),
-        "antialiased": model.antialiased,
         "near": model.near,
+        **accuracy(model),
         "srgb_primitives": False,
         **tensors,
     }
     return mi.load_dict({"type": "scene", "integrator": integrator})
+
+
+def accuracy(model: ModelConfig) -> dict[str, Any]:
+    """The integrator's parameters that are choices of accuracy; those that are not default."""
+    default = ModelConfig()
+    names = [f.name for f in fields(Choices)]
+    return {n: getattr(model, n) for n in names if getattr(model, n) != getattr(default, n)}
 
 
 def make_sensors(views: Iterable[View]) -> list[mi.Sensor]:

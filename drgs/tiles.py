@@ -133,7 +133,7 @@ def bin_splats(
     num_entries = int(first_entry[num_splats])
 
     tile, entries = _make_entries(first_entry, rows, width, num_entries, grid, model)
-    source = _stable_order(tile, grid.num_tiles)
+    source = stable_order(tile, grid.num_tiles)
 
     padded = -(-max(num_entries, 1) // WORD) * WORD
     position = dr.arange(t.UInt32, padded)
@@ -142,7 +142,7 @@ def bin_splats(
     ranks, tiles, masks, _ = dr.gather(t.Array4u, entries, source, active)
     dr.eval(source, ranks, tiles, masks)
     words = transpose_masks(masks)
-    tile_start = _lower_bounds(tiles, num_entries, grid.num_tiles)
+    tile_start = lower_bounds(tiles, num_entries, grid.num_tiles)
     dr.eval(words, tile_start)
     return TileBins(
         order=order,
@@ -236,7 +236,7 @@ def _make_entries(
     return tile, entries
 
 
-def _stable_order(keys: Any, bound: int) -> Any:
+def stable_order(keys: Any, bound: int) -> Any:
     """The stable order of ``keys``, all below ``bound``: one pass with a bucket for each key.
 
     ``dr.argsort`` does not know the bound and needs three passes for 32 bits.
@@ -311,7 +311,7 @@ def transpose_masks(masks: Any) -> Any:
     return interleave(m)
 
 
-def _lower_bounds(sorted_tiles: Any, num_entries: int, num_tiles: int) -> Any:
+def lower_bounds(sorted_tiles: Any, num_entries: int, num_tiles: int) -> Any:
     """(num_tiles + 1,): the first sorted position whose tile is not smaller; binary search."""
     UInt32 = type(sorted_tiles)
     tile = dr.arange(UInt32, num_tiles + 1)

@@ -6,7 +6,7 @@ Executed once per Mitsuba variant (see ``drgs.plugins``). The rasterizer itself 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import drjit as dr
@@ -16,10 +16,10 @@ import numpy as np
 from drgs import rendering
 from drgs.arrays import from_host, interleave
 from drgs.camera import SensorState, camera_from_sensor, read_sensor
+from drgs.choices import Choices
 from drgs.constants import NEAR
 from drgs.gaussians import PARAMETER_NAMES, Gaussians
 from drgs.io.ply import read_ply
-from drgs.projection import compensated_opacity, plain_opacity
 
 SUPPORTED_VARIANTS = ("llvm_ad_rgb", "cuda_ad_rgb")
 
@@ -78,11 +78,6 @@ class SplatsIntegrator(mi.CppADIntegrator):
        - Constant colour behind the splats, in display space (sRGB-encoded). (Default: black)
        - |exposed|, |differentiable|
 
-     * - antialiased
-       - |bool|
-       - Scales opacities so that the low-pass filter keeps each splat's integral, as in
-         Mip-Splatting. (Default: |false|)
-
      * - near
        - |float|
        - Gaussians whose centre is closer than this are culled. The sensor's ``near_clip``
@@ -93,6 +88,44 @@ class SplatsIntegrator(mi.CppADIntegrator):
        - Splat colours live in display space. If true, the image is converted to linear
          radiance, which is what Mitsuba's films expect. If false, it is returned in display
          space, as splat trainers and viewers use it. (Default: |true|)
+
+     * - projection
+       - |string|
+       - How a Gaussian comes to the film: ``ewa``, by the affine approximation at its mean;
+         ``unscented``, by the mean and covariance of projected sigma points; ``exact``, by its
+         peak along each pixel's ray. (Default: ``ewa``)
+
+     * - order
+       - |string|
+       - ``center``: splats are composited in the order of their means' depths; ``pixel``: in
+         that of their peaks along each pixel's ray. (Default: ``center``)
+
+     * - order_window
+       - |int|
+       - Splats that a pixel keeps waiting to put them in order, for ``pixel``. (Default: 4)
+
+     * - sh_direction
+       - |string|
+       - ``mean``: colours are seen in the direction of the mean; ``pixel``: of each pixel's ray.
+         (Default: ``mean``)
+
+     * - alpha_max, alpha_cut, transmittance_stop
+       - |float|
+       - Upper clamp of a splat's alpha; the alpha below which it ends; the transmittance below
+         which a pixel ends. The last two may be 0. (Default: 0.99, 1/255, 1e-4)
+
+     * - extent
+       - |float|
+       - Standard deviations at which splats end. (Default: where ``alpha_cut`` ends them)
+
+     * - low_pass
+       - |float|
+       - Variance that is added to each splat on the film, in square pixels. (Default: 0.3)
+
+     * - antialiased
+       - |bool|
+       - Scales opacities so that the low-pass filter keeps each splat's integral, as in
+         Mip-Splatting. (Default: |false|)
 
      * - means, quats, log_scales, logit_opacities, sh0, shN
        - |tensor|
@@ -147,7 +180,7 @@ class SplatsIntegrator(mi.CppADIntegrator):
             setattr(self, name, getattr(gaussians, name))
         self.sh_degree = props.get("sh_degree", gaussians.sh_degree)
         self.background = _color(props, "background", 0.0)
-        self.antialiased = _boolean(props, "antialiased", False)
+        self.choices = _choices(props)
         self.near = _positive(props, "near", NEAR)
         self.srgb_primitives = _boolean(props, "srgb_primitives", True)
 
@@ -197,10 +230,7 @@ class SplatsIntegrator(mi.CppADIntegrator):
     @property
     def pipeline(self) -> rendering.Pipeline:
         """What this integrator's settings call for."""
-        return rendering.Pipeline(
-            sh_degree=self.sh_degree,
-            opacity_rule=compensated_opacity if self.antialiased else plain_opacity,
-        )
+        return self.choices.pipeline(self.sh_degree)
 
     def aov_names(self) -> list[str]:
         """No output variables besides colour and alpha."""
@@ -213,10 +243,10 @@ class SplatsIntegrator(mi.CppADIntegrator):
             f"  gaussians = {self.gaussians.num_gaussians},\n"
             f"  sh_degree = {self.sh_degree},\n"
             f"  background = {self.background},\n"
-            f"  antialiased = {self.antialiased},\n"
             f"  near = {self.near},\n"
-            f"  srgb_primitives = {self.srgb_primitives}\n"
-            f"]"
+            f"  srgb_primitives = {self.srgb_primitives}"
+            + "".join(f",\n  {n} = {v}" for n, v in self.choices.others_than_default.items())
+            + "\n]"
         )
 
     # ------------------------------------------------------------------------------------------
@@ -493,6 +523,28 @@ def _positive(props: mi.Properties, name: str, default: float) -> float:
     if not (isinstance(value, int | float) and value > 0):
         raise ValueError(f"splats: {name} must be a positive number, got {value!r}")
     return float(value)
+
+
+_EXPECTED = {bool: "true or false", int: "an integer", float: "a number", str: "text"}
+
+
+def _choices(props: mi.Properties) -> Choices:
+    """The choices of accuracy among the parameters; of the types that the defaults have."""
+    values = {}
+    for field in fields(Choices):
+        if field.name in props:
+            value, expected = props[field.name], type(field.default)
+            if expected is float and type(value) is int:
+                value = float(value)
+            if type(value) is not expected:
+                raise TypeError(
+                    f"splats: {field.name} must be {_EXPECTED[expected]}, got {value!r}"
+                )
+            values[field.name] = value
+    try:
+        return Choices(**values)
+    except ValueError as error:
+        raise ValueError(f"splats: {error}") from None
 
 
 def _check_shapes(gaussians: Gaussians) -> None:

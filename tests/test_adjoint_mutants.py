@@ -357,8 +357,8 @@ def test_every_detector_notices_a_mutant(outcome):
 def test_derivatives_have_mutants(outcome):
     """Of these at least; what belongs to the derivative is found by who calls whom."""
     expected = """
-        rasterize.composite_adjoint rasterize._adjoint_step rasterize._sum_slots
-        rasterize.composite_tangent rasterize._pack_tangents image_model.AffineResponse.moments
+        rasterize.composite_adjoint rasterize._adjoint_step rasterize.sum_slots
+        rasterize.composite_tangent rasterize.pack_tangents image_model.AffineResponse.moments
         image_model.AffineResponse.derivatives image_model.AffineResponse.tangent
         image_model.AffineResponse.pack_tangents image_model.SplatFeatures.add_derivatives
         image_model.PixelCenters.sum_dx rendering.render_adjoint rendering.render_tangent

@@ -526,7 +526,7 @@ def test_slots_are_a_numbering_of_the_composited_pairs(precision):
     """Every pair that is composited has a slot of its own, and a lane's slots are contiguous."""
     scene = SCENES["opaque"]
     bins, _, layers = scene.composite(precision)
-    slots = rasterize._assign_slots(bins, layers)
+    slots = rasterize.assign_slots(bins, layers)
     composited = np.array(slots.composited)
     pairs = np.array(slots.pairs).astype(np.int64).reshape(-1, MICROS, 2)
     tiles, stop = np.array(bins.tiles), np.array(layers.stop).reshape(-1, MICROS)

@@ -1,6 +1,7 @@
 """From dataset views and Gaussians to Mitsuba objects that render the same picture."""
 
-from dataclasses import replace
+import math
+from dataclasses import fields, replace
 
 import drjit as dr
 import mitsuba as mi
@@ -12,7 +13,9 @@ from views import View as Perspective
 from views import image_of, pose, splats_before
 
 from drgs import reference
+from drgs.bench.scenes import bench_gaussians
 from drgs.checks import UserError
+from drgs.choices import Choices
 from drgs.config import ModelConfig
 from drgs.data.types import View
 from drgs.gaussians import PARAMETER_NAMES, Gaussians
@@ -180,3 +183,29 @@ def test_sensors_of_views_render_without_a_warning(capfd):
     scene = make_scene(make_gaussians(view), ModelConfig(), BACKGROUND)
     mi.render(scene, sensor=make_sensors([view])[0])
     assert "splats" not in "".join(capfd.readouterr())
+
+
+def test_choices_of_accuracy_reach_the_integrator():
+    """All of them; and the defaults of the configuration are those of the kernels."""
+    values = {
+        "projection": "exact",
+        "order": "pixel",
+        "order_window": 6,
+        "sh_direction": "pixel",
+        "alpha_max": 0.95,
+        "alpha_cut": 0.0,
+        "transmittance_stop": 0.01,
+        "extent": 3.0,
+        "low_pass": 0.1,
+        "antialiased": True,
+    }
+    assert set(values) == {field.name for field in fields(Choices)}
+    gaussians = bench_gaussians(5)
+    scene = make_scene(gaussians, ModelConfig(**values), (1.0, 1.0, 1.0))
+    assert scene.integrator().choices == Choices(**values)
+    scene = make_scene(gaussians, ModelConfig(), (1.0, 1.0, 1.0))
+    assert scene.integrator().choices == Choices()
+    default = {name: getattr(ModelConfig(), name) for name in values}
+    default["extent"] = math.inf
+    for name, value in vars(Choices()).items():
+        assert default[name] == (pytest.approx(value) if isinstance(value, float) else value), name

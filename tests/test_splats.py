@@ -3,7 +3,7 @@
 import gc
 import sys
 import weakref
-from dataclasses import replace
+from dataclasses import fields, replace
 from functools import cache
 
 import drjit as dr
@@ -26,6 +26,7 @@ from views import (
 
 import drgs  # noqa: F401  (registers the plugin)
 from drgs import reference, rendering
+from drgs.choices import Choices
 from drgs.gaussians import PARAMETER_NAMES, Gaussians
 from drgs.io.ply import write_ply
 
@@ -164,7 +165,6 @@ def test_xml_has_the_same_defaults_as_a_dictionary(tmp_path):
         "  gaussians = 40,\n"
         "  sh_degree = 2,\n"
         "  background = [[0, 0, 0]],\n"
-        "  antialiased = False,\n"
         "  near = 0.01,\n"
         "  srgb_primitives = True\n"
         "]"
@@ -924,8 +924,9 @@ def test_a_model_of_degree_zero_has_no_empty_parameter():
 def test_the_class_documents_every_parameter():
     integrator = mi.load_dict({"type": "splats", **tensors(Scene().gaussians)})
     documentation = type(integrator).__doc__
-    settings = ("filename", "sh_degree", "antialiased", "near", "srgb_primitives")
-    for name in (*settings, *ALL_PARAMETERS):
+    settings = ("filename", "sh_degree", "near", "srgb_primitives")
+    choices = [field.name for field in fields(Choices)]
+    for name in (*settings, *choices, *ALL_PARAMETERS):
         assert name in documentation, name
 
 
@@ -1062,15 +1063,48 @@ def test_a_parameter_written_in_place_is_rendered_again():
     assert np.abs(after - before).max() > 0.01 and np.array_equal(after, expected)
 
 
-@pytest.mark.parametrize("name, value", [("sh_degree", 0), ("near", 0.25), ("antialiased", True)])
-def test_a_changed_setting_is_rendered_again(name, value, renderings):
+@pytest.mark.parametrize(
+    "name, value, equivalent",
+    [
+        ("sh_degree", 0, {"sh_degree": 0}),
+        ("near", 0.25, {"near": 0.25}),
+        ("choices", Choices(antialiased=True), {"antialiased": True}),
+    ],
+)
+def test_a_changed_setting_is_rendered_again(name, value, equivalent, renderings):
     scene = Scene()
     loaded = scene.load()
     before = image_of(loaded)
     setattr(loaded.integrator(), name, value)
     after = image_of(loaded)
     assert len(renderings) == 2 and np.abs(after - before).max() > 0.01
-    assert np.array_equal(after, fresh_image(replace(scene, **{name: value})))
+    assert np.array_equal(after, fresh_image(replace(scene, **equivalent)))
+
+
+@pytest.mark.parametrize(
+    "choices",
+    [
+        {"projection": "exact", "order": "pixel", "sh_direction": "pixel"},
+        {"projection": "unscented", "extent": 2.5, "low_pass": 0},
+        {"alpha_max": 0.5, "alpha_cut": 0.05, "transmittance_stop": 0.1, "order_window": 2},
+    ],
+    ids=["rays", "unscented", "cuts"],
+)
+def test_choices_of_accuracy_are_parameters(choices):
+    """The picture and its gradients are those of the pipeline that these choices name."""
+    scene = Scene()
+    integrator = mi.load_dict({"type": "splats", **tensors(scene.gaussians), **choices})
+    values = {k: float(v) if k == "low_pass" else v for k, v in choices.items()}
+    assert integrator.choices == Choices(**values)
+    for name, value in values.items():
+        if value != getattr(Choices(), name):
+            assert f"  {name} = {value}" in str(integrator)
+    loaded = scene.load()
+    image = image_of(loaded, integrator=integrator)
+    expected = mi.load_dict({"type": "splats", **tensors(scene.gaussians)})
+    assert np.abs(image - image_of(loaded, integrator=expected)).max() > 1e-3
+    expected.choices = Choices(**values)
+    assert np.array_equal(image, image_of(loaded, integrator=expected))
 
 
 def test_a_changed_background_needs_no_new_frame_and_no_new_kernel(renderings):
@@ -1216,6 +1250,18 @@ REFUSED = {
     "antialiased a string": (
         {"antialiased": "no"},
         "TypeError: splats: antialiased must be true or false, got 'no'",
+    ),
+    "order_window a float": (
+        {"order_window": 3.5},
+        "TypeError: splats: order_window must be an integer, got 3.5",
+    ),
+    "an unknown projection": (
+        {"projection": "affine"},
+        "ValueError: splats: projection must be one of ewa, unscented, exact, got 'affine'",
+    ),
+    "a low-pass below zero": (
+        {"low_pass": -1},
+        "ValueError: splats: low_pass must be finite and not negative, got -1.0",
     ),
     "srgb_primitives a number": ({"srgb_primitives": 1}, "must be true or false, got 1"),
     "background a string": ({"background": "white"}, "splats: background must be an RGB colour"),
