@@ -148,6 +148,15 @@ def render(gaussians: Gaussians, camera: Camera, pipeline: Pipeline) -> Frame:
     return Frame(pipeline=pipeline, camera=camera, bins=bins, records=records, layers=layers)
 
 
+def render_again(frame: Frame, positions: Any) -> Frame:
+    """The same splats, in the same tiles, at other points of the pixels.
+
+    positions: within the margin of those that ``frame`` was rendered at.
+    """
+    bins = replace(frame.bins, model=replace(frame.bins.model, positions=positions))
+    return replace(frame, bins=bins, layers=frame.pipeline.order.composite(bins, frame.records))
+
+
 def render_adjoint(
     gaussians: Gaussians, frame: Frame, d_features: list[Any], d_transmittance: Any
 ) -> GaussianGradients:
@@ -161,6 +170,38 @@ def render_adjoint(
     gradients = frame.pipeline.order.adjoint(
         frame.bins, frame.records, frame.layers, d_features, d_transmittance
     )
+    return _gaussian_gradients(gaussians, frame, gradients)
+
+
+def frames_adjoint(
+    gaussians: Gaussians, frames: list[Frame], d_planes: list[list[Any]]
+) -> GaussianGradients:
+    """The same for a loss that depends on several frames of the same splats.
+
+    d_planes: of each frame, derivatives with respect to its planes.
+    """
+    total = None
+    for frame, (d_transmittance, *d_features) in zip(frames, d_planes, strict=True):
+        gradients = frame.pipeline.order.adjoint(
+            frame.bins, frame.records, frame.layers, d_features, d_transmittance
+        )
+        total = gradients if total is None else _sum(total, gradients)
+        if len(frames) > 1:
+            dr.eval(total)
+    return _gaussian_gradients(gaussians, frames[0], total)
+
+
+def _sum(a: SplatGradients, b: SplatGradients) -> SplatGradients:
+    return SplatGradients(
+        geometry=[x + y for x, y in zip(a.geometry, b.geometry, strict=True)],
+        features=[x + y for x, y in zip(a.features, b.features, strict=True)],
+    )
+
+
+def _gaussian_gradients(
+    gaussians: Gaussians, frame: Frame, gradients: SplatGradients
+) -> GaussianGradients:
+    """From the derivatives of the 2D splats to those of the parameters, by Dr.Jit."""
     rows = load_rows(gaussians, frame.pipeline.sh_degree)
     with dr.resume_grad():
         dr.enable_grad(rows)
@@ -200,6 +241,23 @@ def render_tangent(gaussians: Gaussians, frame: Frame, tangents: Gaussians) -> l
 
     Not differentiated: visibility, the order of the splats, the decisions of compositing.
     """
+    direction = _splat_tangents(gaussians, frame, tangents)
+    order = frame.pipeline.order
+    return order.tangent(frame.bins, frame.records, frame.layers, direction).planes()
+
+
+def frames_tangent(
+    gaussians: Gaussians, frames: list[Frame], tangents: Gaussians
+) -> list[list[Any]]:
+    """The same for the planes of several frames of the same splats."""
+    direction = _splat_tangents(gaussians, frames[0], tangents)
+    return [
+        f.pipeline.order.tangent(f.bins, f.records, f.layers, direction).planes() for f in frames
+    ]
+
+
+def _splat_tangents(gaussians: Gaussians, frame: Frame, tangents: Gaussians) -> SplatGradients:
+    """From a direction of the parameters to that of the 2D splats, by Dr.Jit."""
     rows = load_rows(gaussians, frame.pipeline.sh_degree)
     with dr.resume_grad():
         dr.enable_grad(rows)
@@ -212,9 +270,7 @@ def render_tangent(gaussians: Gaussians, frame: Frame, tangents: Gaussians) -> l
         columns = [dr.grad(output) for output in outputs]
     dr.eval(columns)
     count = frame.bins.model.response.num_geometry
-    direction = SplatGradients(geometry=columns[:count], features=columns[count:])
-    order = frame.pipeline.order
-    return order.tangent(frame.bins, frame.records, frame.layers, direction).planes()
+    return SplatGradients(geometry=columns[:count], features=columns[count:])
 
 
 def _differentiable(

@@ -6,7 +6,7 @@ Executed once per Mitsuba variant (see ``drgs.plugins``). The rasterizer itself 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import drjit as dr
@@ -14,10 +14,11 @@ import mitsuba as mi
 import numpy as np
 
 from drgs import rendering
-from drgs.arrays import from_host, interleave
+from drgs.arrays import interleave
 from drgs.camera import SensorState, camera_from_sensor, read_sensor
 from drgs.choices import Choices
 from drgs.constants import NEAR
+from drgs.exposure import CenterExposure
 from drgs.gaussians import PARAMETER_NAMES, Gaussians
 from drgs.io.ply import read_ply
 
@@ -26,20 +27,22 @@ SUPPORTED_VARIANTS = ("llvm_ad_rgb", "cuda_ad_rgb")
 
 @dataclass(frozen=True)
 class _Rendered:
-    """The last frame, and everything that it depends on: reused while nothing has changed."""
+    """The last frames, and everything that they depend on: reused while nothing has changed."""
 
-    frame: rendering.Frame
+    frames: list[rendering.Frame]  # one for each sample per pixel
     pipeline: rendering.Pipeline
+    exposure: Any  # key of the points that were sampled; None: pixel centres
     sensor: SensorState
     gaussians: Gaussians  # detached: holding them keeps their variable indices from being reused
 
     def matches(
-        self, pipeline: rendering.Pipeline, sensor: SensorState, gaussians: Gaussians
+        self, pipeline: rendering.Pipeline, exposure: Any, sensor: SensorState, gaussians: Gaussians
     ) -> bool:
-        """Whether rendering these would give the same frame."""
+        """Whether rendering these would give the same frames."""
         indices = dr.detail.collect_indices
         return (
             self.pipeline == pipeline
+            and self.exposure == exposure
             and self.sensor.host == sensor.host
             and indices(self.sensor.device) == indices(sensor.device)
             and indices(self.gaussians) == indices(gaussians)
@@ -136,10 +139,11 @@ class SplatsIntegrator(mi.CppADIntegrator):
 
     This integrator composites Gaussians front to back over each pixel (Kerbl et al. 2023, "3D
     Gaussian Splatting for Real-Time Radiance Field Rendering"). It ignores the scene's shapes
-    and emitters. It evaluates each pixel once, at its centre: one sample per pixel and a
-    ``box`` filter are what it computes, other settings are accepted with a warning.
-
-    Both the picture and the gradients are the same to the last bit in every run.
+    and emitters. With one sample per pixel and a ``box`` filter it evaluates each pixel at its
+    centre, and both the picture and the gradients are the same to the last bit in every run. With
+    more samples or another filter, pixels are evaluated at the points that the sensor's sampler
+    chooses; ``low_pass`` may then be 0. With a ``box`` filter this, too, is the same in every run;
+    other filters add in an order of their own.
 
     As with Mitsuba's other integrators, a backward pass differentiates the scene as it is then:
     a parameter that was changed after ``mi.render()`` is differentiated at its new value. After
@@ -187,7 +191,6 @@ class SplatsIntegrator(mi.CppADIntegrator):
         self.last: LastBackward | None = None
         self._rendered: _Rendered | None = None
         self._film_maps: dict[str, np.ndarray] = {}  # by description of the film
-        self._warned = False
 
     # ------------------------------------------------------------------------------------------
     # Parameters
@@ -263,14 +266,13 @@ class SplatsIntegrator(mi.CppADIntegrator):
         evaluate: bool = True,
     ) -> mi.TensorXf:
         """Render the Gaussians as seen by ``sensor``; see ``mi.Integrator.render``."""
-        del seed
         sensor = _resolve_sensor(scene, sensor)
         with dr.suspend_grad():
-            self._warn_about_sampling(sensor, spp)
-            frame = self._frame(sensor)
-            film = sensor.film()
-            channels = self._channels(film, frame.planes(), self._detached_background())
-            image = _develop(film, channels)
+            exposure = self._exposure(sensor, seed, spp)
+            background = self._detached_background()
+            frames = self._frames(sensor, exposure)
+            channels = [self._channels(sensor.film(), f.planes(), background) for f in frames]
+            image = exposure.develop(channels)
             if evaluate:
                 dr.eval(image)
         return image if develop else mi.TensorXf()
@@ -289,27 +291,26 @@ class SplatsIntegrator(mi.CppADIntegrator):
         grad_in: derivative of the loss with respect to the developed image. Leaves
         :class:`LastBackward` in ``self.last``.
         """
-        del params, seed, spp
+        del params
         sensor = _resolve_sensor(scene, sensor)
         with dr.suspend_grad():
-            frame = self._frame(sensor)
-            planes, background = frame.planes(), self._detached_background()
+            exposure = self._exposure(sensor, seed, spp)
+            frames = self._frames(sensor, exposure)
+            planes, background = [f.planes() for f in frames], self._detached_background()
             dr.eval(planes)
-            d_channels = self._film_adjoint(sensor.film(), grad_in)
+            d_channels = exposure.adjoint(grad_in)
             # Colour conversion and background are a few operations per pixel, traced again and
             # differentiated by Dr.Jit.
             with dr.resume_grad():
                 dr.enable_grad(planes, background)
-                channels = self._channels(sensor.film(), planes, background)
-                for channel, derivative in zip(channels, d_channels, strict=True):
-                    dr.accum_grad(channel, derivative)
+                channels = [self._channels(sensor.film(), p, background) for p in planes]
+                dr.accum_grad(channels, d_channels)
                 dr.enqueue(dr.ADMode.Backward, channels)
                 dr.traverse(dr.ADMode.Backward)
-                d_transmittance, *d_features = dr.grad(planes)
-                d_background = dr.grad(background)
+                d_planes, d_background = dr.grad(planes), dr.grad(background)
             sensor.film().clear()  # as after any backward pass of Mitsuba's own integrators
-            dr.eval(d_transmittance, d_features, d_background)
-            gradients = rendering.render_adjoint(self.gaussians, frame, d_features, d_transmittance)
+            dr.eval(d_planes, d_background)
+            gradients = rendering.frames_adjoint(self.gaussians, frames, d_planes)
             self.last = LastBackward(
                 means2d_grad=_rows(gradients.means2d),
                 visible=gradients.visible,
@@ -329,24 +330,25 @@ class SplatsIntegrator(mi.CppADIntegrator):
         spp: int = 0,
     ) -> mi.TensorXf:
         """Directional derivative of the image along the gradients set on the parameters."""
-        del params, seed, spp
+        del params
         sensor = _resolve_sensor(scene, sensor)
         with dr.suspend_grad():
-            frame = self._frame(sensor)
+            exposure = self._exposure(sensor, seed, spp)
+            frames = self._frames(sensor, exposure)
             with dr.resume_grad():
                 tangents = Gaussians(
                     **{name: _tangent(getattr(self, name)) for name in PARAMETER_NAMES}
                 )
                 d_background = dr.grad(self.background)
-            d_planes = rendering.render_tangent(self.gaussians, frame, tangents)
-            planes, background = frame.planes(), self._detached_background()
+            d_planes = rendering.frames_tangent(self.gaussians, frames, tangents)
+            planes, background = [f.planes() for f in frames], self._detached_background()
             dr.eval(planes, d_planes)
             with dr.resume_grad():
                 dr.enable_grad(planes, background)
                 dr.set_grad(planes, d_planes)
                 dr.set_grad(background, d_background)
-                film = sensor.film()
-                image = _develop(film, self._channels(film, planes, background))
+                channels = [self._channels(sensor.film(), p, background) for p in planes]
+                image = exposure.develop(channels)
                 dr.forward_to(image)
                 d_image = dr.grad(image)
             sensor.film().clear()  # it holds the attached block
@@ -359,18 +361,32 @@ class SplatsIntegrator(mi.CppADIntegrator):
             "that samples single rays, such as 'moment' or 'aov'"
         )
 
-    def _frame(self, sensor: mi.Sensor) -> rendering.Frame:
-        """Render, or reuse the last frame if nothing that it depends on has changed.
+    def _exposure(self, sensor: mi.Sensor, seed: Any, spp: int) -> Any:
+        """Where the sensor's pixels are evaluated, and how its film develops them."""
+        spp = spp or sensor.sampler().sample_count()
+        if spp == 1 and sensor.film().rfilter().is_box_filter():
+            return CenterExposure(sensor.film(), self._film_maps)
+        from drgs.sampling import SampledExposure
+
+        return SampledExposure(sensor, seed, spp, self._film_maps)
+
+    def _frames(self, sensor: mi.Sensor, exposure: Any) -> list[rendering.Frame]:
+        """Render, or reuse the last frames if nothing that they depend on has changed.
 
         ``mi.render`` calls ``render`` and, later, ``render_backward`` on the same object, with
         other renders possibly in between.
         """
         pipeline, gaussians = self.pipeline, dr.detach(self.gaussians)
         state = read_sensor(sensor, self.near)
-        if self._rendered is None or not self._rendered.matches(pipeline, state, gaussians):
-            frame = rendering.render(gaussians, camera_from_sensor(state), pipeline)
-            self._rendered = _Rendered(frame, pipeline, state, gaussians)
-        return self._rendered.frame
+        last = self._rendered
+        if last is None or not last.matches(pipeline, exposure.key, state, gaussians):
+            camera = camera_from_sensor(state)
+            first, *others = exposure.positions
+            model = replace(pipeline.model, positions=first)
+            frame = rendering.render(gaussians, camera, replace(pipeline, model=model))
+            frames = [frame, *(rendering.render_again(frame, p) for p in others)]
+            self._rendered = _Rendered(frames, pipeline, exposure.key, state, gaussians)
+        return self._rendered.frames
 
     def _detached_background(self) -> mi.Color3f:
         """The background without gradients; no literal, or every colour would be a new kernel."""
@@ -391,76 +407,6 @@ class SplatsIntegrator(mi.CppADIntegrator):
         if mi.has_flag(film.flags(), mi.FilmFlags.Alpha):
             channels.append(1 - transmittance)
         return channels
-
-    def _film_adjoint(self, film: mi.Film, grad_in: mi.TensorXf) -> list[mi.Float]:
-        """Derivatives of the loss with respect to the channels, given those of the image.
-
-        A film develops each pixel by the same linear map, found once by developing unit images.
-        (The derivative of ``develop`` itself would be scattered by atomic additions.)
-        """
-        key = str(film)
-        if key not in self._film_maps:
-            self._film_maps[key] = _film_map(film)
-        matrix = self._film_maps[key]
-        pixel = dr.arange(mi.UInt32, grad_in.shape[0] * grad_in.shape[1])
-        developed = [
-            dr.gather(mi.Float, grad_in.array, pixel * len(matrix) + k) for k in range(len(matrix))
-        ]
-        return [
-            sum(
-                (float(weight) * d for weight, d in zip(column, developed, strict=True) if weight),
-                start=mi.Float(0),
-            )
-            for column in matrix.T
-        ]
-
-    def _warn_about_sampling(self, sensor: mi.Sensor, spp: int) -> None:
-        spp = spp or sensor.sampler().sample_count()
-        if self._warned or (spp == 1 and sensor.film().rfilter().is_box_filter()):
-            return
-        self._warned = True
-        mi.Log(
-            mi.LogLevel.Warn,
-            "splats: each pixel is evaluated once, at its centre; the sampler's sample count "
-            f"({spp}) and the film's reconstruction filter are not used. Set sample_count to 1 "
-            "and rfilter to 'box' to silence this warning.",
-        )
-
-
-def _develop(film: mi.Film, channels: list[mi.Float]) -> mi.TensorXf:
-    """Put the channels into ``film`` as one block of the whole image, and develop it.
-
-    A film reconstructs an image from blocks without filtering them again, so the picture is
-    exact whatever the film's filter.
-    """
-    weight = dr.ones(mi.Float, dr.width(channels[0]))
-    size = film.crop_size()
-    raw = mi.TensorXf(interleave([*channels, weight]), (size[1], size[0], len(channels) + 1))
-    film.prepare([])
-    film.put_block(mi.ImageBlock(raw, mi.ScalarPoint2i(film.crop_offset())))
-    return film.develop()
-
-
-def _film_map(film: mi.Film) -> np.ndarray:
-    """(developed channels, channels): the linear map that a film applies to each pixel."""
-    count = 4 if mi.has_flag(film.flags(), mi.FilmFlags.Alpha) else 3
-    num_pixels = film.crop_size()[0] * film.crop_size()[1]
-
-    def develop(channels: np.ndarray) -> np.ndarray:
-        planes = [from_host(mi.Float, plane) for plane in channels.T]
-        return np.array(_develop(film, planes)).reshape(num_pixels, -1)
-
-    unit = np.eye(count, dtype=np.float32)
-    units = [develop(np.tile(channel, (num_pixels, 1)))[0] for channel in unit]
-    matrix = np.stack(units, axis=1)
-    mixed = np.linspace(0.1, 2, num_pixels * count, dtype=np.float32).reshape(num_pixels, count)
-    linear = np.allclose(develop(mixed), mixed @ matrix.T, rtol=1e-3, atol=1e-4)
-    if not linear:
-        raise NotImplementedError(
-            f"splats: gradients through this film are not supported: {film} does not map each "
-            "pixel's channels linearly"
-        )
-    return matrix
 
 
 def _load_gaussians(props: mi.Properties) -> Gaussians:

@@ -361,7 +361,7 @@ def test_derivatives_have_mutants(outcome):
         rasterize.composite_tangent rasterize.pack_tangents image_model.AffineResponse.moments
         image_model.AffineResponse.derivatives image_model.AffineResponse.tangent
         image_model.AffineResponse.pack_tangents image_model.SplatFeatures.add_derivatives
-        image_model.PixelCenters.sum_dx rendering.render_adjoint rendering.render_tangent
+        image_model.PixelCenters.sum_dx rendering._gaussian_gradients rendering._splat_tangents
         rendering._differentiable rendering._as_tensors losses._ssim_and_partials
         losses._assemble_gradient losses._PhotometricOp.backward losses._PhotometricOp.forward
         losses.l1_loss

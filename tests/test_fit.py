@@ -95,6 +95,7 @@ def configuration(dataset):
         "init": {"num_points": 300, "half_extent": 1.0},
         "model": {"sh_degree": 1, "sh_increase_every": 100},
         "densify": {
+            "clone_scale": 0.03,
             "start": 60,
             "stop": 200,
             "every": 20,

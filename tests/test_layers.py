@@ -40,11 +40,13 @@ LAYERS = {
     4: [
         "checkpoint",
         "densify",
+        "exposure",
         "guards",
         "losses",
         "metrics",
         "optimizer",
         "output",
+        "sampling",
         "scene",
         "trainer",
     ],

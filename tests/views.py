@@ -76,7 +76,9 @@ class View:
         x, y, width, height = self.crop or (0, 0, self.width, self.height)
         return slice(y, y + height), slice(x, x + width)
 
-    def sensor(self, pixel_format="rgba", rfilter="box", samples=1, **film) -> dict:
+    def sensor(
+        self, pixel_format="rgba", rfilter="box", samples=1, sampler="independent", **film
+    ) -> dict:
         """The dictionary for ``mi.load_dict``."""
         if self.crop is not None:
             x, y, width, height = self.crop
@@ -101,7 +103,7 @@ class View:
                 "rfilter": {"type": rfilter},
                 **film,
             },
-            "sampler": {"type": "independent", "sample_count": samples},
+            "sampler": {"type": sampler, "sample_count": samples},
         }
 
 

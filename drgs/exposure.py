@@ -1,0 +1,99 @@
+"""How a film is exposed: where pixels are evaluated, and how an image comes of the values.
+
+Layer 4, between the integrator and Mitsuba's films. :class:`CenterExposure` evaluates each pixel
+once, at its centre. ``drgs.sampling`` has the other one, for several samples per pixel.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from drgs.arrays import from_host, interleave
+from drgs.image_model import PixelCenters
+
+Channels = list[Any]
+"""What a film gets of one pass, each Float (H * W,): red, green, blue, perhaps alpha."""
+
+
+class CenterExposure:
+    """Each pixel is evaluated once, at its centre. Exact for films whose filter is a box."""
+
+    positions = (PixelCenters(),)
+    key = None
+
+    def __init__(self, film: mi.Film, maps: dict[str, np.ndarray]) -> None:
+        """maps: remembers the linear maps of films, by their description."""
+        self.film, self.maps = film, maps
+
+    def develop(self, passes: Sequence[Channels]) -> mi.TensorXf:
+        """The image of one pass."""
+        (channels,) = passes
+        return develop_pixels(self.film, channels)
+
+    def adjoint(self, grad_in: mi.TensorXf) -> list[Channels]:
+        """Derivatives of the loss with respect to the channels, given those of the image."""
+        return [pixels_adjoint(self.film, self.maps, grad_in)]
+
+
+def develop_pixels(film: mi.Film, channels: Channels) -> mi.TensorXf:
+    """Put the channels into ``film`` as one block of the whole image, and develop it.
+
+    A film reconstructs an image from blocks without filtering them again, so the picture is
+    exact whatever the film's filter.
+    """
+    weight = dr.ones(mi.Float, dr.width(channels[0]))
+    size = film.crop_size()
+    raw = mi.TensorXf(interleave([*channels, weight]), (size[1], size[0], len(channels) + 1))
+    film.prepare([])
+    film.put_block(mi.ImageBlock(raw, mi.ScalarPoint2i(film.crop_offset())))
+    return film.develop()
+
+
+def pixels_adjoint(film: mi.Film, maps: dict[str, np.ndarray], grad_in: mi.TensorXf) -> Channels:
+    """The adjoint of :func:`develop_pixels`.
+
+    A film develops each pixel by the same linear map, found once by developing unit images.
+    (The derivative of ``develop`` itself would be scattered by atomic additions.)
+    """
+    key = str(film)
+    if key not in maps:
+        maps[key] = _film_map(film)
+    matrix = maps[key]
+    pixel = dr.arange(mi.UInt32, grad_in.shape[0] * grad_in.shape[1])
+    developed = [
+        dr.gather(mi.Float, grad_in.array, pixel * len(matrix) + k) for k in range(len(matrix))
+    ]
+    return [
+        sum(
+            (float(weight) * d for weight, d in zip(column, developed, strict=True) if weight),
+            start=mi.Float(0),
+        )
+        for column in matrix.T
+    ]
+
+
+def _film_map(film: mi.Film) -> np.ndarray:
+    """(developed channels, channels): the linear map that a film applies to each pixel."""
+    count = 4 if mi.has_flag(film.flags(), mi.FilmFlags.Alpha) else 3
+    num_pixels = film.crop_size()[0] * film.crop_size()[1]
+
+    def develop(channels: np.ndarray) -> np.ndarray:
+        planes = [from_host(mi.Float, plane) for plane in channels.T]
+        return np.array(develop_pixels(film, planes)).reshape(num_pixels, -1)
+
+    unit = np.eye(count, dtype=np.float32)
+    units = [develop(np.tile(channel, (num_pixels, 1)))[0] for channel in unit]
+    matrix = np.stack(units, axis=1)
+    mixed = np.linspace(0.1, 2, num_pixels * count, dtype=np.float32).reshape(num_pixels, count)
+    linear = np.allclose(develop(mixed), mixed @ matrix.T, rtol=1e-3, atol=1e-4)
+    if not linear:
+        raise NotImplementedError(
+            f"splats: gradients through this film are not supported: {film} does not map each "
+            "pixel's channels linearly"
+        )
+    return matrix

@@ -1,0 +1,79 @@
+"""Several samples per pixel, at points that Mitsuba's samplers choose.
+
+Layer 4, imported when a scene asks for more than one sample, or for a reconstruction filter other
+than a box. Each pass evaluates every pixel once (``drgs.samples``). With a box filter the passes
+are averaged, in their order: the same bytes in every run. Any other filter spreads a sample over
+its neighbours, which Mitsuba does by atomic additions: such a picture is the same up to rounding.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from drgs.exposure import Channels, develop_pixels, pixels_adjoint
+from drgs.samples import SamplePoints
+
+
+class SampledExposure:
+    """``spp`` samples per pixel, drawn by a copy of the sensor's sampler."""
+
+    def __init__(self, sensor: mi.Sensor, seed: Any, spp: int, maps: dict[str, np.ndarray]) -> None:
+        """maps: remembers the linear maps of films, by their description."""
+        self.film, self.maps = sensor.film(), maps
+        sampler = sensor.sampler().clone()
+        sampler.set_sample_count(spp)
+        spp = sampler.sample_count()  # some round it up
+        size = self.film.crop_size()
+        num_pixels = size[0] * size[1]
+        sampler.set_samples_per_wavefront(spp)
+        sampler.seed(seed, num_pixels * spp)
+        points = sampler.next_2d()
+        pixel = dr.arange(mi.UInt32, num_pixels)
+        self.positions = tuple(
+            SamplePoints(*dr.gather(mi.Point2f, points, pixel * spp + s)) for s in range(spp)
+        )
+        dr.eval([(p.x, p.y) for p in self.positions])
+        self.key = (seed, spp, str(sensor.sampler()))
+
+    def develop(self, passes: Sequence[Channels]) -> mi.TensorXf:
+        """The image of all passes."""
+        if self.film.rfilter().is_box_filter():
+            count = len(passes)
+            sums = [sum(planes[1:], planes[0]) for planes in zip(*passes, strict=True)]
+            return develop_pixels(self.film, [total / count for total in sums])
+        film = self.film
+        film.prepare([])
+        block = film.create_block()
+        size, offset = film.crop_size(), film.crop_offset()
+        pixel = dr.arange(mi.UInt32, size[0] * size[1])
+        y = pixel // size[0]
+        corner = mi.Point2f(pixel - y * size[0] + offset[0], y + offset[1])
+        for point, channels in zip(self.positions, passes, strict=True):
+            block.put(corner + mi.Point2f(point.x, point.y), [*channels, mi.Float(1)])
+        film.put_block(block)
+        return film.develop()
+
+    def adjoint(self, grad_in: mi.TensorXf) -> list[Channels]:
+        """Derivatives of the loss with respect to the channels, given those of the image."""
+        count = len(self.positions)
+        if self.film.rfilter().is_box_filter():
+            averaged = pixels_adjoint(self.film, self.maps, grad_in)
+            return [[d / count for d in averaged]] * count
+        # The image is linear in the channels: their values do not matter.
+        num_channels = 4 if mi.has_flag(self.film.flags(), mi.FilmFlags.Alpha) else 3
+        size = dr.width(self.positions[0].x)
+        passes = [[dr.opaque(mi.Float, 0, size) for _ in range(num_channels)] for _ in range(count)]
+        with dr.resume_grad():
+            dr.enable_grad(passes)
+            image = self.develop(passes)
+            dr.set_grad(image, grad_in)
+            dr.enqueue(dr.ADMode.Backward, image)
+            dr.traverse(dr.ADMode.Backward)
+            derivatives = dr.grad(passes)
+        dr.eval(derivatives)
+        return derivatives
