@@ -7,8 +7,8 @@ depths of the means; splats that interpenetrate then swap as a whole when the ca
 A pixel keeps a *window* of the K nearest splats that it has met and not yet composited (Radl et al.
 2024, "StopThePop", section 4, with a window of one level). A splat that is met is inserted, and the
 nearest of the K + 1 is composited. Each micro-tile has a list of its own, sorted by the depths of
-the peaks where they are in it. The order is exact wherever a splat's place among those of its pixel
-differs by at most K from its place in that list; the error vanishes as K grows.
+the peaks along the ray through its middle. The order is exact wherever a splat's place among those
+of its pixel differs by at most K from its place in that list; the error vanishes as K grows.
 
 Nothing jumps: inserting into a sorted window is K comparisons with selections, at every pixel.
 
@@ -50,6 +50,14 @@ from drgs.rasterize import (
     splat_gradients,
 )
 from drgs.tiles import GRID, MICROS, TILE, TileBins, lower_bounds, stable_order
+
+UNORDERED_ALPHA = 1e-4
+"""A smaller alpha is composited when it is met. Two splats in the wrong order change a pixel by the
+product of their alphas; and the faint rims of large splats, whose peaks are far from everything
+else, would fill the windows."""
+
+FARTHEST = 4.0
+"""Between this and its inverse is the depth by which a list is sorted, relative to the mean's."""
 
 
 @dataclass(frozen=True)
@@ -202,7 +210,7 @@ def _levels(depths: Any) -> Any:
 class _Items:
     """Columns of the items as made."""
 
-    depths: Any  # Float: of the peak, where the splat is in the micro-tile
+    depths: Any  # Float: of the peak along the ray through the middle of the micro-tile
     micro_tiles: Any  # UInt32: tile * 16 + micro-tile within the tile
     entries: Any  # UInt32: sorted entry
 
@@ -236,11 +244,15 @@ class _Items:
 
         def body(masks: Any, item: Any) -> tuple:
             micro = dr.tzcnt(masks)
-            dx = _nearest_to_zero(x + t.Float(micro % GRID) * MICRO)
-            dy = _nearest_to_zero(y + t.Float(micro // GRID) * MICRO)
-            _, a, denominator = ray_denominator(perspective, dr.fma(p, dx, r * dy), s * dy)
+            dx = x + t.Float(micro % GRID) * MICRO + (MICRO - 1) / 2
+            dy = y + t.Float(micro // GRID) * MICRO + (MICRO - 1) / 2
+            u, v = dr.fma(p, dx, r * dy), s * dy
+            _, a, denominator = ray_denominator(perspective, u, v)
             # Where there is no peak, there may be one at a neighbour.
-            dr.scatter(items.depths, depth * dr.select(a > 0, a / denominator, 1), item)
+            along = dr.select(a > 0, a / denominator, 1)
+            along = dr.select(along < 1 / FARTHEST, 1 / FARTHEST, along)
+            along = dr.select(along > FARTHEST, FARTHEST, along)
+            dr.scatter(items.depths, depth * along, item)
             dr.scatter(items.micro_tiles, tile * MICROS + micro, item)
             dr.scatter(items.entries, entry, item)
             return masks & (masks - 1), item + 1
@@ -252,12 +264,6 @@ class _Items:
         )
         dr.eval(loop, items)
         return items
-
-
-def _nearest_to_zero(first: Any) -> Any:
-    """Of the offsets from ``first`` to that of a micro-tile's last pixel."""
-    last = first + (MICRO - 1)
-    return dr.select(first > 0, first, dr.select(last < 0, last, 0))
 
 
 # ----------------------------------------------------------------------------------------------
@@ -312,8 +318,8 @@ def _walk(
         next_queue, visited = [], []
         for pixel, along in enumerate(order.depths.along(footprint, keys)):
             exists = (alphas[pixel].value > 0) & (along > 0)
-            depth = dr.select(exists, keys[-1] * along, absent)
             alpha = dr.select(exists, alphas[pixel].value, 0)
+            depth = dr.select(alpha >= UNORDERED_ALPHA, keys[-1] * along, absent)
             places, nearest = _insert(queue[pixel], [depth, alpha, *carry(met, pixel)])
             next_queue.append(places)
             visited.append(nearest[1:])

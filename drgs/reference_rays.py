@@ -56,6 +56,9 @@ THINNEST = 1e-30
 its depth (with one): far below rounding, so that it changes nothing, and far from overflow in the
 fourth powers of its inverse. It gives a disc of thickness zero its limit."""
 
+NEAREST_POINT = 1 / 3
+"""Sigma points nearer than this part of the mean's depth say nothing about a splat."""
+
 OPEN_CONE = 1e-6
 """An ellipsoid this close (squared, relative) to the plane z = 0 is given the whole film."""
 
@@ -269,7 +272,7 @@ def _splats(gaussians: Gaussians, camera: Camera, model: ImageModel) -> _Splats:
     depth_cov = np.einsum("nij,nj->ni", axes2d, affine.axes[:, 2]) / z[:, None]
     means2d = _film_positions(affine.means, camera)
     if model.projection == "unscented":
-        means2d, axes2d = _unscented_transform(affine, camera)
+        means2d, axes2d = _unscented_transform(affine, camera, means2d)
     cov2d, dets, areas = _low_passed_covariances(axes2d, model.low_pass)
 
     opacities = reference.sigmoid(gaussians.logit_opacities)
@@ -308,23 +311,28 @@ def _film_axes(affine: reference._LocalAffine, camera: Camera, slopes: np.ndarra
 
 
 def _unscented_transform(
-    affine: reference._LocalAffine, camera: Camera
+    affine: reference._LocalAffine, camera: Camera, means2d: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the mean (N, 2), px, and M (N, 2, 7), px, with covariance M M^T, of sigma points.
 
     They are the mean and, for each half axis a_i, m +- sqrt(3) a_i: UT with n = 3, alpha = 1,
     beta = 2, kappa = 0, hence lambda = 0, weights of the mean 0 and 1/6, and of the covariance 2
-    and 1/6. A point before the near plane is moved onto it along z.
+    and 1/6. Splats that have a point nearer than ``NEAREST_POINT`` of their depth, or whose slope
+    is clamped, are projected by the affine approximation. means2d: projections of the means.
     """
     steps = np.sqrt(3.0) * np.swapaxes(affine.axes, 1, 2)
     means = affine.means[:, None]
     points = np.concatenate([means, means + steps, means - steps], axis=1)
-    points[..., 2] = np.maximum(points[..., 2], camera.near)
-    film = _film_positions(points, camera)
-    means2d = np.sum(film[:, 1:], axis=1) / 6
+    nearest = points[..., 2].min(axis=1)
+    usable = affine.unclamped.all(axis=1) & (nearest >= NEAREST_POINT * affine.means[:, 2])
+    film = _film_positions(np.where(usable[:, None, None], points, means), camera)
+    centers = np.sum(film[:, 1:], axis=1) / 6
     weights = np.array([2.0] + 6 * [1 / 6])
-    axes2d = (film - means2d[:, None]) * np.sqrt(weights)[:, None]
-    return means2d, np.swapaxes(axes2d, 1, 2)
+    axes2d = np.swapaxes((film - centers[:, None]) * np.sqrt(weights)[:, None], 1, 2)
+    affine_axes = np.zeros_like(axes2d)
+    affine_axes[:, :, :3] = affine.axes2d
+    usable = usable[:, None]
+    return np.where(usable, centers, means2d), np.where(usable[:, None], axes2d, affine_axes)
 
 
 def _low_passed_covariances(

@@ -20,6 +20,8 @@ from drgs.camera import Camera
 from drgs.projection import (
     FilmShape,
     GaussianRows,
+    clamped_slopes,
+    ewa,
     film_axes,
     film_point,
     true_slopes,
@@ -36,21 +38,31 @@ of the points is 0."""
 WEIGHT = 1 / 6
 """Of each other point, in both."""
 
+NEAREST = 1 / 3
+"""Of the mean's depth: where a point would be nearer, a Gaussian has neither mean nor covariance on
+the film, or ones that have nothing to do with its middle. The same holds far outside the film,
+where slopes are clamped. Such splats are projected by the affine approximation."""
+
 
 def unscented(rows: GaussianRows, camera: Camera, position: Any, low_pass: float) -> FilmShape:
     """The unscented transform of a Gaussian through the camera.
 
-    position: Array3f, camera axes, the mean. Points before the near plane are moved into it.
+    position: Array3f, camera axes, the mean. Not differentiated: where :data:`NEAREST` decides.
     """
-    offsets = _sigma_points(rows, camera, position)
-    shift = [WEIGHT * sum(axis[1:], axis[0]) for axis in offsets]
+    slopes, clamped = true_slopes(position), clamped_slopes(camera, position)
+    m0, m1, n = film_axes(rows, camera, position, slopes)
+    on_film = [_sigma_offsets(m, n) for m in (m0, m1)]
+    shift = [WEIGHT * sum(axis[1:], axis[0]) for axis in on_film]
     # The mean itself has the offset 0.
     columns = [
         [-math.sqrt(CENTER_WEIGHT) * mu, *(math.sqrt(WEIGHT) * (o - mu) for o in axis)]
-        for axis, mu in zip(offsets, shift, strict=True)
+        for axis, mu in zip(on_film, shift, strict=True)
     ]
     means2d = film_point(camera, position) + types_of(type(shift[0])).Array2f(shift)
-    return whiten(means2d, *columns, low_pass)
+    usable = (slopes[0] == clamped[0]) & (slopes[1] == clamped[1]) & _far_enough(n)
+    affine = ewa(rows, camera, position, low_pass)
+    transformed = whiten(means2d, *columns, low_pass)
+    return dr.select(usable, transformed, affine)
 
 
 def unscented_with_depth(
@@ -69,23 +81,22 @@ def unscented_with_depth(
     return replace(film, perspective=type(m0)(kx, ky, dr.select(h > 0, h, 0)))
 
 
-def _sigma_points(rows: GaussianRows, camera: Camera, position: Any) -> list[list[Any]]:
-    """x and y (px, from the mean's place on the film) of the six points besides the mean.
+def _far_enough(n: Any) -> Any:
+    """Whether no point is too near; n: half axes in depth, relative to the mean's."""
+    return dr.max(dr.abs(n)) <= (1 - NEAREST) / SPREAD
 
-    With c = +-sqrt(3) and a column (m, n) of the half axes on the film and in depth, the point's
-    depth is z' = z (1 + c n), and its place c m z / z': a difference that does not cancel. Where z'
-    is replaced, f (x / z) (z (1 + c n) - z') / z' is added.
+
+def _sigma_offsets(m: Any, n: Any) -> list[Any]:
+    """Places of the six points besides the mean, px, along one side of the film, from the mean's.
+
+    m, n: half axes on the film and in depth. With c = +-sqrt(3), a point's depth is z (1 + c n) and
+    its place c m / (1 + c n): a difference that does not cancel.
     """
-    slopes, z = true_slopes(position), position.z
-    m0, m1, n = film_axes(rows, camera, position, slopes)
-    offsets: list[list[Any]] = [[], []]
+    # Where a point is too near, its place is not used, and must not be infinite.
+    nearest = NEAREST / 2
+    offsets = []
     for c in (SPREAD, -SPREAD):
-        for k in range(3):
-            true_depth = z * dr.fma(c, n[k], 1)
-            depth = dr.select(true_depth < camera.near, camera.near, true_depth)
-            excess = dr.select(true_depth < camera.near, true_depth - camera.near, 0)
-            for axis, (m, focal, slope) in enumerate(
-                zip((m0, m1), camera.focal, slopes, strict=True)
-            ):
-                offsets[axis].append((c * m[k] * z + focal * slope * excess) / depth)
+        for m_k, n_k in zip(m, n, strict=True):
+            depth = dr.fma(c, n_k, 1)
+            offsets.append(c * m_k / dr.select(depth > nearest, depth, nearest))
     return offsets

@@ -6,12 +6,13 @@ import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
-from drgs.bench import population, scaling, speed, stability
+from drgs.bench import accuracy, population, scaling, speed, stability
 from drgs.checks import exit_on_user_error
 
 COMMANDS = {
     "speed": speed,
     "scaling": scaling,
+    "accuracy": accuracy,
     "stability": stability,
     "population": population,
 }

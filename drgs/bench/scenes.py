@@ -117,3 +117,71 @@ def trainer_of(scene: Scene) -> Trainer:
     trainer = Trainer(config, dataset, scene.gaussians)
     trainer.iteration = 10  # all SH degrees are in use
     return trainer
+
+
+def stress_scene(size: int, seed: int = 0) -> tuple[Gaussians, list[reference.Camera]]:
+    """What the affine approximation and one order for all pixels are bad at.
+
+    A lens of 110 degrees; two layers of flat discs that cross in the middle of the picture; large,
+    faint splats before the camera; a shell of splats around everything.
+    """
+    rng = np.random.default_rng(seed)
+    layer, near, shell = 700, 60, 1500
+
+    def crossing(angle: float) -> tuple[np.ndarray, np.ndarray]:
+        """Discs on a plane through (0, 0, 3) that is turned about the vertical axis."""
+        u, v = rng.uniform(-3, 3, layer), rng.uniform(-2, 2, layer)
+        means = np.stack([u * np.cos(angle), v, 3 + u * np.sin(angle)], axis=-1)
+        # About y by -angle: the disc's thin axis, z, becomes the plane's normal.
+        quat = [np.cos(-angle / 2), 0, np.sin(-angle / 2), 0]
+        return means, np.tile(quat, (layer, 1))
+
+    directions = rng.normal(size=(shell, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    close = rng.normal(size=(near, 3)) * [0.8, 0.8, 0.3] + [0, 0, 1.2]
+    close[:, 2] = np.maximum(close[:, 2], 0.4)
+    planes = [crossing(0.7), crossing(-0.7)]
+    means = np.concatenate(
+        [*(m for m, _ in planes), close, directions * rng.uniform(5, 8, (shell, 1))]
+    )
+    quats = np.concatenate(
+        [*(q for _, q in planes), rng.normal(size=(near, 4)), rng.normal(size=(shell, 4))]
+    )
+    scales = np.concatenate(
+        [
+            np.tile([0.15, 0.15, 0.004], (2 * layer, 1)),
+            rng.uniform(0.08, 0.4, (near, 3)),
+            rng.uniform(0.1, 0.6, (shell, 3)),
+        ]
+    )
+    opacities = np.concatenate(
+        [
+            rng.uniform(0.5, 0.98, 2 * layer),
+            rng.uniform(0.05, 0.3, near),
+            rng.uniform(0.3, 0.9, shell),
+        ]
+    )
+    colors = np.concatenate(
+        [
+            np.tile([0.9, 0.35, 0.1], (layer, 1)),
+            np.tile([0.1, 0.45, 0.85], (layer, 1)),
+            rng.uniform(0, 1, (near + shell, 3)),
+        ]
+    )
+    colors = np.clip(colors + rng.normal(0, 0.08, colors.shape), 0, 1)
+    count = len(means)
+    values = {
+        "means": means,
+        "quats": quats,
+        "log_scales": np.log(scales),
+        "logit_opacities": np.log(opacities / (1 - opacities)),
+        "sh0": ((colors - 0.5) / reference.C_00)[:, None],
+        "shN": rng.normal(0, 0.05, (count, 15, 3)),
+    }
+    gaussians = Gaussians(**{name: value.astype(np.float32) for name, value in values.items()})
+    focal = size / 2 / np.tan(np.radians(110) / 2)
+    camera = reference.Camera(
+        np.eye(3), np.zeros(3), float(np.float32(focal)), float(np.float32(focal)), size / 2,
+        size / 2, size, size,
+    )  # fmt: skip
+    return gaussians, [camera]

@@ -1,0 +1,410 @@
+"""``python -m drgs.bench accuracy SCENE``: what each approximation costs, and what it saves.
+
+Layer 5. A trained scene and a stress scene (wide lens, large splats near the camera, layers that
+interpenetrate) are rendered along a ladder of choices. Each is compared with the most accurate
+form: double precision, splats evaluated along each pixel's ray and ordered at each pixel, without
+cut-offs, which is itself checked against the float64 numpy reference on crops. A fit's pictures
+are also compared with the photographs.
+
+Three things are apart in the tables: *approximations* of one picture, whose error is the distance
+from the most accurate form; *other pictures* (no or another low-pass, samples per pixel, other SH),
+whose distance is no error; and precision.
+"""
+
+from __future__ import annotations
+
+import argparse
+import statistics
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import drjit as dr
+import drjit.llvm.ad as llvm
+import numpy as np
+
+from drgs import metrics, reference, reference_rays, rendering
+from drgs.bench.output import machine, markdown_table, new_figure, write_csv, write_figure
+from drgs.bench.scenes import bench_camera, device_camera, stress_scene
+from drgs.checks import UserError
+from drgs.choices import Choices
+from drgs.config import load_config
+from drgs.data import load_dataset
+from drgs.data.types import View
+from drgs.gaussians import PARAMETER_NAMES, Gaussians
+from drgs.image_model import PixelCenters
+from drgs.io.ply import read_ply
+from drgs.samples import SamplePoints
+
+DESCRIPTION = "the error of each approximation against the time that it saves"
+
+ROUNDS, QUICK_ROUNDS = 9, 3
+
+SIZE = 400
+"""px: film of scenes that have no cameras of their own."""
+
+WINDOW = 32
+"""Of the most accurate form. What it leaves is part of what the crops show."""
+
+EXACT_PIXEL = {"projection": "exact", "order": "pixel"}
+
+CROP = 8
+"""px: side of the crops on which the numpy reference evaluates every splat at every pixel."""
+
+UNCUT = {"alpha_cut": 0.0, "transmittance_stop": 0.0}
+MOST_ACCURATE = {**EXACT_PIXEL, "order_window": WINDOW, **UNCUT}
+
+
+@dataclass(frozen=True)
+class Rung:
+    """One way to render."""
+
+    name: str
+    choices: dict[str, Any] = field(default_factory=dict)
+    is_approximation: bool = True  # of the most accurate form
+    samples: int = 1  # per pixel, a square number
+    sh_degree: int | None = None  # None: all
+    float64: bool = False
+
+
+RUNGS = (
+    Rung("default"),
+    Rung("unscented", {"projection": "unscented"}),
+    Rung("exact", {"projection": "exact"}),
+    Rung("pixel order, window 4", {"order": "pixel"}),
+    Rung("exact, pixel order, window 1", {**EXACT_PIXEL, "order_window": 1}),
+    Rung("exact, pixel order, window 4", EXACT_PIXEL),
+    Rung("exact, pixel order, window 16", {**EXACT_PIXEL, "order_window": 16}),
+    Rung("alpha cut 1/64", {"alpha_cut": 1 / 64}),
+    Rung("no alpha cut", {"alpha_cut": 0.0}),
+    Rung("transmittance stop 1e-2", {"transmittance_stop": 1e-2}),
+    Rung("no transmittance stop", {"transmittance_stop": 0.0}),
+    Rung("extent 3 sigma", {"extent": 3.0}),
+    Rung("no cut-offs", UNCUT),
+    Rung("exact, pixel order (16), no cut-offs", {**MOST_ACCURATE, "order_window": 16}),
+    Rung("default in float64", float64=True),
+    Rung("SH of degree 0", is_approximation=False, sh_degree=0),
+    Rung("SH of degree 1", is_approximation=False, sh_degree=1),
+    Rung("SH of degree 2", is_approximation=False, sh_degree=2),
+    Rung("SH along each pixel's ray", {"sh_direction": "pixel"}, is_approximation=False),
+    Rung("antialiased low-pass", {"antialiased": True}, is_approximation=False),
+    Rung("no low-pass", {"low_pass": 0.0}, is_approximation=False),
+    Rung("4 samples, no low-pass", {"low_pass": 0.0}, False, samples=4),
+    Rung("16 samples, no low-pass", {"low_pass": 0.0}, False, samples=16),
+)
+
+
+@dataclass(frozen=True)
+class Subject:
+    """Gaussians and the cameras that they are seen by."""
+
+    name: str
+    gaussians: Gaussians  # numpy
+    cameras: list[reference.Camera]
+    photographs: list[np.ndarray]  # (H, W, 3) each; none if there are none
+    background: tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Measurement:
+    """One rung on one subject: means over views, the largest error of all."""
+
+    scene: str
+    rung: str
+    is_approximation: bool
+    milliseconds: float  # forward, median, per view
+    both_milliseconds: float  # forward and backward
+    operations: int  # in the kernels of a forward pass
+    psnr: float  # dB, against the most accurate form
+    ssim: float
+    largest_error: float
+    photo_psnr: float | None  # dB, against the photographs
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Options besides ``--out``."""
+    parser.add_argument(
+        "scene",
+        nargs="?",
+        default="out/lego",
+        metavar="SCENE",
+        help="a fit's output folder or a PLY file (default: out/lego)",
+    )
+    parser.add_argument("--views", type=int, default=3, help="test views of a fit (default: 3)")
+    parser.add_argument("--quick", action="store_true", help="one view, fewer rounds")
+
+
+def run(args: argparse.Namespace) -> None:
+    """Measure both scenes; write table, CSV and plot."""
+    subjects = [
+        load_subject(Path(args.scene), 1 if args.quick else args.views),
+        Subject("stress", *stress_scene(SIZE), [], (0.0, 0.0, 0.0)),
+    ]
+    print(f"{machine()}")
+    results = []
+    for subject in subjects:
+        accurate = [most_accurate(subject, camera) for camera in subject.cameras]
+        error = check_on_crops(subject, accurate[0])
+        print(
+            f"\n{subject.name}: {subject.gaussians.num_gaussians:,} Gaussians, "
+            f"{len(subject.cameras)} views; the most accurate form differs from the numpy "
+            f"reference by at most {error:.1e} on crops\n"
+        )
+        found = measure(subject, accurate, QUICK_ROUNDS if args.quick else ROUNDS)
+        results += found
+        print(table(found), flush=True)
+    columns = list(Measurement.__dataclass_fields__)
+    write_csv(args.out / "accuracy.csv", columns, [list(vars(m).values()) for m in results])
+    write_figure(args.out / "accuracy.png", plot(results))
+    print(f"\nwritten: {args.out / 'accuracy.csv'}, {args.out / 'accuracy.png'}")
+
+
+# ----------------------------------------------------------------------------------------------
+# Scenes
+# ----------------------------------------------------------------------------------------------
+
+
+def load_subject(path: Path, num_views: int) -> Subject:
+    """A fit's folder with evenly spaced test views, or a PLY file seen by the bench camera."""
+    if path.is_dir():
+        ply, config_file = path / "point_cloud.ply", path / "config.yml"
+        for file in (ply, config_file):
+            if not file.exists():
+                raise UserError(f"{file}: not there; {path} must be the folder of a finished fit")
+        config = load_config(str(config_file), [])
+        dataset = load_dataset(config.data)
+        step = max(1, len(dataset.test) // num_views)
+        views = dataset.test[::step][:num_views]
+        cameras = [camera_of(view, config.model.near) for view in views]
+        photographs = [view.image for view in views]
+        return Subject(path.name, read_ply(ply), cameras, photographs, dataset.background)
+    return Subject(path.stem, read_ply(path), [bench_camera(SIZE)], [], (1.0, 1.0, 1.0))
+
+
+def camera_of(view: View, near: float) -> reference.Camera:
+    """The camera of a photograph, rounded to single precision."""
+    pose = view.camera_to_world.astype(np.float32)
+    numbers = (float(np.float32(v)) for v in (view.fx, view.fy, view.cx, view.cy))
+    return reference.Camera(pose[:3, :3].T, pose[:3, 3], *numbers, view.width, view.height, near)
+
+
+# ----------------------------------------------------------------------------------------------
+# Rendering
+# ----------------------------------------------------------------------------------------------
+
+
+def positions(samples: int, camera: reference.Camera, float_type: type) -> list[Any]:
+    """A grid of points in each pixel."""
+    if samples == 1:
+        return [PixelCenters()]
+    side, size = round(np.sqrt(samples)), camera.width * camera.height
+    offsets = [dr.opaque(float_type, (i + 0.5) / side, size) for i in range(side)]
+    return [SamplePoints(x, y) for y in offsets for x in offsets]
+
+
+@dataclass(frozen=True)
+class Renderer:
+    """A rung, ready to render one view."""
+
+    rung: Rung
+    gaussians: Gaussians  # on the device
+    camera: Any
+    positions: list[Any]
+    background: tuple[float, float, float]
+
+    @staticmethod
+    def of(rung: Rung, subject: Subject, camera: reference.Camera) -> Renderer:
+        """Upload."""
+        Float = llvm.Float64 if rung.float64 else llvm.Float
+        gaussians = subject.gaussians.to(llvm.TensorXf64 if rung.float64 else llvm.TensorXf)
+        points = positions(rung.samples, camera, Float)
+        return Renderer(rung, gaussians, device_camera(camera, Float), points, subject.background)
+
+    def frames(self) -> list[rendering.Frame]:
+        """Render; returns when the planes are in memory."""
+        stored = self.gaussians.sh_degree
+        degree = stored if self.rung.sh_degree is None else min(stored, self.rung.sh_degree)
+        pipeline = Choices(**self.rung.choices).pipeline(degree)
+        first, *others = self.positions
+        model = replace(pipeline.model, positions=first)
+        frame = rendering.render(self.gaussians, self.camera, replace(pipeline, model=model))
+        frames = [frame, *(rendering.render_again(frame, p) for p in others)]
+        dr.eval([f.planes() for f in frames])
+        dr.sync_thread()
+        return frames
+
+    def image(self) -> np.ndarray:
+        """(H, W, 3) float64, display space, not clamped."""
+        shape = self.camera.height, self.camera.width
+        images = []
+        for frame in self.frames():
+            T, *color = (np.array(p, np.float64).reshape(shape) for p in frame.planes())
+            images.append(np.stack(color, axis=-1) + T[..., None] * np.array(self.background))
+        return np.mean(images, axis=0)
+
+    def forward_backward(self) -> None:
+        """Render and differentiate the sum of all planes."""
+        frames = self.frames()
+        ones = dr.ones(type(self.camera.near), self.camera.width * self.camera.height)
+        gradients = rendering.frames_adjoint(self.gaussians, frames, [[ones] * 4] * len(frames))
+        dr.eval(gradients.parameters)
+        dr.sync_thread()
+
+    def operations(self) -> int:
+        """Operations in the kernels of a forward pass."""
+        with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
+            dr.kernel_history_clear()
+            self.frames()
+            kernels = dr.kernel_history([dr.KernelType.JIT])
+        return sum(kernel["operation_count"] for kernel in kernels)
+
+
+def most_accurate(subject: Subject, camera: reference.Camera) -> np.ndarray:
+    """The picture that errors are measured against."""
+    return Renderer.of(Rung("", MOST_ACCURATE, float64=True), subject, camera).image()
+
+
+def check_on_crops(subject: Subject, accurate: np.ndarray) -> float:
+    """Largest difference of the most accurate form from the numpy reference, on the first view.
+
+    On crops around the middle and in two other places, where every splat is evaluated at every
+    pixel.
+    """
+    camera = subject.cameras[0]
+    gaussians = reference.Gaussians(
+        **{name: getattr(subject.gaussians, name) for name in PARAMETER_NAMES}
+    )
+    model = reference_rays.ImageModel(
+        projection="exact", order="pixel", alpha_cut=0.0, transmittance_stop=0.0
+    )
+    errors = []
+    for x, y in ((0.5, 0.5), (0.35, 0.6), (0.6, 0.35)):
+        column, row = int(x * (camera.width - CROP)), int(y * (camera.height - CROP))
+        region = slice(row, row + CROP), slice(column, column + CROP)
+        picture = reference_rays.render(gaussians, camera, subject.background, model, region)
+        errors.append(np.abs(picture.image - accurate[region]).max())
+    return max(errors)
+
+
+# ----------------------------------------------------------------------------------------------
+# Measuring
+# ----------------------------------------------------------------------------------------------
+
+
+def measure(
+    subject: Subject, accurate: Sequence[np.ndarray], rounds: int, rungs: Sequence[Rung] = RUNGS
+) -> list[Measurement]:
+    """Errors of all rungs, and their times on the first view, in turns."""
+    renderers = [Renderer.of(rung, subject, subject.cameras[0]) for rung in rungs]
+    operations = [renderer.operations() for renderer in renderers]  # compiles the kernels
+    for renderer in renderers:
+        renderer.forward_backward()
+    times: list[list[tuple[float, float]]] = [[] for _ in rungs]
+    for _ in range(rounds):
+        for renderer, spent in zip(renderers, times, strict=True):
+            spent.append((_seconds(renderer.frames), _seconds(renderer.forward_backward)))
+    results = []
+    for rung, count, spent in zip(rungs, operations, times, strict=True):
+        images = [Renderer.of(rung, subject, camera).image() for camera in subject.cameras]
+        quality = metrics.mean_quality(zip(images, accurate, strict=True))
+        photos = list(zip(images, subject.photographs, strict=bool(subject.photographs)))
+        results.append(
+            Measurement(
+                scene=subject.name,
+                rung=rung.name,
+                is_approximation=rung.is_approximation,
+                milliseconds=1e3 * statistics.median(forward for forward, _ in spent),
+                both_milliseconds=1e3 * statistics.median(both for _, both in spent),
+                operations=count,
+                psnr=quality.psnr,
+                ssim=quality.ssim,
+                largest_error=max(
+                    np.abs(a - b).max() for a, b in zip(images, accurate, strict=True)
+                ),
+                photo_psnr=metrics.mean_quality(photos).psnr if photos else None,
+            )
+        )
+    return results
+
+
+def _seconds(function: Callable[[], Any]) -> float:
+    started = time.perf_counter()
+    function()
+    return time.perf_counter() - started
+
+
+def pareto_front(results: Sequence[Measurement]) -> list[Measurement]:
+    """Approximations that none is both faster and closer than, fastest first."""
+    candidates = sorted(
+        (m for m in results if m.is_approximation), key=lambda m: (m.milliseconds, -m.psnr)
+    )
+    front: list[Measurement] = []
+    for m in candidates:
+        if not front or m.psnr > front[-1].psnr:
+            front.append(m)
+    return front
+
+
+# ----------------------------------------------------------------------------------------------
+# Output
+# ----------------------------------------------------------------------------------------------
+
+
+def table(results: Sequence[Measurement]) -> str:
+    """As the README holds it; times relative to the first."""
+    first, front = results[0], pareto_front(results)
+    header = [
+        results[0].scene, "forward", "forward + backward", "operations", "PSNR", "SSIM",
+        "largest error", "PSNR, photographs",
+    ]  # fmt: skip
+    rows = []
+    for m in results:
+        mark = " *" if m in front else ""
+        rows.append(
+            [
+                m.rung + mark if m.is_approximation else f"({m.rung})",
+                _times(m.milliseconds, first.milliseconds),
+                _times(m.both_milliseconds, first.both_milliseconds),
+                f"{m.operations:,}",
+                f"{m.psnr:.1f} dB",
+                f"{m.ssim:.5f}",
+                f"{m.largest_error:.2g}",
+                "" if m.photo_psnr is None else f"{m.photo_psnr:.2f} dB",
+            ]
+        )
+    note = "* on the Pareto front of the approximations; (in brackets) other pictures"
+    return f"{markdown_table(header, rows)}\n\n{note}"
+
+
+def _times(milliseconds: float, first: float) -> str:
+    return f"{milliseconds:.0f} ms, {milliseconds / first:.2f}x"
+
+
+def plot(results: Sequence[Measurement]) -> Any:
+    """Error over time for each scene, the Pareto front marked."""
+    scenes = list(dict.fromkeys(m.scene for m in results))
+    figure = new_figure(6.2 * len(scenes), 5)
+    for axes, scene in zip(figure.subplots(1, len(scenes), squeeze=False)[0], scenes, strict=True):
+        here = [m for m in results if m.scene == scene and m.is_approximation]
+        front = pareto_front(here)
+        axes.plot([m.milliseconds for m in front], [_rms(m) for m in front], "-", color="0.7")
+        for m in here:
+            on_front = m in front
+            axes.plot(
+                m.milliseconds, _rms(m), "o" if on_front else ".", color="C0" if on_front else "0.5"
+            )
+            axes.annotate(
+                m.rung, (m.milliseconds, _rms(m)), xytext=(5, 3), textcoords="offset points",
+                fontsize=7, color="k" if on_front else "0.4",
+            )  # fmt: skip
+        axes.set(
+            xscale="log", yscale="log", xlabel="ms, forward", title=scene,
+            ylabel="root mean square error against the most accurate form",
+        )  # fmt: skip
+    return figure
+
+
+def _rms(m: Measurement) -> float:
+    return 10 ** (-m.psnr / 20)
