@@ -10,8 +10,9 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterable, Iterator
+from itertools import pairwise
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_args
 
 import yaml
 from pydantic import (
@@ -260,6 +261,13 @@ class OutputConfig(_Section):
     )
 
 
+class CoarseStage(_Section):
+    """Iterations that see smaller pictures."""
+
+    until: Count = Field(ge=1, description="The stage's last iteration.")
+    factor: int = Field(ge=2, le=64, description="Width and height are divided by this.")
+
+
 class FitConfig(_Section):
     """Everything that decides a fit."""
 
@@ -271,6 +279,11 @@ class FitConfig(_Section):
     densify: DensifyConfig = Field(default_factory=DensifyConfig)
     output: OutputConfig = Field(default_factory=OutputConfig)
     iterations: Count = Field(30_000, ge=1, description="Optimizer steps; one view each.")
+    coarse: list[CoarseStage] = Field(
+        default_factory=list,
+        description="Stages of smaller training pictures, before those of full size: a list of "
+        "{until: iteration, factor: 4}.",
+    )
     seed: Count = Field(0, ge=0, description="Seed of everything random.")
 
     @model_validator(mode="after")
@@ -296,6 +309,13 @@ class FitConfig(_Section):
                 f"init.num_points must be <= densify.max_gaussians ({densify.max_gaussians}), "
                 f"got {self.init.num_points}"
             )
+        for before, after in pairwise(self.coarse):
+            if not (before.until < after.until and before.factor > after.factor):
+                raise ValueError(
+                    "coarse must be stages with growing until and falling factor, got "
+                    f"{{until: {before.until}, factor: {before.factor}}} before "
+                    f"{{until: {after.until}, factor: {after.factor}}}"
+                )
         if self.loss.window % 2 == 0:
             raise ValueError(f"loss.window must be odd, got {self.loss.window}")
         return self
@@ -342,8 +362,17 @@ def known_keys() -> list[str]:
 def _fields(model: type[BaseModel], prefix: str = "") -> Iterator[tuple[str, Any]]:
     for name, field in model.model_fields.items():
         yield prefix + name, field.annotation
-        if isinstance(field.annotation, type) and issubclass(field.annotation, BaseModel):
-            yield from _fields(field.annotation, f"{prefix}{name}.")
+        section = _section(field.annotation)
+        if section is not None:
+            yield from _fields(section, f"{prefix}{name}.")
+
+
+def _section(annotation: Any) -> type[BaseModel] | None:
+    """The section that a value is, or that the elements of a list are."""
+    for candidate in (annotation, *get_args(annotation)):
+        if isinstance(candidate, type) and issubclass(candidate, BaseModel):
+            return candidate
+    return None
 
 
 class _Loader(yaml.SafeLoader):
@@ -484,15 +513,16 @@ _EXPECTED = {
     "bool": "true or false",
     "string": "text",
     "path": "a path",
+    "list": "a list",
     "model": "a section of keys",
 }
 
 
 def _description(key: str) -> str:
     model: Any = FitConfig
-    *sections, leaf = key.split(".")
+    *sections, leaf = (part for part in key.split(".") if not part.isdigit())
     for section in sections:
-        model = model.model_fields[section].annotation
+        model = _section(model.model_fields[section].annotation)
     field = model.model_fields[leaf]
     return field.description or field.annotation.__doc__
 

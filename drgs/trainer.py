@@ -8,7 +8,7 @@ and its gradients come from ``mi.render`` with the ``splats`` integrator, the st
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,6 +18,7 @@ import numpy as np
 
 from drgs import densify
 from drgs.config import FitConfig, OptimizerConfig
+from drgs.data.images import smaller_view
 from drgs.data.types import Dataset, View
 from drgs.gaussians import PARAMETER_NAMES, Gaussians
 from drgs.guards import GradientWatch, check_values
@@ -43,6 +44,14 @@ class TrainingView:
     target: Target
     width: int  # px
     height: int  # px
+
+
+@dataclass(frozen=True, eq=False)
+class Stage:
+    """Iterations that train on pictures of one size."""
+
+    until: float  # last iteration
+    views: list[TrainingView]
 
 
 @dataclass(frozen=True)
@@ -92,7 +101,7 @@ class Trainer:
         )
         self.loss = PhotometricLoss(config.loss.dssim_weight)
         self.white_background = tuple(dataset.background) == (1.0, 1.0, 1.0)
-        self.views = make_training_views(dataset.train, config)
+        self.stages = make_stages(dataset.train, config)
         self.statistics = self._no_statistics()
         self.watch = GradientWatch()
         self.iteration = 0
@@ -100,7 +109,7 @@ class Trainer:
     def step(self) -> StepReport:
         """One iteration: one view, one optimizer step, now and then a change of the population."""
         self.iteration += 1
-        view = self.views[view_of(self.iteration, len(self.views), self.config.seed)]
+        view = self.view
         self.integrator.sh_degree = self.sh_degree
         self.optimizer.set_learning_rate({PREFIX + "means": self.means_lr(self.iteration)})
         self.params.update(self.optimizer)
@@ -122,6 +131,12 @@ class Trainer:
             loss_array=loss,
             squared_error=error,
         )
+
+    @property
+    def view(self) -> TrainingView:
+        """What this iteration trains on."""
+        views = next(stage.views for stage in self.stages if self.iteration <= stage.until)
+        return views[view_of(self.iteration, len(views), self.config.seed)]
 
     @property
     def sh_degree(self) -> int:
@@ -211,7 +226,16 @@ def learning_rates(config: OptimizerConfig, extent: float) -> dict[str, float]:
     }
 
 
-def make_training_views(views: tuple[View, ...], config: FitConfig) -> list[TrainingView]:
+def make_stages(views: tuple[View, ...], config: FitConfig) -> list[Stage]:
+    """The configuration's coarse stages, and the last one, of pictures as they are."""
+    stages = [
+        Stage(s.until, make_training_views([smaller_view(v, s.factor) for v in views], config))
+        for s in config.coarse
+    ]
+    return [*stages, Stage(math.inf, make_training_views(views, config))]
+
+
+def make_training_views(views: Sequence[View], config: FitConfig) -> list[TrainingView]:
     """Sensors and loss targets for ``views``."""
     targets = [
         prepare_target(mi.TensorXf(view.image), config.loss.window, config.loss.sigma)

@@ -98,6 +98,21 @@ def test_a_configuration_is_frozen(load):
         ("model: 5", "model must be a section of keys, got 5"),
         ("model:", "model must be a section of keys, got null"),
         ("output: {dir: [1]}", "output.dir must be a path, got [1]"),
+        ("coarse: 4", "coarse must be a list, got 4"),
+        ("coarse: [{until: 9, factor: 1}]", "coarse.0.factor must be >= 2, got 1"),
+        (
+            "coarse: [{until: 9}]",
+            "coarse.0.factor is missing: Width and height are divided by this.",
+        ),
+        (
+            "coarse: [{until: 9, factor: 2, facto: 2}]",
+            "unknown key coarse.0.facto; did you mean coarse.factor?",
+        ),
+        (
+            "coarse: [{until: 9, factor: 2}, {until: 20, factor: 4}]",
+            "coarse must be stages with growing until and falling factor, got {until: 9, "
+            "factor: 2} before {until: 20, factor: 4}",
+        ),
         (
             "densify: {start: 900, stop: 800}",
             "densify.start must be < densify.stop (800), got 900",
@@ -258,7 +273,8 @@ def test_path_keys_are_all_the_paths():
     [
         MINIMAL,
         "data: {path: ../x, background: [0.1, 0.2, 0.3], image_size: 7}\n"
-        "optimizer: {epsilon: 1e-15}\ninit: {half_extent: 0.1}\noutput: {dir: y}",
+        "optimizer: {epsilon: 1e-15}\ninit: {half_extent: 0.1}\noutput: {dir: y}\n"
+        "coarse: [{until: 5, factor: 4}, {until: 9, factor: 2}]",
     ],
 )
 def test_a_dumped_configuration_reloads_equal(load, tmp_path, text):

@@ -9,6 +9,7 @@ import pytest
 
 from drgs import densify
 from drgs.config import FitConfig
+from drgs.data.images import smaller_view
 from drgs.data.points import gaussians_from_points
 from drgs.data.types import Dataset, View
 from drgs.gaussians import PARAMETER_NAMES
@@ -124,7 +125,9 @@ def test_reported_loss_and_psnr_are_those_of_the_view_before_the_step():
     report = trainer.step()
     first = view_of(1, 4, seed=0)
     untouched = make_trainer(loss={"dssim_weight": 0.0})
-    image = np.array(mi.render(untouched.scene, sensor=untouched.views[first].sensor, spp=1))
+    image = np.array(
+        mi.render(untouched.scene, sensor=untouched.stages[-1].views[first].sensor, spp=1)
+    )
     photo = small_dataset().train[first].image
     assert report.loss == pytest.approx(np.abs(image - photo).mean(), rel=1e-5)
     psnr = -10 * np.log10(np.mean((image.astype(float) - photo) ** 2))
@@ -195,6 +198,47 @@ def test_restored_trainer_continues_to_the_same_bytes():
         uninterrupted.step()
         second.step()
     assert uninterrupted.num_gaussians != 40
+    expected, got = uninterrupted.gaussians(), second.gaussians()
+    for name in PARAMETER_NAMES:
+        assert getattr(got, name).tobytes() == getattr(expected, name).tobytes(), name
+
+
+COARSE = [{"until": 2, "factor": 4}, {"until": 5, "factor": 2}]
+
+
+def test_coarse_stages_come_first_and_end_where_they_say():
+    trainer = make_trainer(coarse=COARSE)
+    sizes, names = [], []
+    for iteration in range(1, 9):
+        trainer.iteration = iteration
+        sizes.append((trainer.view.width, trainer.view.height))
+        names.append(trainer.view.name)
+    assert sizes == [(5, 4)] * 2 + [(10, 8)] * 3 + [(20, 16)] * 3
+    assert sorted(names[:4]) == sorted(names[4:]) == ["v0", "v1", "v2", "v3"]
+
+
+def test_a_smaller_view_is_the_same_camera_with_larger_pixels():
+    view = small_view("v", 1.0)
+    smaller = smaller_view(view, 4)
+    blocks = view.image.reshape(4, 4, 5, 4, 3).mean(axis=(1, 3))
+    np.testing.assert_allclose(smaller.image, blocks, rtol=1e-6)
+    # A point on the film is at a quarter of its place, counted from the corner.
+    point = np.array([0.3, -0.2, 2.0])
+    film, smaller_film = view.K @ point / point[2], smaller.K @ point / point[2]
+    np.testing.assert_allclose(smaller_film[:2], film[:2] / 4, rtol=1e-12)
+    assert smaller.name == "v" and np.array_equal(smaller.camera_to_world, view.camera_to_world)
+
+
+def test_a_trainer_restored_within_the_coarse_stages_continues_to_the_same_bytes():
+    uninterrupted, first = make_trainer(coarse=COARSE), make_trainer(coarse=COARSE)
+    for _ in range(4):
+        uninterrupted.step()
+        first.step()
+    second = make_trainer(coarse=COARSE)
+    second.restore(first.state())
+    for _ in range(4):
+        uninterrupted.step()
+        second.step()
     expected, got = uninterrupted.gaussians(), second.gaussians()
     for name in PARAMETER_NAMES:
         assert getattr(got, name).tobytes() == getattr(expected, name).tobytes(), name

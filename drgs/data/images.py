@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from PIL import Image
 
 from drgs.checks import UserError, one_line
+from drgs.data.types import View
 
 MAX_PIXELS = 1 << 26
 """67 million, as 8192 x 8192: 0.8 GB once decoded to float32."""
@@ -86,6 +88,23 @@ def downscale(image: np.ndarray, max_width: int | None) -> np.ndarray:
     new_height = max(1, round(height * max_width / width))
     rows = _average_rows(image, new_height)
     return np.ascontiguousarray(_average_rows(rows.swapaxes(0, 1), max_width).swapaxes(0, 1))
+
+
+def smaller_view(view: View, factor: int) -> View:
+    """The same camera with pixels ``factor`` times as large, each the average over its area."""
+    image = downscale(view.image, max(1, round(view.width / factor)))
+    height, width = image.shape[:2]
+    x, y = width / view.width, height / view.height
+    return replace(
+        view,
+        image=image,
+        fx=view.fx * x,
+        fy=view.fy * y,
+        cx=view.cx * x,
+        cy=view.cy * y,
+        width=width,
+        height=height,
+    )
 
 
 def _average_rows(image: np.ndarray, count: int) -> np.ndarray:
