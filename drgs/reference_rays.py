@@ -79,15 +79,22 @@ class ImageModel:
     pixel's ray; by ``"entry"``, where that ray enters the ellipsoid of ``extent`` (exact only).
 
     sh_direction: colours are seen along the ray to the ``"mean"`` or to the ``"pixel"``.
+
+    stop: a pixel is finished ``"before"`` the splat that takes its transmittance below
+    transmittance_stop, which is then not composited, or ``"after"`` it. step: of order ``"entry"``;
+    a ray that has entered a splat goes on so far behind the entry, and passes over what it enters
+    on the way.
     """
 
     projection: Literal["ewa", "unscented", "exact"] = "ewa"
     order: Literal["center", "pixel", "entry"] = "center"
     sh_direction: Literal["mean", "pixel"] = "mean"
+    stop: Literal["before", "after"] = "before"
     alpha_max: float = reference.ALPHA_MAX  # upper clamp of alpha; 1: none
     alpha_cut: float = reference.ALPHA_CUT  # a smaller alpha does not exist; 0: none
     transmittance_stop: float = reference.TRANSMITTANCE_STOP  # 0: none
     extent: float = inf  # standard deviations beyond which a splat does not exist
+    step: float = 0.0  # world units along the ray
     low_pass: float = reference.LOW_PASS  # px^2; 0: none
     antialiased: bool = False  # opacities compensate for the low-pass (Mip-Splatting)
     sh_degree: int | None = None  # None: all that is stored
@@ -95,7 +102,7 @@ class ImageModel:
     def __post_init__(self) -> None:
         """Refuse unknown names, numbers out of range, and an entry that nothing defines."""
         choices = get_type_hints(ImageModel)
-        for name in ("projection", "order", "sh_direction"):
+        for name in ("projection", "order", "sh_direction", "stop"):
             known, value = get_args(choices[name]), getattr(self, name)
             if value not in known:
                 raise ValueError(
@@ -108,6 +115,7 @@ class ImageModel:
             "transmittance_stop": ("in [0, 1)", 0 <= self.transmittance_stop < 1),
             "extent": ("> 0", self.extent > 0),
             "low_pass": (">= 0 and finite", 0 <= self.low_pass < inf),
+            "step": (">= 0 and finite", 0 <= self.step < inf),
         }
         for name, (expected, holds) in ranges.items():
             if not holds:
@@ -119,6 +127,10 @@ class ImageModel:
             raise ValueError(
                 "reference_rays.ImageModel: order 'entry' needs projection 'exact' and a finite "
                 f"extent, got projection {self.projection!r} and extent {self.extent}"
+            )
+        if self.step > 0 and self.order != "entry":
+            raise ValueError(
+                f"reference_rays.ImageModel: a step needs order 'entry', got {self.order!r}"
             )
 
 
@@ -215,7 +227,9 @@ def render(
         place = block.rows, block.columns
         points = positions[place].reshape(-1, 2)
         pairs = _pairs(block, splats, points, model, threshold_width)
-        weights, behind, near = _composite(pairs, len(points), model, threshold_width)
+        slopes = (points - [camera.cx, camera.cy]) / [camera.fx, camera.fy]
+        steps = model.step / np.sqrt(1 + np.sum(slopes**2, axis=1))  # in camera z
+        weights, behind, near = _composite(pairs, steps, model, threshold_width)
 
         seen = weights > 0
         colors = _pair_colors(splats, pairs, seen, camera, points, model)
@@ -602,14 +616,17 @@ def _pairs_in_boxes(block: _Block) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _composite(
-    pairs: _Pairs, num_pixels: int, model: ImageModel, threshold_width: float
+    pairs: _Pairs, steps: np.ndarray, model: ImageModel, threshold_width: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the weights T alpha (M,), the transmittance (P,) and the marks (P,) of P pixels.
+
+    steps: (P,) the model's step in the units of the keys.
 
     Pixels are taken together whose lists have a length in (2^(n-1), 2^n]: as rows of a matrix,
     filled up with alpha = 0, which at most doubles them. Transmittance is a cumulative product,
     and as it never rises, the pixel is finished exactly where it is below the stop.
     """
+    num_pixels = len(steps)
     weights, transmittance = np.zeros(len(pairs.pixels)), np.ones(num_pixels)
     near_threshold = np.zeros(num_pixels, dtype=bool)
     lengths = np.bincount(pairs.pixels, minlength=num_pixels)
@@ -623,10 +640,13 @@ def _composite(
         shape = len(members), 2**size
 
         alphas = _matrix(pairs.alphas[chosen], cells, shape)
+        if model.step > 0:
+            keys = _matrix(pairs.keys[chosen], cells, shape)
+            alphas = np.where(_passed_over(alphas > 0, keys, steps[members]), 0.0, alphas)
         behind = np.cumprod(1 - alphas, axis=1)
         before = np.column_stack([np.ones(len(members)), behind[:, :-1]])
         unfinished = before >= model.transmittance_stop
-        composited = behind >= model.transmittance_stop
+        composited = unfinished if model.stop == "after" else behind >= model.transmittance_stop
         weights[chosen] = np.where(composited, before * alphas, 0.0)[cells]
         transmittance[members] = np.min(np.where(composited, behind, 1.0), axis=1)
 
@@ -639,6 +659,15 @@ def _composite(
             near |= exists & _follows_closely(keys, threshold_width)
         near_threshold[members] = np.any(unfinished & near, axis=1)
     return weights, transmittance, near_threshold
+
+
+def _passed_over(exists: np.ndarray, keys: np.ndarray, steps: np.ndarray) -> np.ndarray:
+    """Return (P, L) bool: the splat's key is within the step (P,) behind the last one entered."""
+    passed, last = np.zeros_like(exists), np.full(len(keys), -inf)
+    for rank in range(keys.shape[1]):
+        passed[:, rank] = exists[:, rank] & (keys[:, rank] < last + steps)
+        last = np.where(exists[:, rank] & ~passed[:, rank], keys[:, rank], last)
+    return passed
 
 
 def _matrix(values: np.ndarray, cells: tuple, shape: tuple[int, int]) -> np.ndarray:

@@ -110,7 +110,7 @@ class Problem:
 
     @property
     def model(self) -> reference_rays.ImageModel:
-        names = {f for f in reference_rays.ImageModel.__dataclass_fields__ if f != "sh_degree"}
+        names = set(reference_rays.ImageModel.__dataclass_fields__) & set(vars(self.choices))
         return reference_rays.ImageModel(**{n: getattr(self.choices, n) for n in names})
 
     def render(self, precision):

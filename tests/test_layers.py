@@ -48,6 +48,7 @@ LAYERS = {
         "output",
         "sampling",
         "scene",
+        "schedule",
         "trainer",
     ],
     5: [

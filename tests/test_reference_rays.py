@@ -181,9 +181,14 @@ def naive_picture(gaussians, camera, model) -> dict[str, np.ndarray]:
             bases = [naive_basis(gaussians, camera, model, position)] * len(indices)
         hits = [(splat(position), n) for n, splat in enumerate(splats) if splat]
         hits = sorted((hit[1], n, hit[0], hit[2]) for hit, n in hits if hit)
-        transmittance = 1.0
-        for _, n, alpha, depth in hits:
-            if transmittance * (1 - alpha) < model.transmittance_stop:
+        transmittance, last = 1.0, -math.inf
+        slope = (position - [camera.cx, camera.cy]) / [camera.fx, camera.fy]
+        for key, n, alpha, depth in hits:
+            if (key - last) * math.hypot(*slope, 1) < model.step:
+                continue
+            last = key
+            behind = transmittance * (1 - alpha)
+            if (behind if model.stop == "before" else transmittance) < model.transmittance_stop:
                 break
             color = naive_color(gaussians, n, bases[n])
             picture["image"][row, column] += transmittance * alpha * color
@@ -664,6 +669,21 @@ def test_entry_order_puts_a_large_splat_before_a_small_nearer_one():
         np.testing.assert_allclose(picture.depth[4, 4], expected, rtol=1e-14)
 
 
+@pytest.mark.parametrize("step", [0.0, 0.3])
+@pytest.mark.parametrize("stop", ["before", "after"])
+def test_a_ray_passes_over_what_it_enters_within_a_step(step, stop):
+    """And a pixel may end behind the splat that is too much. Against the loop over pixels."""
+    gaussians, camera = small_scene()
+    model = ImageModel(
+        "exact", "entry", stop=stop, transmittance_stop=0.2, extent=2.0, step=step, low_pass=0.0
+    )
+    picture = rays.render(gaussians, camera, BACKGROUND, model)
+    assert_pictures_agree(picture, naive_picture(gaussians, camera, model), atol=1e-12)
+    plain = replace(model, stop="before", step=0.0)
+    same = np.array_equal(rays.render(gaussians, camera, BACKGROUND, plain).image, picture.image)
+    assert same == (step == 0 and stop == "before")
+
+
 def test_splat_around_the_camera_does_not_exist_in_entry_order():
     gaussians, camera = scene_of([[0, 0, 1.0]], np.log(0.4)), straight_camera()
     for extent, exists in [(2.4, True), (2.6, False)]:
@@ -914,6 +934,9 @@ def test_no_gaussians_show_the_background():
         ({"alpha_max": 1.5}, r"alpha_max must be in \(0, 1\], got 1.5"),
         ({"alpha_cut": -0.1}, r"alpha_cut must be in \[0, 1\), got -0.1"),
         ({"transmittance_stop": 1.0}, r"transmittance_stop must be in \[0, 1\), got 1.0"),
+        ({"stop": "never"}, "stop must be one of before, after, got 'never'"),
+        ({"step": 1e-4}, "a step needs order 'entry', got 'center'"),
+        ({"step": -1.0}, "step must be >= 0 and finite, got -1.0"),
         ({"extent": 0.0}, "extent must be > 0, got 0.0"),
         ({"low_pass": math.nan}, "low_pass must be >= 0 and finite, got nan"),
     ],

@@ -6,13 +6,15 @@ import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
-from drgs.bench import accuracy, population, scaling, speed, stability
+from drgs.bench import accuracy, population, scaling, speed, stability, training, volprim
 from drgs.checks import exit_on_user_error
 
 COMMANDS = {
     "speed": speed,
     "scaling": scaling,
     "accuracy": accuracy,
+    "training": training,
+    "volprim": volprim,
     "stability": stability,
     "population": population,
 }

@@ -1,0 +1,191 @@
+"""``python -m drgs.bench training``: what another minute of fitting buys.
+
+Layer 5. The shipped scene at 200x200 (``scenes/lego_mini.yml``) is fitted with different numbers of
+iterations, and with one other choice at a time: smaller pictures first, fewer Gaussians, spherical
+harmonics of a lower degree, another window of the loss. Each choice is a curve of the quality on
+the test views over the time that the fit took. Finished fits are not repeated, interrupted ones go
+on.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import multiprocessing
+from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from drgs import fit
+from drgs.bench.output import machine, markdown_table, new_figure, write_csv, write_figure
+from drgs.config import dump_config, load_config
+from drgs.output import LAST_FILE
+from drgs.schedule import with_iterations
+
+DESCRIPTION = "quality over time for several choices of a fit; an hour or two"
+
+CONFIG = Path(__file__).parents[2] / "scenes" / "lego_mini.yml"
+
+BUDGETS = (500, 1000, 2000, 4000, 8000)
+"""Iterations."""
+
+QUICK_BUDGETS = (100, 200)
+
+
+def _nothing(iterations: int) -> dict[str, Any]:
+    return {}
+
+
+def _coarse(*shares_and_factors: tuple[float, int]) -> Callable[[int], dict[str, Any]]:
+    def overrides(iterations: int) -> dict[str, Any]:
+        stages = (
+            f"{{until: {max(k + 1, round(share * iterations))}, factor: {factor}}}"
+            for k, (share, factor) in enumerate(shares_and_factors)
+        )
+        return {"coarse": f"[{', '.join(stages)}]"}
+
+    return overrides
+
+
+def _set(**values: Any) -> Callable[[int], dict[str, Any]]:
+    changes = {key.replace("__", "."): value for key, value in values.items()}
+    return lambda iterations: changes
+
+
+@dataclass(frozen=True)
+class Choice:
+    """A curve: a change of the configuration, given the number of iterations."""
+
+    name: str
+    overrides: Callable[[int], dict[str, Any]] = _nothing
+
+
+CHOICES = (
+    Choice("as shipped"),
+    Choice("half size for the first quarter", _coarse((0.25, 2))),
+    Choice("half size for the first half", _coarse((0.5, 2))),
+    Choice("quarter, then half size, for the first half", _coarse((0.2, 4), (0.5, 2))),
+    Choice("at most 30,000 Gaussians", _set(densify__max_gaussians=30_000)),
+    Choice("at most 40,000 Gaussians", _set(densify__max_gaussians=40_000)),
+    Choice("SH of degree 0", _set(model__sh_degree=0)),
+    Choice("SH of degree 1", _set(model__sh_degree=1)),
+    Choice("SSIM window of 5 px", _set(loss__window=5, loss__sigma=0.7)),
+    Choice("no SSIM", _set(loss__dssim_weight=0)),
+)
+
+
+@dataclass(frozen=True)
+class Point:
+    """A finished fit."""
+
+    choice: str
+    iterations: int
+    wall_s: float
+    psnr: float  # dB, test views
+    ssim: float
+    gaussians: int
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Options besides ``--out``."""
+    parser.add_argument("--quick", action="store_true", help="a few hundred iterations")
+    parser.add_argument(
+        "--config",
+        type=Path,
+        default=CONFIG,
+        metavar="YML",
+        help=f"what to fit (default: {CONFIG})",
+    )
+    parser.add_argument(
+        "--only", type=int, nargs="+", metavar="K", choices=range(1, len(CHOICES) + 1),
+        help="; ".join(f"{k}: {choice.name}" for k, choice in enumerate(CHOICES, 1)),
+    )  # fmt: skip
+
+
+def run(args: argparse.Namespace) -> None:
+    """Fit what is not finished; table, CSV and plot of all that is."""
+    out = args.out / "training"
+    budgets = QUICK_BUDGETS if args.quick else BUDGETS
+    numbers = args.only or range(1, len(CHOICES) + 1)
+    for iterations in budgets:
+        for choice in (CHOICES[k - 1] for k in numbers):
+            with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:
+                pool.submit(fit_point, args.config, choice.name, iterations, out).result()
+    points = [
+        point_of(choice, iterations, out)
+        for choice in CHOICES
+        for iterations in budgets
+        if (folder_of(choice, iterations, out) / LAST_FILE).exists()
+    ]
+    print(f"\n{machine()}\n\n{table(points)}")
+    rows = [list(vars(point).values()) for point in points]
+    write_csv(out / "training.csv", list(Point.__dataclass_fields__), rows)
+    write_figure(out / "training.png", plot(points))
+    print(f"\nwritten: {out / 'training.csv'}, {out / 'training.png'}")
+
+
+def folder_of(choice: Choice, iterations: int, out: Path) -> Path:
+    """Where a fit is written."""
+    return out / choice.name.replace(",", "").replace(" ", "_") / str(iterations)
+
+
+def fit_point(config: Path, name: str, iterations: int, out: Path) -> None:
+    """Run, or go on with, one fit: the configuration's schedule in proportion, then the choice.
+
+    name: of a choice; functions do not travel to another process.
+    """
+    choice = next(choice for choice in CHOICES if choice.name == name)
+    folder = folder_of(choice, iterations, out)
+    file = folder.with_suffix(".yml")
+    file.parent.mkdir(parents=True, exist_ok=True)
+    dump_config(with_iterations(load_config(config), iterations), file)
+    arguments = [str(file), "--out", str(folder)]
+    for key, value in choice.overrides(iterations).items():
+        arguments += ["--set", f"{key}={value}"]
+    print(f"\n{choice.name}, {iterations} iterations", flush=True)
+    fit.main(arguments)
+
+
+def point_of(choice: Choice, iterations: int, out: Path) -> Point:
+    """What a finished fit reached."""
+    metrics = json.loads((folder_of(choice, iterations, out) / LAST_FILE).read_text())
+    return Point(
+        choice=choice.name,
+        iterations=iterations,
+        wall_s=metrics["wall_s"],
+        psnr=metrics["test"]["psnr"],
+        ssim=metrics["test"]["ssim"],
+        gaussians=metrics["num_gaussians"],
+    )
+
+
+def table(points: Sequence[Point]) -> str:
+    """A row for each choice, a column for each number of iterations."""
+    budgets = sorted({point.iterations for point in points})
+    header = ["time and PSNR", *(f"{n:,} iterations" for n in budgets)]
+    rows = []
+    for name in dict.fromkeys(point.choice for point in points):
+        reached = {
+            p.iterations: f"{p.wall_s:.0f} s, {p.psnr:.2f} dB" for p in points if p.choice == name
+        }
+        rows.append([name, *(reached.get(n, "") for n in budgets)])
+    return markdown_table(header, rows)
+
+
+def plot(points: Sequence[Point]) -> Any:
+    """PSNR over time, one curve a choice."""
+    figure = new_figure(9, 5)
+    axes = figure.subplots()
+    for k, name in enumerate(dict.fromkeys(point.choice for point in points)):
+        curve = sorted((p.wall_s, p.psnr) for p in points if p.choice == name)
+        style = "o-" if k == 0 else "o--"
+        axes.plot(
+            *zip(*curve, strict=True), style, markersize=4, linewidth=2 if k == 0 else 1, label=name
+        )
+    axes.set(xscale="log", xlabel="s", ylabel="PSNR on the test views, dB")
+    axes.grid(alpha=0.3)
+    if points:
+        axes.legend(fontsize=8, loc="upper left", bbox_to_anchor=(1.02, 1))
+    return figure

@@ -1,0 +1,189 @@
+"""``python -m drgs.bench volprim SCENE``: what sets Mitsuba's ``volprim_rf_basic`` apart.
+
+Layer 5. The float64 numpy reference makes that integrator's choices: splats are evaluated along
+each pixel's ray, end at 3 standard deviations, are ordered by where the ray enters them, and those
+that are entered within 1e-4 behind an entry are passed over; there is no low-pass and no smallest
+alpha; a pixel ends behind the splat that takes its transmittance below 0.01. Then one choice at a
+time is replaced by that of 3DGS.
+
+How closely the two can agree depends on the scene's unit of length: where lengths are small or
+large against that step, the integrator enters some splats twice. So the same scene is also measured
+with all its lengths multiplied (by powers of two, so that all else is rounded alike).
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+
+from drgs import metrics, reference, reference_rays
+from drgs.bench.accuracy import Subject, load_subject
+from drgs.bench.output import markdown_table, write_csv
+from drgs.gaussians import PARAMETER_NAMES, Gaussians
+
+DESCRIPTION = "each choice of Mitsuba's volprim_rf_basic, by how much it changes the picture"
+
+SHELL = 3.0
+"""Standard deviations: ``extent`` of Mitsuba's ``ellipsoids``."""
+
+VOLPRIM = reference_rays.ImageModel(
+    projection="exact",
+    order="entry",
+    sh_direction="pixel",
+    stop="after",
+    alpha_max=0.9999,
+    alpha_cut=0.0,
+    transmittance_stop=0.01,
+    extent=SHELL,
+    step=1e-4,
+    low_pass=0.0,
+)
+
+CHANGES: dict[str, dict[str, Any]] = {
+    "all of its choices": {},
+    "no step behind an entry": {"step": 0.0},
+    "a pixel ends at 1e-4, before the splat": {"stop": "before", "transmittance_stop": 1e-4},
+    "alpha at most 0.99": {"alpha_max": reference.ALPHA_MAX},
+    "alpha at least 1/255": {"alpha_cut": reference.ALPHA_CUT},
+    "colours in the direction of the means": {"sh_direction": "mean"},
+    "ordered by the peaks": {"order": "pixel", "step": 0.0},
+    "ordered by the means": {"order": "center", "step": 0.0},
+    "a low-pass of 0.3 px^2": {"low_pass": reference.LOW_PASS},
+}
+
+FACTORS = (1, 4, 16, 64)
+"""By which all lengths are multiplied."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """How far two pictures are apart."""
+
+    factor: int  # by which all lengths are multiplied
+    what: str
+    psnr: float  # dB
+    largest_error: float
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Options besides ``--out``."""
+    parser.add_argument(
+        "scene",
+        nargs="?",
+        default="out/lego",
+        metavar="SCENE",
+        help="a fit's output folder or a PLY file (default: out/lego)",
+    )
+
+
+def run(args: argparse.Namespace) -> None:
+    """Measure; write table and CSV."""
+    mi.set_variant("llvm_ad_rgb")
+    subject = load_subject(Path(args.scene), 1)
+    rows = []
+    for factor in FACTORS:
+        rows += compare(enlarged(subject, factor), factor)
+        print(f"lengths x {factor}: {rows[-len(CHANGES)].psnr:.1f} dB", flush=True)
+    print(f"\n{table(rows)}")
+    write_csv(
+        args.out / "volprim.csv", list(Row.__dataclass_fields__), [vars(r).values() for r in rows]
+    )
+    print(f"\nwritten: {args.out / 'volprim.csv'}")
+
+
+def enlarged(subject: Subject, factor: int) -> Subject:
+    """The same scene with all lengths multiplied by ``factor``."""
+    gaussians = subject.gaussians
+    return replace(
+        subject,
+        gaussians=replace(
+            gaussians,
+            means=gaussians.means * np.float32(factor),
+            log_scales=gaussians.log_scales + np.float32(np.log(factor)),
+        ),
+        cameras=[
+            replace(c, center=c.center * factor, near=c.near * factor) for c in subject.cameras
+        ],
+    )
+
+
+def compare(subject: Subject, factor: int) -> list[Row]:
+    """All changes of the reference, against Mitsuba's picture of the first view."""
+    camera = subject.cameras[0]
+    image = volprim_image(subject.gaussians, camera)
+    gaussians = reference.Gaussians(
+        **{name: getattr(subject.gaussians, name) for name in PARAMETER_NAMES}
+    )
+    rows = []
+    for what, change in CHANGES.items():
+        model = replace(VOLPRIM, **change)
+        picture = reference_rays.render(gaussians, camera, (0, 0, 0), model)
+        rows.append(_row(factor, what, picture.image, image))
+    return rows
+
+
+def _row(factor: int, what: str, image: np.ndarray, other: np.ndarray) -> Row:
+    return Row(factor, what, metrics.psnr(image, other), float(np.abs(image - other).max()))
+
+
+def volprim_image(gaussians: Gaussians, camera: reference.Camera) -> np.ndarray:
+    """(H, W, 3) display space, on black, each pixel at its centre; fx and fy must agree."""
+    quats_xyzw = gaussians.quats / np.linalg.norm(gaussians.quats, axis=1, keepdims=True)
+    quats_xyzw = np.roll(quats_xyzw, -1, axis=1)
+    sh = np.concatenate([gaussians.sh0, gaussians.shN], axis=1)
+    attributes = {
+        "data": np.concatenate([gaussians.means, gaussians.scales, quats_xyzw], axis=1),
+        "opacities": gaussians.opacities[:, None],
+        "sh_coeffs": sh.reshape(len(sh), -1),
+    }
+    to_world = np.eye(4)
+    to_world[:3, :3], to_world[:3, 3] = camera.rotation.T, camera.center
+    tensors = {name: mi.TensorXf(v.astype(np.float32)) for name, v in attributes.items()}
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "integrator": {
+                "type": "volprim_rf_basic",
+                "srgb_primitives": False,
+                "max_depth": 4096,
+            },
+            "emitter": {"type": "constant"},
+            "shapes": {"type": "ellipsoids", "extent": SHELL, **tensors},
+            "sensor": {
+                "type": "perspective",
+                "fov": float(np.degrees(2 * np.arctan(camera.width / 2 / camera.fx))),
+                "fov_axis": "x",
+                "principal_point_offset_x": 0.5 - camera.cx / camera.width,
+                "principal_point_offset_y": 0.5 - camera.cy / camera.height,
+                "near_clip": camera.near,
+                "to_world": mi.ScalarTransform4f(to_world @ np.diag([-1.0, -1.0, 1.0, 1.0])),
+                "film": {
+                    "type": "hdrfilm",
+                    "width": camera.width,
+                    "height": camera.height,
+                    "pixel_format": "rgb",
+                    "component_format": "float32",
+                    "rfilter": {"type": "box"},
+                },
+                "sampler": {"type": "stratified", "sample_count": 1, "jitter": False},
+            },
+        }
+    )
+    return np.array(mi.render(scene, spp=1), np.float64)
+
+
+def table(rows: Sequence[Row]) -> str:
+    """PSNR of each change, a column for each factor."""
+    factors = list(dict.fromkeys(row.factor for row in rows))
+    header = ["PSNR against volprim_rf_basic", *(f"lengths x {factor}" for factor in factors)]
+    lines = []
+    for what in dict.fromkeys(row.what for row in rows):
+        found = {row.factor: row.psnr for row in rows if row.what == what}
+        lines.append([what, *(f"{found[factor]:.1f} dB" for factor in factors)])
+    return markdown_table(header, lines)
