@@ -57,7 +57,7 @@ CHANGES: dict[str, dict[str, Any]] = {
     "a low-pass of 0.3 px^2": {"low_pass": reference.LOW_PASS},
 }
 
-FACTORS = (1, 4, 16, 64)
+FACTORS = (1, 16, 64)
 """By which all lengths are multiplied."""
 
 
