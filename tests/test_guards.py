@@ -29,7 +29,8 @@ def variant():
 def view_name(trainer, iteration):
     from drgs.trainer import view_of
 
-    return trainer.views[view_of(iteration, len(trainer.views), trainer.config.seed)].name
+    views = trainer.stages[-1].views
+    return views[view_of(iteration, len(views), trainer.config.seed)].name
 
 
 # ----------------------------------------------------------------------------------------------
@@ -130,7 +131,8 @@ def test_loss_that_is_not_finite_names_iteration_and_view(dssim_weight, gradient
     photo = np.full((16, 20, 3), 0.5, np.float32)
     photo[8, 10] = np.nan
     target = prepare_target(mi.TensorXf(photo))
-    trainer.views[spoilt] = replace(trainer.views[spoilt], target=target)
+    views = trainer.stages[-1].views
+    views[spoilt] = replace(views[spoilt], target=target)
     for _ in range(3):
         trainer.step()
     trainer.check()
