@@ -127,6 +127,13 @@ class Measurement:
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Options besides ``--out``."""
+    add_scene(parser)
+    parser.add_argument("--views", type=int, default=3, help="test views of a fit (default: 3)")
+    parser.add_argument("--quick", action="store_true", help="one view, fewer rounds")
+
+
+def add_scene(parser: argparse.ArgumentParser) -> None:
+    """The argument that :func:`load_subject` reads."""
     parser.add_argument(
         "scene",
         nargs="?",
@@ -134,8 +141,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         metavar="SCENE",
         help="a fit's output folder or a PLY file (default: out/lego)",
     )
-    parser.add_argument("--views", type=int, default=3, help="test views of a fit (default: 3)")
-    parser.add_argument("--quick", action="store_true", help="one view, fewer rounds")
 
 
 def run(args: argparse.Namespace) -> None:

@@ -52,7 +52,12 @@ def drgs_renderer(problem: Problem) -> Renderer:
 
 def volprim_renderer(problem: Problem, shape: str, seconds: float) -> Renderer:
     """Mitsuba's ``volprim_rf_basic`` on ``ellipsoids`` or ``ellipsoidsmesh``."""
-    gaussians = problem.gaussians
+    scene = mi.load_dict(volprim_scene(problem.gaussians, shape, 256))
+    return _mitsuba_renderer(f"volprim_rf_basic, {shape}", scene, problem, "shapes.", seconds)
+
+
+def volprim_scene(gaussians: Gaussians, shape: str, max_depth: int) -> dict[str, Any]:
+    """A scene of ``ellipsoids`` or ``ellipsoidsmesh``, without a sensor, in display space."""
     quats_xyzw = gaussians.quats / np.linalg.norm(gaussians.quats, axis=1, keepdims=True)
     quats_xyzw = np.roll(quats_xyzw, -1, axis=1)
     sh = np.concatenate([gaussians.sh0, gaussians.shN], axis=1)
@@ -61,23 +66,17 @@ def volprim_renderer(problem: Problem, shape: str, seconds: float) -> Renderer:
         "opacities": gaussians.opacities[:, None],
         "sh_coeffs": sh.reshape(len(sh), -1),
     }
-    scene = mi.load_dict(
-        {
-            "type": "scene",
-            "integrator": {
-                "type": "volprim_rf_basic",
-                "srgb_primitives": False,
-                "max_depth": 256,
-            },
-            "emitter": {"type": "constant"},
-            "shapes": {
-                "type": shape,
-                "extent": SHELL,
-                **{name: mi.TensorXf(v.astype(np.float32)) for name, v in attributes.items()},
-            },
-        }
-    )
-    return _mitsuba_renderer(f"volprim_rf_basic, {shape}", scene, problem, "shapes.", seconds)
+    tensors = {name: mi.TensorXf(v.astype(np.float32)) for name, v in attributes.items()}
+    return {
+        "type": "scene",
+        "integrator": {
+            "type": "volprim_rf_basic",
+            "srgb_primitives": False,
+            "max_depth": max_depth,
+        },
+        "emitter": {"type": "constant"},
+        "shapes": {"type": shape, "extent": SHELL, **tensors},
+    }
 
 
 def _mitsuba_renderer(

@@ -23,14 +23,12 @@ import mitsuba as mi
 import numpy as np
 
 from drgs import metrics, reference, reference_rays
-from drgs.bench.accuracy import Subject, load_subject
+from drgs.bench.accuracy import Subject, add_scene, load_subject
 from drgs.bench.output import markdown_table, write_csv
+from drgs.bench.peers import SHELL, volprim_scene
 from drgs.gaussians import PARAMETER_NAMES, Gaussians
 
 DESCRIPTION = "each choice of Mitsuba's volprim_rf_basic, by how much it changes the picture"
-
-SHELL = 3.0
-"""Standard deviations: ``extent`` of Mitsuba's ``ellipsoids``."""
 
 VOLPRIM = reference_rays.ImageModel(
     projection="exact",
@@ -73,13 +71,7 @@ class Row:
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Options besides ``--out``."""
-    parser.add_argument(
-        "scene",
-        nargs="?",
-        default="out/lego",
-        metavar="SCENE",
-        help="a fit's output folder or a PLY file (default: out/lego)",
-    )
+    add_scene(parser)
 
 
 def run(args: argparse.Namespace) -> None:
@@ -134,27 +126,11 @@ def _row(factor: int, what: str, image: np.ndarray, other: np.ndarray) -> Row:
 
 def volprim_image(gaussians: Gaussians, camera: reference.Camera) -> np.ndarray:
     """(H, W, 3) display space, on black, each pixel at its centre; fx and fy must agree."""
-    quats_xyzw = gaussians.quats / np.linalg.norm(gaussians.quats, axis=1, keepdims=True)
-    quats_xyzw = np.roll(quats_xyzw, -1, axis=1)
-    sh = np.concatenate([gaussians.sh0, gaussians.shN], axis=1)
-    attributes = {
-        "data": np.concatenate([gaussians.means, gaussians.scales, quats_xyzw], axis=1),
-        "opacities": gaussians.opacities[:, None],
-        "sh_coeffs": sh.reshape(len(sh), -1),
-    }
     to_world = np.eye(4)
     to_world[:3, :3], to_world[:3, 3] = camera.rotation.T, camera.center
-    tensors = {name: mi.TensorXf(v.astype(np.float32)) for name, v in attributes.items()}
     scene = mi.load_dict(
         {
-            "type": "scene",
-            "integrator": {
-                "type": "volprim_rf_basic",
-                "srgb_primitives": False,
-                "max_depth": 4096,
-            },
-            "emitter": {"type": "constant"},
-            "shapes": {"type": "ellipsoids", "extent": SHELL, **tensors},
+            **volprim_scene(gaussians, "ellipsoids", 4096),
             "sensor": {
                 "type": "perspective",
                 "fov": float(np.degrees(2 * np.arctan(camera.width / 2 / camera.fx))),
