@@ -48,6 +48,7 @@ from drgs.rasterize import (
     largest,
     pack_tangents,
     splat_gradients,
+    sum_runs,
 )
 from drgs.tiles import GRID, MICROS, TILE, TileBins, lower_bounds, stable_order
 
@@ -555,19 +556,11 @@ def _sum_items(bins: TileBins, lists: _Lists, partials: Any) -> SplatGradients:
     """Add up the items of each splat."""
     t = types_of(type(bins.rows))
     width = bins.model.response.num_moments + bins.num_features
-    rank = dr.arange(t.UInt32, dr.width(bins.order))
-    begin, end = (dr.gather(t.UInt32, lists.first_item, rank + k) for k in (0, 1))
     places = lists.places()
-
-    def body(item: Any, totals: list) -> tuple:
-        numbers = load_row(partials, width, dr.gather(t.UInt32, places, item))
-        return item + 1, [a + b for a, b in zip(totals, numbers, strict=True)]
-
-    zero = dr.zeros(t.Float, dr.width(rank))
-    _, totals = dr.while_loop(
-        state=(begin, [t.Float(zero) for _ in range(width)]),
-        cond=lambda item, totals: item < end,
-        body=body,
+    totals = sum_runs(
+        t.Float,
+        lists.first_item,
+        lambda item: load_row(partials, width, dr.gather(t.UInt32, places, item)),
     )
     return splat_gradients(bins, totals)
 

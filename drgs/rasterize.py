@@ -406,20 +406,30 @@ def sum_slots(bins: TileBins, slots: Slots, partials: Any, width: int) -> SplatG
     """
     t = types_of(type(bins.rows))
     by_entry = _sum_entries(bins, slots, partials, width)
-    rank = dr.arange(t.UInt32, dr.width(bins.order))
-    begin, end = (dr.gather(t.UInt32, bins.first_entry, rank + k) for k in (0, 1))
+    totals = sum_runs(t.Float, bins.first_entry, lambda entry: load_row(by_entry, width, entry))
+    return splat_gradients(bins, totals)
 
-    def body(entry: Any, totals: list) -> tuple:
-        numbers = load_row(by_entry, width, entry)
-        return entry + 1, [a + b for a, b in zip(totals, numbers, strict=True)]
 
-    zero = dr.zeros(t.Float, dr.width(rank))
+def sum_runs(Float: type, first: Any, load: Callable[[Any], list[Any]]) -> list[Any]:
+    """Sums over runs, one lane a run: run r is from ``first[r]`` to ``first[r + 1]``.
+
+    load: the numbers of an element of a run.
+    """
+    UInt32 = type(first)
+    run = dr.arange(UInt32, dr.width(first) - 1)
+    begin, end = (dr.gather(UInt32, first, run + k) for k in (0, 1))
+    width = len(load(begin))
+
+    def body(element: Any, totals: list) -> tuple:
+        return element + 1, [a + b for a, b in zip(totals, load(element), strict=True)]
+
+    zero = dr.zeros(Float, dr.width(run))
     _, totals = dr.while_loop(
-        state=(begin, [t.Float(zero) for _ in range(width)]),
-        cond=lambda entry, totals: entry < end,
+        state=(begin, [Float(zero) for _ in range(width)]),
+        cond=lambda element, totals: element < end,
         body=body,
     )
-    return splat_gradients(bins, totals)
+    return totals
 
 
 def splat_gradients(bins: TileBins, totals: list[Any]) -> SplatGradients:

@@ -357,7 +357,7 @@ def test_every_detector_notices_a_mutant(outcome):
 def test_derivatives_have_mutants(outcome):
     """Of these at least; what belongs to the derivative is found by who calls whom."""
     expected = """
-        rasterize.composite_adjoint rasterize._adjoint_step rasterize.sum_slots
+        rasterize.composite_adjoint rasterize._adjoint_step rasterize.sum_runs
         rasterize.composite_tangent rasterize.pack_tangents image_model.AffineResponse.moments
         image_model.AffineResponse.derivatives image_model.AffineResponse.tangent
         image_model.AffineResponse.pack_tangents image_model.SplatFeatures.add_derivatives
