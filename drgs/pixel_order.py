@@ -318,8 +318,7 @@ def _walk(
         absent = dr.select(active, t.Float(-dr.inf), dr.inf)
         next_queue, visited = [], []
         for pixel, along in enumerate(order.depths.along(footprint, keys)):
-            exists = (alphas[pixel].value > 0) & (along > 0)
-            alpha = dr.select(exists, alphas[pixel].value, 0)
+            alpha = dr.select(along > 0, alphas[pixel].value, 0)
             depth = dr.select(alpha >= UNORDERED_ALPHA, keys[-1] * along, absent)
             places, nearest = _insert(queue[pixel], [depth, alpha, *carry(met, pixel)])
             next_queue.append(places)

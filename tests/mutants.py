@@ -481,14 +481,23 @@ def _package_functions(tree: ast.Module) -> set[str]:
     return {name for _, name in ours} | {name.rpartition(".")[2] for name in defined}
 
 
+def _extending_others(tree: ast.Module) -> set[str]:
+    """Classes whose base is not of this package: others call their methods."""
+    ours = {name for module, name in _imports(tree) if module.startswith("drgs.")}
+    classes = [node for node in tree.body if isinstance(node, ast.ClassDef)]
+    ours |= {node.name for node in classes}
+    return {node.name for node in classes if {ast.unparse(base) for base in node.bases} - ours}
+
+
 def _reachable(tree: ast.Module, roots: Iterable[str]) -> set[str]:
     """Functions and methods that ``roots`` may call, by the names that they mention."""
     definitions, imported = _definitions(tree), {name for _, name in _imports(tree)}
+    frameworks = _extending_others(tree)
     by_mention: dict[str, list[str]] = {}
     for name in definitions:
         owner, _, method = name.rpartition(".")
-        for mention in {owner or name, method}:
-            by_mention.setdefault(mention, []).append(name)
+        unnamed = method.startswith("__") or owner in frameworks
+        by_mention.setdefault(owner if unnamed and owner else method, []).append(name)
     reached: set[str] = set()
     pending = list(roots)
     assert set(pending) <= set(definitions), set(pending) - set(definitions)
@@ -497,7 +506,8 @@ def _reachable(tree: ast.Module, roots: Iterable[str]) -> set[str]:
         if name in reached:
             continue
         reached.add(name)
-        for node in ast.walk(definitions[name]):
+        statements = definitions[name].body  # and not the annotations
+        for node in (n for statement in statements for n in ast.walk(statement)):
             if isinstance(node, ast.Name):
                 pending += by_mention.get(node.id, [])
             elif isinstance(node, ast.Attribute) and ast.unparse(node.value) not in imported:
@@ -600,7 +610,8 @@ class _Instrumenter(ast.NodeTransformer):
         return node
 
     def visit_Tuple(self, node: ast.Tuple) -> ast.Tuple:
-        node.elts = [self._made_here(element) for element in node.elts]
+        if isinstance(node.ctx, ast.Load):
+            node.elts = [self._made_here(element) for element in node.elts]
         return node
 
     def visit_BinOp(self, node: ast.BinOp) -> ast.expr:

@@ -15,9 +15,7 @@ what it returns.
 from __future__ import annotations
 
 import textwrap
-from collections import Counter
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cache, partial
 
 import drjit as dr
@@ -27,6 +25,7 @@ import pytest
 import test_losses
 import test_rasterize
 import test_rendering
+from detectors import detectors, find_noticed
 from drjit.llvm.ad import Float64
 from helpers import (
     FLOAT64,
@@ -41,7 +40,7 @@ from helpers import (
     single,
     stacked_scene,
 )
-from mutants import ALWAYS, AT_EQUALITY, NEGATED, NEVER, SCALED, Instrumented, Mutant, Switchboard
+from mutants import ALWAYS, AT_EQUALITY, NEGATED, NEVER, SCALED, Instrumented, Switchboard
 
 from drgs import image_model, losses, rasterize, reference, rendering
 from drgs.cutoffs import Cutoffs
@@ -151,22 +150,7 @@ def _check_loss_and_gradient():
 # ----------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class Detector:
-    name: str
-    check: Callable[[], None]
-
-    def notices(self) -> bool:
-        """Whether the check fails. An error that is no failed comparison is passed on."""
-        try:
-            with np.errstate(all="ignore"):
-                self.check()
-        except (AssertionError, pytest.fail.Exception):
-            return True
-        return False
-
-
-def _detectors(at_thresholds) -> tuple[list[Detector], list[Detector]]:
+def _detectors(at_thresholds):
     """Those that see all partials; and those for hard cases, for what the former do not notice."""
     case, flat, equal = clear(CASE), _flat_scene(), _scene_at_thresholds()
     chain, stage, loss = test_rendering, test_rasterize, test_losses
@@ -192,27 +176,7 @@ def _detectors(at_thresholds) -> tuple[list[Detector], list[Detector]]:
         "loss at equality": loss.test_l1_gradient_is_the_sign_and_zero_at_equality,
         "loss overexposed": loss.test_overexposed_images_do_not_blow_up_the_gradient,
     }
-    return tuple([Detector(*item) for item in group.items()] for group in (general, special))
-
-
-@dataclass(frozen=True)
-class Outcome:
-    """What became of each mutant."""
-
-    switchboard: Switchboard
-    detectors: list[str]
-    false_alarms: list[str]  # detectors that fail without a mutant
-    noticed_by: dict[Mutant, list[str]]
-
-    @property
-    def table(self) -> str:
-        lines = [
-            f"{str(mutant)[:110]:110}  {mutant.change:11}  {', '.join(names) or '-'}"
-            for mutant, names in self.noticed_by.items()
-        ]
-        reasons = Counter(reason for _, _, reason in self.switchboard.left_out)
-        lines += [f"left out {count:3}: {reason}" for reason, count in reasons.items()]
-        return "\n".join(lines)
+    return detectors(general), detectors(special)
 
 
 @pytest.fixture(scope="module")
@@ -283,7 +247,7 @@ def outcome():
         for name in ("kernel_gradients", "kernel_tangent"):
             patch.setattr(test_rendering, name, _remembered(board, getattr(test_rendering, name)))
         general, special = _detectors(at_thresholds)
-        result = _find_noticed(board, general, special)
+        result = find_noticed(board, general, special)
     return result
 
 
@@ -305,27 +269,6 @@ def _remembered(board, function):
     return call
 
 
-def _find_noticed(board, general, special) -> Outcome:
-    false_alarms, reached, noticed_by = [], {}, {}
-    for detector in (*general, *special):
-        fails, reached[detector.name] = board.record(detector.notices)
-        if fails:
-            false_alarms.append(detector.name)
-    for mutant in board.mutants:
-        board.apply(mutant)
-
-        def ask(group, mutant=mutant):
-            return [d.name for d in group if mutant.switch in reached[d.name] and d.notices()]
-
-        noticed_by[mutant] = ask(general) or ask(special)
-    board.apply(None)
-    return Outcome(board, list(reached), false_alarms, noticed_by)
-
-
-def _key(mutant: Mutant) -> tuple[str, str, str, str]:
-    return mutant.site.function, mutant.site.text, mutant.part, mutant.change
-
-
 # ----------------------------------------------------------------------------------------------
 # Tests
 # ----------------------------------------------------------------------------------------------
@@ -338,20 +281,17 @@ def test_no_detector_fails_without_a_mutant(outcome):
 
 def test_every_mutant_is_noticed(outcome):
     print(f"\n{outcome.table}")
-    unnoticed = [m for m, names in outcome.noticed_by.items() if not names]
-    survivors = [f"{m}  {m.change}" for m in unnoticed if _key(m) not in EQUIVALENT]
+    survivors = outcome.survivors(EQUIVALENT)
     assert not survivors, "noticed by nobody:\n" + "\n".join(survivors)
 
 
 def test_equivalent_mutants_exist_and_are_noticed_by_nobody(outcome):
     """Otherwise the reason for leaving them out no longer holds."""
-    noticed_by = {_key(mutant): names for mutant, names in outcome.noticed_by.items()}
-    assert {key: noticed_by.get(key) for key in EQUIVALENT} == {key: [] for key in EQUIVALENT}
+    assert outcome.noticing(EQUIVALENT) == {key: [] for key in EQUIVALENT}
 
 
 def test_every_detector_notices_a_mutant(outcome):
-    busy = {name for names in outcome.noticed_by.values() for name in names}
-    assert busy == set(outcome.detectors)
+    assert outcome.busy_detectors == set(outcome.detectors)
 
 
 def test_derivatives_have_mutants(outcome):
@@ -372,10 +312,7 @@ def test_derivatives_have_mutants(outcome):
 
 def test_every_site_is_evaluated(outcome):
     """A partial that no scene reaches would have no mutant."""
-    idle = [
-        f"{s.function}:{s.line}  {s.text}" for s in outcome.switchboard.sites if not s.evaluated
-    ]
-    assert not idle, "\n".join(idle)
+    assert not outcome.idle_sites, "\n".join(outcome.idle_sites)
 
 
 # ----------------------------------------------------------------------------------------------

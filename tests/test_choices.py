@@ -20,8 +20,9 @@ from helpers import (
     single,
     stacked_scene,
 )
+from scipy.spatial.transform import Rotation
 
-from drgs import reference, reference_rays, rendering
+from drgs import perspective, pixel_order, ray_colors, reference, reference_rays, rendering
 from drgs.choices import Choices
 from drgs.gaussians import PARAMETER_NAMES
 
@@ -34,6 +35,10 @@ CHOICES = {
     "pixel colours": {"sh_direction": "pixel"},
     "all three": {
         "projection": "exact", "order": "pixel", "order_window": 8, "sh_direction": "pixel"
+    },
+    "all three, other cuts": {
+        "projection": "exact", "order": "pixel", "order_window": 8, "sh_direction": "pixel",
+        "alpha_max": 0.7, "alpha_cut": 0.03, "transmittance_stop": 0.05
     },
     "no cuts": {"alpha_cut": 0.0, "transmittance_stop": 0.0},
     "exact, no cuts": {"projection": "exact", "alpha_cut": 0.0, "transmittance_stop": 0.0},
@@ -74,12 +79,24 @@ def close_scene(seed, width, height, degree, count):
     return replace(gaussians, means=means, log_scales=scales, logit_opacities=logits), camera
 
 
+def around_scene(seed, width, height, degree, count):
+    """Needles that reach past the camera: rays meet their peaks before and behind it."""
+    gaussians, camera = close_scene(seed, width, height, degree, count)
+    rng = np.random.default_rng(seed)
+    tilt = Rotation.from_rotvec(rng.normal(0, 0.4, (count, 3)))
+    quats = (Rotation.from_matrix(camera.rotation.T) * tilt).as_quat(scalar_first=True)
+    depths = (gaussians.means - camera.center) @ camera.rotation[2]
+    scales = rng.uniform([0.1, 0.1, 0.5], [0.3, 0.3, 1.5], (count, 3)) * depths[:, None]
+    return replace(gaussians, quats=single(quats), log_scales=single(np.log(scales))), camera
+
+
 SCENES = {
     "random": (random_scene, 37, 29, 1, 60),
     "close": (close_scene, 40, 23, 1, 20),
+    "around": (around_scene, 40, 23, 1, 8),
 }
 
-all_scenes = pytest.mark.parametrize("scene", SCENES)
+all_scenes = pytest.mark.parametrize("scene", ("random", "close"))
 
 
 @dataclass(frozen=True)
@@ -219,24 +236,29 @@ STEP = 2.0**-24
 1e-16 / STEP of each plane's values: 1e-8 in all."""
 
 
+@cache
+def central_differences(problem, parameter, weights_seed, seed) -> float:
+    """Of the reference, along :func:`direction`: d sum(weights * planes)."""
+    weights, d = problem.weights(weights_seed), direction(problem, parameter, seed)
+
+    def moved(sign):
+        values = {
+            n: getattr(problem.inputs[0], n) + sign * STEP * getattr(d, n) for n in PARAMETER_NAMES
+        }
+        return problem.reference_planes(reference.Gaussians(**values))
+
+    return np.sum(weights * (moved(1) - moved(-1))) / (2 * STEP)
+
+
 @all_scenes
 @all_choices
 def test_gradients_equal_central_differences_of_the_reference(scene, name):
     problem = Problem(name, scene)
-    weights = problem.weights(seed=1)
-    gradients = problem.kernel_gradients(FLOAT64, weights)
+    gradients = problem.kernel_gradients(FLOAT64, problem.weights(seed=1))
     for parameter in PARAMETER_NAMES:
         d = direction(problem, parameter, seed=2)
-
-        def moved(sign, d=d):
-            values = {
-                n: getattr(problem.inputs[0], n) + sign * STEP * getattr(d, n)
-                for n in PARAMETER_NAMES
-            }
-            return problem.reference_planes(reference.Gaussians(**values))
-
-        expected = np.sum(weights * (moved(1) - moved(-1))) / (2 * STEP)
         terms = getattr(d, parameter) * gradients[parameter]
+        expected = central_differences(problem, parameter, weights_seed=1, seed=2)
         # A sum of terms of both signs: relative to their size.
         assert abs(terms.sum() - expected) < 1e-6 * np.abs(terms).sum(), parameter
 
@@ -279,34 +301,106 @@ def test_same_bytes_in_every_run(name):
     assert [a.tobytes() for a in first] == [a.tobytes() for a in second]
 
 
-def test_behind_a_hundred_layers_gradients_keep_their_accuracy():
+def test_behind_hundreds_of_layers_gradients_keep_their_accuracy():
     """What lies behind is known as a difference of sums; a splat seen through a transmittance of
-    1e-4 would lose three digits more than the first.
+    1e-9 would have no digit left. Colours darken with depth, so that all terms are positive.
     """
-    count = 100
+    count = 220
     rng = np.random.default_rng(0)
     camera = reference.Camera(np.eye(3), np.zeros(3), 20.0, 20.0, 8.0, 8.0, 16, 16)
     z = np.linspace(2, 4, count)
     gaussians = reference.Gaussians(
         means=single(np.column_stack([rng.normal(0, 0.02, (count, 2)) * z[:, None], z])),
         quats=single(rng.normal(size=(count, 4))),
-        log_scales=single(np.log(rng.uniform(0.3, 0.6, (count, 3)))),
+        log_scales=single(np.log(rng.uniform(1.2, 1.5, (count, 3)) * z[:, None])),
         logit_opacities=single(np.full(count, -2.3)),
-        sh0=single(rng.normal(0, 1, (count, 1, 3))),
+        sh0=single(np.repeat(np.linspace(1, -1, count), 3).reshape(count, 1, 3)),
         shN=np.zeros((count, 0, 3)),
     )
-    pipeline = Choices(order="pixel", order_window=8, transmittance_stop=0.0).pipeline(0)
-    weights = single(rng.normal(size=(4, 256)))
+    pipeline = Choices(order="pixel", order_window=1, transmittance_stop=0.0).pipeline(0)
     results = []
     for precision in (FLOAT64, FLOAT32):
         device = device_gaussians(gaussians, precision)
         frame = rendering.render(device, device_camera(camera, precision), pipeline)
-        d_transmittance, *d_features = (precision.array(w) for w in weights)
-        gradients = rendering.render_adjoint(device, frame, d_features, d_transmittance)
+        ones = precision.array(np.ones(256))
+        gradients = rendering.render_adjoint(device, frame, [ones] * 3, 0 * ones)
         results.append(np.array(gradients.parameters.logit_opacities))
-    assert np.array(frame.planes()[0]).min() < 1e-3
-    # Each derivative relative to its own row's terms: a few roundings a layer.
-    np.testing.assert_allclose(results[1], results[0], rtol=2e-3, atol=1e-6 * abs(results[0]).max())
+        assert np.array(frame.planes()[0]).max() < 1e-8
+    # Doubled precision, 2^-48 a layer, relative to 1e-9 and to a twentieth of the colour.
+    np.testing.assert_allclose(results[1], results[0], rtol=1e-3)
+
+
+def test_sums_of_products_are_exact_to_twice_the_precision():
+    """The second half of the terms almost cancels the first."""
+    count = 100
+    rng = np.random.default_rng(0)
+    a, b = (single(rng.normal(size=count)) for _ in range(2))
+    a, b = np.append(a, -a), np.append(b, b * (1 + 2.0**-20))
+    assert (a == single(a)).all()
+    high = low = FLOAT32.Float(0)
+    for x, y in zip(a, single(b), strict=True):
+        high, low = pixel_order._add_product(high, low, FLOAT32.Float(x), FLOAT32.Float(y))
+    exact = math.fsum(a * single(b))
+    # Of doubled single precision, 2^-48 a term.
+    assert abs(float(high[0]) + float(low[0]) - exact) < 200 * 2.0**-48 * np.abs(a * b).max()
+
+
+def test_twins_are_composited_in_one_order_by_picture_and_derivative():
+    """Every splat is there twice, in two colours, at equal depths. Pictures are linear in the
+    colours that are not clamped: their derivatives, times them, give the picture again. (The window
+    is odd: a comparison that swaps twins does it again at every insertion.)
+    """
+    gaussians, camera = close_scene(3, 20, 12, 0, 10)
+    twins = {n: np.repeat(getattr(gaussians, n), 2, axis=0) for n in PARAMETER_NAMES}
+    twins["sh0"] = single(np.random.default_rng(1).uniform(-1, 1, (20, 1, 3)))
+    pipeline = Choices(projection="exact", order="pixel", order_window=7).pipeline(0)
+    weights = single(np.random.default_rng(2).normal(size=(3, 240)))
+    device = device_gaussians(reference.Gaussians(**twins), FLOAT64)
+    frame = rendering.render(device, device_camera(camera, FLOAT64), pipeline)
+    black = device_gaussians(reference.Gaussians(**{**twins, "sh0": 0 * twins["sh0"]}), FLOAT64)
+    without = rendering.render(black, device_camera(camera, FLOAT64), pipeline)
+    gradients = rendering.render_adjoint(
+        device, frame, [precise(w) for w in weights], precise(0 * weights[0])
+    )
+    pictures = [np.array([rows(p) for p in f.planes()[1:]]) for f in (frame, without)]
+    linear = np.sum(weights * (pictures[0] - pictures[1]))
+    from_gradients = np.sum(twins["sh0"] * np.array(gradients.parameters.sh0))
+    assert from_gradients == pytest.approx(linear, rel=1e-12)
+
+
+def precise(values):
+    return FLOAT64.array(values)
+
+
+def test_a_peak_in_the_plane_of_the_camera_shows_nothing():
+    """Nor does one behind it: a = 1 - kappa . e is 0 at dx = 1, and -1 at dx = 2."""
+    number = FLOAT64.Float
+    geometry = [number(x) for x in (0.5, 0.5, 1, 0, 1, 0, 1, 0, 0.5)]
+    offsets = [[[number(i) for i in range(4)]] * 4, [[number(j)] * 4 for j in range(4)]]
+    footprint = perspective.RayResponse().footprint(geometry, offsets, number(0) == 0)
+    shows = np.array([float(x[0]) > -math.inf for x in footprint.log2_alpha]).reshape(4, 4)
+    assert shows[:, 0].all() and not shows[:, 1:].any()
+
+
+def test_a_splat_without_opacity_has_no_derivatives():
+    """An opacity that underflows to zero has the logarithm - inf."""
+    number = FLOAT64.Float
+    response = perspective.RayResponse()
+    geometry = [number(x) for x in (0.5, 0.5, 1, 0, 1, -math.inf, 1, 0, 0.5)]
+    derivatives = response.derivatives(geometry, [number(0)] * response.num_moments)
+    assert [float(d[0]) for d in derivatives] == [0] * 9
+
+
+def test_a_colour_at_its_minimum_keeps_its_derivative():
+    """As Dr.Jit's selection does for the colour at the mean; below it there is none."""
+    number = FLOAT64.Float
+    colors = ray_colors.RayColors(sh_degree=0, basis=([number(1)],))
+    stored = [number(x) for x in (-0.5, -0.75, 0, -3)]  # colour 0, -0.25, 0.5; another feature
+    zeros, ones = [number(0)] * 4, [number(1)] * 4
+    derivatives = colors.add_derivatives(zeros, stored, 0, number(1), ones)
+    tangents = colors.tangents(stored, ones, 0)
+    for values in (derivatives, tangents):
+        assert [float(x[0]) for x in values] == [1, 0, 1, 1]
 
 
 # ----------------------------------------------------------------------------------------------
