@@ -181,7 +181,10 @@ class OptimizerConfig(_Section):
         1.6e-4, gt=0, description="First rate of the means, in units of the scene extent."
     )
     means_lr_final: float = Field(
-        1.6e-6, gt=0, description="Last rate of the means; exponential decay over all iterations."
+        1.6e-6, gt=0, description="Last rate of the means, which decays exponentially."
+    )
+    means_lr_steps: Count | None = Field(
+        None, ge=1, description="Iterations until the means' rate is the last one; null: all."
     )
     sh0_lr: float = Field(2.5e-3, ge=0, description="Degree-0 colour coefficients.")
     shN_lr: float = Field(1.25e-4, ge=0, description="Colour coefficients of higher degrees.")  # noqa: N815

@@ -11,6 +11,7 @@ result on the test views and writes the output folder:
 - ``curves.png``, ``orbit.webp``, ``orbit.gif``
 - ``report.html``: all of it on one page that needs no other file
 - ``config.yml``: every value that the fit used
+- ``plan.txt``: with ``--budget``, what was planned and why
 
 While it runs there is also ``checkpoint.npz``, from which ``--resume`` continues.
 """
@@ -41,24 +42,36 @@ from drgs.checkpoint import (
     save_checkpoint,
 )
 from drgs.checks import UserError, exit_on_user_error, one_line
-from drgs.config import FitConfig, load_config
+from drgs.config import FitConfig, dump_config, load_config
 from drgs.data import Dataset, initial_gaussians, load_dataset
 from drgs.execution import add_options, execution
 from drgs.files import atomic_path
+from drgs.gaussians import Gaussians
 from drgs.guards import NonFiniteError
 from drgs.interrupts import INTERRUPTED_STATUS, StopRequest
 from drgs.io.ply import write_ply
 from drgs.metrics import Quality, mean_quality
 from drgs.output import (
+    CONFIG_NAME,
     LAST_FILE,
     claim_output_folder,
     is_finished,
     load_run_config,
     remove_run,
+    require_no_run,
 )
 from drgs.pictures import write_png
+from drgs.plan import (
+    AllIterations,
+    Deadline,
+    Plan,
+    load_curves,
+    make_plan,
+    parse_duration,
+    rehearse,
+)
 from drgs.progress import FitProgress
-from drgs.report import write_results
+from drgs.report import seconds_to_write, write_results
 from drgs.trainer import StepReport, Trainer, render_views
 
 SMOOTHING = 0.9
@@ -79,6 +92,7 @@ class HistoryRow:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Entry point of the command."""
+    started = time.perf_counter()
     args = _parse(arguments)
     with exit_on_user_error(), execution(args.threads, args.debug) as check_ranges:
         if args.resume is not None:
@@ -97,12 +111,24 @@ def main(arguments: Sequence[str] | None = None) -> None:
             f"'{dataset.test_split}' to measure on; background {config.data.background}"
         )
         # The folder is touched when all of the input has been found to be usable.
-        trainer = Trainer(config, dataset, initial_gaussians(config, dataset))
+        gaussians = initial_gaussians(config, dataset)
+        length, reasons = AllIterations(), None
+        if args.budget is not None:
+            if not args.overwrite:
+                require_no_run(out)
+            end, plan = planned(config, dataset, gaussians, started + args.budget)
+            config, reasons = plan.config, plan.reasons
+            print(reasons)
+        trainer = Trainer(config, dataset, gaussians)
         dataset = dataset.without_training_images()
         if args.overwrite:
             remove_run(out)
         claim_output_folder(out, config)
-        finished = run(trainer, config, dataset, out, check_ranges)
+        if reasons is not None:
+            with atomic_path(out / "plan.txt") as temporary:
+                temporary.write_text(f"--budget {args.budget:g}s\n{reasons}\n")
+            length = Deadline(trainer, end)
+        finished = run(trainer, dataset, out, length, check_ranges)
     if not finished:
         print(f"stopped; continue with: python -m drgs.fit --resume {out}")
         sys.exit(INTERRUPTED_STATUS)
@@ -116,25 +142,40 @@ def select_variant(name: str) -> None:
         raise UserError(f"--variant {name}: not usable here: {one_line(error)}") from None
 
 
+def planned(
+    config: FitConfig, dataset: Dataset, gaussians: Gaussians, end: float
+) -> tuple[float, Plan]:
+    """When the iterations are to end, and a plan until then.
+
+    end: of everything, by ``time.perf_counter``.
+    """
+    rehearsal = rehearse(config, dataset, gaussians)
+    end -= seconds_to_write(rehearsal.trainer.scene, dataset)
+    side = min(min(view.width, view.height) for view in dataset.train)
+    seconds = end - time.perf_counter()
+    num_points, second = gaussians.num_gaussians, rehearsal.iteration_s
+    return end, make_plan(config, num_points, side, seconds, second, load_curves())
+
+
 def run(
     trainer: Trainer,
-    config: FitConfig,
     dataset: Dataset,
     out: Path,
+    length: AllIterations | Deadline,
     check_ranges: Callable[[], None],
 ) -> bool:
     """Fit, measure, and write into the folder ``out``; False if stopped by Ctrl-C.
 
     Goes on from the checkpoint in ``out``, if there is one. check_ranges: raises ``UserError``.
     """
-    checkpoint = load_checkpoint(out, config)
+    checkpoint = load_checkpoint(out, trainer.config)
     log = History()
     if checkpoint is not None:
         trainer.restore(checkpoint.trainer)
         log = History.from_array(checkpoint.history, checkpoint.wall_s)
         print(f"continues at iteration {trainer.iteration}")
     try:
-        if not train(trainer, config, log, out, check_ranges):
+        if not train(trainer, log, out, length, check_ranges):
             return False
         wall_s = log.wall_s
         gaussians = trainer.gaussians()
@@ -146,6 +187,8 @@ def run(
     quality = mean_quality(
         (image, view.image) for image, view in zip(images, dataset.test, strict=True)
     )
+    config = trainer.config
+    dump_config(config, out / CONFIG_NAME)
     if config.output.save_renders:
         for view, image in zip(dataset.test, images, strict=True):
             write_png(out / "renders" / dataset.test_split / f"{view.name}.png", image)
@@ -207,34 +250,41 @@ class History:
 
 def train(
     trainer: Trainer,
-    config: FitConfig,
     log: History,
     out: Path,
+    length: AllIterations | Deadline,
     check_ranges: Callable[[], None],
 ) -> bool:
     """Run the iterations that are left, showing progress and saving checkpoints.
 
     False if Ctrl-C stopped it; the state is saved then.
     """
-    every = config.output.checkpoint_every
-    smooth_psnr = None
-    with FitProgress(config.iterations) as progress, StopRequest() as stop:
-        while trainer.iteration < config.iterations:
+    output, smooth_psnr = trainer.config.output, None
+    every = output.checkpoint_every
+    with FitProgress(length.total(trainer)) as progress, StopRequest() as stop:
+        goes_on = length.goes_on(trainer)
+        while goes_on:
             report = trainer.step()
             check_ranges()
-            last = report.iteration == config.iterations
-            if last or report.iteration % config.output.history_every == 0:
+            goes_on = length.goes_on(trainer)
+            if not goes_on or report.iteration % output.history_every == 0:
                 row = log.add(report)
                 trainer.watch.check()  # reading the row has waited for the device
                 smooth_psnr = row.psnr if smooth_psnr is None else smooth_psnr
                 smooth_psnr = SMOOTHING * smooth_psnr + (1 - SMOOTHING) * row.psnr
-                progress.update(row.iteration, row.loss, smooth_psnr, row.num_gaussians)
-            if stop.requested or (every and report.iteration % every == 0 and not last):
-                state = Checkpoint(trainer.state(), log.as_array(), log.wall_s)
-                save_checkpoint(out, config, state)
+                total = length.total(trainer)
+                progress.update(row.iteration, total, row.loss, smooth_psnr, row.num_gaussians)
+            if stop.requested or (every and report.iteration % every == 0 and goes_on):
+                save(trainer, log, out)
             if stop.requested:
                 return False
     return True
+
+
+def save(trainer: Trainer, log: History, out: Path) -> None:
+    """Write the checkpoint, and the configuration, of which the end may have changed."""
+    dump_config(trainer.config, out / CONFIG_NAME)
+    save_checkpoint(out, trainer.config, Checkpoint(trainer.state(), log.as_array(), log.wall_s))
 
 
 def _remedy(out: Path) -> str:
@@ -306,6 +356,12 @@ def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
         help="override a value of the configuration, as in densify.every=200; repeatable",
     )
     parser.add_argument(
+        "--budget",
+        type=_duration,
+        metavar="TIME",
+        help="90s, 5m, 1h30m: plan a fit that is done, results written, after this time",
+    )
+    parser.add_argument(
         "--variant",
         default="llvm_ad_rgb",
         choices=("llvm_ad_rgb", "cuda_ad_rgb"),
@@ -315,9 +371,18 @@ def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     args = parser.parse_args(arguments)
     if (args.config is None) == (args.resume is None):
         parser.error("give either CONFIG.yml or --resume OUT_DIR")
-    if args.resume and (args.overrides or args.data or args.out or args.overwrite):
+    if args.resume and (
+        args.overrides or args.data or args.out or args.overwrite or args.budget is not None
+    ):
         parser.error("--resume takes its configuration from OUT_DIR/config.yml, and nothing else")
     return args
+
+
+def _duration(text: str) -> float:
+    try:
+        return parse_duration(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(str(error)) from None
 
 
 def _shorthands(args: argparse.Namespace) -> list[str]:

@@ -14,7 +14,9 @@ they are chosen:
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any, ClassVar
 
 import drjit as dr
@@ -99,10 +101,10 @@ class PixelCenters:
         x, y = Float(lanes.x) + 0.5, Float(lanes.y) + 0.5
         return [(x + i, y + j) for j in range(MICRO) for i in range(MICRO)]
 
-    def offsets(self, lanes: Any, mean_x: Any, mean_y: Any) -> tuple[list, list]:
-        """Grids of x and y, from the splat's mean to the pixels, px."""
-        t = types_of(type(mean_x))
-        first_x, first_y = t.Float(lanes.x) + 0.5 - mean_x, t.Float(lanes.y) + 0.5 - mean_y
+    def offsets(self, lanes: Any, x: Any, y: Any) -> tuple[list, list]:
+        """Grids of x and y, from a point of the film to the pixels, px."""
+        t = types_of(type(x))
+        first_x, first_y = t.Float(lanes.x) + 0.5 - x, t.Float(lanes.y) + 0.5 - y
         dx = [first_x + i for i in range(MICRO)]
         dy = [first_y + j for j in range(MICRO)]
         return [dx] * MICRO, [[d] * MICRO for d in dy]
@@ -169,6 +171,10 @@ class Footprint:
     log2_alpha: list[Any]  # 16: unclamped
 
 
+Offsets = Callable[[Any, Any], tuple[list, list]]
+"""From a point of the film, x and y (px), to grids of offsets from it to the 16 pixels."""
+
+
 @dataclass(frozen=True)
 class AffineResponse:
     """The projected Gaussian is a Gaussian on the film: alpha = o exp(-|U d|^2 / 2).
@@ -179,6 +185,7 @@ class AffineResponse:
     """
 
     num_geometry: ClassVar[int] = 6
+    num_derivatives: ClassVar[int] = 6
     num_moments: ClassVar[int] = 6
 
     def geometry(self, splats: Any) -> list[Any]:
@@ -200,11 +207,11 @@ class AffineResponse:
         del reach
         return geometry[:5]
 
-    def footprint(self, geometry: list[Any], offsets: tuple, active: Any) -> Footprint:
+    def footprint(self, geometry: list[Any], offsets_from: Offsets, active: Any) -> Footprint:
         """Evaluate the exponent; on a lane that is not active every alpha is below any floor."""
-        _, _, p, r, s, log2_opacity = geometry
+        x, y, p, r, s, log2_opacity = geometry
         log2_opacity = dr.select(active, log2_opacity, -dr.inf)
-        dx, dy = offsets
+        dx, dy = offsets_from(x, y)
         u = [
             [p * x + r * y for x, y in zip(*rows, strict=True)] for rows in zip(dx, dy, strict=True)
         ]
@@ -341,8 +348,7 @@ class ImageModel:
 
     def footprint(self, geometry: list[Any], lanes: Any, active: Any) -> Footprint:
         """A splat at the pixels of each lane."""
-        offsets = self.positions.offsets(lanes, geometry[0], geometry[1])
-        return self.response.footprint(geometry, offsets, active)
+        return self.response.footprint(geometry, partial(self.positions.offsets, lanes), active)
 
     def alphas(self, geometry: list[Any], footprint: Footprint) -> list[Alpha]:
         """Alpha at the 16 pixels."""

@@ -28,6 +28,7 @@ RESULTS = (
     "metrics.json",
     "orbit.gif",
     "orbit.webp",
+    "plan.txt",
     "point_cloud.ply",
     "renders",
     "report.html",
@@ -61,6 +62,16 @@ def claim_output_folder(folder: Path, config: FitConfig) -> None:
         )
     remove_stale_temporaries(folder)
     dump_config(config, folder / CONFIG_NAME)
+
+
+def require_no_run(folder: Path) -> None:
+    """Raise :class:`UserError` where ``folder`` holds a run: for one that cannot be continued."""
+    if os.path.lexists(folder) and (names := _visible_names(folder)):
+        raise UserError(
+            f"{folder}: must be new or empty for a fit with --budget, got one that holds "
+            f"{_listed(names)}; choose another with --out, go on with --resume {folder}, or "
+            "replace it with --overwrite"
+        )
 
 
 def is_finished(folder: Path, config: FitConfig) -> bool:

@@ -20,6 +20,16 @@ response.
 
 The low-pass widens the Gaussian parallel to the film, which changes C and neither k nor w.
 
+**Anchor.** Where a mean is far outside the film, but its splat reaches it, a is a small difference
+of large numbers. It is linear in the pixel, and so is known from a point c of the film, the closest
+to the mean: a = a_c + g . (x - c). The same formulas, seen from the ray through c and with primes
+(m = U' (c - mean), a' = 1 + kappa' . m, D' = a'^2 + h' |m|^2), give sums of what is small:
+
+    a_c = a' / D',  g = -U'^T (a' kappa' + h' m) / D',  h = h' / D'
+
+*Proof.* By the same two inversions, from C' = C - d k^T - k d^T + w d d^T back to C. Where the mean
+is on the film, c is the mean, a_c = 1, g = -U^T kappa.
+
 **Extent.** With t = |U d|^2 the smallest exponent that shows, |e|^2 <= t D is |e| <= sqrt(q) a with
 q = t / (1 - t h): a conic section with a focus in the mean and the eccentricity sqrt(q) |kappa|. If
 that is below 1 it is an ellipse, which :meth:`RayResponse.outline` finds; otherwise the splat
@@ -37,11 +47,12 @@ import drjit as dr
 from drgs.arrays import types_of
 from drgs.camera import Camera
 from drgs.constants import WHITENING_SCALE
-from drgs.image_model import AffineResponse, Footprint
+from drgs.image_model import AffineResponse, Footprint, Offsets
 from drgs.projection import (
     FilmShape,
     GaussianRows,
     clamped_slopes,
+    ewa,
     film_axes,
     film_point,
     true_slopes,
@@ -61,69 +72,67 @@ LARGEST_EXPONENT = 1e4
 
 
 def exact(rows: GaussianRows, camera: Camera, position: Any, low_pass: float) -> FilmShape:
-    """The shape that :class:`RayResponse` evaluates; the slopes of its Jacobian are not clamped."""
-    return _with_perspective(rows, camera, position, true_slopes(position), low_pass)
+    """The shape that :class:`RayResponse` evaluates; the slopes of its Jacobian are not clamped.
+
+    ``perspective`` is g (2), a_c, h, and the anchor c (2). Not differentiated: where the anchor is,
+    which makes no difference.
+    """
+    m0, m1, _ = film_axes(rows, camera, position, true_slopes(position))
+    film = whiten(film_point(camera, position), [*m0], [*m1], low_pass)
+    mean = dr.detach(film.means2d)
+    anchor = dr.clip(mean, camera.film_start, camera.film_end)
+    slopes = list((anchor - camera.principal) / camera.focal)
+    beyond = anchor - mean
+    # Differentiated as the mean's distance from a point that stays.
+    offset = dr.select(beyond == 0, 0, beyond) - (film.means2d - mean)
+    (p, r, s), (kx, ky), h = _seen_along(rows, camera, position, slopes, low_pass)
+    u, v = dr.fma(p, offset.x, r * offset.y), s * offset.y
+    a = dr.fma(kx, u, dr.fma(ky, v, 1))
+    scale = dr.rcp(dr.fma(a, a, h * dr.fma(u, u, v * v)))
+    gx, gy = dr.fma(a, kx, h * u) * scale, dr.fma(a, ky, h * v) * scale
+    plane = [-p * gx, -dr.fma(r, gx, s * gy), a * scale]
+    return replace(film, perspective=[*plane, h * scale, *anchor])
 
 
 def ewa_with_depth(rows: GaussianRows, camera: Camera, position: Any, low_pass: float) -> FilmShape:
-    """As ``projection.ewa``, and what is needed for the depth at a pixel."""
-    return _with_perspective(rows, camera, position, clamped_slopes(camera, position), low_pass)
+    """As ``projection.ewa``, and what is needed for the depth at a pixel: kappa (2) and h."""
+    slopes = clamped_slopes(camera, position)
+    film = ewa(rows, camera, position, low_pass)
+    _, kappa, h = _seen_along(rows, camera, position, slopes, low_pass)
+    return replace(film, perspective=[*kappa, h])
 
 
-def _with_perspective(
+def _seen_along(
     rows: GaussianRows, camera: Camera, position: Any, slopes: list[Any], low_pass: float
-) -> FilmShape:
+) -> tuple[Any, tuple[Any, Any], Any]:
+    """U, kappa and h of a Gaussian that is projected along the ray with the given slopes."""
     m0, m1, n = film_axes(rows, camera, position, slopes)
     film = whiten(film_point(camera, position), [*m0], [*m1], low_pass)
-    p, r, s = film.whitening
-    kx, ky = dr.dot(m0, n), dr.dot(m1, n)
-    # h = det(cov of film and depth) / det(cov of film), a sum of squares (Cauchy-Binet): free of
-    # the cancellation of w - |kappa|^2. The rows are scaled first, or giants overflow.
-    m0, m1 = p * m0, s * m1
-    h = dr.square(dr.dot(dr.cross(m0, m1), n)) + low_pass * (
-        dr.square(s) * dr.squared_norm(dr.cross(m0, n))
-        + dr.square(p) * dr.squared_norm(dr.cross(m1, n))
-        + low_pass * dr.square(p * s) * dr.squared_norm(n)
-    )
-    perspective = type(m0)(dr.fma(p, kx, r * ky), s * ky, h)
-    return replace(film, perspective=perspective)
-
-
-def scaled_perspective(splats: Any) -> list[Any]:
-    """kappa and h for coordinates e that are scaled to base 2."""
-    kx, ky, h = splats.perspective
-    return [kx / WHITENING_SCALE, ky / WHITENING_SCALE, h / WHITENING_SCALE**2]
-
-
-def ray_denominator(perspective: list[Any], u: Any, v: Any) -> tuple[Any, Any, Any]:
-    """|e|^2, a and D at a pixel with e = (u, v)."""
-    kx, ky, h = perspective
-    squared = dr.fma(u, u, v * v)
-    a = dr.fma(-kx, u, dr.fma(-ky, v, 1))
-    return squared, a, dr.fma(a, a, h * squared)
+    p, _, s = film.whitening
+    # kappa and h by minors (Binet-Cauchy), free of the cancellation in p k_x + r k_y and in
+    # w - |kappa|^2. The rows are scaled first, or giants overflow.
+    low_pass_s = low_pass * dr.square(s)
+    m1 = s * m1
+    minors, minors_n, ky = dr.cross(m0, m1), dr.cross(n, m1), dr.dot(m1, n)
+    kx = p * dr.fma(low_pass_s, dr.dot(m0, n), dr.dot(minors, minors_n))
+    m0 = p * m0
+    h = dr.square(dr.dot(p * minors, n)) + low_pass_s * dr.squared_norm(dr.cross(m0, n))
+    h += low_pass * dr.square(p) * (dr.squared_norm(minors_n) + low_pass_s * dr.squared_norm(n))
+    return film.whitening, (kx, ky), h
 
 
 @dataclass(frozen=True)
 class RayFootprint(Footprint):
-    """The same, with what the derivatives of |e|^2 / D need; 16 values each, or a splat's."""
+    """The same, with what the derivatives of |e|^2 / D need, at the 16 pixels."""
 
     along: list[Any]  # A = a / D: depth of the peak, divided by the mean's
     exponent: list[Any]  # B = |e|^2 / D, base 2
-    kappa: tuple[Any, Any]  # of the splat
+    from_anchor: tuple[list, list]  # grids of x - c, px
 
     @property
     def coordinates(self) -> list[tuple[Any, Any]]:
-        """e = (u, v) at the 16 pixels."""
+        """e = (u, v)."""
         return list(zip(_flat(self.u), _flat(self.v), strict=True))
-
-    @property
-    def slopes(self) -> list[tuple[Any, Any]]:
-        """b = A (A e + B kappa), half the derivative of |e|^2 / D with respect to e."""
-        kx, ky = self.kappa
-        return [
-            (a * dr.fma(a, u, b * kx), a * dr.fma(a, v, b * ky))
-            for a, b, (u, v) in zip(self.along, self.exponent, self.coordinates, strict=True)
-        ]
 
 
 def _flat(rows: list) -> list[Any]:
@@ -134,19 +143,21 @@ def _flat(rows: list) -> list[Any]:
 class RayResponse(AffineResponse):
     """alpha = o exp(-rho^2 / 2), with rho^2 the smallest along the pixel's ray.
 
-    Geometry: that of :class:`AffineResponse`, then kappa (2) and h, scaled to base 2.
+    Geometry: that of :class:`AffineResponse`, then g (2), a_c, h (scaled to base 2), c (2).
     """
 
-    num_geometry: ClassVar[int] = 9
-    num_moments: ClassVar[int] = 9
+    num_geometry: ClassVar[int] = 12
+    num_derivatives: ClassVar[int] = 10
+    num_moments: ClassVar[int] = 10
 
     def geometry(self, splats: Any) -> list[Any]:
         """Columns, one value per Gaussian."""
-        return super().geometry(splats) + scaled_perspective(splats)
+        gx, gy, a, h, *anchor = splats.perspective
+        return [*super().geometry(splats), gx, gy, a, h / WHITENING_SCALE**2, *anchor]
 
     def differentiable(self, splats: Any) -> list[Any]:
         """What :meth:`derivatives` are with respect to."""
-        return [*super().differentiable(splats), *splats.perspective]
+        return [*super().differentiable(splats), *splats.perspective[:4]]
 
     def bounds(self, splats: Any, geometry: list[Any], reach: Any) -> tuple[Any, Any]:
         """Centre and half sizes (Array2f, px) of the box around the outline."""
@@ -162,7 +173,10 @@ class RayResponse(AffineResponse):
         g^2 = 1 - q |kappa|^2 and c = -q kappa / g^2. I - q kappa kappa^T = V^T V with V upper
         triangular turns it into |V U (d - U^-1 c)|^2 <= q / g^2.
         """
-        x, y, p, r, s, _, kx, ky, h = geometry
+        x, y, p, r, s, _, gx, gy, _, h = geometry[:10]
+        # g = -U^T kappa
+        kx = -gx / p
+        ky = -dr.fma(r, kx, gy) / s
         depth = 1 - reach * h
         bounded = depth > 1 - MOST_ECCENTRIC
         q = reach / dr.select(bounded, depth, 1)
@@ -186,13 +200,15 @@ class RayResponse(AffineResponse):
         ]
         return [dr.select(bounded, a, b) for a, b in zip(ellipse, everywhere, strict=True)]
 
-    def footprint(self, geometry: list[Any], offsets: tuple, active: Any) -> RayFootprint:
+    def footprint(self, geometry: list[Any], offsets_from: Offsets, active: Any) -> RayFootprint:
         """Evaluate the exponent; on a lane that is not active every alpha is below any floor."""
-        affine = super().footprint(geometry[:6], offsets, active)
+        affine = super().footprint(geometry[:6], offsets_from, active)
         log2_opacity = dr.select(active, geometry[5], -dr.inf)
+        from_anchor = offsets_from(geometry[10], geometry[11])
+        pixels = zip(*map(_flat, (affine.u, affine.v, *from_anchor)), strict=True)
         along, exponent, log2_alpha = [], [], []
-        for u, v in zip(_flat(affine.u), _flat(affine.v), strict=True):
-            squared, a, denominator = ray_denominator(geometry[6:], u, v)
+        for u, v, x, y in pixels:
+            squared, a, denominator = ray_denominator(geometry, u, v, x, y)
             # Elsewhere alpha is 0, and its derivatives' factors have to be finite.
             shows = (a > 0) & (squared < LARGEST_EXPONENT * denominator)
             inverse = dr.select(shows, 1 / denominator, 0)
@@ -207,31 +223,26 @@ class RayResponse(AffineResponse):
             log2_alpha=log2_alpha,
             along=along,
             exponent=exponent,
-            kappa=(geometry[6], geometry[7]),
+            from_anchor=from_anchor,
         )
 
     def moments(self, footprint: RayFootprint, weights: list[Any], positions: Any) -> list[Any]:
         """Sums over the 16 pixels of w = d loss / d ln(alpha) times each of these.
 
-        1; b_x, b_x dx, b_x dy; b_y, b_y dy; A B u, A B v; B^2. With f = |e|^2 / D,
+        1; A^2 u, A^2 u dx, A^2 u dy; A^2 v, A^2 v dy; A B, A B (x - c); B^2. With f = |e|^2 / D,
 
-            df = 2 b . de + 2 A B e . dkappa - B^2 dh
+            df = 2 A^2 e . de - 2 A B da - B^2 dh
         """
         dx, dy = footprint.dx, footprint.dy
-        x, y, ku, kv, bb = [], [], [], [], []
-        for w, (bx, by), a, b, (u, v) in zip(
-            weights,
-            footprint.slopes,
-            footprint.along,
-            footprint.exponent,
-            footprint.coordinates,
-            strict=True,
+        anchor_x, anchor_y = footprint.from_anchor
+        x, y, z, bb = [], [], [], []
+        for w, a, b, (u, v) in zip(
+            weights, footprint.along, footprint.exponent, footprint.coordinates, strict=True
         ):
-            x.append(w * bx)
-            y.append(w * by)
-            w_b = w * b
-            ku.append(w_b * a * u)
-            kv.append(w_b * a * v)
+            w_a, w_b = w * a, w * b
+            x.append(w_a * a * u)
+            y.append(w_a * a * v)
+            z.append(w_b * a)
             bb.append(w_b * b)
         return [
             positions.sum(weights),
@@ -240,18 +251,19 @@ class RayResponse(AffineResponse):
             positions.sum_dy(x, dy),
             positions.sum(y),
             positions.sum_dy(y, dy),
-            positions.sum(ku),
-            positions.sum(kv),
+            positions.sum(z),
+            positions.sum_dx(z, anchor_x),
+            positions.sum_dy(z, anchor_y),
             positions.sum(bb),
         ]
 
     def derivatives(self, geometry: list[Any], totals: list[Any]) -> list[Any]:
         """From moments to the derivatives of what :meth:`differentiable` lists.
 
-        log2_alpha = log2_opacity - f, e = (p dx + r dy, s dy), dx = x - mean.
+        log2_alpha = log2_opacity - f, e = (p dx + r dy, s dy), dx = x - mean, a = a_c + g (x - c).
         """
         _, _, p, r, s, log2_opacity = geometry[:6]
-        w, x, x_dx, x_dy, y, y_dy, ku, kv, bb = totals
+        w, x, x_dx, x_dy, y, y_dy, z, z_x, z_y, bb = totals
         scale = 2 * math.log(2)
         return [
             scale * p * x,
@@ -260,37 +272,46 @@ class RayResponse(AffineResponse):
             -scale * WHITENING_SCALE * x_dy,
             -scale * WHITENING_SCALE * y_dy,
             dr.select(w == 0, 0, w * dr.exp2(-log2_opacity)),
-            -scale / WHITENING_SCALE * ku,
-            -scale / WHITENING_SCALE * kv,
+            scale * z_x,
+            scale * z_y,
+            scale * z,
             math.log(2) / WHITENING_SCALE**2 * bb,
         ]
 
     def pack_tangents(self, geometry: list[Any], tangents: list[Any]) -> list[Any]:
-        """Tangents of the geometry, that of the opacity as d ln(opacity)."""
-        return super().pack_tangents(geometry, tangents[:6]) + list(tangents[6:])
+        """Tangents of the geometry, that of the opacity as d ln(opacity); the anchor has none."""
+        anchor = [dr.zeros(type(geometry[0]), dr.width(geometry[0]))] * 2
+        return super().pack_tangents(geometry, tangents[:6]) + list(tangents[6:]) + anchor
 
     def tangent(
         self, geometry: list[Any], footprint: RayFootprint, d_geometry: list[Any]
     ) -> list[Any]:
         """Tangent of ln(alpha) at the 16 pixels; see :meth:`moments`."""
         _, _, p, r, s = geometry[:5]
-        d_x, d_y, d_p, d_r, d_s, d_log_opacity, d_kx, d_ky, d_h = d_geometry
+        d_x, d_y, d_p, d_r, d_s, d_log_opacity, d_gx, d_gy, d_ac, d_h = d_geometry[:10]
         d_p, d_r, d_s = d_p * WHITENING_SCALE, d_r * WHITENING_SCALE, d_s * WHITENING_SCALE
-        d_kx, d_ky = d_kx / WHITENING_SCALE, d_ky / WHITENING_SCALE
         d_h = d_h / WHITENING_SCALE**2
-        result = []
-        for dx, dy, (bx, by), a, b, (u, v) in zip(
-            _flat(footprint.dx),
-            _flat(footprint.dy),
-            footprint.slopes,
+        pixels = zip(
+            *map(_flat, (footprint.dx, footprint.dy, footprint.u, footprint.v)),
+            *map(_flat, footprint.from_anchor),
             footprint.along,
             footprint.exponent,
-            footprint.coordinates,
             strict=True,
-        ):
+        )
+        result = []
+        for dx, dy, u, v, x, y, a, b in pixels:
             d_u = dr.fma(d_p, dx, dr.fma(d_r, dy, -dr.fma(p, d_x, r * d_y)))
             d_v = dr.fma(d_s, dy, -s * d_y)
-            along = dr.fma(bx, d_u, by * d_v) + a * b * dr.fma(u, d_kx, v * d_ky)
-            d_f = dr.fma(-b * b, d_h, 2 * along)
+            d_a = dr.fma(d_gx, x, dr.fma(d_gy, y, d_ac))
+            change = a * dr.fma(a, dr.fma(u, d_u, v * d_v), -b * d_a)
+            d_f = dr.fma(-b * b, d_h, 2 * change)
             result.append(dr.fma(-math.log(2), d_f, d_log_opacity))
         return result
+
+
+def ray_denominator(geometry: list[Any], u: Any, v: Any, x: Any, y: Any) -> tuple[Any, Any, Any]:
+    """|e|^2, a and D at a pixel with e = (u, v), at (x, y) from the anchor."""
+    gx, gy, a_c, h = geometry[6:10]
+    squared = dr.fma(u, u, v * v)
+    a = dr.fma(gx, x, dr.fma(gy, y, a_c))
+    return squared, a, dr.fma(a, a, h * squared)

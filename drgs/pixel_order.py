@@ -30,6 +30,7 @@ from typing import Any
 import drjit as dr
 
 from drgs.arrays import empty_rows, load_row, scatter_rows, store_row, types_of
+from drgs.constants import WHITENING_SCALE
 from drgs.image_model import MICRO, PIXELS, Alpha, Footprint, ImageModel
 from drgs.lanes import (
     Lanes,
@@ -39,7 +40,7 @@ from drgs.lanes import (
     pixels_of,
     similar_together,
 )
-from drgs.perspective import RayFootprint, ray_denominator, scaled_perspective
+from drgs.perspective import RayFootprint, ray_denominator
 from drgs.rasterize import (
     Layers,
     Records,
@@ -67,18 +68,24 @@ class AffineDepths:
 
     def keys(self, splats: Any) -> list[Any]:
         """kappa, h (scaled to base 2), and the depth of the mean."""
-        return [*scaled_perspective(splats), splats.depths]
+        kx, ky, h = splats.perspective
+        scale = WHITENING_SCALE
+        return [kx / scale, ky / scale, h / scale**2, splats.depths]
 
-    def perspective(self, geometry: list[Any], keys: list[Any]) -> list[Any]:
-        """kappa, h."""
-        del geometry
-        return keys[:3]
+    def at(self, geometry: list[Any], keys: list[Any], x: Any, y: Any) -> tuple[Any, Any]:
+        """a and D at a point of the film."""
+        return self._at(keys, *_coordinates(geometry, x, y))
 
     def along(self, footprint: Footprint, keys: list[Any]) -> list[Any]:
         """Depths at the 16 pixels, divided by the mean's; not positive where there is none."""
         coordinates = zip(_flat(footprint.u), _flat(footprint.v), strict=True)
-        numbers = [ray_denominator(keys[:3], u, v) for u, v in coordinates]
-        return [a / denominator for _, a, denominator in numbers]
+        return [a / denominator for a, denominator in (self._at(keys, *e) for e in coordinates)]
+
+    @staticmethod
+    def _at(keys: list[Any], u: Any, v: Any) -> tuple[Any, Any]:
+        kx, ky, h = keys[:3]
+        a = dr.fma(-kx, u, dr.fma(-ky, v, 1))
+        return a, dr.fma(a, a, h * dr.fma(u, u, v * v))
 
 
 @dataclass(frozen=True)
@@ -89,15 +96,25 @@ class RayDepths:
         """The depth of the mean."""
         return [splats.depths]
 
-    def perspective(self, geometry: list[Any], keys: list[Any]) -> list[Any]:
-        """kappa, h."""
+    def at(self, geometry: list[Any], keys: list[Any], x: Any, y: Any) -> tuple[Any, Any]:
+        """a and D at a point of the film."""
         del keys
-        return geometry[6:]
+        u, v = _coordinates(geometry, x, y)
+        anchor_x, anchor_y = geometry[10:]
+        _, a, denominator = ray_denominator(geometry, u, v, x - anchor_x, y - anchor_y)
+        return a, denominator
 
     def along(self, footprint: RayFootprint, keys: list[Any]) -> list[Any]:
         """Depths at the 16 pixels, divided by the mean's; not positive where there is none."""
         del keys
         return footprint.along
+
+
+def _coordinates(geometry: list[Any], x: Any, y: Any) -> tuple[Any, Any]:
+    """e = U d at a point of the film."""
+    mean_x, mean_y, p, r, s = geometry[:5]
+    dx, dy = x - mean_x, y - mean_y
+    return dr.fma(p, dx, r * dy), s * dy
 
 
 @dataclass(frozen=True)
@@ -235,25 +252,22 @@ class _Items:
         exists = masks != 0
         geometry, _ = records.load(entry, exists)
         keys = records.load_keys(entry, exists)
-        mean_x, mean_y, p, r, s = geometry[:5]
-        perspective, depth = depths.perspective(geometry, keys), keys[-1]
         tile = dr.gather(t.UInt32, bins.tiles, entry, exists)
         columns = dr.opaque(t.UInt32, bins.grid.columns)
         row = tile // columns
-        x = t.Float((tile - row * columns) * TILE) + 0.5 - mean_x
-        y = t.Float(row * TILE) + 0.5 - mean_y
+        # Middle of the first micro-tile.
+        x = t.Float((tile - row * columns) * TILE) + MICRO / 2
+        y = t.Float(row * TILE) + MICRO / 2
 
         def body(masks: Any, item: Any) -> tuple:
             micro = dr.tzcnt(masks)
-            dx = x + t.Float(micro % GRID) * MICRO + (MICRO - 1) / 2
-            dy = y + t.Float(micro // GRID) * MICRO + (MICRO - 1) / 2
-            u, v = dr.fma(p, dx, r * dy), s * dy
-            _, a, denominator = ray_denominator(perspective, u, v)
+            middle = x + t.Float(micro % GRID) * MICRO, y + t.Float(micro // GRID) * MICRO
+            a, denominator = depths.at(geometry, keys, *middle)
             # Where there is no peak, there may be one at a neighbour.
             along = dr.select(a > 0, a / denominator, 1)
             along = dr.select(along < 1 / FARTHEST, 1 / FARTHEST, along)
             along = dr.select(along > FARTHEST, FARTHEST, along)
-            dr.scatter(items.depths, depth * along, item)
+            dr.scatter(items.depths, keys[-1] * along, item)
             dr.scatter(items.micro_tiles, tile * MICROS + micro, item)
             dr.scatter(items.entries, entry, item)
             return masks & (masks - 1), item + 1
@@ -498,8 +512,9 @@ def _adjoint(
             weight, T[pixel], goes_on = composite_step(T[pixel], alpha, stop)
             high[pixel], low[pixel] = _add_product(high[pixel], low[pixel], weight, seen)
             behind = (totals[pixel][0] - high[pixel]) + (totals[pixel][1] - low[pixel])
-            gain = seen - behind / dr.abs(T[pixel])
-            d_log_alpha = dr.select(alpha < alpha_max, weight * gain, 0)
+            # Of what is behind, alpha / (1 - alpha) is lost: no division by T, which may underflow.
+            change = dr.fma(weight, seen, -behind * (alpha / (1 - alpha)))
+            d_log_alpha = dr.select(alpha < alpha_max, change, 0)
             for plane, value in zip(pairs, (weight, d_log_alpha), strict=True):
                 dr.scatter(plane, value, place * PIXELS + pixel, goes_on & (alpha > 0))
         return (T, high, low), _unfinished(T)

@@ -23,7 +23,6 @@ class FitProgress:
     """
 
     def __init__(self, total: int) -> None:
-        self._total = total
         self._started = self._last_line = time.monotonic()
         self._first: int | None = None
         self._bar = None
@@ -56,22 +55,22 @@ class FitProgress:
         if self._bar is not None:
             self._bar.stop()
 
-    def update(self, iteration: int, loss: float, psnr: float, num_gaussians: int) -> None:
+    def update(
+        self, iteration: int, total: int, loss: float, psnr: float, num_gaussians: int
+    ) -> None:
         """Show where the fit is; psnr: dB, smoothed over recent training views."""
         status = f"loss {loss:.4f}  PSNR {psnr:5.2f} dB  Gaussians {num_gaussians:,}"
         if self._bar is not None:
-            self._bar.update(self._task, completed=iteration, status=status)
+            self._bar.update(self._task, completed=iteration, total=total, status=status)
             return
         now = time.monotonic()
         if self._first is None:
             self._first, self._started = iteration, now
-        if now - self._last_line >= LOG_SECONDS or iteration == self._total:
+        if now - self._last_line >= LOG_SECONDS or iteration == total:
             self._last_line = now
             done = max(1, iteration - self._first)
-            left = (now - self._started) / done * (self._total - iteration)
-            print(
-                f"iteration {iteration}/{self._total}  {status}  left {_minutes(left)}", flush=True
-            )
+            left = (now - self._started) / done * (total - iteration)
+            print(f"iteration {iteration}/{total}  {status}  left {_minutes(left)}", flush=True)
 
 
 def _minutes(seconds: float) -> str:

@@ -44,7 +44,7 @@ class Splats2D:
     colors: Any  # Array3f, display space; or whatever else :func:`project`'s ``color`` gave
     variances: Any  # Array2f, px^2: diagonal of the projected covariance, low-pass included
     visible: Any  # Bool: in front of the near plane, above the alpha cut, finite
-    perspective: Any = None  # Array3f, only where a choice needs it: see drgs.perspective
+    perspective: Any = None  # list of Float, only where a choice needs it: see drgs.perspective
 
     @property
     def conics(self) -> Any:
@@ -62,7 +62,7 @@ class FilmShape:
     variances: Any  # Array2f, px^2, low-pass included
     sharp: Any  # Float: determinant of the covariance without low-pass; and what the low-pass
     added: Any  # Float: adds to it, both divided by the variance in y
-    perspective: Any = None  # Array3f
+    perspective: Any = None  # list of Float
 
 
 @dataclass(frozen=True)

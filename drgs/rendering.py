@@ -269,7 +269,7 @@ def _splat_tangents(gaussians: Gaussians, frame: Frame, tangents: Gaussians) -> 
         dr.forward_to(outputs, flags=dr.ADFlag.ClearEdges)
         columns = [dr.grad(output) for output in outputs]
     dr.eval(columns)
-    count = frame.bins.model.response.num_geometry
+    count = frame.bins.model.response.num_derivatives
     return SplatGradients(geometry=columns[:count], features=columns[count:])
 
 

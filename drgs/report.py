@@ -9,6 +9,7 @@ from __future__ import annotations
 import base64
 import html
 import math
+import time
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -35,6 +36,9 @@ GAP = 4
 """px between the pictures of a comparison, white."""
 
 ORBIT_FRAMES = 60
+
+PAGE_SECONDS = 4.0
+"""Curves and page, which do not depend on the scene."""
 
 PANEL_WIDTH = 360
 """px: of each of the three pictures of a comparison in the page, at most."""
@@ -67,6 +71,20 @@ def write_results(
     write_orbit(out / "orbit.webp", scene, dataset, gaussians)
     orbit = (out / "orbit.webp").read_bytes()
     write_report(out / "report.html", out.name, dataset, images, history, metrics, orbit)
+
+
+def seconds_to_write(scene: mi.Scene, dataset: Dataset) -> float:
+    """About what measuring and :func:`write_results` will take: one test view is tried out."""
+    view = dataset.test[0]
+    list(render_views(scene, (view,)))  # compiles kernels
+    start = time.perf_counter()
+    (image,) = render_views(scene, (view,))
+    rendering = time.perf_counter() - start
+    for picture in (image, side_by_side(image, view.image)):
+        encode(picture, "PNG")
+    psnr(image, view.image), ssim(image, view.image)
+    one_view = time.perf_counter() - start
+    return PAGE_SECONDS + len(dataset.test) * one_view + 2 * ORBIT_FRAMES * rendering
 
 
 def write_side_by_side(folder: Path, dataset: Dataset, images: Iterable[np.ndarray]) -> None:

@@ -43,12 +43,12 @@ class SamplePoints:
             for pixel, (px, py) in enumerate(zip(*self.bound, strict=True))
         ]
 
-    def offsets(self, lanes: Lanes, mean_x: Any, mean_y: Any) -> tuple[list, list]:
-        """Grids of x and y, from the splat's mean to the points, px."""
-        Float = types_of(type(mean_x)).Float
-        first_x, first_y = Float(lanes.x) - mean_x, Float(lanes.y) - mean_y
-        dx = [first_x + (pixel % MICRO) + x for pixel, x in enumerate(self.bound[0])]
-        dy = [first_y + (pixel // MICRO) + y for pixel, y in enumerate(self.bound[1])]
+    def offsets(self, lanes: Lanes, x: Any, y: Any) -> tuple[list, list]:
+        """Grids of x and y, from a point of the film to the points, px."""
+        Float = types_of(type(x)).Float
+        first_x, first_y = Float(lanes.x) - x, Float(lanes.y) - y
+        dx = [first_x + (pixel % MICRO) + in_x for pixel, in_x in enumerate(self.bound[0])]
+        dy = [first_y + (pixel // MICRO) + in_y for pixel, in_y in enumerate(self.bound[1])]
         return _grid(dx), _grid(dy)
 
     def sum(self, values: list[Any]) -> Any:

@@ -1,4 +1,4 @@
-"""The same fit in fewer or more iterations. Layer 4.
+"""The same fit in fewer or more iterations, or with other values. Layer 4.
 
 What a configuration says in iterations (when the population may change, when opacities are reset,
 when the degree of the spherical harmonics rises, where coarse stages end) keeps its share of the
@@ -7,6 +7,7 @@ whole.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 from drgs.config import FitConfig
@@ -17,7 +18,20 @@ _COUNTS = (
     "densify.reset_every",
     "densify.white_background_reset",
     "model.sh_increase_every",
+    "optimizer.means_lr_steps",
 )
+
+
+def changed(config: FitConfig, changes: Mapping[str, Any]) -> FitConfig:
+    """``config`` with other values, by names such as ``densify.every``; checked like a file's."""
+    values: dict[str, Any] = config.model_dump()
+    for key, value in changes.items():
+        *sections, name = key.split(".")
+        target = values
+        for section in sections:
+            target = target[section]
+        target[name] = value
+    return FitConfig.model_validate(values)
 
 
 def with_iterations(config: FitConfig, iterations: int) -> FitConfig:
@@ -31,11 +45,11 @@ def with_iterations(config: FitConfig, iterations: int) -> FitConfig:
     def scaled(count: int | None) -> int | None:
         return None if count is None else max(1, round(count * share))
 
-    values: dict[str, Any] = config.model_dump()
-    values["iterations"] = iterations
+    changes: dict[str, Any] = {"iterations": iterations}
     for key in _COUNTS:
         section, name = key.split(".")
-        values[section][name] = scaled(values[section][name])
-    for stage in values["coarse"]:
-        stage["until"] = scaled(stage["until"])
-    return FitConfig.model_validate(values)
+        changes[key] = scaled(getattr(getattr(config, section), name))
+    changes["coarse"] = [
+        {"until": scaled(stage.until), "factor": stage.factor} for stage in config.coarse
+    ]
+    return changed(config, changes)

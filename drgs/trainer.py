@@ -30,6 +30,7 @@ from drgs.optimizer import (
     restore_optimizer,
 )
 from drgs.scene import make_scene, make_sensors
+from drgs.schedule import changed
 
 PREFIX = "integrator."
 """What precedes a parameter's name when the scene is traversed."""
@@ -97,7 +98,7 @@ class Trainer:
         self.means_lr = ExponentialDecay(
             config.optimizer.means_lr * self.extent,
             config.optimizer.means_lr_final * self.extent,
-            config.iterations,
+            config.optimizer.means_lr_steps or config.iterations,
         )
         self.loss = PhotometricLoss(config.loss.dssim_weight)
         self.white_background = tuple(dataset.background) == (1.0, 1.0, 1.0)
@@ -148,6 +149,24 @@ class Trainer:
     def num_gaussians(self) -> int:
         """N at the moment."""
         return self.optimizer[PREFIX + "means"].shape[0]
+
+    def replan(self, iterations: int, densify_stop: int) -> None:
+        """End the fit, and changes of the population, at another iteration.
+
+        Neither has an influence on iterations before: the state stays that of a fit whose
+        configuration says so from the start.
+
+        Raises ValueError where it would have one.
+        """
+        config, now = self.config, self.iteration
+        if iterations != config.iterations and config.optimizer.means_lr_steps is None:
+            raise ValueError("Trainer.replan(): the means' rate depends on the last iteration")
+        if densify_stop != config.densify.stop and now >= min(densify_stop, config.densify.stop):
+            raise ValueError(
+                f"Trainer.replan(): densify.stop cannot change from {config.densify.stop} to "
+                f"{densify_stop} after iteration {now}"
+            )
+        self.config = changed(config, {"iterations": iterations, "densify.stop": densify_stop})
 
     def check(self) -> None:
         """Raise ``NonFiniteError`` if a loss, a gradient or a value is not; waits for the device.

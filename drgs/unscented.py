@@ -52,7 +52,7 @@ def unscented(rows: GaussianRows, camera: Camera, position: Any, low_pass: float
     slopes, clamped = true_slopes(position), clamped_slopes(camera, position)
     m0, m1, n = film_axes(rows, camera, position, slopes)
     on_film = [_sigma_offsets(m, n) for m in (m0, m1)]
-    shift = [WEIGHT * sum(axis[1:], axis[0]) for axis in on_film]
+    shift = [_mean_offset(m, n) for m in (m0, m1)]
     # The mean itself has the offset 0.
     columns = [
         [-math.sqrt(CENTER_WEIGHT) * mu, *(math.sqrt(WEIGHT) * (o - mu) for o in axis)]
@@ -78,7 +78,7 @@ def unscented_with_depth(
     kx, ky = dr.dot(m0, n), dr.dot(m1, n)
     kx, ky = dr.fma(p, kx, r * ky), s * ky
     h = dr.squared_norm(n) - dr.fma(kx, kx, ky * ky)
-    return replace(film, perspective=type(m0)(kx, ky, dr.select(h > 0, h, 0)))
+    return replace(film, perspective=[kx, ky, dr.select(h > 0, h, 0)])
 
 
 def _far_enough(n: Any) -> Any:
@@ -92,11 +92,21 @@ def _sigma_offsets(m: Any, n: Any) -> list[Any]:
     m, n: half axes on the film and in depth. With c = +-sqrt(3), a point's depth is z (1 + c n) and
     its place c m / (1 + c n): a difference that does not cancel.
     """
-    # Where a point is too near, its place is not used, and must not be infinite.
-    nearest = NEAREST / 2
-    offsets = []
-    for c in (SPREAD, -SPREAD):
-        for m_k, n_k in zip(m, n, strict=True):
-            depth = dr.fma(c, n_k, 1)
-            offsets.append(c * m_k / dr.select(depth > nearest, depth, nearest))
-    return offsets
+    return [
+        c * m_k / _depth(c * n_k) for c in (SPREAD, -SPREAD) for m_k, n_k in zip(m, n, strict=True)
+    ]
+
+
+def _mean_offset(m: Any, n: Any) -> Any:
+    """The weighted mean of these places: two of opposite c add up to -2 c^2 m n / (1 - c^2 n^2)."""
+    terms = [
+        m_k * n_k / (_depth(SPREAD * n_k) * _depth(-SPREAD * n_k))
+        for m_k, n_k in zip(m, n, strict=True)
+    ]
+    return -2 * SPREAD**2 * WEIGHT * sum(terms[1:], terms[0])
+
+
+def _depth(change: Any) -> Any:
+    """Of a point, relative to the mean's. One that is too near is not used, but stays finite."""
+    nearest, depth = NEAREST / 2, 1 + change
+    return dr.select(depth > nearest, depth, nearest)

@@ -212,6 +212,8 @@ class SplatsIntegrator(mi.CppADIntegrator):
         """
         if keys != ["background"]:
             self._rendered = None
+        if dr.width(self.shN) == 0:  # not exposed, so that its rows could not be set
+            self.shN = dr.zeros(mi.TensorXf, (next(iter(self.means.shape), 0), 0, 3))
         _check_shapes(self.gaussians)
         _check_degree(self.sh_degree, self.gaussians)
 

@@ -50,9 +50,9 @@ def noise(case: Case, cotangents: Cotangents, samples: int = SAMPLES) -> Noise:
     order = reference._depth_order(splats.depths, splats.visible)
     for sample in range(samples):
         rng = np.random.default_rng([sample, 17])
-        gaussians, camera = _rounded_inputs(rng, case.gaussians, case.camera)
+        gaussians, camera = rounded_inputs(rng, case.gaussians, case.camera)
         weights = Cotangents(
-            *(_rounded(rng, getattr(cotangents, name)) for name in vars(cotangents))
+            *(rounded(rng, getattr(cotangents, name)) for name in vars(cotangents))
         )
         with _rounded_stages(rng, order):
             picture, gradient = _results(gaussians, camera, case, weights)
@@ -84,24 +84,37 @@ def _rms(samples: list[dict], base: dict) -> dict[str, np.ndarray]:
     return result
 
 
-def _rounded(rng, values, roundings=1.0) -> np.ndarray:
+def rounded(rng, values, roundings=1.0) -> np.ndarray:
     """Each value moved by up to ``roundings`` roundings, in either direction."""
     values = np.asarray(values, dtype=np.float64)
     return values * (1 + roundings * U * rng.uniform(-1, 1, values.shape))
 
 
-def _rounded_inputs(rng, gaussians, camera):
-    fields = {name: _rounded(rng, getattr(gaussians, name)) for name in PARAMETER_NAMES}
+def rounded_inputs(rng, gaussians, camera):
+    """Gaussians and camera, every number moved by up to one rounding."""
+    fields = {name: rounded(rng, getattr(gaussians, name)) for name in PARAMETER_NAMES}
     # The difference of mean and camera centre is rounded, not the two: they are given exactly.
     offset = gaussians.means - camera.center
-    fields["means"] = camera.center + _rounded(rng, offset)
+    fields["means"] = camera.center + rounded(rng, offset)
     numbers = {
-        name: float(_rounded(rng, getattr(camera, name))) for name in ("fx", "fy", "cx", "cy")
+        name: float(rounded(rng, getattr(camera, name))) for name in ("fx", "fy", "cx", "cy")
     }
     # Gaussians at the near plane stay in front of it.
     near = camera.near * (1 - 1e-5)
-    camera = replace(camera, rotation=_rounded(rng, camera.rotation), near=near, **numbers)
+    camera = replace(camera, rotation=rounded(rng, camera.rotation), near=near, **numbers)
     return reference.Gaussians(**fields), camera
+
+
+def opacity_size(opacities) -> np.ndarray:
+    """What is rounded with an opacity: alpha's exponential, and T (1 - alpha), where it is one
+    rounding of T however small alpha is.
+    """
+    return np.maximum(EXP2 * opacities, opacities > reference.ALPHA_CUT)
+
+
+def color_share(opacities) -> np.ndarray:
+    """By which a rounding of the sum that a splat's light is added to becomes one of its colour."""
+    return np.maximum(opacities, reference.ALPHA_CUT)
 
 
 @contextmanager
@@ -119,22 +132,18 @@ def _rounded_stages(rng, order):
     def affine(gaussians, camera):
         result = original_affine(gaussians, camera)
         own = np.random.default_rng([seed, 1])
-        scales = _rounded(own, result.scales)
-        return replace(result, axes2d=_rounded(own, result.axes2d), scales=scales)
+        scales = rounded(own, result.scales)
+        return replace(result, axes2d=rounded(own, result.axes2d), scales=scales)
 
     def sigmoid(logits):
         own = np.random.default_rng([seed, 2])
         opacities = original_sigmoid(logits)
-        # Also covers the rounding of T (1 - alpha), which is one of T however small alpha is.
-        size = np.maximum(EXP2 * opacities, opacities > reference.ALPHA_CUT)
-        return opacities + size * U * own.uniform(-1, 1, np.shape(logits))
+        return opacities + opacity_size(opacities) * U * own.uniform(-1, 1, np.shape(logits))
 
     def colors(gaussians, directions, degree):
         own = np.random.default_rng([seed, 3])
         result = original_colors(gaussians, directions, degree)
-        # Also covers the rounding of the sum that the splat's light is added to, which is one of
-        # the sum however small the splat's share.
-        share = np.maximum(original_sigmoid(gaussians.logit_opacities), reference.ALPHA_CUT)
+        share = color_share(original_sigmoid(gaussians.logit_opacities))
         return result + U / share[:, None] * own.uniform(-1, 1, result.shape)
 
     with (

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from drgs import reference, rendering
+from drgs.arrays import from_host
 from drgs.bench import scenes
 from drgs.camera import Camera
 from drgs.gaussians import PARAMETER_NAMES, Gaussians
@@ -40,7 +41,7 @@ class Precision:
 
     def array(self, values) -> object:
         """Flat array of numpy ``values``."""
-        return self.Float(np.ascontiguousarray(values, dtype=self.dtype).ravel())
+        return from_host(self.Float, values)
 
     def vectors(self, values) -> object:
         """Array2f, Array3f or Array4f of the rows of ``values`` (N, D)."""

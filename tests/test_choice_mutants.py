@@ -185,7 +185,7 @@ def test_every_site_is_evaluated(outcome):
 def test_derivatives_have_mutants(outcome):
     """Of these at least."""
     expected = """
-        perspective.RayFootprint.slopes perspective.RayResponse.moments
+        perspective.RayResponse.moments
         perspective.RayResponse.derivatives perspective.RayResponse.tangent
         perspective.RayResponse.pack_tangents pixel_order._adjoint pixel_order._add_product
         pixel_order._sum_pixels pixel_order._tangent ray_colors.RayColors.add_derivatives

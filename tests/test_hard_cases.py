@@ -504,18 +504,19 @@ def allowed(name) -> tuple[dict, dict]:
     """What float32 may be off by: see the module's description."""
     case = FAMILIES[name]
     found = noise(case, cotangents_of(name), samples=SAMPLES if case.count < 1000 else 6)
-    layers = np.sqrt(1 + len(case.gaussians.means) / ROUNDINGS)
 
     def bounds(noises, values):
-        result = {}
-        for key, value in values.items():
-            size = np.abs(value)
-            rounding = noises[key] + U * layers * size
-            result[key] = BOUND * rounding + UNDERFLOW * size.max(initial=0)
-        return result
+        return {key: bound_of(case, noises[key], value) for key, value in values.items()}
 
     pictures, gradients = expected(name)
     return bounds(found.picture, pictures), bounds(found.gradients, gradients)
+
+
+def bound_of(case, noise, values) -> np.ndarray:
+    """Of one result with its noise: see the module's description."""
+    size = np.abs(values)
+    rounding = noise + U * np.sqrt(1 + len(case.gaussians.means) / ROUNDINGS) * size
+    return BOUND * rounding + UNDERFLOW * size.max(initial=0)
 
 
 def errors_over_bounds(actual, wanted, bounds, precision, left_out=None) -> dict[str, float]:

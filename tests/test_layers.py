@@ -46,6 +46,7 @@ LAYERS = {
         "metrics",
         "optimizer",
         "output",
+        "plan",
         "sampling",
         "scene",
         "schedule",

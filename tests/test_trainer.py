@@ -252,3 +252,14 @@ def test_other_models_learn_as_well(model):
     # The pictures are noise: what can be learnt is their mean.
     assert np.mean(losses[-8:]) < 0.95 * np.mean(losses[:8])
     assert trainer.gaussians().sh_degree == model["sh_degree"]
+
+
+def test_without_higher_degrees_the_population_may_change():
+    """shN, which has no numbers then, is in no optimizer: its rows follow."""
+    densify = {"start": 2, "stop": 30, "every": 5, "grad_threshold": 1e-9, "clone_scale": 10.0}
+    trainer = make_trainer(model={"sh_degree": 0}, densify=densify)
+    reports = [trainer.step().density for _ in range(12)]
+    assert sum(report.cloned for report in reports if report) > 0
+    gaussians = trainer.gaussians()
+    assert gaussians.shN.shape == (gaussians.num_gaussians, 0, 3)
+    assert gaussians.num_gaussians > 40

@@ -10,8 +10,11 @@ on.
 from __future__ import annotations
 
 import argparse
+import csv
 import json
+import math
 import multiprocessing
+import statistics
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
@@ -20,9 +23,10 @@ from typing import Any
 
 from drgs import fit
 from drgs.bench.output import machine, markdown_table, new_figure, write_csv, write_figure
-from drgs.config import dump_config, load_config
+from drgs.config import FitConfig, dump_config, load_config
 from drgs.output import LAST_FILE
-from drgs.schedule import with_iterations
+from drgs.plan import STRATEGIES, Strategy
+from drgs.schedule import changed, with_iterations
 
 DESCRIPTION = "quality over time for several choices of a fit; an hour or two"
 
@@ -33,46 +37,37 @@ BUDGETS = (500, 1000, 2000, 4000, 8000)
 
 QUICK_BUDGETS = (100, 200)
 
-
-def _nothing(iterations: int) -> dict[str, Any]:
-    return {}
-
-
-def _coarse(*shares_and_factors: tuple[float, int]) -> Callable[[int], dict[str, Any]]:
-    def overrides(iterations: int) -> dict[str, Any]:
-        stages = (
-            f"{{until: {max(k + 1, round(share * iterations))}, factor: {factor}}}"
-            for k, (share, factor) in enumerate(shares_and_factors)
-        )
-        return {"coarse": f"[{', '.join(stages)}]"}
-
-    return overrides
+START_ROWS = 2
+"""Rows of a history, of ten iterations each, after the first one, in which kernels are compiled."""
 
 
-def _set(**values: Any) -> Callable[[int], dict[str, Any]]:
-    changes = {key.replace("__", "."): value for key, value in values.items()}
-    return lambda iterations: changes
+Change = Callable[[FitConfig], FitConfig]
 
 
 @dataclass(frozen=True)
 class Choice:
-    """A curve: a change of the configuration, given the number of iterations."""
+    """A curve: a change of the configuration, which knows its number of iterations."""
 
     name: str
-    overrides: Callable[[int], dict[str, Any]] = _nothing
+    change: Change
+
+
+def _strategy(strategy: Strategy) -> Choice:
+    return Choice(strategy.name, lambda config: strategy.applied(config, config.init.num_points))
+
+
+def _other(name: str, **values: Any) -> Choice:
+    """values: by names of the configuration, with __ for a dot."""
+    changes = {key.replace("__", "."): value for key, value in values.items()}
+    return Choice(name, lambda config: changed(config, changes))
 
 
 CHOICES = (
-    Choice("as shipped"),
-    Choice("half size for the first quarter", _coarse((0.25, 2))),
-    Choice("half size for the first half", _coarse((0.5, 2))),
-    Choice("quarter, then half size, for the first half", _coarse((0.2, 4), (0.5, 2))),
-    Choice("at most 30,000 Gaussians", _set(densify__max_gaussians=30_000)),
-    Choice("at most 40,000 Gaussians", _set(densify__max_gaussians=40_000)),
-    Choice("SH of degree 0", _set(model__sh_degree=0)),
-    Choice("SH of degree 1", _set(model__sh_degree=1)),
-    Choice("SSIM window of 5 px", _set(loss__window=5, loss__sigma=0.7)),
-    Choice("no SSIM", _set(loss__dssim_weight=0)),
+    *map(_strategy, STRATEGIES),
+    _other("SH of degree 0", model__sh_degree=0),
+    _other("SH of degree 1", model__sh_degree=1),
+    _other("SSIM window of 5 px", loss__window=5, loss__sigma=0.7),
+    _other("no SSIM", loss__dssim_weight=0.0),
 )
 
 
@@ -82,7 +77,8 @@ class Point:
 
     choice: str
     iterations: int
-    wall_s: float
+    start_s: float  # of an iteration at the start, as shipped
+    wall_s: float  # of all iterations
     psnr: float  # dB, test views
     ssim: float
     gaussians: int
@@ -113,8 +109,9 @@ def run(args: argparse.Namespace) -> None:
         for choice in (CHOICES[k - 1] for k in numbers):
             with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:
                 pool.submit(fit_point, args.config, choice.name, iterations, out).result()
+    second = seconds_at_start(out, budgets)
     points = [
-        point_of(choice, iterations, out)
+        point_of(choice, iterations, out, second)
         for choice in CHOICES
         for iterations in budgets
         if (folder_of(choice, iterations, out) / LAST_FILE).exists()
@@ -140,20 +137,34 @@ def fit_point(config: Path, name: str, iterations: int, out: Path) -> None:
     folder = folder_of(choice, iterations, out)
     file = folder.with_suffix(".yml")
     file.parent.mkdir(parents=True, exist_ok=True)
-    dump_config(with_iterations(load_config(config), iterations), file)
-    arguments = [str(file), "--out", str(folder)]
-    for key, value in choice.overrides(iterations).items():
-        arguments += ["--set", f"{key}={value}"]
+    dump_config(choice.change(with_iterations(load_config(config), iterations)), file)
     print(f"\n{choice.name}, {iterations} iterations", flush=True)
-    fit.main(arguments)
+    fit.main([str(file), "--out", str(folder)])
 
 
-def point_of(choice: Choice, iterations: int, out: Path) -> Point:
+def seconds_at_start(out: Path, budgets: Sequence[int]) -> float:
+    """Seconds of an iteration at the start of a fit as shipped: the median of several fits.
+
+    The same iterations, or as many, as ``drgs.plan.rehearse`` times.
+    """
+    seconds = []
+    for iterations in budgets:
+        path = folder_of(CHOICES[0], iterations, out) / "history.csv"
+        if path.exists():
+            with path.open(newline="") as file:
+                rows = {int(row["iteration"]): float(row["wall_s"]) for row in csv.DictReader(file)}
+            first, last = sorted(rows)[0], sorted(rows)[START_ROWS]
+            seconds.append((rows[last] - rows[first]) / (last - first))
+    return statistics.median(seconds) if seconds else math.nan
+
+
+def point_of(choice: Choice, iterations: int, out: Path, start_s: float) -> Point:
     """What a finished fit reached."""
     metrics = json.loads((folder_of(choice, iterations, out) / LAST_FILE).read_text())
     return Point(
         choice=choice.name,
         iterations=iterations,
+        start_s=start_s,
         wall_s=metrics["wall_s"],
         psnr=metrics["test"]["psnr"],
         ssim=metrics["test"]["ssim"],
