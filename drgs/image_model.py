@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any, ClassVar
 
@@ -185,8 +185,12 @@ class AffineResponse:
     """
 
     num_geometry: ClassVar[int] = 6
-    num_derivatives: ClassVar[int] = 6
     num_moments: ClassVar[int] = 6
+
+    def seen_by(self, camera: Any) -> AffineResponse:
+        """For one camera: nothing depends on it."""
+        del camera
+        return self
 
     def geometry(self, splats: Any) -> list[Any]:
         """Columns, one value per Gaussian."""
@@ -335,6 +339,12 @@ class ImageModel:
     positions: Any = field(default_factory=PixelCenters)
     features: Any = field(default_factory=SplatFeatures)
     cutoffs: Cutoffs = field(default_factory=Cutoffs)
+
+    def seen_by(self, camera: Any) -> ImageModel:
+        """This model for one camera."""
+        return replace(
+            self, response=self.response.seen_by(camera), features=self.features.seen_by(camera)
+        )
 
     def bind(self, lanes: Any, grid: Any) -> ImageModel:
         """This model for the lanes of one kernel: loads what a lane needs before its loop."""

@@ -30,6 +30,9 @@ to the mean: a = a_c + g . (x - c). The same formulas, seen from the ray through
 *Proof.* By the same two inversions, from C' = C - d k^T - k d^T + w d d^T back to C. Where the mean
 is on the film, c is the mean, a_c = 1, g = -U^T kappa.
 
+As rho^2 is a ratio, U, g and z_mean are divided by |a_c| once and for all: then a = +-1 +
+g . (x - c). The sign, that of a_c, is kept as that of U, which does not matter otherwise.
+
 **Extent.** With t = |U d|^2 the smallest exponent that shows, |e|^2 <= t D is |e| <= sqrt(q) a with
 q = t / (1 - t h): a conic section with a focus in the mean and the eccentricity sqrt(q) |kappa|. If
 that is below 1 it is an ellipse, which :meth:`RayResponse.outline` finds; otherwise the splat
@@ -74,24 +77,30 @@ LARGEST_EXPONENT = 1e4
 def exact(rows: GaussianRows, camera: Camera, position: Any, low_pass: float) -> FilmShape:
     """The shape that :class:`RayResponse` evaluates; the slopes of its Jacobian are not clamped.
 
-    ``perspective`` is g (2), a_c, h, and the anchor c (2). Not differentiated: where the anchor is,
-    which makes no difference.
+    Its whitening is U / a_c, and ``perspective`` is g / |a_c| (2), h, and 1 / |a_c|. Not
+    differentiated: where the anchor is, which makes no difference.
     """
     m0, m1, _ = film_axes(rows, camera, position, true_slopes(position))
     film = whiten(film_point(camera, position), [*m0], [*m1], low_pass)
     mean = dr.detach(film.means2d)
-    anchor = dr.clip(mean, camera.film_start, camera.film_end)
+    anchor = closest_on_film(camera, *mean)
     slopes = list((anchor - camera.principal) / camera.focal)
-    beyond = anchor - mean
     # Differentiated as the mean's distance from a point that stays.
-    offset = dr.select(beyond == 0, 0, beyond) - (film.means2d - mean)
+    offset = (anchor - mean) - (film.means2d - mean)
     (p, r, s), (kx, ky), h = _seen_along(rows, camera, position, slopes, low_pass)
     u, v = dr.fma(p, offset.x, r * offset.y), s * offset.y
     a = dr.fma(kx, u, dr.fma(ky, v, 1))
-    scale = dr.rcp(dr.fma(a, a, h * dr.fma(u, u, v * v)))
-    gx, gy = dr.fma(a, kx, h * u) * scale, dr.fma(a, ky, h * v) * scale
-    plane = [-p * gx, -dr.fma(r, gx, s * gy), a * scale]
-    return replace(film, perspective=[*plane, h * scale, *anchor])
+    denominator = dr.fma(a, a, h * dr.fma(u, u, v * v))
+    size = dr.abs(a)
+    gx, gy = dr.fma(kx, a, h * u) / size, dr.fma(ky, a, h * v) / size
+    perspective = [-p * gx, -dr.fma(r, gx, s * gy), h / denominator, denominator / size]
+    return replace(film, whitening=film.whitening * (denominator / a), perspective=perspective)
+
+
+def closest_on_film(camera: Camera, x: Any, y: Any) -> Any:
+    """The point of the film, Array2f, that is closest to a point of its plane, px."""
+    t = types_of(type(x))
+    return dr.clip(t.Array2f(x, y), camera.film_start, camera.film_end)
 
 
 def ewa_with_depth(rows: GaussianRows, camera: Camera, position: Any, low_pass: float) -> FilmShape:
@@ -125,7 +134,7 @@ def _seen_along(
 class RayFootprint(Footprint):
     """The same, with what the derivatives of |e|^2 / D need, at the 16 pixels."""
 
-    along: list[Any]  # A = a / D: depth of the peak, divided by the mean's
+    along: list[Any]  # A = a / D: depth of the peak, divided by z_mean / a_c
     exponent: list[Any]  # B = |e|^2 / D, base 2
     from_anchor: tuple[list, list]  # grids of x - c, px
 
@@ -143,21 +152,27 @@ def _flat(rows: list) -> list[Any]:
 class RayResponse(AffineResponse):
     """alpha = o exp(-rho^2 / 2), with rho^2 the smallest along the pixel's ray.
 
-    Geometry: that of :class:`AffineResponse`, then g (2), a_c, h (scaled to base 2), c (2).
+    Geometry: that of :class:`AffineResponse`, then g (2), h; all as :func:`exact` gives them, U
+    and h scaled to base 2.
     """
 
-    num_geometry: ClassVar[int] = 12
-    num_derivatives: ClassVar[int] = 10
-    num_moments: ClassVar[int] = 10
+    num_geometry: ClassVar[int] = 9
+    num_moments: ClassVar[int] = 9
+
+    camera: Camera | None = None
+
+    def seen_by(self, camera: Camera) -> RayResponse:
+        """For one camera, whose film has the anchors."""
+        return RayResponse(camera)
 
     def geometry(self, splats: Any) -> list[Any]:
         """Columns, one value per Gaussian."""
-        gx, gy, a, h, *anchor = splats.perspective
-        return [*super().geometry(splats), gx, gy, a, h / WHITENING_SCALE**2, *anchor]
+        gx, gy, h, _ = splats.perspective
+        return [*super().geometry(splats), gx, gy, h / WHITENING_SCALE**2]
 
     def differentiable(self, splats: Any) -> list[Any]:
         """What :meth:`derivatives` are with respect to."""
-        return [*super().differentiable(splats), *splats.perspective[:4]]
+        return [*super().differentiable(splats), *splats.perspective[:3]]
 
     def bounds(self, splats: Any, geometry: list[Any], reach: Any) -> tuple[Any, Any]:
         """Centre and half sizes (Array2f, px) of the box around the outline."""
@@ -173,10 +188,13 @@ class RayResponse(AffineResponse):
         g^2 = 1 - q |kappa|^2 and c = -q kappa / g^2. I - q kappa kappa^T = V^T V with V upper
         triangular turns it into |V U (d - U^-1 c)|^2 <= q / g^2.
         """
-        x, y, p, r, s, _, gx, gy, _, h = geometry[:10]
-        # g = -U^T kappa
-        kx = -gx / p
-        ky = -dr.fma(r, kx, gy) / s
+        x, y, p, r, s, _, gx, gy, h = geometry
+        # At the mean a is 1, and g = -U^T kappa, before they are divided.
+        anchor, sign = closest_on_film(self.camera, x, y), _sign(p)
+        at_mean = sign * dr.fma(gx, x - anchor.x, dr.fma(gy, y - anchor.y, sign))
+        kx = -sign * gx / p
+        ky = -dr.fma(r, kx, sign * gy) / s
+        p, r, s = p / at_mean, r / at_mean, s / at_mean
         depth = 1 - reach * h
         bounded = depth > 1 - MOST_ECCENTRIC
         q = reach / dr.select(bounded, depth, 1)
@@ -204,7 +222,7 @@ class RayResponse(AffineResponse):
         """Evaluate the exponent; on a lane that is not active every alpha is below any floor."""
         affine = super().footprint(geometry[:6], offsets_from, active)
         log2_opacity = dr.select(active, geometry[5], -dr.inf)
-        from_anchor = offsets_from(geometry[10], geometry[11])
+        from_anchor = offsets_from(*closest_on_film(self.camera, *geometry[:2]))
         pixels = zip(*map(_flat, (affine.u, affine.v, *from_anchor)), strict=True)
         along, exponent, log2_alpha = [], [], []
         for u, v, x, y in pixels:
@@ -229,7 +247,7 @@ class RayResponse(AffineResponse):
     def moments(self, footprint: RayFootprint, weights: list[Any], positions: Any) -> list[Any]:
         """Sums over the 16 pixels of w = d loss / d ln(alpha) times each of these.
 
-        1; A^2 u, A^2 u dx, A^2 u dy; A^2 v, A^2 v dy; A B, A B (x - c); B^2. With f = |e|^2 / D,
+        1; A^2 u, A^2 u dx, A^2 u dy; A^2 v, A^2 v dy; A B (x - c); B^2. With f = |e|^2 / D,
 
             df = 2 A^2 e . de - 2 A B da - B^2 dh
         """
@@ -251,7 +269,6 @@ class RayResponse(AffineResponse):
             positions.sum_dy(x, dy),
             positions.sum(y),
             positions.sum_dy(y, dy),
-            positions.sum(z),
             positions.sum_dx(z, anchor_x),
             positions.sum_dy(z, anchor_y),
             positions.sum(bb),
@@ -260,10 +277,10 @@ class RayResponse(AffineResponse):
     def derivatives(self, geometry: list[Any], totals: list[Any]) -> list[Any]:
         """From moments to the derivatives of what :meth:`differentiable` lists.
 
-        log2_alpha = log2_opacity - f, e = (p dx + r dy, s dy), dx = x - mean, a = a_c + g (x - c).
+        log2_alpha = log2_opacity - f, e = (p dx + r dy, s dy), dx = x - mean, a = +-1 + g (x - c).
         """
         _, _, p, r, s, log2_opacity = geometry[:6]
-        w, x, x_dx, x_dy, y, y_dy, z, z_x, z_y, bb = totals
+        w, x, x_dx, x_dy, y, y_dy, z_x, z_y, bb = totals
         scale = 2 * math.log(2)
         return [
             scale * p * x,
@@ -274,21 +291,19 @@ class RayResponse(AffineResponse):
             dr.select(w == 0, 0, w * dr.exp2(-log2_opacity)),
             scale * z_x,
             scale * z_y,
-            scale * z,
             math.log(2) / WHITENING_SCALE**2 * bb,
         ]
 
     def pack_tangents(self, geometry: list[Any], tangents: list[Any]) -> list[Any]:
-        """Tangents of the geometry, that of the opacity as d ln(opacity); the anchor has none."""
-        anchor = [dr.zeros(type(geometry[0]), dr.width(geometry[0]))] * 2
-        return super().pack_tangents(geometry, tangents[:6]) + list(tangents[6:]) + anchor
+        """Tangents of the geometry, that of the opacity as d ln(opacity)."""
+        return super().pack_tangents(geometry, tangents[:6]) + list(tangents[6:])
 
     def tangent(
         self, geometry: list[Any], footprint: RayFootprint, d_geometry: list[Any]
     ) -> list[Any]:
         """Tangent of ln(alpha) at the 16 pixels; see :meth:`moments`."""
         _, _, p, r, s = geometry[:5]
-        d_x, d_y, d_p, d_r, d_s, d_log_opacity, d_gx, d_gy, d_ac, d_h = d_geometry[:10]
+        d_x, d_y, d_p, d_r, d_s, d_log_opacity, d_gx, d_gy, d_h = d_geometry
         d_p, d_r, d_s = d_p * WHITENING_SCALE, d_r * WHITENING_SCALE, d_s * WHITENING_SCALE
         d_h = d_h / WHITENING_SCALE**2
         pixels = zip(
@@ -302,7 +317,7 @@ class RayResponse(AffineResponse):
         for dx, dy, u, v, x, y, a, b in pixels:
             d_u = dr.fma(d_p, dx, dr.fma(d_r, dy, -dr.fma(p, d_x, r * d_y)))
             d_v = dr.fma(d_s, dy, -s * d_y)
-            d_a = dr.fma(d_gx, x, dr.fma(d_gy, y, d_ac))
+            d_a = dr.fma(d_gx, x, d_gy * y)
             change = a * dr.fma(a, dr.fma(u, d_u, v * d_v), -b * d_a)
             d_f = dr.fma(-b * b, d_h, 2 * change)
             result.append(dr.fma(-math.log(2), d_f, d_log_opacity))
@@ -311,7 +326,12 @@ class RayResponse(AffineResponse):
 
 def ray_denominator(geometry: list[Any], u: Any, v: Any, x: Any, y: Any) -> tuple[Any, Any, Any]:
     """|e|^2, a and D at a pixel with e = (u, v), at (x, y) from the anchor."""
-    gx, gy, a_c, h = geometry[6:10]
+    gx, gy, h = geometry[6:]
     squared = dr.fma(u, u, v * v)
-    a = dr.fma(gx, x, dr.fma(gy, y, a_c))
+    a = dr.fma(gx, x, dr.fma(gy, y, _sign(geometry[2])))
     return squared, a, dr.fma(a, a, h * squared)
+
+
+def _sign(p: Any) -> Any:
+    """Of a_c: that of U."""
+    return dr.copysign(type(p)(1), p)

@@ -40,7 +40,7 @@ from drgs.lanes import (
     pixels_of,
     similar_together,
 )
-from drgs.perspective import RayFootprint, ray_denominator
+from drgs.perspective import RayFootprint, closest_on_film, ray_denominator
 from drgs.rasterize import (
     Layers,
     Records,
@@ -72,8 +72,10 @@ class AffineDepths:
         scale = WHITENING_SCALE
         return [kx / scale, ky / scale, h / scale**2, splats.depths]
 
-    def at(self, geometry: list[Any], keys: list[Any], x: Any, y: Any) -> tuple[Any, Any]:
-        """a and D at a point of the film."""
+    def at(self, bins: TileBins, numbers: tuple, x: Any, y: Any) -> tuple[Any, Any]:
+        """a and D at a point of the film; numbers: geometry and keys of the splat."""
+        del bins
+        geometry, keys = numbers
         return self._at(keys, *_coordinates(geometry, x, y))
 
     def along(self, footprint: Footprint, keys: list[Any]) -> list[Any]:
@@ -93,19 +95,19 @@ class RayDepths:
     """Depths at a pixel for ``RayResponse``, which computes them."""
 
     def keys(self, splats: Any) -> list[Any]:
-        """The depth of the mean."""
-        return [splats.depths]
+        """The depth of the mean, divided by a_c."""
+        return [splats.depths * splats.perspective[3]]
 
-    def at(self, geometry: list[Any], keys: list[Any], x: Any, y: Any) -> tuple[Any, Any]:
+    def at(self, bins: TileBins, numbers: tuple, x: Any, y: Any) -> tuple[Any, Any]:
         """a and D at a point of the film."""
-        del keys
+        geometry, _ = numbers
         u, v = _coordinates(geometry, x, y)
-        anchor_x, anchor_y = geometry[10:]
-        _, a, denominator = ray_denominator(geometry, u, v, x - anchor_x, y - anchor_y)
+        anchor = closest_on_film(bins.model.response.camera, *geometry[:2])
+        _, a, denominator = ray_denominator(geometry, u, v, x - anchor.x, y - anchor.y)
         return a, denominator
 
     def along(self, footprint: RayFootprint, keys: list[Any]) -> list[Any]:
-        """Depths at the 16 pixels, divided by the mean's; not positive where there is none."""
+        """Depths at the 16 pixels, divided by the key; not positive where there is none."""
         del keys
         return footprint.along
 
@@ -262,7 +264,7 @@ class _Items:
         def body(masks: Any, item: Any) -> tuple:
             micro = dr.tzcnt(masks)
             middle = x + t.Float(micro % GRID) * MICRO, y + t.Float(micro // GRID) * MICRO
-            a, denominator = depths.at(geometry, keys, *middle)
+            a, denominator = depths.at(bins, (geometry, keys), *middle)
             # Where there is no peak, there may be one at a neighbour.
             along = dr.select(a > 0, a / denominator, 1)
             along = dr.select(along < 1 / FARTHEST, 1 / FARTHEST, along)

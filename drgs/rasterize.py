@@ -446,7 +446,7 @@ def splat_gradients(bins: TileBins, totals: list[Any]) -> SplatGradients:
     size = dr.width(rank)
     flat = scatter_rows(columns, bins.order, size)
     row = [dr.gather(t.Float, flat, rank * len(columns) + k) for k in range(len(columns))]
-    count = response.num_derivatives
+    count = response.num_geometry
     return SplatGradients(geometry=row[:count], features=row[count:])
 
 

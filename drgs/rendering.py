@@ -139,7 +139,7 @@ def render(gaussians: Gaussians, camera: Camera, pipeline: Pipeline) -> Frame:
     """
     splats = pipeline.project(load_rows(gaussians, pipeline.sh_degree), camera)
     columns = pipeline.feature_columns(splats)
-    model = replace(pipeline.model, features=pipeline.model.features.seen_by(camera))
+    model = pipeline.model.seen_by(camera)
     grid = TileGrid(camera.width, camera.height)
     order = pipeline.order
     bins = bin_splats(splats, grid, columns, model, order.keys(splats))
@@ -269,7 +269,7 @@ def _splat_tangents(gaussians: Gaussians, frame: Frame, tangents: Gaussians) -> 
         dr.forward_to(outputs, flags=dr.ADFlag.ClearEdges)
         columns = [dr.grad(output) for output in outputs]
     dr.eval(columns)
-    count = frame.bins.model.response.num_derivatives
+    count = frame.bins.model.response.num_geometry
     return SplatGradients(geometry=columns[:count], features=columns[count:])
 
 

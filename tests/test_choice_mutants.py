@@ -91,7 +91,7 @@ class Copies:
         model, pipeline = frame.bins.model, frame.pipeline
         features, order = model.features, pipeline.order
         if isinstance(model.response, perspective.RayResponse):
-            model = replace(model, response=self.response())
+            model = replace(model, response=self.response(model.response.camera))
         if isinstance(features, ray_colors.RayColors):
             model = replace(model, features=self.colors(features.sh_degree, features.camera))
         if isinstance(order, pixel_order.PixelOrder):
