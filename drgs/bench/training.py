@@ -155,7 +155,7 @@ def seconds_at_start(out: Path, budgets: Sequence[int]) -> float:
                 rows = {int(row["iteration"]): float(row["wall_s"]) for row in csv.DictReader(file)}
             first, last = sorted(rows)[0], sorted(rows)[START_ROWS]
             seconds.append((rows[last] - rows[first]) / (last - first))
-    return statistics.median(seconds) if seconds else math.nan
+    return round(statistics.median(seconds), 5) if seconds else math.nan
 
 
 def point_of(choice: Choice, iterations: int, out: Path, start_s: float) -> Point:
