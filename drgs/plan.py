@@ -281,8 +281,10 @@ class Deadline:
         return True
 
     def total(self, trainer: Trainer) -> int:
-        """Iterations in all, if they go on taking as long as so far."""
+        """Iterations in all: as planned, later if they go on taking as long as so far."""
         now, done = time.perf_counter(), trainer.iteration - self._first
+        if done == 0:
+            return trainer.config.iterations
         left = (self._end - now) / max(now - self._start, 1e-9) * done
         return max(trainer.iteration, round(trainer.iteration + left))
 

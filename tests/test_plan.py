@@ -179,6 +179,15 @@ def test_a_fit_ends_in_time_whatever_an_iteration_takes(clock, second):
     assert trainer.config.densify.stop == pytest.approx(min(600, 80 / second), abs=2)
 
 
+def test_the_expected_end_follows_the_clock(clock):
+    trainer = FakeTrainer(clock, 0.2)
+    deadline = Deadline(trainer, clock.now + 100)
+    assert deadline.total(trainer) == 1000
+    for _ in range(10):
+        trainer.step()
+    assert deadline.total(trainer) == 500
+
+
 def test_the_end_of_changes_is_never_before_their_start(clock):
     trainer = FakeTrainer(clock, 1.0, **{"densify.start": 590})
     assert until_the_end(trainer, 100).config.densify.stop == 591
