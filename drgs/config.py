@@ -174,6 +174,13 @@ class ModelConfig(_Section):
     )
 
 
+class RateAim(_Section):
+    """What a falling rate heads for after an iteration."""
+
+    after: Count = Field(ge=0, description="The last iteration that is not affected.")
+    end: Count = Field(ge=1, description="Where the rate would be the last one.")
+
+
 class OptimizerConfig(_Section):
     """Adam (Kingma and Ba 2015): learning rates per step and its constants."""
 
@@ -183,8 +190,10 @@ class OptimizerConfig(_Section):
     means_lr_final: float = Field(
         1.6e-6, gt=0, description="Last rate of the means, which decays exponentially."
     )
-    means_lr_steps: Count | None = Field(
-        None, ge=1, description="Iterations until the means' rate is the last one; null: all."
+    means_lr_aims: list[RateAim] = Field(
+        default_factory=list,
+        description="When the means' rate is to be the last one, as a plan was revised: a list of "
+        "{after: iteration, end: iteration}; empty: at the last iteration.",
     )
     sh0_lr: float = Field(2.5e-3, ge=0, description="Degree-0 colour coefficients.")
     shN_lr: float = Field(1.25e-4, ge=0, description="Colour coefficients of higher degrees.")  # noqa: N815
@@ -319,6 +328,17 @@ class FitConfig(_Section):
                     f"{{until: {before.until}, factor: {before.factor}}} before "
                     f"{{until: {after.until}, factor: {after.factor}}}"
                 )
+        aims = optimizer.means_lr_aims
+        starts = [aim.after for aim in aims]
+        if (
+            starts != sorted(set(starts))
+            or starts[:1] not in ([], [0])
+            or any(aim.end <= aim.after for aim in aims)
+        ):
+            raise ValueError(
+                "optimizer.means_lr_aims must begin after iteration 0, with growing after < end, "
+                f"got {', '.join(f'{{after: {aim.after}, end: {aim.end}}}' for aim in aims)}"
+            )
         if self.loss.window % 2 == 0:
             raise ValueError(f"loss.window must be odd, got {self.loss.window}")
         return self

@@ -112,22 +112,22 @@ def main(arguments: Sequence[str] | None = None) -> None:
         )
         # The folder is touched when all of the input has been found to be usable.
         gaussians = initial_gaussians(config, dataset)
-        length, reasons = AllIterations(), None
+        length, plan = AllIterations(), None
         if args.budget is not None:
             if not args.overwrite:
                 require_no_run(out)
             end, plan = planned(config, dataset, gaussians, started + args.budget)
-            config, reasons = plan.config, plan.reasons
-            print(reasons)
+            config = plan.config
+            print(plan.reasons)
         trainer = Trainer(config, dataset, gaussians)
         dataset = dataset.without_training_images()
         if args.overwrite:
             remove_run(out)
         claim_output_folder(out, config)
-        if reasons is not None:
+        if plan is not None:
             with atomic_path(out / "plan.txt") as temporary:
-                temporary.write_text(f"--budget {args.budget:g}s\n{reasons}\n")
-            length = Deadline(trainer, end)
+                temporary.write_text(f"--budget {args.budget:g}s\n{plan.reasons}\n")
+            length = Deadline(trainer, end, plan.curve)
         finished = run(trainer, dataset, out, length, check_ranges)
     if not finished:
         print(f"stopped; continue with: python -m drgs.fit --resume {out}")

@@ -55,25 +55,29 @@ def make_optimizer(
 class ExponentialDecay:
     """A learning rate that falls by the same factor at every iteration.
 
-    rate(i) = initial^(1 - s) final^s with s = i / num_iterations clamped to [0, 1]: the
-    reference 3DGS schedule of the means.
+    rate(i) = initial^(1 - s) final^s with s = i / n clamped to [0, 1]: the reference 3DGS schedule
+    of the means. n may be revised on the way: each of ``aims``, (after, end), spreads what is left
+    of s at iteration ``after`` until ``end``. The first begins after iteration 0.
     """
 
     initial: float
     final: float
-    num_iterations: int
+    aims: tuple[tuple[int, int], ...]
 
     def __post_init__(self) -> None:
         """Refuse rates that have no logarithm."""
-        if not (self.initial > 0 and self.final > 0 and self.num_iterations >= 1):
+        if not (self.initial > 0 and self.final > 0 and all(a < b for a, b in self.aims)):
             raise ValueError(
-                "ExponentialDecay(): initial and final must be > 0 and num_iterations >= 1, got "
-                f"{self.initial}, {self.final} and {self.num_iterations}"
+                "ExponentialDecay(): initial and final must be > 0 and each aim's end > after, got "
+                f"{self.initial}, {self.final} and {self.aims}"
             )
 
     def __call__(self, iteration: int) -> float:
         """Return the learning rate of an iteration."""
-        s = min(max(iteration / self.num_iterations, 0.0), 1.0)
+        s = 0.0
+        for (after, end), until in zip(self.aims, [*self.aims[1:], (math.inf,)], strict=True):
+            passed = min(max(iteration, after), until[0]) - after
+            s += (1 - s) * min(passed / (end - after), 1.0)
         return math.exp((1 - s) * math.log(self.initial) + s * math.log(self.final))
 
 

@@ -7,9 +7,8 @@ iterations of a fit that is to be planned, timed where it will run, turn these i
 is planned is the strategy whose curve is highest where the time is up.
 
 Curves of another scene predict a time to some ten or twenty per cent, and machines vary. So the
-clock has the last word (:class:`Deadline`): it ends the fit, and before that, if need be, changes
-of the population. Neither has an influence on iterations before, so that a configuration that
-names the iterations reached gives the same bytes.
+clock has the last word (:class:`Deadline`): it revises the plan, but only what is ahead, and ends
+the fit. A configuration that says what was done gives the same bytes without a clock.
 """
 
 from __future__ import annotations
@@ -40,6 +39,9 @@ MIN_SIDE = 32
 """px: pictures of coarse stages are not smaller than SSIM's windows need."""
 
 REHEARSAL_VIEWS = 8
+
+REVISED_EVERY = 0.1
+"""Of the time."""
 
 WARM_UP, TIMED = 6, 20
 """Iterations: the first compile kernels and fill the allocator's pools."""
@@ -102,6 +104,11 @@ class Curve:
         log_n = _interpolated(math.log(time), _logs(self.time), _logs(self.iterations))
         return math.floor(math.exp(log_n) + 1e-9)
 
+    def time_of(self, iterations: int) -> float:
+        """What so many iterations take."""
+        log_n = math.log(iterations)
+        return math.exp(_interpolated(log_n, _logs(self.iterations), _logs(self.time)))
+
     def psnr_at(self, iterations: int) -> float:
         """What so many iterations reach on the shipped scene."""
         return _interpolated(math.log(iterations), _logs(self.iterations), self.psnr)
@@ -157,6 +164,7 @@ class Plan:
     candidates: tuple[Candidate, ...]
     seconds: float  # for the iterations
     start_s: float  # of an iteration at the start
+    curve: Curve  # of what was chosen
 
     @property
     def reasons(self) -> str:
@@ -208,9 +216,10 @@ def make_plan(
         )
     chosen = max(candidates, key=lambda candidate: candidate.psnr)
     planned = with_iterations(config, chosen.iterations)
-    planned = changed(planned, {"optimizer.means_lr_steps": chosen.iterations})
+    planned = changed(planned, {"optimizer.means_lr_aims": []})
     planned = chosen.strategy.applied(planned, num_points)
-    return Plan(planned, chosen, tuple(candidates), seconds, start_s)
+    curve = curves[chosen.strategy.name]
+    return Plan(planned, chosen, tuple(candidates), seconds, start_s, curve)
 
 
 @dataclass(frozen=True)
@@ -257,36 +266,46 @@ class AllIterations:
 
 
 class Deadline:
-    """A fit ends when its time is up, and changes of the population in time before.
+    """A fit ends when its time is up.
 
-    The trainer's configuration is kept such that it says what was done.
+    Ten times on the way, the curve is scaled to the time that the fit has taken so far; that says
+    where it will end, and where changes of the population are to end, which keep their share of
+    the whole. The trainer's configuration is kept such that it says what was done.
     """
 
-    def __init__(self, trainer: Trainer, end: float) -> None:
+    def __init__(self, trainer: Trainer, end: float, curve: Curve) -> None:
         """end: when the last iteration is to end, by ``time.perf_counter``."""
+        self._curve, config = curve, trainer.config
         self._start, self._end = time.perf_counter(), end
-        self._first = trainer.iteration
-        # What is planned to remain after the last change may shrink by half.
-        share = min(1.0, trainer.config.densify.stop / trainer.config.iterations)
-        self._densify_end = self._start + (end - self._start) * (1 + share) / 2
+        self._next = self._start + REVISED_EVERY * (end - self._start)
+        self._densify_share = config.densify.stop / config.iterations
 
     def goes_on(self, trainer: Trainer) -> bool:
-        """Whether there is time for another iteration; notes in the trainer what has ended."""
-        now, done, config = time.perf_counter(), trainer.iteration, trainer.config
-        if now >= self._end and done > self._first:
-            trainer.replan(done, config.densify.stop)
+        """Whether there is time for another iteration; revises the trainer's configuration."""
+        now, done = time.perf_counter(), trainer.iteration
+        if now >= self._end and done > 0:
+            trainer.replan(done, trainer.config.densify.stop)
             return False
-        if now >= self._densify_end and done + 1 < config.densify.stop:
-            trainer.replan(config.iterations, max(done, config.densify.start) + 1)
+        if now >= self._next and done > 0:
+            self._next = now + REVISED_EVERY * (self._end - self._start)
+            total = self.total(trainer)
+            trainer.replan(total, self._densify_stop(trainer, total))
         return True
 
     def total(self, trainer: Trainer) -> int:
-        """Iterations in all: as planned, later if they go on taking as long as so far."""
-        now, done = time.perf_counter(), trainer.iteration - self._first
+        """Iterations in all: as planned, later as the curve and the time so far say."""
+        now, done = time.perf_counter(), trainer.iteration
         if done == 0:
             return trainer.config.iterations
-        left = (self._end - now) / max(now - self._start, 1e-9) * done
-        return max(trainer.iteration, round(trainer.iteration + left))
+        ratio = (self._end - self._start) / max(now - self._start, 1e-9)
+        total = self._curve.iterations_in(self._curve.time_of(done) * max(ratio, 1.0))
+        return max(total, done + 1) if now < self._end else done
+
+    def _densify_stop(self, trainer: Trainer, total: int) -> int:
+        done, config = trainer.iteration, trainer.config.densify
+        if done >= config.stop:
+            return config.stop
+        return max(round(self._densify_share * total), done + 1, config.start + 1)
 
 
 _DURATION = re.compile(

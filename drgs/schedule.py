@@ -18,7 +18,6 @@ _COUNTS = (
     "densify.reset_every",
     "densify.white_background_reset",
     "model.sh_increase_every",
-    "optimizer.means_lr_steps",
 )
 
 
@@ -51,5 +50,9 @@ def with_iterations(config: FitConfig, iterations: int) -> FitConfig:
         changes[key] = scaled(getattr(getattr(config, section), name))
     changes["coarse"] = [
         {"until": scaled(stage.until), "factor": stage.factor} for stage in config.coarse
+    ]
+    changes["optimizer.means_lr_aims"] = [
+        {"after": round(aim.after * share), "end": max(1, round(aim.end * share))}
+        for aim in config.optimizer.means_lr_aims
     ]
     return changed(config, changes)

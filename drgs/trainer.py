@@ -95,11 +95,7 @@ class Trainer:
             beta_2=config.optimizer.beta_2,
             epsilon=config.optimizer.epsilon,
         )
-        self.means_lr = ExponentialDecay(
-            config.optimizer.means_lr * self.extent,
-            config.optimizer.means_lr_final * self.extent,
-            config.optimizer.means_lr_steps or config.iterations,
-        )
+        self.means_lr = means_rate(config, self.extent)
         self.loss = PhotometricLoss(config.loss.dssim_weight)
         self.white_background = tuple(dataset.background) == (1.0, 1.0, 1.0)
         self.stages = make_stages(dataset.train, config)
@@ -151,22 +147,28 @@ class Trainer:
         return self.optimizer[PREFIX + "means"].shape[0]
 
     def replan(self, iterations: int, densify_stop: int) -> None:
-        """End the fit, and changes of the population, at another iteration.
+        """End the fit, and changes of the population, at another iteration; only what is ahead.
 
-        Neither has an influence on iterations before: the state stays that of a fit whose
-        configuration says so from the start.
+        What was done is what a fit does whose configuration is, from the start, as this one is now.
 
-        Raises ValueError where it would have one.
+        Raises ValueError where it would not be.
         """
         config, now = self.config, self.iteration
-        if iterations != config.iterations and config.optimizer.means_lr_steps is None:
-            raise ValueError("Trainer.replan(): the means' rate depends on the last iteration")
         if densify_stop != config.densify.stop and now >= min(densify_stop, config.densify.stop):
             raise ValueError(
                 f"Trainer.replan(): densify.stop cannot change from {config.densify.stop} to "
                 f"{densify_stop} after iteration {now}"
             )
-        self.config = changed(config, {"iterations": iterations, "densify.stop": densify_stop})
+        aims = [(after, end) for after, end in rate_aims(config) if after < now or after == 0]
+        if 0 < now < iterations:
+            aims.append((now, iterations))
+        changes = {
+            "iterations": iterations,
+            "densify.stop": densify_stop,
+            "optimizer.means_lr_aims": [{"after": after, "end": end} for after, end in aims],
+        }
+        self.config = changed(config, changes)
+        self.means_lr = means_rate(self.config, self.extent)
 
     def check(self) -> None:
         """Raise ``NonFiniteError`` if a loss, a gradient or a value is not; waits for the device.
@@ -243,6 +245,19 @@ def learning_rates(config: OptimizerConfig, extent: float) -> dict[str, float]:
         "sh0": config.sh0_lr,
         "shN": config.shN_lr,
     }
+
+
+def rate_aims(config: FitConfig) -> list[tuple[int, int]]:
+    """(after, end) of the means' rate: see :class:`drgs.optimizer.ExponentialDecay`."""
+    aims = [(aim.after, aim.end) for aim in config.optimizer.means_lr_aims]
+    return aims or [(0, config.iterations)]
+
+
+def means_rate(config: FitConfig, extent: float) -> ExponentialDecay:
+    """The rate of the means over the iterations; extent: world units."""
+    rates = config.optimizer
+    aims = tuple(rate_aims(config))
+    return ExponentialDecay(rates.means_lr * extent, rates.means_lr_final * extent, aims)
 
 
 def make_stages(views: tuple[View, ...], config: FitConfig) -> list[Stage]:

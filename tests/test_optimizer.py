@@ -226,11 +226,11 @@ def test_replaced_values_keep_step_count_and_rate_but_not_moments():
 
 
 def test_decay_is_a_straight_line_in_the_logarithm():
-    rate = ExponentialDecay(1.6e-4, 1.6e-6, 30_000)
+    rate = ExponentialDecay(1.6e-4, 1.6e-6, ((0, 30_000),))
     assert rate(0) == pytest.approx(1.6e-4)
     assert rate(15_000) == pytest.approx(1.6e-5)
     assert rate(30_000) == rate(40_000) == pytest.approx(1.6e-6)
     ratios = [rate(i + 1) / rate(i) for i in (0, 10_000, 29_999)]
     np.testing.assert_allclose(ratios, 0.01 ** (1 / 30_000), rtol=1e-12)
     with pytest.raises(ValueError, match="must be > 0"):
-        ExponentialDecay(1e-3, 0.0, 10)
+        ExponentialDecay(1e-3, 0.0, ((0, 10),))

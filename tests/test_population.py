@@ -87,7 +87,7 @@ def test_fits_of_the_study_run_and_are_not_repeated(tmp_path, capfd):
     configs[4]["optimizer"]["means_lr"] *= extent
     configs[4]["optimizer"]["means_lr_final"] *= extent
     rates = [configs[k]["optimizer"] for k in (1, 4)]
-    assert [rate.pop("means_lr_steps") for rate in rates] == [None, None]
+    assert [rate.pop("means_lr_aims") for rate in rates] == [[], []]
     assert rates[1] == pytest.approx(rates[0], rel=1e-12)
     assert configs[5]["densify"].pop("white_background_reset") is None
     assert recipe["densify"].pop("white_background_reset") == 500
