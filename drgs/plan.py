@@ -30,7 +30,7 @@ from drgs.schedule import changed, with_iterations
 from drgs.trainer import Trainer
 
 CURVES = Path(__file__).parent / "training_curves.csv"
-"""What ``drgs.bench training`` wrote on the machine that the README names."""
+"""What ``drgs.bench training`` wrote."""
 
 MIN_ITERATIONS = 200
 """Fewer fit nothing."""
@@ -215,8 +215,7 @@ def make_plan(
             "time, or smaller pictures (--set data.image_size=...)"
         )
     chosen = max(candidates, key=lambda candidate: candidate.psnr)
-    planned = with_iterations(config, chosen.iterations)
-    planned = changed(planned, {"optimizer.means_lr_aims": []})
+    planned = with_iterations(changed(config, {"coarse": []}), chosen.iterations)
     planned = chosen.strategy.applied(planned, num_points)
     curve = curves[chosen.strategy.name]
     return Plan(planned, chosen, tuple(candidates), seconds, start_s, curve)

@@ -37,7 +37,7 @@ def with_iterations(config: FitConfig, iterations: int) -> FitConfig:
     """``config`` with another number of iterations, and everything else in proportion.
 
     The iterations between two changes of the population (``densify.every``) stay: what a change
-    needs to know is gathered over views.
+    needs to know is gathered over views. The means' rate falls until the end, without revisions.
     """
     share = iterations / config.iterations
 
@@ -51,8 +51,6 @@ def with_iterations(config: FitConfig, iterations: int) -> FitConfig:
     changes["coarse"] = [
         {"until": scaled(stage.until), "factor": stage.factor} for stage in config.coarse
     ]
-    changes["optimizer.means_lr_aims"] = [
-        {"after": round(aim.after * share), "end": max(1, round(aim.end * share))}
-        for aim in config.optimizer.means_lr_aims
-    ]
+    changes["densify.stop"] = max(changes["densify.stop"], changes["densify.start"] + 1)
+    changes["optimizer.means_lr_aims"] = []
     return changed(config, changes)

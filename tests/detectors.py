@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
-from mutants import Mutant, Switchboard
+from mutants import SCALED, Mutant, Switchboard
 
 MutantKey = tuple[str, str, str, str]
 """Function, source, part, change."""
@@ -99,3 +99,35 @@ def find_noticed(board: Switchboard, general: list[Detector], special: list[Dete
         noticed_by[mutant] = ask(general) or ask(special)
     board.apply(None)
     return Outcome(board, list(reached), false_alarms, noticed_by)
+
+
+class MutationChecks:
+    """What has to hold of an outcome: the tests of a module that has a fixture ``outcome``."""
+
+    equivalent: dict[MutantKey, str] = {}  # mutants that change no result, and why  # noqa: RUF012
+    derivatives = ""  # functions that have mutants, at least these
+
+    def test_no_detector_fails_without_a_mutant(self, outcome):
+        """Nor does instrumentation change a result."""
+        assert outcome.false_alarms == []
+
+    def test_every_mutant_is_noticed(self, outcome):
+        print(f"\n{outcome.table}")
+        survivors = outcome.survivors(self.equivalent)
+        assert not survivors, "noticed by nobody:\n" + "\n".join(survivors)
+
+    def test_equivalent_mutants_exist_and_are_noticed_by_nobody(self, outcome):
+        """Otherwise the reason for leaving them out no longer holds."""
+        assert outcome.noticing(self.equivalent) == {key: [] for key in self.equivalent}
+
+    def test_every_detector_notices_a_mutant(self, outcome):
+        assert outcome.busy_detectors == set(outcome.detectors)
+
+    def test_derivatives_have_mutants(self, outcome):
+        """What belongs to a derivative is found by who calls whom."""
+        scaled = {m.site.function for m in outcome.noticed_by if m.change == SCALED}
+        assert set(self.derivatives.split()) <= scaled
+
+    def test_every_site_is_evaluated(self, outcome):
+        """A partial that no scene reaches would have no mutant."""
+        assert not outcome.idle_sites, "\n".join(outcome.idle_sites)

@@ -25,7 +25,7 @@ import pytest
 import test_losses
 import test_rasterize
 import test_rendering
-from detectors import detectors, find_noticed
+from detectors import MutationChecks, detectors, find_noticed
 from drjit.llvm.ad import Float64
 from helpers import (
     FLOAT64,
@@ -274,29 +274,9 @@ def _remembered(board, function):
 # ----------------------------------------------------------------------------------------------
 
 
-def test_no_detector_fails_without_a_mutant(outcome):
-    """Nor does instrumentation change a result."""
-    assert outcome.false_alarms == []
-
-
-def test_every_mutant_is_noticed(outcome):
-    print(f"\n{outcome.table}")
-    survivors = outcome.survivors(EQUIVALENT)
-    assert not survivors, "noticed by nobody:\n" + "\n".join(survivors)
-
-
-def test_equivalent_mutants_exist_and_are_noticed_by_nobody(outcome):
-    """Otherwise the reason for leaving them out no longer holds."""
-    assert outcome.noticing(EQUIVALENT) == {key: [] for key in EQUIVALENT}
-
-
-def test_every_detector_notices_a_mutant(outcome):
-    assert outcome.busy_detectors == set(outcome.detectors)
-
-
-def test_derivatives_have_mutants(outcome):
-    """Of these at least; what belongs to the derivative is found by who calls whom."""
-    expected = """
+class TestDefault(MutationChecks):
+    equivalent = EQUIVALENT
+    derivatives = """
         rasterize.composite_adjoint rasterize._adjoint_step rasterize.sum_runs
         rasterize.composite_tangent rasterize.pack_tangents image_model.AffineResponse.moments
         image_model.AffineResponse.derivatives image_model.AffineResponse.tangent
@@ -306,13 +286,6 @@ def test_derivatives_have_mutants(outcome):
         losses._assemble_gradient losses._PhotometricOp.backward losses._PhotometricOp.forward
         losses.l1_loss
     """
-    scaled = {m.site.function for m in outcome.noticed_by if m.change == SCALED}
-    assert set(expected.split()) <= scaled
-
-
-def test_every_site_is_evaluated(outcome):
-    """A partial that no scene reaches would have no mutant."""
-    assert not outcome.idle_sites, "\n".join(outcome.idle_sites)
 
 
 # ----------------------------------------------------------------------------------------------

@@ -10,9 +10,9 @@ from functools import cache, partial
 
 import pytest
 import test_choices as choices
-from detectors import detectors, find_noticed
+from detectors import MutationChecks, detectors, find_noticed
 from helpers import FLOAT64
-from mutants import ALWAYS, AT_EQUALITY, SCALED, Instrumented, Switchboard
+from mutants import ALWAYS, AT_EQUALITY, Instrumented, Switchboard
 
 from drgs import perspective, pixel_order, ray_colors, rendering
 
@@ -158,38 +158,12 @@ def outcome():
         return find_noticed(board, detectors(general), detectors(special))
 
 
-def test_no_detector_fails_without_a_mutant(outcome):
-    assert outcome.false_alarms == []
-
-
-def test_every_mutant_is_noticed(outcome):
-    print(f"\n{outcome.table}")
-    survivors = outcome.survivors(EQUIVALENT)
-    assert not survivors, "noticed by nobody:\n" + "\n".join(survivors)
-
-
-def test_equivalent_mutants_exist_and_are_noticed_by_nobody(outcome):
-    """Otherwise the reason for leaving them out no longer holds."""
-    assert outcome.noticing(EQUIVALENT) == {key: [] for key in EQUIVALENT}
-
-
-def test_every_detector_notices_a_mutant(outcome):
-    assert outcome.busy_detectors == set(outcome.detectors)
-
-
-def test_every_site_is_evaluated(outcome):
-    """A partial that no scene reaches would have no mutant."""
-    assert not outcome.idle_sites, "\n".join(outcome.idle_sites)
-
-
-def test_derivatives_have_mutants(outcome):
-    """Of these at least."""
-    expected = """
+class TestChoices(MutationChecks):
+    equivalent = EQUIVALENT
+    derivatives = """
         perspective.RayResponse.moments
         perspective.RayResponse.derivatives perspective.RayResponse.tangent
         perspective.RayResponse.pack_tangents pixel_order._adjoint pixel_order._add_product
         pixel_order._sum_pixels pixel_order._tangent ray_colors.RayColors.add_derivatives
         ray_colors.RayColors.tangents
     """
-    scaled = {m.site.function for m in outcome.noticed_by if m.change == SCALED}
-    assert set(expected.split()) <= scaled

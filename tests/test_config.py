@@ -114,6 +114,11 @@ def test_a_configuration_is_frozen(load):
             "factor: 2} before {until: 20, factor: 4}",
         ),
         (
+            "optimizer: {means_lr_aims: [{after: 0, end: 9}, {after: 9, end: 9}]}",
+            "optimizer.means_lr_aims must begin after iteration 0, with growing after < end, got "
+            "{after: 0, end: 9}, {after: 9, end: 9}",
+        ),
+        (
             "densify: {start: 900, stop: 800}",
             "densify.start must be < densify.stop (800), got 900",
         ),

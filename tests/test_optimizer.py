@@ -234,3 +234,12 @@ def test_decay_is_a_straight_line_in_the_logarithm():
     np.testing.assert_allclose(ratios, 0.01 ** (1 / 30_000), rtol=1e-12)
     with pytest.raises(ValueError, match="must be > 0"):
         ExponentialDecay(1e-3, 0.0, ((0, 10),))
+
+
+def test_a_decay_that_is_revised_spreads_what_is_left():
+    """Half of it is done at 50; a quarter is left in the middle of what remains; none at 150."""
+    rate = ExponentialDecay(1.0, 1e-4, ((0, 100), (50, 150)))
+    once = ExponentialDecay(1.0, 1e-4, ((0, 100),))
+    assert [rate(i) for i in range(51)] == [once(i) for i in range(51)]
+    exponents = [math.log10(rate(i)) for i in (50, 75, 100, 150, 200)]
+    np.testing.assert_allclose(exponents, [-2, -2.5, -3, -4, -4], rtol=1e-12)

@@ -106,6 +106,17 @@ def test_reasons_name_all_candidates():
     assert "1/4 size until iteration 400, 1/2 size until iteration 1,000, then full size" in reasons
 
 
+def test_a_configuration_that_cannot_shrink_is_planned():
+    """Stages of its own, few iterations of changes, revisions of an earlier plan."""
+    values = {"coarse": [{"until": 10, "factor": 4}, {"until": 20, "factor": 2}]}
+    values |= {"densify.start": 500, "densify.stop": 501}
+    values |= {"optimizer.means_lr_aims": [{"after": 0, "end": 5}, {"after": 1, "end": 7}]}
+    config = changed(CONFIG, values)
+    result = make_plan(config, 50, 400, 25, 0.1, curves_of())
+    assert result.config.iterations == 500 and result.config.optimizer.means_lr_aims == []
+    assert (result.config.densify.start, result.config.densify.stop) == (36, 37)
+
+
 def test_small_pictures_do_not_become_smaller():
     assert planned(100, side=100).chosen.strategy is plan.STRATEGIES[0]
 
@@ -175,12 +186,16 @@ def until_the_end(trainer, seconds):
 
 @pytest.mark.parametrize("second", [0.05, 0.1, 0.2])
 def test_a_fit_ends_in_time_whatever_an_iteration_takes(clock, second):
-    """Planned were 0.1 s. The population changes during six tenths of the iterations."""
+    """Planned were 0.1 s. The population changes during six tenths of the iterations.
+
+    An iteration or two more or less: the clock is read between them.
+    """
     trainer = until_the_end(FakeTrainer(clock, second), 100)
     assert 200 <= clock.now < 200 + 2 * second
     n = trainer.iteration
     assert trainer.config.iterations == n == pytest.approx(100 / second, abs=2)
     assert trainer.config.densify.stop == pytest.approx(0.6 * n, abs=2)
+    # Two iterations of 500 in five e-folds.
     assert trainer.means_lr(n) == pytest.approx(trainer.means_lr.final, rel=0.02)
 
 
