@@ -83,7 +83,7 @@ def _mitsuba_renderer(
     name: str, scene: mi.Scene, problem: Problem, prefix: str, seconds: float
 ) -> Renderer:
     camera = problem.camera
-    sensor = mi.load_dict(_sensor(camera))
+    sensor = mi.load_dict(sensor_of(camera, 1e-3, {"type": "independent"}))
     params = mi.traverse(scene)
     names = ("means", "quats", "log_scales", "logit_opacities", "sh0", "shN")
     names += ("data", "opacities", "sh_coeffs")
@@ -113,7 +113,10 @@ def _mitsuba_renderer(
     return Renderer(name, forward, forward_backward, seconds)
 
 
-def _sensor(camera: reference.Camera) -> dict[str, Any]:
+def sensor_of(
+    camera: reference.Camera, near_clip: float, sampler: dict[str, Any]
+) -> dict[str, Any]:
+    """Mitsuba's sensor, with a film of single precision and box filter; fx and fy must agree."""
     to_world = np.eye(4)
     to_world[:3, :3] = camera.rotation.T * [-1, -1, 1]  # Mitsuba's x is to the left, its y up
     to_world[:3, 3] = camera.center
@@ -121,7 +124,9 @@ def _sensor(camera: reference.Camera) -> dict[str, Any]:
         "type": "perspective",
         "fov": float(np.degrees(2 * np.arctan(camera.width / 2 / camera.fx))),
         "fov_axis": "x",
-        "near_clip": 1e-3,
+        "principal_point_offset_x": 0.5 - camera.cx / camera.width,
+        "principal_point_offset_y": 0.5 - camera.cy / camera.height,
+        "near_clip": near_clip,
         "to_world": mi.ScalarTransform4f(to_world),
         "film": {
             "type": "hdrfilm",
@@ -131,7 +136,7 @@ def _sensor(camera: reference.Camera) -> dict[str, Any]:
             "component_format": "float32",
             "rfilter": {"type": "box"},
         },
-        "sampler": {"type": "independent", "sample_count": 1},
+        "sampler": {**sampler, "sample_count": 1},
     }
 
 

@@ -25,7 +25,7 @@ import numpy as np
 from drgs import metrics, reference, reference_rays
 from drgs.bench.accuracy import Subject, add_scene, load_subject
 from drgs.bench.output import markdown_table, write_csv
-from drgs.bench.peers import SHELL, volprim_scene
+from drgs.bench.peers import SHELL, sensor_of, volprim_scene
 from drgs.gaussians import PARAMETER_NAMES, Gaussians
 
 DESCRIPTION = "each choice of Mitsuba's volprim_rf_basic, by how much it changes the picture"
@@ -126,31 +126,8 @@ def _row(factor: int, what: str, image: np.ndarray, other: np.ndarray) -> Row:
 
 def volprim_image(gaussians: Gaussians, camera: reference.Camera) -> np.ndarray:
     """(H, W, 3) display space, on black, each pixel at its centre; fx and fy must agree."""
-    to_world = np.eye(4)
-    to_world[:3, :3], to_world[:3, 3] = camera.rotation.T, camera.center
-    scene = mi.load_dict(
-        {
-            **volprim_scene(gaussians, "ellipsoids", 4096),
-            "sensor": {
-                "type": "perspective",
-                "fov": float(np.degrees(2 * np.arctan(camera.width / 2 / camera.fx))),
-                "fov_axis": "x",
-                "principal_point_offset_x": 0.5 - camera.cx / camera.width,
-                "principal_point_offset_y": 0.5 - camera.cy / camera.height,
-                "near_clip": camera.near,
-                "to_world": mi.ScalarTransform4f(to_world @ np.diag([-1.0, -1.0, 1.0, 1.0])),
-                "film": {
-                    "type": "hdrfilm",
-                    "width": camera.width,
-                    "height": camera.height,
-                    "pixel_format": "rgb",
-                    "component_format": "float32",
-                    "rfilter": {"type": "box"},
-                },
-                "sampler": {"type": "stratified", "sample_count": 1, "jitter": False},
-            },
-        }
-    )
+    sensor = sensor_of(camera, camera.near, {"type": "stratified", "jitter": False})
+    scene = mi.load_dict({**volprim_scene(gaussians, "ellipsoids", 4096), "sensor": sensor})
     return np.array(mi.render(scene, spp=1), np.float64)
 
 
