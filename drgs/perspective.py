@@ -134,7 +134,7 @@ def _seen_along(
 class RayFootprint(Footprint):
     """The same, with what the derivatives of |e|^2 / D need, at the 16 pixels."""
 
-    along: list[Any]  # A = a / D: depth of the peak, divided by z_mean / a_c
+    along: list[Any]  # A = a / D: depth of the peak, divided by z_mean / |a_c|
     exponent: list[Any]  # B = |e|^2 / D, base 2
     from_anchor: tuple[list, list]  # grids of x - c, px
 

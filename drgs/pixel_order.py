@@ -95,7 +95,7 @@ class RayDepths:
     """Depths at a pixel for ``RayResponse``, which computes them."""
 
     def keys(self, splats: Any) -> list[Any]:
-        """The depth of the mean, divided by a_c."""
+        """The depth of the mean, divided by |a_c|."""
         return [splats.depths * splats.perspective[3]]
 
     def at(self, bins: TileBins, numbers: tuple, x: Any, y: Any) -> tuple[Any, Any]:
