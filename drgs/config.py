@@ -104,7 +104,7 @@ class DataConfig(_Section):
         "behind the splats at training, evaluation and rendering.",
     )
     ignore_distortion: bool = Field(
-        False, description="Treat images with lens distortion as if they had none."
+        False, description="Treat images with lens distortion as those of a pinhole camera."
     )
 
     @property

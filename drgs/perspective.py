@@ -54,11 +54,8 @@ from drgs.image_model import AffineResponse, Footprint, Offsets
 from drgs.projection import (
     FilmShape,
     GaussianRows,
-    clamped_slopes,
     ewa,
     film_axes,
-    film_point,
-    true_slopes,
     whiten,
 )
 
@@ -80,8 +77,8 @@ def exact(rows: GaussianRows, camera: Camera, position: Any, low_pass: float) ->
     Its whitening is U / a_c, and ``perspective`` is g / |a_c| (2), h, and 1 / |a_c|. Not
     differentiated: where the anchor is, which makes no difference.
     """
-    m0, m1, _ = film_axes(rows, camera, position, true_slopes(position))
-    film = whiten(film_point(camera, position), [*m0], [*m1], low_pass)
+    m0, m1, _ = film_axes(rows, camera, position, camera.lens.true_slopes(camera, position))
+    film = whiten(camera.lens.film_point(camera, position), [*m0], [*m1], low_pass)
     mean = dr.detach(film.means2d)
     anchor = closest_on_film(camera, *mean)
     slopes = list((anchor - camera.principal) / camera.focal)
@@ -105,7 +102,7 @@ def closest_on_film(camera: Camera, x: Any, y: Any) -> Any:
 
 def ewa_with_depth(rows: GaussianRows, camera: Camera, position: Any, low_pass: float) -> FilmShape:
     """As ``projection.ewa``, and what is needed for the depth at a pixel: kappa (2) and h."""
-    slopes = clamped_slopes(camera, position)
+    slopes = camera.lens.clamped_slopes(camera, position)
     film = ewa(rows, camera, position, low_pass)
     _, kappa, h = _seen_along(rows, camera, position, slopes, low_pass)
     return replace(film, perspective=[*kappa, h])
@@ -116,7 +113,7 @@ def _seen_along(
 ) -> tuple[Any, tuple[Any, Any], Any]:
     """U, kappa and h of a Gaussian that is projected along the ray with the given slopes."""
     m0, m1, n = film_axes(rows, camera, position, slopes)
-    film = whiten(film_point(camera, position), [*m0], [*m1], low_pass)
+    film = whiten(camera.lens.film_point(camera, position), [*m0], [*m1], low_pass)
     p, _, s = film.whitening
     # kappa and h by minors (Binet-Cauchy), free of the cancellation in p k_x + r k_y and in
     # w - |kappa|^2. The rows are scaled first, or giants overflow.

@@ -21,7 +21,7 @@ import drjit as dr
 from drgs import sh
 from drgs.arrays import types_of
 from drgs.camera import Camera
-from drgs.constants import LEAST_LOW_PASS, LOW_PASS, TAN_CLAMP
+from drgs.constants import LEAST_LOW_PASS, LOW_PASS
 from drgs.cutoffs import Cutoffs
 from drgs.gaussians import Gaussians
 
@@ -63,6 +63,7 @@ class FilmShape:
     sharp: Any  # Float: determinant of the covariance without low-pass; and what the low-pass
     added: Any  # Float: adds to it, both divided by the variance in y
     perspective: Any = None  # list of Float
+    dimming: Any = None  # Float: factor of the opacity; None: 1
 
 
 @dataclass(frozen=True)
@@ -118,27 +119,26 @@ def project(
 
     Differentiable in ``rows`` and in the camera's numbers. Not differentiated: visibility.
     """
-    t = types_of(type(rows.logit_opacities))
     offset = rows.means - camera.center
-    x, y, z = camera.rotation @ offset
-    in_front = z >= camera.near
-    # A masked lane must not divide by zero: 0 * inf would poison the gradient of its neighbours.
-    z = dr.select(in_front, z, 1)
+    seen, position, depth = camera.lens.look(camera, camera.rotation @ offset)
     low_pass = max(low_pass, LEAST_LOW_PASS)
-    film = (shape or ewa)(rows, camera, t.Array3f(x, y, z), low_pass)
+    film = (shape or ewa)(rows, camera, position, low_pass)
     opacities = opacity_rule(_sigmoid(rows.logit_opacities), film.sharp, film.added)
-    colors = (color or color_at_mean)(rows, offset, sh_degree)
+    if film.dimming is not None:
+        opacities = opacities * film.dimming
+    direction = camera.lens.view_direction(camera, offset)
+    colors = (color or color_at_mean)(rows, direction, sh_degree)
     numbers = [*film.means2d, *film.whitening, *colors]
     numbers += [] if film.perspective is None else [*film.perspective]
     finite = dr.isfinite(dr.detach(sum(numbers[1:], numbers[0])))
     return Splats2D(
         means2d=film.means2d,
         whitening=film.whitening,
-        depths=z,
+        depths=depth,
         opacities=opacities,
         colors=colors,
         variances=film.variances,
-        visible=in_front & (opacities > least_alpha) & finite & dr.isfinite(dr.sum(film.variances)),
+        visible=seen & (opacities > least_alpha) & finite & dr.isfinite(dr.sum(film.variances)),
         perspective=film.perspective,
     )
 
@@ -149,14 +149,9 @@ def ewa(rows: GaussianRows, camera: Camera, position: Any, low_pass: float) -> F
     position: Array3f, camera axes, the mean. With M = J R_camera R(q) diag(s), 2 x 3, the
     covariance on the film is M M^T + low_pass I.
     """
-    m0, m1, _ = film_axes(rows, camera, position, clamped_slopes(camera, position))
-    return whiten(film_point(camera, position), [*m0], [*m1], low_pass)
-
-
-def film_point(camera: Camera, position: Any) -> Any:
-    """Where a point in camera axes is on the film, Array2f, px."""
-    x, y, z = position
-    return camera.focal * types_of(type(z)).Array2f(x, y) / z + camera.principal
+    lens = camera.lens
+    m0, m1, _ = film_axes(rows, camera, position, lens.clamped_slopes(camera, position))
+    return whiten(lens.film_point(camera, position), [*m0], [*m1], low_pass)
 
 
 def whiten(means2d: Any, m0: Sequence[Any], m1: Sequence[Any], low_pass: float) -> FilmShape:
@@ -191,9 +186,9 @@ def dot(a: Sequence[Any], b: Sequence[Any]) -> Any:
     return total
 
 
-def color_at_mean(rows: GaussianRows, offset: Any, sh_degree: int) -> Any:
-    """The colour (Array3f) in the direction ``offset`` from the camera's centre to the mean."""
-    return sh.sh_color(rows.sh, _normalize(offset), sh_degree)
+def color_at_mean(rows: GaussianRows, direction: Any, sh_degree: int) -> Any:
+    """The colour (Array3f) in the ``direction`` in which the mean is seen, of any length."""
+    return sh.sh_color(rows.sh, _normalize(direction), sh_degree)
 
 
 def plain_opacity(opacity: Any, sharp: Any, added: Any) -> Any:
@@ -215,43 +210,31 @@ def compensated_opacity(opacity: Any, sharp: Any, added: Any) -> Any:
     return dr.select(thin, 0, opacity * dr.rsqrt(1 + added / dr.select(thin, 1, sharp)))
 
 
-def clamped_slopes(camera: Camera, position: Any) -> list[Any]:
-    """x / z and y / z of the mean, not far outside the film: see ``constants.TAN_CLAMP``."""
-    # Of the whole film: a crop window is a part of the same picture.
-    start = (camera.film_start - camera.principal) / camera.focal
-    end = (camera.film_end - camera.principal) / camera.focal
-    margin = TAN_CLAMP * (end - start) / 2
-    slopes = []
-    for slope, lo, hi in zip(true_slopes(position), start - margin, end + margin, strict=True):
-        slopes.append(dr.select(slope < lo, lo, dr.select(slope > hi, hi, slope)))
-    return slopes
-
-
-def true_slopes(position: Any) -> list[Any]:
-    """x / z and y / z of the mean."""
-    return [position.x / position.z, position.y / position.z]
-
-
 def film_axes(
-    rows: GaussianRows, camera: Camera, position: Any, slopes: list[Any]
+    rows: GaussianRows, camera: Camera, position: Any, slopes: Any
 ) -> tuple[Any, Any, Any]:
     """The half axes of a Gaussian as rows of two matrices: on the film, and in depth.
 
     The first two are those of M = J R_camera R(q) diag(s), px; the third the same for the depth
-    divided by that of the mean.
+    divided by that of the mean. slopes: see :meth:`drgs.camera.Pinhole.film_directions`.
     """
-    right, down, forward = camera.rotation
     world_from_splat, scales = quat_to_rotation(rows.quats), dr.exp(rows.log_scales)
 
     def along(direction: Any) -> Any:
         return (world_from_splat.T @ direction) * scales
 
-    # J's rows are focal / z (e_axis - slope e_z).
-    m0, m1 = (
-        along((axis - slope * forward) * (focal / position.z))
-        for axis, focal, slope in zip((right, down), camera.focal, slopes, strict=True)
-    )
-    return m0, m1, along(forward / position.z)
+    m0, m1 = map(along, camera.lens.film_directions(camera, position, slopes))
+    return m0, m1, along(camera.lens.depth_direction(camera, position))
+
+
+def world_axes(rows: GaussianRows) -> list[Any]:
+    """The three half axes of a Gaussian, Array3f, world."""
+    world_from_splat, scales = quat_to_rotation(rows.quats), dr.exp(rows.log_scales)
+    Array3f = types_of(type(rows.logit_opacities)).Array3f
+    return [
+        Array3f([world_from_splat[row, column] for row in range(3)]) * scales[column]
+        for column in range(3)
+    ]
 
 
 def quat_to_rotation(quats: Any) -> Any:

@@ -12,7 +12,6 @@ from typing import Any
 
 import drjit as dr
 
-from drgs.arrays import types_of
 from drgs.camera import Camera
 from drgs.constants import COLOR_MIN
 from drgs.image_model import SplatFeatures
@@ -22,9 +21,9 @@ from drgs.sh import num_coefficients, sh_basis
 CHANNELS = 3
 
 
-def stored_coefficients(rows: GaussianRows, offset: Any, sh_degree: int) -> list[Any]:
+def stored_coefficients(rows: GaussianRows, direction: Any, sh_degree: int) -> list[Any]:
     """What is stored of a splat's colour: its coefficients, three colours each."""
-    del offset
+    del direction
     return [value for c in rows.sh[: num_coefficients(sh_degree)] for value in c]
 
 
@@ -59,9 +58,8 @@ class RayColors(SplatFeatures):
         return replace(self, basis=basis)
 
     def _direction(self, x: Any, y: Any) -> Any:
-        camera, t = self.camera, types_of(type(x))
-        film = (t.Array2f(x, y) - camera.principal) / camera.focal
-        return dr.normalize(camera.rotation.T @ t.Array3f(film.x, film.y, 1))
+        camera = self.camera
+        return dr.normalize(camera.rotation.T @ camera.lens.ray(camera, x, y))
 
     def at(self, stored: list[Any], pixel: int) -> list[Any]:
         """max(0, sum_k basis_k coefficient_k + 0.5), then what else is stored."""

@@ -90,13 +90,20 @@ class Pipeline:
     order: Any = CenterOrder()
 
     def project(self, rows: GaussianRows, camera: Camera) -> Splats2D:
-        """The first stage with this pipeline's choices."""
+        """The first stage with this pipeline's choices, and what the camera calls for."""
+        shape = self.shape
+        if camera.aperture is not None:
+            from drgs.defocus import Defocused
+
+            shape = Defocused(shape)
+        if camera.shutter is not None:
+            camera = camera.shutter.camera_of(rows, camera)
         return project(
             rows,
             camera,
             self.sh_degree,
             self.opacity_rule,
-            self.shape,
+            shape,
             self.color,
             self.low_pass,
             self.model.cutoffs.least_alpha,
@@ -176,7 +183,7 @@ def render_adjoint(
 def frames_adjoint(
     gaussians: Gaussians, frames: list[Frame], d_planes: list[list[Any]]
 ) -> GaussianGradients:
-    """The same for a loss that depends on several frames of the same splats.
+    """The same for a loss that depends on several frames of the same splats: of one camera.
 
     d_planes: of each frame, derivatives with respect to its planes.
     """
@@ -219,6 +226,21 @@ def _gaussian_gradients(
         visible=_on_film(frame.bins),
         first_fault=first_fault,
     )
+
+
+def added(a: GaussianGradients, b: GaussianGradients) -> GaussianGradients:
+    """Of a loss that depends on what several cameras see."""
+    parameters = {
+        name: getattr(a.parameters, name) + getattr(b.parameters, name) for name in PARAMETER_NAMES
+    }
+    total = GaussianGradients(
+        parameters=Gaussians(**parameters),
+        means2d=a.means2d + b.means2d,
+        visible=a.visible | b.visible,
+        first_fault=dr.select(a.first_fault < b.first_fault, a.first_fault, b.first_fault),
+    )
+    dr.eval(total)
+    return total
 
 
 def decode_fault(fault: int) -> tuple[int, str] | None:

@@ -14,13 +14,12 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
-from drgs.checks import UserError
 from drgs.choices import Choices
 from drgs.config import ModelConfig
 from drgs.data.types import View
 from drgs.gaussians import PARAMETER_NAMES, Gaussians
 
-SQUARE_PIXEL_TOLERANCE = 0.5
+SQUARE_PIXEL_TOLERANCE = 0.01
 """px: largest shift at the image's border that may come from treating pixels as square."""
 
 
@@ -52,10 +51,10 @@ def accuracy(model: ModelConfig) -> dict[str, Any]:
 
 
 def make_sensors(views: Iterable[View]) -> list[mi.Sensor]:
-    """One ``perspective`` sensor per view: box filter, one sample, RGB.
+    """One sensor per view: box filter, one sample, RGB.
 
-    Views of one size share a film. Raises UserError for pixels that are far from square, which
-    Mitsuba's sensors cannot express.
+    ``perspective`` where Mitsuba's own sensor can be the view's camera, else ``calibrated``. Views
+    of one size share a film.
     """
     films: dict[tuple[int, int], mi.Film] = {}
     sensors = []
@@ -63,7 +62,7 @@ def make_sensors(views: Iterable[View]) -> list[mi.Sensor]:
         size = (view.width, view.height)
         if size not in films:
             films[size] = mi.load_dict(_film(*size))
-        sensors.append(mi.load_dict(_sensor(view, films[size])))
+        sensors.append(mi.load_dict({**_sensor(view), "film": films[size]}))
     return sensors
 
 
@@ -78,27 +77,36 @@ def _film(width: int, height: int) -> dict[str, Any]:
     }
 
 
-def _sensor(view: View, film: mi.Film) -> dict[str, Any]:
+def _sensor(view: View) -> dict[str, Any]:
+    pose = {
+        # Mitsuba's camera has x to the left and y up.
+        "to_world": mi.ScalarTransform4f(view.camera_to_world @ np.diag([-1.0, -1.0, 1.0, 1.0])),
+        "near_clip": 1e-3,  # the integrator's own near plane decides
+        "sampler": {"type": "independent", "sample_count": 1},
+    }
+    if view.lens is None and _has_square_pixels(view):
+        return pose | _perspective(view)
+    lens = {"lens": view.lens.kind, **view.lens.named()} if view.lens is not None else {}
+    intrinsics = {name: getattr(view, name) for name in ("fx", "fy", "cx", "cy")}
+    return {"type": "calibrated", **pose, **intrinsics, **lens}
+
+
+def _perspective(view: View) -> dict[str, Any]:
     focal = math.sqrt(view.fx * view.fy)
-    shift = max(
-        abs(view.fx / focal - 1) * max(view.cx, view.width - view.cx),
-        abs(view.fy / focal - 1) * max(view.cy, view.height - view.cy),
-    )
-    if shift > SQUARE_PIXEL_TOLERANCE:
-        raise UserError(
-            f"{view.name}: fl_x and fl_y must agree (square pixels), got {view.fx:g} and "
-            f"{view.fy:g}, which moves pixels by up to {shift:.1f}; resample the image"
-        )
-    # Mitsuba's camera has x to the left and y up.
-    to_world = view.camera_to_world @ np.diag([-1.0, -1.0, 1.0, 1.0])
     return {
         "type": "perspective",
         "fov": math.degrees(2 * math.atan(0.5 * view.width / focal)),
         "fov_axis": "x",
         "principal_point_offset_x": 0.5 - view.cx / view.width,
         "principal_point_offset_y": 0.5 - view.cy / view.height,
-        "near_clip": 1e-3,  # the integrator's own near plane decides
-        "to_world": mi.ScalarTransform4f(to_world),
-        "film": film,
-        "sampler": {"type": "independent", "sample_count": 1},
     }
+
+
+def _has_square_pixels(view: View) -> bool:
+    """To within :data:`SQUARE_PIXEL_TOLERANCE`."""
+    focal = math.sqrt(view.fx * view.fy)
+    shift = max(
+        abs(view.fx / focal - 1) * max(view.cx, view.width - view.cx),
+        abs(view.fy / focal - 1) * max(view.cy, view.height - view.cy),
+    )
+    return shift <= SQUARE_PIXEL_TOLERANCE

@@ -10,23 +10,15 @@ covariance are positive, so that it is a sum of outer products, without cancella
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import singledispatch
 from typing import Any
 
 import drjit as dr
 
 from drgs.arrays import types_of
-from drgs.camera import Camera
-from drgs.projection import (
-    FilmShape,
-    GaussianRows,
-    clamped_slopes,
-    ewa,
-    film_axes,
-    film_point,
-    true_slopes,
-    whiten,
-)
+from drgs.camera import Camera, Pinhole
+from drgs.projection import FilmShape, GaussianRows, ewa, film_axes, whiten, world_axes
 
 SPREAD = math.sqrt(3)
 """Standard deviations from the mean to a sigma point: sqrt(n + lambda), lambda = 0."""
@@ -49,20 +41,16 @@ def unscented(rows: GaussianRows, camera: Camera, position: Any, low_pass: float
 
     position: Array3f, camera axes, the mean. Not differentiated: where :data:`NEAREST` decides.
     """
-    slopes, clamped = true_slopes(position), clamped_slopes(camera, position)
-    m0, m1, n = film_axes(rows, camera, position, slopes)
-    on_film = [_sigma_offsets(m, n) for m in (m0, m1)]
-    shift = [_mean_offset(m, n) for m in (m0, m1)]
+    points = _sigma_points(camera.lens, rows, camera, position)
     # The mean itself has the offset 0.
     columns = [
         [-math.sqrt(CENTER_WEIGHT) * mu, *(math.sqrt(WEIGHT) * (o - mu) for o in axis)]
-        for axis, mu in zip(on_film, shift, strict=True)
+        for axis, mu in zip(points.offsets, points.mean, strict=True)
     ]
-    means2d = film_point(camera, position) + types_of(type(shift[0])).Array2f(shift)
-    usable = (slopes[0] == clamped[0]) & (slopes[1] == clamped[1]) & _far_enough(n)
+    shift = types_of(type(position.z)).Array2f(points.mean)
+    means2d = camera.lens.film_point(camera, position) + shift
     affine = ewa(rows, camera, position, low_pass)
-    transformed = whiten(means2d, *columns, low_pass)
-    return dr.select(usable, transformed, affine)
+    return dr.select(points.usable, whiten(means2d, *columns, low_pass), affine)
 
 
 def unscented_with_depth(
@@ -73,12 +61,57 @@ def unscented_with_depth(
     The Gaussian's covariance with the depth is the affine one, and h is not negative.
     """
     film = unscented(rows, camera, position, low_pass)
-    m0, m1, n = film_axes(rows, camera, position, true_slopes(position))
+    slopes = camera.lens.true_slopes(camera, position)
+    m0, m1, n = film_axes(rows, camera, position, slopes)
     p, r, s = film.whitening
     kx, ky = dr.dot(m0, n), dr.dot(m1, n)
     kx, ky = dr.fma(p, kx, r * ky), s * ky
     h = dr.squared_norm(n) - dr.fma(kx, kx, ky * ky)
     return replace(film, perspective=[kx, ky, dr.select(h > 0, h, 0)])
+
+
+@dataclass(frozen=True)
+class _SigmaPoints:
+    """The six points besides the mean, on the film."""
+
+    offsets: list[list[Any]]  # by side of the film: six places, px, from the mean's
+    mean: list[Any]  # by side: the mean of the offsets
+    usable: Any  # Bool
+
+
+@singledispatch
+def _sigma_points(lens: Any, rows: GaussianRows, camera: Camera, position: Any) -> _SigmaPoints:
+    """Through any lens: as it projects points."""
+    center, slopes = lens.film_point(camera, position), lens.true_slopes(camera, position)
+    not_nearer = replace(camera, near=NEAREST * lens.look(camera, position)[2])
+    usable = _same(slopes, lens.clamped_slopes(camera, position))
+    offsets = [[], []]
+    for axis in world_axes(rows):
+        for c in (SPREAD, -SPREAD):
+            seen, point, _ = lens.look(not_nearer, position + c * (camera.rotation @ axis))
+            usable &= seen
+            for side, offset in zip(offsets, lens.film_point(camera, point) - center, strict=True):
+                side.append(offset)
+    return _SigmaPoints(offsets, [WEIGHT * sum(o[1:], o[0]) for o in offsets], usable)
+
+
+@_sigma_points.register
+def _(lens: Pinhole, rows: GaussianRows, camera: Camera, position: Any) -> _SigmaPoints:
+    """Through a pinhole: by formulas that do not cancel."""
+    slopes = lens.true_slopes(camera, position)
+    m0, m1, n = film_axes(rows, camera, position, slopes)
+    return _SigmaPoints(
+        offsets=[_sigma_offsets(m, n) for m in (m0, m1)],
+        mean=[_mean_offset(m, n) for m in (m0, m1)],
+        usable=_same(slopes, lens.clamped_slopes(camera, position)) & _far_enough(n),
+    )
+
+
+def _same(slopes: list[Any] | None, clamped: list[Any] | None) -> Any:
+    """Whether slopes are not clamped; a lens that has none does not clamp."""
+    if slopes is None:
+        return True
+    return (slopes[0] == clamped[0]) & (slopes[1] == clamped[1])
 
 
 def _far_enough(n: Any) -> Any:

@@ -18,7 +18,9 @@ import numpy as np
 
 from drgs.checks import UserError
 from drgs.data.frames import (
+    FrameValues,
     focal_from_angle,
+    lens_of,
     number,
     opencv_camera_to_world,
     positive,
@@ -59,7 +61,7 @@ TILT_WEIGHT = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class Viewpoint:
-    """A pinhole camera and the size of its picture; square pixels."""
+    """A camera and the size of its picture."""
 
     name: str  # unique among those rendered together; a file name without suffix
     camera_to_world: np.ndarray  # (4, 4) float64, rigid, OpenCV axes: x right, y down, z forward
@@ -69,6 +71,7 @@ class Viewpoint:
     cy: float  # px
     width: int  # px
     height: int  # px
+    lens: Any = None  # of drgs.lenses; None: a pinhole
 
 
 @dataclass(frozen=True, eq=False)
@@ -199,9 +202,9 @@ def orbit_size(views: Sequence[View]) -> tuple[int, int]:
 def read_viewpoints(path: Path, size: tuple[int, int] | None) -> list[Viewpoint]:
     """The cameras of a file in the layout of ``transforms.json``, without its pictures.
 
-    Lenses: ``camera_angle_x``, or ``fl_x`` in pixels of ``w`` (and ``cx``, ``cy`` of ``w``,
-    ``h``), at the top or, overriding that, in a frame. size: width and height, px; None for those
-    that the file gives.
+    ``camera_angle_x``, or ``fl_x`` in pixels of ``w`` (and ``fl_y`` and ``cy`` of ``h``, ``cx`` of
+    ``w``), and lens distortion, at the top or, overriding that, in a frame. size: width and height,
+    px; None for those that the file gives.
 
     Raises :class:`UserError` naming the file, the key, what was expected and what was got.
     """
@@ -231,11 +234,16 @@ def _read_viewpoint(
         focal = focal_from_angle(values, "camera_angle_x", where, width)
     else:
         raise UserError(f"{where}camera_angle_x (or fl_x with w) is missing")
+    focal_y = focal
+    if "fl_x" in values and "fl_y" in values:
+        focal_y = height * positive(values, "fl_y", where) / positive(values, "h", where)
     cx, cy = width / 2, height / 2
     if "cx" in values and "cy" in values:
         cx = width * number(values, "cx", where) / positive(values, "w", where)
         cy = height * number(values, "cy", where) / positive(values, "h", where)
-    return Viewpoint(name, pose, focal, focal, cx, cy, width, height)
+    return Viewpoint(
+        name, pose, focal, focal_y, cx, cy, width, height, lens_of(FrameValues(values, where))
+    )
 
 
 def _middle(gaussians: Gaussians) -> tuple[np.ndarray, float]:

@@ -11,7 +11,7 @@ import importlib.util
 import sys
 from pathlib import Path
 
-PLUGINS = ("splats",)
+PLUGINS = ("splats", "calibrated")
 
 
 def register(variant: str) -> None:

@@ -7,6 +7,7 @@ Executed once per Mitsuba variant (see ``drgs.plugins``). The rasterizer itself 
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
+from functools import reduce
 from typing import Any
 
 import drjit as dr
@@ -15,7 +16,7 @@ import numpy as np
 
 from drgs import rendering
 from drgs.arrays import interleave
-from drgs.camera import SensorState, camera_from_sensor, read_sensor
+from drgs.camera import SensorState, camera_from_sensor, cameras_in_time, read_sensor
 from drgs.choices import Choices
 from drgs.constants import NEAR
 from drgs.exposure import CenterExposure
@@ -29,7 +30,7 @@ SUPPORTED_VARIANTS = ("llvm_ad_rgb", "cuda_ad_rgb")
 class _Rendered:
     """The last frames, and everything that they depend on: reused while nothing has changed."""
 
-    frames: list[rendering.Frame]  # one for each sample per pixel
+    frames: list[list[rendering.Frame]]  # by time; one for each sample per pixel
     pipeline: rendering.Pipeline
     exposure: Any  # key of the points that were sampled; None: pixel centres
     sensor: SensorState
@@ -43,8 +44,7 @@ class _Rendered:
         return (
             self.pipeline == pipeline
             and self.exposure == exposure
-            and self.sensor.host == sensor.host
-            and indices(self.sensor.device) == indices(sensor.device)
+            and self.sensor.same_as(sensor)
             and indices(self.gaussians) == indices(gaussians)
         )
 
@@ -273,8 +273,8 @@ class SplatsIntegrator(mi.CppADIntegrator):
             exposure = self._exposure(sensor, seed, spp)
             background = self._detached_background()
             frames = self._frames(sensor, exposure)
-            channels = [self._channels(sensor.film(), f.planes(), background) for f in frames]
-            image = exposure.develop(channels)
+            planes = [[frame.planes() for frame in times] for times in frames]
+            image = exposure.develop(self._channels(sensor.film(), planes, background))
             if evaluate:
                 dr.eval(image)
         return image if develop else mi.TensorXf()
@@ -298,21 +298,28 @@ class SplatsIntegrator(mi.CppADIntegrator):
         with dr.suspend_grad():
             exposure = self._exposure(sensor, seed, spp)
             frames = self._frames(sensor, exposure)
-            planes, background = [f.planes() for f in frames], self._detached_background()
+            planes = [[frame.planes() for frame in times] for times in frames]
+            background = self._detached_background()
             dr.eval(planes)
             d_channels = exposure.adjoint(grad_in)
             # Colour conversion and background are a few operations per pixel, traced again and
             # differentiated by Dr.Jit.
             with dr.resume_grad():
                 dr.enable_grad(planes, background)
-                channels = [self._channels(sensor.film(), p, background) for p in planes]
+                channels = self._channels(sensor.film(), planes, background)
                 dr.accum_grad(channels, d_channels)
                 dr.enqueue(dr.ADMode.Backward, channels)
                 dr.traverse(dr.ADMode.Backward)
                 d_planes, d_background = dr.grad(planes), dr.grad(background)
             sensor.film().clear()  # as after any backward pass of Mitsuba's own integrators
             dr.eval(d_planes, d_background)
-            gradients = rendering.frames_adjoint(self.gaussians, frames, d_planes)
+            gradients = reduce(
+                rendering.added,
+                (
+                    rendering.frames_adjoint(self.gaussians, *of_time)
+                    for of_time in zip(frames, d_planes, strict=True)
+                ),
+            )
             self.last = LastBackward(
                 means2d_grad=_rows(gradients.means2d),
                 visible=gradients.visible,
@@ -342,14 +349,15 @@ class SplatsIntegrator(mi.CppADIntegrator):
                     **{name: _tangent(getattr(self, name)) for name in PARAMETER_NAMES}
                 )
                 d_background = dr.grad(self.background)
-            d_planes = rendering.frames_tangent(self.gaussians, frames, tangents)
-            planes, background = [f.planes() for f in frames], self._detached_background()
+            d_planes = [rendering.frames_tangent(self.gaussians, f, tangents) for f in frames]
+            planes = [[frame.planes() for frame in times] for times in frames]
+            background = self._detached_background()
             dr.eval(planes, d_planes)
             with dr.resume_grad():
                 dr.enable_grad(planes, background)
                 dr.set_grad(planes, d_planes)
                 dr.set_grad(background, d_background)
-                channels = [self._channels(sensor.film(), p, background) for p in planes]
+                channels = self._channels(sensor.film(), planes, background)
                 image = exposure.develop(channels)
                 dr.forward_to(image)
                 d_image = dr.grad(image)
@@ -372,8 +380,10 @@ class SplatsIntegrator(mi.CppADIntegrator):
 
         return SampledExposure(sensor, seed, spp, self._film_maps)
 
-    def _frames(self, sensor: mi.Sensor, exposure: Any) -> list[rendering.Frame]:
+    def _frames(self, sensor: mi.Sensor, exposure: Any) -> list[list[rendering.Frame]]:
         """Render, or reuse the last frames if nothing that they depend on has changed.
+
+        One list for each time at which the shutter is open, of a frame for each sample per pixel.
 
         ``mi.render`` calls ``render`` and, later, ``render_backward`` on the same object, with
         other renders possibly in between.
@@ -382,11 +392,12 @@ class SplatsIntegrator(mi.CppADIntegrator):
         state = read_sensor(sensor, self.near)
         last = self._rendered
         if last is None or not last.matches(pipeline, exposure.key, state, gaussians):
-            camera = camera_from_sensor(state)
             first, *others = exposure.positions
             model = replace(pipeline.model, positions=first)
-            frame = rendering.render(gaussians, camera, replace(pipeline, model=model))
-            frames = [frame, *(rendering.render_again(frame, p) for p in others)]
+            frames = []
+            for camera in cameras_in_time(camera_from_sensor(state)):
+                frame = rendering.render(gaussians, camera, replace(pipeline, model=model))
+                frames.append([frame, *(rendering.render_again(frame, p) for p in others)])
             self._rendered = _Rendered(frames, pipeline, exposure.key, state, gaussians)
         return self._rendered.frames
 
@@ -397,9 +408,21 @@ class SplatsIntegrator(mi.CppADIntegrator):
         return background
 
     def _channels(
+        self, film: mi.Film, planes: list[list[list[mi.Float]]], background: mi.Color3f
+    ) -> list[list[mi.Float]]:
+        """What the film gets of each sample per pixel: the mean over the times."""
+        channels = [[self._composited(film, p, background) for p in times] for times in planes]
+        if len(channels) == 1:
+            return channels[0]
+        return [
+            [sum(values[1:], values[0]) / len(values) for values in zip(*of_sample, strict=True)]
+            for of_sample in zip(*channels, strict=True)
+        ]
+
+    def _composited(
         self, film: mi.Film, planes: list[mi.Float], background: mi.Color3f
     ) -> list[mi.Float]:
-        """What the film gets, each a plane of pixels: red, green, blue, perhaps alpha."""
+        """Planes of pixels: red, green, blue, perhaps alpha."""
         transmittance, *color = planes
         color = mi.Color3f(color)
         if self.srgb_primitives:

@@ -14,6 +14,7 @@ from drgs.data.images import downscale
 from drgs.data.points import focus_of, mean_squared_neighbour_distance, points_in_view
 from drgs.data.types import Dataset, View
 from drgs.io import write_ply
+from drgs.lenses import Fisheye, RadialTangential
 
 
 def look_at(center, target, up=(0, 0, 1)):
@@ -348,21 +349,38 @@ def test_angles_replace_missing_focal_lengths(photographs):
 
 
 @pytest.mark.parametrize("place", ["top", "frame"])
-def test_lens_distortion_is_refused_by_name(photographs, place):
+def test_lens_distortion_is_read(photographs, place):
     path = photographs / "transforms.json"
     coefficients = {"k1": 0.1, "k2": 0.0, "p1": -0.02}
+    # Frames are in reverse order of their names: the first is the last view.
     edit(path, lambda m: (m if place == "top" else m["frames"][0]).update(coefficients))
-    assert refusal(photographs) == (
-        f"{path}: frames[0]: lens distortion (k1 = 0.1, p1 = -0.02) is not supported: undistort "
-        "the images, or set data.ignore_distortion: true"
-    )
-    description = load(photographs, ignore_distortion=True).description
-    assert description.endswith("; lens distortion (k1, p1) ignored")
+    dataset = load(photographs)
+    assert dataset.train[-1].lens == RadialTangential.of(k1=0.1, p1=-0.02)
+    assert dataset.train[0].lens == (dataset.train[-1].lens if place == "top" else None)
+    assert dataset.description.endswith("; lens opencv (k1, p1, p2)")
+    dataset = load(photographs, ignore_distortion=True)
+    assert all(view.lens is None for view in dataset.train)
+    assert dataset.description.endswith("; lens opencv (k1, p1, p2) ignored")
+
+
+@pytest.mark.parametrize("says", [{"camera_model": "OPENCV_FISHEYE"}, {"is_fisheye": True}])
+def test_a_fisheye_lens_is_read(photographs, says):
+    edit(photographs / "transforms.json", lambda m: m.update(k1=0.1, k4=-0.01, **says))
+    dataset = load(photographs)
+    assert dataset.train[0].lens == Fisheye.of(k1=0.1, k4=-0.01)
+    assert dataset.description.endswith("; lens fisheye (k1, k2, k3, k4)")
+
+
+def test_coefficients_do_not_depend_on_the_size_of_the_picture(photographs):
+    edit(photographs / "transforms.json", lambda m: m.update(k1=0.1))
+    view = load(photographs, image_size=4).train[0]
+    assert view.lens == RadialTangential.of(k1=0.1) and view.fx == 4.5
 
 
 def test_distortion_coefficients_of_zero_are_accepted(photographs):
     edit(photographs / "transforms.json", lambda m: m.update(k1=0, k2=0.0, p1=0))
-    assert "ignored" not in load(photographs).description
+    dataset = load(photographs)
+    assert dataset.train[0].lens is None and "lens" not in dataset.description
 
 
 @pytest.mark.parametrize(
@@ -377,13 +395,14 @@ def test_distortion_coefficients_of_zero_are_accepted(photographs):
         (lambda m: m.update(cy=-700), "cy must be within 600 px of the picture, got -700"),
         (lambda m: m.update(cx="4"), 'cx must be a finite number, got "4"'),
         (
-            lambda m: m.update(camera_model="OPENCV_FISHEYE"),
+            lambda m: m.update(camera_model="EQUIRECTANGULAR"),
             "camera_model must be one of SIMPLE_PINHOLE, PINHOLE, SIMPLE_RADIAL, RADIAL, OPENCV, "
-            "FULL_OPENCV, got OPENCV_FISHEYE",
+            "FULL_OPENCV, SIMPLE_RADIAL_FISHEYE, RADIAL_FISHEYE, OPENCV_FISHEYE, got "
+            "EQUIRECTANGULAR",
         ),
         (
-            lambda m: m.update(is_fisheye=True),
-            "is_fisheye must be false: only pinhole cameras are supported",
+            lambda m: m.update(is_fisheye=True, p1=0.5),
+            "p1: a fisheye lens has the coefficients k1, k2, k3, k4, got p1 = 0.5",
         ),
     ],
 )
@@ -683,7 +702,10 @@ def test_lego_is_read(lego_folder):
 
 
 def test_fox_is_read(fox_folder):
-    dataset = load(fox_folder, ignore_distortion=True)
+    dataset = load(fox_folder)
     assert (len(dataset.train), len(dataset.test)) == (43, 7)
     assert (dataset.train[0].width, dataset.train[0].height) == (270, 480)
-    assert "(k1 = 0.0578421, k2 = -0.0805099, p1 = " in refusal(fox_folder)
+    named = dataset.train[0].lens.named()
+    assert named == {
+        "k1": 0.0578421, "k2": -0.0805099, "p1": -0.000980296, "p2": 0.00015575
+    }  # fmt: skip

@@ -322,8 +322,8 @@ def test_an_output_folder_that_is_a_file_is_an_error(fit, tmp_path, capsys):
         (
             '<scene version="3.0.0"><integrator type="splats">'
             '<string name="filename" value="model.ply"/></integrator>'
-            '<sensor type="orthographic"/></scene>',
-            "the sensor must be of type 'perspective'",
+            '<sensor type="irradiancemeter"/></scene>',
+            "the sensor must be of type perspective, thinlens, orthographic or calibrated",
         ),
     ],
     ids=["not XML", "empty", "model missing", "wrong sensor"],

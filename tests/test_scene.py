@@ -14,12 +14,13 @@ from views import image_of, pose, splats_before
 
 from drgs import reference
 from drgs.bench.scenes import bench_gaussians
-from drgs.checks import UserError
+from drgs.camera import Pinhole
 from drgs.choices import Choices
 from drgs.config import ModelConfig
 from drgs.data.types import View
 from drgs.gaussians import PARAMETER_NAMES, Gaussians
-from drgs.scene import make_scene, make_sensors
+from drgs.lenses import Fisheye, RadialTangential
+from drgs.scene import SQUARE_PIXEL_TOLERANCE, make_scene, make_sensors
 
 BACKGROUND = (0.875, 0.375, 0.1875)
 
@@ -94,18 +95,31 @@ def test_views_of_one_size_share_a_film():
     assert [list(film.size()) for film in (a, b)] == [[37, 23], [23, 37]]
 
 
-def test_pixels_that_are_far_from_square_are_refused_by_name():
-    view = make_view(fx=30.0, fy=33.0, name="IMG_7")
-    with pytest.raises(UserError, match=r"^IMG_7: fl_x and fl_y must agree .* got 30 and 33"):
-        make_sensors([view])
+@pytest.mark.parametrize("lens", [None, RadialTangential.of(k1=-0.2, p2=0.01), Fisheye.of(k1=0.1)])
+def test_what_mitsubas_sensors_cannot_express_is_a_calibrated_camera(lens):
+    view = replace(make_view(fx=30.0, fy=33.0), lens=lens)
+    (sensor,) = make_sensors([view])
+    camera = camera_of(sensor)
+    actual = numbers(camera)
+    assert type(sensor).__name__ == "CalibratedSensor"
+    assert actual["rotation"] == pytest.approx(view.camera_to_world[:3, :3].T, abs=1e-7)
+    assert actual["center"] == pytest.approx(view.center, rel=1e-7)
+    assert actual["focal"].tolist() == [30, 33]
+    assert actual["principal"].tolist() == [20.5, 9.25]
+    expected = {} if lens is None else lens.named()
+    named = {name: float(value[0]) for name, value in camera.lens.named().items()}
+    assert named == pytest.approx(expected, rel=1e-7)
+    assert type(camera.lens) is (Pinhole if lens is None else type(lens))
 
 
 def test_pixels_that_are_nearly_square_move_by_less_than_said():
-    view = make_view(fx=30.0, fy=30.3)
-    camera = numbers(camera_of(make_sensors([view])[0]))
+    view = make_view(fx=30.0, fy=30.01)
+    (sensor,) = make_sensors([view])
+    assert sensor.class_name() == "PerspectiveCamera"
+    camera = numbers(camera_of(sensor))
     corners = np.array([[0, 0], [view.width, view.height]]) - [view.cx, view.cy]
     shift = corners * (camera["focal"] / [view.fx, view.fy] - 1)
-    assert 0.02 < np.abs(shift).max() < 0.5
+    assert 0.002 < np.abs(shift).max() < SQUARE_PIXEL_TOLERANCE
 
 
 # ----------------------------------------------------------------------------------------------

@@ -35,6 +35,13 @@ degrees down to 0.006."""
 MAX_OFFSET = 100
 """Image sizes: how far the principal point may lie from the picture."""
 
+DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
+
+PINHOLE_MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
+"""Values of ``camera_model`` that are a pinhole camera apart from their distortion."""
+
+FISHEYE_MODELS = ("SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "OPENCV_FISHEYE")
+
 T = TypeVar("T")
 
 
@@ -141,6 +148,71 @@ def opencv_camera_to_world(frame: dict[str, Any], where: str) -> np.ndarray:
         raise UserError(f"{key} must end in the row 0 0 0 1, got {matrix[3].tolist()}")
     matrix[:3, 1:3] *= -1
     return matrix
+
+
+class FrameValues:
+    """The values of a frame, and where they are for messages."""
+
+    def __init__(self, values: dict[str, Any], where: str) -> None:
+        """where: the prefix of a key."""
+        self.values, self.where = values, where
+
+    def __contains__(self, key: str) -> bool:
+        return key in self.values
+
+    def get(self, key: str, default: Any = None) -> Any:
+        """Of a key that may be missing."""
+        return self.values.get(key, default)
+
+    def at(self, key: str) -> tuple[dict[str, Any], str, str]:
+        """The object that holds ``key``, the key, and the prefix that messages name it with."""
+        return self.values, key, self.where
+
+
+class InheritedValues(FrameValues):
+    """The same; what a frame does not have is the file's."""
+
+    def __init__(self, own: dict[str, Any], where: str, meta: dict[str, Any], path: Path) -> None:
+        """own, meta: the frame's values and the file's."""
+        super().__init__(meta | own, where)
+        self.own, self.meta, self.top = own, meta, f"{path}: "
+
+    def at(self, key: str) -> tuple[dict[str, Any], str, str]:
+        """See :meth:`FrameValues.at`."""
+        return (self.own, key, self.where) if key in self.own else (self.meta, key, self.top)
+
+
+def lens_of(frame: FrameValues) -> Any:
+    """The lens that a frame names, with its coefficients; None for a pinhole.
+
+    ``camera_model`` as nerfstudio writes it, ``is_fisheye`` as instant-ngp does.
+    """
+    model = frame.get("camera_model", PINHOLE_MODELS[0])
+    if model not in (*PINHOLE_MODELS, *FISHEYE_MODELS):
+        raise UserError(
+            f"{frame.at('camera_model')[2]}camera_model must be one of "
+            f"{', '.join((*PINHOLE_MODELS, *FISHEYE_MODELS))}, got {one_line(model)}"
+        )
+    is_fisheye = model in FISHEYE_MODELS or bool(frame.get("is_fisheye"))
+    coefficients = distortion_of(frame)
+    if not is_fisheye and not coefficients:
+        return None
+    from drgs import lenses
+
+    kind = lenses.Fisheye if is_fisheye else lenses.RadialTangential
+    for name in coefficients:
+        if name not in kind.names:
+            raise UserError(
+                f"{frame.at(name)[2]}{name}: a fisheye lens has the coefficients "
+                f"{', '.join(kind.names)}, got {name} = {coefficients[name]:g}"
+            )
+    return kind.of(**coefficients)
+
+
+def distortion_of(frame: FrameValues) -> dict[str, float]:
+    """The coefficients that are not zero."""
+    given = {key: number(*frame.at(key)) for key in DISTORTION if key in frame}
+    return {key: value for key, value in given.items() if value != 0}
 
 
 def image_path(folder: Path, frame: dict[str, Any], where: str) -> Path:

@@ -7,18 +7,19 @@ name, and every ``data.test_every``-th is for testing, as in Mip-NeRF 360 and 3D
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from drgs.checks import UserError, one_line
+from drgs.checks import UserError
 from drgs.config import DataConfig
 from drgs.data.frames import (
+    InheritedValues,
     focal_from_angle,
     focal_length,
     image_path,
     in_parallel,
-    number,
+    lens_of,
     opencv_camera_to_world,
     positive,
     principal_point,
@@ -27,11 +28,6 @@ from drgs.data.frames import (
 )
 from drgs.data.images import composite, downscale, read_image
 from drgs.data.types import Dataset, View
-
-DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
-
-PINHOLE_MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
-"""Values of ``camera_model`` that are a pinhole camera apart from their distortion."""
 
 
 def load(config: DataConfig) -> Dataset:
@@ -46,16 +42,15 @@ def load(config: DataConfig) -> Dataset:
     if len(meta["frames"]) < 2:
         raise UserError(f"{path}: at least 2 views are needed, one of them to test; got 1")
     frames = [
-        _Frame(meta, own, path, f"{path}: frames[{index}].")
+        InheritedValues(own, f"{path}: frames[{index}].", meta, path)
         for index, own in enumerate(meta["frames"])
     ]
     files = [image_path(config.path, frame.own, frame.where) for frame in frames]
-    if not config.ignore_distortion:
-        for frame in frames:
-            _refuse_distortion(frame)
+    lenses = [lens_of(frame) for frame in frames]
 
     def load_view(index: int, name: str) -> View:
-        return _load_view(config, frames[index], files[index], name)
+        view = _load_view(config, frames[index], files[index], name)
+        return view if config.ignore_distortion else replace(view, lens=lenses[index])
 
     order = sorted(range(len(frames)), key=lambda index: frames[index].own["file_path"])
     names = unique_names([frames[index].own for index in order])
@@ -71,37 +66,13 @@ def load(config: DataConfig) -> Dataset:
         description=(
             f"{config.path.name} (nerfstudio layout): {len(train)} train views, measured on "
             f"{len(test)} views (every {config.test_every}th by file name), "
-            f"{views[0].width}x{views[0].height}, background {config.background}" + _ignored(frames)
+            f"{views[0].width}x{views[0].height}, background {config.background}"
+            + _notes(config, frames, lenses)
         ),
     )
 
 
-@dataclass(frozen=True)
-class _Frame:
-    """One frame's values and, for those that it does not have, the file's."""
-
-    meta: dict[str, Any]
-    own: dict[str, Any]
-    path: Path
-    where: str  # how messages name the frame: prefix of a key
-
-    def __contains__(self, key: str) -> bool:
-        return key in self.own or key in self.meta
-
-    def get(self, key: str, default: Any = None) -> Any:
-        return self.own.get(key, self.meta.get(key, default))
-
-    def at(self, key: str) -> tuple[dict[str, Any], str, str]:
-        """The object that holds ``key``, the key, and the prefix that messages name it with."""
-        return (self.own, key, self.where) if key in self.own else (self.meta, key, self.top)
-
-    @property
-    def top(self) -> str:
-        return f"{self.path}: "
-
-
-def _load_view(config: DataConfig, frame: _Frame, file: Path, name: str) -> View:
-    _refuse_other_lenses(frame)
+def _load_view(config: DataConfig, frame: InheritedValues, file: Path, name: str) -> View:
     camera_to_world = opencv_camera_to_world(frame.own, frame.where)
     image = composite(read_image(file), config.background_rgb)
     height, width = image.shape[:2]
@@ -131,7 +102,7 @@ def _load_view(config: DataConfig, frame: _Frame, file: Path, name: str) -> View
     )
 
 
-def _focal(frame: _Frame, axis: str, size: int) -> float:
+def _focal(frame: InheritedValues, axis: str, size: int) -> float:
     if f"fl_{axis}" in frame:
         return focal_length(*frame.at(f"fl_{axis}"), size)
     if f"camera_angle_{axis}" in frame:
@@ -139,42 +110,13 @@ def _focal(frame: _Frame, axis: str, size: int) -> float:
     raise UserError(f"{frame.top}fl_{axis} is missing, and there is no camera_angle_{axis} either")
 
 
-def _coefficients(frame: _Frame) -> dict[str, float]:
-    """The distortion coefficients that are not zero."""
-    given = {key: number(*frame.at(key)) for key in DISTORTION if key in frame}
-    return {key: value for key, value in given.items() if value != 0}
-
-
-def _refuse_distortion(frame: _Frame) -> None:
-    found = _coefficients(frame)
-    if found:
-        listed = ", ".join(f"{key} = {value:g}" for key, value in found.items())
-        raise UserError(
-            f"{frame.where.rstrip('.')}: lens distortion ({listed}) is not supported: undistort "
-            "the images, or set data.ignore_distortion: true"
-        )
-
-
-def _refuse_other_lenses(frame: _Frame) -> None:
-    model = frame.get("camera_model", PINHOLE_MODELS[0])
-    if model not in PINHOLE_MODELS:
-        raise UserError(
-            f"{frame.at('camera_model')[2]}camera_model must be one of "
-            f"{', '.join(PINHOLE_MODELS)}, got {one_line(model)}"
-        )
-    if frame.get("is_fisheye"):
-        raise UserError(
-            f"{frame.at('is_fisheye')[2]}is_fisheye must be false: only pinhole cameras are "
-            "supported"
-        )
-
-
-def _ignored(frames: list[_Frame]) -> str:
-    """What the dataset has and the loader leaves out, for the description."""
+def _notes(config: DataConfig, frames: list[InheritedValues], lenses: list[Any]) -> str:
+    """What the dataset has besides pinhole cameras, and what is left out, for the description."""
     notes = ""
-    keys = {key for frame in frames for key in _coefficients(frame)}
-    if keys:
-        notes += f"; lens distortion ({', '.join(sorted(keys))}) ignored"
+    found = {f"{lens.kind} ({', '.join(lens.named())})" for lens in lenses if lens is not None}
+    if found:
+        ignored = " ignored" if config.ignore_distortion else ""
+        notes += f"; lens {' and '.join(sorted(found))}{ignored}"
     if any("mask_path" in frame for frame in frames):
         notes += "; masks (mask_path) ignored"
     return notes

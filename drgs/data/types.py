@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """One photograph and the pinhole camera that took it."""
+    """One photograph and the camera that took it."""
 
     name: str  # unique in its split; a file name without folders or suffix
     image: np.ndarray  # (height, width, 3) float32, display space 0..1, opaque
@@ -20,6 +21,7 @@ class View:
     cy: float  # px
     width: int  # px
     height: int  # px
+    lens: Any = None  # of drgs.lenses, with numbers of the host; None: a pinhole
 
     @property
     def center(self) -> np.ndarray:

@@ -1,0 +1,508 @@
+"""Lenses other than a pinhole: with distortion, fisheye, orthographic, with an aperture.
+
+Layer 1, imported when a sensor or a dataset has such a lens. Each has the methods of
+:class:`drgs.camera.Pinhole`. Coefficients are numbers of the host, or Dr.Jit scalars after
+:meth:`upload`; one that is zero is left out (trailing zeros of a polynomial, both tangential
+ones), so that nothing is computed for it.
+
+Outside the part of the film's plane that a lens model is made for, its polynomials turn around and
+would fold what lies far outside back into the picture: what is seen under a larger angle than that
+at which the radial function first stops growing is not seen at all.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+from typing import Any, ClassVar
+
+import drjit as dr
+import numpy as np
+
+from drgs.arrays import is_float64, types_of
+from drgs.camera import Camera, Lens, Perspective
+
+NEWTON_STEPS = 10
+"""When rays of pixels are looked for: lenses that bend straight lines visibly need 4 or 5."""
+
+BORDER = 17
+"""Points on each side of the film, whose rays tell what the film sees."""
+
+MISSED = 1e-6
+"""Squared, of slopes: how far Newton's method may end from the point that it looked for."""
+
+UNBOUNDED = 1e4
+"""A slope that no film shows."""
+
+MAX_ANGLE = 0.95 * math.pi
+"""From the axis of a fisheye: what is behind it has no place on the film."""
+
+NEAR_AXIS = 0.1
+"""tan^2 of the angle below which series are used: theta / rho is 0 / 0 on the axis, and what its
+derivative needs is a difference that cancels near it."""
+
+AXIS_TERMS = {False: 8, True: 16}
+"""Terms of these series in single and in double precision: 0.1^n is below their roundings."""
+
+
+# ----------------------------------------------------------------------------------------------
+# Polynomials
+# ----------------------------------------------------------------------------------------------
+
+
+def _horner(coefficients: Sequence[Any], x: Any) -> Any:
+    """c_0 + c_1 x + c_2 x^2 + ...; 0.0 without coefficients."""
+    if not coefficients:
+        return 0.0
+    total = coefficients[-1]
+    for c in reversed(coefficients[:-1]):
+        total = total * x + c
+    return total
+
+
+def _polynomial(coefficients: Sequence[Any], x: Any) -> Any:
+    """1 + c_1 x + c_2 x^2 + ..."""
+    return _horner([1.0, *coefficients], x)
+
+
+def _derivative(coefficients: Sequence[Any], x: Any) -> Any:
+    """c_1 + 2 c_2 x + ..."""
+    return _horner([power * c for power, c in enumerate(coefficients, 1)], x)
+
+
+def _first_root(polynomial: np.ndarray) -> float:
+    """The smallest positive root, coefficients from the constant term up; inf: there is none."""
+    roots = np.polynomial.polynomial.polyroots(np.trim_zeros(polynomial, "b"))
+    real = roots.real[(np.abs(roots.imag) < 1e-9 * (1 + np.abs(roots))) & (roots.real > 0)]
+    return float(real.min(initial=math.inf))
+
+
+def _without_trailing_zeros(coefficients: Sequence[float]) -> tuple[float, ...]:
+    kept = [float(c) for c in coefficients]
+    while kept and kept[-1] == 0:
+        kept.pop()
+    return tuple(kept)
+
+
+def _uploaded(lens: Any, float_type: type) -> Any:
+    """The lens with Dr.Jit scalars for its numbers, so that kernels are the same for all."""
+
+    def opaque(value: Any) -> Any:
+        if isinstance(value, tuple):
+            return tuple(opaque(item) for item in value)
+        return dr.opaque(float_type, value) if isinstance(value, float) else value
+
+    return replace(lens, **{f.name: opaque(getattr(lens, f.name)) for f in fields(lens)})
+
+
+# ----------------------------------------------------------------------------------------------
+# Distortion
+# ----------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class RadialTangential(Perspective):
+    """OpenCV's lens: slopes (x, y) are distorted before they come to the film.
+
+    With r^2 = x^2 + y^2 and R = (1 + k1 r^2 + k2 r^4 + k3 r^6) / (1 + k4 r^2 + k5 r^4 + k6 r^6),
+
+        x' = R x + 2 p1 x y + p2 (r^2 + 2 x^2),  y' = R y + p1 (r^2 + 2 y^2) + 2 p2 x y
+
+    (Brown 1966; OpenCV's documentation, "Camera Calibration and 3D Reconstruction"). Means whose r
+    is beyond ``max_squared_radius`` are not seen.
+    """
+
+    kind: ClassVar[str] = "opencv"
+    names: ClassVar[tuple[str, ...]] = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
+
+    numerator: tuple[Any, ...]  # k1, k2, k3
+    denominator: tuple[Any, ...]  # k4, k5, k6
+    tangential: tuple[Any, ...]  # p1, p2; or none
+    max_squared_radius: Any  # of the slopes
+    on_film: Any = None  # (2) Array2f: the least and the largest slopes on the film
+
+    @staticmethod
+    def of(**coefficients: float) -> RadialTangential:
+        """From OpenCV's names, ``k1`` to ``k6``, ``p1``, ``p2``; what is not given is zero."""
+        k1, k2, k3, k4, k5, k6, p1, p2 = (
+            coefficients.pop(name, 0.0) for name in RadialTangential.names
+        )
+        assert not coefficients
+        numerator = _without_trailing_zeros((k1, k2, k3))
+        denominator = _without_trailing_zeros((k4, k5, k6))
+        return RadialTangential(
+            numerator=numerator,
+            denominator=denominator,
+            tangential=(p1, p2) if p1 or p2 else (),
+            max_squared_radius=_largest_squared_radius(numerator, denominator),
+        )
+
+    def upload(self, float_type: type) -> RadialTangential:
+        """For kernels of this precision."""
+        return _uploaded(self, float_type)
+
+    def named(self) -> dict[str, Any]:
+        """The coefficients that are not left out, by OpenCV's names."""
+        names = (*self.names[: len(self.numerator)], *self.names[3 : 3 + len(self.denominator)])
+        names += self.names[6:] if self.tangential else ()
+        values = (*self.numerator, *self.denominator, *self.tangential)
+        return dict(zip(names, values, strict=True))
+
+    def with_named(self, values: dict[str, Any]) -> RadialTangential:
+        """Other numbers for the same coefficients; where the model ends stays as it is."""
+        k, p = self.names[:6], self.names[6:]
+        return replace(
+            self,
+            numerator=tuple(values[name] for name in k[: len(self.numerator)]),
+            denominator=tuple(values[name] for name in k[3 : 3 + len(self.denominator)]),
+            tangential=tuple(values[name] for name in p[: len(self.tangential)]),
+        )
+
+    def distort(self, x: Any, y: Any) -> tuple[Any, Any]:
+        """Slopes as the film shows them."""
+        squared = x * x + y * y
+        radial = self._radial(squared)
+        if not self.tangential:
+            return radial * x, radial * y
+        p1, p2 = self.tangential
+        return (
+            radial * x + 2 * p1 * (x * y) + p2 * (squared + 2 * x * x),
+            radial * y + p1 * (squared + 2 * y * y) + 2 * p2 * (x * y),
+        )
+
+    def distortion_jacobian(self, x: Any, y: Any) -> tuple[Any, Any, Any]:
+        """d x' / d x, d x' / d y = d y' / d x, d y' / d y."""
+        squared = x * x + y * y
+        radial, slope = self._radial(squared), 2 * self._radial_derivative(squared)
+        xx, xy, yy = radial + slope * x * x, slope * (x * y), radial + slope * y * y
+        if not self.tangential:
+            return xx, xy, yy
+        p1, p2 = self.tangential
+        return (
+            xx + 2 * p1 * y + 6 * p2 * x,
+            xy + 2 * p1 * x + 2 * p2 * y,
+            yy + 6 * p1 * y + 2 * p2 * x,
+        )
+
+    def undistort(self, x: Any, y: Any) -> tuple[Any, Any]:
+        """The slopes that :meth:`distort` sends to (x, y), by Newton's method.
+
+        Where there are none, the result means nothing: :meth:`sees_slopes` and a second look tell.
+        """
+        u, v = x, y
+        for _ in range(NEWTON_STEPS):
+            at_x, at_y = self.distort(u, v)
+            xx, xy, yy = self.distortion_jacobian(u, v)
+            dx, dy = x - at_x, y - at_y
+            determinant = xx * yy - xy * xy
+            u = u + (yy * dx - xy * dy) / determinant
+            v = v + (xx * dy - xy * dx) / determinant
+        return u, v
+
+    def sees_slopes(self, x: Any, y: Any) -> Any:
+        """Whether they are within the part that the model is made for."""
+        return x * x + y * y < self.max_squared_radius
+
+    # What kernels call: see ``drgs.camera``.
+
+    def look(self, camera: Camera, position: Any) -> tuple[Any, Any, Any]:
+        """Whether a mean is seen, its position, and its depth."""
+        x, y, z = position
+        # Not divided by z, which may be zero.
+        limit = self.max_squared_radius * z * z
+        return _replaced(position, (z >= camera.near) & (x * x + y * y < limit))
+
+    def film_point(self, camera: Camera, position: Any) -> Any:
+        """Where a point is on the film, Array2f, px."""
+        slopes = self.distort(*self.true_slopes(camera, position))
+        return camera.focal * types_of(type(position.z)).Array2f(*slopes) + camera.principal
+
+    def film_directions(self, camera: Camera, position: Any, slopes: list[Any]) -> list[Any]:
+        """Derivatives of the place on the film, two Array3f, world."""
+        xx, xy, yy = self.distortion_jacobian(*slopes)
+        right, down, forward = camera.rotation
+        dx, dy = (
+            (axis - slope * forward) / position.z
+            for axis, slope in zip((right, down), slopes, strict=True)
+        )
+        return [camera.focal.x * (xx * dx + xy * dy), camera.focal.y * (xy * dx + yy * dy)]
+
+    def fitted(self, camera: Camera) -> RadialTangential:
+        """The lens that knows what the film of ``camera`` sees."""
+        return replace(self, on_film=_slopes_on_border(self, camera))
+
+    def frustum(self, camera: Camera) -> tuple[Any, Any]:
+        """The least and the largest slopes on the film."""
+        del camera
+        return self.on_film
+
+    def ray(self, camera: Camera, x: Any, y: Any) -> Any:
+        """Through a point of the film (px), Array3f, camera axes."""
+        t = types_of(type(x))
+        film = (t.Array2f(x, y) - camera.principal) / camera.focal
+        return t.Array3f(*self.undistort(film.x, film.y), 1)
+
+    def _radial(self, squared: Any) -> Any:
+        return _polynomial(self.numerator, squared) / _polynomial(self.denominator, squared)
+
+    def _radial_derivative(self, squared: Any) -> Any:
+        """d R / d r^2."""
+        denominator = _polynomial(self.denominator, squared)
+        change = _derivative(self.numerator, squared)
+        change = change - self._radial(squared) * _derivative(self.denominator, squared)
+        return change / denominator
+
+
+def _largest_squared_radius(numerator: Sequence[float], denominator: Sequence[float]) -> float:
+    """r^2 where r R(r^2) stops growing, or has a pole; inf if it never does.
+
+    With R = N / D and u = r^2, the derivative's numerator is N D + 2 u (N' D - N D').
+    """
+    n, d = (np.array([1.0, *coefficients]) for coefficients in (numerator, denominator))
+    multiply, derive = np.polynomial.polynomial.polymul, np.polynomial.polynomial.polyder
+    change = np.polynomial.polynomial.polysub(multiply(derive(n), d), multiply(n, derive(d)))
+    growth = np.polynomial.polynomial.polyadd(multiply(n, d), multiply([0.0, 2.0], change))
+    return min(_first_root(growth), _first_root(d))
+
+
+def _replaced(position: Any, seen: Any) -> tuple[Any, Any, Any]:
+    """Positions, with one on the axis for those that are not seen, and their z."""
+    x, y, z = position
+    z = dr.select(seen, z, 1)
+    return seen, type(position)(dr.select(seen, x, 0), dr.select(seen, y, 0), z), z
+
+
+def _slopes_on_border(lens: RadialTangential, camera: Camera) -> tuple[Any, Any]:
+    """The box around the slopes of points on the film's border that a lens sees.
+
+    Not differentiated. Where it sees none of them, nothing bounds the slopes.
+    """
+    t = types_of(type(camera.near))
+    with dr.suspend_grad():
+        side = dr.linspace(t.Float, 0, 1, BORDER)
+        zero, one = dr.zeros(t.Float, BORDER), dr.ones(t.Float, BORDER)
+        start, end = camera.film_start, camera.film_end
+        x = dr.concat([side, side, zero, one]) * (end.x - start.x) + start.x
+        y = dr.concat([zero, one, side, side]) * (end.y - start.y) + start.y
+        film = (t.Array2f(x, y) - camera.principal) / camera.focal
+        slopes = lens.undistort(film.x, film.y)
+        missed = dr.squared_norm(t.Array2f(*lens.distort(*slopes)) - film)
+        found = lens.sees_slopes(*slopes) & (missed < MISSED)
+        lowest = [dr.min(dr.select(found, s, UNBOUNDED)) for s in slopes]
+        highest = [dr.max(dr.select(found, s, -UNBOUNDED)) for s in slopes]
+        none = ~dr.any(found)
+        return (
+            t.Array2f([dr.select(none, -UNBOUNDED, s) for s in lowest]),
+            t.Array2f([dr.select(none, UNBOUNDED, s) for s in highest]),
+        )
+
+
+# ----------------------------------------------------------------------------------------------
+# Fisheye
+# ----------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Fisheye(Lens):
+    """A point at the angle theta from the axis is seen at a distance from the principal point of
+
+        theta_d = theta (1 + k1 theta^2 + k2 theta^4 + k3 theta^6 + k4 theta^8)
+
+    in its direction (Kannala and Brandt 2006, as in OpenCV's ``fisheye`` module). What it shows may
+    be beside and behind the camera, so that *depth* is the distance from the centre. Means whose
+    angle has a cosine below ``min_cosine`` are not seen.
+    """
+
+    kind: ClassVar[str] = "fisheye"
+    names: ClassVar[tuple[str, ...]] = ("k1", "k2", "k3", "k4")
+
+    coefficients: tuple[Any, ...]
+    min_cosine: Any
+
+    @staticmethod
+    def of(k1: float = 0.0, k2: float = 0.0, k3: float = 0.0, k4: float = 0.0) -> Fisheye:
+        """From OpenCV's names."""
+        coefficients = _without_trailing_zeros((k1, k2, k3, k4))
+        growth = [1.0, *((2 * n + 3) * k for n, k in enumerate(coefficients))]
+        turn = math.sqrt(_first_root(np.array(growth)))
+        return Fisheye(coefficients, math.cos(min(turn, MAX_ANGLE)))
+
+    def upload(self, float_type: type) -> Fisheye:
+        """For kernels of this precision."""
+        return _uploaded(self, float_type)
+
+    def named(self) -> dict[str, Any]:
+        """The coefficients that are not left out, by OpenCV's names."""
+        return dict(zip(self.names, self.coefficients, strict=False))
+
+    def with_named(self, values: dict[str, Any]) -> Fisheye:
+        """Other numbers for the same coefficients; where the model ends stays as it is."""
+        names = self.names[: len(self.coefficients)]
+        return replace(self, coefficients=tuple(values[name] for name in names))
+
+    # What kernels call: see ``drgs.camera``.
+
+    def look(self, camera: Camera, position: Any) -> tuple[Any, Any, Any]:
+        """Whether a mean is seen, its position, and its distance."""
+        distance = dr.norm(position)
+        seen = (distance >= camera.near) & (position.z > self.min_cosine * distance)
+        _, position, _ = _replaced(position, seen)
+        return seen, position, dr.norm(position)
+
+    def true_slopes(self, camera: Camera, position: Any) -> None:
+        """None: the projection is linearised at the mean, wherever it is."""
+        del camera, position
+
+    clamped_slopes = true_slopes
+
+    def film_point(self, camera: Camera, position: Any) -> Any:
+        """Where a point is on the film, Array2f, px."""
+        x, y, _ = position
+        per_radius, _ = self._angle_per_radius(position)
+        scale = per_radius * _polynomial(
+            self.coefficients, self._squared_angle(position, per_radius)
+        )
+        return camera.focal * types_of(type(x)).Array2f(scale * x, scale * y) + camera.principal
+
+    def film_directions(self, camera: Camera, position: Any, slopes: None) -> list[Any]:
+        """Derivatives of the place on the film, two Array3f, world.
+
+        With rho^2 = x^2 + y^2, n^2 = rho^2 + z^2, a = theta / rho, b = (d a / d rho) / rho, and
+        theta_d = h theta: the place is A (x, y) with A = h a, (d A / d rho) / rho = B = h b +
+        2 h' a^2 z / n^2, where h' = d h / d theta^2, and d A / d z = -(h + 2 h' theta^2) / n^2.
+        """
+        del slopes
+        x, y, z = position
+        a, b = self._angle_per_radius(position)
+        squared = self._squared_angle(position, a)
+        h, dh = _polynomial(self.coefficients, squared), _derivative(self.coefficients, squared)
+        inverse = dr.rcp(dr.squared_norm(position))
+        scale, bend = h * a, h * b + 2 * dh * (a * a) * (z * inverse)
+        tilt = (h + 2 * dh * squared) * inverse
+        right, down, forward = camera.rotation
+        change = bend * (x * right + y * down) - tilt * forward
+        return [
+            focal * (scale * axis + c * change)
+            for axis, c, focal in zip((right, down), (x, y), camera.focal, strict=True)
+        ]
+
+    def depth_direction(self, camera: Camera, position: Any) -> Any:
+        """Derivative of the distance divided by the distance, Array3f, world."""
+        right, down, forward = camera.rotation
+        x, y, z = position / dr.squared_norm(position)
+        return x * right + y * down + z * forward
+
+    def ray_range(self, direction: Any, near: Any, far: Any) -> tuple[Any, Any]:
+        """Where a ray of unit ``direction`` reaches two depths."""
+        del direction
+        return near, far
+
+    def ray(self, camera: Camera, x: Any, y: Any) -> Any:
+        """Through a point of the film (px), Array3f, camera axes; found by Newton's method."""
+        t = types_of(type(x))
+        film = (t.Array2f(x, y) - camera.principal) / camera.focal
+        radius = dr.norm(film)
+        angle = radius
+        for _ in range(NEWTON_STEPS):
+            squared = angle * angle
+            h, dh = _polynomial(self.coefficients, squared), _derivative(self.coefficients, squared)
+            angle = angle - (h * angle - radius) / (h + 2 * dh * squared)
+        sine, cosine = dr.sincos(angle)
+        scale = dr.select(radius > 0, sine / dr.select(radius > 0, radius, 1), 1)
+        return t.Array3f(scale * film.x, scale * film.y, cosine)
+
+    @staticmethod
+    def _angle_per_radius(position: Any) -> tuple[Any, Any]:
+        """a = theta / rho, and b = (z / n^2 - a) / rho^2; near the axis by their series.
+
+        With t = rho / z: z a = 1 - t^2 / 3 + t^4 / 5 ..., z^3 b = -2/3 + 4/5 t^2 - 6/7 t^4 ...
+        """
+        x, y, z = position
+        squared = x * x + y * y
+        on_axis = (z > 0) & (squared < NEAR_AXIS * (z * z))
+        depth = dr.select(on_axis, z, 1)
+        t = dr.select(on_axis, squared, 0) / (depth * depth)
+        terms = range(AXIS_TERMS[is_float64(type(z))])
+        series_a = _polynomial([(-1) ** (k + 1) / (2 * k + 3) for k in terms], t) / depth
+        series_b = [(-1) ** (k + 1) * (2 * k + 2) / (2 * k + 3) for k in terms]
+        series_b = _horner(series_b, t) / (depth * depth * depth)
+        squared = dr.select(on_axis, 1, squared)
+        radius = dr.sqrt(squared)
+        a = dr.atan2(radius, z) / radius
+        b = (z / (squared + z * z) - a) / squared
+        return dr.select(on_axis, series_a, a), dr.select(on_axis, series_b, b)
+
+    @staticmethod
+    def _squared_angle(position: Any, per_radius: Any) -> Any:
+        return (per_radius * per_radius) * (dr.square(position.x) + dr.square(position.y))
+
+
+# ----------------------------------------------------------------------------------------------
+# Orthographic
+# ----------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Orthographic(Lens):
+    """A point (x, y, z) is seen at focal (x, y) + principal, with focal in px per scene unit.
+
+    All rays are parallel: colours are seen along the camera's axis.
+    """
+
+    def look(self, camera: Camera, position: Any) -> tuple[Any, Any, Any]:
+        """Whether a mean is seen, its position, and its depth."""
+        return _replaced(position, position.z >= camera.near)
+
+    def true_slopes(self, camera: Camera, position: Any) -> None:
+        """None: the projection is linear."""
+        del camera, position
+
+    clamped_slopes = true_slopes
+
+    def film_point(self, camera: Camera, position: Any) -> Any:
+        """Where a point is on the film, Array2f, px."""
+        x, y, _ = position
+        return camera.focal * types_of(type(x)).Array2f(x, y) + camera.principal
+
+    def film_directions(self, camera: Camera, position: Any, slopes: None) -> list[Any]:
+        """Derivatives of the place on the film, two Array3f, world."""
+        del position, slopes
+        right, down, _ = camera.rotation
+        return [right * camera.focal.x, down * camera.focal.y]
+
+    def depth_direction(self, camera: Camera, position: Any) -> Any:
+        """Derivative of the depth divided by the depth, Array3f, world."""
+        return camera.rotation[2] / position.z
+
+    def view_direction(self, camera: Camera, offset: Any) -> Any:
+        """In which a mean is seen: that of the axis."""
+        del offset
+        return camera.rotation[2]
+
+    def ray(self, camera: Camera, x: Any, y: Any) -> Any:
+        """The direction of the ray through a point of the film, Array3f, camera axes."""
+        del camera, y
+        return types_of(type(x)).Array3f(0, 0, 1)
+
+
+# ----------------------------------------------------------------------------------------------
+# Aperture
+# ----------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Aperture:
+    """Of a thin lens: what is at ``focus_distance`` is sharp."""
+
+    radius: Any  # Float, scene units
+    focus_distance: Any  # Float, scene units, along the axis
+
+    def variance(self, camera: Camera, depth: Any) -> Any:
+        """Along either axis, px^2, of the disc over which a point at ``depth`` is spread.
+
+        Its radius is focal radius |1 / focus_distance - 1 / depth| (similar triangles), and a
+        uniform disc of radius R has the variance R^2 / 4. Pixels are square.
+        """
+        radius = camera.focal.x * self.radius * (1 / self.focus_distance - 1 / depth)
+        return dr.square(radius) / 4

@@ -1,0 +1,314 @@
+"""The ``calibrated`` sensor: a camera as calibration tools describe it. Layer 5.
+
+Executed once per Mitsuba variant (see ``drgs.plugins``). The lenses are in ``drgs.lenses``; this
+file is where they meet Mitsuba's rays, films and parameters.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from drgs.camera import (
+    Camera,
+    Pinhole,
+    SensorState,
+    on_crop_window,
+    opaque_host,
+    pose_from_to_world,
+    read_sensor,
+)
+from drgs.checks import did_you_mean
+
+LENSES = ("pinhole", "opencv", "fisheye")
+SHUTTERS = ("global", "rolling")
+
+
+class CalibratedSensor(mi.Sensor):
+    r"""
+    .. _sensor-calibrated:
+
+    Calibrated camera (:monosp:`calibrated`)
+    ----------------------------------------
+
+    .. pluginparameters::
+
+     * - to_world
+       - |transform|
+       - Pose, in the axes of Mitsuba's ``perspective`` (x to the left, y up, z forward).
+         (Default: the identity)
+       - |exposed|, |differentiable|
+
+     * - fx, fy
+       - |float|
+       - Focal lengths in pixels of the whole film. (Default: the film's width)
+       - |exposed|, |differentiable|
+
+     * - cx, cy
+       - |float|
+       - Principal point in pixels from the upper left corner of the whole film; the middle of the
+         first pixel is at (0.5, 0.5). (Default: the film's centre)
+       - |exposed|, |differentiable|
+
+     * - lens
+       - |string|
+       - ``pinhole``; ``opencv``, radial and tangential distortion; ``fisheye``, by the angle from
+         the axis (Kannala and Brandt 2006). (Default: ``pinhole``)
+
+     * - k1, k2, k3, k4, k5, k6, p1, p2
+       - |float|
+       - Coefficients of the lens as OpenCV defines them; ``fisheye`` has ``k1`` to ``k4``. Those
+         that are not zero are exposed. (Default: 0)
+       - |exposed|, |differentiable|
+
+     * - near_clip, far_clip
+       - |float|
+       - Depths (with ``fisheye``: distances) between which something is seen.
+         (Default: 0.01, 10000)
+
+     * - to_world_close
+       - |transform|
+       - Pose when the shutter closes, for a camera that moves by less than half a turn.
+         (Default: none, it does not move)
+       - |exposed|
+
+     * - shutter
+       - |string|
+       - Of a camera that moves. ``global``: the whole film is open all the time, what moves is
+         blurred; ``rolling``: its rows are read one after the other, from the first to the last.
+         (Default: ``global``)
+
+     * - shutter_samples
+       - |int|
+       - Times at which the ``splats`` integrator renders what a ``global`` shutter blurs.
+         (Default: 8)
+
+    This sensor has the parameters that photographs are calibrated with. It works with every
+    integrator: rays are found by inverting the distortion. Where a film shows more than the lens
+    model is made for, rays carry no weight.
+
+    .. note:: Not differentiated: ``to_world_close``, and where the lens model ends.
+
+    .. tabs::
+
+        .. code-tab:: xml
+
+            <sensor type="calibrated">
+                <float name="fx" value="343.9"/>
+                <string name="lens" value="opencv"/>
+                <float name="k1" value="0.0578"/>
+            </sensor>
+
+        .. code-tab:: python
+
+            'type': 'calibrated',
+            'fx': 343.9,
+            'lens': 'opencv',
+            'k1': 0.0578
+    """
+
+    def __init__(self, props: mi.Properties) -> None:
+        super().__init__(props)
+        width, height = self.film().size()
+        self.fx, self.fy = (_number(props, name, width) for name in ("fx", "fy"))
+        self.cx = _number(props, "cx", width / 2)
+        self.cy = _number(props, "cy", height / 2)
+        self.lens = _lens(props)
+        self.coefficients = {k: mi.Float(v) for k, v in self.lens.named().items()}
+        self.near, self.far = float(props.get("near_clip", 0.01)), float(props.get("far_clip", 1e4))
+        close = props.get("to_world_close", None)
+        self.to_world_close = None
+        if close is not None:
+            self.to_world_close = mi.AffineTransform4f(np.array(close.matrix, np.float32))
+        self.shutter = _one_of(props, "shutter", SHUTTERS)
+        self.shutter_samples = int(props.get("shutter_samples", 8))
+        if self.shutter_samples < 1:
+            raise ValueError(
+                f"calibrated: shutter_samples must be >= 1, got {self.shutter_samples}"
+            )
+
+    # ------------------------------------------------------------------------------------------
+    # Parameters
+    # ------------------------------------------------------------------------------------------
+
+    def traverse(self, callback: mi.TraversalCallback) -> None:
+        """Expose the pose and the calibration."""
+        super().traverse(callback)
+        callback.put("to_world", self.m_to_world, mi.ParamFlags.Differentiable)
+        for name in ("fx", "fy", "cx", "cy"):
+            callback.put(name, getattr(self, name), mi.ParamFlags.Differentiable)
+        for name, value in self.coefficients.items():
+            callback.put(name, value, mi.ParamFlags.Differentiable)
+        if self.to_world_close is not None:
+            callback.put("to_world_close", self.to_world_close, mi.ParamFlags.NonDifferentiable)
+
+    def parameters_changed(self, keys: list[str]) -> None:
+        """Where the lens model ends depends on its coefficients, which are read back."""
+        if not keys or set(keys) & set(self.coefficients):
+            values = {name: float(value[0]) for name, value in self.coefficients.items()}
+            self.lens = type(self.lens).of(**values) if values else self.lens
+
+    def near_clip(self) -> float:
+        """Nearer means and surfaces are not seen."""
+        return self.near
+
+    def far_clip(self) -> float:
+        """Nor are surfaces farther than this."""
+        return self.far
+
+    def to_string(self) -> str:
+        """One line a setting."""
+        lens = ", ".join([type(self.lens).__name__, *map(str, self.coefficients)])
+        return (
+            f"CalibratedSensor[\n  fx = {self.fx}, fy = {self.fy},\n  cx = {self.cx}, "
+            f"cy = {self.cy},\n  lens = {lens},\n  to_world = {self.m_to_world},\n"
+            f"  film = {self.film()}\n]"
+        )
+
+    # ------------------------------------------------------------------------------------------
+    # For the splats integrator: see ``drgs.camera``
+    # ------------------------------------------------------------------------------------------
+
+    @property
+    def camera_parameters(self) -> list[str]:
+        """What the camera depends on."""
+        moves = ["to_world_close"] if self.to_world_close is not None else []
+        return ["to_world", *moves, "fx", "fy", "cx", "cy", *self.coefficients]
+
+    def camera_from_state(self, state: SensorState) -> Camera:
+        """The camera with these parameters."""
+        camera = self._pinhole(state)
+        return camera.with_lens(self.lens.with_named(state.device))
+
+    def _pinhole(self, state: SensorState) -> Camera:
+        device = state.device
+        focal, principal = (device["fx"], device["fy"]), (device["cx"], device["cy"])
+        camera = on_crop_window(state, opaque_host(state), device["to_world"], focal, principal)
+        if self.to_world_close is None:
+            return camera
+        from drgs.shutter import Motion, MotionBlur, RollingShutter
+
+        motion = Motion.between(camera, *pose_from_to_world(device["to_world_close"]))
+        if self.shutter == "rolling":
+            return replace(camera, shutter=RollingShutter(*motion))
+        return replace(camera, shutter=MotionBlur(*motion, self.shutter_samples))
+
+    # ------------------------------------------------------------------------------------------
+    # For integrators that trace rays
+    # ------------------------------------------------------------------------------------------
+
+    def sample_ray(
+        self,
+        time: Any,
+        wavelength_sample: Any,
+        position_sample: Any,
+        aperture_sample: Any,
+        active: Any = True,
+    ) -> tuple[mi.Ray3f, mi.Spectrum]:
+        """A ray through a point of the crop window."""
+        del aperture_sample
+        size = mi.Vector2f(self.film().crop_size())
+        place = position_sample * size
+        state = read_sensor(self, 0.0)
+        camera = self._pinhole(state)
+        lens = self.lens.with_named(state.device).upload(mi.Float)
+        direction = mi.Vector3f(lens.ray(camera, place.x, place.y))
+        # Where nothing that the lens sees comes to this place, Newton's method ends elsewhere.
+        seen, _, _ = lens.look(replace(camera, near=mi.Float(0)), direction)
+        missed = mi.Vector2f(lens.film_point(camera, direction)) - mi.Vector2f(place)
+        seen &= dr.squared_norm(missed) < MISSED**2
+
+        if camera.shutter is not None:
+            rows = camera.film_end.y - camera.film_start.y
+            row = (place.y - camera.film_start.y) / rows
+            camera = camera.shutter.pose(camera, row if self.shutter == "rolling" else time)
+        per_length = 1 / dr.norm(direction)
+        near, far = lens.ray_range(direction * per_length, self.near, self.far)
+        direction = camera.rotation.T @ (direction * per_length)
+        wavelengths, weight = self.sample_wavelengths(
+            dr.zeros(mi.SurfaceInteraction3f), wavelength_sample, active
+        )
+        ray = mi.Ray3f(
+            o=mi.Point3f(camera.center) + direction * near,
+            d=mi.Vector3f(direction),
+            maxt=far - near,
+            time=self.shutter_open() + time * self.shutter_open_time(),
+            wavelengths=wavelengths,
+        )
+        return ray, weight & seen
+
+    def sample_ray_differential(
+        self,
+        time: Any,
+        wavelength_sample: Any,
+        position_sample: Any,
+        aperture_sample: Any,
+        active: Any = True,
+    ) -> tuple[mi.RayDifferential3f, mi.Spectrum]:
+        """The same, with the rays of the neighbouring pixels."""
+        samples = (wavelength_sample, position_sample, aperture_sample, active)
+        ray, weight = self.sample_ray(time, *samples)
+        width, height = self.film().crop_size()
+        beside = []
+        for step in (mi.Vector2f(1 / width, 0), mi.Vector2f(0, 1 / height)):
+            other = (wavelength_sample, position_sample + step, aperture_sample, active)
+            beside.append(self.sample_ray(time, *other)[0])
+        result = mi.RayDifferential3f(ray)
+        result.o_x, result.o_y = (other.o for other in beside)
+        result.d_x, result.d_y = (other.d for other in beside)
+        result.has_differentials = True
+        return result, weight
+
+    def bbox(self) -> mi.ScalarBoundingBox3f:
+        """Of the centre: nothing of the camera is in the scene."""
+        return mi.ScalarBoundingBox3f()
+
+
+MISSED = 0.01
+"""px: how far from its place a ray's point may be seen."""
+
+
+def _number(props: mi.Properties, name: str, default: float) -> mi.Float:
+    value = props.get(name, default)
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise TypeError(f"calibrated: {name} must be a number, got {value!r}")
+    return mi.Float(value)
+
+
+def _one_of(props: mi.Properties, name: str, known: tuple[str, ...]) -> str:
+    value = props.get(name, known[0])
+    if value not in known:
+        raise ValueError(
+            f"calibrated: {name} must be one of {', '.join(known)}, got {value!r}"
+            + did_you_mean(str(value), known)
+        )
+    return value
+
+
+def _lens(props: mi.Properties) -> Any:
+    kind = _one_of(props, "lens", LENSES)
+    if kind == "pinhole":
+        model, names = Pinhole, ()
+    else:
+        from drgs import lenses
+
+        model = lenses.RadialTangential if kind == "opencv" else lenses.Fisheye
+        names = model.names
+    given = {name: float(props[name]) for name in ALL_COEFFICIENTS if name in props}
+    for name in given:
+        if name not in names:
+            raise ValueError(
+                f"calibrated: lens '{kind}' has "
+                f"{'the coefficients ' + ', '.join(names) if names else 'no coefficients'}, "
+                f"got {name}"
+            )
+    return model.of(**given) if names else model()
+
+
+ALL_COEFFICIENTS = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
+
+mi.register_sensor("calibrated", lambda props: CalibratedSensor(props))
