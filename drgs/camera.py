@@ -11,7 +11,7 @@ How points come to the film is up to the camera's *lens*, an object with the met
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, is_dataclass, replace
 from typing import Any
 
 import drjit as dr
@@ -177,9 +177,43 @@ class Camera:
         )
         return camera.with_lens(lens)
 
+    def numbers(self) -> list[Any]:
+        """Pose, focal lengths, principal point and lens as Float of one entry, in a fixed order."""
+        return [n for name in _DIFFERENTIABLE for n in _numbers_of(getattr(self, name))]
+
+    def by_lane(self, width: int) -> Camera:
+        """The same camera with these numbers stored for each of ``width`` lanes.
+
+        Derivatives of each lane's are then known apart, and can be summed in a fixed order.
+        """
+        lanes = dr.zeros(types_of(type(self.near)).UInt32, width)
+        return replace(
+            self, **{name: _gathered(getattr(self, name), lanes) for name in _DIFFERENTIABLE}
+        )
+
     def with_lens(self, lens: Lens) -> Camera:
         """The same camera with another lens."""
         return replace(self, lens=lens.upload(type(self.near)).fitted(self))
+
+
+_DIFFERENTIABLE = ("rotation", "center", "focal", "principal", "lens", "aperture", "shutter")
+
+
+def _numbers_of(value: Any) -> list[Any]:
+    if is_dataclass(value):
+        return [n for f in fields(value) for n in _numbers_of(getattr(value, f.name))]
+    if isinstance(value, tuple) or (dr.is_array_v(value) and dr.depth_v(value) > 1):
+        return [n for item in value for n in _numbers_of(item)]
+    return [value] if dr.is_array_v(value) else []
+
+
+def _gathered(value: Any, lanes: Any) -> Any:
+    if is_dataclass(value):
+        changes = {f.name: _gathered(getattr(value, f.name), lanes) for f in fields(value)}
+        return replace(value, **changes)
+    if isinstance(value, tuple):
+        return tuple(_gathered(item, lanes) for item in value)
+    return dr.gather(type(value), value, lanes) if dr.is_array_v(value) else value
 
 
 @dataclass(frozen=True)
@@ -192,6 +226,15 @@ class SensorState:
     device: dict[str, Any]  # numbers on the device, by the names that Mitsuba gives them
     host: tuple[float, ...]  # film width and height, crop offset x and y, crop size, near
     make: Callable[[SensorState], Camera]
+
+    @property
+    def is_attached(self) -> bool:
+        """Whether derivatives with respect to one of the sensor's parameters are asked for."""
+        return any(dr.grad_enabled(value) for value in self.device.values())
+
+    def detached(self) -> SensorState:
+        """The same without derivatives."""
+        return replace(self, device=dr.detach(self.device))
 
     def same_as(self, other: SensorState) -> bool:
         """Whether both give the same camera."""
@@ -227,23 +270,25 @@ def read_sensor(sensor: Any, near: float) -> SensorState:
     device = {k: v.matrix if k.startswith("to_world") else v for k, v in device.items()}
     film = sensor.film()
     host = (*film.size(), *film.crop_offset(), *film.crop_size(), max(near, sensor.near_clip()))
-    return SensorState(device=dr.detach(device), host=host, make=make)
+    return SensorState(device=device, host=host, make=make)
 
 
 def camera_from_sensor(state: SensorState) -> Camera:
-    """The camera of a Mitsuba sensor's crop window.
+    """The camera of a Mitsuba sensor's crop window, detached.
 
-    Not differentiated: the sensor's parameters.
+    ``state.make(state)`` is the one that Dr.Jit differentiates in the sensor's parameters.
     """
-    camera = state.make(state)
+    camera = state.make(state.detached())
     dr.make_opaque(camera)
     return camera
 
 
-def cameras_in_time(camera: Camera) -> list[Camera]:
-    """The cameras whose pictures are averaged: one, unless the shutter blurs."""
+def cameras_in_time(camera: Camera) -> tuple[list[float], list[Camera]]:
+    """Times from 0 to 1, and the cameras then, whose pictures are averaged: one unless it blurs."""
     times = getattr(camera.shutter, "times", None)
-    return [camera] if times is None else [camera.shutter.pose(camera, t) for t in times()]
+    if times is None:
+        return [0.5], [camera]
+    return times(), [camera.shutter.pose(camera, t) for t in times()]
 
 
 def _perspective(state: SensorState) -> Camera:

@@ -17,30 +17,45 @@ from drgs.arrays import from_host, interleave
 from drgs.image_model import PixelCenters
 
 Channels = list[Any]
-"""What a film gets of one pass, each Float (H * W,): red, green, blue, perhaps alpha."""
+"""What a film gets of one pass, each Float (H * W,): red, green, blue, perhaps alpha, then what the
+integrator puts out besides (AOVs)."""
+
+
+def num_colors(film: mi.Film) -> int:
+    """Channels of colour that a film gets: with or without alpha."""
+    return 4 if mi.has_flag(film.flags(), mi.FilmFlags.Alpha) else 3
+
+
+def with_weight(film: mi.Film, channels: Channels, weight: Any) -> Channels:
+    """The channels of a block of this film: the weight is behind the colours."""
+    count = num_colors(film)
+    return [*channels[:count], weight, *channels[count:]]
 
 
 class CenterExposure:
     """Each pixel is evaluated once, at its centre. Exact for films whose filter is a box."""
 
     positions = (PixelCenters(),)
+    within = ((0.5, 0.5),)
     key = None
 
-    def __init__(self, film: mi.Film, maps: dict[str, np.ndarray]) -> None:
-        """maps: remembers the linear maps of films, by their description."""
-        self.film, self.maps = film, maps
+    def __init__(
+        self, film: mi.Film, maps: dict[str, np.ndarray], aovs: Sequence[str] = ()
+    ) -> None:
+        """maps: remembers the linear maps of films, by their description; aovs: channels' names."""
+        self.film, self.maps, self.aovs = film, maps, list(aovs)
 
     def develop(self, passes: Sequence[Channels]) -> mi.TensorXf:
         """The image of one pass."""
         (channels,) = passes
-        return develop_pixels(self.film, channels)
+        return develop_pixels(self.film, channels, self.aovs)
 
     def adjoint(self, grad_in: mi.TensorXf) -> list[Channels]:
         """Derivatives of the loss with respect to the channels, given those of the image."""
-        return [pixels_adjoint(self.film, self.maps, grad_in)]
+        return [pixels_adjoint(self.film, self.maps, grad_in, self.aovs)]
 
 
-def develop_pixels(film: mi.Film, channels: Channels) -> mi.TensorXf:
+def develop_pixels(film: mi.Film, channels: Channels, aovs: Sequence[str]) -> mi.TensorXf:
     """Put the channels into ``film`` as one block of the whole image, and develop it.
 
     A film reconstructs an image from blocks without filtering them again, so the picture is
@@ -48,21 +63,24 @@ def develop_pixels(film: mi.Film, channels: Channels) -> mi.TensorXf:
     """
     weight = dr.ones(mi.Float, dr.width(channels[0]))
     size = film.crop_size()
-    raw = mi.TensorXf(interleave([*channels, weight]), (size[1], size[0], len(channels) + 1))
-    film.prepare([])
+    columns = with_weight(film, channels, weight)
+    raw = mi.TensorXf(interleave(columns), (size[1], size[0], len(columns)))
+    film.prepare(list(aovs))
     film.put_block(mi.ImageBlock(raw, mi.ScalarPoint2i(film.crop_offset())))
     return film.develop()
 
 
-def pixels_adjoint(film: mi.Film, maps: dict[str, np.ndarray], grad_in: mi.TensorXf) -> Channels:
+def pixels_adjoint(
+    film: mi.Film, maps: dict[str, np.ndarray], grad_in: mi.TensorXf, aovs: Sequence[str]
+) -> Channels:
     """The adjoint of :func:`develop_pixels`.
 
     A film develops each pixel by the same linear map, found once by developing unit images.
     (The derivative of ``develop`` itself would be scattered by atomic additions.)
     """
-    key = str(film)
+    key = f"{film} {', '.join(aovs)}"
     if key not in maps:
-        maps[key] = _film_map(film)
+        maps[key] = _film_map(film, aovs)
     matrix = maps[key]
     pixel = dr.arange(mi.UInt32, grad_in.shape[0] * grad_in.shape[1])
     developed = [
@@ -77,14 +95,14 @@ def pixels_adjoint(film: mi.Film, maps: dict[str, np.ndarray], grad_in: mi.Tenso
     ]
 
 
-def _film_map(film: mi.Film) -> np.ndarray:
+def _film_map(film: mi.Film, aovs: Sequence[str]) -> np.ndarray:
     """(developed channels, channels): the linear map that a film applies to each pixel."""
-    count = 4 if mi.has_flag(film.flags(), mi.FilmFlags.Alpha) else 3
+    count = num_colors(film) + len(aovs)
     num_pixels = film.crop_size()[0] * film.crop_size()[1]
 
     def develop(channels: np.ndarray) -> np.ndarray:
         planes = [from_host(mi.Float, plane) for plane in channels.T]
-        return np.array(develop_pixels(film, planes)).reshape(num_pixels, -1)
+        return np.array(develop_pixels(film, planes, aovs)).reshape(num_pixels, -1)
 
     unit = np.eye(count, dtype=np.float32)
     units = [develop(np.tile(channel, (num_pixels, 1)))[0] for channel in unit]

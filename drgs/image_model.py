@@ -303,6 +303,9 @@ class SplatFeatures:
         del camera
         return self
 
+    def check_differentiable_in_camera(self) -> None:
+        """They do not depend on the camera."""
+
     def bind(self, lanes: Any, positions: Any) -> SplatFeatures:
         """For the lanes of one kernel: nothing depends on where the pixels are."""
         del lanes, positions
@@ -345,6 +348,10 @@ class ImageModel:
         return replace(
             self, response=self.response.seen_by(camera), features=self.features.seen_by(camera)
         )
+
+    def check_differentiable_in_camera(self) -> None:
+        """Raise NotImplementedError if pixels depend on the camera but through the splats."""
+        self.features.check_differentiable_in_camera()
 
     def bind(self, lanes: Any, grid: Any) -> ImageModel:
         """This model for the lanes of one kernel: loads what a lane needs before its loop."""

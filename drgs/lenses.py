@@ -26,7 +26,7 @@ from drgs.camera import Camera, Lens, Perspective
 NEWTON_STEPS = 10
 """When rays of pixels are looked for: lenses that bend straight lines visibly need 4 or 5."""
 
-BORDER = 17
+BORDER = 65
 """Points on each side of the film, whose rays tell what the film sees."""
 
 MISSED = 1e-6
@@ -74,7 +74,7 @@ def _derivative(coefficients: Sequence[Any], x: Any) -> Any:
 def _first_root(polynomial: np.ndarray) -> float:
     """The smallest positive root, coefficients from the constant term up; inf: there is none."""
     roots = np.polynomial.polynomial.polyroots(np.trim_zeros(polynomial, "b"))
-    real = roots.real[(np.abs(roots.imag) < 1e-9 * (1 + np.abs(roots))) & (roots.real > 0)]
+    real = roots.real[(np.abs(roots.imag) < 1e-7 * (1 + np.abs(roots))) & (roots.real > 0)]
     return float(real.min(initial=math.inf))
 
 
@@ -274,9 +274,10 @@ def _replaced(position: Any, seen: Any) -> tuple[Any, Any, Any]:
 
 
 def _slopes_on_border(lens: RadialTangential, camera: Camera) -> tuple[Any, Any]:
-    """The box around the slopes of points on the film's border that a lens sees.
+    """The box around the slopes of points on the film's border.
 
-    Not differentiated. Where it sees none of them, nothing bounds the slopes.
+    Not differentiated. Where the lens does not see all of them, the box says nothing about what it
+    sees: then only the end of the lens model bounds the slopes.
     """
     t = types_of(type(camera.near))
     with dr.suspend_grad():
@@ -289,12 +290,11 @@ def _slopes_on_border(lens: RadialTangential, camera: Camera) -> tuple[Any, Any]
         slopes = lens.undistort(film.x, film.y)
         missed = dr.squared_norm(t.Array2f(*lens.distort(*slopes)) - film)
         found = lens.sees_slopes(*slopes) & (missed < MISSED)
-        lowest = [dr.min(dr.select(found, s, UNBOUNDED)) for s in slopes]
-        highest = [dr.max(dr.select(found, s, -UNBOUNDED)) for s in slopes]
-        none = ~dr.any(found)
+        lowest, highest = [dr.min(s) for s in slopes], [dr.max(s) for s in slopes]
+        bounded = dr.all(found)
         return (
-            t.Array2f([dr.select(none, -UNBOUNDED, s) for s in lowest]),
-            t.Array2f([dr.select(none, UNBOUNDED, s) for s in highest]),
+            t.Array2f([dr.select(bounded, s, -UNBOUNDED) for s in lowest]),
+            t.Array2f([dr.select(bounded, s, UNBOUNDED) for s in highest]),
         )
 
 

@@ -51,6 +51,12 @@ class RayColors(SplatFeatures):
         """For one camera, whose pixels' rays are the directions."""
         return replace(self, camera=camera)
 
+    def check_differentiable_in_camera(self) -> None:
+        """They are not: the direction is the camera's."""
+        raise NotImplementedError(
+            "splats: sh_direction 'pixel' is not differentiable in the camera; use 'mean'"
+        )
+
     def bind(self, lanes: Any, positions: Any) -> RayColors:
         """The basis functions at the 16 pixels of each lane."""
         points = positions.points(lanes, type(self.camera.near))

@@ -137,6 +137,7 @@ class GaussianGradients:
     means2d: Any  # Array2f (N,): loss per px
     visible: Any  # Bool (N,): the Gaussian's extent touches the film
     first_fault: Any  # UInt32 (1,): of ``parameters``, see :func:`decode_fault`
+    camera: list[Any] | None = None  # Float (1,): of ``camera.numbers()``, where asked for
 
 
 def render(gaussians: Gaussians, camera: Camera, pipeline: Pipeline) -> Frame:
@@ -181,11 +182,15 @@ def render_adjoint(
 
 
 def frames_adjoint(
-    gaussians: Gaussians, frames: list[Frame], d_planes: list[list[Any]]
+    gaussians: Gaussians,
+    frames: list[Frame],
+    d_planes: list[list[Any]],
+    of_camera: bool = False,
 ) -> GaussianGradients:
     """The same for a loss that depends on several frames of the same splats: of one camera.
 
-    d_planes: of each frame, derivatives with respect to its planes.
+    d_planes: of each frame, derivatives with respect to its planes; of_camera: whether those with
+    respect to the camera are asked for.
     """
     total = None
     for frame, (d_transmittance, *d_features) in zip(frames, d_planes, strict=True):
@@ -195,7 +200,7 @@ def frames_adjoint(
         total = gradients if total is None else _sum(total, gradients)
         if len(frames) > 1:
             dr.eval(total)
-    return _gaussian_gradients(gaussians, frames[0], total)
+    return _gaussian_gradients(gaussians, frames[0], total, of_camera)
 
 
 def _sum(a: SplatGradients, b: SplatGradients) -> SplatGradients:
@@ -206,26 +211,40 @@ def _sum(a: SplatGradients, b: SplatGradients) -> SplatGradients:
 
 
 def _gaussian_gradients(
-    gaussians: Gaussians, frame: Frame, gradients: SplatGradients
+    gaussians: Gaussians, frame: Frame, gradients: SplatGradients, of_camera: bool = False
 ) -> GaussianGradients:
     """From the derivatives of the 2D splats to those of the parameters, by Dr.Jit."""
     rows = load_rows(gaussians, frame.pipeline.sh_degree)
+    camera, numbers = frame.camera, []
+    if of_camera:
+        frame.pipeline.model.check_differentiable_in_camera()
+        camera = camera.by_lane(dr.width(rows.logit_opacities))
+        numbers = camera.numbers()
     with dr.resume_grad():
-        dr.enable_grad(rows)
-        splats = frame.pipeline.project(rows, frame.camera)
+        dr.enable_grad(rows, numbers)
+        splats = frame.pipeline.project(rows, camera)
         outputs, cotangents = _differentiable(frame.pipeline, splats, gradients)
         for output, cotangent in zip(outputs, cotangents, strict=True):
             dr.accum_grad(output, cotangent)
         dr.enqueue(dr.ADMode.Backward, outputs)
         dr.traverse(dr.ADMode.Backward)
         d_rows, visible = dr.grad(rows), dr.detach(splats.visible)
+        d_numbers = [dr.grad(number) for number in numbers]
     parameters, first_fault = _as_tensors(d_rows, gaussians, visible)
     return GaussianGradients(
         parameters=parameters,
         means2d=gradients.means2d,
         visible=_on_film(frame.bins),
         first_fault=first_fault,
+        camera=_sums(d_numbers, visible) if of_camera else None,
     )
+
+
+def _sums(columns: list[Any], visible: Any) -> list[Any]:
+    """Over the Gaussians that are visible, in an order that is the same in every run."""
+    columns = [dr.select(visible, column, 0) for column in columns]
+    dr.eval(columns)
+    return [dr.sum(column) for column in columns]
 
 
 def added(a: GaussianGradients, b: GaussianGradients) -> GaussianGradients:
@@ -238,6 +257,7 @@ def added(a: GaussianGradients, b: GaussianGradients) -> GaussianGradients:
         means2d=a.means2d + b.means2d,
         visible=a.visible | b.visible,
         first_fault=dr.select(a.first_fault < b.first_fault, a.first_fault, b.first_fault),
+        # Their cameras are not the same: each has derivatives of its own.
     )
     dr.eval(total)
     return total
@@ -269,22 +289,40 @@ def render_tangent(gaussians: Gaussians, frame: Frame, tangents: Gaussians) -> l
 
 
 def frames_tangent(
-    gaussians: Gaussians, frames: list[Frame], tangents: Gaussians
+    gaussians: Gaussians,
+    frames: list[Frame],
+    tangents: Gaussians,
+    camera_tangents: list[Any] | None = None,
 ) -> list[list[Any]]:
-    """The same for the planes of several frames of the same splats."""
-    direction = _splat_tangents(gaussians, frames[0], tangents)
+    """The same for the planes of several frames of the same splats.
+
+    camera_tangents: of ``camera.numbers()``; None: the camera stays.
+    """
+    direction = _splat_tangents(gaussians, frames[0], tangents, camera_tangents)
     return [
         f.pipeline.order.tangent(f.bins, f.records, f.layers, direction).planes() for f in frames
     ]
 
 
-def _splat_tangents(gaussians: Gaussians, frame: Frame, tangents: Gaussians) -> SplatGradients:
+def _splat_tangents(
+    gaussians: Gaussians,
+    frame: Frame,
+    tangents: Gaussians,
+    camera_tangents: list[Any] | None = None,
+) -> SplatGradients:
     """From a direction of the parameters to that of the 2D splats, by Dr.Jit."""
     rows = load_rows(gaussians, frame.pipeline.sh_degree)
+    camera, numbers = frame.camera, []
+    if camera_tangents is not None:
+        frame.pipeline.model.check_differentiable_in_camera()
+        camera = camera.by_lane(dr.width(rows.logit_opacities))
+        numbers = camera.numbers()
     with dr.resume_grad():
-        dr.enable_grad(rows)
-        splats = frame.pipeline.project(rows, frame.camera)
+        dr.enable_grad(rows, numbers)
+        splats = frame.pipeline.project(rows, camera)
         dr.set_grad(rows, load_rows(tangents, frame.pipeline.sh_degree))
+        for number, tangent in zip(numbers, camera_tangents or [], strict=True):
+            dr.set_grad(number, tangent)
         outputs, _ = _differentiable(frame.pipeline, splats, None)
         # Some outputs (depths, p of the whitening) are inputs of others: the default would clear
         # the derivatives of such interior variables on the way.

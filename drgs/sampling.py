@@ -15,16 +15,23 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from drgs.exposure import Channels, develop_pixels, pixels_adjoint
+from drgs.exposure import Channels, develop_pixels, num_colors, pixels_adjoint, with_weight
 from drgs.samples import SamplePoints
 
 
 class SampledExposure:
     """``spp`` samples per pixel, drawn by a copy of the sensor's sampler."""
 
-    def __init__(self, sensor: mi.Sensor, seed: Any, spp: int, maps: dict[str, np.ndarray]) -> None:
-        """maps: remembers the linear maps of films, by their description."""
-        self.film, self.maps = sensor.film(), maps
+    def __init__(
+        self,
+        sensor: mi.Sensor,
+        seed: Any,
+        spp: int,
+        maps: dict[str, np.ndarray],
+        aovs: Sequence[str] = (),
+    ) -> None:
+        """maps: remembers the linear maps of films, by their description; aovs: channels' names."""
+        self.film, self.maps, self.aovs = sensor.film(), maps, list(aovs)
         sampler = sensor.sampler().clone()
         sampler.set_sample_count(spp)
         spp = sampler.sample_count()  # some round it up
@@ -37,7 +44,8 @@ class SampledExposure:
         self.positions = tuple(
             SamplePoints(*dr.gather(mi.Point2f, points, pixel * spp + s)) for s in range(spp)
         )
-        dr.eval([(p.x, p.y) for p in self.positions])
+        self.within = tuple((p.x, p.y) for p in self.positions)
+        dr.eval(self.within)
         self.key = (seed, spp, str(sensor.sampler()))
 
     def develop(self, passes: Sequence[Channels]) -> mi.TensorXf:
@@ -45,16 +53,17 @@ class SampledExposure:
         if self.film.rfilter().is_box_filter():
             count = len(passes)
             sums = [sum(planes[1:], planes[0]) for planes in zip(*passes, strict=True)]
-            return develop_pixels(self.film, [total / count for total in sums])
+            return develop_pixels(self.film, [total / count for total in sums], self.aovs)
         film = self.film
-        film.prepare([])
+        film.prepare(self.aovs)
         block = film.create_block()
         size, offset = film.crop_size(), film.crop_offset()
         pixel = dr.arange(mi.UInt32, size[0] * size[1])
         y = pixel // size[0]
         corner = mi.Point2f(pixel - y * size[0] + offset[0], y + offset[1])
         for point, channels in zip(self.positions, passes, strict=True):
-            block.put(corner + mi.Point2f(point.x, point.y), [*channels, mi.Float(1)])
+            values = with_weight(film, channels, mi.Float(1))
+            block.put(corner + mi.Point2f(point.x, point.y), values)
         film.put_block(block)
         return film.develop()
 
@@ -62,10 +71,10 @@ class SampledExposure:
         """Derivatives of the loss with respect to the channels, given those of the image."""
         count = len(self.positions)
         if self.film.rfilter().is_box_filter():
-            averaged = pixels_adjoint(self.film, self.maps, grad_in)
+            averaged = pixels_adjoint(self.film, self.maps, grad_in, self.aovs)
             return [[d / count for d in averaged]] * count
         # The image is linear in the channels: their values do not matter.
-        num_channels = 4 if mi.has_flag(self.film.flags(), mi.FilmFlags.Alpha) else 3
+        num_channels = num_colors(self.film) + len(self.aovs)
         size = dr.width(self.positions[0].x)
         passes = [[dr.opaque(mi.Float, 0, size) for _ in range(num_channels)] for _ in range(count)]
         with dr.resume_grad():

@@ -109,9 +109,9 @@ def rotation_vector(rotation: Any) -> Any:
         rotation[1, 0] - rotation[0, 1],
     )
     squared = dr.squared_norm(twice_sine)
-    turns = squared > (2 * SLOWEST) ** 2
-    sine = dr.sqrt(dr.select(turns, squared, 1)) / 2
     trace = rotation[0, 0] + rotation[1, 1] + rotation[2, 2]
+    turns = (squared > (2 * SLOWEST) ** 2) | (trace < 1)
+    sine = dr.sqrt(dr.select(turns, squared, 1)) / 2
     angle = dr.atan2(sine, (trace - 1) / 2)
     return twice_sine * dr.select(turns, angle / (2 * sine), 0.5)
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
 from functools import reduce
+from itertools import chain, repeat
 from typing import Any
 
 import drjit as dr
@@ -16,7 +17,12 @@ import numpy as np
 
 from drgs import rendering
 from drgs.arrays import interleave
-from drgs.camera import SensorState, camera_from_sensor, cameras_in_time, read_sensor
+from drgs.camera import (
+    SensorState,
+    camera_from_sensor,
+    cameras_in_time,
+    read_sensor,
+)
 from drgs.choices import Choices
 from drgs.constants import NEAR
 from drgs.exposure import CenterExposure
@@ -27,10 +33,22 @@ SUPPORTED_VARIANTS = ("llvm_ad_rgb", "cuda_ad_rgb")
 
 
 @dataclass(frozen=True)
+class _Aov:
+    """What may be put out besides colour."""
+
+    channel: str  # behind the name, as Mitsuba names channels
+    feature: Any  # that is composited; None: nothing besides the transmittance
+
+
+AOVS = {"depth": _Aov("T", rendering.depth_feature), "alpha": _Aov("I", None)}
+
+
+@dataclass(frozen=True)
 class _Rendered:
     """The last frames, and everything that they depend on: reused while nothing has changed."""
 
     frames: list[list[rendering.Frame]]  # by time; one for each sample per pixel
+    times: list[float]  # at which the shutter is open, from 0 to 1
     pipeline: rendering.Pipeline
     exposure: Any  # key of the points that were sampled; None: pixel centres
     sensor: SensorState
@@ -77,9 +95,15 @@ class SplatsIntegrator(mi.CppADIntegrator):
        - Highest spherical harmonics degree that is evaluated, 0 to 3. (Default: the file's)
 
      * - background
-       - |rgb|
-       - Constant colour behind the splats, in display space (sRGB-encoded). (Default: black)
+       - |rgb| or |texture|
+       - What is behind the splats: a constant colour in display space (sRGB-encoded), or a texture
+         that is stretched over the film and, as all textures are, linear. (Default: black)
        - |exposed|, |differentiable|
+
+     * - hide_emitters
+       - |bool|
+       - An environment emitter of the scene is seen behind the splats, instead of the background,
+         unless this is set. (Default: |false|)
 
      * - near
        - |float|
@@ -91,6 +115,13 @@ class SplatsIntegrator(mi.CppADIntegrator):
        - Splat colours live in display space. If true, the image is converted to linear
          radiance, which is what Mitsuba's films expect. If false, it is returned in display
          space, as splat trainers and viewers use it. (Default: |true|)
+
+     * - aovs
+       - |string|
+       - What is put out besides colour, as in Mitsuba's ``aov``: a list of ``name:type``, such as
+         ``d:depth, a:alpha``. ``depth`` (channel ``name.T``) is the sum of the splats' depths,
+         weighted by their share in the pixel and not normalised; ``alpha`` (``name.I``) is the sum
+         of these weights. (Default: none)
 
      * - projection
        - |string|
@@ -138,12 +169,12 @@ class SplatsIntegrator(mi.CppADIntegrator):
        - |exposed|, |differentiable|
 
     This integrator composites Gaussians front to back over each pixel (Kerbl et al. 2023, "3D
-    Gaussian Splatting for Real-Time Radiance Field Rendering"). It ignores the scene's shapes
-    and emitters. With one sample per pixel and a ``box`` filter it evaluates each pixel at its
-    centre, and both the picture and the gradients are the same to the last bit in every run. With
-    more samples or another filter, pixels are evaluated at the points that the sensor's sampler
-    chooses; ``low_pass`` may then be 0. With a ``box`` filter this, too, is the same in every run;
-    other filters add in an order of their own.
+    Gaussian Splatting for Real-Time Radiance Field Rendering"). Of the scene's other objects it
+    sees the environment emitter alone. With one sample per pixel and a ``box`` filter it evaluates
+    each pixel at its centre, and both the picture and the gradients are the same to the last bit in
+    every run. With more samples or another filter, pixels are evaluated at the points that the
+    sensor's sampler chooses; ``low_pass`` may then be 0. With a ``box`` filter this, too, is the
+    same in every run; other filters add in an order of their own.
 
     As with Mitsuba's other integrators, a backward pass differentiates the scene as it is then:
     a parameter that was changed after ``mi.render()`` is differentiated at its new value. After
@@ -153,7 +184,9 @@ class SplatsIntegrator(mi.CppADIntegrator):
     one rendering to the next.
 
     .. note:: Not differentiated: visibility, the order of the splats, the cut-offs of alpha and
-        transmittance, and the sensor's parameters.
+        transmittance. Derivatives with respect to a sensor's pose, focal lengths and principal
+        point are computed where they are enabled, though Mitsuba's own sensors announce theirs as
+        not differentiable.
 
     .. tabs::
 
@@ -183,10 +216,12 @@ class SplatsIntegrator(mi.CppADIntegrator):
         for name in PARAMETER_NAMES:
             setattr(self, name, getattr(gaussians, name))
         self.sh_degree = props.get("sh_degree", gaussians.sh_degree)
-        self.background = _color(props, "background", 0.0)
+        self.background = _background(props)
+        self.hide_emitters = _boolean(props, "hide_emitters", False)
         self.choices = _choices(props)
         self.near = _positive(props, "near", NEAR)
         self.srgb_primitives = _boolean(props, "srgb_primitives", True)
+        self.aovs = _aovs(props)
 
         self.last: LastBackward | None = None
         self._rendered: _Rendered | None = None
@@ -235,11 +270,13 @@ class SplatsIntegrator(mi.CppADIntegrator):
     @property
     def pipeline(self) -> rendering.Pipeline:
         """What this integrator's settings call for."""
-        return self.choices.pipeline(self.sh_degree)
+        wanted = [AOVS[kind].feature for kind in self.aovs.values()]
+        features = (rendering.color_features, *(f for f in wanted if f is not None))
+        return self.choices.pipeline(self.sh_degree, features=features)
 
     def aov_names(self) -> list[str]:
-        """No output variables besides colour and alpha."""
-        return []
+        """Of the channels besides colour and alpha."""
+        return [f"{name}.{AOVS[kind].channel}" for name, kind in self.aovs.items()]
 
     def to_string(self) -> str:
         """One line a setting."""
@@ -271,10 +308,10 @@ class SplatsIntegrator(mi.CppADIntegrator):
         sensor = _resolve_sensor(scene, sensor)
         with dr.suspend_grad():
             exposure = self._exposure(sensor, seed, spp)
-            background = self._detached_background()
             frames = self._frames(sensor, exposure)
             planes = [[frame.planes() for frame in times] for times in frames]
-            image = exposure.develop(self._channels(sensor.film(), planes, background))
+            behind = self._behind(scene, sensor, exposure, self._constant())
+            image = exposure.develop(self._channels(sensor.film(), planes, behind))
             if evaluate:
                 dr.eval(image)
         return image if develop else mi.TensorXf()
@@ -299,27 +336,30 @@ class SplatsIntegrator(mi.CppADIntegrator):
             exposure = self._exposure(sensor, seed, spp)
             frames = self._frames(sensor, exposure)
             planes = [[frame.planes() for frame in times] for times in frames]
-            background = self._detached_background()
+            constant = self._constant()
             dr.eval(planes)
             d_channels = exposure.adjoint(grad_in)
             # Colour conversion and background are a few operations per pixel, traced again and
             # differentiated by Dr.Jit.
             with dr.resume_grad():
-                dr.enable_grad(planes, background)
-                channels = self._channels(sensor.film(), planes, background)
+                dr.enable_grad(planes, constant)
+                behind = self._behind(scene, sensor, exposure, constant)
+                channels = self._channels(sensor.film(), planes, behind)
                 dr.accum_grad(channels, d_channels)
                 dr.enqueue(dr.ADMode.Backward, channels)
                 dr.traverse(dr.ADMode.Backward)
-                d_planes, d_background = dr.grad(planes), dr.grad(background)
+                d_planes = dr.grad(planes)
+                d_constant = None if constant is None else dr.grad(constant)
             sensor.film().clear()  # as after any backward pass of Mitsuba's own integrators
-            dr.eval(d_planes, d_background)
-            gradients = reduce(
-                rendering.added,
-                (
-                    rendering.frames_adjoint(self.gaussians, *of_time)
-                    for of_time in zip(frames, d_planes, strict=True)
-                ),
-            )
+            dr.eval(d_planes, d_constant)
+            with dr.resume_grad():
+                state = self._sensor_state(sensor)
+                of_camera = state.is_attached
+            by_time = [
+                rendering.frames_adjoint(self.gaussians, *of_time, of_camera)
+                for of_time in zip(frames, d_planes, strict=True)
+            ]
+            gradients = reduce(rendering.added, by_time)
             self.last = LastBackward(
                 means2d_grad=_rows(gradients.means2d),
                 visible=gradients.visible,
@@ -328,7 +368,12 @@ class SplatsIntegrator(mi.CppADIntegrator):
             with dr.resume_grad():
                 for name in PARAMETER_NAMES:
                     _accumulate(getattr(self, name), getattr(gradients.parameters, name))
-                _accumulate(self.background, d_background)
+                if constant is not None:
+                    _accumulate(self.background, d_constant)
+                if of_camera:
+                    _, cameras = cameras_in_time(state.make(state))
+                    numbers = [camera.numbers() for camera in cameras]
+                    _accumulate_through(numbers, [gradients.camera for gradients in by_time])
 
     def render_forward(
         self,
@@ -348,16 +393,21 @@ class SplatsIntegrator(mi.CppADIntegrator):
                 tangents = Gaussians(
                     **{name: _tangent(getattr(self, name)) for name in PARAMETER_NAMES}
                 )
-                d_background = dr.grad(self.background)
-            d_planes = [rendering.frames_tangent(self.gaussians, f, tangents) for f in frames]
+                constant = self._constant()
+                d_constant = None if constant is None else dr.grad(self.background)
+                d_cameras = _camera_tangents(self._sensor_state(sensor), len(frames))
+            d_planes = [
+                rendering.frames_tangent(self.gaussians, of_time, tangents, d_camera)
+                for of_time, d_camera in zip(frames, d_cameras, strict=True)
+            ]
             planes = [[frame.planes() for frame in times] for times in frames]
-            background = self._detached_background()
             dr.eval(planes, d_planes)
             with dr.resume_grad():
-                dr.enable_grad(planes, background)
+                dr.enable_grad(planes, constant)
                 dr.set_grad(planes, d_planes)
-                dr.set_grad(background, d_background)
-                channels = self._channels(sensor.film(), planes, background)
+                dr.set_grad(constant, d_constant)
+                behind = self._behind(scene, sensor, exposure, constant)
+                channels = self._channels(sensor.film(), planes, behind)
                 image = exposure.develop(channels)
                 dr.forward_to(image)
                 d_image = dr.grad(image)
@@ -375,10 +425,10 @@ class SplatsIntegrator(mi.CppADIntegrator):
         """Where the sensor's pixels are evaluated, and how its film develops them."""
         spp = spp or sensor.sampler().sample_count()
         if spp == 1 and sensor.film().rfilter().is_box_filter():
-            return CenterExposure(sensor.film(), self._film_maps)
+            return CenterExposure(sensor.film(), self._film_maps, self.aov_names())
         from drgs.sampling import SampledExposure
 
-        return SampledExposure(sensor, seed, spp, self._film_maps)
+        return SampledExposure(sensor, seed, spp, self._film_maps, self.aov_names())
 
     def _frames(self, sensor: mi.Sensor, exposure: Any) -> list[list[rendering.Frame]]:
         """Render, or reuse the last frames if nothing that they depend on has changed.
@@ -389,29 +439,66 @@ class SplatsIntegrator(mi.CppADIntegrator):
         other renders possibly in between.
         """
         pipeline, gaussians = self.pipeline, dr.detach(self.gaussians)
-        state = read_sensor(sensor, self.near)
+        state = self._sensor_state(sensor).detached()
         last = self._rendered
         if last is None or not last.matches(pipeline, exposure.key, state, gaussians):
             first, *others = exposure.positions
             model = replace(pipeline.model, positions=first)
             frames = []
-            for camera in cameras_in_time(camera_from_sensor(state)):
+            times, cameras = cameras_in_time(camera_from_sensor(state))
+            for camera in cameras:
                 frame = rendering.render(gaussians, camera, replace(pipeline, model=model))
                 frames.append([frame, *(rendering.render_again(frame, p) for p in others)])
-            self._rendered = _Rendered(frames, pipeline, exposure.key, state, gaussians)
+            self._rendered = _Rendered(frames, times, pipeline, exposure.key, state, gaussians)
         return self._rendered.frames
 
-    def _detached_background(self) -> mi.Color3f:
-        """The background without gradients; no literal, or every colour would be a new kernel."""
-        background = mi.Color3f(dr.detach(self.background))
-        dr.make_opaque(background)
-        return background
+    def _sensor_state(self, sensor: mi.Sensor) -> SensorState:
+        return read_sensor(sensor, self.near)
+
+    def _constant(self) -> mi.Color3f | None:
+        """The background without gradients, if it is a colour; display space.
+
+        No literal, or every colour would be a new kernel.
+        """
+        if isinstance(self.background, mi.Texture):
+            return None
+        constant = mi.Color3f(dr.detach(self.background))
+        dr.make_opaque(constant)
+        return constant
+
+    def _behind(
+        self, scene: mi.Scene, sensor: mi.Sensor, exposure: Any, constant: mi.Color3f | None
+    ) -> _Behind:
+        """What is seen past the splats, in the space of the channels."""
+        environment = None if self.hide_emitters else scene.environment()
+        if environment is None and constant is not None:
+            if self.srgb_primitives:
+                constant = mi.math.srgb_to_linear(constant)
+            return _Behind(repeat(repeat(constant)), opaque=False)
+        from drgs import backdrop
+
+        if environment is not None:
+            behind = backdrop.Environment(environment)
+        else:
+            behind = backdrop.Picture(self.background)
+        times = self._rendered.times
+        colors = backdrop.seen_by(sensor, behind, times, exposure.within)
+        if not self.srgb_primitives:
+            colors = [[mi.math.linear_to_srgb(color) for color in of_time] for of_time in colors]
+        return _Behind(colors, behind.opaque)
 
     def _channels(
-        self, film: mi.Film, planes: list[list[list[mi.Float]]], background: mi.Color3f
+        self, film: mi.Film, planes: list[list[list[mi.Float]]], behind: _Behind
     ) -> list[list[mi.Float]]:
         """What the film gets of each sample per pixel: the mean over the times."""
-        channels = [[self._composited(film, p, background) for p in times] for times in planes]
+        has_alpha = mi.has_flag(film.flags(), mi.FilmFlags.Alpha)
+        channels = [
+            [
+                self._composited(plane, color, behind.opaque, has_alpha)
+                for plane, color in zip(of_time, colors, strict=False)
+            ]
+            for of_time, colors in zip(planes, behind.colors, strict=False)
+        ]
         if len(channels) == 1:
             return channels[0]
         return [
@@ -420,18 +507,28 @@ class SplatsIntegrator(mi.CppADIntegrator):
         ]
 
     def _composited(
-        self, film: mi.Film, planes: list[mi.Float], background: mi.Color3f
+        self, planes: list[mi.Float], behind: mi.Color3f, opaque: bool, has_alpha: bool
     ) -> list[mi.Float]:
-        """Planes of pixels: red, green, blue, perhaps alpha."""
-        transmittance, *color = planes
-        color = mi.Color3f(color)
+        """Planes of pixels: red, green, blue, perhaps alpha, AOVs."""
+        transmittance, red, green, blue, *others = planes
+        color = mi.Color3f(red, green, blue)
         if self.srgb_primitives:
             color = mi.math.srgb_to_linear(color)
-            background = mi.math.srgb_to_linear(background)
-        channels = list(dr.fma(transmittance, background, color))
-        if mi.has_flag(film.flags(), mi.FilmFlags.Alpha):
-            channels.append(1 - transmittance)
+        channels = list(dr.fma(transmittance, behind, color))
+        if has_alpha:
+            alpha = 1 - transmittance
+            channels.append(dr.full(mi.Float, 1, dr.width(alpha)) if opaque else alpha)
+        for kind in self.aovs.values():
+            channels.append(1 - transmittance if AOVS[kind].feature is None else others.pop(0))
         return channels
+
+
+@dataclass(frozen=True)
+class _Behind:
+    """What is seen past the splats."""
+
+    colors: Any  # by time and by sample: Color3f
+    opaque: bool  # whether it covers the film
 
 
 def _load_gaussians(props: mi.Properties) -> Gaussians:
@@ -471,15 +568,33 @@ def _tensor(props: mi.Properties, name: str) -> mi.TensorXf:
     return mi.TensorXf(value)
 
 
-def _color(props: mi.Properties, name: str, default: float) -> mi.Color3f:
-    value = props.get(name, default)
+def _background(props: mi.Properties) -> mi.Color3f | mi.Texture:
+    value = props.get("background", 0.0)
+    if isinstance(value, mi.Texture):
+        return value
     try:
         return mi.Color3f(value)
     except TypeError:
         raise TypeError(
-            f"splats: {name} must be an RGB colour, such as [1, 1, 1] or <rgb value='1, 1, 1'/>, "
-            f"got {type(value).__name__}"
+            "splats: background must be an RGB colour, such as [1, 1, 1] or "
+            f"<rgb value='1, 1, 1'/>, or a texture, got {type(value).__name__}"
         ) from None
+
+
+def _aovs(props: mi.Properties) -> dict[str, str]:
+    """By name: what is put out."""
+    aovs = {}
+    for item in str(props.get("aovs", "")).split(","):
+        if not item.strip():
+            continue
+        name, _, kind = (part.strip() for part in item.partition(":"))
+        if not name or kind not in AOVS or name in aovs:
+            raise ValueError(
+                f"splats: aovs must be a list of name:type with names of their own and types of "
+                f"{', '.join(AOVS)}, got {item.strip()!r}"
+            )
+        aovs[name] = kind
+    return aovs
 
 
 def _boolean(props: mi.Properties, name: str, default: bool) -> bool:
@@ -565,6 +680,26 @@ def _tangent(parameter: Any) -> Any:
 def _accumulate(parameter: Any, gradient: Any) -> None:
     if dr.width(parameter) > 0 and dr.grad_enabled(parameter):
         dr.accum_grad(parameter, gradient)
+
+
+def _accumulate_through(values: list[list[Any]], gradients: list[list[mi.Float]]) -> None:
+    """Accumulate into what the values were computed from."""
+    pairs = zip(chain(*values), chain(*gradients), strict=True)
+    attached = [(value, gradient) for value, gradient in pairs if dr.grad_enabled(value)]
+    for value, gradient in attached:
+        dr.accum_grad(value, gradient)
+    dr.enqueue(dr.ADMode.Backward, [value for value, _ in attached])
+    dr.traverse(dr.ADMode.Backward)
+
+
+def _camera_tangents(state: SensorState, num_times: int) -> list[list[mi.Float] | None]:
+    """Of each time's camera, derivatives of its numbers along those set on the sensor."""
+    if not state.is_attached:
+        return [None] * num_times
+    _, cameras = cameras_in_time(state.make(state))
+    numbers = [camera.numbers() for camera in cameras]
+    dr.forward_to(numbers, flags=dr.ADFlag.ClearEdges)
+    return dr.grad(numbers)
 
 
 mi.register_integrator("splats", lambda props: SplatsIntegrator(props))

@@ -41,6 +41,7 @@ LAYERS = {
     ],
     3: ["choices", "rendering"],
     4: [
+        "backdrop",
         "checkpoint",
         "densify",
         "exposure",

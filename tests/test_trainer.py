@@ -141,16 +141,6 @@ def test_gaussians_are_returned_as_plain_numpy_arrays():
         assert len(getattr(gaussians, name)) == 40
 
 
-def test_sensors_refuse_pixels_that_are_not_square():
-    from drgs.checks import UserError
-    from drgs.scene import make_sensors
-
-    view = small_view("stretched", 0.0)
-    stretched = View(**{**vars(view), "fy": 30.0})
-    with pytest.raises(UserError, match="stretched: fl_x and fl_y must agree"):
-        make_sensors([stretched])
-
-
 def test_first_frame_comes_within_15_seconds_cold_and_3_seconds_warm(run_python, tmp_path):
     """Without and with a kernel cache (it lives in the home folder), import included."""
     points = np.random.default_rng(0).uniform(-1, 1, (20_000, 3))
