@@ -10,9 +10,9 @@ How points come to the film is up to the camera's *lens*, an object with the met
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass, fields, is_dataclass, replace
-from typing import Any
+from typing import Any, ClassVar
 
 import drjit as dr
 import numpy as np
@@ -24,6 +24,9 @@ from drgs.constants import TAN_CLAMP
 @dataclass(frozen=True)
 class Lens:
     """What all lenses have in common: by default nothing has to be prepared."""
+
+    distorts: ClassVar[bool] = False
+    """Whether a pinhole could take its place."""
 
     def upload(self, float_type: type) -> Lens:
         """The lens with Dr.Jit scalars of this type for its numbers."""
@@ -280,6 +283,17 @@ def camera_from_sensor(state: SensorState) -> Camera:
     """
     camera = state.make(state.detached())
     dr.make_opaque(camera)
+    return camera
+
+
+def without(camera: Camera, ignored: Collection[str]) -> Camera:
+    """A camera of which some is not simulated: ``distortion``, ``defocus``, ``motion``."""
+    if "distortion" in ignored and camera.lens.distorts:
+        camera = replace(camera, lens=Pinhole())
+    if "defocus" in ignored:
+        camera = replace(camera, aperture=None)
+    if "motion" in ignored:
+        camera = replace(camera, shutter=None)
     return camera
 
 

@@ -103,9 +103,18 @@ class DataConfig(_Section):
         description="white, black or [r, g, b] in display space: behind transparent images, and "
         "behind the splats at training, evaluation and rendering.",
     )
+    random_background: bool = Field(
+        False,
+        description="Each iteration puts another colour behind the transparent pictures and the "
+        "splats, so that splats cannot pass for the background.",
+    )
     ignore_distortion: bool = Field(
         False, description="Treat images with lens distortion as those of a pinhole camera."
     )
+    ignore_motion: bool = Field(
+        False, description="Treat cameras that move while a photograph is taken as if they did not."
+    )
+    ignore_masks: bool = Field(False, description="Use the pixels that masks leave out as well.")
 
     @property
     def background_rgb(self) -> tuple[float, float, float]:
@@ -172,6 +181,11 @@ class ModelConfig(_Section):
     antialiased: bool = Field(
         False, description="Compensate opacities for the low-pass filter (Yu et al. 2024)."
     )
+    smoothing: bool = Field(
+        False,
+        description="Widen Gaussians to what the training cameras can tell apart, for renderings "
+        "at other sizes (the 3D filter of Mip-Splatting, Yu et al. 2024).",
+    )
 
 
 class RateAim(_Section):
@@ -215,6 +229,38 @@ class LossConfig(_Section):
     dssim_weight: float = Field(0.2, ge=0, le=1, description="w; 0 leaves D-SSIM out.")
     window: int = Field(11, ge=3, le=17, description="px: width of SSIM's Gaussian window; odd.")
     sigma: float = Field(1.5, gt=0, description="px: its standard deviation.")
+    depth_weight: float = Field(
+        0.2,
+        ge=0,
+        description="Of the mean difference in depth, in scene extents, where the data has depth; "
+        "0 leaves it out.",
+    )
+
+
+class ColorConfig(_Section):
+    """A colour transform for each training photograph: exposure and white balance."""
+
+    lr: float | None = Field(
+        None, gt=0, description="Rate of the 3 x 4 numbers of each transform; null: there is none."
+    )
+    identity_weight: float = Field(
+        0.1, ge=0, description="Of the mean square by which a transform differs from the identity."
+    )
+
+
+class CamerasConfig(_Section):
+    """Refinement of the training cameras; rates per step of their Adam optimizer."""
+
+    optimise: bool = Field(False, description="Refine poses, focal lengths and principal points.")
+    start: Count = Field(0, ge=0, description="Iterations before it begins.")
+    rotation_lr: float = Field(3e-4, ge=0, description="Radians.")
+    translation_lr: float = Field(3e-4, ge=0, description="In units of the scene extent.")
+    focal_lr: float = Field(
+        0.0, ge=0, description="Relative to the focal lengths, which all views share."
+    )
+    principal_lr: float = Field(
+        0.0, ge=0, description="In parts of the picture's size; all views share it."
+    )
 
 
 class DensifyConfig(_Section):
@@ -266,6 +312,11 @@ class OutputConfig(_Section):
         description="Folder, relative to the configuration file; null: out/NAME under the current "
         "folder, NAME being that of the configuration file.",
     )
+    bake_smoothing: bool = Field(
+        False,
+        description="Write point_cloud.ply with the smoothing of model.smoothing in its scales and "
+        "opacities, for viewers that know nothing of it.",
+    )
     save_renders: bool = Field(True, description="Write renders/<split>/*.png.")
     history_every: Count = Field(10, ge=1, description="Iterations between rows of history.csv.")
     checkpoint_every: Count | None = Field(
@@ -288,6 +339,8 @@ class FitConfig(_Section):
     model: ModelConfig = Field(default_factory=ModelConfig)
     optimizer: OptimizerConfig = Field(default_factory=OptimizerConfig)
     loss: LossConfig = Field(default_factory=LossConfig)
+    colors: ColorConfig = Field(default_factory=ColorConfig)
+    cameras: CamerasConfig = Field(default_factory=CamerasConfig)
     densify: DensifyConfig = Field(default_factory=DensifyConfig)
     output: OutputConfig = Field(default_factory=OutputConfig)
     iterations: Count = Field(30_000, ge=1, description="Optimizer steps; one view each.")

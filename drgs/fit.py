@@ -11,6 +11,7 @@ result on the test views and writes the output folder:
 - ``curves.png``, ``orbit.webp``, ``orbit.gif``
 - ``report.html``: all of it on one page that needs no other file
 - ``config.yml``: every value that the fit used
+- ``colors.json``, ``cameras.json``: colour transforms and refined cameras of the training views
 - ``plan.txt``: with ``--budget``, what was planned and why
 
 While it runs there is also ``checkpoint.npz``, from which ``--resume`` continues.
@@ -44,6 +45,7 @@ from drgs.checkpoint import (
 from drgs.checks import UserError, exit_on_user_error, one_line
 from drgs.config import FitConfig, dump_config, load_config
 from drgs.data import Dataset, initial_gaussians, load_dataset
+from drgs.effects import described, plan_of_fit
 from drgs.execution import add_options, execution
 from drgs.files import atomic_path
 from drgs.gaussians import Gaussians
@@ -110,6 +112,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             f"{len(dataset.train)} views to train on, {len(dataset.test)} of split "
             f"'{dataset.test_split}' to measure on; background {config.data.background}"
         )
+        print(described(plan_of_fit(config, dataset)))
         # The folder is touched when all of the input has been found to be usable.
         gaussians = initial_gaussians(config, dataset)
         length, plan = AllIterations(), None
@@ -181,11 +184,13 @@ def run(
         gaussians = trainer.gaussians()
     except NonFiniteError as error:
         raise UserError(f"{error}; {_remedy(out)}") from None
-    write_ply(out / "point_cloud.ply", gaussians)
+    write_gaussians(out / "point_cloud.ply", gaussians, trainer.config)
+    for effect in trainer.effects:
+        effect.write(out, dataset.train)
     write_history(out / "history.csv", log.rows)
     images = list(render_views(trainer.scene, dataset.test))
     quality = mean_quality(
-        (image, view.image) for image, view in zip(images, dataset.test, strict=True)
+        (image, view.image, view.mask) for image, view in zip(images, dataset.test, strict=True)
     )
     config = trainer.config
     dump_config(config, out / CONFIG_NAME)
@@ -279,6 +284,15 @@ def train(
             if stop.requested:
                 return False
     return True
+
+
+def write_gaussians(path: Path, gaussians: Gaussians, config: FitConfig) -> None:
+    """Write ``point_cloud.ply``, with the smoothing filter apart from the Gaussians or in them."""
+    if config.output.bake_smoothing:
+        from drgs.smoothing import baked
+
+        gaussians = baked(gaussians)
+    write_ply(path, gaussians)
 
 
 def save(trainer: Trainer, log: History, out: Path) -> None:

@@ -32,6 +32,9 @@ class Gaussians:
     logit_opacities: Any  # (N,)
     sh0: Any  # (N, 1, 3) degree-0 coefficients, display space
     shN: Any  # (N, K - 1, 3) coefficients of degree >= 1, K = (degree + 1)^2  # noqa: N815
+    smoothing: Any = (
+        None  # (N,) world units, not optimised: see drgs.smoothing; None: there is none
+    )
 
     @property
     def num_gaussians(self) -> int:
@@ -55,8 +58,7 @@ class Gaussians:
 
     def numpy(self) -> Gaussians:
         """The same Gaussians as numpy arrays on the host."""
-        arrays = {name: np.array(getattr(self, name)) for name in PARAMETER_NAMES}
-        return Gaussians(**arrays)
+        return Gaussians(**{name: np.array(getattr(self, name)) for name in self._names})
 
     def to(self, tensor_type: type) -> Gaussians:
         """Copy to Dr.Jit tensors of type ``tensor_type`` (``TensorXf`` or ``TensorXf64``)."""
@@ -65,9 +67,13 @@ class Gaussians:
         def upload(name: str) -> Any:
             values = np.asarray(getattr(self, name))
             flat = from_host(flat_type, values)
-            return flat if name == "logit_opacities" else tensor_type(flat, values.shape)
+            return flat if values.ndim == 1 else tensor_type(flat, values.shape)
 
-        return Gaussians(**{name: upload(name) for name in PARAMETER_NAMES})
+        return Gaussians(**{name: upload(name) for name in self._names})
+
+    @property
+    def _names(self) -> tuple[str, ...]:
+        return PARAMETER_NAMES if self.smoothing is None else (*PARAMETER_NAMES, "smoothing")
 
 
 def _exp(x: Any) -> Any:

@@ -27,44 +27,52 @@ class Quality:
     num_views: int
 
 
-def psnr(image: Any, target: Any) -> float:
+def psnr(image: Any, target: Any, mask: Any = None) -> float:
     """Return the peak signal-to-noise ratio in dB, -10 log10(mean squared error).
 
-    image, target: (H, W, 3) display space, clamped to [0, 1] (the peak is 1). Infinite for equal
-    pictures, NaN if a pixel is.
+    image, target: (H, W, 3) display space, clamped to [0, 1] (the peak is 1). mask: (H, W), 1 where
+    a pixel counts. Infinite for equal pictures, NaN if a pixel is.
     """
     image, target = _prepare("psnr()", image, target)
     with np.errstate(divide="ignore"):
-        return float(-10 * np.log10(np.mean((image - target) ** 2)))
+        return float(-10 * np.log10(_mean((image - target) ** 2, mask)))
 
 
-def ssim(image: Any, target: Any) -> float:
+def ssim(image: Any, target: Any, mask: Any = None) -> float:
     """Return the structural similarity, averaged over all pixels and channels.
 
     image, target: (H, W, 3) display space, clamped to [0, 1]. Windows reach beyond the image into
     zeros, as in the 3DGS reference's evaluation; equation 13 of Wang et al. 2004 with K1 = 0.01,
-    K2 = 0.03, L = 1.
+    K2 = 0.03, L = 1. mask: (H, W), 1 where a pixel counts; the others are black in both.
     """
     x, y = _prepare("ssim()", image, target)
+    if mask is not None:
+        x, y = x * mask[:, :, None], y * mask[:, :, None]
     mu_x, mu_y = _windowed(x), _windowed(y)
     var_x = _windowed(x * x) - mu_x**2
     var_y = _windowed(y * y) - mu_y**2
     cov_xy = _windowed(x * y) - mu_x * mu_y
     luminance = (2 * mu_x * mu_y + 0.01**2) / (mu_x**2 + mu_y**2 + 0.01**2)
     contrast_structure = (2 * cov_xy + 0.03**2) / (var_x + var_y + 0.03**2)
-    return float(np.mean(luminance * contrast_structure))
+    return float(_mean(luminance * contrast_structure, mask))
 
 
-def mean_quality(pairs: Iterable[tuple[Any, Any]]) -> Quality:
+def mean_quality(pairs: Iterable[tuple[Any, ...]]) -> Quality:
     """Return the means over views of PSNR and SSIM, each view weighing the same.
 
-    pairs: (image, target) of each view; may be a generator, one view is held at a time.
+    pairs: (image, target) of each view, perhaps its mask; may be a generator, one view is held at a
+    time.
     """
-    scores = [(psnr(image, target), ssim(image, target)) for image, target in pairs]
+    scores = [(psnr(*pair), ssim(*pair)) for pair in pairs]
     if not scores:
         raise ValueError("mean_quality(): needs at least one view, got none")
     mean_psnr, mean_ssim = np.mean(scores, axis=0)
     return Quality(psnr=float(mean_psnr), ssim=float(mean_ssim), num_views=len(scores))
+
+
+def _mean(values: np.ndarray, mask: Any) -> float:
+    """Over the pixels that count; NaN if none does."""
+    return np.mean(values) if mask is None else np.mean(values[np.asarray(mask) > 0])
 
 
 def _windowed(values: np.ndarray) -> np.ndarray:

@@ -90,3 +90,30 @@ class _TransformColors(dr.CustomOp):
         return [
             [dr.gather(type(flat), flat, UInt32(4 * i + j)) for j in range(4)] for i in range(3)
         ]
+
+
+def depth_error(depths: Any, target: Any, weights: Any) -> Any:
+    """sum_i w_i |D_i - A_i d_i| over pixels, a Float of one value.
+
+    depths: (H, W, 2), the composited depth D and alpha A; target: d, Float (H * W,), in the units
+    of D; weights: w, Float (H * W,). Not normalised by alpha, the difference stays finite where
+    nothing is. The derivative of |x| at 0 is taken as 0. Not differentiated: target and weights.
+    """
+    return dr.custom(_DepthError, depths=depths, target=target, weights=weights)
+
+
+class _DepthError(dr.CustomOp):
+    def eval(self, depths: Any, target: Any, weights: Any) -> Any:
+        self.like, self.target, self.weights = dr.detach(depths), target, weights
+        depth, alpha = planes_of(depths)
+        difference = dr.fma(-alpha, target, depth)
+        self.slope = weights * dr.select(difference == 0, 0, dr.sign(difference))
+        return dr.sum(weights * dr.abs(difference))
+
+    def forward(self) -> None:
+        d_depth, d_alpha = planes_of(self.grad_in("depths"))
+        self.set_grad_out(dr.sum(self.slope * dr.fma(-d_alpha, self.target, d_depth)))
+
+    def backward(self) -> None:
+        g = self.slope * self.grad_out()
+        self.set_grad_in("depths", image_of([g, -g * self.target], self.like))

@@ -75,6 +75,8 @@ class GaussianRows:
     log_scales: Any  # Array3f
     logit_opacities: Any  # Float
     sh: list[Any]  # (degree + 1)^2 Array3f
+    smoothing: Any = None  # Float: see drgs.smoothing; None: there is none
+    dimming: Any = None  # Float: factor of the opacity; None: 1
 
 
 def load_rows(gaussians: Gaussians, sh_degree: int) -> GaussianRows:
@@ -96,6 +98,7 @@ def load_rows(gaussians: Gaussians, sh_degree: int) -> GaussianRows:
         logit_opacities=flat,
         sh=[t.Array3f(load(gaussians.sh0, 0, 3, 3))]
         + [t.Array3f(load(gaussians.shN, 3 * k, stride, 3)) for k in higher],
+        smoothing=None if gaussians.smoothing is None else dr.detach(gaussians.smoothing),
     )
 
 
@@ -124,8 +127,9 @@ def project(
     low_pass = max(low_pass, LEAST_LOW_PASS)
     film = (shape or ewa)(rows, camera, position, low_pass)
     opacities = opacity_rule(_sigmoid(rows.logit_opacities), film.sharp, film.added)
-    if film.dimming is not None:
-        opacities = opacities * film.dimming
+    for dimming in (rows.dimming, film.dimming):
+        if dimming is not None:
+            opacities = opacities * dimming
     direction = camera.lens.view_direction(camera, offset)
     colors = (color or color_at_mean)(rows, direction, sh_degree)
     numbers = [*film.means2d, *film.whitening, *colors]

@@ -30,14 +30,14 @@ import numpy as np
 
 from drgs.checks import UserError, exit_on_user_error
 from drgs.config import NAMED_COLORS, DataConfig, FitConfig, ModelConfig, load_config
-from drgs.data import Dataset, load_dataset
+from drgs.data import Dataset, View, load_dataset
 from drgs.execution import add_options, execution
 from drgs.files import atomic_path
 from drgs.gaussians import Gaussians
 from drgs.io.ply import read_ply
 from drgs.metrics import Quality, psnr, ssim
 from drgs.pictures import write_animation, write_png
-from drgs.scene import make_scene
+from drgs.scene import make_scene, make_sensors
 from drgs.trainer import render_views
 from drgs.viewpoints import (
     FIELD_OF_VIEW,
@@ -75,6 +75,12 @@ class Model:
     def scene(self) -> mi.Scene:
         """A Mitsuba scene that renders in display space."""
         return make_scene(self.gaussians, self.settings, self.background)
+
+    def pictures(self, views: Sequence[View | Viewpoint]) -> Iterator[np.ndarray]:
+        """Pictures (H, W, 3) of the views, after a plan of what is simulated in the first."""
+        scene = self.scene()
+        print(scene.integrator().plan(scene, make_sensors(views[:1])[0]), flush=True)
+        return render_views(scene, views)
 
     def dataset(self, option: str) -> Dataset:
         """The photographs, without which ``option`` is impossible."""
@@ -149,9 +155,10 @@ def render_split(model: Model, split: str, out: Path) -> Quality:
     column = max(len("view"), *(len(view.name) for view in views))
     print(f"{'view':{column}}  PSNR [dB]    SSIM")
     scores = []
-    for view, image in zip(views, render_views(model.scene(), views), strict=True):
+    for view, image in zip(views, model.pictures(views), strict=True):
         write_png(out / f"{view.name}.png", image)
-        scores.append({"psnr": psnr(image, view.image), "ssim": ssim(image, view.image)})
+        pair = image, view.image, view.mask
+        scores.append({"psnr": psnr(*pair), "ssim": ssim(*pair)})
         print(f"{view.name:{column}}  {_line(**scores[-1])}", flush=True)
     quality = Quality(
         psnr=float(np.mean([score["psnr"] for score in scores])),
@@ -188,7 +195,7 @@ def render_cameras(
     model: Model, viewpoints: Sequence[Viewpoint], out: Path
 ) -> Iterator[np.ndarray]:
     """Write and yield pictures that no photographs belong to."""
-    for camera, image in zip(viewpoints, render_views(model.scene(), viewpoints), strict=True):
+    for camera, image in zip(viewpoints, model.pictures(viewpoints), strict=True):
         write_png(out / f"{camera.name}.png", image)
         print(f"{camera.name}: {camera.width}x{camera.height}", flush=True)
         yield image
@@ -218,6 +225,8 @@ def render_mitsuba_scene(path: Path, out: Path) -> None:
     linear = getattr(scene.integrator(), "srgb_primitives", True)
     for index, sensor in enumerate(scene.sensors()):
         name = path.stem if len(scene.sensors()) == 1 else f"{path.stem}_{index}"
+        if index == 0 and hasattr(scene.integrator(), "plan"):
+            _print_plan(path, scene, sensor)
         _render_sensor(path, scene, index)
         bitmap = sensor.film().bitmap()
         width, height = bitmap.size()
@@ -228,6 +237,14 @@ def render_mitsuba_scene(path: Path, out: Path) -> None:
         )
         write_png(out / f"{name}.png", np.array(colors))
         print(f"{name}: {width}x{height}")
+
+
+def _print_plan(path: Path, scene: mi.Scene, sensor: mi.Sensor) -> None:
+    """What the scene's ``splats`` integrator simulates for a sensor."""
+    try:
+        print(scene.integrator().plan(scene, sensor), flush=True)
+    except TypeError as error:
+        raise UserError(f"{path}: {error}") from None
 
 
 def _render_sensor(path: Path, scene: mi.Scene, index: int) -> None:

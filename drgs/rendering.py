@@ -98,6 +98,10 @@ class Pipeline:
             shape = Defocused(shape)
         if camera.shutter is not None:
             camera = camera.shutter.camera_of(rows, camera)
+        if rows.smoothing is not None:
+            from drgs.smoothing import smoothed
+
+            rows = smoothed(rows)
         return project(
             rows,
             camera,
@@ -221,14 +225,15 @@ def _gaussian_gradients(
         camera = camera.by_lane(dr.width(rows.logit_opacities))
         numbers = camera.numbers()
     with dr.resume_grad():
-        dr.enable_grad(rows, numbers)
+        dr.enable_grad(replace(rows, smoothing=None), numbers)
         splats = frame.pipeline.project(rows, camera)
         outputs, cotangents = _differentiable(frame.pipeline, splats, gradients)
         for output, cotangent in zip(outputs, cotangents, strict=True):
             dr.accum_grad(output, cotangent)
         dr.enqueue(dr.ADMode.Backward, outputs)
         dr.traverse(dr.ADMode.Backward)
-        d_rows, visible = dr.grad(rows), dr.detach(splats.visible)
+        d_rows = dr.grad(replace(rows, smoothing=None))
+        visible = dr.detach(splats.visible)
         d_numbers = [dr.grad(number) for number in numbers]
     parameters, first_fault = _as_tensors(d_rows, gaussians, visible)
     return GaussianGradients(
@@ -318,9 +323,10 @@ def _splat_tangents(
         camera = camera.by_lane(dr.width(rows.logit_opacities))
         numbers = camera.numbers()
     with dr.resume_grad():
-        dr.enable_grad(rows, numbers)
+        dr.enable_grad(replace(rows, smoothing=None), numbers)
         splats = frame.pipeline.project(rows, camera)
-        dr.set_grad(rows, load_rows(tangents, frame.pipeline.sh_degree))
+        d_rows = load_rows(tangents, frame.pipeline.sh_degree)
+        dr.set_grad(replace(rows, smoothing=None), replace(d_rows, smoothing=None))
         for number, tangent in zip(numbers, camera_tangents or [], strict=True):
             dr.set_grad(number, tangent)
         outputs, _ = _differentiable(frame.pipeline, splats, None)

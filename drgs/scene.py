@@ -24,20 +24,26 @@ SQUARE_PIXEL_TOLERANCE = 0.01
 
 
 def make_scene(
-    gaussians: Gaussians, model: ModelConfig, background: tuple[float, float, float]
+    gaussians: Gaussians,
+    model: ModelConfig,
+    background: tuple[float, float, float],
+    **settings: Any,
 ) -> mi.Scene:
     """A scene that holds nothing but the ``splats`` integrator, working in display space.
 
-    gaussians: numpy or Dr.Jit arrays; background: display space.
+    gaussians: numpy or Dr.Jit arrays; background: display space; settings: of the integrator.
     """
     uploaded = gaussians.to(mi.TensorXf)
     tensors = {name: getattr(uploaded, name) for name in PARAMETER_NAMES}
+    if uploaded.smoothing is not None:
+        tensors["smoothing"] = uploaded.smoothing
     integrator = {
         "type": "splats",
         "background": list(background),
         "near": model.near,
         **accuracy(model),
         "srgb_primitives": False,
+        **settings,
         **tensors,
     }
     return mi.load_dict({"type": "scene", "integrator": integrator})
@@ -50,11 +56,11 @@ def accuracy(model: ModelConfig) -> dict[str, Any]:
     return {n: getattr(model, n) for n in names if getattr(model, n) != getattr(default, n)}
 
 
-def make_sensors(views: Iterable[View]) -> list[mi.Sensor]:
+def make_sensors(views: Iterable[View], calibrated: bool = False) -> list[mi.Sensor]:
     """One sensor per view: box filter, one sample, RGB.
 
-    ``perspective`` where Mitsuba's own sensor can be the view's camera, else ``calibrated``. Views
-    of one size share a film.
+    ``perspective`` where Mitsuba's own sensor can be the view's camera, else (or if all are to be)
+    ``calibrated``. Views of one size share a film.
     """
     films: dict[tuple[int, int], mi.Film] = {}
     sensors = []
@@ -62,7 +68,7 @@ def make_sensors(views: Iterable[View]) -> list[mi.Sensor]:
         size = (view.width, view.height)
         if size not in films:
             films[size] = mi.load_dict(_film(*size))
-        sensors.append(mi.load_dict({**_sensor(view), "film": films[size]}))
+        sensors.append(mi.load_dict({**_sensor(view, calibrated), "film": films[size]}))
     return sensors
 
 
@@ -77,18 +83,27 @@ def _film(width: int, height: int) -> dict[str, Any]:
     }
 
 
-def _sensor(view: View) -> dict[str, Any]:
+def _sensor(view: View, calibrated: bool) -> dict[str, Any]:
     pose = {
-        # Mitsuba's camera has x to the left and y up.
-        "to_world": mi.ScalarTransform4f(view.camera_to_world @ np.diag([-1.0, -1.0, 1.0, 1.0])),
+        "to_world": _to_world(view.camera_to_world),
         "near_clip": 1e-3,  # the integrator's own near plane decides
         "sampler": {"type": "independent", "sample_count": 1},
     }
-    if view.lens is None and _has_square_pixels(view):
+    is_perspective = view.lens is None and view.motion is None and _has_square_pixels(view)
+    if is_perspective and not calibrated:
         return pose | _perspective(view)
-    lens = {"lens": view.lens.kind, **view.lens.named()} if view.lens is not None else {}
     intrinsics = {name: getattr(view, name) for name in ("fx", "fy", "cx", "cy")}
-    return {"type": "calibrated", **pose, **intrinsics, **lens}
+    if view.lens is not None:
+        intrinsics |= {"lens": view.lens.kind, **view.lens.named()}
+    if view.motion is not None:
+        pose["to_world_close"] = _to_world(view.motion.close_to_world)
+        pose["shutter"] = view.motion.shutter
+    return {"type": "calibrated", **pose, **intrinsics}
+
+
+def _to_world(camera_to_world: np.ndarray) -> mi.ScalarTransform4f:
+    """Mitsuba's camera has x to the left and y up."""
+    return mi.ScalarTransform4f(camera_to_world @ np.diag([-1.0, -1.0, 1.0, 1.0]))
 
 
 def _perspective(view: View) -> dict[str, Any]:

@@ -20,6 +20,7 @@ from drgs import densify
 from drgs.config import FitConfig, OptimizerConfig
 from drgs.data.images import smaller_view
 from drgs.data.types import Dataset, View
+from drgs.effects import integrator_settings, training_effects
 from drgs.gaussians import PARAMETER_NAMES, Gaussians
 from drgs.guards import GradientWatch, check_values
 from drgs.losses import PhotometricLoss, Target, prepare_target
@@ -31,20 +32,24 @@ from drgs.optimizer import (
 )
 from drgs.scene import make_scene, make_sensors
 from drgs.schedule import changed
+from drgs.training_effects import TrainingEffect
 
 PREFIX = "integrator."
 """What precedes a parameter's name when the scene is traversed."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class TrainingView:
     """A view as training needs it."""
 
     name: str
+    index: int  # among the training views
     sensor: mi.Sensor
-    target: Target
+    photograph: Target
+    target: Target  # what is compared with: the photograph, unless an effect replaces it
     width: int  # px
     height: int  # px
+    uploads: dict[str, Any]  # what effects need, by their names
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,7 +87,9 @@ class Trainer:
 
     def __init__(self, config: FitConfig, dataset: Dataset, gaussians: Gaussians) -> None:
         self.config, self.extent = config, dataset.extent
-        self.scene = make_scene(gaussians, config.model, dataset.background)
+        self.effects = training_effects(config, dataset)
+        settings = integrator_settings(self.effects)
+        self.scene = make_scene(gaussians, config.model, dataset.background, **settings)
         self.integrator = self.scene.integrator()
         self.params = mi.traverse(self.scene)
         self.params.keep([PREFIX + name for name in PARAMETER_NAMES])
@@ -98,7 +105,7 @@ class Trainer:
         self.means_lr = means_rate(config, self.extent)
         self.loss = PhotometricLoss(config.loss.dssim_weight)
         self.white_background = tuple(dataset.background) == (1.0, 1.0, 1.0)
-        self.stages = make_stages(dataset.train, config)
+        self.stages = make_stages(dataset.train, config, self.effects)
         self.statistics = self._no_statistics()
         self.watch = GradientWatch()
         self.iteration = 0
@@ -110,14 +117,18 @@ class Trainer:
         self.integrator.sh_degree = self.sh_degree
         self.optimizer.set_learning_rate({PREFIX + "means": self.means_lr(self.iteration)})
         self.params.update(self.optimizer)
+        for effect in self.effects:
+            effect.before(self, view)
 
         image = mi.render(self.scene, self.params, sensor=view.sensor, spp=1)
-        loss = self.loss(image, view.target)
+        image, loss = self.compared(image, view)
         dr.backward(loss)
         image, loss = dr.detach(image), dr.detach(loss)
         error = dr.mean(dr.square(image.array - view.target.image.array))
         self.watch.add(self.iteration, view.name, loss, self.integrator.last.first_fault)
         self.optimizer.step()
+        for effect in self.effects:
+            effect.after(self, view)
 
         report = self._control_density(view)
         return StepReport(
@@ -129,11 +140,30 @@ class Trainer:
             squared_error=error,
         )
 
+    def compared(self, image: Any, view: TrainingView) -> tuple[Any, Any]:
+        """What a rendering is as a photograph of the view would be, and its loss."""
+        for effect in self.effects:
+            image = effect.adjust(image, view)
+        loss = self.loss(image, view.target)
+        for effect in self.effects:
+            for penalty in effect.penalties(view):
+                loss = loss + penalty
+        return image, loss
+
+    @property
+    def views(self) -> list[TrainingView]:
+        """The training views, at the size in use."""
+        return next(stage.views for stage in self.stages if self.iteration <= stage.until)
+
     @property
     def view(self) -> TrainingView:
         """What this iteration trains on."""
-        views = next(stage.views for stage in self.stages if self.iteration <= stage.until)
-        return views[view_of(self.iteration, len(views), self.config.seed)]
+        return self.views[view_of(self.iteration, len(self.views), self.config.seed)]
+
+    @property
+    def means(self) -> Any:
+        """The means at the moment, (N, 3)."""
+        return self.optimizer[PREFIX + "means"]
 
     @property
     def sh_degree(self) -> int:
@@ -144,7 +174,7 @@ class Trainer:
     @property
     def num_gaussians(self) -> int:
         """N at the moment."""
-        return self.optimizer[PREFIX + "means"].shape[0]
+        return self.means.shape[0]
 
     def replan(self, iterations: int, densify_stop: int) -> None:
         """End the fit, and changes of the population, at another iteration; only what is ahead.
@@ -183,6 +213,8 @@ class Trainer:
         """The Gaussians as numpy arrays."""
         self.check()
         self.params.update(self.optimizer)
+        for effect in self.effects:
+            effect.finish(self)
         return dr.detach(self.integrator.gaussians).numpy()
 
     def state(self) -> dict[str, np.ndarray]:
@@ -196,6 +228,7 @@ class Trainer:
             "gradient_norms": np.array(self.statistics.gradient_norms),
             "views": np.array(self.statistics.views),
             **optimizer_state(self.optimizer, PREFIX),
+            **{f"{e.name}/{k}": v for e in self.effects for k, v in e.state().items()},
         }
 
     def restore(self, state: dict[str, np.ndarray]) -> None:
@@ -205,6 +238,10 @@ class Trainer:
         self.statistics = densify.DensityStatistics(
             mi.Float(state["gradient_norms"]), mi.Float(state["views"])
         )
+        for effect in self.effects:
+            start = f"{effect.name}/"
+            own = {k.removeprefix(start): v for k, v in state.items() if k.startswith(start)}
+            effect.restore(own)
         self.watch = GradientWatch()
         self.params.update(self.optimizer)
 
@@ -225,6 +262,8 @@ class Trainer:
                 self.optimizer, self.statistics, config, self.extent, i, self.config.seed, PREFIX
             )
             self.statistics = self._no_statistics()
+            for effect in self.effects:
+                effect.repopulated()
             # Freed arrays of sizes that will not come again would stay with Dr.Jit's allocator.
             dr.flush_malloc_cache()
         if resets:
@@ -260,25 +299,41 @@ def means_rate(config: FitConfig, extent: float) -> ExponentialDecay:
     return ExponentialDecay(rates.means_lr * extent, rates.means_lr_final * extent, aims)
 
 
-def make_stages(views: tuple[View, ...], config: FitConfig) -> list[Stage]:
+def make_stages(
+    views: tuple[View, ...], config: FitConfig, effects: Sequence[TrainingEffect]
+) -> list[Stage]:
     """The configuration's coarse stages, and the last one, of pictures as they are."""
-    stages = [
-        Stage(s.until, make_training_views([smaller_view(v, s.factor) for v in views], config))
-        for s in config.coarse
-    ]
-    return [*stages, Stage(math.inf, make_training_views(views, config))]
-
-
-def make_training_views(views: Sequence[View], config: FitConfig) -> list[TrainingView]:
-    """Sensors and loss targets for ``views``."""
-    targets = [
-        prepare_target(mi.TensorXf(view.image), config.loss.window, config.loss.sigma)
-        for view in views
-    ]
+    sizes = [(s.until, [smaller_view(v, s.factor) for v in views]) for s in config.coarse]
     return [
-        TrainingView(view.name, sensor, target, view.width, view.height)
-        for view, sensor, target in zip(views, make_sensors(views), targets, strict=True)
+        Stage(until, make_training_views(resized, config, effects))
+        for until, resized in [*sizes, (math.inf, views)]
     ]
+
+
+def make_training_views(
+    views: Sequence[View], config: FitConfig, effects: Sequence[TrainingEffect]
+) -> list[TrainingView]:
+    """Sensors, loss targets, and what effects need, for ``views``."""
+    sensors = make_sensors(views, calibrated=any(e.moves_sensors for e in effects))
+    result = []
+    for index, (view, sensor) in enumerate(zip(views, sensors, strict=True)):
+        image = view.image
+        for effect in effects:
+            image = effect.target_image(view, image)
+        target = prepare_target(mi.TensorXf(image), config.loss.window, config.loss.sigma)
+        result.append(
+            TrainingView(
+                name=view.name,
+                index=index,
+                sensor=sensor,
+                photograph=target,
+                target=target,
+                width=view.width,
+                height=view.height,
+                uploads={effect.name: effect.upload(view) for effect in effects},
+            )
+        )
+    return result
 
 
 def view_of(iteration: int, num_views: int, seed: int) -> int:
@@ -295,4 +350,5 @@ def render_views(scene: mi.Scene, views: tuple[View, ...]) -> Iterator[np.ndarra
     """Pictures (H, W, 3) of ``views``, display space, clamped to [0, 1]."""
     for sensor in make_sensors(views):
         with dr.suspend_grad():
-            yield np.clip(np.array(mi.render(scene, sensor=sensor, spp=1)), 0, 1)
+            image = np.array(mi.render(scene, sensor=sensor, spp=1))
+            yield np.clip(image[:, :, :3], 0, 1)  # what else is put out comes behind the colours

@@ -72,6 +72,7 @@ class Viewpoint:
     width: int  # px
     height: int  # px
     lens: Any = None  # of drgs.lenses; None: a pinhole
+    motion: Any = None  # of drgs.data.types; None: it does not move
 
 
 @dataclass(frozen=True, eq=False)

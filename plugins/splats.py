@@ -18,10 +18,12 @@ import numpy as np
 from drgs import rendering
 from drgs.arrays import interleave
 from drgs.camera import (
+    Camera,
     SensorState,
     camera_from_sensor,
     cameras_in_time,
     read_sensor,
+    without,
 )
 from drgs.choices import Choices
 from drgs.constants import NEAR
@@ -39,6 +41,8 @@ class _Aov:
     channel: str  # behind the name, as Mitsuba names channels
     feature: Any  # that is composited; None: nothing besides the transmittance
 
+
+IGNORABLE = ("distortion", "defocus", "motion", "smoothing")
 
 AOVS = {"depth": _Aov("T", rendering.depth_feature), "alpha": _Aov("I", None)}
 
@@ -123,6 +127,11 @@ class SplatsIntegrator(mi.CppADIntegrator):
          weighted by their share in the pixel and not normalised; ``alpha`` (``name.I``) is the sum
          of these weights. (Default: none)
 
+     * - ignore
+       - |string|
+       - What the sensor and the Gaussians call for and is not to be simulated, a list of
+         ``distortion``, ``defocus``, ``motion`` and ``smoothing``. (Default: none)
+
      * - projection
        - |string|
        - How a Gaussian comes to the film: ``ewa``, by the affine approximation at its mean;
@@ -160,6 +169,11 @@ class SplatsIntegrator(mi.CppADIntegrator):
        - |bool|
        - Scales opacities so that the low-pass filter keeps each splat's integral, as in
          Mip-Splatting. (Default: |false|)
+
+     * - smoothing
+       - |tensor|
+       - Standard deviation of the 3D smoothing filter of each Gaussian (N), in scene units: see
+         ``drgs.smoothing``. (Default: the file's ``filter_3D``, if it has it)
 
      * - means, quats, log_scales, logit_opacities, sh0, shN
        - |tensor|
@@ -215,6 +229,8 @@ class SplatsIntegrator(mi.CppADIntegrator):
         gaussians = _load_gaussians(props)
         for name in PARAMETER_NAMES:
             setattr(self, name, getattr(gaussians, name))
+        self.smoothing = gaussians.smoothing
+        self.ignore = _ignored(props)
         self.sh_degree = props.get("sh_degree", gaussians.sh_degree)
         self.background = _background(props)
         self.hide_emitters = _boolean(props, "hide_emitters", False)
@@ -226,6 +242,7 @@ class SplatsIntegrator(mi.CppADIntegrator):
         self.last: LastBackward | None = None
         self._rendered: _Rendered | None = None
         self._film_maps: dict[str, np.ndarray] = {}  # by description of the film
+        self._logged_plan = ""
 
     # ------------------------------------------------------------------------------------------
     # Parameters
@@ -265,7 +282,9 @@ class SplatsIntegrator(mi.CppADIntegrator):
     @property
     def gaussians(self) -> Gaussians:
         """The parameters as one value; their arrays may be attached."""
-        return Gaussians(**{name: getattr(self, name) for name in PARAMETER_NAMES})
+        parameters = {name: getattr(self, name) for name in PARAMETER_NAMES}
+        smoothing = None if "smoothing" in self.ignore else self.smoothing
+        return Gaussians(**parameters, smoothing=smoothing)
 
     @property
     def pipeline(self) -> rendering.Pipeline:
@@ -307,6 +326,7 @@ class SplatsIntegrator(mi.CppADIntegrator):
         """Render the Gaussians as seen by ``sensor``; see ``mi.Integrator.render``."""
         sensor = _resolve_sensor(scene, sensor)
         with dr.suspend_grad():
+            self._log_plan(scene, sensor)
             exposure = self._exposure(sensor, seed, spp)
             frames = self._frames(sensor, exposure)
             planes = [[frame.planes() for frame in times] for times in frames]
@@ -371,7 +391,7 @@ class SplatsIntegrator(mi.CppADIntegrator):
                 if constant is not None:
                     _accumulate(self.background, d_constant)
                 if of_camera:
-                    _, cameras = cameras_in_time(state.make(state))
+                    _, cameras = cameras_in_time(without(state.make(state), self.ignore))
                     numbers = [camera.numbers() for camera in cameras]
                     _accumulate_through(numbers, [gradients.camera for gradients in by_time])
 
@@ -395,7 +415,7 @@ class SplatsIntegrator(mi.CppADIntegrator):
                 )
                 constant = self._constant()
                 d_constant = None if constant is None else dr.grad(self.background)
-                d_cameras = _camera_tangents(self._sensor_state(sensor), len(frames))
+                d_cameras = self._camera_tangents(sensor, len(frames))
             d_planes = [
                 rendering.frames_tangent(self.gaussians, of_time, tangents, d_camera)
                 for of_time, d_camera in zip(frames, d_cameras, strict=True)
@@ -445,7 +465,7 @@ class SplatsIntegrator(mi.CppADIntegrator):
             first, *others = exposure.positions
             model = replace(pipeline.model, positions=first)
             frames = []
-            times, cameras = cameras_in_time(camera_from_sensor(state))
+            times, cameras = cameras_in_time(self._camera(state))
             for camera in cameras:
                 frame = rendering.render(gaussians, camera, replace(pipeline, model=model))
                 frames.append([frame, *(rendering.render_again(frame, p) for p in others)])
@@ -454,6 +474,36 @@ class SplatsIntegrator(mi.CppADIntegrator):
 
     def _sensor_state(self, sensor: mi.Sensor) -> SensorState:
         return read_sensor(sensor, self.near)
+
+    def _camera(self, state: SensorState) -> Camera:
+        """What of the sensor's camera is simulated, detached."""
+        return without(camera_from_sensor(state), self.ignore)
+
+    def _camera_tangents(self, sensor: mi.Sensor, count: int) -> list[list[mi.Float] | None]:
+        """Of each time's camera, derivatives of its numbers along those set on the sensor."""
+        state = self._sensor_state(sensor)
+        if not state.is_attached:
+            return [None] * count
+        _, cameras = cameras_in_time(without(state.make(state), self.ignore))
+        numbers = [camera.numbers() for camera in cameras]
+        dr.forward_to(numbers, flags=dr.ADFlag.ClearEdges)
+        return dr.grad(numbers)
+
+    def plan(self, scene: mi.Scene, sensor: mi.Sensor) -> str:
+        """What is simulated, what asked for it, and what is not simulated: one line an effect."""
+        from drgs.effects import described, plan_of_scene
+
+        camera = self._camera(self._sensor_state(sensor).detached())
+        return described(plan_of_scene(self, camera, scene.environment()))
+
+    def _log_plan(self, scene: mi.Scene, sensor: mi.Sensor) -> None:
+        """Once for each plan, where somebody listens."""
+        if mi.logger() is None or mi.logger().log_level() > mi.LogLevel.Info:
+            return
+        plan = self.plan(scene, sensor)
+        if plan != self._logged_plan:
+            mi.Log(mi.LogLevel.Info, f"splats: {plan}")
+            self._logged_plan = plan
 
     def _constant(self) -> mi.Color3f | None:
         """The background without gradients, if it is a colour; display space.
@@ -552,6 +602,8 @@ def _load_gaussians(props: mi.Properties) -> Gaussians:
         if "shN" not in given:
             values["shN"] = dr.zeros(mi.TensorXf, (values["means"].shape[0], 0, 3))
         values["logit_opacities"] = mi.Float(values["logit_opacities"].array)
+        if "smoothing" in props:
+            values["smoothing"] = mi.Float(_tensor(props, "smoothing").array)
         gaussians = Gaussians(**values)
     _check_shapes(gaussians)
     return gaussians
@@ -579,6 +631,16 @@ def _background(props: mi.Properties) -> mi.Color3f | mi.Texture:
             "splats: background must be an RGB colour, such as [1, 1, 1] or "
             f"<rgb value='1, 1, 1'/>, or a texture, got {type(value).__name__}"
         ) from None
+
+
+def _ignored(props: mi.Properties) -> tuple[str, ...]:
+    words = [word.strip() for word in str(props.get("ignore", "")).split(",") if word.strip()]
+    for word in words:
+        if word not in IGNORABLE:
+            raise ValueError(
+                f"splats: ignore must be a list of {', '.join(IGNORABLE)}, got {word!r}"
+            )
+    return tuple(words)
 
 
 def _aovs(props: mi.Properties) -> dict[str, str]:
@@ -653,6 +715,11 @@ def _check_shapes(gaussians: Gaussians) -> None:
                 f"splats: {name} must have the shape {expected}, with N = {num} the rows of "
                 f"means, got {got}"
             )
+    if gaussians.smoothing is not None and dr.width(gaussians.smoothing) != num:
+        raise ValueError(
+            f"splats: smoothing must have the shape (N), with N = {num} the rows of means, got "
+            f"({dr.width(gaussians.smoothing)},)"
+        )
 
 
 def _check_degree(degree: int, gaussians: Gaussians) -> None:
@@ -690,16 +757,6 @@ def _accumulate_through(values: list[list[Any]], gradients: list[list[mi.Float]]
         dr.accum_grad(value, gradient)
     dr.enqueue(dr.ADMode.Backward, [value for value, _ in attached])
     dr.traverse(dr.ADMode.Backward)
-
-
-def _camera_tangents(state: SensorState, num_times: int) -> list[list[mi.Float] | None]:
-    """Of each time's camera, derivatives of its numbers along those set on the sensor."""
-    if not state.is_attached:
-        return [None] * num_times
-    _, cameras = cameras_in_time(state.make(state))
-    numbers = [camera.numbers() for camera in cameras]
-    dr.forward_to(numbers, flags=dr.ADFlag.ClearEdges)
-    return dr.grad(numbers)
 
 
 mi.register_integrator("splats", lambda props: SplatsIntegrator(props))

@@ -1288,7 +1288,11 @@ def test_parameters_that_do_not_fit_are_refused_when_updated(name, shape, messag
 
 def test_other_sensors_are_refused():
     loaded = mi.load_dict(
-        {"type": "scene", "integrator": {"type": "splats", **valid()}, "s": {"type": "distant"}}
+        {
+            "type": "scene",
+            "integrator": {"type": "splats", **valid()},
+            "s": {"type": "batch", "inner": {"type": "perspective"}},
+        }
     )
     with pytest.raises(RuntimeError) as caught:
         mi.render(loaded)

@@ -120,12 +120,14 @@ def principal_point(values: dict[str, Any], key: str, where: str, size: int) -> 
     return value
 
 
-def opencv_camera_to_world(frame: dict[str, Any], where: str) -> np.ndarray:
+def opencv_camera_to_world(
+    frame: dict[str, Any], where: str, name: str = "transform_matrix"
+) -> np.ndarray:
     """(4, 4) float64 camera to world in OpenCV axes: columns y and z of the file's change sign."""
-    key = f"{where}transform_matrix"
-    if "transform_matrix" not in frame:
+    key = f"{where}{name}"
+    if name not in frame:
         raise UserError(f"{key} is missing")
-    matrix = _numbers(frame["transform_matrix"], key)
+    matrix = _numbers(frame[name], key)
     if matrix.shape != (4, 4):
         raise UserError(f"{key} must be 4 x 4 numbers, got shape {matrix.shape}")
     if not np.isfinite(matrix).all():
@@ -215,16 +217,16 @@ def distortion_of(frame: FrameValues) -> dict[str, float]:
     return {key: value for key, value in given.items() if value != 0}
 
 
-def image_path(folder: Path, frame: dict[str, Any], where: str) -> Path:
+def image_path(folder: Path, frame: dict[str, Any], where: str, key: str = "file_path") -> Path:
     """The file that ``frame`` names, with ``.png`` added where its name has no suffix."""
-    name = frame.get("file_path")
+    name = frame.get(key)
     if not isinstance(name, str) or not name:
-        raise UserError(f"{where}file_path must be text, got {_show(name)}")
+        raise UserError(f"{where}{key} must be text, got {_show(name)}")
     for candidate in (folder / name, folder / f"{name}.png"):
         if os.path.isfile(candidate):  # False, not an error, for a name that no file can have
             return candidate
     raise UserError(
-        f"{where}file_path: there is no image {one_line(folder / name)} (or with .png added)"
+        f"{where}{key}: there is no image {one_line(folder / name)} (or with .png added)"
     )
 
 

@@ -54,6 +54,46 @@ def read_image(path: Path) -> np.ndarray:
     return pixels.astype(np.float32) / np.float32(white)
 
 
+def read_mask(path: Path, size: tuple[int, int]) -> np.ndarray:
+    """(H, W) float32: 1 where the picture is brighter than half, 0 elsewhere; size: W, H."""
+    image = read_image(path)
+    _check_size(path, image, size)
+    return (image[:, :, 0] > 0.5).astype(np.float32)
+
+
+def read_depth(path: Path, unit: float, size: tuple[int, int]) -> np.ndarray:
+    """(H, W) float32, scene units, 0 where not known.
+
+    unit: scene units in one step of a 16 bit picture; an ``.npy`` file holds scene units. size: W,
+    H. What is not finite or not positive is not known.
+    """
+    if path.suffix == ".npy":
+        try:
+            depth = np.load(path, allow_pickle=False).astype(np.float32)
+        except (OSError, ValueError, EOFError) as error:
+            raise UserError(f"{path}: cannot read the depth: {one_line(error)}") from None
+        depth = depth.squeeze(-1) if depth.ndim == 3 and depth.shape[2] == 1 else depth
+        if depth.ndim != 2:
+            raise UserError(f"{path}: depth must be (height, width), got shape {depth.shape}")
+    else:
+        depth = read_image(path)[:, :, 0] * np.float32(MAX_DEPTH_STEPS * unit)
+    _check_size(path, depth, size)
+    return np.where(np.isfinite(depth) & (depth > 0), depth, 0).astype(np.float32)
+
+
+MAX_DEPTH_STEPS = 2**16 - 1
+"""White in a picture of 16 bits."""
+
+
+def _check_size(path: Path, image: np.ndarray, size: tuple[int, int]) -> None:
+    height, width = image.shape[:2]
+    if (width, height) != size:
+        raise UserError(
+            f"{path}: must be {size[0]} x {size[1]} px, as the photograph is, got {width} x "
+            f"{height}"
+        )
+
+
 @contextmanager
 def _opened(path: Path) -> Iterator[Image.Image]:
     """The image before decoding; errors of the file, also within the block, are the user's."""
@@ -92,7 +132,8 @@ def downscale(image: np.ndarray, max_width: int | None) -> np.ndarray:
 
 def smaller_view(view: View, factor: int) -> View:
     """The same camera with pixels ``factor`` times as large, each the average over its area."""
-    image = downscale(view.image, max(1, round(view.width / factor)))
+    new_width = max(1, round(view.width / factor))
+    image = downscale(view.image, new_width)
     height, width = image.shape[:2]
     x, y = width / view.width, height / view.height
     return replace(
@@ -104,7 +145,25 @@ def smaller_view(view: View, factor: int) -> View:
         cy=view.cy * y,
         width=width,
         height=height,
+        alpha=None if view.alpha is None else downscale(view.alpha, new_width),
+        mask=None if view.mask is None else downscale_mask(view.mask, new_width),
+        depth=None if view.depth is None else downscale_depth(view.depth, new_width),
     )
+
+
+def downscale_mask(mask: np.ndarray, max_width: int | None) -> np.ndarray:
+    """(H, W) of 1 and 0: a pixel counts where all that it covers does."""
+    return (downscale(mask, max_width) > ALL).astype(np.float32)
+
+
+def downscale_depth(depth: np.ndarray, max_width: int | None) -> np.ndarray:
+    """(H, W): the mean depth where all that a pixel covers has one, else 0."""
+    known = downscale((depth > 0).astype(np.float32), max_width)
+    return np.where(known > ALL, downscale(depth, max_width), 0).astype(np.float32)
+
+
+ALL = 1 - 1e-4
+"""Of an area, up to rounding."""
 
 
 def _average_rows(image: np.ndarray, count: int) -> np.ndarray:

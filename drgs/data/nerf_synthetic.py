@@ -87,6 +87,7 @@ def _load_split(config: DataConfig, split: str) -> tuple[View, ...]:
         rgba = read_image(files[index])
         _check_promises(rgba, size, files[index], files[0])
         image = downscale(composite(rgba, config.background_rgb), config.image_size)
+        alpha = downscale(rgba[:, :, 3], config.image_size) if config.random_background else None
         height, width = image.shape[:2]
         # The angle spans the full width, so the focal length in pixels follows the image's size.
         focal = focal_from_angle(meta, "camera_angle_x", f"{path}: ", width)
@@ -100,6 +101,7 @@ def _load_split(config: DataConfig, split: str) -> tuple[View, ...]:
             cy=height / 2,
             width=width,
             height=height,
+            alpha=alpha,
         )
 
     return in_parallel(load_view, range(len(frames)), unique_names(frames))

@@ -3,15 +3,19 @@
 Intrinsics (``fl_x, fl_y, cx, cy, w, h``) stand at the top or, overriding that, in a frame; where
 focal lengths are missing, ``camera_angle_x`` (and ``_y``) give them. Views are sorted by file
 name, and every ``data.test_every``-th is for testing, as in Mip-NeRF 360 and 3DGS.
+
+Frames may name a mask (``mask_path``, black where pixels do not count), a picture of depths
+(``depth_file_path``), and a second pose (:data:`CLOSE`, with ``shutter``).
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from drgs.checks import UserError
+import numpy as np
+
+from drgs.checks import UserError, one_line
 from drgs.config import DataConfig
 from drgs.data.frames import (
     InheritedValues,
@@ -26,8 +30,27 @@ from drgs.data.frames import (
     read_transforms,
     unique_names,
 )
-from drgs.data.images import composite, downscale, read_image
-from drgs.data.types import Dataset, View
+from drgs.data.images import (
+    composite,
+    downscale,
+    downscale_depth,
+    downscale_mask,
+    read_depth,
+    read_image,
+    read_mask,
+)
+from drgs.data.types import Dataset, Motion, View
+
+CLOSE = "transform_matrix_close"
+"""Of a frame: where its camera was when the shutter closed, as ``transform_matrix`` is where it was
+when the shutter opened."""
+
+SHUTTERS = ("global", "rolling")
+"""Values of ``shutter``: all pixels see the whole motion, or the rows one time after the other."""
+
+DEPTH_UNIT = 1e-3
+"""Scene units in a step of a depth picture, unless ``depth_unit_scale_factor`` says otherwise: as
+nerfstudio has it."""
 
 
 def load(config: DataConfig) -> Dataset:
@@ -49,8 +72,7 @@ def load(config: DataConfig) -> Dataset:
     lenses = [lens_of(frame) for frame in frames]
 
     def load_view(index: int, name: str) -> View:
-        view = _load_view(config, frames[index], files[index], name)
-        return view if config.ignore_distortion else replace(view, lens=lenses[index])
+        return _load_view(config, frames[index], files[index], name)
 
     order = sorted(range(len(frames)), key=lambda index: frames[index].own["file_path"])
     names = unique_names([frames[index].own for index in order])
@@ -74,7 +96,8 @@ def load(config: DataConfig) -> Dataset:
 
 def _load_view(config: DataConfig, frame: InheritedValues, file: Path, name: str) -> View:
     camera_to_world = opencv_camera_to_world(frame.own, frame.where)
-    image = composite(read_image(file), config.background_rgb)
+    pixels = read_image(file)
+    image = composite(pixels, config.background_rgb)
     height, width = image.shape[:2]
     for key, size in (("w", width), ("h", height)):
         if key in frame and (given := positive(*frame.at(key))) != size:
@@ -87,8 +110,13 @@ def _load_view(config: DataConfig, frame: InheritedValues, file: Path, name: str
     cx = principal_point(*frame.at("cx"), width) if "cx" in frame else width / 2
     cy = principal_point(*frame.at("cy"), height) if "cy" in frame else height / 2
 
-    image = downscale(image, config.image_size)
+    max_width = config.image_size
+    image = downscale(image, max_width)
     scale_x, scale_y = image.shape[1] / width, image.shape[0] / height
+    alpha = None
+    if config.random_background and pixels.shape[2] == 4:
+        alpha = downscale(pixels[:, :, 3], max_width)
+    mask, depth = _mask(config, frame, (width, height)), _depth(config, frame, (width, height))
     return View(
         name=name,
         image=image,
@@ -99,7 +127,41 @@ def _load_view(config: DataConfig, frame: InheritedValues, file: Path, name: str
         cy=cy * scale_y,
         width=image.shape[1],
         height=image.shape[0],
+        lens=None if config.ignore_distortion else lens_of(frame),
+        motion=None if config.ignore_motion else _motion(frame),
+        alpha=alpha,
+        mask=None if mask is None else downscale_mask(mask, max_width),
+        depth=None if depth is None else downscale_depth(depth, max_width),
     )
+
+
+def _mask(config: DataConfig, frame: InheritedValues, size: tuple[int, int]) -> np.ndarray | None:
+    if "mask_path" not in frame or config.ignore_masks:
+        return None
+    return read_mask(image_path(config.path, frame.own, frame.where, "mask_path"), size)
+
+
+def _depth(config: DataConfig, frame: InheritedValues, size: tuple[int, int]) -> np.ndarray | None:
+    if "depth_file_path" not in frame:
+        return None
+    unit = DEPTH_UNIT
+    if "depth_unit_scale_factor" in frame:
+        unit = positive(*frame.at("depth_unit_scale_factor"))
+    file = image_path(config.path, frame.own, frame.where, "depth_file_path")
+    return read_depth(file, unit, size)
+
+
+def _motion(frame: InheritedValues) -> Motion | None:
+    """Of a frame that says where its camera was when the shutter closed."""
+    if CLOSE not in frame.own:
+        return None
+    shutter = frame.get("shutter", SHUTTERS[0])
+    if shutter not in SHUTTERS:
+        raise UserError(
+            f"{frame.at('shutter')[2]}shutter must be one of {', '.join(SHUTTERS)}, got "
+            f"{one_line(shutter)}"
+        )
+    return Motion(opencv_camera_to_world(frame.own, frame.where, CLOSE), shutter)
 
 
 def _focal(frame: InheritedValues, axis: str, size: int) -> float:
@@ -117,6 +179,8 @@ def _notes(config: DataConfig, frames: list[InheritedValues], lenses: list[Any])
     if found:
         ignored = " ignored" if config.ignore_distortion else ""
         notes += f"; lens {' and '.join(sorted(found))}{ignored}"
-    if any("mask_path" in frame for frame in frames):
+    if config.ignore_masks and any("mask_path" in frame for frame in frames):
         notes += "; masks (mask_path) ignored"
+    if config.ignore_motion and any(CLOSE in frame for frame in frames):
+        notes += f"; motion ({CLOSE}) ignored"
     return notes

@@ -9,6 +9,14 @@ import numpy as np
 
 
 @dataclass(frozen=True, eq=False)
+class Motion:
+    """Of a camera while its shutter was open."""
+
+    close_to_world: np.ndarray  # (4, 4) float64, OpenCV axes: where the camera was in the end
+    shutter: str  # global: all pixels were open all the time; rolling: row after row
+
+
+@dataclass(frozen=True, eq=False)
 class View:
     """One photograph and the camera that took it."""
 
@@ -22,6 +30,10 @@ class View:
     width: int  # px
     height: int  # px
     lens: Any = None  # of drgs.lenses, with numbers of the host; None: a pinhole
+    motion: Motion | None = None  # while the photograph was taken
+    alpha: np.ndarray | None = None  # (height, width) float32: how opaque the picture was
+    mask: np.ndarray | None = None  # (height, width) float32: 1 where a pixel counts, else 0
+    depth: np.ndarray | None = None  # (height, width) float32, scene units; 0 where not known
 
     @property
     def center(self) -> np.ndarray:
@@ -51,7 +63,8 @@ class Dataset:
         For a fit, whose trainer has them on the device.
         """
         empty = np.empty((0, 0, 3), np.float32)
-        return replace(self, train=tuple(replace(view, image=empty) for view in self.train))
+        pictures = {"image": empty, "alpha": None, "mask": None, "depth": None}
+        return replace(self, train=tuple(replace(view, **pictures) for view in self.train))
 
     @property
     def extent(self) -> float:

@@ -6,7 +6,8 @@ Layer 1. The reference (Kerbl et al. 2023, ``save_ply``) writes one float32 row 
 
 with zero normals, the raw values that are optimised (logit opacity, natural logarithm of the
 scales, unnormalised wxyz quaternion), and ``f_rest`` channel-major: all coefficients of red,
-then of green, then of blue. K = (degree + 1)^2.
+then of green, then of blue. K = (degree + 1)^2. Gaussians with a smoothing filter have one property
+more, ``filter_3D``, the filter's standard deviation, as in Mip-Splatting's files.
 """
 
 from __future__ import annotations
@@ -28,6 +29,7 @@ SH0 = ("f_dc_0", "f_dc_1", "f_dc_2")
 OPACITY = ("opacity",)
 SCALE = ("scale_0", "scale_1", "scale_2")
 ROTATION = ("rot_0", "rot_1", "rot_2", "rot_3")
+SMOOTHING = ("filter_3D",)
 COLOR = ("red", "green", "blue")
 
 NUM_REST = {3 * ((degree + 1) ** 2 - 1): degree for degree in range(4)}
@@ -55,6 +57,10 @@ def read_ply(path: str | Path) -> Gaussians:
     _require(
         path, vertex, (*POSITION, *SH0, *_rest(num_rest), *OPACITY, *SCALE, *ROTATION), "Gaussians"
     )
+    smoothing = None
+    if set(SMOOTHING) <= set(vertex.dtype.names):
+        _require(path, vertex, SMOOTHING, "Gaussians")
+        smoothing = _columns(vertex, SMOOTHING)[:, 0]
     sh_rest = _columns(vertex, _rest(num_rest)).reshape(len(vertex), 3, num_rest // 3)
     return Gaussians(
         means=_columns(vertex, POSITION),
@@ -63,6 +69,7 @@ def read_ply(path: str | Path) -> Gaussians:
         logit_opacities=_columns(vertex, OPACITY)[:, 0],
         sh0=_columns(vertex, SH0)[:, None, :],
         shN=np.ascontiguousarray(sh_rest.transpose(0, 2, 1)),
+        smoothing=smoothing,
     )
 
 
@@ -74,6 +81,7 @@ def write_ply(path: str | Path, gaussians: Gaussians) -> None:
     g = gaussians.numpy()
     num, num_rest = g.num_gaussians, 3 * g.shN.shape[1]
     names = (*POSITION, *NORMAL, *SH0, *_rest(num_rest), *OPACITY, *SCALE, *ROTATION)
+    names += () if g.smoothing is None else SMOOTHING
     rows = np.concatenate(
         [
             g.means,
@@ -83,6 +91,7 @@ def write_ply(path: str | Path, gaussians: Gaussians) -> None:
             g.logit_opacities.reshape(num, 1),
             g.log_scales,
             g.quats,
+            *([] if g.smoothing is None else [g.smoothing.reshape(num, 1)]),
         ],
         axis=1,
     ).astype("<f4")

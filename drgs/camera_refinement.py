@@ -1,0 +1,152 @@
+"""Training cameras that are optimised together with the splats.
+
+Layer 4, imported when ``cameras.optimise`` is set. A view's camera is moved, in its own axes, by a
+rotation exp(turn) and a translation; all views share factors of the focal lengths and a shift of
+the principal point. The derivatives come from the integrator: see ``camera.Camera.by_lane``.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from drgs.config import CamerasConfig
+from drgs.data.types import View
+from drgs.files import atomic_path
+from drgs.shutter import rotation_matrix
+from drgs.training_effects import TrainingEffect
+from drgs.view_parameters import ViewParameters
+
+if TYPE_CHECKING:
+    from drgs.trainer import Trainer, TrainingView
+
+CAMERAS = "cameras.json"
+
+INTRINSICS = ("fx", "fy", "cx", "cy")
+
+
+@dataclass(frozen=True)
+class _Start:
+    """A view's camera as the data has it, on the device."""
+
+    to_world: mi.Matrix4f  # camera to world, OpenCV axes
+    intrinsics: mi.Vector4f  # fx, fy, cx, cy, px
+    size: mi.Vector2f  # px
+
+
+class CameraRefinement(TrainingEffect):
+    """Poses of all training views, and what their lenses share."""
+
+    name = "cameras"
+    moves_sensors = True
+
+    def __init__(self, config: CamerasConfig, num_views: int, extent: float) -> None:
+        """num_views: of the training split; extent: world units."""
+        self.first = config.start
+        shapes = {"turns": (num_views, 3), "moves": (num_views, 3)}
+        rates = {"turns": config.rotation_lr, "moves": config.translation_lr * extent}
+        shared = {"log_focals": config.focal_lr, "shifts": config.principal_lr}
+        # A rate of 0 leaves out what it belongs to.
+        shapes |= {name: (1, 2) for name, rate in shared.items() if rate > 0}
+        values = {name: np.zeros(shape) for name, shape in shapes.items()}
+        self.parameters = ViewParameters(values, rates | shared)
+        self.leaves: dict[str, mi.Float] = {}
+        self.numbers: dict[str, Any] = {}  # of the sensor that is rendered
+
+    def upload(self, view: View) -> _Start:
+        """The view's camera."""
+        start = _Start(
+            to_world=mi.Matrix4f(view.camera_to_world.astype(np.float32)),
+            intrinsics=mi.Vector4f(*(float(getattr(view, name)) for name in INTRINSICS)),
+            size=mi.Vector2f(view.width, view.height),
+        )
+        dr.make_opaque(start)
+        return start
+
+    def before(self, trainer: Trainer, view: TrainingView) -> None:
+        """Put the sensor where its camera is now."""
+        self.leaves = self.parameters.leaves(view.index)
+        # What the sensor depends on are leaves: the rest of the chain is differentiated afterwards.
+        self.numbers = dr.detach(self._camera(view.uploads[self.name], self.leaves))
+        if trainer.iteration > self.first:
+            dr.enable_grad(self.numbers)
+        params = mi.traverse(view.sensor)
+        params["to_world"] = mi.AffineTransform4f(self.numbers["to_world"])
+        for name in INTRINSICS:
+            params[name] = self.numbers[name]
+        params.update()
+
+    def after(self, trainer: Trainer, view: TrainingView) -> None:
+        """One step of its own."""
+        if trainer.iteration <= self.first:
+            return
+        camera = self._camera(view.uploads[self.name], self.leaves)
+        for name, value in camera.items():
+            if dr.grad_enabled(value):
+                dr.accum_grad(value, dr.grad(self.numbers[name]))
+                dr.enqueue(dr.ADMode.Backward, value)
+        dr.traverse(dr.ADMode.Backward)
+        self.parameters.step(view.index, self.leaves)
+
+    @staticmethod
+    def _camera(start: _Start, leaves: dict[str, mi.Float]) -> dict[str, Any]:
+        """The sensor's parameters, from the numbers that are optimised."""
+        turn, move = (mi.Vector3f(*_entries(leaves[name])) for name in ("turns", "moves"))
+        rotation = rotation_matrix(turn)
+        rows = [[rotation[i, j] for j in range(3)] + [move[i]] for i in range(3)]
+        moved = start.to_world @ mi.Matrix4f([*rows, [0, 0, 0, 1]])
+        fx, fy, cx, cy = start.intrinsics
+        if "log_focals" in leaves:
+            wide, tall = map(dr.exp, _entries(leaves["log_focals"]))
+            fx, fy = fx * wide, fy * tall
+        if "shifts" in leaves:
+            right, down = _entries(leaves["shifts"])
+            cx, cy = cx + right * start.size.x, cy + down * start.size.y
+        # Mitsuba's camera has x to the left and y up.
+        signs = mi.Matrix4f(np.diag([-1.0, -1.0, 1.0, 1.0]).astype(np.float32))
+        return {"to_world": moved @ signs, "fx": fx, "fy": fy, "cx": cx, "cy": cy}
+
+    def state(self) -> dict[str, np.ndarray]:
+        """Numbers and moments."""
+        return self.parameters.state()
+
+    def restore(self, state: dict[str, np.ndarray]) -> None:
+        """Continue from :meth:`state`."""
+        self.parameters.restore(state)
+
+    def write(self, folder: Path, views: tuple[View, ...]) -> None:
+        """``cameras.json``: the refined training cameras, in the layout of ``transforms.json``."""
+        numbers = self.parameters.numpy()
+        frames = []
+        for index, view in enumerate(views):
+            row = {k: mi.Float(v[min(index, len(v) - 1)]) for k, v in numbers.items()}
+            camera = self._camera(self.upload(view), row)
+            values = {name: float(camera[name][0]) for name in INTRINSICS}
+            pose = np.array(camera["to_world"])[..., 0].astype(np.float64)
+            pose @= np.diag([-1.0, 1.0, -1.0, 1.0])  # to OpenGL axes
+            frames.append(
+                {
+                    "file_path": view.name,
+                    "transform_matrix": pose.tolist(),
+                    "fl_x": values["fx"],
+                    "fl_y": values["fy"],
+                    "cx": values["cx"],
+                    "cy": values["cy"],
+                    "w": view.width,
+                    "h": view.height,
+                }
+                | (view.lens.named() if view.lens is not None else {})
+            )
+        with atomic_path(folder / CAMERAS) as temporary:
+            temporary.write_text(json.dumps({"frames": frames}, indent=1) + "\n")
+
+
+def _entries(values: mi.Float) -> list[mi.Float]:
+    """Each number as an array of one."""
+    return [dr.gather(mi.Float, values, mi.UInt32(k)) for k in range(dr.width(values))]

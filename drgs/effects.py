@@ -1,0 +1,203 @@
+"""Which effects a scene calls for, what asked for each, and what is not simulated.
+
+Layer 4. An effect is composed in when the dataset, the sensor or the configuration calls for it.
+What is not called for is not imported. :func:`plan_of_fit` and :func:`plan_of_scene` are what
+commands print at their start: one line an effect.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from drgs.checks import UserError
+from drgs.config import FitConfig
+from drgs.data.types import Dataset, View
+from drgs.training_effects import TrainingEffect
+
+
+def training_effects(config: FitConfig, dataset: Dataset) -> list[TrainingEffect]:
+    """Those that take part in the iterations of a fit, in the order in which they act."""
+    effects: list[TrainingEffect] = []
+    views = dataset.train
+    if config.loss.depth_weight > 0 and any(view.depth is not None for view in views):
+        from drgs.supervision import DepthSupervision
+
+        effects.append(DepthSupervision(config.loss.depth_weight, dataset.extent))
+    if config.colors.lr is not None:
+        from drgs.color_correction import ColorCorrection
+
+        effects.append(ColorCorrection(config.colors, len(views)))
+    if config.data.random_background:
+        from drgs.supervision import RandomBackground
+
+        if any(view.alpha is None for view in views):
+            raise UserError(
+                "data.random_background: the photographs must be transparent where the background "
+                "is to be seen, got opaque ones"
+            )
+        effects.append(RandomBackground(config.seed, dataset.background))
+    if any(view.mask is not None for view in views):
+        from drgs.supervision import Masks
+
+        effects.append(Masks())
+    if config.cameras.optimise:
+        from drgs.camera_refinement import CameraRefinement
+
+        effects.append(CameraRefinement(config.cameras, len(views), dataset.extent))
+    if config.model.smoothing:
+        from drgs.training_smoothing import TrainingSmoothing
+
+        effects.append(TrainingSmoothing())
+    return effects
+
+
+def integrator_settings(effects: Sequence[TrainingEffect]) -> dict[str, Any]:
+    """Settings of the integrator that effects need."""
+    aovs = ", ".join(effect.aovs for effect in effects if effect.aovs)
+    return {"aovs": aovs} if aovs else {}
+
+
+# ----------------------------------------------------------------------------------------------
+# Plans
+# ----------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Effect:
+    """A line of a plan."""
+
+    name: str
+    what: str | None  # that is simulated; None: nothing is
+    why: str = ""  # what asked for it
+
+
+def described(effects: Sequence[Effect]) -> str:
+    """The plan as text: one line for each effect that is simulated, one for all the others."""
+    lines = [f"  {e.name}: {e.what} ({e.why})" for e in effects if e.what is not None]
+    absent = [e.name for e in effects if e.what is None]
+    if absent:
+        lines.append(f"  not simulated: {', '.join(absent)}")
+    return "simulated:\n" + "\n".join(lines)
+
+
+def plan_of_fit(config: FitConfig, dataset: Dataset) -> list[Effect]:
+    """What a fit simulates."""
+    views, model = dataset.train, config.model
+    return [
+        _view_dependence(model.sh_degree, f"model.sh_degree: {model.sh_degree}"),
+        _background(config),
+        lens_effect(views),
+        motion_effect(views),
+        _antialiasing(
+            "model.antialiased" if model.antialiased else None,
+            "model.smoothing" if model.smoothing else None,
+        ),
+        Effect(
+            "exposure and white balance",
+            None if config.colors.lr is None else "a colour transform for each training photograph",
+            "colors.lr",
+        ),
+        _of_data("masks", [v.mask for v in views], "pixels left out", "the dataset's masks"),
+        _of_data(
+            "depth",
+            [v.depth for v in views] if config.loss.depth_weight > 0 else [],
+            "supervision",
+            "the dataset's depth",
+        ),
+        Effect(
+            "camera refinement",
+            _refined(config) if config.cameras.optimise else None,
+            "cameras.optimise",
+        ),
+    ]
+
+
+def plan_of_scene(integrator: Any, camera: Any, environment: Any) -> list[Effect]:
+    """What the integrator ``splats`` simulates for a sensor's camera in front of an environment."""
+    choices, lens, shutter = integrator.choices, camera.lens, camera.shutter
+    background = Effect("background", "a constant colour", "the integrator's background")
+    if environment is not None and not integrator.hide_emitters:
+        background = Effect("background", "an environment", "the scene's emitter")
+    elif hasattr(integrator.background, "eval"):
+        background = Effect("background", "a picture", "the integrator's background")
+    motion = {None: None, "MotionBlur": "blurred", "RollingShutter": "rolling shutter"}
+    smooth = integrator.gaussians.smoothing is not None
+    return [
+        _view_dependence(integrator.sh_degree, "the Gaussians' coefficients"),
+        background,
+        Effect(
+            "lens",
+            None if type(lens).__name__ == "Pinhole" else _lens_words(lens),
+            "the sensor",
+        ),
+        Effect("depth of field", None if camera.aperture is None else "a thin lens", "the sensor"),
+        Effect("motion", motion[None if shutter is None else type(shutter).__name__], "the sensor"),
+        _antialiasing(
+            "antialiased" if choices.antialiased else None,
+            "the Gaussians' filter" if smooth else None,
+        ),
+    ]
+
+
+def _lens_words(lens: Any) -> str:
+    names = ", ".join(lens.named())
+    return type(lens).__name__ + (f" ({names})" if names else "")
+
+
+def _antialiasing(opacities: str | None, smoothing: str | None) -> Effect:
+    """By what asked for either."""
+    what = _joined(
+        "opacities compensated for the low-pass filter" if opacities else None,
+        "3D smoothing filter" if smoothing else None,
+    )
+    return Effect("antialiasing", what, _joined(opacities, smoothing) or "")
+
+
+def _view_dependence(degree: int, why: str) -> Effect:
+    what = None if degree == 0 else f"spherical harmonics up to degree {degree}"
+    return Effect("view dependence", what, why)
+
+
+def _background(config: FitConfig) -> Effect:
+    if config.data.random_background:
+        return Effect("background", "a random colour at each iteration", "data.random_background")
+    return Effect("background", f"{config.data.background}", "data.background")
+
+
+def lens_effect(views: Sequence[View]) -> Effect:
+    """Lenses that are no pinholes."""
+    bent = [view.lens for view in views if view.lens is not None]
+    kinds = sorted({f"{lens.kind} ({', '.join(lens.named())})" for lens in bent})
+    return Effect(
+        "lens distortion", " and ".join(kinds) or None, f"{len(bent)} of the dataset's cameras"
+    )
+
+
+def motion_effect(views: Sequence[View]) -> Effect:
+    """Cameras that move while a photograph is taken."""
+    moving = [view.motion.shutter for view in views if view.motion is not None]
+    shutters = " and ".join(f"{kind} shutter" for kind in sorted(set(moving)))
+    return Effect("motion", shutters or None, f"{len(moving)} of the dataset's cameras")
+
+
+def _of_data(name: str, values: Sequence[Any], what: str, why: str) -> Effect:
+    count = sum(value is not None for value in values)
+    return Effect(name, what if count else None, f"{why}, in {count} views")
+
+
+def _refined(config: FitConfig) -> str:
+    rates = config.cameras
+    return (
+        _joined(
+            "poses" if rates.rotation_lr or rates.translation_lr else None,
+            "focal lengths" if rates.focal_lr else None,
+            "principal point" if rates.principal_lr else None,
+        )
+        or "nothing: all rates are 0"
+    )
+
+
+def _joined(*parts: str | None) -> str | None:
+    return ", ".join(part for part in parts if part) or None
