@@ -92,7 +92,9 @@ class CameraRefinement(TrainingEffect):
                 dr.accum_grad(value, dr.grad(self.numbers[name]))
                 dr.enqueue(dr.ADMode.Backward, value)
         dr.traverse(dr.ADMode.Backward)
-        self.parameters.step(view.index, self.leaves)
+        # As the rate of the means, which are what cameras are refined against.
+        decay = trainer.means_lr(trainer.iteration) / trainer.means_lr.initial
+        self.parameters.step(view.index, self.leaves, decay)
 
     @staticmethod
     def _camera(start: _Start, leaves: dict[str, mi.Float]) -> dict[str, Any]:

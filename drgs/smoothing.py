@@ -9,6 +9,7 @@ being the largest rate of all cameras that see it, and keeps its integral.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from dataclasses import replace
 from typing import Any
@@ -53,7 +54,7 @@ def smoothing_of(means: Any, cameras: Iterable[Camera]) -> Any:
         rates = dr.maximum(rates, _rates(points, camera))
         dr.eval(rates)
     lowest = dr.min(dr.select(rates > 0, rates, dr.inf))
-    return np.sqrt(VARIANCE) / dr.select(rates > 0, rates, lowest)
+    return math.sqrt(VARIANCE) / dr.select(rates > 0, rates, lowest)
 
 
 def _rates(points: Any, camera: Camera) -> Any:

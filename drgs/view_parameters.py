@@ -19,9 +19,9 @@ class ViewParameters:
         """values: (V, K) each, or (1, K) for all views; rates: per step."""
         # A view that is not seen has derivatives of zero; its numbers and moments stay.
         self.optimizer = Adam(lr=0.0, epsilon=1e-15, mask_updates=True)
+        self.rates = {name: float(rates[name]) for name in values}
         for name, value in values.items():
             self.optimizer[name] = mi.TensorXf(value.astype(np.float32))
-            self.optimizer.set_learning_rate({name: float(rates[name])})
 
     def leaves(self, index: int) -> dict[str, mi.Float]:
         """The numbers (K,) of a view, as variables of their own with derivatives enabled."""
@@ -35,8 +35,9 @@ class ViewParameters:
         dr.enable_grad(result)
         return result
 
-    def step(self, index: int, leaves: Mapping[str, mi.Float]) -> None:
-        """Move the view's numbers along the derivatives of its leaves."""
+    def step(self, index: int, leaves: Mapping[str, mi.Float], decay: float = 1.0) -> None:
+        """Move the view's numbers along the leaves' derivatives; decay: factor of the rates."""
+        self.optimizer.set_learning_rate({k: decay * rate for k, rate in self.rates.items()})
         for name, value in self.optimizer.items():
             count = value.shape[1]
             row = index if value.shape[0] > 1 else 0

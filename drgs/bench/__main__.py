@@ -6,13 +6,14 @@ import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
-from drgs.bench import accuracy, population, scaling, speed, stability, training, volprim
+from drgs.bench import accuracy, effects, population, scaling, speed, stability, training, volprim
 from drgs.checks import exit_on_user_error
 
 COMMANDS = {
     "speed": speed,
     "scaling": scaling,
     "accuracy": accuracy,
+    "effects": effects,
     "training": training,
     "volprim": volprim,
     "stability": stability,

@@ -6,7 +6,9 @@ the kernels' camera in any precision.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
 
 import drjit.llvm.ad as llvm
 import numpy as np
@@ -16,6 +18,7 @@ from drgs.camera import Camera
 from drgs.config import FitConfig
 from drgs.data.types import Dataset, View
 from drgs.gaussians import Gaussians
+from drgs.schedule import changed
 from drgs.trainer import Trainer
 
 BENCH_TO_WORLD = np.array(
@@ -95,26 +98,35 @@ def frame_of(scene: Scene) -> rendering.Frame:
     return rendering.render(scene.gaussians.to(llvm.TensorXf), camera, pipeline)
 
 
-def trainer_of(scene: Scene) -> Trainer:
-    """Its target is the scene's own picture, moved by a pixel: a gradient of realistic size."""
+def view_of(scene: Scene) -> View:
+    """The scene's own picture, moved by a pixel: derivatives of realistic size."""
     camera = scene.camera
     _, *planes = frame_of(scene).planes()
     image = np.stack([np.array(p).reshape(camera.height, camera.width) for p in planes], axis=-1)
     to_world = np.eye(4)
     to_world[:3, :3], to_world[:3, 3] = camera.rotation.T, camera.center
-    view = View(
+    return View(
         "bench", np.clip(np.roll(image, 1, axis=1), 0, 1).astype(np.float32), to_world,
         camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height,
     )  # fmt: skip
+
+
+def trainer_of(
+    scene: Scene, changes: Mapping[str, Any] = {}, extras: Mapping[str, np.ndarray] = {}
+) -> Trainer:
+    """Trains on one view; the population stays, though statistics are gathered as in a fit.
+
+    changes: of the configuration, as ``model.smoothing``; extras: of the view, besides colours.
+    """
+    view = replace(view_of(scene), **extras)
     dataset = Dataset((view,), (view,), "bench", (1.0, 1.0, 1.0), None, "bench")
     config = FitConfig(
         data={"path": "."},
         model={"sh_degree": scene.gaussians.sh_degree, "sh_increase_every": 1},
-        # Statistics are gathered as in a fit, but the population stays.
         densify={"start": 1_000_000, "stop": 1_000_001, "reset_every": 1_000_000},
         iterations=2_000_000,
     )
-    trainer = Trainer(config, dataset, scene.gaussians)
+    trainer = Trainer(changed(config, changes), dataset, scene.gaussians)
     trainer.iteration = 10  # all SH degrees are in use
     return trainer
 

@@ -1,0 +1,345 @@
+"""``python -m drgs.bench effects``: what each effect costs, on the bench scene.
+
+Layer 5. Two tables. The first is of what the integrator simulates: a picture and its derivatives
+with an effect against the same without it. The second is of what takes part in the iterations of a
+fit. An effect and what it is compared with are timed in turns, so that whatever else the machine
+does meets both; medians are reported, and the number of operations in their kernels.
+"""
+
+from __future__ import annotations
+
+import argparse
+import statistics
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from drgs.bench.output import machine, markdown_table, new_figure, write_csv, write_figure
+from drgs.bench.scenes import Scene, bench_camera, bench_gaussians, trainer_of
+from drgs.gaussians import PARAMETER_NAMES, Gaussians
+
+DESCRIPTION = "what each effect costs: time and operations with and without it"
+
+SIZE = 400
+"""px: width and height of all pictures."""
+
+NUM_GAUSSIANS = 100_000
+
+ROUNDS, QUICK_ROUNDS = 11, 3
+
+ENVIRONMENT = (64, 128)
+"""Rows and columns of the environment, and of the picture behind the splats."""
+
+
+@dataclass(frozen=True)
+class Case:
+    """A picture with an effect, or without any."""
+
+    effect: str
+    variant: str
+    sensor: dict[str, Any] = field(default_factory=dict)  # instead of a perspective one
+    integrator: dict[str, Any] = field(default_factory=dict)
+    scene: dict[str, Any] = field(default_factory=dict)
+    sh_degree: int = 3
+    smoothing: bool = False
+    of_camera: bool = False  # whether derivatives of the pose and the lens are asked for
+    against: str = "none"  # variant that it is compared with
+
+
+@dataclass(frozen=True)
+class Price:
+    """Medians, ms, and operations in the kernels; of the case, and of what it is compared with."""
+
+    effect: str
+    variant: str
+    against: str
+    forward_ms: float
+    both_ms: float
+    forward_ratio: float
+    both_ratio: float
+    operations: int
+    operations_more: int
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Options besides ``--out``."""
+    parser.add_argument("--quick", action="store_true", help="10,000 Gaussians, few rounds")
+
+
+def run(args: argparse.Namespace) -> None:
+    """Measure all cases; write tables, CSV and a plot."""
+    mi.set_variant("llvm_ad_rgb")
+    count, rounds = (10_000, QUICK_ROUNDS) if args.quick else (NUM_GAUSSIANS, ROUNDS)
+    gaussians = bench_gaussians(count)
+    print(f"{machine()}\nbench scene, {count:,} Gaussians, {SIZE}x{SIZE}")
+    rendered = measure(rendering_cases(), lambda case: Renderer(case, gaussians), rounds)
+    print(f"\n{table(rendered, 'picture', 'picture + derivatives')}", flush=True)
+    fitted = measure(fitting_cases(), lambda case: Fitter(case, gaussians), rounds)
+    print(f"\n{table(fitted, '', 'training iteration')}")
+    prices = [*rendered, *fitted]
+    rows = [list(vars(price).values()) for price in prices]
+    write_csv(args.out / "effects.csv", list(Price.__dataclass_fields__), rows)
+    write_figure(args.out / "effects.png", plot(prices))
+    print(f"\nwritten: {args.out / 'effects.csv'}, {args.out / 'effects.png'}")
+
+
+# ----------------------------------------------------------------------------------------------
+# What the integrator simulates
+# ----------------------------------------------------------------------------------------------
+
+
+def rendering_cases() -> list[Case]:
+    """The first is what the others are compared with, unless they say otherwise."""
+    focal = bench_camera(SIZE).fx
+    calibrated = {"type": "calibrated", "fx": focal, "fy": focal}
+    moving = calibrated | {"to_world_close": _to_world(0.02)}
+    fox = {"k1": 0.0578421, "k2": -0.0805099, "p1": -0.000980296, "p2": 0.00015575}
+    rational = fox | {"k3": 0.01, "k4": 0.02, "k5": -0.01, "k6": 0.005}
+    sky = {"type": "envmap", "bitmap": _bitmap()}
+    # An orthographic film is 2 units wide: the camera is scaled to what the others see.
+    wide = mi.ScalarTransform4f().scale([1.4, 1.4, 1])
+    return [
+        Case("none", "none"),
+        *(Case("view dependence", f"SH degree {k}", sh_degree=k) for k in range(3)),
+        Case("background", "environment", scene={"sky": sky}),
+        Case(
+            "background",
+            "picture",
+            integrator={"background": {"type": "bitmap", "bitmap": _bitmap(), "raw": True}},
+        ),
+        Case("lens", "distortion: k1 k2 p1 p2", calibrated | {"lens": "opencv", **fox}),
+        Case("lens", "distortion: k1 to k6, p1 p2", calibrated | {"lens": "opencv", **rational}),
+        Case("lens", "fisheye: k1 k2", calibrated | {"lens": "fisheye", "k1": 0.03, "k2": -0.01}),
+        Case(
+            "lens",
+            "orthographic",
+            {"type": "orthographic", "to_world": _to_world(0.0) @ wide},
+        ),
+        Case(
+            "depth of field",
+            "thin lens",
+            _perspective() | {"type": "thinlens", "aperture_radius": 0.05, "focus_distance": 3.2},
+        ),
+        Case("motion", "blur, 8 times", moving | {"shutter_samples": 8}),
+        Case("motion", "rolling shutter", moving | {"shutter": "rolling"}),
+        Case("antialiasing", "opacity compensation", integrator={"antialiased": True}),
+        Case("antialiasing", "3D smoothing filter", smoothing=True),
+        Case("camera refinement", "pose and focal lengths", calibrated, of_camera=True),
+    ]
+
+
+def _to_world(shift: float) -> mi.ScalarTransform4f:
+    """Of the bench camera, moved to its right; world units."""
+    camera, pose = bench_camera(SIZE), np.eye(4)
+    pose[:3, :3] = camera.rotation.T * [-1, -1, 1]  # Mitsuba's x is to the left, its y up
+    pose[:3, 3] = camera.center + shift * camera.rotation[0]
+    return mi.ScalarTransform4f(pose)
+
+
+def _perspective() -> dict[str, Any]:
+    camera = bench_camera(SIZE)
+    fov = float(np.degrees(2 * np.arctan(SIZE / 2 / camera.fx)))
+    return {"type": "perspective", "fov": fov, "fov_axis": "x"}
+
+
+def _bitmap() -> mi.Bitmap:
+    return mi.Bitmap(np.random.default_rng(1).uniform(size=(*ENVIRONMENT, 3)).astype(np.float32))
+
+
+class Renderer:
+    """Pictures of the bench scene, and their derivatives in all parameters."""
+
+    def __init__(self, case: Case, gaussians: Gaussians) -> None:
+        """gaussians: numpy, SH of degree 3."""
+        sensor = {
+            "to_world": _to_world(0.0),
+            "film": {
+                "type": "hdrfilm",
+                "width": SIZE,
+                "height": SIZE,
+                "pixel_format": "rgb",
+                "rfilter": {"type": "box"},
+            },
+            "sampler": {"type": "independent", "sample_count": 1},
+            **(case.sensor or _perspective()),
+        }
+        uploaded = gaussians.to(mi.TensorXf)
+        integrator = {
+            "type": "splats",
+            "background": [1.0, 1.0, 1.0],
+            "sh_degree": case.sh_degree,
+            **{name: getattr(uploaded, name) for name in PARAMETER_NAMES},
+            **case.integrator,
+        }
+        if case.smoothing:
+            integrator["smoothing"] = dr.full(mi.Float, 1e-3, gaussians.num_gaussians)
+        self.scene = mi.load_dict(
+            {"type": "scene", "integrator": integrator, "sensor": sensor, **case.scene}
+        )
+        self.params = mi.traverse(self.scene)
+        names = [f"integrator.{name}" for name in PARAMETER_NAMES]
+        if case.of_camera:
+            names += ["sensor.to_world", "sensor.fx", "sensor.fy"]
+        for name in names:
+            dr.enable_grad(self.params[name])
+        weights = np.random.default_rng(0).normal(size=(SIZE, SIZE, 3)).astype(np.float32)
+        self.weights = mi.TensorXf(weights)
+
+    def forward(self) -> None:
+        """Render a picture."""
+        with dr.suspend_grad():
+            dr.eval(self._render())
+        dr.sync_thread()
+
+    def both(self) -> None:
+        """And its derivatives."""
+        dr.backward(dr.sum(self._render() * self.weights, axis=None))
+        dr.eval(dr.grad(self.params["integrator.means"]))
+        dr.sync_thread()
+
+    def _render(self) -> mi.TensorXf:
+        # Nothing of the last picture may be used again.
+        self.params.set_dirty("integrator.means")
+        self.params.update()
+        return mi.render(self.scene, self.params, spp=1)
+
+
+# ----------------------------------------------------------------------------------------------
+# What takes part in a fit
+# ----------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class FittingCase:
+    """A training iteration with an effect, or without any."""
+
+    effect: str
+    variant: str
+    changes: dict[str, Any] = field(default_factory=dict)  # of the configuration
+    view: tuple[str, ...] = ()  # what the data has besides colours
+    against: str = "none"
+
+
+def fitting_cases() -> list[FittingCase]:
+    """The first is what the others are compared with."""
+    return [
+        FittingCase("none", "none"),
+        FittingCase("background", "random", {"data.random_background": True}, ("alpha",)),
+        FittingCase("exposure and white balance", "", {"colors.lr": 1e-3}),
+        FittingCase("masks", "", view=("mask",)),
+        FittingCase("depth", "supervision", view=("depth",)),
+        FittingCase("camera refinement", "poses", {"cameras.optimise": True}),
+        FittingCase("antialiasing", "3D smoothing filter", {"model.smoothing": True}),
+    ]
+
+
+class Fitter:
+    """Training iterations on the bench scene; the population stays."""
+
+    def __init__(self, case: FittingCase, gaussians: Gaussians) -> None:
+        """gaussians: numpy."""
+        scene = Scene("bench", gaussians, bench_camera(SIZE))
+        self.trainer = trainer_of(scene, case.changes, {name: _extra(name) for name in case.view})
+
+    def forward(self) -> None:
+        """There is no half iteration."""
+
+    def both(self) -> None:
+        """One iteration."""
+        self.trainer.step()
+        dr.sync_thread()
+
+
+def _extra(name: str) -> np.ndarray:
+    """What the data has of a view besides colours; depth: that of the box's middle."""
+    values = np.ones((SIZE, SIZE), np.float32)
+    if name == "depth":
+        return 4 * values
+    values[:, : SIZE // 4] = 0
+    return values
+
+
+# ----------------------------------------------------------------------------------------------
+# Measuring
+# ----------------------------------------------------------------------------------------------
+
+
+def measure(cases: list[Any], make: Callable[[Any], Any], rounds: int) -> list[Price]:
+    """Each case and the first one in turns."""
+    base, prices = make(cases[0]), []
+    base_operations = operations(base)
+    for case in cases:
+        subject = make(case)
+        count = operations(subject)
+        times: dict[str, list[float]] = {k: [] for k in ("f", "b", "base f", "base b")}
+        for _ in range(rounds):
+            for prefix, measured in (("base ", base), ("", subject)):
+                times[f"{prefix}f"].append(_seconds(measured.forward))
+                times[f"{prefix}b"].append(_seconds(measured.both))
+        forward, both, base_forward, base_both = (
+            1e3 * statistics.median(times[k]) for k in ("f", "b", "base f", "base b")
+        )
+        prices.append(
+            Price(
+                effect=case.effect,
+                variant=case.variant,
+                against=case.against,
+                forward_ms=forward,
+                both_ms=both,
+                forward_ratio=forward / base_forward,
+                both_ratio=both / base_both,
+                operations=count,
+                operations_more=count - base_operations,
+            )
+        )
+        print(f"{case.effect}, {case.variant}: x{both / base_both:.2f}", flush=True)
+    return prices
+
+
+def operations(subject: Any) -> int:
+    """In all kernels of a picture and its derivatives, or of an iteration; warms up."""
+    for _ in range(2):
+        subject.forward()
+        subject.both()
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
+        dr.kernel_history_clear()
+        subject.both()
+        kernels = dr.kernel_history()
+    return sum(k["operation_count"] for k in kernels if k["type"] == dr.KernelType.JIT)
+
+
+def _seconds(function: Callable[[], None]) -> float:
+    started = time.perf_counter()
+    function()
+    return time.perf_counter() - started
+
+
+def table(prices: list[Price], forward: str, both: str) -> str:
+    """As the README holds it; without a name for pictures, there is no column of them."""
+    header = ["effect", "", *([forward, "ratio"] if forward else []), both, "ratio"]
+    rows = []
+    for p in prices:
+        first = [f"{p.forward_ms:.1f} ms", f"{p.forward_ratio:.2f}"] if forward else []
+        more = f"{p.operations_more:+,}" if p.operations_more else "0"
+        rows.append(
+            [p.effect, p.variant, *first, f"{p.both_ms:.1f} ms", f"{p.both_ratio:.2f}", more]
+        )
+    return markdown_table([*header, "operations"], rows)
+
+
+def plot(prices: list[Price]) -> Any:
+    """What each effect adds to the time, by bar."""
+    figure = new_figure(9, 0.3 * len(prices) + 1)
+    axes = figure.subplots()
+    labels = [f"{p.effect}: {p.variant}" if p.variant else p.effect for p in prices]
+    bars = axes.barh(labels, [p.both_ratio for p in prices])
+    axes.bar_label(bars, [f"{p.both_ratio:.2f}" for p in prices], padding=3, fontsize=8)
+    axes.axvline(1, color="0.4", linewidth=1)
+    axes.set(xlabel="time with derivatives, without the effect = 1", title="what effects cost")
+    axes.invert_yaxis()
+    return figure
