@@ -8,7 +8,8 @@ the principal point. The derivatives come from the integrator: see ``camera.Came
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -27,6 +28,9 @@ if TYPE_CHECKING:
     from drgs.trainer import Trainer, TrainingView
 
 CAMERAS = "cameras.json"
+
+MITSUBA_AXES = np.diag([-1.0, -1.0, 1.0, 1.0])
+"""From OpenCV's: Mitsuba's camera has x to the left and y up."""
 
 INTRINSICS = ("fx", "fy", "cx", "cy")
 
@@ -110,8 +114,7 @@ class CameraRefinement(TrainingEffect):
         if "shifts" in leaves:
             right, down = _entries(leaves["shifts"])
             cx, cy = cx + right * start.size.x, cy + down * start.size.y
-        # Mitsuba's camera has x to the left and y up.
-        signs = mi.Matrix4f(np.diag([-1.0, -1.0, 1.0, 1.0]).astype(np.float32))
+        signs = mi.Matrix4f(MITSUBA_AXES.astype(np.float32))
         return {"to_world": moved @ signs, "fx": fx, "fy": fy, "cx": cx, "cy": cy}
 
     def state(self) -> dict[str, np.ndarray]:
@@ -122,29 +125,29 @@ class CameraRefinement(TrainingEffect):
         """Continue from :meth:`state`."""
         self.parameters.restore(state)
 
+    def refined(self, views: Sequence[View]) -> list[View]:
+        """The training views with their cameras as they are now."""
+        numbers, result = self.parameters.numpy(), []
+        for index, view in enumerate(views):
+            row = {name: mi.Float(v[min(index, len(v) - 1)]) for name, v in numbers.items()}
+            camera = self._camera(self.upload(view), row)
+            pose = np.array(camera.pop("to_world"))[..., 0].astype(np.float64) @ MITSUBA_AXES
+            values = {name: float(value[0]) for name, value in camera.items()}
+            result.append(replace(view, camera_to_world=pose, **values))
+        return result
+
     def write(self, folder: Path, views: tuple[View, ...]) -> None:
         """``cameras.json``: the refined training cameras, in the layout of ``transforms.json``."""
-        numbers = self.parameters.numpy()
-        frames = []
-        for index, view in enumerate(views):
-            row = {k: mi.Float(v[min(index, len(v) - 1)]) for k, v in numbers.items()}
-            camera = self._camera(self.upload(view), row)
-            values = {name: float(camera[name][0]) for name in INTRINSICS}
-            pose = np.array(camera["to_world"])[..., 0].astype(np.float64)
-            pose @= np.diag([-1.0, 1.0, -1.0, 1.0])  # to OpenGL axes
-            frames.append(
-                {
-                    "file_path": view.name,
-                    "transform_matrix": pose.tolist(),
-                    "fl_x": values["fx"],
-                    "fl_y": values["fy"],
-                    "cx": values["cx"],
-                    "cy": values["cy"],
-                    "w": view.width,
-                    "h": view.height,
-                }
-                | (view.lens.named() if view.lens is not None else {})
-            )
+        frames = [
+            {
+                "file_path": view.name,
+                "transform_matrix": (view.camera_to_world * [1, -1, -1, 1]).tolist(),
+                **{"fl_x": view.fx, "fl_y": view.fy, "cx": view.cx, "cy": view.cy},
+                **{"w": view.width, "h": view.height},
+                **(view.lens.named() if view.lens is not None else {}),
+            }
+            for view in self.refined(views)
+        ]
         with atomic_path(folder / CAMERAS) as temporary:
             temporary.write_text(json.dumps({"frames": frames}, indent=1) + "\n")
 

@@ -6,7 +6,17 @@ import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
-from drgs.bench import accuracy, effects, population, scaling, speed, stability, training, volprim
+from drgs.bench import (
+    accuracy,
+    benefits,
+    effects,
+    population,
+    scaling,
+    speed,
+    stability,
+    training,
+    volprim,
+)
 from drgs.checks import exit_on_user_error
 
 COMMANDS = {
@@ -14,6 +24,7 @@ COMMANDS = {
     "scaling": scaling,
     "accuracy": accuracy,
     "effects": effects,
+    "benefits": benefits,
     "training": training,
     "volprim": volprim,
     "stability": stability,

@@ -1,0 +1,317 @@
+"""``python -m drgs.bench benefits``: what effects are good for.
+
+Layer 5. The shipped scene is fitted at a small size to pictures that were spoiled in a known way,
+with the effect that is made for it and without: other exposures, something before the lens that a
+mask leaves out, few pictures with and without depth, cameras that are somewhere else than the data
+says, colours behind transparent pictures; and renderings at other sizes than that of the fit. All
+fits are measured on pictures that were not spoiled.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from drgs.bench.output import machine, markdown_table, write_csv
+from drgs.capture import first_hits, load_scene
+from drgs.config import FitConfig, load_config
+from drgs.data import initial_gaussians, load_dataset
+from drgs.data.images import smaller_view
+from drgs.data.types import Dataset, View
+from drgs.metrics import mean_quality
+from drgs.schedule import changed, with_iterations
+from drgs.trainer import Trainer, render_views
+
+DESCRIPTION = "what effects are good for: fits of spoiled data with and without them"
+
+SCENES = Path(__file__).parents[2] / "scenes"
+CONFIG = SCENES / "lego_mini.yml"
+GENERATOR = SCENES / "brick_crane.py"
+
+SIZE = 100
+"""px: width and height of the pictures that are fitted."""
+
+ITERATIONS, QUICK_ITERATIONS = 3000, 60
+
+NUM_POINTS = 20_000
+
+FEW = 8
+"""Pictures, where depth is to help."""
+
+Measure = Callable[[Trainer, Dataset, Dataset], dict[str, float]]
+
+
+@dataclass(frozen=True)
+class Case:
+    """One fit."""
+
+    effect: str
+    name: str
+    spoil: Callable[[Dataset, np.random.Generator], Dataset] = lambda data, rng: data
+    changes: tuple[tuple[str, Any], ...] = ()  # of the configuration
+    measure: Measure | None = None  # None: quality on the test views
+
+
+@dataclass(frozen=True)
+class Result:
+    """What a fit was measured to be."""
+
+    effect: str
+    name: str
+    quantity: str
+    value: float
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Options besides ``--out``."""
+    parser.add_argument("--quick", action="store_true", help="a few iterations each")
+    parser.add_argument("--only", nargs="+", metavar="EFFECT", help="such as masks")
+
+
+def run(args: argparse.Namespace) -> None:
+    """Fit all cases; write a table and CSV."""
+    mi.set_variant("llvm_ad_rgb")
+    config = base_config(QUICK_ITERATIONS if args.quick else ITERATIONS)
+    dataset = load_dataset(config.data)
+    results = []
+    for case in CASES:
+        if args.only and case.effect not in args.only:
+            continue
+        found = fit_case(case, config, dataset)
+        results += [Result(case.effect, case.name, k, v) for k, v in found.items()]
+        numbers = ", ".join(f"{k} {v:.4g}" for k, v in found.items())
+        print(f"{case.effect}, {case.name}: {numbers}", flush=True)
+    print(f"\n{machine()}; {SIZE}x{SIZE}, {config.iterations} iterations\n\n{table(results)}")
+    rows = [list(vars(result).values()) for result in results]
+    write_csv(args.out / "benefits.csv", list(Result.__dataclass_fields__), rows)
+    print(f"\nwritten: {args.out / 'benefits.csv'}")
+
+
+def base_config(iterations: int) -> FitConfig:
+    """The small scene's configuration, at a smaller size."""
+    config = changed(load_config(CONFIG), {"data.image_size": SIZE, "init.num_points": NUM_POINTS})
+    return with_iterations(config, iterations)
+
+
+def fit_case(case: Case, config: FitConfig, dataset: Dataset) -> dict[str, float]:
+    """Measure one fit."""
+    spoiled = case.spoil(dataset, np.random.default_rng(0))
+    config = changed(config, dict(case.changes))
+    trainer = Trainer(config, spoiled, initial_gaussians(config, spoiled))
+    for _ in range(config.iterations):
+        trainer.step()
+    trainer.gaussians()  # what effects leave for renderings is there
+    return (case.measure or quality)(trainer, dataset, spoiled)
+
+
+# ----------------------------------------------------------------------------------------------
+# What is spoiled
+# ----------------------------------------------------------------------------------------------
+
+
+def _each_train(dataset: Dataset, change: Callable[[View], View]) -> Dataset:
+    return replace(dataset, train=tuple(change(view) for view in dataset.train))
+
+
+def spoil_exposure(dataset: Dataset, rng: np.random.Generator) -> Dataset:
+    """Each training picture has gains and offsets of its own."""
+
+    def exposed(view: View) -> View:
+        gains, offsets = rng.uniform(0.7, 1.3, 3), rng.uniform(-0.05, 0.05, 3)
+        return _with_image(view, np.clip(view.image * gains + offsets, 0, 1))
+
+    return _each_train(dataset, exposed)
+
+
+def spoil_parts(dataset: Dataset, rng: np.random.Generator) -> Dataset:
+    """A red square hides a sixth of each training picture."""
+
+    def hidden(view: View) -> View:
+        mask, side = np.ones((view.height, view.width), np.float32), round(0.4 * view.width)
+        row, column = rng.integers(0, view.width - side, 2)
+        mask[row : row + side, column : column + side] = 0
+        red = np.array([1.0, 0.0, 0.0])
+        image = np.where(mask[:, :, None] > 0, view.image, red)
+        return replace(_with_image(view, image), mask=mask)
+
+    return _each_train(dataset, hidden)
+
+
+def few_views(dataset: Dataset, rng: np.random.Generator) -> Dataset:
+    """:data:`FEW` training pictures are left, with the depth of the scene that they show."""
+    del rng
+    scene = load_scene(GENERATOR)
+    step = len(dataset.train) // FEW
+    kept = dataset.train[::step][:FEW]
+    return replace(dataset, train=tuple(replace(v, depth=depth_of(scene, v)) for v in kept))
+
+
+def depth_of(scene: mi.Scene, view: View) -> np.ndarray:
+    """(H, W) float32: depth of the surface at each pixel's centre, 0 where there is none."""
+    x, y = np.meshgrid(np.arange(view.width) + 0.5, np.arange(view.height) + 0.5)
+    local = np.stack([(x - view.cx) / view.fx, (y - view.cy) / view.fy, np.ones_like(x)], axis=-1)
+    rotation = view.camera_to_world[:3, :3]
+    hits, valid = first_hits(scene, view.center, local.reshape(-1, 3) @ rotation.T)
+    depths = (hits - view.center) @ rotation[:, 2]
+    return np.where(valid, depths, 0).reshape(view.height, view.width).astype(np.float32)
+
+
+def move_cameras(dataset: Dataset, rng: np.random.Generator) -> Dataset:
+    """The data says that training cameras are somewhere else, by a degree and 0.04 units."""
+
+    def moved(view: View) -> View:
+        pose = view.camera_to_world.copy()
+        turn = Rotation.from_rotvec(np.radians(rng.normal(0, 0.6, 3))).as_matrix()
+        pose[:3, :3] = pose[:3, :3] @ turn
+        pose[:3, 3] += rng.normal(0, 0.025, 3)
+        return replace(view, camera_to_world=pose)
+
+    return _each_train(dataset, moved)
+
+
+def stretch_lenses(dataset: Dataset, rng: np.random.Generator) -> Dataset:
+    """The data says that focal lengths are 4 % longer than they are."""
+    del rng
+    return _each_train(dataset, lambda view: replace(view, fx=1.04 * view.fx, fy=1.04 * view.fy))
+
+
+def _with_image(view: View, image: np.ndarray) -> View:
+    return replace(view, image=image.astype(np.float32))
+
+
+# ----------------------------------------------------------------------------------------------
+# What is measured
+# ----------------------------------------------------------------------------------------------
+
+
+def quality(trainer: Trainer, dataset: Dataset, spoiled: Dataset) -> dict[str, float]:
+    """On the test views."""
+    del spoiled
+    return {"PSNR, dB": _psnr(trainer, dataset.test)}
+
+
+def at_sizes(trainer: Trainer, dataset: Dataset, spoiled: Dataset) -> dict[str, float]:
+    """On the test views at other sizes than that of the fit."""
+    del dataset, spoiled
+    config = changed(trainer.config, {"data.image_size": None})
+    views = load_dataset(config.data).test
+    result = {}
+    for name, size in (("2x", 2 * SIZE), ("1x", SIZE), ("1/2", SIZE // 2), ("1/4", SIZE // 4)):
+        resized = [smaller_view(view, view.width / size) for view in views]
+        result[f"PSNR at {name}, dB"] = _psnr(trainer, resized)
+    return result
+
+
+def cameras(trainer: Trainer, dataset: Dataset, spoiled: Dataset) -> dict[str, float]:
+    """How far the training cameras are from the true ones, and what they see from their pictures.
+
+    What all have in common (a similarity) is undone first. *Shift* is how far the picture of a
+    point at the middle of the scene, or a tenth of the distance around it, is from its place.
+    """
+    refinements = [effect for effect in trainer.effects if effect.name == "cameras"]
+    views = list(spoiled.train)
+    for refinement in refinements:
+        views = refinement.refined(views)
+    scale, turn, move = similarity([v.center for v in views], [v.center for v in dataset.train])
+    shifts, angles, distances = [], [], []
+    for view, true in zip(views, dataset.train, strict=True):
+        pose = np.eye(4)
+        pose[:3, :3] = turn @ view.camera_to_world[:3, :3]
+        pose[:3, 3] = scale * turn @ view.center + move
+        aligned = replace(view, camera_to_world=pose)
+        shifts.append(np.linalg.norm(_pixels(aligned) - _pixels(true), axis=1).mean())
+        relative = Rotation.from_matrix(pose[:3, :3].T @ true.camera_to_world[:3, :3])
+        angles.append(np.degrees(relative.magnitude()))
+        distances.append(np.linalg.norm(pose[:3, 3] - true.center))
+    focal = np.mean([v.fx / t.fx for v, t in zip(views, dataset.train, strict=True)])
+    seen = [replace(v, image=t.image, mask=None) for v, t in zip(views, dataset.train, strict=True)]
+    return {
+        "shift, px": float(np.mean(shifts)),
+        "rotation, degrees": float(np.mean(angles)),
+        "position, units": float(np.mean(distances)),
+        "focal length, %": float(100 * (focal - 1)),
+        "PSNR of training views, dB": _psnr(trainer, seen),
+    }
+
+
+def similarity(
+    points: Sequence[np.ndarray], targets: Sequence[np.ndarray]
+) -> tuple[float, np.ndarray, np.ndarray]:
+    """Scale, rotation and translation that bring points closest to targets (Umeyama 1991)."""
+    a, b = np.array(points), np.array(targets)
+    a0, b0 = a - a.mean(axis=0), b - b.mean(axis=0)
+    u, s, vt = np.linalg.svd(b0.T @ a0)
+    sign = np.diag([1, 1, np.linalg.det(u @ vt)])
+    turn = u @ sign @ vt
+    scale = np.trace(np.diag(s) @ sign) / (a0**2).sum()
+    return float(scale), turn, b.mean(axis=0) - scale * turn @ a.mean(axis=0)
+
+
+def _pixels(view: View) -> np.ndarray:
+    """(27, 2) px: where a view sees a grid of points in the middle of the scene."""
+    grid = np.stack(np.meshgrid(*[[-0.4, 0.0, 0.4]] * 3), axis=-1).reshape(-1, 3)
+    x, y, z = view.camera_to_world[:3, :3].T @ (grid - view.center).T
+    return np.stack([view.fx * x / z + view.cx, view.fy * y / z + view.cy], axis=-1)
+
+
+def _psnr(trainer: Trainer, views: Sequence[View]) -> float:
+    pictures = render_views(trainer.scene, tuple(views))
+    return mean_quality((p, v.image) for p, v in zip(pictures, views, strict=True)).psnr
+
+
+# ----------------------------------------------------------------------------------------------
+# Cases
+# ----------------------------------------------------------------------------------------------
+
+REFINED = (("cameras.optimise", True), ("cameras.start", 300))
+
+CASES = (
+    Case("exposure and white balance", "without", spoil_exposure),
+    Case("exposure and white balance", "with", spoil_exposure, (("colors.lr", 3e-3),)),
+    Case("masks", "without", lambda data, rng: without(spoil_parts(data, rng), "mask")),
+    Case("masks", "with", spoil_parts),
+    Case("depth", "without", few_views, (("loss.depth_weight", 0.0),)),
+    Case("depth", "with", few_views),
+    Case("camera refinement", "poses, without", move_cameras, (), cameras),
+    Case("camera refinement", "poses, with", move_cameras, REFINED, cameras),
+    Case("camera refinement", "focal length, without", stretch_lenses, (), cameras),
+    Case(
+        "camera refinement",
+        "focal length, with",
+        stretch_lenses,
+        (*REFINED, ("cameras.focal_lr", 1e-3)),
+        cameras,
+    ),
+    Case("antialiasing", "none", measure=at_sizes),
+    Case("antialiasing", "opacities", changes=(("model.antialiased", True),), measure=at_sizes),
+    Case("antialiasing", "3D filter", changes=(("model.smoothing", True),), measure=at_sizes),
+    Case(
+        "antialiasing",
+        "both",
+        changes=(("model.antialiased", True), ("model.smoothing", True)),
+        measure=at_sizes,
+    ),
+)
+
+
+def without(dataset: Dataset, name: str) -> Dataset:
+    """The data without what it says besides colours."""
+    return _each_train(dataset, lambda view: replace(view, **{name: None}))
+
+
+def table(results: Sequence[Result]) -> str:
+    """A row for each quantity, a column for each fit of an effect."""
+    rows = []
+    for effect in dict.fromkeys(result.effect for result in results):
+        for name in dict.fromkeys(r.name for r in results if r.effect == effect):
+            values = [r for r in results if (r.effect, r.name) == (effect, name)]
+            text = "; ".join(f"{r.quantity} {r.value:.2f}" for r in values)
+            rows.append([effect, name, text])
+    return markdown_table(["effect", "fit", "measured"], rows)
