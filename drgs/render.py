@@ -31,6 +31,7 @@ import numpy as np
 from drgs.checks import UserError, exit_on_user_error
 from drgs.config import NAMED_COLORS, DataConfig, FitConfig, ModelConfig, load_config
 from drgs.data import Dataset, View, load_dataset
+from drgs.data.images import read_image
 from drgs.execution import add_options, execution
 from drgs.files import atomic_path
 from drgs.gaussians import Gaussians
@@ -69,7 +70,7 @@ class Model:
 
     gaussians: Gaussians
     settings: ModelConfig
-    background: tuple[float, float, float]  # display space
+    background: tuple[float, float, float] | Path  # display space; or a file with a picture
     config: FitConfig | None  # names the dataset
 
     def scene(self) -> mi.Scene:
@@ -130,20 +131,21 @@ def load_model(args: argparse.Namespace) -> Model:
         what = what / MODEL
     config = _load_config(config_path, args) if config_path is not None else None
     gaussians = read_ply(what)
+    model, background = ModelConfig(), NAMED_COLORS[DataConfig.model_fields["background"].default]
     if config is not None:
-        return Model(gaussians, config.model, config.data.background_rgb, config)
-    default = DataConfig.model_fields["background"].default
-    background = NAMED_COLORS[default] if args.background is None else _background(args)
-    return Model(gaussians, ModelConfig(), background, config=None)
+        model, background = config.model, config.data.background_rgb
+    if args.background is not None:
+        background = _background(args)
+    return Model(gaussians, model, background, config)
 
 
 def _load_config(path: Path, args: argparse.Namespace) -> FitConfig:
     overrides = list(args.overrides)
     if args.data is not None:
         overrides.append(f"data.path={args.data}")
-    if args.background is not None:
+    if args.background is not None and not isinstance(color := _background(args), Path):
         # Photographs with alpha are composited over it as well.
-        overrides.append(f"data.background={list(_background(args))}")
+        overrides.append(f"data.background={list(color)}")
     return load_config(path, overrides)
 
 
@@ -301,6 +303,11 @@ def _check_cameras(args: argparse.Namespace) -> None:
             "or --split with --scene CONFIG.yml"
         )
     mode = given[0] if given else "--split"
+    if mode == "--split" and args.background and isinstance(_background(args), Path):
+        raise UserError(
+            "--background: a picture is not what the photographs were composited over; use it with "
+            "--orbit, --camera or --origin"
+        )
     _check_unused(args, f"is not used with {mode}", _UNUSED[mode])
     if has_photographs and mode == "--orbit":
         _check_unused(args, "is not used here: it follows from the photographs' cameras", ("up",))
@@ -342,18 +349,22 @@ def _check_unused(args: argparse.Namespace, reason: str, names: Sequence[str]) -
             raise UserError(f"{option}: {reason}")
 
 
-def _background(args: argparse.Namespace) -> tuple[float, float, float]:
-    """Display space: a colour by name, or three numbers."""
+def _background(args: argparse.Namespace) -> tuple[float, float, float] | Path:
+    """Display space: a colour by name, or three numbers; or a file with a picture."""
     words = args.background
     if len(words) == 1 and words[0] in NAMED_COLORS:
         return NAMED_COLORS[words[0]]
+    if len(words) == 1 and Path(words[0]).is_file():
+        read_image(Path(words[0]))  # or says what is wrong with it
+        return Path(words[0])
     try:
         color = tuple(float(word) for word in words)
     except ValueError:
         color = ()
     if len(color) != 3 or not all(0 <= value <= 1 for value in color):
         raise UserError(
-            f"--background: must be white, black or three numbers in 0..1, got {' '.join(words)}"
+            "--background: must be white, black, three numbers in 0..1 or a picture's file, got "
+            + " ".join(words)
         )
     return color
 
@@ -402,7 +413,12 @@ def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     add("--up", **vector, help="up in the picture, of --origin or --orbit (default: 0 0 1)")
     add("--fov", type=float, metavar="DEGREES", help="horizontal field of view (default: 40)")
     add("--size", type=int, nargs=2, metavar=("W", "H"), help="px (default: 400 400)")
-    add("--background", nargs="+", metavar="COLOR", help="white, black or R G B in 0..1")
+    add(
+        "--background",
+        nargs="+",
+        metavar="COLOR",
+        help="white, black, R G B in 0..1, or a picture's file",
+    )
     add("--scene", type=Path, metavar="CONFIG.yml", help="configuration that names the photographs")
     add("--data", metavar="DIR", help="dataset folder (data.path)")
     add(

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from dataclasses import fields
+from pathlib import Path
 from typing import Any
 
 import mitsuba as mi
@@ -26,12 +27,13 @@ SQUARE_PIXEL_TOLERANCE = 0.01
 def make_scene(
     gaussians: Gaussians,
     model: ModelConfig,
-    background: tuple[float, float, float],
+    background: tuple[float, float, float] | Path,
     **settings: Any,
 ) -> mi.Scene:
     """A scene that holds nothing but the ``splats`` integrator, working in display space.
 
-    gaussians: numpy or Dr.Jit arrays; background: display space; settings: of the integrator.
+    gaussians: numpy or Dr.Jit arrays; background: display space, or a file with a picture;
+    settings: of the integrator.
     """
     uploaded = gaussians.to(mi.TensorXf)
     tensors = {name: getattr(uploaded, name) for name in PARAMETER_NAMES}
@@ -39,7 +41,7 @@ def make_scene(
         tensors["smoothing"] = uploaded.smoothing
     integrator = {
         "type": "splats",
-        "background": list(background),
+        "background": _picture(background) if isinstance(background, Path) else list(background),
         "near": model.near,
         **accuracy(model),
         "srgb_primitives": False,
@@ -47,6 +49,10 @@ def make_scene(
         **tensors,
     }
     return mi.load_dict({"type": "scene", "integrator": integrator})
+
+
+def _picture(path: Path) -> dict[str, Any]:
+    return {"type": "bitmap", "filename": str(path), "wrap_mode": "clamp"}
 
 
 def accuracy(model: ModelConfig) -> dict[str, Any]:
