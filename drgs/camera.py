@@ -286,6 +286,10 @@ def camera_from_sensor(state: SensorState) -> Camera:
     return camera
 
 
+IGNORABLE = ("distortion", "defocus", "motion", "smoothing")
+"""What a sensor or a file calls for and one may decide not to simulate; the last is no camera's."""
+
+
 def without(camera: Camera, ignored: Collection[str]) -> Camera:
     """A camera of which some is not simulated: ``distortion``, ``defocus``, ``motion``."""
     if "distortion" in ignored and camera.lens.distorts:

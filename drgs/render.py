@@ -28,6 +28,7 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
+from drgs.camera import IGNORABLE
 from drgs.checks import UserError, exit_on_user_error
 from drgs.config import NAMED_COLORS, DataConfig, FitConfig, ModelConfig, load_config
 from drgs.data import Dataset, View, load_dataset
@@ -72,10 +73,12 @@ class Model:
     settings: ModelConfig
     background: tuple[float, float, float] | Path  # display space; or a file with a picture
     config: FitConfig | None  # names the dataset
+    ignored: str = ""  # effects that are not to be simulated: see the plugin
 
     def scene(self) -> mi.Scene:
         """A Mitsuba scene that renders in display space."""
-        return make_scene(self.gaussians, self.settings, self.background)
+        settings = {"ignore": self.ignored} if self.ignored else {}
+        return make_scene(self.gaussians, self.settings, self.background, **settings)
 
     def pictures(self, views: Sequence[View | Viewpoint]) -> Iterator[np.ndarray]:
         """Pictures (H, W, 3) of the views, after a plan of what is simulated in the first."""
@@ -136,7 +139,7 @@ def load_model(args: argparse.Namespace) -> Model:
         model, background = config.model, config.data.background_rgb
     if args.background is not None:
         background = _background(args)
-    return Model(gaussians, model, background, config)
+    return Model(gaussians, model, background, config, ", ".join(args.ignore or ()))
 
 
 def _load_config(path: Path, args: argparse.Namespace) -> FitConfig:
@@ -330,7 +333,7 @@ def _check_numbers(args: argparse.Namespace) -> None:
 
 _OPTIONS = (
     *("scene", "data", "overrides", "split", "orbit", "camera", "origin"),
-    *("target", "up", "fov", "size", "background"),
+    *("target", "up", "fov", "size", "background", "ignore"),
 )
 """All options that concern Gaussians."""
 
@@ -418,6 +421,13 @@ def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
         nargs="+",
         metavar="COLOR",
         help="white, black, R G B in 0..1, or a picture's file",
+    )
+    add(
+        "--ignore",
+        nargs="+",
+        choices=IGNORABLE,
+        metavar="EFFECT",
+        help=f"what is not to be simulated: {', '.join(IGNORABLE)}",
     )
     add("--scene", type=Path, metavar="CONFIG.yml", help="configuration that names the photographs")
     add("--data", metavar="DIR", help="dataset folder (data.path)")

@@ -18,6 +18,7 @@ import numpy as np
 from drgs import rendering
 from drgs.arrays import interleave
 from drgs.camera import (
+    IGNORABLE,
     Camera,
     SensorState,
     camera_from_sensor,
@@ -41,8 +42,6 @@ class _Aov:
     channel: str  # behind the name, as Mitsuba names channels
     feature: Any  # that is composited; None: nothing besides the transmittance
 
-
-IGNORABLE = ("distortion", "defocus", "motion", "smoothing")
 
 AOVS = {"depth": _Aov("T", rendering.depth_feature), "alpha": _Aov("I", None)}
 
