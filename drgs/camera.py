@@ -281,7 +281,9 @@ def camera_from_sensor(state: SensorState) -> Camera:
 
     ``state.make(state)`` is the one that Dr.Jit differentiates in the sensor's parameters.
     """
-    camera = state.make(state.detached())
+    state = state.detached()
+    dr.make_opaque(state.device)  # or each value of a literal would be a new kernel
+    camera = state.make(state)
     dr.make_opaque(camera)
     return camera
 
@@ -301,12 +303,10 @@ def without(camera: Camera, ignored: Collection[str]) -> Camera:
     return camera
 
 
-def cameras_in_time(camera: Camera) -> tuple[list[float], list[Camera]]:
-    """Times from 0 to 1, and the cameras then, whose pictures are averaged: one unless it blurs."""
+def cameras_in_time(camera: Camera) -> list[Camera]:
+    """The cameras whose pictures are averaged: one unless it is blurred by motion."""
     times = getattr(camera.shutter, "times", None)
-    if times is None:
-        return [0.5], [camera]
-    return times(), [camera.shutter.pose(camera, t) for t in times()]
+    return [camera] if times is None else [camera.shutter.pose(camera, t) for t in times()]
 
 
 def _perspective(state: SensorState) -> Camera:

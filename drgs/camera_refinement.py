@@ -2,7 +2,8 @@
 
 Layer 4, imported when ``cameras.optimise`` is set. A view's camera is moved, in its own axes, by a
 rotation exp(turn) and a translation; all views share factors of the focal lengths and a shift of
-the principal point. The derivatives come from the integrator: see ``camera.Camera.by_lane``.
+the principal point. Of a camera that moves while it exposes, both poses are moved alike. The
+derivatives come from the integrator: see ``camera.Camera.by_lane``.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ import mitsuba as mi
 import numpy as np
 
 from drgs.config import CamerasConfig
+from drgs.data.nerfstudio import CLOSE
 from drgs.data.types import View
 from drgs.files import atomic_path
 from drgs.shutter import rotation_matrix
@@ -40,6 +42,7 @@ class _Start:
     """A view's camera as the data has it, on the device."""
 
     to_world: mi.Matrix4f  # camera to world, OpenCV axes
+    motion: mi.Matrix4f | None  # the second pose in the axes of the first; None: it does not move
     intrinsics: mi.Vector4f  # fx, fy, cx, cy, px
     size: mi.Vector2f  # px
 
@@ -65,8 +68,13 @@ class CameraRefinement(TrainingEffect):
 
     def upload(self, view: View) -> _Start:
         """The view's camera."""
+        motion = None
+        if view.motion is not None:
+            between = np.linalg.solve(view.camera_to_world, view.motion.close_to_world)
+            motion = mi.Matrix4f(between.astype(np.float32))
         start = _Start(
             to_world=mi.Matrix4f(view.camera_to_world.astype(np.float32)),
+            motion=motion,
             intrinsics=mi.Vector4f(*(float(getattr(view, name)) for name in INTRINSICS)),
             size=mi.Vector2f(view.width, view.height),
         )
@@ -80,11 +88,12 @@ class CameraRefinement(TrainingEffect):
         self.numbers = dr.detach(self._camera(view.uploads[self.name], self.leaves))
         if trainer.iteration > self.first:
             dr.enable_grad(self.numbers)
-        params = mi.traverse(view.sensor)
-        params["to_world"] = mi.AffineTransform4f(self.numbers["to_world"])
-        for name in INTRINSICS:
-            params[name] = self.numbers[name]
-        params.update()
+        _put(view.sensor, self.numbers)
+
+    def place(self, view: TrainingView) -> None:
+        """Put the sensor where its camera is now."""
+        leaves = self.parameters.leaves(view.index)
+        _put(view.sensor, dr.detach(self._camera(view.uploads[self.name], leaves)))
 
     def after(self, trainer: Trainer, view: TrainingView) -> None:
         """One step of its own."""
@@ -115,7 +124,10 @@ class CameraRefinement(TrainingEffect):
             right, down = _entries(leaves["shifts"])
             cx, cy = cx + right * start.size.x, cy + down * start.size.y
         signs = mi.Matrix4f(MITSUBA_AXES.astype(np.float32))
-        return {"to_world": moved @ signs, "fx": fx, "fy": fy, "cx": cx, "cy": cy}
+        poses = {"to_world": moved @ signs}
+        if start.motion is not None:
+            poses["to_world_close"] = moved @ start.motion @ signs
+        return poses | {"fx": fx, "fy": fy, "cx": cx, "cy": cy}
 
     def state(self) -> dict[str, np.ndarray]:
         """Numbers and moments."""
@@ -131,9 +143,11 @@ class CameraRefinement(TrainingEffect):
         for index, view in enumerate(views):
             row = {name: mi.Float(v[min(index, len(v) - 1)]) for name, v in numbers.items()}
             camera = self._camera(self.upload(view), row)
-            pose = np.array(camera.pop("to_world"))[..., 0].astype(np.float64) @ MITSUBA_AXES
-            values = {name: float(value[0]) for name, value in camera.items()}
-            result.append(replace(view, camera_to_world=pose, **values))
+            values = {name: float(camera[name][0]) for name in INTRINSICS}
+            if view.motion is not None:
+                close = _pose(camera["to_world_close"])
+                values["motion"] = replace(view.motion, close_to_world=close)
+            result.append(replace(view, camera_to_world=_pose(camera["to_world"]), **values))
         return result
 
     def write(self, folder: Path, views: tuple[View, ...]) -> None:
@@ -141,15 +155,49 @@ class CameraRefinement(TrainingEffect):
         frames = [
             {
                 "file_path": view.name,
-                "transform_matrix": (view.camera_to_world * [1, -1, -1, 1]).tolist(),
+                "transform_matrix": _in_opengl_axes(view.camera_to_world),
                 **{"fl_x": view.fx, "fl_y": view.fy, "cx": view.cx, "cy": view.cy},
                 **{"w": view.width, "h": view.height},
-                **(view.lens.named() if view.lens is not None else {}),
+                **_lens_and_motion(view),
             }
             for view in self.refined(views)
         ]
         with atomic_path(folder / CAMERAS) as temporary:
             temporary.write_text(json.dumps({"frames": frames}, indent=1) + "\n")
+
+
+def _put(sensor: mi.Sensor, numbers: dict[str, Any]) -> None:
+    """Set a sensor's parameters."""
+    params = mi.traverse(sensor)
+    params["to_world"] = mi.AffineTransform4f(numbers["to_world"])
+    for name in INTRINSICS:
+        params[name] = numbers[name]
+    params.update()
+    if "to_world_close" in numbers:
+        # By name it is announced as not differentiable: each iteration would warn.
+        sensor.to_world_close = mi.AffineTransform4f(numbers["to_world_close"])
+
+
+def _pose(to_world: mi.Matrix4f) -> np.ndarray:
+    """(4, 4) float64, OpenCV axes."""
+    return np.array(to_world)[..., 0].astype(np.float64) @ MITSUBA_AXES
+
+
+def _in_opengl_axes(pose: np.ndarray) -> list[list[float]]:
+    return (pose * [1, -1, -1, 1]).tolist()
+
+
+def _lens_and_motion(view: View) -> dict[str, Any]:
+    """What ``transforms.json`` says of a camera besides its pose and intrinsics."""
+    values: dict[str, Any] = {}
+    if view.lens is not None:
+        # Coefficients without the name of a model are those of OpenCV's.
+        values |= {"camera_model": "OPENCV_FISHEYE"} if view.lens.kind == "fisheye" else {}
+        values |= view.lens.named()
+    if view.motion is not None:
+        values[CLOSE] = _in_opengl_axes(view.motion.close_to_world)
+        values["shutter"] = view.motion.shutter
+    return values
 
 
 def _entries(values: mi.Float) -> list[mi.Float]:

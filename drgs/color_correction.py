@@ -18,6 +18,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from drgs.arrays import from_host
 from drgs.config import ColorConfig
 from drgs.data.types import View
 from drgs.files import atomic_path
@@ -59,13 +60,13 @@ class ColorCorrection(TrainingEffect):
     def penalties(self, view: TrainingView) -> Iterator[Any]:
         """The mean square by which the transform differs from the identity."""
         del view
-        difference = self.leaves["matrices"] - mi.Float(IDENTITY[0].astype(np.float32))
+        difference = self.leaves["matrices"] - from_host(mi.Float, IDENTITY)
         yield self.weight * dr.mean(dr.square(difference))
 
     def after(self, trainer: Trainer, view: TrainingView) -> None:
         """One step of its own."""
-        del trainer
-        self.parameters.step(view.index, self.leaves)
+        decay = trainer.means_lr(trainer.iteration) / trainer.means_lr.initial
+        self.parameters.step(view.index, self.leaves, decay)
 
     def state(self) -> dict[str, np.ndarray]:
         """Numbers and moments."""

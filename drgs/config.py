@@ -241,15 +241,18 @@ class ColorConfig(_Section):
     """A colour transform for each training photograph: exposure and white balance."""
 
     lr: float | None = Field(
-        None, gt=0, description="Rate of the 3 x 4 numbers of each transform; null: there is none."
+        None,
+        gt=0,
+        description="First rate of the 3 x 4 numbers of each transform, such as 0.05; falls as "
+        "that of the means. null: there are no transforms.",
     )
     identity_weight: float = Field(
-        0.1, ge=0, description="Of the mean square by which a transform differs from the identity."
+        1.0, ge=0, description="Of the mean square by which a transform differs from the identity."
     )
 
 
 class CamerasConfig(_Section):
-    """Refinement of the training cameras; rates per step of their Adam optimizer."""
+    """Refinement of the training cameras; first rates per step, which fall as that of the means."""
 
     optimise: bool = Field(False, description="Refine poses, focal lengths and principal points.")
     start: Count = Field(0, ge=0, description="Iterations before it begins.")

@@ -42,14 +42,15 @@ def training_effects(config: FitConfig, dataset: Dataset) -> list[TrainingEffect
         from drgs.supervision import Masks
 
         effects.append(Masks())
-    if config.cameras.optimise:
-        from drgs.camera_refinement import CameraRefinement
-
-        effects.append(CameraRefinement(config.cameras, len(views), dataset.extent))
     if config.model.smoothing:
         from drgs.training_smoothing import TrainingSmoothing
 
         effects.append(TrainingSmoothing())
+    # Behind the filter, which places all sensors: the one that is rendered then gets derivatives.
+    if config.cameras.optimise:
+        from drgs.camera_refinement import CameraRefinement
+
+        effects.append(CameraRefinement(config.cameras, len(views), dataset.extent))
     return effects
 
 

@@ -13,7 +13,7 @@ at which the radial function first stops growing is not seen at all.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any, ClassVar
 
@@ -23,8 +23,12 @@ import numpy as np
 from drgs.arrays import is_float64, types_of
 from drgs.camera import Camera, Lens, Perspective
 
-NEWTON_STEPS = 10
-"""When rays of pixels are looked for: lenses that bend straight lines visibly need 4 or 5."""
+RADIUS_STEPS = 24
+"""When the radius is looked for that a lens shows at a place: most need 4 or 5. Next to the place
+where the function ends, each step at least halves the error."""
+
+TANGENTIAL_STEPS = 5
+"""Of Newton's method, for tangential terms: small beside the radial ones, it starts nearby."""
 
 BORDER = 65
 """Points on each side of the film, whose rays tell what the film sees."""
@@ -78,6 +82,42 @@ def _first_root(polynomial: np.ndarray) -> float:
     return float(real.min(initial=math.inf))
 
 
+def _radius_of(distorted: Callable, target: Any, end: Any) -> Any:
+    """Where an increasing function reaches ``target``; close to ``end`` if it never does.
+
+    distorted: radius -> its value and its derivative; 0 at 0. Newton's method within a bracket,
+    which is divided where a step would leave it (Press et al., "Numerical Recipes", 3rd ed., 9.4):
+    it converges whatever the function, and stays finite. Not differentiated.
+    """
+    UInt32 = types_of(type(target)).UInt32
+    high = dr.minimum(end, UNBOUNDED)
+    first = dr.select(target < high, target, _between(0, high))
+
+    def body(count: Any, low: Any, high: Any, radius: Any) -> tuple[Any, Any, Any, Any]:
+        value, slope = distorted(radius)
+        below = value < target
+        low, high = dr.select(below, radius, low), dr.select(below, high, radius)
+        following = radius - (value - target) / slope
+        inside = (following >= low) & (following <= high)
+        following = dr.select(inside, following, _between(low, high))
+        return dr.select(following == radius, RADIUS_STEPS, count + 1), low, high, following
+
+    # A loop, as most need few steps, and a kernel may have to do this for 16 pixels.
+    *_, radius = dr.while_loop(
+        state=(UInt32(0), type(target)(0), high, first),
+        cond=lambda count, *_: count < RADIUS_STEPS,
+        body=body,
+        labels=("count", "low", "high", "radius"),
+    )
+    return radius
+
+
+def _between(low: Any, high: Any) -> Any:
+    """In the middle on the scale r / (1 + r): a bracket may reach from 0 to very far."""
+    middle = (low / (1 + low) + high / (1 + high)) / 2
+    return middle / (1 - middle)
+
+
 def _without_trailing_zeros(coefficients: Sequence[float]) -> tuple[float, ...]:
     kept = [float(c) for c in coefficients]
     while kept and kept[-1] == 0:
@@ -113,6 +153,7 @@ class RadialTangential(Perspective):
     is beyond ``max_squared_radius`` are not seen.
     """
 
+    distorts: ClassVar[bool] = True
     kind: ClassVar[str] = "opencv"
     names: ClassVar[tuple[str, ...]] = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 
@@ -186,19 +227,44 @@ class RadialTangential(Perspective):
         )
 
     def undistort(self, x: Any, y: Any) -> tuple[Any, Any]:
-        """The slopes that :meth:`distort` sends to (x, y), by Newton's method.
+        """The slopes that :meth:`distort` sends to (x, y).
 
-        Where there are none, the result means nothing: :meth:`sees_slopes` and a second look tell.
+        Where there are none, the result is finite and means nothing: :meth:`sees_slopes` and a
+        second look tell. The search is not differentiated, but its last step: a step of Newton's
+        method from the solution has the solution's derivative (the implicit function theorem).
         """
-        u, v = x, y
-        for _ in range(NEWTON_STEPS):
-            at_x, at_y = self.distort(u, v)
+        with dr.suspend_grad():
+            length = dr.sqrt(x * x + y * y)
+            radius = _radius_of(self._radius, length, dr.sqrt(self.max_squared_radius))
+            # In the middle, radius and length are the same.
+            scale = dr.select(length > 0, radius / dr.select(length > 0, length, 1), 1)
+            u, v = scale * x, scale * y
+            if self.tangential:
+                _, u, v = dr.while_loop(
+                    state=(types_of(type(x)).UInt32(0), u, v),
+                    cond=lambda count, u, v: count < TANGENTIAL_STEPS,
+                    body=lambda count, u, v: (count + 1, *self._step(u, v, x, y)),
+                    labels=("count", "u", "v"),
+                )
+        return self._step(u, v, x, y)
+
+    def _radius(self, radius: Any) -> tuple[Any, Any]:
+        """Distance from the middle at which a radius is seen, but for the tangential terms."""
+        squared = radius * radius
+        radial = self._radial(squared)
+        return radial * radius, radial + 2 * squared * self._radial_derivative(squared)
+
+    def _step(self, u: Any, v: Any, x: Any, y: Any) -> tuple[Any, Any]:
+        """One step of Newton's method towards (x, y), unless it would leave the lens model."""
+        at_x, at_y = self.distort(u, v)
+        dx, dy = x - at_x, y - at_y
+        with dr.suspend_grad():
             xx, xy, yy = self.distortion_jacobian(u, v)
-            dx, dy = x - at_x, y - at_y
-            determinant = xx * yy - xy * xy
-            u = u + (yy * dx - xy * dy) / determinant
-            v = v + (xx * dy - xy * dx) / determinant
-        return u, v
+            per_determinant = 1 / (xx * yy - xy * xy)
+            xx, xy, yy = (value * per_determinant for value in (xx, xy, yy))
+        following = u + (yy * dx - xy * dy), v + (xx * dy - xy * dx)
+        inside = self.sees_slopes(*following)
+        return tuple(dr.select(inside, b, a) for a, b in zip((u, v), following, strict=True))
 
     def sees_slopes(self, x: Any, y: Any) -> Any:
         """Whether they are within the part that the model is made for."""
@@ -276,26 +342,32 @@ def _replaced(position: Any, seen: Any) -> tuple[Any, Any, Any]:
 def _slopes_on_border(lens: RadialTangential, camera: Camera) -> tuple[Any, Any]:
     """The box around the slopes of points on the film's border.
 
-    Not differentiated. Where the lens does not see all of them, the box says nothing about what it
-    sees: then only the end of the lens model bounds the slopes.
+    Where the lens does not see all of them, the box says nothing about what it sees: then only the
+    end of the lens model bounds the slopes.
     """
     t = types_of(type(camera.near))
-    with dr.suspend_grad():
-        side = dr.linspace(t.Float, 0, 1, BORDER)
-        zero, one = dr.zeros(t.Float, BORDER), dr.ones(t.Float, BORDER)
-        start, end = camera.film_start, camera.film_end
-        x = dr.concat([side, side, zero, one]) * (end.x - start.x) + start.x
-        y = dr.concat([zero, one, side, side]) * (end.y - start.y) + start.y
-        film = (t.Array2f(x, y) - camera.principal) / camera.focal
-        slopes = lens.undistort(film.x, film.y)
-        missed = dr.squared_norm(t.Array2f(*lens.distort(*slopes)) - film)
-        found = lens.sees_slopes(*slopes) & (missed < MISSED)
-        lowest, highest = [dr.min(s) for s in slopes], [dr.max(s) for s in slopes]
-        bounded = dr.all(found)
-        return (
-            t.Array2f([dr.select(bounded, s, -UNBOUNDED) for s in lowest]),
-            t.Array2f([dr.select(bounded, s, UNBOUNDED) for s in highest]),
-        )
+    side = dr.linspace(t.Float, 0, 1, BORDER)
+    zero, one = dr.zeros(t.Float, BORDER), dr.ones(t.Float, BORDER)
+    start, end = camera.film_start, camera.film_end
+    x = dr.concat([side, side, zero, one]) * (end.x - start.x) + start.x
+    y = dr.concat([zero, one, side, side]) * (end.y - start.y) + start.y
+    film = (t.Array2f(x, y) - camera.principal) / camera.focal
+    slopes = lens.undistort(film.x, film.y)
+    missed = dr.squared_norm(t.Array2f(*lens.distort(*slopes)) - film)
+    bounded = dr.all(lens.sees_slopes(*slopes) & (missed < MISSED))
+    return tuple(
+        t.Array2f([dr.select(bounded, _mean_where(s, extreme(s)), other) for s in slopes])
+        for extreme, other in ((dr.min, -UNBOUNDED), (dr.max, UNBOUNDED))
+    )
+
+
+def _mean_where(values: Any, extreme: Any) -> Any:
+    """``extreme``, with the mean derivative of the values that are it.
+
+    Several corners of a film may be equally far: Dr.Jit's own reductions add up their derivatives.
+    """
+    equal = values == extreme
+    return dr.sum(dr.select(equal, values, 0)) / dr.count(equal)
 
 
 # ----------------------------------------------------------------------------------------------
@@ -314,6 +386,7 @@ class Fisheye(Lens):
     angle has a cosine below ``min_cosine`` are not seen.
     """
 
+    distorts: ClassVar[bool] = True
     kind: ClassVar[str] = "fisheye"
     names: ClassVar[tuple[str, ...]] = ("k1", "k2", "k3", "k4")
 
@@ -399,18 +472,27 @@ class Fisheye(Lens):
         return near, far
 
     def ray(self, camera: Camera, x: Any, y: Any) -> Any:
-        """Through a point of the film (px), Array3f, camera axes; found by Newton's method."""
+        """Through a point of the film (px), Array3f, camera axes."""
         t = types_of(type(x))
         film = (t.Array2f(x, y) - camera.principal) / camera.focal
-        radius = dr.norm(film)
-        angle = radius
-        for _ in range(NEWTON_STEPS):
-            squared = angle * angle
-            h, dh = _polynomial(self.coefficients, squared), _derivative(self.coefficients, squared)
-            angle = angle - (h * angle - radius) / (h + 2 * dh * squared)
-        sine, cosine = dr.sincos(angle)
-        scale = dr.select(radius > 0, sine / dr.select(radius > 0, radius, 1), 1)
-        return t.Array3f(scale * film.x, scale * film.y, cosine)
+        squared = dr.squared_norm(film)
+        off_axis = squared > 0
+        radius = dr.sqrt(dr.select(off_axis, squared, 1))
+        with dr.suspend_grad():
+            end = dr.acos(self.min_cosine)
+            angle = _radius_of(self._distorted_angle, radius, end)
+        # The last step of Newton's method is differentiated, as in ``RadialTangential``.
+        value, slope = self._distorted_angle(angle)
+        following = angle + (radius - value) / dr.detach(slope)
+        sine, cosine = dr.sincos(dr.select(following < end, following, angle))
+        scale = dr.select(off_axis, sine / radius, 1)
+        return t.Array3f(scale * film.x, scale * film.y, dr.select(off_axis, cosine, 1))
+
+    def _distorted_angle(self, angle: Any) -> tuple[Any, Any]:
+        """theta_d of an angle, and its derivative."""
+        squared = angle * angle
+        h, dh = _polynomial(self.coefficients, squared), _derivative(self.coefficients, squared)
+        return h * angle, h + 2 * dh * squared
 
     @staticmethod
     def _angle_per_radius(position: Any) -> tuple[Any, Any]:

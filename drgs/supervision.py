@@ -94,15 +94,18 @@ class RandomBackground(TrainingEffect):
         self.seed, self.background = seed, np.array(background)
 
     def upload(self, view: View) -> Any:
-        """1 - alpha, (H, W, 3)."""
-        return _tensor(np.repeat(1 - view.alpha[:, :, None], 3, axis=2))
+        """1 - alpha, (H, W, 3); 0 where a mask leaves the background out as well."""
+        transparent = 1 - view.alpha if view.mask is None else (1 - view.alpha) * view.mask
+        return _tensor(np.repeat(transparent[:, :, None], 3, axis=2))
 
     def before(self, trainer: Trainer, view: TrainingView) -> None:
         """Put a colour behind the splats and behind the photograph."""
         rng = np.random.default_rng([self.seed, _BACKGROUND_STREAM, trainer.iteration])
         color = rng.uniform(size=3)
         trainer.integrator.background = mi.Color3f(*map(float, color))
-        shift = dr.opaque(mi.Color3f, 0) + mi.Color3f(*map(float, color - self.background))
+        # No literal, or every colour would be a new kernel.
+        shift = mi.Color3f(*map(float, color - self.background))
+        dr.make_opaque(shift)
         transparent = view.uploads[self.name]
         channel = dr.arange(mi.UInt32, dr.width(transparent.array)) % 3
         shift = dr.select(channel == 0, shift.x, dr.select(channel == 1, shift.y, shift.z))

@@ -241,6 +241,7 @@ class Trainer:
         for effect in self.effects:
             start = f"{effect.name}/"
             own = {k.removeprefix(start): v for k, v in state.items() if k.startswith(start)}
+            effect.repopulated(self)
             effect.restore(own)
         self.watch = GradientWatch()
         self.params.update(self.optimizer)
@@ -263,7 +264,7 @@ class Trainer:
             )
             self.statistics = self._no_statistics()
             for effect in self.effects:
-                effect.repopulated()
+                effect.repopulated(self)
             # Freed arrays of sizes that will not come again would stay with Dr.Jit's allocator.
             dr.flush_malloc_cache()
         if resets:

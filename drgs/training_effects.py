@@ -34,6 +34,9 @@ class TrainingEffect:
         del view
         return image
 
+    def place(self, view: TrainingView) -> None:
+        """Put the view's sensor where the effect has it now; without derivatives."""
+
     def before(self, trainer: Trainer, view: TrainingView) -> None:
         """Called before the view is rendered."""
 
@@ -50,8 +53,8 @@ class TrainingEffect:
     def after(self, trainer: Trainer, view: TrainingView) -> None:
         """Called when the derivatives are known, to take a step of its own."""
 
-    def repopulated(self) -> None:
-        """Called when Gaussians were added or removed."""
+    def repopulated(self, trainer: Trainer) -> None:
+        """Called when Gaussians were added or removed, before the integrator gets the others."""
 
     def finish(self, trainer: Trainer) -> None:
         """Called before the Gaussians are taken out."""

@@ -15,7 +15,8 @@ if TYPE_CHECKING:
     from drgs.trainer import Trainer, TrainingView
 
 EVERY = 100
-"""Iterations (as in Mip-Splatting's code), and after each change of the population."""
+"""Iterations (as in Mip-Splatting's code); also where another stage begins, and after each change
+of the population."""
 
 
 class TrainingSmoothing(TrainingEffect):
@@ -29,7 +30,8 @@ class TrainingSmoothing(TrainingEffect):
     def before(self, trainer: Trainer, view: TrainingView) -> None:
         """Find the filter anew where the means have moved, or are others."""
         del view
-        if self.filter is None or trainer.iteration % EVERY == 1:
+        begins = any(trainer.iteration == stage.until + 1 for stage in trainer.stages)
+        if self.filter is None or begins or trainer.iteration % EVERY == 1:
             self.filter = self._found(trainer)
         trainer.integrator.smoothing = self.filter
 
@@ -39,12 +41,15 @@ class TrainingSmoothing(TrainingEffect):
 
     @staticmethod
     def _found(trainer: Trainer) -> mi.Float:
+        for effect in trainer.effects:
+            for view in trainer.views:
+                effect.place(view)
         states = (read_sensor(view.sensor, trainer.integrator.near) for view in trainer.views)
         return smoothing_of(trainer.means, map(camera_from_sensor, states))
 
-    def repopulated(self) -> None:
+    def repopulated(self, trainer: Trainer) -> None:
         """The former filter has other rows."""
-        self.filter = None
+        self.filter = trainer.integrator.smoothing = None
 
     def state(self) -> dict[str, np.ndarray]:
         """The filter, if there is one."""

@@ -6,6 +6,7 @@ file is where they meet Mitsuba's rays, films and parameters.
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from typing import Any
 
@@ -76,6 +77,11 @@ class CalibratedSensor(mi.Sensor):
          (Default: none, it does not move)
        - |exposed|
 
+     * - shutter_open, shutter_close
+       - |float|
+       - Times of the two poses, among which integrators that trace rays choose a ray's.
+         (Default: 0 and, if the camera moves, 1)
+
      * - shutter
        - |string|
        - Of a camera that moves. ``global``: the whole film is open all the time, what moves is
@@ -88,8 +94,8 @@ class CalibratedSensor(mi.Sensor):
          (Default: 8)
 
     This sensor has the parameters that photographs are calibrated with. It works with every
-    integrator: rays are found by inverting the distortion. Where a film shows more than the lens
-    model is made for, rays carry no weight.
+    integrator that traces rays from the sensor: they are found by inverting the distortion. Where a
+    film shows more than the lens model is made for, rays carry no weight.
 
     .. note:: Not differentiated: ``to_world_close``, and where the lens model ends.
 
@@ -112,24 +118,25 @@ class CalibratedSensor(mi.Sensor):
     """
 
     def __init__(self, props: mi.Properties) -> None:
+        if "to_world_close" in props and "shutter_close" not in props:
+            # Integrators that trace rays choose their times within these two.
+            props["shutter_close"] = props.get("shutter_open", 0.0) + 1.0
         super().__init__(props)
+        self.m_needs_sample_3 = False  # no aperture
         width, height = self.film().size()
-        self.fx, self.fy = (_number(props, name, width) for name in ("fx", "fy"))
-        self.cx = _number(props, "cx", width / 2)
-        self.cy = _number(props, "cy", height / 2)
+        self.fx, self.fy = (mi.Float(_positive(props, name, width)) for name in ("fx", "fy"))
+        self.cx = mi.Float(_number(props, "cx", width / 2))
+        self.cy = mi.Float(_number(props, "cy", height / 2))
         self.lens = _lens(props)
         self.coefficients = {k: mi.Float(v) for k, v in self.lens.named().items()}
-        self.near, self.far = float(props.get("near_clip", 0.01)), float(props.get("far_clip", 1e4))
-        close = props.get("to_world_close", None)
-        self.to_world_close = None
-        if close is not None:
-            self.to_world_close = mi.AffineTransform4f(np.array(close.matrix, np.float32))
-        self.shutter = _one_of(props, "shutter", SHUTTERS)
-        self.shutter_samples = int(props.get("shutter_samples", 8))
-        if self.shutter_samples < 1:
+        self.near, self.far = _positive(props, "near_clip", 0.01), _positive(props, "far_clip", 1e4)
+        if self.near >= self.far:
             raise ValueError(
-                f"calibrated: shutter_samples must be >= 1, got {self.shutter_samples}"
+                f"calibrated: far_clip must be larger than near_clip, {self.near}, got {self.far}"
             )
+        self.to_world_close = _transform(props, "to_world_close")
+        self.shutter = _one_of(props, "shutter", SHUTTERS)
+        self.shutter_samples = _count(props, "shutter_samples", 8)
 
     # ------------------------------------------------------------------------------------------
     # Parameters
@@ -202,61 +209,55 @@ class CalibratedSensor(mi.Sensor):
     # ------------------------------------------------------------------------------------------
 
     def sample_ray(
-        self,
-        time: Any,
-        wavelength_sample: Any,
-        position_sample: Any,
-        aperture_sample: Any,
-        active: Any = True,
+        self, time: Any, sample1: Any, sample2: Any, sample3: Any, active: Any = True
     ) -> tuple[mi.Ray3f, mi.Spectrum]:
-        """A ray through a point of the crop window."""
-        del aperture_sample
-        size = mi.Vector2f(self.film().crop_size())
-        place = position_sample * size
+        """A ray through the point ``sample2`` of the crop window; sample1: for the wavelength."""
+        del sample3
+        place = sample2 * mi.Vector2f(self.film().crop_size())
         state = read_sensor(self, 0.0)
         camera = self._pinhole(state)
         lens = self.lens.with_named(state.device).upload(mi.Float)
         direction = mi.Vector3f(lens.ray(camera, place.x, place.y))
-        # Where nothing that the lens sees comes to this place, Newton's method ends elsewhere.
+        # Where nothing that the lens sees comes to this place, the search ends elsewhere.
         seen, _, _ = lens.look(replace(camera, near=mi.Float(0)), direction)
         missed = mi.Vector2f(lens.film_point(camera, direction)) - mi.Vector2f(place)
         seen &= dr.squared_norm(missed) < MISSED**2
 
         if camera.shutter is not None:
-            rows = camera.film_end.y - camera.film_start.y
-            row = (place.y - camera.film_start.y) / rows
-            camera = camera.shutter.pose(camera, row if self.shutter == "rolling" else time)
+            camera = camera.shutter.pose(camera, self._time_of(camera, time, place.y))
         per_length = 1 / dr.norm(direction)
         near, far = lens.ray_range(direction * per_length, self.near, self.far)
         direction = camera.rotation.T @ (direction * per_length)
         wavelengths, weight = self.sample_wavelengths(
-            dr.zeros(mi.SurfaceInteraction3f), wavelength_sample, active
+            dr.zeros(mi.SurfaceInteraction3f), sample1, active
         )
         ray = mi.Ray3f(
             o=mi.Point3f(camera.center) + direction * near,
             d=mi.Vector3f(direction),
             maxt=far - near,
-            time=self.shutter_open() + time * self.shutter_open_time(),
+            time=time,
             wavelengths=wavelengths,
         )
         return ray, weight & seen
 
+    def _time_of(self, camera: Camera, time: Any, y: Any) -> Any:
+        """From 0, the first pose, to 1, the second, of a ray that starts in the row ``y``, px."""
+        if self.shutter == "rolling":
+            return (y - camera.film_start.y) / (camera.film_end.y - camera.film_start.y)
+        if self.shutter_open_time() == 0:
+            return mi.Float(0)
+        return (mi.Float(time) - self.shutter_open()) / self.shutter_open_time()
+
     def sample_ray_differential(
-        self,
-        time: Any,
-        wavelength_sample: Any,
-        position_sample: Any,
-        aperture_sample: Any,
-        active: Any = True,
+        self, time: Any, sample1: Any, sample2: Any, sample3: Any, active: Any = True
     ) -> tuple[mi.RayDifferential3f, mi.Spectrum]:
         """The same, with the rays of the neighbouring pixels."""
-        samples = (wavelength_sample, position_sample, aperture_sample, active)
-        ray, weight = self.sample_ray(time, *samples)
+        ray, weight = self.sample_ray(time, sample1, sample2, sample3, active)
         width, height = self.film().crop_size()
         beside = []
         for step in (mi.Vector2f(1 / width, 0), mi.Vector2f(0, 1 / height)):
-            other = (wavelength_sample, position_sample + step, aperture_sample, active)
-            beside.append(self.sample_ray(time, *other)[0])
+            other, _ = self.sample_ray(time, sample1, sample2 + step, sample3, active)
+            beside.append(other)
         result = mi.RayDifferential3f(ray)
         result.o_x, result.o_y = (other.o for other in beside)
         result.d_x, result.d_y = (other.d for other in beside)
@@ -272,11 +273,38 @@ MISSED = 0.01
 """px: how far from its place a ray's point may be seen."""
 
 
-def _number(props: mi.Properties, name: str, default: float) -> mi.Float:
+def _number(props: mi.Properties, name: str, default: float) -> float:
     value = props.get(name, default)
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise TypeError(f"calibrated: {name} must be a number, got {value!r}")
-    return mi.Float(value)
+    if not math.isfinite(value):
+        raise ValueError(f"calibrated: {name} must be finite, got {value}")
+    return float(value)
+
+
+def _positive(props: mi.Properties, name: str, default: float) -> float:
+    value = _number(props, name, default)
+    if value <= 0:
+        raise ValueError(f"calibrated: {name} must be positive, got {value}")
+    return value
+
+
+def _count(props: mi.Properties, name: str, default: int) -> int:
+    value = props.get(name, default)
+    if isinstance(value, bool) or not isinstance(value, int):
+        raise TypeError(f"calibrated: {name} must be an integer, got {value!r}")
+    if value < 1:
+        raise ValueError(f"calibrated: {name} must be >= 1, got {value}")
+    return value
+
+
+def _transform(props: mi.Properties, name: str) -> mi.AffineTransform4f | None:
+    if name not in props:
+        return None
+    value = props[name]
+    if not hasattr(value, "matrix"):
+        raise TypeError(f"calibrated: {name} must be a transform, got {value!r}")
+    return mi.AffineTransform4f(np.array(value.matrix, np.float32))
 
 
 def _one_of(props: mi.Properties, name: str, known: tuple[str, ...]) -> str:
@@ -298,7 +326,7 @@ def _lens(props: mi.Properties) -> Any:
 
         model = lenses.RadialTangential if kind == "opencv" else lenses.Fisheye
         names = model.names
-    given = {name: float(props[name]) for name in ALL_COEFFICIENTS if name in props}
+    given = {name: _number(props, name, 0.0) for name in ALL_COEFFICIENTS if name in props}
     for name in given:
         if name not in names:
             raise ValueError(

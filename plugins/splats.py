@@ -51,7 +51,6 @@ class _Rendered:
     """The last frames, and everything that they depend on: reused while nothing has changed."""
 
     frames: list[list[rendering.Frame]]  # by time; one for each sample per pixel
-    times: list[float]  # at which the shutter is open, from 0 to 1
     pipeline: rendering.Pipeline
     exposure: Any  # key of the points that were sampled; None: pixel centres
     sensor: SensorState
@@ -390,8 +389,7 @@ class SplatsIntegrator(mi.CppADIntegrator):
                 if constant is not None:
                     _accumulate(self.background, d_constant)
                 if of_camera:
-                    _, cameras = cameras_in_time(without(state.make(state), self.ignore))
-                    numbers = [camera.numbers() for camera in cameras]
+                    numbers = [camera.numbers() for camera in self._cameras(state)]
                     _accumulate_through(numbers, [gradients.camera for gradients in by_time])
 
     def render_forward(
@@ -424,7 +422,8 @@ class SplatsIntegrator(mi.CppADIntegrator):
             with dr.resume_grad():
                 dr.enable_grad(planes, constant)
                 dr.set_grad(planes, d_planes)
-                dr.set_grad(constant, d_constant)
+                if constant is not None:
+                    dr.set_grad(constant, d_constant)
                 behind = self._behind(scene, sensor, exposure, constant)
                 channels = self._channels(sensor.film(), planes, behind)
                 image = exposure.develop(channels)
@@ -464,11 +463,10 @@ class SplatsIntegrator(mi.CppADIntegrator):
             first, *others = exposure.positions
             model = replace(pipeline.model, positions=first)
             frames = []
-            times, cameras = cameras_in_time(self._camera(state))
-            for camera in cameras:
+            for camera in cameras_in_time(self._camera(state)):
                 frame = rendering.render(gaussians, camera, replace(pipeline, model=model))
                 frames.append([frame, *(rendering.render_again(frame, p) for p in others)])
-            self._rendered = _Rendered(frames, times, pipeline, exposure.key, state, gaussians)
+            self._rendered = _Rendered(frames, pipeline, exposure.key, state, gaussians)
         return self._rendered.frames
 
     def _sensor_state(self, sensor: mi.Sensor) -> SensorState:
@@ -483,10 +481,14 @@ class SplatsIntegrator(mi.CppADIntegrator):
         state = self._sensor_state(sensor)
         if not state.is_attached:
             return [None] * count
-        _, cameras = cameras_in_time(without(state.make(state), self.ignore))
-        numbers = [camera.numbers() for camera in cameras]
+        numbers = [camera.numbers() for camera in self._cameras(state)]
         dr.forward_to(numbers, flags=dr.ADFlag.ClearEdges)
         return dr.grad(numbers)
+
+    def _cameras(self, state: SensorState) -> list[Camera]:
+        """Of each time, attached to the sensor's parameters."""
+        dr.make_opaque(state.device)  # or each value of a literal would be a new kernel
+        return cameras_in_time(without(state.make(state), self.ignore))
 
     def plan(self, scene: mi.Scene, sensor: mi.Sensor) -> str:
         """What is simulated, what asked for it, and what is not simulated: one line an effect."""
@@ -530,8 +532,11 @@ class SplatsIntegrator(mi.CppADIntegrator):
             behind = backdrop.Environment(environment)
         else:
             behind = backdrop.Picture(self.background)
-        times = self._rendered.times
-        colors = backdrop.seen_by(sensor, behind, times, exposure.within)
+        state = self._sensor_state(sensor)
+        cameras = [of_time[0].camera for of_time in self._rendered.frames]
+        if state.is_attached:
+            cameras = self._cameras(state)
+        colors = backdrop.seen_by(sensor.film(), behind, cameras, exposure.within)
         if not self.srgb_primitives:
             colors = [[mi.math.linear_to_srgb(color) for color in of_time] for of_time in colors]
         return _Behind(colors, behind.opaque)

@@ -85,6 +85,61 @@ def test_views_weigh_the_same():
     assert quality.ssim == pytest.approx(np.mean([ssim(*pair) for pair in pairs]))
 
 
+def test_psnr_of_a_mask_is_that_of_the_pixels_that_count():
+    x, y = images()
+    mask = np.random.default_rng(3).integers(0, 2, x.shape[:2])
+    squared = [(x[i, j] - y[i, j]) ** 2 for i, j in np.argwhere(mask)]
+    assert psnr(x, y, mask) == pytest.approx(-10 * np.log10(np.mean(squared)), rel=1e-12)
+    assert psnr(x, y, np.ones(x.shape[:2])) == psnr(x, y)
+    assert psnr(x, y, mask.astype(np.float32)) == psnr(x, y, mask)
+
+
+def test_what_a_mask_leaves_out_does_not_matter():
+    """SSIM's windows see black there."""
+    x, y = images()
+    mask = np.ones(x.shape[:2])
+    mask[5:20, 3:9] = 0
+    spoiled = np.where(mask[..., None] > 0, x, 0.5)
+    assert psnr(spoiled, y, mask) == psnr(x, y, mask)
+    assert ssim(spoiled, y, mask) == ssim(x, y, mask)
+    black = [values * mask[..., None] for values in (x, y)]
+    assert ssim(x, y, mask) == ssim(*black, mask) != ssim(*black)
+
+
+def test_ssim_of_a_mask_is_the_mean_of_the_map_over_the_pixels_that_count():
+    """Of masked pictures, by a window in two dimensions at each pixel."""
+    x, y = images(2, (14, 13, 3))
+    mask = np.ones((14, 13))
+    mask[2:6, 4:9] = 0
+    a, b = x * mask[..., None], y * mask[..., None]
+    offsets = np.arange(-5, 6)
+    window = np.exp(-(offsets[:, None] ** 2 + offsets**2) / 4.5)
+    window /= window.sum()
+    padded = [np.pad(v, ((5, 5), (5, 5), (0, 0))) for v in (a, b)]
+    found = []
+    for i, j in np.argwhere(mask):
+        p, q = (v[i : i + 11, j : j + 11] for v in padded)
+
+        def mean(values):
+            return np.einsum("ij,ijc->c", window, values)
+
+        mp, mq = mean(p), mean(q)
+        vp, vq, cov = mean(p * p) - mp**2, mean(q * q) - mq**2, mean(p * q) - mp * mq
+        found.append(
+            (2 * mp * mq + 1e-4) * (2 * cov + 9e-4) / ((mp**2 + mq**2 + 1e-4) * (vp + vq + 9e-4))
+        )
+    assert ssim(x, y, mask) == pytest.approx(np.mean(found), rel=1e-12)
+
+
+def test_views_may_have_masks():
+    (x, y), (p, q) = images(0), images(1)
+    mask = np.ones(p.shape[:2])
+    mask[:10] = 0
+    quality = mean_quality([(x, y, None), (p, q, mask)])
+    assert quality.psnr == pytest.approx((psnr(x, y) + psnr(p, q, mask)) / 2)
+    assert quality.ssim == pytest.approx((ssim(x, y) + ssim(p, q, mask)) / 2)
+
+
 def test_wrong_input_is_refused():
     x, y = images()
     with pytest.raises(ValueError, match=r"got \(31, 20, 3\) and \(30, 20, 3\)"):

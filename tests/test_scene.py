@@ -128,8 +128,9 @@ def test_pixels_that_are_nearly_square_move_by_less_than_said():
 
 
 def expected_image(gaussians, view, near, antialiased):
+    parameters = {name: getattr(gaussians, name) for name in PARAMETER_NAMES}
     picture = reference.render(
-        reference.Gaussians(**vars(gaussians)), reference_camera(view, near), BACKGROUND,
+        reference.Gaussians(**parameters), reference_camera(view, near), BACKGROUND,
         antialiased=antialiased, threshold_width=NEAR_THRESHOLD,
     )  # fmt: skip
     assert not picture.near_threshold.any(), "choose another seed"

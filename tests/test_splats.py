@@ -760,6 +760,127 @@ def test_parameters_may_be_resized(count):
 
 
 # ----------------------------------------------------------------------------------------------
+# Depth and alpha
+# ----------------------------------------------------------------------------------------------
+
+
+def with_channels(scene, aovs="z:depth, a:alpha", sensor=None, **settings):
+    """The scene with an integrator that puts out more than colours."""
+    integrator = scene.settings | tensors(scene.gaussians) | {"aovs": aovs} | settings
+    sensor = sensor or scene.view.sensor()
+    return mi.load_dict({"type": "scene", "integrator": integrator, "sensor": sensor})
+
+
+def channels_of(scene, kinds) -> np.ndarray:
+    """The window's channels besides colour, by the reference."""
+    planes = {"depth": scene.picture.depth, "alpha": scene.picture.alpha}
+    return np.stack([planes[kind] for kind in kinds], axis=-1)[scene.view.window]
+
+
+@both_color_spaces
+@pytest.mark.parametrize(("pixel_format", "count"), [("rgb", 3), ("rgba", 4)])
+@pytest.mark.parametrize("view", [VIEWS[1], VIEWS[13]], ids=lambda view: view.name)
+def test_depth_and_alpha_are_put_out_behind_the_colors(view, pixel_format, count, srgb_primitives):
+    """In the order in which they are asked for, as linear numbers."""
+    scene = clear(Scene(view, srgb_primitives=srgb_primitives))
+    sensor = view.sensor(pixel_format=pixel_format)
+    for kinds in (["depth", "alpha"], ["alpha", "depth"], ["depth"], ["alpha"]):
+        aovs = ", ".join(f"{kind[0]}:{kind}" for kind in kinds)
+        loaded = with_channels(scene, aovs, sensor)
+        image = image_of(loaded)
+        assert image.shape[-1] == count + len(kinds)
+        plain = image_of(
+            mi.load_dict({"type": "scene", "sensor": sensor}), integrator=fresh_integrator(scene)
+        )
+        np.testing.assert_array_equal(image[..., :count], plain)
+        for k, expected in enumerate(np.moveaxis(channels_of(scene, kinds), -1, 0)):
+            assert_images_agree(image[..., count + k], expected)
+        film = loaded.sensors()[0].film()
+        channel = {"depth": "d.T", "alpha": "a.I"}
+        names = [c.name for c in film.bitmap().struct_()]
+        assert names == [*pixel_format.upper(), *(channel[kind] for kind in kinds)]
+        assert loaded.integrator().aov_names() == names[count:]
+
+
+def test_a_kind_may_be_put_out_twice_under_two_names():
+    scene = Scene()
+    image = image_of(with_channels(scene, " first:depth,second:depth ,a:alpha,"))
+    np.testing.assert_array_equal(image[..., 4], image[..., 5])
+    np.testing.assert_array_equal(image[..., 6], image[..., 3])
+
+
+@both_color_spaces
+def test_gradients_of_depth_and_alpha_equal_the_references(srgb_primitives):
+    """With those of the colours, from random weights on all channels."""
+    scene = clear(Scene(srgb_primitives=srgb_primitives))
+    weights = scene.weights()
+    rng = np.random.default_rng(9)
+    of_depth, of_alpha = (rng.normal(0, 1, weights.shape[:2]) for _ in range(2))
+    actual = gradients_of(
+        with_channels(scene),
+        np.concatenate([weights, of_depth[..., None], of_alpha[..., None]], -1),
+    )
+    expected = scene.gradients(weights)
+    others = reference.render_gradients(
+        scene.gaussians, scene.camera, np.zeros(3), np.zeros((*of_depth.shape, 3)), of_alpha,
+        of_depth, scene.rendered_degree, scene.antialiased,
+    )  # fmt: skip
+    total = {n: expected[n] + others.get(n, 0) for n in PARAMETER_NAMES}
+    assert_gradients_agree(actual, total | {"background": expected["background"]})
+    assert all(
+        np.abs(others[n]).max() > 0.1 * np.abs(expected[n]).max() for n in ("means", "quats")
+    )
+
+
+def test_gradients_of_the_channels_are_those_of_a_film_without_alpha():
+    scene = clear(Scene())
+    weights = np.random.default_rng(9).normal(0, 1, (*scene.weights().shape[:2], 5))
+    of_rgb = gradients_of(
+        with_channels(scene, sensor=scene.view.sensor(pixel_format="rgb")), weights
+    )
+    padded = np.insert(weights, 3, 0, axis=-1)
+    assert_gradients_agree(of_rgb, gradients_of(with_channels(scene), padded))
+
+
+def test_several_samples_average_the_channels():
+    """Depth and alpha of each sample; the alpha of the film is the same number."""
+    scene = Scene()
+    sensor = scene.view.sensor(samples=4)
+    image = image_of(with_channels(scene, sensor=sensor), spp=4, seed=2)
+    # The mean of the samples' transmittances, subtracted from one before or after.
+    np.testing.assert_allclose(image[..., 5], image[..., 3], atol=1e-6)
+    single_sample = image_of(with_channels(scene), spp=1)
+    assert np.abs(image[..., 4] - single_sample[..., 4]).max() > 0.01
+
+
+def test_forward_mode_of_the_channels_equals_central_differences():
+    scene = clear(Scene())
+    directions = random_directions(scene, ["means", "log_scales", "logit_opacities"])
+    loaded = with_channels(scene)
+    tangent = np.array(dr.forward_to(mi.render(loaded, with_tangents(loaded, directions))))
+
+    def at(step):
+        values = dict(vars(scene.gaussians))
+        for name, direction in directions.items():
+            values[name] = values[name] + step * direction
+        picture = reference.render(reference.Gaussians(**values), scene.camera, np.zeros(3), 1)
+        return np.stack([picture.depth, picture.alpha], axis=-1)
+
+    expected = (at(STEP) - at(-STEP)) / (2 * STEP)
+    assert_images_agree(tangent[..., 4:], expected, GRADIENTS)
+
+
+def test_channels_that_are_not_asked_for_cost_nothing():
+    """The planes of the frame are those of the features."""
+    scene = Scene()
+    for aovs, count in (("", 4), ("a:alpha", 4), ("z:depth", 5)):
+        loaded = with_channels(scene, aovs)
+        mi.render(loaded)
+        frames = loaded.integrator()._rendered.frames
+        assert len(frames[0][0].planes()) == count
+
+
+# ----------------------------------------------------------------------------------------------
 # Forward mode
 # ----------------------------------------------------------------------------------------------
 
@@ -1141,6 +1262,143 @@ def test_no_graph_stays_behind_after_a_backward_pass():
 
 
 # ----------------------------------------------------------------------------------------------
+# What is not to be simulated, and what is said about it
+# ----------------------------------------------------------------------------------------------
+
+CLOSE = pose([0.3, -1.0, 0.5], 48, (0.5, -0.6, 1.0))
+
+
+def sensor_like(view, kind="calibrated", **changes) -> dict:
+    """The view with a pinhole, by another sensor."""
+    sensor = view.sensor()
+    kept = {key: sensor[key] for key in ("to_world", "film", "sampler", "near_clip")}
+    if kind == "calibrated":
+        camera = view.camera
+        kept |= {"fx": camera.fx, "fy": camera.fy, "cx": camera.cx, "cy": camera.cy}
+    return kept | {"type": kind, **changes}
+
+
+BENT = {"lens": "opencv", "k1": -0.25, "p1": 0.01}
+BLURRED = {"aperture_radius": 0.1, "focus_distance": 2.0, "fov": VIEWS[1].fov}
+
+
+def moving(**changes):
+    return {"to_world_close": mi.ScalarTransform4f(np.array(CLOSE)), **changes}
+
+
+IGNORED = {
+    "distortion": ("distortion", lambda: sensor_like(VIEWS[1], **BENT)),
+    "fisheye": ("distortion", lambda: sensor_like(VIEWS[1], lens="fisheye", k1=0.02)),
+    "defocus": ("defocus", lambda: sensor_like(VIEWS[1], "thinlens", **BLURRED)),
+    "motion blur": ("motion", lambda: sensor_like(VIEWS[1], **moving(shutter_samples=2))),
+    "rolling shutter": ("motion", lambda: sensor_like(VIEWS[1], **moving(shutter="rolling"))),
+    "both": ("motion, distortion", lambda: sensor_like(VIEWS[1], **BENT, **moving())),
+}
+
+
+@pytest.mark.parametrize("case", IGNORED)
+def test_what_is_ignored_leaves_a_pinhole_that_stands_still(case):
+    """And what is not asked to be ignored is seen."""
+    ignored, sensor = IGNORED[case]
+    scene = Scene()
+
+    def image(**settings):
+        integrator = scene.settings | tensors(scene.gaussians) | settings
+        return image_of(
+            mi.load_dict({"type": "scene", "integrator": integrator, "sensor": sensor()})
+        )
+
+    expected = fresh_image(scene)
+    assert_images_agree(image(ignore=ignored), expected)
+    assert np.abs(image() - expected).max() > 0.05
+    others = [word for word in ("distortion", "defocus", "motion") if word not in ignored]
+    assert np.array_equal(image(ignore=", ".join([*others, "smoothing"])), image())
+
+
+def test_an_orthographic_lens_is_no_distortion():
+    """No pinhole could take its place."""
+    scene = Scene()
+    loaded = mi.load_dict(
+        {
+            "type": "scene",
+            "integrator": fresh_integrator(scene, ignore="distortion"),
+            "sensor": sensor_like(VIEWS[1], "orthographic"),
+        }
+    )
+    plain = image_of(loaded, integrator=fresh_integrator(scene))
+    assert np.array_equal(image_of(loaded), plain)
+
+
+def plan_of(sensor, **settings) -> str:
+    scene = Scene(degree=settings.pop("degree", 1))
+    emitter = {"sky": {"type": "constant"}} if settings.pop("sky", False) else {}
+    integrator = fresh_integrator(scene, **settings)
+    loaded = mi.load_dict({"type": "scene", "integrator": integrator, "sensor": sensor, **emitter})
+    return loaded.integrator().plan(loaded, loaded.sensors()[0])
+
+
+def test_a_plan_of_a_plain_scene():
+    assert plan_of(VIEWS[1].sensor()) == (
+        "simulated:\n"
+        "  view dependence: spherical harmonics up to degree 1 (the Gaussians' coefficients)\n"
+        "  background: a constant colour (the integrator's background)\n"
+        "  not simulated: lens, depth of field, motion, antialiasing"
+    )
+
+
+def test_a_plan_names_what_asked_for_each_effect():
+    sensor = sensor_like(VIEWS[1], **BENT, **moving(shutter="rolling"))
+    smoothing = mi.Float(np.full(40, 0.01, np.float32))
+    settings = {"sky": True, "degree": 0, "antialiased": True, "smoothing": smoothing}
+    assert plan_of(sensor, **settings) == (
+        "simulated:\n"
+        "  background: an environment (the scene's emitter)\n"
+        "  lens: RadialTangential (k1, p1, p2) (the sensor)\n"
+        "  motion: rolling shutter (the sensor)\n"
+        "  antialiasing: opacities compensated for the low-pass filter, 3D smoothing filter "
+        "(antialiased, the Gaussians' filter)\n"
+        "  not simulated: view dependence, depth of field"
+    )
+    ignored = plan_of(sensor, **settings, ignore="distortion, motion, smoothing")
+    assert "  not simulated: view dependence, lens, depth of field, motion" in ignored
+    assert "3D smoothing" not in ignored
+    defocused = plan_of(sensor_like(VIEWS[1], "thinlens", **BLURRED), sky=True, hide_emitters=True)
+    assert "  depth of field: a thin lens (the sensor)\n" in defocused
+    assert "  background: a constant colour (the integrator's background)\n" in defocused
+    picture = {"type": "bitmap", "bitmap": mi.Bitmap(np.ones((2, 2, 3), np.float32))}
+    blurred = plan_of(sensor_like(VIEWS[1], **moving()), background=picture)
+    assert "  background: a picture (the integrator's background)\n" in blurred
+    assert "  motion: blurred (the sensor)\n" in blurred
+
+
+@pytest.fixture
+def logged(monkeypatch):
+    """What this integrator says at the level of information; other messages are dropped."""
+    lines = []
+    monkeypatch.setattr(mi, "Log", lambda level, text: lines.append((level, text)))
+    before = mi.log_level()
+    yield lines
+    mi.set_log_level(before)
+
+
+def test_a_plan_is_logged_once_where_somebody_listens(logged):
+    """Again when it is another."""
+    scene = Scene()
+    loaded = scene.load()
+    mi.render(loaded)
+    assert logged == []
+    mi.set_log_level(mi.LogLevel.Info)
+    for _ in range(3):
+        mi.render(loaded)
+    sensor = loaded.sensors()[0]
+    assert logged == [(mi.LogLevel.Info, f"splats: {loaded.integrator().plan(loaded, sensor)}")]
+    gradients_of(loaded, scene.weights(), ["means"])
+    assert len(logged) == 1
+    mi.render(loaded, sensor=mi.load_dict(sensor_like(VIEWS[1], "thinlens", **BLURRED)))
+    assert len(logged) == 2 and "depth of field: a thin lens" in logged[1][1]
+
+
+# ----------------------------------------------------------------------------------------------
 # Errors
 # ----------------------------------------------------------------------------------------------
 
@@ -1246,6 +1504,23 @@ REFUSED = {
     "background a spectrum": (
         {"background": {"type": "spectrum", "value": 0.5}},
         "splats: background must be an RGB colour",
+    ),
+    "aovs without a type": (
+        {"aovs": "depth"},
+        "ValueError: splats: aovs must be a list of name:type with names of their own and types of "
+        "depth, alpha, got 'depth'",
+    ),
+    "aovs of an unknown type": ({"aovs": "a:alpha, n:sh_normal"}, "got 'n:sh_normal'"),
+    "aovs without a name": ({"aovs": ":depth"}, "got ':depth'"),
+    "aovs of one name": ({"aovs": "a:alpha, a:depth"}, "got 'a:depth'"),
+    "ignore": (
+        {"ignore": "motion, background"},
+        "ValueError: splats: ignore must be a list of distortion, defocus, motion, smoothing, got "
+        "'background'",
+    ),
+    "hide_emitters a number": (
+        {"hide_emitters": 1},
+        'The property "hide_emitters" has the wrong type (expected boolean, got integer)',
     ),
     "unknown": ({"sh_degre": 1}, '- integer "sh_degre": 1'),
 }

@@ -76,6 +76,12 @@ def read_depth(path: Path, unit: float, size: tuple[int, int]) -> np.ndarray:
         if depth.ndim != 2:
             raise UserError(f"{path}: depth must be (height, width), got shape {depth.shape}")
     else:
+        with _opened(path) as image:
+            if MODES.get(image.mode) != 16:  # of 8 bits, all depths would be 257 times as large
+                raise UserError(
+                    f"{path}: must be a grey picture of 16 bits or an .npy file, got one of "
+                    f"Pillow's mode {image.mode}; convert it"
+                )
         depth = read_image(path)[:, :, 0] * np.float32(MAX_DEPTH_STEPS * unit)
     _check_size(path, depth, size)
     return np.where(np.isfinite(depth) & (depth > 0), depth, 0).astype(np.float32)

@@ -1,0 +1,381 @@
+"""Which effects are composed in, what asked for them, and that the others leave no trace."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+import pytest
+import small_fits as fits
+from views import VIEWS, Scene, tensors
+
+import drgs  # noqa: F401  (registers the plugins)
+from drgs.camera import Pinhole
+from drgs.data.types import Motion
+from drgs.effects import Effect, described, integrator_settings, plan_of_fit, training_effects
+from drgs.lenses import Fisheye, RadialTangential
+from drgs.schedule import changed
+
+MODULES = (
+    "backdrop", "camera_refinement", "color_correction", "defocus", "lenses", "pixels", "shutter",
+    "smoothing", "supervision", "training_smoothing", "view_parameters",
+)  # fmt: skip
+"""Of effects, and of nothing else."""
+
+
+@pytest.fixture(scope="module", autouse=True)
+def variant():
+    mi.set_variant("llvm_ad_rgb")
+
+
+def config_of(**changes):
+    """The default of everything; ``__`` is written for the dot."""
+    from drgs.config import FitConfig
+
+    values = {key.replace("__", "."): value for key, value in changes.items()}
+    return changed(FitConfig(data={"path": "."}), values)
+
+
+# ----------------------------------------------------------------------------------------------
+# Plans
+# ----------------------------------------------------------------------------------------------
+
+
+def test_a_plan_is_a_line_for_each_effect_and_one_for_all_others():
+    effects = [
+        Effect("a", "much", "x.y"),
+        Effect("b", None),
+        Effect("c", "some", "z"),
+        Effect("d", None),
+    ]
+    assert described(effects) == "simulated:\n  a: much (x.y)\n  c: some (z)\n  not simulated: b, d"
+    assert described(effects[:1]) == "simulated:\n  a: much (x.y)"
+
+
+def test_the_plan_of_a_plain_fit():
+    assert described(plan_of_fit(config_of(), fits.plain_dataset())) == (
+        "simulated:\n"
+        "  view dependence: spherical harmonics up to degree 3 (model.sh_degree: 3)\n"
+        "  background: white (data.background)\n"
+        "  not simulated: lens distortion, motion, antialiasing, exposure and white balance, "
+        "masks, depth, camera refinement"
+    )
+
+
+def rich_dataset():
+    """Two bent lenses, a moving camera, masks in two views, depth in all, transparency."""
+    dataset = fits.true_dataset()
+    first, second, third, *others = dataset.train
+    mask = np.ones((first.height, first.width), np.float32)
+    first = replace(first, lens=RadialTangential.of(k1=0.1, k2=0.01), mask=mask)
+    second = replace(second, lens=Fisheye.of(k1=0.1), mask=mask)
+    third = replace(third, motion=Motion(first.camera_to_world, "rolling"))
+    return replace(dataset, train=(first, second, third, *others))
+
+
+EVERYTHING = {
+    "data__random_background": True,
+    "colors__lr": 1e-3,
+    "cameras__optimise": True,
+    "model__smoothing": True,
+    "model__antialiased": True,
+}
+
+
+def test_the_plan_of_a_fit_names_what_asked_for_each_effect():
+    config = config_of(**EVERYTHING, model__sh_degree=0, cameras__focal_lr=1e-4)
+    assert described(plan_of_fit(config, rich_dataset())) == (
+        "simulated:\n"
+        "  background: a random colour at each iteration (data.random_background)\n"
+        "  lens distortion: fisheye (k1) and opencv (k1, k2) "
+        "(2 of the dataset's cameras)\n"
+        "  motion: rolling shutter (1 of the dataset's cameras)\n"
+        "  antialiasing: opacities compensated for the low-pass filter, 3D smoothing filter "
+        "(model.antialiased, model.smoothing)\n"
+        "  exposure and white balance: a colour transform for each training photograph "
+        "(colors.lr)\n"
+        "  masks: pixels left out (the dataset's masks, in 2 views)\n"
+        "  depth: supervision (the dataset's depth, in 6 views)\n"
+        "  camera refinement: poses, focal lengths (cameras.optimise)\n"
+        "  not simulated: view dependence"
+    )
+
+
+@pytest.mark.parametrize(
+    ("changes", "name", "expected"),
+    [
+        ({"loss__depth_weight": 0.0}, "depth", None),
+        ({"data__background": "black"}, "background", ("black", "data.background")),
+        (
+            {"cameras__optimise": True, "cameras__principal_lr": 1e-4},
+            "camera refinement",
+            ("poses, principal point", "cameras.optimise"),
+        ),
+        (
+            {
+                "cameras__optimise": True, "cameras__rotation_lr": 0.0,
+                "cameras__translation_lr": 0.0,
+            },
+            "camera refinement",
+            ("nothing: all rates are 0", "cameras.optimise"),
+        ),
+        (
+            {"model__antialiased": True},
+            "antialiasing",
+            ("opacities compensated for the low-pass filter", "model.antialiased"),
+        ),
+        ({"model__smoothing": True}, "antialiasing", ("3D smoothing filter", "model.smoothing")),
+    ],
+)  # fmt: skip
+def test_the_plan_follows_the_configuration(changes, name, expected):
+    (effect,) = [e for e in plan_of_fit(config_of(**changes), rich_dataset()) if e.name == name]
+    assert (None if effect.what is None else (effect.what, effect.why)) == expected
+
+
+def test_the_plan_of_a_fit_says_what_takes_part_in_it():
+    """Both are made of the same configuration and dataset; neither knows of the other."""
+    names = {
+        "background": "background",
+        "colors": "exposure and white balance",
+        "masks": "masks",
+        "depth": "depth",
+        "cameras": "camera refinement",
+        "smoothing": "antialiasing",
+    }
+    for changes, dataset in (
+        ({}, fits.plain_dataset()),
+        ({}, rich_dataset()),
+        ({"loss__depth_weight": 0.0, "colors__lr": 0.1}, rich_dataset()),
+        ({"cameras__optimise": True}, fits.plain_dataset()),
+        (EVERYTHING, rich_dataset()),
+    ):
+        config = config_of(**changes)
+        planned = {e.name for e in plan_of_fit(config, dataset) if e.what is not None}
+        taking_part = {names[e.name] for e in training_effects(config, dataset)}
+        of_the_integrator = {"view dependence", "lens distortion", "motion", "background"}
+        assert planned - of_the_integrator == taking_part - of_the_integrator
+        assert ("background" in taking_part) == config.data.random_background
+
+
+# ----------------------------------------------------------------------------------------------
+# What takes part in a fit
+# ----------------------------------------------------------------------------------------------
+
+
+def test_nothing_takes_part_in_a_plain_fit():
+    assert training_effects(config_of(), fits.plain_dataset()) == []
+    assert integrator_settings([]) == {}
+    trainer = fits.make_trainer(fits.plain_dataset())
+    assert trainer.effects == [] and trainer.integrator.aovs == {}
+    assert all(view.uploads == {} and view.target is view.photograph for view in trainer.views)
+    assert {type(view.sensor).__name__ for view in trainer.views} == {"ProjectiveCamera"}
+
+
+@pytest.mark.parametrize(
+    ("changes", "names"),
+    [
+        ({}, ["depth", "masks"]),
+        ({"colors__lr": 0.1}, ["depth", "colors", "masks"]),
+        ({"data__random_background": True}, ["depth", "background", "masks"]),
+        ({"cameras__optimise": True}, ["depth", "masks", "cameras"]),
+        ({"model__smoothing": True}, ["depth", "masks", "smoothing"]),
+        (EVERYTHING, ["depth", "colors", "background", "masks", "smoothing", "cameras"]),
+    ],
+)
+def test_what_is_called_for_takes_part_in_an_order(changes, names):
+    """Depth is taken off the image first, masks come after what changes colours."""
+    effects = training_effects(config_of(**changes), rich_dataset())
+    assert [effect.name for effect in effects] == names
+    assert integrator_settings(effects) == {"aovs": "depth:depth, alpha:alpha"}
+
+
+def test_everything_takes_part_in_one_fit():
+    """And it learns, and goes on from a checkpoint to the same bytes."""
+    dataset = rich_dataset()
+    # No camera is bent or moves: the photographs show none of it.
+    dataset = fits.with_views(dataset, lambda v: replace(v, lens=None, motion=None))
+    changes = {**EVERYTHING, "model__antialiased": False}
+    trainer = fits.make_trainer(dataset, **changes)
+    losses = [trainer.step().loss for _ in range(36)]
+    assert np.mean(losses[-6:]) < 0.8 * np.mean(losses[:6])
+    fits.assert_resumes_to_the_same_bytes(lambda: fits.make_trainer(dataset, **changes), 3, 4)
+
+
+# ----------------------------------------------------------------------------------------------
+# No trace of what is not called for
+# ----------------------------------------------------------------------------------------------
+
+PLAIN = """
+import importlib.abc, json, sys
+sys.path.insert(0, {tests!r})
+
+class Blocked(importlib.abc.MetaPathFinder):
+    def find_spec(self, name, path=None, target=None):
+        if name in {blocked!r}:
+            raise AssertionError(name + " is not there")
+
+sys.meta_path.insert(0, Blocked())
+import drgs, drjit as dr, mitsuba as mi
+mi.set_variant("llvm_ad_rgb")
+import numpy as np
+from drgs.bench import scenes
+from drgs.gaussians import PARAMETER_NAMES
+from drgs.scene import make_scene, make_sensors
+
+def kernels(action):
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
+        dr.kernel_history_clear()
+        action()
+        dr.sync_thread()
+        history = dr.kernel_history([dr.KernelType.JIT])
+    return [[kernel["hash"], kernel["operation_count"]] for kernel in history]
+
+bench = scenes.Scene("small", scenes.bench_gaussians(300), scenes.bench_camera(48))
+trainer = scenes.trainer_of(bench, {changes!r})
+found = {{"first step": kernels(trainer.step), "later step": kernels(trainer.step)}}
+
+scene = make_scene(bench.gaussians, trainer.config.model, (0.2, 0.4, 0.6))
+(sensor,) = make_sensors([scenes.view_of(bench)])
+params = mi.traverse(scene)
+for name in PARAMETER_NAMES:
+    dr.enable_grad(params["integrator." + name])
+ones = dr.ones(mi.TensorXf, (48, 48, 3))
+dr.eval(ones)
+
+def backward():
+    dr.backward(dr.sum(mi.render(scene, params, sensor=sensor, spp=1) * ones, axis=None))
+    dr.eval([dr.grad(params["integrator." + name]) for name in PARAMETER_NAMES])
+
+found["render and backward"] = kernels(backward)
+found["imported"] = sorted(set(sys.modules) & set({modules!r}))
+print(json.dumps(found))
+"""
+
+
+def in_a_new_process(run_python, blocked=(), **changes) -> dict:
+    """Raises RuntimeError with the process's last line of error."""
+    modules = [f"drgs.{name}" for name in MODULES]
+    program = PLAIN.format(
+        tests=str(Path(__file__).parent),
+        blocked=[f"drgs.{name}" for name in blocked],
+        changes={key.replace("__", "."): value for key, value in changes.items()},
+        modules=modules,
+    )
+    result = run_python(program)
+    if result.returncode != 0:
+        raise RuntimeError(result.stderr.strip().splitlines()[-1])
+    return json.loads(result.stdout)
+
+
+def test_kernels_are_the_same_when_the_modules_of_effects_are_gone(run_python):
+    """Of a picture with its derivatives, and of a fit's iterations: hashes and operations."""
+    whole = in_a_new_process(run_python)
+    reduced = in_a_new_process(run_python, blocked=MODULES)
+    assert whole == reduced
+    assert whole["imported"] == []
+    assert all(len(kernels) > 30 for name, kernels in whole.items() if name != "imported")
+
+
+@pytest.mark.parametrize(
+    ("changes", "module"),
+    [
+        ({"colors__lr": 1e-3}, "color_correction"),
+        ({"cameras__optimise": True}, "camera_refinement"),
+        ({"model__smoothing": True}, "training_smoothing"),
+    ],
+)
+def test_what_is_gone_is_missed_when_it_is_called_for(run_python, changes, module):
+    with pytest.raises(RuntimeError, match=f"drgs.{module} is not there"):
+        in_a_new_process(run_python, blocked=[module], **changes)
+
+
+IMPORTS = """
+import json, sys
+sys.path.insert(0, {tests!r})
+import drgs, mitsuba as mi, numpy as np
+mi.set_variant("llvm_ad_rgb")
+from dataclasses import replace
+from drgs.effects import plan_of_fit, training_effects
+import small_capture as capture
+from drgs.config import FitConfig
+from drgs.schedule import changed
+
+plain = capture.make_dataset(2, 1)
+ones = np.ones((capture.HEIGHT, capture.WIDTH), np.float32)
+
+def dataset(**extras):
+    return replace(plain, train=tuple(replace(view, **extras) for view in plain.train))
+
+found, known = {{}}, set()
+for name, extras, changes in (
+    ("nothing", {{}}, {{}}),
+    ("smoothing", {{}}, {{"model.smoothing": True}}),
+    ("masks", {{"mask": ones}}, {{}}),
+    ("colors", {{}}, {{"colors.lr": 0.1}}),
+    ("cameras", {{}}, {{"cameras.optimise": True}}),
+):
+    config = changed(FitConfig(data={{"path": "."}}), changes)
+    plan_of_fit(config, dataset(**extras))
+    training_effects(config, dataset(**extras))
+    now = set(sys.modules) & set({modules!r})
+    found[name] = sorted(now - known)
+    known |= now
+
+def sensor(**settings):
+    film = {{"type": "hdrfilm", "width": 8, "height": 8, "rfilter": {{"type": "box"}}}}
+    return {{"film": film, **settings}}
+
+from drgs.io.ply import write_ply
+write_ply({ply!r}, capture.blobs())
+for name, scene in (
+    ("calibrated", {{"sensor": sensor(type="calibrated")}}),
+    ("perspective", {{"sensor": sensor(type="perspective")}}),
+    ("environment", {{"sensor": sensor(type="perspective"), "sky": {{"type": "constant"}}}}),
+    ("distorted", {{"sensor": sensor(type="calibrated", lens="opencv", k1=0.1)}}),
+    ("thin lens", {{"sensor": sensor(type="thinlens", aperture_radius=0.1, focus_distance=2.0)}}),
+):
+    integrator = {{"type": "splats", "filename": {ply!r}}}
+    mi.render(mi.load_dict({{"type": "scene", "integrator": integrator, **scene}}), spp=1)
+    now = set(sys.modules) & set({modules!r})
+    found[name] = sorted(now - known)
+    known |= now
+print(json.dumps(found))
+"""
+
+
+def test_each_effect_imports_its_own_modules(run_python, tmp_path):
+    """In this order, what comes later knows what came before."""
+    program = IMPORTS.format(
+        tests=str(Path(__file__).parent),
+        modules=[f"drgs.{name}" for name in MODULES],
+        ply=str(tmp_path / "blobs.ply"),
+    )
+    result = run_python(program)
+    assert result.returncode == 0, result.stderr
+    assert json.loads(result.stdout) == {
+        "nothing": [],
+        "smoothing": ["drgs.smoothing", "drgs.training_smoothing"],
+        "masks": ["drgs.pixels", "drgs.supervision"],
+        "colors": ["drgs.color_correction", "drgs.view_parameters"],
+        "cameras": ["drgs.camera_refinement", "drgs.shutter"],
+        "calibrated": [],
+        "perspective": [],
+        "environment": ["drgs.backdrop"],
+        "distorted": ["drgs.lenses"],
+        "thin lens": ["drgs.defocus"],
+    }
+
+
+def test_a_plain_plugin_has_no_parameter_of_an_effect():
+    params = mi.traverse(mi.load_dict({"type": "splats", **tensors(Scene().gaussians)}))
+    names = ["means", "quats", "log_scales", "logit_opacities", "sh0", "shN", "background"]
+    assert list(params.keys()) == names
+
+
+def test_a_plain_sensor_has_no_parameter_of_an_effect():
+    kept = {key: VIEWS[1].sensor()[key] for key in ("to_world", "film", "sampler")}
+    sensor = mi.load_dict({"type": "calibrated", **kept})
+    own = {key for key in mi.traverse(sensor).keys() if not key.startswith(("film.", "shutter_"))}  # noqa: SIM118
+    assert own - {"near_clip", "far_clip"} == {"to_world", "fx", "fy", "cx", "cy"}
+    assert isinstance(sensor.lens, Pinhole) and sensor.to_world_close is None

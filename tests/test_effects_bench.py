@@ -1,0 +1,108 @@
+"""What effects cost: the command, shrunk, and what it measures."""
+
+import csv
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from PIL import Image
+
+from drgs.bench import __main__ as bench
+from drgs.bench import effects, scenes
+
+
+@pytest.fixture(scope="module", autouse=True)
+def variant():
+    mi.set_variant("llvm_ad_rgb")
+
+
+@pytest.fixture
+def small(monkeypatch):
+    """32 px, 150 Gaussians, one round."""
+    monkeypatch.setattr(effects, "SIZE", 32)
+    monkeypatch.setattr(effects, "NUM_GAUSSIANS", 150)
+    monkeypatch.setattr(effects, "ROUNDS", 1)
+    monkeypatch.setattr(effects, "ENVIRONMENT", (4, 8))
+
+
+def test_the_command_writes_its_table_and_plot(small, tmp_path, capsys):
+    bench.main(["effects", "--out", str(tmp_path)])
+    with (tmp_path / "effects.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    cases = [*effects.rendering_cases(), *effects.fitting_cases()]
+    assert [(r["effect"], r["variant"]) for r in rows] == [(c.effect, c.variant) for c in cases]
+    for row in rows:
+        for name in ("both_ms", "both_ratio", "operations"):
+            assert float(row[name]) > 0, row
+        plain = row["effect"] == "none"
+        if plain:
+            assert row["operations_more"] == "0"
+    assert Image.open(tmp_path / "effects.png").size[0] > 500
+    printed = capsys.readouterr().out
+    assert "150 Gaussians, 32x32" in printed
+    assert printed.count("| --- |") >= 2 and str(tmp_path / "effects.csv") in printed
+
+
+def test_effects_add_operations_and_lower_degrees_take_some_away(small):
+    """Of the kernels of a picture and its derivatives: what the table's last column says."""
+    gaussians = scenes.bench_gaussians(150)
+    cases = {(c.effect, c.variant): c for c in effects.rendering_cases()}
+    plain = effects.operations(effects.Renderer(cases["none", "none"], gaussians))
+    chosen = [
+        ("view dependence", "SH degree 0", False),
+        ("background", "environment", True),
+        ("lens", "distortion: k1 k2 p1 p2", True),
+        ("depth of field", "thin lens", True),
+        ("antialiasing", "3D smoothing filter", True),
+        ("camera refinement", "pose and focal lengths", True),
+    ]
+    for effect, name, adds in chosen:
+        count = effects.operations(effects.Renderer(cases[effect, name], gaussians))
+        assert (count > plain) == adds and count != plain, (effect, name, count, plain)
+
+
+def test_every_case_is_another_picture(small):
+    """But for derivatives, which are no picture's, and effects that a single sample cannot show."""
+    gaussians = scenes.bench_gaussians(150)
+    images = {}
+    for case in effects.rendering_cases():
+        image = np.array(effects.Renderer(case, gaussians)._render())
+        assert image.shape == (32, 32, 3) and np.isfinite(image).all()
+        images[case.effect, case.variant] = image
+    plain = images["none", "none"]
+    for key, image in images.items():
+        same = key in (("none", "none"), ("camera refinement", "pose and focal lengths"))
+        assert (np.abs(image - plain).max() < 1e-4) == same, key
+
+
+def test_a_picture_is_never_reused(small):
+    """Each is rendered: the second launches what the first did."""
+    renderer = effects.Renderer(effects.rendering_cases()[0], scenes.bench_gaussians(150))
+    counts = [effects.operations(renderer) for _ in range(2)]
+    assert counts[0] == counts[1] > 1000
+
+
+def test_prices_are_medians_against_the_first_case(monkeypatch):
+    """With a clock of our own: an effect that takes twice as long has the ratio 2."""
+
+    class Subject:
+        def __init__(self, cost):
+            self.cost = cost
+
+        def forward(self):
+            return self.cost
+
+        def both(self):
+            return 3 * self.cost
+
+    cases = [effects.FittingCase("none", "none"), effects.FittingCase("slow", "x")]
+    monkeypatch.setattr(effects, "_seconds", lambda function: function())
+    monkeypatch.setattr(effects, "operations", lambda subject: int(100 * subject.cost))
+    prices = effects.measure(cases, lambda case: Subject(1.0 + (case.effect == "slow")), rounds=3)
+    assert [(p.forward_ratio, p.both_ratio) for p in prices] == [(1, 1), (2, 2)]
+    assert prices[1].forward_ms == 2000 and prices[1].both_ms == 6000
+    assert [p.operations_more for p in prices] == [0, 100]
+    table = effects.table(prices, "picture", "both")
+    assert "| slow | x | 2000.0 ms | 2.00 | 6000.0 ms | 2.00 | +100 |" in table.splitlines()
+    short = effects.table(prices, "", "both").splitlines()
+    assert "| slow | x | 6000.0 ms | 2.00 | +100 |" in short
