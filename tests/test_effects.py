@@ -11,7 +11,9 @@ import small_fits as fits
 from views import VIEWS, Scene, tensors
 
 import drgs  # noqa: F401  (registers the plugins)
+from drgs import fit
 from drgs.camera import Pinhole
+from drgs.checkpoint import load_checkpoint
 from drgs.data.types import Motion
 from drgs.effects import Effect, described, integrator_settings, plan_of_fit, training_effects
 from drgs.lenses import Fisheye, RadialTangential
@@ -200,6 +202,18 @@ def test_everything_takes_part_in_one_fit():
     losses = [trainer.step().loss for _ in range(36)]
     assert np.mean(losses[-6:]) < 0.8 * np.mean(losses[:6])
     fits.assert_resumes_to_the_same_bytes(lambda: fits.make_trainer(dataset, **changes), 3, 4)
+
+
+def test_a_checkpoint_file_holds_the_state_of_effects(tmp_path):
+    changes = {key: value for key, value in EVERYTHING.items() if key != "model__antialiased"}
+    dataset = fits.with_views(fits.true_dataset(), lambda v: replace(v, depth=None))
+    trainer = fits.steps(fits.make_trainer(dataset, **changes), 3)
+    fit.save(trainer, fit.History(), tmp_path)
+    resumed = fits.make_trainer(dataset, **changes)
+    resumed.restore(load_checkpoint(tmp_path, trainer.config).trainer)
+    expected, got = (fits.everything_of(fits.steps(t, 2)) for t in (trainer, resumed))
+    assert expected == got
+    assert {"colors/matrices.m", "cameras/turns.value", "smoothing/filter"} <= expected.keys()
 
 
 # ----------------------------------------------------------------------------------------------
