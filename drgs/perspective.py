@@ -48,7 +48,7 @@ from typing import Any, ClassVar
 import drjit as dr
 
 from drgs.arrays import types_of
-from drgs.camera import Camera
+from drgs.camera import Camera, Pinhole
 from drgs.constants import WHITENING_SCALE
 from drgs.image_model import AffineResponse, Footprint, Offsets
 from drgs.projection import (
@@ -159,7 +159,15 @@ class RayResponse(AffineResponse):
     camera: Camera | None = None
 
     def seen_by(self, camera: Camera) -> RayResponse:
-        """For one camera, whose film has the anchors."""
+        """For one camera, whose film has the anchors.
+
+        Raises ValueError for lenses that are no pinholes: their rays are not straight on the film.
+        """
+        if not isinstance(camera.lens, Pinhole):
+            raise ValueError(
+                f"splats: projection 'exact' needs a pinhole, got {type(camera.lens).__name__}; "
+                "use 'unscented', or 'ewa', which is exact for parallel rays"
+            )
         return RayResponse(camera)
 
     def geometry(self, splats: Any) -> list[Any]:
