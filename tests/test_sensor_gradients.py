@@ -147,7 +147,7 @@ def orthographic_picture(scene, values):
 
 def blurred_picture(scene, values):
     cameras = [with_intrinsics(c(VIEWS[1], values), values) for c in (camera_of, closing)]
-    return rgba(effects.render_motion_blur(scene.gaussians, *cameras, 3, BACKGROUND))
+    return rgba(effects.render_motion_blur(scene.gaussians, *cameras, 2, BACKGROUND))
 
 
 def rolling_picture(scene, values):
@@ -217,7 +217,7 @@ CASES = {
             blurred_picture,
             {**POSE, **CLOSE_POSE, **INTRINSICS},
             sensor=calibrated(
-                **INTRINSICS, to_world_close=lambda: mi.ScalarTransform4f(CLOSE), shutter_samples=3
+                **INTRINSICS, to_world_close=lambda: mi.ScalarTransform4f(CLOSE), shutter_samples=2
             ),
         ),
         Case(

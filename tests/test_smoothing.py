@@ -569,35 +569,37 @@ def test_no_iteration_after_the_first_compiles_a_kernel():
         seen |= hashes
 
 
-FIT = """
+FITS = """
 import sys
 from drgs import fit
-fit.main([{config!r}, "--out", {out!r}, *sys.argv[1:], {options}])
-print("drgs.smoothing" in sys.modules)
+for name, *options in {runs!r}:
+    fit.main([{config!r}, "--out", {out!r} + "/" + name, *options])
+    print(name, "drgs.smoothing" in sys.modules)
 """
 
 
-@pytest.mark.parametrize(
-    ("options", "is_imported", "has_filter"),
-    [
-        ("", False, False),
-        ("'--set', 'model.smoothing=true'", True, True),
-        ("'--set', 'model.smoothing=true', '--set', 'output.bake_smoothing=true'", True, False),
-    ],
-    ids=["without", "with", "baked"],
-)
-def test_a_fit_writes_the_filter_or_what_it_makes_of_the_gaussians(
-    options, is_imported, has_filter, run_python, tmp_path
-):
-    """And imports nothing of it where it is not asked for."""
+def test_a_fit_writes_the_filter_or_what_it_makes_of_the_gaussians(run_python, tmp_path):
+    """And imports nothing of it where it is not asked for: the first of three."""
     capture.write_dataset(tmp_path / "data", capture.make_dataset(3, 1))
     config = tmp_path / "small.yml"
     config.write_text(
         f"data: {{path: {tmp_path / 'data'}}}\ninit: {{num_points: 30, half_extent: 1.0}}\n"
         "iterations: 2\noutput: {save_renders: false}\n"
     )
-    result = run_python(FIT.format(config=str(config), out=str(tmp_path / "out"), options=options))
+    asked = ("--set", "model.smoothing=true")
+    runs = [
+        ("without",),
+        ("with", *asked),
+        ("baked", *asked, "--set", "output.bake_smoothing=true"),
+    ]
+    result = run_python(FITS.format(config=str(config), out=str(tmp_path), runs=runs))
     assert result.returncode == 0, result.stderr
-    assert result.stdout.splitlines()[-1] == str(is_imported)
-    gaussians = read_ply(tmp_path / "out" / "point_cloud.ply")
-    assert (gaussians.smoothing is not None) == has_filter
+    lines = result.stdout.splitlines()
+    assert "without False" in lines and "with True" in lines and "baked True" in lines
+    written = {name: read_ply(tmp_path / name / "point_cloud.ply") for name, *_ in runs}
+    assert written["without"].smoothing is written["baked"].smoothing is None
+    expected = baked(written["with"])
+    for name in PARAMETER_NAMES:
+        actual = getattr(written["baked"], name)
+        np.testing.assert_array_equal(actual, getattr(expected, name), err_msg=name)
+    assert (written["baked"].log_scales > written["with"].log_scales).all()

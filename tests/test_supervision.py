@@ -135,7 +135,7 @@ def test_masks_keep_what_is_wrong_in_photographs_out_of_new_views():
         "masked": masked_dataset(),
         "spoiled": masked_dataset(masks=False),
     }.items():
-        trainer = fits.steps(fits.make_trainer(dataset), 60)
+        trainer = fits.steps(fits.make_trainer(dataset), 40)
         quality[name] = fits.test_psnr(trainer, dataset)
     assert quality["masked"] > quality["spoiled"] + 2, quality
     assert quality["masked"] > quality["clean"] - 1.5, quality
@@ -303,7 +303,7 @@ def test_depth_supervision_puts_blobs_at_their_depths():
         dataset = depth_dataset()
         dataset = replace(dataset, train=dataset.train[:1])
         trainer = fits.make_trainer(dataset, loss__depth_weight=weight, optimizer__means_lr=2e-3)
-        gaussians = fits.double(fits.steps(trainer, 80).gaussians())
+        gaussians = fits.double(fits.steps(trainer, 40).gaussians())
         photo = fits.true_dataset().train[0]
         picture = fits.photograph(gaussians, photo)
         known = (photo.depth > 0) & (picture.alpha > 0.1)
@@ -483,7 +483,7 @@ def test_splats_of_the_backgrounds_color_have_to_be_opaque():
             lambda v: replace(v, image=np.ones_like(v.image), depth=None),
         )
         trainer = fits.make_trainer(dataset, start, data__random_background=is_random)
-        fits.steps(trainer, 60)
+        fits.steps(trainer, 30)
         gaussians = fits.double(trainer.gaussians())
         errors[is_random] = np.mean(
             [np.abs(fits.photograph(gaussians, v).alpha - v.alpha).mean() for v in dataset.test]
