@@ -238,6 +238,11 @@ def device_gaussians(gaussians: reference.Gaussians, precision: Precision) -> Ga
     return Gaussians(**fields).to(precision.TensorXf)
 
 
+def reference_gaussians(gaussians: Gaussians) -> reference.Gaussians:
+    """The other way round."""
+    return reference.Gaussians(**{n: np.array(getattr(gaussians, n)) for n in PARAMETER_NAMES})
+
+
 def device_camera(camera: reference.Camera, precision: Precision) -> Camera:
     """The same camera as Dr.Jit scalars."""
     return scenes.device_camera(camera, precision.Float)

@@ -7,6 +7,7 @@ from itertools import pairwise
 import mitsuba as mi
 import numpy as np
 import pytest
+from helpers import reference_gaussians
 from PIL import Image
 
 from drgs import metrics, reference_rays
@@ -59,7 +60,7 @@ def test_a_measurement_is_what_its_columns_say(subject):
     default, sampled = accuracy.measure(subject, accurate, rungs, 1)
     image = image_of(subject)
     reference_image = reference_rays.render(
-        accuracy.reference.Gaussians(**vars(subject.gaussians)), subject.cameras[0], (1, 1, 1)
+        reference_gaussians(subject.gaussians), subject.cameras[0], (1, 1, 1)
     ).image
     assert np.abs(image - reference_image).mean() < 1e-5
     assert default.psnr == pytest.approx(metrics.psnr(image, accurate[0]), abs=1e-3)

@@ -37,6 +37,7 @@ from helpers import (
     device_gaussians,
     kernel_gradients,
     plane_cotangents,
+    rows,
     single,
     stacked_scene,
 )
@@ -45,6 +46,8 @@ from mutants import ALWAYS, AT_EQUALITY, NEGATED, NEVER, SCALED, Instrumented, S
 from drgs import image_model, losses, rasterize, reference, rendering
 from drgs.cutoffs import Cutoffs
 from drgs.gaussians import PARAMETER_NAMES
+
+CHAIN = ("render_adjoint", "render_tangent", "frames_adjoint", "frames_tangent")
 
 STAGES = ("composite_adjoint", "composite_tangent")
 
@@ -109,14 +112,17 @@ def _check_row_that_is_not_finite(case):
     precision and with the features of the other detectors, whose kernels this uses.
     """
     names = PARAMETER_NAMES
-    rows = {name: getattr(case.gaussians, name) for name in names}
-    rows = {name: np.concatenate([v, np.full_like(v[:1], np.nan)]) for name, v in rows.items()}
-    gaussians = device_gaussians(reference.Gaussians(**rows), FLOAT64)
+    values = {name: getattr(case.gaussians, name) for name in names}
+    values = {name: np.concatenate([v, np.full_like(v[:1], np.nan)]) for name, v in values.items()}
+    gaussians = device_gaussians(reference.Gaussians(**values), FLOAT64)
     frame = rendering.render(gaussians, device_camera(case.camera, FLOAT64), case.pipeline)
     cotangents = Cotangents.random(case)
-    gradients = rendering.render_adjoint(
-        gaussians, frame, *plane_cotangents(case, cotangents, FLOAT64)
-    ).parameters.numpy()
+    d_features, d_transmittance = plane_cotangents(case, cotangents, FLOAT64)
+    found = rendering.frames_adjoint(
+        gaussians, [frame], [[d_transmittance, *d_features]], of_camera=True
+    )
+    assert np.isfinite(rows(found.camera)).all()
+    gradients = found.parameters.numpy()
     expected = kernel_gradients(case, FLOAT64, cotangents)
     for name in names:
         np.testing.assert_array_equal(getattr(gradients, name)[:-1], expected[name], name)
@@ -161,6 +167,12 @@ def _detectors(at_thresholds):
         "tangents": partial(
             chain.test_tangent_equals_central_differences_of_the_reference, FLOAT64, case
         ),
+        "camera gradients": partial(
+            chain.test_camera_gradients_of_two_frames_equal_differences_of_the_reference, case
+        ),
+        "camera tangents": partial(
+            chain.test_camera_tangents_of_two_frames_equal_differences_of_the_reference, case
+        ),
         "loss": _check_loss_and_gradient,
     }
     special = {
@@ -191,7 +203,7 @@ def outcome():
     chain = Instrumented(
         board,
         rendering,
-        derivatives=["render_adjoint", "render_tangent"],
+        derivatives=CHAIN,
         forward=["render", "Frame.planes"],
     )
     model = Instrumented(
@@ -234,7 +246,7 @@ def outcome():
 
     with pytest.MonkeyPatch.context() as patch:
         for module, names, copy in (
-            (rendering, ("render_adjoint", "render_tangent"), chain),
+            (rendering, CHAIN, chain),
             (test_rasterize, STAGES, stages),
             (rendering, STAGES, stages),
             (test_losses, ("PhotometricLoss", "l1_loss"), loss),
@@ -282,9 +294,9 @@ class TestDefault(MutationChecks):
         image_model.AffineResponse.derivatives image_model.AffineResponse.tangent
         image_model.AffineResponse.pack_tangents image_model.SplatFeatures.add_derivatives
         image_model.PixelCenters.sum_dx rendering._gaussian_gradients rendering._splat_tangents
-        rendering._differentiable rendering._as_tensors losses._ssim_and_partials
-        losses._assemble_gradient losses._PhotometricOp.backward losses._PhotometricOp.forward
-        losses.l1_loss
+        rendering._sum rendering._sums rendering._differentiable rendering._as_tensors
+        losses._ssim_and_partials losses._assemble_gradient losses._PhotometricOp.backward
+        losses._PhotometricOp.forward losses.l1_loss
     """
 
 

@@ -37,6 +37,7 @@ from helpers import (
     kernel_gradients,
     picture_of,
     plane_cotangents,
+    reference_gaussians,
     reference_gradients,
     render,
     rows,
@@ -766,8 +767,7 @@ def test_crop_windows_are_parts_of_the_whole(precision, name):
 
 
 def bench_scene(seed, width, height, degree, count):
-    fields = vars(bench_gaussians(count, seed))
-    return reference.Gaussians(*fields.values()), bench_camera(width)
+    return reference_gaussians(bench_gaussians(count, seed)), bench_camera(width)
 
 
 ORDINARY = [
@@ -818,7 +818,7 @@ def planes_and_gradients(gaussians, case, precision):
         device, frame, *plane_cotangents(case, Cotangents.random(case), precision)
     )
     planes = [np.array(plane) for plane in frame.planes()]
-    return planes, {k: np.array(v) for k, v in vars(gradients.parameters).items()}
+    return planes, vars(reference_gaussians(gradients.parameters))
 
 
 @both_precisions

@@ -375,6 +375,84 @@ def test_tangent_equals_central_differences_of_the_reference(precision, case):
 
 
 # ----------------------------------------------------------------------------------------------
+# Several frames of a camera that is differentiated, too
+# ----------------------------------------------------------------------------------------------
+
+OF_CAMERA = [
+    Case("of the camera", 37, 29, 1),
+    Case("of the camera, antialiased", 33, 17, 0, antialiased=True),
+]
+
+CAMERA_FIELDS = ("rotation", "center", "fx", "fy", "cx", "cy")
+
+
+@cache
+def camera_differences(case) -> np.ndarray:
+    """(18, 5, H W): each number of a camera's, by central differences of the reference's planes.
+
+    A matrix that is no rotation is meant, too: it maps the world to the camera as any does.
+    """
+    step = 2.0**-25
+    found = []
+    for name in CAMERA_FIELDS:
+        for index in np.ndindex(np.shape(getattr(case.camera, name))):
+            planes = []
+            for sign in (1, -1):
+                value = np.array(getattr(case.camera, name))
+                value[index] += sign * step
+                picture = reference.render(
+                    case.gaussians, replace(case.camera, **{name: value}), np.zeros(3),
+                    case.rendered_degree, case.antialiased,
+                )  # fmt: skip
+                images = [picture.transmittance, *np.moveaxis(picture.image, -1, 0), picture.depth]
+                planes.append(np.reshape(images, (5, -1)))
+            found.append((planes[0] - planes[1]) / (2 * step))
+    return np.array(found)
+
+
+def two_frames(case) -> tuple[Gaussians, list[rendering.Frame]]:
+    gaussians, frame = render(case, FLOAT64)
+    return gaussians, [frame, frame]
+
+
+@pytest.mark.parametrize("case", OF_CAMERA, ids=lambda case: case.name)
+def test_camera_gradients_of_two_frames_equal_differences_of_the_reference(case):
+    """And those of the parameters are the reference's. Differences: as for the tangents."""
+    case = clear(case)
+    gaussians, frames = two_frames(case)
+    cotangents = Cotangents.random(case)
+    d_features, d_transmittance = plane_cotangents(case, cotangents, FLOAT64)
+    weights = [d_transmittance, *d_features]
+    parts = [[0.25 * w for w in weights], [0.75 * w for w in weights]]
+    gradients = rendering.frames_adjoint(gaussians, frames, parts, of_camera=True)
+    expected = np.sum(camera_differences(case) * rows(weights).T, axis=(1, 2))
+    actual = rows(gradients.camera)[0]
+    assert_arrays_agree({"camera": actual}, {"camera": expected}, 1e-7)
+    assert_arrays_agree(
+        {name: np.array(getattr(gradients.parameters, name)) for name in PARAMETER_NAMES},
+        {name: reference_gradients(case, cotangents)[name] for name in PARAMETER_NAMES},
+        GRADIENTS[FLOAT64],
+    )
+
+
+@pytest.mark.parametrize("case", OF_CAMERA, ids=lambda case: case.name)
+def test_camera_tangents_of_two_frames_equal_differences_of_the_reference(case):
+    case = clear(case)
+    gaussians, frames = two_frames(case)
+    direction = np.random.default_rng(3).normal(size=len(camera_differences(case)))
+    still = device_gaussians(
+        reference.Gaussians(
+            **{n: np.zeros_like(getattr(case.gaussians, n)) for n in PARAMETER_NAMES}
+        ),
+        FLOAT64,
+    )
+    tangents = [FLOAT64.Float(number) for number in direction]
+    expected = np.einsum("i,ijk->jk", direction, camera_differences(case))
+    for planes in rendering.frames_tangent(gaussians, frames, still, tangents):
+        assert_arrays_agree({"planes": rows(planes).T}, {"planes": expected}, 1e-7)
+
+
+# ----------------------------------------------------------------------------------------------
 # The same bytes
 # ----------------------------------------------------------------------------------------------
 
