@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,9 +18,10 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from drgs.checks import UserError, one_line
 from drgs.config import CamerasConfig
 from drgs.data.nerfstudio import CLOSE
-from drgs.data.types import View
+from drgs.data.types import Dataset, Motion, View
 from drgs.files import atomic_path
 from drgs.shutter import rotation_matrix
 from drgs.training_effects import TrainingEffect
@@ -35,6 +36,24 @@ MITSUBA_AXES = np.diag([-1.0, -1.0, 1.0, 1.0])
 """From OpenCV's: Mitsuba's camera has x to the left and y up."""
 
 INTRINSICS = ("fx", "fy", "cx", "cy")
+
+
+@dataclass(frozen=True)
+class LensChange:
+    """What the lens that all cameras share is found to be, beside what the data says."""
+
+    focal: tuple[float, float] = (1.0, 1.0)  # factors of fx and fy
+    principal: tuple[float, float] = (0.0, 0.0)  # of the picture's width and height
+
+    def of(self, view: View) -> View:
+        """A view with this lens."""
+        return replace(
+            view,
+            fx=view.fx * self.focal[0],
+            fy=view.fy * self.focal[1],
+            cx=view.cx + self.principal[0] * view.width,
+            cy=view.cy + self.principal[1] * view.height,
+        )
 
 
 @dataclass(frozen=True)
@@ -107,7 +126,7 @@ class CameraRefinement(TrainingEffect):
         dr.traverse(dr.ADMode.Backward)
         # As the rate of the means, which are what cameras are refined against.
         decay = trainer.means_lr(trainer.iteration) / trainer.means_lr.initial
-        self.parameters.step(view.index, self.leaves, decay)
+        self.parameters.step(view.index, decay)
 
     @staticmethod
     def _camera(start: _Start, leaves: dict[str, mi.Float]) -> dict[str, Any]:
@@ -150,8 +169,30 @@ class CameraRefinement(TrainingEffect):
             result.append(replace(view, camera_to_world=_pose(camera["to_world"]), **values))
         return result
 
+    @property
+    def lens_change(self) -> LensChange:
+        """Of all cameras."""
+        numbers = {name: values[0].astype(np.float64) for name, values in self._shared.items()}
+        changes = {}
+        if "log_focals" in numbers:
+            changes["focal"] = tuple(np.exp(numbers["log_focals"]).tolist())
+        if "shifts" in numbers:
+            changes["principal"] = tuple(numbers["shifts"].tolist())
+        return LensChange(**changes)
+
+    @property
+    def _shared(self) -> dict[str, np.ndarray]:
+        return {k: v for k, v in self.parameters.numpy().items() if k in ("log_focals", "shifts")}
+
+    def measured(self, views: tuple[View, ...]) -> tuple[View, ...]:
+        """With the lens that was found; where the cameras are is not known better than before."""
+        return tuple(map(self.lens_change.of, views))
+
     def write(self, folder: Path, views: tuple[View, ...]) -> None:
-        """``cameras.json``: the refined training cameras, in the layout of ``transforms.json``."""
+        """``cameras.json``: the refined training cameras, in the layout of ``transforms.json``.
+
+        ``lens_change`` says what of the intrinsics is not the data's.
+        """
         frames = [
             {
                 "file_path": view.name,
@@ -163,7 +204,38 @@ class CameraRefinement(TrainingEffect):
             for view in self.refined(views)
         ]
         with atomic_path(folder / CAMERAS) as temporary:
-            temporary.write_text(json.dumps({"frames": frames}, indent=1) + "\n")
+            found = {"lens_change": asdict(self.lens_change), "frames": frames}
+            temporary.write_text(json.dumps(found, indent=1) + "\n")
+
+
+def refined_dataset(dataset: Dataset, folder: Path) -> Dataset:
+    """A dataset with the cameras that a fit in ``folder`` has refined; as it is where none were."""
+    path = folder / CAMERAS
+    if not path.is_file():
+        return dataset
+    try:
+        found = json.loads(path.read_text())
+        change = LensChange(**{k: tuple(v) for k, v in found["lens_change"].items()})
+        poses = {f["file_path"]: _in_opencv_axes(f["transform_matrix"]) for f in found["frames"]}
+        train = [replace(view, camera_to_world=poses[view.name]) for view in dataset.train]
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise UserError(
+            f"{path}: must hold the refined cameras of all training views, as the fit wrote them: "
+            f"{one_line(error)}; remove it to use the dataset's own"
+        ) from None
+    moved = zip(train, dataset.train, strict=True)
+    train = [replace(new, motion=_moved_motion(old, new.camera_to_world)) for new, old in moved]
+    return replace(
+        dataset, train=tuple(map(change.of, train)), test=tuple(map(change.of, dataset.test))
+    )
+
+
+def _moved_motion(view: View, camera_to_world: np.ndarray) -> Motion | None:
+    """Both poses of a camera that moves are moved alike."""
+    if view.motion is None:
+        return None
+    between = np.linalg.solve(view.camera_to_world, view.motion.close_to_world)
+    return replace(view.motion, close_to_world=camera_to_world @ between)
 
 
 def _put(sensor: mi.Sensor, numbers: dict[str, Any]) -> None:
@@ -185,6 +257,10 @@ def _pose(to_world: mi.Matrix4f) -> np.ndarray:
 
 def _in_opengl_axes(pose: np.ndarray) -> list[list[float]]:
     return (pose * [1, -1, -1, 1]).tolist()
+
+
+def _in_opencv_axes(matrix: list[list[float]]) -> np.ndarray:
+    return np.array(matrix, np.float64).reshape(4, 4) * [1, -1, -1, 1]
 
 
 def _lens_and_motion(view: View) -> dict[str, Any]:

@@ -243,7 +243,7 @@ class ColorConfig(_Section):
     lr: float | None = Field(
         None,
         gt=0,
-        description="First rate of the 3 x 4 numbers of each transform, such as 0.05; falls as "
+        description="First rate of the 3 x 4 numbers of each transform, such as 0.02; falls as "
         "that of the means. null: there are no transforms.",
     )
     identity_weight: float = Field(

@@ -74,7 +74,7 @@ from drgs.plan import (
 )
 from drgs.progress import FitProgress
 from drgs.report import seconds_to_write, write_results
-from drgs.trainer import StepReport, Trainer, render_views
+from drgs.trainer import StepReport, Trainer
 
 SMOOTHING = 0.9
 """Weight of the past in the PSNR that the progress line shows."""
@@ -188,7 +188,7 @@ def run(
     for effect in trainer.effects:
         effect.write(out, dataset.train)
     write_history(out / "history.csv", log.rows)
-    images = list(render_views(trainer.scene, dataset.test))
+    images = list(trainer.pictures(dataset.test))
     quality = mean_quality(
         (image, view.image, view.mask) for image, view in zip(images, dataset.test, strict=True)
     )

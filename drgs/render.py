@@ -74,6 +74,7 @@ class Model:
     background: tuple[float, float, float] | Path  # display space; or a file with a picture
     config: FitConfig | None  # names the dataset
     ignored: str = ""  # effects that are not to be simulated: see the plugin
+    folder: Path | None = None  # the fit's, if there is one
 
     def scene(self) -> mi.Scene:
         """A Mitsuba scene that renders in display space."""
@@ -92,7 +93,12 @@ class Model:
             raise UserError(
                 f"{option}: needs photographs: give the configuration of a fit (--scene CONFIG.yml)"
             )
-        return load_dataset(self.config.data)
+        dataset = load_dataset(self.config.data)
+        if self.folder is None or not self.config.cameras.optimise:
+            return dataset
+        from drgs.camera_refinement import refined_dataset
+
+        return refined_dataset(dataset, self.folder)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -123,7 +129,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
 def load_model(args: argparse.Namespace) -> Model:
     """The Gaussians that the command line names, with the settings of their configuration."""
     what, config_path = args.what, args.scene
-    if what.is_dir():
+    folder = what if what.is_dir() else None
+    if folder is not None:
         for name in (CONFIG, MODEL):
             if not (what / name).is_file():
                 raise UserError(
@@ -139,7 +146,7 @@ def load_model(args: argparse.Namespace) -> Model:
         model, background = config.model, config.data.background_rgb
     if args.background is not None:
         background = _background(args)
-    return Model(gaussians, model, background, config, ", ".join(args.ignore or ()))
+    return Model(gaussians, model, background, config, ", ".join(args.ignore or ()), folder)
 
 
 def _load_config(path: Path, args: argparse.Namespace) -> FitConfig:

@@ -21,7 +21,7 @@ import numpy as np
 import yaml
 
 from drgs.data.images import downscale
-from drgs.data.types import Dataset
+from drgs.data.types import Dataset, View
 from drgs.files import atomic_path
 from drgs.gaussians import Gaussians
 from drgs.metrics import psnr, ssim
@@ -80,9 +80,9 @@ def seconds_to_write(scene: mi.Scene, dataset: Dataset) -> float:
     start = time.perf_counter()
     (image,) = render_views(scene, (view,))
     rendering = time.perf_counter() - start
-    for picture in (image, side_by_side(image, view.image)):
+    for picture in (image, side_by_side(image, view)):
         encode(picture, "PNG")
-    psnr(image, view.image), ssim(image, view.image)
+    score(image, view), ssim(image, view.image, view.mask)
     one_view = time.perf_counter() - start
     return PAGE_SECONDS + len(dataset.test) * one_view + 2 * ORBIT_FRAMES * rendering
 
@@ -90,14 +90,26 @@ def seconds_to_write(scene: mi.Scene, dataset: Dataset) -> float:
 def write_side_by_side(folder: Path, dataset: Dataset, images: Iterable[np.ndarray]) -> None:
     """Write one PNG per test view: fitted, photograph, difference."""
     for view, image in zip(dataset.test, images, strict=True):
-        write_png(folder / f"{view.name}.png", side_by_side(image, view.image))
+        write_png(folder / f"{view.name}.png", side_by_side(image, view))
 
 
-def side_by_side(image: np.ndarray, photograph: np.ndarray) -> np.ndarray:
+def side_by_side(image: np.ndarray, view: View) -> np.ndarray:
     """(H, 3 W + 2 gaps, 3): fitted, photograph, 0.5 + 5 (fitted - photograph)."""
-    difference = np.clip(0.5 + DIFFERENCE_GAIN * (image - photograph), 0, 1)
     gap = np.ones((len(image), GAP, 3), np.float32)
-    return np.concatenate([image, gap, photograph, gap, difference], axis=1)
+    return np.concatenate([image, gap, view.image, gap, difference(image, view)], axis=1)
+
+
+def difference(image: np.ndarray, view: View) -> np.ndarray:
+    """0.5 + 5 (fitted - photograph), clipped; 0.5 where pixels do not count."""
+    values = (
+        image - view.image if view.mask is None else (image - view.image) * view.mask[..., None]
+    )
+    return np.clip(0.5 + DIFFERENCE_GAIN * values, 0, 1)
+
+
+def score(image: np.ndarray, view: View) -> float:
+    """PSNR, dB."""
+    return psnr(image, view.image, view.mask)
 
 
 def write_curves(path: Path, history: Sequence[Any]) -> None:
@@ -129,7 +141,7 @@ def write_report(
     images: of the test views, in their order; metrics: as of ``metrics.json``; orbit: the bytes
     of an animated WebP.
     """
-    scores = [psnr(image, view.image) for image, view in zip(images, dataset.test, strict=True)]
+    scores = [score(image, view) for image, view in zip(images, dataset.test, strict=True)]
     light, dark = (_data_uri(_pixels(_curves(history, theme)), lossless=True) for theme in THEMES)
     page = PAGE.substitute(
         title=html.escape(title),
@@ -145,8 +157,8 @@ def write_report(
         curves_light=light,
         curves_dark=dark,
         views="".join(
-            _row(view.name, f"{score:.2f}")
-            for view, score in zip(dataset.test, scores, strict=True)
+            _row(view.name, f"{decibels:.2f}")
+            for view, decibels in zip(dataset.test, scores, strict=True)
         ),
         config=html.escape(yaml.safe_dump(metrics["config"], sort_keys=False)),
     )
@@ -314,7 +326,7 @@ def _comparison(
     panels = {
         "Fitted": image,
         "Photograph": view.image,
-        "Difference": 0.5 + DIFFERENCE_GAIN * (image - view.image),
+        "Difference": difference(image, view),
     }
     pictures = "".join(
         f'<img alt="{name} {html.escape(view.name)}" '
@@ -323,7 +335,7 @@ def _comparison(
     )
     caption = (
         f"<b>{label}: {html.escape(view.name)}</b> PSNR {_decibels(scores[index])}, "
-        f"SSIM {ssim(image, view.image):.4f}"
+        f"SSIM {ssim(image, view.image, view.mask):.4f}"
     )
     return f'<figure><figcaption>{caption}</figcaption><div class="three">{pictures}</div></figure>'
 

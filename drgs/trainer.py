@@ -49,6 +49,7 @@ class TrainingView:
     target: Target  # what is compared with: the photograph, unless an effect replaces it
     width: int  # px
     height: int  # px
+    counted: float  # share of the pixels that count: those that no mask leaves out
     uploads: dict[str, Any]  # what effects need, by their names
 
 
@@ -70,6 +71,7 @@ class StepReport:
     density: densify.DensityReport | None
     loss_array: Any  # Float, one entry
     squared_error: Any  # Float, one entry: mean over pixels and channels
+    counted: float  # share of the pixels that count
 
     @property
     def loss(self) -> float:
@@ -79,7 +81,7 @@ class StepReport:
     @property
     def psnr(self) -> float:
         """dB, of this iteration's view before the step."""
-        return -10 * math.log10(max(float(self.squared_error[0]), 1e-10))
+        return -10 * math.log10(max(float(self.squared_error[0]) / self.counted, 1e-10))
 
 
 class Trainer:
@@ -138,6 +140,7 @@ class Trainer:
             density=report,
             loss_array=loss,
             squared_error=error,
+            counted=view.counted,
         )
 
     def compared(self, image: Any, view: TrainingView) -> tuple[Any, Any]:
@@ -216,6 +219,12 @@ class Trainer:
         for effect in self.effects:
             effect.finish(self)
         return dr.detach(self.integrator.gaussians).numpy()
+
+    def pictures(self, views: tuple[View, ...]) -> Iterator[np.ndarray]:
+        """Pictures (H, W, 3) of views that were not trained on, display space, in [0, 1]."""
+        for effect in self.effects:
+            views = effect.measured(views)
+        return render_views(self.scene, views)
 
     def state(self) -> dict[str, np.ndarray]:
         """Everything that the coming iterations depend on, as numpy arrays.
@@ -331,6 +340,7 @@ def make_training_views(
                 target=target,
                 width=view.width,
                 height=view.height,
+                counted=1.0 if view.mask is None else max(float(view.mask.mean()), 1e-10),
                 uploads={effect.name: effect.upload(view) for effect in effects},
             )
         )

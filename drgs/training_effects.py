@@ -59,6 +59,10 @@ class TrainingEffect:
     def finish(self, trainer: Trainer) -> None:
         """Called before the Gaussians are taken out."""
 
+    def measured(self, views: tuple[View, ...]) -> tuple[View, ...]:
+        """Views of other photographs, with what the fit found out about their cameras."""
+        return views
+
     def write(self, folder: Path, views: tuple[View, ...]) -> None:
         """Write what was found into the output folder; views: those of the training split."""
 

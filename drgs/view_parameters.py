@@ -4,57 +4,61 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 from drjit.opt import Adam
 
-from drgs.optimizer import optimizer_state, restore_optimizer
+from drgs.optimizer import make_optimizer, optimizer_state, restore_optimizer
 
 
 class ViewParameters:
-    """A row of numbers for each view (or one row for all), by name; optimised when it is seen."""
+    """A row of numbers for each view (or one row for all), by name; optimised when it is seen.
+
+    Each row has an optimizer of its own: whenever a view is seen for the first time, its first
+    steps are as long as the rate.
+    """
 
     def __init__(self, values: Mapping[str, np.ndarray], rates: Mapping[str, float]) -> None:
         """values: (V, K) each, or (1, K) for all views; rates: per step."""
-        # A view that is not seen has derivatives of zero; its numbers and moments stay.
-        self.optimizer = Adam(lr=0.0, epsilon=1e-15, mask_updates=True)
-        self.rates = {name: float(rates[name]) for name in values}
-        for name, value in values.items():
-            self.optimizer[name] = mi.TensorXf(value.astype(np.float32))
+        self.rates = dict(rates)
+        self.optimizers: dict[str, list[Adam]] = {
+            name: [make_optimizer({name: _float(row)}, rates) for row in value]
+            for name, value in values.items()
+        }
 
     def leaves(self, index: int) -> dict[str, mi.Float]:
-        """The numbers (K,) of a view, as variables of their own with derivatives enabled."""
-        result = {}
-        for name, value in self.optimizer.items():
-            count = value.shape[1]
-            row = index if value.shape[0] > 1 else 0
-            where = dr.arange(mi.UInt32, count) + dr.opaque(mi.UInt32, row * count)
-            result[name] = dr.gather(mi.Float, dr.detach(value).array, where)
-        dr.eval(result)
-        dr.enable_grad(result)
-        return result
+        """The numbers (K,) of a view, with derivatives enabled."""
+        return {name: optimizer[name] for name, optimizer in self._of_view(index).items()}
 
-    def step(self, index: int, leaves: Mapping[str, mi.Float], decay: float = 1.0) -> None:
-        """Move the view's numbers along the leaves' derivatives; decay: factor of the rates."""
-        self.optimizer.set_learning_rate({k: decay * rate for k, rate in self.rates.items()})
-        for name, value in self.optimizer.items():
-            count = value.shape[1]
-            row = index if value.shape[0] > 1 else 0
-            gradient = dr.zeros(mi.Float, dr.width(value.array))
-            where = dr.arange(mi.UInt32, count) + dr.opaque(mi.UInt32, row * count)
-            dr.scatter(gradient, dr.grad(leaves[name]), where)
-            dr.set_grad(value, mi.TensorXf(gradient, value.shape))
-        self.optimizer.step()
+    def step(self, index: int, decay: float = 1.0) -> None:
+        """Move the view's numbers along their derivatives; decay: factor of the rates."""
+        for name, optimizer in self._of_view(index).items():
+            optimizer.set_learning_rate({name: decay * self.rates[name]})
+            optimizer.step()
 
     def numpy(self) -> dict[str, np.ndarray]:
         """The numbers, (V, K) each."""
-        return {name: np.array(dr.detach(value)) for name, value in self.optimizer.items()}
+        state = self.state()
+        return {name: state[f"{name}.value"] for name in self.optimizers}
 
     def state(self) -> dict[str, np.ndarray]:
-        """Numbers and moments."""
-        return optimizer_state(self.optimizer)
+        """Numbers, moments and step counts, a row for each view."""
+        result = {}
+        for optimizers in self.optimizers.values():
+            rows = [optimizer_state(optimizer) for optimizer in optimizers]
+            result |= {key: np.stack([row[key] for row in rows]) for key in rows[0]}
+        return result
 
-    def restore(self, state: dict[str, np.ndarray]) -> None:
+    def restore(self, state: Mapping[str, np.ndarray]) -> None:
         """Continue from :meth:`state`."""
-        restore_optimizer(self.optimizer, state)
+        for name, optimizers in self.optimizers.items():
+            own = {key: value for key, value in state.items() if key.startswith(f"{name}.")}
+            for row, optimizer in enumerate(optimizers):
+                restore_optimizer(optimizer, {key: value[row] for key, value in own.items()})
+
+    def _of_view(self, index: int) -> dict[str, Adam]:
+        return {name: rows[min(index, len(rows) - 1)] for name, rows in self.optimizers.items()}
+
+
+def _float(row: np.ndarray) -> mi.Float:
+    return mi.Float(row.astype(np.float32))

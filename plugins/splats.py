@@ -296,17 +296,23 @@ class SplatsIntegrator(mi.CppADIntegrator):
         return [f"{name}.{AOVS[kind].channel}" for name, kind in self.aovs.items()]
 
     def to_string(self) -> str:
-        """One line a setting."""
-        return (
-            f"SplatsIntegrator[\n"
-            f"  gaussians = {self.gaussians.num_gaussians},\n"
-            f"  sh_degree = {self.sh_degree},\n"
-            f"  background = {self.background},\n"
-            f"  near = {self.near},\n"
-            f"  srgb_primitives = {self.srgb_primitives}"
-            + "".join(f",\n  {n} = {v}" for n, v in self.choices.others_than_default.items())
-            + "\n]"
-        )
+        """One line a setting; of those that are off or as usual, none."""
+        settings = {
+            "gaussians": self.gaussians.num_gaussians,
+            "sh_degree": self.sh_degree,
+            "background": self.background,
+            "near": self.near,
+            "srgb_primitives": self.srgb_primitives,
+            **self.choices.others_than_default,
+        }
+        if self.hide_emitters:
+            settings["hide_emitters"] = True
+        if self.aovs:
+            settings["aovs"] = ", ".join(f"{name}:{kind}" for name, kind in self.aovs.items())
+        if self.ignore:
+            settings["ignore"] = ", ".join(self.ignore)
+        lines = ",\n".join(f"  {name} = {value}" for name, value in settings.items())
+        return f"SplatsIntegrator[\n{lines}\n]"
 
     # ------------------------------------------------------------------------------------------
     # Rendering

@@ -12,12 +12,15 @@ from helpers import single
 from scipy.spatial.transform import Rotation
 
 from drgs import reference
-from drgs.camera_refinement import CAMERAS
+from drgs.camera_refinement import CAMERAS, INTRINSICS, refined_dataset
+from drgs.checks import UserError
+from drgs.data.images import smaller_view
 from drgs.data.types import Motion
 from drgs.effects import training_effects
 from drgs.gaussians import PARAMETER_NAMES
 from drgs.lenses import Fisheye, RadialTangential
 from drgs.metrics import ssim
+from drgs.trainer import render_views
 from drgs.viewpoints import read_viewpoints
 
 
@@ -358,6 +361,76 @@ def test_the_refined_cameras_are_written_as_they_are_read(lens, tmp_path):
             assert getattr(camera, name) == pytest.approx(getattr(expected, name), rel=1e-6)
         assert (camera.width, camera.height) == (view.width, view.height)
         assert camera.lens == view.lens
+
+
+def test_other_views_are_measured_through_the_lens_that_was_found():
+    """Where their cameras are is not touched."""
+    trainer = with_numbers(make_trainer(**ALL_RATES), **random_numbers())
+    lens = {name: random_numbers()[name][0] for name in ("log_focals", "shifts")}
+    dataset = fits.plain_dataset()
+    expected = [moved(view, **lens) for view in dataset.test]
+    for view, other in zip(effect_of(trainer).measured(dataset.test), expected, strict=True):
+        np.testing.assert_array_equal(view.camera_to_world, other.camera_to_world)
+        for name in ("fx", "fy", "cx", "cy"):
+            assert getattr(view, name) == pytest.approx(getattr(other, name), rel=1e-7)
+    pictures = trainer.pictures(dataset.test)
+    for picture, other in zip(pictures, render_views(trainer.scene, expected), strict=True):
+        np.testing.assert_allclose(picture, other, atol=1e-5)
+
+
+def test_without_rates_of_the_lens_other_views_are_as_they_were():
+    views = fits.plain_dataset().test
+    for view, other in zip(effect_of(make_trainer()).measured(views), views, strict=True):
+        assert [getattr(view, n) for n in INTRINSICS] == [getattr(other, n) for n in INTRINSICS]
+
+
+def test_a_dataset_is_read_with_the_cameras_that_were_refined(tmp_path):
+    """Also at another size, and with both poses of a camera that moves."""
+    dataset = fits.plain_dataset()
+    close = moved(dataset.train[1], turns=(0.02, 0.01, 0), moves=(0.1, 0, 0)).camera_to_world
+    first = replace(dataset.train[0], motion=Motion(close, "rolling"))
+    dataset = replace(dataset, train=(first, *dataset.train[1:]))
+    trainer = with_numbers(make_trainer(dataset, **ALL_RATES), **random_numbers())
+    effect_of(trainer).write(tmp_path, dataset.train)
+    smaller = replace(
+        dataset, **{k: tuple(smaller_view(v, 2) for v in getattr(dataset, k)) for k in SPLITS}
+    )
+    found = refined_dataset(smaller, tmp_path)
+    for index, (view, start) in enumerate(zip(found.train, smaller.train, strict=True)):
+        expected = moved(start, **row_of(random_numbers(), index))
+        np.testing.assert_allclose(view.camera_to_world, expected.camera_to_world, atol=2e-6)
+        for name in INTRINSICS:
+            assert getattr(view, name) == pytest.approx(getattr(expected, name), rel=1e-6)
+    between = np.linalg.inv(first.camera_to_world) @ close
+    begin, end = found.train[0].camera_to_world, found.train[0].motion.close_to_world
+    np.testing.assert_allclose(np.linalg.inv(begin) @ end, between, atol=1e-9)
+    for view, start in zip(found.test, smaller.test, strict=True):
+        np.testing.assert_array_equal(view.camera_to_world, start.camera_to_world)
+        assert view.fx == pytest.approx(effect_of(trainer).measured((start,))[0].fx)
+
+
+SPLITS = ("train", "test")
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "{",
+        "[]",
+        '{"frames": []}',
+        '{"lens_change": {}, "frames": []}',
+        '{"lens_change": {"focal": [1]}, "frames": [{"file_path": "r_0"}]}',
+    ],
+)
+def test_damaged_cameras_are_refused(text, tmp_path):
+    (tmp_path / CAMERAS).write_text(text)
+    with pytest.raises(UserError, match=r"cameras\.json: must hold .* remove it"):
+        refined_dataset(fits.plain_dataset(), tmp_path)
+
+
+def test_where_no_cameras_were_refined_the_dataset_is_as_it_was(tmp_path):
+    dataset = fits.plain_dataset()
+    assert refined_dataset(dataset, tmp_path) is dataset
 
 
 def test_a_fit_resumes_to_the_same_bytes():

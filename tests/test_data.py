@@ -522,7 +522,8 @@ def test_a_picture_of_another_size_than_the_photograph_is_refused(photographs, k
     iio.imwrite(photographs / "other.png", np.ones((4, 8), np.uint16))
     give(photographs, **{key: "other.png"})
     assert refusal(photographs) == (
-        f"{photographs / 'other.png'}: must be 8 x 6 px, as the photograph is, got 8 x 4"
+        f"{photographs / 'other.png'}: must be 8 x 6 px, as the photograph is, got 8 x 4; "
+        "resize it, or leave it out of the frame in transforms.json"
     )
 
 
@@ -681,26 +682,26 @@ def test_wrong_motion_is_refused_with_the_key(photographs):
     assert refusal(photographs) == (f"{where}shutter must be one of global, rolling, got curtain")
 
 
-def test_transparency_is_kept_for_random_backgrounds(photographs):
+def test_transparency_is_kept(photographs):
     """Of photographs that are transparent; not otherwise."""
     rgba = np.random.default_rng(0).integers(0, 256, (6, 8, 4), np.uint8)
     iio.imwrite(photographs / "images" / "01.png", rgba)
-    dataset = load(photographs, random_background=True)
+    dataset = load(photographs)
     np.testing.assert_allclose(view_named(dataset).alpha, rgba[..., 3] / 255, rtol=1e-6)
     assert view_named(dataset, "02").alpha is None
-    assert view_named(load(photographs)).alpha is None
-    smaller = view_named(load(photographs, random_background=True, image_size=4))
+    smaller = view_named(load(photographs, image_size=4))
     blocks = (rgba[..., 3] / 255).reshape(3, 2, 4, 2).mean(axis=(1, 3))
     np.testing.assert_allclose(smaller.alpha, blocks, rtol=1e-6)
 
 
-def test_transparency_of_synthetic_pictures_is_kept_for_random_backgrounds(blender):
+def test_transparency_of_synthetic_pictures_is_kept(blender):
+    """Of those to train on."""
     folder, images = blender
     for width, shape in ((None, (4, 1, 6, 1)), (3, (2, 2, 3, 2))):
-        view = load(folder, random_background=True, image_size=width).train[1]
+        view = load(folder, image_size=width).train[1]
         expected = (images["train", 1][..., 3] / 255).reshape(shape).mean(axis=(1, 3))
         np.testing.assert_allclose(view.alpha, expected, rtol=1e-6)
-    assert load(folder).train[1].alpha is None
+    assert load(folder).test[1].alpha is None
 
 
 def test_coarse_views_have_smaller_masks_depths_and_transparency():

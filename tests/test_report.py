@@ -92,6 +92,18 @@ def test_a_comparison_is_fitted_photograph_difference(out, dataset, images):
     assert (pixels[:, WIDTH : WIDTH + report.GAP] == 1).all()
 
 
+def test_what_a_mask_leaves_out_is_no_difference(dataset, images):
+    mask = np.ones((HEIGHT, WIDTH), np.float32)
+    mask[:, : WIDTH // 2] = 0
+    view = replace(dataset.test[2], mask=mask)
+    shown = report.difference(images[2], view)
+    assert (shown[:, : WIDTH // 2] == 0.5).all()
+    whole = report.difference(images[2], dataset.test[2])
+    np.testing.assert_array_equal(shown[:, WIDTH // 2 :], whole[:, WIDTH // 2 :])
+    error = (images[2] - view.image)[:, WIDTH // 2 :].astype(np.float64)
+    assert report.score(images[2], view) == pytest.approx(-10 * np.log10(np.mean(error**2)))
+
+
 def test_the_orbit_has_the_shape_of_the_photographs_and_shows_the_scene(out, dataset, scene):
     animation = Image.open(out / "orbit.webp")
     assert (animation.n_frames, animation.size) == (report.ORBIT_FRAMES, (WIDTH, HEIGHT))

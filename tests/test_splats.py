@@ -170,6 +170,18 @@ def test_xml_has_the_same_defaults_as_a_dictionary(tmp_path):
     )
 
 
+def test_its_text_names_what_is_not_as_usual():
+    settings = {"aovs": "d:depth,a:alpha", "ignore": "motion, defocus", "hide_emitters": True}
+    integrator = mi.load_dict(
+        {"type": "splats", **tensors(Scene(degree=0).gaussians), **settings, "low_pass": 0.1}
+    )
+    lines = str(integrator).splitlines()
+    assert "  aovs = d:depth, a:alpha," in lines
+    assert "  ignore = motion, defocus" in lines
+    assert "  hide_emitters = True," in lines
+    assert "  low_pass = 0.1," in lines
+
+
 def test_tensors_without_higher_coefficients_are_of_degree_zero():
     values = tensors(Scene(degree=0).gaussians)
     del values["shN"]

@@ -14,6 +14,7 @@ from drgs.checks import UserError
 from drgs.effects import training_effects
 from drgs.gaussians import PARAMETER_NAMES
 from drgs.metrics import ssim
+from drgs.trainer import view_of
 
 # Values of order 1 in single precision: sums of 2304 numbers, SSIM's windows.
 VALUE = 2e-6
@@ -116,6 +117,19 @@ def test_derivatives_of_a_masked_loss_are_central_differences():
         difference = (both[0] - both[1]) / (2 * step)
         # Single precision of the gradient; rounding of the loss, 1e-16, over the step.
         assert gradient.flat[flat] == pytest.approx(difference, abs=1e-4 * np.abs(gradient).max())
+
+
+def test_the_psnr_of_an_iteration_is_that_of_the_pixels_that_count():
+    trainer, views = fits.make_trainer(masked_dataset()), set()
+    for iteration in range(1, 4):
+        index = view_of(iteration, len(trainer.views), trainer.config.seed)
+        trainer.params.update(trainer.optimizer)
+        picture = mi.render(trainer.scene, sensor=trainer.views[index].sensor)
+        difference = np.array(dr.detach(picture)) - masked_dataset().train[index].image
+        expected = -10 * np.log10(np.mean(difference[mask_of(index) > 0] ** 2))
+        assert trainer.step().psnr == pytest.approx(expected, abs=1e-4)
+        views.add(index)
+    assert views - {0}
 
 
 def test_what_a_mask_leaves_out_does_not_matter_to_a_fit():

@@ -42,6 +42,9 @@ ITERATIONS, QUICK_ITERATIONS = 3000, 60
 
 NUM_POINTS = 20_000
 
+DARK = 0.65
+"""Of the colours as they are, where exposures are to vary."""
+
 FEW = 8
 """Pictures, where depth is to help."""
 
@@ -120,13 +123,21 @@ def _each_train(dataset: Dataset, change: Callable[[View], View]) -> Dataset:
     return replace(dataset, train=tuple(change(view) for view in dataset.train))
 
 
+def darken(dataset: Dataset, rng: np.random.Generator) -> Dataset:
+    """All pictures are so dark that no gain of :func:`spoil_exposure` cuts off a colour."""
+    del rng
+
+    def dark(view: View) -> View:
+        return _with_image(view, DARK * view.image)
+
+    return replace(_each_train(dataset, dark), test=tuple(map(dark, dataset.test)))
+
+
 def spoil_exposure(dataset: Dataset, rng: np.random.Generator) -> Dataset:
-    """Each training picture has gains of its own, for each colour; what exceeds 1 is cut off."""
-
-    def exposed(view: View) -> View:
-        return _with_image(view, np.clip(view.image * rng.uniform(0.7, 1.3, 3), 0, 1))
-
-    return _each_train(dataset, exposed)
+    """Each training picture has gains of its own, for each colour; their mean is 1."""
+    gains = rng.uniform(0.6, 1.4, (len(dataset.train), 3))
+    gains = iter(gains / gains.mean(axis=0))
+    return _each_train(darken(dataset, rng), lambda v: _with_image(v, v.image * next(gains)))
 
 
 def spoil_parts(dataset: Dataset, rng: np.random.Generator) -> Dataset:
@@ -194,6 +205,28 @@ def quality(trainer: Trainer, dataset: Dataset, spoiled: Dataset) -> dict[str, f
     """On the test views."""
     del spoiled
     return {"PSNR, dB": _psnr(trainer, dataset.test)}
+
+
+def quality_as_exposed(trainer: Trainer, dataset: Dataset, spoiled: Dataset) -> dict[str, float]:
+    """On test views as dark as the training views are on average.
+
+    Also with each picture's colours fitted to the photograph's by an affine transform: what is lost
+    besides the exposure.
+    """
+    del dataset
+    pairs = zip(render_views(trainer.scene, spoiled.test), spoiled.test, strict=True)
+    fitted = ((fitted_colors(picture, view.image), view.image) for picture, view in pairs)
+    return {
+        **quality(trainer, spoiled, spoiled),
+        "with colours fitted, dB": mean_quality(fitted).psnr,
+    }
+
+
+def fitted_colors(image: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """A picture (H, W, 3) after the affine map of colours that brings it closest to another."""
+    colors = np.concatenate([image, np.ones_like(image[:, :, :1])], axis=2).reshape(-1, 4)
+    matrix, *_ = np.linalg.lstsq(colors, target.reshape(-1, 3), rcond=None)
+    return np.clip(colors @ matrix, 0, 1).reshape(image.shape)
 
 
 def at_sizes(trainer: Trainer, dataset: Dataset, spoiled: Dataset) -> dict[str, float]:
@@ -269,14 +302,17 @@ def _psnr(trainer: Trainer, views: Sequence[View]) -> float:
 # Cases
 # ----------------------------------------------------------------------------------------------
 
+EXPOSURE = "exposure and white balance"
+
 BLACK = (("data.background", "black"),)
-"""A white background is cut off wherever a gain exceeds 1."""
+"""A gain does not change what is behind transparent pictures."""
 
 REFINED = (("cameras.optimise", True), ("cameras.start", 300))
 
 CASES = (
-    Case("exposure and white balance", "without", spoil_exposure, BLACK),
-    Case("exposure and white balance", "with", spoil_exposure, (*BLACK, ("colors.lr", 0.05))),
+    Case(EXPOSURE, "all alike", darken, BLACK, quality_as_exposed),
+    Case(EXPOSURE, "without", spoil_exposure, BLACK, quality_as_exposed),
+    Case(EXPOSURE, "with", spoil_exposure, (*BLACK, ("colors.lr", 0.02)), quality_as_exposed),
     Case("masks", "without", lambda data, rng: without(spoil_parts(data, rng), "mask")),
     Case("masks", "with", spoil_parts),
     Case("depth", "without", few_views, (("loss.depth_weight", 0.0),)),

@@ -87,7 +87,8 @@ def _load_split(config: DataConfig, split: str) -> tuple[View, ...]:
         rgba = read_image(files[index])
         _check_promises(rgba, size, files[index], files[0])
         image = downscale(composite(rgba, config.background_rgb), config.image_size)
-        alpha = downscale(rgba[:, :, 3], config.image_size) if config.random_background else None
+        # Only training looks at it.
+        alpha = downscale(rgba[:, :, 3], config.image_size) if split == "train" else None
         height, width = image.shape[:2]
         # The angle spans the full width, so the focal length in pixels follows the image's size.
         focal = focal_from_angle(meta, "camera_angle_x", f"{path}: ", width)

@@ -113,9 +113,7 @@ def _load_view(config: DataConfig, frame: InheritedValues, file: Path, name: str
     max_width = config.image_size
     image = downscale(image, max_width)
     scale_x, scale_y = image.shape[1] / width, image.shape[0] / height
-    alpha = None
-    if config.random_background and pixels.shape[2] == 4:
-        alpha = downscale(pixels[:, :, 3], max_width)
+    alpha = downscale(pixels[:, :, 3], max_width) if pixels.shape[2] == 4 else None
     mask, depth = _mask(config, frame, (width, height)), _depth(config, frame, (width, height))
     return View(
         name=name,
