@@ -35,6 +35,7 @@ class Gaussians:
     smoothing: Any = (
         None  # (N,) world units, not optimised: see drgs.smoothing; None: there is none
     )
+    features: Any = None  # by name, (N, C) each: whatever else is to be composited; None: nothing
 
     @property
     def num_gaussians(self) -> int:
@@ -58,18 +59,24 @@ class Gaussians:
 
     def numpy(self) -> Gaussians:
         """The same Gaussians as numpy arrays on the host."""
-        return Gaussians(**{name: np.array(getattr(self, name)) for name in self._names})
+        features = self.features and {k: np.array(v) for k, v in self.features.items()}
+        return Gaussians(
+            **{name: np.array(getattr(self, name)) for name in self._names}, features=features
+        )
 
     def to(self, tensor_type: type) -> Gaussians:
         """Copy to Dr.Jit tensors of type ``tensor_type`` (``TensorXf`` or ``TensorXf64``)."""
         flat_type = dr.array_t(tensor_type)
 
-        def upload(name: str) -> Any:
-            values = np.asarray(getattr(self, name))
+        def upload(values: Any) -> Any:
+            values = np.asarray(values)
             flat = from_host(flat_type, values)
             return flat if values.ndim == 1 else tensor_type(flat, values.shape)
 
-        return Gaussians(**{name: upload(name) for name in self._names})
+        features = self.features and {k: upload(v) for k, v in self.features.items()}
+        return Gaussians(
+            **{name: upload(getattr(self, name)) for name in self._names}, features=features
+        )
 
     @property
     def _names(self) -> tuple[str, ...]:

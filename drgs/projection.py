@@ -77,6 +77,7 @@ class GaussianRows:
     sh: list[Any]  # (degree + 1)^2 Array3f
     smoothing: Any = None  # Float: see drgs.smoothing; None: there is none
     dimming: Any = None  # Float: factor of the opacity; None: 1
+    features: Any = None  # by name: list of Float; None: there are none
 
 
 def load_rows(gaussians: Gaussians, sh_degree: int) -> GaussianRows:
@@ -99,6 +100,8 @@ def load_rows(gaussians: Gaussians, sh_degree: int) -> GaussianRows:
         sh=[t.Array3f(load(gaussians.sh0, 0, 3, 3))]
         + [t.Array3f(load(gaussians.shN, 3 * k, stride, 3)) for k in higher],
         smoothing=None if gaussians.smoothing is None else dr.detach(gaussians.smoothing),
+        features=gaussians.features
+        and {k: load(v, 0, v.shape[1], v.shape[1]) for k, v in gaussians.features.items()},
     )
 
 

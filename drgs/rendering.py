@@ -43,14 +43,19 @@ from drgs.rasterize import (
 )
 from drgs.tiles import TileBins, TileGrid, bin_splats
 
+Feature = Callable[[Splats2D, GaussianRows, Camera], list[Any]]
+"""What is composited of each splat: a list of Float, one for each plane."""
 
-def color_features(splats: Splats2D) -> list[Any]:
+
+def color_features(splats: Splats2D, rows: GaussianRows, camera: Camera) -> list[Any]:
     """Red, green and blue in display space: three planes."""
+    del rows, camera
     return list(splats.colors)
 
 
-def depth_feature(splats: Splats2D) -> list[Any]:
+def depth_feature(splats: Splats2D, rows: GaussianRows, camera: Camera) -> list[Any]:
     """z in the camera, scene units: one plane, the alpha-weighted sum of the depths."""
+    del rows, camera
     return [splats.depths]
 
 
@@ -82,7 +87,7 @@ class Pipeline:
 
     sh_degree: int = 3
     opacity_rule: Callable[[Any, Any, Any], Any] = plain_opacity
-    features: tuple[Callable[[Splats2D], list[Any]], ...] = (color_features,)
+    features: tuple[Feature, ...] = (color_features,)
     shape: Callable = ewa  # how a Gaussian's mean and covariance come to the film
     color: Callable = color_at_mean  # what is stored of a splat's colour
     low_pass: float = LOW_PASS  # px^2
@@ -102,7 +107,7 @@ class Pipeline:
             from drgs.smoothing import smoothed
 
             rows = smoothed(rows)
-        return project(
+        splats = project(
             rows,
             camera,
             self.sh_degree,
@@ -112,10 +117,15 @@ class Pipeline:
             self.low_pass,
             self.model.cutoffs.least_alpha,
         )
+        if rows.features:
+            numbers = [number for columns in rows.features.values() for number in columns]
+            finite = dr.isfinite(dr.detach(sum(numbers[1:], numbers[0])))
+            splats = replace(splats, visible=splats.visible & finite)
+        return splats
 
-    def feature_columns(self, splats: Splats2D) -> list[Any]:
+    def feature_columns(self, splats: Splats2D, rows: GaussianRows, camera: Camera) -> list[Any]:
         """The columns of all features, in order."""
-        return [column for feature in self.features for column in feature(splats)]
+        return [column for feature in self.features for column in feature(splats, rows, camera)]
 
 
 @dataclass(frozen=True)
@@ -149,8 +159,9 @@ def render(gaussians: Gaussians, camera: Camera, pipeline: Pipeline) -> Frame:
 
     The host reads one value, the number of (splat, tile) entries.
     """
-    splats = pipeline.project(load_rows(gaussians, pipeline.sh_degree), camera)
-    columns = pipeline.feature_columns(splats)
+    rows = load_rows(gaussians, pipeline.sh_degree)
+    splats = pipeline.project(rows, camera)
+    columns = pipeline.feature_columns(splats, rows, camera)
     model = pipeline.model.seen_by(camera)
     grid = TileGrid(camera.width, camera.height)
     order = pipeline.order
@@ -227,7 +238,8 @@ def _gaussian_gradients(
     with dr.resume_grad():
         dr.enable_grad(replace(rows, smoothing=None), numbers)
         splats = frame.pipeline.project(rows, camera)
-        outputs, cotangents = _differentiable(frame.pipeline, splats, gradients)
+        outputs = _differentiable(frame.pipeline, splats, rows, camera)
+        cotangents = gradients.geometry + gradients.features
         for output, cotangent in zip(outputs, cotangents, strict=True):
             dr.accum_grad(output, cotangent)
         dr.enqueue(dr.ADMode.Backward, outputs)
@@ -257,6 +269,9 @@ def added(a: GaussianGradients, b: GaussianGradients) -> GaussianGradients:
     parameters = {
         name: getattr(a.parameters, name) + getattr(b.parameters, name) for name in PARAMETER_NAMES
     }
+    if a.parameters.features:
+        others = b.parameters.features
+        parameters["features"] = {k: v + others[k] for k, v in a.parameters.features.items()}
     total = GaussianGradients(
         parameters=Gaussians(**parameters),
         means2d=a.means2d + b.means2d,
@@ -329,7 +344,7 @@ def _splat_tangents(
         dr.set_grad(replace(rows, smoothing=None), replace(d_rows, smoothing=None))
         for number, tangent in zip(numbers, camera_tangents or [], strict=True):
             dr.set_grad(number, tangent)
-        outputs, _ = _differentiable(frame.pipeline, splats, None)
+        outputs = _differentiable(frame.pipeline, splats, rows, camera)
         # Some outputs (depths, p of the whitening) are inputs of others: the default would clear
         # the derivatives of such interior variables on the way.
         dr.forward_to(outputs, flags=dr.ADFlag.ClearEdges)
@@ -340,13 +355,11 @@ def _splat_tangents(
 
 
 def _differentiable(
-    pipeline: Pipeline, splats: Splats2D, gradients: SplatGradients | None
-) -> tuple[list[Any], list[Any]]:
-    """What compositing reads of the splats, and the derivatives with respect to it, aligned."""
-    outputs = pipeline.model.response.differentiable(splats) + pipeline.feature_columns(splats)
-    if gradients is None:
-        return outputs, []
-    return outputs, gradients.geometry + gradients.features
+    pipeline: Pipeline, splats: Splats2D, rows: GaussianRows, camera: Camera
+) -> list[Any]:
+    """What compositing reads of the splats, in the order of :class:`SplatGradients`."""
+    features = pipeline.feature_columns(splats, rows, camera)
+    return pipeline.model.response.differentiable(splats) + features
 
 
 def _as_tensors(d_rows: GaussianRows, gaussians: Gaussians, visible: Any) -> tuple[Gaussians, Any]:
@@ -365,7 +378,11 @@ def _as_tensors(d_rows: GaussianRows, gaussians: Gaussians, visible: Any) -> tup
         columns = [dr.select(visible, column, t.Float(0)) for column in columns]
         return t.TensorXf(interleave(columns), like.shape)
 
+    features = gaussians.features and {
+        name: tensor(d_rows.features[name], like) for name, like in gaussians.features.items()
+    }
     gradients = Gaussians(
+        features=features,
         means=tensor(list(d_rows.means), gaussians.means),
         quats=tensor(list(d_rows.quats), gaussians.quats),
         log_scales=tensor(list(d_rows.log_scales), gaussians.log_scales),

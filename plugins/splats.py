@@ -6,6 +6,7 @@ Executed once per Mitsuba variant (see ``drgs.plugins``). The rasterizer itself 
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import reduce
 from itertools import chain, repeat
@@ -35,15 +36,11 @@ from drgs.io.ply import read_ply
 SUPPORTED_VARIANTS = ("llvm_ad_rgb", "cuda_ad_rgb")
 
 
-@dataclass(frozen=True)
-class _Aov:
-    """What may be put out besides colour."""
+AOVS = {"depth": ("T",), "alpha": ("I",), "normal": ("X", "Y", "Z")}
+"""What may be put out besides colour, and the names of its channels as Mitsuba has them."""
 
-    channel: str  # behind the name, as Mitsuba names channels
-    feature: Any  # that is composited; None: nothing besides the transmittance
-
-
-AOVS = {"depth": _Aov("T", rendering.depth_feature), "alpha": _Aov("I", None)}
+FEATURE = "feature_"
+"""What the names of parameters begin with that hold numbers of the user's own."""
 
 
 @dataclass(frozen=True)
@@ -123,7 +120,10 @@ class SplatsIntegrator(mi.CppADIntegrator):
        - What is put out besides colour, as in Mitsuba's ``aov``: a list of ``name:type``, such as
          ``d:depth, a:alpha``. ``depth`` (channel ``name.T``) is the sum of the splats' depths,
          weighted by their share in the pixel and not normalised; ``alpha`` (``name.I``) is the sum
-         of these weights. (Default: none)
+         of these weights; ``normal`` (``name.X``, ``.Y``, ``.Z``) the weighted sum of the splats'
+         shortest axes, unit vectors in the world that point to the camera; a type that is the name
+         of a parameter ``feature_...`` (``name.0``, ``.1``, ...) the weighted sum of its rows.
+         (Default: none)
 
      * - ignore
        - |string|
@@ -180,6 +180,11 @@ class SplatsIntegrator(mi.CppADIntegrator):
          (N); spherical harmonics coefficients of degree 0 (N, 1, 3) and above (N, K - 1, 3).
        - |exposed|, |differentiable|
 
+     * - feature_...
+       - |tensor|
+       - Numbers of the Gaussians under a name of your own, (N, C), to be put out: see ``aovs``.
+       - |exposed|, |differentiable|
+
     This integrator composites Gaussians front to back over each pixel (Kerbl et al. 2023, "3D
     Gaussian Splatting for Real-Time Radiance Field Rendering"). Of the scene's other objects it
     sees the environment emitter alone. With one sample per pixel and a ``box`` filter it evaluates
@@ -227,15 +232,15 @@ class SplatsIntegrator(mi.CppADIntegrator):
         gaussians = _load_gaussians(props)
         for name in PARAMETER_NAMES:
             setattr(self, name, getattr(gaussians, name))
-        self.smoothing = gaussians.smoothing
+        self.smoothing, self.features = gaussians.smoothing, gaussians.features or {}
         self.ignore = _ignored(props)
+        self.aovs = _aovs(props, [*AOVS, *self.features])
         self.sh_degree = props.get("sh_degree", gaussians.sh_degree)
         self.background = _background(props)
         self.hide_emitters = _boolean(props, "hide_emitters", False)
         self.choices = _choices(props)
         self.near = _positive(props, "near", NEAR)
         self.srgb_primitives = _boolean(props, "srgb_primitives", True)
-        self.aovs = _aovs(props)
 
         self.last: LastBackward | None = None
         self._rendered: _Rendered | None = None
@@ -252,6 +257,8 @@ class SplatsIntegrator(mi.CppADIntegrator):
             value = getattr(self, name)
             if dr.width(value) > 0:
                 callback.put(name, value, mi.ParamFlags.Differentiable)
+        for name, value in self.features.items():
+            callback.put(name, value, mi.ParamFlags.Differentiable)
         callback.put("background", self.background, mi.ParamFlags.Differentiable)
 
     def parameters_changed(self, keys: list[str]) -> None:
@@ -264,7 +271,7 @@ class SplatsIntegrator(mi.CppADIntegrator):
             self._rendered = None
         if dr.width(self.shN) == 0:  # not exposed, so that its rows could not be set
             self.shN = dr.zeros(mi.TensorXf, (next(iter(self.means.shape), 0), 0, 3))
-        _check_shapes(self.gaussians)
+        _check_shapes(replace(self.gaussians, features=self.features))
         _check_degree(self.sh_degree, self.gaussians)
 
     @property
@@ -282,18 +289,22 @@ class SplatsIntegrator(mi.CppADIntegrator):
         """The parameters as one value; their arrays may be attached."""
         parameters = {name: getattr(self, name) for name in PARAMETER_NAMES}
         smoothing = None if "smoothing" in self.ignore else self.smoothing
-        return Gaussians(**parameters, smoothing=smoothing)
+        # What is not put out is not loaded.
+        features = {k: v for k, v in self.features.items() if k in self.aovs.values()}
+        return Gaussians(**parameters, smoothing=smoothing, features=features or None)
 
     @property
     def pipeline(self) -> rendering.Pipeline:
         """What this integrator's settings call for."""
-        wanted = [AOVS[kind].feature for kind in self.aovs.values()]
-        features = (rendering.color_features, *(f for f in wanted if f is not None))
-        return self.choices.pipeline(self.sh_degree, features=features)
+        others = [_composited_feature(kind) for kind in self.aovs.values() if kind != "alpha"]
+        return self.choices.pipeline(self.sh_degree, features=(rendering.color_features, *others))
 
     def aov_names(self) -> list[str]:
         """Of the channels besides colour and alpha."""
-        return [f"{name}.{AOVS[kind].channel}" for name, kind in self.aovs.items()]
+        return [f"{name}.{c}" for name, kind in self.aovs.items() for c in self._channels_of(kind)]
+
+    def _channels_of(self, kind: str) -> Iterable[Any]:
+        return AOVS[kind] if kind in AOVS else range(self.features[kind].shape[1])
 
     def to_string(self) -> str:
         """One line a setting; of those that are off or as usual, none."""
@@ -392,6 +403,8 @@ class SplatsIntegrator(mi.CppADIntegrator):
             with dr.resume_grad():
                 for name in PARAMETER_NAMES:
                     _accumulate(getattr(self, name), getattr(gradients.parameters, name))
+                for name, gradient in (gradients.parameters.features or {}).items():
+                    _accumulate(self.features[name], gradient)
                 if constant is not None:
                     _accumulate(self.background, d_constant)
                 if of_camera:
@@ -413,8 +426,10 @@ class SplatsIntegrator(mi.CppADIntegrator):
             exposure = self._exposure(sensor, seed, spp)
             frames = self._frames(sensor, exposure)
             with dr.resume_grad():
+                features = self.gaussians.features
                 tangents = Gaussians(
-                    **{name: _tangent(getattr(self, name)) for name in PARAMETER_NAMES}
+                    **{name: _tangent(getattr(self, name)) for name in PARAMETER_NAMES},
+                    features=features and {k: _tangent(v) for k, v in features.items()},
                 )
                 constant = self._constant()
                 d_constant = None if constant is None else dr.grad(self.background)
@@ -579,7 +594,10 @@ class SplatsIntegrator(mi.CppADIntegrator):
             alpha = 1 - transmittance
             channels.append(dr.full(mi.Float, 1, dr.width(alpha)) if opaque else alpha)
         for kind in self.aovs.values():
-            channels.append(1 - transmittance if AOVS[kind].feature is None else others.pop(0))
+            if kind == "alpha":
+                channels.append(1 - transmittance)
+            else:
+                channels += [others.pop(0) for _ in self._channels_of(kind)]
         return channels
 
 
@@ -594,13 +612,14 @@ class _Behind:
 def _load_gaussians(props: mi.Properties) -> Gaussians:
     """The Gaussians of a scene description: a PLY file, or six tensors."""
     given = [name for name in PARAMETER_NAMES if name in props]
+    features = {n: _tensor(props, n) for n in props.keys() if n.startswith(FEATURE)}  # noqa: SIM118
     if "filename" in props:
         if given:
             raise ValueError(
                 f"splats: give either 'filename' or tensors, got both ({', '.join(given)})"
             )
         path = mi.file_resolver().resolve(str(props["filename"]))
-        gaussians = read_ply(str(path)).to(mi.TensorXf)
+        gaussians = replace(read_ply(str(path)).to(mi.TensorXf), features=features)
     else:
         missing = [name for name in PARAMETER_NAMES if name not in given and name != "shN"]
         if missing:
@@ -614,7 +633,7 @@ def _load_gaussians(props: mi.Properties) -> Gaussians:
         values["logit_opacities"] = mi.Float(values["logit_opacities"].array)
         if "smoothing" in props:
             values["smoothing"] = mi.Float(_tensor(props, "smoothing").array)
-        gaussians = Gaussians(**values)
+        gaussians = Gaussians(**values, features=features)
     _check_shapes(gaussians)
     return gaussians
 
@@ -653,20 +672,28 @@ def _ignored(props: mi.Properties) -> tuple[str, ...]:
     return tuple(words)
 
 
-def _aovs(props: mi.Properties) -> dict[str, str]:
-    """By name: what is put out."""
+def _aovs(props: mi.Properties, kinds: Sequence[str]) -> dict[str, str]:
+    """By name: what is put out, one of ``kinds``."""
     aovs = {}
     for item in str(props.get("aovs", "")).split(","):
         if not item.strip():
             continue
         name, _, kind = (part.strip() for part in item.partition(":"))
-        if not name or kind not in AOVS or name in aovs:
+        if not name or kind not in kinds or name in aovs:
             raise ValueError(
                 f"splats: aovs must be a list of name:type with names of their own and types of "
-                f"{', '.join(AOVS)}, got {item.strip()!r}"
+                f"{', '.join(kinds)}, got {item.strip()!r}"
             )
         aovs[name] = kind
     return aovs
+
+
+def _composited_feature(kind: str) -> rendering.Feature:
+    if kind == "depth":
+        return rendering.depth_feature
+    from drgs.extra_features import NamedFeature, normal_features
+
+    return normal_features if kind == "normal" else NamedFeature(kind)
 
 
 def _boolean(props: mi.Properties, name: str, default: bool) -> bool:
@@ -724,6 +751,12 @@ def _check_shapes(gaussians: Gaussians) -> None:
             raise ValueError(
                 f"splats: {name} must have the shape {expected}, with N = {num} the rows of "
                 f"means, got {got}"
+            )
+    for name, tensor in (gaussians.features or {}).items():
+        if len(tensor.shape) != 2 or tensor.shape[0] != num or tensor.shape[1] == 0:
+            raise ValueError(
+                f"splats: {name} must have the shape (N, C), with N = {num} the rows of means and "
+                f"C at least 1, got {tuple(tensor.shape)}"
             )
     if gaussians.smoothing is not None and dr.width(gaussians.smoothing) != num:
         raise ValueError(

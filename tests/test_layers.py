@@ -26,6 +26,7 @@ LAYERS = {
     1: ["camera", "data", "gaussians", "io", "lenses", "pictures", "viewpoints"],
     2: [
         "defocus",
+        "extra_features",
         "image_model",
         "lanes",
         "perspective",

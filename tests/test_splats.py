@@ -1520,7 +1520,7 @@ REFUSED = {
     "aovs without a type": (
         {"aovs": "depth"},
         "ValueError: splats: aovs must be a list of name:type with names of their own and types of "
-        "depth, alpha, got 'depth'",
+        "depth, alpha, normal, got 'depth'",
     ),
     "aovs of an unknown type": ({"aovs": "a:alpha, n:sh_normal"}, "got 'n:sh_normal'"),
     "aovs without a name": ({"aovs": ":depth"}, "got ':depth'"),
