@@ -9,15 +9,13 @@ rounding.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
 
 from drgs.camera import Camera
-
-MISSED = 0.01
-"""px: how far from its place a ray's point may be seen. Where no ray's is, a lens sees nothing."""
+from drgs.exposure import pixel_corners
 
 
 @dataclass(frozen=True)
@@ -30,18 +28,12 @@ class Environment:
     def radiance(self, film: mi.Film, camera: Camera, place: mi.Point2f) -> mi.Color3f:
         """At places in the crop window, px; black where the lens model ends."""
         del film
-        if camera.shutter is not None:  # its rows are read one after the other
-            row = (place.y - camera.film_start.y) / (camera.film_end.y - camera.film_start.y)
-            camera = camera.shutter.pose(camera, row)
-        ray = camera.lens.ray(camera, place.x, place.y)
+        camera = camera.at_row(place.y)
+        _, ray, seen = camera.look_through(place.x, place.y)
         interaction = dr.zeros(mi.SurfaceInteraction3f, dr.width(place))
         interaction.wi = -mi.Vector3f(dr.normalize(camera.rotation.T @ ray))
         radiance = mi.Color3f(self.emitter.eval(interaction))
-        if not camera.lens.distorts:
-            return radiance
-        seen, _, _ = camera.lens.look(replace(camera, near=mi.Float(0)), ray)
-        missed = mi.Vector2f(camera.lens.film_point(camera, ray)) - mi.Vector2f(place)
-        return dr.select(seen & (dr.squared_norm(missed) < MISSED**2), radiance, 0)
+        return radiance if seen is True else dr.select(seen, radiance, 0)
 
 
 @dataclass(frozen=True)
@@ -70,9 +62,6 @@ def seen_by(
 
     cameras: of each time; within: of each sample, x and y from the pixel's upper left corner, px.
     """
-    width, height = film.crop_size()
-    pixel = dr.arange(mi.UInt32, width * height)
-    row = pixel // dr.opaque(mi.UInt32, width)
-    corner = mi.Point2f(pixel - row * width, row)
+    corner = pixel_corners(film)
     places = [corner + mi.Vector2f(x, y) for x, y in within]
     return [[backdrop.radiance(film, camera, place) for place in places] for camera in cameras]

@@ -52,6 +52,11 @@ class Lens:
         del camera
         return offset
 
+    def origin(self, camera: Camera, x: Any, y: Any) -> Any:
+        """Where the ray through a point of the film (px) begins, Array3f, camera axes."""
+        del camera, y
+        return types_of(type(x)).Array3f(0, 0, 0)
+
 
 @dataclass(frozen=True)
 class Perspective(Lens):
@@ -128,6 +133,10 @@ class Pinhole(Perspective):
         return t.Array3f(film.x, film.y, 1)
 
 
+MISSED = 0.01
+"""px: how far from its place a ray's point may be seen."""
+
+
 @dataclass(frozen=True)
 class Camera:
     """A camera: x right, y down, z forward; pixel centres at (i + 0.5, j + 0.5).
@@ -179,6 +188,31 @@ class Camera:
             height=int(height),
         )
         return camera.with_lens(lens)
+
+    def look_through(self, x: Any, y: Any) -> tuple[Any, Any, Any]:
+        """The ray through a place of the film (px): its origin, its direction, if it is one.
+
+        Origin and direction (of any length) are Array3f in camera axes. A lens shows nothing at
+        places where its model ends: what it looks for is then found elsewhere.
+        """
+        direction = self.lens.ray(self, x, y)
+        origin = self.lens.origin(self, x, y)
+        if not self.lens.distorts:
+            return origin, direction, True
+        seen, _, _ = self.lens.look(replace(self, near=type(self.near)(0)), direction)
+        t = types_of(type(self.near))
+        missed = self.lens.film_point(self, direction) - t.Array2f(x, y)
+        return origin, direction, seen & (dr.squared_norm(missed) < MISSED**2)
+
+    def at_row(self, y: Any) -> Camera:
+        """Where a camera is whose rows are read one after the other, when it reads that of y, px.
+
+        One that does not move is as it is.
+        """
+        if self.shutter is None:
+            return self
+        row = (y - self.film_start.y) / (self.film_end.y - self.film_start.y)
+        return self.shutter.pose(self, row)
 
     def numbers(self) -> list[Any]:
         """Pose, focal lengths, principal point and lens as Float of one entry, in a fixed order."""

@@ -32,6 +32,14 @@ def with_weight(film: mi.Film, channels: Channels, weight: Any) -> Channels:
     return [*channels[:count], weight, *channels[count:]]
 
 
+def pixel_corners(film: mi.Film) -> mi.Point2f:
+    """The upper left corners of the crop window's pixels, row by row, px."""
+    width, height = film.crop_size()
+    pixel = dr.arange(mi.UInt32, width * height)
+    row = pixel // dr.opaque(mi.UInt32, width)
+    return mi.Point2f(pixel - row * width, row)
+
+
 class CenterExposure:
     """Each pixel is evaluated once, at its centre. Exact for films whose filter is a box."""
 

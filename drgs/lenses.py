@@ -567,6 +567,12 @@ class Orthographic(Lens):
         del camera, y
         return types_of(type(x)).Array3f(0, 0, 1)
 
+    def origin(self, camera: Camera, x: Any, y: Any) -> Any:
+        """Where the ray through a point of the film (px) begins, Array3f, camera axes."""
+        t = types_of(type(x))
+        film = (t.Array2f(x, y) - camera.principal) / camera.focal
+        return t.Array3f(film.x, film.y, 0)
+
 
 # ----------------------------------------------------------------------------------------------
 # Aperture

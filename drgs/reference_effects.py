@@ -682,3 +682,54 @@ def sampling_rates(means: np.ndarray, cameras: Sequence[Camera]) -> np.ndarray:
             f"{len(rates)} means"
         )
     return np.where(rates > 0, rates, rates[rates > 0].min(initial=inf))
+
+
+# ----------------------------------------------------------------------------------------------
+# Surfaces between the splats
+# ----------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class SurfacePicture:
+    """What a camera sees of splats and of a surface between them."""
+
+    color: np.ndarray  # (H, W, 3) display space, of the splats: premultiplied
+    depth: np.ndarray  # (H, W) sum of weights times depths of the splats, world units
+    before: np.ndarray  # (H, W) transmittance in front of the surface
+    transmittance: np.ndarray  # (H, W) share of the background that is seen past all
+
+
+def render_with_surface(
+    gaussians: Gaussians, camera: Camera, surface_depth: np.ndarray, coverage: np.ndarray
+) -> SurfacePicture:
+    """Composite splats, front to back, and a surface as one more layer of alpha ``coverage``.
+
+    surface_depth (H, W) camera z, world units; coverage (H, W) in [0, 1]. A splat is behind the
+    surface where its mean's depth is larger. Which splat is the last that a pixel composites is
+    decided as without the surface.
+    """
+    splats = reference.project(gaussians, camera)
+    colors = reference.sh_colors(gaussians, camera, gaussians.sh_degree)
+    order = np.flatnonzero(splats.visible)
+    order = order[np.argsort(splats.depths[order], kind="stable")]
+    shape = camera.height, camera.width
+    y, x = np.mgrid[: camera.height, : camera.width] + 0.5
+    color, depth, before = np.zeros((*shape, 3)), np.zeros(shape), np.ones(shape)
+    seen, without = np.ones(shape), np.ones(shape)  # transmittance with and without the surface
+    passed, finished = np.zeros(shape, dtype=bool), np.zeros(shape, dtype=bool)
+    for i in order:
+        behind = splats.depths[i] > surface_depth
+        seen = np.where(behind & ~passed, seen * (1 - coverage), seen)
+        passed |= behind
+        offset = np.stack([x, y], axis=-1) - splats.means2d[i]
+        exponent = -0.5 * np.einsum("...a,ab,...b", offset, splats.conics[i], offset)
+        alpha = np.minimum(splats.opacities[i] * np.exp(exponent), reference.ALPHA_MAX)
+        alpha = np.where(alpha < reference.ALPHA_CUT, 0, alpha)
+        finished |= (alpha > 0) & (without * (1 - alpha) < reference.TRANSMITTANCE_STOP)
+        alpha = np.where(finished, 0, alpha)
+        color += (seen * alpha)[..., None] * colors[i]
+        depth += seen * alpha * splats.depths[i]
+        before = np.where(passed, before, before * (1 - alpha))
+        seen, without = seen * (1 - alpha), without * (1 - alpha)
+    seen = np.where(passed, seen, seen * (1 - coverage))
+    return SurfacePicture(color, depth, before, seen)

@@ -217,11 +217,8 @@ class CalibratedSensor(mi.Sensor):
         state = read_sensor(self, 0.0)
         camera = self._pinhole(state)
         lens = self.lens.with_named(state.device).upload(mi.Float)
-        direction = mi.Vector3f(lens.ray(camera, place.x, place.y))
-        # Where nothing that the lens sees comes to this place, the search ends elsewhere.
-        seen, _, _ = lens.look(replace(camera, near=mi.Float(0)), direction)
-        missed = mi.Vector2f(lens.film_point(camera, direction)) - mi.Vector2f(place)
-        seen &= dr.squared_norm(missed) < MISSED**2
+        camera = replace(camera, lens=lens)
+        _, direction, seen = camera.look_through(place.x, place.y)
 
         if camera.shutter is not None:
             camera = camera.shutter.pose(camera, self._time_of(camera, time, place.y))
@@ -267,10 +264,6 @@ class CalibratedSensor(mi.Sensor):
     def bbox(self) -> mi.ScalarBoundingBox3f:
         """Of the centre: nothing of the camera is in the scene."""
         return mi.ScalarBoundingBox3f()
-
-
-MISSED = 0.01
-"""px: how far from its place a ray's point may be seen."""
 
 
 def _number(props: mi.Properties, name: str, default: float) -> float:

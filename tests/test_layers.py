@@ -29,6 +29,7 @@ LAYERS = {
         "extra_features",
         "image_model",
         "lanes",
+        "occlusion",
         "perspective",
         "pixel_order",
         "projection",

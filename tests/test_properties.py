@@ -570,7 +570,7 @@ def test_pictures_are_linear_in_the_features_and_weights_add_up_to_alpha(precisi
     a, b = rng.normal(0, 1, (2, case.count))
     s, t = rng.normal(0, 1, 2)
     columns = [stored(c, precision) for c in (a, b, s * a + t * b, np.ones(case.count))]
-    pipeline = rendering.Pipeline(case.degree, plain_opacity, (lambda splats: columns,))
+    pipeline = rendering.Pipeline(case.degree, plain_opacity, (lambda *_: columns,))
     gaussians = uploaded(case.gaussians, precision)
     frame = rendering.render(gaussians, device_camera(case.camera, precision), pipeline)
     transmittance, of_a, of_b, of_sum, of_one = (rows(plane) for plane in frame.planes())
