@@ -86,10 +86,7 @@ def pixels_adjoint(
     A film develops each pixel by the same linear map, found once by developing unit images.
     (The derivative of ``develop`` itself would be scattered by atomic additions.)
     """
-    key = f"{film} {', '.join(aovs)}"
-    if key not in maps:
-        maps[key] = _film_map(film, aovs)
-    matrix = maps[key]
+    matrix = film_map(film, maps, aovs)
     pixel = dr.arange(mi.UInt32, grad_in.shape[0] * grad_in.shape[1])
     developed = [
         dr.gather(mi.Float, grad_in.array, pixel * len(matrix) + k) for k in range(len(matrix))
@@ -103,8 +100,18 @@ def pixels_adjoint(
     ]
 
 
-def _film_map(film: mi.Film, aovs: Sequence[str]) -> np.ndarray:
-    """(developed channels, channels): the linear map that a film applies to each pixel."""
+def film_map(film: mi.Film, maps: dict[str, np.ndarray], aovs: Sequence[str]) -> np.ndarray:
+    """(developed channels, channels): the linear map that a film applies to each pixel.
+
+    maps: remembers those of films, by their description.
+    """
+    key = f"{film} {', '.join(aovs)}"
+    if key not in maps:
+        maps[key] = _found_map(film, aovs)
+    return maps[key]
+
+
+def _found_map(film: mi.Film, aovs: Sequence[str]) -> np.ndarray:
     count = num_colors(film) + len(aovs)
     num_pixels = film.crop_size()[0] * film.crop_size()[1]
 

@@ -24,7 +24,7 @@ from typing import Any
 
 import drjit as dr
 
-from drgs.image_model import SplatFeatures
+from drgs.image_model import ImageModel, SplatFeatures
 from drgs.lanes import Lanes, load_pixels
 from drgs.tiles import TileGrid
 
@@ -100,3 +100,9 @@ class OccludedFeatures(SplatFeatures):
         z, passes = self.bound[pixel]
         in_front = depth <= z
         return dr.select(in_front, 1, passes), dr.select(in_front, type(depth)(1), 0)
+
+
+def amid(model: ImageModel, surface: Surface, camera: Any) -> ImageModel:
+    """An image model of splats some of which the surface hides."""
+    grid = TileGrid(camera.width, camera.height)
+    return replace(model, features=OccludedFeatures(model.features, surface, grid))

@@ -171,12 +171,13 @@ def render(gaussians: Gaussians, camera: Camera, pipeline: Pipeline) -> Frame:
     return Frame(pipeline=pipeline, camera=camera, bins=bins, records=records, layers=layers)
 
 
-def render_again(frame: Frame, positions: Any) -> Frame:
-    """The same splats, in the same tiles, at other points of the pixels.
+def render_again(frame: Frame, model: ImageModel) -> Frame:
+    """The same splats, in the same tiles, with another image model.
 
-    positions: within the margin of those that ``frame`` was rendered at.
+    model: that of the frame's pipeline, but for points of the pixels within the same margin, or
+    for features that are composited of the same stored numbers.
     """
-    bins = replace(frame.bins, model=replace(frame.bins.model, positions=positions))
+    bins = replace(frame.bins, model=model.seen_by(frame.camera))
     return replace(frame, bins=bins, layers=frame.pipeline.order.composite(bins, frame.records))
 
 

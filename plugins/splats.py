@@ -6,7 +6,7 @@ Executed once per Mitsuba variant (see ``drgs.plugins``). The rasterizer itself 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import reduce
 from itertools import chain, repeat
@@ -52,9 +52,16 @@ class _Rendered:
     exposure: Any  # key of the points that were sampled; None: pixel centres
     sensor: SensorState
     gaussians: Gaussians  # detached: holding them keeps their variable indices from being reused
+    surfaces: Any  # SurfaceScene, or None
+    seen: Any  # what is seen of the surfaces, by time and by sample: SeenSurface, or None
 
     def matches(
-        self, pipeline: rendering.Pipeline, exposure: Any, sensor: SensorState, gaussians: Gaussians
+        self,
+        pipeline: rendering.Pipeline,
+        exposure: Any,
+        sensor: SensorState,
+        gaussians: Gaussians,
+        surfaces: Any,
     ) -> bool:
         """Whether rendering these would give the same frames."""
         indices = dr.detail.collect_indices
@@ -63,6 +70,7 @@ class _Rendered:
             and self.exposure == exposure
             and self.sensor.same_as(sensor)
             and indices(self.gaussians) == indices(gaussians)
+            and self.surfaces is surfaces
         )
 
 
@@ -103,6 +111,16 @@ class SplatsIntegrator(mi.CppADIntegrator):
        - |bool|
        - An environment emitter of the scene is seen behind the splats, instead of the background,
          unless this is set. (Default: |false|)
+
+     * - (Nested plugin)
+       - :paramtype:`integrator`
+       - Renders the scene's meshes and other surfaces, if it has any, between which the splats
+         are composited by depth. Its ``hide_emitters`` should be that of this integrator.
+         (Default: ``path``)
+
+     * - nested_spp
+       - |int|
+       - Samples per pixel of the nested integrator. (Default: as many as of the splats)
 
      * - near
        - |float|
@@ -186,8 +204,10 @@ class SplatsIntegrator(mi.CppADIntegrator):
        - |exposed|, |differentiable|
 
     This integrator composites Gaussians front to back over each pixel (Kerbl et al. 2023, "3D
-    Gaussian Splatting for Real-Time Radiance Field Rendering"). Of the scene's other objects it
-    sees the environment emitter alone. With one sample per pixel and a ``box`` filter it evaluates
+    Gaussian Splatting for Real-Time Radiance Field Rendering"). Meshes and other surfaces of the
+    scene are rendered by a nested integrator; each pixel composites what that shows at the depth of
+    the first surface, amid the splats. Light does not pass from one to the other. A scene without
+    surfaces runs no nested integrator. With one sample per pixel and a ``box`` filter it evaluates
     each pixel at its centre, and both the picture and the gradients are the same to the last bit in
     every run. With more samples or another filter, pixels are evaluated at the points that the
     sensor's sampler chooses; ``low_pass`` may then be 0. With a ``box`` filter this, too, is the
@@ -201,9 +221,9 @@ class SplatsIntegrator(mi.CppADIntegrator):
     one rendering to the next.
 
     .. note:: Not differentiated: visibility, the order of the splats, the cut-offs of alpha and
-        transmittance. Derivatives with respect to a sensor's pose, focal lengths and principal
-        point are computed where they are enabled, though Mitsuba's own sensors announce theirs as
-        not differentiable.
+        transmittance; the depth and the silhouette of surfaces. Derivatives with respect to a
+        sensor's pose, focal lengths and principal point are computed where they are enabled, though
+        Mitsuba's own sensors announce theirs as not differentiable.
 
     .. tabs::
 
@@ -241,9 +261,12 @@ class SplatsIntegrator(mi.CppADIntegrator):
         self.choices = _choices(props)
         self.near = _positive(props, "near", NEAR)
         self.srgb_primitives = _boolean(props, "srgb_primitives", True)
+        self.nested = _nested(props)
+        self.nested_spp = _count(props, "nested_spp", 0)
 
         self.last: LastBackward | None = None
         self._rendered: _Rendered | None = None
+        self._surfaces: Any = None  # SurfaceScene of the last scene that had any
         self._film_maps: dict[str, np.ndarray] = {}  # by description of the film
         self._logged_plan = ""
 
@@ -260,6 +283,8 @@ class SplatsIntegrator(mi.CppADIntegrator):
         for name, value in self.features.items():
             callback.put(name, value, mi.ParamFlags.Differentiable)
         callback.put("background", self.background, mi.ParamFlags.Differentiable)
+        if self.nested is not None:
+            callback.put("nested", self.nested, mi.ParamFlags.Differentiable)
 
     def parameters_changed(self, keys: list[str]) -> None:
         """Check that the parameters still fit together, and forget a frame of former ones.
@@ -320,6 +345,10 @@ class SplatsIntegrator(mi.CppADIntegrator):
             settings["hide_emitters"] = True
         if self.aovs:
             settings["aovs"] = ", ".join(f"{name}:{kind}" for name, kind in self.aovs.items())
+        if self.nested is not None:
+            settings["nested"] = self.nested.class_name()
+        if self.nested_spp:
+            settings["nested_spp"] = self.nested_spp
         if self.ignore:
             settings["ignore"] = ", ".join(self.ignore)
         lines = ",\n".join(f"  {name} = {value}" for name, value in settings.items())
@@ -342,11 +371,14 @@ class SplatsIntegrator(mi.CppADIntegrator):
         sensor = _resolve_sensor(scene, sensor)
         with dr.suspend_grad():
             self._log_plan(scene, sensor)
-            exposure = self._exposure(sensor, seed, spp)
-            frames = self._frames(sensor, exposure)
+            hybrid = self._hybrid(scene, sensor, seed, spp)
+            exposure = self._exposure(sensor, seed, spp, hybrid)
+            frames = self._frames(sensor, exposure, hybrid)
             planes = [[frame.planes() for frame in times] for times in frames]
             behind = self._behind(scene, sensor, exposure, self._constant())
-            image = exposure.develop(self._channels(sensor.film(), planes, behind))
+            image = exposure.develop(self._channels(planes, behind, hybrid, sensor.film()))
+            if hybrid is not None:
+                image = hybrid.insertion.develop(image, hybrid.picture())
             if evaluate:
                 dr.eval(image)
         return image if develop else mi.TensorXf()
@@ -365,27 +397,30 @@ class SplatsIntegrator(mi.CppADIntegrator):
         grad_in: derivative of the loss with respect to the developed image. Leaves
         :class:`LastBackward` in ``self.last``.
         """
-        del params
         sensor = _resolve_sensor(scene, sensor)
         with dr.suspend_grad():
-            exposure = self._exposure(sensor, seed, spp)
-            frames = self._frames(sensor, exposure)
+            hybrid = self._hybrid(scene, sensor, seed, spp)
+            exposure = self._exposure(sensor, seed, spp, hybrid)
+            frames = self._frames(sensor, exposure, hybrid)
             planes = [[frame.planes() for frame in times] for times in frames]
             constant = self._constant()
             dr.eval(planes)
+            if hybrid is not None:
+                behind = self._behind(scene, sensor, exposure, constant)
+                own = exposure.develop(self._channels(planes, behind, hybrid, sensor.film()))
+                grad_in, d_nested = hybrid.insertion.adjoint(own, hybrid.picture(), grad_in)
             d_channels = exposure.adjoint(grad_in)
             # Colour conversion and background are a few operations per pixel, traced again and
             # differentiated by Dr.Jit.
             with dr.resume_grad():
                 dr.enable_grad(planes, constant)
                 behind = self._behind(scene, sensor, exposure, constant)
-                channels = self._channels(sensor.film(), planes, behind)
+                channels = self._channels(planes, behind, hybrid, sensor.film())
                 dr.accum_grad(channels, d_channels)
                 dr.enqueue(dr.ADMode.Backward, channels)
                 dr.traverse(dr.ADMode.Backward)
                 d_planes = dr.grad(planes)
                 d_constant = None if constant is None else dr.grad(constant)
-            sensor.film().clear()  # as after any backward pass of Mitsuba's own integrators
             dr.eval(d_planes, d_constant)
             with dr.resume_grad():
                 state = self._sensor_state(sensor)
@@ -410,6 +445,9 @@ class SplatsIntegrator(mi.CppADIntegrator):
                 if of_camera:
                     numbers = [camera.numbers() for camera in self._cameras(state)]
                     _accumulate_through(numbers, [gradients.camera for gradients in by_time])
+            if hybrid is not None:
+                hybrid.backward(params, d_nested)
+            sensor.film().clear()  # it may hold an attached block
 
     def render_forward(
         self,
@@ -420,11 +458,11 @@ class SplatsIntegrator(mi.CppADIntegrator):
         spp: int = 0,
     ) -> mi.TensorXf:
         """Directional derivative of the image along the gradients set on the parameters."""
-        del params
         sensor = _resolve_sensor(scene, sensor)
         with dr.suspend_grad():
-            exposure = self._exposure(sensor, seed, spp)
-            frames = self._frames(sensor, exposure)
+            hybrid = self._hybrid(scene, sensor, seed, spp)
+            exposure = self._exposure(sensor, seed, spp, hybrid)
+            frames = self._frames(sensor, exposure, hybrid)
             with dr.resume_grad():
                 features = self.gaussians.features
                 tangents = Gaussians(
@@ -446,11 +484,16 @@ class SplatsIntegrator(mi.CppADIntegrator):
                 if constant is not None:
                     dr.set_grad(constant, d_constant)
                 behind = self._behind(scene, sensor, exposure, constant)
-                channels = self._channels(sensor.film(), planes, behind)
+                channels = self._channels(planes, behind, hybrid, sensor.film())
                 image = exposure.develop(channels)
-                dr.forward_to(image)
+                # The nested integrator reads the gradients of the inputs again.
+                dr.forward_to(image, flags=dr.ADFlag.ClearEdges | dr.ADFlag.ClearInterior)
                 d_image = dr.grad(image)
-            sensor.film().clear()  # it holds the attached block
+            if hybrid is not None:
+                nested = hybrid.picture()
+                d_nested = hybrid.tangent(params, nested)
+                d_image = hybrid.insertion.tangent(dr.detach(image), nested, d_image, d_nested)
+            sensor.film().clear()  # it holds an attached block
         return d_image
 
     def sample(self, *args: Any, **kwargs: Any) -> Any:
@@ -460,16 +503,36 @@ class SplatsIntegrator(mi.CppADIntegrator):
             "that samples single rays, such as 'moment' or 'aov'"
         )
 
-    def _exposure(self, sensor: mi.Sensor, seed: Any, spp: int) -> Any:
+    def _exposure(self, sensor: mi.Sensor, seed: Any, spp: int, hybrid: Any) -> Any:
         """Where the sensor's pixels are evaluated, and how its film develops them."""
+        names = self.aov_names() + ([] if hybrid is None else hybrid.insertion.channels)
         spp = spp or sensor.sampler().sample_count()
         if spp == 1 and sensor.film().rfilter().is_box_filter():
-            return CenterExposure(sensor.film(), self._film_maps, self.aov_names())
+            return CenterExposure(sensor.film(), self._film_maps, names)
         from drgs.sampling import SampledExposure
 
-        return SampledExposure(sensor, seed, spp, self._film_maps, self.aov_names())
+        return SampledExposure(sensor, seed, spp, self._film_maps, names)
 
-    def _frames(self, sensor: mi.Sensor, exposure: Any) -> list[list[rendering.Frame]]:
+    def _hybrid(self, scene: mi.Scene, sensor: mi.Sensor, seed: Any, spp: int) -> Any:
+        """The part that surfaces take in a picture; None where there are none."""
+        if all(shape.is_ellipsoids() for shape in scene.shapes()):
+            return None
+        from drgs.surfaces import Hybrid, Insertion, SurfaceScene
+
+        self._surfaces = SurfaceScene.of(scene, self._surfaces)
+        nested = self.nested or mi.load_dict({"type": "path", "hide_emitters": self.hide_emitters})
+        insertion = Insertion(
+            sensor.film(),
+            self._film_maps,
+            self.aov_names(),
+            shows_background=not self.hide_emitters and scene.environment() is not None,
+            display_space=not self.srgb_primitives,
+        )
+        return Hybrid(self._surfaces, nested, sensor, seed, self.nested_spp or spp, insertion)
+
+    def _frames(
+        self, sensor: mi.Sensor, exposure: Any, hybrid: Any = None
+    ) -> list[list[rendering.Frame]]:
         """Render, or reuse the last frames if nothing that they depend on has changed.
 
         One list for each time at which the shutter is open, of a frame for each sample per pixel.
@@ -479,16 +542,33 @@ class SplatsIntegrator(mi.CppADIntegrator):
         """
         pipeline, gaussians = self.pipeline, dr.detach(self.gaussians)
         state = self._sensor_state(sensor).detached()
+        surfaces = None if hybrid is None else hybrid.surfaces
+        key = pipeline, exposure.key, state, gaussians, surfaces
         last = self._rendered
-        if last is None or not last.matches(pipeline, exposure.key, state, gaussians):
-            first, *others = exposure.positions
-            model = replace(pipeline.model, positions=first)
-            frames = []
-            for camera in cameras_in_time(self._camera(state)):
-                frame = rendering.render(gaussians, camera, replace(pipeline, model=model))
-                frames.append([frame, *(rendering.render_again(frame, p) for p in others)])
-            self._rendered = _Rendered(frames, pipeline, exposure.key, state, gaussians)
+        if last is None or not last.matches(*key):
+            cameras = cameras_in_time(self._camera(state))
+            seen = None if hybrid is None else self._seen(hybrid, sensor, cameras, exposure)
+            frames = [
+                _render(gaussians, camera, pipeline, exposure.positions, of_time)
+                for camera, of_time in zip(cameras, seen or repeat(None), strict=False)
+            ]
+            self._rendered = _Rendered(frames, *key, seen)
         return self._rendered.frames
+
+    def _seen(
+        self, hybrid: Any, sensor: mi.Sensor, cameras: list[Camera], exposure: Any
+    ) -> list[list[Any]]:
+        """What is seen of the surfaces, by time and by sample."""
+        from drgs.surfaces import look_at
+
+        return look_at(
+            hybrid.surfaces.scene,
+            sensor.film(),
+            cameras,
+            exposure.within,
+            self.hide_emitters,
+            with_normals="normal" in self.aovs.values(),
+        )
 
     def _sensor_state(self, sensor: mi.Sensor) -> SensorState:
         return read_sensor(sensor, self.near)
@@ -546,7 +626,7 @@ class SplatsIntegrator(mi.CppADIntegrator):
         if environment is None and constant is not None:
             if self.srgb_primitives:
                 constant = mi.math.srgb_to_linear(constant)
-            return _Behind(repeat(repeat(constant)), opaque=False)
+            return _Behind(repeat(repeat(constant)), opaque=False, radiance=repeat(repeat(None)))
         from drgs import backdrop
 
         if environment is not None:
@@ -557,22 +637,31 @@ class SplatsIntegrator(mi.CppADIntegrator):
         cameras = [of_time[0].camera for of_time in self._rendered.frames]
         if state.is_attached:
             cameras = self._cameras(state)
-        colors = backdrop.seen_by(sensor.film(), behind, cameras, exposure.within)
+        colors = radiance = backdrop.seen_by(sensor.film(), behind, cameras, exposure.within)
         if not self.srgb_primitives:
             colors = [[mi.math.linear_to_srgb(color) for color in of_time] for of_time in colors]
-        return _Behind(colors, behind.opaque)
+        return _Behind(colors, behind.opaque, radiance)
 
     def _channels(
-        self, film: mi.Film, planes: list[list[list[mi.Float]]], behind: _Behind
+        self, planes: list[list[list[mi.Float]]], behind: _Behind, hybrid: Any, film: mi.Film
     ) -> list[list[mi.Float]]:
         """What the film gets of each sample per pixel: the mean over the times."""
         has_alpha = mi.has_flag(film.flags(), mi.FilmFlags.Alpha)
+        seen = self._rendered.seen or repeat(repeat(None))
+
+        def channels_of(planes: list[mi.Float], surface: Any, color: Any, radiance: Any) -> list:
+            if surface is None:
+                return self._composited(planes, color, behind.opaque, has_alpha)
+            *planes, front = planes
+            past = [(1 - surface.coverage) * planes[0], *planes[1:]]
+            others = self._composited(
+                past, color, behind.opaque, has_alpha, lambda kind: surface.added(kind, front)
+            )
+            return others + hybrid.insertion.values(surface, front, radiance)
+
+        by_time = zip(planes, seen, behind.colors, behind.radiance, strict=False)
         channels = [
-            [
-                self._composited(plane, color, behind.opaque, has_alpha)
-                for plane, color in zip(of_time, colors, strict=False)
-            ]
-            for of_time, colors in zip(planes, behind.colors, strict=False)
+            [channels_of(*sample) for sample in zip(*time, strict=False)] for time in by_time
         ]
         if len(channels) == 1:
             return channels[0]
@@ -582,9 +671,17 @@ class SplatsIntegrator(mi.CppADIntegrator):
         ]
 
     def _composited(
-        self, planes: list[mi.Float], behind: mi.Color3f, opaque: bool, has_alpha: bool
+        self,
+        planes: list[mi.Float],
+        behind: mi.Color3f,
+        opaque: bool,
+        has_alpha: bool,
+        added: Callable[[str], list[mi.Float] | None] = lambda kind: None,
     ) -> list[mi.Float]:
-        """Planes of pixels: red, green, blue, perhaps alpha, AOVs."""
+        """Planes of pixels: red, green, blue, perhaps alpha, AOVs.
+
+        added: to the channels of an AOV of this kind.
+        """
         transmittance, red, green, blue, *others = planes
         color = mi.Color3f(red, green, blue)
         if self.srgb_primitives:
@@ -596,8 +693,12 @@ class SplatsIntegrator(mi.CppADIntegrator):
         for kind in self.aovs.values():
             if kind == "alpha":
                 channels.append(1 - transmittance)
-            else:
-                channels += [others.pop(0) for _ in self._channels_of(kind)]
+                continue
+            values = [others.pop(0) for _ in self._channels_of(kind)]
+            more = added(kind)
+            channels += (
+                values if more is None else [a + b for a, b in zip(values, more, strict=True)]
+            )
         return channels
 
 
@@ -605,8 +706,30 @@ class SplatsIntegrator(mi.CppADIntegrator):
 class _Behind:
     """What is seen past the splats."""
 
-    colors: Any  # by time and by sample: Color3f
+    colors: Any  # by time and by sample: Color3f, in the space of the channels
     opaque: bool  # whether it covers the film
+    radiance: Any  # by time and by sample: the same, linear; None: of a constant
+
+
+def _render(
+    gaussians: Gaussians,
+    camera: Camera,
+    pipeline: rendering.Pipeline,
+    positions: Sequence[Any],
+    surfaces: Sequence[Any] | None,
+) -> list[rendering.Frame]:
+    """A frame for each sample per pixel; surfaces: what is seen of them at each."""
+    models = [replace(pipeline.model, positions=points) for points in positions]
+    if surfaces is not None:
+        from drgs.occlusion import amid
+
+        models = [
+            amid(model, surface, camera) for model, surface in zip(models, surfaces, strict=True)
+        ]
+        pipeline = replace(pipeline, features=(*pipeline.features, rendering.depth_feature))
+    first, *others = models
+    frame = rendering.render(gaussians, camera, replace(pipeline, model=first))
+    return [frame, *(rendering.render_again(frame, model) for model in others)]
 
 
 def _load_gaussians(props: mi.Properties) -> Gaussians:
@@ -700,6 +823,22 @@ def _boolean(props: mi.Properties, name: str, default: bool) -> bool:
     value = props.get(name, default)
     if not isinstance(value, bool):
         raise TypeError(f"splats: {name} must be true or false, got {value!r}")
+    return value
+
+
+def _nested(props: mi.Properties) -> mi.Integrator | None:
+    """The nested integrator, under whatever name it was given."""
+    given = [props[name] for name in props.keys()]  # noqa: SIM118
+    nested = [value for value in given if isinstance(value, mi.Integrator)]
+    if len(nested) > 1:
+        raise ValueError(f"splats: at most one integrator can be nested, got {len(nested)}")
+    return nested[0] if nested else None
+
+
+def _count(props: mi.Properties, name: str, default: int) -> int:
+    value = props.get(name, default)
+    if isinstance(value, bool) or not isinstance(value, int) or value < 0:
+        raise ValueError(f"splats: {name} must be a whole number, 0 or more, got {value!r}")
     return value
 
 

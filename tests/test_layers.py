@@ -62,6 +62,7 @@ LAYERS = {
         "scene",
         "schedule",
         "supervision",
+        "surfaces",
         "trainer",
         "training_effects",
         "training_smoothing",

@@ -238,7 +238,8 @@ class Renderer:
         first, *others = self.positions
         model = replace(pipeline.model, positions=first)
         frame = rendering.render(self.gaussians, self.camera, replace(pipeline, model=model))
-        frames = [frame, *(rendering.render_again(frame, p) for p in others)]
+        again = [replace(model, positions=points) for points in others]
+        frames = [frame, *(rendering.render_again(frame, other) for other in again)]
         dr.eval([f.planes() for f in frames])
         dr.sync_thread()
         return frames
