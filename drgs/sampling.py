@@ -18,6 +18,10 @@ import numpy as np
 from drgs.exposure import Channels, develop_pixels, num_colors, pixels_adjoint, with_weight
 from drgs.samples import SamplePoints
 
+PASSES_PER_KERNEL = 16
+"""Of more samples per pixel, the sums are evaluated in between: compilers take longer than
+proportionally to a kernel's length."""
+
 
 class SampledExposure:
     """``spp`` samples per pixel, drawn by a copy of the sensor's sampler."""
@@ -52,7 +56,12 @@ class SampledExposure:
         """The image of all passes."""
         if self.film.rfilter().is_box_filter():
             count = len(passes)
-            sums = [sum(planes[1:], planes[0]) for planes in zip(*passes, strict=True)]
+            sums = [mi.Float(0)] * len(passes[0])
+            for first in range(0, count, PASSES_PER_KERNEL):
+                for channels in passes[first : first + PASSES_PER_KERNEL]:
+                    sums = [total + plane for total, plane in zip(sums, channels, strict=True)]
+                if count > PASSES_PER_KERNEL:
+                    dr.eval(sums)
             return develop_pixels(self.film, [total / count for total in sums], self.aovs)
         film = self.film
         film.prepare(self.aovs)

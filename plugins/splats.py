@@ -265,7 +265,7 @@ class SplatsIntegrator(mi.CppADIntegrator):
         self.nested_spp = _count(props, "nested_spp", 0)
 
         self.last: LastBackward | None = None
-        self._rendered: _Rendered | None = None
+        self._rendered: dict[int, _Rendered] = {}  # by number of the view
         self._surfaces: Any = None  # SurfaceScene of the last scene that had any
         self._film_maps: dict[str, np.ndarray] = {}  # by description of the film
         self._logged_plan = ""
@@ -293,7 +293,7 @@ class SplatsIntegrator(mi.CppADIntegrator):
         is what ``SceneParameters.set_dirty`` announces.
         """
         if keys != ["background"]:
-            self._rendered = None
+            self._rendered.clear()
         if dr.width(self.shN) == 0:  # not exposed, so that its rows could not be set
             self.shN = dr.zeros(mi.TensorXf, (next(iter(self.means.shape), 0), 0, 3))
         _check_shapes(replace(self.gaussians, features=self.features))
@@ -371,14 +371,10 @@ class SplatsIntegrator(mi.CppADIntegrator):
         sensor = _resolve_sensor(scene, sensor)
         with dr.suspend_grad():
             self._log_plan(scene, sensor)
-            hybrid = self._hybrid(scene, sensor, seed, spp)
-            exposure = self._exposure(sensor, seed, spp, hybrid)
-            frames = self._frames(sensor, exposure, hybrid)
-            planes = [[frame.planes() for frame in times] for times in frames]
-            behind = self._behind(scene, sensor, exposure, self._constant())
-            image = exposure.develop(self._channels(planes, behind, hybrid, sensor.film()))
-            if hybrid is not None:
-                image = hybrid.insertion.develop(image, hybrid.picture())
+            shot = self._shot(scene, sensor, seed, spp)
+            image = self._own_image(scene, shot)
+            if shot.hybrid is not None:
+                image = shot.hybrid.insertion.develop(image, shot.hybrid.picture())
             if evaluate:
                 dr.eval(image)
         return image if develop else mi.TensorXf()
@@ -399,37 +395,17 @@ class SplatsIntegrator(mi.CppADIntegrator):
         """
         sensor = _resolve_sensor(scene, sensor)
         with dr.suspend_grad():
-            hybrid = self._hybrid(scene, sensor, seed, spp)
-            exposure = self._exposure(sensor, seed, spp, hybrid)
-            frames = self._frames(sensor, exposure, hybrid)
-            planes = [[frame.planes() for frame in times] for times in frames]
-            constant = self._constant()
-            dr.eval(planes)
-            if hybrid is not None:
-                behind = self._behind(scene, sensor, exposure, constant)
-                own = exposure.develop(self._channels(planes, behind, hybrid, sensor.film()))
-                grad_in, d_nested = hybrid.insertion.adjoint(own, hybrid.picture(), grad_in)
-            d_channels = exposure.adjoint(grad_in)
-            # Colour conversion and background are a few operations per pixel, traced again and
-            # differentiated by Dr.Jit.
-            with dr.resume_grad():
-                dr.enable_grad(planes, constant)
-                behind = self._behind(scene, sensor, exposure, constant)
-                channels = self._channels(planes, behind, hybrid, sensor.film())
-                dr.accum_grad(channels, d_channels)
-                dr.enqueue(dr.ADMode.Backward, channels)
-                dr.traverse(dr.ADMode.Backward)
-                d_planes = dr.grad(planes)
-                d_constant = None if constant is None else dr.grad(constant)
-            dr.eval(d_planes, d_constant)
-            with dr.resume_grad():
-                state = self._sensor_state(sensor)
-                of_camera = state.is_attached
-            by_time = [
-                rendering.frames_adjoint(self.gaussians, *of_time, of_camera)
-                for of_time in zip(frames, d_planes, strict=True)
+            shot = self._shot(scene, sensor, seed, spp)
+            if shot.hybrid is not None:
+                image = self._own_image(scene, shot)
+                nested = shot.hybrid.picture()
+                grad_in, d_nested = shot.hybrid.insertion.adjoint(image, nested, grad_in)
+            d_pictures = shot.adjoint(grad_in)
+            by_view = [
+                self._view_backward(scene, view, d_channels)
+                for view, d_channels in zip(shot.views, d_pictures, strict=True)
             ]
-            gradients = reduce(rendering.added, by_time)
+            gradients = reduce(rendering.added, by_view)
             self.last = LastBackward(
                 means2d_grad=_rows(gradients.means2d),
                 visible=gradients.visible,
@@ -440,14 +416,41 @@ class SplatsIntegrator(mi.CppADIntegrator):
                     _accumulate(getattr(self, name), getattr(gradients.parameters, name))
                 for name, gradient in (gradients.parameters.features or {}).items():
                     _accumulate(self.features[name], gradient)
-                if constant is not None:
-                    _accumulate(self.background, d_constant)
-                if of_camera:
-                    numbers = [camera.numbers() for camera in self._cameras(state)]
-                    _accumulate_through(numbers, [gradients.camera for gradients in by_time])
-            if hybrid is not None:
-                hybrid.backward(params, d_nested)
+            if shot.hybrid is not None:
+                shot.hybrid.backward(params, d_nested)
             sensor.film().clear()  # it may hold an attached block
+
+    def _view_backward(
+        self, scene: mi.Scene, view: _View, d_channels: list[list[mi.Float]]
+    ) -> rendering.GaussianGradients:
+        """Derivatives with respect to the Gaussians; all others are accumulated."""
+        planes, constant = self._planes(view), self._constant()
+        dr.eval(planes)
+        # Colour conversion and background are a few operations per pixel, traced again and
+        # differentiated by Dr.Jit.
+        with dr.resume_grad():
+            dr.enable_grad(planes, constant)
+            channels = self._channels(view, planes, self._behind(scene, view, constant))
+            dr.accum_grad(channels, d_channels)
+            dr.enqueue(dr.ADMode.Backward, channels)
+            dr.traverse(dr.ADMode.Backward)
+            d_planes = dr.grad(planes)
+            d_constant = None if constant is None else dr.grad(constant)
+        dr.eval(d_planes, d_constant)
+        with dr.resume_grad():
+            state = self._sensor_state(view.sensor)
+            of_camera = state.is_attached
+        by_time = [
+            rendering.frames_adjoint(self.gaussians, *of_time, of_camera)
+            for of_time in zip(self._frames(view), d_planes, strict=True)
+        ]
+        with dr.resume_grad():
+            if constant is not None:
+                _accumulate(self.background, d_constant)
+            if of_camera:
+                numbers = [camera.numbers() for camera in self._cameras(state)]
+                _accumulate_through(numbers, [gradients.camera for gradients in by_time])
+        return reduce(rendering.added, by_time)
 
     def render_forward(
         self,
@@ -460,39 +463,36 @@ class SplatsIntegrator(mi.CppADIntegrator):
         """Directional derivative of the image along the gradients set on the parameters."""
         sensor = _resolve_sensor(scene, sensor)
         with dr.suspend_grad():
-            hybrid = self._hybrid(scene, sensor, seed, spp)
-            exposure = self._exposure(sensor, seed, spp, hybrid)
-            frames = self._frames(sensor, exposure, hybrid)
+            shot = self._shot(scene, sensor, seed, spp)
             with dr.resume_grad():
                 features = self.gaussians.features
                 tangents = Gaussians(
                     **{name: _tangent(getattr(self, name)) for name in PARAMETER_NAMES},
                     features=features and {k: _tangent(v) for k, v in features.items()},
                 )
-                constant = self._constant()
-                d_constant = None if constant is None else dr.grad(self.background)
-                d_cameras = self._camera_tangents(sensor, len(frames))
-            d_planes = [
-                rendering.frames_tangent(self.gaussians, of_time, tangents, d_camera)
-                for of_time, d_camera in zip(frames, d_cameras, strict=True)
-            ]
-            planes = [[frame.planes() for frame in times] for times in frames]
+            d_planes = [self._plane_tangents(view, tangents) for view in shot.views]
+            planes = [self._planes(view) for view in shot.views]
             dr.eval(planes, d_planes)
             with dr.resume_grad():
+                constant = self._constant()
                 dr.enable_grad(planes, constant)
                 dr.set_grad(planes, d_planes)
                 if constant is not None:
-                    dr.set_grad(constant, d_constant)
-                behind = self._behind(scene, sensor, exposure, constant)
-                channels = self._channels(planes, behind, hybrid, sensor.film())
-                image = exposure.develop(channels)
+                    dr.set_grad(constant, dr.grad(self.background))
+                image = shot.develop(
+                    [
+                        self._channels(view, of_view, self._behind(scene, view, constant))
+                        for view, of_view in zip(shot.views, planes, strict=True)
+                    ]
+                )
                 # The nested integrator reads the gradients of the inputs again.
                 dr.forward_to(image, flags=dr.ADFlag.ClearEdges | dr.ADFlag.ClearInterior)
                 d_image = dr.grad(image)
-            if hybrid is not None:
-                nested = hybrid.picture()
-                d_nested = hybrid.tangent(params, nested)
-                d_image = hybrid.insertion.tangent(dr.detach(image), nested, d_image, d_nested)
+            if shot.hybrid is not None:
+                nested = shot.hybrid.picture()
+                d_nested = shot.hybrid.tangent(params, nested)
+                image = dr.detach(image)
+                d_image = shot.hybrid.insertion.tangent(image, nested, d_image, d_nested)
             sensor.film().clear()  # it holds an attached block
         return d_image
 
@@ -503,15 +503,37 @@ class SplatsIntegrator(mi.CppADIntegrator):
             "that samples single rays, such as 'moment' or 'aov'"
         )
 
-    def _exposure(self, sensor: mi.Sensor, seed: Any, spp: int, hybrid: Any) -> Any:
-        """Where the sensor's pixels are evaluated, and how its film develops them."""
+    def _shot(self, scene: mi.Scene, sensor: mi.Sensor, seed: Any, spp: int) -> _Shot:
+        """One picture: where the sensor's pixels are evaluated, and how its film develops them."""
+        hybrid = self._hybrid(scene, sensor, seed, spp)
         names = self.aov_names() + ([] if hybrid is None else hybrid.insertion.channels)
-        spp = spp or sensor.sampler().sample_count()
-        if spp == 1 and sensor.film().rfilter().is_box_filter():
-            return CenterExposure(sensor.film(), self._film_maps, names)
-        from drgs.sampling import SampledExposure
+        film, spp = sensor.film(), spp or sensor.sampler().sample_count()
+        if spp == 1 and film.rfilter().is_box_filter():
+            exposure = CenterExposure(film, self._film_maps, names)
+        else:
+            from drgs.sampling import SampledExposure
 
-        return SampledExposure(sensor, seed, spp, self._film_maps, names)
+            exposure = SampledExposure(sensor, seed, spp, self._film_maps, names)
+        has_alpha = mi.has_flag(film.flags(), mi.FilmFlags.Alpha)
+        whole = _View(
+            0, sensor, exposure.positions, exposure.within, exposure.key, has_alpha, hybrid
+        )
+        if sensor.class_name() != "BatchSensor":
+            return _Shot([whole], exposure, hybrid)
+        from drgs.batch import SideBySide
+
+        batch = SideBySide.of(sensor)
+        views = [
+            replace(
+                whole,
+                index=index,
+                sensor=one,
+                positions=batch.positions(whole.positions, index),
+                within=batch.within(whole.within, index),
+            )
+            for index, one in enumerate(batch.sensors)
+        ]
+        return _Shot(views, exposure, hybrid, batch)
 
     def _hybrid(self, scene: mi.Scene, sensor: mi.Sensor, seed: Any, spp: int) -> Any:
         """The part that surfaces take in a picture; None where there are none."""
@@ -530,9 +552,30 @@ class SplatsIntegrator(mi.CppADIntegrator):
         )
         return Hybrid(self._surfaces, nested, sensor, seed, self.nested_spp or spp, insertion)
 
-    def _frames(
-        self, sensor: mi.Sensor, exposure: Any, hybrid: Any = None
-    ) -> list[list[rendering.Frame]]:
+    def _own_image(self, scene: mi.Scene, shot: _Shot) -> mi.TensorXf:
+        """The picture of the splats; for a hybrid one, with the channels that the rest needs."""
+        constant = self._constant()
+        return shot.develop(
+            [
+                self._channels(view, self._planes(view), self._behind(scene, view, constant))
+                for view in shot.views
+            ]
+        )
+
+    def _planes(self, view: _View) -> list[list[list[mi.Float]]]:
+        """By time and by sample."""
+        return [[frame.planes() for frame in of_time] for of_time in self._frames(view)]
+
+    def _plane_tangents(self, view: _View, tangents: Gaussians) -> list[list[list[mi.Float]]]:
+        frames = self._frames(view)
+        with dr.resume_grad():
+            d_cameras = self._camera_tangents(view.sensor, len(frames))
+        return [
+            rendering.frames_tangent(self.gaussians, of_time, tangents, d_camera)
+            for of_time, d_camera in zip(frames, d_cameras, strict=True)
+        ]
+
+    def _frames(self, view: _View) -> list[list[rendering.Frame]]:
         """Render, or reuse the last frames if nothing that they depend on has changed.
 
         One list for each time at which the shutter is open, of a frame for each sample per pixel.
@@ -541,31 +584,29 @@ class SplatsIntegrator(mi.CppADIntegrator):
         other renders possibly in between.
         """
         pipeline, gaussians = self.pipeline, dr.detach(self.gaussians)
-        state = self._sensor_state(sensor).detached()
-        surfaces = None if hybrid is None else hybrid.surfaces
-        key = pipeline, exposure.key, state, gaussians, surfaces
-        last = self._rendered
+        state = self._sensor_state(view.sensor).detached()
+        surfaces = None if view.hybrid is None else view.hybrid.surfaces
+        key = pipeline, view.key, state, gaussians, surfaces
+        last = self._rendered.get(view.index)
         if last is None or not last.matches(*key):
             cameras = cameras_in_time(self._camera(state))
-            seen = None if hybrid is None else self._seen(hybrid, sensor, cameras, exposure)
+            seen = None if surfaces is None else self._seen(view, cameras)
             frames = [
-                _render(gaussians, camera, pipeline, exposure.positions, of_time)
+                _render(gaussians, camera, pipeline, view.positions, of_time)
                 for camera, of_time in zip(cameras, seen or repeat(None), strict=False)
             ]
-            self._rendered = _Rendered(frames, *key, seen)
-        return self._rendered.frames
+            last = self._rendered[view.index] = _Rendered(frames, *key, seen)
+        return last.frames
 
-    def _seen(
-        self, hybrid: Any, sensor: mi.Sensor, cameras: list[Camera], exposure: Any
-    ) -> list[list[Any]]:
+    def _seen(self, view: _View, cameras: list[Camera]) -> list[list[Any]]:
         """What is seen of the surfaces, by time and by sample."""
         from drgs.surfaces import look_at
 
         return look_at(
-            hybrid.surfaces.scene,
-            sensor.film(),
+            view.hybrid.surfaces.scene,
+            view.sensor.film(),
             cameras,
-            exposure.within,
+            view.within,
             self.hide_emitters,
             with_normals="normal" in self.aovs.values(),
         )
@@ -595,6 +636,10 @@ class SplatsIntegrator(mi.CppADIntegrator):
         """What is simulated, what asked for it, and what is not simulated: one line an effect."""
         from drgs.effects import described, plan_of_scene
 
+        if sensor.class_name() == "BatchSensor":
+            from drgs.batch import SideBySide
+
+            sensor = SideBySide.of(sensor).sensors[0]
         camera = self._camera(self._sensor_state(sensor).detached())
         return described(plan_of_scene(self, camera, scene.environment()))
 
@@ -618,9 +663,7 @@ class SplatsIntegrator(mi.CppADIntegrator):
         dr.make_opaque(constant)
         return constant
 
-    def _behind(
-        self, scene: mi.Scene, sensor: mi.Sensor, exposure: Any, constant: mi.Color3f | None
-    ) -> _Behind:
+    def _behind(self, scene: mi.Scene, view: _View, constant: mi.Color3f | None) -> _Behind:
         """What is seen past the splats, in the space of the channels."""
         environment = None if self.hide_emitters else scene.environment()
         if environment is None and constant is not None:
@@ -633,31 +676,30 @@ class SplatsIntegrator(mi.CppADIntegrator):
             behind = backdrop.Environment(environment)
         else:
             behind = backdrop.Picture(self.background)
-        state = self._sensor_state(sensor)
-        cameras = [of_time[0].camera for of_time in self._rendered.frames]
+        state = self._sensor_state(view.sensor)
+        cameras = [of_time[0].camera for of_time in self._frames(view)]
         if state.is_attached:
             cameras = self._cameras(state)
-        colors = radiance = backdrop.seen_by(sensor.film(), behind, cameras, exposure.within)
+        colors = radiance = backdrop.seen_by(view.sensor.film(), behind, cameras, view.within)
         if not self.srgb_primitives:
             colors = [[mi.math.linear_to_srgb(color) for color in of_time] for of_time in colors]
         return _Behind(colors, behind.opaque, radiance)
 
     def _channels(
-        self, planes: list[list[list[mi.Float]]], behind: _Behind, hybrid: Any, film: mi.Film
+        self, view: _View, planes: list[list[list[mi.Float]]], behind: _Behind
     ) -> list[list[mi.Float]]:
         """What the film gets of each sample per pixel: the mean over the times."""
-        has_alpha = mi.has_flag(film.flags(), mi.FilmFlags.Alpha)
-        seen = self._rendered.seen or repeat(repeat(None))
+        seen = self._rendered[view.index].seen or repeat(repeat(None))
 
         def channels_of(planes: list[mi.Float], surface: Any, color: Any, radiance: Any) -> list:
             if surface is None:
-                return self._composited(planes, color, behind.opaque, has_alpha)
+                return self._composited(planes, color, behind.opaque, view.has_alpha)
             *planes, front = planes
             past = [(1 - surface.coverage) * planes[0], *planes[1:]]
             others = self._composited(
-                past, color, behind.opaque, has_alpha, lambda kind: surface.added(kind, front)
+                past, color, behind.opaque, view.has_alpha, lambda kind: surface.added(kind, front)
             )
-            return others + hybrid.insertion.values(surface, front, radiance)
+            return others + view.hybrid.insertion.values(surface, front, radiance)
 
         by_time = zip(planes, seen, behind.colors, behind.radiance, strict=False)
         channels = [
@@ -700,6 +742,41 @@ class SplatsIntegrator(mi.CppADIntegrator):
                 values if more is None else [a + b for a, b in zip(values, more, strict=True)]
             )
         return channels
+
+
+@dataclass(frozen=True, eq=False)
+class _View:
+    """What one sensor sees of a picture: mostly all of it."""
+
+    index: int
+    sensor: mi.Sensor
+    positions: Sequence[Any]  # in the pixels, by sample: see drgs.samples
+    within: Sequence[tuple[Any, Any]]  # the same, px from their upper left corners
+    key: Any  # of these; None: pixel centres
+    has_alpha: bool
+    hybrid: Any  # drgs.surfaces.Hybrid, or None
+
+
+@dataclass(frozen=True, eq=False)
+class _Shot:
+    """One picture."""
+
+    views: list[_View]
+    exposure: Any
+    hybrid: Any  # drgs.surfaces.Hybrid, or None
+    batch: Any = None  # drgs.batch.SideBySide, for several views
+
+    def develop(self, pictures: list[list[list[mi.Float]]]) -> mi.TensorXf:
+        """pictures: channels by view and by sample."""
+        passes = pictures[0] if self.batch is None else self.batch.put_together(pictures)
+        return self.exposure.develop(passes)
+
+    def adjoint(self, grad_in: mi.TensorXf) -> list[list[list[mi.Float]]]:
+        """Derivatives with respect to the channels, by view and by sample."""
+        passes = self.exposure.adjoint(grad_in)
+        if self.batch is None:
+            return [passes]
+        return [self.batch.cut(passes, view.index) for view in self.views]
 
 
 @dataclass(frozen=True)

@@ -20,8 +20,9 @@ from drgs.lenses import Fisheye, RadialTangential
 from drgs.schedule import changed
 
 MODULES = (
-    "backdrop", "camera_refinement", "color_correction", "defocus", "lenses", "pixels", "shutter",
-    "smoothing", "supervision", "training_smoothing", "view_parameters",
+    "backdrop", "camera_refinement", "color_correction", "defocus", "extra_features", "lenses",
+    "occlusion", "pixels", "shutter", "smoothing", "supervision", "surfaces", "training_smoothing",
+    "view_parameters",
 )  # fmt: skip
 """Of effects, and of nothing else."""
 
@@ -348,6 +349,7 @@ for name, scene in (
     ("environment", {{"sensor": sensor(type="perspective"), "sky": {{"type": "constant"}}}}),
     ("distorted", {{"sensor": sensor(type="calibrated", lens="opencv", k1=0.1)}}),
     ("thin lens", {{"sensor": sensor(type="thinlens", aperture_radius=0.1, focus_distance=2.0)}}),
+    ("surface", {{"sensor": sensor(type="perspective"), "ball": {{"type": "sphere"}}}}),
 ):
     integrator = {{"type": "splats", "filename": {ply!r}}}
     mi.render(mi.load_dict({{"type": "scene", "integrator": integrator, **scene}}), spp=1)
@@ -378,6 +380,7 @@ def test_each_effect_imports_its_own_modules(run_python, tmp_path):
         "environment": ["drgs.backdrop"],
         "distorted": ["drgs.lenses"],
         "thin lens": ["drgs.defocus"],
+        "surface": ["drgs.occlusion", "drgs.surfaces"],
     }
 
 

@@ -45,6 +45,7 @@ LAYERS = {
     3: ["choices", "rendering"],
     4: [
         "backdrop",
+        "batch",
         "camera_refinement",
         "checkpoint",
         "color_correction",
