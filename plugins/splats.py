@@ -930,8 +930,10 @@ def _boolean(props: mi.Properties, name: str, default: bool) -> bool:
 
 def _nested(props: mi.Properties) -> mi.Integrator | None:
     """The nested integrator, under whatever name it was given."""
-    given = [props[name] for name in props.keys()]  # noqa: SIM118
-    nested = [value for value in given if isinstance(value, mi.Integrator)]
+    # Objects alone: whatever is read counts as known, and a mistyped name would not be refused.
+    is_object = mi.Properties.Type.Object
+    objects = [props[name] for name in props.keys() if props.type(name) == is_object]  # noqa: SIM118
+    nested = [value for value in objects if isinstance(value, mi.Integrator)]
     if len(nested) > 1:
         raise ValueError(f"splats: at most one integrator can be nested, got {len(nested)}")
     return nested[0] if nested else None
