@@ -255,7 +255,9 @@ def _print_plan(path: Path, scene: mi.Scene, sensor: mi.Sensor) -> None:
     """What the scene's ``splats`` integrator simulates for a sensor."""
     try:
         print(scene.integrator().plan(scene, sensor), flush=True)
-    except TypeError as error:
+    except (TypeError, ValueError) as error:
+        if not str(error).startswith("splats: "):
+            raise
         raise UserError(f"{path}: {error}") from None
 
 

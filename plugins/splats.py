@@ -43,6 +43,10 @@ FEATURE = "feature_"
 """What the names of parameters begin with that hold numbers of the user's own."""
 
 
+SHAPES_TO_WORLD = "shapes_to_world"
+"""What the names of parameters begin with that tell the ``to_world`` of shapes."""
+
+
 @dataclass(frozen=True)
 class _Rendered:
     """The last frames, and everything that they depend on: reused while nothing has changed."""
@@ -95,11 +99,25 @@ class SplatsIntegrator(mi.CppADIntegrator):
      * - filename
        - |string|
        - A PLY file in the layout of the 3DGS reference implementation. Without it, the
-         Gaussians are given as tensors under the names below.
+         Gaussians are given as tensors under the names below. With and without them, Gaussians of
+         the scene's shapes of type ``ellipsoids`` and ``ellipsoidsmesh`` are rendered as well.
+
+     * - to_world
+       - |transform|
+       - Rotates, scales (the same along all axes) and moves the Gaussians of ``filename`` or the
+         tensors when they are loaded; what is seen of them from each side turns with them.
+         (Default: none)
+
+     * - shapes_to_world, shapes_to_world_...
+       - |transform|
+       - The ``to_world`` that the scene's ellipsoids were given, or those with the id that the
+         name ends with. Mitsuba moves and turns them by it when they are loaded, but not their
+         spherical harmonics, which this integrator then turns. (Default: not rotated)
 
      * - sh_degree
        - |int|
-       - Highest spherical harmonics degree that is evaluated, 0 to 3. (Default: the file's)
+       - Highest spherical harmonics degree that is evaluated, 0 to 3. (Default: the highest that
+         the file or a shape has)
 
      * - background
        - |rgb| or |texture|
@@ -213,6 +231,12 @@ class SplatsIntegrator(mi.CppADIntegrator):
     sensor's sampler chooses; ``low_pass`` may then be 0. With a ``box`` filter this, too, is the
     same in every run; other filters add in an order of their own.
 
+    Gaussians of shapes (``data``, ``opacities`` and ``sh_coeffs``, as ``volprim_rf_basic`` reads
+    them) come behind the integrator's own, in the order of ``scene.shapes()``, and are
+    differentiated with respect to the shapes' own parameters. Their quaternions are normalised,
+    opacities are clamped to 0..1, and where a splat ends is up to this integrator, not to a shape's
+    ``extent``. Of features such Gaussians have zeros, and no smoothing filter.
+
     As with Mitsuba's other integrators, a backward pass differentiates the scene as it is then:
     a parameter that was changed after ``mi.render()`` is differentiated at its new value. After
     the pass, the attribute ``last`` holds the derivatives with respect to the splats' positions
@@ -253,9 +277,12 @@ class SplatsIntegrator(mi.CppADIntegrator):
         for name in PARAMETER_NAMES:
             setattr(self, name, getattr(gaussians, name))
         self.smoothing, self.features = gaussians.smoothing, gaussians.features or {}
+        self._has_own, self._turns = gaussians.num_gaussians > 0, _turns(props)
+        self._gathered: Any = None  # with those of the scene's shapes: see drgs.shapes
         self.ignore = _ignored(props)
         self.aovs = _aovs(props, [*AOVS, *self.features])
         self.sh_degree = props.get("sh_degree", gaussians.sh_degree)
+        self._sh_degree_is_given = "sh_degree" in props
         self.background = _background(props)
         self.hide_emitters = _boolean(props, "hide_emitters", False)
         self.choices = _choices(props)
@@ -294,24 +321,53 @@ class SplatsIntegrator(mi.CppADIntegrator):
         """
         if keys != ["background"]:
             self._rendered.clear()
+            self._gathered = None
+        if not self._has_own:
+            return
         if dr.width(self.shN) == 0:  # not exposed, so that its rows could not be set
             self.shN = dr.zeros(mi.TensorXf, (next(iter(self.means.shape), 0), 0, 3))
-        _check_shapes(replace(self.gaussians, features=self.features))
-        _check_degree(self.sh_degree, self.gaussians)
+        _check_shapes(replace(self._own, features=self.features))
+        _check_degree(self.sh_degree, self._own)
 
     @property
     def sh_degree(self) -> int:
         """Highest spherical harmonics degree that is evaluated."""
+        if self._gathered is not None and not self._sh_degree_is_given:
+            return self._gathered.gaussians.sh_degree
         return self._sh_degree
 
     @sh_degree.setter
     def sh_degree(self, degree: int) -> None:
         _check_degree(degree, self.gaussians)
-        self._sh_degree = int(degree)
+        self._sh_degree, self._sh_degree_is_given = int(degree), True
 
     @property
     def gaussians(self) -> Gaussians:
-        """The parameters as one value; their arrays may be attached."""
+        """What is rendered, as one value: the parameters, whose arrays may be attached.
+
+        Once a scene with ellipsoids was rendered, theirs as well; then detached.
+        """
+        return self._own if self._gathered is None else self._gathered.gaussians
+
+    def _gather(self, scene: mi.Scene) -> None:
+        """Find the scene's ellipsoids, and convert them if they have changed."""
+        shapes = _ellipsoids(scene)
+        if shapes or set(self._turns) - {""}:
+            from drgs.shapes import gather
+
+            self._gathered = gather(self._own, shapes, self._turns, self._gathered)
+            _check_degree(self.sh_degree, self._gathered.gaussians)
+        else:
+            self._gathered = None
+        if self.gaussians.num_gaussians == 0:
+            raise ValueError(
+                "splats: there are no Gaussians: give the integrator 'filename' or tensors "
+                f"{', '.join(PARAMETER_NAMES)}, or the scene a shape of type ellipsoids or "
+                "ellipsoidsmesh"
+            )
+
+    @property
+    def _own(self) -> Gaussians:
         parameters = {name: getattr(self, name) for name in PARAMETER_NAMES}
         smoothing = None if "smoothing" in self.ignore else self.smoothing
         # What is not put out is not loaded.
@@ -334,7 +390,7 @@ class SplatsIntegrator(mi.CppADIntegrator):
     def to_string(self) -> str:
         """One line a setting; of those that are off or as usual, none."""
         settings = {
-            "gaussians": self.gaussians.num_gaussians,
+            "gaussians": self.gaussians.num_gaussians or "those of the scene's shapes",
             "sh_degree": self.sh_degree,
             "background": self.background,
             "near": self.near,
@@ -370,6 +426,7 @@ class SplatsIntegrator(mi.CppADIntegrator):
         """Render the Gaussians as seen by ``sensor``; see ``mi.Integrator.render``."""
         sensor = _resolve_sensor(scene, sensor)
         with dr.suspend_grad():
+            self._gather(scene)
             self._log_plan(scene, sensor)
             shot = self._shot(scene, sensor, seed, spp)
             image = self._own_image(scene, shot)
@@ -395,6 +452,7 @@ class SplatsIntegrator(mi.CppADIntegrator):
         """
         sensor = _resolve_sensor(scene, sensor)
         with dr.suspend_grad():
+            self._gather(scene)
             shot = self._shot(scene, sensor, seed, spp)
             if shot.hybrid is not None:
                 image = self._own_image(scene, shot)
@@ -412,9 +470,12 @@ class SplatsIntegrator(mi.CppADIntegrator):
                 first_fault=gradients.first_fault,
             )
             with dr.resume_grad():
+                own = gradients.parameters
+                if self._gathered is not None:
+                    own = self._gathered.accumulate(_ellipsoids(scene), own)
                 for name in PARAMETER_NAMES:
-                    _accumulate(getattr(self, name), getattr(gradients.parameters, name))
-                for name, gradient in (gradients.parameters.features or {}).items():
+                    _accumulate(getattr(self, name), getattr(own, name))
+                for name, gradient in (own.features or {}).items():
                     _accumulate(self.features[name], gradient)
             if shot.hybrid is not None:
                 shot.hybrid.backward(params, d_nested)
@@ -463,13 +524,16 @@ class SplatsIntegrator(mi.CppADIntegrator):
         """Directional derivative of the image along the gradients set on the parameters."""
         sensor = _resolve_sensor(scene, sensor)
         with dr.suspend_grad():
+            self._gather(scene)
             shot = self._shot(scene, sensor, seed, spp)
             with dr.resume_grad():
-                features = self.gaussians.features
+                features = self._own.features
                 tangents = Gaussians(
                     **{name: _tangent(getattr(self, name)) for name in PARAMETER_NAMES},
                     features=features and {k: _tangent(v) for k, v in features.items()},
                 )
+                if self._gathered is not None:
+                    tangents = self._gathered.tangents(_ellipsoids(scene), tangents)
             d_planes = [self._plane_tangents(view, tangents) for view in shot.views]
             planes = [self._planes(view) for view in shot.views]
             dr.eval(planes, d_planes)
@@ -636,6 +700,7 @@ class SplatsIntegrator(mi.CppADIntegrator):
         """What is simulated, what asked for it, and what is not simulated: one line an effect."""
         from drgs.effects import described, plan_of_scene
 
+        self._gather(scene)
         if sensor.class_name() == "BatchSensor":
             from drgs.batch import SideBySide
 
@@ -810,7 +875,7 @@ def _render(
 
 
 def _load_gaussians(props: mi.Properties) -> Gaussians:
-    """The Gaussians of a scene description: a PLY file, or six tensors."""
+    """The Gaussians of a scene description: a PLY file, or six tensors; or none."""
     given = [name for name in PARAMETER_NAMES if name in props]
     features = {n: _tensor(props, n) for n in props.keys() if n.startswith(FEATURE)}  # noqa: SIM118
     if "filename" in props:
@@ -820,7 +885,7 @@ def _load_gaussians(props: mi.Properties) -> Gaussians:
             )
         path = mi.file_resolver().resolve(str(props["filename"]))
         gaussians = replace(read_ply(str(path)).to(mi.TensorXf), features=features)
-    else:
+    elif given or features or "smoothing" in props or "to_world" in props:
         missing = [name for name in PARAMETER_NAMES if name not in given and name != "shN"]
         if missing:
             raise ValueError(
@@ -834,8 +899,46 @@ def _load_gaussians(props: mi.Properties) -> Gaussians:
         if "smoothing" in props:
             values["smoothing"] = mi.Float(_tensor(props, "smoothing").array)
         gaussians = Gaussians(**values, features=features)
+    else:
+        shapes = {"means": (0, 3), "quats": (0, 4), "log_scales": (0, 3)}
+        shapes |= {"sh0": (0, 1, 3), "shN": (0, 0, 3)}
+        tensors = {name: dr.zeros(mi.TensorXf, shape) for name, shape in shapes.items()}
+        return Gaussians(**tensors, logit_opacities=mi.Float())
     _check_shapes(gaussians)
+    if "to_world" in props:
+        from drgs.similarity import Similarity
+
+        to_world = Similarity.of(_matrix(props, "to_world"), "splats: to_world")
+        moved = to_world.of_gaussians(gaussians.numpy()).to(mi.TensorXf)
+        gaussians = replace(moved, features=features)
     return gaussians
+
+
+def _ellipsoids(scene: mi.Scene) -> list[mi.Shape]:
+    return [shape for shape in scene.shapes() if shape.is_ellipsoids()]
+
+
+def _turns(props: mi.Properties) -> dict[str, Any]:
+    """By ids of shapes, and under "" for all others: how their spherical harmonics turn."""
+    names = [name for name in props.keys() if name.startswith(SHAPES_TO_WORLD)]  # noqa: SIM118
+    if not names:
+        return {}
+    from drgs.shapes import Turn
+    from drgs.similarity import Similarity
+
+    turns = {}
+    for name in names:
+        shape = name.removeprefix(SHAPES_TO_WORLD).removeprefix("_")
+        turns[shape] = Turn.by(Similarity.of(_matrix(props, name), f"splats: {name}").rotation)
+    return turns
+
+
+def _matrix(props: mi.Properties, name: str) -> np.ndarray:
+    """(4, 4) of a transform."""
+    value = props[name]
+    if not hasattr(value, "matrix"):
+        raise TypeError(f"splats: {name} must be a transform, got {type(value).__name__}")
+    return np.array(value.matrix, np.float64)
 
 
 def _tensor(props: mi.Properties, name: str) -> mi.TensorXf:
@@ -905,8 +1008,10 @@ def _boolean(props: mi.Properties, name: str, default: bool) -> bool:
 
 def _nested(props: mi.Properties) -> mi.Integrator | None:
     """The nested integrator, under whatever name it was given."""
-    given = [props[name] for name in props.keys()]  # noqa: SIM118
-    nested = [value for value in given if isinstance(value, mi.Integrator)]
+    # Objects alone: whatever is read counts as known, and a mistyped name would not be refused.
+    is_object = mi.Properties.Type.Object
+    objects = [props[name] for name in props.keys() if props.type(name) == is_object]  # noqa: SIM118
+    nested = [value for value in objects if isinstance(value, mi.Integrator)]
     if len(nested) > 1:
         raise ValueError(f"splats: at most one integrator can be nested, got {len(nested)}")
     return nested[0] if nested else None
@@ -982,7 +1087,7 @@ def _check_shapes(gaussians: Gaussians) -> None:
 
 
 def _check_degree(degree: int, gaussians: Gaussians) -> None:
-    stored = gaussians.sh_degree
+    stored = gaussians.sh_degree if gaussians.num_gaussians > 0 else 3
     if degree not in range(stored + 1):
         raise ValueError(
             f"splats: sh_degree must be an integer from 0 to {stored}, the degree of the "

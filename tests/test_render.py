@@ -261,6 +261,20 @@ def test_a_scene_of_mitsubas_own_is_rendered_too(tmp_path):
     assert picture(tmp_path / "out" / "sphere.png").shape == (HEIGHT, WIDTH, 3)
 
 
+def test_ellipsoids_of_a_scene_look_as_the_same_file_of_the_integrator(tmp_path):
+    path = write_scene(tmp_path, sensor(pose_around(0.8, 0.3)))
+    run(path, "--out", tmp_path / "file")
+    name = '<string name="filename" value="model.ply"/>'
+    text = path.read_text()
+    assert name in text
+    shape = f'<shape type="ellipsoids">{name}</shape>'
+    path.write_text(text.replace(name, "").replace("</scene>", f"{shape}</scene>"))
+    run(path, "--out", tmp_path / "shape")
+    pair = (np.array(mi.Bitmap(str(tmp_path / d / "blobs.exr"))) for d in ("file", "shape"))
+    # float32's exp, log and sigmoid: 1e-7 each, as in tests/test_shapes.py.
+    np.testing.assert_allclose(*pair, atol=1e-5)
+
+
 # ----------------------------------------------------------------------------------------------
 # Errors
 # ----------------------------------------------------------------------------------------------
@@ -325,8 +339,13 @@ def test_an_output_folder_that_is_a_file_is_an_error(fit, tmp_path, capsys):
             '<sensor type="irradiancemeter"/></scene>',
             "the sensor must be of type perspective, thinlens, orthographic or calibrated",
         ),
+        (
+            '<scene version="3.0.0"><integrator type="splats"/>'
+            '<sensor type="perspective"/></scene>',
+            "splats: there are no Gaussians: give the integrator 'filename' or tensors",
+        ),
     ],
-    ids=["not XML", "empty", "model missing", "wrong sensor"],
+    ids=["not XML", "empty", "model missing", "wrong sensor", "no Gaussians"],
 )
 def test_errors_of_a_mitsuba_scene_are_one_line(tmp_path, capsys, content, message):
     path = write_scene(tmp_path)

@@ -1035,7 +1035,7 @@ def test_a_model_of_degree_zero_has_no_empty_parameter():
 def test_the_class_documents_every_parameter():
     integrator = mi.load_dict({"type": "splats", **tensors(Scene().gaussians)})
     documentation = type(integrator).__doc__
-    settings = ("filename", "sh_degree", "near", "srgb_primitives")
+    settings = ("filename", "to_world", "shapes_to_world", "sh_degree", "near", "srgb_primitives")
     choices = [field.name for field in fields(Choices)]
     for name in (*settings, *choices, *ALL_PARAMETERS):
         assert name in documentation, name
@@ -1442,11 +1442,11 @@ def refusal_of_dictionary(**changes) -> str:
 NONE = dict.fromkeys(PARAMETER_NAMES)
 
 REFUSED = {
-    "nothing given": (
-        NONE,
+    "one tensor given": (
+        {name: None for name in PARAMETER_NAMES if name != "sh0"},
         "ValueError: splats: give 'filename', or the Gaussians as tensors means, quats, "
         "log_scales, logit_opacities, sh0, shN; missing: means, quats, log_scales, "
-        "logit_opacities, sh0",
+        "logit_opacities",
     ),
     "a tensor missing": ({"quats": None}, "missing: quats"),
     "file and tensors": (

@@ -437,8 +437,8 @@ def test_a_picture_in_between_does_not_change_the_gradients():
     np.testing.assert_array_equal(gradient(params["integrator.means"]), expected)
 
 
-def test_shapes_of_gaussians_are_no_surfaces():
-    """They are left out of the nested picture."""
+def test_gaussians_of_shapes_are_splats_and_no_surfaces():
+    """As if they were the integrator's own; they are left out of the nested picture."""
     scene = apart(SCENE)
     center = scene.camera.rotation.T @ [0, 0, 1.5] + scene.camera.center
     shape = {
@@ -446,12 +446,22 @@ def test_shapes_of_gaussians_are_no_surfaces():
         "centers": mi.TensorXf(np.float32([center])),
         "scales": mi.TensorXf(np.float32([[0.3, 0.3, 0.3]])),
         "quaternions": mi.TensorXf(np.float32([[0, 0, 0, 1]])),
-        "opacities": mi.TensorXf(np.float32([[0.9]])),
+        "opacities": mi.TensorXf(np.float32([[0.75]])),
         "sh_coeffs": mi.TensorXf(np.float32([[1, 1, 1]])),
     }
-    assert mi.load_dict(shape).is_ellipsoids()
+    one = {
+        "means": center,
+        "quats": [1, 0, 0, 0],
+        "log_scales": np.log([0.3] * 3),
+        "logit_opacities": np.log(3),
+        "sh0": np.ones((1, 3)),
+        "shN": np.zeros((3, 3)),
+    }
+    together = {n: np.concatenate([v, [one[n]]]) for n, v in vars(scene.gaussians).items()}
     image = image_of(load(scene, shapes={"blob": shape}))
-    np.testing.assert_array_equal(image, image_of(load(scene)))
+    expected = image_of(load(scene, **tensors(reference.Gaussians(**together))))
+    np.testing.assert_allclose(image, expected, atol=PICTURE * expected.max())
+    assert np.abs(image - image_of(load(scene))).max() > 0.1
 
 
 # ----------------------------------------------------------------------------------------------
