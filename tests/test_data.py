@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from PIL import Image
 
 from drgs.checks import UserError
 from drgs.config import DataConfig, FitConfig
@@ -495,6 +496,15 @@ def test_a_mask_counts_pixels_brighter_than_half(photographs, pixels):
         np.testing.assert_array_equal(mask, expected)
     assert view_named(dataset, "02").mask is None
     assert "ignored" not in dataset.description
+
+
+def test_a_mask_of_one_bit_is_read(photographs):
+    kept = np.random.default_rng(0).integers(0, 2, (6, 8)).astype(bool)
+    picture = Image.fromarray(kept)
+    assert picture.mode == "1"
+    picture.save(photographs / "mask.png")
+    give(photographs, mask_path="mask.png")
+    np.testing.assert_array_equal(view_named(load(photographs)).mask, kept)
 
 
 def test_masks_may_be_ignored(photographs):

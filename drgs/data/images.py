@@ -40,6 +40,8 @@ def read_image(path: Path) -> np.ndarray:
             )
         if image.mode == "P":
             image = image.convert("RGBA" if "transparency" in image.info else "RGB")
+        elif image.mode == "1":
+            image = image.convert("L")
         if image.mode not in MODES:
             raise UserError(
                 f"{path}: must be a grey, RGB or RGBA image of 8 or 16 bits, got one of Pillow's "
