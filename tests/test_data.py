@@ -582,18 +582,39 @@ def test_depths_of_a_picture_are_in_steps_of_a_unit(photographs, place, values, 
     assert view_named(dataset, "02").depth is None
 
 
-@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("dtype", [np.float32, np.float64, np.uint16])
 @pytest.mark.parametrize("shape", [(6, 8), (6, 8, 1)])
-def test_depths_of_an_array_are_in_scene_units(photographs, dtype, shape):
+@pytest.mark.parametrize(
+    ("values", "unit"), [({}, 1.0), ({"depth_unit_scale_factor": 0.25}, 0.25)], ids=["", "stated"]
+)
+def test_depths_of_an_array_are_in_scene_units_or_in_those_that_are_stated(
+    photographs, dtype, shape, values, unit
+):
     """What is not finite or not positive is not known."""
-    values = np.random.default_rng(0).uniform(0.5, 9, (6, 8)).astype(dtype)
-    values[0, :4] = [np.nan, np.inf, -1, 0]
-    np.save(photographs / "depth.npy", values.reshape(shape))
-    give(photographs, depth_file_path="depth.npy", depth_unit_scale_factor=7.0)
-    depth = view_named(load(photographs)).depth
-    expected = values.astype(np.float32)
-    expected[0, :4] = 0
-    np.testing.assert_array_equal(depth, expected)
+    depths = np.random.default_rng(0).uniform(5, 90, (6, 8)).astype(dtype)
+    if dtype != np.uint16:
+        depths[0, :5] = [np.nan, np.inf, -1, 0, np.finfo(dtype).max]
+    np.save(photographs / "depth.npy", depths.reshape(shape))
+    give(photographs, depth_file_path="depth.npy", **values)
+    dataset = load(photographs)
+    # A power of two: no rounding but that to single precision.
+    with np.errstate(over="ignore"):
+        expected = (depths * unit).astype(np.float32)
+    expected[~(np.isfinite(expected) & (expected > 0))] = 0
+    assert (expected > 0).sum() >= 43
+    np.testing.assert_array_equal(view_named(dataset).depth, expected)
+    assert dataset.description.endswith(f"; depth in units of {unit:g}")
+
+
+def test_the_units_of_all_depths_are_said(photographs):
+    iio.imwrite(photographs / "depth.png", STEPS)
+    np.save(photographs / "depth.npy", np.ones((6, 8)))
+    give(photographs, "01.png", depth_file_path="depth.png")
+    give(photographs, "02.png", depth_file_path="depth.npy")
+    give(photographs, "03.png", depth_file_path="depth.npy", depth_unit_scale_factor=3)
+    dataset = load(photographs)
+    assert dataset.description.endswith("; depth in units of 0.001 and 1 and 3")
+    assert [float(view_named(dataset, name).depth[5, 7]) for name in ("02", "03")] == [1, 3]
 
 
 def test_smaller_depths_are_means_of_known_ones(photographs):

@@ -4,8 +4,8 @@ Intrinsics (``fl_x, fl_y, cx, cy, w, h``) stand at the top or, overriding that, 
 focal lengths are missing, ``camera_angle_x`` (and ``_y``) give them. Views are sorted by file
 name, and every ``data.test_every``-th is for testing, as in Mip-NeRF 360 and 3DGS.
 
-Frames may name a mask (``mask_path``, black where pixels do not count), a picture of depths
-(``depth_file_path``), and a second pose (:data:`CLOSE`, with ``shutter``).
+Frames may name a mask and depths (``drgs.data.extras``), and a second pose (:data:`CLOSE`, with
+``shutter``).
 """
 
 from __future__ import annotations
@@ -13,10 +13,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from drgs.checks import UserError, one_line
 from drgs.config import DataConfig
+from drgs.data.extras import depth_of, mask_of, notes
 from drgs.data.frames import (
     InheritedValues,
     focal_from_angle,
@@ -30,15 +29,7 @@ from drgs.data.frames import (
     read_transforms,
     unique_names,
 )
-from drgs.data.images import (
-    composite,
-    downscale,
-    downscale_depth,
-    downscale_mask,
-    read_depth,
-    read_image,
-    read_mask,
-)
+from drgs.data.images import composite, downscale, read_image
 from drgs.data.types import Dataset, Motion, View
 
 CLOSE = "transform_matrix_close"
@@ -47,10 +38,6 @@ when the shutter opened."""
 
 SHUTTERS = ("global", "rolling")
 """Values of ``shutter``: all pixels see the whole motion, or the rows one time after the other."""
-
-DEPTH_UNIT = 1e-3
-"""Scene units in a step of a depth picture, unless ``depth_unit_scale_factor`` says otherwise: as
-nerfstudio has it."""
 
 
 def load(config: DataConfig) -> Dataset:
@@ -114,7 +101,6 @@ def _load_view(config: DataConfig, frame: InheritedValues, file: Path, name: str
     image = downscale(image, max_width)
     scale_x, scale_y = image.shape[1] / width, image.shape[0] / height
     alpha = downscale(pixels[:, :, 3], max_width) if pixels.shape[2] == 4 else None
-    mask, depth = _mask(config, frame, (width, height)), _depth(config, frame, (width, height))
     return View(
         name=name,
         image=image,
@@ -128,25 +114,9 @@ def _load_view(config: DataConfig, frame: InheritedValues, file: Path, name: str
         lens=None if config.ignore_distortion else lens_of(frame),
         motion=None if config.ignore_motion else _motion(frame),
         alpha=alpha,
-        mask=None if mask is None else downscale_mask(mask, max_width),
-        depth=None if depth is None else downscale_depth(depth, max_width),
+        mask=mask_of(config, frame, (width, height)),
+        depth=depth_of(config, frame, (width, height)),
     )
-
-
-def _mask(config: DataConfig, frame: InheritedValues, size: tuple[int, int]) -> np.ndarray | None:
-    if "mask_path" not in frame or config.ignore_masks:
-        return None
-    return read_mask(image_path(config.path, frame.own, frame.where, "mask_path"), size)
-
-
-def _depth(config: DataConfig, frame: InheritedValues, size: tuple[int, int]) -> np.ndarray | None:
-    if "depth_file_path" not in frame:
-        return None
-    unit = DEPTH_UNIT
-    if "depth_unit_scale_factor" in frame:
-        unit = positive(*frame.at("depth_unit_scale_factor"))
-    file = image_path(config.path, frame.own, frame.where, "depth_file_path")
-    return read_depth(file, unit, size)
 
 
 def _motion(frame: InheritedValues) -> Motion | None:
@@ -172,13 +142,12 @@ def _focal(frame: InheritedValues, axis: str, size: int) -> float:
 
 def _notes(config: DataConfig, frames: list[InheritedValues], lenses: list[Any]) -> str:
     """What the dataset has besides pinhole cameras, and what is left out, for the description."""
-    notes = ""
+    text = ""
     found = {f"{lens.kind} ({', '.join(lens.named())})" for lens in lenses if lens is not None}
     if found:
         ignored = " ignored" if config.ignore_distortion else ""
-        notes += f"; lens {' and '.join(sorted(found))}{ignored}"
-    if config.ignore_masks and any("mask_path" in frame for frame in frames):
-        notes += "; masks (mask_path) ignored"
+        text += f"; lens {' and '.join(sorted(found))}{ignored}"
+    text += notes(config, frames)
     if config.ignore_motion and any(CLOSE in frame for frame in frames):
-        notes += f"; motion ({CLOSE}) ignored"
-    return notes
+        text += f"; motion ({CLOSE}) ignored"
+    return text
