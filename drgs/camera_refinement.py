@@ -20,7 +20,7 @@ import numpy as np
 
 from drgs.checks import UserError, one_line
 from drgs.config import CamerasConfig
-from drgs.data.nerfstudio import CLOSE
+from drgs.data.frames import CLOSE
 from drgs.data.types import Dataset, Motion, View
 from drgs.files import atomic_path
 from drgs.shutter import rotation_matrix

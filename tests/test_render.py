@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import yaml
 from conftest import REPOSITORY
+from scipy.spatial.transform import Rotation
 from small_capture import (
     FIELD_OF_VIEW,
     FOCUS,
@@ -160,6 +161,48 @@ def test_cameras_of_a_transforms_file_give_the_pictures_of_the_split(fit, tmp_pa
     for index in range(4):
         expected = (tmp_path / "split" / f"r_{index}.png").read_bytes()
         assert (tmp_path / "cameras" / f"camera_{index}.png").read_bytes() == expected
+
+
+def test_a_camera_of_a_file_that_moves_is_seen_moving(fit, tmp_path):
+    """A global shutter that closes where it opened shows what one that stands still does."""
+    begin, end = (pose_around(azimuth, 0.3) for azimuth in (0.8, 0.9))
+    end[:3, 3] += 0.4 * end[:3, 0]
+    for name, close, shutter in (
+        ("still", None, "global"),
+        ("same", begin, "global"),
+        ("global", end, "global"),
+        ("rolling", end, "rolling"),
+    ):
+        frame = {"transform_matrix": (begin * [1, -1, -1, 1]).tolist(), "shutter": shutter}
+        if close is not None:
+            frame["transform_matrix_close"] = (close * [1, -1, -1, 1]).tolist()
+        values = {"camera_angle_x": FIELD_OF_VIEW, "w": WIDTH, "h": HEIGHT, "frames": [frame]}
+        (tmp_path / f"{name}.json").write_text(json.dumps(values))
+        camera = ("--camera", tmp_path / f"{name}.json", "--out", tmp_path / name)
+        run(fit / "point_cloud.ply", *camera, "--background", "white")
+    shown = {path.parent.name: picture(path) for path in tmp_path.glob("*/camera_0.png")}
+    assert np.abs(shown["same"] - shown["still"]).max() < 2 / 255
+    for name in ("global", "rolling"):
+        assert np.abs(shown[name] - shown["still"]).max() > 0.1
+    assert np.abs(shown["global"] - shown["rolling"]).max() > 0.05
+    # The middle times of 8 equal parts, each by the reference.
+    times = [(k + 0.5) / 8 for k in range(8)]
+    parts = [
+        photograph(blobs(), small_view("", between(begin, end, t), None), WHITE) for t in times
+    ]
+    clear = ~np.any([part.near_threshold for part in parts], axis=0)
+    expected = np.clip(np.mean([part.image for part in parts], axis=0), 0, 1)
+    assert clear.mean() > 0.8
+    assert np.abs(shown["global"] - expected)[clear].max() <= EIGHT_BITS
+
+
+def between(begin, end, time):
+    """The pose at a time: the centre on a line, turning at a constant rate."""
+    turn = Rotation.from_matrix(end[:3, :3] @ begin[:3, :3].T).as_rotvec()
+    pose = np.eye(4)
+    pose[:3, :3] = Rotation.from_rotvec(time * turn).as_matrix() @ begin[:3, :3]
+    pose[:3, 3] = (1 - time) * begin[:3, 3] + time * end[:3, 3]
+    return pose
 
 
 def test_a_camera_placed_by_hand_is_that_camera(fit, tmp_path):

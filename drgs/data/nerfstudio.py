@@ -4,8 +4,8 @@ Intrinsics (``fl_x, fl_y, cx, cy, w, h``) stand at the top or, overriding that, 
 focal lengths are missing, ``camera_angle_x`` (and ``_y``) give them. Views are sorted by file
 name, and every ``data.test_every``-th is for testing, as in Mip-NeRF 360 and 3DGS.
 
-Frames may name a mask and depths (``drgs.data.extras``), and a second pose (:data:`CLOSE`, with
-``shutter``).
+Frames may name a mask and depths (``drgs.data.extras``), and a second pose
+(``transform_matrix_close``, with ``shutter``).
 """
 
 from __future__ import annotations
@@ -13,16 +13,18 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from drgs.checks import UserError, one_line
+from drgs.checks import UserError
 from drgs.config import DataConfig
 from drgs.data.extras import depth_of, mask_of, notes
 from drgs.data.frames import (
+    CLOSE,
     InheritedValues,
     focal_from_angle,
     focal_length,
     image_path,
     in_parallel,
     lens_of,
+    motion_of,
     opencv_camera_to_world,
     positive,
     principal_point,
@@ -30,14 +32,7 @@ from drgs.data.frames import (
     unique_names,
 )
 from drgs.data.images import composite, downscale, read_image
-from drgs.data.types import Dataset, Motion, View
-
-CLOSE = "transform_matrix_close"
-"""Of a frame: where its camera was when the shutter closed, as ``transform_matrix`` is where it was
-when the shutter opened."""
-
-SHUTTERS = ("global", "rolling")
-"""Values of ``shutter``: all pixels see the whole motion, or the rows one time after the other."""
+from drgs.data.types import Dataset, View
 
 
 def load(config: DataConfig) -> Dataset:
@@ -112,24 +107,11 @@ def _load_view(config: DataConfig, frame: InheritedValues, file: Path, name: str
         width=image.shape[1],
         height=image.shape[0],
         lens=None if config.ignore_distortion else lens_of(frame),
-        motion=None if config.ignore_motion else _motion(frame),
+        motion=None if config.ignore_motion else motion_of(frame),
         alpha=alpha,
         mask=mask_of(config, frame, (width, height)),
         depth=depth_of(config, frame, (width, height)),
     )
-
-
-def _motion(frame: InheritedValues) -> Motion | None:
-    """Of a frame that says where its camera was when the shutter closed."""
-    if CLOSE not in frame.own:
-        return None
-    shutter = frame.get("shutter", SHUTTERS[0])
-    if shutter not in SHUTTERS:
-        raise UserError(
-            f"{frame.at('shutter')[2]}shutter must be one of {', '.join(SHUTTERS)}, got "
-            f"{one_line(shutter)}"
-        )
-    return Motion(opencv_camera_to_world(frame.own, frame.where, CLOSE), shutter)
 
 
 def _focal(frame: InheritedValues, axis: str, size: int) -> float:
