@@ -26,6 +26,7 @@ from pydantic import (
 )
 
 from drgs.checks import UserError, did_you_mean, one_line
+from drgs.constants import SHUTTER_SAMPLES
 from drgs.files import atomic_path, read_text
 
 Color = str | tuple[float, float, float]
@@ -113,6 +114,12 @@ class DataConfig(_Section):
     )
     ignore_motion: bool = Field(
         False, description="Treat cameras that move while a photograph is taken as if they did not."
+    )
+    shutter_samples: Count = Field(
+        SHUTTER_SAMPLES,
+        ge=1,
+        description="Times at which a picture is rendered that a moving camera with a global "
+        "shutter blurs.",
     )
     ignore_masks: bool = Field(False, description="Use the pixels that masks leave out as well.")
 

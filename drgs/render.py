@@ -31,6 +31,7 @@ import numpy as np
 from drgs.camera import IGNORABLE
 from drgs.checks import UserError, exit_on_user_error
 from drgs.config import NAMED_COLORS, DataConfig, FitConfig, ModelConfig, load_config
+from drgs.constants import SHUTTER_SAMPLES
 from drgs.data import Dataset, View, load_dataset
 from drgs.data.images import read_image
 from drgs.execution import add_options, execution
@@ -114,7 +115,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             if args.orbit is not None:
                 render_orbit(model, args)
             elif args.camera is not None or args.origin is not None:
-                for _ in render_cameras(model, cameras(args), args.out):
+                for _ in render_cameras(model, cameras(args, model), args.out):
                     pass
             else:
                 render_split(model, args.split or "test", args.out)
@@ -213,11 +214,12 @@ def render_cameras(
         yield image
 
 
-def cameras(args: argparse.Namespace) -> list[Viewpoint]:
+def cameras(args: argparse.Namespace, model: Model) -> list[Viewpoint]:
     """The cameras of ``--camera``, or the one of ``--origin``."""
     size = tuple(args.size) if args.size else None
     if args.camera is not None:
-        return read_viewpoints(args.camera, size)
+        samples = model.config.data.shutter_samples if model.config else SHUTTER_SAMPLES
+        return read_viewpoints(args.camera, size, samples)
     pose = look_at(args.origin, args.target or (0.0, 0.0, 0.0), args.up or UP)
     return [pinhole("camera", pose, *(size or DEFAULT_SIZE), args.fov or FIELD_OF_VIEW)]
 

@@ -104,6 +104,7 @@ def _sensor(view: View, calibrated: bool) -> dict[str, Any]:
     if view.motion is not None:
         pose["to_world_close"] = _to_world(view.motion.close_to_world)
         pose["shutter"] = view.motion.shutter
+        pose["shutter_samples"] = view.motion.samples
     return {"type": "calibrated", **pose, **intrinsics}
 
 

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from drgs.checks import UserError
+from drgs.constants import SHUTTER_SAMPLES
 from drgs.data.frames import (
     InheritedValues,
     focal_from_angle,
@@ -201,12 +202,15 @@ def orbit_size(views: Sequence[View]) -> tuple[int, int]:
     return max(1, round(scale * first.width)), max(1, round(scale * first.height))
 
 
-def read_viewpoints(path: Path, size: tuple[int, int] | None) -> list[Viewpoint]:
+def read_viewpoints(
+    path: Path, size: tuple[int, int] | None, shutter_samples: int = SHUTTER_SAMPLES
+) -> list[Viewpoint]:
     """The cameras of a file in the layout of ``transforms.json``, without its pictures.
 
     ``camera_angle_x``, or ``fl_x`` in pixels of ``w`` (and ``fl_y`` and ``cy`` of ``h``, ``cx`` of
     ``w``), and lens distortion, at the top or, overriding that, in a frame; a second pose in a
-    frame. size: width and height, px; None for those that the file gives.
+    frame. size: width and height, px; None for those that the file gives. shutter_samples: times at
+    which what motion blurs is rendered.
 
     Raises :class:`UserError` naming the file, the key, what was expected and what was got.
     """
@@ -218,12 +222,15 @@ def read_viewpoints(path: Path, size: tuple[int, int] | None) -> list[Viewpoint]
             InheritedValues(own, f"{path}: frames[{i}].", meta, path),
             f"camera_{i:0{digits}d}",
             size,
+            shutter_samples,
         )
         for i, own in enumerate(frames)
     ]
 
 
-def _read_viewpoint(frame: InheritedValues, name: str, size: tuple[int, int] | None) -> Viewpoint:
+def _read_viewpoint(
+    frame: InheritedValues, name: str, size: tuple[int, int] | None, shutter_samples: int
+) -> Viewpoint:
     values, where = frame.values, frame.where
     pose = opencv_camera_to_world(values, where)
     if size is None:
@@ -246,7 +253,7 @@ def _read_viewpoint(frame: InheritedValues, name: str, size: tuple[int, int] | N
     if "cx" in values and "cy" in values:
         cx = width * number(values, "cx", where) / positive(values, "w", where)
         cy = height * number(values, "cy", where) / positive(values, "h", where)
-    lens, motion = lens_of(frame), motion_of(frame)
+    lens, motion = lens_of(frame), motion_of(frame, shutter_samples)
     return Viewpoint(name, pose, focal, focal_y, cx, cy, width, height, lens, motion)
 
 

@@ -692,6 +692,8 @@ def test_a_second_pose_is_read(photographs, place, values, shutter):
     ahead = motion.close_to_world[:3, :3].T @ (np.zeros(3) - center)
     np.testing.assert_allclose(ahead, [0, 0, np.linalg.norm(center)], atol=1e-12)
     assert view_named(dataset, "02").motion is None
+    assert motion.samples == 8
+    assert view_named(load(photographs, shutter_samples=3)).motion.samples == 3
     ignored = load(photographs, ignore_motion=True)
     assert view_named(ignored).motion is None
     assert ignored.description.endswith("; motion (transform_matrix_close) ignored")

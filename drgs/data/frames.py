@@ -213,8 +213,11 @@ def distortion_of(frame: InheritedValues) -> dict[str, float]:
     return {key: value for key, value in given.items() if value != 0}
 
 
-def motion_of(frame: InheritedValues) -> Motion | None:
-    """Of a frame that says where its camera was when the shutter closed."""
+def motion_of(frame: InheritedValues, samples: int) -> Motion | None:
+    """Of a frame that says where its camera was when the shutter closed.
+
+    samples: times at which what a global shutter blurs is rendered.
+    """
     if CLOSE not in frame.own:
         return None
     shutter = frame.get("shutter", SHUTTERS[0])
@@ -223,7 +226,8 @@ def motion_of(frame: InheritedValues) -> Motion | None:
             f"{frame.at('shutter')[2]}shutter must be one of {', '.join(SHUTTERS)}, got "
             f"{one_line(shutter)}"
         )
-    return Motion(opencv_camera_to_world(frame.own, frame.where, CLOSE), shutter)
+    close_to_world = opencv_camera_to_world(frame.own, frame.where, CLOSE)
+    return Motion(close_to_world, shutter, samples)
 
 
 def image_path(folder: Path, frame: dict[str, Any], where: str, key: str = "file_path") -> Path:

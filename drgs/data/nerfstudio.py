@@ -107,7 +107,7 @@ def _load_view(config: DataConfig, frame: InheritedValues, file: Path, name: str
         width=image.shape[1],
         height=image.shape[0],
         lens=None if config.ignore_distortion else lens_of(frame),
-        motion=None if config.ignore_motion else motion_of(frame),
+        motion=None if config.ignore_motion else motion_of(frame, config.shutter_samples),
         alpha=alpha,
         mask=mask_of(config, frame, (width, height)),
         depth=depth_of(config, frame, (width, height)),

@@ -7,6 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from drgs.constants import SHUTTER_SAMPLES
+
 
 @dataclass(frozen=True, eq=False)
 class Motion:
@@ -14,6 +16,7 @@ class Motion:
 
     close_to_world: np.ndarray  # (4, 4) float64, OpenCV axes: where the camera was in the end
     shutter: str  # global: all pixels were open all the time; rolling: row after row
+    samples: int = SHUTTER_SAMPLES  # global: times at which the picture is rendered
 
 
 @dataclass(frozen=True, eq=False)
