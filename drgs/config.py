@@ -122,6 +122,9 @@ class DataConfig(_Section):
         "shutter blurs.",
     )
     ignore_masks: bool = Field(False, description="Use the pixels that masks leave out as well.")
+    ignore_depth: bool = Field(
+        False, description="Do not open files of depth; nor are they where loss.depth_weight is 0."
+    )
 
     @property
     def background_rgb(self) -> tuple[float, float, float]:
@@ -360,6 +363,18 @@ class FitConfig(_Section):
         "{until: iteration, factor: 4}.",
     )
     seed: Count = Field(0, ge=0, description="Seed of everything random.")
+
+    @property
+    def data_for_training(self) -> DataConfig:
+        """``data``, without the depths that a loss of weight 0 would not look at."""
+        if self.loss.depth_weight > 0:
+            return self.data
+        return self.data.model_copy(update={"ignore_depth": True})
+
+    @property
+    def data_for_rendering(self) -> DataConfig:
+        """``data``, without what only a loss looks at."""
+        return self.data.model_copy(update={"ignore_depth": True})
 
     @model_validator(mode="after")
     def _check_relations(self) -> FitConfig:

@@ -105,7 +105,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         if is_finished(out, config) and not args.overwrite:
             print(f"{out}: this fit is finished; --overwrite does it again")
             return
-        dataset = load_dataset(config.data)
+        dataset = load_dataset(config.data_for_training)
         select_variant(args.variant)
         print(dataset.description)
         print(

@@ -94,7 +94,7 @@ class Model:
             raise UserError(
                 f"{option}: needs photographs: give the configuration of a fit (--scene CONFIG.yml)"
             )
-        dataset = load_dataset(self.config.data)
+        dataset = load_dataset(self.config.data_for_rendering)
         if self.folder is None or not self.config.cameras.optimise:
             return dataset
         from drgs.camera_refinement import refined_dataset

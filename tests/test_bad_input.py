@@ -228,6 +228,16 @@ def test_wrong_input_ends_with_status_2_and_one_line(scene, capsys, damage, mess
     assert not (scene / "out").exists()
 
 
+@pytest.mark.parametrize(("weight", "first"), [(0.2, "there is no image"), (0, "points.ply")])
+def test_a_fit_opens_depths_if_its_loss_looks_at_them(scene, capsys, weight, first):
+    """Which of two files that are missing is missed first."""
+    edit_transforms(lambda m: m["frames"][1].update(depth_file_path="nowhere.png"))(scene)
+    (scene / "points.ply").unlink()
+    setting = ("--set", f"loss.depth_weight={weight}")
+    status, errors = fit_in_process(capsys, scene / "a.yml", *setting)
+    assert status == 2 and first in errors
+
+
 @pytest.mark.parametrize("size", [10**6, 2**31 - 1])
 def test_a_picture_that_claims_to_be_huge_takes_no_memory(scene, size):
     path = scene / "train" / "1.png"

@@ -533,7 +533,7 @@ def test_a_picture_of_another_size_than_the_photograph_is_refused(photographs, k
     give(photographs, **{key: "other.png"})
     assert refusal(photographs) == (
         f"{photographs / 'other.png'}: must be 8 x 6 px, as the photograph is, got 8 x 4; "
-        "resize it, or leave it out of the frame in transforms.json"
+        "resize it, or leave it out of the frame"
     )
 
 
@@ -662,6 +662,49 @@ def test_a_picture_of_depths_has_16_bits(photographs, pixels, mode):
     )
 
 
+def test_depth_may_be_ignored(photographs):
+    """Then its file is not opened: there is none."""
+    give(photographs, depth_file_path="nowhere.png")
+    dataset = load(photographs, ignore_depth=True)
+    assert all(view.depth is None for view in dataset.train)
+    assert dataset.description.endswith("; depth (depth_file_path) ignored")
+    assert dataset.ignored == ("depth",)
+
+
+@pytest.mark.parametrize("weight", [0.0, 0.2])
+def test_a_fit_whose_loss_does_not_look_at_depth_does_not_open_it(photographs, weight):
+    give(photographs, depth_file_path="nowhere.png")
+    fit = FitConfig(data={"path": str(photographs)}, loss={"depth_weight": weight})
+    assert load_dataset(fit.data_for_rendering).ignored == ("depth",)
+    if weight == 0:
+        assert load_dataset(fit.data_for_training).ignored == ("depth",)
+    else:
+        with pytest.raises(UserError, match="there is no image"):
+            load_dataset(fit.data_for_training)
+
+
+def test_all_that_frames_have_may_be_ignored_and_is_named(photographs):
+    edit(photographs / "transforms.json", lambda m: m.update(k1=0.1))
+    values = {"mask_path": "nowhere.png", "depth_file_path": "nowhere.png"}
+    give(photographs, transform_matrix_close=np.eye(4).tolist(), **values)
+    names = ("distortion", "motion", "masks", "depth")
+    dataset = load(photographs, **{f"ignore_{name}": True for name in names})
+    assert dataset.ignored == names
+    for view in (*dataset.train, *dataset.test):
+        assert (view.lens, view.motion, view.mask, view.depth) == (None,) * 4
+
+
+def test_a_mask_for_the_whole_file_is_that_of_every_frame_without_its_own(photographs):
+    masks = np.random.default_rng(0).integers(0, 2, (2, 6, 8), np.uint8)
+    for name, mask in zip(("all", "one"), masks, strict=True):
+        iio.imwrite(photographs / f"{name}.png", 255 * mask)
+    edit(photographs / "transforms.json", lambda m: m.update(mask_path="all.png"))
+    give(photographs, "02.png", mask_path="one.png")
+    dataset = load(photographs)
+    for view in (*dataset.train, *dataset.test):
+        np.testing.assert_array_equal(view.mask, masks[int(view.name == "02")])
+
+
 def test_a_unit_of_depth_is_positive(photographs):
     iio.imwrite(photographs / "depth.png", STEPS)
     give(photographs, depth_file_path="depth.png", depth_unit_scale_factor=0)
@@ -735,6 +778,33 @@ def test_transparency_of_synthetic_pictures_is_kept(blender):
         expected = (images["train", 1][..., 3] / 255).reshape(shape).mean(axis=(1, 3))
         np.testing.assert_allclose(view.alpha, expected, rtol=1e-6)
     assert load(folder).test[1].alpha is None
+
+
+def test_frames_of_the_synthetic_layout_may_have_the_same(blender):
+    """Mask, depth, lens and second pose, of both splits; what is ignored is named."""
+    folder, _ = blender
+    close = look_at((4, 0.5, 0), (0, 0, 0)).tolist()
+    mask = np.random.default_rng(1).integers(0, 2, (4, 6), np.uint8)
+    iio.imwrite(folder / "mask.png", 255 * mask)
+    np.save(folder / "depth.npy", np.arange(24.0).reshape(4, 6))
+    values = {"mask_path": "mask.png", "depth_file_path": "depth.npy", "k1": 0.1}
+    values |= {"transform_matrix_close": close, "shutter": "rolling"}
+    for split in ("train", "val"):
+        edit(folder / f"transforms_{split}.json", lambda m: m["frames"][1].update(values))
+    dataset = load(folder, ignore_distortion=True)
+    assert dataset.ignored == ("distortion",)
+    assert dataset.description.endswith("; lens opencv (k1) ignored; depth in units of 1")
+    assert load(folder).train[1].lens == RadialTangential.of(k1=0.1)
+    for views in (dataset.train, dataset.test):
+        np.testing.assert_array_equal(views[1].mask, mask)
+        np.testing.assert_array_equal(views[1].depth, np.arange(24.0).reshape(4, 6))
+        assert views[1].motion.shutter == "rolling"
+        np.testing.assert_allclose(views[1].motion.close_to_world[:3, 3], (4, 0.5, 0))
+        for view in (views[0], views[2]):
+            assert (view.lens, view.motion, view.mask, view.depth) == (None,) * 4
+    smaller = load(folder, image_size=3).train[1]
+    np.testing.assert_array_equal(smaller.mask, mask.reshape(2, 2, 3, 2).min(axis=(1, 3)))
+    assert smaller.depth.shape == (2, 3)
 
 
 def test_coarse_views_have_smaller_masks_depths_and_transparency():

@@ -120,6 +120,20 @@ def test_a_background_is_behind_splats_and_photographs(fit, tmp_path):
     assert metrics["views"]["r_1"]["psnr"] == pytest.approx(score, abs=1e-3)
 
 
+def test_depths_are_not_opened(tmp_path):
+    """There are none: nothing that is rendered looks at them."""
+    write_dataset(tmp_path / "data", make_dataset(1, 1))
+    for split in ("train", "test"):
+        path = tmp_path / "data" / f"transforms_{split}.json"
+        values = json.loads(path.read_text())
+        values["frames"][0]["depth_file_path"] = "nowhere.png"
+        path.write_text(json.dumps(values))
+    write_ply(tmp_path / "blobs.ply", blobs())
+    (tmp_path / "a.yml").write_text(yaml.safe_dump({"data": {"path": "data"}}))
+    run(tmp_path / "blobs.ply", "--scene", tmp_path / "a.yml", "--out", tmp_path / "out")
+    assert (tmp_path / "out" / "r_0.png").is_file()
+
+
 def test_values_of_the_configuration_can_be_set(fit, tmp_path):
     run(fit, "--set", "data.image_size=16", "--out", tmp_path)
     assert picture(tmp_path / "r_0.png").shape == (HEIGHT // 2, WIDTH // 2, 3)

@@ -100,7 +100,7 @@ def _check_size(path: Path, image: np.ndarray, size: tuple[int, int]) -> None:
     if (width, height) != size:
         raise UserError(
             f"{path}: must be {size[0]} x {size[1]} px, as the photograph is, got {width} x "
-            f"{height}; resize it, or leave it out of the frame in transforms.json"
+            f"{height}; resize it, or leave it out of the frame"
         )
 
 

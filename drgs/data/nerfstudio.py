@@ -4,27 +4,22 @@ Intrinsics (``fl_x, fl_y, cx, cy, w, h``) stand at the top or, overriding that, 
 focal lengths are missing, ``camera_angle_x`` (and ``_y``) give them. Views are sorted by file
 name, and every ``data.test_every``-th is for testing, as in Mip-NeRF 360 and 3DGS.
 
-Frames may name a mask and depths (``drgs.data.extras``), and a second pose
-(``transform_matrix_close``, with ``shutter``).
+Frames may have a lens, a second pose, a mask and depths: see ``drgs.data.extras``.
 """
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 from drgs.checks import UserError
 from drgs.config import DataConfig
-from drgs.data.extras import depth_of, mask_of, notes
+from drgs.data.extras import extras_of, ignored, notes
 from drgs.data.frames import (
-    CLOSE,
     InheritedValues,
     focal_from_angle,
     focal_length,
     image_path,
     in_parallel,
-    lens_of,
-    motion_of,
     opencv_camera_to_world,
     positive,
     principal_point,
@@ -51,7 +46,6 @@ def load(config: DataConfig) -> Dataset:
         for index, own in enumerate(meta["frames"])
     ]
     files = [image_path(config.path, frame.own, frame.where) for frame in frames]
-    lenses = [lens_of(frame) for frame in frames]
 
     def load_view(index: int, name: str) -> View:
         return _load_view(config, frames[index], files[index], name)
@@ -71,8 +65,9 @@ def load(config: DataConfig) -> Dataset:
             f"{config.path.name} (nerfstudio layout): {len(train)} train views, measured on "
             f"{len(test)} views (every {config.test_every}th by file name), "
             f"{views[0].width}x{views[0].height}, background {config.background}"
-            + _notes(config, frames, lenses)
+            + notes(config, frames)
         ),
+        ignored=ignored(config, frames),
     )
 
 
@@ -106,11 +101,8 @@ def _load_view(config: DataConfig, frame: InheritedValues, file: Path, name: str
         cy=cy * scale_y,
         width=image.shape[1],
         height=image.shape[0],
-        lens=None if config.ignore_distortion else lens_of(frame),
-        motion=None if config.ignore_motion else motion_of(frame, config.shutter_samples),
         alpha=alpha,
-        mask=mask_of(config, frame, (width, height)),
-        depth=depth_of(config, frame, (width, height)),
+        **extras_of(config, frame, (width, height)),
     )
 
 
@@ -120,16 +112,3 @@ def _focal(frame: InheritedValues, axis: str, size: int) -> float:
     if f"camera_angle_{axis}" in frame:
         return focal_from_angle(*frame.at(f"camera_angle_{axis}"), size)
     raise UserError(f"{frame.top}fl_{axis} is missing, and there is no camera_angle_{axis} either")
-
-
-def _notes(config: DataConfig, frames: list[InheritedValues], lenses: list[Any]) -> str:
-    """What the dataset has besides pinhole cameras, and what is left out, for the description."""
-    text = ""
-    found = {f"{lens.kind} ({', '.join(lens.named())})" for lens in lenses if lens is not None}
-    if found:
-        ignored = " ignored" if config.ignore_distortion else ""
-        text += f"; lens {' and '.join(sorted(found))}{ignored}"
-    text += notes(config, frames)
-    if config.ignore_motion and any(CLOSE in frame for frame in frames):
-        text += f"; motion ({CLOSE}) ignored"
-    return text
