@@ -548,6 +548,31 @@ def test_a_missing_mask_or_depth_is_named(photographs, key):
     assert refusal(photographs) == f"{where} must be text, got 3"
 
 
+@pytest.mark.parametrize("name", ["01.png", "08.png"], ids=["train", "test"])
+def test_a_mask_that_leaves_out_every_pixel_is_refused(photographs, name):
+    iio.imwrite(photographs / "mask.png", np.full((6, 8), 127, np.uint8))
+    give(photographs, name, mask_path="mask.png")
+    assert refusal(photographs) == (
+        f"{photographs / 'mask.png'}: must leave pixels that count (brighter than half), got a "
+        "mask without any; remove the view from its file, or set data.ignore_masks"
+    )
+    assert view_named(load(photographs, ignore_masks=True)).mask is None
+
+
+def test_a_mask_that_leaves_out_every_pixel_of_a_smaller_picture_is_refused(photographs):
+    """One of each block of 2 x 2 pixels: none of the larger pixels counts as a whole."""
+    mask = np.full((6, 8), 255, np.uint8)
+    mask[::2, ::2] = 0
+    iio.imwrite(photographs / "mask.png", mask)
+    give(photographs, mask_path="mask.png")
+    assert view_named(load(photographs)).mask.mean() == 0.75
+    assert refusal(photographs, image_size=4) == (
+        f"{photographs / 'mask.png'}: must leave pixels that count (brighter than half), got a "
+        "mask without any at data.image_size 4; set a larger one, remove the view from its file, "
+        "or set data.ignore_masks"
+    )
+
+
 def test_a_broken_mask_is_named(photographs):
     (photographs / "mask.png").write_bytes(b"no picture")
     give(photographs, mask_path="mask.png")
@@ -784,7 +809,8 @@ def test_frames_of_the_synthetic_layout_may_have_the_same(blender):
     """Mask, depth, lens and second pose, of both splits; what is ignored is named."""
     folder, _ = blender
     close = look_at((4, 0.5, 0), (0, 0, 0)).tolist()
-    mask = np.random.default_rng(1).integers(0, 2, (4, 6), np.uint8)
+    mask = np.ones((4, 6), np.uint8)
+    mask[0, 1] = mask[3, 3:] = 0
     iio.imwrite(folder / "mask.png", 255 * mask)
     np.save(folder / "depth.npy", np.arange(24.0).reshape(4, 6))
     values = {"mask_path": "mask.png", "depth_file_path": "depth.npy", "k1": 0.1}

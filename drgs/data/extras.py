@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from drgs.checks import UserError
 from drgs.config import DataConfig
 from drgs.data.frames import CLOSE, InheritedValues, image_path, lens_of, motion_of, positive
 from drgs.data.images import downscale_depth, downscale_mask, read_depth, read_mask
@@ -43,7 +44,17 @@ def _mask(config: DataConfig, frame: InheritedValues, size: tuple[int, int]) -> 
     """(H, W) of 1 and 0, at the width that is configured."""
     if MASK not in frame:
         return None
-    return downscale_mask(read_mask(_file(config, frame, MASK), size), config.image_size)
+    file = _file(config, frame, MASK)
+    mask = read_mask(file, size)
+    smaller = downscale_mask(mask, config.image_size)
+    if not smaller.any():  # its PSNR is the mean of nothing
+        size_too_small = f" at data.image_size {config.image_size}; set a larger one,"
+        raise UserError(
+            f"{file}: must leave pixels that count (brighter than half), got a mask without any"
+            f"{size_too_small if mask.any() else ';'} remove the view from its file, or set "
+            "data.ignore_masks"
+        )
+    return smaller
 
 
 def _depth(config: DataConfig, frame: InheritedValues, size: tuple[int, int]) -> np.ndarray | None:
