@@ -394,6 +394,11 @@ class FitConfig(_Section):
                 f"({densify.reset_opacity}), or a reset removes everything; "
                 f"got {densify.prune_opacity}"
             )
+        if self.cameras.optimise and self.model.sh_direction != "mean":
+            raise ValueError(
+                "model.sh_direction must be mean where cameras.optimise is true (colours along "
+                f"rays are not differentiated in the camera), got {self.model.sh_direction}"
+            )
         if self.init.point_cloud is None and self.init.num_points > densify.max_gaussians:
             raise ValueError(
                 f"init.num_points must be <= densify.max_gaussians ({densify.max_gaussians}), "

@@ -40,7 +40,7 @@ from drgs.gaussians import Gaussians
 from drgs.io.ply import read_ply
 from drgs.metrics import Quality, psnr, ssim
 from drgs.pictures import write_animation, write_png
-from drgs.scene import make_scene, make_sensors
+from drgs.scene import check_lenses, make_scene, make_sensors
 from drgs.trainer import render_views
 from drgs.viewpoints import (
     FIELD_OF_VIEW,
@@ -84,6 +84,8 @@ class Model:
 
     def pictures(self, views: Sequence[View | Viewpoint]) -> Iterator[np.ndarray]:
         """Pictures (H, W, 3) of the views, after a plan of what is simulated in the first."""
+        if "distortion" not in self.ignored:
+            check_lenses(self.settings, views, where="", remedy="give --ignore distortion")
         scene = self.scene()
         print(scene.integrator().plan(scene, make_sensors(views[:1])[0]), flush=True)
         return render_views(scene, views)

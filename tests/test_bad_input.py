@@ -190,6 +190,18 @@ WRONG_INPUTS = {
         lambda f: Image.new("CMYK", (20, 16)).save(f / "train" / "1.png", "TIFF"),
         "1.png: must be a grey, RGB or RGBA image of 8 or 16 bits, got one of Pillow's mode CMYK",
     ),
+    "exact projection of a bent lens": (
+        lambda f: (
+            edit_settings(model={"sh_degree": 0, "projection": "exact"})(f),
+            edit_transforms(lambda m: m["frames"][1].update(k1=0.1))(f),
+        ),
+        ": model.projection must be ewa or unscented for lenses that are no pinholes, such as that "
+        "of view 1 (opencv: k1), got exact; or set data.ignore_distortion",
+    ),
+    "cameras and colours along rays": (
+        edit_settings(cameras={"optimise": True}, model={"sh_direction": "pixel"}),
+        "a.yml: model.sh_direction must be mean where cameras.optimise is true",
+    ),
     "alpha missing": (write_picture((16, 20, 3)), "1.png: must have an alpha channel"),
     "point cloud missing": (lambda f: (f / "points.ply").unlink(), "points.ply: cannot read"),
     "point cloud is a folder": (put_folder_in_place_of("points.ply"), "points.ply: cannot read"),

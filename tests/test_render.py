@@ -364,6 +364,33 @@ def test_user_errors_are_one_line_and_write_nothing(
     assert not (tmp_path / "out").exists()
 
 
+EXACT = ["--set", "model.projection=exact"]
+
+
+@pytest.mark.parametrize("mode", ["--camera", "--split"])
+def test_the_exact_projection_of_a_bent_lens_is_refused(tmp_path, capsys, mode):
+    """With status 2, before anything is written; without the distortion it is rendered."""
+    write_dataset(tmp_path / "data", make_dataset(1, 1))
+    write_ply(tmp_path / "blobs.ply", blobs())
+    (tmp_path / "a.yml").write_text(yaml.safe_dump({"data": {"path": "data"}}))
+    path = tmp_path / "data" / "transforms_test.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"k1": 0.1}))
+    arguments = [tmp_path / "blobs.ply", "--scene", tmp_path / "a.yml", *EXACT]
+    if mode == "--split":
+        arguments += ["--split", "test"]
+    else:
+        arguments += ["--camera", path, "--size", WIDTH, HEIGHT]
+    message = fails(capsys, *arguments, "--out", tmp_path / "out")
+    assert message.startswith(
+        "model.projection must be ewa or unscented for lenses that are no pinholes, such as that "
+        f"of view {'r_0' if mode == '--split' else 'camera_0'} (opencv: k1), got exact; or "
+        "give --ignore distortion"
+    )
+    assert not (tmp_path / "out").exists()
+    run(*arguments, "--ignore", "distortion", "--out", tmp_path / "out")
+    assert list((tmp_path / "out").glob("*.png"))
+
+
 def test_the_folder_of_a_fit_is_not_overwritten(fit, capsys):
     assert "holds a fit" in fails(capsys, fit, "--out", fit)
 
