@@ -148,6 +148,14 @@ class CameraRefinement(TrainingEffect):
             poses["to_world_close"] = moved @ start.motion @ signs
         return poses | {"fx": fx, "fy": fy, "cx": cx, "cy": cy}
 
+    def numbers_of(self, view: TrainingView) -> dict[str, Any]:
+        """See :class:`TrainingEffect`."""
+        return self.parameters.numbers(view.index)
+
+    def values(self) -> dict[str, np.ndarray]:
+        """See :class:`TrainingEffect`."""
+        return self.parameters.values()
+
     def state(self) -> dict[str, np.ndarray]:
         """Numbers and moments."""
         return self.parameters.state()
