@@ -54,7 +54,7 @@ from drgs.viewpoints import (
     read_viewpoints,
 )
 
-MODEL, CONFIG, METRICS = "point_cloud.ply", "config.yml", "metrics.json"
+MODEL, CONFIG, METRICS, CAMERAS = "point_cloud.ply", "config.yml", "metrics.json", "cameras.json"
 """What a fit's output folder holds."""
 
 DEFAULT_SIZE = (400, 400)
@@ -75,7 +75,7 @@ class Model:
     background: tuple[float, float, float] | Path  # display space; or a file with a picture
     config: FitConfig | None  # names the dataset
     ignored: str = ""  # effects that are not to be simulated: see the plugin
-    folder: Path | None = None  # the fit's, if there is one
+    folder: Path | None = None  # where they are, perhaps with refined cameras beside them
 
     def scene(self) -> mi.Scene:
         """A Mitsuba scene that renders in display space."""
@@ -97,10 +97,17 @@ class Model:
                 f"{option}: needs photographs: give the configuration of a fit (--scene CONFIG.yml)"
             )
         dataset = load_dataset(self.config.data_for_rendering)
-        if self.folder is None or not self.config.cameras.optimise:
+        if self.folder is None or not (path := self.folder / CAMERAS).is_file():
+            return dataset
+        if not self.config.cameras.optimise:
+            print(
+                f"cameras: as the dataset has them; those of {path} are used with "
+                "--set cameras.optimise=true"
+            )
             return dataset
         from drgs.camera_refinement import refined_dataset
 
+        print(f"cameras: as refined, from {path}")
         return refined_dataset(dataset, self.folder)
 
 
@@ -132,8 +139,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
 def load_model(args: argparse.Namespace) -> Model:
     """The Gaussians that the command line names, with the settings of their configuration."""
     what, config_path = args.what, args.scene
-    folder = what if what.is_dir() else None
-    if folder is not None:
+    folder = what if what.is_dir() else what.parent
+    if what.is_dir():
         for name in (CONFIG, MODEL):
             if not (what / name).is_file():
                 raise UserError(

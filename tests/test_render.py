@@ -111,6 +111,41 @@ def test_a_ply_is_rendered_under_a_configuration(fit, tmp_path):
         assert (tmp_path / "fit" / name).read_bytes() == (tmp_path / "ply" / name).read_bytes()
 
 
+@pytest.mark.parametrize("optimised", [True, False])
+def test_refined_cameras_beside_the_gaussians_are_used_or_spoken_of(tmp_path, capsys, optimised):
+    """Whether the fit's folder or its PLY file is named, as its configuration says."""
+    dataset = make_dataset(2, 1)
+    write_dataset(tmp_path / "data", dataset)
+    found = tmp_path / "run"
+    write_ply(found / "point_cloud.ply", blobs())
+    config = {"data": {"path": str(tmp_path / "data")}, "cameras": {"optimise": optimised}}
+    (found / "config.yml").write_text(yaml.safe_dump(config))
+    refined = [
+        small_view(v.name, pose_around(0.4 + i, 0.6), None) for i, v in enumerate(dataset.train)
+    ]
+    frames = [
+        {"file_path": v.name, "transform_matrix": (v.camera_to_world * [1, -1, -1, 1]).tolist()}
+        for v in refined
+    ]
+    (found / "cameras.json").write_text(json.dumps({"lens_change": {}, "frames": frames}))
+    for name, what in (
+        ("folder", [found]),
+        ("file", [found / "point_cloud.ply", "--scene", found / "config.yml"]),
+    ):
+        run(*what, "--split", "train", "--out", tmp_path / name)
+        printed = capsys.readouterr().out.splitlines()
+        said = [line for line in printed if "cameras.json" in line]
+        assert said == [
+            f"cameras: as refined, from {found / 'cameras.json'}"
+            if optimised
+            else f"cameras: as the dataset has them; those of {found / 'cameras.json'} are used "
+            "with --set cameras.optimise=true"
+        ]
+        for view, moved in zip(dataset.train, refined, strict=True):
+            seen_from = moved if optimised else view
+            assert_shows(tmp_path / name / f"{view.name}.png", seen_from, WHITE)
+
+
 def test_a_background_is_behind_splats_and_photographs(fit, tmp_path):
     background = (0.0, 0.5, 0.25)
     run(fit, "--background", *background, "--out", tmp_path)
