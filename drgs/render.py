@@ -28,19 +28,20 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
-from drgs.camera import IGNORABLE
+from drgs.camera import IGNORABLE, camera_from_sensor, read_sensor
 from drgs.checks import UserError, exit_on_user_error
 from drgs.config import NAMED_COLORS, DataConfig, FitConfig, ModelConfig, load_config
 from drgs.constants import SHUTTER_SAMPLES
 from drgs.data import Dataset, View, load_dataset
 from drgs.data.images import read_image
+from drgs.effects import described, plan_of_sensors, plan_of_views
 from drgs.execution import add_options, execution
 from drgs.files import atomic_path
 from drgs.gaussians import Gaussians
 from drgs.io.ply import read_ply
 from drgs.metrics import Quality, psnr, ssim
 from drgs.pictures import write_animation, write_png
-from drgs.scene import check_lenses, make_scene, make_sensors
+from drgs.scene import check_lenses, make_scene
 from drgs.trainer import render_views
 from drgs.viewpoints import (
     FIELD_OF_VIEW,
@@ -83,11 +84,11 @@ class Model:
         return make_scene(self.gaussians, self.settings, self.background, **settings)
 
     def pictures(self, views: Sequence[View | Viewpoint]) -> Iterator[np.ndarray]:
-        """Pictures (H, W, 3) of the views, after a plan of what is simulated in the first."""
+        """Pictures (H, W, 3) of the views, after a plan of what is simulated in them."""
         if "distortion" not in self.ignored:
             check_lenses(self.settings, views, where="", remedy="give --ignore distortion")
         scene = self.scene()
-        print(scene.integrator().plan(scene, make_sensors(views[:1])[0]), flush=True)
+        print(described(plan_of_views(scene.integrator(), views)), flush=True)
         return render_views(scene, views)
 
     def dataset(self, option: str) -> Dataset:
@@ -246,10 +247,10 @@ def render_mitsuba_scene(path: Path, out: Path) -> None:
     if scene.integrator() is None or not scene.sensors():
         raise UserError(f"{path}: the scene must hold an integrator and at least one sensor")
     linear = getattr(scene.integrator(), "srgb_primitives", True)
+    if hasattr(scene.integrator(), "plan"):
+        _print_plan(path, scene)
     for index, sensor in enumerate(scene.sensors()):
         name = path.stem if len(scene.sensors()) == 1 else f"{path.stem}_{index}"
-        if index == 0 and hasattr(scene.integrator(), "plan"):
-            _print_plan(path, scene, sensor)
         _render_sensor(path, scene, index)
         bitmap = sensor.film().bitmap()
         width, height = bitmap.size()
@@ -262,12 +263,15 @@ def render_mitsuba_scene(path: Path, out: Path) -> None:
         print(f"{name}: {width}x{height}")
 
 
-def _print_plan(path: Path, scene: mi.Scene, sensor: mi.Sensor) -> None:
-    """What the scene's ``splats`` integrator simulates for a sensor."""
+def _print_plan(path: Path, scene: mi.Scene) -> None:
+    """What the scene's ``splats`` integrator simulates for its sensors."""
+    integrator = scene.integrator()
     try:
-        print(scene.integrator().plan(scene, sensor), flush=True)
+        states = [read_sensor(sensor, integrator.near) for sensor in scene.sensors()]
     except TypeError as error:
         raise UserError(f"{path}: {error}") from None
+    cameras = list(map(camera_from_sensor, states))
+    print(described(plan_of_sensors(integrator, cameras, scene.environment())), flush=True)
 
 
 def _render_sensor(path: Path, scene: mi.Scene, index: int) -> None:

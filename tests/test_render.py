@@ -253,6 +253,34 @@ def test_a_camera_of_a_file_that_moves_is_seen_moving(fit, tmp_path, samples):
     assert np.abs(shown["global"] - expected)[clear].max() <= EIGHT_BITS
 
 
+@pytest.mark.parametrize("ignored", [(), ("distortion", "motion")])
+def test_the_plan_regards_all_cameras_and_names_what_is_ignored(fit, tmp_path, capsys, ignored):
+    """Of a file and of a Mitsuba scene, the first of which is a plain one."""
+    path = write_camera(tmp_path / "c.json", pose_around(0.8, 0.3))
+    values = json.loads(path.read_text())
+    close = {"transform_matrix_close": values["frames"][0]["transform_matrix"]}
+    values["frames"].append({**values["frames"][0], **close, "k1": 0.1})
+    path.write_text(json.dumps(values))
+    ignore = ["--ignore", *ignored] if ignored else []
+    run(fit, "--camera", path, *ignore, "--out", tmp_path / "file")
+    of_file = capsys.readouterr().out
+    bent = sensor(pose_around(2.0, 0.3)).replace("perspective", "calibrated")
+    lens = '<string name="lens" value="opencv"/><float name="k1" value="0.1"/>'
+    bent = bent.replace("<film", f"{lens}<film")
+    bent = bent.replace(f'<float name="fov" value="{np.degrees(FIELD_OF_VIEW)}"/>', "")
+    settings = f'<string name="ignore" value="{", ".join(ignored)}"/>'
+    scene = write_scene(tmp_path, sensor(pose_around(0.8, 0.3)), bent, settings=settings)
+    run(scene, "--out", tmp_path / "scene")
+    of_scene = capsys.readouterr().out
+    if ignored:
+        assert "  not simulated: lens distortion (ignored), motion (ignored), anti" in of_file
+        assert "  not simulated: lens (ignored), depth of field, motion, anti" in of_scene
+    else:
+        assert "  lens distortion: opencv (k1) (1 of 2 cameras)\n" in of_file
+        assert "  motion: global shutter (1 of 2 cameras)\n" in of_file
+        assert "  lens: RadialTangential (k1) (1 of 2 sensors)\n" in of_scene
+
+
 def between(begin, end, time):
     """The pose at a time: the centre on a line, turning at a constant rate."""
     turn = Rotation.from_matrix(end[:3, :3] @ begin[:3, :3].T).as_rotvec()
