@@ -20,7 +20,7 @@ import numpy as np
 
 from drgs.checks import UserError, one_line
 from drgs.config import CamerasConfig
-from drgs.data.nerfstudio import CLOSE
+from drgs.data.frames import CLOSE
 from drgs.data.types import Dataset, Motion, View
 from drgs.files import atomic_path
 from drgs.shutter import rotation_matrix
@@ -147,6 +147,14 @@ class CameraRefinement(TrainingEffect):
         if start.motion is not None:
             poses["to_world_close"] = moved @ start.motion @ signs
         return poses | {"fx": fx, "fy": fy, "cx": cx, "cy": cy}
+
+    def numbers_of(self, view: TrainingView) -> dict[str, Any]:
+        """See :class:`TrainingEffect`."""
+        return self.parameters.numbers(view.index)
+
+    def values(self) -> dict[str, np.ndarray]:
+        """See :class:`TrainingEffect`."""
+        return self.parameters.values()
 
     def state(self) -> dict[str, np.ndarray]:
         """Numbers and moments."""

@@ -89,6 +89,14 @@ class ColorCorrection(TrainingEffect):
         matrices = self.parameters.numpy()["matrices"] - np.array(self.common)
         return matrices.reshape(-1, 3, 4)
 
+    def numbers_of(self, view: TrainingView) -> dict[str, Any]:
+        """See :class:`TrainingEffect`."""
+        return self.parameters.numbers(view.index)
+
+    def values(self) -> dict[str, np.ndarray]:
+        """See :class:`TrainingEffect`."""
+        return self.parameters.values()
+
     def state(self) -> dict[str, np.ndarray]:
         """Numbers and moments."""
         return {**self.parameters.state(), "common": np.array(self.common)}

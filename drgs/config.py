@@ -26,6 +26,7 @@ from pydantic import (
 )
 
 from drgs.checks import UserError, did_you_mean, one_line
+from drgs.constants import SHUTTER_SAMPLES
 from drgs.files import atomic_path, read_text
 
 Color = str | tuple[float, float, float]
@@ -114,7 +115,16 @@ class DataConfig(_Section):
     ignore_motion: bool = Field(
         False, description="Treat cameras that move while a photograph is taken as if they did not."
     )
+    shutter_samples: Count = Field(
+        SHUTTER_SAMPLES,
+        ge=1,
+        description="Times at which a picture is rendered that a moving camera with a global "
+        "shutter blurs.",
+    )
     ignore_masks: bool = Field(False, description="Use the pixels that masks leave out as well.")
+    ignore_depth: bool = Field(
+        False, description="Do not open files of depth; nor are they where loss.depth_weight is 0."
+    )
 
     @property
     def background_rgb(self) -> tuple[float, float, float]:
@@ -354,6 +364,18 @@ class FitConfig(_Section):
     )
     seed: Count = Field(0, ge=0, description="Seed of everything random.")
 
+    @property
+    def data_for_training(self) -> DataConfig:
+        """``data``, without the depths that a loss of weight 0 would not look at."""
+        if self.loss.depth_weight > 0:
+            return self.data
+        return self.data.model_copy(update={"ignore_depth": True})
+
+    @property
+    def data_for_rendering(self) -> DataConfig:
+        """``data``, without what only a loss looks at."""
+        return self.data.model_copy(update={"ignore_depth": True})
+
     @model_validator(mode="after")
     def _check_relations(self) -> FitConfig:
         densify, optimizer = self.densify, self.optimizer
@@ -371,6 +393,11 @@ class FitConfig(_Section):
                 "densify.prune_opacity must be < densify.reset_opacity "
                 f"({densify.reset_opacity}), or a reset removes everything; "
                 f"got {densify.prune_opacity}"
+            )
+        if self.cameras.optimise and self.model.sh_direction != "mean":
+            raise ValueError(
+                "model.sh_direction must be mean where cameras.optimise is true (colours along "
+                f"rays are not differentiated in the camera), got {self.model.sh_direction}"
             )
         if self.init.point_cloud is None and self.init.num_points > densify.max_gaussians:
             raise ValueError(

@@ -49,6 +49,10 @@ COLOR_MIN = 0.0
 """Colours from spherical harmonics are not negative (3DGS reference). Gradient: zero where a colour
 is clamped; at exactly this value it passes, so that black splats can learn."""
 
+SHUTTER_SAMPLES = 8
+"""Times at which a picture is rendered that a moving camera blurs, the default of the sensor
+``calibrated``: each covers an eighth of the motion, and costs a picture."""
+
 NEGLIGIBLE_ALPHA = 2.0**-60
 """Where alpha is not cut, splats end here: thousands of layers of such an alpha change no rounding,
 in either precision, and the short exp2 of the kernels is exact to well below it."""

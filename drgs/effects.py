@@ -1,16 +1,17 @@
 """Which effects a scene calls for, what asked for each, and what is not simulated.
 
 Layer 4. An effect is composed in when the dataset, the sensor or the configuration calls for it.
-What is not called for is not imported. :func:`plan_of_fit` and :func:`plan_of_scene` are what
-commands print at their start: one line an effect.
+What is not called for is not imported. :func:`plan_of_fit`, :func:`plan_of_views` and
+:func:`plan_of_sensors` are what commands print at their start: one line an effect.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
+from drgs.camera import without
 from drgs.checks import UserError
 from drgs.config import FitConfig
 from drgs.data.types import Dataset, View
@@ -72,12 +73,17 @@ class Effect:
     name: str
     what: str | None  # that is simulated; None: nothing is
     why: str = ""  # what asked for it
+    ignored: bool = False  # whether it is asked for where it is not to be simulated
 
 
 def described(effects: Sequence[Effect]) -> str:
     """The plan as text: one line for each effect that is simulated, one for all the others."""
     lines = [f"  {e.name}: {e.what} ({e.why})" for e in effects if e.what is not None]
-    absent = [e.name for e in effects if e.what is None]
+    absent = [
+        f"{e.name} (ignored)" if e.ignored else e.name
+        for e in effects
+        if e.what is None or e.ignored
+    ]
     if absent:
         lines.append(f"  not simulated: {', '.join(absent)}")
     return "simulated:\n" + "\n".join(lines)
@@ -85,12 +91,14 @@ def described(effects: Sequence[Effect]) -> str:
 
 def plan_of_fit(config: FitConfig, dataset: Dataset) -> list[Effect]:
     """What a fit simulates."""
-    views, model = dataset.train, config.model
+    views, model, ignored = dataset.train, config.model, dataset.ignored
+    depths = _of_data("depth", [v.depth for v in views], "supervision", "the dataset's depth")
+    depths = _unless_ignored(depths, config.loss.depth_weight == 0)
     return [
         _view_dependence(model.sh_degree, f"model.sh_degree: {model.sh_degree}"),
         _background(config),
-        lens_effect(views),
-        motion_effect(views),
+        replace(lens_effect(views), ignored="distortion" in ignored),
+        replace(motion_effect(views), ignored="motion" in ignored),
         _antialiasing(
             "model.antialiased" if model.antialiased else None,
             "model.smoothing" if model.smoothing else None,
@@ -100,13 +108,11 @@ def plan_of_fit(config: FitConfig, dataset: Dataset) -> list[Effect]:
             None if config.colors.lr is None else "a colour transform for each training photograph",
             "colors.lr",
         ),
-        _of_data("masks", [v.mask for v in views], "pixels left out", "the dataset's masks"),
-        _of_data(
-            "depth",
-            [v.depth for v in views] if config.loss.depth_weight > 0 else [],
-            "supervision",
-            "the dataset's depth",
+        replace(
+            _of_data("masks", [v.mask for v in views], "pixels left out", "the dataset's masks"),
+            ignored="masks" in ignored,
         ),
+        replace(depths, ignored=depths.ignored or "depth" in ignored),
         Effect(
             "camera refinement",
             _refined(config) if config.cameras.optimise else None,
@@ -115,34 +121,76 @@ def plan_of_fit(config: FitConfig, dataset: Dataset) -> list[Effect]:
     ]
 
 
-def plan_of_scene(integrator: Any, camera: Any, environment: Any) -> list[Effect]:
-    """What the integrator ``splats`` simulates for a sensor's camera in front of an environment."""
-    choices, lens, shutter = integrator.choices, camera.lens, camera.shutter
+def plan_of_sensors(
+    integrator: Any, cameras: Sequence[Any], environment: Any, num_surfaces: int = 0
+) -> list[Effect]:
+    """What the integrator ``splats`` simulates for sensors in front of an environment.
+
+    cameras: as the sensors have them, so that what the integrator ignores of them can be named;
+    num_surfaces: shapes of the scene that are no Gaussians.
+    """
+    left = [without(camera, integrator.ignore) for camera in cameras]
+
+    def effect(name: str, words: Callable[[Any], str | None]) -> Effect:
+        """words: what a camera has of it, or None."""
+        shown = [what for what in map(words, left) if what is not None]
+        why = "the sensor" if len(left) == 1 else f"{len(shown)} of {len(left)} sensors"
+        ignored = sum(words(camera) is not None for camera in cameras) > len(shown)
+        return Effect(name, " and ".join(sorted(set(shown))) or None, why, ignored)
+
+    of_cameras = [
+        effect("lens", lambda camera: _lens_words(camera.lens)),
+        effect("depth of field", lambda camera: None if camera.aperture is None else "a thin lens"),
+        effect("motion", lambda camera: _MOTION[type(camera.shutter).__name__]),
+    ]
+    surfaces = Effect(
+        "surfaces",
+        "a nested integrator's picture, between the splats" if num_surfaces else None,
+        f"{num_surfaces} of the scene's shapes",
+    )
+    return [*_plan_of_integrator(integrator, environment, of_cameras), surfaces]
+
+
+def plan_of_views(integrator: Any, views: Sequence[Any]) -> list[Effect]:
+    """The same for views or viewpoints, with nothing behind but the integrator's background."""
+    count = f"{len(views)} cameras"
+    of_cameras = [
+        _unless_ignored(effect_of(views, count), word in integrator.ignore)
+        for effect_of, word in ((lens_effect, "distortion"), (motion_effect, "motion"))
+    ]
+    return _plan_of_integrator(integrator, None, of_cameras)
+
+
+def _plan_of_integrator(
+    integrator: Any, environment: Any, of_cameras: Sequence[Effect]
+) -> list[Effect]:
     background = Effect("background", "a constant colour", "the integrator's background")
     if environment is not None and not integrator.hide_emitters:
         background = Effect("background", "an environment", "the scene's emitter")
     elif hasattr(integrator.background, "eval"):
         background = Effect("background", "a picture", "the integrator's background")
-    motion = {None: None, "MotionBlur": "blurred", "RollingShutter": "rolling shutter"}
     smooth = integrator.gaussians.smoothing is not None
-    return [
+    effects = [
         _view_dependence(integrator.sh_degree, "the Gaussians' coefficients"),
         background,
-        Effect(
-            "lens",
-            None if type(lens).__name__ == "Pinhole" else _lens_words(lens),
-            "the sensor",
-        ),
-        Effect("depth of field", None if camera.aperture is None else "a thin lens", "the sensor"),
-        Effect("motion", motion[None if shutter is None else type(shutter).__name__], "the sensor"),
+        *of_cameras,
         _antialiasing(
-            "antialiased" if choices.antialiased else None,
+            "antialiased" if integrator.choices.antialiased else None,
             "the Gaussians' filter" if smooth else None,
         ),
     ]
+    if integrator.smoothing is not None and not smooth:
+        effects.append(Effect("smoothing filter", None, ignored=True))
+    return effects
 
 
-def _lens_words(lens: Any) -> str:
+_MOTION = {"NoneType": None, "MotionBlur": "blurred", "RollingShutter": "rolling shutter"}
+"""By the name of a camera's shutter, whose module is imported where there is one."""
+
+
+def _lens_words(lens: Any) -> str | None:
+    if type(lens).__name__ == "Pinhole":
+        return None
     names = ", ".join(lens.named())
     return type(lens).__name__ + (f" ({names})" if names else "")
 
@@ -167,20 +215,24 @@ def _background(config: FitConfig) -> Effect:
     return Effect("background", f"{config.data.background}", "data.background")
 
 
-def lens_effect(views: Sequence[View]) -> Effect:
-    """Lenses that are no pinholes."""
+def lens_effect(views: Sequence[View], of: str = "the dataset's cameras") -> Effect:
+    """Lenses that are no pinholes; of: whose."""
     bent = [view.lens for view in views if view.lens is not None]
     kinds = sorted({f"{lens.kind} ({', '.join(lens.named())})" for lens in bent})
-    return Effect(
-        "lens distortion", " and ".join(kinds) or None, f"{len(bent)} of the dataset's cameras"
-    )
+    return Effect("lens distortion", " and ".join(kinds) or None, f"{len(bent)} of {of}")
 
 
-def motion_effect(views: Sequence[View]) -> Effect:
-    """Cameras that move while a photograph is taken."""
+def motion_effect(views: Sequence[View], of: str = "the dataset's cameras") -> Effect:
+    """Cameras that move while a photograph is taken; of: whose."""
     moving = [view.motion.shutter for view in views if view.motion is not None]
     shutters = " and ".join(f"{kind} shutter" for kind in sorted(set(moving)))
-    return Effect("motion", shutters or None, f"{len(moving)} of the dataset's cameras")
+    return Effect("motion", shutters or None, f"{len(moving)} of {of}")
+
+
+def _unless_ignored(effect: Effect, is_ignored: bool) -> Effect:
+    if is_ignored and effect.what is not None:
+        return replace(effect, what=None, ignored=True)
+    return effect
 
 
 def _of_data(name: str, values: Sequence[Any], what: str, why: str) -> Effect:

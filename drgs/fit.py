@@ -74,6 +74,7 @@ from drgs.plan import (
 )
 from drgs.progress import FitProgress
 from drgs.report import seconds_to_write, write_results
+from drgs.scene import check_lenses
 from drgs.trainer import StepReport, Trainer
 
 SMOOTHING = 0.9
@@ -105,7 +106,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         if is_finished(out, config) and not args.overwrite:
             print(f"{out}: this fit is finished; --overwrite does it again")
             return
-        dataset = load_dataset(config.data)
+        dataset = load_dataset(config.data_for_training)
         select_variant(args.variant)
         print(dataset.description)
         print(
@@ -114,6 +115,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
         )
         print(described(plan_of_fit(config, dataset)))
         # The folder is touched when all of the input has been found to be usable.
+        views, remedy = (*dataset.train, *dataset.test), "set data.ignore_distortion"
+        check_lenses(config.model, views, f"{config.data.path}: ", remedy)
         gaussians = initial_gaussians(config, dataset)
         length, plan = AllIterations(), None
         if args.budget is not None:

@@ -9,7 +9,7 @@ where the trouble began, not where it was noticed.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -30,6 +30,11 @@ class _Iteration:
     view: str
     loss: Any  # Float (1,)
     first_fault: Any  # UInt32 (1,), of the gradients
+    numbers: Mapping[str, Any]  # Float, by name: of the view, from effects
+
+
+NO_NUMBERS: Mapping[str, Any] = {}
+"""Of a fit without effects that optimise."""
 
 
 class GradientWatch:
@@ -38,12 +43,20 @@ class GradientWatch:
     def __init__(self) -> None:
         self._iterations: list[_Iteration] = []
 
-    def add(self, iteration: int, view: str, loss: Any, first_fault: Any) -> None:
+    def add(
+        self,
+        iteration: int,
+        view: str,
+        loss: Any,
+        first_fault: Any,
+        numbers: Mapping[str, Any] = NO_NUMBERS,
+    ) -> None:
         """Write down an iteration on the view of that name; waits for nothing.
 
-        loss: Float (1,). first_fault: see :func:`drgs.rendering.decode_fault`.
+        loss: Float (1,). first_fault: see :func:`drgs.rendering.decode_fault`. numbers: Float by
+        name, what effects had optimised of the view.
         """
-        self._iterations.append(_Iteration(iteration, view, loss, first_fault))
+        self._iterations.append(_Iteration(iteration, view, loss, first_fault, numbers))
 
     def check(self) -> None:
         """Raise :class:`NonFiniteError` for the first iteration at fault; waits for the device."""
@@ -55,6 +68,10 @@ class GradientWatch:
 
 
 def _faults(iteration: _Iteration) -> Any:
+    # First: what is wrong with them is wrong with all that follows.
+    for name, values in iteration.numbers.items():
+        if (first := _first_fault(np.array(values))) is not None:
+            yield f"{name} is {first[1]}"
     loss, fault = float(iteration.loss[0]), decode_fault(int(iteration.first_fault[0]))
     if not math.isfinite(loss):
         yield f"the loss is {loss}"
@@ -73,8 +90,28 @@ def check_values(iteration: int, values: Mapping[str, Any]) -> None:
         array = dr.detach(array)
         if dr.all(dr.isfinite(array.array)):
             continue
-        host = np.array(array)
-        first = tuple(np.argwhere(~np.isfinite(host))[0])
-        raise NonFiniteError(
-            f"after iteration {iteration}: {name} is {host[first]} in row {first[0]}"
-        )
+        row, value = _first_fault(np.array(array))
+        raise NonFiniteError(f"after iteration {iteration}: {name} is {value} in row {row}")
+
+
+def check_view_values(
+    iteration: int, values: Mapping[str, np.ndarray], views: Sequence[str]
+) -> None:
+    """The same for what effects optimise, and its moments.
+
+    values: arrays by name, a row for each of the training views, whose names are ``views``, or one
+    row for all. A camera that is not finite sees nothing: no loss tells.
+    """
+    for name, array in values.items():
+        if (first := _first_fault(array)) is not None:
+            row, value = first
+            view = f"view {views[row]}" if len(array) > 1 else "all views"
+            raise NonFiniteError(
+                f"after iteration {iteration}: {name} is {value} in row {row} ({view})"
+            )
+
+
+def _first_fault(array: np.ndarray) -> tuple[int, float] | None:
+    """The first row, and in it the first value, that is not finite; None: all are."""
+    faults = np.argwhere(~np.isfinite(array))
+    return (int(faults[0][0]), array[tuple(faults[0])]) if len(faults) else None

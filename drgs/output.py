@@ -22,7 +22,9 @@ LAST_FILE = "metrics.json"
 """Written when everything else is there."""
 
 RESULTS = (
+    "cameras.json",
     "checkpoint.npz",
+    "colors.json",
     "curves.png",
     "history.csv",
     "metrics.json",

@@ -28,18 +28,20 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
-from drgs.camera import IGNORABLE
+from drgs.camera import IGNORABLE, camera_from_sensor, read_sensor
 from drgs.checks import UserError, exit_on_user_error
 from drgs.config import NAMED_COLORS, DataConfig, FitConfig, ModelConfig, load_config
+from drgs.constants import SHUTTER_SAMPLES
 from drgs.data import Dataset, View, load_dataset
 from drgs.data.images import read_image
+from drgs.effects import described, plan_of_views
 from drgs.execution import add_options, execution
 from drgs.files import atomic_path
 from drgs.gaussians import Gaussians
 from drgs.io.ply import read_ply
 from drgs.metrics import Quality, psnr, ssim
 from drgs.pictures import write_animation, write_png
-from drgs.scene import make_scene, make_sensors
+from drgs.scene import check_lenses, make_scene
 from drgs.trainer import render_views
 from drgs.viewpoints import (
     FIELD_OF_VIEW,
@@ -53,7 +55,7 @@ from drgs.viewpoints import (
     read_viewpoints,
 )
 
-MODEL, CONFIG, METRICS = "point_cloud.ply", "config.yml", "metrics.json"
+MODEL, CONFIG, METRICS, CAMERAS = "point_cloud.ply", "config.yml", "metrics.json", "cameras.json"
 """What a fit's output folder holds."""
 
 DEFAULT_SIZE = (400, 400)
@@ -74,7 +76,7 @@ class Model:
     background: tuple[float, float, float] | Path  # display space; or a file with a picture
     config: FitConfig | None  # names the dataset
     ignored: str = ""  # effects that are not to be simulated: see the plugin
-    folder: Path | None = None  # the fit's, if there is one
+    folder: Path | None = None  # where they are, perhaps with refined cameras beside them
 
     def scene(self) -> mi.Scene:
         """A Mitsuba scene that renders in display space."""
@@ -82,9 +84,11 @@ class Model:
         return make_scene(self.gaussians, self.settings, self.background, **settings)
 
     def pictures(self, views: Sequence[View | Viewpoint]) -> Iterator[np.ndarray]:
-        """Pictures (H, W, 3) of the views, after a plan of what is simulated in the first."""
+        """Pictures (H, W, 3) of the views, after a plan of what is simulated in them."""
+        if "distortion" not in self.ignored:
+            check_lenses(self.settings, views, where="", remedy="give --ignore distortion")
         scene = self.scene()
-        print(scene.integrator().plan(scene, make_sensors(views[:1])[0]), flush=True)
+        print(described(plan_of_views(scene.integrator(), views)), flush=True)
         return render_views(scene, views)
 
     def dataset(self, option: str) -> Dataset:
@@ -93,11 +97,18 @@ class Model:
             raise UserError(
                 f"{option}: needs photographs: give the configuration of a fit (--scene CONFIG.yml)"
             )
-        dataset = load_dataset(self.config.data)
-        if self.folder is None or not self.config.cameras.optimise:
+        dataset = load_dataset(self.config.data_for_rendering)
+        if self.folder is None or not (path := self.folder / CAMERAS).is_file():
+            return dataset
+        if not self.config.cameras.optimise:
+            print(
+                f"cameras: as the dataset has them; those of {path} are used with "
+                "--set cameras.optimise=true"
+            )
             return dataset
         from drgs.camera_refinement import refined_dataset
 
+        print(f"cameras: as refined, from {path}")
         return refined_dataset(dataset, self.folder)
 
 
@@ -114,7 +125,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             if args.orbit is not None:
                 render_orbit(model, args)
             elif args.camera is not None or args.origin is not None:
-                for _ in render_cameras(model, cameras(args), args.out):
+                for _ in render_cameras(model, cameras(args, model), args.out):
                     pass
             else:
                 render_split(model, args.split or "test", args.out)
@@ -129,8 +140,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
 def load_model(args: argparse.Namespace) -> Model:
     """The Gaussians that the command line names, with the settings of their configuration."""
     what, config_path = args.what, args.scene
-    folder = what if what.is_dir() else None
-    if folder is not None:
+    folder = what if what.is_dir() else what.parent
+    if what.is_dir():
         for name in (CONFIG, MODEL):
             if not (what / name).is_file():
                 raise UserError(
@@ -213,11 +224,12 @@ def render_cameras(
         yield image
 
 
-def cameras(args: argparse.Namespace) -> list[Viewpoint]:
+def cameras(args: argparse.Namespace, model: Model) -> list[Viewpoint]:
     """The cameras of ``--camera``, or the one of ``--origin``."""
     size = tuple(args.size) if args.size else None
     if args.camera is not None:
-        return read_viewpoints(args.camera, size)
+        samples = model.config.data.shutter_samples if model.config else SHUTTER_SAMPLES
+        return read_viewpoints(args.camera, size, samples)
     pose = look_at(args.origin, args.target or (0.0, 0.0, 0.0), args.up or UP)
     return [pinhole("camera", pose, *(size or DEFAULT_SIZE), args.fov or FIELD_OF_VIEW)]
 
@@ -235,10 +247,10 @@ def render_mitsuba_scene(path: Path, out: Path) -> None:
     if scene.integrator() is None or not scene.sensors():
         raise UserError(f"{path}: the scene must hold an integrator and at least one sensor")
     linear = getattr(scene.integrator(), "srgb_primitives", True)
+    if hasattr(scene.integrator(), "plan"):
+        _print_plan(path, scene)
     for index, sensor in enumerate(scene.sensors()):
         name = path.stem if len(scene.sensors()) == 1 else f"{path.stem}_{index}"
-        if index == 0 and hasattr(scene.integrator(), "plan"):
-            _print_plan(path, scene, sensor)
         _render_sensor(path, scene, index)
         bitmap = sensor.film().bitmap()
         width, height = bitmap.size()
@@ -251,10 +263,10 @@ def render_mitsuba_scene(path: Path, out: Path) -> None:
         print(f"{name}: {width}x{height}")
 
 
-def _print_plan(path: Path, scene: mi.Scene, sensor: mi.Sensor) -> None:
-    """What the scene's ``splats`` integrator simulates for a sensor."""
+def _print_plan(path: Path, scene: mi.Scene) -> None:
+    """What the scene's ``splats`` integrator simulates for its sensors."""
     try:
-        print(scene.integrator().plan(scene, sensor), flush=True)
+        print(scene.integrator().plan(scene, *scene.sensors()), flush=True)
     except (TypeError, ValueError) as error:
         if not str(error).startswith("splats: "):
             raise

@@ -15,6 +15,7 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
+from drgs.checks import UserError
 from drgs.choices import Choices
 from drgs.config import ModelConfig
 from drgs.data.types import View
@@ -62,6 +63,21 @@ def accuracy(model: ModelConfig) -> dict[str, Any]:
     return {n: getattr(model, n) for n in names if getattr(model, n) != getattr(default, n)}
 
 
+def check_lenses(model: ModelConfig, views: Iterable[View], where: str, remedy: str) -> None:
+    """Raise :class:`UserError` for a lens that the projection cannot render.
+
+    It would be refused when its view is rendered, perhaps long after a fit has begun. where: the
+    message's beginning; remedy: its end.
+    """
+    bent = next((view for view in views if view.lens is not None), None)
+    if model.projection == "exact" and bent is not None:
+        raise UserError(
+            f"{where}model.projection must be ewa or unscented for lenses that are no pinholes, "
+            f"such as that of view {bent.name} ({bent.lens.kind}: {', '.join(bent.lens.named())}), "
+            f"got exact; or {remedy}"
+        )
+
+
 def make_sensors(views: Iterable[View], calibrated: bool = False) -> list[mi.Sensor]:
     """One sensor per view: box filter, one sample, RGB.
 
@@ -104,6 +120,7 @@ def _sensor(view: View, calibrated: bool) -> dict[str, Any]:
     if view.motion is not None:
         pose["to_world_close"] = _to_world(view.motion.close_to_world)
         pose["shutter"] = view.motion.shutter
+        pose["shutter_samples"] = view.motion.samples
     return {"type": "calibrated", **pose, **intrinsics}
 
 

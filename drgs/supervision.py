@@ -49,8 +49,9 @@ class Masks(TrainingEffect):
 class DepthSupervision(TrainingEffect):
     """Penalises the difference between the composited depth and that of the data.
 
-    The term is weight / extent times the mean of |D - A d| over the pixels whose depth d is known,
-    D being the alpha-weighted sum of the splats' depths and A the alpha: ``pixels.depth_error``.
+    The term is weight / extent times the mean of |D - A d| over the pixels whose depth d is known
+    and that no mask leaves out, D being the alpha-weighted sum of the splats' depths and A the
+    alpha: ``pixels.depth_error``.
     """
 
     name = "depth"
@@ -61,10 +62,14 @@ class DepthSupervision(TrainingEffect):
         self.weight, self.depths = weight / extent, None
 
     def upload(self, view: View) -> Any:
-        """Depths, and weights of the pixels; None where a view has none."""
-        if view.depth is None or not (view.depth > 0).any():
+        """Depths, and weights of the pixels; None where a view has none that counts."""
+        if view.depth is None:
             return None
         known = view.depth > 0
+        if view.mask is not None:
+            known &= view.mask > 0
+        if not known.any():
+            return None
         weights = self.weight * known / known.sum()
         return from_host(mi.Float, view.depth), from_host(mi.Float, weights)
 

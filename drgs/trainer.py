@@ -22,7 +22,7 @@ from drgs.data.images import smaller_view
 from drgs.data.types import Dataset, View
 from drgs.effects import integrator_settings, training_effects
 from drgs.gaussians import PARAMETER_NAMES, Gaussians
-from drgs.guards import GradientWatch, check_values
+from drgs.guards import GradientWatch, check_values, check_view_values
 from drgs.losses import PhotometricLoss, Target, prepare_target
 from drgs.optimizer import (
     ExponentialDecay,
@@ -127,7 +127,8 @@ class Trainer:
         dr.backward(loss)
         image, loss = dr.detach(image), dr.detach(loss)
         error = dr.mean(dr.square(image.array - view.target.image.array))
-        self.watch.add(self.iteration, view.name, loss, self.integrator.last.first_fault)
+        numbers = {f"{e.name}.{k}": v for e in self.effects for k, v in e.numbers_of(view).items()}
+        self.watch.add(self.iteration, view.name, loss, self.integrator.last.first_fault, numbers)
         self.optimizer.step()
         for effect in self.effects:
             effect.after(self, view)
@@ -211,6 +212,8 @@ class Trainer:
         self.watch.check()
         values = {key.removeprefix(PREFIX): value for key, value in self.optimizer.items()}
         check_values(self.iteration, {**values, "gradient_norms": self.statistics.gradient_norms})
+        of_views = {f"{e.name}.{k}": v for e in self.effects for k, v in e.values().items()}
+        check_view_values(self.iteration, of_views, [view.name for view in self.views])
 
     def gaussians(self) -> Gaussians:
         """The Gaussians as numpy arrays."""

@@ -66,6 +66,15 @@ class TrainingEffect:
     def write(self, folder: Path, views: tuple[View, ...]) -> None:
         """Write what was found into the output folder; views: those of the training split."""
 
+    def numbers_of(self, view: TrainingView) -> dict[str, Any]:
+        """What it has optimised that the view depends on: Float by name, without derivatives."""
+        del view
+        return {}
+
+    def values(self) -> dict[str, np.ndarray]:
+        """All that it optimises, and its moments: a row for each training view, or for all."""
+        return {}
+
     def state(self) -> dict[str, np.ndarray]:
         """What the coming iterations depend on."""
         return {}

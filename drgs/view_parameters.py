@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 from drjit.opt import Adam
@@ -30,6 +31,10 @@ class ViewParameters:
         """The numbers (K,) of a view, with derivatives enabled."""
         return {name: optimizer[name] for name, optimizer in self._of_view(index).items()}
 
+    def numbers(self, index: int) -> dict[str, mi.Float]:
+        """The same without derivatives."""
+        return dr.detach(self.leaves(index))
+
     def step(self, index: int, decay: float = 1.0) -> None:
         """Move the view's numbers along their derivatives; decay: factor of the rates."""
         for name, optimizer in self._of_view(index).items():
@@ -40,6 +45,10 @@ class ViewParameters:
         """The numbers, (V, K) each."""
         state = self.state()
         return {name: state[f"{name}.value"] for name in self.optimizers}
+
+    def values(self) -> dict[str, np.ndarray]:
+        """The numbers by name, and their moments as ``NAME.m`` and ``NAME.v``; a row each."""
+        return {key.removesuffix(".value"): value for key, value in self.state().items()}
 
     def state(self) -> dict[str, np.ndarray]:
         """Numbers, moments and step counts, a row for each view."""

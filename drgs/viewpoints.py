@@ -17,10 +17,12 @@ from typing import Any
 import numpy as np
 
 from drgs.checks import UserError
+from drgs.constants import SHUTTER_SAMPLES
 from drgs.data.frames import (
-    FrameValues,
+    InheritedValues,
     focal_from_angle,
     lens_of,
+    motion_of,
     number,
     opencv_camera_to_world,
     positive,
@@ -200,12 +202,15 @@ def orbit_size(views: Sequence[View]) -> tuple[int, int]:
     return max(1, round(scale * first.width)), max(1, round(scale * first.height))
 
 
-def read_viewpoints(path: Path, size: tuple[int, int] | None) -> list[Viewpoint]:
+def read_viewpoints(
+    path: Path, size: tuple[int, int] | None, shutter_samples: int = SHUTTER_SAMPLES
+) -> list[Viewpoint]:
     """The cameras of a file in the layout of ``transforms.json``, without its pictures.
 
     ``camera_angle_x``, or ``fl_x`` in pixels of ``w`` (and ``fl_y`` and ``cy`` of ``h``, ``cx`` of
-    ``w``), and lens distortion, at the top or, overriding that, in a frame. size: width and height,
-    px; None for those that the file gives.
+    ``w``), and lens distortion, at the top or, overriding that, in a frame; a second pose in a
+    frame. size: width and height, px; None for those that the file gives. shutter_samples: times at
+    which what motion blurs is rendered.
 
     Raises :class:`UserError` naming the file, the key, what was expected and what was got.
     """
@@ -213,14 +218,20 @@ def read_viewpoints(path: Path, size: tuple[int, int] | None) -> list[Viewpoint]
     frames = meta["frames"]
     digits = len(str(len(frames) - 1))
     return [
-        _read_viewpoint({**meta, **frame}, f"{path}: frames[{i}].", f"camera_{i:0{digits}d}", size)
-        for i, frame in enumerate(frames)
+        _read_viewpoint(
+            InheritedValues(own, f"{path}: frames[{i}].", meta, path),
+            f"camera_{i:0{digits}d}",
+            size,
+            shutter_samples,
+        )
+        for i, own in enumerate(frames)
     ]
 
 
 def _read_viewpoint(
-    values: dict[str, Any], where: str, name: str, size: tuple[int, int] | None
+    frame: InheritedValues, name: str, size: tuple[int, int] | None, shutter_samples: int
 ) -> Viewpoint:
+    values, where = frame.values, frame.where
     pose = opencv_camera_to_world(values, where)
     if size is None:
         missing = [key for key in ("w", "h") if key not in values]
@@ -242,9 +253,8 @@ def _read_viewpoint(
     if "cx" in values and "cy" in values:
         cx = width * number(values, "cx", where) / positive(values, "w", where)
         cy = height * number(values, "cy", where) / positive(values, "h", where)
-    return Viewpoint(
-        name, pose, focal, focal_y, cx, cy, width, height, lens_of(FrameValues(values, where))
-    )
+    lens, motion = lens_of(frame), motion_of(frame, shutter_samples)
+    return Viewpoint(name, pose, focal, focal_y, cx, cy, width, height, lens, motion)
 
 
 def _middle(gaussians: Gaussians) -> tuple[np.ndarray, float]:

@@ -696,17 +696,15 @@ class SplatsIntegrator(mi.CppADIntegrator):
         dr.make_opaque(state.device)  # or each value of a literal would be a new kernel
         return cameras_in_time(without(state.make(state), self.ignore))
 
-    def plan(self, scene: mi.Scene, sensor: mi.Sensor) -> str:
+    def plan(self, scene: mi.Scene, *sensors: mi.Sensor) -> str:
         """What is simulated, what asked for it, and what is not simulated: one line an effect."""
-        from drgs.effects import described, plan_of_scene
+        from drgs.effects import described, plan_of_sensors
 
         self._gather(scene)
-        if sensor.class_name() == "BatchSensor":
-            from drgs.batch import SideBySide
-
-            sensor = SideBySide.of(sensor).sensors[0]
-        camera = self._camera(self._sensor_state(sensor).detached())
-        return described(plan_of_scene(self, camera, scene.environment()))
+        states = [self._sensor_state(one).detached() for s in sensors for one in _alone(s)]
+        surfaces = [shape for shape in scene.shapes() if not shape.is_ellipsoids()]
+        cameras = list(map(camera_from_sensor, states))
+        return described(plan_of_sensors(self, cameras, scene.environment(), len(surfaces)))
 
     def _log_plan(self, scene: mi.Scene, sensor: mi.Sensor) -> None:
         """Once for each plan, where somebody listens."""
@@ -1097,6 +1095,15 @@ def _check_degree(degree: int, gaussians: Gaussians) -> None:
 
 def _resolve_sensor(scene: mi.Scene, sensor: int | mi.Sensor) -> mi.Sensor:
     return scene.sensors()[sensor] if isinstance(sensor, int) else sensor
+
+
+def _alone(sensor: mi.Sensor) -> list[mi.Sensor]:
+    """The sensors of a batch, or the one."""
+    if sensor.class_name() != "BatchSensor":
+        return [sensor]
+    from drgs.batch import SideBySide
+
+    return SideBySide.of(sensor).sensors
 
 
 def _rows(vector: Any) -> mi.TensorXf:

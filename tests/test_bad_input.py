@@ -190,6 +190,18 @@ WRONG_INPUTS = {
         lambda f: Image.new("CMYK", (20, 16)).save(f / "train" / "1.png", "TIFF"),
         "1.png: must be a grey, RGB or RGBA image of 8 or 16 bits, got one of Pillow's mode CMYK",
     ),
+    "exact projection of a bent lens": (
+        lambda f: (
+            edit_settings(model={"sh_degree": 0, "projection": "exact"})(f),
+            edit_transforms(lambda m: m["frames"][1].update(k1=0.1))(f),
+        ),
+        ": model.projection must be ewa or unscented for lenses that are no pinholes, such as that "
+        "of view 1 (opencv: k1), got exact; or set data.ignore_distortion",
+    ),
+    "cameras and colours along rays": (
+        edit_settings(cameras={"optimise": True}, model={"sh_direction": "pixel"}),
+        "a.yml: model.sh_direction must be mean where cameras.optimise is true",
+    ),
     "alpha missing": (write_picture((16, 20, 3)), "1.png: must have an alpha channel"),
     "point cloud missing": (lambda f: (f / "points.ply").unlink(), "points.ply: cannot read"),
     "point cloud is a folder": (put_folder_in_place_of("points.ply"), "points.ply: cannot read"),
@@ -226,6 +238,16 @@ def test_wrong_input_ends_with_status_2_and_one_line(scene, capsys, damage, mess
     assert message in errors
     assert str(scene) in errors
     assert not (scene / "out").exists()
+
+
+@pytest.mark.parametrize(("weight", "first"), [(0.2, "there is no image"), (0, "points.ply")])
+def test_a_fit_opens_depths_if_its_loss_looks_at_them(scene, capsys, weight, first):
+    """Which of two files that are missing is missed first."""
+    edit_transforms(lambda m: m["frames"][1].update(depth_file_path="nowhere.png"))(scene)
+    (scene / "points.ply").unlink()
+    setting = ("--set", f"loss.depth_weight={weight}")
+    status, errors = fit_in_process(capsys, scene / "a.yml", *setting)
+    assert status == 2 and first in errors
 
 
 @pytest.mark.parametrize("size", [10**6, 2**31 - 1])

@@ -135,6 +135,11 @@ def test_a_configuration_is_frozen(load):
             "densify: {max_gaussians: 500}",
             "init.num_points must be <= densify.max_gaussians (500), got 100000",
         ),
+        (
+            "cameras: {optimise: true}\nmodel: {sh_direction: pixel}",
+            "model.sh_direction must be mean where cameras.optimise is true (colours along rays "
+            "are not differentiated in the camera), got pixel",
+        ),
     ],
 )
 def test_a_wrong_value_is_refused_with_file_key_expected_and_got(load, text, message):

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from PIL import Image
 
 from drgs.checks import UserError
 from drgs.config import DataConfig, FitConfig
@@ -497,6 +498,15 @@ def test_a_mask_counts_pixels_brighter_than_half(photographs, pixels):
     assert "ignored" not in dataset.description
 
 
+def test_a_mask_of_one_bit_is_read(photographs):
+    kept = np.random.default_rng(0).integers(0, 2, (6, 8)).astype(bool)
+    picture = Image.fromarray(kept)
+    assert picture.mode == "1"
+    picture.save(photographs / "mask.png")
+    give(photographs, mask_path="mask.png")
+    np.testing.assert_array_equal(view_named(load(photographs)).mask, kept)
+
+
 def test_masks_may_be_ignored(photographs):
     iio.imwrite(photographs / "mask.png", GREY_MASK)
     give(photographs, mask_path="mask.png")
@@ -523,7 +533,7 @@ def test_a_picture_of_another_size_than_the_photograph_is_refused(photographs, k
     give(photographs, **{key: "other.png"})
     assert refusal(photographs) == (
         f"{photographs / 'other.png'}: must be 8 x 6 px, as the photograph is, got 8 x 4; "
-        "resize it, or leave it out of the frame in transforms.json"
+        "resize it, or leave it out of the frame"
     )
 
 
@@ -536,6 +546,31 @@ def test_a_missing_mask_or_depth_is_named(photographs, key):
     )
     give(photographs, **{key: 3})
     assert refusal(photographs) == f"{where} must be text, got 3"
+
+
+@pytest.mark.parametrize("name", ["01.png", "08.png"], ids=["train", "test"])
+def test_a_mask_that_leaves_out_every_pixel_is_refused(photographs, name):
+    iio.imwrite(photographs / "mask.png", np.full((6, 8), 127, np.uint8))
+    give(photographs, name, mask_path="mask.png")
+    assert refusal(photographs) == (
+        f"{photographs / 'mask.png'}: must leave pixels that count (brighter than half), got a "
+        "mask without any; remove the view from its file, or set data.ignore_masks"
+    )
+    assert view_named(load(photographs, ignore_masks=True)).mask is None
+
+
+def test_a_mask_that_leaves_out_every_pixel_of_a_smaller_picture_is_refused(photographs):
+    """One of each block of 2 x 2 pixels: none of the larger pixels counts as a whole."""
+    mask = np.full((6, 8), 255, np.uint8)
+    mask[::2, ::2] = 0
+    iio.imwrite(photographs / "mask.png", mask)
+    give(photographs, mask_path="mask.png")
+    assert view_named(load(photographs)).mask.mean() == 0.75
+    assert refusal(photographs, image_size=4) == (
+        f"{photographs / 'mask.png'}: must leave pixels that count (brighter than half), got a "
+        "mask without any at data.image_size 4; set a larger one, remove the view from its file, "
+        "or set data.ignore_masks"
+    )
 
 
 def test_a_broken_mask_is_named(photographs):
@@ -572,18 +607,39 @@ def test_depths_of_a_picture_are_in_steps_of_a_unit(photographs, place, values, 
     assert view_named(dataset, "02").depth is None
 
 
-@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("dtype", [np.float32, np.float64, np.uint16])
 @pytest.mark.parametrize("shape", [(6, 8), (6, 8, 1)])
-def test_depths_of_an_array_are_in_scene_units(photographs, dtype, shape):
+@pytest.mark.parametrize(
+    ("values", "unit"), [({}, 1.0), ({"depth_unit_scale_factor": 0.25}, 0.25)], ids=["", "stated"]
+)
+def test_depths_of_an_array_are_in_scene_units_or_in_those_that_are_stated(
+    photographs, dtype, shape, values, unit
+):
     """What is not finite or not positive is not known."""
-    values = np.random.default_rng(0).uniform(0.5, 9, (6, 8)).astype(dtype)
-    values[0, :4] = [np.nan, np.inf, -1, 0]
-    np.save(photographs / "depth.npy", values.reshape(shape))
-    give(photographs, depth_file_path="depth.npy", depth_unit_scale_factor=7.0)
-    depth = view_named(load(photographs)).depth
-    expected = values.astype(np.float32)
-    expected[0, :4] = 0
-    np.testing.assert_array_equal(depth, expected)
+    depths = np.random.default_rng(0).uniform(5, 90, (6, 8)).astype(dtype)
+    if dtype != np.uint16:
+        depths[0, :5] = [np.nan, np.inf, -1, 0, np.finfo(dtype).max]
+    np.save(photographs / "depth.npy", depths.reshape(shape))
+    give(photographs, depth_file_path="depth.npy", **values)
+    dataset = load(photographs)
+    # A power of two: no rounding but that to single precision.
+    with np.errstate(over="ignore"):
+        expected = (depths * unit).astype(np.float32)
+    expected[~(np.isfinite(expected) & (expected > 0))] = 0
+    assert (expected > 0).sum() >= 43
+    np.testing.assert_array_equal(view_named(dataset).depth, expected)
+    assert dataset.description.endswith(f"; depth in units of {unit:g}")
+
+
+def test_the_units_of_all_depths_are_said(photographs):
+    iio.imwrite(photographs / "depth.png", STEPS)
+    np.save(photographs / "depth.npy", np.ones((6, 8)))
+    give(photographs, "01.png", depth_file_path="depth.png")
+    give(photographs, "02.png", depth_file_path="depth.npy")
+    give(photographs, "03.png", depth_file_path="depth.npy", depth_unit_scale_factor=3)
+    dataset = load(photographs)
+    assert dataset.description.endswith("; depth in units of 0.001 and 1 and 3")
+    assert [float(view_named(dataset, name).depth[5, 7]) for name in ("02", "03")] == [1, 3]
 
 
 def test_smaller_depths_are_means_of_known_ones(photographs):
@@ -631,6 +687,49 @@ def test_a_picture_of_depths_has_16_bits(photographs, pixels, mode):
     )
 
 
+def test_depth_may_be_ignored(photographs):
+    """Then its file is not opened: there is none."""
+    give(photographs, depth_file_path="nowhere.png")
+    dataset = load(photographs, ignore_depth=True)
+    assert all(view.depth is None for view in dataset.train)
+    assert dataset.description.endswith("; depth (depth_file_path) ignored")
+    assert dataset.ignored == ("depth",)
+
+
+@pytest.mark.parametrize("weight", [0.0, 0.2])
+def test_a_fit_whose_loss_does_not_look_at_depth_does_not_open_it(photographs, weight):
+    give(photographs, depth_file_path="nowhere.png")
+    fit = FitConfig(data={"path": str(photographs)}, loss={"depth_weight": weight})
+    assert load_dataset(fit.data_for_rendering).ignored == ("depth",)
+    if weight == 0:
+        assert load_dataset(fit.data_for_training).ignored == ("depth",)
+    else:
+        with pytest.raises(UserError, match="there is no image"):
+            load_dataset(fit.data_for_training)
+
+
+def test_all_that_frames_have_may_be_ignored_and_is_named(photographs):
+    edit(photographs / "transforms.json", lambda m: m.update(k1=0.1))
+    values = {"mask_path": "nowhere.png", "depth_file_path": "nowhere.png"}
+    give(photographs, transform_matrix_close=np.eye(4).tolist(), **values)
+    names = ("distortion", "motion", "masks", "depth")
+    dataset = load(photographs, **{f"ignore_{name}": True for name in names})
+    assert dataset.ignored == names
+    for view in (*dataset.train, *dataset.test):
+        assert (view.lens, view.motion, view.mask, view.depth) == (None,) * 4
+
+
+def test_a_mask_for_the_whole_file_is_that_of_every_frame_without_its_own(photographs):
+    masks = np.random.default_rng(0).integers(0, 2, (2, 6, 8), np.uint8)
+    for name, mask in zip(("all", "one"), masks, strict=True):
+        iio.imwrite(photographs / f"{name}.png", 255 * mask)
+    edit(photographs / "transforms.json", lambda m: m.update(mask_path="all.png"))
+    give(photographs, "02.png", mask_path="one.png")
+    dataset = load(photographs)
+    for view in (*dataset.train, *dataset.test):
+        np.testing.assert_array_equal(view.mask, masks[int(view.name == "02")])
+
+
 def test_a_unit_of_depth_is_positive(photographs):
     iio.imwrite(photographs / "depth.png", STEPS)
     give(photographs, depth_file_path="depth.png", depth_unit_scale_factor=0)
@@ -661,6 +760,8 @@ def test_a_second_pose_is_read(photographs, place, values, shutter):
     ahead = motion.close_to_world[:3, :3].T @ (np.zeros(3) - center)
     np.testing.assert_allclose(ahead, [0, 0, np.linalg.norm(center)], atol=1e-12)
     assert view_named(dataset, "02").motion is None
+    assert motion.samples == 8
+    assert view_named(load(photographs, shutter_samples=3)).motion.samples == 3
     ignored = load(photographs, ignore_motion=True)
     assert view_named(ignored).motion is None
     assert ignored.description.endswith("; motion (transform_matrix_close) ignored")
@@ -702,6 +803,34 @@ def test_transparency_of_synthetic_pictures_is_kept(blender):
         expected = (images["train", 1][..., 3] / 255).reshape(shape).mean(axis=(1, 3))
         np.testing.assert_allclose(view.alpha, expected, rtol=1e-6)
     assert load(folder).test[1].alpha is None
+
+
+def test_frames_of_the_synthetic_layout_may_have_the_same(blender):
+    """Mask, depth, lens and second pose, of both splits; what is ignored is named."""
+    folder, _ = blender
+    close = look_at((4, 0.5, 0), (0, 0, 0)).tolist()
+    mask = np.ones((4, 6), np.uint8)
+    mask[0, 1] = mask[3, 3:] = 0
+    iio.imwrite(folder / "mask.png", 255 * mask)
+    np.save(folder / "depth.npy", np.arange(24.0).reshape(4, 6))
+    values = {"mask_path": "mask.png", "depth_file_path": "depth.npy", "k1": 0.1}
+    values |= {"transform_matrix_close": close, "shutter": "rolling"}
+    for split in ("train", "val"):
+        edit(folder / f"transforms_{split}.json", lambda m: m["frames"][1].update(values))
+    dataset = load(folder, ignore_distortion=True)
+    assert dataset.ignored == ("distortion",)
+    assert dataset.description.endswith("; lens opencv (k1) ignored; depth in units of 1")
+    assert load(folder).train[1].lens == RadialTangential.of(k1=0.1)
+    for views in (dataset.train, dataset.test):
+        np.testing.assert_array_equal(views[1].mask, mask)
+        np.testing.assert_array_equal(views[1].depth, np.arange(24.0).reshape(4, 6))
+        assert views[1].motion.shutter == "rolling"
+        np.testing.assert_allclose(views[1].motion.close_to_world[:3, 3], (4, 0.5, 0))
+        for view in (views[0], views[2]):
+            assert (view.lens, view.motion, view.mask, view.depth) == (None,) * 4
+    smaller = load(folder, image_size=3).train[1]
+    np.testing.assert_array_equal(smaller.mask, mask.reshape(2, 2, 3, 2).min(axis=(1, 3)))
+    assert smaller.depth.shape == (2, 3)
 
 
 def test_coarse_views_have_smaller_masks_depths_and_transparency():

@@ -12,10 +12,18 @@ from views import VIEWS, Scene, tensors
 
 import drgs  # noqa: F401  (registers the plugins)
 from drgs import fit
-from drgs.camera import Pinhole
+from drgs.camera import Pinhole, camera_from_sensor, read_sensor
 from drgs.checkpoint import load_checkpoint
 from drgs.data.types import Motion
-from drgs.effects import Effect, described, integrator_settings, plan_of_fit, training_effects
+from drgs.effects import (
+    Effect,
+    described,
+    integrator_settings,
+    plan_of_fit,
+    plan_of_sensors,
+    plan_of_views,
+    training_effects,
+)
 from drgs.lenses import Fisheye, RadialTangential
 from drgs.schedule import changed
 
@@ -54,6 +62,10 @@ def test_a_plan_is_a_line_for_each_effect_and_one_for_all_others():
     ]
     assert described(effects) == "simulated:\n  a: much (x.y)\n  c: some (z)\n  not simulated: b, d"
     assert described(effects[:1]) == "simulated:\n  a: much (x.y)"
+    ignored = [*effects, Effect("e", None, "z", ignored=True), Effect("f", "a part", "z", True)]
+    assert described(ignored[4:]) == (
+        "simulated:\n  f: a part (z)\n  not simulated: e (ignored), f (ignored)"
+    )
 
 
 def test_the_plan_of_a_plain_fit():
@@ -134,6 +146,82 @@ def test_the_plan_of_a_fit_names_what_asked_for_each_effect():
 def test_the_plan_follows_the_configuration(changes, name, expected):
     (effect,) = [e for e in plan_of_fit(config_of(**changes), rich_dataset()) if e.name == name]
     assert (None if effect.what is None else (effect.what, effect.why)) == expected
+
+
+def test_the_plan_of_a_fit_names_what_its_data_has_and_is_ignored():
+    """Not what is ignored and not there."""
+    ignored = replace(fits.plain_dataset(), ignored=("distortion", "motion", "masks", "depth"))
+    assert described(plan_of_fit(config_of(), ignored)).splitlines()[-1] == (
+        "  not simulated: lens distortion (ignored), motion (ignored), antialiasing, exposure and "
+        "white balance, masks (ignored), depth (ignored), camera refinement"
+    )
+    plain = config_of(
+        loss__depth_weight=0.0, data__ignore_distortion=True, data__ignore_motion=True
+    )
+    assert "ignored" not in described(plan_of_fit(plain, fits.plain_dataset()))
+    assert "depth (ignored)" in described(plan_of_fit(plain, rich_dataset()))
+
+
+def rich_scene(**settings):
+    """The integrator of a scene whose Gaussians have a smoothing filter."""
+    gaussians = tensors(Scene().gaussians) | {"smoothing": mi.Float(np.full(40, 0.01, np.float32))}
+    return mi.load_dict({"type": "splats", **gaussians, **settings})
+
+
+def test_the_plan_of_views_regards_all_of_them():
+    views = rich_dataset().train
+    assert described(plan_of_views(rich_scene(), views[1:])) == (
+        "simulated:\n"
+        "  view dependence: spherical harmonics up to degree 1 (the Gaussians' coefficients)\n"
+        "  background: a constant colour (the integrator's background)\n"
+        "  lens distortion: fisheye (k1) (1 of 5 cameras)\n"
+        "  motion: rolling shutter (1 of 5 cameras)\n"
+        "  antialiasing: 3D smoothing filter (the Gaussians' filter)"
+    )
+
+
+def test_the_plan_of_views_names_what_they_have_and_is_ignored():
+    integrator = rich_scene(ignore="distortion, motion, defocus, smoothing")
+    assert described(plan_of_views(integrator, rich_dataset().train)).splitlines()[-1] == (
+        "  not simulated: lens distortion (ignored), motion (ignored), antialiasing, "
+        "smoothing filter (ignored)"
+    )
+    assert described(plan_of_views(integrator, fits.plain_dataset().train)).splitlines()[-1] == (
+        "  not simulated: lens distortion, motion, antialiasing, smoothing filter (ignored)"
+    )
+
+
+def cameras_of_sensors():
+    """A pinhole; one that is bent and moves; a thin lens; an orthographic one."""
+    to_world = {key: VIEWS[1].sensor()[key] for key in ("to_world", "film", "sampler")}
+    close = {"to_world_close": VIEWS[0].sensor()["to_world"]}
+    thin = {"aperture_radius": 0.1, "focus_distance": 2.0}
+    sensors = [
+        VIEWS[1].sensor(),
+        {"type": "calibrated", **to_world, "lens": "opencv", "k1": 0.1, **close},
+        {"type": "thinlens", **to_world, "fov": 40.0, **thin},
+        {"type": "orthographic", **to_world},
+    ]
+    return [camera_from_sensor(read_sensor(mi.load_dict(sensor), 0.01)) for sensor in sensors]
+
+
+def test_the_plan_of_sensors_regards_all_of_them():
+    cameras = cameras_of_sensors()
+    assert described(plan_of_sensors(rich_scene(), cameras, None)).splitlines()[3:] == [
+        "  lens: Orthographic and RadialTangential (k1) (2 of 4 sensors)",
+        "  depth of field: a thin lens (1 of 4 sensors)",
+        "  motion: blurred (1 of 4 sensors)",
+        "  antialiasing: 3D smoothing filter (the Gaussians' filter)",
+    ]
+    ignoring = rich_scene(ignore="distortion, motion, defocus")
+    assert described(plan_of_sensors(ignoring, cameras, None)).splitlines()[3:] == [
+        "  lens: Orthographic (1 of 4 sensors)",
+        "  antialiasing: 3D smoothing filter (the Gaussians' filter)",
+        "  not simulated: lens (ignored), depth of field (ignored), motion (ignored)",
+    ]
+    assert described(plan_of_sensors(ignoring, cameras[:1], None)).splitlines()[-1] == (
+        "  not simulated: lens, depth of field, motion"
+    )
 
 
 def test_the_plan_of_a_fit_says_what_takes_part_in_it():

@@ -9,6 +9,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+import small_fits as fits
 import yaml
 from small_capture import make_dataset, write_dataset
 from test_trainer import make_trainer
@@ -17,6 +18,7 @@ from drgs import fit, rendering
 from drgs.gaussians import PARAMETER_NAMES
 from drgs.guards import GradientWatch, NonFiniteError, check_values
 from drgs.optimizer import replace_values
+from drgs.trainer import PREFIX, Trainer, view_of
 
 ROW = 17
 
@@ -27,8 +29,6 @@ def variant():
 
 
 def view_name(trainer, iteration):
-    from drgs.trainer import view_of
-
     views = trainer.stages[-1].views
     return views[view_of(iteration, len(views), trainer.config.seed)].name
 
@@ -66,8 +66,6 @@ def poison_gradient(monkeypatch, trainer, name, iteration, value=np.nan, row=ROW
 
 def poison_value(trainer, name, value=np.nan, row=ROW):
     """One component of one row of a parameter is ``value`` from now on."""
-    from drgs.trainer import PREFIX
-
     old = dr.detach(trainer.optimizer[PREFIX + name])
     host = np.array(old)
     host[(row, *(-1,) * (host.ndim - 1))] = value
@@ -124,7 +122,6 @@ def test_first_row_is_named_and_in_it_the_first_parameter(monkeypatch):
 def test_loss_that_is_not_finite_names_iteration_and_view(dssim_weight, gradient):
     """SSIM's gradient tells as well; that of L1 is 0 at a NaN."""
     from drgs.losses import prepare_target
-    from drgs.trainer import view_of
 
     trainer = make_trainer(loss={"dssim_weight": dssim_weight})
     spoilt = view_of(4, 4, seed=0)
@@ -213,6 +210,50 @@ def test_statistics_that_are_not_finite_are_named():
     trainer.statistics = replace(trainer.statistics, gradient_norms=norms)
     with pytest.raises(NonFiniteError, match=f"gradient_norms is nan in row {ROW}$"):
         trainer.state()
+
+
+EFFECTS = {
+    "colors.matrices": {"colors__lr": 2e-3},
+    "cameras.turns": {"cameras__optimise": True},
+    "cameras.moves": {"cameras__optimise": True},
+    "cameras.log_focals": {"cameras__optimise": True, "cameras__focal_lr": 1e-3},
+    "cameras.shifts": {"cameras__optimise": True, "cameras__principal_lr": 1e-3},
+}
+
+
+def poison_effect(trainer, name, index, value, part="value"):
+    """The last number of a view's row, or of that for all views, is ``value`` from now on."""
+    (effect,) = trainer.effects
+    state, key = effect.state(), f"{name.partition('.')[2]}.{part}"
+    state[key] = state[key].copy()
+    rows = len(state[key])
+    state[key][min(index, rows - 1), -1] = value
+    effect.restore(state)
+    return f"in row {index} (view r_{index})" if rows > 1 else "in row 0 (all views)"
+
+
+@pytest.mark.parametrize("part", ["value", "m", "v"])
+@pytest.mark.parametrize("name", EFFECTS)
+def test_what_an_effect_optimises_is_named_where_it_is_not_finite(name, part):
+    """And so are its moments."""
+    trainer = fits.steps(fits.make_trainer(fits.plain_dataset(), **EFFECTS[name]), 2)
+    trainer.check()
+    where = poison_effect(trainer, name, 3, np.inf, part)
+    shown = name if part == "value" else f"{name}.{part}"
+    for act in (Trainer.check, Trainer.state, Trainer.gaussians):
+        with pytest.raises(NonFiniteError) as error:
+            act(trainer)
+        assert str(error.value) == f"after iteration 2: {shown} is inf {where}"
+
+
+@pytest.mark.parametrize("name", EFFECTS)
+def test_an_iteration_that_is_not_finite_names_the_effect_that_made_it_so(name):
+    trainer = fits.steps(fits.make_trainer(fits.plain_dataset(), **EFFECTS[name]), 2)
+    index = view_of(3, len(trainer.views), trainer.config.seed)
+    poison_effect(trainer, name, index, np.nan)
+    trainer.step()
+    with pytest.raises(NonFiniteError, match=f"^iteration 3, view r_{index}: {name} is nan"):
+        trainer.check()
 
 
 def test_check_values_names_the_first_row_of_any_shape():
@@ -316,8 +357,6 @@ def saved(monkeypatch):
 
 def spoil_photograph(monkeypatch, iteration):
     """The photograph that the fit visits first in that iteration is NaN in one pixel."""
-    from drgs.trainer import view_of
-
     spoilt, load = view_of(iteration, 4, seed=0), fit.load_dataset
 
     def load_and_spoil(config):

@@ -3,7 +3,9 @@ from pathlib import Path
 
 import pytest
 
+from drgs.camera_refinement import CAMERAS
 from drgs.checks import UserError
+from drgs.color_correction import COLORS
 from drgs.config import FitConfig, load_config
 from drgs.output import (
     LAST_FILE,
@@ -145,6 +147,14 @@ def test_removing_takes_every_result(tmp_path, config):
     claim_output_folder(tmp_path, config)
     for name in RESULTS:
         (tmp_path / name).write_text("")
+    remove_run(tmp_path)
+    assert os.listdir(tmp_path) == []
+
+
+@pytest.mark.parametrize("name", [CAMERAS, COLORS])
+def test_what_effects_write_is_a_result(tmp_path, config, name):
+    claim_output_folder(tmp_path, config)
+    (tmp_path / name).write_text("")
     remove_run(tmp_path)
     assert os.listdir(tmp_path) == []
 

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import yaml
 from conftest import REPOSITORY
+from scipy.spatial.transform import Rotation
 from small_capture import (
     FIELD_OF_VIEW,
     FOCUS,
@@ -110,6 +111,41 @@ def test_a_ply_is_rendered_under_a_configuration(fit, tmp_path):
         assert (tmp_path / "fit" / name).read_bytes() == (tmp_path / "ply" / name).read_bytes()
 
 
+@pytest.mark.parametrize("optimised", [True, False])
+def test_refined_cameras_beside_the_gaussians_are_used_or_spoken_of(tmp_path, capsys, optimised):
+    """Whether the fit's folder or its PLY file is named, as its configuration says."""
+    dataset = make_dataset(2, 1)
+    write_dataset(tmp_path / "data", dataset)
+    found = tmp_path / "run"
+    write_ply(found / "point_cloud.ply", blobs())
+    config = {"data": {"path": str(tmp_path / "data")}, "cameras": {"optimise": optimised}}
+    (found / "config.yml").write_text(yaml.safe_dump(config))
+    refined = [
+        small_view(v.name, pose_around(0.4 + i, 0.6), None) for i, v in enumerate(dataset.train)
+    ]
+    frames = [
+        {"file_path": v.name, "transform_matrix": (v.camera_to_world * [1, -1, -1, 1]).tolist()}
+        for v in refined
+    ]
+    (found / "cameras.json").write_text(json.dumps({"lens_change": {}, "frames": frames}))
+    for name, what in (
+        ("folder", [found]),
+        ("file", [found / "point_cloud.ply", "--scene", found / "config.yml"]),
+    ):
+        run(*what, "--split", "train", "--out", tmp_path / name)
+        printed = capsys.readouterr().out.splitlines()
+        said = [line for line in printed if "cameras.json" in line]
+        assert said == [
+            f"cameras: as refined, from {found / 'cameras.json'}"
+            if optimised
+            else f"cameras: as the dataset has them; those of {found / 'cameras.json'} are used "
+            "with --set cameras.optimise=true"
+        ]
+        for view, moved in zip(dataset.train, refined, strict=True):
+            seen_from = moved if optimised else view
+            assert_shows(tmp_path / name / f"{view.name}.png", seen_from, WHITE)
+
+
 def test_a_background_is_behind_splats_and_photographs(fit, tmp_path):
     background = (0.0, 0.5, 0.25)
     run(fit, "--background", *background, "--out", tmp_path)
@@ -117,6 +153,20 @@ def test_a_background_is_behind_splats_and_photographs(fit, tmp_path):
     score = decibels(expected, photo(fit, "r_1", background))
     metrics = json.loads((tmp_path / "metrics.json").read_text())
     assert metrics["views"]["r_1"]["psnr"] == pytest.approx(score, abs=1e-3)
+
+
+def test_depths_are_not_opened(tmp_path):
+    """There are none: nothing that is rendered looks at them."""
+    write_dataset(tmp_path / "data", make_dataset(1, 1))
+    for split in ("train", "test"):
+        path = tmp_path / "data" / f"transforms_{split}.json"
+        values = json.loads(path.read_text())
+        values["frames"][0]["depth_file_path"] = "nowhere.png"
+        path.write_text(json.dumps(values))
+    write_ply(tmp_path / "blobs.ply", blobs())
+    (tmp_path / "a.yml").write_text(yaml.safe_dump({"data": {"path": "data"}}))
+    run(tmp_path / "blobs.ply", "--scene", tmp_path / "a.yml", "--out", tmp_path / "out")
+    assert (tmp_path / "out" / "r_0.png").is_file()
 
 
 def test_values_of_the_configuration_can_be_set(fit, tmp_path):
@@ -160,6 +210,84 @@ def test_cameras_of_a_transforms_file_give_the_pictures_of_the_split(fit, tmp_pa
     for index in range(4):
         expected = (tmp_path / "split" / f"r_{index}.png").read_bytes()
         assert (tmp_path / "cameras" / f"camera_{index}.png").read_bytes() == expected
+
+
+def write_camera(path, begin, end=None, **says):
+    """Of the small size, in the layout of transforms.json; end: its second pose."""
+    frame = {"transform_matrix": (begin * [1, -1, -1, 1]).tolist(), **says}
+    if end is not None:
+        frame["transform_matrix_close"] = (end * [1, -1, -1, 1]).tolist()
+    values = {"camera_angle_x": FIELD_OF_VIEW, "w": WIDTH, "h": HEIGHT, "frames": [frame]}
+    path.write_text(json.dumps(values))
+    return path
+
+
+@pytest.mark.parametrize("samples", [None, 3])
+def test_a_camera_of_a_file_that_moves_is_seen_moving(fit, tmp_path, samples):
+    """A global shutter that closes where it opened shows what one that stands still does."""
+    begin, end = (pose_around(azimuth, 0.3) for azimuth in (0.8, 0.9))
+    end[:3, 3] += 0.4 * end[:3, 0]
+    settings = ["--set", f"data.shutter_samples={samples}"] if samples else []
+    for name, close, shutter in (
+        ("still", None, "global"),
+        ("same", begin, "global"),
+        ("global", end, "global"),
+        ("rolling", end, "rolling"),
+    ):
+        camera = write_camera(tmp_path / f"{name}.json", begin, close, shutter=shutter)
+        run(fit, "--camera", camera, *settings, "--out", tmp_path / name)
+    shown = {path.parent.name: picture(path) for path in tmp_path.glob("*/camera_0.png")}
+    # The average of equal pictures, rounded to 8 bits.
+    assert np.abs(shown["same"] - shown["still"]).max() <= 1 / 255 + 1e-9
+    for name in ("global", "rolling"):
+        assert np.abs(shown[name] - shown["still"]).max() > 0.1
+    assert np.abs(shown["global"] - shown["rolling"]).max() > 0.05
+    # In the middle of equal times, each by the reference.
+    count = samples or 8
+    times = [(k + 0.5) / count for k in range(count)]
+    cameras = [small_view("", between(begin, end, time), None) for time in times]
+    parts = [photograph(blobs(), camera, WHITE) for camera in cameras]
+    clear = ~np.any([part.near_threshold for part in parts], axis=0)
+    expected = np.clip(np.mean([part.image for part in parts], axis=0), 0, 1)
+    assert clear.mean() > 0.8
+    assert np.abs(shown["global"] - expected)[clear].max() <= EIGHT_BITS
+
+
+@pytest.mark.parametrize("ignored", [(), ("distortion", "motion")])
+def test_the_plan_regards_all_cameras_and_names_what_is_ignored(fit, tmp_path, capsys, ignored):
+    """Of a file and of a Mitsuba scene, the first of which is a plain one."""
+    path = write_camera(tmp_path / "c.json", pose_around(0.8, 0.3))
+    values = json.loads(path.read_text())
+    close = {"transform_matrix_close": values["frames"][0]["transform_matrix"]}
+    values["frames"].append({**values["frames"][0], **close, "k1": 0.1})
+    path.write_text(json.dumps(values))
+    ignore = ["--ignore", *ignored] if ignored else []
+    run(fit, "--camera", path, *ignore, "--out", tmp_path / "file")
+    of_file = capsys.readouterr().out
+    bent = sensor(pose_around(2.0, 0.3)).replace("perspective", "calibrated")
+    lens = '<string name="lens" value="opencv"/><float name="k1" value="0.1"/>'
+    bent = bent.replace("<film", f"{lens}<film")
+    bent = bent.replace(f'<float name="fov" value="{np.degrees(FIELD_OF_VIEW)}"/>', "")
+    settings = f'<string name="ignore" value="{", ".join(ignored)}"/>'
+    scene = write_scene(tmp_path, sensor(pose_around(0.8, 0.3)), bent, settings=settings)
+    run(scene, "--out", tmp_path / "scene")
+    of_scene = capsys.readouterr().out
+    if ignored:
+        assert "  not simulated: lens distortion (ignored), motion (ignored), anti" in of_file
+        assert "  not simulated: lens (ignored), depth of field, motion, anti" in of_scene
+    else:
+        assert "  lens distortion: opencv (k1) (1 of 2 cameras)\n" in of_file
+        assert "  motion: global shutter (1 of 2 cameras)\n" in of_file
+        assert "  lens: RadialTangential (k1) (1 of 2 sensors)\n" in of_scene
+
+
+def between(begin, end, time):
+    """The pose at a time: the centre on a line, turning at a constant rate."""
+    turn = Rotation.from_matrix(end[:3, :3] @ begin[:3, :3].T).as_rotvec()
+    pose = np.eye(4)
+    pose[:3, :3] = Rotation.from_rotvec(time * turn).as_matrix() @ begin[:3, :3]
+    pose[:3, 3] = (1 - time) * begin[:3, 3] + time * end[:3, 3]
+    return pose
 
 
 def test_a_camera_placed_by_hand_is_that_camera(fit, tmp_path):
@@ -311,6 +439,33 @@ def test_user_errors_are_one_line_and_write_nothing(
 ):
     assert message in fails(capsys, fit / what, *arguments, "--out", tmp_path / "out")
     assert not (tmp_path / "out").exists()
+
+
+EXACT = ["--set", "model.projection=exact"]
+
+
+@pytest.mark.parametrize("mode", ["--camera", "--split"])
+def test_the_exact_projection_of_a_bent_lens_is_refused(tmp_path, capsys, mode):
+    """With status 2, before anything is written; without the distortion it is rendered."""
+    write_dataset(tmp_path / "data", make_dataset(1, 1))
+    write_ply(tmp_path / "blobs.ply", blobs())
+    (tmp_path / "a.yml").write_text(yaml.safe_dump({"data": {"path": "data"}}))
+    path = tmp_path / "data" / "transforms_test.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"k1": 0.1}))
+    arguments = [tmp_path / "blobs.ply", "--scene", tmp_path / "a.yml", *EXACT]
+    if mode == "--split":
+        arguments += ["--split", "test"]
+    else:
+        arguments += ["--camera", path, "--size", WIDTH, HEIGHT]
+    message = fails(capsys, *arguments, "--out", tmp_path / "out")
+    assert message.startswith(
+        "model.projection must be ewa or unscented for lenses that are no pinholes, such as that "
+        f"of view {'r_0' if mode == '--split' else 'camera_0'} (opencv: k1), got exact; or "
+        "give --ignore distortion"
+    )
+    assert not (tmp_path / "out").exists()
+    run(*arguments, "--ignore", "distortion", "--out", tmp_path / "out")
+    assert list((tmp_path / "out").glob("*.png"))
 
 
 def test_the_folder_of_a_fit_is_not_overwritten(fit, capsys):

@@ -14,10 +14,10 @@ from views import image_of, pose, splats_before
 
 from drgs import reference
 from drgs.bench.scenes import bench_gaussians
-from drgs.camera import Pinhole
+from drgs.camera import Pinhole, camera_from_sensor, cameras_in_time, read_sensor
 from drgs.choices import Choices
-from drgs.config import ModelConfig
-from drgs.data.types import View
+from drgs.config import DataConfig, ModelConfig
+from drgs.data.types import Motion, View
 from drgs.gaussians import PARAMETER_NAMES, Gaussians
 from drgs.lenses import Fisheye, RadialTangential
 from drgs.scene import SQUARE_PIXEL_TOLERANCE, make_scene, make_sensors
@@ -60,6 +60,19 @@ def make_gaussians(view, count=40, degree=2, seed=0):
 # ----------------------------------------------------------------------------------------------
 # Sensors
 # ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("samples", [None, 3])
+def test_a_moving_views_sensor_blurs_with_as_many_times(samples):
+    """Of those of the configuration; by default as many as the sensor's own default."""
+    data = DataConfig(path=".", **({} if samples is None else {"shutter_samples": samples}))
+    view = make_view()
+    view = replace(view, motion=Motion(view.camera_to_world, "global", data.shutter_samples))
+    (sensor,) = make_sensors([view])
+    expected = mi.load_dict({"type": "calibrated"}).shutter_samples if samples is None else samples
+    assert sensor.shutter_samples == expected
+    state = read_sensor(sensor, 0.0)
+    assert len(cameras_in_time(camera_from_sensor(state))) == expected
 
 
 @pytest.mark.parametrize(

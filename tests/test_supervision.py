@@ -310,6 +310,51 @@ def test_a_view_whose_depths_are_all_unknown_has_no_penalty():
     assert list(effect.penalties(trainer.views[0])) == []
 
 
+def masked_depth_dataset(spoiled=True):
+    """Masks in all views but the first; where they leave pixels out, depths are wrong."""
+    views = []
+    for index, view in enumerate(depth_dataset().train):
+        depth, mask = view.depth, mask_of(index)
+        if spoiled and index:
+            depth = np.where(mask > 0, depth, 77).astype(np.float32)
+        views.append(replace(view, depth=depth, mask=mask if index else None))
+    return replace(depth_dataset(), train=tuple(views))
+
+
+def test_the_penalty_is_that_of_the_pixels_that_a_mask_keeps():
+    dataset = masked_depth_dataset()
+    trainer = depth_trainer(dataset)
+    effect = next(e for e in trainer.effects if e.name == "depth")
+    for index in (0, 4):
+        view, photo = trainer.views[index], dataset.train[index]
+        image = rendered(trainer, view)
+        channels = np.array(image).astype(np.float64)
+        effect.adjust(image, view)
+        (penalty,) = effect.penalties(view)
+        kept = photo if index == 0 else replace(photo, depth=photo.depth * mask_of(index))
+        known = kept.depth > 0
+        expected = penalty_in_numpy(channels[..., 3], channels[..., 4], kept, dataset.extent)
+        assert float(penalty[0]) == pytest.approx(expected, rel=10 * VALUE)
+        assert known.any() and (index == 0 or known.sum() < (photo.depth > 0).sum())
+
+
+def test_depths_that_a_mask_leaves_out_do_not_matter_to_a_fit():
+    """To the last bit, whatever they say."""
+    states = [
+        fits.everything_of(fits.steps(depth_trainer(masked_depth_dataset(spoiled)), 6))
+        for spoiled in (False, True)
+    ]
+    assert states[0] == states[1]
+
+
+def test_a_view_whose_mask_leaves_out_all_known_depths_has_no_penalty():
+    dataset = depth_dataset()
+    first = replace(dataset.train[0], mask=(dataset.train[0].depth == 0).astype(np.float32))
+    trainer = depth_trainer(replace(dataset, train=(first, *dataset.train[1:])))
+    assert trainer.views[0].uploads["depth"] is None
+    assert trainer.views[1].uploads["depth"] is not None
+
+
 def test_depth_supervision_puts_blobs_at_their_depths():
     """From few views that are close to each other, where colours say little about depth."""
     errors = {}

@@ -194,3 +194,33 @@ def test_errors_name_the_file_and_the_key(tmp_path, top, size, message):
     with pytest.raises(UserError, match=message) as error:
         read_viewpoints(path, size)
     assert str(path) in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("place", "says", "shutter"),
+    [
+        ("top", {}, "global"),
+        ("top", {"shutter": "rolling"}, "rolling"),
+        ("frame", {"shutter": "rolling"}, "rolling"),
+    ],
+)
+def test_cameras_of_a_file_move_as_its_frames_say(tmp_path, place, says, shutter):
+    close = pose_around(0.4, 0.25)
+    frame = {"transform_matrix_close": (close * [1, -1, -1, 1]).tolist()}
+    top = {"camera_angle_x": 0.7}
+    (top if place == "top" else frame).update(says)
+    path = write_cameras(tmp_path / "c.json", top, {}, frame)
+    still, moving = read_viewpoints(path, (64, 48))
+    assert still.motion is None
+    assert moving.motion.close_to_world == pytest.approx(close, abs=1e-12)
+    assert moving.motion.shutter == shutter
+
+
+def test_wrong_motion_of_a_camera_is_refused_with_the_key(tmp_path):
+    frame = {"transform_matrix_close": np.eye(4).tolist(), "shutter": "curtain"}
+    path = write_cameras(tmp_path / "c.json", {"camera_angle_x": 0.7}, {}, frame)
+    with pytest.raises(UserError) as error:
+        read_viewpoints(path, (8, 8))
+    assert str(error.value) == (
+        f"{path}: frames[1].shutter must be one of global, rolling, got curtain"
+    )

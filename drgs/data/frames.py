@@ -16,6 +16,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from drgs.checks import UserError, one_line
+from drgs.data.types import Motion
 from drgs.files import read_text
 
 MAX_BYTES = 1 << 28
@@ -41,6 +42,13 @@ PINHOLE_MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENC
 """Values of ``camera_model`` that are a pinhole camera apart from their distortion."""
 
 FISHEYE_MODELS = ("SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "OPENCV_FISHEYE")
+
+CLOSE = "transform_matrix_close"
+"""Of a frame: where its camera was when the shutter closed, as ``transform_matrix`` is where it was
+when the shutter opened."""
+
+SHUTTERS = ("global", "rolling")
+"""Values of ``shutter``: all pixels see the whole motion, or the rows one time after the other."""
 
 T = TypeVar("T")
 
@@ -152,12 +160,13 @@ def opencv_camera_to_world(
     return matrix
 
 
-class FrameValues:
-    """The values of a frame, and where they are for messages."""
+class InheritedValues:
+    """The values of a frame, where what it does not have is the file's; and where they are."""
 
-    def __init__(self, values: dict[str, Any], where: str) -> None:
-        """where: the prefix of a key."""
-        self.values, self.where = values, where
+    def __init__(self, own: dict[str, Any], where: str, meta: dict[str, Any], path: Path) -> None:
+        """own, meta: the frame's values and the file's; where: the prefix of a frame's key."""
+        self.values, self.where = meta | own, where
+        self.own, self.meta, self.top = own, meta, f"{path}: "
 
     def __contains__(self, key: str) -> bool:
         return key in self.values
@@ -168,23 +177,10 @@ class FrameValues:
 
     def at(self, key: str) -> tuple[dict[str, Any], str, str]:
         """The object that holds ``key``, the key, and the prefix that messages name it with."""
-        return self.values, key, self.where
-
-
-class InheritedValues(FrameValues):
-    """The same; what a frame does not have is the file's."""
-
-    def __init__(self, own: dict[str, Any], where: str, meta: dict[str, Any], path: Path) -> None:
-        """own, meta: the frame's values and the file's."""
-        super().__init__(meta | own, where)
-        self.own, self.meta, self.top = own, meta, f"{path}: "
-
-    def at(self, key: str) -> tuple[dict[str, Any], str, str]:
-        """See :meth:`FrameValues.at`."""
         return (self.own, key, self.where) if key in self.own else (self.meta, key, self.top)
 
 
-def lens_of(frame: FrameValues) -> Any:
+def lens_of(frame: InheritedValues) -> Any:
     """The lens that a frame names, with its coefficients; None for a pinhole.
 
     ``camera_model`` as nerfstudio writes it, ``is_fisheye`` as instant-ngp does.
@@ -211,10 +207,27 @@ def lens_of(frame: FrameValues) -> Any:
     return kind.of(**coefficients)
 
 
-def distortion_of(frame: FrameValues) -> dict[str, float]:
+def distortion_of(frame: InheritedValues) -> dict[str, float]:
     """The coefficients that are not zero."""
     given = {key: number(*frame.at(key)) for key in DISTORTION if key in frame}
     return {key: value for key, value in given.items() if value != 0}
+
+
+def motion_of(frame: InheritedValues, samples: int) -> Motion | None:
+    """Of a frame that says where its camera was when the shutter closed.
+
+    samples: times at which what a global shutter blurs is rendered.
+    """
+    if CLOSE not in frame.own:
+        return None
+    shutter = frame.get("shutter", SHUTTERS[0])
+    if shutter not in SHUTTERS:
+        raise UserError(
+            f"{frame.at('shutter')[2]}shutter must be one of {', '.join(SHUTTERS)}, got "
+            f"{one_line(shutter)}"
+        )
+    close_to_world = opencv_camera_to_world(frame.own, frame.where, CLOSE)
+    return Motion(close_to_world, shutter, samples)
 
 
 def image_path(folder: Path, frame: dict[str, Any], where: str, key: str = "file_path") -> Path:

@@ -40,6 +40,8 @@ def read_image(path: Path) -> np.ndarray:
             )
         if image.mode == "P":
             image = image.convert("RGBA" if "transparency" in image.info else "RGB")
+        elif image.mode == "1":
+            image = image.convert("L")
         if image.mode not in MODES:
             raise UserError(
                 f"{path}: must be a grey, RGB or RGBA image of 8 or 16 bits, got one of Pillow's "
@@ -64,14 +66,16 @@ def read_mask(path: Path, size: tuple[int, int]) -> np.ndarray:
 def read_depth(path: Path, unit: float, size: tuple[int, int]) -> np.ndarray:
     """(H, W) float32, scene units, 0 where not known.
 
-    unit: scene units in one step of a 16 bit picture; an ``.npy`` file holds scene units. size: W,
-    H. What is not finite or not positive is not known.
+    unit: scene units that a number of the ``.npy`` file, or a step of the 16 bit picture, counts;
+    size: W, H. What is not finite or not positive is not known.
     """
     if path.suffix == ".npy":
         try:
-            depth = np.load(path, allow_pickle=False).astype(np.float32)
+            depth = np.load(path, allow_pickle=False).astype(np.float64)
         except (OSError, ValueError, EOFError) as error:
             raise UserError(f"{path}: cannot read the depth: {one_line(error)}") from None
+        with np.errstate(over="ignore"):  # becomes infinite, and so is not known
+            depth = (depth * unit).astype(np.float32)
         depth = depth.squeeze(-1) if depth.ndim == 3 and depth.shape[2] == 1 else depth
         if depth.ndim != 2:
             raise UserError(f"{path}: depth must be (height, width), got shape {depth.shape}")
@@ -96,7 +100,7 @@ def _check_size(path: Path, image: np.ndarray, size: tuple[int, int]) -> None:
     if (width, height) != size:
         raise UserError(
             f"{path}: must be {size[0]} x {size[1]} px, as the photograph is, got {width} x "
-            f"{height}; resize it, or leave it out of the frame in transforms.json"
+            f"{height}; resize it, or leave it out of the frame"
         )
 
 

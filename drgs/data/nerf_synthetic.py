@@ -4,6 +4,8 @@ Mildenhall et al. 2020. Pinhole cameras with the principal point in the middle a
 field of view, ``camera_angle_x``, for all; images of one size in a split, with straight alpha. A
 picture without alpha is refused: what it shows behind the object would be fitted as part of it.
 Opaque photographs belong into the nerfstudio layout.
+
+Frames may have a lens, a second pose, a mask and depths, as there: see ``drgs.data.extras``.
 """
 
 from __future__ import annotations
@@ -15,7 +17,9 @@ import numpy as np
 
 from drgs.checks import UserError
 from drgs.config import DataConfig
+from drgs.data.extras import extras_of, ignored, notes
 from drgs.data.frames import (
+    InheritedValues,
     focal_from_angle,
     image_path,
     in_parallel,
@@ -38,7 +42,9 @@ def load(config: DataConfig) -> Dataset:
     ``val``.
     """
     test_split = _test_split(config)
-    train, test = (_load_split(config, split) for split in ("train", test_split))
+    frames = {split: _frames(config, split) for split in ("train", test_split)}
+    train, test = (_load_split(config, split, frames[split]) for split in ("train", test_split))
+    all_frames = [frame for of_split in frames.values() for frame in of_split]
     width, height = train[0].width, train[0].height
     return Dataset(
         train=train,
@@ -49,8 +55,9 @@ def load(config: DataConfig) -> Dataset:
         description=(
             f"{config.path.name} (NeRF-synthetic layout): {len(train)} train views, measured on "
             f"{len(test)} views of split {test_split}, {width}x{height}, "
-            f"background {config.background}"
+            f"background {config.background}" + notes(config, all_frames)
         ),
+        ignored=ignored(config, all_frames),
     )
 
 
@@ -70,20 +77,22 @@ def _transforms_path(folder: Path, split: str) -> Path:
     return folder / f"transforms_{split}.json"
 
 
-def _load_split(config: DataConfig, split: str) -> tuple[View, ...]:
+def _frames(config: DataConfig, split: str) -> list[InheritedValues]:
     path = _transforms_path(config.path, split)
     meta = read_transforms(path)
-
-    frames = meta["frames"]
-    locations = [f"{path}: frames[{index}]." for index in range(len(frames))]
-    files = [
-        image_path(config.path, frame, at) for frame, at in zip(frames, locations, strict=True)
+    return [
+        InheritedValues(own, f"{path}: frames[{index}].", meta, path)
+        for index, own in enumerate(meta["frames"])
     ]
 
+
+def _load_split(config: DataConfig, split: str, frames: list[InheritedValues]) -> tuple[View, ...]:
+    files = [image_path(config.path, frame.own, frame.where) for frame in frames]
     size = image_size(files[0])
 
     def load_view(index: int, name: str) -> View:
-        camera_to_world = opencv_camera_to_world(frames[index], locations[index])
+        frame = frames[index]
+        camera_to_world = opencv_camera_to_world(frame.own, frame.where)
         rgba = read_image(files[index])
         _check_promises(rgba, size, files[index], files[0])
         image = downscale(composite(rgba, config.background_rgb), config.image_size)
@@ -91,7 +100,7 @@ def _load_split(config: DataConfig, split: str) -> tuple[View, ...]:
         alpha = downscale(rgba[:, :, 3], config.image_size) if split == "train" else None
         height, width = image.shape[:2]
         # The angle spans the full width, so the focal length in pixels follows the image's size.
-        focal = focal_from_angle(meta, "camera_angle_x", f"{path}: ", width)
+        focal = focal_from_angle(frame.meta, "camera_angle_x", frame.top, width)
         return View(
             name=name,
             image=image,
@@ -103,9 +112,11 @@ def _load_split(config: DataConfig, split: str) -> tuple[View, ...]:
             width=width,
             height=height,
             alpha=alpha,
+            **extras_of(config, frame, size),
         )
 
-    return in_parallel(load_view, range(len(frames)), unique_names(frames))
+    names = unique_names([frame.own for frame in frames])
+    return in_parallel(load_view, range(len(frames)), names)
 
 
 def _check_promises(image: np.ndarray, size: tuple[int, int], file: Path, first: Path) -> None:

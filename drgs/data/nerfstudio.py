@@ -4,53 +4,30 @@ Intrinsics (``fl_x, fl_y, cx, cy, w, h``) stand at the top or, overriding that, 
 focal lengths are missing, ``camera_angle_x`` (and ``_y``) give them. Views are sorted by file
 name, and every ``data.test_every``-th is for testing, as in Mip-NeRF 360 and 3DGS.
 
-Frames may name a mask (``mask_path``, black where pixels do not count), a picture of depths
-(``depth_file_path``), and a second pose (:data:`CLOSE`, with ``shutter``).
+Frames may have a lens, a second pose, a mask and depths: see ``drgs.data.extras``.
 """
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
-import numpy as np
-
-from drgs.checks import UserError, one_line
+from drgs.checks import UserError
 from drgs.config import DataConfig
+from drgs.data.extras import extras_of, ignored, notes
 from drgs.data.frames import (
     InheritedValues,
     focal_from_angle,
     focal_length,
     image_path,
     in_parallel,
-    lens_of,
     opencv_camera_to_world,
     positive,
     principal_point,
     read_transforms,
     unique_names,
 )
-from drgs.data.images import (
-    composite,
-    downscale,
-    downscale_depth,
-    downscale_mask,
-    read_depth,
-    read_image,
-    read_mask,
-)
-from drgs.data.types import Dataset, Motion, View
-
-CLOSE = "transform_matrix_close"
-"""Of a frame: where its camera was when the shutter closed, as ``transform_matrix`` is where it was
-when the shutter opened."""
-
-SHUTTERS = ("global", "rolling")
-"""Values of ``shutter``: all pixels see the whole motion, or the rows one time after the other."""
-
-DEPTH_UNIT = 1e-3
-"""Scene units in a step of a depth picture, unless ``depth_unit_scale_factor`` says otherwise: as
-nerfstudio has it."""
+from drgs.data.images import composite, downscale, read_image
+from drgs.data.types import Dataset, View
 
 
 def load(config: DataConfig) -> Dataset:
@@ -69,7 +46,6 @@ def load(config: DataConfig) -> Dataset:
         for index, own in enumerate(meta["frames"])
     ]
     files = [image_path(config.path, frame.own, frame.where) for frame in frames]
-    lenses = [lens_of(frame) for frame in frames]
 
     def load_view(index: int, name: str) -> View:
         return _load_view(config, frames[index], files[index], name)
@@ -89,8 +65,9 @@ def load(config: DataConfig) -> Dataset:
             f"{config.path.name} (nerfstudio layout): {len(train)} train views, measured on "
             f"{len(test)} views (every {config.test_every}th by file name), "
             f"{views[0].width}x{views[0].height}, background {config.background}"
-            + _notes(config, frames, lenses)
+            + notes(config, frames)
         ),
+        ignored=ignored(config, frames),
     )
 
 
@@ -114,7 +91,6 @@ def _load_view(config: DataConfig, frame: InheritedValues, file: Path, name: str
     image = downscale(image, max_width)
     scale_x, scale_y = image.shape[1] / width, image.shape[0] / height
     alpha = downscale(pixels[:, :, 3], max_width) if pixels.shape[2] == 4 else None
-    mask, depth = _mask(config, frame, (width, height)), _depth(config, frame, (width, height))
     return View(
         name=name,
         image=image,
@@ -125,41 +101,9 @@ def _load_view(config: DataConfig, frame: InheritedValues, file: Path, name: str
         cy=cy * scale_y,
         width=image.shape[1],
         height=image.shape[0],
-        lens=None if config.ignore_distortion else lens_of(frame),
-        motion=None if config.ignore_motion else _motion(frame),
         alpha=alpha,
-        mask=None if mask is None else downscale_mask(mask, max_width),
-        depth=None if depth is None else downscale_depth(depth, max_width),
+        **extras_of(config, frame, (width, height)),
     )
-
-
-def _mask(config: DataConfig, frame: InheritedValues, size: tuple[int, int]) -> np.ndarray | None:
-    if "mask_path" not in frame or config.ignore_masks:
-        return None
-    return read_mask(image_path(config.path, frame.own, frame.where, "mask_path"), size)
-
-
-def _depth(config: DataConfig, frame: InheritedValues, size: tuple[int, int]) -> np.ndarray | None:
-    if "depth_file_path" not in frame:
-        return None
-    unit = DEPTH_UNIT
-    if "depth_unit_scale_factor" in frame:
-        unit = positive(*frame.at("depth_unit_scale_factor"))
-    file = image_path(config.path, frame.own, frame.where, "depth_file_path")
-    return read_depth(file, unit, size)
-
-
-def _motion(frame: InheritedValues) -> Motion | None:
-    """Of a frame that says where its camera was when the shutter closed."""
-    if CLOSE not in frame.own:
-        return None
-    shutter = frame.get("shutter", SHUTTERS[0])
-    if shutter not in SHUTTERS:
-        raise UserError(
-            f"{frame.at('shutter')[2]}shutter must be one of {', '.join(SHUTTERS)}, got "
-            f"{one_line(shutter)}"
-        )
-    return Motion(opencv_camera_to_world(frame.own, frame.where, CLOSE), shutter)
 
 
 def _focal(frame: InheritedValues, axis: str, size: int) -> float:
@@ -168,17 +112,3 @@ def _focal(frame: InheritedValues, axis: str, size: int) -> float:
     if f"camera_angle_{axis}" in frame:
         return focal_from_angle(*frame.at(f"camera_angle_{axis}"), size)
     raise UserError(f"{frame.top}fl_{axis} is missing, and there is no camera_angle_{axis} either")
-
-
-def _notes(config: DataConfig, frames: list[InheritedValues], lenses: list[Any]) -> str:
-    """What the dataset has besides pinhole cameras, and what is left out, for the description."""
-    notes = ""
-    found = {f"{lens.kind} ({', '.join(lens.named())})" for lens in lenses if lens is not None}
-    if found:
-        ignored = " ignored" if config.ignore_distortion else ""
-        notes += f"; lens {' and '.join(sorted(found))}{ignored}"
-    if config.ignore_masks and any("mask_path" in frame for frame in frames):
-        notes += "; masks (mask_path) ignored"
-    if config.ignore_motion and any(CLOSE in frame for frame in frames):
-        notes += f"; motion ({CLOSE}) ignored"
-    return notes

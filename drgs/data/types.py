@@ -7,6 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from drgs.constants import SHUTTER_SAMPLES
+
 
 @dataclass(frozen=True, eq=False)
 class Motion:
@@ -14,6 +16,7 @@ class Motion:
 
     close_to_world: np.ndarray  # (4, 4) float64, OpenCV axes: where the camera was in the end
     shutter: str  # global: all pixels were open all the time; rolling: row after row
+    samples: int = SHUTTER_SAMPLES  # global: times at which the picture is rendered
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,6 +59,7 @@ class Dataset:
     background: tuple[float, float, float]  # display space, what the images were composited over
     start_half_extent: float | None  # of the layout's own start box [-h, h]^3; None: it has none
     description: str  # one line: what was read, and what was assumed
+    ignored: tuple[str, ...] = ()  # that frames have and the configuration leaves out: see extras
 
     def without_training_images(self) -> Dataset:
         """The same, but that the pictures of the training views are empty: frees their memory.

@@ -1,0 +1,109 @@
+"""What a frame may have besides a photograph by a pinhole camera that stands still.
+
+A lens, and a second pose (``drgs.data.frames``); a mask, and depths. ``mask_path`` names a picture
+that is black where pixels do not count. ``depth_file_path`` names a picture of 16 bits or an
+``.npy`` file; ``depth_unit_scale_factor`` is how many scene units its numbers count. But for the
+pose, what stands at the top of the file is every frame's that has none of its own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from drgs.checks import UserError
+from drgs.config import DataConfig
+from drgs.data.frames import CLOSE, InheritedValues, image_path, lens_of, motion_of, positive
+from drgs.data.images import downscale_depth, downscale_mask, read_depth, read_mask
+
+MASK, DEPTH, UNIT = "mask_path", "depth_file_path", "depth_unit_scale_factor"
+
+PICTURE_UNIT = 1e-3
+"""Scene units in a step of a depth picture, unless :data:`UNIT` says otherwise: as nerfstudio has
+it. An ``.npy`` file then holds scene units, which it has numbers for."""
+
+
+def extras_of(config: DataConfig, frame: InheritedValues, size: tuple[int, int]) -> dict[str, Any]:
+    """``lens``, ``motion``, ``mask`` and ``depth`` of a :class:`drgs.data.types.View`.
+
+    size: of the photograph, W, H, before it is scaled. What the configuration ignores is not
+    looked at.
+    """
+    return {
+        "lens": None if config.ignore_distortion else lens_of(frame),
+        "motion": None if config.ignore_motion else motion_of(frame, config.shutter_samples),
+        "mask": None if config.ignore_masks else _mask(config, frame, size),
+        "depth": None if config.ignore_depth else _depth(config, frame, size),
+    }
+
+
+def _mask(config: DataConfig, frame: InheritedValues, size: tuple[int, int]) -> np.ndarray | None:
+    """(H, W) of 1 and 0, at the width that is configured."""
+    if MASK not in frame:
+        return None
+    file = _file(config, frame, MASK)
+    mask = read_mask(file, size)
+    smaller = downscale_mask(mask, config.image_size)
+    if not smaller.any():  # its PSNR is the mean of nothing
+        size_too_small = f" at data.image_size {config.image_size}; set a larger one,"
+        raise UserError(
+            f"{file}: must leave pixels that count (brighter than half), got a mask without any"
+            f"{size_too_small if mask.any() else ';'} remove the view from its file, or set "
+            "data.ignore_masks"
+        )
+    return smaller
+
+
+def _depth(config: DataConfig, frame: InheritedValues, size: tuple[int, int]) -> np.ndarray | None:
+    """(H, W), scene units, 0 where not known, at the width that is configured."""
+    if DEPTH not in frame:
+        return None
+    depth = read_depth(_file(config, frame, DEPTH), _unit(frame), size)
+    return downscale_depth(depth, config.image_size)
+
+
+def _file(config: DataConfig, frame: InheritedValues, key: str) -> Path:
+    values, key, where = frame.at(key)
+    return image_path(config.path, values, where, key)
+
+
+def _unit(frame: InheritedValues) -> float:
+    """Scene units that a number of the file of depths counts."""
+    if UNIT in frame:
+        return positive(*frame.at(UNIT))
+    return 1.0 if str(frame.get(DEPTH)).endswith(".npy") else PICTURE_UNIT
+
+
+def ignored(config: DataConfig, frames: Sequence[InheritedValues]) -> tuple[str, ...]:
+    """What some frame has and the configuration leaves out.
+
+    ``distortion``, ``motion``, ``masks``, ``depth``: see ``data.ignore_*``.
+    """
+    found = {
+        "distortion": config.ignore_distortion and any(lens_of(frame) for frame in frames),
+        "motion": config.ignore_motion and any(CLOSE in frame.own for frame in frames),
+        "masks": config.ignore_masks and any(MASK in frame for frame in frames),
+        "depth": config.ignore_depth and any(DEPTH in frame for frame in frames),
+    }
+    return tuple(name for name, is_ignored in found.items() if is_ignored)
+
+
+def notes(config: DataConfig, frames: Sequence[InheritedValues]) -> str:
+    """What frames have of it, and what is left out, for a dataset's description."""
+    left_out, text = ignored(config, frames), ""
+    lenses = filter(None, map(lens_of, frames))
+    if found := sorted({f"{lens.kind} ({', '.join(lens.named())})" for lens in lenses}):
+        text += f"; lens {' and '.join(found)}"
+        text += " ignored" if "distortion" in left_out else ""
+    if "masks" in left_out:
+        text += f"; masks ({MASK}) ignored"
+    if "depth" in left_out:
+        text += f"; depth ({DEPTH}) ignored"
+    elif units := sorted({_unit(frame) for frame in frames if DEPTH in frame}):
+        text += f"; depth in units of {' and '.join(f'{unit:g}' for unit in units)}"
+    if "motion" in left_out:
+        text += f"; motion ({CLOSE}) ignored"
+    return text
