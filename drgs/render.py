@@ -28,7 +28,7 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
-from drgs.camera import IGNORABLE, camera_from_sensor, read_sensor
+from drgs.camera import IGNORABLE
 from drgs.checks import UserError, exit_on_user_error
 from drgs.config import NAMED_COLORS, DataConfig, FitConfig, ModelConfig, load_config
 from drgs.constants import SHUTTER_SAMPLES
