@@ -51,6 +51,9 @@ by the eighth power of (step / distance to the nearest pole), and by rounding / 
 CENTRAL_WEIGHTS = (4 / 5, -1 / 5, 4 / 105, -1 / 280)
 """Central differences of order 8: f'(x) h = sum_j w_j (f(x + j h) - f(x - j h)), j = 1 to 4."""
 
+LEAST_CUT = 2.0**-60
+"""An alpha that changes no sum: the cut of splats however dim they are out of focus."""
+
 SMOOTHING_VARIANCE = 0.2
 """px^2: variance of the 3D smoothing filter at the largest sampling rate (Mip-Splatting's s)."""
 
@@ -356,7 +359,9 @@ def project(
 
     defocus: R (N, 2) px are its ``blur_radii``; the variance of a uniform disc of radius R along
     an axis is R^2 / 4. Opacities are multiplied by sqrt(det(cov2d without R) / det(cov2d)), so
-    that the integral over the film of a splat stays. ``Projection.depths`` are the lens's.
+    that the integral over the film of a splat stays. So are ``Projection.cuts``: a splat that is
+    seen in focus is seen out of focus, and ends at as many standard deviations. Both may be small,
+    but not below LEAST_CUT. ``Projection.depths`` are the lens's.
 
     Splats with a singular cov2d, which low_pass = 0 permits, are not visible.
 
@@ -376,6 +381,7 @@ def project(
     opacities = reference.sigmoid(gaussians.logit_opacities)
     if antialiased:
         opacities = opacities * areas / np.sqrt(np.where(singular, 1.0, dets))
+    bright, cuts = opacities > reference.ALPHA_CUT, reference.ALPHA_CUT
     if defocus is not None:
         if isinstance(lens, Orthographic):
             raise ValueError(
@@ -386,14 +392,17 @@ def project(
         dets_in_focus = dets
         cov2d, dets, _ = _widened(axes2d, widening + radii**2 / 4)
         singular = dets == 0
-        opacities = opacities * np.sqrt(dets_in_focus / np.where(singular, 1.0, dets))
+        dimming = np.sqrt(dets_in_focus / np.where(singular, 1.0, dets))
+        opacities, cuts = opacities * dimming, np.maximum(cuts * dimming, LEAST_CUT)
+        bright &= opacities > LEAST_CUT
     return Projection(
         means2d=lens.film_points(camera, points),
         cov2d=cov2d,
         conics=reference._inverses(cov2d, np.where(singular, 1.0, dets)),
         depths=depths,
         opacities=opacities,
-        visible=seen & ~singular & (opacities > reference.ALPHA_CUT),
+        visible=seen & ~singular & bright,
+        cuts=cuts,
     )
 
 
@@ -473,7 +482,7 @@ def render(
     return reference.composite(
         splats.means2d, splats.conics, splats.opacities,
         sh_colors(gaussians, camera, lens, degree), splats.depths, splats.visible,
-        background, camera.width, camera.height, threshold_width,
+        background, camera.width, camera.height, threshold_width, splats.cuts,
     )  # fmt: skip
 
 
