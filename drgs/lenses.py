@@ -7,7 +7,7 @@ ones), so that nothing is computed for it.
 
 Outside the part of the film's plane that a lens model is made for, its polynomials turn around and
 would fold what lies far outside back into the picture: what is seen under a larger angle than that
-at which the radial function first stops growing is not seen at all.
+at which the model first turns, in whatever direction, is not seen at all.
 """
 
 from __future__ import annotations
@@ -176,7 +176,7 @@ class RadialTangential(Perspective):
             numerator=numerator,
             denominator=denominator,
             tangential=(p1, p2) if p1 or p2 else (),
-            max_squared_radius=_largest_squared_radius(numerator, denominator),
+            max_squared_radius=_largest_squared_radius(numerator, denominator, math.hypot(p1, p2)),
         )
 
     def upload(self, float_type: type) -> RadialTangential:
@@ -320,16 +320,29 @@ class RadialTangential(Perspective):
         return change / denominator
 
 
-def _largest_squared_radius(numerator: Sequence[float], denominator: Sequence[float]) -> float:
-    """r^2 where r R(r^2) stops growing, or has a pole; inf if it never does.
+def _largest_squared_radius(
+    numerator: Sequence[float], denominator: Sequence[float], tangential: float
+) -> float:
+    """r^2 within which no two slopes are distorted to the same; inf: wherever they are.
 
-    With R = N / D and u = r^2, the derivative's numerator is N D + 2 u (N' D - N D').
+    With R = N / D and u = r^2, the radial part's Jacobian has the eigenvalues A = G / D^2, with
+    G = N D + 2 u (N' D - N D'), along the slope, and R across it. With ``tangential``, the length
+    q of (p2, p1), no eigenvalue of the tangential part's is below -6 r q. While A and R are larger
+    than 6 r q, the sum is positive definite (Weyl's inequality), and as it is symmetric, its
+    map one-to-one. The bound is reached where A <= R, on the side of -(p2, p1).
     """
-    n, d = (np.array([1.0, *coefficients]) for coefficients in (numerator, denominator))
-    multiply, derive = np.polynomial.polynomial.polymul, np.polynomial.polynomial.polyder
-    change = np.polynomial.polynomial.polysub(multiply(derive(n), d), multiply(n, derive(d)))
-    growth = np.polynomial.polynomial.polyadd(multiply(n, d), multiply([0.0, 2.0], change))
-    return min(_first_root(growth), _first_root(d))
+    u = np.polynomial.Polynomial([0.0, 1.0])
+    n, d = (np.polynomial.Polynomial([1.0, *c]) for c in (numerator, denominator))
+    growth = n * d + 2 * u * (n.deriv() * d - n * d.deriv())
+    first = min(_first_root(growth.coef), _first_root(d.coef))
+    if tangential == 0:
+        return first
+    r = u
+    folds = (
+        growth(r**2) - 6 * tangential * r * d(r**2) ** 2,
+        n(r**2) - 6 * tangential * r * d(r**2),
+    )
+    return min(first, *(_first_root(fold.coef) ** 2 for fold in folds))
 
 
 def _replaced(position: Any, seen: Any) -> tuple[Any, Any, Any]:

@@ -1,5 +1,6 @@
 """Lenses against the float64 reference: what they see, pictures, gradients; and by themselves."""
 
+import math
 from dataclasses import replace
 from itertools import pairwise
 
@@ -281,7 +282,10 @@ def test_a_fisheye_sees_from_the_axis_to_behind_the_camera(precision, name):
 
 
 def folded_points(lens) -> np.ndarray:
-    """Points in front of the lens that it would fold back to the middle of the picture."""
+    """Points in front of the lens that it would fold back to the middle of the picture.
+
+    In the direction (3, -4), in which the tangential terms of "tangential" fold first.
+    """
     if isinstance(lens, Fisheye):
         angles = np.linspace(1.001, 1.3, 20) * lens.valid_angle
         return 2 * np.column_stack([np.sin(angles), 0 * angles, np.cos(angles)])
@@ -291,6 +295,7 @@ def folded_points(lens) -> np.ndarray:
 
 FOLDING = {
     "barrel": OpenCV(k1=-0.3125),
+    "tangential": OpenCV(p1=0.25, p2=-0.1875),
     "barrel, tangential": OpenCV(k1=-0.3125, p1=0.0078125, p2=-0.015625),
     "rational": OpenCV(k4=0.25),
     "pole": OpenCV(k4=-0.25),
@@ -673,6 +678,26 @@ def test_where_the_model_ends_is_where_the_reference_ends(name):
     else:
         return
     assert actual == pytest.approx(expected, rel=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("lens", "ends"),
+    [
+        (OpenCV(p1=0.125, p2=-0.0625), True),
+        # By what the radial part grows along the slope, and by what it is across it.
+        (OpenCV(k1=-0.25, k2=0.03125, k4=0.0625, p1=-0.03125, p2=0.015625), True),
+        (OpenCV(k1=0.0625, k4=0.03125, k5=-0.015625, p1=0.125, p2=0.125), True),
+        # Nowhere; and not before the pole.
+        (OpenCV(k1=0.25, k2=0.125, p1=0.0625), False),
+        (OpenCV(k4=-0.25, p1=2.0**-30), False),
+    ],
+    ids=str,
+)
+def test_tangential_terms_end_the_model_where_the_reference_does(lens, ends):
+    radius = math.sqrt(kernel_lens(lens).max_squared_radius)
+    assert radius == pytest.approx(lens.valid_radius, rel=1e-9)
+    plain = replace(lens, p1=0.0, p2=0.0).valid_radius
+    assert (radius < 0.99 * plain) == ends
 
 
 def kernels_of(lens, camera_seed=0) -> dict[str, list]:
