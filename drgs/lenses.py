@@ -2,8 +2,8 @@
 
 Layer 1, imported when a sensor or a dataset has such a lens. Each has the methods of
 :class:`drgs.camera.Pinhole`. Coefficients are numbers of the host, or Dr.Jit scalars after
-:meth:`upload`; one that is zero is left out (trailing zeros of a polynomial, both tangential
-ones), so that nothing is computed for it.
+:meth:`upload`; one that is not given is left out (of a polynomial, those behind the last one that
+is; or both tangential ones), so that nothing is computed for it.
 
 Outside the part of the film's plane that a lens model is made for, its polynomials turn around and
 would fold what lies far outside back into the picture: what is seen under a larger angle than that
@@ -13,7 +13,7 @@ at which the model first turns, in whatever direction, is not seen at all.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any, ClassVar
 
@@ -118,11 +118,10 @@ def _between(low: Any, high: Any) -> Any:
     return middle / (1 - middle)
 
 
-def _without_trailing_zeros(coefficients: Sequence[float]) -> tuple[float, ...]:
-    kept = [float(c) for c in coefficients]
-    while kept and kept[-1] == 0:
-        kept.pop()
-    return tuple(kept)
+def _up_to_the_last(names: Sequence[str], given: Mapping[str, float]) -> tuple[float, ...]:
+    """Coefficients of a polynomial: zero where one is not given but a later one is."""
+    count = max((n for n, name in enumerate(names, 1) if name in given), default=0)
+    return tuple(float(given.get(name, 0.0)) for name in names[:count])
 
 
 def _uploaded(lens: Any, float_type: type) -> Any:
@@ -166,16 +165,15 @@ class RadialTangential(Perspective):
     @staticmethod
     def of(**coefficients: float) -> RadialTangential:
         """From OpenCV's names, ``k1`` to ``k6``, ``p1``, ``p2``; what is not given is zero."""
-        k1, k2, k3, k4, k5, k6, p1, p2 = (
-            coefficients.pop(name, 0.0) for name in RadialTangential.names
-        )
-        assert not coefficients
-        numerator = _without_trailing_zeros((k1, k2, k3))
-        denominator = _without_trailing_zeros((k4, k5, k6))
+        names = RadialTangential.names
+        assert set(coefficients) <= set(names)
+        p1, p2 = (float(coefficients.get(name, 0.0)) for name in names[6:])
+        numerator = _up_to_the_last(names[:3], coefficients)
+        denominator = _up_to_the_last(names[3:6], coefficients)
         return RadialTangential(
             numerator=numerator,
             denominator=denominator,
-            tangential=(p1, p2) if p1 or p2 else (),
+            tangential=(p1, p2) if set(coefficients) & set(names[6:]) else (),
             max_squared_radius=_largest_squared_radius(numerator, denominator, math.hypot(p1, p2)),
         )
 
@@ -407,12 +405,13 @@ class Fisheye(Lens):
     min_cosine: Any
 
     @staticmethod
-    def of(k1: float = 0.0, k2: float = 0.0, k3: float = 0.0, k4: float = 0.0) -> Fisheye:
-        """From OpenCV's names."""
-        coefficients = _without_trailing_zeros((k1, k2, k3, k4))
-        growth = [1.0, *((2 * n + 3) * k for n, k in enumerate(coefficients))]
+    def of(**coefficients: float) -> Fisheye:
+        """From OpenCV's names, ``k1`` to ``k4``; what is not given is zero."""
+        assert set(coefficients) <= set(Fisheye.names)
+        kept = _up_to_the_last(Fisheye.names, coefficients)
+        growth = [1.0, *((2 * n + 3) * k for n, k in enumerate(kept))]
         turn = math.sqrt(_first_root(np.array(growth)))
-        return Fisheye(coefficients, math.cos(min(turn, MAX_ANGLE)))
+        return Fisheye(kept, math.cos(min(turn, MAX_ANGLE)))
 
     def upload(self, float_type: type) -> Fisheye:
         """For kernels of this precision."""

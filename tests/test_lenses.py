@@ -641,7 +641,7 @@ def test_gradients_equal_their_own_central_differences(name, choices):
         ({}, {}),
         ({"k1": 0.5}, {"k1": 0.5}),
         ({"k2": 0.5}, {"k1": 0.0, "k2": 0.5}),
-        ({"k1": 0.5, "k3": 0.0}, {"k1": 0.5}),
+        ({"k1": 0.0, "p1": 0.0}, {"k1": 0.0, "p1": 0.0, "p2": 0.0}),
         ({"k5": 0.5}, {"k4": 0.0, "k5": 0.5}),
         ({"p2": 0.5}, {"p1": 0.0, "p2": 0.5}),
         (
@@ -650,7 +650,7 @@ def test_gradients_equal_their_own_central_differences(name, choices):
         ),
     ],
 )
-def test_coefficients_that_are_zero_are_left_out(given, named):
+def test_coefficients_that_are_not_given_are_left_out(given, named):
     lens = lenses.RadialTangential.of(**given)
     assert lens.named() == named
     values = {name: -value for name, value in named.items()}
@@ -658,9 +658,10 @@ def test_coefficients_that_are_zero_are_left_out(given, named):
     assert lens.with_named(values).max_squared_radius == lens.max_squared_radius
 
 
-def test_a_fisheye_leaves_out_trailing_zeros():
+def test_a_fisheye_leaves_out_what_is_not_given():
     assert lenses.Fisheye.of().named() == {}
     assert lenses.Fisheye.of(k2=0.5).named() == {"k1": 0.0, "k2": 0.5}
+    assert lenses.Fisheye.of(k1=0.0).named() == {"k1": 0.0}
     lens = lenses.Fisheye.of(k1=0.5, k2=0.25)
     assert lens.with_named({"k1": 0.25, "k2": 0.125, "fx": 1.0}).named() == {
         "k1": 0.25, "k2": 0.125
