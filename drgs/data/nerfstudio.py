@@ -5,7 +5,8 @@ focal lengths are missing, ``camera_angle_x`` (and ``_y``) give them. Views are 
 name, and every ``data.test_every``-th is for testing, as in Mip-NeRF 360 and 3DGS.
 
 Frames may name a mask (``mask_path``, black where pixels do not count), a picture of depths
-(``depth_file_path``), and a second pose (:data:`CLOSE`, with ``shutter``).
+(``depth_file_path``: z in the camera; with a fisheye, the distance from it, as in nerfstudio, where
+a fisheye's rays have unit length), and a second pose (:data:`CLOSE`, with ``shutter``).
 """
 
 from __future__ import annotations
