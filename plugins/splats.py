@@ -102,7 +102,8 @@ class SplatsIntegrator(mi.CppADIntegrator):
      * - hide_emitters
        - |bool|
        - An environment emitter of the scene is seen behind the splats, instead of the background,
-         unless this is set. (Default: |false|)
+         unless this is set. Through a ``thinlens`` it is the mean of what 16 points of the aperture
+         see. (Default: |false|)
 
      * - near
        - |float|
