@@ -139,7 +139,7 @@ class Projection:
     depths: np.ndarray  # (N,) camera z, world units; the true one for culled rows too
     opacities: np.ndarray  # (N,) activated; after compensation where that was asked for
     visible: np.ndarray  # (N,) bool: depths >= near and opacities > ALPHA_CUT; may be off film
-    cuts: np.ndarray | float = ALPHA_CUT  # (N,) or for all: smallest alpha of each splat
+    cuts: np.ndarray | float | None = None  # (N,) or for all: smallest alphas; None: ALPHA_CUT
 
 
 @dataclass(frozen=True)
@@ -482,14 +482,14 @@ def composite(
     width: int,
     height: int,
     threshold_width: float = THRESHOLD_WIDTH,
-    cuts: np.ndarray | float = ALPHA_CUT,
+    cuts: np.ndarray | float | None = None,
 ) -> Picture:
     """Return the picture of N splats: C = sum_i T_i alpha_i c_i + T background (3DGS, equation 3).
 
     T_i = prod_{j < i} (1 - alpha_j), alpha_i = min(0.99, o_i exp(-d^T A_i d / 2)), over the
-    splats i in ascending depth (ties by index) whose alpha is at least ``cuts``, (N,) or for all
-    1/255. A pixel is finished before the first splat that would take T below 1e-4: that splat is
-    not composited.
+    splats i in ascending depth (ties by index) whose alpha is at least ``cuts``, (N,) or for all;
+    None: 1/255. A pixel is finished before the first splat that would take T below 1e-4: that splat
+    is not composited.
 
     means2d (N, 2) px; conics (N, 2, 2) px^-2, symmetric; opacities (N,); colors (N, 3) display
     space; depths (N,) camera z; visible (N,) bool: the others are left out; background (3,)
@@ -516,14 +516,14 @@ def _composite_and_stops(
     width: int,
     height: int,
     threshold_width: float,
-    cuts: np.ndarray | float = ALPHA_CUT,
+    cuts: np.ndarray | float | None = None,
 ) -> tuple[Picture, np.ndarray]:
     """Return ``composite``'s picture and the rank in depth (H, W) at which each pixel stopped."""
     means2d, conics, opacities, colors, depths, background = _as_float64(
         means2d, conics, opacities, colors, depths, background
     )
     order = _depth_order(depths, visible)
-    cuts = np.broadcast_to(cuts, depths.shape)
+    cuts = np.broadcast_to(ALPHA_CUT if cuts is None else cuts, depths.shape)
     smallest = cuts[order] * (1 - threshold_width)
     boxes = _pixel_boxes(means2d[order], conics[order], opacities[order], smallest, width, height)
     never = len(order)
