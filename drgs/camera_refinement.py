@@ -275,9 +275,8 @@ def _lens_and_motion(view: View) -> dict[str, Any]:
     """What ``transforms.json`` says of a camera besides its pose and intrinsics."""
     values: dict[str, Any] = {}
     if view.lens is not None:
-        # Coefficients without the name of a model are those of OpenCV's.
-        values |= {"camera_model": "OPENCV_FISHEYE"} if view.lens.kind == "fisheye" else {}
-        values |= view.lens.named()
+        model = {"opencv": "FULL_OPENCV", "fisheye": "OPENCV_FISHEYE"}[view.lens.kind]
+        values |= {"camera_model": model, **view.lens.named()}
     if view.motion is not None:
         values[CLOSE] = _in_opengl_axes(view.motion.close_to_world)
         values["shutter"] = view.motion.shutter

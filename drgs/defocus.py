@@ -2,12 +2,14 @@
 
 Layer 2, imported when a camera has an aperture. A point is spread over a disc; here the disc's
 variance is added to the splat's covariance on the film, and its opacity falls such that its
-integral stays. What a picture by many rays shows beyond that, such as what is seen past the blurred
-edge of something near, needs the rays.
+integral stays. The alpha at which it ends falls with it: a surface of many small splats, each of
+them hardly there when it is far out of focus, is as opaque as in focus. What a picture by many rays
+shows beyond that, such as what is seen past the blurred edge of something near, needs the rays.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
@@ -15,6 +17,9 @@ from typing import Any
 import drjit as dr
 
 from drgs.camera import Camera
+from drgs.constants import NEGLIGIBLE_ALPHA
+from drgs.cutoffs import Cutoffs
+from drgs.image_model import Footprint, Offsets
 from drgs.projection import FilmShape, GaussianRows
 
 
@@ -50,3 +55,75 @@ def _root_determinant(film: FilmShape) -> Any:
     if film.perspective is not None and len(film.perspective) > 3:
         p, s = p / film.perspective[3], s / film.perspective[3]
     return dr.abs(p * s)
+
+
+@dataclass(frozen=True)
+class DimmedResponse:
+    """A response (see ``drgs.image_model``) whose splats end where they would without dimming.
+
+    *Geometry* is that of the response, then the base-2 logarithm of the dimming. It has no
+    derivatives: the cut is a decision.
+    """
+
+    of: Any
+
+    @property
+    def num_geometry(self) -> int:
+        """Numbers of a splat."""
+        return self.of.num_geometry + 1
+
+    @property
+    def num_moments(self) -> int:
+        """Sums over pixels, by splat."""
+        return self.of.num_moments
+
+    @property
+    def camera(self) -> Any:
+        """That the response is for."""
+        return self.of.camera
+
+    def log2_floor(self, geometry: list[Any], cutoffs: Cutoffs) -> Any:
+        """The base-2 logarithm of the smallest alpha of a splat; see ``NEGLIGIBLE_ALPHA``."""
+        log2_opacity, log2_dimming = geometry[5], geometry[-1]
+        floor = cutoffs.log2_floor(log2_opacity - log2_dimming) + log2_dimming
+        least = math.log2(NEGLIGIBLE_ALPHA)
+        return dr.select(floor > least, floor, least)
+
+    def geometry(self, splats: Any) -> list[Any]:
+        """Columns, one value per Gaussian."""
+        return [*self.of.geometry(splats), dr.log2(splats.dimming)]
+
+    def differentiable(self, splats: Any) -> list[Any]:
+        """What :meth:`derivatives` are with respect to."""
+        return [*self.of.differentiable(splats), dr.detach(splats.dimming)]
+
+    def bounds(self, splats: Any, geometry: list[Any], reach: Any) -> tuple[Any, Any]:
+        """Centre and half sizes (Array2f, px) of the box around what shows."""
+        return self.of.bounds(splats, geometry[:-1], reach)
+
+    def outline(self, geometry: list[Any], reach: Any) -> list[Any]:
+        """Mean x, y, p, r, s of an ellipse |U d|^2 <= ``reach`` that holds the splat."""
+        return self.of.outline(geometry[:-1], reach)
+
+    def footprint(self, geometry: list[Any], offsets_from: Offsets, active: Any) -> Footprint:
+        """At the 16 pixels of each lane."""
+        return self.of.footprint(geometry[:-1], offsets_from, active)
+
+    def moments(self, footprint: Footprint, weights: list[Any], positions: Any) -> list[Any]:
+        """Sums over the 16 pixels."""
+        return self.of.moments(footprint, weights, positions)
+
+    def derivatives(self, geometry: list[Any], totals: list[Any]) -> list[Any]:
+        """From moments to the derivatives of what :meth:`differentiable` lists."""
+        derivatives = self.of.derivatives(geometry[:-1], totals)
+        return [*derivatives, dr.zeros(type(totals[0]), dr.width(totals[0]))]
+
+    def pack_tangents(self, geometry: list[Any], tangents: list[Any]) -> list[Any]:
+        """Tangents of the geometry."""
+        return [*self.of.pack_tangents(geometry[:-1], tangents[:-1]), tangents[-1]]
+
+    def tangent(
+        self, geometry: list[Any], footprint: Footprint, d_geometry: list[Any]
+    ) -> list[Any]:
+        """Tangent of ln(alpha) at the 16 pixels."""
+        return self.of.tangent(geometry[:-1], footprint, d_geometry[:-1])

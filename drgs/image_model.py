@@ -211,6 +211,10 @@ class AffineResponse:
         del reach
         return geometry[:5]
 
+    def log2_floor(self, geometry: list[Any], cutoffs: Cutoffs) -> Any:
+        """The base-2 logarithm of the smallest alpha of a splat."""
+        return cutoffs.log2_floor(geometry[5])
+
     def footprint(self, geometry: list[Any], offsets_from: Offsets, active: Any) -> Footprint:
         """Evaluate the exponent; on a lane that is not active every alpha is below any floor."""
         x, y, p, r, s, log2_opacity = geometry
@@ -345,9 +349,12 @@ class ImageModel:
 
     def seen_by(self, camera: Any) -> ImageModel:
         """This model for one camera."""
-        return replace(
-            self, response=self.response.seen_by(camera), features=self.features.seen_by(camera)
-        )
+        response = self.response.seen_by(camera)
+        if camera.aperture is not None:
+            from drgs.defocus import DimmedResponse
+
+            response = DimmedResponse(response)
+        return replace(self, response=response, features=self.features.seen_by(camera))
 
     def check_differentiable_in_camera(self) -> None:
         """Raise NotImplementedError if pixels depend on the camera but through the splats."""
@@ -369,7 +376,7 @@ class ImageModel:
 
     def alphas(self, geometry: list[Any], footprint: Footprint) -> list[Alpha]:
         """Alpha at the 16 pixels."""
-        floor = self.cutoffs.log2_floor(geometry[5])
+        floor = self.response.log2_floor(geometry, self.cutoffs)
         return [Alpha.at(x, floor, self.cutoffs.alpha_max) for x in footprint.log2_alpha]
 
 

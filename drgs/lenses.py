@@ -2,18 +2,18 @@
 
 Layer 1, imported when a sensor or a dataset has such a lens. Each has the methods of
 :class:`drgs.camera.Pinhole`. Coefficients are numbers of the host, or Dr.Jit scalars after
-:meth:`upload`; one that is zero is left out (trailing zeros of a polynomial, both tangential
-ones), so that nothing is computed for it.
+:meth:`upload`; one that is not given is left out (of a polynomial, those behind the last one that
+is; or both tangential ones), so that nothing is computed for it.
 
 Outside the part of the film's plane that a lens model is made for, its polynomials turn around and
 would fold what lies far outside back into the picture: what is seen under a larger angle than that
-at which the radial function first stops growing is not seen at all.
+at which the model first turns, in whatever direction, is not seen at all.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any, ClassVar
 
@@ -118,11 +118,10 @@ def _between(low: Any, high: Any) -> Any:
     return middle / (1 - middle)
 
 
-def _without_trailing_zeros(coefficients: Sequence[float]) -> tuple[float, ...]:
-    kept = [float(c) for c in coefficients]
-    while kept and kept[-1] == 0:
-        kept.pop()
-    return tuple(kept)
+def _up_to_the_last(names: Sequence[str], given: Mapping[str, float]) -> tuple[float, ...]:
+    """Coefficients of a polynomial: zero where one is not given but a later one is."""
+    count = max((n for n, name in enumerate(names, 1) if name in given), default=0)
+    return tuple(float(given.get(name, 0.0)) for name in names[:count])
 
 
 def _uploaded(lens: Any, float_type: type) -> Any:
@@ -166,17 +165,16 @@ class RadialTangential(Perspective):
     @staticmethod
     def of(**coefficients: float) -> RadialTangential:
         """From OpenCV's names, ``k1`` to ``k6``, ``p1``, ``p2``; what is not given is zero."""
-        k1, k2, k3, k4, k5, k6, p1, p2 = (
-            coefficients.pop(name, 0.0) for name in RadialTangential.names
-        )
-        assert not coefficients
-        numerator = _without_trailing_zeros((k1, k2, k3))
-        denominator = _without_trailing_zeros((k4, k5, k6))
+        names = RadialTangential.names
+        assert set(coefficients) <= set(names)
+        p1, p2 = (float(coefficients.get(name, 0.0)) for name in names[6:])
+        numerator = _up_to_the_last(names[:3], coefficients)
+        denominator = _up_to_the_last(names[3:6], coefficients)
         return RadialTangential(
             numerator=numerator,
             denominator=denominator,
-            tangential=(p1, p2) if p1 or p2 else (),
-            max_squared_radius=_largest_squared_radius(numerator, denominator),
+            tangential=(p1, p2) if set(coefficients) & set(names[6:]) else (),
+            max_squared_radius=_largest_squared_radius(numerator, denominator, math.hypot(p1, p2)),
         )
 
     def upload(self, float_type: type) -> RadialTangential:
@@ -320,16 +318,29 @@ class RadialTangential(Perspective):
         return change / denominator
 
 
-def _largest_squared_radius(numerator: Sequence[float], denominator: Sequence[float]) -> float:
-    """r^2 where r R(r^2) stops growing, or has a pole; inf if it never does.
+def _largest_squared_radius(
+    numerator: Sequence[float], denominator: Sequence[float], tangential: float
+) -> float:
+    """r^2 within which no two slopes are distorted to the same; inf: wherever they are.
 
-    With R = N / D and u = r^2, the derivative's numerator is N D + 2 u (N' D - N D').
+    With R = N / D and u = r^2, the radial part's Jacobian has the eigenvalues A = G / D^2, with
+    G = N D + 2 u (N' D - N D'), along the slope, and R across it. With ``tangential``, the length
+    q of (p2, p1), no eigenvalue of the tangential part's is below -6 r q. While A and R are larger
+    than 6 r q, the sum is positive definite (Weyl's inequality), and as it is symmetric, its
+    map one-to-one. The bound is reached where A <= R, on the side of -(p2, p1).
     """
-    n, d = (np.array([1.0, *coefficients]) for coefficients in (numerator, denominator))
-    multiply, derive = np.polynomial.polynomial.polymul, np.polynomial.polynomial.polyder
-    change = np.polynomial.polynomial.polysub(multiply(derive(n), d), multiply(n, derive(d)))
-    growth = np.polynomial.polynomial.polyadd(multiply(n, d), multiply([0.0, 2.0], change))
-    return min(_first_root(growth), _first_root(d))
+    u = np.polynomial.Polynomial([0.0, 1.0])
+    n, d = (np.polynomial.Polynomial([1.0, *c]) for c in (numerator, denominator))
+    growth = n * d + 2 * u * (n.deriv() * d - n * d.deriv())
+    first = min(_first_root(growth.coef), _first_root(d.coef))
+    if tangential == 0:
+        return first
+    r = u
+    folds = (
+        growth(r**2) - 6 * tangential * r * d(r**2) ** 2,
+        n(r**2) - 6 * tangential * r * d(r**2),
+    )
+    return min(first, *(_first_root(fold.coef) ** 2 for fold in folds))
 
 
 def _replaced(position: Any, seen: Any) -> tuple[Any, Any, Any]:
@@ -394,12 +405,13 @@ class Fisheye(Lens):
     min_cosine: Any
 
     @staticmethod
-    def of(k1: float = 0.0, k2: float = 0.0, k3: float = 0.0, k4: float = 0.0) -> Fisheye:
-        """From OpenCV's names."""
-        coefficients = _without_trailing_zeros((k1, k2, k3, k4))
-        growth = [1.0, *((2 * n + 3) * k for n, k in enumerate(coefficients))]
+    def of(**coefficients: float) -> Fisheye:
+        """From OpenCV's names, ``k1`` to ``k4``; what is not given is zero."""
+        assert set(coefficients) <= set(Fisheye.names)
+        kept = _up_to_the_last(Fisheye.names, coefficients)
+        growth = [1.0, *((2 * n + 3) * k for n, k in enumerate(kept))]
         turn = math.sqrt(_first_root(np.array(growth)))
-        return Fisheye(coefficients, math.cos(min(turn, MAX_ANGLE)))
+        return Fisheye(kept, math.cos(min(turn, MAX_ANGLE)))
 
     def upload(self, float_type: type) -> Fisheye:
         """For kernels of this precision."""

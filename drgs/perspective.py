@@ -331,7 +331,7 @@ class RayResponse(AffineResponse):
 
 def ray_denominator(geometry: list[Any], u: Any, v: Any, x: Any, y: Any) -> tuple[Any, Any, Any]:
     """|e|^2, a and D at a pixel with e = (u, v), at (x, y) from the anchor."""
-    gx, gy, h = geometry[6:]
+    gx, gy, h = geometry[6:9]
     squared = dr.fma(u, u, v * v)
     a = dr.fma(gx, x, dr.fma(gy, y, _sign(geometry[2])))
     return squared, a, dr.fma(a, a, h * squared)

@@ -21,7 +21,7 @@ import drjit as dr
 from drgs import sh
 from drgs.arrays import types_of
 from drgs.camera import Camera
-from drgs.constants import LEAST_LOW_PASS, LOW_PASS
+from drgs.constants import LEAST_LOW_PASS, LOW_PASS, NEGLIGIBLE_ALPHA
 from drgs.cutoffs import Cutoffs
 from drgs.gaussians import Gaussians
 
@@ -45,6 +45,7 @@ class Splats2D:
     variances: Any  # Array2f, px^2: diagonal of the projected covariance, low-pass included
     visible: Any  # Bool: in front of the near plane, above the alpha cut, finite
     perspective: Any = None  # list of Float, only where a choice needs it: see drgs.perspective
+    dimming: Any = None  # Float: factor of the opacity, where the camera is out of focus
 
     @property
     def conics(self) -> Any:
@@ -120,8 +121,8 @@ def project(
     opacity_rule: how low-pass filtering affects opacity: :func:`plain_opacity` or
     :func:`compensated_opacity`; shape: how mean and covariance are projected, by default
     :func:`ewa`; color: what is known of a splat's colour, by default :func:`color_at_mean`;
-    low_pass: px^2 added to the covariance; least_alpha: Gaussians whose opacity does
-    not reach it are not visible.
+    low_pass: px^2 added to the covariance; least_alpha: Gaussians whose opacity, before the shape's
+    dimming, does not reach it are not visible.
 
     Differentiable in ``rows`` and in the camera's numbers. Not differentiated: visibility.
     """
@@ -130,9 +131,12 @@ def project(
     low_pass = max(low_pass, LEAST_LOW_PASS)
     film = (shape or ewa)(rows, camera, position, low_pass)
     opacities = opacity_rule(_sigmoid(rows.logit_opacities), film.sharp, film.added)
-    for dimming in (rows.dimming, film.dimming):
-        if dimming is not None:
-            opacities = opacities * dimming
+    if rows.dimming is not None:
+        opacities = opacities * rows.dimming
+    bright = opacities > least_alpha
+    if film.dimming is not None:
+        opacities = opacities * film.dimming
+        bright = bright & (opacities > NEGLIGIBLE_ALPHA)
     direction = camera.lens.view_direction(camera, offset)
     colors = (color or color_at_mean)(rows, direction, sh_degree)
     numbers = [*film.means2d, *film.whitening, *colors]
@@ -145,8 +149,9 @@ def project(
         opacities=opacities,
         colors=colors,
         variances=film.variances,
-        visible=seen & (opacities > least_alpha) & finite & dr.isfinite(dr.sum(film.variances)),
+        visible=seen & bright & finite & dr.isfinite(dr.sum(film.variances)),
         perspective=film.perspective,
+        dimming=film.dimming,
     )
 
 

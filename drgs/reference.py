@@ -139,6 +139,7 @@ class Projection:
     depths: np.ndarray  # (N,) camera z, world units; the true one for culled rows too
     opacities: np.ndarray  # (N,) activated; after compensation where that was asked for
     visible: np.ndarray  # (N,) bool: depths >= near and opacities > ALPHA_CUT; may be off film
+    cuts: np.ndarray | float | None = None  # (N,) or for all: smallest alphas; None: ALPHA_CUT
 
 
 @dataclass(frozen=True)
@@ -435,7 +436,7 @@ def _pixel_boxes(
     means2d: np.ndarray,
     conics: np.ndarray,
     opacities: np.ndarray,
-    smallest_alpha: float,
+    smallest_alpha: np.ndarray | float,
     width: int,
     height: int,
 ) -> list[tuple[slice, slice]]:
@@ -481,12 +482,14 @@ def composite(
     width: int,
     height: int,
     threshold_width: float = THRESHOLD_WIDTH,
+    cuts: np.ndarray | float | None = None,
 ) -> Picture:
     """Return the picture of N splats: C = sum_i T_i alpha_i c_i + T background (3DGS, equation 3).
 
     T_i = prod_{j < i} (1 - alpha_j), alpha_i = min(0.99, o_i exp(-d^T A_i d / 2)), over the
-    splats i in ascending depth (ties by index) whose alpha is at least 1/255. A pixel is finished
-    before the first splat that would take T below 1e-4: that splat is not composited.
+    splats i in ascending depth (ties by index) whose alpha is at least ``cuts``, (N,) or for all;
+    None: 1/255. A pixel is finished before the first splat that would take T below 1e-4: that splat
+    is not composited.
 
     means2d (N, 2) px; conics (N, 2, 2) px^-2, symmetric; opacities (N,); colors (N, 3) display
     space; depths (N,) camera z; visible (N,) bool: the others are left out; background (3,)
@@ -497,7 +500,7 @@ def composite(
     """
     picture, _ = _composite_and_stops(
         means2d, conics, opacities, colors, depths, visible, background, width, height,
-        threshold_width,
+        threshold_width, cuts,
     )  # fmt: skip
     return picture
 
@@ -513,14 +516,16 @@ def _composite_and_stops(
     width: int,
     height: int,
     threshold_width: float,
+    cuts: np.ndarray | float | None = None,
 ) -> tuple[Picture, np.ndarray]:
     """Return ``composite``'s picture and the rank in depth (H, W) at which each pixel stopped."""
     means2d, conics, opacities, colors, depths, background = _as_float64(
         means2d, conics, opacities, colors, depths, background
     )
     order = _depth_order(depths, visible)
-    cut = ALPHA_CUT * (1 - threshold_width)
-    boxes = _pixel_boxes(means2d[order], conics[order], opacities[order], cut, width, height)
+    cuts = np.broadcast_to(ALPHA_CUT if cuts is None else cuts, depths.shape)
+    smallest = cuts[order] * (1 - threshold_width)
+    boxes = _pixel_boxes(means2d[order], conics[order], opacities[order], smallest, width, height)
     never = len(order)
 
     def is_near(values: np.ndarray, threshold: float) -> np.ndarray:
@@ -535,12 +540,12 @@ def _composite_and_stops(
         splat = _footprint(box, means2d[i], conics[i], opacities[i])
         alpha = np.minimum(splat.raw_alpha, ALPHA_MAX)
         unfinished = stops[box] == never
-        contributes = unfinished & (alpha >= ALPHA_CUT)
+        contributes = unfinished & (alpha >= cuts[i])
         behind = transmittance[box] * (1 - alpha)
         stopping = contributes & (behind < TRANSMITTANCE_STOP)
 
         near_threshold[box] |= unfinished & (
-            is_near(splat.raw_alpha, ALPHA_CUT) | is_near(splat.raw_alpha, ALPHA_MAX)
+            is_near(splat.raw_alpha, cuts[i]) | is_near(splat.raw_alpha, ALPHA_MAX)
         )
         near_threshold[box] |= contributes & is_near(behind, TRANSMITTANCE_STOP)
 
@@ -573,7 +578,7 @@ def render(
     colors = sh_colors(gaussians, camera, degree)
     return composite(
         splats.means2d, splats.conics, splats.opacities, colors, splats.depths, splats.visible,
-        background, camera.width, camera.height, threshold_width,
+        background, camera.width, camera.height, threshold_width, splats.cuts,
     )  # fmt: skip
 
 

@@ -26,6 +26,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
+from functools import cache
 from math import inf, pi, sqrt
 
 import numpy as np
@@ -40,6 +41,9 @@ BORDER_SAMPLES = 65
 """Points of each edge of the film, corners included, whose slopes bound an OpenCV lens's picture.
 Between two of 65, a border bent like a circle arc bulges 1 / 64^2 of its own bulge."""
 
+FOLD_RADII, FOLD_STEPS = (1e-3, 1e6), 1000
+"""Where a lens with tangential terms is searched for a fold: slopes, in steps of two percent."""
+
 REAL_ROOT = 1e-7
 """A root with a smaller imaginary part (relative) is real: a double root is found to within the
 square root of rounding, 1.5e-8."""
@@ -50,6 +54,9 @@ by the eighth power of (step / distance to the nearest pole), and by rounding / 
 
 CENTRAL_WEIGHTS = (4 / 5, -1 / 5, 4 / 105, -1 / 280)
 """Central differences of order 8: f'(x) h = sum_j w_j (f(x + j h) - f(x - j h)), j = 1 to 4."""
+
+LEAST_CUT = 2.0**-60
+"""An alpha that changes no sum: the cut of splats however dim they are out of focus."""
 
 SMOOTHING_VARIANCE = 0.2
 """px^2: variance of the 3D smoothing filter at the largest sampling rate (Mip-Splatting's s)."""
@@ -185,16 +192,39 @@ class OpenCV(Lens):
 
     @property
     def valid_radius(self) -> float:
-        """The smallest r > 0 at which the derivative of r -> r q(r) vanishes, or q has a pole.
+        """The radius within which no two slopes are distorted to the same; it may be infinite.
 
-        Infinite if there is none. With u = r^2, q = n(u) / d(u) and ' for d/du, the derivative is
-        (d n + 2 u (d n' - n d')) / d^2. The tangential terms do not count.
+        Without tangential terms, the smallest r > 0 at which the derivative of r -> r q(r)
+        vanishes, or q has a pole. With u = r^2, q = n(u) / d(u) and ' for d/du, the derivative is
+        (d n + 2 u (d n' - n d')) / d^2.
+
+        With them: where ``least_eigenvalue`` first vanishes, if that comes before. A symmetric
+        Jacobian that is positive definite all over a disc is that of a one-to-one map.
         """
         n = np.polynomial.Polynomial([1.0, self.k1, self.k2, self.k3])
         d = np.polynomial.Polynomial([1.0, self.k4, self.k5, self.k6])
         u = np.polynomial.Polynomial([0.0, 1.0])
         slope = d * n + 2 * u * (d * n.deriv() - n * d.deriv())
-        return sqrt(min(_first_positive_root(slope.coef), _first_positive_root(d.coef)))
+        radius = sqrt(min(_first_positive_root(slope.coef), _first_positive_root(d.coef)))
+        return _first_fold(self, radius) if self.p1 or self.p2 else radius
+
+    def least_eigenvalue(self, radii: np.ndarray) -> np.ndarray:
+        """Return (M,): no eigenvalue of the Jacobian, in any direction at radii (M,), is smaller.
+
+        The least one of the radial part and the least one of the tangential part, in the direction
+        where that is least, added (Weyl's inequality).
+        """
+        radial, tangential = replace(self, p1=0.0, p2=0.0), OpenCV(p1=self.p1, p2=self.p2)
+        # Where the tangential part alone, without x and y themselves, has its least eigenvalue.
+        direction = -np.array([self.p2, self.p1]) / np.hypot(self.p1, self.p2)
+        slopes = radii[:, None] * direction
+        parts = [np.linalg.eigvalsh(lens._jacobians(slopes))[:, 0] for lens in (radial, tangential)]
+        return parts[0] + parts[1] - 1
+
+    def _jacobians(self, slopes: np.ndarray) -> np.ndarray:
+        """Return (M, 2, 2): derivatives of ``distorted`` at slopes (M, 2), by complex steps."""
+        columns = [self.distorted(slopes + 1e-30j * axis).imag / 1e-30 for axis in np.eye(2)]
+        return np.stack(columns, axis=-1)
 
     def undistorted(self, slopes: np.ndarray) -> np.ndarray:
         """Return the slopes (M, 2) within ``valid_radius`` that are distorted to ``slopes`` (M, 2).
@@ -208,8 +238,7 @@ class OpenCV(Lens):
         fractions = 0.5 ** np.arange(40.0)[:, None, None]
         for _ in range(100):
             errors = slopes - self.distorted(guesses)
-            columns = [self.distorted(guesses + 1e-30j * axis).imag / 1e-30 for axis in np.eye(2)]
-            steps = np.linalg.solve(np.stack(columns, axis=-1), errors[..., None])[..., 0]
+            steps = np.linalg.solve(self._jacobians(guesses), errors[..., None])[..., 0]
             candidates = guesses + fractions * steps
             left = np.linalg.norm(slopes - self.distorted(candidates), axis=-1)
             better = (np.linalg.norm(candidates, axis=-1) < radius) & (
@@ -279,6 +308,22 @@ class Orthographic(Lens):
         """Return (N, 3), unit, world: the camera's forward axis for all."""
         forward = camera.rotation[2] / np.linalg.norm(camera.rotation[2])
         return np.tile(forward, (len(means), 1))
+
+
+@cache
+def _first_fold(lens: OpenCV, radius: float) -> float:
+    """Return the smallest r below ``radius`` with ``least_eigenvalue`` 0; ``radius``: none is."""
+    radii = np.geomspace(*FOLD_RADII, FOLD_STEPS)
+    radii = np.append(radii[radii < radius], radius * (1 - 1e-12)) if radius < inf else radii
+    folded = np.flatnonzero(lens.least_eigenvalue(radii) <= 0)
+    if len(folded) == 0:
+        return radius
+    low, high = radii[max(folded[0] - 1, 0)], radii[folded[0]]
+    for _ in range(60):
+        middle = (low + high) / 2
+        is_folded = lens.least_eigenvalue(np.array([middle]))[0] <= 0
+        low, high = (low, middle) if is_folded else (middle, high)
+    return low
 
 
 def _focal(camera: Camera) -> np.ndarray:
@@ -356,7 +401,9 @@ def project(
 
     defocus: R (N, 2) px are its ``blur_radii``; the variance of a uniform disc of radius R along
     an axis is R^2 / 4. Opacities are multiplied by sqrt(det(cov2d without R) / det(cov2d)), so
-    that the integral over the film of a splat stays. ``Projection.depths`` are the lens's.
+    that the integral over the film of a splat stays. So are ``Projection.cuts``: a splat that is
+    seen in focus is seen out of focus, and ends at as many standard deviations. Both may be small,
+    but not below LEAST_CUT. ``Projection.depths`` are the lens's.
 
     Splats with a singular cov2d, which low_pass = 0 permits, are not visible.
 
@@ -376,6 +423,7 @@ def project(
     opacities = reference.sigmoid(gaussians.logit_opacities)
     if antialiased:
         opacities = opacities * areas / np.sqrt(np.where(singular, 1.0, dets))
+    bright, cuts = opacities > reference.ALPHA_CUT, reference.ALPHA_CUT
     if defocus is not None:
         if isinstance(lens, Orthographic):
             raise ValueError(
@@ -386,14 +434,17 @@ def project(
         dets_in_focus = dets
         cov2d, dets, _ = _widened(axes2d, widening + radii**2 / 4)
         singular = dets == 0
-        opacities = opacities * np.sqrt(dets_in_focus / np.where(singular, 1.0, dets))
+        dimming = np.sqrt(dets_in_focus / np.where(singular, 1.0, dets))
+        opacities, cuts = opacities * dimming, np.maximum(cuts * dimming, LEAST_CUT)
+        bright &= opacities > LEAST_CUT
     return Projection(
         means2d=lens.film_points(camera, points),
         cov2d=cov2d,
         conics=reference._inverses(cov2d, np.where(singular, 1.0, dets)),
         depths=depths,
         opacities=opacities,
-        visible=seen & ~singular & (opacities > reference.ALPHA_CUT),
+        visible=seen & ~singular & bright,
+        cuts=cuts,
     )
 
 
@@ -473,7 +524,7 @@ def render(
     return reference.composite(
         splats.means2d, splats.conics, splats.opacities,
         sh_colors(gaussians, camera, lens, degree), splats.depths, splats.visible,
-        background, camera.width, camera.height, threshold_width,
+        background, camera.width, camera.height, threshold_width, splats.cuts,
     )  # fmt: skip
 
 

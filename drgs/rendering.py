@@ -239,7 +239,7 @@ def _gaussian_gradients(
     with dr.resume_grad():
         dr.enable_grad(replace(rows, smoothing=None), numbers)
         splats = frame.pipeline.project(rows, camera)
-        outputs = _differentiable(frame.pipeline, splats, rows, camera)
+        outputs = _differentiable(frame, splats, rows, camera)
         cotangents = gradients.geometry + gradients.features
         for output, cotangent in zip(outputs, cotangents, strict=True):
             dr.accum_grad(output, cotangent)
@@ -345,7 +345,7 @@ def _splat_tangents(
         dr.set_grad(replace(rows, smoothing=None), replace(d_rows, smoothing=None))
         for number, tangent in zip(numbers, camera_tangents or [], strict=True):
             dr.set_grad(number, tangent)
-        outputs = _differentiable(frame.pipeline, splats, rows, camera)
+        outputs = _differentiable(frame, splats, rows, camera)
         # Some outputs (depths, p of the whitening) are inputs of others: the default would clear
         # the derivatives of such interior variables on the way.
         dr.forward_to(outputs, flags=dr.ADFlag.ClearEdges)
@@ -356,11 +356,11 @@ def _splat_tangents(
 
 
 def _differentiable(
-    pipeline: Pipeline, splats: Splats2D, rows: GaussianRows, camera: Camera
+    frame: Frame, splats: Splats2D, rows: GaussianRows, camera: Camera
 ) -> list[Any]:
     """What compositing reads of the splats, in the order of :class:`SplatGradients`."""
-    features = pipeline.feature_columns(splats, rows, camera)
-    return pipeline.model.response.differentiable(splats) + features
+    features = frame.pipeline.feature_columns(splats, rows, camera)
+    return frame.bins.model.response.differentiable(splats) + features
 
 
 def _as_tensors(d_rows: GaussianRows, gaussians: Gaussians, visible: Any) -> tuple[Gaussians, Any]:

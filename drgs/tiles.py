@@ -180,9 +180,8 @@ def _reach(geometry: list[Any], grid: TileGrid, model: ImageModel) -> Any:
     opacity-aware radius, instead of 3.
     """
     t = types_of(type(geometry[0]))
-    log2_opacity = geometry[5]
-    floor = model.cutoffs.log2_floor(log2_opacity)
-    return log2_opacity - floor + dr.opaque(t.Float, grid.cull_margin)
+    floor = model.response.log2_floor(geometry, model.cutoffs)
+    return geometry[5] - floor + dr.opaque(t.Float, grid.cull_margin)
 
 
 def _tile_box(

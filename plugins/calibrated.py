@@ -46,7 +46,8 @@ class CalibratedSensor(mi.Sensor):
 
      * - fx, fy
        - |float|
-       - Focal lengths in pixels of the whole film. (Default: the film's width)
+       - Focal lengths in pixels of the whole film. (Default of ``fx``: the film's width; of ``fy``:
+         ``fx``)
        - |exposed|, |differentiable|
 
      * - cx, cy
@@ -63,12 +64,13 @@ class CalibratedSensor(mi.Sensor):
      * - k1, k2, k3, k4, k5, k6, p1, p2
        - |float|
        - Coefficients of the lens as OpenCV defines them; ``fisheye`` has ``k1`` to ``k4``. Those
-         that are not zero are exposed. (Default: 0)
+         that are given, be it as 0, are exposed; what is not given costs nothing. (Default: 0)
        - |exposed|, |differentiable|
 
      * - near_clip, far_clip
        - |float|
-       - Depths (with ``fisheye``: distances) between which something is seen.
+       - Depths (with ``fisheye``: distances) between which something is seen. The ``splats``
+         integrator knows no ``far_clip``: it draws splats at any depth beyond ``near_clip``.
          (Default: 0.01, 10000)
 
      * - to_world_close
@@ -90,8 +92,9 @@ class CalibratedSensor(mi.Sensor):
 
      * - shutter_samples
        - |int|
-       - Times at which the ``splats`` integrator renders what a ``global`` shutter blurs.
-         (Default: 8)
+       - Times at which the ``splats`` integrator renders what a ``global`` shutter blurs. It takes
+         the mean of what the film gets: of radiance, or of display values, which is no longer what
+         a shutter does, where its ``srgb_primitives`` is false. (Default: 8)
 
     This sensor has the parameters that photographs are calibrated with. It works with every
     integrator that traces rays from the sensor: they are found by inverting the distortion. Where a
@@ -124,7 +127,8 @@ class CalibratedSensor(mi.Sensor):
         super().__init__(props)
         self.m_needs_sample_3 = False  # no aperture
         width, height = self.film().size()
-        self.fx, self.fy = (mi.Float(_positive(props, name, width)) for name in ("fx", "fy"))
+        fx = _positive(props, "fx", width)
+        self.fx, self.fy = mi.Float(fx), mi.Float(_positive(props, "fy", fx))
         self.cx = mi.Float(_number(props, "cx", width / 2))
         self.cy = mi.Float(_number(props, "cy", height / 2))
         self.lens = _lens(props)

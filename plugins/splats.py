@@ -128,7 +128,8 @@ class SplatsIntegrator(mi.CppADIntegrator):
      * - hide_emitters
        - |bool|
        - An environment emitter of the scene is seen behind the splats, instead of the background,
-         unless this is set. (Default: |false|)
+         unless this is set. Through a ``thinlens`` it is the mean of what 16 points of the aperture
+         see. (Default: |false|)
 
      * - (Nested plugin)
        - :paramtype:`integrator`
@@ -143,7 +144,7 @@ class SplatsIntegrator(mi.CppADIntegrator):
      * - near
        - |float|
        - Gaussians whose centre is closer than this are culled. The sensor's ``near_clip``
-         applies as well: the larger of the two wins. (Default: 0.01)
+         applies as well: the larger of the two wins; its ``far_clip`` does not. (Default: 0.01)
 
      * - srgb_primitives
        - |bool|
@@ -154,8 +155,9 @@ class SplatsIntegrator(mi.CppADIntegrator):
      * - aovs
        - |string|
        - What is put out besides colour, as in Mitsuba's ``aov``: a list of ``name:type``, such as
-         ``d:depth, a:alpha``. ``depth`` (channel ``name.T``) is the sum of the splats' depths,
-         weighted by their share in the pixel and not normalised; ``alpha`` (``name.I``) is the sum
+         ``d:depth, a:alpha``. ``depth`` (channel ``name.T``) is the sum of the splats' depths (z in
+         the camera; with a fisheye lens, the distance from it), weighted by their share in the
+         pixel and not normalised; ``alpha`` (``name.I``) is the sum
          of these weights; ``normal`` (``name.X``, ``.Y``, ``.Z``) the weighted sum of the splats'
          shortest axes, unit vectors in the world that point to the camera; a type that is the name
          of a parameter ``feature_...`` (``name.0``, ``.1``, ...) the weighted sum of its rows.

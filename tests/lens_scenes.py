@@ -41,10 +41,11 @@ PINHOLE = effects.Pinhole()
 
 
 def kernel_lens(lens: effects.Lens) -> object:
-    """The kernels' lens with the coefficients of the reference's."""
+    """The kernels' lens with the coefficients of the reference's that are not zero."""
+    given = {name: value for name, value in asdict(lens).items() if value != 0}
     if isinstance(lens, OpenCV):
-        return lenses.RadialTangential.of(**asdict(lens))
-    return lenses.Fisheye.of(**asdict(lens)) if isinstance(lens, Fisheye) else lenses.Orthographic()
+        return lenses.RadialTangential.of(**given)
+    return lenses.Fisheye.of(**given) if isinstance(lens, Fisheye) else lenses.Orthographic()
 
 
 def lens_camera(camera: reference.Camera, lens: effects.Lens, precision: Precision) -> Camera:

@@ -49,7 +49,8 @@ class Calibrated:
 
     @property
     def coefficients(self) -> dict[str, float]:
-        return {} if isinstance(self.lens, Pinhole) else asdict(self.lens)
+        given = {} if isinstance(self.lens, Pinhole) else asdict(self.lens)
+        return {name: value for name, value in given.items() if value != 0}
 
     def dictionary(self, **others) -> dict:
         common = self.view.sensor()
@@ -466,11 +467,54 @@ def test_where_the_lens_model_ends_follows_its_coefficients():
     assert (weight == 1).all()
 
 
-def test_coefficients_of_zero_are_not_exposed():
+def test_coefficients_that_are_not_given_are_not_exposed():
     assert set(mi.traverse(PINHOLE.load()).keys()) >= {"to_world", "fx", "fy", "cx", "cy"}
     keys = set(mi.traverse(replace(OPENCV, lens=OpenCV(k1=0.125)).load()).keys())
     assert "k1" in keys and not keys & {"k2", "k3", "k4", "p1", "to_world_close"}
     assert "to_world_close" in mi.traverse(CHANGING.load()).keys()  # noqa: SIM118
+
+
+@pytest.mark.parametrize(
+    ("sensor", "names"),
+    [(OPENCV, ("k1", "k2", "p1")), (FISHEYE, ("k1", "k4"))],
+    ids=["opencv", "fisheye"],
+)
+def test_coefficients_that_are_given_as_zero_can_be_optimised(sensor, names):
+    """Each has a derivative, that of a difference across 0, and stays when another is changed.
+
+    Of splats on the film: without distortion, all places on a side of the film bound the slopes at
+    which the others are projected, and what bounds them beside 0 is another one on either side.
+    """
+    zeros = replace(sensor, lens=type(sensor.lens)(), view=FILM)
+    dictionary = zeros.dictionary(**dict.fromkeys(names, 0.0))
+    gaussians = splats_before(FILM, 1, 40, 0)
+    film = effects.project(gaussians, zeros.camera, zeros.lens).means2d
+    on_film = ((film > 0) & (film < zeros.size)).all(axis=1)
+    gaussians = reference.Gaussians(**{k: v[on_film] for k, v in vars(gaussians).items()})
+    scene = splats_scene(dictionary, gaussians, alpha_cut=0.0, transmittance_stop=0.0)
+    params = mi.traverse(scene)
+    keys = {key.split(".")[-1]: key for key in params.keys()}  # noqa: SIM118
+    assert set(names) <= set(keys)
+    weights = np.random.default_rng(1).normal(size=(*zeros.size[::-1], 4))
+
+    def loss(name, value) -> float:
+        params[keys[name]] = mi.Float(value)
+        params.update()
+        return float(np.sum(weights * image_of(scene)))
+
+    for name in names:
+        step = 1e-3 if name == "p1" else 4e-3
+        expected = (loss(name, step) - loss(name, -step)) / (2 * step)
+        loss(name, 0.0)
+        dr.enable_grad(params[keys[name]])
+        params.update()
+        image = mi.render(scene, params)
+        dr.backward(dr.sum(image * mi.TensorXf(weights.astype(np.float32)), axis=None))
+        actual = float(dr.grad(params[keys[name]])[0])
+        params[keys[name]] = dr.detach(params[keys[name]])
+        # The differences': 1e-6 of 4000 numbers of either sign, over the step, and its square.
+        assert actual == pytest.approx(expected, rel=2e-3, abs=1e-4 / step), name
+        assert abs(actual) > 2e-4 / step, name
 
 
 def test_an_opencv_lens_without_coefficients_is_a_pinhole():
@@ -587,6 +631,8 @@ def test_defaults_are_those_of_the_description():
     width, height = sensor.film().size()
     values = [float(v[0]) for v in (sensor.fx, sensor.fy, sensor.cx, sensor.cy)]
     assert values == [30, 30, 15, height / 2] and width == 30
+    focal = mi.load_dict({"type": "calibrated", "fx": 43.5})
+    assert (float(focal.fx[0]), float(focal.fy[0])) == (43.5, 43.5)
     assert (sensor.near_clip(), sensor.far_clip(), sensor.shutter_samples) == (0.01, 1e4, 8)
     assert not sensor.needs_aperture_sample()
 

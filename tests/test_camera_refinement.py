@@ -341,6 +341,7 @@ def test_refined_cameras_make_better_pictures():
 LENSES = {
     "pinhole": None,
     "opencv": RadialTangential.of(k1=0.1, p2=-0.02),
+    "rational": RadialTangential.of(k1=0.1, k4=0.25),
     "fisheye": Fisheye.of(k1=0.05, k2=-0.01),
 }
 

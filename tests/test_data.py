@@ -373,6 +373,13 @@ def test_a_fisheye_lens_is_read(photographs, says):
     assert dataset.description.endswith("; lens fisheye (k1, k2, k3, k4)")
 
 
+@pytest.mark.parametrize("says", [{"camera_model": "FULL_OPENCV"}, {"k5": 0.125}])
+def test_a_fourth_coefficient_that_is_opencvs_is_read(photographs, says):
+    edit(photographs / "transforms.json", lambda m: m.update(k1=0.1, k4=0.25, **says))
+    given = {k: v for k, v in says.items() if k == "k5"}
+    assert load(photographs).train[0].lens == RadialTangential.of(k1=0.1, k4=0.25, **given)
+
+
 def test_coefficients_do_not_depend_on_the_size_of_the_picture(photographs):
     edit(photographs / "transforms.json", lambda m: m.update(k1=0.1))
     view = load(photographs, image_size=4).train[0]
@@ -405,6 +412,12 @@ def test_distortion_coefficients_of_zero_are_accepted(photographs):
         (
             lambda m: m.update(is_fisheye=True, p1=0.5),
             "p1: a fisheye lens has the coefficients k1, k2, k3, k4, got p1 = 0.5",
+        ),
+        (
+            lambda m: m.update(camera_model="OPENCV", k1=0.1, k4=0.25),
+            "k4 is read as OpenCV's, of a denominator 1 + k4 r^2, where camera_model is "
+            "FULL_OPENCV; nerfstudio's, of a term k4 r^8, is not supported. Got k4 = 0.25 and "
+            "camera_model OPENCV: set camera_model, or calibrate without k4",
         ),
     ],
 )

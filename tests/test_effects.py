@@ -212,15 +212,19 @@ def test_the_plan_of_sensors_regards_all_of_them():
         "  depth of field: a thin lens (1 of 4 sensors)",
         "  motion: blurred (1 of 4 sensors)",
         "  antialiasing: 3D smoothing filter (the Gaussians' filter)",
+        "  not simulated: surfaces",
     ]
     ignoring = rich_scene(ignore="distortion, motion, defocus")
     assert described(plan_of_sensors(ignoring, cameras, None)).splitlines()[3:] == [
         "  lens: Orthographic (1 of 4 sensors)",
         "  antialiasing: 3D smoothing filter (the Gaussians' filter)",
-        "  not simulated: lens (ignored), depth of field (ignored), motion (ignored)",
+        "  not simulated: lens (ignored), depth of field (ignored), motion (ignored), surfaces",
     ]
+    plan = plan_of_sensors(rich_scene(), cameras[:1], None, num_surfaces=2)
+    line = "  surfaces: a nested integrator's picture, between the splats (2 of the scene's shapes)"
+    assert line in described(plan).splitlines()
     assert described(plan_of_sensors(ignoring, cameras[:1], None)).splitlines()[-1] == (
-        "  not simulated: lens, depth of field, motion"
+        "  not simulated: lens, depth of field, motion, surfaces"
     )
 
 

@@ -2,6 +2,7 @@
 
 import csv
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -80,6 +81,19 @@ def test_a_picture_is_never_reused(small):
     renderer = effects.Renderer(effects.rendering_cases()[0], scenes.bench_gaussians(150))
     counts = [effects.operations(renderer) for _ in range(2)]
     assert counts[0] == counts[1] > 1000
+
+
+def test_derivatives_do_not_add_up_over_rounds(small):
+    cases = {c.effect: c for c in effects.rendering_cases()}
+    renderer = effects.Renderer(cases["camera refinement"], scenes.bench_gaussians(150))
+    found = []
+    for _ in range(2):
+        renderer.both()
+        gradients = [np.array(dr.grad(renderer.params[n])) for n in renderer.differentiated]
+        found.append([np.asarray(gradient) for gradient in gradients])
+    for first, second in zip(*found, strict=True):
+        np.testing.assert_array_equal(first, second)
+    assert sum(first.any() for first in found[0]) >= 6
 
 
 def test_prices_are_medians_against_the_first_case(monkeypatch):

@@ -1,5 +1,6 @@
 """Lenses against the float64 reference: what they see, pictures, gradients; and by themselves."""
 
+import math
 from dataclasses import replace
 from itertools import pairwise
 
@@ -45,6 +46,12 @@ from drgs.reference_effects import Fisheye, OpenCV, Orthographic
 from drgs.unscented import unscented
 
 every_lens = pytest.mark.parametrize("name", LENSES)
+
+FORMS = ("rational", "barrel", "fisheye", "orthographic")
+"""One of each form; of a barrel, pixels that show nothing. Where Dr.Jit differentiates, or kernels
+take long to compile, the others, which are these without some terms, tell no more."""
+
+every_form = pytest.mark.parametrize("name", FORMS)
 antialiased_too = pytest.mark.parametrize(
     ("name", "antialiased"),
     [(name, False) for name in LENSES] + [(name, True) for name in ("rational", "fisheye")],
@@ -177,7 +184,10 @@ def tiny_scene(case, rng):
     return gaussians_at_points(case, rng, camera, points, sizes, logits), camera
 
 
-@antialiased_too
+@pytest.mark.parametrize(
+    ("name", "antialiased"),
+    [(name, False) for name in (*FORMS, "plain fisheye")] + [("rational", True), ("fisheye", True)],
+)
 def test_gradients_equal_differences_of_the_reference_along_a_direction(
     name, antialiased, monkeypatch
 ):
@@ -202,7 +212,7 @@ def test_gradients_equal_differences_of_the_reference_along_a_direction(
 
 
 @both_precisions
-@every_lens
+@every_form
 def test_adjoint_is_the_transpose_of_the_tangent(precision, name):
     case = clear(case_of(name))
     cotangents = Cotangents.random(case, seed=4)
@@ -220,7 +230,7 @@ def test_adjoint_is_the_transpose_of_the_tangent(precision, name):
         assert abs(left.sum() - right.sum()) <= GRADIENTS[precision] / 5 * size, parameter
 
 
-@every_lens
+@every_form
 def test_single_precision_gradients_equal_double_precision(name):
     case = clear(case_of(name))
     cotangents = Cotangents.random(case)
@@ -281,7 +291,10 @@ def test_a_fisheye_sees_from_the_axis_to_behind_the_camera(precision, name):
 
 
 def folded_points(lens) -> np.ndarray:
-    """Points in front of the lens that it would fold back to the middle of the picture."""
+    """Points in front of the lens that it would fold back to the middle of the picture.
+
+    In the direction (3, -4), in which the tangential terms of "tangential" fold first.
+    """
     if isinstance(lens, Fisheye):
         angles = np.linspace(1.001, 1.3, 20) * lens.valid_angle
         return 2 * np.column_stack([np.sin(angles), 0 * angles, np.cos(angles)])
@@ -291,6 +304,7 @@ def folded_points(lens) -> np.ndarray:
 
 FOLDING = {
     "barrel": OpenCV(k1=-0.3125),
+    "tangential": OpenCV(p1=0.25, p2=-0.1875),
     "barrel, tangential": OpenCV(k1=-0.3125, p1=0.0078125, p2=-0.015625),
     "rational": OpenCV(k4=0.25),
     "pole": OpenCV(k4=-0.25),
@@ -515,10 +529,6 @@ def test_unscented_splats_that_are_tiny_are_the_affine_ones(name):
 UNSCENTED = {"projection": "unscented"}
 PIXEL_ORDER = {"order": "pixel", "order_window": 2}
 PIXEL_COLORS = {"sh_direction": "pixel"}
-FORMS = ("rational", "barrel", "fisheye", "orthographic")
-"""One of each form; of a barrel, pixels that show nothing."""
-
-every_form = pytest.mark.parametrize("name", FORMS)
 
 
 def planes_of(frame) -> np.ndarray:
@@ -636,7 +646,7 @@ def test_gradients_equal_their_own_central_differences(name, choices):
         ({}, {}),
         ({"k1": 0.5}, {"k1": 0.5}),
         ({"k2": 0.5}, {"k1": 0.0, "k2": 0.5}),
-        ({"k1": 0.5, "k3": 0.0}, {"k1": 0.5}),
+        ({"k1": 0.0, "p1": 0.0}, {"k1": 0.0, "p1": 0.0, "p2": 0.0}),
         ({"k5": 0.5}, {"k4": 0.0, "k5": 0.5}),
         ({"p2": 0.5}, {"p1": 0.0, "p2": 0.5}),
         (
@@ -645,7 +655,7 @@ def test_gradients_equal_their_own_central_differences(name, choices):
         ),
     ],
 )
-def test_coefficients_that_are_zero_are_left_out(given, named):
+def test_coefficients_that_are_not_given_are_left_out(given, named):
     lens = lenses.RadialTangential.of(**given)
     assert lens.named() == named
     values = {name: -value for name, value in named.items()}
@@ -653,9 +663,10 @@ def test_coefficients_that_are_zero_are_left_out(given, named):
     assert lens.with_named(values).max_squared_radius == lens.max_squared_radius
 
 
-def test_a_fisheye_leaves_out_trailing_zeros():
+def test_a_fisheye_leaves_out_what_is_not_given():
     assert lenses.Fisheye.of().named() == {}
     assert lenses.Fisheye.of(k2=0.5).named() == {"k1": 0.0, "k2": 0.5}
+    assert lenses.Fisheye.of(k1=0.0).named() == {"k1": 0.0}
     lens = lenses.Fisheye.of(k1=0.5, k2=0.25)
     assert lens.with_named({"k1": 0.25, "k2": 0.125, "fx": 1.0}).named() == {
         "k1": 0.25, "k2": 0.125
@@ -675,6 +686,26 @@ def test_where_the_model_ends_is_where_the_reference_ends(name):
     assert actual == pytest.approx(expected, rel=1e-9)
 
 
+@pytest.mark.parametrize(
+    ("lens", "ends"),
+    [
+        (OpenCV(p1=0.125, p2=-0.0625), True),
+        # By what the radial part grows along the slope, and by what it is across it.
+        (OpenCV(k1=-0.25, k2=0.03125, k4=0.0625, p1=-0.03125, p2=0.015625), True),
+        (OpenCV(k1=0.0625, k4=0.03125, k5=-0.015625, p1=0.125, p2=0.125), True),
+        # Nowhere; and not before the pole.
+        (OpenCV(k1=0.25, k2=0.125, p1=0.0625), False),
+        (OpenCV(k4=-0.25, p1=2.0**-30), False),
+    ],
+    ids=str,
+)
+def test_tangential_terms_end_the_model_where_the_reference_does(lens, ends):
+    radius = math.sqrt(kernel_lens(lens).max_squared_radius)
+    assert radius == pytest.approx(lens.valid_radius, rel=1e-9)
+    plain = replace(lens, p1=0.0, p2=0.0).valid_radius
+    assert (radius < 0.99 * plain) == ends
+
+
 def kernels_of(lens, camera_seed=0) -> dict[str, list]:
     """[hash, operation count] of the kernels of a frame, its adjoint, and its tangent."""
     # Few enough entries that Dr.Jit's running maximum needs one pass.
@@ -687,10 +718,11 @@ def kernels_of(lens, camera_seed=0) -> dict[str, list]:
     dr.eval(gaussians, ones)
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
         dr.kernel_history()
-        frame = rendering.render(gaussians, camera, rendering.Pipeline(1))
+        # That of the other tests, for the same kernels.
+        frame = rendering.render(gaussians, camera, case.pipeline)
         dr.eval(frame.planes())
         forward = drain_kernels()
-        rendering.render_adjoint(gaussians, frame, [ones] * 3, ones)
+        rendering.render_adjoint(gaussians, frame, [ones] * (len(frame.planes()) - 1), ones)
         adjoint = drain_kernels()
         dr.eval(rendering.render_tangent(gaussians, frame, gaussians))
         tangent = drain_kernels()
@@ -721,10 +753,10 @@ def test_kernels_do_not_depend_on_the_numbers_of_a_lens(lens, other):
 
 def test_each_coefficient_adds_operations_where_it_belongs():
     """A lens without any has those of a pinhole with a bound; compositing never changes."""
-    names = ("k1", "k2", "k3", "k4", "k5", "k6")
-    steps = [{}, {"k1": 0.01}, {"k1": 0.01, "k2": 0.01}, dict.fromkeys(names, 0.01)]
-    steps += [steps[-1] | {"p1": 0.01, "p2": 0.01}]
-    kernels = [kernels_of(effects.Pinhole()), *(kernels_of(OpenCV(**step)) for step in steps)]
+    radial, rational = LENSES["radial"], LENSES["rational"]
+    lenses_of = [effects.Pinhole(), OpenCV(), LENSES["barrel"], radial]
+    lenses_of += [replace(rational, p1=0.0, p2=0.0), rational]
+    kernels = [kernels_of(lens) for lens in lenses_of]
     for fewer, more in pairwise(kernels):
         before, after = operations(fewer), operations(more)
         assert all(before[name] < after[name] for name in before), (before, after)
@@ -733,7 +765,7 @@ def test_each_coefficient_adds_operations_where_it_belongs():
 
 
 def test_each_coefficient_of_a_fisheye_adds_operations():
-    steps = [Fisheye(), Fisheye(0.01), Fisheye(0.01, 0.01), Fisheye(0.01, 0.01, 0.01, 0.01)]
+    steps = [LENSES["plain fisheye"], Fisheye(0.01), LENSES["fisheye"]]
     for fewer, more in pairwise(kernels_of(lens) for lens in steps):
         before, after = operations(fewer), operations(more)
         assert all(before[name] < after[name] for name in before), (before, after)
@@ -744,11 +776,11 @@ def test_each_coefficient_of_a_fisheye_adds_operations():
 # ----------------------------------------------------------------------------------------------
 
 
-@both_precisions
 @pytest.mark.parametrize(
-    ("name", "shape"),
-    [(name, ewa) for name in LENSES] + [("rational", unscented), ("fisheye", unscented)],
-    ids=lambda value: value if isinstance(value, str) else value.__name__,
+    ("name", "shape", "precision"),
+    [(name, ewa, precision) for name in FORMS for precision in (FLOAT32, FLOAT64)]
+    + [("rational", unscented, FLOAT32), ("fisheye", unscented, FLOAT32)],
+    ids=lambda value: value if isinstance(value, str) else getattr(value, "__name__", None),
 )
 def test_positions_that_are_no_numbers_poison_nothing(precision, name, shape):
     """As with them far away: the same picture and the same gradients of all others."""

@@ -162,7 +162,52 @@ def test_valid_radius_of_one_coefficient_is_known():
     assert OpenCV(k4=-0.25).valid_radius == pytest.approx(2.0, rel=1e-12)
     # d/dr r / (1 + k4 r^2) vanishes where 1 = k4 r^2.
     assert OpenCV(k4=0.25).valid_radius == pytest.approx(2.0, rel=1e-12)
-    assert OpenCV(p1=0.1, p2=0.1).valid_radius == math.inf
+
+
+@pytest.mark.parametrize(("p1", "p2"), [(0.25, 0.0), (-0.03, 0.04), (1e-4, -2e-4)])
+def test_tangential_terms_alone_fold_on_one_side(p1, p2):
+    """Along s = -r (p2, p1) / q the distorted slope is -(r - 3 q r^2) (p2, p1) / q."""
+    lens, q = OpenCV(p1=p1, p2=p2), math.hypot(p1, p2)
+    assert lens.valid_radius == pytest.approx(1 / (6 * q), rel=1e-12)
+    toward = -np.array([p2, p1]) / q
+    for part in (0.5, 0.99):
+        beyond = (1 / (3 * q) - part * lens.valid_radius) * toward
+        images = [lens.distorted(s) for s in (part * lens.valid_radius * toward, beyond)]
+        np.testing.assert_allclose(*images, rtol=1e-9)
+
+
+@pytest.mark.parametrize("k1", [-0.3, 0.3])
+def test_within_its_radius_a_lens_with_tangential_terms_is_undone(k1):
+    """In all directions. What a barrel shows is folded just beyond, in that of the terms."""
+    lens = OpenCV(k1=k1, p1=0.18, p2=-0.24)
+    assert lens.valid_radius < OpenCV(k1=k1).valid_radius
+    angles, parts = np.meshgrid(np.linspace(0, 6.2, 40), [0.5, 0.9, 0.999])
+    slopes = (parts * lens.valid_radius)[..., None] * np.stack([np.cos(angles), np.sin(angles)], -1)
+    slopes = slopes.reshape(-1, 2)
+    # Next to the fold the inverse is steeper than the distortion by a factor of 1000.
+    np.testing.assert_allclose(lens.undistorted(lens.distorted(slopes)), slopes, atol=1e-8)
+    toward = lens.valid_radius * np.array([0.8, -0.6])
+    steps = [lens.distorted(f * toward) - lens.distorted((f - 1e-3) * toward) for f in (1, 1.002)]
+    assert steps[0] @ toward > 0 and (steps[1] @ toward < 0) == (k1 < 0)
+
+
+def test_lenses_with_tangential_terms_have_no_fold_within_their_radius():
+    """The determinants of difference quotients, in a disc of each of 40 lenses, are positive."""
+    ended = 0
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        lens = OpenCV(*rng.normal(0, [0.3, 0.1, 0.03, 0.3, 0.1, 0.03, 0.1, 0.1]))
+        ended += lens.valid_radius < 0.99 * replace(lens, p1=0.0, p2=0.0).valid_radius
+        radius = min(lens.valid_radius, 10.0)
+        angles, radii = np.meshgrid(np.linspace(0, 2 * np.pi, 90), np.linspace(0.01, 0.999, 100))
+        slopes = (radius * radii)[..., None] * np.stack([np.cos(angles), np.sin(angles)], -1)
+        h = 1e-6 * radius
+        (a, c), (b, d) = (
+            np.moveaxis((lens.distorted(slopes + step) - lens.distorted(slopes - step)) / h, -1, 0)
+            for step in h * np.eye(2) / 2
+        )
+        assert (a * d - b * c).min() > 0 and (a + d).min() > 0, lens
+    assert ended > 20
 
 
 def test_valid_radius_of_a_touching_derivative_is_where_it_touches():

@@ -185,6 +185,7 @@ class Renderer:
         names = [f"integrator.{name}" for name in PARAMETER_NAMES]
         if case.of_camera:
             names += ["sensor.to_world", "sensor.fx", "sensor.fy"]
+        self.differentiated = names
         for name in names:
             dr.enable_grad(self.params[name])
         weights = np.random.default_rng(0).normal(size=(SIZE, SIZE, 3)).astype(np.float32)
@@ -198,8 +199,10 @@ class Renderer:
 
     def both(self) -> None:
         """And its derivatives."""
+        for name in self.differentiated:
+            dr.clear_grad(self.params[name])
         dr.backward(dr.sum(self._render() * self.weights, axis=None))
-        dr.eval(dr.grad(self.params["integrator.means"]))
+        dr.eval([dr.grad(self.params[name]) for name in self.differentiated])
         dr.sync_thread()
 
     def _render(self) -> mi.TensorXf:

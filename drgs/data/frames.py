@@ -41,6 +41,9 @@ DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 PINHOLE_MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
 """Values of ``camera_model`` that are a pinhole camera apart from their distortion."""
 
+RATIONAL_MODEL = "FULL_OPENCV"
+"""The one that has k4 to k6."""
+
 FISHEYE_MODELS = ("SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "OPENCV_FISHEYE")
 
 CLOSE = "transform_matrix_close"
@@ -197,6 +200,7 @@ def lens_of(frame: InheritedValues) -> Any:
         return None
     from drgs import lenses
 
+    _check_fourth(frame, coefficients, model, is_fisheye)
     kind = lenses.Fisheye if is_fisheye else lenses.RadialTangential
     for name in coefficients:
         if name not in kind.names:
@@ -205,6 +209,25 @@ def lens_of(frame: InheritedValues) -> Any:
                 f"{', '.join(kind.names)}, got {name} = {coefficients[name]:g}"
             )
     return kind.of(**coefficients)
+
+
+def _check_fourth(
+    frame: InheritedValues, coefficients: dict[str, float], model: str, is_fisheye: bool
+) -> None:
+    """Raise UserError for a k4 of which one cannot know what it multiplies.
+
+    In OpenCV it is the first coefficient of a denominator, in nerfstudio the fourth of the
+    polynomial. Files that have k5 or k6 mean OpenCV's.
+    """
+    if is_fisheye or model == RATIONAL_MODEL or {"k5", "k6"} & set(coefficients):
+        return
+    if "k4" in coefficients:
+        raise UserError(
+            f"{frame.at('k4')[2]}k4 is read as OpenCV's, of a denominator 1 + k4 r^2, where "
+            f"camera_model is {RATIONAL_MODEL}; nerfstudio's, of a term k4 r^8, is not supported. "
+            f"Got k4 = {coefficients['k4']:g} and camera_model {model}: set camera_model, or "
+            "calibrate without k4"
+        )
 
 
 def distortion_of(frame: InheritedValues) -> dict[str, float]:
