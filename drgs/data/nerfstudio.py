@@ -4,8 +4,9 @@ Intrinsics (``fl_x, fl_y, cx, cy, w, h``) stand at the top or, overriding that, 
 focal lengths are missing, ``camera_angle_x`` (and ``_y``) give them. Views are sorted by file
 name, and every ``data.test_every``-th is for testing, as in Mip-NeRF 360 and 3DGS.
 
-Frames may have a lens, a second pose, a mask and depths: see ``drgs.data.extras``. Depths are z in the camera;
-with a fisheye, the distance from it, as in nerfstudio, where a fisheye's rays have unit length.
+Frames may have a lens, a second pose, a mask and depths: see ``drgs.data.extras``. Depths are z in
+the camera; with a fisheye, the distance from it, as in nerfstudio, where a fisheye's rays have unit
+length.
 """
 
 from __future__ import annotations
