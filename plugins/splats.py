@@ -56,8 +56,7 @@ class _Rendered:
     exposure: Any  # key of the points that were sampled; None: pixel centres
     sensor: SensorState
     gaussians: Gaussians  # detached: holding them keeps their variable indices from being reused
-    surfaces: Any  # SurfaceScene, or None
-    seen: Any  # what is seen of the surfaces, by time and by sample: SeenSurface, or None
+    surfaces: _Looked | None  # what was seen besides splats
 
     def matches(
         self,
@@ -65,7 +64,7 @@ class _Rendered:
         exposure: Any,
         sensor: SensorState,
         gaussians: Gaussians,
-        surfaces: Any,
+        surfaces: _Looked | None,
     ) -> bool:
         """Whether rendering these would give the same frames."""
         indices = dr.detail.collect_indices
@@ -76,6 +75,16 @@ class _Rendered:
             and indices(self.gaussians) == indices(gaussians)
             and self.surfaces is surfaces
         )
+
+
+@dataclass(frozen=True, eq=False)
+class _Looked:
+    """What a sensor saw of a scene's surfaces: reused while neither has changed."""
+
+    surfaces: Any  # drgs.surfaces.SurfaceScene
+    settings: Any  # of the integrator, and the key of the points that were looked at
+    sensor: SensorState
+    seen: list[list[Any]]  # by time and by sample: SeenSurface
 
 
 @dataclass(frozen=True)
@@ -296,6 +305,7 @@ class SplatsIntegrator(mi.CppADIntegrator):
         self.last: LastBackward | None = None
         self._rendered: dict[int, _Rendered] = {}  # by number of the view
         self._surfaces: Any = None  # SurfaceScene of the last scene that had any
+        self._looked: dict[int, _Looked] = {}  # by number of the view
         self._film_maps: dict[str, np.ndarray] = {}  # by description of the film
         self._logged_plan = ""
 
@@ -651,38 +661,48 @@ class SplatsIntegrator(mi.CppADIntegrator):
         """
         pipeline, gaussians = self.pipeline, dr.detach(self.gaussians)
         state = self._sensor_state(view.sensor).detached()
-        surfaces = None if view.hybrid is None else view.hybrid.surfaces
-        key = pipeline, view.key, state, gaussians, surfaces
+        looked = None if view.hybrid is None else self._look(view, state)
+        key = pipeline, view.key, state, gaussians, looked
         last = self._rendered.get(view.index)
         if last is None or not last.matches(*key):
-            cameras = cameras_in_time(self._camera(state))
-            seen = None if surfaces is None else self._seen(view, cameras)
+            seen = repeat(None) if looked is None else looked.seen
             frames = [
                 _render(gaussians, camera, pipeline, view.positions, of_time)
-                for camera, of_time in zip(cameras, seen or repeat(None), strict=False)
+                for camera, of_time in zip(self._cameras_of(state), seen, strict=False)
             ]
-            last = self._rendered[view.index] = _Rendered(frames, *key, seen)
+            last = self._rendered[view.index] = _Rendered(frames, *key)
         return last.frames
 
-    def _seen(self, view: _View, cameras: list[Camera]) -> list[list[Any]]:
-        """What is seen of the surfaces, by time and by sample."""
+    def _look(self, view: _View, state: SensorState) -> _Looked:
+        """At the scene's surfaces, unless the last look was the same."""
         from drgs.surfaces import look_at
 
-        return look_at(
-            view.hybrid.surfaces.scene,
+        surfaces, last = view.hybrid.surfaces, self._looked.get(view.index)
+        settings = view.key, self.hide_emitters
+        if (
+            last is not None
+            and last.surfaces is surfaces
+            and last.settings == settings
+            and last.sensor.same_as(state)
+        ):
+            return last
+        seen = look_at(
+            surfaces.scene,
             view.sensor.film(),
-            cameras,
+            self._cameras_of(state),
             view.within,
             self.hide_emitters,
             with_normals="normal" in self.aovs.values(),
         )
+        looked = self._looked[view.index] = _Looked(surfaces, settings, state, seen)
+        return looked
 
     def _sensor_state(self, sensor: mi.Sensor) -> SensorState:
         return read_sensor(sensor, self.near)
 
-    def _camera(self, state: SensorState) -> Camera:
-        """What of the sensor's camera is simulated, detached."""
-        return without(camera_from_sensor(state), self.ignore)
+    def _cameras_of(self, state: SensorState) -> list[Camera]:
+        """What is simulated of the sensor's camera, detached; of each time."""
+        return cameras_in_time(without(camera_from_sensor(state), self.ignore))
 
     def _camera_tangents(self, sensor: mi.Sensor, count: int) -> list[list[mi.Float] | None]:
         """Of each time's camera, derivatives of its numbers along those set on the sensor."""
@@ -754,7 +774,8 @@ class SplatsIntegrator(mi.CppADIntegrator):
         self, view: _View, planes: list[list[list[mi.Float]]], behind: _Behind
     ) -> list[list[mi.Float]]:
         """What the film gets of each sample per pixel: the mean over the times."""
-        seen = self._rendered[view.index].seen or repeat(repeat(None))
+        looked = self._rendered[view.index].surfaces
+        seen = repeat(repeat(None)) if looked is None else looked.seen
 
         def channels_of(planes: list[mi.Float], surface: Any, color: Any, radiance: Any) -> list:
             if surface is None:

@@ -97,7 +97,7 @@ def rendering_cases() -> list[Case]:
     """The first is what the others are compared with, unless they say otherwise."""
     focal = bench_camera(SIZE).fx
     calibrated = {"type": "calibrated", "fx": focal, "fy": focal}
-    moving = calibrated | {"to_world_close": _to_world(0.02)}
+    moving = calibrated | {"to_world_close": to_world(0.02)}
     fox = {"k1": 0.0578421, "k2": -0.0805099, "p1": -0.000980296, "p2": 0.00015575}
     rational = fox | {"k3": 0.01, "k4": 0.02, "k5": -0.01, "k6": 0.005}
     sky = {"type": "envmap", "bitmap": _bitmap()}
@@ -118,12 +118,12 @@ def rendering_cases() -> list[Case]:
         Case(
             "lens",
             "orthographic",
-            {"type": "orthographic", "to_world": _to_world(0.0) @ wide},
+            {"type": "orthographic", "to_world": to_world(0.0) @ wide},
         ),
         Case(
             "depth of field",
             "thin lens",
-            _perspective() | {"type": "thinlens", "aperture_radius": 0.05, "focus_distance": 3.2},
+            perspective() | {"type": "thinlens", "aperture_radius": 0.05, "focus_distance": 3.2},
         ),
         Case("motion", "blur, 8 times", moving | {"shutter_samples": 8}),
         Case("motion", "rolling shutter", moving | {"shutter": "rolling"}),
@@ -133,7 +133,7 @@ def rendering_cases() -> list[Case]:
     ]
 
 
-def _to_world(shift: float) -> mi.ScalarTransform4f:
+def to_world(shift: float) -> mi.ScalarTransform4f:
     """Of the bench camera, moved to its right; world units."""
     camera, pose = bench_camera(SIZE), np.eye(4)
     pose[:3, :3] = camera.rotation.T * [-1, -1, 1]  # Mitsuba's x is to the left, its y up
@@ -141,7 +141,8 @@ def _to_world(shift: float) -> mi.ScalarTransform4f:
     return mi.ScalarTransform4f(pose)
 
 
-def _perspective() -> dict[str, Any]:
+def perspective() -> dict[str, Any]:
+    """A sensor as the bench camera, without a pose and a film."""
     camera = bench_camera(SIZE)
     fov = float(np.degrees(2 * np.arctan(SIZE / 2 / camera.fx)))
     return {"type": "perspective", "fov": fov, "fov_axis": "x"}
@@ -157,7 +158,7 @@ class Renderer:
     def __init__(self, case: Case, gaussians: Gaussians) -> None:
         """gaussians: numpy, SH of degree 3."""
         sensor = {
-            "to_world": _to_world(0.0),
+            "to_world": to_world(0.0),
             "film": {
                 "type": "hdrfilm",
                 "width": SIZE,
@@ -166,7 +167,7 @@ class Renderer:
                 "rfilter": {"type": "box"},
             },
             "sampler": {"type": "independent", "sample_count": 1},
-            **(case.sensor or _perspective()),
+            **(case.sensor or perspective()),
         }
         uploaded = gaussians.to(mi.TensorXf)
         integrator = {
