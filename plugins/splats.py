@@ -431,6 +431,7 @@ class SplatsIntegrator(mi.CppADIntegrator):
         evaluate: bool = True,
     ) -> mi.TensorXf:
         """Render the Gaussians as seen by ``sensor``; see ``mi.Integrator.render``."""
+        _refuse_recording()
         sensor = self._last_sensor = _resolve_sensor(scene, sensor)
         with dr.suspend_grad():
             self._gather(scene)
@@ -457,6 +458,7 @@ class SplatsIntegrator(mi.CppADIntegrator):
         grad_in: derivative of the loss with respect to the developed image. Leaves
         :class:`LastBackward` in ``self.last``.
         """
+        _refuse_recording()
         sensor = _resolve_sensor(scene, sensor)
         with dr.suspend_grad():
             self._gather(scene)
@@ -529,6 +531,7 @@ class SplatsIntegrator(mi.CppADIntegrator):
         spp: int = 0,
     ) -> mi.TensorXf:
         """Directional derivative of the image along the gradients set on the parameters."""
+        _refuse_recording()
         sensor = _resolve_sensor(scene, sensor)
         with dr.suspend_grad():
             self._gather(scene)
@@ -1124,6 +1127,15 @@ def _check_degree(degree: int, gaussians: Gaussians) -> None:
         raise ValueError(
             f"splats: sh_degree must be an integer from 0 to {stored}, the degree of the "
             f"Gaussians, got {degree!r}"
+        )
+
+
+def _refuse_recording() -> None:
+    """What is launched depends on what is seen, which a recording could not know."""
+    if dr.flag(dr.JitFlag.FreezingScope):
+        raise RuntimeError(
+            "splats: rendering cannot be recorded by dr.freeze, as it reads counts back from the "
+            "device: call mi.render outside of the frozen function"
         )
 
 
