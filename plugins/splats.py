@@ -140,6 +140,7 @@ class SplatsIntegrator(mi.CppADIntegrator):
        - Renders the scene's meshes and other surfaces, if it has any, between which the splats
          are composited by depth. Its ``hide_emitters`` should be that of this integrator.
          (Default: ``path``)
+       - |exposed|, |differentiable|
 
      * - nested_spp
        - |int|
