@@ -38,6 +38,8 @@ class Environment:
             return self._along_rays(camera, place)
         x, y = dr.tile(_disc(LENS_POINTS), dr.width(place))
         radiance = self._along_rays(camera, dr.repeat(place, LENS_POINTS), mi.Vector3f(x, y, 0))
+        if dr.width(radiance) == 1:  # the same from everywhere
+            return radiance
         return mi.Color3f([dr.block_sum(color, LENS_POINTS) for color in radiance]) / LENS_POINTS
 
     def _along_rays(

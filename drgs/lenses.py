@@ -585,6 +585,10 @@ class Orthographic(Lens):
         film = (t.Array2f(x, y) - camera.principal) / camera.focal
         return t.Array3f(film.x, film.y, 0)
 
+    def ray_range(self, direction: Any, near: Any, far: Any) -> tuple[Any, Any]:
+        """Where a ray of unit ``direction`` (camera axes) reaches two depths."""
+        return near / direction.z, far / direction.z
+
 
 # ----------------------------------------------------------------------------------------------
 # Aperture

@@ -43,6 +43,10 @@ FEATURE = "feature_"
 """What the names of parameters begin with that hold numbers of the user's own."""
 
 
+NESTED = -1
+"""Number of the view that ``aov`` asks for."""
+
+
 SHAPES_TO_WORLD = "shapes_to_world"
 """What the names of parameters begin with that tell the ``to_world`` of shapes."""
 
@@ -145,6 +149,7 @@ class SplatsIntegrator(mi.CppADIntegrator):
        - Renders the scene's meshes and other surfaces, if it has any, between which the splats
          are composited by depth. Its ``hide_emitters`` should be that of this integrator.
          (Default: ``path``)
+       - |exposed|, |differentiable|
 
      * - nested_spp
        - |int|
@@ -304,6 +309,7 @@ class SplatsIntegrator(mi.CppADIntegrator):
 
         self.last: LastBackward | None = None
         self._rendered: dict[int, _Rendered] = {}  # by number of the view
+        self._last_sensor: mi.Sensor | None = None  # that was rendered
         self._surfaces: Any = None  # SurfaceScene of the last scene that had any
         self._looked: dict[int, _Looked] = {}  # by number of the view
         self._film_maps: dict[str, np.ndarray] = {}  # by description of the film
@@ -436,7 +442,8 @@ class SplatsIntegrator(mi.CppADIntegrator):
         evaluate: bool = True,
     ) -> mi.TensorXf:
         """Render the Gaussians as seen by ``sensor``; see ``mi.Integrator.render``."""
-        sensor = _resolve_sensor(scene, sensor)
+        _refuse_recording()
+        sensor = self._last_sensor = _resolve_sensor(scene, sensor)
         with dr.suspend_grad():
             self._gather(scene)
             self._log_plan(scene, sensor)
@@ -462,6 +469,7 @@ class SplatsIntegrator(mi.CppADIntegrator):
         grad_in: derivative of the loss with respect to the developed image. Leaves
         :class:`LastBackward` in ``self.last``.
         """
+        _refuse_recording()
         sensor = _resolve_sensor(scene, sensor)
         with dr.suspend_grad():
             self._gather(scene)
@@ -534,6 +542,7 @@ class SplatsIntegrator(mi.CppADIntegrator):
         spp: int = 0,
     ) -> mi.TensorXf:
         """Directional derivative of the image along the gradients set on the parameters."""
+        _refuse_recording()
         sensor = _resolve_sensor(scene, sensor)
         with dr.suspend_grad():
             self._gather(scene)
@@ -572,12 +581,39 @@ class SplatsIntegrator(mi.CppADIntegrator):
             sensor.film().clear()  # it holds an attached block
         return d_image
 
-    def sample(self, *args: Any, **kwargs: Any) -> Any:
-        """Refused: splats are composited over whole images, not along single rays."""
-        raise NotImplementedError(
-            "splats: this integrator renders whole images and cannot be nested in an integrator "
-            "that samples single rays, such as 'moment' or 'aov'"
-        )
+    def sample(
+        self, *, scene: mi.Scene, sampler: mi.Sampler, ray: Any, active: Any, **others: Any
+    ) -> tuple[mi.Color3f, mi.Bool, list[mi.Float], None]:
+        """What the rays of a whole picture see: for ``aov``, all others are refused.
+
+        See ``drgs.nesting``. Not differentiated, which ``aov`` only asks for the AOVs.
+        """
+        from drgs.nesting import PictureRays
+
+        del others
+        sensor = self._last_sensor
+        objects = [self, *scene.shapes(), *([] if sensor is None else [sensor])]
+        attached = any(dr.grad_enabled(value) for o in objects for _, value in mi.traverse(o))
+        with dr.suspend_grad():
+            rays = PictureRays.of(sensor, self.near, dr.detach(ray))
+            if self.aovs and attached:
+                raise NotImplementedError(
+                    "splats: inside 'aov', derivatives with 'aovs' of this integrator are not "
+                    "supported: leave them out, or render it alone"
+                )
+            self._gather(scene)
+            hybrid = self._hybrid(scene, sensor, 0, 1)
+            # With a single sample, what is seen of edges would be the mean over their pixels.
+            times = 2 if rays.count == 1 and hybrid is not None else 1
+            points, within = times * rays.positions, times * rays.within
+            view = _View(NESTED, sensor, points, within, rays, True, hybrid)
+            behind = self._behind(scene, view, self._constant())
+            channels = rays.gathered(self._channels(view, self._planes(view), behind))
+            del self._rendered[NESTED]
+            if hybrid is not None:
+                channels = rays.with_surfaces(channels, hybrid, sampler, active)
+            red, green, blue, alpha, *aovs = channels
+            return mi.Color3f(red, green, blue), active & (alpha > 0), aovs, None
 
     def _shot(self, scene: mi.Scene, sensor: mi.Sensor, seed: Any, spp: int) -> _Shot:
         """One picture: where the sensor's pixels are evaluated, and how its film develops them."""
@@ -1113,6 +1149,15 @@ def _check_degree(degree: int, gaussians: Gaussians) -> None:
         raise ValueError(
             f"splats: sh_degree must be an integer from 0 to {stored}, the degree of the "
             f"Gaussians, got {degree!r}"
+        )
+
+
+def _refuse_recording() -> None:
+    """What is launched depends on what is seen, which a recording could not know."""
+    if dr.flag(dr.JitFlag.FreezingScope):
+        raise RuntimeError(
+            "splats: rendering cannot be recorded by dr.freeze, as it reads counts back from the "
+            "device: call mi.render outside of the frozen function"
         )
 
 

@@ -57,6 +57,7 @@ LAYERS = {
         "guards",
         "losses",
         "metrics",
+        "nesting",
         "optimizer",
         "output",
         "pixels",

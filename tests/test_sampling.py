@@ -168,7 +168,9 @@ def pictures_at(points) -> np.ndarray:
 MEAN_ERROR = 1e-5
 
 
-@pytest.mark.parametrize("sampler", ["independent", "stratified", "multijitter", "ldsampler"])
+@pytest.mark.parametrize(
+    "sampler", ["independent", "stratified", "multijitter", "orthogonal", "ldsampler"]
+)
 def test_a_box_filter_averages_the_samples(sampler):
     loaded = SCENE.load(samples=4, sampler=sampler)
     image = image_of(loaded, seed=3)

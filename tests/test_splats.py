@@ -1586,15 +1586,3 @@ def test_other_sensors_are_refused():
     assert message_of(caught.value).startswith(
         "splats: the sensor must be of type perspective, thinlens, orthographic or calibrated, got "
     )
-
-
-@pytest.mark.parametrize("outer", [{"type": "moment"}, {"type": "aov", "aovs": "d:depth"}])
-def test_it_cannot_be_nested(outer):
-    integrator = outer | {"nested": {"type": "splats", **valid()}}
-    loaded = mi.load_dict({"type": "scene", "integrator": integrator, "sensor": VIEWS[0].sensor()})
-    with pytest.raises(RuntimeError) as caught:
-        mi.render(loaded)
-    assert message_of(caught.value) == (
-        "splats: this integrator renders whole images and cannot be nested in an integrator "
-        "that samples single rays, such as 'moment' or 'aov'"
-    )
