@@ -609,7 +609,8 @@ class SplatsIntegrator(mi.CppADIntegrator):
             view = _View(NESTED, sensor, points, within, rays, True, hybrid)
             behind = self._behind(scene, view, self._constant())
             channels = rays.gathered(self._channels(view, self._planes(view), behind))
-            del self._rendered[NESTED]
+            self._rendered.pop(NESTED)
+            self._looked.pop(NESTED, None)
             if hybrid is not None:
                 channels = rays.with_surfaces(channels, hybrid, sampler, active)
             red, green, blue, alpha, *aovs = channels

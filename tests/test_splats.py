@@ -1354,7 +1354,7 @@ def test_a_plan_of_a_plain_scene():
         "simulated:\n"
         "  view dependence: spherical harmonics up to degree 1 (the Gaussians' coefficients)\n"
         "  background: a constant colour (the integrator's background)\n"
-        "  not simulated: lens, depth of field, motion, antialiasing"
+        "  not simulated: lens, depth of field, motion, antialiasing, surfaces"
     )
 
 
@@ -1369,7 +1369,7 @@ def test_a_plan_names_what_asked_for_each_effect():
         "  motion: rolling shutter (the sensor)\n"
         "  antialiasing: opacities compensated for the low-pass filter, 3D smoothing filter "
         "(antialiased, the Gaussians' filter)\n"
-        "  not simulated: view dependence, depth of field"
+        "  not simulated: view dependence, depth of field, surfaces"
     )
     ignored = plan_of(sensor, **settings, ignore="distortion, motion, smoothing")
     assert "  not simulated: view dependence, lens, depth of field, motion" in ignored
@@ -1578,7 +1578,7 @@ def test_other_sensors_are_refused():
         {
             "type": "scene",
             "integrator": {"type": "splats", **valid()},
-            "s": {"type": "batch", "inner": {"type": "perspective"}},
+            "s": {"type": "radiancemeter"},
         }
     )
     with pytest.raises(RuntimeError) as caught:
