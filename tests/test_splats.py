@@ -1372,7 +1372,8 @@ def test_a_plan_names_what_asked_for_each_effect():
         "  not simulated: view dependence, depth of field, surfaces"
     )
     ignored = plan_of(sensor, **settings, ignore="distortion, motion, smoothing")
-    assert "  not simulated: view dependence, lens, depth of field, motion" in ignored
+    absent = "view dependence, lens (ignored), depth of field, motion (ignored)"
+    assert f"  not simulated: {absent}, smoothing filter (ignored), surfaces" in ignored
     assert "3D smoothing" not in ignored
     defocused = plan_of(sensor_like(VIEWS[1], "thinlens", **BLURRED), sky=True, hide_emitters=True)
     assert "  depth of field: a thin lens (the sensor)\n" in defocused
@@ -1578,7 +1579,7 @@ def test_other_sensors_are_refused():
         {
             "type": "scene",
             "integrator": {"type": "splats", **valid()},
-            "s": {"type": "radiancemeter"},
+            "s": {"type": "radiancemeter", "film": {"type": "hdrfilm", "width": 1, "height": 1}},
         }
     )
     with pytest.raises(RuntimeError) as caught:
