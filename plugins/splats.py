@@ -7,7 +7,7 @@ Executed once per Mitsuba variant (see ``drgs.plugins``). The rasterizer itself 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import reduce
 from itertools import chain, repeat
 from typing import Any
@@ -19,7 +19,6 @@ import numpy as np
 from drgs import rendering
 from drgs.arrays import interleave
 from drgs.camera import (
-    IGNORABLE,
     Camera,
     SensorState,
     camera_from_sensor,
@@ -27,28 +26,30 @@ from drgs.camera import (
     read_sensor,
     without,
 )
-from drgs.choices import Choices
 from drgs.constants import NEAR
 from drgs.exposure import CenterExposure
 from drgs.gaussians import PARAMETER_NAMES, Gaussians
-from drgs.io.ply import read_ply
+from drgs.properties import (
+    AOVS,
+    aovs_of,
+    background_of,
+    boolean,
+    check_degree,
+    check_shapes,
+    choices_of,
+    ignored_effects,
+    load_gaussians,
+    nested_integrator,
+    positive,
+    turns_of_shapes,
+    whole_number,
+)
 
 SUPPORTED_VARIANTS = ("llvm_ad_rgb", "cuda_ad_rgb")
 
 
-AOVS = {"depth": ("T",), "alpha": ("I",), "normal": ("X", "Y", "Z")}
-"""What may be put out besides colour, and the names of its channels as Mitsuba has them."""
-
-FEATURE = "feature_"
-"""What the names of parameters begin with that hold numbers of the user's own."""
-
-
 NESTED = -1
 """Number of the view that ``aov`` asks for."""
-
-
-SHAPES_TO_WORLD = "shapes_to_world"
-"""What the names of parameters begin with that tell the ``to_world`` of shapes."""
 
 
 @dataclass(frozen=True)
@@ -289,23 +290,23 @@ class SplatsIntegrator(mi.CppADIntegrator):
                 f"use mi.set_variant('{SUPPORTED_VARIANTS[0]}')"
             )
         super().__init__(props)
-        gaussians = _load_gaussians(props)
+        gaussians = load_gaussians(props)
         for name in PARAMETER_NAMES:
             setattr(self, name, getattr(gaussians, name))
         self.smoothing, self.features = gaussians.smoothing, gaussians.features or {}
-        self._has_own, self._turns = gaussians.num_gaussians > 0, _turns(props)
+        self._has_own, self._turns = gaussians.num_gaussians > 0, turns_of_shapes(props)
         self._gathered: Any = None  # with those of the scene's shapes: see drgs.shapes
-        self.ignore = _ignored(props)
-        self.aovs = _aovs(props, [*AOVS, *self.features])
+        self.ignore = ignored_effects(props)
+        self.aovs = aovs_of(props, [*AOVS, *self.features])
         self.sh_degree = props.get("sh_degree", gaussians.sh_degree)
         self._sh_degree_is_given = "sh_degree" in props
-        self.background = _background(props)
-        self.hide_emitters = _boolean(props, "hide_emitters", False)
-        self.choices = _choices(props)
-        self.near = _positive(props, "near", NEAR)
-        self.srgb_primitives = _boolean(props, "srgb_primitives", True)
-        self.nested = _nested(props)
-        self.nested_spp = _count(props, "nested_spp", 0)
+        self.background = background_of(props)
+        self.hide_emitters = boolean(props, "hide_emitters", False)
+        self.choices = choices_of(props)
+        self.near = positive(props, "near", NEAR)
+        self.srgb_primitives = boolean(props, "srgb_primitives", True)
+        self.nested = nested_integrator(props)
+        self.nested_spp = whole_number(props, "nested_spp", 0)
 
         self.last: LastBackward | None = None
         self._rendered: dict[int, _Rendered] = {}  # by number of the view
@@ -344,8 +345,8 @@ class SplatsIntegrator(mi.CppADIntegrator):
             return
         if dr.width(self.shN) == 0:  # not exposed, so that its rows could not be set
             self.shN = dr.zeros(mi.TensorXf, (next(iter(self.means.shape), 0), 0, 3))
-        _check_shapes(replace(self._own, features=self.features))
-        _check_degree(self.sh_degree, self._own)
+        check_shapes(replace(self._own, features=self.features))
+        check_degree(self.sh_degree, self._own)
 
     @property
     def sh_degree(self) -> int:
@@ -356,7 +357,7 @@ class SplatsIntegrator(mi.CppADIntegrator):
 
     @sh_degree.setter
     def sh_degree(self, degree: int) -> None:
-        _check_degree(degree, self.gaussians)
+        check_degree(degree, self.gaussians)
         self._sh_degree, self._sh_degree_is_given = int(degree), True
 
     @property
@@ -374,7 +375,7 @@ class SplatsIntegrator(mi.CppADIntegrator):
             from drgs.shapes import gather
 
             self._gathered = gather(self._own, shapes, self._turns, self._gathered)
-            _check_degree(self.sh_degree, self._gathered.gaussians)
+            check_degree(self.sh_degree, self._gathered.gaussians)
         else:
             self._gathered = None
         if self.gaussians.num_gaussians == 0:
@@ -932,121 +933,8 @@ def _render(
     return [frame, *(rendering.render_again(frame, model) for model in others)]
 
 
-def _load_gaussians(props: mi.Properties) -> Gaussians:
-    """The Gaussians of a scene description: a PLY file, or six tensors; or none."""
-    given = [name for name in PARAMETER_NAMES if name in props]
-    features = {n: _tensor(props, n) for n in props.keys() if n.startswith(FEATURE)}  # noqa: SIM118
-    if "filename" in props:
-        if given:
-            raise ValueError(
-                f"splats: give either 'filename' or tensors, got both ({', '.join(given)})"
-            )
-        path = mi.file_resolver().resolve(str(props["filename"]))
-        gaussians = replace(read_ply(str(path)).to(mi.TensorXf), features=features)
-    elif given or features or "smoothing" in props or "to_world" in props:
-        missing = [name for name in PARAMETER_NAMES if name not in given and name != "shN"]
-        if missing:
-            raise ValueError(
-                "splats: give 'filename', or the Gaussians as tensors "
-                f"{', '.join(PARAMETER_NAMES)}; missing: {', '.join(missing)}"
-            )
-        values = {name: _tensor(props, name) for name in given}
-        if "shN" not in given:
-            values["shN"] = dr.zeros(mi.TensorXf, (values["means"].shape[0], 0, 3))
-        values["logit_opacities"] = mi.Float(values["logit_opacities"].array)
-        if "smoothing" in props:
-            values["smoothing"] = mi.Float(_tensor(props, "smoothing").array)
-        gaussians = Gaussians(**values, features=features)
-    else:
-        shapes = {"means": (0, 3), "quats": (0, 4), "log_scales": (0, 3)}
-        shapes |= {"sh0": (0, 1, 3), "shN": (0, 0, 3)}
-        tensors = {name: dr.zeros(mi.TensorXf, shape) for name, shape in shapes.items()}
-        return Gaussians(**tensors, logit_opacities=mi.Float())
-    _check_shapes(gaussians)
-    if "to_world" in props:
-        from drgs.similarity import Similarity
-
-        to_world = Similarity.of(_matrix(props, "to_world"), "splats: to_world")
-        moved = to_world.of_gaussians(gaussians.numpy()).to(mi.TensorXf)
-        gaussians = replace(moved, features=features)
-    return gaussians
-
-
 def _ellipsoids(scene: mi.Scene) -> list[mi.Shape]:
     return [shape for shape in scene.shapes() if shape.is_ellipsoids()]
-
-
-def _turns(props: mi.Properties) -> dict[str, Any]:
-    """By ids of shapes, and under "" for all others: how their spherical harmonics turn."""
-    names = [name for name in props.keys() if name.startswith(SHAPES_TO_WORLD)]  # noqa: SIM118
-    if not names:
-        return {}
-    from drgs.shapes import Turn
-    from drgs.similarity import Similarity
-
-    turns = {}
-    for name in names:
-        shape = name.removeprefix(SHAPES_TO_WORLD).removeprefix("_")
-        turns[shape] = Turn.by(Similarity.of(_matrix(props, name), f"splats: {name}").rotation)
-    return turns
-
-
-def _matrix(props: mi.Properties, name: str) -> np.ndarray:
-    """(4, 4) of a transform."""
-    value = props[name]
-    if not hasattr(value, "matrix"):
-        raise TypeError(f"splats: {name} must be a transform, got {type(value).__name__}")
-    return np.array(value.matrix, np.float64)
-
-
-def _tensor(props: mi.Properties, name: str) -> mi.TensorXf:
-    """A tensor of the integrator's own: parameters are assigned in place, the caller's are not."""
-    value = props[name]
-    if not dr.is_array_v(value):
-        raise TypeError(f"splats: {name} must be a tensor, got {type(value).__name__}")
-    if not dr.is_jit_v(value):
-        # Three numbers, which a property set turns into a vector on the host.
-        value = mi.Float(list(value))
-    return mi.TensorXf(value)
-
-
-def _background(props: mi.Properties) -> mi.Color3f | mi.Texture:
-    value = props.get("background", 0.0)
-    if isinstance(value, mi.Texture):
-        return value
-    try:
-        return mi.Color3f(value)
-    except TypeError:
-        raise TypeError(
-            "splats: background must be an RGB colour, such as [1, 1, 1] or "
-            f"<rgb value='1, 1, 1'/>, or a texture, got {type(value).__name__}"
-        ) from None
-
-
-def _ignored(props: mi.Properties) -> tuple[str, ...]:
-    words = [word.strip() for word in str(props.get("ignore", "")).split(",") if word.strip()]
-    for word in words:
-        if word not in IGNORABLE:
-            raise ValueError(
-                f"splats: ignore must be a list of {', '.join(IGNORABLE)}, got {word!r}"
-            )
-    return tuple(words)
-
-
-def _aovs(props: mi.Properties, kinds: Sequence[str]) -> dict[str, str]:
-    """By name: what is put out, one of ``kinds``."""
-    aovs = {}
-    for item in str(props.get("aovs", "")).split(","):
-        if not item.strip():
-            continue
-        name, _, kind = (part.strip() for part in item.partition(":"))
-        if not name or kind not in kinds or name in aovs:
-            raise ValueError(
-                f"splats: aovs must be a list of name:type with names of their own and types of "
-                f"{', '.join(kinds)}, got {item.strip()!r}"
-            )
-        aovs[name] = kind
-    return aovs
 
 
 def _composited_feature(kind: str) -> rendering.Feature:
@@ -1055,102 +943,6 @@ def _composited_feature(kind: str) -> rendering.Feature:
     from drgs.extra_features import NamedFeature, normal_features
 
     return normal_features if kind == "normal" else NamedFeature(kind)
-
-
-def _boolean(props: mi.Properties, name: str, default: bool) -> bool:
-    value = props.get(name, default)
-    if not isinstance(value, bool):
-        raise TypeError(f"splats: {name} must be true or false, got {value!r}")
-    return value
-
-
-def _nested(props: mi.Properties) -> mi.Integrator | None:
-    """The nested integrator, under whatever name it was given."""
-    # Objects alone: whatever is read counts as known, and a mistyped name would not be refused.
-    is_object = mi.Properties.Type.Object
-    objects = [props[name] for name in props.keys() if props.type(name) == is_object]  # noqa: SIM118
-    nested = [value for value in objects if isinstance(value, mi.Integrator)]
-    if len(nested) > 1:
-        raise ValueError(f"splats: at most one integrator can be nested, got {len(nested)}")
-    return nested[0] if nested else None
-
-
-def _count(props: mi.Properties, name: str, default: int) -> int:
-    value = props.get(name, default)
-    if isinstance(value, bool) or not isinstance(value, int) or value < 0:
-        raise ValueError(f"splats: {name} must be a whole number, 0 or more, got {value!r}")
-    return value
-
-
-def _positive(props: mi.Properties, name: str, default: float) -> float:
-    value = props.get(name, default)
-    if not (isinstance(value, int | float) and value > 0):
-        raise ValueError(f"splats: {name} must be a positive number, got {value!r}")
-    return float(value)
-
-
-_EXPECTED = {bool: "true or false", int: "an integer", float: "a number", str: "text"}
-
-
-def _choices(props: mi.Properties) -> Choices:
-    """The choices of accuracy among the parameters; of the types that the defaults have."""
-    values = {}
-    for field in fields(Choices):
-        if field.name in props:
-            value, expected = props[field.name], type(field.default)
-            if expected is float and type(value) is int:
-                value = float(value)
-            if type(value) is not expected:
-                raise TypeError(
-                    f"splats: {field.name} must be {_EXPECTED[expected]}, got {value!r}"
-                )
-            values[field.name] = value
-    try:
-        return Choices(**values)
-    except ValueError as error:
-        raise ValueError(f"splats: {error}") from None
-
-
-def _check_shapes(gaussians: Gaussians) -> None:
-    num = next(iter(gaussians.means.shape), 0)
-    if num == 0:
-        raise ValueError("splats: at least one Gaussian is needed, got none")
-    rows = {
-        "means": [(3,)],
-        "quats": [(4,)],
-        "log_scales": [(3,)],
-        "logit_opacities": [()],
-        "sh0": [(1, 3)],
-        "shN": [((degree + 1) ** 2 - 1, 3) for degree in range(4)],
-    }
-    for name, allowed in rows.items():
-        got = tuple(getattr(gaussians, name).shape)
-        if got not in [(num, *row) for row in allowed]:
-            expected = " or ".join(f"({', '.join(map(str, ('N', *row)))})" for row in allowed)
-            raise ValueError(
-                f"splats: {name} must have the shape {expected}, with N = {num} the rows of "
-                f"means, got {got}"
-            )
-    for name, tensor in (gaussians.features or {}).items():
-        if len(tensor.shape) != 2 or tensor.shape[0] != num or tensor.shape[1] == 0:
-            raise ValueError(
-                f"splats: {name} must have the shape (N, C), with N = {num} the rows of means and "
-                f"C at least 1, got {tuple(tensor.shape)}"
-            )
-    if gaussians.smoothing is not None and dr.width(gaussians.smoothing) != num:
-        raise ValueError(
-            f"splats: smoothing must have the shape (N), with N = {num} the rows of means, got "
-            f"({dr.width(gaussians.smoothing)},)"
-        )
-
-
-def _check_degree(degree: int, gaussians: Gaussians) -> None:
-    stored = gaussians.sh_degree if gaussians.num_gaussians > 0 else 3
-    if degree not in range(stored + 1):
-        raise ValueError(
-            f"splats: sh_degree must be an integer from 0 to {stored}, the degree of the "
-            f"Gaussians, got {degree!r}"
-        )
 
 
 def _refuse_recording() -> None:

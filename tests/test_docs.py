@@ -4,6 +4,7 @@ import ast
 import re
 from dataclasses import dataclass, fields
 from fractions import Fraction
+from itertools import chain
 
 import mitsuba as mi
 import numpy as np
@@ -62,7 +63,10 @@ def table(plugin) -> list[Row]:
 def names_read(plugin) -> set[str]:
     """Every name that the code asks a property set for, itself or through a function."""
     names = set()
-    for node in ast.walk(ast.parse(source(plugin))):
+    reading = [source(plugin)]
+    if plugin == "splats":
+        reading.append((REPOSITORY / "drgs" / "properties.py").read_text())
+    for node in chain.from_iterable(ast.walk(ast.parse(text)) for text in reading):
         if isinstance(node, ast.Call):
             of_props = isinstance(node.func, ast.Attribute) and _is_props(node.func.value)
             found = node.args[:1] if of_props else []

@@ -62,6 +62,7 @@ LAYERS = {
         "output",
         "pixels",
         "plan",
+        "properties",
         "sampling",
         "scene",
         "schedule",
