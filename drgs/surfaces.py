@@ -23,7 +23,8 @@ with that its silhouette.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -343,13 +344,14 @@ class Hybrid:
 
     def picture(self) -> mi.TensorXf:
         """The nested one, developed. Leaves the film with it."""
-        return self.integrator.render(
-            self.surfaces.scene, sensor=self.sensor, seed=self.seed, spp=self.spp
-        )
+        with _sample_count_kept(self.sensor):
+            return self.integrator.render(
+                self.surfaces.scene, sensor=self.sensor, seed=self.seed, spp=self.spp
+            )
 
     def backward(self, params: Any, d_picture: mi.TensorXf) -> None:
         """Accumulate derivatives into the parameters of surfaces and emitters."""
-        with dr.resume_grad():
+        with dr.resume_grad(), _sample_count_kept(self.sensor):
             if self.surfaces.is_attached(self.sensor):
                 self.integrator.render_backward(
                     self.surfaces.scene, params, d_picture, self.sensor, self.seed, self.spp
@@ -357,9 +359,23 @@ class Hybrid:
 
     def tangent(self, params: Any, picture: mi.TensorXf) -> mi.TensorXf:
         """Directional derivative of the nested picture, along those set on the parameters."""
-        with dr.resume_grad():
+        with dr.resume_grad(), _sample_count_kept(self.sensor):
             if self.surfaces.is_attached(self.sensor):
                 return self.integrator.render_forward(
                     self.surfaces.scene, params, self.sensor, self.seed, self.spp
                 )
         return dr.zeros(mi.TensorXf, picture.shape)
+
+
+@contextmanager
+def _sample_count_kept(sensor: mi.Sensor) -> Iterator[None]:
+    """Mitsuba's integrators leave theirs with the sampler: the splats' next picture would have it.
+
+    With ``nested_spp``, that would have other samples than the one before, and its gradients.
+    """
+    sampler = sensor.sampler()
+    count = sampler.sample_count()
+    try:
+        yield
+    finally:
+        sampler.set_sample_count(count)

@@ -571,8 +571,9 @@ class SplatsIntegrator(mi.CppADIntegrator):
                         for view, of_view in zip(shot.views, planes, strict=True)
                     ]
                 )
-                # The nested integrator reads the gradients of the inputs again.
-                dr.forward_to(image, flags=dr.ADFlag.ClearEdges | dr.ADFlag.ClearInterior)
+                # The nested integrator, and other pictures of the same pass, read the gradients of
+                # parameters again, also of those that are computed from others.
+                dr.forward_to(image, flags=dr.ADFlag.ClearEdges)
                 d_image = dr.grad(image)
             if shot.hybrid is not None:
                 nested = shot.hybrid.picture()

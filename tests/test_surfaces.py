@@ -413,6 +413,24 @@ def test_a_nested_integrator_can_be_given():
     assert "nested = " in str(scene.integrator())
 
 
+@pytest.mark.parametrize("spp", [0, 4], ids=["its sampler's", "given"])
+def test_samples_of_the_nested_integrator_are_left_to_it(spp):
+    """Mitsuba's integrators leave their count with the sampler: the next picture is the same."""
+    loaded = load(apart(SCENE), wall=Wall(half=0.5), nested_spp=16)
+    first = image_of(loaded, spp=spp, seed=3)
+    assert loaded.sensors()[0].sampler().sample_count() == 1
+    loaded.integrator()._rendered.clear()
+    np.testing.assert_array_equal(image_of(loaded, spp=spp, seed=3), first)
+
+
+def test_gradients_are_those_of_the_picture_whatever_the_nested_samples():
+    """Of splats at the centres of pixels, before a wall that covers the film and has no noise."""
+    scene, weights = apart(SCENE), weights_of(SCENE)
+    alone = gradients_of(load(scene), weights, ["means"])["means"]
+    with_more = gradients_of(load(scene, nested_spp=16), weights, ["means"])["means"]
+    np.testing.assert_allclose(with_more, alone, rtol=0, atol=GRADIENTS * np.abs(alone).max())
+
+
 def test_a_wall_that_has_moved_is_seen_where_it_is():
     scene = apart(SCENE)
     loaded = load(scene)
