@@ -23,7 +23,8 @@ with that its silhouette.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -343,23 +344,39 @@ class Hybrid:
 
     def picture(self) -> mi.TensorXf:
         """The nested one, developed. Leaves the film with it."""
-        return self.integrator.render(
-            self.surfaces.scene, sensor=self.sensor, seed=self.seed, spp=self.spp
-        )
+        with self._samples():
+            return self.integrator.render(
+                self.surfaces.scene, sensor=self.sensor, seed=self.seed, spp=self.spp
+            )
 
     def backward(self, params: Any, d_picture: mi.TensorXf) -> None:
         """Accumulate derivatives into the parameters of surfaces and emitters."""
         with dr.resume_grad():
             if self.surfaces.is_attached(self.sensor):
-                self.integrator.render_backward(
-                    self.surfaces.scene, params, d_picture, self.sensor, self.seed, self.spp
-                )
+                with self._samples():
+                    self.integrator.render_backward(
+                        self.surfaces.scene, params, d_picture, self.sensor, self.seed, self.spp
+                    )
 
     def tangent(self, params: Any, picture: mi.TensorXf) -> mi.TensorXf:
         """Directional derivative of the nested picture, along those set on the parameters."""
         with dr.resume_grad():
             if self.surfaces.is_attached(self.sensor):
-                return self.integrator.render_forward(
-                    self.surfaces.scene, params, self.sensor, self.seed, self.spp
-                )
+                with self._samples():
+                    return self.integrator.render_forward(
+                        self.surfaces.scene, params, self.sensor, self.seed, self.spp
+                    )
         return dr.zeros(mi.TensorXf, picture.shape)
+
+    @contextmanager
+    def _samples(self) -> Iterator[None]:
+        """Leave the sensor its number of samples, which is that of the splats.
+
+        Mitsuba's C++ integrators write theirs into the sensor's sampler.
+        """
+        sampler = self.sensor.sampler()
+        count = sampler.sample_count()
+        try:
+            yield
+        finally:
+            sampler.set_sample_count(count)
