@@ -119,7 +119,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         _check(args)
         mi.set_variant(args.variant)
         if args.what.suffix == ".xml":
-            render_mitsuba_scene(args.what, args.out)
+            render_mitsuba_scene(args.what, args.out, _definitions(args.definitions))
         else:
             model = load_model(args)
             if args.orbit is not None:
@@ -234,14 +234,16 @@ def cameras(args: argparse.Namespace, model: Model) -> list[Viewpoint]:
     return [pinhole("camera", pose, *(size or DEFAULT_SIZE), args.fov or FIELD_OF_VIEW)]
 
 
-def render_mitsuba_scene(path: Path, out: Path) -> None:
+def render_mitsuba_scene(path: Path, out: Path, definitions: dict[str, str]) -> None:
     """Render every sensor of a Mitsuba scene with the scene's own integrator.
+
+    definitions: values for the parameters ($name) of the scene file.
 
     The EXR holds all channels as the film has them, the PNG the colours alone, sRGB-encoded. What
     a ``splats`` integrator with ``srgb_primitives`` false returns is display space already.
     """
     try:
-        scene = mi.load_file(str(path))
+        scene = mi.load_file(str(path), **definitions)
     except RuntimeError as error:
         raise UserError(f"{path}: {_first_and_last(str(error))}") from None
     if scene.integrator() is None or not scene.sensors():
@@ -300,6 +302,7 @@ def _check(args: argparse.Namespace) -> None:
         _check_unused(args, reason, _OPTIONS)
         _check_variant(args, mi.variants())
     elif args.what.suffix == ".ply" or args.what.is_dir():
+        _check_unused(args, "is for the parameters of a Mitsuba scene (.xml)", ("definitions",))
         _check_variant(args, SPLATS_VARIANTS)
         _check_cameras(args)
         _check_numbers(args)
@@ -339,6 +342,15 @@ def _check_cameras(args: argparse.Namespace) -> None:
         _check_unused(args, "needs --scene CONFIG.yml", ("data", "overrides"))
 
 
+def _definitions(words: Sequence[str]) -> dict[str, str]:
+    """Parameters of a scene file by name."""
+    for word in words:
+        if not word.partition("=")[0].strip() or "=" not in word:
+            raise UserError(f"--define: must be NAME=VALUE, got {word}")
+    pairs = (word.partition("=") for word in words)
+    return {name.strip(): value for name, _, value in pairs}
+
+
 def _check_numbers(args: argparse.Namespace) -> None:
     if args.size is not None and min(args.size) < 1:
         raise UserError(f"--size: must be >= 1 px, got {args.size[0]} {args.size[1]}")
@@ -358,6 +370,9 @@ _OPTIONS = (
 )
 """All options that concern Gaussians."""
 
+_NAMES = {"overrides": "set", "definitions": "define"}
+"""Of options that are not called as the attribute that holds them."""
+
 _UNUSED = {
     "--split": ("target", "up", "fov", "size"),
     "--orbit": ("target",),
@@ -369,8 +384,7 @@ _UNUSED = {
 def _check_unused(args: argparse.Namespace, reason: str, names: Sequence[str]) -> None:
     for name in names:
         if getattr(args, name) not in (None, []):
-            option = "--set" if name == "overrides" else f"--{name}"
-            raise UserError(f"{option}: {reason}")
+            raise UserError(f"--{_NAMES.get(name, name)}: {reason}")
 
 
 def _background(args: argparse.Namespace) -> tuple[float, float, float] | Path:
@@ -459,6 +473,15 @@ def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
         default=[],
         metavar="KEY=VALUE",
         help="override a value of the configuration, as in data.image_size=200; repeatable",
+    )
+    add(
+        "--define",
+        "-D",
+        dest="definitions",
+        action="append",
+        default=[],
+        metavar="NAME=VALUE",
+        help="a parameter of a Mitsuba scene file, as in model=point_cloud.ply; repeatable",
     )
     add("--variant", default="llvm_ad_rgb", help="Mitsuba variant (default: llvm_ad_rgb)")
     add_options(parser)

@@ -403,6 +403,34 @@ def test_ellipsoids_of_a_scene_look_as_the_same_file_of_the_integrator(tmp_path)
     np.testing.assert_allclose(*pair, atol=1e-5)
 
 
+def test_parameters_of_a_scene_file_can_be_given(tmp_path):
+    path = write_scene(tmp_path, sensor(pose_around(0.8, 0.3)))
+    path.write_text(
+        path.read_text().replace('"model.ply"', '"$model"').replace("1, 1, 1", "$color")
+    )
+    (tmp_path / "model.ply").rename(tmp_path / "a=b.ply")
+    run(path, "-D", "model=a=b.ply", "--define", "color=1, 1, 1", "--out", tmp_path / "given")
+    (tmp_path / "a=b.ply").rename(tmp_path / "model.ply")
+    run(write_scene(tmp_path, sensor(pose_around(0.8, 0.3))), "--out", tmp_path / "written")
+    pictures = [picture(tmp_path / folder / "blobs.png") for folder in ("given", "written")]
+    np.testing.assert_array_equal(*pictures)
+
+
+def test_the_shipped_scene_shows_objects_among_splats(tmp_path):
+    """Some pixels show what is seen there without the model, others do not."""
+    path = REPOSITORY / "scenes" / "hybrid.xml"
+    values = {"model": str(REPOSITORY / "scenes" / "shapes" / "knot.ply"), "spp": "4"}
+    values |= {"width": "60", "height": "40"}
+    definitions = [word for name in values for word in ("-D", f"{name}={values[name]}")]
+    run(path, *definitions, "--out", tmp_path)
+    shown = np.array(mi.Bitmap(str(tmp_path / "hybrid.exr")))
+    scene = mi.load_file(str(path), **values)
+    objects = np.array(mi.render(scene, integrator=scene.integrator().nested, spp=4))
+    # The file has half precision: 11 bits.
+    agree = np.all(np.abs(shown - objects) <= 1e-3 * (1 + objects), axis=-1)
+    assert 0.3 < agree.mean() < 0.9
+
+
 # ----------------------------------------------------------------------------------------------
 # Errors
 # ----------------------------------------------------------------------------------------------
@@ -432,6 +460,7 @@ def test_ellipsoids_of_a_scene_look_as_the_same_file_of_the_integrator(tmp_path)
         ("", ["--camera", "nowhere.json", "--size", "8", "8"], "nowhere.json: cannot read"),
         ("", ["--data", "nowhere"], "data.path: there is no folder"),
         ("", ["--set", "data.imagesize=3"], "did you mean data.image_size?"),
+        ("", ["-D", "model=x.ply"], "--define: is for the parameters of a Mitsuba scene (.xml)"),
     ],
 )
 def test_user_errors_are_one_line_and_write_nothing(
@@ -512,6 +541,19 @@ def test_options_for_gaussians_are_refused_with_a_scene(tmp_path, capsys):
     path = write_scene(tmp_path, sensor(pose_around(0.8, 0.3)))
     message = fails(capsys, path, "--orbit", "3", "--out", tmp_path / "out")
     assert message.startswith("--orbit: is not used with a Mitsuba scene")
+
+
+@pytest.mark.parametrize("word", ["model", "=model.ply"])
+def test_parameters_without_a_name_or_a_value_are_refused(tmp_path, capsys, word):
+    path = write_scene(tmp_path, sensor(pose_around(0.8, 0.3)))
+    message = fails(capsys, path, "-D", word, "--out", tmp_path / "out")
+    assert message.startswith(f"--define: must be NAME=VALUE, got {word}")
+
+
+def test_parameters_that_a_scene_file_does_not_have_are_refused(tmp_path, capsys):
+    path = write_scene(tmp_path, sensor(pose_around(0.8, 0.3)))
+    message = fails(capsys, path, "-D", "colour=1", "--out", tmp_path / "out")
+    assert message.startswith(f"{path}: ") and "colour" in message
 
 
 def test_it_is_a_command(fit, tmp_path):

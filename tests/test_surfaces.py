@@ -404,6 +404,29 @@ def test_a_scene_without_surfaces_never_runs_the_nested_integrator():
     assert nested.count == 1
 
 
+def test_samples_of_the_nested_integrator_are_not_those_of_the_splats():
+    """Whatever the nested integrator writes into the sensor's sampler."""
+    scene, weights = apart(SCENE), weights_of(SCENE)
+    loaded = load(scene, nested_spp=16)
+    pictures = [image_of(loaded) for _ in range(2)]
+    np.testing.assert_array_equal(*pictures)
+    gradients = [gradients_of(loaded, weights, ["means"])["means"] for _ in range(2)]
+    np.testing.assert_array_equal(gradients[1], 2 * gradients[0])  # they are accumulated
+    assert loaded.sensors()[0].sampler().sample_count() == 1
+
+
+@pytest.mark.parametrize("mode", ["backward", "forward"])
+def test_derivatives_of_a_surface_leave_the_number_of_samples(mode):
+    loaded = load(apart(SCENE), nested_spp=16)
+    params = mi.traverse(loaded)
+    dr.enable_grad(params[RADIANCE_KEY])
+    dr.set_grad(params[RADIANCE_KEY], 1)
+    image = mi.render(loaded, params)
+    derivative = dr.backward if mode == "backward" else dr.forward_to
+    derivative(image)
+    assert loaded.sensors()[0].sampler().sample_count() == 1
+
+
 def test_a_nested_integrator_can_be_given():
     """``direct`` does not see a light by way of another surface."""
     scene = load(apart(SCENE), nested=mi.load_dict({"type": "direct"}))
