@@ -25,11 +25,15 @@ from drgs.camera import Camera, camera_from_sensor, read_sensor
 from drgs.exposure import Channels, pixel_corners
 from drgs.lenses import Orthographic
 from drgs.samples import SamplePoints
+from drgs.shot import View, constant_background, hybrid_of
 
 REFUSAL = (
     "splats: this integrator renders whole images: of those that sample the rays of another one, "
     "such as 'moment', it can only be nested in 'aov'"
 )
+
+NESTED = -1
+"""Number of the view."""
 
 SLACK = 1 / 16
 """px: how far outside of its pixel a ray may be found. Single precision finds it to 1e-3."""
@@ -82,12 +86,41 @@ class PictureRays:
         """Where they start, by sample: x and y from their pixels' upper left corners, px."""
         return tuple((p.x, p.y) for p in self.positions)
 
-    def gathered(self, passes: Sequence[Channels]) -> Channels:
+    def channels(
+        self,
+        integrator: Any,
+        scene: mi.Scene,
+        sensor: mi.Sensor,
+        sampler: mi.Sampler,
+        active: mi.Bool,
+    ) -> Channels:
+        """What the rays see, each Float (H * W * count,): colour, alpha, AOVs of the integrator."""
+        hybrid = hybrid_of(integrator, scene, sensor, 0, 1)
+        # With a single sample, what is seen of edges would be the mean over their pixels.
+        times = 2 if self.count == 1 and hybrid is not None else 1
+        view = View(
+            integrator=integrator,
+            scene=scene,
+            index=NESTED,
+            sensor=sensor,
+            positions=times * self.positions,
+            within=times * self.within,
+            key=self,
+            has_alpha=True,
+            hybrid=hybrid,
+        )
+        channels = self._gathered(view.channels(view.planes(), constant_background(integrator)))
+        integrator.memory.forget_view(NESTED)
+        if hybrid is not None:
+            channels = self._with_surfaces(channels, hybrid, sampler, active)
+        return channels
+
+    def _gathered(self, passes: Sequence[Channels]) -> Channels:
         """Channels by ray, from those by pixel of each sample."""
         planes = zip(*passes[: self.count], strict=True)
         return [mi.Float(interleave(list(of_samples))) for of_samples in planes]
 
-    def with_surfaces(
+    def _with_surfaces(
         self, channels: Channels, hybrid: Any, sampler: mi.Sampler, active: mi.Bool
     ) -> Channels:
         """The channels with what the nested integrator sees along the rays.

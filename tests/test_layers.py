@@ -66,6 +66,7 @@ LAYERS = {
         "sampling",
         "scene",
         "schedule",
+        "shot",
         "shapes",
         "supervision",
         "surfaces",

@@ -449,7 +449,7 @@ def test_what_nobody_asks_for_is_not_computed(name, monkeypatch):
     dr.enable_grad(params["integrator.means"])
 
     def plain():
-        loaded.integrator()._rendered.clear()
+        loaded.integrator().memory.rendered.clear()
         dr.backward(dr.sum(mi.render(loaded, params) * weights, axis=None))
         dr.eval(dr.grad(params["integrator.means"]))
 

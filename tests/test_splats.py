@@ -888,7 +888,7 @@ def test_channels_that_are_not_asked_for_cost_nothing():
     for aovs, count in (("", 4), ("a:alpha", 4), ("z:depth", 5)):
         loaded = with_channels(scene, aovs)
         mi.render(loaded)
-        frames = loaded.integrator()._rendered[0].frames
+        frames = loaded.integrator().memory.rendered[0].frames
         assert len(frames[0][0].planes()) == count
 
 
@@ -1074,7 +1074,7 @@ def test_an_unchanged_scene_is_not_rendered_again():
     loaded = Scene().load()
     dr.eval(mi.render(loaded))
     assert kernels_of(lambda: dr.eval(mi.render(loaded))) <= 2
-    loaded.integrator()._rendered.clear()
+    loaded.integrator().memory.rendered.clear()
     assert kernels_of(lambda: dr.eval(mi.render(loaded))) > 10
 
 
@@ -1254,7 +1254,7 @@ def test_a_new_view_needs_no_new_kernel():
 def test_a_stale_frame_is_not_kept():
     loaded = Scene().load()
     mi.render(loaded)
-    frame = weakref.ref(loaded.integrator()._rendered[0].frames[0][0])
+    frame = weakref.ref(loaded.integrator().memory.rendered[0].frames[0][0])
     params = mi.traverse(loaded)
     params["integrator.means"] = params["integrator.means"] + 1
     params.update()
