@@ -19,8 +19,9 @@ from drgs.exposure import Channels, develop_pixels, num_colors, pixels_adjoint, 
 from drgs.samples import SamplePoints
 
 PASSES_PER_KERNEL = 16
-"""Of more samples per pixel, the sums are evaluated in between: compilers take longer than
-proportionally to a kernel's length."""
+"""Of more samples per pixel, the sums of a box filter are evaluated in between: compilers take
+longer than proportionally to a kernel's length. Of other filters, which reach over many
+pixels, each pass is evaluated by itself."""
 
 
 class SampledExposure:
@@ -73,6 +74,7 @@ class SampledExposure:
         for point, channels in zip(self.positions, passes, strict=True):
             values = with_weight(film, channels, mi.Float(1))
             block.put(corner + mi.Point2f(point.x, point.y), values)
+            dr.eval(block.tensor())  # a kernel for each pass: all are the same one
         film.put_block(block)
         return film.develop()
 
@@ -93,5 +95,6 @@ class SampledExposure:
             dr.enqueue(dr.ADMode.Backward, image)
             dr.traverse(dr.ADMode.Backward)
             derivatives = dr.grad(passes)
-        dr.eval(derivatives)
+        for of_pass in derivatives:
+            dr.eval(of_pass)  # as in develop
         return derivatives

@@ -682,7 +682,7 @@ def test_pictures_are_those_that_are_stored(name):
     assert actual.shape == expected.shape
     error_mean, differing = errors_of_picture(actual, expected)
     assert differing <= 0.01
-    # Rounding to float16 is a mean of at most ln 2 / 2 * 2^-11 = 2^-12.5; pixels that differ may by
+    # Rounding to float16 is 2^-12 of a value at most, on the mean; pixels that differ may do so by
     # Mitsuba's maximum.
     assert error_mean <= 2**-12 + 0.5 * differing
 

@@ -257,6 +257,27 @@ def test_gradients_are_the_transpose_of_the_tangents(samples, rfilter):
         assert size > 0 and abs(left - right) < 1e-5 * size, name
 
 
+@pytest.mark.parametrize("action", ["develop", "adjoint"])
+def test_more_samples_need_no_longer_kernels_for_a_filter(action):
+    """Compilers take longer than proportionally to a kernel's length."""
+    sensor = SCENE.load(rfilter="gaussian").sensors()[0]
+    width, height = sensor.film().crop_size()
+
+    def longest_kernel(samples) -> int:
+        exposure = SampledExposure(sensor, 0, samples, {})
+        with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
+            dr.kernel_history_clear()
+            if action == "develop":
+                planes = [[dr.opaque(mi.Float, 1, width * height)] * 4] * samples
+                dr.eval(exposure.develop(planes))
+            else:
+                dr.eval(exposure.adjoint(dr.full(mi.TensorXf, 1, (height, width, 4))))
+            kernels = dr.kernel_history([dr.KernelType.JIT])
+        return max(kernel["operation_count"] for kernel in kernels)
+
+    assert longest_kernel(6) < 1.2 * longest_kernel(2)
+
+
 def test_a_box_filter_gives_the_same_bytes_in_every_run():
     results = []
     for _ in range(2):
