@@ -1,0 +1,320 @@
+"""Find how a fitted model stands in a path-traced scene, and how that scene is lit and painted.
+
+    python scenes/relight.py out/lego --out out/relight
+
+A model that was fitted to photographs (``python -m drgs.fit``) stands on a path-traced floor under
+a lamp, behind a globe and before a ball: what a splat trainer cannot render, and Mitsuba alone
+cannot either. A picture of this is taken, and what it was made of is forgotten:
+
+- the model's pose: a translation and a rotation
+- the globe's pose: it is turned about its centre
+- the ball's colour and the lamp's
+
+From wrong ones, gradient descent through the composited picture finds the true ones. The unit of
+length is the model's radius. Rotations are quaternions (xyzw), as Dr.Jit has them.
+
+Differentiated: the splats' means, quaternions and spherical harmonics are functions of the model's
+pose, written in Dr.Jit below; what the ``splats`` integrator finds for them becomes the gradient of
+the pose, that of the model's outline included, since splats have soft edges. The nested integrator
+is Mitsuba's ``prb`` (path tracing whose backward pass replays its paths). It finds the gradients of
+the globe's pose, through the texture that turns with it, and those of paint and light.
+
+Not differentiated: whether a splat is in front of a surface, and the outlines of surfaces. So the
+globe turns where it is: to move a surface would need derivatives of its silhouette. What counts is
+how the two stand to each other, and here the model moves. Light does not pass between surfaces and
+splats: the model has no shadow on the floor.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+import drgs  # noqa: F401  (registers the plugin)
+from drgs import reference
+from drgs.arrays import interleave
+from drgs.bench.output import markdown_table, new_figure, write_figure
+from drgs.checks import UserError, exit_on_user_error
+from drgs.files import atomic_path
+from drgs.gaussians import PARAMETER_NAMES, Gaussians
+from drgs.io.ply import read_ply
+from drgs.pictures import write_animation, write_png
+from drgs.sh import sh_basis
+from drgs.similarity import Similarity
+from drgs.viewpoints import OPAQUE, orbit_of_gaussians
+
+
+@dataclass(frozen=True)
+class Unknowns:
+    """What is to be found, in words that a table shows."""
+
+    shift: list[float]  # of the model, in its radii
+    turn: list[float]  # of the model: axis times angle, degrees
+    roll: list[float]  # of the globe: axis times angle, degrees
+    paint: list[float]  # of the ball: reflectance, RGB
+    lamp: list[float]  # RGB, in units of RADIANCE
+
+    def variables(self) -> dict[str, Any]:
+        """For the optimizer."""
+        turn, roll = (
+            mi.Quaternion4f(*Rotation.from_rotvec(v, degrees=True).as_quat().tolist())
+            for v in (self.turn, self.roll)
+        )
+        colors = {"paint": mi.Color3f(self.paint), "lamp": mi.Color3f(self.lamp)}
+        return {"shift": mi.Vector3f(self.shift), "turn": turn, "roll": roll, **colors}
+
+    @staticmethod
+    def of(variables: Any) -> Unknowns:
+        """The inverse of :meth:`variables`."""
+        values = {name: np.array(value).ravel() for name, value in variables.items()}
+        for name in ("turn", "roll"):
+            values[name] = Rotation.from_quat(values[name]).as_rotvec(degrees=True)
+        return Unknowns(**{name: value.tolist() for name, value in values.items()})
+
+
+TRUE = Unknowns([0, 0, 0], [0, 0, 0], [10, -20, 30], [0.75, 0.2, 0.1], [1.0, 0.9, 0.7])
+START = Unknowns([-0.2, 0.15, 0.1], [5, -8, 15], [-10, 5, 0], [0.4] * 3, [0.6] * 3)
+
+RATE, LAST_RATE = 0.02, 0.002
+"""Adam's steps in the first and the last iteration: about what a number changes by."""
+
+SCALES = (1, 2, 4, 8)
+"""px: sides of the blocks whose means are compared. Large ones see a model that is far off, small
+ones place it exactly."""
+
+SPP, TARGET_SPP = 8, 256  # paths per pixel
+FRAME_EVERY = 3  # iterations, of the animation
+FIELD_OF_VIEW = 40.0  # degrees
+GLOBE, GLOBE_RADIUS = [-0.25, -0.95, 0.28], 0.28  # above the floor
+BALL, BALL_RADIUS = [0.55, 0.75, 0.45], 0.45
+RADIANCE = 12.0
+
+
+def main() -> None:
+    """Entry point of the command."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("model", type=Path, metavar="MODEL.ply|OUT_DIR", help="a fitted model")
+    parser.add_argument("--out", type=Path, default=Path("out/relight"), metavar="DIR")
+    parser.add_argument("--iterations", type=int, default=150, metavar="N", help="(default: 150)")
+    parser.add_argument("--size", type=int, default=200, metavar="N", help="px (default: 200)")
+    args = parser.parse_args()
+    with exit_on_user_error():
+        if args.iterations < 1:
+            raise UserError(f"--iterations must be >= 1, got {args.iterations}")
+        if args.size < 1 or args.size % SCALES[-1]:
+            raise UserError(f"--size must be a multiple of {SCALES[-1]} px, got {args.size}")
+        mi.set_variant("llvm_ad_rgb")
+        relight(Stage.of(load(args.model), args.size), args.iterations, args.out)
+
+
+def relight(stage: Stage, iterations: int, out: Path) -> None:
+    """Forget what a picture was made of, find it again, and write what happened."""
+    stage.show(TRUE.variables())
+    target = stage.picture(seed=0, spp=TARGET_SPP)
+    optimizer = mi.ad.Adam(lr=RATE, params=START.variables())
+    losses, frames, start = [], [], time.perf_counter()
+    for iteration in range(iterations):
+        optimizer.set_learning_rate(RATE * (LAST_RATE / RATE) ** (iteration / iterations))
+        stage.show(optimizer)
+        image = stage.picture(seed=1 + iteration, spp=SPP)
+        loss = distance(image, target)
+        dr.backward(loss)
+        optimizer.step()
+        optimizer["paint"] = dr.clip(optimizer["paint"], 0, 1)
+        losses.append(loss.array[0])
+        if iteration % FRAME_EVERY == 0:
+            frames.append(encoded(image))
+        if iteration % 10 == 0 or iteration == iterations - 1:
+            seconds = time.perf_counter() - start
+            print(f"iteration {iteration}: loss {losses[-1]:.2e}, {seconds:.0f} s", flush=True)
+    pictures = {"target": encoded(target)}
+    for name, variables in {"start": START.variables(), "end": optimizer}.items():
+        stage.show(variables)
+        pictures[name] = encoded(stage.picture(seed=0, spp=TARGET_SPP))
+    write(out, pictures, frames, losses, Unknowns.of(optimizer))
+
+
+def distance(image: mi.TensorXf, target: mi.TensorXf) -> mi.TensorXf:
+    """Mean square of the difference of two pictures (H, W, 3), summed over :data:`SCALES`."""
+    difference = image - target
+    height, width, _ = difference.shape
+    blocks = [
+        dr.mean(dr.reshape(difference, (height // s, s, width // s, s, 3)), axis=(1, 3))
+        for s in SCALES
+    ]
+    return sum(dr.mean(dr.square(means), axis=None) for means in blocks)
+
+
+# ----------------------------------------------------------------------------------------------
+# The scene, as a function of the unknowns
+# ----------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class Stage:
+    """Splats and surfaces in one Mitsuba scene."""
+
+    scene: mi.Scene
+    params: Any  # mi.SceneParameters
+    model: Gaussians  # Dr.Jit, as it was fitted
+    globe: Any  # its place: AffineTransform4f
+
+    @staticmethod
+    def of(model: Gaussians, size: int) -> Stage:
+        """Set it up; model: as :func:`load` gives it; size: px, of the picture's sides."""
+        gaussians = model.to(mi.TensorXf)
+        tensors = {name: mi.TensorXf(getattr(model, name)) for name in PARAMETER_NAMES}
+        splats = {"type": "splats", "nested": {"type": "prb", "max_depth": 3}, **tensors}
+        heights = model.means[model.opacities >= OPAQUE, 2]
+        floor = float(np.quantile(heights, 0.01)) if len(heights) else -0.5
+        scene = mi.load_dict({"integrator": splats, **surroundings(floor, size)})
+        params = mi.traverse(scene)
+        place = mi.AffineTransform4f(params["globe.to_world"])  # a copy: Mitsuba writes in place
+        return Stage(scene, params, gaussians, place)
+
+    def show(self, unknowns: Any) -> None:
+        """Make the scene's parameters functions of these variables."""
+        turn, roll = (dr.normalize(unknowns[name]) for name in ("turn", "roll"))
+        rotation = dr.quat_to_matrix(mi.Matrix3f, turn)
+        means = rotation @ dr.unravel(mi.Point3f, self.model.means.array) + unknowns["shift"]
+        w, x, y, z = dr.unravel(mi.Vector4f, self.model.quats.array)
+        quats = turn * mi.Quaternion4f(x, y, z, w)
+        changed = {
+            "integrator.means": rows(means),
+            "integrator.quats": rows([quats.w, quats.x, quats.y, quats.z]),
+            "globe.to_world": self.globe
+            @ mi.AffineTransform4f(dr.quat_to_matrix(mi.Matrix4f, roll)),
+            "ball.bsdf.diffuse_reflectance.value": unknowns["paint"],
+            "lamp.emitter.radiance.value": RADIANCE * unknowns["lamp"],
+        }
+        degree = self.model.sh_degree
+        if degree > 0:
+            changed["integrator.shN"] = sh_rotation(rotation, degree) @ self.model.shN
+        self.params.update(changed)
+
+    def picture(self, seed: int, spp: int) -> mi.TensorXf:
+        """The composited one, linear; spp: paths per pixel. Splats need one sample."""
+        self.scene.integrator().nested_spp = spp
+        return mi.render(self.scene, self.params, seed=seed)
+
+
+def load(path: Path) -> Gaussians:
+    """A fitted model (numpy), moved and scaled to stand around the origin with radius 1."""
+    gaussians = read_ply(path / "point_cloud.ply" if path.is_dir() else path)
+    orbit = orbit_of_gaussians(gaussians, np.array([0.0, 0.0, 1.0]), FIELD_OF_VIEW)
+    radius = orbit.radius * np.sin(np.radians(FIELD_OF_VIEW / 2))
+    return Similarity(1 / radius, np.eye(3), -orbit.focus / radius).of_gaussians(gaussians)
+
+
+def rows(columns: Any) -> mi.TensorXf:
+    """A tensor (N, number of columns)."""
+    return mi.TensorXf(interleave(list(columns)), (dr.width(columns), len(columns)))
+
+
+def sh_rotation(rotation: mi.Matrix3f, degree: int) -> mi.TensorXf:
+    """(K - 1, K - 1): D with c' = D c, the coefficients above degree 0 of a model that is turned.
+
+    What was seen in R^T d is then seen in d. Enough directions d determine D: Y(d) D = Y(R^T d).
+    ``drgs.sh_rotation`` does the same on the host; here it is differentiated.
+    """
+    directions = np.random.default_rng(0).normal(0, 1, (64, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    inverse = np.linalg.pinv(reference.sh_basis(directions, degree)[:, 1:])
+    before = sh_basis(rotation.T @ mi.Vector3f(directions.T), degree)[1:]
+    return mi.TensorXf(inverse.astype(np.float32)) @ rows(before)
+
+
+def surroundings(floor: float, size: int) -> dict[str, Any]:
+    """The scene without its integrator, for ``mi.load_dict``; floor: height; size: px."""
+    T, above = mi.ScalarTransform4f, np.array([0, 0, floor])
+    camera = T().look_at(origin=[1.1, -2.7, 1.3], target=[0, 0, -0.05], up=[0, 0, 1])
+    film = {"type": "hdrfilm", "width": size, "height": size, "pixel_format": "rgb"}
+    film["rfilter"] = {"type": "box"}
+    sampler = {"type": "independent", "sample_count": 1}
+    sensor = {"type": "perspective", "fov": FIELD_OF_VIEW, "to_world": camera, "film": film}
+    lamp = T().look_at(origin=[-2.2, -2.6, 3.4], target=[0, 0, 0], up=[0, 0, 1]).scale(0.7)
+    painted = {"type": "bitmap", "data": waves(), "raw": True}
+
+    def shape(kind: str, to_world: mi.ScalarTransform4f, **others: Any) -> dict[str, Any]:
+        return {"type": kind, "to_world": to_world, **others}
+
+    def sphere(center: list[float], radius: float, bsdf: dict[str, Any]) -> dict[str, Any]:
+        return shape("sphere", T().translate(center + above).scale(radius), bsdf=bsdf)
+
+    return {
+        "type": "scene",
+        "sensor": sensor | {"sampler": sampler},
+        "sky": {"type": "constant", "radiance": rgb([0.4, 0.45, 0.5])},
+        "lamp": shape("rectangle", lamp, emitter={"type": "area", "radiance": rgb([1] * 3)}),
+        "floor": shape("disk", T().translate(above).scale(20)),
+        "globe": sphere(GLOBE, GLOBE_RADIUS, {"type": "diffuse", "reflectance": painted}),
+        "ball": sphere(
+            BALL, BALL_RADIUS, {"type": "roughplastic", "diffuse_reflectance": rgb([0.5] * 3)}
+        ),
+    }
+
+
+def rgb(value: list[float]) -> dict[str, Any]:
+    """A colour, as scene descriptions have it."""
+    return {"type": "rgb", "value": value}
+
+
+def waves() -> mi.TensorXf:
+    """A texture (H, W, 3) for a sphere: smooth and without seams, so that turning it is smooth."""
+    theta, phi = np.mgrid[0.5:64, 0.5:128] * np.pi / 64
+    axes = np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)
+    basis = reference.sh_basis(np.stack(axes, axis=-1).reshape(-1, 3), 2)
+    values = basis @ np.random.default_rng(1).normal(0, 1, (9, 3))
+    return mi.TensorXf((0.5 + 0.4 * np.sin(2 * values)).reshape(64, 128, 3).astype(np.float32))
+
+
+# ----------------------------------------------------------------------------------------------
+# What is written
+# ----------------------------------------------------------------------------------------------
+
+
+def encoded(image: mi.TensorXf) -> np.ndarray:
+    """(H, W, 3) in display space."""
+    return np.array(mi.math.linear_to_srgb(dr.detach(image.array))).reshape(image.shape)
+
+
+def write(
+    out: Path,
+    pictures: dict[str, np.ndarray],
+    frames: list[np.ndarray],
+    losses: list[float],
+    found: Unknowns,
+) -> None:
+    """Pictures, an animation, the losses, and a table of what was found."""
+    target = pictures["target"]
+    pictures["difference"] = 0.5 + 5 * (pictures["end"] - target)
+    for name, picture in pictures.items():
+        write_png(out / f"{name}.png", picture)
+    write_animation(out / "relight.webp", [np.hstack([frame, target]) for frame in frames])
+    figure = new_figure(5, 3)
+    axes = figure.add_subplot()
+    axes.semilogy(losses)
+    axes.set(xlabel="iteration", ylabel="loss")
+    write_figure(out / "loss.png", figure)
+    table = markdown_table(
+        ["", "true", "start", "found"],
+        [
+            [name, *(", ".join(f"{x:.3g}" for x in getattr(u, name)) for u in (TRUE, START, found))]
+            for name in asdict(TRUE)
+        ],
+    )
+    with atomic_path(out / "parameters.md") as temporary:
+        temporary.write_text(table + "\n")
+    print(f"{table}\nwritten: {out}")
+
+
+if __name__ == "__main__":
+    main()
