@@ -383,16 +383,6 @@ class Distortion(Calibrated):
     along = 1.0
 
 
-class MovingCamera(Means):
-    """Blurred by its way to where it is when the shutter closes."""
-
-    picture = "moving_camera"
-
-    def sensor(self):
-        close = mi.ScalarTransform4f().translate([0.3, 0.1, 0]) @ self.to_world()
-        return {"type": "calibrated", "fx": 64.0, "to_world_close": close, "shutter_samples": 4}
-
-
 class CropWindow(Means):
     """Left of the middle of a film that is twice as large."""
 
