@@ -221,7 +221,7 @@ class DefaultCutoffs(Means):
 
     At the end of a splat alpha jumps by 1/255. Where a step of theta moves that past a pixel,
     differences are off by 8 / (12 epsilon 255), 0.13 of Mitsuba's floor. Large splats end flatly,
-    so that larger steps are as good. Measured: mean 0.016, maximum 0.25, of the sum 0.006.
+    so that larger steps are as good. Measured: mean 0.018, maximum 0.22, of the sum 0.005.
     """
 
     picture = "default_cutoffs"
@@ -457,6 +457,18 @@ class Hybrid(Means):
         return {"ball": ball, "light": self.light()}
 
 
+class HybridOpacity(Hybrid):
+    key = "integrator.logit_opacities"
+    along = 1.0
+
+
+class HybridColor(Hybrid):
+    """Also of splats that the ball hides."""
+
+    key = "integrator.sh0"
+    along = 1.0
+
+
 class DiffuseAlbedo(Hybrid):
     key = "ball.bsdf.reflectance.value"
     along = 1.0
@@ -666,8 +678,12 @@ def error_of_backward(kind, actual) -> float:
 
 @pytest.mark.parametrize("name", PICTURES)
 def test_pictures_are_those_that_are_stored(name):
-    """Machines round differently, so that a light path or a splat's end may fall otherwise."""
-    (actual,) = pictures(PICTURES[name], [0.0])
+    """The second, which is as the first: nothing is left behind by one that it could show.
+
+    Machines round differently, so that a light path or a splat's end may fall otherwise.
+    """
+    first, actual = pictures(PICTURES[name], [0.0, 0.0])
+    np.testing.assert_allclose(actual, first, rtol=0, atol=1e-5)  # filters add in any order
     expected = read_reference(name)
     assert actual.shape == expected.shape
     error_mean, differing = errors_of_picture(actual, expected)
