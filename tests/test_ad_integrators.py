@@ -504,14 +504,17 @@ class ConstantEmitterRadiance(BeforeConstantEmitter):
 
 
 class HiddenEmitters(AreaLightRadiance):
-    """A lamp before the ball and a sky, of which only the light on the ball is seen."""
+    """A lamp beside the ball and a sky, of which only the light on the ball is seen.
+
+    Not before the ball: what Mitsuba 3.9 sees through a hidden lamp is not lit by it.
+    """
 
     picture = "hidden_emitters"
     hide_emitters = True
 
     def light(self):
-        lamp = emitter([0.8, 0.5, -0.6], [6.0, 5.0, 4.0])
-        return lamp | {"to_world": lamp["to_world"].scale(0.5)}
+        lamp = emitter([-1.2, 0.7, 0], [6.0, 5.0, 4.0])
+        return lamp | {"to_world": lamp["to_world"].scale(0.4)}
 
     def objects(self):
         sky = {"type": "constant", "radiance": {"type": "rgb", "value": [0.1, 0.2, 0.4]}}
