@@ -221,7 +221,7 @@ class DefaultCutoffs(Means):
 
     At the end of a splat alpha jumps by 1/255. Where a step of theta moves that past a pixel,
     differences are off by 8 / (12 epsilon 255), 0.13 of Mitsuba's floor. Large splats end flatly,
-    so that larger steps are as good. Measured: mean 0.016, maximum 0.25, of the sum 0.006.
+    so that larger steps are as good. Measured: mean 0.018, maximum 0.22, of the sum 0.005.
     """
 
     picture = "default_cutoffs"
@@ -383,16 +383,6 @@ class Distortion(Calibrated):
     along = 1.0
 
 
-class MovingCamera(Means):
-    """Blurred by its way to where it is when the shutter closes."""
-
-    picture = "moving_camera"
-
-    def sensor(self):
-        close = mi.ScalarTransform4f().translate([0.3, 0.1, 0]) @ self.to_world()
-        return {"type": "calibrated", "fx": 64.0, "to_world_close": close, "shutter_samples": 4}
-
-
 class CropWindow(Means):
     """Left of the middle of a film that is twice as large."""
 
@@ -467,6 +457,18 @@ class Hybrid(Means):
         return {"ball": ball, "light": self.light()}
 
 
+class HybridOpacity(Hybrid):
+    key = "integrator.logit_opacities"
+    along = 1.0
+
+
+class HybridColor(Hybrid):
+    """Also of splats that the ball hides."""
+
+    key = "integrator.sh0"
+    along = 1.0
+
+
 class DiffuseAlbedo(Hybrid):
     key = "ball.bsdf.reflectance.value"
     along = 1.0
@@ -502,14 +504,17 @@ class ConstantEmitterRadiance(BeforeConstantEmitter):
 
 
 class HiddenEmitters(AreaLightRadiance):
-    """A lamp before the ball and a sky, of which only the light on the ball is seen."""
+    """A lamp beside the ball and a sky, of which only the light on the ball is seen.
+
+    Not before the ball: what Mitsuba 3.9 sees through a hidden lamp is not lit by it.
+    """
 
     picture = "hidden_emitters"
     hide_emitters = True
 
     def light(self):
-        lamp = emitter([0.8, 0.5, -0.6], [6.0, 5.0, 4.0])
-        return lamp | {"to_world": lamp["to_world"].scale(0.5)}
+        lamp = emitter([-1.2, 0.7, 0], [6.0, 5.0, 4.0])
+        return lamp | {"to_world": lamp["to_world"].scale(0.4)}
 
     def objects(self):
         sky = {"type": "constant", "radiance": {"type": "rgb", "value": [0.1, 0.2, 0.4]}}
@@ -676,8 +681,12 @@ def error_of_backward(kind, actual) -> float:
 
 @pytest.mark.parametrize("name", PICTURES)
 def test_pictures_are_those_that_are_stored(name):
-    """Machines round differently, so that a light path or a splat's end may fall otherwise."""
-    (actual,) = pictures(PICTURES[name], [0.0])
+    """The second, which is as the first: nothing is left behind by one that it could show.
+
+    Machines round differently, so that a light path or a splat's end may fall otherwise.
+    """
+    first, actual = pictures(PICTURES[name], [0.0, 0.0])
+    np.testing.assert_allclose(actual, first, rtol=0, atol=1e-5)  # filters add in any order
     expected = read_reference(name)
     assert actual.shape == expected.shape
     error_mean, differing = errors_of_picture(actual, expected)
