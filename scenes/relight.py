@@ -29,7 +29,7 @@ from __future__ import annotations
 
 import argparse
 import time
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -54,13 +54,13 @@ from drgs.viewpoints import OPAQUE, orbit_of_gaussians
 
 @dataclass(frozen=True)
 class Unknowns:
-    """What is to be found, in words that a table shows."""
+    """What is to be found, as a table shows it."""
 
     shift: list[float]  # of the model, in its radii
     turn: list[float]  # of the model: axis times angle, degrees
     roll: list[float]  # of the globe: axis times angle, degrees
     paint: list[float]  # of the ball: reflectance, RGB
-    lamp: list[float]  # RGB, in units of RADIANCE
+    lamp: list[float]  # radiance, RGB, in units of RADIANCE
 
     def variables(self) -> dict[str, Any]:
         """For the optimizer."""
@@ -80,8 +80,16 @@ class Unknowns:
         return Unknowns(**{name: value.tolist() for name, value in values.items()})
 
 
-TRUE = Unknowns([0, 0, 0], [0, 0, 0], [10, -20, 30], [0.75, 0.2, 0.1], [1.0, 0.9, 0.7])
-START = Unknowns([-0.2, 0.15, 0.1], [5, -8, 15], [-10, 5, 0], [0.4] * 3, [0.6] * 3)
+TRUE = Unknowns([0.05, 0.05, 0], [0, 0, -12], [10, -20, 30], [0.75, 0.2, 0.1], [1, 0.9, 0.7])
+START = Unknowns([-0.15, 0.2, 0.1], [5, -8, 3], [-10, 5, 0], [0.4] * 3, [0.6] * 3)
+
+TITLES = {
+    "shift": "model: shift [radii]",
+    "turn": "model: turn [degrees]",
+    "roll": "globe: turn [degrees]",
+    "paint": "ball: reflectance",
+    "lamp": "lamp: RGB",
+}
 
 RATE, LAST_RATE = 0.02, 0.002
 """Adam's steps in the first and the last iteration: about what a number changes by."""
@@ -304,13 +312,11 @@ def write(
     axes.semilogy(losses)
     axes.set(xlabel="iteration", ylabel="loss")
     write_figure(out / "loss.png", figure)
-    table = markdown_table(
-        ["", "true", "start", "found"],
-        [
-            [name, *(", ".join(f"{x:.3g}" for x in getattr(u, name)) for u in (TRUE, START, found))]
-            for name in asdict(TRUE)
-        ],
-    )
+    lines = [
+        [title, *(", ".join(f"{x:.3f}" for x in getattr(u, name)) for u in (TRUE, START, found))]
+        for name, title in TITLES.items()
+    ]
+    table = markdown_table(["", "true", "start", "found"], lines)
     with atomic_path(out / "parameters.md") as temporary:
         temporary.write_text(table + "\n")
     print(f"{table}\nwritten: {out}")
