@@ -94,7 +94,7 @@ TITLES = {
 RATE, LAST_RATE = 0.02, 0.002
 """Adam's steps in the first and the last iteration: about what a number changes by."""
 
-SCALES = (1, 2, 4, 8)
+SCALES = (1, 2, 4, 10, 20)
 """px: sides of the blocks whose means are compared. Large ones see a model that is far off, small
 ones place it exactly."""
 
@@ -151,14 +151,17 @@ def relight(stage: Stage, iterations: int, out: Path) -> None:
 
 
 def distance(image: mi.TensorXf, target: mi.TensorXf) -> mi.TensorXf:
-    """Mean square of the difference of two pictures (H, W, 3), summed over :data:`SCALES`."""
+    """Of two pictures (H, W, 3): the mean square of their difference at each of :data:`SCALES`.
+
+    The sum weights them by s, for what is left of noise and detail in a block shrinks with it.
+    """
     difference = image - target
     height, width, _ = difference.shape
-    blocks = [
-        dr.mean(dr.reshape(difference, (height // s, s, width // s, s, 3)), axis=(1, 3))
-        for s in SCALES
-    ]
-    return sum(dr.mean(dr.square(means), axis=None) for means in blocks)
+    total = 0
+    for s in SCALES:
+        blocks = dr.reshape(difference, (height // s, s, width // s, s, 3))
+        total += s * dr.mean(dr.square(dr.mean(blocks, axis=(1, 3))), axis=None)
+    return total
 
 
 # ----------------------------------------------------------------------------------------------
