@@ -92,9 +92,9 @@ TITLES = {
 }
 
 RATE, LAST_RATE = 0.02, 0.002
-"""Adam's steps in the first and the last iteration: about what a number changes by."""
+"""Adam's steps in the first half and in the last iteration: about what a number changes by."""
 
-SCALES = (1, 2, 4, 8)
+SCALES = (1, 2, 4, 10, 20)
 """px: sides of the blocks whose means are compared. Large ones see a model that is far off, small
 ones place it exactly."""
 
@@ -111,7 +111,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("model", type=Path, metavar="MODEL.ply|OUT_DIR", help="a fitted model")
     parser.add_argument("--out", type=Path, default=Path("out/relight"), metavar="DIR")
-    parser.add_argument("--iterations", type=int, default=150, metavar="N", help="(default: 150)")
+    parser.add_argument("--iterations", type=int, default=200, metavar="N", help="(default: 200)")
     parser.add_argument("--size", type=int, default=200, metavar="N", help="px (default: 200)")
     args = parser.parse_args()
     with exit_on_user_error():
@@ -130,7 +130,8 @@ def relight(stage: Stage, iterations: int, out: Path) -> None:
     optimizer = mi.ad.Adam(lr=RATE, params=START.variables())
     losses, frames, start = [], [], time.perf_counter()
     for iteration in range(iterations):
-        optimizer.set_learning_rate(RATE * (LAST_RATE / RATE) ** (iteration / iterations))
+        cooling = max(0, 2 * iteration / iterations - 1)  # in the second half
+        optimizer.set_learning_rate(RATE * (LAST_RATE / RATE) ** cooling)
         stage.show(optimizer)
         image = stage.picture(seed=1 + iteration, spp=SPP)
         loss = distance(image, target)
@@ -151,14 +152,17 @@ def relight(stage: Stage, iterations: int, out: Path) -> None:
 
 
 def distance(image: mi.TensorXf, target: mi.TensorXf) -> mi.TensorXf:
-    """Mean square of the difference of two pictures (H, W, 3), summed over :data:`SCALES`."""
+    """Of two pictures (H, W, 3): the mean square of their difference at each of :data:`SCALES`.
+
+    The sum weights them by s, for what is left of noise and detail in a block shrinks with it.
+    """
     difference = image - target
     height, width, _ = difference.shape
-    blocks = [
-        dr.mean(dr.reshape(difference, (height // s, s, width // s, s, 3)), axis=(1, 3))
-        for s in SCALES
-    ]
-    return sum(dr.mean(dr.square(means), axis=None) for means in blocks)
+    total = 0
+    for s in SCALES:
+        blocks = dr.reshape(difference, (height // s, s, width // s, s, 3))
+        total += s * dr.mean(dr.square(dr.mean(blocks, axis=(1, 3))), axis=None)
+    return total
 
 
 # ----------------------------------------------------------------------------------------------
