@@ -129,7 +129,7 @@ class PictureRays:
         """
         # Of the base class, as integrators written in Python have another signature.
         radiance, *_ = mi.SamplingIntegrator.sample(
-            hybrid.integrator, hybrid.surfaces.scene, sampler, self.ray, None, active
+            hybrid.integrator, hybrid.scene, sampler, self.ray, None, active
         )
         if hybrid.insertion.display_space:
             radiance = mi.math.linear_to_srgb(dr.maximum(mi.Color3f(radiance), 0))

@@ -81,7 +81,7 @@ class Rendered:
 class Look:
     """What a sensor saw of a scene's surfaces, and everything that this depends on."""
 
-    surfaces: Any  # drgs.surfaces.SurfaceScene
+    surfaces: Any  # drgs.surfaces.Surfaces
     settings: Any  # of the integrator, and the key of the points that were looked at
     sensor: SensorState
     seen: list[list[Any]]  # by time and by sample: drgs.surfaces.SeenSurface
@@ -98,7 +98,7 @@ class Memory:
 
     rendered: dict[int, Rendered] = field(default_factory=dict)
     looks: dict[int, Look] = field(default_factory=dict)
-    surfaces: dict[str, Any] = field(default_factory=dict)  # "last": drgs.surfaces.SurfaceScene
+    surfaces: dict[str, Any] = field(default_factory=dict)  # "last": drgs.surfaces.Surfaces
     film_maps: dict[str, np.ndarray] = field(default_factory=dict)  # see drgs.exposure
 
     def forget_view(self, index: int) -> None:
@@ -229,10 +229,10 @@ def hybrid_of(integrator: Any, scene: mi.Scene, sensor: mi.Sensor, seed: Any, sp
     """The part that surfaces take in a picture; None where there are none."""
     if all(shape.is_ellipsoids() for shape in scene.shapes()):
         return None
-    from drgs.surfaces import Hybrid, Insertion, SurfaceScene
+    from drgs.surfaces import Hybrid, Insertion, Surfaces
 
     memory, hide_emitters = integrator.memory, integrator.hide_emitters
-    surfaces = SurfaceScene.of(scene, memory.surfaces.get("last"))
+    surfaces = Surfaces.of(scene, memory.surfaces.get("last"))
     memory.surfaces["last"] = surfaces
     nested = integrator.nested or mi.load_dict({"type": "path", "hide_emitters": hide_emitters})
     insertion = Insertion(
@@ -242,7 +242,8 @@ def hybrid_of(integrator: Any, scene: mi.Scene, sensor: mi.Sensor, seed: Any, sp
         shows_background=not hide_emitters and scene.environment() is not None,
         display_space=not integrator.srgb_primitives,
     )
-    return Hybrid(surfaces, nested, sensor, seed, integrator.nested_spp or spp, insertion)
+    traced = surfaces.traced(scene)
+    return Hybrid(traced, surfaces, nested, sensor, seed, integrator.nested_spp or spp, insertion)
 
 
 def sensors_of(sensor: mi.Sensor) -> list[mi.Sensor]:
@@ -433,7 +434,7 @@ class View:
         last = looks.get(self.index)
         if last is None or not last.matches(*key):
             seen = look_at(
-                surfaces.scene,
+                self.hybrid.scene,
                 self.sensor.film(),
                 self._cameras(state),
                 self.within,

@@ -12,9 +12,10 @@ S is what the surface itself shows; where the nested integrator does not show th
 share is not taken off. Light does not pass from one to the other: splats neither light surfaces
 nor are lit by them, and cast no shadows.
 
-Where a surface ends within a pixel, it covers a part of it. With one sample per pixel, pixels whose
-neighbours see something else are looked at in :data:`EDGE_SAMPLES` places; with several samples,
-each has its own depth. A ``thinlens`` sees depths and coverage from the middle of its aperture.
+Where a surface ends within a pixel, it covers a part of it. With one sample per pixel, pixels next
+to where surfaces end and the background begins are looked at in :data:`EDGE_SAMPLES` places; with
+several samples, each has its own depth. A ``thinlens`` sees depths and coverage from the middle of
+its aperture.
 
 Derivatives flow to the splats and, through the nested integrator, to the parameters of surfaces and
 emitters. Not differentiated: the depth of a surface and the part of a pixel that it covers, and
@@ -50,38 +51,40 @@ EDGE_SAMPLES = EDGE_GRID**2
 
 
 @dataclass(frozen=True, eq=False)
-class SurfaceScene:
-    """What of a scene light is traced through, and all that its shapes depend on."""
+class Surfaces:
+    """What of a scene light is traced through, and all that its shapes depend on.
 
-    scene: mi.Scene
+    It holds no scene that has the integrator, which keeps it: neither would ever be freed.
+    """
+
+    objects: list[mi.Object]  # shapes but Gaussians, emitters that are no shapes, sensors
     parameters: list[Any]  # of its shapes, detached: held, so that equal indices mean equal values
-    source: mi.Scene
+    apart: mi.Scene | None  # made of the objects, where the scene's shapes are not all surfaces
 
     @staticmethod
-    def of(scene: mi.Scene, last: SurfaceScene | None) -> SurfaceScene:
-        """A scene without its Gaussians, or ``last`` if that is still the same."""
+    def of(scene: mi.Scene, last: Surfaces | None) -> Surfaces:
+        """Those of a scene, or ``last`` if they are still the same."""
         shapes = [shape for shape in scene.shapes() if not shape.is_ellipsoids()]
+        emitters = [emitter for emitter in scene.emitters() if emitter.get_shape() is None]
+        objects = [*shapes, *emitters, *scene.sensors()]
         parameters = [dr.detach(value) for s in shapes for _, value in mi.traverse(s)]
         indices = dr.detail.collect_indices
         if (
             last is not None
-            and last.source is scene
-            and indices(parameters) == indices(last.parameters)
+            and list(map(id, last.objects)) == list(map(id, objects))
+            and indices(last.parameters) == indices(parameters)
         ):
             return last
-        traced = scene
+        apart = None
         if len(shapes) < len(scene.shapes()):
             # Of the same objects, so that their parameters are those of the scene.
-            others = [e for e in scene.emitters() if e.get_shape() is None]
-            objects = [*shapes, *others, *scene.sensors()]
             named = {f"object_{k}": value for k, value in enumerate(objects)}
-            traced = mi.load_dict({"type": "scene", **named})
-        return SurfaceScene(traced, parameters, scene)
+            apart = mi.load_dict({"type": "scene", **named})
+        return Surfaces(objects, parameters, apart)
 
-    def is_attached(self, sensor: mi.Sensor) -> bool:
-        """Whether derivatives are asked for that the nested integrator gives."""
-        objects = [*self.scene.shapes(), *self.scene.emitters(), sensor]
-        return any(dr.grad_enabled(value) for o in objects for _, value in mi.traverse(o))
+    def traced(self, scene: mi.Scene) -> mi.Scene:
+        """What the nested integrator renders; scene: the one that these are of."""
+        return scene if self.apart is None else self.apart
 
 
 # ----------------------------------------------------------------------------------------------
@@ -335,7 +338,8 @@ def _mapped(matrix: np.ndarray, planes: list[mi.Float]) -> list[mi.Float]:
 class Hybrid:
     """One rendering of splats and surfaces: the part of the surfaces."""
 
-    surfaces: SurfaceScene
+    scene: mi.Scene  # what the nested integrator is given
+    surfaces: Surfaces
     integrator: mi.Integrator
     sensor: mi.Sensor
     seed: Any
@@ -346,25 +350,30 @@ class Hybrid:
         """The nested one, developed. Leaves the film with it."""
         with _sample_count_kept(self.sensor):
             return self.integrator.render(
-                self.surfaces.scene, sensor=self.sensor, seed=self.seed, spp=self.spp
+                self.scene, sensor=self.sensor, seed=self.seed, spp=self.spp
             )
 
     def backward(self, params: Any, d_picture: mi.TensorXf) -> None:
         """Accumulate derivatives into the parameters of surfaces and emitters."""
         with dr.resume_grad(), _sample_count_kept(self.sensor):
-            if self.surfaces.is_attached(self.sensor):
+            if self._is_attached():
                 self.integrator.render_backward(
-                    self.surfaces.scene, params, d_picture, self.sensor, self.seed, self.spp
+                    self.scene, params, d_picture, self.sensor, self.seed, self.spp
                 )
 
     def tangent(self, params: Any, picture: mi.TensorXf) -> mi.TensorXf:
         """Directional derivative of the nested picture, along those set on the parameters."""
         with dr.resume_grad(), _sample_count_kept(self.sensor):
-            if self.surfaces.is_attached(self.sensor):
+            if self._is_attached():
                 return self.integrator.render_forward(
-                    self.surfaces.scene, params, self.sensor, self.seed, self.spp
+                    self.scene, params, self.sensor, self.seed, self.spp
                 )
         return dr.zeros(mi.TensorXf, picture.shape)
+
+    def _is_attached(self) -> bool:
+        """Whether derivatives are asked for that the nested integrator gives."""
+        objects = [*self.scene.shapes(), *self.scene.emitters(), self.sensor]
+        return any(dr.grad_enabled(value) for o in objects for _, value in mi.traverse(o))
 
 
 @contextmanager

@@ -1,5 +1,7 @@
 """Surfaces that Mitsuba renders, between splats: against the float64 reference and differences."""
 
+import gc
+import weakref
 from dataclasses import dataclass, replace
 from functools import cache
 
@@ -373,6 +375,18 @@ def test_gradients_are_the_same_to_the_last_bit():
     assert bitwise(list(runs[0].values())) == bitwise(list(runs[1].values()))
 
 
+def blob(center) -> dict:
+    """One of Mitsuba's own Gaussians."""
+    return {
+        "type": "ellipsoids",
+        "centers": mi.TensorXf(np.float32([center])),
+        "scales": mi.TensorXf(np.float32([[0.3, 0.3, 0.3]])),
+        "quaternions": mi.TensorXf(np.float32([[0, 0, 0, 1]])),
+        "opacities": mi.TensorXf(np.float32([[0.75]])),
+        "sh_coeffs": mi.TensorXf(np.float32([[1, 1, 1]])),
+    }
+
+
 # ----------------------------------------------------------------------------------------------
 # What runs, and when
 # ----------------------------------------------------------------------------------------------
@@ -402,6 +416,23 @@ def test_a_scene_without_surfaces_never_runs_the_nested_integrator():
     assert nested.count == 0
     image_of(load(SCENE, nested=nested))
     assert nested.count == 1
+
+
+@pytest.mark.parametrize("use", ["a picture", "a gradient", "a picture with gradients"])
+@pytest.mark.parametrize("with_shapes", [False, True])
+def test_a_scene_is_freed_when_nobody_holds_it(use, with_shapes):
+    """Though its integrator keeps what it saw of it."""
+    loaded = load(SCENE, sky=True, shapes={"blob": blob([0, 0, 0])} if with_shapes else {})
+    params = mi.traverse(loaded)
+    if use != "a picture":
+        dr.enable_grad(params["integrator.means"], params[RADIANCE_KEY])
+    image = mi.render(loaded, params)
+    if use == "a gradient":
+        dr.backward(dr.mean(image, axis=None))
+    integrator = weakref.ref(loaded.integrator())
+    del loaded, params, image
+    gc.collect()
+    assert integrator() is None
 
 
 def test_samples_of_the_nested_integrator_are_not_those_of_the_splats():
@@ -482,14 +513,6 @@ def test_gaussians_of_shapes_are_splats_and_no_surfaces():
     """As if they were the integrator's own; they are left out of the nested picture."""
     scene = apart(SCENE)
     center = scene.camera.rotation.T @ [0, 0, 1.5] + scene.camera.center
-    shape = {
-        "type": "ellipsoids",
-        "centers": mi.TensorXf(np.float32([center])),
-        "scales": mi.TensorXf(np.float32([[0.3, 0.3, 0.3]])),
-        "quaternions": mi.TensorXf(np.float32([[0, 0, 0, 1]])),
-        "opacities": mi.TensorXf(np.float32([[0.75]])),
-        "sh_coeffs": mi.TensorXf(np.float32([[1, 1, 1]])),
-    }
     one = {
         "means": center,
         "quats": [1, 0, 0, 0],
@@ -499,7 +522,7 @@ def test_gaussians_of_shapes_are_splats_and_no_surfaces():
         "shN": np.zeros((3, 3)),
     }
     together = {n: np.concatenate([v, [one[n]]]) for n, v in vars(scene.gaussians).items()}
-    image = image_of(load(scene, shapes={"blob": shape}))
+    image = image_of(load(scene, shapes={"blob": blob(center)}))
     expected = image_of(load(scene, **tensors(reference.Gaussians(**together))))
     np.testing.assert_allclose(image, expected, atol=PICTURE * expected.max())
     assert np.abs(image - image_of(load(scene))).max() > 0.1
