@@ -320,6 +320,18 @@ class SplatFeatures:
         del pixel
         return stored
 
+    def add(self, planes: list[Any], stored: list[Any], pixel: int, weight: Any) -> list[Any]:
+        """A pixel's ``planes`` with this splat's share; weight: T alpha."""
+        features = self.at(stored, pixel)
+        return [dr.fma(weight, c, plane) for c, plane in zip(features, planes, strict=True)]
+
+    def worth(self, stored: list[Any], pixel: int, g: list[Any]) -> Any:
+        """c . g, with the features c at a pixel and the loss's derivatives g there."""
+        result = type(g[0])(0)
+        for c, derivative in zip(self.at(stored, pixel), g, strict=True):
+            result = dr.fma(c, derivative, result)
+        return result
+
     def add_derivatives(
         self, totals: list[Any], stored: list[Any], pixel: int, weight: Any, g: list[Any]
     ) -> list[Any]:

@@ -75,8 +75,22 @@ class OccludedFeatures(SplatFeatures):
     def at(self, stored: list[Any], pixel: int) -> list[Any]:
         """The splat's features at a pixel, as far as they are seen; 1 in front, 0 behind."""
         *others, depth = stored
-        share, front = self._share(depth, pixel)
-        return [share * value for value in self.features.at(others, pixel)] + [front]
+        values = self.features.at(others, pixel)
+        front = self._in_front(type(depth)(1), depth, pixel)
+        return [self._seen(value, depth, pixel) for value in values] + [front]
+
+    def add(self, planes: list[Any], stored: list[Any], pixel: int, weight: Any) -> list[Any]:
+        """As :meth:`at` says; it is the weight that is scaled, once for all features."""
+        *others, depth = stored
+        *planes, front = planes
+        seen = self.features.add(planes, others, pixel, self._seen(weight, depth, pixel))
+        return [*seen, front + self._in_front(weight, depth, pixel)]
+
+    def worth(self, stored: list[Any], pixel: int, g: list[Any]) -> Any:
+        """As :meth:`at` says; it is the sum that is scaled."""
+        *others, depth = stored
+        worth = self._seen(self.features.worth(others, pixel, g[:-1]), depth, pixel)
+        return worth + self._in_front(g[-1], depth, pixel)
 
     def add_derivatives(
         self, totals: list[Any], stored: list[Any], pixel: int, weight: Any, g: list[Any]
@@ -84,22 +98,25 @@ class OccludedFeatures(SplatFeatures):
         """See :class:`SplatFeatures`."""
         *others, depth = stored
         *totals, nothing = totals
-        share, _ = self._share(depth, pixel)
-        sums = self.features.add_derivatives(totals, others, pixel, share * weight, g[:-1])
+        weight = self._seen(weight, depth, pixel)
+        sums = self.features.add_derivatives(totals, others, pixel, weight, g[:-1])
         return [*sums, nothing]
 
     def tangents(self, stored: list[Any], d_stored: list[Any], pixel: int) -> list[Any]:
         """Tangents of the features at a pixel."""
         *others, depth = stored
-        share, _ = self._share(depth, pixel)
         tangents = self.features.tangents(others, d_stored[:-1], pixel)
-        return [share * value for value in tangents] + [type(depth)(0)]
+        return [self._seen(value, depth, pixel) for value in tangents] + [type(depth)(0)]
 
-    def _share(self, depth: Any, pixel: int) -> tuple[Any, Any]:
-        """Of a splat that is seen: 1 or 1 - c; and whether it is in front: 1 or 0."""
+    def _seen(self, value: Any, depth: Any, pixel: int) -> Any:
+        """What is left of a splat's number: all of it in front, 1 - c behind."""
         z, passes = self.bound[pixel]
-        in_front = depth <= z
-        return dr.select(in_front, 1, passes), dr.select(in_front, type(depth)(1), 0)
+        return dr.select(depth <= z, value, passes * value)
+
+    def _in_front(self, value: Any, depth: Any, pixel: int) -> Any:
+        """A splat's number in front, 0 behind."""
+        z, _ = self.bound[pixel]
+        return dr.select(depth <= z, value, 0)
 
 
 def amid(model: ImageModel, surface: Surface, camera: Any) -> ImageModel:

@@ -474,11 +474,7 @@ def _adjoint(
     stop = model.cutoffs.transmittance_stop
 
     def worth(met: _Met, pixel: int) -> Any:
-        """c . g"""
-        seen = t.Float(0)
-        for c, plane in zip(model.features.at(met.features, pixel), g, strict=True):
-            seen = dr.fma(c, plane[pixel], seen)
-        return seen
+        return model.features.worth(met.features, pixel, [plane[pixel] for plane in g])
 
     # First walk: what all splats of a pixel and its background are worth.
     def add_up(state: tuple, visited: list[list[Any]]) -> tuple:

@@ -177,8 +177,9 @@ def composite(bins: TileBins, records: Records) -> Layers:
         for pixel, alpha in enumerate(model.alphas(geometry, footprint)):
             weight, T[pixel], goes_on = composite_step(T[pixel], alpha.value, stop)
             ends[pixel] = dr.select(goes_on, behind, ends[pixel])
-            for k, c in enumerate(model.features.at(features, pixel)):
-                C[k][pixel] = dr.fma(weight, c, C[k][pixel])
+            planes = model.features.add([plane[pixel] for plane in C], features, pixel, weight)
+            for plane, value in zip(C, planes, strict=True):
+                plane[pixel] = value
         return entries.advance(cursor), T, C, ends, _any_positive(T)
 
     stop = model.cutoffs.transmittance_stop
@@ -388,11 +389,8 @@ def _adjoint_step(
         T[pixel] = T[pixel] / (1 - value)
         weight = value * T[pixel]
         g_pixel = [plane[pixel] for plane in g]
-        seen = zero
-        for c, derivative in zip(features.at(stored, pixel), g_pixel, strict=True):
-            seen = dr.fma(c, derivative, seen)
         d_stored = features.add_derivatives(d_stored, stored, pixel, weight, g_pixel)
-        gain = seen - R[pixel]
+        gain = features.worth(stored, pixel, g_pixel) - R[pixel]
         R[pixel] = dr.fma(value, gain, R[pixel])
         # d loss / d ln(alpha) = a T (c.g - R), zero where alpha is clamped.
         d_log_alpha.append(dr.select(alpha.smooth, weight * gain, 0))

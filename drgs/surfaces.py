@@ -320,7 +320,9 @@ class Insertion:
         matrix = film_map(self.film, self.maps, ())
         has_alpha = num_colors(self.film) == 4
         to_developed = matrix[: len(matrix) - has_alpha, :3]
-        if self.display_space and not np.array_equal(to_developed, np.eye(3)):
+        if np.array_equal(to_developed, np.eye(3)):
+            return to_developed, to_developed
+        if self.display_space:
             raise ValueError(
                 "splats: in a scene with surfaces and with srgb_primitives false, the film's "
                 "pixel_format must be rgb or rgba"
