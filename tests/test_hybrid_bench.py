@@ -25,6 +25,7 @@ def test_the_command_writes_its_table(tmp_path, capsys, monkeypatch):
     for row in rows:
         splats, nested, both = (float(row[f"{n}_ms"]) for n in ("splats", "nested", "hybrid"))
         assert min(splats, nested, both) > 0
+        # Of a single round.
         assert float(row["factor"]) == pytest.approx((both - nested) / splats)
     printed = capsys.readouterr().out
     assert "| Gaussians | samples |" in printed and str(tmp_path / "hybrid.csv") in printed
