@@ -30,7 +30,7 @@ SIZE = 400
 
 NUM_GAUSSIANS = 100_000
 
-ROUNDS, QUICK_ROUNDS = 11, 3
+ROUNDS, QUICK_ROUNDS = 31, 3
 
 ENVIRONMENT = (64, 128)
 """Rows and columns of the environment, and of the picture behind the splats."""
@@ -84,7 +84,7 @@ def run(args: argparse.Namespace) -> None:
     prices = [*rendered, *fitted]
     rows = [list(vars(price).values()) for price in prices]
     write_csv(args.out / "effects.csv", list(Price.__dataclass_fields__), rows)
-    write_figure(args.out / "effects.png", plot(prices))
+    write_figure(args.out / "effects.png", plot(rendered, fitted))
     print(f"\nwritten: {args.out / 'effects.csv'}, {args.out / 'effects.png'}")
 
 
@@ -285,24 +285,27 @@ def measure(cases: list[Any], make: Callable[[Any], Any], rounds: int) -> list[P
             for prefix, measured in (("base ", base), ("", subject)):
                 times[f"{prefix}f"].append(_seconds(measured.forward))
                 times[f"{prefix}b"].append(_seconds(measured.both))
-        forward, both, base_forward, base_both = (
-            1e3 * statistics.median(times[k]) for k in ("f", "b", "base f", "base b")
-        )
+        forward_ratio, both_ratio = (_ratio(times[k], times[f"base {k}"]) for k in ("f", "b"))
         prices.append(
             Price(
                 effect=case.effect,
                 variant=case.variant,
                 against=case.against,
-                forward_ms=forward,
-                both_ms=both,
-                forward_ratio=forward / base_forward,
-                both_ratio=both / base_both,
+                forward_ms=1e3 * statistics.median(times["f"]),
+                both_ms=1e3 * statistics.median(times["b"]),
+                forward_ratio=forward_ratio,
+                both_ratio=both_ratio,
                 operations=count,
                 operations_more=count - base_operations,
             )
         )
-        print(f"{case.effect}, {case.variant}: x{both / base_both:.2f}", flush=True)
+        print(f"{case.effect}, {case.variant}: x{both_ratio:.2f}", flush=True)
     return prices
+
+
+def _ratio(times: list[float], base_times: list[float]) -> float:
+    """Median over the rounds: those of a round were taken one after the other."""
+    return statistics.median(t / base for t, base in zip(times, base_times, strict=True))
 
 
 def operations(subject: Any) -> int:
@@ -336,14 +339,22 @@ def table(prices: list[Price], forward: str, both: str) -> str:
     return markdown_table([*header, "operations"], rows)
 
 
-def plot(prices: list[Price]) -> Any:
+def plot(rendered: list[Price], fitted: list[Price]) -> Any:
     """What each effect adds to the time, by bar."""
-    figure = new_figure(9, 0.3 * len(prices) + 1)
-    axes = figure.subplots()
-    labels = [f"{p.effect}: {p.variant}" if p.variant else p.effect for p in prices]
-    bars = axes.barh(labels, [p.both_ratio for p in prices])
-    axes.bar_label(bars, [f"{p.both_ratio:.2f}" for p in prices], padding=3, fontsize=8)
-    axes.axvline(1, color="0.4", linewidth=1)
-    axes.set(xlabel="time with derivatives, without the effect = 1", title="what effects cost")
-    axes.invert_yaxis()
+    parts = {"picture and derivatives": rendered[1:], "training iteration": fitted[1:]}
+    heights = [len(prices) for prices in parts.values()]
+    figure = new_figure(8, 0.28 * sum(heights) + 1.5)
+    all_axes = figure.subplots(len(parts), sharex=True, height_ratios=heights)
+    for axes, (title, prices) in zip(all_axes, parts.items(), strict=True):
+        labels = [f"{p.effect}: {p.variant}" if p.variant else p.effect for p in prices]
+        ratios = [p.both_ratio for p in prices]
+        axes.barh(labels, [ratio - 1 for ratio in ratios], left=1)
+        for row, ratio in enumerate(ratios):
+            axes.text(max(ratio, 1) * 1.02, row, f"{ratio:.2f}", va="center", fontsize=8)
+        axes.axvline(1, color="0.4", linewidth=1)
+        axes.set(title=title, xscale="log", xlim=(0.8, 1.25 * max(p.both_ratio for p in rendered)))
+        axes.set_xticks([1, 2, 4, 8], ["1", "2", "4", "8"])
+        axes.minorticks_off()
+        axes.invert_yaxis()
+    all_axes[-1].set_xlabel("time, without the effect = 1")
     return figure
