@@ -19,13 +19,14 @@ import mitsuba as mi
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from drgs.bench.output import machine, markdown_table, write_csv
+from drgs.bench.output import machine, markdown_table, new_figure, write_csv, write_figure
 from drgs.capture import first_hits, load_scene
 from drgs.config import FitConfig, load_config
 from drgs.data import initial_gaussians, load_dataset
 from drgs.data.images import smaller_view
 from drgs.data.types import Dataset, View
 from drgs.metrics import mean_quality
+from drgs.pictures import to_uint8
 from drgs.schedule import changed, with_iterations
 from drgs.trainer import Trainer, render_views
 
@@ -47,6 +48,9 @@ DARK = 0.65
 
 FEW = 8
 """Pictures, where depth is to help."""
+
+SIZES = {"2x": 2.0, "1x": 1.0, "1/2": 0.5, "1/4": 0.25}
+"""Of renderings, times that of the fit."""
 
 Measure = Callable[[Trainer, Dataset, Dataset], dict[str, float]]
 
@@ -79,14 +83,17 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> None:
-    """Fit all cases; write a table and CSV."""
+    """Fit all cases; write a table and CSV, and renderings at several sizes."""
     mi.set_variant("llvm_ad_rgb")
     config = base_config(QUICK_ITERATIONS if args.quick else ITERATIONS)
-    results = []
+    results, shown = [], {}
     for case in CASES:
         if args.only and case.effect not in args.only:
             continue
-        found = fit_case(case, config)
+        trainer, dataset, spoiled = fit_case(case, config)
+        found = (case.measure or quality)(trainer, dataset, spoiled)
+        if case.measure is at_sizes:
+            shown[case.name] = seen_at_sizes(trainer)
         results += [Result(case.effect, case.name, k, v) for k, v in found.items()]
         numbers = ", ".join(f"{k} {v:.4g}" for k, v in found.items())
         print(f"{case.effect}, {case.name}: {numbers}", flush=True)
@@ -94,6 +101,10 @@ def run(args: argparse.Namespace) -> None:
     rows = [list(vars(result).values()) for result in results]
     write_csv(args.out / "benefits.csv", list(Result.__dataclass_fields__), rows)
     print(f"\nwritten: {args.out / 'benefits.csv'}")
+    if shown:
+        shown = {"photograph": photographs_at_sizes(config)} | shown
+        write_figure(args.out / "antialiasing.png", plot(shown))
+        print(f"written: {args.out / 'antialiasing.png'}")
 
 
 def base_config(iterations: int) -> FitConfig:
@@ -102,8 +113,8 @@ def base_config(iterations: int) -> FitConfig:
     return with_iterations(config, iterations)
 
 
-def fit_case(case: Case, config: FitConfig) -> dict[str, float]:
-    """Measure one fit."""
+def fit_case(case: Case, config: FitConfig) -> tuple[Trainer, Dataset, Dataset]:
+    """One fit: the trainer at its end, the data as it is, and what was fitted."""
     config = changed(config, dict(case.changes))
     dataset = load_dataset(config.data)
     spoiled = case.spoil(dataset, np.random.default_rng(0))
@@ -111,7 +122,7 @@ def fit_case(case: Case, config: FitConfig) -> dict[str, float]:
     for _ in range(config.iterations):
         trainer.step()
     trainer.gaussians()  # what effects leave for renderings is there
-    return (case.measure or quality)(trainer, dataset, spoiled)
+    return trainer, dataset, spoiled
 
 
 # ----------------------------------------------------------------------------------------------
@@ -232,13 +243,28 @@ def fitted_colors(image: np.ndarray, target: np.ndarray) -> np.ndarray:
 def at_sizes(trainer: Trainer, dataset: Dataset, spoiled: Dataset) -> dict[str, float]:
     """On the test views at other sizes than that of the fit."""
     del dataset, spoiled
-    config = changed(trainer.config, {"data.image_size": None})
-    views = load_dataset(config.data).test
-    result = {}
-    for name, size in (("2x", 2 * SIZE), ("1x", SIZE), ("1/2", SIZE // 2), ("1/4", SIZE // 4)):
-        resized = [smaller_view(view, view.width / size) for view in views]
-        result[f"PSNR at {name}, dB"] = _psnr(trainer, resized)
-    return result
+    views = views_at_sizes(trainer.config)
+    return {f"PSNR at {name}, dB": _psnr(trainer, resized) for name, resized in views.items()}
+
+
+def views_at_sizes(config: FitConfig) -> dict[str, list[View]]:
+    """The test views, each with its photograph at that size."""
+    views = load_dataset(changed(config, {"data.image_size": None}).data).test
+    return {
+        name: [smaller_view(view, view.width / (SIZE * factor)) for view in views]
+        for name, factor in SIZES.items()
+    }
+
+
+def seen_at_sizes(trainer: Trainer) -> list[np.ndarray]:
+    """The first test view."""
+    views = views_at_sizes(trainer.config).values()
+    return [next(iter(render_views(trainer.scene, of_size[:1]))) for of_size in views]
+
+
+def photographs_at_sizes(config: FitConfig) -> list[np.ndarray]:
+    """The same of the data."""
+    return [of_size[0].image for of_size in views_at_sizes(config).values()]
 
 
 def cameras(trainer: Trainer, dataset: Dataset, spoiled: Dataset) -> dict[str, float]:
@@ -353,3 +379,17 @@ def table(results: Sequence[Result]) -> str:
             text = "; ".join(f"{r.quantity} {r.value:.2f}" for r in values)
             rows.append([effect, name, text])
     return markdown_table(["effect", "fit", "measured"], rows)
+
+
+def plot(rows: dict[str, list[np.ndarray]]) -> Any:
+    """Pictures, a row for each name, a column for each of :data:`SIZES`."""
+    figure = new_figure(2 * len(SIZES) + 0.4, 2 * len(rows))
+    grid = figure.subplots(len(rows), len(SIZES), squeeze=False)
+    for name, pictures, of_row in zip(rows, rows.values(), grid, strict=True):
+        for axes, picture in zip(of_row, pictures, strict=True):
+            axes.imshow(to_uint8(picture), interpolation="none")
+            axes.set(xticks=[], yticks=[])
+        of_row[0].set_ylabel(name)
+    for axes, name in zip(grid[0], SIZES, strict=True):
+        axes.set_title(name)
+    return figure
