@@ -9,10 +9,11 @@ does meets both; medians are reported, and the number of operations in their ker
 from __future__ import annotations
 
 import argparse
+import math
 import statistics
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import drjit as dr
@@ -81,8 +82,8 @@ def run(args: argparse.Namespace) -> None:
     print(f"\n{table(rendered, 'picture', 'picture + derivatives')}", flush=True)
     fitted = measure(fitting_cases(), lambda case: Fitter(case, gaussians), rounds)
     print(f"\n{table(fitted, '', 'training iteration')}")
-    prices = [*rendered, *fitted]
-    rows = [list(vars(price).values()) for price in prices]
+    fitted = [replace(p, forward_ms=math.nan, forward_ratio=math.nan) for p in fitted]
+    rows = [list(vars(price).values()) for price in [*rendered, *fitted]]
     write_csv(args.out / "effects.csv", list(Price.__dataclass_fields__), rows)
     write_figure(args.out / "effects.png", plot(rendered, fitted))
     print(f"\nwritten: {args.out / 'effects.csv'}, {args.out / 'effects.png'}")
