@@ -430,12 +430,13 @@ class View:
         from drgs.surfaces import look_at
 
         surfaces, looks = self.hybrid.surfaces, self.integrator.memory.looks
-        key = surfaces, (self.key, self.integrator.hide_emitters), state
+        settings = self.key, self.integrator.hide_emitters, self.sensor.far_clip()
+        key = surfaces, settings, state
         last = looks.get(self.index)
         if last is None or not last.matches(*key):
             seen = look_at(
                 self.hybrid.scene,
-                self.sensor.film(),
+                self.sensor,
                 self._cameras(state),
                 self.within,
                 self.integrator.hide_emitters,

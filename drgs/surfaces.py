@@ -15,7 +15,8 @@ nor are lit by them, and cast no shadows.
 Where a surface ends within a pixel, it covers a part of it. With one sample per pixel, pixels next
 to where surfaces end and the background begins are looked at in :data:`EDGE_SAMPLES` places; with
 several samples, each has its own depth. A ``thinlens`` sees depths and coverage from the middle of
-its aperture.
+its aperture. What lets light pass straight on (``null``, ``mask``, ``thindielectric``) covers the
+rest; of several such surfaces on a ray, all cover at the place of the first.
 
 Derivatives flow to the splats and, through the nested integrator, to the parameters of surfaces and
 emitters. Not differentiated: the depth of a surface and the part of a pixel that it covers, and
@@ -52,39 +53,67 @@ EDGE_SAMPLES = EDGE_GRID**2
 
 @dataclass(frozen=True, eq=False)
 class Surfaces:
-    """What of a scene light is traced through, and all that its shapes depend on.
+    """What of a scene light is traced through, and all that this depends on.
 
     It holds no scene that has the integrator, which keeps it: neither would ever be freed.
     """
 
-    objects: list[mi.Object]  # shapes but Gaussians, emitters that are no shapes, sensors
-    parameters: list[Any]  # of its shapes, detached: held, so that equal indices mean equal values
-    apart: mi.Scene | None  # made of the objects, where the scene's shapes are not all surfaces
+    objects: list[mi.Object]  # of the scene, without its Gaussians and integrator
+    parameters: list[Any]  # of these, detached: held, so that equal indices mean equal values
+    apart: mi.Scene | None  # made of the objects, where the scene has Gaussians besides
 
     @staticmethod
     def of(scene: mi.Scene, last: Surfaces | None) -> Surfaces:
         """Those of a scene, or ``last`` if they are still the same."""
-        shapes = [shape for shape in scene.shapes() if not shape.is_ellipsoids()]
-        emitters = [emitter for emitter in scene.emitters() if emitter.get_shape() is None]
-        objects = [*shapes, *emitters, *scene.sensors()]
-        parameters = [dr.detach(value) for s in shapes for _, value in mi.traverse(s)]
-        indices = dr.detail.collect_indices
+        objects, parameters = _surroundings(scene)
+        has_gaussians = any(shape.is_ellipsoids() for shape in scene.shapes())
         if (
             last is not None
+            and (last.apart is not None) == has_gaussians
             and list(map(id, last.objects)) == list(map(id, objects))
-            and indices(last.parameters) == indices(parameters)
+            and _same(last.parameters, parameters)
         ):
             return last
-        apart = None
-        if len(shapes) < len(scene.shapes()):
-            # Of the same objects, so that their parameters are those of the scene.
-            named = {f"object_{k}": value for k, value in enumerate(objects)}
-            apart = mi.load_dict({"type": "scene", **named})
-        return Surfaces(objects, parameters, apart)
+        return Surfaces(objects, dr.detach(parameters), _scene(objects) if has_gaussians else None)
 
     def traced(self, scene: mi.Scene) -> mi.Scene:
         """What the nested integrator renders; scene: the one that these are of."""
         return scene if self.apart is None else self.apart
+
+
+def _surroundings(scene: mi.Scene) -> tuple[list[mi.Object], list[Any]]:
+    """A scene's own objects but Gaussians and integrators, and parameters of all but sensors.
+
+    Shape groups are found among them alone: instances do not show what they repeat.
+    """
+    params = mi.traverse(scene)
+    objects, left_out = [], set()
+    for node, (parent, depth) in params.hierarchy.items():
+        is_gaussians = isinstance(node, mi.Shape) and node.is_ellipsoids()
+        if parent in left_out or isinstance(node, mi.Integrator) or is_gaussians:
+            left_out.add(node)
+        elif depth == 1:
+            objects.append(node)
+            if isinstance(node, mi.Sensor):
+                left_out.add(node)
+    names = [name for name, (_, _, node, _) in params.properties.items() if node not in left_out]
+    return objects, [params[name] for name in names]
+
+
+def _same(parameters: list[Any], others: list[Any]) -> bool:
+    """Whether arrays are the same variables, and everything else has the same value."""
+    on_host = [[v for v in of if not dr.is_array_v(v)] for of in (parameters, others)]
+    indices = dr.detail.collect_indices
+    return on_host[0] == on_host[1] and indices(parameters) == indices(dr.detach(others))
+
+
+def _scene(objects: list[mi.Object]) -> mi.Scene:
+    """Of the same objects, so that their parameters are those of the user's scene, and names."""
+    names = [node.id() for node in objects]
+    scene = mi.load_dict({"type": "scene", **{f"object_{k}": o for k, o in enumerate(objects)}})
+    for node, name in zip(objects, names, strict=True):
+        node.set_id(name)
+    return scene
 
 
 # ----------------------------------------------------------------------------------------------
@@ -97,6 +126,12 @@ class SeenSurface(Surface):
     """The nearest surface at each pixel, as one camera sees it."""
 
     normal: Any  # Normal3f, world, times the coverage; None: nobody asked
+
+    def at(self, pixel: mi.UInt32) -> SeenSurface:
+        """At some of the pixels."""
+        planes = (dr.gather(mi.Float, plane, pixel) for plane in (self.depth, self.coverage))
+        normal = None if self.normal is None else dr.gather(mi.Normal3f, self.normal, pixel)
+        return SeenSurface(*planes, normal)
 
     def share(self, front: mi.Float) -> mi.Float:
         """What the surface adds its own with; front: sum of the splats' weights in front of it."""
@@ -113,7 +148,7 @@ class SeenSurface(Surface):
 
 def look_at(
     scene: mi.Scene,
-    film: mi.Film,
+    sensor: mi.Sensor,
     cameras: Sequence[Camera],
     within: Sequence[tuple[Any, Any]],
     hide_emitters: bool,
@@ -124,23 +159,35 @@ def look_at(
     cameras: of each time; within: of each sample, x and y from the pixel's upper left corner, px;
     hide_emitters: whether surfaces that are emitters are looked through.
     """
-    eye = _Eye(scene, hide_emitters, with_normals)
-    corner = pixel_corners(film)
-    seen = [[eye.look(camera, corner, *place) for place in within] for camera in cameras]
-    dr.eval(seen)
+    eye = _Eye(
+        scene=scene,
+        far=dr.opaque(mi.Float, sensor.far_clip()),
+        hide_emitters=hide_emitters,
+        looks_through=hide_emitters or _has_transparent_parts(scene),
+        with_normals=with_normals,
+    )
+    film = sensor.film()
     if len(within) == 1:
-        seen = [
-            [eye.look_closer(camera, film, corner, surface) for surface in of_time]
-            for camera, of_time in zip(cameras, seen, strict=True)
-        ]
-        dr.eval(seen)
+        seen = [[eye.look_closely(camera, film, *within[0])] for camera in cameras]
+    else:
+        corner = pixel_corners(film)
+        seen = [[eye.look(camera, corner, *place) for place in within] for camera in cameras]
+    dr.eval(seen)
     return seen
 
 
-@dataclass(frozen=True)
+def _has_transparent_parts(scene: mi.Scene) -> bool:
+    """Whether anything lets light pass straight on."""
+    bsdfs = (node for node in mi.traverse(scene).hierarchy if isinstance(node, mi.BSDF))
+    return any(mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null) for bsdf in bsdfs)
+
+
+@dataclass  # not frozen: ``dr.syntax`` carries it through a loop
 class _Eye:
     scene: mi.Scene
+    far: mi.Float  # depth, scene units: farther surfaces are not seen
     hide_emitters: bool
+    looks_through: bool  # anything at all
     with_normals: bool
 
     def look(self, camera: Camera, corner: mi.Point2f, x: Any, y: Any) -> SeenSurface:
@@ -149,41 +196,59 @@ class _Eye:
         camera = camera.at_row(place.y)
         origin, direction, seen = camera.look_through(place.x, place.y)
         direction = dr.normalize(direction)
-        start, _ = camera.lens.ray_range(direction, camera.near, camera.near)
+        start, end = camera.lens.ray_range(direction, camera.near, self.far)
         to_world = camera.rotation.T
         ray = mi.Ray3f(
             o=mi.Point3f(camera.center + to_world @ (origin + start * direction)),
             d=mi.Vector3f(to_world @ direction),
         )
-        active = mi.Bool(seen)
-        hit = self.scene.ray_intersect_preliminary(ray, coherent=True, active=active)
-        if self.hide_emitters:
-            ray, hit = _past_emitters(self.scene, ray, hit)
-        valid = hit.is_valid()
+        ray.maxt = end - start
+        ray, hit, coverage = self._meet(ray, mi.Bool(seen))
+        valid = coverage > 0
         point = ray.o + dr.select(valid, hit.t, 1) * ray.d
         _, _, depth = camera.lens.look(camera, camera.rotation @ (point - camera.center))
         normal = None
         if self.with_normals:
             frame = hit.compute_surface_interaction(ray, mi.RayFlags.ShadingFrame, valid).sh_frame
-            normal = dr.select(valid, mi.Normal3f(frame.n), 0)
-        return SeenSurface(depth, dr.select(valid, mi.Float(1), 0), normal)
+            normal = dr.select(valid, coverage * mi.Normal3f(frame.n), 0)
+        return SeenSurface(depth, coverage, normal)
 
-    def look_closer(
-        self, camera: Camera, film: mi.Film, corner: mi.Point2f, surface: SeenSurface
-    ) -> SeenSurface:
-        """The same with the mean of several places in each pixel at an edge.
+    def look_closely(self, camera: Camera, film: mi.Film, x: Any, y: Any) -> SeenSurface:
+        """At one place of each pixel, and at several of those next to where coverage changes.
 
+        Around the crop window is a row of pixels more, so that its edges are those of the film.
         The host reads how many there are.
         """
-        edge = dr.compress(_differs_from_a_neighbour(surface.coverage, film))
-        if dr.width(edge) == 0:
-            return surface
+        count = dr.prod(film.crop_size() + 2)
+        width, height = (dr.opaque(mi.Int32, size + 2) for size in film.crop_size())
+        number = dr.arange(mi.Int32, count)
+        row = number // width
+        column = number - row * width
+        corner = mi.Point2f(column - 1, row - 1)
+        surface = self.look(camera, corner, x, y)
+        dr.eval(surface)
+        inside = (row > 0) & (row < height - 1) & (column > 0) & (column < width - 1)
+        differs = mi.Bool(False)
+        for down in (-1, 0, 1):
+            for right in (-1, 0, 1):
+                neighbour = mi.UInt32(number + down * width + right)
+                coverage = dr.gather(mi.Float, surface.coverage, neighbour, inside)
+                differs |= coverage != surface.coverage
+        edge = dr.compress(inside & differs)
+        if dr.width(edge) > 0:
+            surface = self._look_closer(camera, corner, surface, edge)
+        return surface.at(dr.compress(inside))
+
+    def _look_closer(
+        self, camera: Camera, corner: mi.Point2f, surface: SeenSurface, edge: mi.UInt32
+    ) -> SeenSurface:
+        """The same with means over the pixels ``edge``."""
         corner = dr.gather(mi.Point2f, corner, edge)
         places = [(k + 0.5) / EDGE_GRID for k in range(EDGE_GRID)]
         hits = [self.look(camera, corner, x, y) for y in places for x in places]
         covered = sum((h.coverage for h in hits), mi.Float(0))
-        depth = sum((h.coverage * h.depth for h in hits), mi.Float(0)) / dr.maximum(covered, 1)
-        means = [depth, covered / EDGE_SAMPLES]
+        depth = sum((h.coverage * h.depth for h in hits), mi.Float(0))
+        means = [depth / dr.select(covered > 0, covered, 1), covered / EDGE_SAMPLES]
         planes = [surface.depth, surface.coverage]
         if surface.normal is not None:
             means += list(sum((h.normal for h in hits), mi.Normal3f(0)) / EDGE_SAMPLES)
@@ -194,33 +259,45 @@ class _Eye:
         depth, coverage, *normal = planes
         return SeenSurface(depth, coverage, mi.Normal3f(*normal) if normal else None)
 
+    def _meet(
+        self, ray: mi.Ray3f, active: mi.Bool
+    ) -> tuple[mi.Ray3f, mi.PreliminaryIntersection3f, mi.Float]:
+        """The first hit that is seen, the ray that ends there, and how much all hits cover."""
+        hit = self.scene.ray_intersect_preliminary(ray, coherent=True, active=active)
+        if self.looks_through:
+            return self._look_on(ray, hit)
+        return ray, hit, dr.select(hit.is_valid(), mi.Float(1), 0)
 
-@dr.syntax
-def _past_emitters(
-    scene: mi.Scene, ray: mi.Ray3f, hit: mi.PreliminaryIntersection3f
-) -> tuple[mi.Ray3f, mi.PreliminaryIntersection3f]:
-    """The first hit that is no emitter, and the last part of the ray, which ends there."""
-    emits = hit.is_valid() & hit.shape.is_emitter()
-    while emits:
-        ray = hit.compute_surface_interaction(ray, mi.RayFlags.Minimal, emits).spawn_ray(ray.d)
-        hit = scene.ray_intersect_preliminary(ray, coherent=True, active=emits)
-        emits &= hit.is_valid() & hit.shape.is_emitter()
-    return ray, hit
+    @dr.syntax
+    def _look_on(
+        self, ray: mi.Ray3f, hit: mi.PreliminaryIntersection3f
+    ) -> tuple[mi.Ray3f, mi.PreliminaryIntersection3f, mi.Float]:
+        """As :meth:`_meet`, past what is transparent in all or part."""
+        coverage = dr.select(hit.is_valid(), self._opacity(ray, hit), 0)
+        seen_ray, seen_hit = mi.Ray3f(ray), mi.PreliminaryIntersection3f(hit)
+        goes_on = hit.is_valid() & (coverage < 1)
+        while goes_on:
+            rest = ray.maxt - hit.t
+            si = hit.compute_surface_interaction(ray, mi.RayFlags.Minimal, goes_on)
+            ray = si.spawn_ray(ray.d)
+            ray.maxt = rest
+            hit = self.scene.ray_intersect_preliminary(ray, coherent=True, active=goes_on)
+            goes_on &= hit.is_valid()
+            opacity = dr.select(goes_on, self._opacity(ray, hit), 0)
+            is_first = (coverage == 0) & (opacity > 0)
+            seen_ray = dr.select(is_first, ray, seen_ray)
+            seen_hit = dr.select(is_first, hit, seen_hit)
+            coverage = dr.fma(1 - coverage, opacity, coverage)
+            goes_on &= coverage < 1
+        return seen_ray, seen_hit, coverage
 
-
-def _differs_from_a_neighbour(plane: mi.Float, film: mi.Film) -> mi.Bool:
-    """Of pixels, row by row: whether one of the eight around has another value."""
-    width, height = (dr.opaque(mi.Int32, size) for size in film.crop_size())
-    pixel = dr.arange(mi.Int32, dr.width(plane))
-    row = pixel // width
-    column = pixel - row * width
-    differs = mi.Bool(False)
-    for down in (-1, 0, 1):
-        y = dr.clip(row + down, 0, height - 1)
-        for right in (-1, 0, 1):
-            x = dr.clip(column + right, 0, width - 1)
-            differs |= dr.gather(mi.Float, plane, mi.UInt32(y * width + x)) != plane
-    return differs
+    def _opacity(self, ray: mi.Ray3f, hit: mi.PreliminaryIntersection3f) -> mi.Float:
+        """Of what a ray has hit: what it does not let pass straight on."""
+        si = hit.compute_surface_interaction(ray, mi.RayFlags.All, hit.is_valid())
+        opacity = 1 - dr.mean(si.bsdf().eval_null_transmission(si, hit.is_valid()))
+        if self.hide_emitters:
+            opacity = dr.select(si.shape.is_emitter(), 0, opacity)
+        return opacity
 
 
 # ----------------------------------------------------------------------------------------------
@@ -374,8 +451,9 @@ class Hybrid:
 
     def _is_attached(self) -> bool:
         """Whether derivatives are asked for that the nested integrator gives."""
-        objects = [*self.scene.shapes(), *self.scene.emitters(), self.sensor]
-        return any(dr.grad_enabled(value) for o in objects for _, value in mi.traverse(o))
+        _, parameters = _surroundings(self.scene)
+        sensor = [value for _, value in mi.traverse(self.sensor)]
+        return any(map(dr.grad_enabled, parameters + sensor))
 
 
 @contextmanager

@@ -105,7 +105,8 @@ class SplatsIntegrator(mi.CppADIntegrator):
      * - near
        - |float|
        - Gaussians whose centre is closer than this are culled. The sensor's ``near_clip``
-         applies as well: the larger of the two wins; its ``far_clip`` does not. (Default: 0.01)
+         applies as well: the larger of the two wins. Its ``far_clip`` holds for surfaces alone.
+         (Default: 0.01)
 
      * - srgb_primitives
        - |bool|

@@ -286,6 +286,148 @@ def test_surfaces_nearer_than_the_near_plane_are_not_seen():
     np.testing.assert_allclose(image[..., 4], expected(scene)["depth"], rtol=0, atol=PICTURE * 4)
 
 
+def test_surfaces_beyond_the_far_clip_are_not_seen():
+    """As ``path`` has it. Splats are."""
+    scene = apart(SCENE)
+    loaded = load(scene, sensor=scene.view.sensor() | {"far_clip": 1.5}, aovs="z:depth")
+    without = image_of(load(scene, wall=None, aovs="z:depth"))
+    np.testing.assert_array_equal(image_of(loaded), without)
+    params = mi.traverse(loaded)
+    params["sensor.far_clip"] = 100.0
+    params.update()
+    np.testing.assert_array_equal(image_of(loaded), image_of(load(scene, aovs="z:depth")))
+
+
+def pane(z, bsdf) -> dict:
+    shape = Wall(z=z).shape(SCENE.camera)
+    del shape["emitter"]
+    return shape | {"bsdf": bsdf}
+
+
+def masked(opacity) -> dict:
+    return {"type": "mask", "opacity": opacity, "bsdf": {"type": "diffuse"}}
+
+
+@pytest.mark.parametrize("bsdf", [{"type": "null"}, masked(0.0)], ids=["null", "mask"])
+def test_surfaces_that_let_everything_pass_hide_nothing(bsdf):
+    scene = apart(SCENE)
+    image = image_of(load(scene, shapes={"pane": pane(1.7, bsdf)}, aovs="z:depth,n:normal"))
+    expected = image_of(load(scene, aovs="z:depth,n:normal"))
+    # Mitsuba moves the rays that go on from a surface by 1e-4, along its normal.
+    np.testing.assert_allclose(image, expected, rtol=0, atol=4e-4)
+
+
+@pytest.mark.parametrize("opacities", [(0.25,), (0.25, 0.5)])
+def test_surfaces_that_let_a_part_pass_hide_a_part(opacities):
+    """All that is on a ray counts at the place of the first."""
+    scene = apart(SCENE)
+    shapes = {f"pane_{k}": pane(WALL.z + k, masked(v)) for k, v in enumerate(opacities)}
+    image = image_of(load(scene, wall=None, shapes=shapes, aovs="z:depth", srgb_primitives=True))
+    planes = expected(scene, coverage=1 - np.prod(1 - np.array(opacities)))
+    np.testing.assert_allclose(image[..., 3], planes["alpha"], rtol=0, atol=PICTURE)
+    np.testing.assert_allclose(image[..., 4], planes["depth"], rtol=0, atol=PICTURE * 4)
+
+
+def test_edges_are_the_same_at_the_border_of_a_crop_window():
+    scene, (x, y, width, height) = apart(SCENE), (9, 4, 17, 9)
+    wall = Wall(half=0.5)
+    planes = covered_by(wall, scene.camera)[y : y + height, x : x + width]
+    edge = (planes > 0) & (planes < 1)
+    border = np.ones_like(edge)
+    border[1:-1, 1:-1] = False
+    assert (edge & border).sum() > 5
+    cropped = replace(scene.view, crop=(x, y, width, height)).sensor()
+    settings = {"wall": wall, "aovs": "z:depth,t:alpha"}
+    whole = image_of(load(scene, **settings))[y : y + height, x : x + width]
+    part = image_of(load(scene, sensor=cropped, **settings))
+    np.testing.assert_allclose(part[..., 3:], whole[..., 3:], rtol=0, atol=PICTURE)
+
+
+# ----------------------------------------------------------------------------------------------
+# Whatever a scene holds
+# ----------------------------------------------------------------------------------------------
+
+
+def test_the_users_scene_stays_as_it_is():
+    """Names of its objects, and what Mitsuba's own integrators see, with Gaussians of shapes."""
+    floor = {"type": "rectangle", "to_world": mi.ScalarTransform4f().scale(3)}
+    shapes = {"floor": floor, "sun": {"type": "directional"}, "blob": blob([0, 0, 0])}
+    loaded = load(SCENE, sky=True, shapes=shapes)
+    names = [name for name, _ in mi.traverse(loaded)]
+    path = mi.load_dict({"type": "path"})
+    before = image_of(loaded, integrator=path, spp=16)
+    image_of(loaded)
+    assert [name for name, _ in mi.traverse(loaded)] == names
+    np.testing.assert_array_equal(image_of(loaded, integrator=path, spp=16), before)
+
+
+def repeated(shape) -> dict:
+    """Of a shape, the group that holds it and an instance of that."""
+    group = {"type": "shapegroup", "shape": shape}
+    return {"group": group, "copy": {"type": "instance", "of": {"type": "ref", "id": "group"}}}
+
+
+@pytest.mark.parametrize("with_shapes", [False, True])
+def test_instances_are_surfaces(with_shapes):
+    """Seen, moved with what they repeat, and differentiated, as if they were the shape itself."""
+    scene = apart(SCENE)
+    lamp = {"type": "point", "position": list(scene.camera.center)}
+    diffuse = {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.5, 0.6, 0.7]}}
+    others = {"lamp": lamp} | ({"blob": blob([0, 0, 0])} if with_shapes else {})
+
+    def results(shapes, prefix):
+        settings = {"nested": mi.load_dict({"type": "prb", "max_depth": 2}), "aovs": "z:depth"}
+        loaded = load(scene, wall=None, shapes=shapes | others, **settings)
+        pictures = [image_of(loaded)]
+        params = mi.traverse(loaded)
+        key = f"{prefix}.bsdf.reflectance.value"
+        dr.enable_grad(params[key])
+        dr.backward(dr.sum(mi.render(loaded, params), axis=None))
+        gradients = gradient(params[key])
+        key = f"{prefix}.to_world"
+        params[key] = mi.Transform4f(mi.traverse(mi.load_dict(pane(2.9, diffuse)))["to_world"])
+        params.update()
+        return *pictures, gradients, image_of(loaded)
+
+    found = results(repeated(pane(2.3, diffuse)), "group.shape")
+    known = results({"floor": pane(2.3, diffuse)}, "floor")
+    assert np.abs(found[1]).min() > 0 and np.abs(found[0] - found[2]).max() > 0.1
+    for value, correct in zip(found, known, strict=True):
+        np.testing.assert_allclose(value, correct, rtol=1e-4, atol=1e-4)
+
+
+def test_one_integrator_can_render_a_scene_with_and_without_mitsubas_gaussians():
+    """Of the same objects otherwise."""
+    floor, more = mi.load_dict(pane(2.3, {"type": "diffuse"})), mi.load_dict(blob([0, 0, 0]))
+    sensor = mi.load_dict(SCENE.view.sensor())
+    lamp = mi.load_dict({"type": "point", "position": list(SCENE.camera.center)})
+    common = {"type": "scene", "sensor": sensor, "floor": floor, "lamp": lamp}
+    scenes = [mi.load_dict(common), mi.load_dict(common | {"more": more})]
+    settings = SCENE.settings | tensors(SCENE.gaussians)
+    one = mi.load_dict(settings)
+    for loaded in (*scenes, *scenes):
+        fresh = image_of(loaded, integrator=mi.load_dict(settings))
+        np.testing.assert_array_equal(image_of(loaded, integrator=one), fresh)
+
+
+def test_numbers_of_the_host_count_too():
+    """A lamp of which the sampling weight becomes zero, in a scene with Mitsuba's Gaussians."""
+    lamps = {
+        f"lamp_{k}": {"type": "point", "position": list(SCENE.camera.center + k)} for k in range(2)
+    }
+    shapes = {"floor": pane(2.3, {"type": "diffuse"}), "blob": blob([0, 0, 0]), **lamps}
+    loaded = load(SCENE, wall=None, shapes=shapes)
+    before = image_of(loaded)
+    params = mi.traverse(loaded)
+    params["lamp_1.sampling_weight"] = 0.0
+    params.update()
+    after = image_of(loaded)
+    loaded.integrator().memory.surfaces.clear()
+    loaded.integrator().memory.looks.clear()
+    np.testing.assert_array_equal(after, image_of(loaded))
+    assert np.abs(after - before).max() > 0.01
+
+
 # ----------------------------------------------------------------------------------------------
 # Derivatives
 # ----------------------------------------------------------------------------------------------
