@@ -290,10 +290,15 @@ class Merged(Scene):
         )
 
 
-MERGED = (Merged(), Merged(own_degree=3), Merged(own_degree=0, degrees=(0, 3)))
+MERGED = (
+    Merged(),
+    Merged(own_degree=3),
+    Merged(own_degree=0, degrees=(0, 3)),
+    Merged(own_degree=0, degrees=(0, 0)),
+)
 
 
-@pytest.mark.parametrize("scene", MERGED, ids=["1, 2, 0", "3, 2, 0", "0, 0, 3"])
+@pytest.mark.parametrize("scene", MERGED, ids=["1, 2, 0", "3, 2, 0", "0, 0, 3", "0, 0, 0"])
 def test_several_shapes_and_tensors_merge(scene):
     scene = clear(scene)
     loaded = scene.load()
@@ -457,9 +462,9 @@ def test_forward_mode_equals_central_differences(names):
     assert_images_agree(forward_image(scene.load(), directions), expected, GRADIENTS)
 
 
-def test_forward_and_backward_mode_are_transposed_for_merged_gaussians():
+@pytest.mark.parametrize("scene", [MERGED[0], MERGED[3]], ids=["1, 2, 0", "0, 0, 0"])
+def test_forward_and_backward_mode_are_transposed_for_merged_gaussians(scene):
     """<J v, w> = <v, J^T w>, for a shape that was turned and one with Gaussians before it."""
-    scene = Merged()
     settings = {"shapes_to_world_first": transform()}
     directions = directions_of(scene.shapes[0].held)
     image = forward_image(scene.load(**settings), directions, "first")
