@@ -921,6 +921,32 @@ def test_a_degree_above_that_of_the_shapes_is_refused():
     )
 
 
+def test_a_degree_that_only_shapes_have_may_be_asked_for():
+    """When loaded, later, and still after a parameter of the integrator's own has changed."""
+    scene = clear(Merged(own_degree=0, degrees=(0, 3), sh_degree=2))
+    loaded = scene.load()
+    expected = scene.image()
+    assert_images_agree(image_of(loaded), expected)
+    loaded = replace(scene, sh_degree=None).load()
+    assert np.abs(image_of(loaded) - expected).max() > 1e-3
+    loaded.integrator().sh_degree = 2
+    params = mi.traverse(loaded)
+    params["integrator.means"] = mi.TensorXf(params["integrator.means"])
+    params.update()
+    assert_images_agree(image_of(loaded), expected)
+
+
+def test_own_coefficients_may_be_fewer_than_those_of_shapes_were():
+    """The highest degree is still that of a shape."""
+    loaded = Merged().load()
+    before = image_of(loaded)
+    params = mi.traverse(loaded)
+    params["integrator.shN"] = dr.zeros(mi.TensorXf, (40, 0, 3))
+    params.update()
+    after = image_of(loaded)
+    assert loaded.integrator().sh_degree == 2 and np.abs(after - before).max() > 1e-3
+
+
 def test_a_to_world_for_a_shape_that_is_not_there_is_refused():
     settings = {"shapes_to_world_chair": transform()}
     assert refusal(Held().load(settings)) == (
