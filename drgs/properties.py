@@ -16,6 +16,7 @@ import mitsuba as mi
 import numpy as np
 
 from drgs.camera import IGNORABLE
+from drgs.checks import did_you_mean
 from drgs.choices import Choices
 from drgs.gaussians import PARAMETER_NAMES, Gaussians
 from drgs.io.ply import read_ply
@@ -134,8 +135,15 @@ def nested_integrator(props: mi.Properties) -> mi.Integrator | None:
     """The nested integrator, under whatever name it was given."""
     # Objects alone: whatever is read counts as known, and a mistyped name would not be refused.
     is_object = mi.Properties.Type.Object
-    objects = [props[name] for name in props.keys() if props.type(name) == is_object]  # noqa: SIM118
-    nested = [value for value in objects if isinstance(value, mi.Integrator)]
+    names = [name for name in props.keys() if props.type(name) == is_object]  # noqa: SIM118
+    objects = {name: props[name] for name in names if name != "background"}
+    for name, value in objects.items():
+        if not isinstance(value, mi.Integrator):
+            raise ValueError(
+                f"splats: {name} must be an integrator, the only object besides the texture "
+                f"background, got {value.class_name()}{did_you_mean(name, ['background'])}"
+            )
+    nested = list(objects.values())
     if len(nested) > 1:
         raise ValueError(f"splats: at most one integrator can be nested, got {len(nested)}")
     return nested[0] if nested else None

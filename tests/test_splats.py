@@ -1539,6 +1539,20 @@ REFUSED = {
         'The property "hide_emitters" has the wrong type (expected boolean, got integer)',
     ),
     "unknown": ({"sh_degre": 1}, '- integer "sh_degre": 1'),
+    "a texture under an unknown name": (
+        {"backgroud": {"type": "checkerboard"}},
+        "ValueError: splats: backgroud must be an integrator, the only object besides the texture "
+        "background, got Checkerboard; did you mean background?",
+    ),
+    "an object of no use": (
+        {"foo": {"type": "diffuse"}},
+        "splats: foo must be an integrator, the only object besides the texture background, got "
+        "SmoothDiffuse",
+    ),
+    "an object of no use besides an integrator": (
+        {"nested": {"type": "path"}, "foo": {"type": "diffuse"}},
+        "splats: foo must be an integrator",
+    ),
 }
 
 
