@@ -349,12 +349,23 @@ def _check_cameras(args: argparse.Namespace) -> None:
 
 
 def _definitions(words: Sequence[str]) -> dict[str, str]:
-    """Parameters of a scene file by name."""
+    """Parameters of a scene file by name; those of ``mi.load_file`` itself cannot be given."""
     for word in words:
         if not word.partition("=")[0].strip() or "=" not in word:
             raise UserError(f"--define: must be NAME=VALUE, got {word}")
     pairs = (word.partition("=") for word in words)
-    return {name.strip(): value for name, _, value in pairs}
+    definitions = {name.strip(): value for name, _, value in pairs}
+    for name in _TAKEN:
+        if name in definitions:
+            raise UserError(
+                f"--define: the name {name} is taken by Mitsuba's loader: rename the parameter in "
+                "the scene file"
+            )
+    return definitions
+
+
+_TAKEN = ("path", "parallel", "optimize")
+"""Arguments of ``mi.load_file``, which takes a file's parameters by name as well."""
 
 
 def _check_numbers(args: argparse.Namespace) -> None:

@@ -566,6 +566,15 @@ def test_parameters_without_a_name_or_a_value_are_refused(tmp_path, capsys, word
     assert message.startswith(f"--define: must be NAME=VALUE, got {word}")
 
 
+@pytest.mark.parametrize("name", ["path", "parallel", "optimize"])
+def test_parameters_that_mitsubas_loader_has_itself_are_refused(tmp_path, capsys, name):
+    """Also where the file has one: it cannot be given from Python."""
+    path = write_scene(tmp_path, sensor(pose_around(0.8, 0.3)))
+    path.write_text(path.read_text().replace("model.ply", f"${name}"))
+    message = fails(capsys, path, "-D", f"{name}=model.ply", "--out", tmp_path / "out")
+    assert message.startswith(f"--define: the name {name} is taken") and "rename" in message
+
+
 def test_parameters_that_a_scene_file_does_not_have_are_refused(tmp_path, capsys):
     path = write_scene(tmp_path, sensor(pose_around(0.8, 0.3)))
     message = fails(capsys, path, "-D", "colour=1", "--out", tmp_path / "out")
