@@ -20,16 +20,14 @@ from drgs.exposure import Channels
 class SideBySide:
     """Where the pictures stand; all have one size, px."""
 
-    sensors: list[mi.Sensor]
+    sensors: list[mi.Sensor]  # the same one, perhaps, at several places
     width: int
     height: int
 
     @staticmethod
     def of(batch: mi.Sensor) -> SideBySide:
         """Raises ValueError if the batch's film has a crop window."""
-        found = mi.traverse(batch).hierarchy.items()
-        sensors = [o for o, (_, depth) in found if depth == 1 and isinstance(o, mi.Sensor)]
-        film = batch.film()
+        sensors, film = _children(batch), batch.film()
         if list(film.crop_size()) != list(film.size()):
             raise ValueError("splats: the film of a batch sensor must not have a crop window")
         return SideBySide(sensors, film.size()[0] // len(sensors), film.size()[1])
@@ -77,3 +75,17 @@ class SideBySide:
             for k, plane in enumerate(planes)
         ]
         return sum(parts[1:], parts[0])
+
+
+def _children(batch: mi.Sensor) -> list[mi.Sensor]:
+    """The sensors of a batch in their order; ``mi.traverse`` names each once."""
+
+    class Children(mi.TraversalCallback):  # of the variant that is set
+        def put(self, name: str, value: Any, flags: int, cpptype: Any = None) -> None:
+            del name, flags, cpptype
+            if isinstance(value, mi.Sensor):
+                sensors.append(value)
+
+    sensors: list[mi.Sensor] = []
+    batch.traverse(Children())
+    return sensors

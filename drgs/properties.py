@@ -5,8 +5,10 @@ Layer 4. Every error names the property, what was expected and what was given.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import fields, replace
+from numbers import Integral
 from typing import Any
 
 import drjit as dr
@@ -14,6 +16,7 @@ import mitsuba as mi
 import numpy as np
 
 from drgs.camera import IGNORABLE
+from drgs.checks import did_you_mean
 from drgs.choices import Choices
 from drgs.gaussians import PARAMETER_NAMES, Gaussians
 from drgs.io.ply import read_ply
@@ -132,8 +135,15 @@ def nested_integrator(props: mi.Properties) -> mi.Integrator | None:
     """The nested integrator, under whatever name it was given."""
     # Objects alone: whatever is read counts as known, and a mistyped name would not be refused.
     is_object = mi.Properties.Type.Object
-    objects = [props[name] for name in props.keys() if props.type(name) == is_object]  # noqa: SIM118
-    nested = [value for value in objects if isinstance(value, mi.Integrator)]
+    names = [name for name in props.keys() if props.type(name) == is_object]  # noqa: SIM118
+    objects = {name: props[name] for name in names if name != "background"}
+    for name, value in objects.items():
+        if not isinstance(value, mi.Integrator):
+            raise ValueError(
+                f"splats: {name} must be an integrator, the only object besides the texture "
+                f"background, got {value.class_name()}{did_you_mean(name, ['background'])}"
+            )
+    nested = list(objects.values())
     if len(nested) > 1:
         raise ValueError(f"splats: at most one integrator can be nested, got {len(nested)}")
     return nested[0] if nested else None
@@ -194,9 +204,10 @@ def whole_number(props: mi.Properties, name: str, default: int) -> int:
 
 
 def positive(props: mi.Properties, name: str, default: float) -> float:
-    """A number above 0."""
+    """A finite number above 0."""
     value = props.get(name, default)
-    if not (isinstance(value, int | float) and value > 0):
+    is_number = isinstance(value, int | float) and not isinstance(value, bool)
+    if not (is_number and 0 < value < math.inf):
         raise ValueError(f"splats: {name} must be a positive number, got {value!r}")
     return float(value)
 
@@ -235,11 +246,18 @@ def check_shapes(gaussians: Gaussians) -> None:
         )
 
 
+def degree_of(value: Any) -> int:
+    """A degree of spherical harmonics that Gaussians may have."""
+    is_integer = isinstance(value, Integral) and not isinstance(value, bool)
+    if not is_integer or value not in range(4):
+        raise ValueError(f"splats: sh_degree must be an integer from 0 to 3, got {value!r}")
+    return int(value)
+
+
 def check_degree(degree: int, gaussians: Gaussians) -> None:
     """Raise ValueError for a degree of spherical harmonics that the Gaussians do not have."""
-    stored = gaussians.sh_degree if gaussians.num_gaussians > 0 else 3
-    if degree not in range(stored + 1):
+    if degree > gaussians.sh_degree:
         raise ValueError(
-            f"splats: sh_degree must be an integer from 0 to {stored}, the degree of the "
-            f"Gaussians, got {degree!r}"
+            f"splats: sh_degree must be an integer from 0 to {gaussians.sh_degree}, the degree of "
+            f"the Gaussians, got {degree}"
         )

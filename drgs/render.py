@@ -240,7 +240,8 @@ def render_mitsuba_scene(path: Path, out: Path, definitions: dict[str, str]) -> 
     definitions: values for the parameters ($name) of the scene file.
 
     The EXR holds all channels as the film has them, the PNG the colours alone, sRGB-encoded. What
-    a ``splats`` integrator with ``srgb_primitives`` false returns is display space already.
+    a ``splats`` integrator with ``srgb_primitives`` false returns is display space already, also
+    inside ``aov``.
     """
     try:
         scene = mi.load_file(str(path), **definitions)
@@ -248,7 +249,7 @@ def render_mitsuba_scene(path: Path, out: Path, definitions: dict[str, str]) -> 
         raise UserError(f"{path}: {_first_and_last(str(error))}") from None
     if scene.integrator() is None or not scene.sensors():
         raise UserError(f"{path}: the scene must hold an integrator and at least one sensor")
-    linear = getattr(scene.integrator(), "srgb_primitives", True)
+    linear = _is_linear(scene.integrator())
     if hasattr(scene.integrator(), "plan"):
         _print_plan(path, scene)
     for index, sensor in enumerate(scene.sensors()):
@@ -263,6 +264,11 @@ def render_mitsuba_scene(path: Path, out: Path, definitions: dict[str, str]) -> 
         )
         write_png(out / f"{name}.png", np.array(colors))
         print(f"{name}: {width}x{height}")
+
+
+def _is_linear(integrator: mi.Integrator) -> bool:
+    """Whether what it returns is radiance, and that of those that are nested in it."""
+    return all(getattr(one, "srgb_primitives", True) for one in mi.traverse(integrator).hierarchy)
 
 
 def _print_plan(path: Path, scene: mi.Scene) -> None:
@@ -343,12 +349,23 @@ def _check_cameras(args: argparse.Namespace) -> None:
 
 
 def _definitions(words: Sequence[str]) -> dict[str, str]:
-    """Parameters of a scene file by name."""
+    """Parameters of a scene file by name; those of ``mi.load_file`` itself cannot be given."""
     for word in words:
         if not word.partition("=")[0].strip() or "=" not in word:
             raise UserError(f"--define: must be NAME=VALUE, got {word}")
     pairs = (word.partition("=") for word in words)
-    return {name.strip(): value for name, _, value in pairs}
+    definitions = {name.strip(): value for name, _, value in pairs}
+    for name in _TAKEN:
+        if name in definitions:
+            raise UserError(
+                f"--define: the name {name} is taken by Mitsuba's loader: rename the parameter in "
+                "the scene file"
+            )
+    return definitions
+
+
+_TAKEN = ("path", "parallel", "optimize")
+"""Arguments of ``mi.load_file``, which takes a file's parameters by name as well."""
 
 
 def _check_numbers(args: argparse.Namespace) -> None:

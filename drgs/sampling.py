@@ -24,6 +24,23 @@ longer than proportionally to a kernel's length. Of other filters, which reach o
 pixels, each pass is evaluated by itself."""
 
 
+class HeldSeed:
+    """A seed that is an array, as it is now: its owner may change it in place.
+
+    Equal to another of the same variable: no value is read back. That it is held keeps the
+    variable's index from being reused.
+    """
+
+    def __init__(self, seed: Any) -> None:
+        self.seed = type(seed)(seed)
+
+    def __eq__(self, other: object) -> bool:
+        indices = dr.detail.collect_indices
+        return isinstance(other, HeldSeed) and indices(self.seed) == indices(other.seed)
+
+    __hash__ = None
+
+
 class SampledExposure:
     """``spp`` samples per pixel, drawn by a copy of the sensor's sampler."""
 
@@ -51,7 +68,7 @@ class SampledExposure:
         )
         self.within = tuple((p.x, p.y) for p in self.positions)
         dr.eval(self.within)
-        self.key = (seed, spp, str(sensor.sampler()))
+        self.key = (HeldSeed(seed) if dr.is_jit_v(seed) else seed, spp, str(sensor.sampler()))
 
     def develop(self, passes: Sequence[Channels]) -> mi.TensorXf:
         """The image of all passes."""

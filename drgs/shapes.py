@@ -403,4 +403,5 @@ def _zeros(part: Gaussians, width: int) -> Any:
 
 
 def _concatenated(arrays: list[Any]) -> Any:
-    return arrays[0] if len(arrays) == 1 else dr.concat(arrays)
+    filled = [array for array in arrays if dr.width(array) > 0]  # dr.concat takes no others
+    return dr.concat(filled) if len(filled) > 1 else (filled or arrays)[0]

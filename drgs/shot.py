@@ -299,7 +299,9 @@ class View:
             channels = self.channels(planes, constant)
             dr.accum_grad(channels, d_channels)
             dr.enqueue(dr.ADMode.Backward, channels)
-            dr.traverse(dr.ADMode.Backward)
+            # Other views, the nested integrator, and other pictures of the same pass go back along
+            # what textures were computed from again.
+            dr.traverse(dr.ADMode.Backward, flags=dr.ADFlag.ClearVertices)
             d_planes = dr.grad(planes)
             d_constant = None if constant is None else dr.grad(constant)
         dr.eval(d_planes, d_constant)
@@ -536,4 +538,4 @@ def _accumulate_through(values: list[list[Any]], gradients: list[list[mi.Float]]
     for value, gradient in attached:
         dr.accum_grad(value, gradient)
     dr.enqueue(dr.ADMode.Backward, [value for value, _ in attached])
-    dr.traverse(dr.ADMode.Backward)
+    dr.traverse(dr.ADMode.Backward, flags=dr.ADFlag.ClearVertices)

@@ -26,6 +26,7 @@ from drgs.properties import (
     check_degree,
     check_shapes,
     choices_of,
+    degree_of,
     ignored_effects,
     load_gaussians,
     nested_integrator,
@@ -243,6 +244,7 @@ class SplatsIntegrator(mi.CppADIntegrator):
         self.smoothing, self.features = gaussians.smoothing, gaussians.features or {}
         self._has_own, self._turns = gaussians.num_gaussians > 0, turns_of_shapes(props)
         self._gathered: Any = None  # with those of the scene's shapes: see drgs.shapes
+        self._scene_has_shapes = False  # of Gaussians: the last one that was rendered
         self.ignore = ignored_effects(props)
         self.aovs = aovs_of(props, [*AOVS, *self.features])
         self.sh_degree = props.get("sh_degree", gaussians.sh_degree)
@@ -290,19 +292,22 @@ class SplatsIntegrator(mi.CppADIntegrator):
         if dr.width(self.shN) == 0:  # not exposed, so that its rows could not be set
             self.shN = dr.zeros(mi.TensorXf, (next(iter(self.means.shape), 0), 0, 3))
         check_shapes(replace(self._own, features=self.features))
-        check_degree(self.sh_degree, self._own)
+        if not (self._sh_degree_is_given or self._scene_has_shapes):
+            check_degree(self.sh_degree, self._own)
 
     @property
     def sh_degree(self) -> int:
-        """Highest spherical harmonics degree that is evaluated."""
+        """Highest spherical harmonics degree that is evaluated; 0 to 3.
+
+        A scene is refused whose Gaussians, those of its shapes included, do not have it.
+        """
         if self._gathered is not None and not self._sh_degree_is_given:
             return self._gathered.gaussians.sh_degree
         return self._sh_degree
 
     @sh_degree.setter
     def sh_degree(self, degree: int) -> None:
-        check_degree(degree, self.gaussians)
-        self._sh_degree, self._sh_degree_is_given = int(degree), True
+        self._sh_degree, self._sh_degree_is_given = degree_of(degree), True
 
     @property
     def gaussians(self) -> Gaussians:
@@ -315,11 +320,11 @@ class SplatsIntegrator(mi.CppADIntegrator):
     def _gather(self, scene: mi.Scene) -> None:
         """Find the scene's ellipsoids, and convert them if they have changed."""
         shapes = _ellipsoids(scene)
+        self._scene_has_shapes = bool(shapes)
         if shapes or set(self._turns) - {""}:
             from drgs.shapes import gather
 
             self._gathered = gather(self._own, shapes, self._turns, self._gathered)
-            check_degree(self.sh_degree, self._gathered.gaussians)
         else:
             self._gathered = None
         if self.gaussians.num_gaussians == 0:
@@ -328,6 +333,7 @@ class SplatsIntegrator(mi.CppADIntegrator):
                 f"{', '.join(PARAMETER_NAMES)}, or the scene a shape of type ellipsoids or "
                 "ellipsoidsmesh"
             )
+        check_degree(self.sh_degree, self.gaussians)
 
     @property
     def _own(self) -> Gaussians:

@@ -183,7 +183,8 @@ class Stage:
     def of(model: Gaussians, size: int) -> Stage:
         """Set it up; model: as :func:`load` gives it; size: px, of the picture's sides."""
         gaussians = model.to(mi.TensorXf)
-        tensors = {name: mi.TensorXf(getattr(model, name)) for name in PARAMETER_NAMES}
+        names = [*PARAMETER_NAMES, *(["smoothing"] if model.smoothing is not None else [])]
+        tensors = {name: mi.TensorXf(getattr(model, name)) for name in names}
         splats = {"type": "splats", "nested": {"type": "prb", "max_depth": 3}, **tensors}
         heights = model.means[model.opacities >= OPAQUE, 2]
         floor = float(np.quantile(heights, 0.01)) if len(heights) else -0.5

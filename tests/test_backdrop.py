@@ -558,6 +558,93 @@ def test_derivatives_of_the_radiance_are_differences(kind, srgb_primitives):
     assert np.abs(gradient).max() > 0
 
 
+def batch_of(first, second, width) -> dict:
+    """Two views of one size, side by side."""
+    film = first["film"] | {"width": 2 * width}
+    return {"type": "batch", "film": film, "sampler": first["sampler"], "a": first, "b": second}
+
+
+def floor() -> dict:
+    """Behind the splats, in a part of the film."""
+    camera = VIEW.camera
+    matrix = np.eye(4)
+    matrix[:3, :3] = camera.rotation.T @ np.diag([1.0, -1.0, -1.0])
+    matrix[:3, 3] = camera.rotation.T @ [0.5, 0.5, 4] + camera.center
+    reflectance = {"type": "rgb", "value": [0.5, 0.3, 0.2]}
+    return {
+        "type": "rectangle",
+        "to_world": mi.ScalarTransform4f(matrix),
+        "bsdf": {"type": "diffuse", "reflectance": reflectance},
+    }
+
+
+FLOOR = "floor.bsdf.reflectance.value"
+
+TWICE = "two pictures", "two losses", "two losses of one graph"
+"""What a factor reaches the backdrop through, more than once."""
+
+
+def factored(way, kind):
+    """A scene, and the parameters that are multiplied by the factor."""
+    if way == "batch":
+        views = [Camera(view).dictionary() for view in (VIEW, VIEWS[2])]
+        sensor = batch_of(*views, VIEW.width)
+    else:
+        sensor = Camera().dictionary()
+    objects, settings = {}, {}
+    if kind == "picture":
+        settings["background"] = picture(texels(6, 8), filter_type="bilinear")
+    else:
+        objects["sky"] = EMITTERS[kind]()
+    keys = [{"constant": "sky.radiance.value", "envmap": "sky.data"}.get(kind, BACKGROUND)]
+    if way.startswith("surface"):
+        objects["floor"] = floor()
+        settings |= {"nested": {"type": "prb", "max_depth": 2}, "nested_spp": 4}
+    if way == "surface of the same":
+        keys.append(FLOOR)
+    if way == "splats of the same":
+        keys.append("integrator.sh0")
+    return load(sensor, integrator_of(Scene().gaussians, **settings), **objects), keys
+
+
+BACKGROUND = "integrator.background.data"
+
+
+@all_kinds
+@pytest.mark.parametrize(
+    "way", [*TWICE, "batch", "surface", "surface of the same", "splats of the same"]
+)
+def test_gradients_reach_what_the_radiance_was_computed_from(way, kind):
+    """A factor of all of it, by central differences, from the same points of the emitters."""
+    loaded, keys = factored(way, kind)
+    start = {key: np.array(mi.traverse(loaded)[key]) for key in keys}
+    count = 2 if way in TWICE else 1
+    weights = single(np.random.default_rng(1).uniform(0.5, 1.5, image_of(loaded).shape))
+
+    def loss(factor, **seeds):
+        params = mi.traverse(loaded)
+        for key, values in start.items():
+            params[key] = like(params[key], values) * factor
+        params.update()
+        pictures = [mi.render(loaded, params, **seeds) for _ in range(count)]
+        return [dr.sum(image * tensor(weights), axis=None) for image in pictures]
+
+    factor = mi.Float(1)
+    dr.enable_grad(factor)
+    losses = loss(factor, seed=1, seed_grad=7)
+    if way == "two losses":
+        dr.backward(losses[0])
+        losses = loss(factor, seed=1, seed_grad=7)[1:]
+    elif way == "two losses of one graph":
+        dr.backward(losses.pop(0), flags=dr.ADFlag.ClearVertices)
+    dr.backward(sum(losses[1:], losses[0]))
+    step = 0.01
+    both = [sum(np.array(one)[()] for one in loss(mi.Float(1 + s), seed=7)) for s in (step, -step)]
+    # Sums of 3404 terms of one sign, in single precision; of pixels in a curved display space and
+    # of what reflects the sky, a step leaves its square.
+    assert dr.grad(factor)[0] == pytest.approx((both[0] - both[1]) / (2 * step), rel=3e-3)
+
+
 def test_the_derivative_of_a_constant_radiance_is_what_passes_the_splats():
     """By hand, from the transmittance."""
     loaded, key = scene_with("constant")

@@ -118,6 +118,30 @@ def test_the_gradient_of_a_sensor_is_that_of_its_own_part():
         assert gradient(params[key]) == pytest.approx(gradient(own[name]), rel=1e-4)
 
 
+def test_a_sensor_may_stand_in_it_twice():
+    """Its gradient is the sum of those of both parts."""
+    weights, view = weights_of(), SENSORS[0]
+    twice = mi.load_dict(view.sensor())
+    loaded = load(batch() | {"view_0": twice, "view_2": twice})
+    params = mi.traverse(loaded)
+    fovs = [key for key in params.keys() if key.endswith(".x_fov")]  # noqa: SIM118
+    assert len(fovs) == 2  # its name is that of its last place
+    (key,) = set(fovs) - {"sensor.view_1.x_fov"}
+    dr.enable_grad(params[key])
+    image = mi.render(loaded, params)
+    order = (SENSORS[0], SENSORS[1], SENSORS[0])
+    for part, one in zip(parts(np.array(image)), order, strict=True):
+        np.testing.assert_array_equal(part, image_of(load(one.sensor())))
+    dr.backward(dr.sum(image * mi.TensorXf(weights), axis=None))
+    alone = load(view.sensor())
+    own = mi.traverse(alone)
+    name = next(k for k in own.keys() if k.endswith(".x_fov"))  # noqa: SIM118
+    dr.enable_grad(own[name])
+    both = sum(parts(weights)[::2])
+    dr.backward(dr.sum(mi.render(alone, own) * mi.TensorXf(np.ascontiguousarray(both)), axis=None))
+    assert gradient(params[key]) == pytest.approx(gradient(own[name]), rel=1e-4)
+
+
 def test_forward_mode_is_the_transpose_of_the_gradients():
     weights, rng = weights_of(), np.random.default_rng(3)
     loaded = load(batch())

@@ -66,6 +66,15 @@ def test_what_the_picture_was_made_of_is_found(relight, monkeypatch, tmp_path, c
     assert (tmp_path / "loss.png").exists() and (tmp_path / "relight.gif").exists()
 
 
+def test_a_models_smoothing_filter_reaches_the_integrator(relight):
+    model = relight.load(MODEL)
+    smoothing = np.full(model.num_gaussians, 0.05, np.float32)
+    stages = [relight.Stage.of(one, 20) for one in (model, replace(model, smoothing=smoothing))]
+    filters = [stage.scene.integrator().smoothing for stage in stages]
+    assert filters[0] is None
+    np.testing.assert_array_equal(np.array(filters[1]), smoothing)
+
+
 def test_harmonics_are_rotated_as_on_the_host(relight):
     rotation = Rotation.from_rotvec([0.3, -0.7, 0.4]).as_matrix()
     coefficients = np.random.default_rng(0).normal(0, 1, (5, 15, 3)).astype(np.float32)

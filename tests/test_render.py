@@ -370,6 +370,22 @@ def test_a_scene_in_display_space_is_not_encoded_again(tmp_path):
     assert_pictures_agree(exr, expected.image, expected, 1e-4)
 
 
+def test_a_scene_in_display_space_inside_aov_is_not_encoded_again(tmp_path):
+    """Both files have what the rays of ``aov`` see, at points of its own."""
+    pose = pose_around(0.8, 0.3)
+    settings = '<boolean name="srgb_primitives" value="false"/>'
+    path = write_scene(tmp_path, sensor(pose), settings=settings)
+    begin, end = '<integrator type="splats">', "</integrator>"
+    aov = '<integrator type="aov"><string name="aovs" value="d:depth"/>'
+    text = path.read_text().replace(begin, aov + begin).replace(end, end + end)
+    path.write_text(text)
+    run(path, "--out", tmp_path / "out")
+    root = mi.Bitmap(str(tmp_path / "out" / "blobs.exr")).split()[0][1]
+    colors = np.clip(np.array(root.convert(mi.Bitmap.PixelFormat.RGB)), 0, 1)
+    assert np.abs(picture(tmp_path / "out" / "blobs.png") - colors).max() <= EIGHT_BITS
+    assert np.abs(to_srgb(colors) - colors).max() > 0.1
+
+
 def test_every_sensor_of_a_scene_is_rendered(tmp_path):
     sensors = sensor(pose_around(0.8, 0.3)), sensor(pose_around(2.0, 0.3), "rgba")
     run(write_scene(tmp_path, *sensors), "--out", tmp_path / "out")
@@ -548,6 +564,15 @@ def test_parameters_without_a_name_or_a_value_are_refused(tmp_path, capsys, word
     path = write_scene(tmp_path, sensor(pose_around(0.8, 0.3)))
     message = fails(capsys, path, "-D", word, "--out", tmp_path / "out")
     assert message.startswith(f"--define: must be NAME=VALUE, got {word}")
+
+
+@pytest.mark.parametrize("name", ["path", "parallel", "optimize"])
+def test_parameters_that_mitsubas_loader_has_itself_are_refused(tmp_path, capsys, name):
+    """Also where the file has one: it cannot be given from Python."""
+    path = write_scene(tmp_path, sensor(pose_around(0.8, 0.3)))
+    path.write_text(path.read_text().replace("model.ply", f"${name}"))
+    message = fails(capsys, path, "-D", f"{name}=model.ply", "--out", tmp_path / "out")
+    assert message.startswith(f"--define: the name {name} is taken") and "rename" in message
 
 
 def test_parameters_that_a_scene_file_does_not_have_are_refused(tmp_path, capsys):

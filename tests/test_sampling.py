@@ -190,6 +190,26 @@ def test_points_are_those_of_the_sampler():
     assert np.array_equal(first, again) and not np.array_equal(first, other)
 
 
+def test_a_seed_that_was_changed_in_place_gives_other_points():
+    loaded = SCENE.load(samples=4)
+    integrator, sensor = loaded.integrator(), loaded.sensors()[0]
+    seed = mi.UInt32(0)
+
+    def picture(seed):
+        return np.array(integrator.render(loaded, sensor, seed=seed))
+
+    before = picture(seed)
+    frames = integrator.memory.rendered[0]
+    np.testing.assert_array_equal(picture(seed), before)
+    assert integrator.memory.rendered[0] is frames
+    seed += 1
+    np.testing.assert_array_equal(picture(seed), picture(1))
+    assert np.abs(picture(1) - before).max() > 1e-3
+    dr.make_opaque(seed)
+    seed += 1
+    np.testing.assert_array_equal(picture(seed), picture(2))
+
+
 def test_samples_of_one_call_replace_those_of_the_sampler():
     few, many = SCENE.load(samples=1), SCENE.load(samples=4)
     assert np.array_equal(image_of(few, spp=4), image_of(many))

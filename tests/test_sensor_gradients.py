@@ -336,6 +336,20 @@ def test_forward_and_backward_derivatives_are_transposed(name):
     assert np.abs(products).max() > 100 * allowed
 
 
+@all_cases
+def test_two_pictures_have_twice_the_derivatives_of_one(name):
+    """Of what the sensor's parameters were computed from, in two passes; sums of the same terms."""
+    case, scene = CASES[name], clear_scene(name)
+    weights = single(np.random.default_rng(3).normal(size=image_of(case.load(scene)).shape))
+    loaded = case.load(scene)
+    params, numbers = attach_all(loaded, *case.start)
+    losses = [dr.sum(mi.render(loaded, params) * tensor(weights), axis=None) for _ in range(2)]
+    dr.backward(losses[0], flags=dr.ADFlag.ClearVertices)
+    dr.backward(losses[1])
+    expected = 2 * backward(case.load(scene), weights, *case.start)
+    np.testing.assert_allclose([dr.grad(x)[0] for x in numbers], expected, rtol=1e-6)
+
+
 def test_derivatives_in_linear_radiance():
     """The conversion to what films expect is behind the splats, and before the background."""
     case, scene = CASES["perspective"], clear_scene("perspective")

@@ -290,10 +290,15 @@ class Merged(Scene):
         )
 
 
-MERGED = (Merged(), Merged(own_degree=3), Merged(own_degree=0, degrees=(0, 3)))
+MERGED = (
+    Merged(),
+    Merged(own_degree=3),
+    Merged(own_degree=0, degrees=(0, 3)),
+    Merged(own_degree=0, degrees=(0, 0)),
+)
 
 
-@pytest.mark.parametrize("scene", MERGED, ids=["1, 2, 0", "3, 2, 0", "0, 0, 3"])
+@pytest.mark.parametrize("scene", MERGED, ids=["1, 2, 0", "3, 2, 0", "0, 0, 3", "0, 0, 0"])
 def test_several_shapes_and_tensors_merge(scene):
     scene = clear(scene)
     loaded = scene.load()
@@ -457,9 +462,9 @@ def test_forward_mode_equals_central_differences(names):
     assert_images_agree(forward_image(scene.load(), directions), expected, GRADIENTS)
 
 
-def test_forward_and_backward_mode_are_transposed_for_merged_gaussians():
+@pytest.mark.parametrize("scene", [MERGED[0], MERGED[3]], ids=["1, 2, 0", "0, 0, 0"])
+def test_forward_and_backward_mode_are_transposed_for_merged_gaussians(scene):
     """<J v, w> = <v, J^T w>, for a shape that was turned and one with Gaussians before it."""
-    scene = Merged()
     settings = {"shapes_to_world_first": transform()}
     directions = directions_of(scene.shapes[0].held)
     image = forward_image(scene.load(**settings), directions, "first")
@@ -914,6 +919,32 @@ def test_a_degree_above_that_of_the_shapes_is_refused():
     assert "integer from 0 to 1, the degree of the Gaussians, got 2" in refusal(
         Held(degree=1).load({"sh_degree": 2})
     )
+
+
+def test_a_degree_that_only_shapes_have_may_be_asked_for():
+    """When loaded, later, and still after a parameter of the integrator's own has changed."""
+    scene = clear(Merged(own_degree=0, degrees=(0, 3), sh_degree=2))
+    loaded = scene.load()
+    expected = scene.image()
+    assert_images_agree(image_of(loaded), expected)
+    loaded = replace(scene, sh_degree=None).load()
+    assert np.abs(image_of(loaded) - expected).max() > 1e-3
+    loaded.integrator().sh_degree = 2
+    params = mi.traverse(loaded)
+    params["integrator.means"] = mi.TensorXf(params["integrator.means"])
+    params.update()
+    assert_images_agree(image_of(loaded), expected)
+
+
+def test_own_coefficients_may_be_fewer_than_those_of_shapes_were():
+    """The highest degree is still that of a shape."""
+    loaded = Merged().load()
+    before = image_of(loaded)
+    params = mi.traverse(loaded)
+    params["integrator.shN"] = dr.zeros(mi.TensorXf, (40, 0, 3))
+    params.update()
+    after = image_of(loaded)
+    assert loaded.integrator().sh_degree == 2 and np.abs(after - before).max() > 1e-3
 
 
 def test_a_to_world_for_a_shape_that_is_not_there_is_refused():

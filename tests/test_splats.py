@@ -1484,16 +1484,19 @@ REFUSED = {
         {name: (lambda name=name: zeros(0, *valid()[name].shape[1:])) for name in PARAMETER_NAMES},
         "ValueError: splats: at least one Gaussian is needed, got none",
     ),
-    "sh_degree above the stored": (
-        {"sh_degree": 2},
-        "ValueError: splats: sh_degree must be an integer from 0 to 1, the degree of the "
-        "Gaussians, got 2",
+    "sh_degree above any": (
+        {"sh_degree": 4},
+        "ValueError: splats: sh_degree must be an integer from 0 to 3, got 4",
     ),
     "sh_degree negative": ({"sh_degree": -1}, "got -1"),
     "sh_degree not an integer": ({"sh_degree": 0.5}, "got 0.5"),
+    "sh_degree a float": ({"sh_degree": 0.0}, "sh_degree must be an integer from 0 to 3, got 0.0"),
+    "sh_degree a boolean": ({"sh_degree": True}, "got True"),
     "sh_degree a string": ({"sh_degree": "1"}, "got '1'"),
     "near zero": ({"near": 0.0}, "ValueError: splats: near must be a positive number, got 0.0"),
     "near negative": ({"near": -1}, "got -1"),
+    "near a boolean": ({"near": True}, "splats: near must be a positive number, got True"),
+    "near infinite": ({"near": float("inf")}, "near must be a positive number, got inf"),
     "near a string": ({"near": "far"}, "got 'far'"),
     "near not a number": ({"near": float("nan")}, "got nan"),
     "antialiased a string": (
@@ -1536,6 +1539,20 @@ REFUSED = {
         'The property "hide_emitters" has the wrong type (expected boolean, got integer)',
     ),
     "unknown": ({"sh_degre": 1}, '- integer "sh_degre": 1'),
+    "a texture under an unknown name": (
+        {"backgroud": {"type": "checkerboard"}},
+        "ValueError: splats: backgroud must be an integrator, the only object besides the texture "
+        "background, got Checkerboard; did you mean background?",
+    ),
+    "an object of no use": (
+        {"foo": {"type": "diffuse"}},
+        "splats: foo must be an integrator, the only object besides the texture background, got "
+        "SmoothDiffuse",
+    ),
+    "an object of no use besides an integrator": (
+        {"nested": {"type": "path"}, "foo": {"type": "diffuse"}},
+        "splats: foo must be an integrator",
+    ),
 }
 
 
@@ -1551,11 +1568,27 @@ def test_an_unknown_property_is_mitsubas_own_error():
         mi.load_dict({"type": "splats", **valid(), "sh_degre": 1})
 
 
-def test_the_degree_in_use_is_checked():
+@pytest.mark.parametrize("degree", [4, -1, 0.0, True])
+def test_the_degree_in_use_is_checked(degree):
     integrator = mi.load_dict({"type": "splats", **valid()})
-    with pytest.raises(ValueError, match=r"integer from 0 to 1, .* got 2"):
-        integrator.sh_degree = 2
+    with pytest.raises(ValueError, match=rf"integer from 0 to 3, got {degree}"):
+        integrator.sh_degree = degree
     assert integrator.sh_degree == 1
+
+
+@pytest.mark.parametrize("use", ["render", "plan"])
+@pytest.mark.parametrize("given", [True, False], ids=["when loaded", "later"])
+def test_a_degree_above_that_of_the_scenes_gaussians_is_refused(given, use):
+    """Before that, shapes of the scene might have it."""
+    loaded = replace(Scene(), sh_degree=2 if given else None).load()
+    integrator = loaded.integrator()
+    if not given:
+        mi.render(loaded)
+        integrator.sh_degree = 2
+    with pytest.raises(ValueError, match=r"integer from 0 to 1, the degree of the Gau.* got 2"):
+        getattr(integrator, use)(loaded, loaded.sensors()[0])
+    integrator.sh_degree = np.int64(1)
+    mi.render(loaded)
 
 
 @pytest.mark.parametrize(
