@@ -262,7 +262,11 @@ class ColorConfig(_Section):
 
 
 class CamerasConfig(_Section):
-    """Refinement of the training cameras; first rates per step, which fall as that of the means."""
+    """Refinement of the training cameras; first rates per step, which fall as that of the means.
+
+    A camera's pose gets a step when its picture is drawn: of 7,000 iterations with 100 pictures 70.
+    Fits that short need higher rates than 30,000 iterations, which these are for.
+    """
 
     optimise: bool = Field(False, description="Refine poses, focal lengths and principal points.")
     start: Count = Field(0, ge=0, description="Iterations before it begins.")
