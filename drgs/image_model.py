@@ -327,7 +327,7 @@ class SplatFeatures:
 
     def worth(self, stored: list[Any], pixel: int, g: list[Any]) -> Any:
         """c . g, with the features c at a pixel and the loss's derivatives g there."""
-        result = type(g[0])(0)
+        result: Any = 0  # there may be no features, but alpha alone
         for c, derivative in zip(self.at(stored, pixel), g, strict=True):
             result = dr.fma(c, derivative, result)
         return result
