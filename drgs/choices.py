@@ -10,6 +10,8 @@ import math
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
+import numpy as np
+
 from drgs.constants import ALPHA_CUT, ALPHA_MAX, LOW_PASS, TRANSMITTANCE_STOP
 from drgs.cutoffs import Cutoffs
 from drgs.image_model import DEFAULT, ImageModel
@@ -19,6 +21,9 @@ from drgs.rendering import CenterOrder, Pipeline
 PROJECTIONS = ("ewa", "unscented", "exact")
 ORDERS = ("center", "pixel")
 SH_DIRECTIONS = ("mean", "pixel")
+
+LEAST_STOP = 1e-30
+"""Where no stop is asked for: past it float32 has no transmittance to go back from."""
 
 WINDOW = 4
 """Splats that a pixel keeps waiting: see ``drgs.pixel_order``."""
@@ -62,7 +67,7 @@ class Choices:
                 )
         for name, expected, holds in (
             ("order_window", "from 1 to 64", 1 <= self.order_window <= 64),
-            ("alpha_max", "above 0 and below 1", 0 < self.alpha_max < 1),
+            ("alpha_max", "above 0 and below 1 in float32", 0 < np.float32(self.alpha_max) < 1),
             ("alpha_cut", "from 0 to below 1", 0 <= self.alpha_cut < 1),
             ("transmittance_stop", "from 0 to below 1", 0 <= self.transmittance_stop < 1),
             ("extent", "positive", self.extent > 0),
@@ -88,7 +93,8 @@ class Choices:
 
     def pipeline(self, sh_degree: int, **others: Any) -> Pipeline:
         """What renders with these choices; others: further fields of the pipeline."""
-        cutoffs = Cutoffs(self.alpha_max, self.alpha_cut, self.transmittance_stop, self.extent)
+        stop = max(self.transmittance_stop, LEAST_STOP)
+        cutoffs = Cutoffs(self.alpha_max, self.alpha_cut, stop, self.extent)
         model = DEFAULT if cutoffs == Cutoffs() else ImageModel(cutoffs=cutoffs)
         shape, order, color = ewa, CenterOrder(), color_at_mean
         if self.projection == "exact":

@@ -43,6 +43,9 @@ REHEARSAL_VIEWS = 8
 REVISED_EVERY = 0.1
 """Of the time."""
 
+LONGEST = 7 * 24 * 3600.0
+"""Seconds."""
+
 WARM_UP, TIMED = 6, 20
 """Iterations: the first compile kernels and fill the allocator's pools."""
 
@@ -313,10 +316,14 @@ _DURATION = re.compile(
 
 
 def parse_duration(text: str) -> float:
-    """Seconds of ``90``, ``90s``, ``5m``, ``1h30m``. Raises ValueError for anything else."""
+    """Seconds of ``90``, ``90s``, ``5m``, ``1m30``, ``1h30m``. Raises ValueError for anything else.
+
+    That includes ``1h30``, which would be half a minute.
+    """
     match = _DURATION.fullmatch(text.strip())
     parts = match.groupdict(default="0") if match else {"h": "0", "m": "0", "s": "0"}
     seconds = 3600 * float(parts["h"]) + 60 * float(parts["m"]) + float(parts["s"])
-    if seconds <= 0:
-        raise ValueError(f"must be a time such as 90s, 5m or 1h30m, got {text!r}")
+    unclear = re.search(r"h[\d.]+$", text.strip())
+    if unclear or not 0 < seconds <= LONGEST:
+        raise ValueError(f"must be a time such as 90s, 5m or 1h30m, a week at most, got {text!r}")
     return seconds

@@ -52,7 +52,9 @@ class RayColors(SplatFeatures):
         return replace(self, camera=camera)
 
     def check_differentiable_in_camera(self) -> None:
-        """They are not: the direction is the camera's."""
+        """They are not: the direction is the camera's. Degree 0 has none."""
+        if self.sh_degree == 0:
+            return
         raise NotImplementedError(
             "splats: sh_direction 'pixel' is not differentiable in the camera; use 'mean'"
         )
@@ -64,7 +66,7 @@ class RayColors(SplatFeatures):
         return replace(self, basis=basis)
 
     def _direction(self, x: Any, y: Any) -> Any:
-        camera = self.camera
+        camera = self.camera.at_row(y)
         return dr.normalize(camera.rotation.T @ camera.lens.ray(camera, x, y))
 
     def at(self, stored: list[Any], pixel: int) -> list[Any]:

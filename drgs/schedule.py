@@ -18,6 +18,7 @@ _COUNTS = (
     "densify.reset_every",
     "densify.white_background_reset",
     "model.sh_increase_every",
+    "cameras.start",
 )
 
 
@@ -42,7 +43,7 @@ def with_iterations(config: FitConfig, iterations: int) -> FitConfig:
     share = iterations / config.iterations
 
     def scaled(count: int | None) -> int | None:
-        return None if count is None else max(1, round(count * share))
+        return count if not count else max(1, round(count * share))  # None, and 0: from the start
 
     changes: dict[str, Any] = {"iterations": iterations}
     for key in _COUNTS:

@@ -802,3 +802,35 @@ def test_a_picture_through_a_thin_lens_is_that_of_the_reference():
     np.testing.assert_allclose(image, expected[view.window], rtol=0, atol=5e-5)
     sharp = effects.render(gaussians, camera)
     assert np.abs(sharp.image - picture.image)[view.window].max() > 0.05
+
+
+def test_colours_along_rays_turn_with_a_rolling_shutter():
+    """Of splats that are small, rays have the direction of the mean, with which colours change."""
+    count = 3000
+    directions = np.random.default_rng(0).normal(size=(count, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    gaussians = {
+        "means": 4 * directions,
+        "quats": np.tile([1.0, 0, 0, 0], (count, 1)),
+        "log_scales": np.full((count, 3), np.log(0.05)),
+        "logit_opacities": np.full(count, 3.0),
+        "sh0": np.zeros((count, 1, 3)),
+        "shN": np.tile(np.eye(3), (count, 1, 1)),
+    }
+    tensors = {name: mi.TensorXf(value.astype(np.float32)) for name, value in gaussians.items()}
+    transform = mi.ScalarTransform4f()
+    sensor = {
+        "type": "calibrated", "fx": 40.0, "fy": 40.0, "shutter": "rolling",
+        "to_world": transform.look_at([0, 0, 0], [0, 0, 1], [0, -1, 0]),
+        "to_world_close": transform.look_at([0, 0, 0], [1.2, 0, 0.7], [0, -1, 0]),
+        "film": {"type": "hdrfilm", "width": 48, "height": 40, "rfilter": {"type": "box"}},
+    }  # fmt: skip
+    images = [
+        image_of(mi.load_dict({
+            "type": "scene", "sensor": sensor,
+            "integrator": {"type": "splats", "sh_direction": name, **tensors},
+        }))
+        for name in ("mean", "pixel")
+    ]  # fmt: skip
+    assert np.ptp(images[0][..., :3]) > 0.5
+    np.testing.assert_allclose(images[1], images[0], rtol=0, atol=0.03)

@@ -330,6 +330,31 @@ def test_behind_hundreds_of_layers_gradients_keep_their_accuracy():
     np.testing.assert_allclose(results[1], results[0], rtol=1e-3)
 
 
+def test_no_stop_leaves_gradients_behind_any_number_of_opaque_layers():
+    """Transmittance is 1e-60 there, which float32 has not: it ends before."""
+    count = 30
+    camera = reference.Camera(np.eye(3), np.zeros(3), 20.0, 20.0, 8.0, 8.0, 16, 16)
+    z = np.linspace(2, 4, count)
+    gaussians = reference.Gaussians(
+        means=single(np.column_stack([0 * z, 0 * z, z])),
+        quats=np.tile([1.0, 0, 0, 0], (count, 1)),
+        log_scales=np.full((count, 3), single(np.log(3))),
+        logit_opacities=np.full(count, 12.0),
+        sh0=single(np.random.default_rng(0).normal(size=(count, 1, 3))),
+        shN=np.zeros((count, 0, 3)),
+    )
+    results = []
+    for precision in (FLOAT64, FLOAT32):
+        device = device_gaussians(gaussians, precision)
+        pipeline = Choices(transmittance_stop=0.0).pipeline(0)
+        frame = rendering.render(device, device_camera(camera, precision), pipeline)
+        ones = precision.array(np.ones(256))
+        gradients = rendering.render_adjoint(device, frame, [ones] * 3, 0 * ones).parameters
+        results.append([np.array(gradients.sh0), np.array(gradients.logit_opacities)])
+    for single_precision, correct in zip(results[1], results[0], strict=True):
+        np.testing.assert_allclose(single_precision, correct, rtol=1e-4, atol=1e-4)
+
+
 def test_sums_of_products_are_exact_to_twice_the_precision():
     """The second half of the terms almost cancels the first."""
     count = 100
@@ -420,7 +445,8 @@ def test_a_colour_at_its_minimum_keeps_its_derivative():
         ({"order": "entry"}, "order must be one of center, pixel, got 'entry'"),
         ({"order_window": 0}, "order_window must be from 1 to 64, got 0"),
         ({"sh_direction": "ray"}, "sh_direction must be one of mean, pixel, got 'ray'"),
-        ({"alpha_max": 1.0}, "alpha_max must be above 0 and below 1, got 1.0"),
+        ({"alpha_max": 1.0}, "alpha_max must be above 0 and below 1 in float32, got 1.0"),
+        ({"alpha_max": 1 - 1e-9}, "alpha_max must be above 0 and below 1 in float32, got 0.99999"),
         ({"alpha_cut": -0.1}, "alpha_cut must be from 0 to below 1, got -0.1"),
         ({"transmittance_stop": math.nan}, "transmittance_stop must be from 0 to below 1, got nan"),
         ({"extent": 0.0}, "extent must be positive, got 0.0"),

@@ -11,7 +11,7 @@ from small_capture import make_dataset, write_dataset
 from drgs.bench import __main__ as bench
 from drgs.bench import training
 from drgs.config import FitConfig, load_config
-from drgs.schedule import with_iterations
+from drgs.schedule import changed, with_iterations
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -26,6 +26,9 @@ def test_a_shorter_schedule_keeps_its_shares():
     short = with_iterations(config, 6000)
     assert short.iterations == 6000 and short.seed == 7
     assert (short.densify.start, short.densify.stop, short.densify.every) == (100, 3000, 100)
+    assert short.cameras.start == 0
+    refined = changed(config, {"cameras.start": 1000})
+    assert with_iterations(refined, 6000).cameras.start == 200
     assert (short.densify.reset_every, short.densify.white_background_reset) == (600, 100)
     assert short.model.sh_increase_every == 200 and short.coarse[0].until == 600
     assert with_iterations(short, 30_000) == config
@@ -57,6 +60,7 @@ def test_fits_run_and_are_not_repeated(tmp_path, capfd, monkeypatch):
     values = yaml.safe_load(training.CONFIG.read_text())
     values["data"] = {"path": str(tmp_path / "data")}
     values["init"] = {"num_points": 60, "half_extent": 1.0}
+    values["output"] = {"history_every": 50}
     config = tmp_path / "small.yml"
     config.write_text(yaml.safe_dump(values))
     command = ["training", "--quick", "--only", "1", "3", "--config", str(config)]

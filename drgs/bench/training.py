@@ -153,7 +153,8 @@ def seconds_at_start(out: Path, budgets: Sequence[int]) -> float:
         if path.exists():
             with path.open(newline="") as file:
                 rows = {int(row["iteration"]): float(row["wall_s"]) for row in csv.DictReader(file)}
-            first, last = sorted(rows)[0], sorted(rows)[START_ROWS]
+            first, *others = sorted(rows)
+            last = others[:START_ROWS][-1]
             seconds.append((rows[last] - rows[first]) / (last - first))
     return round(statistics.median(seconds), 5) if seconds else math.nan
 
