@@ -28,6 +28,9 @@ class Lens:
     distorts: ClassVar[bool] = False
     """Whether a pinhole could take its place."""
 
+    parallel: ClassVar[bool] = False
+    """Whether its rays do not meet in the camera."""
+
     def upload(self, float_type: type) -> Lens:
         """The lens with Dr.Jit scalars of this type for its numbers."""
         del float_type

@@ -544,6 +544,8 @@ class Orthographic(Lens):
     All rays are parallel: colours are seen along the camera's axis.
     """
 
+    parallel = True
+
     def look(self, camera: Camera, position: Any) -> tuple[Any, Any, Any]:
         """Whether a mean is seen, its position, and its depth."""
         return _replaced(position, position.z >= camera.near)

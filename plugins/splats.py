@@ -140,7 +140,8 @@ class SplatsIntegrator(mi.CppADIntegrator):
      * - order
        - |string|
        - ``center``: splats are composited in the order of their means' depths; ``pixel``: in
-         that of their peaks along each pixel's ray. (Default: ``center``)
+         that of their peaks along each pixel's ray. Not for ``orthographic``.
+         (Default: ``center``)
 
      * - order_window
        - |int|

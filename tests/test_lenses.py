@@ -573,7 +573,9 @@ def test_colours_are_seen_in_the_directions_of_the_pixels_rays(precision, name):
     np.testing.assert_allclose(color[shown], expected[shown], rtol=0, atol=tolerance)
 
 
-@every_form
+@pytest.mark.parametrize(
+    "name", [name for name, lens in LENSES.items() if not isinstance(lens, Orthographic)]
+)
 def test_pixels_in_their_own_order_are_those_of_layers_in_the_centers_order(name):
     """Flat splats in layers far apart, so that no pixel's order is another one."""
     camera = camera_behind(case_of(name), np.random.default_rng(0))
@@ -825,4 +827,15 @@ def test_the_exact_projection_refuses_other_lenses_than_pinholes(name):
     with pytest.raises(
         ValueError, match=f"^splats: projection 'exact' needs a pinhole, got {kind}"
     ):
+        rendering.render(gaussians, lens_camera(case.camera, case.lens, FLOAT32), pipeline)
+
+
+@pytest.mark.parametrize("projection", ["ewa", "unscented"])
+def test_an_order_of_each_pixel_refuses_parallel_rays(projection):
+    """Peaks along them are at other depths than along rays from a centre."""
+    [lens] = [lens for lens in LENSES.values() if isinstance(lens, Orthographic)]
+    case = LensCase("tiny", 13, 11, 0, 5, lens=lens)
+    pipeline = Choices(projection=projection, order="pixel").pipeline(0)
+    gaussians = device_gaussians(case.gaussians, FLOAT32)
+    with pytest.raises(ValueError, match=r"^splats: order 'pixel' needs rays that meet in the"):
         rendering.render(gaussians, lens_camera(case.camera, case.lens, FLOAT32), pipeline)
