@@ -28,8 +28,8 @@ class Lens:
     distorts: ClassVar[bool] = False
     """Whether a pinhole could take its place."""
 
-    parallel: ClassVar[bool] = False
-    """Whether its rays do not meet in the camera."""
+    def check_rays_meet(self) -> None:
+        """Raise ValueError where they do not, and depths of peaks along them are others."""
 
     def upload(self, float_type: type) -> Lens:
         """The lens with Dr.Jit scalars of this type for its numbers."""

@@ -102,20 +102,11 @@ def closest_on_film(camera: Camera, x: Any, y: Any) -> Any:
 
 def ewa_with_depth(rows: GaussianRows, camera: Camera, position: Any, low_pass: float) -> FilmShape:
     """As ``projection.ewa``, and what is needed for the depth at a pixel: kappa (2) and h."""
-    check_rays_meet(camera)
+    camera.lens.check_rays_meet()
     slopes = camera.lens.clamped_slopes(camera, position)
     film = ewa(rows, camera, position, low_pass)
     _, kappa, h = _seen_along(rows, camera, position, slopes, low_pass)
     return replace(film, perspective=[*kappa, h])
-
-
-def check_rays_meet(camera: Camera) -> None:
-    """Raise ValueError for parallel rays: the depths of peaks along them are others."""
-    if camera.lens.parallel:
-        raise ValueError(
-            "splats: order 'pixel' needs rays that meet in the camera, got "
-            f"{type(camera.lens).__name__}; use order 'center'"
-        )
 
 
 def _seen_along(

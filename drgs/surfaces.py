@@ -217,27 +217,26 @@ class _Eye:
         """At one place of each pixel, and at several of those next to where coverage changes.
 
         Around the crop window is a row of pixels more, so that its edges are those of the film.
-        The host reads how many there are.
+        The host reads how many of the latter there are.
         """
         count = dr.prod(film.crop_size() + 2)
-        width, height = (dr.opaque(mi.Int32, size + 2) for size in film.crop_size())
-        number = dr.arange(mi.Int32, count)
-        row = number // width
-        column = number - row * width
-        corner = mi.Point2f(column - 1, row - 1)
-        surface = self.look(camera, corner, x, y)
-        dr.eval(surface)
-        inside = (row > 0) & (row < height - 1) & (column > 0) & (column < width - 1)
+        width = dr.opaque(mi.UInt32, film.crop_size()[0] + 2)
+        row = dr.arange(mi.UInt32, count) // width
+        column = dr.arange(mi.UInt32, count) - row * width
+        around = self.look(camera, mi.Point2f(column, row) - 1, x, y)
+        dr.eval(around)
+
+        corner = pixel_corners(film)
+        number = mi.UInt32(corner.y + 1) * width + mi.UInt32(corner.x + 1)
+        surface = around.at(number)
         differs = mi.Bool(False)
-        for down in (-1, 0, 1):
-            for right in (-1, 0, 1):
-                neighbour = mi.UInt32(number + down * width + right)
-                coverage = dr.gather(mi.Float, surface.coverage, neighbour, inside)
-                differs |= coverage != surface.coverage
-        edge = dr.compress(inside & differs)
+        for down in (number - width, number, number + width):
+            for neighbour in (down - 1, down, down + 1):
+                differs |= dr.gather(mi.Float, around.coverage, neighbour) != surface.coverage
+        edge = dr.compress(differs)
         if dr.width(edge) > 0:
             surface = self._look_closer(camera, corner, surface, edge)
-        return surface.at(dr.compress(inside))
+        return surface
 
     def _look_closer(
         self, camera: Camera, corner: mi.Point2f, surface: SeenSurface, edge: mi.UInt32

@@ -18,7 +18,6 @@ import drjit as dr
 
 from drgs.arrays import types_of
 from drgs.camera import Camera, Pinhole
-from drgs.perspective import check_rays_meet
 from drgs.projection import FilmShape, GaussianRows, ewa, film_axes, whiten, world_axes
 
 SPREAD = math.sqrt(3)
@@ -61,7 +60,7 @@ def unscented_with_depth(
 
     The Gaussian's covariance with the depth is the affine one, and h is not negative.
     """
-    check_rays_meet(camera)
+    camera.lens.check_rays_meet()
     film = unscented(rows, camera, position, low_pass)
     slopes = camera.lens.true_slopes(camera, position)
     m0, m1, n = film_axes(rows, camera, position, slopes)
