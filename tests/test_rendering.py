@@ -34,6 +34,7 @@ from helpers import (
 )
 
 from drgs import reference, rendering
+from drgs.choices import Choices
 from drgs.gaussians import PARAMETER_NAMES, Gaussians
 from drgs.projection import plain_opacity
 
@@ -633,15 +634,17 @@ def test_gsplat_scene_agrees_with_the_reference(precision, gsplat, gsplat_marked
 
 
 @both_precisions
-def test_transmittance_alone_is_rendered_and_differentiated(precision):
+@pytest.mark.parametrize("order", ["center", "pixel"])
+def test_transmittance_alone_is_rendered_and_differentiated(precision, order):
     """A pipeline without features: what an alpha mask needs."""
+    pipeline = Choices(order=order).pipeline(1)
     case = clear(Case("alpha only", 21, 18, 1))
     gaussians = device_gaussians(case.gaussians, precision)
     camera = device_camera(case.camera, precision)
     rng = np.random.default_rng(5)
     cotangent = precision.Float(rng.normal(size=21 * 18))
-    with_color = rendering.render(gaussians, camera, rendering.Pipeline(1))
-    alone = rendering.render(gaussians, camera, rendering.Pipeline(1, features=()))
+    with_color = rendering.render(gaussians, camera, pipeline)
+    alone = rendering.render(gaussians, camera, replace(pipeline, features=()))
     assert len(alone.planes()) == 1
     assert dr.all(alone.planes()[0] == with_color.planes()[0])
     zero = dr.zeros(precision.Float, 21 * 18)
