@@ -27,9 +27,8 @@ class Lens:
 
     distorts: ClassVar[bool] = False
     """Whether a pinhole could take its place."""
-
-    def check_rays_meet(self) -> None:
-        """Raise ValueError where they do not, and depths of peaks along them are others."""
+    parallel: ClassVar[bool] = False
+    """Whether its rays are, instead of meeting in the camera."""
 
     def upload(self, float_type: type) -> Lens:
         """The lens with Dr.Jit scalars of this type for its numbers."""

@@ -14,8 +14,9 @@ from pathlib import Path
 import numpy as np
 
 from drgs.checks import UserError
-from drgs.config import FitConfig
+from drgs.config import FitConfig, dump_config
 from drgs.files import atomic_path
+from drgs.output import CONFIG_NAME
 
 FILE_NAME = "checkpoint.npz"
 
@@ -30,7 +31,11 @@ class Checkpoint:
 
 
 def save_checkpoint(folder: Path, config: FitConfig, checkpoint: Checkpoint) -> None:
-    """Write or replace the checkpoint of the output folder ``folder``."""
+    """Write or replace the checkpoint of the output folder ``folder``, and its ``config.yml``.
+
+    The configuration's end may have changed. Both files change together: one that does not belong
+    to the other could not be continued.
+    """
     arrays = {f"trainer.{name}": values for name, values in checkpoint.trainer.items()}
     with atomic_path(folder / FILE_NAME) as temporary:
         np.savez(
@@ -40,6 +45,7 @@ def save_checkpoint(folder: Path, config: FitConfig, checkpoint: Checkpoint) -> 
             wall_s=np.array(checkpoint.wall_s),
             **arrays,
         )
+        dump_config(config, folder / CONFIG_NAME)
 
 
 def load_checkpoint(folder: Path, config: FitConfig) -> Checkpoint | None:

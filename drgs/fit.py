@@ -299,8 +299,7 @@ def write_gaussians(path: Path, gaussians: Gaussians, config: FitConfig) -> None
 
 
 def save(trainer: Trainer, log: History, out: Path) -> None:
-    """Write the checkpoint, and the configuration, of which the end may have changed."""
-    dump_config(trainer.config, out / CONFIG_NAME)
+    """Write the checkpoint."""
     save_checkpoint(out, trainer.config, Checkpoint(trainer.state(), log.as_array(), log.wall_s))
 
 

@@ -544,12 +544,7 @@ class Orthographic(Lens):
     All rays are parallel: colours are seen along the camera's axis.
     """
 
-    def check_rays_meet(self) -> None:
-        """They are parallel."""
-        raise ValueError(
-            "splats: order 'pixel' needs rays that meet in the camera, got Orthographic; use "
-            "order 'center'"
-        )
+    parallel: ClassVar[bool] = True
 
     def look(self, camera: Camera, position: Any) -> tuple[Any, Any, Any]:
         """Whether a mean is seen, its position, and its depth."""

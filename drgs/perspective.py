@@ -33,6 +33,9 @@ is on the film, c is the mean, a_c = 1, g = -U^T kappa.
 As rho^2 is a ratio, U, g and z_mean are divided by |a_c| once and for all: then a = +-1 +
 g . (x - c). The sign, that of a_c, is kept as that of U, which does not matter otherwise.
 
+**Parallel rays** see no perspective. Where the position on the film is known, the depth is expected
+at z = z_mean (1 + kappa . e) (linear regression), and there is the peak.
+
 **Extent.** With t = |U d|^2 the smallest exponent that shows, |e|^2 <= t D is |e| <= sqrt(q) a with
 q = t / (1 - t h): a conic section with a focus in the mean and the eccentricity sqrt(q) |kappa|. If
 that is below 1 it is an ellipse, which :meth:`RayResponse.outline` finds; otherwise the splat
@@ -102,7 +105,6 @@ def closest_on_film(camera: Camera, x: Any, y: Any) -> Any:
 
 def ewa_with_depth(rows: GaussianRows, camera: Camera, position: Any, low_pass: float) -> FilmShape:
     """As ``projection.ewa``, and what is needed for the depth at a pixel: kappa (2) and h."""
-    camera.lens.check_rays_meet()
     slopes = camera.lens.clamped_slopes(camera, position)
     film = ewa(rows, camera, position, low_pass)
     _, kappa, h = _seen_along(rows, camera, position, slopes, low_pass)

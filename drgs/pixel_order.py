@@ -23,13 +23,14 @@ whose sum is exact to twice the precision.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
 import drjit as dr
 
 from drgs.arrays import empty_rows, load_row, scatter_rows, store_row, types_of
+from drgs.camera import Camera
 from drgs.constants import WHITENING_SCALE
 from drgs.image_model import MICRO, PIXELS, Alpha, Footprint, ImageModel
 from drgs.lanes import (
@@ -91,6 +92,16 @@ class AffineDepths:
 
 
 @dataclass(frozen=True)
+class ParallelDepths(AffineDepths):
+    """The same for rays that are parallel."""
+
+    @staticmethod
+    def _at(keys: list[Any], u: Any, v: Any) -> tuple[Any, Any]:
+        kx, ky = keys[:2]
+        return dr.fma(kx, u, dr.fma(ky, v, 1)), type(u)(1)
+
+
+@dataclass(frozen=True)
 class RayDepths:
     """Depths at a pixel for ``RayResponse``, which computes them."""
 
@@ -128,6 +139,10 @@ class PixelOrder:
 
     window: int
     depths: AffineDepths | RayDepths
+
+    def seen_by(self, camera: Camera) -> PixelOrder:
+        """For one camera, whose rays may be parallel."""
+        return replace(self, depths=ParallelDepths()) if camera.lens.parallel else self
 
     def keys(self, splats: Any) -> list[Any]:
         """Columns that the depth at a pixel depends on."""

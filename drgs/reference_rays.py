@@ -281,7 +281,7 @@ def _splats(gaussians: Gaussians, camera: Camera, model: ImageModel) -> _Splats:
 
     affine = reference._local_affine(gaussians, camera)
     z = affine.means[:, 2]
-    slopes = affine.ratios if model.projection == "ewa" else affine.means[:, :2] / z[:, None]
+    slopes = affine.means[:, :2] / z[:, None] if model.projection == "exact" else affine.ratios
     axes2d = _film_axes(affine, camera, slopes)
     depth_cov = np.einsum("nij,nj->ni", axes2d, affine.axes[:, 2]) / z[:, None]
     means2d = _film_positions(affine.means, camera)

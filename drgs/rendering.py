@@ -63,6 +63,11 @@ def depth_feature(splats: Splats2D, rows: GaussianRows, camera: Camera) -> list[
 class CenterOrder:
     """One order of the splats for the whole image: by the depth of their means."""
 
+    def seen_by(self, camera: Camera) -> CenterOrder:
+        """For any camera."""
+        del camera
+        return self
+
     def keys(self, splats: Splats2D) -> list[Any]:
         """Columns that compositing needs for the order, besides the order of the entries."""
         del splats
@@ -134,6 +139,7 @@ class Frame:
 
     pipeline: Pipeline
     camera: Camera
+    order: Any  # the pipeline's, for this camera
     bins: TileBins
     records: Records
     layers: Layers
@@ -164,11 +170,11 @@ def render(gaussians: Gaussians, camera: Camera, pipeline: Pipeline) -> Frame:
     columns = pipeline.feature_columns(splats, rows, camera)
     model = pipeline.model.seen_by(camera)
     grid = TileGrid(camera.width, camera.height)
-    order = pipeline.order
+    order = pipeline.order.seen_by(camera)
     bins = bin_splats(splats, grid, columns, model, order.keys(splats))
     records = Records.of(bins, bins.splats)
     layers = order.composite(bins, records)
-    return Frame(pipeline=pipeline, camera=camera, bins=bins, records=records, layers=layers)
+    return Frame(pipeline, camera, order, bins, records, layers)
 
 
 def render_again(frame: Frame, model: ImageModel) -> Frame:
@@ -178,7 +184,7 @@ def render_again(frame: Frame, model: ImageModel) -> Frame:
     for features that are composited of the same stored numbers.
     """
     bins = replace(frame.bins, model=model.seen_by(frame.camera))
-    return replace(frame, bins=bins, layers=frame.pipeline.order.composite(bins, frame.records))
+    return replace(frame, bins=bins, layers=frame.order.composite(bins, frame.records))
 
 
 def render_adjoint(
@@ -191,7 +197,7 @@ def render_adjoint(
 
     Not differentiated: visibility, the order of the splats, the decisions of compositing.
     """
-    gradients = frame.pipeline.order.adjoint(
+    gradients = frame.order.adjoint(
         frame.bins, frame.records, frame.layers, d_features, d_transmittance
     )
     return _gaussian_gradients(gaussians, frame, gradients)
@@ -210,7 +216,7 @@ def frames_adjoint(
     """
     total = None
     for frame, (d_transmittance, *d_features) in zip(frames, d_planes, strict=True):
-        gradients = frame.pipeline.order.adjoint(
+        gradients = frame.order.adjoint(
             frame.bins, frame.records, frame.layers, d_features, d_transmittance
         )
         total = gradients if total is None else _sum(total, gradients)
@@ -305,7 +311,7 @@ def render_tangent(gaussians: Gaussians, frame: Frame, tangents: Gaussians) -> l
     Not differentiated: visibility, the order of the splats, the decisions of compositing.
     """
     direction = _splat_tangents(gaussians, frame, tangents)
-    order = frame.pipeline.order
+    order = frame.order
     return order.tangent(frame.bins, frame.records, frame.layers, direction).planes()
 
 
@@ -320,9 +326,7 @@ def frames_tangent(
     camera_tangents: of ``camera.numbers()``; None: the camera stays.
     """
     direction = _splat_tangents(gaussians, frames[0], tangents, camera_tangents)
-    return [
-        f.pipeline.order.tangent(f.bins, f.records, f.layers, direction).planes() for f in frames
-    ]
+    return [f.order.tangent(f.bins, f.records, f.layers, direction).planes() for f in frames]
 
 
 def _splat_tangents(

@@ -54,6 +54,12 @@ class SampledExposure:
     ) -> None:
         """maps: remembers the linear maps of films, by their description; aovs: channels' names."""
         self.film, self.maps, self.aovs = sensor.film(), maps, list(aovs)
+        if self.film.sample_border() and not self.film.rfilter().is_box_filter():
+            raise NotImplementedError(
+                "splats: a film with sample_border is not supported: pixels beyond the film are "
+                f"not rendered; leave it out of that of {sensor.class_name()} '{sensor.id()}', or "
+                "render a larger film and crop the picture"
+            )
         sampler = sensor.sampler().clone()
         sampler.set_sample_count(spp)
         spp = sampler.sample_count()  # some round it up

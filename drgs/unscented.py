@@ -60,9 +60,9 @@ def unscented_with_depth(
 
     The Gaussian's covariance with the depth is the affine one, and h is not negative.
     """
-    camera.lens.check_rays_meet()
     film = unscented(rows, camera, position, low_pass)
-    slopes = camera.lens.true_slopes(camera, position)
+    # Where they are clamped, the splat is the affine one.
+    slopes = camera.lens.clamped_slopes(camera, position)
     m0, m1, n = film_axes(rows, camera, position, slopes)
     p, r, s = film.whitening
     kx, ky = dr.dot(m0, n), dr.dot(m1, n)

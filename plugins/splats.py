@@ -140,8 +140,7 @@ class SplatsIntegrator(mi.CppADIntegrator):
      * - order
        - |string|
        - ``center``: splats are composited in the order of their means' depths; ``pixel``: in
-         that of their peaks along each pixel's ray. Not for ``orthographic``.
-         (Default: ``center``)
+         that of their peaks along each pixel's ray. (Default: ``center``)
 
      * - order_window
        - |int|

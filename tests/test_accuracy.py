@@ -1,12 +1,14 @@
 """The ladder of accuracy: what it measures, and what it says about it."""
 
 import csv
+import json
 from dataclasses import replace
 from itertools import pairwise
 
 import mitsuba as mi
 import numpy as np
 import pytest
+import small_capture
 from helpers import reference_gaussians
 from PIL import Image
 
@@ -14,6 +16,8 @@ from drgs import metrics, reference_rays
 from drgs.bench import __main__ as bench
 from drgs.bench import accuracy
 from drgs.bench.scenes import bench_camera, bench_gaussians, stress_scene
+from drgs.config import FitConfig, dump_config
+from drgs.data.types import View
 from drgs.io.ply import write_ply
 
 
@@ -23,7 +27,8 @@ def subject():
     gaussians = bench_gaussians(300)
     gaussians = replace(gaussians, log_scales=gaussians.log_scales + np.float32(1.8))
     camera = bench_camera(24)
-    photograph = np.full((24, 24, 3), 0.5, np.float32)
+    grey = np.full((24, 24, 3), 0.5, np.float32)
+    photograph = View("grey", grey, np.eye(4), camera.fx, camera.fy, camera.cx, camera.cy, 24, 24)
     return accuracy.Subject("small", gaussians, [camera], [photograph], (1.0, 1.0, 1.0))
 
 
@@ -67,7 +72,7 @@ def test_a_measurement_is_what_its_columns_say(subject):
     assert default.ssim == pytest.approx(metrics.ssim(image, accurate[0]), abs=1e-5)
     assert default.largest_error == pytest.approx(np.abs(image - accurate[0]).max(), abs=1e-4)
     assert default.photo_psnr == pytest.approx(
-        metrics.psnr(image, subject.photographs[0]), abs=1e-3
+        metrics.psnr(image, subject.photographs[0].image), abs=1e-3
     )
     assert 0 < default.milliseconds < default.both_milliseconds
     assert 1000 < default.operations < sampled.operations
@@ -121,6 +126,59 @@ def test_the_command_measures_a_ply_and_the_stress_scene(tmp_path, capsys, monke
         (scene, rung) for scene in ("few", "stress") for rung in ("default", "unscented", "exact")
     ]
     assert Image.open(tmp_path / "accuracy.png").size[0] > 800
+
+
+def test_pixels_that_do_not_count_are_left_out(subject):
+    """Of the photograph."""
+    accurate = [accuracy.most_accurate(subject, c, accuracy.LEAST_ALPHA) for c in subject.cameras]
+    (view,), mask = subject.photographs, np.ones((24, 24), np.float32)
+    mask[:, 5:] = 0
+    masked = replace(subject, photographs=[replace(view, mask=mask)])
+    (found,) = accuracy.measure(masked, accurate, accuracy.RUNGS[:1], 1)
+    expected = metrics.psnr(image_of(subject)[:, :5], view.image[:, :5])
+    assert found.photo_psnr == pytest.approx(expected, abs=1e-3)
+    assert abs(expected - metrics.psnr(image_of(subject), view.image)) > 0.1
+
+
+def test_a_smoothing_filter_is_part_of_what_is_measured(tmp_path, subject):
+    """Of the most accurate form and of all rungs: they agree as they do without it."""
+    gaussians = subject.gaussians
+    smoothing = np.full(gaussians.num_gaussians, 0.1, np.float32)
+    write_ply(tmp_path / "smooth.ply", replace(gaussians, smoothing=smoothing))
+    found = accuracy.load_subject(tmp_path / "smooth.ply", 1)
+    assert (found.gaussians.log_scales > gaussians.log_scales).all()
+    found = replace(found, cameras=subject.cameras, background=subject.background)
+    accurate = accuracy.most_accurate(found, found.cameras[0], accuracy.LEAST_ALPHA)
+    without = accuracy.most_accurate(subject, subject.cameras[0], accuracy.LEAST_ALPHA)
+    image = image_of(found, projection="exact", order="pixel", order_window=16, **accuracy.UNCUT)
+    assert np.abs(image - accurate).mean() < 1e-4 < 0.01 < np.abs(accurate - without).mean()
+
+
+@pytest.mark.parametrize("has", ["lens distortion", "motion"])
+def test_views_that_are_not_of_pinholes_at_rest_are_refused(tmp_path, capsys, has):
+    """By the folder of a fit; its Gaussians can be measured alone."""
+    dataset = small_capture.make_dataset(2, 1)
+    small_capture.write_dataset(tmp_path / "data", dataset)
+    path = tmp_path / "data" / "transforms_test.json"
+    transforms = json.loads(path.read_text())
+    if has == "motion":
+        (frame,) = transforms["frames"]
+        close = np.array(frame["transform_matrix"])
+        close[0, 3] += 0.1
+        frame["transform_matrix_close"] = close.tolist()
+    else:
+        transforms["k1"] = 0.1
+    path.write_text(json.dumps(transforms))
+    fit = tmp_path / "fit"
+    fit.mkdir()
+    write_ply(fit / "point_cloud.ply", bench_gaussians(10))
+    dump_config(FitConfig(data={"path": str(tmp_path / "data")}), fit / "config.yml")
+    with pytest.raises(SystemExit) as stop:
+        bench.main(["accuracy", str(fit)])
+    assert stop.value.code == 2
+    message = capsys.readouterr().err
+    assert f"has {has}, expected pinhole cameras at rest" in message
+    assert f"give {fit / 'point_cloud.ply'} instead" in message
 
 
 def test_a_folder_without_a_fit_is_refused(tmp_path, capsys):

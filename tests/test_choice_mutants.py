@@ -88,15 +88,15 @@ class Copies:
 
     def used_by(self, frame: rendering.Frame) -> rendering.Frame:
         """The frame, whose forward pass is that of the package, with derivatives of the copies."""
-        model, pipeline = frame.bins.model, frame.pipeline
-        features, order = model.features, pipeline.order
+        model, order = frame.bins.model, frame.order
+        features = model.features
         if isinstance(model.response, perspective.RayResponse):
             model = replace(model, response=self.response(model.response.camera))
         if isinstance(features, ray_colors.RayColors):
             model = replace(model, features=self.colors(features.sh_degree, features.camera))
         if isinstance(order, pixel_order.PixelOrder):
-            pipeline = replace(pipeline, order=self.order(order.window, order.depths))
-        return replace(frame, bins=replace(frame.bins, model=model), pipeline=pipeline)
+            order = self.order(order.window, order.depths)
+        return replace(frame, bins=replace(frame.bins, model=model), order=order)
 
 
 @pytest.fixture(scope="module")

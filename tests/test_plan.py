@@ -10,9 +10,11 @@ import pytest
 from small_capture import make_dataset, write_dataset
 from test_trainer import make_trainer
 
-from drgs import fit, plan
+from drgs import checkpoint, fit, plan
+from drgs.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from drgs.checks import UserError
 from drgs.config import FitConfig, load_config
+from drgs.output import load_run_config
 from drgs.plan import Curve, Deadline, Strategy, load_curves, make_plan, parse_duration
 from drgs.schedule import changed
 from drgs.trainer import Trainer, means_rate
@@ -289,6 +291,29 @@ def test_the_resolved_plan_gives_the_same_bytes(fitted, scene):
     assert first[0] == second[0]
     configs = [load_config(out / "config.yml") for out in (fitted.out, again)]
     assert changed(configs[0], {"output.dir": None}) == changed(configs[1], {"output.dir": None})
+
+
+def test_a_plan_that_was_revised_since_the_last_checkpoint_can_be_continued(
+    fitted, tmp_path, monkeypatch
+):
+    """Whatever ends the process while the next one is written: both files are as they were."""
+    config = load_config(fitted.out / "config.yml")
+    state = Checkpoint({"iteration": np.array(7)}, np.zeros((0, 6)), 1.0)
+    save_checkpoint(tmp_path, config, state)
+    revised = changed(config, {"iterations": config.iterations + 10})
+    for module, name in ((checkpoint.np, "savez"), (checkpoint, "dump_config")):
+        with monkeypatch.context() as patched, pytest.raises(KeyboardInterrupt):
+            patched.setattr(module, name, interrupt)
+            save_checkpoint(tmp_path, revised, state)
+        assert load_run_config(tmp_path) == config
+        assert load_checkpoint(tmp_path, config) is not None
+    save_checkpoint(tmp_path, revised, state)
+    assert load_run_config(tmp_path) == revised
+    assert load_checkpoint(tmp_path, revised) is not None
+
+
+def interrupt(*arguments, **others):
+    raise KeyboardInterrupt
 
 
 def test_a_budget_needs_a_folder_of_its_own(fitted, scene, capsys):

@@ -277,6 +277,17 @@ def test_gradients_are_the_transpose_of_the_tangents(samples, rfilter):
         assert size > 0 and abs(left - right) < 1e-5 * size, name
 
 
+def test_samples_beyond_the_film_are_refused_where_they_would_matter():
+    """A box spreads no sample over its neighbours: Mitsuba takes none beyond the film either."""
+    film = {"samples": 2, "sample_border": True}
+    loaded = SCENE.load(samples=2)
+    sensor = mi.load_dict(SCENE.view.sensor(rfilter="gaussian", **film))
+    with pytest.raises(NotImplementedError, match="sample_border is not supported"):
+        loaded.integrator().render(loaded, sensor)
+    boxed = mi.load_dict(SCENE.view.sensor(**film))
+    np.testing.assert_array_equal(image_of(loaded, sensor=boxed), image_of(loaded))
+
+
 @pytest.mark.parametrize("action", ["develop", "adjoint"])
 def test_more_samples_need_no_longer_kernels_for_a_filter(action):
     """Compilers take longer than proportionally to a kernel's length."""

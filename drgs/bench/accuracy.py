@@ -37,6 +37,7 @@ from drgs.gaussians import PARAMETER_NAMES, Gaussians
 from drgs.image_model import PixelCenters
 from drgs.io.ply import read_ply
 from drgs.samples import SamplePoints
+from drgs.smoothing import baked
 
 DESCRIPTION = "the error of each approximation against the time that it saves"
 
@@ -105,7 +106,7 @@ class Subject:
     name: str
     gaussians: Gaussians  # numpy
     cameras: list[reference.Camera]
-    photographs: list[np.ndarray]  # (H, W, 3) each; none if there are none
+    photographs: list[View]  # none if there are none
     background: tuple[float, float, float]
 
 
@@ -175,7 +176,11 @@ def run(args: argparse.Namespace) -> None:
 
 
 def load_subject(path: Path, num_views: int) -> Subject:
-    """A fit's folder with evenly spaced test views, or a PLY file seen by the bench camera."""
+    """A fit's folder with evenly spaced test views, or a PLY file seen by the bench camera.
+
+    A 3D smoothing filter becomes part of the Gaussians. Raises UserError for views that are not
+    those of pinholes at rest.
+    """
     if path.is_dir():
         ply, config_file = path / "point_cloud.ply", path / "config.yml"
         for file in (ply, config_file):
@@ -185,10 +190,21 @@ def load_subject(path: Path, num_views: int) -> Subject:
         dataset = load_dataset(config.data)
         step = max(1, len(dataset.test) // num_views)
         views = dataset.test[::step][:num_views]
+        _check_pinholes(views, config_file, ply)
         cameras = [camera_of(view, config.model.near) for view in views]
-        photographs = [view.image for view in views]
-        return Subject(path.name, read_ply(ply), cameras, photographs, dataset.background)
-    return Subject(path.stem, read_ply(path), [bench_camera(SIZE)], [], (1.0, 1.0, 1.0))
+        return Subject(path.name, baked(read_ply(ply)), cameras, list(views), dataset.background)
+    return Subject(path.stem, baked(read_ply(path)), [bench_camera(SIZE)], [], (1.0, 1.0, 1.0))
+
+
+def _check_pinholes(views: Sequence[View], config_file: Path, ply: Path) -> None:
+    for view in views:
+        if view.lens is not None or view.motion is not None:
+            has = "lens distortion" if view.lens is not None else "motion"
+            raise UserError(
+                f"{config_file}: view {view.name} has {has}, expected pinhole cameras at rest, the "
+                f"only ones that the most accurate form has; give {ply} instead, which is seen by "
+                "a camera of the benchmark's own"
+            )
 
 
 def camera_of(view: View, near: float) -> reference.Camera:
@@ -323,7 +339,10 @@ def measure(
     for rung, count, spent in zip(rungs, operations, times, strict=True):
         images = [Renderer.of(rung, subject, camera).image() for camera in subject.cameras]
         quality = metrics.mean_quality(zip(images, accurate, strict=True))
-        photos = list(zip(images, subject.photographs, strict=bool(subject.photographs)))
+        photos = [
+            (image, view.image, view.mask)
+            for image, view in zip(images, subject.photographs, strict=bool(subject.photographs))
+        ]
         results.append(
             Measurement(
                 scene=subject.name,
