@@ -8,7 +8,8 @@ A pixel keeps a *window* of the K nearest splats that it has met and not yet com
 2024, "StopThePop", section 4, with a window of one level). A splat that is met is inserted, and the
 nearest of the K + 1 is composited. Each micro-tile has a list of its own, sorted by the depths of
 the peaks along the ray through its middle. The order is exact wherever a splat's place among those
-of its pixel differs by at most K from its place in that list; the error vanishes as K grows.
+of its pixel differs by at most K from its place in that list; the error vanishes as K grows, but
+for what :data:`UNORDERED_ALPHA` leaves out.
 
 Nothing jumps: inserting into a sorted window is K comparisons with selections, at every pixel.
 
@@ -55,9 +56,11 @@ from drgs.rasterize import (
 from drgs.tiles import GRID, MICROS, TILE, TileBins, lower_bounds, stable_order
 
 UNORDERED_ALPHA = 1e-4
-"""A smaller alpha is composited when it is met. Two splats in the wrong order change a pixel by the
-product of their alphas; and the faint rims of large splats, whose peaks are far from everything
-else, would fill the windows."""
+"""A smaller alpha, which only a smaller alpha cut lets in, is composited when it is met, before all
+that waits. Two splats in the wrong order change a pixel by the product of their alphas: a splat
+loses at most the sum of the faint alphas behind it, and no window makes up for that. But in order,
+the faint rims of large splats, whose peaks are far from everything else, would fill the windows:
+uncut, a fitted scene is 52.4 dB from the true order with 16 places, and 51.3 dB with 1e-6 here."""
 
 FARTHEST = 4.0
 """Between this and its inverse is the depth by which a list is sorted, relative to the mean's."""

@@ -330,6 +330,34 @@ def test_behind_hundreds_of_layers_gradients_keep_their_accuracy():
     np.testing.assert_allclose(results[1], results[0], rtol=1e-3)
 
 
+def test_what_the_order_of_faint_splats_is_worth():
+    """A splat before 200 that are fainter than what is put in order: at most their sum."""
+    faint, count = 0.9 * pixel_order.UNORDERED_ALPHA, 201
+    z = np.linspace(2, 4, count)
+    alphas = np.full(count, faint)
+    alphas[0] = 0.5
+    gaussians = reference.Gaussians(
+        means=single(np.column_stack([0 * z, 0 * z, z])),
+        quats=np.tile([1.0, 0, 0, 0], (count, 1)),
+        log_scales=single(np.log(np.full((count, 3), 0.5) * z[:, None])),
+        logit_opacities=single(np.log(alphas / (1 - alphas))),
+        sh0=single(np.random.default_rng(0).normal(size=(count, 1, 3))),
+        shN=np.zeros((count, 0, 3)),
+    )
+    camera = reference.Camera(np.eye(3), np.zeros(3), 20.0, 20.0, 8.0, 8.0, 16, 16)
+    choices = {"order": "pixel", "alpha_cut": 0.0, "transmittance_stop": 0.0}
+    expected = reference_rays.render(gaussians, camera, model=reference_rays.ImageModel(**choices))
+    device = device_gaussians(gaussians, FLOAT64)
+    pipeline = Choices(**choices, order_window=4).pipeline(0)
+    frame = rendering.render(device, device_camera(camera, FLOAT64), pipeline)
+    color = np.stack([rows(plane) for plane in frame.planes()[1:]], axis=-1)
+    error = np.abs(color - expected.image.reshape(-1, 3))
+    brightest = np.maximum(gaussians.sh0 * reference.C_00 + 0.5, 0).max()
+    assert error.max() <= brightest * alphas[0] * alphas[1:].sum()
+    T = rows(frame.planes()[0])
+    np.testing.assert_allclose(T, expected.transmittance.ravel(), rtol=0, atol=1e-12)
+
+
 def test_no_stop_leaves_gradients_behind_any_number_of_opaque_layers():
     """Transmittance is 1e-60 there, which float32 has not: it ends before."""
     count = 30
