@@ -4,6 +4,8 @@ Layer 4, imported when a scene asks for more than one sample, or for a reconstru
 than a box. Each pass evaluates every pixel once (``drgs.samples``). With a box filter the passes
 are averaged, in their order: the same bytes in every run. Any other filter spreads a sample over
 its neighbours, which Mitsuba does by atomic additions: such a picture is the same up to rounding.
+No samples are taken beyond the film, also where it has ``sample_border``: its outermost pixels are
+means of the samples that there are.
 """
 
 from __future__ import annotations
@@ -54,12 +56,6 @@ class SampledExposure:
     ) -> None:
         """maps: remembers the linear maps of films, by their description; aovs: channels' names."""
         self.film, self.maps, self.aovs = sensor.film(), maps, list(aovs)
-        if self.film.sample_border() and not self.film.rfilter().is_box_filter():
-            raise NotImplementedError(
-                "splats: a film with sample_border is not supported: pixels beyond the film are "
-                f"not rendered; leave it out of that of {sensor.class_name()} '{sensor.id()}', or "
-                "render a larger film and crop the picture"
-            )
         sampler = sensor.sampler().clone()
         sampler.set_sample_count(spp)
         spp = sampler.sample_count()  # some round it up

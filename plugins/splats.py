@@ -194,7 +194,8 @@ class SplatsIntegrator(mi.CppADIntegrator):
     each pixel at its centre, and both the picture and the gradients are the same to the last bit in
     every run. With more samples or another filter, pixels are evaluated at the points that the
     sensor's sampler chooses; ``low_pass`` may then be 0. With a ``box`` filter this, too, is the
-    same in every run; other filters add in an order of their own.
+    same in every run; other filters add in an order of their own. No samples are taken beyond the
+    film: its ``sample_border`` makes no difference.
 
     Gaussians of shapes (``data``, ``opacities`` and ``sh_coeffs``, as ``volprim_rf_basic`` reads
     them) come behind the integrator's own, in the order of ``scene.shapes()``, and are

@@ -77,16 +77,12 @@ def naive_film(mean, factor, camera, model):
         return focal * point[:2] / point[2] + [camera.cx, camera.cy]
 
     sigma = factor @ factor.T
-    mean2d, true_jacobian = pinhole(mean), jacobian(slope)
-    if model.projection == "ewa":
-        true_jacobian = jacobian(clamped)
-    cov = true_jacobian @ sigma @ true_jacobian.T
-    if model.projection == "unscented":
-        if is_usable(mean, factor) and np.array_equal(slope, clamped):
-            mean2d, cov = textbook_unscented(mean, factor, pinhole, alpha=1, beta=2, kappa=0)
-        else:
-            cov = jacobian(clamped) @ sigma @ jacobian(clamped).T
-    return mean2d, cov, true_jacobian @ sigma[:, 2] / z, sigma[2, 2] / z**2
+    mean2d, linear = pinhole(mean), jacobian(slope if model.projection == "exact" else clamped)
+    cov = linear @ sigma @ linear.T
+    is_clamped = not np.array_equal(slope, clamped)
+    if model.projection == "unscented" and is_usable(mean, factor) and not is_clamped:
+        mean2d, cov = textbook_unscented(mean, factor, pinhole, alpha=1, beta=2, kappa=0)
+    return mean2d, cov, linear @ sigma[:, 2] / z, sigma[2, 2] / z**2
 
 
 def is_usable(mean, factor) -> bool:
