@@ -331,7 +331,9 @@ def test_behind_hundreds_of_layers_gradients_keep_their_accuracy():
 
 
 def test_what_the_order_of_faint_splats_is_worth():
-    """A splat before 200 that are fainter than what is put in order: at most their sum."""
+    """A splat before 200 that are fainter than what is put in order: it loses at most their sum of
+    its light, and they gain at most as much.
+    """
     faint, count = 0.9 * pixel_order.UNORDERED_ALPHA, 201
     z = np.linspace(2, 4, count)
     alphas = np.full(count, faint)

@@ -598,8 +598,9 @@ def test_pixels_in_their_own_order_are_those_of_layers_in_the_centers_order(name
     np.testing.assert_allclose(ordered, plain, rtol=0, atol=1e-13)
 
 
-def composited_along_parallel_rays(case, low_pass=0.3) -> np.ndarray:
-    """(4, H W): transmittance and colour; each pixel's splats by the depths of their peaks.
+def composited_along_parallel_rays(case, low_pass=0.3) -> tuple[np.ndarray, int]:
+    """(4, H W): transmittance and colour; each pixel's splats by the depths of their peaks. And how
+    many of these would show, but are behind the camera.
 
     The density of a Gaussian along a line is that of another one, whose mean the precision has.
     """
@@ -611,7 +612,7 @@ def composited_along_parallel_rays(case, low_pass=0.3) -> np.ndarray:
     precision = np.linalg.inv(widened)
     means = (gaussians.means - camera.center) @ camera.rotation.T
     colors = np.maximum(gaussians.sh0[:, 0] * reference.C_00 + 0.5, 0)
-    planes = []
+    planes, behind = [], 0
     for y, x in np.ndindex(case.height, case.width):
         point = (np.array([x, y]) + 0.5 - [camera.cx, camera.cy]) / focal
         beside = point - means[:, :2]
@@ -624,11 +625,12 @@ def composited_along_parallel_rays(case, low_pass=0.3) -> np.ndarray:
         )
         depths = means[:, 2] + along
         shown = (alphas >= reference.ALPHA_CUT) & (depths > 0)
+        behind += np.sum((alphas >= reference.ALPHA_CUT) & (depths <= 0))
         T, color = 1.0, np.zeros(3)
         for n in np.flatnonzero(shown)[np.argsort(depths[shown])]:
             color, T = color + T * alphas[n] * colors[n], T * (1 - alphas[n])
         planes.append([T, *color])
-    return np.transpose(planes)
+    return np.transpose(planes), behind
 
 
 @pytest.mark.parametrize("projection", ["ewa", "unscented"])
@@ -637,7 +639,9 @@ def test_an_order_of_each_pixel_along_parallel_rays(projection):
     case = LensCase("needles", 19, 14, 0, 12, lens=LENSES["orthographic"], recipe=needles)
     window = Choices(projection=projection, order="pixel", order_window=12)
     _, frame = case.render(FLOAT64, window.pipeline(0))
-    expected = composited_along_parallel_rays(case)
+    expected, behind = composited_along_parallel_rays(case)
+    assert behind > 20
+    # A dozen products and sums in double precision.
     np.testing.assert_allclose(planes_of(frame), expected, rtol=0, atol=1e-12)
     _, plain = case.render(FLOAT64, Choices(projection=projection).pipeline(0))
     assert np.abs(planes_of(plain) - expected).max() > 0.05
