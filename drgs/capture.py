@@ -1,8 +1,8 @@
 """``python -m drgs.capture SCENE --out DIR``: turn a Mitsuba scene into a training set.
 
-Layer 5. SCENE is an XML file, or a Python file with a function ``scene()`` that returns a scene
-dictionary without sensors. Its pictures are path traced from cameras on the upper hemisphere
-around it and written in the NeRF-synthetic layout:
+SCENE is an XML file, or a Python file with a function ``scene()`` that returns a scene dictionary
+without sensors. Its pictures are path traced from cameras on the upper hemisphere around it and
+written in the NeRF-synthetic layout:
 
 - ``transforms_{train,val,test}.json``: ``camera_angle_x`` and camera to world, OpenGL axes
 - ``{train,val,test}/r_0.png``, ...: RGBA, 8 bits, straight alpha, colour in sRGB
@@ -27,104 +27,39 @@ from __future__ import annotations
 
 import argparse
 import hashlib
-import importlib.util
 import json
-import math
 import sys
 import time
-import traceback
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, fields
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
-import drjit as dr
 import imageio.v3 as iio
 import mitsuba as mi
 import numpy as np
 from plyfile import PlyData, PlyElement
 
-from drgs.checks import UserError, exit_on_user_error, one_line
-from drgs.data.images import read_image
-from drgs.files import atomic_path, why_refused
-from drgs.interrupts import INTERRUPTED_STATUS
-from drgs.progress import LOG_SECONDS
-from drgs.viewpoints import look_at
+from drgs.cli.errors import exit_on_user_error
+from drgs.cli.interrupts import INTERRUPTED_STATUS
+from drgs.cli.progress import LOG_SECONDS
+from drgs.core.errors import UserError
+from drgs.core.files import atomic_path, why_refused
+from drgs.data.path_tracing import (
+    SPLITS,
+    Camera,
+    CaptureSettings,
+    CaptureView,
+    _option,
+    load_scene,
+    orbit,
+    picture_path,
+    plan,
+    visible_points,
+)
 
-NERF_SYNTHETIC_FOV = 0.6911112070083618
-"""Radians: the original's ``camera_angle_x``."""
-
-SPLITS = ("train", "val", "test")
 MANIFEST = "capture.json"
 POINTS = "points3d.ply"
-
-OPENCV_TO_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
-"""Of camera axes: y and z change sign."""
-
-GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
-
-PATHS_PER_PASS = 2**24
-"""Paths traced at once, at most: their state takes a few hundred MiB."""
-
-SAMPLES_PER_PASS = 64
-"""Per pixel, a square: they are stratified together (8x8 multi-jittered), which leaves about half
-the noise variance of as many independent ones."""
-
-NEAR_CLIP, FAR_CLIP = 1e-5, 1e5
-"""Of the bounding box's diagonal."""
-
-MAX_LAMPS_IN_A_ROW = 16
-"""Surfaces that shine are passed through on the way to the first hit, this many at most."""
-
-
-@dataclass(frozen=True)
-class CaptureSettings:
-    """What the pictures depend on, beside the scene."""
-
-    views: int = 100  # to train on
-    val_views: int = 0
-    test_views: int = 25
-    size: int = 400  # px, width and height
-    spp: int = 256  # paths per pixel
-    max_depth: int = 8  # segments of a path
-    fov: float = NERF_SYNTHETIC_FOV  # radians
-    distance: float | None = None  # of the cameras from the target; None: all is in the picture
-    target: tuple[float, float, float] | None = None  # None: centre of the bounding box
-    up: str = "z"
-    points: int = 100_000
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        least = {"views": 1, "val_views": 0, "test_views": 0, "size": 1, "spp": 1, "max_depth": 1}
-        for name, minimum in {**least, "points": 0, "seed": 0}.items():
-            value = getattr(self, name)
-            if value < minimum:
-                raise UserError(f"{_option(name)} must be >= {minimum}, got {value}")
-        if not 0 < self.fov < math.pi:
-            raise UserError(f"--fov must be between 0 and pi (radians), got {self.fov:g}")
-        if self.distance is not None and not 0 < self.distance < math.inf:
-            raise UserError(f"--distance must be > 0, got {self.distance:g}")
-        if self.target is not None and not np.isfinite(self.target).all():
-            raise UserError(f"--target must be finite, got {self.target}")
-
-    def count(self, split: str) -> int:
-        """Number of views of a split."""
-        return {"train": self.views, "val": self.val_views, "test": self.test_views}[split]
-
-
-@dataclass(frozen=True, eq=False)
-class Shot:
-    """One picture to take."""
-
-    split: str
-    index: int
-    pose: np.ndarray  # (4, 4) float64 camera to world, OpenGL axes: x right, y up, z backward
-
-    @property
-    def file_path(self) -> str:
-        """As the transforms file names it, without the suffix."""
-        return f"./{self.split}/r_{self.index}"
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -148,7 +83,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             sys.exit(INTERRUPTED_STATUS)
 
 
-def run(scene: mi.Scene, settings: CaptureSettings, shots: list[Shot], out: Path) -> None:
+def run(scene: mi.Scene, settings: CaptureSettings, shots: list[CaptureView], out: Path) -> None:
     """Take the pictures that are not in ``out`` yet, then write points and transforms files."""
     camera = Camera(scene, settings)
     missing = [shot for shot in shots if not picture_path(out, shot).exists()]
@@ -218,12 +153,9 @@ def claim_folder(out: Path, wanted: dict[str, Any]) -> None:
             )
 
 
-def picture_path(out: Path, shot: Shot) -> Path:
-    """Where a picture is written."""
-    return out / f"{shot.file_path}.png"
-
-
-def write_transforms(path: Path, settings: CaptureSettings, shots: list[Shot], split: str) -> None:
+def write_transforms(
+    path: Path, settings: CaptureSettings, shots: list[CaptureView], split: str
+) -> None:
     """Write one ``transforms_*.json``; numbers have all digits of their float64."""
     frames = [
         {"file_path": shot.file_path, "transform_matrix": shot.pose.tolist()}
@@ -250,256 +182,19 @@ def write_points(path: Path, positions: np.ndarray, colors: np.ndarray) -> None:
 # Scene -------------------------------------------------------------------------------------------
 
 
-def load_scene(path: Path) -> mi.Scene:
-    """The scene that an XML or a Python file describes.
-
-    Raises :class:`UserError` where it describes none.
-    """
-    if path.suffix == ".py":
-        description = _scene_dictionary(path)
-        mi.file_resolver().append(str(path.parent.resolve()))
-    try:
-        scene = mi.load_dict(description) if path.suffix == ".py" else mi.load_file(str(path))
-    except (RuntimeError, ValueError, TypeError, AttributeError) as error:
-        raise UserError(f"{path}: Mitsuba cannot load the scene: {one_line(error)}") from None
-    if not isinstance(scene, mi.Scene):
-        raise UserError(f"{path}: must describe a scene, got a {type(scene).__name__}")
-    return scene
-
-
-def _scene_dictionary(path: Path) -> dict[str, Any]:
-    """What ``scene()`` of a Python file returns."""
-    try:
-        function = getattr(_import(path), "scene", None)
-        if not callable(function):
-            raise UserError(f"{path}: must define a function scene() that returns a dictionary")
-        description = function()
-    except UserError:
-        raise
-    except Exception as error:
-        lines = [
-            f.lineno for f in traceback.extract_tb(error.__traceback__) if f.filename == str(path)
-        ]
-        if isinstance(error, SyntaxError):
-            lines = [error.lineno]
-        line = f":{lines[-1]}" if lines else ""
-        raise UserError(f"{path}{line}: {type(error).__name__}: {one_line(error)}") from None
-    if not isinstance(description, dict) or description.get("type") != "scene":
-        raise UserError(f'{path}: scene() must return a dictionary with "type": "scene"')
-    return description
-
-
-def _import(path: Path) -> ModuleType:
-    name = f"drgs_capture_scene_{path.stem}"
-    spec = importlib.util.spec_from_file_location(name, path)
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[name] = module  # dataclasses look their module up
-    # As for a script: its neighbours can be imported.
-    sys.path.insert(0, str(path.parent.resolve()))
-    spec.loader.exec_module(module)
-    return module
-
-
-def bounding_box(scene: mi.Scene) -> tuple[np.ndarray, np.ndarray]:
-    """(3,) lowest and highest coordinates of the surfaces that do not shine."""
-    boxes = [shape.bbox() for shape in scene.shapes() if not shape.is_emitter()]
-    corners = np.array([[box.min, box.max] for box in boxes if box.valid()]).reshape(-1, 2, 3)
-    if not len(corners):
-        raise UserError("the scene has no surfaces that cameras could see (lights are hidden)")
-    return corners[:, 0].min(axis=0), corners[:, 1].max(axis=0)
-
-
 # Cameras -----------------------------------------------------------------------------------------
-
-
-def orbit(scene: mi.Scene, settings: CaptureSettings) -> tuple[np.ndarray, float]:
-    """What the cameras look at, (3,) world, and their distance from it.
-
-    Without ``distance``, the bounding box's sphere just fits between the edges of the picture:
-    radius / sin(fov / 2). The original's 4.03 is 10% less: its box has empty corners.
-    """
-    low, high = bounding_box(scene)
-    target = (low + high) / 2 if settings.target is None else np.array(settings.target)
-    if settings.distance is not None:
-        return target, settings.distance
-    return target, float(np.linalg.norm(high - low)) / 2 / math.sin(settings.fov / 2)
-
-
-def plan(settings: CaptureSettings, target: np.ndarray, distance: float) -> list[Shot]:
-    """All pictures with their cameras, split after split."""
-    shots = []
-    for number, split in enumerate(SPLITS):
-        rng = np.random.default_rng([settings.seed, number])
-        # Test views lie evenly; training views at random, but without gaps.
-        jitter = 0.0 if split == "test" else 1.0
-        directions = hemisphere(settings.count(split), jitter, rng)
-        directions = np.roll(directions, "zxy".index(settings.up), axis=1)
-        up = np.eye(3)["xyz".index(settings.up)]
-        shots += [
-            Shot(
-                split, index, look_at(target + distance * direction, target, up) @ OPENCV_TO_OPENGL
-            )
-            for index, direction in enumerate(directions)
-        ]
-    return shots
-
-
-def hemisphere(count: int, jitter: float, rng: np.random.Generator) -> np.ndarray:
-    """(count, 3): unit vectors with z > 0, of equal density per solid angle.
-
-    A golden-angle spiral from the rim to the pole: equal steps of height are equal areas (the
-    sphere's hat-box theorem). ``jitter`` 1 moves each within its own step, 0 not at all; ``rng``
-    turns the whole spiral.
-    """
-    step = np.arange(count)
-    offset = rng.uniform(0, 2 * math.pi)
-    moved = jitter * rng.uniform(-0.5, 0.5, (2, count))
-    height = (step + 0.5 + moved[0]) / max(count, 1)
-    azimuth = offset + GOLDEN_ANGLE * (step + moved[1])
-    radius = np.sqrt(1 - height**2)
-    return np.stack([radius * np.cos(azimuth), radius * np.sin(azimuth), height], axis=1)
 
 
 # Pictures ----------------------------------------------------------------------------------------
 
 
-class Camera:
-    """Takes pictures of a scene with one Mitsuba sensor that is moved around."""
-
-    def __init__(self, scene: mi.Scene, settings: CaptureSettings) -> None:
-        self._scene, self._settings = scene, settings
-        low, high = bounding_box(scene)
-        diagonal = float(np.linalg.norm(high - low))
-        self._integrator = mi.load_dict(
-            {"type": "path", "max_depth": settings.max_depth, "hide_emitters": True}
-        )
-        self._sensor = mi.load_dict(
-            {
-                "type": "perspective",
-                "fov_axis": "x",
-                "fov": math.degrees(settings.fov),
-                # Rays start at the near plane: nothing in front of a camera is left out.
-                "near_clip": NEAR_CLIP * diagonal,
-                "far_clip": FAR_CLIP * diagonal,
-                "film": {
-                    "type": "hdrfilm",
-                    "width": settings.size,
-                    "height": settings.size,
-                    "pixel_format": "rgba",
-                    "component_format": "float32",
-                    "rfilter": {"type": "box"},
-                },
-                "sampler": {"type": "multijitter"},
-            }
-        )
-        self._parameters = mi.traverse(self._sensor)
-
-    def picture(self, shot: Shot) -> np.ndarray:
-        """(size, size, 4) uint8: straight alpha, colour in display space."""
-        linear = self.linear(shot)
-        if not np.isfinite(linear).all():
-            y, x = np.argwhere(~np.isfinite(linear).all(axis=2))[0]
-            raise UserError(f"{shot.file_path}: the light at pixel x {x}, y {y} is not finite")
-        return encode(linear)
-
-    def linear(self, shot: Shot) -> np.ndarray:
-        """(size, size, 4) float64: radiance times alpha, and alpha."""
-        # Mitsuba's cameras have x to the left and look along z.
-        to_world = shot.pose @ np.diag([-1.0, 1.0, -1.0, 1.0])
-        self._parameters["to_world"] = mi.Transform4f(to_world)
-        self._parameters.update()
-        size, spp = self._settings.size, self._settings.spp
-        at_once = min(SAMPLES_PER_PASS, max(1, math.isqrt(PATHS_PER_PASS // size**2) ** 2))
-        counts = [min(at_once, spp - start) for start in range(0, spp, at_once)]
-        entropy = [self._settings.seed, SPLITS.index(shot.split), shot.index]
-        seeds = np.random.SeedSequence(entropy).generate_state(len(counts))
-        total = np.zeros((size, size, 4))
-        for count, seed in zip(counts, seeds, strict=True):
-            image = mi.render(
-                self._scene,
-                sensor=self._sensor,
-                integrator=self._integrator,
-                seed=int(seed),
-                spp=count,
-            )
-            total += count * np.array(image, np.float64)
-        return total / spp
-
-
-def encode(linear: np.ndarray) -> np.ndarray:
-    """(H, W, 4) uint8 straight sRGB and alpha, from premultiplied linear radiance and alpha.
-
-    Light beyond white is cut off. Where alpha rounds to zero the colour is black, not noise.
-    """
-    alpha = np.clip(linear[:, :, 3:], 0, 1)
-    color = np.clip(linear[:, :, :3] / np.maximum(alpha, 1e-9), 0, 1)
-    display = np.where(color <= 0.0031308, 12.92 * color, 1.055 * color ** (1 / 2.4) - 0.055)
-    rgba = np.round(np.concatenate([display, alpha], axis=2) * 255).astype(np.uint8)
-    rgba[rgba[:, :, 3] == 0] = 0
-    return rgba
-
-
 # Points ------------------------------------------------------------------------------------------
-
-
-def visible_points(
-    scene: mi.Scene, settings: CaptureSettings, shots: list[Shot], out: Path
-) -> tuple[np.ndarray, np.ndarray]:
-    """First hits of random rays: positions (N, 3) float32 world, colours (N, 3) uint8.
-
-    Each training view has the same share of ``settings.points``, spread evenly over what is
-    covered of its picture; the colour is that of the pixel in the written picture.
-    """
-    train = [shot for shot in shots if shot.split == "train"]
-    positions, colors = [], []
-    for number, shot in enumerate(train):
-        share = (number + 1) * settings.points // len(train) - number * settings.points // len(
-            train
-        )
-        rng = np.random.default_rng([settings.seed, len(SPLITS), shot.index])
-        picture = read_image(picture_path(out, shot)).reshape(-1, 4)
-        weights = picture[:, 3].astype(np.float64)
-        if not weights.any():
-            continue
-        # At the edge of a surface a ray can miss it, so draw more than are kept.
-        pixels = rng.choice(len(picture), 2 * share + 64, p=weights / weights.sum())
-        rows, columns = np.divmod(pixels, settings.size)
-        spots = np.stack([columns, rows], axis=1) + rng.uniform(size=(len(pixels), 2))
-        hits, valid = first_hits(scene, shot.pose[:3, 3], view_rays(shot.pose, spots, settings))
-        positions.append(hits[valid][:share])
-        colors.append(np.round(picture[pixels[valid], :3] * 255).astype(np.uint8)[:share])
-    if not sum(map(len, positions)):
-        raise UserError("the cameras see nothing of the scene: give --target and --distance")
-    return np.concatenate(positions), np.concatenate(colors)
-
-
-def view_rays(pose: np.ndarray, spots: np.ndarray, settings: CaptureSettings) -> np.ndarray:
-    """(N, 3): unit directions, world, through (N, 2) places x, y in px of a picture."""
-    focal = 0.5 * settings.size / math.tan(0.5 * settings.fov)
-    offset = (spots - settings.size / 2) / focal
-    local = np.stack([offset[:, 0], -offset[:, 1], -np.ones(len(spots))], axis=1)
-    directions = local @ pose[:3, :3].T
-    return directions / np.linalg.norm(directions, axis=1, keepdims=True)
-
-
-def first_hits(
-    scene: mi.Scene, origin: np.ndarray, directions: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """(N, 3) float32 world, where rays meet a surface that does not shine; (N,) bool if any."""
-    ray = mi.Ray3f(mi.Point3f(origin), mi.Vector3f(directions.T))
-    for _ in range(MAX_LAMPS_IN_A_ROW):
-        hit = scene.ray_intersect(ray)
-        lamp = hit.is_valid() & hit.shape.is_emitter()
-        if not dr.any(lamp):
-            break
-        ray = dr.select(lamp, hit.spawn_ray(ray.d), ray)
-    return np.array(hit.p).T, np.array(hit.is_valid() & ~lamp)
 
 
 # Command line ------------------------------------------------------------------------------------
 
 
-def progress(missing: list[Shot], total: int) -> Iterator[Shot]:
+def progress(missing: list[CaptureView], total: int) -> Iterator[CaptureView]:
     """The shots one by one, with a line that says how far they are."""
     terminal = sys.stdout.isatty()
     started = last = time.monotonic()
@@ -517,10 +212,6 @@ def progress(missing: list[Shot], total: int) -> Iterator[Shot]:
             print(f"\r{line}  " if terminal else line, end="" if terminal else "\n", flush=True)
     if terminal and missing:
         print()
-
-
-def _option(name: str) -> str:
-    return "--" + name.replace("_", "-")
 
 
 def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:

@@ -1,6 +1,6 @@
 """``python -m drgs.fit CONFIG.yml``: fit Gaussians to photographs.
 
-Layer 5. Reads the configuration and the dataset, runs :class:`drgs.trainer.Trainer`, measures the
+Reads the configuration and the dataset, runs :class:`drgs.training.trainer.Trainer`, measures the
 result on the test views and writes the output folder:
 
 - ``point_cloud.ply``: the Gaussians, in the layout of the 3DGS reference implementation
@@ -20,13 +20,11 @@ While it runs there is also ``checkpoint.npz``, from which ``--resume`` continue
 from __future__ import annotations
 
 import argparse
-import csv
 import json
 import platform
 import sys
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -35,25 +33,21 @@ import mitsuba as mi
 import numpy as np
 
 import drgs
-from drgs.checkpoint import (
-    FILE_NAME,
-    Checkpoint,
-    load_checkpoint,
-    remove_checkpoint,
-    save_checkpoint,
-)
-from drgs.checks import UserError, exit_on_user_error, one_line
-from drgs.config import FitConfig, dump_config, load_config
+from drgs.cli.errors import exit_on_user_error
+from drgs.cli.execution import add_options, execution
+from drgs.cli.interrupts import INTERRUPTED_STATUS, StopRequest
+from drgs.cli.progress import FitProgress
+from drgs.config.load import dump_config, load_config
+from drgs.config.schema import FitConfig
+from drgs.core.errors import UserError, one_line
+from drgs.core.files import atomic_path
 from drgs.data import Dataset, initial_gaussians, load_dataset
-from drgs.effects import described, plan_of_fit
-from drgs.execution import add_options, execution
-from drgs.files import atomic_path
-from drgs.gaussians import Gaussians
-from drgs.guards import NonFiniteError
-from drgs.interrupts import INTERRUPTED_STATUS, StopRequest
+from drgs.gaussians.parameters import Gaussians
+from drgs.integrator.scene import check_lenses
+from drgs.integrator.summary import described
+from drgs.io.pictures import write_png
 from drgs.io.ply import write_ply
-from drgs.metrics import Quality, mean_quality
-from drgs.output import (
+from drgs.results.folder import (
     CONFIG_NAME,
     LAST_FILE,
     claim_output_folder,
@@ -62,8 +56,9 @@ from drgs.output import (
     remove_run,
     require_no_run,
 )
-from drgs.pictures import write_png
-from drgs.plan import (
+from drgs.results.metrics import Quality, mean_quality
+from drgs.results.report import seconds_to_write, write_results
+from drgs.training.budget import (
     AllIterations,
     Deadline,
     Plan,
@@ -72,25 +67,20 @@ from drgs.plan import (
     parse_duration,
     rehearse,
 )
-from drgs.progress import FitProgress
-from drgs.report import seconds_to_write, write_results
-from drgs.scene import check_lenses
-from drgs.trainer import StepReport, Trainer
+from drgs.training.checkpoint import (
+    FILE_NAME,
+    Checkpoint,
+    load_checkpoint,
+    remove_checkpoint,
+    save_checkpoint,
+)
+from drgs.training.finite_checks import NonFiniteError
+from drgs.training.history import History, write_history
+from drgs.training.summary import summary_of_fit
+from drgs.training.trainer import Trainer
 
 SMOOTHING = 0.9
 """Weight of the past in the PSNR that the progress line shows."""
-
-
-@dataclass(frozen=True)
-class HistoryRow:
-    """One line of ``history.csv``."""
-
-    iteration: int
-    loss: float
-    psnr: float  # dB, of the iteration's training view
-    num_gaussians: int
-    means_lr: float
-    wall_s: float  # since the first iteration
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -113,7 +103,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             f"{len(dataset.train)} views to train on, {len(dataset.test)} of split "
             f"'{dataset.test_split}' to measure on; background {config.data.background}"
         )
-        print(described(plan_of_fit(config, dataset)))
+        print(described(summary_of_fit(config, dataset)))
         # The folder is touched when all of the input has been found to be usable.
         views, remedy = (*dataset.train, *dataset.test), "set data.ignore_distortion"
         check_lenses(config.model, views, f"{config.data.path}: ", remedy)
@@ -214,48 +204,6 @@ def run(
     return True
 
 
-class History:
-    """Rows of ``history.csv`` and the time spent, also before an interruption."""
-
-    def __init__(self) -> None:
-        self.rows: list[HistoryRow] = []
-        self._before = 0.0
-        self._started = time.perf_counter()
-
-    @staticmethod
-    def from_array(rows: np.ndarray, wall_s: float) -> History:
-        """What :meth:`as_array` gave; the clock goes on from ``wall_s``."""
-        history = History()
-        history.rows = [
-            HistoryRow(int(i), loss, psnr, int(n), lr, at) for i, loss, psnr, n, lr, at in rows
-        ]
-        history._before = wall_s
-        return history
-
-    def as_array(self) -> np.ndarray:
-        """(rows, columns) float64."""
-        columns = len(HistoryRow.__dataclass_fields__)
-        return np.array([tuple(vars(r).values()) for r in self.rows], float).reshape(-1, columns)
-
-    @property
-    def wall_s(self) -> float:
-        """Seconds spent so far."""
-        return self._before + time.perf_counter() - self._started
-
-    def add(self, report: StepReport) -> HistoryRow:
-        """Read the numbers of one iteration; waits for the device."""
-        row = HistoryRow(
-            iteration=report.iteration,
-            loss=report.loss,
-            psnr=report.psnr,
-            num_gaussians=report.num_gaussians,
-            means_lr=report.means_lr,
-            wall_s=self.wall_s,
-        )
-        self.rows.append(row)
-        return row
-
-
 def train(
     trainer: Trainer,
     log: History,
@@ -292,7 +240,7 @@ def train(
 def write_gaussians(path: Path, gaussians: Gaussians, config: FitConfig) -> None:
     """Write ``point_cloud.ply``, with the smoothing filter apart from the Gaussians or in them."""
     if config.output.bake_smoothing:
-        from drgs.smoothing import baked
+        from drgs.effects.smoothing import baked
 
         gaussians = baked(gaussians)
     write_ply(path, gaussians)
@@ -310,15 +258,6 @@ def _remedy(out: Path) -> str:
         f"{kept}. --resume {out} --debug repeats this with range checks; lower learning rates "
         "(--set optimizer.means_lr=..., and so on) may avoid it"
     )
-
-
-def write_history(path: Path, history: list[HistoryRow]) -> None:
-    """Write ``history.csv``."""
-    with atomic_path(path) as temporary, temporary.open("w", newline="") as file:
-        writer = csv.writer(file)
-        writer.writerow(HistoryRow.__dataclass_fields__)
-        for row in history:
-            writer.writerow([f"{v:.6g}" if isinstance(v, float) else v for v in vars(row).values()])
 
 
 def summarize(

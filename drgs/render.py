@@ -1,6 +1,6 @@
 """``python -m drgs.render WHAT --out DIR``: pictures of Gaussians, of a fit, of a Mitsuba scene.
 
-Layer 5. ``WHAT`` is one of
+``WHAT`` is one of
 
 - ``MODEL.ply``: Gaussians in the layout of the 3DGS reference implementation
 - ``OUT_DIR``: the output folder of a fit; its ``point_cloud.ply`` under its own ``config.yml``
@@ -28,32 +28,31 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
-from drgs.camera import IGNORABLE
-from drgs.checks import UserError, exit_on_user_error
-from drgs.config import NAMED_COLORS, DataConfig, FitConfig, ModelConfig, load_config
-from drgs.constants import SHUTTER_SAMPLES
+from drgs.cli.errors import exit_on_user_error
+from drgs.cli.execution import add_options, execution
+from drgs.config.load import load_config
+from drgs.config.schema import NAMED_COLORS, DataConfig, FitConfig, ModelConfig
+from drgs.core.constants import SHUTTER_SAMPLES
+from drgs.core.errors import UserError
+from drgs.core.files import atomic_path
 from drgs.data import Dataset, View, load_dataset
 from drgs.data.images import read_image
-from drgs.effects import described, plan_of_views
-from drgs.execution import add_options, execution
-from drgs.files import atomic_path
-from drgs.gaussians import Gaussians
-from drgs.io.ply import read_ply
-from drgs.metrics import Quality, psnr, ssim
-from drgs.pictures import write_animation, write_png
-from drgs.scene import check_lenses, make_scene
-from drgs.trainer import render_views
-from drgs.viewpoints import (
+from drgs.data.orbits import orbit_of_gaussians, orbit_of_views, orbit_size
+from drgs.data.viewpoints import (
     FIELD_OF_VIEW,
     Viewpoint,
     field_of_view,
     look_at,
-    orbit_of_gaussians,
-    orbit_of_views,
-    orbit_size,
     pinhole,
     read_viewpoints,
 )
+from drgs.effects.compose import IGNORABLE
+from drgs.gaussians.parameters import Gaussians
+from drgs.integrator.scene import check_lenses, make_scene, render_views
+from drgs.integrator.summary import described, summary_of_views
+from drgs.io.pictures import write_animation, write_png
+from drgs.io.ply import read_ply
+from drgs.results.metrics import Quality, psnr, ssim
 
 MODEL, CONFIG, METRICS, CAMERAS = "point_cloud.ply", "config.yml", "metrics.json", "cameras.json"
 """What a fit's output folder holds."""
@@ -88,7 +87,7 @@ class Model:
         if "distortion" not in self.ignored:
             check_lenses(self.settings, views, where="", remedy="give --ignore distortion")
         scene = self.scene()
-        print(described(plan_of_views(scene.integrator(), views)), flush=True)
+        print(described(summary_of_views(scene.integrator(), views)), flush=True)
         return render_views(scene, views)
 
     def dataset(self, option: str) -> Dataset:
@@ -106,7 +105,7 @@ class Model:
                 "--set cameras.optimise=true"
             )
             return dataset
-        from drgs.camera_refinement import refined_dataset
+        from drgs.results.refined_cameras import refined_dataset
 
         print(f"cameras: as refined, from {path}")
         return refined_dataset(dataset, self.folder)
@@ -274,7 +273,7 @@ def _is_linear(integrator: mi.Integrator) -> bool:
 def _print_plan(path: Path, scene: mi.Scene) -> None:
     """What the scene's ``splats`` integrator simulates for its sensors."""
     try:
-        print(scene.integrator().plan(scene, *scene.sensors()), flush=True)
+        print(scene.integrator().summary(scene, *scene.sensors()), flush=True)
     except (TypeError, ValueError) as error:
         if not str(error).startswith("splats: "):
             raise

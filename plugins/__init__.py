@@ -1,8 +1,10 @@
-"""Mitsuba plugins of drgs, one file each; importable as ``drgs.plugins``. Layer 5.
+"""Mitsuba plugins of drgs, one file each; importable as ``drgs.plugins``.
+
+May import ``integrator`` and what that may import.
 
 A plugin file reads like one of Mitsuba's own: a class that derives from a class of the active
-variant, and a registration that closes the file. Such a class belongs to one variant, so the
-files are executed once for each variant that becomes active, and the results are kept.
+variant, and a registration that closes the file. Such a class belongs to one variant, so the files
+are executed once for each variant that becomes active, and the results are kept.
 """
 
 from __future__ import annotations

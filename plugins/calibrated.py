@@ -1,7 +1,8 @@
-"""The ``calibrated`` sensor: a camera as calibration tools describe it. Layer 5.
+"""The ``calibrated`` sensor: a camera as calibration tools describe it.
 
-Executed once per Mitsuba variant (see ``drgs.plugins``). The lenses are in ``drgs.lenses``; this
-file is where they meet Mitsuba's rays, films and parameters.
+Executed once per Mitsuba variant (see ``drgs.plugins``). The lenses are in
+``drgs.cameras.radial_tangential``; this file is where they meet Mitsuba's rays, films and
+parameters.
 """
 
 from __future__ import annotations
@@ -14,16 +15,15 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from drgs.camera import (
-    Camera,
-    Pinhole,
+from drgs.cameras.camera import Camera, Pinhole
+from drgs.core.errors import did_you_mean
+from drgs.integrator.sensors import (
     SensorState,
     on_crop_window,
     opaque_host,
     pose_from_to_world,
     read_sensor,
 )
-from drgs.checks import did_you_mean
 
 LENSES = ("pinhole", "opencv", "fisheye")
 SHUTTERS = ("global", "rolling")
@@ -181,7 +181,7 @@ class CalibratedSensor(mi.Sensor):
         )
 
     # ------------------------------------------------------------------------------------------
-    # For the splats integrator: see ``drgs.camera``
+    # For the splats integrator: see ``drgs.cameras.camera``
     # ------------------------------------------------------------------------------------------
 
     @property
@@ -201,7 +201,7 @@ class CalibratedSensor(mi.Sensor):
         camera = on_crop_window(state, opaque_host(state), device["to_world"], focal, principal)
         if self.to_world_close is None:
             return camera
-        from drgs.shutter import Motion, MotionBlur, RollingShutter
+        from drgs.cameras.motion import Motion, MotionBlur, RollingShutter
 
         motion = Motion.between(camera, *pose_from_to_world(device["to_world_close"]))
         if self.shutter == "rolling":
@@ -314,15 +314,23 @@ def _one_of(props: mi.Properties, name: str, known: tuple[str, ...]) -> str:
     return value
 
 
+def _lens_type(kind: str) -> Any:
+    """Imported when it is chosen."""
+    if kind == "opencv":
+        from drgs.cameras.radial_tangential import RadialTangential
+
+        return RadialTangential
+    if kind == "fisheye":
+        from drgs.cameras.fisheye import Fisheye
+
+        return Fisheye
+    return Pinhole
+
+
 def _lens(props: mi.Properties) -> Any:
     kind = _one_of(props, "lens", LENSES)
-    if kind == "pinhole":
-        model, names = Pinhole, ()
-    else:
-        from drgs import lenses
-
-        model = lenses.RadialTangential if kind == "opencv" else lenses.Fisheye
-        names = model.names
+    model = _lens_type(kind)
+    names = () if model is Pinhole else model.names
     given = {name: _number(props, name, 0.0) for name in ALL_COEFFICIENTS if name in props}
     for name in given:
         if name not in names:

@@ -1,7 +1,7 @@
-"""The ``splats`` integrator: 3D Gaussian splatting as a Mitsuba plugin. Layer 5.
+"""The ``splats`` integrator: 3D Gaussian splatting as a Mitsuba plugin.
 
 Executed once per Mitsuba variant (see ``drgs.plugins``). The rasterizer itself is
-``drgs.rendering``; this file is where it meets sensors, films, parameters and gradients.
+``drgs.splatting.rendering``; this file is where it meets sensors, films, parameters and gradients.
 """
 
 from __future__ import annotations
@@ -13,19 +13,20 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from drgs import rendering
-from drgs.arrays import interleave
-from drgs.camera import camera_from_sensor, read_sensor
-from drgs.constants import NEAR
-from drgs.gaussians import PARAMETER_NAMES, Gaussians
-from drgs.properties import (
+from drgs.accuracy.pipeline import pipeline_of
+from drgs.core.arrays import interleave
+from drgs.core.constants import NEAR
+from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
+from drgs.integrator.cache import Memory
+from drgs.integrator.picture import Picture, sensors_of
+from drgs.integrator.properties import (
     AOVS,
     aovs_of,
+    approximations_of,
     background_of,
     boolean,
     check_degree,
     check_shapes,
-    choices_of,
     degree_of,
     ignored_effects,
     load_gaussians,
@@ -34,7 +35,9 @@ from drgs.properties import (
     turns_of_shapes,
     whole_number,
 )
-from drgs.shot import Memory, Shot, accumulate, feature_of, sensors_of
+from drgs.integrator.sensors import camera_from_sensor, read_sensor
+from drgs.integrator.view import accumulate, feature_of
+from drgs.splatting import rendering
 
 SUPPORTED_VARIANTS = ("llvm_ad_rgb", "cuda_ad_rgb")
 
@@ -172,7 +175,7 @@ class SplatsIntegrator(mi.CppADIntegrator):
      * - smoothing
        - |tensor|
        - Standard deviation of the 3D smoothing filter of each Gaussian (N), in scene units: see
-         ``drgs.smoothing``. (Default: the file's ``filter_3D``, if it has it)
+         ``drgs.effects.smoothing``. (Default: the file's ``filter_3D``, if it has it)
 
      * - means, quats, log_scales, logit_opacities, sh0, shN
        - |tensor|
@@ -244,7 +247,9 @@ class SplatsIntegrator(mi.CppADIntegrator):
             setattr(self, name, getattr(gaussians, name))
         self.smoothing, self.features = gaussians.smoothing, gaussians.features or {}
         self._has_own, self._turns = gaussians.num_gaussians > 0, turns_of_shapes(props)
-        self._gathered: Any = None  # with those of the scene's shapes: see drgs.shapes
+        self._gathered: Any = (
+            None  # with those of the scene's shapes: see drgs.integrator.ellipsoids
+        )
         self._scene_has_shapes = False  # of Gaussians: the last one that was rendered
         self.ignore = ignored_effects(props)
         self.aovs = aovs_of(props, [*AOVS, *self.features])
@@ -252,7 +257,7 @@ class SplatsIntegrator(mi.CppADIntegrator):
         self._sh_degree_is_given = "sh_degree" in props
         self.background = background_of(props)
         self.hide_emitters = boolean(props, "hide_emitters", False)
-        self.choices = choices_of(props)
+        self.approximations = approximations_of(props)
         self.near = positive(props, "near", NEAR)
         self.srgb_primitives = boolean(props, "srgb_primitives", True)
         self.nested = nested_integrator(props)
@@ -261,7 +266,7 @@ class SplatsIntegrator(mi.CppADIntegrator):
         self.last: LastBackward | None = None
         self.memory = Memory()
         self._last_sensor: mi.Sensor | None = None  # that was rendered
-        self._logged_plan = ""
+        self._logged_summary = ""
 
     # ------------------------------------------------------------------------------------------
     # Parameters
@@ -323,7 +328,7 @@ class SplatsIntegrator(mi.CppADIntegrator):
         shapes = _ellipsoids(scene)
         self._scene_has_shapes = bool(shapes)
         if shapes or set(self._turns) - {""}:
-            from drgs.shapes import gather
+            from drgs.integrator.ellipsoids import gather
 
             self._gathered = gather(self._own, shapes, self._turns, self._gathered)
         else:
@@ -348,7 +353,9 @@ class SplatsIntegrator(mi.CppADIntegrator):
     def pipeline(self) -> rendering.Pipeline:
         """What this integrator's settings call for."""
         others = [feature_of(kind) for kind in self.aovs.values() if kind != "alpha"]
-        return self.choices.pipeline(self.sh_degree, features=(rendering.color_features, *others))
+        return pipeline_of(
+            self.approximations, self.sh_degree, features=(rendering.color_features, *others)
+        )
 
     def aov_names(self) -> list[str]:
         """Of the channels besides colour and alpha."""
@@ -366,7 +373,7 @@ class SplatsIntegrator(mi.CppADIntegrator):
             "background": self.background,
             "near": self.near,
             "srgb_primitives": self.srgb_primitives,
-            **self.choices.others_than_default,
+            **self.approximations.others_than_default,
         }
         if self.hide_emitters:
             settings["hide_emitters"] = True
@@ -399,8 +406,8 @@ class SplatsIntegrator(mi.CppADIntegrator):
         sensor = self._last_sensor = _resolve_sensor(scene, sensor)
         with dr.suspend_grad():
             self._gather(scene)
-            self._log_plan(scene, sensor)
-            image = Shot.of(self, scene, sensor, seed, spp).image()
+            self._log_summary(scene, sensor)
+            image = Picture.of(self, scene, sensor, seed, spp).image()
             if evaluate:
                 dr.eval(image)
         return image if develop else mi.TensorXf()
@@ -423,7 +430,7 @@ class SplatsIntegrator(mi.CppADIntegrator):
         sensor = _resolve_sensor(scene, sensor)
         with dr.suspend_grad():
             self._gather(scene)
-            gradients = Shot.of(self, scene, sensor, seed, spp).backward(params, grad_in)
+            gradients = Picture.of(self, scene, sensor, seed, spp).backward(params, grad_in)
             self.last = LastBackward(
                 means2d_grad=_rows(gradients.means2d),
                 visible=gradients.visible,
@@ -460,7 +467,7 @@ class SplatsIntegrator(mi.CppADIntegrator):
                 )
                 if self._gathered is not None:
                     tangents = self._gathered.tangents(_ellipsoids(scene), tangents)
-            d_image = Shot.of(self, scene, sensor, seed, spp).tangent(params, tangents)
+            d_image = Picture.of(self, scene, sensor, seed, spp).tangent(params, tangents)
             sensor.film().clear()  # it holds an attached block
         return d_image
 
@@ -469,9 +476,9 @@ class SplatsIntegrator(mi.CppADIntegrator):
     ) -> tuple[mi.Color3f, mi.Bool, list[mi.Float], None]:
         """What the rays of a whole picture see: for ``aov``, all others are refused.
 
-        See ``drgs.nesting``. Not differentiated, which ``aov`` only asks for the AOVs.
+        See ``drgs.integrator.aov_rays``. Not differentiated, which ``aov`` only asks for the AOVs.
         """
-        from drgs.nesting import PictureRays
+        from drgs.integrator.aov_rays import PictureRays
 
         del others
         sensor = self._last_sensor
@@ -489,25 +496,25 @@ class SplatsIntegrator(mi.CppADIntegrator):
             red, green, blue, alpha, *aovs = channels
             return mi.Color3f(red, green, blue), active & (alpha > 0), aovs, None
 
-    def plan(self, scene: mi.Scene, *sensors: mi.Sensor) -> str:
+    def summary(self, scene: mi.Scene, *sensors: mi.Sensor) -> str:
         """What is simulated, what asked for it, and what is not simulated: one line an effect."""
-        from drgs.effects import described, plan_of_sensors
+        from drgs.integrator.summary import described, summary_of_sensors
 
         self._gather(scene)
         alone = [one for sensor in sensors for one in sensors_of(sensor)]
         states = [read_sensor(one, self.near).detached() for one in alone]
         surfaces = [shape for shape in scene.shapes() if not shape.is_ellipsoids()]
         cameras = list(map(camera_from_sensor, states))
-        return described(plan_of_sensors(self, cameras, scene.environment(), len(surfaces)))
+        return described(summary_of_sensors(self, cameras, scene.environment(), len(surfaces)))
 
-    def _log_plan(self, scene: mi.Scene, sensor: mi.Sensor) -> None:
-        """Once for each plan, where somebody listens."""
+    def _log_summary(self, scene: mi.Scene, sensor: mi.Sensor) -> None:
+        """Once for each summary, where somebody listens."""
         if mi.logger() is None or mi.logger().log_level() > mi.LogLevel.Info:
             return
-        plan = self.plan(scene, sensor)
-        if plan != self._logged_plan:
-            mi.Log(mi.LogLevel.Info, f"splats: {plan}")
-            self._logged_plan = plan
+        summary = self.summary(scene, sensor)
+        if summary != self._logged_summary:
+            mi.Log(mi.LogLevel.Info, f"splats: {summary}")
+            self._logged_summary = summary
 
 
 def _ellipsoids(scene: mi.Scene) -> list[mi.Shape]:

@@ -18,12 +18,12 @@ import mitsuba as mi
 import numpy as np
 
 import drgs  # noqa: F401  (registers the plugin)
-from drgs import metrics
 from drgs.bench.output import machine, new_figure, write_figure
-from drgs.checks import exit_on_user_error
+from drgs.cli.errors import exit_on_user_error
+from drgs.data.orbits import orbit_of_gaussians
+from drgs.io.pictures import to_uint8
 from drgs.io.ply import read_ply
-from drgs.pictures import to_uint8
-from drgs.viewpoints import orbit_of_gaussians
+from drgs.results import metrics
 
 FOLDER = Path(__file__).parent
 SCENE, PICTURE = FOLDER / "shapes.xml", FOLDER / "pictures" / "shapes.png"

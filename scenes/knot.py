@@ -12,9 +12,9 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from drgs import reference
-from drgs.gaussians import Gaussians
+from drgs.gaussians.parameters import Gaussians
 from drgs.io.ply import write_ply
+from drgs.reference import splatting as reference
 
 FILE = Path(__file__).parent / "shapes" / "knot.ply"
 

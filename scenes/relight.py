@@ -39,17 +39,18 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 import drgs  # noqa: F401  (registers the plugin)
-from drgs import reference
-from drgs.arrays import interleave
 from drgs.bench.output import markdown_table, new_figure, write_figure
-from drgs.checks import UserError, exit_on_user_error
-from drgs.files import atomic_path
-from drgs.gaussians import PARAMETER_NAMES, Gaussians
+from drgs.cli.errors import exit_on_user_error
+from drgs.core.arrays import interleave
+from drgs.core.errors import UserError
+from drgs.core.files import atomic_path
+from drgs.data.orbits import OPAQUE, orbit_of_gaussians
+from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
+from drgs.gaussians.sh import sh_basis
+from drgs.gaussians.similarity import Similarity
+from drgs.io.pictures import write_animation, write_png
 from drgs.io.ply import read_ply
-from drgs.pictures import write_animation, write_png
-from drgs.sh import sh_basis
-from drgs.similarity import Similarity
-from drgs.viewpoints import OPAQUE, orbit_of_gaussians
+from drgs.reference import splatting as reference
 
 
 @dataclass(frozen=True)
@@ -236,7 +237,7 @@ def sh_rotation(rotation: mi.Matrix3f, degree: int) -> mi.TensorXf:
     """(K - 1, K - 1): D with c' = D c, the coefficients above degree 0 of a model that is turned.
 
     What was seen in R^T d is then seen in d. Enough directions d determine D: Y(d) D = Y(R^T d).
-    ``drgs.sh_rotation`` does the same on the host; here it is differentiated.
+    ``drgs.gaussians.sh_rotation`` does the same on the host; here it is differentiated.
     """
     directions = np.random.default_rng(0).normal(0, 1, (64, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)

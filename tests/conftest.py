@@ -8,6 +8,10 @@ from pathlib import Path
 import pytest
 
 REPOSITORY = Path(__file__).resolve().parent.parent
+TESTS = REPOSITORY / "tests"
+PATHS = [str(TESTS), *sorted(str(folder) for folder in TESTS.iterdir() if folder.is_dir())]
+"""Where programs of the tests find what the tests import."""
+
 SHARED_DATA = REPOSITORY.parent / "shared" / "data"
 
 

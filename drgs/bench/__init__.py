@@ -1,4 +1,4 @@
-"""Measurements that the README shows, each made by a command: ``python -m drgs.bench NAME``.
+"""Measurements that the README shows, each made by a command: ``drgs bench NAME``.
 
-Layer 5.
+May import everything.
 """

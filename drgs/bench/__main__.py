@@ -18,7 +18,7 @@ from drgs.bench import (
     training,
     volprim,
 )
-from drgs.checks import exit_on_user_error
+from drgs.cli.errors import exit_on_user_error
 
 COMMANDS = {
     "speed": speed,

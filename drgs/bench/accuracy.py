@@ -1,6 +1,6 @@
 """``python -m drgs.bench accuracy SCENE``: what each approximation costs, and what it saves.
 
-Layer 5. A trained scene and a stress scene (wide lens, large splats near the camera, layers that
+A trained scene and a stress scene (wide lens, large splats near the camera, layers that
 interpenetrate) are rendered along a ladder of choices. Each is compared with the most accurate
 form, the float64 numpy reference with splats evaluated along each pixel's ray, all sorted at each
 pixel, to the last transmittance and down to an alpha of a millionth; on crops it is checked against
@@ -25,19 +25,23 @@ import drjit as dr
 import drjit.llvm.ad as llvm
 import numpy as np
 
-from drgs import metrics, reference, reference_rays, rendering
+from drgs.accuracy.pipeline import pipeline_of
+from drgs.accuracy.sample_points import SamplePoints
 from drgs.bench.output import machine, markdown_table, new_figure, write_csv, write_figure
 from drgs.bench.scenes import bench_camera, device_camera, stress_scene
-from drgs.checks import UserError
-from drgs.choices import Choices
-from drgs.config import load_config
+from drgs.config.approximations import Approximations
+from drgs.config.load import load_config
+from drgs.core.errors import UserError
 from drgs.data import load_dataset
 from drgs.data.types import View
-from drgs.gaussians import PARAMETER_NAMES, Gaussians
-from drgs.image_model import PixelCenters
+from drgs.effects.smoothing import baked
+from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 from drgs.io.ply import read_ply
-from drgs.samples import SamplePoints
-from drgs.smoothing import baked
+from drgs.reference import rays as reference_rays
+from drgs.reference import splatting as reference
+from drgs.results import metrics
+from drgs.splatting import rendering
+from drgs.splatting.image_model import PixelCenters
 
 DESCRIPTION = "the error of each approximation against the time that it saves"
 
@@ -250,7 +254,7 @@ class Renderer:
         """Render; returns when the planes are in memory."""
         stored = self.gaussians.sh_degree
         degree = stored if self.rung.sh_degree is None else min(stored, self.rung.sh_degree)
-        pipeline = Choices(**self.rung.choices).pipeline(degree)
+        pipeline = pipeline_of(Approximations(**self.rung.choices), degree)
         first, *others = self.positions
         model = replace(pipeline.model, positions=first)
         frame = rendering.render(self.gaussians, self.camera, replace(pipeline, model=model))

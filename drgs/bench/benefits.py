@@ -1,10 +1,10 @@
 """``python -m drgs.bench benefits``: what effects are good for.
 
-Layer 5. The shipped scene is fitted at a small size to pictures that were spoiled in a known way,
-with the effect that is made for it and without: other exposures, something before the lens that a
-mask leaves out, few pictures with and without depth, cameras that are somewhere else than the data
-says, colours behind transparent pictures; and renderings at other sizes than that of the fit. All
-fits are measured on pictures that were not spoiled.
+The shipped scene is fitted at a small size to pictures that were spoiled in a known way, with the
+effect that is made for it and without: other exposures, something before the lens that a mask
+leaves out, few pictures with and without depth, cameras that are somewhere else than the data says,
+colours behind transparent pictures; and renderings at other sizes than that of the fit. All fits
+are measured on pictures that were not spoiled.
 """
 
 from __future__ import annotations
@@ -20,15 +20,17 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from drgs.bench.output import machine, markdown_table, new_figure, write_csv, write_figure
-from drgs.capture import first_hits, load_scene
-from drgs.config import FitConfig, load_config
+from drgs.config.changes import changed, with_iterations
+from drgs.config.load import load_config
+from drgs.config.schema import FitConfig
 from drgs.data import initial_gaussians, load_dataset
 from drgs.data.images import smaller_view
+from drgs.data.path_tracing import first_hits, load_scene
 from drgs.data.types import Dataset, View
-from drgs.metrics import mean_quality
-from drgs.pictures import to_uint8
-from drgs.schedule import changed, with_iterations
-from drgs.trainer import Trainer, render_views
+from drgs.integrator.scene import render_views
+from drgs.io.pictures import to_uint8
+from drgs.results.metrics import mean_quality
+from drgs.training.trainer import Trainer
 
 DESCRIPTION = "what effects are good for: fits of spoiled data with and without them"
 

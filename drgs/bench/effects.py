@@ -1,9 +1,9 @@
 """``python -m drgs.bench effects``: what each effect costs, on the bench scene.
 
-Layer 5. Two tables. The first is of what the integrator simulates: a picture and its derivatives
-with an effect against the same without it. The second is of what takes part in the iterations of a
-fit. An effect and what it is compared with are timed in turns, so that whatever else the machine
-does meets both; medians are reported, and the number of operations in their kernels.
+Two tables. The first is of what the integrator simulates: a picture and its derivatives with an
+effect against the same without it. The second is of what takes part in the iterations of a fit. An
+effect and what it is compared with are timed in turns, so that whatever else the machine does meets
+both; medians are reported, and the number of operations in their kernels.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ import numpy as np
 
 from drgs.bench.output import machine, markdown_table, new_figure, write_csv, write_figure
 from drgs.bench.scenes import Scene, bench_camera, bench_gaussians, trainer_of
-from drgs.gaussians import PARAMETER_NAMES, Gaussians
+from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 
 DESCRIPTION = "what each effect costs: time and operations with and without it"
 

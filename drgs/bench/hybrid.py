@@ -1,8 +1,8 @@
 """``python -m drgs.bench hybrid``: what a path-traced object among splats costs.
 
-Layer 5. Pictures of the bench scene in turns: of the splats alone, of a ball and a box under a
-light by the nested integrator alone, and of both. The factor is what the splats then cost, by what
-they cost alone: what is left of the last time when the second is taken off, over the first.
+Pictures of the bench scene in turns: of the splats alone, of a ball and a box under a light by the
+nested integrator alone, and of both. The factor is what the splats then cost, by what they cost
+alone: what is left of the last time when the second is taken off, over the first.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ import mitsuba as mi
 from drgs.bench.effects import SIZE, perspective, to_world
 from drgs.bench.output import machine, markdown_table, write_csv
 from drgs.bench.scenes import bench_camera, bench_gaussians
-from drgs.gaussians import PARAMETER_NAMES, Gaussians
+from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 
 DESCRIPTION = "what a path-traced object among splats costs"
 

@@ -1,4 +1,4 @@
-"""What the machine can do at best, measured through Dr.Jit. Layer 5.
+"""What the machine can do at best, measured through Dr.Jit.
 
 Both numbers bound every kernel from below: how many vector instructions it can execute, and how
 many bytes it can move, in a second.

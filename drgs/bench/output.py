@@ -1,4 +1,4 @@
-"""What every measurement writes: a table on the screen and in Markdown, CSV, figures. Layer 5."""
+"""What every measurement writes: a table on the screen and in Markdown, CSV, figures."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Any
 
 import drjit as dr
 
-from drgs.files import atomic_path
+from drgs.core.files import atomic_path
 
 
 def machine() -> str:

@@ -1,4 +1,4 @@
-"""How much work a frame is: entries, and (pixel, Gaussian) pairs. Layer 5."""
+"""How much work a frame is: entries, and (pixel, Gaussian) pairs."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ from typing import Any
 
 import drjit as dr
 
-from drgs.arrays import types_of
-from drgs.image_model import PIXELS
-from drgs.lanes import Entries, load_lane_row, make_lanes
-from drgs.rendering import Frame
+from drgs.core.arrays import types_of
+from drgs.splatting.image_model import PIXELS
+from drgs.splatting.lanes import Entries, load_lane_row, make_lanes
+from drgs.splatting.rendering import Frame
 
 
 @dataclass(frozen=True)

@@ -1,8 +1,8 @@
-"""Other implementations, given the same Gaussians, camera and loss. Layer 5.
+"""Other implementations, given the same Gaussians, camera and loss.
 
-A :class:`Renderer` renders a frame, and renders one and differentiates the loss
-sum(weights * image) / pixels with respect to all of its parameters. Each call returns when the
-device has finished.
+A :class:`Renderer` renders a frame, and renders one and differentiates the loss sum(weights *
+image) / pixels with respect to all of its parameters. Each call returns when the device has
+finished.
 """
 
 from __future__ import annotations
@@ -16,10 +16,10 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from drgs import reference
-from drgs.config import ModelConfig
-from drgs.gaussians import PARAMETER_NAMES, Gaussians
-from drgs.scene import make_scene
+from drgs.config.schema import ModelConfig
+from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
+from drgs.integrator.scene import make_scene
+from drgs.reference import splatting as reference
 
 SHELL = 3.0
 """Standard deviations at which Mitsuba's ellipsoids end (its default, and 3DGS's extent)."""

@@ -1,9 +1,9 @@
 """``python -m drgs.bench population``: how many Gaussians the reference recipe keeps, and why.
 
-Layer 5. The recipe of the 3DGS paper (``scenes/lego_paper.yml``, 30,000 iterations) at three
-sizes of the pictures, and at the smallest with one of its rules changed at a time, as people do
-who write it again: what survives, and what it is worth. Each fit is a run of ``drgs.fit`` in a
-process and a folder of its own. Interrupted fits go on, finished ones are not repeated.
+The recipe of the 3DGS paper (``scenes/lego_paper.yml``, 30,000 iterations) at three sizes of the
+pictures, and at the smallest with one of its rules changed at a time, as people do who write it
+again: what survives, and what it is worth. Each fit is a run of ``drgs.fit`` in a process and a
+folder of its own. Interrupted fits go on, finished ones are not repeated.
 
 At 200 and 400 px the pictures are those of NeRF-synthetic's Lego (which is distributed at 800;
 smaller pictures are area averages), at 800 px those of the shipped generator.
@@ -27,12 +27,14 @@ import drjit as dr
 import numpy as np
 from scipy.special import expit
 
-from drgs import capture, densify, fit, optimizer
-from drgs.arrays import from_host
+from drgs import capture, fit
 from drgs.bench.output import markdown_table, new_figure, write_csv, write_figure
-from drgs.config import DensifyConfig, FitConfig, load_config
+from drgs.config.load import load_config
+from drgs.config.schema import DensifyConfig, FitConfig
+from drgs.core.arrays import from_host
 from drgs.data import load_dataset
-from drgs.output import LAST_FILE
+from drgs.results.folder import LAST_FILE
+from drgs.training import densify, optimizer
 
 DESCRIPTION = "how many Gaussians the reference recipe keeps, by picture size and by rule; hours"
 

@@ -1,10 +1,10 @@
-"""Which stage of a computation its kernels belong to. Layer 5.
+"""Which stage of a computation its kernels belong to.
 
-Dr.Jit's kernel history names no stages. :class:`StageClock` waits for the device at the borders
-of the stages and reads the history there, so that whatever ran since the last border belongs to
-the stage that ends. Stages end where functions of the product are called, which are wrapped for
-as long as the clock runs; the computation itself is untouched. Waiting costs overlap: the sum of
-the stages is a little more than the computation takes when nobody looks.
+Dr.Jit's kernel history names no stages. :class:`StageClock` waits for the device at the borders of
+the stages and reads the history there, so that whatever ran since the last border belongs to the
+stage that ends. Stages end where functions of the product are called, which are wrapped for as long
+as the clock runs; the computation itself is untouched. Waiting costs overlap: the sum of the stages
+is a little more than the computation takes when nobody looks.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from typing import Any
 
 import drjit as dr
 
-from drgs import rasterize, rendering, tiles
+from drgs.splatting import rasterize, rendering, tiles
 
 STAGES = (
     "projection and SH",

@@ -1,7 +1,7 @@
 """``python -m drgs.bench scaling``: time and memory against Gaussians, pixels and threads.
 
-Layer 5. Each point is a training iteration (render, loss, gradients, optimizer) on a scene of its
-own, measured in a fresh process, so that its peak of memory is its own.
+Each point is a training iteration (render, loss, gradients, optimizer) on a scene of its own,
+measured in a fresh process, so that its peak of memory is its own.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""Scenes that measurements share. Layer 5.
+"""Scenes that measurements share.
 
-Cameras are :class:`drgs.reference.Camera`: plain numbers, from which :func:`device_camera` makes
-the kernels' camera in any precision.
+Cameras are :class:`drgs.reference.splatting.Camera`: plain numbers, from which
+:func:`device_camera` makes the kernels' camera in any precision.
 """
 
 from __future__ import annotations
@@ -13,13 +13,14 @@ from typing import Any
 import drjit.llvm.ad as llvm
 import numpy as np
 
-from drgs import reference, rendering
-from drgs.camera import Camera
-from drgs.config import FitConfig
+from drgs.cameras.camera import Camera
+from drgs.config.changes import changed
+from drgs.config.schema import FitConfig
 from drgs.data.types import Dataset, View
-from drgs.gaussians import Gaussians
-from drgs.schedule import changed
-from drgs.trainer import Trainer
+from drgs.gaussians.parameters import Gaussians
+from drgs.reference import splatting as reference
+from drgs.splatting import rendering
+from drgs.training.trainer import Trainer
 
 BENCH_TO_WORLD = np.array(
     [

@@ -1,8 +1,8 @@
 """``python -m drgs.bench speed``: drgs, other renderers, and the machine's limits, side by side.
 
-Layer 5. Everything is measured in one process, on the same Gaussians and camera, with the same
-loss, in turns: each round times every implementation once, so that whatever else the machine does
-meets all of them. Medians are reported, and ratios of medians.
+Everything is measured in one process, on the same Gaussians and camera, with the same loss, in
+turns: each round times every implementation once, so that whatever else the machine does meets all
+of them. Medians are reported, and ratios of medians.
 
 For the compositing kernels the command also says how much of their work shows (pairs of a pixel
 and a Gaussian whose alpha reaches 1/255 before the pixel is finished), and what part of the
@@ -30,9 +30,9 @@ from drgs.bench.output import machine, markdown_table, new_figure, write_csv, wr
 from drgs.bench.pairs import Work, count_work
 from drgs.bench.profile import STAGES, StageClock, stage_clock
 from drgs.bench.scenes import Scene, bench_camera, bench_gaussians, frame_of, trainer_of
-from drgs.files import atomic_path
+from drgs.core.files import atomic_path
 from drgs.io.ply import read_ply
-from drgs.trainer import Trainer
+from drgs.training.trainer import Trainer
 
 DESCRIPTION = "times of drgs and of other renderers on the same scene, in one run"
 

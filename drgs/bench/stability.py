@@ -1,11 +1,11 @@
 """``python -m drgs.bench stability``: what single precision costs in accuracy, and why.
 
-Layer 5. Four families of scenes become harder step by step: more layers, longer needles, larger
-distances, coordinates farther from the origin. For each step the float32 kernels are compared with
-the float64 reference (``drgs.reference``), and their error is set beside the *noise*: how much the
+Four families of scenes become harder step by step: more layers, longer needles, larger distances,
+coordinates farther from the origin. For each step the float32 kernels are compared with the float64
+reference (``drgs.reference.splatting``), and their error is set beside the *noise*: how much the
 reference's own result changes when every input is moved by one rounding of single precision. The
-noise is the conditioning of the problem; no single-precision program can be expected to do
-better. An error that grows faster than the noise would be the kernels' own fault.
+noise is the conditioning of the problem; no single-precision program can be expected to do better.
+An error that grows faster than the noise would be the kernels' own fault.
 
 Pixels at which a decision (cut, clamp, stop) may fall either way in single precision are left out;
 the reference marks them.
@@ -21,10 +21,11 @@ from typing import Any
 import drjit.llvm.ad as llvm
 import numpy as np
 
-from drgs import reference, rendering
 from drgs.bench.output import machine, markdown_table, new_figure, write_csv, write_figure
 from drgs.bench.scenes import device_camera
-from drgs.gaussians import PARAMETER_NAMES, Gaussians
+from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
+from drgs.reference import splatting as reference
+from drgs.splatting import rendering
 
 DESCRIPTION = "error of float32 against float64 as scenes become harder"
 

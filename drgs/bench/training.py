@@ -1,6 +1,6 @@
 """``python -m drgs.bench training``: what another minute of fitting buys.
 
-Layer 5. The shipped scene at 200x200 (``scenes/lego_mini.yml``) is fitted with different numbers of
+The shipped scene at 200x200 (``scenes/lego_mini.yml``) is fitted with different numbers of
 iterations, and with one other choice at a time: smaller pictures first, fewer Gaussians, spherical
 harmonics of a lower degree, another window of the loss. Each choice is a curve of the quality on
 the test views over the time that the fit took. Finished fits are not repeated, interrupted ones go
@@ -23,10 +23,11 @@ from typing import Any
 
 from drgs import fit
 from drgs.bench.output import machine, markdown_table, new_figure, write_csv, write_figure
-from drgs.config import FitConfig, dump_config, load_config
-from drgs.output import LAST_FILE
-from drgs.plan import STRATEGIES, Strategy
-from drgs.schedule import changed, with_iterations
+from drgs.config.changes import changed, with_iterations
+from drgs.config.load import dump_config, load_config
+from drgs.config.schema import FitConfig
+from drgs.results.folder import LAST_FILE
+from drgs.training.budget import STRATEGIES, Strategy
 
 DESCRIPTION = "quality over time for several choices of a fit; an hour or two"
 
@@ -145,7 +146,7 @@ def fit_point(config: Path, name: str, iterations: int, out: Path) -> None:
 def seconds_at_start(out: Path, budgets: Sequence[int]) -> float:
     """Seconds of an iteration at the start of a fit as shipped: the median of several fits.
 
-    The same iterations, or as many, as ``drgs.plan.rehearse`` times.
+    The same iterations, or as many, as ``drgs.training.budget.rehearse`` times.
     """
     seconds = []
     for iterations in budgets:

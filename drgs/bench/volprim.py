@@ -1,10 +1,10 @@
 """``python -m drgs.bench volprim SCENE``: what sets Mitsuba's ``volprim_rf_basic`` apart.
 
-Layer 5. The float64 numpy reference makes that integrator's choices: splats are evaluated along
-each pixel's ray, end at 3 standard deviations, are ordered by where the ray enters them, and those
-that are entered within 1e-4 behind an entry are passed over; there is no low-pass and no smallest
-alpha; a pixel ends behind the splat that takes its transmittance below 0.01. Then one choice at a
-time is replaced by that of 3DGS.
+The float64 numpy reference makes that integrator's choices: splats are evaluated along each pixel's
+ray, end at 3 standard deviations, are ordered by where the ray enters them, and those that are
+entered within 1e-4 behind an entry are passed over; there is no low-pass and no smallest alpha; a
+pixel ends behind the splat that takes its transmittance below 0.01. Then one choice at a time is
+replaced by that of 3DGS.
 
 How closely the two can agree depends on the scene's unit of length: where lengths are small or
 large against that step, the integrator enters some splats twice. So the same scene is also measured
@@ -22,11 +22,13 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
-from drgs import metrics, reference, reference_rays
 from drgs.bench.accuracy import Subject, add_scene, load_subject
 from drgs.bench.output import markdown_table, write_csv
 from drgs.bench.peers import SHELL, sensor_of, volprim_scene
-from drgs.gaussians import PARAMETER_NAMES, Gaussians
+from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
+from drgs.reference import rays as reference_rays
+from drgs.reference import splatting as reference
+from drgs.results import metrics
 
 DESCRIPTION = "each choice of Mitsuba's volprim_rf_basic, by how much it changes the picture"
 

@@ -1,14 +1,17 @@
-"""Datasets: photographs with cameras, read into :class:`drgs.data.types.Dataset`. Layer 1."""
+"""Datasets, start points, viewpoints, and pictures of Mitsuba scenes as a dataset.
+
+May import ``io``, ``config``, ``gaussians``, ``cameras`` and ``core``.
+"""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Callable
 
-from drgs.checks import UserError
-from drgs.config import DataConfig
+from drgs.config.schema import DataConfig
+from drgs.core.errors import UserError
 from drgs.data import nerf_synthetic, nerfstudio
-from drgs.data.points import initial_gaussians
+from drgs.data.initial import initial_gaussians
 from drgs.data.types import Dataset, View
 
 __all__ = ["Dataset", "View", "initial_gaussians", "load_dataset"]

@@ -1,8 +1,8 @@
 """What a frame may have besides a photograph by a pinhole camera that stands still.
 
-A lens, and a second pose (``drgs.data.frames``); a mask, and depths. ``mask_path`` names a picture
-that is black where pixels do not count. ``depth_file_path`` names a picture of 16 bits or an
-``.npy`` file; ``depth_unit_scale_factor`` is how many scene units its numbers count. But for the
+A lens, and a second pose (``drgs.data.transforms``); a mask, and depths. ``mask_path`` names a
+picture that is black where pixels do not count. ``depth_file_path`` names a picture of 16 bits or
+an ``.npy`` file; ``depth_unit_scale_factor`` is how many scene units its numbers count. But for the
 pose, what stands at the top of the file is every frame's that has none of its own.
 """
 
@@ -14,10 +14,10 @@ from typing import Any
 
 import numpy as np
 
-from drgs.checks import UserError
-from drgs.config import DataConfig
-from drgs.data.frames import CLOSE, InheritedValues, image_path, lens_of, motion_of, positive
+from drgs.config.schema import DataConfig
+from drgs.core.errors import UserError
 from drgs.data.images import downscale_depth, downscale_mask, read_depth, read_mask
+from drgs.data.transforms import CLOSE, InheritedValues, image_path, lens_of, motion_of, positive
 
 MASK, DEPTH, UNIT = "mask_path", "depth_file_path", "depth_unit_scale_factor"
 

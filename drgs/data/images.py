@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from drgs.checks import UserError, one_line
+from drgs.core.errors import UserError, one_line
 from drgs.data.types import View
 
 MAX_PIXELS = 1 << 26

@@ -15,10 +15,11 @@ from pathlib import Path
 
 import numpy as np
 
-from drgs.checks import UserError
-from drgs.config import DataConfig
+from drgs.config.schema import DataConfig
+from drgs.core.errors import UserError
 from drgs.data.extras import extras_of, ignored, notes
-from drgs.data.frames import (
+from drgs.data.images import composite, downscale, image_size, read_image
+from drgs.data.transforms import (
     InheritedValues,
     focal_from_angle,
     image_path,
@@ -27,7 +28,6 @@ from drgs.data.frames import (
     read_transforms,
     unique_names,
 )
-from drgs.data.images import composite, downscale, image_size, read_image
 from drgs.data.types import Dataset, View
 
 START_HALF_EXTENT = 1.3

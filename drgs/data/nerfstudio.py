@@ -13,10 +13,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from drgs.checks import UserError
-from drgs.config import DataConfig
+from drgs.config.schema import DataConfig
+from drgs.core.errors import UserError
 from drgs.data.extras import extras_of, ignored, notes
-from drgs.data.frames import (
+from drgs.data.images import composite, downscale, read_image
+from drgs.data.transforms import (
     InheritedValues,
     focal_from_angle,
     focal_length,
@@ -28,7 +29,6 @@ from drgs.data.frames import (
     read_transforms,
     unique_names,
 )
-from drgs.data.images import composite, downscale, read_image
 from drgs.data.types import Dataset, View
 
 

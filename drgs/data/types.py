@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from drgs.constants import SHUTTER_SAMPLES
+from drgs.core.constants import SHUTTER_SAMPLES
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,7 +32,7 @@ class View:
     cy: float  # px
     width: int  # px
     height: int  # px
-    lens: Any = None  # of drgs.lenses, with numbers of the host; None: a pinhole
+    lens: Any = None  # of drgs.cameras.radial_tangential, with numbers of the host; None: a pinhole
     motion: Motion | None = None  # while the photograph was taken
     alpha: np.ndarray | None = None  # (height, width) float32: how opaque the picture was
     mask: np.ndarray | None = None  # (height, width) float32: 1 where a pixel counts, else 0

@@ -1,4 +1,7 @@
-"""Scene files: disk <-> :class:`drgs.gaussians.Gaussians`. Layer 1; needs no libLLVM."""
+"""Files: Gaussians and points as PLY, pictures and animations; needs no libLLVM.
+
+May import ``gaussians`` and ``core``.
+"""
 
 from drgs.io.ply import read_ply, read_points, write_ply
 

@@ -1,6 +1,6 @@
 """PLY files: Gaussians in the layout of the 3DGS reference, and plain point clouds.
 
-Layer 1. The reference (Kerbl et al. 2023, ``save_ply``) writes one float32 row per Gaussian::
+The reference (Kerbl et al. 2023, ``save_ply``) writes one float32 row per Gaussian::
 
     x y z  nx ny nz  f_dc_0..2  f_rest_0..3(K-1)-1  opacity  scale_0..2  rot_0..3
 
@@ -19,9 +19,9 @@ from typing import IO
 import numpy as np
 from plyfile import PlyData, PlyElement, PlyElementParseError
 
-from drgs.checks import UserError, one_line
-from drgs.files import atomic_path
-from drgs.gaussians import Gaussians
+from drgs.core.errors import UserError, one_line
+from drgs.core.files import atomic_path
+from drgs.gaussians.parameters import Gaussians
 
 POSITION = ("x", "y", "z")
 NORMAL = ("nx", "ny", "nz")

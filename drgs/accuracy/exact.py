@@ -1,0 +1,339 @@
+r"""Splats evaluated along each pixel's ray: the projection ``exact``, and depths at a pixel.
+
+Imported when it is chosen. The affine approximation (EWA) replaces a Gaussian by one on the film.
+What a ray really meets is the Gaussian's peak along it, and that is hardly more work.
+
+In camera axes let d be a pixel's offset from the mean on the film, in the coordinates e = U d in
+which the affine approximation at the mean is the unit Gaussian. Write k for the covariance of the
+position on the film with z / z_mean, w for the variance of z / z_mean, kappa = U k, and h = w -
+|kappa|^2: the variance of z / z_mean where the position on the film is known. Along the ray through
+the pixel, the smallest Mahalanobis distance from the mean, rho^2, and where it lies, z, are
+
+    rho^2 = |e|^2 / D,  z = z_mean a / D,  a = 1 - kappa . e,  D = a^2 + h |e|^2
+
+*Proof.* The distance of a point from a line is that of their projections along the line.
+Projecting along the pixel's ray instead of the mean's changes the 2x3 projection A to
+A - d e_z^T / z_mean, and so the projected covariance from C to C - d k^T - k d^T + w d d^T, whose
+inverse (Sherman-Morrison, twice) gives d^T (...)^-1 d = |e|^2 / D. (The affine approximation is the
+first order in the size of the splat; D = 1 there.) The peak is behind the camera where a <= 0: no
+response.
+
+The low-pass widens the Gaussian parallel to the film, which changes C and neither k nor w.
+
+**Anchor.** Where a mean is far outside the film, but its splat reaches it, a is a small difference
+of large numbers. It is linear in the pixel, and so is known from a point c of the film, the closest
+to the mean: a = a_c + g . (x - c). The same formulas, seen from the ray through c and with primes
+(m = U' (c - mean), a' = 1 + kappa' . m, D' = a'^2 + h' |m|^2), give sums of what is small:
+
+    a_c = a' / D',  g = -U'^T (a' kappa' + h' m) / D',  h = h' / D'
+
+*Proof.* By the same two inversions, from C' = C - d k^T - k d^T + w d d^T back to C. Where the mean
+is on the film, c is the mean, a_c = 1, g = -U^T kappa.
+
+As rho^2 is a ratio, U, g and z_mean are divided by |a_c| once and for all: then a = +-1 +
+g . (x - c). The sign, that of a_c, is kept as that of U, which does not matter otherwise.
+
+**Parallel rays** see no perspective. Where the position on the film is known, the depth is expected
+at z = z_mean (1 + kappa . e) (linear regression), and there is the peak.
+
+**Extent.** With t = |U d|^2 the smallest exponent that shows, |e|^2 <= t D is |e| <= sqrt(q) a with
+q = t / (1 - t h): a conic section with a focus in the mean and the eccentricity sqrt(q) |kappa|. If
+that is below 1 it is an ellipse, which :meth:`RayResponse.outline` finds; otherwise the splat
+reaches around the camera and is taken to be everywhere.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar
+
+import drjit as dr
+
+from drgs.cameras.camera import Camera, Pinhole
+from drgs.core.arrays import types_of
+from drgs.core.constants import WHITENING_SCALE
+from drgs.splatting.image_model import AffineResponse, Footprint, Offsets
+from drgs.splatting.projection import FilmShape, GaussianRows, ewa, film_axes, whiten
+
+MOST_ECCENTRIC = 0.99
+"""Outlines whose squared eccentricity is larger are taken to be everywhere: an ellipse ten times as
+long as wide, whose size is known to 1e-5 in single precision. The same for t h, the share of the
+way to the camera."""
+
+_EVERYWHERE = 1e-12
+"""1 / px: U of an outline that holds every film."""
+
+LARGEST_EXPONENT = 1e4
+"""2^-1e4 is 0 in either precision."""
+
+
+def exact(rows: GaussianRows, camera: Camera, position: Any, low_pass: float) -> FilmShape:
+    """The shape that :class:`RayResponse` evaluates; the slopes of its Jacobian are not clamped.
+
+    Its whitening is U / a_c, and ``perspective`` is g / |a_c| (2), h, and 1 / |a_c|. Not
+    differentiated: where the anchor is, which makes no difference.
+    """
+    m0, m1, _ = film_axes(rows, camera, position, camera.lens.true_slopes(camera, position))
+    film = whiten(camera.lens.film_point(camera, position), [*m0], [*m1], low_pass)
+    mean = dr.detach(film.means2d)
+    anchor = closest_on_film(camera, *mean)
+    slopes = list((anchor - camera.principal) / camera.focal)
+    # Differentiated as the mean's distance from a point that stays.
+    offset = (anchor - mean) - (film.means2d - mean)
+    (p, r, s), (kx, ky), h = _seen_along(rows, camera, position, slopes, low_pass)
+    u, v = dr.fma(p, offset.x, r * offset.y), s * offset.y
+    a = dr.fma(kx, u, dr.fma(ky, v, 1))
+    denominator = dr.fma(a, a, h * dr.fma(u, u, v * v))
+    size = dr.abs(a)
+    gx, gy = dr.fma(kx, a, h * u) / size, dr.fma(ky, a, h * v) / size
+    perspective = [-p * gx, -dr.fma(r, gx, s * gy), h / denominator, denominator / size]
+    return replace(film, whitening=film.whitening * (denominator / a), perspective=perspective)
+
+
+def closest_on_film(camera: Camera, x: Any, y: Any) -> Any:
+    """The point of the film, Array2f, that is closest to a point of its plane, px."""
+    t = types_of(type(x))
+    return dr.clip(t.Array2f(x, y), camera.film_start, camera.film_end)
+
+
+def ewa_with_depth(rows: GaussianRows, camera: Camera, position: Any, low_pass: float) -> FilmShape:
+    """As ``projection.ewa``, and what is needed for the depth at a pixel: kappa (2) and h."""
+    slopes = camera.lens.clamped_slopes(camera, position)
+    film = ewa(rows, camera, position, low_pass)
+    _, kappa, h = _seen_along(rows, camera, position, slopes, low_pass)
+    return replace(film, perspective=[*kappa, h])
+
+
+def _seen_along(
+    rows: GaussianRows, camera: Camera, position: Any, slopes: list[Any], low_pass: float
+) -> tuple[Any, tuple[Any, Any], Any]:
+    """U, kappa and h of a Gaussian that is projected along the ray with the given slopes."""
+    m0, m1, n = film_axes(rows, camera, position, slopes)
+    film = whiten(camera.lens.film_point(camera, position), [*m0], [*m1], low_pass)
+    p, _, s = film.whitening
+    # kappa and h by minors (Binet-Cauchy), free of the cancellation in p k_x + r k_y and in
+    # w - |kappa|^2. The rows are scaled first, or giants overflow.
+    low_pass_s = low_pass * dr.square(s)
+    m1 = s * m1
+    minors, minors_n, ky = dr.cross(m0, m1), dr.cross(n, m1), dr.dot(m1, n)
+    kx = p * dr.fma(low_pass_s, dr.dot(m0, n), dr.dot(minors, minors_n))
+    m0 = p * m0
+    h = dr.square(dr.dot(p * minors, n)) + low_pass_s * dr.squared_norm(dr.cross(m0, n))
+    h += low_pass * dr.square(p) * (dr.squared_norm(minors_n) + low_pass_s * dr.squared_norm(n))
+    return film.whitening, (kx, ky), h
+
+
+@dataclass(frozen=True)
+class RayFootprint(Footprint):
+    """The same, with what the derivatives of |e|^2 / D need, at the 16 pixels."""
+
+    along: list[Any]  # A = a / D: depth of the peak, divided by z_mean / |a_c|
+    exponent: list[Any]  # B = |e|^2 / D, base 2
+    from_anchor: tuple[list, list]  # grids of x - c, px
+
+    @property
+    def coordinates(self) -> list[tuple[Any, Any]]:
+        """e = (u, v)."""
+        return list(zip(_flat(self.u), _flat(self.v), strict=True))
+
+
+def _flat(rows: list) -> list[Any]:
+    return [value for row in rows for value in row]
+
+
+@dataclass(frozen=True)
+class RayResponse(AffineResponse):
+    """alpha = o exp(-rho^2 / 2), with rho^2 the smallest along the pixel's ray.
+
+    Geometry: that of :class:`AffineResponse`, then g (2), h; all as :func:`exact` gives them, U
+    and h scaled to base 2.
+    """
+
+    num_geometry: ClassVar[int] = 9
+    num_moments: ClassVar[int] = 9
+
+    camera: Camera | None = None
+
+    def seen_by(self, camera: Camera) -> RayResponse:
+        """For one camera, whose film has the anchors.
+
+        Raises ValueError for lenses that are no pinholes: their rays are not straight on the film.
+        """
+        if not isinstance(camera.lens, Pinhole):
+            raise ValueError(
+                f"splats: projection 'exact' needs a pinhole, got {type(camera.lens).__name__}; "
+                "use 'unscented', or 'ewa', which is exact for parallel rays"
+            )
+        return RayResponse(camera)
+
+    def geometry(self, splats: Any) -> list[Any]:
+        """Columns, one value per Gaussian."""
+        gx, gy, h, _ = splats.perspective
+        return [*super().geometry(splats), gx, gy, h / WHITENING_SCALE**2]
+
+    def differentiable(self, splats: Any) -> list[Any]:
+        """What :meth:`derivatives` are with respect to."""
+        return [*super().differentiable(splats), *splats.perspective[:3]]
+
+    def bounds(self, splats: Any, geometry: list[Any], reach: Any) -> tuple[Any, Any]:
+        """Centre and half sizes (Array2f, px) of the box around the outline."""
+        x, y, p, r, s = self.outline(geometry, reach)
+        Array2f = types_of(type(p)).Array2f
+        half_sizes = Array2f(dr.sqrt(1 + dr.square(r / s)) / p, 1 / s)
+        return Array2f(x, y), dr.sqrt(reach) * half_sizes
+
+    def outline(self, geometry: list[Any], reach: Any) -> list[Any]:
+        """Centre x, y, p, r, s of an ellipse |U d|^2 <= ``reach`` that holds the splat.
+
+        |e| <= sqrt(q) (1 - kappa . e) is (e - c)^T (I - q kappa kappa^T) (e - c) <= q / g^2 with
+        g^2 = 1 - q |kappa|^2 and c = -q kappa / g^2. I - q kappa kappa^T = V^T V with V upper
+        triangular turns it into |V U (d - U^-1 c)|^2 <= q / g^2.
+        """
+        x, y, p, r, s, _, gx, gy, h = geometry
+        # At the mean a is 1, and g = -U^T kappa, before they are divided.
+        anchor, sign = closest_on_film(self.camera, x, y), _sign(p)
+        at_mean = sign * dr.fma(gx, x - anchor.x, dr.fma(gy, y - anchor.y, sign))
+        kx = -sign * gx / p
+        ky = -dr.fma(r, kx, sign * gy) / s
+        p, r, s = p / at_mean, r / at_mean, s / at_mean
+        depth = 1 - reach * h
+        bounded = depth > 1 - MOST_ECCENTRIC
+        q = reach / dr.select(bounded, depth, 1)
+        squared = 1 - q * dr.fma(kx, kx, ky * ky)
+        # Written such that NaN is unbounded.
+        bounded = bounded & (squared > 1 - MOST_ECCENTRIC)
+        squared = dr.select(bounded, squared, 1)
+        v00 = dr.sqrt(dr.select(bounded, 1 - q * kx * kx, 1))
+        v01, v11 = -q * kx * ky / v00, dr.sqrt(squared) / v00
+        scale = dr.sqrt(depth * squared)
+        shift = -q / squared
+        shift_y = ky / s
+        shift_x = (kx - r * shift_y) / p
+        everywhere = [x, y, _EVERYWHERE, 0, _EVERYWHERE]
+        ellipse = [
+            x + shift * shift_x,
+            y + shift * shift_y,
+            scale * v00 * p,
+            scale * dr.fma(v00, r, v01 * s),
+            scale * v11 * s,
+        ]
+        return [dr.select(bounded, a, b) for a, b in zip(ellipse, everywhere, strict=True)]
+
+    def footprint(self, geometry: list[Any], offsets_from: Offsets, active: Any) -> RayFootprint:
+        """Evaluate the exponent; on a lane that is not active every alpha is below any floor."""
+        affine = super().footprint(geometry[:6], offsets_from, active)
+        log2_opacity = dr.select(active, geometry[5], -dr.inf)
+        from_anchor = offsets_from(*closest_on_film(self.camera, *geometry[:2]))
+        pixels = zip(*map(_flat, (affine.u, affine.v, *from_anchor)), strict=True)
+        along, exponent, log2_alpha = [], [], []
+        for u, v, x, y in pixels:
+            squared, a, denominator = ray_denominator(geometry, u, v, x, y)
+            # Elsewhere alpha is 0, and its derivatives' factors have to be finite.
+            shows = (a > 0) & (squared < LARGEST_EXPONENT * denominator)
+            inverse = dr.select(shows, 1 / denominator, 0)
+            along.append(a * inverse)
+            exponent.append(squared * inverse)
+            log2_alpha.append(dr.select(shows, log2_opacity - exponent[-1], -dr.inf))
+        return RayFootprint(
+            dx=affine.dx,
+            dy=affine.dy,
+            u=affine.u,
+            v=affine.v,
+            log2_alpha=log2_alpha,
+            along=along,
+            exponent=exponent,
+            from_anchor=from_anchor,
+        )
+
+    def moments(self, footprint: RayFootprint, weights: list[Any], positions: Any) -> list[Any]:
+        """Sums over the 16 pixels of w = d loss / d ln(alpha) times each of these.
+
+        1; A^2 u, A^2 u dx, A^2 u dy; A^2 v, A^2 v dy; A B (x - c); B^2. With f = |e|^2 / D,
+
+            df = 2 A^2 e . de - 2 A B da - B^2 dh
+        """
+        dx, dy = footprint.dx, footprint.dy
+        anchor_x, anchor_y = footprint.from_anchor
+        x, y, z, bb = [], [], [], []
+        for w, a, b, (u, v) in zip(
+            weights, footprint.along, footprint.exponent, footprint.coordinates, strict=True
+        ):
+            w_a, w_b = w * a, w * b
+            x.append(w_a * a * u)
+            y.append(w_a * a * v)
+            z.append(w_b * a)
+            bb.append(w_b * b)
+        return [
+            positions.sum(weights),
+            positions.sum(x),
+            positions.sum_dx(x, dx),
+            positions.sum_dy(x, dy),
+            positions.sum(y),
+            positions.sum_dy(y, dy),
+            positions.sum_dx(z, anchor_x),
+            positions.sum_dy(z, anchor_y),
+            positions.sum(bb),
+        ]
+
+    def derivatives(self, geometry: list[Any], totals: list[Any]) -> list[Any]:
+        """From moments to the derivatives of what :meth:`differentiable` lists.
+
+        log2_alpha = log2_opacity - f, e = (p dx + r dy, s dy), dx = x - mean, a = +-1 + g (x - c).
+        """
+        _, _, p, r, s, log2_opacity = geometry[:6]
+        w, x, x_dx, x_dy, y, y_dy, z_x, z_y, bb = totals
+        scale = 2 * math.log(2)
+        return [
+            scale * p * x,
+            scale * dr.fma(r, x, s * y),
+            -scale * WHITENING_SCALE * x_dx,
+            -scale * WHITENING_SCALE * x_dy,
+            -scale * WHITENING_SCALE * y_dy,
+            dr.select(w == 0, 0, w * dr.exp2(-log2_opacity)),
+            scale * z_x,
+            scale * z_y,
+            math.log(2) / WHITENING_SCALE**2 * bb,
+        ]
+
+    def pack_tangents(self, geometry: list[Any], tangents: list[Any]) -> list[Any]:
+        """Tangents of the geometry, that of the opacity as d ln(opacity)."""
+        return super().pack_tangents(geometry, tangents[:6]) + list(tangents[6:])
+
+    def tangent(
+        self, geometry: list[Any], footprint: RayFootprint, d_geometry: list[Any]
+    ) -> list[Any]:
+        """Tangent of ln(alpha) at the 16 pixels; see :meth:`moments`."""
+        _, _, p, r, s = geometry[:5]
+        d_x, d_y, d_p, d_r, d_s, d_log_opacity, d_gx, d_gy, d_h = d_geometry
+        d_p, d_r, d_s = d_p * WHITENING_SCALE, d_r * WHITENING_SCALE, d_s * WHITENING_SCALE
+        d_h = d_h / WHITENING_SCALE**2
+        pixels = zip(
+            *map(_flat, (footprint.dx, footprint.dy, footprint.u, footprint.v)),
+            *map(_flat, footprint.from_anchor),
+            footprint.along,
+            footprint.exponent,
+            strict=True,
+        )
+        result = []
+        for dx, dy, u, v, x, y, a, b in pixels:
+            d_u = dr.fma(d_p, dx, dr.fma(d_r, dy, -dr.fma(p, d_x, r * d_y)))
+            d_v = dr.fma(d_s, dy, -s * d_y)
+            d_a = dr.fma(d_gx, x, d_gy * y)
+            change = a * dr.fma(a, dr.fma(u, d_u, v * d_v), -b * d_a)
+            d_f = dr.fma(-b * b, d_h, 2 * change)
+            result.append(dr.fma(-math.log(2), d_f, d_log_opacity))
+        return result
+
+
+def ray_denominator(geometry: list[Any], u: Any, v: Any, x: Any, y: Any) -> tuple[Any, Any, Any]:
+    """|e|^2, a and D at a pixel with e = (u, v), at (x, y) from the anchor."""
+    gx, gy, h = geometry[6:9]
+    squared = dr.fma(u, u, v * v)
+    a = dr.fma(gx, x, dr.fma(gy, y, _sign(geometry[2])))
+    return squared, a, dr.fma(a, a, h * squared)
+
+
+def _sign(p: Any) -> Any:
+    """Of a_c: that of U."""
+    return dr.copysign(type(p)(1), p)

@@ -1,0 +1,68 @@
+"""From approximations to the pipeline that renders with them.
+
+Everything but the defaults is in modules of its own, imported when it is chosen: what is not chosen
+costs nothing.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+from drgs.config.approximations import Approximations
+from drgs.splatting.cutoffs import Cutoffs
+from drgs.splatting.image_model import DEFAULT, ImageModel
+from drgs.splatting.projection import color_at_mean, compensated_opacity, ewa, plain_opacity
+from drgs.splatting.rendering import CenterOrder, Pipeline
+
+LEAST_STOP = 1e-30
+"""Where no stop is asked for: past it float32 has no transmittance to go back from."""
+
+
+def pipeline_of(choices: Approximations, sh_degree: int, **others: Any) -> Pipeline:
+    """What renders with these choices; others: further fields of the pipeline."""
+    stop = max(choices.transmittance_stop, LEAST_STOP)
+    cutoffs = Cutoffs(choices.alpha_max, choices.alpha_cut, stop, choices.extent)
+    model = DEFAULT if cutoffs == Cutoffs() else ImageModel(cutoffs=cutoffs)
+    shape, order, color = ewa, CenterOrder(), color_at_mean
+    if choices.projection == "exact":
+        from drgs.accuracy.exact import RayResponse, exact
+
+        shape, model = exact, replace(model, response=RayResponse())
+    elif choices.projection == "unscented":
+        from drgs.accuracy.unscented import unscented
+
+        shape = unscented
+    if choices.order == "pixel":
+        from drgs.accuracy.pixel_order import PixelOrder
+
+        shape, depths = _with_depths(choices, shape)
+        order = PixelOrder(choices.order_window, depths)
+    if choices.sh_direction == "pixel":
+        from drgs.accuracy.ray_colors import RayColors, stored_coefficients
+
+        color, model = stored_coefficients, replace(model, features=RayColors(sh_degree))
+    return Pipeline(
+        sh_degree=sh_degree,
+        opacity_rule=compensated_opacity if choices.antialiased else plain_opacity,
+        shape=shape,
+        color=color,
+        low_pass=choices.low_pass,
+        model=model,
+        order=order,
+        **others,
+    )
+
+
+def _with_depths(choices: Approximations, shape: Any) -> tuple[Any, Any]:
+    """A projection that knows depths at a pixel, and who computes them."""
+    from drgs.accuracy.exact import ewa_with_depth
+    from drgs.accuracy.peak_depths import AffineDepths, RayDepths
+
+    if choices.projection == "exact":
+        return shape, RayDepths()
+    if choices.projection == "unscented":
+        from drgs.accuracy.unscented import unscented_with_depth
+
+        return unscented_with_depth, AffineDepths()
+    return ewa_with_depth, AffineDepths()

@@ -1,0 +1,472 @@
+"""Splats in the order of each pixel: the choice ``order: pixel``.
+
+Imported when it is chosen. By default all pixels composite in one order, that of the depths of the
+means; splats that interpenetrate then swap as a whole when the camera moves (*popping*). Here each
+pixel orders splats by the depth of their peak along its own ray.
+
+A pixel keeps a *window* of the K nearest splats that it has met and not yet composited (Radl et al.
+2024, "StopThePop", section 4, with a window of one level). A splat that is met is inserted, and the
+nearest of the K + 1 is composited. Each micro-tile has a list of its own, sorted by the depths of
+the peaks along the ray through its middle. The order is exact wherever a splat's place among those
+of its pixel differs by at most K from its place in that list; the error vanishes as K grows, but
+for what :data:`UNORDERED_ALPHA` leaves out.
+
+Nothing jumps: inserting into a sorted window is K comparisons with selections, at every pixel.
+
+**Adjoint.** Pixels of a micro-tile composite different splats at the same time, while a splat's
+partial derivatives are sums over pixels. So two walks compute what a pixel contributes, and store w
+= T alpha and d loss / d ln(alpha) where the splat's pixels are together; a third walk sums. What
+light behind a splat is worth, R (see ``drgs.splatting.rasterize``), follows from the sum over all
+splats less that of the splats in front. That difference would cancel: both sums are kept as two
+numbers each, whose sum is exact to twice the precision.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
+
+import drjit as dr
+
+from drgs.accuracy.peak_depths import AffineDepths, ParallelDepths, RayDepths, flat_columns
+from drgs.accuracy.pixel_lists import PixelLists
+from drgs.cameras.camera import Camera
+from drgs.core.arrays import empty_rows, load_row, scatter_rows, store_row, types_of
+from drgs.splatting.image_model import PIXELS, Alpha, Footprint, ImageModel
+from drgs.splatting.lanes import (
+    Lanes,
+    grouped_by_work,
+    load_lane_row,
+    load_pixels,
+    make_lanes,
+    pixels_of,
+)
+from drgs.splatting.rasterize import (
+    Layers,
+    Records,
+    SplatGradients,
+    composite_step,
+    largest,
+    pack_tangents,
+    splat_gradients,
+    sum_runs,
+)
+from drgs.splatting.tiles import TileBins
+
+UNORDERED_ALPHA = 1e-4
+"""A smaller alpha, which only a smaller alpha cut lets in, is composited when it is met, before all
+that waits. Two splats in the wrong order change a pixel by the product of their alphas: a splat
+loses at most the sum of the faint alphas behind it, and no window makes up for that. But in order,
+the faint rims of large splats, whose peaks are far from everything else, would fill the windows:
+uncut, a fitted scene is 52.4 dB from the true order with 16 places, and 51.3 dB with 1e-6 here."""
+
+
+@dataclass(frozen=True)
+class PixelOrder:
+    """Composites by the depth of the peak along each pixel's ray.
+
+    window: K, how many splats a pixel keeps waiting.
+    """
+
+    window: int
+    depths: AffineDepths | RayDepths
+
+    def seen_by(self, camera: Camera) -> PixelOrder:
+        """For one camera, whose rays may be parallel."""
+        return replace(self, depths=ParallelDepths()) if camera.lens.parallel else self
+
+    def keys(self, splats: Any) -> list[Any]:
+        """Columns that the depth at a pixel depends on."""
+        return self.depths.keys(splats)
+
+    def composite(self, bins: TileBins, records: Records) -> Layers:
+        """See :func:`drgs.splatting.rasterize.composite`."""
+        return _composite(bins, records, self)
+
+    def adjoint(self, *arguments: Any) -> SplatGradients:
+        """See :func:`drgs.splatting.rasterize.composite_adjoint`."""
+        return _adjoint(*arguments, self)
+
+    def tangent(self, *arguments: Any) -> Layers:
+        """See :func:`drgs.splatting.rasterize.composite_tangent`."""
+        return _tangent(*arguments, self)
+
+
+# ----------------------------------------------------------------------------------------------
+# Lists
+# ----------------------------------------------------------------------------------------------
+
+
+# ----------------------------------------------------------------------------------------------
+# The walk
+# ----------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _Met:
+    """A splat that the lanes meet."""
+
+    place: Any  # UInt32: in the lists
+    entry: Any  # UInt32: sorted
+    active: Any  # Bool: there is one
+    geometry: list[Any]
+    features: list[Any]
+    footprint: Footprint
+    alphas: list[Alpha]
+
+
+def _walk(
+    lists: PixelLists,
+    records: Records,
+    model: ImageModel,
+    lanes: Lanes,
+    order: PixelOrder,
+    carry: Callable[[_Met, int], list[Any]],
+    visit: Callable[[Any, list[list[Any]]], Any],
+    state: Any,
+    nothing: list[Any],
+) -> tuple[Any, Any]:
+    """Visit each pixel's splats in their order; returns the last state.
+
+    carry: the numbers that a splat brings along at a pixel; visit: from a state and, for each
+    pixel, alpha and what was carried, to the next state and whether any pixel is unfinished;
+    nothing: what is carried where there is no splat, with an alpha of 0.
+    """
+    t = types_of(type(records.rows))
+    begin, end = lists.range(lanes)
+
+    def body(place: Any, queue: list, state: Any, go_on: Any) -> tuple:
+        active = place < end
+        entry = dr.gather(t.UInt32, lists.entries, place, active)
+        geometry, features = records.load(entry, active)
+        keys = records.load_keys(entry, active)
+        footprint = model.footprint(geometry, lanes, active)
+        alphas = model.alphas(geometry, footprint)
+        met = _Met(place, entry, active, geometry, features, footprint, alphas)
+        # The place of a pixel where there is no splat: before all others, and so it is visited at
+        # once, and changes nothing. When all splats were met, behind them: it takes their places.
+        absent = dr.select(active, t.Float(-dr.inf), dr.inf)
+        next_queue, visited = [], []
+        for pixel, along in enumerate(order.depths.along(footprint, keys)):
+            alpha = dr.select(along > 0, alphas[pixel].value, 0)
+            depth = dr.select(alpha >= UNORDERED_ALPHA, keys[-1] * along, absent)
+            places, nearest = _insert(queue[pixel], [depth, alpha, *carry(met, pixel)])
+            next_queue.append(places)
+            visited.append(nearest[1:])
+        state, go_on = visit(state, visited)
+        return place + 1, next_queue, state, go_on
+
+    size = dr.width(lanes.tile)
+    empty = [dr.full(t.Float, -dr.inf, size), dr.zeros(t.Float, size), *nothing]
+    _, _, state, _ = dr.while_loop(
+        state=(
+            begin,
+            [[[type(x)(x) for x in empty] for _ in range(order.window)] for _ in range(PIXELS)],
+            state,
+            dr.full(t.Bool, True, size),
+        ),
+        # The last splats are still waiting when all were met.
+        cond=lambda place, queue, state, go_on: (place < end + order.window) & go_on,
+        body=body,
+    )
+    return state
+
+
+def _insert(places: list[list[Any]], item: list[Any]) -> tuple[list[list[Any]], list[Any]]:
+    """Insert into places sorted by their first number; returns all but the first, and that.
+
+    Of equals, the one that came first stays before.
+    """
+    places = list(places)
+    for k in reversed(range(len(places))):
+        before = item[0] < places[k][0]
+        pairs = list(zip(places[k], item, strict=True))
+        places[k] = [dr.select(before, old, new) for old, new in pairs]
+        item = [dr.select(before, new, old) for old, new in pairs]
+    return places, item
+
+
+def _unfinished(T: list[Any]) -> Any:
+    return largest(T) > 0
+
+
+# ----------------------------------------------------------------------------------------------
+# Forward
+# ----------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _OrderedLayers(Layers):
+    """What the adjoint and the tangent use again."""
+
+    lists: PixelLists
+
+
+def _composite(bins: TileBins, records: Records, order: PixelOrder) -> _OrderedLayers:
+    t = types_of(type(bins.rows))
+    lists = PixelLists.of(bins, records, order.depths)
+    lanes = _lanes(bins, lists)
+    model = bins.model.bind(lanes, bins.grid)
+    count = model.features.num_planes(bins.num_features)
+    stop = model.cutoffs.transmittance_stop
+
+    def visit(state: tuple, visited: list[list[Any]]) -> tuple:
+        T, C = list(state[0]), [list(plane) for plane in state[1]]
+        for pixel, (alpha, *features) in enumerate(visited):
+            weight, T[pixel], _ = composite_step(T[pixel], alpha, stop)
+            for k, c in enumerate(features):
+                C[k][pixel] = dr.fma(weight, c, C[k][pixel])
+        return (T, C), _unfinished(T)
+
+    size = dr.width(lanes.tile)
+    T, C = _walk(
+        lists,
+        records,
+        model,
+        lanes,
+        order,
+        carry=lambda met, pixel: model.features.at(met.features, pixel),
+        visit=visit,
+        state=(_transmittance(lanes, bins), _zeros(t.Float, size, count)),
+        nothing=[dr.zeros(t.Float, size)] * count,
+    )
+    dr.eval(T, C)
+    columns = [dr.abs(v) for v in T] + flat_columns(C)
+    last = dr.gather(t.UInt32, bins.tile_start, lanes.tile + 1)
+    return _OrderedLayers(
+        values=scatter_rows(columns, lanes.micro_tile, size),
+        ends=scatter_rows([last] * PIXELS, lanes.micro_tile, size),
+        stop=scatter_rows([last], lanes.micro_tile, size),
+        count=count,
+        grid=bins.grid,
+        lists=lists,
+    )
+
+
+def _lanes(bins: TileBins, lists: PixelLists) -> Lanes:
+    """Lanes with lists of similar length together."""
+    lanes = make_lanes(type(bins.rows), bins.grid)
+    begin, end = lists.range(lanes)
+    return grouped_by_work(lanes, end - begin)
+
+
+def _transmittance(lanes: Lanes, bins: TileBins) -> list[Any]:
+    """Of the 16 pixels before the first splat; those off the film are finished."""
+    Float = type(bins.rows)
+    return [dr.select(inside, Float(1), -1) for _, inside in pixels_of(lanes, bins.grid)]
+
+
+def _zeros(Float: type, size: int, planes: int) -> list[list[Any]]:
+    zero = dr.zeros(Float, size)
+    return [[Float(zero) for _ in range(PIXELS)] for _ in range(planes)]
+
+
+# ----------------------------------------------------------------------------------------------
+# Adjoint
+# ----------------------------------------------------------------------------------------------
+
+
+def _adjoint(
+    bins: TileBins,
+    records: Records,
+    layers: _OrderedLayers,
+    d_features: list[Any],
+    d_transmittance: Any,
+    order: PixelOrder,
+) -> SplatGradients:
+    t = types_of(type(bins.rows))
+    lists = layers.lists
+    lanes = _lanes(bins, lists)
+    model = bins.model.bind(lanes, bins.grid)
+    g = [load_pixels(plane, lanes, bins.grid) for plane in d_features]
+    walk = partial(_walk, lists, records, model, lanes, order)
+    size = dr.width(lanes.tile)
+    stop = model.cutoffs.transmittance_stop
+
+    def feature_gradient(met: _Met, pixel: int) -> Any:
+        return model.features.feature_gradient(met.features, pixel, [plane[pixel] for plane in g])
+
+    # First walk: what all splats of a pixel and its background are worth.
+    def add_up(state: tuple, visited: list[list[Any]]) -> tuple:
+        T, high, low = (list(column) for column in state)
+        for pixel, (alpha, seen) in enumerate(visited):
+            weight, T[pixel], _ = composite_step(T[pixel], alpha, stop)
+            high[pixel], low[pixel] = _add_product(high[pixel], low[pixel], weight, seen)
+        return (T, high, low), _unfinished(T)
+
+    _, *totals = walk(
+        carry=lambda met, pixel: [feature_gradient(met, pixel)],
+        visit=add_up,
+        state=(_transmittance(lanes, bins), *_zeros(t.Float, size, 2)),
+        nothing=[dr.zeros(t.Float, size)],
+    )
+    background = zip(
+        *totals,
+        load_lane_row(layers.values, lanes.micro_tile, 1 + layers.count),
+        load_pixels(d_transmittance, lanes, bins.grid),
+        strict=True,
+    )
+    totals = [_add_product(*numbers) for numbers in background]
+    dr.eval(totals)
+
+    # Second walk: each pair's weight and d loss / d ln(alpha), at the place of its splat.
+    pairs = [dr.zeros(t.Float, max(lists.count, 1) * PIXELS) for _ in range(2)]
+    dr.eval(pairs)
+    alpha_max = model.cutoffs.alpha_max
+
+    def store(state: tuple, visited: list[list[Any]]) -> tuple:
+        T, high, low = (list(column) for column in state)
+        for pixel, (alpha, seen, place) in enumerate(visited):
+            weight, T[pixel], goes_on = composite_step(T[pixel], alpha, stop)
+            high[pixel], low[pixel] = _add_product(high[pixel], low[pixel], weight, seen)
+            behind = (totals[pixel][0] - high[pixel]) + (totals[pixel][1] - low[pixel])
+            # Of what is behind, alpha / (1 - alpha) is lost: no division by T, which may underflow.
+            change = dr.fma(weight, seen, -behind * (alpha / (1 - alpha)))
+            d_log_alpha = dr.select(alpha < alpha_max, change, 0)
+            for plane, value in zip(pairs, (weight, d_log_alpha), strict=True):
+                dr.scatter(plane, value, place * PIXELS + pixel, goes_on & (alpha > 0))
+        return (T, high, low), _unfinished(T)
+
+    result = walk(
+        carry=lambda met, pixel: [feature_gradient(met, pixel), met.place],
+        visit=store,
+        state=(_transmittance(lanes, bins), *_zeros(t.Float, size, 2)),
+        nothing=[dr.zeros(t.Float, size), dr.zeros(t.UInt32, size)],
+    )
+    dr.eval(result, pairs)
+    partials = _sum_pixels(bins, records, lists, model, lanes, pairs, g)
+    return _sum_items(bins, lists, partials)
+
+
+def _sum_pixels(
+    bins: TileBins,
+    records: Records,
+    lists: PixelLists,
+    model: ImageModel,
+    lanes: Lanes,
+    pairs: list[Any],
+    g: list[list[Any]],
+) -> Any:
+    """Third walk: the sums over the 16 pixels of each item, rows by place.
+
+    pairs: weights and d loss / d ln(alpha), 16 for each place.
+    """
+    t = types_of(type(bins.rows))
+    width = model.response.num_moments + bins.num_features
+    partials = empty_rows(t.Float, width, max(lists.count, 1))
+    begin, end = lists.range(lanes)
+
+    def body(place: Any) -> tuple:
+        entry = dr.gather(t.UInt32, lists.entries, place)
+        geometry, features = records.load(entry, True)
+        footprint = model.footprint(geometry, lanes, True)
+        weights, d_log_alpha = (load_row(plane, PIXELS, place) for plane in pairs)
+        d_stored = [t.Float(0) for _ in features]
+        for pixel, weight in enumerate(weights):
+            g_pixel = [plane[pixel] for plane in g]
+            d_stored = model.features.add_derivatives(d_stored, features, pixel, weight, g_pixel)
+        moments = model.response.moments(footprint, d_log_alpha, model.positions)
+        store_row(partials, moments + d_stored, place)
+        return (place + 1,)
+
+    loop = dr.while_loop(state=(begin,), cond=lambda place: place < end, body=body)
+    dr.eval(loop, partials)
+    return partials
+
+
+def _sum_items(bins: TileBins, lists: PixelLists, partials: Any) -> SplatGradients:
+    """Add up the items of each splat."""
+    t = types_of(type(bins.rows))
+    width = bins.model.response.num_moments + bins.num_features
+    places = lists.places()
+    totals = sum_runs(
+        t.Float,
+        lists.first_item,
+        lambda item: load_row(partials, width, dr.gather(t.UInt32, places, item)),
+    )
+    return splat_gradients(bins, totals)
+
+
+def _add_product(high: Any, low: Any, a: Any, b: Any) -> tuple[Any, Any]:
+    """high + low + a b, to twice the precision.
+
+    The errors of a product and of a sum are numbers of the same precision (Dekker 1971; Knuth,
+    "The Art of Computer Programming", volume 2, section 4.2.2).
+    """
+    product = a * b
+    rest = dr.fma(a, b, -product)
+    total = high + product
+    part = total - high
+    lost = (high - (total - part)) + (product - part)
+    return total, low + (lost + rest)
+
+
+# ----------------------------------------------------------------------------------------------
+# Tangent
+# ----------------------------------------------------------------------------------------------
+
+
+def _tangent(
+    bins: TileBins,
+    records: Records,
+    layers: _OrderedLayers,
+    tangents: SplatGradients,
+    order: PixelOrder,
+) -> Layers:
+    t = types_of(type(bins.rows))
+    lanes = _lanes(bins, layers.lists)
+    model = bins.model.bind(lanes, bins.grid)
+    stop = model.cutoffs.transmittance_stop
+    d_records, count = pack_tangents(bins, tangents), layers.count
+    size = dr.width(lanes.tile)
+
+    def carry(met: _Met, pixel: int) -> list[Any]:
+        d_geometry, d_features = d_records.load(met.entry, met.active)
+        d_log_alpha = model.response.tangent(met.geometry, met.footprint, d_geometry)[pixel]
+        alpha = met.alphas[pixel]
+        return [
+            dr.select(alpha.smooth, alpha.value * d_log_alpha, 0),
+            *model.features.at(met.features, pixel),
+            *model.features.tangents(met.features, d_features, pixel),
+        ]
+
+    def visit(state: tuple, visited: list[list[Any]]) -> tuple:
+        T, dT = list(state[0]), list(state[1])
+        dC = [list(plane) for plane in state[2]]
+        for pixel, (alpha, d_alpha, *features) in enumerate(visited):
+            d_alpha = dr.select(alpha > 0, d_alpha, 0)  # behind the camera, there is a footprint
+            before, d_before = dr.abs(T[pixel]), dT[pixel]
+            weight, T[pixel], goes_on = composite_step(T[pixel], alpha, stop)
+            d_weight = dr.select(goes_on, dr.fma(before, d_alpha, alpha * d_before), 0)
+            dT[pixel] = d_before - d_weight
+            for k in range(count):
+                change = dr.fma(d_weight, features[k], weight * features[count + k])
+                dC[k][pixel] = dC[k][pixel] + change
+        return (T, dT, dC), _unfinished(T)
+
+    _, dT, dC = _walk(
+        layers.lists,
+        records,
+        model,
+        lanes,
+        order,
+        carry=carry,
+        visit=visit,
+        state=(
+            _transmittance(lanes, bins),
+            _zeros(t.Float, size, 1)[0],
+            _zeros(t.Float, size, count),
+        ),
+        nothing=[dr.zeros(t.Float, size)] * (1 + 2 * count),
+    )
+    columns = dT + flat_columns(dC)
+    dr.eval(columns)
+    return Layers(
+        values=scatter_rows(columns, lanes.micro_tile, size),
+        ends=layers.ends,
+        stop=layers.stop,
+        count=count,
+        grid=bins.grid,
+    )

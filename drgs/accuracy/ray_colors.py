@@ -1,0 +1,113 @@
+"""Colour in the direction of each pixel's ray: the choice ``sh_direction: pixel``.
+
+Imported when it is chosen. By default a splat has one colour, seen in the direction of its mean
+(3DGS). Here its spherical harmonics are stored, and evaluated in the direction of each pixel. The
+basis functions depend on the pixel alone and are computed once per lane.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import drjit as dr
+
+from drgs.cameras.camera import Camera
+from drgs.core.constants import COLOR_MIN
+from drgs.gaussians.sh import num_coefficients, sh_basis
+from drgs.splatting.image_model import SplatFeatures
+from drgs.splatting.projection import GaussianRows
+
+CHANNELS = 3
+
+
+def stored_coefficients(rows: GaussianRows, direction: Any, sh_degree: int) -> list[Any]:
+    """What is stored of a splat's colour: its coefficients, three colours each."""
+    del direction
+    return [value for c in rows.sh[: num_coefficients(sh_degree)] for value in c]
+
+
+@dataclass(frozen=True)
+class RayColors(SplatFeatures):
+    """Of what is stored, the first are SH coefficients; the others are composited as they are.
+
+    Not differentiated: the direction, in the camera.
+    """
+
+    sh_degree: int
+    camera: Camera | None = None
+    basis: tuple[list[Any], ...] = ()  # by pixel, for the lanes of one kernel
+
+    @property
+    def num_coefficients(self) -> int:
+        """Stored numbers that are coefficients."""
+        return CHANNELS * num_coefficients(self.sh_degree)
+
+    def num_planes(self, num_stored: int) -> int:
+        """Planes that come of ``num_stored`` numbers per splat."""
+        return num_stored - self.num_coefficients + CHANNELS
+
+    def seen_by(self, camera: Camera) -> RayColors:
+        """For one camera, whose pixels' rays are the directions."""
+        return replace(self, camera=camera)
+
+    def check_differentiable_in_camera(self) -> None:
+        """They are not: the direction is the camera's. Degree 0 has none."""
+        if self.sh_degree == 0:
+            return
+        raise NotImplementedError(
+            "splats: sh_direction 'pixel' is not differentiable in the camera; use 'mean'"
+        )
+
+    def bind(self, lanes: Any, positions: Any) -> RayColors:
+        """The basis functions at the 16 pixels of each lane."""
+        points = positions.points(lanes, type(self.camera.near))
+        basis = tuple(sh_basis(self._direction(x, y), self.sh_degree) for x, y in points)
+        return replace(self, basis=basis)
+
+    def _direction(self, x: Any, y: Any) -> Any:
+        camera = self.camera.at_row(y)
+        return dr.normalize(camera.rotation.T @ camera.lens.ray(camera, x, y))
+
+    def at(self, stored: list[Any], pixel: int) -> list[Any]:
+        """max(0, sum_k basis_k coefficient_k + 0.5), then what else is stored."""
+        colors = [
+            dr.select(value < COLOR_MIN, COLOR_MIN, value) for value in self._sums(stored, pixel)
+        ]
+        return colors + stored[self.num_coefficients :]
+
+    def _sums(self, stored: list[Any], pixel: int) -> list[Any]:
+        sums = [type(stored[0])(0.5)] * CHANNELS
+        for k, basis in enumerate(self.basis[pixel]):
+            coefficients = stored[CHANNELS * k : CHANNELS * (k + 1)]
+            sums = [dr.fma(c, basis, total) for c, total in zip(coefficients, sums, strict=True)]
+        return sums
+
+    def add_derivatives(
+        self, totals: list[Any], stored: list[Any], pixel: int, weight: Any, g: list[Any]
+    ) -> list[Any]:
+        """See :class:`SplatFeatures`. Where a colour is clamped, its derivative is zero."""
+        d_colors = [
+            dr.select(value < COLOR_MIN, 0, weight * derivative)
+            for value, derivative in zip(self._sums(stored, pixel), g[:CHANNELS], strict=True)
+        ]
+        coefficients, others = totals[: self.num_coefficients], totals[self.num_coefficients :]
+        d_basis = [(basis, d) for basis in self.basis[pixel] for d in d_colors]
+        return [
+            dr.fma(d, basis, total) for total, (basis, d) in zip(coefficients, d_basis, strict=True)
+        ] + [
+            dr.fma(weight, derivative, total)
+            for total, derivative in zip(others, g[CHANNELS:], strict=True)
+        ]
+
+    def tangents(self, stored: list[Any], d_stored: list[Any], pixel: int) -> list[Any]:
+        """Tangents of the features at a pixel."""
+        d_colors = [type(d_stored[0])(0)] * CHANNELS
+        for k, basis in enumerate(self.basis[pixel]):
+            d = d_stored[CHANNELS * k : CHANNELS * (k + 1)]
+            d_colors = [dr.fma(c, basis, total) for c, total in zip(d, d_colors, strict=True)]
+        d_colors = [
+            dr.select(value < COLOR_MIN, 0, d)
+            for value, d in zip(self._sums(stored, pixel), d_colors, strict=True)
+        ]
+        return d_colors + d_stored[self.num_coefficients :]

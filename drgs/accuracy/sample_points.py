@@ -1,0 +1,77 @@
+"""Pixels evaluated at points of their own: several samples per pixel.
+
+Imported when a scene asks for more than one sample per pixel or for a reconstruction filter. Each
+pass evaluates every pixel once, at a point that the sampler has chosen; splats are put into tiles
+with half a pixel to spare, so that all passes share the tiles.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+from drgs.core.arrays import types_of
+from drgs.splatting.image_model import MICRO, total
+from drgs.splatting.lanes import Lanes, load_pixels
+from drgs.splatting.tiles import TileGrid
+
+
+@dataclass(frozen=True)
+class SamplePoints:
+    """One point in each pixel.
+
+    Equality is identity of the arrays: those of another pass are another model.
+    """
+
+    margin: ClassVar[float] = 0.5
+    """px: how far from its centre a pixel may be evaluated."""
+
+    x: Any = None  # Float (H * W,) in [0, 1): from the pixel's left border, px
+    y: Any = None  # Float (H * W,), from its upper border
+    bound: tuple[list[Any], list[Any]] | None = None  # the 16 of each lane
+
+    def bind(self, lanes: Lanes, grid: TileGrid) -> SamplePoints:
+        """For the lanes of one kernel."""
+        bound = tuple(load_pixels(plane, lanes, grid) for plane in (self.x, self.y))
+        return SamplePoints(bound=bound)
+
+    def points(self, lanes: Lanes, Float: type) -> list[tuple[Any, Any]]:
+        """x and y (px) of the 16 pixels."""
+        x, y = Float(lanes.x), Float(lanes.y)
+        return [
+            (x + (pixel % MICRO) + px, y + (pixel // MICRO) + py)
+            for pixel, (px, py) in enumerate(zip(*self.bound, strict=True))
+        ]
+
+    def offsets(self, lanes: Lanes, x: Any, y: Any) -> tuple[list, list]:
+        """Grids of x and y, from a point of the film to the points, px."""
+        Float = types_of(type(x)).Float
+        first_x, first_y = Float(lanes.x) - x, Float(lanes.y) - y
+        dx = [first_x + (pixel % MICRO) + in_x for pixel, in_x in enumerate(self.bound[0])]
+        dy = [first_y + (pixel // MICRO) + in_y for pixel, in_y in enumerate(self.bound[1])]
+        return _grid(dx), _grid(dy)
+
+    def sum(self, values: list[Any]) -> Any:
+        """Of 16 values."""
+        return total(values)
+
+    def sum_dx(self, values: list[Any], dx: list) -> Any:
+        """Of values times dx."""
+        return total(_products(values, dx))
+
+    def sum_dy(self, values: list[Any], dy: list) -> Any:
+        """Of values times dy."""
+        return total(_products(values, dy))
+
+    def sum_dy_dy(self, values: list[Any], dy: list) -> Any:
+        """Of values times dy^2."""
+        return total(_products(_products(values, dy), dy))
+
+
+def _grid(values: list[Any]) -> list[list[Any]]:
+    return [values[MICRO * j : MICRO * j + MICRO] for j in range(MICRO)]
+
+
+def _products(values: list[Any], grid: list[list[Any]]) -> list[Any]:
+    flat = [value for row in grid for value in row]
+    return [a * b for a, b in zip(values, flat, strict=True)]

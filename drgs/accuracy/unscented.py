@@ -1,0 +1,146 @@
+"""Splats from sigma points: the projection ``unscented``.
+
+Imported when it is chosen. The scaled unscented transform (Julier and Uhlmann 1997; Wan and van der
+Merwe 2000; for splatting: Wu et al. 2025, "3DGUT") with alpha = 1, beta = 2, kappa = 0: the mean
+and the points sqrt(3) standard deviations away from it along the three axes are projected exactly,
+and their weighted mean and covariance are those of the splat. All weights of the covariance are
+positive, so that it is a sum of outer products, without cancellation.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from functools import singledispatch
+from typing import Any
+
+import drjit as dr
+
+from drgs.cameras.camera import Camera, Pinhole
+from drgs.core.arrays import types_of
+from drgs.splatting.projection import FilmShape, GaussianRows, ewa, film_axes, whiten, world_axes
+
+SPREAD = math.sqrt(3)
+"""Standard deviations from the mean to a sigma point: sqrt(n + lambda), lambda = 0."""
+
+CENTER_WEIGHT = 2.0
+"""Of the mean in the covariance, lambda / (n + lambda) + 1 - alpha^2 + beta; its weight in the mean
+of the points is 0."""
+
+WEIGHT = 1 / 6
+"""Of each other point, in both."""
+
+NEAREST = 1 / 3
+"""Of the mean's depth: where a point would be nearer, a Gaussian has neither mean nor covariance on
+the film, or ones that have nothing to do with its middle. The same holds far outside the film,
+where slopes are clamped. Such splats are projected by the affine approximation."""
+
+
+def unscented(rows: GaussianRows, camera: Camera, position: Any, low_pass: float) -> FilmShape:
+    """The unscented transform of a Gaussian through the camera.
+
+    position: Array3f, camera axes, the mean. Not differentiated: where :data:`NEAREST` decides.
+    """
+    points = _sigma_points(camera.lens, rows, camera, position)
+    # The mean itself has the offset 0.
+    columns = [
+        [-math.sqrt(CENTER_WEIGHT) * mu, *(math.sqrt(WEIGHT) * (o - mu) for o in axis)]
+        for axis, mu in zip(points.offsets, points.mean, strict=True)
+    ]
+    shift = types_of(type(position.z)).Array2f(points.mean)
+    means2d = camera.lens.film_point(camera, position) + shift
+    affine = ewa(rows, camera, position, low_pass)
+    return dr.select(points.usable, whiten(means2d, *columns, low_pass), affine)
+
+
+def unscented_with_depth(
+    rows: GaussianRows, camera: Camera, position: Any, low_pass: float
+) -> FilmShape:
+    """As :func:`unscented`, and what is needed for the depth at a pixel.
+
+    The Gaussian's covariance with the depth is the affine one, and h is not negative.
+    """
+    film = unscented(rows, camera, position, low_pass)
+    # Where they are clamped, the splat is the affine one.
+    slopes = camera.lens.clamped_slopes(camera, position)
+    m0, m1, n = film_axes(rows, camera, position, slopes)
+    p, r, s = film.whitening
+    kx, ky = dr.dot(m0, n), dr.dot(m1, n)
+    kx, ky = dr.fma(p, kx, r * ky), s * ky
+    h = dr.squared_norm(n) - dr.fma(kx, kx, ky * ky)
+    return replace(film, perspective=[kx, ky, dr.select(h > 0, h, 0)])
+
+
+@dataclass(frozen=True)
+class _SigmaPoints:
+    """The six points besides the mean, on the film."""
+
+    offsets: list[list[Any]]  # by side of the film: six places, px, from the mean's
+    mean: list[Any]  # by side: the mean of the offsets
+    usable: Any  # Bool
+
+
+@singledispatch
+def _sigma_points(lens: Any, rows: GaussianRows, camera: Camera, position: Any) -> _SigmaPoints:
+    """Through any lens: as it projects points."""
+    center, slopes = lens.film_point(camera, position), lens.true_slopes(camera, position)
+    not_nearer = replace(camera, near=NEAREST * lens.look(camera, position)[2])
+    usable = _same(slopes, lens.clamped_slopes(camera, position))
+    offsets = [[], []]
+    for axis in world_axes(rows):
+        for c in (SPREAD, -SPREAD):
+            seen, point, _ = lens.look(not_nearer, position + c * (camera.rotation @ axis))
+            usable &= seen
+            for side, offset in zip(offsets, lens.film_point(camera, point) - center, strict=True):
+                side.append(offset)
+    return _SigmaPoints(offsets, [WEIGHT * sum(o[1:], o[0]) for o in offsets], usable)
+
+
+@_sigma_points.register
+def _(lens: Pinhole, rows: GaussianRows, camera: Camera, position: Any) -> _SigmaPoints:
+    """Through a pinhole: by formulas that do not cancel."""
+    slopes = lens.true_slopes(camera, position)
+    m0, m1, n = film_axes(rows, camera, position, slopes)
+    return _SigmaPoints(
+        offsets=[_sigma_offsets(m, n) for m in (m0, m1)],
+        mean=[_mean_offset(m, n) for m in (m0, m1)],
+        usable=_same(slopes, lens.clamped_slopes(camera, position)) & _far_enough(n),
+    )
+
+
+def _same(slopes: list[Any] | None, clamped: list[Any] | None) -> Any:
+    """Whether slopes are not clamped; a lens that has none does not clamp."""
+    if slopes is None:
+        return True
+    return (slopes[0] == clamped[0]) & (slopes[1] == clamped[1])
+
+
+def _far_enough(n: Any) -> Any:
+    """Whether no point is too near; n: half axes in depth, relative to the mean's."""
+    return dr.max(dr.abs(n)) <= (1 - NEAREST) / SPREAD
+
+
+def _sigma_offsets(m: Any, n: Any) -> list[Any]:
+    """Places of the six points besides the mean, px, along one side of the film, from the mean's.
+
+    m, n: half axes on the film and in depth. With c = +-sqrt(3), a point's depth is z (1 + c n) and
+    its place c m / (1 + c n): a difference that does not cancel.
+    """
+    return [
+        c * m_k / _depth(c * n_k) for c in (SPREAD, -SPREAD) for m_k, n_k in zip(m, n, strict=True)
+    ]
+
+
+def _mean_offset(m: Any, n: Any) -> Any:
+    """The weighted mean of these places: two of opposite c add up to -2 c^2 m n / (1 - c^2 n^2)."""
+    terms = [
+        m_k * n_k / (_depth(SPREAD * n_k) * _depth(-SPREAD * n_k))
+        for m_k, n_k in zip(m, n, strict=True)
+    ]
+    return -2 * SPREAD**2 * WEIGHT * sum(terms[1:], terms[0])
+
+
+def _depth(change: Any) -> Any:
+    """Of a point, relative to the mean's. One that is too near is not used, but stays finite."""
+    nearest, depth = NEAREST / 2, 1 + change
+    return dr.select(depth > nearest, depth, nearest)

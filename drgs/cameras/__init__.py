@@ -1,0 +1,4 @@
+"""Cameras in OpenCV axes; one lens a file, and how a camera moves.
+
+May import ``core``.
+"""

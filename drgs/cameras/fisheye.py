@@ -1,0 +1,179 @@
+"""OpenCV's fisheye lens."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar
+
+import drjit as dr
+import numpy as np
+
+from drgs.cameras.camera import Camera, Lens, moved_on_axis, uploaded
+from drgs.cameras.polynomials import (
+    _derivative,
+    _first_root,
+    _horner,
+    _polynomial,
+    _radius_of,
+    _up_to_the_last,
+)
+from drgs.core.arrays import is_float64, types_of
+
+MAX_ANGLE = 0.95 * math.pi
+"""From the axis of a fisheye: what is behind it has no place on the film."""
+
+
+NEAR_AXIS = 0.1
+"""tan^2 of the angle below which series are used: theta / rho is 0 / 0 on the axis, and what its
+derivative needs is a difference that cancels near it."""
+
+
+AXIS_TERMS = {False: 8, True: 16}
+"""Terms of these series in single and in double precision: 0.1^n is below their roundings."""
+
+
+@dataclass(frozen=True)
+class Fisheye(Lens):
+    """A point at the angle theta from the axis is seen at a distance from the principal point of
+
+        theta_d = theta (1 + k1 theta^2 + k2 theta^4 + k3 theta^6 + k4 theta^8)
+
+    in its direction (Kannala and Brandt 2006, as in OpenCV's ``fisheye`` module). What it shows may
+    be beside and behind the camera, so that *depth* is the distance from the centre. Means whose
+    angle has a cosine below ``min_cosine`` are not seen.
+    """
+
+    distorts: ClassVar[bool] = True
+    kind: ClassVar[str] = "fisheye"
+    names: ClassVar[tuple[str, ...]] = ("k1", "k2", "k3", "k4")
+
+    coefficients: tuple[Any, ...]
+    min_cosine: Any
+
+    @staticmethod
+    def of(**coefficients: float) -> Fisheye:
+        """From OpenCV's names, ``k1`` to ``k4``; what is not given is zero."""
+        assert set(coefficients) <= set(Fisheye.names)
+        kept = _up_to_the_last(Fisheye.names, coefficients)
+        growth = [1.0, *((2 * n + 3) * k for n, k in enumerate(kept))]
+        turn = math.sqrt(_first_root(np.array(growth)))
+        return Fisheye(kept, math.cos(min(turn, MAX_ANGLE)))
+
+    def upload(self, float_type: type) -> Fisheye:
+        """For kernels of this precision."""
+        return uploaded(self, float_type)
+
+    def named(self) -> dict[str, Any]:
+        """The coefficients that are not left out, by OpenCV's names."""
+        return dict(zip(self.names, self.coefficients, strict=False))
+
+    def with_named(self, values: dict[str, Any]) -> Fisheye:
+        """Other numbers for the same coefficients; where the model ends stays as it is."""
+        names = self.names[: len(self.coefficients)]
+        return replace(self, coefficients=tuple(values[name] for name in names))
+
+    # What kernels call: see ``drgs.cameras.camera``.
+
+    def look(self, camera: Camera, position: Any) -> tuple[Any, Any, Any]:
+        """Whether a mean is seen, its position, and its distance."""
+        distance = dr.norm(position)
+        seen = (distance >= camera.near) & (position.z > self.min_cosine * distance)
+        _, position, _ = moved_on_axis(position, seen)
+        return seen, position, dr.norm(position)
+
+    def true_slopes(self, camera: Camera, position: Any) -> None:
+        """None: the projection is linearised at the mean, wherever it is."""
+        del camera, position
+
+    clamped_slopes = true_slopes
+
+    def film_point(self, camera: Camera, position: Any) -> Any:
+        """Where a point is on the film, Array2f, px."""
+        x, y, _ = position
+        per_radius, _ = self._angle_per_radius(position)
+        scale = per_radius * _polynomial(
+            self.coefficients, self._squared_angle(position, per_radius)
+        )
+        return camera.focal * types_of(type(x)).Array2f(scale * x, scale * y) + camera.principal
+
+    def film_directions(self, camera: Camera, position: Any, slopes: None) -> list[Any]:
+        """Derivatives of the place on the film, two Array3f, world.
+
+        With rho^2 = x^2 + y^2, n^2 = rho^2 + z^2, a = theta / rho, b = (d a / d rho) / rho, and
+        theta_d = h theta: the place is A (x, y) with A = h a, (d A / d rho) / rho = B = h b +
+        2 h' a^2 z / n^2, where h' = d h / d theta^2, and d A / d z = -(h + 2 h' theta^2) / n^2.
+        """
+        del slopes
+        x, y, z = position
+        a, b = self._angle_per_radius(position)
+        squared = self._squared_angle(position, a)
+        h, dh = _polynomial(self.coefficients, squared), _derivative(self.coefficients, squared)
+        inverse = dr.rcp(dr.squared_norm(position))
+        scale, bend = h * a, h * b + 2 * dh * (a * a) * (z * inverse)
+        tilt = (h + 2 * dh * squared) * inverse
+        right, down, forward = camera.rotation
+        change = bend * (x * right + y * down) - tilt * forward
+        return [
+            focal * (scale * axis + c * change)
+            for axis, c, focal in zip((right, down), (x, y), camera.focal, strict=True)
+        ]
+
+    def depth_direction(self, camera: Camera, position: Any) -> Any:
+        """Derivative of the distance divided by the distance, Array3f, world."""
+        right, down, forward = camera.rotation
+        x, y, z = position / dr.squared_norm(position)
+        return x * right + y * down + z * forward
+
+    def ray_range(self, direction: Any, near: Any, far: Any) -> tuple[Any, Any]:
+        """Where a ray of unit ``direction`` reaches two depths."""
+        del direction
+        return near, far
+
+    def ray(self, camera: Camera, x: Any, y: Any) -> Any:
+        """Through a point of the film (px), Array3f, camera axes."""
+        t = types_of(type(x))
+        film = (t.Array2f(x, y) - camera.principal) / camera.focal
+        squared = dr.squared_norm(film)
+        off_axis = squared > 0
+        radius = dr.sqrt(dr.select(off_axis, squared, 1))
+        with dr.suspend_grad():
+            end = dr.acos(self.min_cosine)
+            angle = _radius_of(self._distorted_angle, radius, end)
+        # The last step of Newton's method is differentiated, as in ``RadialTangential``.
+        value, slope = self._distorted_angle(angle)
+        following = angle + (radius - value) / dr.detach(slope)
+        sine, cosine = dr.sincos(dr.select(following < end, following, angle))
+        scale = dr.select(off_axis, sine / radius, 1)
+        return t.Array3f(scale * film.x, scale * film.y, dr.select(off_axis, cosine, 1))
+
+    def _distorted_angle(self, angle: Any) -> tuple[Any, Any]:
+        """theta_d of an angle, and its derivative."""
+        squared = angle * angle
+        h, dh = _polynomial(self.coefficients, squared), _derivative(self.coefficients, squared)
+        return h * angle, h + 2 * dh * squared
+
+    @staticmethod
+    def _angle_per_radius(position: Any) -> tuple[Any, Any]:
+        """a = theta / rho, and b = (z / n^2 - a) / rho^2; near the axis by their series.
+
+        With t = rho / z: z a = 1 - t^2 / 3 + t^4 / 5 ..., z^3 b = -2/3 + 4/5 t^2 - 6/7 t^4 ...
+        """
+        x, y, z = position
+        squared = x * x + y * y
+        on_axis = (z > 0) & (squared < NEAR_AXIS * (z * z))
+        depth = dr.select(on_axis, z, 1)
+        t = dr.select(on_axis, squared, 0) / (depth * depth)
+        terms = range(AXIS_TERMS[is_float64(type(z))])
+        series_a = _polynomial([(-1) ** (k + 1) / (2 * k + 3) for k in terms], t) / depth
+        series_b = [(-1) ** (k + 1) * (2 * k + 2) / (2 * k + 3) for k in terms]
+        series_b = _horner(series_b, t) / (depth * depth * depth)
+        squared = dr.select(on_axis, 1, squared)
+        radius = dr.sqrt(squared)
+        a = dr.atan2(radius, z) / radius
+        b = (z / (squared + z * z) - a) / squared
+        return dr.select(on_axis, series_a, a), dr.select(on_axis, series_b, b)
+
+    @staticmethod
+    def _squared_angle(position: Any, per_radius: Any) -> Any:
+        return (per_radius * per_radius) * (dr.square(position.x) + dr.square(position.y))

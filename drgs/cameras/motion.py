@@ -1,0 +1,137 @@
+"""A camera that moves while its shutter is open: motion blur and rolling shutter.
+
+Imported when a camera has a second pose. Time runs from 0, where the camera is as it says, to 1,
+where it is at the second pose: its centre on a line, turning at a constant rate.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import drjit as dr
+
+from drgs.cameras.camera import Camera
+from drgs.core.arrays import types_of
+
+NEWTON_STEPS = 3
+"""Until a splat's time is known: pixels move by a small part of the film while it is read."""
+
+SLOWEST = 1e-4
+"""Radians: turns below this are composed by their series, the formulas being 0 / 0 at 0."""
+
+
+@dataclass(frozen=True)
+class Motion:
+    """From the first pose to the second."""
+
+    travel: Any  # Array3f, world: of the centre
+    turn: Any  # Array3f, camera axes: axis times angle (radians), below half a turn
+
+    @staticmethod
+    def between(camera: Camera, rotation: Any, center: Any) -> Any:
+        """From the pose of ``camera`` to another (3 x 3 world to camera; Array3f)."""
+        return center - camera.center, rotation_vector(rotation @ camera.rotation.T)
+
+    def pose(self, camera: Camera, time: Any) -> Camera:
+        """``camera``, which is at time 0, at another time."""
+        turn = rotation_matrix(self.turn * time)
+        return replace(
+            camera,
+            rotation=turn @ camera.rotation,
+            center=camera.center + self.travel * time,
+            shutter=None,
+        )
+
+    def velocity(self, camera: Camera, offset: Any) -> Any:
+        """Of a point relative to the camera, world axes, per unit of time.
+
+        camera: at the time in question; offset: from its centre to the point, world.
+        """
+        turn = camera.rotation.T @ dr.cross(self.turn, camera.rotation @ offset)
+        return turn - self.travel
+
+
+@dataclass(frozen=True)
+class MotionBlur(Motion):
+    """All pixels are open all the time: pictures at ``samples`` times are averaged."""
+
+    samples: int
+
+    def times(self) -> list[float]:
+        """In the middle of equal intervals."""
+        return [(k + 0.5) / self.samples for k in range(self.samples)]
+
+
+@dataclass(frozen=True)
+class RollingShutter(Motion):
+    """The film's rows are read from the first, at time 0, to the last, at time 1."""
+
+    def camera_of(self, means: Any, camera: Camera) -> Camera:
+        """The camera as it is when the row of the film that shows a mean is read.
+
+        means: Array3f, world.
+
+        The time is where the row that the mean is seen at says the same: found by Newton's method,
+        of which the last step is differentiated (the implicit function theorem). A splat is
+        projected as a whole at the time of its mean.
+        """
+        still = dr.detach((means, camera))
+        time = dr.full(type(means.x), 0.5, dr.width(means))
+        for _ in range(NEWTON_STEPS):
+            time, _ = self._step(*still, time)
+            time = dr.select(time < 0, 0, dr.select(time > 1, 1, time))
+        moved, inside = self._step(means, camera, dr.detach(time))
+        return self.pose(camera, dr.select(inside, moved, time))
+
+    def _step(self, means: Any, camera: Camera, time: Any) -> tuple[Any, Any]:
+        """One step of Newton's method, and whether the time is on the film."""
+        at = self.pose(camera, time)
+        offset = means - at.center
+        seen, position, _ = at.lens.look(at, at.rotation @ offset)
+        height = camera.film_end.y - camera.film_start.y
+        row = (at.lens.film_point(at, position).y - camera.film_start.y) / height
+        with dr.suspend_grad():
+            slopes = at.lens.true_slopes(at, position)
+            _, down = at.lens.film_directions(at, position, slopes)
+            rate = dr.dot(down, self.velocity(at, offset)) / height
+            # Where rows run away from the reader as fast as it reads, no time is the right one.
+            rate = dr.select(seen & (rate < 0.5), rate, 0)
+        moved = time + (row - time) / (1 - rate)
+        return moved, seen & (moved > 0) & (moved < 1)
+
+
+def rotation_vector(rotation: Any) -> Any:
+    """Axis times angle, radians, of a rotation by less than half a turn."""
+    t = types_of(type(rotation[0, 0]))
+    twice_sine = t.Array3f(
+        rotation[2, 1] - rotation[1, 2],
+        rotation[0, 2] - rotation[2, 0],
+        rotation[1, 0] - rotation[0, 1],
+    )
+    squared = dr.squared_norm(twice_sine)
+    trace = rotation[0, 0] + rotation[1, 1] + rotation[2, 2]
+    turns = (squared > (2 * SLOWEST) ** 2) | (trace < 1)
+    sine = dr.sqrt(dr.select(turns, squared, 1)) / 2
+    angle = dr.atan2(sine, (trace - 1) / 2)
+    return twice_sine * dr.select(turns, angle / (2 * sine), 0.5)
+
+
+def rotation_matrix(turn: Any) -> Any:
+    """3 x 3 of axis times angle, radians (Rodrigues)."""
+    t = types_of(type(turn.x))
+    squared = dr.squared_norm(turn)
+    turns = squared > SLOWEST**2
+    angle = dr.sqrt(dr.select(turns, squared, 1))
+    a = dr.select(turns, dr.sin(angle) / angle, 1 - squared / 6)
+    # (1 - cos) / angle^2, which cancels for small angles.
+    half = dr.sin(angle / 2) / angle
+    b = dr.select(turns, 2 * half * half, 0.5)
+    x, y, z = turn
+    return t.Matrix3f(
+        [
+            [1 - b * (y * y + z * z), b * (x * y) - a * z, b * (x * z) + a * y],
+            [b * (x * y) + a * z, 1 - b * (x * x + z * z), b * (y * z) - a * x],
+            [b * (x * z) - a * y, b * (y * z) + a * x, 1 - b * (x * x + y * y)],
+        ]
+    )

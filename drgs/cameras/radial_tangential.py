@@ -1,0 +1,300 @@
+"""Lenses other than a pinhole: with distortion, fisheye, orthographic, with an aperture.
+
+Imported when a sensor or a dataset has such a lens. Each has the methods of
+:class:`drgs.cameras.camera.Pinhole`. Coefficients are numbers of the host, or Dr.Jit scalars after
+:meth:`upload`; one that is not given is left out (of a polynomial, those behind the last one that
+is; or both tangential ones), so that nothing is computed for it.
+
+Outside the part of the film's plane that a lens model is made for, its polynomials turn around and
+would fold what lies far outside back into the picture: what is seen under a larger angle than that
+at which the model first turns, in whatever direction, is not seen at all.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar
+
+import drjit as dr
+import numpy as np
+
+from drgs.cameras.camera import Camera, Perspective, moved_on_axis, uploaded
+from drgs.cameras.polynomials import (
+    UNBOUNDED,
+    _derivative,
+    _first_root,
+    _polynomial,
+    _radius_of,
+    _up_to_the_last,
+)
+from drgs.core.arrays import types_of
+
+TANGENTIAL_STEPS = 5
+"""Of Newton's method, for tangential terms: small beside the radial ones, it starts nearby."""
+
+BORDER = 65
+"""Points on each side of the film, whose rays tell what the film sees."""
+
+MISSED = 1e-6
+"""Squared, of slopes: how far Newton's method may end from the point that it looked for."""
+
+
+# ----------------------------------------------------------------------------------------------
+# Polynomials
+# ----------------------------------------------------------------------------------------------
+
+
+# ----------------------------------------------------------------------------------------------
+# Distortion
+# ----------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class RadialTangential(Perspective):
+    """OpenCV's lens: slopes (x, y) are distorted before they come to the film.
+
+    With r^2 = x^2 + y^2 and R = (1 + k1 r^2 + k2 r^4 + k3 r^6) / (1 + k4 r^2 + k5 r^4 + k6 r^6),
+
+        x' = R x + 2 p1 x y + p2 (r^2 + 2 x^2),  y' = R y + p1 (r^2 + 2 y^2) + 2 p2 x y
+
+    (Brown 1966; OpenCV's documentation, "Camera Calibration and 3D Reconstruction"). Means whose r
+    is beyond ``max_squared_radius`` are not seen.
+    """
+
+    distorts: ClassVar[bool] = True
+    kind: ClassVar[str] = "opencv"
+    names: ClassVar[tuple[str, ...]] = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
+
+    numerator: tuple[Any, ...]  # k1, k2, k3
+    denominator: tuple[Any, ...]  # k4, k5, k6
+    tangential: tuple[Any, ...]  # p1, p2; or none
+    max_squared_radius: Any  # of the slopes
+    on_film: Any = None  # (2) Array2f: the least and the largest slopes on the film
+
+    @staticmethod
+    def of(**coefficients: float) -> RadialTangential:
+        """From OpenCV's names, ``k1`` to ``k6``, ``p1``, ``p2``; what is not given is zero."""
+        names = RadialTangential.names
+        assert set(coefficients) <= set(names)
+        p1, p2 = (float(coefficients.get(name, 0.0)) for name in names[6:])
+        numerator = _up_to_the_last(names[:3], coefficients)
+        denominator = _up_to_the_last(names[3:6], coefficients)
+        return RadialTangential(
+            numerator=numerator,
+            denominator=denominator,
+            tangential=(p1, p2) if set(coefficients) & set(names[6:]) else (),
+            max_squared_radius=_largest_squared_radius(numerator, denominator, math.hypot(p1, p2)),
+        )
+
+    def upload(self, float_type: type) -> RadialTangential:
+        """For kernels of this precision."""
+        return uploaded(self, float_type)
+
+    def named(self) -> dict[str, Any]:
+        """The coefficients that are not left out, by OpenCV's names."""
+        names = (*self.names[: len(self.numerator)], *self.names[3 : 3 + len(self.denominator)])
+        names += self.names[6:] if self.tangential else ()
+        values = (*self.numerator, *self.denominator, *self.tangential)
+        return dict(zip(names, values, strict=True))
+
+    def with_named(self, values: dict[str, Any]) -> RadialTangential:
+        """Other numbers for the same coefficients; where the model ends stays as it is."""
+        k, p = self.names[:6], self.names[6:]
+        return replace(
+            self,
+            numerator=tuple(values[name] for name in k[: len(self.numerator)]),
+            denominator=tuple(values[name] for name in k[3 : 3 + len(self.denominator)]),
+            tangential=tuple(values[name] for name in p[: len(self.tangential)]),
+        )
+
+    def distort(self, x: Any, y: Any) -> tuple[Any, Any]:
+        """Slopes as the film shows them."""
+        squared = x * x + y * y
+        radial = self._radial(squared)
+        if not self.tangential:
+            return radial * x, radial * y
+        p1, p2 = self.tangential
+        return (
+            radial * x + 2 * p1 * (x * y) + p2 * (squared + 2 * x * x),
+            radial * y + p1 * (squared + 2 * y * y) + 2 * p2 * (x * y),
+        )
+
+    def distortion_jacobian(self, x: Any, y: Any) -> tuple[Any, Any, Any]:
+        """d x' / d x, d x' / d y = d y' / d x, d y' / d y."""
+        squared = x * x + y * y
+        radial, slope = self._radial(squared), 2 * self._radial_derivative(squared)
+        xx, xy, yy = radial + slope * x * x, slope * (x * y), radial + slope * y * y
+        if not self.tangential:
+            return xx, xy, yy
+        p1, p2 = self.tangential
+        return (
+            xx + 2 * p1 * y + 6 * p2 * x,
+            xy + 2 * p1 * x + 2 * p2 * y,
+            yy + 6 * p1 * y + 2 * p2 * x,
+        )
+
+    def undistort(self, x: Any, y: Any) -> tuple[Any, Any]:
+        """The slopes that :meth:`distort` sends to (x, y).
+
+        Where there are none, the result is finite and means nothing: :meth:`sees_slopes` and a
+        second look tell. The search is not differentiated, but its last step: a step of Newton's
+        method from the solution has the solution's derivative (the implicit function theorem).
+        """
+        with dr.suspend_grad():
+            length = dr.sqrt(x * x + y * y)
+            radius = _radius_of(self._radius, length, dr.sqrt(self.max_squared_radius))
+            # In the middle, radius and length are the same.
+            scale = dr.select(length > 0, radius / dr.select(length > 0, length, 1), 1)
+            u, v = scale * x, scale * y
+            if self.tangential:
+                _, u, v = dr.while_loop(
+                    state=(types_of(type(x)).UInt32(0), u, v),
+                    cond=lambda count, u, v: count < TANGENTIAL_STEPS,
+                    body=lambda count, u, v: (count + 1, *self._step(u, v, x, y)),
+                    labels=("count", "u", "v"),
+                )
+        return self._step(u, v, x, y)
+
+    def _radius(self, radius: Any) -> tuple[Any, Any]:
+        """Distance from the middle at which a radius is seen, but for the tangential terms."""
+        squared = radius * radius
+        radial = self._radial(squared)
+        return radial * radius, radial + 2 * squared * self._radial_derivative(squared)
+
+    def _step(self, u: Any, v: Any, x: Any, y: Any) -> tuple[Any, Any]:
+        """One step of Newton's method towards (x, y), unless it would leave the lens model."""
+        at_x, at_y = self.distort(u, v)
+        dx, dy = x - at_x, y - at_y
+        with dr.suspend_grad():
+            xx, xy, yy = self.distortion_jacobian(u, v)
+            per_determinant = 1 / (xx * yy - xy * xy)
+            xx, xy, yy = (value * per_determinant for value in (xx, xy, yy))
+        following = u + (yy * dx - xy * dy), v + (xx * dy - xy * dx)
+        inside = self.sees_slopes(*following)
+        return tuple(dr.select(inside, b, a) for a, b in zip((u, v), following, strict=True))
+
+    def sees_slopes(self, x: Any, y: Any) -> Any:
+        """Whether they are within the part that the model is made for."""
+        return x * x + y * y < self.max_squared_radius
+
+    # What kernels call: see ``drgs.cameras.camera``.
+
+    def look(self, camera: Camera, position: Any) -> tuple[Any, Any, Any]:
+        """Whether a mean is seen, its position, and its depth."""
+        x, y, z = position
+        # Not divided by z, which may be zero.
+        limit = self.max_squared_radius * z * z
+        return moved_on_axis(position, (z >= camera.near) & (x * x + y * y < limit))
+
+    def film_point(self, camera: Camera, position: Any) -> Any:
+        """Where a point is on the film, Array2f, px."""
+        slopes = self.distort(*self.true_slopes(camera, position))
+        return camera.focal * types_of(type(position.z)).Array2f(*slopes) + camera.principal
+
+    def film_directions(self, camera: Camera, position: Any, slopes: list[Any]) -> list[Any]:
+        """Derivatives of the place on the film, two Array3f, world."""
+        xx, xy, yy = self.distortion_jacobian(*slopes)
+        right, down, forward = camera.rotation
+        dx, dy = (
+            (axis - slope * forward) / position.z
+            for axis, slope in zip((right, down), slopes, strict=True)
+        )
+        return [camera.focal.x * (xx * dx + xy * dy), camera.focal.y * (xy * dx + yy * dy)]
+
+    def fitted(self, camera: Camera) -> RadialTangential:
+        """The lens that knows what the film of ``camera`` sees."""
+        return replace(self, on_film=_slopes_on_border(self, camera))
+
+    def frustum(self, camera: Camera) -> tuple[Any, Any]:
+        """The least and the largest slopes on the film."""
+        del camera
+        return self.on_film
+
+    def ray(self, camera: Camera, x: Any, y: Any) -> Any:
+        """Through a point of the film (px), Array3f, camera axes."""
+        t = types_of(type(x))
+        film = (t.Array2f(x, y) - camera.principal) / camera.focal
+        return t.Array3f(*self.undistort(film.x, film.y), 1)
+
+    def _radial(self, squared: Any) -> Any:
+        return _polynomial(self.numerator, squared) / _polynomial(self.denominator, squared)
+
+    def _radial_derivative(self, squared: Any) -> Any:
+        """d R / d r^2."""
+        denominator = _polynomial(self.denominator, squared)
+        change = _derivative(self.numerator, squared)
+        change = change - self._radial(squared) * _derivative(self.denominator, squared)
+        return change / denominator
+
+
+def _largest_squared_radius(
+    numerator: Sequence[float], denominator: Sequence[float], tangential: float
+) -> float:
+    """r^2 within which no two slopes are distorted to the same; inf: wherever they are.
+
+    With R = N / D and u = r^2, the radial part's Jacobian has the eigenvalues A = G / D^2, with
+    G = N D + 2 u (N' D - N D'), along the slope, and R across it. With ``tangential``, the length
+    q of (p2, p1), no eigenvalue of the tangential part's is below -6 r q. While A and R are larger
+    than 6 r q, the sum is positive definite (Weyl's inequality), and as it is symmetric, its
+    map one-to-one. The bound is reached where A <= R, on the side of -(p2, p1).
+    """
+    u = np.polynomial.Polynomial([0.0, 1.0])
+    n, d = (np.polynomial.Polynomial([1.0, *c]) for c in (numerator, denominator))
+    growth = n * d + 2 * u * (n.deriv() * d - n * d.deriv())
+    first = min(_first_root(growth.coef), _first_root(d.coef))
+    if tangential == 0:
+        return first
+    r = u
+    folds = (
+        growth(r**2) - 6 * tangential * r * d(r**2) ** 2,
+        n(r**2) - 6 * tangential * r * d(r**2),
+    )
+    return min(first, *(_first_root(fold.coef) ** 2 for fold in folds))
+
+
+def _slopes_on_border(lens: RadialTangential, camera: Camera) -> tuple[Any, Any]:
+    """The box around the slopes of points on the film's border.
+
+    Where the lens does not see all of them, the box says nothing about what it sees: then only the
+    end of the lens model bounds the slopes.
+    """
+    t = types_of(type(camera.near))
+    side = dr.linspace(t.Float, 0, 1, BORDER)
+    zero, one = dr.zeros(t.Float, BORDER), dr.ones(t.Float, BORDER)
+    start, end = camera.film_start, camera.film_end
+    x = dr.concat([side, side, zero, one]) * (end.x - start.x) + start.x
+    y = dr.concat([zero, one, side, side]) * (end.y - start.y) + start.y
+    film = (t.Array2f(x, y) - camera.principal) / camera.focal
+    slopes = lens.undistort(film.x, film.y)
+    missed = dr.squared_norm(t.Array2f(*lens.distort(*slopes)) - film)
+    bounded = dr.all(lens.sees_slopes(*slopes) & (missed < MISSED))
+    return tuple(
+        t.Array2f([dr.select(bounded, _mean_where(s, extreme(s)), other) for s in slopes])
+        for extreme, other in ((dr.min, -UNBOUNDED), (dr.max, UNBOUNDED))
+    )
+
+
+def _mean_where(values: Any, extreme: Any) -> Any:
+    """``extreme``, with the mean derivative of the values that are it.
+
+    Several corners of a film may be equally far: Dr.Jit's own reductions add up their derivatives.
+    """
+    equal = values == extreme
+    return dr.sum(dr.select(equal, values, 0)) / dr.count(equal)
+
+
+# ----------------------------------------------------------------------------------------------
+# Fisheye
+# ----------------------------------------------------------------------------------------------
+
+
+# ----------------------------------------------------------------------------------------------
+# Orthographic
+# ----------------------------------------------------------------------------------------------
+
+
+# ----------------------------------------------------------------------------------------------
+# Aperture
+# ----------------------------------------------------------------------------------------------

@@ -1,0 +1,4 @@
+"""What all commands share: arguments, execution, progress, interrupts, errors.
+
+May import ``core``.
+"""

@@ -1,0 +1,26 @@
+"""How a command ends for a user's error: one line, exit status 2."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from drgs.core.errors import UserError
+from drgs.core.llvm import LLVMVersionError
+
+USER_ERROR_STATUS = 2
+"""Exit status of a command that the user has to call differently (as argparse's)."""
+
+
+@contextmanager
+def exit_on_user_error() -> Iterator[None]:
+    """Around (or, as a decorator, on) a command: print the error without a traceback, exit with 2.
+
+    Only errors that the user can repair; any other keeps its traceback.
+    """
+    try:
+        yield
+    except (UserError, LLVMVersionError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        sys.exit(USER_ERROR_STATUS)

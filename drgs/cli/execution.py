@@ -1,0 +1,133 @@
+"""How Dr.Jit runs a command: on how many threads, and with range checks or without.
+
+The bytes of a result depend on neither. These are settings of the process and of the calling
+thread; a command gives them back when it ends.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ctypes
+import platform
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, redirect_stderr
+from typing import Any, TextIO
+
+import drjit as dr
+
+from drgs.core.errors import UserError, one_line
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Add ``--threads`` and ``--debug``."""
+    parser.add_argument(
+        "--threads", type=int, metavar="N", help="CPU threads to use (default: one a core)"
+    )
+    parser.add_argument(
+        "--debug",
+        action="store_true",
+        help="check the range of every access to memory and stop where one is violated; slow",
+    )
+
+
+@contextmanager
+def execution(threads: int | None, debug: bool) -> Iterator[Callable[[], None]]:
+    """Run the block on ``threads`` threads (None: as many as now), with range checks if ``debug``.
+
+    Yields a function that raises :class:`UserError` if an access was out of range so far; leaving
+    the block does so as well.
+    """
+    with _thread_count(threads), _denormals_flushed():
+        if not debug:
+            yield lambda: None
+            return
+        with _range_checks() as reports:
+            yield reports.check
+            reports.check()
+
+
+@contextmanager
+def _thread_count(count: int | None) -> Iterator[None]:
+    if count is None:
+        yield
+        return
+    if count < 1:
+        raise UserError(f"--threads: must be >= 1, got {count}")
+    previous = dr.thread_count()
+    try:
+        try:
+            dr.set_thread_count(count)
+        except RuntimeError as error:
+            raise UserError(f"--threads {count}: the system says: {one_line(error)}") from None
+        yield
+    finally:
+        dr.set_thread_count(previous)
+
+
+_FLUSH_DENORMALS = 0x8040
+"""Bits FTZ and DAZ of x86's register MXCSR (Intel, Software Developer's Manual 1, 10.2.3)."""
+
+
+@contextmanager
+def _denormals_flushed() -> Iterator[None]:
+    """Take denormal numbers for zero on this thread within the block, as Dr.Jit's workers do.
+
+    Dr.Jit leaves the calling thread's mode as it is, and runs what is small there, or everything
+    if there is no worker: bits of Adam's moments, and soon all of a fit, would depend on the
+    number of threads. Only where the C library is glibc on x86-64; elsewhere nothing happens.
+    """
+    if (platform.libc_ver()[0], platform.machine()) != ("glibc", "x86_64"):
+        yield
+        return
+    libm = ctypes.CDLL("libm.so.6")
+    before = (ctypes.c_uint32 * 8)()  # fenv_t, the last word of which is MXCSR
+    libm.fegetenv(before)
+    flushing = type(before)(*before)
+    flushing[7] |= _FLUSH_DENORMALS
+    libm.fesetenv(flushing)
+    try:
+        yield
+    finally:
+        libm.fesetenv(before)
+
+
+class _RangeReports:
+    """Stands before a text stream, and remembers what Dr.Jit reports of accesses out of range.
+
+    Dr.Jit masks such an access, says so on the standard error output and goes on.
+    """
+
+    def __init__(self, stream: TextIO) -> None:
+        self._stream = stream
+        self._reports: list[str] = []
+
+    def write(self, text: str) -> int:
+        """Pass on ``text``."""
+        if "out-of-bounds" in text:
+            self._reports.append(one_line(text))
+        return self._stream.write(text)
+
+    def __getattr__(self, name: str) -> Any:
+        """Everything else is the stream's."""
+        return getattr(self._stream, name)
+
+    def check(self) -> None:
+        """Raise :class:`UserError` with the first report, if there is one."""
+        dr.sync_thread()
+        if self._reports:
+            raise UserError(
+                f"--debug: {self._reports[0]}; this is a defect of the program: please report it"
+            )
+
+
+@contextmanager
+def _range_checks() -> Iterator[_RangeReports]:
+    """Within the block, Dr.Jit is in debug mode."""
+    reports = _RangeReports(sys.stderr)
+    tracer = sys.gettrace()  # debug mode installs its own
+    try:
+        with redirect_stderr(reports), dr.scoped_set_flag(dr.JitFlag.Debug):
+            yield reports
+    finally:
+        sys.settrace(tracer)

@@ -1,0 +1,4 @@
+"""Typed settings of a fit, and the YAML they are read from.
+
+May import ``core``.
+"""

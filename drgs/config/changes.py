@@ -1,0 +1,57 @@
+"""The same fit in fewer or more iterations, or with other values.
+
+What a configuration says in iterations (when the population may change, when opacities are reset,
+when the degree of the spherical harmonics rises, where coarse stages end) keeps its share of the
+whole.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from drgs.config.schema import FitConfig
+
+_COUNTS = (
+    "densify.start",
+    "densify.stop",
+    "densify.reset_every",
+    "densify.white_background_reset",
+    "model.sh_increase_every",
+    "cameras.start",
+)
+
+
+def changed(config: FitConfig, changes: Mapping[str, Any]) -> FitConfig:
+    """``config`` with other values, by names such as ``densify.every``; checked like a file's."""
+    values: dict[str, Any] = config.model_dump()
+    for key, value in changes.items():
+        *sections, name = key.split(".")
+        target = values
+        for section in sections:
+            target = target[section]
+        target[name] = value
+    return FitConfig.model_validate(values)
+
+
+def with_iterations(config: FitConfig, iterations: int) -> FitConfig:
+    """``config`` with another number of iterations, and everything else in proportion.
+
+    The iterations between two changes of the population (``densify.every``) stay: what a change
+    needs to know is gathered over views. The means' rate falls until the end, without revisions.
+    """
+    share = iterations / config.iterations
+
+    def scaled(count: int | None) -> int | None:
+        return count if not count else max(1, round(count * share))  # None, and 0: from the start
+
+    changes: dict[str, Any] = {"iterations": iterations}
+    for key in _COUNTS:
+        section, name = key.split(".")
+        changes[key] = scaled(getattr(getattr(config, section), name))
+    changes["coarse"] = [
+        {"until": scaled(stage.until), "factor": stage.factor} for stage in config.coarse
+    ]
+    changes["densify.stop"] = max(changes["densify.stop"], changes["densify.start"] + 1)
+    changes["optimizer.means_lr_aims"] = []
+    return changed(config, changes)

@@ -1,0 +1,252 @@
+"""Configurations from YAML and back, with messages that name file, key, expected and got."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import Any, get_args
+
+import yaml
+from pydantic import (
+    BaseModel,
+    ValidationError,
+)
+
+from drgs.config.schema import FitConfig
+from drgs.core.errors import UserError, did_you_mean, one_line
+from drgs.core.files import atomic_path, read_text
+
+PATH_KEYS = ("data.path", "init.point_cloud", "output.dir")
+"""Values that are made absolute when a configuration is loaded."""
+
+
+MAX_BYTES = 1 << 20
+"""Of a configuration file: a thousand times what every value with a comment takes."""
+
+
+MAX_DEPTH = 20
+"""Of nested lists and sections in YAML; a configuration has 3. Python's stack ends at about 100."""
+
+
+MAX_EXPLAINED = 20
+"""Wrong values that an error lists; the rest are counted."""
+
+
+def load_config(path: str | Path, overrides: Iterable[str] = ()) -> FitConfig:
+    """Read a YAML configuration; ``overrides`` are ``section.key=VALUE`` with VALUE in YAML.
+
+    Relative paths in the file are relative to the file's folder; in ``overrides``, which are
+    typed in a shell and need not be YAML, to the current folder. The result holds absolute paths.
+
+    Raises :class:`UserError` with one line for each wrong key.
+    """
+    path = Path(path)
+    values = _read_yaml(path)
+    _resolve_paths(values, path)
+    overridden = set()
+    for override in overrides:
+        key, value = _parse_override(override)
+        _insert(values, key, value)
+        overridden.add(key)
+    try:
+        return FitConfig.model_validate(values)
+    except ValidationError as error:
+        errors = error.errors()
+        lines = [_explain(str(path), item, overridden) for item in errors[:MAX_EXPLAINED]]
+        if len(errors) > MAX_EXPLAINED:
+            lines.append(f"{path}: {len(errors) - MAX_EXPLAINED} more values are wrong")
+        raise UserError("\n".join(lines)) from None
+
+
+def dump_config(config: FitConfig, path: str | Path) -> None:
+    """Write every value of ``config`` as YAML; :func:`load_config` reads an equal one back."""
+    text = yaml.safe_dump(config.model_dump(mode="json"), sort_keys=False)
+    with atomic_path(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+
+
+def known_keys() -> list[str]:
+    """Dotted names of every section and every value, such as ``densify.every``."""
+    return [key for key, _ in _fields(FitConfig)]
+
+
+def _fields(model: type[BaseModel], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    for name, field in model.model_fields.items():
+        yield prefix + name, field.annotation
+        section = _section(field.annotation)
+        if section is not None:
+            yield from _fields(section, f"{prefix}{name}.")
+
+
+def _section(annotation: Any) -> type[BaseModel] | None:
+    """The section that a value is, or that the elements of a list are."""
+    for candidate in (annotation, *get_args(annotation)):
+        if isinstance(candidate, type) and issubclass(candidate, BaseModel):
+            return candidate
+    return None
+
+
+class _Loader(yaml.SafeLoader):
+    """YAML with the changes that a configuration needs.
+
+    1e-15 is a number (YAML 1.1 wants 1.0e-15 and would read text). A key that is given twice in
+    one section is an error (the first would be dropped silently), and so are aliases and deep
+    nesting: a few lines of either could take all memory or Python's whole stack.
+    """
+
+    depth = 0
+
+    def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node:
+        event = self.peek_event()
+        if isinstance(event, yaml.AliasEvent):
+            raise yaml.MarkedYAMLError(
+                problem=f"aliases such as *{event.anchor} are not supported; write the value out",
+                problem_mark=event.start_mark,
+            )
+        if self.depth >= MAX_DEPTH:
+            raise yaml.MarkedYAMLError(
+                problem=f"more than {MAX_DEPTH} levels of nesting", problem_mark=event.start_mark
+            )
+        self.depth += 1
+        node = super().compose_node(parent, index)
+        self.depth -= 1
+        return node
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict:
+        seen = set()
+        for key_node, _ in node.value:
+            key = key_node.value
+            if isinstance(key, str) and key in seen:
+                raise yaml.MarkedYAMLError(
+                    problem=f"key {key} is given twice", problem_mark=key_node.start_mark
+                )
+            seen.add(str(key))
+        return super().construct_mapping(node, deep)
+
+
+_Loader.add_implicit_resolver(
+    "tag:yaml.org,2002:float",
+    re.compile(r"[-+]?(\d+(\.\d*)?|\.\d+)[eE][-+]?\d+$"),
+    list("-+.0123456789"),
+)
+
+
+def _read_yaml(path: Path) -> dict:
+    text = read_text(path, "configuration", MAX_BYTES)
+    try:
+        values = yaml.load(text, Loader=_Loader)
+    except yaml.MarkedYAMLError as error:
+        line = f"line {error.problem_mark.line + 1}: " if error.problem_mark else ""
+        raise UserError(f"{path}: {line}not valid YAML: {one_line(error.problem)}") from None
+    except Exception as error:  # a date or number that YAML's syntax allows: PyYAML raises anything
+        reason = one_line(error) or type(error).__name__
+        raise UserError(f"{path}: not valid YAML: {reason}") from None
+    if not isinstance(values, dict):
+        raise UserError(f"{path}: must hold sections such as 'data:', got {_show(values)}")
+    return values
+
+
+def _parse_override(override: str) -> tuple[str, Any]:
+    key, equals, text = override.partition("=")
+    key = key.strip()
+    if not equals or not key:
+        raise UserError(f"--set {override}: must be KEY=VALUE, as in densify.every=200")
+    if key not in known_keys():
+        raise UserError(f"--set {key}: unknown key {key}{did_you_mean(key, known_keys())}")
+    if key in PATH_KEYS:
+        return key, None if text == "null" else _absolute(Path(), text, f"--set {key}")
+    try:
+        return key, yaml.load(text, Loader=_Loader)
+    except Exception:  # as in _read_yaml
+        raise UserError(f"--set {key}: not a YAML value: {one_line(text)}") from None
+
+
+def _insert(values: dict, key: str, value: Any) -> None:
+    *sections, leaf = key.split(".")
+    for section in sections:
+        if not isinstance(values.get(section), dict):
+            values[section] = {}
+        values = values[section]
+    values[leaf] = value
+
+
+def _resolve_paths(values: dict, file: Path) -> None:
+    folder = file.resolve().parent
+    for key in PATH_KEYS:
+        section, leaf = key.split(".")
+        entries = values.get(section)
+        if isinstance(entries, dict) and isinstance(entries.get(leaf), str):
+            entries[leaf] = _absolute(folder, entries[leaf], f"{file}: {key}")
+
+
+def _absolute(folder: Path, text: str, where: str) -> str:
+    try:
+        path = str((folder / Path(text).expanduser()).resolve())
+        path.encode()  # what UTF-8 cannot express could not be written to config.yml
+    except (OSError, ValueError, RuntimeError) as error:  # of these, RuntimeError: no such user
+        raise UserError(
+            f"{where} must be a path, got {_show(text)} ({one_line(error, 100)})"
+        ) from None
+    return path
+
+
+def _explain(file: str, item: Any, overridden: set[str]) -> str:
+    """One line for one of pydantic's errors: where, name, expected, got, remedy."""
+    key = one_line(".".join(str(part) for part in item["loc"]), limit=60)
+    given = [k for k in overridden if key == k or key.startswith(f"{k}.")]
+    where = f"--set {given[0]}" if given else file
+    kind, limits = item["type"], item.get("ctx", {})
+    if kind in ("extra_forbidden", "invalid_key"):
+        return f"{where}: unknown key {key}{did_you_mean(key, known_keys())}"
+    if kind == "missing":
+        return f"{where}: {key} is missing: {_description(key)}"
+    got = f", got {_show(item['input'])}"
+    if kind == "value_error" and not key:
+        # A relation between values that may come from the file and from the command line.
+        origin = f"{file} with --set {' '.join(sorted(overridden))}" if overridden else file
+        return f"{origin}: {limits['error']}"
+    if kind == "value_error":
+        return f"{where}: {key} {limits['error']}{got}"
+    for relation, sign in _RELATIONS.items():
+        if relation in limits:
+            return f"{where}: {key} must be {sign} {limits[relation]:.10g}{got}"
+    if kind == "literal_error":
+        return f"{where}: {key} must be one of {limits['expected']}{got}"
+    return f"{where}: {key} must be {_EXPECTED.get(kind.split('_')[0], item['msg'])}{got}"
+
+
+_RELATIONS = {"ge": ">=", "gt": ">", "le": "<=", "lt": "<"}
+
+
+_EXPECTED = {
+    "int": "an integer",
+    "float": "a number",
+    "finite": "a finite number",
+    "bool": "true or false",
+    "string": "text",
+    "path": "a path",
+    "list": "a list",
+    "model": "a section of keys",
+}
+
+
+def _description(key: str) -> str:
+    model: Any = FitConfig
+    *sections, leaf = (part for part in key.split(".") if not part.isdigit())
+    for section in sections:
+        model = _section(model.model_fields[section].annotation)
+    field = model.model_fields[leaf]
+    return field.description or field.annotation.__doc__
+
+
+def _show(value: Any) -> str:
+    """The value as YAML writes it, on one line and shortened."""
+    if isinstance(value, str):
+        return one_line(repr(value), limit=60)
+    try:
+        text = yaml.safe_dump(value, default_flow_style=True, width=math.inf)
+    except ValueError:  # Python writes no integer of more than 4300 digits
+        return "a number of thousands of digits"
+    return one_line(text.removesuffix("\n").removesuffix("\n..."), limit=60)

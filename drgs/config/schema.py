@@ -1,0 +1,413 @@
+"""The typed configuration of a fit: YAML -> :class:`FitConfig`.
+
+The defaults are the reference 3DGS recipe (Kerbl et al. 2023, section 7 and its released code) for
+30,000 iterations; each field names its unit and range. A configuration is frozen: what a run used
+is what :func:`dump_config` writes.
+"""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    PlainSerializer,
+    PlainValidator,
+    model_validator,
+)
+
+from drgs.core.constants import SHUTTER_SAMPLES
+
+Color = str | tuple[float, float, float]
+
+
+MAX_INT = 2**31 - 1
+"""The counters of Mitsuba and Dr.Jit are of 32 bits."""
+
+NAMED_COLORS = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0)}
+
+
+def _color(value: Any) -> Color:
+    if isinstance(value, str) and value in NAMED_COLORS:
+        return value
+    if isinstance(value, (list, tuple)) and len(value) == 3:
+        numbers = [v for v in value if isinstance(v, (int, float)) and not isinstance(v, bool)]
+        if len(numbers) == 3 and all(0 <= v <= 1 for v in numbers):
+            return tuple(float(v) for v in numbers)
+    raise ValueError("must be white, black or three numbers in 0..1")
+
+
+def _color_to_yaml(color: Color) -> Any:
+    return color if isinstance(color, str) else list(color)
+
+
+ColorField = Annotated[Color, PlainValidator(_color), PlainSerializer(_color_to_yaml)]
+Count = Annotated[int, Field(le=MAX_INT)]
+PathField = Annotated[Path, Field(strict=False)]
+
+
+class _Section(BaseModel):
+    """Frozen; unknown keys, infinities and silent conversions ("3" for 3) are refused."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
+
+
+class DataConfig(_Section):
+    """Where the photographs and their cameras are, and how they are read."""
+
+    path: PathField = Field(description="Dataset folder; relative to the configuration file.")
+    source: str = Field(
+        "", description="Where to get the data: printed in the error if the folder is missing."
+    )
+    type: Literal["auto", "nerf_synthetic", "nerfstudio"] = Field(
+        "auto",
+        description="Layout of the folder. auto: nerf_synthetic if there is a "
+        "transforms_train.json, nerfstudio if there is a transforms.json.",
+    )
+    image_size: Count | None = Field(
+        None,
+        ge=1,
+        description="px. Wider images are scaled down to this width by area averaging; null: "
+        "none is.",
+    )
+    test_split: Literal["train", "val", "test"] | None = Field(
+        None,
+        description="NeRF-synthetic split to measure on; null: test if it is there, else val.",
+    )
+    test_every: Count = Field(
+        8, ge=2, description="nerfstudio: images 0, n, 2n, ... by file name are the test split."
+    )
+    background: ColorField = Field(
+        "white",
+        description="white, black or [r, g, b] in display space: behind transparent images, and "
+        "behind the splats at training, evaluation and rendering.",
+    )
+    random_background: bool = Field(
+        False,
+        description="Each iteration puts another colour behind the transparent pictures and the "
+        "splats, so that splats cannot pass for the background.",
+    )
+    ignore_distortion: bool = Field(
+        False, description="Treat images with lens distortion as those of a pinhole camera."
+    )
+    ignore_motion: bool = Field(
+        False, description="Treat cameras that move while a photograph is taken as if they did not."
+    )
+    shutter_samples: Count = Field(
+        SHUTTER_SAMPLES,
+        ge=1,
+        description="Times at which a picture is rendered that a moving camera with a global "
+        "shutter blurs.",
+    )
+    ignore_masks: bool = Field(False, description="Use the pixels that masks leave out as well.")
+    ignore_depth: bool = Field(
+        False, description="Do not open files of depth; nor are they where loss.depth_weight is 0."
+    )
+
+    @property
+    def background_rgb(self) -> tuple[float, float, float]:
+        """The background's display-space colour, three numbers in 0..1."""
+        return NAMED_COLORS.get(self.background, self.background)
+
+
+class InitConfig(_Section):
+    """The Gaussians at iteration 0."""
+
+    num_points: Count = Field(100_000, ge=4, description="Random points in the start box.")
+    half_extent: float | None = Field(
+        None,
+        gt=0,
+        le=1e9,
+        description="Scene units: the start box is [-h, h]^3. null: the reference's 1.3 for the "
+        "NeRF-synthetic layout, otherwise a box derived from the cameras.",
+    )
+    opacity: float = Field(0.1, gt=0, lt=1, description="Opacity of every starting Gaussian.")
+    point_cloud: PathField | None = Field(
+        None, description="PLY with x, y, z (and red, green, blue) to use instead of random points."
+    )
+
+
+class ModelConfig(_Section):
+    """What is fitted and how it is rendered."""
+
+    sh_degree: int = Field(3, ge=0, le=3, description="Degree of the spherical harmonics.")
+    sh_increase_every: Count = Field(
+        1000, ge=1, description="Iterations between +1 of the degree in use, which starts at 0."
+    )
+    near: float = Field(0.2, gt=0, description="Near plane, scene units: closer means are culled.")
+    projection: Literal["ewa", "unscented", "exact"] = Field(
+        "ewa",
+        description="ewa: the affine approximation at the mean; unscented: of projected sigma "
+        "points; exact: the peak of the 3D Gaussian along each pixel's ray.",
+    )
+    order: Literal["center", "pixel"] = Field(
+        "center",
+        description="center: splats are ordered by the depth of their means; pixel: by that of "
+        "their peaks along each pixel's ray.",
+    )
+    order_window: int = Field(
+        4, ge=1, le=64, description="Of order pixel: splats that a pixel keeps waiting."
+    )
+    sh_direction: Literal["mean", "pixel"] = Field(
+        "mean", description="Where colours are seen from: towards the mean, or along each ray."
+    )
+    alpha_max: float = Field(0.99, gt=0, lt=1, description="Upper clamp of a splat's alpha.")
+    alpha_cut: float = Field(
+        1 / 255, ge=0, lt=1, description="Splats end where their alpha is smaller; 0: they do not."
+    )
+    transmittance_stop: float = Field(
+        1e-4, ge=0, lt=1, description="A pixel ends before its transmittance is smaller; 0: never."
+    )
+    extent: float | None = Field(
+        None,
+        gt=0,
+        description="Standard deviations at which splats end; null: where alpha_cut ends them.",
+    )
+    low_pass: float = Field(
+        0.3, ge=0, description="px^2 added to the variance of a splat on the film; 0: none."
+    )
+    antialiased: bool = Field(
+        False, description="Compensate opacities for the low-pass filter (Yu et al. 2024)."
+    )
+    smoothing: bool = Field(
+        False,
+        description="Widen Gaussians to what the training cameras can tell apart, for renderings "
+        "at other sizes (the 3D filter of Mip-Splatting, Yu et al. 2024).",
+    )
+
+
+class RateAim(_Section):
+    """What a falling rate heads for after an iteration."""
+
+    after: Count = Field(ge=0, description="The last iteration that is not affected.")
+    end: Count = Field(ge=1, description="Where the rate would be the last one.")
+
+
+class OptimizerConfig(_Section):
+    """Adam (Kingma and Ba 2015): learning rates per step and its constants."""
+
+    means_lr: float = Field(
+        1.6e-4, gt=0, description="First rate of the means, in units of the scene extent."
+    )
+    means_lr_final: float = Field(
+        1.6e-6, gt=0, description="Last rate of the means, which decays exponentially."
+    )
+    means_lr_aims: list[RateAim] = Field(
+        default_factory=list,
+        description="When the means' rate is to be the last one, as a plan was revised: a list of "
+        "{after: iteration, end: iteration}; empty: at the last iteration.",
+    )
+    sh0_lr: float = Field(2.5e-3, ge=0, description="Degree-0 colour coefficients.")
+    shN_lr: float = Field(1.25e-4, ge=0, description="Colour coefficients of higher degrees.")  # noqa: N815
+    opacities_lr: float = Field(
+        0.05, ge=0, description="Logit opacities (0.025 in newer releases of the reference)."
+    )
+    scales_lr: float = Field(5e-3, ge=0, description="Logarithms of the scales.")
+    quats_lr: float = Field(1e-3, ge=0, description="Quaternions.")
+    beta_1: float = Field(0.9, ge=0, lt=1, description="Decay of the first moment.")
+    beta_2: float = Field(0.999, ge=0, lt=1, description="Decay of the second moment.")
+    epsilon: float = Field(
+        1e-15, gt=0, description="Added to the root of the second moment; gradients are tiny."
+    )
+
+
+class LossConfig(_Section):
+    """(1 - w) L1 + w (1 - SSIM), in display space."""
+
+    dssim_weight: float = Field(0.2, ge=0, le=1, description="w; 0 leaves D-SSIM out.")
+    window: int = Field(11, ge=3, le=17, description="px: width of SSIM's Gaussian window; odd.")
+    sigma: float = Field(1.5, gt=0, description="px: its standard deviation.")
+    depth_weight: float = Field(
+        0.2,
+        ge=0,
+        description="Of the mean difference in depth, in scene extents, where the data has depth; "
+        "0 leaves it out.",
+    )
+
+
+class ColorConfig(_Section):
+    """A colour transform for each training photograph: exposure and white balance."""
+
+    lr: float | None = Field(
+        None,
+        gt=0,
+        description="First rate of the 3 x 4 numbers of each transform, such as 0.02; falls as "
+        "that of the means. null: there are no transforms.",
+    )
+    identity_weight: float = Field(
+        1.0, ge=0, description="Of the mean square by which a transform differs from the identity."
+    )
+
+
+class CamerasConfig(_Section):
+    """Refinement of the training cameras; first rates per step, which fall as that of the means.
+
+    A camera's pose gets a step when its picture is drawn: of 7,000 iterations with 100 pictures 70.
+    Fits that short need higher rates than 30,000 iterations, which these are for.
+    """
+
+    optimise: bool = Field(False, description="Refine poses, focal lengths and principal points.")
+    start: Count = Field(0, ge=0, description="Iterations before it begins.")
+    rotation_lr: float = Field(3e-4, ge=0, description="Radians.")
+    translation_lr: float = Field(3e-4, ge=0, description="In units of the scene extent.")
+    focal_lr: float = Field(
+        0.0, ge=0, description="Relative to the focal lengths, which all views share."
+    )
+    principal_lr: float = Field(
+        0.0, ge=0, description="In parts of the picture's size; all views share it."
+    )
+
+
+class DensifyConfig(_Section):
+    """Adaptive density control: clone, split, prune, opacity reset."""
+
+    start: Count = Field(500, ge=0, description="The population changes only after this iteration.")
+    stop: Count = Field(
+        15_000, ge=1, description="It changes, and is reset, only before this iteration."
+    )
+    every: Count = Field(100, ge=1, description="Iterations between two changes.")
+    grad_threshold: float = Field(
+        2e-4,
+        gt=0,
+        description="A Gaussian is cloned or split if the mean norm of its 2D position gradient, "
+        "in NDC units, over the views that saw it reaches this.",
+    )
+    clone_scale: float = Field(
+        0.01,
+        gt=0,
+        description="Cloned if its largest scale is at most this, split if larger; x extent.",
+    )
+    split_count: int = Field(
+        2, ge=2, le=1_000_000, description="Samples that replace a Gaussian that is split."
+    )
+    split_shrink: float = Field(1.6, gt=1, description="Their scales are the parent's / this.")
+    prune_opacity: float = Field(0.005, ge=0, lt=1, description="Removed if less opaque.")
+    prune_scale: float = Field(
+        0.1,
+        gt=0,
+        description="Removed after the first reset if its largest scale is larger; x extent.",
+    )
+    reset_every: Count = Field(
+        3000, ge=1, description="Iterations between opacity resets, which end with densify.stop."
+    )
+    reset_opacity: float = Field(0.01, gt=0, lt=1, description="A reset lowers opacities to this.")
+    white_background_reset: Count | None = Field(
+        500, ge=1, description="Iteration of an extra reset if the background is white; null: none."
+    )
+    max_gaussians: int = Field(
+        1_000_000, ge=4, le=100_000_000, description="Cap that is never exceeded."
+    )
+
+
+class OutputConfig(_Section):
+    """What a fit leaves behind."""
+
+    dir: PathField | None = Field(
+        None,
+        description="Folder, relative to the configuration file; null: out/NAME under the current "
+        "folder, NAME being that of the configuration file.",
+    )
+    bake_smoothing: bool = Field(
+        False,
+        description="Write point_cloud.ply with the smoothing of model.smoothing in its scales and "
+        "opacities, for viewers that know nothing of it.",
+    )
+    save_renders: bool = Field(True, description="Write renders/<split>/*.png.")
+    history_every: Count = Field(10, ge=1, description="Iterations between rows of history.csv.")
+    checkpoint_every: Count | None = Field(
+        500, ge=1, description="Iterations between checkpoints, for --resume; null: none."
+    )
+
+
+class CoarseStage(_Section):
+    """Iterations that see smaller pictures."""
+
+    until: Count = Field(ge=1, description="The stage's last iteration.")
+    factor: int = Field(ge=2, le=64, description="Width and height are divided by this.")
+
+
+class FitConfig(_Section):
+    """Everything that decides a fit."""
+
+    data: DataConfig
+    init: InitConfig = Field(default_factory=InitConfig)
+    model: ModelConfig = Field(default_factory=ModelConfig)
+    optimizer: OptimizerConfig = Field(default_factory=OptimizerConfig)
+    loss: LossConfig = Field(default_factory=LossConfig)
+    colors: ColorConfig = Field(default_factory=ColorConfig)
+    cameras: CamerasConfig = Field(default_factory=CamerasConfig)
+    densify: DensifyConfig = Field(default_factory=DensifyConfig)
+    output: OutputConfig = Field(default_factory=OutputConfig)
+    iterations: Count = Field(30_000, ge=1, description="Optimizer steps; one view each.")
+    coarse: list[CoarseStage] = Field(
+        default_factory=list,
+        description="Stages of smaller training pictures, before those of full size: a list of "
+        "{until: iteration, factor: 4}.",
+    )
+    seed: Count = Field(0, ge=0, description="Seed of everything random.")
+
+    @property
+    def data_for_training(self) -> DataConfig:
+        """``data``, without the depths that a loss of weight 0 would not look at."""
+        if self.loss.depth_weight > 0:
+            return self.data
+        return self.data.model_copy(update={"ignore_depth": True})
+
+    @property
+    def data_for_rendering(self) -> DataConfig:
+        """``data``, without what only a loss looks at."""
+        return self.data.model_copy(update={"ignore_depth": True})
+
+    @model_validator(mode="after")
+    def _check_relations(self) -> FitConfig:
+        densify, optimizer = self.densify, self.optimizer
+        if densify.start >= densify.stop:
+            raise ValueError(
+                f"densify.start must be < densify.stop ({densify.stop}), got {densify.start}"
+            )
+        if optimizer.means_lr_final > optimizer.means_lr:
+            raise ValueError(
+                f"optimizer.means_lr_final must be <= optimizer.means_lr ({optimizer.means_lr}), "
+                f"got {optimizer.means_lr_final}"
+            )
+        if densify.prune_opacity >= densify.reset_opacity:
+            raise ValueError(
+                "densify.prune_opacity must be < densify.reset_opacity "
+                f"({densify.reset_opacity}), or a reset removes everything; "
+                f"got {densify.prune_opacity}"
+            )
+        if self.cameras.optimise and self.model.sh_direction != "mean":
+            raise ValueError(
+                "model.sh_direction must be mean where cameras.optimise is true (colours along "
+                f"rays are not differentiated in the camera), got {self.model.sh_direction}"
+            )
+        if self.init.point_cloud is None and self.init.num_points > densify.max_gaussians:
+            raise ValueError(
+                f"init.num_points must be <= densify.max_gaussians ({densify.max_gaussians}), "
+                f"got {self.init.num_points}"
+            )
+        for before, after in pairwise(self.coarse):
+            if not (before.until < after.until and before.factor > after.factor):
+                raise ValueError(
+                    "coarse must be stages with growing until and falling factor, got "
+                    f"{{until: {before.until}, factor: {before.factor}}} before "
+                    f"{{until: {after.until}, factor: {after.factor}}}"
+                )
+        aims = optimizer.means_lr_aims
+        starts = [aim.after for aim in aims]
+        if (
+            starts != sorted(set(starts))
+            or starts[:1] not in ([], [0])
+            or any(aim.end <= aim.after for aim in aims)
+        ):
+            raise ValueError(
+                "optimizer.means_lr_aims must begin after iteration 0, with growing after < end, "
+                f"got {', '.join(f'{{after: {aim.after}, end: {aim.end}}}' for aim in aims)}"
+            )
+        if self.loss.window % 2 == 0:
+            raise ValueError(f"loss.window must be odd, got {self.loss.window}")
+        return self

@@ -1,0 +1,4 @@
+"""Array types, constants, errors, files and LLVM: what everything else stands on.
+
+Imports nothing of drgs.
+"""

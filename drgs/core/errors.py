@@ -1,0 +1,36 @@
+"""Errors that a user can repair, and how commands report them.
+
+A message says where, which name, what was expected, what was got and what to do: ``scenes/lego.yml:
+densify.every must be >= 1, got 0``.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
+
+
+class UserError(ValueError):
+    """A wrong input: a configuration, a dataset, a file. Its text is all that the user needs."""
+
+
+def one_line(text: object, limit: int = 300) -> str:
+    """``text`` as one line of at most ``limit`` characters: what a library's error says, or a value
+    from a file, within a message of ours.
+    """
+    line = " ".join(str(text).split())
+    return line if len(line) <= limit else f"{line[: limit - 3]}..."
+
+
+def did_you_mean(name: str, candidates: Iterable[str]) -> str:
+    """``"; did you mean X?"`` with the candidate nearest to ``name``, or ``""`` if none is near.
+
+    Of dotted names, one whose last part is near will do: a key in the wrong section.
+    """
+    candidates = list(candidates)
+    nearest = difflib.get_close_matches(name, candidates, n=1, cutoff=0.7)
+    if not nearest:
+        by_leaf = {candidate.rpartition(".")[2]: candidate for candidate in reversed(candidates)}
+        leaf = difflib.get_close_matches(name.rpartition(".")[2], by_leaf, n=1, cutoff=0.7)
+        nearest = [by_leaf[leaf[0]]] if leaf else []
+    return f"; did you mean {nearest[0]}?" if nearest else ""

@@ -1,0 +1,90 @@
+"""Reading text files of a bounded size, and writing files so that a reader never sees half of one.
+
+What the file system refuses becomes a :class:`drgs.core.errors.UserError`: a missing folder, a
+lacking permission or a full disk is the user's to repair.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+from drgs.core.errors import UserError
+
+_REMEDIES = {
+    errno.ENOSPC: "free some space, or choose another disk",
+    errno.EDQUOT: "free some space, or choose another disk",
+    errno.EACCES: "choose a folder that you may write to",
+    errno.EPERM: "choose a folder that you may write to",
+    errno.EROFS: "choose a folder that you may write to",
+    errno.ENOTDIR: "choose another folder: a part of this path is a file",
+    errno.EEXIST: "choose another folder: a part of this path is a file",
+    errno.EISDIR: "remove or rename the folder of this name",
+    errno.ENAMETOOLONG: "choose a shorter name",
+}
+
+
+def read_text(path: Path, what: str, max_bytes: int) -> str:
+    """The text of a UTF-8 file; ``what`` it should be stands in the errors.
+
+    Raises :class:`UserError` where it cannot be read, is longer than ``max_bytes`` or not UTF-8.
+    """
+    try:
+        with path.open("rb") as file:
+            content = file.read(max_bytes + 1)
+    except OSError as error:
+        raise UserError(f"{path}: cannot read the {what}: {error.strerror or error}") from None
+    if len(content) > max_bytes:
+        raise UserError(f"{path}: cannot read the {what}: more than {max_bytes:,} bytes")
+    try:
+        return content.decode("utf-8")
+    except UnicodeDecodeError as error:
+        raise UserError(
+            f"{path}: cannot read the {what}: not UTF-8 text (byte {error.start})"
+        ) from None
+
+
+_TEMPORARY_NAME = re.compile(r"\..*\.\d+\.tmp(\.[^.]*)?")
+"""Names that :func:`atomic_path` makes: .STEM.PROCESS.tmp.SUFFIX."""
+
+
+@contextmanager
+def atomic_path(path: str | Path) -> Iterator[Path]:
+    """A temporary path beside ``path`` that replaces it when the block ends without an error.
+
+    Missing parent folders are created. After an error the old file is still there, unchanged, and
+    the temporary one is gone.
+
+    Raises :class:`UserError` where the file system refuses, also within the block.
+    """
+    path = Path(path)
+    # The suffix stays last: image writers choose the format by it.
+    temporary = path.with_name(f".{path.stem}.{os.getpid()}.tmp{path.suffix}")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        yield temporary
+        os.replace(temporary, path)
+    except OSError as error:
+        raise UserError(f"{path}: cannot write the file: {why_refused(error)}") from error
+    finally:
+        with suppress(OSError):
+            temporary.unlink(missing_ok=True)
+
+
+def remove_stale_temporaries(folder: Path) -> None:
+    """Remove what writers that were killed have left behind, in ``folder`` and below it."""
+    for path in folder.rglob(".*.tmp*"):
+        if _TEMPORARY_NAME.fullmatch(path.name):
+            with suppress(OSError):
+                path.unlink()
+
+
+def why_refused(error: OSError) -> str:
+    """The file system's reason, and what to do about it where that is known."""
+    reason = error.strerror or str(error) or type(error).__name__
+    remedy = _REMEDIES.get(error.errno)
+    return f"{reason}; {remedy}" if remedy else reason

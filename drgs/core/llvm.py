@@ -1,0 +1,189 @@
+"""Which libLLVM Dr.Jit compiles with: choosing it, and refusing one that would crash.
+
+LLVM 14 to 16 end the whole process as soon as a kernel contains ``dr.minimum``, ``dr.maximum`` or
+``dr.clip`` ("Cannot select: fminimum"), so the version is checked before any kernel exists.
+
+How Dr.Jit 1.5 finds the library, while ``import drjit`` runs: a libLLVM that the process has
+loaded already; else the file that ``DRJIT_LIBLLVM_PATH`` names; else ``libLLVM.so`` on the
+loader's path, whatever its version; else, on Linux, the last of
+``/usr/lib/{x86_64-linux-gnu,aarch64-linux-gnu,wsl/lib}/libLLVM*.so.*`` in numeric order, where
+symbolic links count only if there is nothing else. A newer library that is a link (LLVM's own
+packages), or that lives in another folder (Fedora), therefore loses against an old one.
+"""
+
+from __future__ import annotations
+
+import os
+import platform
+import re
+import sys
+import warnings
+from glob import glob
+from pathlib import Path
+
+MINIMUM_VERSION = 17
+"""First major version that compiles every kernel."""
+
+TESTED_VERSION = 19
+"""First major version that drgs is tested with (19 and 22 are); earlier ones give a warning."""
+
+PATH_VARIABLE = "DRJIT_LIBLLVM_PATH"
+
+Version = tuple[int, ...]
+
+
+class LLVMVersionError(ImportError, RuntimeError):
+    """There is no libLLVM that drgs can run with.
+
+    An ImportError, so that ``mi.set_variant("llvm_ad_rgb", "scalar_rgb")`` goes on to its next
+    choice, as it does where libLLVM is missing.
+    """
+
+
+def select_newest_llvm() -> None:
+    """Point Dr.Jit at the newest usable libLLVM, unless the user or an earlier import chose one.
+
+    Sets ``DRJIT_LIBLLVM_PATH`` for this process and its children. Without effect once Dr.Jit
+    was imported, when the variable is set, and where no usable library is found.
+    """
+    if os.environ.get(PATH_VARIABLE) or "drjit" in sys.modules:
+        return
+    for version, path in installed_libraries():
+        if version[0] >= MINIMUM_VERSION:
+            os.environ[PATH_VARIABLE] = path
+            return
+
+
+def ensure_usable_llvm() -> None:
+    """Raise :class:`LLVMVersionError` unless Dr.Jit's libLLVM is recent enough.
+
+    Warns for versions that drgs is not tested with. Compiles nothing.
+    """
+    version = loaded_version()
+    if version is None or version[0] < MINIMUM_VERSION:
+        raise LLVMVersionError(_refusal(version))
+    if version[0] < TESTED_VERSION:
+        warnings.warn(
+            f"drgs: libLLVM {_dotted(version)} is untested; {TESTED_VERSION} or newer is "
+            f"recommended: {_install_command()}",
+            stacklevel=2,
+        )
+
+
+def check_llvm_variants() -> None:
+    """Run :func:`ensure_usable_llvm` when Mitsuba first loads one of its ``llvm_*`` variants.
+
+    An import hook, because ``mi.set_variant`` tells its callbacks of a variant only after it has
+    loaded it, and fails before that, with a misleading message, if Dr.Jit refused the library.
+    """
+    if not any(isinstance(finder, _VariantCheck) for finder in sys.meta_path):
+        sys.meta_path.insert(0, _VariantCheck())
+
+
+def loaded_version() -> Version | None:
+    """Version of the libLLVM in use, such as (19, 1, 7); None if Dr.Jit has none.
+
+    Waits for Dr.Jit's start-up, which a thread of its own performs.
+    """
+    import drjit as dr
+
+    version = dr.detail.llvm_version()
+    return tuple(version) if version[0] >= 0 else None
+
+
+def installed_libraries() -> list[tuple[Version, str]]:
+    """(version, path) of every libLLVM in the usual places, the newest first.
+
+    Versions are read from file names: loading the libraries to ask them would be slow, and two
+    of them in one process get in each other's way.
+    """
+    found = set()
+    for folder in _library_folders():
+        for name in glob(os.path.join(folder, "libLLVM*")):
+            version = version_from_name(name)
+            if version is not None and os.path.isfile(name):
+                found.add((version, name))
+    return sorted(found, key=lambda item: (item[0], len(item[1])), reverse=True)
+
+
+def version_from_name(path: str | Path) -> Version | None:
+    """Version of a libLLVM from its file name, or from its folder if the name has none.
+
+    ``libLLVM-14.so.1`` is (14,), ``libLLVM.so.19.1`` (19, 1), ``llvm/22.1.8/lib/libLLVM.dylib``
+    (22, 1, 8). None for any other file (``libLLVMSPIRVLib.so.19``, ``libLLVM-14.a``).
+    """
+    path = str(path)
+    name = os.path.basename(path)
+    if not re.fullmatch(r"libLLVM(-[\d.]+)?\.(so(\.[\d.]+)?|dylib)", name):
+        return None
+    for pattern, text in (
+        (r"libLLVM-([\d.]+)\.(so|dylib)", name),
+        (r"libLLVM\.so\.(\d[\d.]*)", os.path.basename(os.path.realpath(path))),
+        (r"libLLVM\.so\.(\d[\d.]*)", name),
+        (r"/llvm[-@/](\d[\d.]*)", path),
+    ):
+        match = re.search(pattern, text)
+        if match:
+            return tuple(int(part) for part in match.group(1).strip(".").split("."))
+    return None
+
+
+class _VariantCheck:
+    """An import hook that finds nothing and checks before ``mitsuba.llvm_*`` is loaded."""
+
+    def find_spec(self, name: str, path: object = None, target: object = None) -> None:
+        if name.startswith("mitsuba.llvm_"):
+            ensure_usable_llvm()
+
+
+def _library_folders() -> list[str]:
+    """Where libLLVM may lie: only folders for this machine's architecture and word size."""
+    folders = [f for f in os.environ.get("LD_LIBRARY_PATH", "").split(os.pathsep) if f]
+    folders += [
+        os.path.join(sys.prefix, "lib"),  # conda environments
+        f"/usr/lib/{platform.machine()}-linux-gnu",
+        "/usr/lib64",
+        "/usr/local/lib",
+        *glob("/usr/lib/llvm-*/lib"),
+        *glob("/usr/lib64/llvm*/lib*"),
+        *glob("/opt/homebrew/Cellar/llvm*/*/lib"),
+        *glob("/usr/local/Cellar/llvm*/*/lib"),
+    ]
+    return folders
+
+
+def _refusal(version: Version | None) -> str:
+    message = (
+        f"drgs: libLLVM {MINIMUM_VERSION} or newer is needed ({TESTED_VERSION} is tested), "
+        f"found {_describe_found(version)}. Install one with '{_install_command()}', or name its "
+        f"file in the environment variable {PATH_VARIABLE}"
+    )
+    usable = [path for found, path in installed_libraries() if found[0] >= MINIMUM_VERSION]
+    if usable:
+        message += f"; here {PATH_VARIABLE}={usable[0]} would do"
+        if not os.environ.get(PATH_VARIABLE):
+            message += ", and so would importing drgs before mitsuba and drjit"
+    return message + "."
+
+
+def _describe_found(version: Version | None) -> str:
+    named = os.environ.get(PATH_VARIABLE)
+    if version is not None:
+        return _dotted(version)
+    if named and not os.path.isfile(named):
+        return f"none ({PATH_VARIABLE}={named} is not a file)"
+    candidates = [(version_from_name(named), named)] if named else installed_libraries()
+    for guess, path in candidates[:1]:
+        if guess is not None:
+            return f"{_dotted(guess)} ({path})"
+    return f"none ({PATH_VARIABLE}={named} cannot be used)" if named else "none"
+
+
+def _install_command() -> str:
+    if sys.platform == "darwin":
+        return "brew install llvm"
+    return f"apt-get install libllvm{TESTED_VERSION}"
+
+
+def _dotted(version: Version) -> str:
+    return ".".join(str(part) for part in version)

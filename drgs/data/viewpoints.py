@@ -1,0 +1,143 @@
+"""Cameras without photographs: where new pictures of a scene are taken from.
+
+Read from a file of poses, placed by hand with :func:`look_at`, or on an orbit that follows from the
+cameras of a dataset (:func:`orbit_of_views`) or from the Gaussians alone
+(:func:`orbit_of_gaussians`). A :class:`Viewpoint` has the fields of :class:`drgs.data.types.View`
+that ``drgs.integrator.scene.make_sensors`` reads.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from drgs.core.constants import SHUTTER_SAMPLES
+from drgs.core.errors import UserError
+from drgs.data.transforms import (
+    InheritedValues,
+    focal_from_angle,
+    lens_of,
+    motion_of,
+    number,
+    opencv_camera_to_world,
+    positive,
+    read_transforms,
+)
+from drgs.data.types import View
+
+FIELD_OF_VIEW = 40.0
+"""Degrees, horizontal: that of the NeRF-synthetic cameras, rounded."""
+
+
+@dataclass(frozen=True, eq=False)
+class Viewpoint:
+    """A camera and the size of its picture."""
+
+    name: str  # unique among those rendered together; a file name without suffix
+    camera_to_world: np.ndarray  # (4, 4) float64, rigid, OpenCV axes: x right, y down, z forward
+    fx: float  # px
+    fy: float  # px
+    cx: float  # px; pixel centres are at (i + 0.5, j + 0.5)
+    cy: float  # px
+    width: int  # px
+    height: int  # px
+    lens: Any = None  # of drgs.cameras.radial_tangential; None: a pinhole
+    motion: Any = None  # of drgs.data.types; None: it does not move
+
+
+def pinhole(name: str, pose: np.ndarray, width: int, height: int, fov: float) -> Viewpoint:
+    """A camera with its principal point in the middle; fov: degrees, horizontal."""
+    focal = 0.5 * width / math.tan(math.radians(fov) / 2)
+    return Viewpoint(name, pose, focal, focal, width / 2, height / 2, width, height)
+
+
+def look_at(origin: np.ndarray, target: np.ndarray, up: np.ndarray) -> np.ndarray:
+    """(4, 4) camera to world, OpenCV axes, of a camera at ``origin`` that looks at ``target``.
+
+    origin, target, up: (3,) world; ``up`` points up in the picture and has any length.
+
+    Raises :class:`UserError` where they determine no camera.
+    """
+    origin, target, up = (np.asarray(v, np.float64) for v in (origin, target, up))
+    forward = target - origin
+    right = np.cross(forward, up)
+    scale = np.linalg.norm(forward) * np.linalg.norm(up)
+    if not np.linalg.norm(right) > 1e-6 * scale:
+        raise UserError(
+            f"camera: the direction from origin {shown(origin)} to target {shown(target)} must "
+            f"not be zero or parallel to up {shown(up)}"
+        )
+    forward, right = (v / np.linalg.norm(v) for v in (forward, right))
+    pose = np.eye(4)
+    pose[:3] = np.stack([right, np.cross(forward, right), forward, origin], axis=1)
+    return pose
+
+
+def field_of_view(views: Sequence[View]) -> float:
+    """Degrees: the median horizontal field of view."""
+    return math.degrees(np.median([2 * math.atan(0.5 * v.width / v.fx) for v in views]))
+
+
+def read_viewpoints(
+    path: Path, size: tuple[int, int] | None, shutter_samples: int = SHUTTER_SAMPLES
+) -> list[Viewpoint]:
+    """The cameras of a file in the layout of ``transforms.json``, without its pictures.
+
+    ``camera_angle_x``, or ``fl_x`` in pixels of ``w`` (and ``fl_y`` and ``cy`` of ``h``, ``cx`` of
+    ``w``), and lens distortion, at the top or, overriding that, in a frame; a second pose in a
+    frame. size: width and height, px; None for those that the file gives. shutter_samples: times at
+    which what motion blurs is rendered.
+
+    Raises :class:`UserError` naming the file, the key, what was expected and what was got.
+    """
+    meta = read_transforms(path)
+    frames = meta["frames"]
+    digits = len(str(len(frames) - 1))
+    return [
+        _read_viewpoint(
+            InheritedValues(own, f"{path}: frames[{i}].", meta, path),
+            f"camera_{i:0{digits}d}",
+            size,
+            shutter_samples,
+        )
+        for i, own in enumerate(frames)
+    ]
+
+
+def _read_viewpoint(
+    frame: InheritedValues, name: str, size: tuple[int, int] | None, shutter_samples: int
+) -> Viewpoint:
+    values, where = frame.values, frame.where
+    pose = opencv_camera_to_world(values, where)
+    if size is None:
+        missing = [key for key in ("w", "h") if key not in values]
+        if missing:
+            raise UserError(f"{where}{missing[0]} is missing; give --size WIDTH HEIGHT instead")
+        size = tuple(max(1, round(positive(values, key, where))) for key in ("w", "h"))
+    width, height = size
+    if "fl_x" in values:
+        scale = width / positive(values, "w", where)
+        focal = scale * positive(values, "fl_x", where)
+    elif "camera_angle_x" in values:
+        focal = focal_from_angle(values, "camera_angle_x", where, width)
+    else:
+        raise UserError(f"{where}camera_angle_x (or fl_x with w) is missing")
+    focal_y = focal
+    if "fl_x" in values and "fl_y" in values:
+        focal_y = height * positive(values, "fl_y", where) / positive(values, "h", where)
+    cx, cy = width / 2, height / 2
+    if "cx" in values and "cy" in values:
+        cx = width * number(values, "cx", where) / positive(values, "w", where)
+        cy = height * number(values, "cy", where) / positive(values, "h", where)
+    lens, motion = lens_of(frame), motion_of(frame, shutter_samples)
+    return Viewpoint(name, pose, focal, focal_y, cx, cy, width, height, lens, motion)
+
+
+def shown(vector: np.ndarray) -> str:
+    """A vector as messages write it."""
+    return f"({', '.join(f'{v:g}' for v in vector)})"

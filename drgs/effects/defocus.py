@@ -1,0 +1,133 @@
+"""Depth of field: what is out of focus is blurred, as a thin lens blurs it.
+
+Imported when a camera has an aperture. A point is spread over a disc; here the disc's variance is
+added to the splat's covariance on the film, and its opacity falls such that its integral stays. The
+alpha at which it ends falls with it: a surface of many small splats, each of them hardly there when
+it is far out of focus, is as opaque as in focus. What a picture by many rays shows beyond that,
+such as what is seen past the blurred edge of something near, needs the rays.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import drjit as dr
+
+from drgs.cameras.camera import Camera
+from drgs.core.constants import NEGLIGIBLE_ALPHA
+from drgs.splatting.cutoffs import Cutoffs
+from drgs.splatting.image_model import Footprint, Offsets
+from drgs.splatting.projection import FilmShape, GaussianRows
+
+
+@dataclass(frozen=True)
+class Defocused:
+    """A projection (see ``drgs.splatting.projection.ewa``), blurred by the camera's aperture."""
+
+    shape: Callable
+
+    def __call__(
+        self, rows: GaussianRows, camera: Camera, position: Any, low_pass: float
+    ) -> FilmShape:
+        """The blurred shape; its ``dimming`` keeps the integral. ``sharp`` and ``added`` are those
+        of the low-pass alone.
+        """
+        film = self.shape(rows, camera, position, low_pass)
+        spread = camera.aperture.variance(camera, position.z)
+        blurred = self.shape(rows, camera, position, low_pass + spread)
+        return replace(
+            blurred,
+            sharp=film.sharp,
+            added=film.added,
+            dimming=_root_determinant(blurred) / _root_determinant(film),
+        )
+
+
+def _root_determinant(film: FilmShape) -> Any:
+    """sqrt(det(conic)) at the mean.
+
+    That of ``drgs.accuracy.exact`` is divided by |a_c|, whose inverse is its fourth number.
+    """
+    p, _, s = film.whitening
+    if film.perspective is not None and len(film.perspective) > 3:
+        p, s = p / film.perspective[3], s / film.perspective[3]
+    return dr.abs(p * s)
+
+
+@dataclass(frozen=True)
+class DimmedResponse:
+    """A response whose splats end where they would without dimming.
+
+    *Geometry* is that of the response, then the base-2 logarithm of the dimming. It has no
+    derivatives: the cut is a decision.
+    """
+
+    of: Any
+
+    @property
+    def num_geometry(self) -> int:
+        """Numbers of a splat."""
+        return self.of.num_geometry + 1
+
+    @property
+    def num_moments(self) -> int:
+        """Sums over pixels, by splat."""
+        return self.of.num_moments
+
+    def seen_by(self, camera: Camera) -> DimmedResponse:
+        """For one camera."""
+        return replace(self, of=self.of.seen_by(camera))
+
+    @property
+    def camera(self) -> Any:
+        """That the response is for."""
+        return self.of.camera
+
+    def log2_floor(self, geometry: list[Any], cutoffs: Cutoffs) -> Any:
+        """The base-2 logarithm of the smallest alpha of a splat; see ``NEGLIGIBLE_ALPHA``."""
+        log2_opacity, log2_dimming = geometry[5], geometry[-1]
+        floor = cutoffs.log2_floor(log2_opacity - log2_dimming) + log2_dimming
+        least = math.log2(NEGLIGIBLE_ALPHA)
+        return dr.select(floor > least, floor, least)
+
+    def geometry(self, splats: Any) -> list[Any]:
+        """Columns, one value per Gaussian."""
+        return [*self.of.geometry(splats), dr.log2(splats.dimming)]
+
+    def differentiable(self, splats: Any) -> list[Any]:
+        """What :meth:`derivatives` are with respect to."""
+        return [*self.of.differentiable(splats), dr.detach(splats.dimming)]
+
+    def bounds(self, splats: Any, geometry: list[Any], reach: Any) -> tuple[Any, Any]:
+        """Centre and half sizes (Array2f, px) of the box around what shows."""
+        return self.of.bounds(splats, geometry[:-1], reach)
+
+    def outline(self, geometry: list[Any], reach: Any) -> list[Any]:
+        """Mean x, y, p, r, s of an ellipse |U d|^2 <= ``reach`` that holds the splat."""
+        return self.of.outline(geometry[:-1], reach)
+
+    def footprint(self, geometry: list[Any], offsets_from: Offsets, active: Any) -> Footprint:
+        """At the 16 pixels of each lane."""
+        return self.of.footprint(geometry[:-1], offsets_from, active)
+
+    def moments(self, footprint: Footprint, weights: list[Any], positions: Any) -> list[Any]:
+        """Sums over the 16 pixels."""
+        return self.of.moments(footprint, weights, positions)
+
+    def derivatives(self, geometry: list[Any], totals: list[Any]) -> list[Any]:
+        """From moments to the derivatives of what :meth:`differentiable` lists."""
+        derivatives = self.of.derivatives(geometry[:-1], totals)
+        return [*derivatives, dr.zeros(type(totals[0]), dr.width(totals[0]))]
+
+    def pack_tangents(self, geometry: list[Any], tangents: list[Any]) -> list[Any]:
+        """Tangents of the geometry."""
+        return [*self.of.pack_tangents(geometry[:-1], tangents[:-1]), tangents[-1]]
+
+    def tangent(
+        self, geometry: list[Any], footprint: Footprint, d_geometry: list[Any]
+    ) -> list[Any]:
+        """Tangent of ln(alpha) at the 16 pixels."""
+        return self.of.tangent(geometry[:-1], footprint, d_geometry[:-1])

@@ -1,0 +1,57 @@
+"""Spherical harmonics coefficients of a function that is rotated.
+
+Host code: a model is rotated once, when it is loaded. The functions of one degree transform among
+themselves (Green 2003, "Spherical Harmonic Lighting: The Gritty Details"), and their matrix is
+found by projection: it is determined by the functions' values in enough directions, whatever their
+order and signs.
+"""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+
+from drgs.gaussians.sh import num_coefficients, sh_basis
+
+NUM_DIRECTIONS = 64
+"""Spread over the sphere, many more than the 7 functions of degree 3: the equations are then as
+well conditioned as the functions are orthogonal."""
+
+
+def sh_rotation(rotation: np.ndarray, degree: int) -> list[np.ndarray]:
+    """For each degree l from 1 to ``degree``, the matrix D (2 l + 1, 2 l + 1) with c' = D c.
+
+    rotation: R (3, 3), x' = R x. With c' for c, the function's value in a direction R d is what it
+    was in d: sum_k Y_k(d') c'_k = sum_k Y_k(R^T d') c_k for all unit d'. float64.
+    """
+    directions = _directions()
+    after, before = _basis(directions, degree), _basis(directions @ rotation, degree)
+    bands = [slice(num_coefficients(k - 1), num_coefficients(k)) for k in range(1, degree + 1)]
+    return [np.linalg.lstsq(after[:, b], before[:, b], rcond=None)[0] for b in bands]
+
+
+def rotated(coefficients: np.ndarray, rotation: np.ndarray) -> np.ndarray:
+    """Coefficients (N, K - 1, 3) of degree 1 and above, rotated; K = (degree + 1)^2."""
+    degree = round(np.sqrt(coefficients.shape[1] + 1)) - 1
+    turned, start = [coefficients[:, :0]], 0
+    for matrix in sh_rotation(rotation, degree):
+        band = coefficients[:, start : start + len(matrix)]
+        turned.append(np.einsum("kj,njc->nkc", matrix, band))
+        start += len(matrix)
+    return np.concatenate(turned, axis=1)
+
+
+def _directions() -> np.ndarray:
+    """(NUM_DIRECTIONS, 3) unit vectors: a Fibonacci lattice."""
+    index = np.arange(NUM_DIRECTIONS)
+    z = 1 - (2 * index + 1) / NUM_DIRECTIONS
+    radius, angle = np.sqrt(1 - z * z), index * np.pi * (3 - np.sqrt(5))
+    return np.stack([radius * np.cos(angle), radius * np.sin(angle), z], axis=1)
+
+
+def _basis(directions: np.ndarray, degree: int) -> np.ndarray:
+    """(N, (degree + 1)^2) values in unit directions (N, 3)."""
+    x, y, z = directions.T
+    columns = sh_basis(SimpleNamespace(x=x, y=y, z=z), degree)
+    return np.stack([np.broadcast_to(column, x.shape) for column in columns], axis=1)

@@ -1,0 +1,67 @@
+"""Rotation, uniform scale and translation of a model, as a ``to_world`` gives them.
+
+Host code, applied once when a model is loaded: Gaussians stay Gaussians with the same opacities,
+and what they look like from the side stays the same.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from drgs.gaussians.parameters import Gaussians
+from drgs.gaussians.sh_rotation import rotated
+
+TOLERANCE = 1e-4
+"""Of A^T A / s^2 - I: numbers written with five digits are a rotation, a shear by a pixel in ten
+thousand is one. What is left is then taken off: the nearest rotation is used."""
+
+
+@dataclass(frozen=True)
+class Similarity:
+    """x' = scale * rotation x + translation."""
+
+    scale: float
+    rotation: np.ndarray  # (3, 3), orthonormal, determinant 1
+    translation: np.ndarray  # (3,)
+
+    @staticmethod
+    def of(matrix: np.ndarray, name: str) -> Similarity:
+        """From a homogeneous matrix (4, 4). Raises ValueError that begins with ``name``."""
+        matrix = np.asarray(matrix, np.float64)
+        linear = matrix[:3, :3]
+        is_affine = np.isfinite(matrix).all() and (matrix[3] == [0, 0, 0, 1]).all()
+        if is_affine and (determinant := np.linalg.det(linear)) > 0:
+            scale = np.cbrt(determinant)
+            if np.abs(linear.T @ linear / scale**2 - np.eye(3)).max() <= TOLERANCE:
+                left, _, right = np.linalg.svd(linear)
+                return Similarity(float(scale), left @ right, matrix[:3, 3])
+        rows = "; ".join(" ".join(f"{number:g}" for number in row) for row in matrix)
+        raise ValueError(
+            f"{name} must be made of rotations, translations and scales that are the same along "
+            f"all axes and positive, got the matrix [{rows}]"
+        )
+
+    def of_gaussians(self, gaussians: Gaussians) -> Gaussians:
+        """Gaussians (numpy) moved, with what is seen of them from each side; float32."""
+        wxyz = np.roll(Rotation.from_matrix(self.rotation).as_quat(), 1)
+        g = replace(
+            gaussians,
+            means=self.scale * (gaussians.means @ self.rotation.T) + self.translation,
+            quats=_product(wxyz, gaussians.quats.astype(np.float64)),
+            log_scales=gaussians.log_scales + np.log(self.scale),
+            shN=rotated(gaussians.shN.astype(np.float64), self.rotation),
+        )
+        if g.smoothing is not None:
+            g = replace(g, smoothing=(g.smoothing * self.scale).astype(np.float32))
+        names = ("means", "quats", "log_scales", "shN")
+        return replace(g, **{name: getattr(g, name).astype(np.float32) for name in names})
+
+
+def _product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Hamilton's product of a quaternion (4,) and quaternions (N, 4), wxyz: first b, then a."""
+    w, x, y, z = a
+    left = np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]])
+    return b @ left.T

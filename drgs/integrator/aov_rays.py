@@ -1,0 +1,168 @@
+"""Inside Mitsuba's ``aov``: what the single rays of a whole picture see.
+
+Imported when ``aov`` asks. That integrator takes the picture of a nested one, and its derivatives,
+from ``render``, ``render_backward`` and ``render_forward``. It then calls ``sample`` with the rays
+of a picture of its own, all pixels at once, and takes from that the AOVs of the nested integrator
+and what the film holds besides its picture.
+
+Splats are composited over whole images, so rays are only answered if they are those of one: ray k
+starts in pixel k // n of the sensor that was rendered last, n of them a pixel. Where in its pixel
+each of them starts is found by looking at it through the camera; the splats are then evaluated at
+these very points.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from drgs.accuracy.sample_points import SamplePoints
+from drgs.cameras.camera import Camera
+from drgs.cameras.orthographic import Orthographic
+from drgs.core.arrays import interleave
+from drgs.integrator.film import Channels, pixel_corners
+from drgs.integrator.picture import hybrid_of
+from drgs.integrator.sensors import camera_from_sensor, read_sensor
+from drgs.integrator.view import View, constant_background
+
+REFUSAL = (
+    "splats: this integrator renders whole images: of those that sample the rays of another one, "
+    "such as 'moment', it can only be nested in 'aov'"
+)
+
+NESTED = -1
+"""Number of the view."""
+
+SLACK = 1 / 16
+"""px: how far outside of its pixel a ray may be found. Single precision finds it to 1e-3."""
+
+ROUNDING = 1e-5
+"""How far a ray may pass by the camera's centre, relative to the numbers that say where it is."""
+
+
+@dataclass(frozen=True, eq=False)
+class PictureRays:
+    """Rays of a whole picture, and where they start. Equality is identity."""
+
+    ray: Any  # RayDifferential3f (H * W * count,): those of a pixel are neighbours
+    count: int  # rays per pixel
+    positions: tuple[SamplePoints, ...]  # by sample
+
+    @staticmethod
+    def of(sensor: mi.Sensor | None, near: float, ray: mi.RayDifferential3f) -> PictureRays:
+        """Find where in their pixels the rays start.
+
+        sensor: of which a picture was rendered last, None if there was none; near: near plane of
+        the integrator, scene units.
+
+        Raises NotImplementedError for rays that are not those of a picture of this sensor.
+        """
+        if sensor is None:
+            raise NotImplementedError(REFUSAL)
+        film = sensor.film()
+        width, height = film.crop_size()
+        count, rest = divmod(dr.width(ray), width * height)
+        if count == 0 or rest or sensor.class_name() == "BatchSensor":
+            raise NotImplementedError(_unknown(sensor))
+        camera = camera_from_sensor(read_sensor(sensor, near))
+        if camera.shutter is not None:
+            raise NotImplementedError(_unknown(sensor))
+        corner = dr.repeat(pixel_corners(film), count)
+        place, on_camera = _look_back(camera, ray)
+        within = place - corner
+        inside = (dr.min(within) > -SLACK) & (dr.max(within) < 1 + SLACK)
+        if not dr.all(inside & on_camera):
+            raise NotImplementedError(_unknown(sensor))
+        within = dr.clip(within, 0, 1 - dr.epsilon(mi.Float))
+        pixel = dr.arange(mi.UInt32, width * height)
+        positions = [dr.gather(mi.Point2f, within, pixel * count + s) for s in range(count)]
+        dr.eval(positions)
+        return PictureRays(ray, count, tuple(SamplePoints(*p) for p in positions))
+
+    @property
+    def within(self) -> tuple[tuple[Any, Any], ...]:
+        """Where they start, by sample: x and y from their pixels' upper left corners, px."""
+        return tuple((p.x, p.y) for p in self.positions)
+
+    def channels(
+        self,
+        integrator: Any,
+        scene: mi.Scene,
+        sensor: mi.Sensor,
+        sampler: mi.Sampler,
+        active: mi.Bool,
+    ) -> Channels:
+        """What the rays see, each Float (H * W * count,): colour, alpha, AOVs of the integrator."""
+        hybrid = hybrid_of(integrator, scene, sensor, 0, 1)
+        # With a single sample, what is seen of edges would be the mean over their pixels.
+        times = 2 if self.count == 1 and hybrid is not None else 1
+        view = View(
+            integrator=integrator,
+            scene=scene,
+            index=NESTED,
+            sensor=sensor,
+            positions=times * self.positions,
+            within=times * self.within,
+            key=self,
+            has_alpha=True,
+            hybrid=hybrid,
+        )
+        channels = self._gathered(view.channels(view.planes(), constant_background(integrator)))
+        integrator.memory.forget_view(NESTED)
+        if hybrid is not None:
+            channels = self._with_surfaces(channels, hybrid, sampler, active)
+        return channels
+
+    def _gathered(self, passes: Sequence[Channels]) -> Channels:
+        """Channels by ray, from those by pixel of each sample."""
+        planes = zip(*passes[: self.count], strict=True)
+        return [mi.Float(interleave(list(of_samples))) for of_samples in planes]
+
+    def _with_surfaces(
+        self, channels: Channels, hybrid: Any, sampler: mi.Sampler, active: mi.Bool
+    ) -> Channels:
+        """The channels with what the nested integrator sees along the rays.
+
+        hybrid: see ``drgs.integrator.surfaces.Hybrid``, whose own channels are at the end.
+        """
+        # Of the base class, as integrators written in Python have another signature.
+        radiance, *_ = mi.SamplingIntegrator.sample(
+            hybrid.integrator, hybrid.scene, sampler, self.ray, None, active
+        )
+        if hybrid.insertion.display_space:
+            radiance = mi.math.linear_to_srgb(dr.maximum(mi.Color3f(radiance), 0))
+        share = channels[-len(hybrid.insertion.channels)]
+        shown = [dr.fma(share, s, c) for s, c in zip(radiance, channels[:3], strict=True)]
+        return [*shown, *channels[3 : -len(hybrid.insertion.channels)]]
+
+
+def _look_back(camera: Camera, ray: mi.Ray3f) -> tuple[mi.Point2f, mi.Bool]:
+    """Where on the film rays start, px; whether they belong to this camera."""
+    offset = camera.rotation @ mi.Vector3f(ray.o - mi.Point3f(camera.center))
+    direction = camera.rotation @ mi.Vector3f(ray.d)
+    radius = mi.Float(0)
+    if isinstance(camera.lens, Orthographic):
+        place = camera.lens.film_point(camera, offset)
+    elif camera.aperture is None:
+        place = camera.lens.film_point(camera, direction)
+    else:  # rays of one place meet where it is in focus
+        radius = camera.aperture.radius
+        t = (camera.aperture.focus_distance - offset.z) / direction.z
+        place = camera.lens.film_point(camera, offset + t * direction)
+    origin, axis, seen = camera.look_through(place.x, place.y)
+    passes_by = dr.norm(dr.cross(offset - origin, direction))
+    size = dr.norm(camera.center) + dr.norm(ray.o) + dr.norm(offset - origin)
+    near = passes_by <= radius * (1 + SLACK) + ROUNDING * size
+    return mi.Point2f(place), near & (dr.dot(axis, direction) > 0) & seen
+
+
+def _unknown(sensor: mi.Sensor) -> str:
+    return (
+        "splats: inside 'aov', rays must be those of the whole film, without sample_border, of a "
+        "sensor of type perspective, thinlens, orthographic or calibrated that stands still; "
+        f"those of {sensor.class_name()} '{sensor.id()}' are not"
+    )

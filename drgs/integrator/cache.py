@@ -1,0 +1,75 @@
+"""What a picture keeps for the next one: frames, surfaces, maps of films."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import drjit as dr
+import numpy as np
+
+from drgs.gaussians.parameters import Gaussians
+from drgs.integrator.sensors import SensorState
+from drgs.splatting import rendering
+
+
+@dataclass(frozen=True)
+class Rendered:
+    """The last frames of a view, and everything that they depend on."""
+
+    frames: list[list[rendering.Frame]]  # by time; one for each sample per pixel
+    pipeline: rendering.Pipeline
+    exposure: Any  # key of the points that were sampled; None: pixel centres
+    sensor: SensorState
+    gaussians: Gaussians  # detached: holding them keeps their variable indices from being reused
+    traced: TracedSurfaces | None  # what was seen besides splats
+
+    def matches(
+        self,
+        pipeline: rendering.Pipeline,
+        exposure: Any,
+        sensor: SensorState,
+        gaussians: Gaussians,
+        traced: TracedSurfaces | None,
+    ) -> bool:
+        """Whether rendering these would give the same frames."""
+        indices = dr.detail.collect_indices
+        return (
+            self.pipeline == pipeline
+            and self.exposure == exposure
+            and self.sensor.same_as(sensor)
+            and indices(self.gaussians) == indices(gaussians)
+            and self.traced is traced
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class TracedSurfaces:
+    """What a sensor saw of a scene's surfaces, and everything that this depends on."""
+
+    surfaces: Any  # drgs.integrator.surfaces.Surfaces
+    settings: Any  # of the integrator, and the key of the points that were looked at
+    sensor: SensorState
+    seen: list[list[Any]]  # by time and by sample: drgs.integrator.surfaces.SeenSurface
+
+    def matches(self, surfaces: Any, settings: Any, sensor: SensorState) -> bool:
+        """Whether looking at these would be the same."""
+        same = self.surfaces is surfaces and self.settings == settings
+        return same and self.sensor.same_as(sensor)
+
+
+@dataclass(frozen=True)
+class Memory:
+    """What an integrator keeps. Views are known by their numbers."""
+
+    rendered: dict[int, Rendered] = field(default_factory=dict)
+    traced: dict[int, TracedSurfaces] = field(default_factory=dict)
+    surfaces: dict[str, Any] = field(
+        default_factory=dict
+    )  # "last": drgs.integrator.surfaces.Surfaces
+    film_maps: dict[str, np.ndarray] = field(default_factory=dict)  # see drgs.integrator.film
+
+    def forget_view(self, index: int) -> None:
+        """A view that will not be asked for again."""
+        self.rendered.pop(index, None)
+        self.traced.pop(index, None)

@@ -1,0 +1,173 @@
+"""One picture of the integrator ``splats``: what its sensor sees, as channels of the film.
+
+A :class:`Picture` has a :class:`View` for each sensor, which are several only for a batch. A view
+renders frames (``drgs.splatting.rendering``), one for each time at which its shutter is open and
+each sample per pixel; puts what is behind the splats behind them; and gives the film its channels.
+The film develops these (``drgs.integrator.film``), and a nested integrator's picture of surfaces
+comes in between (``drgs.integrator.surfaces``). :meth:`Picture.backward` and
+:meth:`Picture.tangent` run the same way back and along.
+
+Frames are reused while nothing that they depend on has changed: ``mi.render`` calls ``render`` and,
+later, ``render_backward`` on the same integrator, with other pictures possibly in between.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import reduce
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from drgs.gaussians.parameters import Gaussians
+from drgs.integrator.film import CenterSamples
+from drgs.integrator.view import Planes, View, constant_background
+from drgs.splatting import rendering
+
+# ----------------------------------------------------------------------------------------------
+# What is kept from one picture to the next
+# ----------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class Picture:
+    """One picture."""
+
+    views: list[View]
+    exposure: Any
+    hybrid: Any  # drgs.integrator.surfaces.Hybrid; None: there are splats alone
+    batch: Any = None  # drgs.integrator.batch.SideBySide, for several views
+
+    @staticmethod
+    def of(integrator: Any, scene: mi.Scene, sensor: mi.Sensor, seed: Any, spp: int) -> Picture:
+        """Where the sensor's pixels are evaluated, and how its film develops them."""
+        hybrid = hybrid_of(integrator, scene, sensor, seed, spp)
+        names = integrator.aov_names() + ([] if hybrid is None else hybrid.insertion.channels)
+        film, spp = sensor.film(), spp or sensor.sampler().sample_count()
+        maps = integrator.memory.film_maps
+        if spp == 1 and film.rfilter().is_box_filter():
+            exposure = CenterSamples(film, maps, names)
+        else:
+            from drgs.integrator.sampling import DrawnSamples
+
+            exposure = DrawnSamples(sensor, seed, spp, maps, names)
+        whole = View(
+            integrator=integrator,
+            scene=scene,
+            index=0,
+            sensor=sensor,
+            positions=exposure.positions,
+            within=exposure.within,
+            key=exposure.key,
+            has_alpha=mi.has_flag(film.flags(), mi.FilmFlags.Alpha),
+            hybrid=hybrid,
+        )
+        if sensor.class_name() != "BatchSensor":
+            return Picture([whole], exposure, hybrid)
+        from drgs.integrator.batch import SideBySide
+
+        batch = SideBySide.of(sensor)
+        views = [
+            replace(
+                whole,
+                index=index,
+                sensor=one,
+                positions=batch.positions(whole.positions, index),
+                within=batch.within(whole.within, index),
+            )
+            for index, one in enumerate(batch.sensors)
+        ]
+        return Picture(views, exposure, hybrid, batch)
+
+    def image(self) -> mi.TensorXf:
+        """The developed picture."""
+        image = self._image_of_splats()
+        if self.hybrid is None:
+            return image
+        return self.hybrid.insertion.develop(image, self.hybrid.picture())
+
+    def backward(self, params: Any, grad_in: mi.TensorXf) -> rendering.GaussianGradients:
+        """Derivatives with respect to the Gaussians; all others are accumulated.
+
+        params: as ``mi.render`` has them; grad_in: derivative of the loss with respect to the
+        image.
+        """
+        if self.hybrid is not None:
+            own, nested = self._image_of_splats(), self.hybrid.picture()
+            grad_in, d_nested = self.hybrid.insertion.adjoint(own, nested, grad_in)
+        d_passes = self.exposure.adjoint(grad_in)
+        gradients = [
+            view.backward(d_passes if self.batch is None else self.batch.cut(d_passes, view.index))
+            for view in self.views
+        ]
+        if self.hybrid is not None:
+            self.hybrid.backward(params, d_nested)
+        return reduce(rendering.added, gradients)
+
+    def tangent(self, params: Any, tangents: Gaussians) -> mi.TensorXf:
+        """Directional derivative of the image.
+
+        tangents: of the Gaussians; those of all other parameters are set on them.
+        """
+        integrator = self.views[0].integrator
+        d_planes = [view.plane_tangents(tangents) for view in self.views]
+        planes = [view.planes() for view in self.views]
+        dr.eval(planes, d_planes)
+        with dr.resume_grad():
+            constant = constant_background(integrator)
+            dr.enable_grad(planes, constant)
+            dr.set_grad(planes, d_planes)
+            if constant is not None:
+                dr.set_grad(constant, dr.grad(integrator.background))
+            image = self._developed(planes, constant)
+            # The nested integrator, and other pictures of the same pass, read the gradients of
+            # parameters again, also of those that are computed from others.
+            dr.forward_to(image, flags=dr.ADFlag.ClearEdges)
+            d_image = dr.grad(image)
+        if self.hybrid is None:
+            return d_image
+        nested = self.hybrid.picture()
+        d_nested = self.hybrid.tangent(params, nested)
+        return self.hybrid.insertion.tangent(dr.detach(image), nested, d_image, d_nested)
+
+    def _image_of_splats(self) -> mi.TensorXf:
+        """For a hybrid picture, with the channels that the insertion needs."""
+        constant = constant_background(self.views[0].integrator)
+        return self._developed([view.planes() for view in self.views], constant)
+
+    def _developed(self, planes: list[Planes], constant: mi.Color3f | None) -> mi.TensorXf:
+        """planes: by view."""
+        pictures = [v.channels(p, constant) for v, p in zip(self.views, planes, strict=True)]
+        passes = pictures[0] if self.batch is None else self.batch.put_together(pictures)
+        return self.exposure.develop(passes)
+
+
+def hybrid_of(integrator: Any, scene: mi.Scene, sensor: mi.Sensor, seed: Any, spp: int) -> Any:
+    """The part that surfaces take in a picture; None where there are none."""
+    if all(shape.is_ellipsoids() for shape in scene.shapes()):
+        return None
+    from drgs.integrator.surfaces import Hybrid, Insertion, Surfaces
+
+    memory, hide_emitters = integrator.memory, integrator.hide_emitters
+    surfaces = Surfaces.of(scene, memory.surfaces.get("last"))
+    memory.surfaces["last"] = surfaces
+    nested = integrator.nested or mi.load_dict({"type": "path", "hide_emitters": hide_emitters})
+    insertion = Insertion(
+        sensor.film(),
+        memory.film_maps,
+        integrator.aov_names(),
+        shows_background=not hide_emitters and scene.environment() is not None,
+        display_space=not integrator.srgb_primitives,
+    )
+    traced = surfaces.traced(scene)
+    return Hybrid(traced, surfaces, nested, sensor, seed, integrator.nested_spp or spp, insertion)
+
+
+def sensors_of(sensor: mi.Sensor) -> list[mi.Sensor]:
+    """Those of a batch, or the one."""
+    if sensor.class_name() != "BatchSensor":
+        return [sensor]
+    from drgs.integrator.batch import SideBySide
+
+    return SideBySide.of(sensor).sensors

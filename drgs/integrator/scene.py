@@ -1,0 +1,159 @@
+"""From a dataset to Mitsuba objects: sensors for the views, a scene with the integrator.
+
+The trainer and the commands reach the integrator through these dictionaries, as any Mitsuba scene
+would.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from drgs.config.approximations import Approximations
+from drgs.config.schema import ModelConfig
+from drgs.core.errors import UserError
+from drgs.data.types import View
+from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
+
+SQUARE_PIXEL_TOLERANCE = 0.01
+"""px: largest shift at the image's border that may come from treating pixels as square."""
+
+
+def make_scene(
+    gaussians: Gaussians,
+    model: ModelConfig,
+    background: tuple[float, float, float] | Path,
+    **settings: Any,
+) -> mi.Scene:
+    """A scene that holds nothing but the ``splats`` integrator, working in display space.
+
+    gaussians: numpy or Dr.Jit arrays; background: display space, or a file with a picture;
+    settings: of the integrator.
+    """
+    uploaded = gaussians.to(mi.TensorXf)
+    tensors = {name: getattr(uploaded, name) for name in PARAMETER_NAMES}
+    if uploaded.smoothing is not None:
+        tensors["smoothing"] = uploaded.smoothing
+    integrator = {
+        "type": "splats",
+        "background": _picture(background) if isinstance(background, Path) else list(background),
+        "near": model.near,
+        **accuracy(model),
+        "srgb_primitives": False,
+        **settings,
+        **tensors,
+    }
+    return mi.load_dict({"type": "scene", "integrator": integrator})
+
+
+def _picture(path: Path) -> dict[str, Any]:
+    return {"type": "bitmap", "filename": str(path), "wrap_mode": "clamp"}
+
+
+def accuracy(model: ModelConfig) -> dict[str, Any]:
+    """The integrator's parameters that are choices of accuracy; those that are not default."""
+    default = ModelConfig()
+    names = [f.name for f in fields(Approximations)]
+    return {n: getattr(model, n) for n in names if getattr(model, n) != getattr(default, n)}
+
+
+def check_lenses(model: ModelConfig, views: Iterable[View], where: str, remedy: str) -> None:
+    """Raise :class:`UserError` for a lens that the projection cannot render.
+
+    It would be refused when its view is rendered, perhaps long after a fit has begun. where: the
+    message's beginning; remedy: its end.
+    """
+    bent = next((view for view in views if view.lens is not None), None)
+    if model.projection == "exact" and bent is not None:
+        raise UserError(
+            f"{where}model.projection must be ewa or unscented for lenses that are no pinholes, "
+            f"such as that of view {bent.name} ({bent.lens.kind}: {', '.join(bent.lens.named())}), "
+            f"got exact; or {remedy}"
+        )
+
+
+def make_sensors(views: Iterable[View], calibrated: bool = False) -> list[mi.Sensor]:
+    """One sensor per view: box filter, one sample, RGB.
+
+    ``perspective`` where Mitsuba's own sensor can be the view's camera, else (or if all are to be)
+    ``calibrated``. Views of one size share a film.
+    """
+    films: dict[tuple[int, int], mi.Film] = {}
+    sensors = []
+    for view in views:
+        size = (view.width, view.height)
+        if size not in films:
+            films[size] = mi.load_dict(_film(*size))
+        sensors.append(mi.load_dict({**_sensor(view, calibrated), "film": films[size]}))
+    return sensors
+
+
+def _film(width: int, height: int) -> dict[str, Any]:
+    return {
+        "type": "hdrfilm",
+        "width": width,
+        "height": height,
+        "pixel_format": "rgb",
+        "component_format": "float32",
+        "rfilter": {"type": "box"},
+    }
+
+
+def _sensor(view: View, calibrated: bool) -> dict[str, Any]:
+    pose = {
+        "to_world": _to_world(view.camera_to_world),
+        "near_clip": 1e-3,  # the integrator's own near plane decides
+        "sampler": {"type": "independent", "sample_count": 1},
+    }
+    is_perspective = view.lens is None and view.motion is None and _has_square_pixels(view)
+    if is_perspective and not calibrated:
+        return pose | _perspective(view)
+    intrinsics = {name: getattr(view, name) for name in ("fx", "fy", "cx", "cy")}
+    if view.lens is not None:
+        intrinsics |= {"lens": view.lens.kind, **view.lens.named()}
+    if view.motion is not None:
+        pose["to_world_close"] = _to_world(view.motion.close_to_world)
+        pose["shutter"] = view.motion.shutter
+        pose["shutter_samples"] = view.motion.samples
+    return {"type": "calibrated", **pose, **intrinsics}
+
+
+def _to_world(camera_to_world: np.ndarray) -> mi.ScalarTransform4f:
+    """Mitsuba's camera has x to the left and y up."""
+    return mi.ScalarTransform4f(camera_to_world @ np.diag([-1.0, -1.0, 1.0, 1.0]))
+
+
+def _perspective(view: View) -> dict[str, Any]:
+    focal = math.sqrt(view.fx * view.fy)
+    return {
+        "type": "perspective",
+        "fov": math.degrees(2 * math.atan(0.5 * view.width / focal)),
+        "fov_axis": "x",
+        "principal_point_offset_x": 0.5 - view.cx / view.width,
+        "principal_point_offset_y": 0.5 - view.cy / view.height,
+    }
+
+
+def _has_square_pixels(view: View) -> bool:
+    """To within :data:`SQUARE_PIXEL_TOLERANCE`."""
+    focal = math.sqrt(view.fx * view.fy)
+    shift = max(
+        abs(view.fx / focal - 1) * max(view.cx, view.width - view.cx),
+        abs(view.fy / focal - 1) * max(view.cy, view.height - view.cy),
+    )
+    return shift <= SQUARE_PIXEL_TOLERANCE
+
+
+def render_views(scene: mi.Scene, views: tuple[View, ...]) -> Iterator[np.ndarray]:
+    """Pictures (H, W, 3) of ``views``, display space, clamped to [0, 1]."""
+    for sensor in make_sensors(views):
+        with dr.suspend_grad():
+            image = np.array(mi.render(scene, sensor=sensor, spp=1))
+            yield np.clip(image[:, :, :3], 0, 1)  # what else is put out comes behind the colours

@@ -1,0 +1,180 @@
+"""Cameras of Mitsuba's sensors."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import drjit as dr
+
+from drgs.cameras.camera import Camera
+from drgs.core.arrays import types_of
+
+
+@dataclass(frozen=True)
+class SensorState:
+    """All that the camera of a Mitsuba sensor depends on, film and crop included.
+
+    Holding it keeps the variables of ``device`` alive, so that equal indices mean equal values.
+    """
+
+    device: dict[str, Any]  # numbers on the device, by the names that Mitsuba gives them
+    host: tuple[float, ...]  # film width and height, crop offset x and y, crop size, near
+    make: Callable[[SensorState], Camera]
+
+    @property
+    def is_attached(self) -> bool:
+        """Whether derivatives with respect to one of the sensor's parameters are asked for."""
+        return any(dr.grad_enabled(value) for value in self.device.values())
+
+    def detached(self) -> SensorState:
+        """The same without derivatives."""
+        return replace(self, device=dr.detach(self.device))
+
+    def same_as(self, other: SensorState) -> bool:
+        """Whether both give the same camera."""
+        indices = dr.detail.collect_indices
+        return (
+            self.make == other.make
+            and self.host == other.host
+            and indices(self.device) == indices(other.device)
+        )
+
+
+def read_sensor(sensor: Any, near: float) -> SensorState:
+    """Collect a sensor's state without reading anything back from the device.
+
+    near: near plane, scene units; the sensor's ``near_clip`` applies as well, the larger wins.
+
+    Raises TypeError for a sensor that is none of ``perspective``, ``thinlens``, ``orthographic``
+    and ``calibrated``.
+    """
+    import mitsuba as mi
+
+    if hasattr(sensor, "lens"):  # ours: see ``plugins/calibrated.py``
+        names, make = sensor.camera_parameters, sensor.camera_from_state
+    elif isinstance(sensor, mi.ProjectiveCamera):
+        names, make = _PROJECTIVE[sensor.class_name()]
+    else:
+        raise TypeError(
+            "splats: the sensor must be of type perspective, thinlens, orthographic or "
+            f"calibrated, got {sensor.class_name()} '{sensor.id()}'"
+        )
+    params = mi.traverse(sensor)
+    device = {name: params[name] for name in names}
+    device = {k: v.matrix if k.startswith("to_world") else v for k, v in device.items()}
+    film = sensor.film()
+    host = (*film.size(), *film.crop_offset(), *film.crop_size(), max(near, sensor.near_clip()))
+    return SensorState(device=device, host=host, make=make)
+
+
+def camera_from_sensor(state: SensorState) -> Camera:
+    """The camera of a Mitsuba sensor's crop window, detached.
+
+    ``state.make(state)`` is the one that Dr.Jit differentiates in the sensor's parameters.
+    """
+    state = state.detached()
+    dr.make_opaque(state.device)  # or each value of a literal would be a new kernel
+    camera = state.make(state)
+    dr.make_opaque(camera)
+    return camera
+
+
+def _perspective(state: SensorState) -> Camera:
+    """Of type ``perspective``; a thin lens has no offsets of the principal point."""
+    width, height, *_ = host = opaque_host(state)
+    device = state.device
+    # x_fov is the horizontal field of view of the whole film, whatever 'fov_axis' was given.
+    focal = width / (2 * dr.tan(dr.deg2rad(device["x_fov"]) / 2))
+    offset_x = device.get("principal_point_offset_x", 0)
+    offset_y = device.get("principal_point_offset_y", 0)
+    principal = (width / 2 - offset_x * width, height / 2 - offset_y * height)
+    return on_crop_window(state, host, device["to_world"], (focal, focal), principal)
+
+
+def _thin_lens(state: SensorState) -> Camera:
+    """Of type ``thinlens``: what is not at the focus distance is blurred."""
+    from drgs.cameras.thin_lens import Aperture
+
+    device = state.device
+    scales = axis_lengths(device["to_world"])
+    aperture = Aperture(device["aperture_radius"] * scales[0], device["focus_distance"] * scales[2])
+    return replace(_perspective(state), aperture=aperture)
+
+
+def _orthographic(state: SensorState) -> Camera:
+    """Of type ``orthographic``: its film is 2 units of its own wide."""
+    from drgs.cameras.orthographic import Orthographic
+
+    width, height, *_ = host = opaque_host(state)
+    scale_x, scale_y, _ = axis_lengths(state.device["to_world"])
+    focal = (width / (2 * scale_x), width / (2 * scale_y))
+    camera = on_crop_window(state, host, state.device["to_world"], focal, (width / 2, height / 2))
+    return camera.with_lens(Orthographic())
+
+
+_PROJECTIVE = {
+    "PerspectiveCamera": (
+        ("to_world", "x_fov", "principal_point_offset_x", "principal_point_offset_y"),
+        _perspective,
+    ),
+    "ThinLensCamera": (("to_world", "x_fov", "aperture_radius", "focus_distance"), _thin_lens),
+    "OrthographicCamera": (("to_world",), _orthographic),
+}
+"""By Mitsuba's class: the parameters that the camera depends on, and who makes it."""
+
+
+def opaque_host(state: SensorState) -> list[Any]:
+    """The numbers of the host on the device.
+
+    None may be compiled into a kernel: each film, crop or view would compile its own.
+    """
+    Float = type(state.device["to_world"][0, 0])
+    return [dr.opaque(Float, value) for value in state.host]
+
+
+def on_crop_window(
+    state: SensorState, host: list[Any], to_world: Any, focal: Any, principal: Any
+) -> Camera:
+    """A camera of the crop window of a film.
+
+    to_world: 4 x 4, from Mitsuba's camera axes; focal and principal: pairs, px, of the whole film.
+    """
+    width, height, crop_x, crop_y, *_, near = host
+    *_, crop_width, crop_height, _ = state.host
+    t = types_of(type(near))
+    rotation, center = pose_from_to_world(to_world)
+    return Camera(
+        rotation=rotation,
+        center=center,
+        focal=t.Array2f(*focal),
+        principal=t.Array2f(principal[0] - crop_x, principal[1] - crop_y),
+        film_start=t.Array2f(-crop_x, -crop_y),
+        film_end=t.Array2f(width - crop_x, height - crop_y),
+        near=near,
+        width=int(crop_width),
+        height=int(crop_height),
+    )
+
+
+def pose_from_to_world(to_world: Any) -> tuple[Any, Any]:
+    """Rotation (world to camera, OpenCV axes) and centre of Mitsuba's 4 x 4 ``to_world``.
+
+    Mitsuba's camera has x to the left and y up, OpenCV's x to the right and y down. A camera has
+    no unit of length: if ``to_world`` scales, its axes are normalised.
+    """
+    right, down, forward, center = _columns(to_world)
+    t = types_of(type(center.x))
+    axes = [list(dr.normalize(axis)) for axis in (-right, -down, forward)]
+    return t.Matrix3f(axes), center
+
+
+def axis_lengths(to_world: Any) -> list[Any]:
+    """World units in a unit of the camera, by axis."""
+    return [dr.norm(column) for column in _columns(to_world)[:3]]
+
+
+def _columns(matrix: Any) -> list[Any]:
+    t = types_of(type(matrix[0, 0]))
+    return [t.Array3f([matrix[row, column] for row in range(3)]) for column in range(4)]

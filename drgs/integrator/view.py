@@ -1,0 +1,305 @@
+"""What one sensor sees of a picture."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
+from functools import reduce
+from itertools import chain, repeat
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from drgs.cameras.camera import Camera, cameras_in_time
+from drgs.effects.compose import composed, ignoring
+from drgs.gaussians.parameters import Gaussians
+from drgs.integrator.cache import Rendered, TracedSurfaces
+from drgs.integrator.film import Channels
+from drgs.integrator.sensors import SensorState, camera_from_sensor, read_sensor
+from drgs.splatting import rendering
+
+Passes = list[Channels]
+"""Channels by sample per pixel."""
+
+
+Planes = list[list[list[Any]]]
+"""Planes of frames, each Float (H * W,), by time and by sample."""
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """What one sensor sees of a picture: mostly all of it."""
+
+    integrator: Any  # whose settings, Gaussians and memory it has
+    scene: mi.Scene
+    index: int
+    sensor: mi.Sensor
+    positions: Sequence[Any]  # in the pixels, by sample: see drgs.accuracy.sample_points
+    within: Sequence[tuple[Any, Any]]  # the same, px from their upper left corners
+    key: Any  # of these; None: pixel centres
+    has_alpha: bool
+    hybrid: Any  # drgs.integrator.surfaces.Hybrid, or None
+
+    def planes(self) -> Planes:
+        """Of all frames, unevaluated."""
+        return [[frame.planes() for frame in of_time] for of_time in self._frames()]
+
+    def plane_tangents(self, tangents: Gaussians) -> Planes:
+        """Along tangents of the Gaussians, and those set on the sensor."""
+        frames = self._frames()
+        with dr.resume_grad():
+            d_cameras = self._camera_tangents(len(frames))
+        return [
+            rendering.frames_tangent(self.integrator.gaussians, of_time, tangents, d_camera)
+            for of_time, d_camera in zip(frames, d_cameras, strict=True)
+        ]
+
+    def backward(self, d_channels: Passes) -> rendering.GaussianGradients:
+        """Derivatives with respect to the Gaussians; all others are accumulated."""
+        planes, constant = self.planes(), constant_background(self.integrator)
+        dr.eval(planes)
+        # Colour conversion and background are a few operations per pixel, traced again and
+        # differentiated by Dr.Jit.
+        with dr.resume_grad():
+            dr.enable_grad(planes, constant)
+            channels = self.channels(planes, constant)
+            dr.accum_grad(channels, d_channels)
+            dr.enqueue(dr.ADMode.Backward, channels)
+            # Other views, the nested integrator, and other pictures of the same pass go back along
+            # what textures were computed from again.
+            dr.traverse(dr.ADMode.Backward, flags=dr.ADFlag.ClearVertices)
+            d_planes = dr.grad(planes)
+            d_constant = None if constant is None else dr.grad(constant)
+        dr.eval(d_planes, d_constant)
+        with dr.resume_grad():
+            state = self._state()
+            of_camera = state.is_attached
+        by_time = [
+            rendering.frames_adjoint(self.integrator.gaussians, *of_time, of_camera)
+            for of_time in zip(self._frames(), d_planes, strict=True)
+        ]
+        with dr.resume_grad():
+            if constant is not None:
+                accumulate(self.integrator.background, d_constant)
+            if of_camera:
+                numbers = [camera.numbers() for camera in self._attached_cameras(state)]
+                _accumulate_through(numbers, [gradients.camera for gradients in by_time])
+        return reduce(rendering.added, by_time)
+
+    def channels(self, planes: Planes, constant: mi.Color3f | None) -> Passes:
+        """What the film gets of each sample per pixel: the mean over the times.
+
+        constant: the background, where it is a colour; display space.
+        """
+        behind = self._behind(constant)
+        traced = self.integrator.memory.rendered[self.index].traced
+        seen = repeat(repeat(None)) if traced is None else traced.seen
+
+        def channels_of(planes: list[Any], surface: Any, color: Any, radiance: Any) -> Channels:
+            if surface is None:
+                return self._composited(planes, color, behind.opaque)
+            *planes, front = planes
+            past = [(1 - surface.coverage) * planes[0], *planes[1:]]
+            own = self._composited(
+                past, color, behind.opaque, lambda kind: surface.added(kind, front)
+            )
+            return own + self.hybrid.insertion.values(surface, front, radiance)
+
+        by_time = zip(planes, seen, behind.colors, behind.radiance, strict=False)
+        channels = [
+            [channels_of(*sample) for sample in zip(*time, strict=False)] for time in by_time
+        ]
+        if len(channels) == 1:
+            return channels[0]
+        return [
+            [sum(values[1:], values[0]) / len(values) for values in zip(*of_sample, strict=True)]
+            for of_sample in zip(*channels, strict=True)
+        ]
+
+    def _composited(
+        self,
+        planes: list[Any],
+        behind: mi.Color3f,
+        opaque: bool,
+        added: Callable[[str], Channels | None] = lambda kind: None,
+    ) -> Channels:
+        """Planes of pixels: red, green, blue, perhaps alpha, AOVs.
+
+        added: to the channels of an AOV of this kind.
+        """
+        transmittance, red, green, blue, *others = planes
+        color = mi.Color3f(red, green, blue)
+        if self.integrator.srgb_primitives:
+            color = mi.math.srgb_to_linear(color)
+        channels = list(dr.fma(transmittance, behind, color))
+        if self.has_alpha:
+            alpha = 1 - transmittance
+            channels.append(dr.full(mi.Float, 1, dr.width(alpha)) if opaque else alpha)
+        for kind in self.integrator.aovs.values():
+            if kind == "alpha":
+                channels.append(1 - transmittance)
+                continue
+            values = [others.pop(0) for _ in self.integrator.channels_of(kind)]
+            more = added(kind)
+            if more is not None:
+                values = [a + b for a, b in zip(values, more, strict=True)]
+            channels += values
+        return channels
+
+    def _behind(self, constant: mi.Color3f | None) -> _Behind:
+        """What is seen past the splats, in the space of the channels."""
+        integrator = self.integrator
+        environment = None if integrator.hide_emitters else self.scene.environment()
+        if environment is None and constant is not None:
+            if integrator.srgb_primitives:
+                constant = mi.math.srgb_to_linear(constant)
+            return _Behind(repeat(repeat(constant)), opaque=False, radiance=repeat(repeat(None)))
+        from drgs.integrator import background as backdrop
+
+        if environment is not None:
+            behind = backdrop.Environment(environment)
+        else:
+            behind = backdrop.Picture(integrator.background)
+        state = self._state()
+        cameras = [of_time[0].camera for of_time in self._frames()]
+        if state.is_attached:
+            cameras = self._attached_cameras(state)
+        colors = radiance = backdrop.seen_by(self.sensor.film(), behind, cameras, self.within)
+        if not integrator.srgb_primitives:
+            colors = [[mi.math.linear_to_srgb(color) for color in of_time] for of_time in colors]
+        return _Behind(colors, behind.opaque, radiance)
+
+    # ------------------------------------------------------------------------------------------
+    # Frames
+    # ------------------------------------------------------------------------------------------
+
+    def _frames(self) -> list[list[rendering.Frame]]:
+        """Render, or reuse the last frames if nothing that they depend on has changed.
+
+        One list for each time at which the shutter is open, of a frame for each sample per pixel.
+        """
+        pipeline, gaussians = self.integrator.pipeline, dr.detach(self.integrator.gaussians)
+        state = self._state().detached()
+        traced = None if self.hybrid is None else self._traced_surfaces(state)
+        key = pipeline, self.key, state, gaussians, traced
+        rendered = self.integrator.memory.rendered
+        last = rendered.get(self.index)
+        if last is None or not last.matches(*key):
+            seen = repeat(None) if traced is None else traced.seen
+            frames = [
+                _render(gaussians, camera, pipeline, self.positions, of_time)
+                for camera, of_time in zip(self._cameras(state), seen, strict=False)
+            ]
+            last = rendered[self.index] = Rendered(frames, *key)
+        return last.frames
+
+    def _traced_surfaces(self, state: SensorState) -> TracedSurfaces:
+        """At the scene's surfaces, unless the last look was the same."""
+        from drgs.integrator.surfaces import trace_surfaces
+
+        surfaces, kept = self.hybrid.surfaces, self.integrator.memory.traced
+        settings = self.key, self.integrator.hide_emitters, self.sensor.far_clip()
+        key = surfaces, settings, state
+        last = kept.get(self.index)
+        if last is None or not last.matches(*key):
+            seen = trace_surfaces(
+                self.hybrid.scene,
+                self.sensor,
+                self._cameras(state),
+                self.within,
+                self.integrator.hide_emitters,
+                with_normals="normal" in self.integrator.aovs.values(),
+            )
+            last = kept[self.index] = TracedSurfaces(*key, seen)
+        return last
+
+    def _state(self) -> SensorState:
+        return read_sensor(self.sensor, self.integrator.near)
+
+    def _cameras(self, state: SensorState) -> list[Camera]:
+        """What is simulated of the sensor's camera, detached; of each time."""
+        return cameras_in_time(ignoring(camera_from_sensor(state), self.integrator.ignore))
+
+    def _attached_cameras(self, state: SensorState) -> list[Camera]:
+        """The same, attached to the sensor's parameters."""
+        dr.make_opaque(state.device)  # or each value of a literal would be a new kernel
+        return cameras_in_time(ignoring(state.make(state), self.integrator.ignore))
+
+    def _camera_tangents(self, count: int) -> list[list[mi.Float] | None]:
+        """Of each time's camera, derivatives of its numbers along those set on the sensor."""
+        state = self._state()
+        if not state.is_attached:
+            return [None] * count
+        numbers = [camera.numbers() for camera in self._attached_cameras(state)]
+        dr.forward_to(numbers, flags=dr.ADFlag.ClearEdges)
+        return dr.grad(numbers)
+
+
+@dataclass(frozen=True)
+class _Behind:
+    """What is seen past the splats."""
+
+    colors: Iterable[Iterable[Any]]  # by time and by sample: Color3f, in the channels' space
+    opaque: bool  # whether it covers the film
+    radiance: Iterable[Iterable[Any]]  # by time and by sample: linear; None: of a constant
+
+
+def _render(
+    gaussians: Gaussians,
+    camera: Camera,
+    pipeline: rendering.Pipeline,
+    positions: Sequence[Any],
+    surfaces: Sequence[Any] | None,
+) -> list[rendering.Frame]:
+    """A frame for each sample per pixel; surfaces: what is seen of them at each."""
+    pipeline = composed(pipeline, gaussians, camera)
+    models = [replace(pipeline.model, positions=points) for points in positions]
+    if surfaces is not None:
+        from drgs.effects.occlusion import occluded_by
+
+        models = [
+            occluded_by(model, surface, camera)
+            for model, surface in zip(models, surfaces, strict=True)
+        ]
+        pipeline = replace(pipeline, features=(*pipeline.features, rendering.depth_feature))
+    first, *others = models
+    frame = rendering.render(gaussians, camera, replace(pipeline, model=first))
+    return [frame, *(rendering.render_again(frame, model) for model in others)]
+
+
+def constant_background(integrator: Any) -> mi.Color3f | None:
+    """The background without gradients, if it is a colour; display space.
+
+    No literal, or every colour would be a new kernel.
+    """
+    if isinstance(integrator.background, mi.Texture):
+        return None
+    constant = mi.Color3f(dr.detach(integrator.background))
+    dr.make_opaque(constant)
+    return constant
+
+
+def feature_of(kind: str) -> rendering.Feature:
+    """What is composited for an AOV of this kind, other than alpha."""
+    if kind == "depth":
+        return rendering.depth_feature
+    from drgs.effects.features import NamedFeature, normal_features
+
+    return normal_features if kind == "normal" else NamedFeature(kind)
+
+
+def accumulate(parameter: Any, gradient: Any) -> None:
+    """Add to a parameter's gradient, if it has one."""
+    if dr.width(parameter) > 0 and dr.grad_enabled(parameter):
+        dr.accum_grad(parameter, gradient)
+
+
+def _accumulate_through(values: list[list[Any]], gradients: list[list[mi.Float]]) -> None:
+    """Accumulate into what the values were computed from."""
+    pairs = zip(chain(*values), chain(*gradients), strict=True)
+    attached = [(value, gradient) for value, gradient in pairs if dr.grad_enabled(value)]
+    for value, gradient in attached:
+        dr.accum_grad(value, gradient)
+    dr.enqueue(dr.ADMode.Backward, [value for value, _ in attached])
+    dr.traverse(dr.ADMode.Backward, flags=dr.ADFlag.ClearVertices)

@@ -1,0 +1,786 @@
+"""The reference of the effects a scene may call for: lenses, defocus, moving cameras, smoothing.
+
+It imports nothing of this package but ``reference``, and is to be read after it. Each effect
+replaces one stage of ``reference.render``, or is the mean of many of its pictures::
+
+    Lens, ThinLens     project, sh_colors     where splats lie, how large, seen along what
+    render_lens_samples, render_motion_blur, render_rolling_shutter     many pictures
+    smoothing_filter   the scales and opacities that everything starts from
+
+The Jacobian of a lens is a difference quotient of its ``film_points``: no derivative is written
+down here, so that the kernels, which have formulas, have an independent computation to agree with.
+
+Sources are those of ``reference``, and:
+
+- OpenCV: its documentation of ``calib3d`` ("Camera Calibration and 3D Reconstruction", the
+  rational model) and of ``cv::fisheye``.
+- Kannala, Brandt, "A Generic Camera Model and Calibration Method for Conventional, Wide-Angle,
+  and Fish-Eye Lenses", IEEE TPAMI 28(8), 2006: the fisheye's polynomial.
+- Shoemake, "Animating Rotation with Quaternion Curves", SIGGRAPH 1985.
+
+Spaces, units and orders are those of ``reference``. A *slope* is (x/z, y/z) of a point in camera
+axes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+from functools import cache
+from math import inf, pi, sqrt
+
+import numpy as np
+
+from drgs.reference import splatting as reference
+from drgs.reference.splatting import Camera, Gaussians, Picture, Projection
+
+FISHEYE_MAX_ANGLE = 0.95 * pi
+"""rad: at pi, straight behind, a fisheye smears one point over a circle and J is infinite."""
+
+BORDER_SAMPLES = 65
+"""Points of each edge of the film, corners included, whose slopes bound an OpenCV lens's picture.
+Between two of 65, a border bent like a circle arc bulges 1 / 64^2 of its own bulge."""
+
+FOLD_RADII, FOLD_STEPS = (1e-3, 1e6), 1000
+"""Where a lens with tangential terms is searched for a fold: slopes, in steps of two percent."""
+
+REAL_ROOT = 1e-7
+"""A root with a smaller imaginary part (relative) is real: a double root is found to within the
+square root of rounding, 1.5e-8."""
+
+DIFFERENCE_STEP = 2.0**-9
+"""Step of the central differences, relative to the point's distance from the camera: they are off
+by the eighth power of (step / distance to the nearest pole), and by rounding / step = 1e-13."""
+
+CENTRAL_WEIGHTS = (4 / 5, -1 / 5, 4 / 105, -1 / 280)
+"""Central differences of order 8: f'(x) h = sum_j w_j (f(x + j h) - f(x - j h)), j = 1 to 4."""
+
+LEAST_CUT = 2.0**-60
+"""An alpha that changes no sum: the cut of splats however dim they are out of focus."""
+
+SMOOTHING_VARIANCE = 0.2
+"""px^2: variance of the 3D smoothing filter at the largest sampling rate (Mip-Splatting's s)."""
+
+VIEW_MARGIN = 0.15
+"""A camera samples what lies within its film, widened by this part of its size (Mip-Splatting)."""
+
+
+# ----------------------------------------------------------------------------------------------
+# Lenses
+# ----------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Lens:
+    """How points come to lie on the film. What a lens does not define anew is as with a pinhole.
+
+    ``points`` are (M, 3) in camera axes (x right, y down, z forward), world units.
+    """
+
+    def film_points(self, camera: Camera, points: np.ndarray) -> np.ndarray:
+        """Return (M, 2), px, film; meaningless for points that are not seen."""
+        raise NotImplementedError
+
+    def depths(self, camera: Camera, points: np.ndarray) -> np.ndarray:
+        """Return (M,), world units: what splats are sorted by and the near plane is compared with.
+
+        Here: z.
+        """
+        return points[:, 2]
+
+    def is_seen(self, camera: Camera, points: np.ndarray) -> np.ndarray:
+        """Return (M,) bool: the lens maps the point, onto the film or beside it.
+
+        Here: depth >= near.
+        """
+        return self.depths(camera, points) >= camera.near
+
+    def view_directions(self, camera: Camera, means: np.ndarray) -> np.ndarray:
+        """Return (N, 3), unit, world: along what the means (N, 3), world, are seen.
+
+        Here: from the camera's centre to the mean.
+        """
+        directions, _ = reference._normalize(means - camera.center, fallback=(0.0, 0.0, 1.0))
+        return directions
+
+    def slope_bounds(self, camera: Camera) -> tuple[np.ndarray, np.ndarray] | None:
+        """Return the lowest and highest slopes (2,), (2,) of the film's border.
+
+        Within these bounds, widened by ``reference.FRUSTUM_MARGIN``, J is evaluated. None: at the
+        mean itself, wherever it is.
+        """
+        return None
+
+
+@dataclass(frozen=True)
+class Pinhole(Lens):
+    """film = (fx x/z + cx, fy y/z + cy)."""
+
+    def film_points(self, camera: Camera, points: np.ndarray) -> np.ndarray:
+        """Return (M, 2), px, film."""
+        return _focal(camera) * points[:, :2] / points[:, 2:] + _principal(camera)
+
+    def slope_bounds(self, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+        """Return the slopes (2,), (2,) of the film's corners (0, 0) and (W, H)."""
+        corners = np.array([[0.0, 0.0], [camera.width, camera.height]])
+        lower, upper = (corners - _principal(camera)) / _focal(camera)
+        return lower, upper
+
+
+@dataclass(frozen=True)
+class OpenCV(Lens):
+    """Radial and tangential distortion: OpenCV's rational model, without thin prism and tilt.
+
+    With (x, y) the slope, r^2 = x^2 + y^2, the distorted slope is
+
+        x'' = x q + 2 p1 x y + p2 (r^2 + 2 x^2)
+        y'' = y q + p1 (r^2 + 2 y^2) + 2 p2 x y
+        q = (1 + k1 r^2 + k2 r^4 + k3 r^6) / (1 + k4 r^2 + k5 r^4 + k6 r^6)
+
+    and film = (fx x'' + cx, fy y'' + cy). OpenCV's own vector of coefficients has another order:
+    k1, k2, p1, p2, k3, k4, k5, k6.
+    """
+
+    k1: float = 0.0
+    k2: float = 0.0
+    k3: float = 0.0
+    k4: float = 0.0
+    k5: float = 0.0
+    k6: float = 0.0
+    p1: float = 0.0
+    p2: float = 0.0
+
+    def film_points(self, camera: Camera, points: np.ndarray) -> np.ndarray:
+        """Return (M, 2), px, film."""
+        slopes = points[:, :2] / points[:, 2:]
+        return _focal(camera) * self.distorted(slopes) + _principal(camera)
+
+    def is_seen(self, camera: Camera, points: np.ndarray) -> np.ndarray:
+        """Return (M,) bool: z >= near, and the slope's length is below ``valid_radius``.
+
+        Slopes beyond would fold back into the picture.
+        """
+        in_front = points[:, 2] >= camera.near
+        z = np.where(in_front, points[:, 2], 1.0)
+        radii = np.linalg.norm(points[:, :2], axis=1) / z
+        return in_front & (radii < self.valid_radius)
+
+    def slope_bounds(self, camera: Camera) -> tuple[np.ndarray, np.ndarray] | None:
+        """Return the bounding box of the undistorted slopes of the film's border.
+
+        None if one of the border's points is the image of no slope within ``valid_radius``: the
+        slopes of the others need not hold all that the film shows.
+        """
+        border = (_film_border(camera) - _principal(camera)) / _focal(camera)
+        slopes = self.undistorted(border)
+        return (slopes.min(axis=0), slopes.max(axis=0)) if np.isfinite(slopes).all() else None
+
+    def distorted(self, slopes: np.ndarray) -> np.ndarray:
+        """Return (..., 2) distorted slopes of slopes (..., 2), which may be complex."""
+        x, y = slopes[..., 0], slopes[..., 1]
+        r2 = x * x + y * y
+        numerator = 1 + self.k1 * r2 + self.k2 * r2**2 + self.k3 * r2**3
+        denominator = 1 + self.k4 * r2 + self.k5 * r2**2 + self.k6 * r2**3
+        ratio = numerator / denominator
+        return np.stack(
+            [
+                x * ratio + 2 * self.p1 * x * y + self.p2 * (r2 + 2 * x * x),
+                y * ratio + self.p1 * (r2 + 2 * y * y) + 2 * self.p2 * x * y,
+            ],
+            axis=-1,
+        )
+
+    @property
+    def valid_radius(self) -> float:
+        """The radius within which no two slopes are distorted to the same; it may be infinite.
+
+        Without tangential terms, the smallest r > 0 at which the derivative of r -> r q(r)
+        vanishes, or q has a pole. With u = r^2, q = n(u) / d(u) and ' for d/du, the derivative is
+        (d n + 2 u (d n' - n d')) / d^2.
+
+        With them: where ``least_eigenvalue`` first vanishes, if that comes before. A symmetric
+        Jacobian that is positive definite all over a disc is that of a one-to-one map.
+        """
+        n = np.polynomial.Polynomial([1.0, self.k1, self.k2, self.k3])
+        d = np.polynomial.Polynomial([1.0, self.k4, self.k5, self.k6])
+        u = np.polynomial.Polynomial([0.0, 1.0])
+        slope = d * n + 2 * u * (d * n.deriv() - n * d.deriv())
+        radius = sqrt(min(_first_positive_root(slope.coef), _first_positive_root(d.coef)))
+        return _first_fold(self, radius) if self.p1 or self.p2 else radius
+
+    def least_eigenvalue(self, radii: np.ndarray) -> np.ndarray:
+        """Return (M,): no eigenvalue of the Jacobian, in any direction at radii (M,), is smaller.
+
+        The least one of the radial part and the least one of the tangential part, in the direction
+        where that is least, added (Weyl's inequality).
+        """
+        radial, tangential = replace(self, p1=0.0, p2=0.0), OpenCV(p1=self.p1, p2=self.p2)
+        # Where the tangential part alone, without x and y themselves, has its least eigenvalue.
+        direction = -np.array([self.p2, self.p1]) / np.hypot(self.p1, self.p2)
+        slopes = radii[:, None] * direction
+        parts = [np.linalg.eigvalsh(lens._jacobians(slopes))[:, 0] for lens in (radial, tangential)]
+        return parts[0] + parts[1] - 1
+
+    def _jacobians(self, slopes: np.ndarray) -> np.ndarray:
+        """Return (M, 2, 2): derivatives of ``distorted`` at slopes (M, 2), by complex steps."""
+        columns = [self.distorted(slopes + 1e-30j * axis).imag / 1e-30 for axis in np.eye(2)]
+        return np.stack(columns, axis=-1)
+
+    def undistorted(self, slopes: np.ndarray) -> np.ndarray:
+        """Return the slopes (M, 2) within ``valid_radius`` that are distorted to ``slopes`` (M, 2).
+
+        NaN where there is none. Newton's method from the distorted slope; its step is halved until
+        it stays within the radius and lessens the error. Derivatives are complex steps.
+        """
+        radius = self.valid_radius
+        lengths = np.linalg.norm(slopes, axis=1, keepdims=True)
+        guesses = slopes * np.minimum(1.0, 0.9 * radius / np.maximum(lengths, 1e-300))
+        fractions = 0.5 ** np.arange(40.0)[:, None, None]
+        for _ in range(100):
+            errors = slopes - self.distorted(guesses)
+            steps = np.linalg.solve(self._jacobians(guesses), errors[..., None])[..., 0]
+            candidates = guesses + fractions * steps
+            left = np.linalg.norm(slopes - self.distorted(candidates), axis=-1)
+            better = (np.linalg.norm(candidates, axis=-1) < radius) & (
+                left < np.linalg.norm(errors, axis=-1)
+            )
+            first = np.argmax(better, axis=0)
+            moved = candidates[first, np.arange(len(slopes))]
+            guesses = np.where(better.any(axis=0)[:, None], moved, guesses)
+            if not better.any():
+                break
+        errors = np.linalg.norm(slopes - self.distorted(guesses), axis=1)
+        return np.where((errors <= 1e-12 * (1 + lengths[:, 0]))[:, None], guesses, np.nan)
+
+
+@dataclass(frozen=True)
+class Fisheye(Lens):
+    """OpenCV's fisheye (Kannala, Brandt), also beyond 90 degrees from the axis.
+
+    With rho = sqrt(x^2 + y^2) and theta = atan2(rho, z), the angle from the axis,
+
+        theta_d = theta (1 + k1 theta^2 + k2 theta^4 + k3 theta^6 + k4 theta^8)
+        film = (fx, fy) theta_d / rho (x, y) + (cx, cy)
+    """
+
+    k1: float = 0.0
+    k2: float = 0.0
+    k3: float = 0.0
+    k4: float = 0.0
+
+    def film_points(self, camera: Camera, points: np.ndarray) -> np.ndarray:
+        """Return (M, 2), px, film."""
+        rho = np.linalg.norm(points[:, :2], axis=1)
+        theta = np.arctan2(rho, points[:, 2])
+        # On the axis (x, y) = 0, whatever it is multiplied by.
+        theta_by_rho = theta / np.where(rho == 0, 1.0, rho)
+        polynomial = sum(
+            k * theta ** (2 * i) for i, k in enumerate([1.0, self.k1, self.k2, self.k3, self.k4])
+        )
+        spread = (polynomial * theta_by_rho)[:, None]
+        return _focal(camera) * spread * points[:, :2] + _principal(camera)
+
+    def depths(self, camera: Camera, points: np.ndarray) -> np.ndarray:
+        """Return (M,): distances from the camera's centre, world units."""
+        return np.linalg.norm(points, axis=1)
+
+    def is_seen(self, camera: Camera, points: np.ndarray) -> np.ndarray:
+        """Return (M,) bool: the distance is >= near, the angle from the axis < ``valid_angle``."""
+        angles = np.arctan2(np.linalg.norm(points[:, :2], axis=1), points[:, 2])
+        return (self.depths(camera, points) >= camera.near) & (angles < self.valid_angle)
+
+    @property
+    def valid_angle(self) -> float:
+        """rad: the first theta at which d theta_d / d theta vanishes, FISHEYE_MAX_ANGLE at most."""
+        slope = [1.0, 3 * self.k1, 5 * self.k2, 7 * self.k3, 9 * self.k4]
+        return min(sqrt(_first_positive_root(slope)), FISHEYE_MAX_ANGLE)
+
+
+@dataclass(frozen=True)
+class Orthographic(Lens):
+    """film = (fx x + cx, fy y + cy), with fx and fy in px per world unit."""
+
+    def film_points(self, camera: Camera, points: np.ndarray) -> np.ndarray:
+        """Return (M, 2), px, film."""
+        return _focal(camera) * points[:, :2] + _principal(camera)
+
+    def view_directions(self, camera: Camera, means: np.ndarray) -> np.ndarray:
+        """Return (N, 3), unit, world: the camera's forward axis for all."""
+        forward = camera.rotation[2] / np.linalg.norm(camera.rotation[2])
+        return np.tile(forward, (len(means), 1))
+
+
+@cache
+def _first_fold(lens: OpenCV, radius: float) -> float:
+    """Return the smallest r below ``radius`` with ``least_eigenvalue`` 0; ``radius``: none is."""
+    radii = np.geomspace(*FOLD_RADII, FOLD_STEPS)
+    radii = np.append(radii[radii < radius], radius * (1 - 1e-12)) if radius < inf else radii
+    folded = np.flatnonzero(lens.least_eigenvalue(radii) <= 0)
+    if len(folded) == 0:
+        return radius
+    low, high = radii[max(folded[0] - 1, 0)], radii[folded[0]]
+    for _ in range(60):
+        middle = (low + high) / 2
+        is_folded = lens.least_eigenvalue(np.array([middle]))[0] <= 0
+        low, high = (low, middle) if is_folded else (middle, high)
+    return low
+
+
+def _focal(camera: Camera) -> np.ndarray:
+    return np.array([camera.fx, camera.fy])
+
+
+def _principal(camera: Camera) -> np.ndarray:
+    return np.array([camera.cx, camera.cy])
+
+
+def _film_border(camera: Camera) -> np.ndarray:
+    """Return (4 BORDER_SAMPLES, 2), px: evenly spaced points of the film's edges."""
+    x = np.linspace(0, camera.width, BORDER_SAMPLES)
+    y = np.linspace(0, camera.height, BORDER_SAMPLES)
+    edges = [(x, 0 * x), (x, 0 * x + camera.height), (0 * y, y), (0 * y + camera.width, y)]
+    return np.concatenate([np.column_stack(edge) for edge in edges])
+
+
+def _first_positive_root(coefficients: Sequence[float]) -> float:
+    """Return the smallest u > 0 with 1 + c1 u + ... + cn u^n = 0, or inf; coefficients[0] is 1.
+
+    It is 1 / v for the largest v with v^n + c1 v^(n - 1) + ... + cn = 0, which divides by no cn.
+    """
+    roots = np.roots(coefficients)
+    real = roots.real[np.abs(roots.imag) <= REAL_ROOT * np.abs(roots)]
+    return 1 / real.max() if (real > 0).any() else inf
+
+
+# ----------------------------------------------------------------------------------------------
+# Projection
+# ----------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class ThinLens:
+    """An aperture, a disc about the camera's centre, and the plane that is in focus."""
+
+    aperture_radius: float  # world units
+    focus_distance: float  # world units: camera z of what is in focus
+
+    def __post_init__(self) -> None:
+        """Refuse numbers out of range."""
+        if not (0 <= self.aperture_radius < inf and 0 < self.focus_distance < inf):
+            raise ValueError(
+                "reference_effects.ThinLens: aperture_radius must be >= 0, focus_distance > 0 and "
+                f"both finite, got {self.aperture_radius} and {self.focus_distance}"
+            )
+
+    def blur_radii(self, camera: Camera, depths: np.ndarray) -> np.ndarray:
+        """Return (N, 2), px: half axes of the ellipse over which a point at depth (N,) is spread.
+
+        Seen from the aperture's point a, the point (x, z) is at f (x - a) / z on the film, moved
+        by f a / focus_distance so that the plane in focus stays where it is: together it moves by
+        f a (1 / focus_distance - 1 / z).
+        """
+        spread = self.aperture_radius * np.abs(1 / self.focus_distance - 1 / depths)
+        return _focal(camera) * spread[:, None]
+
+
+def project(
+    gaussians: Gaussians,
+    camera: Camera,
+    lens: Lens = Pinhole(),
+    antialiased: bool = False,
+    low_pass: float = reference.LOW_PASS,
+    defocus: ThinLens | None = None,
+) -> Projection:
+    """Return the splats that Gaussians leave on the film behind a lens.
+
+    cov2d = J W Sigma W^T J^T + low_pass I + diag(R^2 / 4)    (EWA, section 4)
+
+    J is the derivative of ``film_points`` at the mean, its slope clamped where the lens has
+    ``slope_bounds``. low_pass: px^2; antialiased: opacities are multiplied by
+    sqrt(det(J W Sigma W^T J^T) / det(cov2d without R)), as in ``reference.project``.
+
+    defocus: R (N, 2) px are its ``blur_radii``; the variance of a uniform disc of radius R along
+    an axis is R^2 / 4. Opacities are multiplied by sqrt(det(cov2d without R) / det(cov2d)), so
+    that the integral over the film of a splat stays. So are ``Projection.cuts``: a splat that is
+    seen in focus is seen out of focus, and ends at as many standard deviations. Both may be small,
+    but not below LEAST_CUT. ``Projection.depths`` are the lens's.
+
+    Splats with a singular cov2d, which low_pass = 0 permits, are not visible.
+
+    Raises ValueError for defocus behind an orthographic lens, whose rays meet in no aperture.
+    """
+    points = (gaussians.means - camera.center) @ camera.rotation.T
+    depths = lens.depths(camera, points)
+    seen = lens.is_seen(camera, points)
+    points = np.where(seen[:, None], points, (0.0, 0.0, 1.0))
+
+    scales = np.exp(gaussians.log_scales)
+    axes = camera.rotation @ reference.quat_to_rotation(gaussians.quats) * scales[:, None, :]
+    axes2d = jacobians(lens, camera, _points_of_jacobian(lens, camera, points)) @ axes
+    widening = np.full((len(points), 2), low_pass)
+    cov2d, dets, areas = _widened(axes2d, widening)
+    singular = dets == 0
+    opacities = reference.sigmoid(gaussians.logit_opacities)
+    if antialiased:
+        opacities = opacities * areas / np.sqrt(np.where(singular, 1.0, dets))
+    bright, cuts = opacities > reference.ALPHA_CUT, reference.ALPHA_CUT
+    if defocus is not None:
+        if isinstance(lens, Orthographic):
+            raise ValueError(
+                "reference_effects.project: defocus needs a lens whose rays meet in its centre, "
+                "got Orthographic"
+            )
+        radii = defocus.blur_radii(camera, np.where(seen, depths, 1.0))
+        dets_in_focus = dets
+        cov2d, dets, _ = _widened(axes2d, widening + radii**2 / 4)
+        singular = dets == 0
+        dimming = np.sqrt(dets_in_focus / np.where(singular, 1.0, dets))
+        opacities, cuts = opacities * dimming, np.maximum(cuts * dimming, LEAST_CUT)
+        bright &= opacities > LEAST_CUT
+    return Projection(
+        means2d=lens.film_points(camera, points),
+        cov2d=cov2d,
+        conics=reference._inverses(cov2d, np.where(singular, 1.0, dets)),
+        depths=depths,
+        opacities=opacities,
+        visible=seen & ~singular & bright,
+        cuts=cuts,
+    )
+
+
+def jacobians(lens: Lens, camera: Camera, points: np.ndarray) -> np.ndarray:
+    """Return (M, 2, 3), px per world unit: derivatives of ``film_points`` at points (M, 3).
+
+    Points are in camera axes. Central differences of order 8: see DIFFERENCE_STEP.
+    """
+    steps = DIFFERENCE_STEP * np.linalg.norm(points, axis=1)[:, None]
+    columns = []
+    for axis in np.eye(3):
+        differences = [
+            lens.film_points(camera, points + j * steps * axis)
+            - lens.film_points(camera, points - j * steps * axis)
+            for j in range(1, len(CENTRAL_WEIGHTS) + 1)
+        ]
+        columns.append(np.tensordot(CENTRAL_WEIGHTS, differences, axes=1) / steps)
+    return np.stack(columns, axis=-1)
+
+
+def _points_of_jacobian(lens: Lens, camera: Camera, points: np.ndarray) -> np.ndarray:
+    """Return the points (M, 3), camera, with slopes clamped to the widened bounds of the lens."""
+    bounds = lens.slope_bounds(camera)
+    if bounds is None:
+        return points
+    lower, upper = bounds
+    margin = reference.FRUSTUM_MARGIN * (upper - lower) / 2
+    z = points[:, 2:]
+    return np.hstack([np.clip(points[:, :2] / z, lower - margin, upper + margin) * z, z])
+
+
+def _widened(axes2d: np.ndarray, widening: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return cov2d = M M^T + diag(t) (N, 2, 2), det(cov2d) (N,) and sqrt(det(M M^T)) (N,).
+
+    M (N, 2, 3) px; t (N, 2) px^2. det(A + diag(t)) = det(A) + t0 A11 + t1 A00 + t0 t1: sums of
+    squares, like ``reference._low_passed_covariances``, which is the case t0 = t1.
+    """
+    areas = np.linalg.norm(np.cross(axes2d[:, 0], axes2d[:, 1]), axis=-1)
+    (a, b), (t0, t1) = np.sum(axes2d**2, axis=2).T, widening.T
+    cov2d = axes2d @ np.swapaxes(axes2d, 1, 2) + widening[:, :, None] * np.eye(2)
+    return cov2d, areas**2 + t0 * b + t1 * a + t0 * t1, areas
+
+
+# ----------------------------------------------------------------------------------------------
+# Pictures
+# ----------------------------------------------------------------------------------------------
+
+
+def sh_colors(
+    gaussians: Gaussians, camera: Camera, lens: Lens = Pinhole(), degree: int | None = None
+) -> np.ndarray:
+    """Return the colours (N, 3), display space, >= 0, seen along the lens's directions.
+
+    degree: None for all that is stored.
+    """
+    degree = gaussians.sh_degree if degree is None else degree
+    directions = lens.view_directions(camera, gaussians.means)
+    return np.maximum(reference._unclamped_colors(gaussians, directions, degree), 0.0)
+
+
+def render(
+    gaussians: Gaussians,
+    camera: Camera,
+    lens: Lens = Pinhole(),
+    background: np.ndarray = (0.0, 0.0, 0.0),
+    antialiased: bool = False,
+    defocus: ThinLens | None = None,
+    degree: int | None = None,
+    threshold_width: float = reference.THRESHOLD_WIDTH,
+) -> Picture:
+    """Return the picture of Gaussians behind a lens; its depth sums the lens's ``depths``.
+
+    background: (3,) display space; antialiased, defocus: see ``project``; degree: see
+    ``sh_colors``; threshold_width: see ``reference.composite``.
+    """
+    splats = project(gaussians, camera, lens, antialiased, defocus=defocus)
+    return reference.composite(
+        splats.means2d, splats.conics, splats.opacities,
+        sh_colors(gaussians, camera, lens, degree), splats.depths, splats.visible,
+        background, camera.width, camera.height, threshold_width, splats.cuts,
+    )  # fmt: skip
+
+
+def render_lens_samples(
+    gaussians: Gaussians,
+    camera: Camera,
+    defocus: ThinLens,
+    num_samples: int,
+    background: np.ndarray = (0.0, 0.0, 0.0),
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the image (H, W, 3), display space, and alpha (H, W) of a camera with an aperture.
+
+    They are means over ``lens_cameras``, and what defocus in ``project`` approximates.
+    """
+    pictures = [
+        reference.render(gaussians, lens_camera, background)
+        for lens_camera in lens_cameras(camera, defocus, num_samples)
+    ]
+    mean = _mean_picture(pictures)
+    return mean.image, mean.alpha
+
+
+def lens_cameras(camera: Camera, defocus: ThinLens, num_samples: int) -> list[Camera]:
+    """Return pinhole cameras at points of the aperture that agree on the plane in focus.
+
+    The camera's centre moves by (a_x, a_y) to the right and down, its principal point by
+    f a / focus_distance.
+    """
+    right, down, _ = camera.rotation
+    return [
+        replace(
+            camera,
+            center=camera.center + a_x * right + a_y * down,
+            cx=camera.cx + camera.fx * a_x / defocus.focus_distance,
+            cy=camera.cy + camera.fy * a_y / defocus.focus_distance,
+        )
+        for a_x, a_y in defocus.aperture_radius * _disc_points(num_samples)
+    ]
+
+
+def _disc_points(count: int) -> np.ndarray:
+    """Return (count, 2): a sunflower, each seed with an equal share of the unit disc's area."""
+    k = np.arange(count)
+    radii = np.sqrt((k + 0.5) / count)
+    angles = k * pi * (3 - sqrt(5))
+    return radii[:, None] * np.column_stack([np.cos(angles), np.sin(angles)])
+
+
+def _mean_picture(pictures: list[Picture]) -> Picture:
+    """Return the mean of pictures; a pixel that any of them marks as near a threshold is marked."""
+    means = {
+        name: np.mean([getattr(picture, name) for picture in pictures], axis=0)
+        for name in ("image", "alpha", "depth", "transmittance")
+    }
+    marked = np.any([picture.near_threshold for picture in pictures], axis=0)
+    return Picture(**means, near_threshold=marked)
+
+
+# ----------------------------------------------------------------------------------------------
+# Cameras that move while they expose
+# ----------------------------------------------------------------------------------------------
+
+Pose = tuple[np.ndarray, np.ndarray]  # rotation (3, 3) world to camera, center (3,) world
+
+
+def interpolate_pose(open: Pose, close: Pose, t: float) -> Pose:
+    """Return the pose at time t: ``open`` at 0, ``close`` at 1.
+
+    The centre moves along a line. The rotation moves along the shortest arc at constant speed
+    (Shoemake's slerp): it is exp(t log(R_close R_open^T)) R_open. Between rotations that are half
+    a turn apart there are two shortest arcs; which one is taken is not defined.
+    """
+    (rotation_open, center_open), (rotation_close, center_close) = open, close
+    w, *axis = _quat_of_rotation(rotation_close @ rotation_open.T)
+    half_angle = np.arctan2(np.linalg.norm(axis), w)
+    axis, _ = reference._normalize(np.array([axis]), fallback=(1.0, 0.0, 0.0))
+    quat = np.array([[np.cos(t * half_angle), *(np.sin(t * half_angle) * axis[0])]])
+    rotation = reference.quat_to_rotation(quat)[0] @ rotation_open
+    return rotation, (1 - t) * center_open + t * center_close
+
+
+def _quat_of_rotation(rotation: np.ndarray) -> np.ndarray:
+    """Return the unit quaternion (4,), wxyz, w >= 0, of a rotation (3, 3).
+
+    With R(q) quadratic in q, trace(R(q)^T R) = q^T K q: the quaternion of R maximises it, and is
+    the eigenvector of K's largest eigenvalue (Bar-Itzhack, "New Method for Extracting the
+    Quaternion from a Rotation Matrix", JGCD 23(6), 2000). No case needs a division.
+    """
+    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = rotation
+    K = np.array(
+        [
+            [xx + yy + zz, zy - yz, xz - zx, yx - xy],
+            [zy - yz, xx - yy - zz, xy + yx, xz + zx],
+            [xz - zx, xy + yx, yy - xx - zz, yz + zy],
+            [yx - xy, xz + zx, yz + zy, zz - xx - yy],
+        ]
+    )
+    quat = np.linalg.eigh(K).eigenvectors[:, -1]
+    return -quat if quat[0] < 0 else quat
+
+
+def camera_at(camera_open: Camera, camera_close: Camera, t: float) -> Camera:
+    """Return the camera at time t, 0 to 1, of the exposure; see ``interpolate_pose``.
+
+    Raises ValueError if the two differ in anything but their pose.
+    """
+    for field in fields(Camera):
+        values = getattr(camera_open, field.name), getattr(camera_close, field.name)
+        if field.name not in ("rotation", "center") and values[0] != values[1]:
+            raise ValueError(
+                f"reference_effects.camera_at: {field.name} must be the same when the shutter "
+                f"opens and when it closes, got {values[0]} and {values[1]}"
+            )
+    rotation, center = interpolate_pose(
+        (camera_open.rotation, camera_open.center), (camera_close.rotation, camera_close.center), t
+    )
+    return replace(camera_open, rotation=rotation, center=center)
+
+
+def render_motion_blur(
+    gaussians: Gaussians,
+    camera_open: Camera,
+    camera_close: Camera,
+    num_samples: int,
+    background: np.ndarray = (0.0, 0.0, 0.0),
+    lens: Lens = Pinhole(),
+) -> Picture:
+    """Return the mean of n = num_samples pictures, at the times (k + 0.5) / n of the exposure."""
+    times = (np.arange(num_samples) + 0.5) / num_samples
+    return _mean_picture(
+        [
+            render(gaussians, camera_at(camera_open, camera_close, t), lens, background)
+            for t in times
+        ]
+    )
+
+
+def render_rolling_shutter(
+    gaussians: Gaussians,
+    camera_open: Camera,
+    camera_close: Camera,
+    background: np.ndarray = (0.0, 0.0, 0.0),
+    lens: Lens = Pinhole(),
+) -> Picture:
+    """Return the picture whose row j is row j of the picture at time (j + 0.5) / H."""
+    height = camera_open.height
+    pictures = [
+        render(
+            gaussians, camera_at(camera_open, camera_close, (j + 0.5) / height), lens, background
+        )
+        for j in range(height)
+    ]
+    return Picture(
+        **{
+            field.name: np.stack([getattr(p, field.name)[j] for j, p in enumerate(pictures)])
+            for field in fields(Picture)
+        }
+    )
+
+
+# ----------------------------------------------------------------------------------------------
+# The 3D smoothing filter
+# ----------------------------------------------------------------------------------------------
+
+
+def smoothing_filter(
+    log_scales: np.ndarray, logit_opacities: np.ndarray, rates: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return scales (N, 3), world units, and opacities (N,) of Gaussians without finer detail.
+
+    Each Gaussian is convolved with an isotropic one of variance v = 0.2 / rate^2 (Mip-Splatting,
+    section 4.1, equations 8 and 9):
+
+        scales = sqrt(s^2 + v),  opacities = o prod_k s_k / sqrt(s_k^2 + v)
+
+    log_scales (N, 3); logit_opacities (N,); rates (N,) px per world unit: see ``sampling_rates``.
+    """
+    scales = np.exp(log_scales)
+    smoothed = np.sqrt(scales**2 + (SMOOTHING_VARIANCE / rates**2)[:, None])
+    return smoothed, reference.sigmoid(logit_opacities) * np.prod(scales / smoothed, axis=1)
+
+
+def sampling_rates(means: np.ndarray, cameras: Sequence[Camera]) -> np.ndarray:
+    """Return the largest rate (N,), px per world unit, at which pinhole cameras sample means.
+
+    means (N, 3) world. A camera samples a mean at max(fx, fy) / z (Mip-Splatting, equation 7) if
+    z >= near and the mean lies on its film, widened by 15 percent of its width and height on each
+    side. A mean that no camera samples gets the smallest rate of all that are sampled, and so is
+    smoothed most, as in Mip-Splatting's code, which gives it the largest distance.
+
+    Raises ValueError if there are means and no camera samples any of them.
+    """
+    rates = np.zeros(len(means))
+    for camera in cameras:
+        points = (means - camera.center) @ camera.rotation.T
+        in_front = points[:, 2] >= camera.near
+        points = np.where(in_front[:, None], points, (0.0, 0.0, 1.0))
+        size = np.array([camera.width, camera.height])
+        film = Pinhole().film_points(camera, points)
+        on_film = (film >= -VIEW_MARGIN * size) & (film <= (1 + VIEW_MARGIN) * size)
+        rate = max(camera.fx, camera.fy) / points[:, 2]
+        rates = np.where(in_front & on_film.all(axis=1), np.maximum(rates, rate), rates)
+    if len(rates) and not rates.any():
+        raise ValueError(
+            f"reference_effects.sampling_rates: none of {len(cameras)} cameras sees any of the "
+            f"{len(rates)} means"
+        )
+    return np.where(rates > 0, rates, rates[rates > 0].min(initial=inf))
+
+
+# ----------------------------------------------------------------------------------------------
+# Surfaces between the splats
+# ----------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class SurfacePicture:
+    """What a camera sees of splats and of a surface between them."""
+
+    color: np.ndarray  # (H, W, 3) display space, of the splats: premultiplied
+    depth: np.ndarray  # (H, W) sum of weights times depths of the splats, world units
+    before: np.ndarray  # (H, W) transmittance in front of the surface
+    transmittance: np.ndarray  # (H, W) share of the background that is seen past all
+
+
+def render_with_surface(
+    gaussians: Gaussians, camera: Camera, surface_depth: np.ndarray, coverage: np.ndarray
+) -> SurfacePicture:
+    """Composite splats, front to back, and a surface as one more layer of alpha ``coverage``.
+
+    surface_depth (H, W) camera z, world units; coverage (H, W) in [0, 1]. A splat is behind the
+    surface where its mean's depth is larger. Which splat is the last that a pixel composites is
+    decided as without the surface.
+    """
+    splats = reference.project(gaussians, camera)
+    colors = reference.sh_colors(gaussians, camera, gaussians.sh_degree)
+    order = np.flatnonzero(splats.visible)
+    order = order[np.argsort(splats.depths[order], kind="stable")]
+    shape = camera.height, camera.width
+    y, x = np.mgrid[: camera.height, : camera.width] + 0.5
+    color, depth, before = np.zeros((*shape, 3)), np.zeros(shape), np.ones(shape)
+    seen, without = np.ones(shape), np.ones(shape)  # transmittance with and without the surface
+    passed, finished = np.zeros(shape, dtype=bool), np.zeros(shape, dtype=bool)
+    for i in order:
+        behind = splats.depths[i] > surface_depth
+        seen = np.where(behind & ~passed, seen * (1 - coverage), seen)
+        passed |= behind
+        offset = np.stack([x, y], axis=-1) - splats.means2d[i]
+        exponent = -0.5 * np.einsum("...a,ab,...b", offset, splats.conics[i], offset)
+        alpha = np.minimum(splats.opacities[i] * np.exp(exponent), reference.ALPHA_MAX)
+        alpha = np.where(alpha < reference.ALPHA_CUT, 0, alpha)
+        finished |= (alpha > 0) & (without * (1 - alpha) < reference.TRANSMITTANCE_STOP)
+        alpha = np.where(finished, 0, alpha)
+        color += (seen * alpha)[..., None] * colors[i]
+        depth += seen * alpha * splats.depths[i]
+        before = np.where(passed, before, before * (1 - alpha))
+        seen, without = seen * (1 - alpha), without * (1 - alpha)
+    seen = np.where(passed, seen, seen * (1 - coverage))
+    return SurfacePicture(color, depth, before, seen)

@@ -1,0 +1,729 @@
+"""The reference, one approximation at a time: each that 3DGS makes is a choice here.
+
+It imports nothing of this package but ``reference``, and is to be read after it. The default
+``ImageModel`` is ``reference.render``; every field of it replaces one approximation, so that a
+kernel which makes other choices has an independent float64 computation to agree with.
+
+Where ``reference`` walks over splats, this file walks over pairs of a pixel and a splat::
+
+    Gaussians, Camera
+      -> _splats     the splats on the film, and along its rays      (N splats)
+      -> _boxes      the pixels that each may reach                  (N boxes)
+      -> _blocks     parts of the film with a bounded number of pairs
+      -> _pairs      response, sort key and depth, in compositing order    (pairs)
+      -> _composite  weights, transmittance                          (pairs, pixels)
+
+Notation, with m the mean, S the covariance, both in camera axes, (fx, fy) the focal lengths in
+px, u0 = (m_x / m_z, m_y / m_z) the mean's slope:
+
+    F  = diag(fx, fy)           A0 = [I | -u0], the 2 x 3 projection along the mean's ray
+    C  = F A0 S A0^T F / m_z^2 + low_pass I   px^2, covariance on the film   (EWA, section 4)
+    k  = F A0 S e_z / m_z^2     px, covariance of the place on the film with relative depth
+    w  = S_zz / m_z^2           variance of relative depth
+    d  = pixel - mean2d         px
+
+A point p = t r of the ray r through the pixel is at (q d, q - 1), q = t / m_z, in the coordinates
+(F A0 (p - m) / m_z, (p_z - m_z) / m_z), in which the covariance is [[C, k], [k^T, w]]. With the
+Schur complement h = w - k^T C^-1 k and a = 1 - k^T C^-1 d, the squared Mahalanobis distance is
+
+    rho^2(q) = q^2 d^T C^-1 d + (q a - 1)^2 / h
+
+which is least at q = a / D, D = a^2 + h d^T C^-1 d, where it is d^T C^-1 d / D. EWA is D = 1.
+
+Sources are those of ``reference``, and:
+
+- UT: Julier, "The Scaled Unscented Transformation", American Control Conference, 2002; for
+  splats: Wu et al., "3DGUT", CVPR 2025.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, fields
+from math import inf, isfinite
+from typing import Any, Literal, get_args, get_type_hints
+
+import numpy as np
+
+from drgs.reference import splatting as reference
+from drgs.reference.splatting import Camera, Gaussians, Picture
+
+MAX_PAIRS = 2**18
+"""Pairs evaluated at a time: some 100 numbers each, so 200 MB, whatever the film and the scene."""
+
+THINNEST = 1e-30
+"""Least standard deviation of an exact splat, relative to its largest (without a low-pass) or to
+its depth (with one): far below rounding, so that it changes nothing, and far from overflow in the
+fourth powers of its inverse. It gives a disc of thickness zero its limit."""
+
+NEAREST_POINT = 1 / 3
+"""Sigma points nearer than this part of the mean's depth say nothing about a splat."""
+
+OPEN_CONE = 1e-6
+"""An ellipsoid this close (squared, relative) to the plane z = 0 is given the whole film."""
+
+
+# ----------------------------------------------------------------------------------------------
+# Types
+# ----------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class ImageModel:
+    """How a picture comes of Gaussians: the defaults are those of 3DGS and ``reference``.
+
+    projection: ``"ewa"``, the affine approximation at the mean; ``"unscented"``, mean and
+    covariance of seven projected sigma points; ``"exact"``, the peak along each pixel's ray.
+
+    order: by ``"center"``, the mean's camera z; by ``"pixel"``, the depth of the peak along the
+    pixel's ray; by ``"entry"``, where that ray enters the ellipsoid of ``extent`` (exact only).
+
+    sh_direction: colours are seen along the ray to the ``"mean"`` or to the ``"pixel"``.
+
+    stop: a pixel is finished ``"before"`` the splat that takes its transmittance below
+    transmittance_stop, which is then not composited, or ``"after"`` it. step: of order ``"entry"``;
+    a ray that has entered a splat goes on so far behind the entry, and passes over what it enters
+    on the way.
+    """
+
+    projection: Literal["ewa", "unscented", "exact"] = "ewa"
+    order: Literal["center", "pixel", "entry"] = "center"
+    sh_direction: Literal["mean", "pixel"] = "mean"
+    stop: Literal["before", "after"] = "before"
+    alpha_max: float = reference.ALPHA_MAX  # upper clamp of alpha; 1: none
+    alpha_cut: float = reference.ALPHA_CUT  # a smaller alpha does not exist; 0: none
+    transmittance_stop: float = reference.TRANSMITTANCE_STOP  # 0: none
+    extent: float = inf  # standard deviations beyond which a splat does not exist
+    step: float = 0.0  # world units along the ray
+    low_pass: float = reference.LOW_PASS  # px^2; 0: none
+    antialiased: bool = False  # opacities compensate for the low-pass (Mip-Splatting)
+    sh_degree: int | None = None  # None: all that is stored
+
+    def __post_init__(self) -> None:
+        """Refuse unknown names, numbers out of range, and an entry that nothing defines."""
+        choices = get_type_hints(ImageModel)
+        for name in ("projection", "order", "sh_direction", "stop"):
+            known, value = get_args(choices[name]), getattr(self, name)
+            if value not in known:
+                raise ValueError(
+                    f"reference_rays.ImageModel: {name} must be one of {', '.join(known)}, "
+                    f"got {value!r}"
+                )
+        ranges = {
+            "alpha_max": ("in (0, 1]", 0 < self.alpha_max <= 1),
+            "alpha_cut": ("in [0, 1)", 0 <= self.alpha_cut < 1),
+            "transmittance_stop": ("in [0, 1)", 0 <= self.transmittance_stop < 1),
+            "extent": ("> 0", self.extent > 0),
+            "low_pass": (">= 0 and finite", 0 <= self.low_pass < inf),
+            "step": (">= 0 and finite", 0 <= self.step < inf),
+        }
+        for name, (expected, holds) in ranges.items():
+            if not holds:
+                raise ValueError(
+                    f"reference_rays.ImageModel: {name} must be {expected}, "
+                    f"got {getattr(self, name)}"
+                )
+        if self.order == "entry" and not (self.projection == "exact" and isfinite(self.extent)):
+            raise ValueError(
+                "reference_rays.ImageModel: order 'entry' needs projection 'exact' and a finite "
+                f"extent, got projection {self.projection!r} and extent {self.extent}"
+            )
+        if self.step > 0 and self.order != "entry":
+            raise ValueError(
+                f"reference_rays.ImageModel: a step needs order 'entry', got {self.order!r}"
+            )
+
+
+@dataclass(frozen=True)
+class _Splats:
+    """N visible splats, in ascending index of their Gaussians; see the module for the symbols."""
+
+    depths: np.ndarray  # (N,) m_z, world units
+    opacities: np.ndarray  # (N,) after compensation
+    means2d: np.ndarray  # (N, 2) px, film
+    cov2d: np.ndarray  # (N, 2, 2) C, px^2, low-pass included
+    dets: np.ndarray  # (N,) det C
+    depth_cov: np.ndarray  # (N, 2) k, px
+    depth_var: np.ndarray  # (N,) w
+    whitened: np.ndarray  # (N, 3, 3) "exact": see ``_whitened_rays``; else zeros
+    colors: np.ndarray  # (N, 3) display space, seen along the ray to the mean
+    sh: np.ndarray  # (N, K, 3) coefficients
+
+
+@dataclass(frozen=True)
+class _Peaks:
+    """The peaks of M splats along the rays of M pixels."""
+
+    rho_sq: np.ndarray  # (M,) squared distance from the mean, standard deviations
+    depths: np.ndarray  # (M,) t, camera z of the peak, world units
+    keys: np.ndarray  # (M,) what compositing sorts by, world units
+    ahead: np.ndarray  # (M,) relative to m_z: the splat does not exist where this is <= 0
+
+
+@dataclass(frozen=True)
+class _Block:
+    """A rectangle of the picture and the parts of the splats' boxes within it."""
+
+    rows: slice
+    columns: slice
+    splats: np.ndarray  # (B,) indices of the splats that reach into it, ascending
+    boxes: np.ndarray  # (B, 2, 2) [first, end) columns and rows of the picture
+
+
+@dataclass(frozen=True)
+class _Pairs:
+    """M pairs of a block, by pixel, then front to back."""
+
+    pixels: np.ndarray  # (M,) row-major within the block
+    splats: np.ndarray  # (M,)
+    alphas: np.ndarray  # (M,) clamped; 0 where the splat does not exist
+    keys: np.ndarray  # (M,) world units
+    depths: np.ndarray  # (M,) world units, what the picture's depth sums
+    undecided: np.ndarray  # (M,) bool: a decision about this splat may flip in float32
+
+
+# ----------------------------------------------------------------------------------------------
+# The picture
+# ----------------------------------------------------------------------------------------------
+
+
+def render(
+    gaussians: Gaussians,
+    camera: Camera,
+    background: np.ndarray = (0.0, 0.0, 0.0),
+    model: ImageModel = ImageModel(),
+    region: tuple[slice, slice] | None = None,
+    positions: np.ndarray | None = None,
+    threshold_width: float = reference.THRESHOLD_WIDTH,
+) -> Picture:
+    """Return the picture of Gaussians under a model; with a region, that part of it.
+
+    background: (3,) display space; region: rows and columns of the film, None for all; positions:
+    (camera.height, camera.width, 2) px, film, the (x, y) at which each pixel is evaluated, None
+    for the centres; threshold_width: relative distance from a threshold within which a pixel is
+    marked in ``Picture.near_threshold``: alpha from the cut and the clamp, transmittance from the
+    stop, rho^2 from extent^2, the peak (or entry) from the ray's origin, and, unless order is
+    ``"center"``, the sort keys of consecutive splats from each other.
+
+    ``Picture.depth`` sums the means' camera z for order ``"center"``, else that of the peaks.
+
+    Raises ValueError for a shape or region that does not fit the film.
+    """
+    rows, columns = _checked_region(region, camera)
+    positions = _checked_positions(positions, camera)[rows, columns]
+    background = np.asarray(background, dtype=np.float64)
+    if background.shape != (3,):
+        raise ValueError(
+            f"reference_rays.render: background must have shape (3,), got {background.shape}"
+        )
+    splats = _splats(gaussians, camera, model)
+    boxes = _boxes(splats, model, positions, threshold_width)
+
+    shape = positions.shape[:2]
+    image, depth = np.zeros((*shape, 3)), np.zeros(shape)
+    transmittance, near_threshold = np.ones(shape), np.zeros(shape, dtype=bool)
+    whole = _Block(slice(0, shape[0]), slice(0, shape[1]), np.arange(len(boxes)), boxes)
+    for block in _blocks(whole):
+        place = block.rows, block.columns
+        points = positions[place].reshape(-1, 2)
+        pairs = _pairs(block, splats, points, model, threshold_width)
+        slopes = (points - [camera.cx, camera.cy]) / [camera.fx, camera.fy]
+        steps = model.step / np.sqrt(1 + np.sum(slopes**2, axis=1))  # in camera z
+        weights, behind, near = _composite(pairs, steps, model, threshold_width)
+
+        seen = weights > 0
+        colors = _pair_colors(splats, pairs, seen, camera, points, model)
+        sums = np.zeros((len(points), 4))
+        values = np.column_stack([colors, pairs.depths[seen]]) * weights[seen, None]
+        for channel in range(4):
+            sums[:, channel] = np.bincount(pairs.pixels[seen], values[:, channel], len(points))
+        block_shape = transmittance[place].shape
+        image[place] = (sums[:, :3] + behind[:, None] * background).reshape(*block_shape, 3)
+        depth[place] = sums[:, 3].reshape(block_shape)
+        transmittance[place] = behind.reshape(block_shape)
+        near_threshold[place] = near.reshape(block_shape)
+    return Picture(image, 1 - transmittance, depth, transmittance, near_threshold)
+
+
+def _pair_colors(
+    splats: _Splats,
+    pairs: _Pairs,
+    seen: np.ndarray,
+    camera: Camera,
+    points: np.ndarray,
+    model: ImageModel,
+) -> np.ndarray:
+    """Return the colours (M', 3) of the pairs that are ``seen`` (M,), display space, >= 0."""
+    if model.sh_direction == "mean":
+        return splats.colors[pairs.splats[seen]]
+    slopes = (points - [camera.cx, camera.cy]) / [camera.fx, camera.fy]
+    rays = np.column_stack([slopes, np.ones(len(slopes))]) @ camera.rotation
+    directions = rays / np.linalg.norm(rays, axis=1, keepdims=True)
+    degree = round(splats.sh.shape[1] ** 0.5) - 1
+    basis = reference.sh_basis(directions, degree)[pairs.pixels[seen]]
+    return np.maximum(np.einsum("mk,mkc->mc", basis, splats.sh[pairs.splats[seen]]) + 0.5, 0.0)
+
+
+# ----------------------------------------------------------------------------------------------
+# Splats
+# ----------------------------------------------------------------------------------------------
+
+
+def _splats(gaussians: Gaussians, camera: Camera, model: ImageModel) -> _Splats:
+    """Return the splats of the Gaussians that are in front of the near plane and not too faint.
+
+    Those whose covariance on the film is singular, which low_pass = 0 permits, cover no pixel and
+    are left out; an exact splat needs only one of its three scales to be positive.
+    """
+    camera_z = (gaussians.means - camera.center) @ camera.rotation[2]
+    gaussians = _rows(gaussians, camera_z >= camera.near)
+    degree = gaussians.sh_degree if model.sh_degree is None else model.sh_degree
+
+    affine = reference._local_affine(gaussians, camera)
+    z = affine.means[:, 2]
+    slopes = affine.means[:, :2] / z[:, None] if model.projection == "exact" else affine.ratios
+    axes2d = _film_axes(affine, camera, slopes)
+    depth_cov = np.einsum("nij,nj->ni", axes2d, affine.axes[:, 2]) / z[:, None]
+    means2d = _film_positions(affine.means, camera)
+    if model.projection == "unscented":
+        means2d, axes2d = _unscented_transform(affine, camera, means2d)
+    cov2d, dets, areas = _low_passed_covariances(axes2d, model.low_pass)
+
+    opacities = reference.sigmoid(gaussians.logit_opacities)
+    if model.antialiased and model.low_pass > 0:
+        opacities = opacities * areas / np.sqrt(dets)
+    extended = affine.scales.max(axis=1) > 0 if model.projection == "exact" else dets > 0
+    if model.projection == "exact":
+        whitened = _whitened_rays(affine, camera, model.low_pass)
+    else:
+        whitened = np.zeros((len(z), 3, 3))
+    splats = _Splats(
+        depths=z,
+        opacities=opacities,
+        means2d=means2d,
+        cov2d=cov2d,
+        dets=dets,
+        depth_cov=depth_cov,
+        depth_var=np.sum((affine.axes[:, 2] / z[:, None]) ** 2, axis=-1),
+        whitened=whitened,
+        colors=reference.sh_colors(gaussians, camera, degree),
+        sh=reference._sh_coefficients(gaussians, degree),
+    )
+    return _rows(splats, (opacities > model.alpha_cut) & (extended | (model.low_pass > 0)))
+
+
+def _film_positions(points: np.ndarray, camera: Camera) -> np.ndarray:
+    """Return the pinhole projections (..., 2), px, of points (..., 3) in camera axes, z > 0."""
+    focal, principal = [camera.fx, camera.fy], [camera.cx, camera.cy]
+    return focal * points[..., :2] / points[..., 2:] + principal
+
+
+def _film_axes(affine: reference._LocalAffine, camera: Camera, slopes: np.ndarray) -> np.ndarray:
+    """Return M = F A0 V / m_z (N, 2, 3), px, S = V V^T, where A0 has the given slopes (N, 2)."""
+    along_film = affine.axes[:, :2] - slopes[:, :, None] * affine.axes[:, 2:]
+    return along_film * [[camera.fx], [camera.fy]] / affine.means[:, 2, None, None]
+
+
+def _unscented_transform(
+    affine: reference._LocalAffine, camera: Camera, means2d: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the mean (N, 2), px, and M (N, 2, 7), px, with covariance M M^T, of sigma points.
+
+    They are the mean and, for each half axis a_i, m +- sqrt(3) a_i: UT with n = 3, alpha = 1,
+    beta = 2, kappa = 0, hence lambda = 0, weights of the mean 0 and 1/6, and of the covariance 2
+    and 1/6. Splats that have a point nearer than ``NEAREST_POINT`` of their depth, or whose slope
+    is clamped, are projected by the affine approximation. means2d: projections of the means.
+    """
+    steps = np.sqrt(3.0) * np.swapaxes(affine.axes, 1, 2)
+    means = affine.means[:, None]
+    points = np.concatenate([means, means + steps, means - steps], axis=1)
+    nearest = points[..., 2].min(axis=1)
+    usable = affine.unclamped.all(axis=1) & (nearest >= NEAREST_POINT * affine.means[:, 2])
+    film = _film_positions(np.where(usable[:, None, None], points, means), camera)
+    centers = np.sum(film[:, 1:], axis=1) / 6
+    weights = np.array([2.0] + 6 * [1 / 6])
+    axes2d = np.swapaxes((film - centers[:, None]) * np.sqrt(weights)[:, None], 1, 2)
+    affine_axes = np.zeros_like(axes2d)
+    affine_axes[:, :, :3] = affine.axes2d
+    usable = usable[:, None]
+    return np.where(usable, centers, means2d), np.where(usable[:, None], axes2d, affine_axes)
+
+
+def _low_passed_covariances(
+    axes2d: np.ndarray, low_pass: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return C = M M^T + low_pass I (N, 2, 2), det C (N,), sqrt(det M M^T) (N,), of M (N, 2, K).
+
+    As in ``reference``, determinants are sums of squares: those of the 2 x 2 minors of M.
+    """
+    x, y = axes2d[:, 0], axes2d[:, 1]
+    minors = x[:, :, None] * y[:, None, :] - y[:, :, None] * x[:, None, :]
+    areas = np.sqrt(np.sum(minors**2, axis=(1, 2)) / 2)
+    dets = areas**2 + low_pass * np.sum(axes2d**2, axis=(1, 2)) + low_pass**2
+    return axes2d @ np.swapaxes(axes2d, 1, 2) + low_pass * np.eye(2), dets, areas
+
+
+def _whitened_rays(affine: reference._LocalAffine, camera: Camera, low_pass: float) -> np.ndarray:
+    """Return (N, 3, 3), columns B e_x / fx, B e_y / fy and B m / m_z, with B^T B = S'^-1.
+
+    The ray through the pixel at ``mean2d + d`` is whitened to B r = (B m / m_z) + B (F^-1 d, 0).
+    S' = S + low_pass m_z^2 diag(1 / fx^2, 1 / fy^2, 0) is the Gaussian widened along the film.
+
+    Neither S' nor its inverse is formed: their small eigenvalues would cancel. Without a low-pass
+    B = diag(1 / s) R^T W^-1. With one, S' = N N^T, where N (3 x 5) has the half axes and the two
+    widenings in its columns; its rows are orthonormalised, N = L Q, and B = L^-1. With z last, L
+    is bounded below by the low-pass except in its last element, the deviation in depth at a fixed
+    place on the film, which is small only where the whole row is.
+    """
+    focal, z = np.array([camera.fx, camera.fy]), affine.means[:, 2]
+    if low_pass == 0:
+        largest = np.max(affine.scales, axis=1, keepdims=True)
+        largest = np.where(largest > 0, largest, 1.0)
+        scales = np.maximum(affine.scales, THINNEST * largest)
+        # W^-1, not W^T: a rotation that was rounded to single precision is orthogonal to 1e-7.
+        from_camera = np.swapaxes(affine.rotations, 1, 2) @ np.linalg.inv(camera.rotation)
+        whitening = from_camera / scales[:, :, None]
+    else:
+        widening = np.sqrt(low_pass) * z[:, None, None] * np.eye(3)[:, :2] / focal
+        whitening = _inverse_factors(
+            np.concatenate([affine.axes, widening], axis=2), smallest=THINNEST * z
+        )
+    mean_rays = affine.means / z[:, None]
+    return np.concatenate([whitening[:, :, :2] / focal, whitening @ mean_rays[:, :, None]], axis=2)
+
+
+def _inverse_factors(rows: np.ndarray, smallest: np.ndarray) -> np.ndarray:
+    """Return L^-1 (N, 3, 3) of rows = L Q (N, 3, K), Q orthonormal rows, L lower triangular.
+
+    Modified Gram-Schmidt. Diagonal elements of L are raised to ``smallest`` (N,).
+    """
+    inverse = np.tile(np.eye(3), (len(rows), 1, 1))
+    rest = rows.copy()
+    for i in range(3):
+        for j in range(i):
+            factor = np.sum(rest[:, i] * rest[:, j], axis=-1)[:, None]
+            rest[:, i] -= factor * rest[:, j]
+            inverse[:, i] -= factor * inverse[:, j]
+        length = np.maximum(np.linalg.norm(rest[:, i], axis=-1), smallest)[:, None]
+        rest[:, i] /= length
+        inverse[:, i] /= length
+    return inverse
+
+
+# ----------------------------------------------------------------------------------------------
+# A splat at a pixel
+# ----------------------------------------------------------------------------------------------
+
+
+def _peaks(splats: _Splats, i: np.ndarray, offsets: np.ndarray, model: ImageModel) -> _Peaks:
+    """Return the peaks of the splats i (M,) at pixels that are ``offsets`` (M, 2) px from them."""
+    if model.projection == "exact":
+        return _exact_peaks(splats, i, offsets, model)
+    return _affine_peaks(splats, i, offsets, model)
+
+
+def _affine_peaks(splats: _Splats, i: np.ndarray, offsets: np.ndarray, model: ImageModel) -> _Peaks:
+    """Return the peaks of a Gaussian on the film: rho^2 = d^T C^-1 d, t = m_z a / D.
+
+    With C = L L^T, e = L^-1 d and kappa = L^-1 k: rho^2 = |e|^2, a = 1 - kappa . e,
+    h = w - |kappa|^2, D = a^2 + h |e|^2. Order ``"center"`` does not ask for the depth, and a
+    splat then exists whatever the sign of a.
+    """
+    z = splats.depths[i]
+    e = _whitened_on_film(splats, i, offsets)
+    rho_sq = np.sum(e**2, axis=-1)
+    if model.order == "center":
+        return _Peaks(rho_sq, z, z, np.ones_like(z))
+    kappa = _whitened_on_film(splats, i, splats.depth_cov[i])
+    a = 1 - np.sum(kappa * e, axis=-1)
+    h = np.maximum(splats.depth_var[i] - np.sum(kappa**2, axis=-1), 0.0)
+    t = z * a / np.where(a > 0, a**2 + h * rho_sq, 1.0)
+    return _Peaks(rho_sq, depths=t, keys=t, ahead=a)
+
+
+def _whitened_on_film(splats: _Splats, i: np.ndarray, vectors: np.ndarray) -> np.ndarray:
+    """Return L^-1 v (M, 2) for vectors v (M, 2) px, C = L L^T of the splats i, L triangular."""
+    variance, covariance = splats.cov2d[i, 0, 0], splats.cov2d[i, 0, 1]
+    first = vectors[:, 0] / np.sqrt(variance)
+    rest = vectors[:, 1] - covariance / variance * vectors[:, 0]
+    return np.stack([first, rest / np.sqrt(splats.dets[i] / variance)], axis=-1)
+
+
+def _exact_peaks(splats: _Splats, i: np.ndarray, offsets: np.ndarray, model: ImageModel) -> _Peaks:
+    """Return the peaks of a Gaussian along rays r, at t = Br . Bm / |Br|^2.
+
+    rho^2 = |Bm x Br|^2 / |Br|^2, where Bm x Br = Bm x B (r - m / m_z) does not cancel near the
+    mean. The ray enters the ellipsoid rho = extent at sqrt(extent^2 - rho^2) / |Br| before t.
+    """
+    z, (x_axis, y_axis, to_mean) = splats.depths[i], np.moveaxis(splats.whitened[i], 2, 0)
+    sideways = x_axis * offsets[:, :1] + y_axis * offsets[:, 1:]
+    ray = to_mean + sideways
+    ray_sq = np.sum(ray**2, axis=-1)
+    rho_sq = z**2 * np.sum(np.cross(to_mean, sideways) ** 2, axis=-1) / ray_sq
+    t = z * np.sum(ray * to_mean, axis=-1) / ray_sq
+    if model.order == "center":
+        return _Peaks(rho_sq, depths=z, keys=z, ahead=t / z)
+    if model.order == "pixel":
+        return _Peaks(rho_sq, depths=t, keys=t, ahead=t / z)
+    entry = t - np.sqrt(np.maximum(model.extent**2 - rho_sq, 0.0) / ray_sq)
+    return _Peaks(rho_sq, depths=t, keys=entry, ahead=entry / z)
+
+
+def _pairs(
+    block: _Block, splats: _Splats, points: np.ndarray, model: ImageModel, threshold_width: float
+) -> _Pairs:
+    """Return the pairs of a block whose splat exists at its pixel, or may in single precision.
+
+    points: (P, 2) px, film, where the block's pixels are evaluated, row by row.
+    """
+    i, pixels = _pairs_in_boxes(block)
+    peaks = _peaks(splats, i, points[pixels] - splats.means2d[i], model)
+    raw = splats.opacities[i] * np.exp(-0.5 * peaks.rho_sq)
+    far = model.extent**2
+    possible = (
+        (raw >= model.alpha_cut * (1 - threshold_width))
+        & (peaks.rho_sq <= far * (1 + threshold_width))
+        & (peaks.ahead > -threshold_width)
+    )
+    exists = (raw >= model.alpha_cut) & (peaks.rho_sq <= far) & (peaks.ahead > 0)
+    undecided = (
+        _is_near(raw, model.alpha_cut, threshold_width)
+        | _is_near(raw, model.alpha_max, threshold_width)
+        | _is_near(peaks.rho_sq, far, threshold_width)
+        | (np.abs(peaks.ahead) <= threshold_width)
+    )
+    order = np.lexsort((i[possible], peaks.keys[possible], pixels[possible]))
+    chosen = np.flatnonzero(possible)[order]
+    return _Pairs(
+        pixels=pixels[chosen],
+        splats=i[chosen],
+        alphas=np.where(exists, np.minimum(raw, model.alpha_max), 0.0)[chosen],
+        keys=peaks.keys[chosen],
+        depths=peaks.depths[chosen],
+        undecided=undecided[chosen],
+    )
+
+
+def _is_near(values: np.ndarray, threshold: float, width: float) -> np.ndarray:
+    """Return (M,) bool: within ``width``, relative; nothing is near a threshold of 0 or inf."""
+    if threshold == 0 or not isfinite(threshold):
+        return np.zeros(np.shape(values), dtype=bool)
+    return np.abs(values - threshold) <= width * threshold
+
+
+# ----------------------------------------------------------------------------------------------
+# Which pixels a splat may reach
+# ----------------------------------------------------------------------------------------------
+
+
+def _boxes(
+    splats: _Splats, model: ImageModel, positions: np.ndarray, threshold_width: float
+) -> np.ndarray:
+    """Return (N, 2, 2) [first, end) columns and rows of the picture that each splat may reach.
+
+    positions: (H, W, 2) px, film. One pixel is added for rounding.
+    """
+    size = np.array([positions.shape[1], positions.shape[0]])
+    if not size.all():
+        return np.zeros((len(splats.depths), 2, 2), dtype=int)
+    low, high = _film_bounds(splats, model, threshold_width)
+    indices = np.stack(np.meshgrid(np.arange(size[0]), np.arange(size[1])), axis=-1)
+    shifts = positions - indices
+    first = np.ceil(low - shifts.max(axis=(0, 1)) - 1)
+    last = np.floor(high - shifts.min(axis=(0, 1)) + 1)
+    # fmin and fmax also send a NaN to the border, so that the conversion is defined.
+    first = np.fmin(np.fmax(first, 0), size)
+    end = np.fmax(np.fmin(last + 1, size), first)
+    return np.stack([first, end], axis=-1).astype(int)
+
+
+def _film_bounds(
+    splats: _Splats, model: ImageModel, threshold_width: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the lowest and highest film positions (N, 2), px, at which a splat may exist.
+
+    rho <= R, from the extent and from o exp(-R^2 / 2) = alpha_cut, bounds a Gaussian on the film
+    by R sqrt(C_xx). An exact one is bounded by the planes through the x or y axis that touch the
+    ellipsoid rho = R: with l = A0^T e_x - y e_z / fx, one that passes y px beside the mean,
+    (l . m)^2 = R^2 l^T S' l is
+
+        (1 - R^2 w) y^2 + 2 R^2 k_x y - R^2 C_xx = 0
+
+    Where R^2 w >= 1 the ellipsoid reaches the plane z = 0, and there is no bound.
+    """
+    reach_sq = np.full(len(splats.depths), model.extent**2 * (1 + threshold_width))
+    if model.alpha_cut > 0:
+        cut = model.alpha_cut * (1 - threshold_width)
+        reach_sq = np.minimum(reach_sq, 2 * np.log(splats.opacities / cut))
+    variances = np.diagonal(splats.cov2d, axis1=1, axis2=2)
+    if model.projection != "exact":
+        half_sizes = np.sqrt(reach_sq[:, None] * variances)
+        return splats.means2d - half_sizes, splats.means2d + half_sizes
+    finite = np.isfinite(reach_sq)
+    reach_sq = np.where(finite, reach_sq, 0.0)
+    bounded = finite & (reach_sq * splats.depth_var < 1 - OPEN_CONE)
+    reach_sq = np.where(bounded, reach_sq, 0.0)[:, None]
+    closing = 1 - reach_sq * splats.depth_var[:, None]
+    middle = -reach_sq * splats.depth_cov
+    half_sizes = np.sqrt(middle**2 + closing * reach_sq * variances)
+    half_sizes = np.where(bounded[:, None], half_sizes, inf)
+    return (
+        splats.means2d + (middle - half_sizes) / closing,
+        splats.means2d + (middle + half_sizes) / closing,
+    )
+
+
+def _blocks(block: _Block) -> Iterator[_Block]:
+    """Yield parts of a block, halved until each has at most ``MAX_PAIRS`` pairs or one pixel."""
+    limits = np.array(
+        [[block.columns.start, block.columns.stop], [block.rows.start, block.rows.stop]]
+    )
+    boxes = np.clip(block.boxes, limits[:, :1], limits[:, 1:])
+    counts = np.prod(boxes[:, :, 1] - boxes[:, :, 0], axis=-1)
+    touching = counts > 0
+    clipped = _Block(block.rows, block.columns, block.splats[touching], boxes[touching])
+    width, height = limits[:, 1] - limits[:, 0]
+    if counts.sum() <= MAX_PAIRS or width * height == 1:
+        yield clipped
+        return
+    for rows, columns in _halves(block.rows, block.columns):
+        yield from _blocks(_Block(rows, columns, clipped.splats, clipped.boxes))
+
+
+def _halves(rows: slice, columns: slice) -> list[tuple[slice, slice]]:
+    """Return the two halves of a rectangle, cut across its longer side."""
+    if rows.stop - rows.start > columns.stop - columns.start:
+        middle = (rows.start + rows.stop) // 2
+        return [(slice(rows.start, middle), columns), (slice(middle, rows.stop), columns)]
+    middle = (columns.start + columns.stop) // 2
+    return [(rows, slice(columns.start, middle)), (rows, slice(middle, columns.stop))]
+
+
+def _pairs_in_boxes(block: _Block) -> tuple[np.ndarray, np.ndarray]:
+    """Return the splat (M,) and the pixel (M,), row-major within the block, of all its pairs."""
+    widths, heights = (block.boxes[:, :, 1] - block.boxes[:, :, 0]).T
+    counts = widths * heights
+    owner = np.repeat(np.arange(len(counts)), counts)
+    within = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
+    columns = block.boxes[owner, 0, 0] + within % widths[owner] - block.columns.start
+    rows = block.boxes[owner, 1, 0] + within // widths[owner] - block.rows.start
+    return block.splats[owner], rows * (block.columns.stop - block.columns.start) + columns
+
+
+# ----------------------------------------------------------------------------------------------
+# Compositing
+# ----------------------------------------------------------------------------------------------
+
+
+def _composite(
+    pairs: _Pairs, steps: np.ndarray, model: ImageModel, threshold_width: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the weights T alpha (M,), the transmittance (P,) and the marks (P,) of P pixels.
+
+    steps: (P,) the model's step in the units of the keys.
+
+    Pixels are taken together whose lists have a length in (2^(n-1), 2^n]: as rows of a matrix,
+    filled up with alpha = 0, which at most doubles them. Transmittance is a cumulative product,
+    and as it never rises, the pixel is finished exactly where it is below the stop.
+    """
+    num_pixels = len(steps)
+    weights, transmittance = np.zeros(len(pairs.pixels)), np.ones(num_pixels)
+    near_threshold = np.zeros(num_pixels, dtype=bool)
+    lengths = np.bincount(pairs.pixels, minlength=num_pixels)
+    ranks = np.arange(len(pairs.pixels)) - (np.cumsum(lengths) - lengths)[pairs.pixels]
+    sizes = np.where(lengths > 0, np.ceil(np.log2(np.maximum(lengths, 1))), -1).astype(int)
+    for size in np.unique(sizes[lengths > 0]):
+        members = np.flatnonzero(sizes == size)
+        chosen = np.flatnonzero(sizes[pairs.pixels] == size)
+        cells = np.searchsorted(members, pairs.pixels[chosen]), ranks[chosen]
+
+        shape = len(members), 2**size
+
+        alphas = _matrix(pairs.alphas[chosen], cells, shape)
+        if model.step > 0:
+            keys = _matrix(pairs.keys[chosen], cells, shape)
+            alphas = np.where(_passed_over(alphas > 0, keys, steps[members]), 0.0, alphas)
+        behind = np.cumprod(1 - alphas, axis=1)
+        before = np.column_stack([np.ones(len(members)), behind[:, :-1]])
+        unfinished = before >= model.transmittance_stop
+        composited = unfinished if model.stop == "after" else behind >= model.transmittance_stop
+        weights[chosen] = np.where(composited, before * alphas, 0.0)[cells]
+        transmittance[members] = np.min(np.where(composited, behind, 1.0), axis=1)
+
+        exists = alphas > 0
+        near = _matrix(pairs.undecided[chosen], cells, shape) | (
+            exists & _is_near(behind, model.transmittance_stop, threshold_width)
+        )
+        if model.order != "center":
+            keys = _matrix(pairs.keys[chosen], cells, shape)
+            near |= exists & _follows_closely(keys, threshold_width)
+        near_threshold[members] = np.any(unfinished & near, axis=1)
+    return weights, transmittance, near_threshold
+
+
+def _passed_over(exists: np.ndarray, keys: np.ndarray, steps: np.ndarray) -> np.ndarray:
+    """Return (P, L) bool: the splat's key is within the step (P,) behind the last one entered."""
+    passed, last = np.zeros_like(exists), np.full(len(keys), -inf)
+    for rank in range(keys.shape[1]):
+        passed[:, rank] = exists[:, rank] & (keys[:, rank] < last + steps)
+        last = np.where(exists[:, rank] & ~passed[:, rank], keys[:, rank], last)
+    return passed
+
+
+def _matrix(values: np.ndarray, cells: tuple, shape: tuple[int, int]) -> np.ndarray:
+    """Return a matrix with the values (M,) in its cells, rows and columns (M,) each, else 0."""
+    matrix = np.zeros(shape, dtype=values.dtype)
+    matrix[cells] = values
+    return matrix
+
+
+def _follows_closely(keys: np.ndarray, width: float) -> np.ndarray:
+    """Return (P, L) bool: the sort key (P, L) is that of the splat before it, within ``width``.
+
+    A splat that does not exist may stand between two that do: it is near a threshold itself.
+    """
+    steps = np.diff(keys, axis=1, prepend=-inf)
+    return steps <= width * np.abs(keys)
+
+
+# ----------------------------------------------------------------------------------------------
+# Small helpers
+# ----------------------------------------------------------------------------------------------
+
+
+def _rows(data: Any, chosen: np.ndarray) -> Any:
+    """Return a dataclass of arrays (N, ...) with the rows that are ``chosen`` (N,) bool."""
+    return type(data)(**{field.name: getattr(data, field.name)[chosen] for field in fields(data)})
+
+
+def _checked_region(region: tuple[slice, slice] | None, camera: Camera) -> tuple[slice, slice]:
+    """Return the region's rows and columns with explicit ends, the whole film for None."""
+    if region is None:
+        return slice(0, camera.height), slice(0, camera.width)
+    if len(region) != 2 or not all(isinstance(part, slice) for part in region):
+        raise ValueError(
+            f"reference_rays.render: region must be a slice of rows and one of columns, "
+            f"got {region!r}"
+        )
+    for part, size in zip(region, (camera.height, camera.width), strict=True):
+        if part.step not in (None, 1) or part.indices(size)[1] < part.indices(size)[0]:
+            raise ValueError(
+                f"reference_rays.render: region must have slices of step 1 in ascending order, "
+                f"got {part}"
+            )
+    return slice(*region[0].indices(camera.height)), slice(*region[1].indices(camera.width))
+
+
+def _checked_positions(positions: np.ndarray | None, camera: Camera) -> np.ndarray:
+    """Return where each pixel of the film is evaluated (height, width, 2), px, (x, y)."""
+    if positions is None:
+        x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
+        return np.stack([x, y], axis=-1)
+    positions = np.asarray(positions, dtype=np.float64)
+    expected = (camera.height, camera.width, 2)
+    if positions.shape != expected:
+        raise ValueError(
+            f"reference_rays.render: positions must have shape {expected}, that of the film even "
+            f"where a region is given, got {positions.shape}"
+        )
+    return positions

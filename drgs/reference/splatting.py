@@ -1,0 +1,912 @@
+"""The reference: 3D Gaussian splatting in float64 numpy, to be read beside the paper.
+
+It imports nothing of this package, not even its constants, so that the fast kernels are compared
+with an independent computation. The order of the file is the order of the data::
+
+    Gaussians, Camera
+      -> project     means2d, conics, depths, opacities       (N splats on the film)
+      -> sh_colors   colors
+      -> composite   image, alpha, depth                      (pixels)
+
+followed by the gradients in the opposite order, each derived by hand and each beside the
+equation that it differentiates. For a scalar loss L, ``d_x`` is the array dL/dx.
+
+Sources, cited by these names:
+
+- 3DGS: Kerbl, Kopanas, Leimkuehler, Drettakis, "3D Gaussian Splatting for Real-Time Radiance
+  Field Rendering", ACM Transactions on Graphics 42(4), 2023, and its CUDA rasterizer.
+- EWA: Zwicker, Pfister, van Baar, Gross, "EWA Splatting", IEEE TVCG 8(3), 2002.
+- Mip-Splatting: Yu, Chen, Huang, Sattler, Geiger, CVPR 2024.
+
+Spaces: *world*; *camera* (x right, y down, z forward, world units); *film* (pixels, x right,
+y down, pixel (i, j) has its centre at (i + 0.5, j + 0.5)). Images are indexed [row, column].
+Colours are in display space (sRGB-encoded). Quaternions are wxyz.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+# The two thresholds on alpha are the single-precision numbers of the CUDA rasterizer (0.99f and
+# 1.0f / 255.0f), not the decimals. For the clamp this decides pictures: behind one clamped
+# splat T = 1 - 0.99, and a second one leaves (1 - 0.99)^2, which is just above 1e-4 with the
+# double nearest to 0.99, and 2e-6 (relative) below it with 0.99f. So every single-precision
+# rasterizer stops there, and so does this one.
+ALPHA_MAX = float(np.float32(0.99))
+"""Upper clamp of alpha (3DGS rasterizer)."""
+
+ALPHA_CUT = float(np.float32(1.0) / np.float32(255.0))
+"""A splat with a smaller alpha at a pixel does not exist there (3DGS rasterizer)."""
+
+TRANSMITTANCE_STOP = 1e-4
+"""A pixel is finished before the splat that would take it below this (3DGS rasterizer)."""
+
+LOW_PASS = 0.3
+"""px^2 added to the diagonal of the covariance on the film (3DGS rasterizer)."""
+
+FRUSTUM_MARGIN = 0.3
+"""The Jacobian's x/z and y/z may leave the frustum by this part of its half extents (3DGS)."""
+
+THRESHOLD_WIDTH = 1e-6
+"""Relative distance from a threshold at which single precision may decide otherwise."""
+
+
+# ----------------------------------------------------------------------------------------------
+# Types
+# ----------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A pinhole camera in OpenCV axes: a world point x is at ``rotation (x - center)``."""
+
+    rotation: np.ndarray  # (3, 3) world to camera
+    center: np.ndarray  # (3,) world
+    fx: float  # px
+    fy: float  # px
+    cx: float  # px, film
+    cy: float  # px, film
+    width: int  # px
+    height: int  # px
+    near: float = 0.01  # world units: means with a smaller camera z are culled
+
+    def __post_init__(self) -> None:
+        """Convert to float64 and check shapes."""
+        for name, shape in {"rotation": (3, 3), "center": (3,)}.items():
+            value = np.asarray(getattr(self, name), dtype=np.float64)
+            if value.shape != shape:
+                raise ValueError(
+                    f"reference.Camera: {name} must have shape {shape}, got {value.shape}"
+                )
+            object.__setattr__(self, name, value)
+        if not self.near > 0:
+            raise ValueError(
+                f"reference.Camera: near must be > 0, since projection divides by z, "
+                f"got {self.near}"
+            )
+
+
+@dataclass(frozen=True)
+class Gaussians:
+    """N Gaussians; ``log_`` and ``logit_`` mark values before their activation."""
+
+    means: np.ndarray  # (N, 3) world
+    quats: np.ndarray  # (N, 4) wxyz, not normalised
+    log_scales: np.ndarray  # (N, 3) natural logarithm of standard deviations in world units
+    logit_opacities: np.ndarray  # (N,)
+    sh0: np.ndarray  # (N, 1, 3) coefficient of degree 0, RGB, display space
+    shN: np.ndarray  # (N, K - 1, 3) the others, K = (degree + 1)^2  # noqa: N815
+
+    def __post_init__(self) -> None:
+        """Convert to float64 and check shapes."""
+        for name in ("means", "quats", "log_scales", "logit_opacities", "sh0", "shN"):
+            object.__setattr__(self, name, np.asarray(getattr(self, name), dtype=np.float64))
+        n = len(self.means)
+        shapes = {
+            "means": (n, 3),
+            "quats": (n, 4),
+            "log_scales": (n, 3),
+            "logit_opacities": (n,),
+            "sh0": (n, 1, 3),
+        }
+        for name, shape in shapes.items():
+            if getattr(self, name).shape != shape:
+                raise ValueError(
+                    f"reference.Gaussians: {name} must have shape {shape} like the {n} means, "
+                    f"got {getattr(self, name).shape}"
+                )
+        if self.shN.shape not in [(n, (degree + 1) ** 2 - 1, 3) for degree in range(4)]:
+            raise ValueError(
+                f"reference.Gaussians: shN must have shape ({n}, 0, 3), ({n}, 3, 3), "
+                f"({n}, 8, 3) or ({n}, 15, 3) for degree 0, 1, 2 or 3, got {self.shN.shape}"
+            )
+
+    @property
+    def sh_degree(self) -> int:
+        """Highest degree stored, 0 to 3."""
+        return {0: 0, 3: 1, 8: 2, 15: 3}[self.shN.shape[1]]
+
+
+@dataclass(frozen=True)
+class Projection:
+    """N splats on the film. Rows that are not ``visible`` hold finite, meaningless numbers."""
+
+    means2d: np.ndarray  # (N, 2) px, film
+    cov2d: np.ndarray  # (N, 2, 2) px^2, low-pass included
+    conics: np.ndarray  # (N, 2, 2) px^-2, inverse of cov2d
+    depths: np.ndarray  # (N,) camera z, world units; the true one for culled rows too
+    opacities: np.ndarray  # (N,) activated; after compensation where that was asked for
+    visible: np.ndarray  # (N,) bool: depths >= near and opacities > ALPHA_CUT; may be off film
+    cuts: np.ndarray | float | None = None  # (N,) or for all: smallest alphas; None: ALPHA_CUT
+
+
+@dataclass(frozen=True)
+class Picture:
+    """What a camera sees."""
+
+    image: np.ndarray  # (H, W, 3) display space, background included
+    alpha: np.ndarray  # (H, W) = 1 - transmittance
+    depth: np.ndarray  # (H, W) sum of T alpha z: premultiplied by alpha, world units
+    transmittance: np.ndarray  # (H, W) share of the background that is seen
+    near_threshold: np.ndarray  # (H, W) bool: a decision of this pixel may flip in float32
+
+
+# ----------------------------------------------------------------------------------------------
+# Gaussians in the world
+# ----------------------------------------------------------------------------------------------
+
+
+def quat_to_rotation(quats: np.ndarray) -> np.ndarray:
+    """Return the rotation matrices (N, 3, 3) of quaternions (N, 4), wxyz, of any norm.
+
+    A quaternion of norm zero gives the identity.
+    """
+    unit_quats, _ = _normalize(quats, fallback=(1.0, 0.0, 0.0, 0.0))
+    w, x, y, z = unit_quats.T
+    return _rows_of_matrices(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def covariances(quats: np.ndarray, log_scales: np.ndarray) -> np.ndarray:
+    """Return Sigma = R S S^T R^T (3DGS, equation 6): (N, 3, 3), world units squared.
+
+    quats: (N, 4) wxyz; log_scales: (N, 3). Projection works with the factor R S instead: the
+    determinant of a needle's covariance cancels, that of its factor does not.
+    """
+    factors = quat_to_rotation(quats) * np.exp(log_scales)[:, None, :]
+    return factors @ _transposed(factors)
+
+
+def sigmoid(logits: np.ndarray) -> np.ndarray:
+    """Return 1 / (1 + exp(-x)), accurate and without overflow for every x."""
+    return np.exp(-np.logaddexp(0.0, -logits))
+
+
+# ----------------------------------------------------------------------------------------------
+# Colour
+# ----------------------------------------------------------------------------------------------
+
+# Normalisation of the real spherical harmonics (Condon-Shortley phase, as in 3DGS), with l the
+# degree: C_LM multiplies the polynomials of order +-m.
+C_00 = np.sqrt(1 / (4 * np.pi))
+C_1 = np.sqrt(3 / (4 * np.pi))
+C_20 = np.sqrt(5 / (16 * np.pi))
+C_21 = np.sqrt(15 / (4 * np.pi))
+C_22 = np.sqrt(15 / (16 * np.pi))
+C_30 = np.sqrt(7 / (16 * np.pi))
+C_31 = np.sqrt(21 / (32 * np.pi))
+C_32 = np.sqrt(105 / (16 * np.pi))
+C_33 = np.sqrt(35 / (32 * np.pi))
+
+
+def sh_basis(directions: np.ndarray, degree: int) -> np.ndarray:
+    """Return the real spherical harmonics (N, K) of unit directions (N, 3), K = (degree + 1)^2.
+
+    Column l^2 + l + m holds degree l, order m, with the signs of 3DGS. They are orthonormal on
+    the sphere.
+    """
+    _check_degree("sh_basis", degree, 3)
+    x, y, z = directions.T
+    basis = [
+        C_00 * np.ones_like(x),
+        -C_1 * y,
+        C_1 * z,
+        -C_1 * x,
+        2 * C_22 * x * y,
+        -C_21 * y * z,
+        C_20 * (2 * z * z - x * x - y * y),
+        -C_21 * x * z,
+        C_22 * (x * x - y * y),
+        -C_33 * y * (3 * x * x - y * y),
+        2 * C_32 * x * y * z,
+        -C_31 * y * (4 * z * z - x * x - y * y),
+        C_30 * z * (2 * z * z - 3 * x * x - 3 * y * y),
+        -C_31 * x * (4 * z * z - x * x - y * y),
+        C_32 * z * (x * x - y * y),
+        -C_33 * x * (x * x - 3 * y * y),
+    ]
+    return np.stack(basis[: (degree + 1) ** 2], axis=-1)
+
+
+def sh_basis_gradient(directions: np.ndarray, degree: int) -> np.ndarray:
+    """Return (N, K, 3): the derivatives of the polynomials of ``sh_basis`` with respect to x, y, z.
+
+    x, y, z vary independently here; the unit length of a direction is the caller's business.
+    """
+    _check_degree("sh_basis_gradient", degree, 3)
+    x, y, z = directions.T
+    zero, one = np.zeros_like(x), np.ones_like(x)
+    gradient = [
+        [zero, zero, zero],
+        [zero, -C_1 * one, zero],
+        [zero, zero, C_1 * one],
+        [-C_1 * one, zero, zero],
+        [2 * C_22 * y, 2 * C_22 * x, zero],
+        [zero, -C_21 * z, -C_21 * y],
+        [-2 * C_20 * x, -2 * C_20 * y, 4 * C_20 * z],
+        [-C_21 * z, zero, -C_21 * x],
+        [2 * C_22 * x, -2 * C_22 * y, zero],
+        [-6 * C_33 * x * y, -3 * C_33 * (x * x - y * y), zero],
+        [2 * C_32 * y * z, 2 * C_32 * x * z, 2 * C_32 * x * y],
+        [2 * C_31 * x * y, -C_31 * (4 * z * z - x * x - 3 * y * y), -8 * C_31 * y * z],
+        [-6 * C_30 * x * z, -6 * C_30 * y * z, C_30 * (6 * z * z - 3 * x * x - 3 * y * y)],
+        [-C_31 * (4 * z * z - 3 * x * x - y * y), 2 * C_31 * x * y, -8 * C_31 * x * z],
+        [2 * C_32 * x * z, -2 * C_32 * y * z, C_32 * (x * x - y * y)],
+        [-3 * C_33 * (x * x - y * y), 6 * C_33 * x * y, zero],
+    ]
+    return _rows_of_matrices(gradient[: (degree + 1) ** 2])
+
+
+def sh_colors(gaussians: Gaussians, camera: Camera, degree: int) -> np.ndarray:
+    """Return the colours (N, 3) that the camera sees, display space, >= 0, not bounded above.
+
+    color = max(0, sum_k Y_k(direction) coefficient_k + 0.5), with the direction from the camera's
+    centre to the mean (3DGS rasterizer). ``degree`` may be lower than what is stored.
+    """
+    directions, _ = _view_directions(gaussians, camera)
+    return np.maximum(_unclamped_colors(gaussians, directions, degree), 0.0)
+
+
+def _view_directions(gaussians: Gaussians, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+    """Return unit directions (N, 3) and distances (N,) from the camera's centre to the means."""
+    return _normalize(gaussians.means - camera.center, fallback=(0.0, 0.0, 1.0))
+
+
+def _unclamped_colors(gaussians: Gaussians, directions: np.ndarray, degree: int) -> np.ndarray:
+    basis = sh_basis(directions, degree)
+    return np.einsum("nk,nkc->nc", basis, _sh_coefficients(gaussians, degree)) + 0.5
+
+
+def _sh_coefficients(gaussians: Gaussians, degree: int) -> np.ndarray:
+    """Return (N, K, 3): the coefficients up to ``degree``."""
+    _check_degree("sh_colors", degree, gaussians.sh_degree)
+    coefficients = np.concatenate([gaussians.sh0, gaussians.shN], axis=1)
+    return coefficients[:, : (degree + 1) ** 2]
+
+
+# ----------------------------------------------------------------------------------------------
+# Projection
+# ----------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _LocalAffine:
+    """The affine approximation of the projection at each mean, with its intermediate results.
+
+    Rows behind the near plane have their camera mean replaced by (0, 0, 1), so that no division
+    meets a zero.
+    """
+
+    in_front: np.ndarray  # (N,) bool: camera z >= near
+    means: np.ndarray  # (N, 3) camera
+    ratios: np.ndarray  # (N, 2) x/z and y/z, clamped to the widened frustum
+    unclamped: np.ndarray  # (N, 2) bool: the clamp left this ratio as it was
+    jacobians: np.ndarray  # (N, 2, 3) J, px per world unit
+    rotations: np.ndarray  # (N, 3, 3) R(q)
+    scales: np.ndarray  # (N, 3) s, world units
+    axes: np.ndarray  # (N, 3, 3) V = W R(q) diag(s), camera: the ellipsoid's half axes in columns
+    axes2d: np.ndarray  # (N, 2, 3) M = J V, px
+
+
+def _local_affine(gaussians: Gaussians, camera: Camera) -> _LocalAffine:
+    """Linearise the projection at each mean (EWA, section 4; 3DGS, equation 5).
+
+    M = J W R(q) diag(s), with W the camera's rotation and J the Jacobian of
+    (fx x/z + cx, fy y/z + cy). In J only, x/z and y/z are clamped: far outside the film the
+    affine approximation makes splats so large that they would reach back into the picture.
+    """
+    camera_means = (gaussians.means - camera.center) @ camera.rotation.T
+    in_front = camera_means[:, 2] >= camera.near
+    camera_means = np.where(in_front[:, None], camera_means, (0.0, 0.0, 1.0))
+    z = camera_means[:, 2]
+
+    focal = np.array([camera.fx, camera.fy])
+    principal = np.array([camera.cx, camera.cy])
+    size = np.array([camera.width, camera.height])
+    lower = (0 - principal) / focal
+    upper = (size - principal) / focal
+    margin = FRUSTUM_MARGIN * (upper - lower) / 2
+    true_ratios = camera_means[:, :2] / z[:, None]
+    ratios = np.clip(true_ratios, lower - margin, upper + margin)
+
+    zero = np.zeros_like(z)
+    jacobians = _rows_of_matrices(
+        [
+            [camera.fx / z, zero, -camera.fx * ratios[:, 0] / z],
+            [zero, camera.fy / z, -camera.fy * ratios[:, 1] / z],
+        ]
+    )
+    rotations = quat_to_rotation(gaussians.quats)
+    scales = np.exp(gaussians.log_scales)
+    axes = camera.rotation @ rotations * scales[:, None, :]
+    return _LocalAffine(
+        in_front=in_front,
+        means=camera_means,
+        ratios=ratios,
+        unclamped=ratios == true_ratios,
+        jacobians=jacobians,
+        rotations=rotations,
+        scales=scales,
+        axes=axes,
+        axes2d=jacobians @ axes,
+    )
+
+
+def project(gaussians: Gaussians, camera: Camera, antialiased: bool = False) -> Projection:
+    """Return the splats that Gaussians leave on the film.
+
+    cov2d = J W Sigma W^T J^T + 0.3 I = M M^T + 0.3 I    (3DGS, equation 5, and its rasterizer)
+
+    ``antialiased`` multiplies each opacity by sqrt(det(M M^T) / det(cov2d)), which undoes the
+    brightening that the low-pass causes (Mip-Splatting, section 4.2).
+    """
+    affine = _local_affine(gaussians, camera)
+    x, y, z = affine.means.T
+    cov2d, dets, areas = _low_passed_covariances(affine.axes2d)
+    opacities = sigmoid(gaussians.logit_opacities)
+    if antialiased:
+        opacities = opacities * areas / np.sqrt(dets)
+    depths = (gaussians.means - camera.center) @ camera.rotation[2]
+    return Projection(
+        means2d=np.stack([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy], axis=-1),
+        cov2d=cov2d,
+        conics=_inverses(cov2d, dets),
+        depths=depths,
+        opacities=opacities,
+        visible=affine.in_front & (opacities > ALPHA_CUT),
+    )
+
+
+def _low_passed_covariances(axes2d: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return cov2d = M M^T + 0.3 I (N, 2, 2), det(cov2d) (N,) and sqrt(det(M M^T)) (N,).
+
+    The determinants are sums of squares, which cannot cancel: by Cauchy-Binet det(M M^T) is the
+    sum of the squared 2 x 2 minors of M, which are the components of the cross product of its
+    two rows, and det(A + t I) = det(A) + t trace(A) + t^2.
+    """
+    areas = np.linalg.norm(np.cross(axes2d[:, 0], axes2d[:, 1]), axis=-1)
+    traces = np.sum(axes2d**2, axis=(1, 2))
+    dets = areas**2 + LOW_PASS * traces + LOW_PASS**2
+    cov2d = axes2d @ _transposed(axes2d) + LOW_PASS * np.eye(2)
+    return cov2d, dets, areas
+
+
+def _inverses(matrices: np.ndarray, dets: np.ndarray) -> np.ndarray:
+    """Return the inverses of symmetric matrices (N, 2, 2) whose determinants (N,) are given."""
+    a, b, c = matrices[:, 0, 0], matrices[:, 0, 1], matrices[:, 1, 1]
+    return _rows_of_matrices([[c / dets, -b / dets], [-b / dets, a / dets]])
+
+
+# ----------------------------------------------------------------------------------------------
+# Compositing
+# ----------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _Footprint:
+    """One splat on the pixels of its bounding box of h x w pixels."""
+
+    box: tuple[slice, slice]  # rows and columns of the film
+    dx: np.ndarray  # (1, w) px, from the splat's mean to the pixel centres
+    dy: np.ndarray  # (h, 1) px
+    falloff: np.ndarray  # (h, w) exp(-d^T A d / 2)
+    raw_alpha: np.ndarray  # (h, w) opacity * falloff, before the clamp
+
+
+def _footprint(
+    box: tuple[slice, slice], mean2d: np.ndarray, conic: np.ndarray, opacity: float
+) -> _Footprint:
+    """Evaluate G(d) = exp(-d^T A d / 2) (3DGS, equation 4, on the film) in a box of pixels."""
+    rows, columns = box
+    dx = (np.arange(columns.start, columns.stop) + 0.5 - mean2d[0])[None, :]
+    dy = (np.arange(rows.start, rows.stop) + 0.5 - mean2d[1])[:, None]
+    a, b, c = conic[0, 0], conic[0, 1], conic[1, 1]
+    falloff = np.exp(-0.5 * (a * dx * dx + 2 * b * dx * dy + c * dy * dy))
+    return _Footprint(box, dx, dy, falloff, opacity * falloff)
+
+
+def _pixel_boxes(
+    means2d: np.ndarray,
+    conics: np.ndarray,
+    opacities: np.ndarray,
+    smallest_alpha: np.ndarray | float,
+    width: int,
+    height: int,
+) -> list[tuple[slice, slice]]:
+    """Return, for each splat, the rows and columns outside which its alpha is < smallest_alpha.
+
+    opacity exp(-d^T A d / 2) >= smallest_alpha is the ellipse d^T A d <= k with
+    k = 2 ln(opacity / smallest_alpha); with A = cov2d^-1 its half width is sqrt(k cov2d_xx) and
+    its half height sqrt(k cov2d_yy). One pixel is added for rounding. Where inverting A would
+    cancel, the box is the whole film.
+    """
+    a, b, c = conics[:, 0, 0], conics[:, 0, 1], conics[:, 1, 1]
+    dets = a * c - b * b
+    well_conditioned = dets > 1e-9 * np.abs(a * c)
+    dets = np.where(well_conditioned, dets, 1.0)
+    k = 2 * np.log(np.maximum(opacities, smallest_alpha) / smallest_alpha)
+    variances = np.stack([c, a], axis=-1) / dets[:, None]
+    half_sizes = np.sqrt(np.maximum(k[:, None] * variances, 0.0)) + 1.0
+    half_sizes[~well_conditioned] = np.inf
+    # fmin and fmax also send a NaN to the film's border, so that the conversion is defined.
+    film = np.array([width, height], dtype=np.float64)
+    first = np.fmin(np.fmax(np.ceil(means2d - half_sizes - 0.5), 0.0), film).astype(int)
+    last = np.fmax(np.fmin(np.floor(means2d + half_sizes - 0.5), film - 1.0), -1.0).astype(int)
+    return [
+        (slice(y0, max(y0, y1 + 1)), slice(x0, max(x0, x1 + 1)))
+        for (x0, y0), (x1, y1) in zip(first, last, strict=True)
+    ]
+
+
+def _depth_order(depths: np.ndarray, visible: np.ndarray) -> np.ndarray:
+    """Return the indices of the visible splats, nearest first, ties by index."""
+    indices = np.flatnonzero(visible)
+    return indices[np.argsort(depths[indices], kind="stable")]
+
+
+def composite(
+    means2d: np.ndarray,
+    conics: np.ndarray,
+    opacities: np.ndarray,
+    colors: np.ndarray,
+    depths: np.ndarray,
+    visible: np.ndarray,
+    background: np.ndarray,
+    width: int,
+    height: int,
+    threshold_width: float = THRESHOLD_WIDTH,
+    cuts: np.ndarray | float | None = None,
+) -> Picture:
+    """Return the picture of N splats: C = sum_i T_i alpha_i c_i + T background (3DGS, equation 3).
+
+    T_i = prod_{j < i} (1 - alpha_j), alpha_i = min(0.99, o_i exp(-d^T A_i d / 2)), over the
+    splats i in ascending depth (ties by index) whose alpha is at least ``cuts``, (N,) or for all;
+    None: 1/255. A pixel is finished before the first splat that would take T below 1e-4: that splat
+    is not composited.
+
+    means2d (N, 2) px; conics (N, 2, 2) px^-2, symmetric; opacities (N,); colors (N, 3) display
+    space; depths (N,) camera z; visible (N,) bool: the others are left out; background (3,)
+    display space; width and height of the film, px; threshold_width: relative distance from a
+    threshold within which a pixel is marked in ``Picture.near_threshold``. Marked are pixels at
+    which an alpha, evaluated before the pixel is finished, is that close to the cut or (before
+    clamping) to the clamp, or the transmittance behind a splat is that close to the stop.
+    """
+    picture, _ = _composite_and_stops(
+        means2d, conics, opacities, colors, depths, visible, background, width, height,
+        threshold_width, cuts,
+    )  # fmt: skip
+    return picture
+
+
+def _composite_and_stops(
+    means2d: np.ndarray,
+    conics: np.ndarray,
+    opacities: np.ndarray,
+    colors: np.ndarray,
+    depths: np.ndarray,
+    visible: np.ndarray,
+    background: np.ndarray,
+    width: int,
+    height: int,
+    threshold_width: float,
+    cuts: np.ndarray | float | None = None,
+) -> tuple[Picture, np.ndarray]:
+    """Return ``composite``'s picture and the rank in depth (H, W) at which each pixel stopped."""
+    means2d, conics, opacities, colors, depths, background = _as_float64(
+        means2d, conics, opacities, colors, depths, background
+    )
+    order = _depth_order(depths, visible)
+    cuts = np.broadcast_to(ALPHA_CUT if cuts is None else cuts, depths.shape)
+    smallest = cuts[order] * (1 - threshold_width)
+    boxes = _pixel_boxes(means2d[order], conics[order], opacities[order], smallest, width, height)
+    never = len(order)
+
+    def is_near(values: np.ndarray, threshold: float) -> np.ndarray:
+        return np.abs(values - threshold) <= threshold_width * threshold
+
+    image = np.zeros((height, width, 3))
+    depth = np.zeros((height, width))
+    transmittance = np.ones((height, width))
+    stops = np.full((height, width), never)
+    near_threshold = np.zeros((height, width), dtype=bool)
+    for rank, (i, box) in enumerate(zip(order, boxes, strict=True)):
+        splat = _footprint(box, means2d[i], conics[i], opacities[i])
+        alpha = np.minimum(splat.raw_alpha, ALPHA_MAX)
+        unfinished = stops[box] == never
+        contributes = unfinished & (alpha >= cuts[i])
+        behind = transmittance[box] * (1 - alpha)
+        stopping = contributes & (behind < TRANSMITTANCE_STOP)
+
+        near_threshold[box] |= unfinished & (
+            is_near(splat.raw_alpha, cuts[i]) | is_near(splat.raw_alpha, ALPHA_MAX)
+        )
+        near_threshold[box] |= contributes & is_near(behind, TRANSMITTANCE_STOP)
+
+        stops[box][stopping] = rank
+        contributes &= ~stopping
+        weight = np.where(contributes, transmittance[box] * alpha, 0.0)
+        image[box] += weight[..., None] * colors[i]
+        depth[box] += weight * depths[i]
+        transmittance[box] = np.where(contributes, behind, transmittance[box])
+
+    image += transmittance[..., None] * background
+    return Picture(image, 1 - transmittance, depth, transmittance, near_threshold), stops
+
+
+def render(
+    gaussians: Gaussians,
+    camera: Camera,
+    background: np.ndarray = (0.0, 0.0, 0.0),
+    sh_degree: int | None = None,
+    antialiased: bool = False,
+    threshold_width: float = THRESHOLD_WIDTH,
+) -> Picture:
+    """Return the picture of Gaussians.
+
+    background: (3,) display space; sh_degree: None for all that is stored; antialiased: see
+    ``project``; threshold_width: see ``composite``.
+    """
+    degree = gaussians.sh_degree if sh_degree is None else sh_degree
+    splats = project(gaussians, camera, antialiased)
+    colors = sh_colors(gaussians, camera, degree)
+    return composite(
+        splats.means2d, splats.conics, splats.opacities, colors, splats.depths, splats.visible,
+        background, camera.width, camera.height, threshold_width, splats.cuts,
+    )  # fmt: skip
+
+
+# ----------------------------------------------------------------------------------------------
+# Gradients, from the pixels back to the Gaussians
+# ----------------------------------------------------------------------------------------------
+
+
+def composite_gradients(
+    means2d: np.ndarray,
+    conics: np.ndarray,
+    opacities: np.ndarray,
+    colors: np.ndarray,
+    depths: np.ndarray,
+    visible: np.ndarray,
+    background: np.ndarray,
+    width: int,
+    height: int,
+    d_image: np.ndarray,
+    d_alpha: np.ndarray | None = None,
+    d_depth: np.ndarray | None = None,
+) -> dict[str, np.ndarray]:
+    """Return the gradients of L = sum d_image image + sum d_alpha alpha + sum d_depth depth.
+
+    The first nine arguments are ``composite``'s. d_image (H, W, 3); d_alpha and d_depth (H, W),
+    None for zero. The result has ``means2d`` (N, 2), ``conics`` (N, 2, 2), ``opacities`` (N,),
+    ``colors`` (N, 3), ``depths`` (N,) and ``background`` (3,), zero for splats that are left out.
+
+    ``conics`` is the symmetric matrix G with dL = sum_ij G_ij dA_ij. In terms of the three
+    numbers of a dx^2 + 2 b dx dy + c dy^2: dL/da = G_00, dL/db = 2 G_01, dL/dc = G_11.
+
+    At one pixel, let v_i = d_image . c_i + d_alpha + d_depth z_i be what one unit of weight of
+    splat i adds to L, and v_bg = d_image . background the same for the background. Then
+
+        L = sum_i T_i alpha_i v_i + T v_bg      (d_alpha: 1 - T = sum_i T_i alpha_i)
+        dL/dv_i = T_i alpha_i
+        dL/dalpha_i = T_i v_i - S_i / (1 - alpha_i),  S_i = sum_{j > i} T_j alpha_j v_j + T v_bg
+
+    since every later weight, and T, has the factor (1 - alpha_i). The suffix sums S_i build up
+    from the back to the front (3DGS, section 6), where T_i = T_{i+1} / (1 - alpha_i) is
+    recovered by division: alpha <= 0.99 keeps that accurate.
+
+    Not differentiated: the depth order and the decisions at the thresholds. Where alpha is
+    clamped its derivative is zero.
+    """
+    means2d, conics, opacities, colors, depths, background, d_image = _as_float64(
+        means2d, conics, opacities, colors, depths, background, d_image
+    )
+    zeros = np.zeros((height, width))
+    d_alpha, d_depth = _as_float64(
+        zeros if d_alpha is None else d_alpha, zeros if d_depth is None else d_depth
+    )
+    picture, stops = _composite_and_stops(
+        means2d, conics, opacities, colors, depths, visible, background, width, height,
+        THRESHOLD_WIDTH,
+    )  # fmt: skip
+    order = _depth_order(depths, visible)
+    boxes = _pixel_boxes(means2d[order], conics[order], opacities[order], ALPHA_CUT, width, height)
+
+    n = len(means2d)
+    d_means2d = np.zeros((n, 2))
+    d_conics = np.zeros((n, 2, 2))
+    d_opacities = np.zeros(n)
+    d_colors = np.zeros((n, 3))
+    d_depths = np.zeros(n)
+    d_background = np.einsum("hw,hwc->c", picture.transmittance, d_image)
+
+    transmittance = picture.transmittance.copy()
+    suffix_sum = transmittance * (d_image @ background)
+    for rank in reversed(range(len(order))):
+        i, box = order[rank], boxes[rank]
+        splat = _footprint(box, means2d[i], conics[i], opacities[i])
+        alpha = np.minimum(splat.raw_alpha, ALPHA_MAX)
+        contributes = (rank < stops[box]) & (alpha >= ALPHA_CUT)
+        alpha = np.where(contributes, alpha, 0.0)
+
+        transmittance[box] /= 1 - alpha
+        weight = transmittance[box] * alpha
+        value = d_image[box] @ colors[i] + d_alpha[box] + d_depth[box] * depths[i]
+        d_splat_alpha = transmittance[box] * value - suffix_sum[box] / (1 - alpha)
+        suffix_sum[box] += weight * value
+
+        d_colors[i] = np.einsum("hw,hwc->c", weight, d_image[box])
+        d_depths[i] = np.sum(weight * d_depth[box])
+
+        # alpha = o G(d) where it is neither cut nor clamped, G = exp(p), p = -d^T A d / 2.
+        differentiable = contributes & (splat.raw_alpha < ALPHA_MAX)
+        d_splat_alpha = np.where(differentiable, d_splat_alpha, 0.0)
+        d_opacities[i] = np.sum(d_splat_alpha * splat.falloff)
+        d_power = d_splat_alpha * alpha
+
+        # dp/dA = -d d^T / 2 and, since d = pixel - mean2d, dp/dmean2d = A d.
+        sum_dx, sum_dy = np.sum(d_power * splat.dx), np.sum(d_power * splat.dy)
+        sum_dxdx = np.sum(d_power * splat.dx * splat.dx)
+        sum_dxdy = np.sum(d_power * splat.dx * splat.dy)
+        sum_dydy = np.sum(d_power * splat.dy * splat.dy)
+        d_means2d[i] = conics[i] @ [sum_dx, sum_dy]
+        d_conics[i] = -0.5 * np.array([[sum_dxdx, sum_dxdy], [sum_dxdy, sum_dydy]])
+    return {
+        "means2d": d_means2d,
+        "conics": d_conics,
+        "opacities": d_opacities,
+        "colors": d_colors,
+        "depths": d_depths,
+        "background": d_background,
+    }
+
+
+def project_gradients(
+    gaussians: Gaussians,
+    camera: Camera,
+    d_means2d: np.ndarray,
+    d_conics: np.ndarray,
+    d_opacities: np.ndarray,
+    d_depths: np.ndarray,
+    antialiased: bool = False,
+) -> dict[str, np.ndarray]:
+    """Return the gradients with respect to means, quats, log_scales and logit_opacities.
+
+    d_means2d (N, 2), d_conics (N, 2, 2) symmetric as from ``composite_gradients``, d_opacities
+    (N,) and d_depths (N,) belong to the fields of ``Projection``. Rows that are not visible get
+    zero. A quaternion of norm zero gets zero. Where a ratio of the Jacobian is clamped, it is a
+    constant, and J still depends on z.
+
+    Not differentiated: the camera.
+    """
+    affine = _local_affine(gaussians, camera)
+    splats = project(gaussians, camera, antialiased)
+    opacities = sigmoid(gaussians.logit_opacities)
+
+    # A = cov2d^-1, so dA = -A dcov2d A.
+    d_cov2d = -splats.conics @ d_conics @ splats.conics
+    d_axes2d = np.zeros_like(affine.axes2d)
+    if antialiased:
+        _, dets, areas = _low_passed_covariances(affine.axes2d)
+        compensations = areas / np.sqrt(dets)
+        d_compensations = d_opacities * opacities
+        d_opacities = d_opacities * compensations
+        # det(cov2d)^-1/2 varies as -1/2 det(cov2d)^-1/2 trace(A dcov2d).
+        d_cov2d += (-0.5 * d_compensations * compensations)[:, None, None] * splats.conics
+        d_areas = d_compensations / np.sqrt(dets)
+        d_axes2d += d_areas[:, None, None] * _area_gradients(affine.axes2d)
+
+    # cov2d = M M^T + 0.3 I, M = J V, V = W R diag(s).
+    d_axes2d += 2 * d_cov2d @ affine.axes2d
+    d_axes = _transposed(affine.jacobians) @ d_axes2d
+    d_jacobians = d_axes2d @ _transposed(affine.axes)
+    d_factors = camera.rotation.T @ d_axes
+    d_scales = np.einsum("nij,nij->nj", affine.rotations, d_factors)
+    d_rotations = d_factors * affine.scales[:, None, :]
+
+    d_camera_means = _camera_mean_gradients(affine, camera, d_means2d, d_jacobians)
+    d_camera_means[:, 2] += d_depths
+    gradients = {
+        "means": d_camera_means @ camera.rotation,
+        "quats": _quat_gradients(gaussians.quats, d_rotations),
+        "log_scales": d_scales * affine.scales,
+        "logit_opacities": d_opacities * opacities * sigmoid(-gaussians.logit_opacities),
+    }
+    return {name: _rows_where(splats.visible, value) for name, value in gradients.items()}
+
+
+def _area_gradients(axes2d: np.ndarray) -> np.ndarray:
+    """Return the derivatives (N, 2, 3) of |m_0 x m_1| with respect to the rows m_0, m_1 of M.
+
+    With n the unit vector along m_0 x m_1: d|m_0 x m_1| = (m_1 x n) . dm_0 + (n x m_0) . dm_1.
+    A degenerate M, whose compensated opacity is zero, gets zero.
+    """
+    normals, lengths = _normalize(np.cross(axes2d[:, 0], axes2d[:, 1]), fallback=(0.0, 0.0, 1.0))
+    normals = _rows_where(np.isfinite(lengths), normals)
+    return np.stack([np.cross(axes2d[:, 1], normals), np.cross(normals, axes2d[:, 0])], axis=1)
+
+
+def _camera_mean_gradients(
+    affine: _LocalAffine, camera: Camera, d_means2d: np.ndarray, d_jacobians: np.ndarray
+) -> np.ndarray:
+    """Return the gradients (N, 3) with respect to the camera-space mean (x, y, z).
+
+    means2d = (fx x/z + cx, fy y/z + cy); J = [[fx/z, 0, -fx rx/z], [0, fy/z, -fy ry/z]], with
+    (rx, ry) = (x/z, y/z), or constants where they are clamped.
+    """
+    x, y, z = affine.means.T
+    d_x, d_y, d_z = np.zeros_like(x), np.zeros_like(y), np.zeros_like(z)
+    for row, (focal, u, d_u) in enumerate([(camera.fx, x, d_x), (camera.fy, y, d_y)]):
+        d_u += d_means2d[:, row] * focal / z
+        d_z -= d_means2d[:, row] * focal * u / z**2
+
+        d_diagonal, d_last = d_jacobians[:, row, row], d_jacobians[:, row, 2]
+        ratio = affine.ratios[:, row]
+        d_z -= d_diagonal * focal / z**2
+        d_z += d_last * focal * ratio / z**2
+
+        d_ratio = np.where(affine.unclamped[:, row], -d_last * focal / z, 0.0)
+        d_u += d_ratio / z
+        d_z -= d_ratio * u / z**2
+    return np.stack([d_x, d_y, d_z], axis=-1)
+
+
+def _quat_gradients(quats: np.ndarray, d_rotations: np.ndarray) -> np.ndarray:
+    """Return the gradients (N, 4) with respect to the quaternions as stored, not normalised.
+
+    First the derivatives of the entries of R(q) with respect to w, x, y, z (3DGS, appendix A),
+    then those of q -> q / |q|.
+    """
+    unit_quats, norms = _normalize(quats, fallback=(1.0, 0.0, 0.0, 0.0))
+    w, x, y, z = unit_quats.T
+    zero = np.zeros_like(w)
+    derivatives = [
+        _rows_of_matrices([[zero, -z, y], [z, zero, -x], [-y, x, zero]]),
+        _rows_of_matrices([[zero, y, z], [y, -2 * x, -w], [z, w, -2 * x]]),
+        _rows_of_matrices([[-2 * y, x, w], [x, zero, z], [-w, z, -2 * y]]),
+        _rows_of_matrices([[-2 * z, -w, x], [w, -2 * z, y], [x, y, zero]]),
+    ]
+    d_unit_quats = np.stack(
+        [2 * np.einsum("nij,nij->n", derivative, d_rotations) for derivative in derivatives],
+        axis=-1,
+    )
+    return _normalize_gradients(unit_quats, norms, d_unit_quats)
+
+
+def sh_colors_gradients(
+    gaussians: Gaussians, camera: Camera, degree: int, d_colors: np.ndarray
+) -> dict[str, np.ndarray]:
+    """Return the gradients with respect to means, sh0 and shN, given d_colors (N, 3).
+
+    A mean acts through the direction in which it is seen. Where a colour is clamped to zero its
+    gradient is zero; so is that of the coefficients above ``degree``.
+    """
+    directions, distances = _view_directions(gaussians, camera)
+    coefficients = _sh_coefficients(gaussians, degree)
+    d_colors = np.where(_unclamped_colors(gaussians, directions, degree) >= 0, d_colors, 0.0)
+
+    d_coefficients = np.einsum("nk,nc->nkc", sh_basis(directions, degree), d_colors)
+    d_sh = np.zeros((len(gaussians.means), 1 + gaussians.shN.shape[1], 3))
+    d_sh[:, : (degree + 1) ** 2] = d_coefficients
+
+    d_basis = np.einsum("nkc,nc->nk", coefficients, d_colors)
+    d_directions = np.einsum("nkx,nk->nx", sh_basis_gradient(directions, degree), d_basis)
+    return {
+        "means": _normalize_gradients(directions, distances, d_directions),
+        "sh0": d_sh[:, :1],
+        "shN": d_sh[:, 1:],
+    }
+
+
+def render_gradients(
+    gaussians: Gaussians,
+    camera: Camera,
+    background: np.ndarray,
+    d_image: np.ndarray,
+    d_alpha: np.ndarray | None = None,
+    d_depth: np.ndarray | None = None,
+    sh_degree: int | None = None,
+    antialiased: bool = False,
+) -> dict[str, np.ndarray]:
+    """Return the gradients of L = sum d_image image + sum d_alpha alpha + sum d_depth depth.
+
+    d_image (H, W, 3); d_alpha and d_depth (H, W), None for zero; the rest as in ``render``. The
+    result has the six fields of ``Gaussians`` in their shapes, ``background`` (3,), and
+    ``means2d`` (N, 2), per pixel of position on the film. What is not differentiated is said by
+    ``composite_gradients`` and ``project_gradients``.
+    """
+    degree = gaussians.sh_degree if sh_degree is None else sh_degree
+    splats = project(gaussians, camera, antialiased)
+    colors = sh_colors(gaussians, camera, degree)
+    d_splats = composite_gradients(
+        splats.means2d, splats.conics, splats.opacities, colors, splats.depths, splats.visible,
+        background, camera.width, camera.height, d_image, d_alpha, d_depth,
+    )  # fmt: skip
+    through_projection = project_gradients(
+        gaussians, camera, d_splats["means2d"], d_splats["conics"], d_splats["opacities"],
+        d_splats["depths"], antialiased,
+    )  # fmt: skip
+    through_color = sh_colors_gradients(gaussians, camera, degree, d_splats["colors"])
+    return {
+        "means": through_projection["means"] + through_color["means"],
+        "quats": through_projection["quats"],
+        "log_scales": through_projection["log_scales"],
+        "logit_opacities": through_projection["logit_opacities"],
+        "sh0": through_color["sh0"],
+        "shN": through_color["shN"],
+        "background": d_splats["background"],
+        "means2d": d_splats["means2d"],
+    }
+
+
+# ----------------------------------------------------------------------------------------------
+# Small helpers
+# ----------------------------------------------------------------------------------------------
+
+
+def _as_float64(*arrays: np.ndarray) -> list[np.ndarray]:
+    """Return the arrays in double precision, so that kernels' own splats may be composited."""
+    return [np.asarray(array, dtype=np.float64) for array in arrays]
+
+
+def _normalize(vectors: np.ndarray, fallback: tuple) -> tuple[np.ndarray, np.ndarray]:
+    """Return v / |v| (N, D) and |v| (N,).
+
+    A zero vector becomes ``fallback``, and its norm is given as infinite: ``_normalize_gradients``
+    then returns zero for it.
+    """
+    norms = np.linalg.norm(vectors, axis=-1)
+    norms = np.where(norms == 0, np.inf, norms)
+    units = np.where(np.isinf(norms)[:, None], fallback, vectors / norms[:, None])
+    return units, norms
+
+
+def _normalize_gradients(units: np.ndarray, norms: np.ndarray, d_units: np.ndarray) -> np.ndarray:
+    """Return the gradients (N, D) with respect to v: (I - u u^T) d_u / |v|, where u = v / |v|."""
+    along = np.sum(units * d_units, axis=-1, keepdims=True)
+    return (d_units - units * along) / norms[:, None]
+
+
+def _rows_of_matrices(entries: list[list[np.ndarray]]) -> np.ndarray:
+    """Return (N, rows, columns) from rows and columns of entries that are (N,) each."""
+    return np.moveaxis(np.array(entries), -1, 0)
+
+
+def _rows_where(condition: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Return ``values`` (N, ...) with zeros in the rows where ``condition`` (N,) is false."""
+    return np.where(condition.reshape((-1,) + (1,) * (values.ndim - 1)), values, 0.0)
+
+
+def _transposed(matrices: np.ndarray) -> np.ndarray:
+    return np.swapaxes(matrices, -1, -2)
+
+
+def _check_degree(where: str, degree: int, highest: int) -> None:
+    if degree not in range(highest + 1):
+        raise ValueError(f"reference.{where}: degree must be 0 to {highest}, got {degree}")

@@ -1,0 +1,124 @@
+"""Curves of a fit: loss, PSNR, population and rate over the iterations."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from drgs.core.files import atomic_path
+
+PANEL_WIDTH = 360
+"""px: of each of the three pictures of a comparison in the page, at most."""
+
+
+SMOOTHING_PARTS = 50
+"""The smooth line of a curve is a running mean over this part of all rows."""
+
+
+def write_curves(path: Path, history: Sequence[Any]) -> None:
+    """Write a picture of the loss, the PSNR, the population and the rates over the iterations."""
+    with atomic_path(path) as temporary:
+        draw_curves(history, LIGHT).savefig(temporary)
+
+
+@dataclass(frozen=True)
+class Theme:
+    """Colours of the curves."""
+
+    paper: str
+    ink: str
+    faint: str
+    raw: str  # single iterations
+    line: str
+
+
+LIGHT = Theme(paper="#ffffff", ink="#1d2330", faint="#e3e6ec", raw="#b9cdf0", line="#1f5fd0")
+
+
+DARK = Theme(paper="#1a1e27", ink="#d8dde8", faint="#333a48", raw="#34507f", line="#7fb0ff")
+
+
+THEMES = (LIGHT, DARK)
+
+
+@dataclass(frozen=True)
+class Panel:
+    """One curve."""
+
+    title: str
+    x: np.ndarray  # (n,) iterations
+    y: np.ndarray  # (n,)
+    scale: str = "linear"  # of y: "linear" or "log"
+    bottom: float | None = None  # of y's range; None: as the values have it
+    noisy: bool = False  # drawn with its running mean
+
+
+def _panels(history: Sequence[Any]) -> list[Panel]:
+    def column(name: str) -> np.ndarray:
+        return np.array([getattr(row, name) for row in history], np.float64)
+
+    x, wall_s = column("iteration"), column("wall_s")
+    # Two rows may carry one time: the clock's resolution, or a run that was resumed.
+    speed = np.diff(x) / np.maximum(np.diff(wall_s), 1e-3)
+    return [
+        Panel("Loss", x, column("loss"), scale="log", noisy=True),
+        Panel("PSNR of the training view [dB]", x, column("psnr"), noisy=True),
+        Panel("Gaussians", x, column("num_gaussians"), bottom=0),
+        Panel("Learning rate of the means", x, column("means_lr"), scale="log"),
+        Panel("Iterations per second", x[1:], speed, bottom=0, noisy=True),
+        Panel("Time [min]", x, wall_s / 60, bottom=0),
+    ]
+
+
+def draw_curves(history: Sequence[Any], theme: Theme) -> Any:
+    """A matplotlib figure of six panels over the iterations."""
+    # Imported here because it takes half a second, which a command that fails early should not.
+    # Without pyplot no window system is looked for.
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(11, 5.8), dpi=110, facecolor=theme.paper, layout="constrained")
+    figure.get_layout_engine().set(w_pad=0.1, h_pad=0.1)
+    FigureCanvasAgg(figure)
+    axes = figure.subplots(2, 3)
+    for axis, panel in zip(axes.flat, _panels(history), strict=True):
+        _draw(axis, panel, theme)
+    axes[0, 2].yaxis.set_major_formatter("{x:,.0f}")
+    for axis in axes[-1]:
+        axis.set_xlabel("iteration", fontsize=8.5, color=theme.ink)
+    return figure
+
+
+def _draw(axis: Any, panel: Panel, theme: Theme) -> None:
+    y = panel.y
+    axis.set_title(panel.title, fontsize=10, color=theme.ink, loc="left")
+    axis.set_yscale(panel.scale)
+    if panel.noisy:
+        axis.plot(panel.x, y, color=theme.raw, linewidth=0.7)
+        y = _running_mean(y)
+    axis.plot(panel.x, y, color=theme.line, linewidth=1.7)
+    if panel.bottom is not None:
+        axis.set_ylim(bottom=panel.bottom)
+    axis.set_facecolor(theme.paper)
+    axis.grid(color=theme.faint, linewidth=0.7)
+    axis.tick_params(colors=theme.ink, labelsize=8, length=0, which="both")
+    axis.spines[:].set_visible(False)
+
+
+def _running_mean(values: np.ndarray) -> np.ndarray:
+    """Centred, over a 50th of all rows; narrower at the ends."""
+    reach = len(values) // (2 * SMOOTHING_PARTS)
+    total = np.concatenate([[0.0], np.cumsum(values)])
+    index = np.arange(len(values))
+    first, end = np.maximum(index - reach, 0), np.minimum(index + reach + 1, len(values))
+    return (total[end] - total[first]) / (end - first)
+
+
+def as_pixels(figure: Any) -> np.ndarray:
+    """(H, W, 3) 0..1."""
+    figure.canvas.draw()
+    return np.asarray(figure.canvas.buffer_rgba())[:, :, :3] / 255

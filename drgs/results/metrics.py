@@ -1,0 +1,91 @@
+"""Image quality as papers report it: PSNR and SSIM in float64 numpy.
+
+Reads finished pictures on the host, (H, W, 3) in display space, and shares no code with
+``drgs.training.losses``: one checks the other. Not differentiated.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy.ndimage import correlate1d
+
+WINDOW = np.exp(-0.5 * (np.arange(-5, 6) / 1.5) ** 2)
+"""The Gaussian window of Wang et al. 2004, section III.B: 11 pixels, sigma 1.5, unit sum."""
+WINDOW /= WINDOW.sum()
+
+
+@dataclass(frozen=True)
+class Quality:
+    """Means over views of what one view's picture scores."""
+
+    psnr: float  # dB
+    ssim: float
+    num_views: int
+
+
+def psnr(image: Any, target: Any, mask: Any = None) -> float:
+    """Return the peak signal-to-noise ratio in dB, -10 log10(mean squared error).
+
+    image, target: (H, W, 3) display space, clamped to [0, 1] (the peak is 1). mask: (H, W), 1 where
+    a pixel counts. Infinite for equal pictures, NaN if a pixel is.
+    """
+    image, target = _prepare("psnr()", image, target)
+    with np.errstate(divide="ignore"):
+        return float(-10 * np.log10(_mean((image - target) ** 2, mask)))
+
+
+def ssim(image: Any, target: Any, mask: Any = None) -> float:
+    """Return the structural similarity, averaged over all pixels and channels.
+
+    image, target: (H, W, 3) display space, clamped to [0, 1]. Windows reach beyond the image into
+    zeros, as in the 3DGS reference's evaluation; equation 13 of Wang et al. 2004 with K1 = 0.01,
+    K2 = 0.03, L = 1. mask: (H, W), 1 where a pixel counts; the others are black in both.
+    """
+    x, y = _prepare("ssim()", image, target)
+    if mask is not None:
+        x, y = x * mask[:, :, None], y * mask[:, :, None]
+    mu_x, mu_y = _windowed(x), _windowed(y)
+    var_x = _windowed(x * x) - mu_x**2
+    var_y = _windowed(y * y) - mu_y**2
+    cov_xy = _windowed(x * y) - mu_x * mu_y
+    luminance = (2 * mu_x * mu_y + 0.01**2) / (mu_x**2 + mu_y**2 + 0.01**2)
+    contrast_structure = (2 * cov_xy + 0.03**2) / (var_x + var_y + 0.03**2)
+    return float(_mean(luminance * contrast_structure, mask))
+
+
+def mean_quality(pairs: Iterable[tuple[Any, ...]]) -> Quality:
+    """Return the means over views of PSNR and SSIM, each view weighing the same.
+
+    pairs: (image, target) of each view, perhaps its mask; may be a generator, one view is held at a
+    time.
+    """
+    scores = [(psnr(*pair), ssim(*pair)) for pair in pairs]
+    if not scores:
+        raise ValueError("mean_quality(): needs at least one view, got none")
+    mean_psnr, mean_ssim = np.mean(scores, axis=0)
+    return Quality(psnr=float(mean_psnr), ssim=float(mean_ssim), num_views=len(scores))
+
+
+def _mean(values: np.ndarray, mask: Any) -> float:
+    """Over the pixels that count; NaN if none does."""
+    return np.mean(values) if mask is None else np.mean(values[np.asarray(mask) > 0])
+
+
+def _windowed(values: np.ndarray) -> np.ndarray:
+    for axis in (0, 1):
+        values = correlate1d(values, WINDOW, axis=axis, mode="constant", cval=0.0)
+    return values
+
+
+def _prepare(where: str, image: Any, target: Any) -> tuple[np.ndarray, np.ndarray]:
+    image, target = (np.asarray(values, dtype=np.float64) for values in (image, target))
+    if image.shape != target.shape or image.ndim != 3 or image.shape[2] != 3:
+        raise ValueError(
+            f"{where}: image and target must both be (H, W, 3), got {image.shape} "
+            f"and {target.shape}"
+        )
+    return np.clip(image, 0, 1), np.clip(target, 0, 1)

@@ -1,0 +1,80 @@
+"""Cameras that a fit has refined: written beside it, applied to its dataset."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from drgs.core.errors import UserError, one_line
+from drgs.data.transforms import CLOSE
+from drgs.data.types import Dataset, Motion, View
+
+if TYPE_CHECKING:
+    pass
+from drgs.cameras.axes import in_opencv_axes, in_opengl_axes
+
+CAMERAS = "cameras.json"
+
+
+@dataclass(frozen=True)
+class LensChange:
+    """What the lens that all cameras share is found to be, beside what the data says."""
+
+    focal: tuple[float, float] = (1.0, 1.0)  # factors of fx and fy
+    principal: tuple[float, float] = (0.0, 0.0)  # of the picture's width and height
+
+    def of(self, view: View) -> View:
+        """A view with this lens."""
+        return replace(
+            view,
+            fx=view.fx * self.focal[0],
+            fy=view.fy * self.focal[1],
+            cx=view.cx + self.principal[0] * view.width,
+            cy=view.cy + self.principal[1] * view.height,
+        )
+
+
+def refined_dataset(dataset: Dataset, folder: Path) -> Dataset:
+    """A dataset with the cameras that a fit in ``folder`` has refined; as it is where none were."""
+    path = folder / CAMERAS
+    if not path.is_file():
+        return dataset
+    try:
+        found = json.loads(path.read_text())
+        change = LensChange(**{k: tuple(v) for k, v in found["lens_change"].items()})
+        poses = {f["file_path"]: in_opencv_axes(f["transform_matrix"]) for f in found["frames"]}
+        train = [replace(view, camera_to_world=poses[view.name]) for view in dataset.train]
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise UserError(
+            f"{path}: must hold the refined cameras of all training views, as the fit wrote them: "
+            f"{one_line(error)}; remove it to use the dataset's own"
+        ) from None
+    moved = zip(train, dataset.train, strict=True)
+    train = [replace(new, motion=_moved_motion(old, new.camera_to_world)) for new, old in moved]
+    return replace(
+        dataset, train=tuple(map(change.of, train)), test=tuple(map(change.of, dataset.test))
+    )
+
+
+def _moved_motion(view: View, camera_to_world: np.ndarray) -> Motion | None:
+    """Both poses of a camera that moves are moved alike."""
+    if view.motion is None:
+        return None
+    between = np.linalg.solve(view.camera_to_world, view.motion.close_to_world)
+    return replace(view.motion, close_to_world=camera_to_world @ between)
+
+
+def lens_and_motion(view: View) -> dict[str, Any]:
+    """What ``transforms.json`` says of a camera besides its pose and intrinsics."""
+    values: dict[str, Any] = {}
+    if view.lens is not None:
+        model = {"opencv": "FULL_OPENCV", "fisheye": "OPENCV_FISHEYE"}[view.lens.kind]
+        values |= {"camera_model": model, **view.lens.named()}
+    if view.motion is not None:
+        values[CLOSE] = in_opengl_axes(view.motion.close_to_world)
+        values["shutter"] = view.motion.shutter
+    return values

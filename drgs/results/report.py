@@ -1,0 +1,361 @@
+"""What a fit shows of itself: comparisons, curves, an orbit, and a page that holds all of it.
+
+The fit command calls :func:`write_results` at its end. Everything is computed from what the fit
+already has: its pictures of the test views, its history, its scene.
+"""
+
+from __future__ import annotations
+
+import base64
+import html
+import math
+import time
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from string import Template
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+import yaml
+
+from drgs.core.files import atomic_path
+from drgs.data.images import downscale
+from drgs.data.orbits import orbit_of_views, orbit_size
+from drgs.data.types import Dataset, View
+from drgs.data.viewpoints import field_of_view
+from drgs.gaussians.parameters import Gaussians
+from drgs.integrator.scene import render_views
+from drgs.io.pictures import encode, write_animation, write_png
+from drgs.results.curves import PANEL_WIDTH, THEMES, as_pixels, draw_curves, write_curves
+from drgs.results.metrics import psnr, ssim
+
+DIFFERENCE_GAIN = 5.0
+"""Of difference pictures, 0.5 + gain (fitted - photograph): saturates at 10 % of the range."""
+
+GAP = 4
+"""px between the pictures of a comparison, white."""
+
+ORBIT_FRAMES = 60
+
+PAGE_SECONDS = 4.0
+"""Curves and page, which do not depend on the scene."""
+
+
+# ----------------------------------------------------------------------------------------------
+# Files
+# ----------------------------------------------------------------------------------------------
+
+
+def write_results(
+    out: Path,
+    dataset: Dataset,
+    scene: mi.Scene,
+    gaussians: Gaussians,
+    images: Sequence[np.ndarray],
+    history: Sequence[Any],
+    metrics: dict[str, Any],
+) -> None:
+    """Write ``side_by_side/``, ``curves.png``, ``orbit.webp`` and ``.gif``, ``report.html``.
+
+    scene: renders ``gaussians``, in display space; images: (H, W, 3) display space, of the test
+    views, in their order; history: rows as of ``history.csv``; metrics: as of ``metrics.json``.
+    """
+    write_side_by_side(out / "side_by_side" / dataset.test_split, dataset, images)
+    write_curves(out / "curves.png", history)
+    write_orbit(out / "orbit.webp", scene, dataset, gaussians)
+    orbit = (out / "orbit.webp").read_bytes()
+    write_report(out / "report.html", out.name, dataset, images, history, metrics, orbit)
+
+
+def seconds_to_write(scene: mi.Scene, dataset: Dataset) -> float:
+    """About what measuring and :func:`write_results` will take: one test view is tried out."""
+    view = dataset.test[0]
+    list(render_views(scene, (view,)))  # compiles kernels
+    start = time.perf_counter()
+    (image,) = render_views(scene, (view,))
+    rendering = time.perf_counter() - start
+    for picture in (image, side_by_side(image, view)):
+        encode(picture, "PNG")
+    score(image, view), ssim(image, view.image, view.mask)
+    one_view = time.perf_counter() - start
+    return PAGE_SECONDS + len(dataset.test) * one_view + 2 * ORBIT_FRAMES * rendering
+
+
+def write_side_by_side(folder: Path, dataset: Dataset, images: Iterable[np.ndarray]) -> None:
+    """Write one PNG per test view: fitted, photograph, difference."""
+    for view, image in zip(dataset.test, images, strict=True):
+        write_png(folder / f"{view.name}.png", side_by_side(image, view))
+
+
+def side_by_side(image: np.ndarray, view: View) -> np.ndarray:
+    """(H, 3 W + 2 gaps, 3): fitted, photograph, 0.5 + 5 (fitted - photograph)."""
+    gap = np.ones((len(image), GAP, 3), np.float32)
+    return np.concatenate([image, gap, view.image, gap, difference(image, view)], axis=1)
+
+
+def difference(image: np.ndarray, view: View) -> np.ndarray:
+    """0.5 + 5 (fitted - photograph), clipped; 0.5 where pixels do not count."""
+    values = (
+        image - view.image if view.mask is None else (image - view.image) * view.mask[..., None]
+    )
+    return np.clip(0.5 + DIFFERENCE_GAIN * values, 0, 1)
+
+
+def score(image: np.ndarray, view: View) -> float:
+    """PSNR, dB."""
+    return psnr(image, view.image, view.mask)
+
+
+def write_orbit(path: Path, scene: mi.Scene, dataset: Dataset, gaussians: Gaussians) -> None:
+    """Write an animation around what the training cameras look at: ``path`` (WebP) and a GIF."""
+    orbit = orbit_of_views(dataset.train, gaussians)
+    cameras = orbit.viewpoints(
+        ORBIT_FRAMES, *orbit_size(dataset.train), field_of_view(dataset.train)
+    )
+    write_animation(path, render_views(scene, cameras))
+
+
+def write_report(
+    path: Path,
+    title: str,
+    dataset: Dataset,
+    images: Sequence[np.ndarray],
+    history: Sequence[Any],
+    metrics: dict[str, Any],
+    orbit: bytes,
+) -> None:
+    """Write one HTML file with everything in it, which needs no network and no other file.
+
+    images: of the test views, in their order; metrics: as of ``metrics.json``; orbit: the bytes
+    of an animated WebP.
+    """
+    scores = [score(image, view) for image, view in zip(images, dataset.test, strict=True)]
+    light, dark = (
+        _data_uri(as_pixels(draw_curves(history, theme)), lossless=True) for theme in THEMES
+    )
+    page = PAGE.substitute(
+        title=html.escape(title),
+        description=html.escape(dataset.description),
+        tiles="".join(_tile(*tile) for tile in _headline(metrics)),
+        facts="".join(_row(*fact) for fact in _facts(dataset, metrics)),
+        split=html.escape(dataset.test_split),
+        orbit=_uri("image/webp", orbit),
+        comparisons="".join(
+            _comparison(dataset, images, scores, *choice) for choice in choose_views(scores)
+        ),
+        gain=f"{DIFFERENCE_GAIN:g}",
+        curves_light=light,
+        curves_dark=dark,
+        views="".join(
+            _row(view.name, f"{decibels:.2f}")
+            for view, decibels in zip(dataset.test, scores, strict=True)
+        ),
+        config=html.escape(yaml.safe_dump(metrics["config"], sort_keys=False)),
+    )
+    with atomic_path(path) as temporary:
+        temporary.write_text(page, encoding="utf-8")
+
+
+def choose_views(scores: Sequence[float]) -> list[tuple[str, int]]:
+    """(label, index) of the best, the median and the worst of the views; of all if they are few."""
+    order = sorted(range(len(scores)), key=lambda index: -scores[index])
+    if len(order) < 3:
+        return [("View", index) for index in order]
+    return [("Best", order[0]), ("Median", order[len(order) // 2]), ("Worst", order[-1])]
+
+
+# ----------------------------------------------------------------------------------------------
+# Curves
+# ----------------------------------------------------------------------------------------------
+
+
+# ----------------------------------------------------------------------------------------------
+# Page
+# ----------------------------------------------------------------------------------------------
+
+
+def _headline(metrics: dict[str, Any]) -> list[tuple[str, str, str]]:
+    """(value, unit, label) of the four numbers at the top."""
+    test = metrics["test"]
+    return [
+        (f"{test['psnr']:.2f}", "dB", f"PSNR, mean of {test['num_views']} {test['split']} views"),
+        (f"{test['ssim']:.4f}", "", "SSIM"),
+        (f"{metrics['num_gaussians']:,}", "", "Gaussians"),
+        (duration(metrics["wall_s"]), "", f"for {metrics['iterations']:,} iterations"),
+    ]
+
+
+def _facts(dataset: Dataset, metrics: dict[str, Any]) -> list[tuple[str, str]]:
+    versions = metrics["versions"]
+    names = {"mitsuba": "Mitsuba", "drjit": "Dr.Jit", "numpy": "NumPy", "python": "Python"}
+    names["llvm"] = "LLVM"
+    speed = metrics["iterations"] / max(metrics["wall_s"], 1e-9)
+    return [
+        ("Training views", f"{len(dataset.train)}"),
+        ("Test views", f"{len(dataset.test)} (split {dataset.test_split})"),
+        ("Iterations per second", f"{speed:.1f}"),
+        ("Threads", f"{metrics['threads']}"),
+        ("Mitsuba variant", metrics["variant"]),
+        ("Seed", f"{metrics['seed']}"),
+        ("Versions", ", ".join(f"{names.get(k, k)} {v}" for k, v in versions.items())),
+    ]
+
+
+def duration(seconds: float) -> str:
+    """``9 min 51 s``."""
+    minutes, rest = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    if hours:
+        return f"{hours} h {minutes} min"
+    return f"{minutes} min {rest} s" if minutes else f"{rest} s"
+
+
+def _comparison(
+    dataset: Dataset,
+    images: Sequence[np.ndarray],
+    scores: Sequence[float],
+    label: str,
+    index: int,
+) -> str:
+    view, image = dataset.test[index], images[index]
+    panels = {
+        "Fitted": image,
+        "Photograph": view.image,
+        "Difference": difference(image, view),
+    }
+    pictures = "".join(
+        f'<img alt="{name} {html.escape(view.name)}" '
+        f'src="{_data_uri(downscale(np.clip(picture, 0, 1), PANEL_WIDTH), quality=88)}">'
+        for name, picture in panels.items()
+    )
+    caption = (
+        f"<b>{label}: {html.escape(view.name)}</b> PSNR {_decibels(scores[index])}, "
+        f"SSIM {ssim(image, view.image, view.mask):.4f}"
+    )
+    return f'<figure><figcaption>{caption}</figcaption><div class="three">{pictures}</div></figure>'
+
+
+def _decibels(value: float) -> str:
+    return f"{value:.2f} dB" if math.isfinite(value) else "infinite"
+
+
+def _tile(value: str, unit: str, label: str) -> str:
+    unit = f" <small>{unit}</small>" if unit else ""
+    return (
+        f"<div><strong>{html.escape(value)}{unit}</strong><span>{html.escape(label)}</span></div>"
+    )
+
+
+def _row(name: str, value: str) -> str:
+    return f"<tr><th>{html.escape(name)}</th><td>{html.escape(value)}</td></tr>"
+
+
+def _data_uri(image: np.ndarray, **options: Any) -> str:
+    return _uri("image/webp", encode(image, "WEBP", **options))
+
+
+def _uri(kind: str, data: bytes) -> str:
+    return f"data:{kind};base64,{base64.b64encode(data).decode('ascii')}"
+
+
+PAGE = Template("""<!DOCTYPE html>
+<html lang="en">
+<head>
+<meta charset="utf-8">
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<title>$title: Gaussian splats</title>
+<link rel="icon" href="data:,">
+<style>
+:root {
+  color-scheme: light dark;
+  --page: #f3f5f8; --card: #ffffff; --ink: #1d2330; --soft: #5c6577; --line: #e3e6ec;
+}
+@media (prefers-color-scheme: dark) {
+  :root { --page: #11141a; --card: #1a1e27; --ink: #e2e6ee; --soft: #98a2b5; --line: #2c3340; }
+}
+* { box-sizing: border-box; }
+body {
+  margin: 0; padding: 2.5rem 1.25rem 3rem; background: var(--page); color: var(--ink);
+  font: 16px/1.5 system-ui, -apple-system, "Segoe UI", Roboto, "DejaVu Sans", sans-serif;
+}
+main { max-width: 1120px; margin: 0 auto; }
+h1 { font-size: 2rem; line-height: 1.2; margin: 0; letter-spacing: -0.01em; }
+h2 { font-size: 1.15rem; margin: 2.5rem 0 0.8rem; }
+p { margin: 0.4rem 0 0; color: var(--soft); }
+img { display: block; max-width: 100%; height: auto; border-radius: 6px; }
+.card {
+  background: var(--card); border: 1px solid var(--line); border-radius: 12px; padding: 1rem;
+}
+.top {
+  display: grid; grid-template-columns: minmax(0, 432px) minmax(0, 1fr); gap: 1.25rem;
+  margin-top: 1.5rem;
+}
+.top > .card:first-child { display: grid; place-items: center; }
+.top > .card:first-child img { width: 100%; }
+.tiles { display: grid; grid-template-columns: 1fr 1fr; gap: 1.25rem; margin-bottom: 1rem; }
+.tiles strong { display: block; font-size: 1.7rem; line-height: 1.2; white-space: nowrap; }
+.tiles small { font-size: 1rem; font-weight: 500; }
+.tiles span { color: var(--soft); font-size: 0.88rem; }
+table { border-collapse: collapse; width: 100%; font-size: 0.9rem; }
+th, td { text-align: left; padding: 0.4rem 0; border-top: 1px solid var(--line); }
+th { font-weight: 400; color: var(--soft); padding-right: 1.25rem; white-space: nowrap; }
+th, td { vertical-align: top; font-variant-numeric: tabular-nums; }
+figure { margin: 0 0 1.25rem; }
+figure:last-of-type { margin: 0; }
+figcaption { margin-bottom: 0.5rem; color: var(--soft); font-size: 0.9rem; }
+figcaption b { color: var(--ink); margin-right: 0.6rem; }
+.three { display: grid; grid-template-columns: repeat(3, minmax(0, 1fr)); gap: 0.6rem; }
+.three img { width: 100%; }
+.labels { color: var(--soft); font-size: 0.85rem; margin-bottom: 0.9rem; }
+details { margin-top: 1.25rem; }
+summary { cursor: pointer; font-weight: 600; }
+pre { overflow-x: auto; font-size: 0.84rem; line-height: 1.45; margin: 0.8rem 0 0; }
+.columns { columns: 4 11rem; column-gap: 2rem; margin-top: 0.8rem; }
+.columns td { text-align: right; }
+@media (max-width: 820px) { .top { grid-template-columns: minmax(0, 1fr); } }
+</style>
+</head>
+<body>
+<main>
+<h1>$title</h1>
+<p>3D Gaussian splats fitted by drgs to $description.</p>
+
+<div class="top">
+<div class="card"><img alt="orbit around the fitted scene" src="$orbit"></div>
+<div class="card">
+<div class="tiles">$tiles</div>
+<table>$facts</table>
+</div>
+</div>
+
+<h2>Views of split $split</h2>
+<div class="card">
+<div class="three labels">
+<div>Fitted</div><div>Photograph</div>
+<div>Difference: 0.5 + $gain (fitted &minus; photograph), grey where equal</div>
+</div>
+$comparisons
+</div>
+
+<h2>Training</h2>
+<div class="card">
+<picture>
+<source media="(prefers-color-scheme: dark)" srcset="$curves_dark">
+<img alt="loss, PSNR, population and rates over the iterations" src="$curves_light">
+</picture>
+</div>
+
+<details class="card">
+<summary>PSNR of every test view [dB]</summary>
+<div class="columns"><table>$views</table></div>
+</details>
+
+<details class="card">
+<summary>Configuration, every value</summary>
+<pre>$config</pre>
+</details>
+</main>
+</body>
+</html>
+""")

@@ -1,0 +1,393 @@
+"""What a splat is at the 16 pixels of a micro-tile: the image model of the kernels.
+
+An :class:`ImageModel` names the choices that tiles and compositing have to agree on, each an object
+that the kernels' Python code calls while Dr.Jit traces it. The types here are the defaults, those
+of the 3DGS paper; the others are in modules of their own, which are imported when they are chosen:
+
+- *response*: how alpha falls off around a splat (:class:`AffineResponse`)
+- *positions*: where in a pixel it is evaluated (:class:`PixelCenters`)
+- *features*: what is composited of a splat (:class:`SplatFeatures`)
+- *cutoffs*: where splats and pixels end (:class:`drgs.splatting.cutoffs.Cutoffs`)
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import Any, ClassVar
+
+import drjit as dr
+
+from drgs.core.arrays import is_float64, types_of
+from drgs.core.constants import WHITENING_SCALE
+from drgs.splatting.cutoffs import Cutoffs
+
+MICRO = 4
+"""Pixels on a micro-tile's side. A micro-tile is one SIMD lane of the compositing kernels."""
+
+PIXELS = MICRO * MICRO
+
+
+# ----------------------------------------------------------------------------------------------
+# Alpha
+# ----------------------------------------------------------------------------------------------
+
+
+def exp2_short(x: Any) -> Any:
+    """2^x for float32 x in [-126, 127]; relative error below 2.2e-7.
+
+    x = n + f with |f| <= 1/2; 2^f by a minimax polynomial of degree 5 (coefficients from a
+    Remez exchange on the relative error, 7.5e-8), 2^n by adding n to the exponent bits. Adding
+    1.5 * 2^23 rounds x and leaves n in the low bits of the sum.
+    """
+    t = types_of(type(x))
+    shifted = x + 12582912.0
+    f = x - (shifted - 12582912.0)
+    p = t.Float(0.0013276471979479397)
+    for c in (
+        0.009675541334216184,
+        0.05550713273542589,
+        0.24022119723848476,
+        0.6931469670647331,
+        1.0000000716546822,
+    ):
+        p = dr.fma(p, f, c)
+    exponent = dr.reinterpret_array(t.Int32, shifted) << 23
+    return dr.reinterpret_array(t.Float, dr.reinterpret_array(t.Int32, p) + exponent)
+
+
+def exp2_function(Float: type) -> Any:
+    """The exponential that compositing uses in this precision."""
+    return dr.exp2 if is_float64(Float) else exp2_short
+
+
+@dataclass(frozen=True)
+class Alpha:
+    """Alpha at one pixel, with the decisions taken on the way."""
+
+    value: Any  # 0 where the splat is skipped
+    smooth: Any  # Bool: not clamped, so that the derivative flows
+
+    @staticmethod
+    def at(log2_alpha: Any, floor: Any, alpha_max: float) -> Alpha:
+        """alpha = min(alpha_max, 2^log2_alpha), or 0 where log2_alpha is below ``floor``."""
+        # Far below the floor the short exp2 returns garbage; the selection discards it.
+        unclamped = exp2_function(type(log2_alpha))(log2_alpha)
+        smooth = unclamped < alpha_max
+        value = dr.select(smooth, unclamped, alpha_max)
+        return Alpha(value=dr.select(log2_alpha >= floor, value, 0), smooth=smooth)
+
+
+# ----------------------------------------------------------------------------------------------
+# Where in a pixel
+# ----------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class PixelCenters:
+    """Every pixel is evaluated at its centre: offsets are shared by rows and columns.
+
+    Grids of 16 values are lists of 4 rows of 4.
+    """
+
+    margin: ClassVar[float] = 0.0
+    """px: how far from its centre a pixel may be evaluated."""
+
+    def points(self, lanes: Any, Float: type) -> list[tuple[Any, Any]]:
+        """x and y (px) of the 16 pixels."""
+        x, y = Float(lanes.x) + 0.5, Float(lanes.y) + 0.5
+        return [(x + i, y + j) for j in range(MICRO) for i in range(MICRO)]
+
+    def offsets(self, lanes: Any, x: Any, y: Any) -> tuple[list, list]:
+        """Grids of x and y, from a point of the film to the pixels, px."""
+        t = types_of(type(x))
+        first_x, first_y = t.Float(lanes.x) + 0.5 - x, t.Float(lanes.y) + 0.5 - y
+        dx = [first_x + i for i in range(MICRO)]
+        dy = [first_y + j for j in range(MICRO)]
+        return [dx] * MICRO, [[d] * MICRO for d in dy]
+
+    def sum(self, values: list[Any]) -> Any:
+        """Of 16 values."""
+        return total(self._rows(values))
+
+    def sum_dx(self, values: list[Any], dx: list) -> Any:
+        """Of values times dx: dx is shared by a column, so columns are summed first."""
+        columns = [total([values[MICRO * j + i] for j in range(MICRO)]) for i in range(MICRO)]
+        return _dot(columns, dx[0])
+
+    def sum_dy(self, values: list[Any], dy: list) -> Any:
+        """Of values times dy, shared by a row."""
+        return _dot(self._rows(values), _first_of_rows(dy))
+
+    def sum_dy_dy(self, values: list[Any], dy: list) -> Any:
+        """Of values times dy^2."""
+        dy = _first_of_rows(dy)
+        return _dot([a * b for a, b in zip(self._rows(values), dy, strict=True)], dy)
+
+    def bind(self, lanes: Any, grid: Any) -> PixelCenters:
+        """For the lanes of one kernel: nothing has to be loaded."""
+        del lanes, grid
+        return self
+
+    @staticmethod
+    def _rows(values: list[Any]) -> list[Any]:
+        return [total(values[MICRO * j : MICRO * j + MICRO]) for j in range(MICRO)]
+
+
+def _first_of_rows(rows: list) -> list[Any]:
+    return [row[0] for row in rows]
+
+
+def total(values: list[Any]) -> Any:
+    """Pairwise: the shortest chain of dependent additions."""
+    while len(values) > 1:
+        values = [a + b for a, b in zip(values[::2], values[1::2], strict=True)]
+    return values[0]
+
+
+def _dot(a: list[Any], b: list[Any]) -> Any:
+    result = a[0] * b[0]
+    for x, y in zip(a[1:], b[1:], strict=True):
+        result = dr.fma(x, y, result)
+    return result
+
+
+# ----------------------------------------------------------------------------------------------
+# How alpha falls off
+# ----------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Footprint:
+    """A splat at the 16 pixels of a micro-tile; grids are lists of 4 rows of 4."""
+
+    dx: list  # grid: pixel - mean, px
+    dy: list  # grid, px
+    u: list  # grid: first component of U d, scaled to base 2
+    v: list  # grid: second component
+    log2_alpha: list[Any]  # 16: unclamped
+
+
+Offsets = Callable[[Any, Any], tuple[list, list]]
+"""From a point of the film, x and y (px), to grids of offsets from it to the 16 pixels."""
+
+
+@dataclass(frozen=True)
+class AffineResponse:
+    """The projected Gaussian is a Gaussian on the film: alpha = o exp(-|U d|^2 / 2).
+
+    *Geometry* are the numbers of a splat that decide its alpha: mean x, y (px); then p, r, s of U
+    and log2_opacity, scaled such that log2_alpha = log2_opacity - |U d|^2. *Moments* are the sums
+    over pixels, weighted by d loss / d ln(alpha), that give the derivatives of the geometry.
+    """
+
+    num_geometry: ClassVar[int] = 6
+    num_moments: ClassVar[int] = 6
+
+    def seen_by(self, camera: Any) -> AffineResponse:
+        """For one camera: nothing depends on it."""
+        del camera
+        return self
+
+    def geometry(self, splats: Any) -> list[Any]:
+        """Columns, one value per Gaussian."""
+        p, r, s = splats.whitening * WHITENING_SCALE
+        return [*splats.means2d, p, r, s, dr.log2(splats.opacities)]
+
+    def differentiable(self, splats: Any) -> list[Any]:
+        """What :meth:`derivatives` are with respect to."""
+        return [*splats.means2d, *splats.whitening, splats.opacities]
+
+    def bounds(self, splats: Any, geometry: list[Any], reach: Any) -> tuple[Any, Any]:
+        """Centre and half sizes (Array2f, px) of the box around |U d|^2 <= ``reach``."""
+        del geometry
+        return splats.means2d, dr.sqrt(2 * math.log(2) * reach * splats.variances)
+
+    def outline(self, geometry: list[Any], reach: Any) -> list[Any]:
+        """Mean x, y, p, r, s of an ellipse |U d|^2 <= ``reach`` that holds the splat."""
+        del reach
+        return geometry[:5]
+
+    def log2_floor(self, geometry: list[Any], cutoffs: Cutoffs) -> Any:
+        """The base-2 logarithm of the smallest alpha of a splat."""
+        return cutoffs.log2_floor(geometry[5])
+
+    def footprint(self, geometry: list[Any], offsets_from: Offsets, active: Any) -> Footprint:
+        """Evaluate the exponent; on a lane that is not active every alpha is below any floor."""
+        x, y, p, r, s, log2_opacity = geometry
+        log2_opacity = dr.select(active, log2_opacity, -dr.inf)
+        dx, dy = offsets_from(x, y)
+        u = [
+            [p * x + r * y for x, y in zip(*rows, strict=True)] for rows in zip(dx, dy, strict=True)
+        ]
+        v = [[s * y for y in row] for row in dy]
+        log2_alpha = [
+            dr.fma(-a, a, dr.fma(-b, b, log2_opacity))
+            for rows in zip(u, v, strict=True)
+            for a, b in zip(*rows, strict=True)
+        ]
+        return Footprint(dx=dx, dy=dy, u=u, v=v, log2_alpha=log2_alpha)
+
+    def moments(self, footprint: Footprint, weights: list[Any], positions: Any) -> list[Any]:
+        """Sums over the 16 pixels of w = d loss / d ln(alpha) times 1, u, u dx, u dy, dy, dy^2."""
+        dx, dy = footprint.dx, footprint.dy
+        u = [value for row in footprint.u for value in row]
+        z = [a * b for a, b in zip(weights, u, strict=True)]
+        return [
+            positions.sum(weights),
+            positions.sum(z),
+            positions.sum_dx(z, dx),
+            positions.sum_dy(z, dy),
+            positions.sum_dy(weights, dy),
+            positions.sum_dy_dy(weights, dy),
+        ]
+
+    def derivatives(self, geometry: list[Any], totals: list[Any]) -> list[Any]:
+        """From moments to the derivatives of mean x, y, p, r, s (unscaled), and opacity.
+
+        log2_alpha = log2_opacity - u^2 - (s dy)^2, u = p dx + r dy, dx = x - mean: hence
+        d ln(alpha) / d(anything) = ln(2) * d log2_alpha / d(anything).
+        """
+        _, _, p, r, s, log2_opacity = geometry
+        w, w_u, w_u_dx, w_u_dy, w_dy, w_dy_dy = totals
+        scale = 2 * math.log(2)
+        return [
+            scale * p * w_u,
+            scale * dr.fma(r, w_u, s * s * w_dy),
+            -scale * WHITENING_SCALE * w_u_dx,
+            -scale * WHITENING_SCALE * w_u_dy,
+            -scale * WHITENING_SCALE * s * w_dy_dy,
+            # An opacity that underflows to 0 is invisible: 0 and not 0 * inf.
+            dr.select(w == 0, 0, w * dr.exp2(-log2_opacity)),
+        ]
+
+    def pack_tangents(self, geometry: list[Any], tangents: list[Any]) -> list[Any]:
+        """Tangents of the geometry, that of the opacity as d ln(opacity)."""
+        *others, d_opacity = tangents
+        return [*others, d_opacity * dr.exp2(-geometry[5])]
+
+    def tangent(
+        self, geometry: list[Any], footprint: Footprint, d_geometry: list[Any]
+    ) -> list[Any]:
+        """Tangent of ln(alpha) at the 16 pixels."""
+        _, _, p, r, s, _ = geometry
+        d_x, d_y, d_p, d_r, d_s, d_log_opacity = d_geometry
+        d_p, d_r, d_s = d_p * WHITENING_SCALE, d_r * WHITENING_SCALE, d_s * WHITENING_SCALE
+        scale = 2 * math.log(2)
+        result = []
+        for dx_row, dy_row, u_row, v_row in zip(
+            footprint.dx, footprint.dy, footprint.u, footprint.v, strict=True
+        ):
+            for dx, dy, u, v in zip(dx_row, dy_row, u_row, v_row, strict=True):
+                dv = dr.fma(d_s, dy, -s * d_y)
+                d_row = dr.fma(-scale * v, dv, d_log_opacity)
+                du_row = dr.fma(d_r, dy, -dr.fma(p, d_x, r * d_y))
+                result.append(dr.fma(-scale * u, dr.fma(d_p, dx, du_row), d_row))
+        return result
+
+
+# ----------------------------------------------------------------------------------------------
+# What is composited
+# ----------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class SplatFeatures:
+    """A splat's features are the same at every pixel: what is stored is what is composited."""
+
+    def num_planes(self, num_stored: int) -> int:
+        """Planes that come of ``num_stored`` numbers per splat."""
+        return num_stored
+
+    def seen_by(self, camera: Any) -> SplatFeatures:
+        """For one camera: nothing depends on it."""
+        del camera
+        return self
+
+    def check_differentiable_in_camera(self) -> None:
+        """They do not depend on the camera."""
+
+    def bind(self, lanes: Any, positions: Any) -> SplatFeatures:
+        """For the lanes of one kernel: nothing depends on where the pixels are."""
+        del lanes, positions
+        return self
+
+    def at(self, stored: list[Any], pixel: int) -> list[Any]:
+        """The splat's features at a pixel."""
+        del pixel
+        return stored
+
+    def add(self, planes: list[Any], stored: list[Any], pixel: int, weight: Any) -> list[Any]:
+        """A pixel's ``planes`` with this splat's share; weight: T alpha."""
+        features = self.at(stored, pixel)
+        return [dr.fma(weight, c, plane) for c, plane in zip(features, planes, strict=True)]
+
+    def feature_gradient(self, stored: list[Any], pixel: int, g: list[Any]) -> Any:
+        """c . g, with the features c at a pixel and the loss's derivatives g there."""
+        result: Any = 0  # there may be no features, but alpha alone
+        for c, derivative in zip(self.at(stored, pixel), g, strict=True):
+            result = dr.fma(c, derivative, result)
+        return result
+
+    def add_derivatives(
+        self, totals: list[Any], stored: list[Any], pixel: int, weight: Any, g: list[Any]
+    ) -> list[Any]:
+        """``totals`` and one pixel's share of the derivatives with respect to ``stored``.
+
+        weight: T alpha; g: derivatives of the loss with respect to the pixel's planes.
+        """
+        del stored, pixel
+        return [
+            dr.fma(weight, derivative, total) for derivative, total in zip(g, totals, strict=True)
+        ]
+
+    def tangents(self, stored: list[Any], d_stored: list[Any], pixel: int) -> list[Any]:
+        """Tangents of the features at a pixel."""
+        del stored, pixel
+        return d_stored
+
+
+@dataclass(frozen=True)
+class ImageModel:
+    """The choices that tiles and compositing share; see the module's description."""
+
+    response: Any = field(default_factory=AffineResponse)
+    positions: Any = field(default_factory=PixelCenters)
+    features: Any = field(default_factory=SplatFeatures)
+    cutoffs: Cutoffs = field(default_factory=Cutoffs)
+
+    def seen_by(self, camera: Any) -> ImageModel:
+        """This model for one camera."""
+        return replace(
+            self,
+            response=self.response.seen_by(camera),
+            features=self.features.seen_by(camera),
+        )
+
+    def check_differentiable_in_camera(self) -> None:
+        """Raise NotImplementedError if pixels depend on the camera but through the splats."""
+        self.features.check_differentiable_in_camera()
+
+    def bind(self, lanes: Any, grid: Any) -> ImageModel:
+        """This model for the lanes of one kernel: loads what a lane needs before its loop."""
+        positions = self.positions.bind(lanes, grid)
+        return ImageModel(
+            response=self.response,
+            positions=positions,
+            features=self.features.bind(lanes, positions),
+            cutoffs=self.cutoffs,
+        )
+
+    def footprint(self, geometry: list[Any], lanes: Any, active: Any) -> Footprint:
+        """A splat at the pixels of each lane."""
+        return self.response.footprint(geometry, partial(self.positions.offsets, lanes), active)
+
+    def alphas(self, geometry: list[Any], footprint: Footprint) -> list[Alpha]:
+        """Alpha at the 16 pixels."""
+        floor = self.response.log2_floor(geometry, self.cutoffs)
+        return [Alpha.at(x, floor, self.cutoffs.alpha_max) for x in footprint.log2_alpha]
+
+
+DEFAULT = ImageModel()

@@ -1,0 +1,201 @@
+"""Lanes of the compositing kernels: which micro-tile, which pixels, which splat next.
+
+One SIMD lane is one micro-tile of 4x4 pixels. It walks the entries of its tile, front to back or
+back to front, and visits those whose bit in its words is set.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+
+from drgs.core.arrays import types_of
+from drgs.splatting.image_model import MICRO, PIXELS
+from drgs.splatting.tiles import GRID, MICROS, TILE, WORD, TileBins, TileGrid
+
+
+@dataclass(frozen=True)
+class Lanes:
+    """One lane per micro-tile, in the order in which Dr.Jit starts them."""
+
+    micro_tile: Any  # UInt32: tile * 16 + micro-tile within the tile
+    micro: Any  # UInt32: micro-tile within the tile
+    tile: Any  # UInt32
+    x: Any  # UInt32: first pixel column
+    y: Any  # UInt32: first pixel row
+
+
+def make_lanes(Float: type, grid: TileGrid) -> Lanes:
+    """Lanes such that neighbours in time are far apart on the film.
+
+    Dr.Jit cuts a small launch into few blocks of consecutive lanes. Tiles are visited with a
+    stride near the golden section, so that each block gets its share of the busy centre.
+    """
+    t = types_of(Float)
+    stride = _coprime_stride(grid.num_tiles)
+    lane = dr.arange(t.UInt32, grid.num_tiles * MICROS)
+    turn, micro = lane // MICROS, lane % MICROS
+    tile = t.UInt32(
+        (t.UInt64(turn) * dr.opaque(t.UInt64, stride)) % dr.opaque(t.UInt64, grid.num_tiles)
+    )
+    columns = dr.opaque(t.UInt32, grid.columns)
+    row = tile // columns
+    return Lanes(
+        micro_tile=tile * MICROS + micro,
+        micro=micro,
+        tile=tile,
+        x=(tile - row * columns) * TILE + (micro % GRID) * MICRO,
+        y=row * TILE + (micro // GRID) * MICRO,
+    )
+
+
+def grouped_by_work(lanes: Lanes, work: Any) -> Lanes:
+    """The same lanes, in each block ordered by how many splats they visit, roughly."""
+    level = work // 4
+    level = dr.select(level < _LEVELS, level, _LEVELS - 1)
+    dr.eval(level)
+    order = dr.detail.block_mkperm(level, min(_BLOCK, dr.width(level)), _LEVELS)
+    return dr.gather(Lanes, lanes, order)
+
+
+_BLOCK = 32 * MICROS
+"""Lanes that are ordered together. In larger blocks the lanes of a tile, which read the same
+records, are too far apart; in smaller ones they are less alike."""
+
+_LEVELS = 256
+
+
+def _coprime_stride(count: int) -> int:
+    stride = max(1, round(count * (math.sqrt(5) - 1) / 2))
+    while math.gcd(stride, count) != 1:
+        stride += 1
+    return stride
+
+
+@dataclass
+class Cursor:
+    """Walks the set bits of a micro-tile's words: the splats that touch it.
+
+    Not frozen: Dr.Jit assigns the fields of a loop's state.
+    """
+
+    word: Any  # UInt32: bits of the current group that are still to come
+    group: Any  # UInt32: index of the current group of 32 entries
+
+
+class Entries:
+    """The entries [start, end) of each lane's tile that touch its micro-tile, front to back."""
+
+    def __init__(self, bins: TileBins, lanes: Lanes, end: Any) -> None:
+        UInt32 = type(lanes.tile)
+        self.words, self.micro = bins.words, lanes.micro
+        start = dr.gather(UInt32, bins.tile_start, lanes.tile)
+        occupied = start < end
+        # An empty lane gets first == last and no bits: it is over before it begins.
+        self.first = dr.select(occupied, start // WORD, 0)
+        self.last = dr.select(occupied, (end - 1) // WORD, 0)
+        ones = UInt32(0xFFFFFFFF)
+        self.head = dr.select(occupied, ones << (start % WORD), 0)
+        self.tail = dr.select(occupied, ones >> (WORD - 1 - (end - 1) % WORD), 0)
+
+    def begin(self) -> Cursor:
+        """The cursor at the first entry."""
+        return self._open(self.first, True)
+
+    def pending(self, cursor: Cursor) -> Any:
+        """Whether entries may be left."""
+        return (cursor.word != 0) | (cursor.group < self.last)
+
+    @staticmethod
+    def current(cursor: Cursor) -> tuple[Any, Any]:
+        """The current sorted entry, and whether there is one (a word may be empty).
+
+        Where there is none, the index lies between the entries before and those to come.
+        """
+        return cursor.group * WORD + dr.tzcnt(cursor.word), cursor.word != 0
+
+    def advance(self, cursor: Cursor) -> Cursor:
+        """Drop the current entry; open the next group when this one is used up."""
+        word = cursor.word & (cursor.word - 1)
+        return self._go_on(cursor, word, cursor.group + 1, cursor.group < self.last)
+
+    def _go_on(self, cursor: Cursor, word: Any, neighbor: Any, has_neighbor: Any) -> Cursor:
+        used_up = (word == 0) & has_neighbor
+        opened = self._open(dr.select(used_up, neighbor, cursor.group), used_up)
+        return Cursor(word=dr.select(used_up, opened.word, word), group=opened.group)
+
+    def _open(self, group: Any, active: Any) -> Cursor:
+        word = dr.gather(type(group), self.words, group * MICROS + self.micro, active)
+        word &= dr.select(group == self.first, self.head, 0xFFFFFFFF)
+        word &= dr.select(group == self.last, self.tail, 0xFFFFFFFF)
+        return Cursor(word=word, group=group)
+
+
+class EntriesBackToFront(Entries):
+    """The same entries in the opposite order."""
+
+    def begin(self) -> Cursor:
+        """The cursor at the last entry."""
+        return self._open(self.last, True)
+
+    def pending(self, cursor: Cursor) -> Any:
+        """Whether entries may be left."""
+        return (cursor.word != 0) | (cursor.group > self.first)
+
+    @staticmethod
+    def current(cursor: Cursor) -> tuple[Any, Any]:
+        """The current sorted entry, and whether there is one (a word may be empty)."""
+        return cursor.group * WORD + _highest_bit(cursor.word), cursor.word != 0
+
+    def advance(self, cursor: Cursor) -> Cursor:
+        """Drop the current entry; open the group before when this one is used up."""
+        bit = (type(cursor.word)(1) << (WORD - 1)) >> dr.lzcnt(cursor.word)
+        word = cursor.word & ~bit
+        return self._go_on(cursor, word, cursor.group - 1, cursor.group > self.first)
+
+
+def count_entries(entries: Entries) -> Any:
+    """How many entries each lane has."""
+
+    def body(group: Any, count: Any) -> tuple[Any, Any]:
+        return group + 1, count + dr.popcnt(entries._open(group, True).word)
+
+    UInt32 = type(entries.first)
+    _, count = dr.while_loop(
+        state=(UInt32(entries.first), dr.zeros(UInt32, dr.width(entries.first))),
+        cond=lambda group, count: group <= entries.last,
+        body=body,
+    )
+    return count
+
+
+def _highest_bit(word: Any) -> Any:
+    return (WORD - 1) - dr.lzcnt(word)
+
+
+def load_pixels(plane: Any, lanes: Lanes, grid: TileGrid) -> list[Any]:
+    """The 16 values of a row-major plane of pixels in each micro-tile; 0 off the film."""
+    return [
+        dr.gather(type(plane), plane, index, inside) for index, inside in pixels_of(lanes, grid)
+    ]
+
+
+def pixels_of(lanes: Lanes, grid: TileGrid) -> list[tuple[Any, Any]]:
+    """For the 16 pixels of each micro-tile: row-major index, and whether it is on the film."""
+    UInt32 = type(lanes.x)
+    width, height = dr.opaque(UInt32, grid.width), dr.opaque(UInt32, grid.height)
+    pixels = []
+    for pixel in range(PIXELS):
+        row, column = divmod(pixel, MICRO)
+        x, y = lanes.x + column, lanes.y + row
+        pixels.append((y * width + x, (x < width) & (y < height)))
+    return pixels
+
+
+def load_lane_row(values: Any, micro_tile: Any, planes: int) -> list[Any]:
+    """The first 16 values of each micro-tile's row of ``planes`` x 16."""
+    first = micro_tile * (planes * PIXELS)
+    return [dr.gather(type(values), values, first + k) for k in range(PIXELS)]

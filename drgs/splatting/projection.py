@@ -1,0 +1,257 @@
+"""From 3D Gaussians to 2D splats: culling, EWA projection, opacity and colour.
+
+The first stage: ``Gaussians`` + ``Camera`` -> ``Splats2D``. One lane is one Gaussian; every line is
+plain arithmetic, so Dr.Jit differentiates it. The equations are those of Zwicker et al. 2002 ("EWA
+splatting") as used in section 4 of the 3DGS paper, written so that they do not cancel in single
+precision.
+
+How a Gaussian's shape comes to the film is a function, :func:`ewa` or one of another module
+(``drgs.accuracy.unscented``, ``drgs.accuracy.exact``).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+from typing import Any
+
+import drjit as dr
+
+from drgs.cameras.camera import Camera
+from drgs.core.arrays import types_of
+from drgs.core.constants import LEAST_LOW_PASS, LOW_PASS, NEGLIGIBLE_ALPHA
+from drgs.gaussians import sh
+from drgs.gaussians.parameters import Gaussians
+from drgs.gaussians.quaternions import normalized, quat_to_rotation
+from drgs.splatting.cutoffs import Cutoffs
+
+
+@dataclass(frozen=True)
+class Splats2D:
+    """N projected Gaussians, one per lane, in the order of the Gaussians.
+
+    The conic (the inverse of the projected covariance) is kept as its upper triangular factor
+    U = [[p, r], [0, s]] with conic = U^T U: U maps a pixel offset d to standard normal
+    coordinates u = U d, and the splat's exponent is -|u|^2 / 2. A sum of squares is never
+    negative, whatever the rounding, and stays accurate for needles, where
+    a dx^2 + 2 b dx dy + c dy^2 cancels.
+    """
+
+    means2d: Any  # Array2f, px
+    whitening: Any  # Array3f (p, r, s), 1 / px
+    depths: Any  # Float, z in the camera, scene units
+    opacities: Any  # Float in (0, 1)
+    colors: Any  # Array3f, display space; or whatever else :func:`project`'s ``color`` gave
+    variances: Any  # Array2f, px^2: diagonal of the projected covariance, low-pass included
+    visible: Any  # Bool: in front of the near plane, above the alpha cut, finite
+    perspective: Any = None  # list of Float, only where a choice needs it: see drgs.accuracy.exact
+    dimming: Any = None  # Float: factor of the opacity, where the camera is out of focus
+
+    @property
+    def conics(self) -> Any:
+        """Array3f (a, b, c) of the exponent -(a dx^2 + 2 b dx dy + c dy^2) / 2, px^-2."""
+        p, r, s = self.whitening
+        return type(self.whitening)(p * p, p * r, r * r + s * s)
+
+
+@dataclass(frozen=True)
+class FilmShape:
+    """What a Gaussian's mean and covariance are on the film."""
+
+    means2d: Any  # Array2f, px
+    whitening: Any  # Array3f (p, r, s), 1 / px
+    variances: Any  # Array2f, px^2, low-pass included
+    sharp: Any  # Float: determinant of the covariance without low-pass; and what the low-pass
+    added: Any  # Float: adds to it, both divided by the variance in y
+    perspective: Any = None  # list of Float
+    dimming: Any = None  # Float: factor of the opacity; None: 1
+
+
+@dataclass(frozen=True)
+class GaussianRows:
+    """The parameters of Gaussians as one value per lane and component."""
+
+    means: Any  # Array3f
+    quats: Any  # Array4f, wxyz
+    log_scales: Any  # Array3f
+    logit_opacities: Any  # Float
+    sh: list[Any]  # (degree + 1)^2 Array3f
+    smoothing: Any = None  # Float: see drgs.effects.smoothing; None: there is none
+    dimming: Any = None  # Float: factor of the opacity; None: 1
+    features: Any = None  # by name: list of Float; None: there are none
+
+
+def load_rows(gaussians: Gaussians, sh_degree: int) -> GaussianRows:
+    """Load every Gaussian's parameters, detached; of the SH only what ``sh_degree`` needs."""
+    flat = dr.detach(gaussians.logit_opacities)
+    t = types_of(type(flat))
+    row = dr.arange(t.UInt32, dr.width(flat))
+
+    def load(tensor: Any, start: int, stride: int, width: int) -> list[Any]:
+        source = dr.detach(tensor).array
+        return [dr.gather(t.Float, source, row * stride + (start + k)) for k in range(width)]
+
+    stride = 3 * gaussians.shN.shape[1]
+    higher = range(sh.num_coefficients(sh_degree) - 1)
+    return GaussianRows(
+        means=t.Array3f(load(gaussians.means, 0, 3, 3)),
+        quats=dr.gather(t.Array4f, dr.detach(gaussians.quats).array, row),
+        log_scales=t.Array3f(load(gaussians.log_scales, 0, 3, 3)),
+        logit_opacities=flat,
+        sh=[t.Array3f(load(gaussians.sh0, 0, 3, 3))]
+        + [t.Array3f(load(gaussians.shN, 3 * k, stride, 3)) for k in higher],
+        smoothing=None if gaussians.smoothing is None else dr.detach(gaussians.smoothing),
+        features=gaussians.features
+        and {k: load(v, 0, v.shape[1], v.shape[1]) for k, v in gaussians.features.items()},
+    )
+
+
+def project(
+    rows: GaussianRows,
+    camera: Camera,
+    sh_degree: int,
+    opacity_rule: Any,
+    shape: Callable | None = None,
+    color: Callable | None = None,
+    low_pass: float = LOW_PASS,
+    least_alpha: float = Cutoffs().least_alpha,
+) -> Splats2D:
+    """Project Gaussians onto the image plane of ``camera``.
+
+    opacity_rule: how low-pass filtering affects opacity: :func:`plain_opacity` or
+    :func:`compensated_opacity`; shape: how mean and covariance are projected, by default
+    :func:`ewa`; color: what is known of a splat's colour, by default :func:`color_at_mean`;
+    low_pass: px^2 added to the covariance; least_alpha: Gaussians whose opacity, before the shape's
+    dimming, does not reach it are not visible.
+
+    Differentiable in ``rows`` and in the camera's numbers. Not differentiated: visibility.
+    """
+    offset = rows.means - camera.center
+    seen, position, depth = camera.lens.look(camera, camera.rotation @ offset)
+    low_pass = max(low_pass, LEAST_LOW_PASS)
+    film = (shape or ewa)(rows, camera, position, low_pass)
+    opacities = opacity_rule(_sigmoid(rows.logit_opacities), film.sharp, film.added)
+    if rows.dimming is not None:
+        opacities = opacities * rows.dimming
+    bright = opacities > least_alpha
+    if film.dimming is not None:
+        opacities = opacities * film.dimming
+        bright = bright & (opacities > NEGLIGIBLE_ALPHA)
+    direction = camera.lens.view_direction(camera, offset)
+    colors = (color or color_at_mean)(rows, direction, sh_degree)
+    numbers = [*film.means2d, *film.whitening, *colors]
+    numbers += [] if film.perspective is None else [*film.perspective]
+    finite = dr.isfinite(dr.detach(sum(numbers[1:], numbers[0])))
+    return Splats2D(
+        means2d=film.means2d,
+        whitening=film.whitening,
+        depths=depth,
+        opacities=opacities,
+        colors=colors,
+        variances=film.variances,
+        visible=seen & bright & finite & dr.isfinite(dr.sum(film.variances)),
+        perspective=film.perspective,
+        dimming=film.dimming,
+    )
+
+
+def ewa(rows: GaussianRows, camera: Camera, position: Any, low_pass: float) -> FilmShape:
+    """The affine approximation of the projection at the mean (Zwicker et al. 2002, section 4).
+
+    position: Array3f, camera axes, the mean. With M = J R_camera R(q) diag(s), 2 x 3, the
+    covariance on the film is M M^T + low_pass I.
+    """
+    lens = camera.lens
+    m0, m1, _ = film_axes(rows, camera, position, lens.clamped_slopes(camera, position))
+    return whiten(lens.film_point(camera, position), [*m0], [*m1], low_pass)
+
+
+def whiten(means2d: Any, m0: Sequence[Any], m1: Sequence[Any], low_pass: float) -> FilmShape:
+    """The shape of a Gaussian whose covariance on the film is M M^T + low_pass I.
+
+    m0, m1: the rows of M, equally many numbers, px.
+    """
+    xx, xy, yy = dot(m0, m0), dot(m0, m1), dot(m1, m1) + low_pass
+    # U needs det / yy, the variance of x where y is given. det(M M^T) is the sum of the squared
+    # 2x2 minors of M (Cauchy-Binet): never negative and free of the cancellation of
+    # xx yy - xy^2. Its minors are divided by sqrt(yy) first, or the square of a giant's overflows.
+    s = dr.rsqrt(yy)
+    m1 = [component * s for component in m1]
+    minors = [dr.fma(m0[i], m1[j], -(m0[j] * m1[i])) for i, j in combinations(range(len(m0)), 2)]
+    sharp, added = dot(minors, minors), low_pass * (xx / yy + 1)
+    p = dr.rsqrt(sharp + added)
+    t = types_of(type(s))
+    return FilmShape(
+        means2d=means2d,
+        whitening=t.Array3f(p, -p * (xy / yy), s),
+        variances=t.Array2f(xx + low_pass, yy),
+        sharp=sharp,
+        added=added,
+    )
+
+
+def dot(a: Sequence[Any], b: Sequence[Any]) -> Any:
+    """The inner product of two vectors of the same length."""
+    total = a[0] * b[0]
+    for x, y in zip(a[1:], b[1:], strict=True):
+        total = dr.fma(x, y, total)
+    return total
+
+
+def color_at_mean(rows: GaussianRows, direction: Any, sh_degree: int) -> Any:
+    """The colour (Array3f) in the ``direction`` in which the mean is seen, of any length."""
+    return sh.sh_color(rows.sh, normalized(direction), sh_degree)
+
+
+def plain_opacity(opacity: Any, sharp: Any, added: Any) -> Any:
+    """The opacity as it is: low-pass filtering makes small splats larger and thus brighter."""
+    del sharp, added
+    return opacity
+
+
+def compensated_opacity(opacity: Any, sharp: Any, added: Any) -> Any:
+    """Opacity scaled by sqrt(det without / det with low-pass): the splat's integral is kept.
+
+    sharp, added: in the ratio of the determinant without low-pass to what the low-pass adds.
+
+    Mip-Splatting (Yu et al. 2024), section 5; gsplat's "antialiased" mode. The derivative of
+    the square root at 0 (a splat of no area) is taken as 0.
+    """
+    thin = sharp < 1e-12 * added
+    # Not sharp / (sharp + added), whose derivative is a difference that cancels for giants.
+    return dr.select(thin, 0, opacity * dr.rsqrt(1 + added / dr.select(thin, 1, sharp)))
+
+
+def film_axes(
+    rows: GaussianRows, camera: Camera, position: Any, slopes: Any
+) -> tuple[Any, Any, Any]:
+    """The half axes of a Gaussian as rows of two matrices: on the film, and in depth.
+
+    The first two are those of M = J R_camera R(q) diag(s), px; the third the same for the depth
+    divided by that of the mean. slopes: see :meth:`drgs.cameras.camera.Pinhole.film_directions`.
+    """
+    world_from_splat, scales = quat_to_rotation(rows.quats), dr.exp(rows.log_scales)
+
+    def along(direction: Any) -> Any:
+        return (world_from_splat.T @ direction) * scales
+
+    m0, m1 = map(along, camera.lens.film_directions(camera, position, slopes))
+    return m0, m1, along(camera.lens.depth_direction(camera, position))
+
+
+def world_axes(rows: GaussianRows) -> list[Any]:
+    """The three half axes of a Gaussian, Array3f, world."""
+    world_from_splat, scales = quat_to_rotation(rows.quats), dr.exp(rows.log_scales)
+    Array3f = types_of(type(rows.logit_opacities)).Array3f
+    return [
+        Array3f([world_from_splat[row, column] for row in range(3)]) * scales[column]
+        for column in range(3)
+    ]
+
+
+def _sigmoid(x: Any) -> Any:
+    """1 / (1 + e^-x) without overflow for large |x|."""
+    # Not dr.abs: its derivative at 0 is 0, and a logit of exactly 0 would never move.
+    decayed = dr.exp(dr.select(x >= 0, -x, x))
+    return dr.select(x >= 0, 1, decayed) / (1 + decayed)

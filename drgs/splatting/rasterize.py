@@ -1,0 +1,559 @@
+r"""Compositing splats front to back, its adjoint and its tangent.
+
+The last stage: ``TileBins`` + features -> planes of pixels. The image model is equation 3 of the
+3DGS paper: with splats i = 1, 2, ... in front-to-back order,
+
+    a_i = min(0.99, o_i exp(-|U_i d_i|^2 / 2)),  d_i = pixel centre - mean_i
+    T_1 = 1,  T_{i+1} = T_i (1 - a_i),  w_i = T_i a_i
+    C = sum_i w_i c_i,  T = T_last
+
+where splats with a_i < 1/255 are skipped and a pixel stops before the splat that would take T
+below 1e-4. c_i is a vector of any length, the splat's *features*: colour, depth, or whatever
+else is to be composited. The background is added by the caller, from T.
+
+**Adjoint.** Let g = dL/dC and G = dL/dT. Whatever lies behind splat i contributes to the loss
+through the factor T_{i+1} = T_i (1 - a_i) only. Let R_i be what one unit of light that passes
+splat i is worth: R_last = G, since it reaches the background, and
+
+    R_{i-1} = a_i (c_i . g) + (1 - a_i) R_i.
+
+    dL/dc_i = w_i g,   dL/da_i = T_i (c_i . g - R_i).
+
+The adjoint walks the splats back to front, from the last one that the pixel composited, and
+recovers T_i = T_{i+1} / (1 - a_i) (3DGS, section 6), which alpha <= 0.99 keeps accurate. R is a
+convex combination of the values behind it: its rounding errors do not grow, and a splat that is
+seen through little transmittance has a gradient as accurate, relative to its own size, as the
+first. (The equivalent sums from front to back, S_i = S_{i-1} - w_i (c_i . g) and dL/da_i =
+T_i (c_i . g) - S_i / (1 - a_i), cancel: they carry the error of the whole sum to the last splat.)
+Nothing is stored per pixel pair, and all decisions of the forward pass are taken again exactly.
+
+**Mapping to the machine.** One SIMD lane is one micro-tile of 4x4 pixels, its pixels unrolled:
+the load of a splat's record is paid once for 16 pixels. Lanes that share a vector wait for the
+last of them, so that lanes with similarly many splats are put together.
+
+**Memory.** A read or a write that no cache foresees takes as long as a lane's arithmetic. Lanes
+therefore walk through memory in order: splats are copied into the order of the entries, and what
+a lane of the adjoint writes is contiguous.
+
+**No atomics.** In the adjoint, a lane sums each splat's partial derivatives over its 16 pixels
+and writes them into a slot that belongs to this (splat, micro-tile) alone. One lane per entry
+adds up its slots, one lane per splat its entries, in an order of their own. The result is the
+same to the last bit in every run.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import drjit as dr
+
+from drgs.core.arrays import (
+    empty_rows,
+    interleave,
+    load_row,
+    pack_rows,
+    scatter_rows,
+    store_row,
+    types_of,
+)
+from drgs.splatting.image_model import MICRO, PIXELS, Alpha
+from drgs.splatting.lanes import (
+    Cursor,
+    Entries,
+    EntriesBackToFront,
+    count_entries,
+    grouped_by_work,
+    load_lane_row,
+    load_pixels,
+    make_lanes,
+    pixels_of,
+)
+from drgs.splatting.tiles import GRID, MICROS, TILE, WORD, TileBins, TileGrid, transpose_masks
+
+
+@dataclass(frozen=True)
+class Layers:
+    """What compositing makes of the splats, stored one row per micro-tile."""
+
+    values: Any  # Float (tiles * 16 * (1 + C) * 16,): row: transmittance, then each plane
+    ends: Any  # UInt32 (tiles * 16 * 16,): sorted entry from which on a pixel composited nothing
+    stop: Any  # UInt32 (tiles * 16,): the largest of them in each micro-tile
+    count: int  # C, planes
+    grid: TileGrid
+
+    def planes(self) -> list[Any]:
+        """1 + C planes in row-major pixel order, Float (H * W,), not evaluated.
+
+        The first is T, the transmittance left for the background; then sum_i w_i c_i for each
+        component of c.
+        """
+        t = types_of(type(self.values))
+        pixel = dr.arange(t.UInt32, self.grid.width * self.grid.height)
+        width = dr.opaque(t.UInt32, self.grid.width)
+        y = pixel // width
+        x = pixel - y * width
+        tile = (y // TILE) * dr.opaque(t.UInt32, self.grid.columns) + x // TILE
+        micro = ((y % TILE) // MICRO) * GRID + (x % TILE) // MICRO
+        base = (tile * MICROS + micro) * (PIXELS * (1 + self.count))
+        index = base + (y % MICRO) * MICRO + x % MICRO
+        return [dr.gather(t.Float, self.values, index + PIXELS * k) for k in range(1 + self.count)]
+
+
+def composite_step(transmittance: Any, alpha: Any, stop: float) -> tuple[Any, Any, Any]:
+    """Composite one alpha: (weight, next transmittance, whether the pixel goes on).
+
+    stop: the last transmittance that a pixel may have.
+
+    A finished pixel keeps its transmittance with a negative sign, which fails the comparison
+    ever after.
+    """
+    after = dr.fma(-alpha, transmittance, transmittance)
+    goes_on = after >= stop
+    weight = dr.select(goes_on, alpha * transmittance, 0)
+    return weight, dr.select(goes_on, after, -dr.abs(transmittance)), goes_on
+
+
+@dataclass(frozen=True)
+class Records:
+    """What compositing loads for each sorted entry: its splat's geometry and features.
+
+    A splat that touches several tiles is stored several times, so that the lanes of a tile read
+    memory in order instead of jumping from splat to splat.
+    """
+
+    rows: Any  # Float (M padded * packets * 4,): geometry, features, keys, padding
+    num_geometry: int
+    num_features: int
+    num_keys: int
+
+    @staticmethod
+    def of(bins: TileBins, numbers: Callable[[Any], list[Any]]) -> Records:
+        """Copies, evaluated, of each rank's ``numbers``, such as those of ``bins.splats``."""
+        rows = pack_rows(numbers(bins.ranks))
+        dr.eval(rows)
+        return Records(rows, bins.model.response.num_geometry, bins.num_features, bins.num_keys)
+
+    def load(self, entry: Any, active: Any) -> tuple[list[Any], list[Any]]:
+        """Geometry and features of a sorted entry."""
+        numbers = self._numbers(entry, active)
+        return numbers[: self.num_geometry], numbers[self.num_geometry :][: self.num_features]
+
+    def load_keys(self, entry: Any, active: Any) -> list[Any]:
+        """Keys of a sorted entry."""
+        return self._numbers(entry, active)[self.num_geometry + self.num_features :]
+
+    def _numbers(self, entry: Any, active: Any) -> list[Any]:
+        width = self.num_geometry + self.num_features + self.num_keys
+        return load_row(self.rows, width, entry, active)
+
+
+# ----------------------------------------------------------------------------------------------
+# Forward
+# ----------------------------------------------------------------------------------------------
+
+
+def composite(bins: TileBins, records: Records) -> Layers:
+    """Composite the features of all splats.
+
+    bins: from ``bin_splats``; records: ``Records.of(bins, bins.splats)``.
+    """
+    t = types_of(type(bins.rows))
+    lanes = make_lanes(t.Float, bins.grid)
+    end = dr.gather(t.UInt32, bins.tile_start, lanes.tile + 1)
+    lanes = grouped_by_work(lanes, count_entries(Entries(bins, lanes, end)))
+    entries = Entries(bins, lanes, dr.gather(t.UInt32, bins.tile_start, lanes.tile + 1))
+    model = bins.model.bind(lanes, bins.grid)
+    count = model.features.num_planes(bins.num_features)
+
+    def body(cursor: Cursor, T: list, C: list, ends: list, unfinished: Any) -> tuple:
+        entry, active = entries.current(cursor)
+        geometry, features = records.load(entry, active)
+        footprint = model.footprint(geometry, lanes, active)
+        T, C, ends = list(T), [list(c) for c in C], list(ends)
+        behind = dr.select(active, entry + 1, entry)
+        for pixel, alpha in enumerate(model.alphas(geometry, footprint)):
+            weight, T[pixel], goes_on = composite_step(T[pixel], alpha.value, stop)
+            ends[pixel] = dr.select(goes_on, behind, ends[pixel])
+            planes = model.features.add([plane[pixel] for plane in C], features, pixel, weight)
+            for plane, value in zip(C, planes, strict=True):
+                plane[pixel] = value
+        return entries.advance(cursor), T, C, ends, _any_positive(T)
+
+    stop = model.cutoffs.transmittance_stop
+    size = dr.width(lanes.tile)
+    zero = dr.zeros(t.Float, size)
+    _, T, C, ends, _ = dr.while_loop(
+        state=(
+            entries.begin(),
+            # Pixels off the film are finished before they begin.
+            [dr.select(inside, t.Float(1), -1) for _, inside in pixels_of(lanes, bins.grid)],
+            [[t.Float(zero) for _ in range(PIXELS)] for _ in range(count)],
+            [dr.zeros(t.UInt32, size) for _ in range(PIXELS)],
+            dr.full(t.Bool, True, size),
+        ),
+        cond=lambda cursor, T, C, ends, unfinished: entries.pending(cursor) & unfinished,
+        body=body,
+    )
+    dr.eval(T, C, ends)
+    columns = [dr.abs(v) for v in T] + [v for plane in C for v in plane]
+    last = largest(ends)
+    dr.eval(columns, last)
+    return Layers(
+        values=scatter_rows(columns, lanes.micro_tile, size),
+        ends=scatter_rows(ends, lanes.micro_tile, size),
+        stop=scatter_rows([last], lanes.micro_tile, size),
+        count=count,
+        grid=bins.grid,
+    )
+
+
+def _any_positive(values: list[Any]) -> Any:
+    return largest(values) > 0
+
+
+def largest(values: list[Any]) -> Any:
+    """The largest of several numbers, lane by lane."""
+    result = values[0]
+    for v in values[1:]:
+        result = dr.select(v > result, v, result)
+    return result
+
+
+# ----------------------------------------------------------------------------------------------
+# Adjoint
+# ----------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class SplatGradients:
+    """Derivatives of the loss with respect to the 2D splats, in the order of the Gaussians."""
+
+    geometry: list[Any]  # Float each: mean x, y (per px), p, r, s, opacity, more of the response's
+    features: list[Any]  # Float each
+
+    @property
+    def means2d(self) -> Any:
+        """Array2f, loss per px."""
+        return types_of(type(self.geometry[0])).Array2f(self.geometry[:2])
+
+    @property
+    def whitening(self) -> Any:
+        """Array3f."""
+        return types_of(type(self.geometry[0])).Array3f(self.geometry[2:5])
+
+    @property
+    def opacities(self) -> Any:
+        """Float."""
+        return self.geometry[5]
+
+
+@dataclass(frozen=True)
+class Slots:
+    """Where each composited (entry, micro-tile) pair stores its partial derivatives.
+
+    First come the pairs of all tiles' first micro-tiles, in the order of the sorted entries, then
+    those of the second ones, and so on: what a lane writes is contiguous. (In the order in which
+    the slots are added up, each write would wait for memory of its own.) Pairs behind a
+    micro-tile's stop have no slot, so that every slot is written exactly once.
+    """
+
+    pairs: Any  # UInt32 (M padded / 32 * 16 * 2,): (group of 32, micro-tile) -> first slot, bits
+    composited: Any  # UInt32 (M padded,): sorted -> bit per micro-tile
+    count: int
+
+    def at(self, group: Any, micro: Any, active: Any = True) -> tuple[Any, Any]:
+        """First slot of a group of entries in a micro-tile, and the word of its composited bits."""
+        return dr.gather(types_of(type(group)).Array2u, self.pairs, group * MICROS + micro, active)
+
+    def end(self, entries: Entries) -> Any:
+        """Where each lane's slots end."""
+        first, word = self.at(entries.last, entries.micro)
+        return first + dr.popcnt(word & entries.tail)
+
+    def number(self, entries: Entries) -> Any:
+        """How many slots each lane has."""
+        first, word = self.at(entries.first, entries.micro)
+        begin = first + dr.popcnt(word & ~entries.head)
+        return dr.select(entries.head == 0, 0, self.end(entries) - begin)
+
+
+def assign_slots(bins: TileBins, layers: Layers) -> Slots:
+    """Number the slots. The host reads one value, how many there are."""
+    t = types_of(type(bins.rows))
+    entry = dr.arange(t.UInt32, dr.width(bins.masks))
+    composited = t.UInt32(0)
+    for k in range(MICROS // 4):
+        stops = dr.gather(t.Array4u, layers.stop, bins.tiles * (MICROS // 4) + k)
+        for m, stop in enumerate(stops):
+            composited |= dr.select(entry < stop, t.UInt32(1 << (4 * k + m)), 0)
+    composited &= bins.masks
+    dr.eval(composited)
+    words = transpose_masks(composited)
+
+    num_words = dr.width(words)
+    groups = dr.opaque(t.UInt32, num_words // MICROS)
+    index = dr.arange(t.UInt32, num_words + 1)
+    micro = index // groups
+    transposed = (index - micro * groups) * MICROS + micro
+    exists = index < dr.opaque(t.UInt32, num_words)
+    first = dr.prefix_sum(dr.popcnt(dr.gather(t.UInt32, words, transposed, exists)))
+    count = int(first[num_words])
+
+    index = dr.arange(t.UInt32, num_words)
+    group, micro = index // MICROS, index % MICROS
+    pairs = interleave([dr.gather(t.UInt32, first, micro * groups + group), words])
+    dr.eval(pairs)
+    return Slots(pairs=pairs, composited=composited, count=count)
+
+
+def composite_adjoint(
+    bins: TileBins,
+    records: Records,
+    layers: Layers,
+    d_features: list[Any],
+    d_transmittance: Any,
+) -> SplatGradients:
+    """Derivatives with respect to the splats, given those with respect to the planes.
+
+    layers: what :func:`composite` returned for the same bins and records; d_features: C planes
+    (H * W,); d_transmittance: plane (H * W,). Not differentiated: the order, the decisions
+    (cut, clamp, stop).
+    """
+    t = types_of(type(bins.rows))
+    slots = assign_slots(bins, layers)
+    lanes = make_lanes(t.Float, bins.grid)
+    stop = dr.gather(t.UInt32, layers.stop, lanes.micro_tile)
+    lanes = grouped_by_work(lanes, slots.number(Entries(bins, lanes, stop)))
+    stop = dr.gather(t.UInt32, layers.stop, lanes.micro_tile)
+    entries = EntriesBackToFront(bins, lanes, stop)
+    model = bins.model.bind(lanes, bins.grid)
+    width = model.response.num_moments + bins.num_features
+
+    g = [load_pixels(plane, lanes, bins.grid) for plane in d_features]
+    ends = load_lane_row(layers.ends, lanes.micro_tile, 1)
+    transmittance = load_lane_row(layers.values, lanes.micro_tile, 1 + layers.count)
+    partials = empty_rows(t.Float, width, max(slots.count, 1))
+
+    def body(cursor: Cursor, slot: Any, T: list, R: list) -> tuple:
+        entry, active = entries.current(cursor)
+        slot = dr.select(active, slot - 1, slot)
+        geometry, features = records.load(entry, active)
+        footprint = model.footprint(geometry, lanes, active)
+        alphas = model.alphas(geometry, footprint)
+        composited = [entry < end for end in ends]
+        T, R, d_log_alpha, d_features = _adjoint_step(
+            alphas, composited, features, model.features, T, R, g
+        )
+        moments = model.response.moments(footprint, d_log_alpha, model.positions)
+        store_row(partials, moments + d_features, slot, active)
+        return entries.advance(cursor), slot, T, R
+
+    loop = dr.while_loop(
+        state=(
+            entries.begin(),
+            slots.end(entries),
+            transmittance,
+            load_pixels(d_transmittance, lanes, bins.grid),
+        ),
+        cond=lambda cursor, slot, T, R: entries.pending(cursor),
+        body=body,
+    )
+    dr.eval(loop, partials)
+    return sum_slots(bins, slots, partials, width)
+
+
+def _adjoint_step(
+    alphas: list[Alpha],
+    composited: list[Any],
+    stored: list[Any],
+    features: Any,
+    T: list[Any],
+    R: list[Any],
+    g: list[list[Any]],
+) -> tuple[list, list, list, list]:
+    """One splat at 16 pixels: T and R before it, d loss / d ln(alpha), d loss / d stored (summed).
+
+    composited: whether each pixel was still unfinished; stored: what is stored of the splat, and
+    features: what they are at a pixel; T, R: past the splat; g: [plane][pixel] derivative of the
+    loss with respect to C.
+    """
+    T, R = list(T), list(R)
+    zero = type(T[0])(0)
+    d_stored = [zero for _ in stored]
+    d_log_alpha = []
+    for pixel, alpha in enumerate(alphas):
+        value = dr.select(composited[pixel], alpha.value, 0)
+        T[pixel] = T[pixel] / (1 - value)
+        weight = value * T[pixel]
+        g_pixel = [plane[pixel] for plane in g]
+        d_stored = features.add_derivatives(d_stored, stored, pixel, weight, g_pixel)
+        gain = features.feature_gradient(stored, pixel, g_pixel) - R[pixel]
+        R[pixel] = dr.fma(value, gain, R[pixel])
+        # d loss / d ln(alpha) = a T (c.g - R), zero where alpha is clamped.
+        d_log_alpha.append(dr.select(alpha.smooth, weight * gain, 0))
+    return T, R, d_log_alpha, d_stored
+
+
+def sum_slots(bins: TileBins, slots: Slots, partials: Any, width: int) -> SplatGradients:
+    """Add up the slots of each entry, the entries of each splat, and turn sums into derivatives.
+
+    width: numbers in a slot.
+    """
+    t = types_of(type(bins.rows))
+    by_entry = _sum_entries(bins, slots, partials, width)
+    totals = sum_runs(t.Float, bins.first_entry, lambda entry: load_row(by_entry, width, entry))
+    return splat_gradients(bins, totals)
+
+
+def sum_runs(Float: type, first: Any, load: Callable[[Any], list[Any]]) -> list[Any]:
+    """Sums over runs, one lane a run: run r is from ``first[r]`` to ``first[r + 1]``.
+
+    load: the numbers of an element of a run.
+    """
+    UInt32 = type(first)
+    run = dr.arange(UInt32, dr.width(first) - 1)
+    begin, end = (dr.gather(UInt32, first, run + k) for k in (0, 1))
+    width = len(load(begin))
+
+    def body(element: Any, totals: list) -> tuple:
+        return element + 1, [a + b for a, b in zip(totals, load(element), strict=True)]
+
+    zero = dr.zeros(Float, dr.width(run))
+    _, totals = dr.while_loop(
+        state=(begin, [Float(zero) for _ in range(width)]),
+        cond=lambda element, totals: element < end,
+        body=body,
+    )
+    return totals
+
+
+def splat_gradients(bins: TileBins, totals: list[Any]) -> SplatGradients:
+    """From each splat's sums, by rank, to its derivatives, by Gaussian.
+
+    totals: moments, and derivatives of the features.
+    """
+    t, response = types_of(type(bins.rows)), bins.model.response
+    rank = dr.arange(t.UInt32, dr.width(bins.order))
+    geometry = bins.splats(rank)[: response.num_geometry]
+    columns = response.derivatives(geometry, totals[: response.num_moments])
+    columns += totals[response.num_moments :]
+    dr.eval(columns)
+    size = dr.width(rank)
+    flat = scatter_rows(columns, bins.order, size)
+    row = [dr.gather(t.Float, flat, rank * len(columns) + k) for k in range(len(columns))]
+    count = response.num_geometry
+    return SplatGradients(geometry=row[:count], features=row[count:])
+
+
+def _sum_entries(bins: TileBins, slots: Slots, partials: Any, width: int) -> Any:
+    """Sums over the micro-tiles of each entry: rows of ``width`` numbers by unsorted entry."""
+    t = types_of(type(bins.rows))
+    entry = dr.arange(t.UInt32, max(bins.num_entries, 1))
+    group, below = entry // WORD, (t.UInt32(1) << (entry % WORD)) - 1
+
+    def body(micros: Any, totals: list) -> tuple:
+        for _ in range(2):  # two at a time wait for memory together
+            active = micros != 0
+            first, word = slots.at(group, dr.tzcnt(micros), active)
+            numbers = load_row(partials, width, first + dr.popcnt(word & below), active)
+            totals = [a + b for a, b in zip(totals, numbers, strict=True)]
+            micros = micros & (micros - 1)
+        return micros, totals
+
+    zero = dr.zeros(t.Float, dr.width(entry))
+    _, totals = dr.while_loop(
+        state=(
+            dr.gather(t.UInt32, slots.composited, entry),
+            [t.Float(zero) for _ in range(width)],
+        ),
+        cond=lambda micros, totals: micros != 0,
+        body=body,
+    )
+    dr.eval(totals)
+    rows = empty_rows(t.Float, width, dr.width(entry))
+    store_row(rows, totals, dr.gather(t.UInt32, bins.source, entry))
+    return rows
+
+
+# ----------------------------------------------------------------------------------------------
+# Tangent (forward mode)
+# ----------------------------------------------------------------------------------------------
+
+
+def composite_tangent(
+    bins: TileBins, records: Records, layers: Layers, tangents: SplatGradients
+) -> Layers:
+    """Directional derivatives of the planes along ``tangents`` of the 2D splats.
+
+    tangents: the same fields as the gradients, holding the direction. Returns the tangents of
+    the planes that :func:`composite` made. Not differentiated: the order, the decisions.
+    """
+    t = types_of(type(bins.rows))
+    count = layers.count
+    lanes = make_lanes(t.Float, bins.grid)
+    entries = Entries(bins, lanes, dr.gather(t.UInt32, layers.stop, lanes.micro_tile))
+    model = bins.model.bind(lanes, bins.grid)
+    stop = model.cutoffs.transmittance_stop
+    d_records = pack_tangents(bins, tangents)
+
+    def body(cursor: Cursor, T: list, dT: list, dC: list) -> tuple:
+        entry, active = entries.current(cursor)
+        geometry, features = records.load(entry, active)
+        footprint = model.footprint(geometry, lanes, active)
+        d_geometry, d_features = d_records.load(entry, active)
+        d_log_alpha = model.response.tangent(geometry, footprint, d_geometry)
+        T, dT, dC = list(T), list(dT), [list(c) for c in dC]
+        for pixel, alpha in enumerate(model.alphas(geometry, footprint)):
+            before, d_before = dr.abs(T[pixel]), dT[pixel]
+            weight, T[pixel], goes_on = composite_step(T[pixel], alpha.value, stop)
+            d_alpha = dr.select(alpha.smooth, alpha.value * d_log_alpha[pixel], 0)
+            d_weight = dr.select(goes_on, dr.fma(before, d_alpha, alpha.value * d_before), 0)
+            dT[pixel] = d_before - d_weight
+            c = model.features.at(features, pixel)
+            d_c = model.features.tangents(features, d_features, pixel)
+            for k in range(count):
+                change = dr.fma(d_weight, c[k], weight * d_c[k])
+                dC[k][pixel] = dC[k][pixel] + change
+        return entries.advance(cursor), T, dT, dC
+
+    size = dr.width(lanes.tile)
+    one, zero = dr.ones(t.Float, size), dr.zeros(t.Float, size)
+    _, _, dT, dC = dr.while_loop(
+        state=(
+            entries.begin(),
+            [t.Float(one) for _ in range(PIXELS)],
+            [t.Float(zero) for _ in range(PIXELS)],
+            [[t.Float(zero) for _ in range(PIXELS)] for _ in range(count)],
+        ),
+        cond=lambda cursor, T, dT, dC: entries.pending(cursor),
+        body=body,
+    )
+    columns = dT + [v for plane in dC for v in plane]
+    dr.eval(columns)
+    return Layers(
+        values=scatter_rows(columns, lanes.micro_tile, size),
+        ends=layers.ends,
+        stop=layers.stop,
+        count=count,
+        grid=bins.grid,
+    )
+
+
+def pack_tangents(bins: TileBins, tangents: SplatGradients) -> Records:
+    """The records' tangents: of the geometry as the response wants it, and of the features."""
+    t = types_of(type(bins.rows))
+    rank = dr.arange(t.UInt32, dr.width(bins.order))
+
+    def by_rank(columns: list[Any]) -> list[Any]:
+        return [dr.gather(t.Float, column, bins.order) for column in columns]
+
+    geometry = bins.splats(rank)[: bins.model.response.num_geometry]
+    numbers = bins.model.response.pack_tangents(geometry, by_rank(tangents.geometry))
+    numbers += by_rank(tangents.features)
+    numbers += [dr.zeros(t.Float, dr.width(rank))] * bins.num_keys  # they have no derivatives
+    rows = pack_rows(numbers)
+    dr.eval(rows)
+    return Records.of(bins, partial(load_row, rows, len(numbers)))

@@ -1,0 +1,428 @@
+"""The stages composed: from Gaussians and a camera to planes of pixels, and back.
+
+A :class:`Pipeline` says what a scene calls for: which SH degree, which opacity rule, which features
+are composited, which approximations are made. It does so by naming functions and objects, and
+Dr.Jit traces only what is called: what is not composed in leaves no instruction in any kernel.
+``drgs.config.approximations`` makes a pipeline from names.
+
+The chain is  Gaussians -> ``project`` -> Splats2D -> ``bin_splats`` -> TileBins
+-> ``composite`` -> Layers.  The adjoint runs it backwards: the hand-written adjoint of
+compositing gives the derivatives of the 2D splats, and Dr.Jit differentiates projection and SH,
+which are traced again, one Gaussian per lane, so that no gradient is ever scattered.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import drjit as dr
+
+from drgs.cameras.camera import Camera
+from drgs.core.arrays import interleave, types_of
+from drgs.core.constants import LOW_PASS
+from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
+from drgs.splatting.image_model import DEFAULT, ImageModel
+from drgs.splatting.projection import (
+    GaussianRows,
+    Splats2D,
+    color_at_mean,
+    ewa,
+    load_rows,
+    plain_opacity,
+    project,
+)
+from drgs.splatting.rasterize import (
+    Layers,
+    Records,
+    SplatGradients,
+    composite,
+    composite_adjoint,
+    composite_tangent,
+)
+from drgs.splatting.tiles import TileBins, TileGrid, bin_splats
+
+Feature = Callable[[Splats2D, GaussianRows, Camera], list[Any]]
+"""What is composited of each splat: a list of Float, one for each plane."""
+
+
+def color_features(splats: Splats2D, rows: GaussianRows, camera: Camera) -> list[Any]:
+    """Red, green and blue in display space: three planes."""
+    del rows, camera
+    return list(splats.colors)
+
+
+def depth_feature(splats: Splats2D, rows: GaussianRows, camera: Camera) -> list[Any]:
+    """z in the camera, scene units: one plane, the alpha-weighted sum of the depths."""
+    del rows, camera
+    return [splats.depths]
+
+
+@dataclass(frozen=True)
+class CenterOrder:
+    """One order of the splats for the whole image: by the depth of their means."""
+
+    def seen_by(self, camera: Camera) -> CenterOrder:
+        """For any camera."""
+        del camera
+        return self
+
+    def keys(self, splats: Splats2D) -> list[Any]:
+        """Columns that compositing needs for the order, besides the order of the entries."""
+        del splats
+        return []
+
+    def composite(self, bins: TileBins, records: Records) -> Layers:
+        """Composite front to back."""
+        return composite(bins, records)
+
+    def adjoint(self, *arguments: Any) -> SplatGradients:
+        """See :func:`drgs.splatting.rasterize.composite_adjoint`."""
+        return composite_adjoint(*arguments)
+
+    def tangent(self, *arguments: Any) -> Layers:
+        """See :func:`drgs.splatting.rasterize.composite_tangent`."""
+        return composite_tangent(*arguments)
+
+
+def as_loaded(rows: GaussianRows) -> GaussianRows:
+    """The Gaussians as they are."""
+    return rows
+
+
+@dataclass(frozen=True)
+class Pipeline:
+    """What is rendered, and how; see the module's description."""
+
+    sh_degree: int = 3
+    opacity_rule: Callable[[Any, Any, Any], Any] = plain_opacity
+    features: tuple[Feature, ...] = (color_features,)
+    rows: Callable[[GaussianRows], GaussianRows] = as_loaded  # what is done to the Gaussians first
+    shape: Callable = ewa  # how a Gaussian's mean and covariance come to the film
+    color: Callable = color_at_mean  # what is stored of a splat's colour
+    low_pass: float = LOW_PASS  # px^2
+    model: ImageModel = DEFAULT
+    order: Any = CenterOrder()
+
+    def project(self, rows: GaussianRows, camera: Camera) -> Splats2D:
+        """The first stage with this pipeline's approximations."""
+        splats = project(
+            self.rows(rows),
+            camera.seeing(rows.means),
+            self.sh_degree,
+            self.opacity_rule,
+            self.shape,
+            self.color,
+            self.low_pass,
+            self.model.cutoffs.least_alpha,
+        )
+        if rows.features:
+            numbers = [number for columns in rows.features.values() for number in columns]
+            finite = dr.isfinite(dr.detach(sum(numbers[1:], numbers[0])))
+            splats = replace(splats, visible=splats.visible & finite)
+        return splats
+
+    def feature_columns(self, splats: Splats2D, rows: GaussianRows, camera: Camera) -> list[Any]:
+        """The columns of all features, in order."""
+        return [column for feature in self.features for column in feature(splats, rows, camera)]
+
+
+@dataclass(frozen=True)
+class Frame:
+    """A rendered frame: its planes, and what the adjoint and the tangent replay."""
+
+    pipeline: Pipeline
+    camera: Camera
+    order: Any  # the pipeline's, for this camera
+    bins: TileBins
+    records: Records
+    layers: Layers
+
+    def planes(self) -> list[Any]:
+        """Transmittance, then the pipeline's features, each Float (H * W,), unevaluated."""
+        return self.layers.planes()
+
+
+@dataclass(frozen=True)
+class GaussianGradients:
+    """Derivatives of the loss, shaped like the parameters, and what densification needs."""
+
+    parameters: Gaussians
+    means2d: Any  # Array2f (N,): loss per px
+    visible: Any  # Bool (N,): the Gaussian's extent touches the film
+    first_fault: Any  # UInt32 (1,): of ``parameters``, see :func:`decode_fault`
+    camera: list[Any] | None = None  # Float (1,): of ``camera.numbers()``, where asked for
+
+
+def render(gaussians: Gaussians, camera: Camera, pipeline: Pipeline) -> Frame:
+    """Render ``gaussians`` as seen by ``camera``. Parameters may be attached; they are detached.
+
+    An aperture and a smoothing filter must have been composed into the pipeline: see
+    :func:`drgs.effects.compose.composed`. The host reads one value, the number of (splat, tile)
+    entries.
+    """
+    rows = load_rows(gaussians, pipeline.sh_degree)
+    splats = pipeline.project(rows, camera)
+    columns = pipeline.feature_columns(splats, rows, camera)
+    model = pipeline.model.seen_by(camera)
+    grid = TileGrid(camera.width, camera.height)
+    order = pipeline.order.seen_by(camera)
+    bins = bin_splats(splats, grid, columns, model, order.keys(splats))
+    records = Records.of(bins, bins.splats)
+    layers = order.composite(bins, records)
+    return Frame(pipeline, camera, order, bins, records, layers)
+
+
+def render_again(frame: Frame, model: ImageModel) -> Frame:
+    """The same splats, in the same tiles, with another image model.
+
+    model: that of the frame's pipeline, but for points of the pixels within the same margin, or
+    for features that are composited of the same stored numbers.
+    """
+    bins = replace(frame.bins, model=model.seen_by(frame.camera))
+    return replace(frame, bins=bins, layers=frame.order.composite(bins, frame.records))
+
+
+def render_adjoint(
+    gaussians: Gaussians, frame: Frame, d_features: list[Any], d_transmittance: Any
+) -> GaussianGradients:
+    """Derivatives of a loss with respect to all parameters.
+
+    gaussians: those that ``frame`` was rendered from; d_features: derivative of the loss with
+    respect to each feature plane, Float (H * W,); d_transmittance: the same for T.
+
+    Not differentiated: visibility, the order of the splats, the decisions of compositing.
+    """
+    gradients = frame.order.adjoint(
+        frame.bins, frame.records, frame.layers, d_features, d_transmittance
+    )
+    return _gaussian_gradients(gaussians, frame, gradients)
+
+
+def frames_adjoint(
+    gaussians: Gaussians,
+    frames: list[Frame],
+    d_planes: list[list[Any]],
+    of_camera: bool = False,
+) -> GaussianGradients:
+    """The same for a loss that depends on several frames of the same splats: of one camera.
+
+    d_planes: of each frame, derivatives with respect to its planes; of_camera: whether those with
+    respect to the camera are asked for.
+    """
+    total = None
+    for frame, (d_transmittance, *d_features) in zip(frames, d_planes, strict=True):
+        gradients = frame.order.adjoint(
+            frame.bins, frame.records, frame.layers, d_features, d_transmittance
+        )
+        total = gradients if total is None else _sum(total, gradients)
+        if len(frames) > 1:
+            dr.eval(total)
+    return _gaussian_gradients(gaussians, frames[0], total, of_camera)
+
+
+def _sum(a: SplatGradients, b: SplatGradients) -> SplatGradients:
+    return SplatGradients(
+        geometry=[x + y for x, y in zip(a.geometry, b.geometry, strict=True)],
+        features=[x + y for x, y in zip(a.features, b.features, strict=True)],
+    )
+
+
+def _gaussian_gradients(
+    gaussians: Gaussians, frame: Frame, gradients: SplatGradients, of_camera: bool = False
+) -> GaussianGradients:
+    """From the derivatives of the 2D splats to those of the parameters, by Dr.Jit."""
+    rows = load_rows(gaussians, frame.pipeline.sh_degree)
+    camera, numbers = frame.camera, []
+    if of_camera:
+        frame.pipeline.model.check_differentiable_in_camera()
+        camera = camera.by_lane(dr.width(rows.logit_opacities))
+        numbers = camera.numbers()
+    with dr.resume_grad():
+        dr.enable_grad(replace(rows, smoothing=None), numbers)
+        splats = frame.pipeline.project(rows, camera)
+        outputs = _differentiable(frame, splats, rows, camera)
+        cotangents = gradients.geometry + gradients.features
+        for output, cotangent in zip(outputs, cotangents, strict=True):
+            dr.accum_grad(output, cotangent)
+        dr.enqueue(dr.ADMode.Backward, outputs)
+        dr.traverse(dr.ADMode.Backward)
+        d_rows = dr.grad(replace(rows, smoothing=None))
+        visible = dr.detach(splats.visible)
+        d_numbers = [dr.grad(number) for number in numbers]
+    parameters, first_fault = _as_tensors(d_rows, gaussians, visible)
+    return GaussianGradients(
+        parameters=parameters,
+        means2d=gradients.means2d,
+        visible=_on_film(frame.bins),
+        first_fault=first_fault,
+        camera=_sums(d_numbers, visible) if of_camera else None,
+    )
+
+
+def _sums(columns: list[Any], visible: Any) -> list[Any]:
+    """Over the Gaussians that are visible, in an order that is the same in every run."""
+    columns = [dr.select(visible, column, 0) for column in columns]
+    dr.eval(columns)
+    return [dr.sum(column) for column in columns]
+
+
+def added(a: GaussianGradients, b: GaussianGradients) -> GaussianGradients:
+    """Of a loss that depends on what several cameras see."""
+    parameters = {
+        name: getattr(a.parameters, name) + getattr(b.parameters, name) for name in PARAMETER_NAMES
+    }
+    if a.parameters.features:
+        others = b.parameters.features
+        parameters["features"] = {k: v + others[k] for k, v in a.parameters.features.items()}
+    total = GaussianGradients(
+        parameters=Gaussians(**parameters),
+        means2d=a.means2d + b.means2d,
+        visible=a.visible | b.visible,
+        first_fault=dr.select(a.first_fault < b.first_fault, a.first_fault, b.first_fault),
+        # Their cameras are not the same: each has derivatives of its own.
+    )
+    dr.eval(total)
+    return total
+
+
+def decode_fault(fault: int) -> tuple[int, str] | None:
+    """The row and the parameter of :attr:`GaussianGradients.first_fault`; None if there is none.
+
+    A row's gradient of a parameter is at fault if its squared norm is not finite: it is NaN or
+    infinite, or Adam's second moment, which holds squares, would be.
+    """
+    if fault == _NO_FAULT:
+        return None
+    row, parameter = divmod(fault, len(PARAMETER_NAMES))
+    return row, PARAMETER_NAMES[parameter]
+
+
+_NO_FAULT = 2**32 - 1
+
+
+def render_tangent(gaussians: Gaussians, frame: Frame, tangents: Gaussians) -> list[Any]:
+    """Directional derivatives of ``frame.planes()`` along ``tangents`` of the parameters.
+
+    Not differentiated: visibility, the order of the splats, the decisions of compositing.
+    """
+    direction = _splat_tangents(gaussians, frame, tangents)
+    order = frame.order
+    return order.tangent(frame.bins, frame.records, frame.layers, direction).planes()
+
+
+def frames_tangent(
+    gaussians: Gaussians,
+    frames: list[Frame],
+    tangents: Gaussians,
+    camera_tangents: list[Any] | None = None,
+) -> list[list[Any]]:
+    """The same for the planes of several frames of the same splats.
+
+    camera_tangents: of ``camera.numbers()``; None: the camera stays.
+    """
+    direction = _splat_tangents(gaussians, frames[0], tangents, camera_tangents)
+    return [f.order.tangent(f.bins, f.records, f.layers, direction).planes() for f in frames]
+
+
+def _splat_tangents(
+    gaussians: Gaussians,
+    frame: Frame,
+    tangents: Gaussians,
+    camera_tangents: list[Any] | None = None,
+) -> SplatGradients:
+    """From a direction of the parameters to that of the 2D splats, by Dr.Jit."""
+    rows = load_rows(gaussians, frame.pipeline.sh_degree)
+    camera, numbers = frame.camera, []
+    if camera_tangents is not None:
+        frame.pipeline.model.check_differentiable_in_camera()
+        camera = camera.by_lane(dr.width(rows.logit_opacities))
+        numbers = camera.numbers()
+    with dr.resume_grad():
+        dr.enable_grad(replace(rows, smoothing=None), numbers)
+        splats = frame.pipeline.project(rows, camera)
+        d_rows = load_rows(tangents, frame.pipeline.sh_degree)
+        dr.set_grad(replace(rows, smoothing=None), replace(d_rows, smoothing=None))
+        for number, tangent in zip(numbers, camera_tangents or [], strict=True):
+            dr.set_grad(number, tangent)
+        outputs = _differentiable(frame, splats, rows, camera)
+        # Some outputs (depths, p of the whitening) are inputs of others: the default would clear
+        # the derivatives of such interior variables on the way.
+        dr.forward_to(outputs, flags=dr.ADFlag.ClearEdges)
+        columns = [dr.grad(output) for output in outputs]
+    dr.eval(columns)
+    count = frame.bins.model.response.num_geometry
+    return SplatGradients(geometry=columns[:count], features=columns[count:])
+
+
+def _differentiable(
+    frame: Frame, splats: Splats2D, rows: GaussianRows, camera: Camera
+) -> list[Any]:
+    """What compositing reads of the splats, in the order of :class:`SplatGradients`."""
+    features = frame.pipeline.feature_columns(splats, rows, camera)
+    return frame.bins.model.response.differentiable(splats) + features
+
+
+def _as_tensors(d_rows: GaussianRows, gaussians: Gaussians, visible: Any) -> tuple[Gaussians, Any]:
+    """Per-lane derivatives as tensors shaped like the parameters, and their first fault, evaluated.
+
+    Rows that are not visible have zero gradient, also where their values are not finite; so have
+    SH coefficients above the pipeline's degree.
+    """
+    t = types_of(type(d_rows.logit_opacities))
+    higher = [component for vector in d_rows.sh[1:] for component in vector]
+    missing = 3 * gaussians.shN.shape[1] - len(higher)
+
+    def tensor(columns: list[Any], like: Any) -> Any:
+        if not columns:
+            return dr.zeros(t.TensorXf, like.shape)
+        columns = [dr.select(visible, column, t.Float(0)) for column in columns]
+        return t.TensorXf(interleave(columns), like.shape)
+
+    features = gaussians.features and {
+        name: tensor(d_rows.features[name], like) for name, like in gaussians.features.items()
+    }
+    gradients = Gaussians(
+        features=features,
+        means=tensor(list(d_rows.means), gaussians.means),
+        quats=tensor(list(d_rows.quats), gaussians.quats),
+        log_scales=tensor(list(d_rows.log_scales), gaussians.log_scales),
+        logit_opacities=dr.select(visible, d_rows.logit_opacities, 0),
+        sh0=tensor(list(d_rows.sh[0]), gaussians.sh0),
+        shN=tensor(higher + [t.Float(0)] * missing, gaussians.shN),
+    )
+    faults = dr.select(visible, _faults(d_rows), _NO_FAULT)
+    dr.eval(gradients, faults)
+    return gradients, dr.min(faults)
+
+
+def _faults(d_rows: GaussianRows) -> Any:
+    """UInt32 (N,): row * 6 + number of the first parameter at fault there, or ``_NO_FAULT``."""
+    UInt32 = types_of(type(d_rows.logit_opacities)).UInt32
+    row = dr.arange(UInt32, dr.width(d_rows.logit_opacities))
+    higher = [component for vector in d_rows.sh[1:] for component in vector]
+    columns = {
+        "means": d_rows.means,
+        "quats": d_rows.quats,
+        "log_scales": d_rows.log_scales,
+        "logit_opacities": [d_rows.logit_opacities],
+        "sh0": d_rows.sh[0],
+        "shN": higher,
+    }
+    faults = UInt32(_NO_FAULT)
+    for number, name in reversed(list(enumerate(PARAMETER_NAMES))):
+        squared_norm = sum(dr.square(component) for component in columns[name])
+        # Written such that NaN is a fault.
+        faults = dr.select(squared_norm < dr.inf, faults, row * len(PARAMETER_NAMES) + number)
+    return faults
+
+
+def _on_film(bins: TileBins) -> Any:
+    """Bool per Gaussian: it has entries."""
+    t = types_of(type(bins.rows))
+    rank = dr.arange(t.UInt32, dr.width(bins.order))
+    first, end = (dr.gather(t.UInt32, bins.first_entry, rank + k) for k in (0, 1))
+    visible = dr.empty(t.Bool, dr.width(bins.order))
+    dr.scatter(visible, first < end, bins.order)
+    return visible

@@ -1,0 +1,329 @@
+"""Integer binning: which splats touch which tile, front to back.
+
+The second stage: ``Splats2D`` -> ``TileBins``. The film is cut into tiles of 16x16 pixels, each a
+4x4 grid of micro-tiles of 4x4 pixels. Every (splat, tile) pair of a splat's bounding box is one
+*entry*; an entry carries 16 bits that say which micro-tiles its ellipse touches. All steps are
+flat: no lane loops over a splat's tiles, so a giant splat does not hold up its neighbours, and the
+only value that the host reads is the number of entries.
+
+1. Store each splat's numbers as a row and count the tiles of its bounding box.
+2. Sort the splats by depth; a prefix sum gives each one its run of entries.
+3. For each entry: its tile, and the exact ellipse-against-rectangle test of its micro-tiles.
+4. Stable sort of the entries by tile; within a tile they stay front to back.
+5. Transpose the bits: for each group of 32 entries and each micro-tile one 32-bit word, so that
+   compositing finds a micro-tile's next splat by counting trailing zeros.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+
+from drgs.core.arrays import interleave, load_row, pack_rows, types_of
+from drgs.core.constants import CULL_MARGIN, CULL_MARGIN_PER_PX
+from drgs.splatting.image_model import DEFAULT, MICRO, ImageModel
+from drgs.splatting.projection import Splats2D
+
+BOX = 4
+"""Numbers of a splat's box of tiles: first column, first row, columns, number of tiles."""
+
+GRID = 4
+"""Micro-tiles on a tile's side."""
+
+TILE = MICRO * GRID
+"""Pixels on a tile's side."""
+
+MICROS = GRID * GRID
+"""Micro-tiles in a tile: the bits of an entry's mask."""
+
+WORD = 32
+"""Entries in a word of the transposed masks."""
+
+
+@dataclass(frozen=True)
+class TileGrid:
+    """The tiles of a film of ``width`` x ``height`` px, in rows from the upper left corner."""
+
+    width: int
+    height: int
+
+    @property
+    def columns(self) -> int:
+        """Tiles in a row."""
+        return -(-self.width // TILE)
+
+    @property
+    def rows(self) -> int:
+        """Tiles in a column."""
+        return -(-self.height // TILE)
+
+    @property
+    def num_tiles(self) -> int:
+        """Tiles on the film."""
+        return self.columns * self.rows
+
+    @property
+    def cull_margin(self) -> float:
+        """What rounding may take from an exponent (base 2) on this film."""
+        return CULL_MARGIN + CULL_MARGIN_PER_PX * max(self.width, self.height)
+
+
+@dataclass(frozen=True)
+class TileBins:
+    """Entries sorted by tile, then by depth.
+
+    N splats in depth order are *ranks*; M entries in the order in which they are made, run by
+    run, are *unsorted*; in the order of the tiles they are *sorted*. Sorted arrays are padded
+    to a multiple of 32 with entries that touch nothing.
+    """
+
+    order: Any  # UInt32 (N,): rank -> index of the Gaussian
+    rows: Any  # Float (N * packets * 4,): by rank: box of tiles, geometry, features, keys
+    num_features: int
+    num_keys: int
+    first_entry: Any  # UInt32 (N + 1,): rank -> first of its run of unsorted entries
+    source: Any  # UInt32 (M padded,): sorted -> unsorted
+    ranks: Any  # UInt32 (M padded,): sorted -> rank
+    tiles: Any  # UInt32 (M padded,): sorted -> tile
+    masks: Any  # UInt32 (M padded,): sorted -> bit per micro-tile that the splat touches
+    words: Any  # UInt32 (M padded / 32 * 16,): (group of 32, micro-tile) -> bit per entry
+    tile_start: Any  # UInt32 (tiles + 1,): tile -> first sorted entry
+    num_entries: int  # M
+    grid: TileGrid
+    model: ImageModel
+
+    def splats(self, rank: Any) -> list[Any]:
+        """Geometry, features and keys of a splat."""
+        width = BOX + self.model.response.num_geometry + self.num_features + self.num_keys
+        return load_row(self.rows, width, rank, start=BOX)
+
+
+def bin_splats(
+    splats: Splats2D,
+    grid: TileGrid,
+    features: Sequence[Any] = (),
+    model: ImageModel = DEFAULT,
+    keys: Sequence[Any] = (),
+) -> TileBins:
+    """Distribute the visible ``splats`` over the tiles of ``grid``, front to back.
+
+    features: columns, one value per Gaussian, that compositing will read beside the geometry;
+    keys: more of them, that it will not composite. Neither they nor the splats need to be
+    evaluated: the kernel that computes them stores rows.
+
+    Not differentiated: integer work. The host reads one value, the number of entries.
+    """
+    t = types_of(type(splats.depths))
+    stored = [*features, *keys]
+    width = BOX + model.response.num_geometry + len(stored)
+    rows, depths = _store_rows(splats, grid, stored, model)
+    # A stable sort: equal depths stay in the order of the Gaussians.
+    order = dr.argsort(depths)
+    # A kernel of its own: loads that wait for memory, and for no arithmetic, wait together.
+    numbers = load_row(rows, width, order)
+    rows, counts = pack_rows(numbers), t.UInt32(numbers[BOX - 1])
+    dr.eval(rows, counts)
+    num_splats = dr.width(order)
+    rank = dr.arange(t.UInt32, num_splats + 1)
+    counts = dr.gather(t.UInt32, counts, rank, rank < dr.opaque(t.UInt32, num_splats))
+    first_entry = dr.prefix_sum(counts)
+    num_entries = int(first_entry[num_splats])
+
+    tile, entries = _make_entries(first_entry, rows, width, num_entries, grid, model)
+    source = stable_order(tile, grid.num_tiles)
+
+    padded = -(-max(num_entries, 1) // WORD) * WORD
+    position = dr.arange(t.UInt32, padded)
+    active = position < dr.opaque(t.UInt32, num_entries)
+    source = dr.gather(t.UInt32, source, position, active)
+    ranks, tiles, masks, _ = dr.gather(t.Array4u, entries, source, active)
+    dr.eval(source, ranks, tiles, masks)
+    words = transpose_masks(masks)
+    tile_start = lower_bounds(tiles, num_entries, grid.num_tiles)
+    dr.eval(words, tile_start)
+    return TileBins(
+        order=order,
+        rows=rows,
+        num_features=len(features),
+        num_keys=len(keys),
+        first_entry=first_entry,
+        source=source,
+        ranks=ranks,
+        tiles=tiles,
+        masks=masks,
+        words=words,
+        tile_start=tile_start,
+        num_entries=num_entries,
+        grid=grid,
+        model=model,
+    )
+
+
+def _store_rows(
+    splats: Splats2D, grid: TileGrid, stored: Sequence[Any], model: ImageModel
+) -> tuple[Any, Any]:
+    """By Gaussian, evaluated at once: rows of all numbers, and depths to sort by."""
+    geometry = model.response.geometry(splats)
+    rows = pack_rows([*_tile_box(splats, geometry, grid, model), *geometry, *stored])
+    depths = dr.select(splats.visible, splats.depths, dr.inf)
+    dr.eval(rows, depths)
+    return rows, depths
+
+
+def _reach(geometry: list[Any], grid: TileGrid, model: ImageModel) -> Any:
+    """What |U d|^2 may be (base 2) where a splat ends, and a margin for rounding.
+
+    For the default cut-offs, sqrt(2 ln(opacity / alpha_cut)) standard deviations: the
+    opacity-aware radius, instead of 3.
+    """
+    t = types_of(type(geometry[0]))
+    floor = model.response.log2_floor(geometry, model.cutoffs)
+    return geometry[5] - floor + dr.opaque(t.Float, grid.cull_margin)
+
+
+def _tile_box(
+    splats: Splats2D, geometry: list[Any], grid: TileGrid, model: ImageModel
+) -> list[Any]:
+    """First column and row, columns, and number of tiles: whole numbers, exact up to 2^24."""
+    t = types_of(type(splats.depths))
+    center, radius = model.response.bounds(splats, geometry, _reach(geometry, grid, model))
+    radius = radius + model.positions.margin
+    size = t.Array2f(dr.opaque(t.Float, grid.width), dr.opaque(t.Float, grid.height))
+    # The first and last pixel whose centre lies within the radius, clamped to the film while
+    # still in floating point: a splat may be arbitrarily far away.
+    first = dr.ceil(center - radius - 0.5)
+    last = dr.floor(center + radius - 0.5)
+    first = dr.select(first < 0, 0, first)
+    last = dr.select(last > size - 1, size - 1, last)
+    visible = splats.visible & (first.x <= last.x) & (first.y <= last.y)
+
+    Pixel = dr.uint32_array_t(type(first))
+    first_tile = Pixel(dr.select(visible, first, 0)) // TILE
+    last_tile = Pixel(dr.select(visible, last, 0)) // TILE
+    extent = last_tile - first_tile + 1
+    count = dr.select(visible, extent.x * extent.y, 0)
+    return [t.Float(number) for number in (*first_tile, extent.x, count)]
+
+
+def _make_entries(
+    first_entry: Any, rows: Any, width: int, num_entries: int, grid: TileGrid, model: ImageModel
+) -> tuple[Any, Any]:
+    """Of each entry its tile; and four numbers: rank, tile, mask of micro-tiles, 0."""
+    t = types_of(type(rows))
+    # Rank of each entry: write each rank at the start of its run, then a running maximum.
+    rank = dr.arange(t.UInt32, dr.width(first_entry) - 1)
+    start, end = dr.gather(t.UInt32, first_entry, rank), dr.gather(t.UInt32, first_entry, rank + 1)
+    starts = dr.zeros(t.UInt32, max(num_entries, 1))
+    dr.scatter(starts, rank, start, start < end)
+    rank = dr.prefix_reduce(dr.ReduceOp.Max, starts, exclusive=False)
+
+    numbers = load_row(rows, width, rank, end=BOX + model.response.num_geometry)
+    tile_x, tile_y, columns = (t.UInt32(number) for number in numbers[: BOX - 1])
+    local = dr.arange(t.UInt32, max(num_entries, 1)) - dr.gather(t.UInt32, first_entry, rank)
+    # Exact while a splat covers fewer than 2^22 tiles; an integer division by a varying number
+    # has no vector instruction.
+    row = t.UInt32((t.Float(local) + 0.5) / t.Float(columns))
+    tile_x = tile_x + (local - row * columns)
+    tile_y = tile_y + row
+    tile = dr.fma(tile_y, dr.opaque(t.UInt32, grid.columns), tile_x)
+    mask = _touched_micros(numbers[BOX:], tile_x, tile_y, grid, model)
+    entries = interleave([rank, tile, mask, dr.zeros(t.UInt32, dr.width(tile))])
+    dr.eval(tile, entries)
+    return tile, entries
+
+
+def stable_order(keys: Any, bound: int) -> Any:
+    """The stable order of ``keys``, all below ``bound``: one pass with a bucket for each key.
+
+    ``dr.argsort`` does not know the bound and needs three passes for 32 bits.
+    """
+    buckets = 1 << (bound - 1).bit_length()
+    return dr.detail.block_mkperm(keys, dr.width(keys), max(buckets, 2))
+
+
+def _touched_micros(
+    geometry: list[Any], tile_x: Any, tile_y: Any, grid: TileGrid, model: ImageModel
+) -> Any:
+    """Bit m is set where the ellipse alpha >= cut reaches a pixel centre of micro-tile m.
+
+    |U d|^2 is convex, so its minimum over a rectangle that does not contain the mean lies on
+    one of the (at most two) sides that face the mean: for such a side, one coordinate is given
+    and the best other coordinate is clamped to the rectangle.
+    """
+    reach = _reach(geometry, grid, model)
+    mean_x, mean_y, p, r, s = model.response.outline(geometry, reach)
+    t = types_of(type(mean_x))
+    margin = model.positions.margin
+    dx_per_dy = -r / p
+    dy_per_dx = -(p * r) / dr.fma(r, r, s * s)
+
+    def intervals(tile: Any, mean: Any) -> list[tuple[Any, Any]]:
+        first = dr.fma(t.Float(tile), TILE, 0.5 - margin) - mean
+        size = MICRO - 1 + 2 * margin
+        return [(first + MICRO * k, first + (MICRO * k + size)) for k in range(GRID)]
+
+    def exponent(dx: Any, dy: Any) -> Any:
+        u = dr.fma(p, dx, r * dy)
+        v = s * dy
+        return dr.fma(u, u, v * v)
+
+    columns, rows = intervals(tile_x, mean_x), intervals(tile_y, mean_y)
+    nearest_dx = [_clamp(t.Float(0), lo, hi) for lo, hi in columns]
+    nearest_dy = [_clamp(t.Float(0), lo, hi) for lo, hi in rows]
+    mask = t.UInt32(0)
+    for j, (y_range, dy) in enumerate(zip(rows, nearest_dy, strict=True)):
+        for i, (x_range, dx) in enumerate(zip(columns, nearest_dx, strict=True)):
+            facing_x = exponent(dx, _clamp(dy_per_dx * dx, *y_range))
+            facing_y = exponent(_clamp(dx_per_dy * dy, *x_range), dy)
+            touched = (facing_x <= reach) | (facing_y <= reach)
+            mask |= dr.select(touched, t.UInt32(1 << (j * GRID + i)), 0)
+    return mask
+
+
+def _clamp(x: Any, lo: Any, hi: Any) -> Any:
+    """Unlike dr.clip this maps to two vector instructions; a NaN becomes ``lo`` or stays NaN."""
+    x = dr.select(x < lo, lo, x)
+    return dr.select(x > hi, hi, x)
+
+
+def transpose_masks(masks: Any) -> Any:
+    """From 16 bits per entry to 32 bits per (group of 32 entries, micro-tile).
+
+    Two 16x16 bit matrices side by side in each word, transposed by exchanging ever smaller
+    blocks (Warren, "Hacker's Delight", 2nd ed., section 7-3).
+    """
+    UInt32 = type(masks)
+    Array4u = types_of(UInt32).Array4u
+    group = dr.arange(UInt32, dr.width(masks) // WORD)
+    packets = WORD // 4
+    m = [v for k in range(packets) for v in dr.gather(Array4u, masks, group * packets + k)]
+    m = [m[k] | (m[k + MICROS] << MICROS) for k in range(MICROS)]
+    for step, keep in ((8, 0x00FF00FF), (4, 0x0F0F0F0F), (2, 0x33333333), (1, 0x55555555)):
+        for k in range(MICROS):
+            if not k & step:
+                swap = ((m[k] >> step) ^ m[k + step]) & keep
+                m[k + step] ^= swap
+                m[k] ^= swap << step
+    return interleave(m)
+
+
+def lower_bounds(sorted_tiles: Any, num_entries: int, num_tiles: int) -> Any:
+    """(num_tiles + 1,): the first sorted position whose tile is not smaller; binary search."""
+    UInt32 = type(sorted_tiles)
+    tile = dr.arange(UInt32, num_tiles + 1)
+
+    def body(first: Any, last: Any) -> tuple[Any, Any]:
+        middle = (first + last) >> 1
+        smaller = dr.gather(UInt32, sorted_tiles, middle) < tile
+        return dr.select(smaller, middle + 1, first), dr.select(smaller, last, middle)
+
+    first, _ = dr.while_loop(
+        state=(dr.zeros(UInt32, num_tiles + 1), dr.opaque(UInt32, num_entries, num_tiles + 1)),
+        cond=lambda first, last: first < last,
+        body=body,
+        labels=("first", "last"),
+    )
+    return first

@@ -1,0 +1,329 @@
+"""A fit for a given time: what to choose, how many iterations, and when to end.
+
+``python -m drgs.bench training`` measures quality over time on the shipped scene: one curve for
+each :class:`Strategy`, some points on it for numbers of iterations. A point's time is counted in
+iterations as they are at the start of a fit, with full pictures and the first Gaussians. A few
+iterations of a fit that is to be planned, timed where it will run, turn these into seconds. What is
+planned is the strategy whose curve is highest where the time is up.
+
+Curves of another scene predict a time to some ten or twenty per cent, and machines vary. So the
+clock has the last word (:class:`Deadline`): it revises the plan, but only what is ahead, and ends
+the fit. A configuration that says what was done gives the same bytes without a clock.
+"""
+
+from __future__ import annotations
+
+import csv
+import math
+import re
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from pathlib import Path
+
+from drgs.config.changes import changed, with_iterations
+from drgs.config.schema import FitConfig
+from drgs.core.errors import UserError
+from drgs.data.types import Dataset
+from drgs.gaussians.parameters import Gaussians
+from drgs.training.trainer import Trainer
+
+CURVES = Path(__file__).parent / "training_curves.csv"
+"""What ``drgs.bench training`` wrote."""
+
+MIN_ITERATIONS = 200
+"""Fewer fit nothing."""
+
+MIN_SIDE = 32
+"""px: pictures of coarse stages are not smaller than SSIM's windows need."""
+
+REHEARSAL_VIEWS = 8
+
+REVISED_EVERY = 0.1
+"""Of the time."""
+
+LONGEST = 7 * 24 * 3600.0
+"""Seconds."""
+
+WARM_UP, TIMED = 6, 20
+"""Iterations: the first compile kernels and fill the allocator's pools."""
+
+
+# ----------------------------------------------------------------------------------------------
+# What can be chosen
+# ----------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Strategy:
+    """What a plan chooses besides the number of iterations."""
+
+    name: str  # of its curve
+    coarse: tuple[tuple[float, int], ...] = ()  # (end, in shares of all iterations; factor)
+    growth: float | None = None  # most Gaussians, in parts of those at the start; None: as it is
+
+    def applied(self, config: FitConfig, num_points: int) -> FitConfig:
+        """``config`` with this strategy; num_points: Gaussians at the start."""
+        n, most = config.iterations, config.densify.max_gaussians
+        if self.growth is not None:
+            most = min(most, max(num_points, round(self.growth * num_points)))
+        stages = [
+            {"until": max(k + 1, round(share * n)), "factor": factor}
+            for k, (share, factor) in enumerate(self.coarse)
+        ]
+        return changed(config, {"coarse": stages, "densify.max_gaussians": most})
+
+
+STRATEGIES = (
+    Strategy("as shipped"),
+    Strategy("half size for the first quarter", coarse=((0.25, 2),)),
+    Strategy("half size for the first half", coarse=((0.5, 2),)),
+    Strategy("quarter, then half size, for the first half", coarse=((0.2, 4), (0.5, 2))),
+    Strategy("never more Gaussians than at the start", growth=1),
+    Strategy("at most a third more Gaussians than at the start", growth=4 / 3),
+)
+
+
+# ----------------------------------------------------------------------------------------------
+# Curves
+# ----------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Curve:
+    """Measured points of one strategy, by ascending number of iterations.
+
+    Between them, and beyond, time is a power of the number of iterations, and PSNR grows with its
+    logarithm.
+    """
+
+    iterations: tuple[int, ...]
+    time: tuple[float, ...]  # in iterations as they are at the start
+    psnr: tuple[float, ...]  # dB, test views of the shipped scene
+
+    def iterations_in(self, time: float) -> int:
+        """How many iterations ``time`` is enough for."""
+        log_n = _interpolated(math.log(time), _logs(self.time), _logs(self.iterations))
+        return math.floor(math.exp(log_n) + 1e-9)
+
+    def time_of(self, iterations: int) -> float:
+        """What so many iterations take."""
+        log_n = math.log(iterations)
+        return math.exp(_interpolated(log_n, _logs(self.iterations), _logs(self.time)))
+
+    def psnr_at(self, iterations: int) -> float:
+        """What so many iterations reach on the shipped scene."""
+        return _interpolated(math.log(iterations), _logs(self.iterations), self.psnr)
+
+
+def _logs(values: Sequence[float]) -> list[float]:
+    return [math.log(value) for value in values]
+
+
+def _interpolated(x: float, xs: Sequence[float], ys: Sequence[float]) -> float:
+    """Piecewise linear; beyond the ends like the last piece."""
+    pieces = list(pairwise(zip(xs, ys, strict=True)))
+    (x0, y0), (x1, y1) = next((piece for piece in pieces if x <= piece[1][0]), pieces[-1])
+    return y0 + (x - x0) / (x1 - x0) * (y1 - y0)
+
+
+def load_curves(path: Path = CURVES) -> dict[str, Curve]:
+    """The curves of all strategies, by name."""
+    with path.open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    curves = {}
+    for name in (strategy.name for strategy in STRATEGIES):
+        points = sorted(
+            (int(r["iterations"]), float(r["wall_s"]) / float(r["start_s"]), float(r["psnr"]))
+            for r in rows
+            if r["choice"] == name
+        )
+        if len(points) > 1:
+            curves[name] = Curve(*zip(*points, strict=True))
+    return curves
+
+
+# ----------------------------------------------------------------------------------------------
+# Plans
+# ----------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A strategy, and what a given time is enough for."""
+
+    strategy: Strategy
+    iterations: int
+    psnr: float  # dB, on the shipped scene
+
+
+@dataclass(frozen=True)
+class Plan:
+    """A resolved configuration, and where it comes from."""
+
+    config: FitConfig
+    chosen: Candidate
+    candidates: tuple[Candidate, ...]
+    seconds: float  # for the iterations
+    start_s: float  # of an iteration at the start
+    curve: Curve  # of what was chosen
+
+    @property
+    def reasons(self) -> str:
+        """What was chosen and why, as text."""
+        most = f"at most {self.config.densify.max_gaussians:,} Gaussians"
+        stages = [f"1/{s.factor} size until iteration {s.until:,}" for s in self.config.coarse]
+        lines = [
+            f"An iteration takes {1e3 * self.start_s:.0f} ms at the start here.",
+            f"By the curves of the shipped scene, {self.seconds:.0f} s are enough for",
+            *(
+                f"  {c.iterations:7,} iterations, {c.psnr:.2f} dB there: {c.strategy.name}"
+                + (" (chosen)" if c == self.chosen else "")
+                for c in self.candidates
+            ),
+            f"Planned: {self.config.iterations:,} iterations; "
+            f"{', '.join([*stages, 'then full size']) if stages else 'full size'}; {most}; the "
+            f"population changes until iteration {self.config.densify.stop:,}.",
+        ]
+        return "\n".join(lines)
+
+
+def make_plan(
+    config: FitConfig,
+    num_points: int,
+    side: int,
+    seconds: float,
+    start_s: float,
+    curves: Mapping[str, Curve],
+) -> Plan:
+    """The best plan for ``seconds`` of iterations, of which one takes ``start_s`` at the start.
+
+    num_points: Gaussians at the start. side: px, the shortest of the training pictures.
+
+    Raises :class:`UserError` if the time is too short for anything.
+    """
+    candidates = []
+    for strategy in STRATEGIES:
+        smallest = side / max((factor for _, factor in strategy.coarse), default=1)
+        if strategy.name in curves and (smallest >= MIN_SIDE or not strategy.coarse):
+            curve = curves[strategy.name]
+            iterations = curve.iterations_in(seconds / start_s) if seconds > 0 else 0
+            if iterations >= MIN_ITERATIONS:
+                candidates.append(Candidate(strategy, iterations, curve.psnr_at(iterations)))
+    if not candidates:
+        raise UserError(
+            f"--budget: must leave time for {MIN_ITERATIONS} iterations, got "
+            f"{max(seconds, 0):.0f} s where an iteration takes {1e3 * start_s:.0f} ms; give more "
+            "time, or smaller pictures (--set data.image_size=...)"
+        )
+    chosen = max(candidates, key=lambda candidate: candidate.psnr)
+    planned = with_iterations(changed(config, {"coarse": []}), chosen.iterations)
+    planned = chosen.strategy.applied(planned, num_points)
+    curve = curves[chosen.strategy.name]
+    return Plan(planned, chosen, tuple(candidates), seconds, start_s, curve)
+
+
+@dataclass(frozen=True)
+class Rehearsal:
+    """The beginning of a fit, to be thrown away."""
+
+    trainer: Trainer
+    iteration_s: float  # of an iteration: full pictures, the first Gaussians
+
+
+def rehearse(config: FitConfig, dataset: Dataset, gaussians: Gaussians) -> Rehearsal:
+    """Time a few iterations on a few of the views."""
+    views = dataset.train[:: max(1, len(dataset.train) // REHEARSAL_VIEWS)]
+    few = replace(dataset, train=views[:REHEARSAL_VIEWS])
+    never = config.iterations + WARM_UP + TIMED
+    trainer = Trainer(
+        changed(config, {"coarse": [], "densify.start": never, "densify.stop": never + 1}),
+        few,
+        gaussians,
+    )
+    for count in (WARM_UP, TIMED):
+        start = time.perf_counter()
+        for _ in range(count):
+            report = trainer.step()
+        _ = report.loss  # waits for the device
+    return Rehearsal(trainer, (time.perf_counter() - start) / TIMED)
+
+
+# ----------------------------------------------------------------------------------------------
+# The end of a fit
+# ----------------------------------------------------------------------------------------------
+
+
+class AllIterations:
+    """A fit ends when the iterations of its configuration are done."""
+
+    def goes_on(self, trainer: Trainer) -> bool:
+        """Whether there is another iteration."""
+        return trainer.iteration < trainer.config.iterations
+
+    def total(self, trainer: Trainer) -> int:
+        """Iterations in all."""
+        return trainer.config.iterations
+
+
+class Deadline:
+    """A fit ends when its time is up.
+
+    Ten times on the way, the curve is scaled to the time that the fit has taken so far; that says
+    where it will end, and where changes of the population are to end, which keep their share of
+    the whole. The trainer's configuration is kept such that it says what was done.
+    """
+
+    def __init__(self, trainer: Trainer, end: float, curve: Curve) -> None:
+        """end: when the last iteration is to end, by ``time.perf_counter``."""
+        self._curve, config = curve, trainer.config
+        self._start, self._end = time.perf_counter(), end
+        self._next = self._start + REVISED_EVERY * (end - self._start)
+        self._densify_share = config.densify.stop / config.iterations
+
+    def goes_on(self, trainer: Trainer) -> bool:
+        """Whether there is time for another iteration; revises the trainer's configuration."""
+        now, done = time.perf_counter(), trainer.iteration
+        if now >= self._end and done > 0:
+            trainer.replan(done, trainer.config.densify.stop)
+            return False
+        if now >= self._next and done > 0:
+            self._next = now + REVISED_EVERY * (self._end - self._start)
+            total = self.total(trainer)
+            trainer.replan(total, self._densify_stop(trainer, total))
+        return True
+
+    def total(self, trainer: Trainer) -> int:
+        """Iterations in all: as planned, later as the curve and the time so far say."""
+        now, done = time.perf_counter(), trainer.iteration
+        if done == 0:
+            return trainer.config.iterations
+        ratio = (self._end - self._start) / max(now - self._start, 1e-9)
+        total = self._curve.iterations_in(self._curve.time_of(done) * max(ratio, 1.0))
+        return max(total, done + 1) if now < self._end else done
+
+    def _densify_stop(self, trainer: Trainer, total: int) -> int:
+        done, config = trainer.iteration, trainer.config.densify
+        if done >= config.stop:
+            return config.stop
+        return max(round(self._densify_share * total), done + 1, config.start + 1)
+
+
+_DURATION = re.compile(
+    r"(?=.)(?:(?P<h>\d+(?:\.\d+)?)h)?(?:(?P<m>\d+(?:\.\d+)?)m)?(?:(?P<s>\d+(?:\.\d+)?)s?)?"
+)
+
+
+def parse_duration(text: str) -> float:
+    """Seconds of ``90``, ``90s``, ``5m``, ``1m30``, ``1h30m``. Raises ValueError for anything else.
+
+    That includes ``1h30``, which would be half a minute.
+    """
+    match = _DURATION.fullmatch(text.strip())
+    parts = match.groupdict(default="0") if match else {"h": "0", "m": "0", "s": "0"}
+    seconds = 3600 * float(parts["h"]) + 60 * float(parts["m"]) + float(parts["s"])
+    unclear = re.search(r"h[\d.]+$", text.strip())
+    if unclear or not 0 < seconds <= LONGEST:
+        raise ValueError(f"must be a time such as 90s, 5m or 1h30m, a week at most, got {text!r}")
+    return seconds

@@ -1,0 +1,261 @@
+"""Adaptive density control: clone, split, prune and the opacity reset.
+
+Section 5 of the 3DGS paper (Kerbl et al. 2023) with the details of its reference implementation,
+except where a docstring says otherwise. Rows are chosen on the host, every hundred iterations or
+so, and moved by ``drgs.training.optimizer`` together with their moments. Equal inputs give equal
+bytes: no atomics, ties are broken by index, and random numbers depend on seed and iteration alone.
+
+``config`` is the section ``densify`` of the configuration; ``scene_extent`` is in world units.
+Iterations are counted from 1.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import numpy as np
+from drjit.opt import Adam
+from scipy.special import expit
+
+from drgs.config.schema import DensifyConfig
+from drgs.core.arrays import from_host, types_of
+from drgs.core.errors import UserError
+from drgs.gaussians.quaternions import quat_to_rotation
+from drgs.training.optimizer import edit_rows, num_rows, replace_values, take_rows
+
+
+@dataclass(frozen=True)
+class DensityStatistics:
+    """What the views since the last change say about each Gaussian."""
+
+    gradient_norms: Any  # (N,) Float, sum over views of |d loss / d mean2d| in NDC units
+    views: Any  # (N,) Float, number of views in which the Gaussian was visible
+
+    @staticmethod
+    def zeros(float_type: type, num_gaussians: int) -> DensityStatistics:
+        """Return the statistics of no views."""
+        zeros = dr.zeros(float_type, num_gaussians)
+        return DensityStatistics(zeros, zeros)
+
+    def mean_gradient_norms(self) -> np.ndarray:
+        """Mean over the views that saw a Gaussian, (N,) float64 on the host; 0 if none did."""
+        sums, views = np.array(self.gradient_norms, float), np.array(self.views, float)
+        return sums / np.maximum(views, 1)
+
+
+@dataclass(frozen=True)
+class DensityReport:
+    """What one call of :func:`densify_and_prune` changed."""
+
+    cloned: int
+    split: int
+    pruned: int  # parents of a split not counted
+    refused: int  # clones and splits for which max_gaussians left no room
+    num_gaussians: int
+
+
+def accumulate(
+    statistics: DensityStatistics, means2d_grad: Any, visible: Any, width: int, height: int
+) -> DensityStatistics:
+    """Return the statistics with one more view.
+
+    means2d_grad: d loss / d mean2d, per pixel: ``Array2f`` or (N, 2) tensor. visible: (N,)
+    ``Bool``. width, height: of that view's film, px. A pixel gradient times (W/2, H/2) is the
+    gradient with respect to normalised device coordinates, the unit of the threshold.
+    """
+    grad_x, grad_y = _columns(means2d_grad)
+    norm = dr.sqrt(dr.square(grad_x * (0.5 * width)) + dr.square(grad_y * (0.5 * height)))
+    updated = DensityStatistics(
+        statistics.gradient_norms + dr.select(visible, norm, 0),
+        statistics.views + dr.select(visible, 1, 0),
+    )
+    dr.eval(updated)
+    return updated
+
+
+def gathers_statistics(config: DensifyConfig, iteration: int) -> bool:
+    """Whether the gradients of this iteration can still lead to a change."""
+    return iteration < config.stop
+
+
+def should_densify(config: DensifyConfig, iteration: int) -> bool:
+    """Whether the population changes after this iteration."""
+    return config.start < iteration < config.stop and iteration % config.every == 0
+
+
+def should_reset(config: DensifyConfig, iteration: int, white_background: bool) -> bool:
+    """Whether opacities are lowered after this iteration: only while densifying.
+
+    White backgrounds get one more: white Gaussians in front of white would otherwise stay.
+    """
+    extra = white_background and iteration == config.white_background_reset
+    return iteration < config.stop and (iteration % config.reset_every == 0 or extra)
+
+
+def prunes_large(config: DensifyConfig, iteration: int) -> bool:
+    """Whether large Gaussians are pruned: once the first regular opacity reset is over."""
+    return iteration > config.reset_every
+
+
+def densify_and_prune(
+    optimizer: Adam,
+    statistics: DensityStatistics,
+    config: DensifyConfig,
+    scene_extent: float,
+    iteration: int,
+    seed: int,
+    prefix: str = "",
+) -> DensityReport:
+    """Clone, split and prune; the caller then starts again with zero statistics.
+
+    A Gaussian whose mean gradient norm reaches the threshold is cloned in place if it is small;
+    otherwise it is replaced by samples of itself, which are smaller. Of more candidates than
+    ``max_gaussians`` has room for, those with the largest gradients are taken. Rows end up as:
+    survivors in their order, clones, samples.
+
+    Added rows are spared by the prune of the same step. Hence a Gaussian that is too transparent
+    is never cloned or split: its copies, as transparent as itself, would stay.
+
+    Raises ``UserError`` if no Gaussian would remain: such a fit cannot recover.
+    """
+    num_before = num_rows(optimizer, prefix)
+    if dr.width(statistics.views) != num_before:
+        raise ValueError(
+            f"densify_and_prune(): statistics of {dr.width(statistics.views)} Gaussians for "
+            f"{num_before} in the optimizer: they start again after every change"
+        )
+    limit = config.prune_scale * scene_extent if prunes_large(config, iteration) else np.inf
+    with np.errstate(over="ignore"):
+        scales = np.exp(_host(optimizer, prefix + "log_scales")).max(axis=1)
+    chosen = _choose_rows(
+        gradient_norms=statistics.mean_gradient_norms(),
+        opacities=expit(_host(optimizer, prefix + "logit_opacities")),
+        scales=scales,
+        config=config,
+        scene_extent=scene_extent,
+        largest_scale=limit,
+    )
+    num_added = len(chosen.clone) + len(chosen.split) * config.split_count
+    if len(chosen.keep) + num_added == 0:
+        raise UserError(
+            f"iteration {iteration}: every Gaussian would be pruned (opacity below "
+            f"densify.prune_opacity = {config.prune_opacity}, or scale above densify.prune_scale "
+            f"= {config.prune_scale} x {scene_extent:g}): do the cameras see the start points?"
+        )
+    if num_added > 0 or len(chosen.keep) < num_before:
+        keep = from_host(dr.uint32_array_t(type(statistics.views)), chosen.keep)
+        key = [seed, iteration]
+        append = _new_rows(optimizer, chosen, config, key, prefix) if num_added > 0 else None
+        edit_rows(optimizer, keep, append, prefix)
+    return DensityReport(
+        cloned=len(chosen.clone),
+        split=len(chosen.split),
+        pruned=num_before - len(chosen.keep) - len(chosen.split),
+        refused=chosen.num_refused,
+        num_gaussians=len(chosen.keep) + num_added,
+    )
+
+
+def reset_opacities(optimizer: Adam, config: DensifyConfig, prefix: str = "") -> None:
+    """Lower every opacity to at most ``reset_opacity`` and forget its moments.
+
+    What the photographs need regains opacity; what floats before the cameras is pruned.
+    """
+    ceiling = math.log(config.reset_opacity / (1 - config.reset_opacity))
+    logits = dr.detach(optimizer[prefix + "logit_opacities"])
+    lowered = dr.select(logits > ceiling, ceiling, logits)
+    replace_values(optimizer, "logit_opacities", lowered, prefix)
+
+
+@dataclass(frozen=True)
+class _ChosenRows:
+    """Row numbers, uint32, ascending."""
+
+    keep: np.ndarray  # stay, those to be cloned among them
+    clone: np.ndarray
+    split: np.ndarray
+    num_refused: int
+
+
+def _choose_rows(
+    gradient_norms: np.ndarray,
+    opacities: np.ndarray,
+    scales: np.ndarray,
+    config: DensifyConfig,
+    scene_extent: float,
+    largest_scale: float,
+) -> _ChosenRows:
+    """Decide about every row; scales: (N,) largest standard deviation, world units.
+
+    Comparisons are written such that NaN counts as transparent and as too large.
+    """
+    small = scales <= config.clone_scale * scene_extent
+    transparent = ~(opacities >= config.prune_opacity)
+    too_large = ~(scales <= largest_scale)
+    candidate = (gradient_norms >= config.grad_threshold) & ~transparent & np.isfinite(scales)
+    candidate &= ~(small & too_large)  # a clone would be as large
+
+    # Room is what is left if every candidate survives, so that no choice can exceed it.
+    survivors = np.count_nonzero(candidate | ~(transparent | too_large))
+    rows = np.flatnonzero(candidate)
+    rows = rows[np.argsort(-gradient_norms[rows], kind="stable")]
+    cost = np.where(small[rows], 1, config.split_count - 1)
+    affordable = rows[np.cumsum(cost) <= config.max_gaussians - survivors]
+
+    taken = np.zeros_like(candidate)
+    taken[affordable] = True
+    split = taken & ~small
+    return _ChosenRows(
+        keep=_row_numbers(~(split | transparent | too_large)),
+        clone=_row_numbers(taken & small),
+        split=_row_numbers(split),
+        num_refused=len(rows) - len(affordable),
+    )
+
+
+def _new_rows(
+    optimizer: Adam, chosen: _ChosenRows, config: DensifyConfig, key: list[int], prefix: str
+) -> dict[str, Any]:
+    """The clones, then ``split_count`` samples of each row that is split.
+
+    A sample is drawn from its parent's own Gaussian: mean + R(q) (s * n), n standard normal. A
+    clone is the same with n = 0. key: what the random numbers depend on.
+    """
+    num_clones = len(chosen.clone)
+    samples_of = np.repeat(chosen.split, config.split_count)
+    normals = np.zeros((num_clones + len(samples_of), 3))
+    normals[num_clones:] = np.random.default_rng(key).standard_normal((len(samples_of), 3))
+    log_shrink = np.zeros_like(normals)
+    log_shrink[num_clones:] = math.log(config.split_shrink)
+
+    t = types_of(type(optimizer[prefix + "means"].array))
+    rows = take_rows(optimizer, from_host(t.UInt32, np.append(chosen.clone, samples_of)), prefix)
+    mean, log_scale, quat = (
+        dr.unravel(vector, rows[name].array)
+        for vector, name in ((t.Array3f, "means"), (t.Array3f, "log_scales"), (t.Array4f, "quats"))
+    )
+    normal = dr.unravel(t.Array3f, from_host(t.Float, normals))
+    mean += quat_to_rotation(quat) @ (dr.exp(log_scale) * normal)
+    shape = normals.shape
+    rows["means"] = t.TensorXf(dr.ravel(mean), shape)
+    rows["log_scales"] = rows["log_scales"] - t.TensorXf(from_host(t.Float, log_shrink), shape)
+    return rows
+
+
+def _row_numbers(mask: np.ndarray) -> np.ndarray:
+    return np.flatnonzero(mask).astype(np.uint32)
+
+
+def _host(optimizer: Adam, key: str) -> np.ndarray:
+    return np.array(dr.detach(optimizer[key]), dtype=np.float64)
+
+
+def _columns(gradient: Any) -> tuple[Any, Any]:
+    """The x and y of an ``Array2f`` or of an (N, 2) tensor."""
+    if not dr.is_tensor_v(gradient):
+        return gradient.x, gradient.y
+    x, y = dr.unravel(types_of(type(gradient.array)).Array2f, gradient.array)
+    return x, y

@@ -1,0 +1,61 @@
+"""Random backgrounds behind transparent photographs."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from drgs.data.types import View
+from drgs.training.effects.base import FitState, TrainingEffect, as_tensor
+from drgs.training.losses import prepare_target
+from drgs.training.views import TrainingView
+
+
+class RandomBackground(TrainingEffect):
+    """Another colour behind each picture: nothing but an opaque splat can look like what is there.
+
+    The colours are functions of seed and iteration. Behind what is measured and shown is the
+    dataset's background.
+    """
+
+    name = "background"
+
+    def __init__(
+        self, seed: int, background: tuple[float, float, float], window: int, sigma: float
+    ) -> None:
+        """background: what the pictures were composited over, display space.
+
+        window, sigma: of SSIM, px: see :func:`drgs.training.losses.prepare_target`.
+        """
+        self.seed, self.background, self.window = seed, np.array(background), (window, sigma)
+
+    def upload(self, view: View) -> Any:
+        """1 - alpha, (H, W, 3); 0 where a mask leaves the background out as well."""
+        transparent = 1 - view.alpha if view.mask is None else (1 - view.alpha) * view.mask
+        return as_tensor(np.repeat(transparent[:, :, None], 3, axis=2))
+
+    def before(self, fit: FitState, view: TrainingView) -> None:
+        """Put a colour behind the splats and behind the photograph."""
+        rng = np.random.default_rng([self.seed, _BACKGROUND_STREAM, fit.iteration])
+        color = rng.uniform(size=3)
+        fit.integrator.background = mi.Color3f(*map(float, color))
+        # No literal, or every colour would be a new kernel.
+        shift = mi.Color3f(*map(float, color - self.background))
+        dr.make_opaque(shift)
+        transparent = view.uploads[self.name]
+        channel = dr.arange(mi.UInt32, dr.width(transparent.array)) % 3
+        shift = dr.select(channel == 0, shift.x, dr.select(channel == 1, shift.y, shift.z))
+        image = view.photograph.image.array + transparent.array * shift
+        view.target = prepare_target(mi.TensorXf(image, transparent.shape), *self.window)
+
+    def after(self, fit: FitState, view: TrainingView) -> None:
+        """Put the dataset's background back."""
+        fit.integrator.background = mi.Color3f(*map(float, self.background))
+        view.target = view.photograph
+
+
+_BACKGROUND_STREAM = 71
+"""Tells the random numbers of backgrounds from others of the same seed."""

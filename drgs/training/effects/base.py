@@ -1,0 +1,120 @@
+"""What a scene calls for between rendering and the loss: composed into a fit, or not there.
+
+A :class:`TrainingEffect` takes part in each iteration of a fit, of which it knows a
+:class:`FitState`. ``drgs.training.effects.called_for`` says which ones a configuration and a
+dataset call for, and imports them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, Protocol
+
+import mitsuba as mi
+import numpy as np
+
+from drgs.core.arrays import from_host
+from drgs.data.types import View
+from drgs.training.views import TrainingView
+
+
+class FitState(Protocol):
+    """What an effect may know of the fit that it takes part in."""
+
+    @property
+    def iteration(self) -> int:
+        """The one that runs; the first is 1."""
+
+    @property
+    def rate_decay(self) -> float:
+        """What the means' learning rate has fallen to, relative to where it began."""
+
+    @property
+    def begins_stage(self) -> bool:
+        """Whether the pictures have other sizes than in the iteration before."""
+
+    @property
+    def integrator(self) -> Any:
+        """The integrator ``splats`` that renders the fit."""
+
+    @property
+    def means(self) -> Any:
+        """The means at the moment, TensorXf (N, 3), world."""
+
+    @property
+    def views(self) -> list[TrainingView]:
+        """The training views, at the size in use."""
+
+    def place_all(self) -> None:
+        """Put all sensors where effects have them now, without derivatives."""
+
+
+class TrainingEffect:
+    """Does nothing; effects override what they need."""
+
+    name = ""  # of its part of a checkpoint, and of what it uploads
+    moves_sensors = False  # whether it changes the parameters of sensors
+    aovs = ""  # what the integrator has to put out besides colour
+
+    def upload(self, view: View) -> Any:
+        """What the effect needs of a view, on the device; kept with the view."""
+        del view
+
+    def target_image(self, view: View, image: np.ndarray) -> np.ndarray:
+        """The photograph (H, W, 3) that a rendering is compared with."""
+        del view
+        return image
+
+    def place(self, view: TrainingView) -> None:
+        """Put the view's sensor where the effect has it now; without derivatives."""
+
+    def before(self, fit: FitState, view: TrainingView) -> None:
+        """Called before the view is rendered."""
+
+    def adjust(self, image: Any, view: TrainingView) -> Any:
+        """What is compared with the photograph, from what was rendered; tensors (H, W, C)."""
+        del view
+        return image
+
+    def penalties(self, view: TrainingView) -> Iterator[Any]:
+        """Terms of the loss, Float of one value each; after :meth:`adjust`."""
+        del view
+        yield from ()
+
+    def after(self, fit: FitState, view: TrainingView) -> None:
+        """Called when the derivatives are known, to take a step of its own."""
+
+    def repopulated(self, fit: FitState) -> None:
+        """Called when Gaussians were added or removed, before the integrator gets the others."""
+
+    def finish(self, fit: FitState) -> None:
+        """Called before the Gaussians are taken out."""
+
+    def measured(self, views: tuple[View, ...]) -> tuple[View, ...]:
+        """Views of other photographs, with what the fit found out about their cameras."""
+        return views
+
+    def write(self, folder: Path, views: tuple[View, ...]) -> None:
+        """Write what was found into the output folder; views: those of the training split."""
+
+    def numbers_of(self, view: TrainingView) -> dict[str, Any]:
+        """What it has optimised that the view depends on: Float by name, without derivatives."""
+        del view
+        return {}
+
+    def values(self) -> dict[str, np.ndarray]:
+        """All that it optimises, and its moments: a row for each training view, or for all."""
+        return {}
+
+    def state(self) -> dict[str, np.ndarray]:
+        """What the coming iterations depend on."""
+        return {}
+
+    def restore(self, state: dict[str, np.ndarray]) -> None:
+        """Continue from :meth:`state`."""
+
+
+def as_tensor(values: np.ndarray) -> mi.TensorXf:
+    """Upload an array of any shape."""
+    return mi.TensorXf(from_host(mi.Float, values), values.shape)

@@ -1,0 +1,213 @@
+"""Training cameras that are optimised together with the splats.
+
+Imported when ``cameras.optimise`` is set. A view's camera is moved, in its own axes, by a rotation
+exp(turn) and a translation; all views share factors of the focal lengths and a shift of the
+principal point. Of a camera that moves while it exposes, both poses are moved alike. The
+derivatives come from the integrator: see ``camera.Camera.by_lane``.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from drgs.cameras.axes import MITSUBA_AXES, in_opengl_axes
+from drgs.cameras.motion import rotation_matrix
+from drgs.config.schema import CamerasConfig
+from drgs.core.files import atomic_path
+from drgs.data.types import View
+from drgs.results.refined_cameras import CAMERAS, LensChange, lens_and_motion
+from drgs.training.effects.base import FitState, TrainingEffect
+from drgs.training.effects.view_parameters import ViewParameters
+from drgs.training.views import TrainingView
+
+INTRINSICS = ("fx", "fy", "cx", "cy")
+
+
+@dataclass(frozen=True)
+class _Start:
+    """A view's camera as the data has it, on the device."""
+
+    to_world: mi.Matrix4f  # camera to world, OpenCV axes
+    motion: mi.Matrix4f | None  # the second pose in the axes of the first; None: it does not move
+    intrinsics: mi.Vector4f  # fx, fy, cx, cy, px
+    size: mi.Vector2f  # px
+
+
+class CameraRefinement(TrainingEffect):
+    """Poses of all training views, and what their lenses share."""
+
+    name = "cameras"
+    moves_sensors = True
+
+    def __init__(self, config: CamerasConfig, num_views: int, extent: float) -> None:
+        """num_views: of the training split; extent: world units."""
+        self.first = config.start
+        shapes = {"turns": (num_views, 3), "moves": (num_views, 3)}
+        rates = {"turns": config.rotation_lr, "moves": config.translation_lr * extent}
+        shared = {"log_focals": config.focal_lr, "shifts": config.principal_lr}
+        # A rate of 0 leaves out what it belongs to.
+        shapes |= {name: (1, 2) for name, rate in shared.items() if rate > 0}
+        values = {name: np.zeros(shape) for name, shape in shapes.items()}
+        self.parameters = ViewParameters(values, rates | shared)
+        self.leaves: dict[str, mi.Float] = {}
+        self.numbers: dict[str, Any] = {}  # of the sensor that is rendered
+
+    def upload(self, view: View) -> _Start:
+        """The view's camera."""
+        motion = None
+        if view.motion is not None:
+            between = np.linalg.solve(view.camera_to_world, view.motion.close_to_world)
+            motion = mi.Matrix4f(between.astype(np.float32))
+        start = _Start(
+            to_world=mi.Matrix4f(view.camera_to_world.astype(np.float32)),
+            motion=motion,
+            intrinsics=mi.Vector4f(*(float(getattr(view, name)) for name in INTRINSICS)),
+            size=mi.Vector2f(view.width, view.height),
+        )
+        dr.make_opaque(start)
+        return start
+
+    def before(self, fit: FitState, view: TrainingView) -> None:
+        """Put the sensor where its camera is now."""
+        self.leaves = self.parameters.leaves(view.index)
+        # What the sensor depends on are leaves: the rest of the chain is differentiated afterwards.
+        self.numbers = dr.detach(self._camera(view.uploads[self.name], self.leaves))
+        if fit.iteration > self.first:
+            dr.enable_grad(self.numbers)
+        _put(view.sensor, self.numbers)
+
+    def place(self, view: TrainingView) -> None:
+        """Put the sensor where its camera is now."""
+        leaves = self.parameters.leaves(view.index)
+        _put(view.sensor, dr.detach(self._camera(view.uploads[self.name], leaves)))
+
+    def after(self, fit: FitState, view: TrainingView) -> None:
+        """One step of its own."""
+        if fit.iteration <= self.first:
+            return
+        camera = self._camera(view.uploads[self.name], self.leaves)
+        for name, value in camera.items():
+            if dr.grad_enabled(value):
+                dr.accum_grad(value, dr.grad(self.numbers[name]))
+                dr.enqueue(dr.ADMode.Backward, value)
+        dr.traverse(dr.ADMode.Backward)
+        # As the rate of the means, which are what cameras are refined against.
+        decay = fit.rate_decay
+        self.parameters.step(view.index, decay)
+
+    @staticmethod
+    def _camera(start: _Start, leaves: dict[str, mi.Float]) -> dict[str, Any]:
+        """The sensor's parameters, from the numbers that are optimised."""
+        turn, move = (mi.Vector3f(*_entries(leaves[name])) for name in ("turns", "moves"))
+        rotation = rotation_matrix(turn)
+        rows = [[rotation[i, j] for j in range(3)] + [move[i]] for i in range(3)]
+        moved = start.to_world @ mi.Matrix4f([*rows, [0, 0, 0, 1]])
+        fx, fy, cx, cy = start.intrinsics
+        if "log_focals" in leaves:
+            wide, tall = map(dr.exp, _entries(leaves["log_focals"]))
+            fx, fy = fx * wide, fy * tall
+        if "shifts" in leaves:
+            right, down = _entries(leaves["shifts"])
+            cx, cy = cx + right * start.size.x, cy + down * start.size.y
+        signs = mi.Matrix4f(MITSUBA_AXES.astype(np.float32))
+        poses = {"to_world": moved @ signs}
+        if start.motion is not None:
+            poses["to_world_close"] = moved @ start.motion @ signs
+        return poses | {"fx": fx, "fy": fy, "cx": cx, "cy": cy}
+
+    def numbers_of(self, view: TrainingView) -> dict[str, Any]:
+        """See :class:`TrainingEffect`."""
+        return self.parameters.numbers(view.index)
+
+    def values(self) -> dict[str, np.ndarray]:
+        """See :class:`TrainingEffect`."""
+        return self.parameters.values()
+
+    def state(self) -> dict[str, np.ndarray]:
+        """Numbers and moments."""
+        return self.parameters.state()
+
+    def restore(self, state: dict[str, np.ndarray]) -> None:
+        """Continue from :meth:`state`."""
+        self.parameters.restore(state)
+
+    def refined(self, views: Sequence[View]) -> list[View]:
+        """The training views with their cameras as they are now."""
+        numbers, result = self.parameters.numpy(), []
+        for index, view in enumerate(views):
+            row = {name: mi.Float(v[min(index, len(v) - 1)]) for name, v in numbers.items()}
+            camera = self._camera(self.upload(view), row)
+            values = {name: float(camera[name][0]) for name in INTRINSICS}
+            if view.motion is not None:
+                close = _pose(camera["to_world_close"])
+                values["motion"] = replace(view.motion, close_to_world=close)
+            result.append(replace(view, camera_to_world=_pose(camera["to_world"]), **values))
+        return result
+
+    @property
+    def lens_change(self) -> LensChange:
+        """Of all cameras."""
+        numbers = {name: values[0].astype(np.float64) for name, values in self._shared.items()}
+        changes = {}
+        if "log_focals" in numbers:
+            changes["focal"] = tuple(np.exp(numbers["log_focals"]).tolist())
+        if "shifts" in numbers:
+            changes["principal"] = tuple(numbers["shifts"].tolist())
+        return LensChange(**changes)
+
+    @property
+    def _shared(self) -> dict[str, np.ndarray]:
+        return {k: v for k, v in self.parameters.numpy().items() if k in ("log_focals", "shifts")}
+
+    def measured(self, views: tuple[View, ...]) -> tuple[View, ...]:
+        """With the lens that was found; where the cameras are is not known better than before."""
+        return tuple(map(self.lens_change.of, views))
+
+    def write(self, folder: Path, views: tuple[View, ...]) -> None:
+        """``cameras.json``: the refined training cameras, in the layout of ``transforms.json``.
+
+        ``lens_change`` says what of the intrinsics is not the data's.
+        """
+        frames = [
+            {
+                "file_path": view.name,
+                "transform_matrix": in_opengl_axes(view.camera_to_world),
+                **{"fl_x": view.fx, "fl_y": view.fy, "cx": view.cx, "cy": view.cy},
+                **{"w": view.width, "h": view.height},
+                **lens_and_motion(view),
+            }
+            for view in self.refined(views)
+        ]
+        with atomic_path(folder / CAMERAS) as temporary:
+            found = {"lens_change": asdict(self.lens_change), "frames": frames}
+            temporary.write_text(json.dumps(found, indent=1) + "\n")
+
+
+def _put(sensor: mi.Sensor, numbers: dict[str, Any]) -> None:
+    """Set a sensor's parameters."""
+    params = mi.traverse(sensor)
+    params["to_world"] = mi.AffineTransform4f(numbers["to_world"])
+    for name in INTRINSICS:
+        params[name] = numbers[name]
+    params.update()
+    if "to_world_close" in numbers:
+        # By name it is announced as not differentiable: each iteration would warn.
+        sensor.to_world_close = mi.AffineTransform4f(numbers["to_world_close"])
+
+
+def _pose(to_world: mi.Matrix4f) -> np.ndarray:
+    """(4, 4) float64, OpenCV axes."""
+    return np.array(to_world)[..., 0].astype(np.float64) @ MITSUBA_AXES
+
+
+def _entries(values: mi.Float) -> list[mi.Float]:
+    """Each number as an array of one."""
+    return [dr.gather(mi.Float, values, mi.UInt32(k)) for k in range(dr.width(values))]

@@ -1,0 +1,53 @@
+"""Supervision by depth."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import mitsuba as mi
+
+from drgs.core.arrays import from_host
+from drgs.data.types import View
+from drgs.training.effects.base import TrainingEffect
+from drgs.training.image_ops import depth_error, split
+from drgs.training.views import TrainingView
+
+
+class DepthSupervision(TrainingEffect):
+    """Penalises the difference between the composited depth and that of the data.
+
+    The term is weight / extent times the mean of |D - A d| over the pixels whose depth d is known
+    and that no mask leaves out, D being the alpha-weighted sum of the splats' depths and A the
+    alpha: ``pixels.depth_error``.
+    """
+
+    name = "depth"
+    aovs = "depth:depth, alpha:alpha"
+
+    def __init__(self, weight: float, extent: float) -> None:
+        """weight: of the term, per scene extent."""
+        self.weight, self.depths = weight / extent, None
+
+    def upload(self, view: View) -> Any:
+        """Depths, and weights of the pixels; None where a view has none that counts."""
+        if view.depth is None:
+            return None
+        known = view.depth > 0
+        if view.mask is not None:
+            known &= view.mask > 0
+        if not known.any():
+            return None
+        weights = self.weight * known / known.sum()
+        return from_host(mi.Float, view.depth), from_host(mi.Float, weights)
+
+    def adjust(self, image: Any, view: TrainingView) -> Any:
+        """The colours; depth and alpha are kept for the penalty."""
+        del view
+        image, self.depths = split(image, 3)
+        return image
+
+    def penalties(self, view: TrainingView) -> Iterator[Any]:
+        """The difference in depth."""
+        if (known := view.uploads[self.name]) is not None:
+            yield depth_error(self.depths, *known)

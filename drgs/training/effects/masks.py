@@ -1,0 +1,38 @@
+"""What the data says besides colours: masks, depth; and backgrounds that vary.
+
+Imported when the data or the configuration calls for one of them.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from drgs.data.types import View
+from drgs.training.effects.base import TrainingEffect, as_tensor
+from drgs.training.views import TrainingView
+
+
+class Masks(TrainingEffect):
+    """Pixels that a mask leaves out are black in what is rendered and in what it is compared with.
+
+    They have no derivative. SSIM's windows that reach into them see the same black in both.
+    """
+
+    name = "masks"
+
+    def upload(self, view: View) -> Any:
+        """The mask, (H, W, 3); None where a view has none."""
+        if view.mask is None:
+            return None
+        return as_tensor(np.repeat(view.mask[:, :, None], 3, axis=2))
+
+    def target_image(self, view: View, image: np.ndarray) -> np.ndarray:
+        """The photograph without what the mask leaves out."""
+        return image if view.mask is None else image * view.mask[:, :, None]
+
+    def adjust(self, image: Any, view: TrainingView) -> Any:
+        """The rendering without it."""
+        mask = view.uploads[self.name]
+        return image if mask is None else image * mask

@@ -1,0 +1,53 @@
+"""Keeps the 3D smoothing filter of a fit up to date. Imported for ``model.smoothing``."""
+
+from __future__ import annotations
+
+import mitsuba as mi
+import numpy as np
+
+from drgs.effects.smoothing import smoothing_of
+from drgs.integrator.sensors import camera_from_sensor, read_sensor
+from drgs.training.effects.base import FitState, TrainingEffect
+from drgs.training.views import TrainingView
+
+EVERY = 100
+"""Iterations (as in Mip-Splatting's code); also where another stage begins, and after each change
+of the population."""
+
+
+class TrainingSmoothing(TrainingEffect):
+    """The filter of ``drgs.effects.smoothing``, from the training cameras at the size in use."""
+
+    name = "smoothing"
+
+    def __init__(self) -> None:
+        self.filter: mi.Float | None = None
+
+    def before(self, fit: FitState, view: TrainingView) -> None:
+        """Find the filter anew where the means have moved, or are others."""
+        del view
+        if self.filter is None or fit.begins_stage or fit.iteration % EVERY == 1:
+            self.filter = self._found(fit)
+        fit.integrator.smoothing = self.filter
+
+    def finish(self, fit: FitState) -> None:
+        """The filter of the means as they are; what the fit goes on with stays."""
+        fit.integrator.smoothing = self._found(fit)
+
+    @staticmethod
+    def _found(fit: FitState) -> mi.Float:
+        fit.place_all()
+        states = (read_sensor(view.sensor, fit.integrator.near) for view in fit.views)
+        return smoothing_of(fit.means, map(camera_from_sensor, states))
+
+    def repopulated(self, fit: FitState) -> None:
+        """The former filter has other rows."""
+        self.filter = fit.integrator.smoothing = None
+
+    def state(self) -> dict[str, np.ndarray]:
+        """The filter, if there is one."""
+        return {} if self.filter is None else {"filter": np.array(self.filter)}
+
+    def restore(self, state: dict[str, np.ndarray]) -> None:
+        """Continue with it."""
+        self.filter = mi.Float(state["filter"]) if "filter" in state else None

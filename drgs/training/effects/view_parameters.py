@@ -1,0 +1,73 @@
+"""Parameters of single training views, and steps of Adam that move no other view's."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from drjit.opt import Adam
+
+from drgs.training.optimizer import make_optimizer, optimizer_state, restore_optimizer
+
+
+class ViewParameters:
+    """A row of numbers for each view (or one row for all), by name; optimised when it is seen.
+
+    Each row has an optimizer of its own: whenever a view is seen for the first time, its first
+    steps are as long as the rate.
+    """
+
+    def __init__(self, values: Mapping[str, np.ndarray], rates: Mapping[str, float]) -> None:
+        """values: (V, K) each, or (1, K) for all views; rates: per step."""
+        self.rates = dict(rates)
+        self.optimizers: dict[str, list[Adam]] = {
+            name: [make_optimizer({name: _float(row)}, rates) for row in value]
+            for name, value in values.items()
+        }
+
+    def leaves(self, index: int) -> dict[str, mi.Float]:
+        """The numbers (K,) of a view, with derivatives enabled."""
+        return {name: optimizer[name] for name, optimizer in self._of_view(index).items()}
+
+    def numbers(self, index: int) -> dict[str, mi.Float]:
+        """The same without derivatives."""
+        return dr.detach(self.leaves(index))
+
+    def step(self, index: int, decay: float = 1.0) -> None:
+        """Move the view's numbers along their derivatives; decay: factor of the rates."""
+        for name, optimizer in self._of_view(index).items():
+            optimizer.set_learning_rate({name: decay * self.rates[name]})
+            optimizer.step()
+
+    def numpy(self) -> dict[str, np.ndarray]:
+        """The numbers, (V, K) each."""
+        state = self.state()
+        return {name: state[f"{name}.value"] for name in self.optimizers}
+
+    def values(self) -> dict[str, np.ndarray]:
+        """The numbers by name, and their moments as ``NAME.m`` and ``NAME.v``; a row each."""
+        return {key.removesuffix(".value"): value for key, value in self.state().items()}
+
+    def state(self) -> dict[str, np.ndarray]:
+        """Numbers, moments and step counts, a row for each view."""
+        result = {}
+        for optimizers in self.optimizers.values():
+            rows = [optimizer_state(optimizer) for optimizer in optimizers]
+            result |= {key: np.stack([row[key] for row in rows]) for key in rows[0]}
+        return result
+
+    def restore(self, state: Mapping[str, np.ndarray]) -> None:
+        """Continue from :meth:`state`."""
+        for name, optimizers in self.optimizers.items():
+            own = {key: value for key, value in state.items() if key.startswith(f"{name}.")}
+            for row, optimizer in enumerate(optimizers):
+                restore_optimizer(optimizer, {key: value[row] for key, value in own.items()})
+
+    def _of_view(self, index: int) -> dict[str, Adam]:
+        return {name: rows[min(index, len(rows) - 1)] for name, rows in self.optimizers.items()}
+
+
+def _float(row: np.ndarray) -> mi.Float:
+    return mi.Float(row.astype(np.float32))

@@ -1,0 +1,210 @@
+"""Adam over the parameters of the Gaussians, and row surgery on them.
+
+``drjit.opt.Adam`` keeps, for each parameter, ``(value, promoted, rate, (t, m, v, v_max))``: the
+step count t and the moments m, v (flat arrays as long as the value). Assigning a value of another
+shape to it discards moments, step count and rate, so every change of the number of Gaussians goes
+through :func:`edit_rows`, which moves a row's value and moments together and leaves everything else
+as it was.
+
+Parameters are named as in ``gaussians.PARAMETER_NAMES``; in the optimizer (and in Mitsuba's
+parameter tables) a prefix such as ``integrator.`` precedes the name. Entries without the prefix
+are left alone. A parameter of zero size, ``shN`` at degree 0, cannot be registered and is not.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import drjit as dr
+import numpy as np
+from drjit.opt import Adam
+
+
+def make_optimizer(
+    parameters: Mapping[str, Any],
+    rates: Mapping[str, float],
+    prefix: str = "",
+    beta_1: float = 0.9,
+    beta_2: float = 0.999,
+    epsilon: float = 1e-15,
+) -> Adam:
+    """Return an Adam optimizer (Kingma and Ba 2015) with a learning rate for each parameter.
+
+    parameters: tensors by name, without the prefix; those of zero size are left out.
+    rates: learning rate per step by name. A fixed rate of 0 is allowed.
+    epsilon: 3DGS uses 1e-15, because gradients of a mean over pixels are far below 1e-8.
+    """
+    optimizer = Adam(lr=0.0, beta_1=beta_1, beta_2=beta_2, epsilon=epsilon)
+    for name, value in parameters.items():
+        if name not in rates:
+            raise ValueError(
+                f"make_optimizer(): no learning rate for parameter {name}; rates are given for "
+                f"{', '.join(sorted(rates)) or 'none'}"
+            )
+        if dr.width(value) == 0:
+            continue
+        optimizer[prefix + name] = value
+        optimizer.set_learning_rate({prefix + name: float(rates[name])})
+    return optimizer
+
+
+def num_rows(optimizer: Adam, prefix: str = "") -> int:
+    """Return the number of Gaussians N, the first dimension that all parameters share."""
+    lengths = {
+        name: optimizer.state[prefix + name][0].shape[0] for name in _names(optimizer, prefix)
+    }
+    if len(set(lengths.values())) != 1:
+        raise ValueError(
+            f'num_rows(): the optimizer\'s parameters with prefix "{prefix}" must share one '
+            f"number of rows, got {lengths or 'no parameters'}"
+        )
+    return next(iter(lengths.values()))
+
+
+def edit_rows(
+    optimizer: Adam, keep: Any, append: Mapping[str, Any] | None = None, prefix: str = ""
+) -> None:
+    """Keep some rows of every parameter, in the order given, and append new ones.
+
+    keep: (K,) ``UInt32``, the rows that stay. append: M new rows of every parameter by name,
+    without the prefix; ``None``: none are appended. Afterwards row i is former row keep[i] for
+    i < K, and appended row i - K from there on.
+
+    Kept rows take their moments along bit by bit, appended rows start with moments of zero, and
+    step counts and learning rates stay: the next steps move a kept row as if nothing had
+    happened. Detached; waits for the device once, to check ``keep``.
+    """
+    total = num_rows(optimizer, prefix)
+    if dr.width(keep) > 0 and dr.max(keep)[0] >= total:
+        raise ValueError(f"edit_rows(): keep must hold row numbers below {total}")
+    added = _check_rows(optimizer, append, prefix)
+    if dr.width(keep) + added == 0:
+        raise ValueError("edit_rows(): at least one row must remain, but none is kept or appended")
+
+    for name in _names(optimizer, prefix):
+        value, promoted, rate, (step, *moments) = optimizer.state[prefix + name]
+        row_shape = tuple(value.shape[1:])
+        width = math.prod(row_shape)
+        elements = _elements(keep, width)
+        new_rows = dr.detach(append[name]).array if added else None
+        no_moments = dr.zeros(type(new_rows), added * width) if added else None
+
+        flat = _gather_and_append(dr.detach(value).array, elements, new_rows)
+        moments = [
+            None if m is None else _gather_and_append(m, elements, no_moments) for m in moments
+        ]
+        if dr.is_tensor_v(value):
+            flat = type(value)(flat, (dr.width(flat) // width, *row_shape))
+        dr.enable_grad(flat)
+        dr.schedule(flat, moments)
+        optimizer.state[prefix + name] = flat, promoted, rate, (step, *moments)
+    dr.eval()
+
+
+def take_rows(optimizer: Adam, rows: Any, prefix: str = "") -> dict[str, Any]:
+    """Return copies of some rows of every parameter by name, detached; rows: (M,) ``UInt32``."""
+    result = {}
+    for name in _names(optimizer, prefix):
+        value = dr.detach(optimizer.state[prefix + name][0])
+        row_shape = tuple(value.shape[1:])
+        flat = value.array
+        flat = dr.gather(type(flat), flat, _elements(rows, math.prod(row_shape)))
+        is_tensor = dr.is_tensor_v(value)
+        result[name] = type(value)(flat, (dr.width(rows), *row_shape)) if is_tensor else flat
+    return result
+
+
+def replace_values(optimizer: Adam, name: str, value: Any, prefix: str = "") -> None:
+    """Give a parameter new values of the same shape, and moments of zero.
+
+    The step count and the learning rate stay: as in the reference's opacity reset, Adam's bias
+    correction does not start again.
+    """
+    key = prefix + name
+    old, promoted, rate, (step, *moments) = optimizer.state[key]
+    if tuple(value.shape) != tuple(old.shape):
+        raise ValueError(
+            f"replace_values(): {key} has shape {tuple(old.shape)}, the new values "
+            f"{tuple(value.shape)}: edit_rows() adds and removes rows"
+        )
+    value = type(old)(dr.detach(value))
+    dr.make_opaque(value)
+    dr.enable_grad(value)
+    moments = [None if m is None else dr.opaque(type(m), 0, m.shape) for m in moments]
+    optimizer.state[key] = value, promoted, rate, (step, *moments)
+
+
+def optimizer_state(optimizer: Adam, prefix: str = "") -> dict[str, np.ndarray]:
+    """Values, moments and step counts as numpy arrays: ``NAME.value``, ``.m``, ``.v``, ``.t``.
+
+    Learning rates are not part of it: they follow from the configuration and the iteration.
+    """
+    state = {}
+    for name in _names(optimizer, prefix):
+        value, _, _, (step, first, second, _) = optimizer.state[prefix + name]
+        state[f"{name}.value"] = np.array(dr.detach(value))
+        state[f"{name}.m"], state[f"{name}.v"] = np.array(first), np.array(second)
+        state[f"{name}.t"] = np.array(step)
+    return state
+
+
+def restore_optimizer(optimizer: Adam, state: Mapping[str, np.ndarray], prefix: str = "") -> None:
+    """Continue from :func:`optimizer_state`, bit by bit; rates stay as they are."""
+    for name in _names(optimizer, prefix):
+        old, promoted, rate, (step, first, second, maximum) = optimizer.state[prefix + name]
+        value = type(old)(state[f"{name}.value"])
+        dr.make_opaque(value)
+        dr.enable_grad(value)
+        moments = type(first)(state[f"{name}.m"]), type(second)(state[f"{name}.v"])
+        extra = (type(step)(state[f"{name}.t"]), *moments, maximum)
+        optimizer.state[prefix + name] = value, promoted, rate, extra
+
+
+def _names(optimizer: Adam, prefix: str) -> list[str]:
+    """Names without the prefix, in the order of registration."""
+    return [key[len(prefix) :] for key in optimizer.state if key.startswith(prefix)]
+
+
+def _check_rows(optimizer: Adam, rows: Mapping[str, Any] | None, prefix: str) -> int:
+    """The number of ``rows``, which must be given for every parameter in its shape."""
+    if rows is None:
+        return 0
+    counts = set()
+    for name in _names(optimizer, prefix):
+        expected = tuple(optimizer.state[prefix + name][0].shape[1:])
+        got = tuple(rows[name].shape) if name in rows else None
+        if got is None or got[1:] != expected:
+            raise ValueError(
+                f"edit_rows(): appended rows of {name} must have the shape "
+                f"({', '.join(map(str, ('M', *expected)))}), got {got or 'none'}"
+            )
+        counts.add(got[0])
+    if len(counts) != 1:
+        raise ValueError(
+            f"edit_rows(): every parameter must get the same number of rows, got {sorted(counts)}"
+        )
+    return counts.pop()
+
+
+def _elements(rows: Any, width: int) -> Any:
+    """Where the elements of ``rows`` lie in a flat row-major array of ``width`` columns."""
+    if dr.width(rows) == 0:
+        return rows  # Dr.Jit does not compute with empty arrays
+    element = dr.arange(type(rows), dr.width(rows) * width)
+    return dr.gather(type(rows), rows, element // width) * width + element % width
+
+
+def _gather_and_append(flat: Any, elements: Any, added: Any | None) -> Any:
+    kept = dr.gather(type(flat), flat, elements)
+    if added is None:
+        return kept
+    index_type, num_kept, num_added = type(elements), dr.width(kept), dr.width(added)
+    result = dr.empty(type(flat), num_kept + num_added)
+    if num_kept > 0:
+        dr.scatter(result, kept, dr.arange(index_type, num_kept))
+    # Opaque: as a literal (and in dr.concat) the offset would make each call a new kernel.
+    offset = dr.opaque(index_type, num_kept)
+    dr.scatter(result, added, dr.arange(index_type, num_added) + offset)
+    return result

@@ -1,0 +1,63 @@
+"""Learning rates over the iterations."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from drgs.config.schema import FitConfig, OptimizerConfig
+
+
+@dataclass(frozen=True)
+class ExponentialDecay:
+    """A learning rate that falls by the same factor at every iteration.
+
+    rate(i) = initial^(1 - s) final^s with s = i / n clamped to [0, 1]: the reference 3DGS schedule
+    of the means. n may be revised on the way: each of ``aims``, (after, end), spreads what is left
+    of s at iteration ``after`` until ``end``. The first begins after iteration 0.
+    """
+
+    initial: float
+    final: float
+    aims: tuple[tuple[int, int], ...]
+
+    def __post_init__(self) -> None:
+        """Refuse rates that have no logarithm."""
+        if not (self.initial > 0 and self.final > 0 and all(a < b for a, b in self.aims)):
+            raise ValueError(
+                "ExponentialDecay(): initial and final must be > 0 and each aim's end > after, got "
+                f"{self.initial}, {self.final} and {self.aims}"
+            )
+
+    def __call__(self, iteration: int) -> float:
+        """Return the learning rate of an iteration."""
+        s = 0.0
+        for (after, end), until in zip(self.aims, [*self.aims[1:], (math.inf,)], strict=True):
+            passed = min(max(iteration, after), until[0]) - after
+            s += (1 - s) * min(passed / (end - after), 1.0)
+        return math.exp((1 - s) * math.log(self.initial) + s * math.log(self.final))
+
+
+def learning_rates(config: OptimizerConfig, extent: float) -> dict[str, float]:
+    """Rate per step of each parameter; extent: world units."""
+    return {
+        "means": config.means_lr * extent,
+        "quats": config.quats_lr,
+        "log_scales": config.scales_lr,
+        "logit_opacities": config.opacities_lr,
+        "sh0": config.sh0_lr,
+        "shN": config.shN_lr,
+    }
+
+
+def rate_aims(config: FitConfig) -> list[tuple[int, int]]:
+    """(after, end) of the means' rate: see :class:`drgs.training.rates.ExponentialDecay`."""
+    aims = [(aim.after, aim.end) for aim in config.optimizer.means_lr_aims]
+    return aims or [(0, config.iterations)]
+
+
+def means_rate(config: FitConfig, extent: float) -> ExponentialDecay:
+    """The rate of the means over the iterations; extent: world units."""
+    rates = config.optimizer
+    aims = tuple(rate_aims(config))
+    return ExponentialDecay(rates.means_lr * extent, rates.means_lr_final * extent, aims)

@@ -1,0 +1,74 @@
+"""What a fit simulates, and what asked for it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+from drgs.config.schema import FitConfig
+from drgs.data.types import Dataset
+from drgs.integrator.summary import (
+    Effect,
+    _antialiasing,
+    _joined,
+    _unless_ignored,
+    _view_dependence,
+    lens_effect,
+    motion_effect,
+)
+
+
+def summary_of_fit(config: FitConfig, dataset: Dataset) -> list[Effect]:
+    """What a fit simulates."""
+    views, model, ignored = dataset.train, config.model, dataset.ignored
+    depths = _of_data("depth", [v.depth for v in views], "supervision", "the dataset's depth")
+    depths = _unless_ignored(depths, config.loss.depth_weight == 0)
+    return [
+        _view_dependence(model.sh_degree, f"model.sh_degree: {model.sh_degree}"),
+        _background(config),
+        replace(lens_effect(views), ignored="distortion" in ignored),
+        replace(motion_effect(views), ignored="motion" in ignored),
+        _antialiasing(
+            "model.antialiased" if model.antialiased else None,
+            "model.smoothing" if model.smoothing else None,
+        ),
+        Effect(
+            "exposure and white balance",
+            None if config.colors.lr is None else "a colour transform for each training photograph",
+            "colors.lr",
+        ),
+        replace(
+            _of_data("masks", [v.mask for v in views], "pixels left out", "the dataset's masks"),
+            ignored="masks" in ignored,
+        ),
+        replace(depths, ignored=depths.ignored or "depth" in ignored),
+        Effect(
+            "camera refinement",
+            _refined(config) if config.cameras.optimise else None,
+            "cameras.optimise",
+        ),
+    ]
+
+
+def _background(config: FitConfig) -> Effect:
+    if config.data.random_background:
+        return Effect("background", "a random colour at each iteration", "data.random_background")
+    return Effect("background", f"{config.data.background}", "data.background")
+
+
+def _of_data(name: str, values: Sequence[Any], what: str, why: str) -> Effect:
+    count = sum(value is not None for value in values)
+    return Effect(name, what if count else None, f"{why}, in {count} views")
+
+
+def _refined(config: FitConfig) -> str:
+    rates = config.cameras
+    return (
+        _joined(
+            "poses" if rates.rotation_lr or rates.translation_lr else None,
+            "focal lengths" if rates.focal_lr else None,
+            "principal point" if rates.principal_lr else None,
+        )
+        or "nothing: all rates are 0"
+    )

@@ -1,0 +1,276 @@
+"""The training loop: photographs in, Gaussians out.
+
+Everything between two optimizer steps is visible in :meth:`Trainer.step`. The picture and its
+gradients come from ``mi.render`` with the ``splats`` integrator, the steps from ``drjit.opt.Adam``,
+changes of the population from ``drgs.training.densify``.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from drgs.config.changes import changed
+from drgs.config.schema import FitConfig
+from drgs.data.types import Dataset, View
+from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
+from drgs.integrator.scene import make_scene, render_views
+from drgs.training import densify
+from drgs.training.effects.called_for import integrator_settings, training_effects
+from drgs.training.finite_checks import GradientWatch, check_values, check_view_values
+from drgs.training.losses import PhotometricLoss
+from drgs.training.optimizer import make_optimizer, optimizer_state, restore_optimizer
+from drgs.training.rates import learning_rates, means_rate, rate_aims
+from drgs.training.stages import make_stages, view_of
+from drgs.training.views import TrainingView
+
+PREFIX = "integrator."
+"""What precedes a parameter's name when the scene is traversed."""
+
+
+@dataclass(frozen=True)
+class StepReport:
+    """What one iteration did; numbers that cost a wait for the device are read on demand."""
+
+    iteration: int
+    num_gaussians: int
+    means_lr: float
+    density: densify.DensityReport | None
+    loss_array: Any  # Float, one entry
+    squared_error: Any  # Float, one entry: mean over pixels and channels
+    counted: float  # share of the pixels that count
+
+    @property
+    def loss(self) -> float:
+        """The loss of this iteration's view."""
+        return float(self.loss_array[0])
+
+    @property
+    def psnr(self) -> float:
+        """dB, of this iteration's view before the step."""
+        return -10 * math.log10(max(float(self.squared_error[0]) / self.counted, 1e-10))
+
+
+class Trainer:
+    """Fits ``gaussians`` to the training views of ``dataset``."""
+
+    def __init__(self, config: FitConfig, dataset: Dataset, gaussians: Gaussians) -> None:
+        self.config, self.extent = config, dataset.extent
+        self.effects = training_effects(config, dataset)
+        settings = integrator_settings(self.effects)
+        self.scene = make_scene(gaussians, config.model, dataset.background, **settings)
+        self.integrator = self.scene.integrator()
+        self.params = mi.traverse(self.scene)
+        self.params.keep([PREFIX + name for name in PARAMETER_NAMES])
+        initial = {key.removeprefix(PREFIX): value for key, value in self.params.items()}
+        self.optimizer = make_optimizer(
+            initial,
+            learning_rates(config.optimizer, self.extent),
+            prefix=PREFIX,
+            beta_1=config.optimizer.beta_1,
+            beta_2=config.optimizer.beta_2,
+            epsilon=config.optimizer.epsilon,
+        )
+        self.means_lr = means_rate(config, self.extent)
+        self.loss = PhotometricLoss(config.loss.dssim_weight)
+        self.white_background = tuple(dataset.background) == (1.0, 1.0, 1.0)
+        self.stages = make_stages(dataset.train, config, self.effects)
+        self.statistics = self._no_statistics()
+        self.watch = GradientWatch()
+        self.iteration = 0
+
+    def step(self) -> StepReport:
+        """One iteration: one view, one optimizer step, now and then a change of the population."""
+        self.iteration += 1
+        view = self.view
+        self.integrator.sh_degree = self.sh_degree
+        self.optimizer.set_learning_rate({PREFIX + "means": self.means_lr(self.iteration)})
+        self.params.update(self.optimizer)
+        for effect in self.effects:
+            effect.before(self, view)
+
+        image = mi.render(self.scene, self.params, sensor=view.sensor, spp=1)
+        image, loss = self.compared(image, view)
+        dr.backward(loss)
+        image, loss = dr.detach(image), dr.detach(loss)
+        error = dr.mean(dr.square(image.array - view.target.image.array))
+        numbers = {f"{e.name}.{k}": v for e in self.effects for k, v in e.numbers_of(view).items()}
+        self.watch.add(self.iteration, view.name, loss, self.integrator.last.first_fault, numbers)
+        self.optimizer.step()
+        for effect in self.effects:
+            effect.after(self, view)
+
+        report = self._control_density(view)
+        return StepReport(
+            iteration=self.iteration,
+            num_gaussians=self.num_gaussians,
+            means_lr=self.means_lr(self.iteration),
+            density=report,
+            loss_array=loss,
+            squared_error=error,
+            counted=view.counted,
+        )
+
+    def compared(self, image: Any, view: TrainingView) -> tuple[Any, Any]:
+        """What a rendering is as a photograph of the view would be, and its loss."""
+        for effect in self.effects:
+            image = effect.adjust(image, view)
+        loss = self.loss(image, view.target)
+        for effect in self.effects:
+            for penalty in effect.penalties(view):
+                loss = loss + penalty
+        return image, loss
+
+    @property
+    def views(self) -> list[TrainingView]:
+        """The training views, at the size in use."""
+        return next(stage.views for stage in self.stages if self.iteration <= stage.until)
+
+    @property
+    def begins_stage(self) -> bool:
+        """Whether the pictures have other sizes than in the iteration before."""
+        return any(self.iteration == stage.until + 1 for stage in self.stages)
+
+    @property
+    def rate_decay(self) -> float:
+        """What the means' learning rate has fallen to, relative to where it began."""
+        return self.means_lr(self.iteration) / self.means_lr.initial
+
+    def place_all(self) -> None:
+        """Put all sensors where effects have them now, without derivatives."""
+        for effect in self.effects:
+            for view in self.views:
+                effect.place(view)
+
+    @property
+    def view(self) -> TrainingView:
+        """What this iteration trains on."""
+        return self.views[view_of(self.iteration, len(self.views), self.config.seed)]
+
+    @property
+    def means(self) -> Any:
+        """The means at the moment, (N, 3)."""
+        return self.optimizer[PREFIX + "means"]
+
+    @property
+    def sh_degree(self) -> int:
+        """The degree in use: one more every ``model.sh_increase_every`` iterations."""
+        model = self.config.model
+        return min(model.sh_degree, self.iteration // model.sh_increase_every)
+
+    @property
+    def num_gaussians(self) -> int:
+        """N at the moment."""
+        return self.means.shape[0]
+
+    def replan(self, iterations: int, densify_stop: int) -> None:
+        """End the fit, and changes of the population, at another iteration; only what is ahead.
+
+        What was done is what a fit does whose configuration is, from the start, as this one is now.
+
+        Raises ValueError where it would not be.
+        """
+        config, now = self.config, self.iteration
+        if densify_stop != config.densify.stop and now >= min(densify_stop, config.densify.stop):
+            raise ValueError(
+                f"Trainer.replan(): densify.stop cannot change from {config.densify.stop} to "
+                f"{densify_stop} after iteration {now}"
+            )
+        aims = [(after, end) for after, end in rate_aims(config) if after < now or after == 0]
+        if 0 < now < iterations:
+            aims.append((now, iterations))
+        changes = {
+            "iterations": iterations,
+            "densify.stop": densify_stop,
+            "optimizer.means_lr_aims": [{"after": after, "end": end} for after, end in aims],
+        }
+        self.config = changed(config, changes)
+        self.means_lr = means_rate(self.config, self.extent)
+
+    def check(self) -> None:
+        """Raise ``NonFiniteError`` if a loss, a gradient or a value is not; waits for the device.
+
+        Called before anything that saves, returns or edits the state.
+        """
+        self.watch.check()
+        values = {key.removeprefix(PREFIX): value for key, value in self.optimizer.items()}
+        check_values(self.iteration, {**values, "gradient_norms": self.statistics.gradient_norms})
+        of_views = {f"{e.name}.{k}": v for e in self.effects for k, v in e.values().items()}
+        check_view_values(self.iteration, of_views, [view.name for view in self.views])
+
+    def gaussians(self) -> Gaussians:
+        """The Gaussians as numpy arrays."""
+        self.check()
+        self.params.update(self.optimizer)
+        for effect in self.effects:
+            effect.finish(self)
+        return dr.detach(self.integrator.gaussians).numpy()
+
+    def pictures(self, views: tuple[View, ...]) -> Iterator[np.ndarray]:
+        """Pictures (H, W, 3) of views that were not trained on, display space, in [0, 1]."""
+        for effect in self.effects:
+            views = effect.measured(views)
+        return render_views(self.scene, views)
+
+    def state(self) -> dict[str, np.ndarray]:
+        """Everything that the coming iterations depend on, as numpy arrays.
+
+        Random numbers are functions of seed and iteration: they have no state.
+        """
+        self.check()
+        return {
+            "iteration": np.array(self.iteration),
+            "gradient_norms": np.array(self.statistics.gradient_norms),
+            "views": np.array(self.statistics.views),
+            **optimizer_state(self.optimizer, PREFIX),
+            **{f"{e.name}/{k}": v for e in self.effects for k, v in e.state().items()},
+        }
+
+    def restore(self, state: dict[str, np.ndarray]) -> None:
+        """Continue where :meth:`state` was taken, to the same bytes."""
+        self.iteration = int(state["iteration"])
+        restore_optimizer(self.optimizer, state, PREFIX)
+        self.statistics = densify.DensityStatistics(
+            mi.Float(state["gradient_norms"]), mi.Float(state["views"])
+        )
+        for effect in self.effects:
+            start = f"{effect.name}/"
+            own = {k.removeprefix(start): v for k, v in state.items() if k.startswith(start)}
+            effect.repopulated(self)
+            effect.restore(own)
+        self.watch = GradientWatch()
+        self.params.update(self.optimizer)
+
+    def _control_density(self, view: TrainingView) -> densify.DensityReport | None:
+        config, i = self.config.densify, self.iteration
+        if densify.gathers_statistics(config, i):
+            last = self.integrator.last
+            self.statistics = densify.accumulate(
+                self.statistics, last.means2d_grad, last.visible, view.width, view.height
+            )
+        densifies = densify.should_densify(config, i)
+        resets = densify.should_reset(config, i, self.white_background)
+        if densifies or resets:
+            self.check()
+        report = None
+        if densifies:
+            report = densify.densify_and_prune(
+                self.optimizer, self.statistics, config, self.extent, i, self.config.seed, PREFIX
+            )
+            self.statistics = self._no_statistics()
+            for effect in self.effects:
+                effect.repopulated(self)
+            # Freed arrays of sizes that will not come again would stay with Dr.Jit's allocator.
+            dr.flush_malloc_cache()
+        if resets:
+            densify.reset_opacities(self.optimizer, config, PREFIX)
+        return report
+
+    def _no_statistics(self) -> densify.DensityStatistics:
+        return densify.DensityStatistics.zeros(mi.Float, self.num_gaussians)

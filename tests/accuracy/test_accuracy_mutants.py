@@ -1,0 +1,171 @@
+"""Mutation check of the derivatives of the choices: exact response, order and colours of pixels.
+
+As in ``test_adjoint_mutants``: every partial derivative is scaled by 1.01 and changes its sign, and
+a test of the suite must notice it.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cache, partial
+
+import pytest
+import test_approximations as choices
+from support.detectors import MutationChecks, detectors, find_noticed
+from support.helpers import FLOAT64
+from support.mutants import ALWAYS, AT_EQUALITY, Instrumented, Switchboard
+
+from drgs.accuracy import exact as perspective
+from drgs.accuracy import pixel_order, ray_colors
+from drgs.splatting import rendering
+
+_REASONS = {
+    (
+        "exact.RayResponse.footprint",
+        "squared < LARGEST_EXPONENT * denominator",
+        (AT_EQUALITY, ALWAYS),
+    ): "beyond it alpha is 2^-10000 = 0: it keeps the factors of that 0 from overflowing",
+    (
+        "pixel_order._unfinished",
+        "largest(T) > 0",
+        (AT_EQUALITY, ALWAYS),
+    ): "it saves the time to visit what changes nothing",
+    (
+        "pixel_order._walk",
+        "along > 0",
+        (AT_EQUALITY,),
+    ): "an alpha at a depth of exactly 0; that it shows nothing is tested for RayResponse",
+    (
+        "pixel_order._walk",
+        "alpha >= UNORDERED_ALPHA",
+        (AT_EQUALITY,),
+    ): "an alpha of exactly 1e-4, which may be visited in either order",
+}
+
+EQUIVALENT = {
+    (function, text, "", change): reason
+    for (function, text, changes), reason in _REASONS.items()
+    for change in changes
+}
+"""Mutants that change no result of any scene here, and why: (function, source, part, change)."""
+
+
+@dataclass(frozen=True)
+class Copies:
+    """Of classes and a function, instrumented."""
+
+    response: type
+    order: type
+    colors: type
+    add_product: Callable
+
+    @staticmethod
+    def of(board: Switchboard) -> "Copies":
+        response = Instrumented(
+            board,
+            perspective,
+            derivatives=[
+                f"RayResponse.{name}"
+                for name in ("moments", "derivatives", "pack_tangents", "tangent")
+            ],
+            forward=["RayResponse.footprint", "RayResponse.geometry", "RayResponse.bounds"],
+        )
+        order = Instrumented(
+            board,
+            pixel_order,
+            derivatives=["PixelOrder.adjoint", "PixelOrder.tangent"],
+            forward=["PixelOrder.composite", "PixelOrder.keys"],
+        )
+        colors = Instrumented(
+            board,
+            ray_colors,
+            derivatives=["RayColors.add_derivatives", "RayColors.tangents"],
+            forward=["RayColors.at", "RayColors.bind"],
+        )
+        return Copies(
+            response=response["RayResponse"],
+            order=order["PixelOrder"],
+            colors=colors["RayColors"],
+            add_product=order["_add_product"],
+        )
+
+    def used_by(self, frame: rendering.Frame) -> rendering.Frame:
+        """The frame, whose forward pass is that of the package, with derivatives of the copies."""
+        model, order = frame.bins.model, frame.order
+        features = model.features
+        if isinstance(model.response, perspective.RayResponse):
+            model = replace(model, response=self.response(model.response.camera))
+        if isinstance(features, ray_colors.RayColors):
+            model = replace(model, features=self.colors(features.sh_degree, features.camera))
+        if isinstance(order, pixel_order.PixelOrder):
+            order = self.order(order.window, order.depths)
+        return replace(frame, bins=replace(frame.bins, model=model), order=order)
+
+
+@pytest.fixture(scope="module")
+def outcome():
+    board = Switchboard()
+    copies = Copies.of(board)
+    package_render, problem_render = rendering.render, cache(choices.Problem.render)
+
+    def render(problem, precision):
+        gaussians, frame = problem_render(problem, precision)
+        return gaussians, copies.used_by(frame)
+
+    def with_copies(check):
+        """For a test that uses the classes themselves."""
+
+        def run():
+            with pytest.MonkeyPatch.context() as patch:
+                patch.setattr(perspective, "RayResponse", copies.response)
+                patch.setattr(ray_colors, "RayColors", copies.colors)
+                patch.setattr(pixel_order, "_add_product", copies.add_product)
+                check()
+
+        return run
+
+    def rendering_with_copies(check):
+        """For a test that renders no ``Problem``."""
+
+        def run():
+            with pytest.MonkeyPatch.context() as patch:
+                patch.setattr(rendering, "render", lambda *a: copies.used_by(package_render(*a)))
+                check()
+
+        return run
+
+    gradients = choices.test_gradients_equal_central_differences_of_the_reference
+    transpose = partial(choices.test_adjoint_is_the_transpose_of_the_tangent, FLOAT64)
+    general = {"gradients": partial(gradients, "close", "all three, other cuts")}
+    special = {
+        "transpose": partial(transpose, "close", "all three, other cuts"),
+        "around, by depth": partial(gradients, "around", "pixel order"),
+        "around, by depth, transpose": partial(transpose, "around", "pixel order"),
+        "no opacity": with_copies(choices.test_a_splat_without_opacity_has_no_derivatives),
+        "at the camera": with_copies(choices.test_a_peak_in_the_plane_of_the_camera_shows_nothing),
+        "colour at its minimum": with_copies(
+            choices.test_a_colour_at_its_minimum_keeps_its_derivative
+        ),
+        "twice the precision": with_copies(
+            choices.test_sums_of_products_are_exact_to_twice_the_precision
+        ),
+        "hundreds of layers": rendering_with_copies(
+            choices.test_behind_hundreds_of_layers_gradients_keep_their_accuracy
+        ),
+        "twins": rendering_with_copies(
+            choices.test_twins_are_composited_in_one_order_by_picture_and_derivative
+        ),
+    }
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(choices.Problem, "render", render)
+        return find_noticed(board, detectors(general), detectors(special))
+
+
+class TestChoices(MutationChecks):
+    equivalent = EQUIVALENT
+    derivatives = """
+        exact.RayResponse.moments
+        exact.RayResponse.derivatives exact.RayResponse.tangent
+        exact.RayResponse.pack_tangents pixel_order._adjoint pixel_order._add_product
+        pixel_order._sum_pixels pixel_order._tangent ray_colors.RayColors.add_derivatives
+        ray_colors.RayColors.tangents
+    """

@@ -1,0 +1,347 @@
+"""Several samples per pixel: kernels against the reference, films against the definition."""
+
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from support.helpers import (
+    FLOAT32,
+    FLOAT64,
+    assert_arrays_agree,
+    both_precisions,
+    device_camera,
+    device_gaussians,
+    single,
+)
+from support.views import Scene, image_of, tensors
+from test_approximations import GRADIENTS, MARKED, PLANES, STEP, Problem, _planes, direction
+
+import drgs  # noqa: F401  (registers the plugin)
+from drgs.accuracy.sample_points import SamplePoints
+from drgs.gaussians.parameters import PARAMETER_NAMES
+from drgs.integrator.sampling import DrawnSamples
+from drgs.reference import rays as reference_rays
+from drgs.reference import splatting as reference
+from drgs.splatting import rendering
+
+# ----------------------------------------------------------------------------------------------
+# Kernels
+# ----------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Sampled(Problem):
+    """A choice, seen at one random point of each pixel."""
+
+    @property
+    def points(self) -> np.ndarray:
+        """(H, W, 2) in [0, 1), exact in single precision."""
+        camera = self.inputs[1]
+        rng = np.random.default_rng(9)
+        return rng.integers(0, 256, (camera.height, camera.width, 2)) / 256
+
+    @property
+    def positions(self) -> np.ndarray:
+        """(H, W, 2) px, film."""
+        camera = self.inputs[1]
+        corners = np.stack(np.meshgrid(np.arange(camera.width), np.arange(camera.height)), axis=-1)
+        return corners + self.points
+
+    def picture(self, threshold_width) -> reference.Picture:
+        return reference_rays.render(
+            *self.inputs, (0, 0, 0), self.model, None, self.positions, threshold_width
+        )
+
+    def reference_planes(self, gaussians) -> np.ndarray:
+        return _planes(
+            reference_rays.render(
+                gaussians, self.inputs[1], (0, 0, 0), self.model, None, self.positions
+            )
+        )
+
+    @property
+    def pipeline(self) -> rendering.Pipeline:
+        raise AssertionError("depends on the precision")
+
+    def render(self, precision):
+        pipeline = Problem.pipeline.fget(self)
+        points = SamplePoints(*(precision.array(p) for p in np.moveaxis(self.points, -1, 0)))
+        model = replace(pipeline.model, positions=points)
+        gaussians = device_gaussians(self.inputs[0], precision)
+        camera = device_camera(self.inputs[1], precision)
+        return gaussians, rendering.render(gaussians, camera, replace(pipeline, model=model))
+
+
+CASES = [Sampled("wide low-pass", "random"), Sampled("all three", "close")]
+
+all_cases = pytest.mark.parametrize("problem", CASES, ids=lambda p: f"{p.name}, {p.scene}")
+
+
+@both_precisions
+@all_cases
+def test_picture_at_points_equals_the_reference(precision, problem):
+    picture = problem.picture(MARKED[precision])
+    kept = ~picture.near_threshold
+    assert kept.mean() > 0.9
+    actual = problem.kernel_planes(precision)
+    assert_arrays_agree(
+        {"planes": actual[kept]}, {"planes": _planes(picture)[kept]}, PLANES[precision]
+    )
+    centers = Problem(problem.name, problem.scene).kernel_planes(precision)
+    assert np.abs(actual - centers).max() > 0.01
+
+
+@all_cases
+def test_gradients_at_points_equal_central_differences_of_the_reference(problem):
+    weights = problem.weights(seed=1)
+    gradients = problem.kernel_gradients(FLOAT64, weights)
+    for parameter in PARAMETER_NAMES:
+        d = direction(problem, parameter, seed=2)
+        moved = [
+            problem.reference_planes(
+                reference.Gaussians(
+                    **{
+                        n: getattr(problem.inputs[0], n) + sign * STEP * getattr(d, n)
+                        for n in PARAMETER_NAMES
+                    }
+                )
+            )
+            for sign in (1, -1)
+        ]
+        expected = np.sum(weights * (moved[0] - moved[1])) / (2 * STEP)
+        terms = getattr(d, parameter) * gradients[parameter]
+        assert abs(terms.sum() - expected) < 1e-6 * np.abs(terms).sum(), parameter
+
+
+@all_cases
+def test_single_precision_gradients_at_points_equal_double_precision(problem):
+    weights = problem.weights(seed=5)
+    expected = problem.kernel_gradients(FLOAT64, weights)
+    assert_arrays_agree(problem.kernel_gradients(FLOAT32, weights), expected, GRADIENTS[FLOAT32])
+
+
+# ----------------------------------------------------------------------------------------------
+# Films
+# ----------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(autouse=True)
+def variant():
+    mi.set_variant("llvm_ad_rgb")
+
+
+SCENE = Scene(count=12)
+
+
+def exposure_of(loaded, samples, seed=0):
+    """The points (samples, H, W, 2) in [0, 1) at which ``mi.render`` evaluates the pixels."""
+    sensor = loaded.sensors()[0]
+    exposure = DrawnSamples(sensor, seed, samples, {})
+    width, height = sensor.film().crop_size()
+    return np.array(
+        [np.array([p.x, p.y]).T.reshape(height, width, 2) for p in exposure.positions], np.float64
+    )
+
+
+def pictures_at(points) -> np.ndarray:
+    """(samples, H, W, 4): colour and alpha by the reference, at each sample's points."""
+    camera, window = SCENE.camera, SCENE.view.window
+    corners = np.stack(np.meshgrid(np.arange(camera.width), np.arange(camera.height)), axis=-1)
+    pictures = []
+    for inside in points:
+        positions = corners + 0.5
+        positions[window] = corners[window] + inside
+        picture = reference_rays.render(
+            SCENE.gaussians,
+            camera,
+            SCENE.background,
+            reference_rays.ImageModel(sh_degree=SCENE.rendered_degree),
+            window,
+            positions,
+        )
+        pictures.append(np.dstack([picture.image, picture.alpha]))
+    return np.array(pictures)
+
+
+# Single precision; a pixel that is near a decision may flip: the picture is bounded in the mean.
+MEAN_ERROR = 1e-5
+
+
+@pytest.mark.parametrize(
+    "sampler", ["independent", "stratified", "multijitter", "orthogonal", "ldsampler"]
+)
+def test_a_box_filter_averages_the_samples(sampler):
+    loaded = SCENE.load(samples=4, sampler=sampler)
+    image = image_of(loaded, seed=3)
+    points = exposure_of(loaded, 4, seed=3)
+    assert np.abs(image - pictures_at(points).mean(axis=0)).mean() < MEAN_ERROR
+    assert np.abs(image - image_of(SCENE.load())).max() > 0.01
+
+
+def test_points_are_those_of_the_sampler():
+    points = exposure_of(SCENE.load(samples=16, sampler="stratified"), 16)
+    cells = np.floor(points * 4).astype(int)
+    number = cells[..., 1] * 4 + cells[..., 0]
+    np.testing.assert_array_equal(
+        np.sort(number, axis=0), np.broadcast_to(np.arange(16)[:, None, None], number.shape)
+    )
+    first, again, other = (exposure_of(SCENE.load(samples=4), 4, seed=s) for s in (1, 1, 2))
+    assert np.array_equal(first, again) and not np.array_equal(first, other)
+
+
+def test_a_seed_that_was_changed_in_place_gives_other_points():
+    loaded = SCENE.load(samples=4)
+    integrator, sensor = loaded.integrator(), loaded.sensors()[0]
+    seed = mi.UInt32(0)
+
+    def picture(seed):
+        return np.array(integrator.render(loaded, sensor, seed=seed))
+
+    before = picture(seed)
+    frames = integrator.memory.rendered[0]
+    np.testing.assert_array_equal(picture(seed), before)
+    assert integrator.memory.rendered[0] is frames
+    seed += 1
+    np.testing.assert_array_equal(picture(seed), picture(1))
+    assert np.abs(picture(1) - before).max() > 1e-3
+    dr.make_opaque(seed)
+    seed += 1
+    np.testing.assert_array_equal(picture(seed), picture(2))
+
+
+def test_samples_of_one_call_replace_those_of_the_sampler():
+    few, many = SCENE.load(samples=1), SCENE.load(samples=4)
+    assert np.array_equal(image_of(few, spp=4), image_of(many))
+    assert np.array_equal(image_of(many, spp=1), image_of(few))
+
+
+@pytest.mark.parametrize("name", ["gaussian", "tent", "mitchell", "lanczos"])
+@pytest.mark.parametrize("samples", [1, 3])
+def test_a_filter_weighs_the_samples_around_a_pixel(name, samples):
+    """image = sum f(x - center) value / sum f, over the samples within the filter's radius."""
+    loaded = SCENE.load(samples=samples, rfilter=name)
+    image = image_of(loaded)
+    points = exposure_of(loaded, samples)
+    values = pictures_at(points)
+    rfilter = mi.load_dict({"type": name})
+    radius, (_, height, width, _) = rfilter.radius(), values.shape
+    reach = int(np.ceil(radius))
+
+    def weigh(x):
+        inside = np.abs(x) < radius
+        return np.where(inside, np.array(rfilter.eval(mi.Float(x.ravel()))).reshape(x.shape), 0)
+
+    total, weights = np.zeros((height, width, 4)), np.zeros((height, width, 1))
+    rows, columns = np.mgrid[:height, :width]
+    for y in range(-reach, reach + 1):
+        for x in range(-reach, reach + 1):
+            target = rows + y, columns + x
+            inside = (
+                (target[0] >= 0) & (target[0] < height) & (target[1] >= 0) & (target[1] < width)
+            )
+            for s in range(samples):
+                weight = weigh(points[s, ..., 0] - x - 0.5) * weigh(points[s, ..., 1] - y - 0.5)
+                target_inside = target[0][inside], target[1][inside]
+                np.add.at(weights, target_inside, weight[inside][:, None])
+                np.add.at(total, target_inside, (weight[..., None] * values[s])[inside])
+    # Mitsuba reads its filters from tables of 32 entries a radius, linearly: 1e-3 of a weight.
+    # Where negative lobes leave little weight, a pixel is a quotient of small numbers.
+    expected = total / weights
+    kept = weights[..., 0] > 0.2 * weights.max()
+    assert kept.mean() > 0.8
+    assert np.abs(image - expected)[kept].mean() < 3e-3
+
+
+@pytest.mark.parametrize(("samples", "rfilter"), [(3, "box"), (2, "gaussian")])
+def test_gradients_are_the_transpose_of_the_tangents(samples, rfilter):
+    """With the same seed, through film, samples, colour and background."""
+    loaded = SCENE.load(samples=samples, rfilter=rfilter)
+    integrator, sensor = loaded.integrator(), loaded.sensors()[0]
+    params = mi.traverse(loaded)
+    rng = np.random.default_rng(0)
+    weights = SCENE.weights()
+    for name in (*PARAMETER_NAMES, "background"):
+        key = f"integrator.{name}"
+        value = params[key]
+        dr.enable_grad(value)
+        d = type(value)(rng.normal(size=np.array(value).shape).astype(np.float32))
+        dr.set_grad(value, d)
+        tangent = np.array(integrator.render_forward(loaded, params, sensor, 5, samples))
+        dr.clear_grad(value)
+        integrator.render_backward(loaded, params, mi.TensorXf(weights), sensor, 5, samples)
+        terms = np.array(d, np.float64) * np.array(dr.grad(value), np.float64)
+        dr.disable_grad(value)
+        left, right = np.sum(weights * np.float64(tangent)), terms.sum()
+        size = np.abs(weights * tangent).sum() + np.abs(terms).sum()
+        assert size > 0 and abs(left - right) < 1e-5 * size, name
+
+
+def test_no_samples_are_taken_beyond_the_film():
+    """Whether or not it has a border for them."""
+    loaded = SCENE.load(samples=2)
+    pictures = [
+        image_of(loaded, sensor=mi.load_dict(sensor))
+        for border in (False, True)
+        for sensor in [SCENE.view.sensor(rfilter="gaussian", samples=2, sample_border=border)]
+    ]
+    # Atomic additions round in an order of their own.
+    np.testing.assert_allclose(*pictures, rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize("action", ["develop", "adjoint"])
+def test_more_samples_need_no_longer_kernels_for_a_filter(action):
+    """Compilers take longer than proportionally to a kernel's length."""
+    sensor = SCENE.load(rfilter="gaussian").sensors()[0]
+    width, height = sensor.film().crop_size()
+
+    def longest_kernel(samples) -> int:
+        exposure = DrawnSamples(sensor, 0, samples, {})
+        with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
+            dr.kernel_history_clear()
+            if action == "develop":
+                planes = [[dr.opaque(mi.Float, 1, width * height)] * 4] * samples
+                dr.eval(exposure.develop(planes))
+            else:
+                dr.eval(exposure.adjoint(dr.full(mi.TensorXf, 1, (height, width, 4))))
+            kernels = dr.kernel_history([dr.KernelType.JIT])
+        return max(kernel["operation_count"] for kernel in kernels)
+
+    assert longest_kernel(6) < 1.2 * longest_kernel(2)
+
+
+def test_a_box_filter_gives_the_same_bytes_in_every_run():
+    results = []
+    for _ in range(2):
+        loaded = SCENE.load(samples=4)
+        params = mi.traverse(loaded)
+        dr.enable_grad(params["integrator.means"])
+        image = mi.render(loaded, params)
+        dr.backward(dr.sum(dr.square(image), axis=None))
+        results.append([np.array(image), np.array(dr.grad(params["integrator.means"]))])
+    assert all(a.tobytes() == b.tobytes() for a, b in zip(*results, strict=True))
+
+
+def test_more_samples_come_closer_to_the_area_of_a_pixel():
+    """Splats smaller than a pixel, no low-pass: a pixel is the mean over its area. Errors of
+    stratified samples fall at least as 1 / sqrt(n).
+    """
+    gaussians = SCENE.gaussians
+    small = replace(gaussians, log_scales=single(gaussians.log_scales - 2.5))
+    settings = SCENE.settings | {"low_pass": 0.0}
+
+    def image(samples, seed):
+        loaded = mi.load_dict(
+            {
+                "type": "scene",
+                "integrator": settings | tensors(small),
+                "sensor": SCENE.view.sensor(samples=samples, sampler="stratified"),
+            }
+        )
+        return image_of(loaded, seed=seed)
+
+    exact = image(256, 1)
+    errors = [np.sqrt(np.mean((image(n, 2) - exact) ** 2)) for n in (1, 4, 16, 64)]
+    assert all(after < 0.7 * before for before, after in pairwise(errors)), errors

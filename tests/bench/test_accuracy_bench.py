@@ -1,0 +1,191 @@
+"""The ladder of accuracy: what it measures, and what it says about it."""
+
+import csv
+import json
+from dataclasses import replace
+from itertools import pairwise
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from PIL import Image
+from support import small_capture
+from support.helpers import reference_gaussians
+
+from drgs.bench import __main__ as bench
+from drgs.bench import accuracy
+from drgs.bench.scenes import bench_camera, bench_gaussians, stress_scene
+from drgs.config.load import dump_config
+from drgs.config.schema import FitConfig
+from drgs.data.types import View
+from drgs.io.ply import write_ply
+from drgs.reference import rays as reference_rays
+from drgs.results import metrics
+
+
+@pytest.fixture(scope="module")
+def subject():
+    """Three hundred splats that cover a small film."""
+    gaussians = bench_gaussians(300)
+    gaussians = replace(gaussians, log_scales=gaussians.log_scales + np.float32(1.8))
+    camera = bench_camera(24)
+    grey = np.full((24, 24, 3), 0.5, np.float32)
+    photograph = View("grey", grey, np.eye(4), camera.fx, camera.fy, camera.cx, camera.cy, 24, 24)
+    return accuracy.Subject("small", gaussians, [camera], [photograph], (1.0, 1.0, 1.0))
+
+
+def image_of(subject, **choices):
+    return accuracy.Renderer.of(accuracy.Rung("", choices), subject, subject.cameras[0]).image()
+
+
+def test_the_ladder_leads_to_the_most_accurate_form(subject):
+    """Kernels that make every accurate choice agree with it; each step on the way comes closer."""
+    accurate = accuracy.most_accurate(subject, subject.cameras[0], accuracy.LEAST_ALPHA)
+    steps = [
+        {},
+        {"projection": "exact"},
+        {"projection": "exact", "order": "pixel", "order_window": 16},
+        {"projection": "exact", "order": "pixel", "order_window": 16, **accuracy.UNCUT},
+    ]
+    errors = [np.abs(image_of(subject, **step) - accurate).mean() for step in steps]
+    assert all(after < before for before, after in pairwise(errors))
+    # Of single precision, of alphas below a millionth, and of order among faint splats.
+    assert errors[-1] < 1e-4 < errors[0]
+
+
+def test_the_most_accurate_form_is_close_to_one_without_any_cut(subject):
+    accurate = accuracy.most_accurate(subject, subject.cameras[0], accuracy.LEAST_ALPHA)
+    # Three hundred alphas of less than a millionth.
+    assert 0 < accuracy.check_on_crops(subject, accurate) < 3e-4
+    rough = accuracy.most_accurate(subject, subject.cameras[0], 1e-2)
+    assert accuracy.check_on_crops(subject, rough) > 1e-3
+
+
+def test_a_measurement_is_what_its_columns_say(subject):
+    accurate = [accuracy.most_accurate(subject, c, accuracy.LEAST_ALPHA) for c in subject.cameras]
+    rungs = [accuracy.RUNGS[0], accuracy.Rung("4 samples", {"low_pass": 0.0}, False, samples=4)]
+    default, sampled = accuracy.measure(subject, accurate, rungs, 1)
+    image = image_of(subject)
+    reference_image = reference_rays.render(
+        reference_gaussians(subject.gaussians), subject.cameras[0], (1, 1, 1)
+    ).image
+    assert np.abs(image - reference_image).mean() < 1e-5
+    assert default.psnr == pytest.approx(metrics.psnr(image, accurate[0]), abs=1e-3)
+    assert default.ssim == pytest.approx(metrics.ssim(image, accurate[0]), abs=1e-5)
+    assert default.largest_error == pytest.approx(np.abs(image - accurate[0]).max(), abs=1e-4)
+    assert default.photo_psnr == pytest.approx(
+        metrics.psnr(image, subject.photographs[0].image), abs=1e-3
+    )
+    assert 0 < default.milliseconds < default.both_milliseconds
+    assert 1000 < default.operations < sampled.operations
+
+
+def measurement(name, milliseconds, psnr, is_approximation=True):
+    return accuracy.Measurement(
+        "scene", name, is_approximation, milliseconds, 2 * milliseconds, 1, psnr, 0.9, 0.1, None
+    )
+
+
+def test_the_front_holds_what_none_is_both_faster_and_closer_than():
+    a, b, c = measurement("a", 1, 30), measurement("b", 2, 40), measurement("c", 3, 35)
+    d, other = measurement("d", 4, 50), measurement("other", 0.5, 90, is_approximation=False)
+    assert accuracy.pareto_front([d, c, other, b, a]) == [a, b, d]
+    text = accuracy.table([a, b, c, d, other])
+    assert "| a * | 1 ms, 1.00x | 2 ms, 1.00x | 1 | 30.0 dB |" in text
+    assert "| c | 3 ms" in text and "| (other) | 0 ms" in text
+
+
+def test_the_stress_scene_is_what_it_says():
+    """Its layers cross in the middle of the picture, and splats are large and near."""
+    gaussians, (camera,) = stress_scene(64)
+    assert 2 * np.degrees(np.arctan(camera.width / 2 / camera.fx)) == pytest.approx(110, abs=1e-3)
+    first, second = gaussians.means[:700], gaussians.means[700:1400]
+    for layer, sign in ((first, 1), (second, -1)):
+        x, _, z = layer.T
+        np.testing.assert_allclose(z - 3, sign * np.tan(0.7) * x, rtol=1e-4, atol=1e-5)
+    thin = np.exp(gaussians.log_scales[:1400])
+    assert (thin[:, 2] < 0.05 * thin[:, 0]).all()
+    normals = accuracy.reference.quat_to_rotation(gaussians.quats[:1400])[:, :, 2]
+    # Across their planes, whose directions are (cos, 0, +-sin).
+    for rows, sign in ((slice(0, 700), 1), (slice(700, 1400), -1)):
+        along = [np.cos(0.7), 0, sign * np.sin(0.7)]
+        assert np.abs(normals[rows] @ along).max() < 1e-6
+    near = gaussians.means[1400:1460]
+    assert (near[:, 2] < 3).all() and np.exp(gaussians.log_scales[1400:1460]).min() > 0.05
+
+
+def test_the_command_measures_a_ply_and_the_stress_scene(tmp_path, capsys, monkeypatch):
+    mi.set_variant("llvm_ad_rgb")
+    write_ply(tmp_path / "few.ply", bench_gaussians(50))
+    monkeypatch.setattr(accuracy, "SIZE", 32)
+    monkeypatch.setattr(accuracy, "RUNGS", accuracy.RUNGS[:3])
+    bench.main(["accuracy", str(tmp_path / "few.ply"), "--quick", "--out", str(tmp_path)])
+    printed = capsys.readouterr().out
+    assert "few: 50 Gaussians, 1 views" in printed and "| stress |" in printed
+    with (tmp_path / "accuracy.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [(row["scene"], row["rung"]) for row in rows] == [
+        (scene, rung) for scene in ("few", "stress") for rung in ("default", "unscented", "exact")
+    ]
+    assert Image.open(tmp_path / "accuracy.png").size[0] > 800
+
+
+def test_pixels_that_do_not_count_are_left_out(subject):
+    """Of the photograph."""
+    accurate = [accuracy.most_accurate(subject, c, accuracy.LEAST_ALPHA) for c in subject.cameras]
+    (view,), mask = subject.photographs, np.ones((24, 24), np.float32)
+    mask[:, 5:] = 0
+    masked = replace(subject, photographs=[replace(view, mask=mask)])
+    (found,) = accuracy.measure(masked, accurate, accuracy.RUNGS[:1], 1)
+    expected = metrics.psnr(image_of(subject)[:, :5], view.image[:, :5])
+    assert found.photo_psnr == pytest.approx(expected, abs=1e-3)
+    assert abs(expected - metrics.psnr(image_of(subject), view.image)) > 0.1
+
+
+def test_a_smoothing_filter_is_part_of_what_is_measured(tmp_path, subject):
+    """Of the most accurate form and of all rungs: they agree as they do without it."""
+    gaussians = subject.gaussians
+    smoothing = np.full(gaussians.num_gaussians, 0.1, np.float32)
+    write_ply(tmp_path / "smooth.ply", replace(gaussians, smoothing=smoothing))
+    found = accuracy.load_subject(tmp_path / "smooth.ply", 1)
+    assert (found.gaussians.log_scales > gaussians.log_scales).all()
+    found = replace(found, cameras=subject.cameras, background=subject.background)
+    accurate = accuracy.most_accurate(found, found.cameras[0], accuracy.LEAST_ALPHA)
+    without = accuracy.most_accurate(subject, subject.cameras[0], accuracy.LEAST_ALPHA)
+    image = image_of(found, projection="exact", order="pixel", order_window=16, **accuracy.UNCUT)
+    # What the ladder's last step leaves; the filter is as wide as the splats, and changes far more.
+    assert np.abs(image - accurate).mean() < 1e-4 < 0.01 < np.abs(accurate - without).mean()
+
+
+@pytest.mark.parametrize("has", ["lens distortion", "motion"])
+def test_views_that_are_not_of_pinholes_at_rest_are_refused(tmp_path, capsys, has):
+    """By the folder of a fit; its Gaussians can be measured alone."""
+    dataset = small_capture.make_dataset(2, 1)
+    small_capture.write_dataset(tmp_path / "data", dataset)
+    path = tmp_path / "data" / "transforms_test.json"
+    transforms = json.loads(path.read_text())
+    if has == "motion":
+        (frame,) = transforms["frames"]
+        close = np.array(frame["transform_matrix"])
+        close[0, 3] += 0.1
+        frame["transform_matrix_close"] = close.tolist()
+    else:
+        transforms["k1"] = 0.1
+    path.write_text(json.dumps(transforms))
+    fit = tmp_path / "fit"
+    fit.mkdir()
+    write_ply(fit / "point_cloud.ply", bench_gaussians(10))
+    dump_config(FitConfig(data={"path": str(tmp_path / "data")}), fit / "config.yml")
+    with pytest.raises(SystemExit) as stop:
+        bench.main(["accuracy", str(fit)])
+    assert stop.value.code == 2
+    message = capsys.readouterr().err
+    assert f"has {has}, expected pinhole cameras at rest" in message
+    assert f"give {fit / 'point_cloud.ply'} instead" in message
+
+
+def test_a_folder_without_a_fit_is_refused(tmp_path, capsys):
+    with pytest.raises(SystemExit) as stop:
+        bench.main(["accuracy", str(tmp_path)])
+    assert stop.value.code == 2
+    assert "must be the folder of a finished fit" in capsys.readouterr().err

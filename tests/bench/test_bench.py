@@ -1,0 +1,157 @@
+"""The measurements run, write what they say, and measure what they say."""
+
+import csv
+from dataclasses import replace
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from PIL import Image
+from support.helpers import FLOAT32 as SINGLE
+from support.helpers import Case, clear, device_camera, device_gaussians
+
+from drgs.bench import __main__ as bench
+from drgs.bench import limits, pairs, peers, profile, scaling, scenes, speed, stability
+from drgs.reference import splatting as reference
+from drgs.splatting import rendering
+
+
+@pytest.fixture(scope="module")
+def stability_run(tmp_path_factory):
+    out = tmp_path_factory.mktemp("bench")
+    bench.main(["stability", "--quick", "--out", str(out)])
+    return out
+
+
+def test_stability_writes_its_table_and_plot(stability_run):
+    with (stability_run / "stability.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert {row["sweep"] for row in rows} == {sweep.name for sweep in stability.sweeps()}
+    assert all(np.isfinite(float(value)) for row in rows for value in list(row.values())[1:])
+    assert Image.open(stability_run / "stability.png").size[0] > 800
+
+
+def test_stability_finds_no_error_beyond_the_conditioning(stability_run):
+    """As in test_hard_cases.py: 30 times the noise, 4 roundings in the exponential, n in a sum."""
+    with (stability_run / "stability.csv").open() as file:
+        for row in csv.DictReader(file):
+            layers = float(row["value"]) if row["sweep"] == "Stack depth" else 60
+            rounding = stability.UNIT_ROUNDOFF * (4 + np.sqrt(layers))
+            for what in ("picture", "gradient"):
+                allowed = 30 * (float(row[f"{what}_noise"]) + rounding)
+                assert 0 < float(row[what]) <= allowed, row
+            assert float(row["left_out"]) < 0.1
+
+
+def test_noise_is_that_of_single_precision():
+    """Rounding the scene to float32 changes the picture by about as much as the noise says."""
+    sweep = next(s for s in stability.sweeps() if s.name == "Anisotropy")
+    found = stability.measure(sweep, 100.0, samples=4)
+    assert 0.1 < found.storage / found.picture_noise < 10
+
+
+# ----------------------------------------------------------------------------------------------
+# Work
+# ----------------------------------------------------------------------------------------------
+
+
+def test_useful_pairs_are_those_that_the_reference_composites():
+    case = clear(Case("pairs", 40, 35, 0, count=80))
+    frame = rendering.render(
+        device_gaussians(case.gaussians, SINGLE), device_camera(case.camera, SINGLE),
+        rendering.Pipeline(0),
+    )  # fmt: skip
+    work = pairs.count_work(frame)
+    splats = reference.project(case.gaussians, case.camera)
+    order = reference._depth_order(splats.depths, splats.visible)
+    y, x = np.mgrid[: case.height, : case.width] + 0.5
+    transmittance, finished, useful = np.ones(x.shape), np.zeros(x.shape, bool), 0
+    for i in order:
+        d = np.stack([x - splats.means2d[i, 0], y - splats.means2d[i, 1]], axis=-1)
+        exponent = -0.5 * np.einsum("hwi,ij,hwj->hw", d, splats.conics[i], d)
+        alpha = np.minimum(splats.opacities[i] * np.exp(exponent), reference.ALPHA_MAX)
+        seen = (alpha >= reference.ALPHA_CUT) & ~finished
+        finished |= seen & (transmittance * (1 - alpha) < reference.TRANSMITTANCE_STOP)
+        seen &= ~finished
+        transmittance = np.where(seen, transmittance * (1 - alpha), transmittance)
+        useful += int(seen.sum())
+    assert work.useful == useful > 1000
+    assert work.useful <= work.evaluated <= 16 * work.micro_entries
+    assert work.entries <= work.micro_entries <= 16 * work.entries
+
+
+# ----------------------------------------------------------------------------------------------
+# Stages
+# ----------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def small_scene():
+    mi.set_variant("llvm_ad_rgb")
+    return scenes.Scene("small", scenes.bench_gaussians(500), scenes.bench_camera(48))
+
+
+def test_every_kernel_of_an_iteration_belongs_to_a_stage(small_scene):
+    trainer = scenes.trainer_of(small_scene)
+    trainer.step()
+    before = rendering.bin_splats
+    with profile.stage_clock() as clock:
+        report = trainer.step()
+        dr.eval(report.loss_array)
+        clock.end("optimizer and statistics")
+    assert rendering.bin_splats is before
+    assert set(clock.kernel_ms) == set(profile.STAGES)
+    assert all(spent > 0 for spent in clock.kernel_ms.values())
+
+
+def test_an_iteration_is_profiled_and_its_shares_are_shares(small_scene):
+    limit = limits.MachineLimits(multiply_adds=1e12, bytes_moved=1e11, width=8, threads=2)
+    report = speed.profile_training(small_scene, limit, rounds=2)
+    assert report.wall_ms > 0 and report.kernel_ms > 0
+    assert all(0 < share < 1 for share in report.vector_share.values())
+
+
+def test_renderers_do_not_reuse_a_frame(small_scene):
+    problem = peers.Problem(small_scene.gaussians, small_scene.camera, np.ones((48, 48, 3)))
+    renderer = peers.drgs_renderer(problem)
+    renderer.forward()
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
+        dr.kernel_history_clear()
+        renderer.forward()
+        first = len(dr.kernel_history())
+        renderer.forward()
+        assert len(dr.kernel_history()) == first >= 10
+
+
+# ----------------------------------------------------------------------------------------------
+# Scaling
+# ----------------------------------------------------------------------------------------------
+
+
+def test_exponents_are_those_of_a_power_law():
+    work = pairs.Work(1, 1, 1, 1)
+    found = [
+        scaling.Result(scaling.Point("Gaussians", n, 400, 2), 3e-3 * n**1.5, 7 * n, 0, work)
+        for n in (1000, 5000, 20_000)
+    ]
+    assert scaling.exponent(found, "milliseconds") == pytest.approx(1.5)
+    assert scaling.exponent(found, "device_bytes") == pytest.approx(1)
+
+
+def test_gaussians_keep_their_entries_as_their_number_grows():
+    """In the first sweep the film grows and the Gaussians shrink."""
+    points = [p for p in scaling.points(quick=True) if p.sweep.startswith("constant")]
+    ratios = []
+    for point in points:
+        gaussians = scenes.bench_gaussians(point.count)
+        shrunk = gaussians.log_scales + np.float32(np.log(point.scale))
+        scene = scenes.Scene(
+            "", replace(gaussians, log_scales=shrunk), scenes.bench_camera(point.size)
+        )
+        ratios.append(pairs.count_work(scenes.frame_of(scene)).entries / point.count)
+    assert len(ratios) >= 2 and max(ratios) / min(ratios) < 1.1
+
+
+def test_vector_width_is_a_power_of_two():
+    assert limits._vector_width() in (4, 8, 16)

@@ -1,0 +1,153 @@
+"""The camera of a Mitsuba sensor against the rays that the sensor itself samples."""
+
+from dataclasses import replace
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from support.views import VIEWS, View, pose
+
+from drgs.cameras.camera import Camera
+from drgs.integrator.sensors import camera_from_sensor, read_sensor
+
+all_views = pytest.mark.parametrize("view", VIEWS, ids=lambda view: view.name)
+
+# px. A float32 direction is good to 1e-7, which over a focal length of 50 px is 5e-6 px; the ray's
+# origin adds as much at a distance of 1. Measured 8e-6.
+PIXELS = 5e-5
+
+
+@pytest.fixture(scope="module", autouse=True)
+def variant():
+    mi.set_variant("llvm_ad_rgb")
+
+
+def camera_of(sensor, near=0.01) -> Camera:
+    return camera_from_sensor(read_sensor(sensor, near))
+
+
+def numbers(camera) -> dict[str, np.ndarray]:
+    """Of a Dr.Jit camera in float64."""
+    names = ("rotation", "center", "focal", "principal", "near")
+    return {n: np.array(getattr(camera, n)).astype(np.float64)[..., 0] for n in names}
+
+
+def project(camera, points) -> np.ndarray:
+    """Film positions (N, 2) in px of world points (N, 3)."""
+    c = numbers(camera)
+    x, y, z = c["rotation"] @ (points - c["center"]).T
+    assert (z > 0).all(), "points that the sensor sees must lie before the camera"
+    return np.stack([x, y], axis=-1) / z[:, None] * c["focal"] + c["principal"]
+
+
+def points_on_rays(sensor) -> tuple[np.ndarray, np.ndarray]:
+    """Points (N, 3) on the sensor's rays, and the film positions (N, 2) in px of the rays."""
+    rng = np.random.default_rng(3)
+    sample = rng.uniform(size=(2, 200)).astype(np.float32)
+    ray, _ = sensor.sample_ray(0.0, 0.5, mi.Point2f(sample), mi.Point2f(0.5))
+    points = np.array(ray(mi.Float(rng.uniform(1, 8, 200)))).T.astype(np.float64)
+    return points, sample.T.astype(np.float64) * np.array(sensor.film().crop_size())
+
+
+@all_views
+def test_points_on_a_sensors_rays_project_to_where_the_rays_start(view):
+    sensor = mi.load_dict(view.sensor())
+    points, expected = points_on_rays(sensor)
+    camera = camera_of(sensor)
+    assert np.abs(project(camera, points) - expected).max() < PIXELS
+    rows, columns = view.window
+    assert (camera.width, camera.height) == (
+        columns.stop - columns.start,
+        rows.stop - rows.start,
+    )
+
+
+@all_views
+def test_numbers_are_those_of_the_manuals_definitions(view):
+    """To float32 rounding; with the rays above, this checks the cameras of the other tests."""
+    expected, (rows, columns) = view.camera, view.window
+    actual = numbers(camera_of(mi.load_dict(view.sensor())))
+    assert actual["rotation"] == pytest.approx(expected.rotation, abs=3e-7)
+    assert np.array_equal(actual["center"], expected.center)
+    assert actual["focal"] == pytest.approx(expected.fx, rel=3e-7)
+    principal = [expected.cx - columns.start, expected.cy - rows.start]
+    assert actual["principal"] == pytest.approx(principal, abs=1e-5)
+
+
+def test_a_camera_far_from_the_origin_keeps_its_centre():
+    """Where a translation -R c would have lost 0.06 units, and a film 2 px."""
+    position = (1e6, -2e6, 5e5)
+    view = View("far", to_world=pose([0.3, -1.0, 0.5], 40, position))
+    camera = numbers(camera_of(mi.load_dict(view.sensor())))
+    assert np.array_equal(camera["center"], position)
+
+
+@pytest.mark.parametrize("near, near_clip", [(0.25, 0.5), (0.5, 0.25)])
+def test_the_larger_near_plane_wins(near, near_clip):
+    sensor = mi.load_dict(replace(VIEWS[1], near_clip=near_clip).sensor())
+    assert numbers(camera_of(sensor, near))["near"] == 0.5
+
+
+def test_a_camera_follows_its_sensor():
+    view, other = View("before"), View("after", fov=35.0, to_world=pose([1, 2, 3], 80, (1, 2, 3)))
+    sensor = mi.load_dict(view.sensor())
+    params = mi.traverse(sensor)
+    params["x_fov"] = other.fov
+    params["to_world"] = mi.load_dict(other.sensor()).world_transform()
+    params["film.crop_size"], params["film.crop_offset"] = [11, 9], [5, 3]
+    params.update()
+    expected = mi.load_dict(replace(other, crop=(5, 3, 11, 9)).sensor())
+    points, positions = points_on_rays(expected)
+    assert np.abs(project(camera_of(sensor), points) - positions).max() < PIXELS
+
+
+def test_no_number_of_a_camera_is_a_literal():
+    """A literal would be compiled into the kernels, and each view would compile its own."""
+    camera = camera_of(mi.load_dict(VIEWS[1].sensor()))
+    scalars = [v for row in camera.rotation for v in row]
+    scalars += [*camera.center, *camera.focal, *camera.principal, camera.near]
+    assert {value.state for value in scalars} == {dr.VarState.Evaluated}
+
+
+def test_other_sensors_are_refused_by_name():
+    sensor = mi.load_dict({"type": "batch", "id": "mine", "first": VIEWS[0].sensor()})
+    message = (
+        r"^splats: the sensor must be of type perspective, thinlens, orthographic or calibrated, "
+        r"got \w+ 'mine'$"
+    )
+    with pytest.raises(TypeError, match=message):
+        read_sensor(sensor, 0.01)
+
+
+def test_create_uploads_a_camera():
+    rotation, center = np.array(VIEWS[1].camera.rotation), np.array([1e6, 2.0, 3.0])
+    K = np.array([[20.0, 0, 9.5], [0, 21.0, 7.25], [0, 0, 1]])
+    camera = Camera.create(mi.Float, rotation, center, K, 19, 15, 0.25)
+    assert {n: v.tolist() for n, v in numbers(camera).items()} == {
+        "rotation": rotation.astype(np.float32).tolist(),
+        "center": center.tolist(),
+        "focal": [20.0, 21.0],
+        "principal": [9.5, 7.25],
+        "near": 0.25,
+    }
+    assert (camera.width, camera.height) == (19, 15)
+
+
+def test_films_of_all_sizes_share_their_kernels():
+    """No number of the film or the crop window is compiled into a kernel."""
+
+    def kernels(**film):
+        sensor = mi.load_dict(
+            {"type": "perspective", "film": {"type": "hdrfilm", **film}, "fov": 40.0}
+        )
+        with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
+            dr.kernel_history_clear()
+            camera = camera_from_sensor(read_sensor(sensor, 0.01))
+            dr.eval(camera)
+            return {k["hash"] for k in dr.kernel_history() if k["type"] == dr.KernelType.JIT}
+
+    first = kernels(width=33, height=21)
+    assert first and kernels(width=57, height=40) == first
+    window = {"crop_offset_x": 3, "crop_offset_y": 2, "crop_width": 11, "crop_height": 9}
+    assert kernels(width=33, height=21, **window) == first

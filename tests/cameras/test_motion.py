@@ -1,0 +1,715 @@
+"""Motion blur and rolling shutter against the float64 reference; turns; through the plugin."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cache
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from scipy.optimize import brentq
+from scipy.spatial.transform import Rotation
+from support.helpers import (
+    FLOAT32,
+    FLOAT64,
+    Cotangents,
+    assert_arrays_agree,
+    assert_pictures_agree,
+    both_precisions,
+    clear,
+    device_gaussians,
+    picture_of,
+    plane_cotangents,
+    rows,
+    single,
+)
+from support.lens_scenes import LENSES, LensCase, directions, lens_camera, moved
+from support.views import gradients_of, image_of
+from test_calibrated import (
+    CLOSE,
+    FILM,
+    FISHEYE,
+    OPENCV,
+    PINHOLE,
+    clear_gaussians,
+    splats_scene,
+)
+from test_lenses import keep_bounds, planes_of
+from test_reference_splatting import rotation_about
+
+from drgs.cameras import motion as shutter
+from drgs.cameras.camera import Camera, cameras_in_time
+from drgs.cameras.motion import (
+    Motion,
+    MotionBlur,
+    RollingShutter,
+    rotation_matrix,
+    rotation_vector,
+)
+from drgs.gaussians.parameters import PARAMETER_NAMES
+from drgs.reference import effects
+from drgs.reference import splatting as reference
+from drgs.splatting import rendering
+from drgs.splatting.projection import load_rows
+
+# Those of test_lenses.
+PICTURE = {FLOAT64: 1e-11, FLOAT32: 2e-5}
+GRADIENTS = {FLOAT64: 1e-12, FLOAT32: 5e-5}
+
+# ----------------------------------------------------------------------------------------------
+# Turns
+# ----------------------------------------------------------------------------------------------
+
+
+def matrices(values, precision) -> object:
+    """Matrix3f of (N, 3, 3)."""
+    from drgs.core.arrays import types_of
+
+    values = np.asarray(values)
+    return types_of(precision.Float).Matrix3f(
+        [[precision.array(values[:, i, j]) for j in range(3)] for i in range(3)]
+    )
+
+
+def turns() -> np.ndarray:
+    """(N, 3), radians: every size from nothing to almost half a turn, about every axis."""
+    rng = np.random.default_rng(0)
+    angles = np.concatenate([[0], 10.0 ** np.arange(-20, 0.4, 0.1), np.linspace(1, 3.1, 50)])
+    at = shutter.SLOWEST * (1 + np.array([-1e-2, -1e-6, 1e-6, 1e-2]))
+    angles = np.concatenate([angles, at])
+    axes = rng.normal(size=(len(angles), 3))
+    axes[:6] = np.concatenate([np.eye(3), -np.eye(3)])
+    axes[-20:-14] = axes[:6]
+    return single(angles[:, None] * axes / np.linalg.norm(axes, axis=1, keepdims=True))
+
+
+@both_precisions
+def test_a_turn_is_the_rotation_of_its_axis_and_angle(precision):
+    actual = np.moveaxis(np.array(rotation_matrix(precision.vectors(turns()))), -1, 0)
+    expected = Rotation.from_rotvec(turns()).as_matrix()
+    # Some roundings of numbers of size one. Measured: 4e-16 and 2e-7.
+    tolerance = {FLOAT64: 2e-15, FLOAT32: 1e-6}[precision]
+    np.testing.assert_allclose(actual, expected, rtol=0, atol=tolerance)
+
+
+@both_precisions
+def test_the_turn_of_a_rotation_is_found_again(precision):
+    rotations = Rotation.from_rotvec(turns()).as_matrix()
+    actual = rows(rotation_vector(matrices(rotations, precision)))
+    angles = np.linalg.norm(turns(), axis=1)
+    # The entries' roundings; next to half a turn, over the sine that tells the axis. Below
+    # SLOWEST the angle is its sine: off by SLOWEST^3 / 6.
+    tolerance = {FLOAT64: 1e-14, FLOAT32: 1e-6}[precision] / np.sin(np.clip(angles, 0.5, 3.1))
+    errors = np.abs(actual - turns()).max(axis=1)
+    assert (errors <= tolerance + (angles < 2 * shutter.SLOWEST) * 2e-13).all()
+
+
+@both_precisions
+def test_turns_are_found_again_from_their_own_rotations(precision):
+    """Both ways, without another computation between them."""
+    angles = np.linalg.norm(turns(), axis=1)
+    kept = turns()[angles < 2.5]
+    again = rows(rotation_vector(rotation_matrix(precision.vectors(kept))))
+    tolerance = {FLOAT64: 3e-13, FLOAT32: 2e-6}[precision]
+    np.testing.assert_allclose(again, kept, rtol=0, atol=tolerance)
+
+
+def test_derivatives_at_no_turn_are_those_of_a_small_one():
+    """(a_x)' = e_x: nothing is divided by an angle of zero."""
+    turn = FLOAT64.vectors(np.zeros((1, 3)))
+    dr.enable_grad(turn)
+    matrix = rotation_matrix(turn)
+    dr.backward(matrix[2, 1] + 10 * matrix[0, 2] + 100 * matrix[1, 0] + 1000 * matrix[0, 0])
+    assert rows(dr.grad(turn)).tolist() == [[1, 10, 100]]
+    rotation = matrices(np.eye(3)[None], FLOAT64)
+    dr.enable_grad(rotation)
+    dr.backward(rotation_vector(rotation).y)
+    gradient = np.array(dr.grad(rotation))[..., 0]
+    np.testing.assert_allclose(gradient, [[0, 0, 0.5], [0, 0, 0], [-0.5, 0, 0]], atol=1e-15)
+
+
+# ----------------------------------------------------------------------------------------------
+# Cameras that move
+# ----------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class MovingCase(LensCase):
+    """A scene before a camera that moves while it is open."""
+
+    turn: float = 0.06  # radians
+    travel: float = 0.1  # scene units
+    samples: int = 3  # of motion blur; 0: rolling shutter
+
+    @property
+    def scene(self) -> tuple[reference.Gaussians, reference.Camera]:
+        """Rotations are rotations to more than single precision: turns are products of them."""
+        gaussians, camera = super().scene
+        rotation = Rotation.from_matrix(camera.rotation).as_matrix()
+        return gaussians, replace(camera, rotation=rotation)
+
+    @property
+    def close_camera(self) -> reference.Camera:
+        """At time 1; float32 values."""
+        rng = np.random.default_rng(7)
+        turned = rotation_about(rng.normal(size=3), self.turn) @ self.camera.rotation
+        travel = rng.normal(size=3)
+        travel *= self.travel / np.linalg.norm(travel)
+        return replace(self.camera, rotation=turned, center=single(self.camera.center + travel))
+
+    def camera_at(self, time) -> reference.Camera:
+        return effects.camera_at(self.camera, self.close_camera, time)
+
+    @property
+    def picture(self) -> reference.Picture:
+        return _picture(self)
+
+    def reference_picture(self, gaussians=None, threshold_width=0.0) -> reference.Picture:
+        gaussians = gaussians or self.gaussians
+        if self.samples:
+            return effects._mean_picture(
+                [
+                    effects.render(
+                        gaussians, self.camera_at((k + 0.5) / self.samples), self.lens,
+                        self.background, threshold_width=threshold_width,
+                    )
+                    for k in range(self.samples)
+                ]
+            )  # fmt: skip
+        return rolling_picture(self, gaussians, threshold_width)
+
+    def device_camera(self, precision) -> Camera:
+        camera = super().device_camera(precision)
+        close = lens_camera(self.close_camera, self.lens, precision)
+        motion = Motion.between(camera, close.rotation, close.center)
+        if self.samples:
+            camera = replace(camera, shutter=MotionBlur(*motion, self.samples))
+        else:
+            camera = replace(camera, shutter=RollingShutter(*motion))
+        dr.make_opaque(camera)
+        return camera
+
+    def frames(self, precision, pipeline=None, gaussians=None) -> tuple[object, list]:
+        """The Gaussians on the device, and a frame for each time."""
+        device = device_gaussians(gaussians or self.gaussians, precision)
+        cameras = cameras_in_time(self.device_camera(precision))
+        return device, [rendering.render(device, c, pipeline or self.pipeline) for c in cameras]
+
+
+@cache
+def _picture(case):
+    return case.reference_picture(threshold_width=case.threshold_width)
+
+
+def time_of(case, mean) -> float:
+    """When the row that shows a mean is read: the root of its row less the time."""
+    return _time_of(case, tuple(mean))
+
+
+@cache
+def _time_of(case, mean) -> float:
+    def behind(time) -> float:
+        camera = case.camera_at(time)
+        point = (mean - camera.center) @ camera.rotation.T
+        return case.lens.film_points(camera, point[None])[0, 1] / case.height - time
+
+    if behind(0) <= 0:
+        return 0.0
+    return 1.0 if behind(1) >= 0 else brentq(behind, 0, 1, xtol=1e-15, rtol=1e-14)
+
+
+def rolling_picture(case, gaussians, threshold_width) -> reference.Picture:
+    """Each splat as a whole at the time of its mean."""
+    single_rows = [
+        reference.Gaussians(**{n: getattr(gaussians, n)[k : k + 1] for n in PARAMETER_NAMES})
+        for k in range(len(gaussians.means))
+    ]
+    cameras = [case.camera_at(time_of(case, mean)) for mean in gaussians.means]
+    splats = [effects.project(*pair, case.lens) for pair in zip(single_rows, cameras, strict=True)]
+    colors = [
+        effects.sh_colors(*pair, case.lens, case.rendered_degree)
+        for pair in zip(single_rows, cameras, strict=True)
+    ]
+    fields = ("means2d", "conics", "opacities", "depths", "visible")
+    columns = {name: np.concatenate([getattr(s, name) for s in splats]) for name in fields}
+    return reference.composite(
+        columns["means2d"], columns["conics"], columns["opacities"], np.concatenate(colors),
+        columns["depths"], columns["visible"], case.background, case.width, case.height,
+        threshold_width,
+    )  # fmt: skip
+
+
+def case_of(name, **others) -> MovingCase:
+    # A fisheye's pixels are wide.
+    turn = {"turn": 0.1 if name == "fisheye" else 0.06}
+    return MovingCase(name, 37, 29, 1, 20, lens=KINDS[name], **(turn | others))
+
+
+KINDS = {
+    "pinhole": effects.Pinhole(),
+    "rational": LENSES["rational"],
+    "fisheye": LENSES["fisheye"],
+}
+all_kinds = pytest.mark.parametrize("name", KINDS)
+# The pictures that blurred ones are a mean of have no derivatives of their own.
+kinds_and_samples = pytest.mark.parametrize(
+    ("name", "samples"),
+    [("pinhole", 2), *((name, 0) for name in KINDS)],
+    ids=["motion blur", *(f"rolling, {name}" for name in KINDS)],
+)
+
+
+@both_precisions
+@pytest.mark.parametrize("turn", [0.0, 1e-5, 0.06, 2.5])
+def test_poses_are_those_of_the_reference(precision, turn):
+    case = case_of("pinhole", turn=turn, travel=3.0)
+    camera = case.device_camera(precision)
+    for time in (0.0, 0.25, 1.0):
+        actual = camera.shutter.pose(camera, precision.Float(time))
+        expected = case.camera_at(time)
+        # Products of some ten roundings; the turn's axis is found by its sine.
+        tolerance = {FLOAT64: 1e-14, FLOAT32: 2e-6}[precision]
+        rotation = np.array(actual.rotation).astype(np.float64)[..., 0]
+        np.testing.assert_allclose(rotation, expected.rotation, rtol=0, atol=tolerance)
+        np.testing.assert_allclose(rows(actual.center)[0], expected.center, rtol=0, atol=tolerance)
+        assert actual.shutter is None
+
+
+# ----------------------------------------------------------------------------------------------
+# Motion blur
+# ----------------------------------------------------------------------------------------------
+
+
+def blurred(frames, case) -> dict[str, np.ndarray]:
+    """The mean of pictures."""
+    pictures = [picture_of(frame, case) for frame in frames]
+    return {name: np.mean([p[name] for p in pictures], axis=0) for name in pictures[0]}
+
+
+@pytest.mark.parametrize(
+    ("name", "precision"),
+    [("pinhole", FLOAT32), ("pinhole", FLOAT64), ("rational", FLOAT32)],
+    ids=["pinhole, float32", "pinhole", "rational"],
+)
+def test_motion_blur_equals_the_reference(precision, name):
+    """Pictures of one camera at other places: what a lens does to each is in test_lenses."""
+    case = clear(case_of(name))
+    expected = effects.render_motion_blur(
+        case.gaussians, case.camera, case.close_camera, 3, case.background, case.lens
+    )
+    assert not case.picture.near_threshold.any()
+    np.testing.assert_array_equal(expected.image, case.picture.image)
+    _, frames = case.frames(precision)
+    assert len(frames) == 3
+    assert_pictures_agree(blurred(frames, case), case.picture, PICTURE[precision])
+    still = (
+        case.reference_picture(case.gaussians).image
+        - effects.render(*case.scene, case.lens, case.background).image
+    )
+    assert np.abs(still).max() > 0.03
+
+
+@both_precisions
+@pytest.mark.parametrize("samples", [0, 1, 4])
+def test_a_still_camera_takes_the_plain_picture(precision, samples):
+    """To the last bit: turns of zero are the identity."""
+    case = clear(case_of("pinhole", samples=samples))
+    zero = precision.Array3f(0, 0, 0)
+    camera = lens_camera(case.camera, case.lens, precision)
+    moving = RollingShutter(zero, zero) if samples == 0 else MotionBlur(zero, zero, samples)
+    gaussians = device_gaussians(case.gaussians, precision)
+    plain = planes_of(rendering.render(gaussians, camera, case.pipeline))
+    cameras = cameras_in_time(replace(camera, shutter=moving))
+    assert len(cameras) == max(samples, 1)
+    for at_time in cameras:
+        planes = planes_of(rendering.render(gaussians, at_time, case.pipeline))
+        np.testing.assert_array_equal(planes, plain)
+    # A second pose that is the first one, from rounded matrices.
+    again = replace(case, turn=0.0, travel=0.0)
+    _, frames = again.frames(precision)
+    for frame in frames:
+        np.testing.assert_allclose(planes_of(frame), plain, rtol=0, atol=PICTURE[precision])
+
+
+# ----------------------------------------------------------------------------------------------
+# Rolling shutter
+# ----------------------------------------------------------------------------------------------
+
+
+@both_precisions
+@all_kinds
+def test_rolling_shutter_equals_splats_at_the_time_of_their_row(precision, name):
+    """Found by bisection and secants in the reference. Some are never read: above, or below."""
+    case = clear(case_of(name, samples=0))
+    times = np.array([time_of(case, mean) for mean in case.gaussians.means])
+    assert (times == 0).any() and (times == 1).any() and ((times > 0) & (times < 1)).sum() >= 8
+    _, (frame,) = case.frames(precision)
+    assert_pictures_agree(picture_of(frame, case), case.picture, PICTURE[precision])
+    still = effects.render(*case.scene, case.lens, case.background)
+    assert np.abs(case.picture.image - still.image).max() > 0.02
+
+
+def small_scene(case, rng):
+    """Round splats of half a pixel and more, side by side: what a row sees of them is known."""
+    camera = reference.Camera(
+        rotation_about([0.3, -1.0, 0.5], 0.7), np.array([0.5, -0.75, 1.0]), 40.0, 40.0, 24.0, 20.0,
+        case.width, case.height,
+    )  # fmt: skip
+    x, y = (v.ravel() for v in np.meshgrid(np.arange(5, 45, 9.5), np.arange(4, 38, 8.0)))
+    film = np.column_stack([x, y]) + rng.uniform(-1, 1, (len(x), 2))
+    z = rng.uniform(1.5, 3.0, len(x))
+    slopes = (film - [24, 20]) / 40
+    points = np.column_stack([slopes * z[:, None], z])
+    sizes = rng.uniform(0.5, 0.8, (len(x), 1)) * z[:, None] / 40
+    return (
+        reference.Gaussians(
+            means=points @ camera.rotation + camera.center,
+            quats=np.tile([1.0, 0, 0, 0], (len(x), 1)),
+            log_scales=np.log(np.repeat(sizes, 3, axis=1)),
+            logit_opacities=np.full(len(x), 1.5),
+            sh0=rng.uniform(-1, 1.7, (len(x), 1, 3)),
+            shN=np.zeros((len(x), 0, 3)),
+        ),
+        camera,
+    )
+
+
+def test_small_splats_look_as_if_each_row_had_a_picture_of_its_own():
+    """While a row is read, splats move by up to V / H = 4.9 px / 40 = 0.12 px; d rows from its mean
+    a splat is off by so much d. With a standard deviation of sigma = 0.74 px and more, low-pass
+    included, and an opacity of 0.82, alpha is off by 0.12 d 0.82 exp(-1/2) / sigma exp(-d^2 / 2
+    sigma^2), at most 0.036 (d = sigma), to the first order. Measured: 0.041.
+    """
+    case = MovingCase("small", 48, 40, 0, 25, recipe=small_scene, turn=0.1, travel=0.05, samples=0)
+    _, (frame,) = case.frames(FLOAT64)
+    actual = picture_of(frame, case)
+    expected = effects.render_rolling_shutter(
+        case.gaussians, case.camera, case.close_camera, case.background
+    )
+    still = effects.render(*case.scene, background=case.background)
+    middle = effects.render(case.gaussians, case.camera_at(0.5), background=case.background)
+    moved_by = np.abs(
+        effects.project(case.gaussians, case.close_camera).means2d
+        - effects.project(*case.scene).means2d
+    )
+    assert 3 < moved_by.max() < 5
+    errors = np.abs(actual["alpha"] - expected.alpha)
+    assert errors.max() < 0.05
+    for wrong in (still, middle):
+        assert np.abs(wrong.alpha - expected.alpha).max() > 0.5
+
+
+def test_motion_along_the_rows_is_exact_in_the_middle_of_each_row():
+    """A camera that moves to the right, and splats in the middle of rows: each is seen by its row
+    at the time at which it is projected.
+    """
+    height = 24
+    camera = reference.Camera(np.eye(3), np.zeros(3), 30.0, 30.0, 16.0, 12.0, 32, height)
+    close = replace(camera, center=np.array([0.5, 0.0, 0.0]))
+    y = np.arange(2, height, 5) + 0.5
+    points = np.column_stack([0.05 * y - 0.3, (y - 12) / 30 * 2, np.full(len(y), 2.0)])
+    gaussians = reference.Gaussians(
+        points, np.tile([1.0, 0, 0, 0], (len(y), 1)), np.full((len(y), 3), np.log(0.05)),
+        np.full(len(y), 2.0), np.zeros((len(y), 1, 3)), np.zeros((len(y), 0, 3)),
+    )  # fmt: skip
+    device = lens_camera(camera, effects.Pinhole(), FLOAT64)
+    end = lens_camera(close, effects.Pinhole(), FLOAT64)
+    motion = Motion.between(device, end.rotation, end.center)
+    device = replace(device, shutter=RollingShutter(*motion))
+    frame = rendering.render(device_gaussians(gaussians, FLOAT64), device, rendering.Pipeline(0))
+    alpha = 1 - planes_of(frame)[0].reshape(height, 32)
+    expected = effects.render_rolling_shutter(gaussians, camera, close)
+    rows_of_splats = y.astype(int)
+    np.testing.assert_allclose(
+        alpha[rows_of_splats], expected.alpha[rows_of_splats], rtol=0, atol=1e-12
+    )
+
+
+@pytest.mark.parametrize("turn", [0.03, 0.1, 0.3])
+def test_times_are_found_though_the_camera_turns_by_a_third_of_the_film(turn):
+    """Of the fraction of the turn that a splat is seen after. Measured: 3e-15."""
+    case = case_of("pinhole", samples=0, turn=turn, travel=0.0)
+    camera = case.device_camera(FLOAT64)
+    rows_of = load_rows(device_gaussians(case.gaussians, FLOAT64), 0)
+    at = camera.shutter.camera_of(rows_of.means, camera)
+    in_front = effects.project(*case.scene).visible
+    found = []
+    for n in np.flatnonzero(in_front):
+        turned = np.array(at.rotation)[..., n] @ case.camera.rotation.T
+        found.append(np.linalg.norm(Rotation.from_matrix(turned).as_rotvec()) / turn)
+    expected = [time_of(case, mean) for mean in case.gaussians.means[in_front]]
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-13)
+
+
+# ----------------------------------------------------------------------------------------------
+# Derivatives
+# ----------------------------------------------------------------------------------------------
+
+# As in test_lenses; brentq finds times to 1e-15, which over the step is 1e-9.
+DIFFERENCES = 1e-6
+
+
+def kernel_gradients(case, precision, cotangents):
+    """Of the mean over the times."""
+    gaussians, frames = case.frames(precision)
+    d_features, d_transmittance = plane_cotangents(case, cotangents, precision)
+    parts = [
+        rendering.render_adjoint(gaussians, frame, d_features, d_transmittance).parameters
+        for frame in frames
+    ]
+    return {n: np.mean([np.array(getattr(part, n)) for part in parts], 0) for n in PARAMETER_NAMES}
+
+
+@kinds_and_samples
+def test_gradients_equal_differences_of_the_reference(name, samples, monkeypatch):
+    case = clear(case_of(name, samples=samples, threshold_width=1e-3))
+    cotangents = Cotangents.random(case, seed=2)
+    keep_bounds(case, monkeypatch)
+    gradients = kernel_gradients(case, FLOAT64, cotangents)
+    step = 1e-6
+    for parameter, direction in directions(case.gaussians, seed=3).items():
+        forward, backward = (
+            case.reference_picture(moved(case.gaussians, direction, sign * step))
+            for sign in (1, -1)
+        )
+        expected = sum(
+            np.sum(getattr(cotangents, f"d_{n}") * (getattr(forward, n) - getattr(backward, n)))
+            for n in ("image", "alpha", "depth")
+        ) / (2 * step)
+        terms = getattr(direction, parameter) * gradients[parameter]
+        difference = abs(terms.sum() - expected)
+        assert difference <= DIFFERENCES * np.abs(terms).sum(), parameter
+        # One percent of any parameter's gradient would be noticed.
+        assert np.abs(0.01 * terms.sum()) > DIFFERENCES * np.abs(terms).sum(), parameter
+
+
+@pytest.mark.parametrize(
+    ("name", "samples", "precision"),
+    [
+        *(("pinhole", samples, precision) for samples in (2, 0) for precision in GRADIENTS),
+        *((name, 0, FLOAT64) for name in ("rational", "fisheye")),
+    ],
+    ids=["blur", "blur, float32", "rolling", "rolling, float32", "rational", "fisheye"],
+)
+def test_adjoint_is_the_transpose_of_the_tangent(precision, name, samples):
+    case = clear(case_of(name, samples=samples))
+    cotangents = Cotangents.random(case, seed=4)
+    gradients = kernel_gradients(case, precision, cotangents)
+    gaussians, frames = case.frames(precision)
+    d_features, d_transmittance = plane_cotangents(case, cotangents, precision)
+    weights = np.array([rows(d) for d in (d_transmittance, *d_features)])
+    for parameter, direction in directions(case.gaussians, seed=5).items():
+        tangents = device_gaussians(direction, precision)
+        planes = [rendering.render_tangent(gaussians, frame, tangents) for frame in frames]
+        left = weights * np.mean([[rows(plane) for plane in of_time] for of_time in planes], axis=0)
+        right = getattr(direction, parameter) * gradients[parameter]
+        size = np.abs(left).sum() + np.abs(right).sum()
+        assert abs(left.sum() - right.sum()) <= GRADIENTS[precision] / 5 * size, parameter
+
+
+@pytest.mark.parametrize("samples", [2, 0], ids=["motion blur", "rolling"])
+def test_single_precision_gradients_equal_double_precision(samples):
+    case = clear(case_of("pinhole", samples=samples))
+    cotangents = Cotangents.random(case)
+    expected = kernel_gradients(case, FLOAT64, cotangents)
+    assert_arrays_agree(kernel_gradients(case, FLOAT32, cotangents), expected, GRADIENTS[FLOAT32])
+
+
+def test_gradients_with_respect_to_the_motion_equal_their_own_differences():
+    """Of a rolling shutter's travel and turn: what a calibration of the motion would need."""
+    case = clear(case_of("pinhole", samples=0, threshold_width=1e-3))
+    weights = single(np.random.default_rng(1).normal(size=(5, case.height * case.width)))
+    gaussians, (frame,) = case.frames(FLOAT64)
+    gradients = rendering.frames_adjoint(
+        gaussians, [frame], [list(map(FLOAT64.array, weights))], of_camera=True
+    )
+    step = 1e-7
+    motion = frame.camera.shutter
+    # The motion's are the last of the camera's numbers.
+    for n, name in enumerate(["travel"] * 3 + ["turn"] * 3):
+        change = np.eye(3)[n % 3] * step
+        found = []
+        for sign in (1, -1):
+            value = getattr(motion, name) + FLOAT64.Array3f((sign * change).tolist())
+            camera = replace(frame.camera, shutter=replace(motion, **{name: value}))
+            dr.make_opaque(camera)
+            found.append(weights * planes_of(rendering.render(gaussians, camera, case.pipeline)))
+        terms = (found[0] - found[1]) / (2 * step)
+        actual = float(gradients.camera[n - 6][0])
+        assert abs(actual - terms.sum()) <= 1e-6 * np.abs(terms).sum(), (name, n % 3)
+
+
+# ----------------------------------------------------------------------------------------------
+# Hard cases
+# ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("samples", [2, 0], ids=["motion blur", "rolling"])
+@pytest.mark.parametrize(("turn", "travel"), [(0.5, 2.0), (2.5, 50.0), (3.0, 1e5)])
+@pytest.mark.parametrize(
+    ("name", "precision"),
+    [("pinhole", FLOAT32), ("pinhole", FLOAT64), ("fisheye", FLOAT32)],
+    ids=["pinhole, float32", "pinhole", "fisheye"],
+)
+def test_a_camera_that_moves_quickly_stays_finite(precision, samples, turn, travel, name):
+    """Past the splats, through them, away from them; and positions that are no numbers."""
+    case = case_of(name, samples=samples, turn=turn, travel=travel)
+    means = case.gaussians.means.copy()
+    means[-3:] = [[np.nan, 0, 0], [0, np.inf, 0], [-np.inf, np.nan, np.inf]]
+    cotangents = Cotangents.random(replace(case, samples=0, turn=0.0, travel=0.0))
+    d_features, d_transmittance = plane_cotangents(case, cotangents, precision)
+    gaussians, frames = case.frames(precision, gaussians=replace(case.gaussians, means=means))
+    for frame in frames:
+        assert np.isfinite(planes_of(frame)).all()
+        gradients = rendering.render_adjoint(gaussians, frame, d_features, d_transmittance)
+        for parameter in PARAMETER_NAMES:
+            values = np.array(getattr(gradients.parameters, parameter))
+            assert np.isfinite(values).all() and not values[-3:].any(), parameter
+
+
+# ----------------------------------------------------------------------------------------------
+# Through the plugin
+# ----------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def variant():
+    mi.set_variant("llvm_ad_rgb")
+
+
+SENSORS = [
+    replace(sensor, view=replace(FILM, crop=(5, 4, 26, 21)), close=CLOSE, shutter=kind)
+    for sensor in (PINHOLE, OPENCV, FISHEYE)
+    for kind in ("global", "rolling")
+]
+SAMPLES = 3
+
+
+def picture_by_reference(sensor, gaussians, threshold_width=1e-4) -> reference.Picture:
+    """Of the whole film, on black."""
+    camera = replace(sensor.camera, near=0.01)
+    case = PluginCase(
+        "plugin", camera.width, camera.height, 1, lens=sensor.lens, near_camera=camera,
+        far_camera=replace(sensor.close_camera, near=0.01),
+        samples=SAMPLES if sensor.shutter == "global" else 0,
+    )  # fmt: skip
+    return case.reference_picture(gaussians, threshold_width)
+
+
+@dataclass(frozen=True, eq=False)
+class PluginCase(MovingCase):
+    """With cameras of its own, on black. Its hash is its identity."""
+
+    near_camera: reference.Camera = None
+    far_camera: reference.Camera = None
+
+    camera = property(lambda self: self.near_camera)
+    close_camera = property(lambda self: self.far_camera)
+    background = property(lambda self: np.zeros(3))
+
+
+@pytest.mark.parametrize("sensor", SENSORS, ids=lambda s: f"{s.name}, {s.shutter}")
+def test_a_calibrated_sensors_picture_is_that_of_the_reference(variant, sensor):
+    gaussians, picture = clear_gaussians(
+        sensor, lambda gaussians: picture_by_reference(sensor, gaussians)
+    )
+    scene = splats_scene(replace_samples(sensor), gaussians)
+    expected = np.concatenate([picture.image, picture.alpha[..., None]], axis=-1)
+    np.testing.assert_allclose(image_of(scene), expected[sensor.view.window], rtol=0, atol=5e-5)
+    still = image_of(splats_scene(replace(sensor, close=None), gaussians))
+    assert np.abs(still - expected[sensor.view.window]).max() > 0.02
+
+
+def replace_samples(sensor) -> dict:
+    return sensor.dictionary(shutter_samples=SAMPLES)
+
+
+@pytest.mark.parametrize("sensor", SENSORS[:2], ids=lambda s: f"{s.name}, {s.shutter}")
+def test_gradients_add_up_over_the_times(variant, sensor):
+    """Of mi.render, in single precision, against differences of the float64 reference."""
+    gaussians, _ = clear_gaussians(
+        sensor, lambda gaussians: picture_by_reference(sensor, gaussians, threshold_width=1e-3)
+    )
+    rows_of_window, columns = sensor.view.window
+    shape = rows_of_window.stop - rows_of_window.start, columns.stop - columns.start, 4
+    weights = single(np.random.default_rng(1).normal(0, 1, shape))
+    scene = splats_scene(replace_samples(sensor), gaussians)
+    gradients = gradients_of(scene, weights, PARAMETER_NAMES)
+    step = 1e-6
+
+    def loss(sign, direction) -> np.ndarray:
+        picture = picture_by_reference(sensor, moved(gaussians, direction, sign * step))
+        image = np.concatenate([picture.image, picture.alpha[..., None]], axis=-1)
+        return weights * image[sensor.view.window]
+
+    for parameter, direction in directions(gaussians, seed=2).items():
+        expected = np.sum(loss(1, direction) - loss(-1, direction)) / (2 * step)
+        terms = getattr(direction, parameter) * gradients[parameter]
+        assert abs(terms.sum() - expected) <= 2e-5 * np.abs(terms).sum(), parameter
+        assert abs(1.01 * terms.sum() - expected) > 2e-5 * np.abs(terms).sum(), parameter
+
+
+@pytest.mark.parametrize("sensor", SENSORS[:2], ids=lambda s: f"{s.name}, {s.shutter}")
+def test_forward_derivatives_of_a_moving_camera_are_the_transpose(variant, sensor):
+    gaussians, _ = clear_gaussians(
+        sensor, lambda gaussians: picture_by_reference(sensor, gaussians)
+    )
+    scene = splats_scene(replace_samples(sensor), gaussians)
+    weights = single(np.random.default_rng(1).normal(0, 1, image_of(scene).shape))
+    gradients = gradients_of(scene, weights, PARAMETER_NAMES)
+    for parameter, direction in directions(gaussians, seed=2).items():
+        # A new scene: the derivatives that were accumulated would be taken for directions.
+        fresh = splats_scene(replace_samples(sensor), gaussians)
+        params = mi.traverse(fresh)
+        value = params[f"integrator.{parameter}"]
+        dr.enable_grad(value)
+        dr.set_grad(value, type(value)(getattr(direction, parameter).astype(np.float32)))
+        tangent = np.array(dr.forward_to(mi.render(fresh, params))).astype(np.float64)
+        left = weights * tangent
+        right = getattr(direction, parameter) * gradients[parameter]
+        size = np.abs(left).sum() + np.abs(right).sum()
+        assert abs(left.sum() - right.sum()) <= 1e-5 * size, parameter
+
+
+# ----------------------------------------------------------------------------------------------
+# Only what the scene calls for
+# ----------------------------------------------------------------------------------------------
+
+RENDERING = """
+import sys
+sys.modules["drgs." + {blocked!r}] = None  # importing it raises ImportError
+import mitsuba as mi
+mi.set_variant("llvm_ad_rgb")
+import drgs
+import numpy as np
+splats = {{
+    "type": "splats", "means": mi.TensorXf(np.zeros((1, 3), np.float32)),
+    "quats": mi.TensorXf(np.ones((1, 4), np.float32)),
+    "log_scales": mi.TensorXf(np.full((1, 3), -2, np.float32)),
+    "logit_opacities": mi.TensorXf(np.ones(1, np.float32)),
+    "sh0": mi.TensorXf(np.ones((1, 1, 3), np.float32)),
+    "shN": mi.TensorXf(np.zeros((1, 0, 3), np.float32)),
+}}
+film = {{"type": "hdrfilm", "width": 8, "height": 8}}
+T = mi.ScalarTransform4f
+sensor = {{"to_world": T().translate([0, 0, -2]), "film": film}} | {sensor}
+print(np.array(mi.render(mi.load_dict({{"type": "scene", "i": splats, "s": sensor}}))).max() > 0.1)
+"""
+
+
+MOVES = '"to_world_close": T().translate([0, 0.1, -2])'
+CALLED_FOR = {
+    "lens": ('{"type": "calibrated", "lens": "opencv"}', "cameras.radial_tangential"),
+    "orthographic": ('{"type": "orthographic"}', "cameras.orthographic"),
+    "thin lens": ('{"type": "thinlens", "aperture_radius": 0.1}', "effects.defocus"),
+    "moving": (f'{{"type": "calibrated", {MOVES}}}', "cameras.motion"),
+}
+
+
+@pytest.mark.parametrize(("sensor", "module"), CALLED_FOR.values(), ids=CALLED_FOR)
+def test_modules_are_missed_when_a_sensor_calls_for_them(run_python, sensor, module):
+    """That they are not otherwise is in test_summary, as are the kernels without them."""
+    result = run_python(RENDERING.format(blocked=module, sensor=sensor))
+    assert result.returncode != 0 and f"drgs.{module}" in result.stderr, result.stderr

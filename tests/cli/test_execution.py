@@ -1,0 +1,249 @@
+"""``--threads`` and ``--debug`` of the commands."""
+
+import platform
+import sys
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+import yaml
+from support.small_capture import blobs, make_dataset, write_dataset
+
+from drgs import fit, render
+from drgs.cli.execution import execution
+from drgs.core.errors import UserError
+from drgs.io.ply import read_ply, write_ply
+
+DEBUG = dr.JitFlag.Debug
+
+
+@pytest.fixture(scope="module", autouse=True)
+def variant():
+    mi.set_variant("llvm_ad_rgb")
+
+
+@pytest.fixture(autouse=True)
+def nothing_is_left_behind():
+    before = dr.flag(DEBUG), dr.thread_count(), sys.gettrace(), sys.stderr
+    yield
+    assert (dr.flag(DEBUG), dr.thread_count(), sys.gettrace(), sys.stderr) == before
+
+
+def read_beyond_the_end():
+    dr.eval(dr.gather(mi.UInt32, mi.UInt32(1, 2, 3), mi.UInt32(0, 7)))
+
+
+def write_beyond_the_end():
+    array = mi.Float(1, 2, 3)
+    dr.scatter(array, mi.Float(5, 6), mi.UInt32(0, 9))
+    dr.eval(array)
+
+
+# ----------------------------------------------------------------------------------------------
+# As a context
+# ----------------------------------------------------------------------------------------------
+
+
+def test_range_checks_are_on_only_if_asked_for_and_only_within():
+    for debug in (False, True):
+        with execution(threads=None, debug=debug):
+            assert dr.flag(DEBUG) == debug
+        assert not dr.flag(DEBUG)
+
+
+def test_debuggers_trace_function_is_given_back():
+    def trace(*_):
+        return None
+
+    before = sys.gettrace()
+    sys.settrace(trace)
+    try:
+        with execution(threads=None, debug=True):
+            assert sys.gettrace() is not trace  # Dr.Jit notes the lines that operations come from
+        assert sys.gettrace() is trace
+    finally:
+        sys.settrace(before)
+
+
+@pytest.mark.parametrize(
+    ("access", "line", "report"),
+    [
+        (read_beyond_the_end, 1, "drjit.gather(): out-of-bounds read from position 7 in an array"),
+        (write_beyond_the_end, 2, "drjit.scatter(): out-of-bounds write to position 9 in an array"),
+    ],
+)
+def test_access_out_of_range_is_an_error_that_names_it(capsys, access, line, report):
+    with (
+        pytest.raises(UserError) as error,
+        execution(threads=None, debug=True) as check_ranges,
+    ):
+        check_ranges()
+        access()
+        with pytest.raises(UserError, match="out-of-bounds"):
+            check_ranges()  # before the end
+    line += access.__code__.co_firstlineno
+    assert str(error.value).startswith(f"--debug: {report} of size 3. (test_execution.py:{line}); ")
+    assert report in capsys.readouterr().err  # at once, where it happened
+
+
+def test_error_of_the_block_is_not_replaced_by_a_report():
+    with pytest.raises(ZeroDivisionError), execution(threads=None, debug=True):
+        read_beyond_the_end()
+        1 / 0  # noqa: B018
+
+
+def test_threads_are_as_many_as_asked_for_within():
+    before = dr.thread_count()
+    for count in (1, before + 1):
+        with execution(threads=count, debug=False):
+            assert dr.thread_count() == count
+        assert dr.thread_count() == before
+
+
+def denormal_product(count):
+    """1e-40, where denormal numbers are kept; computed by Dr.Jit."""
+    small, smaller = dr.opaque(mi.Float, 1e-30, count), dr.opaque(mi.Float, 1e-10, count)
+    return np.array(small * smaller)
+
+
+@pytest.mark.skipif(
+    (platform.libc_ver()[0], platform.machine()) != ("glibc", "x86_64"),
+    reason="the mode is only known there",
+)
+@pytest.mark.parametrize("count", [1, 2, 5])
+def test_denormal_numbers_are_zero_on_any_number_of_threads(count):
+    with execution(threads=count, debug=False):
+        for size in (1, 64, 1_000_000):
+            assert np.all(denormal_product(size) == 0)
+    # The calling thread's own mode is given back.
+    assert np.float32(1e-30) * np.float32(1e-10) > 0
+
+
+def test_number_of_threads_that_the_system_refuses_is_the_users_to_change(monkeypatch):
+    set_thread_count = dr.set_thread_count
+
+    def refuse(count):
+        if count == 100_000:
+            raise RuntimeError("Resource temporarily unavailable")
+        set_thread_count(count)
+
+    monkeypatch.setattr(dr, "set_thread_count", refuse)
+    with (
+        pytest.raises(UserError, match=r"--threads 100000: .*: Resource temporarily"),
+        execution(threads=100_000, debug=False),
+    ):
+        pass
+
+
+# ----------------------------------------------------------------------------------------------
+# In the commands
+# ----------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("scene")
+    write_dataset(folder / "data", make_dataset(train=3, test=1))
+    values = {
+        "data": {"path": "data"},
+        "init": {"num_points": 40, "half_extent": 0.5},
+        "model": {"sh_degree": 1, "sh_increase_every": 2},
+        "densify": {"start": 1, "stop": 4, "every": 2, "reset_every": 3, "grad_threshold": 1e-6},
+        "iterations": 3,
+        "output": {"checkpoint_every": 1},
+    }
+    (folder / "a.yml").write_text(yaml.safe_dump(values))
+    write_ply(folder / "blobs.ply", blobs())
+    return folder
+
+
+@pytest.fixture
+def in_every_step(monkeypatch):
+    """Calls of ``Trainer.step`` call these, with the trainer, when they are done."""
+    acts, step = [], fit.Trainer.step
+
+    def step_and_act(trainer):
+        report = step(trainer)
+        for act in acts:
+            act(trainer)
+        return report
+
+    monkeypatch.setattr(fit.Trainer, "step", step_and_act)
+    monkeypatch.setattr(fit, "write_results", lambda *arguments: None)
+    return acts
+
+
+def fails(capsys, command, *arguments):
+    with pytest.raises(SystemExit) as exit_info:
+        command.main([str(argument) for argument in arguments])
+    assert exit_info.value.code == 2
+    return capsys.readouterr().err
+
+
+def test_fit_has_no_access_out_of_range_and_gives_the_same_bytes_with_range_checks(
+    scene, tmp_path, in_every_step, capsys
+):
+    """Across a change of the population, of the SH degree, and an opacity reset."""
+    flags = []
+    in_every_step.append(lambda trainer: flags.append(dr.flag(DEBUG)))
+    for name, options in (("plain", []), ("checked", ["--debug", "--threads", "1"])):
+        fit.main([str(scene / "a.yml"), "--out", str(tmp_path / name), *options])
+    assert flags == [False] * 3 + [True] * 3
+    assert "out-of-bounds" not in capsys.readouterr().err
+    assert read_ply(tmp_path / "plain" / "point_cloud.ply").num_gaussians > 40
+    for name in ("point_cloud.ply", "renders/test/r_0.png"):
+        plain, checked = ((tmp_path / run / name).read_bytes() for run in ("plain", "checked"))
+        assert plain == checked, name
+
+
+def test_fit_stops_at_an_access_out_of_range_and_keeps_the_last_checkpoint(
+    scene, tmp_path, in_every_step, capsys
+):
+    in_every_step.append(lambda trainer: trainer.iteration == 2 and read_beyond_the_end())
+    out = tmp_path / "out"
+    message = fails(capsys, fit, scene / "a.yml", "--out", out, "--debug").splitlines()[-1]
+    assert message.startswith("error: --debug: drjit.gather(): out-of-bounds read from position 7")
+    assert sorted(path.name for path in out.iterdir()) == ["checkpoint.npz", "config.yml"]
+    assert np.load(out / "checkpoint.npz")["trainer.iteration"] == 1
+
+
+def test_render_gives_the_same_bytes_with_range_checks(scene, tmp_path, monkeypatch, capsys):
+    flags, render_views = [], render.render_views
+
+    def render_and_note(*arguments):
+        for image in render_views(*arguments):
+            flags.append(dr.flag(DEBUG))
+            yield image
+
+    monkeypatch.setattr(render, "render_views", render_and_note)
+    for name, options in (("plain", ()), ("checked", ("--debug", "--threads", "1"))):
+        camera = ("--origin", "0", "-4", "1", "--size", "32", "24", "--out", tmp_path / name)
+        render.main([str(a) for a in (scene / "blobs.ply", *camera, *options)])
+    assert flags == [False, True]
+    assert "out-of-bounds" not in capsys.readouterr().err
+    plain, checked = ((tmp_path / run / "camera.png").read_bytes() for run in ("plain", "checked"))
+    assert plain == checked
+
+
+def test_render_fails_after_an_access_out_of_range(scene, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(render, "render_cameras", lambda *_: [read_beyond_the_end()])
+    camera = ("--origin", "0", "-4", "1", "--out", tmp_path / "out")
+    message = fails(capsys, render, scene / "blobs.ply", *camera, "--debug").splitlines()[-1]
+    assert message.startswith("error: --debug: drjit.gather(): out-of-bounds read from position 7")
+
+
+@pytest.mark.parametrize("command", [fit, render])
+@pytest.mark.parametrize(
+    ("count", "message"),
+    [
+        ("0", "error: --threads: must be >= 1, got 0\n"),
+        ("-2", "error: --threads: must be >= 1, got -2\n"),
+        ("two", "argument --threads: invalid int value: 'two'\n"),
+    ],
+)
+def test_wrong_numbers_of_threads_are_refused(scene, tmp_path, capsys, command, count, message):
+    what = scene / ("a.yml" if command is fit else "blobs.ply")
+    arguments = (what, "--out", tmp_path / "out", "--threads", count)
+    assert fails(capsys, command, *arguments).endswith(message)
+    assert not (tmp_path / "out").exists()

@@ -1,0 +1,466 @@
+"""``python -m drgs.capture``, on scenes whose pictures are known in closed form.
+
+A convex diffuse body under a sky of constant radiance L sends albedo x L everywhere and in all
+directions: nothing shades it and nothing is reflected onto it twice.
+"""
+
+import json
+import math
+import subprocess
+import sys
+from dataclasses import replace
+from itertools import product
+
+import imageio.v3 as iio
+import mitsuba as mi
+import numpy as np
+import pytest
+from conftest import REPOSITORY
+
+from drgs import capture
+from drgs.config.schema import DataConfig
+from drgs.core.errors import UserError
+from drgs.data import load_dataset, path_tracing
+from drgs.data.path_tracing import CaptureSettings
+from drgs.io.ply import read_points
+
+CENTER = np.array([0.3, -0.2, 0.5])
+RADIUS = 0.8
+ALBEDO = np.array([0.05, 0.2, 0.6])
+
+BALL = f"""
+<scene version="3.0.0">
+    <emitter type="constant"><rgb name="radiance" value="1"/></emitter>
+    <shape type="sphere">
+        <point name="center" x="{CENTER[0]}" y="{CENTER[1]}" z="{CENTER[2]}"/>
+        <float name="radius" value="{RADIUS}"/>
+        <bsdf type="diffuse"><rgb name="reflectance" value="{", ".join(map(str, ALBEDO))}"/></bsdf>
+    </shape>
+    {{extra}}
+</scene>
+"""
+
+LAMP = """
+<shape type="rectangle">
+    <transform name="to_world"><scale value="2"/><translate z="3"/></transform>
+    <emitter type="area"><rgb name="radiance" value="1"/></emitter>
+</shape>
+"""
+
+CUBE = """
+import mitsuba as mi
+
+def scene():
+    return {
+        "type": "scene",
+        "sky": {"type": "constant"},
+        "cube": {"type": "cube", "to_world": mi.ScalarTransform4f().scale(0.5)},
+    }
+"""
+
+SMALL = ["--views", "6", "--test-views", "3", "--size", "20", "--spp", "16", "--points", "600"]
+
+
+@pytest.fixture(scope="module", autouse=True)
+def variant():
+    mi.set_variant("llvm_ad_rgb")
+
+
+def write(folder, name, text):
+    path = folder / name
+    path.write_text(text)
+    return path
+
+
+@pytest.fixture(scope="module")
+def ball(tmp_path_factory):
+    return write(tmp_path_factory.mktemp("scene"), "ball.xml", BALL.format(extra=""))
+
+
+def run(scene, out, *options):
+    """The command, in this process."""
+    capture.main([str(scene), "--out", str(out), *map(str, options)])
+
+
+@pytest.fixture(scope="module")
+def captured(ball, tmp_path_factory):
+    out = tmp_path_factory.mktemp("captured") / "ball"
+    run(ball, out, *SMALL)
+    return out
+
+
+def contents(folder):
+    return {p.relative_to(folder).as_posix(): p.read_bytes() for p in folder.rglob("*.*")}
+
+
+def encode_srgb(linear):
+    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
+
+
+# Layout and cameras
+
+
+def test_layout_is_that_of_nerf_synthetic(captured):
+    assert set(contents(captured)) == {
+        *("capture.json", "points3d.ply", "transforms_train.json", "transforms_test.json"),
+        *(f"train/r_{i}.png" for i in range(6)),
+        *(f"test/r_{i}.png" for i in range(3)),
+    }
+    transforms = json.loads((captured / "transforms_train.json").read_text())
+    assert transforms["camera_angle_x"] == 0.6911112070083618
+    assert [frame["file_path"] for frame in transforms["frames"]] == [
+        f"./train/r_{i}" for i in range(6)
+    ]
+    picture = iio.imread(captured / "train" / "r_0.png")
+    assert picture.shape == (20, 20, 4)
+    assert picture.dtype == np.uint8
+
+
+def test_dataset_loads_and_its_cameras_look_at_the_object_from_above(captured):
+    dataset = load_dataset(DataConfig(path=captured))
+    assert len(dataset.train) == 6
+    assert len(dataset.test) == 3
+    # Without --distance the bounding box's sphere touches the edges of the picture.
+    distance = RADIUS * math.sqrt(3) / math.sin(path_tracing.NERF_SYNTHETIC_FOV / 2)
+    for view in dataset.train + dataset.test:
+        rotation = view.camera_to_world[:3, :3]
+        x, y, z = view.K @ rotation.T @ (CENTER - view.center)
+        # The box is stored in float32, at coordinates around 1.
+        assert x / z == pytest.approx(10, abs=1e-4)
+        assert y / z == pytest.approx(10, abs=1e-4)
+        assert z == pytest.approx(distance, rel=1e-5)
+        assert view.center[2] > CENTER[2]
+        assert rotation[2, 1] < 0, "the picture's downward axis points up"
+        assert rotation[2, 0] == pytest.approx(0, abs=1e-12), "the horizon is not level"
+        np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
+
+
+@pytest.mark.parametrize("jitter", [0.0, 1.0])
+def test_directions_are_spread_evenly_over_the_upper_hemisphere(jitter):
+    count = 100
+    directions = path_tracing.hemisphere(count, jitter, np.random.default_rng(3))
+    np.testing.assert_allclose(np.linalg.norm(directions, axis=1), 1, atol=1e-12)
+    assert (directions[:, 2] > 0).all()
+    # Uniform on the hemisphere: the mean is (0, 0, 1/2) and z is uniform in 0..1.
+    np.testing.assert_allclose(directions.mean(axis=0), [0, 0, 0.5], atol=0.04)
+    np.testing.assert_allclose(directions[:, 2], (np.arange(count) + 0.5) / count, atol=0.5 / count)
+    # No gaps: a direction in the hemisphere has a camera within two mean spacings,
+    # sqrt(2 pi / 100) = 14 degrees.
+    probes = np.random.default_rng(0).normal(size=(500, 3))
+    probes[:, 2] = abs(probes[:, 2])
+    probes /= np.linalg.norm(probes, axis=1, keepdims=True)
+    assert np.degrees(np.arccos((probes @ directions.T).max(axis=1))).max() < 28
+
+
+def test_splits_and_seeds_have_cameras_of_their_own():
+    settings = CaptureSettings(views=5, val_views=5, test_views=5)
+    first = path_tracing.plan(settings, np.zeros(3), 4.0)
+    other = path_tracing.plan(replace(settings, seed=1), np.zeros(3), 4.0)
+    centers = np.array([shot.pose[:3, 3] for shot in first + other])
+    distances = np.linalg.norm(centers[:, None] - centers[None], axis=2)
+    assert distances[~np.eye(len(centers), dtype=bool)].min() > 0.01
+
+
+@pytest.mark.parametrize("axis", ["x", "y", "z"])
+def test_hemisphere_stands_on_the_chosen_axis(axis):
+    settings = CaptureSettings(up=axis, views=9)
+    height = "xyz".index(axis)
+    for shot in path_tracing.plan(settings, np.array([1.0, 2.0, 3.0]), 4.0):
+        assert shot.pose[height, 3] > [1, 2, 3][height]
+        assert shot.pose[height, 1] > 0
+        assert np.linalg.det(shot.pose[:3, :3]) == pytest.approx(1)
+
+
+# Pictures
+
+
+def outline_radius(size):
+    """px: a sphere in the middle of the picture is a disc of this radius."""
+    distance = RADIUS * math.sqrt(3) / math.sin(path_tracing.NERF_SYNTHETIC_FOV / 2)
+    focal = size / 2 / math.tan(path_tracing.NERF_SYNTHETIC_FOV / 2)
+    return focal * math.tan(math.asin(RADIUS / distance))
+
+
+def test_alpha_is_the_coverage_of_a_disc(captured):
+    size = 20
+    radius = outline_radius(size)
+    x, y = np.meshgrid(np.arange(size) + 0.5, np.arange(size) + 0.5)
+    from_center = np.hypot(x - size / 2, y - size / 2)
+    inside, outside = from_center < radius - 0.75, from_center > radius + 0.75
+    assert inside.sum() > 40
+    assert outside.sum() > 100
+    for path in captured.glob("*/r_*.png"):
+        alpha = iio.imread(path)[:, :, 3] / 255
+        assert (alpha[inside] == 1).all()
+        assert (alpha[outside] == 0).all()
+        assert ((alpha > 0.1) & (alpha < 0.9)).sum() > 10
+        # About 2 pi r edge pixels, each with an error of at most 1/4 (16 samples in 4x4 strata).
+        assert alpha.sum() == pytest.approx(math.pi * radius**2, rel=0.02)
+
+
+def test_color_of_covered_pixels_is_encoded_radiance_not_premultiplied(captured):
+    expected = 255 * encode_srgb(ALBEDO)
+    for path in captured.glob("*/r_*.png"):
+        rgba = iio.imread(path).astype(float)
+        covered = rgba[:, :, 3] > 250
+        assert rgba[covered, :3].mean(axis=0) == pytest.approx(expected, abs=1.5)
+        # Edge pixels hold the same colour: 4 covered samples or more have little noise here.
+        edge = (rgba[:, :, 3] > 60) & ~covered
+        assert rgba[edge, :3].mean(axis=0) == pytest.approx(expected, abs=3)
+        assert (rgba[rgba[:, :, 3] == 0] == 0).all()
+
+
+def test_composite_over_white_agrees_with_a_render_before_a_white_sky(ball):
+    """Against many small pixels of a camera placed by Mitsuba, each encoded, then averaged."""
+    size, finer = 24, 8
+    settings = CaptureSettings(size=size, spp=256)
+    scene = path_tracing.load_scene(ball)
+    target, distance = path_tracing.orbit(scene, settings)
+    shot = path_tracing.plan(settings, target, distance)[60]
+    rgba = path_tracing.Camera(scene, settings).picture(shot) / 255
+    composited = rgba[:, :, :3] * rgba[:, :, 3:] + 1 - rgba[:, :, 3:]
+
+    look_at = mi.ScalarTransform4f().look_at(
+        origin=shot.pose[:3, 3].tolist(), target=target.tolist(), up=[0, 0, 1]
+    )
+    film = {"type": "hdrfilm", "width": size * finer, "height": size * finer}
+    film |= {"rfilter": {"type": "box"}, "component_format": "float32"}
+    fov = math.degrees(settings.fov)
+    sensor = mi.load_dict({"type": "perspective", "to_world": look_at, "fov": fov, "film": film})
+    seen_sky = mi.render(scene, sensor=sensor, integrator=mi.load_dict({"type": "path"}), spp=64)
+    display = encode_srgb(np.array(seen_sky).clip(0, 1))
+    expected = display.reshape(size, finer, size, finer, 3).mean(axis=(1, 3))
+
+    # Of the 64 small pixels of one at the edge, about 10 are cut by the edge themselves, and there
+    # the order of mixing and encoding matters: up to 0.25 x 10/64. Rounding and noise are smaller.
+    assert abs(composited - expected).max() < 0.05
+    assert abs(composited - expected).mean() < 0.004
+    # The check tells: mixed before it is encoded, an edge would be off by much more.
+    linear = path_tracing.Camera(scene, settings).linear(shot)
+    wrong = encode_srgb((linear[:, :, :3] + 1 - linear[:, :, 3:]).clip(0, 1))
+    assert abs(wrong - expected).max() > 0.1
+
+
+def test_lamps_are_neither_seen_nor_part_of_the_bounding_box(tmp_path, ball, captured):
+    lit = write(tmp_path, "lit.xml", BALL.format(extra=LAMP))
+    run(lit, tmp_path / "out", *SMALL)
+    for name in (f"test/r_{i}.png" for i in range(3)):
+        alpha, expected = (iio.imread(f / name)[:, :, 3] for f in (tmp_path / "out", captured))
+        # The lamp hangs between the cameras and the ball; without it the paths are others.
+        assert abs(alpha.astype(int) - expected).max() <= 64
+        assert alpha.sum() == pytest.approx(expected.sum(), rel=0.02)
+    positions, _ = read_points(tmp_path / "out" / "points3d.ply")
+    assert np.linalg.norm(positions - CENTER, axis=1).max() == pytest.approx(RADIUS, rel=1e-4)
+
+
+def test_encoding_of_known_pixels():
+    half = 0.2145  # linear value of display 0.5005
+    pixels = [[0, 0, 0, 0], [half, 0, 2, 1], [half / 2, 0, 0.5, 0.5], [1e-4, 0, 0, 1e-3]]
+    encoded = path_tracing.encode(np.array([pixels]))
+    expected = [[0, 0, 0, 0], [128, 0, 255, 255], [128, 0, 255, 128], [0, 0, 0, 0]]
+    assert encoded[0].tolist() == expected
+
+
+# Points
+
+
+def test_points_lie_on_the_sphere_with_its_color(captured):
+    positions, colors = read_points(captured / "points3d.ply")
+    assert positions.shape == (600, 3)
+    # float32 hits, from about 5 away.
+    np.testing.assert_allclose(np.linalg.norm(positions - CENTER, axis=1), RADIUS, atol=1e-5)
+    assert colors.mean(axis=0) == pytest.approx(encode_srgb(ALBEDO), abs=0.01)
+    assert positions.std(axis=0).min() > 0.2, "all points are on one side"
+
+
+def test_each_view_contributes_its_share_of_the_points_it_sees(ball, captured):
+    settings = CaptureSettings(**SETTINGS, points=600)
+    scene = path_tracing.load_scene(ball)
+    shots = path_tracing.plan(settings, *path_tracing.orbit(scene, settings))
+    positions, _ = path_tracing.visible_points(scene, settings, shots, captured)
+    for number in range(6):
+        seen = positions[100 * number : 100 * (number + 1)]
+        towards = shots[number].pose[:3, 3] - CENTER
+        # A sphere's visible cap: its normals point to the camera.
+        cosines = (seen - CENTER) @ towards / (RADIUS * np.linalg.norm(towards))
+        assert (cosines > RADIUS / np.linalg.norm(towards) - 1e-4).all()
+
+
+SETTINGS = {"views": 6, "test_views": 3, "size": 20, "spp": 16}
+
+
+def test_points_of_a_python_scene_lie_on_the_cube(tmp_path):
+    out = tmp_path / "out"
+    run(write(tmp_path, "cube.py", CUBE), out, *SMALL, "--points", 100)
+    positions, _ = read_points(out / "points3d.ply")
+    assert len(positions) == 100
+    np.testing.assert_allclose(abs(positions).max(axis=1), 0.5, atol=1e-5)
+    # Its pictures are not cut by their edges.
+    corners = np.array(list(product((-0.5, 0.5), repeat=3)))
+    for view in load_dataset(DataConfig(path=out)).train:
+        projected = (corners - view.center) @ view.camera_to_world[:3, :3] @ view.K.T
+        pixels = projected[:, :2] / projected[:, 2:]
+        assert pixels.min() > -1e-4
+        assert pixels.max() < 20 + 1e-4
+
+
+def test_points_can_be_left_out(ball, tmp_path):
+    out = tmp_path / "out"
+    run(ball, out, "--views", 1, "--test-views", 0, "--size", 4, "--spp", 1, "--points", 0)
+    assert set(contents(out)) == {"capture.json", "transforms_train.json", "train/r_0.png"}
+
+
+# The same command again
+
+
+def test_the_same_command_gives_the_same_bytes(ball, captured, tmp_path):
+    run(ball, tmp_path / "again", *SMALL)
+    assert contents(tmp_path / "again") == contents(captured)
+
+
+def test_another_seed_gives_other_pictures(ball, captured, tmp_path):
+    run(ball, tmp_path / "other", *SMALL, "--seed", 1)
+    for name in ("train/r_0.png", "test/r_0.png", "points3d.ply"):
+        assert (tmp_path / "other" / name).read_bytes() != (captured / name).read_bytes()
+
+
+def test_interrupted_capture_continues_to_the_same_bytes(
+    ball, captured, tmp_path, monkeypatch, capsys
+):
+    picture, calls = path_tracing.Camera.picture, []
+
+    def interrupted(self, shot):
+        calls.append(shot)
+        if len(calls) == 4:
+            raise KeyboardInterrupt
+        return picture(self, shot)
+
+    monkeypatch.setattr(path_tracing.Camera, "picture", interrupted)
+    with pytest.raises(SystemExit) as stop:
+        run(ball, tmp_path / "out", *SMALL)
+    assert stop.value.code == 130
+    assert "the same command continues" in capsys.readouterr().err
+    assert set(contents(tmp_path / "out")) == {
+        "capture.json",
+        *(f"train/r_{i}.png" for i in range(3)),
+    }
+    run(ball, tmp_path / "out", *SMALL)
+    assert len(calls) == 4 + 6, "pictures that were there were taken again"
+    assert contents(tmp_path / "out") == contents(captured)
+
+
+# Errors
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "message"),
+    [
+        ("missing.xml", None, "there is no such scene file"),
+        ("a.xml", "no XML", "Mitsuba cannot load the scene"),
+        ("a.xml", '<scene version="3.0.0"><shape type="ball"/></scene>', "cannot load the scene"),
+        ("a.xml", '<bsdf version="3.0.0" type="diffuse"/>', "a.xml"),
+        ("a.xml", '<scene version="3.0.0"><emitter type="constant"/></scene>', "no surfaces"),
+        ("a.py", "x = 1", "must define a function scene()"),
+        ("a.py", "def scene():\n    return []", 'must return a dictionary with "type": "scene"'),
+        ("a.py", "def scene():\n    return {'type': 'sphere'}", 'with "type": "scene"'),
+        ("a.py", "def scene():\n\n    return 1 / 0", "a.py:3: ZeroDivisionError: division by zero"),
+        ("a.py", "import nothing_of_that_name", "a.py:1: ModuleNotFoundError"),
+        ("a.py", "def scene(:", "a.py:1: SyntaxError"),
+        ("a.py", "def scene():\n    return {'type': 'scene', 's': {'type': 'ball'}}", "ball"),
+    ],
+)
+def test_wrong_scenes_are_refused_in_one_line(tmp_path, capsys, name, text, message):
+    path = tmp_path / name if text is None else write(tmp_path, name, text)
+    with pytest.raises(SystemExit) as stop:
+        run(path, tmp_path / "out")
+    assert stop.value.code == 2
+    error = capsys.readouterr().err
+    assert message in error
+    assert len(error.strip().splitlines()) == 1
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"views": 0}, "--views must be >= 1, got 0"),
+        ({"test_views": -1}, "--test-views must be >= 0, got -1"),
+        ({"size": 0}, "--size must be >= 1"),
+        ({"fov": 3.2}, "--fov must be between 0 and pi (radians), got 3.2"),
+        ({"fov": math.nan}, "--fov must be between 0 and pi"),
+        ({"distance": -1.0}, "--distance must be > 0, got -1"),
+        ({"target": (0.0, math.inf, 0.0)}, "--target must be finite"),
+    ],
+)
+def test_wrong_numbers_are_refused(options, message):
+    with pytest.raises(UserError) as error:
+        CaptureSettings(**options)
+    assert message in str(error.value)
+
+
+def refusal(scene, out, *options):
+    before = contents(out) if out.is_dir() else out.read_bytes()
+    with pytest.raises(SystemExit) as stop:
+        run(scene, out, *options)
+    assert stop.value.code == 2
+    assert (contents(out) if out.is_dir() else out.read_bytes()) == before
+
+
+def test_folders_of_others_are_left_alone(ball, captured, tmp_path, capsys):
+    write(tmp_path, "notes.txt", "mine")
+    refusal(ball, tmp_path)
+    assert "the folder is not empty and holds no capture.json" in capsys.readouterr().err
+    refusal(ball, tmp_path / "notes.txt")
+    assert "--out must be a folder" in capsys.readouterr().err
+    refusal(ball, captured, *SMALL, "--spp", 17)
+    assert "spp is 16, asked for is 17" in capsys.readouterr().err
+    other = write(tmp_path, "ball.xml", BALL.format(extra="<!-- changed -->"))
+    refusal(other, captured, *SMALL)
+    assert "the folder holds another capture: scene_sha256" in capsys.readouterr().err
+
+
+def test_a_folder_that_cannot_be_made_is_refused(ball, capsys):
+    with pytest.raises(SystemExit) as stop:
+        run(ball, "/dev/null/out", *SMALL)
+    assert stop.value.code == 2
+    assert "/dev/null" in capsys.readouterr().err
+
+
+def test_a_changed_neighbour_of_a_python_scene_is_another_scene(tmp_path):
+    helper = write(tmp_path, "capture_test_neighbour.py", "SIZE = 1")
+    path = write(tmp_path, "s.py", "import capture_test_neighbour\n" + CUBE)
+    path_tracing.load_scene(path)
+    before = capture.fingerprint(path)
+    assert capture.fingerprint(path) == before
+    helper.write_text("SIZE = 2")
+    assert capture.fingerprint(path) != before
+
+
+def test_the_command_runs_as_a_module(ball, tmp_path):
+    options = ["--views", "2", "--test-views", "1", "--size", "8", "--spp", "4", "--points", "50"]
+    command = [sys.executable, "-m", "drgs.capture", str(ball), "--out", str(tmp_path / "out")]
+    result = subprocess.run(
+        [*command, *options], cwd=REPOSITORY, capture_output=True, text=True, timeout=120
+    )
+    assert result.returncode == 0, result.stderr
+    assert "picture 3/3" in result.stdout
+    assert "50 points" in result.stdout
+    assert "\r" not in result.stdout
+
+
+# The shipped scene
+
+
+def test_shipped_scene_is_in_the_picture_and_has_hundreds_of_parts():
+    path = REPOSITORY / "scenes" / "brick_crane.py"
+    scene = path_tracing.load_scene(path)
+    low, high = path_tracing.bounding_box(scene)
+    assert np.abs([low, high]).max() < 1.2
+    assert sys.modules["drgs_capture_scene_brick_crane"].build().num_parts > 250
+    settings = CaptureSettings(size=48, spp=4, views=8, distance=4.0311, target=(0, 0, 0))
+    camera = path_tracing.Camera(scene, settings)
+    for shot in path_tracing.plan(settings, *path_tracing.orbit(scene, settings))[:8]:
+        alpha = camera.picture(shot)[:, :, 3]
+        assert not alpha[[0, -1]].any()
+        assert not alpha[:, [0, -1]].any()
+        assert (alpha == 255).mean() > 0.1

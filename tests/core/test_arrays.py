@@ -1,0 +1,79 @@
+"""Rows, packets, and numbers that come from the host."""
+
+import drjit as dr
+import numpy as np
+import pytest
+from support.helpers import both_precisions
+
+from drgs.core.arrays import (
+    empty_rows,
+    from_host,
+    interleave,
+    load_row,
+    pack_rows,
+    scatter_rows,
+    store_row,
+)
+
+UInt32 = dr.llvm.ad.UInt32
+
+
+def numbered(precision, count, length=5) -> list:
+    """Columns whose numbers say where they belong."""
+    return [precision.array(np.arange(length) * 100.0 + k) for k in range(count)]
+
+
+def table(count, length=5) -> np.ndarray:
+    return np.arange(length)[:, None] * 100.0 + np.arange(count)
+
+
+@both_precisions
+@pytest.mark.parametrize("count", [1, 2, 3, 4, 5, 8, 9, 12, 45, 64])
+def test_columns_become_rows(precision, count):
+    flat = np.array(interleave(numbered(precision, count))).reshape(-1, count)
+    np.testing.assert_array_equal(flat, table(count))
+    order = UInt32(4, 0, 3, 1, 2)
+    flat = np.array(scatter_rows(numbered(precision, count), order, 5)).reshape(-1, count)
+    np.testing.assert_array_equal(flat[np.array(order)], table(count))
+
+
+@both_precisions
+@pytest.mark.parametrize("count", [1, 4, 6, 9, 12])
+def test_rows_are_loaded_as_they_were_packed(precision, count):
+    rows = pack_rows(numbered(precision, count))
+    assert dr.width(rows) == 5 * -(-count // 4) * 4
+    lanes, active = UInt32(4, 4, 0, 2), dr.llvm.ad.Bool(True, False, True, True)
+    loaded = np.stack([np.array(v) for v in load_row(rows, count, lanes, active)], axis=1)
+    np.testing.assert_array_equal(loaded, table(count)[[4, 4, 0, 2]] * [[1], [0], [1], [1]])
+
+
+@both_precisions
+@pytest.mark.parametrize("count", [1, 4, 6, 9, 12])
+def test_rows_are_stored_where_a_lane_is_active(precision, count):
+    rows = empty_rows(precision.Float, count, 6)
+    store_row(rows, [precision.array(np.full(6, -1.0))] * count, dr.arange(UInt32, 6))
+    lanes, active = UInt32(5, 0, 2, 3, 1), dr.llvm.ad.Bool(True, True, True, False, True)
+    store_row(rows, numbered(precision, count), lanes, active)
+    stored = np.stack([np.array(v) for v in load_row(rows, count, dr.arange(UInt32, 6))], axis=1)
+    np.testing.assert_array_equal(stored[[5, 0, 2, 1]], table(count)[[0, 1, 2, 4]])
+    assert (stored[[3, 4]] == -1).all()
+
+
+@both_precisions
+def test_numbers_of_the_host_are_copied(precision):
+    values = np.arange(6.0).reshape(2, 3)
+    copy = from_host(precision.Float, values)
+    values[:] = -1
+    np.testing.assert_array_equal(np.array(copy), np.arange(6.0))
+    assert type(from_host(UInt32, [3, 1])) is UInt32 and dr.width(from_host(UInt32, [])) == 0
+
+
+def test_where_numpy_puts_numbers_makes_no_difference_to_kernels():
+    hashes = set()
+    for offset in range(8):
+        values = np.arange(64, dtype=np.float32)[offset : offset + 40]
+        with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
+            dr.kernel_history_clear()
+            dr.eval(from_host(dr.llvm.ad.Float, values) * 1.25 + 0.5)
+            hashes |= {kernel["hash"] for kernel in dr.kernel_history([dr.KernelType.JIT])}
+    assert len(hashes) == 1

@@ -1,0 +1,43 @@
+import sys
+
+import pytest
+
+from drgs.cli.errors import exit_on_user_error
+from drgs.core.errors import UserError, did_you_mean, one_line
+from drgs.core.llvm import LLVMVersionError
+
+
+def test_did_you_mean_names_the_nearest_candidate():
+    assert did_you_mean("evry", ["start", "every"]) == "; did you mean every?"
+
+
+def test_did_you_mean_finds_a_key_in_another_section():
+    names = ["model.near", "densify.every"]
+    assert did_you_mean("every", names) == "; did you mean densify.every?"
+
+
+def test_did_you_mean_is_silent_when_nothing_is_near():
+    assert did_you_mean("xyzzy", ["start", "every"]) == ""
+
+
+@pytest.mark.parametrize("error", [UserError("a.yml: wrong"), LLVMVersionError("a.yml: wrong")])
+def test_commands_report_user_errors_in_one_line(error, capsys):
+    @exit_on_user_error()
+    def command():
+        raise error
+
+    with pytest.raises(SystemExit) as exit_info:
+        command()
+    assert exit_info.value.code == 2
+    captured = capsys.readouterr()
+    assert (captured.out, captured.err) == ("", "error: a.yml: wrong\n")
+
+
+def test_commands_keep_the_traceback_of_other_errors():
+    with pytest.raises(ZeroDivisionError), exit_on_user_error():
+        print(1 / 0, file=sys.stderr)
+
+
+def test_what_others_say_fits_on_one_line():
+    assert one_line("a\n  b\tc") == "a b c"
+    assert one_line("x" * 10, limit=9) == "xxxxxx..."

@@ -1,0 +1,87 @@
+import errno
+import os
+
+import pytest
+
+from drgs.core.errors import UserError
+from drgs.core.files import atomic_path, read_text
+
+
+def test_atomic_path_replaces_the_file_and_creates_folders(tmp_path):
+    path = tmp_path / "new" / "a.txt"
+    with atomic_path(path) as temporary:
+        temporary.write_text("1")
+        assert not path.exists()
+        assert temporary.suffix == ".txt"
+    assert path.read_text() == "1"
+    assert [p.name for p in path.parent.iterdir()] == ["a.txt"]
+
+
+def test_atomic_path_keeps_the_old_file_after_an_error(tmp_path):
+    path = tmp_path / "a.txt"
+    path.write_text("old")
+    with pytest.raises(RuntimeError), atomic_path(path) as temporary:
+        temporary.write_text("half")
+        raise RuntimeError
+    assert path.read_text() == "old"
+    assert [p.name for p in tmp_path.iterdir()] == ["a.txt"]
+
+
+@pytest.mark.parametrize(
+    ("number", "message"),
+    [
+        (errno.ENOSPC, "No space left on device; free some space, or choose another disk"),
+        (errno.EACCES, "Permission denied; choose a folder that you may write to"),
+        (errno.EIO, "Input/output error"),
+    ],
+)
+@pytest.mark.parametrize("stage", ["write", "replace"])
+def test_what_the_file_system_refuses_is_the_users_to_repair(
+    tmp_path, monkeypatch, stage, number, message
+):
+    path = tmp_path / "a.txt"
+    path.write_text("old")
+
+    def refuse(*arguments, **options):
+        raise OSError(number, os.strerror(number))
+
+    if stage == "replace":
+        monkeypatch.setattr(os, "replace", refuse)
+    with pytest.raises(UserError) as error, atomic_path(path) as temporary:
+        temporary.write_text("half")
+        if stage == "write":
+            refuse()
+    assert str(error.value) == f"{path}: cannot write the file: {message}"
+    assert path.read_text() == "old"
+    assert [p.name for p in tmp_path.iterdir()] == ["a.txt"]
+
+
+def test_a_folder_is_not_replaced_by_a_file(tmp_path):
+    (tmp_path / "a.txt").mkdir()
+    message = "Is a directory; remove or rename the folder"
+    with pytest.raises(UserError, match=message), atomic_path(tmp_path / "a.txt") as temporary:
+        temporary.write_text("1")
+    assert [p.name for p in tmp_path.iterdir()] == ["a.txt"]
+
+
+def test_a_file_is_not_replaced_by_a_folder(tmp_path):
+    (tmp_path / "a").write_text("old")
+    message = "choose another folder: a part of this path is a file"
+    with pytest.raises(UserError, match=message), atomic_path(tmp_path / "a" / "b.txt"):
+        pass
+    assert (tmp_path / "a").read_text() == "old"
+
+
+def test_text_is_read_up_to_a_limit(tmp_path):
+    path = tmp_path / "a.txt"
+    path.write_bytes(b"\xc3\xa4b")
+    assert read_text(path, "poem", 3) == "äb"
+    with pytest.raises(UserError) as error:
+        read_text(path, "poem", 2)
+    assert str(error.value) == f"{path}: cannot read the poem: more than 2 bytes"
+    path.write_bytes(b"ab\xff")
+    with pytest.raises(UserError) as error:
+        read_text(path, "poem", 9)
+    assert str(error.value) == f"{path}: cannot read the poem: not UTF-8 text (byte 2)"
+    with pytest.raises(UserError, match="cannot read the poem: Is a directory"):
+        read_text(tmp_path, "poem", 9)

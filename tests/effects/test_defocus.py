@@ -1,0 +1,494 @@
+"""Depth of field against the float64 reference and against many samples of the aperture."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import drjit as dr
+import numpy as np
+import pytest
+from support.helpers import (
+    FLOAT32,
+    FLOAT64,
+    Cotangents,
+    assert_arrays_agree,
+    assert_pictures_agree,
+    both_precisions,
+    clear,
+    device_gaussians,
+    picture_of,
+    plane_cotangents,
+    render_composed,
+    rows,
+    single,
+)
+from support.lens_scenes import (
+    LENSES,
+    PINHOLE,
+    LensCase,
+    directions,
+    lens_camera,
+    moved,
+)
+from test_lenses import covariances, keep_bounds, kernel_gradients, planes_of, tiny_scene
+from test_reference_effects import camera_at_origin, gaussians_at
+from test_reference_splatting import numeric_gradients
+
+from drgs.accuracy.pipeline import pipeline_of
+from drgs.cameras import thin_lens
+from drgs.config.approximations import Approximations
+from drgs.effects.defocus import Defocused
+from drgs.gaussians.parameters import PARAMETER_NAMES
+from drgs.reference import effects
+from drgs.reference import splatting as reference
+from drgs.reference.effects import ThinLens
+from drgs.splatting import rendering
+from drgs.splatting.projection import compensated_opacity, ewa, load_rows, plain_opacity, project
+
+# Blurred by up to 3 px: f a |1 / focus - 1 / z| with f = 26 px and z from 1 to 4.
+DEFOCUS = ThinLens(0.21875, 2.0)
+SCENES = {
+    "plain": {},
+    "antialiased": {"antialiased": True},
+    "distorted": {"lens": LENSES["rational"]},
+}
+all_scenes = pytest.mark.parametrize("scene", SCENES.values(), ids=SCENES)
+
+# Those of test_lenses.
+PICTURE = {FLOAT64: 1e-11, FLOAT32: 2e-5}
+GRADIENTS = {FLOAT64: 1e-12, FLOAT32: 5e-5}
+DIFFERENCES = 1e-6
+
+
+def case_of(scene, **others) -> LensCase:
+    return LensCase("defocus", 37, 29, 1, **({"defocus": DEFOCUS} | scene | others))
+
+
+# ----------------------------------------------------------------------------------------------
+# Pictures
+# ----------------------------------------------------------------------------------------------
+
+
+@both_precisions
+@all_scenes
+def test_picture_equals_the_reference(precision, scene):
+    case = clear(case_of(scene))
+    _, frame = case.render(precision)
+    assert_pictures_agree(picture_of(frame, case), case.picture, PICTURE[precision])
+    sharp = effects.render(*case.scene, case.lens, case.background, case.antialiased)
+    assert np.abs(case.picture.image - sharp.image).max() > 0.05
+
+
+@both_precisions
+def test_an_aperture_of_zero_takes_the_pinholes_picture(precision):
+    case = clear(case_of({}, defocus=ThinLens(0.0, 2.0)))
+    gaussians, frame = case.render(precision)
+    sharp = render_composed(gaussians, replace(frame.camera, aperture=None), case.pipeline)
+    # The same covariance; the factor of the opacity is x / x.
+    np.testing.assert_array_equal(planes_of(frame), planes_of(sharp))
+
+
+def splats_of(gaussians, camera, precision, defocus, rule=plain_opacity, low_pass=0.3):
+    """Projected by the kernels, sharp if ``defocus`` is None."""
+    device = lens_camera(camera, PINHOLE, precision)
+    shape = ewa
+    if defocus is not None:
+        numbers = (dr.opaque(precision.Float, n) for n in vars(defocus).values())
+        device = replace(device, aperture=thin_lens.Aperture(*numbers))
+        shape = Defocused(ewa)
+    parameter_rows = load_rows(device_gaussians(gaussians, precision), 0)
+    return project(parameter_rows, device, 0, rule, shape, low_pass=low_pass)
+
+
+@both_precisions
+def test_a_splat_in_focus_is_not_blurred(precision):
+    """Nor dimmed; those before and behind it are."""
+    camera = camera_at_origin(fx=200.0, fy=200.0)
+    points = [[0.25, -0.125, 0.5], [0.5, 0.25, 2.0], [-1.0, 0.5, 8.0]]
+    gaussians = replace(
+        gaussians_at(points, [0.05, 0.1, 0.02]), quats=single([[0.3, 0.8, -0.5, 0.1]] * 3)
+    )
+    blurred, sharp = (
+        splats_of(gaussians, camera, precision, defocus) for defocus in (ThinLens(0.125, 2.0), None)
+    )
+    for name in ("whitening", "variances", "opacities"):
+        a, b = (rows(getattr(splats, name)) for splats in (blurred, sharp))
+        np.testing.assert_array_equal(a[1], b[1])
+        assert (np.abs(a[[0, 2]] / b[[0, 2]] - 1).reshape(2, -1).max(axis=1) > 0.1).all()
+    np.testing.assert_array_equal(rows(blurred.means2d), rows(sharp.means2d))
+    np.testing.assert_array_equal(rows(blurred.depths), rows(sharp.depths))
+
+
+@both_precisions
+@pytest.mark.parametrize("rule", [plain_opacity, compensated_opacity], ids=lambda f: f.__name__)
+@pytest.mark.parametrize("scale", [0.1, 1e-3, 1e-6])
+@pytest.mark.parametrize("low_pass", [0.3, 0.0])
+def test_the_integral_of_a_splat_stays(precision, rule, scale, low_pass):
+    """2 pi opacity sqrt(det cov2d). Also of splats that are far thinner than the low-pass."""
+    camera = camera_at_origin(fx=200.0, fy=200.0)
+    gaussians = gaussians_at([[0.25, -0.125, 1.0]], [[scale, 2 * scale, 0.5 * scale]])
+    integrals, sizes = [], []
+    for defocus in (DEFOCUS, None):
+        splats = splats_of(gaussians, camera, precision, defocus, rule, low_pass)
+        p, _, s = rows(splats.whitening)[0]
+        integrals.append(rows(splats.opacities)[0] / (p * s))
+        sizes.append(1 / (p * s))
+    rounding = float(np.finfo(precision.dtype).eps)
+    assert integrals[0] == pytest.approx(integrals[1], rel=64 * rounding)
+    assert sizes[0] > sizes[1] + 100
+
+
+def test_the_sum_of_alpha_over_the_film_stays():
+    """Of one splat without cut-offs: sums of a smooth function are its integral."""
+    camera = camera_at_origin(fx=40.0, fy=40.0, cx=30.0, cy=24.0, width=60, height=48)
+    gaussians = single_splat([0.05, -0.025, 1.0], 0.05)
+    pipeline = pipeline_of(Approximations(alpha_cut=0.0, transmittance_stop=0.0), 0)
+    sums = []
+    for defocus in (ThinLens(0.1, 2.0), None):
+        device = device_gaussians(gaussians, FLOAT64)
+        frame = render_composed(device, aperture_camera(camera, FLOAT64, defocus), pipeline)
+        sums.append((1 - planes_of(frame)[0]).sum())
+    # The blurred splat has a standard deviation of 2.3 px: its tails end within the film.
+    assert sums[0] == pytest.approx(sums[1], rel=1e-9)
+
+
+def single_splat(point, scale) -> reference.Gaussians:
+    return gaussians_at([point], scale)
+
+
+def aperture_camera(camera, precision, defocus):
+    device = lens_camera(camera, PINHOLE, precision)
+    if defocus is None:
+        return device
+    numbers = (dr.opaque(precision.Float, n) for n in vars(defocus).values())
+    return replace(device, aperture=thin_lens.Aperture(*numbers))
+
+
+# ----------------------------------------------------------------------------------------------
+# Against many samples of the aperture
+# ----------------------------------------------------------------------------------------------
+
+
+def separate_scene() -> tuple[reference.Gaussians, reference.Camera]:
+    """12 splats side by side on a 64 x 48 film, at depths of 1 to 6: no two overlap."""
+    rng = np.random.default_rng(0)
+    camera = camera_at_origin(fx=60.0, fy=60.0, cx=32.0, cy=24.0, width=64, height=48)
+    x, y = (v.ravel() for v in np.meshgrid(8 + 16 * np.arange(4), 8 + 16 * np.arange(3)))
+    z = np.geomspace(1, 6, 12)[rng.permutation(12)]
+    slopes = (np.column_stack([x, y]) + rng.uniform(-1, 1, (12, 2)) - [32, 24]) / 60
+    points = np.column_stack([slopes * z[:, None], z])
+    gaussians = gaussians_at(points, (rng.uniform(1, 1.6, (12, 3)) * z[:, None] / 60), 0.7)
+    gaussians = replace(gaussians, quats=rng.normal(0, 1, (12, 4)))
+    return replace(gaussians, sh0=rng.uniform(-1, 1.7, (12, 1, 3))), camera
+
+
+# By aperture: PSNR (dB) of the blurred picture and of the sharp one. Measured: 73.8 and 52.6, 63.5
+# and 41.7, 51.6 and 33.1, 45.5 and 27.7.
+SAMPLED = {0.03125: (73, 53), 0.0625: (63, 42), 0.125: (51, 34), 0.25: (45, 28)}
+
+
+@pytest.mark.parametrize("aperture_radius", SAMPLED)
+def test_pictures_are_nearly_those_of_many_samples_of_the_aperture(aperture_radius):
+    """A disc and a Gaussian of its variance differ in shape, by the square of its area over the
+    splat's. The splats have standard deviations of 1 to 1.6 px, the discs radii of up to 0.9, 1.9,
+    3.8 and 7.5 px.
+    """
+    gaussians, camera = separate_scene()
+    defocus = ThinLens(aperture_radius, 2.0)
+    expected, _ = effects.render_lens_samples(gaussians, camera, defocus, 400)
+    found = []
+    for used in (defocus, None):
+        device = device_gaussians(gaussians, FLOAT64)
+        frame = render_composed(
+            device, aperture_camera(camera, FLOAT64, used), rendering.Pipeline(0)
+        )
+        image = np.moveaxis(planes_of(frame)[1:].reshape(3, camera.height, camera.width), 0, -1)
+        found.append(-10 * np.log10(np.mean((image - expected) ** 2)))
+    psnr, sharp = SAMPLED[aperture_radius]
+    assert found[0] > psnr and found[1] < sharp
+
+
+# ----------------------------------------------------------------------------------------------
+# Surfaces far out of focus
+# ----------------------------------------------------------------------------------------------
+
+FAR = ThinLens(0.4, 1.0)
+"""At the wall's depth, 4, points are spread over discs with a radius of 12 px."""
+
+
+def wall() -> tuple[reference.Gaussians, reference.Camera]:
+    """A plane of splats, one each half px, of 0.6 px and opacity 0.2; its colour changes slowly.
+
+    Out of focus they have an opacity of 0.0017, less than half of what is cut in focus.
+    """
+    camera = camera_at_origin(fx=40.0, fy=40.0, cx=6.0, cy=4.5, width=12, height=9)
+    x, y = (v.ravel() for v in np.mgrid[-24:36:0.5, -24:33:0.5])
+    # In any order: all are equally far, and those that come first are composited first.
+    shuffled = np.random.default_rng(0).permutation(x.size)
+    x, y = x[shuffled], y[shuffled]
+    points = 4 * np.column_stack([(x - 6) / 40, (y - 4.5) / 40, np.ones(x.size)])
+    colors = np.column_stack([0.7 + 0.02 * x, -0.9 + 0 * x, 0.2 - 0.02 * y])
+    return replace(gaussians_at(points, 0.01, 0.2), sh0=colors[:, None]), camera
+
+
+def planes_of_wall(precision=FLOAT64, pipeline=None) -> np.ndarray:
+    gaussians, camera = wall()
+    device = device_gaussians(gaussians, precision)
+    camera = aperture_camera(camera, precision, FAR)
+    return planes_of(render_composed(device, camera, pipeline or rendering.Pipeline(0)))
+
+
+def test_a_wall_out_of_focus_keeps_its_alpha_and_its_colour():
+    """As many pinhole pictures have them.
+
+    With S the sum of all alphas at a pixel, a wall of splats that are hardly there lets exp(-S)
+    through; one of splats of opacity o lets exp(-S (1 + o / 4 + o^2 / 9 + ...)) through, where the
+    integral of -ln(1 - alpha) over a splat is that of alpha times the parenthesis: for S = 1.55,
+    0.212 and 0.201. What remains is the grain of 64 pictures. Measured: 0.001.
+    """
+    gaussians, camera = wall()
+    device = device_gaussians(gaussians, FLOAT64)
+    pinholes = [aperture_camera(c, FLOAT64, None) for c in effects.lens_cameras(camera, FAR, 64)]
+    pictures = [planes_of(render_composed(device, c, rendering.Pipeline(0))) for c in pinholes]
+    mean, found = np.mean(pictures, axis=0), planes_of_wall()
+    thicker = 1 + 0.2 / 4 + 0.2**2 / 9 + 0.2**3 / 16
+    np.testing.assert_allclose(found[0] ** thicker, mean[0], rtol=0, atol=0.004)
+    np.testing.assert_allclose(found[1:] / (1 - found[0]), mean[1:] / (1 - mean[0]), atol=0.004)
+    assert mean[0].min() > 0.1 and mean[0].max() < 0.3
+
+
+@both_precisions
+def test_a_wall_out_of_focus_is_that_of_the_reference(precision):
+    """Which evaluates each splat at each pixel, up to the alpha at which it ends."""
+    gaussians, camera = wall()
+    expected = effects.render(gaussians, camera, defocus=FAR)
+    found = planes_of_wall(precision)
+    # Of 5000 splats at each pixel some hundreds end there within a rounding of its centre.
+    np.testing.assert_allclose(found[0], expected.transmittance.ravel(), rtol=0, atol=1e-5)
+    np.testing.assert_allclose(found[1:].T, expected.image.reshape(-1, 3), rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize("order", ["center", "pixel"])
+def test_a_wall_out_of_focus_is_as_opaque_with_exact_splats(order):
+    """They are small beside their distance. Which of equally far ones is first is open."""
+    found = planes_of_wall(pipeline=pipeline_of(Approximations(projection="exact", order=order), 0))
+    # A splat is seen from 12 px away, at an angle whose square is 0.09, as that much longer.
+    # Measured: 0.0002.
+    np.testing.assert_allclose(found[0], planes_of_wall()[0], rtol=0, atol=1e-3)
+
+
+def test_splats_out_of_focus_end_where_they_do_in_focus():
+    """An alpha of 1 / 255 is 1 / 51 of the largest, below which lies that part of the integral; at
+    an extent of 2 standard deviations it is exp(-2).
+    """
+    depths = [
+        -np.log(planes_of_wall(pipeline=pipeline_of(choices, 0))[0])
+        for choices in (Approximations(alpha_cut=0.0), Approximations(), Approximations(extent=2.0))
+    ]
+    for depth, part in zip(depths, (0, 1 / 51, math.exp(-2)), strict=True):
+        # The squares of alphas count half as much, of up to 0.0017; and a circle's edge in pixels.
+        np.testing.assert_allclose(depth, (1 - part) * depths[0], rtol=0.002)
+
+
+@both_precisions
+def test_splats_that_are_not_seen_in_focus_are_not_seen_out_of_focus(precision):
+    """Opacities around 1 / 255; dimmed far below it, and down to where no sum notices."""
+    opacities = np.array([0.3, 0.004, 0.0038, 0.3])
+    camera = camera_at_origin(fx=40.0, fy=40.0, cx=6.0, cy=4.5, width=12, height=9)
+    gaussians = gaussians_at(np.tile([0, 0, 4.0], (4, 1)), [[0.01], [0.01], [0.01], [1e-9]])
+    gaussians = replace(gaussians, logit_opacities=single(np.log(opacities / (1 - opacities))))
+    for low_pass, visible in ((0.3, [1, 1, 0, 1]), (1e-18, [1, 1, 0, 0])):
+        splats = splats_of(gaussians, camera, precision, FAR, low_pass=low_pass)
+        expected = effects.project(gaussians, camera, low_pass=low_pass, defocus=FAR)
+        np.testing.assert_array_equal(np.array(splats.visible), visible)
+        np.testing.assert_array_equal(expected.visible, visible)
+        assert rows(splats.opacities).max() < reference.ALPHA_CUT
+
+
+# ----------------------------------------------------------------------------------------------
+# Derivatives
+# ----------------------------------------------------------------------------------------------
+
+
+def test_each_number_of_the_gradients_equals_a_difference_of_the_reference():
+    case = LensCase("tiny", 13, 11, 1, 5, defocus=DEFOCUS, recipe=tiny_scene, threshold_width=5e-4)
+    case = clear(case)
+    cotangents = Cotangents.random(case)
+    weights = [cotangents.d_image, cotangents.d_alpha, cotangents.d_depth]
+
+    def outputs(**parameters):
+        picture = case.reference_picture(reference.Gaussians(**parameters))
+        return [picture.image, picture.alpha, picture.depth]
+
+    parameters = {n: getattr(case.gaussians, n) for n in PARAMETER_NAMES}
+    expected = numeric_gradients(outputs, weights, parameters)
+    actual = kernel_gradients(case, FLOAT64, cotangents)
+    assert_arrays_agree(actual, expected, DIFFERENCES)
+    # The comparison notices one percent, in every array.
+    for parameter, values in actual.items():
+        with pytest.raises(AssertionError, match=rf"{parameter}\["):
+            assert_arrays_agree({**actual, parameter: 1.01 * values}, expected, DIFFERENCES)
+
+
+@all_scenes
+def test_gradients_equal_differences_of_the_reference_along_a_direction(scene, monkeypatch):
+    case = clear(case_of(scene, threshold_width=1e-3))
+    cotangents = Cotangents.random(case, seed=2)
+    keep_bounds(case, monkeypatch)
+    gradients = kernel_gradients(case, FLOAT64, cotangents)
+    step = 1e-6
+    for parameter, direction in directions(case.gaussians, seed=3).items():
+        forward, backward = (
+            case.reference_picture(moved(case.gaussians, direction, sign * step))
+            for sign in (1, -1)
+        )
+        expected = sum(
+            np.sum(getattr(cotangents, f"d_{n}") * (getattr(forward, n) - getattr(backward, n)))
+            for n in ("image", "alpha", "depth")
+        ) / (2 * step)
+        terms = getattr(direction, parameter) * gradients[parameter]
+        assert abs(terms.sum() - expected) <= DIFFERENCES * np.abs(terms).sum(), parameter
+
+
+@both_precisions
+@all_scenes
+def test_adjoint_is_the_transpose_of_the_tangent(precision, scene):
+    case = clear(case_of(scene))
+    cotangents = Cotangents.random(case, seed=4)
+    gradients = kernel_gradients(case, precision, cotangents)
+    gaussians, frame = case.render(precision)
+    d_features, d_transmittance = plane_cotangents(case, cotangents, precision)
+    weights = np.array([rows(d) for d in (d_transmittance, *d_features)])
+    for parameter, direction in directions(case.gaussians, seed=5).items():
+        planes = rendering.render_tangent(gaussians, frame, device_gaussians(direction, precision))
+        left = weights * np.array([rows(plane) for plane in planes])
+        right = getattr(direction, parameter) * gradients[parameter]
+        size = np.abs(left).sum() + np.abs(right).sum()
+        assert abs(left.sum() - right.sum()) <= GRADIENTS[precision] / 5 * size, parameter
+
+
+def test_single_precision_gradients_equal_double_precision():
+    case = clear(case_of({}))
+    cotangents = Cotangents.random(case)
+    expected = kernel_gradients(case, FLOAT64, cotangents)
+    assert_arrays_agree(kernel_gradients(case, FLOAT32, cotangents), expected, GRADIENTS[FLOAT32])
+
+
+CHOICES = {
+    "exact": {"projection": "exact"},
+    "unscented": {"projection": "unscented"},
+    "exact, antialiased, pixel order": {
+        "projection": "exact", "antialiased": True, "order": "pixel", "order_window": 2
+    },
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("choices", CHOICES.values(), ids=CHOICES)
+def test_gradients_of_other_choices_equal_their_own_central_differences(choices):
+    """Those of the Gaussians, and those of the aperture; nothing is cut, so that nothing jumps."""
+    case = LensCase("choices", 19, 14, 1, 20, defocus=DEFOCUS)
+    pipeline = pipeline_of(Approximations(alpha_cut=0.0, transmittance_stop=0.0, **choices), 1)
+    weights = single(np.random.default_rng(1).normal(size=(4, case.height * case.width)))
+    gaussians, frame = case.render(FLOAT64, pipeline)
+    gradients = rendering.frames_adjoint(
+        gaussians, [frame], [list(map(FLOAT64.array, weights))], of_camera=True
+    )
+    step = 1e-7
+
+    def loss(gaussians, camera) -> np.ndarray:
+        device = device_gaussians(gaussians, FLOAT64)
+        return weights * planes_of(render_composed(device, camera, pipeline))
+
+    for parameter, direction in directions(case.gaussians, seed=2).items():
+        forward, backward = (
+            loss(moved(case.gaussians, direction, sign * step), frame.camera) for sign in (1, -1)
+        )
+        expected = np.sum(forward - backward) / (2 * step)
+        terms = getattr(direction, parameter) * np.array(getattr(gradients.parameters, parameter))
+        # Rounding, 1e-15 / step, of each plane.
+        assert abs(terms.sum() - expected) <= 1e-6 * np.abs(terms).sum(), parameter
+
+    # The aperture's are the last of the camera's numbers.
+    numbers = zip(vars(frame.camera.aperture).items(), gradients.camera[-2:], strict=True)
+    for (name, value), gradient in numbers:
+        found = []
+        for sign in (1, -1):
+            aperture = replace(frame.camera.aperture, **{name: value + sign * step})
+            camera = replace(frame.camera, aperture=aperture)
+            dr.make_opaque(camera)
+            found.append(loss(case.gaussians, camera))
+        terms = (found[0] - found[1]) / (2 * step)
+        assert abs(float(gradient[0]) - terms.sum()) <= 1e-6 * np.abs(terms).sum(), name
+
+
+def test_exact_splats_that_are_small_are_blurred_like_affine_ones():
+    """But for their size, 1e-4 of their distance, squared, times some 10. Measured: 3e-8."""
+    camera = camera_at_origin(fx=2e4, fy=2e4, cx=30.0, cy=24.0, width=60, height=48)
+    points = np.array([[-6e-4, -4e-4, 1.0], [4e-4, 6e-4, 2.5], [2e-4, -9e-4, 1.5]])
+    gaussians = replace(
+        gaussians_at(points, 1e-4), quats=np.random.default_rng(0).normal(0, 1, (3, 4))
+    )
+    planes = {}
+    for projection in ("ewa", "exact"):
+        for defocus in (ThinLens(2e-4, 2.0), None):
+            frame = render_composed(
+                device_gaussians(gaussians, FLOAT64),
+                aperture_camera(camera, FLOAT64, defocus),
+                pipeline_of(Approximations(projection=projection), 0),
+            )
+            planes[projection, defocus is None] = planes_of(frame)
+    np.testing.assert_allclose(planes["exact", False], planes["ewa", False], rtol=0, atol=1e-6)
+    assert np.abs(planes["exact", True] - planes["exact", False]).max() > 0.05
+
+
+# ----------------------------------------------------------------------------------------------
+# Hard cases
+# ----------------------------------------------------------------------------------------------
+
+
+@both_precisions
+def test_splats_that_are_not_seen_poison_nothing(precision):
+    """Behind the camera, at its centre, no numbers: as if they were not there."""
+    case = clear(case_of({}, count=30))
+    means = case.gaussians.means.copy()
+    bad = [[np.nan, 0, 0], [0, np.inf, 0], [-np.inf, np.nan, np.inf], case.camera.center,
+           case.camera.center - case.camera.rotation[2]]  # fmt: skip
+    where = np.arange(10, 10 + len(bad))
+    means[where] = bad
+    hidden = case.gaussians.logit_opacities.copy()
+    hidden[where] = -50.0
+    d_features, d_transmittance = plane_cotangents(case, Cotangents.random(case), precision)
+    found = []
+    for gaussians in (
+        replace(case.gaussians, means=means),
+        replace(case.gaussians, logit_opacities=hidden),
+    ):
+        device = device_gaussians(gaussians, precision)
+        frame = render_composed(device, case.device_camera(precision), case.pipeline)
+        gradients = rendering.render_adjoint(device, frame, d_features, d_transmittance).parameters
+        found.append(
+            [planes_of(frame), *(np.array(getattr(gradients, n)) for n in PARAMETER_NAMES)]
+        )
+    for a, b in zip(*found, strict=True):
+        np.testing.assert_array_equal(a, b)
+        assert np.isfinite(a).all() and a.any()
+
+
+@both_precisions
+def test_a_splat_blurred_over_thousands_of_pixels_has_the_reference_covariance(precision):
+    """Next to the near plane, through a large aperture."""
+    camera = camera_at_origin(fx=200.0, fy=200.0)
+    defocus = ThinLens(1.0, 4.0)
+    gaussians = gaussians_at([[0.001, -0.002, 0.015625], [0.1, 0.1, 100.0]], 2.0**-10)
+    expected = effects.project(gaussians, camera, defocus=defocus)
+    splats = splats_of(gaussians, camera, precision, defocus)
+    sizes = np.abs(expected.cov2d).max(axis=(1, 2), keepdims=True)
+    assert sizes[0] > 1e7
+    errors = np.abs(covariances(splats) - expected.cov2d) / sizes
+    assert errors.max() < {FLOAT64: 1e-12, FLOAT32: 2e-6}[precision]
+    np.testing.assert_allclose(
+        rows(splats.opacities),
+        expected.opacities,
+        rtol={FLOAT64: 1e-11, FLOAT32: 5e-6}[precision],
+    )

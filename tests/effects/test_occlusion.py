@@ -1,0 +1,191 @@
+"""Splats before and behind a surface: planes and derivatives against the float64 reference."""
+
+from dataclasses import replace
+from functools import cache
+
+import drjit as dr
+import numpy as np
+import pytest
+from support.helpers import (
+    FLOAT64,
+    Case,
+    assert_arrays_agree,
+    both_precisions,
+    clear,
+    device_camera,
+    device_gaussians,
+    rows,
+    single,
+    stacked_scene,
+)
+from support.lens_scenes import directions, moved
+
+from drgs.accuracy.pipeline import pipeline_of
+from drgs.config.approximations import Approximations
+from drgs.core.arrays import from_host
+from drgs.effects.occlusion import OccludedFeatures, Surface
+from drgs.gaussians.parameters import PARAMETER_NAMES
+from drgs.reference.effects import render_with_surface
+from drgs.splatting import rendering
+from drgs.splatting.image_model import DEFAULT
+from drgs.splatting.tiles import TileGrid
+
+# As in test_rendering.
+PICTURE = {name: limit for name, limit in (("Float64", 1e-12), ("Float", 2e-5))}
+GRADIENTS = {name: limit for name, limit in (("Float64", 1e-7), ("Float", 1e-4))}
+
+CASES = [
+    Case("scattered", 37, 29, 2, count=60),
+    Case("stacked", 37, 29, 1, count=24, recipe=stacked_scene),
+    Case("one pixel", 1, 1, 1, count=12),
+]
+all_cases = pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
+
+STEP = 1e-6
+
+
+def of(table, precision) -> float:
+    return table["Float64" if precision is FLOAT64 else "Float"]
+
+
+@cache
+def surface_of(case) -> tuple[np.ndarray, np.ndarray]:
+    """Depths (H, W) amid the splats, no one's, and coverages: 0, 1 and between."""
+    rng = np.random.default_rng(2)
+    depths = np.sort(reference_depths(case))
+    gaps = (depths[1:] + depths[:-1]) / 2
+    z = rng.choice(gaps[len(gaps) // 8 :], (case.height, case.width)) if len(gaps) else depths
+    coverage = rng.choice([0.0, 0.25, 0.625, 1.0], (case.height, case.width))
+    return single(np.resize(z, (case.height, case.width))), coverage
+
+
+def reference_depths(case) -> np.ndarray:
+    from drgs.reference import splatting as reference
+
+    splats = reference.project(*case.scene)
+    return splats.depths[splats.visible]
+
+
+def occluded_pipeline(case, precision, features=DEFAULT.features, degree=None):
+    surface = Surface(*(from_host(precision.Float, p.ravel()) for p in surface_of(case)))
+    features = OccludedFeatures(features, surface, TileGrid(case.width, case.height))
+    return replace(
+        case.pipeline,
+        model=replace(DEFAULT, features=features),
+        features=(*case.pipeline.features, rendering.depth_feature),
+    )
+
+
+def expected_planes(case, gaussians=None) -> np.ndarray:
+    """(6, H W): the splats' own transmittance, color, depth, weights in front."""
+    picture = render_with_surface(gaussians or case.gaussians, case.camera, *surface_of(case))
+    from drgs.reference import splatting as reference
+
+    plain = reference.render(gaussians or case.gaussians, case.camera)
+    planes = [plain.transmittance, *np.moveaxis(picture.color, -1, 0), picture.depth]
+    return np.reshape([*planes, 1 - picture.before], (6, -1))
+
+
+def render(case, precision):
+    gaussians = device_gaussians(case.gaussians, precision)
+    camera = device_camera(case.camera, precision)
+    return gaussians, rendering.render(gaussians, camera, occluded_pipeline(case, precision))
+
+
+@both_precisions
+@all_cases
+def test_planes_are_those_of_the_reference(precision, case):
+    case = clear(case)
+    _, frame = render(case, precision)
+    planes = rows(frame.planes()).T
+    expected = expected_planes(case)
+    names = ("transmittance", "red", "green", "blue", "depth", "front")
+    assert_arrays_agree(
+        dict(zip(names, planes, strict=True)),
+        dict(zip(names, expected, strict=True)),
+        of(PICTURE, precision),
+    )
+
+
+@all_cases
+def test_what_is_seen_past_all_follows_from_the_planes(case):
+    """The reference composites the surface as a layer; the kernels scale."""
+    case = clear(case)
+    _, coverage = surface_of(case)
+    picture = render_with_surface(case.gaussians, case.camera, *surface_of(case))
+    transmittance, *_ = expected_planes(case)
+    np.testing.assert_allclose(
+        picture.transmittance.ravel(), transmittance * (1 - coverage.ravel()), atol=1e-15
+    )
+
+
+@both_precisions
+@all_cases
+def test_gradients_equal_differences_of_the_reference(precision, case):
+    """Along a random direction of each parameter."""
+    case = clear(case)
+    gaussians, frame = render(case, precision)
+    weights = single(np.random.default_rng(4).normal(0, 1, expected_planes(case).shape))
+    d_transmittance, *d_features = (precision.array(w) for w in weights)
+    gradients = rendering.render_adjoint(gaussians, frame, d_features, d_transmittance)
+    for name, direction in directions(case.gaussians, seed=5).items():
+        forward, backward = (
+            expected_planes(case, moved(case.gaussians, direction, sign * STEP)) for sign in (1, -1)
+        )
+        expected = np.sum(weights * (forward - backward)) / (2 * STEP)
+        terms = getattr(direction, name) * np.array(getattr(gradients.parameters, name))
+        limit = of(GRADIENTS, precision) * np.abs(terms).sum()
+        assert abs(terms.sum() - expected) <= limit, name
+
+
+@both_precisions
+@all_cases
+def test_adjoint_is_the_transpose_of_the_tangent(precision, case):
+    case = clear(case)
+    gaussians, frame = render(case, precision)
+    rng = np.random.default_rng(6)
+    tangent = {
+        n: single(rng.normal(0, 1, getattr(case.gaussians, n).shape)) for n in PARAMETER_NAMES
+    }
+    planes = rendering.render_tangent(
+        gaussians, frame, device_gaussians(replace(case.gaussians, **tangent), precision)
+    )
+    weights = single(rng.normal(0, 1, expected_planes(case).shape))
+    d_transmittance, *d_features = (precision.array(w) for w in weights)
+    gradients = rendering.render_adjoint(gaussians, frame, d_features, d_transmittance)
+    left = weights * rows(planes).T
+    right = [np.array(getattr(gradients.parameters, n)) * tangent[n] for n in PARAMETER_NAMES]
+    size = np.sqrt(np.sum(left**2) + sum(np.sum(r**2) for r in right))
+    limit = 1e-12 if precision is FLOAT64 else 5e-5
+    assert abs(left.sum() - sum(r.sum() for r in right)) <= limit * size
+
+
+@pytest.mark.parametrize("choices", [{"sh_direction": "pixel"}, {"order": "pixel"}], ids=str)
+def test_with_choices_what_is_covered_is_the_mixture(choices):
+    """Linear in the coverage: of nothing and of all; the sum in front does not depend on it."""
+    case = clear(CASES[0])
+    gaussians = device_gaussians(case.gaussians, FLOAT64)
+    camera = device_camera(case.camera, FLOAT64)
+    z, coverage = surface_of(case)
+    plain = pipeline_of(Approximations(**choices), 2, features=case.pipeline.features)
+
+    def planes(amount):
+        surface = Surface(*(from_host(FLOAT64.Float, p.ravel()) for p in (z, amount)))
+        features = OccludedFeatures(
+            plain.model.features, surface, TileGrid(case.width, case.height)
+        )
+        pipeline = replace(
+            plain,
+            model=replace(plain.model, features=features),
+            features=(*plain.features, rendering.depth_feature),
+        )
+        return rows(rendering.render(gaussians, camera, pipeline).planes()).T
+
+    nothing, everything, part = (planes(a) for a in (0 * coverage, 0 * coverage + 1, coverage))
+    c = coverage.ravel()
+    np.testing.assert_allclose(part, (1 - c) * nothing + c * everything, atol=1e-12)
+    without = rows(rendering.render(gaussians, camera, plain).planes()).T
+    np.testing.assert_allclose(nothing[:-1], without, atol=1e-12)
+    assert np.abs(everything[1:4] - nothing[1:4]).max() > 0.1
+    np.testing.assert_array_equal(part[-1], nothing[-1])
+    assert dr.width(gaussians.logit_opacities) == 60

@@ -1,0 +1,128 @@
+"""Spherical harmonics against the float64 reference and against Legendre functions."""
+
+import drjit as dr
+import numpy as np
+import pytest
+from support.helpers import both_precisions, relative_errors, rows, single
+from test_reference_splatting import legendre_sh_basis
+
+from drgs.gaussians import sh
+from drgs.reference import splatting as reference
+
+DEGREES = [0, 1, 2, 3]
+
+# The largest basis function is a sum of up to four products of up to four factors of size one:
+# a dozen roundings. Measured: below 3 units of the format's epsilon.
+UNITS = 16
+
+
+def tolerance(precision) -> float:
+    return UNITS * float(np.finfo(precision.dtype).eps)
+
+
+def directions(count=64) -> np.ndarray:
+    """(N, 3) unit vectors, the axes among them, representable in float32 (unit to 1e-7)."""
+    vectors = np.random.default_rng(0).normal(0, 1, (count, 3))
+    vectors[:6] = np.concatenate([np.eye(3), -np.eye(3)])
+    return single(vectors / np.linalg.norm(vectors, axis=1, keepdims=True))
+
+
+@pytest.mark.parametrize("degree", DEGREES)
+def test_number_of_coefficients(degree):
+    assert sh.num_coefficients(degree) == len(reference.sh_basis(np.eye(3), degree).T)
+
+
+def test_constants_are_those_of_the_normalisation():
+    """C0 to C3 from pi alone, to the last digits of a double."""
+    pi = np.pi
+    c2, c3 = np.sqrt(15 / pi) / 2, np.sqrt(105 / pi)
+    expected = {
+        "C0": np.sqrt(1 / pi) / 2,
+        "C1": np.sqrt(3 / pi) / 2,
+        "C2": [c2, -c2, np.sqrt(5 / pi) / 4, -c2, c2 / 2],
+        "C3": [
+            -np.sqrt(35 / (2 * pi)) / 4, c3 / 2, -np.sqrt(21 / (2 * pi)) / 4, np.sqrt(7 / pi) / 4,
+            -np.sqrt(21 / (2 * pi)) / 4, c3 / 4, -np.sqrt(35 / (2 * pi)) / 4,
+        ],
+    }  # fmt: skip
+    for name, values in expected.items():
+        np.testing.assert_allclose(getattr(sh, name), values, rtol=1e-14, err_msg=name)
+
+
+@both_precisions
+@pytest.mark.parametrize("degree", DEGREES)
+def test_basis_equals_the_reference_and_legendre_functions(precision, degree):
+    points = directions()
+    basis = sh.sh_basis(precision.vectors(points), degree)
+    ones = dr.ones(precision.Float, len(points))
+    actual = np.stack([rows(value * ones) for value in basis], axis=-1)
+    expected = reference.sh_basis(points, degree)
+    np.testing.assert_allclose(actual, expected, rtol=0, atol=tolerance(precision))
+    # Angles assume an exact unit vector: normalise again, which moves the basis by 1e-7 times
+    # its degree and a factor below 3.
+    units = points / np.linalg.norm(points, axis=1, keepdims=True)
+    legendre = np.array([legendre_sh_basis(unit, degree) for unit in units])
+    np.testing.assert_allclose(actual, legendre, rtol=0, atol=tolerance(precision) + 1e-6)
+
+
+def colour_scene(degree) -> tuple[reference.Gaussians, reference.Camera]:
+    """Gaussians around a camera at (1, 2, 3), with some colours that are clamped."""
+    rng = np.random.default_rng(degree)
+    n, center = 64, np.array([1.0, 2.0, 3.0])
+    gaussians = reference.Gaussians(
+        means=single(center + directions(n) * rng.uniform(0.5, 5, (n, 1))),
+        quats=np.ones((n, 4)),
+        log_scales=np.zeros((n, 3)),
+        logit_opacities=np.zeros(n),
+        sh0=single(rng.normal(0, 1.2, (n, 1, 3))),
+        shN=single(rng.normal(0, 0.4, (n, (degree + 1) ** 2 - 1, 3))),
+    )
+    return gaussians, reference.Camera(np.eye(3), center, 1, 1, 0, 0, 1, 1)
+
+
+@both_precisions
+@pytest.mark.parametrize("degree", DEGREES)
+def test_colour_and_its_gradients_equal_the_reference(precision, degree):
+    gaussians, camera = colour_scene(degree)
+    coefficients = np.concatenate([gaussians.sh0, gaussians.shN], axis=1)
+    inputs = [precision.vectors(column) for column in np.moveaxis(coefficients, 1, 0)]
+    offsets = precision.vectors(gaussians.means - camera.center)
+    weights = single(np.random.default_rng(9).normal(0, 1, (64, 3)))
+    dr.enable_grad(inputs, offsets)
+    color = sh.sh_color(inputs, dr.normalize(offsets), degree)
+    dr.backward(dr.dot(precision.vectors(weights), color))
+
+    expected = reference.sh_colors(gaussians, camera, degree)
+    assert (expected == 0).sum() >= 5 and (expected > 0).sum() >= 100
+    d_sh = np.stack([rows(dr.grad(c)) for c in inputs], axis=1)
+    actual = {
+        "colors": rows(dr.detach(color)),
+        "means": rows(dr.grad(offsets)) if degree else np.zeros((64, 3)),
+        "sh0": d_sh[:, :1],
+        "shN": d_sh[:, 1:],
+    }
+    gradients = reference.sh_colors_gradients(gaussians, camera, degree, weights)
+    # Sums of 16 products: four times the basis's tolerance. Normalising adds a few roundings.
+    errors = relative_errors(actual, {"colors": expected, **gradients})
+    assert max(errors.values()) <= 4 * tolerance(precision), errors
+
+
+@both_precisions
+def test_clamped_colour_is_zero_and_has_no_gradient(precision):
+    coefficient = precision.Array3f([-2.0, 1.0, -1.7])
+    dr.enable_grad(coefficient)
+    color = sh.sh_color([coefficient], precision.Array3f(0, 0, 1), 0)
+    dr.backward(color)
+    below = 0.5 - 1.7 * sh.C0
+    assert below > 0
+    np.testing.assert_allclose(
+        rows(dr.detach(color))[0], [0, 0.5 + sh.C0, below], rtol=0, atol=tolerance(precision)
+    )
+    np.testing.assert_allclose(rows(dr.grad(coefficient))[0], [0, sh.C0, sh.C0], rtol=1e-6)
+
+
+@both_precisions
+def test_nan_stays_nan(precision):
+    coefficient = precision.Array3f([np.nan, 0.0, 0.0])
+    color = rows(sh.sh_color([coefficient], precision.Array3f(0, 0, 1), 0))
+    assert np.isnan(color[0, 0]) and np.isfinite(color[0, 1:]).all()

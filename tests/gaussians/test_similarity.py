@@ -1,0 +1,101 @@
+"""A model that is moved, against the reference with the camera moved the other way."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from support.views import Scene
+
+from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
+from drgs.gaussians.similarity import Similarity
+from drgs.reference import splatting as reference
+
+SCALE, TRANSLATION = 1.75, np.array([0.5, -2.0, 1.25])
+ROTATION = Rotation.random(random_state=5).as_matrix()
+
+
+def matrix_of(linear, translation=(0, 0, 0)) -> np.ndarray:
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = linear, translation
+    return matrix
+
+
+MATRIX = matrix_of(SCALE * ROTATION, TRANSLATION)
+
+
+def model(degree=3, **others) -> Gaussians:
+    gaussians = Scene(degree=degree).gaussians
+    fields = {name: getattr(gaussians, name).astype(np.float32) for name in PARAMETER_NAMES}
+    return Gaussians(**fields, **others)
+
+
+def as_reference(gaussians) -> reference.Gaussians:
+    return reference.Gaussians(**{n: np.float64(getattr(gaussians, n)) for n in PARAMETER_NAMES})
+
+
+def test_a_matrix_is_taken_apart():
+    similarity = Similarity.of(MATRIX, "x")
+    assert similarity.scale == pytest.approx(SCALE, rel=1e-14)
+    np.testing.assert_allclose(similarity.rotation, ROTATION, atol=1e-14)
+    np.testing.assert_array_equal(similarity.translation, TRANSLATION)
+
+
+def test_numbers_of_five_digits_are_a_rotation_and_the_nearest_is_used():
+    similarity = Similarity.of(np.round(MATRIX, 5), "x")
+    np.testing.assert_allclose(similarity.rotation, ROTATION, atol=1e-5)
+    np.testing.assert_allclose(similarity.rotation @ similarity.rotation.T, np.eye(3), atol=1e-14)
+
+
+REFUSED = {
+    "scales that differ": matrix_of(np.diag([1, 1, 1.01])),
+    "a shear": matrix_of([[1, 0.01, 0], [0, 1, 0], [0, 0, 1]]),
+    "a mirror": matrix_of(np.diag([-1, 1, 1])),
+    "a projection to a plane": matrix_of(np.diag([1, 1, 0])),
+    "not a number": matrix_of(np.eye(3), [np.nan, 0, 0]),
+    "infinite": matrix_of(np.where(np.eye(3) > 0, np.inf, 0)),
+    "perspective": np.array([[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 1, 1.0]]),
+}
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_anything_but_a_similarity_is_refused(case):
+    message = (
+        r"^splats: to_world must be made of rotations, translations and scales that are the same "
+        r"along all axes and positive, got the matrix \["
+    )
+    with pytest.raises(ValueError, match=message):
+        Similarity.of(REFUSED[case], "splats: to_world")
+
+
+@pytest.mark.parametrize("degree", [0, 1, 3])
+def test_a_moved_model_looks_as_before_from_a_camera_that_moved_with_it(degree):
+    """Depths are multiplied. float32 parameters of a moved model are rounded anew: 1e-7 each."""
+    scene, camera = Scene(degree=degree), Scene().camera
+    moved = Similarity.of(MATRIX, "x").of_gaussians(model(degree))
+    assert {getattr(moved, n).dtype for n in PARAMETER_NAMES} == {np.dtype(np.float32)}
+    follower = replace(
+        camera,
+        rotation=camera.rotation @ ROTATION.T,
+        center=SCALE * ROTATION @ camera.center + TRANSLATION,
+        near=SCALE * camera.near,
+    )
+    expected = reference.render(scene.gaussians, camera, np.zeros(3), degree)
+    actual = reference.render(as_reference(moved), follower, np.zeros(3), degree)
+    np.testing.assert_allclose(actual.image, expected.image, atol=1e-5 * expected.image.max())
+    np.testing.assert_allclose(
+        actual.depth, SCALE * expected.depth, atol=1e-5 * SCALE * expected.depth.max()
+    )
+
+
+def test_a_smoothing_filter_grows_with_the_model():
+    filters = np.linspace(0.01, 0.2, 40, dtype=np.float32)
+    moved = Similarity.of(MATRIX, "x").of_gaussians(model(smoothing=filters))
+    np.testing.assert_allclose(moved.smoothing, SCALE * filters, rtol=1e-6)
+    assert moved.smoothing.dtype == np.float32
+
+
+def test_what_a_move_does_not_touch_stays():
+    before = model()
+    moved = Similarity.of(MATRIX, "x").of_gaussians(before)
+    assert moved.logit_opacities is before.logit_opacities and moved.sh0 is before.sh0

@@ -1,0 +1,170 @@
+"""Sensors of type ``batch``: pictures side by side, each as if its sensor were alone."""
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from support.helpers import bitwise
+from support.views import VIEWS, Scene, clear, gradient, image_of, tensors
+
+import drgs  # noqa: F401  (registers the plugins)
+from drgs.gaussians.parameters import PARAMETER_NAMES
+
+SCENE = Scene(VIEWS[1])
+SENSORS = (VIEWS[1], VIEWS[2], VIEWS[10])
+
+# As in test_splats.
+GRADIENTS = 1e-4
+
+
+@pytest.fixture(scope="module", autouse=True)
+def variant():
+    mi.set_variant("llvm_ad_rgb")
+
+
+def load(sensor, wall=False, **others):
+    scene = clear(SCENE)
+    objects = {"integrator": scene.settings | tensors(scene.gaussians) | others, "sensor": sensor}
+    if wall:
+        emitter = {"type": "area", "radiance": 0.5}
+        position = scene.camera.rotation.T @ [0, 0, 2] + scene.camera.center
+        place = mi.ScalarTransform4f().translate(position)
+        objects["wall"] = {"type": "sphere", "radius": 0.5, "to_world": place, "emitter": emitter}
+    return mi.load_dict({"type": "scene", **objects})
+
+
+def batch(samples=1, rfilter="box", pixel_format="rgba", **film):
+    view = SENSORS[0]
+    whole = view.sensor(pixel_format, rfilter, samples)
+    whole["film"] |= {"width": view.width * len(SENSORS)} | film
+    children = {f"view_{k}": one.sensor() for k, one in enumerate(SENSORS)}
+    return {"type": "batch", "film": whole["film"], "sampler": whole["sampler"], **children}
+
+
+def weights_of(seed=2) -> np.ndarray:
+    view = SENSORS[0]
+    shape = view.height, len(SENSORS) * view.width, 4
+    return np.random.default_rng(seed).normal(0, 1, shape).astype(np.float32)
+
+
+def parts(image) -> list[np.ndarray]:
+    return np.split(image, len(SENSORS), axis=1)
+
+
+@pytest.mark.parametrize("wall", [False, True], ids=["splats", "hybrid"])
+@pytest.mark.parametrize("pixel_format", ["rgba", "xyz"])
+def test_pictures_stand_side_by_side(wall, pixel_format):
+    settings = {"aovs": "z:depth", "srgb_primitives": True, "hide_emitters": not wall}
+    image = image_of(load(batch(pixel_format=pixel_format), wall, **settings))
+    for part, view in zip(parts(image), SENSORS, strict=True):
+        alone = image_of(load(view.sensor(pixel_format), wall, **settings))
+        # A path's samples at the edge of the sphere are not the same.
+        differs = np.abs(part - alone).max(axis=-1) > 1e-6
+        assert differs.mean() <= (0.1 if wall else 0)
+
+
+def test_several_samples_are_those_of_the_whole_film():
+    """A box filter averages them; each picture's are a part of the film's."""
+    center = image_of(load(batch()))
+    sampled = image_of(load(batch(samples=256)))
+    other = image_of(load(batch(samples=256)), seed=5)
+    assert np.abs(sampled - other).max() > 0
+    assert np.abs(sampled - other).mean() < 5e-3
+    alone = [image_of(load(view.sensor(samples=256))) for view in SENSORS]
+    difference = np.abs(sampled - np.concatenate(alone, axis=1))
+    assert difference.mean() < 5e-3
+    assert np.abs(sampled - center).mean() > difference.mean()
+
+
+def test_gradients_are_the_sums_of_those_of_each_alone():
+    weights = weights_of()
+
+    def gradients(sensor, weights):
+        loaded = load(sensor)
+        params = mi.traverse(loaded)
+        keys = [f"integrator.{name}" for name in (*PARAMETER_NAMES, "background")]
+        for key in keys:
+            dr.enable_grad(params[key])
+        image = mi.render(loaded, params)
+        dr.backward(dr.sum(image * mi.TensorXf(np.ascontiguousarray(weights)), axis=None))
+        return [gradient(params[key]) for key in keys]
+
+    actual = gradients(batch(), weights)
+    of_each = [
+        gradients(view.sensor(), part) for view, part in zip(SENSORS, parts(weights), strict=True)
+    ]
+    for value, *terms in zip(actual, *of_each, strict=True):
+        size = sum(np.abs(term).max() for term in terms)
+        np.testing.assert_allclose(value, sum(terms), rtol=0, atol=1e-5 * size)
+    assert bitwise(actual) == bitwise(gradients(batch(), weights))
+
+
+def test_the_gradient_of_a_sensor_is_that_of_its_own_part():
+    weights = weights_of()
+    loaded = load(batch())
+    params = mi.traverse(loaded)
+    keys = [key for key in params.keys() if key.endswith(".x_fov")]  # noqa: SIM118
+    assert len(keys) == len(SENSORS)
+    for key in keys:
+        dr.enable_grad(params[key])
+    dr.backward(dr.sum(mi.render(loaded, params) * mi.TensorXf(weights), axis=None))
+    for key, view, part in zip(keys, SENSORS, parts(weights), strict=True):
+        alone = load(view.sensor())
+        own = mi.traverse(alone)
+        name = next(k for k in own.keys() if k.endswith(".x_fov"))  # noqa: SIM118
+        dr.enable_grad(own[name])
+        part = mi.TensorXf(np.ascontiguousarray(part))
+        dr.backward(dr.sum(mi.render(alone, own) * part, axis=None))
+        assert gradient(params[key]) == pytest.approx(gradient(own[name]), rel=1e-4)
+
+
+def test_a_sensor_may_stand_in_it_twice():
+    """Its gradient is the sum of those of both parts."""
+    weights, view = weights_of(), SENSORS[0]
+    twice = mi.load_dict(view.sensor())
+    loaded = load(batch() | {"view_0": twice, "view_2": twice})
+    params = mi.traverse(loaded)
+    fovs = [key for key in params.keys() if key.endswith(".x_fov")]  # noqa: SIM118
+    assert len(fovs) == 2  # its name is that of its last place
+    (key,) = set(fovs) - {"sensor.view_1.x_fov"}
+    dr.enable_grad(params[key])
+    image = mi.render(loaded, params)
+    order = (SENSORS[0], SENSORS[1], SENSORS[0])
+    for part, one in zip(parts(np.array(image)), order, strict=True):
+        np.testing.assert_array_equal(part, image_of(load(one.sensor())))
+    dr.backward(dr.sum(image * mi.TensorXf(weights), axis=None))
+    alone = load(view.sensor())
+    own = mi.traverse(alone)
+    name = next(k for k in own.keys() if k.endswith(".x_fov"))  # noqa: SIM118
+    dr.enable_grad(own[name])
+    both = sum(parts(weights)[::2])
+    dr.backward(dr.sum(mi.render(alone, own) * mi.TensorXf(np.ascontiguousarray(both)), axis=None))
+    assert gradient(params[key]) == pytest.approx(gradient(own[name]), rel=1e-4)
+
+
+def test_forward_mode_is_the_transpose_of_the_gradients():
+    weights, rng = weights_of(), np.random.default_rng(3)
+    loaded = load(batch())
+    params = mi.traverse(loaded)
+    value = params["integrator.means"]
+    dr.enable_grad(value)
+    dr.backward(dr.sum(mi.render(loaded, params) * mi.TensorXf(weights), axis=None))
+    direction = rng.normal(0, 1, value.shape).astype(np.float32)
+    terms = gradient(value) * direction
+    dr.clear_grad(value)
+    dr.set_grad(value, mi.TensorXf(direction))
+    tangent = np.array(dr.forward_to(mi.render(loaded, params))).astype(np.float64)
+    total = np.sum(tangent * weights)
+    assert total == pytest.approx(terms.sum(), abs=GRADIENTS * np.abs(terms).sum())
+
+
+def test_a_crop_window_is_refused():
+    loaded = load(batch(crop_offset_x=3, crop_width=20))
+    with pytest.raises(ValueError, match="must not have a crop window"):
+        loaded.integrator().render(loaded)
+
+
+def test_the_plan_is_that_of_the_first_sensor():
+    loaded = load(batch())
+    plan = loaded.integrator().summary(loaded, loaded.sensors()[0])
+    assert plan.startswith("simulated:")

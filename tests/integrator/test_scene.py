@@ -1,0 +1,241 @@
+"""From dataset views and Gaussians to Mitsuba objects that render the same picture."""
+
+import math
+from dataclasses import fields, replace
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from support.helpers import NEAR_THRESHOLD, assert_arrays_agree
+from support.views import View as Perspective
+from support.views import image_of, pose, splats_before
+from test_camera import camera_of, numbers, points_on_rays
+
+from drgs.bench.scenes import bench_gaussians
+from drgs.cameras.camera import Pinhole, cameras_in_time
+from drgs.cameras.fisheye import Fisheye
+from drgs.cameras.radial_tangential import RadialTangential
+from drgs.config.approximations import Approximations
+from drgs.config.schema import DataConfig, ModelConfig
+from drgs.data.types import Motion, View
+from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
+from drgs.integrator.scene import SQUARE_PIXEL_TOLERANCE, make_scene, make_sensors
+from drgs.integrator.sensors import camera_from_sensor, read_sensor
+from drgs.reference import splatting as reference
+
+BACKGROUND = (0.875, 0.375, 0.1875)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def variant():
+    mi.set_variant("llvm_ad_rgb")
+
+
+def make_view(width=37, height=23, fx=30.0, fy=30.0, cx=20.5, cy=9.25, name="view"):
+    """An oblique camera with an off-centre principal point."""
+    camera_to_world = np.array(pose([0.3, -1.0, 0.5], 40, (0.4, -0.7, 1.1)))
+    image = np.zeros((height, width, 3), np.float32)
+    return View(name, image, camera_to_world, fx, fy, cx, cy, width, height)
+
+
+def reference_camera(view, near):
+    rotation = view.camera_to_world[:3, :3].T
+    return reference.Camera(
+        rotation, view.center, view.fx, view.fy, view.cx, view.cy, view.width, view.height, near
+    )
+
+
+def make_gaussians(view, count=40, degree=2, seed=0):
+    """numpy Gaussians before ``view``; the first is behind it, the second very near."""
+    focal = (view.fx * view.fy) ** 0.5
+    fov = float(np.degrees(2 * np.arctan(view.width / 2 / focal)))
+    offset = (0.5 - view.cx / view.width, 0.5 - view.cy / view.height)
+    to_world = view.camera_to_world @ np.diag([-1.0, -1.0, 1.0, 1.0])
+    before = Perspective(
+        "", view.width, view.height, fov, offset=offset, to_world=tuple(map(tuple, to_world))
+    )
+    g = splats_before(before, degree, count, seed)
+    return Gaussians(**{n: getattr(g, n).astype(np.float32) for n in PARAMETER_NAMES})
+
+
+# ----------------------------------------------------------------------------------------------
+# Sensors
+# ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("samples", [None, 3])
+def test_a_moving_views_sensor_blurs_with_as_many_times(samples):
+    """Of those of the configuration; by default as many as the sensor's own default."""
+    data = DataConfig(path=".", **({} if samples is None else {"shutter_samples": samples}))
+    view = make_view()
+    view = replace(view, motion=Motion(view.camera_to_world, "global", data.shutter_samples))
+    (sensor,) = make_sensors([view])
+    expected = mi.load_dict({"type": "calibrated"}).shutter_samples if samples is None else samples
+    assert sensor.shutter_samples == expected
+    state = read_sensor(sensor, 0.0)
+    assert len(cameras_in_time(camera_from_sensor(state))) == expected
+
+
+@pytest.mark.parametrize(
+    "view",
+    [make_view(), make_view(23, 37, cx=8.0, cy=20.0), make_view(64, 64, 80, 80, 32, 32)],
+    ids=["wide", "tall", "centred"],
+)
+def test_a_sensor_has_the_views_camera(view):
+    (sensor,) = make_sensors([view])
+    camera = camera_of(sensor)
+    actual = numbers(camera)
+    # Mitsuba keeps to_world, the angle and the offsets in float32.
+    assert actual["rotation"] == pytest.approx(view.camera_to_world[:3, :3].T, abs=1e-7)
+    assert actual["center"] == pytest.approx(view.center, rel=1e-7)
+    assert actual["focal"] == pytest.approx([view.fx, view.fy], rel=1e-6)
+    assert actual["principal"] == pytest.approx([view.cx, view.cy], abs=1e-5)
+    assert (camera.width, camera.height) == (view.width, view.height)
+
+
+def test_a_sensors_rays_are_the_views():
+    """Independent of the integrator's reading of a sensor."""
+    view = make_view()
+    points, positions = points_on_rays(make_sensors([view])[0])
+    x, y, z = view.camera_to_world[:3, :3].T @ (points - view.center).T
+    film = np.stack([view.fx * x / z + view.cx, view.fy * y / z + view.cy], axis=-1)
+    assert np.abs(film - positions).max() < 5e-5
+
+
+def test_views_of_one_size_share_a_film():
+    wide, tall = make_view(), make_view(23, 37, cx=8.0, cy=20.0)
+    a, b, c = (sensor.film() for sensor in make_sensors([wide, tall, replace(wide, fx=31, fy=31)]))
+    assert a is c and a is not b
+    assert [list(film.size()) for film in (a, b)] == [[37, 23], [23, 37]]
+
+
+@pytest.mark.parametrize("lens", [None, RadialTangential.of(k1=-0.2, p2=0.01), Fisheye.of(k1=0.1)])
+def test_what_mitsubas_sensors_cannot_express_is_a_calibrated_camera(lens):
+    view = replace(make_view(fx=30.0, fy=33.0), lens=lens)
+    (sensor,) = make_sensors([view])
+    camera = camera_of(sensor)
+    actual = numbers(camera)
+    assert type(sensor).__name__ == "CalibratedSensor"
+    assert actual["rotation"] == pytest.approx(view.camera_to_world[:3, :3].T, abs=1e-7)
+    assert actual["center"] == pytest.approx(view.center, rel=1e-7)
+    assert actual["focal"].tolist() == [30, 33]
+    assert actual["principal"].tolist() == [20.5, 9.25]
+    expected = {} if lens is None else lens.named()
+    named = {name: float(value[0]) for name, value in camera.lens.named().items()}
+    assert named == pytest.approx(expected, rel=1e-7)
+    assert type(camera.lens) is (Pinhole if lens is None else type(lens))
+
+
+def test_pixels_that_are_nearly_square_move_by_less_than_said():
+    view = make_view(fx=30.0, fy=30.01)
+    (sensor,) = make_sensors([view])
+    assert sensor.class_name() == "PerspectiveCamera"
+    camera = numbers(camera_of(sensor))
+    corners = np.array([[0, 0], [view.width, view.height]]) - [view.cx, view.cy]
+    shift = corners * (camera["focal"] / [view.fx, view.fy] - 1)
+    assert 0.002 < np.abs(shift).max() < SQUARE_PIXEL_TOLERANCE
+
+
+# ----------------------------------------------------------------------------------------------
+# Scene
+# ----------------------------------------------------------------------------------------------
+
+
+def expected_image(gaussians, view, near, antialiased):
+    parameters = {name: getattr(gaussians, name) for name in PARAMETER_NAMES}
+    picture = reference.render(
+        reference.Gaussians(**parameters), reference_camera(view, near), BACKGROUND,
+        antialiased=antialiased, threshold_width=NEAR_THRESHOLD,
+    )  # fmt: skip
+    assert not picture.near_threshold.any(), "choose another seed"
+    return picture.image
+
+
+@pytest.mark.parametrize("antialiased, near", [(False, 0.01), (True, 0.25)])
+def test_a_scene_renders_the_views_picture_in_display_space(antialiased, near):
+    view = make_view()
+    gaussians = make_gaussians(view)
+    scene = make_scene(gaussians, ModelConfig(antialiased=antialiased, near=near), BACKGROUND)
+    image = image_of(scene, sensor=make_sensors([view])[0])
+    expected = expected_image(gaussians, view, near, antialiased)
+    # As for the integrator: see test_splats.
+    assert_arrays_agree({"image": image}, {"image": expected}, 1e-5)
+
+
+def test_settings_of_the_model_change_the_picture():
+    """Or the test above would show nothing."""
+    view = make_view()
+    gaussians = make_gaussians(view)
+    images = [
+        expected_image(gaussians, view, near, antialiased)
+        for antialiased, near in ((False, 0.01), (True, 0.01), (False, 0.25))
+    ]
+    assert all(np.abs(images[0] - other).max() > 0.05 for other in images[1:])
+
+
+def test_a_scene_takes_gaussians_from_host_or_device():
+    view = make_view()
+    gaussians = make_gaussians(view)
+    sensor = make_sensors([view])[0]
+    images = [
+        image_of(make_scene(g, ModelConfig(), BACKGROUND), sensor=sensor)
+        for g in (gaussians, gaussians.to(mi.TensorXf))
+    ]
+    assert np.array_equal(*images)
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 4, 16])
+def test_a_scene_may_hold_few_gaussians(count):
+    """Mitsuba turns three numbers into a colour, four or sixteen could be a matrix."""
+    view = make_view()
+    rows = slice(3, 3 + count)
+    many = make_gaussians(view)
+    few = Gaussians(**{name: getattr(many, name)[rows] for name in PARAMETER_NAMES})
+    scene = make_scene(few, ModelConfig(near=0.01), BACKGROUND)
+    image = image_of(scene, sensor=make_sensors([view])[0])
+    expected = expected_image(few, view, 0.01, False)
+    assert_arrays_agree({"image": image}, {"image": expected}, 1e-5)
+
+
+def test_a_scenes_parameters_are_copies_under_the_integrators_name():
+    gaussians = make_gaussians(make_view()).to(mi.TensorXf)
+    scene = make_scene(gaussians, ModelConfig(), BACKGROUND)
+    params = mi.traverse(scene)
+    before = np.array(gaussians.means)
+    params["integrator.means"] = dr.zeros(mi.TensorXf, gaussians.means.shape)
+    params.update()
+    assert np.array_equal(np.array(gaussians.means), before)
+
+
+def test_sensors_of_views_render_without_a_warning(capfd):
+    view = make_view()
+    scene = make_scene(make_gaussians(view), ModelConfig(), BACKGROUND)
+    mi.render(scene, sensor=make_sensors([view])[0])
+    assert "splats" not in "".join(capfd.readouterr())
+
+
+def test_choices_of_accuracy_reach_the_integrator():
+    """All of them; and the defaults of the configuration are those of the kernels."""
+    values = {
+        "projection": "exact",
+        "order": "pixel",
+        "order_window": 6,
+        "sh_direction": "pixel",
+        "alpha_max": 0.95,
+        "alpha_cut": 0.0,
+        "transmittance_stop": 0.01,
+        "extent": 3.0,
+        "low_pass": 0.1,
+        "antialiased": True,
+    }
+    assert set(values) == {field.name for field in fields(Approximations)}
+    gaussians = bench_gaussians(5)
+    scene = make_scene(gaussians, ModelConfig(**values), (1.0, 1.0, 1.0))
+    assert scene.integrator().approximations == Approximations(**values)
+    scene = make_scene(gaussians, ModelConfig(), (1.0, 1.0, 1.0))
+    assert scene.integrator().approximations == Approximations()
+    default = {name: getattr(ModelConfig(), name) for name in values}
+    default["extent"] = math.inf
+    for name, value in vars(Approximations()).items():
+        assert default[name] == (pytest.approx(value) if isinstance(value, float) else value), name

@@ -1,0 +1,495 @@
+"""Which effects are composed in, what asked for them, and that the others leave no trace."""
+
+import json
+from dataclasses import replace
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from conftest import PATHS
+from support import small_fits as fits
+from support.views import VIEWS, Scene, tensors
+
+import drgs  # noqa: F401  (registers the plugins)
+from drgs import fit
+from drgs.cameras.camera import Pinhole
+from drgs.cameras.fisheye import Fisheye
+from drgs.cameras.radial_tangential import RadialTangential
+from drgs.config.changes import changed
+from drgs.data.types import Motion
+from drgs.integrator.sensors import camera_from_sensor, read_sensor
+from drgs.integrator.summary import Effect, described, summary_of_sensors, summary_of_views
+from drgs.training import history
+from drgs.training.checkpoint import load_checkpoint
+from drgs.training.effects.called_for import integrator_settings, training_effects
+from drgs.training.summary import summary_of_fit
+
+MODULES = (
+    "cameras.fisheye", "cameras.motion", "cameras.orthographic", "cameras.polynomials",
+    "cameras.radial_tangential", "cameras.thin_lens", "effects.defocus", "effects.features",
+    "effects.occlusion", "effects.smoothing", "integrator.background", "integrator.surfaces",
+    "training.effects.background", "training.effects.cameras", "training.effects.colors",
+    "training.effects.depth", "training.effects.masks", "training.effects.smoothing",
+    "training.effects.view_parameters", "training.image_ops",
+)  # fmt: skip
+"""Of effects, and of nothing else."""
+
+
+@pytest.fixture(scope="module", autouse=True)
+def variant():
+    mi.set_variant("llvm_ad_rgb")
+
+
+def config_of(**changes):
+    """The default of everything; ``__`` is written for the dot."""
+    from drgs.config.schema import FitConfig
+
+    values = {key.replace("__", "."): value for key, value in changes.items()}
+    return changed(FitConfig(data={"path": "."}), values)
+
+
+# ----------------------------------------------------------------------------------------------
+# Plans
+# ----------------------------------------------------------------------------------------------
+
+
+def test_a_plan_is_a_line_for_each_effect_and_one_for_all_others():
+    effects = [
+        Effect("a", "much", "x.y"),
+        Effect("b", None),
+        Effect("c", "some", "z"),
+        Effect("d", None),
+    ]
+    assert described(effects) == "simulated:\n  a: much (x.y)\n  c: some (z)\n  not simulated: b, d"
+    assert described(effects[:1]) == "simulated:\n  a: much (x.y)"
+    ignored = [*effects, Effect("e", None, "z", ignored=True), Effect("f", "a part", "z", True)]
+    assert described(ignored[4:]) == (
+        "simulated:\n  f: a part (z)\n  not simulated: e (ignored), f (ignored)"
+    )
+
+
+def test_the_plan_of_a_plain_fit():
+    assert described(summary_of_fit(config_of(), fits.plain_dataset())) == (
+        "simulated:\n"
+        "  view dependence: spherical harmonics up to degree 3 (model.sh_degree: 3)\n"
+        "  background: white (data.background)\n"
+        "  not simulated: lens distortion, motion, antialiasing, exposure and white balance, "
+        "masks, depth, camera refinement"
+    )
+
+
+def rich_dataset():
+    """Two bent lenses, a moving camera, masks in two views, depth in all, transparency."""
+    dataset = fits.true_dataset()
+    first, second, third, *others = dataset.train
+    mask = np.ones((first.height, first.width), np.float32)
+    first = replace(first, lens=RadialTangential.of(k1=0.1, k2=0.01), mask=mask)
+    second = replace(second, lens=Fisheye.of(k1=0.1), mask=mask)
+    third = replace(third, motion=Motion(first.camera_to_world, "rolling"))
+    return replace(dataset, train=(first, second, third, *others))
+
+
+EVERYTHING = {
+    "data__random_background": True,
+    "colors__lr": 1e-3,
+    "cameras__optimise": True,
+    "model__smoothing": True,
+    "model__antialiased": True,
+}
+
+
+def test_the_plan_of_a_fit_names_what_asked_for_each_effect():
+    config = config_of(**EVERYTHING, model__sh_degree=0, cameras__focal_lr=1e-4)
+    assert described(summary_of_fit(config, rich_dataset())) == (
+        "simulated:\n"
+        "  background: a random colour at each iteration (data.random_background)\n"
+        "  lens distortion: fisheye (k1) and opencv (k1, k2) "
+        "(2 of the dataset's cameras)\n"
+        "  motion: rolling shutter (1 of the dataset's cameras)\n"
+        "  antialiasing: opacities compensated for the low-pass filter, 3D smoothing filter "
+        "(model.antialiased, model.smoothing)\n"
+        "  exposure and white balance: a colour transform for each training photograph "
+        "(colors.lr)\n"
+        "  masks: pixels left out (the dataset's masks, in 2 views)\n"
+        "  depth: supervision (the dataset's depth, in 6 views)\n"
+        "  camera refinement: poses, focal lengths (cameras.optimise)\n"
+        "  not simulated: view dependence"
+    )
+
+
+@pytest.mark.parametrize(
+    ("changes", "name", "expected"),
+    [
+        ({"loss__depth_weight": 0.0}, "depth", None),
+        ({"data__background": "black"}, "background", ("black", "data.background")),
+        (
+            {"cameras__optimise": True, "cameras__principal_lr": 1e-4},
+            "camera refinement",
+            ("poses, principal point", "cameras.optimise"),
+        ),
+        (
+            {
+                "cameras__optimise": True, "cameras__rotation_lr": 0.0,
+                "cameras__translation_lr": 0.0,
+            },
+            "camera refinement",
+            ("nothing: all rates are 0", "cameras.optimise"),
+        ),
+        (
+            {"model__antialiased": True},
+            "antialiasing",
+            ("opacities compensated for the low-pass filter", "model.antialiased"),
+        ),
+        ({"model__smoothing": True}, "antialiasing", ("3D smoothing filter", "model.smoothing")),
+    ],
+)  # fmt: skip
+def test_the_plan_follows_the_configuration(changes, name, expected):
+    (effect,) = [e for e in summary_of_fit(config_of(**changes), rich_dataset()) if e.name == name]
+    assert (None if effect.what is None else (effect.what, effect.why)) == expected
+
+
+def test_the_plan_of_a_fit_names_what_its_data_has_and_is_ignored():
+    """Not what is ignored and not there."""
+    ignored = replace(fits.plain_dataset(), ignored=("distortion", "motion", "masks", "depth"))
+    assert described(summary_of_fit(config_of(), ignored)).splitlines()[-1] == (
+        "  not simulated: lens distortion (ignored), motion (ignored), antialiasing, exposure and "
+        "white balance, masks (ignored), depth (ignored), camera refinement"
+    )
+    plain = config_of(
+        loss__depth_weight=0.0, data__ignore_distortion=True, data__ignore_motion=True
+    )
+    assert "ignored" not in described(summary_of_fit(plain, fits.plain_dataset()))
+    assert "depth (ignored)" in described(summary_of_fit(plain, rich_dataset()))
+
+
+def rich_scene(**settings):
+    """The integrator of a scene whose Gaussians have a smoothing filter."""
+    gaussians = tensors(Scene().gaussians) | {"smoothing": mi.Float(np.full(40, 0.01, np.float32))}
+    return mi.load_dict({"type": "splats", **gaussians, **settings})
+
+
+def test_the_plan_of_views_regards_all_of_them():
+    views = rich_dataset().train
+    assert described(summary_of_views(rich_scene(), views[1:])) == (
+        "simulated:\n"
+        "  view dependence: spherical harmonics up to degree 1 (the Gaussians' coefficients)\n"
+        "  background: a constant colour (the integrator's background)\n"
+        "  lens distortion: fisheye (k1) (1 of 5 cameras)\n"
+        "  motion: rolling shutter (1 of 5 cameras)\n"
+        "  antialiasing: 3D smoothing filter (the Gaussians' filter)"
+    )
+
+
+def test_the_plan_of_views_names_what_they_have_and_is_ignored():
+    integrator = rich_scene(ignore="distortion, motion, defocus, smoothing")
+    assert described(summary_of_views(integrator, rich_dataset().train)).splitlines()[-1] == (
+        "  not simulated: lens distortion (ignored), motion (ignored), antialiasing, "
+        "smoothing filter (ignored)"
+    )
+    assert described(summary_of_views(integrator, fits.plain_dataset().train)).splitlines()[-1] == (
+        "  not simulated: lens distortion, motion, antialiasing, smoothing filter (ignored)"
+    )
+
+
+def cameras_of_sensors():
+    """A pinhole; one that is bent and moves; a thin lens; an orthographic one."""
+    to_world = {key: VIEWS[1].sensor()[key] for key in ("to_world", "film", "sampler")}
+    close = {"to_world_close": VIEWS[0].sensor()["to_world"]}
+    thin = {"aperture_radius": 0.1, "focus_distance": 2.0}
+    sensors = [
+        VIEWS[1].sensor(),
+        {"type": "calibrated", **to_world, "lens": "opencv", "k1": 0.1, **close},
+        {"type": "thinlens", **to_world, "fov": 40.0, **thin},
+        {"type": "orthographic", **to_world},
+    ]
+    return [camera_from_sensor(read_sensor(mi.load_dict(sensor), 0.01)) for sensor in sensors]
+
+
+def test_the_plan_of_sensors_regards_all_of_them():
+    cameras = cameras_of_sensors()
+    assert described(summary_of_sensors(rich_scene(), cameras, None)).splitlines()[3:] == [
+        "  lens: Orthographic and RadialTangential (k1) (2 of 4 sensors)",
+        "  depth of field: a thin lens (1 of 4 sensors)",
+        "  motion: blurred (1 of 4 sensors)",
+        "  antialiasing: 3D smoothing filter (the Gaussians' filter)",
+        "  not simulated: surfaces",
+    ]
+    ignoring = rich_scene(ignore="distortion, motion, defocus")
+    assert described(summary_of_sensors(ignoring, cameras, None)).splitlines()[3:] == [
+        "  lens: Orthographic (1 of 4 sensors)",
+        "  antialiasing: 3D smoothing filter (the Gaussians' filter)",
+        "  not simulated: lens (ignored), depth of field (ignored), motion (ignored), surfaces",
+    ]
+    plan = summary_of_sensors(rich_scene(), cameras[:1], None, num_surfaces=2)
+    line = "  surfaces: a nested integrator's picture, between the splats (2 of the scene's shapes)"
+    assert line in described(plan).splitlines()
+    assert described(summary_of_sensors(ignoring, cameras[:1], None)).splitlines()[-1] == (
+        "  not simulated: lens, depth of field, motion, surfaces"
+    )
+
+
+def test_the_plan_of_a_fit_says_what_takes_part_in_it():
+    """Both are made of the same configuration and dataset; neither knows of the other."""
+    names = {
+        "background": "background",
+        "colors": "exposure and white balance",
+        "masks": "masks",
+        "depth": "depth",
+        "cameras": "camera refinement",
+        "smoothing": "antialiasing",
+    }
+    for changes, dataset in (
+        ({}, fits.plain_dataset()),
+        ({}, rich_dataset()),
+        ({"loss__depth_weight": 0.0, "colors__lr": 0.1}, rich_dataset()),
+        ({"cameras__optimise": True}, fits.plain_dataset()),
+        (EVERYTHING, rich_dataset()),
+    ):
+        config = config_of(**changes)
+        planned = {e.name for e in summary_of_fit(config, dataset) if e.what is not None}
+        taking_part = {names[e.name] for e in training_effects(config, dataset)}
+        of_the_integrator = {"view dependence", "lens distortion", "motion", "background"}
+        assert planned - of_the_integrator == taking_part - of_the_integrator
+        assert ("background" in taking_part) == config.data.random_background
+
+
+# ----------------------------------------------------------------------------------------------
+# What takes part in a fit
+# ----------------------------------------------------------------------------------------------
+
+
+def test_nothing_takes_part_in_a_plain_fit():
+    assert training_effects(config_of(), fits.plain_dataset()) == []
+    assert integrator_settings([]) == {}
+    trainer = fits.make_trainer(fits.plain_dataset())
+    assert trainer.effects == [] and trainer.integrator.aovs == {}
+    assert all(view.uploads == {} and view.target is view.photograph for view in trainer.views)
+    assert {type(view.sensor).__name__ for view in trainer.views} == {"ProjectiveCamera"}
+
+
+@pytest.mark.parametrize(
+    ("changes", "names"),
+    [
+        ({}, ["depth", "masks"]),
+        ({"colors__lr": 0.1}, ["depth", "colors", "masks"]),
+        ({"data__random_background": True}, ["depth", "background", "masks"]),
+        ({"cameras__optimise": True}, ["depth", "masks", "cameras"]),
+        ({"model__smoothing": True}, ["depth", "masks", "smoothing"]),
+        (EVERYTHING, ["depth", "colors", "background", "masks", "smoothing", "cameras"]),
+    ],
+)
+def test_what_is_called_for_takes_part_in_an_order(changes, names):
+    """Depth is taken off the image first, masks come after what changes colours."""
+    effects = training_effects(config_of(**changes), rich_dataset())
+    assert [effect.name for effect in effects] == names
+    assert integrator_settings(effects) == {"aovs": "depth:depth, alpha:alpha"}
+
+
+def test_everything_takes_part_in_one_fit():
+    """And it learns, and goes on from a checkpoint to the same bytes."""
+    dataset = rich_dataset()
+    # No camera is bent or moves: the photographs show none of it.
+    dataset = fits.with_views(dataset, lambda v: replace(v, lens=None, motion=None))
+    changes = {**EVERYTHING, "model__antialiased": False}
+    trainer = fits.make_trainer(dataset, **changes)
+    losses = [trainer.step().loss for _ in range(36)]
+    assert np.mean(losses[-6:]) < 0.8 * np.mean(losses[:6])
+    fits.assert_resumes_to_the_same_bytes(lambda: fits.make_trainer(dataset, **changes), 3, 4)
+
+
+def test_a_checkpoint_file_holds_the_state_of_effects(tmp_path):
+    changes = {key: value for key, value in EVERYTHING.items() if key != "model__antialiased"}
+    dataset = fits.with_views(fits.true_dataset(), lambda v: replace(v, depth=None))
+    trainer = fits.steps(fits.make_trainer(dataset, **changes), 3)
+    fit.save(trainer, history.History(), tmp_path)
+    resumed = fits.make_trainer(dataset, **changes)
+    resumed.restore(load_checkpoint(tmp_path, trainer.config).trainer)
+    expected, got = (fits.everything_of(fits.steps(t, 2)) for t in (trainer, resumed))
+    assert expected == got
+    assert {"colors/matrices.m", "cameras/turns.value", "smoothing/filter"} <= expected.keys()
+
+
+# ----------------------------------------------------------------------------------------------
+# No trace of what is not called for
+# ----------------------------------------------------------------------------------------------
+
+PLAIN = """
+import importlib.abc, json, sys
+sys.path[:0] = {tests!r}
+
+class Blocked(importlib.abc.MetaPathFinder):
+    def find_spec(self, name, path=None, target=None):
+        if name in {blocked!r}:
+            raise AssertionError(name + " is not there")
+
+sys.meta_path.insert(0, Blocked())
+import drgs, drjit as dr, mitsuba as mi
+mi.set_variant("llvm_ad_rgb")
+import numpy as np
+from drgs.bench import scenes
+from drgs.gaussians.parameters import PARAMETER_NAMES
+from drgs.integrator.scene import make_scene, make_sensors
+
+def kernels(action):
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
+        dr.kernel_history_clear()
+        action()
+        dr.sync_thread()
+        history = dr.kernel_history([dr.KernelType.JIT])
+    return [[kernel["hash"], kernel["operation_count"]] for kernel in history]
+
+bench = scenes.Scene("small", scenes.bench_gaussians(300), scenes.bench_camera(48))
+trainer = scenes.trainer_of(bench, {changes!r})
+found = {{"first step": kernels(trainer.step), "later step": kernels(trainer.step)}}
+
+scene = make_scene(bench.gaussians, trainer.config.model, (0.2, 0.4, 0.6))
+(sensor,) = make_sensors([scenes.view_of(bench)])
+params = mi.traverse(scene)
+for name in PARAMETER_NAMES:
+    dr.enable_grad(params["integrator." + name])
+ones = dr.ones(mi.TensorXf, (48, 48, 3))
+dr.eval(ones)
+
+def backward():
+    dr.backward(dr.sum(mi.render(scene, params, sensor=sensor, spp=1) * ones, axis=None))
+    dr.eval([dr.grad(params["integrator." + name]) for name in PARAMETER_NAMES])
+
+found["render and backward"] = kernels(backward)
+found["imported"] = sorted(set(sys.modules) & set({modules!r}))
+print(json.dumps(found))
+"""
+
+
+def in_a_new_process(run_python, blocked=(), **changes) -> dict:
+    """Raises RuntimeError with the process's last line of error."""
+    modules = [f"drgs.{name}" for name in MODULES]
+    program = PLAIN.format(
+        tests=PATHS,
+        blocked=[f"drgs.{name}" for name in blocked],
+        changes={key.replace("__", "."): value for key, value in changes.items()},
+        modules=modules,
+    )
+    result = run_python(program)
+    if result.returncode != 0:
+        raise RuntimeError(result.stderr.strip().splitlines()[-1])
+    return json.loads(result.stdout)
+
+
+def test_kernels_are_the_same_when_the_modules_of_effects_are_gone(run_python):
+    """Of a picture with its derivatives, and of a fit's iterations: hashes and operations."""
+    whole = in_a_new_process(run_python)
+    reduced = in_a_new_process(run_python, blocked=MODULES)
+    assert whole == reduced
+    assert whole["imported"] == []
+    assert all(len(kernels) > 30 for name, kernels in whole.items() if name != "imported")
+
+
+@pytest.mark.parametrize(
+    ("changes", "module"),
+    [
+        ({"colors__lr": 1e-3}, "training.effects.colors"),
+        ({"cameras__optimise": True}, "training.effects.cameras"),
+        ({"model__smoothing": True}, "training.effects.smoothing"),
+    ],
+)
+def test_what_is_gone_is_missed_when_it_is_called_for(run_python, changes, module):
+    with pytest.raises(RuntimeError, match=f"drgs.{module} is not there"):
+        in_a_new_process(run_python, blocked=[module], **changes)
+
+
+IMPORTS = """
+import json, sys
+sys.path[:0] = {tests!r}
+import drgs, mitsuba as mi, numpy as np
+mi.set_variant("llvm_ad_rgb")
+from dataclasses import replace
+from drgs.training.effects.called_for import training_effects
+from drgs.training.summary import summary_of_fit
+from support import small_capture as capture
+from drgs.config.changes import changed
+from drgs.config.schema import FitConfig
+
+plain = capture.make_dataset(2, 1)
+ones = np.ones((capture.HEIGHT, capture.WIDTH), np.float32)
+
+def dataset(**extras):
+    return replace(plain, train=tuple(replace(view, **extras) for view in plain.train))
+
+found, known = {{}}, set()
+for name, extras, changes in (
+    ("nothing", {{}}, {{}}),
+    ("smoothing", {{}}, {{"model.smoothing": True}}),
+    ("masks", {{"mask": ones}}, {{}}),
+    ("colors", {{}}, {{"colors.lr": 0.1}}),
+    ("cameras", {{}}, {{"cameras.optimise": True}}),
+):
+    config = changed(FitConfig(data={{"path": "."}}), changes)
+    summary_of_fit(config, dataset(**extras))
+    training_effects(config, dataset(**extras))
+    now = set(sys.modules) & set({modules!r})
+    found[name] = sorted(now - known)
+    known |= now
+
+def sensor(**settings):
+    film = {{"type": "hdrfilm", "width": 8, "height": 8, "rfilter": {{"type": "box"}}}}
+    return {{"film": film, **settings}}
+
+from drgs.io.ply import write_ply
+write_ply({ply!r}, capture.blobs())
+for name, scene in (
+    ("calibrated", {{"sensor": sensor(type="calibrated")}}),
+    ("perspective", {{"sensor": sensor(type="perspective")}}),
+    ("environment", {{"sensor": sensor(type="perspective"), "sky": {{"type": "constant"}}}}),
+    ("distorted", {{"sensor": sensor(type="calibrated", lens="opencv", k1=0.1)}}),
+    ("thin lens", {{"sensor": sensor(type="thinlens", aperture_radius=0.1, focus_distance=2.0)}}),
+    ("surface", {{"sensor": sensor(type="perspective"), "ball": {{"type": "sphere"}}}}),
+):
+    integrator = {{"type": "splats", "filename": {ply!r}}}
+    mi.render(mi.load_dict({{"type": "scene", "integrator": integrator, **scene}}), spp=1)
+    now = set(sys.modules) & set({modules!r})
+    found[name] = sorted(now - known)
+    known |= now
+print(json.dumps(found))
+"""
+
+
+def test_each_effect_imports_its_own_modules(run_python, tmp_path):
+    """In this order, what comes later knows what came before."""
+    program = IMPORTS.format(
+        tests=PATHS,
+        modules=[f"drgs.{name}" for name in MODULES],
+        ply=str(tmp_path / "blobs.ply"),
+    )
+    result = run_python(program)
+    assert result.returncode == 0, result.stderr
+    assert json.loads(result.stdout) == {
+        "nothing": [],
+        "smoothing": ["drgs.effects.smoothing", "drgs.training.effects.smoothing"],
+        "masks": ["drgs.training.effects.masks"],
+        "colors": [
+            "drgs.training.effects.colors",
+            "drgs.training.effects.view_parameters",
+            "drgs.training.image_ops",
+        ],
+        "cameras": ["drgs.cameras.motion", "drgs.training.effects.cameras"],
+        "calibrated": [],
+        "perspective": [],
+        "environment": ["drgs.integrator.background"],
+        "distorted": ["drgs.cameras.polynomials", "drgs.cameras.radial_tangential"],
+        "thin lens": ["drgs.cameras.thin_lens", "drgs.effects.defocus"],
+        "surface": ["drgs.effects.occlusion", "drgs.integrator.surfaces"],
+    }
+
+
+def test_a_plain_plugin_has_no_parameter_of_an_effect():
+    params = mi.traverse(mi.load_dict({"type": "splats", **tensors(Scene().gaussians)}))
+    names = ["means", "quats", "log_scales", "logit_opacities", "sh0", "shN", "background"]
+    assert list(params.keys()) == names
+
+
+def test_a_plain_sensor_has_no_parameter_of_an_effect():
+    kept = {key: VIEWS[1].sensor()[key] for key in ("to_world", "film", "sampler")}
+    sensor = mi.load_dict({"type": "calibrated", **kept})
+    own = {key for key in mi.traverse(sensor).keys() if not key.startswith(("film.", "shutter_"))}  # noqa: SIM118
+    assert own - {"near_clip", "far_clip"} == {"to_world", "fx", "fy", "cx", "cy"}
+    assert isinstance(sensor.lens, Pinhole) and sensor.to_world_close is None

@@ -1,0 +1,696 @@
+"""Surfaces that Mitsuba renders, between splats: against the float64 reference and differences."""
+
+import gc
+import weakref
+from dataclasses import dataclass, replace
+from functools import cache
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from support.helpers import bitwise
+from support.views import (
+    VIEWS,
+    Scene,
+    clear,
+    gradient,
+    gradients_of,
+    image_of,
+    tensors,
+    to_linear,
+)
+
+import drgs  # noqa: F401  (registers the plugins)
+from drgs.gaussians.parameters import PARAMETER_NAMES
+from drgs.reference import splatting as reference
+from drgs.reference.effects import render_with_surface
+
+# As in test_splats: single precision, relative to the largest value of an array. Conversions to
+# display space multiply errors of dark pixels by up to 13.
+PICTURE, GRADIENTS = 2e-5, 1e-4
+
+STEP = 1e-6
+
+RADIANCE = np.array([0.25, 0.5, 1.5])
+SKY = np.array([0.75, 0.125, 0.5])
+
+SCENE = Scene(VIEWS[1])
+CROPPED = Scene(VIEWS[12])
+
+
+@pytest.fixture(scope="module", autouse=True)
+def variant():
+    mi.set_variant("llvm_ad_rgb")
+
+
+# ----------------------------------------------------------------------------------------------
+# Scenes
+# ----------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Wall:
+    """A rectangle that shines, tilted, before a camera: what ``path`` makes of it is known."""
+
+    z: float = 2.3  # in the middle of the film, scene units
+    tilt: tuple[float, float] = (0.3, -0.2)  # slopes of z along x and y
+    half: float = 20.0  # side, scene units: 20 covers the film
+
+    def axes(self) -> np.ndarray:
+        """(3, 3): right, up and the normal, towards the camera; camera axes."""
+        right = np.array([1, 0, self.tilt[0]])
+        normal = np.cross(right, [0, 1, self.tilt[1]])
+        normal *= -np.sign(normal[2])
+        right, normal = right / np.linalg.norm(right), normal / np.linalg.norm(normal)
+        return np.stack([right, np.cross(normal, right), normal])
+
+    def shape(self, camera, **others) -> dict:
+        """For ``mi.load_dict``."""
+        to_world = np.eye(4)
+        to_world[:3, :3] = camera.rotation.T @ (self.axes().T * [self.half, self.half, 1])
+        to_world[:3, 3] = camera.rotation.T @ [0, 0, self.z] + camera.center
+        emitter = {"type": "area", "radiance": {"type": "rgb", "value": list(RADIANCE)}}
+        to_world = mi.ScalarTransform4f(to_world)
+        return {"type": "rectangle", "to_world": to_world, "emitter": emitter, **others}
+
+    def depth(self, camera) -> np.ndarray:
+        """(H, W): of the plane, at the pixels' centres."""
+        y, x = np.mgrid[: camera.height, : camera.width] + 0.5
+        slopes = np.stack([(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy], axis=-1)
+        normal = self.axes()[2]
+        return normal[2] * self.z / (slopes @ normal[:2] + normal[2])
+
+
+WALL = Wall()
+
+
+def load(scene, sensor=None, wall=WALL, sky=False, shapes=None, **others):
+    """A Mitsuba scene; others: settings of the integrator."""
+    objects = {} if wall is None else {"wall": wall.shape(scene.view.camera)}
+    if sky:
+        radiance = {"type": "rgb", "value": list(SKY)}
+        objects["sky"] = {"type": "constant", "radiance": radiance}
+    integrator = scene.settings | tensors(scene.gaussians) | others
+    sensor = sensor or scene.view.sensor()
+    objects |= {"integrator": integrator, "sensor": sensor, **(shapes or {})}
+    return mi.load_dict({"type": "scene", **objects})
+
+
+@cache
+def apart(scene: Scene) -> Scene:
+    """With the first seed of which no pixel is near a threshold, nor a splat near the wall."""
+    for seed in range(scene.seed, scene.seed + 200):
+        candidate = clear(replace(scene, seed=seed))
+        depths = reference.project(candidate.gaussians, candidate.camera).depths
+        gaps = np.abs(depths[:, None] - WALL.depth(candidate.camera).ravel())
+        if gaps.min() > 1e-5:  # float32 places a wall at 2 to 1e-6
+            return candidate
+    raise AssertionError("no seed among 200")
+
+
+def to_display(linear) -> np.ndarray:
+    """IEC 61966-2-1."""
+    linear = np.asarray(linear)
+    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
+
+
+def expected(scene, gaussians=None, wall=WALL, coverage=1.0, sky=None) -> dict[str, np.ndarray]:
+    """Planes of the window: color (RGB as the integrator has it), alpha, depth, share."""
+    camera = scene.camera
+    depth = wall.depth(camera)
+    coverage = np.broadcast_to(coverage, depth.shape)
+    picture = render_with_surface(gaussians or scene.gaussians, camera, depth, coverage)
+    share = coverage * picture.before
+    linear = scene.srgb_primitives
+    decode, encode = (to_linear, np.asarray) if linear else (np.asarray, to_display)
+    behind = decode(scene.background) if sky is None else encode(sky)
+    color = decode(picture.color) + share[..., None] * encode(RADIANCE)
+    planes = {
+        "color": color + picture.transmittance[..., None] * behind,
+        "alpha": 1 - picture.transmittance if sky is None else np.ones_like(share),
+        "depth": picture.depth + share * depth,
+        "share": share,
+        "transmittance": picture.transmittance,
+    }
+    return {name: plane[scene.view.window] for name, plane in planes.items()}
+
+
+def rgba(scene, **arguments) -> np.ndarray:
+    planes = expected(scene, **arguments)
+    return np.concatenate([planes["color"], planes["alpha"][..., None]], axis=-1)
+
+
+# ----------------------------------------------------------------------------------------------
+# Pictures
+# ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("scene", [SCENE, CROPPED], ids=lambda scene: scene.view.name)
+@pytest.mark.parametrize("srgb_primitives", [False, True])
+@pytest.mark.parametrize("sky", [None, SKY], ids=["constant background", "sky"])
+def test_a_wall_hides_what_is_behind_it_and_is_hidden_by_what_is_before(
+    scene, srgb_primitives, sky
+):
+    scene = apart(replace(scene, srgb_primitives=srgb_primitives))
+    image = image_of(load(scene, sky=sky is not None))
+    np.testing.assert_allclose(image, rgba(scene, sky=sky), rtol=0, atol=PICTURE * image.max())
+
+
+def covered_by(wall, camera, count=32) -> np.ndarray:
+    """(H, W): the part of each pixel that a wall covers, by count^2 points."""
+    share = np.zeros((camera.height, camera.width))
+    axes = wall.axes()
+    for down in (np.arange(count) + 0.5) / count - 0.5:
+        for right in (np.arange(count) + 0.5) / count - 0.5:
+            moved = replace(camera, cx=camera.cx - right, cy=camera.cy - down)
+            y, x = np.mgrid[: camera.height, : camera.width] + 0.5
+            slopes = (x - moved.cx) / camera.fx, (y - moved.cy) / camera.fy
+            point = np.stack([*slopes, np.ones_like(x)], axis=-1) * wall.depth(moved)[..., None]
+            offset = (point - [0, 0, wall.z]) @ axes[:2].T
+            share += np.abs(offset).max(axis=-1) < wall.half
+    return share / count**2
+
+
+def test_a_wall_that_covers_a_part_of_the_film_ends_where_rays_say():
+    """Pixels that it covers are as before it, others as without it, those at its edge between."""
+    scene, wall = apart(SCENE), Wall(half=0.5)
+    image = image_of(load(scene, wall=wall, nested_spp=1024))
+    share = covered_by(wall, scene.camera)[..., None]
+    whole, without = rgba(scene, wall=wall), scene.image()
+    tolerance = np.full_like(image, PICTURE * image.max())
+    # Rows of samples are a quarter of a pixel apart, so that a straight edge is found to an eighth;
+    # 1024 samples of the nested picture differ by 0.016 of what they show (3 sigma).
+    edge = (share > 0) & (share < 1)
+    assert 50 < edge.sum() < 150
+    assert 50 < (share == 1).sum() < 500
+    tolerance += edge * (np.abs(whole - without) / 8 + 3 * 0.016 * RADIANCE.max())
+    assert np.all(np.abs(image - share * whole - (1 - share) * without) <= tolerance)
+
+
+def test_without_splats_the_picture_is_the_nested_one():
+    """With an environment that is seen past the edges of the wall, and a mirror that shows it."""
+    scene = apart(SCENE)
+    empty = {"logit_opacities": mi.TensorXf(np.full(scene.count, -20, np.float32))}
+    ball = {"type": "sphere", "radius": 0.4, "bsdf": {"type": "conductor"}}
+    position = scene.camera.rotation.T @ [0.1, 0.2, 1.8] + scene.camera.center
+    ball["to_world"] = mi.ScalarTransform4f().translate(position)
+    for background in ({"sky": True}, {"background": [0.0, 0.0, 0.0]}):
+        loaded = load(
+            scene, wall=Wall(half=0.4), shapes={"ball": ball}, nested_spp=64,
+            **(empty | {"srgb_primitives": True} | background),
+        )  # fmt: skip
+        image = image_of(loaded, seed=3)
+        nested = image_of(loaded, integrator=mi.load_dict({"type": "path"}), spp=64, seed=3)
+        difference = np.abs(image - nested)
+        # Where none of the 16 rays at an edge meets what one of the 64 did, the surface is lost:
+        # an eighth of a pixel at most, seen by some more of 64 random samples.
+        assert (difference[..., :3].max(axis=-1) > 1e-5).mean() < 0.02
+        assert difference.max() < 0.125 + 0.1
+
+
+def test_several_samples_of_a_pixel_each_have_their_depth():
+    """The mean over the samples, of a wall whose edge crosses pixels."""
+    scene, count = apart(SCENE), 256
+    sensor = scene.view.sensor(samples=count)
+    wall = Wall(half=0.5)
+    smooth = image_of(load(scene, sensor, wall=wall))
+    center = image_of(load(scene, wall=wall, nested_spp=count))
+    blurred = image_of(load(scene, sensor, wall=None)) - image_of(load(scene, wall=None))
+    # Both see the same, but for what the splats change within a pixel and for the sampling noise.
+    difference = np.abs(smooth - center - blurred)
+    assert difference.mean() < 0.01
+    assert np.abs(smooth - center).max() < 0.5
+
+
+@pytest.mark.parametrize("pixel_format", ["luminance", "luminance_alpha", "xyz", "xyza", "rgb"])
+def test_films_of_other_formats_show_the_same(pixel_format):
+    scene = replace(apart(SCENE), srgb_primitives=True)
+    image = image_of(load(scene, scene.view.sensor(pixel_format), sky=True))
+    rgb = rgba(scene, sky=SKY)
+    to_xyz = [
+        [0.412453, 0.357580, 0.180423],
+        [0.212671, 0.715160, 0.072169],
+        [0.019334, 0.119193, 0.950227],
+    ]
+    matrix = {"rgb": np.eye(3), "xyz": to_xyz, "luminance": to_xyz[1:2]}
+    colors = (
+        rgb[..., :3] @ np.array(matrix[pixel_format.removesuffix("_alpha").removesuffix("a")]).T
+    )
+    if pixel_format.endswith("a"):
+        colors = np.concatenate([colors, rgb[..., 3:]], axis=-1)
+    np.testing.assert_allclose(image, colors, rtol=0, atol=PICTURE * image.max())
+
+
+def test_the_film_holds_the_picture_when_it_is_not_developed():
+    scene = load(apart(SCENE), sky=True)
+    image = image_of(scene)
+    nothing = scene.integrator().render(scene, develop=False)
+    assert dr.width(nothing) == 0
+    np.testing.assert_array_equal(np.array(scene.sensors()[0].film().develop()), image)
+
+
+def test_depth_alpha_and_normal_are_those_of_both():
+    scene = apart(SCENE)
+    image = image_of(load(scene, aovs="z:depth, a:alpha, n:normal"))
+    planes = expected(scene)
+    np.testing.assert_allclose(image[..., :4], rgba(scene), rtol=0, atol=PICTURE * 2)
+    np.testing.assert_allclose(image[..., 4], planes["depth"], rtol=0, atol=PICTURE * 4)
+    np.testing.assert_allclose(image[..., 5], planes["alpha"], rtol=0, atol=PICTURE)
+    # The normals of splats are 0 where they are all transparent, and the wall's is added.
+    bare = {"logit_opacities": mi.TensorXf(np.full(scene.count, -20, np.float32))}
+    normals = image_of(load(scene, aovs="n:normal", **bare))[..., 4:]
+    normal = scene.camera.rotation.T @ WALL.axes()[2]
+    np.testing.assert_allclose(normals, np.broadcast_to(normal, normals.shape), atol=PICTURE)
+
+
+def test_emitters_that_are_hidden_are_looked_through():
+    scene = apart(SCENE)
+    hidden = image_of(load(scene, hide_emitters=True))
+    np.testing.assert_array_equal(hidden, image_of(load(scene, wall=None)))
+    # One behind the other: what is seen is behind both.
+    screen = Wall(z=3.1).shape(scene.camera)
+    screen["bsdf"] = {"type": "diffuse"}
+    del screen["emitter"]
+    shapes = {"first": Wall(z=1.7).shape(scene.camera), "screen": screen}
+    hidden = image_of(load(scene, shapes=shapes, hide_emitters=True, aovs="z:depth"))
+    planes = expected(scene, wall=Wall(z=3.1))
+    # Mitsuba moves the rays that go on from an emitter by 1e-4, along its normal.
+    np.testing.assert_allclose(hidden[..., 4], planes["depth"], rtol=0, atol=4e-4)
+
+
+def test_surfaces_nearer_than_the_near_plane_are_not_seen():
+    scene = apart(replace(SCENE, near=0.5))
+    shapes = {"close": Wall(z=0.4, tilt=(0, 0)).shape(scene.camera)}
+    image = image_of(load(scene, shapes=shapes, aovs="z:depth"))
+    np.testing.assert_allclose(image[..., 4], expected(scene)["depth"], rtol=0, atol=PICTURE * 4)
+
+
+def test_surfaces_beyond_the_far_clip_are_not_seen():
+    """As ``path`` has it. Splats are."""
+    scene = apart(SCENE)
+    loaded = load(scene, sensor=scene.view.sensor() | {"far_clip": 1.5}, aovs="z:depth")
+    without = image_of(load(scene, wall=None, aovs="z:depth"))
+    np.testing.assert_array_equal(image_of(loaded), without)
+    params = mi.traverse(loaded)
+    params["sensor.far_clip"] = 100.0
+    params.update()
+    np.testing.assert_array_equal(image_of(loaded), image_of(load(scene, aovs="z:depth")))
+
+
+def pane(z, bsdf) -> dict:
+    shape = Wall(z=z).shape(SCENE.camera)
+    del shape["emitter"]
+    return shape | {"bsdf": bsdf}
+
+
+def masked(opacity) -> dict:
+    return {"type": "mask", "opacity": opacity, "bsdf": {"type": "diffuse"}}
+
+
+@pytest.mark.parametrize("bsdf", [{"type": "null"}, masked(0.0)], ids=["null", "mask"])
+def test_surfaces_that_let_everything_pass_hide_nothing(bsdf):
+    scene = apart(SCENE)
+    image = image_of(load(scene, shapes={"pane": pane(1.7, bsdf)}, aovs="z:depth,n:normal"))
+    expected = image_of(load(scene, aovs="z:depth,n:normal"))
+    # Mitsuba moves the rays that go on from a surface by 1e-4, along its normal.
+    np.testing.assert_allclose(image, expected, rtol=0, atol=4e-4)
+
+
+@pytest.mark.parametrize("opacities", [(0.25,), (0.25, 0.5)])
+def test_surfaces_that_let_a_part_pass_hide_a_part(opacities):
+    """All that is on a ray counts at the place of the first."""
+    scene = apart(SCENE)
+    shapes = {f"pane_{k}": pane(WALL.z + k, masked(v)) for k, v in enumerate(opacities)}
+    image = image_of(load(scene, wall=None, shapes=shapes, aovs="z:depth", srgb_primitives=True))
+    planes = expected(scene, coverage=1 - np.prod(1 - np.array(opacities)))
+    np.testing.assert_allclose(image[..., 3], planes["alpha"], rtol=0, atol=PICTURE)
+    np.testing.assert_allclose(image[..., 4], planes["depth"], rtol=0, atol=PICTURE * 4)
+
+
+def test_edges_are_the_same_at_the_border_of_a_crop_window():
+    scene, (x, y, width, height) = apart(SCENE), (9, 4, 17, 9)
+    wall = Wall(half=0.5)
+    planes = covered_by(wall, scene.camera)[y : y + height, x : x + width]
+    edge = (planes > 0) & (planes < 1)
+    border = np.ones_like(edge)
+    border[1:-1, 1:-1] = False
+    assert (edge & border).sum() > 5
+    cropped = replace(scene.view, crop=(x, y, width, height)).sensor()
+    settings = {"wall": wall, "aovs": "z:depth,t:alpha"}
+    whole = image_of(load(scene, **settings))[y : y + height, x : x + width]
+    part = image_of(load(scene, sensor=cropped, **settings))
+    np.testing.assert_allclose(part[..., 3:], whole[..., 3:], rtol=0, atol=PICTURE)
+
+
+# ----------------------------------------------------------------------------------------------
+# Whatever a scene holds
+# ----------------------------------------------------------------------------------------------
+
+
+def test_the_users_scene_stays_as_it_is():
+    """Names of its objects, and what Mitsuba's own integrators see, with Gaussians of shapes."""
+    floor = {"type": "rectangle", "to_world": mi.ScalarTransform4f().scale(3)}
+    shapes = {"floor": floor, "sun": {"type": "directional"}, "blob": blob([0, 0, 0])}
+    loaded = load(SCENE, sky=True, shapes=shapes)
+    names = [name for name, _ in mi.traverse(loaded)]
+    path = mi.load_dict({"type": "path"})
+    before = image_of(loaded, integrator=path, spp=16)
+    image_of(loaded)
+    assert [name for name, _ in mi.traverse(loaded)] == names
+    np.testing.assert_array_equal(image_of(loaded, integrator=path, spp=16), before)
+
+
+def repeated(shape) -> dict:
+    """Of a shape, the group that holds it and an instance of that."""
+    group = {"type": "shapegroup", "shape": shape}
+    return {"group": group, "copy": {"type": "instance", "of": {"type": "ref", "id": "group"}}}
+
+
+@pytest.mark.parametrize("with_shapes", [False, True])
+def test_instances_are_surfaces(with_shapes):
+    """Seen, moved with what they repeat, and differentiated, as if they were the shape itself."""
+    scene = apart(SCENE)
+    lamp = {"type": "point", "position": list(scene.camera.center)}
+    diffuse = {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.5, 0.6, 0.7]}}
+    others = {"lamp": lamp} | ({"blob": blob([0, 0, 0])} if with_shapes else {})
+
+    def results(shapes, prefix):
+        settings = {"nested": mi.load_dict({"type": "prb", "max_depth": 2}), "aovs": "z:depth"}
+        loaded = load(scene, wall=None, shapes=shapes | others, **settings)
+        pictures = [image_of(loaded)]
+        params = mi.traverse(loaded)
+        key = f"{prefix}.bsdf.reflectance.value"
+        dr.enable_grad(params[key])
+        dr.backward(dr.sum(mi.render(loaded, params), axis=None))
+        gradients = gradient(params[key])
+        key = f"{prefix}.to_world"
+        params[key] = mi.Transform4f(mi.traverse(mi.load_dict(pane(2.9, diffuse)))["to_world"])
+        params.update()
+        return *pictures, gradients, image_of(loaded)
+
+    found = results(repeated(pane(2.3, diffuse)), "group.shape")
+    known = results({"floor": pane(2.3, diffuse)}, "floor")
+    assert np.abs(found[1]).min() > 0 and np.abs(found[0] - found[2]).max() > 0.1
+    for value, correct in zip(found, known, strict=True):
+        # Rays go into the instance's space and back, which moves what they hit by some roundings;
+        # gradients are sums over all pixels.
+        np.testing.assert_allclose(value, correct, rtol=1e-4, atol=1e-4)
+
+
+def test_one_integrator_can_render_a_scene_with_and_without_mitsubas_gaussians():
+    """Of the same objects otherwise."""
+    floor, more = mi.load_dict(pane(2.3, {"type": "diffuse"})), mi.load_dict(blob([0, 0, 0]))
+    sensor = mi.load_dict(SCENE.view.sensor())
+    lamp = mi.load_dict({"type": "point", "position": list(SCENE.camera.center)})
+    common = {"type": "scene", "sensor": sensor, "floor": floor, "lamp": lamp}
+    scenes = [mi.load_dict(common), mi.load_dict(common | {"more": more})]
+    settings = SCENE.settings | tensors(SCENE.gaussians)
+    one = mi.load_dict(settings)
+    for loaded in (*scenes, *scenes):
+        fresh = image_of(loaded, integrator=mi.load_dict(settings))
+        np.testing.assert_array_equal(image_of(loaded, integrator=one), fresh)
+
+
+def test_numbers_of_the_host_count_too():
+    """A lamp of which the sampling weight becomes zero, in a scene with Mitsuba's Gaussians."""
+    lamps = {
+        f"lamp_{k}": {"type": "point", "position": list(SCENE.camera.center + k)} for k in range(2)
+    }
+    shapes = {"floor": pane(2.3, {"type": "diffuse"}), "blob": blob([0, 0, 0]), **lamps}
+    loaded = load(SCENE, wall=None, shapes=shapes)
+    before = image_of(loaded)
+    params = mi.traverse(loaded)
+    params["lamp_1.sampling_weight"] = 0.0
+    params.update()
+    after = image_of(loaded)
+    loaded.integrator().memory.surfaces.clear()
+    loaded.integrator().memory.traced.clear()
+    np.testing.assert_array_equal(after, image_of(loaded))
+    assert np.abs(after - before).max() > 0.01
+
+
+# ----------------------------------------------------------------------------------------------
+# Derivatives
+# ----------------------------------------------------------------------------------------------
+
+RADIANCE_KEY = "wall.emitter.radiance.value"
+
+
+def weights_of(scene, seed=1) -> np.ndarray:
+    return scene.weights(seed)
+
+
+@pytest.mark.parametrize("srgb_primitives", [False, True])
+def test_gradients_equal_differences_of_the_reference(srgb_primitives):
+    """Along a random direction of each parameter; the wall stays."""
+    scene = apart(replace(SCENE, srgb_primitives=srgb_primitives))
+    weights = weights_of(scene)
+    actual = gradients_of(load(scene), weights, PARAMETER_NAMES)
+    rng = np.random.default_rng(5)
+    for name in PARAMETER_NAMES:
+        value = getattr(scene.gaussians, name)
+        direction = rng.normal(0, 1, value.shape)
+        losses = []
+        for sign in (1, -1):
+            moved = replace(scene.gaussians, **{name: value + sign * STEP * direction})
+            losses.append(np.sum(weights * rgba(scene, gaussians=moved)))
+        terms = actual[name].reshape(direction.shape) * direction
+        size = np.abs(terms).sum()
+        assert size > 0
+        difference = (losses[0] - losses[1]) / (2 * STEP)
+        assert terms.sum() == pytest.approx(difference, abs=GRADIENTS * size), name
+
+
+def test_the_gradient_of_what_the_wall_shows_is_its_share():
+    scene = replace(apart(SCENE), srgb_primitives=True)
+    weights = weights_of(scene)
+    loaded = load(scene)
+    params = mi.traverse(loaded)
+    dr.enable_grad(params[RADIANCE_KEY])
+    image = mi.render(loaded, params)
+    dr.backward(dr.sum(image * mi.TensorXf(weights.astype(np.float32)), axis=None))
+    share = expected(scene)["share"]
+    terms = share[..., None] * weights[..., :3]
+    np.testing.assert_allclose(
+        gradient(params[RADIANCE_KEY]), terms.sum(axis=(0, 1)), atol=GRADIENTS * np.abs(terms).sum()
+    )
+
+
+@pytest.mark.parametrize("srgb_primitives", [False, True])
+def test_forward_mode_is_the_transpose_of_the_gradients(srgb_primitives):
+    """Of the splats, what the wall shows, and the environment past its edges."""
+    scene = apart(replace(SCENE, srgb_primitives=srgb_primitives))
+    weights = weights_of(scene)
+    keys = [f"integrator.{name}" for name in PARAMETER_NAMES]
+    keys += [RADIANCE_KEY, "sky.radiance.value"]
+    wall = Wall(half=0.5)
+
+    def attached():
+        loaded = load(scene, wall=wall, sky=True, nested_spp=16)
+        params = mi.traverse(loaded)
+        for key in keys:
+            dr.enable_grad(params[key])
+        return loaded, params
+
+    loaded, params = attached()
+    image = mi.render(loaded, params, seed=1, seed_grad=2)
+    dr.backward(dr.sum(image * mi.TensorXf(weights.astype(np.float32)), axis=None))
+    gradients = {key: gradient(params[key]) for key in keys}
+
+    rng = np.random.default_rng(7)
+    loaded, params = attached()
+    total = size = 0.0
+    for key in keys:
+        direction = rng.normal(0, 1, gradients[key].shape).astype(np.float32)
+        dr.set_grad(params[key], type(params[key])(direction))
+        terms = gradients[key] * direction
+        assert np.abs(terms).sum() > 0, key
+        total, size = total + terms.sum(), size + np.abs(terms).sum()
+    # Forward mode's own seed is seed_grad as well.
+    tangent = dr.forward_to(mi.render(loaded, params, seed=1, seed_grad=2))
+    tangent = np.array(tangent).astype(np.float64)
+    assert np.sum(tangent * weights) == pytest.approx(total, abs=GRADIENTS * size)
+
+
+def test_gradients_are_the_same_to_the_last_bit():
+    scene = apart(SCENE)
+    runs = [gradients_of(load(scene), weights_of(scene), PARAMETER_NAMES) for _ in range(2)]
+    assert bitwise(list(runs[0].values())) == bitwise(list(runs[1].values()))
+
+
+def blob(center) -> dict:
+    """One of Mitsuba's own Gaussians."""
+    return {
+        "type": "ellipsoids",
+        "centers": mi.TensorXf(np.float32([center])),
+        "scales": mi.TensorXf(np.float32([[0.3, 0.3, 0.3]])),
+        "quaternions": mi.TensorXf(np.float32([[0, 0, 0, 1]])),
+        "opacities": mi.TensorXf(np.float32([[0.75]])),
+        "sh_coeffs": mi.TensorXf(np.float32([[1, 1, 1]])),
+    }
+
+
+# ----------------------------------------------------------------------------------------------
+# What runs, and when
+# ----------------------------------------------------------------------------------------------
+
+
+def counting():
+    """``path``, that counts its pictures."""
+
+    class Counting(mi.SamplingIntegrator):
+        def __init__(self, props):
+            super().__init__(props)
+            self.path = mi.load_dict({"type": "path"})
+            self.count = 0
+
+        def render(self, *arguments, **named):
+            self.count += 1
+            return self.path.render(*arguments, **named)
+
+    mi.register_integrator("counting", lambda props: Counting(props))
+    return mi.load_dict({"type": "counting"})
+
+
+def test_a_scene_without_surfaces_never_runs_the_nested_integrator():
+    nested = counting()
+    scene = load(SCENE, wall=None, sky=True, nested=nested)
+    image_of(scene)
+    assert nested.count == 0
+    image_of(load(SCENE, nested=nested))
+    assert nested.count == 1
+
+
+@pytest.mark.parametrize("use", ["a picture", "a gradient", "a picture with gradients"])
+@pytest.mark.parametrize("with_shapes", [False, True])
+def test_a_scene_is_freed_when_nobody_holds_it(use, with_shapes):
+    """Though its integrator keeps what it saw of it."""
+    loaded = load(SCENE, sky=True, shapes={"blob": blob([0, 0, 0])} if with_shapes else {})
+    params = mi.traverse(loaded)
+    if use != "a picture":
+        dr.enable_grad(params["integrator.means"], params[RADIANCE_KEY])
+    image = mi.render(loaded, params)
+    if use == "a gradient":
+        dr.backward(dr.mean(image, axis=None))
+    integrator = weakref.ref(loaded.integrator())
+    del loaded, params, image
+    gc.collect()
+    assert integrator() is None
+
+
+def test_samples_of_the_nested_integrator_are_not_those_of_the_splats():
+    """Whatever the nested integrator writes into the sensor's sampler."""
+    scene, weights = apart(SCENE), weights_of(SCENE)
+    loaded = load(scene, nested_spp=16)
+    pictures = [image_of(loaded) for _ in range(2)]
+    np.testing.assert_array_equal(*pictures)
+    gradients = [gradients_of(loaded, weights, ["means"])["means"] for _ in range(2)]
+    np.testing.assert_array_equal(gradients[1], 2 * gradients[0])  # they are accumulated
+    assert loaded.sensors()[0].sampler().sample_count() == 1
+
+
+@pytest.mark.parametrize("mode", ["backward", "forward"])
+def test_derivatives_of_a_surface_leave_the_number_of_samples(mode):
+    loaded = load(apart(SCENE), nested_spp=16)
+    params = mi.traverse(loaded)
+    dr.enable_grad(params[RADIANCE_KEY])
+    dr.set_grad(params[RADIANCE_KEY], 1)
+    image = mi.render(loaded, params)
+    derivative = dr.backward if mode == "backward" else dr.forward_to
+    derivative(image)
+    assert loaded.sensors()[0].sampler().sample_count() == 1
+
+
+def test_a_nested_integrator_can_be_given():
+    """``direct`` does not see a light by way of another surface."""
+    scene = load(apart(SCENE), nested=mi.load_dict({"type": "direct"}))
+    np.testing.assert_allclose(
+        image_of(scene), image_of(load(apart(SCENE))), rtol=0, atol=PICTURE * 2
+    )
+    assert "nested = " in str(scene.integrator())
+
+
+@pytest.mark.parametrize("spp", [0, 4], ids=["its sampler's", "given"])
+def test_samples_of_the_nested_integrator_are_left_to_it(spp):
+    """Mitsuba's integrators leave their count with the sampler: the next picture is the same."""
+    loaded = load(apart(SCENE), wall=Wall(half=0.5), nested_spp=16)
+    first = image_of(loaded, spp=spp, seed=3)
+    assert loaded.sensors()[0].sampler().sample_count() == 1
+    loaded.integrator().memory.rendered.clear()
+    np.testing.assert_array_equal(image_of(loaded, spp=spp, seed=3), first)
+
+
+def test_gradients_are_those_of_the_picture_whatever_the_nested_samples():
+    """Of splats at the centres of pixels, before a wall that covers the film and has no noise."""
+    scene, weights = apart(SCENE), weights_of(SCENE)
+    alone = gradients_of(load(scene), weights, ["means"])["means"]
+    with_more = gradients_of(load(scene, nested_spp=16), weights, ["means"])["means"]
+    np.testing.assert_allclose(with_more, alone, rtol=0, atol=GRADIENTS * np.abs(alone).max())
+
+
+def test_a_wall_that_has_moved_is_seen_where_it_is():
+    scene = apart(SCENE)
+    loaded = load(scene)
+    image_of(loaded)
+    params = mi.traverse(loaded)
+    other = mi.load_dict(Wall(z=2.9).shape(scene.camera))
+    params["wall.to_world"] = mi.traverse(other)["to_world"]
+    params.update()
+    np.testing.assert_array_equal(image_of(loaded), image_of(load(scene, wall=Wall(z=2.9))))
+
+
+def test_a_picture_in_between_does_not_change_the_gradients():
+    scene, weights = apart(SCENE), weights_of(SCENE)
+    loaded = load(scene)
+    expected = gradients_of(loaded, weights, ["means"])["means"]
+    loaded, other = load(scene), load(scene, wall=Wall(z=2.9))
+    params = mi.traverse(loaded)
+    dr.enable_grad(params["integrator.means"])
+    image = mi.render(loaded, params)
+    mi.render(other, integrator=loaded.integrator())
+    dr.backward(dr.sum(image * mi.TensorXf(weights.astype(np.float32)), axis=None))
+    np.testing.assert_array_equal(gradient(params["integrator.means"]), expected)
+
+
+def test_gaussians_of_shapes_are_splats_and_no_surfaces():
+    """As if they were the integrator's own; they are left out of the nested picture."""
+    scene = apart(SCENE)
+    center = scene.camera.rotation.T @ [0, 0, 1.5] + scene.camera.center
+    one = {
+        "means": center,
+        "quats": [1, 0, 0, 0],
+        "log_scales": np.log([0.3] * 3),
+        "logit_opacities": np.log(3),
+        "sh0": np.ones((1, 3)),
+        "shN": np.zeros((3, 3)),
+    }
+    together = {n: np.concatenate([v, [one[n]]]) for n, v in vars(scene.gaussians).items()}
+    image = image_of(load(scene, shapes={"blob": blob(center)}))
+    expected = image_of(load(scene, **tensors(reference.Gaussians(**together))))
+    np.testing.assert_allclose(image, expected, atol=PICTURE * expected.max())
+    assert np.abs(image - image_of(load(scene))).max() > 0.1
+
+
+# ----------------------------------------------------------------------------------------------
+# Refusals
+# ----------------------------------------------------------------------------------------------
+
+
+def test_two_nested_integrators_are_refused():
+    nested = {"first": {"type": "path"}, "second": {"type": "direct"}}
+    with pytest.raises(RuntimeError, match="at most one integrator can be nested, got 2"):
+        load(SCENE, **nested)
+
+
+@pytest.mark.parametrize("value", [-1, 1.5, True])
+def test_counts_of_samples_that_are_none_are_refused(value):
+    with pytest.raises(RuntimeError, match="nested_spp must be a whole number, 0 or more"):
+        load(SCENE, nested_spp=value)
+
+
+def test_display_space_on_a_film_without_rgb_is_refused():
+    scene = replace(SCENE, srgb_primitives=False)
+    loaded = load(scene, scene.view.sensor("luminance"))
+    with pytest.raises(ValueError, match="pixel_format must be rgb or rgba"):
+        loaded.integrator().render(loaded)

@@ -1,0 +1,187 @@
+import os
+from pathlib import Path
+
+import pytest
+
+from drgs.config.load import load_config
+from drgs.config.schema import FitConfig
+from drgs.core.errors import UserError
+from drgs.results.folder import (
+    LAST_FILE,
+    RESULTS,
+    claim_output_folder,
+    is_finished,
+    load_run_config,
+    remove_run,
+)
+from drgs.results.refined_cameras import CAMERAS
+from drgs.training.effects.colors import COLORS
+
+
+@pytest.fixture
+def config(tmp_path):
+    return FitConfig(data={"path": tmp_path / "data"})
+
+
+@pytest.fixture
+def finished(tmp_path, config):
+    """The folder of a run that has written something."""
+    folder = tmp_path / "out"
+    claim_output_folder(folder, config)
+    (folder / "renders").mkdir()
+    for name in ("point_cloud.ply", "renders/r_0.png"):
+        (folder / name).write_text("result")
+    return folder
+
+
+def refusal(function, *arguments):
+    with pytest.raises(UserError) as error:
+        function(*arguments)
+    return str(error.value)
+
+
+def contents(folder):
+    return {p.relative_to(folder): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
+
+
+def test_a_missing_folder_is_created_and_holds_the_configuration(tmp_path, config):
+    claim_output_folder(tmp_path / "a" / "b", config)
+    assert os.listdir(tmp_path / "a" / "b") == ["config.yml"]
+    assert load_config(tmp_path / "a" / "b" / "config.yml") == config
+
+
+@pytest.mark.parametrize("present", [[], [".DS_Store"], ["config.yml"]])
+def test_a_folder_without_results_is_taken(tmp_path, config, present):
+    for name in present:
+        (tmp_path / name).write_text("")
+    claim_output_folder(tmp_path, config)
+    assert load_run_config(tmp_path) == config
+
+
+def test_a_run_of_the_same_configuration_may_go_on_in_its_folder(finished, config):
+    before = contents(finished)
+    same = FitConfig(data=config.data, output={"history_every": 3})
+    claim_output_folder(finished, same)
+    after = contents(finished)
+    assert load_run_config(finished) == same
+    assert {**after, Path("config.yml"): None} == {**before, Path("config.yml"): None}
+
+
+def test_a_run_is_finished_when_its_last_file_is_there_and_the_configuration_is_its_own(
+    finished, config
+):
+    assert not is_finished(finished, config)
+    (finished / LAST_FILE).write_text("{}")
+    assert is_finished(finished, config)
+    assert not is_finished(finished, FitConfig(data=config.data, seed=7))
+    (finished / "config.yml").write_text("[")
+    assert not is_finished(finished, config)
+
+
+def test_what_a_killed_run_was_writing_is_removed_and_nothing_else(finished, config):
+    kept = {".DS_Store", ".notes.tmp.txt", "point_cloud.ply", "renders/r_0.png"}
+    for name in (".checkpoint.4711.tmp.npz", "renders/.r_1.4711.tmp.png", *kept):
+        (finished / name).write_text("half")
+    claim_output_folder(finished, config)
+    left = {str(path) for path in contents(finished)}
+    assert left == {"config.yml", *kept}
+
+
+def test_another_run_is_named_by_what_differs(finished, config):
+    other = FitConfig(
+        data=config.data, seed=7, init={"half_extent": 2.0}, iterations=9, loss={"sigma": 2.0}
+    )
+    assert (
+        "already holds another run, which differs in init.half_extent = None (here 2.0), "
+        "loss.sigma = 1.5 (here 2.0), iterations = 30000 (here 9) and 1 more; choose"
+    ) in refusal(claim_output_folder, finished, other)
+
+
+def test_a_run_whose_configuration_is_broken_is_kept(finished, config):
+    (finished / "config.yml").write_text("[")
+    assert "holds another run, with a config.yml that is not readable; choose" in refusal(
+        claim_output_folder, finished, config
+    )
+    assert "not valid YAML" in refusal(remove_run, finished)
+    assert (finished / "point_cloud.ply").read_text() == "result"
+
+
+def test_a_folder_with_files_of_others_is_refused(tmp_path, config):
+    for name in "dbca":
+        (tmp_path / name).write_text("")
+    assert refusal(claim_output_folder, tmp_path, config) == (
+        f"{tmp_path}: the output folder must be new or empty, got one that holds a, b, c and 1 "
+        "more; choose another with --out"
+    )
+    assert sorted(os.listdir(tmp_path)) == ["a", "b", "c", "d"]
+
+
+def test_a_file_in_the_folders_place_is_refused(tmp_path, config):
+    (tmp_path / "out").write_text("mine")
+    assert refusal(claim_output_folder, tmp_path / "out", config) == (
+        f"{tmp_path}/out: cannot be the output folder: File exists; choose another folder: a part "
+        "of this path is a file (--out)"
+    )
+    assert "Not a directory" in refusal(claim_output_folder, tmp_path / "out" / "deeper", config)
+    assert (tmp_path / "out").read_text() == "mine"
+
+
+@pytest.mark.parametrize("function", ["mkdir", "listdir"])
+def test_a_folder_that_is_closed_to_us_is_refused(tmp_path, config, monkeypatch, function):
+    def refuse(*arguments, **options):
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr(os, function, refuse)
+    assert refusal(claim_output_folder, tmp_path / "out", config) == (
+        f"{tmp_path}/out: cannot be the output folder: Permission denied; choose a folder that you "
+        "may write to (--out)"
+    )
+
+
+def test_a_removed_run_makes_room_for_another(finished, config):
+    remove_run(finished)
+    assert os.listdir(finished) == []
+    claim_output_folder(finished, config)
+
+
+def test_removing_takes_every_result(tmp_path, config):
+    claim_output_folder(tmp_path, config)
+    for name in RESULTS:
+        (tmp_path / name).write_text("")
+    remove_run(tmp_path)
+    assert os.listdir(tmp_path) == []
+
+
+@pytest.mark.parametrize("name", [CAMERAS, COLORS])
+def test_what_effects_write_is_a_result(tmp_path, config, name):
+    claim_output_folder(tmp_path, config)
+    (tmp_path / name).write_text("")
+    remove_run(tmp_path)
+    assert os.listdir(tmp_path) == []
+
+
+def test_removing_what_is_not_there_is_no_error(tmp_path):
+    remove_run(tmp_path / "none")
+    remove_run(tmp_path)
+    assert os.listdir(tmp_path) == []
+
+
+def test_files_of_others_are_never_removed(finished):
+    (finished / "notes.txt").write_text("mine")
+    before = contents(finished)
+    assert refusal(remove_run, finished) == (
+        f"{finished}: must hold nothing but a run to be replaced, got notes.txt; move that away, "
+        "or choose another folder with --out"
+    )
+    assert contents(finished) == before
+    (finished / "config.yml").unlink()
+    assert "is not the output folder of a fit: it has no config.yml" in refusal(
+        remove_run, finished
+    )
+
+
+def test_a_folder_without_a_run_cannot_be_continued(tmp_path):
+    assert refusal(load_run_config, tmp_path / "none") == (
+        f"{tmp_path}/none: is not the output folder of a fit: it does not exist, and so has no "
+        "config.yml"
+    )

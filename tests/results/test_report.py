@@ -1,0 +1,297 @@
+"""What a fit shows of itself, made from a few blobs and noise for photographs."""
+
+import base64
+import json
+import re
+from dataclasses import replace
+from html.parser import HTMLParser
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from PIL import Image
+from support.small_capture import HEIGHT, WIDTH, blobs, decibels, make_dataset
+
+from drgs.config.schema import FitConfig, ModelConfig
+from drgs.data.orbits import orbit_of_views
+from drgs.data.viewpoints import field_of_view
+from drgs.integrator.scene import make_scene, render_views
+from drgs.results import curves, report
+from drgs.training.history import HistoryRow
+
+VOID = {"meta", "link", "img", "source", "br"}
+
+
+@pytest.fixture(scope="module")
+def dataset():
+    return make_dataset()
+
+
+@pytest.fixture(scope="module")
+def scene(dataset):
+    mi.set_variant("llvm_ad_rgb")
+    return make_scene(blobs(), ModelConfig(), dataset.background)
+
+
+@pytest.fixture(scope="module")
+def images(dataset, scene):
+    return list(render_views(scene, dataset.test))
+
+
+def history(count=120):
+    return [
+        HistoryRow(i, 1 / i, 10 + i / 10, 100 * i, 1e-3 * 0.9**i, 0.5 * i)
+        for i in range(1, count + 1)
+    ]
+
+
+def metrics(**data):
+    config = FitConfig.model_validate({"data": {"path": "photographs", **data}})
+    return {
+        "iterations": 1200,
+        "num_gaussians": 12345,
+        "wall_s": 75.2,
+        "test": {"psnr": 31.234, "ssim": 0.9, "num_views": 4, "split": "test"},
+        "seed": 7,
+        "versions": {"drgs": "1.2.3", "mitsuba": "3.9.1", "llvm": "19.1.7"},
+        "variant": "llvm_ad_rgb",
+        "threads": 2,
+        "config": config.model_dump(mode="json"),
+    }
+
+
+@pytest.fixture(scope="module")
+def out(tmp_path_factory, dataset, scene, images):
+    folder = tmp_path_factory.mktemp("results") / "blobs"
+    folder.mkdir()
+    report.write_results(folder, dataset, scene, blobs(), images, history(), metrics())
+    return folder
+
+
+def test_everything_is_written_and_nothing_temporary(out):
+    names = {str(path.relative_to(out)) for path in out.rglob("*") if path.is_file()}
+    comparisons = {f"side_by_side/test/r_{i}.png" for i in range(4)}
+    assert names == {"curves.png", "orbit.webp", "orbit.gif", "report.html", *comparisons}
+
+
+# ----------------------------------------------------------------------------------------------
+# Pictures
+# ----------------------------------------------------------------------------------------------
+
+
+def test_a_comparison_is_fitted_photograph_difference(out, dataset, images):
+    pixels = np.asarray(Image.open(out / "side_by_side" / "test" / "r_2.png")) / 255
+    step = WIDTH + report.GAP
+    fitted, photograph, difference = (pixels[:, k * step : k * step + WIDTH] for k in range(3))
+    rounding = 0.5 / 255 + 1e-6
+    assert np.abs(fitted - images[2]).max() < rounding
+    assert np.abs(photograph - dataset.test[2].image).max() < rounding
+    expected = np.clip(0.5 + 5 * (images[2] - dataset.test[2].image), 0, 1)
+    assert np.abs(difference - expected).max() < rounding
+    assert pixels.shape == (HEIGHT, 3 * WIDTH + 2 * report.GAP, 3)
+    assert (pixels[:, WIDTH : WIDTH + report.GAP] == 1).all()
+
+
+def test_what_a_mask_leaves_out_is_no_difference(dataset, images):
+    mask = np.ones((HEIGHT, WIDTH), np.float32)
+    mask[:, : WIDTH // 2] = 0
+    view = replace(dataset.test[2], mask=mask)
+    shown = report.difference(images[2], view)
+    assert (shown[:, : WIDTH // 2] == 0.5).all()
+    whole = report.difference(images[2], dataset.test[2])
+    np.testing.assert_array_equal(shown[:, WIDTH // 2 :], whole[:, WIDTH // 2 :])
+    error = (images[2] - view.image)[:, WIDTH // 2 :].astype(np.float64)
+    assert report.score(images[2], view) == pytest.approx(-10 * np.log10(np.mean(error**2)))
+
+
+def test_the_orbit_has_the_shape_of_the_photographs_and_shows_the_scene(out, dataset, scene):
+    animation = Image.open(out / "orbit.webp")
+    assert (animation.n_frames, animation.size) == (report.ORBIT_FRAMES, (WIDTH, HEIGHT))
+    fov = field_of_view(dataset.train)
+    orbit = orbit_of_views(dataset.train, blobs())
+    camera = orbit.viewpoints(report.ORBIT_FRAMES, WIDTH, HEIGHT, fov)[17]
+    (expected,) = render_views(scene, [camera])
+    animation.seek(17)
+    difference = np.asarray(animation.convert("RGB")) / 255 - expected
+    assert np.abs(difference).mean() < 0.05  # lossy, of small colourful pictures
+
+
+def test_curves_are_drawn(out):
+    pixels = np.asarray(Image.open(out / "curves.png").convert("RGB"))
+    assert pixels.shape[0] > 400 and pixels.shape[1] > 800
+    line = np.array([int(curves.LIGHT.line[i : i + 2], 16) for i in (1, 3, 5)])
+    for row in np.array_split(pixels, 2, axis=0):
+        for panel in np.array_split(row, 3, axis=1):
+            assert (np.abs(panel.astype(int) - line).max(axis=2) < 8).sum() > 100
+
+
+@pytest.mark.parametrize(
+    "rows",
+    [
+        [],
+        history(1),
+        [replace(row, wall_s=1.0) for row in history(3)],
+        [replace(row, loss=float("nan"), psnr=float("nan")) for row in history(3)],
+    ],
+    ids=["empty", "one row", "no time between rows", "diverged"],
+)
+@pytest.mark.filterwarnings("error")
+def test_curves_of_unusual_histories_are_drawn(tmp_path, rows):
+    curves.write_curves(tmp_path / "curves.png", rows)
+    with Image.open(tmp_path / "curves.png") as image:
+        assert image.size[0] > 800
+
+
+def test_the_panels_are_of_the_history():
+    panels = {panel.title: panel for panel in curves._panels(history(5))}
+    assert panels["Loss"].y == pytest.approx([1, 1 / 2, 1 / 3, 1 / 4, 1 / 5])
+    assert panels["Gaussians"].y.tolist() == [100, 200, 300, 400, 500]
+    assert panels["Iterations per second"].x.tolist() == [2, 3, 4, 5]
+    assert panels["Iterations per second"].y == pytest.approx([2, 2, 2, 2])
+    assert panels["Time [min]"].y[-1] == pytest.approx(2.5 / 60)
+
+
+@pytest.mark.parametrize("count", [1, 7, 50, 333])
+def test_the_running_mean_is_the_mean_of_the_rows_around(count):
+    values = np.random.default_rng(0).normal(size=count)
+    reach = count // 100
+    expected = [values[max(0, i - reach) : i + reach + 1].mean() for i in range(count)]
+    assert curves._running_mean(values) == pytest.approx(expected)
+
+
+# ----------------------------------------------------------------------------------------------
+# Page
+# ----------------------------------------------------------------------------------------------
+
+
+class Page(HTMLParser):
+    """Checks that elements nest; collects text and everything that refers to something."""
+
+    def __init__(self, path):
+        super().__init__()
+        self.text, self.references, self.open, self.tags = [], [], [], []
+        self.source = path.read_text(encoding="utf-8")
+        self.feed(self.source)
+        self.close()
+        assert self.open == []
+
+    def handle_starttag(self, tag, attributes):
+        self.tags.append(tag)
+        names = ("src", "srcset", "href", "data", "action", "poster", "background", "style")
+        self.references += [value for name, value in attributes if name in names]
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        self.text.append(data)
+
+    def images(self):
+        """(bytes) of every embedded picture."""
+        for reference in self.references:
+            if reference != "data:,":
+                kind, data = re.fullmatch(r"data:(image/\w+);base64,(.*)", reference).groups()
+                yield kind, base64.b64decode(data, validate=True)
+
+
+@pytest.fixture(scope="module")
+def page(out):
+    return Page(out / "report.html")
+
+
+def test_the_page_refers_to_nothing_outside(page):
+    assert len(page.references) == 1 + 1 + 3 * 3 + 2  # icon, orbit, comparisons, curves
+    assert all(reference.startswith("data:") for reference in page.references)
+    for outside in ("http:", "https:", "file:", "//", "@import", "url(", "<script"):
+        assert outside not in re.sub(r"base64,[A-Za-z0-9+/=]*", "", page.source), outside
+    assert set(page.tags).isdisjoint({"script", "iframe", "object", "embed"})
+
+
+def test_the_pages_pictures_are_whole(page, out, tmp_path):
+    sizes = []
+    for index, (kind, data) in enumerate(page.images()):
+        path = tmp_path / str(index)
+        path.write_bytes(data)
+        with Image.open(path) as image:
+            image.load()
+            assert kind == f"image/{image.format.lower()}"
+            sizes.append(image.size)
+    assert (out / "orbit.webp").read_bytes() in [data for _, data in page.images()]
+    assert sizes.count((WIDTH, HEIGHT)) == 1 + 9
+    assert len(page.source) < 3_000_000
+
+
+def test_the_page_states_the_metrics(page):
+    text = " ".join(" ".join(page.text).split())
+    for stated in (
+        "blobs", "noise <small>", "31.23 dB", "mean of 4 test views", "0.9000", "12,345",
+        "1 min 15 s", "1,200 iterations", "Threads 2", "Seed 7", "drgs 1.2.3, Mitsuba 3.9.1",
+        "16.0", "LLVM 19.1.7", "sh_increase_every: 1000", "path: photographs",
+    ):  # fmt: skip
+        assert stated in text, stated
+
+
+def test_the_page_shows_the_best_the_median_and_the_worst_view(page, dataset, images):
+    scores = {
+        view.name: decibels(image, view.image)
+        for view, image in zip(dataset.test, images, strict=True)
+    }
+    ranked = sorted(scores, key=scores.get, reverse=True)
+    text = " ".join(" ".join(page.text).split())
+    for label, name in (("Best", ranked[0]), ("Median", ranked[2]), ("Worst", ranked[3])):
+        assert f"{label}: {name} PSNR {scores[name]:.2f} dB" in text
+    for name, score in scores.items():
+        assert f"{name} {score:.2f}" in text
+
+
+@pytest.mark.parametrize(
+    ("scores", "expected"),
+    [
+        ([3.0], [("View", 0)]),
+        ([3.0, 5.0], [("View", 1), ("View", 0)]),
+        ([1.0, 9.0, 5.0, 7.0, 3.0], [("Best", 1), ("Median", 2), ("Worst", 0)]),
+    ],
+)
+def test_views_are_chosen_by_their_psnr(scores, expected):
+    assert report.choose_views(scores) == expected
+
+
+def test_text_from_outside_is_escaped(tmp_path, dataset, images, out):
+    hostile = "</pre><script>alert(1)</script>"
+    test = tuple(replace(view, name=f"<b>{view.name}") for view in dataset.test)
+    report.write_report(
+        tmp_path / "report.html",
+        hostile,
+        replace(dataset, test=test, description=hostile, test_split=hostile),
+        images,
+        history(),
+        metrics(source=hostile),
+        (out / "orbit.webp").read_bytes(),
+    )
+    page = Page(tmp_path / "report.html")
+    assert "script" not in page.tags
+    assert "<b>r_0" in "".join(page.text)
+
+
+def test_a_picture_that_equals_its_photograph_is_infinitely_good(tmp_path, dataset, out):
+    equal = replace(dataset, test=dataset.test[:1])
+    report.write_report(
+        tmp_path / "report.html",
+        "equal",
+        equal,
+        [equal.test[0].image],
+        history(2),
+        json.loads(json.dumps(metrics())),
+        (out / "orbit.webp").read_bytes(),
+    )
+    assert "PSNR infinite" in " ".join(Page(tmp_path / "report.html").text)
+
+
+@pytest.mark.parametrize(
+    ("seconds", "expected"),
+    [(0.4, "0 s"), (59.4, "59 s"), (59.6, "1 min 0 s"), (591, "9 min 51 s"), (7260, "2 h 1 min")],
+)
+def test_durations_are_readable(seconds, expected):
+    assert report.duration(seconds) == expected

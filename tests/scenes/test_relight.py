@@ -1,0 +1,100 @@
+"""The worked example ``scenes/relight.py``, on the shipped knot."""
+
+import re
+import sys
+from dataclasses import asdict, replace
+
+import imageio.v3 as iio
+import mitsuba as mi
+import numpy as np
+import pytest
+from conftest import REPOSITORY
+from PIL import Image
+from scipy.spatial.transform import Rotation
+
+from drgs.gaussians.sh_rotation import rotated
+
+SCENES = REPOSITORY / "scenes"
+MODEL = SCENES / "shapes" / "knot.ply"
+
+
+@pytest.fixture
+def relight(monkeypatch):
+    monkeypatch.syspath_prepend(SCENES)
+    mi.set_variant("llvm_ad_rgb")
+    import relight
+
+    return relight
+
+
+def run(relight, monkeypatch, *arguments):
+    monkeypatch.setattr(sys, "argv", ["relight.py", *map(str, arguments)])
+    relight.main()
+
+
+def errors(relight, found) -> dict[str, float]:
+    """Of each unknown, the distance from the truth."""
+    true = asdict(relight.TRUE)
+    return {name: float(np.linalg.norm(np.subtract(v, true[name]))) for name, v in found.items()}
+
+
+def test_what_the_picture_was_made_of_is_found(relight, monkeypatch, tmp_path, capsys):
+    """In 40 steps, from a start that is half as far away."""
+    start = {
+        name: (np.array(value) + asdict(relight.TRUE)[name]) / 2
+        for name, value in asdict(relight.START).items()
+    }
+    monkeypatch.setattr(relight, "START", replace(relight.START, **start))
+    monkeypatch.setattr(relight, "TARGET_SPP", 64)
+    monkeypatch.setattr(relight, "BALL", [0.9, 0.2, 0.45])  # beside the knot
+    run(relight, monkeypatch, MODEL, "--size", 40, "--iterations", 40, "--out", tmp_path)
+    output = capsys.readouterr().out
+    losses = [float(x) for x in re.findall(r"loss ([\d.e+-]+)", output)]
+    assert losses[-1] < losses[0] / 20
+    rows = re.findall(r"^\| (.*) \| .* \| .* \| (.*) \|$", output, re.MULTILINE)
+    found = {title: [float(x) for x in row.split(", ")] for title, row in rows[2:]}
+    assert list(found) == list(relight.TITLES.values())
+    found = {name: found[title] for name, title in relight.TITLES.items()}
+    at_start, at_end = errors(relight, start), errors(relight, found)
+    for name in start:
+        assert at_end[name] < at_start[name] / 3, name
+    assert (tmp_path / "parameters.md").read_text() in output
+    for name in ("target", "start", "end", "difference"):
+        assert iio.imread(tmp_path / f"{name}.png").shape == (40, 40, 3)
+    with Image.open(tmp_path / "relight.webp") as animation:
+        assert animation.n_frames == 14 and animation.size == (80, 40)
+    assert (tmp_path / "loss.png").exists() and (tmp_path / "relight.gif").exists()
+
+
+def test_a_models_smoothing_filter_reaches_the_integrator(relight):
+    model = relight.load(MODEL)
+    smoothing = np.full(model.num_gaussians, 0.05, np.float32)
+    stages = [relight.Stage.of(one, 20) for one in (model, replace(model, smoothing=smoothing))]
+    filters = [stage.scene.integrator().smoothing for stage in stages]
+    assert filters[0] is None
+    np.testing.assert_array_equal(np.array(filters[1]), smoothing)
+
+
+def test_harmonics_are_rotated_as_on_the_host(relight):
+    rotation = Rotation.from_rotvec([0.3, -0.7, 0.4]).as_matrix()
+    coefficients = np.random.default_rng(0).normal(0, 1, (5, 15, 3)).astype(np.float32)
+    matrix = relight.sh_rotation(mi.Matrix3f(rotation), 3)
+    actual = np.array(matrix @ mi.TensorXf(coefficients))
+    # Some tens of float32 products of numbers of size one.
+    np.testing.assert_allclose(actual, rotated(coefficients, rotation), atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["nowhere.ply"], "nowhere.ply: "),
+        ([MODEL, "--iterations", 0], "--iterations must be >= 1, got 0"),
+        ([MODEL, "--size", 90], "--size must be a multiple of 20 px, got 90"),
+    ],
+)
+def test_wrong_arguments_are_refused(relight, monkeypatch, tmp_path, capsys, arguments, message):
+    with pytest.raises(SystemExit) as caught:
+        run(relight, monkeypatch, *arguments, "--out", tmp_path / "out")
+    assert caught.value.code == 2
+    assert capsys.readouterr().err.startswith(f"error: {message}")
+    assert not (tmp_path / "out").exists()

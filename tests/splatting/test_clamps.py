@@ -1,0 +1,259 @@
+"""What each limit of the image model does to the gradient: decided in ``constants.py``, shown here.
+
+One splat (or a few), float64 and float32. Each test moves a parameter from one side of a limit to
+the other: on the limited side the gradient is exactly what the constant's docstring says, on the
+other it is the slope of the float64 reference (central differences).
+"""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support.helpers import (
+    FLOAT32,
+    FLOAT64,
+    Case,
+    Cotangents,
+    both_precisions,
+    kernel_gradients,
+    picture_of,
+    render,
+    single,
+)
+
+from drgs.core import constants
+from drgs.reference import splatting as reference
+
+CAMERA = reference.Camera(
+    rotation=np.eye(3), center=np.zeros(3), fx=20.0, fy=20.0, cx=8.5, cy=6.5, width=17, height=13,
+    near=0.25,
+)  # fmt: skip
+
+TOLERANCE = {FLOAT64: 1e-7, FLOAT32: 2e-5}
+"""Relative: central differences of 1e-6 in float64; some hundred roundings in float32."""
+
+
+def splat(**changes) -> reference.Gaussians:
+    """One splat at the centre of the film, 3 px wide, white, of opacity 0.5."""
+    fields = {
+        "means": [[0.0, 0.0, 2.0]],
+        "quats": [[1.0, 0.1, 0.2, 0.3]],
+        "log_scales": np.log([[0.3, 0.25, 0.2]]),
+        "logit_opacities": [0.0],
+        "sh0": np.full((1, 1, 3), 0.5 / reference.C_00),
+        "shN": np.zeros((1, 0, 3)),
+    }
+    fields |= changes
+    return reference.Gaussians(**{name: single(value) for name, value in fields.items()})
+
+
+def joined(*parts) -> reference.Gaussians:
+    columns = zip(*(vars(part).values() for part in parts), strict=True)
+    return reference.Gaussians(*map(np.concatenate, columns))
+
+
+def case_of(gaussians) -> Case:
+    degree = gaussians.sh_degree
+    # The reference's background is behind every picture: the loss sees transmittance too.
+    return Case("clamp", 17, 13, degree, recipe=lambda *_: (gaussians, CAMERA))
+
+
+def gradients_of(gaussians, precision, cotangents) -> dict[str, np.ndarray]:
+    return kernel_gradients(case_of(gaussians), precision, cotangents)
+
+
+def at_pixel(x, y) -> Cotangents:
+    """The loss is the sum of the colours of one pixel, and its depth."""
+    image, alpha, depth = np.zeros((13, 17, 3)), np.zeros((13, 17)), np.zeros((13, 17))
+    image[y, x], depth[y, x] = [1.0, 0.5, 0.25], 0.125
+    return Cotangents(image, alpha, depth)
+
+
+def slope(gaussians, cotangents, name, index, step=1e-6) -> float:
+    """Central difference of the loss by the reference with respect to one number."""
+
+    def loss(sign):
+        values = getattr(gaussians, name).copy()
+        values[index] += sign * step
+        picture = reference.render(
+            replace(gaussians, **{name: values}), CAMERA, case_of(gaussians).background
+        )
+        return (
+            np.sum(cotangents.d_image * picture.image)
+            + np.sum(cotangents.d_alpha * picture.alpha)
+            + np.sum(cotangents.d_depth * picture.depth)
+        )
+
+    return (loss(1) - loss(-1)) / (2 * step)
+
+
+def assert_slopes(gaussians, precision, cotangents, *numbers, nonzero=True):
+    """Gradients of (name, index) are the reference's slopes."""
+    gradients = gradients_of(gaussians, precision, cotangents)
+    for name, index in numbers:
+        expected = slope(gaussians, cotangents, name, index)
+        assert (abs(expected) > 1e-4) == nonzero, (name, expected)
+        error = abs(gradients[name][index] - expected)
+        assert error <= TOLERANCE[precision] * max(1.0, abs(expected)), name
+
+
+CENTER = at_pixel(8, 6)
+"""The pixel whose centre is the splat's mean."""
+
+
+# Alpha's upper clamp
+
+
+@both_precisions
+def test_a_clamped_alpha_has_no_derivative_and_its_colour_has(precision):
+    gaussians = splat(logit_opacities=[6.0])
+    gradients = gradients_of(gaussians, precision, CENTER)
+    for name in ("logit_opacities", "log_scales", "quats"):
+        assert not gradients[name].any(), name
+    # The mean still moves the depth: 0.125 times the weight.
+    expected = [0, 0, 0.125 * constants.ALPHA_MAX]
+    np.testing.assert_allclose(gradients["means"][0], expected, rtol=1e-6, atol=0)
+    assert_slopes(gaussians, precision, CENTER, ("sh0", (0, 0, 0)), ("means", (0, 2)))
+
+
+@both_precisions
+def test_an_alpha_just_below_the_clamp_has_its_slope(precision):
+    gaussians = splat(logit_opacities=[np.log(0.985 / 0.015)])
+    assert_slopes(gaussians, precision, CENTER, ("logit_opacities", 0), ("sh0", (0, 0, 1)))
+
+
+# Alpha's cut
+
+
+@both_precisions
+@pytest.mark.parametrize(("factor", "is_seen"), [(1.01, True), (0.99, False)])
+def test_an_alpha_below_the_cut_has_no_gradient_at_all(precision, factor, is_seen):
+    opacity = factor * constants.ALPHA_CUT
+    gaussians = splat(logit_opacities=[np.log(opacity / (1 - opacity))])
+    numbers = [("logit_opacities", 0), ("sh0", (0, 0, 0)), ("means", (0, 2))]
+    if is_seen:
+        assert_slopes(gaussians, precision, CENTER, *numbers[:2])
+    else:
+        gradients = gradients_of(gaussians, precision, CENTER)
+        for name, _ in numbers:
+            assert not gradients[name].any(), name
+
+
+@both_precisions
+def test_a_pixel_outside_the_ellipse_has_no_gradient_where_others_have(precision):
+    gaussians = splat(log_scales=np.log([[0.02, 0.02, 0.02]]))
+    assert not gradients_of(gaussians, precision, at_pixel(14, 6))["means"].any()
+    assert gradients_of(gaussians, precision, at_pixel(9, 6))["means"].any()
+
+
+# The exponent, which needs no clamp
+
+
+@both_precisions
+def test_exponents_far_below_underflow_are_zero_not_garbage(precision):
+    """A needle along x: a few pixels off it the exponent is below -1000, where exp2 underflows."""
+    gaussians = splat(log_scales=np.log([[2.0, 1e-4, 1e-4]]), quats=[[1.0, 0, 0, 0]])
+    case = case_of(gaussians)
+    picture = picture_of(render(case, precision)[1], case)
+    rows_of_the_needle = np.abs(np.arange(13) + 0.5 - CAMERA.cy) < 3
+    assert (picture["alpha"][rows_of_the_needle] > 0).any()
+    assert (picture["transmittance"][~rows_of_the_needle] == 1).all()
+    assert not gradients_of(gaussians, precision, at_pixel(8, 0))["means"].any()
+
+
+# The slope's clamp in the Jacobian
+
+
+def wide_splat(slope_x) -> reference.Gaussians:
+    """Large enough to reach the film from ``slope_x`` = x / z."""
+    z = 2.0
+    size = max(abs(slope_x) - 0.3, 0.2) * z
+    return splat(means=[[slope_x * z, 0.1, z]], log_scales=np.log([[size, 0.5 * size, 0.7 * size]]))
+
+
+@both_precisions
+@pytest.mark.parametrize("factor", [0.98, 1.02, -0.98, -1.02])
+def test_a_clamped_slope_is_a_constant_in_the_covariance_only(precision, factor):
+    """On either side of the clamp all slopes are those of the reference: beyond it the covariance
+    depends on z but not on x, while the position on the film depends on both."""
+    limit = (1 + constants.TAN_CLAMP) * (CAMERA.width / 2) / CAMERA.fx
+    gaussians = wide_splat(factor * limit)
+    numbers = [("means", (0, 0)), ("means", (0, 2)), ("log_scales", (0, 0))]
+    assert_slopes(gaussians, precision, at_pixel(16 if factor > 0 else 0, 6), *numbers)
+    affine = reference._local_affine(gaussians, CAMERA)
+    assert affine.unclamped[0, 0] == (abs(factor) < 1)
+
+
+# The colour's clamp
+
+
+@both_precisions
+@pytest.mark.parametrize("color", [-0.01, 0.0, 0.01])
+def test_a_negative_colour_has_no_gradient_and_zero_has(precision, color):
+    gaussians = splat(sh0=np.full((1, 1, 3), (color - 0.5) / reference.C_00))
+    if color == 0:
+        # So that the sum is exactly 0 in both precisions.
+        gaussians.sh0[:] = -0.5 / constants_c0(precision)
+    gradients = gradients_of(gaussians, precision, CENTER)
+    if color < 0:
+        assert not gradients["sh0"].any()
+    else:
+        # d loss / d colour = weight of the pixel = opacity 0.5, times the basis function.
+        expected = 0.5 * reference.C_00 * np.array([1.0, 0.5, 0.25])
+        np.testing.assert_allclose(gradients["sh0"][0, 0], expected, rtol=1e-6)
+    # Alpha's gradient does not depend on which side of the clamp the colour is.
+    assert gradients["logit_opacities"].any()
+
+
+def constants_c0(precision) -> float:
+    """The basis function of degree 0, as the kernels hold it."""
+    return float(precision.dtype(0.28209479177387814))
+
+
+# The near plane
+
+
+@both_precisions
+@pytest.mark.parametrize(("z", "is_drawn"), [(0.25, True), (np.nextafter(0.25, 0), False)])
+def test_a_gaussian_nearer_than_the_near_plane_has_no_gradient(precision, z, is_drawn):
+    z = float(z) if precision is FLOAT64 or is_drawn else float(np.nextafter(np.float32(0.25), 0))
+    gaussians = splat(means=[[0.0, 0.0, 1.0]], log_scales=np.log([[0.02, 0.02, 0.02]]))
+    gaussians.means[0, 2] = z
+    gradients = gradients_of(gaussians, precision, CENTER)
+    assert gradients["means"].any() == is_drawn
+    assert gradients["sh0"].any() == is_drawn
+
+
+# The transmittance's stop
+
+
+@both_precisions
+def test_what_lies_behind_the_stop_has_no_gradient(precision):
+    """Two clamped splats leave just less than the stop: the second and all behind have none."""
+    layers = [
+        splat(means=[[0.0, 0.0, z]], logit_opacities=[logit])
+        for z, logit in [(1.0, 8.0), (1.5, 8.0), (2.0, 0.0)]
+    ]
+    gradients = gradients_of(joined(*layers), precision, CENTER)
+    assert gradients["sh0"][0].any() and not gradients["sh0"][1:].any()
+    assert gradients["means"][0].any() and not gradients["means"][1:].any()
+    # With a first layer that lets more through, the third is seen.
+    layers[0] = splat(means=[[0.0, 0.0, 1.0]], logit_opacities=[1.0])
+    assert_slopes(joined(*layers), precision, CENTER, ("sh0", (2, 0, 0)), ("means", (2, 2)))
+
+
+# The low-pass
+
+
+@both_precisions
+def test_a_splat_far_below_a_pixel_moves_but_its_size_does_not_matter(precision):
+    """The low-pass is added, not clamped: the gradient of the size fades with the size squared."""
+    off_center = at_pixel(9, 6)
+
+    def gradients(size):
+        return gradients_of(splat(log_scales=np.log([[size] * 3])), precision, off_center)
+
+    slopes = [np.abs(gradients(size)["log_scales"]).sum() for size in (0.02, 0.01, 0.005)]
+    assert slopes[0] / slopes[1] == pytest.approx(4, rel=0.3)
+    assert slopes[1] / slopes[2] == pytest.approx(4, rel=0.1)
+    assert gradients(1e-8)["means"].any()

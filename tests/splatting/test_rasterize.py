@@ -1,0 +1,567 @@
+"""Compositing, its adjoint and its tangent against the float64 reference, stage alone."""
+
+import math
+from dataclasses import dataclass, field, replace
+
+import drjit as dr
+import numpy as np
+import pytest
+from support.helpers import (
+    FLOAT32,
+    FLOAT64,
+    NEAR_THRESHOLD,
+    assert_arrays_agree,
+    both_precisions,
+    relative_errors,
+    rows,
+    single,
+)
+
+from drgs.core.constants import WHITENING_SCALE
+from drgs.reference import splatting as reference
+from drgs.splatting import image_model, rasterize
+from drgs.splatting import lanes as lanes_module
+from drgs.splatting.cutoffs import Cutoffs
+from drgs.splatting.image_model import ImageModel
+from drgs.splatting.projection import Splats2D
+from drgs.splatting.rasterize import (
+    SplatGradients,
+    composite,
+    composite_adjoint,
+    composite_tangent,
+)
+from drgs.splatting.tiles import MICROS, TileGrid, bin_splats
+
+# float64: some hundred terms of the size of the result. float32: an exponent of up to 8 carries
+# 1e-6, so alpha 1e-6 and a pixel a few of them; measured 1e-6. In the adjoint, S is the
+# difference of numbers of the size of C.g + T G, off by some 1e-7 of them, and is divided by
+# 1 - a >= 0.01: behind an opaque splat a pixel may be off by 1e-5, and a derivative sums pixels
+# of both signs. Measured: 3e-15 and 5e-6.
+PLANES = {FLOAT64: 1e-12, FLOAT32: 1e-5}
+GRADIENTS = {FLOAT64: 1e-12, FLOAT32: 5e-5}
+
+
+@dataclass(frozen=True)
+class FlatScene:
+    """Splats on the film: the same numbers for both sides, representable in float32."""
+
+    means2d: np.ndarray  # (N, 2) px
+    whitening: np.ndarray  # (N, 3) p, r, s of U
+    opacities: np.ndarray  # (N,)
+    features: np.ndarray  # (N, C)
+    depths: np.ndarray  # (N,)
+    width: int
+    height: int
+    cutoffs: Cutoffs = field(default_factory=Cutoffs)
+
+    @property
+    def conics(self) -> np.ndarray:
+        """(N, 2, 2): U^T U."""
+        p, r, s = self.whitening.T
+        return np.moveaxis(np.array([[p * p, p * r], [p * r, r * r + s * s]]), -1, 0)
+
+    @property
+    def visible(self) -> np.ndarray:
+        return self.opacities > reference.ALPHA_CUT
+
+    def colors(self, group) -> np.ndarray:
+        """Features 3 group, 3 group + 1, ... as three colours, zero beyond the last."""
+        padded = np.pad(self.features, ((0, 0), (0, 2)))[:, 3 * group : 3 * group + 3]
+        return np.pad(padded, ((0, 0), (0, 3 - padded.shape[1])))
+
+    def reference_arguments(self, group=0) -> dict:
+        return {
+            "means2d": self.means2d, "conics": self.conics, "opacities": self.opacities,
+            "colors": self.colors(group), "depths": self.depths, "visible": self.visible,
+            "background": np.zeros(3), "width": self.width, "height": self.height,
+        }  # fmt: skip
+
+    @property
+    def num_groups(self) -> int:
+        return -(-self.features.shape[1] // 3)
+
+    def reference_planes(self) -> dict[str, np.ndarray]:
+        """transmittance (H, W) and features (H, W, C)."""
+        pictures = [
+            reference.composite(**self.reference_arguments(g)) for g in range(self.num_groups)
+        ]
+        images = np.concatenate([picture.image for picture in pictures], axis=-1)
+        return {
+            "transmittance": pictures[0].transmittance,
+            "features": images[..., : self.features.shape[1]],
+        }
+
+    def reference_gradients(self, d_features, d_transmittance) -> dict[str, np.ndarray]:
+        """Under the names of ``SplatGradients``. The loss is linear: groups of features add up."""
+        total: dict[str, np.ndarray] = {}
+        d_colors = []
+        for group in range(self.num_groups):
+            d_image = d_features[..., 3 * group : 3 * group + 3]
+            d_image = np.pad(d_image, ((0, 0), (0, 0), (0, 3 - d_image.shape[-1])))
+            d_alpha = -d_transmittance if group == 0 else None
+            part = reference.composite_gradients(
+                **self.reference_arguments(group), d_image=d_image, d_alpha=d_alpha
+            )
+            d_colors.append(part["colors"])
+            for name in ("means2d", "conics", "opacities"):
+                total[name] = total.get(name, 0) + part[name]
+        p, r, s = self.whitening.T
+        G = total.pop("conics")
+        # A = U^T U and dL = sum_ij G_ij dA_ij, G symmetric: dL/dU = 2 U G.
+        total["whitening"] = 2 * np.column_stack(
+            [p * G[:, 0, 0] + r * G[:, 0, 1], p * G[:, 0, 1] + r * G[:, 1, 1], s * G[:, 1, 1]]
+        )
+        total["features"] = np.concatenate(d_colors, axis=-1)[:, : self.features.shape[1]]
+        return total
+
+    def near_threshold(self) -> np.ndarray:
+        picture = reference.composite(**self.reference_arguments(), threshold_width=NEAR_THRESHOLD)
+        return picture.near_threshold
+
+    def num_stopped(self) -> int:
+        """Pixels that are finished before the last splat that reaches them."""
+        _, stops = reference._composite_and_stops(
+            **self.reference_arguments(), threshold_width=NEAR_THRESHOLD
+        )
+        return int((stops < self.visible.sum()).sum())
+
+    def num_clamped(self) -> int:
+        """(pixel, splat) pairs whose alpha is clamped."""
+        y, x = np.mgrid[: self.height, : self.width] + 0.5
+        d = np.stack([x, y], axis=-1) - self.means2d[:, None, None]
+        power = np.einsum("nhwi,nij,nhwj->nhw", d, self.conics, d)
+        alpha = self.opacities[:, None, None] * np.exp(-0.5 * power)
+        return int((alpha > reference.ALPHA_MAX).sum())
+
+    # The kernels' side
+
+    def splats(self, precision) -> Splats2D:
+        determinants = np.linalg.det(self.conics)
+        variances = np.column_stack([self.conics[:, 1, 1], self.conics[:, 0, 0]])
+        return Splats2D(
+            means2d=precision.vectors(self.means2d),
+            whitening=precision.vectors(self.whitening),
+            depths=precision.array(self.depths),
+            opacities=precision.array(self.opacities),
+            colors=precision.vectors(np.zeros((len(self.depths), 3))),
+            variances=precision.vectors(variances / determinants[:, None]),
+            visible=dr.llvm.ad.Bool(self.visible),
+        )
+
+    def composite(self, precision):
+        columns = [precision.array(column) for column in self.features.T]
+        grid, model = TileGrid(self.width, self.height), ImageModel(cutoffs=self.cutoffs)
+        bins = bin_splats(self.splats(precision), grid, columns, model)
+        records = rasterize.Records.of(bins, bins.splats)
+        return bins, records, composite(bins, records)
+
+    def as_images(self, planes) -> dict[str, np.ndarray]:
+        planes = [rows(plane).reshape(self.height, self.width) for plane in planes]
+        return {"transmittance": planes[0], "features": np.stack(planes[1:], axis=-1)}
+
+    def kernel_planes(self, precision) -> dict[str, np.ndarray]:
+        return self.as_images(self.composite(precision)[2].planes())
+
+    def kernel_gradients(self, precision, d_features, d_transmittance) -> dict[str, np.ndarray]:
+        gradients = composite_adjoint(
+            *self.composite(precision),
+            [precision.array(plane) for plane in np.moveaxis(d_features, -1, 0)],
+            precision.array(d_transmittance),
+        )
+        return as_arrays(gradients)
+
+    def random_cotangents(self, seed=0) -> tuple[np.ndarray, np.ndarray]:
+        rng = np.random.default_rng(seed)
+        shape = self.height, self.width
+        return (
+            single(rng.normal(0, 1, (*shape, self.features.shape[1]))),
+            single(rng.normal(0, 1, shape)),
+        )
+
+
+def as_arrays(gradients: SplatGradients) -> dict[str, np.ndarray]:
+    return {
+        "means2d": rows(gradients.means2d),
+        "whitening": rows(gradients.whitening),
+        "opacities": rows(gradients.opacities),
+        "features": np.stack([rows(column) for column in gradients.features], axis=-1),
+    }
+
+
+def random_flat_scene(width, height, count, num_features=3, opaque=False, seed=0) -> FlatScene:
+    """No pixel is near a threshold: seeds are tried until that holds."""
+    for attempt in range(200):
+        rng = np.random.default_rng([seed, attempt])
+        extent = max(width, height)
+        smallest, largest = (0.1 * extent, 0.5 * extent) if opaque else (0.55, 0.2 * extent + 2)
+        sigma = np.exp(rng.uniform(np.log(smallest), np.log(largest), count))
+        p = 1 / sigma
+        s = 1 / (0.55 + (sigma - 0.55) * rng.uniform(0.1, 1, count))
+        logits = rng.normal(0, 1.5, count)
+        if opaque:
+            logits = rng.uniform(1, 4, count)
+            logits[::3] = 8.0
+        scene = FlatScene(
+            means2d=single(rng.uniform(-0.1, 1.1, (count, 2)) * [width, height]),
+            whitening=single(np.column_stack([p, s * rng.normal(0, 0.7, count), s])),
+            opacities=single(1 / (1 + np.exp(-logits))),
+            features=single(rng.normal(0.5, 0.5, (count, num_features))),
+            depths=single(rng.uniform(1, 4, count)),
+            width=width,
+            height=height,
+        )
+        if not scene.near_threshold().any():
+            return scene
+    raise AssertionError("no clear seed among 200")
+
+
+SCENES = {
+    "one pixel": random_flat_scene(1, 1, 20, 1),
+    "5x3": random_flat_scene(5, 3, 25, 4),
+    "37x29": random_flat_scene(37, 29, 90, 3),
+    "five features": random_flat_scene(33, 18, 60, 5),
+    "whole tiles": random_flat_scene(48, 32, 150, 2),
+    "opaque": random_flat_scene(37, 29, 70, 3, opaque=True),
+    "one splat": random_flat_scene(20, 20, 1, 3, seed=2),
+}
+all_scenes = pytest.mark.parametrize("scene", SCENES.values(), ids=SCENES)
+
+
+def test_scenes_enter_every_branch():
+    opaque = SCENES["opaque"]
+    assert opaque.num_stopped() >= 100 and opaque.num_clamped() >= 20
+    bins, _, layers = opaque.composite(FLOAT64)
+    assert bins.num_entries > 2 * 32
+    # Some micro-tile has stopped before the end of its tile's entries.
+    ends = np.repeat(np.array(bins.tile_start)[1:], MICROS)
+    assert (np.array(layers.stop) <= ends).all() and (np.array(layers.stop) < ends).any()
+
+
+# ----------------------------------------------------------------------------------------------
+# Against the reference
+# ----------------------------------------------------------------------------------------------
+
+
+@both_precisions
+@all_scenes
+def test_planes_equal_the_reference(precision, scene):
+    assert_arrays_agree(scene.kernel_planes(precision), scene.reference_planes(), PLANES[precision])
+
+
+@both_precisions
+@all_scenes
+def test_gradients_equal_the_reference(precision, scene):
+    cotangents = scene.random_cotangents()
+    actual = scene.kernel_gradients(precision, *cotangents)
+    expected = scene.reference_gradients(*cotangents)
+    assert_arrays_agree(actual, expected, GRADIENTS[precision])
+    for name in actual:
+        with pytest.raises(AssertionError, match=rf"{name}\["):
+            scaled = {**actual, name: 1.01 * actual[name]}
+            assert_arrays_agree(scaled, expected, GRADIENTS[precision])
+
+
+@both_precisions
+def test_transmittance_alone_has_the_right_gradients(precision):
+    scene = SCENES["37x29"]
+    _, d_transmittance = scene.random_cotangents()
+    cotangents = np.zeros((29, 37, 3)), d_transmittance
+    actual = scene.kernel_gradients(precision, *cotangents)
+    assert not actual["features"].any()
+    assert_arrays_agree(actual, scene.reference_gradients(*cotangents), GRADIENTS[precision])
+
+
+def random_tangents(scene, seed=5) -> dict[str, np.ndarray]:
+    rng = np.random.default_rng(seed)
+    names = ("means2d", "whitening", "opacities", "features")
+    # A direction that moves a splat of any size by a like part of itself.
+    size = {"whitening": scene.whitening[:, :1], "opacities": scene.opacities}
+    return {
+        name: single(rng.normal(0, 1, getattr(scene, name).shape) * size.get(name, 1.0))
+        for name in names
+    }
+
+
+def kernel_tangents(scene, precision, tangents) -> dict[str, np.ndarray]:
+    direction = SplatGradients(
+        [
+            *precision.vectors(tangents["means2d"]),
+            *precision.vectors(tangents["whitening"]),
+            precision.array(tangents["opacities"]),
+        ],
+        [precision.array(column) for column in tangents["features"].T],
+    )
+    return scene.as_images(composite_tangent(*scene.composite(precision), direction).planes())
+
+
+@both_precisions
+@all_scenes
+def test_tangents_equal_central_differences_of_the_reference(precision, scene):
+    tangents = random_tangents(scene)
+    # alpha changes by at most 100 * step relative: no decision flips, see NEAR_THRESHOLD. The
+    # error is step^2 / 6 times a third derivative of 1e5, and 1e-16 / step: 1e-9 of the values.
+    step = 2.0**-22
+
+    def moved(sign):
+        fields = {name: getattr(scene, name) + sign * step * v for name, v in tangents.items()}
+        return replace(scene, **fields).reference_planes()
+
+    forward, backward = moved(1), moved(-1)
+    expected = {name: (forward[name] - backward[name]) / (2 * step) for name in forward}
+    tolerance = max(GRADIENTS[precision], 1e-7)
+    assert_arrays_agree(kernel_tangents(scene, precision, tangents), expected, tolerance)
+
+
+@both_precisions
+@all_scenes
+def test_adjoint_is_the_transpose_of_the_tangent(precision, scene):
+    tangents = random_tangents(scene)
+    d_features, d_transmittance = scene.random_cotangents(3)
+    images = kernel_tangents(scene, precision, tangents)
+    gradients = scene.kernel_gradients(precision, d_features, d_transmittance)
+    pixels = [d_features * images["features"], d_transmittance * images["transmittance"]]
+    splats = [gradients[name] * tangents[name] for name in tangents]
+    left, right = (sum(term.sum() for term in terms) for terms in (pixels, splats))
+    size = math.sqrt(sum((term**2).sum() for term in [*pixels, *splats]))
+    # Relative to the root of the sum of squares: the sum itself may cancel.
+    tolerance = GRADIENTS[precision]
+    assert abs(left - right) <= tolerance * size
+    assert not abs(left - 1.01 * right) <= tolerance * size
+
+
+# ----------------------------------------------------------------------------------------------
+# Decisions
+# ----------------------------------------------------------------------------------------------
+
+
+def stack(opacities, width=1, height=1, sigma=10.0, offset=(0.0, 0.0)) -> FlatScene:
+    """Splats behind each other on the film's centre, the nearest first, with features 1, 2, ..."""
+    n = len(opacities)
+    return FlatScene(
+        means2d=np.tile(np.array([width / 2, height / 2]) + offset, (n, 1)),
+        whitening=single(np.tile([1 / sigma, 0, 1 / sigma], (n, 1))),
+        opacities=single(opacities),
+        features=np.arange(1.0, n + 1)[:, None],
+        depths=np.arange(1.0, n + 1),
+        width=width,
+        height=height,
+    )
+
+
+@both_precisions
+def test_a_pixel_stops_before_the_splat_that_would_take_it_below_the_stop(precision):
+    scene = stack([0.9, 0.9, 0.9, 0.95, 0.1])
+    planes = scene.kernel_planes(precision)
+    expected = 0.9 + 2 * 0.09 + 3 * 0.009
+    assert planes["transmittance"][0, 0] == pytest.approx(1e-3, rel=1e-5)
+    assert planes["features"][0, 0, 0] == pytest.approx(expected, rel=1e-6)
+    gradients = scene.kernel_gradients(precision, np.ones((1, 1, 1)), np.ones((1, 1)))
+    # The fourth ends the pixel; the fifth would fit, but the pixel is finished.
+    for name, values in gradients.items():
+        assert not values[3:].any(), name
+    np.testing.assert_allclose(gradients["features"][:3, 0], [0.9, 0.09, 0.009], rtol=1e-5)
+
+
+@both_precisions
+def test_the_second_clamped_splat_stops_the_pixel(precision):
+    """(1 - 0.99f)^2 is 2e-6, relative, below the stop; with the double 0.99 it is not."""
+    planes = stack([0.999, 0.999, 0.5]).kernel_planes(precision)
+    assert planes["transmittance"][0, 0] == pytest.approx(0.01, rel=1e-5)
+    np.testing.assert_allclose(planes["features"][0, 0], [0.99], rtol=1e-6)
+
+
+@both_precisions
+def test_a_clamped_alpha_has_no_derivative_but_the_colour_has(precision):
+    scene = stack([0.999, 0.5], offset=(0.3, 0.1))
+    gradients = scene.kernel_gradients(precision, np.ones((1, 1, 1)), np.ones((1, 1)))
+    for name in ("means2d", "whitening", "opacities"):
+        assert not gradients[name][0].any() and gradients[name][1].any(), name
+    np.testing.assert_allclose(gradients["features"][:, 0], [0.99, 0.005], rtol=1e-3)
+    tangents = random_tangents(scene)
+    tangents = {
+        name: v * np.array([1, 0]).reshape(2, *[1] * (v.ndim - 1)) for name, v in tangents.items()
+    }
+    tangents["features"] *= 0
+    images = kernel_tangents(scene, precision, tangents)
+    assert not images["features"].any() and not images["transmittance"].any()
+
+
+@both_precisions
+@pytest.mark.parametrize(("factor", "seen"), [(1 - 1e-5, False), (1 + 1e-5, True)])
+def test_alpha_is_cut_at_its_threshold(precision, factor, seen):
+    """Half a pixel off the centre of a 1 px splat: the falloff there is exp(-1/8)."""
+    opacity = reference.ALPHA_CUT * factor * math.exp(0.125)
+    planes = stack([opacity], sigma=1.0, offset=(0.5, 0.0)).kernel_planes(precision)
+    assert (planes["transmittance"][0, 0] < 1) == seen
+
+
+@both_precisions
+@pytest.mark.parametrize("count", [1, 31, 32, 33, 64, 65, 200])
+def test_lists_around_a_word_of_32_entries(precision, count):
+    """On four tiles, so that three of the lists begin within a word."""
+    opacities = np.random.default_rng(count).uniform(0.01, 0.06, count)
+    scene = stack(opacities, 20, 20, sigma=9.0)
+    assert_arrays_agree(scene.kernel_planes(precision), scene.reference_planes(), PLANES[precision])
+    # Isotropic splats on a symmetric film: eight pixels may be near the cut at once.
+    kept = ~scene.near_threshold()
+    assert kept.sum() >= kept.size - 16
+    d_features, d_transmittance = scene.random_cotangents(count)
+    cotangents = d_features * kept[..., None], d_transmittance * kept
+    assert_arrays_agree(
+        scene.kernel_gradients(precision, *cotangents),
+        scene.reference_gradients(*cotangents),
+        GRADIENTS[precision],
+    )
+
+
+@both_precisions
+def test_a_needle_leaves_nothing_where_its_exponent_is_far_below_the_range(precision):
+    """A horizontal needle 0.55 px thick: 3 px away, in the same micro-tile, exp2(-19); with the
+    steepest conic, times 100, exponents reach -2000, where a short exp2 returns garbage.
+    """
+    for steepness in (1, 10):
+        scene = stack([0.9], 12, 12, sigma=0.55)
+        scene = replace(
+            scene,
+            means2d=np.array([[6.0, 4.5]]),
+            whitening=single([[1 / 500, 0, steepness / 0.55]]),
+        )
+        expected = scene.reference_planes()
+        assert (expected["transmittance"][4] < 0.2).all()
+        assert (expected["transmittance"][[0, 1, 2, 6, 7, 8]] == 1).all()
+        actual = scene.kernel_planes(precision)
+        assert_arrays_agree(actual, expected, PLANES[precision])
+        cotangents = scene.random_cotangents()
+        assert_arrays_agree(
+            scene.kernel_gradients(precision, *cotangents),
+            scene.reference_gradients(*cotangents),
+            GRADIENTS[precision],
+        )
+
+
+@both_precisions
+def test_without_a_visible_splat_the_film_is_transparent(precision):
+    scene = replace(stack([0.5, 0.5], 20, 10), opacities=np.array([0.001, 0.002]))
+    planes = scene.kernel_planes(precision)
+    assert (planes["transmittance"] == 1).all() and not planes["features"].any()
+    for name, values in scene.kernel_gradients(precision, *scene.random_cotangents()).items():
+        assert values.shape[0] == 2 and not values.any(), name
+    tangents = kernel_tangents(scene, precision, random_tangents(scene))
+    assert not tangents["transmittance"].any() and not tangents["features"].any()
+
+
+@both_precisions
+def test_memory_that_was_never_written_is_never_read(precision):
+    """Partial derivatives and rows are stored in uninitialised memory: fill it with NaN first."""
+    scene = SCENES["opaque"]
+    cotangents = scene.random_cotangents()
+    expected = scene.kernel_gradients(precision, *cotangents)
+    frame = scene.composite(precision)
+    poison = [dr.opaque(precision.Float, math.nan, 2**k) for k in range(4, 20) for _ in range(6)]
+    del poison
+    assert np.isnan(np.array(dr.empty(precision.Float, 2**14))).all(), "freed memory is reused"
+    gradients = as_arrays(
+        composite_adjoint(
+            *frame,
+            [precision.array(plane) for plane in np.moveaxis(cotangents[0], -1, 0)],
+            precision.array(cotangents[1]),
+        )
+    )
+    for name, values in expected.items():
+        np.testing.assert_array_equal(gradients[name], values)
+    np.testing.assert_array_equal(
+        scene.kernel_planes(precision)["features"], scene.as_images(frame[2].planes())["features"]
+    )
+
+
+# ----------------------------------------------------------------------------------------------
+# Pieces
+# ----------------------------------------------------------------------------------------------
+
+
+def test_short_exp2_is_accurate_to_single_precision():
+    x = np.linspace(-126, 127, 2_000_001).astype(np.float32)
+    x = np.concatenate([x, np.float32([-126, -0.5, 0.5, 0, 127, -1e-30, -125.5])])
+    actual = np.array(image_model.exp2_short(FLOAT32.Float(x))).astype(np.float64)
+    exact = np.exp2(x.astype(np.float64))
+    assert np.abs(actual / exact - 1).max() < 2.2e-7
+
+
+@pytest.mark.parametrize("size", [(1, 1), (37, 29), (64, 48), (160, 16), (100, 90)])
+def test_lanes_visit_every_micro_tile_once(size):
+    grid = TileGrid(*size)
+    lanes = lanes_module.make_lanes(FLOAT32.Float, grid)
+    micro_tile, micro, tile, x, y = (
+        np.array(getattr(lanes, name)).astype(int)
+        for name in ("micro_tile", "micro", "tile", "x", "y")
+    )
+    np.testing.assert_array_equal(np.sort(micro_tile), np.arange(grid.num_tiles * MICROS))
+    np.testing.assert_array_equal(micro_tile, tile * MICROS + micro)
+    np.testing.assert_array_equal(x, tile % grid.columns * 16 + micro % 4 * 4)
+    np.testing.assert_array_equal(y, tile // grid.columns * 16 + micro // 4 * 4)
+
+
+@both_precisions
+@pytest.mark.parametrize("count", [0, 1, 2, 3, 7])
+def test_records_hold_geometry_and_features_of_each_entry(precision, count):
+    scene = SCENES["37x29"]
+    features = np.random.default_rng(0).normal(size=(len(scene.depths), count))
+    scene = replace(scene, features=single(features))
+    bins, records, _ = scene.composite(precision)
+    packed = np.array(records.rows).reshape(len(bins.ranks), -1)[: bins.num_entries]
+    gaussians = np.array(bins.order)[np.array(bins.ranks)[: bins.num_entries]]
+    expected = np.column_stack(
+        [
+            rows(precision.vectors(scene.means2d)),
+            rows(precision.vectors(scene.whitening) * WHITENING_SCALE),
+            np.array(dr.log2(precision.array(scene.opacities))),
+            *(np.array(precision.array(column)) for column in scene.features.T),
+        ]
+    )
+    np.testing.assert_array_equal(packed[:, : 6 + count], expected[gaussians])
+    assert packed.shape[1] == -(-(6 + count) // 4) * 4 and not packed[:, 6 + count :].any()
+
+
+@both_precisions
+def test_slots_are_a_numbering_of_the_composited_pairs(precision):
+    """Every pair that is composited has a slot of its own, and a lane's slots are contiguous."""
+    scene = SCENES["opaque"]
+    bins, _, layers = scene.composite(precision)
+    slots = rasterize.assign_slots(bins, layers)
+    composited = np.array(slots.composited)
+    pairs = np.array(slots.pairs).astype(np.int64).reshape(-1, MICROS, 2)
+    tiles, stop = np.array(bins.tiles), np.array(layers.stop).reshape(-1, MICROS)
+    masks, found = np.array(bins.masks), {}
+    for micro in range(MICROS):
+        for entry in range(bins.num_entries):
+            expected = masks[entry] >> micro & 1 and entry < stop[tiles[entry], micro]
+            assert composited[entry] >> micro & 1 == expected
+            if expected:
+                first, word = pairs[entry // 32, micro]
+                found[micro, entry] = first + bin(word & ((1 << entry % 32) - 1)).count("1")
+    assert list(found.values()) == list(range(slots.count)) and slots.count > 0
+
+    lanes = lanes_module.make_lanes(precision.Float, bins.grid)
+    lane_stop = dr.gather(dr.llvm.ad.UInt32, layers.stop, lanes.micro_tile)
+    number = np.array(slots.number(lanes_module.Entries(bins, lanes, lane_stop)))
+    begins = np.searchsorted(tiles[: bins.num_entries], np.arange(bins.grid.num_tiles))
+    expected = [
+        sum(1 for m, entry in found if m == micro and begins[tile] <= entry < stop[tile, micro])
+        for tile, micro in zip(np.array(lanes.tile), np.array(lanes.micro), strict=True)
+    ]
+    np.testing.assert_array_equal(number, expected)
+    counted = lanes_module.count_entries(lanes_module.Entries(bins, lanes, lane_stop))
+    np.testing.assert_array_equal(counted, expected)
+    assert len(set(expected)) > 3
+    similar = lanes_module.grouped_by_work(
+        lanes, slots.number(lanes_module.Entries(bins, lanes, lane_stop))
+    )
+    np.testing.assert_array_equal(np.sort(similar.micro_tile), np.sort(lanes.micro_tile))
+    assert slots.count < sum(bin(mask).count("1") for mask in masks), "some pairs are behind a stop"
+
+
+def test_comparison_is_relative_to_each_array():
+    errors = relative_errors({"a": np.array([2.0, 1.0])}, {"a": np.array([2.0, 1.5])})
+    assert errors == {"a": 0.25}
+    with pytest.raises(AssertionError, match=r"a\[1\]: kernels nan"):
+        assert_arrays_agree({"a": np.array([2.0, np.nan])}, {"a": np.array([2.0, 1.5])}, 1.0)

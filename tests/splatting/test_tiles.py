@@ -1,0 +1,372 @@
+"""Binning against brute force in float64: every pair that compositing needs, in order."""
+
+from dataclasses import dataclass
+
+import drjit as dr
+import numpy as np
+import pytest
+from support.helpers import (
+    FLOAT32,
+    Case,
+    both_precisions,
+    device_camera,
+    device_gaussians,
+    rows,
+    single,
+    stacked_scene,
+)
+
+from drgs.reference import splatting as reference
+from drgs.splatting import tiles
+from drgs.splatting.projection import compensated_opacity, load_rows, plain_opacity, project
+from drgs.splatting.tiles import GRID, MICRO, MICROS, TILE, WORD, TileGrid, bin_splats
+
+CASES = [
+    Case("37x29", 37, 29, 0),
+    Case("antialiased", 40, 70, 0, count=200, antialiased=True, seed=1),
+    Case("one pixel", 1, 1, 0, count=40, seed=2),
+    Case("5x3", 5, 3, 0, count=40, seed=3),
+    Case("whole tiles", 64, 48, 0, count=300, seed=4),
+    Case("stacked", 37, 29, 0, count=70, recipe=stacked_scene, seed=5),
+    Case("one splat", 20, 20, 0, count=1, seed=6),
+]
+all_cases = pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
+
+
+@dataclass(frozen=True)
+class Binned:
+    """``TileBins`` on the host, padding included, and what it was made of."""
+
+    case: Case
+    splats: object
+    bins: object
+
+    def __getattr__(self, name):
+        return np.array(getattr(self.bins, name)).astype(np.int64)
+
+    @property
+    def count(self) -> int:
+        return self.bins.num_entries
+
+    @property
+    def visible(self) -> np.ndarray:
+        return np.array(self.splats.visible)
+
+    def mask_table(self) -> np.ndarray:
+        """(N, tiles): the mask of each (Gaussian, tile), 0 where there is no entry."""
+        table = np.zeros((len(self.order), self.bins.grid.num_tiles), dtype=np.int64)
+        gaussians = self.order[self.ranks[: self.count]]
+        table[gaussians, self.tiles[: self.count]] = self.masks[: self.count]
+        return table
+
+
+def bin_case(case, precision) -> Binned:
+    gaussians = device_gaussians(case.gaussians, precision)
+    rule = compensated_opacity if case.antialiased else plain_opacity
+    splats = project(load_rows(gaussians, 0), device_camera(case.camera, precision), 0, rule)
+    dr.eval(splats)
+    return Binned(case, splats, bin_splats(splats, TileGrid(case.width, case.height)))
+
+
+def tile_and_micro(x, y, grid) -> tuple[np.ndarray, np.ndarray]:
+    """Of pixels: the tile, and the micro-tile within it, both counted in rows."""
+    tile = (y // TILE) * grid.columns + x // TILE
+    return tile, (y % TILE // MICRO) * GRID + x % TILE // MICRO
+
+
+def quadratic_form(factor, dx, dy) -> np.ndarray:
+    """|U d|^2 with U = [[p, r], [0, s]], base e: twice the negative exponent."""
+    p, r, s = factor
+    return (p * dx + r * dy) ** 2 + (s * dy) ** 2
+
+
+# ----------------------------------------------------------------------------------------------
+# The grid
+# ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("size", "columns", "rows_"), [((1, 1), 1, 1), ((16, 17), 1, 2), ((37, 29), 3, 2)]
+)
+def test_tiles_cover_the_film(size, columns, rows_):
+    grid = TileGrid(*size)
+    assert (grid.columns, grid.rows, grid.num_tiles) == (columns, rows_, columns * rows_)
+
+
+# ----------------------------------------------------------------------------------------------
+# Which pairs
+# ----------------------------------------------------------------------------------------------
+
+
+@both_precisions
+@all_cases
+def test_entries_cover_every_pair_that_the_reference_accepts(precision, case):
+    binned = bin_case(case, precision)
+    grid = binned.bins.grid
+    table = binned.mask_table()
+    splats = reference.project(case.gaussians, case.camera, case.antialiased)
+    y, x = np.mgrid[: case.height, : case.width]
+    tile, micro = tile_and_micro(x, y, grid)
+    pairs = 0
+    for i in np.flatnonzero(splats.visible):
+        d = np.stack([x + 0.5, y + 0.5], axis=-1) - splats.means2d[i]
+        power = np.einsum("hwi,ij,hwj->hw", d, splats.conics[i], d)
+        accepted = splats.opacities[i] * np.exp(-0.5 * power) >= reference.ALPHA_CUT
+        found = table[i, tile] >> micro & 1
+        assert found[accepted].all(), f"splat {i} is missing at {np.argwhere(accepted & ~found)}"
+        pairs += accepted.sum()
+    assert pairs > 0
+    assert not table[~splats.visible].any()
+
+
+@both_precisions
+@all_cases
+def test_masks_equal_a_brute_force_ellipse_test(precision, case):
+    """The smallest exponent over each micro-tile's rectangle of pixel centres.
+
+    A quadratic's minimum over a rectangle that does not hold its centre lies on the border: here
+    all four sides are tried. ``cull_margin`` (base 2) is the documented margin; beyond it a
+    rounding error of a tenth is allowed for float32.
+    """
+    binned = bin_case(case, precision)
+    grid = binned.bins.grid
+    table = binned.mask_table()
+    rank = dr.arange(dr.llvm.ad.UInt32, len(binned.order))
+    geometry = np.stack([np.array(v, float) for v in binned.bins.splats(rank)], axis=1)
+    undecided = total = 0
+    tile = np.arange(grid.num_tiles)[:, None]
+    micro = np.arange(MICROS)[None, :]
+    left = tile % grid.columns * TILE + micro % GRID * MICRO + 0.5
+    top = tile // grid.columns * TILE + micro // GRID * MICRO + 0.5
+    for rank in range(binned.visible.sum()):
+        mean_x, mean_y, p, r, s, log2_opacity = geometry[rank]
+        x0, y0 = left - mean_x, top - mean_y
+        x1, y1 = x0 + MICRO - 1, y0 + MICRO - 1
+        candidates = []
+        for dx in (x0, x1):
+            dy = np.clip(-p * r * dx / (r * r + s * s), y0, y1)
+            candidates.append(quadratic_form((p, r, s), dx, dy))
+        for dy in (y0, y1):
+            dx = np.clip(-r * dy / p, x0, x1)
+            candidates.append(quadratic_form((p, r, s), dx, dy))
+        inside = (x0 <= 0) & (x1 >= 0) & (y0 <= 0) & (y1 >= 0)
+        smallest = np.where(inside, 0, np.min(candidates, axis=0))
+        reach = log2_opacity - np.log2(reference.ALPHA_CUT)
+
+        actual = (table[binned.order[rank]][:, None] >> micro & 1).astype(bool)
+        slack = grid.cull_margin
+        must_not = smallest > reach + slack * 1.1
+        assert not (actual & must_not).any(), f"rank {rank}: bits outside the ellipse"
+        # A micro-tile that reaches over the border may be touched off the film only: then the
+        # box, which ends at the film's last pixel, need not list its tile. Whole ones must be.
+        whole = (left + MICRO <= case.width + 0.5) & (top + MICRO <= case.height + 0.5)
+        must = (smallest <= reach) & whole
+        assert actual[must].all(), f"rank {rank}: missing bits"
+        undecided += ((smallest > reach) & ~must_not).sum()
+        total += must.sum()
+    assert undecided <= 2 + 1e-2 * total, "the margin decides too much"
+
+
+@both_precisions
+@all_cases
+def test_number_of_entries_is_that_of_the_boxes(precision, case):
+    """Each visible splat's bounding box, in whole tiles: two computations of the same box."""
+    binned = bin_case(case, precision)
+    splats = reference.project(case.gaussians, case.camera, case.antialiased)
+    variances = np.diagonal(splats.cov2d, axis1=1, axis2=2)
+    size = np.array([case.width, case.height])
+    with np.errstate(invalid="ignore"):
+        reach = 2 * np.log(splats.opacities / reference.ALPHA_CUT)
+
+        def count(margin):
+            radius = np.sqrt((reach + margin)[:, None] * variances) + margin / 100
+            first = np.maximum(np.ceil(splats.means2d - radius - 0.5), 0)
+            last = np.minimum(np.floor(splats.means2d + radius - 0.5), size - 1)
+            tiles_per_axis = last // TILE - first // TILE + 1
+            hit = splats.visible & (first <= last).all(axis=1)
+            return np.where(hit, tiles_per_axis.prod(axis=1), 0)
+
+        fewest, most = count(0), count(2 * binned.bins.grid.cull_margin)
+    runs = np.zeros(len(fewest), dtype=np.int64)
+    runs[binned.order] = np.diff(binned.first_entry)
+    assert (fewest <= runs).all() and (runs <= most).all()
+    assert runs.sum() == binned.count == binned.first_entry[-1]
+    assert (fewest == most).mean() > 0.9
+
+
+# ----------------------------------------------------------------------------------------------
+# In which order
+# ----------------------------------------------------------------------------------------------
+
+
+@both_precisions
+@all_cases
+def test_entries_are_sorted_by_tile_then_depth(precision, case):
+    binned = bin_case(case, precision)
+    count, visible = binned.count, binned.visible
+    # Ranks: the visible ones by depth, ties by index; then the others.
+    depths = rows(binned.splats.depths)
+    expected = np.argsort(np.where(visible, depths, np.inf), kind="stable")
+    np.testing.assert_array_equal(binned.order, expected)
+    reference_order = reference._depth_order(
+        reference.project(case.gaussians, case.camera).depths, visible
+    )
+    np.testing.assert_array_equal(binned.order[: visible.sum()], reference_order)
+
+    key = binned.tiles[:count] * len(depths) + binned.ranks[:count]
+    assert (np.diff(key) > 0).all(), "sorted by (tile, rank), each pair once"
+    assert binned.bins.grid.num_tiles > binned.tiles[:count].max(initial=0)
+
+
+@both_precisions
+@all_cases
+def test_tile_start_and_sources_and_padding(precision, case):
+    binned = bin_case(case, precision)
+    count, num_tiles = binned.count, binned.bins.grid.num_tiles
+    np.testing.assert_array_equal(
+        binned.tile_start, np.searchsorted(binned.tiles[:count], np.arange(num_tiles + 1))
+    )
+    padded = -(-max(count, 1) // WORD) * WORD
+    assert {len(getattr(binned, n)) for n in ("source", "ranks", "tiles", "masks")} == {padded}
+    assert not binned.masks[count:].any()
+    np.testing.assert_array_equal(np.sort(binned.source[:count]), np.arange(count))
+    # An entry's source lies in the run of its rank.
+    run = np.searchsorted(binned.first_entry, binned.source[:count], side="right") - 1
+    np.testing.assert_array_equal(run, binned.ranks[:count])
+
+
+@both_precisions
+@all_cases
+def test_words_are_the_masks_transposed(precision, case):
+    binned = bin_case(case, precision)
+    bits = binned.masks[:, None] >> np.arange(MICROS) & 1
+    groups = bits.reshape(-1, WORD, MICROS)
+    expected = (groups << np.arange(WORD)[None, :, None]).sum(axis=1)
+    np.testing.assert_array_equal(binned.words.reshape(-1, MICROS), expected)
+
+
+def test_random_bits_are_transposed():
+    bits = np.random.default_rng(0).integers(0, 2, (7, WORD, MICROS))
+    masks = (bits << np.arange(MICROS)).sum(axis=-1).ravel()
+    words = tiles.transpose_masks(dr.llvm.ad.UInt32(masks.astype(np.uint32)))
+    expected = (bits << np.arange(WORD)[None, :, None]).sum(axis=1)
+    np.testing.assert_array_equal(np.array(words).reshape(-1, MICROS), expected)
+
+
+# ----------------------------------------------------------------------------------------------
+# Corner cases, given as splats on the film
+# ----------------------------------------------------------------------------------------------
+
+
+def round_splats(precision, means2d, sigma=1.0, depths=None, opacities=0.5, visible=True):
+    """Isotropic splats of ``sigma`` px."""
+    means2d = np.asarray(means2d, dtype=float).reshape(-1, 2)
+    n = len(means2d)
+    ones = np.ones(n)
+    return tiles.Splats2D(
+        means2d=precision.vectors(means2d),
+        whitening=precision.vectors(np.outer(1 / (sigma * ones), [1, 0, 1])),
+        depths=precision.array(ones if depths is None else depths),
+        opacities=precision.array(opacities * ones),
+        colors=precision.vectors(np.ones((n, 3))),
+        variances=precision.vectors(np.outer((sigma * ones) ** 2, [1, 1])),
+        visible=dr.llvm.ad.Bool(np.full(n, visible)),
+    )
+
+
+@both_precisions
+@pytest.mark.parametrize(
+    "mean", [(-30, 10), (10, 60), (1e30, 10), (-1e30, -1e30), (10, 3e9), (66.62, 10)]
+)
+def test_a_splat_off_the_film_has_no_entry(precision, mean):
+    bins = bin_splats(round_splats(precision, mean), TileGrid(64, 48))
+    assert bins.num_entries == 0
+    assert not np.array(bins.masks).any() and not np.array(bins.tile_start).any()
+    assert not np.array(bins.words).any()
+
+
+@both_precisions
+def test_a_splat_reaches_as_far_as_the_cut(precision):
+    """Radius sqrt(2 ln(0.5 * 255)) = 3.114 px; the last pixel's centre is at 63.5."""
+    bins = bin_splats(round_splats(precision, (63.5 + 3.11, 10)), TileGrid(64, 48))
+    assert bins.num_entries == 1 and np.array(bins.tiles)[0] == 3
+    assert np.array(bins.masks)[0] == 1 << (2 * GRID + 3)
+
+
+@both_precisions
+def test_invisible_splats_have_no_entries(precision):
+    splats = round_splats(precision, np.full((40, 2), 20.0), visible=False)
+    bins = bin_splats(splats, TileGrid(64, 48))
+    assert bins.num_entries == 0 and not np.array(bins.first_entry).any()
+
+
+@both_precisions
+def test_one_splat_in_the_corner_of_four_tiles(precision):
+    # Radius sqrt(2 ln(0.5 * 255)) = 3.1 px around the corner (16, 16): one micro-tile of each tile.
+    bins = bin_splats(round_splats(precision, (16, 16)), TileGrid(40, 40))
+    assert bins.num_entries == 4
+    np.testing.assert_array_equal(np.array(bins.tiles)[:4], [0, 1, 3, 4])
+    np.testing.assert_array_equal(np.array(bins.masks)[:4], [1 << 15, 1 << 12, 1 << 3, 1 << 0])
+    np.testing.assert_array_equal(np.array(bins.tile_start), [0, 1, 2, 2, 3, 4, 4, 4, 4, 4])
+
+
+@both_precisions
+@pytest.mark.parametrize("sigma", [1000.0, 1e6])
+def test_a_giant_splat_touches_everything(precision, sigma):
+    grid = TileGrid(1000, 300)
+    bins = bin_splats(round_splats(precision, (90, 40), sigma, opacities=0.99), grid)
+    assert bins.num_entries == grid.num_tiles == 63 * 19
+    np.testing.assert_array_equal(np.array(bins.tiles)[: grid.num_tiles], np.arange(63 * 19))
+    assert (np.array(bins.masks)[: grid.num_tiles] == 0xFFFF).all()
+
+
+@both_precisions
+def test_equal_depths_stay_in_the_order_of_the_gaussians(precision):
+    """Enough of them that a sort which is not stable would reorder them."""
+    depths = np.tile([2.0, 1.0, 3.0], 100)
+    bins = bin_splats(
+        round_splats(precision, np.full((300, 2), 8.0), depths=depths), TileGrid(9, 9)
+    )
+    expected = np.argsort(depths, kind="stable")
+    np.testing.assert_array_equal(np.array(bins.order), expected)
+    np.testing.assert_array_equal(np.array(bins.ranks)[:300], np.arange(300))
+
+
+@both_precisions
+@pytest.mark.parametrize("count", [1, 31, 32, 33, 64, 65])
+def test_runs_of_entries_around_a_word(precision, count):
+    bins = bin_splats(round_splats(precision, np.full((count, 2), 8.0)), TileGrid(16, 16))
+    assert bins.num_entries == count
+    words = np.array(bins.words).reshape(-1, MICROS)
+    assert len(words) == -(-count // WORD)
+    # The middle of the tile, at the corner of micro-tiles 5, 6, 9 and 10.
+    expected = [min(2**WORD, 2 ** (count - WORD * k)) - 1 for k in range(len(words))]
+    for micro in (5, 6, 9, 10):
+        np.testing.assert_array_equal(words[:, micro], expected)
+
+
+def test_a_needle_touches_only_what_its_ellipse_touches():
+    """A diagonal needle's bounding box is the whole film; its ellipse, a few micro-tiles."""
+    length, film = 1e4, 160
+    long, short = length**2, 0.3
+    xx = yy = (long + short) / 2
+    xy = (long - short) / 2
+    det = long * short
+    p = np.sqrt(yy / det)
+    splats = round_splats(FLOAT32, (80, 80), opacities=0.9)
+    whitening = single([[p, -p * xy / yy, 1 / np.sqrt(yy)]])
+    splats = tiles.Splats2D(
+        **{
+            **vars(splats),
+            "whitening": FLOAT32.vectors(whitening),
+            "variances": FLOAT32.vectors([[xx, yy]]),
+        }
+    )
+    grid = TileGrid(film, film)
+    bins = bin_splats(splats, grid)
+    assert bins.num_entries == grid.num_tiles
+    masks = np.array(bins.masks)[: grid.num_tiles]
+    micro_tiles = (masks[:, None] >> np.arange(MICROS) & 1).sum()
+    # 1.8 px to either side of the diagonal: it and its two neighbours.
+    diagonal = film // MICRO
+    assert diagonal <= micro_tiles <= 3 * diagonal

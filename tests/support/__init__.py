@@ -1,0 +1,1 @@
+"""What tests share: scenes, small fits and captures, conditioning, mutants."""

@@ -1,0 +1,116 @@
+"""A few blobs, cameras around them, and photographs of them: on disk and in memory."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import imageio.v3 as iio
+import numpy as np
+
+from drgs.data.types import Dataset, View
+from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
+from drgs.reference import splatting as reference
+from support.helpers import NEAR_THRESHOLD
+
+WIDTH, HEIGHT = 32, 24
+FIELD_OF_VIEW = 0.7  # radians, horizontal
+RADIUS = 4.0
+FOCUS = np.array([0.25, -0.5, 0.125])
+
+
+def blobs(count=30, seed=0) -> Gaussians:
+    """Opaque and coloured, within a unit of the focus, numpy float32."""
+    rng = np.random.default_rng(seed)
+    g = reference.Gaussians(
+        means=FOCUS + rng.uniform(-0.6, 0.6, (count, 3)),
+        quats=rng.normal(size=(count, 4)),
+        log_scales=np.log(rng.uniform(0.08, 0.3, (count, 3))),
+        logit_opacities=rng.uniform(0.5, 3, count),
+        sh0=rng.uniform(-1.5, 1.5, (count, 1, 3)),
+        shN=rng.normal(0, 0.2, (count, 3, 3)),
+    )
+    return Gaussians(**{name: getattr(g, name).astype(np.float32) for name in PARAMETER_NAMES})
+
+
+def pose_around(azimuth: float, elevation: float, radius=RADIUS) -> np.ndarray:
+    """Camera to world, OpenCV axes, of a camera that looks at the focus with z up."""
+    level = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
+    forward = -np.cos(elevation) * level - np.sin(elevation) * np.array([0.0, 0.0, 1.0])
+    right = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
+    pose = np.eye(4)
+    pose[:3, :3] = np.stack([right, np.cross(forward, right), forward], axis=1)
+    pose[:3, 3] = FOCUS - radius * forward
+    return pose
+
+
+def view(name: str, pose: np.ndarray, image: np.ndarray) -> View:
+    """A view of the small size."""
+    focal = WIDTH / 2 / np.tan(FIELD_OF_VIEW / 2)
+    return View(name, image, pose, focal, focal, WIDTH / 2, HEIGHT / 2, WIDTH, HEIGHT)
+
+
+def photograph(gaussians: Gaussians, camera, background) -> reference.Picture:
+    """By the reference, as a View or a Viewpoint sees it; 0.2: the configuration's near plane."""
+    pose = camera.camera_to_world
+    lens = camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height
+    fields = {name: getattr(gaussians, name).astype(np.float64) for name in PARAMETER_NAMES}
+    return reference.render(
+        reference.Gaussians(**fields),
+        reference.Camera(pose[:3, :3].T, pose[:3, 3], *lens, 0.2),
+        np.array(background),
+        gaussians.sh_degree,
+        threshold_width=NEAR_THRESHOLD,
+    )
+
+
+def assert_pictures_agree(image, expected, picture: reference.Picture, tolerance) -> None:
+    """Compare (H, W, 3), leaving out pixels where float32 may decide otherwise than float64."""
+    kept = ~picture.near_threshold
+    assert image.shape == expected.shape
+    assert kept.mean() > 0.95
+    errors = np.abs(image - expected)[kept]
+    assert errors.max() <= tolerance, f"{errors.max()} at {(errors > tolerance).sum()} values"
+
+
+def make_dataset(train=8, test=4, seed=0) -> Dataset:
+    """Views at one height; the photographs are noise."""
+    rng = np.random.default_rng(seed)
+
+    def noise():
+        return rng.uniform(0, 1, (HEIGHT, WIDTH, 3)).astype(np.float32)
+
+    def views(count, offset):
+        azimuths = offset + 2 * np.pi * np.arange(count) / count
+        return tuple(
+            view(f"r_{i}", pose_around(azimuth, 0.5), noise()) for i, azimuth in enumerate(azimuths)
+        )
+
+    return Dataset(
+        train=views(train, 0.0),
+        test=views(test, 0.3),
+        test_split="test",
+        background=(1.0, 1.0, 1.0),
+        start_half_extent=None,
+        description="noise <small>",
+    )
+
+
+def write_dataset(folder: Path, dataset: Dataset) -> None:
+    """The same views in the NeRF-synthetic layout, with half transparent photographs."""
+    for split, views in (("train", dataset.train), ("test", dataset.test)):
+        (folder / split).mkdir(parents=True)
+        frames = []
+        for v in views:
+            alpha = np.full((HEIGHT, WIDTH, 1), 0.5)
+            rgba = np.round(np.concatenate([v.image, alpha], axis=2) * 255).astype(np.uint8)
+            iio.imwrite(folder / split / f"{v.name}.png", rgba)
+            opengl = v.camera_to_world * [1, -1, -1, 1]
+            frames.append({"file_path": f"./{split}/{v.name}", "transform_matrix": opengl.tolist()})
+        transforms = {"camera_angle_x": FIELD_OF_VIEW, "frames": frames}
+        (folder / f"transforms_{split}.json").write_text(json.dumps(transforms))
+
+
+def decibels(image, target) -> float:
+    """PSNR, computed plainly."""
+    return float(10 * np.log10(1 / np.square(np.asarray(image) - target).mean()))

@@ -1,0 +1,174 @@
+"""Fits of a few blobs to photographs of them, made by the float64 reference."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cache
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from drgs.config.changes import changed
+from drgs.config.schema import FitConfig
+from drgs.data.types import Dataset, View
+from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
+from drgs.integrator.scene import render_views
+from drgs.reference import splatting as reference
+from drgs.training.trainer import Trainer
+from support import small_capture as capture
+from support.helpers import NEAR_THRESHOLD
+
+WHITE = (1.0, 1.0, 1.0)
+
+
+def double(gaussians: Gaussians) -> reference.Gaussians:
+    """The same numbers for the reference."""
+    return reference.Gaussians(
+        **{name: getattr(gaussians, name).astype(np.float64) for name in PARAMETER_NAMES}
+    )
+
+
+def reference_camera(view: View, near=0.2) -> reference.Camera:
+    """A view's camera for the reference; near: the configuration's."""
+    lens = view.fx, view.fy, view.cx, view.cy, view.width, view.height
+    return reference.Camera(view.camera_to_world[:3, :3].T, view.center, *lens, near)
+
+
+def photograph(gaussians: reference.Gaussians, view: View, background=WHITE) -> reference.Picture:
+    """Pixels near a threshold, where float32 may decide otherwise, are marked."""
+    return reference.render(
+        gaussians, reference_camera(view), np.array(background), threshold_width=NEAR_THRESHOLD
+    )
+
+
+@cache
+def true_blobs() -> Gaussians:
+    """What the photographs show: numpy float32, degree 1."""
+    return capture.blobs(25)
+
+
+@cache
+def true_dataset(background=WHITE) -> Dataset:
+    """6 views to train on and 3 to measure on, with alpha, and depth where alpha is above 0.1."""
+    dataset = capture.make_dataset(6, 3)
+    blobs = double(true_blobs())
+
+    def seen(view: View) -> View:
+        picture = photograph(blobs, view, background)
+        opaque = picture.alpha > 0.1
+        depth = np.where(opaque, picture.depth / np.where(opaque, picture.alpha, 1), 0)
+        pictures = {"image": np.clip(picture.image, 0, 1), "alpha": picture.alpha, "depth": depth}
+        return replace(view, **{k: v.astype(np.float32) for k, v in pictures.items()})
+
+    return replace(
+        dataset,
+        train=tuple(map(seen, dataset.train)),
+        test=tuple(map(seen, dataset.test)),
+        background=background,
+    )
+
+
+def plain_dataset(background=WHITE) -> Dataset:
+    """The same photographs and nothing besides."""
+    return with_views(true_dataset(background), lambda v: replace(v, alpha=None, depth=None))
+
+
+def with_views(dataset: Dataset, change: Callable[[View], View]) -> Dataset:
+    """Changes of the training views."""
+    return replace(dataset, train=tuple(map(change, dataset.train)))
+
+
+def disturbed_blobs(amount=0.15, seed=4) -> Gaussians:
+    """The true blobs, moved, resized and recoloured: where a fit begins."""
+    rng, blobs = np.random.default_rng(seed), true_blobs()
+    scale = {"means": 0.3 * amount, "log_scales": amount, "sh0": 2 * amount}
+    noise = {n: rng.normal(0, s, getattr(blobs, n).shape) for n, s in scale.items()}
+    moved = {n: (getattr(blobs, n) + v).astype(np.float32) for n, v in noise.items()}
+    return replace(blobs, **moved)
+
+
+def config_of(**changes) -> FitConfig:
+    """Of a fit whose population stays; changes: by names such as ``model.smoothing``."""
+    config = FitConfig(
+        data={"path": "."},
+        model={"sh_degree": 1, "sh_increase_every": 1},
+        densify={"start": 1_000_000, "stop": 1_000_001, "reset_every": 1_000_000},
+        iterations=400,
+    )
+    return changed(config, changes)
+
+
+def make_trainer(dataset: Dataset, gaussians: Gaussians | None = None, **changes) -> Trainer:
+    """See :func:`config_of`; ``__`` is written for the dot."""
+    values = {key.replace("__", "."): value for key, value in changes.items()}
+    return Trainer(config_of(**values), dataset, gaussians or disturbed_blobs())
+
+
+def steps(trainer: Trainer, count: int) -> Trainer:
+    """After ``count`` more iterations."""
+    for _ in range(count):
+        trainer.step()
+    return trainer
+
+
+def test_psnr(trainer: Trainer, dataset: Dataset) -> float:
+    """dB, mean over the views to measure on."""
+    trainer.gaussians()  # the scene gets the parameters
+    images = render_views(trainer.scene, dataset.test)
+    pairs = zip(images, dataset.test, strict=True)
+    return float(np.mean([capture.decibels(image, view.image) for image, view in pairs]))
+
+
+test_psnr.__test__ = False
+
+
+def everything_of(trainer: Trainer) -> dict[str, bytes]:
+    """The bytes of all that a fit is."""
+    return {name: value.tobytes() for name, value in trainer.state().items()}
+
+
+def assert_resumes_to_the_same_bytes(make: Callable[[], Trainer], before: int, after: int) -> None:
+    """A fit that is interrupted, and one that is not."""
+    whole = steps(make(), before + after)
+    interrupted = steps(make(), before)
+    resumed = make()
+    resumed.restore(interrupted.state())
+    steps(resumed, after)
+    expected, got = everything_of(whole), everything_of(resumed)
+    assert expected.keys() == got.keys()
+    differ = [name for name, value in expected.items() if got[name] != value]
+    assert not differ
+    begun = everything_of(interrupted)
+    assert any(begun[name] != value for name, value in expected.items())
+
+
+def assert_no_new_kernels(trainer: Trainer, warm=7, count=5) -> None:
+    """Iterations launch what was compiled already, once each of the 6 views was seen.
+
+    By hash: what Dr.Jit's caches hold from other runs does not matter.
+    """
+    seen: set = set()
+    for iteration in range(warm + count):
+        with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
+            dr.kernel_history_clear()
+            trainer.step()
+            trainer.watch.check()
+            hashes = {kernel["hash"] for kernel in dr.kernel_history([dr.KernelType.JIT])}
+        assert hashes
+        assert iteration < warm or hashes <= seen, f"{len(hashes - seen)} at {iteration + 1}"
+        seen |= hashes
+
+
+def gradients_of_loss(trainer: Trainer, view) -> dict[str, np.ndarray]:
+    """Of the Gaussians' parameters, through what the effects do; no step is taken."""
+    trainer.params.update(trainer.optimizer)
+    image = mi.render(trainer.scene, trainer.params, sensor=view.sensor, spp=1)
+    _, loss = trainer.compared(image, view)
+    dr.set_grad(trainer.optimizer, 0)
+    dr.backward(loss)
+    return {
+        key.removeprefix("integrator."): np.array(dr.grad(value)).astype(np.float64)
+        for key, value in trainer.optimizer.items()
+    }

@@ -1,0 +1,335 @@
+"""Fits for a given time: what is planned, when they end, and that their plans can be repeated."""
+
+import time
+from dataclasses import replace
+from types import SimpleNamespace
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from support.small_capture import make_dataset, write_dataset
+from test_trainer import make_trainer
+
+from drgs import fit
+from drgs.config.changes import changed
+from drgs.config.load import load_config
+from drgs.config.schema import FitConfig
+from drgs.core.errors import UserError
+from drgs.results.folder import load_run_config
+from drgs.training import budget as plan
+from drgs.training import checkpoint
+from drgs.training.budget import Curve, Deadline, Strategy, load_curves, make_plan, parse_duration
+from drgs.training.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
+from drgs.training.rates import means_rate
+from drgs.training.trainer import Trainer
+
+
+@pytest.fixture(scope="module", autouse=True)
+def variant():
+    mi.set_variant("llvm_ad_rgb")
+
+
+@pytest.mark.parametrize(
+    ("text", "seconds"),
+    [("90", 90), ("90s", 90), ("5m", 300), ("1h30m", 5400), ("0.5h", 1800), ("1m30", 90)],
+)
+def test_durations(text, seconds):
+    assert parse_duration(text) == seconds
+
+
+@pytest.mark.parametrize(
+    "text", ["", "0", "m", "5 minutes", "-3s", "nan", "1m2h", "0s", "1h30", "9" * 400]
+)
+def test_what_is_no_duration_is_refused(text):
+    with pytest.raises(ValueError, match="must be a time such as 90s, 5m or 1h30m"):
+        parse_duration(text)
+
+
+# ----------------------------------------------------------------------------------------------
+# Curves
+# ----------------------------------------------------------------------------------------------
+
+# Time grows as n^1.5, PSNR by 2 dB with every doubling.
+POWER = Curve((100, 200, 400), (1000.0, 1000 * 2**1.5, 8000.0), (20.0, 22.0, 24.0))
+
+
+@pytest.mark.parametrize("n", [50, 100, 150, 200, 333, 400, 3200])
+def test_a_power_law_is_followed_between_and_beyond_the_points(n):
+    assert POWER.iterations_in(1000 * (n / 100) ** 1.5) == n
+    assert POWER.psnr_at(n) == pytest.approx(20 + 2 * np.log2(n / 100))
+
+
+def test_measured_curves_are_those_of_the_strategies():
+    curves = load_curves()
+    assert set(curves) == {strategy.name for strategy in plan.STRATEGIES}
+    for curve in curves.values():
+        assert len(curve.iterations) >= 4
+        assert (np.diff(curve.time) > 0).all()
+        for n, seconds, psnr in zip(curve.iterations, curve.time, curve.psnr, strict=True):
+            assert curve.iterations_in(seconds) == n
+            assert curve.psnr_at(n) == pytest.approx(psnr)
+
+
+# ----------------------------------------------------------------------------------------------
+# Plans
+# ----------------------------------------------------------------------------------------------
+
+SLOW = Curve((1000, 2000), (1000.0, 2000.0), (30.0, 31.0))
+FAST = Curve((1000, 2000), (500.0, 1000.0), (29.5, 30.5))
+CONFIG = FitConfig(data={"path": "."}, init={"num_points": 50}, iterations=7000)
+
+
+def curves_of(slow=SLOW, fast=FAST):
+    return {plan.STRATEGIES[0].name: slow, plan.STRATEGIES[3].name: fast}
+
+
+def planned(seconds, side=400, start_s=0.1, **curves):
+    return make_plan(CONFIG, 50, side, seconds, start_s, curves_of(**curves))
+
+
+def test_the_best_strategy_in_the_time_is_planned():
+    """A thousand iterations as they are, or two thousand cheaper ones: 30 or 30.5 dB."""
+    result = planned(100)
+    assert [(c.iterations, c.psnr) for c in result.candidates] == [(1000, 30.0), (2000, 30.5)]
+    assert result.chosen.strategy is plan.STRATEGIES[3]
+    assert result.config.iterations == 2000
+    assert [(s.until, s.factor) for s in result.config.coarse] == [(400, 4), (1000, 2)]
+    assert result.config.densify.stop == round(15000 * 2000 / 7000)
+    worse = planned(100, fast=replace(FAST, psnr=(28.5, 29.5)))
+    assert worse.chosen.strategy is plan.STRATEGIES[0] and worse.config.coarse == []
+
+
+def test_a_faster_machine_does_more():
+    assert planned(100, start_s=0.05).config.iterations == 4000
+
+
+def test_reasons_name_all_candidates():
+    reasons = planned(100).reasons
+    assert "100 ms at the start" in reasons and "100 s are enough" in reasons
+    assert "1,000 iterations, 30.00 dB there: as shipped" in reasons
+    assert (
+        "2,000 iterations, 30.50 dB there: quarter, then half size, for the first half (chosen)"
+        in (reasons)
+    )
+    assert "1/4 size until iteration 400, 1/2 size until iteration 1,000, then full size" in reasons
+
+
+def test_a_configuration_that_cannot_shrink_is_planned():
+    """Stages of its own, few iterations of changes, revisions of an earlier plan."""
+    values = {"coarse": [{"until": 10, "factor": 4}, {"until": 20, "factor": 2}]}
+    values |= {"densify.start": 500, "densify.stop": 501}
+    values |= {"optimizer.means_lr_aims": [{"after": 0, "end": 5}, {"after": 1, "end": 7}]}
+    config = changed(CONFIG, values)
+    result = make_plan(config, 50, 400, 25, 0.1, curves_of())
+    assert result.config.iterations == 500 and result.config.optimizer.means_lr_aims == []
+    assert (result.config.densify.start, result.config.densify.stop) == (36, 37)
+
+
+def test_small_pictures_do_not_become_smaller():
+    assert planned(100, side=100).chosen.strategy is plan.STRATEGIES[0]
+
+
+def test_too_short_a_time_is_refused():
+    with pytest.raises(UserError, match=r"--budget: must leave time for 200 iterations, got 5 s"):
+        planned(5)
+    with pytest.raises(UserError, match="got 0 s"):
+        planned(-3)
+
+
+def test_growth_is_counted_from_the_start_and_keeps_the_cap():
+    strategy = Strategy("x", growth=1.5)
+    assert strategy.applied(CONFIG, 50).densify.max_gaussians == 75
+    capped = changed(CONFIG, {"densify.max_gaussians": 60})
+    assert strategy.applied(capped, 50).densify.max_gaussians == 60
+
+
+# ----------------------------------------------------------------------------------------------
+# The end
+# ----------------------------------------------------------------------------------------------
+
+
+class Clock:
+    """Instead of time.perf_counter: seconds that a test decides."""
+
+    now = 100.0
+
+    def perf_counter(self):
+        return self.now
+
+
+class FakeTrainer:
+    """A trainer's count of iterations; an iteration takes ``second``."""
+
+    replan = Trainer.replan
+
+    def __init__(self, clock, second, **changes):
+        self.clock, self.second, self.iteration = clock, second, 0
+        self.extent = 1.0
+        values = {"iterations": 1000, "densify.start": 100, "densify.stop": 600}
+        self.config = changed(CONFIG, {**values, **changes})
+        self.means_lr = means_rate(self.config, self.extent)
+
+    def step(self):
+        self.iteration += 1
+        self.clock.now += self.second
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    clock = Clock()
+    monkeypatch.setattr(plan, "time", clock)
+    return clock
+
+
+# Time is proportional to iterations.
+LINEAR = Curve((100, 200), (100.0, 200.0), (20.0, 21.0))
+
+
+def until_the_end(trainer, seconds):
+    deadline = Deadline(trainer, trainer.clock.now + seconds, LINEAR)
+    while deadline.goes_on(trainer):
+        trainer.step()
+    return trainer
+
+
+@pytest.mark.parametrize("second", [0.05, 0.1, 0.2])
+def test_a_fit_ends_in_time_whatever_an_iteration_takes(clock, second):
+    """Planned were 0.1 s. The population changes during six tenths of the iterations.
+
+    An iteration or two more or less: the clock is read between them.
+    """
+    trainer = until_the_end(FakeTrainer(clock, second), 100)
+    assert 200 <= clock.now < 200 + 2 * second
+    n = trainer.iteration
+    assert trainer.config.iterations == n == pytest.approx(100 / second, abs=2)
+    assert trainer.config.densify.stop == pytest.approx(0.6 * n, abs=2)
+    # Two iterations of 500 in five e-folds.
+    assert trainer.means_lr(n) == pytest.approx(trainer.means_lr.final, rel=0.02)
+
+
+def test_a_fit_that_becomes_slower_is_revised(clock):
+    trainer = FakeTrainer(clock, 0.05)
+    deadline = Deadline(trainer, clock.now + 100, LINEAR)
+    rates = []
+    while deadline.goes_on(trainer):
+        trainer.second = 0.05 if trainer.iteration < 600 else 0.2
+        trainer.step()
+        rates.append(trainer.means_lr(trainer.iteration))
+    assert trainer.iteration == pytest.approx(600 + 70 / 0.2, abs=2)
+    # All rates, also those of iterations before a revision, are what the last configuration says.
+    assert rates == [trainer.means_lr(i + 1) for i in range(trainer.iteration)]
+    assert len(trainer.config.optimizer.means_lr_aims) == 10
+    # Without revisions after the fit became slower, it would have fallen half the way: 1.7e-5.
+    assert trainer.means_lr.final < rates[-1] < 2 * trainer.means_lr.final
+
+
+def test_the_expected_end_follows_the_clock(clock):
+    trainer = FakeTrainer(clock, 0.2)
+    deadline = Deadline(trainer, clock.now + 100, LINEAR)
+    assert deadline.total(trainer) == 1000
+    for _ in range(10):
+        trainer.step()
+    assert deadline.total(trainer) == 500
+
+
+def test_the_end_of_changes_is_never_before_their_start(clock):
+    trainer = FakeTrainer(clock, 1.0, **{"densify.start": 590})
+    assert until_the_end(trainer, 100).config.densify.stop == 591
+
+
+def test_a_change_of_what_has_happened_is_refused():
+    trainer = make_trainer(densify={"start": 2, "stop": 5})
+    for _ in range(4):
+        trainer.step()
+    trainer.replan(50, 9)
+    with pytest.raises(ValueError, match="cannot change from 9 to 4 after iteration 4"):
+        trainer.replan(50, 4)
+
+
+# ----------------------------------------------------------------------------------------------
+# The command
+# ----------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("budget")
+    write_dataset(folder / "data", make_dataset(train=6, test=2))
+    (folder / "scene.yml").write_text(
+        f"data: {{path: {folder / 'data'}}}\n"
+        "init: {num_points: 300, half_extent: 1.0}\n"
+        "densify: {every: 50, max_gaussians: 600}\n"
+    )
+    return folder
+
+
+BUDGET = 30.0
+
+
+@pytest.fixture(scope="module")
+def fitted(scene):
+    """A fit in a given time: seconds it took, its folder."""
+    out = scene / "out"
+    start = time.perf_counter()
+    fit.main([str(scene / "scene.yml"), "--out", str(out), "--budget", f"{BUDGET:g}"])
+    return SimpleNamespace(seconds=time.perf_counter() - start, out=out)
+
+
+def test_a_fit_ends_within_a_tenth_of_its_budget(fitted):
+    assert fitted.seconds == pytest.approx(BUDGET, rel=0.1)
+
+
+def test_the_plan_is_written_with_its_reasons(fitted):
+    text = (fitted.out / "plan.txt").read_text()
+    assert text.startswith("--budget 30s\n") and "(chosen)" in text
+    aims = load_config(fitted.out / "config.yml").optimizer.means_lr_aims
+    assert f"Planned: {aims[0].end:,} iterations" in text
+
+
+def test_the_resolved_plan_gives_the_same_bytes(fitted, scene):
+    """Without a clock."""
+    again = scene / "again"
+    fit.main([str(fitted.out / "config.yml"), "--out", str(again)])
+    files = "point_cloud.ply", "config.yml"
+    first, second = ([(out / name).read_bytes() for name in files] for out in (fitted.out, again))
+    assert first[0] == second[0]
+    configs = [load_config(out / "config.yml") for out in (fitted.out, again)]
+    assert changed(configs[0], {"output.dir": None}) == changed(configs[1], {"output.dir": None})
+
+
+def test_a_plan_that_was_revised_since_the_last_checkpoint_can_be_continued(
+    fitted, tmp_path, monkeypatch
+):
+    """Whatever ends the process while the next one is written: both files are as they were."""
+    config = load_config(fitted.out / "config.yml")
+    state = Checkpoint({"iteration": np.array(7)}, np.zeros((0, 6)), 1.0)
+    save_checkpoint(tmp_path, config, state)
+    revised = changed(config, {"iterations": config.iterations + 10})
+    for module, name in ((checkpoint.np, "savez"), (checkpoint, "dump_config")):
+        with monkeypatch.context() as patched, pytest.raises(KeyboardInterrupt):
+            patched.setattr(module, name, interrupt)
+            save_checkpoint(tmp_path, revised, state)
+        assert load_run_config(tmp_path) == config
+        assert load_checkpoint(tmp_path, config) is not None
+    save_checkpoint(tmp_path, revised, state)
+    assert load_run_config(tmp_path) == revised
+    assert load_checkpoint(tmp_path, revised) is not None
+
+
+def interrupt(*arguments, **others):
+    raise KeyboardInterrupt
+
+
+def test_a_budget_needs_a_folder_of_its_own(fitted, scene, capsys):
+    with pytest.raises(SystemExit) as stopped:
+        fit.main([str(scene / "scene.yml"), "--out", str(fitted.out), "--budget", "30"])
+    assert stopped.value.code == 2
+    error = capsys.readouterr().err
+    assert "must be new or empty for a fit with --budget" in error and "--overwrite" in error
+
+
+def test_too_short_a_budget_leaves_nothing_behind(scene, capsys):
+    with pytest.raises(SystemExit) as stopped:
+        fit.main([str(scene / "scene.yml"), "--out", str(scene / "short"), "--budget", "1s"])
+    assert stopped.value.code == 2 and "--budget: must leave time" in capsys.readouterr().err
+    assert not (scene / "short").exists()

@@ -1,0 +1,417 @@
+"""Adaptive density control against the rules of the 3DGS reference, written out row by row."""
+
+import math
+
+import drjit as dr
+import numpy as np
+import pytest
+from drjit.llvm.ad import Array2f, Bool, Float, TensorXf, TensorXf64
+
+from drgs.config.schema import DensifyConfig
+from drgs.core.errors import UserError
+from drgs.gaussians.parameters import PARAMETER_NAMES
+from drgs.reference import splatting as reference
+from drgs.training.densify import (
+    DensityReport,
+    DensityStatistics,
+    accumulate,
+    densify_and_prune,
+    gathers_statistics,
+    prunes_large,
+    reset_opacities,
+    should_densify,
+    should_reset,
+)
+from drgs.training.optimizer import make_optimizer, num_rows
+
+EXTENT = 4.0
+EARLY, LATE = 600, 3100  # before and after the first opacity reset of the default schedule
+SMALL, LARGE, HUGE = 0.01, 0.2, 0.5  # world units: cloned, split, pruned after the first reset
+HIGH = 3e-4  # a mean gradient norm above the default threshold of 2e-4
+
+
+def logit(opacity):
+    return np.log(opacity / (1 - np.asarray(opacity, dtype=float)))
+
+
+def make(scales, opacities, sh_rows=3, tensor_type=TensorXf, seed=0):
+    """An optimizer that has made one step; scales: largest standard deviations, world units."""
+    random = np.random.default_rng(seed)
+    num = len(scales)
+    log_scales = np.log(np.asarray(scales, dtype=float))[:, None] - [0.0, 0.3, 0.7]
+    arrays = {
+        "means": random.standard_normal((num, 3)),
+        "quats": random.standard_normal((num, 4)),
+        "log_scales": random.permuted(log_scales, axis=1),
+        "logit_opacities": np.broadcast_to(logit(opacities), num),
+        "sh0": random.standard_normal((num, 1, 3)),
+        "shN": random.standard_normal((num, sh_rows, 3)),
+    }
+    flat_type = dr.array_t(tensor_type)
+    parameters = {
+        name: flat_type(a) if a.ndim == 1 else tensor_type(flat_type(a.ravel()), a.shape)
+        for name, a in arrays.items()
+    }
+    # Rates of 0: the step fills the moments and leaves the values where they are.
+    optimizer = make_optimizer(parameters, dict.fromkeys(PARAMETER_NAMES, 0.0))
+    for key, value in optimizer.items():
+        dr.set_grad(value, type(value)(random.standard_normal(value.shape) + 3))
+        assert key in PARAMETER_NAMES
+    optimizer.step()
+    return optimizer
+
+
+def statistics(gradient_norms, views=None):
+    norms = np.asarray(gradient_norms, dtype=np.float32)
+    views = np.full(len(norms), 4) if views is None else np.asarray(views)
+    return DensityStatistics(Float(norms * views), Float(views))
+
+
+def run(optimizer, gradient_norms, iteration=EARLY, seed=0, **config):
+    return densify_and_prune(
+        optimizer,
+        statistics(gradient_norms),
+        DensifyConfig(**config),
+        EXTENT,
+        iteration=iteration,
+        seed=seed,
+    )
+
+
+def values(optimizer):
+    return {name: np.array(dr.detach(value)) for name, value in optimizer.items()}
+
+
+def moments(optimizer, name):
+    value, _, _, (_, m, v, _) = optimizer.state[name]
+    num = value.shape[0]
+    return np.array(m).reshape(num, -1), np.array(v).reshape(num, -1)
+
+
+# ---- statistics
+
+
+@pytest.mark.parametrize("as_tensor", [False, True])
+def test_statistics_are_gradient_norms_in_ndc_over_visible_views(as_tensor):
+    width, height, num = 40, 26, 5
+    random = np.random.default_rng(0)
+    gradients = random.standard_normal((3, num, 2))
+    visible = random.random((3, num)) < 0.6
+    visible[:, 2] = False
+
+    result = DensityStatistics.zeros(Float, num)
+    for gradient, seen in zip(gradients, visible, strict=True):
+        pixel = TensorXf(gradient) if as_tensor else Array2f(gradient.T)
+        result = accumulate(result, pixel, Bool(seen), width, height)
+
+    # d/dx_ndc = d/dx_px * W / 2, because x_ndc spans 2 over W pixels.
+    norms = np.linalg.norm(gradients * [width / 2, height / 2], axis=2)
+    np.testing.assert_array_equal(result.views, visible.sum(0))
+    np.testing.assert_allclose(result.gradient_norms, (norms * visible).sum(0), rtol=1e-6)
+    means = result.mean_gradient_norms()
+    assert means[2] == 0
+    expected = (norms * visible).sum(0) / np.maximum(visible.sum(0), 1)
+    np.testing.assert_allclose(means, expected, rtol=1e-6)
+
+
+def test_invisible_gradients_are_ignored_even_if_they_are_nan():
+    gradient, visible = Array2f([np.nan, 1], [0, 0]), Bool(False, True)
+    result = accumulate(DensityStatistics.zeros(Float, 2), gradient, visible, 2, 2)
+    np.testing.assert_array_equal(result.gradient_norms, [0, 1])
+
+
+# ---- schedule
+
+
+@pytest.mark.parametrize("white", [False, True])
+def test_schedule_is_that_of_the_reference_training_loop(white):
+    config = DensifyConfig(start=20, stop=200, every=10, reset_every=60, white_background_reset=20)
+    for i in range(1, 300):
+        densify = reset = False
+        if i < 200:
+            densify = i > 20 and i % 10 == 0
+            reset = i % 60 == 0 or (white and i == 20)
+        assert should_densify(config, i) == densify, i
+        assert should_reset(config, i, white) == reset, i
+        assert gathers_statistics(config, i) == (i < 200), i
+        assert prunes_large(config, i) == (i > 60), i
+
+
+def test_extra_reset_can_be_off():
+    config = DensifyConfig(white_background_reset=None)
+    assert not any(should_reset(config, i, True) for i in range(1, 3000))
+
+
+# ---- single decisions
+
+
+def test_small_gaussian_is_cloned_in_place():
+    optimizer = make([SMALL, SMALL], 0.5)
+    before, (m, v) = values(optimizer), moments(optimizer, "means")
+    report = run(optimizer, [0, HIGH])
+    assert report == DensityReport(cloned=1, split=0, pruned=0, refused=0, num_gaussians=3)
+    for name, value in values(optimizer).items():
+        np.testing.assert_array_equal(value, before[name][[0, 1, 1]])
+    new_m, new_v = moments(optimizer, "means")
+    np.testing.assert_array_equal(new_m[:2], m)
+    np.testing.assert_array_equal(new_v[:2], v)
+    assert not new_m[2].any()
+    assert not new_v[2].any()
+
+
+def test_large_gaussian_is_replaced_by_smaller_samples():
+    optimizer = make([SMALL, LARGE, SMALL], 0.5)
+    before = values(optimizer)
+    report = run(optimizer, [0, HIGH, 0])
+    assert report == DensityReport(cloned=0, split=1, pruned=0, refused=0, num_gaussians=4)
+    after = values(optimizer)
+    for name in PARAMETER_NAMES:
+        np.testing.assert_array_equal(after[name][:2], before[name][[0, 2]])
+        if name not in ("means", "log_scales"):
+            np.testing.assert_array_equal(after[name][2:], before[name][[1, 1]])
+        for moment in moments(optimizer, name):
+            assert moment[:2].all()
+            assert not moment[2:].any()
+    # 1e-6: single precision of a logarithm.
+    shrunk = np.exp(before["log_scales"][[1, 1]].astype(float)) / 1.6
+    np.testing.assert_allclose(np.exp(after["log_scales"][2:].astype(float)), shrunk, rtol=1e-6)
+    assert (after["means"][2] != after["means"][3]).all()
+
+
+def test_samples_have_the_mean_and_covariance_of_their_parent():
+    count = 20_000
+    optimizer = make([LARGE, LARGE], 0.5, tensor_type=TensorXf64)
+    before = values(optimizer)
+    run(optimizer, [0, HIGH], split_count=count)
+    samples = values(optimizer)["means"][1:]
+    assert samples.shape == (count, 3)
+    covariance = reference.covariances(before["quats"], before["log_scales"])[1]
+    # In the parent's own axes: five standard deviations of a sample mean and covariance.
+    whiten = np.linalg.inv(np.linalg.cholesky(covariance))
+    normal = (samples - before["means"][1]) @ whiten.T
+    assert np.abs(normal.mean(0)).max() < 5 / math.sqrt(count)
+    assert np.abs(np.cov(normal.T) - np.eye(3)).max() < 5 * math.sqrt(2 / count)
+
+
+def test_thresholds_belong_to_the_side_of_the_reference():
+    # Gradient >= threshold, scale <= clone_scale x extent, opacity < prune_opacity. Powers of
+    # two, so that all are exact.
+    config = {"grad_threshold": 2**-12, "clone_scale": 2**-7, "prune_opacity": 0.25}
+    edge = 2**-7 * EXTENT
+    optimizer = make([edge, edge * 1.001, edge], 0.5, tensor_type=TensorXf64)
+    report = run(optimizer, [2**-12, 2**-12, 2**-12 * 0.999], **config, reset_opacity=0.3)
+    assert (report.cloned, report.split, report.pruned) == (1, 1, 0)
+
+    optimizer = make([SMALL, SMALL], [0.2501, 0.2499])
+    assert run(optimizer, [0, 0], **config, reset_opacity=0.3).pruned == 1
+
+
+def test_transparent_gaussians_are_pruned_and_never_copied():
+    optimizer = make([SMALL, SMALL, LARGE, SMALL], [0.5, 0.004, 0.004, 0.006])
+    before = values(optimizer)
+    report = run(optimizer, [0, HIGH, HIGH, 0])
+    assert report == DensityReport(cloned=0, split=0, pruned=2, refused=0, num_gaussians=2)
+    for name, value in values(optimizer).items():
+        np.testing.assert_array_equal(value, before[name][[0, 3]])
+
+
+def test_huge_gaussians_are_pruned_only_after_the_first_reset():
+    for iteration, pruned in ((EARLY, 0), (3000, 0), (LATE, 1)):
+        optimizer = make([SMALL, HUGE], 0.5)
+        assert run(optimizer, [0, 0], iteration=iteration).pruned == pruned
+
+
+def test_clones_do_not_escape_the_size_limit():
+    # Only where clone_scale exceeds prune_scale can a Gaussian be small and too large.
+    optimizer = make([HUGE, SMALL], 0.5)
+    report = run(optimizer, [HIGH, 0], iteration=LATE, clone_scale=0.2)
+    assert (report.cloned, report.pruned) == (0, 1)
+
+
+def test_just_added_rows_are_not_pruned_in_the_same_step():
+    # Half the size of the scene divided by 1.6 is still far above the limit of 0.1 x extent.
+    optimizer = make([2.0, SMALL], 0.5)
+    report = run(optimizer, [HIGH, 0], iteration=LATE)
+    assert report == DensityReport(cloned=0, split=1, pruned=0, refused=0, num_gaussians=3)
+    # In the next step they are old.
+    assert run(optimizer, [0, 0, 0], iteration=LATE + 100).pruned == 2
+
+
+def test_not_a_number_is_pruned_and_never_copied():
+    optimizer = make([SMALL, SMALL, SMALL], [0.5, np.nan, 0.5])
+    report = run(optimizer, [np.nan, HIGH, 0])
+    assert report == DensityReport(cloned=0, split=0, pruned=1, refused=0, num_gaussians=2)
+
+
+def test_nothing_to_do_changes_nothing():
+    optimizer = make([SMALL, LARGE], 0.5)
+    before = dict(optimizer.state)
+    report = run(optimizer, [0, 0], iteration=LATE)
+    assert report == DensityReport(cloned=0, split=0, pruned=0, refused=0, num_gaussians=2)
+    assert all(optimizer.state[key] is entry for key, entry in before.items())
+
+
+def test_last_gaussian_is_not_pruned_silently():
+    optimizer = make([SMALL, SMALL], 0.001)
+    with pytest.raises(UserError, match="iteration 600: every Gaussian would be pruned"):
+        run(optimizer, [HIGH, 0])
+    assert num_rows(optimizer) == 2
+
+
+def test_all_gaussians_can_be_split():
+    optimizer = make([LARGE, LARGE], 0.5)
+    assert run(optimizer, [HIGH, HIGH]).num_gaussians == 4
+
+
+def test_degree_0_has_no_higher_coefficients():
+    optimizer = make([SMALL, LARGE], 0.5, sh_rows=0)
+    assert run(optimizer, [HIGH, HIGH]).num_gaussians == 4
+    assert "shN" not in optimizer
+
+
+def test_prefixed_parameters_are_found():
+    bare = make([SMALL, LARGE, SMALL], [0.5, 0.5, 0.001])
+    rates = dict.fromkeys(PARAMETER_NAMES, 0.0)
+    optimizer = make_optimizer(dict(bare.items()), rates, "integrator.")
+    config = DensifyConfig()
+    report = densify_and_prune(
+        optimizer, statistics([HIGH] * 3), config, EXTENT, EARLY, 0, "integrator."
+    )
+    assert (report.cloned, report.split, report.pruned) == (1, 1, 1)
+    reset_opacities(optimizer, config, "integrator.")
+    assert num_rows(optimizer, "integrator.") == report.num_gaussians
+
+
+def test_statistics_of_another_population_are_refused():
+    optimizer = make([SMALL, SMALL], 0.5)
+    with pytest.raises(ValueError, match="statistics of 3 Gaussians for 2"):
+        run(optimizer, [0, 0, 0])
+
+
+# ---- cap
+
+
+def test_cap_takes_the_largest_gradients_and_breaks_ties_by_index():
+    optimizer = make([SMALL] * 6, 0.5)
+    before = values(optimizer)["means"]
+    gradients = [2 * HIGH, HIGH, 3 * HIGH, HIGH, HIGH, 0]
+    report = run(optimizer, gradients, max_gaussians=9)
+    assert report == DensityReport(cloned=3, split=0, pruned=0, refused=2, num_gaussians=9)
+    np.testing.assert_array_equal(values(optimizer)["means"][6:], before[[0, 1, 2]])
+
+
+def test_cap_counts_a_clone_as_one_and_a_split_as_its_samples_less_the_parent():
+    # Room for four: a split into three costs two, the clone one, the next split does not fit.
+    optimizer = make([LARGE, SMALL, LARGE, SMALL, SMALL], 0.5)
+    gradients = [4 * HIGH, 3 * HIGH, 2 * HIGH, 0, 0]
+    report = run(optimizer, gradients, max_gaussians=9, split_count=3)
+    assert report == DensityReport(cloned=1, split=1, pruned=0, refused=1, num_gaussians=8)
+
+
+def test_pruned_rows_make_room():
+    optimizer = make([SMALL] * 5, [0.001, 0.001, 0.5, 0.5, 0.5])
+    assert run(optimizer, [0, 0, HIGH, HIGH, HIGH], max_gaussians=5).num_gaussians == 5
+
+
+def test_full_population_only_shrinks():
+    optimizer = make([SMALL] * 6, [0.5] * 5 + [0.001])
+    report = run(optimizer, [HIGH] * 6, max_gaussians=4)
+    assert report == DensityReport(cloned=0, split=0, pruned=1, refused=5, num_gaussians=5)
+
+
+# ---- everything together
+
+
+def naive_decisions(norms, scales, opacities, large_is_pruned, config):
+    """The rules, one Gaussian after the other: (kept, cloned, split) row numbers."""
+    limit = config.prune_scale * EXTENT if large_is_pruned else math.inf
+    kinds = []
+    for norm, scale, opacity in zip(norms, scales, opacities, strict=True):
+        if opacity < config.prune_opacity:
+            kinds.append("prune")
+        elif norm >= config.grad_threshold:
+            kinds.append("clone" if scale <= config.clone_scale * EXTENT else "split")
+        else:
+            kinds.append("prune" if scale > limit else "keep")
+    room = config.max_gaussians - sum(kind != "prune" for kind in kinds)
+    candidates = [i for i, kind in enumerate(kinds) if kind in ("clone", "split")]
+    full = False
+    for i in sorted(candidates, key=lambda i: (-norms[i], i)):
+        cost = 1 if kinds[i] == "clone" else config.split_count - 1
+        full = full or cost > room
+        if full:
+            kinds[i] = "prune" if scales[i] > limit else "keep"
+        else:
+            room -= cost
+    rows = {kind: [i for i, k in enumerate(kinds) if k == kind] for kind in set(kinds)}
+    kept = sorted(rows.get("keep", []) + rows.get("clone", []))
+    return kept, rows.get("clone", []), rows.get("split", [])
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_random_populations_follow_the_rules_and_the_cap(seed):
+    random = np.random.default_rng(seed)
+    num = 60
+    # float32, as in the statistics; coarse steps make ties.
+    norms = (random.integers(0, 8, num) * 1e-4).astype(np.float32)
+    scales = np.exp(random.uniform(np.log(0.005), np.log(2), num))
+    opacities = np.where(random.random(num) < 0.2, 0.001, random.uniform(0.01, 0.9, num))
+    config = {
+        "max_gaussians": int(random.integers(50, 110)),
+        "split_count": int(random.integers(2, 5)),
+    }
+    iteration = random.choice([EARLY, LATE])
+    optimizer = make(scales, opacities)
+    before = values(optimizer)
+    report = run(optimizer, norms, iteration=iteration, seed=seed, **config)
+    after = values(optimizer)
+
+    config = DensifyConfig(**config)
+    kept, cloned, split = naive_decisions(
+        norms.astype(float), scales, opacities, iteration == LATE, config
+    )
+    parents = [*kept, *cloned, *np.repeat(split, config.split_count)]
+    assert report.num_gaussians == num_rows(optimizer) == len(parents)
+    assert report.num_gaussians <= max(config.max_gaussians, len(kept))
+    assert (report.cloned, report.split) == (len(cloned), len(split))
+    assert report.pruned == num - len(kept) - len(split)
+    for name in ("quats", "logit_opacities", "sh0", "shN"):
+        np.testing.assert_array_equal(after[name], before[name][parents])
+    same = len(kept) + len(cloned)
+    np.testing.assert_array_equal(after["means"][:same], before["means"][parents[:same]])
+    for moment in moments(optimizer, "quats"):
+        assert moment[: len(kept)].all()
+        assert not moment[len(kept) :].any()
+
+
+def test_equal_seeds_give_equal_bytes():
+    def population(seed, iteration):
+        optimizer = make([LARGE, SMALL, LARGE], 0.5)
+        run(optimizer, [HIGH] * 3, iteration=iteration, seed=seed)
+        return b"".join(value.tobytes() for value in values(optimizer).values())
+
+    first = population(3, EARLY)
+    assert population(3, EARLY) == first
+    assert population(4, EARLY) != first
+    assert population(3, EARLY + 100) != first
+
+
+# ---- opacity reset
+
+
+def test_reset_lowers_opacities_and_forgets_their_moments_only():
+    config = DensifyConfig()
+    optimizer = make([SMALL] * 3, [0.9, 0.01001, 0.007])
+    before, (means_m, _) = values(optimizer), moments(optimizer, "means")
+    reset_opacities(optimizer, config)
+    after = values(optimizer)
+    opacities = reference.sigmoid(after["logit_opacities"].astype(float))
+    # 1e-6: single precision of a logit of -4.6.
+    np.testing.assert_allclose(opacities, [0.01, 0.01, 0.007], rtol=1e-6)
+    assert after["logit_opacities"][2] == before["logit_opacities"][2]
+    for moment in moments(optimizer, "logit_opacities"):
+        assert not moment.any()
+    np.testing.assert_array_equal(moments(optimizer, "means")[0], means_m)
+    assert optimizer.state["logit_opacities"][3][0][0] == 1
+    # No Gaussian falls below the prune threshold by being reset.
+    assert run(optimizer, [0, 0, 0]).pruned == 0

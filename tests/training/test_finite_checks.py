@@ -1,0 +1,436 @@
+"""A fit whose numbers are no longer finite: where it says the trouble began, and what it keeps."""
+
+import re
+from collections import Counter
+from dataclasses import replace
+from types import SimpleNamespace
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+import yaml
+from support import small_fits as fits
+from support.small_capture import make_dataset, write_dataset
+from test_trainer import make_trainer
+
+from drgs import fit
+from drgs.gaussians.parameters import PARAMETER_NAMES
+from drgs.splatting import rendering
+from drgs.training.finite_checks import GradientWatch, NonFiniteError, check_values
+from drgs.training.optimizer import replace_values
+from drgs.training.stages import view_of
+from drgs.training.trainer import PREFIX, Trainer
+
+ROW = 17
+
+
+@pytest.fixture(scope="module", autouse=True)
+def variant():
+    mi.set_variant("llvm_ad_rgb")
+
+
+def view_name(trainer, iteration):
+    views = trainer.stages[-1].views
+    return views[view_of(iteration, len(views), trainer.config.seed)].name
+
+
+# ----------------------------------------------------------------------------------------------
+# Poison
+# ----------------------------------------------------------------------------------------------
+
+
+def with_value(vector, row, value):
+    """``vector``, a Float or an array of Floats, with ``value`` in its last column of one row."""
+    columns = [vector] if dr.depth_v(vector) == 1 else list(vector)
+    here = dr.arange(mi.UInt32, dr.width(vector)) == row
+    columns[-1] = dr.select(here, value, columns[-1])
+    return columns[0] if dr.depth_v(vector) == 1 else type(vector)(columns)
+
+
+def poison_gradient(monkeypatch, trainer, name, iteration, value=np.nan, row=ROW):
+    """One component of one row's gradient is ``value`` in that iteration."""
+    real = rendering._as_tensors
+
+    def poisoned(d_rows, gaussians, visible):
+        if trainer.iteration == iteration:
+            assert visible[row]
+            if name in ("sh0", "shN"):
+                k = 0 if name == "sh0" else len(d_rows.sh) - 1
+                sh = [with_value(v, row, value) if i == k else v for i, v in enumerate(d_rows.sh)]
+                d_rows = replace(d_rows, sh=sh)
+            else:
+                d_rows = replace(d_rows, **{name: with_value(getattr(d_rows, name), row, value)})
+        return real(d_rows, gaussians, visible)
+
+    monkeypatch.setattr(rendering, "_as_tensors", poisoned)
+
+
+def poison_value(trainer, name, value=np.nan, row=ROW):
+    """One component of one row of a parameter is ``value`` from now on."""
+    old = dr.detach(trainer.optimizer[PREFIX + name])
+    host = np.array(old)
+    host[(row, *(-1,) * (host.ndim - 1))] = value
+    replace_values(trainer.optimizer, name, type(old)(host), PREFIX)
+
+
+# ----------------------------------------------------------------------------------------------
+# Losses and gradients
+# ----------------------------------------------------------------------------------------------
+
+DEGREE_1_AT_ONCE = {"sh_degree": 1, "sh_increase_every": 1}
+
+
+@pytest.mark.parametrize("name", PARAMETER_NAMES)
+def test_gradient_that_is_not_finite_is_named_though_noticed_later(monkeypatch, name):
+    trainer = make_trainer(model=DEGREE_1_AT_ONCE)
+    poison_gradient(monkeypatch, trainer, name, iteration=3)
+    for _ in range(6):
+        trainer.step()
+    expected = f"iteration 3, view {view_name(trainer, 3)}: the gradient of {name} in row {ROW} is"
+    with pytest.raises(NonFiniteError, match=f"^{re.escape(expected)} not finite"):
+        trainer.watch.check()
+
+
+@pytest.mark.parametrize(
+    ("value", "is_fault"),
+    # Adam squares gradients: 1e20 squared is beyond float32 (3.4e38), 1e18 squared is not.
+    [(np.inf, True), (-np.inf, True), (1e20, True), (-1e20, True), (1e18, False)],
+)
+def test_gradient_is_at_fault_where_its_square_overflows(monkeypatch, value, is_fault):
+    trainer = make_trainer()
+    poison_gradient(monkeypatch, trainer, "log_scales", iteration=2, value=value)
+    trainer.step()
+    trainer.step()
+    if is_fault:
+        with pytest.raises(NonFiniteError, match=f"log_scales in row {ROW}"):
+            trainer.check()
+    else:
+        trainer.check()
+
+
+def test_first_row_is_named_and_in_it_the_first_parameter(monkeypatch):
+    trainer = make_trainer()
+    for name, row in (("means", 30), ("sh0", 20), ("quats", 20), ("logit_opacities", 25)):
+        poison_gradient(monkeypatch, trainer, name, iteration=1, row=row)
+    trainer.step()
+    with pytest.raises(NonFiniteError, match="gradient of quats in row 20 "):
+        trainer.check()
+
+
+@pytest.mark.parametrize(
+    ("dssim_weight", "gradient"), [(0.0, ""), (0.2, r" and the gradient of \w+ in row \d+ .*")]
+)
+def test_loss_that_is_not_finite_names_iteration_and_view(dssim_weight, gradient):
+    """SSIM's gradient tells as well; that of L1 is 0 at a NaN."""
+    from drgs.training.losses import prepare_target
+
+    trainer = make_trainer(loss={"dssim_weight": dssim_weight})
+    spoilt = view_of(4, 4, seed=0)
+    photo = np.full((16, 20, 3), 0.5, np.float32)
+    photo[8, 10] = np.nan
+    target = prepare_target(mi.TensorXf(photo))
+    views = trainer.stages[-1].views
+    views[spoilt] = replace(views[spoilt], target=target)
+    for _ in range(3):
+        trainer.step()
+    trainer.check()
+    trainer.step()
+    message = f"^iteration 4, view v{spoilt}: the loss is nan{gradient}$"
+    with pytest.raises(NonFiniteError, match=message):
+        trainer.check()
+
+
+EVENTS = {
+    "saving": ({}, lambda trainer: trainer.state()),
+    "returning": ({}, lambda trainer: trainer.gaussians()),
+    "densifying": ({"start": 1, "every": 4}, lambda trainer: trainer.step()),
+    "opacity reset": ({"start": 1, "reset_every": 4}, lambda trainer: trainer.step()),
+}
+
+
+@pytest.mark.parametrize("event", EVENTS)
+def test_nothing_is_saved_returned_or_edited_after_a_fault(monkeypatch, event):
+    densify, act = EVENTS[event]
+    trainer = make_trainer(densify=densify)
+    poison_gradient(monkeypatch, trainer, "log_scales", iteration=2)
+    for _ in range(3):
+        trainer.step()
+    for attempt in (act, type(trainer).state):  # nor by who has caught the error
+        with pytest.raises(NonFiniteError, match=r"^iteration 2, "):
+            attempt(trainer)
+
+
+def test_restored_trainer_has_left_the_fault_behind(monkeypatch):
+    trainer = make_trainer()
+    trainer.step()
+    good = trainer.state()
+    poison_gradient(monkeypatch, trainer, "means", iteration=2)
+    trainer.step()
+    trainer.restore(good)
+    monkeypatch.undo()
+    trainer.step()
+    trainer.check()
+
+
+# ----------------------------------------------------------------------------------------------
+# Values
+# ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", PARAMETER_NAMES)
+@pytest.mark.parametrize("value", [np.nan, -np.inf])
+def test_value_that_is_not_finite_is_named(name, value):
+    trainer = make_trainer(model=DEGREE_1_AT_ONCE)
+    trainer.step()
+    poison_value(trainer, name, value)
+    with pytest.raises(
+        NonFiniteError, match=f"^after iteration 1: {name} is {value} in row {ROW}$"
+    ):
+        trainer.check()
+
+
+def test_value_that_is_not_finite_is_noticed_though_no_gradient_tells():
+    """Such a Gaussian is invisible; densification would have removed it without a word."""
+    trainer = make_trainer(densify={"start": 1, "every": 5})
+    trainer.step()
+    poison_value(trainer, "log_scales")
+    for _ in range(3):
+        assert np.isfinite(trainer.step().loss)
+    trainer.watch.check()
+    with pytest.raises(
+        NonFiniteError, match=f"^after iteration 5: log_scales is nan in row {ROW}$"
+    ):
+        trainer.step()
+
+
+def test_statistics_that_are_not_finite_are_named():
+    """A gradient of positions on the film that overflows may leave all parameters' gradients."""
+    trainer = make_trainer()
+    trainer.step()
+    norms = with_value(trainer.statistics.gradient_norms, ROW, np.nan)
+    trainer.statistics = replace(trainer.statistics, gradient_norms=norms)
+    with pytest.raises(NonFiniteError, match=f"gradient_norms is nan in row {ROW}$"):
+        trainer.state()
+
+
+EFFECTS = {
+    "colors.matrices": {"colors__lr": 2e-3},
+    "cameras.turns": {"cameras__optimise": True},
+    "cameras.moves": {"cameras__optimise": True},
+    "cameras.log_focals": {"cameras__optimise": True, "cameras__focal_lr": 1e-3},
+    "cameras.shifts": {"cameras__optimise": True, "cameras__principal_lr": 1e-3},
+}
+
+
+def poison_effect(trainer, name, index, value, part="value"):
+    """The last number of a view's row, or of that for all views, is ``value`` from now on."""
+    (effect,) = trainer.effects
+    state, key = effect.state(), f"{name.partition('.')[2]}.{part}"
+    state[key] = state[key].copy()
+    rows = len(state[key])
+    state[key][min(index, rows - 1), -1] = value
+    effect.restore(state)
+    return f"in row {index} (view r_{index})" if rows > 1 else "in row 0 (all views)"
+
+
+@pytest.mark.parametrize("part", ["value", "m", "v"])
+@pytest.mark.parametrize("name", EFFECTS)
+def test_what_an_effect_optimises_is_named_where_it_is_not_finite(name, part):
+    """And so are its moments."""
+    trainer = fits.steps(fits.make_trainer(fits.plain_dataset(), **EFFECTS[name]), 2)
+    trainer.check()
+    where = poison_effect(trainer, name, 3, np.inf, part)
+    shown = name if part == "value" else f"{name}.{part}"
+    for act in (Trainer.check, Trainer.state, Trainer.gaussians):
+        with pytest.raises(NonFiniteError) as error:
+            act(trainer)
+        assert str(error.value) == f"after iteration 2: {shown} is inf {where}"
+
+
+@pytest.mark.parametrize("name", EFFECTS)
+def test_an_iteration_that_is_not_finite_names_the_effect_that_made_it_so(name):
+    trainer = fits.steps(fits.make_trainer(fits.plain_dataset(), **EFFECTS[name]), 2)
+    index = view_of(3, len(trainer.views), trainer.config.seed)
+    poison_effect(trainer, name, index, np.nan)
+    trainer.step()
+    with pytest.raises(NonFiniteError, match=f"^iteration 3, view r_{index}: {name} is nan"):
+        trainer.check()
+
+
+def test_check_values_names_the_first_row_of_any_shape():
+    values = np.zeros((5, 2, 3), np.float32)
+    check_values(1, {"sh": mi.TensorXf(values)})
+    values[2, 1, 0], values[3, 0, 0] = np.inf, np.nan
+    with pytest.raises(NonFiniteError, match=r"^after iteration 7: sh is inf in row 2$"):
+        check_values(7, {"sh": mi.TensorXf(values)})
+
+
+# ----------------------------------------------------------------------------------------------
+# What the guards cost a good fit
+# ----------------------------------------------------------------------------------------------
+
+
+def test_bytes_of_a_good_fit_are_those_without_guards(monkeypatch):
+    """Across changes of the population and an opacity reset."""
+    changes = {
+        "densify": {"start": 2, "stop": 40, "every": 5, "reset_every": 8, "grad_threshold": 1e-6},
+        "model": {"sh_degree": 2, "sh_increase_every": 4},
+    }
+
+    def result():
+        trainer = make_trainer(**changes)
+        for _ in range(12):
+            trainer.step()
+        assert trainer.num_gaussians != 40
+        return [getattr(trainer.gaussians(), name).tobytes() for name in PARAMETER_NAMES]
+
+    guarded = result()
+    monkeypatch.setattr(rendering, "_faults", lambda d_rows: mi.UInt32(0))
+    monkeypatch.setattr(GradientWatch, "add", lambda *arguments: None)
+    assert result() == guarded
+
+
+def history_of(act):
+    """Kernels, reductions and copies that ``act`` launches, in order, as (type, size)."""
+    dr.sync_thread()
+    dr.kernel_history_clear()
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
+        act()
+        dr.sync_thread()
+    return [(entry["type"], entry["size"]) for entry in dr.kernel_history()]
+
+
+def test_guards_cost_an_iteration_two_reductions_and_no_wait(monkeypatch):
+    trainer = make_trainer()
+    for _ in range(5):
+        trainer.step()
+    guarded = Counter(kind for kind, _ in history_of(trainer.step))
+    # dr.min reduces the faults, which the gradients' own kernel computes.
+    without_min = SimpleNamespace(**{**vars(dr), "min": lambda faults: faults})
+    monkeypatch.setattr(rendering, "dr", without_min)
+    plain = Counter(kind for kind, _ in history_of(trainer.step))
+    for kind in guarded | plain:
+        allowed = 2 if kind == dr.KernelType.BlockReduce else 0
+        assert 0 <= guarded[kind] - plain[kind] <= allowed, kind
+    # Each copy is a value that the host waits for: the numbers of entries, made and composited.
+    assert guarded[dr.KernelType.Memcpy] == 2
+
+
+def test_watching_launches_nothing_larger_than_one_value():
+    trainer = make_trainer()
+    for _ in range(5):
+        trainer.step()
+    assert all(size <= 4 for _, size in history_of(trainer.watch.check))
+
+
+# ----------------------------------------------------------------------------------------------
+# The command
+# ----------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def configuration(tmp_path):
+    write_dataset(tmp_path / "data", make_dataset(train=4, test=1))
+    values = {
+        "data": {"path": "data"},
+        "init": {"num_points": 40, "half_extent": 0.5},
+        "model": {"sh_degree": 0},
+        "iterations": 7,
+        "output": {"checkpoint_every": 2, "history_every": 3, "save_renders": False},
+    }
+    (tmp_path / "a.yml").write_text(yaml.safe_dump(values))
+    return tmp_path / "a.yml"
+
+
+@pytest.fixture
+def saved(monkeypatch):
+    """The bytes of every checkpoint, as they were written; there are no reports."""
+    monkeypatch.setattr(fit, "write_results", lambda *arguments: None)
+    saved, save = [], fit.save_checkpoint
+
+    def save_and_remember(folder, *rest):
+        save(folder, *rest)
+        saved.append((folder / "checkpoint.npz").read_bytes())
+
+    monkeypatch.setattr(fit, "save_checkpoint", save_and_remember)
+    return saved
+
+
+def spoil_photograph(monkeypatch, iteration):
+    """The photograph that the fit visits first in that iteration is NaN in one pixel."""
+    spoilt, load = view_of(iteration, 4, seed=0), fit.load_dataset
+
+    def load_and_spoil(config):
+        dataset = load(config)
+        image = dataset.train[spoilt].image.copy()
+        image[12, 16, 0] = np.nan
+        train = list(dataset.train)
+        train[spoilt] = replace(train[spoilt], image=image)
+        return replace(dataset, train=tuple(train))
+
+    monkeypatch.setattr(fit, "load_dataset", load_and_spoil)
+    return f"iteration {iteration}, view r_{spoilt}: the loss is nan"
+
+
+def spoil_value(monkeypatch, iteration):
+    """After that iteration a scale is infinite."""
+    step = fit.Trainer.step
+
+    def step_and_spoil(trainer):
+        report = step(trainer)
+        if trainer.iteration == iteration:
+            poison_value(trainer, "log_scales", np.inf)
+        return report
+
+    monkeypatch.setattr(fit.Trainer, "step", step_and_spoil)
+    return f"after iteration 4: log_scales is inf in row {ROW}"
+
+
+def fails(capsys, *arguments):
+    with pytest.raises(SystemExit) as exit_info:
+        fit.main([str(argument) for argument in arguments])
+    assert exit_info.value.code == 2
+    (line,) = capsys.readouterr().err.strip().splitlines()
+    return line.removeprefix("error: ")
+
+
+@pytest.mark.parametrize("spoil", [spoil_photograph, spoil_value])
+def test_fit_stops_keeps_the_last_good_checkpoint_and_resumes(
+    monkeypatch, capsys, tmp_path, configuration, saved, spoil
+):
+    out = tmp_path / "out"
+    with monkeypatch.context() as spoiling:
+        expected = spoil(spoiling, iteration=4)
+        message = fails(capsys, configuration, "--out", out)
+    assert message.startswith(expected)
+    assert f"the last checkpoint is kept. --resume {out} --debug repeats this" in message
+    assert sorted(path.name for path in out.iterdir()) == ["checkpoint.npz", "config.yml"]
+    assert [(out / "checkpoint.npz").read_bytes()] == saved  # that of iteration 2
+
+    fit.main(["--resume", str(out)])
+    assert "continues at iteration 2\n" in capsys.readouterr().out
+    fit.main([str(configuration), "--out", str(tmp_path / "good")])
+    expected = (tmp_path / "good" / "point_cloud.ply").read_bytes()
+    assert (out / "point_cloud.ply").read_bytes() == expected
+
+
+def test_fit_stops_at_the_next_row_of_its_history(monkeypatch, capsys, tmp_path, configuration):
+    expected = spoil_photograph(monkeypatch, iteration=4)
+    steps, step = [], fit.Trainer.step
+    monkeypatch.setattr(fit.Trainer, "step", lambda self: steps.append(self) or step(self))
+    arguments = ("--set", "output.checkpoint_every=null")
+    message = fails(capsys, configuration, "--out", tmp_path / "out", *arguments)
+    assert message.startswith(expected)
+    assert len(steps) == 6  # history_every is 3
+
+
+def test_fault_of_the_last_iteration_leaves_no_results(
+    monkeypatch, capsys, tmp_path, configuration
+):
+    out = tmp_path / "out"
+    spoil_value(monkeypatch, iteration=4)
+    arguments = ("--set", "iterations=4", "--set", "output.checkpoint_every=null")
+    message = fails(capsys, configuration, "--out", out, *arguments)
+    assert message.startswith(f"after iteration 4: log_scales is inf in row {ROW}; nothing was")
+    assert [path.name for path in out.iterdir()] == ["config.yml"]

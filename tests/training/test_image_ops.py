@@ -1,0 +1,374 @@
+"""Operations on pixels against numpy, their derivatives against formulas and each other."""
+
+from functools import partial
+
+import drjit as dr
+import numpy as np
+import pytest
+from support.helpers import FLOAT32, FLOAT64, assert_arrays_agree, bitwise, both_precisions, single
+from test_composition import float_reductions
+
+from drgs.training import image_ops as pixels
+
+HEIGHT, WIDTH = 13, 21
+
+# Relative to the largest value of an array: sums of at most 273 products, with a rounding each.
+TOLERANCE = {FLOAT64: 1e-14, FLOAT32: 2e-6}
+
+# Central differences of functions that are linear or bilinear: exact but for the rounding of a
+# difference of values of order 1 to 100 over a step of 1e-4.
+STEP, DIFFERENCES = 1e-4, 1e-9
+
+
+def random(*shape, seed=0) -> np.ndarray:
+    """Normal numbers, the same in both precisions."""
+    return single(np.random.default_rng([seed, *shape]).normal(size=shape))
+
+
+def tensor(values, precision, grad=False):
+    values = np.asarray(values)
+    result = precision.TensorXf(precision.array(values), values.shape)
+    if grad:
+        dr.enable_grad(result)
+    return result
+
+
+def to_numpy(value) -> np.ndarray:
+    return np.array(value).astype(np.float64)
+
+
+# ----------------------------------------------------------------------------------------------
+# What is computed, twice
+# ----------------------------------------------------------------------------------------------
+
+
+def numpy_split(image, count):
+    return image[..., :count], image[..., count:]
+
+
+def numpy_transform(image, matrix):
+    return np.einsum("ij,hwj->hwi", matrix[:, :3], image) + matrix[:, 3]
+
+
+def numpy_depth_error(depths, target, weights):
+    depth, alpha = depths[..., 0].ravel(), depths[..., 1].ravel()
+    return np.array([np.sum(weights * np.abs(depth - alpha * target))])
+
+
+def depth_inputs():
+    """Depths behind, before and, in three pixels, exactly at the target; some without weight."""
+    rng = np.random.default_rng(3)
+    alpha = single(rng.uniform(0.1, 1, (HEIGHT, WIDTH)))
+    target = rng.integers(1, 5, (HEIGHT, WIDTH)).astype(np.float64)
+    depth = single(alpha * target + rng.normal(0, 0.3, alpha.shape))
+    alpha[0, :3], depth[0, :3] = 0.5, 0.5 * target[0, :3]
+    weights = single(rng.uniform(0.5, 1, alpha.shape)) * (rng.uniform(size=alpha.shape) < 0.8)
+    return np.stack([depth, alpha], axis=-1), target.ravel(), weights.ravel()
+
+
+class Operation:
+    """A function of pixels: by drgs, by numpy, and numpy's derivative."""
+
+    def __init__(self, apply, numpy, inputs, adjoint):
+        """inputs: by name; apply, numpy: of these; adjoint: of cotangents, by name of input."""
+        self.apply, self.numpy, self.inputs, self.adjoint = apply, numpy, inputs, adjoint
+
+    def device(self, precision, grad=False):
+        return {k: tensor(v, precision, grad) for k, v in self.inputs.items()}
+
+    def outputs(self, inputs):
+        result = self.apply(**inputs)
+        return result if isinstance(result, tuple) else (result,)
+
+    def expected(self, inputs):
+        result = self.numpy(**inputs)
+        return result if isinstance(result, tuple) else (result,)
+
+
+def split_operation(channels=5, count=3):
+    return Operation(
+        lambda image: pixels.split(image, count),
+        lambda image: numpy_split(image, count),
+        {"image": random(HEIGHT, WIDTH, channels)},
+        lambda first, rest: {"image": np.concatenate([first, rest], axis=-1)},
+    )
+
+
+def transform_operation():
+    image, matrix = random(HEIGHT, WIDTH, 3), random(3, 4)
+
+    def adjoint(g):
+        ones = np.ones((HEIGHT, WIDTH, 1))
+        return {
+            "image": np.einsum("ij,hwi->hwj", matrix[:, :3], g),
+            "matrix": np.einsum("hwi,hwj->ij", g, np.concatenate([image, ones], axis=-1)),
+        }
+
+    return Operation(
+        pixels.transform_colors, numpy_transform, {"image": image, "matrix": matrix}, adjoint
+    )
+
+
+def depth_operation():
+    depths, target, weights = depth_inputs()
+
+    def apply(depths):
+        flat = dr.array_t(depths)
+        of_type = FLOAT32 if flat is FLOAT32.Float else FLOAT64
+        return pixels.depth_error(depths, of_type.array(target), of_type.array(weights))
+
+    def adjoint(g):
+        difference = depths[..., 0].ravel() - depths[..., 1].ravel() * target
+        slope = g[0] * weights * np.sign(difference)
+        return {"depths": np.stack([slope, -slope * target], axis=-1).reshape(depths.shape)}
+
+    numpy = partial(numpy_depth_error, target=target, weights=weights)
+    return Operation(apply, numpy, {"depths": depths}, adjoint)
+
+
+OPERATIONS = {
+    "split": split_operation,
+    "split off one": lambda: split_operation(4, 3),
+    "transform_colors": transform_operation,
+    "depth_error": depth_operation,
+}
+
+all_operations = pytest.mark.parametrize("name", OPERATIONS)
+
+
+def cotangents_of(operation):
+    """One for each output; exact in single precision."""
+    outputs = operation.expected(operation.inputs)
+    return [random(*output.shape, seed=10 + k) for k, output in enumerate(outputs)]
+
+
+def gradients(operation, precision, cotangents) -> dict[str, np.ndarray]:
+    """Of sum(cotangents * outputs)."""
+    inputs = operation.device(precision, grad=True)
+    outputs = operation.outputs(inputs)
+    for output, cotangent in zip(outputs, cotangents, strict=True):
+        if dr.is_tensor_v(output):
+            dr.set_grad(output, tensor(cotangent, precision))
+        else:
+            dr.set_grad(output, precision.array(cotangent))
+    dr.enqueue(dr.ADMode.Backward, outputs)
+    dr.traverse(dr.ADMode.Backward)
+    return {name: to_numpy(dr.grad(value)) for name, value in inputs.items()}
+
+
+def tangents(operation, precision, directions) -> list[np.ndarray]:
+    """Of the outputs, along directions of the inputs."""
+    inputs = operation.device(precision, grad=True)
+    for name, value in inputs.items():
+        dr.set_grad(value, tensor(directions[name], precision))
+    outputs = operation.outputs(inputs)
+    dr.forward_to(outputs)
+    return [to_numpy(dr.grad(output)) for output in outputs]
+
+
+def random_directions(operation):
+    return {k: random(*v.shape, seed=20) for k, v in operation.inputs.items()}
+
+
+# ----------------------------------------------------------------------------------------------
+# Values and derivatives
+# ----------------------------------------------------------------------------------------------
+
+
+@both_precisions
+@all_operations
+def test_values_are_those_of_numpy(name, precision):
+    operation = OPERATIONS[name]()
+    actual = operation.outputs(operation.device(precision))
+    expected = operation.expected(operation.inputs)
+    assert_arrays_agree(
+        {str(k): to_numpy(a) for k, a in enumerate(actual)},
+        {str(k): e for k, e in enumerate(expected)},
+        TOLERANCE[precision],
+    )
+
+
+@both_precisions
+@all_operations
+def test_backward_derivatives_are_the_formulas(name, precision):
+    operation = OPERATIONS[name]()
+    cotangents = cotangents_of(operation)
+    actual = gradients(operation, precision, cotangents)
+    assert_arrays_agree(actual, operation.adjoint(*cotangents), TOLERANCE[precision])
+
+
+@all_operations
+def test_backward_derivatives_are_central_differences(name):
+    """Of the value by numpy, at some of the numbers. At a kink of |x| both slopes average to 0."""
+    operation = OPERATIONS[name]()
+    cotangents = cotangents_of(operation)
+    actual = gradients(operation, FLOAT64, cotangents)
+    rng = np.random.default_rng(5)
+
+    def loss(inputs):
+        outputs = operation.expected(inputs)
+        return sum(np.sum(c * o) for c, o in zip(cotangents, outputs, strict=True))
+
+    for key, values in operation.inputs.items():
+        scale = np.abs(actual[key]).max()
+        for flat in rng.choice(values.size, min(values.size, 30), replace=False):
+            moved = []
+            for sign in (1, -1):
+                other = values.copy()
+                other.flat[flat] += sign * STEP
+                moved.append(loss(operation.inputs | {key: other}))
+            difference = (moved[0] - moved[1]) / (2 * STEP)
+            error = abs(actual[key].flat[flat] - difference)
+            assert error <= DIFFERENCES * scale, (key, flat, actual[key].flat[flat], difference)
+
+
+@both_precisions
+@all_operations
+def test_forward_derivatives_are_central_differences(name, precision):
+    operation = OPERATIONS[name]()
+    directions = random_directions(operation)
+    actual = tangents(operation, precision, directions)
+    # |x| has kinks; no difference of depths is as close to one as this step reaches, but those
+    # that are zero, where the derivative is taken as 0: as the mean of both sides is.
+    step = 1e-6
+
+    def at(sign):
+        moved = {k: v + sign * step * directions[k] for k, v in operation.inputs.items()}
+        return operation.expected(moved)
+
+    expected = [(a - b) / (2 * step) for a, b in zip(at(1), at(-1), strict=True)]
+    # A step of 1e-6 amplifies roundings of float64 to 1e-10 of values up to 100.
+    tolerance = max(TOLERANCE[precision], 1e-8)
+    assert_arrays_agree(
+        {str(k): a for k, a in enumerate(actual)},
+        {str(k): e for k, e in enumerate(expected)},
+        tolerance,
+    )
+
+
+@both_precisions
+@all_operations
+def test_forward_and_backward_derivatives_are_transposed(name, precision):
+    """<J v, w> = <v, J^T w>."""
+    operation = OPERATIONS[name]()
+    directions, cotangents = random_directions(operation), cotangents_of(operation)
+    forward = tangents(operation, precision, directions)
+    backward = gradients(operation, precision, cotangents)
+    left = [np.sum(c * f) for c, f in zip(cotangents, forward, strict=True)]
+    right = [np.sum(directions[k] * g) for k, g in backward.items()]
+    size = sum(np.abs(c * f).sum() for c, f in zip(cotangents, forward, strict=True))
+    assert abs(sum(left) - sum(right)) <= TOLERANCE[precision] * size
+    assert abs(sum(left)) > 1e-3 * size  # not two zeros
+
+
+def test_the_comparisons_notice_one_percent(monkeypatch):
+    """Of an adjoint, and of a tangent."""
+    scale = 1.01
+    for method in ("set_grad_in", "set_grad_out"):
+        original = getattr(dr.CustomOp, method)
+
+        def scaled(self, *arguments, original=original):
+            *key, value = arguments
+            both = isinstance(value, tuple)
+            value = tuple(scale * v for v in value) if both else scale * value
+            original(self, *key, value)
+
+        for kind in (pixels._Split, pixels._TransformColors, pixels._DepthError):
+            monkeypatch.setattr(kind, method, scaled)
+    for name in OPERATIONS:
+        for check in (
+            partial(test_backward_derivatives_are_the_formulas, name, FLOAT32),
+            partial(test_backward_derivatives_are_central_differences, name),
+            partial(test_forward_derivatives_are_central_differences, name, FLOAT32),
+        ):
+            with pytest.raises(AssertionError):
+                check()
+
+
+# ----------------------------------------------------------------------------------------------
+# What is not asked for
+# ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("used", [0, 1])
+def test_the_half_of_a_split_that_nothing_depends_on_has_no_derivative(used):
+    operation = split_operation()
+    image = operation.device(FLOAT32, grad=True)["image"]
+    halves = pixels.split(image, 3)
+    weights = random(*halves[used].shape)
+    dr.backward(dr.sum(halves[used] * tensor(weights, FLOAT32), axis=None))
+    expected = np.zeros((HEIGHT, WIDTH, 5))
+    expected[..., [slice(0, 3), slice(3, 5)][used]] = weights
+    np.testing.assert_array_equal(to_numpy(dr.grad(image)), expected)
+
+
+@pytest.mark.parametrize("attached", ["image", "matrix"])
+def test_colors_may_be_transformed_with_one_derivative_alone(attached):
+    operation = transform_operation()
+    everything = gradients(operation, FLOAT32, cotangents_of(operation))
+    inputs = operation.device(FLOAT32)
+    dr.enable_grad(inputs[attached])
+    output = pixels.transform_colors(**inputs)
+    dr.set_grad(output, tensor(cotangents_of(operation)[0], FLOAT32))
+    dr.enqueue(dr.ADMode.Backward, output)
+    dr.traverse(dr.ADMode.Backward)
+    np.testing.assert_array_equal(to_numpy(dr.grad(inputs[attached])), everything[attached])
+    dr.enable_grad(inputs)
+    inputs = operation.device(FLOAT32)
+    dr.enable_grad(inputs[attached])
+    direction = random(*operation.inputs[attached].shape, seed=20)
+    dr.set_grad(inputs[attached], tensor(direction, FLOAT32))
+    output = pixels.transform_colors(**inputs)
+    dr.forward_to(output)
+    zero = {k: np.zeros_like(v) for k, v in operation.inputs.items()}
+    (expected,) = tangents(operation, FLOAT32, zero | {attached: direction})
+    np.testing.assert_array_equal(to_numpy(dr.grad(output)), expected)
+
+
+def test_equal_depths_have_no_slope():
+    """In the three pixels where depth is exactly alpha times the target's."""
+    operation = depth_operation()
+    gradient = gradients(operation, FLOAT32, [np.ones(1)])["depths"]
+    weights = depth_inputs()[2].reshape(HEIGHT, WIDTH)
+    assert (gradient[0, :3] == 0).all()
+    assert ((gradient[..., 0] != 0) == (weights > 0))[1:].all()
+
+
+# ----------------------------------------------------------------------------------------------
+# The same in every run
+# ----------------------------------------------------------------------------------------------
+
+
+@all_operations
+def test_derivatives_are_the_same_bytes_in_two_runs(name):
+    operation = OPERATIONS[name]()
+    runs = [bitwise(gradients(operation, FLOAT32, cotangents_of(operation))) for _ in range(2)]
+    assert runs[0] == runs[1]
+
+
+@both_precisions
+@all_operations
+def test_no_derivative_is_added_in_memory(name, precision):
+    """Where Dr.Jit differentiates a gather, it would be."""
+    operation = OPERATIONS[name]()
+    results = {}
+    found, count = float_reductions(
+        lambda: results.update(gradients(operation, precision, cotangents_of(operation)))
+    )
+    assert results and not found and count >= 1
+
+
+def test_the_matrix_is_not_compiled_into_the_kernels():
+    """Each step of its optimizer would compile its own."""
+    operation = transform_operation()
+
+    def hashes(factor):
+        changed = Operation(
+            operation.apply, None, operation.inputs | {"matrix": factor * random(3, 4)}, None
+        )
+        with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
+            dr.kernel_history_clear()
+            gradients(changed, FLOAT32, [random(HEIGHT, WIDTH, 3)])
+            return {kernel["hash"] for kernel in dr.kernel_history([dr.KernelType.JIT])}
+
+    assert hashes(1.0) == hashes(0.5)

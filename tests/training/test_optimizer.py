@@ -1,0 +1,239 @@
+"""Row surgery on Adam: what stays must not notice, what is new must start from nothing."""
+
+import math
+
+import drjit as dr
+import numpy as np
+import pytest
+from drjit.llvm.ad import Float, TensorXf, TensorXf64, UInt32
+from drjit.opt import Adam
+
+from drgs.gaussians.parameters import PARAMETER_NAMES
+from drgs.training.optimizer import edit_rows, make_optimizer, num_rows, replace_values, take_rows
+from drgs.training.rates import ExponentialDecay
+
+PREFIX = "integrator."
+RATES = {name: 0.01 * (k + 1) for k, name in enumerate(PARAMETER_NAMES)}
+
+
+def row_shapes(sh_rows=15):
+    return {
+        "means": (3,),
+        "quats": (4,),
+        "log_scales": (3,),
+        "logit_opacities": (),
+        "sh0": (1, 3),
+        "shN": (sh_rows, 3),
+    }
+
+
+def parameters(num, sh_rows=15, seed=0, tensor_type=TensorXf):
+    random = np.random.default_rng(seed)
+    flat_type = dr.array_t(tensor_type)
+    result = {}
+    for name, shape in row_shapes(sh_rows).items():
+        flat = flat_type(random.standard_normal(num * math.prod(shape)))
+        result[name] = tensor_type(flat, (num, *shape)) if shape else flat
+    return result
+
+
+def step(optimizer, seed, rows):
+    """One Adam step; row i gets a gradient that depends on seed and ``rows[i]`` alone."""
+    for name, shape in row_shapes().items():
+        if PREFIX + name not in optimizer:
+            continue
+        value = optimizer[PREFIX + name]
+        table = np.random.default_rng([seed, len(name)]).standard_normal((100, *shape))
+        gradient = type(value)(table[rows].astype(np.float32))
+        dr.set_grad(value, gradient)
+    optimizer.step()
+
+
+def snapshot(optimizer):
+    """Bytes of the value and both moments of every row, by parameter."""
+    result = {}
+    for key, (value, _, _, (_, m, v, _)) in optimizer.state.items():
+        num = value.shape[0]
+        flat = dr.detach(value).array
+        result[key] = [np.array(array).reshape(num, -1) for array in (flat, m, v)]
+    return result
+
+
+def test_make_optimizer_sets_rates_and_leaves_out_empty_parameters():
+    optimizer = make_optimizer(parameters(5, sh_rows=0), RATES, PREFIX, epsilon=1e-12)
+    assert isinstance(optimizer, Adam)
+    assert optimizer.epsilon == 1e-12
+    assert list(optimizer.keys()) == [PREFIX + name for name in PARAMETER_NAMES[:-1]]
+    for name in PARAMETER_NAMES[:-1]:
+        assert optimizer.learning_rate(PREFIX + name) == RATES[name]
+
+
+def test_tiny_gradients_move_parameters():
+    # A gradient of 1e-10 is far below Adam's default epsilon of 1e-8; with 1e-15 the first step
+    # is one learning rate.
+    optimizer = make_optimizer({"means": dr.zeros(TensorXf, (2, 3))}, {"means": 0.5})
+    dr.set_grad(optimizer["means"], dr.full(TensorXf, 1e-10, (2, 3)))
+    optimizer.step()
+    np.testing.assert_allclose(optimizer["means"].numpy(), -0.5, rtol=1e-5)
+
+
+def test_missing_rate_is_refused_by_name():
+    with pytest.raises(ValueError, match="no learning rate for parameter quats"):
+        make_optimizer(parameters(2), {"means": 1.0})
+
+
+@pytest.mark.parametrize("tensor_type", [TensorXf, TensorXf64])
+def test_surviving_rows_continue_bitwise(tensor_type):
+    def run(edit):
+        optimizer = make_optimizer(parameters(20, tensor_type=tensor_type), RATES, PREFIX)
+        rows = np.arange(20)
+        for seed in range(3):
+            step(optimizer, seed, rows)
+        if edit:
+            keep = [0, 3, 4, 7, 19]
+            new = parameters(6, seed=9, tensor_type=tensor_type)
+            edit_rows(optimizer, UInt32(keep), new, PREFIX)
+            rows = np.array([*keep, 50, 51, 52, 53, 54, 55])
+        for seed in range(3, 7):
+            step(optimizer, seed, rows)
+        return snapshot(optimizer)
+
+    edited, untouched = run(edit=True), run(edit=False)
+    for key, arrays in edited.items():
+        for array, original in zip(arrays, untouched[key], strict=True):
+            assert array.shape[0] == 11
+            assert array[:5].tobytes() == original[[0, 3, 4, 7, 19]].tobytes(), key
+
+
+def test_appended_rows_have_their_values_and_zero_moments():
+    optimizer = make_optimizer(parameters(4), RATES, PREFIX)
+    step(optimizer, 0, np.arange(4))
+    before = snapshot(optimizer)
+    new = parameters(3, seed=5)
+    edit_rows(optimizer, UInt32(3, 1), new, PREFIX)
+    after = snapshot(optimizer)
+    assert num_rows(optimizer, PREFIX) == 5
+    for name in PARAMETER_NAMES:
+        value, m, v = after[PREFIX + name]
+        np.testing.assert_array_equal(value[:2], before[PREFIX + name][0][[3, 1]])
+        np.testing.assert_array_equal(m[:2], before[PREFIX + name][1][[3, 1]])
+        np.testing.assert_array_equal(v[:2], before[PREFIX + name][2][[3, 1]])
+        np.testing.assert_array_equal(value[2:], new[name].numpy().reshape(3, -1))
+        assert (m[:2] != 0).all()
+        assert (v[:2] != 0).all()
+        assert (m[2:] == 0).all()
+        assert (v[2:] == 0).all()
+        assert optimizer[PREFIX + name].shape == (5, *row_shapes()[name])
+
+
+def test_edit_keeps_step_counts_rates_order_and_gradients():
+    optimizer = make_optimizer(parameters(4), RATES, PREFIX)
+    optimizer["exposure"] = Float(1, 2, 3)
+    step(optimizer, 0, np.arange(4))
+    step(optimizer, 1, np.arange(4))
+    optimizer.set_learning_rate({PREFIX + "means": 0.125})
+    keys = list(optimizer.keys())
+    edit_rows(optimizer, UInt32(2), parameters(2), PREFIX)
+    assert list(optimizer.keys()) == keys
+    assert optimizer.learning_rate(PREFIX + "means") == 0.125
+    assert optimizer.learning_rate(PREFIX + "quats") == RATES["quats"]
+    for name in PARAMETER_NAMES:
+        value, promoted, _, (t, _, _, _) = optimizer.state[PREFIX + name]
+        assert t[0] == 2
+        assert promoted is False
+        assert dr.grad_enabled(value)
+    # What does not start with the prefix is not a row of anything.
+    np.testing.assert_array_equal(optimizer["exposure"].numpy(), [1, 2, 3])
+
+
+def test_edit_without_appending_and_without_keeping():
+    optimizer = make_optimizer(parameters(4), RATES, PREFIX)
+    expected = snapshot(optimizer)[PREFIX + "shN"][0][[2, 0]]
+    edit_rows(optimizer, UInt32(2, 0), prefix=PREFIX)
+    np.testing.assert_array_equal(snapshot(optimizer)[PREFIX + "shN"][0], expected)
+
+    new = parameters(3, seed=1)
+    edit_rows(optimizer, UInt32(), new, PREFIX)
+    np.testing.assert_array_equal(optimizer[PREFIX + "means"].numpy(), new["means"].numpy())
+    step(optimizer, 0, np.arange(3))
+
+
+def test_edit_refuses_what_would_misalign_rows():
+    optimizer = make_optimizer(parameters(4), RATES, PREFIX)
+    with pytest.raises(ValueError, match="row numbers below 4"):
+        edit_rows(optimizer, UInt32(0, 4), prefix=PREFIX)
+    with pytest.raises(ValueError, match="at least one row must remain"):
+        edit_rows(optimizer, UInt32(), prefix=PREFIX)
+    incomplete = parameters(2)
+    del incomplete["quats"]
+    with pytest.raises(ValueError, match=r"rows of quats must have the shape \(M, 4\), got none"):
+        edit_rows(optimizer, UInt32(0), incomplete, PREFIX)
+    uneven = parameters(2) | {"sh0": parameters(3)["sh0"]}
+    with pytest.raises(ValueError, match=r"same number of rows, got \[2, 3\]"):
+        edit_rows(optimizer, UInt32(0), uneven, PREFIX)
+    with pytest.raises(ValueError, match="must share one number of rows"):
+        num_rows(optimizer, "sensor.")
+
+
+def test_later_edits_of_other_sizes_compile_no_kernel():
+    def kernels(num, keep, added):
+        optimizer = make_optimizer(parameters(num), RATES, PREFIX)
+        # Memory of Dr.Jit's own: kernels that read numpy's also depend on its alignment.
+        new = {name: value + 1 for name, value in parameters(added).items()}
+        dr.eval(new)
+        with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+            dr.kernel_history_clear()
+            edit_rows(optimizer, dr.arange(UInt32, keep), new, PREFIX)
+            history = dr.kernel_history([dr.KernelType.JIT])
+        return {kernel["hash"] for kernel in history}
+
+    first = kernels(40, 30, 9)
+    assert len(first) > 0
+    assert kernels(70, 41, 22) == first
+
+
+def test_taken_rows_are_detached_copies():
+    values = parameters(5)
+    optimizer = make_optimizer(values, RATES, PREFIX)
+    rows = take_rows(optimizer, UInt32(4, 4, 1), PREFIX)
+    for name in PARAMETER_NAMES:
+        assert rows[name].shape == (3, *row_shapes()[name])
+        np.testing.assert_array_equal(rows[name].numpy(), values[name].numpy()[[4, 4, 1]])
+        assert not dr.grad_enabled(rows[name])
+
+
+def test_replaced_values_keep_step_count_and_rate_but_not_moments():
+    optimizer = make_optimizer(parameters(4), RATES, PREFIX)
+    step(optimizer, 0, np.arange(4))
+    replace_values(optimizer, "logit_opacities", Float(1, 2, 3, 4), PREFIX)
+    value, _, rate, (t, m, v, _) = optimizer.state[PREFIX + "logit_opacities"]
+    np.testing.assert_array_equal(value.numpy(), [1, 2, 3, 4])
+    assert rate == RATES["logit_opacities"]
+    assert t[0] == 1
+    assert not m.numpy().any()
+    assert not v.numpy().any()
+    assert dr.grad_enabled(value)
+    # The others keep theirs.
+    assert snapshot(optimizer)[PREFIX + "means"][1].all()
+    with pytest.raises(ValueError, match=r"has shape \(4,\), the new values \(3,\)"):
+        replace_values(optimizer, "logit_opacities", Float(1, 2, 3), PREFIX)
+
+
+def test_decay_is_a_straight_line_in_the_logarithm():
+    rate = ExponentialDecay(1.6e-4, 1.6e-6, ((0, 30_000),))
+    assert rate(0) == pytest.approx(1.6e-4)
+    assert rate(15_000) == pytest.approx(1.6e-5)
+    assert rate(30_000) == rate(40_000) == pytest.approx(1.6e-6)
+    ratios = [rate(i + 1) / rate(i) for i in (0, 10_000, 29_999)]
+    np.testing.assert_allclose(ratios, 0.01 ** (1 / 30_000), rtol=1e-12)
+    with pytest.raises(ValueError, match="must be > 0"):
+        ExponentialDecay(1e-3, 0.0, ((0, 10),))
+
+
+def test_a_decay_that_is_revised_spreads_what_is_left():
+    """Half of it is done at 50; a quarter is left in the middle of what remains; none at 150."""
+    rate = ExponentialDecay(1.0, 1e-4, ((0, 100), (50, 150)))
+    once = ExponentialDecay(1.0, 1e-4, ((0, 100),))
+    assert [rate(i) for i in range(51)] == [once(i) for i in range(51)]
+    exponents = [math.log10(rate(i)) for i in (50, 75, 100, 150, 200)]
+    np.testing.assert_allclose(exponents, [-2, -2.5, -3, -4, -4], rtol=1e-12)

@@ -1,0 +1,255 @@
+"""The parts of the training loop that can be stated without running a whole fit."""
+
+import time
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from drgs.config.schema import FitConfig
+from drgs.data.images import smaller_view
+from drgs.data.initial import gaussians_from_points
+from drgs.data.types import Dataset, View
+from drgs.gaussians.parameters import PARAMETER_NAMES
+from drgs.io.ply import write_ply
+from drgs.training import densify
+
+
+@pytest.fixture(scope="module", autouse=True)
+def variant():
+    mi.set_variant("llvm_ad_rgb")
+
+
+def small_view(name, angle):
+    """A 20x16 picture of random colours, from a circle of radius 3 in the plane z = 0."""
+    center = 3 * np.array([np.cos(angle), np.sin(angle), 0.0])
+    pose = np.eye(4)
+    forward = -center / 3
+    right = np.cross(forward, [0, 0, 1])
+    pose[:3, :3] = np.stack([right, np.cross(forward, right), forward], axis=1)
+    pose[:3, 3] = center
+    image = np.random.default_rng(int(10 * angle)).uniform(size=(16, 20, 3)).astype(np.float32)
+    return View(name, image, pose, 24.0, 24.0, 10.0, 8.0, 20, 16)
+
+
+def small_dataset():
+    views = tuple(small_view(f"v{i}", angle) for i, angle in enumerate((0.0, 1.0, 2.0, 4.0)))
+    return Dataset(views, views[:1], "test", (1.0, 1.0, 1.0), 1.0, "four random pictures")
+
+
+def make_trainer(**changes):
+    from drgs.training.trainer import Trainer
+
+    values = {"data": {"path": "."}, "iterations": 50, **changes}
+    config = FitConfig.model_validate(values)
+    points = np.random.default_rng(0).uniform(-0.5, 0.5, (40, 3))
+    gaussians = gaussians_from_points(points, None, 0.5, config.model.sh_degree)
+    return Trainer(config, small_dataset(), gaussians)
+
+
+def test_views_come_in_a_new_random_order_every_round():
+    from drgs.training.stages import view_of
+
+    rounds = np.array([view_of(i, 10, seed=3) for i in range(1, 51)]).reshape(5, 10)
+    assert np.array_equal(np.sort(rounds, axis=1), np.tile(np.arange(10), (5, 1)))
+    assert len({tuple(r) for r in rounds}) == 5
+    assert [view_of(i, 10, seed=4) for i in range(1, 51)] != rounds.ravel().tolist()
+
+
+def test_sh_degree_rises_by_one_every_so_many_iterations():
+    trainer = make_trainer(model={"sh_degree": 2, "sh_increase_every": 3})
+    degrees = []
+    for _ in range(10):
+        trainer.step()
+        degrees.append(trainer.integrator.sh_degree)
+    assert degrees == [0, 0, 1, 1, 1, 2, 2, 2, 2, 2]
+
+
+def test_only_sh_steps_compile_kernels_after_the_first_change_of_the_population(monkeypatch):
+    """Kernels by hash, as Dr.Jit's caches do: what they hold from other runs does not matter."""
+
+    def random_rows(gradient_norms, **_):
+        rng = np.random.default_rng(len(gradient_norms))
+        kind = rng.choice(["keep", "clone", "split", "prune"], len(gradient_norms))
+        rows = {name: np.flatnonzero(kind == name).astype(np.uint32) for name in np.unique(kind)}
+        kept = np.flatnonzero((kind == "keep") | (kind == "clone")).astype(np.uint32)
+        return densify._ChosenRows(kept, rows["clone"], rows["split"], 0)
+
+    monkeypatch.setattr(densify, "_choose_rows", random_rows)
+    trainer = make_trainer(
+        model={"sh_degree": 3, "sh_increase_every": 12},
+        densify={"start": 3, "stop": 45, "every": 4, "reset_every": 8},
+    )
+    seen, new, populations = set(), {}, set()
+    while trainer.iteration < 50:
+        with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
+            dr.kernel_history_clear()
+            report = trainer.step()
+            trainer.watch.check()
+            hashes = {kernel["hash"] for kernel in dr.kernel_history([dr.KernelType.JIT])}
+        new[trainer.iteration] = len(hashes - seen)
+        seen |= hashes
+        populations.add(report.num_gaussians)
+    assert len(populations) == 12  # 4, 8, ..., 44, and the start
+    # The first change is at 4, the first reset at 8; degrees rise at 12, 24 and 36.
+    compiled = {iteration for iteration, count in new.items() if count > 0}
+    assert {4, 8} <= compiled and {i for i in compiled if i > 8} == {12, 24, 36}, new
+
+
+def test_each_parameter_moves_by_its_rate_in_the_first_step():
+    """Adam's first step is rate * sign(gradient) wherever the gradient is not zero."""
+    trainer = make_trainer()
+    before = trainer.gaussians()
+    trainer.step()
+    after = trainer.gaussians()
+    extent = small_dataset().extent
+    rates = {
+        "means": 1.6e-4 * extent * 100 ** (-1 / 50),
+        "quats": 1e-3,
+        "log_scales": 5e-3,
+        "logit_opacities": 0.05,
+        "sh0": 2.5e-3,
+    }
+    for name, rate in rates.items():
+        moved = np.abs(getattr(after, name) - getattr(before, name)).ravel()
+        # Values of order 1 to 10 are stored in float32: 5e-7 absolute.
+        assert moved.max() == pytest.approx(rate, abs=1e-6 + 1e-3 * rate), name
+    assert np.array_equal(after.shN, before.shN)  # degree 0 is in use
+
+
+def test_reported_loss_and_psnr_are_those_of_the_view_before_the_step():
+    from drgs.training.stages import view_of
+
+    trainer = make_trainer(loss={"dssim_weight": 0.0})
+    report = trainer.step()
+    first = view_of(1, 4, seed=0)
+    untouched = make_trainer(loss={"dssim_weight": 0.0})
+    image = np.array(
+        mi.render(untouched.scene, sensor=untouched.stages[-1].views[first].sensor, spp=1)
+    )
+    photo = small_dataset().train[first].image
+    assert report.loss == pytest.approx(np.abs(image - photo).mean(), rel=1e-5)
+    psnr = -10 * np.log10(np.mean((image.astype(float) - photo) ** 2))
+    assert report.psnr == pytest.approx(psnr, rel=1e-5)
+
+
+def test_gaussians_are_returned_as_plain_numpy_arrays():
+    gaussians = make_trainer().gaussians()
+    for name in PARAMETER_NAMES:
+        assert type(getattr(gaussians, name)) is np.ndarray
+        assert len(getattr(gaussians, name)) == 40
+
+
+def test_first_frame_comes_within_15_seconds_cold_and_3_seconds_warm(run_python, tmp_path):
+    """Without and with a kernel cache (it lives in the home folder), import included."""
+    points = np.random.default_rng(0).uniform(-1, 1, (20_000, 3))
+    write_ply(tmp_path / "points.ply", gaussians_from_points(points, None, 0.5, 3))
+    program = f"""
+import drgs, drjit as dr, mitsuba as mi
+mi.set_variant("llvm_ad_rgb")
+look = mi.ScalarTransform4f().look_at([0, 0, 4], [0, 0, 0], [0, 1, 0])
+film = {{"type": "hdrfilm", "width": 400, "height": 400, "rfilter": {{"type": "box"}}}}
+scene = mi.load_dict({{
+    "type": "scene",
+    "integrator": {{"type": "splats", "filename": {str(tmp_path / "points.ply")!r}}},
+    "sensor": {{"type": "perspective", "to_world": look, "film": film}},
+}})
+image = mi.render(scene, spp=1)
+dr.eval(image)
+dr.sync_thread()
+assert dr.all(dr.isfinite(image.array))
+"""
+    (tmp_path / "home").mkdir()
+    started = time.perf_counter()
+    result = run_python(program, HOME=str(tmp_path / "home"))
+    elapsed = time.perf_counter() - started
+    assert result.returncode == 0, result.stderr
+    assert any((tmp_path / "home" / ".drjit").iterdir())  # the cache was empty and is there
+    assert elapsed < 15
+    started = time.perf_counter()
+    assert run_python(program, HOME=str(tmp_path / "home")).returncode == 0
+    assert time.perf_counter() - started < 3
+
+
+def test_restored_trainer_continues_to_the_same_bytes():
+    """Across a change of the population, an opacity reset and a change of the SH degree."""
+    changes = {
+        "densify": {"start": 5, "stop": 40, "every": 5, "reset_every": 15, "grad_threshold": 1e-6},
+        "model": {"sh_degree": 2, "sh_increase_every": 8},
+    }
+    uninterrupted, first = make_trainer(**changes), make_trainer(**changes)
+    for _ in range(12):
+        uninterrupted.step()
+        first.step()
+    second = make_trainer(**changes)
+    second.restore(first.state())
+    for _ in range(12):
+        uninterrupted.step()
+        second.step()
+    assert uninterrupted.num_gaussians != 40
+    expected, got = uninterrupted.gaussians(), second.gaussians()
+    for name in PARAMETER_NAMES:
+        assert getattr(got, name).tobytes() == getattr(expected, name).tobytes(), name
+
+
+COARSE = [{"until": 2, "factor": 4}, {"until": 5, "factor": 2}]
+
+
+def test_coarse_stages_come_first_and_end_where_they_say():
+    trainer = make_trainer(coarse=COARSE)
+    sizes, names = [], []
+    for iteration in range(1, 9):
+        trainer.iteration = iteration
+        sizes.append((trainer.view.width, trainer.view.height))
+        names.append(trainer.view.name)
+    assert sizes == [(5, 4)] * 2 + [(10, 8)] * 3 + [(20, 16)] * 3
+    assert sorted(names[:4]) == sorted(names[4:]) == ["v0", "v1", "v2", "v3"]
+
+
+def test_a_smaller_view_is_the_same_camera_with_larger_pixels():
+    view = small_view("v", 1.0)
+    smaller = smaller_view(view, 4)
+    blocks = view.image.reshape(4, 4, 5, 4, 3).mean(axis=(1, 3))
+    np.testing.assert_allclose(smaller.image, blocks, rtol=1e-6)
+    # A point on the film is at a quarter of its place, counted from the corner.
+    point = np.array([0.3, -0.2, 2.0])
+    film, smaller_film = view.K @ point / point[2], smaller.K @ point / point[2]
+    np.testing.assert_allclose(smaller_film[:2], film[:2] / 4, rtol=1e-12)
+    assert smaller.name == "v" and np.array_equal(smaller.camera_to_world, view.camera_to_world)
+
+
+def test_a_trainer_restored_within_the_coarse_stages_continues_to_the_same_bytes():
+    uninterrupted, first = make_trainer(coarse=COARSE), make_trainer(coarse=COARSE)
+    for _ in range(4):
+        uninterrupted.step()
+        first.step()
+    second = make_trainer(coarse=COARSE)
+    second.restore(first.state())
+    for _ in range(4):
+        uninterrupted.step()
+        second.step()
+    expected, got = uninterrupted.gaussians(), second.gaussians()
+    for name in PARAMETER_NAMES:
+        assert getattr(got, name).tobytes() == getattr(expected, name).tobytes(), name
+
+
+@pytest.mark.parametrize("model", [{"sh_degree": 0}, {"sh_degree": 1, "antialiased": True}])
+def test_other_models_learn_as_well(model):
+    """Degree 0 has no shN parameter at all; antialiasing changes the opacities' gradient."""
+    trainer = make_trainer(model=model)
+    losses = [trainer.step().loss for _ in range(40)]
+    # The pictures are noise: what can be learnt is their mean.
+    assert np.mean(losses[-8:]) < 0.95 * np.mean(losses[:8])
+    assert trainer.gaussians().sh_degree == model["sh_degree"]
+
+
+def test_without_higher_degrees_the_population_may_change():
+    """shN, which has no numbers then, is in no optimizer: its rows follow."""
+    densify = {"start": 2, "stop": 30, "every": 5, "grad_threshold": 1e-9, "clone_scale": 10.0}
+    trainer = make_trainer(model={"sh_degree": 0}, densify=densify)
+    reports = [trainer.step().density for _ in range(12)]
+    assert sum(report.cloned for report in reports if report) > 0
+    gaussians = trainer.gaussians()
+    assert gaussians.shN.shape == (gaussians.num_gaussians, 0, 3)
+    assert gaussians.num_gaussians > 40
