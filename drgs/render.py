@@ -83,7 +83,7 @@ class Model:
         return make_scene(self.gaussians, self.settings, self.background, **settings)
 
     def pictures(self, views: Sequence[View | Viewpoint]) -> Iterator[np.ndarray]:
-        """Pictures (H, W, 3) of the views, after a plan of what is simulated in them."""
+        """Pictures (H, W, 3) of the views, after a summary of what is simulated in them."""
         if "distortion" not in self.ignored:
             check_lenses(self.settings, views, where="", remedy="give --ignore distortion")
         scene = self.scene()
@@ -249,8 +249,8 @@ def render_mitsuba_scene(path: Path, out: Path, definitions: dict[str, str]) -> 
     if scene.integrator() is None or not scene.sensors():
         raise UserError(f"{path}: the scene must hold an integrator and at least one sensor")
     linear = _is_linear(scene.integrator())
-    if hasattr(scene.integrator(), "plan"):
-        _print_plan(path, scene)
+    if hasattr(scene.integrator(), "summary"):
+        _print_summary(path, scene)
     for index, sensor in enumerate(scene.sensors()):
         name = path.stem if len(scene.sensors()) == 1 else f"{path.stem}_{index}"
         _render_sensor(path, scene, index)
@@ -270,7 +270,7 @@ def _is_linear(integrator: mi.Integrator) -> bool:
     return all(getattr(one, "srgb_primitives", True) for one in mi.traverse(integrator).hierarchy)
 
 
-def _print_plan(path: Path, scene: mi.Scene) -> None:
+def _print_summary(path: Path, scene: mi.Scene) -> None:
     """What the scene's ``splats`` integrator simulates for its sensors."""
     try:
         print(scene.integrator().summary(scene, *scene.sensors()), flush=True)

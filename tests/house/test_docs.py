@@ -65,7 +65,7 @@ def names_read(plugin) -> set[str]:
     names = set()
     reading = [source(plugin)]
     if plugin == "splats":
-        reading.append((REPOSITORY / "drgs" / "properties.py").read_text())
+        reading.append((REPOSITORY / "drgs" / "integrator" / "properties.py").read_text())
     for node in chain.from_iterable(ast.walk(ast.parse(text)) for text in reading):
         if isinstance(node, ast.Call):
             of_props = isinstance(node.func, ast.Attribute) and _is_props(node.func.value)
