@@ -7,12 +7,22 @@ from pathlib import Path
 
 import pytest
 
+import drgs  # noqa: F401  (chooses libLLVM before Dr.Jit is imported)
+
 REPOSITORY = Path(__file__).resolve().parent.parent
 TESTS = REPOSITORY / "tests"
 PATHS = [str(TESTS), *sorted(str(folder) for folder in TESTS.iterdir() if folder.is_dir())]
 """Where programs of the tests find what the tests import."""
 
 SHARED_DATA = REPOSITORY.parent / "shared" / "data"
+
+
+def pytest_configure(config):
+    """Dr.Jit computes on one thread in each worker: they share the cores, and idle threads spin."""
+    if hasattr(config, "workerinput"):
+        import drjit as dr
+
+        dr.set_thread_count(1)
 
 
 def _shared(*parts):

@@ -160,6 +160,7 @@ def outcome():
         return find_noticed(board, detectors(general), detectors(special))
 
 
+@pytest.mark.slow
 class TestChoices(MutationChecks):
     equivalent = EQUIVALENT
     derivatives = """

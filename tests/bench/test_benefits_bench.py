@@ -27,6 +27,7 @@ def small(tmp_path, monkeypatch):
     return tmp_path
 
 
+@pytest.mark.slow
 def test_every_case_is_fitted_and_written(small, capsys):
     out = small / "out"
     bench.main(["benefits", "--quick", "--out", str(out)])

@@ -26,6 +26,7 @@ def small(monkeypatch):
     monkeypatch.setattr(effects, "ENVIRONMENT", (4, 8))
 
 
+@pytest.mark.slow
 def test_the_command_writes_its_table_and_plot(small, tmp_path, capsys):
     bench.main(["effects", "--out", str(tmp_path)])
     with (tmp_path / "effects.csv").open() as file:

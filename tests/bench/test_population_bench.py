@@ -70,6 +70,7 @@ def test_changes_of_the_configuration():
     assert rates["optimizer.means_lr_final"] * 4 == config.optimizer.means_lr_final
 
 
+@pytest.mark.slow
 def test_fits_of_the_study_run_and_are_not_repeated(tmp_path, capfd):
     write_dataset(tmp_path / "data", make_dataset(train=3, test=1))
     command = ["population", "--data", str(tmp_path / "data"), "--out", str(tmp_path / "out")]

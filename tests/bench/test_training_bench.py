@@ -55,6 +55,7 @@ def test_every_choice_is_a_configuration(iterations, tmp_path):
     assert len({str(config) for config in seen}) == len(seen)
 
 
+@pytest.mark.slow
 def test_fits_run_and_are_not_repeated(tmp_path, capfd, monkeypatch):
     """Each in a process of its own, which does not know what this one has changed."""
     write_dataset(tmp_path / "data", make_dataset(train=3, test=1))

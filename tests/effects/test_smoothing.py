@@ -581,6 +581,7 @@ for name, *options in {runs!r}:
 """
 
 
+@pytest.mark.slow
 def test_a_fit_writes_the_filter_or_what_it_makes_of_the_gaussians(run_python, tmp_path):
     """And imports nothing of it where it is not asked for: the first of three."""
     capture.write_dataset(tmp_path / "data", capture.make_dataset(3, 1))

@@ -38,6 +38,7 @@ def errors(relight, found) -> dict[str, float]:
     return {name: float(np.linalg.norm(np.subtract(v, true[name]))) for name, v in found.items()}
 
 
+@pytest.mark.slow
 def test_what_the_picture_was_made_of_is_found(relight, monkeypatch, tmp_path, capsys):
     """In 40 steps, from a start that is half as far away."""
     start = {

@@ -288,6 +288,7 @@ def _remembered(board, function):
 # ----------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 class TestDefault(MutationChecks):
     equivalent = EQUIVALENT
     derivatives = """

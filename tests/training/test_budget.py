@@ -275,10 +275,12 @@ def fitted(scene):
     return SimpleNamespace(seconds=time.perf_counter() - start, out=out)
 
 
+@pytest.mark.slow
 def test_a_fit_ends_within_a_tenth_of_its_budget(fitted):
     assert fitted.seconds == pytest.approx(BUDGET, rel=0.1)
 
 
+@pytest.mark.slow
 def test_the_plan_is_written_with_its_reasons(fitted):
     text = (fitted.out / "plan.txt").read_text()
     assert text.startswith("--budget 30s\n") and "(chosen)" in text
@@ -286,6 +288,7 @@ def test_the_plan_is_written_with_its_reasons(fitted):
     assert f"Planned: {aims[0].end:,} iterations" in text
 
 
+@pytest.mark.slow
 def test_the_resolved_plan_gives_the_same_bytes(fitted, scene):
     """Without a clock."""
     again = scene / "again"
@@ -297,6 +300,7 @@ def test_the_resolved_plan_gives_the_same_bytes(fitted, scene):
     assert changed(configs[0], {"output.dir": None}) == changed(configs[1], {"output.dir": None})
 
 
+@pytest.mark.slow
 def test_a_plan_that_was_revised_since_the_last_checkpoint_can_be_continued(
     fitted, tmp_path, monkeypatch
 ):
@@ -320,6 +324,7 @@ def interrupt(*arguments, **others):
     raise KeyboardInterrupt
 
 
+@pytest.mark.slow
 def test_a_budget_needs_a_folder_of_its_own(fitted, scene, capsys):
     with pytest.raises(SystemExit) as stopped:
         fit.main([str(scene / "scene.yml"), "--out", str(fitted.out), "--budget", "30"])

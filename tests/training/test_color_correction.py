@@ -253,6 +253,7 @@ def transformed(image, matrix) -> np.ndarray:
     return (image @ matrix[:, :3].T + matrix[:, 3]).astype(np.float32)
 
 
+@pytest.mark.slow
 def test_the_color_change_of_a_photograph_is_found():
     """Before true blobs that stay. Few colours are all that tell of its 12 numbers.
 
