@@ -13,6 +13,7 @@ from typing import Any
 import drjit.llvm.ad as llvm
 import numpy as np
 
+from drgs.cameras.axes import OPENCV_TO_OPENGL
 from drgs.cameras.camera import Camera
 from drgs.config.changes import changed
 from drgs.config.schema import FitConfig
@@ -64,7 +65,7 @@ def bench_camera(size: int) -> reference.Camera:
     """The bench scene's camera with a square film of ``size`` px."""
     focal = size / (2 * np.tan(BENCH_FIELD_OF_VIEW / 2))
     return reference.Camera(
-        rotation=(BENCH_TO_WORLD[:, :3] * [1, -1, -1]).T.astype(np.float32),
+        rotation=(BENCH_TO_WORLD[:, :3] * OPENCV_TO_OPENGL.diagonal()[:3]).T.astype(np.float32),
         center=BENCH_TO_WORLD[:, 3].astype(np.float32),
         fx=float(np.float32(focal)),
         fy=float(np.float32(focal)),

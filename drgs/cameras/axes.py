@@ -1,21 +1,23 @@
-"""Axis conventions: OpenCV's (x right, y down, z forward), OpenGL's, and Mitsuba's."""
+"""Axes of a camera: OpenCV's (x right, y down, z forward), OpenGL's, and Mitsuba's.
+
+Everything in drgs is in OpenCV's. Datasets are in OpenGL's (x right, y up, z backward), Mitsuba's
+sensors have x to the left, y up and z forward. A matrix here stands on the right of a pose (camera
+to world) and is its own inverse.
+"""
 
 from __future__ import annotations
 
 import numpy as np
 
-MITSUBA_AXES = np.diag([-1.0, -1.0, 1.0, 1.0])
-"""From OpenCV's: Mitsuba's camera has x to the left and y up."""
-
 OPENCV_TO_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
-"""Of camera axes: y and z change sign."""
+
+OPENCV_TO_MITSUBA = np.diag([-1.0, -1.0, 1.0, 1.0])
+
+OPENGL_TO_MITSUBA = OPENCV_TO_OPENGL @ OPENCV_TO_MITSUBA
 
 
-def in_opengl_axes(pose: np.ndarray) -> list[list[float]]:
-    """Camera to world (4, 4), of a camera in OpenCV axes: as datasets in OpenGL's write it."""
-    return (pose * [1, -1, -1, 1]).tolist()
-
-
-def in_opencv_axes(matrix: list[list[float]]) -> np.ndarray:
-    """The same back: (4, 4) float64."""
-    return np.array(matrix, np.float64).reshape(4, 4) * [1, -1, -1, 1]
+def between_opencv_and_opengl(pose: np.ndarray) -> np.ndarray:
+    """A pose (4, 4), camera to world, in the other of the two conventions, float64."""
+    turned = np.array(pose, np.float64)
+    turned[:3, 1:3] *= -1
+    return turned

@@ -11,10 +11,8 @@ from drgs.config.schema import FitConfig, InitConfig
 from drgs.core.errors import UserError
 from drgs.data.types import Dataset, View
 from drgs.gaussians.parameters import Gaussians
+from drgs.gaussians.sh import C0
 from drgs.io.ply import read_points
-
-SH_C0 = 0.28209479177387814
-"""Value of the degree-0 spherical harmonic, 1 / (2 sqrt(pi))."""
 
 MIN_SQUARED_DISTANCE = 1e-7
 """World units^2: lower bound of a Gaussian's squared first scale (3DGS reference), for points
@@ -69,7 +67,7 @@ def gaussians_from_points(
     colors = np.full((num, 3), 0.5) if colors is None else colors
     squared = np.maximum(mean_squared_neighbour_distance(means), MIN_SQUARED_DISTANCE)
     log_scales = np.repeat(0.5 * np.log(squared)[:, None], 3, axis=1)
-    sh0 = (np.asarray(colors, np.float64) - 0.5) / SH_C0
+    sh0 = (np.asarray(colors, np.float64) - 0.5) / C0
     return Gaussians(
         means=means,
         quats=np.tile(np.array([1, 0, 0, 0], np.float32), (num, 1)),

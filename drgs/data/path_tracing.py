@@ -15,7 +15,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from drgs.cameras.axes import OPENCV_TO_OPENGL
+from drgs.cameras.axes import OPENCV_TO_OPENGL, OPENGL_TO_MITSUBA
 from drgs.core.errors import UserError, one_line
 from drgs.data.images import read_image
 from drgs.data.viewpoints import look_at
@@ -249,8 +249,7 @@ class Camera:
 
     def linear(self, shot: CaptureView) -> np.ndarray:
         """(size, size, 4) float64: radiance times alpha, and alpha."""
-        # Mitsuba's cameras have x to the left and look along z.
-        to_world = shot.pose @ np.diag([-1.0, 1.0, -1.0, 1.0])
+        to_world = shot.pose @ OPENGL_TO_MITSUBA
         self._parameters["to_world"] = mi.Transform4f(to_world)
         self._parameters.update()
         size, spp = self._settings.size, self._settings.spp

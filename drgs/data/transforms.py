@@ -15,6 +15,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from drgs.cameras.axes import between_opencv_and_opengl
 from drgs.core.errors import UserError, one_line
 from drgs.core.files import read_text
 from drgs.data.types import Motion
@@ -134,7 +135,7 @@ def principal_point(values: dict[str, Any], key: str, where: str, size: int) -> 
 def opencv_camera_to_world(
     frame: dict[str, Any], where: str, name: str = "transform_matrix"
 ) -> np.ndarray:
-    """(4, 4) float64 camera to world in OpenCV axes: columns y and z of the file's change sign."""
+    """(4, 4) float64 camera to world in OpenCV axes, from the file's in OpenGL's."""
     key = f"{where}{name}"
     if name not in frame:
         raise UserError(f"{key} is missing")
@@ -159,8 +160,7 @@ def opencv_camera_to_world(
         )
     if np.abs(matrix[3] - [0, 0, 0, 1]).max() > RIGID_TOLERANCE:
         raise UserError(f"{key} must end in the row 0 0 0 1, got {matrix[3].tolist()}")
-    matrix[:3, 1:3] *= -1
-    return matrix
+    return between_opencv_and_opengl(matrix)
 
 
 class InheritedValues:

@@ -16,6 +16,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from drgs.cameras.axes import OPENCV_TO_MITSUBA
 from drgs.config.approximations import Approximations
 from drgs.config.schema import ModelConfig
 from drgs.core.errors import UserError
@@ -126,8 +127,7 @@ def _sensor(view: View, calibrated: bool) -> dict[str, Any]:
 
 
 def _to_world(camera_to_world: np.ndarray) -> mi.ScalarTransform4f:
-    """Mitsuba's camera has x to the left and y up."""
-    return mi.ScalarTransform4f(camera_to_world @ np.diag([-1.0, -1.0, 1.0, 1.0]))
+    return mi.ScalarTransform4f(camera_to_world @ OPENCV_TO_MITSUBA)
 
 
 def _perspective(view: View) -> dict[str, Any]:

@@ -5,17 +5,14 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from drgs.cameras.axes import between_opencv_and_opengl
 from drgs.core.errors import UserError, one_line
 from drgs.data.transforms import CLOSE
 from drgs.data.types import Dataset, Motion, View
-
-if TYPE_CHECKING:
-    pass
-from drgs.cameras.axes import in_opencv_axes, in_opengl_axes
 
 CAMERAS = "cameras.json"
 
@@ -46,7 +43,7 @@ def refined_dataset(dataset: Dataset, folder: Path) -> Dataset:
     try:
         found = json.loads(path.read_text())
         change = LensChange(**{k: tuple(v) for k, v in found["lens_change"].items()})
-        poses = {f["file_path"]: in_opencv_axes(f["transform_matrix"]) for f in found["frames"]}
+        poses = {f["file_path"]: _opencv_pose(f["transform_matrix"]) for f in found["frames"]}
         train = [replace(view, camera_to_world=poses[view.name]) for view in dataset.train]
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise UserError(
@@ -58,6 +55,10 @@ def refined_dataset(dataset: Dataset, folder: Path) -> Dataset:
     return replace(
         dataset, train=tuple(map(change.of, train)), test=tuple(map(change.of, dataset.test))
     )
+
+
+def _opencv_pose(rows: list[list[float]]) -> np.ndarray:
+    return between_opencv_and_opengl(np.array(rows, np.float64).reshape(4, 4))
 
 
 def _moved_motion(view: View, camera_to_world: np.ndarray) -> Motion | None:
@@ -75,6 +76,6 @@ def lens_and_motion(view: View) -> dict[str, Any]:
         model = {"opencv": "FULL_OPENCV", "fisheye": "OPENCV_FISHEYE"}[view.lens.kind]
         values |= {"camera_model": model, **view.lens.named()}
     if view.motion is not None:
-        values[CLOSE] = in_opengl_axes(view.motion.close_to_world)
+        values[CLOSE] = between_opencv_and_opengl(view.motion.close_to_world).tolist()
         values["shutter"] = view.motion.shutter
     return values

@@ -18,7 +18,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from drgs.cameras.axes import MITSUBA_AXES, in_opengl_axes
+from drgs.cameras.axes import OPENCV_TO_MITSUBA, between_opencv_and_opengl
 from drgs.cameras.motion import rotation_matrix
 from drgs.config.schema import CamerasConfig
 from drgs.core.files import atomic_path
@@ -117,7 +117,7 @@ class CameraRefinement(TrainingEffect):
         if "shifts" in leaves:
             right, down = _entries(leaves["shifts"])
             cx, cy = cx + right * start.size.x, cy + down * start.size.y
-        signs = mi.Matrix4f(MITSUBA_AXES.astype(np.float32))
+        signs = mi.Matrix4f(OPENCV_TO_MITSUBA.astype(np.float32))
         poses = {"to_world": moved @ signs}
         if start.motion is not None:
             poses["to_world_close"] = moved @ start.motion @ signs
@@ -179,7 +179,7 @@ class CameraRefinement(TrainingEffect):
         frames = [
             {
                 "file_path": view.name,
-                "transform_matrix": in_opengl_axes(view.camera_to_world),
+                "transform_matrix": between_opencv_and_opengl(view.camera_to_world).tolist(),
                 **{"fl_x": view.fx, "fl_y": view.fy, "cx": view.cx, "cy": view.cy},
                 **{"w": view.width, "h": view.height},
                 **lens_and_motion(view),
@@ -205,7 +205,7 @@ def _put(sensor: mi.Sensor, numbers: dict[str, Any]) -> None:
 
 def _pose(to_world: mi.Matrix4f) -> np.ndarray:
     """(4, 4) float64, OpenCV axes."""
-    return np.array(to_world)[..., 0].astype(np.float64) @ MITSUBA_AXES
+    return np.array(to_world)[..., 0].astype(np.float64) @ OPENCV_TO_MITSUBA
 
 
 def _entries(values: mi.Float) -> list[mi.Float]:
