@@ -47,9 +47,16 @@ from drgs.integrator.scene import check_lenses
 from drgs.integrator.summary import described
 from drgs.io.pictures import write_png
 from drgs.io.ply import write_ply
+from drgs.results.files import (
+    BUDGET_PLAN,
+    CHECKPOINT,
+    CONFIG,
+    GAUSSIANS,
+    HISTORY,
+    METRICS,
+    RENDERS,
+)
 from drgs.results.folder import (
-    CONFIG_NAME,
-    LAST_FILE,
     claim_output_folder,
     is_finished,
     load_run_config,
@@ -68,7 +75,6 @@ from drgs.training.budget import (
     rehearse,
 )
 from drgs.training.checkpoint import (
-    FILE_NAME,
     Checkpoint,
     load_checkpoint,
     remove_checkpoint,
@@ -121,7 +127,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             remove_run(out)
         claim_output_folder(out, config)
         if plan is not None:
-            with atomic_path(out / "plan.txt") as temporary:
+            with atomic_path(out / BUDGET_PLAN) as temporary:
                 temporary.write_text(f"--budget {args.budget:g}s\n{plan.reasons}\n")
             length = Deadline(trainer, end, plan.curve)
         finished = run(trainer, dataset, out, length, check_ranges)
@@ -177,22 +183,22 @@ def run(
         gaussians = trainer.gaussians()
     except NonFiniteError as error:
         raise UserError(f"{error}; {_remedy(out)}") from None
-    write_gaussians(out / "point_cloud.ply", gaussians, trainer.config)
+    write_gaussians(out / GAUSSIANS, gaussians, trainer.config)
     for effect in trainer.effects:
         effect.write(out, dataset.train)
-    write_history(out / "history.csv", log.rows)
+    write_history(out / HISTORY, log.rows)
     images = list(trainer.pictures(dataset.test))
     quality = mean_quality(
         (image, view.image, view.mask) for image, view in zip(images, dataset.test, strict=True)
     )
     config = trainer.config
-    dump_config(config, out / CONFIG_NAME)
+    dump_config(config, out / CONFIG)
     if config.output.save_renders:
         for view, image in zip(dataset.test, images, strict=True):
-            write_png(out / "renders" / dataset.test_split / f"{view.name}.png", image)
+            write_png(out / RENDERS / dataset.test_split / f"{view.name}.png", image)
     metrics = summarize(config, dataset, gaussians.num_gaussians, wall_s, quality)
     write_results(out, dataset, trainer.scene, gaussians, images, log.rows, metrics)
-    with atomic_path(out / LAST_FILE) as temporary:
+    with atomic_path(out / METRICS) as temporary:
         temporary.write_text(json.dumps(metrics, indent=2) + "\n")
     remove_checkpoint(out)
     print(
@@ -253,7 +259,7 @@ def save(trainer: Trainer, log: History, out: Path) -> None:
 
 def _remedy(out: Path) -> str:
     """What to do about numbers that are not finite."""
-    kept = "the last checkpoint is kept" if (out / FILE_NAME).exists() else "nothing was saved yet"
+    kept = "the last checkpoint is kept" if (out / CHECKPOINT).exists() else "nothing was saved yet"
     return (
         f"{kept}. --resume {out} --debug repeats this with range checks; lower learning rates "
         "(--set optimizer.means_lr=..., and so on) may avoid it"

@@ -52,10 +52,8 @@ from drgs.integrator.scene import check_lenses, make_scene, render_views
 from drgs.integrator.summary import described, summary_of_views
 from drgs.io.pictures import write_animation, write_png
 from drgs.io.ply import read_ply
+from drgs.results.files import CAMERAS, CONFIG, GAUSSIANS, METRICS, ORBIT
 from drgs.results.metrics import Quality, psnr, ssim
-
-MODEL, CONFIG, METRICS, CAMERAS = "point_cloud.ply", "config.yml", "metrics.json", "cameras.json"
-"""What a fit's output folder holds."""
 
 DEFAULT_SIZE = (400, 400)
 """px, where nothing else says how large a picture should be."""
@@ -141,14 +139,14 @@ def load_model(args: argparse.Namespace) -> Model:
     what, config_path = args.what, args.scene
     folder = what if what.is_dir() else what.parent
     if what.is_dir():
-        for name in (CONFIG, MODEL):
+        for name in (CONFIG, GAUSSIANS):
             if not (what / name).is_file():
                 raise UserError(
                     f"{what}: must be the output folder of a fit that has ended, but there is no "
                     f"{name} in it"
                 )
         config_path = config_path or what / CONFIG
-        what = what / MODEL
+        what = what / GAUSSIANS
     config = _load_config(config_path, args) if config_path is not None else None
     gaussians = read_ply(what)
     model, background = ModelConfig(), NAMED_COLORS[DataConfig.model_fields["background"].default]
@@ -210,7 +208,7 @@ def render_orbit(model: Model, args: argparse.Namespace) -> None:
         fov, size = args.fov or field_of_view(views), args.size or orbit_size(views)
         orbit = orbit_of_views(views, model.gaussians)
     viewpoints = orbit.viewpoints(args.orbit, *size, fov)
-    write_animation(args.out / "orbit.webp", render_cameras(model, viewpoints, args.out))
+    write_animation(args.out / ORBIT, render_cameras(model, viewpoints, args.out))
 
 
 def render_cameras(

@@ -40,6 +40,7 @@ from drgs.io.ply import read_ply
 from drgs.reference import rays as reference_rays
 from drgs.reference import splatting as reference
 from drgs.results import metrics
+from drgs.results.files import CONFIG, GAUSSIANS
 from drgs.splatting import rendering
 from drgs.splatting.image_model import PixelCenters
 
@@ -186,7 +187,7 @@ def load_subject(path: Path, num_views: int) -> Subject:
     those of pinholes at rest.
     """
     if path.is_dir():
-        ply, config_file = path / "point_cloud.ply", path / "config.yml"
+        ply, config_file = path / GAUSSIANS, path / CONFIG
         for file in (ply, config_file):
             if not file.exists():
                 raise UserError(f"{file}: not there; {path} must be the folder of a finished fit")

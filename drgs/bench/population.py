@@ -33,7 +33,7 @@ from drgs.config.load import load_config
 from drgs.config.schema import DensifyConfig, FitConfig
 from drgs.core.arrays import from_host
 from drgs.data import load_dataset
-from drgs.results.folder import LAST_FILE
+from drgs.results.files import HISTORY, METRICS
 from drgs.training import densify, optimizer
 
 DESCRIPTION = "how many Gaussians the reference recipe keeps, by picture size and by rule; hours"
@@ -183,7 +183,7 @@ def run(args: argparse.Namespace) -> None:
     found = [
         outcome(case, folders[case.name])
         for case in CASES
-        if (folders[case.name] / LAST_FILE).exists()
+        if (folders[case.name] / METRICS).exists()
     ]
     print(f"\n{_table(found)}")
     rows = [list(vars(outcome).values()) for outcome in found]
@@ -230,7 +230,7 @@ def generate(folder: Path, size: int) -> Path:
 
 def outcome(case: Case, folder: Path) -> Outcome:
     """What the finished fit in ``folder`` left."""
-    metrics = json.loads((folder / LAST_FILE).read_text())
+    metrics = json.loads((folder / METRICS).read_text())
     iterations, population = read_population(folder)
     early = population[iterations <= metrics["config"]["densify"]["reset_every"]]
     return Outcome(
@@ -248,7 +248,7 @@ def outcome(case: Case, folder: Path) -> Outcome:
 
 def read_population(folder: Path) -> tuple[np.ndarray, np.ndarray]:
     """Iterations and numbers of Gaussians from a fit's ``history.csv``."""
-    with (folder / "history.csv").open() as file:
+    with (folder / HISTORY).open() as file:
         rows = [(int(row["iteration"]), int(row["num_gaussians"])) for row in csv.DictReader(file)]
     iterations, population = np.array(rows).T
     return iterations, population

@@ -32,6 +32,7 @@ from drgs.bench.profile import STAGES, StageClock, stage_clock
 from drgs.bench.scenes import Scene, bench_camera, bench_gaussians, frame_of, trainer_of
 from drgs.core.files import atomic_path
 from drgs.io.ply import read_ply
+from drgs.results.files import GAUSSIANS
 from drgs.training.trainer import Trainer
 
 DESCRIPTION = "times of drgs and of other renderers on the same scene, in one run"
@@ -79,7 +80,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--trained",
         type=Path,
-        default=Path("out/lego/point_cloud.ply"),
+        default=Path("out/lego") / GAUSSIANS,
         metavar="PLY",
         help="a fitted scene to measure as well (default: out/lego/point_cloud.ply, if it exists)",
     )

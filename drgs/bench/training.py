@@ -26,7 +26,7 @@ from drgs.bench.output import machine, markdown_table, new_figure, write_csv, wr
 from drgs.config.changes import changed, with_iterations
 from drgs.config.load import dump_config, load_config
 from drgs.config.schema import FitConfig
-from drgs.results.folder import LAST_FILE
+from drgs.results.files import HISTORY, METRICS
 from drgs.training.budget import STRATEGIES, Strategy
 
 DESCRIPTION = "quality over time for several choices of a fit; an hour or two"
@@ -115,7 +115,7 @@ def run(args: argparse.Namespace) -> None:
         point_of(choice, iterations, out, second)
         for choice in CHOICES
         for iterations in budgets
-        if (folder_of(choice, iterations, out) / LAST_FILE).exists()
+        if (folder_of(choice, iterations, out) / METRICS).exists()
     ]
     print(f"\n{machine()}\n\n{table(points)}")
     rows = [list(vars(point).values()) for point in points]
@@ -150,7 +150,7 @@ def seconds_at_start(out: Path, budgets: Sequence[int]) -> float:
     """
     seconds = []
     for iterations in budgets:
-        path = folder_of(CHOICES[0], iterations, out) / "history.csv"
+        path = folder_of(CHOICES[0], iterations, out) / HISTORY
         if path.exists():
             with path.open(newline="") as file:
                 rows = {int(row["iteration"]): float(row["wall_s"]) for row in csv.DictReader(file)}
@@ -162,7 +162,7 @@ def seconds_at_start(out: Path, budgets: Sequence[int]) -> float:
 
 def point_of(choice: Choice, iterations: int, out: Path, start_s: float) -> Point:
     """What a finished fit reached."""
-    metrics = json.loads((folder_of(choice, iterations, out) / LAST_FILE).read_text())
+    metrics = json.loads((folder_of(choice, iterations, out) / METRICS).read_text())
     return Point(
         choice=choice.name,
         iterations=iterations,

@@ -16,28 +16,7 @@ from drgs.config.load import dump_config, load_config
 from drgs.config.schema import FitConfig
 from drgs.core.errors import UserError, one_line
 from drgs.core.files import remove_stale_temporaries, why_refused
-
-CONFIG_NAME = "config.yml"
-
-LAST_FILE = "metrics.json"
-"""Written when everything else is there."""
-
-RESULTS = (
-    "cameras.json",
-    "checkpoint.npz",
-    "colors.json",
-    "curves.png",
-    "history.csv",
-    "metrics.json",
-    "orbit.gif",
-    "orbit.webp",
-    "plan.txt",
-    "point_cloud.ply",
-    "renders",
-    "report.html",
-    "side_by_side",
-)
-"""Everything else that a fit writes."""
+from drgs.results.files import CONFIG, METRICS, RESULTS
 
 MAX_NAMED = 3
 """Values or files that a message names; the rest are counted."""
@@ -53,18 +32,18 @@ def claim_output_folder(folder: Path, config: FitConfig) -> None:
     """
     _make_folder(folder)
     present = _visible_names(folder)
-    if CONFIG_NAME not in present and present:
+    if CONFIG not in present and present:
         raise UserError(
             f"{folder}: the output folder must be new or empty, got one that holds "
             f"{_listed(present)}; choose another with --out"
         )
-    if set(present) - {CONFIG_NAME} and not _belongs_to(folder, config):
+    if set(present) - {CONFIG} and not _belongs_to(folder, config):
         raise UserError(
             f"{folder}: already holds {_which_run(folder, config)}; choose another folder with "
             f"--out, continue that run with --resume {folder}, or replace it with --overwrite"
         )
     remove_stale_temporaries(folder)
-    dump_config(config, folder / CONFIG_NAME)
+    dump_config(config, folder / CONFIG)
 
 
 def require_no_run(folder: Path) -> None:
@@ -79,7 +58,7 @@ def require_no_run(folder: Path) -> None:
 
 def is_finished(folder: Path, config: FitConfig) -> bool:
     """Whether ``folder`` holds the whole result of this very configuration."""
-    return (folder / LAST_FILE).is_file() and _belongs_to(folder, config)
+    return (folder / METRICS).is_file() and _belongs_to(folder, config)
 
 
 def load_run_config(folder: Path) -> FitConfig:
@@ -87,10 +66,10 @@ def load_run_config(folder: Path) -> FitConfig:
 
     Raises :class:`UserError` where it holds none.
     """
-    if not os.path.isfile(folder / CONFIG_NAME):
+    if not os.path.isfile(folder / CONFIG):
         what = "has no" if os.path.isdir(folder) else "does not exist, and so has no"
-        raise UserError(f"{folder}: is not the output folder of a fit: it {what} {CONFIG_NAME}")
-    return load_config(folder / CONFIG_NAME)
+        raise UserError(f"{folder}: is not the output folder of a fit: it {what} {CONFIG}")
+    return load_config(folder / CONFIG)
 
 
 def remove_run(folder: Path) -> None:
@@ -103,13 +82,13 @@ def remove_run(folder: Path) -> None:
     if not os.path.lexists(folder) or not (names := _visible_names(folder)):
         return
     load_run_config(folder)
-    strangers = sorted(set(names) - {CONFIG_NAME, *RESULTS})
+    strangers = sorted(set(names) - {CONFIG, *RESULTS})
     if strangers:
         raise UserError(
             f"{folder}: must hold nothing but a run to be replaced, got {_listed(strangers)}; move "
             "that away, or choose another folder with --out"
         )
-    for name in sorted(names, key=lambda name: name == CONFIG_NAME):
+    for name in sorted(names, key=lambda name: name == CONFIG):
         _remove(folder / name)
 
 
@@ -154,7 +133,7 @@ def _which_run(folder: Path, config: FitConfig) -> str:
     try:
         earlier = load_run_config(folder)
     except UserError:
-        return f"another run, with a {CONFIG_NAME} that is not readable"
+        return f"another run, with a {CONFIG} that is not readable"
     return (
         f"another run, which differs in {_listed(_differences(_values(earlier), _values(config)))}"
     )

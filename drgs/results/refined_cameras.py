@@ -13,8 +13,7 @@ from drgs.cameras.axes import between_opencv_and_opengl
 from drgs.core.errors import UserError, one_line
 from drgs.data.transforms import CLOSE
 from drgs.data.types import Dataset, Motion, View
-
-CAMERAS = "cameras.json"
+from drgs.results.files import CAMERAS
 
 
 @dataclass(frozen=True)

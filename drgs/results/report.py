@@ -28,6 +28,7 @@ from drgs.gaussians.parameters import Gaussians
 from drgs.integrator.scene import render_views
 from drgs.io.pictures import encode, write_animation, write_png
 from drgs.results.curves import PANEL_WIDTH, THEMES, as_pixels, draw_curves, write_curves
+from drgs.results.files import CURVES, ORBIT, REPORT, SIDE_BY_SIDE
 from drgs.results.metrics import psnr, ssim
 
 DIFFERENCE_GAIN = 5.0
@@ -61,11 +62,11 @@ def write_results(
     scene: renders ``gaussians``, in display space; images: (H, W, 3) display space, of the test
     views, in their order; history: rows as of ``history.csv``; metrics: as of ``metrics.json``.
     """
-    write_side_by_side(out / "side_by_side" / dataset.test_split, dataset, images)
-    write_curves(out / "curves.png", history)
-    write_orbit(out / "orbit.webp", scene, dataset, gaussians)
-    orbit = (out / "orbit.webp").read_bytes()
-    write_report(out / "report.html", out.name, dataset, images, history, metrics, orbit)
+    write_side_by_side(out / SIDE_BY_SIDE / dataset.test_split, dataset, images)
+    write_curves(out / CURVES, history)
+    write_orbit(out / ORBIT, scene, dataset, gaussians)
+    orbit = (out / ORBIT).read_bytes()
+    write_report(out / REPORT, out.name, dataset, images, history, metrics, orbit)
 
 
 def seconds_to_write(scene: mi.Scene, dataset: Dataset) -> float:

@@ -17,9 +17,7 @@ from drgs.config.load import dump_config
 from drgs.config.schema import FitConfig
 from drgs.core.errors import UserError
 from drgs.core.files import atomic_path
-from drgs.results.folder import CONFIG_NAME
-
-FILE_NAME = "checkpoint.npz"
+from drgs.results.files import CHECKPOINT, CONFIG
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,7 +36,7 @@ def save_checkpoint(folder: Path, config: FitConfig, checkpoint: Checkpoint) -> 
     to the other could not be continued.
     """
     arrays = {f"trainer.{name}": values for name, values in checkpoint.trainer.items()}
-    with atomic_path(folder / FILE_NAME) as temporary:
+    with atomic_path(folder / CHECKPOINT) as temporary:
         np.savez(
             temporary,
             config=np.array(_fingerprint(config)),
@@ -46,7 +44,7 @@ def save_checkpoint(folder: Path, config: FitConfig, checkpoint: Checkpoint) -> 
             wall_s=np.array(checkpoint.wall_s),
             **arrays,
         )
-        dump_config(config, folder / CONFIG_NAME)
+        dump_config(config, folder / CONFIG)
 
 
 def load_checkpoint(folder: Path, config: FitConfig) -> Checkpoint | None:
@@ -54,7 +52,7 @@ def load_checkpoint(folder: Path, config: FitConfig) -> Checkpoint | None:
 
     Raises UserError if the file is damaged or belongs to another configuration.
     """
-    path = folder / FILE_NAME
+    path = folder / CHECKPOINT
     if not path.exists():
         return None
     remedy = f"remove {path} to start again from iteration 0"
@@ -67,7 +65,7 @@ def load_checkpoint(folder: Path, config: FitConfig) -> Checkpoint | None:
         raise UserError(f"{path}: not a readable checkpoint ({error}); {remedy}") from None
     if fingerprint != _fingerprint(config):
         raise UserError(
-            f"{path}: belongs to another configuration than {folder / 'config.yml'}; {remedy}"
+            f"{path}: belongs to another configuration than {folder / CONFIG}; {remedy}"
         )
     trainer = {name.removeprefix("trainer."): values for name, values in arrays.items()}
     return Checkpoint(trainer=trainer, history=history, wall_s=wall_s)
@@ -75,7 +73,7 @@ def load_checkpoint(folder: Path, config: FitConfig) -> Checkpoint | None:
 
 def remove_checkpoint(folder: Path) -> None:
     """A finished fit needs none."""
-    (folder / FILE_NAME).unlink(missing_ok=True)
+    (folder / CHECKPOINT).unlink(missing_ok=True)
 
 
 def _fingerprint(config: FitConfig) -> str:

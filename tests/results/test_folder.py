@@ -6,16 +6,13 @@ import pytest
 from drgs.config.load import load_config
 from drgs.config.schema import FitConfig
 from drgs.core.errors import UserError
+from drgs.results.files import CAMERAS, COLORS, METRICS, RESULTS
 from drgs.results.folder import (
-    LAST_FILE,
-    RESULTS,
     claim_output_folder,
     is_finished,
     load_run_config,
     remove_run,
 )
-from drgs.results.refined_cameras import CAMERAS
-from drgs.training.effects.colors import COLORS
 
 
 @pytest.fixture
@@ -71,7 +68,7 @@ def test_a_run_is_finished_when_its_last_file_is_there_and_the_configuration_is_
     finished, config
 ):
     assert not is_finished(finished, config)
-    (finished / LAST_FILE).write_text("{}")
+    (finished / METRICS).write_text("{}")
     assert is_finished(finished, config)
     assert not is_finished(finished, FitConfig(data=config.data, seed=7))
     (finished / "config.yml").write_text("[")

@@ -20,8 +20,9 @@ from drgs.data.viewpoints import read_viewpoints
 from drgs.gaussians.parameters import PARAMETER_NAMES
 from drgs.integrator.scene import render_views
 from drgs.reference import splatting as reference
+from drgs.results.files import CAMERAS
 from drgs.results.metrics import ssim
-from drgs.results.refined_cameras import CAMERAS, refined_dataset
+from drgs.results.refined_cameras import refined_dataset
 from drgs.training.effects.called_for import training_effects
 from drgs.training.effects.cameras import INTRINSICS
 

@@ -10,9 +10,9 @@ import pytest
 from support import small_fits as fits
 from support.helpers import single
 
+from drgs.results.files import COLORS
 from drgs.results.metrics import ssim
 from drgs.training.effects.called_for import training_effects
-from drgs.training.effects.colors import COLORS
 
 IDENTITY = np.eye(3, 4)
 

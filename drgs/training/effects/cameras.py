@@ -23,7 +23,8 @@ from drgs.cameras.motion import rotation_matrix
 from drgs.config.schema import CamerasConfig
 from drgs.core.files import atomic_path
 from drgs.data.types import View
-from drgs.results.refined_cameras import CAMERAS, LensChange, lens_and_motion
+from drgs.results.files import CAMERAS
+from drgs.results.refined_cameras import LensChange, lens_and_motion
 from drgs.training.effects.base import FitState, TrainingEffect
 from drgs.training.effects.view_parameters import ViewParameters
 from drgs.training.views import TrainingView

@@ -24,6 +24,7 @@ from drgs.config.schema import ColorConfig
 from drgs.core.arrays import from_host
 from drgs.core.files import atomic_path
 from drgs.data.types import View
+from drgs.results.files import COLORS
 from drgs.training.effects.base import FitState, TrainingEffect
 from drgs.training.effects.view_parameters import ViewParameters
 from drgs.training.image_ops import transform_colors
@@ -31,8 +32,6 @@ from drgs.training.views import TrainingView
 
 IDENTITY = np.eye(3, 4).reshape(1, 12)
 """Row by row."""
-
-COLORS = "colors.json"
 
 
 class ColorCorrection(TrainingEffect):

@@ -1,0 +1,51 @@
+"""Names of the files and folders that a fit writes into its output folder."""
+
+from __future__ import annotations
+
+CONFIG = "config.yml"
+"""Every value of the configuration; it says whose folder it is."""
+
+CHECKPOINT = "checkpoint.npz"
+"""While the fit runs: see :mod:`drgs.training.checkpoint`."""
+
+GAUSSIANS = "point_cloud.ply"
+HISTORY = "history.csv"
+CURVES = "curves.png"
+ORBIT = "orbit.webp"
+ORBIT_GIF = "orbit.gif"
+REPORT = "report.html"
+
+RENDERS = "renders"
+"""A folder for each split that was measured, with a picture for each of its views."""
+
+SIDE_BY_SIDE = "side_by_side"
+"""The same, with the photograph and the difference beside the picture."""
+
+CAMERAS = "cameras.json"
+"""Refined cameras of the training views."""
+
+COLORS = "colors.json"
+"""Colour transforms of the training views."""
+
+BUDGET_PLAN = "plan.txt"
+"""What was planned for a budget of time, and why."""
+
+METRICS = "metrics.json"
+"""Written when everything else is there."""
+
+RESULTS = (
+    CAMERAS,
+    CHECKPOINT,
+    COLORS,
+    CURVES,
+    HISTORY,
+    METRICS,
+    ORBIT_GIF,
+    ORBIT,
+    BUDGET_PLAN,
+    GAUSSIANS,
+    RENDERS,
+    REPORT,
+    SIDE_BY_SIDE,
+)
+"""All of them but ``config.yml``."""

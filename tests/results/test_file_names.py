@@ -1,0 +1,35 @@
+"""The names of what a fit writes are said in one module."""
+
+import ast
+
+import pytest
+from conftest import REPOSITORY
+
+from drgs.results import files
+
+NAMES = {files.CONFIG, *files.RESULTS}
+
+MODULES = [
+    path
+    for path in sorted((REPOSITORY / "drgs").rglob("*.py"))
+    if path != REPOSITORY / "drgs" / "results" / "files.py"
+]
+
+
+def strings(source):
+    """The text of all constants; docstrings and messages are longer than a name."""
+    nodes = ast.walk(ast.parse(source))
+    return {node.value for node in nodes if isinstance(node, ast.Constant)} - {None}
+
+
+def test_no_name_is_given_to_two_files():
+    assert len(NAMES) == len(files.RESULTS) + 1
+
+
+@pytest.mark.parametrize("path", MODULES, ids=lambda path: str(path.relative_to(REPOSITORY)))
+def test_no_other_module_writes_a_name_out(path):
+    assert not NAMES & strings(path.read_text())
+
+
+def test_a_name_that_is_written_out_is_found():
+    assert strings('"""A docstring."""\npath = out / "metrics.json"') & NAMES == {"metrics.json"}
