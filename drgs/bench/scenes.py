@@ -193,9 +193,11 @@ def stress_scene(size: int, seed: int = 0) -> tuple[Gaussians, list[reference.Ca
         "shN": rng.normal(0, 0.05, (count, 15, 3)),
     }
     gaussians = Gaussians(**{name: value.astype(np.float32) for name, value in values.items()})
-    focal = size / 2 / np.tan(np.radians(110) / 2)
-    camera = reference.Camera(
-        np.eye(3), np.zeros(3), float(np.float32(focal)), float(np.float32(focal)), size / 2,
-        size / 2, size, size,
-    )  # fmt: skip
-    return gaussians, [camera]
+    return gaussians, [_camera_at_origin(size, field_of_view=110)]
+
+
+def _camera_at_origin(size: int, field_of_view: float) -> reference.Camera:
+    """Square pictures; field_of_view: degrees."""
+    focal = float(np.float32(size / 2 / np.tan(np.radians(field_of_view) / 2)))
+    middle = size / 2
+    return reference.Camera(np.eye(3), np.zeros(3), focal, focal, middle, middle, size, size)
