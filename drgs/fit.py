@@ -82,6 +82,7 @@ from drgs.training.checkpoint import (
 )
 from drgs.training.finite_checks import NonFiniteError
 from drgs.training.history import History, write_history
+from drgs.training.loop import Length, as_saved, iterations
 from drgs.training.summary import summary_of_fit
 from drgs.training.trainer import Trainer
 
@@ -163,7 +164,7 @@ def run(
     trainer: Trainer,
     dataset: Dataset,
     out: Path,
-    length: AllIterations | Deadline,
+    length: Length,
     check_ranges: Callable[[], None],
 ) -> bool:
     """Fit, measure, and write into the folder ``out``; False if stopped by Ctrl-C.
@@ -177,13 +178,13 @@ def run(
         log = History.from_array(checkpoint.history, checkpoint.wall_s)
         print(f"continues at iteration {trainer.iteration}")
     try:
-        if not train(trainer, log, out, length, check_ranges):
+        if not run_iterations(trainer, log, out, length, check_ranges):
             return False
         wall_s = log.wall_s
         gaussians = trainer.gaussians()
     except NonFiniteError as error:
         raise UserError(f"{error}; {_remedy(out)}") from None
-    write_gaussians(out / GAUSSIANS, gaussians, trainer.config)
+    write_ply(out / GAUSSIANS, as_saved(gaussians, trainer))
     for effect in trainer.effects:
         effect.write(out, dataset.train)
     write_history(out / HISTORY, log.rows)
@@ -210,46 +211,34 @@ def run(
     return True
 
 
-def train(
+def run_iterations(
     trainer: Trainer,
-    log: History,
+    history: History,
     out: Path,
-    length: AllIterations | Deadline,
+    length: Length,
     check_ranges: Callable[[], None],
 ) -> bool:
     """Run the iterations that are left, showing progress and saving checkpoints.
 
     False if Ctrl-C stopped it; the state is saved then.
     """
-    output, smooth_psnr = trainer.config.output, None
-    every = output.checkpoint_every
+    smooth_psnr, every = None, trainer.config.output.checkpoint_every
     with FitProgress(length.total(trainer)) as progress, StopRequest() as stop:
-        goes_on = length.goes_on(trainer)
-        while goes_on:
-            report = trainer.step()
+        for done in iterations(trainer, history, length):
             check_ranges()
-            goes_on = length.goes_on(trainer)
-            if not goes_on or report.iteration % output.history_every == 0:
-                row = log.add(report)
-                trainer.watch.check()  # reading the row has waited for the device
-                smooth_psnr = row.psnr if smooth_psnr is None else smooth_psnr
-                smooth_psnr = SMOOTHING * smooth_psnr + (1 - SMOOTHING) * row.psnr
+            if done.row is not None:
+                psnr = done.row.psnr
+                smooth_psnr = psnr if smooth_psnr is None else smooth_psnr
+                smooth_psnr = SMOOTHING * smooth_psnr + (1 - SMOOTHING) * psnr
+                loss, num_gaussians = done.row.loss, done.row.num_gaussians
                 total = length.total(trainer)
-                progress.update(row.iteration, total, row.loss, smooth_psnr, row.num_gaussians)
-            if stop.requested or (every and report.iteration % every == 0 and goes_on):
-                save(trainer, log, out)
+                progress.update(done.row.iteration, total, loss, smooth_psnr, num_gaussians)
+            is_due = every and done.report.iteration % every == 0 and not done.is_last
+            if stop.requested or is_due:
+                save(trainer, history, out)
             if stop.requested:
                 return False
     return True
-
-
-def write_gaussians(path: Path, gaussians: Gaussians, config: FitConfig) -> None:
-    """Write ``point_cloud.ply``, with the smoothing filter apart from the Gaussians or in them."""
-    if config.output.bake_smoothing:
-        from drgs.effects.smoothing import baked
-
-        gaussians = baked(gaussians)
-    write_ply(path, gaussians)
 
 
 def save(trainer: Trainer, log: History, out: Path) -> None:
