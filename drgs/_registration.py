@@ -17,7 +17,9 @@ def register_plugins() -> None:
     """Register for the active variant, if any, and for every one that becomes active later."""
     import mitsuba as mi
 
-    mi.detail.add_variant_callback(_on_variant)
+    from drgs.core.private import call_on_variant_change  # imports Dr.Jit
+
+    call_on_variant_change(_on_variant)
     if mi.variant() is not None:
         _on_variant(None, mi.variant())
 

@@ -41,6 +41,7 @@ from drgs.config.load import dump_config, load_config
 from drgs.config.schema import FitConfig
 from drgs.core.errors import UserError, one_line
 from drgs.core.files import atomic_path
+from drgs.core.private import llvm_version
 from drgs.data import Dataset, initial_gaussians, load_dataset
 from drgs.gaussians.parameters import Gaussians
 from drgs.integrator.scene import check_lenses
@@ -276,7 +277,7 @@ def summarize(
             "drjit": dr.__version__,
             "numpy": np.__version__,
             "python": platform.python_version(),
-            "llvm": ".".join(map(str, dr.detail.llvm_version())),
+            "llvm": ".".join(map(str, llvm_version())),
         },
         "variant": mi.variant(),
         "threads": dr.thread_count(),

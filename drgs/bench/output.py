@@ -12,6 +12,7 @@ from typing import Any
 import drjit as dr
 
 from drgs.core.files import atomic_path
+from drgs.core.private import llvm_version
 
 
 def machine() -> str:
@@ -21,7 +22,7 @@ def machine() -> str:
         with open("/proc/cpuinfo") as file:
             names = [line.partition(":")[2].strip() for line in file if "model name" in line]
         name = names[0] if names else name
-    version = ".".join(map(str, dr.detail.llvm_version()))
+    version = ".".join(map(str, llvm_version()))
     return f"{name}, {dr.thread_count()} threads, LLVM {version}"
 
 

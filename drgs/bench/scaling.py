@@ -25,6 +25,7 @@ import drgs  # noqa: F401  (registers the plugin, in the fresh process too)
 from drgs.bench.output import machine, markdown_table, new_figure, write_csv, write_figure
 from drgs.bench.pairs import Work, count_work
 from drgs.bench.scenes import Scene, bench_camera, bench_gaussians, frame_of, trainer_of
+from drgs.core.private import clear_memory_peak, memory_peak
 
 DESCRIPTION = "time and memory of a training iteration against the size of the problem"
 
@@ -134,7 +135,7 @@ def measure(point: Point, steps: int) -> Result:
     for _ in range(3):
         trainer.step()
     dr.sync_thread()
-    dr.detail.malloc_clear_statistics()
+    clear_memory_peak()
     times = []
     for _ in range(steps):
         started = time.perf_counter()
@@ -144,7 +145,7 @@ def measure(point: Point, steps: int) -> Result:
     return Result(
         point=point,
         milliseconds=1e3 * statistics.median(times),
-        device_bytes=dr.detail.malloc_watermark(dr.JitBackend.LLVM),
+        device_bytes=memory_peak(),
         process_bytes=1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss,
         work=work,
     )

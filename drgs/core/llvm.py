@@ -85,10 +85,10 @@ def loaded_version() -> Version | None:
 
     Waits for Dr.Jit's start-up, which a thread of its own performs.
     """
-    import drjit as dr
+    from drgs.core.private import llvm_version
 
-    version = dr.detail.llvm_version()
-    return tuple(version) if version[0] >= 0 else None
+    version = llvm_version()
+    return version if version[0] >= 0 else None
 
 
 def installed_libraries() -> list[tuple[Version, str]]:

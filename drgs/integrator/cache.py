@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any
 
-import drjit as dr
 import numpy as np
 
+from drgs.core.private import same_variables
 from drgs.gaussians.parameters import Gaussians
 from drgs.integrator.sensors import SensorState
 from drgs.splatting import rendering
@@ -33,12 +33,11 @@ class Rendered:
         traced: TracedSurfaces | None,
     ) -> bool:
         """Whether rendering these would give the same frames."""
-        indices = dr.detail.collect_indices
         return (
             self.pipeline == pipeline
             and self.exposure == exposure
             and self.sensor.same_as(sensor)
-            and indices(self.gaussians) == indices(gaussians)
+            and same_variables(self.gaussians, gaussians)
             and self.traced is traced
         )
 

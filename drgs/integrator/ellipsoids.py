@@ -32,6 +32,7 @@ import mitsuba as mi
 import numpy as np
 
 from drgs.core.arrays import from_host, interleave, types_of
+from drgs.core.private import same_variables
 from drgs.gaussians.parameters import Gaussians
 from drgs.gaussians.sh import num_coefficients
 from drgs.gaussians.sh_rotation import sh_rotation
@@ -255,9 +256,8 @@ class Gathered:
 
     def matches(self, own: Gaussians, shapes: list[Ellipsoids], turns: list[Turn | None]) -> bool:
         """Whether gathering these would give the same Gaussians."""
-        indices = dr.detail.collect_indices
         return (
-            indices([self.own, [c.shape for c in self.conversions]]) == indices([own, shapes])
+            same_variables([self.own, [c.shape for c in self.conversions]], [own, shapes])
             and [c.turn for c in self.conversions] == turns
         )
 

@@ -18,6 +18,7 @@ import mitsuba as mi
 import numpy as np
 
 from drgs.accuracy.sample_points import SamplePoints
+from drgs.core.private import same_variables
 from drgs.integrator.film import Channels, develop_pixels, num_colors, pixels_adjoint, with_weight
 
 PASSES_PER_KERNEL = 16
@@ -37,8 +38,7 @@ class HeldSeed:
         self.seed = type(seed)(seed)
 
     def __eq__(self, other: object) -> bool:
-        indices = dr.detail.collect_indices
-        return isinstance(other, HeldSeed) and indices(self.seed) == indices(other.seed)
+        return isinstance(other, HeldSeed) and same_variables(self.seed, other.seed)
 
     __hash__ = None
 

@@ -10,6 +10,7 @@ import drjit as dr
 
 from drgs.cameras.camera import Camera
 from drgs.core.arrays import types_of
+from drgs.core.private import same_variables
 
 
 @dataclass(frozen=True)
@@ -34,11 +35,10 @@ class SensorState:
 
     def same_as(self, other: SensorState) -> bool:
         """Whether both give the same camera."""
-        indices = dr.detail.collect_indices
         return (
             self.make == other.make
             and self.host == other.host
-            and indices(self.device) == indices(other.device)
+            and same_variables(self.device, other.device)
         )
 
 

@@ -36,6 +36,7 @@ import numpy as np
 
 from drgs.cameras.camera import Camera
 from drgs.core.arrays import image_of, planes_of
+from drgs.core.private import same_variables
 from drgs.effects.occlusion import Surface
 from drgs.integrator.film import Channels, develop_pixels, film_map, num_colors, pixel_corners
 from drgs.integrator.film import pixels_adjoint as film_adjoint
@@ -103,8 +104,7 @@ def _surroundings(scene: mi.Scene) -> tuple[list[mi.Object], list[Any]]:
 def _same(parameters: list[Any], others: list[Any]) -> bool:
     """Whether arrays are the same variables, and everything else has the same value."""
     on_host = [[v for v in of if not dr.is_array_v(v)] for of in (parameters, others)]
-    indices = dr.detail.collect_indices
-    return on_host[0] == on_host[1] and indices(parameters) == indices(dr.detach(others))
+    return on_host[0] == on_host[1] and same_variables(parameters, dr.detach(others))
 
 
 def _scene(objects: list[mi.Object]) -> mi.Scene:

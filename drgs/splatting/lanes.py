@@ -13,6 +13,7 @@ from typing import Any
 import drjit as dr
 
 from drgs.core.arrays import types_of
+from drgs.core.private import bucket_order
 from drgs.splatting.image_model import MICRO, PIXELS
 from drgs.splatting.tiles import GRID, MICROS, TILE, WORD, TileBins, TileGrid
 
@@ -57,7 +58,7 @@ def grouped_by_work(lanes: Lanes, work: Any) -> Lanes:
     level = work // 4
     level = dr.select(level < _LEVELS, level, _LEVELS - 1)
     dr.eval(level)
-    order = dr.detail.block_mkperm(level, min(_BLOCK, dr.width(level)), _LEVELS)
+    order = bucket_order(level, min(_BLOCK, dr.width(level)), _LEVELS)
     return dr.gather(Lanes, lanes, order)
 
 

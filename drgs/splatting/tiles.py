@@ -24,6 +24,7 @@ import drjit as dr
 
 from drgs.core.arrays import interleave, load_row, pack_rows, types_of
 from drgs.core.constants import CULL_MARGIN, CULL_MARGIN_PER_PX
+from drgs.core.private import bucket_order
 from drgs.splatting.image_model import DEFAULT, MICRO, ImageModel
 from drgs.splatting.projection import Splats2D
 
@@ -241,7 +242,7 @@ def stable_order(keys: Any, bound: int) -> Any:
     ``dr.argsort`` does not know the bound and needs three passes for 32 bits.
     """
     buckets = 1 << (bound - 1).bit_length()
-    return dr.detail.block_mkperm(keys, dr.width(keys), max(buckets, 2))
+    return bucket_order(keys, dr.width(keys), max(buckets, 2))
 
 
 def _touched_micros(

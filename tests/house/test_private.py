@@ -1,0 +1,56 @@
+"""Undocumented functions of Dr.Jit and Mitsuba are called in one module."""
+
+import ast
+
+import drjit as dr
+import numpy as np
+from conftest import REPOSITORY
+from drjit.llvm.ad import Float, UInt32
+
+from drgs.core import private
+
+FILES = [path for f in ("drgs", "plugins") for path in sorted((REPOSITORY / f).rglob("*.py"))]
+
+
+def undocumented(source):
+    """Attributes of anything that is called ``detail``."""
+    return [
+        ast.unparse(node)
+        for node in ast.walk(ast.parse(source))
+        if isinstance(node, ast.Attribute) and node.attr == "detail"
+    ]
+
+
+def test_they_are_called_nowhere_else():
+    found = {str(p.relative_to(REPOSITORY)): undocumented(p.read_text()) for p in FILES}
+    assert {name for name, uses in found.items() if uses} == {"drgs/core/private.py"}
+
+
+def test_a_use_is_found():
+    assert undocumented("def f(x):\n    return dr.detail.collect_indices(x)") == ["dr.detail"]
+
+
+def test_lanes_of_a_block_are_ordered_stably():
+    keys = np.random.default_rng(0).integers(0, 8, 100)
+    order = private.bucket_order(UInt32(keys), 64, 8)
+    expected = [np.argsort(keys[b : b + 64], kind="stable") + b for b in (0, 64)]
+    np.testing.assert_array_equal(order, np.concatenate(expected))
+
+
+def test_variables_are_the_same_or_have_equal_values():
+    a, b = Float(1, 2), Float(1, 2)
+    assert private.same_variables([a, {"b": b}], (a, b))
+    assert not private.same_variables(a, b)
+
+
+def test_the_library_has_a_version():
+    assert private.llvm_version()[0] > 10
+
+
+def test_the_peak_of_memory_is_that_since_it_was_cleared():
+    private.clear_memory_peak()
+    before = private.memory_peak()
+    held = dr.full(Float, 1.0, 1 << 22)
+    dr.make_opaque(held)
+    assert dr.width(held) == 1 << 22
+    assert private.memory_peak() >= before + 4 * (1 << 22)
