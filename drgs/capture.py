@@ -35,7 +35,6 @@ from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
 
-import imageio.v3 as iio
 import mitsuba as mi
 import numpy as np
 from plyfile import PlyData, PlyElement
@@ -57,6 +56,7 @@ from drgs.data.path_tracing import (
     plan,
     visible_points,
 )
+from drgs.io.pictures import write_png
 
 MANIFEST = "capture.json"
 POINTS = "points3d.ply"
@@ -89,8 +89,7 @@ def run(scene: mi.Scene, settings: CaptureSettings, shots: list[CaptureView], ou
     missing = [shot for shot in shots if not picture_path(out, shot).exists()]
     for shot in progress(missing, len(shots)):
         picture = camera.picture(shot)
-        with atomic_path(picture_path(out, shot)) as temporary:
-            iio.imwrite(temporary, picture)
+        write_png(picture_path(out, shot), picture)
     if settings.points:
         positions, colors = visible_points(scene, settings, shots, out)
         write_points(out / POINTS, positions, colors)

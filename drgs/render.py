@@ -36,7 +36,6 @@ from drgs.core.constants import SHUTTER_SAMPLES
 from drgs.core.errors import UserError
 from drgs.core.files import atomic_path
 from drgs.data import Dataset, View, load_dataset
-from drgs.data.images import read_image
 from drgs.data.orbits import orbit_of_gaussians, orbit_of_views, orbit_size
 from drgs.data.viewpoints import (
     FIELD_OF_VIEW,
@@ -50,7 +49,7 @@ from drgs.effects.compose import IGNORABLE
 from drgs.gaussians.parameters import Gaussians
 from drgs.integrator.scene import check_lenses, make_scene, render_views
 from drgs.integrator.summary import described, summary_of_views
-from drgs.io.pictures import write_animation, write_png
+from drgs.io.pictures import read_image, write_animation, write_exr, write_png
 from drgs.io.ply import read_ply
 from drgs.results.files import CAMERAS, CONFIG, GAUSSIANS, METRICS, ORBIT
 from drgs.results.metrics import Quality, psnr, ssim
@@ -254,7 +253,7 @@ def render_mitsuba_scene(path: Path, out: Path, definitions: dict[str, str]) -> 
         _render_sensor(path, scene, index)
         bitmap = sensor.film().bitmap()
         width, height = bitmap.size()
-        _write_exr(out / f"{name}.exr", bitmap)
+        write_exr(out / f"{name}.exr", bitmap)
         # As floats: Mitsuba's own conversion to 8 bits rounds down.
         colors = bitmap.split()[0][1].convert(
             mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.Float32, srgb_gamma=linear
@@ -438,14 +437,6 @@ def _first_and_last(message: str) -> str:
     head = head.removesuffix("Traceback (most recent call last):").strip()
     last = re.sub(r"^\w*(Error|Exception): ", "", rest[-1].strip()) if rest else ""
     return f"{head} {last}".strip()
-
-
-def _write_exr(path: Path, bitmap: mi.Bitmap) -> None:
-    """Write through memory: an error of the disk is then Python's, and names the file."""
-    stream = mi.MemoryStream()
-    bitmap.write(stream, mi.Bitmap.FileFormat.OpenEXR)
-    with atomic_path(path) as temporary:
-        temporary.write_bytes(stream.raw_buffer())
 
 
 def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:

@@ -18,9 +18,10 @@ import mitsuba as mi
 import numpy as np
 
 import drgs  # noqa: F401  (registers the plugin)
-from drgs.bench.output import machine, new_figure, write_figure
+from drgs.bench.output import machine
 from drgs.cli.errors import exit_on_user_error
 from drgs.data.orbits import orbit_of_gaussians
+from drgs.io.figures import new_figure, write_figure
 from drgs.io.pictures import to_uint8
 from drgs.io.ply import read_ply
 from drgs.results import metrics

@@ -39,7 +39,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 import drgs  # noqa: F401  (registers the plugin)
-from drgs.bench.output import markdown_table, new_figure, write_figure
+from drgs.bench.output import markdown_table
 from drgs.cli.errors import exit_on_user_error
 from drgs.core.arrays import interleave
 from drgs.core.errors import UserError
@@ -48,6 +48,7 @@ from drgs.data.orbits import OPAQUE, orbit_of_gaussians
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 from drgs.gaussians.sh import sh_basis
 from drgs.gaussians.similarity import Similarity
+from drgs.io.figures import new_figure, write_figure
 from drgs.io.pictures import write_animation, write_png
 from drgs.io.ply import read_ply
 from drgs.reference import splatting as reference

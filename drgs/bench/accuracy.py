@@ -27,7 +27,7 @@ import numpy as np
 
 from drgs.accuracy.pipeline import pipeline_of
 from drgs.accuracy.sample_points import SamplePoints
-from drgs.bench.output import machine, markdown_table, new_figure, write_csv, write_figure
+from drgs.bench.output import machine, markdown_table, write_csv
 from drgs.bench.scenes import bench_camera, device_camera, stress_scene
 from drgs.config.approximations import Approximations
 from drgs.config.load import load_config
@@ -36,6 +36,7 @@ from drgs.data import load_dataset
 from drgs.data.types import View
 from drgs.effects.smoothing import baked
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
+from drgs.io.figures import new_figure, write_figure
 from drgs.io.ply import read_ply
 from drgs.reference import rays as reference_rays
 from drgs.reference import splatting as reference

@@ -19,7 +19,7 @@ import mitsuba as mi
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from drgs.bench.output import machine, markdown_table, new_figure, write_csv, write_figure
+from drgs.bench.output import machine, markdown_table, write_csv
 from drgs.config.changes import changed, with_iterations
 from drgs.config.load import load_config
 from drgs.config.schema import FitConfig
@@ -28,6 +28,7 @@ from drgs.data.images import smaller_view
 from drgs.data.path_tracing import first_hits, load_scene
 from drgs.data.types import Dataset, View
 from drgs.integrator.scene import render_views
+from drgs.io.figures import new_figure, write_figure
 from drgs.io.pictures import to_uint8
 from drgs.results.metrics import mean_quality
 from drgs.training.trainer import Trainer

@@ -20,9 +20,10 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from drgs.bench.output import machine, markdown_table, new_figure, write_csv, write_figure
+from drgs.bench.output import machine, markdown_table, write_csv
 from drgs.bench.scenes import Scene, bench_camera, bench_gaussians, trainer_of
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
+from drgs.io.figures import new_figure, write_figure
 
 DESCRIPTION = "what each effect costs: time and operations with and without it"
 

@@ -1,4 +1,4 @@
-"""What every measurement writes: a table on the screen and in Markdown, CSV, figures."""
+"""What every measurement writes: a table on the screen and in Markdown, CSV."""
 
 from __future__ import annotations
 
@@ -39,20 +39,3 @@ def markdown_table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     """A table as the README holds it."""
     lines = [header, ["---"] * len(header), *rows]
     return "\n".join(f"| {' | '.join(map(str, line))} |" for line in lines)
-
-
-def new_figure(width: float, height: float) -> Any:
-    """An empty matplotlib figure (inches) that needs no screen."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(width, height), dpi=110, layout="constrained")
-    FigureCanvasAgg(figure)
-    return figure
-
-
-def write_figure(path: Path, figure: Any) -> None:
-    """Write a figure as PNG."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with atomic_path(path) as temporary:
-        figure.savefig(temporary, format="png")

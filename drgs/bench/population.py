@@ -28,11 +28,12 @@ import numpy as np
 from scipy.special import expit
 
 from drgs import capture, fit
-from drgs.bench.output import markdown_table, new_figure, write_csv, write_figure
+from drgs.bench.output import markdown_table, write_csv
 from drgs.config.load import load_config
 from drgs.config.schema import DensifyConfig, FitConfig
 from drgs.core.arrays import from_host
 from drgs.data import load_dataset
+from drgs.io.figures import new_figure, write_figure
 from drgs.results.files import HISTORY, METRICS
 from drgs.training import densify, optimizer
 

@@ -22,10 +22,11 @@ import mitsuba as mi
 import numpy as np
 
 import drgs  # noqa: F401  (registers the plugin, in the fresh process too)
-from drgs.bench.output import machine, markdown_table, new_figure, write_csv, write_figure
+from drgs.bench.output import machine, markdown_table, write_csv
 from drgs.bench.pairs import Work, count_work
 from drgs.bench.scenes import Scene, bench_camera, bench_gaussians, frame_of, trainer_of
 from drgs.core.private import clear_memory_peak, memory_peak
+from drgs.io.figures import new_figure, write_figure
 
 DESCRIPTION = "time and memory of a training iteration against the size of the problem"
 

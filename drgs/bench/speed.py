@@ -26,11 +26,12 @@ import numpy as np
 
 from drgs.bench import peers
 from drgs.bench.limits import MachineLimits, measure_limits
-from drgs.bench.output import machine, markdown_table, new_figure, write_csv, write_figure
+from drgs.bench.output import machine, markdown_table, write_csv
 from drgs.bench.pairs import Work, count_work
 from drgs.bench.profile import STAGES, StageClock, stage_clock
 from drgs.bench.scenes import Scene, bench_camera, bench_gaussians, frame_of, trainer_of
 from drgs.core.files import atomic_path
+from drgs.io.figures import new_figure, write_figure
 from drgs.io.ply import read_ply
 from drgs.results.files import GAUSSIANS
 from drgs.training.trainer import Trainer

@@ -21,9 +21,10 @@ from typing import Any
 import drjit.llvm.ad as llvm
 import numpy as np
 
-from drgs.bench.output import machine, markdown_table, new_figure, write_csv, write_figure
+from drgs.bench.output import machine, markdown_table, write_csv
 from drgs.bench.scenes import device_camera
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
+from drgs.io.figures import new_figure, write_figure
 from drgs.reference import splatting as reference
 from drgs.splatting import rendering
 

@@ -22,10 +22,11 @@ from pathlib import Path
 from typing import Any
 
 from drgs import fit
-from drgs.bench.output import machine, markdown_table, new_figure, write_csv, write_figure
+from drgs.bench.output import machine, markdown_table, write_csv
 from drgs.config.changes import changed, with_iterations
 from drgs.config.load import dump_config, load_config
 from drgs.config.schema import FitConfig
+from drgs.io.figures import new_figure, write_figure
 from drgs.results.files import HISTORY, METRICS
 from drgs.training.budget import STRATEGIES, Strategy
 

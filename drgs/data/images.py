@@ -1,59 +1,21 @@
-"""Image files -> opaque display-space images of the wanted size."""
+"""Photographs, masks and depths of a dataset: read, composited, and scaled to the wanted size."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from PIL import Image
 
 from drgs.core.errors import UserError, one_line
 from drgs.data.types import View
+from drgs.io.pictures import BITS, image_mode, read_image
 
-MAX_PIXELS = 1 << 26
-"""67 million, as 8192 x 8192: 0.8 GB once decoded to float32."""
+MAX_DEPTH_STEPS = 2**16 - 1
+"""White in a picture of 16 bits."""
 
-MODES = {"L": 8, "LA": 8, "RGB": 8, "RGBA": 8, "I;16": 16, "I;16B": 16, "I": 16}
-"""Pillow's modes that are read -> bits of a channel. ``I`` holds 32, but is what some versions of
-Pillow make of a grey PNG of 16."""
-
-
-def image_size(path: Path) -> tuple[int, int]:
-    """(width, height) in px, from the file's header."""
-    with _opened(path) as image:
-        return image.size
-
-
-def read_image(path: Path) -> np.ndarray:
-    """(H, W, C) float32 in 0..1, as stored (EXIF orientation is not applied).
-
-    C is 3, or 4 with straight (not premultiplied) alpha; grey images become RGB.
-    """
-    with _opened(path) as image:
-        if image.width * image.height > MAX_PIXELS:  # before memory is allocated for them
-            raise UserError(
-                f"{path}: must have at most {MAX_PIXELS:,} pixels, got {image.width} x "
-                f"{image.height}; scale the images down"
-            )
-        if image.mode == "P":
-            image = image.convert("RGBA" if "transparency" in image.info else "RGB")
-        elif image.mode == "1":
-            image = image.convert("L")
-        if image.mode not in MODES:
-            raise UserError(
-                f"{path}: must be a grey, RGB or RGBA image of 8 or 16 bits, got one of Pillow's "
-                f"mode {image.mode}; convert it"
-            )
-        pixels = np.asarray(image)
-        white = 2 ** MODES[image.mode] - 1
-    if pixels.ndim == 2:
-        pixels = pixels[:, :, None]
-    if pixels.shape[2] < 3:
-        pixels = np.concatenate([pixels[:, :, :1]] * 3 + [pixels[:, :, 1:]], axis=2)
-    return pixels.astype(np.float32) / np.float32(white)
+ALL = 1 - 1e-4
+"""Of an area, up to rounding."""
 
 
 def read_mask(path: Path, size: tuple[int, int]) -> np.ndarray:
@@ -80,19 +42,15 @@ def read_depth(path: Path, unit: float, size: tuple[int, int]) -> np.ndarray:
         if depth.ndim != 2:
             raise UserError(f"{path}: depth must be (height, width), got shape {depth.shape}")
     else:
-        with _opened(path) as image:
-            if MODES.get(image.mode) != 16:  # of 8 bits, all depths would be 257 times as large
-                raise UserError(
-                    f"{path}: must be a grey picture of 16 bits or an .npy file, got one of "
-                    f"Pillow's mode {image.mode}; convert it"
-                )
+        mode = image_mode(path)
+        if BITS.get(mode) != 16:  # of 8 bits, all depths would be 257 times as large
+            raise UserError(
+                f"{path}: must be a grey picture of 16 bits or an .npy file, got one of Pillow's "
+                f"mode {mode}; convert it"
+            )
         depth = read_image(path)[:, :, 0] * np.float32(MAX_DEPTH_STEPS * unit)
     _check_size(path, depth, size)
     return np.where(np.isfinite(depth) & (depth > 0), depth, 0).astype(np.float32)
-
-
-MAX_DEPTH_STEPS = 2**16 - 1
-"""White in a picture of 16 bits."""
 
 
 def _check_size(path: Path, image: np.ndarray, size: tuple[int, int]) -> None:
@@ -102,19 +60,6 @@ def _check_size(path: Path, image: np.ndarray, size: tuple[int, int]) -> None:
             f"{path}: must be {size[0]} x {size[1]} px, as the photograph is, got {width} x "
             f"{height}; resize it, or leave it out of the frame"
         )
-
-
-@contextmanager
-def _opened(path: Path) -> Iterator[Image.Image]:
-    """The image before decoding; errors of the file, also within the block, are the user's."""
-    try:
-        with Image.open(path) as image:
-            yield image
-    except UserError:
-        raise
-    except Exception as error:  # Pillow raises many types for a broken file
-        reason = getattr(error, "strerror", None) or one_line(error) or type(error).__name__
-        raise UserError(f"{path}: cannot read the image: {reason}") from None
 
 
 def composite(image: np.ndarray, background: tuple[float, float, float]) -> np.ndarray:
@@ -170,10 +115,6 @@ def downscale_depth(depth: np.ndarray, max_width: int | None) -> np.ndarray:
     """(H, W): the mean depth where all that a pixel covers has one, else 0."""
     known = downscale((depth > 0).astype(np.float32), max_width)
     return np.where(known > ALL, downscale(depth, max_width), 0).astype(np.float32)
-
-
-ALL = 1 - 1e-4
-"""Of an area, up to rounding."""
 
 
 def _average_rows(image: np.ndarray, count: int) -> np.ndarray:

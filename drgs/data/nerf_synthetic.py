@@ -18,7 +18,7 @@ import numpy as np
 from drgs.config.schema import DataConfig
 from drgs.core.errors import UserError
 from drgs.data.extras import extras_of, ignored, notes
-from drgs.data.images import composite, downscale, image_size, read_image
+from drgs.data.images import composite, downscale
 from drgs.data.transforms import (
     InheritedValues,
     focal_from_angle,
@@ -29,6 +29,7 @@ from drgs.data.transforms import (
     unique_names,
 )
 from drgs.data.types import Dataset, View
+from drgs.io.pictures import image_size, read_image
 
 START_HALF_EXTENT = 1.3
 """The 3DGS reference starts from random points in [-1.3, 1.3]^3 for these scenes

@@ -16,7 +16,7 @@ from pathlib import Path
 from drgs.config.schema import DataConfig
 from drgs.core.errors import UserError
 from drgs.data.extras import extras_of, ignored, notes
-from drgs.data.images import composite, downscale, read_image
+from drgs.data.images import composite, downscale
 from drgs.data.transforms import (
     InheritedValues,
     focal_from_angle,
@@ -30,6 +30,7 @@ from drgs.data.transforms import (
     unique_names,
 )
 from drgs.data.types import Dataset, View
+from drgs.io.pictures import read_image
 
 
 def load(config: DataConfig) -> Dataset:

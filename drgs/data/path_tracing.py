@@ -17,8 +17,8 @@ import numpy as np
 
 from drgs.cameras.axes import OPENCV_TO_OPENGL, OPENGL_TO_MITSUBA
 from drgs.core.errors import UserError, one_line
-from drgs.data.images import read_image
 from drgs.data.viewpoints import look_at
+from drgs.io.pictures import read_image
 
 NERF_SYNTHETIC_FOV = 0.6911112070083618
 """Radians: the original's ``camera_angle_x``."""

@@ -1,20 +1,33 @@
-"""Pictures to files: 8-bit PNG, and animations as WebP and GIF.
+"""Pictures from files and to files; all that drgs reads or writes goes through here.
 
-Pictures are (H, W, 3) in display space, clamped to [0, 1] here; files are written whole or not at
-all.
+Read: 8 and 16 bits, with and without alpha. Written: 8-bit PNG and WebP, animations as WebP and
+GIF, Mitsuba's bitmaps as EXR. Pictures are (H, W, C) in display space, rounded to 8 bits and
+clamped to [0, 1] here; files are written whole or not at all.
 """
 
 from __future__ import annotations
 
-import io
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
+import imageio.v3 as iio
 import numpy as np
 from PIL import Image
 
+from drgs.core.errors import UserError, one_line
 from drgs.core.files import atomic_path
+
+if TYPE_CHECKING:
+    import mitsuba as mi
+
+MAX_PIXELS = 1 << 26
+"""67 million, as 8192 x 8192: 0.8 GB once decoded to float32."""
+
+BITS = {"L": 8, "LA": 8, "RGB": 8, "RGBA": 8, "I;16": 16, "I;16B": 16, "I": 16}
+"""Of a channel, by those of Pillow's modes that are read. ``I`` holds 32, but is what some versions
+of Pillow make of a grey PNG of 16."""
 
 FRAME_MS = 70
 """Duration of a frame: 60 frames turn once in 4.2 s. A multiple of GIF's unit of 10 ms."""
@@ -31,21 +44,94 @@ NEAR_BACKGROUND = 8
 """Levels of 255: colours of a GIF's palette that differ less become the background's."""
 
 
+# Reading: by Pillow itself, which tells a picture's mode and size before it is decoded
+
+
+def image_size(path: Path) -> tuple[int, int]:
+    """(width, height) in px, from the file's header."""
+    with _opened(path) as image:
+        return image.size
+
+
+def image_mode(path: Path) -> str:
+    """Pillow's name of what a pixel holds, from the file's header: see :data:`BITS`."""
+    with _opened(path) as image:
+        return image.mode
+
+
+def read_image(path: Path) -> np.ndarray:
+    """(H, W, C) float32 in 0..1, as stored (EXIF orientation is not applied).
+
+    C is 3, or 4 with straight (not premultiplied) alpha; grey images become RGB.
+
+    Raises :class:`UserError` for a file that is no such picture.
+    """
+    with _opened(path) as image:
+        if image.width * image.height > MAX_PIXELS:  # before memory is allocated for them
+            raise UserError(
+                f"{path}: must have at most {MAX_PIXELS:,} pixels, got {image.width} x "
+                f"{image.height}; scale the images down"
+            )
+        if image.mode == "P":
+            image = image.convert("RGBA" if "transparency" in image.info else "RGB")
+        elif image.mode == "1":
+            image = image.convert("L")
+        if image.mode not in BITS:
+            raise UserError(
+                f"{path}: must be a grey, RGB or RGBA image of 8 or 16 bits, got one of Pillow's "
+                f"mode {image.mode}; convert it"
+            )
+        pixels = np.asarray(image)
+        white = 2 ** BITS[image.mode] - 1
+    if pixels.ndim == 2:
+        pixels = pixels[:, :, None]
+    if pixels.shape[2] < 3:
+        pixels = np.concatenate([pixels[:, :, :1]] * 3 + [pixels[:, :, 1:]], axis=2)
+    return pixels.astype(np.float32) / np.float32(white)
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[Image.Image]:
+    """The image before decoding; errors of the file, also within the block, are the user's."""
+    try:
+        with Image.open(path) as image:
+            yield image
+    except UserError:
+        raise
+    except OSError as error:
+        reason = error.strerror or one_line(error) or type(error).__name__
+        raise UserError(f"{path}: cannot read the image: {reason}") from None
+    except Exception as error:  # Pillow raises many types for a broken file
+        reason = one_line(error) or type(error).__name__
+        raise UserError(f"{path}: cannot read the image: {reason}") from None
+
+
+# Writing: by imageio, but for the palette that all frames of a GIF share
+
+
 def to_uint8(image: np.ndarray) -> np.ndarray:
     """The picture rounded to 8 bits."""
     return np.round(np.clip(image, 0, 1) * 255).astype(np.uint8)
 
 
 def write_png(path: Path, image: np.ndarray) -> None:
-    """Write one picture."""
-    _write(path, encode(image, "PNG"))
+    """Write one picture: (H, W, 3) or, with straight alpha, (H, W, 4), in 0..1 or uint8."""
+    _write(path, encode(image, "png"))
 
 
-def encode(image: np.ndarray, file_format: str, **options: Any) -> bytes:
-    """The picture as a file of Pillow's ``file_format``."""
-    buffer = io.BytesIO()
-    _pillow(image).save(buffer, file_format, **options)
-    return buffer.getvalue()
+def write_exr(path: Path, bitmap: mi.Bitmap) -> None:
+    """Write all channels of a bitmap, in its own precision."""
+    import mitsuba as mi
+
+    stream = mi.MemoryStream()  # an error of the disk is then Python's, and names the file
+    bitmap.write(stream, mi.Bitmap.FileFormat.OpenEXR)
+    _write(path, stream.raw_buffer())
+
+
+def encode(image: np.ndarray, suffix: str, **options: float) -> bytes:
+    """The picture as a file with ``suffix``, png or webp; options: of Pillow's writer."""
+    pixels = image if image.dtype == np.uint8 else to_uint8(image)
+    return iio.imwrite("<bytes>", pixels, extension=f".{suffix}", plugin="pillow", **options)
 
 
 def write_animation(path: Path, frames: Iterable[np.ndarray]) -> None:
@@ -54,16 +140,21 @@ def write_animation(path: Path, frames: Iterable[np.ndarray]) -> None:
     Every browser shows the WebP; the GIF is for what else there is (mail, slides, old viewers).
     frames: of one size, at least one; may be a generator, only 8 bits of each are kept.
     """
-    large = [_pillow(frame) for frame in frames]
+    large = np.stack([to_uint8(frame) for frame in frames])
     for quality in WEBP_QUALITIES:
-        data = _animate(large, "WEBP", quality=quality, method=3)
+        data = encode(large, "webp", quality=quality, method=3, duration=FRAME_MS, loop=0)
         if len(data) <= WEBP_BYTES:
             break
     _write(path, data)
-    small = [_shrink(frame) for frame in large]
-    palette = _common_palette(small)
-    indexed = [frame.quantize(palette=palette) for frame in small]
-    _write(path.with_suffix(".gif"), _animate(indexed, "GIF", optimize=False))
+    _write_gif(path.with_suffix(".gif"), [_shrink(Image.fromarray(frame)) for frame in large])
+
+
+def _write_gif(path: Path, frames: Sequence[Image.Image]) -> None:
+    palette = _common_palette(frames)
+    first, *rest = [frame.quantize(palette=palette) for frame in frames]
+    options = {"append_images": rest, "duration": FRAME_MS, "loop": 0, "optimize": False}
+    with atomic_path(path) as temporary:
+        first.save(temporary, "GIF", save_all=True, **options)
 
 
 def _shrink(frame: Image.Image) -> Image.Image:
@@ -71,30 +162,6 @@ def _shrink(frame: Image.Image) -> Image.Image:
         return frame
     height = max(1, round(frame.height * GIF_WIDTH / frame.width))
     return frame.resize((GIF_WIDTH, height), Image.Resampling.BOX)
-
-
-def _pillow(image: np.ndarray) -> Image.Image:
-    return Image.fromarray(to_uint8(image))
-
-
-def _animate(frames: Sequence[Image.Image], file_format: str, **options: Any) -> bytes:
-    first, *rest = frames
-    buffer = io.BytesIO()
-    first.save(
-        buffer,
-        file_format,
-        save_all=True,
-        append_images=rest,
-        duration=FRAME_MS,
-        loop=0,
-        **options,
-    )
-    return buffer.getvalue()
-
-
-def _write(path: Path, data: bytes) -> None:
-    with atomic_path(path) as temporary:
-        temporary.write_bytes(data)
 
 
 def _common_palette(frames: Sequence[Image.Image]) -> Image.Image:
@@ -111,3 +178,8 @@ def _common_palette(frames: Sequence[Image.Image]) -> Image.Image:
     values[np.abs(values - background).max(axis=1) <= NEAR_BACKGROUND] = background
     palette.putpalette(values.ravel().tolist())
     return palette
+
+
+def _write(path: Path, data: bytes) -> None:
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(data)

@@ -9,11 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from drgs.core.files import atomic_path
-
-PANEL_WIDTH = 360
-"""px: of each of the three pictures of a comparison in the page, at most."""
-
+from drgs.io.figures import new_figure, write_figure
 
 SMOOTHING_PARTS = 50
 """The smooth line of a curve is a running mean over this part of all rows."""
@@ -21,8 +17,7 @@ SMOOTHING_PARTS = 50
 
 def write_curves(path: Path, history: Sequence[Any]) -> None:
     """Write a picture of the loss, the PSNR, the population and the rates over the iterations."""
-    with atomic_path(path) as temporary:
-        draw_curves(history, LIGHT).savefig(temporary)
+    write_figure(path, draw_curves(history, LIGHT))
 
 
 @dataclass(frozen=True)
@@ -76,14 +71,8 @@ def _panels(history: Sequence[Any]) -> list[Panel]:
 
 def draw_curves(history: Sequence[Any], theme: Theme) -> Any:
     """A matplotlib figure of six panels over the iterations."""
-    # Imported here because it takes half a second, which a command that fails early should not.
-    # Without pyplot no window system is looked for.
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(11, 5.8), dpi=110, facecolor=theme.paper, layout="constrained")
+    figure = new_figure(11, 5.8, paper=theme.paper)
     figure.get_layout_engine().set(w_pad=0.1, h_pad=0.1)
-    FigureCanvasAgg(figure)
     axes = figure.subplots(2, 3)
     for axis, panel in zip(axes.flat, _panels(history), strict=True):
         _draw(axis, panel, theme)
@@ -116,9 +105,3 @@ def _running_mean(values: np.ndarray) -> np.ndarray:
     index = np.arange(len(values))
     first, end = np.maximum(index - reach, 0), np.minimum(index + reach + 1, len(values))
     return (total[end] - total[first]) / (end - first)
-
-
-def as_pixels(figure: Any) -> np.ndarray:
-    """(H, W, 3) 0..1."""
-    figure.canvas.draw()
-    return np.asarray(figure.canvas.buffer_rgba())[:, :, :3] / 255

@@ -11,6 +11,7 @@ import html
 import math
 import time
 from collections.abc import Iterable, Sequence
+from importlib import resources
 from pathlib import Path
 from string import Template
 from typing import Any
@@ -26,8 +27,9 @@ from drgs.data.types import Dataset, View
 from drgs.data.viewpoints import field_of_view
 from drgs.gaussians.parameters import Gaussians
 from drgs.integrator.scene import render_views
+from drgs.io.figures import pixels_of
 from drgs.io.pictures import encode, write_animation, write_png
-from drgs.results.curves import PANEL_WIDTH, THEMES, as_pixels, draw_curves, write_curves
+from drgs.results.curves import THEMES, draw_curves, write_curves
 from drgs.results.files import CURVES, ORBIT, REPORT, SIDE_BY_SIDE
 from drgs.results.metrics import psnr, ssim
 
@@ -39,13 +41,14 @@ GAP = 4
 
 ORBIT_FRAMES = 60
 
+PANEL_WIDTH = 360
+"""px: of each of the three pictures of a comparison in the page, at most."""
+
+PAGE = "page.html"
+"""Of this package: the page, with ``$names`` for what :func:`write_report` fills in."""
+
 PAGE_SECONDS = 4.0
 """Curves and page, which do not depend on the scene."""
-
-
-# ----------------------------------------------------------------------------------------------
-# Files
-# ----------------------------------------------------------------------------------------------
 
 
 def write_results(
@@ -77,7 +80,7 @@ def seconds_to_write(scene: mi.Scene, dataset: Dataset) -> float:
     (image,) = render_views(scene, (view,))
     rendering = time.perf_counter() - start
     for picture in (image, side_by_side(image, view)):
-        encode(picture, "PNG")
+        encode(picture, "png")
     score(image, view), ssim(image, view.image, view.mask)
     one_view = time.perf_counter() - start
     return PAGE_SECONDS + len(dataset.test) * one_view + 2 * ORBIT_FRAMES * rendering
@@ -133,9 +136,10 @@ def write_report(
     """
     scores = [score(image, view) for image, view in zip(images, dataset.test, strict=True)]
     light, dark = (
-        _data_uri(as_pixels(draw_curves(history, theme)), lossless=True) for theme in THEMES
+        _data_uri(pixels_of(draw_curves(history, theme)), lossless=True) for theme in THEMES
     )
-    page = PAGE.substitute(
+    template = Template(resources.files("drgs.results").joinpath(PAGE).read_text("utf-8"))
+    page = template.substitute(
         title=html.escape(title),
         description=html.escape(dataset.description),
         tiles="".join(_tile(*tile) for tile in _headline(metrics)),
@@ -164,16 +168,6 @@ def choose_views(scores: Sequence[float]) -> list[tuple[str, int]]:
     if len(order) < 3:
         return [("View", index) for index in order]
     return [("Best", order[0]), ("Median", order[len(order) // 2]), ("Worst", order[-1])]
-
-
-# ----------------------------------------------------------------------------------------------
-# Curves
-# ----------------------------------------------------------------------------------------------
-
-
-# ----------------------------------------------------------------------------------------------
-# Page
-# ----------------------------------------------------------------------------------------------
 
 
 def _headline(metrics: dict[str, Any]) -> list[tuple[str, str, str]]:
@@ -253,110 +247,8 @@ def _row(name: str, value: str) -> str:
 
 
 def _data_uri(image: np.ndarray, **options: Any) -> str:
-    return _uri("image/webp", encode(image, "WEBP", **options))
+    return _uri("image/webp", encode(image, "webp", **options))
 
 
 def _uri(kind: str, data: bytes) -> str:
     return f"data:{kind};base64,{base64.b64encode(data).decode('ascii')}"
-
-
-PAGE = Template("""<!DOCTYPE html>
-<html lang="en">
-<head>
-<meta charset="utf-8">
-<meta name="viewport" content="width=device-width, initial-scale=1">
-<title>$title: Gaussian splats</title>
-<link rel="icon" href="data:,">
-<style>
-:root {
-  color-scheme: light dark;
-  --page: #f3f5f8; --card: #ffffff; --ink: #1d2330; --soft: #5c6577; --line: #e3e6ec;
-}
-@media (prefers-color-scheme: dark) {
-  :root { --page: #11141a; --card: #1a1e27; --ink: #e2e6ee; --soft: #98a2b5; --line: #2c3340; }
-}
-* { box-sizing: border-box; }
-body {
-  margin: 0; padding: 2.5rem 1.25rem 3rem; background: var(--page); color: var(--ink);
-  font: 16px/1.5 system-ui, -apple-system, "Segoe UI", Roboto, "DejaVu Sans", sans-serif;
-}
-main { max-width: 1120px; margin: 0 auto; }
-h1 { font-size: 2rem; line-height: 1.2; margin: 0; letter-spacing: -0.01em; }
-h2 { font-size: 1.15rem; margin: 2.5rem 0 0.8rem; }
-p { margin: 0.4rem 0 0; color: var(--soft); }
-img { display: block; max-width: 100%; height: auto; border-radius: 6px; }
-.card {
-  background: var(--card); border: 1px solid var(--line); border-radius: 12px; padding: 1rem;
-}
-.top {
-  display: grid; grid-template-columns: minmax(0, 432px) minmax(0, 1fr); gap: 1.25rem;
-  margin-top: 1.5rem;
-}
-.top > .card:first-child { display: grid; place-items: center; }
-.top > .card:first-child img { width: 100%; }
-.tiles { display: grid; grid-template-columns: 1fr 1fr; gap: 1.25rem; margin-bottom: 1rem; }
-.tiles strong { display: block; font-size: 1.7rem; line-height: 1.2; white-space: nowrap; }
-.tiles small { font-size: 1rem; font-weight: 500; }
-.tiles span { color: var(--soft); font-size: 0.88rem; }
-table { border-collapse: collapse; width: 100%; font-size: 0.9rem; }
-th, td { text-align: left; padding: 0.4rem 0; border-top: 1px solid var(--line); }
-th { font-weight: 400; color: var(--soft); padding-right: 1.25rem; white-space: nowrap; }
-th, td { vertical-align: top; font-variant-numeric: tabular-nums; }
-figure { margin: 0 0 1.25rem; }
-figure:last-of-type { margin: 0; }
-figcaption { margin-bottom: 0.5rem; color: var(--soft); font-size: 0.9rem; }
-figcaption b { color: var(--ink); margin-right: 0.6rem; }
-.three { display: grid; grid-template-columns: repeat(3, minmax(0, 1fr)); gap: 0.6rem; }
-.three img { width: 100%; }
-.labels { color: var(--soft); font-size: 0.85rem; margin-bottom: 0.9rem; }
-details { margin-top: 1.25rem; }
-summary { cursor: pointer; font-weight: 600; }
-pre { overflow-x: auto; font-size: 0.84rem; line-height: 1.45; margin: 0.8rem 0 0; }
-.columns { columns: 4 11rem; column-gap: 2rem; margin-top: 0.8rem; }
-.columns td { text-align: right; }
-@media (max-width: 820px) { .top { grid-template-columns: minmax(0, 1fr); } }
-</style>
-</head>
-<body>
-<main>
-<h1>$title</h1>
-<p>3D Gaussian splats fitted by drgs to $description.</p>
-
-<div class="top">
-<div class="card"><img alt="orbit around the fitted scene" src="$orbit"></div>
-<div class="card">
-<div class="tiles">$tiles</div>
-<table>$facts</table>
-</div>
-</div>
-
-<h2>Views of split $split</h2>
-<div class="card">
-<div class="three labels">
-<div>Fitted</div><div>Photograph</div>
-<div>Difference: 0.5 + $gain (fitted &minus; photograph), grey where equal</div>
-</div>
-$comparisons
-</div>
-
-<h2>Training</h2>
-<div class="card">
-<picture>
-<source media="(prefers-color-scheme: dark)" srcset="$curves_dark">
-<img alt="loss, PSNR, population and rates over the iterations" src="$curves_light">
-</picture>
-</div>
-
-<details class="card">
-<summary>PSNR of every test view [dB]</summary>
-<div class="columns"><table>$views</table></div>
-</details>
-
-<details class="card">
-<summary>Configuration, every value</summary>
-<pre>$config</pre>
-</details>
-</main>
-</body>
-</html>
-""")

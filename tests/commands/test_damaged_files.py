@@ -21,8 +21,9 @@ from drgs.config.load import dump_config, load_config
 from drgs.config.schema import DataConfig, FitConfig
 from drgs.core.errors import UserError
 from drgs.data import initial_gaussians, load_dataset
-from drgs.data.images import composite, read_image
+from drgs.data.images import composite
 from drgs.io import read_ply, read_points
+from drgs.io.pictures import read_image
 
 COUNT = 600
 """Mutations of each format."""

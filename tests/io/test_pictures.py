@@ -70,6 +70,6 @@ def test_equal_frames_give_equal_bytes(tmp_path):
 
 
 def test_an_encoded_picture_is_a_file_of_its_format():
-    data = pictures.encode(np.zeros((3, 5, 3)), "WEBP", lossless=True)
+    data = pictures.encode(np.zeros((3, 5, 3)), "webp", lossless=True)
     picture = Image.open(io.BytesIO(data))
     assert (picture.format, picture.size) == ("WEBP", (5, 3))

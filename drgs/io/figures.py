@@ -1,0 +1,40 @@
+"""Figures of matplotlib that need no screen, to files and to pixels.
+
+Matplotlib is imported when a figure is made: it takes half a second, which a command that fails
+early should not.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from drgs.core.files import atomic_path
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+def new_figure(width: float, height: float, paper: str = "white") -> Figure:
+    """An empty figure; width, height: inches; paper: its colour."""
+    # Without pyplot no window system is looked for.
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(width, height), dpi=110, facecolor=paper, layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def write_figure(path: Path, figure: Figure) -> None:
+    """Write a figure as PNG."""
+    with atomic_path(path) as temporary:
+        figure.savefig(temporary, format="png")
+
+
+def pixels_of(figure: Figure) -> np.ndarray:
+    """(H, W, 3) uint8: the figure as it is written."""
+    figure.canvas.draw()
+    return np.asarray(figure.canvas.buffer_rgba())[:, :, :3]
