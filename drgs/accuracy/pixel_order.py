@@ -25,7 +25,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any
 
 import drjit as dr
@@ -95,11 +94,6 @@ class PixelOrder:
 
 
 # ----------------------------------------------------------------------------------------------
-# Lists
-# ----------------------------------------------------------------------------------------------
-
-
-# ----------------------------------------------------------------------------------------------
 # The walk
 # ----------------------------------------------------------------------------------------------
 
@@ -117,23 +111,62 @@ class _Met:
     alphas: list[Alpha]
 
 
+@dataclass(frozen=True)
+class _Lanes:
+    """What a walk reads: the lanes, the list of each, and what its splats are."""
+
+    bins: TileBins
+    records: Records
+    lists: PixelLists
+    order: PixelOrder
+    lanes: Lanes
+    model: ImageModel  # bound to the lanes
+
+    @staticmethod
+    def of(bins: TileBins, records: Records, lists: PixelLists, order: PixelOrder) -> _Lanes:
+        """Lanes with lists of similar length together."""
+        lanes = make_lanes(type(bins.rows), bins.grid)
+        begin, end = lists.range(lanes)
+        lanes = grouped_by_work(lanes, end - begin)
+        return _Lanes(bins, records, lists, order, lanes, bins.model.bind(lanes, bins.grid))
+
+    @property
+    def size(self) -> int:
+        """Number of lanes."""
+        return dr.width(self.lanes.tile)
+
+    @property
+    def stop(self) -> float:
+        """The last transmittance that a pixel may have."""
+        return self.model.cutoffs.transmittance_stop
+
+    def transmittance(self) -> list[Any]:
+        """Of the 16 pixels before the first splat; those off the film are finished."""
+        Float = type(self.bins.rows)
+        inside = [inside for _, inside in pixels_of(self.lanes, self.bins.grid)]
+        return [dr.select(of_pixel, Float(1), -1) for of_pixel in inside]
+
+    def zeros(self, planes: int) -> list[list[Any]]:
+        """By plane: of the 16 pixels."""
+        Float = type(self.bins.rows)
+        zero = dr.zeros(Float, self.size)
+        return [[Float(zero) for _ in range(PIXELS)] for _ in range(planes)]
+
+
 def _walk(
-    lists: PixelLists,
-    records: Records,
-    model: ImageModel,
-    lanes: Lanes,
-    order: PixelOrder,
+    of: _Lanes,
     carry: Callable[[_Met, int], list[Any]],
     visit: Callable[[Any, list[list[Any]]], Any],
     state: Any,
     nothing: list[Any],
-) -> tuple[Any, Any]:
+) -> Any:
     """Visit each pixel's splats in their order; returns the last state.
 
     carry: the numbers that a splat brings along at a pixel; visit: from a state and, for each
     pixel, alpha and what was carried, to the next state and whether any pixel is unfinished;
     nothing: what is carried where there is no splat, with an alpha of 0.
     """
+    lists, records, model, lanes, order = of.lists, of.records, of.model, of.lanes, of.order
     t = types_of(type(records.rows))
     begin, end = lists.range(lanes)
 
@@ -158,7 +191,7 @@ def _walk(
         state, go_on = visit(state, visited)
         return place + 1, next_queue, state, go_on
 
-    size = dr.width(lanes.tile)
+    size = of.size
     empty = [dr.full(t.Float, -dr.inf, size), dr.zeros(t.Float, size), *nothing]
     _, _, state, _ = dr.while_loop(
         state=(
@@ -207,29 +240,23 @@ class _OrderedLayers(Layers):
 def _composite(bins: TileBins, records: Records, order: PixelOrder) -> _OrderedLayers:
     t = types_of(type(bins.rows))
     lists = PixelLists.of(bins, records, order.depths)
-    lanes = _lanes(bins, lists)
-    model = bins.model.bind(lanes, bins.grid)
+    of = _Lanes.of(bins, records, lists, order)
+    lanes, model, size = of.lanes, of.model, of.size
     count = model.features.num_planes(bins.num_features)
-    stop = model.cutoffs.transmittance_stop
 
     def visit(state: tuple, visited: list[list[Any]]) -> tuple:
         T, C = list(state[0]), [list(plane) for plane in state[1]]
         for pixel, (alpha, *features) in enumerate(visited):
-            weight, T[pixel], _ = composite_step(T[pixel], alpha, stop)
+            weight, T[pixel], _ = composite_step(T[pixel], alpha, of.stop)
             for k, c in enumerate(features):
                 C[k][pixel] = dr.fma(weight, c, C[k][pixel])
         return (T, C), _unfinished(T)
 
-    size = dr.width(lanes.tile)
     T, C = _walk(
-        lists,
-        records,
-        model,
-        lanes,
-        order,
+        of,
         carry=lambda met, pixel: model.features.at(met.features, pixel),
         visit=visit,
-        state=(_transmittance(lanes, bins), _zeros(t.Float, size, count)),
+        state=(of.transmittance(), of.zeros(count)),
         nothing=[dr.zeros(t.Float, size)] * count,
     )
     dr.eval(T, C)
@@ -245,24 +272,6 @@ def _composite(bins: TileBins, records: Records, order: PixelOrder) -> _OrderedL
     )
 
 
-def _lanes(bins: TileBins, lists: PixelLists) -> Lanes:
-    """Lanes with lists of similar length together."""
-    lanes = make_lanes(type(bins.rows), bins.grid)
-    begin, end = lists.range(lanes)
-    return grouped_by_work(lanes, end - begin)
-
-
-def _transmittance(lanes: Lanes, bins: TileBins) -> list[Any]:
-    """Of the 16 pixels before the first splat; those off the film are finished."""
-    Float = type(bins.rows)
-    return [dr.select(inside, Float(1), -1) for _, inside in pixels_of(lanes, bins.grid)]
-
-
-def _zeros(Float: type, size: int, planes: int) -> list[list[Any]]:
-    zero = dr.zeros(Float, size)
-    return [[Float(zero) for _ in range(PIXELS)] for _ in range(planes)]
-
-
 # ----------------------------------------------------------------------------------------------
 # Adjoint
 # ----------------------------------------------------------------------------------------------
@@ -276,50 +285,61 @@ def _adjoint(
     d_transmittance: Any,
     order: PixelOrder,
 ) -> SplatGradients:
-    t = types_of(type(bins.rows))
-    lists = layers.lists
-    lanes = _lanes(bins, lists)
-    model = bins.model.bind(lanes, bins.grid)
-    g = [load_pixels(plane, lanes, bins.grid) for plane in d_features]
-    walk = partial(_walk, lists, records, model, lanes, order)
-    size = dr.width(lanes.tile)
-    stop = model.cutoffs.transmittance_stop
+    of = _Lanes.of(bins, records, layers.lists, order)
+    g = [load_pixels(plane, of.lanes, bins.grid) for plane in d_features]
+    totals = _totals(of, layers, g, d_transmittance)
+    pairs = _pairs(of, totals, g)
+    return _sum_items(bins, layers.lists, _sum_pixels(of, pairs, g))
 
-    def feature_gradient(met: _Met, pixel: int) -> Any:
-        return model.features.feature_gradient(met.features, pixel, [plane[pixel] for plane in g])
 
-    # First walk: what all splats of a pixel and its background are worth.
+def _feature_gradient(of: _Lanes, met: _Met, pixel: int, g: list[list[Any]]) -> Any:
+    """c . g of a splat at a pixel; g: [plane][pixel] derivative of the loss."""
+    features = of.model.features
+    return features.feature_gradient(met.features, pixel, [plane[pixel] for plane in g])
+
+
+def _totals(
+    of: _Lanes, layers: _OrderedLayers, g: list[list[Any]], d_transmittance: Any
+) -> list[tuple[Any, Any]]:
+    """First walk: what all splats of each pixel and its background are worth, in two numbers."""
+    t = types_of(type(of.bins.rows))
+
     def add_up(state: tuple, visited: list[list[Any]]) -> tuple:
         T, high, low = (list(column) for column in state)
         for pixel, (alpha, seen) in enumerate(visited):
-            weight, T[pixel], _ = composite_step(T[pixel], alpha, stop)
+            weight, T[pixel], _ = composite_step(T[pixel], alpha, of.stop)
             high[pixel], low[pixel] = _add_product(high[pixel], low[pixel], weight, seen)
         return (T, high, low), _unfinished(T)
 
-    _, *totals = walk(
-        carry=lambda met, pixel: [feature_gradient(met, pixel)],
+    _, *totals = _walk(
+        of,
+        carry=lambda met, pixel: [_feature_gradient(of, met, pixel, g)],
         visit=add_up,
-        state=(_transmittance(lanes, bins), *_zeros(t.Float, size, 2)),
-        nothing=[dr.zeros(t.Float, size)],
+        state=(of.transmittance(), *of.zeros(2)),
+        nothing=[dr.zeros(t.Float, of.size)],
     )
     background = zip(
         *totals,
-        load_lane_row(layers.values, lanes.micro_tile, 1 + layers.count),
-        load_pixels(d_transmittance, lanes, bins.grid),
+        load_lane_row(layers.values, of.lanes.micro_tile, 1 + layers.count),
+        load_pixels(d_transmittance, of.lanes, of.bins.grid),
         strict=True,
     )
     totals = [_add_product(*numbers) for numbers in background]
     dr.eval(totals)
+    return totals
 
-    # Second walk: each pair's weight and d loss / d ln(alpha), at the place of its splat.
-    pairs = [dr.zeros(t.Float, max(lists.count, 1) * PIXELS) for _ in range(2)]
+
+def _pairs(of: _Lanes, totals: list[tuple[Any, Any]], g: list[list[Any]]) -> list[Any]:
+    """Second walk: each pair's weight and d loss / d ln(alpha), at the place of its splat."""
+    t = types_of(type(of.bins.rows))
+    pairs = [dr.zeros(t.Float, max(of.lists.count, 1) * PIXELS) for _ in range(2)]
     dr.eval(pairs)
-    alpha_max = model.cutoffs.alpha_max
+    alpha_max = of.model.cutoffs.alpha_max
 
     def store(state: tuple, visited: list[list[Any]]) -> tuple:
         T, high, low = (list(column) for column in state)
         for pixel, (alpha, seen, place) in enumerate(visited):
-            weight, T[pixel], goes_on = composite_step(T[pixel], alpha, stop)
+            weight, T[pixel], goes_on = composite_step(T[pixel], alpha, of.stop)
             high[pixel], low[pixel] = _add_product(high[pixel], low[pixel], weight, seen)
             behind = (totals[pixel][0] - high[pixel]) + (totals[pixel][1] - low[pixel])
             # Of what is behind, alpha / (1 - alpha) is lost: no division by T, which may underflow.
@@ -329,30 +349,23 @@ def _adjoint(
                 dr.scatter(plane, value, place * PIXELS + pixel, goes_on & (alpha > 0))
         return (T, high, low), _unfinished(T)
 
-    result = walk(
-        carry=lambda met, pixel: [feature_gradient(met, pixel), met.place],
+    result = _walk(
+        of,
+        carry=lambda met, pixel: [_feature_gradient(of, met, pixel, g), met.place],
         visit=store,
-        state=(_transmittance(lanes, bins), *_zeros(t.Float, size, 2)),
-        nothing=[dr.zeros(t.Float, size), dr.zeros(t.UInt32, size)],
+        state=(of.transmittance(), *of.zeros(2)),
+        nothing=[dr.zeros(t.Float, of.size), dr.zeros(t.UInt32, of.size)],
     )
     dr.eval(result, pairs)
-    partials = _sum_pixels(bins, records, lists, model, lanes, pairs, g)
-    return _sum_items(bins, lists, partials)
+    return pairs
 
 
-def _sum_pixels(
-    bins: TileBins,
-    records: Records,
-    lists: PixelLists,
-    model: ImageModel,
-    lanes: Lanes,
-    pairs: list[Any],
-    g: list[list[Any]],
-) -> Any:
+def _sum_pixels(of: _Lanes, pairs: list[Any], g: list[list[Any]]) -> Any:
     """Third walk: the sums over the 16 pixels of each item, rows by place.
 
     pairs: weights and d loss / d ln(alpha), 16 for each place.
     """
+    bins, records, lists, lanes, model = of.bins, of.records, of.lists, of.lanes, of.model
     t = types_of(type(bins.rows))
     width = model.response.num_moments + bins.num_features
     partials = empty_rows(t.Float, width, max(lists.count, 1))
@@ -415,12 +428,9 @@ def _tangent(
     tangents: SplatGradients,
     order: PixelOrder,
 ) -> Layers:
-    t = types_of(type(bins.rows))
-    lanes = _lanes(bins, layers.lists)
-    model = bins.model.bind(lanes, bins.grid)
-    stop = model.cutoffs.transmittance_stop
+    of = _Lanes.of(bins, records, layers.lists, order)
+    model, size = of.model, of.size
     d_records, count = pack_tangents(bins, tangents), layers.count
-    size = dr.width(lanes.tile)
 
     def carry(met: _Met, pixel: int) -> list[Any]:
         d_geometry, d_features = d_records.load(met.entry, met.active)
@@ -438,7 +448,7 @@ def _tangent(
         for pixel, (alpha, d_alpha, *features) in enumerate(visited):
             d_alpha = dr.select(alpha > 0, d_alpha, 0)  # behind the camera, there is a footprint
             before, d_before = dr.abs(T[pixel]), dT[pixel]
-            weight, T[pixel], goes_on = composite_step(T[pixel], alpha, stop)
+            weight, T[pixel], goes_on = composite_step(T[pixel], alpha, of.stop)
             d_weight = dr.select(goes_on, dr.fma(before, d_alpha, alpha * d_before), 0)
             dT[pixel] = d_before - d_weight
             for k in range(count):
@@ -447,24 +457,16 @@ def _tangent(
         return (T, dT, dC), _unfinished(T)
 
     _, dT, dC = _walk(
-        layers.lists,
-        records,
-        model,
-        lanes,
-        order,
+        of,
         carry=carry,
         visit=visit,
-        state=(
-            _transmittance(lanes, bins),
-            _zeros(t.Float, size, 1)[0],
-            _zeros(t.Float, size, count),
-        ),
-        nothing=[dr.zeros(t.Float, size)] * (1 + 2 * count),
+        state=(of.transmittance(), of.zeros(1)[0], of.zeros(count)),
+        nothing=[dr.zeros(type(bins.rows), size)] * (1 + 2 * count),
     )
     columns = dT + flat_columns(dC)
     dr.eval(columns)
     return Layers(
-        values=scatter_rows(columns, lanes.micro_tile, size),
+        values=scatter_rows(columns, of.lanes.micro_tile, size),
         ends=layers.ends,
         stop=layers.stop,
         count=count,

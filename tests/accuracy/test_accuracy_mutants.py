@@ -167,6 +167,6 @@ class TestChoices(MutationChecks):
         exact.RayResponse.moments
         exact.RayResponse.derivatives exact.RayResponse.tangent
         exact.RayResponse.pack_tangents pixel_order._adjoint pixel_order._add_product
-        pixel_order._sum_pixels pixel_order._tangent ray_colors.RayColors.add_derivatives
-        ray_colors.RayColors.tangents
+        pixel_order._totals pixel_order._pairs pixel_order._sum_pixels pixel_order._tangent
+        ray_colors.RayColors.add_derivatives ray_colors.RayColors.tangents
     """

@@ -11,14 +11,7 @@ from conftest import REPOSITORY
 MOST_LINES = 60
 MOST_PARAMETERS = 8
 
-LONGER = {
-    "drgs/bench/scenes.py:stress_scene",
-    "drgs/accuracy/pixel_order.py:_adjoint",
-    "drgs/accuracy/pixel_order.py:_tangent",
-}
-"""To be cut."""
-
-MORE_PARAMETERS = {"rasterization", "_walk"}
+MORE_PARAMETERS = {"rasterization"}
 """It has the names and the order of gsplat's."""
 
 FILES = [
@@ -47,16 +40,9 @@ def sizes(source):
 @pytest.mark.parametrize("path", FILES, ids=lambda path: str(path.relative_to(REPOSITORY)))
 def test_functions_are_short_and_take_few_parameters(path):
     for name, (lines, parameters) in sizes(path.read_text()).items():
-        if f"{path.relative_to(REPOSITORY)}:{name}" not in LONGER:
-            assert lines <= MOST_LINES, f"{name}: {lines} lines"
+        assert lines <= MOST_LINES, f"{name}: {lines} lines"
         if name not in MORE_PARAMETERS:
             assert parameters <= MOST_PARAMETERS, f"{name}: {parameters} parameters"
-
-
-def test_what_may_be_longer_still_is():
-    for entry in LONGER:
-        path, name = entry.split(":")
-        assert sizes((REPOSITORY / path).read_text())[name][0] > MOST_LINES, entry
 
 
 def test_lines_and_parameters_are_counted():
