@@ -9,14 +9,11 @@ import drjit as dr
 
 from drgs.accuracy.peak_depths import AffineDepths, RayDepths
 from drgs.core.arrays import types_of
-from drgs.splatting.image_model import MICRO
-from drgs.splatting.lanes import (
-    Lanes,
-)
+from drgs.splatting.grid import GRID, MICRO, MICROS, TILE, Lanes
 from drgs.splatting.rasterize import (
     Records,
 )
-from drgs.splatting.tiles import GRID, MICROS, TILE, TileBins, lower_bounds, stable_order
+from drgs.splatting.tiles import TileBins, lower_bounds, stable_order
 
 FARTHEST = 4.0
 """Between this and its inverse is the depth by which a list is sorted, relative to the mean's."""

@@ -33,15 +33,9 @@ from drgs.accuracy.peak_depths import AffineDepths, ParallelDepths, RayDepths, f
 from drgs.accuracy.pixel_lists import PixelLists
 from drgs.cameras.camera import Camera
 from drgs.core.arrays import empty_rows, load_row, scatter_rows, store_row, types_of
-from drgs.splatting.image_model import PIXELS, Alpha, Footprint, ImageModel
-from drgs.splatting.lanes import (
-    Lanes,
-    grouped_by_work,
-    load_lane_row,
-    load_pixels,
-    make_lanes,
-    pixels_of,
-)
+from drgs.splatting.grid import PIXELS, Lanes
+from drgs.splatting.image_model import Alpha, Footprint, ImageModel
+from drgs.splatting.lanes import grouped_by_work, load_lane_row, load_pixels, make_lanes, pixels_of
 from drgs.splatting.rasterize import (
     Layers,
     Records,

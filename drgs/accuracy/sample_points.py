@@ -11,9 +11,9 @@ from dataclasses import dataclass
 from typing import Any, ClassVar
 
 from drgs.core.arrays import types_of
-from drgs.splatting.image_model import MICRO, total
-from drgs.splatting.lanes import Lanes, load_pixels
-from drgs.splatting.tiles import TileGrid
+from drgs.splatting.grid import MICRO, Lanes, TileGrid
+from drgs.splatting.image_model import total
+from drgs.splatting.lanes import load_pixels
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ from typing import Any
 import drjit as dr
 
 from drgs.core.arrays import types_of
-from drgs.splatting.image_model import PIXELS
+from drgs.splatting.grid import PIXELS
 from drgs.splatting.lanes import Entries, load_lane_row, make_lanes
 from drgs.splatting.rendering import Frame
 

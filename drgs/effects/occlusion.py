@@ -24,9 +24,9 @@ from typing import Any
 
 import drjit as dr
 
+from drgs.splatting.grid import Lanes, TileGrid
 from drgs.splatting.image_model import ImageModel, SplatFeatures
-from drgs.splatting.lanes import Lanes, load_pixels
-from drgs.splatting.tiles import TileGrid
+from drgs.splatting.lanes import load_pixels
 
 
 @dataclass(frozen=True, eq=False)

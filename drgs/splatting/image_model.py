@@ -23,12 +23,7 @@ import drjit as dr
 from drgs.core.arrays import is_float64, types_of
 from drgs.core.constants import WHITENING_SCALE
 from drgs.splatting.cutoffs import Cutoffs
-
-MICRO = 4
-"""Pixels on a micro-tile's side. A micro-tile is one SIMD lane of the compositing kernels."""
-
-PIXELS = MICRO * MICRO
-
+from drgs.splatting.grid import MICRO
 
 # ----------------------------------------------------------------------------------------------
 # Alpha

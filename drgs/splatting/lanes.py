@@ -14,19 +14,8 @@ import drjit as dr
 
 from drgs.core.arrays import types_of
 from drgs.core.private import bucket_order
-from drgs.splatting.image_model import MICRO, PIXELS
-from drgs.splatting.tiles import GRID, MICROS, TILE, WORD, TileBins, TileGrid
-
-
-@dataclass(frozen=True)
-class Lanes:
-    """One lane per micro-tile, in the order in which Dr.Jit starts them."""
-
-    micro_tile: Any  # UInt32: tile * 16 + micro-tile within the tile
-    micro: Any  # UInt32: micro-tile within the tile
-    tile: Any  # UInt32
-    x: Any  # UInt32: first pixel column
-    y: Any  # UInt32: first pixel row
+from drgs.splatting.grid import GRID, MICRO, MICROS, PIXELS, TILE, Lanes, TileGrid
+from drgs.splatting.tiles import WORD, TileBins
 
 
 def make_lanes(Float: type, grid: TileGrid) -> Lanes:

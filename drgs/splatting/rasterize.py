@@ -59,7 +59,8 @@ from drgs.core.arrays import (
     store_row,
     types_of,
 )
-from drgs.splatting.image_model import MICRO, PIXELS, Alpha
+from drgs.splatting.grid import GRID, MICRO, MICROS, PIXELS, TILE, TileGrid
+from drgs.splatting.image_model import Alpha
 from drgs.splatting.lanes import (
     Cursor,
     Entries,
@@ -71,7 +72,7 @@ from drgs.splatting.lanes import (
     make_lanes,
     pixels_of,
 )
-from drgs.splatting.tiles import GRID, MICROS, TILE, WORD, TileBins, TileGrid, transpose_masks
+from drgs.splatting.tiles import WORD, TileBins, transpose_masks
 
 
 @dataclass(frozen=True)

@@ -23,6 +23,7 @@ from drgs.cameras.camera import Camera
 from drgs.core.arrays import interleave, types_of
 from drgs.core.constants import LOW_PASS
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
+from drgs.splatting.grid import TileGrid
 from drgs.splatting.image_model import DEFAULT, ImageModel
 from drgs.splatting.projection import (
     GaussianRows,
@@ -41,7 +42,7 @@ from drgs.splatting.rasterize import (
     composite_adjoint,
     composite_tangent,
 )
-from drgs.splatting.tiles import TileBins, TileGrid, bin_splats
+from drgs.splatting.tiles import TileBins, bin_splats
 
 Feature = Callable[[Splats2D, GaussianRows, Camera], list[Any]]
 """What is composited of each splat: a list of Float, one for each plane."""

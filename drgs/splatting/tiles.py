@@ -23,53 +23,16 @@ from typing import Any
 import drjit as dr
 
 from drgs.core.arrays import interleave, load_row, pack_rows, types_of
-from drgs.core.constants import CULL_MARGIN, CULL_MARGIN_PER_PX
 from drgs.core.private import bucket_order
-from drgs.splatting.image_model import DEFAULT, MICRO, ImageModel
+from drgs.splatting.grid import GRID, MICRO, MICROS, TILE, TileGrid
+from drgs.splatting.image_model import DEFAULT, ImageModel
 from drgs.splatting.projection import Splats2D
 
 BOX = 4
 """Numbers of a splat's box of tiles: first column, first row, columns, number of tiles."""
 
-GRID = 4
-"""Micro-tiles on a tile's side."""
-
-TILE = MICRO * GRID
-"""Pixels on a tile's side."""
-
-MICROS = GRID * GRID
-"""Micro-tiles in a tile: the bits of an entry's mask."""
-
 WORD = 32
 """Entries in a word of the transposed masks."""
-
-
-@dataclass(frozen=True)
-class TileGrid:
-    """The tiles of a film of ``width`` x ``height`` px, in rows from the upper left corner."""
-
-    width: int
-    height: int
-
-    @property
-    def columns(self) -> int:
-        """Tiles in a row."""
-        return -(-self.width // TILE)
-
-    @property
-    def rows(self) -> int:
-        """Tiles in a column."""
-        return -(-self.height // TILE)
-
-    @property
-    def num_tiles(self) -> int:
-        """Tiles on the film."""
-        return self.columns * self.rows
-
-    @property
-    def cull_margin(self) -> float:
-        """What rounding may take from an exponent (base 2) on this film."""
-        return CULL_MARGIN + CULL_MARGIN_PER_PX * max(self.width, self.height)
 
 
 @dataclass(frozen=True)

@@ -27,8 +27,8 @@ from drgs.effects.occlusion import OccludedFeatures, Surface
 from drgs.gaussians.parameters import PARAMETER_NAMES
 from drgs.reference.effects import render_with_surface
 from drgs.splatting import rendering
+from drgs.splatting.grid import TileGrid
 from drgs.splatting.image_model import DEFAULT
-from drgs.splatting.tiles import TileGrid
 
 # As in test_rendering.
 PICTURE = {name: limit for name, limit in (("Float64", 1e-12), ("Float", 2e-5))}

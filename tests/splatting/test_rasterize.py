@@ -22,6 +22,7 @@ from drgs.reference import splatting as reference
 from drgs.splatting import image_model, rasterize
 from drgs.splatting import lanes as lanes_module
 from drgs.splatting.cutoffs import Cutoffs
+from drgs.splatting.grid import MICROS, TileGrid
 from drgs.splatting.image_model import ImageModel
 from drgs.splatting.projection import Splats2D
 from drgs.splatting.rasterize import (
@@ -30,7 +31,7 @@ from drgs.splatting.rasterize import (
     composite_adjoint,
     composite_tangent,
 )
-from drgs.splatting.tiles import MICROS, TileGrid, bin_splats
+from drgs.splatting.tiles import bin_splats
 
 # float64: some hundred terms of the size of the result. float32: an exponent of up to 8 carries
 # 1e-6, so alpha 1e-6 and a pixel a few of them; measured 1e-6. In the adjoint, S is the

@@ -18,8 +18,9 @@ from support.helpers import (
 
 from drgs.reference import splatting as reference
 from drgs.splatting import tiles
+from drgs.splatting.grid import GRID, MICRO, MICROS, TILE, TileGrid
 from drgs.splatting.projection import compensated_opacity, load_rows, plain_opacity, project
-from drgs.splatting.tiles import GRID, MICRO, MICROS, TILE, WORD, TileGrid, bin_splats
+from drgs.splatting.tiles import WORD, bin_splats
 
 CASES = [
     Case("37x29", 37, 29, 0),

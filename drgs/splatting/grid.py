@@ -1,0 +1,62 @@
+"""How the film is cut: tiles, their micro-tiles, and the lanes of kernels that have one each."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from drgs.core.constants import CULL_MARGIN, CULL_MARGIN_PER_PX
+
+MICRO = 4
+"""Pixels on a micro-tile's side. A micro-tile is one SIMD lane of the compositing kernels."""
+
+PIXELS = MICRO * MICRO
+"""Pixels of a micro-tile."""
+
+GRID = 4
+"""Micro-tiles on a tile's side."""
+
+TILE = MICRO * GRID
+"""Pixels on a tile's side."""
+
+MICROS = GRID * GRID
+"""Micro-tiles in a tile: the bits of an entry's mask."""
+
+
+@dataclass(frozen=True)
+class TileGrid:
+    """The tiles of a film of ``width`` x ``height`` px, in rows from the upper left corner."""
+
+    width: int
+    height: int
+
+    @property
+    def columns(self) -> int:
+        """Tiles in a row."""
+        return -(-self.width // TILE)
+
+    @property
+    def rows(self) -> int:
+        """Tiles in a column."""
+        return -(-self.height // TILE)
+
+    @property
+    def num_tiles(self) -> int:
+        """Tiles on the film."""
+        return self.columns * self.rows
+
+    @property
+    def cull_margin(self) -> float:
+        """What rounding may take from an exponent (base 2) on this film."""
+        return CULL_MARGIN + CULL_MARGIN_PER_PX * max(self.width, self.height)
+
+
+@dataclass(frozen=True)
+class Lanes:
+    """One lane per micro-tile, in the order in which Dr.Jit starts them."""
+
+    micro_tile: Any  # UInt32: tile * 16 + micro-tile within the tile
+    micro: Any  # UInt32: micro-tile within the tile
+    tile: Any  # UInt32
+    x: Any  # UInt32: first pixel column
+    y: Any  # UInt32: first pixel row
