@@ -1,0 +1,135 @@
+"""How Sphinx builds these pages: sphinx-build -W -b html docs docs/_build/html"""
+
+import re
+import sys
+from pathlib import Path
+from typing import ClassVar
+
+from docutils import nodes
+from docutils.parsers.rst import Directive
+from docutils.parsers.rst.directives.tables import ListTable
+from docutils.statemachine import StringList
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT))
+
+import drgs  # noqa: E402  (selects LLVM and registers the plugins before Mitsuba is imported)
+
+import mitsuba as mi  # noqa: E402, I001
+
+# Modules that use Mitsuba's types can only be imported once a variant is set.
+mi.set_variant("llvm_ad_rgb")
+
+project = "drgs"
+author = "The drgs authors"
+copyright = author
+release = version = drgs.__version__
+
+extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.mathjax"]
+exclude_patterns = ["_build"]
+nitpicky = False
+
+myst_enable_extensions = ["dollarmath"]
+myst_heading_anchors = 3  # links such as results.md#speed work here as on a code host
+
+autodoc_member_order = "bysource"
+autodoc_typehints = "description"
+autodoc_typehints_description_target = "documented"
+add_module_names = False
+
+html_theme = "furo"
+html_title = "drgs"
+
+
+# Docstrings are written to be read in the code: equations are indented, |x| is a norm. Those of
+# the plugins are in the format of Mitsuba's own documentation.
+
+MITSUBA_NAMES = "bool|differentiable|exposed|false|float|int|rgb|string|tensor|texture|transform|true"
+LITERAL = re.compile(r"(``.+?``|:\w+(?::\w+)?:`.+?`)")
+
+
+def as_restructured_text(app, what, name, obj, options, lines):
+    """Escape what reStructuredText would read as markup, and set indented blocks as they are."""
+    del app, what, obj, options
+    if name.startswith("drgs.plugins"):
+        text = re.sub(rf"\|({MITSUBA_NAMES})\|", r"``\1``", "\n".join(lines))
+        text = re.sub(r"(.+)\n-{4,}", r"**\1**", text)  # no section of a page within a class
+        lines[:] = re.sub(r"(\w)_(\.\.\.)", r"\1\_\2", text).split("\n")
+        return
+    result, literal = [], False
+    for k, line in enumerate(lines):
+        indented = line.startswith("    ")
+        after_blank = k == 0 or not lines[k - 1].strip()
+        if indented and after_blank and not literal:
+            before = next((text for text in reversed(result) if text.strip()), "")
+            if not before.endswith("::"):
+                result += ["::", ""]
+            literal = True
+        elif line.strip() and not indented:
+            literal = False
+        result.append(line if literal else _escaped(line))
+    lines[:] = result
+
+
+def _escaped(line):
+    """Outside of literals: no substitutions, no references, no emphasis within equations."""
+    parts = LITERAL.split(line)
+    for k in range(0, len(parts), 2):
+        parts[k] = re.sub(r"\||(?<=\w)_(?!\w)|\*(?=[\w(])(?<! \*)|(?<=\w)\*\*", r"\\\g<0>", parts[k])
+        if k > 0 and re.match(r"[\w^]", parts[k]):
+            parts[k] = r"\ " + parts[k]  # a literal ends before a space
+    return "".join(parts)
+
+
+class PluginParameters(ListTable):
+    """Mitsuba's table of parameters: name, type, description and, for some, flags."""
+
+    def run(self):
+        """Fill up rows without flags, and set the table with a header."""
+        rows, count = ["* - Parameter", "  - Type", "  - Description", "  - Flags"], 4
+        for line in self.content:
+            starts = line.startswith("* - ")
+            if starts and count < 4:
+                rows += ["  -"] * (4 - count)
+            count = 1 if starts else count + line.startswith("  - ")
+            rows.append(line)
+        rows = [row for row in rows if row.strip()] + ["  -"] * (4 - count)
+        self.content = StringList(rows, self.content.source(0))
+        self.options |= {"header-rows": 1, "widths": [20, 12, 53, 15]}
+        return super().run()
+
+
+class Tabs(Directive):
+    """Tabs one below the other."""
+
+    has_content = True
+
+    def run(self):
+        """What the tabs hold."""
+        node = nodes.container()
+        self.state.nested_parse(self.content, self.content_offset, node)
+        return node.children
+
+
+class CodeTab(Directive):
+    """A tab with a program."""
+
+    has_content = True
+    required_arguments = 1
+    optional_arguments = 1
+    option_spec: ClassVar = {"name": str}
+
+    def run(self):
+        """The program, highlighted."""
+        text = "\n".join(self.content)
+        return [nodes.literal_block(text, text, language=self.arguments[0])]
+
+
+def setup(app):
+    """Called by Sphinx."""
+    app.connect("autodoc-process-docstring", as_restructured_text)
+    app.add_directive("pluginparameters", PluginParameters)
+    app.add_directive("tabs", Tabs)
+    app.add_directive("code-tab", CodeTab)
+    for role in ("monosp", "paramtype"):
+        app.add_generic_role(role, nodes.literal)
