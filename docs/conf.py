@@ -13,9 +13,9 @@ from docutils.statemachine import StringList
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
-import drgs  # noqa: E402  (selects LLVM and registers the plugins before Mitsuba is imported)
+import mitsuba as mi  # noqa: E402
 
-import mitsuba as mi  # noqa: E402, I001
+import drgs  # noqa: E402  (selects LLVM and registers the plugins before Mitsuba is imported)
 
 # Modules that use Mitsuba's types can only be imported once a variant is set.
 mi.set_variant("llvm_ad_rgb")
@@ -44,7 +44,9 @@ html_title = "drgs"
 # Docstrings are written to be read in the code: equations are indented, |x| is a norm. Those of
 # the plugins are in the format of Mitsuba's own documentation.
 
-MITSUBA_NAMES = "bool|differentiable|exposed|false|float|int|rgb|string|tensor|texture|transform|true"
+MITSUBA_NAMES = (
+    "bool|differentiable|exposed|false|float|int|rgb|string|tensor|texture|transform|true"
+)
 LITERAL = re.compile(r"(``.+?``|:\w+(?::\w+)?:`.+?`)")
 
 
@@ -75,7 +77,9 @@ def _escaped(line):
     """Outside of literals: no substitutions, no references, no emphasis within equations."""
     parts = LITERAL.split(line)
     for k in range(0, len(parts), 2):
-        parts[k] = re.sub(r"\||(?<=\w)_(?!\w)|\*(?=[\w(])(?<! \*)|(?<=\w)\*\*", r"\\\g<0>", parts[k])
+        parts[k] = re.sub(
+            r"\||(?<=\w)_(?!\w)|\*(?=[\w(])(?<! \*)|(?<=\w)\*\*", r"\\\g<0>", parts[k]
+        )
         if k > 0 and re.match(r"[\w^]", parts[k]):
             parts[k] = r"\ " + parts[k]  # a literal ends before a space
     return "".join(parts)

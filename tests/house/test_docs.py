@@ -1,4 +1,4 @@
-"""What is documented is what there is: the plugins' tables, and the programs on the pages."""
+"""What the plugins' tables of parameters say is what there is."""
 
 import ast
 import re
@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 from conftest import REPOSITORY
 from support.views import Scene, tensors
-from test_splats import write_gaussians
 
 import drgs  # noqa: F401  (registers the plugins)
 from drgs.config.approximations import Approximations
@@ -208,47 +207,3 @@ def test_every_row_has_a_default_or_is_one_of_several_ways_to_give_gaussians():
 
 def row_text(name) -> str:
     return next(row.text for p in ("splats", "calibrated") for row in table(p) if name in row.names)
-
-
-# ----------------------------------------------------------------------------------------------
-# Programs
-# ----------------------------------------------------------------------------------------------
-
-
-def programs(page, language) -> list[str]:
-    """What is fenced on a page, in its order."""
-    text = (REPOSITORY / page).read_text()
-    return re.findall(rf"^```{language}\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
-
-
-@pytest.fixture
-def folder(tmp_path):
-    """Where the pages' file of Gaussians lies where they say."""
-    path = tmp_path / "out" / "lego" / "point_cloud.ply"
-    path.parent.mkdir(parents=True)
-    write_gaussians(path, Scene(count=20, degree=3).gaussians)
-    return tmp_path
-
-
-@pytest.mark.parametrize("page", ["README.md", "docs/mitsuba.md"])
-def test_the_programs_of_a_page_run_one_after_the_other(page, folder, run_python):
-    """In one process, as if they were pasted; those in XML are loaded and rendered behind them."""
-    files = []
-    for k, xml in enumerate(programs(page, "xml")):
-        (folder / f"page_{k}.xml").write_text(xml)
-        files.append(f"page_{k}.xml")
-    loading = "\n".join(f"assert mi.render(mi.load_file({name!r})).shape" for name in files)
-    python = programs(page, "python")
-    assert python
-    program = "\n".join([*python, loading, "print('all ran')"])
-    result = run_python(program, cwd=folder, PYTHONPATH=str(REPOSITORY))
-    assert result.returncode == 0, result.stderr
-    assert result.stdout.endswith("all ran\n")
-
-
-def test_pages_link_to_what_there_is():
-    for page in ("README.md", "docs/mitsuba.md"):
-        path = REPOSITORY / page
-        for target in re.findall(r"\]\(([^)#]+?)(?:#[^)]*)?\)", path.read_text()):
-            if "://" not in target:
-                assert (path.parent / target).exists(), f"{page}: {target}"

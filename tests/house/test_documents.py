@@ -1,0 +1,221 @@
+"""What the pages say is what there is: links, paths, names, commands, options, and programs."""
+
+import contextlib
+import importlib
+import io
+import re
+import shlex
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import REPOSITORY
+from support.views import Scene
+
+from drgs.config.schema import FitConfig
+from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
+from drgs.io.ply import write_ply
+
+PAGES = (
+    "README.md",
+    "CHANGELOG.md",
+    "CONTRIBUTING.md",
+    *(f"docs/{path.name}" for path in sorted((REPOSITORY / "docs").glob("*.md"))),
+)
+
+each_page = pytest.mark.parametrize("page", PAGES)
+
+
+def text_of(page) -> str:
+    return (REPOSITORY / page).read_text()
+
+
+def fenced(page, language) -> list[str]:
+    """Blocks of a page, in their order."""
+    return re.findall(rf"^```{language}\n(.*?)^```", text_of(page), re.MULTILINE | re.DOTALL)
+
+
+def inline_code(page) -> list[str]:
+    """What stands in backticks, outside of blocks."""
+    prose = re.sub(r"^```.*?^```", "", text_of(page), flags=re.MULTILINE | re.DOTALL)
+    return re.findall(r"`([^`\n]+)`", prose)
+
+
+# ----------------------------------------------------------------------------------------------
+# The README
+# ----------------------------------------------------------------------------------------------
+
+MOST_WORDS = 1200
+
+
+def test_the_readme_is_short():
+    assert len(text_of("README.md").split()) <= MOST_WORDS
+
+
+def test_the_readme_has_two_commands_each_alone_on_its_line():
+    assert [block.strip() for block in fenced("README.md", "sh")] == [
+        "bash .ci/setup python -m drgs.fit scenes/lego.yml",
+        "bash .ci/setup python -m pytest",
+    ]
+
+
+def test_the_readme_leads_to_every_page():
+    for page in PAGES:
+        if page not in ("README.md", "docs/index.md"):
+            assert f"]({page})" in text_of("README.md")
+
+
+# ----------------------------------------------------------------------------------------------
+# Links, paths and names
+# ----------------------------------------------------------------------------------------------
+
+
+def anchors(path) -> set[str]:
+    """Of the headings, as code hosts make them."""
+    headings = re.findall(r"^#+ (.*)$", path.read_text(), re.MULTILINE)
+    return {
+        re.sub(r"[^\w\- ]", "", heading).strip().lower().replace(" ", "-") for heading in headings
+    }
+
+
+@each_page
+def test_links_lead_somewhere(page):
+    path = REPOSITORY / page
+    for target in re.findall(r"\]\(([^)\s]+)\)", path.read_text()):
+        if "://" in target:
+            continue
+        name, _, anchor = target.partition("#")
+        linked = path.parent / name if name else path
+        assert linked.exists(), target
+        assert not anchor or anchor in anchors(linked), target
+
+
+FOLDERS = ("drgs", "plugins", "scenes", "tests", "docs")
+OF_WORKED_EXAMPLES = {"drgs/effects/fog.py", "drgs/cameras/stereographic.py"}
+
+
+@each_page
+def test_paths_in_the_text_exist(page):
+    for code in inline_code(page):
+        if code.startswith(tuple(f"{folder}/" for folder in FOLDERS)):
+            for path in code.split()[:1]:
+                assert path in OF_WORKED_EXAMPLES or (REPOSITORY / path).exists(), path
+
+
+GONE = {"drgs.rendering"}  # of the changelog
+
+
+@each_page
+def test_names_of_modules_and_their_contents_exist(page):
+    for code in inline_code(page):
+        if re.fullmatch(r"drgs(\.\w+)+", code) and code not in GONE:
+            assert _exists(code), code
+
+
+def _exists(name) -> bool:
+    module, names = name, []
+    while True:
+        with contextlib.suppress(ModuleNotFoundError):
+            found = importlib.import_module(module)
+            break
+        module, _, last = module.rpartition(".")
+        names.insert(0, last)
+    for each in names:
+        found = getattr(found, each, None)
+    return found is not None
+
+
+@each_page
+def test_keys_of_the_configuration_exist(page):
+    for code in inline_code(page):
+        match = re.fullmatch(r"(\w+)\.(\w+)(=.*)?", code)
+        if match and match[2] != "json" and match[1] in FitConfig.model_fields:
+            section = FitConfig.model_fields[match[1]].annotation
+            assert match[2] in section.model_fields, code
+
+
+# ----------------------------------------------------------------------------------------------
+# Commands
+# ----------------------------------------------------------------------------------------------
+
+MODULES = {
+    "fit": "drgs.fit",
+    "render": "drgs.render",
+    "capture": "drgs.capture",
+    "bench": "drgs.bench.__main__",
+}
+
+
+def commands(page) -> list[list[str]]:
+    """The commands of drgs on a page, without what starts them: ``fit scenes/lego.yml``."""
+    lines = [line for block in fenced(page, "sh") for line in block.splitlines()]
+    found = []
+    for line in [*lines, *inline_code(page)]:
+        match = re.search(r"python -m drgs\.(.*)|^drgs (.*)", line)
+        if match:
+            found.append(shlex.split(match[1] or match[2], comments=True))
+    return found
+
+
+@cache
+def help_of(*command) -> str:
+    """What ``--help`` prints."""
+    printed = io.StringIO()
+    main = importlib.import_module(MODULES[command[0]]).main
+    with contextlib.redirect_stdout(printed), pytest.raises(SystemExit) as end:
+        main([*command[1:], "--help"])
+    assert end.value.code == 0
+    return printed.getvalue()
+
+
+@each_page
+def test_commands_and_their_options_exist(page):
+    for name, *arguments in commands(page):
+        assert name in MODULES, name
+        command = (name, *arguments[:1]) if name == "bench" and arguments else (name,)
+        options = {argument for argument in arguments if re.match(r"--?[a-zA-Z]", argument)}
+        assert options <= set(re.findall(r"--?[a-zA-Z][\w-]*", help_of(*command))), arguments
+
+
+def test_the_pages_show_every_command():
+    shown = {command[0] for page in PAGES for command in commands(page)}
+    benches = {tuple(c[1:2]) for page in PAGES for c in commands(page) if c[0] == "bench"}
+    assert shown == set(MODULES)
+    known = re.search(r"\{([\w,]+)\}", help_of("bench"))[1].split(",")
+    assert {name for each in benches for name in each} == set(known)
+
+
+# ----------------------------------------------------------------------------------------------
+# Programs
+# ----------------------------------------------------------------------------------------------
+
+WITH_PROGRAMS = tuple(page for page in PAGES if fenced(page, "python"))
+
+
+@pytest.fixture
+def folder(tmp_path) -> Path:
+    """Where files lie that the pages' programs read."""
+    path = tmp_path / "out" / "lego" / "point_cloud.ply"
+    path.parent.mkdir(parents=True)
+    gaussians = Scene(count=20, degree=3).gaussians
+    columns = {name: getattr(gaussians, name).astype(np.float32) for name in PARAMETER_NAMES}
+    write_ply(path, Gaussians(**columns))
+    return tmp_path
+
+
+def test_the_programs_of_the_pages_run(folder, run_python):
+    """Each page's one after the other, as if they were pasted, then its scenes in XML."""
+    program = []
+    for page in WITH_PROGRAMS:
+        name = f"page_{Path(page).stem}"
+        (folder / f"{name}.py").write_text("\n".join(fenced(page, "python")))
+        program.append(f"exec(compile(open('{name}.py').read(), {page!r}, 'exec'), {{}})")
+        program.append(f"print('ran', {page!r})")
+        for k, xml in enumerate(fenced(page, "xml")):
+            (folder / f"{name}_{k}.xml").write_text(xml)
+            program.append("import mitsuba as mi")
+            program.append(f"assert mi.render(mi.load_file('{name}_{k}.xml')).shape")
+    result = run_python("\n".join(program), cwd=folder, PYTHONPATH=str(REPOSITORY))
+    assert result.returncode == 0, result.stderr
+    assert result.stdout.count("ran ") >= len(WITH_PROGRAMS) == 3, result.stdout
