@@ -47,7 +47,6 @@ from drgs.gaussians.parameters import Gaussians
 from drgs.integrator.scene import check_lenses
 from drgs.integrator.summary import described
 from drgs.io.pictures import write_png
-from drgs.io.ply import write_ply
 from drgs.results.files import (
     BUDGET_PLAN,
     CHECKPOINT,
@@ -185,7 +184,7 @@ def run(
         gaussians = trainer.gaussians()
     except NonFiniteError as error:
         raise UserError(f"{error}; {_remedy(out)}") from None
-    write_ply(out / GAUSSIANS, as_saved(gaussians, trainer))
+    as_saved(gaussians, trainer).save(out / GAUSSIANS)
     for effect in trainer.effects:
         effect.write(out, dataset.train)
     write_history(out / HISTORY, log.rows)

@@ -50,7 +50,6 @@ from drgs.gaussians.parameters import Gaussians
 from drgs.integrator.scene import check_lenses, make_scene, render_views
 from drgs.integrator.summary import described, summary_of_views
 from drgs.io.pictures import read_image, write_animation, write_exr, write_png
-from drgs.io.ply import read_ply
 from drgs.results.files import CAMERAS, CONFIG, GAUSSIANS, METRICS, ORBIT
 from drgs.results.metrics import Quality, psnr, ssim
 
@@ -147,7 +146,7 @@ def load_model(args: argparse.Namespace) -> Model:
         config_path = config_path or what / CONFIG
         what = what / GAUSSIANS
     config = _load_config(config_path, args) if config_path is not None else None
-    gaussians = read_ply(what)
+    gaussians = Gaussians.load(what)
     model, background = ModelConfig(), NAMED_COLORS[DataConfig.model_fields["background"].default]
     if config is not None:
         model, background = config.model, config.data.background_rgb

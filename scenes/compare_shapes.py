@@ -21,9 +21,9 @@ import drgs  # noqa: F401  (registers the plugin)
 from drgs.bench.output import machine
 from drgs.cli.errors import exit_on_user_error
 from drgs.data.orbits import orbit_of_gaussians
+from drgs.gaussians.parameters import Gaussians
 from drgs.io.figures import new_figure, write_figure
 from drgs.io.pictures import to_uint8
-from drgs.io.ply import read_ply
 from drgs.results import metrics
 
 FOLDER = Path(__file__).parent
@@ -68,7 +68,7 @@ def main() -> None:
 
 def view_of(model: Path) -> dict[str, str]:
     """Parameters of the scene file that show all of a model from the front, z up."""
-    orbit = orbit_of_gaussians(read_ply(model), np.array([0.0, 0.0, 1.0]), FIELD_OF_VIEW)
+    orbit = orbit_of_gaussians(Gaussians.load(model), np.array([0.0, 0.0, 1.0]), FIELD_OF_VIEW)
     center = orbit.viewpoints(1, 1, 1, FIELD_OF_VIEW)[0].camera_to_world[:3, 3]
     points = {"origin": center, "target": orbit.focus}
     return {

@@ -13,7 +13,6 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from drgs.gaussians.parameters import Gaussians
-from drgs.io.ply import write_ply
 from drgs.reference import splatting as reference
 
 FILE = Path(__file__).parent / "shapes" / "knot.ply"
@@ -93,5 +92,5 @@ def unit(vectors: np.ndarray) -> np.ndarray:
 if __name__ == "__main__":
     path = Path(sys.argv[1]) if len(sys.argv) > 1 else FILE
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_ply(path, knot())
+    knot().save(path)
     print(f"written: {path}")

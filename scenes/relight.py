@@ -50,7 +50,6 @@ from drgs.gaussians.sh import sh_basis
 from drgs.gaussians.similarity import Similarity
 from drgs.io.figures import new_figure, write_figure
 from drgs.io.pictures import write_animation, write_png
-from drgs.io.ply import read_ply
 from drgs.reference import splatting as reference
 
 
@@ -223,7 +222,7 @@ class Stage:
 
 def load(path: Path) -> Gaussians:
     """A fitted model (numpy), moved and scaled to stand around the origin with radius 1."""
-    gaussians = read_ply(path / "point_cloud.ply" if path.is_dir() else path)
+    gaussians = Gaussians.load(path / "point_cloud.ply" if path.is_dir() else path)
     orbit = orbit_of_gaussians(gaussians, np.array([0.0, 0.0, 1.0]), FIELD_OF_VIEW)
     radius = orbit.radius * np.sin(np.radians(FIELD_OF_VIEW / 2))
     return Similarity(1 / radius, np.eye(3), -orbit.focus / radius).of_gaussians(gaussians)

@@ -37,7 +37,6 @@ from drgs.data.types import View
 from drgs.effects.smoothing import baked
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 from drgs.io.figures import new_figure, write_figure
-from drgs.io.ply import read_ply
 from drgs.reference import rays as reference_rays
 from drgs.reference import splatting as reference
 from drgs.results import metrics
@@ -198,8 +197,12 @@ def load_subject(path: Path, num_views: int) -> Subject:
         views = dataset.test[::step][:num_views]
         _check_pinholes(views, config_file, ply)
         cameras = [camera_of(view, config.model.near) for view in views]
-        return Subject(path.name, baked(read_ply(ply)), cameras, list(views), dataset.background)
-    return Subject(path.stem, baked(read_ply(path)), [bench_camera(SIZE)], [], (1.0, 1.0, 1.0))
+        return Subject(
+            path.name, baked(Gaussians.load(ply)), cameras, list(views), dataset.background
+        )
+    return Subject(
+        path.stem, baked(Gaussians.load(path)), [bench_camera(SIZE)], [], (1.0, 1.0, 1.0)
+    )
 
 
 def _check_pinholes(views: Sequence[View], config_file: Path, ply: Path) -> None:

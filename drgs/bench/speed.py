@@ -31,8 +31,8 @@ from drgs.bench.pairs import Work, count_work
 from drgs.bench.profile import STAGES, StageClock, stage_clock
 from drgs.bench.scenes import Scene, bench_camera, bench_gaussians, frame_of, trainer_of
 from drgs.core.files import atomic_path
+from drgs.gaussians.parameters import Gaussians
 from drgs.io.figures import new_figure, write_figure
-from drgs.io.ply import read_ply
 from drgs.results.files import GAUSSIANS
 from drgs.training.trainer import Trainer
 
@@ -113,7 +113,7 @@ def scenes_of(args: argparse.Namespace) -> list[Scene]:
     counts = (10_000,) if args.quick else (10_000, 100_000)
     scenes = [Scene(f"bench scene, {n:,}", bench_gaussians(n), camera) for n in counts]
     if args.trained.exists():
-        gaussians = read_ply(args.trained)
+        gaussians = Gaussians.load(args.trained)
         scenes.append(Scene(f"trained, {gaussians.num_gaussians:,}", gaussians, camera))
     else:
         print(f"{args.trained}: not there; fit a scene, or name one with --trained, to measure it")

@@ -1,4 +1,4 @@
 """The scene's type, its spherical harmonics, and how both are turned.
 
-May import ``core``.
+May import ``io`` and ``core``.
 """

@@ -1,14 +1,15 @@
 """The scene representation: N anisotropic 3D Gaussians with view-dependent colour.
 
-A :class:`Gaussians` comes from disk (``drgs.io``) or from the trainer's optimizer and is what
-``drgs.splatting.projection`` and ``drgs.gaussians.sh`` read. It holds either numpy arrays (as files
-give them; no Dr.Jit backend is touched) or Dr.Jit arrays, and every stage derives its types from
-it.
+A :class:`Gaussians` comes from a file, from numpy arrays or from the trainer's optimizer and is
+what ``drgs.splatting.projection`` and ``drgs.gaussians.sh`` read. It holds either numpy arrays (as
+files give them; no Dr.Jit backend is touched) or Dr.Jit arrays, and every stage derives its types
+from it.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import drjit as dr
@@ -37,6 +38,74 @@ class Gaussians:
         None  # (N,) world units, not optimised: see drgs.effects.smoothing; None: there is none
     )
     features: Any = None  # by name, (N, C) each: whatever else is to be composited; None: nothing
+
+    @staticmethod
+    def load(path: str | Path) -> Gaussians:
+        """The Gaussians of a PLY file in the layout of the 3DGS reference, as numpy arrays.
+
+        float32, with the values and the SH degree that the file holds.
+
+        Raises ``drgs.core.errors.UserError`` (a ValueError) naming the file and what it lacks.
+        """
+        from drgs.io.ply import read_gaussians
+
+        return Gaussians(**read_gaussians(path))
+
+    def save(self, path: str | Path) -> None:
+        """Write a PLY file in the layout of the 3DGS reference, atomically.
+
+        Equal Gaussians give equal bytes. Not saved: ``features``.
+        """
+        from drgs.io.ply import write_gaussians
+
+        host = self.numpy()
+        write_gaussians(path, {name: getattr(host, name) for name in host._names})
+
+    @staticmethod
+    def from_numpy(
+        means: np.ndarray,
+        quats: np.ndarray,
+        scales: np.ndarray,
+        opacities: np.ndarray,
+        sh: np.ndarray,
+    ) -> Gaussians:
+        """Gaussians of float32 numpy arrays from activated values, as they are seen.
+
+        means: (N, 3) world; quats: (N, 4) wxyz, of any norm; scales: (N, 3) standard deviations,
+        world units; opacities: (N,); sh: (N, K, 3) coefficients, display space, of degree 0 to 3,
+        K = (degree + 1)^2.
+
+        Raises ValueError for another shape, a scale that is not positive, or an opacity that is not
+        between 0 and 1.
+        """
+        means, quats, scales, opacities, sh = (
+            np.asarray(values, np.float32) for values in (means, quats, scales, opacities, sh)
+        )
+        num, where = len(means), "Gaussians.from_numpy(): "
+        coefficients = [(degree + 1) ** 2 for degree in range(4)]
+        for name, values, shapes in (
+            ("means", means, [(num, 3)]),
+            ("quats", quats, [(num, 4)]),
+            ("scales", scales, [(num, 3)]),
+            ("opacities", opacities, [(num,)]),
+            ("sh", sh, [(num, count, 3) for count in coefficients]),
+        ):
+            if values.shape not in shapes:
+                expected = " or ".join(str(shape) for shape in shapes)
+                raise ValueError(f"{where}{name} must be of shape {expected}, got {values.shape}")
+        if not (scales > 0).all():
+            raise ValueError(f"{where}scales must be positive, got {scales.min()}")
+        if not ((opacities > 0) & (opacities < 1)).all():
+            wrong = opacities[~((opacities > 0) & (opacities < 1))][0]
+            raise ValueError(f"{where}opacities must be between 0 and 1, got {wrong}")
+        return Gaussians(
+            means=means,
+            quats=quats,
+            log_scales=np.log(scales),
+            logit_opacities=np.log(opacities) - np.log1p(-opacities),
+            sh0=sh[:, :1],
+            shN=sh[:, 1:],
+        )
 
     @property
     def num_gaussians(self) -> int:

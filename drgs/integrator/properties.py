@@ -19,7 +19,6 @@ from drgs.config.approximations import Approximations
 from drgs.core.errors import did_you_mean
 from drgs.effects.compose import IGNORABLE
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
-from drgs.io.ply import read_ply
 
 AOVS = {"depth": ("T",), "alpha": ("I",), "normal": ("X", "Y", "Z")}
 """What may be put out besides colour, and the names of its channels as Mitsuba has them."""
@@ -45,7 +44,7 @@ def load_gaussians(props: mi.Properties) -> Gaussians:
                 f"splats: give either 'filename' or tensors, got both ({', '.join(given)})"
             )
         path = mi.file_resolver().resolve(str(props["filename"]))
-        gaussians = replace(read_ply(str(path)).to(mi.TensorXf), features=features)
+        gaussians = replace(Gaussians.load(str(path)).to(mi.TensorXf), features=features)
     elif given or features or "smoothing" in props or "to_world" in props:
         missing = [name for name in PARAMETER_NAMES if name not in given and name != "shN"]
         if missing:

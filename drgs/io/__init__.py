@@ -1,8 +1,4 @@
 """Files: Gaussians and points as PLY, pictures and animations; needs no libLLVM.
 
-May import ``gaussians`` and ``core``.
+May import ``core``.
 """
-
-from drgs.io.ply import read_ply, read_points, write_ply
-
-__all__ = ["read_ply", "read_points", "write_ply"]

@@ -13,6 +13,7 @@ more, ``filter_3D``, the filter's standard deviation, as in Mip-Splatting's file
 from __future__ import annotations
 
 import io
+from collections.abc import Mapping
 from pathlib import Path
 from typing import IO
 
@@ -21,7 +22,6 @@ from plyfile import PlyData, PlyElement, PlyElementParseError
 
 from drgs.core.errors import UserError, one_line
 from drgs.core.files import atomic_path
-from drgs.gaussians.parameters import Gaussians
 
 POSITION = ("x", "y", "z")
 NORMAL = ("nx", "ny", "nz")
@@ -39,10 +39,12 @@ MAX_HEADER_BYTES = 1 << 20
 """The header of 62 properties takes 1.5 kB; the rest is room for comments."""
 
 
-def read_ply(path: str | Path) -> Gaussians:
+def read_gaussians(path: str | Path) -> dict[str, np.ndarray]:
     """Gaussians as numpy float32 arrays, with the values and the SH degree that the file holds.
 
-    Properties are found by name, in any order and of any numeric type; others are ignored.
+    By the names of the fields of :class:`drgs.gaussians.parameters.Gaussians`, whose ``load`` calls
+    this; ``smoothing`` is missing where the file has none. Properties are found by name, in any
+    order and of any numeric type; others are ignored.
 
     Raises :class:`UserError` naming the file and what it lacks: it must be whole, hold at least
     one row, and nothing but finite numbers.
@@ -57,41 +59,41 @@ def read_ply(path: str | Path) -> Gaussians:
     _require(
         path, vertex, (*POSITION, *SH0, *_rest(num_rest), *OPACITY, *SCALE, *ROTATION), "Gaussians"
     )
-    smoothing = None
+    sh_rest = _columns(vertex, _rest(num_rest)).reshape(len(vertex), 3, num_rest // 3)
+    gaussians = {
+        "means": _columns(vertex, POSITION),
+        "quats": _columns(vertex, ROTATION),
+        "log_scales": _columns(vertex, SCALE),
+        "logit_opacities": _columns(vertex, OPACITY)[:, 0],
+        "sh0": _columns(vertex, SH0)[:, None, :],
+        "shN": np.ascontiguousarray(sh_rest.transpose(0, 2, 1)),
+    }
     if set(SMOOTHING) <= set(vertex.dtype.names):
         _require(path, vertex, SMOOTHING, "Gaussians")
-        smoothing = _columns(vertex, SMOOTHING)[:, 0]
-    sh_rest = _columns(vertex, _rest(num_rest)).reshape(len(vertex), 3, num_rest // 3)
-    return Gaussians(
-        means=_columns(vertex, POSITION),
-        quats=_columns(vertex, ROTATION),
-        log_scales=_columns(vertex, SCALE),
-        logit_opacities=_columns(vertex, OPACITY)[:, 0],
-        sh0=_columns(vertex, SH0)[:, None, :],
-        shN=np.ascontiguousarray(sh_rest.transpose(0, 2, 1)),
-        smoothing=smoothing,
-    )
+        gaussians["smoothing"] = _columns(vertex, SMOOTHING)[:, 0]
+    return gaussians
 
 
-def write_ply(path: str | Path, gaussians: Gaussians) -> None:
+def write_gaussians(path: str | Path, gaussians: Mapping[str, np.ndarray]) -> None:
     """Write Gaussians as the 3DGS reference does, binary little-endian, atomically.
 
-    Equal Gaussians give equal bytes.
+    gaussians: numpy arrays by the names that :func:`read_gaussians` gives. Equal Gaussians give
+    equal bytes.
     """
-    g = gaussians.numpy()
-    num, num_rest = g.num_gaussians, 3 * g.shN.shape[1]
+    g = gaussians
+    num, num_rest = len(g["means"]), 3 * g["shN"].shape[1]
     names = (*POSITION, *NORMAL, *SH0, *_rest(num_rest), *OPACITY, *SCALE, *ROTATION)
-    names += () if g.smoothing is None else SMOOTHING
+    names += SMOOTHING if "smoothing" in g else ()
     rows = np.concatenate(
         [
-            g.means,
+            g["means"],
             np.zeros((num, 3)),
-            g.sh0.reshape(num, 3),
-            g.shN.transpose(0, 2, 1).reshape(num, num_rest),
-            g.logit_opacities.reshape(num, 1),
-            g.log_scales,
-            g.quats,
-            *([] if g.smoothing is None else [g.smoothing.reshape(num, 1)]),
+            g["sh0"].reshape(num, 3),
+            g["shN"].transpose(0, 2, 1).reshape(num, num_rest),
+            g["logit_opacities"].reshape(num, 1),
+            g["log_scales"],
+            g["quats"],
+            *([g["smoothing"].reshape(num, 1)] if "smoothing" in g else []),
         ],
         axis=1,
     ).astype("<f4")
@@ -105,7 +107,7 @@ def read_points(path: str | Path) -> tuple[np.ndarray, np.ndarray | None]:
 
     Integer colours are scaled by their type's range, floats are taken as they are.
 
-    Raises :class:`UserError` naming the file and what it lacks, as :func:`read_ply` does.
+    Raises :class:`UserError` naming the file and what it lacks, as :func:`read_gaussians` does.
     """
     vertex = _read_vertices(path)
     _require(path, vertex, POSITION, "points")

@@ -18,7 +18,6 @@ from drgs.bench.scenes import bench_camera, bench_gaussians, stress_scene
 from drgs.config.load import dump_config
 from drgs.config.schema import FitConfig
 from drgs.data.types import View
-from drgs.io.ply import write_ply
 from drgs.reference import rays as reference_rays
 from drgs.results import metrics
 
@@ -116,7 +115,7 @@ def test_the_stress_scene_is_what_it_says():
 
 def test_the_command_measures_a_ply_and_the_stress_scene(tmp_path, capsys, monkeypatch):
     mi.set_variant("llvm_ad_rgb")
-    write_ply(tmp_path / "few.ply", bench_gaussians(50))
+    bench_gaussians(50).save(tmp_path / "few.ply")
     monkeypatch.setattr(accuracy, "SIZE", 32)
     monkeypatch.setattr(accuracy, "RUNGS", accuracy.RUNGS[:3])
     bench.main(["accuracy", str(tmp_path / "few.ply"), "--quick", "--out", str(tmp_path)])
@@ -146,7 +145,7 @@ def test_a_smoothing_filter_is_part_of_what_is_measured(tmp_path, subject):
     """Of the most accurate form and of all rungs: they agree as they do without it."""
     gaussians = subject.gaussians
     smoothing = np.full(gaussians.num_gaussians, 0.1, np.float32)
-    write_ply(tmp_path / "smooth.ply", replace(gaussians, smoothing=smoothing))
+    replace(gaussians, smoothing=smoothing).save(tmp_path / "smooth.ply")
     found = accuracy.load_subject(tmp_path / "smooth.ply", 1)
     assert (found.gaussians.log_scales > gaussians.log_scales).all()
     found = replace(found, cameras=subject.cameras, background=subject.background)
@@ -174,7 +173,7 @@ def test_views_that_are_not_of_pinholes_at_rest_are_refused(tmp_path, capsys, ha
     path.write_text(json.dumps(transforms))
     fit = tmp_path / "fit"
     fit.mkdir()
-    write_ply(fit / "point_cloud.ply", bench_gaussians(10))
+    bench_gaussians(10).save(fit / "point_cloud.ply")
     dump_config(FitConfig(data={"path": str(tmp_path / "data")}), fit / "config.yml")
     with pytest.raises(SystemExit) as stop:
         bench.main(["accuracy", str(fit)])

@@ -11,7 +11,6 @@ from drgs.bench import __main__ as bench
 from drgs.bench import accuracy, volprim
 from drgs.bench.scenes import bench_camera, bench_gaussians
 from drgs.gaussians.parameters import PARAMETER_NAMES
-from drgs.io.ply import write_ply
 from drgs.reference import rays as reference_rays
 from drgs.reference import splatting as reference
 from drgs.results import metrics
@@ -60,7 +59,7 @@ def test_an_enlarged_scene_is_the_same_picture(subject):
 def test_the_command_writes_its_table(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(accuracy, "SIZE", 32)
     monkeypatch.setattr(volprim, "FACTORS", (1, 16))
-    write_ply(tmp_path / "few.ply", bench_gaussians(100))
+    bench_gaussians(100).save(tmp_path / "few.ply")
     bench.main(["volprim", str(tmp_path / "few.ply"), "--out", str(tmp_path)])
     printed = capsys.readouterr().out
     assert "| lengths x 1 | lengths x 16 |" in printed

@@ -13,7 +13,7 @@ from support.small_capture import blobs, make_dataset, write_dataset
 from drgs import fit, render
 from drgs.cli.execution import execution
 from drgs.core.errors import UserError
-from drgs.io.ply import read_ply, write_ply
+from drgs.gaussians.parameters import Gaussians
 
 DEBUG = dr.JitFlag.Debug
 
@@ -154,7 +154,7 @@ def scene(tmp_path_factory):
         "output": {"checkpoint_every": 1},
     }
     (folder / "a.yml").write_text(yaml.safe_dump(values))
-    write_ply(folder / "blobs.ply", blobs())
+    blobs().save(folder / "blobs.ply")
     return folder
 
 
@@ -191,7 +191,7 @@ def test_fit_has_no_access_out_of_range_and_gives_the_same_bytes_with_range_chec
         fit.main([str(scene / "a.yml"), "--out", str(tmp_path / name), *options])
     assert flags == [False] * 3 + [True] * 3
     assert "out-of-bounds" not in capsys.readouterr().err
-    assert read_ply(tmp_path / "plain" / "point_cloud.ply").num_gaussians > 40
+    assert Gaussians.load(tmp_path / "plain" / "point_cloud.ply").num_gaussians > 40
     for name in ("point_cloud.ply", "renders/test/r_0.png"):
         plain, checked = ((tmp_path / run / name).read_bytes() for run in ("plain", "checked"))
         assert plain == checked, name

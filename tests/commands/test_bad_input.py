@@ -26,7 +26,7 @@ from drgs.config.schema import FitConfig
 from drgs.core.errors import UserError
 from drgs.data import load_dataset
 from drgs.gaussians.parameters import Gaussians
-from drgs.io import read_ply, read_points, write_ply
+from drgs.io.ply import read_points
 from drgs.results.folder import claim_output_folder
 from drgs.training.checkpoint import Checkpoint, save_checkpoint
 
@@ -55,7 +55,7 @@ def make_scene(folder):
             iio.imwrite(folder / split / f"{i}.png", pixels)
         meta = {"camera_angle_x": 0.7, "frames": frames}
         (folder / f"transforms_{split}.json").write_text(json.dumps(meta))
-    write_ply(folder / "points.ply", some_gaussians(5))
+    some_gaussians(5).save(folder / "points.ply")
     (folder / "a.yml").write_text(yaml.safe_dump(SETTINGS))
 
 
@@ -109,7 +109,7 @@ def edit_means(row, value):
     def apply(folder):
         gaussians = some_gaussians(5)
         gaussians.means[row] = value
-        write_ply(folder / "points.ply", gaussians)
+        gaussians.save(folder / "points.ply")
 
     return apply
 
@@ -216,7 +216,7 @@ WRONG_INPUTS = {
     ),
     "point cloud with NaN": (edit_means(3, np.nan), "points.ply: element vertex, row 3: x must be"),
     "point cloud empty": (
-        lambda f: write_ply(f / "points.ply", some_gaussians(0)),
+        lambda f: some_gaussians(0).save(f / "points.ply"),
         "points.ply: element vertex must have at least 1 row, got 0",
     ),
     "point cloud too long": (
@@ -374,7 +374,7 @@ def test_a_folder_that_may_not_be_written_keeps_its_files(as_ordinary_user):
     folder.chmod(0o500)
     message = "Permission denied; choose a folder that you may write to"
     with pytest.raises(UserError, match=f"points.ply: cannot write the file: {message}"):
-        write_ply(folder / "points.ply", some_gaussians(7))
+        some_gaussians(7).save(folder / "points.ply")
     with pytest.raises(UserError, match=f"out: cannot be the output folder: {message}"):
         claim_output_folder(folder / "out", config)
     assert contents(folder) == before
@@ -405,7 +405,7 @@ def save_large_checkpoint(path):
 
 
 WRITERS = {
-    "point_cloud.ply": lambda path: write_ply(path, some_gaussians(5000)),
+    "point_cloud.ply": lambda path: some_gaussians(5000).save(path),
     "checkpoint.npz": save_large_checkpoint,
     "config.yml": lambda path: dump_config(
         FitConfig(data={"path": "x", "source": "y" * 10**5}), path
@@ -428,5 +428,5 @@ def test_a_full_disk_keeps_the_earlier_file(small_disk, name, write_large):
 
 
 def test_what_fits_on_a_small_disk_is_written(small_disk):
-    write_ply(small_disk / "a.ply", some_gaussians(9))
-    assert read_ply(small_disk / "a.ply").num_gaussians == 9
+    some_gaussians(9).save(small_disk / "a.ply")
+    assert Gaussians.load(small_disk / "a.ply").num_gaussians == 9

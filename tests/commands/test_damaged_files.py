@@ -22,8 +22,9 @@ from drgs.config.schema import DataConfig, FitConfig
 from drgs.core.errors import UserError
 from drgs.data import initial_gaussians, load_dataset
 from drgs.data.images import composite
-from drgs.io import read_ply, read_points
+from drgs.gaussians.parameters import Gaussians
 from drgs.io.pictures import read_image
+from drgs.io.ply import read_points
 
 COUNT = 600
 """Mutations of each format."""
@@ -236,7 +237,7 @@ def test_damaged_ply_files_are_read_or_refused(tmp_path):
         content = gaussians_file(text=seed % 3 == 0)
         mutate = mutate_header if seed % 2 else mutate_bytes
         path.write_bytes(mutate(rng, content))
-        for read in (read_ply, read_points):
+        for read in (Gaussians.load, read_points):
             refused.append(check(seed, path, lambda read=read: read(path)))
     assert_both_happen(refused)
 

@@ -17,7 +17,7 @@ from conftest import REPOSITORY
 from drgs.cli.execution import execution
 from drgs.config.load import dump_config, load_config
 from drgs.data import initial_gaussians, load_dataset
-from drgs.io.ply import read_ply, write_ply
+from drgs.gaussians.parameters import Gaussians
 from drgs.reference import splatting as reference
 
 SIZE = 32
@@ -165,7 +165,7 @@ def test_population_changes_and_never_exceeds_its_cap(fitted):
     population = [int(row["num_gaussians"]) for row in rows]
     assert len(set(population)) > 1
     assert max(population) <= 500
-    assert len(read_ply(out / "point_cloud.ply").means) == population[-1]
+    assert len(Gaussians.load(out / "point_cloud.ply").means) == population[-1]
     assert [int(row["iteration"]) for row in rows] == list(range(10, 301, 10))
     assert float(rows[-1]["loss"]) < 0.5 * float(rows[0]["loss"])
 
@@ -199,7 +199,7 @@ def test_the_configuration_changes_all_that_a_fit_can_change(fitted, configurati
     assert degrees == {0, 1}
 
     _, first = fitted
-    write_ply(first.parent / "in_process.ply", trainer.gaussians())
+    trainer.gaussians().save(first.parent / "in_process.ply")
     expected = (first / "point_cloud.ply").read_bytes()
     assert (first.parent / "in_process.ply").read_bytes() == expected
 

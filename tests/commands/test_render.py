@@ -28,7 +28,6 @@ from support.small_capture import view as small_view
 
 from drgs import render
 from drgs.data.orbits import orbit_of_gaussians, orbit_of_views
-from drgs.io.ply import write_ply
 
 WHITE = (1.0, 1.0, 1.0)
 
@@ -38,7 +37,7 @@ def fit(tmp_path_factory):
     """A folder as a fit leaves it, with its dataset."""
     folder = tmp_path_factory.mktemp("fit")
     write_dataset(folder / "data", make_dataset())
-    write_ply(folder / "run" / "point_cloud.ply", blobs())
+    blobs().save(folder / "run" / "point_cloud.ply")
     config = {"data": {"path": str(folder / "data"), "background": "white"}}
     (folder / "run" / "config.yml").write_text(yaml.safe_dump(config))
     return folder / "run"
@@ -117,7 +116,7 @@ def test_refined_cameras_beside_the_gaussians_are_used_or_spoken_of(tmp_path, ca
     dataset = make_dataset(2, 1)
     write_dataset(tmp_path / "data", dataset)
     found = tmp_path / "run"
-    write_ply(found / "point_cloud.ply", blobs())
+    blobs().save(found / "point_cloud.ply")
     config = {"data": {"path": str(tmp_path / "data")}, "cameras": {"optimise": optimised}}
     (found / "config.yml").write_text(yaml.safe_dump(config))
     refined = [
@@ -163,7 +162,7 @@ def test_depths_are_not_opened(tmp_path):
         values = json.loads(path.read_text())
         values["frames"][0]["depth_file_path"] = "nowhere.png"
         path.write_text(json.dumps(values))
-    write_ply(tmp_path / "blobs.ply", blobs())
+    blobs().save(tmp_path / "blobs.ply")
     (tmp_path / "a.yml").write_text(yaml.safe_dump({"data": {"path": "data"}}))
     run(tmp_path / "blobs.ply", "--scene", tmp_path / "a.yml", "--out", tmp_path / "out")
     assert (tmp_path / "out" / "r_0.png").is_file()
@@ -322,7 +321,7 @@ def sensor(pose, pixel_format="rgb"):
 
 
 def write_scene(folder, *sensors, settings=""):
-    write_ply(folder / "model.ply", blobs())
+    blobs().save(folder / "model.ply")
     path = folder / "blobs.xml"
     path.write_text(
         f"""<scene version="3.0.0">
@@ -493,7 +492,7 @@ EXACT = ["--set", "model.projection=exact"]
 def test_the_exact_projection_of_a_bent_lens_is_refused(tmp_path, capsys, mode):
     """With status 2, before anything is written; without the distortion it is rendered."""
     write_dataset(tmp_path / "data", make_dataset(1, 1))
-    write_ply(tmp_path / "blobs.ply", blobs())
+    blobs().save(tmp_path / "blobs.ply")
     (tmp_path / "a.yml").write_text(yaml.safe_dump({"data": {"path": "data"}}))
     path = tmp_path / "data" / "transforms_test.json"
     path.write_text(json.dumps(json.loads(path.read_text()) | {"k1": 0.1}))

@@ -17,7 +17,6 @@ from drgs.data import initial_gaussians, load_dataset
 from drgs.data.images import downscale, smaller_view
 from drgs.data.initial import focus_of, mean_squared_neighbour_distance, points_in_view
 from drgs.data.types import Dataset, View
-from drgs.io import write_ply
 
 
 def look_at(center, target, up=(0, 0, 1)):
@@ -1110,7 +1109,7 @@ def test_cameras_that_determine_no_box_are_refused(views, reason):
 
 def test_starting_gaussians_can_be_written(blender, tmp_path):
     g = initial_gaussians(config(init={"num_points": 5}), load(blender[0]))
-    write_ply(tmp_path / "start.ply", g)
+    g.save(tmp_path / "start.ply")
     assert (tmp_path / "start.ply").is_file()
 
 

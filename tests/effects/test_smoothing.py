@@ -33,7 +33,6 @@ from drgs.config.schema import FitConfig
 from drgs.core.errors import UserError
 from drgs.effects.smoothing import baked, smoothed, smoothing_of
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
-from drgs.io.ply import read_ply, write_ply
 from drgs.reference import effects as reference_effects
 from drgs.reference import splatting as reference
 from drgs.splatting import rendering
@@ -347,41 +346,41 @@ def with_filter(count=12, degree=1) -> Gaussians:
 
 def test_a_file_holds_the_filter_as_its_last_property(tmp_path):
     gaussians = with_filter()
-    write_ply(tmp_path / "a.ply", gaussians)
+    gaussians.save(tmp_path / "a.ply")
     vertex = PlyData.read(str(tmp_path / "a.ply"))["vertex"]
     assert [p.name for p in vertex.properties][-2:] == ["rot_3", "filter_3D"]
     np.testing.assert_array_equal(vertex["filter_3D"], gaussians.smoothing)
-    actual = read_ply(tmp_path / "a.ply")
+    actual = Gaussians.load(tmp_path / "a.ply")
     for name in (*PARAMETER_NAMES, "smoothing"):
         np.testing.assert_array_equal(getattr(actual, name), getattr(gaussians, name), name)
 
 
 def test_a_file_of_gaussians_without_a_filter_has_no_such_property(tmp_path):
     plain = replace(with_filter(), smoothing=None)
-    write_ply(tmp_path / "a.ply", plain)
+    plain.save(tmp_path / "a.ply")
     assert b"filter" not in (tmp_path / "a.ply").read_bytes().partition(b"end_header")[0]
-    assert read_ply(tmp_path / "a.ply").smoothing is None
+    assert Gaussians.load(tmp_path / "a.ply").smoothing is None
 
 
 def test_a_filter_that_is_not_finite_is_refused(tmp_path):
     gaussians = with_filter()
     gaussians.smoothing[3] = np.nan
-    write_ply(tmp_path / "a.ply", gaussians)
+    gaussians.save(tmp_path / "a.ply")
     with pytest.raises(UserError, match=r"a\.ply: element vertex, row 3: filter_3D must be a"):
-        read_ply(tmp_path / "a.ply")
+        Gaussians.load(tmp_path / "a.ply")
 
 
 def test_a_filter_of_another_type_is_read(tmp_path):
     """As a tool writes it that computes in double precision."""
     gaussians = with_filter()
-    write_ply(tmp_path / "a.ply", gaussians)
+    gaussians.save(tmp_path / "a.ply")
     vertex = PlyData.read(str(tmp_path / "a.ply"))["vertex"].data
     kinds = [(n, "f8" if n == "filter_3D" else "f4") for n in reversed(vertex.dtype.names)]
     other = np.empty(len(vertex), kinds)
     for name, _ in kinds:
         other[name] = vertex[name]
     PlyData([PlyElement.describe(other, "vertex")]).write(str(tmp_path / "b.ply"))
-    np.testing.assert_array_equal(read_ply(tmp_path / "b.ply").smoothing, gaussians.smoothing)
+    np.testing.assert_array_equal(Gaussians.load(tmp_path / "b.ply").smoothing, gaussians.smoothing)
 
 
 # ----------------------------------------------------------------------------------------------
@@ -401,10 +400,10 @@ def loaded_with(scene, **settings):
 def test_the_plugin_uses_the_filter_of_a_file_unless_it_is_ignored(tmp_path):
     scene = Scene()
     plain = as_numpy(scene.gaussians)
-    write_ply(tmp_path / "plain.ply", plain)
+    plain.save(tmp_path / "plain.ply")
     filtered = replace(plain, smoothing=scene_filter(scene))
-    write_ply(tmp_path / "filtered.ply", filtered)
-    write_ply(tmp_path / "baked.ply", baked(filtered))
+    filtered.save(tmp_path / "filtered.ply")
+    baked(filtered).save(tmp_path / "baked.ply")
 
     def image(name, **settings):
         return image_of(loaded_with(scene, filename=str(tmp_path / name), **settings))
@@ -600,7 +599,7 @@ def test_a_fit_writes_the_filter_or_what_it_makes_of_the_gaussians(run_python, t
     assert result.returncode == 0, result.stderr
     lines = result.stdout.splitlines()
     assert "without False" in lines and "with True" in lines and "baked True" in lines
-    written = {name: read_ply(tmp_path / name / "point_cloud.ply") for name, *_ in runs}
+    written = {name: Gaussians.load(tmp_path / name / "point_cloud.ply") for name, *_ in runs}
     assert written["without"].smoothing is written["baked"].smoothing is None
     expected = baked(written["with"])
     for name in PARAMETER_NAMES:

@@ -15,7 +15,6 @@ from support.views import Scene
 
 from drgs.config.schema import FitConfig
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
-from drgs.io.ply import write_ply
 
 PAGES = (
     "README.md",
@@ -200,7 +199,7 @@ def folder(tmp_path) -> Path:
     path.parent.mkdir(parents=True)
     gaussians = Scene(count=20, degree=3).gaussians
     columns = {name: getattr(gaussians, name).astype(np.float32) for name in PARAMETER_NAMES}
-    write_ply(path, Gaussians(**columns))
+    Gaussians(**columns).save(path)
     return tmp_path
 
 

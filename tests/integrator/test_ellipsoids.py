@@ -22,7 +22,6 @@ from test_composition import drain_kernels, float_reductions
 import drgs  # noqa: F401  (registers the plugin)
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 from drgs.integrator import ellipsoids as shapes_module
-from drgs.io.ply import read_ply, write_ply
 from drgs.reference import splatting as reference
 from drgs.splatting import rendering
 
@@ -174,7 +173,7 @@ def test_a_shape_looks_as_the_reference_draws_its_gaussians(kind, degree):
 
 def write_model(path, gaussians):
     fields = {name: getattr(gaussians, name).astype(np.float32) for name in PARAMETER_NAMES}
-    write_ply(path, Gaussians(**fields))
+    Gaussians(**fields).save(path)
     return str(path)
 
 
@@ -1000,7 +999,7 @@ def test_the_shipped_model_is_what_its_program_makes(monkeypatch):
     monkeypatch.syspath_prepend(SCENES)
     import knot
 
-    made, shipped = knot.knot(), read_ply(knot.FILE)
+    made, shipped = knot.knot(), Gaussians.load(knot.FILE)
     for name in PARAMETER_NAMES:
         if name != "quats":  # either sign is the same rotation
             np.testing.assert_allclose(getattr(made, name), getattr(shipped, name), atol=1e-5)

@@ -27,7 +27,6 @@ import drgs  # noqa: F401  (registers the plugin)
 from drgs.config.approximations import Approximations
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 from drgs.integrator import film as exposure
-from drgs.io.ply import write_ply
 from drgs.reference import splatting as reference
 from drgs.splatting import rendering
 
@@ -115,7 +114,7 @@ def scene_xml(view, integrator) -> str:
 
 def write_gaussians(path, gaussians):
     fields = {name: getattr(gaussians, name).astype(np.float32) for name in PARAMETER_NAMES}
-    write_ply(path, Gaussians(**fields))
+    Gaussians(**fields).save(path)
 
 
 @pytest.mark.parametrize("degree", [0, 3])

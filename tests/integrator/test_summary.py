@@ -434,8 +434,7 @@ def sensor(**settings):
     film = {{"type": "hdrfilm", "width": 8, "height": 8, "rfilter": {{"type": "box"}}}}
     return {{"film": film, **settings}}
 
-from drgs.io.ply import write_ply
-write_ply({ply!r}, capture.blobs())
+capture.blobs().save({ply!r})
 for name, scene in (
     ("calibrated", {{"sensor": sensor(type="calibrated")}}),
     ("perspective", {{"sensor": sensor(type="perspective")}}),

@@ -4,7 +4,7 @@ from plyfile import PlyData, PlyElement
 
 from drgs.core.errors import UserError
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
-from drgs.io import read_ply, read_points, write_ply
+from drgs.io.ply import read_points
 
 
 def random_gaussians(num, degree, seed=0):
@@ -36,8 +36,8 @@ def rows_of(columns):
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 def test_written_gaussians_are_read_back_bitwise(tmp_path, degree):
     expected = random_gaussians(5, degree)
-    write_ply(tmp_path / "a.ply", expected)
-    actual = read_ply(tmp_path / "a.ply")
+    expected.save(tmp_path / "a.ply")
+    actual = Gaussians.load(tmp_path / "a.ply")
     assert actual.sh_degree == degree
     for name in PARAMETER_NAMES:
         values = getattr(actual, name)
@@ -46,15 +46,15 @@ def test_written_gaussians_are_read_back_bitwise(tmp_path, degree):
 
 
 def test_a_file_without_gaussians_is_refused(tmp_path):
-    write_ply(tmp_path / "a.ply", random_gaussians(0, 3))
+    random_gaussians(0, 3).save(tmp_path / "a.ply")
     with pytest.raises(UserError) as error:
-        read_ply(tmp_path / "a.ply")
+        Gaussians.load(tmp_path / "a.ply")
     assert str(error.value) == f"{tmp_path}/a.ply: element vertex must have at least 1 row, got 0"
 
 
 def test_the_file_is_laid_out_as_the_3dgs_reference_writes_it(tmp_path):
     g = random_gaussians(2, 3)
-    write_ply(tmp_path / "a.ply", g)
+    g.save(tmp_path / "a.ply")
     content = (tmp_path / "a.ply").read_bytes()
     # The order of construct_list_of_attributes in the reference's scene/gaussian_model.py.
     names = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
@@ -79,7 +79,7 @@ def test_the_file_is_laid_out_as_the_3dgs_reference_writes_it(tmp_path):
 
 def test_equal_gaussians_give_equal_bytes(tmp_path):
     for name in ("a", "b"):
-        write_ply(tmp_path / f"{name}.ply", random_gaussians(7, 2))
+        random_gaussians(7, 2).save(tmp_path / f"{name}.ply")
     assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()
 
 
@@ -93,7 +93,7 @@ def test_properties_are_found_by_name_in_any_order_and_type(tmp_path, text):
     columns |= {axis: g.means[:, i] for i, axis in enumerate("xyz")}
     columns["opacity"] = g.logit_opacities
     write_elements(tmp_path / "a.ply", text, vertex=rows_of(columns))
-    actual = read_ply(tmp_path / "a.ply")
+    actual = Gaussians.load(tmp_path / "a.ply")
     for name in PARAMETER_NAMES:
         # Text holds at least 8 digits: float32 values come back to 1 unit in the last place.
         np.testing.assert_allclose(getattr(actual, name), getattr(g, name), rtol=1.2e-7)
@@ -101,7 +101,7 @@ def test_properties_are_found_by_name_in_any_order_and_type(tmp_path, text):
 
 def without(tmp_path, *names):
     """A PLY of one degree-1 Gaussian, less some properties."""
-    write_ply(tmp_path / "full.ply", random_gaussians(1, 1))
+    random_gaussians(1, 1).save(tmp_path / "full.ply")
     rows = PlyData.read(str(tmp_path / "full.ply"))["vertex"].data
     keep = [name for name in rows.dtype.names if name not in names]
     write_elements(tmp_path / "a.ply", vertex=rows_of({name: rows[name] for name in keep}))
@@ -111,7 +111,7 @@ def without(tmp_path, *names):
 def test_missing_properties_are_named(tmp_path):
     path = without(tmp_path, "opacity", "rot_2")
     with pytest.raises(UserError) as error:
-        read_ply(path)
+        Gaussians.load(path)
     assert str(error.value) == (
         f"{path}: not a PLY of Gaussians: properties opacity, rot_2 are missing"
     )
@@ -120,7 +120,7 @@ def test_missing_properties_are_named(tmp_path):
 def test_a_wrong_number_of_coefficients_is_refused(tmp_path):
     path = without(tmp_path, "f_rest_8")
     with pytest.raises(UserError) as error:
-        read_ply(path)
+        Gaussians.load(path)
     assert str(error.value) == (
         f"{path}: the number of f_rest properties must be one of [0, 9, 24, 45] "
         "(SH degree 0 to 3), got 8"
@@ -136,7 +136,7 @@ def test_list_properties_are_refused(tmp_path):
         read_points(tmp_path / "a.ply")
 
 
-@pytest.mark.parametrize("read", [read_ply, read_points])
+@pytest.mark.parametrize("read", [Gaussians.load, read_points])
 def test_unreadable_files_are_named(tmp_path, read):
     with pytest.raises(UserError, match=r"none.ply: cannot read the file: No such file"):
         read(tmp_path / "none.ply")
@@ -146,7 +146,7 @@ def test_unreadable_files_are_named(tmp_path, read):
     (tmp_path / "bytes.ply").write_bytes(bytes(range(256)))
     with pytest.raises(UserError, match=r"bytes.ply: not a valid PLY file: "):
         read(tmp_path / "bytes.ply")
-    write_ply(tmp_path / "full.ply", random_gaussians(2, 0))
+    random_gaussians(2, 0).save(tmp_path / "full.ply")
     (tmp_path / "short.ply").write_bytes((tmp_path / "full.ply").read_bytes()[:-4])
     with pytest.raises(UserError, match=r"short.ply: not a valid PLY file: "):
         read(tmp_path / "short.ply")
@@ -159,7 +159,7 @@ def test_unreadable_files_are_named(tmp_path, read):
 
 def test_a_failed_write_leaves_the_old_file(tmp_path, monkeypatch):
     path = tmp_path / "a.ply"
-    write_ply(path, random_gaussians(1, 0))
+    random_gaussians(1, 0).save(path)
     before = path.read_bytes()
 
     def fail(self, stream):
@@ -169,7 +169,7 @@ def test_a_failed_write_leaves_the_old_file(tmp_path, monkeypatch):
 
     monkeypatch.setattr(PlyData, "write", fail)
     with pytest.raises(UserError, match=r"a.ply: cannot write the file: disk full"):
-        write_ply(path, random_gaussians(2, 0))
+        random_gaussians(2, 0).save(path)
     assert path.read_bytes() == before
     assert [p.name for p in tmp_path.iterdir()] == ["a.ply"]
 
@@ -229,9 +229,9 @@ def test_the_first_row_that_is_not_finite_is_named(tmp_path):
     g = random_gaussians(9, 1)
     g.means[7, 0] = np.nan
     g.quats[3, 2] = g.quats[5, 1] = -np.inf
-    write_ply(tmp_path / "a.ply", g)
+    g.save(tmp_path / "a.ply")
     with pytest.raises(UserError) as error:
-        read_ply(tmp_path / "a.ply")
+        Gaussians.load(tmp_path / "a.ply")
     assert str(error.value) == (
         f"{tmp_path}/a.ply: element vertex, row 3: rot_2 must be a finite float32 number, got "
         "-inf (3 of 9 rows are not finite; remove them)"
@@ -277,12 +277,13 @@ def test_a_header_without_an_end_is_refused(tmp_path):
 
 
 def test_reading_and_writing_needs_no_libllvm(tmp_path, run_python):
-    write_ply(tmp_path / "a.ply", random_gaussians(2, 1))
+    random_gaussians(2, 1).save(tmp_path / "a.ply")
     code = f"""
 import drjit as dr
-from drgs.io import read_ply, read_points, write_ply
+from drgs.gaussians.parameters import Gaussians
+from drgs.io.ply import read_points
 assert dr.detail.llvm_version()[0] == -1, "this test must run without a libLLVM"
-write_ply({str(tmp_path / "b.ply")!r}, read_ply({str(tmp_path / "a.ply")!r}))
+Gaussians.load({str(tmp_path / "a.ply")!r}).save({str(tmp_path / "b.ply")!r})
 print(read_points({str(tmp_path / "b.ply")!r})[0].shape)
 """
     result = run_python(code, DRJIT_LIBLLVM_PATH="/nonexistent")

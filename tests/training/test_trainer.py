@@ -12,7 +12,6 @@ from drgs.data.images import smaller_view
 from drgs.data.initial import gaussians_from_points
 from drgs.data.types import Dataset, View
 from drgs.gaussians.parameters import PARAMETER_NAMES
-from drgs.io.ply import write_ply
 from drgs.training import densify
 
 
@@ -144,7 +143,7 @@ def test_gaussians_are_returned_as_plain_numpy_arrays():
 def test_first_frame_comes_within_15_seconds_cold_and_3_seconds_warm(run_python, tmp_path):
     """Without and with a kernel cache (it lives in the home folder), import included."""
     points = np.random.default_rng(0).uniform(-1, 1, (20_000, 3))
-    write_ply(tmp_path / "points.ply", gaussians_from_points(points, None, 0.5, 3))
+    gaussians_from_points(points, None, 0.5, 3).save(tmp_path / "points.ply")
     program = f"""
 import drgs, drjit as dr, mitsuba as mi
 mi.set_variant("llvm_ad_rgb")
