@@ -53,8 +53,22 @@ import drjit as dr
 from drgs.cameras.camera import Camera, Pinhole
 from drgs.core.arrays import types_of
 from drgs.core.constants import WHITENING_SCALE
-from drgs.splatting.image_model import AffineResponse, Footprint, Offsets
-from drgs.splatting.projection import FilmShape, GaussianRows, ewa, film_axes, whiten
+from drgs.splatting.image_model import (
+    AffineResponse,
+    Footprint,
+    Offsets,
+    Positions,
+    flat_columns,
+)
+from drgs.splatting.projection import (
+    FilmShape,
+    GaussianRows,
+    RayTerms,
+    Splats2D,
+    ewa,
+    film_axes,
+    whiten,
+)
 
 MOST_ECCENTRIC = 0.99
 """Outlines whose squared eccentricity is larger are taken to be everywhere: an ellipse ten times as
@@ -71,8 +85,8 @@ LARGEST_EXPONENT = 1e4
 def exact(rows: GaussianRows, camera: Camera, position: Any, low_pass: float) -> FilmShape:
     """The shape that :class:`RayResponse` evaluates; the slopes of its Jacobian are not clamped.
 
-    Its whitening is U / a_c, and ``perspective`` is g / |a_c| (2), h, and 1 / |a_c|. Not
-    differentiated: where the anchor is, which makes no difference.
+    Its whitening is U / a_c, and ``ray`` holds g / |a_c|, h, and 1 / |a_c|. Not differentiated:
+    where the anchor is, which makes no difference.
     """
     m0, m1, _ = film_axes(rows, camera, position, camera.lens.true_slopes(camera, position))
     film = whiten(camera.lens.film_point(camera, position), [*m0], [*m1], low_pass)
@@ -87,8 +101,8 @@ def exact(rows: GaussianRows, camera: Camera, position: Any, low_pass: float) ->
     denominator = dr.fma(a, a, h * dr.fma(u, u, v * v))
     size = dr.abs(a)
     gx, gy = dr.fma(kx, a, h * u) / size, dr.fma(ky, a, h * v) / size
-    perspective = [-p * gx, -dr.fma(r, gx, s * gy), h / denominator, denominator / size]
-    return replace(film, whitening=film.whitening * (denominator / a), perspective=perspective)
+    ray = RayTerms(-p * gx, -dr.fma(r, gx, s * gy), h / denominator, denominator / size)
+    return replace(film, whitening=film.whitening * (denominator / a), ray=ray)
 
 
 def closest_on_film(camera: Camera, x: Any, y: Any) -> Any:
@@ -102,7 +116,7 @@ def ewa_with_depth(rows: GaussianRows, camera: Camera, position: Any, low_pass: 
     slopes = camera.lens.clamped_slopes(camera, position)
     film = ewa(rows, camera, position, low_pass)
     _, kappa, h = _seen_along(rows, camera, position, slopes, low_pass)
-    return replace(film, perspective=[*kappa, h])
+    return replace(film, ray=RayTerms(*kappa, h))
 
 
 def _seen_along(
@@ -135,11 +149,7 @@ class RayFootprint(Footprint):
     @property
     def coordinates(self) -> list[tuple[Any, Any]]:
         """e = (u, v)."""
-        return list(zip(_flat(self.u), _flat(self.v), strict=True))
-
-
-def _flat(rows: list) -> list[Any]:
-    return [value for row in rows for value in row]
+        return list(zip(flat_columns(self.u), flat_columns(self.v), strict=True))
 
 
 @dataclass(frozen=True)
@@ -167,16 +177,18 @@ class RayResponse(AffineResponse):
             )
         return RayResponse(camera)
 
-    def geometry(self, splats: Any) -> list[Any]:
+    def geometry(self, splats: Splats2D) -> list[Any]:
         """Columns, one value per Gaussian."""
-        gx, gy, h, _ = splats.perspective
-        return [*super().geometry(splats), gx, gy, h / WHITENING_SCALE**2]
+        ray = splats.ray
+        own = [ray.tilt_x, ray.tilt_y, ray.spread / WHITENING_SCALE**2]
+        return [*super().geometry(splats), *own]
 
-    def differentiable(self, splats: Any) -> list[Any]:
+    def differentiable(self, splats: Splats2D) -> list[Any]:
         """What :meth:`derivatives` are with respect to."""
-        return [*super().differentiable(splats), *splats.perspective[:3]]
+        ray = splats.ray
+        return [*super().differentiable(splats), ray.tilt_x, ray.tilt_y, ray.spread]
 
-    def bounds(self, splats: Any, geometry: list[Any], reach: Any) -> tuple[Any, Any]:
+    def bounds(self, splats: Splats2D, geometry: list[Any], reach: Any) -> tuple[Any, Any]:
         """Centre and half sizes (Array2f, px) of the box around the outline."""
         x, y, p, r, s = self.outline(geometry, reach)
         Array2f = types_of(type(p)).Array2f
@@ -222,10 +234,10 @@ class RayResponse(AffineResponse):
 
     def footprint(self, geometry: list[Any], offsets_from: Offsets, active: Any) -> RayFootprint:
         """Evaluate the exponent; on a lane that is not active every alpha is below any floor."""
-        affine = super().footprint(geometry[:6], offsets_from, active)
-        log2_opacity = dr.select(active, geometry[5], -dr.inf)
+        affine = super().footprint(geometry[: super().num_geometry], offsets_from, active)
+        log2_opacity = dr.select(active, self.log2_opacity(geometry), -dr.inf)
         from_anchor = offsets_from(*closest_on_film(self.camera, *geometry[:2]))
-        pixels = zip(*map(_flat, (affine.u, affine.v, *from_anchor)), strict=True)
+        pixels = zip(*map(flat_columns, (affine.u, affine.v, *from_anchor)), strict=True)
         along, exponent, log2_alpha = [], [], []
         for u, v, x, y in pixels:
             squared, a, denominator = ray_denominator(geometry, u, v, x, y)
@@ -246,7 +258,9 @@ class RayResponse(AffineResponse):
             from_anchor=from_anchor,
         )
 
-    def moments(self, footprint: RayFootprint, weights: list[Any], positions: Any) -> list[Any]:
+    def moments(
+        self, footprint: RayFootprint, weights: list[Any], positions: Positions
+    ) -> list[Any]:
         """Sums over the 16 pixels of w = d loss / d ln(alpha) times each of these.
 
         1; A^2 u, A^2 u dx, A^2 u dy; A^2 v, A^2 v dy; A B (x - c); B^2. With f = |e|^2 / D,
@@ -298,7 +312,8 @@ class RayResponse(AffineResponse):
 
     def pack_tangents(self, geometry: list[Any], tangents: list[Any]) -> list[Any]:
         """Tangents of the geometry, that of the opacity as d ln(opacity)."""
-        return super().pack_tangents(geometry, tangents[:6]) + list(tangents[6:])
+        count = super().num_geometry
+        return super().pack_tangents(geometry, tangents[:count]) + list(tangents[count:])
 
     def tangent(
         self, geometry: list[Any], footprint: RayFootprint, d_geometry: list[Any]
@@ -309,8 +324,8 @@ class RayResponse(AffineResponse):
         d_p, d_r, d_s = d_p * WHITENING_SCALE, d_r * WHITENING_SCALE, d_s * WHITENING_SCALE
         d_h = d_h / WHITENING_SCALE**2
         pixels = zip(
-            *map(_flat, (footprint.dx, footprint.dy, footprint.u, footprint.v)),
-            *map(_flat, footprint.from_anchor),
+            *map(flat_columns, (footprint.dx, footprint.dy, footprint.u, footprint.v)),
+            *map(flat_columns, footprint.from_anchor),
             footprint.along,
             footprint.exponent,
             strict=True,
@@ -328,9 +343,9 @@ class RayResponse(AffineResponse):
 
 def ray_denominator(geometry: list[Any], u: Any, v: Any, x: Any, y: Any) -> tuple[Any, Any, Any]:
     """|e|^2, a and D at a pixel with e = (u, v), at (x, y) from the anchor."""
-    gx, gy, h = geometry[6:9]
+    _, _, p, _, _, _, gx, gy, h, *_ = geometry
     squared = dr.fma(u, u, v * v)
-    a = dr.fma(gx, x, dr.fma(gy, y, _sign(geometry[2])))
+    a = dr.fma(gx, x, dr.fma(gy, y, _sign(p)))
     return squared, a, dr.fma(a, a, h * squared)
 
 

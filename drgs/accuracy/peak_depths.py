@@ -1,33 +1,41 @@
-"""Depths of splats' peaks along the ray of each pixel."""
+"""Depths of splats' peaks along the ray of each pixel: what the order of each pixel compares.
+
+:class:`RayDepths` where the response finds the peak anyway (``drgs.accuracy.exact``, whose formulas
+these are), :class:`AffineDepths` where it does not, :class:`ParallelDepths` where rays do not meet.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import drjit as dr
 
 from drgs.accuracy.exact import RayFootprint, closest_on_film, ray_denominator
+from drgs.cameras.camera import Camera
 from drgs.core.constants import WHITENING_SCALE
-from drgs.splatting.image_model import Footprint
-from drgs.splatting.tiles import TileBins
+from drgs.splatting.image_model import Footprint, Response, flat_columns
+from drgs.splatting.projection import Splats2D
 
 
 @dataclass(frozen=True)
 class AffineDepths:
     """Depths at a pixel for a response that does not know them: stores what they depend on."""
 
-    def keys(self, splats: Any) -> list[Any]:
-        """kappa, h (scaled to base 2), and the depth of the mean."""
-        kx, ky, h = splats.perspective
-        scale = WHITENING_SCALE
-        return [kx / scale, ky / scale, h / scale**2, splats.depths]
+    def seen_by(self, camera: Camera) -> AffineDepths:
+        """For one camera, whose rays may be parallel."""
+        return ParallelDepths() if camera.lens.parallel else self
 
-    def at(self, bins: TileBins, numbers: tuple, x: Any, y: Any) -> tuple[Any, Any]:
-        """a and D at a point of the film; numbers: geometry and keys of the splat."""
-        del bins
-        geometry, keys = numbers
-        return self._at(keys, *_coordinates(geometry, x, y))
+    def keys(self, splats: Splats2D) -> list[Any]:
+        """kappa, h (scaled to base 2), and the depth of the mean."""
+        ray, scale = splats.ray, WHITENING_SCALE
+        return [ray.tilt_x / scale, ray.tilt_y / scale, ray.spread / scale**2, splats.depths]
+
+    def at(
+        self, response: Response, geometry: list[Any], keys: list[Any], x: Any, y: Any
+    ) -> tuple[Any, Any]:
+        """a and D of a splat at a point of the film, px."""
+        return self._at(keys, *response.coordinates(geometry, x, y))
 
     def along(self, footprint: Footprint, keys: list[Any]) -> list[Any]:
         """Depths at the 16 pixels, divided by the mean's; not positive where there is none."""
@@ -55,15 +63,23 @@ class ParallelDepths(AffineDepths):
 class RayDepths:
     """Depths at a pixel for ``RayResponse``, which computes them."""
 
-    def keys(self, splats: Any) -> list[Any]:
-        """The depth of the mean, divided by |a_c|."""
-        return [splats.depths * splats.perspective[3]]
+    camera: Camera | None = None  # whose film has the anchors
 
-    def at(self, bins: TileBins, numbers: tuple, x: Any, y: Any) -> tuple[Any, Any]:
-        """a and D at a point of the film."""
-        geometry, _ = numbers
-        u, v = _coordinates(geometry, x, y)
-        anchor = closest_on_film(bins.model.response.camera, *geometry[:2])
+    def seen_by(self, camera: Camera) -> RayDepths:
+        """For one camera."""
+        return replace(self, camera=camera)
+
+    def keys(self, splats: Splats2D) -> list[Any]:
+        """The depth of the mean, divided by |a_c|."""
+        return [splats.depths * splats.ray.scale]
+
+    def at(
+        self, response: Response, geometry: list[Any], keys: list[Any], x: Any, y: Any
+    ) -> tuple[Any, Any]:
+        """a and D of a splat at a point of the film, px."""
+        del keys
+        u, v = response.coordinates(geometry, x, y)
+        anchor = closest_on_film(self.camera, *geometry[:2])
         _, a, denominator = ray_denominator(geometry, u, v, x - anchor.x, y - anchor.y)
         return a, denominator
 
@@ -71,15 +87,3 @@ class RayDepths:
         """Depths at the 16 pixels, divided by the key; not positive where there is none."""
         del keys
         return footprint.along
-
-
-def _coordinates(geometry: list[Any], x: Any, y: Any) -> tuple[Any, Any]:
-    """e = U d at a point of the film."""
-    mean_x, mean_y, p, r, s = geometry[:5]
-    dx, dy = x - mean_x, y - mean_y
-    return dr.fma(p, dx, r * dy), s * dy
-
-
-def flat_columns(rows: list) -> list[Any]:
-    """The 16 values of 4 rows of 4."""
-    return [value for row in rows for value in row]

@@ -1,4 +1,4 @@
-"""Splats in the order of each pixel: the choice ``order: pixel``.
+"""Splats in the order of each pixel: ``order: pixel``.
 
 Imported when it is chosen. By default all pixels composite in one order, that of the depths of the
 means; splats that interpenetrate then swap as a whole when the camera moves (*popping*). Here each
@@ -29,13 +29,13 @@ from typing import Any
 
 import drjit as dr
 
-from drgs.accuracy.peak_depths import AffineDepths, ParallelDepths, RayDepths, flat_columns
-from drgs.accuracy.pixel_lists import PixelLists
+from drgs.accuracy.pixel_lists import PeakDepths, PixelLists
 from drgs.cameras.camera import Camera
 from drgs.core.arrays import empty_rows, load_row, scatter_rows, store_row, types_of
 from drgs.splatting.grid import PIXELS, Lanes
-from drgs.splatting.image_model import Alpha, Footprint, ImageModel
+from drgs.splatting.image_model import Alpha, Footprint, ImageModel, flat_columns
 from drgs.splatting.lanes import grouped_by_work, load_lane_row, load_pixels, make_lanes, pixels_of
+from drgs.splatting.projection import Splats2D
 from drgs.splatting.rasterize import (
     Layers,
     Records,
@@ -64,27 +64,36 @@ class PixelOrder:
     """
 
     window: int
-    depths: AffineDepths | RayDepths
+    depths: PeakDepths
 
     def seen_by(self, camera: Camera) -> PixelOrder:
-        """For one camera, whose rays may be parallel."""
-        return replace(self, depths=ParallelDepths()) if camera.lens.parallel else self
+        """For one camera."""
+        return replace(self, depths=self.depths.seen_by(camera))
 
-    def keys(self, splats: Any) -> list[Any]:
+    def keys(self, splats: Splats2D) -> list[Any]:
         """Columns that the depth at a pixel depends on."""
         return self.depths.keys(splats)
 
-    def composite(self, bins: TileBins, records: Records) -> Layers:
+    def composite(self, bins: TileBins, records: Records) -> _OrderedLayers:
         """See :func:`drgs.splatting.rasterize.composite`."""
         return _composite(bins, records, self)
 
-    def adjoint(self, *arguments: Any) -> SplatGradients:
+    def adjoint(
+        self,
+        bins: TileBins,
+        records: Records,
+        layers: _OrderedLayers,
+        d_features: list[Any],
+        d_transmittance: Any,
+    ) -> SplatGradients:
         """See :func:`drgs.splatting.rasterize.composite_adjoint`."""
-        return _adjoint(*arguments, self)
+        return _adjoint(bins, records, layers, d_features, d_transmittance, self)
 
-    def tangent(self, *arguments: Any) -> Layers:
+    def tangent(
+        self, bins: TileBins, records: Records, layers: _OrderedLayers, tangents: SplatGradients
+    ) -> Layers:
         """See :func:`drgs.splatting.rasterize.composite_tangent`."""
-        return _tangent(*arguments, self)
+        return _tangent(bins, records, layers, tangents, self)
 
 
 # ----------------------------------------------------------------------------------------------

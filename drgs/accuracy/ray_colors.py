@@ -1,4 +1,4 @@
-"""Colour in the direction of each pixel's ray: the choice ``sh_direction: pixel``.
+"""Colour in the direction of each pixel's ray: ``sh_direction: pixel``.
 
 Imported when it is chosen. By default a splat has one colour, seen in the direction of its mean
 (3DGS). Here its spherical harmonics are stored, and evaluated in the direction of each pixel. The
@@ -15,7 +15,8 @@ import drjit as dr
 from drgs.cameras.camera import Camera
 from drgs.core.constants import COLOR_MIN
 from drgs.gaussians.sh import num_coefficients, sh_basis
-from drgs.splatting.image_model import SplatFeatures
+from drgs.splatting.grid import Lanes
+from drgs.splatting.image_model import Positions, SplatFeatures
 from drgs.splatting.projection import GaussianRows
 
 CHANNELS = 3
@@ -59,7 +60,7 @@ class RayColors(SplatFeatures):
             "splats: sh_direction 'pixel' is not differentiable in the camera; use 'mean'"
         )
 
-    def bind(self, lanes: Any, positions: Any) -> RayColors:
+    def bind(self, lanes: Lanes, positions: Positions) -> RayColors:
         """The basis functions at the 16 pixels of each lane."""
         points = positions.points(lanes, type(self.camera.near))
         basis = tuple(sh_basis(self._direction(x, y), self.sh_degree) for x, y in points)

@@ -18,7 +18,15 @@ import drjit as dr
 
 from drgs.cameras.camera import Camera, Pinhole
 from drgs.core.arrays import types_of
-from drgs.splatting.projection import FilmShape, GaussianRows, ewa, film_axes, whiten, world_axes
+from drgs.splatting.projection import (
+    FilmShape,
+    GaussianRows,
+    RayTerms,
+    ewa,
+    film_axes,
+    whiten,
+    world_axes,
+)
 
 SPREAD = math.sqrt(3)
 """Standard deviations from the mean to a sigma point: sqrt(n + lambda), lambda = 0."""
@@ -68,7 +76,7 @@ def unscented_with_depth(
     kx, ky = dr.dot(m0, n), dr.dot(m1, n)
     kx, ky = dr.fma(p, kx, r * ky), s * ky
     h = dr.squared_norm(n) - dr.fma(kx, kx, ky * ky)
-    return replace(film, perspective=[kx, ky, dr.select(h > 0, h, 0)])
+    return replace(film, ray=RayTerms(kx, ky, dr.select(h > 0, h, 0)))
 
 
 @dataclass(frozen=True)

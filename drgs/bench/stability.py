@@ -283,7 +283,7 @@ def _by_kernels(
     image = np.stack([np.array(plane).reshape(HEIGHT, WIDTH) for plane in color], axis=-1)
     planes = [llvm.Float(np.ascontiguousarray(w, np.float32)) for w in _planes(cotangent)]
     nothing = llvm.Float(np.zeros(HEIGHT * WIDTH, np.float32))
-    gradients = rendering.render_adjoint(device, frame, planes, nothing).parameters
+    gradients = rendering.frames_adjoint(device, [frame], [[nothing, *planes]]).parameters
     return image, {name: np.array(getattr(gradients, name)) for name in PARAMETER_NAMES}
 
 

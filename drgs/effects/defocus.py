@@ -10,7 +10,6 @@ such as what is seen past the blurred edge of something near, needs the rays.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -19,42 +18,32 @@ import drjit as dr
 from drgs.cameras.camera import Camera
 from drgs.core.constants import NEGLIGIBLE_ALPHA
 from drgs.splatting.cutoffs import Cutoffs
-from drgs.splatting.image_model import Footprint, Offsets
-from drgs.splatting.projection import FilmShape, GaussianRows
+from drgs.splatting.image_model import Footprint, Offsets, Positions, Response
+from drgs.splatting.projection import FilmShape, GaussianRows, Projection, Splats2D
 
 
 @dataclass(frozen=True)
 class Defocused:
-    """A projection (see ``drgs.splatting.projection.ewa``), blurred by the camera's aperture."""
+    """A projection, blurred by the camera's aperture."""
 
-    shape: Callable
+    shape: Projection
 
     def __call__(
         self, rows: GaussianRows, camera: Camera, position: Any, low_pass: float
     ) -> FilmShape:
-        """The blurred shape; its ``dimming`` keeps the integral. ``sharp`` and ``added`` are those
-        of the low-pass alone.
+        """The blurred shape, whose ``dimming`` keeps the integral.
+
+        Its determinants are those of the low-pass alone.
         """
         film = self.shape(rows, camera, position, low_pass)
         spread = camera.aperture.variance(camera, position.z)
         blurred = self.shape(rows, camera, position, low_pass + spread)
         return replace(
             blurred,
-            sharp=film.sharp,
-            added=film.added,
-            dimming=_root_determinant(blurred) / _root_determinant(film),
+            determinant=film.determinant,
+            added_determinant=film.added_determinant,
+            dimming=blurred.root_determinant() / film.root_determinant(),
         )
-
-
-def _root_determinant(film: FilmShape) -> Any:
-    """sqrt(det(conic)) at the mean.
-
-    That of ``drgs.accuracy.exact`` is divided by |a_c|, whose inverse is its fourth number.
-    """
-    p, _, s = film.whitening
-    if film.perspective is not None and len(film.perspective) > 3:
-        p, s = p / film.perspective[3], s / film.perspective[3]
-    return dr.abs(p * s)
 
 
 @dataclass(frozen=True)
@@ -65,7 +54,7 @@ class DimmedResponse:
     derivatives: the cut is a decision.
     """
 
-    of: Any
+    of: Response
 
     @property
     def num_geometry(self) -> int:
@@ -81,27 +70,26 @@ class DimmedResponse:
         """For one camera."""
         return replace(self, of=self.of.seen_by(camera))
 
-    @property
-    def camera(self) -> Any:
-        """That the response is for."""
-        return self.of.camera
+    def log2_opacity(self, geometry: list[Any]) -> Any:
+        """The base-2 logarithm of the opacity, dimmed."""
+        return self.of.log2_opacity(geometry[:-1])
 
     def log2_floor(self, geometry: list[Any], cutoffs: Cutoffs) -> Any:
         """The base-2 logarithm of the smallest alpha of a splat; see ``NEGLIGIBLE_ALPHA``."""
-        log2_opacity, log2_dimming = geometry[5], geometry[-1]
-        floor = cutoffs.log2_floor(log2_opacity - log2_dimming) + log2_dimming
+        log2_dimming = geometry[-1]
+        floor = cutoffs.log2_floor(self.log2_opacity(geometry) - log2_dimming) + log2_dimming
         least = math.log2(NEGLIGIBLE_ALPHA)
         return dr.select(floor > least, floor, least)
 
-    def geometry(self, splats: Any) -> list[Any]:
+    def geometry(self, splats: Splats2D) -> list[Any]:
         """Columns, one value per Gaussian."""
         return [*self.of.geometry(splats), dr.log2(splats.dimming)]
 
-    def differentiable(self, splats: Any) -> list[Any]:
+    def differentiable(self, splats: Splats2D) -> list[Any]:
         """What :meth:`derivatives` are with respect to."""
         return [*self.of.differentiable(splats), dr.detach(splats.dimming)]
 
-    def bounds(self, splats: Any, geometry: list[Any], reach: Any) -> tuple[Any, Any]:
+    def bounds(self, splats: Splats2D, geometry: list[Any], reach: Any) -> tuple[Any, Any]:
         """Centre and half sizes (Array2f, px) of the box around what shows."""
         return self.of.bounds(splats, geometry[:-1], reach)
 
@@ -109,11 +97,15 @@ class DimmedResponse:
         """Mean x, y, p, r, s of an ellipse |U d|^2 <= ``reach`` that holds the splat."""
         return self.of.outline(geometry[:-1], reach)
 
+    def coordinates(self, geometry: list[Any], x: Any, y: Any) -> tuple[Any, Any]:
+        """U d at a point of the film, px."""
+        return self.of.coordinates(geometry[:-1], x, y)
+
     def footprint(self, geometry: list[Any], offsets_from: Offsets, active: Any) -> Footprint:
         """At the 16 pixels of each lane."""
         return self.of.footprint(geometry[:-1], offsets_from, active)
 
-    def moments(self, footprint: Footprint, weights: list[Any], positions: Any) -> list[Any]:
+    def moments(self, footprint: Footprint, weights: list[Any], positions: Positions) -> list[Any]:
         """Sums over the 16 pixels."""
         return self.of.moments(footprint, weights, positions)
 

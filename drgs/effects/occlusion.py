@@ -24,8 +24,9 @@ from typing import Any
 
 import drjit as dr
 
+from drgs.cameras.camera import Camera
 from drgs.splatting.grid import Lanes, TileGrid
-from drgs.splatting.image_model import ImageModel, SplatFeatures
+from drgs.splatting.image_model import Features, ImageModel, Positions
 from drgs.splatting.lanes import load_pixels
 
 
@@ -38,14 +39,14 @@ class Surface:
 
 
 @dataclass(frozen=True)
-class OccludedFeatures(SplatFeatures):
+class OccludedFeatures:
     """Features of splats that a surface may hide.
 
     Of what is stored, the last is the splat's depth; of the planes, the last is the sum of the
     weights in front of the surface.
     """
 
-    features: SplatFeatures
+    features: Features
     surface: Surface
     grid: TileGrid
     bound: list[tuple[Any, Any]] = field(default_factory=list)  # the 16 of each lane: z, 1 - c
@@ -54,7 +55,7 @@ class OccludedFeatures(SplatFeatures):
         """Planes that come of ``num_stored`` numbers per splat."""
         return self.features.num_planes(num_stored - 1) + 1
 
-    def seen_by(self, camera: Any) -> OccludedFeatures:
+    def seen_by(self, camera: Camera) -> OccludedFeatures:
         """For one camera."""
         return replace(self, features=self.features.seen_by(camera))
 
@@ -62,7 +63,7 @@ class OccludedFeatures(SplatFeatures):
         """As the features; the surface stays where it is."""
         self.features.check_differentiable_in_camera()
 
-    def bind(self, lanes: Lanes, positions: Any) -> OccludedFeatures:
+    def bind(self, lanes: Lanes, positions: Positions) -> OccludedFeatures:
         """For the lanes of one kernel: loads the surface."""
         depths = load_pixels(self.surface.depth, lanes, self.grid)
         coverage = load_pixels(self.surface.coverage, lanes, self.grid)
@@ -95,7 +96,7 @@ class OccludedFeatures(SplatFeatures):
     def add_derivatives(
         self, totals: list[Any], stored: list[Any], pixel: int, weight: Any, g: list[Any]
     ) -> list[Any]:
-        """See :class:`SplatFeatures`."""
+        """As :meth:`at` says; the depth has none."""
         *others, depth = stored
         *totals, nothing = totals
         weight = self._seen(weight, depth, pixel)
@@ -119,7 +120,7 @@ class OccludedFeatures(SplatFeatures):
         return dr.select(depth <= z, value, 0)
 
 
-def occluded_by(model: ImageModel, surface: Surface, camera: Any) -> ImageModel:
+def occluded_by(model: ImageModel, surface: Surface, camera: Camera) -> ImageModel:
     """An image model of splats some of which the surface hides."""
     grid = TileGrid(camera.width, camera.height)
     return replace(model, features=OccludedFeatures(model.features, surface, grid))

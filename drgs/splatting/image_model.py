@@ -1,12 +1,13 @@
 """What a splat is at the 16 pixels of a micro-tile: the image model of the kernels.
 
-An :class:`ImageModel` names the choices that tiles and compositing have to agree on, each an object
-that the kernels' Python code calls while Dr.Jit traces it. The types here are the defaults, those
-of the 3DGS paper; the others are in modules of their own, which are imported when they are chosen:
+An :class:`ImageModel` names what tiles and compositing have to agree on, each an object that the
+kernels' Python code calls while Dr.Jit traces it. A protocol says what such an object must have.
+The types here are the defaults, those of the 3DGS paper; the others are in modules of their own,
+which are imported when they are chosen:
 
-- *response*: how alpha falls off around a splat (:class:`AffineResponse`)
-- *positions*: where in a pixel it is evaluated (:class:`PixelCenters`)
-- *features*: what is composited of a splat (:class:`SplatFeatures`)
+- *response*: how alpha falls off around a splat (:class:`Response`: :class:`AffineResponse`)
+- *positions*: where in a pixel it is evaluated (:class:`Positions`: :class:`PixelCenters`)
+- *features*: what is composited of a splat (:class:`Features`: :class:`SplatFeatures`)
 - *cutoffs*: where splats and pixels end (:class:`drgs.splatting.cutoffs.Cutoffs`)
 """
 
@@ -16,14 +17,16 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Protocol
 
 import drjit as dr
 
+from drgs.cameras.camera import Camera
 from drgs.core.arrays import is_float64, types_of
 from drgs.core.constants import WHITENING_SCALE
 from drgs.splatting.cutoffs import Cutoffs
-from drgs.splatting.grid import MICRO
+from drgs.splatting.grid import MICRO, Lanes, TileGrid
+from drgs.splatting.projection import Splats2D
 
 # ----------------------------------------------------------------------------------------------
 # Alpha
@@ -80,22 +83,55 @@ class Alpha:
 # ----------------------------------------------------------------------------------------------
 
 
+class Positions(Protocol):
+    """Where in a pixel splats are evaluated. Grids of 16 values are lists of 4 rows of 4."""
+
+    @property
+    def margin(self) -> float:
+        """px: how far from its centre a pixel may be evaluated, along either axis."""
+        ...
+
+    def bind(self, lanes: Lanes, grid: TileGrid) -> Positions:
+        """For the lanes of one kernel: loads what they need. The rest is called of the result."""
+        ...
+
+    def points(self, lanes: Lanes, Float: type) -> list[tuple[Any, Any]]:
+        """x and y (px) of the 16 pixels."""
+        ...
+
+    def offsets(self, lanes: Lanes, x: Any, y: Any) -> tuple[list, list]:
+        """Grids of x and y, from a point of the film to the pixels, px."""
+        ...
+
+    def sum(self, values: list[Any]) -> Any:
+        """Of 16 values."""
+        ...
+
+    def sum_dx(self, values: list[Any], dx: list) -> Any:
+        """Of values times dx, a grid of :meth:`offsets`."""
+        ...
+
+    def sum_dy(self, values: list[Any], dy: list) -> Any:
+        """Of values times dy."""
+        ...
+
+    def sum_dy_dy(self, values: list[Any], dy: list) -> Any:
+        """Of values times dy^2."""
+        ...
+
+
 @dataclass(frozen=True)
 class PixelCenters:
-    """Every pixel is evaluated at its centre: offsets are shared by rows and columns.
-
-    Grids of 16 values are lists of 4 rows of 4.
-    """
+    """Every pixel is evaluated at its centre: offsets are shared by rows and columns."""
 
     margin: ClassVar[float] = 0.0
-    """px: how far from its centre a pixel may be evaluated."""
 
-    def points(self, lanes: Any, Float: type) -> list[tuple[Any, Any]]:
+    def points(self, lanes: Lanes, Float: type) -> list[tuple[Any, Any]]:
         """x and y (px) of the 16 pixels."""
         x, y = Float(lanes.x) + 0.5, Float(lanes.y) + 0.5
         return [(x + i, y + j) for j in range(MICRO) for i in range(MICRO)]
 
-    def offsets(self, lanes: Any, x: Any, y: Any) -> tuple[list, list]:
+    def offsets(self, lanes: Lanes, x: Any, y: Any) -> tuple[list, list]:
         """Grids of x and y, from a point of the film to the pixels, px."""
         t = types_of(type(x))
         first_x, first_y = t.Float(lanes.x) + 0.5 - x, t.Float(lanes.y) + 0.5 - y
@@ -121,7 +157,7 @@ class PixelCenters:
         dy = _first_of_rows(dy)
         return _dot([a * b for a, b in zip(self._rows(values), dy, strict=True)], dy)
 
-    def bind(self, lanes: Any, grid: Any) -> PixelCenters:
+    def bind(self, lanes: Lanes, grid: TileGrid) -> PixelCenters:
         """For the lanes of one kernel: nothing has to be loaded."""
         del lanes, grid
         return self
@@ -140,6 +176,11 @@ def total(values: list[Any]) -> Any:
     while len(values) > 1:
         values = [a + b for a, b in zip(values[::2], values[1::2], strict=True)]
     return values[0]
+
+
+def flat_columns(rows: list) -> list[Any]:
+    """The 16 values of 4 rows of 4."""
+    return [value for row in rows for value in row]
 
 
 def _dot(a: list[Any], b: list[Any]) -> Any:
@@ -169,33 +210,108 @@ Offsets = Callable[[Any, Any], tuple[list, list]]
 """From a point of the film, x and y (px), to grids of offsets from it to the 16 pixels."""
 
 
+class Response(Protocol):
+    """How alpha falls off around a splat.
+
+    *Geometry* are the numbers of a splat that decide its alpha; the first are mean x, y (px) and p,
+    r, s of U (1 / px, base 2). *Moments* are sums over pixels, weighted by d loss / d ln(alpha),
+    that give the derivatives of what :meth:`differentiable` lists.
+    """
+
+    @property
+    def num_geometry(self) -> int:
+        """Numbers of a splat."""
+        ...
+
+    @property
+    def num_moments(self) -> int:
+        """Sums over pixels, by splat."""
+        ...
+
+    def seen_by(self, camera: Camera) -> Response:
+        """For one camera."""
+        ...
+
+    def geometry(self, splats: Splats2D) -> list[Any]:
+        """Columns, one value per Gaussian."""
+        ...
+
+    def differentiable(self, splats: Splats2D) -> list[Any]:
+        """What :meth:`derivatives` are with respect to: as many columns as the geometry has."""
+        ...
+
+    def log2_opacity(self, geometry: list[Any]) -> Any:
+        """The base-2 logarithm of the opacity."""
+        ...
+
+    def log2_floor(self, geometry: list[Any], cutoffs: Cutoffs) -> Any:
+        """The base-2 logarithm of the smallest alpha of a splat."""
+        ...
+
+    def bounds(self, splats: Splats2D, geometry: list[Any], reach: Any) -> tuple[Any, Any]:
+        """Centre and half sizes (Array2f, px) of a box around all that shows.
+
+        reach: by how much log2_alpha may be below log2_opacity.
+        """
+        ...
+
+    def outline(self, geometry: list[Any], reach: Any) -> list[Any]:
+        """Mean x, y, p, r, s of an ellipse |U d|^2 <= ``reach`` that holds all that shows."""
+        ...
+
+    def coordinates(self, geometry: list[Any], x: Any, y: Any) -> tuple[Any, Any]:
+        """U d at a point of the film, px."""
+        ...
+
+    def footprint(self, geometry: list[Any], offsets_from: Offsets, active: Any) -> Footprint:
+        """Evaluate the exponent; on a lane that is not active every alpha is below any floor."""
+        ...
+
+    def moments(self, footprint: Footprint, weights: list[Any], positions: Positions) -> list[Any]:
+        """Moments of one micro-tile; weights: d loss / d ln(alpha) at the 16 pixels."""
+        ...
+
+    def derivatives(self, geometry: list[Any], totals: list[Any]) -> list[Any]:
+        """From moments, summed over all micro-tiles, to derivatives."""
+        ...
+
+    def pack_tangents(self, geometry: list[Any], tangents: list[Any]) -> list[Any]:
+        """Tangents of the geometry, from those of what :meth:`differentiable` lists."""
+        ...
+
+    def tangent(
+        self, geometry: list[Any], footprint: Footprint, d_geometry: list[Any]
+    ) -> list[Any]:
+        """Tangent of ln(alpha) at the 16 pixels; d_geometry: of :meth:`pack_tangents`."""
+        ...
+
+
 @dataclass(frozen=True)
 class AffineResponse:
     """The projected Gaussian is a Gaussian on the film: alpha = o exp(-|U d|^2 / 2).
 
-    *Geometry* are the numbers of a splat that decide its alpha: mean x, y (px); then p, r, s of U
-    and log2_opacity, scaled such that log2_alpha = log2_opacity - |U d|^2. *Moments* are the sums
-    over pixels, weighted by d loss / d ln(alpha), that give the derivatives of the geometry.
+    Geometry: mean x, y (px); then p, r, s of U and log2_opacity, scaled such that log2_alpha =
+    log2_opacity - |U d|^2.
     """
 
     num_geometry: ClassVar[int] = 6
     num_moments: ClassVar[int] = 6
 
-    def seen_by(self, camera: Any) -> AffineResponse:
+    def seen_by(self, camera: Camera) -> AffineResponse:
         """For one camera: nothing depends on it."""
         del camera
         return self
 
-    def geometry(self, splats: Any) -> list[Any]:
+    def geometry(self, splats: Splats2D) -> list[Any]:
         """Columns, one value per Gaussian."""
         p, r, s = splats.whitening * WHITENING_SCALE
         return [*splats.means2d, p, r, s, dr.log2(splats.opacities)]
 
-    def differentiable(self, splats: Any) -> list[Any]:
+    def differentiable(self, splats: Splats2D) -> list[Any]:
         """What :meth:`derivatives` are with respect to."""
         return [*splats.means2d, *splats.whitening, splats.opacities]
 
-    def bounds(self, splats: Any, geometry: list[Any], reach: Any) -> tuple[Any, Any]:
+    def bounds(self, splats: Splats2D, geometry: list[Any], reach: Any) -> tuple[Any, Any]:
         """Centre and half sizes (Array2f, px) of the box around |U d|^2 <= ``reach``."""
         del geometry
         return splats.means2d, dr.sqrt(2 * math.log(2) * reach * splats.variances)
@@ -205,9 +321,19 @@ class AffineResponse:
         del reach
         return geometry[:5]
 
+    def log2_opacity(self, geometry: list[Any]) -> Any:
+        """The base-2 logarithm of the opacity."""
+        return geometry[5]
+
     def log2_floor(self, geometry: list[Any], cutoffs: Cutoffs) -> Any:
         """The base-2 logarithm of the smallest alpha of a splat."""
-        return cutoffs.log2_floor(geometry[5])
+        return cutoffs.log2_floor(self.log2_opacity(geometry))
+
+    def coordinates(self, geometry: list[Any], x: Any, y: Any) -> tuple[Any, Any]:
+        """U d at a point of the film, px."""
+        mean_x, mean_y, p, r, s = geometry[:5]
+        dx, dy = x - mean_x, y - mean_y
+        return dr.fma(p, dx, r * dy), s * dy
 
     def footprint(self, geometry: list[Any], offsets_from: Offsets, active: Any) -> Footprint:
         """Evaluate the exponent; on a lane that is not active every alpha is below any floor."""
@@ -225,7 +351,7 @@ class AffineResponse:
         ]
         return Footprint(dx=dx, dy=dy, u=u, v=v, log2_alpha=log2_alpha)
 
-    def moments(self, footprint: Footprint, weights: list[Any], positions: Any) -> list[Any]:
+    def moments(self, footprint: Footprint, weights: list[Any], positions: Positions) -> list[Any]:
         """Sums over the 16 pixels of w = d loss / d ln(alpha) times 1, u, u dx, u dy, dy, dy^2."""
         dx, dy = footprint.dx, footprint.dy
         u = [value for row in footprint.u for value in row]
@@ -261,7 +387,7 @@ class AffineResponse:
     def pack_tangents(self, geometry: list[Any], tangents: list[Any]) -> list[Any]:
         """Tangents of the geometry, that of the opacity as d ln(opacity)."""
         *others, d_opacity = tangents
-        return [*others, d_opacity * dr.exp2(-geometry[5])]
+        return [*others, d_opacity * dr.exp2(-self.log2_opacity(geometry))]
 
     def tangent(
         self, geometry: list[Any], footprint: Footprint, d_geometry: list[Any]
@@ -288,6 +414,51 @@ class AffineResponse:
 # ----------------------------------------------------------------------------------------------
 
 
+class Features(Protocol):
+    """What is composited of a splat, from the numbers that are stored of it."""
+
+    def num_planes(self, num_stored: int) -> int:
+        """Planes that come of ``num_stored`` numbers per splat."""
+        ...
+
+    def seen_by(self, camera: Camera) -> Features:
+        """For one camera."""
+        ...
+
+    def check_differentiable_in_camera(self) -> None:
+        """Raise NotImplementedError if they depend on the camera but through what is stored."""
+        ...
+
+    def bind(self, lanes: Lanes, positions: Positions) -> Features:
+        """For the lanes of one kernel: loads what they need. The rest is called of the result."""
+        ...
+
+    def at(self, stored: list[Any], pixel: int) -> list[Any]:
+        """The splat's features at a pixel."""
+        ...
+
+    def add(self, planes: list[Any], stored: list[Any], pixel: int, weight: Any) -> list[Any]:
+        """A pixel's ``planes`` with this splat's share; weight: T alpha."""
+        ...
+
+    def feature_gradient(self, stored: list[Any], pixel: int, g: list[Any]) -> Any:
+        """c . g, with the features c at a pixel and the loss's derivatives g there."""
+        ...
+
+    def add_derivatives(
+        self, totals: list[Any], stored: list[Any], pixel: int, weight: Any, g: list[Any]
+    ) -> list[Any]:
+        """``totals`` and one pixel's share of the derivatives with respect to ``stored``.
+
+        weight: T alpha; g: derivatives of the loss with respect to the pixel's planes.
+        """
+        ...
+
+    def tangents(self, stored: list[Any], d_stored: list[Any], pixel: int) -> list[Any]:
+        """Tangents of the features at a pixel."""
+        ...
+
+
 @dataclass(frozen=True)
 class SplatFeatures:
     """A splat's features are the same at every pixel: what is stored is what is composited."""
@@ -296,7 +467,7 @@ class SplatFeatures:
         """Planes that come of ``num_stored`` numbers per splat."""
         return num_stored
 
-    def seen_by(self, camera: Any) -> SplatFeatures:
+    def seen_by(self, camera: Camera) -> SplatFeatures:
         """For one camera: nothing depends on it."""
         del camera
         return self
@@ -304,7 +475,7 @@ class SplatFeatures:
     def check_differentiable_in_camera(self) -> None:
         """They do not depend on the camera."""
 
-    def bind(self, lanes: Any, positions: Any) -> SplatFeatures:
+    def bind(self, lanes: Lanes, positions: Positions) -> SplatFeatures:
         """For the lanes of one kernel: nothing depends on where the pixels are."""
         del lanes, positions
         return self
@@ -329,10 +500,7 @@ class SplatFeatures:
     def add_derivatives(
         self, totals: list[Any], stored: list[Any], pixel: int, weight: Any, g: list[Any]
     ) -> list[Any]:
-        """``totals`` and one pixel's share of the derivatives with respect to ``stored``.
-
-        weight: T alpha; g: derivatives of the loss with respect to the pixel's planes.
-        """
+        """``totals`` and one pixel's share of the derivatives with respect to ``stored``."""
         del stored, pixel
         return [
             dr.fma(weight, derivative, total) for derivative, total in zip(g, totals, strict=True)
@@ -346,14 +514,14 @@ class SplatFeatures:
 
 @dataclass(frozen=True)
 class ImageModel:
-    """The choices that tiles and compositing share; see the module's description."""
+    """What tiles and compositing share; see the module's description."""
 
-    response: Any = field(default_factory=AffineResponse)
-    positions: Any = field(default_factory=PixelCenters)
-    features: Any = field(default_factory=SplatFeatures)
+    response: Response = field(default_factory=AffineResponse)
+    positions: Positions = field(default_factory=PixelCenters)
+    features: Features = field(default_factory=SplatFeatures)
     cutoffs: Cutoffs = field(default_factory=Cutoffs)
 
-    def seen_by(self, camera: Any) -> ImageModel:
+    def seen_by(self, camera: Camera) -> ImageModel:
         """This model for one camera."""
         return replace(
             self,
@@ -365,7 +533,7 @@ class ImageModel:
         """Raise NotImplementedError if pixels depend on the camera but through the splats."""
         self.features.check_differentiable_in_camera()
 
-    def bind(self, lanes: Any, grid: Any) -> ImageModel:
+    def bind(self, lanes: Lanes, grid: TileGrid) -> ImageModel:
         """This model for the lanes of one kernel: loads what a lane needs before its loop."""
         positions = self.positions.bind(lanes, grid)
         return ImageModel(
@@ -375,7 +543,7 @@ class ImageModel:
             cutoffs=self.cutoffs,
         )
 
-    def footprint(self, geometry: list[Any], lanes: Any, active: Any) -> Footprint:
+    def footprint(self, geometry: list[Any], lanes: Lanes, active: Any) -> Footprint:
         """A splat at the pixels of each lane."""
         return self.response.footprint(geometry, partial(self.positions.offsets, lanes), active)
 

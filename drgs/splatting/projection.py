@@ -5,16 +5,16 @@ plain arithmetic, so Dr.Jit differentiates it. The equations are those of Zwicke
 splatting") as used in section 4 of the 3DGS paper, written so that they do not cancel in single
 precision.
 
-How a Gaussian's shape comes to the film is a function, :func:`ewa` or one of another module
-(``drgs.accuracy.unscented``, ``drgs.accuracy.exact``).
+How a Gaussian's shape comes to the film is a :class:`Projection`: :func:`ewa` or one of another
+module (``drgs.accuracy.unscented``, ``drgs.accuracy.exact``).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations
-from typing import Any
+from typing import Any, Protocol
 
 import drjit as dr
 
@@ -25,6 +25,21 @@ from drgs.gaussians import sh
 from drgs.gaussians.parameters import Gaussians
 from drgs.gaussians.quaternions import normalized, quat_to_rotation
 from drgs.splatting.cutoffs import Cutoffs
+
+
+@dataclass(frozen=True)
+class RayTerms:
+    """What the peak along a pixel's ray depends on: see ``drgs.accuracy.exact``."""
+
+    tilt_x: Any  # Float: how the peak's depth changes across the film, kappa or g / |a_c|
+    tilt_y: Any  # Float
+    spread: Any  # Float: h, of the depth where the place on the film is known
+    scale: Any = None  # Float: 1 / |a_c|, what the whitening is multiplied by; None: 1
+
+    def numbers(self) -> list[Any]:
+        """Those that there are, Float each."""
+        numbers = [self.tilt_x, self.tilt_y, self.spread]
+        return numbers if self.scale is None else [*numbers, self.scale]
 
 
 @dataclass(frozen=True)
@@ -45,7 +60,7 @@ class Splats2D:
     colors: Any  # Array3f, display space; or whatever else :func:`project`'s ``color`` gave
     variances: Any  # Array2f, px^2: diagonal of the projected covariance, low-pass included
     visible: Any  # Bool: in front of the near plane, above the alpha cut, finite
-    perspective: Any = None  # list of Float, only where a choice needs it: see drgs.accuracy.exact
+    ray: RayTerms | None = None  # only where something asks for them
     dimming: Any = None  # Float: factor of the opacity, where the camera is out of focus
 
     @property
@@ -62,10 +77,43 @@ class FilmShape:
     means2d: Any  # Array2f, px
     whitening: Any  # Array3f (p, r, s), 1 / px
     variances: Any  # Array2f, px^2, low-pass included
-    sharp: Any  # Float: determinant of the covariance without low-pass; and what the low-pass
-    added: Any  # Float: adds to it, both divided by the variance in y
-    perspective: Any = None  # list of Float
+    determinant: Any  # Float: of the covariance without low-pass; and what the low-pass
+    added_determinant: Any  # Float: adds to it, both divided by the variance in y
+    ray: RayTerms | None = None
     dimming: Any = None  # Float: factor of the opacity; None: 1
+
+    def root_determinant(self) -> Any:
+        """Float, 1 / px^2: sqrt(det(conic)) at the mean."""
+        p, _, s = self.whitening
+        if self.ray is not None and self.ray.scale is not None:
+            p, s = p / self.ray.scale, s / self.ray.scale
+        return dr.abs(p * s)
+
+
+class Projection(Protocol):
+    """How a Gaussian's mean and covariance come to the film."""
+
+    def __call__(
+        self, rows: GaussianRows, camera: Camera, position: Any, low_pass: float
+    ) -> FilmShape:
+        """Project; position: Array3f, camera axes, the mean; low_pass: px^2."""
+        ...
+
+
+class OpacityRule(Protocol):
+    """How low-pass filtering affects opacity."""
+
+    def __call__(self, opacity: Any, determinant: Any, added_determinant: Any) -> Any:
+        """Float; for the determinants see :class:`FilmShape`."""
+        ...
+
+
+class SplatColor(Protocol):
+    """What is stored of a splat's colour."""
+
+    def __call__(self, rows: GaussianRows, direction: Any, sh_degree: int) -> Sequence[Any]:
+        """Float each; direction: Array3f, world, of any length, in which the mean is seen."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -111,9 +159,9 @@ def project(
     rows: GaussianRows,
     camera: Camera,
     sh_degree: int,
-    opacity_rule: Any,
-    shape: Callable | None = None,
-    color: Callable | None = None,
+    opacity_rule: OpacityRule,
+    shape: Projection | None = None,
+    color: SplatColor | None = None,
     low_pass: float = LOW_PASS,
     least_alpha: float = Cutoffs().least_alpha,
 ) -> Splats2D:
@@ -131,7 +179,9 @@ def project(
     seen, position, depth = camera.lens.look(camera, camera.rotation @ offset)
     low_pass = max(low_pass, LEAST_LOW_PASS)
     film = (shape or ewa)(rows, camera, position, low_pass)
-    opacities = opacity_rule(_sigmoid(rows.logit_opacities), film.sharp, film.added)
+    opacities = opacity_rule(
+        _sigmoid(rows.logit_opacities), film.determinant, film.added_determinant
+    )
     if rows.dimming is not None:
         opacities = opacities * rows.dimming
     bright = opacities > least_alpha
@@ -141,7 +191,7 @@ def project(
     direction = camera.lens.view_direction(camera, offset)
     colors = (color or color_at_mean)(rows, direction, sh_degree)
     numbers = [*film.means2d, *film.whitening, *colors]
-    numbers += [] if film.perspective is None else [*film.perspective]
+    numbers += [] if film.ray is None else film.ray.numbers()
     finite = dr.isfinite(dr.detach(sum(numbers[1:], numbers[0])))
     return Splats2D(
         means2d=film.means2d,
@@ -151,7 +201,7 @@ def project(
         colors=colors,
         variances=film.variances,
         visible=seen & bright & finite & dr.isfinite(dr.sum(film.variances)),
-        perspective=film.perspective,
+        ray=film.ray,
         dimming=film.dimming,
     )
 
@@ -179,15 +229,15 @@ def whiten(means2d: Any, m0: Sequence[Any], m1: Sequence[Any], low_pass: float) 
     s = dr.rsqrt(yy)
     m1 = [component * s for component in m1]
     minors = [dr.fma(m0[i], m1[j], -(m0[j] * m1[i])) for i, j in combinations(range(len(m0)), 2)]
-    sharp, added = dot(minors, minors), low_pass * (xx / yy + 1)
-    p = dr.rsqrt(sharp + added)
+    determinant, added_determinant = dot(minors, minors), low_pass * (xx / yy + 1)
+    p = dr.rsqrt(determinant + added_determinant)
     t = types_of(type(s))
     return FilmShape(
         means2d=means2d,
         whitening=t.Array3f(p, -p * (xy / yy), s),
         variances=t.Array2f(xx + low_pass, yy),
-        sharp=sharp,
-        added=added,
+        determinant=determinant,
+        added_determinant=added_determinant,
     )
 
 
@@ -204,23 +254,26 @@ def color_at_mean(rows: GaussianRows, direction: Any, sh_degree: int) -> Any:
     return sh.sh_color(rows.sh, normalized(direction), sh_degree)
 
 
-def plain_opacity(opacity: Any, sharp: Any, added: Any) -> Any:
+def plain_opacity(opacity: Any, determinant: Any, added_determinant: Any) -> Any:
     """The opacity as it is: low-pass filtering makes small splats larger and thus brighter."""
-    del sharp, added
+    del determinant, added_determinant
     return opacity
 
 
-def compensated_opacity(opacity: Any, sharp: Any, added: Any) -> Any:
+def compensated_opacity(opacity: Any, determinant: Any, added_determinant: Any) -> Any:
     """Opacity scaled by sqrt(det without / det with low-pass): the splat's integral is kept.
 
-    sharp, added: in the ratio of the determinant without low-pass to what the low-pass adds.
+    determinant, added_determinant: Float, of the covariance on the film without low-pass, and what
+    the low-pass adds to it; only their ratio counts.
 
     Mip-Splatting (Yu et al. 2024), section 5; gsplat's "antialiased" mode. The derivative of
     the square root at 0 (a splat of no area) is taken as 0.
     """
-    thin = sharp < 1e-12 * added
-    # Not sharp / (sharp + added), whose derivative is a difference that cancels for giants.
-    return dr.select(thin, 0, opacity * dr.rsqrt(1 + added / dr.select(thin, 1, sharp)))
+    thin = determinant < 1e-12 * added_determinant
+    # With a = determinant and b = added_determinant, not a / (a + b), whose derivative is a
+    # difference that cancels for giants.
+    ratio = added_determinant / dr.select(thin, 1, determinant)
+    return dr.select(thin, 0, opacity * dr.rsqrt(1 + ratio))
 
 
 def film_axes(

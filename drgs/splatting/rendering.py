@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Protocol
 
 import drjit as dr
 
@@ -27,6 +27,9 @@ from drgs.splatting.grid import TileGrid
 from drgs.splatting.image_model import DEFAULT, ImageModel
 from drgs.splatting.projection import (
     GaussianRows,
+    OpacityRule,
+    Projection,
+    SplatColor,
     Splats2D,
     color_at_mean,
     ewa,
@@ -44,8 +47,13 @@ from drgs.splatting.rasterize import (
 )
 from drgs.splatting.tiles import TileBins, bin_splats
 
-Feature = Callable[[Splats2D, GaussianRows, Camera], list[Any]]
-"""What is composited of each splat: a list of Float, one for each plane."""
+
+class Feature(Protocol):
+    """Something that is composited of each splat."""
+
+    def __call__(self, splats: Splats2D, rows: GaussianRows, camera: Camera) -> list[Any]:
+        """Columns, Float (N,) each, one for each plane."""
+        ...
 
 
 def color_features(splats: Splats2D, rows: GaussianRows, camera: Camera) -> list[Any]:
@@ -58,6 +66,39 @@ def depth_feature(splats: Splats2D, rows: GaussianRows, camera: Camera) -> list[
     """z in the camera, scene units: one plane, the alpha-weighted sum of the depths."""
     del rows, camera
     return [splats.depths]
+
+
+class Order(Protocol):
+    """In which order a pixel composites its splats."""
+
+    def seen_by(self, camera: Camera) -> Order:
+        """For one camera."""
+        ...
+
+    def keys(self, splats: Splats2D) -> list[Any]:
+        """Columns that compositing needs for the order, besides the order of the entries."""
+        ...
+
+    def composite(self, bins: TileBins, records: Records) -> Layers:
+        """See :func:`drgs.splatting.rasterize.composite`."""
+        ...
+
+    def adjoint(
+        self,
+        bins: TileBins,
+        records: Records,
+        layers: Layers,
+        d_features: list[Any],
+        d_transmittance: Any,
+    ) -> SplatGradients:
+        """See :func:`drgs.splatting.rasterize.composite_adjoint`."""
+        ...
+
+    def tangent(
+        self, bins: TileBins, records: Records, layers: Layers, tangents: SplatGradients
+    ) -> Layers:
+        """See :func:`drgs.splatting.rasterize.composite_tangent`."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -78,13 +119,22 @@ class CenterOrder:
         """Composite front to back."""
         return composite(bins, records)
 
-    def adjoint(self, *arguments: Any) -> SplatGradients:
+    def adjoint(
+        self,
+        bins: TileBins,
+        records: Records,
+        layers: Layers,
+        d_features: list[Any],
+        d_transmittance: Any,
+    ) -> SplatGradients:
         """See :func:`drgs.splatting.rasterize.composite_adjoint`."""
-        return composite_adjoint(*arguments)
+        return composite_adjoint(bins, records, layers, d_features, d_transmittance)
 
-    def tangent(self, *arguments: Any) -> Layers:
+    def tangent(
+        self, bins: TileBins, records: Records, layers: Layers, tangents: SplatGradients
+    ) -> Layers:
         """See :func:`drgs.splatting.rasterize.composite_tangent`."""
-        return composite_tangent(*arguments)
+        return composite_tangent(bins, records, layers, tangents)
 
 
 def as_loaded(rows: GaussianRows) -> GaussianRows:
@@ -97,14 +147,14 @@ class Pipeline:
     """What is rendered, and how; see the module's description."""
 
     sh_degree: int = 3
-    opacity_rule: Callable[[Any, Any, Any], Any] = plain_opacity
+    opacity_rule: OpacityRule = plain_opacity
     features: tuple[Feature, ...] = (color_features,)
     rows: Callable[[GaussianRows], GaussianRows] = as_loaded  # what is done to the Gaussians first
-    shape: Callable = ewa  # how a Gaussian's mean and covariance come to the film
-    color: Callable = color_at_mean  # what is stored of a splat's colour
+    shape: Projection = ewa  # how a Gaussian's mean and covariance come to the film
+    color: SplatColor = color_at_mean  # what is stored of a splat's colour
     low_pass: float = LOW_PASS  # px^2
     model: ImageModel = DEFAULT
-    order: Any = CenterOrder()
+    order: Order = CenterOrder()
 
     def project(self, rows: GaussianRows, camera: Camera) -> Splats2D:
         """The first stage with this pipeline's approximations."""
@@ -135,7 +185,7 @@ class Frame:
 
     pipeline: Pipeline
     camera: Camera
-    order: Any  # the pipeline's, for this camera
+    order: Order  # the pipeline's, for this camera
     bins: TileBins
     records: Records
     layers: Layers
@@ -185,32 +235,23 @@ def render_again(frame: Frame, model: ImageModel) -> Frame:
     return replace(frame, bins=bins, layers=frame.order.composite(bins, frame.records))
 
 
-def render_adjoint(
-    gaussians: Gaussians, frame: Frame, d_features: list[Any], d_transmittance: Any
-) -> GaussianGradients:
-    """Derivatives of a loss with respect to all parameters.
-
-    gaussians: those that ``frame`` was rendered from; d_features: derivative of the loss with
-    respect to each feature plane, Float (H * W,); d_transmittance: the same for T.
-
-    Not differentiated: visibility, the order of the splats, the decisions of compositing.
-    """
-    gradients = frame.order.adjoint(
-        frame.bins, frame.records, frame.layers, d_features, d_transmittance
-    )
-    return _gaussian_gradients(gaussians, frame, gradients)
-
-
 def frames_adjoint(
     gaussians: Gaussians,
     frames: list[Frame],
     d_planes: list[list[Any]],
     of_camera: bool = False,
 ) -> GaussianGradients:
-    """The same for a loss that depends on several frames of the same splats: of one camera.
+    """Derivatives of a loss with respect to all parameters.
 
-    d_planes: of each frame, derivatives with respect to its planes; of_camera: whether those with
-    respect to the camera are asked for.
+    The loss depends on several frames of the same splats and one camera.
+
+    gaussians: those that ``frames`` were rendered from; d_planes: of each frame, derivatives of the
+    loss with respect to its planes (see :meth:`Frame.planes`), Float (H * W,) each; of_camera:
+    whether those with respect to the camera are asked for.
+
+    Raises NotImplementedError if they are, and the pipeline has none.
+
+    Not differentiated: visibility, the order of the splats, the decisions of compositing.
     """
     total = None
     for frame, (d_transmittance, *d_features) in zip(frames, d_planes, strict=True):
@@ -303,25 +344,20 @@ def decode_fault(fault: int) -> tuple[int, str] | None:
 _NO_FAULT = 2**32 - 1
 
 
-def render_tangent(gaussians: Gaussians, frame: Frame, tangents: Gaussians) -> list[Any]:
-    """Directional derivatives of ``frame.planes()`` along ``tangents`` of the parameters.
-
-    Not differentiated: visibility, the order of the splats, the decisions of compositing.
-    """
-    direction = _splat_tangents(gaussians, frame, tangents)
-    order = frame.order
-    return order.tangent(frame.bins, frame.records, frame.layers, direction).planes()
-
-
 def frames_tangent(
     gaussians: Gaussians,
     frames: list[Frame],
     tangents: Gaussians,
     camera_tangents: list[Any] | None = None,
 ) -> list[list[Any]]:
-    """The same for the planes of several frames of the same splats.
+    """Directional derivatives of each frame's planes along ``tangents`` of the parameters.
 
-    camera_tangents: of ``camera.numbers()``; None: the camera stays.
+    gaussians: those that ``frames`` were rendered from, all by one camera; camera_tangents: of
+    ``camera.numbers()``; None: the camera stays.
+
+    Raises NotImplementedError for the camera's tangents if the pipeline has none.
+
+    Not differentiated: visibility, the order of the splats, the decisions of compositing.
     """
     direction = _splat_tangents(gaussians, frames[0], tangents, camera_tangents)
     return [f.order.tangent(f.bins, f.records, f.layers, direction).planes() for f in frames]

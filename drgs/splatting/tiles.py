@@ -145,7 +145,7 @@ def _reach(geometry: list[Any], grid: TileGrid, model: ImageModel) -> Any:
     """
     t = types_of(type(geometry[0]))
     floor = model.response.log2_floor(geometry, model.cutoffs)
-    return geometry[5] - floor + dr.opaque(t.Float, grid.cull_margin)
+    return model.response.log2_opacity(geometry) - floor + dr.opaque(t.Float, grid.cull_margin)
 
 
 def _tile_box(

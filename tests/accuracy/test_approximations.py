@@ -17,6 +17,8 @@ from support.helpers import (
     both_precisions,
     device_camera,
     device_gaussians,
+    frame_adjoint,
+    frame_tangent,
     random_scene,
     rows,
     single,
@@ -160,7 +162,7 @@ class Problem:
         d_transmittance, *d_features = [
             precision.array(plane) for plane in np.moveaxis(weights, -1, 0)
         ]
-        gradients = rendering.render_adjoint(gaussians, frame, d_features, d_transmittance)
+        gradients = frame_adjoint(gaussians, frame, d_features, d_transmittance)
         return {name: np.array(getattr(gradients.parameters, name)) for name in PARAMETER_NAMES}
 
 
@@ -279,7 +281,7 @@ def test_adjoint_is_the_transpose_of_the_tangent(precision, scene, name):
     gaussians, frame = problem.render(precision)
     for parameter in PARAMETER_NAMES:
         d = direction(problem, parameter, seed=4)
-        tangent = rendering.render_tangent(gaussians, frame, device_gaussians(d, precision))
+        tangent = frame_tangent(gaussians, frame, device_gaussians(d, precision))
         left = np.float64(weights) * problem.as_planes(tangent)
         right = np.float64(getattr(d, parameter)) * gradients[parameter]
         size = np.abs(left).sum() + np.abs(right).sum()
@@ -329,7 +331,7 @@ def test_behind_hundreds_of_layers_gradients_keep_their_accuracy():
         device = device_gaussians(gaussians, precision)
         frame = rendering.render(device, device_camera(camera, precision), pipeline)
         ones = precision.array(np.ones(256))
-        gradients = rendering.render_adjoint(device, frame, [ones] * 3, 0 * ones)
+        gradients = frame_adjoint(device, frame, [ones] * 3, 0 * ones)
         results.append(np.array(gradients.parameters.logit_opacities))
         assert np.array(frame.planes()[0]).max() < 1e-8
     # Doubled precision, 2^-48 a layer, relative to 1e-9 and to a twentieth of the colour.
@@ -385,7 +387,7 @@ def test_no_stop_leaves_gradients_behind_any_number_of_opaque_layers():
         pipeline = pipeline_of(Approximations(transmittance_stop=0.0), 0)
         frame = rendering.render(device, device_camera(camera, precision), pipeline)
         ones = precision.array(np.ones(256))
-        gradients = rendering.render_adjoint(device, frame, [ones] * 3, 0 * ones).parameters
+        gradients = frame_adjoint(device, frame, [ones] * 3, 0 * ones).parameters
         results.append([np.array(gradients.sh0), np.array(gradients.logit_opacities)])
     for single_precision, correct in zip(results[1], results[0], strict=True):
         tolerance = GRADIENTS[FLOAT32] * np.abs(correct).max()
@@ -421,9 +423,7 @@ def test_twins_are_composited_in_one_order_by_picture_and_derivative():
     frame = rendering.render(device, device_camera(camera, FLOAT64), pipeline)
     black = device_gaussians(reference.Gaussians(**{**twins, "sh0": 0 * twins["sh0"]}), FLOAT64)
     without = rendering.render(black, device_camera(camera, FLOAT64), pipeline)
-    gradients = rendering.render_adjoint(
-        device, frame, [precise(w) for w in weights], precise(0 * weights[0])
-    )
+    gradients = frame_adjoint(device, frame, [precise(w) for w in weights], precise(0 * weights[0]))
     pictures = [np.array([rows(p) for p in f.planes()[1:]]) for f in (frame, without)]
     linear = np.sum(weights * (pictures[0] - pictures[1]))
     from_gradients = np.sum(twins["sh0"] * np.array(gradients.parameters.sh0))
@@ -585,5 +585,5 @@ def test_no_gaussians_on_the_film():
     planes = problem.as_planes(frame.planes())
     assert (planes[..., 0] == 1).all() and not planes[..., 1:].any()
     ones = dr.ones(FLOAT32.Float, planes[..., 0].size)
-    gradients = rendering.render_adjoint(device, frame, [ones] * 3, ones)
+    gradients = frame_adjoint(device, frame, [ones] * 3, ones)
     assert not any(np.array(getattr(gradients.parameters, n)).any() for n in PARAMETER_NAMES)

@@ -15,7 +15,15 @@ import drjit as dr
 import numpy as np
 import pytest
 from support.conditioning import U, color_share, opacity_size, rounded_inputs
-from support.helpers import FLOAT32, FLOAT64, device_camera, device_gaussians, rows, single
+from support.helpers import (
+    FLOAT32,
+    FLOAT64,
+    device_camera,
+    device_gaussians,
+    frame_adjoint,
+    rows,
+    single,
+)
 from test_hard_cases import EXACT, FAMILIES, bound_of, errors_over_bounds
 
 from drgs.accuracy import exact as perspective
@@ -50,7 +58,7 @@ def planes_and_gradients(gaussians, camera, pipeline, weights, precision) -> tup
     frame = rendering.render(device, device_camera(camera, precision), pipeline)
     planes = [rows(plane).reshape(camera.height, camera.width) for plane in frame.planes()]
     d_transmittance, *d_features = (precision.array(w) for w in np.moveaxis(weights, -1, 0))
-    gradients = rendering.render_adjoint(device, frame, d_features, d_transmittance).parameters
+    gradients = frame_adjoint(device, frame, d_features, d_transmittance).parameters
     return {"planes": np.stack(planes, axis=-1)}, {
         name: np.array(getattr(gradients, name)) for name in PARAMETER_NAMES
     }

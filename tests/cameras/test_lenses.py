@@ -16,6 +16,8 @@ from support.helpers import (
     both_precisions,
     clear,
     device_gaussians,
+    frame_adjoint,
+    frame_tangent,
     picture_of,
     plane_cotangents,
     rows,
@@ -140,7 +142,7 @@ GRADIENTS = {FLOAT64: 1e-12, FLOAT32: 5e-5}
 def kernel_gradients(case, precision, cotangents, pipeline=None) -> dict[str, np.ndarray]:
     gaussians, frame = case.render(precision, pipeline)
     d_features, d_transmittance = plane_cotangents(case, cotangents, precision)
-    gradients = rendering.render_adjoint(gaussians, frame, d_features, d_transmittance)
+    gradients = frame_adjoint(gaussians, frame, d_features, d_transmittance)
     return {n: np.array(getattr(gradients.parameters, n)) for n in PARAMETER_NAMES}
 
 
@@ -226,7 +228,7 @@ def test_adjoint_is_the_transpose_of_the_tangent(precision, name):
     weights = np.array([rows(d) for d in (d_transmittance, *d_features)])
     for parameter, direction in directions(case.gaussians, seed=5).items():
         tangents = device_gaussians(direction, precision)
-        planes = rendering.render_tangent(gaussians, frame, tangents)
+        planes = frame_tangent(gaussians, frame, tangents)
         left = weights * np.array([rows(plane) for plane in planes])
         right = getattr(direction, parameter) * gradients[parameter]
         size = np.abs(left).sum() + np.abs(right).sum()
@@ -682,7 +684,7 @@ def test_gradients_equal_their_own_central_differences(name, choices):
     weights = single(np.random.default_rng(1).normal(size=(4, case.height * case.width)))
     gaussians, frame = case.render(FLOAT64, pipeline)
     d_transmittance, *d_features = map(FLOAT64.array, weights)
-    gradients = rendering.render_adjoint(gaussians, frame, d_features, d_transmittance).parameters
+    gradients = frame_adjoint(gaussians, frame, d_features, d_transmittance).parameters
     step = 1e-7
     for parameter, direction in directions(case.gaussians, seed=2).items():
         forward, backward = (
@@ -788,9 +790,9 @@ def kernels_of(lens, camera_seed=0) -> dict[str, list]:
         frame = rendering.render(gaussians, camera, case.pipeline)
         dr.eval(frame.planes())
         forward = drain_kernels()
-        rendering.render_adjoint(gaussians, frame, [ones] * (len(frame.planes()) - 1), ones)
+        frame_adjoint(gaussians, frame, [ones] * (len(frame.planes()) - 1), ones)
         adjoint = drain_kernels()
-        dr.eval(rendering.render_tangent(gaussians, frame, gaussians))
+        dr.eval(frame_tangent(gaussians, frame, gaussians))
         tangent = drain_kernels()
     return {"forward": forward, "adjoint": adjoint, "tangent": tangent}
 
@@ -868,7 +870,7 @@ def test_positions_that_are_no_numbers_poison_nothing(precision, name, shape):
     def rendered(gaussians):
         device = device_gaussians(gaussians, precision)
         frame = rendering.render(device, case.device_camera(precision), pipeline)
-        gradients = rendering.render_adjoint(device, frame, d_features, d_transmittance).parameters
+        gradients = frame_adjoint(device, frame, d_features, d_transmittance).parameters
         planes = {n: rows(plane) for n, plane in enumerate(frame.planes())}
         return planes, {n: np.array(getattr(gradients, n)) for n in PARAMETER_NAMES}
 

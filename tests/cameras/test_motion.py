@@ -20,6 +20,8 @@ from support.helpers import (
     both_precisions,
     clear,
     device_gaussians,
+    frame_adjoint,
+    frame_tangent,
     picture_of,
     plane_cotangents,
     rows,
@@ -456,8 +458,7 @@ def kernel_gradients(case, precision, cotangents):
     gaussians, frames = case.frames(precision)
     d_features, d_transmittance = plane_cotangents(case, cotangents, precision)
     parts = [
-        rendering.render_adjoint(gaussians, frame, d_features, d_transmittance).parameters
-        for frame in frames
+        frame_adjoint(gaussians, frame, d_features, d_transmittance).parameters for frame in frames
     ]
     return {n: np.mean([np.array(getattr(part, n)) for part in parts], 0) for n in PARAMETER_NAMES}
 
@@ -502,7 +503,7 @@ def test_adjoint_is_the_transpose_of_the_tangent(precision, name, samples):
     weights = np.array([rows(d) for d in (d_transmittance, *d_features)])
     for parameter, direction in directions(case.gaussians, seed=5).items():
         tangents = device_gaussians(direction, precision)
-        planes = [rendering.render_tangent(gaussians, frame, tangents) for frame in frames]
+        planes = [frame_tangent(gaussians, frame, tangents) for frame in frames]
         left = weights * np.mean([[rows(plane) for plane in of_time] for of_time in planes], axis=0)
         right = getattr(direction, parameter) * gradients[parameter]
         size = np.abs(left).sum() + np.abs(right).sum()
@@ -563,7 +564,7 @@ def test_a_camera_that_moves_quickly_stays_finite(precision, samples, turn, trav
     gaussians, frames = case.frames(precision, gaussians=replace(case.gaussians, means=means))
     for frame in frames:
         assert np.isfinite(planes_of(frame)).all()
-        gradients = rendering.render_adjoint(gaussians, frame, d_features, d_transmittance)
+        gradients = frame_adjoint(gaussians, frame, d_features, d_transmittance)
         for parameter in PARAMETER_NAMES:
             values = np.array(getattr(gradients.parameters, parameter))
             assert np.isfinite(values).all() and not values[-3:].any(), parameter

@@ -17,6 +17,8 @@ from support.helpers import (
     both_precisions,
     clear,
     device_gaussians,
+    frame_adjoint,
+    frame_tangent,
     picture_of,
     plane_cotangents,
     render_composed,
@@ -361,7 +363,7 @@ def test_adjoint_is_the_transpose_of_the_tangent(precision, scene):
     d_features, d_transmittance = plane_cotangents(case, cotangents, precision)
     weights = np.array([rows(d) for d in (d_transmittance, *d_features)])
     for parameter, direction in directions(case.gaussians, seed=5).items():
-        planes = rendering.render_tangent(gaussians, frame, device_gaussians(direction, precision))
+        planes = frame_tangent(gaussians, frame, device_gaussians(direction, precision))
         left = weights * np.array([rows(plane) for plane in planes])
         right = getattr(direction, parameter) * gradients[parameter]
         size = np.abs(left).sum() + np.abs(right).sum()
@@ -466,7 +468,7 @@ def test_splats_that_are_not_seen_poison_nothing(precision):
     ):
         device = device_gaussians(gaussians, precision)
         frame = render_composed(device, case.device_camera(precision), case.pipeline)
-        gradients = rendering.render_adjoint(device, frame, d_features, d_transmittance).parameters
+        gradients = frame_adjoint(device, frame, d_features, d_transmittance).parameters
         found.append(
             [planes_of(frame), *(np.array(getattr(gradients, n)) for n in PARAMETER_NAMES)]
         )

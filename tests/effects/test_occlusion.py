@@ -14,6 +14,8 @@ from support.helpers import (
     clear,
     device_camera,
     device_gaussians,
+    frame_adjoint,
+    frame_tangent,
     rows,
     single,
     stacked_scene,
@@ -127,7 +129,7 @@ def test_gradients_equal_differences_of_the_reference(precision, case):
     gaussians, frame = render(case, precision)
     weights = single(np.random.default_rng(4).normal(0, 1, expected_planes(case).shape))
     d_transmittance, *d_features = (precision.array(w) for w in weights)
-    gradients = rendering.render_adjoint(gaussians, frame, d_features, d_transmittance)
+    gradients = frame_adjoint(gaussians, frame, d_features, d_transmittance)
     for name, direction in directions(case.gaussians, seed=5).items():
         forward, backward = (
             expected_planes(case, moved(case.gaussians, direction, sign * STEP)) for sign in (1, -1)
@@ -147,12 +149,12 @@ def test_adjoint_is_the_transpose_of_the_tangent(precision, case):
     tangent = {
         n: single(rng.normal(0, 1, getattr(case.gaussians, n).shape)) for n in PARAMETER_NAMES
     }
-    planes = rendering.render_tangent(
+    planes = frame_tangent(
         gaussians, frame, device_gaussians(replace(case.gaussians, **tangent), precision)
     )
     weights = single(rng.normal(0, 1, expected_planes(case).shape))
     d_transmittance, *d_features = (precision.array(w) for w in weights)
-    gradients = rendering.render_adjoint(gaussians, frame, d_features, d_transmittance)
+    gradients = frame_adjoint(gaussians, frame, d_features, d_transmittance)
     left = weights * rows(planes).T
     right = [np.array(getattr(gradients.parameters, n)) * tangent[n] for n in PARAMETER_NAMES]
     size = np.sqrt(np.sum(left**2) + sum(np.sum(r**2) for r in right))

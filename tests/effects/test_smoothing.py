@@ -20,6 +20,8 @@ from support.helpers import (
     clear,
     device_camera,
     device_gaussians,
+    frame_adjoint,
+    frame_tangent,
     picture_of,
     plane_cotangents,
     render_composed,
@@ -35,7 +37,6 @@ from drgs.effects.smoothing import baked, smoothed, smoothing_of
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 from drgs.reference import effects as reference_effects
 from drgs.reference import splatting as reference
-from drgs.splatting import rendering
 from drgs.splatting.projection import load_rows
 
 # Relative to the largest value of an array. The filter is a sum of squares and a logarithm: a few
@@ -275,9 +276,7 @@ GRADIENTS = {FLOAT64: DIFFERENCES, FLOAT32: 2e-4}  # the latter as in test_rende
 
 def kernel_gradients(case, precision, cotangents):
     gaussians, frame = case.render(precision)
-    gradients = rendering.render_adjoint(
-        gaussians, frame, *plane_cotangents(case, cotangents, precision)
-    )
+    gradients = frame_adjoint(gaussians, frame, *plane_cotangents(case, cotangents, precision))
     assert gradients.parameters.smoothing is None
     return {n: np.array(getattr(gradients.parameters, n)) for n in PARAMETER_NAMES}
 
@@ -324,7 +323,7 @@ def test_tangent_and_adjoint_are_transposed(precision):
     direction = {n: single(rng.normal(size=g.shape)) for n, g in gradients.items()}
     gaussians, frame = case.render(precision)
     tangents = Gaussians(**direction).to(precision.TensorXf)
-    planes = rendering.render_tangent(gaussians, frame, tangents)
+    planes = frame_tangent(gaussians, frame, tangents)
     d_features, d_transmittance = plane_cotangents(case, cotangents, precision)
     left = sum(
         np.sum(rows(d) * rows(p))

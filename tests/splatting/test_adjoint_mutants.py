@@ -49,7 +49,7 @@ from drgs.splatting import image_model, rasterize, rendering
 from drgs.splatting.cutoffs import Cutoffs
 from drgs.training import losses
 
-CHAIN = ("render_adjoint", "render_tangent", "frames_adjoint", "frames_tangent")
+CHAIN = ("frames_adjoint", "frames_tangent")
 
 STAGES = ("composite_adjoint", "composite_tangent")
 

@@ -21,6 +21,8 @@ from support.helpers import (
     clear,
     device_camera,
     device_gaussians,
+    frame_adjoint,
+    frame_tangent,
     plane_cotangents,
     render,
 )
@@ -93,9 +95,9 @@ def kernels_of_a_frame(pipeline, case=None) -> dict[str, list]:
         planes = frame.planes()
         dr.eval(planes)
         forward = drain_kernels()
-        rendering.render_adjoint(gaussians, frame, [ones] * (len(planes) - 1), ones)
+        frame_adjoint(gaussians, frame, [ones] * (len(planes) - 1), ones)
         adjoint = drain_kernels()
-        dr.eval(rendering.render_tangent(gaussians, frame, gaussians))
+        dr.eval(frame_tangent(gaussians, frame, gaussians))
         tangent = drain_kernels()
     return {"forward": forward, "adjoint": adjoint, "tangent": tangent}
 
@@ -255,12 +257,12 @@ def test_no_kernel_reduces_floats_in_memory(precision, antialiased):
         dr.eval(results["frame"][1].planes())
 
     def adjoint():
-        gradients = rendering.render_adjoint(*results["frame"], *cotangents)
+        gradients = frame_adjoint(*results["frame"], *cotangents)
         dr.eval(gradients)
 
     def tangent():
         gaussians, frame = results["frame"]
-        dr.eval(rendering.render_tangent(gaussians, frame, gaussians))
+        dr.eval(frame_tangent(gaussians, frame, gaussians))
 
     for stage in (forward, adjoint, tangent):
         found, count = float_reductions(stage)

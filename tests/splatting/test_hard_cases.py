@@ -34,6 +34,7 @@ from support.helpers import (
     clear,
     device_camera,
     device_gaussians,
+    frame_adjoint,
     kernel_gradients,
     picture_of,
     plane_cotangents,
@@ -815,7 +816,7 @@ INFINITE_BUT_MEANINGFUL = {
 def planes_and_gradients(gaussians, case, precision):
     device = device_gaussians(gaussians, precision)
     frame = rendering.render(device, device_camera(case.camera, precision), case.pipeline)
-    gradients = rendering.render_adjoint(
+    gradients = frame_adjoint(
         device, frame, *plane_cotangents(case, Cotangents.random(case), precision)
     )
     planes = [np.array(plane) for plane in frame.planes()]

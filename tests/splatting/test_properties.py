@@ -24,6 +24,8 @@ from support.helpers import (
     both_precisions,
     device_camera,
     device_gaussians,
+    frame_adjoint,
+    frame_tangent,
     random_scene,
     rows,
     single,
@@ -188,7 +190,7 @@ def result_of(case, precision, weights, gaussians=None, camera=None) -> Result:
     camera = camera or device_camera(case.camera, precision)
     frame = rendering.render(gaussians, camera, case.pipeline)
     d_transmittance, *d_features = [stored(plane, precision) for plane in weights]
-    gradients = rendering.render_adjoint(gaussians, frame, d_features, d_transmittance)
+    gradients = frame_adjoint(gaussians, frame, d_features, d_transmittance)
     return Result(
         picture=picture_of(frame),
         gradients={
@@ -466,7 +468,7 @@ def test_adjoint_is_the_transpose_of_the_tangent(precision, case, seed):
     weights = random_weights(case)
     gaussians = uploaded(case.gaussians, precision)
     frame = rendering.render(gaussians, device_camera(case.camera, precision), case.pipeline)
-    tangents = rendering.render_tangent(gaussians, frame, uploaded(direction, precision))
+    tangents = frame_tangent(gaussians, frame, uploaded(direction, precision))
     gradients = result_of(case, precision, weights).gradients
     left = [w.ravel() * rows(plane) for w, plane in zip(weights, tangents, strict=True)]
     right = [gradients[name] * getattr(direction, name) for name in PARAMETER_NAMES]

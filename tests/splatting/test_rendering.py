@@ -23,6 +23,8 @@ from support.helpers import (
     clear,
     device_camera,
     device_gaussians,
+    frame_adjoint,
+    frame_tangent,
     kernel_gradients,
     picture_of,
     plane_cotangents,
@@ -217,7 +219,7 @@ def test_features_are_composited_in_the_order_that_was_asked_for(precision, feat
     assert len(actual) == len(expected)
     assert_arrays_agree(dict(enumerate(actual)), dict(enumerate(expected)), PICTURE[precision])
 
-    gradients = rendering.render_adjoint(
+    gradients = frame_adjoint(
         gaussians,
         frame,
         [precision.array(w) for feature in features for w in weights[feature]],
@@ -243,7 +245,7 @@ def test_attached_parameters_are_detached(precision):
         camera = device_camera(case.camera, precision)
         frame = rendering.render(gaussians, camera, case.pipeline)
         cotangents = plane_cotangents(case, Cotangents.random(case), precision)
-        gradients = rendering.render_adjoint(gaussians, frame, *cotangents)
+        gradients = frame_adjoint(gaussians, frame, *cotangents)
     assert_arrays_agree(
         {name: np.array(getattr(gradients.parameters, name)) for name in PARAMETER_NAMES},
         {name: expected_gradients(case)[name] for name in PARAMETER_NAMES},
@@ -256,7 +258,7 @@ def test_attached_parameters_are_detached(precision):
 def test_visible_are_those_whose_extent_touches_the_film(precision):
     case = clear(CASES[0])
     gaussians, frame = render(case, precision)
-    gradients = rendering.render_adjoint(
+    gradients = frame_adjoint(
         gaussians, frame, *plane_cotangents(case, Cotangents.random(case), precision)
     )
     visible = np.array(gradients.visible)
@@ -277,7 +279,7 @@ def test_without_a_visible_splat_there_is_only_the_background(precision):
     picture = picture_of(frame, case)
     np.testing.assert_array_equal(picture["image"], np.broadcast_to(case.background, (13, 20, 3)))
     assert not picture["depth"].any() and not picture["alpha"].any()
-    gradients = rendering.render_adjoint(
+    gradients = frame_adjoint(
         gaussians, frame, *plane_cotangents(case, Cotangents.random(case), precision)
     )
     for name in PARAMETER_NAMES:
@@ -296,7 +298,7 @@ def test_an_opacity_that_underflows_to_zero_has_no_gradient(precision, logit):
     gaussians = device_gaussians(replace(case.gaussians, logit_opacities=logits), precision)
     frame = rendering.render(gaussians, device_camera(case.camera, precision), case.pipeline)
     cotangents = plane_cotangents(case, Cotangents.random(case), precision)
-    gradients = rendering.render_adjoint(gaussians, frame, *cotangents)
+    gradients = frame_adjoint(gaussians, frame, *cotangents)
     for name in PARAMETER_NAMES:
         values = np.array(getattr(gradients.parameters, name))
         assert np.isfinite(values).all() and not values[row].any(), name
@@ -318,7 +320,7 @@ def random_direction(case, seed=7) -> reference.Gaussians:
 def kernel_tangent(case, precision, direction) -> dict[str, np.ndarray]:
     gaussians, frame = render(case, precision)
     tangents = device_gaussians(direction, precision)
-    return as_images(rendering.render_tangent(gaussians, frame, tangents), case.camera)
+    return as_images(frame_tangent(gaussians, frame, tangents), case.camera)
 
 
 @both_precisions
@@ -467,13 +469,13 @@ def frame_and_gradients(case, precision, gaussians=None, order=None) -> dict[str
     fields = gaussians or case.gaussians
     device = device_gaussians(fields, precision)
     frame = rendering.render(device, device_camera(case.camera, precision), case.pipeline)
-    gradients = rendering.render_adjoint(
+    gradients = frame_adjoint(
         device, frame, *plane_cotangents(case, Cotangents.random(case), precision)
     )
     tangents = random_direction(case)
     if order is not None:
         tangents = permuted(tangents, order)
-    d_planes = rendering.render_tangent(device, frame, device_gaussians(tangents, precision))
+    d_planes = frame_tangent(device, frame, device_gaussians(tangents, precision))
     return {
         **{f"plane {k}": np.array(plane) for k, plane in enumerate(frame.planes())},
         **{f"tangent {k}": np.array(plane) for k, plane in enumerate(d_planes)},
@@ -585,7 +587,7 @@ def test_gradients_agree_with_gsplat(precision, gsplat):
     scene, _, _, expected = gsplat
     gaussians, frame, _ = gsplat_frame(gsplat, precision)
     w = expected["w"].astype(float)
-    gradients = rendering.render_adjoint(
+    gradients = frame_adjoint(
         gaussians,
         frame,
         [precision.array(w[..., k]) for k in range(3)],
@@ -620,7 +622,7 @@ def test_gsplat_scene_agrees_with_the_reference(precision, gsplat, gsplat_marked
     assert bad.mean() <= 1e-4 and marked[bad].all()
 
     w = single(data["w"] * ~marked[..., None])
-    gradients = rendering.render_adjoint(
+    gradients = frame_adjoint(
         gaussians,
         frame,
         [precision.array(w[..., k]) for k in range(3)],
@@ -650,8 +652,8 @@ def test_transmittance_alone_is_rendered_and_differentiated(precision, order):
     assert len(alone.planes()) == 1
     assert dr.all(alone.planes()[0] == with_color.planes()[0])
     zero = dr.zeros(precision.Float, 21 * 18)
-    expected = rendering.render_adjoint(gaussians, with_color, [zero] * 3, cotangent)
-    got = rendering.render_adjoint(gaussians, alone, [], cotangent)
+    expected = frame_adjoint(gaussians, with_color, [zero] * 3, cotangent)
+    got = frame_adjoint(gaussians, alone, [], cotangent)
     for name in ("means", "quats", "log_scales"):
         expected_array = np.array(getattr(expected.parameters, name))
         got_array = np.array(getattr(got.parameters, name))
@@ -672,7 +674,7 @@ def test_row_that_is_not_finite_has_zero_gradient_and_spoils_no_other():
     for values in (good, Gaussians(**bad)):
         gaussians = values.to(FLOAT32.TensorXf)
         frame = rendering.render(gaussians, camera, rendering.Pipeline(1))
-        gradients = rendering.render_adjoint(gaussians, frame, cotangents[:3], cotangents[3])
+        gradients = frame_adjoint(gaussians, frame, cotangents[:3], cotangents[3])
         results.append((frame.planes(), gradients.parameters.numpy()))
     (planes, gradients), (planes_bad, gradients_bad) = results
     for plane, plane_bad in zip(planes, planes_bad, strict=True):

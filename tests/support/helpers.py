@@ -262,6 +262,16 @@ def render(case: Case, precision: Precision, pipeline=None) -> tuple[Gaussians, 
     return gaussians, rendering.render(gaussians, camera, pipeline or case.pipeline)
 
 
+def frame_adjoint(gaussians, frame, d_features, d_transmittance) -> rendering.GaussianGradients:
+    """Of a loss with these derivatives with respect to the frame's planes."""
+    return rendering.frames_adjoint(gaussians, [frame], [[d_transmittance, *d_features]])
+
+
+def frame_tangent(gaussians, frame, tangents) -> list:
+    """Directional derivatives of the frame's planes."""
+    return rendering.frames_tangent(gaussians, [frame], tangents)[0]
+
+
 def as_images(planes, camera) -> dict[str, np.ndarray]:
     """Planes (transmittance, color, depth) as transmittance (H, W), color (H, W, 3), depth."""
     planes = [rows(plane).reshape(camera.height, camera.width) for plane in planes]
@@ -322,9 +332,7 @@ def plane_cotangents(case, cotangents, precision) -> tuple[list, object]:
 def kernel_gradients(case, precision, cotangents) -> dict[str, np.ndarray]:
     """All gradients by the kernels, under the names and in the shapes of the reference."""
     gaussians, frame = render(case, precision)
-    gradients = rendering.render_adjoint(
-        gaussians, frame, *plane_cotangents(case, cotangents, precision)
-    )
+    gradients = frame_adjoint(gaussians, frame, *plane_cotangents(case, cotangents, precision))
     transmittance = as_images(frame.planes(), case.camera)["transmittance"]
     return {
         **{name: np.array(getattr(gradients.parameters, name)) for name in PARAMETER_NAMES},
