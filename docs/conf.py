@@ -55,8 +55,10 @@ def as_restructured_text(app, what, name, obj, options, lines):
     del app, what, obj, options
     if name.startswith("drgs.plugins"):
         text = re.sub(rf"\|({MITSUBA_NAMES})\|", r"``\1``", "\n".join(lines))
+        text = re.sub(r":monosp:`(.*?)`", r"\1", text)
         text = re.sub(r"(.+)\n-{4,}", r"**\1**", text)  # no section of a page within a class
-        lines[:] = re.sub(r"(\w)_(\.\.\.)", r"\1\_\2", text).split("\n")
+        text = re.sub(r"^(     \* - .*?\w)_\.\.\.", r"\1\\_...", text, flags=re.MULTILINE)
+        lines[:] = text.split("\n")
         return
     result, literal = [], False
     for k, line in enumerate(lines):
@@ -135,5 +137,4 @@ def setup(app):
     app.add_directive("pluginparameters", PluginParameters)
     app.add_directive("tabs", Tabs)
     app.add_directive("code-tab", CodeTab)
-    for role in ("monosp", "paramtype"):
-        app.add_generic_role(role, nodes.literal)
+    app.add_generic_role("paramtype", nodes.literal)
