@@ -1,7 +1,10 @@
 """How Sphinx builds these pages: sphinx-build -W -b html docs docs/_build/html"""
 
+import inspect
 import re
 import sys
+from contextlib import suppress
+from dataclasses import is_dataclass
 from pathlib import Path
 from typing import ClassVar
 
@@ -9,6 +12,7 @@ from docutils import nodes
 from docutils.parsers.rst import Directive
 from docutils.parsers.rst.directives.tables import ListTable
 from docutils.statemachine import StringList
+from pydantic import BaseModel
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
@@ -52,12 +56,12 @@ LITERAL = re.compile(r"(``.+?``|:\w+(?::\w+)?:`.+?`)")
 
 def as_restructured_text(app, what, name, obj, options, lines):
     """Escape what reStructuredText would read as markup, and set indented blocks as they are."""
-    del app, what, obj, options
+    del app, options
     if name.startswith("drgs.plugins"):
         text = re.sub(rf"\|({MITSUBA_NAMES})\|", r"``\1``", "\n".join(lines))
         text = re.sub(r":monosp:`(.*?)`", r"\1", text)
         text = re.sub(r"(.+)\n-{4,}", r"**\1**", text)  # no section of a page within a class
-        text = re.sub(r"^(     \* - .*?\w)_\.\.\.", r"\1\\_...", text, flags=re.MULTILINE)
+        text = re.sub(r"^( *\* - .*?\w)_\.\.\.", r"\1\\_...", text, flags=re.MULTILINE)
         lines[:] = text.split("\n")
         return
     result, literal = [], False
@@ -72,7 +76,31 @@ def as_restructured_text(app, what, name, obj, options, lines):
         elif line.strip() and not indented:
             literal = False
         result.append(line if literal else _escaped(line))
-    lines[:] = result
+    lines[:] = result + (["", *_fields(obj), ""] if what == "class" else [])
+
+
+def _fields(cls):
+    """The fields of a section of the configuration, or of a dataclass, as a list."""
+    if issubclass(cls, BaseModel):
+        for name, field in cls.model_fields.items():
+            default = "required" if field.is_required() else f"default ``{field.get_default()!r}``"
+            if field.default_factory is not None:
+                default = ""
+            described = " ".join(filter(None, [field.description, default and f"({default})"]))
+            yield f"- ``{name}``: {_plain(described)}" if described else f"- ``{name}``"
+    elif is_dataclass(cls):
+        with suppress(OSError):
+            for line in inspect.getsource(cls).splitlines():
+                found = re.fullmatch(r"    (\w+): [^#]*?  # (.*?)(  # noqa.*)?", line)
+                if found:
+                    yield f"- ``{found[1]}``: {_plain(found[2])}"
+
+
+def _plain(text):
+    """Of text that is no markup."""
+    parts = LITERAL.split(text)
+    parts[::2] = [re.sub(r"[|*_`]", r"\\\g<0>", part) for part in parts[::2]]
+    return "".join(parts)
 
 
 def _escaped(line):
