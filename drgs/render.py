@@ -33,7 +33,7 @@ from drgs.cli.execution import add_options, execution
 from drgs.config.load import load_config
 from drgs.config.schema import NAMED_COLORS, DataConfig, FitConfig, ModelConfig
 from drgs.core.constants import SHUTTER_SAMPLES
-from drgs.core.errors import UserError
+from drgs.core.errors import PluginError, UserError
 from drgs.core.files import atomic_path
 from drgs.data import Dataset, View, load_dataset
 from drgs.data.orbits import orbit_of_gaussians, orbit_of_views, orbit_size
@@ -48,6 +48,7 @@ from drgs.data.viewpoints import (
 from drgs.effects.compose import IGNORABLE
 from drgs.gaussians.parameters import Gaussians
 from drgs.integrator.scene import check_lenses, make_scene, render_views
+from drgs.integrator.settings import SummarisingIntegrator
 from drgs.integrator.summary import described, summary_of_views
 from drgs.io.pictures import read_image, write_animation, write_exr, write_png
 from drgs.results.files import CAMERAS, CONFIG, GAUSSIANS, METRICS, ORBIT
@@ -245,7 +246,7 @@ def render_mitsuba_scene(path: Path, out: Path, definitions: dict[str, str]) -> 
     if scene.integrator() is None or not scene.sensors():
         raise UserError(f"{path}: the scene must hold an integrator and at least one sensor")
     linear = _is_linear(scene.integrator())
-    if hasattr(scene.integrator(), "summary"):
+    if isinstance(scene.integrator(), SummarisingIntegrator):
         _print_summary(path, scene)
     for index, sensor in enumerate(scene.sensors()):
         name = path.stem if len(scene.sensors()) == 1 else f"{path.stem}_{index}"
@@ -263,16 +264,15 @@ def render_mitsuba_scene(path: Path, out: Path, definitions: dict[str, str]) -> 
 
 def _is_linear(integrator: mi.Integrator) -> bool:
     """Whether what it returns is radiance, and that of those that are nested in it."""
-    return all(getattr(one, "srgb_primitives", True) for one in mi.traverse(integrator).hierarchy)
+    nested = mi.traverse(integrator).hierarchy
+    return all(one.srgb_primitives for one in nested if isinstance(one, SummarisingIntegrator))
 
 
 def _print_summary(path: Path, scene: mi.Scene) -> None:
     """What the scene's ``splats`` integrator simulates for its sensors."""
     try:
         print(scene.integrator().summary(scene, *scene.sensors()), flush=True)
-    except (TypeError, ValueError) as error:
-        if not str(error).startswith("splats: "):
-            raise
+    except PluginError as error:
         raise UserError(f"{path}: {error}") from None
 
 
@@ -280,10 +280,7 @@ def _render_sensor(path: Path, scene: mi.Scene, index: int) -> None:
     """Leave the picture in the sensor's film."""
     try:
         scene.integrator().render(scene, sensor=index)
-    except (RuntimeError, TypeError, ValueError) as error:
-        # What the plugin refuses is the scene's fault; anything else is not.
-        if not str(error).startswith("splats: "):
-            raise
+    except PluginError as error:  # the scene's fault; anything else is not
         raise UserError(f"{path}: {_first_and_last(str(error))}") from None
 
 
@@ -434,7 +431,7 @@ def _first_and_last(message: str) -> str:
     """One line of Mitsuba's message: where, and the error itself, without a traceback between."""
     head, *rest = re.sub(r"^\[[\w.]+:\d+\] ", "", message.strip()).splitlines()
     head = head.removesuffix("Traceback (most recent call last):").strip()
-    last = re.sub(r"^\w*(Error|Exception): ", "", rest[-1].strip()) if rest else ""
+    last = re.sub(r"^[\w.]*(Error|Exception): ", "", rest[-1].strip()) if rest else ""
     return f"{head} {last}".strip()
 
 

@@ -7,7 +7,6 @@ parameters.
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 from typing import Any
 
@@ -16,7 +15,9 @@ import mitsuba as mi
 import numpy as np
 
 from drgs.cameras.camera import Camera, Pinhole
-from drgs.core.errors import did_you_mean
+from drgs.core.constants import SHUTTER_SAMPLES
+from drgs.core.errors import PluginError
+from drgs.integrator.properties import integer, matrix, number, one_of, positive
 from drgs.integrator.sensors import (
     SensorState,
     on_crop_window,
@@ -27,6 +28,7 @@ from drgs.integrator.sensors import (
 
 LENSES = ("pinhole", "opencv", "fisheye")
 SHUTTERS = ("global", "rolling")
+ALL_COEFFICIENTS = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 
 
 class CalibratedSensor(mi.Sensor):
@@ -127,20 +129,23 @@ class CalibratedSensor(mi.Sensor):
         super().__init__(props)
         self.m_needs_sample_3 = False  # no aperture
         width, height = self.film().size()
-        fx = _positive(props, "fx", width)
-        self.fx, self.fy = mi.Float(fx), mi.Float(_positive(props, "fy", fx))
-        self.cx = mi.Float(_number(props, "cx", width / 2))
-        self.cy = mi.Float(_number(props, "cy", height / 2))
+        fx = positive(props, "fx", width)
+        self.fx, self.fy = mi.Float(fx), mi.Float(positive(props, "fy", fx))
+        self.cx = mi.Float(number(props, "cx", width / 2))
+        self.cy = mi.Float(number(props, "cy", height / 2))
         self.lens = _lens(props)
         self.coefficients = {k: mi.Float(v) for k, v in self.lens.named().items()}
-        self.near, self.far = _positive(props, "near_clip", 0.01), _positive(props, "far_clip", 1e4)
+        self.near, self.far = positive(props, "near_clip", 0.01), positive(props, "far_clip", 1e4)
         if self.near >= self.far:
-            raise ValueError(
+            raise PluginError(
                 f"calibrated: far_clip must be larger than near_clip, {self.near}, got {self.far}"
             )
-        self.to_world_close = _transform(props, "to_world_close")
-        self.shutter = _one_of(props, "shutter", SHUTTERS)
-        self.shutter_samples = _count(props, "shutter_samples", 8)
+        self.to_world_close = None
+        if "to_world_close" in props:
+            close = matrix(props, "to_world_close").astype(np.float32)
+            self.to_world_close = mi.AffineTransform4f(close)
+        self.shutter = one_of(props, "shutter", SHUTTERS)
+        self.shutter_samples = integer(props, "shutter_samples", SHUTTER_SAMPLES, least=1)
 
     # ------------------------------------------------------------------------------------------
     # Parameters
@@ -173,7 +178,7 @@ class CalibratedSensor(mi.Sensor):
 
     def to_string(self) -> str:
         """One line a setting."""
-        lens = ", ".join([type(self.lens).__name__, *map(str, self.coefficients)])
+        lens = ", ".join([self.lens.label, *map(str, self.coefficients)])
         return (
             f"CalibratedSensor[\n  fx = {self.fx}, fy = {self.fy},\n  cx = {self.cx}, "
             f"cy = {self.cy},\n  lens = {lens},\n  to_world = {self.m_to_world},\n"
@@ -181,12 +186,11 @@ class CalibratedSensor(mi.Sensor):
         )
 
     # ------------------------------------------------------------------------------------------
-    # For the splats integrator: see ``drgs.cameras.camera``
+    # For the splats integrator: see ``drgs.integrator.sensors.CameraSensor``
     # ------------------------------------------------------------------------------------------
 
-    @property
     def camera_parameters(self) -> list[str]:
-        """What the camera depends on."""
+        """Names of the parameters that the camera depends on."""
         moves = ["to_world_close"] if self.to_world_close is not None else []
         return ["to_world", *moves, "fx", "fy", "cx", "cy", *self.coefficients]
 
@@ -270,50 +274,6 @@ class CalibratedSensor(mi.Sensor):
         return mi.ScalarBoundingBox3f()
 
 
-def _number(props: mi.Properties, name: str, default: float) -> float:
-    value = props.get(name, default)
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        raise TypeError(f"calibrated: {name} must be a number, got {value!r}")
-    if not math.isfinite(value):
-        raise ValueError(f"calibrated: {name} must be finite, got {value}")
-    return float(value)
-
-
-def _positive(props: mi.Properties, name: str, default: float) -> float:
-    value = _number(props, name, default)
-    if value <= 0:
-        raise ValueError(f"calibrated: {name} must be positive, got {value}")
-    return value
-
-
-def _count(props: mi.Properties, name: str, default: int) -> int:
-    value = props.get(name, default)
-    if isinstance(value, bool) or not isinstance(value, int):
-        raise TypeError(f"calibrated: {name} must be an integer, got {value!r}")
-    if value < 1:
-        raise ValueError(f"calibrated: {name} must be >= 1, got {value}")
-    return value
-
-
-def _transform(props: mi.Properties, name: str) -> mi.AffineTransform4f | None:
-    if name not in props:
-        return None
-    value = props[name]
-    if not hasattr(value, "matrix"):
-        raise TypeError(f"calibrated: {name} must be a transform, got {value!r}")
-    return mi.AffineTransform4f(np.array(value.matrix, np.float32))
-
-
-def _one_of(props: mi.Properties, name: str, known: tuple[str, ...]) -> str:
-    value = props.get(name, known[0])
-    if value not in known:
-        raise ValueError(
-            f"calibrated: {name} must be one of {', '.join(known)}, got {value!r}"
-            + did_you_mean(str(value), known)
-        )
-    return value
-
-
 def _lens_type(kind: str) -> Any:
     """Imported when it is chosen."""
     if kind == "opencv":
@@ -328,20 +288,18 @@ def _lens_type(kind: str) -> Any:
 
 
 def _lens(props: mi.Properties) -> Any:
-    kind = _one_of(props, "lens", LENSES)
+    kind = one_of(props, "lens", LENSES)
     model = _lens_type(kind)
     names = () if model is Pinhole else model.names
-    given = {name: _number(props, name, 0.0) for name in ALL_COEFFICIENTS if name in props}
+    given = {name: number(props, name, 0.0) for name in ALL_COEFFICIENTS if name in props}
     for name in given:
         if name not in names:
-            raise ValueError(
+            raise PluginError(
                 f"calibrated: lens '{kind}' has "
                 f"{'the coefficients ' + ', '.join(names) if names else 'no coefficients'}, "
                 f"got {name}"
             )
     return model.of(**given) if names else model()
 
-
-ALL_COEFFICIENTS = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 
 mi.register_sensor("calibrated", lambda props: CalibratedSensor(props))

@@ -16,6 +16,7 @@ import mitsuba as mi
 from drgs.accuracy.pipeline import pipeline_of
 from drgs.core.arrays import interleave
 from drgs.core.constants import NEAR
+from drgs.core.errors import PluginError, UnsupportedError
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 from drgs.integrator.cache import Memory
 from drgs.integrator.picture import Picture, sensors_of
@@ -29,11 +30,11 @@ from drgs.integrator.properties import (
     check_shapes,
     degree_of,
     ignored_effects,
+    integer,
     load_gaussians,
     nested_integrator,
     positive,
     turns_of_shapes,
-    whole_number,
 )
 from drgs.integrator.sensors import camera_from_sensor, read_sensor
 from drgs.integrator.view import accumulate, feature_of
@@ -237,7 +238,7 @@ class SplatsIntegrator(mi.CppADIntegrator):
     def __init__(self, props: mi.Properties) -> None:
         # Before the base class, which has a warning of its own about scalar variants.
         if mi.variant() not in SUPPORTED_VARIANTS:
-            raise ValueError(
+            raise PluginError(
                 f"splats: the variant '{mi.variant()}' is not supported, "
                 f"use mi.set_variant('{SUPPORTED_VARIANTS[0]}')"
             )
@@ -261,7 +262,7 @@ class SplatsIntegrator(mi.CppADIntegrator):
         self.near = positive(props, "near", NEAR)
         self.srgb_primitives = boolean(props, "srgb_primitives", True)
         self.nested = nested_integrator(props)
-        self.nested_spp = whole_number(props, "nested_spp", 0)
+        self.nested_spp = integer(props, "nested_spp", 0, least=0)
 
         self.last: LastBackward | None = None
         self.memory = Memory()
@@ -334,7 +335,7 @@ class SplatsIntegrator(mi.CppADIntegrator):
         else:
             self._gathered = None
         if self.gaussians.num_gaussians == 0:
-            raise ValueError(
+            raise PluginError(
                 "splats: there are no Gaussians: give the integrator 'filename' or tensors "
                 f"{', '.join(PARAMETER_NAMES)}, or the scene a shape of type ellipsoids or "
                 "ellipsoidsmesh"
@@ -487,7 +488,7 @@ class SplatsIntegrator(mi.CppADIntegrator):
         with dr.suspend_grad():
             rays = PictureRays.of(sensor, self.near, dr.detach(ray))
             if self.aovs and attached:
-                raise NotImplementedError(
+                raise UnsupportedError(
                     "splats: inside 'aov', derivatives with 'aovs' of this integrator are not "
                     "supported: leave them out, or render it alone"
                 )
@@ -524,7 +525,7 @@ def _ellipsoids(scene: mi.Scene) -> list[mi.Shape]:
 def _refuse_recording() -> None:
     """What is launched depends on what is seen, which a recording could not know."""
     if dr.flag(dr.JitFlag.FreezingScope):
-        raise RuntimeError(
+        raise UnsupportedError(
             "splats: rendering cannot be recorded by dr.freeze, as it reads counts back from the "
             "device: call mi.render outside of the frozen function"
         )

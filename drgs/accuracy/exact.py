@@ -53,6 +53,7 @@ import drjit as dr
 from drgs.cameras.camera import Camera, Pinhole
 from drgs.core.arrays import types_of
 from drgs.core.constants import WHITENING_SCALE
+from drgs.core.errors import UnsupportedError
 from drgs.splatting.image_model import (
     AffineResponse,
     Footprint,
@@ -168,11 +169,12 @@ class RayResponse(AffineResponse):
     def seen_by(self, camera: Camera) -> RayResponse:
         """For one camera, whose film has the anchors.
 
-        Raises ValueError for lenses that are no pinholes: their rays are not straight on the film.
+        Raises UnsupportedError for lenses that are no pinholes: their rays are not straight on
+        the film.
         """
         if not isinstance(camera.lens, Pinhole):
-            raise ValueError(
-                f"splats: projection 'exact' needs a pinhole, got {type(camera.lens).__name__}; "
+            raise UnsupportedError(
+                f"splats: projection 'exact' needs a pinhole, got {camera.lens.label}; "
                 "use 'unscented', or 'ewa', which is exact for parallel rays"
             )
         return RayResponse(camera)

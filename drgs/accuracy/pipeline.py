@@ -19,49 +19,51 @@ LEAST_STOP = 1e-30
 """Where no stop is asked for: past it float32 has no transmittance to go back from."""
 
 
-def pipeline_of(choices: Approximations, sh_degree: int, **others: Any) -> Pipeline:
-    """What renders with these choices; others: further fields of the pipeline."""
-    stop = max(choices.transmittance_stop, LEAST_STOP)
-    cutoffs = Cutoffs(choices.alpha_max, choices.alpha_cut, stop, choices.extent)
+def pipeline_of(approximations: Approximations, sh_degree: int, **others: Any) -> Pipeline:
+    """What renders with ``approximations``; others: further fields of the pipeline."""
+    stop = max(approximations.transmittance_stop, LEAST_STOP)
+    cutoffs = Cutoffs(
+        approximations.alpha_max, approximations.alpha_cut, stop, approximations.extent
+    )
     model = DEFAULT if cutoffs == Cutoffs() else ImageModel(cutoffs=cutoffs)
     shape, order, color = ewa, CenterOrder(), color_at_mean
-    if choices.projection == "exact":
+    if approximations.projection == "exact":
         from drgs.accuracy.exact import RayResponse, exact
 
         shape, model = exact, replace(model, response=RayResponse())
-    elif choices.projection == "unscented":
+    elif approximations.projection == "unscented":
         from drgs.accuracy.unscented import unscented
 
         shape = unscented
-    if choices.order == "pixel":
+    if approximations.order == "pixel":
         from drgs.accuracy.pixel_order import PixelOrder
 
-        shape, depths = _with_depths(choices, shape)
-        order = PixelOrder(choices.order_window, depths)
-    if choices.sh_direction == "pixel":
+        shape, depths = _with_depths(approximations, shape)
+        order = PixelOrder(approximations.order_window, depths)
+    if approximations.sh_direction == "pixel":
         from drgs.accuracy.ray_colors import RayColors, stored_coefficients
 
         color, model = stored_coefficients, replace(model, features=RayColors(sh_degree))
     return Pipeline(
         sh_degree=sh_degree,
-        opacity_rule=compensated_opacity if choices.antialiased else plain_opacity,
+        opacity_rule=compensated_opacity if approximations.antialiased else plain_opacity,
         shape=shape,
         color=color,
-        low_pass=choices.low_pass,
+        low_pass=approximations.low_pass,
         model=model,
         order=order,
         **others,
     )
 
 
-def _with_depths(choices: Approximations, shape: Any) -> tuple[Any, Any]:
+def _with_depths(approximations: Approximations, shape: Any) -> tuple[Any, Any]:
     """A projection that knows depths at a pixel, and who computes them."""
     from drgs.accuracy.exact import ewa_with_depth
     from drgs.accuracy.peak_depths import AffineDepths, RayDepths
 
-    if choices.projection == "exact":
+    if approximations.projection == "exact":
         return shape, RayDepths()
-    if choices.projection == "unscented":
+    if approximations.projection == "unscented":
         from drgs.accuracy.unscented import unscented_with_depth
 
         return unscented_with_depth, AffineDepths()

@@ -14,6 +14,7 @@ import drjit as dr
 
 from drgs.cameras.camera import Camera
 from drgs.core.constants import COLOR_MIN
+from drgs.core.errors import UnsupportedError
 from drgs.gaussians.sh import num_coefficients, sh_basis
 from drgs.splatting.grid import Lanes
 from drgs.splatting.image_model import Positions, SplatFeatures
@@ -56,7 +57,7 @@ class RayColors(SplatFeatures):
         """They are not: the direction is the camera's. Degree 0 has none."""
         if self.sh_degree == 0:
             return
-        raise NotImplementedError(
+        raise UnsupportedError(
             "splats: sh_direction 'pixel' is not differentiable in the camera; use 'mean'"
         )
 

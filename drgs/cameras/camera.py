@@ -25,6 +25,8 @@ from drgs.core.constants import TAN_CLAMP
 class Lens:
     """What all lenses have in common: by default nothing has to be prepared."""
 
+    label: ClassVar[str]
+    """What messages call it."""
     distorts: ClassVar[bool] = False
     """Whether a pinhole could take its place."""
     parallel: ClassVar[bool] = False
@@ -103,6 +105,8 @@ class Perspective(Lens):
 @dataclass(frozen=True)
 class Pinhole(Perspective):
     """A point (x, y, z) is seen at focal (x, y) / z + principal."""
+
+    label: ClassVar[str] = "Pinhole"
 
     def film_point(self, camera: Camera, position: Any) -> Any:
         """Where a point is on the film, Array2f, px."""

@@ -44,6 +44,7 @@ class Fisheye(Lens):
     angle has a cosine below ``min_cosine`` are not seen.
     """
 
+    label: ClassVar[str] = "Fisheye"
     distorts: ClassVar[bool] = True
     kind: ClassVar[str] = "fisheye"
     names: ClassVar[tuple[str, ...]] = ("k1", "k2", "k3", "k4")

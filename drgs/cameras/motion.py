@@ -7,7 +7,7 @@ where it is at the second pose: its centre on a line, turning at a constant rate
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, ClassVar
 
 import drjit as dr
 
@@ -24,6 +24,9 @@ SLOWEST = 1e-4
 @dataclass(frozen=True)
 class Motion:
     """From the first pose to the second."""
+
+    label: ClassVar[str]
+    """What messages call it."""
 
     travel: Any  # Array3f, world: of the centre
     turn: Any  # Array3f, camera axes: axis times angle (radians), below half a turn
@@ -56,6 +59,8 @@ class Motion:
 class MotionBlur(Motion):
     """All pixels are open all the time: pictures at ``samples`` times are averaged."""
 
+    label: ClassVar[str] = "blurred"
+
     samples: int
 
     def times(self) -> list[float]:
@@ -66,6 +71,8 @@ class MotionBlur(Motion):
 @dataclass(frozen=True)
 class RollingShutter(Motion):
     """The film's rows are read from the first, at time 0, to the last, at time 1."""
+
+    label: ClassVar[str] = "rolling shutter"
 
     def camera_of(self, means: Any, camera: Camera) -> Camera:
         """The camera as it is when the row of the film that shows a mean is read.

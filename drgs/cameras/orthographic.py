@@ -16,6 +16,7 @@ class Orthographic(Lens):
     All rays are parallel: colours are seen along the camera's axis.
     """
 
+    label: ClassVar[str] = "Orthographic"
     parallel: ClassVar[bool] = True
 
     def look(self, camera: Camera, position: Any) -> tuple[Any, Any, Any]:

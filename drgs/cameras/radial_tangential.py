@@ -63,6 +63,7 @@ class RadialTangential(Perspective):
     is beyond ``max_squared_radius`` are not seen.
     """
 
+    label: ClassVar[str] = "RadialTangential"
     distorts: ClassVar[bool] = True
     kind: ClassVar[str] = "opencv"
     names: ClassVar[tuple[str, ...]] = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")

@@ -1,86 +1,184 @@
-"""The approximations that a picture is made with, by name.
+"""The approximations that a picture is made with, declared once.
 
-The configuration (``drgs.config.schema``) and the plugin hold :class:`Approximations`;
-``drgs.accuracy.pipeline`` makes a pipeline of them.
+Whoever lists them asks :data:`DECLARED`, which reads the annotations of :class:`Approximations`:
+the section ``model`` of a configuration (``drgs.config.schema``), the properties of the plugin
+``splats`` (``drgs.integrator.properties``) and the test of that plugin's documentation.
+``drgs.accuracy.pipeline`` turns :class:`Approximations` into what renders.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
-from typing import Any
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields
+from typing import Annotated, Literal, get_args, get_type_hints
 
 import numpy as np
 
 from drgs.core.constants import ALPHA_CUT, ALPHA_MAX, LOW_PASS, TRANSMITTANCE_STOP
 
-PROJECTIONS = ("ewa", "unscented", "exact")
-ORDERS = ("center", "pixel")
-SH_DIRECTIONS = ("mean", "pixel")
+Value = bool | int | float | str
 
 
-WINDOW = 4
-"""Splats that a pixel keeps waiting: see ``drgs.accuracy.pixel_order``."""
+@dataclass(frozen=True)
+class Limits:
+    """The numbers that a value may be; None: no such limit."""
+
+    words: str  # what messages call them
+    gt: float | None = None
+    ge: float | None = None
+    lt: float | None = None
+    le: float | None = None
+
+    def hold_for(self, value: float) -> bool:
+        """Whether they do in single precision, in which kernels compute; they never do for NaN."""
+        value = float(np.float32(value))
+        return (
+            (self.gt is None or value > self.gt)
+            and (self.ge is None or value >= self.ge)
+            and (self.lt is None or value < self.lt)
+            and (self.le is None or value <= self.le)
+            and not math.isnan(value)
+        )
+
+    @property
+    def finite(self) -> dict[str, float]:
+        """By name, those that are given and finite."""
+        given = {name: limit for name, limit in asdict(self).items() if name != "words"}
+        return {k: v for k, v in given.items() if v is not None and math.isfinite(v)}
+
+
+@dataclass(frozen=True)
+class Unrounded:
+    """What a configuration writes for a default that is rounded to single precision."""
+
+    value: float
 
 
 @dataclass(frozen=True)
 class Approximations:
     """The approximations that a picture is made with; the defaults are those of 3DGS.
 
-    projection: ``ewa``, the affine approximation at the mean; ``unscented``, mean and covariance
-    of projected sigma points; ``exact``, the peak of the 3D Gaussian along each pixel's ray.
-
-    order: ``center``, by the depth of the means; ``pixel``, by the depth of the peaks along each
-    pixel's ray, re-sorted within ``order_window`` splats.
-
-    sh_direction: ``mean``, colours are seen in the direction of the mean; ``pixel``, in that of
-    each pixel.
+    Raises ValueError for a value that is outside of its limits.
     """
 
-    projection: str = "ewa"
-    order: str = "center"
-    order_window: int = WINDOW
-    sh_direction: str = "mean"
-    alpha_max: float = ALPHA_MAX
-    alpha_cut: float = ALPHA_CUT  # 0: none
-    transmittance_stop: float = TRANSMITTANCE_STOP  # 0: none
-    extent: float = math.inf  # standard deviations at which splats end; inf: at alpha_cut
-    low_pass: float = LOW_PASS  # px^2; 0: none
-    antialiased: bool = False
+    projection: Annotated[
+        Literal["ewa", "unscented", "exact"],
+        "How a Gaussian comes to the film. ewa: by the affine approximation at its mean; "
+        "unscented: by the mean and covariance of projected sigma points; exact: by its peak along "
+        "each pixel's ray.",
+    ] = "ewa"
+    order: Annotated[
+        Literal["center", "pixel"],
+        "In which splats are composited. center: by the depth of their means; pixel: by that of "
+        "their peaks along each pixel's ray.",
+    ] = "center"
+    order_window: Annotated[
+        int,
+        "Splats that a pixel keeps waiting to put them in order, where order is pixel.",
+        Limits("from 1 to 64", ge=1, le=64),
+    ] = 4
+    sh_direction: Annotated[
+        Literal["mean", "pixel"],
+        "In which colours are seen. mean: towards the mean of a Gaussian; pixel: along each "
+        "pixel's ray.",
+    ] = "mean"
+    alpha_max: Annotated[
+        float,
+        "Upper clamp of a splat's alpha.",
+        Limits("above 0 and below 1 in float32", gt=0, lt=1),
+        Unrounded(0.99),
+    ] = ALPHA_MAX
+    alpha_cut: Annotated[
+        float,
+        "Splats end where their alpha is smaller; 0: they do not.",
+        Limits("from 0 to below 1", ge=0, lt=1),
+        Unrounded(1 / 255),
+    ] = ALPHA_CUT
+    transmittance_stop: Annotated[
+        float,
+        "A pixel ends before its transmittance is smaller; 0: never.",
+        Limits("from 0 to below 1", ge=0, lt=1),
+    ] = TRANSMITTANCE_STOP
+    extent: Annotated[
+        float,
+        "Standard deviations at which splats end, unless alpha_cut ends them before.",
+        Limits("positive", gt=0),
+    ] = math.inf
+    low_pass: Annotated[
+        float,
+        "Variance that is added to each splat on the film, in square pixels; 0: none.",
+        Limits("finite and not negative", ge=0, lt=math.inf),
+    ] = LOW_PASS
+    antialiased: Annotated[
+        bool,
+        "Compensate opacities for the low-pass filter, so that it keeps each splat's integral "
+        "(Mip-Splatting, Yu et al. 2024).",
+    ] = False
 
     def __post_init__(self) -> None:
-        """Raise ValueError for a value that is none of a choice's."""
-        for name, known in (
-            ("projection", PROJECTIONS),
-            ("order", ORDERS),
-            ("sh_direction", SH_DIRECTIONS),
-        ):
-            if getattr(self, name) not in known:
-                raise ValueError(
-                    f"{name} must be one of {', '.join(known)}, got {getattr(self, name)!r}"
-                )
-        for name, expected, holds in (
-            ("order_window", "from 1 to 64", 1 <= self.order_window <= 64),
-            ("alpha_max", "above 0 and below 1 in float32", 0 < np.float32(self.alpha_max) < 1),
-            ("alpha_cut", "from 0 to below 1", 0 <= self.alpha_cut < 1),
-            ("transmittance_stop", "from 0 to below 1", 0 <= self.transmittance_stop < 1),
-            ("extent", "positive", self.extent > 0),
-            ("low_pass", "finite and not negative", 0 <= self.low_pass < math.inf),
-        ):
-            if not holds:
-                raise ValueError(f"{name} must be {expected}, got {getattr(self, name)!r}")
+        """Check all values."""
+        for name, declared in DECLARED.items():
+            value = getattr(self, name)
+            if not declared.allows(value):
+                raise ValueError(f"{name} must be {declared.expected}, got {value!r}")
 
     @staticmethod
-    def of(source: Any) -> Approximations:
-        """The choices among the attributes of ``source``."""
-        return Approximations(**{f.name: getattr(source, f.name) for f in fields(Approximations)})
+    def of(values: Mapping[str, Value | None]) -> Approximations:
+        """Those among ``values``; None, and a default that is not rounded, are the default."""
+        given = {name: value for name, value in values.items() if name in DECLARED}
+        return Approximations(
+            **{k: v for k, v in given.items() if v not in (None, DECLARED[k].unrounded)}
+        )
 
     @property
-    def others_than_default(self) -> dict[str, Any]:
-        """What was chosen."""
-        default = Approximations()
-        return {
-            f.name: getattr(self, f.name)
-            for f in fields(Approximations)
-            if getattr(self, f.name) != getattr(default, f.name)
-        }
+    def others_than_default(self) -> dict[str, Value]:
+        """By name, the values that are not the default."""
+        values = {name: getattr(self, name) for name in DECLARED}
+        return {name: value for name, value in values.items() if value != DECLARED[name].default}
+
+
+@dataclass(frozen=True)
+class Declared:
+    """What is said of one approximation."""
+
+    kind: type  # bool, int, float or str
+    default: Value
+    description: str
+    words: tuple[str, ...] = ()  # of a str: those that it may be
+    limits: Limits | None = None  # of a number
+    unrounded: float | None = None  # the default, where configurations write another number
+
+    @property
+    def expected(self) -> str:
+        """What messages ask for, behind "must be"."""
+        return self.limits.words if self.limits else f"one of {', '.join(self.words)}"
+
+    def allows(self, value: Value) -> bool:
+        """Whether a value of this kind is within the limits."""
+        if self.limits is not None:
+            return self.limits.hold_for(value)
+        return not self.words or value in self.words
+
+
+def _declared() -> dict[str, Declared]:
+    """Read the annotations."""
+    hints, result = get_type_hints(Approximations, include_extras=True), {}
+    for field in fields(Approximations):
+        kind, description, *extras = get_args(hints[field.name])
+        words = get_args(kind)
+        found = {type(extra): extra for extra in extras}
+        unrounded = found.get(Unrounded)
+        result[field.name] = Declared(
+            kind=str if words else kind,
+            default=field.default,
+            description=description,
+            words=words,
+            limits=found.get(Limits),
+            unrounded=None if unrounded is None else unrounded.value,
+        )
+    return result
+
+
+DECLARED = _declared()
+"""All approximations by name, in the order in which they are listed."""

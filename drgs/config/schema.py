@@ -7,6 +7,7 @@ is what :func:`dump_config` writes.
 
 from __future__ import annotations
 
+import math
 from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -17,9 +18,13 @@ from pydantic import (
     Field,
     PlainSerializer,
     PlainValidator,
+    ValidationInfo,
+    create_model,
+    field_validator,
     model_validator,
 )
 
+from drgs.config.approximations import DECLARED, Approximations, Declared
 from drgs.core.constants import SHUTTER_SAMPLES
 
 Color = str | tuple[float, float, float]
@@ -131,53 +136,57 @@ class InitConfig(_Section):
     )
 
 
-class ModelConfig(_Section):
-    """What is fitted and how it is rendered."""
+class _Model(_Section):
+    """What of :class:`ModelConfig` stands before the approximations."""
 
     sh_degree: int = Field(3, ge=0, le=3, description="Degree of the spherical harmonics.")
     sh_increase_every: Count = Field(
         1000, ge=1, description="Iterations between +1 of the degree in use, which starts at 0."
     )
     near: float = Field(0.2, gt=0, description="Near plane, scene units: closer means are culled.")
-    projection: Literal["ewa", "unscented", "exact"] = Field(
-        "ewa",
-        description="ewa: the affine approximation at the mean; unscented: of projected sigma "
-        "points; exact: the peak of the 3D Gaussian along each pixel's ray.",
-    )
-    order: Literal["center", "pixel"] = Field(
-        "center",
-        description="center: splats are ordered by the depth of their means; pixel: by that of "
-        "their peaks along each pixel's ray.",
-    )
-    order_window: int = Field(
-        4, ge=1, le=64, description="Of order pixel: splats that a pixel keeps waiting."
-    )
-    sh_direction: Literal["mean", "pixel"] = Field(
-        "mean", description="Where colours are seen from: towards the mean, or along each ray."
-    )
-    alpha_max: float = Field(0.99, gt=0, lt=1, description="Upper clamp of a splat's alpha.")
-    alpha_cut: float = Field(
-        1 / 255, ge=0, lt=1, description="Splats end where their alpha is smaller; 0: they do not."
-    )
-    transmittance_stop: float = Field(
-        1e-4, ge=0, lt=1, description="A pixel ends before its transmittance is smaller; 0: never."
-    )
-    extent: float | None = Field(
-        None,
-        gt=0,
-        description="Standard deviations at which splats end; null: where alpha_cut ends them.",
-    )
-    low_pass: float = Field(
-        0.3, ge=0, description="px^2 added to the variance of a splat on the film; 0: none."
-    )
-    antialiased: bool = Field(
-        False, description="Compensate opacities for the low-pass filter (Yu et al. 2024)."
-    )
+
+
+def _as_field(declared: Declared) -> tuple[Any, Any]:
+    """An approximation as a configuration has it; YAML has no infinity, which is null there."""
+    default, description = declared.default, declared.description
+    kind = Literal[declared.words] if declared.words else declared.kind
+    if declared.unrounded is not None:
+        default = declared.unrounded
+    elif default == math.inf:
+        kind, default, description = kind | None, None, f"{description} null: nowhere else."
+    limits = declared.limits.finite if declared.limits else {}
+    return kind, Field(default, description=description, **limits)
+
+
+_ModelWithApproximations = create_model(
+    "_ModelWithApproximations",
+    __base__=_Model,
+    **{name: _as_field(declared) for name, declared in DECLARED.items()},
+)
+
+
+class ModelConfig(_ModelWithApproximations):
+    """What is fitted and how it is rendered; with the fields of :class:`Approximations`."""
+
     smoothing: bool = Field(
         False,
         description="Widen Gaussians to what the training cameras can tell apart, for renderings "
         "at other sizes (the 3D filter of Mip-Splatting, Yu et al. 2024).",
     )
+
+    @field_validator(*(name for name, declared in DECLARED.items() if declared.limits))
+    @classmethod
+    def _check_in_single_precision(cls, value: float | None, field: ValidationInfo) -> float | None:
+        """A number may be rounded onto a limit."""
+        declared = DECLARED[field.field_name]
+        if value is not None and not declared.allows(value):
+            raise ValueError(f"must be {declared.expected}")
+        return value
+
+    @property
+    def approximations(self) -> Approximations:
+        """Those that are configured."""
+        return Approximations.of(vars(self))
 
 
 class RateAim(_Section):

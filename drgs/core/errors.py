@@ -14,6 +14,18 @@ class UserError(ValueError):
     """A wrong input: a configuration, a dataset, a file. Its text is all that the user needs."""
 
 
+class PluginError(UserError):
+    """What a scene asks of a plugin and cannot have; the message begins with the plugin's name."""
+
+
+class PluginTypeError(PluginError, TypeError):
+    """The same, where something is of another type than it must be."""
+
+
+class UnsupportedError(PluginError, NotImplementedError):
+    """The same, where the plugin has no code for it."""
+
+
 def one_line(text: object, limit: int = 300) -> str:
     """``text`` as one line of at most ``limit`` characters: what a library's error says, or a value
     from a file, within a message of ours.

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from drgs.core.errors import PluginError
 from drgs.gaussians.parameters import Gaussians
 from drgs.gaussians.sh_rotation import rotated
 
@@ -29,7 +30,7 @@ class Similarity:
 
     @staticmethod
     def of(matrix: np.ndarray, name: str) -> Similarity:
-        """From a homogeneous matrix (4, 4). Raises ValueError that begins with ``name``."""
+        """From a homogeneous matrix (4, 4). Raises PluginError that begins with ``name``."""
         matrix = np.asarray(matrix, np.float64)
         linear = matrix[:3, :3]
         is_affine = np.isfinite(matrix).all() and (matrix[3] == [0, 0, 0, 1]).all()
@@ -39,7 +40,7 @@ class Similarity:
                 left, _, right = np.linalg.svd(linear)
                 return Similarity(float(scale), left @ right, matrix[:3, 3])
         rows = "; ".join(" ".join(f"{number:g}" for number in row) for row in matrix)
-        raise ValueError(
+        raise PluginError(
             f"{name} must be made of rotations, translations and scales that are the same along "
             f"all axes and positive, got the matrix [{rows}]"
         )

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 import mitsuba as mi
@@ -24,10 +24,15 @@ from drgs.accuracy.sample_points import SamplePoints
 from drgs.cameras.camera import Camera
 from drgs.cameras.orthographic import Orthographic
 from drgs.core.arrays import interleave
+from drgs.core.errors import UnsupportedError
 from drgs.integrator.film import Channels, pixel_corners
 from drgs.integrator.picture import hybrid_of
-from drgs.integrator.sensors import camera_from_sensor, read_sensor
+from drgs.integrator.sensors import camera_from_sensor, is_batch, read_sensor
+from drgs.integrator.settings import SplatsSettings
 from drgs.integrator.view import View, constant_background
+
+if TYPE_CHECKING:  # imported where a scene has surfaces
+    from drgs.integrator.surfaces import Hybrid
 
 REFUSAL = (
     "splats: this integrator renders whole images: of those that sample the rays of another one, "
@@ -59,24 +64,24 @@ class PictureRays:
         sensor: of which a picture was rendered last, None if there was none; near: near plane of
         the integrator, scene units.
 
-        Raises NotImplementedError for rays that are not those of a picture of this sensor.
+        Raises UnsupportedError for rays that are not those of a picture of this sensor.
         """
         if sensor is None:
-            raise NotImplementedError(REFUSAL)
+            raise UnsupportedError(REFUSAL)
         film = sensor.film()
         width, height = film.crop_size()
         count, rest = divmod(dr.width(ray), width * height)
-        if count == 0 or rest or sensor.class_name() == "BatchSensor":
-            raise NotImplementedError(_unknown(sensor))
+        if count == 0 or rest or is_batch(sensor):
+            raise UnsupportedError(_unknown(sensor))
         camera = camera_from_sensor(read_sensor(sensor, near))
         if camera.shutter is not None:
-            raise NotImplementedError(_unknown(sensor))
+            raise UnsupportedError(_unknown(sensor))
         corner = dr.repeat(pixel_corners(film), count)
         place, on_camera = _look_back(camera, ray)
         within = place - corner
         inside = (dr.min(within) > -SLACK) & (dr.max(within) < 1 + SLACK)
         if not dr.all(inside & on_camera):
-            raise NotImplementedError(_unknown(sensor))
+            raise UnsupportedError(_unknown(sensor))
         within = dr.clip(within, 0, 1 - dr.epsilon(mi.Float))
         pixel = dr.arange(mi.UInt32, width * height)
         positions = [dr.gather(mi.Point2f, within, pixel * count + s) for s in range(count)]
@@ -90,7 +95,7 @@ class PictureRays:
 
     def channels(
         self,
-        integrator: Any,
+        integrator: SplatsSettings,
         scene: mi.Scene,
         sensor: mi.Sensor,
         sampler: mi.Sampler,
@@ -123,7 +128,7 @@ class PictureRays:
         return [mi.Float(interleave(list(of_samples))) for of_samples in planes]
 
     def _with_surfaces(
-        self, channels: Channels, hybrid: Any, sampler: mi.Sampler, active: mi.Bool
+        self, channels: Channels, hybrid: Hybrid, sampler: mi.Sampler, active: mi.Bool
     ) -> Channels:
         """The channels with what the nested integrator sees along the rays.
 

@@ -1,4 +1,4 @@
-"""What is seen past the splats that is no constant: an environment, a picture.
+"""What is seen past the splats that is no constant: an environment, a texture.
 
 Imported when a scene has an environment emitter or the background is a texture. Both are linear
 radiance, evaluated where the pixels are, and differentiated by Dr.Jit. Derivatives of an image's
@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import drjit as dr
 import mitsuba as mi
@@ -21,6 +22,15 @@ LENS_POINTS = 16
 """At which an aperture is sampled, for each place on the film: always the same, so that nothing is
 random. What is much brighter than its surroundings and smaller than the gaps between them is seen
 as so many pictures of itself."""
+
+
+class Background(Protocol):
+    """What is seen past the splats."""
+
+    opaque: bool  # whether it covers the film: alpha is then 1
+
+    def radiance(self, film: mi.Film, camera: Camera, place: mi.Point2f) -> mi.Color3f:
+        """At places in the crop window, px."""
 
 
 @dataclass(frozen=True)
@@ -67,7 +77,7 @@ def _disc(count: int) -> mi.Point2f:
 
 
 @dataclass(frozen=True)
-class Picture:
+class StretchedTexture:
     """A texture that is stretched over the whole film."""
 
     texture: mi.Texture
@@ -84,7 +94,7 @@ class Picture:
 
 def seen_by(
     film: mi.Film,
-    backdrop: Environment | Picture,
+    background: Background,
     cameras: Sequence[Camera],
     within: Sequence[tuple[mi.Float | float, mi.Float | float]],
 ) -> list[list[mi.Color3f]]:
@@ -94,4 +104,4 @@ def seen_by(
     """
     corner = pixel_corners(film)
     places = [corner + mi.Vector2f(x, y) for x, y in within]
-    return [[backdrop.radiance(film, camera, place) for place in places] for camera in cameras]
+    return [[background.radiance(film, camera, place) for place in places] for camera in cameras]

@@ -13,7 +13,9 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from drgs.integrator.film import Channels
+from drgs.core.errors import PluginError
+from drgs.integrator.film import Channels, PixelPositions
+from drgs.splatting.image_model import PixelCenters
 
 
 @dataclass(frozen=True)
@@ -26,16 +28,20 @@ class SideBySide:
 
     @staticmethod
     def of(batch: mi.Sensor) -> SideBySide:
-        """Raises ValueError if the batch's film has a crop window."""
+        """Raises PluginError if the batch's film has a crop window."""
         sensors, film = _children(batch), batch.film()
         if list(film.crop_size()) != list(film.size()):
-            raise ValueError("splats: the film of a batch sensor must not have a crop window")
+            raise PluginError("splats: the film of a batch sensor must not have a crop window")
         return SideBySide(sensors, film.size()[0] // len(sensors), film.size()[1])
 
-    def positions(self, positions: Sequence[Any], index: int) -> tuple[Any, ...]:
+    def positions(
+        self, positions: Sequence[PixelPositions], index: int
+    ) -> tuple[PixelPositions, ...]:
         """Where the pixels of one picture are evaluated, by sample."""
         return tuple(
-            replace(p, x=self._cut(p.x, index), y=self._cut(p.y, index)) if hasattr(p, "x") else p
+            p
+            if isinstance(p, PixelCenters)
+            else replace(p, x=self._cut(p.x, index), y=self._cut(p.y, index))
             for p in positions
         )
 

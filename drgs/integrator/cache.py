@@ -1,7 +1,12 @@
-"""What a picture keeps for the next one: frames, surfaces, maps of films."""
+"""What an integrator keeps for its next picture: frames, surfaces, maps of films.
+
+``mi.render`` has Dr.Jit traverse the integrator with all that it keeps, which resolves annotations.
+So what is imported on demand is ``Any`` here, and named beside it.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Hashable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -19,7 +24,7 @@ class Rendered:
 
     frames: list[list[rendering.Frame]]  # by time; one for each sample per pixel
     pipeline: rendering.Pipeline
-    exposure: Any  # key of the points that were sampled; None: pixel centres
+    samples: Hashable  # key of the film's samples: see drgs.integrator.film.FilmSamples
     sensor: SensorState
     gaussians: Gaussians  # detached: holding them keeps their variable indices from being reused
     traced: TracedSurfaces | None  # what was seen besides splats
@@ -27,7 +32,7 @@ class Rendered:
     def matches(
         self,
         pipeline: rendering.Pipeline,
-        exposure: Any,
+        samples: Hashable,
         sensor: SensorState,
         gaussians: Gaussians,
         traced: TracedSurfaces | None,
@@ -35,7 +40,7 @@ class Rendered:
         """Whether rendering these would give the same frames."""
         return (
             self.pipeline == pipeline
-            and self.exposure == exposure
+            and self.samples == samples
             and self.sensor.same_as(sensor)
             and same_variables(self.gaussians, gaussians)
             and self.traced is traced
@@ -47,25 +52,23 @@ class TracedSurfaces:
     """What a sensor saw of a scene's surfaces, and everything that this depends on."""
 
     surfaces: Any  # drgs.integrator.surfaces.Surfaces
-    settings: Any  # of the integrator, and the key of the points that were looked at
+    settings: tuple[Hashable, ...]  # of samples, integrator and sensor
     sensor: SensorState
     seen: list[list[Any]]  # by time and by sample: drgs.integrator.surfaces.SeenSurface
 
-    def matches(self, surfaces: Any, settings: Any, sensor: SensorState) -> bool:
-        """Whether looking at these would be the same."""
+    def matches(self, surfaces: Any, settings: tuple[Hashable, ...], sensor: SensorState) -> bool:
+        """Whether tracing these would give the same."""
         same = self.surfaces is surfaces and self.settings == settings
         return same and self.sensor.same_as(sensor)
 
 
-@dataclass(frozen=True)
+@dataclass
 class Memory:
     """What an integrator keeps. Views are known by their numbers."""
 
     rendered: dict[int, Rendered] = field(default_factory=dict)
     traced: dict[int, TracedSurfaces] = field(default_factory=dict)
-    surfaces: dict[str, Any] = field(
-        default_factory=dict
-    )  # "last": drgs.integrator.surfaces.Surfaces
+    surfaces: Any = None  # drgs.integrator.surfaces.Surfaces of the last scene that had some
     film_maps: dict[str, np.ndarray] = field(default_factory=dict)  # see drgs.integrator.film
 
     def forget_view(self, index: int) -> None:

@@ -32,6 +32,7 @@ import mitsuba as mi
 import numpy as np
 
 from drgs.core.arrays import from_host, interleave, types_of
+from drgs.core.errors import PluginError
 from drgs.core.private import same_variables
 from drgs.gaussians.parameters import Gaussians
 from drgs.gaussians.sh import num_coefficients
@@ -107,13 +108,13 @@ class Turn:
 
 
 def read(shape: mi.Shape) -> Ellipsoids:
-    """What the shape holds now, attached. Raises ValueError that names what does not fit."""
+    """What the shape holds now, attached. Raises PluginError that names what does not fit."""
     values = mi.traverse(shape)
     where = f"splats: the {_name(shape)}"
     missing = [name for name in ("opacities", "sh_coeffs") if name not in values]
     if missing:
         others = [name for name in values.keys() if not name.startswith("extent")]  # noqa: SIM118
-        raise ValueError(
+        raise PluginError(
             f"{where} must have the attributes opacities and sh_coeffs; missing: "
             f"{', '.join(missing)}; it has: {', '.join(others)}"
         )
@@ -123,7 +124,7 @@ def read(shape: mi.Shape) -> Ellipsoids:
         got = dr.width(values[name])
         if num == 0 or got not in [num * width for width in widths]:
             words = " or ".join(f"({num}, {width})" for width in widths)
-            raise ValueError(f"{where} must have {name} of shape {words}, got {got} numbers")
+            raise PluginError(f"{where} must have {name} of shape {words}, got {got} numbers")
     return Ellipsoids(values["data"], values["opacities"], values["sh_coeffs"])
 
 
@@ -297,13 +298,13 @@ def gather(
     which is returned again while nothing has changed. Of features the shapes' Gaussians have zeros,
     and no smoothing filter.
 
-    Raises ValueError for shapes that cannot be rendered, and for turns of shapes that there are
+    Raises PluginError for shapes that cannot be rendered, and for turns of shapes that there are
     not.
     """
     unknown = set(turns) - {shape.id() for shape in shapes} - {""}
     if unknown:
         found = ", ".join(f"'{shape.id()}'" for shape in shapes if shape.id()) or "none"
-        raise ValueError(
+        raise PluginError(
             f"splats: shapes_to_world_{min(unknown)} must end with the id of a shape of type "
             f"ellipsoids or ellipsoidsmesh, ids are: {found}"
         )

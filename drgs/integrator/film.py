@@ -1,20 +1,24 @@
-"""How a film is exposed: where pixels are evaluated, and how an image comes of the values.
+"""Samples of a film: where pixels are evaluated, and how an image comes of the values.
 
-Between the integrator and Mitsuba's films. :class:`CenterSamples` evaluates each pixel once, at its
-centre. ``drgs.integrator.sampling`` has the other one, for several samples per pixel.
+Between the integrator and Mitsuba's films. There are two :class:`FilmSamples`.
+:class:`CenterSamples` evaluates each pixel once, at its centre; ``drgs.integrator.sampling`` has
+the other, for several samples per pixel.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Hashable, Sequence
+from typing import Any, Protocol
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from drgs.core.arrays import from_host, interleave
+from drgs.core.errors import UnsupportedError
 from drgs.splatting.image_model import PixelCenters
+from drgs.splatting.lanes import Lanes
+from drgs.splatting.tiles import TileGrid
 
 Channels = list[Any]
 """What a film gets of one pass, each Float (H * W,): red, green, blue, perhaps alpha, then what the
@@ -38,6 +42,29 @@ def pixel_corners(film: mi.Film) -> mi.Point2f:
     pixel = dr.arange(mi.UInt32, width * height)
     row = pixel // dr.opaque(mi.UInt32, width)
     return mi.Point2f(pixel - row * width, row)
+
+
+class PixelPositions(Protocol):
+    """Where in the pixels one pass evaluates them: ``PixelCenters`` or ``SamplePoints``."""
+
+    margin: float  # px: how far from its centre a pixel may be evaluated
+
+    def bind(self, lanes: Lanes, grid: TileGrid) -> PixelPositions:
+        """For the lanes of one kernel."""
+
+
+class FilmSamples(Protocol):
+    """The samples of a picture."""
+
+    positions: Sequence[PixelPositions]  # by sample
+    within: Sequence[tuple[Any, Any]]  # the same: x and y from the pixels' upper left corners, px
+    key: Hashable  # equal for equal positions; None: pixel centres
+
+    def develop(self, passes: Sequence[Channels]) -> mi.TensorXf:
+        """The image, from the channels of each sample."""
+
+    def adjoint(self, grad_in: mi.TensorXf) -> list[Channels]:
+        """Derivatives of the loss with respect to the channels, given those of the image."""
 
 
 class CenterSamples:
@@ -125,7 +152,7 @@ def _found_map(film: mi.Film, aovs: Sequence[str]) -> np.ndarray:
     mixed = np.linspace(0.1, 2, num_pixels * count, dtype=np.float32).reshape(num_pixels, count)
     linear = np.allclose(develop(mixed), mixed @ matrix.T, rtol=1e-3, atol=1e-4)
     if not linear:
-        raise NotImplementedError(
+        raise UnsupportedError(
             f"splats: gradients through this film are not supported: {film} does not map each "
             "pixel's channels linearly"
         )

@@ -15,56 +15,67 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import reduce
-from typing import Any
+from typing import TYPE_CHECKING
 
 import drjit as dr
 import mitsuba as mi
 
 from drgs.gaussians.parameters import Gaussians
-from drgs.integrator.film import CenterSamples
+from drgs.integrator.film import CenterSamples, FilmSamples
+from drgs.integrator.sensors import is_batch
+from drgs.integrator.settings import SplatsSettings
 from drgs.integrator.view import Planes, View, constant_background
 from drgs.splatting import rendering
 
-# ----------------------------------------------------------------------------------------------
-# What is kept from one picture to the next
-# ----------------------------------------------------------------------------------------------
+if TYPE_CHECKING:  # imported where a scene calls for them
+    from drgs.integrator.batch import SideBySide
+    from drgs.integrator.surfaces import Hybrid
 
 
 @dataclass(frozen=True, eq=False)
 class Picture:
-    """One picture."""
+    """One picture of a sensor, by view."""
 
     views: list[View]
-    exposure: Any
-    hybrid: Any  # drgs.integrator.surfaces.Hybrid; None: there are splats alone
-    batch: Any = None  # drgs.integrator.batch.SideBySide, for several views
+    samples: FilmSamples
+    hybrid: Hybrid | None  # None: there are splats alone
+    batch: SideBySide | None = None  # for several views
 
     @staticmethod
-    def of(integrator: Any, scene: mi.Scene, sensor: mi.Sensor, seed: Any, spp: int) -> Picture:
-        """Where the sensor's pixels are evaluated, and how its film develops them."""
+    def of(
+        integrator: SplatsSettings,
+        scene: mi.Scene,
+        sensor: mi.Sensor,
+        seed: int | mi.UInt32,
+        spp: int,
+    ) -> Picture:
+        """Where the sensor's pixels are evaluated, and how its film develops them.
+
+        seed, spp: as ``mi.render`` has them; 0 samples per pixel: those of the sensor's sampler.
+        """
         hybrid = hybrid_of(integrator, scene, sensor, seed, spp)
         names = integrator.aov_names() + ([] if hybrid is None else hybrid.insertion.channels)
         film, spp = sensor.film(), spp or sensor.sampler().sample_count()
         maps = integrator.memory.film_maps
         if spp == 1 and film.rfilter().is_box_filter():
-            exposure = CenterSamples(film, maps, names)
+            samples = CenterSamples(film, maps, names)
         else:
             from drgs.integrator.sampling import DrawnSamples
 
-            exposure = DrawnSamples(sensor, seed, spp, maps, names)
+            samples = DrawnSamples(sensor, seed, spp, maps, names)
         whole = View(
             integrator=integrator,
             scene=scene,
             index=0,
             sensor=sensor,
-            positions=exposure.positions,
-            within=exposure.within,
-            key=exposure.key,
+            positions=samples.positions,
+            within=samples.within,
+            key=samples.key,
             has_alpha=mi.has_flag(film.flags(), mi.FilmFlags.Alpha),
             hybrid=hybrid,
         )
-        if sensor.class_name() != "BatchSensor":
-            return Picture([whole], exposure, hybrid)
+        if not is_batch(sensor):
+            return Picture([whole], samples, hybrid)
         from drgs.integrator.batch import SideBySide
 
         batch = SideBySide.of(sensor)
@@ -78,7 +89,7 @@ class Picture:
             )
             for index, one in enumerate(batch.sensors)
         ]
-        return Picture(views, exposure, hybrid, batch)
+        return Picture(views, samples, hybrid, batch)
 
     def image(self) -> mi.TensorXf:
         """The developed picture."""
@@ -87,7 +98,7 @@ class Picture:
             return image
         return self.hybrid.insertion.develop(image, self.hybrid.picture())
 
-    def backward(self, params: Any, grad_in: mi.TensorXf) -> rendering.GaussianGradients:
+    def backward(self, params: object, grad_in: mi.TensorXf) -> rendering.GaussianGradients:
         """Derivatives with respect to the Gaussians; all others are accumulated.
 
         params: as ``mi.render`` has them; grad_in: derivative of the loss with respect to the
@@ -96,7 +107,7 @@ class Picture:
         if self.hybrid is not None:
             own, nested = self._image_of_splats(), self.hybrid.picture()
             grad_in, d_nested = self.hybrid.insertion.adjoint(own, nested, grad_in)
-        d_passes = self.exposure.adjoint(grad_in)
+        d_passes = self.samples.adjoint(grad_in)
         gradients = [
             view.backward(d_passes if self.batch is None else self.batch.cut(d_passes, view.index))
             for view in self.views
@@ -105,7 +116,7 @@ class Picture:
             self.hybrid.backward(params, d_nested)
         return reduce(rendering.added, gradients)
 
-    def tangent(self, params: Any, tangents: Gaussians) -> mi.TensorXf:
+    def tangent(self, params: object, tangents: Gaussians) -> mi.TensorXf:
         """Directional derivative of the image.
 
         tangents: of the Gaussians; those of all other parameters are set on them.
@@ -140,18 +151,23 @@ class Picture:
         """planes: by view."""
         pictures = [v.channels(p, constant) for v, p in zip(self.views, planes, strict=True)]
         passes = pictures[0] if self.batch is None else self.batch.put_together(pictures)
-        return self.exposure.develop(passes)
+        return self.samples.develop(passes)
 
 
-def hybrid_of(integrator: Any, scene: mi.Scene, sensor: mi.Sensor, seed: Any, spp: int) -> Any:
+def hybrid_of(
+    integrator: SplatsSettings,
+    scene: mi.Scene,
+    sensor: mi.Sensor,
+    seed: int | mi.UInt32,
+    spp: int,
+) -> Hybrid | None:
     """The part that surfaces take in a picture; None where there are none."""
     if all(shape.is_ellipsoids() for shape in scene.shapes()):
         return None
     from drgs.integrator.surfaces import Hybrid, Insertion, Surfaces
 
     memory, hide_emitters = integrator.memory, integrator.hide_emitters
-    surfaces = Surfaces.of(scene, memory.surfaces.get("last"))
-    memory.surfaces["last"] = surfaces
+    surfaces = memory.surfaces = Surfaces.of(scene, memory.surfaces)
     nested = integrator.nested or mi.load_dict({"type": "path", "hide_emitters": hide_emitters})
     insertion = Insertion(
         sensor.film(),
@@ -166,7 +182,7 @@ def hybrid_of(integrator: Any, scene: mi.Scene, sensor: mi.Sensor, seed: Any, sp
 
 def sensors_of(sensor: mi.Sensor) -> list[mi.Sensor]:
     """Those of a batch, or the one."""
-    if sensor.class_name() != "BatchSensor":
+    if not is_batch(sensor):
         return [sensor]
     from drgs.integrator.batch import SideBySide
 

@@ -1,13 +1,15 @@
-"""What a scene description tells the integrator ``splats``: read and checked.
+"""What a scene description tells the plugins: properties, read and checked.
 
-Every error names the property, what was expected and what was given.
+The readers of single values serve both plugins, the others ``splats``. All raise
+:class:`drgs.core.errors.PluginError` with the plugin's name, that of the property, what was
+expected and what was given; where the type is wrong, its subclass ``PluginTypeError``.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import fields, replace
+from dataclasses import replace
 from numbers import Integral
 from typing import Any
 
@@ -15,8 +17,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from drgs.config.approximations import Approximations
-from drgs.core.errors import did_you_mean
+from drgs.config.approximations import DECLARED, Approximations, Declared, Value
+from drgs.core.errors import PluginError, PluginTypeError, did_you_mean
 from drgs.effects.compose import IGNORABLE
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 
@@ -26,12 +28,8 @@ AOVS = {"depth": ("T",), "alpha": ("I",), "normal": ("X", "Y", "Z")}
 FEATURE = "feature_"
 """What the names of parameters begin with that hold numbers of the user's own."""
 
-
 SHAPES_TO_WORLD = "shapes_to_world"
 """What the names of parameters begin with that tell the ``to_world`` of shapes."""
-
-
-_EXPECTED = {bool: "true or false", int: "an integer", float: "a number", str: "text"}
 
 
 def load_gaussians(props: mi.Properties) -> Gaussians:
@@ -40,7 +38,7 @@ def load_gaussians(props: mi.Properties) -> Gaussians:
     features = {n: _tensor(props, n) for n in props.keys() if n.startswith(FEATURE)}  # noqa: SIM118
     if "filename" in props:
         if given:
-            raise ValueError(
+            raise PluginError(
                 f"splats: give either 'filename' or tensors, got both ({', '.join(given)})"
             )
         path = mi.file_resolver().resolve(str(props["filename"]))
@@ -48,7 +46,7 @@ def load_gaussians(props: mi.Properties) -> Gaussians:
     elif given or features or "smoothing" in props or "to_world" in props:
         missing = [name for name in PARAMETER_NAMES if name not in given and name != "shN"]
         if missing:
-            raise ValueError(
+            raise PluginError(
                 "splats: give 'filename', or the Gaussians as tensors "
                 f"{', '.join(PARAMETER_NAMES)}; missing: {', '.join(missing)}"
             )
@@ -68,7 +66,7 @@ def load_gaussians(props: mi.Properties) -> Gaussians:
     if "to_world" in props:
         from drgs.gaussians.similarity import Similarity
 
-        to_world = Similarity.of(_matrix(props, "to_world"), "splats: to_world")
+        to_world = Similarity.of(matrix(props, "to_world"), "splats: to_world")
         moved = to_world.of_gaussians(gaussians.numpy()).to(mi.TensorXf)
         gaussians = replace(moved, features=features)
     return gaussians
@@ -85,7 +83,7 @@ def turns_of_shapes(props: mi.Properties) -> dict[str, Any]:
     turns = {}
     for name in names:
         shape = name.removeprefix(SHAPES_TO_WORLD).removeprefix("_")
-        turns[shape] = Turn.by(Similarity.of(_matrix(props, name), f"splats: {name}").rotation)
+        turns[shape] = Turn.by(Similarity.of(matrix(props, name), f"splats: {name}").rotation)
     return turns
 
 
@@ -97,7 +95,7 @@ def background_of(props: mi.Properties) -> mi.Color3f | mi.Texture:
     try:
         return mi.Color3f(value)
     except TypeError:
-        raise TypeError(
+        raise PluginTypeError(
             "splats: background must be an RGB colour, such as [1, 1, 1] or "
             f"<rgb value='1, 1, 1'/>, or a texture, got {type(value).__name__}"
         ) from None
@@ -108,7 +106,7 @@ def ignored_effects(props: mi.Properties) -> tuple[str, ...]:
     words = [word.strip() for word in str(props.get("ignore", "")).split(",") if word.strip()]
     for word in words:
         if word not in IGNORABLE:
-            raise ValueError(
+            raise PluginError(
                 f"splats: ignore must be a list of {', '.join(IGNORABLE)}, got {word!r}"
             )
     return tuple(words)
@@ -122,7 +120,7 @@ def aovs_of(props: mi.Properties, kinds: Sequence[str]) -> dict[str, str]:
             continue
         name, _, kind = (part.strip() for part in item.partition(":"))
         if not name or kind not in kinds or name in aovs:
-            raise ValueError(
+            raise PluginError(
                 f"splats: aovs must be a list of name:type with names of their own and types of "
                 f"{', '.join(kinds)}, got {item.strip()!r}"
             )
@@ -138,84 +136,125 @@ def nested_integrator(props: mi.Properties) -> mi.Integrator | None:
     objects = {name: props[name] for name in names if name != "background"}
     for name, value in objects.items():
         if not isinstance(value, mi.Integrator):
-            raise ValueError(
+            raise PluginError(
                 f"splats: {name} must be an integrator, the only object besides the texture "
                 f"background, got {value.class_name()}{did_you_mean(name, ['background'])}"
             )
     nested = list(objects.values())
     if len(nested) > 1:
-        raise ValueError(f"splats: at most one integrator can be nested, got {len(nested)}")
+        raise PluginError(f"splats: at most one integrator can be nested, got {len(nested)}")
     return nested[0] if nested else None
 
 
 def approximations_of(props: mi.Properties) -> Approximations:
-    """The choices of accuracy among the parameters; of the types that the defaults have."""
-    values = {}
-    for field in fields(Approximations):
-        if field.name in props:
-            value, expected = props[field.name], type(field.default)
-            if expected is float and type(value) is int:
-                value = float(value)
-            if type(value) is not expected:
-                raise TypeError(
-                    f"splats: {field.name} must be {_EXPECTED[expected]}, got {value!r}"
-                )
-            values[field.name] = value
-    try:
-        return Approximations(**values)
-    except ValueError as error:
-        raise ValueError(f"splats: {error}") from None
+    """The approximations among the properties; all others are the default."""
+    values = {n: _approximation(props, n, d) for n, d in DECLARED.items() if n in props}
+    return Approximations(**values)
+
+
+def _approximation(props: mi.Properties, name: str, declared: Declared) -> Value:
+    """One of them, of the type that it is declared with."""
+    value = props[name]
+    if declared.kind is float and type(value) is int:
+        value = float(value)
+    if type(value) is not declared.kind:
+        raise PluginTypeError(_message(props, name, _KINDS[declared.kind], value))
+    if not declared.allows(value):
+        raise PluginError(_message(props, name, declared.expected, value))
+    return value
+
+
+_KINDS = {bool: "true or false", int: "an integer", float: "a number", str: "text"}
 
 
 def _tensor(props: mi.Properties, name: str) -> mi.TensorXf:
     """A tensor of the integrator's own: parameters are assigned in place, the caller's are not."""
     value = props[name]
     if not dr.is_array_v(value):
-        raise TypeError(f"splats: {name} must be a tensor, got {type(value).__name__}")
+        raise PluginTypeError(f"splats: {name} must be a tensor, got {type(value).__name__}")
     if not dr.is_jit_v(value):
         # Three numbers, which a property set turns into a vector on the host.
         value = mi.Float(list(value))
     return mi.TensorXf(value)
 
 
-def _matrix(props: mi.Properties, name: str) -> np.ndarray:
-    """(4, 4) of a transform."""
-    value = props[name]
-    if not hasattr(value, "matrix"):
-        raise TypeError(f"splats: {name} must be a transform, got {type(value).__name__}")
-    return np.array(value.matrix, np.float64)
+# ----------------------------------------------------------------------------------------------
+# Single values
+# ----------------------------------------------------------------------------------------------
 
 
 def boolean(props: mi.Properties, name: str, default: bool) -> bool:
     """True or false."""
     value = props.get(name, default)
     if not isinstance(value, bool):
-        raise TypeError(f"splats: {name} must be true or false, got {value!r}")
+        raise PluginTypeError(_message(props, name, "true or false", value))
     return value
 
 
-def whole_number(props: mi.Properties, name: str, default: int) -> int:
-    """A whole number, 0 or more."""
-    value = props.get(name, default)
-    if isinstance(value, bool) or not isinstance(value, int) or value < 0:
-        raise ValueError(f"splats: {name} must be a whole number, 0 or more, got {value!r}")
+def integer(props: mi.Properties, name: str, default: int, least: int) -> int:
+    """An integer of at least ``least``."""
+    value, expected = props.get(name, default), f"an integer of at least {least}"
+    if isinstance(value, bool) or not isinstance(value, int):
+        raise PluginTypeError(_message(props, name, expected, value))
+    if value < least:
+        raise PluginError(_message(props, name, expected, value))
     return value
+
+
+def number(props: mi.Properties, name: str, default: float) -> float:
+    """A finite number."""
+    return _number(props, name, default, "a finite number")
 
 
 def positive(props: mi.Properties, name: str, default: float) -> float:
     """A finite number above 0."""
+    value = _number(props, name, default, "a positive number")
+    if value <= 0:
+        raise PluginError(_message(props, name, "a positive number", value))
+    return value
+
+
+def _number(props: mi.Properties, name: str, default: float, expected: str) -> float:
     value = props.get(name, default)
-    is_number = isinstance(value, int | float) and not isinstance(value, bool)
-    if not (is_number and 0 < value < math.inf):
-        raise ValueError(f"splats: {name} must be a positive number, got {value!r}")
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise PluginTypeError(_message(props, name, expected, value))
+    if not math.isfinite(value):
+        raise PluginError(_message(props, name, expected, value))
     return float(value)
 
 
+def one_of(props: mi.Properties, name: str, known: Sequence[str]) -> str:
+    """One of several words, the first of which is the default."""
+    value = props.get(name, known[0])
+    if value not in known:
+        message = _message(props, name, f"one of {', '.join(known)}", value)
+        raise PluginError(message + did_you_mean(str(value), known))
+    return value
+
+
+def matrix(props: mi.Properties, name: str) -> np.ndarray:
+    """(4, 4) float64, of a transform that is given."""
+    if props.type(name) != mi.Properties.Type.Transform:
+        got = type(props[name]).__name__
+        where = f"{props.plugin_name()}: {name}"
+        raise PluginTypeError(f"{where} must be a transform, got {got}")
+    return np.array(props[name].matrix, np.float64)
+
+
+def _message(props: mi.Properties, name: str, expected: str, got: object) -> str:
+    return f"{props.plugin_name()}: {name} must be {expected}, got {got!r}"
+
+
+# ----------------------------------------------------------------------------------------------
+# Gaussians
+# ----------------------------------------------------------------------------------------------
+
+
 def check_shapes(gaussians: Gaussians) -> None:
-    """Raise ValueError unless all parameters have rows for the same Gaussians."""
+    """Raise PluginError unless all parameters have rows for the same Gaussians."""
     num = next(iter(gaussians.means.shape), 0)
     if num == 0:
-        raise ValueError("splats: at least one Gaussian is needed, got none")
+        raise PluginError("splats: at least one Gaussian is needed, got none")
     rows = {
         "means": [(3,)],
         "quats": [(4,)],
@@ -228,18 +267,18 @@ def check_shapes(gaussians: Gaussians) -> None:
         got = tuple(getattr(gaussians, name).shape)
         if got not in [(num, *row) for row in allowed]:
             expected = " or ".join(f"({', '.join(map(str, ('N', *row)))})" for row in allowed)
-            raise ValueError(
+            raise PluginError(
                 f"splats: {name} must have the shape {expected}, with N = {num} the rows of "
                 f"means, got {got}"
             )
     for name, tensor in (gaussians.features or {}).items():
         if len(tensor.shape) != 2 or tensor.shape[0] != num or tensor.shape[1] == 0:
-            raise ValueError(
+            raise PluginError(
                 f"splats: {name} must have the shape (N, C), with N = {num} the rows of means and "
                 f"C at least 1, got {tuple(tensor.shape)}"
             )
     if gaussians.smoothing is not None and dr.width(gaussians.smoothing) != num:
-        raise ValueError(
+        raise PluginError(
             f"splats: smoothing must have the shape (N), with N = {num} the rows of means, got "
             f"({dr.width(gaussians.smoothing)},)"
         )
@@ -249,14 +288,14 @@ def degree_of(value: Any) -> int:
     """A degree of spherical harmonics that Gaussians may have."""
     is_integer = isinstance(value, Integral) and not isinstance(value, bool)
     if not is_integer or value not in range(4):
-        raise ValueError(f"splats: sh_degree must be an integer from 0 to 3, got {value!r}")
+        raise PluginError(f"splats: sh_degree must be an integer from 0 to 3, got {value!r}")
     return int(value)
 
 
 def check_degree(degree: int, gaussians: Gaussians) -> None:
-    """Raise ValueError for a degree of spherical harmonics that the Gaussians do not have."""
+    """Raise PluginError for a degree of spherical harmonics that the Gaussians do not have."""
     if degree > gaussians.sh_degree:
-        raise ValueError(
+        raise PluginError(
             f"splats: sh_degree must be an integer from 0 to {gaussians.sh_degree}, the degree of "
             f"the Gaussians, got {degree}"
         )

@@ -11,7 +11,6 @@ pixels are means of the samples that there are.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -34,7 +33,7 @@ class HeldSeed:
     variable's index from being reused.
     """
 
-    def __init__(self, seed: Any) -> None:
+    def __init__(self, seed: mi.UInt32) -> None:
         self.seed = type(seed)(seed)
 
     def __eq__(self, other: object) -> bool:
@@ -49,7 +48,7 @@ class DrawnSamples:
     def __init__(
         self,
         sensor: mi.Sensor,
-        seed: Any,
+        seed: int | mi.UInt32,
         spp: int,
         maps: dict[str, np.ndarray],
         aovs: Sequence[str] = (),

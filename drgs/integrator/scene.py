@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator
-from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +16,6 @@ import mitsuba as mi
 import numpy as np
 
 from drgs.cameras.axes import OPENCV_TO_MITSUBA
-from drgs.config.approximations import Approximations
 from drgs.config.schema import ModelConfig
 from drgs.core.errors import UserError
 from drgs.data.types import View
@@ -46,7 +44,7 @@ def make_scene(
         "type": "splats",
         "background": _picture(background) if isinstance(background, Path) else list(background),
         "near": model.near,
-        **accuracy(model),
+        **model.approximations.others_than_default,
         "srgb_primitives": False,
         **settings,
         **tensors,
@@ -56,13 +54,6 @@ def make_scene(
 
 def _picture(path: Path) -> dict[str, Any]:
     return {"type": "bitmap", "filename": str(path), "wrap_mode": "clamp"}
-
-
-def accuracy(model: ModelConfig) -> dict[str, Any]:
-    """The integrator's parameters that are choices of accuracy; those that are not default."""
-    default = ModelConfig()
-    names = [f.name for f in fields(Approximations)]
-    return {n: getattr(model, n) for n in names if getattr(model, n) != getattr(default, n)}
 
 
 def check_lenses(model: ModelConfig, views: Iterable[View], where: str, remedy: str) -> None:

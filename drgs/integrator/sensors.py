@@ -1,15 +1,17 @@
-"""Cameras of Mitsuba's sensors."""
+"""From Mitsuba's sensors to the cameras that the projection knows."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 import drjit as dr
+import mitsuba as mi
 
 from drgs.cameras.camera import Camera
 from drgs.core.arrays import types_of
+from drgs.core.errors import PluginTypeError
 from drgs.core.private import same_variables
 
 
@@ -42,22 +44,36 @@ class SensorState:
         )
 
 
-def read_sensor(sensor: Any, near: float) -> SensorState:
+@runtime_checkable
+class CameraSensor(Protocol):
+    """A sensor that makes its camera itself, as ``calibrated`` does."""
+
+    def camera_parameters(self) -> list[str]:
+        """Names of the parameters that the camera depends on, as ``mi.traverse`` has them."""
+
+    def camera_from_state(self, state: SensorState) -> Camera:
+        """The camera with these values of its parameters; OpenCV axes, px."""
+
+
+def is_batch(sensor: mi.Sensor) -> bool:
+    """Whether it is one of Mitsuba's type ``batch``, which has no type in Python."""
+    return sensor.class_name() == "BatchSensor"
+
+
+def read_sensor(sensor: mi.Sensor, near: float) -> SensorState:
     """Collect a sensor's state without reading anything back from the device.
 
     near: near plane, scene units; the sensor's ``near_clip`` applies as well, the larger wins.
 
-    Raises TypeError for a sensor that is none of ``perspective``, ``thinlens``, ``orthographic``
-    and ``calibrated``.
+    Raises PluginTypeError for a sensor that is none of ``perspective``, ``thinlens``,
+    ``orthographic`` and ``calibrated``.
     """
-    import mitsuba as mi
-
-    if hasattr(sensor, "lens"):  # ours: see ``plugins/calibrated.py``
-        names, make = sensor.camera_parameters, sensor.camera_from_state
+    if isinstance(sensor, CameraSensor):
+        names, make = sensor.camera_parameters(), sensor.camera_from_state
     elif isinstance(sensor, mi.ProjectiveCamera):
         names, make = _PROJECTIVE[sensor.class_name()]
     else:
-        raise TypeError(
+        raise PluginTypeError(
             "splats: the sensor must be of type perspective, thinlens, orthographic or "
             f"calibrated, got {sensor.class_name()} '{sensor.id()}'"
         )
@@ -122,7 +138,8 @@ _PROJECTIVE = {
     "ThinLensCamera": (("to_world", "x_fov", "aperture_radius", "focus_distance"), _thin_lens),
     "OrthographicCamera": (("to_world",), _orthographic),
 }
-"""By Mitsuba's class: the parameters that the camera depends on, and who makes it."""
+"""By the name of Mitsuba's class, which has no type in Python: the parameters that the camera
+depends on, and what makes it."""
 
 
 def opaque_host(state: SensorState) -> list[Any]:

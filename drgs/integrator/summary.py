@@ -1,36 +1,42 @@
-"""Which effects a scene calls for, what asked for each, and what is not simulated.
+"""What is simulated of a scene, what asked for each effect, and what is not simulated.
 
 An effect is composed in when the dataset, the sensor or the configuration calls for it. What is not
-called for is not imported. :func:`summary_of_fit`, :func:`summary_of_views` and
-:func:`summary_of_sensors` are what commands print at their start: one line an effect.
+called for is not imported. Commands print such a summary at their start, one line an effect:
+:func:`summary_of_sensors` of a Mitsuba scene, :func:`summary_of_views` of pictures of Gaussians.
+That of a fit is in ``drgs.training.summary``.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
+import mitsuba as mi
+
+from drgs.cameras.camera import Camera, Lens, Pinhole
 from drgs.data.types import View
 from drgs.effects.compose import ignoring
-
-# ----------------------------------------------------------------------------------------------
-# Plans
-# ----------------------------------------------------------------------------------------------
+from drgs.integrator.settings import SplatsSettings
 
 
 @dataclass(frozen=True)
-class Effect:
-    """A line of a plan."""
+class SimulatedEffect:
+    """One effect of a summary: simulated, or not."""
 
     name: str
     what: str | None  # that is simulated; None: nothing is
     why: str = ""  # what asked for it
     ignored: bool = False  # whether it is asked for where it is not to be simulated
 
+    def unless(self, is_ignored: bool) -> SimulatedEffect:
+        """The effect, not simulated if it ``is_ignored``."""
+        if is_ignored and self.what is not None:
+            return replace(self, what=None, ignored=True)
+        return self
 
-def described(effects: Sequence[Effect]) -> str:
-    """The plan as text: one line for each effect that is simulated, one for all the others."""
+
+def described(effects: Sequence[SimulatedEffect]) -> str:
+    """The summary as text: a line for each effect that is simulated, one for all the others."""
     lines = [f"  {e.name}: {e.what} ({e.why})" for e in effects if e.what is not None]
     absent = [
         f"{e.name} (ignored)" if e.ignored else e.name
@@ -43,8 +49,11 @@ def described(effects: Sequence[Effect]) -> str:
 
 
 def summary_of_sensors(
-    integrator: Any, cameras: Sequence[Any], environment: Any, num_surfaces: int = 0
-) -> list[Effect]:
+    integrator: SplatsSettings,
+    cameras: Sequence[Camera],
+    environment: mi.Emitter | None,
+    num_surfaces: int = 0,
+) -> list[SimulatedEffect]:
     """What the integrator ``splats`` simulates for sensors in front of an environment.
 
     cameras: as the sensors have them, so that what the integrator ignores of them can be named;
@@ -52,19 +61,19 @@ def summary_of_sensors(
     """
     left = [ignoring(camera, integrator.ignore) for camera in cameras]
 
-    def effect(name: str, words: Callable[[Any], str | None]) -> Effect:
+    def effect(name: str, words: Callable[[Camera], str | None]) -> SimulatedEffect:
         """words: what a camera has of it, or None."""
         shown = [what for what in map(words, left) if what is not None]
         why = "the sensor" if len(left) == 1 else f"{len(shown)} of {len(left)} sensors"
         ignored = sum(words(camera) is not None for camera in cameras) > len(shown)
-        return Effect(name, " and ".join(sorted(set(shown))) or None, why, ignored)
+        return SimulatedEffect(name, " and ".join(sorted(set(shown))) or None, why, ignored)
 
     of_cameras = [
         effect("lens", lambda camera: _lens_words(camera.lens)),
         effect("depth of field", lambda camera: None if camera.aperture is None else "a thin lens"),
-        effect("motion", lambda camera: _MOTION[type(camera.shutter).__name__]),
+        effect("motion", lambda camera: camera.shutter and camera.shutter.label),
     ]
-    surfaces = Effect(
+    surfaces = SimulatedEffect(
         "surfaces",
         "a nested integrator's picture, between the splats" if num_surfaces else None,
         f"{num_surfaces} of the scene's shapes",
@@ -72,83 +81,77 @@ def summary_of_sensors(
     return [*_summary_of_integrator(integrator, environment, of_cameras), surfaces]
 
 
-def summary_of_views(integrator: Any, views: Sequence[Any]) -> list[Effect]:
+def summary_of_views(integrator: SplatsSettings, views: Sequence[View]) -> list[SimulatedEffect]:
     """The same for views or viewpoints, with nothing behind but the integrator's background."""
     count = f"{len(views)} cameras"
     of_cameras = [
-        _unless_ignored(effect_of(views, count), word in integrator.ignore)
+        effect_of(views, count).unless(word in integrator.ignore)
         for effect_of, word in ((lens_effect, "distortion"), (motion_effect, "motion"))
     ]
     return _summary_of_integrator(integrator, None, of_cameras)
 
 
 def _summary_of_integrator(
-    integrator: Any, environment: Any, of_cameras: Sequence[Effect]
-) -> list[Effect]:
-    background = Effect("background", "a constant colour", "the integrator's background")
+    integrator: SplatsSettings,
+    environment: mi.Emitter | None,
+    of_cameras: Sequence[SimulatedEffect],
+) -> list[SimulatedEffect]:
+    background = SimulatedEffect("background", "a constant colour", "the integrator's background")
     if environment is not None and not integrator.hide_emitters:
-        background = Effect("background", "an environment", "the scene's emitter")
-    elif hasattr(integrator.background, "eval"):
-        background = Effect("background", "a picture", "the integrator's background")
+        background = SimulatedEffect("background", "an environment", "the scene's emitter")
+    elif isinstance(integrator.background, mi.Texture):
+        background = SimulatedEffect("background", "a picture", "the integrator's background")
     smooth = integrator.gaussians.smoothing is not None
     effects = [
-        _view_dependence(integrator.sh_degree, "the Gaussians' coefficients"),
+        view_dependence_effect(integrator.sh_degree, "the Gaussians' coefficients"),
         background,
         *of_cameras,
-        _antialiasing(
+        antialiasing_effect(
             "antialiased" if integrator.approximations.antialiased else None,
             "the Gaussians' filter" if smooth else None,
         ),
     ]
     if integrator.smoothing is not None and not smooth:
-        effects.append(Effect("smoothing filter", None, ignored=True))
+        effects.append(SimulatedEffect("smoothing filter", None, ignored=True))
     return effects
 
 
-_MOTION = {"NoneType": None, "MotionBlur": "blurred", "RollingShutter": "rolling shutter"}
-"""By the name of a camera's shutter, whose module is imported where there is one."""
-
-
-def _lens_words(lens: Any) -> str | None:
-    if type(lens).__name__ == "Pinhole":
+def _lens_words(lens: Lens) -> str | None:
+    if isinstance(lens, Pinhole):
         return None
     names = ", ".join(lens.named())
-    return type(lens).__name__ + (f" ({names})" if names else "")
+    return lens.label + (f" ({names})" if names else "")
 
 
-def _antialiasing(opacities: str | None, smoothing: str | None) -> Effect:
-    """By what asked for either."""
-    what = _joined(
+def antialiasing_effect(opacities: str | None, smoothing: str | None) -> SimulatedEffect:
+    """By what asked for compensated opacities and for the smoothing filter; None: nothing."""
+    what = joined(
         "opacities compensated for the low-pass filter" if opacities else None,
         "3D smoothing filter" if smoothing else None,
     )
-    return Effect("antialiasing", what, _joined(opacities, smoothing) or "")
+    return SimulatedEffect("antialiasing", what, joined(opacities, smoothing) or "")
 
 
-def _view_dependence(degree: int, why: str) -> Effect:
+def view_dependence_effect(degree: int, why: str) -> SimulatedEffect:
+    """Colours that depend on the direction, up to a degree of the spherical harmonics."""
     what = None if degree == 0 else f"spherical harmonics up to degree {degree}"
-    return Effect("view dependence", what, why)
+    return SimulatedEffect("view dependence", what, why)
 
 
-def lens_effect(views: Sequence[View], of: str = "the dataset's cameras") -> Effect:
+def lens_effect(views: Sequence[View], of: str = "the dataset's cameras") -> SimulatedEffect:
     """Lenses that are no pinholes; of: whose."""
     bent = [view.lens for view in views if view.lens is not None]
     kinds = sorted({f"{lens.kind} ({', '.join(lens.named())})" for lens in bent})
-    return Effect("lens distortion", " and ".join(kinds) or None, f"{len(bent)} of {of}")
+    return SimulatedEffect("lens distortion", " and ".join(kinds) or None, f"{len(bent)} of {of}")
 
 
-def motion_effect(views: Sequence[View], of: str = "the dataset's cameras") -> Effect:
+def motion_effect(views: Sequence[View], of: str = "the dataset's cameras") -> SimulatedEffect:
     """Cameras that move while a photograph is taken; of: whose."""
     moving = [view.motion.shutter for view in views if view.motion is not None]
     shutters = " and ".join(f"{kind} shutter" for kind in sorted(set(moving)))
-    return Effect("motion", shutters or None, f"{len(moving)} of {of}")
+    return SimulatedEffect("motion", shutters or None, f"{len(moving)} of {of}")
 
 
-def _unless_ignored(effect: Effect, is_ignored: bool) -> Effect:
-    if is_ignored and effect.what is not None:
-        return replace(effect, what=None, ignored=True)
-    return effect
-
-
-def _joined(*parts: str | None) -> str | None:
+def joined(*parts: str | None) -> str | None:
+    """Those parts that there are, as a list; None if there is none."""
     return ", ".join(part for part in parts if part) or None

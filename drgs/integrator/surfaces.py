@@ -12,11 +12,12 @@ S is what the surface itself shows; where the nested integrator does not show th
 share is not taken off. Light does not pass from one to the other: splats neither light surfaces
 nor are lit by them, and cast no shadows.
 
-Where a surface ends within a pixel, it covers a part of it. With one sample per pixel, pixels next
-to where surfaces end and the background begins are looked at in :data:`EDGE_SAMPLES` places; with
-several samples, each has its own depth. A ``thinlens`` sees depths and coverage from the middle of
-its aperture. What lets light pass straight on (``null``, ``mask``, ``thindielectric``) covers the
-rest; of several such surfaces on a ray, all cover at the place of the first.
+Where a surface ends within a pixel, it covers a part of it. With one sample per pixel, rays are
+traced through :data:`EDGE_SAMPLES` places of each pixel next to where surfaces end and the
+background begins; with several samples, each has its own depth. A ``thinlens`` sees depths and
+coverage from the middle of its aperture. What lets light pass straight on (``null``, ``mask``,
+``thindielectric``) covers the rest; of several such surfaces on a ray, all cover at the place of
+the first.
 
 Derivatives flow to the splats and, through the nested integrator, to the parameters of surfaces and
 emitters. Not differentiated: the depth of a surface and the part of a pixel that it covers, and
@@ -36,6 +37,7 @@ import numpy as np
 
 from drgs.cameras.camera import Camera
 from drgs.core.arrays import image_of, planes_of
+from drgs.core.errors import PluginError
 from drgs.core.private import same_variables
 from drgs.effects.occlusion import Surface
 from drgs.integrator.film import Channels, develop_pixels, film_map, num_colors, pixel_corners
@@ -44,7 +46,7 @@ from drgs.integrator.film import pixels_adjoint as film_adjoint
 EDGE_GRID = 4
 
 EDGE_SAMPLES = EDGE_GRID**2
-"""Places of a pixel at which the edge of a surface is looked at."""
+"""Rays through a pixel in which a surface ends."""
 
 
 # ----------------------------------------------------------------------------------------------
@@ -157,7 +159,7 @@ def trace_surfaces(
     """What is seen of the surfaces, by time and by sample, evaluated.
 
     cameras: of each time; within: of each sample, x and y from the pixel's upper left corner, px;
-    hide_emitters: whether surfaces that are emitters are looked through.
+    hide_emitters: whether rays pass through surfaces that are emitters.
     """
     tracer = _Tracer(
         scene=scene,
@@ -184,6 +186,8 @@ def _has_transparent_parts(scene: mi.Scene) -> bool:
 
 @dataclass  # not frozen: ``dr.syntax`` carries it through a loop
 class _Tracer:
+    """Traces rays of a camera to the surfaces of a scene."""
+
     scene: mi.Scene
     far: mi.Float  # depth, scene units: farther surfaces are not seen
     hide_emitters: bool
@@ -191,7 +195,10 @@ class _Tracer:
     with_normals: bool
 
     def trace(self, camera: Camera, corner: mi.Point2f, x: Any, y: Any) -> SeenSurface:
-        """At places of pixels."""
+        """What rays meet at places of pixels.
+
+        corner: upper left corners of the pixels, px; x, y: from there.
+        """
         place = corner + mi.Point2f(x, y)
         camera = camera.at_row(place.y)
         origin, direction, seen = camera.look_through(place.x, place.y)
@@ -214,7 +221,7 @@ class _Tracer:
         return SeenSurface(depth, coverage, normal)
 
     def trace_with_edges(self, camera: Camera, film: mi.Film, x: Any, y: Any) -> SeenSurface:
-        """At one place of each pixel, and at several of those next to where coverage changes.
+        """The same at one place of each pixel, or at several where coverage changes next to it.
 
         Around the crop window is a row of pixels more, so that its edges are those of the film.
         The host reads how many of the latter there are.
@@ -241,7 +248,7 @@ class _Tracer:
     def _trace_edges(
         self, camera: Camera, corner: mi.Point2f, surface: SeenSurface, edge: mi.UInt32
     ) -> SeenSurface:
-        """The same with means over the pixels ``edge``."""
+        """``surface`` with means over several rays in the pixels ``edge``."""
         corner = dr.gather(mi.Point2f, corner, edge)
         places = [(k + 0.5) / EDGE_GRID for k in range(EDGE_GRID)]
         hits = [self.trace(camera, corner, x, y) for y in places for x in places]
@@ -261,7 +268,7 @@ class _Tracer:
     def _meet(
         self, ray: mi.Ray3f, active: mi.Bool
     ) -> tuple[mi.Ray3f, mi.PreliminaryIntersection3f, mi.Float]:
-        """The first hit that is seen, the ray that ends there, and how much all hits cover."""
+        """The first hit that is seen, the ray that ends there, and how much all cover, 0..1."""
         hit = self.scene.ray_intersect_preliminary(ray, coherent=True, active=active)
         if self.sees_through:
             return self._trace_through(ray, hit)
@@ -324,7 +331,9 @@ class Insertion:
         names = ["share", "coverage"] + ["R", "G", "B"] * self.shows_background
         return [f"surface.{k}.{name}" for k, name in enumerate(names)]
 
-    def values(self, surface: SeenSurface, front: mi.Float, radiance: Any) -> Channels:
+    def values(
+        self, surface: SeenSurface, front: mi.Float, radiance: mi.Color3f | None
+    ) -> Channels:
         """Those channels of a pass; front: see :class:`SeenSurface`; radiance: B, linear."""
         values = [surface.share(front), surface.coverage]
         if self.shows_background:
@@ -399,7 +408,7 @@ class Insertion:
         if np.array_equal(to_developed, np.eye(3)):
             return to_developed, to_developed
         if self.display_space:
-            raise ValueError(
+            raise PluginError(
                 "splats: in a scene with surfaces and with srgb_primitives false, the film's "
                 "pixel_format must be rgb or rgba"
             )
@@ -420,7 +429,7 @@ class Hybrid:
     surfaces: Surfaces
     integrator: mi.Integrator
     sensor: mi.Sensor
-    seed: Any
+    seed: int | mi.UInt32
     spp: int  # of the nested integrator; 0: as the sensor's sampler has it
     insertion: Insertion
 
@@ -431,7 +440,7 @@ class Hybrid:
                 self.scene, sensor=self.sensor, seed=self.seed, spp=self.spp
             )
 
-    def backward(self, params: Any, d_picture: mi.TensorXf) -> None:
+    def backward(self, params: object, d_picture: mi.TensorXf) -> None:
         """Accumulate derivatives into the parameters of surfaces and emitters."""
         with dr.resume_grad(), _sample_count_kept(self.sensor):
             if self._is_attached():
@@ -439,7 +448,7 @@ class Hybrid:
                     self.scene, params, d_picture, self.sensor, self.seed, self.spp
                 )
 
-    def tangent(self, params: Any, picture: mi.TensorXf) -> mi.TensorXf:
+    def tangent(self, params: object, picture: mi.TensorXf) -> mi.TensorXf:
         """Directional derivative of the nested picture, along those set on the parameters."""
         with dr.resume_grad(), _sample_count_kept(self.sensor):
             if self._is_attached():

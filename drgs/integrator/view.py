@@ -1,12 +1,17 @@
-"""What one sensor sees of a picture."""
+"""What one sensor sees of a picture: frames, their planes, and the channels of its film.
+
+A view renders the frames of its camera (``drgs.splatting.rendering``), or takes those of the last
+picture where nothing has changed. It puts what is behind the splats behind them, and adds what is
+seen of surfaces. ``drgs.integrator.picture`` asks for a picture, its derivatives or its tangent.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Hashable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import reduce
 from itertools import chain, repeat
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 import mitsuba as mi
@@ -15,13 +20,17 @@ from drgs.cameras.camera import Camera, cameras_in_time
 from drgs.effects.compose import composed, ignoring
 from drgs.gaussians.parameters import Gaussians
 from drgs.integrator.cache import Rendered, TracedSurfaces
-from drgs.integrator.film import Channels
+from drgs.integrator.film import Channels, PixelPositions
 from drgs.integrator.sensors import SensorState, camera_from_sensor, read_sensor
+from drgs.integrator.settings import SplatsSettings
 from drgs.splatting import rendering
+
+if TYPE_CHECKING:  # imported where a scene calls for them
+    from drgs.integrator.background import Background
+    from drgs.integrator.surfaces import Hybrid, SeenSurface
 
 Passes = list[Channels]
 """Channels by sample per pixel."""
-
 
 Planes = list[list[list[Any]]]
 """Planes of frames, each Float (H * W,), by time and by sample."""
@@ -29,17 +38,17 @@ Planes = list[list[list[Any]]]
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """What one sensor sees of a picture: mostly all of it."""
+    """What one sensor sees of a picture: all of it, unless it is one of a batch."""
 
-    integrator: Any  # whose settings, Gaussians and memory it has
+    integrator: SplatsSettings
     scene: mi.Scene
-    index: int
+    index: int  # of the view, in the integrator's memory
     sensor: mi.Sensor
-    positions: Sequence[Any]  # in the pixels, by sample: see drgs.accuracy.sample_points
-    within: Sequence[tuple[Any, Any]]  # the same, px from their upper left corners
-    key: Any  # of these; None: pixel centres
+    positions: Sequence[PixelPositions]  # by sample
+    within: Sequence[tuple[Any, Any]]  # the same, px from the pixels' upper left corners
+    key: Hashable  # of these: see drgs.integrator.film.FilmSamples
     has_alpha: bool
-    hybrid: Any  # drgs.integrator.surfaces.Hybrid, or None
+    hybrid: Hybrid | None  # the part of surfaces, if there are any
 
     def planes(self) -> Planes:
         """Of all frames, unevaluated."""
@@ -96,7 +105,12 @@ class View:
         traced = self.integrator.memory.rendered[self.index].traced
         seen = repeat(repeat(None)) if traced is None else traced.seen
 
-        def channels_of(planes: list[Any], surface: Any, color: Any, radiance: Any) -> Channels:
+        def channels_of(
+            planes: list[Any],
+            surface: SeenSurface | None,
+            color: mi.Color3f,
+            radiance: mi.Color3f | None,
+        ) -> Channels:
             if surface is None:
                 return self._composited(planes, color, behind.opaque)
             *planes, front = planes
@@ -155,17 +169,17 @@ class View:
             if integrator.srgb_primitives:
                 constant = mi.math.srgb_to_linear(constant)
             return _Behind(repeat(repeat(constant)), opaque=False, radiance=repeat(repeat(None)))
-        from drgs.integrator import background as backdrop
+        from drgs.integrator.background import Environment, StretchedTexture, seen_by
 
         if environment is not None:
-            behind = backdrop.Environment(environment)
+            behind: Background = Environment(environment)
         else:
-            behind = backdrop.Picture(integrator.background)
+            behind = StretchedTexture(integrator.background)
         state = self._state()
         cameras = [of_time[0].camera for of_time in self._frames()]
         if state.is_attached:
             cameras = self._attached_cameras(state)
-        colors = radiance = backdrop.seen_by(self.sensor.film(), behind, cameras, self.within)
+        colors = radiance = seen_by(self.sensor.film(), behind, cameras, self.within)
         if not integrator.srgb_primitives:
             colors = [[mi.math.linear_to_srgb(color) for color in of_time] for of_time in colors]
         return _Behind(colors, behind.opaque, radiance)
@@ -195,7 +209,7 @@ class View:
         return last.frames
 
     def _traced_surfaces(self, state: SensorState) -> TracedSurfaces:
-        """At the scene's surfaces, unless the last look was the same."""
+        """What is seen of the scene's surfaces, traced unless the last time was the same."""
         from drgs.integrator.surfaces import trace_surfaces
 
         surfaces, kept = self.hybrid.surfaces, self.integrator.memory.traced
@@ -240,17 +254,17 @@ class View:
 class _Behind:
     """What is seen past the splats."""
 
-    colors: Iterable[Iterable[Any]]  # by time and by sample: Color3f, in the channels' space
+    colors: Iterable[Iterable[mi.Color3f]]  # by time and by sample, in the channels' space
     opaque: bool  # whether it covers the film
-    radiance: Iterable[Iterable[Any]]  # by time and by sample: linear; None: of a constant
+    radiance: Iterable[Iterable[mi.Color3f | None]]  # the same, linear; None: of a constant
 
 
 def _render(
     gaussians: Gaussians,
     camera: Camera,
     pipeline: rendering.Pipeline,
-    positions: Sequence[Any],
-    surfaces: Sequence[Any] | None,
+    positions: Sequence[PixelPositions],
+    surfaces: Sequence[SeenSurface] | None,
 ) -> list[rendering.Frame]:
     """A frame for each sample per pixel; surfaces: what is seen of them at each."""
     pipeline = composed(pipeline, gaussians, camera)
@@ -268,7 +282,7 @@ def _render(
     return [frame, *(rendering.render_again(frame, model) for model in others)]
 
 
-def constant_background(integrator: Any) -> mi.Color3f | None:
+def constant_background(integrator: SplatsSettings) -> mi.Color3f | None:
     """The background without gradients, if it is a colour; display space.
 
     No literal, or every colour would be a new kernel.

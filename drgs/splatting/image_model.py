@@ -530,7 +530,7 @@ class ImageModel:
         )
 
     def check_differentiable_in_camera(self) -> None:
-        """Raise NotImplementedError if pixels depend on the camera but through the splats."""
+        """Raise UnsupportedError if pixels depend on the camera but through the splats."""
         self.features.check_differentiable_in_camera()
 
     def bind(self, lanes: Lanes, grid: TileGrid) -> ImageModel:

@@ -1,4 +1,7 @@
-"""What a fit simulates, and what asked for it."""
+"""The summary of a fit: what it simulates, what asked for that, and what is left out.
+
+The command ``fit`` prints it at its start: see ``drgs.integrator.summary``.
+"""
 
 from __future__ import annotations
 
@@ -9,31 +12,30 @@ from typing import Any
 from drgs.config.schema import FitConfig
 from drgs.data.types import Dataset
 from drgs.integrator.summary import (
-    Effect,
-    _antialiasing,
-    _joined,
-    _unless_ignored,
-    _view_dependence,
+    SimulatedEffect,
+    antialiasing_effect,
+    joined,
     lens_effect,
     motion_effect,
+    view_dependence_effect,
 )
 
 
-def summary_of_fit(config: FitConfig, dataset: Dataset) -> list[Effect]:
-    """What a fit simulates."""
+def summary_of_fit(config: FitConfig, dataset: Dataset) -> list[SimulatedEffect]:
+    """The effects of a fit, in the order in which they are listed."""
     views, model, ignored = dataset.train, config.model, dataset.ignored
     depths = _of_data("depth", [v.depth for v in views], "supervision", "the dataset's depth")
-    depths = _unless_ignored(depths, config.loss.depth_weight == 0)
+    depths = depths.unless(config.loss.depth_weight == 0)
     return [
-        _view_dependence(model.sh_degree, f"model.sh_degree: {model.sh_degree}"),
+        view_dependence_effect(model.sh_degree, f"model.sh_degree: {model.sh_degree}"),
         _background(config),
         replace(lens_effect(views), ignored="distortion" in ignored),
         replace(motion_effect(views), ignored="motion" in ignored),
-        _antialiasing(
+        antialiasing_effect(
             "model.antialiased" if model.antialiased else None,
             "model.smoothing" if model.smoothing else None,
         ),
-        Effect(
+        SimulatedEffect(
             "exposure and white balance",
             None if config.colors.lr is None else "a colour transform for each training photograph",
             "colors.lr",
@@ -43,7 +45,7 @@ def summary_of_fit(config: FitConfig, dataset: Dataset) -> list[Effect]:
             ignored="masks" in ignored,
         ),
         replace(depths, ignored=depths.ignored or "depth" in ignored),
-        Effect(
+        SimulatedEffect(
             "camera refinement",
             _refined(config) if config.cameras.optimise else None,
             "cameras.optimise",
@@ -51,21 +53,23 @@ def summary_of_fit(config: FitConfig, dataset: Dataset) -> list[Effect]:
     ]
 
 
-def _background(config: FitConfig) -> Effect:
+def _background(config: FitConfig) -> SimulatedEffect:
     if config.data.random_background:
-        return Effect("background", "a random colour at each iteration", "data.random_background")
-    return Effect("background", f"{config.data.background}", "data.background")
+        return SimulatedEffect(
+            "background", "a random colour at each iteration", "data.random_background"
+        )
+    return SimulatedEffect("background", f"{config.data.background}", "data.background")
 
 
-def _of_data(name: str, values: Sequence[Any], what: str, why: str) -> Effect:
+def _of_data(name: str, values: Sequence[Any], what: str, why: str) -> SimulatedEffect:
     count = sum(value is not None for value in values)
-    return Effect(name, what if count else None, f"{why}, in {count} views")
+    return SimulatedEffect(name, what if count else None, f"{why}, in {count} views")
 
 
 def _refined(config: FitConfig) -> str:
     rates = config.cameras
     return (
-        _joined(
+        joined(
             "poses" if rates.rotation_lr or rates.translation_lr else None,
             "focal lengths" if rates.focal_lr else None,
             "principal point" if rates.principal_lr else None,

@@ -439,7 +439,7 @@ def test_a_filter_of_another_length_is_refused(count):
     with pytest.raises(RuntimeError) as caught:
         mi.load_dict({"type": "splats", **values})
     assert str(caught.value).strip().splitlines()[-1] == (
-        "ValueError: splats: smoothing must have the shape (N), with N = 40 the rows of means, "
+        "PluginError: splats: smoothing must have the shape (N), with N = 40 the rows of means, "
         f"got ({count},)"
     )
 

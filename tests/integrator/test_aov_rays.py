@@ -141,7 +141,7 @@ def test_derivatives_of_the_picture_are_those_without_aov():
 def last_line(error) -> str:
     while error.__cause__ is not None:
         error = error.__cause__
-    return str(error).strip().splitlines()[-1].removeprefix("NotImplementedError: ")
+    return str(error).strip().splitlines()[-1].removeprefix("drgs.core.errors.UnsupportedError: ")
 
 
 def refusal(loaded, **arguments) -> str:

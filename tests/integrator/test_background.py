@@ -473,7 +473,7 @@ def test_a_background_that_is_neither_color_nor_texture_is_refused(background, g
         mi.load_dict(integrator_of(Scene(count=8).gaussians, background=value))
     message = str(caught.value).strip().splitlines()[-1]
     assert message.startswith(
-        "TypeError: splats: background must be an RGB colour, such as [1, 1, 1] or "
+        "PluginTypeError: splats: background must be an RGB colour, such as [1, 1, 1] or "
         "<rgb value='1, 1, 1'/>, or a texture, got "
     )
     assert got is None or message.endswith(got)

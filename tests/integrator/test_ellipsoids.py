@@ -961,19 +961,19 @@ def test_a_to_world_for_a_shape_that_is_not_there_is_refused():
 WRONG_PROPERTIES = {
     "to_world of nothing": (
         lambda: {"to_world": transform()},
-        "ValueError: splats: give 'filename', or the Gaussians as tensors",
+        "PluginError: splats: give 'filename', or the Gaussians as tensors",
     ),
     "to_world, scales": (
         lambda: tensors(Scene().gaussians) | {"to_world": mi.ScalarTransform4f().scale([1, 2, 1])},
-        "ValueError: splats: to_world must be made of rotations, translations and scales",
+        "PluginError: splats: to_world must be made of rotations, translations and scales",
     ),
     "to_world, text": (
         lambda: tensors(Scene().gaussians) | {"to_world": "up"},
-        "TypeError: splats: to_world must be a transform, got str",
+        "PluginTypeError: splats: to_world must be a transform, got str",
     ),
     "shapes_to_world, mirror": (
         lambda: {"shapes_to_world_a": mi.ScalarTransform4f().scale([-1, 1, 1])},
-        "ValueError: splats: shapes_to_world_a must be made of rotations, translations and scales",
+        "PluginError: splats: shapes_to_world_a must be made of rotations, translations and scales",
     ),
     "sh_degree": (lambda: {"sh_degree": 4}, "splats: sh_degree must be an integer from 0 to 3"),
 }

@@ -274,7 +274,7 @@ def test_variants_may_be_switched_and_others_refuse_in_one_line(order, run_pytho
     result = run_python(SWITCHING.format(order=order))
     assert result.returncode == 0, result.stderr
     assert result.stdout.splitlines() == [
-        f"ValueError: splats: the variant '{variant}' is not supported, "
+        f"PluginError: splats: the variant '{variant}' is not supported, "
         "use mi.set_variant('llvm_ad_rgb')"
         for variant in ("scalar_rgb", "llvm_ad_mono", "llvm_ad_spectral")
     ]
@@ -1449,34 +1449,34 @@ NONE = dict.fromkeys(PARAMETER_NAMES)
 REFUSED = {
     "one tensor given": (
         {name: None for name in PARAMETER_NAMES if name != "sh0"},
-        "ValueError: splats: give 'filename', or the Gaussians as tensors means, quats, "
+        "PluginError: splats: give 'filename', or the Gaussians as tensors means, quats, "
         "log_scales, logit_opacities, sh0, shN; missing: means, quats, log_scales, "
         "logit_opacities",
     ),
     "a tensor missing": ({"quats": None}, "missing: quats"),
     "file and tensors": (
         {"filename": "x.ply"},
-        "ValueError: splats: give either 'filename' or tensors, got both (means, quats, "
+        "PluginError: splats: give either 'filename' or tensors, got both (means, quats, "
         "log_scales, logit_opacities, sh0, shN)",
     ),
     "no such file": (
         {**NONE, "filename": "nowhere.ply"},
         "UserError: nowhere.ply: cannot read the file: No such file or directory",
     ),
-    "not a tensor": ({"means": "abc"}, "TypeError: splats: means must be a tensor, got str"),
+    "not a tensor": ({"means": "abc"}, "PluginTypeError: splats: means must be a tensor, got str"),
     "means": (
         {"means": lambda: zeros(8, 2)},
-        "ValueError: splats: means must have the shape (N, 3), with N = 8 the rows of means, got "
+        "PluginError: splats: means must have the shape (N, 3), with N = 8 the rows of means, got "
         "(8, 2)",
     ),
     "quats": (
         {"quats": lambda: zeros(7, 4)},
-        "ValueError: splats: quats must have the shape (N, 4), with N = 8 the rows of means, got "
+        "PluginError: splats: quats must have the shape (N, 4), with N = 8 the rows of means, got "
         "(7, 4)",
     ),
     "logit_opacities": (
         {"logit_opacities": lambda: zeros(9)},
-        "ValueError: splats: logit_opacities must have the shape (N), with N = 8 the rows of "
+        "PluginError: splats: logit_opacities must have the shape (N), with N = 8 the rows of "
         "means, got (9,)",
     ),
     "sh0": ({"sh0": lambda: zeros(8, 3)}, "splats: sh0 must have the shape (N, 1, 3)"),
@@ -1486,18 +1486,18 @@ REFUSED = {
     ),
     "no Gaussians": (
         {name: (lambda name=name: zeros(0, *valid()[name].shape[1:])) for name in PARAMETER_NAMES},
-        "ValueError: splats: at least one Gaussian is needed, got none",
+        "PluginError: splats: at least one Gaussian is needed, got none",
     ),
     "sh_degree above any": (
         {"sh_degree": 4},
-        "ValueError: splats: sh_degree must be an integer from 0 to 3, got 4",
+        "PluginError: splats: sh_degree must be an integer from 0 to 3, got 4",
     ),
     "sh_degree negative": ({"sh_degree": -1}, "got -1"),
     "sh_degree not an integer": ({"sh_degree": 0.5}, "got 0.5"),
     "sh_degree a float": ({"sh_degree": 0.0}, "sh_degree must be an integer from 0 to 3, got 0.0"),
     "sh_degree a boolean": ({"sh_degree": True}, "got True"),
     "sh_degree a string": ({"sh_degree": "1"}, "got '1'"),
-    "near zero": ({"near": 0.0}, "ValueError: splats: near must be a positive number, got 0.0"),
+    "near zero": ({"near": 0.0}, "PluginError: splats: near must be a positive number, got 0.0"),
     "near negative": ({"near": -1}, "got -1"),
     "near a boolean": ({"near": True}, "splats: near must be a positive number, got True"),
     "near infinite": ({"near": float("inf")}, "near must be a positive number, got inf"),
@@ -1505,19 +1505,19 @@ REFUSED = {
     "near not a number": ({"near": float("nan")}, "got nan"),
     "antialiased a string": (
         {"antialiased": "no"},
-        "TypeError: splats: antialiased must be true or false, got 'no'",
+        "PluginTypeError: splats: antialiased must be true or false, got 'no'",
     ),
     "order_window a float": (
         {"order_window": 3.5},
-        "TypeError: splats: order_window must be an integer, got 3.5",
+        "PluginTypeError: splats: order_window must be an integer, got 3.5",
     ),
     "an unknown projection": (
         {"projection": "affine"},
-        "ValueError: splats: projection must be one of ewa, unscented, exact, got 'affine'",
+        "PluginError: splats: projection must be one of ewa, unscented, exact, got 'affine'",
     ),
     "a low-pass below zero": (
         {"low_pass": -1},
-        "ValueError: splats: low_pass must be finite and not negative, got -1.0",
+        "PluginError: splats: low_pass must be finite and not negative, got -1.0",
     ),
     "srgb_primitives a number": ({"srgb_primitives": 1}, "must be true or false, got 1"),
     "background a string": ({"background": "white"}, "splats: background must be an RGB colour"),
@@ -1527,15 +1527,15 @@ REFUSED = {
     ),
     "aovs without a type": (
         {"aovs": "depth"},
-        "ValueError: splats: aovs must be a list of name:type with names of their own and types of "
-        "depth, alpha, normal, got 'depth'",
+        "PluginError: splats: aovs must be a list of name:type with names of their own and types "
+        "of depth, alpha, normal, got 'depth'",
     ),
     "aovs of an unknown type": ({"aovs": "a:alpha, n:sh_normal"}, "got 'n:sh_normal'"),
     "aovs without a name": ({"aovs": ":depth"}, "got ':depth'"),
     "aovs of one name": ({"aovs": "a:alpha, a:depth"}, "got 'a:depth'"),
     "ignore": (
         {"ignore": "motion, background"},
-        "ValueError: splats: ignore must be a list of distortion, defocus, motion, smoothing, got "
+        "PluginError: splats: ignore must be a list of distortion, defocus, motion, smoothing, got "
         "'background'",
     ),
     "hide_emitters a number": (
@@ -1545,7 +1545,7 @@ REFUSED = {
     "unknown": ({"sh_degre": 1}, '- integer "sh_degre": 1'),
     "a texture under an unknown name": (
         {"backgroud": {"type": "checkerboard"}},
-        "ValueError: splats: backgroud must be an integrator, the only object besides the texture "
+        "PluginError: splats: backgroud must be an integrator, the only object besides the texture "
         "background, got Checkerboard; did you mean background?",
     ),
     "an object of no use": (

@@ -18,7 +18,7 @@ from drgs.cameras.radial_tangential import RadialTangential
 from drgs.config.changes import changed
 from drgs.data.types import Motion
 from drgs.integrator.sensors import camera_from_sensor, read_sensor
-from drgs.integrator.summary import Effect, described, summary_of_sensors, summary_of_views
+from drgs.integrator.summary import SimulatedEffect, described, summary_of_sensors, summary_of_views
 from drgs.training import history
 from drgs.training.checkpoint import load_checkpoint
 from drgs.training.effects.called_for import integrator_settings, training_effects
@@ -55,14 +55,18 @@ def config_of(**changes):
 
 def test_a_plan_is_a_line_for_each_effect_and_one_for_all_others():
     effects = [
-        Effect("a", "much", "x.y"),
-        Effect("b", None),
-        Effect("c", "some", "z"),
-        Effect("d", None),
+        SimulatedEffect("a", "much", "x.y"),
+        SimulatedEffect("b", None),
+        SimulatedEffect("c", "some", "z"),
+        SimulatedEffect("d", None),
     ]
     assert described(effects) == "simulated:\n  a: much (x.y)\n  c: some (z)\n  not simulated: b, d"
     assert described(effects[:1]) == "simulated:\n  a: much (x.y)"
-    ignored = [*effects, Effect("e", None, "z", ignored=True), Effect("f", "a part", "z", True)]
+    ignored = [
+        *effects,
+        SimulatedEffect("e", None, "z", ignored=True),
+        SimulatedEffect("f", "a part", "z", True),
+    ]
     assert described(ignored[4:]) == (
         "simulated:\n  f: a part (z)\n  not simulated: e (ignored), f (ignored)"
     )

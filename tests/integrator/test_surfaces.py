@@ -424,7 +424,7 @@ def test_numbers_of_the_host_count_too():
     params["lamp_1.sampling_weight"] = 0.0
     params.update()
     after = image_of(loaded)
-    loaded.integrator().memory.surfaces.clear()
+    loaded.integrator().memory.surfaces = None
     loaded.integrator().memory.traced.clear()
     np.testing.assert_array_equal(after, image_of(loaded))
     assert np.abs(after - before).max() > 0.01

@@ -1,0 +1,58 @@
+"""What a picture may know of the integrator that it is rendered for.
+
+:class:`SplatsSettings` is what ``plugins/splats.py`` has for pictures and views; the plugin itself
+is loaded for each variant of Mitsuba, so that its class cannot be imported here.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import Any, Protocol, runtime_checkable
+
+import mitsuba as mi
+
+from drgs.config.approximations import Approximations
+from drgs.gaussians.parameters import Gaussians
+from drgs.integrator.cache import Memory
+from drgs.splatting.rendering import Pipeline
+
+
+class SplatsSettings(Protocol):
+    """What an integrator renders, and how."""
+
+    near: float  # near plane, scene units
+    background: mi.Color3f | mi.Texture  # display space; a texture: linear
+    hide_emitters: bool
+    srgb_primitives: bool  # whether pictures are linear radiance, not display space
+    sh_degree: int  # highest that is evaluated
+    approximations: Approximations
+    smoothing: Any  # Float (N,), scene units; None: the Gaussians have no filter
+    ignore: Sequence[str]  # effects that are not simulated
+    aovs: dict[str, str]  # what is put out besides colour: kinds by name
+    nested: mi.Integrator | None  # of surfaces
+    nested_spp: int  # 0: as many as of the splats
+    memory: Memory
+
+    @property
+    def gaussians(self) -> Gaussians:
+        """All that is rendered, those of the scene's shapes included."""
+
+    @property
+    def pipeline(self) -> Pipeline:
+        """What the settings call for."""
+
+    def aov_names(self) -> list[str]:
+        """Of the channels besides colour and alpha."""
+
+    def channels_of(self, kind: str) -> Iterable[int | str]:
+        """What comes behind the dot in the names of an AOV's channels."""
+
+
+@runtime_checkable
+class SummarisingIntegrator(Protocol):
+    """An integrator that says what it simulates, as ``splats`` does."""
+
+    srgb_primitives: bool  # whether pictures are linear radiance, not display space
+
+    def summary(self, scene: mi.Scene, *sensors: mi.Sensor) -> str:
+        """One line for each effect: what is simulated, and what asked for it."""
