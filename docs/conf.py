@@ -36,6 +36,7 @@ nitpicky = False
 myst_enable_extensions = ["dollarmath"]
 myst_heading_anchors = 3  # links such as results.md#speed work here as on a code host
 
+autodoc_default_options = {"exclude-members": "model_config"}
 autodoc_member_order = "bysource"
 autodoc_typehints = "description"
 autodoc_typehints_description_target = "documented"
