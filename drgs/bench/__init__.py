@@ -1,4 +1,4 @@
-"""Measurements that the README shows, each made by a command: ``drgs bench NAME``.
+"""Measurements that the documents show, each made by a command: ``drgs bench NAME``.
 
 May import everything.
 """

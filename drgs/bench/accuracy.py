@@ -395,7 +395,7 @@ def pareto_front(results: Sequence[Measurement]) -> list[Measurement]:
 
 
 def table(results: Sequence[Measurement]) -> str:
-    """As the README holds it; times relative to the first."""
+    """As the page of results holds it; times relative to the first."""
     first, front = results[0], pareto_front(results)
     header = [
         results[0].scene, "forward", "forward + backward", "operations", "PSNR", "SSIM",

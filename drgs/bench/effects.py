@@ -329,7 +329,7 @@ def _seconds(function: Callable[[], None]) -> float:
 
 
 def table(prices: list[Price], forward: str, both: str) -> str:
-    """As the README holds it; without a name for pictures, there is no column of them."""
+    """As the page of results holds it; without a name for pictures, there is no column of them."""
     header = ["effect", "", *([forward, "ratio"] if forward else []), both, "ratio"]
     rows = []
     for p in prices:

@@ -155,7 +155,7 @@ def _objects() -> dict[str, Any]:
 
 
 def table(costs: list[Cost]) -> str:
-    """As the README holds it."""
+    """As the page of results holds it."""
     header = ["Gaussians", "samples", "splats", "path", "both", "factor", "again", "factor"]
     rows = [
         [
