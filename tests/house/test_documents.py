@@ -102,6 +102,13 @@ def test_paths_in_the_text_exist(page):
                 assert path in OF_WORKED_EXAMPLES or (REPOSITORY / path).exists(), path
 
 
+def test_the_layout_lists_every_package():
+    table = text_of("docs/developing.md").split("## Layout")[1].split("## Tests")[0]
+    for init in sorted((REPOSITORY / "drgs").rglob("__init__.py")):
+        folder = init.parent.relative_to(REPOSITORY / "drgs")
+        assert folder == Path() or f"`{folder.as_posix()}/`" in table, folder
+
+
 GONE = {"drgs.rendering"}  # of the changelog
 
 
