@@ -4,15 +4,15 @@ A :class:`Camera` is what projection reads. Its numbers are Dr.Jit scalars that 
 so that kernels are compiled once for all views, and a Mitsuba sensor's transform is never read back
 to the host.
 
-How points come to the film is up to the camera's *lens*, an object with the methods of
-:class:`Pinhole`. The other ones are in ``drgs.cameras.radial_tangential``, imported when a sensor
-has one.
+How points come to the film is up to the camera's *lens*, blur to its *aperture*, motion to its
+*shutter*: protocols say what they must have. All but :class:`Pinhole` are in modules of their own,
+imported when a sensor has one.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, is_dataclass, replace
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Protocol
 
 import drjit as dr
 import numpy as np
@@ -21,9 +21,12 @@ from drgs.core.arrays import types_of
 from drgs.core.constants import TAN_CLAMP
 
 
-@dataclass(frozen=True)
-class Lens:
-    """What all lenses have in common: by default nothing has to be prepared."""
+class Lens(Protocol):
+    """How points come to the film, and what its places look along.
+
+    Positions are Array3f in camera axes, one a lane; *slopes* are x / z and y / z. The bodies here
+    are what most lenses do.
+    """
 
     label: ClassVar[str]
     """What messages call it."""
@@ -51,6 +54,37 @@ class Lens:
         del values
         return self
 
+    def look(self, camera: Camera, position: Any) -> tuple[Any, Any, Any]:
+        """Whether a mean is seen, its position, and its depth (scene units).
+
+        The position and the depth of one that is not seen are replaced: a masked lane must not
+        divide by zero, as 0 * inf would poison the gradient of its neighbours.
+        """
+        ...
+
+    def true_slopes(self, camera: Camera, position: Any) -> list[Any] | None:
+        """Of a mean; None: the projection is linearised at the mean, wherever it is."""
+        ...
+
+    def clamped_slopes(self, camera: Camera, position: Any) -> list[Any] | None:
+        """The same, but not far outside the film: see ``constants.TAN_CLAMP``."""
+        ...
+
+    def film_point(self, camera: Camera, position: Any) -> Any:
+        """Where a point is on the film, Array2f, px."""
+        ...
+
+    def film_directions(self, camera: Camera, position: Any, slopes: list[Any] | None) -> list[Any]:
+        """Derivatives of the place on the film, two Array3f, world: px per scene unit.
+
+        slopes: of the ray along which the mean is projected.
+        """
+        ...
+
+    def depth_direction(self, camera: Camera, position: Any) -> Any:
+        """Derivative of the depth divided by the depth, Array3f, world."""
+        ...
+
     def view_direction(self, camera: Camera, offset: Any) -> Any:
         """In which a mean is seen, Array3f, world, of any length; offset: from the centre."""
         del camera
@@ -61,20 +95,25 @@ class Lens:
         del camera, y
         return types_of(type(x)).Array3f(0, 0, 0)
 
+    def ray(self, camera: Camera, x: Any, y: Any) -> Any:
+        """Its direction, Array3f, camera axes, of any length."""
+        ...
 
-@dataclass(frozen=True)
-class Perspective(Lens):
-    """What lenses have in common that see along rays from a centre, in front of them.
+    def ray_range(self, direction: Any, near: Any, far: Any) -> tuple[Any, Any]:
+        """Where a ray of unit ``direction`` (camera axes) reaches two depths."""
+        ...
 
-    Positions are Array3f in camera axes, one a lane. *Slopes* are x / z and y / z.
-    """
+    def place_of_ray(self, camera: Camera, origin: Any, direction: Any) -> Any:
+        """Where on the film a ray (Array3f, camera axes) begins, Array2f, px."""
+        del origin
+        return self.film_point(camera, direction)
+
+
+class Perspective(Lens, Protocol):
+    """What lenses have in common that see along rays from a centre, in front of them."""
 
     def look(self, camera: Camera, position: Any) -> tuple[Any, Any, Any]:
-        """Whether a mean is seen, its position, and its depth (scene units).
-
-        The position and the depth of one that is not seen are replaced: a masked lane must not
-        divide by zero, as 0 * inf would poison the gradient of its neighbours.
-        """
+        """Whether a mean is seen, its position, and its depth."""
         x, y, z = position
         seen = z >= camera.near
         z = dr.select(seen, z, 1)
@@ -98,8 +137,12 @@ class Perspective(Lens):
         return camera.rotation[2] / position.z
 
     def ray_range(self, direction: Any, near: Any, far: Any) -> tuple[Any, Any]:
-        """Where a ray of unit ``direction`` (camera axes) reaches two depths."""
+        """Where a ray of unit ``direction`` reaches two depths."""
         return near / direction.z, far / direction.z
+
+    def frustum(self, camera: Camera) -> tuple[Any, Any]:
+        """The least and the largest slopes on the film, Array2f."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -139,6 +182,46 @@ class Pinhole(Perspective):
         return t.Array3f(film.x, film.y, 1)
 
 
+class Aperture(Protocol):
+    """Of a lens that blurs what is not in focus: rays of one place start all over it."""
+
+    @property
+    def radius(self) -> Any:
+        """Float, scene units."""
+        ...
+
+    def variance(self, camera: Camera, depth: Any) -> Any:
+        """Float, px^2: along either axis, of the place on the film of a point at ``depth``."""
+        ...
+
+    def rays(self, camera: Camera, x: Any, y: Any, count: int) -> tuple[Any, Any]:
+        """See :meth:`Camera.view_directions`."""
+        ...
+
+    def in_focus(self, origin: Any, direction: Any) -> Any:
+        """The point of a ray (Array3f, camera axes) that is in focus."""
+        ...
+
+
+class Shutter(Protocol):
+    """How a camera moves while it is open, from time 0, where it is as it says, to 1."""
+
+    label: ClassVar[str]
+    """What messages call it."""
+
+    def cameras(self, camera: Camera) -> list[Camera]:
+        """Those whose pictures are averaged."""
+        ...
+
+    def pose(self, camera: Camera, time: Any) -> Camera:
+        """Where ``camera`` is at a time; it does not move."""
+        ...
+
+    def camera_of(self, means: Any, camera: Camera) -> Camera:
+        """Where ``camera`` is when it sees means (Array3f, world), one a lane."""
+        ...
+
+
 MISSED = 0.01
 """px: how far from its place a ray's point may be seen."""
 
@@ -160,9 +243,9 @@ class Camera:
     near: Any  # Float, scene units: means with smaller z are culled
     width: int
     height: int
-    lens: Any = Pinhole()
-    aperture: Any = None  # of a lens that blurs: see ``drgs.effects.defocus``
-    shutter: Any = None  # of a camera that moves while it is open: see ``drgs.cameras.motion``
+    lens: Lens = Pinhole()
+    aperture: Aperture | None = None  # of a lens that blurs
+    shutter: Shutter | None = None  # of a camera that moves while it is open
 
     @staticmethod
     def create(
@@ -209,6 +292,31 @@ class Camera:
         t = types_of(type(self.near))
         missed = self.lens.film_point(self, direction) - t.Array2f(x, y)
         return origin, direction, seen & (dr.squared_norm(missed) < MISSED**2)
+
+    def view_directions(self, x: Any, y: Any, count: int) -> tuple[Any, Any, int]:
+        """Directions in which places of the film (px) see: Array3f, world, of any length.
+
+        count: how many there are of each place, next to each other, where the lens has an aperture,
+        over which they are spread evenly; otherwise there is one.
+
+        Returns them, whether they are any, and how many there are of each place.
+        """
+        if self.aperture is not None:
+            return *self.aperture.rays(self, x, y, count), count
+        camera = self.at_row(y)
+        _, ray, seen = camera.look_through(x, y)
+        return camera.rotation.T @ ray, seen, 1
+
+    def place_of_ray(self, origin: Any, direction: Any) -> tuple[Any, Any]:
+        """Where on the film a ray begins, Array2f, px; and how far from the middle of the lens.
+
+        origin, direction: Array3f, camera axes. The latter is at most the radius of the aperture,
+        Float, scene units.
+        """
+        if self.aperture is None:
+            return self.lens.place_of_ray(self, origin, direction), type(self.near)(0)
+        point = self.aperture.in_focus(origin, direction)
+        return self.lens.film_point(self, point), self.aperture.radius
 
     def at_row(self, y: Any) -> Camera:
         """Where a camera is whose rows are read one after the other, when it reads that of y, px.
@@ -268,12 +376,11 @@ def _gathered(value: Any, lanes: Any) -> Any:
 
 def cameras_in_time(camera: Camera) -> list[Camera]:
     """The cameras whose pictures are averaged: one unless it is blurred by motion."""
-    times = getattr(camera.shutter, "times", None)
-    return [camera] if times is None else [camera.shutter.pose(camera, t) for t in times()]
+    return [camera] if camera.shutter is None else camera.shutter.cameras(camera)
 
 
-def uploaded(lens: Any, float_type: type) -> Any:
-    """The lens with Dr.Jit scalars for its numbers, so that kernels are the same for all."""
+def uploaded(lens: Lens, float_type: type) -> Lens:
+    """The lens, a dataclass, with Dr.Jit scalars for its numbers: kernels are the same for all."""
 
     def opaque(value: Any) -> Any:
         if isinstance(value, tuple):
@@ -283,8 +390,12 @@ def uploaded(lens: Any, float_type: type) -> Any:
     return replace(lens, **{f.name: opaque(getattr(lens, f.name)) for f in fields(lens)})
 
 
-def moved_on_axis(position: Any, seen: Any) -> tuple[Any, Any, Any]:
-    """Positions, with one on the axis for those that are not seen, and their z."""
+def with_unseen_on_axis(position: Any, seen: Any) -> tuple[Any, Any, Any]:
+    """``seen``, positions with those on the axis that are not seen, and their z.
+
+    position: Array3f, camera axes; seen: Bool. A mean that is not seen is put at (0, 0, 1), where
+    every lens is differentiable.
+    """
     x, y, z = position
     z = dr.select(seen, z, 1)
     return seen, type(position)(dr.select(seen, x, 0), dr.select(seen, y, 0), z), z

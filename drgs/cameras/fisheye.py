@@ -1,4 +1,8 @@
-"""OpenCV's fisheye lens."""
+"""OpenCV's fisheye lens.
+
+Imported when a sensor or a dataset has one. Coefficients and what lies beyond the lens model: as in
+``drgs.cameras.radial_tangential``.
+"""
 
 from __future__ import annotations
 
@@ -9,25 +13,23 @@ from typing import Any, ClassVar
 import drjit as dr
 import numpy as np
 
-from drgs.cameras.camera import Camera, Lens, moved_on_axis, uploaded
+from drgs.cameras.camera import Camera, Lens, uploaded, with_unseen_on_axis
 from drgs.cameras.polynomials import (
-    _derivative,
-    _first_root,
-    _horner,
-    _polynomial,
-    _radius_of,
-    _up_to_the_last,
+    derivative,
+    first_root,
+    horner,
+    polynomial,
+    radius_at,
+    up_to_the_last,
 )
 from drgs.core.arrays import is_float64, types_of
 
 MAX_ANGLE = 0.95 * math.pi
 """From the axis of a fisheye: what is behind it has no place on the film."""
 
-
 NEAR_AXIS = 0.1
 """tan^2 of the angle below which series are used: theta / rho is 0 / 0 on the axis, and what its
 derivative needs is a difference that cancels near it."""
-
 
 AXIS_TERMS = {False: 8, True: 16}
 """Terms of these series in single and in double precision: 0.1^n is below their roundings."""
@@ -56,9 +58,9 @@ class Fisheye(Lens):
     def of(**coefficients: float) -> Fisheye:
         """From OpenCV's names, ``k1`` to ``k4``; what is not given is zero."""
         assert set(coefficients) <= set(Fisheye.names)
-        kept = _up_to_the_last(Fisheye.names, coefficients)
+        kept = up_to_the_last(Fisheye.names, coefficients)
         growth = [1.0, *((2 * n + 3) * k for n, k in enumerate(kept))]
-        turn = math.sqrt(_first_root(np.array(growth)))
+        turn = math.sqrt(first_root(np.array(growth)))
         return Fisheye(kept, math.cos(min(turn, MAX_ANGLE)))
 
     def upload(self, float_type: type) -> Fisheye:
@@ -80,7 +82,7 @@ class Fisheye(Lens):
         """Whether a mean is seen, its position, and its distance."""
         distance = dr.norm(position)
         seen = (distance >= camera.near) & (position.z > self.min_cosine * distance)
-        _, position, _ = moved_on_axis(position, seen)
+        _, position, _ = with_unseen_on_axis(position, seen)
         return seen, position, dr.norm(position)
 
     def true_slopes(self, camera: Camera, position: Any) -> None:
@@ -93,7 +95,7 @@ class Fisheye(Lens):
         """Where a point is on the film, Array2f, px."""
         x, y, _ = position
         per_radius, _ = self._angle_per_radius(position)
-        scale = per_radius * _polynomial(
+        scale = per_radius * polynomial(
             self.coefficients, self._squared_angle(position, per_radius)
         )
         return camera.focal * types_of(type(x)).Array2f(scale * x, scale * y) + camera.principal
@@ -109,7 +111,7 @@ class Fisheye(Lens):
         x, y, z = position
         a, b = self._angle_per_radius(position)
         squared = self._squared_angle(position, a)
-        h, dh = _polynomial(self.coefficients, squared), _derivative(self.coefficients, squared)
+        h, dh = polynomial(self.coefficients, squared), derivative(self.coefficients, squared)
         inverse = dr.rcp(dr.squared_norm(position))
         scale, bend = h * a, h * b + 2 * dh * (a * a) * (z * inverse)
         tilt = (h + 2 * dh * squared) * inverse
@@ -140,7 +142,7 @@ class Fisheye(Lens):
         radius = dr.sqrt(dr.select(off_axis, squared, 1))
         with dr.suspend_grad():
             end = dr.acos(self.min_cosine)
-            angle = _radius_of(self._distorted_angle, radius, end)
+            angle = radius_at(self._distorted_angle, radius, end)
         # The last step of Newton's method is differentiated, as in ``RadialTangential``.
         value, slope = self._distorted_angle(angle)
         following = angle + (radius - value) / dr.detach(slope)
@@ -151,7 +153,7 @@ class Fisheye(Lens):
     def _distorted_angle(self, angle: Any) -> tuple[Any, Any]:
         """theta_d of an angle, and its derivative."""
         squared = angle * angle
-        h, dh = _polynomial(self.coefficients, squared), _derivative(self.coefficients, squared)
+        h, dh = polynomial(self.coefficients, squared), derivative(self.coefficients, squared)
         return h * angle, h + 2 * dh * squared
 
     @staticmethod
@@ -166,9 +168,9 @@ class Fisheye(Lens):
         depth = dr.select(on_axis, z, 1)
         t = dr.select(on_axis, squared, 0) / (depth * depth)
         terms = range(AXIS_TERMS[is_float64(type(z))])
-        series_a = _polynomial([(-1) ** (k + 1) / (2 * k + 3) for k in terms], t) / depth
+        series_a = polynomial([(-1) ** (k + 1) / (2 * k + 3) for k in terms], t) / depth
         series_b = [(-1) ** (k + 1) * (2 * k + 2) / (2 * k + 3) for k in terms]
-        series_b = _horner(series_b, t) / (depth * depth * depth)
+        series_b = horner(series_b, t) / (depth * depth * depth)
         squared = dr.select(on_axis, 1, squared)
         radius = dr.sqrt(squared)
         a = dr.atan2(radius, z) / radius

@@ -32,8 +32,11 @@ class Motion:
     turn: Any  # Array3f, camera axes: axis times angle (radians), below half a turn
 
     @staticmethod
-    def between(camera: Camera, rotation: Any, center: Any) -> Any:
-        """From the pose of ``camera`` to another (3 x 3 world to camera; Array3f)."""
+    def between(camera: Camera, rotation: Any, center: Any) -> tuple[Any, Any]:
+        """``travel`` and ``turn`` from the pose of ``camera`` to another.
+
+        rotation: Matrix3f, world to camera; center: Array3f, world.
+        """
         return center - camera.center, rotation_vector(rotation @ camera.rotation.T)
 
     def pose(self, camera: Camera, time: Any) -> Camera:
@@ -63,9 +66,13 @@ class MotionBlur(Motion):
 
     samples: int
 
-    def times(self) -> list[float]:
-        """In the middle of equal intervals."""
-        return [(k + 0.5) / self.samples for k in range(self.samples)]
+    def cameras(self, camera: Camera) -> list[Camera]:
+        """At times in the middle of equal intervals."""
+        return [self.pose(camera, (k + 0.5) / self.samples) for k in range(self.samples)]
+
+    def camera_of(self, means: Any, camera: Camera) -> Camera:
+        """Raise ValueError: means are seen all the time, by each of :meth:`cameras`."""
+        raise ValueError("a camera that motion blurs has a picture for each of its cameras_in_time")
 
 
 @dataclass(frozen=True)
@@ -73,6 +80,10 @@ class RollingShutter(Motion):
     """The film's rows are read from the first, at time 0, to the last, at time 1."""
 
     label: ClassVar[str] = "rolling shutter"
+
+    def cameras(self, camera: Camera) -> list[Camera]:
+        """The camera itself: it has one picture."""
+        return [camera]
 
     def camera_of(self, means: Any, camera: Camera) -> Camera:
         """The camera as it is when the row of the film that shows a mean is read.

@@ -1,11 +1,14 @@
-"""Parallel rays."""
+"""Parallel rays: Mitsuba's ``orthographic``.
+
+Imported when a sensor has them.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
-from drgs.cameras.camera import Camera, Lens, moved_on_axis
+from drgs.cameras.camera import Camera, Lens, with_unseen_on_axis
 from drgs.core.arrays import types_of
 
 
@@ -21,7 +24,7 @@ class Orthographic(Lens):
 
     def look(self, camera: Camera, position: Any) -> tuple[Any, Any, Any]:
         """Whether a mean is seen, its position, and its depth."""
-        return moved_on_axis(position, position.z >= camera.near)
+        return with_unseen_on_axis(position, position.z >= camera.near)
 
     def true_slopes(self, camera: Camera, position: Any) -> None:
         """None: the projection is linear."""
@@ -59,6 +62,11 @@ class Orthographic(Lens):
         t = types_of(type(x))
         film = (t.Array2f(x, y) - camera.principal) / camera.focal
         return t.Array3f(film.x, film.y, 0)
+
+    def place_of_ray(self, camera: Camera, origin: Any, direction: Any) -> Any:
+        """Where on the film a ray (Array3f, camera axes) begins, Array2f, px."""
+        del direction
+        return self.film_point(camera, origin)
 
     def ray_range(self, direction: Any, near: Any, far: Any) -> tuple[Any, Any]:
         """Where a ray of unit ``direction`` (camera axes) reaches two depths."""

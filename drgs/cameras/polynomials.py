@@ -1,4 +1,7 @@
-"""Polynomials of distortion models: values, derivatives, and where they stop being monotonic."""
+"""Polynomials of distortion models: values, derivatives, first roots, and inverses.
+
+Coefficients are numbers of the host or Dr.Jit scalars.
+"""
 
 from __future__ import annotations
 
@@ -15,12 +18,11 @@ RADIUS_STEPS = 24
 """When the radius is looked for that a lens shows at a place: most need 4 or 5. Next to the place
 where the function ends, each step at least halves the error."""
 
-
 UNBOUNDED = 1e4
 """A slope that no film shows."""
 
 
-def _horner(coefficients: Sequence[Any], x: Any) -> Any:
+def horner(coefficients: Sequence[Any], x: Any) -> Any:
     """c_0 + c_1 x + c_2 x^2 + ...; 0.0 without coefficients."""
     if not coefficients:
         return 0.0
@@ -30,24 +32,24 @@ def _horner(coefficients: Sequence[Any], x: Any) -> Any:
     return total
 
 
-def _polynomial(coefficients: Sequence[Any], x: Any) -> Any:
+def polynomial(coefficients: Sequence[Any], x: Any) -> Any:
     """1 + c_1 x + c_2 x^2 + ..."""
-    return _horner([1.0, *coefficients], x)
+    return horner([1.0, *coefficients], x)
 
 
-def _derivative(coefficients: Sequence[Any], x: Any) -> Any:
+def derivative(coefficients: Sequence[Any], x: Any) -> Any:
     """c_1 + 2 c_2 x + ..."""
-    return _horner([power * c for power, c in enumerate(coefficients, 1)], x)
+    return horner([power * c for power, c in enumerate(coefficients, 1)], x)
 
 
-def _first_root(polynomial: np.ndarray) -> float:
-    """The smallest positive root, coefficients from the constant term up; inf: there is none."""
-    roots = np.polynomial.polynomial.polyroots(np.trim_zeros(polynomial, "b"))
+def first_root(coefficients: np.ndarray) -> float:
+    """The smallest positive root; inf: there is none. coefficients: from the constant term up."""
+    roots = np.polynomial.polynomial.polyroots(np.trim_zeros(coefficients, "b"))
     real = roots.real[(np.abs(roots.imag) < 1e-7 * (1 + np.abs(roots))) & (roots.real > 0)]
     return float(real.min(initial=math.inf))
 
 
-def _radius_of(distorted: Callable, target: Any, end: Any) -> Any:
+def radius_at(distorted: Callable, target: Any, end: Any) -> Any:
     """Where an increasing function reaches ``target``; close to ``end`` if it never does.
 
     distorted: radius -> its value and its derivative; 0 at 0. Newton's method within a bracket,
@@ -83,7 +85,7 @@ def _between(low: Any, high: Any) -> Any:
     return middle / (1 - middle)
 
 
-def _up_to_the_last(names: Sequence[str], given: Mapping[str, float]) -> tuple[float, ...]:
+def up_to_the_last(names: Sequence[str], given: Mapping[str, float]) -> tuple[float, ...]:
     """Coefficients of a polynomial: zero where one is not given but a later one is."""
     count = max((n for n, name in enumerate(names, 1) if name in given), default=0)
     return tuple(float(given.get(name, 0.0)) for name in names[:count])

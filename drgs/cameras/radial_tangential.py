@@ -1,11 +1,10 @@
-"""Lenses other than a pinhole: with distortion, fisheye, orthographic, with an aperture.
+"""OpenCV's lens with radial and tangential distortion.
 
-Imported when a sensor or a dataset has such a lens. Each has the methods of
-:class:`drgs.cameras.camera.Pinhole`. Coefficients are numbers of the host, or Dr.Jit scalars after
-:meth:`upload`; one that is not given is left out (of a polynomial, those behind the last one that
-is; or both tangential ones), so that nothing is computed for it.
+Imported when a sensor or a dataset has one. Coefficients are numbers of the host, or Dr.Jit scalars
+after :meth:`RadialTangential.upload`; one that is not given is left out (of a polynomial, those
+behind the last one that is; or both tangential ones), so that nothing is computed for it.
 
-Outside the part of the film's plane that a lens model is made for, its polynomials turn around and
+Outside the part of the film's plane that the model is made for, its polynomials turn around and
 would fold what lies far outside back into the picture: what is seen under a larger angle than that
 at which the model first turns, in whatever direction, is not seen at all.
 """
@@ -20,14 +19,14 @@ from typing import Any, ClassVar
 import drjit as dr
 import numpy as np
 
-from drgs.cameras.camera import Camera, Perspective, moved_on_axis, uploaded
+from drgs.cameras.camera import Camera, Perspective, uploaded, with_unseen_on_axis
 from drgs.cameras.polynomials import (
     UNBOUNDED,
-    _derivative,
-    _first_root,
-    _polynomial,
-    _radius_of,
-    _up_to_the_last,
+    derivative,
+    first_root,
+    polynomial,
+    radius_at,
+    up_to_the_last,
 )
 from drgs.core.arrays import types_of
 
@@ -39,16 +38,6 @@ BORDER = 65
 
 MISSED = 1e-6
 """Squared, of slopes: how far Newton's method may end from the point that it looked for."""
-
-
-# ----------------------------------------------------------------------------------------------
-# Polynomials
-# ----------------------------------------------------------------------------------------------
-
-
-# ----------------------------------------------------------------------------------------------
-# Distortion
-# ----------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -80,8 +69,8 @@ class RadialTangential(Perspective):
         names = RadialTangential.names
         assert set(coefficients) <= set(names)
         p1, p2 = (float(coefficients.get(name, 0.0)) for name in names[6:])
-        numerator = _up_to_the_last(names[:3], coefficients)
-        denominator = _up_to_the_last(names[3:6], coefficients)
+        numerator = up_to_the_last(names[:3], coefficients)
+        denominator = up_to_the_last(names[3:6], coefficients)
         return RadialTangential(
             numerator=numerator,
             denominator=denominator,
@@ -145,7 +134,7 @@ class RadialTangential(Perspective):
         """
         with dr.suspend_grad():
             length = dr.sqrt(x * x + y * y)
-            radius = _radius_of(self._radius, length, dr.sqrt(self.max_squared_radius))
+            radius = radius_at(self._radius, length, dr.sqrt(self.max_squared_radius))
             # In the middle, radius and length are the same.
             scale = dr.select(length > 0, radius / dr.select(length > 0, length, 1), 1)
             u, v = scale * x, scale * y
@@ -187,7 +176,7 @@ class RadialTangential(Perspective):
         x, y, z = position
         # Not divided by z, which may be zero.
         limit = self.max_squared_radius * z * z
-        return moved_on_axis(position, (z >= camera.near) & (x * x + y * y < limit))
+        return with_unseen_on_axis(position, (z >= camera.near) & (x * x + y * y < limit))
 
     def film_point(self, camera: Camera, position: Any) -> Any:
         """Where a point is on the film, Array2f, px."""
@@ -220,13 +209,13 @@ class RadialTangential(Perspective):
         return t.Array3f(*self.undistort(film.x, film.y), 1)
 
     def _radial(self, squared: Any) -> Any:
-        return _polynomial(self.numerator, squared) / _polynomial(self.denominator, squared)
+        return polynomial(self.numerator, squared) / polynomial(self.denominator, squared)
 
     def _radial_derivative(self, squared: Any) -> Any:
         """d R / d r^2."""
-        denominator = _polynomial(self.denominator, squared)
-        change = _derivative(self.numerator, squared)
-        change = change - self._radial(squared) * _derivative(self.denominator, squared)
+        denominator = polynomial(self.denominator, squared)
+        change = derivative(self.numerator, squared)
+        change = change - self._radial(squared) * derivative(self.denominator, squared)
         return change / denominator
 
 
@@ -244,7 +233,7 @@ def _largest_squared_radius(
     u = np.polynomial.Polynomial([0.0, 1.0])
     n, d = (np.polynomial.Polynomial([1.0, *c]) for c in (numerator, denominator))
     growth = n * d + 2 * u * (n.deriv() * d - n * d.deriv())
-    first = min(_first_root(growth.coef), _first_root(d.coef))
+    first = min(first_root(growth.coef), first_root(d.coef))
     if tangential == 0:
         return first
     r = u
@@ -252,7 +241,7 @@ def _largest_squared_radius(
         growth(r**2) - 6 * tangential * r * d(r**2) ** 2,
         n(r**2) - 6 * tangential * r * d(r**2),
     )
-    return min(first, *(_first_root(fold.coef) ** 2 for fold in folds))
+    return min(first, *(first_root(fold.coef) ** 2 for fold in folds))
 
 
 def _slopes_on_border(lens: RadialTangential, camera: Camera) -> tuple[Any, Any]:
@@ -284,18 +273,3 @@ def _mean_where(values: Any, extreme: Any) -> Any:
     """
     equal = values == extreme
     return dr.sum(dr.select(equal, values, 0)) / dr.count(equal)
-
-
-# ----------------------------------------------------------------------------------------------
-# Fisheye
-# ----------------------------------------------------------------------------------------------
-
-
-# ----------------------------------------------------------------------------------------------
-# Orthographic
-# ----------------------------------------------------------------------------------------------
-
-
-# ----------------------------------------------------------------------------------------------
-# Aperture
-# ----------------------------------------------------------------------------------------------

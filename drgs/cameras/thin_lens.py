@@ -1,4 +1,8 @@
-"""The aperture of a thin lens."""
+"""The aperture of a thin lens: what is not in focus is blurred.
+
+Imported when a sensor has one (Mitsuba's ``thinlens``). What it does to splats is in
+``drgs.effects.defocus``.
+"""
 
 from __future__ import annotations
 
@@ -6,13 +10,15 @@ from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
+import numpy as np
 
 from drgs.cameras.camera import Camera
+from drgs.core.arrays import types_of
 
 
 @dataclass(frozen=True)
-class Aperture:
-    """Of a thin lens: what is at ``focus_distance`` is sharp."""
+class RoundAperture:
+    """A disc: what is at ``focus_distance`` is sharp."""
 
     radius: Any  # Float, scene units
     focus_distance: Any  # Float, scene units, along the axis
@@ -25,3 +31,29 @@ class Aperture:
         """
         radius = camera.focal.x * self.radius * (1 / self.focus_distance - 1 / depth)
         return dr.square(radius) / 4
+
+    def rays(self, camera: Camera, x: Any, y: Any, count: int) -> tuple[Any, Any]:
+        """Directions (Array3f, world) of ``count`` rays of each place of the film (px); if any.
+
+        They begin all over the disc and meet at the focus distance.
+        """
+        t = types_of(type(x))
+        on_disc = dr.tile(t.Array2f(_disc(count)), dr.width(x))
+        x, y = dr.repeat(x, count), dr.repeat(y, count)
+        camera = camera.at_row(y)
+        _, ray, seen = camera.look_through(x, y)
+        begin = t.Array3f(on_disc.x, on_disc.y, 0)
+        ray = ray * self.focus_distance - begin * self.radius
+        return camera.rotation.T @ ray, seen
+
+    def in_focus(self, origin: Any, direction: Any) -> Any:
+        """The point of a ray (Array3f, camera axes) where all rays of its place meet."""
+        t = (self.focus_distance - origin.z) / direction.z
+        return origin + t * direction
+
+
+def _disc(count: int) -> np.ndarray:
+    """Points (2, count) of the unit disc, each with an equal share of it: a sunflower's seeds."""
+    k = np.arange(count)
+    radii, angles = np.sqrt((k + 0.5) / count), np.pi * (3 - np.sqrt(5)) * k
+    return np.array([radii * np.cos(angles), radii * np.sin(angles)])

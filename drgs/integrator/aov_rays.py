@@ -22,7 +22,6 @@ import mitsuba as mi
 
 from drgs.accuracy.sample_points import SamplePoints
 from drgs.cameras.camera import Camera
-from drgs.cameras.orthographic import Orthographic
 from drgs.core.arrays import interleave
 from drgs.core.errors import UnsupportedError
 from drgs.integrator.film import Channels, pixel_corners
@@ -149,15 +148,7 @@ def _look_back(camera: Camera, ray: mi.Ray3f) -> tuple[mi.Point2f, mi.Bool]:
     """Where on the film rays start, px; whether they belong to this camera."""
     offset = camera.rotation @ mi.Vector3f(ray.o - mi.Point3f(camera.center))
     direction = camera.rotation @ mi.Vector3f(ray.d)
-    radius = mi.Float(0)
-    if isinstance(camera.lens, Orthographic):
-        place = camera.lens.film_point(camera, offset)
-    elif camera.aperture is None:
-        place = camera.lens.film_point(camera, direction)
-    else:  # rays of one place meet where it is in focus
-        radius = camera.aperture.radius
-        t = (camera.aperture.focus_distance - offset.z) / direction.z
-        place = camera.lens.film_point(camera, offset + t * direction)
+    place, radius = camera.place_of_ray(offset, direction)
     origin, axis, seen = camera.look_through(place.x, place.y)
     passes_by = dr.norm(dr.cross(offset - origin, direction))
     size = dr.norm(camera.center) + dr.norm(ray.o) + dr.norm(offset - origin)

@@ -13,7 +13,6 @@ from typing import Protocol
 
 import drjit as dr
 import mitsuba as mi
-import numpy as np
 
 from drgs.cameras.camera import Camera
 from drgs.integrator.film import pixel_corners
@@ -43,37 +42,16 @@ class Environment:
     def radiance(self, film: mi.Film, camera: Camera, place: mi.Point2f) -> mi.Color3f:
         """At places in the crop window, px; black where the lens model ends."""
         del film
-        if camera.aperture is None:
-            return self._along_rays(camera, place)
-        x, y = dr.tile(_disc(LENS_POINTS), dr.width(place))
-        radiance = self._along_rays(camera, dr.repeat(place, LENS_POINTS), mi.Vector3f(x, y, 0))
-        if dr.width(radiance) == 1:  # the same from everywhere
-            return radiance
-        return mi.Color3f([dr.block_sum(color, LENS_POINTS) for color in radiance]) / LENS_POINTS
-
-    def _along_rays(
-        self, camera: Camera, place: mi.Point2f, lens_point: mi.Vector3f | None = None
-    ) -> mi.Color3f:
-        """Radiance at places; lens_point: of the unit disc, where the aperture's rays begin.
-
-        They meet at the focus distance. As the environment is infinitely far, only their direction
-        counts.
-        """
-        camera = camera.at_row(place.y)
-        _, ray, seen = camera.look_through(place.x, place.y)
-        if lens_point is not None:
-            ray = ray * camera.aperture.focus_distance - lens_point * camera.aperture.radius
-        interaction = dr.zeros(mi.SurfaceInteraction3f, dr.width(place))
-        interaction.wi = -mi.Vector3f(dr.normalize(camera.rotation.T @ ray))
+        ray, seen, count = camera.view_directions(place.x, place.y, LENS_POINTS)
+        interaction = dr.zeros(mi.SurfaceInteraction3f, count * dr.width(place))
+        # As the environment is infinitely far, only directions count.
+        interaction.wi = -mi.Vector3f(dr.normalize(ray))
         radiance = mi.Color3f(self.emitter.eval(interaction))
-        return radiance if seen is True else dr.select(seen, radiance, 0)
-
-
-def _disc(count: int) -> mi.Point2f:
-    """Points of the unit disc, each with an equal share of its area: the seeds of a sunflower."""
-    k = np.arange(count)
-    radii, angles = np.sqrt((k + 0.5) / count), np.pi * (3 - np.sqrt(5)) * k
-    return mi.Point2f(np.array([radii * np.cos(angles), radii * np.sin(angles)]))
+        if seen is not True:
+            radiance = dr.select(seen, radiance, 0)
+        if count == 1 or dr.width(radiance) == 1:  # the latter: the same from everywhere
+            return radiance
+        return mi.Color3f([dr.block_sum(color, count) for color in radiance]) / count
 
 
 @dataclass(frozen=True)

@@ -111,11 +111,13 @@ def _perspective(state: SensorState) -> Camera:
 
 def _thin_lens(state: SensorState) -> Camera:
     """Of type ``thinlens``: what is not at the focus distance is blurred."""
-    from drgs.cameras.thin_lens import Aperture
+    from drgs.cameras.thin_lens import RoundAperture
 
     device = state.device
     scales = axis_lengths(device["to_world"])
-    aperture = Aperture(device["aperture_radius"] * scales[0], device["focus_distance"] * scales[2])
+    aperture = RoundAperture(
+        device["aperture_radius"] * scales[0], device["focus_distance"] * scales[2]
+    )
     return replace(_perspective(state), aperture=aperture)
 
 

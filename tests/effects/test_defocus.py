@@ -97,7 +97,7 @@ def splats_of(gaussians, camera, precision, defocus, rule=plain_opacity, low_pas
     shape = ewa
     if defocus is not None:
         numbers = (dr.opaque(precision.Float, n) for n in vars(defocus).values())
-        device = replace(device, aperture=thin_lens.Aperture(*numbers))
+        device = replace(device, aperture=thin_lens.RoundAperture(*numbers))
         shape = Defocused(ewa)
     parameter_rows = load_rows(device_gaussians(gaussians, precision), 0)
     return project(parameter_rows, device, 0, rule, shape, low_pass=low_pass)
@@ -164,7 +164,7 @@ def aperture_camera(camera, precision, defocus):
     if defocus is None:
         return device
     numbers = (dr.opaque(precision.Float, n) for n in vars(defocus).values())
-    return replace(device, aperture=thin_lens.Aperture(*numbers))
+    return replace(device, aperture=thin_lens.RoundAperture(*numbers))
 
 
 # ----------------------------------------------------------------------------------------------

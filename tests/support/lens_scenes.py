@@ -135,7 +135,7 @@ class LensCase(Case):
             return camera
         assert self.camera.fx == self.camera.fy, "an aperture's disc is round"
         numbers = (self.defocus.aperture_radius, self.defocus.focus_distance)
-        aperture = thin_lens.Aperture(*(dr.opaque(precision.Float, n) for n in numbers))
+        aperture = thin_lens.RoundAperture(*(dr.opaque(precision.Float, n) for n in numbers))
         return replace(camera, aperture=aperture)
 
     def render(self, precision: Precision, pipeline=None) -> tuple[Gaussians, rendering.Frame]:
