@@ -9,10 +9,11 @@ import pytest
 
 import drgs  # noqa: F401  (chooses libLLVM before Dr.Jit is imported)
 
+pytest.register_assert_rewrite("support")
+
 REPOSITORY = Path(__file__).resolve().parent.parent
-TESTS = REPOSITORY / "tests"
-PATHS = [str(TESTS), *sorted(str(folder) for folder in TESTS.iterdir() if folder.is_dir())]
-"""Where programs of the tests find what the tests import."""
+TESTS = str(REPOSITORY / "tests")
+"""Where programs of the tests find ``support``."""
 
 SHARED_DATA = REPOSITORY.parent / "shared" / "data"
 

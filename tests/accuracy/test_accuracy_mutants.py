@@ -1,7 +1,7 @@
 """Mutation check of the derivatives of the choices: exact response, order and colours of pixels.
 
 As in ``test_adjoint_mutants``: every partial derivative is scaled by 1.01 and changes its sign, and
-a test of the suite must notice it.
+a check of the suite must notice it.
 """
 
 from collections.abc import Callable
@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from functools import cache, partial
 
 import pytest
-import test_approximations as choices
+from support import approximation_checks as checks
 from support.detectors import MutationChecks, detectors, find_noticed
 from support.helpers import FLOAT64
 from support.mutants import ALWAYS, AT_EQUALITY, Instrumented, Switchboard
@@ -105,7 +105,7 @@ class Copies:
 def outcome():
     board = Switchboard()
     copies = Copies.of(board)
-    package_render, problem_render = rendering.render, cache(choices.Problem.render)
+    package_render, problem_render = rendering.render, cache(checks.Problem.render)
 
     def render(problem, precision):
         gaussians, frame = problem_render(problem, precision)
@@ -133,30 +133,30 @@ def outcome():
 
         return run
 
-    gradients = choices.test_gradients_equal_central_differences_of_the_reference
-    transpose = partial(choices.test_adjoint_is_the_transpose_of_the_tangent, FLOAT64)
+    gradients = checks.check_gradients_equal_central_differences_of_the_reference
+    transpose = partial(checks.check_adjoint_is_the_transpose_of_the_tangent, FLOAT64)
     general = {"gradients": partial(gradients, "close", "all three, other cuts")}
     special = {
         "transpose": partial(transpose, "close", "all three, other cuts"),
         "around, by depth": partial(gradients, "around", "pixel order"),
         "around, by depth, transpose": partial(transpose, "around", "pixel order"),
-        "no opacity": with_copies(choices.test_a_splat_without_opacity_has_no_derivatives),
-        "at the camera": with_copies(choices.test_a_peak_in_the_plane_of_the_camera_shows_nothing),
+        "no opacity": with_copies(checks.check_a_splat_without_opacity_has_no_derivatives),
+        "at the camera": with_copies(checks.check_a_peak_in_the_plane_of_the_camera_shows_nothing),
         "colour at its minimum": with_copies(
-            choices.test_a_colour_at_its_minimum_keeps_its_derivative
+            checks.check_a_colour_at_its_minimum_keeps_its_derivative
         ),
         "twice the precision": with_copies(
-            choices.test_sums_of_products_are_exact_to_twice_the_precision
+            checks.check_sums_of_products_are_exact_to_twice_the_precision
         ),
         "hundreds of layers": rendering_with_copies(
-            choices.test_behind_hundreds_of_layers_gradients_keep_their_accuracy
+            checks.check_behind_hundreds_of_layers_gradients_keep_their_accuracy
         ),
         "twins": rendering_with_copies(
-            choices.test_twins_are_composited_in_one_order_by_picture_and_derivative
+            checks.check_twins_are_composited_in_one_order_by_picture_and_derivative
         ),
     }
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(choices.Problem, "render", render)
+        patch.setattr(checks.Problem, "render", render)
         return find_noticed(board, detectors(general), detectors(special))
 
 

@@ -7,6 +7,15 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from support.approximation_checks import (
+    GRADIENTS,
+    MARKED,
+    PLANES,
+    STEP,
+    Problem,
+    _planes,
+    direction,
+)
 from support.helpers import (
     FLOAT32,
     FLOAT64,
@@ -17,7 +26,6 @@ from support.helpers import (
     single,
 )
 from support.views import Scene, image_of, tensors
-from test_approximations import GRADIENTS, MARKED, PLANES, STEP, Problem, _planes, direction
 
 import drgs  # noqa: F401  (registers the plugin)
 from drgs.accuracy.sample_points import SamplePoints

@@ -5,9 +5,9 @@ import csv
 import mitsuba as mi
 import numpy as np
 import pytest
-import test_densify
 import yaml
 from PIL import Image
+from support import populations
 from support.small_capture import make_dataset, write_dataset
 
 from drgs.bench import __main__ as bench
@@ -17,7 +17,7 @@ from drgs.config.schema import DensifyConfig
 from drgs.data import load_dataset
 from drgs.training import densify
 
-EXTENT = test_densify.EXTENT
+EXTENT = populations.EXTENT
 LATE = 3100  # large Gaussians are pruned from the first regular reset on
 
 
@@ -29,7 +29,7 @@ def variant():
 def change(optimizer, norms):
     """Through the module's name, as the trainer calls it."""
     return densify.densify_and_prune(
-        optimizer, test_densify.statistics(norms), DensifyConfig(), EXTENT, LATE, 0
+        optimizer, populations.statistics(norms), DensifyConfig(), EXTENT, LATE, 0
     )
 
 
@@ -37,15 +37,15 @@ def test_samples_that_are_still_too_large_are_pruned_at_once():
     """A giant's samples are smaller by 1.6, which may not be enough; clones of it are kept."""
     scales = np.array([0.5, 0.12, 0.05, 0.05]) * EXTENT  # x 0.1 is the limit
     opacities, norms = [0.5, 0.5, 0.5, 0.001], [1.0, 1.0, 0.0, 0.0]
-    spared = change(test_densify.make(scales, opacities), norms)
+    spared = change(populations.make(scales, opacities), norms)
     assert (spared.split, spared.pruned, spared.num_gaussians) == (2, 1, 5)
-    optimizer = test_densify.make(scales, opacities)
+    optimizer = populations.make(scales, opacities)
     with population._prune_added_rows_at_once():
         pruned = change(optimizer, norms)
     assert (pruned.split, pruned.pruned, pruned.num_gaussians) == (2, 3, 3)
     sizes = np.exp(np.array(optimizer["log_scales"])).max(axis=1)
     assert len(sizes) == 3 and (sizes <= 0.1 * EXTENT).all()
-    assert change(test_densify.make(scales, opacities), norms) == spared
+    assert change(populations.make(scales, opacities), norms) == spared
 
 
 def test_resets_go_on_but_for_the_last_iteration_that_counts():

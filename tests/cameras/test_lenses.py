@@ -23,6 +23,7 @@ from support.helpers import (
     rows,
     single,
 )
+from support.kernels import drain_kernels
 from support.lens_scenes import (
     LENSES,
     LensCase,
@@ -35,7 +36,6 @@ from support.lens_scenes import (
     points_at,
     points_near_the_end,
 )
-from test_composition import drain_kernels
 from test_reference_effects import camera_at_origin, gaussians_at, whitened_samples
 from test_reference_splatting import numeric_gradients
 

@@ -24,12 +24,12 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from conftest import TESTS
+from conftest import REPOSITORY
 
 import drgs  # noqa: F401  (registers the plugins)
 from drgs.core.arrays import from_host
 
-REFERENCES = TESTS / "references"
+REFERENCES = REPOSITORY / "tests" / "references"
 
 WIDTH, HEIGHT = 48, 32
 

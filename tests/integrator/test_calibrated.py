@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 from support.helpers import NEAR_THRESHOLD
 from support.lens_scenes import LENSES, points_at
+from support.sensors import PIXELS, camera_of, numbers, points_on_rays, project
 from support.views import VIEWS, View, image_of, pose, splats_before, tensors
-from test_camera import PIXELS, camera_of, numbers, points_on_rays, project
 
 from drgs.reference import effects
 from drgs.reference import splatting as reference

@@ -16,8 +16,8 @@ import pytest
 from conftest import REPOSITORY
 from scipy.spatial.transform import Rotation
 from support.helpers import assert_arrays_agree, single
+from support.kernels import drain_kernels, float_reductions
 from support.views import VIEWS, Scene, clear, gradient, gradients_of, image_of, tensors
-from test_composition import drain_kernels, float_reductions
 
 import drgs  # noqa: F401  (registers the plugin)
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
@@ -812,8 +812,7 @@ def test_an_integrator_shows_the_shapes_of_the_scene_that_it_renders():
 
 KERNELS = """
 import json, sys
-import glob
-sys.path[:0] = ["tests", *glob.glob("tests/*")]
+sys.path.insert(0, "tests")
 blocked = {blocked!r}
 for name in blocked:
     sys.modules["drgs." + name] = None  # importing it raises ImportError
@@ -821,7 +820,7 @@ import drgs, drjit as dr, mitsuba as mi
 mi.set_variant("llvm_ad_rgb")
 from drgs.gaussians.parameters import PARAMETER_NAMES
 from support.helpers import FLOAT32, device_gaussians
-from test_composition import drain_kernels
+from support.kernels import drain_kernels
 from support.views import Scene
 
 scene = Scene(degree=3)

@@ -8,9 +8,9 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from support.helpers import NEAR_THRESHOLD, assert_arrays_agree
+from support.sensors import camera_of, numbers, points_on_rays
 from support.views import View as Perspective
 from support.views import image_of, pose, splats_before
-from test_camera import camera_of, numbers, points_on_rays
 
 from drgs.bench.scenes import bench_gaussians
 from drgs.cameras.camera import Pinhole, cameras_in_time

@@ -6,7 +6,7 @@ from dataclasses import replace
 import mitsuba as mi
 import numpy as np
 import pytest
-from conftest import PATHS
+from conftest import TESTS
 from support import small_fits as fits
 from support.views import VIEWS, Scene, tensors
 
@@ -319,7 +319,7 @@ def test_a_checkpoint_file_holds_the_state_of_effects(tmp_path):
 
 PLAIN = """
 import importlib.abc, json, sys
-sys.path[:0] = {tests!r}
+sys.path.insert(0, {tests!r})
 
 class Blocked(importlib.abc.MetaPathFinder):
     def find_spec(self, name, path=None, target=None):
@@ -368,7 +368,7 @@ def in_a_new_process(run_python, blocked=(), **changes) -> dict:
     """Raises RuntimeError with the process's last line of error."""
     modules = [f"drgs.{name}" for name in MODULES]
     program = PLAIN.format(
-        tests=PATHS,
+        tests=TESTS,
         blocked=[f"drgs.{name}" for name in blocked],
         changes={key.replace("__", "."): value for key, value in changes.items()},
         modules=modules,
@@ -403,7 +403,7 @@ def test_what_is_gone_is_missed_when_it_is_called_for(run_python, changes, modul
 
 IMPORTS = """
 import json, sys
-sys.path[:0] = {tests!r}
+sys.path.insert(0, {tests!r})
 import drgs, mitsuba as mi, numpy as np
 mi.set_variant("llvm_ad_rgb")
 from dataclasses import replace
@@ -459,7 +459,7 @@ print(json.dumps(found))
 def test_each_effect_imports_its_own_modules(run_python, tmp_path):
     """In this order, what comes later knows what came before."""
     program = IMPORTS.format(
-        tests=PATHS,
+        tests=TESTS,
         modules=[f"drgs.{name}" for name in MODULES],
         ply=str(tmp_path / "blobs.ply"),
     )

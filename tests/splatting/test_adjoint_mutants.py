@@ -2,14 +2,14 @@
 
 Every partial derivative in the source of the adjoints and tangents is scaled by 1.01 and, on its
 own, changes its sign; every decision that they replay is dropped, or taken the other way where
-two numbers are equal. ``mutants`` makes the mutants. The detectors are tests of the suite, run on
+two numbers are equal. ``mutants`` makes the mutants. The detectors are checks of the suite, run on
 small scenes in double precision: each mutant must be noticed by one of them. Those for hard cases
 are asked about the mutants that the others do not notice.
 
 Where Dr.Jit differentiates (projection, spherical harmonics), mutants are what it is given and
 what it returns.
 
-``pytest -s`` shows who noticed what.
+``pytest -m slow -n 0 -s`` shows who noticed what.
 """
 
 from __future__ import annotations
@@ -21,11 +21,8 @@ from functools import cache, partial
 import drjit as dr
 import numpy as np
 import pytest
-import test_losses
-import test_rasterize
-import test_rendering
 from drjit.llvm.ad import Float64
-from support import helpers
+from support import compositing_checks, helpers, loss_checks, rendering_checks
 from support.detectors import MutationChecks, detectors, find_noticed
 from support.helpers import (
     FLOAT64,
@@ -85,7 +82,7 @@ def _mixed_scene(seed, width, height, degree, count):
 CASE = Case("mutants", 18, 9, 1, count=10, recipe=_mixed_scene)
 
 
-class _EqualsThresholds(test_rasterize.FlatScene):
+class _EqualsThresholds(compositing_checks.FlatScene):
     """Splats whose opacity is the cut itself are not culled."""
 
     @property
@@ -95,7 +92,7 @@ class _EqualsThresholds(test_rasterize.FlatScene):
 
 def _scene_at_thresholds() -> _EqualsThresholds:
     """In the middle pixel alpha equals the cut, then the clamp, and T the stop: 3/4 3/8 3/4."""
-    scene = test_rasterize.stack([0.25, 0.5, 0.25, 0.25], 3, 1, 2.0)
+    scene = compositing_checks.stack([0.25, 0.5, 0.25, 0.25], 3, 1, 2.0)
     cutoffs = Cutoffs(**{name.lower(): value for name, value in THRESHOLDS.items()})
     return _EqualsThresholds(**{**vars(scene), "cutoffs": cutoffs})
 
@@ -103,9 +100,9 @@ def _scene_at_thresholds() -> _EqualsThresholds:
 THRESHOLDS = {"ALPHA_CUT": 0.25, "ALPHA_MAX": 0.5, "TRANSMITTANCE_STOP": 0.75 * 0.5 * 0.75}
 
 
-def _flat_scene() -> test_rasterize.FlatScene:
+def _flat_scene() -> compositing_checks.FlatScene:
     """One splat's opacity is zero."""
-    scene = test_rasterize.random_flat_scene(13, 11, 12, 4, opaque=True)
+    scene = compositing_checks.random_flat_scene(13, 11, 12, 4, opaque=True)
     return replace(scene, opacities=scene.opacities * (np.arange(12) != 5))
 
 
@@ -134,20 +131,20 @@ def _check_row_that_is_not_finite(case):
 @cache
 def _loss_and_gradient(height, width, weight):
     """Of the naive formula, the gradient by central differences: two images, loss, gradient."""
-    x, y = test_losses.images(height, width, seed=1)
+    x, y = loss_checks.images(height, width, seed=1)
     gradient, step = np.empty_like(x), 1e-5
     assert np.abs(x - y).min() > step  # |x - y| has a kink
     for index in np.ndindex(x.shape):
         moved = np.zeros_like(x)
         moved[index] = step
-        ends = [test_losses.reference(x + sign * moved, y, weight) for sign in (1, -1)]
+        ends = [loss_checks.reference(x + sign * moved, y, weight) for sign in (1, -1)]
         gradient[index] = (ends[0] - ends[1]) / (2 * step)
-    return x, y, test_losses.reference(x, y, weight), gradient
+    return x, y, loss_checks.reference(x, y, weight), gradient
 
 
 def _check_loss_and_gradient():
     x, y, expected_loss, expected_gradient = _loss_and_gradient(9, 3, 0.2)
-    loss, gradient = test_losses.value_and_gradient(x, y, 0.2)
+    loss, gradient = loss_checks.value_and_gradient(x, y, 0.2)
     # As in test_losses.
     assert loss == pytest.approx(expected_loss, rel=1e-12)
     np.testing.assert_allclose(gradient, expected_gradient, rtol=1e-5, atol=2e-11)
@@ -161,34 +158,34 @@ def _check_loss_and_gradient():
 def _detectors(at_thresholds):
     """Those that see all partials; and those for hard cases, for what the former do not notice."""
     case, flat, equal = clear(CASE), _flat_scene(), _scene_at_thresholds()
-    chain, stage, loss = test_rendering, test_rasterize, test_losses
+    chain, stage, loss = rendering_checks, compositing_checks, loss_checks
 
     general = {
-        "gradients": partial(chain.test_gradients_equal_the_reference, FLOAT64, case),
-        "transpose": partial(chain.test_adjoint_is_the_transpose_of_the_tangent, FLOAT64, case),
+        "gradients": partial(chain.check_gradients_equal_the_reference, FLOAT64, case),
+        "transpose": partial(chain.check_adjoint_is_the_transpose_of_the_tangent, FLOAT64, case),
         "tangents": partial(
-            chain.test_tangent_equals_central_differences_of_the_reference, FLOAT64, case
+            chain.check_tangent_equals_central_differences_of_the_reference, FLOAT64, case
         ),
         "camera gradients": partial(
-            chain.test_camera_gradients_of_two_frames_equal_differences_of_the_reference, case
+            chain.check_camera_gradients_of_two_frames_equal_differences_of_the_reference, case
         ),
         "camera tangents": partial(
-            chain.test_camera_tangents_of_two_frames_equal_differences_of_the_reference, case
+            chain.check_camera_tangents_of_two_frames_equal_differences_of_the_reference, case
         ),
         "loss": _check_loss_and_gradient,
     }
     special = {
         "not finite": partial(_check_row_that_is_not_finite, case),
-        "zero opacity": partial(stage.test_gradients_equal_the_reference, FLOAT64, flat),
+        "zero opacity": partial(stage.check_gradients_equal_the_reference, FLOAT64, flat),
         "thresholds": at_thresholds(
-            partial(stage.test_gradients_equal_the_reference, FLOAT64, equal)
+            partial(stage.check_gradients_equal_the_reference, FLOAT64, equal)
         ),
         "thresholds transpose": at_thresholds(
-            partial(stage.test_adjoint_is_the_transpose_of_the_tangent, FLOAT64, equal)
+            partial(stage.check_adjoint_is_the_transpose_of_the_tangent, FLOAT64, equal)
         ),
-        "loss transpose": loss.test_gradient_is_the_transpose_of_the_tangent,
-        "loss at equality": loss.test_l1_gradient_is_the_sign_and_zero_at_equality,
-        "loss overexposed": loss.test_overexposed_images_do_not_blow_up_the_gradient,
+        "loss transpose": loss.check_gradient_is_the_transpose_of_the_tangent,
+        "loss at equality": loss.check_l1_gradient_is_the_sign_and_zero_at_equality,
+        "loss overexposed": loss.check_overexposed_images_do_not_blow_up_the_gradient,
     }
     return detectors(general), detectors(special)
 
@@ -249,17 +246,18 @@ def outcome():
     with pytest.MonkeyPatch.context() as patch:
         for module, names, copy in (
             (rendering, CHAIN, chain),
-            (test_rasterize, STAGES, stages),
+            (compositing_checks, STAGES, stages),
             (rendering, STAGES, stages),
-            (test_losses, ("PhotometricLoss", "l1_loss"), loss),
+            (loss_checks, ("PhotometricLoss", "l1_loss"), loss),
         ):
             for name in names:
                 patch.setattr(module, name, copy[name])
         # The forward pass is the same for all mutants.
-        for module in (helpers, test_rendering):
+        for module in (helpers, rendering_checks):
             patch.setattr(module, "render", cache(helpers.render))
         for name in ("kernel_gradients", "kernel_tangent"):
-            patch.setattr(test_rendering, name, _remembered(board, getattr(test_rendering, name)))
+            function = getattr(rendering_checks, name)
+            patch.setattr(rendering_checks, name, _remembered(board, function))
         general, special = _detectors(at_thresholds)
         result = find_noticed(board, general, special)
     return result

@@ -1,15 +1,24 @@
 """Compositing, its adjoint and its tangent against the float64 reference, stage alone."""
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 
 import drjit as dr
 import numpy as np
 import pytest
+from support.compositing_checks import (
+    GRADIENTS,
+    as_arrays,
+    check_adjoint_is_the_transpose_of_the_tangent,
+    check_gradients_equal_the_reference,
+    kernel_tangents,
+    random_flat_scene,
+    random_tangents,
+    stack,
+)
 from support.helpers import (
     FLOAT32,
     FLOAT64,
-    NEAR_THRESHOLD,
     assert_arrays_agree,
     both_precisions,
     relative_errors,
@@ -21,17 +30,10 @@ from drgs.core.constants import WHITENING_SCALE
 from drgs.reference import splatting as reference
 from drgs.splatting import image_model, rasterize
 from drgs.splatting import lanes as lanes_module
-from drgs.splatting.cutoffs import Cutoffs
 from drgs.splatting.grid import MICROS, TileGrid
-from drgs.splatting.image_model import ImageModel
-from drgs.splatting.projection import Splats2D
 from drgs.splatting.rasterize import (
-    SplatGradients,
-    composite,
     composite_adjoint,
-    composite_tangent,
 )
-from drgs.splatting.tiles import bin_splats
 
 # float64: some hundred terms of the size of the result. float32: an exponent of up to 8 carries
 # 1e-6, so alpha 1e-6 and a pixel a few of them; measured 1e-6. In the adjoint, S is the
@@ -39,181 +41,6 @@ from drgs.splatting.tiles import bin_splats
 # 1 - a >= 0.01: behind an opaque splat a pixel may be off by 1e-5, and a derivative sums pixels
 # of both signs. Measured: 3e-15 and 5e-6.
 PLANES = {FLOAT64: 1e-12, FLOAT32: 1e-5}
-GRADIENTS = {FLOAT64: 1e-12, FLOAT32: 5e-5}
-
-
-@dataclass(frozen=True)
-class FlatScene:
-    """Splats on the film: the same numbers for both sides, representable in float32."""
-
-    means2d: np.ndarray  # (N, 2) px
-    whitening: np.ndarray  # (N, 3) p, r, s of U
-    opacities: np.ndarray  # (N,)
-    features: np.ndarray  # (N, C)
-    depths: np.ndarray  # (N,)
-    width: int
-    height: int
-    cutoffs: Cutoffs = field(default_factory=Cutoffs)
-
-    @property
-    def conics(self) -> np.ndarray:
-        """(N, 2, 2): U^T U."""
-        p, r, s = self.whitening.T
-        return np.moveaxis(np.array([[p * p, p * r], [p * r, r * r + s * s]]), -1, 0)
-
-    @property
-    def visible(self) -> np.ndarray:
-        return self.opacities > reference.ALPHA_CUT
-
-    def colors(self, group) -> np.ndarray:
-        """Features 3 group, 3 group + 1, ... as three colours, zero beyond the last."""
-        padded = np.pad(self.features, ((0, 0), (0, 2)))[:, 3 * group : 3 * group + 3]
-        return np.pad(padded, ((0, 0), (0, 3 - padded.shape[1])))
-
-    def reference_arguments(self, group=0) -> dict:
-        return {
-            "means2d": self.means2d, "conics": self.conics, "opacities": self.opacities,
-            "colors": self.colors(group), "depths": self.depths, "visible": self.visible,
-            "background": np.zeros(3), "width": self.width, "height": self.height,
-        }  # fmt: skip
-
-    @property
-    def num_groups(self) -> int:
-        return -(-self.features.shape[1] // 3)
-
-    def reference_planes(self) -> dict[str, np.ndarray]:
-        """transmittance (H, W) and features (H, W, C)."""
-        pictures = [
-            reference.composite(**self.reference_arguments(g)) for g in range(self.num_groups)
-        ]
-        images = np.concatenate([picture.image for picture in pictures], axis=-1)
-        return {
-            "transmittance": pictures[0].transmittance,
-            "features": images[..., : self.features.shape[1]],
-        }
-
-    def reference_gradients(self, d_features, d_transmittance) -> dict[str, np.ndarray]:
-        """Under the names of ``SplatGradients``. The loss is linear: groups of features add up."""
-        total: dict[str, np.ndarray] = {}
-        d_colors = []
-        for group in range(self.num_groups):
-            d_image = d_features[..., 3 * group : 3 * group + 3]
-            d_image = np.pad(d_image, ((0, 0), (0, 0), (0, 3 - d_image.shape[-1])))
-            d_alpha = -d_transmittance if group == 0 else None
-            part = reference.composite_gradients(
-                **self.reference_arguments(group), d_image=d_image, d_alpha=d_alpha
-            )
-            d_colors.append(part["colors"])
-            for name in ("means2d", "conics", "opacities"):
-                total[name] = total.get(name, 0) + part[name]
-        p, r, s = self.whitening.T
-        G = total.pop("conics")
-        # A = U^T U and dL = sum_ij G_ij dA_ij, G symmetric: dL/dU = 2 U G.
-        total["whitening"] = 2 * np.column_stack(
-            [p * G[:, 0, 0] + r * G[:, 0, 1], p * G[:, 0, 1] + r * G[:, 1, 1], s * G[:, 1, 1]]
-        )
-        total["features"] = np.concatenate(d_colors, axis=-1)[:, : self.features.shape[1]]
-        return total
-
-    def near_threshold(self) -> np.ndarray:
-        picture = reference.composite(**self.reference_arguments(), threshold_width=NEAR_THRESHOLD)
-        return picture.near_threshold
-
-    def num_stopped(self) -> int:
-        """Pixels that are finished before the last splat that reaches them."""
-        _, stops = reference._composite_and_stops(
-            **self.reference_arguments(), threshold_width=NEAR_THRESHOLD
-        )
-        return int((stops < self.visible.sum()).sum())
-
-    def num_clamped(self) -> int:
-        """(pixel, splat) pairs whose alpha is clamped."""
-        y, x = np.mgrid[: self.height, : self.width] + 0.5
-        d = np.stack([x, y], axis=-1) - self.means2d[:, None, None]
-        power = np.einsum("nhwi,nij,nhwj->nhw", d, self.conics, d)
-        alpha = self.opacities[:, None, None] * np.exp(-0.5 * power)
-        return int((alpha > reference.ALPHA_MAX).sum())
-
-    # The kernels' side
-
-    def splats(self, precision) -> Splats2D:
-        determinants = np.linalg.det(self.conics)
-        variances = np.column_stack([self.conics[:, 1, 1], self.conics[:, 0, 0]])
-        return Splats2D(
-            means2d=precision.vectors(self.means2d),
-            whitening=precision.vectors(self.whitening),
-            depths=precision.array(self.depths),
-            opacities=precision.array(self.opacities),
-            colors=precision.vectors(np.zeros((len(self.depths), 3))),
-            variances=precision.vectors(variances / determinants[:, None]),
-            visible=dr.llvm.ad.Bool(self.visible),
-        )
-
-    def composite(self, precision):
-        columns = [precision.array(column) for column in self.features.T]
-        grid, model = TileGrid(self.width, self.height), ImageModel(cutoffs=self.cutoffs)
-        bins = bin_splats(self.splats(precision), grid, columns, model)
-        records = rasterize.Records.of(bins, bins.splats)
-        return bins, records, composite(bins, records)
-
-    def as_images(self, planes) -> dict[str, np.ndarray]:
-        planes = [rows(plane).reshape(self.height, self.width) for plane in planes]
-        return {"transmittance": planes[0], "features": np.stack(planes[1:], axis=-1)}
-
-    def kernel_planes(self, precision) -> dict[str, np.ndarray]:
-        return self.as_images(self.composite(precision)[2].planes())
-
-    def kernel_gradients(self, precision, d_features, d_transmittance) -> dict[str, np.ndarray]:
-        gradients = composite_adjoint(
-            *self.composite(precision),
-            [precision.array(plane) for plane in np.moveaxis(d_features, -1, 0)],
-            precision.array(d_transmittance),
-        )
-        return as_arrays(gradients)
-
-    def random_cotangents(self, seed=0) -> tuple[np.ndarray, np.ndarray]:
-        rng = np.random.default_rng(seed)
-        shape = self.height, self.width
-        return (
-            single(rng.normal(0, 1, (*shape, self.features.shape[1]))),
-            single(rng.normal(0, 1, shape)),
-        )
-
-
-def as_arrays(gradients: SplatGradients) -> dict[str, np.ndarray]:
-    return {
-        "means2d": rows(gradients.means2d),
-        "whitening": rows(gradients.whitening),
-        "opacities": rows(gradients.opacities),
-        "features": np.stack([rows(column) for column in gradients.features], axis=-1),
-    }
-
-
-def random_flat_scene(width, height, count, num_features=3, opaque=False, seed=0) -> FlatScene:
-    """No pixel is near a threshold: seeds are tried until that holds."""
-    for attempt in range(200):
-        rng = np.random.default_rng([seed, attempt])
-        extent = max(width, height)
-        smallest, largest = (0.1 * extent, 0.5 * extent) if opaque else (0.55, 0.2 * extent + 2)
-        sigma = np.exp(rng.uniform(np.log(smallest), np.log(largest), count))
-        p = 1 / sigma
-        s = 1 / (0.55 + (sigma - 0.55) * rng.uniform(0.1, 1, count))
-        logits = rng.normal(0, 1.5, count)
-        if opaque:
-            logits = rng.uniform(1, 4, count)
-            logits[::3] = 8.0
-        scene = FlatScene(
-            means2d=single(rng.uniform(-0.1, 1.1, (count, 2)) * [width, height]),
-            whitening=single(np.column_stack([p, s * rng.normal(0, 0.7, count), s])),
-            opacities=single(1 / (1 + np.exp(-logits))),
-            features=single(rng.normal(0.5, 0.5, (count, num_features))),
-            depths=single(rng.uniform(1, 4, count)),
-            width=width,
-            height=height,
-        )
-        if not scene.near_threshold().any():
-            return scene
-    raise AssertionError("no clear seed among 200")
 
 
 SCENES = {
@@ -225,6 +52,8 @@ SCENES = {
     "opaque": random_flat_scene(37, 29, 70, 3, opaque=True),
     "one splat": random_flat_scene(20, 20, 1, 3, seed=2),
 }
+
+
 all_scenes = pytest.mark.parametrize("scene", SCENES.values(), ids=SCENES)
 
 
@@ -252,14 +81,7 @@ def test_planes_equal_the_reference(precision, scene):
 @both_precisions
 @all_scenes
 def test_gradients_equal_the_reference(precision, scene):
-    cotangents = scene.random_cotangents()
-    actual = scene.kernel_gradients(precision, *cotangents)
-    expected = scene.reference_gradients(*cotangents)
-    assert_arrays_agree(actual, expected, GRADIENTS[precision])
-    for name in actual:
-        with pytest.raises(AssertionError, match=rf"{name}\["):
-            scaled = {**actual, name: 1.01 * actual[name]}
-            assert_arrays_agree(scaled, expected, GRADIENTS[precision])
+    check_gradients_equal_the_reference(precision, scene)
 
 
 @both_precisions
@@ -270,29 +92,6 @@ def test_transmittance_alone_has_the_right_gradients(precision):
     actual = scene.kernel_gradients(precision, *cotangents)
     assert not actual["features"].any()
     assert_arrays_agree(actual, scene.reference_gradients(*cotangents), GRADIENTS[precision])
-
-
-def random_tangents(scene, seed=5) -> dict[str, np.ndarray]:
-    rng = np.random.default_rng(seed)
-    names = ("means2d", "whitening", "opacities", "features")
-    # A direction that moves a splat of any size by a like part of itself.
-    size = {"whitening": scene.whitening[:, :1], "opacities": scene.opacities}
-    return {
-        name: single(rng.normal(0, 1, getattr(scene, name).shape) * size.get(name, 1.0))
-        for name in names
-    }
-
-
-def kernel_tangents(scene, precision, tangents) -> dict[str, np.ndarray]:
-    direction = SplatGradients(
-        [
-            *precision.vectors(tangents["means2d"]),
-            *precision.vectors(tangents["whitening"]),
-            precision.array(tangents["opacities"]),
-        ],
-        [precision.array(column) for column in tangents["features"].T],
-    )
-    return scene.as_images(composite_tangent(*scene.composite(precision), direction).planes())
 
 
 @both_precisions
@@ -316,37 +115,12 @@ def test_tangents_equal_central_differences_of_the_reference(precision, scene):
 @both_precisions
 @all_scenes
 def test_adjoint_is_the_transpose_of_the_tangent(precision, scene):
-    tangents = random_tangents(scene)
-    d_features, d_transmittance = scene.random_cotangents(3)
-    images = kernel_tangents(scene, precision, tangents)
-    gradients = scene.kernel_gradients(precision, d_features, d_transmittance)
-    pixels = [d_features * images["features"], d_transmittance * images["transmittance"]]
-    splats = [gradients[name] * tangents[name] for name in tangents]
-    left, right = (sum(term.sum() for term in terms) for terms in (pixels, splats))
-    size = math.sqrt(sum((term**2).sum() for term in [*pixels, *splats]))
-    # Relative to the root of the sum of squares: the sum itself may cancel.
-    tolerance = GRADIENTS[precision]
-    assert abs(left - right) <= tolerance * size
-    assert not abs(left - 1.01 * right) <= tolerance * size
+    check_adjoint_is_the_transpose_of_the_tangent(precision, scene)
 
 
 # ----------------------------------------------------------------------------------------------
 # Decisions
 # ----------------------------------------------------------------------------------------------
-
-
-def stack(opacities, width=1, height=1, sigma=10.0, offset=(0.0, 0.0)) -> FlatScene:
-    """Splats behind each other on the film's centre, the nearest first, with features 1, 2, ..."""
-    n = len(opacities)
-    return FlatScene(
-        means2d=np.tile(np.array([width / 2, height / 2]) + offset, (n, 1)),
-        whitening=single(np.tile([1 / sigma, 0, 1 / sigma], (n, 1))),
-        opacities=single(opacities),
-        features=np.arange(1.0, n + 1)[:, None],
-        depths=np.arange(1.0, n + 1),
-        width=width,
-        height=height,
-    )
 
 
 @both_precisions

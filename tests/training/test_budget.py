@@ -8,7 +8,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from support.small_capture import make_dataset, write_dataset
-from test_trainer import make_trainer
+from support.trainers import make_trainer
 
 from drgs import fit
 from drgs.config.changes import changed

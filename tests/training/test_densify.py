@@ -6,6 +6,7 @@ import drjit as dr
 import numpy as np
 import pytest
 from drjit.llvm.ad import Array2f, Bool, Float, TensorXf, TensorXf64
+from support.populations import EXTENT, make, statistics
 
 from drgs.config.schema import DensifyConfig
 from drgs.core.errors import UserError
@@ -24,47 +25,13 @@ from drgs.training.densify import (
 )
 from drgs.training.optimizer import make_optimizer, num_rows
 
-EXTENT = 4.0
 EARLY, LATE = 600, 3100  # before and after the first opacity reset of the default schedule
+
+
 SMALL, LARGE, HUGE = 0.01, 0.2, 0.5  # world units: cloned, split, pruned after the first reset
+
+
 HIGH = 3e-4  # a mean gradient norm above the default threshold of 2e-4
-
-
-def logit(opacity):
-    return np.log(opacity / (1 - np.asarray(opacity, dtype=float)))
-
-
-def make(scales, opacities, sh_rows=3, tensor_type=TensorXf, seed=0):
-    """An optimizer that has made one step; scales: largest standard deviations, world units."""
-    random = np.random.default_rng(seed)
-    num = len(scales)
-    log_scales = np.log(np.asarray(scales, dtype=float))[:, None] - [0.0, 0.3, 0.7]
-    arrays = {
-        "means": random.standard_normal((num, 3)),
-        "quats": random.standard_normal((num, 4)),
-        "log_scales": random.permuted(log_scales, axis=1),
-        "logit_opacities": np.broadcast_to(logit(opacities), num),
-        "sh0": random.standard_normal((num, 1, 3)),
-        "shN": random.standard_normal((num, sh_rows, 3)),
-    }
-    flat_type = dr.array_t(tensor_type)
-    parameters = {
-        name: flat_type(a) if a.ndim == 1 else tensor_type(flat_type(a.ravel()), a.shape)
-        for name, a in arrays.items()
-    }
-    # Rates of 0: the step fills the moments and leaves the values where they are.
-    optimizer = make_optimizer(parameters, dict.fromkeys(PARAMETER_NAMES, 0.0))
-    for key, value in optimizer.items():
-        dr.set_grad(value, type(value)(random.standard_normal(value.shape) + 3))
-        assert key in PARAMETER_NAMES
-    optimizer.step()
-    return optimizer
-
-
-def statistics(gradient_norms, views=None):
-    norms = np.asarray(gradient_norms, dtype=np.float32)
-    views = np.full(len(norms), 4) if views is None else np.asarray(views)
-    return DensityStatistics(Float(norms * views), Float(views))
 
 
 def run(optimizer, gradient_norms, iteration=EARLY, seed=0, **config):
@@ -89,8 +56,6 @@ def moments(optimizer, name):
 
 
 # ---- statistics
-
-
 @pytest.mark.parametrize("as_tensor", [False, True])
 def test_statistics_are_gradient_norms_in_ndc_over_visible_views(as_tensor):
     width, height, num = 40, 26, 5
@@ -121,8 +86,6 @@ def test_invisible_gradients_are_ignored_even_if_they_are_nan():
 
 
 # ---- schedule
-
-
 @pytest.mark.parametrize("white", [False, True])
 def test_schedule_is_that_of_the_reference_training_loop(white):
     config = DensifyConfig(start=20, stop=200, every=10, reset_every=60, white_background_reset=20)
@@ -143,8 +106,6 @@ def test_extra_reset_can_be_off():
 
 
 # ---- single decisions
-
-
 def test_small_gaussian_is_cloned_in_place():
     optimizer = make([SMALL, SMALL], 0.5)
     before, (m, v) = values(optimizer), moments(optimizer, "means")
@@ -289,8 +250,6 @@ def test_statistics_of_another_population_are_refused():
 
 
 # ---- cap
-
-
 def test_cap_takes_the_largest_gradients_and_breaks_ties_by_index():
     optimizer = make([SMALL] * 6, 0.5)
     before = values(optimizer)["means"]
@@ -320,8 +279,6 @@ def test_full_population_only_shrinks():
 
 
 # ---- everything together
-
-
 def naive_decisions(norms, scales, opacities, large_is_pruned, config):
     """The rules, one Gaussian after the other: (kept, cloned, split) row numbers."""
     limit = config.prune_scale * EXTENT if large_is_pruned else math.inf
@@ -397,8 +354,6 @@ def test_equal_seeds_give_equal_bytes():
 
 
 # ---- opacity reset
-
-
 def test_reset_lowers_opacities_and_forgets_their_moments_only():
     config = DensifyConfig()
     optimizer = make([SMALL] * 3, [0.9, 0.01001, 0.007])

@@ -12,7 +12,7 @@ import pytest
 import yaml
 from support import small_fits as fits
 from support.small_capture import make_dataset, write_dataset
-from test_trainer import make_trainer
+from support.trainers import make_trainer
 
 from drgs import fit
 from drgs.gaussians.parameters import PARAMETER_NAMES

@@ -6,7 +6,7 @@ import drjit as dr
 import numpy as np
 import pytest
 from support.helpers import FLOAT32, FLOAT64, assert_arrays_agree, bitwise, both_precisions, single
-from test_composition import float_reductions
+from support.kernels import float_reductions
 
 from drgs.training import image_ops as pixels
 

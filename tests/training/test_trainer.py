@@ -6,11 +6,10 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from support.trainers import make_trainer, small_dataset, small_view
 
-from drgs.config.schema import FitConfig
 from drgs.data.images import smaller_view
 from drgs.data.initial import gaussians_from_points
-from drgs.data.types import Dataset, View
 from drgs.gaussians.parameters import PARAMETER_NAMES
 from drgs.training import densify
 
@@ -18,33 +17,6 @@ from drgs.training import densify
 @pytest.fixture(scope="module", autouse=True)
 def variant():
     mi.set_variant("llvm_ad_rgb")
-
-
-def small_view(name, angle):
-    """A 20x16 picture of random colours, from a circle of radius 3 in the plane z = 0."""
-    center = 3 * np.array([np.cos(angle), np.sin(angle), 0.0])
-    pose = np.eye(4)
-    forward = -center / 3
-    right = np.cross(forward, [0, 0, 1])
-    pose[:3, :3] = np.stack([right, np.cross(forward, right), forward], axis=1)
-    pose[:3, 3] = center
-    image = np.random.default_rng(int(10 * angle)).uniform(size=(16, 20, 3)).astype(np.float32)
-    return View(name, image, pose, 24.0, 24.0, 10.0, 8.0, 20, 16)
-
-
-def small_dataset():
-    views = tuple(small_view(f"v{i}", angle) for i, angle in enumerate((0.0, 1.0, 2.0, 4.0)))
-    return Dataset(views, views[:1], "test", (1.0, 1.0, 1.0), 1.0, "four random pictures")
-
-
-def make_trainer(**changes):
-    from drgs.training.trainer import Trainer
-
-    values = {"data": {"path": "."}, "iterations": 50, **changes}
-    config = FitConfig.model_validate(values)
-    points = np.random.default_rng(0).uniform(-0.5, 0.5, (40, 3))
-    gaussians = gaussians_from_points(points, None, 0.5, config.model.sh_degree)
-    return Trainer(config, small_dataset(), gaussians)
 
 
 def test_views_come_in_a_new_random_order_every_round():

@@ -1,0 +1,50 @@
+"""Populations of a few Gaussians for density control."""
+
+import drjit as dr
+import numpy as np
+from drjit.llvm.ad import Float, TensorXf
+
+from drgs.gaussians.parameters import PARAMETER_NAMES
+from drgs.training.densify import (
+    DensityStatistics,
+)
+from drgs.training.optimizer import make_optimizer
+
+EXTENT = 4.0
+
+
+def logit(opacity):
+    return np.log(opacity / (1 - np.asarray(opacity, dtype=float)))
+
+
+def make(scales, opacities, sh_rows=3, tensor_type=TensorXf, seed=0):
+    """An optimizer that has made one step; scales: largest standard deviations, world units."""
+    random = np.random.default_rng(seed)
+    num = len(scales)
+    log_scales = np.log(np.asarray(scales, dtype=float))[:, None] - [0.0, 0.3, 0.7]
+    arrays = {
+        "means": random.standard_normal((num, 3)),
+        "quats": random.standard_normal((num, 4)),
+        "log_scales": random.permuted(log_scales, axis=1),
+        "logit_opacities": np.broadcast_to(logit(opacities), num),
+        "sh0": random.standard_normal((num, 1, 3)),
+        "shN": random.standard_normal((num, sh_rows, 3)),
+    }
+    flat_type = dr.array_t(tensor_type)
+    parameters = {
+        name: flat_type(a) if a.ndim == 1 else tensor_type(flat_type(a.ravel()), a.shape)
+        for name, a in arrays.items()
+    }
+    # Rates of 0: the step fills the moments and leaves the values where they are.
+    optimizer = make_optimizer(parameters, dict.fromkeys(PARAMETER_NAMES, 0.0))
+    for key, value in optimizer.items():
+        dr.set_grad(value, type(value)(random.standard_normal(value.shape) + 3))
+        assert key in PARAMETER_NAMES
+    optimizer.step()
+    return optimizer
+
+
+def statistics(gradient_norms, views=None):
+    norms = np.asarray(gradient_norms, dtype=np.float32)
+    views = np.full(len(norms), 4) if views is None else np.asarray(views)
+    return DensityStatistics(Float(norms * views), Float(views))

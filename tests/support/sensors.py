@@ -1,0 +1,38 @@
+"""Mitsuba's sensors and the cameras that drgs makes of them."""
+
+import mitsuba as mi
+import numpy as np
+
+from drgs.cameras.camera import Camera
+from drgs.integrator.sensors import camera_from_sensor, read_sensor
+
+# px. A float32 direction is good to 1e-7, which over a focal length of 50 px is 5e-6 px; the ray's
+# origin adds as much at a distance of 1. Measured 8e-6.
+PIXELS = 5e-5
+
+
+def camera_of(sensor, near=0.01) -> Camera:
+    return camera_from_sensor(read_sensor(sensor, near))
+
+
+def numbers(camera) -> dict[str, np.ndarray]:
+    """Of a Dr.Jit camera in float64."""
+    names = ("rotation", "center", "focal", "principal", "near")
+    return {n: np.array(getattr(camera, n)).astype(np.float64)[..., 0] for n in names}
+
+
+def project(camera, points) -> np.ndarray:
+    """Film positions (N, 2) in px of world points (N, 3)."""
+    c = numbers(camera)
+    x, y, z = c["rotation"] @ (points - c["center"]).T
+    assert (z > 0).all(), "points that the sensor sees must lie before the camera"
+    return np.stack([x, y], axis=-1) / z[:, None] * c["focal"] + c["principal"]
+
+
+def points_on_rays(sensor) -> tuple[np.ndarray, np.ndarray]:
+    """Points (N, 3) on the sensor's rays, and the film positions (N, 2) in px of the rays."""
+    rng = np.random.default_rng(3)
+    sample = rng.uniform(size=(2, 200)).astype(np.float32)
+    ray, _ = sensor.sample_ray(0.0, 0.5, mi.Point2f(sample), mi.Point2f(0.5))
+    points = np.array(ray(mi.Float(rng.uniform(1, 8, 200)))).T.astype(np.float64)
+    return points, sample.T.astype(np.float64) * np.array(sensor.film().crop_size())
