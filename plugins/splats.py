@@ -137,28 +137,36 @@ class SplatsIntegrator(mi.CppADIntegrator):
 
      * - projection
        - |string|
-       - How a Gaussian comes to the film: ``ewa``, by the affine approximation at its mean;
-         ``unscented``, by the mean and covariance of projected sigma points; ``exact``, by its
-         peak along each pixel's ray. (Default: ``ewa``)
+       - How a Gaussian comes to the film. ``ewa``: by the affine approximation at its mean;
+         ``unscented``: by the mean and covariance of projected sigma points; ``exact``: by its peak
+         along each pixel's ray. (Default: ``ewa``)
 
      * - order
        - |string|
-       - ``center``: splats are composited in the order of their means' depths; ``pixel``: in
-         that of their peaks along each pixel's ray. (Default: ``center``)
+       - In which splats are composited. ``center``: by the depth of their means; ``pixel``: by that
+         of their peaks along each pixel's ray. (Default: ``center``)
 
      * - order_window
        - |int|
-       - Splats that a pixel keeps waiting to put them in order, for ``pixel``. (Default: 4)
+       - Splats that a pixel keeps waiting to put them in order, where ``order`` is ``pixel``.
+         (Default: 4)
 
      * - sh_direction
        - |string|
-       - ``mean``: colours are seen in the direction of the mean; ``pixel``: of each pixel's ray.
-         (Default: ``mean``)
+       - In which colours are seen. ``mean``: towards the mean of a Gaussian; ``pixel``: along each
+         pixel's ray. (Default: ``mean``)
 
-     * - alpha_max, alpha_cut, transmittance_stop
+     * - alpha_max
        - |float|
-       - Upper clamp of a splat's alpha; the alpha below which it ends; the transmittance below
-         which a pixel ends. The last two may be 0. (Default: 0.99, 1/255, 1e-4)
+       - Upper clamp of a splat's alpha. (Default: 0.99)
+
+     * - alpha_cut
+       - |float|
+       - Splats end where their alpha is smaller; 0: they do not. (Default: 1/255)
+
+     * - transmittance_stop
+       - |float|
+       - A pixel ends before its transmittance is smaller; 0: never. (Default: 1e-4)
 
      * - extent
        - |float|
@@ -166,12 +174,12 @@ class SplatsIntegrator(mi.CppADIntegrator):
 
      * - low_pass
        - |float|
-       - Variance that is added to each splat on the film, in square pixels. (Default: 0.3)
+       - Variance that is added to each splat on the film, in square pixels; 0: none. (Default: 0.3)
 
      * - antialiased
        - |bool|
-       - Scales opacities so that the low-pass filter keeps each splat's integral, as in
-         Mip-Splatting. (Default: |false|)
+       - Compensate opacities for the low-pass filter, so that it keeps each splat's integral
+         (Mip-Splatting, Yu et al. 2024). (Default: |false|)
 
      * - smoothing
        - |tensor|

@@ -102,7 +102,7 @@ class Approximations:
     ] = TRANSMITTANCE_STOP
     extent: Annotated[
         float,
-        "Standard deviations at which splats end, unless alpha_cut ends them before.",
+        "Standard deviations at which splats end.",
         Limits("positive", gt=0),
     ] = math.inf
     low_pass: Annotated[

@@ -153,7 +153,8 @@ def _as_field(declared: Declared) -> tuple[Any, Any]:
     if declared.unrounded is not None:
         default = declared.unrounded
     elif default == math.inf:
-        kind, default, description = kind | None, None, f"{description} null: nowhere else."
+        kind, default = kind | None, None
+        description = f"{description} null: where alpha_cut ends them."
     limits = declared.limits.finite if declared.limits else {}
     return kind, Field(default, description=description, **limits)
 

@@ -14,8 +14,8 @@ import drjit as dr
 import mitsuba as mi
 
 from drgs.core.errors import PluginError
-from drgs.integrator.film import Channels, PixelPositions
-from drgs.splatting.image_model import PixelCenters
+from drgs.integrator.film import Channels
+from drgs.splatting.image_model import PixelCenters, Positions
 
 
 @dataclass(frozen=True)
@@ -34,9 +34,7 @@ class SideBySide:
             raise PluginError("splats: the film of a batch sensor must not have a crop window")
         return SideBySide(sensors, film.size()[0] // len(sensors), film.size()[1])
 
-    def positions(
-        self, positions: Sequence[PixelPositions], index: int
-    ) -> tuple[PixelPositions, ...]:
+    def positions(self, positions: Sequence[Positions], index: int) -> tuple[Positions, ...]:
         """Where the pixels of one picture are evaluated, by sample."""
         return tuple(
             p

@@ -16,9 +16,7 @@ import numpy as np
 
 from drgs.core.arrays import from_host, interleave
 from drgs.core.errors import UnsupportedError
-from drgs.splatting.image_model import PixelCenters
-from drgs.splatting.lanes import Lanes
-from drgs.splatting.tiles import TileGrid
+from drgs.splatting.image_model import PixelCenters, Positions
 
 Channels = list[Any]
 """What a film gets of one pass, each Float (H * W,): red, green, blue, perhaps alpha, then what the
@@ -44,19 +42,10 @@ def pixel_corners(film: mi.Film) -> mi.Point2f:
     return mi.Point2f(pixel - row * width, row)
 
 
-class PixelPositions(Protocol):
-    """Where in the pixels one pass evaluates them: ``PixelCenters`` or ``SamplePoints``."""
-
-    margin: float  # px: how far from its centre a pixel may be evaluated
-
-    def bind(self, lanes: Lanes, grid: TileGrid) -> PixelPositions:
-        """For the lanes of one kernel."""
-
-
 class FilmSamples(Protocol):
     """The samples of a picture."""
 
-    positions: Sequence[PixelPositions]  # by sample
+    positions: Sequence[Positions]  # by sample
     within: Sequence[tuple[Any, Any]]  # the same: x and y from the pixels' upper left corners, px
     key: Hashable  # equal for equal positions; None: pixel centres
 

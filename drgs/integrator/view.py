@@ -20,10 +20,11 @@ from drgs.cameras.camera import Camera, cameras_in_time
 from drgs.effects.compose import composed, ignoring
 from drgs.gaussians.parameters import Gaussians
 from drgs.integrator.cache import Rendered, TracedSurfaces
-from drgs.integrator.film import Channels, PixelPositions
+from drgs.integrator.film import Channels
 from drgs.integrator.sensors import SensorState, camera_from_sensor, read_sensor
 from drgs.integrator.settings import SplatsSettings
 from drgs.splatting import rendering
+from drgs.splatting.image_model import Positions
 
 if TYPE_CHECKING:  # imported where a scene calls for them
     from drgs.integrator.background import Background
@@ -44,7 +45,7 @@ class View:
     scene: mi.Scene
     index: int  # of the view, in the integrator's memory
     sensor: mi.Sensor
-    positions: Sequence[PixelPositions]  # by sample
+    positions: Sequence[Positions]  # by sample
     within: Sequence[tuple[Any, Any]]  # the same, px from the pixels' upper left corners
     key: Hashable  # of these: see drgs.integrator.film.FilmSamples
     has_alpha: bool
@@ -263,7 +264,7 @@ def _render(
     gaussians: Gaussians,
     camera: Camera,
     pipeline: rendering.Pipeline,
-    positions: Sequence[PixelPositions],
+    positions: Sequence[Positions],
     surfaces: Sequence[SeenSurface] | None,
 ) -> list[rendering.Frame]:
     """A frame for each sample per pixel; surfaces: what is seen of them at each."""

@@ -1,0 +1,68 @@
+"""The approximations are declared once, and whoever lists them agrees with that."""
+
+import re
+
+import annotated_types
+import mitsuba as mi
+import pytest
+from conftest import REPOSITORY
+
+from drgs.config.approximations import DECLARED, Approximations
+from drgs.config.load import load_config
+from drgs.config.schema import ModelConfig
+from drgs.core.errors import UserError
+
+KINDS = {bool: "|bool|", int: "|int|", float: "|float|", str: "|string|"}
+
+
+@pytest.fixture(autouse=True)
+def variant():
+    mi.set_variant("llvm_ad_rgb")
+
+
+def row(name) -> str:
+    """Of the plugin's table: the property ``name``, its kind and its text, without line breaks."""
+    documentation = (REPOSITORY / "plugins" / "splats.py").read_text()
+    (found,) = re.findall(rf"     \* - {name}\n(.*?)\n\n", documentation, re.DOTALL)
+    return " ".join(found.split())
+
+
+@pytest.mark.parametrize("name", DECLARED)
+def test_the_plugin_documents_what_is_declared(name):
+    declared = DECLARED[name]
+    text = row(name).replace("``", "")
+    assert text.startswith(f"- {KINDS[declared.kind]} - {declared.description} (Default: ")
+    for word in declared.words:
+        assert f"``{word}``:" in row(name)
+
+
+@pytest.mark.parametrize("name", DECLARED)
+def test_the_configuration_has_what_is_declared(name):
+    field, declared = ModelConfig.model_fields[name], DECLARED[name]
+    assert field.description.startswith(declared.description)
+    assert ModelConfig().approximations == Approximations()
+    limits = declared.limits.finite if declared.limits else {}
+    assert field.metadata == [getattr(annotated_types, k.title())(v) for k, v in limits.items()]
+
+
+def test_every_annotation_is_read():
+    assert list(DECLARED) == list(Approximations.__dataclass_fields__)
+    assert DECLARED["projection"].words == ("ewa", "unscented", "exact")
+    assert DECLARED["order_window"].kind is int and DECLARED["antialiased"].kind is bool
+    assert DECLARED["extent"].limits.finite == {"gt": 0}
+
+
+def test_a_default_that_is_not_rounded_is_the_default():
+    """A configuration writes 0.99 for the float32 next to it."""
+    written = ModelConfig(alpha_max=0.99, alpha_cut=1 / 255, extent=None)
+    assert written.approximations == Approximations()
+    assert written.approximations.others_than_default == {}
+    chosen = ModelConfig(alpha_max=0.98, extent=3.0).approximations
+    assert chosen.others_than_default == {"alpha_max": 0.98, "extent": 3.0}
+
+
+def test_a_configuration_is_refused_that_single_precision_rounds_onto_a_limit(tmp_path):
+    path = tmp_path / "x.yml"
+    path.write_text("data: {path: lego}\nmodel: {alpha_max: 0.999999999}\n")
+    with pytest.raises(UserError, match=r"model.alpha_max must be above 0 and below 1 in float32"):
+        load_config(path)
