@@ -1,12 +1,52 @@
-"""3D Gaussian splatting inside Mitsuba 3: a rasterizer in Dr.Jit with a hand-written adjoint."""
+"""3D Gaussian splatting inside Mitsuba 3: a rasterizer in Dr.Jit with a hand-written adjoint.
+
+>>> import drgs
+>>> dataset = drgs.load_dataset("data/lego", image_size=400)
+>>> fitted = drgs.train("scenes/lego.yml", dataset)
+>>> fitted.gaussians.save("lego.ply")
+>>> picture, alpha, _ = drgs.rasterization(means, quats, scales, opacities, colors, ...)
+
+:class:`Gaussians`: a scene, from and to PLY files and numpy arrays; :func:`load_dataset`:
+photographs with their cameras; :func:`train`: fits Gaussians to them; :func:`rasterization`:
+differentiable pictures, with gsplat's names and conventions.
+
+Importing ``drgs`` registers Mitsuba's plugins ``splats`` and ``calibrated`` for the active variant
+and for every later one; these names are imported when they are first used.
+"""
+
+from __future__ import annotations
+
+import importlib
 
 from drgs import _registration
 from drgs.core import llvm
 
 __version__ = "0.1.0"
 
+__all__ = ["Gaussians", "load_dataset", "rasterization", "train"]
+
 # Dr.Jit loads its libLLVM while it is being imported: this comes before anything that does.
 llvm.select_newest_llvm()
 llvm.check_llvm_variants()
 _registration.map_sibling_plugins()
 _registration.register_plugins()
+
+_MODULES = {
+    "Gaussians": "drgs.gaussians.parameters",
+    "load_dataset": "drgs.data",
+    "rasterization": "drgs.rasterizing",
+    "train": "drgs.training.loop",
+}
+
+
+def __getattr__(name: str) -> object:
+    """The public names, imported when they are first used."""
+    if name not in _MODULES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value = globals()[name] = getattr(importlib.import_module(_MODULES[name]), name)
+    return value
+
+
+def __dir__() -> list[str]:
+    """What is there already, and what is imported when it is used."""
+    return sorted({*globals(), *__all__})

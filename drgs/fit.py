@@ -34,7 +34,7 @@ import numpy as np
 
 import drgs
 from drgs.cli.errors import exit_on_user_error
-from drgs.cli.execution import add_options, execution
+from drgs.cli.execution import add_options, executing
 from drgs.cli.interrupts import INTERRUPTED_STATUS, StopRequest
 from drgs.cli.progress import FitProgress
 from drgs.config.load import dump_config, load_config
@@ -94,7 +94,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Entry point of the command."""
     started = time.perf_counter()
     args = _parse(arguments)
-    with exit_on_user_error(), execution(args.threads, args.debug) as check_ranges:
+    with exit_on_user_error(), executing(args.threads, args.debug) as check_ranges:
         if args.resume is not None:
             config, out = load_run_config(args.resume), args.resume
         else:

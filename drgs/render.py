@@ -29,7 +29,7 @@ import mitsuba as mi
 import numpy as np
 
 from drgs.cli.errors import exit_on_user_error
-from drgs.cli.execution import add_options, execution
+from drgs.cli.execution import add_options, executing
 from drgs.config.load import load_config
 from drgs.config.schema import NAMED_COLORS, DataConfig, FitConfig, ModelConfig
 from drgs.core.constants import SHUTTER_SAMPLES
@@ -111,7 +111,7 @@ class Model:
 def main(arguments: Sequence[str] | None = None) -> None:
     """Entry point of the command."""
     args = _parse(arguments)
-    with exit_on_user_error(), execution(args.threads, args.debug):
+    with exit_on_user_error(), executing(args.threads, args.debug):
         _check(args)
         mi.set_variant(args.variant)
         if args.what.suffix == ".xml":
@@ -121,7 +121,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             if args.orbit is not None:
                 render_orbit(model, args)
             elif args.camera is not None or args.origin is not None:
-                for _ in render_cameras(model, cameras(args, model), args.out):
+                for _ in render_cameras(model, viewpoints_of(args, model), args.out):
                     pass
             else:
                 render_split(model, args.split or "test", args.out)
@@ -220,7 +220,7 @@ def render_cameras(
         yield image
 
 
-def cameras(args: argparse.Namespace, model: Model) -> list[Viewpoint]:
+def viewpoints_of(args: argparse.Namespace, model: Model) -> list[Viewpoint]:
     """The cameras of ``--camera``, or the one of ``--origin``."""
     size = tuple(args.size) if args.size else None
     if args.camera is not None:

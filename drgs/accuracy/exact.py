@@ -83,7 +83,7 @@ LARGEST_EXPONENT = 1e4
 """2^-1e4 is 0 in either precision."""
 
 
-def exact(rows: GaussianRows, camera: Camera, position: Any, low_pass: float) -> FilmShape:
+def exact_shape(rows: GaussianRows, camera: Camera, position: Any, low_pass: float) -> FilmShape:
     """The shape that :class:`RayResponse` evaluates; the slopes of its Jacobian are not clamped.
 
     Its whitening is U / a_c, and ``ray`` holds g / |a_c|, h, and 1 / |a_c|. Not differentiated:
@@ -157,8 +157,8 @@ class RayFootprint(Footprint):
 class RayResponse(AffineResponse):
     """alpha = o exp(-rho^2 / 2), with rho^2 the smallest along the pixel's ray.
 
-    Geometry: that of :class:`AffineResponse`, then g (2), h; all as :func:`exact` gives them, U
-    and h scaled to base 2.
+    Geometry: that of :class:`AffineResponse`, then g (2), h; all as :func:`exact_shape` gives
+    them, U and h scaled to base 2.
     """
 
     num_geometry: ClassVar[int] = 9

@@ -28,13 +28,13 @@ def pipeline_of(approximations: Approximations, sh_degree: int, **others: Any) -
     model = DEFAULT if cutoffs == Cutoffs() else ImageModel(cutoffs=cutoffs)
     shape, order, color = ewa, CenterOrder(), color_at_mean
     if approximations.projection == "exact":
-        from drgs.accuracy.exact import RayResponse, exact
+        from drgs.accuracy.exact import RayResponse, exact_shape
 
-        shape, model = exact, replace(model, response=RayResponse())
+        shape, model = exact_shape, replace(model, response=RayResponse())
     elif approximations.projection == "unscented":
-        from drgs.accuracy.unscented import unscented
+        from drgs.accuracy.unscented import unscented_shape
 
-        shape = unscented
+        shape = unscented_shape
     if approximations.order == "pixel":
         from drgs.accuracy.pixel_order import PixelOrder
 

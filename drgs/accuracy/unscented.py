@@ -44,7 +44,9 @@ the film, or ones that have nothing to do with its middle. The same holds far ou
 where slopes are clamped. Such splats are projected by the affine approximation."""
 
 
-def unscented(rows: GaussianRows, camera: Camera, position: Any, low_pass: float) -> FilmShape:
+def unscented_shape(
+    rows: GaussianRows, camera: Camera, position: Any, low_pass: float
+) -> FilmShape:
     """The unscented transform of a Gaussian through the camera.
 
     position: Array3f, camera axes, the mean. Not differentiated: where :data:`NEAREST` decides.
@@ -64,11 +66,11 @@ def unscented(rows: GaussianRows, camera: Camera, position: Any, low_pass: float
 def unscented_with_depth(
     rows: GaussianRows, camera: Camera, position: Any, low_pass: float
 ) -> FilmShape:
-    """As :func:`unscented`, and what is needed for the depth at a pixel.
+    """As :func:`unscented_shape`, and what is needed for the depth at a pixel.
 
     The Gaussian's covariance with the depth is the affine one, and h is not negative.
     """
-    film = unscented(rows, camera, position, low_pass)
+    film = unscented_shape(rows, camera, position, low_pass)
     # Where they are clamped, the splat is the affine one.
     slopes = camera.lens.clamped_slopes(camera, position)
     m0, m1, n = film_axes(rows, camera, position, slopes)

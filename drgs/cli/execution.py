@@ -32,7 +32,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 @contextmanager
-def execution(threads: int | None, debug: bool) -> Iterator[Callable[[], None]]:
+def executing(threads: int | None, debug: bool) -> Iterator[Callable[[], None]]:
     """Run the block on ``threads`` threads (None: as many as now), with range checks if ``debug``.
 
     Yields a function that raises :class:`UserError` if an access was out of range so far; leaving

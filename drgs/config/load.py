@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, get_args
 
@@ -50,13 +50,36 @@ def load_config(path: str | Path, overrides: Iterable[str] = ()) -> FitConfig:
         key, value = _parse_override(override)
         _insert(values, key, value)
         overridden.add(key)
+    return _validated(values, str(path), overridden)
+
+
+def config_from(values: Mapping[str, Any], where: str) -> FitConfig:
+    """A configuration from nested mappings, with the keys of the YAML file.
+
+    where: the beginning of errors. Paths, text or ``Path``, are relative to the current folder.
+
+    Raises :class:`UserError` with one line for each wrong key.
+    """
+    values = {
+        key: dict(section) if isinstance(section, Mapping) else section
+        for key, section in values.items()
+    }
+    for key in PATH_KEYS:
+        section, leaf = key.split(".")
+        entries = values.get(section)
+        if isinstance(entries, dict) and isinstance(entries.get(leaf), (str, Path)):
+            entries[leaf] = _absolute(Path(), str(entries[leaf]), f"{where}: {key}")
+    return _validated(values, where, set())
+
+
+def _validated(values: dict, where: str, overridden: set[str]) -> FitConfig:
     try:
         return FitConfig.model_validate(values)
     except ValidationError as error:
         errors = error.errors()
-        lines = [_explain(str(path), item, overridden) for item in errors[:MAX_EXPLAINED]]
+        lines = [_explain(where, item, overridden) for item in errors[:MAX_EXPLAINED]]
         if len(errors) > MAX_EXPLAINED:
-            lines.append(f"{path}: {len(errors) - MAX_EXPLAINED} more values are wrong")
+            lines.append(f"{where}: {len(errors) - MAX_EXPLAINED} more values are wrong")
         raise UserError("\n".join(lines)) from None
 
 

@@ -7,7 +7,10 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
+from pathlib import Path
+from typing import Any
 
+from drgs.config.load import config_from
 from drgs.config.schema import DataConfig
 from drgs.core.errors import UserError
 from drgs.data import nerf_synthetic, nerfstudio
@@ -27,13 +30,20 @@ _MARKERS = {
 }
 
 
-def load_dataset(config: DataConfig) -> Dataset:
-    """Read all views of the dataset that ``config`` names.
+def load_dataset(source: str | Path | DataConfig, **settings: Any) -> Dataset:
+    """All views of a dataset: photographs with their cameras, to train on and to measure on.
+
+    source: the folder, in the layout of NeRF-synthetic or of nerfstudio / instant-ngp, or the
+    section ``data`` of a configuration; settings: other values of that section, such as
+    ``image_size=400`` (px) or ``background="black"``.
 
     Raises :class:`UserError` naming the file, the key, what was expected and what was got; where
     the folder is missing, it says where to get the data.
     """
-    return _LOADERS[_layout(config)](config)
+    if settings or not isinstance(source, DataConfig):
+        given = source.model_dump() if isinstance(source, DataConfig) else {"path": source}
+        source = config_from({"data": {**given, **settings}}, "load_dataset()").data
+    return _LOADERS[_layout(source)](source)
 
 
 def _layout(config: DataConfig) -> str:

@@ -19,7 +19,7 @@ NUM_DIRECTIONS = 64
 well conditioned as the functions are orthogonal."""
 
 
-def sh_rotation(rotation: np.ndarray, degree: int) -> list[np.ndarray]:
+def sh_rotation_matrices(rotation: np.ndarray, degree: int) -> list[np.ndarray]:
     """For each degree l from 1 to ``degree``, the matrix D (2 l + 1, 2 l + 1) with c' = D c.
 
     rotation: R (3, 3), x' = R x. With c' for c, the function's value in a direction R d is what it
@@ -35,7 +35,7 @@ def rotated(coefficients: np.ndarray, rotation: np.ndarray) -> np.ndarray:
     """Coefficients (N, K - 1, 3) of degree 1 and above, rotated; K = (degree + 1)^2."""
     degree = round(np.sqrt(coefficients.shape[1] + 1)) - 1
     turned, start = [coefficients[:, :0]], 0
-    for matrix in sh_rotation(rotation, degree):
+    for matrix in sh_rotation_matrices(rotation, degree):
         band = coefficients[:, start : start + len(matrix)]
         turned.append(np.einsum("kj,njc->nkc", matrix, band))
         start += len(matrix)

@@ -36,7 +36,7 @@ from drgs.core.errors import PluginError
 from drgs.core.private import same_variables
 from drgs.gaussians.parameters import Gaussians
 from drgs.gaussians.sh import num_coefficients
-from drgs.gaussians.sh_rotation import sh_rotation
+from drgs.gaussians.sh_rotation import sh_rotation_matrices
 
 DATA = 10
 """Numbers of a row of ``data``: centre, standard deviations, quaternion xyzw."""
@@ -79,7 +79,7 @@ class Turn:
     @staticmethod
     def by(rotation: np.ndarray) -> Turn:
         """rotation: (3, 3), x' = R x."""
-        matrices = [matrix.ravel() for matrix in sh_rotation(rotation, 3)]
+        matrices = [matrix.ravel() for matrix in sh_rotation_matrices(rotation, 3)]
         return Turn(from_host(mi.Float, np.concatenate(matrices)))
 
     def of(self, columns: list[Any], transposed: bool = False) -> list[Any]:

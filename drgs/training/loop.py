@@ -2,11 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import Protocol
+from pathlib import Path
+from typing import Any, Protocol
 
+import mitsuba as mi
+
+from drgs.config.load import config_from, load_config
+from drgs.config.schema import FitConfig
+from drgs.data import Dataset, initial_gaussians, load_dataset
 from drgs.gaussians.parameters import Gaussians
+from drgs.integrator.scene import check_lenses
+from drgs.training.budget import AllIterations
 from drgs.training.history import History, HistoryRow
 from drgs.training.trainer import StepReport, Trainer
 
@@ -58,3 +66,49 @@ def as_saved(gaussians: Gaussians, trainer: Trainer) -> Gaussians:
     from drgs.effects.smoothing import baked
 
     return baked(gaussians)
+
+
+@dataclass(frozen=True)
+class FitResult:
+    """What a fit in memory gives."""
+
+    gaussians: Gaussians  # numpy arrays: what ``point_cloud.ply`` of the command holds
+    history: tuple[HistoryRow, ...]  # as in ``history.csv``
+    trainer: Trainer  # goes on from here with ``trainer.step()``, renders with ``pictures(views)``
+
+
+def train(
+    config: FitConfig | Mapping[str, Any] | str | Path,
+    dataset: Dataset | None = None,
+    callback: Callable[[StepReport], bool | None] | None = None,
+) -> FitResult:
+    """Fit Gaussians to photographs, in memory: the bytes that ``drgs fit`` writes to its PLY file.
+
+    config: what to fit, and how: the path of a YAML file, the same as nested mappings, or a
+    :class:`drgs.config.schema.FitConfig`; dataset: the photographs, by default those of the
+    configuration's section ``data``, which is needed in any case (its background is that of the
+    splats); callback: called after each iteration with what it did, a
+    :class:`drgs.training.trainer.StepReport`; the fit ends early where it returns True.
+
+    Where no Mitsuba variant is active, ``llvm_ad_rgb`` is made so. Nothing is written.
+
+    Raises ``drgs.core.errors.UserError`` (a ValueError) for wrong input, naming the key and the
+    remedy, and ``drgs.training.finite_checks.NonFiniteError`` if a number is not finite.
+    """
+    if isinstance(config, (str, Path)):
+        config = load_config(config)
+    elif not isinstance(config, FitConfig):
+        config = config_from(config, "train(): config")
+    if mi.variant() is None:
+        mi.set_variant("llvm_ad_rgb")
+    if dataset is None:
+        dataset = load_dataset(config.data_for_training)
+    views, remedy = (*dataset.train, *dataset.test), "set data.ignore_distortion"
+    check_lenses(config.model, views, "train(): ", remedy)
+    trainer = Trainer(config, dataset, initial_gaussians(config, dataset))
+    history = History()
+    for done in iterations(trainer, history, AllIterations()):
+        if callback is not None and callback(done.report) is True:
+            break
+    gaussians = as_saved(trainer.gaussians(), trainer)
+    return FitResult(gaussians, tuple(history.rows), trainer)

@@ -40,7 +40,7 @@ from test_reference_effects import camera_at_origin, gaussians_at, whitened_samp
 from test_reference_splatting import numeric_gradients
 
 from drgs.accuracy.pipeline import pipeline_of
-from drgs.accuracy.unscented import unscented
+from drgs.accuracy.unscented import unscented_shape
 from drgs.cameras import fisheye, orthographic, polynomials
 from drgs.cameras import radial_tangential as lenses
 from drgs.config.approximations import Approximations
@@ -495,7 +495,7 @@ def test_unscented_splats_have_the_mean_and_covariance_of_projected_samples(name
         world = mean + samples * np.exp(log_scale) @ turn.T
         film = lens.film_points(camera, (world - camera.center) @ camera.rotation.T)
         by_samples.append((film.mean(axis=0), np.cov(film.T, bias=True)))
-    for shape, found in ((unscented, by_unscented), (ewa, by_ewa)):
+    for shape, found in ((unscented_shape, by_unscented), (ewa, by_ewa)):
         splats = splats_of(gaussians, camera, lens, FLOAT64, shape, low_pass=0.0)
         assert np.array(splats.visible).all()
         found += zip(rows(splats.means2d), covariances(splats), strict=True)
@@ -523,7 +523,7 @@ def test_unscented_splats_that_are_tiny_are_the_affine_ones(name):
     gaussians, camera = unscented_scene(name, size=1e-4)
     affine, points = (
         splats_of(gaussians, camera, LENSES[name], FLOAT64, shape, low_pass=0.0)
-        for shape in (ewa, unscented)
+        for shape in (ewa, unscented_shape)
     )
     # The square of the size, times second derivatives of up to 1000 px.
     np.testing.assert_allclose(rows(points.means2d), rows(affine.means2d), rtol=0, atol=1e-4)
@@ -847,7 +847,7 @@ def test_each_coefficient_of_a_fisheye_adds_operations():
 @pytest.mark.parametrize(
     ("name", "shape", "precision"),
     [(name, ewa, precision) for name in FORMS for precision in (FLOAT32, FLOAT64)]
-    + [("rational", unscented, FLOAT32), ("fisheye", unscented, FLOAT32)],
+    + [("rational", unscented_shape, FLOAT32), ("fisheye", unscented_shape, FLOAT32)],
     ids=lambda value: value if isinstance(value, str) else getattr(value, "__name__", None),
 )
 def test_positions_that_are_no_numbers_poison_nothing(precision, name, shape):

@@ -14,7 +14,7 @@ import pytest
 import yaml
 from conftest import REPOSITORY
 
-from drgs.cli.execution import execution
+from drgs.cli.execution import executing
 from drgs.config.load import dump_config, load_config
 from drgs.data import initial_gaussians, load_dataset
 from drgs.gaussians.parameters import Gaussians
@@ -182,7 +182,7 @@ def test_the_configuration_changes_all_that_a_fit_can_change(fitted, configurati
     """The tests below compare the bytes of such fits, this one with those of a longer process."""
     config = load_config(configuration)
     reports, degrees, opacities = [], set(), {}
-    with execution(threads=None, debug=False):
+    with executing(threads=None, debug=False):
         trainer = make_trainer(config)
         for iteration in range(1, config.iterations + 1):
             reports.append(trainer.step().density)
@@ -221,7 +221,7 @@ def test_shipped_scene_gives_the_same_bytes_on_any_number_of_threads():
     trainer = make_trainer(config)
     start, results = trainer.state(), {}
     for threads in (1, 2, 5):
-        with execution(threads, debug=False):
+        with executing(threads, debug=False):
             trainer.restore(start)
             for _ in range(8):
                 trainer.step()

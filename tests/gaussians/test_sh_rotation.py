@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from drgs.gaussians.sh_rotation import rotated, sh_rotation
+from drgs.gaussians.sh_rotation import rotated, sh_rotation_matrices
 from drgs.reference import splatting as reference
 
 # Values of a basis of at most 1.5 with 1e-16 of rounding, through a least-squares problem of a
@@ -38,13 +38,15 @@ def test_a_rotated_function_has_the_values_of_the_directions_turned_back(rotatio
 
 def test_matrices_are_orthogonal_and_compose_as_rotations_do():
     a, b = ROTATIONS[:2]
-    for of_a, of_b, of_both in zip(*(sh_rotation(r, 3) for r in (a, b, a @ b)), strict=True):
+    for of_a, of_b, of_both in zip(
+        *(sh_rotation_matrices(r, 3) for r in (a, b, a @ b)), strict=True
+    ):
         np.testing.assert_allclose(of_a @ of_a.T, np.eye(len(of_a)), atol=ROUNDING)
         np.testing.assert_allclose(of_a @ of_b, of_both, atol=ROUNDING)
 
 
 def test_matrices_are_as_many_as_degrees():
-    assert [m.shape for m in sh_rotation(ROTATIONS[0], 3)] == [(3, 3), (5, 5), (7, 7)]
-    assert sh_rotation(ROTATIONS[0], 0) == []
-    for matrix in sh_rotation(np.eye(3), 3):
+    assert [m.shape for m in sh_rotation_matrices(ROTATIONS[0], 3)] == [(3, 3), (5, 5), (7, 7)]
+    assert sh_rotation_matrices(ROTATIONS[0], 0) == []
+    for matrix in sh_rotation_matrices(np.eye(3), 3):
         np.testing.assert_allclose(matrix, np.eye(len(matrix)), atol=ROUNDING)

@@ -32,8 +32,9 @@ MAY_IMPORT = {
     "plugins": {"integrator", *INTEGRATOR},
     "_registration": {"plugins", *GROUND},
     "": {"_registration", "core"},  # drgs/__init__.py; what it offers is imported when it is used
+    "rasterizing": {"accuracy", "effects", "splatting", "config", *METHOD},
     "commands": {"training", "cli", "plugins", *TRAINING},
-    "bench": {"commands", "training", "cli", "reference", "", *TRAINING},
+    "bench": {"commands", "rasterizing", "training", "cli", "reference", "", *TRAINING},
 }
 """By package: the others that it may import. ``drgs`` itself may be imported for its version."""
 

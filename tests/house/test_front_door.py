@@ -1,0 +1,76 @@
+"""What ``import drgs`` offers, and that no name stands for a module and for something in it."""
+
+import ast
+
+import pytest
+from conftest import REPOSITORY
+
+import drgs
+
+PUBLIC = {"Gaussians", "load_dataset", "rasterization", "train"}
+
+LAZILY = """
+import sys
+import drgs
+heavy = {{"drgs.gaussians", "drgs.data", "drgs.training", "drgs.rasterizing", "plyfile"}}
+assert not heavy & set(sys.modules), heavy & set(sys.modules)
+drgs.{name}
+assert "{name}" in vars(drgs)
+"""
+
+
+def test_public_names_are_listed():
+    assert set(drgs.__all__) == PUBLIC
+    assert set(dir(drgs)) >= PUBLIC | {"__version__"}
+
+
+@pytest.mark.parametrize("name", sorted(PUBLIC))
+def test_a_public_name_is_documented(name):
+    documentation = getattr(drgs, name).__doc__
+    assert documentation.split("\n\n")[0].rstrip().endswith(".")
+    assert name in drgs.__doc__
+
+
+@pytest.mark.parametrize("name", ["Gaussians", "rasterization"])
+def test_names_are_imported_when_they_are_used(run_python, name):
+    result = run_python(LAZILY.format(name=name))
+    assert result.returncode == 0, result.stderr
+
+
+def test_another_name_is_refused():
+    with pytest.raises(AttributeError, match="module 'drgs' has no attribute 'fitt'"):
+        _ = drgs.fitt
+
+
+# ----------------------------------------------------------------------------------------------
+# Modules and functions share no name
+# ----------------------------------------------------------------------------------------------
+
+FILES = sorted((REPOSITORY / "drgs").rglob("*.py"))
+
+
+def names_around(file):
+    """Modules and packages that lie beside ``file`` or hold it, itself included."""
+    parts = file.relative_to(REPOSITORY).with_suffix("").parts
+    beside = {path.stem for path in file.parent.iterdir() if path.suffix == ".py" or path.is_dir()}
+    return {*parts, *beside} - {"__init__", "__main__"}
+
+
+def shared_names(source, modules):
+    """Public functions and classes of a module that are called like one of ``modules``."""
+    kinds = (ast.FunctionDef, ast.AsyncFunctionDef, ast.ClassDef)
+    defined = {node.name for node in ast.parse(source).body if isinstance(node, kinds)}
+    return defined & modules
+
+
+@pytest.mark.parametrize("file", FILES, ids=lambda file: str(file.relative_to(REPOSITORY)))
+def test_nothing_is_called_like_a_module_that_defines_or_holds_it(file):
+    assert not shared_names(file.read_text(), names_around(file))
+
+
+def test_public_names_are_those_of_no_module():
+    assert not PUBLIC & {path.stem for path in (REPOSITORY / "drgs").iterdir()}
+
+
+def test_a_shared_name_is_found():
+    assert shared_names("def exact(): ...\n\nclass Other: ...", {"exact", "other"}) == {"exact"}
