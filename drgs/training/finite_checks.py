@@ -9,7 +9,7 @@ began, not where it was noticed.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -67,7 +67,7 @@ class GradientWatch:
         self._iterations.clear()
 
 
-def _faults(iteration: _Iteration) -> Any:
+def _faults(iteration: _Iteration) -> Iterator[str]:
     # First: what is wrong with them is wrong with all that follows.
     for name, values in iteration.numbers.items():
         if (first := _first_fault(np.array(values))) is not None:

@@ -1,4 +1,8 @@
-"""Stages of a fit: the sizes of its pictures, and which one an iteration trains on."""
+"""Stages of a fit: the size of its pictures, and which one each iteration trains on.
+
+From the views of a dataset to what the trainer renders and compares: sensors, loss targets, and
+what effects need of each view on the device.
+"""
 
 from __future__ import annotations
 

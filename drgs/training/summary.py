@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 from drgs.config.schema import FitConfig
 from drgs.data.types import Dataset
@@ -61,7 +60,7 @@ def _background(config: FitConfig) -> SimulatedEffect:
     return SimulatedEffect("background", f"{config.data.background}", "data.background")
 
 
-def _of_data(name: str, values: Sequence[Any], what: str, why: str) -> SimulatedEffect:
+def _of_data(name: str, values: Sequence[object], what: str, why: str) -> SimulatedEffect:
     count = sum(value is not None for value in values)
     return SimulatedEffect(name, what if count else None, f"{why}, in {count} views")
 

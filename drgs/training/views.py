@@ -1,4 +1,4 @@
-"""A photograph as training needs it."""
+"""One training photograph: its sensor, what is rendered is compared with, and effects' uploads."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from drgs.training.losses import Target
 
 @dataclass(eq=False)
 class TrainingView:
-    """A view as training needs it."""
+    """A photograph of the training split, at the size of one stage; in display space."""
 
     name: str
     index: int  # among the training views
@@ -22,4 +22,4 @@ class TrainingView:
     width: int  # px
     height: int  # px
     counted: float  # share of the pixels that count: those that no mask leaves out
-    uploads: dict[str, Any]  # what effects need, by their names
+    uploads: dict[str, Any]  # by effect: what it needs of the view, Dr.Jit arrays in any PyTree

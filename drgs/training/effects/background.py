@@ -1,4 +1,4 @@
-"""Random backgrounds behind transparent photographs."""
+"""Random backgrounds behind transparent photographs. Imported for ``data.random_background``."""
 
 from __future__ import annotations
 
@@ -12,6 +12,9 @@ from drgs.data.types import View
 from drgs.training.effects.base import FitState, TrainingEffect, as_tensor
 from drgs.training.losses import prepare_target
 from drgs.training.views import TrainingView
+
+STREAM = 71
+"""Tells the random numbers of backgrounds from others of the same seed."""
 
 
 class RandomBackground(TrainingEffect):
@@ -39,7 +42,7 @@ class RandomBackground(TrainingEffect):
 
     def before(self, fit: FitState, view: TrainingView) -> None:
         """Put a colour behind the splats and behind the photograph."""
-        rng = np.random.default_rng([self.seed, _BACKGROUND_STREAM, fit.iteration])
+        rng = np.random.default_rng([self.seed, STREAM, fit.iteration])
         color = rng.uniform(size=3)
         fit.integrator.background = mi.Color3f(*map(float, color))
         # No literal, or every colour would be a new kernel.
@@ -55,7 +58,3 @@ class RandomBackground(TrainingEffect):
         """Put the dataset's background back."""
         fit.integrator.background = mi.Color3f(*map(float, self.background))
         view.target = view.photograph
-
-
-_BACKGROUND_STREAM = 71
-"""Tells the random numbers of backgrounds from others of the same seed."""

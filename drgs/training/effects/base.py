@@ -16,6 +16,7 @@ import numpy as np
 
 from drgs.core.arrays import from_host
 from drgs.data.types import View
+from drgs.integrator.settings import SplatsSettings
 from drgs.training.views import TrainingView
 
 
@@ -35,7 +36,7 @@ class FitState(Protocol):
         """Whether the pictures have other sizes than in the iteration before."""
 
     @property
-    def integrator(self) -> Any:
+    def integrator(self) -> SplatsSettings:
         """The integrator ``splats`` that renders the fit."""
 
     @property
@@ -50,15 +51,18 @@ class FitState(Protocol):
         """Put all sensors where effects have them now, without derivatives."""
 
 
-class TrainingEffect:
-    """Does nothing; effects override what they need."""
+class TrainingEffect(Protocol):
+    """What the trainer asks of an effect; effects derive from it and override what they need.
+
+    As it is here, an effect does nothing. Images are tensors (H, W, C) in display space.
+    """
 
     name = ""  # of its part of a checkpoint, and of what it uploads
     moves_sensors = False  # whether it changes the parameters of sensors
     aovs = ""  # what the integrator has to put out besides colour
 
     def upload(self, view: View) -> Any:
-        """What the effect needs of a view, on the device; kept with the view."""
+        """What the effect needs of a view, on the device; kept in ``TrainingView.uploads``."""
         del view
 
     def target_image(self, view: View, image: np.ndarray) -> np.ndarray:

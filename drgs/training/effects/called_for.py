@@ -1,9 +1,11 @@
-"""The effects that a dataset and a configuration call for."""
+"""The effects that a dataset and a configuration call for: the one place that composes them.
+
+Each is imported where it is called for.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 from drgs.config.schema import FitConfig
 from drgs.core.errors import UserError
@@ -49,7 +51,7 @@ def training_effects(config: FitConfig, dataset: Dataset) -> list[TrainingEffect
     return effects
 
 
-def integrator_settings(effects: Sequence[TrainingEffect]) -> dict[str, Any]:
+def integrator_settings(effects: Sequence[TrainingEffect]) -> dict[str, str]:
     """Settings of the integrator that effects need."""
     aovs = ", ".join(effect.aovs for effect in effects if effect.aovs)
     return {"aovs": aovs} if aovs else {}

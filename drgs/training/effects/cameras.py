@@ -3,7 +3,7 @@
 Imported when ``cameras.optimise`` is set. A view's camera is moved, in its own axes, by a rotation
 exp(turn) and a translation; all views share factors of the focal lengths and a shift of the
 principal point. Of a camera that moves while it exposes, both poses are moved alike. The
-derivatives come from the integrator: see ``camera.Camera.by_lane``.
+derivatives come from the integrator: see ``drgs.cameras.camera.Camera.by_lane``.
 """
 
 from __future__ import annotations

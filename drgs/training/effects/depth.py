@@ -1,4 +1,4 @@
-"""Supervision by depth."""
+"""Supervision by the depth that the data has. Imported where a view has it and it counts."""
 
 from __future__ import annotations
 
@@ -19,7 +19,8 @@ class DepthSupervision(TrainingEffect):
 
     The term is weight / extent times the mean of |D - A d| over the pixels whose depth d is known
     and that no mask leaves out, D being the alpha-weighted sum of the splats' depths and A the
-    alpha: ``pixels.depth_error``.
+    alpha:
+    :func:`drgs.training.image_ops.depth_error`.
     """
 
     name = "depth"

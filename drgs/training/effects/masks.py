@@ -1,7 +1,4 @@
-"""What the data says besides colours: masks, depth; and backgrounds that vary.
-
-Imported when the data or the configuration calls for one of them.
-"""
+"""Pixels that the dataset's masks leave out of a fit. Imported where a view has a mask."""
 
 from __future__ import annotations
 
