@@ -154,17 +154,21 @@ def rasterization(
     tensor_type = _tensor_type(means)
     if "llvm" in tensor_type.__module__:
         ensure_usable_llvm()
-    inputs = {name: _tensor(name, value, tensor_type) for name, value in given.items()}
+    inputs = {
+        name: _tensor(name, value, tensor_type)
+        for name, value in given.items()
+        if value is not None
+    }
     _check_shapes(inputs, sh_degree)
     features = () if render_mode in ("D", "ED") else (_color_feature(sh_degree),)
     features += () if render_mode == "RGB" else (depth_feature,)
     pictures = _Pictures(
-        {name: None if value is None else dr.detach(value) for name, value in inputs.items()},
+        dr.detach(inputs),
         pipeline_of(choices, sh_degree or 0, features=features, rows=activated),
         _Film(int(width), int(height), float(near_plane), sh_degree, render_mode),
         of_camera=any(dr.grad_enabled(inputs[name]) for name in ("viewmats", "Ks")),
     )
-    images, alphas = dr.custom(_Rasterization, pictures, *inputs.values())
+    images, alphas = dr.custom(_Rasterization, pictures, inputs)
     meta = pictures.meta()
     if dr.is_array_v(means):
         return images, alphas, meta
@@ -231,7 +235,7 @@ def _tensor_type(means: Any) -> type:
 
 def _tensor(name: str, value: Any, tensor_type: type) -> Any:
     """``value`` as a tensor, still attached."""
-    if value is None or type(value) is tensor_type:
+    if type(value) is tensor_type:
         return value
     flat_type = dr.array_t(tensor_type)
     if not dr.is_array_v(value):
@@ -270,7 +274,7 @@ def _check_shapes(inputs: Mapping[str, Any], sh_degree: int | None) -> None:
         fits = shape[:-2] in ((num,), (views, num)) and shape[-1] == 3 and shape[-2] >= least
         wanted = f"({num}, K, 3) or ({views}, {num}, K, 3), K >= {least}, for sh_degree {sh_degree}"
     _require(fits, "colors", f"of shape {wanted}", shape)
-    if inputs["backgrounds"] is not None:
+    if "backgrounds" in inputs:
         wanted, got = (views, shape[-1]), inputs["backgrounds"].shape
         _require(got == wanted, "backgrounds", f"of shape {wanted}", got)
 
@@ -404,7 +408,7 @@ class _Pictures:
         pictures, alphas = [], []
         for index, (transmittance, *features) in enumerate(self._planes()):
             colors, depths = self._split(features)
-            if self.inputs["backgrounds"] is not None:
+            if "backgrounds" in self.inputs:
                 colors = [
                     dr.fma(transmittance, self._background(self.inputs, index, k), color)
                     for k, color in enumerate(colors)
@@ -430,7 +434,7 @@ class _Pictures:
             d_transmittance, *d_features = d_planes
             _, depths = self._split(features)
             d_colors, d_depths = self._split(d_features)
-            if self.inputs["backgrounds"] is not None:
+            if "backgrounds" in self.inputs:
                 d_colors = [
                     color
                     + d_transmittance * self._background(self.inputs, index, k)
@@ -478,7 +482,7 @@ class _Pictures:
         _, depths = self._split(features)
         d_colors, d_depths = self._split(d_channels)
         d_transmittance, d_background = -d_alphas[0], []
-        if self.inputs["backgrounds"] is not None:
+        if "backgrounds" in self.inputs:
             for k, d_color in enumerate(d_colors):
                 background = self._background(self.inputs, index, k)
                 d_transmittance = dr.fma(d_color, background, d_transmittance)
@@ -596,33 +600,19 @@ def _divisor(transmittance: Any) -> Any:
 class _Rasterization(dr.CustomOp):
     """The pictures as an operation that Dr.Jit differentiates."""
 
-    def eval(
-        self,
-        pictures: _Pictures,
-        means: Any,
-        quats: Any,
-        scales: Any,
-        opacities: Any,
-        colors: Any,
-        viewmats: Any,
-        Ks: Any,
-        backgrounds: Any,
-    ) -> tuple[Any, Any]:
-        """Pictures and alphas; the other arguments are what they were rendered from."""
-        del means, quats, scales, opacities, colors, viewmats, Ks, backgrounds
-        self.pictures = pictures
-        self.names = [name for name, value in pictures.inputs.items() if value is not None]
+    def eval(self, pictures: _Pictures, inputs: dict[str, Any]) -> tuple[Any, Any]:
+        """Pictures and alphas; inputs: what they were rendered from, attached."""
+        self.pictures, self.names = pictures, list(inputs)
         return pictures.images()
 
     def forward(self) -> None:
         """Hand on tangents of the inputs."""
-        self.set_grad_out(self.pictures.tangents({n: self.grad_in(n) for n in self.names}))
+        self.set_grad_out(self.pictures.tangents(self.grad_in("inputs")))
 
     def backward(self) -> None:
-        """Hand back derivatives with respect to the images."""
+        """Hand back derivatives with respect to the inputs."""
         gradients = self.pictures.gradients(*self.grad_out())
-        for name in self.names:
-            self.set_grad_in(name, gradients[name])
+        self.set_grad_in("inputs", {name: gradients[name] for name in self.names})
 
     def name(self) -> str:
         """What Dr.Jit calls it."""
