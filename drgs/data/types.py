@@ -48,6 +48,14 @@ class View:
         """(3, 3) float64: camera coordinates to homogeneous pixel coordinates."""
         return np.array([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1]], np.float64)
 
+    @property
+    def viewmat(self) -> np.ndarray:
+        """(4, 4) float64, world to camera, OpenCV axes: what ``drgs.rasterization`` takes."""
+        rotation = self.camera_to_world[:3, :3].T
+        viewmat = np.eye(4)
+        viewmat[:3] = np.column_stack([rotation, -rotation @ self.center])
+        return viewmat
+
 
 @dataclass(frozen=True, eq=False)
 class Dataset:

@@ -127,6 +127,12 @@ class Gaussians:
         """(N,) in (0, 1)."""
         return 1.0 / (1.0 + _exp(-self.logit_opacities))
 
+    @property
+    def sh(self) -> Any:
+        """(N, K, 3) coefficients of all degrees, display space; K = (sh_degree + 1)^2."""
+        numpy = isinstance(self.sh0, np.ndarray)
+        return (np.concatenate if numpy else dr.concat)((self.sh0, self.shN), axis=1)
+
     def numpy(self) -> Gaussians:
         """The same Gaussians as numpy arrays on the host."""
         features = self.features and {k: np.array(v) for k, v in self.features.items()}
