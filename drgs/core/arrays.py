@@ -1,7 +1,8 @@
 """Dr.Jit types that belong together, and row access to flat arrays.
 
 Every stage is written once for all array types (float32 and float64, LLVM and CUDA): it asks this
-module for the companions of the float type that it was given.
+module for the companions of the float type that it was given. Therefore arrays are ``Any`` in
+signatures; a comment says which type it is (Float, Array3f, ...), and of what shape and unit.
 """
 
 from __future__ import annotations

@@ -77,8 +77,8 @@ class FilmShape:
     means2d: Any  # Array2f, px
     whitening: Any  # Array3f (p, r, s), 1 / px
     variances: Any  # Array2f, px^2, low-pass included
-    determinant: Any  # Float: of the covariance without low-pass; and what the low-pass
-    added_determinant: Any  # Float: adds to it, both divided by the variance in y
+    determinant: Any  # Float, px^2: of the covariance without low-pass, over the variance in y
+    added_determinant: Any  # Float, px^2: what the low-pass adds to it
     ray: RayTerms | None = None
     dimming: Any = None  # Float: factor of the opacity; None: 1
 

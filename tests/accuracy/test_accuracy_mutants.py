@@ -14,8 +14,7 @@ from support.detectors import MutationChecks, detectors, find_noticed
 from support.helpers import FLOAT64
 from support.mutants import ALWAYS, AT_EQUALITY, Instrumented, Switchboard
 
-from drgs.accuracy import exact as perspective
-from drgs.accuracy import pixel_order, ray_colors
+from drgs.accuracy import exact, pixel_order, ray_colors
 from drgs.splatting import rendering
 
 _REASONS = {
@@ -62,7 +61,7 @@ class Copies:
     def of(board: Switchboard) -> "Copies":
         response = Instrumented(
             board,
-            perspective,
+            exact,
             derivatives=[
                 f"RayResponse.{name}"
                 for name in ("moments", "derivatives", "pack_tangents", "tangent")
@@ -92,7 +91,7 @@ class Copies:
         """The frame, whose forward pass is that of the package, with derivatives of the copies."""
         model, order = frame.bins.model, frame.order
         features = model.features
-        if isinstance(model.response, perspective.RayResponse):
+        if isinstance(model.response, exact.RayResponse):
             model = replace(model, response=self.response(model.response.camera))
         if isinstance(features, ray_colors.RayColors):
             model = replace(model, features=self.colors(features.sh_degree, features.camera))
@@ -116,7 +115,7 @@ def outcome():
 
         def run():
             with pytest.MonkeyPatch.context() as patch:
-                patch.setattr(perspective, "RayResponse", copies.response)
+                patch.setattr(exact, "RayResponse", copies.response)
                 patch.setattr(ray_colors, "RayColors", copies.colors)
                 patch.setattr(pixel_order, "_add_product", copies.add_product)
                 check()

@@ -26,8 +26,7 @@ from support.helpers import (
 )
 from test_hard_cases import EXACT, FAMILIES, bound_of, errors_over_bounds
 
-from drgs.accuracy import exact as perspective
-from drgs.accuracy import unscented
+from drgs.accuracy import exact, unscented
 from drgs.accuracy.pipeline import pipeline_of
 from drgs.config.approximations import Approximations
 from drgs.gaussians.parameters import PARAMETER_NAMES
@@ -136,7 +135,7 @@ def rounded_axes(seed):
         return [moved(rng, x) for x in sigma_offsets(*arguments)]
 
     with ExitStack() as patches:
-        for module in (projection, perspective, unscented):
+        for module in (projection, exact, unscented):
             patches.enter_context(mock.patch.object(module, "film_axes", rounded_film_axes))
         patches.enter_context(mock.patch.object(unscented, "_sigma_offsets", rounded_offsets))
         yield

@@ -42,7 +42,7 @@ from test_reference_splatting import numeric_gradients
 from drgs.accuracy.pipeline import pipeline_of
 from drgs.accuracy.unscented import unscented_shape
 from drgs.cameras import fisheye, orthographic, polynomials
-from drgs.cameras import radial_tangential as lenses
+from drgs.cameras.radial_tangential import RadialTangential
 from drgs.config.approximations import Approximations
 from drgs.gaussians.parameters import PARAMETER_NAMES
 from drgs.reference import effects
@@ -718,13 +718,13 @@ def test_gradients_equal_their_own_central_differences(name, choices):
         ({"k5": 0.5}, {"k4": 0.0, "k5": 0.5}),
         ({"p2": 0.5}, {"p1": 0.0, "p2": 0.5}),
         (
-            dict(zip(lenses.RadialTangential.names, (1, 2, 3, 4, 5, 6, 7, 8), strict=True)),
-            dict(zip(lenses.RadialTangential.names, (1, 2, 3, 4, 5, 6, 7, 8), strict=True)),
+            dict(zip(RadialTangential.names, (1, 2, 3, 4, 5, 6, 7, 8), strict=True)),
+            dict(zip(RadialTangential.names, (1, 2, 3, 4, 5, 6, 7, 8), strict=True)),
         ),
     ],
 )
 def test_coefficients_that_are_not_given_are_left_out(given, named):
-    lens = lenses.RadialTangential.of(**given)
+    lens = RadialTangential.of(**given)
     assert lens.named() == named
     values = {name: -value for name, value in named.items()}
     assert lens.with_named(values).named() == values

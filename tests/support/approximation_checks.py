@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from drgs.accuracy import exact as perspective
-from drgs.accuracy import pixel_order, ray_colors
+from drgs.accuracy import exact, pixel_order, ray_colors
 from drgs.accuracy.pipeline import pipeline_of
 from drgs.config.approximations import Approximations
 from drgs.gaussians.parameters import PARAMETER_NAMES
@@ -271,9 +270,9 @@ def check_sums_of_products_are_exact_to_twice_the_precision():
     high = low = FLOAT32.Float(0)
     for x, y in zip(a, single(b), strict=True):
         high, low = pixel_order._add_product(high, low, FLOAT32.Float(x), FLOAT32.Float(y))
-    exact = math.fsum(a * single(b))
+    expected = math.fsum(a * single(b))
     # Of doubled single precision, 2^-48 a term.
-    assert abs(float(high[0]) + float(low[0]) - exact) < 200 * 2.0**-48 * np.abs(a * b).max()
+    assert abs(float(high[0]) + float(low[0]) - expected) < 200 * 2.0**-48 * np.abs(a * b).max()
 
 
 def check_twins_are_composited_in_one_order_by_picture_and_derivative():
@@ -310,7 +309,7 @@ def check_a_peak_in_the_plane_of_the_camera_shows_nothing():
     def offsets_from(x, y):
         return [[i + 0.5 - x for i in range(4)]] * 4, [[j + 0.5 - y] * 4 for j in range(4)]
 
-    response = perspective.RayResponse().seen_by(camera)
+    response = exact.RayResponse().seen_by(camera)
     footprint = response.footprint(geometry, offsets_from, number(0) == 0)
     shows = np.array([float(x[0]) > -math.inf for x in footprint.log2_alpha]).reshape(4, 4)
     assert shows[:, 0].all() and not shows[:, 1:].any()
@@ -319,7 +318,7 @@ def check_a_peak_in_the_plane_of_the_camera_shows_nothing():
 def check_a_splat_without_opacity_has_no_derivatives():
     """An opacity that underflows to zero has the logarithm - inf."""
     number = FLOAT64.Float
-    response = perspective.RayResponse()
+    response = exact.RayResponse()
     geometry = [number(x) for x in (0.5, 0.5, 1, 0, 1, -math.inf, -1, 0, 0.5)]
     derivatives = response.derivatives(geometry, [number(0)] * response.num_moments)
     assert [float(d[0]) for d in derivatives] == [0] * 9

@@ -9,8 +9,8 @@ import drjit as dr
 import numpy as np
 
 from drgs.cameras import fisheye, orthographic, thin_lens
-from drgs.cameras import radial_tangential as lenses
 from drgs.cameras.camera import Camera
+from drgs.cameras.radial_tangential import RadialTangential
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 from drgs.reference import effects
 from drgs.reference import splatting as reference
@@ -54,7 +54,7 @@ def kernel_lens(lens: effects.Lens) -> object:
     """The kernels' lens with the coefficients of the reference's that are not zero."""
     given = {name: value for name, value in asdict(lens).items() if value != 0}
     if isinstance(lens, OpenCV):
-        return lenses.RadialTangential.of(**given)
+        return RadialTangential.of(**given)
     return fisheye.Fisheye.of(**given) if isinstance(lens, Fisheye) else orthographic.Orthographic()
 
 

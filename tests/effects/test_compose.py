@@ -1,0 +1,79 @@
+"""One place puts effects into a pipeline; whoever renders does not ask for them."""
+
+import ast
+from dataclasses import replace
+
+import drjit.llvm.ad as llvm
+import pytest
+from conftest import REPOSITORY
+from support.helpers import FLOAT32, Case, device_camera, device_gaussians
+
+from drgs.accuracy.exact import RayResponse, exact
+from drgs.cameras.thin_lens import RoundAperture
+from drgs.effects.compose import composed, ignoring
+from drgs.effects.defocus import Defocused, DimmedResponse
+from drgs.effects.smoothing import smoothed
+from drgs.splatting import rendering
+from drgs.splatting.image_model import ImageModel
+
+CASE = Case("compose", 16, 12, 0, count=12)
+APERTURE = RoundAperture(llvm.Float(0.1), llvm.Float(2.0))
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return device_gaussians(CASE.gaussians, FLOAT32), device_camera(CASE.camera, FLOAT32)
+
+
+def test_what_is_not_called_for_leaves_the_pipeline_as_it_is(scene):
+    gaussians, camera = scene
+    pipeline = rendering.Pipeline(0)
+    assert composed(pipeline, gaussians, camera) is pipeline
+
+
+def test_an_aperture_wraps_the_projection_and_the_response(scene):
+    gaussians, camera = scene
+    pipeline = rendering.Pipeline(0, shape=exact, model=ImageModel(response=RayResponse()))
+    found = composed(pipeline, gaussians, replace(camera, aperture=APERTURE))
+    assert found.shape == Defocused(exact)
+    assert found.model.response == DimmedResponse(RayResponse())
+    assert replace(found, shape=exact, model=pipeline.model) == pipeline
+
+
+def test_a_filter_changes_the_gaussians_first(scene):
+    gaussians, camera = scene
+    filtered = replace(gaussians, smoothing=llvm.Float(0.1) + 0 * gaussians.logit_opacities)
+    pipeline = rendering.Pipeline(0)
+    assert composed(pipeline, filtered, camera) == replace(pipeline, rows=smoothed)
+
+
+def test_what_is_ignored_is_not_composed(scene):
+    gaussians, camera = scene
+    pipeline = rendering.Pipeline(0)
+    blurred = replace(camera, aperture=APERTURE)
+    assert composed(pipeline, gaussians, ignoring(blurred, ["motion"])) != pipeline
+    assert composed(pipeline, gaussians, ignoring(blurred, ["defocus"])) is pipeline
+
+
+def test_adjoint_and_tangent_replay_what_was_composed(scene):
+    gaussians, camera = scene
+    camera = replace(camera, aperture=APERTURE)
+    pipeline = composed(rendering.Pipeline(0), gaussians, camera)
+    assert rendering.render(gaussians, camera, pipeline).pipeline is pipeline
+
+
+def asking(source):
+    """Whether ``source`` reads an attribute ``aperture`` or ``shutter``."""
+    nodes = (node for node in ast.walk(ast.parse(source)) if isinstance(node, ast.Attribute))
+    return any(node.attr in ("aperture", "shutter") for node in nodes)
+
+
+@pytest.mark.parametrize("package", ["splatting", "accuracy"])
+def test_the_method_does_not_ask_a_camera_whether_it_blurs(package):
+    paths = sorted((REPOSITORY / "drgs" / package).glob("*.py"))
+    assert len(paths) > 5
+    assert [path.name for path in paths if asking(path.read_text())] == []
+
+
+def test_a_question_is_found():
+    assert asking("x = camera.aperture is None") and not asking("aperture = 1")

@@ -1,0 +1,108 @@
+"""Whatever stands in for another has what the protocol says, with the same parameters."""
+
+import inspect
+
+import pytest
+
+from drgs.accuracy import exact, peak_depths, pixel_lists, pixel_order, ray_colors, unscented
+from drgs.accuracy.sample_points import SamplePoints
+from drgs.cameras import camera, fisheye, motion, orthographic, radial_tangential, thin_lens
+from drgs.effects import defocus, features, occlusion
+from drgs.splatting import image_model, projection, rendering
+
+CLASSES = {
+    image_model.Response: (image_model.AffineResponse, exact.RayResponse, defocus.DimmedResponse),
+    image_model.Positions: (image_model.PixelCenters, SamplePoints),
+    image_model.Features: (
+        image_model.SplatFeatures,
+        occlusion.OccludedFeatures,
+        ray_colors.RayColors,
+    ),
+    rendering.Order: (rendering.CenterOrder, pixel_order.PixelOrder),
+    pixel_lists.PeakDepths: (
+        peak_depths.AffineDepths,
+        peak_depths.ParallelDepths,
+        peak_depths.RayDepths,
+    ),
+    camera.Lens: (
+        camera.Pinhole,
+        radial_tangential.RadialTangential,
+        fisheye.Fisheye,
+        orthographic.Orthographic,
+    ),
+    camera.Aperture: (thin_lens.RoundAperture,),
+    camera.Shutter: (motion.MotionBlur, motion.RollingShutter),
+}
+
+FUNCTIONS = {
+    projection.Projection: (
+        projection.ewa,
+        exact.exact,
+        exact.ewa_with_depth,
+        unscented.unscented,
+        unscented.unscented_with_depth,
+        defocus.Defocused(projection.ewa),
+    ),
+    projection.OpacityRule: (projection.plain_opacity, projection.compensated_opacity),
+    projection.SplatColor: (projection.color_at_mean, ray_colors.stored_coefficients),
+    rendering.Feature: (
+        rendering.color_features,
+        rendering.depth_feature,
+        features.normal_features,
+        features.NamedFeature("roughness"),
+    ),
+}
+
+
+def pairs(table):
+    return [(protocol, one) for protocol, found in table.items() for one in found]
+
+
+def members(protocol):
+    """Its own names, and those of its annotations."""
+    names = {**vars(protocol), **inspect.get_annotations(protocol)}
+    return {name for name in names if not name.startswith("_")}
+
+
+def parameters(function):
+    return [name for name in inspect.signature(function).parameters if name != "self"]
+
+
+def missing(protocol, implementation):
+    """Names that it lacks, has the protocol's empty body for, or that take other parameters."""
+    fields = getattr(implementation, "__dataclass_fields__", {})
+    found = []
+    for name in sorted(members(protocol)):
+        wanted = vars(protocol).get(name)
+        own = getattr(implementation, name, None)
+        if own is None:
+            if name not in fields:
+                found.append(name)
+        elif inspect.isfunction(wanted):
+            empty = "..." in inspect.getsource(wanted) and own is wanted
+            if empty or parameters(own) != parameters(wanted):
+                found.append(name)
+    return found
+
+
+@pytest.mark.parametrize(("protocol", "implementation"), pairs(CLASSES))
+def test_a_class_has_what_its_protocol_says(protocol, implementation):
+    assert len(members(protocol)) >= 3
+    assert missing(protocol, implementation) == []
+
+
+@pytest.mark.parametrize(("protocol", "function"), pairs(FUNCTIONS))
+def test_a_function_takes_what_its_protocol_says(protocol, function):
+    assert parameters(function) == parameters(protocol.__call__)
+
+
+def test_what_is_missing_is_found():
+    assert "view_direction" in missing(camera.Lens, thin_lens.RoundAperture)
+    assert "camera_of" in missing(camera.Shutter, motion.Motion)
+    assert "frustum" in missing(camera.Perspective, orthographic.Orthographic)
+    assert "at" in missing(pixel_lists.PeakDepths, image_model.SplatFeatures)
+
+
+@pytest.mark.parametrize("lens", [camera.Pinhole, radial_tangential.RadialTangential])
+def test_lenses_with_slopes_know_those_of_their_film(lens):
+    assert missing(camera.Perspective, lens) == []
