@@ -8,7 +8,7 @@ import pytest
 from conftest import REPOSITORY
 from support.helpers import FLOAT32, Case, device_camera, device_gaussians
 
-from drgs.accuracy.exact import RayResponse, exact
+from drgs.accuracy.exact import RayResponse, exact_shape
 from drgs.cameras.thin_lens import RoundAperture
 from drgs.effects.compose import composed, ignoring
 from drgs.effects.defocus import Defocused, DimmedResponse
@@ -33,11 +33,11 @@ def test_what_is_not_called_for_leaves_the_pipeline_as_it_is(scene):
 
 def test_an_aperture_wraps_the_projection_and_the_response(scene):
     gaussians, camera = scene
-    pipeline = rendering.Pipeline(0, shape=exact, model=ImageModel(response=RayResponse()))
+    pipeline = rendering.Pipeline(0, shape=exact_shape, model=ImageModel(response=RayResponse()))
     found = composed(pipeline, gaussians, replace(camera, aperture=APERTURE))
-    assert found.shape == Defocused(exact)
+    assert found.shape == Defocused(exact_shape)
     assert found.model.response == DimmedResponse(RayResponse())
-    assert replace(found, shape=exact, model=pipeline.model) == pipeline
+    assert replace(found, shape=exact_shape, model=pipeline.model) == pipeline
 
 
 def test_a_filter_changes_the_gaussians_first(scene):

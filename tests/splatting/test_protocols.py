@@ -37,9 +37,9 @@ CLASSES = {
 FUNCTIONS = {
     projection.Projection: (
         projection.ewa,
-        exact.exact,
+        exact.exact_shape,
         exact.ewa_with_depth,
-        unscented.unscented,
+        unscented.unscented_shape,
         unscented.unscented_with_depth,
         defocus.Defocused(projection.ewa),
     ),
