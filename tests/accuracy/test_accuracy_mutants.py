@@ -12,7 +12,8 @@ import pytest
 from support import approximation_checks as checks
 from support.detectors import MutationChecks, detectors, find_noticed
 from support.helpers import FLOAT64
-from support.mutants import ALWAYS, AT_EQUALITY, Instrumented, Switchboard
+from support.instrumented import Instrumented
+from support.mutants import ALWAYS, AT_EQUALITY, Switchboard
 
 from drgs.accuracy import exact, pixel_order, ray_colors
 from drgs.splatting import rendering

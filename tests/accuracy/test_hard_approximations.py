@@ -15,6 +15,7 @@ import drjit as dr
 import numpy as np
 import pytest
 from support.conditioning import U, color_share, opacity_size, rounded_inputs
+from support.hard_cases import EXACT, FAMILIES, bound_of, errors_over_bounds
 from support.helpers import (
     FLOAT32,
     FLOAT64,
@@ -24,7 +25,6 @@ from support.helpers import (
     rows,
     single,
 )
-from test_hard_cases import EXACT, FAMILIES, bound_of, errors_over_bounds
 
 from drgs.accuracy import exact, unscented
 from drgs.accuracy.pipeline import pipeline_of

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from functools import cache
+from dataclasses import replace
 
 import drjit as dr
-import mitsuba as mi
 import numpy as np
 import pytest
-from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 from support.helpers import (
     FLOAT32,
@@ -27,28 +24,16 @@ from support.helpers import (
     rows,
     single,
 )
-from support.lens_scenes import LENSES, LensCase, directions, lens_camera, moved
-from support.views import gradients_of, image_of
-from test_calibrated import (
-    CLOSE,
-    FILM,
-    FISHEYE,
-    OPENCV,
-    PINHOLE,
-    clear_gaussians,
-    splats_scene,
-)
-from test_lenses import keep_bounds, planes_of
-from test_reference_splatting import rotation_about
+from support.lens_checks import keep_bounds, planes_of
+from support.lens_scenes import LENSES, directions, lens_camera, moved
+from support.motion_checks import MovingCase, time_of
+from support.reference_scenes import rotation_about
 
-from drgs.cameras import motion as shutter
-from drgs.cameras.camera import Camera, cameras_in_time
+from drgs.cameras.camera import cameras_in_time
 from drgs.cameras.motion import (
     Motion,
     MotionBlur,
     RollingShutter,
-    rotation_matrix,
-    rotation_vector,
 )
 from drgs.gaussians.parameters import PARAMETER_NAMES
 from drgs.reference import effects
@@ -58,189 +43,14 @@ from drgs.splatting.projection import load_rows
 
 # Those of test_lenses.
 PICTURE = {FLOAT64: 1e-11, FLOAT32: 2e-5}
+
+
 GRADIENTS = {FLOAT64: 1e-12, FLOAT32: 5e-5}
-
-# ----------------------------------------------------------------------------------------------
-# Turns
-# ----------------------------------------------------------------------------------------------
-
-
-def matrices(values, precision) -> object:
-    """Matrix3f of (N, 3, 3)."""
-    from drgs.core.arrays import types_of
-
-    values = np.asarray(values)
-    return types_of(precision.Float).Matrix3f(
-        [[precision.array(values[:, i, j]) for j in range(3)] for i in range(3)]
-    )
-
-
-def turns() -> np.ndarray:
-    """(N, 3), radians: every size from nothing to almost half a turn, about every axis."""
-    rng = np.random.default_rng(0)
-    angles = np.concatenate([[0], 10.0 ** np.arange(-20, 0.4, 0.1), np.linspace(1, 3.1, 50)])
-    at = shutter.SLOWEST * (1 + np.array([-1e-2, -1e-6, 1e-6, 1e-2]))
-    angles = np.concatenate([angles, at])
-    axes = rng.normal(size=(len(angles), 3))
-    axes[:6] = np.concatenate([np.eye(3), -np.eye(3)])
-    axes[-20:-14] = axes[:6]
-    return single(angles[:, None] * axes / np.linalg.norm(axes, axis=1, keepdims=True))
-
-
-@both_precisions
-def test_a_turn_is_the_rotation_of_its_axis_and_angle(precision):
-    actual = np.moveaxis(np.array(rotation_matrix(precision.vectors(turns()))), -1, 0)
-    expected = Rotation.from_rotvec(turns()).as_matrix()
-    # Some roundings of numbers of size one. Measured: 4e-16 and 2e-7.
-    tolerance = {FLOAT64: 2e-15, FLOAT32: 1e-6}[precision]
-    np.testing.assert_allclose(actual, expected, rtol=0, atol=tolerance)
-
-
-@both_precisions
-def test_the_turn_of_a_rotation_is_found_again(precision):
-    rotations = Rotation.from_rotvec(turns()).as_matrix()
-    actual = rows(rotation_vector(matrices(rotations, precision)))
-    angles = np.linalg.norm(turns(), axis=1)
-    # The entries' roundings; next to half a turn, over the sine that tells the axis. Below
-    # SLOWEST the angle is its sine: off by SLOWEST^3 / 6.
-    tolerance = {FLOAT64: 1e-14, FLOAT32: 1e-6}[precision] / np.sin(np.clip(angles, 0.5, 3.1))
-    errors = np.abs(actual - turns()).max(axis=1)
-    assert (errors <= tolerance + (angles < 2 * shutter.SLOWEST) * 2e-13).all()
-
-
-@both_precisions
-def test_turns_are_found_again_from_their_own_rotations(precision):
-    """Both ways, without another computation between them."""
-    angles = np.linalg.norm(turns(), axis=1)
-    kept = turns()[angles < 2.5]
-    again = rows(rotation_vector(rotation_matrix(precision.vectors(kept))))
-    tolerance = {FLOAT64: 3e-13, FLOAT32: 2e-6}[precision]
-    np.testing.assert_allclose(again, kept, rtol=0, atol=tolerance)
-
-
-def test_derivatives_at_no_turn_are_those_of_a_small_one():
-    """(a_x)' = e_x: nothing is divided by an angle of zero."""
-    turn = FLOAT64.vectors(np.zeros((1, 3)))
-    dr.enable_grad(turn)
-    matrix = rotation_matrix(turn)
-    dr.backward(matrix[2, 1] + 10 * matrix[0, 2] + 100 * matrix[1, 0] + 1000 * matrix[0, 0])
-    assert rows(dr.grad(turn)).tolist() == [[1, 10, 100]]
-    rotation = matrices(np.eye(3)[None], FLOAT64)
-    dr.enable_grad(rotation)
-    dr.backward(rotation_vector(rotation).y)
-    gradient = np.array(dr.grad(rotation))[..., 0]
-    np.testing.assert_allclose(gradient, [[0, 0, 0.5], [0, 0, 0], [-0.5, 0, 0]], atol=1e-15)
 
 
 # ----------------------------------------------------------------------------------------------
 # Cameras that move
 # ----------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class MovingCase(LensCase):
-    """A scene before a camera that moves while it is open."""
-
-    turn: float = 0.06  # radians
-    travel: float = 0.1  # scene units
-    samples: int = 3  # of motion blur; 0: rolling shutter
-
-    @property
-    def scene(self) -> tuple[reference.Gaussians, reference.Camera]:
-        """Rotations are rotations to more than single precision: turns are products of them."""
-        gaussians, camera = super().scene
-        rotation = Rotation.from_matrix(camera.rotation).as_matrix()
-        return gaussians, replace(camera, rotation=rotation)
-
-    @property
-    def close_camera(self) -> reference.Camera:
-        """At time 1; float32 values."""
-        rng = np.random.default_rng(7)
-        turned = rotation_about(rng.normal(size=3), self.turn) @ self.camera.rotation
-        travel = rng.normal(size=3)
-        travel *= self.travel / np.linalg.norm(travel)
-        return replace(self.camera, rotation=turned, center=single(self.camera.center + travel))
-
-    def camera_at(self, time) -> reference.Camera:
-        return effects.camera_at(self.camera, self.close_camera, time)
-
-    @property
-    def picture(self) -> reference.Picture:
-        return _picture(self)
-
-    def reference_picture(self, gaussians=None, threshold_width=0.0) -> reference.Picture:
-        gaussians = gaussians or self.gaussians
-        if self.samples:
-            return effects._mean_picture(
-                [
-                    effects.render(
-                        gaussians, self.camera_at((k + 0.5) / self.samples), self.lens,
-                        self.background, threshold_width=threshold_width,
-                    )
-                    for k in range(self.samples)
-                ]
-            )  # fmt: skip
-        return rolling_picture(self, gaussians, threshold_width)
-
-    def device_camera(self, precision) -> Camera:
-        camera = super().device_camera(precision)
-        close = lens_camera(self.close_camera, self.lens, precision)
-        motion = Motion.between(camera, close.rotation, close.center)
-        if self.samples:
-            camera = replace(camera, shutter=MotionBlur(*motion, self.samples))
-        else:
-            camera = replace(camera, shutter=RollingShutter(*motion))
-        dr.make_opaque(camera)
-        return camera
-
-    def frames(self, precision, pipeline=None, gaussians=None) -> tuple[object, list]:
-        """The Gaussians on the device, and a frame for each time."""
-        device = device_gaussians(gaussians or self.gaussians, precision)
-        cameras = cameras_in_time(self.device_camera(precision))
-        return device, [rendering.render(device, c, pipeline or self.pipeline) for c in cameras]
-
-
-@cache
-def _picture(case):
-    return case.reference_picture(threshold_width=case.threshold_width)
-
-
-def time_of(case, mean) -> float:
-    """When the row that shows a mean is read: the root of its row less the time."""
-    return _time_of(case, tuple(mean))
-
-
-@cache
-def _time_of(case, mean) -> float:
-    def behind(time) -> float:
-        camera = case.camera_at(time)
-        point = (mean - camera.center) @ camera.rotation.T
-        return case.lens.film_points(camera, point[None])[0, 1] / case.height - time
-
-    if behind(0) <= 0:
-        return 0.0
-    return 1.0 if behind(1) >= 0 else brentq(behind, 0, 1, xtol=1e-15, rtol=1e-14)
-
-
-def rolling_picture(case, gaussians, threshold_width) -> reference.Picture:
-    """Each splat as a whole at the time of its mean."""
-    single_rows = [
-        reference.Gaussians(**{n: getattr(gaussians, n)[k : k + 1] for n in PARAMETER_NAMES})
-        for k in range(len(gaussians.means))
-    ]
-    cameras = [case.camera_at(time_of(case, mean)) for mean in gaussians.means]
-    splats = [effects.project(*pair, case.lens) for pair in zip(single_rows, cameras, strict=True)]
-    colors = [
-        effects.sh_colors(*pair, case.lens, case.rendered_degree)
-        for pair in zip(single_rows, cameras, strict=True)
-    ]
-    fields = ("means2d", "conics", "opacities", "depths", "visible")
-    columns = {name: np.concatenate([getattr(s, name) for s in splats]) for name in fields}
-    return reference.composite(
-        columns["means2d"], columns["conics"], columns["opacities"], np.concatenate(colors),
-        columns["depths"], columns["visible"], case.background, case.width, case.height,
-        threshold_width,
-    )  # fmt: skip
 
 
 def case_of(name, **others) -> MovingCase:
@@ -254,7 +64,11 @@ KINDS = {
     "rational": LENSES["rational"],
     "fisheye": LENSES["fisheye"],
 }
+
+
 all_kinds = pytest.mark.parametrize("name", KINDS)
+
+
 # The pictures that blurred ones are a mean of have no derivatives of their own.
 kinds_and_samples = pytest.mark.parametrize(
     ("name", "samples"),
@@ -449,6 +263,7 @@ def test_times_are_found_though_the_camera_turns_by_a_third_of_the_film(turn):
 # Derivatives
 # ----------------------------------------------------------------------------------------------
 
+
 # As in test_lenses; brentq finds times to 1e-15, which over the step is 1e-9.
 DIFFERENCES = 1e-6
 
@@ -568,149 +383,3 @@ def test_a_camera_that_moves_quickly_stays_finite(precision, samples, turn, trav
         for parameter in PARAMETER_NAMES:
             values = np.array(getattr(gradients.parameters, parameter))
             assert np.isfinite(values).all() and not values[-3:].any(), parameter
-
-
-# ----------------------------------------------------------------------------------------------
-# Through the plugin
-# ----------------------------------------------------------------------------------------------
-
-
-@pytest.fixture
-def variant():
-    mi.set_variant("llvm_ad_rgb")
-
-
-SENSORS = [
-    replace(sensor, view=replace(FILM, crop=(5, 4, 26, 21)), close=CLOSE, shutter=kind)
-    for sensor in (PINHOLE, OPENCV, FISHEYE)
-    for kind in ("global", "rolling")
-]
-SAMPLES = 3
-
-
-def picture_by_reference(sensor, gaussians, threshold_width=1e-4) -> reference.Picture:
-    """Of the whole film, on black."""
-    camera = replace(sensor.camera, near=0.01)
-    case = PluginCase(
-        "plugin", camera.width, camera.height, 1, lens=sensor.lens, near_camera=camera,
-        far_camera=replace(sensor.close_camera, near=0.01),
-        samples=SAMPLES if sensor.shutter == "global" else 0,
-    )  # fmt: skip
-    return case.reference_picture(gaussians, threshold_width)
-
-
-@dataclass(frozen=True, eq=False)
-class PluginCase(MovingCase):
-    """With cameras of its own, on black. Its hash is its identity."""
-
-    near_camera: reference.Camera = None
-    far_camera: reference.Camera = None
-
-    camera = property(lambda self: self.near_camera)
-    close_camera = property(lambda self: self.far_camera)
-    background = property(lambda self: np.zeros(3))
-
-
-@pytest.mark.parametrize("sensor", SENSORS, ids=lambda s: f"{s.name}, {s.shutter}")
-def test_a_calibrated_sensors_picture_is_that_of_the_reference(variant, sensor):
-    gaussians, picture = clear_gaussians(
-        sensor, lambda gaussians: picture_by_reference(sensor, gaussians)
-    )
-    scene = splats_scene(replace_samples(sensor), gaussians)
-    expected = np.concatenate([picture.image, picture.alpha[..., None]], axis=-1)
-    np.testing.assert_allclose(image_of(scene), expected[sensor.view.window], rtol=0, atol=5e-5)
-    still = image_of(splats_scene(replace(sensor, close=None), gaussians))
-    assert np.abs(still - expected[sensor.view.window]).max() > 0.02
-
-
-def replace_samples(sensor) -> dict:
-    return sensor.dictionary(shutter_samples=SAMPLES)
-
-
-@pytest.mark.parametrize("sensor", SENSORS[:2], ids=lambda s: f"{s.name}, {s.shutter}")
-def test_gradients_add_up_over_the_times(variant, sensor):
-    """Of mi.render, in single precision, against differences of the float64 reference."""
-    gaussians, _ = clear_gaussians(
-        sensor, lambda gaussians: picture_by_reference(sensor, gaussians, threshold_width=1e-3)
-    )
-    rows_of_window, columns = sensor.view.window
-    shape = rows_of_window.stop - rows_of_window.start, columns.stop - columns.start, 4
-    weights = single(np.random.default_rng(1).normal(0, 1, shape))
-    scene = splats_scene(replace_samples(sensor), gaussians)
-    gradients = gradients_of(scene, weights, PARAMETER_NAMES)
-    step = 1e-6
-
-    def loss(sign, direction) -> np.ndarray:
-        picture = picture_by_reference(sensor, moved(gaussians, direction, sign * step))
-        image = np.concatenate([picture.image, picture.alpha[..., None]], axis=-1)
-        return weights * image[sensor.view.window]
-
-    for parameter, direction in directions(gaussians, seed=2).items():
-        expected = np.sum(loss(1, direction) - loss(-1, direction)) / (2 * step)
-        terms = getattr(direction, parameter) * gradients[parameter]
-        assert abs(terms.sum() - expected) <= 2e-5 * np.abs(terms).sum(), parameter
-        assert abs(1.01 * terms.sum() - expected) > 2e-5 * np.abs(terms).sum(), parameter
-
-
-@pytest.mark.parametrize("sensor", SENSORS[:2], ids=lambda s: f"{s.name}, {s.shutter}")
-def test_forward_derivatives_of_a_moving_camera_are_the_transpose(variant, sensor):
-    gaussians, _ = clear_gaussians(
-        sensor, lambda gaussians: picture_by_reference(sensor, gaussians)
-    )
-    scene = splats_scene(replace_samples(sensor), gaussians)
-    weights = single(np.random.default_rng(1).normal(0, 1, image_of(scene).shape))
-    gradients = gradients_of(scene, weights, PARAMETER_NAMES)
-    for parameter, direction in directions(gaussians, seed=2).items():
-        # A new scene: the derivatives that were accumulated would be taken for directions.
-        fresh = splats_scene(replace_samples(sensor), gaussians)
-        params = mi.traverse(fresh)
-        value = params[f"integrator.{parameter}"]
-        dr.enable_grad(value)
-        dr.set_grad(value, type(value)(getattr(direction, parameter).astype(np.float32)))
-        tangent = np.array(dr.forward_to(mi.render(fresh, params))).astype(np.float64)
-        left = weights * tangent
-        right = getattr(direction, parameter) * gradients[parameter]
-        size = np.abs(left).sum() + np.abs(right).sum()
-        assert abs(left.sum() - right.sum()) <= 1e-5 * size, parameter
-
-
-# ----------------------------------------------------------------------------------------------
-# Only what the scene calls for
-# ----------------------------------------------------------------------------------------------
-
-RENDERING = """
-import sys
-sys.modules["drgs." + {blocked!r}] = None  # importing it raises ImportError
-import mitsuba as mi
-mi.set_variant("llvm_ad_rgb")
-import drgs
-import numpy as np
-splats = {{
-    "type": "splats", "means": mi.TensorXf(np.zeros((1, 3), np.float32)),
-    "quats": mi.TensorXf(np.ones((1, 4), np.float32)),
-    "log_scales": mi.TensorXf(np.full((1, 3), -2, np.float32)),
-    "logit_opacities": mi.TensorXf(np.ones(1, np.float32)),
-    "sh0": mi.TensorXf(np.ones((1, 1, 3), np.float32)),
-    "shN": mi.TensorXf(np.zeros((1, 0, 3), np.float32)),
-}}
-film = {{"type": "hdrfilm", "width": 8, "height": 8}}
-T = mi.ScalarTransform4f
-sensor = {{"to_world": T().translate([0, 0, -2]), "film": film}} | {sensor}
-print(np.array(mi.render(mi.load_dict({{"type": "scene", "i": splats, "s": sensor}}))).max() > 0.1)
-"""
-
-
-MOVES = '"to_world_close": T().translate([0, 0.1, -2])'
-CALLED_FOR = {
-    "lens": ('{"type": "calibrated", "lens": "opencv"}', "cameras.radial_tangential"),
-    "orthographic": ('{"type": "orthographic"}', "cameras.orthographic"),
-    "thin lens": ('{"type": "thinlens", "aperture_radius": 0.1}', "effects.defocus"),
-    "moving": (f'{{"type": "calibrated", {MOVES}}}', "cameras.motion"),
-}
-
-
-@pytest.mark.parametrize(("sensor", "module"), CALLED_FOR.values(), ids=CALLED_FOR)
-def test_modules_are_missed_when_a_sensor_calls_for_them(run_python, sensor, module):
-    """That they are not otherwise is in test_summary, as are the kernels without them."""
-    result = run_python(RENDERING.format(blocked=module, sensor=sensor))
-    assert result.returncode != 0 and f"drgs.{module}" in result.stderr, result.stderr

@@ -25,6 +25,7 @@ from support.helpers import (
     rows,
     single,
 )
+from support.lens_checks import covariances, keep_bounds, kernel_gradients, planes_of, tiny_scene
 from support.lens_scenes import (
     LENSES,
     PINHOLE,
@@ -33,9 +34,8 @@ from support.lens_scenes import (
     lens_camera,
     moved,
 )
-from test_lenses import covariances, keep_bounds, kernel_gradients, planes_of, tiny_scene
-from test_reference_effects import camera_at_origin, gaussians_at
-from test_reference_splatting import numeric_gradients
+from support.reference_lenses import camera_at_origin, gaussians_at
+from support.reference_scenes import numeric_gradients
 
 from drgs.accuracy.pipeline import pipeline_of
 from drgs.cameras import thin_lens

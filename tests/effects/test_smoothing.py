@@ -3,12 +3,10 @@
 from dataclasses import replace
 from functools import cache
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
 from plyfile import PlyData, PlyElement
-from support import small_capture as capture
 from support.helpers import (
     FLOAT32,
     FLOAT64,
@@ -28,10 +26,10 @@ from support.helpers import (
     rows,
     single,
 )
+from support.smoothing import rates_of, smoothed_reference
 from support.views import Scene, image_of, tensors
 
 import drgs  # noqa: F401  (registers the plugin)
-from drgs.config.schema import FitConfig
 from drgs.core.errors import UserError
 from drgs.effects.smoothing import baked, smoothed, smoothing_of
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
@@ -42,6 +40,8 @@ from drgs.splatting.projection import load_rows
 # Relative to the largest value of an array. The filter is a sum of squares and a logarithm: a few
 # roundings; pictures and gradients as in test_rendering.
 FILTER = {FLOAT64: 1e-14, FLOAT32: 2e-6}
+
+
 PICTURE = {FLOAT64: 1e-12, FLOAT32: 2e-5}
 
 
@@ -53,20 +53,6 @@ def variant():
 def filter_of(count, seed=0) -> np.ndarray:
     """Standard deviations (N,) from far below to far above the Gaussians' own."""
     return single(10 ** np.random.default_rng([seed, count]).uniform(-4, 0, count))
-
-
-def rates_of(smoothing) -> np.ndarray:
-    """The sampling rates that call for a filter: its variance is 0.2 / rate^2."""
-    return np.sqrt(0.2) / smoothing
-
-
-def smoothed_reference(gaussians: reference.Gaussians, smoothing) -> reference.Gaussians:
-    """Gaussians whose parameters hold the filter."""
-    scales, opacities = reference_effects.smoothing_filter(
-        gaussians.log_scales, gaussians.logit_opacities, rates_of(smoothing)
-    )
-    logits = np.log(opacities) - np.log1p(-opacities)
-    return replace(gaussians, log_scales=np.log(scales), logit_opacities=logits)
 
 
 # ----------------------------------------------------------------------------------------------
@@ -268,9 +254,12 @@ def as_numpy(gaussians: reference.Gaussians) -> Gaussians:
 # Gradients
 # ----------------------------------------------------------------------------------------------
 
+
 # Central differences of the reference with a step of 1e-6: rounding 1e-16 / 1e-6, and a sixth of
 # the third derivative times the step squared. Measured 1e-8.
 STEP, DIFFERENCES = 1e-6, 1e-6
+
+
 GRADIENTS = {FLOAT64: DIFFERENCES, FLOAT32: 2e-4}  # the latter as in test_rendering
 
 
@@ -451,157 +440,3 @@ def test_a_filter_that_no_longer_fits_is_refused_when_parameters_are_updated():
         params[name] = value
     with pytest.raises(ValueError, match=r"smoothing must have the shape \(N\), with N = 20"):
         params.update()
-
-
-# ----------------------------------------------------------------------------------------------
-# Fits
-# ----------------------------------------------------------------------------------------------
-
-GROWING = {"start": 3, "stop": 60, "every": 4, "grad_threshold": 1e-6, "reset_every": 25}
-
-
-def make_trainer(coarse=(), **changes):
-    from drgs.training.trainer import Trainer
-
-    config = FitConfig.model_validate(
-        {
-            "data": {"path": "."},
-            "model": {"smoothing": True, "sh_degree": 1, "sh_increase_every": 1},
-            "densify": GROWING,
-            "iterations": 60,
-            "coarse": list(coarse),
-            **changes,
-        }
-    )
-    return Trainer(config, capture.make_dataset(4, 1), capture.blobs(40))
-
-
-def reference_cameras(views, near=0.2) -> list[reference.Camera]:
-    return [
-        reference.Camera(
-            view.camera_to_world[:3, :3].T, view.center, view.fx, view.fy, view.cx, view.cy,
-            view.width, view.height, near,
-        )
-        for view in views
-    ]  # fmt: skip
-
-
-def expected_filter(means, views) -> np.ndarray:
-    rates = reference_effects.sampling_rates(
-        np.asarray(means, np.float64), reference_cameras(views)
-    )
-    return np.sqrt(0.2) / rates
-
-
-def test_a_fit_keeps_one_filter_for_each_gaussian():
-    """Through changes of the population and resets; in the end it is that of the final means."""
-    trainer = make_trainer()
-    counts = set()
-    for _ in range(14):
-        trainer.step()
-        counts.add(trainer.num_gaussians)
-        gaussians = trainer.gaussians()
-        assert gaussians.smoothing.shape == (gaussians.num_gaussians,)
-        # float32: as in the comparison of the filter above.
-        expected = expected_filter(gaussians.means, capture.make_dataset(4, 1).train)
-        np.testing.assert_allclose(gaussians.smoothing, expected, rtol=2e-5)
-    assert len(counts) == 4  # at 4, 8 and 12
-
-
-def test_a_fit_renders_with_the_filter_that_it_found():
-    """The loss of the first iteration is that of the widened Gaussians."""
-    from drgs.training.stages import view_of
-
-    loss = make_trainer(loss={"dssim_weight": 0.0}).step().loss
-    dataset, start = capture.make_dataset(4, 1), capture.blobs(40)
-    photo = dataset.train[view_of(1, 4, seed=0)]
-    by_reference = reference.Gaussians(
-        **{name: getattr(start, name).astype(np.float64) for name in PARAMETER_NAMES}
-    )
-    widened = smoothed_reference(by_reference, expected_filter(start.means, dataset.train))
-    (camera,) = reference_cameras([photo])
-    picture = reference.render(widened, camera, np.ones(3), 1)
-    # A mean of 2304 numbers in single precision; without the filter it is another.
-    assert loss == pytest.approx(np.abs(picture.image - photo.image).mean(), rel=1e-5)
-    sharp = reference.render(by_reference, camera, np.ones(3), 1)
-    assert np.abs(sharp.image - photo.image).mean() != pytest.approx(loss, rel=1e-4)
-
-
-def test_coarse_stages_have_wider_filters():
-    """Of cameras with larger pixels; found anew when a stage ends."""
-    trainer = make_trainer(coarse=[{"until": 2, "factor": 2}], densify={"start": 50, "stop": 60})
-    widths = []
-    for _ in range(4):
-        trainer.step()
-        widths.append(np.array(trainer.integrator.smoothing))
-    np.testing.assert_allclose(widths[1], widths[0])
-    # The means have moved a little.
-    np.testing.assert_allclose(widths[2], widths[1] / 2, rtol=0.02)
-
-
-@pytest.mark.parametrize("pause", [3, 4, 5, 11])
-def test_a_fit_that_is_resumed_ends_in_the_same_bytes(pause):
-    """Just before a change of the population, at it, after it, and later."""
-    uninterrupted, first = make_trainer(), make_trainer()
-    for _ in range(pause):
-        first.step()
-    second = make_trainer()
-    second.restore(first.state())
-    for _ in range(14):
-        uninterrupted.step()
-    while second.iteration < 14:
-        second.step()
-    expected, got = uninterrupted.gaussians(), second.gaussians()
-    assert expected.num_gaussians != 40
-    for name in (*PARAMETER_NAMES, "smoothing"):
-        assert getattr(got, name).tobytes() == getattr(expected, name).tobytes(), name
-
-
-def test_no_iteration_after_the_first_compiles_a_kernel():
-    trainer = make_trainer(densify={"start": 50, "stop": 60})
-    seen = set()
-    for iteration in range(6):
-        with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
-            dr.kernel_history_clear()
-            trainer.step()
-            trainer.watch.check()
-            hashes = {kernel["hash"] for kernel in dr.kernel_history([dr.KernelType.JIT])}
-        assert iteration < 3 or hashes <= seen, iteration
-        seen |= hashes
-
-
-FITS = """
-import sys
-from drgs import fit
-for name, *options in {runs!r}:
-    fit.main([{config!r}, "--out", {out!r} + "/" + name, *options])
-    print(name, "drgs.effects.smoothing" in sys.modules)
-"""
-
-
-@pytest.mark.slow
-def test_a_fit_writes_the_filter_or_what_it_makes_of_the_gaussians(run_python, tmp_path):
-    """And imports nothing of it where it is not asked for: the first of three."""
-    capture.write_dataset(tmp_path / "data", capture.make_dataset(3, 1))
-    config = tmp_path / "small.yml"
-    config.write_text(
-        f"data: {{path: {tmp_path / 'data'}}}\ninit: {{num_points: 30, half_extent: 1.0}}\n"
-        "iterations: 2\noutput: {save_renders: false}\n"
-    )
-    asked = ("--set", "model.smoothing=true")
-    runs = [
-        ("without",),
-        ("with", *asked),
-        ("baked", *asked, "--set", "output.bake_smoothing=true"),
-    ]
-    result = run_python(FITS.format(config=str(config), out=str(tmp_path), runs=runs))
-    assert result.returncode == 0, result.stderr
-    lines = result.stdout.splitlines()
-    assert "without False" in lines and "with True" in lines and "baked True" in lines
-    written = {name: Gaussians.load(tmp_path / name / "point_cloud.ply") for name, *_ in runs}
-    assert written["without"].smoothing is written["baked"].smoothing is None
-    expected = baked(written["with"])
-    for name in PARAMETER_NAMES:
-        actual = getattr(written["baked"], name)
-        np.testing.assert_array_equal(actual, getattr(expected, name), err_msg=name)
-    assert (written["baked"].log_scales > written["with"].log_scales).all()

@@ -4,7 +4,7 @@ import drjit as dr
 import numpy as np
 import pytest
 from support.helpers import both_precisions, relative_errors, rows, single
-from test_reference_splatting import legendre_sh_basis
+from support.reference_scenes import legendre_sh_basis
 
 from drgs.gaussians import sh
 from drgs.reference import splatting as reference

@@ -10,9 +10,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from support.lens_scenes import points_at
-from support.views import VIEWS, Scene, View, clear, gradient, image_of, tensors
-from test_calibrated import (
+from support.calibrated_sensors import (
     CLOSE,
     FISHEYE,
     OPENCV,
@@ -23,8 +21,10 @@ from test_calibrated import (
     own_camera,
     own_sensor,
 )
-from test_splats import GRADIENTS, PICTURE, write_gaussians
-from test_splats import XYZ as TO_XYZ
+from support.lens_scenes import points_at
+from support.splats_checks import GRADIENTS, PICTURE, write_gaussians
+from support.splats_checks import XYZ as TO_XYZ
+from support.views import VIEWS, Scene, View, clear, gradient, image_of, tensors
 
 import drgs  # noqa: F401  (registers the plugins)
 from drgs.gaussians.parameters import PARAMETER_NAMES

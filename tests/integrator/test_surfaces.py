@@ -1,144 +1,40 @@
 """Surfaces that Mitsuba renders, between splats: against the float64 reference and differences."""
 
-import gc
-import weakref
-from dataclasses import dataclass, replace
-from functools import cache
+from dataclasses import replace
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from support.helpers import bitwise
 from support.views import (
     VIEWS,
     Scene,
-    clear,
     gradient,
-    gradients_of,
     image_of,
     tensors,
-    to_linear,
+)
+from support.walls import (
+    PICTURE,
+    RADIANCE,
+    SCENE,
+    SKY,
+    WALL,
+    Wall,
+    apart,
+    blob,
+    expected,
+    load,
+    rgba,
 )
 
 import drgs  # noqa: F401  (registers the plugins)
-from drgs.gaussians.parameters import PARAMETER_NAMES
-from drgs.reference import splatting as reference
-from drgs.reference.effects import render_with_surface
 
-# As in test_splats: single precision, relative to the largest value of an array. Conversions to
-# display space multiply errors of dark pixels by up to 13.
-PICTURE, GRADIENTS = 2e-5, 1e-4
-
-STEP = 1e-6
-
-RADIANCE = np.array([0.25, 0.5, 1.5])
-SKY = np.array([0.75, 0.125, 0.5])
-
-SCENE = Scene(VIEWS[1])
 CROPPED = Scene(VIEWS[12])
 
 
 @pytest.fixture(scope="module", autouse=True)
 def variant():
     mi.set_variant("llvm_ad_rgb")
-
-
-# ----------------------------------------------------------------------------------------------
-# Scenes
-# ----------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class Wall:
-    """A rectangle that shines, tilted, before a camera: what ``path`` makes of it is known."""
-
-    z: float = 2.3  # in the middle of the film, scene units
-    tilt: tuple[float, float] = (0.3, -0.2)  # slopes of z along x and y
-    half: float = 20.0  # side, scene units: 20 covers the film
-
-    def axes(self) -> np.ndarray:
-        """(3, 3): right, up and the normal, towards the camera; camera axes."""
-        right = np.array([1, 0, self.tilt[0]])
-        normal = np.cross(right, [0, 1, self.tilt[1]])
-        normal *= -np.sign(normal[2])
-        right, normal = right / np.linalg.norm(right), normal / np.linalg.norm(normal)
-        return np.stack([right, np.cross(normal, right), normal])
-
-    def shape(self, camera, **others) -> dict:
-        """For ``mi.load_dict``."""
-        to_world = np.eye(4)
-        to_world[:3, :3] = camera.rotation.T @ (self.axes().T * [self.half, self.half, 1])
-        to_world[:3, 3] = camera.rotation.T @ [0, 0, self.z] + camera.center
-        emitter = {"type": "area", "radiance": {"type": "rgb", "value": list(RADIANCE)}}
-        to_world = mi.ScalarTransform4f(to_world)
-        return {"type": "rectangle", "to_world": to_world, "emitter": emitter, **others}
-
-    def depth(self, camera) -> np.ndarray:
-        """(H, W): of the plane, at the pixels' centres."""
-        y, x = np.mgrid[: camera.height, : camera.width] + 0.5
-        slopes = np.stack([(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy], axis=-1)
-        normal = self.axes()[2]
-        return normal[2] * self.z / (slopes @ normal[:2] + normal[2])
-
-
-WALL = Wall()
-
-
-def load(scene, sensor=None, wall=WALL, sky=False, shapes=None, **others):
-    """A Mitsuba scene; others: settings of the integrator."""
-    objects = {} if wall is None else {"wall": wall.shape(scene.view.camera)}
-    if sky:
-        radiance = {"type": "rgb", "value": list(SKY)}
-        objects["sky"] = {"type": "constant", "radiance": radiance}
-    integrator = scene.settings | tensors(scene.gaussians) | others
-    sensor = sensor or scene.view.sensor()
-    objects |= {"integrator": integrator, "sensor": sensor, **(shapes or {})}
-    return mi.load_dict({"type": "scene", **objects})
-
-
-@cache
-def apart(scene: Scene) -> Scene:
-    """With the first seed of which no pixel is near a threshold, nor a splat near the wall."""
-    for seed in range(scene.seed, scene.seed + 200):
-        candidate = clear(replace(scene, seed=seed))
-        depths = reference.project(candidate.gaussians, candidate.camera).depths
-        gaps = np.abs(depths[:, None] - WALL.depth(candidate.camera).ravel())
-        if gaps.min() > 1e-5:  # float32 places a wall at 2 to 1e-6
-            return candidate
-    raise AssertionError("no seed among 200")
-
-
-def to_display(linear) -> np.ndarray:
-    """IEC 61966-2-1."""
-    linear = np.asarray(linear)
-    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
-
-
-def expected(scene, gaussians=None, wall=WALL, coverage=1.0, sky=None) -> dict[str, np.ndarray]:
-    """Planes of the window: color (RGB as the integrator has it), alpha, depth, share."""
-    camera = scene.camera
-    depth = wall.depth(camera)
-    coverage = np.broadcast_to(coverage, depth.shape)
-    picture = render_with_surface(gaussians or scene.gaussians, camera, depth, coverage)
-    share = coverage * picture.before
-    linear = scene.srgb_primitives
-    decode, encode = (to_linear, np.asarray) if linear else (np.asarray, to_display)
-    behind = decode(scene.background) if sky is None else encode(sky)
-    color = decode(picture.color) + share[..., None] * encode(RADIANCE)
-    planes = {
-        "color": color + picture.transmittance[..., None] * behind,
-        "alpha": 1 - picture.transmittance if sky is None else np.ones_like(share),
-        "depth": picture.depth + share * depth,
-        "share": share,
-        "transmittance": picture.transmittance,
-    }
-    return {name: plane[scene.view.window] for name, plane in planes.items()}
-
-
-def rgba(scene, **arguments) -> np.ndarray:
-    planes = expected(scene, **arguments)
-    return np.concatenate([planes["color"], planes["alpha"][..., None]], axis=-1)
 
 
 # ----------------------------------------------------------------------------------------------
@@ -428,248 +324,6 @@ def test_numbers_of_the_host_count_too():
     loaded.integrator().memory.traced.clear()
     np.testing.assert_array_equal(after, image_of(loaded))
     assert np.abs(after - before).max() > 0.01
-
-
-# ----------------------------------------------------------------------------------------------
-# Derivatives
-# ----------------------------------------------------------------------------------------------
-
-RADIANCE_KEY = "wall.emitter.radiance.value"
-
-
-def weights_of(scene, seed=1) -> np.ndarray:
-    return scene.weights(seed)
-
-
-@pytest.mark.parametrize("srgb_primitives", [False, True])
-def test_gradients_equal_differences_of_the_reference(srgb_primitives):
-    """Along a random direction of each parameter; the wall stays."""
-    scene = apart(replace(SCENE, srgb_primitives=srgb_primitives))
-    weights = weights_of(scene)
-    actual = gradients_of(load(scene), weights, PARAMETER_NAMES)
-    rng = np.random.default_rng(5)
-    for name in PARAMETER_NAMES:
-        value = getattr(scene.gaussians, name)
-        direction = rng.normal(0, 1, value.shape)
-        losses = []
-        for sign in (1, -1):
-            moved = replace(scene.gaussians, **{name: value + sign * STEP * direction})
-            losses.append(np.sum(weights * rgba(scene, gaussians=moved)))
-        terms = actual[name].reshape(direction.shape) * direction
-        size = np.abs(terms).sum()
-        assert size > 0
-        difference = (losses[0] - losses[1]) / (2 * STEP)
-        assert terms.sum() == pytest.approx(difference, abs=GRADIENTS * size), name
-
-
-def test_the_gradient_of_what_the_wall_shows_is_its_share():
-    scene = replace(apart(SCENE), srgb_primitives=True)
-    weights = weights_of(scene)
-    loaded = load(scene)
-    params = mi.traverse(loaded)
-    dr.enable_grad(params[RADIANCE_KEY])
-    image = mi.render(loaded, params)
-    dr.backward(dr.sum(image * mi.TensorXf(weights.astype(np.float32)), axis=None))
-    share = expected(scene)["share"]
-    terms = share[..., None] * weights[..., :3]
-    np.testing.assert_allclose(
-        gradient(params[RADIANCE_KEY]), terms.sum(axis=(0, 1)), atol=GRADIENTS * np.abs(terms).sum()
-    )
-
-
-@pytest.mark.parametrize("srgb_primitives", [False, True])
-def test_forward_mode_is_the_transpose_of_the_gradients(srgb_primitives):
-    """Of the splats, what the wall shows, and the environment past its edges."""
-    scene = apart(replace(SCENE, srgb_primitives=srgb_primitives))
-    weights = weights_of(scene)
-    keys = [f"integrator.{name}" for name in PARAMETER_NAMES]
-    keys += [RADIANCE_KEY, "sky.radiance.value"]
-    wall = Wall(half=0.5)
-
-    def attached():
-        loaded = load(scene, wall=wall, sky=True, nested_spp=16)
-        params = mi.traverse(loaded)
-        for key in keys:
-            dr.enable_grad(params[key])
-        return loaded, params
-
-    loaded, params = attached()
-    image = mi.render(loaded, params, seed=1, seed_grad=2)
-    dr.backward(dr.sum(image * mi.TensorXf(weights.astype(np.float32)), axis=None))
-    gradients = {key: gradient(params[key]) for key in keys}
-
-    rng = np.random.default_rng(7)
-    loaded, params = attached()
-    total = size = 0.0
-    for key in keys:
-        direction = rng.normal(0, 1, gradients[key].shape).astype(np.float32)
-        dr.set_grad(params[key], type(params[key])(direction))
-        terms = gradients[key] * direction
-        assert np.abs(terms).sum() > 0, key
-        total, size = total + terms.sum(), size + np.abs(terms).sum()
-    # Forward mode's own seed is seed_grad as well.
-    tangent = dr.forward_to(mi.render(loaded, params, seed=1, seed_grad=2))
-    tangent = np.array(tangent).astype(np.float64)
-    assert np.sum(tangent * weights) == pytest.approx(total, abs=GRADIENTS * size)
-
-
-def test_gradients_are_the_same_to_the_last_bit():
-    scene = apart(SCENE)
-    runs = [gradients_of(load(scene), weights_of(scene), PARAMETER_NAMES) for _ in range(2)]
-    assert bitwise(list(runs[0].values())) == bitwise(list(runs[1].values()))
-
-
-def blob(center) -> dict:
-    """One of Mitsuba's own Gaussians."""
-    return {
-        "type": "ellipsoids",
-        "centers": mi.TensorXf(np.float32([center])),
-        "scales": mi.TensorXf(np.float32([[0.3, 0.3, 0.3]])),
-        "quaternions": mi.TensorXf(np.float32([[0, 0, 0, 1]])),
-        "opacities": mi.TensorXf(np.float32([[0.75]])),
-        "sh_coeffs": mi.TensorXf(np.float32([[1, 1, 1]])),
-    }
-
-
-# ----------------------------------------------------------------------------------------------
-# What runs, and when
-# ----------------------------------------------------------------------------------------------
-
-
-def counting():
-    """``path``, that counts its pictures."""
-
-    class Counting(mi.SamplingIntegrator):
-        def __init__(self, props):
-            super().__init__(props)
-            self.path = mi.load_dict({"type": "path"})
-            self.count = 0
-
-        def render(self, *arguments, **named):
-            self.count += 1
-            return self.path.render(*arguments, **named)
-
-    mi.register_integrator("counting", lambda props: Counting(props))
-    return mi.load_dict({"type": "counting"})
-
-
-def test_a_scene_without_surfaces_never_runs_the_nested_integrator():
-    nested = counting()
-    scene = load(SCENE, wall=None, sky=True, nested=nested)
-    image_of(scene)
-    assert nested.count == 0
-    image_of(load(SCENE, nested=nested))
-    assert nested.count == 1
-
-
-@pytest.mark.parametrize("use", ["a picture", "a gradient", "a picture with gradients"])
-@pytest.mark.parametrize("with_shapes", [False, True])
-def test_a_scene_is_freed_when_nobody_holds_it(use, with_shapes):
-    """Though its integrator keeps what it saw of it."""
-    loaded = load(SCENE, sky=True, shapes={"blob": blob([0, 0, 0])} if with_shapes else {})
-    params = mi.traverse(loaded)
-    if use != "a picture":
-        dr.enable_grad(params["integrator.means"], params[RADIANCE_KEY])
-    image = mi.render(loaded, params)
-    if use == "a gradient":
-        dr.backward(dr.mean(image, axis=None))
-    integrator = weakref.ref(loaded.integrator())
-    del loaded, params, image
-    gc.collect()
-    assert integrator() is None
-
-
-def test_samples_of_the_nested_integrator_are_not_those_of_the_splats():
-    """Whatever the nested integrator writes into the sensor's sampler."""
-    scene, weights = apart(SCENE), weights_of(SCENE)
-    loaded = load(scene, nested_spp=16)
-    pictures = [image_of(loaded) for _ in range(2)]
-    np.testing.assert_array_equal(*pictures)
-    gradients = [gradients_of(loaded, weights, ["means"])["means"] for _ in range(2)]
-    np.testing.assert_array_equal(gradients[1], 2 * gradients[0])  # they are accumulated
-    assert loaded.sensors()[0].sampler().sample_count() == 1
-
-
-@pytest.mark.parametrize("mode", ["backward", "forward"])
-def test_derivatives_of_a_surface_leave_the_number_of_samples(mode):
-    loaded = load(apart(SCENE), nested_spp=16)
-    params = mi.traverse(loaded)
-    dr.enable_grad(params[RADIANCE_KEY])
-    dr.set_grad(params[RADIANCE_KEY], 1)
-    image = mi.render(loaded, params)
-    derivative = dr.backward if mode == "backward" else dr.forward_to
-    derivative(image)
-    assert loaded.sensors()[0].sampler().sample_count() == 1
-
-
-def test_a_nested_integrator_can_be_given():
-    """``direct`` does not see a light by way of another surface."""
-    scene = load(apart(SCENE), nested=mi.load_dict({"type": "direct"}))
-    np.testing.assert_allclose(
-        image_of(scene), image_of(load(apart(SCENE))), rtol=0, atol=PICTURE * 2
-    )
-    assert "nested = " in str(scene.integrator())
-
-
-@pytest.mark.parametrize("spp", [0, 4], ids=["its sampler's", "given"])
-def test_samples_of_the_nested_integrator_are_left_to_it(spp):
-    """Mitsuba's integrators leave their count with the sampler: the next picture is the same."""
-    loaded = load(apart(SCENE), wall=Wall(half=0.5), nested_spp=16)
-    first = image_of(loaded, spp=spp, seed=3)
-    assert loaded.sensors()[0].sampler().sample_count() == 1
-    loaded.integrator().memory.rendered.clear()
-    np.testing.assert_array_equal(image_of(loaded, spp=spp, seed=3), first)
-
-
-def test_gradients_are_those_of_the_picture_whatever_the_nested_samples():
-    """Of splats at the centres of pixels, before a wall that covers the film and has no noise."""
-    scene, weights = apart(SCENE), weights_of(SCENE)
-    alone = gradients_of(load(scene), weights, ["means"])["means"]
-    with_more = gradients_of(load(scene, nested_spp=16), weights, ["means"])["means"]
-    np.testing.assert_allclose(with_more, alone, rtol=0, atol=GRADIENTS * np.abs(alone).max())
-
-
-def test_a_wall_that_has_moved_is_seen_where_it_is():
-    scene = apart(SCENE)
-    loaded = load(scene)
-    image_of(loaded)
-    params = mi.traverse(loaded)
-    other = mi.load_dict(Wall(z=2.9).shape(scene.camera))
-    params["wall.to_world"] = mi.traverse(other)["to_world"]
-    params.update()
-    np.testing.assert_array_equal(image_of(loaded), image_of(load(scene, wall=Wall(z=2.9))))
-
-
-def test_a_picture_in_between_does_not_change_the_gradients():
-    scene, weights = apart(SCENE), weights_of(SCENE)
-    loaded = load(scene)
-    expected = gradients_of(loaded, weights, ["means"])["means"]
-    loaded, other = load(scene), load(scene, wall=Wall(z=2.9))
-    params = mi.traverse(loaded)
-    dr.enable_grad(params["integrator.means"])
-    image = mi.render(loaded, params)
-    mi.render(other, integrator=loaded.integrator())
-    dr.backward(dr.sum(image * mi.TensorXf(weights.astype(np.float32)), axis=None))
-    np.testing.assert_array_equal(gradient(params["integrator.means"]), expected)
-
-
-def test_gaussians_of_shapes_are_splats_and_no_surfaces():
-    """As if they were the integrator's own; they are left out of the nested picture."""
-    scene = apart(SCENE)
-    center = scene.camera.rotation.T @ [0, 0, 1.5] + scene.camera.center
-    one = {
-        "means": center,
-        "quats": [1, 0, 0, 0],
-        "log_scales": np.log([0.3] * 3),
-        "logit_opacities": np.log(3),
-        "sh0": np.ones((1, 3)),
-        "shN": np.zeros((3, 3)),
-    }
-    together = {n: np.concatenate([v, [one[n]]]) for n, v in vars(scene.gaussians).items()}
-    image = image_of(load(scene, shapes={"blob": blob(center)}))
-    expected = image_of(load(scene, **tensors(reference.Gaussians(**together))))
-    np.testing.assert_allclose(image, expected, atol=PICTURE * expected.max())
-    assert np.abs(image - image_of(load(scene))).max() > 0.1
 
 
 # ----------------------------------------------------------------------------------------------

@@ -38,7 +38,8 @@ from support.helpers import (
     single,
     stacked_scene,
 )
-from support.mutants import ALWAYS, AT_EQUALITY, NEGATED, NEVER, SCALED, Instrumented, Switchboard
+from support.instrumented import Instrumented
+from support.mutants import ALWAYS, AT_EQUALITY, NEGATED, NEVER, SCALED, Switchboard
 
 from drgs.gaussians.parameters import PARAMETER_NAMES
 from drgs.reference import splatting as reference

@@ -16,7 +16,7 @@ from support.helpers import (
     rows,
     single,
 )
-from test_reference_splatting import needle
+from support.reference_scenes import needle
 
 from drgs.core import constants
 from drgs.gaussians.parameters import PARAMETER_NAMES

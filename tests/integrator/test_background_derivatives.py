@@ -1,0 +1,355 @@
+"""Derivatives of what is behind splats, and of the splats before it."""
+
+from dataclasses import replace
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from support.backgrounds import (
+    EMITTERS,
+    VIEW,
+    Camera,
+    attached,
+    integrator_of,
+    load,
+    picture,
+    splats_alone,
+    texels,
+)
+from support.helpers import single
+from support.views import VIEWS, Scene, image_of
+
+import drgs  # noqa: F401  (registers the plugins)
+from drgs.core.arrays import from_host
+from drgs.gaussians.parameters import PARAMETER_NAMES
+from drgs.reference import splatting as reference
+
+
+@pytest.fixture(scope="module", autouse=True)
+def variant():
+    mi.set_variant("llvm_ad_rgb")
+
+
+def tensor(values):
+    values = np.asarray(values)
+    return mi.TensorXf(from_host(mi.Float, values), values.shape)
+
+
+def weights_of(loaded, seed=1) -> np.ndarray:
+    return single(np.random.default_rng(seed).normal(size=image_of(loaded).shape))
+
+
+def scene_with(kind, srgb_primitives=True, camera=None, **settings):
+    """A scene with a background of a kind, and the name of its parameter."""
+    sensor, gaussians = (camera or Camera()).dictionary(), Scene().gaussians
+    settings = {"srgb_primitives": srgb_primitives, **settings}
+    if kind == "picture":
+        settings["background"] = picture(texels(6, 8), filter_type="bilinear")
+        return load(sensor, integrator_of(gaussians, **settings)), "integrator.background.data"
+    loaded = load(sensor, integrator_of(gaussians, **settings), sky=EMITTERS[kind]())
+    return loaded, "sky.radiance.value" if kind == "constant" else "sky.data"
+
+
+def gradient_of(loaded, key, weights) -> np.ndarray:
+    params, leaves = attached(loaded, key)
+    dr.backward(dr.sum(mi.render(loaded, params) * tensor(weights), axis=None))
+    return np.array(dr.grad(leaves[key])).astype(np.float64)
+
+
+def like(parameter, values):
+    """Numbers as a value of a parameter: of a colour, of a flat array, of a tensor."""
+    values = np.asarray(values, np.float32)
+    if isinstance(parameter, mi.Color3f):
+        return mi.Color3f(values.ravel().tolist())
+    flat = from_host(mi.Float, values)
+    return flat if isinstance(parameter, mi.Float) else mi.TensorXf(flat, values.shape)
+
+
+KINDS = ["constant", "envmap", "picture"]
+
+
+all_kinds = pytest.mark.parametrize("kind", KINDS)
+
+
+@all_kinds
+@pytest.mark.parametrize("srgb_primitives", [True, False], ids=["linear", "display"])
+def test_derivatives_of_the_radiance_are_differences(kind, srgb_primitives):
+    """Along random directions. In linear radiance the picture is linear in it: any step is exact
+    up to rounding; in display space a step of 1e-2 leaves its square.
+    """
+    loaded, key = scene_with(kind, srgb_primitives)
+    weights = weights_of(loaded)
+    gradient = gradient_of(loaded, key, weights)
+    start = np.array(mi.traverse(loaded)[key])
+    rng, step = np.random.default_rng(3), 0.01
+    for _ in range(3):
+        direction = (np.sign(gradient) * np.abs(rng.normal(size=gradient.shape))).astype(np.float32)
+        both = []
+        for sign in (1, -1):
+            params = mi.traverse(loaded)
+            params[key] = like(params[key], start + np.float32(sign * step) * direction)
+            params.update()
+            both.append(np.sum(weights * image_of(loaded)))
+        difference = (both[0] - both[1]) / (2 * step)
+        assert np.sum(gradient * direction) == pytest.approx(difference, rel=3e-3)
+    assert np.abs(gradient).max() > 0
+
+
+def batch_of(first, second, width) -> dict:
+    """Two views of one size, side by side."""
+    film = first["film"] | {"width": 2 * width}
+    return {"type": "batch", "film": film, "sampler": first["sampler"], "a": first, "b": second}
+
+
+def floor() -> dict:
+    """Behind the splats, in a part of the film."""
+    camera = VIEW.camera
+    matrix = np.eye(4)
+    matrix[:3, :3] = camera.rotation.T @ np.diag([1.0, -1.0, -1.0])
+    matrix[:3, 3] = camera.rotation.T @ [0.5, 0.5, 4] + camera.center
+    reflectance = {"type": "rgb", "value": [0.5, 0.3, 0.2]}
+    return {
+        "type": "rectangle",
+        "to_world": mi.ScalarTransform4f(matrix),
+        "bsdf": {"type": "diffuse", "reflectance": reflectance},
+    }
+
+
+FLOOR = "floor.bsdf.reflectance.value"
+
+
+TWICE = "two pictures", "two losses", "two losses of one graph"
+"""What a factor reaches the backdrop through, more than once."""
+
+
+def factored(way, kind):
+    """A scene, and the parameters that are multiplied by the factor."""
+    if way == "batch":
+        views = [Camera(view).dictionary() for view in (VIEW, VIEWS[2])]
+        sensor = batch_of(*views, VIEW.width)
+    else:
+        sensor = Camera().dictionary()
+    objects, settings = {}, {}
+    if kind == "picture":
+        settings["background"] = picture(texels(6, 8), filter_type="bilinear")
+    else:
+        objects["sky"] = EMITTERS[kind]()
+    keys = [{"constant": "sky.radiance.value", "envmap": "sky.data"}.get(kind, BACKGROUND)]
+    if way.startswith("surface"):
+        objects["floor"] = floor()
+        settings |= {"nested": {"type": "prb", "max_depth": 2}, "nested_spp": 4}
+    if way == "surface of the same":
+        keys.append(FLOOR)
+    if way == "splats of the same":
+        keys.append("integrator.sh0")
+    return load(sensor, integrator_of(Scene().gaussians, **settings), **objects), keys
+
+
+BACKGROUND = "integrator.background.data"
+
+
+@all_kinds
+@pytest.mark.parametrize(
+    "way", [*TWICE, "batch", "surface", "surface of the same", "splats of the same"]
+)
+def test_gradients_reach_what_the_radiance_was_computed_from(way, kind):
+    """A factor of all of it, by central differences, from the same points of the emitters."""
+    loaded, keys = factored(way, kind)
+    start = {key: np.array(mi.traverse(loaded)[key]) for key in keys}
+    count = 2 if way in TWICE else 1
+    weights = single(np.random.default_rng(1).uniform(0.5, 1.5, image_of(loaded).shape))
+
+    def loss(factor, **seeds):
+        params = mi.traverse(loaded)
+        for key, values in start.items():
+            params[key] = like(params[key], values) * factor
+        params.update()
+        pictures = [mi.render(loaded, params, **seeds) for _ in range(count)]
+        return [dr.sum(image * tensor(weights), axis=None) for image in pictures]
+
+    factor = mi.Float(1)
+    dr.enable_grad(factor)
+    losses = loss(factor, seed=1, seed_grad=7)
+    if way == "two losses":
+        dr.backward(losses[0])
+        losses = loss(factor, seed=1, seed_grad=7)[1:]
+    elif way == "two losses of one graph":
+        dr.backward(losses.pop(0), flags=dr.ADFlag.ClearVertices)
+    dr.backward(sum(losses[1:], losses[0]))
+    step = 0.01
+    both = [sum(np.array(one)[()] for one in loss(mi.Float(1 + s), seed=7)) for s in (step, -step)]
+    # Sums of 3404 terms of one sign, in single precision; of pixels in a curved display space and
+    # of what reflects the sky, a step leaves its square.
+    assert dr.grad(factor)[0] == pytest.approx((both[0] - both[1]) / (2 * step), rel=3e-3)
+
+
+def test_the_derivative_of_a_constant_radiance_is_what_passes_the_splats():
+    """By hand, from the transmittance."""
+    loaded, key = scene_with("constant")
+    weights = weights_of(loaded)
+    gradient = gradient_of(loaded, key, weights).ravel()
+    transmittance = 1 - splats_alone(Camera().dictionary(), Scene().gaussians)[..., 3:]
+    expected = np.sum(weights[..., :3] * transmittance, axis=(0, 1))
+    size = np.sum(np.abs(weights[..., :3]) * transmittance, axis=(0, 1))
+    # Sums of 851 terms of both signs.
+    assert (np.abs(gradient - expected) <= 1e-6 * size).all()
+    assert (np.abs(expected) > 1e-3 * size).all()
+
+
+@all_kinds
+def test_derivatives_of_the_gaussians_know_what_is_behind_them(kind):
+    """By the reference: its gradients with respect to colour and transmittance, chained by hand."""
+    scene = Scene()
+    loaded, _ = scene_with(kind)
+    weights = weights_of(loaded)
+    params = mi.traverse(loaded)
+    for name in PARAMETER_NAMES:
+        dr.enable_grad(params[f"integrator.{name}"])
+    dr.backward(dr.sum(mi.render(loaded, params) * tensor(weights), axis=None))
+    nothing = {"integrator.logit_opacities": mi.Float(np.full(40, -20, np.float32))}
+    empty, _ = scene_with(kind)
+    hidden = mi.traverse(empty)
+    for key, value in nothing.items():
+        hidden[key] = value
+    hidden.update()
+    behind = image_of(empty)[..., :3]
+    picture = reference.render(scene.gaussians, scene.camera, np.zeros(3), threshold_width=1e-4)
+    assert not picture.near_threshold.any()
+    covered = 0 if kind != "picture" else 1  # alpha is 1 before an environment
+    d_alpha = covered * weights[..., 3] - np.sum(weights[..., :3] * behind, axis=-1)
+    slope = np.where(
+        picture.image <= 0.04045,
+        1 / 12.92,
+        2.4 / 1.055 * ((np.maximum(picture.image, 0) + 0.055) / 1.055) ** 1.4,
+    )
+    expected = reference.render_gradients(
+        scene.gaussians,
+        scene.camera,
+        np.zeros(3),
+        weights[..., :3] * slope,
+        d_alpha,
+        None,
+        1,
+        False,
+    )
+    for name in PARAMETER_NAMES:
+        actual = np.array(dr.grad(params[f"integrator.{name}"])).astype(np.float64)
+        # As in test_splats.
+        np.testing.assert_allclose(
+            actual, expected[name], atol=1e-4 * np.abs(expected[name]).max(), err_msg=name
+        )
+
+
+@all_kinds
+@pytest.mark.parametrize("srgb_primitives", [True, False], ids=["linear", "display"])
+def test_forward_and_backward_derivatives_are_transposed(kind, srgb_primitives):
+    """Of radiance and Gaussians together."""
+    loaded, key = scene_with(kind, srgb_primitives)
+    keys = [key, "integrator.means", "integrator.sh0", "integrator.logit_opacities"]
+    weights, rng = weights_of(loaded), np.random.default_rng(8)
+
+    scene, _ = scene_with(kind, srgb_primitives)
+    params, leaves = attached(scene, *keys)
+    dr.backward(dr.sum(mi.render(scene, params) * tensor(weights), axis=None))
+    gradients = {k: np.array(dr.grad(leaf)).astype(np.float64) for k, leaf in leaves.items()}
+
+    params, leaves = attached(loaded, *keys)
+    # No two terms of a sum cancel.
+    directions = {
+        k: single(np.sign(g) * np.abs(rng.normal(size=g.shape))) for k, g in gradients.items()
+    }
+    for k, direction in directions.items():
+        dr.set_grad(leaves[k], like(leaves[k], direction))
+    tangent = np.array(dr.forward_to(mi.render(loaded, params))).astype(np.float64)
+    terms = [np.sum(directions[k] * gradients[k]) for k in keys]
+    size = np.abs(weights * tangent).sum()
+    assert np.sum(weights * tangent) == pytest.approx(sum(terms), abs=2e-5 * size)
+    assert min(terms) > 5e-4 * size
+
+
+def test_derivatives_of_a_sensor_see_the_environment_move():
+    """A smooth one, before splats that end nowhere: a quotient in single precision."""
+    y, x = np.mgrid[:32, :64]
+    waves = [np.sin(x / 32 * np.pi), np.cos(y / 32 * np.pi), np.cos(x / 16 * np.pi)]
+    values = (1 + 0.5 * np.stack(waves, axis=-1)).astype(np.float32)
+    settings = {"alpha_cut": 0.0, "extent": 6.0, "transmittance_stop": 0.0}
+
+    def loaded():
+        sky = {"type": "envmap", "bitmap": mi.Bitmap(values)}
+        integrator = integrator_of(Scene().gaussians, **settings)
+        return load(Camera().dictionary(), integrator, sky=sky)
+
+    def moved(scene, turn):
+        params = mi.traverse(scene)
+        matrix = params["sensor.to_world"].matrix
+        params["sensor.to_world"] = mi.Transform4f(matrix).rotate([0.6, -0.48, 0.64], turn)
+        params.update()
+        return params
+
+    scene, turn = loaded(), mi.Float(0)
+    weights = weights_of(scene)
+    dr.enable_grad(turn)
+    params = moved(scene, turn)
+    dr.backward(dr.sum(mi.render(scene, params) * tensor(weights), axis=None))
+    step = 0.05  # degrees
+    both = []
+    for sign in (1, -1):
+        scene = loaded()
+        moved(scene, mi.Float(sign * step))
+        both.append(np.sum(weights * image_of(scene)))
+    difference = (both[0] - both[1]) / (2 * step)
+    assert dr.grad(turn)[0] == pytest.approx(difference, rel=0.01)
+    # Of a constant behind the splats it would be another.
+    plain = load(Camera().dictionary(), integrator_of(Scene().gaussians, **settings))
+    turn = mi.Float(0)
+    dr.enable_grad(turn)
+    params = moved(plain, turn)
+    dr.backward(dr.sum(mi.render(plain, params) * tensor(weights), axis=None))
+    assert dr.grad(turn)[0] != pytest.approx(difference, rel=0.1)
+
+
+def test_pictures_and_constant_radiance_are_the_same_bytes_in_two_runs():
+    """Derivatives of texels are added in any order: they, alone, may differ by rounding."""
+    for kind in KINDS:
+        loaded, key = scene_with(kind)
+        weights = weights_of(loaded)
+        images = [image_of(scene_with(kind)[0]).tobytes() for _ in range(2)]
+        assert images[0] == images[1]
+        names = ["integrator.means", *([key] if kind == "constant" else [])]
+        for name in names:
+            runs = [gradient_of(scene_with(kind)[0], name, weights).tobytes() for _ in range(2)]
+            assert runs[0] == runs[1], (kind, name)
+
+
+def test_a_changed_environment_needs_no_new_frame_and_no_new_kernel():
+    loaded, key = scene_with("constant")
+
+    def set_to(value):
+        params = mi.traverse(loaded)
+        params[key] = mi.Color3f(value)
+        params.update()
+        dr.eval(mi.render(loaded))
+
+    set_to([0.1, 0.2, 0.3])
+    set_to([0.2, 0.3, 0.4])
+    frames = loaded.integrator().memory.rendered[0]
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
+        dr.kernel_history_clear()
+        set_to([0.3, 0.4, 0.5])
+        history = dr.kernel_history([dr.KernelType.JIT])
+    assert history and all(kernel["cache_hit"] for kernel in history)
+    assert loaded.integrator().memory.rendered[0] is frames
+
+
+def test_a_new_view_before_an_environment_needs_no_new_kernel():
+    loaded, _ = scene_with("envmap")
+    poses = [replace(VIEW, to_world=VIEWS[k].to_world) for k in (1, 2, 3)]
+    sensors = [mi.load_dict(Camera(view).dictionary()) for view in poses]
+    for sensor in sensors[:2]:
+        dr.eval(mi.render(loaded, sensor=sensor))
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
+        dr.kernel_history_clear()
+        dr.eval(mi.render(loaded, sensor=sensors[2]))
+        history = dr.kernel_history([dr.KernelType.JIT])
+    assert len(history) > 10 and all(kernel["cache_hit"] for kernel in history)

@@ -1,0 +1,305 @@
+"""Parameters of the ``calibrated`` sensor: followed, differentiated, refused."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from support.calibrated_sensors import (
+    BARREL,
+    CLOSE,
+    FILM,
+    FISHEYE,
+    OPENCV,
+    PINHOLE,
+    STILL,
+    by_name,
+    sampled_rays,
+    splats_scene,
+    transform,
+)
+from support.views import image_of, pose, splats_before
+
+from drgs.reference import effects
+from drgs.reference import splatting as reference
+from drgs.reference.effects import OpenCV, Pinhole
+
+
+@pytest.fixture(scope="module", autouse=True)
+def variant():
+    mi.set_variant("llvm_ad_rgb")
+
+
+OTHER_POSE = pose([1, 2, 3], 30, (0.5, -0.6, 1.0))
+
+
+CHANGES = {
+    "to_world": (transform, OTHER_POSE),
+    "fx": (mi_float := lambda value: mi.Float(value), 33.0),
+    "fy": (mi_float, 33.0),
+    "cx": (mi_float, 19.0),
+    "cy": (mi_float, 19.0),
+    "k1": (mi_float, -0.125),
+    "p1": (mi_float, -0.03125),
+    "to_world_close": (transform, OTHER_POSE),
+}
+
+
+CHANGING = replace(OPENCV, close=CLOSE, shutter="rolling")
+
+
+@pytest.mark.parametrize("name", CHANGES)
+def test_a_changed_parameter_is_followed(name):
+    convert, value = CHANGES[name]
+    given = transform(value) if name.startswith("to_world") else value
+    expected = CHANGING.load(**{name: given})
+    gaussians = splats_before(CHANGING.view, 1, 40, 0)
+    scene = splats_scene(CHANGING, gaussians)
+    before = image_of(scene)
+    sensor = scene.sensors()[0]
+    params = mi.traverse(scene)
+    key = next(key for key in params.keys() if key.split(".")[-1] == name)  # noqa: SIM118
+    params[key] = convert(value)
+    params.update()
+    (ray, weight, _), (other, other_weight, _) = map(sampled_rays, (sensor, expected))
+    np.testing.assert_allclose(np.array(ray.d), np.array(other.d), rtol=0, atol=1e-6)
+    np.testing.assert_allclose(np.array(ray.o), np.array(other.o), rtol=0, atol=1e-6)
+    np.testing.assert_array_equal(weight, other_weight)
+    image = image_of(scene)
+    np.testing.assert_array_equal(image, image_of(scene, sensor=expected))
+    assert np.abs(image - before).max() > 0.01
+
+
+def test_where_the_lens_model_ends_follows_its_coefficients():
+    scene = splats_scene(BARREL, splats_before(FILM, 1, 40, 0))
+    params = mi.traverse(scene)
+    key = next(key for key in params.keys() if key.endswith("k1"))  # noqa: SIM118
+    params[key] = mi.Float(-0.0625)
+    params.update()
+    sensor = scene.sensors()[0]
+    assert sensor.lens.max_squared_radius == pytest.approx(1 / (3 * 0.0625))
+    _, weight, _ = sampled_rays(sensor)
+    assert (weight == 1).all()
+
+
+def test_coefficients_that_are_not_given_are_not_exposed():
+    assert set(mi.traverse(PINHOLE.load()).keys()) >= {"to_world", "fx", "fy", "cx", "cy"}
+    keys = set(mi.traverse(replace(OPENCV, lens=OpenCV(k1=0.125)).load()).keys())
+    assert "k1" in keys and not keys & {"k2", "k3", "k4", "p1", "to_world_close"}
+    assert "to_world_close" in mi.traverse(CHANGING.load()).keys()  # noqa: SIM118
+
+
+@pytest.mark.parametrize(
+    ("sensor", "names"),
+    [(OPENCV, ("k1", "k2", "p1")), (FISHEYE, ("k1", "k4"))],
+    ids=["opencv", "fisheye"],
+)
+def test_coefficients_that_are_given_as_zero_can_be_optimised(sensor, names):
+    """Each has a derivative, that of a difference across 0, and stays when another is changed.
+
+    Of splats on the film: without distortion, all places on a side of the film bound the slopes at
+    which the others are projected, and what bounds them beside 0 is another one on either side.
+    """
+    zeros = replace(sensor, lens=type(sensor.lens)(), view=FILM)
+    dictionary = zeros.dictionary(**dict.fromkeys(names, 0.0))
+    gaussians = splats_before(FILM, 1, 40, 0)
+    film = effects.project(gaussians, zeros.camera, zeros.lens).means2d
+    on_film = ((film > 0) & (film < zeros.size)).all(axis=1)
+    gaussians = reference.Gaussians(**{k: v[on_film] for k, v in vars(gaussians).items()})
+    scene = splats_scene(dictionary, gaussians, alpha_cut=0.0, transmittance_stop=0.0)
+    params = mi.traverse(scene)
+    keys = {key.split(".")[-1]: key for key in params.keys()}  # noqa: SIM118
+    assert set(names) <= set(keys)
+    weights = np.random.default_rng(1).normal(size=(*zeros.size[::-1], 4))
+
+    def loss(name, value) -> float:
+        params[keys[name]] = mi.Float(value)
+        params.update()
+        return float(np.sum(weights * image_of(scene)))
+
+    for name in names:
+        step = 1e-3 if name == "p1" else 4e-3
+        expected = (loss(name, step) - loss(name, -step)) / (2 * step)
+        loss(name, 0.0)
+        dr.enable_grad(params[keys[name]])
+        params.update()
+        image = mi.render(scene, params)
+        dr.backward(dr.sum(image * mi.TensorXf(weights.astype(np.float32)), axis=None))
+        actual = float(dr.grad(params[keys[name]])[0])
+        params[keys[name]] = dr.detach(params[keys[name]])
+        # The differences': 1e-6 of 4000 numbers of either sign, over the step, and its square.
+        assert actual == pytest.approx(expected, rel=2e-3, abs=1e-4 / step), name
+        assert abs(actual) > 2e-4 / step, name
+
+
+def test_an_opencv_lens_without_coefficients_is_a_pinhole():
+    (ray, weight, _), (expected, _, _) = (
+        sampled_rays(replace(OPENCV, lens=lens).load()) for lens in (OpenCV(), Pinhole())
+    )
+    assert (weight == 1).all()
+    np.testing.assert_allclose(np.array(ray.d), np.array(expected.d), rtol=0, atol=2e-7)
+
+
+@pytest.mark.parametrize("sensor", STILL, **by_name)
+def test_gradients_of_a_picture_reach_the_calibration(sensor):
+    """Against central differences in single precision; some slopes are clamped."""
+    gaussians = splats_before(FILM, 1, 40, 0)
+    # Nothing is cut: nothing jumps.
+    sensor = replace(sensor, view=FILM)
+    scene = splats_scene(sensor, gaussians, alpha_cut=0.0, transmittance_stop=0.0)
+    params = mi.traverse(scene)
+    weights = np.random.default_rng(1).normal(size=(29, 37, 4)).astype(np.float32)
+
+    def loss(key, value) -> float:
+        params[key] = value
+        params.update()
+        return float(np.sum(weights.astype(np.float64) * image_of(scene)))
+
+    for name, step in {
+        "fx": 0.02,
+        "fy": 0.02,
+        "cx": 0.02,
+        "cy": 0.02,
+        "k1": 1e-3,
+        "p1": 1e-3,
+    }.items():
+        keys = [key for key in params.keys() if key.split(".")[-1] == name]  # noqa: SIM118
+        if not keys:
+            continue
+        value = mi.Float(params[keys[0]])
+        expected = (loss(keys[0], value + step) - loss(keys[0], value - step)) / (2 * step)
+        params[keys[0]] = mi.Float(value)
+        dr.enable_grad(params[keys[0]])
+        params.update()
+        image = mi.render(scene, params)
+        dr.backward(dr.sum(image * mi.TensorXf(weights), axis=None))
+        actual = float(dr.grad(params[keys[0]])[0])
+        params[keys[0]] = dr.detach(params[keys[0]])
+        # Of the differences: 1e-6 of 4000 numbers of either sign, over the step, and its square.
+        assert actual == pytest.approx(expected, rel=2e-3, abs=1e-4 / step), name
+
+
+REFUSED = {
+    "lens": (
+        {"lens": "opencvv"},
+        "PluginError: calibrated: lens must be one of pinhole, opencv, fisheye, got 'opencvv'; "
+        "did you mean opencv?",
+    ),
+    "lens that is no name": (
+        {"lens": 3},
+        "PluginError: calibrated: lens must be one of pinhole, opencv, fisheye, got 3",
+    ),
+    "coefficient of another lens": (
+        {"lens": "fisheye", "k5": 0.1},
+        "PluginError: calibrated: lens 'fisheye' has the coefficients k1, k2, k3, k4, got k5",
+    ),
+    "coefficient of a pinhole": (
+        {"k1": 0.1},
+        "PluginError: calibrated: lens 'pinhole' has no coefficients, got k1",
+    ),
+    "focal length": (
+        {"fx": "long"},
+        "PluginTypeError: calibrated: fx must be a positive number, got 'long'",
+    ),
+    "truth": ({"cx": True}, "PluginTypeError: calibrated: cx must be a finite number, got True"),
+    "no focal length": (
+        {"fy": 0.0},
+        "PluginError: calibrated: fy must be a positive number, got 0.0",
+    ),
+    "coefficient": (
+        {"lens": "opencv", "k1": "a"},
+        "PluginTypeError: calibrated: k1 must be a finite number, got 'a'",
+    ),
+    "infinite": ({"cy": np.inf}, "PluginError: calibrated: cy must be a finite number, got inf"),
+    "near": (
+        {"near_clip": -1.0},
+        "PluginError: calibrated: near_clip must be a positive number, got -1.0",
+    ),
+    "far": (
+        {"far_clip": 0.005},
+        "PluginError: calibrated: far_clip must be larger than near_clip, 0.01, got 0.005",
+    ),
+    "shutter": (
+        {"shutter": "leaf"},
+        "PluginError: calibrated: shutter must be one of global, rolling, got 'leaf'",
+    ),
+    "no samples": (
+        {"shutter_samples": 0},
+        "PluginError: calibrated: shutter_samples must be an integer of at least 1, got 0",
+    ),
+    "part of a sample": (
+        {"shutter_samples": 2.5},
+        "PluginTypeError: calibrated: shutter_samples must be an integer of at least 1, got 2.5",
+    ),
+    "pose": (
+        {"to_world_close": 3.0},
+        "PluginTypeError: calibrated: to_world_close must be a transform, got float",
+    ),
+}
+
+
+@pytest.mark.parametrize(("values", "message"), REFUSED.values(), ids=REFUSED)
+def test_wrong_values_are_refused(values, message):
+    with pytest.raises(RuntimeError) as caught:
+        mi.load_dict({"type": "calibrated", **values})
+    assert str(caught.value).strip().splitlines()[-1].removeprefix("drgs.core.errors.") == message
+
+
+def test_a_property_that_there_is_not_is_refused():
+    with pytest.raises(RuntimeError, match=r'unreferenced property[\s\S]*"focal"'):
+        mi.load_dict({"type": "calibrated", "focal": 3.0})
+
+
+def test_defaults_are_those_of_the_description():
+    sensor = mi.load_dict({"type": "calibrated", "film": {"type": "hdrfilm", "width": 30}})
+    width, height = sensor.film().size()
+    values = [float(v[0]) for v in (sensor.fx, sensor.fy, sensor.cx, sensor.cy)]
+    assert values == [30, 30, 15, height / 2] and width == 30
+    focal = mi.load_dict({"type": "calibrated", "fx": 43.5})
+    assert (float(focal.fx[0]), float(focal.fy[0])) == (43.5, 43.5)
+    assert (sensor.near_clip(), sensor.far_clip(), sensor.shutter_samples) == (0.01, 1e4, 8)
+    assert not sensor.needs_aperture_sample()
+
+
+def test_a_sensor_describes_itself():
+    description = str(replace(OPENCV, lens=OpenCV(k1=0.125, p2=0.25)).load())
+    assert description.startswith("CalibratedSensor[\n  fx = [40], fy = [44],\n  cx = [24]")
+    assert "lens = RadialTangential, k1, p1, p2" in description
+    assert "HDRFilm" in description and "0.9" in description
+
+
+XML = """
+<scene version="3.0.0">
+    <sensor type="calibrated">
+        <float name="fx" value="40"/> <float name="fy" value="44"/>
+        <float name="cx" value="24"/> <float name="cy" value="22.5"/>
+        <string name="lens" value="opencv"/>
+        <float name="k1" value="-0.25"/> <float name="p2" value="0.015625"/>
+        <string name="shutter" value="rolling"/> <integer name="shutter_samples" value="3"/>
+        <transform name="to_world"> <matrix value="{open}"/> </transform>
+        <transform name="to_world_close"> <matrix value="{close}"/> </transform>
+        <film type="hdrfilm">
+            <integer name="width" value="53"/> <integer name="height" value="41"/>
+            <integer name="crop_offset_x" value="13"/> <integer name="crop_offset_y" value="7"/>
+            <integer name="crop_width" value="29"/> <integer name="crop_height" value="18"/>
+        </film>
+    </sensor>
+</scene>
+"""
+
+
+def test_a_sensor_of_an_xml_file_is_that_of_a_dictionary():
+    sensor = replace(OPENCV, lens=OpenCV(k1=-0.25, p2=0.015625), close=CLOSE, shutter="rolling")
+    open, close = (
+        " ".join(repr(float(value)) for row in matrix for value in row)
+        for matrix in (sensor.view.to_world, CLOSE)
+    )
+    scene = mi.load_string(XML.format(open=open, close=close))
+    by_xml, by_dictionary = scene.sensors()[0], sensor.load()
+    assert by_xml.shutter_samples == 3
+    (ray, _, _), (expected, _, _) = map(sampled_rays, (by_xml, by_dictionary))
+    np.testing.assert_array_equal(np.array(ray.d), np.array(expected.d))
+    np.testing.assert_array_equal(np.array(ray.o), np.array(expected.o))

@@ -1,0 +1,302 @@
+"""Derivatives of what shapes of ellipsoids hold."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from support.ellipsoids import (
+    GRADIENTS,
+    HELD,
+    MERGED,
+    Held,
+    Merged,
+    apart,
+    assert_held_agree,
+    assert_images_agree,
+    gaussians_of,
+    gradients_held,
+    held_gradients,
+    shape_of,
+    transform,
+)
+from support.helpers import assert_arrays_agree, single
+from support.kernels import float_reductions
+from support.views import clear, gradient, image_of, tensors
+
+import drgs  # noqa: F401  (registers the plugin)
+from drgs.integrator import ellipsoids as shapes_module
+from drgs.reference import splatting as reference
+from drgs.splatting import rendering
+
+
+@pytest.fixture(scope="module", autouse=True)
+def variant():
+    mi.set_variant("llvm_ad_rgb")
+
+
+# ----------------------------------------------------------------------------------------------
+# Gradients
+# ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("srgb_primitives", [False, True])
+@pytest.mark.parametrize("degree", [0, 1, 3])
+def test_gradients_equal_the_references(degree, srgb_primitives):
+    scene = clear(Held(degree=degree, srgb_primitives=srgb_primitives))
+    expected = held_gradients(scene.held, scene.gradients(scene.weights()))
+    assert_held_agree(gradients_held(scene.load(), scene.weights()), expected)
+
+
+def test_gradients_equal_the_references_for_a_mesh():
+    scene = clear(Held(kind="ellipsoidsmesh"))
+    expected = held_gradients(scene.held, scene.gradients(scene.weights()))
+    assert_held_agree(gradients_held(scene.load(), scene.weights()), expected)
+
+
+@pytest.mark.parametrize("name", HELD)
+def test_only_what_is_enabled_receives_gradients(name):
+    scene = Held()
+    loaded = scene.load()
+    params = mi.traverse(loaded)
+    dr.enable_grad(params[f"shape.{name}"])
+    image = mi.render(loaded, params)
+    dr.backward(dr.sum(image * mi.TensorXf(scene.weights().astype(np.float32)), axis=None))
+    everything = gradients_held(scene.load(), scene.weights())
+    np.testing.assert_array_equal(gradient(params[f"shape.{name}"]), everything[name])
+    assert not any(dr.grad_enabled(params[f"shape.{other}"]) for other in HELD if other != name)
+
+
+def test_gradients_reach_what_a_shapes_parameters_were_computed_from():
+    scene = clear(Held())
+    loaded = scene.load()
+    params = mi.traverse(loaded)
+    factor = mi.Float(1.0)
+    dr.enable_grad(factor)
+    params["shape.sh_coeffs"] = params["shape.sh_coeffs"] * factor
+    params.update()
+    image = mi.render(loaded, params)
+    dr.backward(dr.sum(image * mi.TensorXf(scene.weights().astype(np.float32)), axis=None))
+    expected = held_gradients(scene.held, scene.gradients(scene.weights()))
+    terms = expected["sh_coeffs"] * scene.held["sh_coeffs"]
+    assert dr.grad(factor)[0] == pytest.approx(terms.sum(), abs=GRADIENTS * np.abs(terms).max())
+
+
+STEP = 1e-7
+
+
+def directions_of(held) -> dict[str, np.ndarray]:
+    """Of opacities so small that they stay within 0..1; of scales and others as their values."""
+    rng = np.random.default_rng(7)
+    directions = {name: rng.normal(0, 1, v.shape) * np.abs(v) for name, v in held.items()}
+    directions["opacities"] *= 1 - held["opacities"]
+    return {name: single(values) for name, values in directions.items()}
+
+
+def forward_image(loaded, directions, prefix="shape") -> np.ndarray:
+    params = mi.traverse(loaded)
+    for name, direction in directions.items():
+        parameter = params[f"{prefix}.{name}"]
+        dr.enable_grad(parameter)
+        dr.set_grad(parameter, mi.Float(direction.ravel().astype(np.float32)))
+    return np.array(dr.forward_to(mi.render(loaded, params))).astype(np.float64)
+
+
+@pytest.mark.parametrize("names", [*((name,) for name in HELD), HELD], ids="+".join)
+def test_forward_mode_equals_central_differences(names):
+    """STEP: as in test_splats."""
+    scene = clear(Held(degree=2))
+    directions = {name: directions_of(scene.held)[name] for name in names}
+
+    def moved(step):
+        changed = {name: scene.held[name] + step * v for name, v in directions.items()}
+        gaussians = gaussians_of(scene.held | changed)
+        return scene.image(reference.render(gaussians, scene.camera, np.zeros(3), 2))
+
+    expected = (moved(STEP) - moved(-STEP)) / (2 * STEP)
+    assert_images_agree(forward_image(scene.load(), directions), expected, GRADIENTS)
+
+
+@pytest.mark.parametrize("scene", [MERGED[0], MERGED[3]], ids=["1, 2, 0", "0, 0, 0"])
+def test_forward_and_backward_mode_are_transposed_for_merged_gaussians(scene):
+    """<J v, w> = <v, J^T w>, for a shape that was turned and one with Gaussians before it."""
+    settings = {"shapes_to_world_first": transform()}
+    directions = directions_of(scene.shapes[0].held)
+    image = forward_image(scene.load(**settings), directions, "first")
+    gradients = gradients_held(scene.load(**settings), scene.weights(), "first")
+    terms = [np.sum(directions[name].ravel() * gradients[name]) for name in HELD]
+    forward = np.sum(image * scene.weights())
+    assert forward == pytest.approx(sum(terms), abs=1e-5 * np.abs(terms).max())
+
+
+def test_the_gradient_tests_would_notice_one_percent():
+    scene = clear(Held())
+    expected = apart(held_gradients(scene.held, scene.gradients(scene.weights())))
+    for name, values in expected.items():
+        with pytest.raises(AssertionError):
+            assert_arrays_agree({name: 1.01 * values}, {name: values}, GRADIENTS)
+
+
+def test_backward_passes_give_the_same_bytes_and_add_nothing_atomically():
+    scene = Merged()
+    first = gradients_held(scene.load(), scene.weights(), "first")
+    again = {}
+    loaded = scene.load(shapes_to_world=transform())
+
+    def turned():
+        again.update(gradients_held(loaded, scene.weights(), "first"))
+
+    found, count = float_reductions(turned)
+    assert not found and count > 5
+    again = gradients_held(scene.load(), scene.weights(), "first")
+    assert all(first[name].tobytes() == again[name].tobytes() for name in HELD)
+
+
+def test_adam_reduces_the_loss():
+    """Every parameter starts somewhat off; the picture it had is the target."""
+    scene = Held()
+    loaded = scene.load()
+    target = mi.TensorXf(image_of(loaded).astype(np.float32))
+    params = mi.traverse(loaded)
+    rng = np.random.default_rng(4)
+    optimizer = mi.ad.Adam(lr=0.003)
+    for name in HELD:
+        factors = rng.uniform(0.9, 1.1, scene.held[name].size).astype(np.float32)
+        optimizer[f"shape.{name}"] = params[f"shape.{name}"] * mi.Float(factors)
+    losses = []
+    for _ in range(25):
+        params.update(optimizer)
+        loss = dr.mean(dr.square(mi.render(loaded, params) - target), axis=None)
+        dr.backward(loss)
+        optimizer.step()
+        losses.append(float(loss.array[0]))
+    assert losses[-1] < 0.3 * losses[0]
+
+
+# ----------------------------------------------------------------------------------------------
+# What is kept from one rendering to the next
+# ----------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def counted(monkeypatch):
+    """Two lists: a growing one for each frame that is rendered, and for each conversion."""
+    frames, conversions = [], []
+    render, convert = rendering.render, shapes_module.Conversion.gaussians
+
+    def counting_render(*arguments):
+        frames.append(arguments)
+        return render(*arguments)
+
+    def counting_convert(self):
+        conversions.append(self)
+        return convert(self)
+
+    monkeypatch.setattr(rendering, "render", counting_render)
+    monkeypatch.setattr(shapes_module.Conversion, "gaussians", counting_convert)
+    return frames, conversions
+
+
+def test_a_backward_pass_reuses_the_frame_and_converts_nothing(counted):
+    scene = Held()
+    loaded = scene.load()
+    gradients_held(loaded, scene.weights())
+    image_of(loaded)
+    assert [len(calls) for calls in counted] == [1, 1]
+
+
+@pytest.mark.parametrize("name", HELD)
+def test_a_changed_parameter_is_rendered_again(name, counted):
+    scene = Held()
+    loaded = scene.load()
+    before = image_of(loaded)
+    params = mi.traverse(loaded)
+    params[f"shape.{name}"] = params[f"shape.{name}"] * 0.75
+    params.update()
+    after = image_of(loaded)
+    assert [len(calls) for calls in counted] == [2, 2] and np.abs(after - before).max() > 0.01
+    halved = scene.held | {name: scene.held[name] * 0.75}
+    np.testing.assert_array_equal(after, image_of(scene.load(shape=shape_of(halved))))
+
+
+def test_a_shape_may_be_given_other_gaussians(counted):
+    scene, other = Held(), Held(count=60, seed=9)
+    loaded = scene.load()
+    image_of(loaded)
+    params = mi.traverse(loaded)
+    for name, values in other.held.items():
+        params[f"shape.{name}"] = mi.Float(values.ravel().astype(np.float32))
+    params.update()
+    np.testing.assert_array_equal(image_of(loaded), image_of(other.load()))
+
+
+def test_a_changed_parameter_of_the_integrators_own_is_rendered_again():
+    scene = Merged()
+    loaded = scene.load()
+    image_of(loaded)
+    params = mi.traverse(loaded)
+    params["integrator.means"] = params["integrator.means"] + 0.25
+    params.update()
+    moved = replace(scene.own, means=single(scene.own.means + 0.25))
+    expected = image_of(scene.load(**tensors(moved)))
+    np.testing.assert_array_equal(image_of(loaded), expected)
+
+
+def test_an_integrator_shows_the_shapes_of_the_scene_that_it_renders():
+    first, second = Held(), Held(seed=9)
+    scenes = [scene.load() for scene in (first, second)]
+    expected = [image_of(loaded) for loaded in scenes]
+    integrator = mi.load_dict(first.settings)
+    for _ in range(2):
+        for loaded, image in zip(scenes, expected, strict=True):
+            np.testing.assert_array_equal(image_of(loaded, integrator=integrator), image)
+
+
+KERNELS = """
+import json, sys
+sys.path.insert(0, "tests")
+blocked = {blocked!r}
+for name in blocked:
+    sys.modules["drgs." + name] = None  # importing it raises ImportError
+import drgs, drjit as dr, mitsuba as mi
+mi.set_variant("llvm_ad_rgb")
+from drgs.gaussians.parameters import PARAMETER_NAMES
+from support.helpers import FLOAT32, device_gaussians
+from support.kernels import drain_kernels
+from support.views import Scene
+
+scene = Scene(degree=3)
+gaussians = device_gaussians(scene.gaussians, FLOAT32)
+loaded = mi.load_dict(
+    {{
+        "type": "scene",
+        "integrator": scene.settings | {{n: getattr(gaussians, n) for n in PARAMETER_NAMES}},
+        "sensor": scene.view.sensor(),
+        "ball": {{"type": "sphere"}},
+    }}
+)
+params = mi.traverse(loaded)
+dr.enable_grad(params["integrator.means"])
+with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+    dr.backward(mi.render(loaded, params))
+    dr.eval(dr.grad(params["integrator.means"]))
+    kernels = drain_kernels()
+loaded_modules = [name for name in {modules!r} if "drgs." + name in sys.modules]
+print(json.dumps([kernels, [] if blocked else loaded_modules]))
+"""
+
+
+MODULES = ("integrator.ellipsoids", "gaussians.similarity", "gaussians.sh_rotation")
+
+
+def test_without_such_shapes_nothing_of_this_is_imported_and_kernels_are_the_same(run_python):
+    results = [
+        run_python(KERNELS.format(blocked=blocked, modules=MODULES)) for blocked in ((), MODULES)
+    ]
+    assert [r.returncode for r in results] == [0, 0], results[1].stderr
+    (whole, imported), (reduced, _) = (json.loads(r.stdout) for r in results)
+    assert whole == reduced and len(whole) > 10 and imported == []

@@ -1,0 +1,256 @@
+"""Ellipsoids at the border of what can be drawn, and those that are refused."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from support.ellipsoids import (
+    Held,
+    Merged,
+    assert_images_agree,
+    gradients_held,
+    scene_with,
+    shape_of,
+    transform,
+    write_model,
+)
+from support.views import VIEWS, Scene, clear, image_of, tensors
+
+import drgs  # noqa: F401  (registers the plugin)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def variant():
+    mi.set_variant("llvm_ad_rgb")
+
+
+# ----------------------------------------------------------------------------------------------
+# Numbers at the border
+# ----------------------------------------------------------------------------------------------
+
+
+def picture_of(scene, **changes) -> np.ndarray:
+    """Of the scene's shape with some numbers changed: name = (row, column, value)."""
+    return image_of(scene.load(shape=shape_of(changed(scene.held, **changes))))
+
+
+def changed(held, **changes):
+    held = {name: values.copy() for name, values in held.items()}
+    for name, (row, column, value) in changes.items():
+        held[name][row, column] = value
+    return held
+
+
+SEEN = 3
+"""The large splat of ``views.splats_before``."""
+
+
+def test_an_opacity_of_one_is_the_largest_below_one():
+    scene = Held()
+    largest = picture_of(scene, opacities=(SEEN, 0, 1 - 2.0**-24))
+    for value in (1.0, 1.5, np.inf):
+        np.testing.assert_array_equal(picture_of(scene, opacities=(SEEN, 0, value)), largest)
+    assert np.abs(largest - picture_of(scene, opacities=(SEEN, 0, 0.9))).max() > 0.01
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        *({"opacities": (SEEN, 0, value)} for value in (0.0, -0.5, np.nan)),
+        *({"data": (SEEN, 4, value)} for value in (0.0, -0.0, np.nan)),
+    ],
+    ids=str,
+)
+def test_what_cannot_be_seen_leaves_the_picture_of_the_others(changes):
+    """With any least alpha."""
+    scene = Held()
+    others = {name: np.delete(values, SEEN, axis=0) for name, values in scene.held.items()}
+    for settings in ({}, {"alpha_cut": 0.0}):
+        loaded = scene.load(settings, shape=shape_of(changed(scene.held, **changes)))
+        expected = scene.load(settings, shape=shape_of(others))
+        np.testing.assert_array_equal(image_of(loaded), image_of(expected))
+        derivatives = gradients_held(loaded, scene.weights())
+        for name, width in (("data", 10), ("opacities", 1), ("sh_coeffs", 12)):
+            rows = derivatives[name].reshape(40, width)
+            assert np.isfinite(rows).all() and (rows[SEEN] == 0).all() and rows.any()
+
+
+def test_the_sign_of_a_standard_deviation_means_nothing():
+    """Derivatives change theirs."""
+    scene = Held()
+    loaded = scene.load()
+    width = scene.held["data"][SEEN, 4]
+    other = scene.load(shape=shape_of(changed(scene.held, data=(SEEN, 4, -width))))
+    np.testing.assert_array_equal(image_of(other), image_of(loaded))
+    plain, negated = (
+        gradients_held(each, scene.weights())["data"].reshape(-1, 10)[SEEN]
+        for each in (loaded, other)
+    )
+    np.testing.assert_array_equal(negated, plain * np.repeat([1, -1, 1], [4, 1, 5]))
+    assert plain[4] != 0
+
+
+def test_a_to_world_that_mirrors_makes_the_mirror_image(tmp_path):
+    """Before a camera that is mirrored with it: of degree 0, the same picture."""
+    path = write_model(tmp_path / "model.ply", Scene(degree=0).gaussians)
+    shape = {"type": "ellipsoids", "filename": path}
+    mirror = mi.ScalarTransform4f().scale([-1, 1, 1])
+    view = VIEWS[1]
+    reflected = np.diag([-1.0, 1, 1, 1]) @ np.array(view.to_world)
+    image = image_of(scene_with({}, view, shape=shape))
+    other = replace(view, to_world=tuple(map(tuple, reflected)))
+    mirrored = image_of(scene_with({}, other, shape=shape | {"to_world": mirror}))
+    assert_images_agree(mirrored, image)
+
+
+def test_the_derivative_at_an_opacity_of_one_is_that_of_the_inside():
+    """A splat behind all others, its peak beside the film: pictures are linear in its opacity."""
+    settings = {"alpha_cut": 0.0, "transmittance_stop": 0.0, "extent": 3.0}
+    scene = Held(degree=0)
+    camera = scene.camera
+    held = {name: values.copy() for name, values in scene.held.items()}
+    held["data"][SEEN, :3] = camera.center + [7, 0, 9] @ camera.rotation
+    held["data"][SEEN, 3:6] = 2.5
+
+    def derivative(opacity):
+        loaded = scene.load(settings, shape=shape_of(changed(held, opacities=(SEEN, 0, opacity))))
+        return gradients_held(loaded, scene.weights())["opacities"][SEEN]
+
+    expected = derivative(0.9)
+    assert derivative(1.0) == pytest.approx(expected, rel=1e-4) and abs(expected) > 0.1
+    assert derivative(1.001) == 0
+
+
+# ----------------------------------------------------------------------------------------------
+# Errors
+# ----------------------------------------------------------------------------------------------
+
+
+def refusal(loaded) -> str:
+    with pytest.raises(Exception) as caught:
+        mi.render(loaded)
+    error = caught.value
+    while error.__cause__ or error.__context__:
+        error = error.__cause__ or error.__context__
+    assert isinstance(error, ValueError)
+    return str(error)
+
+
+def without(held, *names):
+    return {name: values for name, values in held.items() if name not in names}
+
+
+def wide(held, name, width):
+    return held | {name: np.zeros((len(held["data"]), width))}
+
+
+REFUSED = {
+    "no attributes": (
+        lambda held: {"data": held["data"], "albedo": held["data"][:, :3]},
+        "splats: the shape 'shape' (ellipsoids) must have the attributes opacities and sh_coeffs; "
+        "missing: opacities, sh_coeffs; it has: data, albedo",
+    ),
+    "no coefficients": (lambda held: without(held, "sh_coeffs"), "missing: sh_coeffs; it has: "),
+    "no opacities": (lambda held: without(held, "opacities"), "missing: opacities; it has: "),
+    "coefficients of no degree": (
+        lambda held: wide(held, "sh_coeffs", 15),
+        "splats: the shape 'shape' (ellipsoids) must have sh_coeffs of shape (40, 3) or (40, 12) "
+        "or (40, 27) or (40, 48), got 600 numbers",
+    ),
+    "two opacities": (
+        lambda held: wide(held, "opacities", 2),
+        "must have opacities of shape (40, 1), got 80 numbers",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_shapes_without_what_is_needed_are_refused(case):
+    make, expected = REFUSED[case]
+    scene = Held()
+    assert expected in refusal(scene.load(shape=shape_of(make(scene.held))))
+
+
+def test_a_scene_without_gaussians_is_refused():
+    for others in ({}, {"ball": {"type": "sphere"}}):
+        loaded = scene_with({}, VIEWS[1], **others)
+        assert refusal(loaded) == (
+            "splats: there are no Gaussians: give the integrator 'filename' or tensors means, "
+            "quats, log_scales, logit_opacities, sh0, shN, or the scene a shape of type "
+            "ellipsoids or ellipsoidsmesh"
+        )
+
+
+def test_a_degree_above_that_of_the_shapes_is_refused():
+    assert "integer from 0 to 1, the degree of the Gaussians, got 2" in refusal(
+        Held(degree=1).load({"sh_degree": 2})
+    )
+
+
+def test_a_degree_that_only_shapes_have_may_be_asked_for():
+    """When loaded, later, and still after a parameter of the integrator's own has changed."""
+    scene = clear(Merged(own_degree=0, degrees=(0, 3), sh_degree=2))
+    loaded = scene.load()
+    expected = scene.image()
+    assert_images_agree(image_of(loaded), expected)
+    loaded = replace(scene, sh_degree=None).load()
+    assert np.abs(image_of(loaded) - expected).max() > 1e-3
+    loaded.integrator().sh_degree = 2
+    params = mi.traverse(loaded)
+    params["integrator.means"] = mi.TensorXf(params["integrator.means"])
+    params.update()
+    assert_images_agree(image_of(loaded), expected)
+
+
+def test_own_coefficients_may_be_fewer_than_those_of_shapes_were():
+    """The highest degree is still that of a shape."""
+    loaded = Merged().load()
+    before = image_of(loaded)
+    params = mi.traverse(loaded)
+    params["integrator.shN"] = dr.zeros(mi.TensorXf, (40, 0, 3))
+    params.update()
+    after = image_of(loaded)
+    assert loaded.integrator().sh_degree == 2 and np.abs(after - before).max() > 1e-3
+
+
+def test_a_to_world_for_a_shape_that_is_not_there_is_refused():
+    settings = {"shapes_to_world_chair": transform()}
+    assert refusal(Held().load(settings)) == (
+        "splats: shapes_to_world_chair must end with the id of a shape of type ellipsoids or "
+        "ellipsoidsmesh, ids are: 'shape'"
+    )
+    own = scene_with(settings | tensors(Scene().gaussians), VIEWS[1])
+    assert refusal(own).endswith("ids are: none")
+
+
+WRONG_PROPERTIES = {
+    "to_world of nothing": (
+        lambda: {"to_world": transform()},
+        "PluginError: splats: give 'filename', or the Gaussians as tensors",
+    ),
+    "to_world, scales": (
+        lambda: tensors(Scene().gaussians) | {"to_world": mi.ScalarTransform4f().scale([1, 2, 1])},
+        "PluginError: splats: to_world must be made of rotations, translations and scales",
+    ),
+    "to_world, text": (
+        lambda: tensors(Scene().gaussians) | {"to_world": "up"},
+        "PluginTypeError: splats: to_world must be a transform, got str",
+    ),
+    "shapes_to_world, mirror": (
+        lambda: {"shapes_to_world_a": mi.ScalarTransform4f().scale([-1, 1, 1])},
+        "PluginError: splats: shapes_to_world_a must be made of rotations, translations and scales",
+    ),
+    "sh_degree": (lambda: {"sh_degree": 4}, "splats: sh_degree must be an integer from 0 to 3"),
+}
+
+
+@pytest.mark.parametrize("case", WRONG_PROPERTIES)
+def test_wrong_properties_are_refused(case):
+    make, expected = WRONG_PROPERTIES[case]
+    with pytest.raises(RuntimeError) as caught:
+        mi.load_dict({"type": "splats", **make()})
+    assert expected in str(caught.value).strip().splitlines()[-1]

@@ -1,0 +1,149 @@
+"""Depth and alpha beside the colours of the ``splats`` integrator."""
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from support.splats_checks import (
+    GRADIENTS,
+    STEP,
+    assert_gradients_agree,
+    assert_images_agree,
+    both_color_spaces,
+    fresh_integrator,
+    random_directions,
+    with_tangents,
+)
+from support.views import (
+    VIEWS,
+    Scene,
+    clear,
+    gradients_of,
+    image_of,
+    tensors,
+)
+
+import drgs  # noqa: F401  (registers the plugin)
+from drgs.gaussians.parameters import PARAMETER_NAMES
+from drgs.reference import splatting as reference
+
+
+@pytest.fixture(scope="module", autouse=True)
+def variant():
+    mi.set_variant("llvm_ad_rgb")
+
+
+def with_channels(scene, aovs="z:depth, a:alpha", sensor=None, **settings):
+    """The scene with an integrator that puts out more than colours."""
+    integrator = scene.settings | tensors(scene.gaussians) | {"aovs": aovs} | settings
+    sensor = sensor or scene.view.sensor()
+    return mi.load_dict({"type": "scene", "integrator": integrator, "sensor": sensor})
+
+
+def channels_of(scene, kinds) -> np.ndarray:
+    """The window's channels besides colour, by the reference."""
+    planes = {"depth": scene.picture.depth, "alpha": scene.picture.alpha}
+    return np.stack([planes[kind] for kind in kinds], axis=-1)[scene.view.window]
+
+
+@both_color_spaces
+@pytest.mark.parametrize(("pixel_format", "count"), [("rgb", 3), ("rgba", 4)])
+@pytest.mark.parametrize("view", [VIEWS[1], VIEWS[13]], ids=lambda view: view.name)
+def test_depth_and_alpha_are_put_out_behind_the_colors(view, pixel_format, count, srgb_primitives):
+    """In the order in which they are asked for, as linear numbers."""
+    scene = clear(Scene(view, srgb_primitives=srgb_primitives))
+    sensor = view.sensor(pixel_format=pixel_format)
+    for kinds in (["depth", "alpha"], ["alpha", "depth"], ["depth"], ["alpha"]):
+        aovs = ", ".join(f"{kind[0]}:{kind}" for kind in kinds)
+        loaded = with_channels(scene, aovs, sensor)
+        image = image_of(loaded)
+        assert image.shape[-1] == count + len(kinds)
+        plain = image_of(
+            mi.load_dict({"type": "scene", "sensor": sensor}), integrator=fresh_integrator(scene)
+        )
+        np.testing.assert_array_equal(image[..., :count], plain)
+        for k, expected in enumerate(np.moveaxis(channels_of(scene, kinds), -1, 0)):
+            assert_images_agree(image[..., count + k], expected)
+        film = loaded.sensors()[0].film()
+        channel = {"depth": "d.T", "alpha": "a.I"}
+        names = [c.name for c in film.bitmap().struct_()]
+        assert names == [*pixel_format.upper(), *(channel[kind] for kind in kinds)]
+        assert loaded.integrator().aov_names() == names[count:]
+
+
+def test_a_kind_may_be_put_out_twice_under_two_names():
+    scene = Scene()
+    image = image_of(with_channels(scene, " first:depth,second:depth ,a:alpha,"))
+    np.testing.assert_array_equal(image[..., 4], image[..., 5])
+    np.testing.assert_array_equal(image[..., 6], image[..., 3])
+
+
+@both_color_spaces
+def test_gradients_of_depth_and_alpha_equal_the_references(srgb_primitives):
+    """With those of the colours, from random weights on all channels."""
+    scene = clear(Scene(srgb_primitives=srgb_primitives))
+    weights = scene.weights()
+    rng = np.random.default_rng(9)
+    of_depth, of_alpha = (rng.normal(0, 1, weights.shape[:2]) for _ in range(2))
+    actual = gradients_of(
+        with_channels(scene),
+        np.concatenate([weights, of_depth[..., None], of_alpha[..., None]], -1),
+    )
+    expected = scene.gradients(weights)
+    others = reference.render_gradients(
+        scene.gaussians, scene.camera, np.zeros(3), np.zeros((*of_depth.shape, 3)), of_alpha,
+        of_depth, scene.rendered_degree, scene.antialiased,
+    )  # fmt: skip
+    total = {n: expected[n] + others.get(n, 0) for n in PARAMETER_NAMES}
+    assert_gradients_agree(actual, total | {"background": expected["background"]})
+    assert all(
+        np.abs(others[n]).max() > 0.1 * np.abs(expected[n]).max() for n in ("means", "quats")
+    )
+
+
+def test_gradients_of_the_channels_are_those_of_a_film_without_alpha():
+    scene = clear(Scene())
+    weights = np.random.default_rng(9).normal(0, 1, (*scene.weights().shape[:2], 5))
+    of_rgb = gradients_of(
+        with_channels(scene, sensor=scene.view.sensor(pixel_format="rgb")), weights
+    )
+    padded = np.insert(weights, 3, 0, axis=-1)
+    assert_gradients_agree(of_rgb, gradients_of(with_channels(scene), padded))
+
+
+def test_several_samples_average_the_channels():
+    """Depth and alpha of each sample; the alpha of the film is the same number."""
+    scene = Scene()
+    sensor = scene.view.sensor(samples=4)
+    image = image_of(with_channels(scene, sensor=sensor), spp=4, seed=2)
+    # The mean of the samples' transmittances, subtracted from one before or after.
+    np.testing.assert_allclose(image[..., 5], image[..., 3], atol=1e-6)
+    single_sample = image_of(with_channels(scene), spp=1)
+    assert np.abs(image[..., 4] - single_sample[..., 4]).max() > 0.01
+
+
+def test_forward_mode_of_the_channels_equals_central_differences():
+    scene = clear(Scene())
+    directions = random_directions(scene, ["means", "log_scales", "logit_opacities"])
+    loaded = with_channels(scene)
+    tangent = np.array(dr.forward_to(mi.render(loaded, with_tangents(loaded, directions))))
+
+    def at(step):
+        values = dict(vars(scene.gaussians))
+        for name, direction in directions.items():
+            values[name] = values[name] + step * direction
+        picture = reference.render(reference.Gaussians(**values), scene.camera, np.zeros(3), 1)
+        return np.stack([picture.depth, picture.alpha], axis=-1)
+
+    expected = (at(STEP) - at(-STEP)) / (2 * STEP)
+    assert_images_agree(tangent[..., 4:], expected, GRADIENTS)
+
+
+def test_channels_that_are_not_asked_for_cost_nothing():
+    """The planes of the frame are those of the features."""
+    scene = Scene()
+    for aovs, count in (("", 4), ("a:alpha", 4), ("z:depth", 5)):
+        loaded = with_channels(scene, aovs)
+        mi.render(loaded)
+        frames = loaded.integrator().memory.rendered[0].frames
+        assert len(frames[0][0].planes()) == count

@@ -1,0 +1,227 @@
+"""What the ``splats`` integrator refuses."""
+
+from dataclasses import replace
+from functools import cache
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from support.views import (
+    Scene,
+    tensors,
+)
+
+import drgs  # noqa: F401  (registers the plugin)
+from drgs.gaussians.parameters import PARAMETER_NAMES
+
+
+@pytest.fixture(scope="module", autouse=True)
+def variant():
+    mi.set_variant("llvm_ad_rgb")
+
+
+@cache
+def valid():
+    return tensors(Scene(count=8).gaussians)
+
+
+def zeros(*shape):
+    return mi.TensorXf(np.zeros(shape, np.float32))
+
+
+def message_of(error) -> str:
+    """The message of the exception that a chain of exceptions started with."""
+    while error.__cause__ or error.__context__:
+        error = error.__cause__ or error.__context__
+    return str(error)
+
+
+def refusal_of_dictionary(**changes) -> str:
+    """The last line of what Mitsuba says when the plugin cannot be loaded."""
+    settings = {"type": "splats", **valid(), **changes}
+    with pytest.raises(RuntimeError) as caught:
+        mi.load_dict({key: value for key, value in settings.items() if value is not None})
+    return str(caught.value).strip().splitlines()[-1]
+
+
+NONE = dict.fromkeys(PARAMETER_NAMES)
+
+
+REFUSED = {
+    "one tensor given": (
+        {name: None for name in PARAMETER_NAMES if name != "sh0"},
+        "PluginError: splats: give 'filename', or the Gaussians as tensors means, quats, "
+        "log_scales, logit_opacities, sh0, shN; missing: means, quats, log_scales, "
+        "logit_opacities",
+    ),
+    "a tensor missing": ({"quats": None}, "missing: quats"),
+    "file and tensors": (
+        {"filename": "x.ply"},
+        "PluginError: splats: give either 'filename' or tensors, got both (means, quats, "
+        "log_scales, logit_opacities, sh0, shN)",
+    ),
+    "no such file": (
+        {**NONE, "filename": "nowhere.ply"},
+        "UserError: nowhere.ply: cannot read the file: No such file or directory",
+    ),
+    "not a tensor": ({"means": "abc"}, "PluginTypeError: splats: means must be a tensor, got str"),
+    "means": (
+        {"means": lambda: zeros(8, 2)},
+        "PluginError: splats: means must have the shape (N, 3), with N = 8 the rows of means, got "
+        "(8, 2)",
+    ),
+    "quats": (
+        {"quats": lambda: zeros(7, 4)},
+        "PluginError: splats: quats must have the shape (N, 4), with N = 8 the rows of means, got "
+        "(7, 4)",
+    ),
+    "logit_opacities": (
+        {"logit_opacities": lambda: zeros(9)},
+        "PluginError: splats: logit_opacities must have the shape (N), with N = 8 the rows of "
+        "means, got (9,)",
+    ),
+    "sh0": ({"sh0": lambda: zeros(8, 3)}, "splats: sh0 must have the shape (N, 1, 3)"),
+    "shN": (
+        {"shN": lambda: zeros(8, 4, 3)},
+        "splats: shN must have the shape (N, 0, 3) or (N, 3, 3) or (N, 8, 3) or (N, 15, 3)",
+    ),
+    "no Gaussians": (
+        {name: (lambda name=name: zeros(0, *valid()[name].shape[1:])) for name in PARAMETER_NAMES},
+        "PluginError: splats: at least one Gaussian is needed, got none",
+    ),
+    "sh_degree above any": (
+        {"sh_degree": 4},
+        "PluginError: splats: sh_degree must be an integer from 0 to 3, got 4",
+    ),
+    "sh_degree negative": ({"sh_degree": -1}, "got -1"),
+    "sh_degree not an integer": ({"sh_degree": 0.5}, "got 0.5"),
+    "sh_degree a float": ({"sh_degree": 0.0}, "sh_degree must be an integer from 0 to 3, got 0.0"),
+    "sh_degree a boolean": ({"sh_degree": True}, "got True"),
+    "sh_degree a string": ({"sh_degree": "1"}, "got '1'"),
+    "near zero": ({"near": 0.0}, "PluginError: splats: near must be a positive number, got 0.0"),
+    "near negative": ({"near": -1}, "got -1"),
+    "near a boolean": ({"near": True}, "splats: near must be a positive number, got True"),
+    "near infinite": ({"near": float("inf")}, "near must be a positive number, got inf"),
+    "near a string": ({"near": "far"}, "got 'far'"),
+    "near not a number": ({"near": float("nan")}, "got nan"),
+    "antialiased a string": (
+        {"antialiased": "no"},
+        "PluginTypeError: splats: antialiased must be true or false, got 'no'",
+    ),
+    "order_window a float": (
+        {"order_window": 3.5},
+        "PluginTypeError: splats: order_window must be an integer, got 3.5",
+    ),
+    "an unknown projection": (
+        {"projection": "affine"},
+        "PluginError: splats: projection must be one of ewa, unscented, exact, got 'affine'",
+    ),
+    "a low-pass below zero": (
+        {"low_pass": -1},
+        "PluginError: splats: low_pass must be finite and not negative, got -1.0",
+    ),
+    "srgb_primitives a number": ({"srgb_primitives": 1}, "must be true or false, got 1"),
+    "background a string": ({"background": "white"}, "splats: background must be an RGB colour"),
+    "background a spectrum": (
+        {"background": {"type": "spectrum", "value": 0.5}},
+        "splats: background must be an RGB colour",
+    ),
+    "aovs without a type": (
+        {"aovs": "depth"},
+        "PluginError: splats: aovs must be a list of name:type with names of their own and types "
+        "of depth, alpha, normal, got 'depth'",
+    ),
+    "aovs of an unknown type": ({"aovs": "a:alpha, n:sh_normal"}, "got 'n:sh_normal'"),
+    "aovs without a name": ({"aovs": ":depth"}, "got ':depth'"),
+    "aovs of one name": ({"aovs": "a:alpha, a:depth"}, "got 'a:depth'"),
+    "ignore": (
+        {"ignore": "motion, background"},
+        "PluginError: splats: ignore must be a list of distortion, defocus, motion, smoothing, got "
+        "'background'",
+    ),
+    "hide_emitters a number": (
+        {"hide_emitters": 1},
+        'The property "hide_emitters" has the wrong type (expected boolean, got integer)',
+    ),
+    "unknown": ({"sh_degre": 1}, '- integer "sh_degre": 1'),
+    "a texture under an unknown name": (
+        {"backgroud": {"type": "checkerboard"}},
+        "PluginError: splats: backgroud must be an integrator, the only object besides the texture "
+        "background, got Checkerboard; did you mean background?",
+    ),
+    "an object of no use": (
+        {"foo": {"type": "diffuse"}},
+        "splats: foo must be an integrator, the only object besides the texture background, got "
+        "SmoothDiffuse",
+    ),
+    "an object of no use besides an integrator": (
+        {"nested": {"type": "path"}, "foo": {"type": "diffuse"}},
+        "splats: foo must be an integrator",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_wrong_properties_are_refused_in_one_line(case):
+    changes, expected = REFUSED[case]
+    changes = {key: v() if callable(v) else v for key, v in changes.items()}
+    assert expected in refusal_of_dictionary(**changes)
+
+
+def test_an_unknown_property_is_mitsubas_own_error():
+    with pytest.raises(RuntimeError, match="unreferenced property"):
+        mi.load_dict({"type": "splats", **valid(), "sh_degre": 1})
+
+
+@pytest.mark.parametrize("degree", [4, -1, 0.0, True])
+def test_the_degree_in_use_is_checked(degree):
+    integrator = mi.load_dict({"type": "splats", **valid()})
+    with pytest.raises(ValueError, match=rf"integer from 0 to 3, got {degree}"):
+        integrator.sh_degree = degree
+    assert integrator.sh_degree == 1
+
+
+@pytest.mark.parametrize("use", ["render", "summary"])
+@pytest.mark.parametrize("given", [True, False], ids=["when loaded", "later"])
+def test_a_degree_above_that_of_the_scenes_gaussians_is_refused(given, use):
+    """Before that, shapes of the scene might have it."""
+    loaded = replace(Scene(), sh_degree=2 if given else None).load()
+    integrator = loaded.integrator()
+    if not given:
+        mi.render(loaded)
+        integrator.sh_degree = 2
+    with pytest.raises(ValueError, match=r"integer from 0 to 1, the degree of the Gau.* got 2"):
+        getattr(integrator, use)(loaded, loaded.sensors()[0])
+    integrator.sh_degree = np.int64(1)
+    mi.render(loaded)
+
+
+@pytest.mark.parametrize(
+    "name, shape, message",
+    [
+        ("means", (8, 2), r"means must have the shape \(N, 3\)"),
+        ("means", (9, 3), r"quats must have the shape \(N, 4\), with N = 9"),
+        ("shN", (8, 5, 3), r"shN must have the shape"),
+        ("shN", (8, 0, 3), r"sh_degree must be an integer from 0 to 0"),
+    ],
+)
+def test_parameters_that_do_not_fit_are_refused_when_updated(name, shape, message):
+    params = mi.traverse(mi.load_dict({"type": "splats", **valid()}))
+    params[name] = zeros(*shape)
+    with pytest.raises(ValueError, match=rf"^splats: {message}"):
+        params.update()
+
+
+def test_other_sensors_are_refused():
+    loaded = mi.load_dict(
+        {
+            "type": "scene",
+            "integrator": {"type": "splats", **valid()},
+            "s": {"type": "radiancemeter", "film": {"type": "hdrfilm", "width": 1, "height": 1}},
+        }
+    )
+    with pytest.raises(RuntimeError) as caught:
+        mi.render(loaded)
+    assert message_of(caught.value).startswith(
+        "splats: the sensor must be of type perspective, thinlens, orthographic or calibrated, got "
+    )

@@ -1,0 +1,157 @@
+"""What the ``splats`` integrator is told to ignore, and what it says about it."""
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from support.splats_checks import assert_images_agree, fresh_image, fresh_integrator
+from support.views import (
+    VIEWS,
+    Scene,
+    gradients_of,
+    image_of,
+    pose,
+    tensors,
+)
+
+import drgs  # noqa: F401  (registers the plugin)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def variant():
+    mi.set_variant("llvm_ad_rgb")
+
+
+CLOSE = pose([0.3, -1.0, 0.5], 48, (0.5, -0.6, 1.0))
+
+
+def sensor_like(view, kind="calibrated", **changes) -> dict:
+    """The view with a pinhole, by another sensor."""
+    sensor = view.sensor()
+    kept = {key: sensor[key] for key in ("to_world", "film", "sampler", "near_clip")}
+    if kind == "calibrated":
+        camera = view.camera
+        kept |= {"fx": camera.fx, "fy": camera.fy, "cx": camera.cx, "cy": camera.cy}
+    return kept | {"type": kind, **changes}
+
+
+BENT = {"lens": "opencv", "k1": -0.25, "p1": 0.01}
+
+
+BLURRED = {"aperture_radius": 0.1, "focus_distance": 2.0, "fov": VIEWS[1].fov}
+
+
+def moving(**changes):
+    return {"to_world_close": mi.ScalarTransform4f(np.array(CLOSE)), **changes}
+
+
+IGNORED = {
+    "distortion": ("distortion", lambda: sensor_like(VIEWS[1], **BENT)),
+    "fisheye": ("distortion", lambda: sensor_like(VIEWS[1], lens="fisheye", k1=0.02)),
+    "defocus": ("defocus", lambda: sensor_like(VIEWS[1], "thinlens", **BLURRED)),
+    "motion blur": ("motion", lambda: sensor_like(VIEWS[1], **moving(shutter_samples=2))),
+    "rolling shutter": ("motion", lambda: sensor_like(VIEWS[1], **moving(shutter="rolling"))),
+    "both": ("motion, distortion", lambda: sensor_like(VIEWS[1], **BENT, **moving())),
+}
+
+
+@pytest.mark.parametrize("case", IGNORED)
+def test_what_is_ignored_leaves_a_pinhole_that_stands_still(case):
+    """And what is not asked to be ignored is seen."""
+    ignored, sensor = IGNORED[case]
+    scene = Scene()
+
+    def image(**settings):
+        integrator = scene.settings | tensors(scene.gaussians) | settings
+        return image_of(
+            mi.load_dict({"type": "scene", "integrator": integrator, "sensor": sensor()})
+        )
+
+    expected = fresh_image(scene)
+    assert_images_agree(image(ignore=ignored), expected)
+    assert np.abs(image() - expected).max() > 0.05
+    others = [word for word in ("distortion", "defocus", "motion") if word not in ignored]
+    assert np.array_equal(image(ignore=", ".join([*others, "smoothing"])), image())
+
+
+def test_an_orthographic_lens_is_no_distortion():
+    """No pinhole could take its place."""
+    scene = Scene()
+    loaded = mi.load_dict(
+        {
+            "type": "scene",
+            "integrator": fresh_integrator(scene, ignore="distortion"),
+            "sensor": sensor_like(VIEWS[1], "orthographic"),
+        }
+    )
+    plain = image_of(loaded, integrator=fresh_integrator(scene))
+    assert np.array_equal(image_of(loaded), plain)
+
+
+def plan_of(sensor, **settings) -> str:
+    scene = Scene(degree=settings.pop("degree", 1))
+    emitter = {"sky": {"type": "constant"}} if settings.pop("sky", False) else {}
+    integrator = fresh_integrator(scene, **settings)
+    loaded = mi.load_dict({"type": "scene", "integrator": integrator, "sensor": sensor, **emitter})
+    return loaded.integrator().summary(loaded, loaded.sensors()[0])
+
+
+def test_a_plan_of_a_plain_scene():
+    assert plan_of(VIEWS[1].sensor()) == (
+        "simulated:\n"
+        "  view dependence: spherical harmonics up to degree 1 (the Gaussians' coefficients)\n"
+        "  background: a constant colour (the integrator's background)\n"
+        "  not simulated: lens, depth of field, motion, antialiasing, surfaces"
+    )
+
+
+def test_a_plan_names_what_asked_for_each_effect():
+    sensor = sensor_like(VIEWS[1], **BENT, **moving(shutter="rolling"))
+    smoothing = mi.Float(np.full(40, 0.01, np.float32))
+    settings = {"sky": True, "degree": 0, "antialiased": True, "smoothing": smoothing}
+    assert plan_of(sensor, **settings) == (
+        "simulated:\n"
+        "  background: an environment (the scene's emitter)\n"
+        "  lens: RadialTangential (k1, p1, p2) (the sensor)\n"
+        "  motion: rolling shutter (the sensor)\n"
+        "  antialiasing: opacities compensated for the low-pass filter, 3D smoothing filter "
+        "(antialiased, the Gaussians' filter)\n"
+        "  not simulated: view dependence, depth of field, surfaces"
+    )
+    ignored = plan_of(sensor, **settings, ignore="distortion, motion, smoothing")
+    absent = "view dependence, lens (ignored), depth of field, motion (ignored)"
+    assert f"  not simulated: {absent}, smoothing filter (ignored), surfaces" in ignored
+    assert "3D smoothing" not in ignored
+    defocused = plan_of(sensor_like(VIEWS[1], "thinlens", **BLURRED), sky=True, hide_emitters=True)
+    assert "  depth of field: a thin lens (the sensor)\n" in defocused
+    assert "  background: a constant colour (the integrator's background)\n" in defocused
+    picture = {"type": "bitmap", "bitmap": mi.Bitmap(np.ones((2, 2, 3), np.float32))}
+    blurred = plan_of(sensor_like(VIEWS[1], **moving()), background=picture)
+    assert "  background: a picture (the integrator's background)\n" in blurred
+    assert "  motion: blurred (the sensor)\n" in blurred
+
+
+@pytest.fixture
+def logged(monkeypatch):
+    """What this integrator says at the level of information; other messages are dropped."""
+    lines = []
+    monkeypatch.setattr(mi, "Log", lambda level, text: lines.append((level, text)))
+    before = mi.log_level()
+    yield lines
+    mi.set_log_level(before)
+
+
+def test_a_plan_is_logged_once_where_somebody_listens(logged):
+    """Again when it is another."""
+    scene = Scene()
+    loaded = scene.load()
+    mi.render(loaded)
+    assert logged == []
+    mi.set_log_level(mi.LogLevel.Info)
+    for _ in range(3):
+        mi.render(loaded)
+    sensor = loaded.sensors()[0]
+    assert logged == [(mi.LogLevel.Info, f"splats: {loaded.integrator().summary(loaded, sensor)}")]
+    gradients_of(loaded, scene.weights(), ["means"])
+    assert len(logged) == 1
+    mi.render(loaded, sensor=mi.load_dict(sensor_like(VIEWS[1], "thinlens", **BLURRED)))
+    assert len(logged) == 2 and "depth of field: a thin lens" in logged[1][1]

@@ -1,0 +1,515 @@
+"""Lenses of the float64 reference: where points lie, how large splats are."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import fields, replace
+
+import numpy as np
+import pytest
+from scipy.optimize import brentq
+from support.reference_lenses import FISHEYE, camera_at_origin, gaussians_at, whitened_samples
+from support.reference_scenes import (
+    small_camera,
+    small_scene,
+)
+
+from drgs.reference import effects
+from drgs.reference import splatting as reference
+from drgs.reference.effects import Fisheye, OpenCV, Orthographic, Pinhole
+
+# Coefficients of sizes that cameras have, exact in binary.
+BARREL = OpenCV(k1=-0.25, k2=0.0625, p1=0.0078125, p2=-0.015625, k3=0.03125)
+
+
+RATIONAL = replace(BARREL, k4=0.125, k5=-0.0625, k6=0.015625)
+
+
+PINCUSHION = OpenCV(k1=0.125, k2=0.03125)
+
+
+LENSES = [Pinhole(), BARREL, RATIONAL, PINCUSHION, Fisheye(), FISHEYE, Orthographic()]
+
+
+every_lens = pytest.mark.parametrize("lens", LENSES, ids=str)
+
+
+def points_within(lens, camera, count=200, seed=3) -> np.ndarray:
+    """(count, 3) random points in camera axes that the lens sees, at distances 0.5 to 4."""
+    rng = np.random.default_rng(seed)
+    angles = rng.uniform(0, 2.7 if isinstance(lens, Fisheye) else 0.75, count)
+    azimuths, distances = rng.uniform(0, 2 * np.pi, count), rng.uniform(0.5, 4, count)
+    sines = np.sin(angles)
+    directions = [sines * np.cos(azimuths), sines * np.sin(azimuths), np.cos(angles)]
+    points = distances[:, None] * np.stack(directions, axis=-1)
+    assert lens.is_seen(camera, points).all()
+    return points
+
+
+# ----------------------------------------------------------------------------------------------
+# Lenses: where points lie
+# ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "lens", [Pinhole(), OpenCV(), BARREL, Fisheye(), FISHEYE, Orthographic()], ids=str
+)
+def test_a_point_on_the_axis_is_at_the_principal_point(lens):
+    camera = camera_at_origin()
+    points = np.array([[0, 0, 0.5], [1e-200, 0, 2.0], [0, -1e-12, 1.0]])
+    assert lens.is_seen(camera, points).all()
+    # The third is f * 1e-12 away.
+    np.testing.assert_allclose(lens.film_points(camera, points), [[140, 95]] * 3, atol=1e-9)
+
+
+def test_pinhole_points_are_those_of_the_reference():
+    gaussians, camera = small_scene()
+    splats = reference.project(gaussians, camera)
+    points = (gaussians.means - camera.center) @ camera.rotation.T
+    seen = Pinhole().is_seen(camera, points)
+    np.testing.assert_array_equal(seen, splats.depths >= camera.near)
+    np.testing.assert_allclose(
+        Pinhole().film_points(camera, points[seen]), splats.means2d[seen], rtol=1e-14
+    )
+    # Two sums of three products, in another order.
+    np.testing.assert_allclose(Pinhole().depths(camera, points), splats.depths, atol=1e-15)
+
+
+def test_opencv_without_coefficients_is_a_pinhole():
+    camera = camera_at_origin()
+    points = points_within(Pinhole(), camera)
+    np.testing.assert_allclose(
+        OpenCV().film_points(camera, points), Pinhole().film_points(camera, points), rtol=1e-13
+    )
+    assert OpenCV().valid_radius == math.inf
+    bounds = OpenCV().slope_bounds(camera), Pinhole().slope_bounds(camera)
+    np.testing.assert_allclose(*bounds, atol=1e-15)
+
+
+@pytest.mark.parametrize("lens", [BARREL, RATIONAL, PINCUSHION], ids=str)
+def test_opencv_is_its_vector_equation(lens):
+    """s q + r^2 p + 2 (p . s) s with the vector p = (p2, p1); radii by Horner, not powers."""
+    camera = camera_at_origin()
+    points = points_within(lens, camera)
+    film = lens.film_points(camera, points)
+    for point, actual in zip(points, film, strict=True):
+        slope, p = point[:2] / point[2], np.array([lens.p2, lens.p1])
+        r2 = slope @ slope
+        q = (1 + r2 * (lens.k1 + r2 * (lens.k2 + r2 * lens.k3))) / (
+            1 + r2 * (lens.k4 + r2 * (lens.k5 + r2 * lens.k6))
+        )
+        expected = slope * q + r2 * p + 2 * (p @ slope) * slope
+        expected = np.array([230.0, 190.0]) * expected + [140.0, 95.0]
+        np.testing.assert_allclose(actual, expected, atol=1e-12)
+
+
+# cv2.projectPoints and cv2.fisheye.projectPoints of opencv-python 5.0.0, of the points
+# (0, 0, 1), (0.5, -0.25, 2), (-1.5, 1, 2), (0.75, 1.5, 1.25), with RATIONAL and FISHEYE.
+OPENCV_POINTS = np.array([[0, 0, 1], [0.5, -0.25, 2], [-1.5, 1, 2], [0.75, 1.5, 1.25]])
+
+
+OPENCV_FILM = {
+    RATIONAL: [
+        [140.0, 95.0],
+        [195.03270342494275, 72.26910075926278],
+        [-6.302419057302984, 175.17032849804366],
+        [249.3651258558761, 289.04958293579534],
+    ],
+    FISHEYE: [
+        [140.0, 95.0],
+        [195.9436003856843, 71.89286071026083],
+        [1.4869510124012777, 171.282548717808],
+        [233.83945348652193, 250.03909706468843],
+    ],
+}
+
+
+@pytest.mark.parametrize("lens", OPENCV_FILM, ids=str)
+def test_film_points_are_those_of_opencv(lens):
+    actual = lens.film_points(camera_at_origin(), OPENCV_POINTS)
+    np.testing.assert_allclose(actual, OPENCV_FILM[lens], rtol=1e-13)
+
+
+def radial(lens, r) -> float:
+    """R -> r q(r) of an OpenCV lens."""
+    u = r * r
+    numerator = 1 + lens.k1 * u + lens.k2 * u**2 + lens.k3 * u**3
+    return r * numerator / (1 + lens.k4 * u + lens.k5 * u**2 + lens.k6 * u**3)
+
+
+def test_valid_radius_of_one_coefficient_is_known():
+    # d/dr (r + k1 r^3) = 1 + 3 k1 r^2; 1 + k4 r^2 has its zero before the derivative has one.
+    assert OpenCV(k1=-0.3).valid_radius == pytest.approx(math.sqrt(1 / 0.9), rel=1e-12)
+    assert OpenCV(k1=0.3).valid_radius == math.inf
+    assert OpenCV(k4=-0.25).valid_radius == pytest.approx(2.0, rel=1e-12)
+    # d/dr r / (1 + k4 r^2) vanishes where 1 = k4 r^2.
+    assert OpenCV(k4=0.25).valid_radius == pytest.approx(2.0, rel=1e-12)
+
+
+@pytest.mark.parametrize(("p1", "p2"), [(0.25, 0.0), (-0.03, 0.04), (1e-4, -2e-4)])
+def test_tangential_terms_alone_fold_on_one_side(p1, p2):
+    """Along s = -r (p2, p1) / q the distorted slope is -(r - 3 q r^2) (p2, p1) / q."""
+    lens, q = OpenCV(p1=p1, p2=p2), math.hypot(p1, p2)
+    assert lens.valid_radius == pytest.approx(1 / (6 * q), rel=1e-12)
+    toward = -np.array([p2, p1]) / q
+    for part in (0.5, 0.99):
+        beyond = (1 / (3 * q) - part * lens.valid_radius) * toward
+        images = [lens.distorted(s) for s in (part * lens.valid_radius * toward, beyond)]
+        np.testing.assert_allclose(*images, rtol=1e-9)
+
+
+@pytest.mark.parametrize("k1", [-0.3, 0.3])
+def test_within_its_radius_a_lens_with_tangential_terms_is_undone(k1):
+    """In all directions. What a barrel shows is folded just beyond, in that of the terms."""
+    lens = OpenCV(k1=k1, p1=0.18, p2=-0.24)
+    assert lens.valid_radius < OpenCV(k1=k1).valid_radius
+    angles, parts = np.meshgrid(np.linspace(0, 6.2, 40), [0.5, 0.9, 0.999])
+    slopes = (parts * lens.valid_radius)[..., None] * np.stack([np.cos(angles), np.sin(angles)], -1)
+    slopes = slopes.reshape(-1, 2)
+    # Next to the fold the inverse is steeper than the distortion by a factor of 1000.
+    np.testing.assert_allclose(lens.undistorted(lens.distorted(slopes)), slopes, atol=1e-8)
+    toward = lens.valid_radius * np.array([0.8, -0.6])
+    steps = [lens.distorted(f * toward) - lens.distorted((f - 1e-3) * toward) for f in (1, 1.002)]
+    assert steps[0] @ toward > 0 and (steps[1] @ toward < 0) == (k1 < 0)
+
+
+def test_lenses_with_tangential_terms_have_no_fold_within_their_radius():
+    """The determinants of difference quotients, in a disc of each of 40 lenses, are positive."""
+    ended = 0
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        lens = OpenCV(*rng.normal(0, [0.3, 0.1, 0.03, 0.3, 0.1, 0.03, 0.1, 0.1]))
+        ended += lens.valid_radius < 0.99 * replace(lens, p1=0.0, p2=0.0).valid_radius
+        radius = min(lens.valid_radius, 10.0)
+        angles, radii = np.meshgrid(np.linspace(0, 2 * np.pi, 90), np.linspace(0.01, 0.999, 100))
+        slopes = (radius * radii)[..., None] * np.stack([np.cos(angles), np.sin(angles)], -1)
+        h = 1e-6 * radius
+        (a, c), (b, d) = (
+            np.moveaxis((lens.distorted(slopes + step) - lens.distorted(slopes - step)) / h, -1, 0)
+            for step in h * np.eye(2) / 2
+        )
+        assert (a * d - b * c).min() > 0 and (a + d).min() > 0, lens
+    assert ended > 20
+
+
+def test_valid_radius_of_a_touching_derivative_is_where_it_touches():
+    # 1 + 3 k1 u + 5 k2 u^2 = (1 - u / c)^2: a double root, found to the square root of rounding,
+    # and with an imaginary part of 1e-8 for some of these.
+    for c in np.arange(0.3, 3.0, 0.1):
+        lens = OpenCV(k1=-2 / (3 * c), k2=1 / (5 * c**2))
+        assert lens.valid_radius == pytest.approx(math.sqrt(c), rel=1e-7)
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_valid_radius_is_where_the_distorted_radius_first_turns(seed):
+    rng = np.random.default_rng(seed)
+    lens = OpenCV(*rng.normal(0, [0.3, 0.1, 0.03, 0.3, 0.1, 0.03]))
+    radii = np.linspace(0, 5, 500_001)
+    values = radial(lens, radii)
+    turns = np.flatnonzero(np.diff(values) <= 0)  # a pole jumps down from +inf to -inf
+    first = radii[turns[0]] if len(turns) else math.inf
+    assert first < 5 or len(turns) == 0
+    if first < math.inf:
+        assert abs(lens.valid_radius - first) <= 2 * radii[1]
+    else:
+        assert lens.valid_radius > 5
+
+
+def test_some_random_lenses_turn_and_some_do_not():
+    """The test above meets both."""
+    radii = []
+    for seed in range(8):
+        rng = np.random.default_rng(seed)
+        radii.append(OpenCV(*rng.normal(0, [0.3, 0.1, 0.03, 0.3, 0.1, 0.03])).valid_radius)
+    assert min(radii) < 5 and max(radii) > 5
+
+
+def test_points_that_would_fold_back_into_the_picture_are_not_seen():
+    camera, lens = camera_at_origin(), OpenCV(k1=-0.3)
+    limit = math.sqrt(1 / 0.9)
+    folded = np.array([[1.8, 0, 1.0], [2 * limit, 0, 2.0]])
+    film = lens.film_points(camera, folded)[0]
+    assert ((film > 0) & (film < [camera.width, camera.height])).all()
+    assert not lens.is_seen(camera, folded).any()
+    assert lens.is_seen(camera, np.array([[2 * limit - 1e-9, 0, 2.0]])).all()
+    splats = effects.project(gaussians_at(folded), camera, lens)
+    assert not splats.visible.any()
+    assert effects.project(gaussians_at(folded), camera).visible.all()
+
+
+@pytest.mark.parametrize("lens", [BARREL, RATIONAL, PINCUSHION], ids=str)
+def test_distortion_is_undone(lens):
+    slopes = np.random.default_rng(0).uniform(-0.55, 0.55, (300, 2))
+    assert np.linalg.norm(slopes, axis=1).max() < lens.valid_radius
+    # Newton stops at rounding; near no fold the inverse is as accurate as the residual.
+    np.testing.assert_allclose(lens.undistorted(lens.distorted(slopes)), slopes, atol=1e-11)
+
+
+def test_undistorted_radius_is_the_root_of_the_radial_equation():
+    lens = OpenCV(k1=-0.3)
+    highest = radial(lens, lens.valid_radius)
+    for radius in (0.1, 0.5, 0.999 * highest):
+        expected = brentq(lambda r, t=radius: radial(lens, r) - t, 0, lens.valid_radius)
+        actual = lens.undistorted(np.array([[0.6, -0.8]]) * radius)
+        # brentq's own tolerance, 2e-12; the fold amplifies the residual by a few hundred.
+        np.testing.assert_allclose(actual, [[0.6 * expected, -0.8 * expected]], atol=1e-9)
+    beyond = np.array([[0.6, -0.8]]) * [[1.001 * highest], [3.0]]
+    assert np.isnan(lens.undistorted(beyond)).all()
+
+
+@pytest.mark.parametrize("degrees", [1e-6, 30, 90, 120, 170])
+def test_plain_fisheye_is_proportional_to_the_angle(degrees):
+    camera, theta = camera_at_origin(fy=230.0), math.radians(degrees)
+    point = 3.0 * np.array([[math.sin(theta) * 0.6, math.sin(theta) * -0.8, math.cos(theta)]])
+    assert Fisheye().is_seen(camera, point).all()
+    expected = 230 * theta * np.array([[0.6, -0.8]]) + [140, 95]
+    np.testing.assert_allclose(Fisheye().film_points(camera, point), expected, rtol=1e-13)
+
+
+def test_fisheye_agrees_with_a_pinhole_that_bends_the_angle():
+    """In front, theta_d is the polynomial and the point (tan(theta_d) u, 1) a pinhole's."""
+    camera = camera_at_origin()
+    points = points_within(Pinhole(), camera)
+    u = points[:, :2] / np.linalg.norm(points[:, :2], axis=1, keepdims=True)
+    theta = np.arccos(points[:, 2] / np.linalg.norm(points, axis=1))
+    bent = theta + sum(
+        k * theta**n
+        for k, n in zip([-0.03125, 0.015625, -0.0078125, 0.001953125], [3, 5, 7, 9], strict=True)
+    )
+    expected = np.column_stack([bent[:, None] * u, np.ones(len(u))])
+    # arccos loses half the digits near the axis: 1e-16 / sin(theta).
+    np.testing.assert_allclose(
+        FISHEYE.film_points(camera, points), Pinhole().film_points(camera, expected), rtol=1e-11
+    )
+
+
+def test_fisheye_sees_up_to_its_first_turn_or_almost_all_around():
+    assert Fisheye().valid_angle == 0.95 * math.pi
+    assert Fisheye(k1=0.1).valid_angle == 0.95 * math.pi
+    # d/dtheta (theta + k1 theta^3) = 1 + 3 k1 theta^2
+    assert Fisheye(k1=-0.3).valid_angle == pytest.approx(math.sqrt(1 / 0.9), rel=1e-12)
+    theta = np.linspace(0, np.pi, 1_000_001)
+    lens = Fisheye(0.05, -0.04, 0.01, -0.002)
+    powers = theta ** np.array([[1], [3], [5], [7], [9]])
+    turn = theta[np.argmax(np.diff(np.array([1, lens.k1, lens.k2, lens.k3, lens.k4]) @ powers) < 0)]
+    assert 0 < turn < 2.5 and abs(lens.valid_angle - turn) < 1e-5
+
+    camera = camera_at_origin()
+    for lens, limit in [(Fisheye(), 0.95 * math.pi), (Fisheye(k1=-0.3), math.sqrt(1 / 0.9))]:
+        angles = np.array([limit - 1e-9, limit + 1e-9, math.pi])
+        points = np.column_stack([np.sin(angles), 0 * angles, np.cos(angles)])
+        np.testing.assert_array_equal(lens.is_seen(camera, points), [True, False, False])
+
+
+def test_depth_is_distance_for_a_fisheye_and_z_otherwise():
+    camera = camera_at_origin(near=0.5)
+    points = np.array([[0.6, 0, 0.1], [0.3, 0, 0.1], [0.0, 0.4, 0.5], [0.7, 0, -0.1], [0, 0, 0]])
+    assert list(Fisheye().is_seen(camera, points)) == [True, False, True, True, False]
+    np.testing.assert_allclose(Fisheye().depths(camera, points)[2], math.sqrt(0.41), rtol=1e-15)
+    for lens in (Pinhole(), OpenCV(), Orthographic()):
+        assert list(lens.is_seen(camera, points)) == [False, False, True, False, False]
+        np.testing.assert_array_equal(lens.depths(camera, points), points[:, 2])
+
+
+def test_orthographic_film_does_not_depend_on_z():
+    camera = camera_at_origin()
+    points = np.array([[0.25, -0.5, 0.5], [0.25, -0.5, 50.0]])
+    film = Orthographic().film_points(camera, points)
+    np.testing.assert_array_equal(film, [[197.5, 0.0]] * 2)
+
+
+@every_lens
+def test_view_directions_end_at_the_means_unless_rays_are_parallel(lens):
+    gaussians, camera = small_scene()
+    directions = lens.view_directions(camera, gaussians.means)
+    for mean, direction in zip(gaussians.means, directions, strict=True):
+        expected = mean - camera.center
+        if isinstance(lens, Orthographic):
+            expected = np.linalg.inv(camera.rotation) @ [0, 0, 1]
+        np.testing.assert_allclose(direction, expected / np.linalg.norm(expected), atol=1e-14)
+
+
+# ----------------------------------------------------------------------------------------------
+# Lenses: how large splats are
+# ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("lens", [Pinhole(), OpenCV()], ids=str)
+@pytest.mark.parametrize("antialiased", [False, True])
+def test_splats_behind_a_pinhole_are_those_of_the_reference(lens, antialiased):
+    """Row 9's slopes are clamped in J, row 10 is behind the camera, row 11 is too faint."""
+    gaussians, camera = small_scene()
+    expected = reference.project(gaussians, camera, antialiased)
+    actual = effects.project(gaussians, camera, lens, antialiased)
+    np.testing.assert_array_equal(actual.visible, expected.visible)
+    assert list(np.flatnonzero(~actual.visible)) == [10, 11]
+    for field in ("means2d", "cov2d", "conics", "opacities"):
+        # J by differences is off by 1e-13 of itself. Measured: 1e-13.
+        np.testing.assert_allclose(
+            getattr(actual, field)[:10], getattr(expected, field)[:10], rtol=1e-10, atol=1e-11
+        )
+    np.testing.assert_allclose(actual.depths, expected.depths, atol=1e-14)
+
+
+@every_lens
+def test_covariances_are_those_of_projected_samples(lens):
+    """A Gaussian of 1e-5 of its distance leaves samples whose covariance is J's sandwich."""
+    camera = replace(small_camera(), width=400, height=400, cx=210.0, cy=190.0, fx=220.0, fy=260.0)
+    points = points_within(lens, camera, count=8)
+    rng = np.random.default_rng(1)
+    scales = 1e-5 * np.linalg.norm(points, axis=1)[:, None] * rng.uniform(0.3, 1.0, (8, 3))
+    gaussians = gaussians_at(points @ camera.rotation + camera.center, scales)
+    gaussians = replace(gaussians, quats=rng.normal(0, 1, (8, 4)))
+    splats = effects.project(gaussians, camera, lens, low_pass=0.0)
+    assert splats.visible.all()
+
+    turns = reference.quat_to_rotation(gaussians.quats)
+    for n in range(8):
+        offsets = whitened_samples(5000) * scales[n] @ turns[n].T
+        world = gaussians.means[n] + offsets
+        film = lens.film_points(camera, (world - camera.center) @ camera.rotation.T)
+        # The Gaussian is 1e-5 of its distance, and so is the quadratic part of the linear one,
+        # times the samples' third moments, 0.03. Measured: 1.1e-6.
+        expected = np.cov(film.T, bias=True)
+        np.testing.assert_allclose(
+            splats.cov2d[n], expected, rtol=0, atol=1e-5 * np.abs(expected).max()
+        )
+        np.testing.assert_allclose(splats.conics[n] @ splats.cov2d[n], np.eye(2), atol=1e-8)
+
+
+@pytest.mark.parametrize("lens", [Fisheye(), FISHEYE, PINCUSHION], ids=str)
+def test_a_sphere_is_stretched_along_and_across_the_radius(lens):
+    """Along: f d theta_d / d theta s / distance; across: f theta_d / sin(theta) s / distance."""
+    camera = camera_at_origin(fy=230.0)
+    points = points_within(lens, camera, count=20)
+    scale = 0.1
+    splats = effects.project(gaussians_at(points, scale), camera, lens)
+
+    def film_radius(theta):
+        """theta_d, a function of the angle from the axis alone."""
+        if isinstance(lens, Fisheye):
+            powers = theta ** np.arange(1, 10, 2)
+            return powers @ [1, lens.k1, lens.k2, lens.k3, lens.k4]
+        return radial(lens, math.tan(theta))
+
+    lower, upper = (camera.width * 0.65 * np.array([[-1], [1]]) + [130, 105]) / 230
+    for point, cov2d in zip(points, splats.cov2d, strict=True):
+        distance, rho = np.linalg.norm(point), math.hypot(*point[:2])
+        theta = math.atan2(rho, point[2])
+        if isinstance(lens, OpenCV) and not np.all((lower < point[:2]) & (point[:2] < upper)):
+            continue
+        along = (film_radius(theta + 1e-5) - film_radius(theta - 1e-5)) / 2e-5
+        across = film_radius(theta) / math.sin(theta)
+        u = point[:2] / rho
+        v = np.array([-u[1], u[0]])
+        size = (230 * scale / distance) ** 2
+        expected = size * (along**2 * np.outer(u, u) + across**2 * np.outer(v, v))
+        # Central differences with a step of 1e-5: 1e-10 of the third derivative.
+        np.testing.assert_allclose(cov2d, expected + 0.3 * np.eye(2), rtol=1e-8, atol=1e-6)
+
+
+@pytest.mark.parametrize("lens", [Fisheye(), FISHEYE, RATIONAL], ids=str)
+def test_on_the_axis_every_lens_that_bends_rays_is_a_pinhole(lens):
+    gaussians = gaussians_at([0, 0, 2.0], [[0.1, 0.2, 0.05]], quats=[0.3, 0.8, -0.5, 0.1])
+    actual = effects.project(gaussians, camera_at_origin(), lens)
+    expected = reference.project(gaussians, camera_at_origin())
+    np.testing.assert_allclose(actual.cov2d, expected.cov2d, rtol=1e-11)
+    np.testing.assert_array_equal(actual.means2d, expected.means2d)
+
+
+def test_low_pass_is_what_was_asked_for():
+    gaussians, camera = small_scene()
+    plain, none = (effects.project(gaussians, camera, low_pass=t) for t in (0.3, 0.0))
+    difference = plain.cov2d[:10] - none.cov2d[:10]
+    np.testing.assert_allclose(difference, np.tile(0.3 * np.eye(2), (10, 1, 1)), atol=1e-10)
+    compensated = effects.project(gaussians, camera, antialiased=True, low_pass=0.0)
+    np.testing.assert_allclose(compensated.opacities, none.opacities, rtol=1e-12)
+
+
+def test_a_singular_splat_is_not_visible():
+    gaussians = gaussians_at([0, 0, 1], [1e-200, 1e-200, 0.1])
+    splats = effects.project(gaussians, camera_at_origin(), Orthographic(), low_pass=0.0)
+    assert not splats.visible.any() and np.isfinite(splats.conics).all()
+
+
+@every_lens
+def test_splats_that_are_not_seen_hold_finite_numbers(lens):
+    means = np.array([[0, 0, 0], [0, 0, -1], [1, 2, 0], [3, 0, 0.011], [0, 0, 2.0], [1e3, 0, 1]])
+    gaussians, camera = gaussians_at(means), camera_at_origin()
+    with np.errstate(all="raise"):
+        splats = effects.project(gaussians, camera, lens, defocus=None)
+    for field in fields(splats):
+        assert np.isfinite(getattr(splats, field.name)).all(), field.name
+    assert splats.visible[4] and not splats.visible[0]
+
+
+# ----------------------------------------------------------------------------------------------
+# Lenses: the clamp of J
+# ----------------------------------------------------------------------------------------------
+
+
+def test_slope_bounds_of_a_barrel_are_those_of_its_corners():
+    """A barrel's film corners are its border's extremes: they are pulled in most."""
+    camera, lens = camera_at_origin(), OpenCV(k1=-0.1)
+    corners = np.array([[0, 0], [260, 0], [0, 210], [260, 210]])
+    slopes = []
+    for x, y in (corners - [140, 95]) / [230, 190]:
+        distorted = math.hypot(x, y)
+        radius = brentq(lambda r, t=distorted: radial(lens, r) - t, 0, lens.valid_radius)
+        slopes.append([x * radius / distorted, y * radius / distorted])
+    lower, upper = lens.slope_bounds(camera)
+    np.testing.assert_allclose(lower, np.min(slopes, axis=0), rtol=1e-10)
+    np.testing.assert_allclose(upper, np.max(slopes, axis=0), rtol=1e-10)
+
+
+def test_slope_bounds_of_a_pincushion_are_on_the_axes_of_the_film():
+    """Its edges bulge outward between the corners: farthest on the row and column of (cx, cy)."""
+    camera = camera_at_origin(cx=130.0, cy=105.0)
+    lower, upper = PINCUSHION.slope_bounds(camera)
+    for axis, half in enumerate([130 / 230, 105 / 190]):
+        expected = brentq(lambda r, t=half: radial(PINCUSHION, r) - t, 0, 2)
+        np.testing.assert_allclose([lower[axis], upper[axis]], [-expected, expected], rtol=1e-10)
+
+
+@pytest.mark.parametrize("part", [0.7, 0.71, 0.81, 1.2])
+def test_slopes_are_bounded_while_the_lens_reaches_the_whole_border(part):
+    """Half a side is a part of the largest distorted radius; the corners are sqrt(2) as far."""
+    lens = OpenCV(k1=-0.3)
+    half = part * radial(lens, lens.valid_radius)
+    camera = camera_at_origin(fx=100 / half, fy=100 / half, cx=100, cy=100, width=200, height=200)
+    assert (lens.slope_bounds(camera) is None) == (part > math.sqrt(0.5))
+
+
+def test_a_lens_whose_slopes_are_not_bounded_has_the_jacobian_at_the_mean():
+    """The corners of the film are beyond the fold: a mean beside it, below the fold, is not."""
+    lens, camera = OpenCV(k1=-0.3), camera_at_origin(fx=230.0, fy=230.0, width=400, height=400)
+    assert lens.slope_bounds(camera) is None
+    point = np.array([[-1.0, 0.2, 1.0]])
+    splats = effects.project(gaussians_at(point, 0.1), camera, lens)
+    J = 0.1 * effects.jacobians(lens, camera, point)[0]
+    np.testing.assert_allclose(splats.cov2d[0], J @ J.T + 0.3 * np.eye(2), rtol=1e-12, atol=1e-12)
+
+
+def test_lenses_without_slopes_have_no_bounds():
+    assert Fisheye().slope_bounds(camera_at_origin()) is None
+    assert Orthographic().slope_bounds(camera_at_origin()) is None
+
+
+@pytest.mark.parametrize("lens", [Pinhole(), PINCUSHION], ids=str)
+def test_far_outside_the_film_splats_have_the_size_of_the_widened_border(lens):
+    """The clamped J of one mean is the J of another, on the widened border at the same z."""
+    camera = camera_at_origin()
+    lower, upper = lens.slope_bounds(camera)
+    at = (lower + upper) / 2 + 1.3 * (upper - lower) / 2 * [1, -1]
+    z = 2.5
+    on_border, outside = z * np.array([*at, 1]), z * np.array([at[0] + 1.0, at[1] - 0.7, 1])
+    quat = [0.3, 0.8, -0.5, 0.1]
+    splats = effects.project(
+        gaussians_at([on_border, outside], [[0.1, 0.2, 0.05]] * 2, quats=quat), camera, lens
+    )
+    np.testing.assert_allclose(splats.cov2d[1], splats.cov2d[0], rtol=1e-10)
+    film = lens.film_points(camera, outside[None])
+    np.testing.assert_allclose(splats.means2d[1:], film, rtol=1e-12)
+    inside = effects.project(gaussians_at(0.9 * on_border + [0, 0, 0.25], [[0.1, 0.2, 0.05]],
+                                          quats=quat), camera, lens)  # fmt: skip
+    assert np.abs(inside.cov2d[0] / splats.cov2d[0] - 1).max() > 0.01

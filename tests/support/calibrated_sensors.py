@@ -1,0 +1,177 @@
+"""``calibrated`` sensors, and Mitsuba's own, before a few splats."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, replace
+
+import mitsuba as mi
+import numpy as np
+
+from drgs.reference import effects
+from drgs.reference import splatting as reference
+from drgs.reference.effects import Fisheye, OpenCV, Pinhole
+from support.lens_scenes import LENSES
+from support.views import VIEWS, View, pose, splats_before, tensors
+
+WINDOW = (13, 7, 29, 18)
+
+
+CLOSE = pose([0.1, -1.0, 0.3], 43, (0.5, -0.65, 1.05))
+
+
+@dataclass(frozen=True)
+class Calibrated:
+    """A sensor: its dictionary, and what the reference makes of it."""
+
+    name: str
+    lens: effects.Lens = Pinhole()  # noqa: RUF009
+    view: View = View("", 53, 41, crop=WINDOW)  # noqa: RUF009
+    f: tuple[float, float] = (40.0, 44.0)  # fx, fy, px
+    c: tuple[float, float] = (24.0, 22.5)  # cx, cy, px
+    close: tuple | None = None  # to_world_close
+    shutter: str = "global"
+
+    @property
+    def coefficients(self) -> dict[str, float]:
+        given = {} if isinstance(self.lens, Pinhole) else asdict(self.lens)
+        return {name: value for name, value in given.items() if value != 0}
+
+    def dictionary(self, **others) -> dict:
+        common = self.view.sensor()
+        kind = {Pinhole: "pinhole", OpenCV: "opencv", Fisheye: "fisheye"}[type(self.lens)]
+        moves = {} if self.close is None else {"to_world_close": transform(self.close)}
+        return {
+            "type": "calibrated",
+            "lens": kind,
+            **dict(zip(("fx", "fy", "cx", "cy"), (*self.f, *self.c), strict=True)),
+            **self.coefficients,
+            **{name: common[name] for name in ("near_clip", "to_world", "film", "sampler")},
+            **moves,
+            "shutter": self.shutter,
+            **others,
+        }
+
+    def load(self, **others) -> mi.Sensor:
+        return mi.load_dict(self.dictionary(**others))
+
+    @property
+    def camera(self) -> reference.Camera:
+        """Of the whole film, at time 0."""
+        (fx, fy), (cx, cy) = self.f, self.c
+        return replace(self.view.camera, fx=fx, fy=fy, cx=cx, cy=cy)
+
+    @property
+    def close_camera(self) -> reference.Camera:
+        """At time 1."""
+        at_close = replace(self.view, to_world=self.close or self.view.to_world).camera
+        return replace(self.camera, rotation=at_close.rotation, center=at_close.center)
+
+    def camera_at(self, time: float) -> reference.Camera:
+        return effects.camera_at(self.camera, self.close_camera, time)
+
+    @property
+    def corner(self) -> np.ndarray:
+        """Of the crop window in the film, px."""
+        return np.array((self.view.crop or (0, 0))[:2])
+
+    @property
+    def size(self) -> np.ndarray:
+        """Of the crop window, px."""
+        rows, columns = self.view.window
+        return np.array([columns.stop - columns.start, rows.stop - rows.start])
+
+
+def transform(matrix) -> mi.ScalarTransform4f:
+    return mi.ScalarTransform4f(np.array(matrix))
+
+
+PINHOLE = Calibrated("pinhole")
+
+
+OPENCV = Calibrated("opencv", LENSES["rational"])
+
+
+FISHEYE = Calibrated("fisheye", LENSES["fisheye"], f=(13.0, 14.5))
+
+
+FILM = View("", 37, 29)  # without a crop window
+
+
+# A fold within the film.
+BARREL = Calibrated("barrel", LENSES["barrel"], FILM, f=(26.0, 26.0), c=(19.0, 14.0))
+
+
+STILL = [PINHOLE, OPENCV, FISHEYE]
+
+
+by_name = {"ids": lambda sensor: sensor.name}
+
+
+def sampled_rays(sensor, time=0.0, count=200, seed=3):
+    """Rays through ``count`` random points of the film, their weights, and the samples (N, 2)."""
+    sample = np.random.default_rng(seed).uniform(size=(2, count)).astype(np.float32)
+    ray, weight = sensor.sample_ray(time, 0.5, mi.Point2f(sample), mi.Point2f(0.5))
+    return ray, np.array(weight)[0], sample.T.astype(np.float64)
+
+
+def splats_scene(sensor, gaussians, **settings) -> mi.Scene:
+    return mi.load_dict(
+        {
+            "type": "scene",
+            "integrator": {
+                "type": "splats", "srgb_primitives": False, **tensors(gaussians), **settings
+            },
+            "sensor": sensor.dictionary() if isinstance(sensor, Calibrated) else sensor,
+        }
+    )  # fmt: skip
+
+
+def clear_gaussians(sensor, render, view=None):
+    """Gaussians before the view, and their picture, which no threshold is near to."""
+    for seed in range(100):
+        gaussians = splats_before(view or sensor.view, 1, 40, seed)
+        picture = render(gaussians)
+        if not picture.near_threshold[sensor.view.window].any():
+            return gaussians, picture
+    raise AssertionError(f"{sensor.name}: no clear seed among 100")
+
+
+def scaled(matrix, *factors) -> tuple:
+    """A ``to_world`` that scales first."""
+    return tuple(map(tuple, np.array(matrix) @ np.diag([*factors, 1.0])))
+
+
+SENSORS = {
+    "thinlens": {"aperture_radius": 0.125, "focus_distance": 3.0},
+    "orthographic": {},
+}
+
+
+POSES = {"rotated": VIEWS[1].to_world, "mirrored": VIEWS[3].to_world}
+
+
+SCALED = {
+    "scaled": scaled(VIEWS[1].to_world, 3.0, 3.0, 3.0),
+    "scaled unevenly": scaled(VIEWS[1].to_world, 2.0, 0.5, 1.0),
+}
+"""Mitsuba refuses them for a thin lens."""
+
+
+def own_sensor(kind, view) -> dict:
+    dictionary = view.sensor()
+    others = {name: dictionary[name] for name in ("to_world", "film", "sampler", "near_clip")}
+    if kind == "thinlens":
+        others["fov"] = view.fov
+    return {"type": kind, **others, **SENSORS[kind]}
+
+
+def own_camera(view) -> reference.Camera:
+    """Of an orthographic sensor, by the manual: its film is 2 units of its own wide."""
+    matrix = np.array(view.to_world)[:3, :3]
+    scales = np.linalg.norm(matrix, axis=0)
+    rotation = np.diag([-1.0, -1.0, 1.0]) @ (matrix / scales).T
+    fx, fy = view.width / 2 / scales[:2]
+    return replace(
+        view.camera, rotation=rotation, fx=fx, fy=fy, cx=view.width / 2, cy=view.height / 2,
+        near=0.01,
+    )  # fmt: skip

@@ -1,0 +1,53 @@
+"""Folders of small datasets in both layouts."""
+
+import json
+
+import numpy as np
+import pytest
+
+from drgs.config.schema import DataConfig
+from drgs.core.errors import UserError
+from drgs.data import load_dataset
+from drgs.data.types import Dataset, View
+
+
+def look_at(center, target, up=(0, 0, 1)):
+    """(4, 4) camera to world in OpenGL axes (x right, y up, z backward)."""
+    center, target = np.asarray(center, float), np.asarray(target, float)
+    back = (center - target) / np.linalg.norm(center - target)
+    right = np.cross(up, back)
+    right /= np.linalg.norm(right)
+    matrix = np.eye(4)
+    matrix[:3] = np.stack([right, np.cross(back, right), back, center], axis=1)
+    return matrix
+
+
+def view_at(center, target, width=40, height=30):
+    matrix = look_at(center, target)
+    matrix[:3, 1:3] *= -1
+    image = np.zeros((height, width, 3), np.float32)
+    return View("v", image, matrix, width, width, width / 2, height / 2, width, height)
+
+
+def dataset_of(views, half_extent=None):
+    return Dataset(tuple(views), tuple(views), "test", (1.0, 1.0, 1.0), half_extent, "")
+
+
+CENTERS = [(4, 0, 0), (0, 4, 1), (-3, 0, 2)]
+
+
+def edit(path, change):
+    """Apply ``change`` to the parsed JSON of ``path``."""
+    meta = json.loads(path.read_text())
+    change(meta)
+    path.write_text(json.dumps(meta))
+
+
+def load(folder, **options):
+    return load_dataset(DataConfig(path=folder, **options))
+
+
+def refusal(folder, **options):
+    with pytest.raises(UserError) as error:
+        load(folder, **options)
+    return str(error.value)

@@ -1,0 +1,507 @@
+"""Families of hard inputs, and how far rounding may take their pictures and gradients."""
+
+from dataclasses import replace
+from functools import cache, partial
+
+import numpy as np
+
+from drgs.reference import splatting as reference
+from support.conditioning import SAMPLES, U, noise
+from support.helpers import (
+    FLOAT32,
+    FLOAT64,
+    Case,
+    Cotangents,
+    reference_gradients,
+    single,
+)
+
+ROUNDINGS = 25
+
+
+BOUND = 6 * np.sqrt(ROUNDINGS)
+
+
+UNDERFLOW = 1e-15
+"""Of an array's largest value: what is smaller may be lost to products below 1e-38."""
+
+
+PLANES = ("image", "alpha", "depth", "transmittance")
+
+
+def camera_for(width, height, rng=None, **changes) -> reference.Camera:
+    """A camera at the origin that looks along z; with ``rng``, one that is turned and moved."""
+    extent = max(width, height)
+    camera = reference.Camera(
+        rotation=np.eye(3),
+        center=np.zeros(3),
+        fx=1.25 * extent,
+        fy=1.125 * extent,
+        cx=0.5 * width,
+        cy=0.5 * height,
+        width=width,
+        height=height,
+        near=0.25,
+    )
+    if rng is not None:
+        rotation = reference.quat_to_rotation(rng.normal(0, 1, (1, 4)))[0]
+        camera = replace(camera, rotation=single(rotation), center=single(rng.normal(0, 1, 3)))
+    return replace(camera, **changes)
+
+
+def splats(
+    rng, camera, film, z, scales, logits, degree, quats=None, sh_size=0.3
+) -> reference.Gaussians:
+    """Gaussians whose means project to ``film`` (N, 2) px at depth ``z`` (N,); world ``scales``.
+
+    Scalars are the same for all; quats: (N, 4), None for random ones.
+    """
+    film = np.asarray(film, dtype=np.float64)
+    n = len(film)
+    z = np.broadcast_to(np.asarray(z, dtype=np.float64), n)
+    scales = np.broadcast_to(np.asarray(scales, dtype=np.float64), (n, 3))
+    slopes = (film - [camera.cx, camera.cy]) / [camera.fx, camera.fy]
+    points = np.column_stack([slopes * z[:, None], z])
+    quats = rng.normal(0, 1, (n, 4)) if quats is None else np.broadcast_to(quats, (n, 4))
+    return reference.Gaussians(
+        means=single(points @ camera.rotation + camera.center),
+        quats=single(quats),
+        log_scales=single(np.log(scales)),
+        logit_opacities=single(np.broadcast_to(logits, n)),
+        sh0=single(rng.normal(0, 1, (n, 1, 3))),
+        shN=single(rng.normal(0, sh_size, (n, (degree + 1) ** 2 - 1, 3))),
+    )
+
+
+def with_backdrop(rng, camera, gaussians, count=12) -> reference.Gaussians:
+    """Some ordinary Gaussians before and behind: the hard ones must not spoil them."""
+    degree = gaussians.sh_degree
+    film = rng.uniform(0, 1, (count, 2)) * [camera.width, camera.height]
+    z = rng.uniform(1, 4, count)
+    sizes = rng.uniform(0.04, 0.15, (count, 3)) * max(camera.width, camera.height)
+    ordinary = splats(
+        rng, camera, film, z, sizes * z[:, None] / camera.fx, rng.normal(0.5, 1, count), degree
+    )
+    return joined(gaussians, ordinary)
+
+
+def joined(first, second) -> reference.Gaussians:
+    return reference.Gaussians(
+        *(
+            np.concatenate(pair)
+            for pair in zip(vars(first).values(), vars(second).values(), strict=True)
+        )
+    )
+
+
+def on_film(rng, camera, count, margin=0.0) -> np.ndarray:
+    size = np.array([camera.width, camera.height])
+    return rng.uniform(-margin, 1 + margin, (count, 2)) * size
+
+
+FAMILIES = {}
+
+
+def family(name, width=37, height=29, degree=1, count=16, **settings):
+    """Register recipe(rng, width, height, degree, count) -> (Gaussians, camera) as a case."""
+
+    def register(recipe):
+        def seeded(seed, *arguments):
+            return recipe(np.random.default_rng(seed), *arguments)
+
+        FAMILIES[name] = Case(name, width, height, degree, count=count, recipe=seeded, **settings)
+        return recipe
+
+    return register
+
+
+@family("means at, just before, just behind and far behind the near plane")
+def near_plane(rng, width, height, degree, count):
+    # An axis-aligned camera at the origin: z is the mean's own third coordinate, not rounded.
+    camera = camera_for(width, height)
+    near = np.float32(camera.near)
+    above, below = np.nextafter(near, np.float32(1)), np.nextafter(near, np.float32(0))
+    z = np.array([near, above, below, 0.99 * near, 0.5 * near, 1.01 * near])
+    z = np.append(z, [1e-20, 0.0, -1e-20, -near, -1.0, -1e6])
+    hard = splats(
+        rng, camera, on_film(rng, camera, len(z)), z, 0.01, rng.normal(0, 1, len(z)), degree
+    )
+    hard.means[6:, :2] = single(rng.normal(0, 0.1, (len(z) - 6, 2)))
+    return with_backdrop(rng, camera, hard), camera
+
+
+@family("means at the camera centre")
+def camera_center(rng, width, height, degree, count):
+    camera = camera_for(width, height, rng)
+    hard = splats(
+        rng,
+        camera,
+        on_film(rng, camera, 4),
+        1.0,
+        [[1e-3] * 3, [0.1] * 3, [10] * 3, [1e4] * 3],
+        2.0,
+        degree,
+    )
+    hard.means[:] = camera.center
+    hard.means[1] += 1e-7
+    return with_backdrop(rng, camera, hard), camera
+
+
+@family("far outside the frustum, reaching it")
+def far_outside(rng, width, height, degree, count):
+    camera = camera_for(width, height, rng)
+    size = np.array([width, height])
+    beyond = np.array(
+        [[-0.4, 0.5], [1.5, 0.4], [0.3, -1.5], [0.6, 2.5], [-2, -2], [4, 3], [9, 0.5], [-20, 8]]
+    )
+    distance = np.abs(beyond - np.clip(beyond, 0, 1)).max(axis=1) * max(width, height)
+    z = rng.uniform(1, 4, len(beyond))
+    sizes = distance[:, None] * rng.uniform(0.4, 0.8, (len(beyond), 3))
+    hard = splats(rng, camera, beyond * size, z, sizes * z[:, None] / camera.fx, 1.0, degree)
+    return with_backdrop(rng, camera, hard), camera
+
+
+@family("89 degrees off axis", threshold_width=1e-3)
+def off_axis(rng, width, height, degree, count):
+    camera = camera_for(width, height, rng)
+    angle = np.deg2rad([60, 75, 85, 89, 89, 89.9])
+    turn = rng.uniform(0, 2 * np.pi, len(angle))
+    slopes = np.tan(angle)[:, None] * np.column_stack([np.cos(turn), np.sin(turn)])
+    film = slopes * [camera.fx, camera.fy] + [camera.cx, camera.cy]
+    z = np.linspace(0.5, 0.6, len(angle))
+    sizes = np.linalg.norm(film, axis=1) / 2.5
+    hard = splats(rng, camera, film, z, (sizes * z)[:, None] / camera.fx, 0.5, degree)
+    return with_backdrop(rng, camera, hard), camera
+
+
+@family("needles of ratio 1e6", count=40)
+def needles(rng, width, height, degree, count):
+    camera = camera_for(width, height, rng)
+    z = rng.uniform(1, 4, count)
+    long = 10.0 ** rng.uniform(-1, 1, count)
+    scales = long[:, None] * [1, 1e-6, 1e-6]
+    hard = splats(
+        rng, camera, on_film(rng, camera, count, 0.3), z, scales, rng.normal(1, 1, count), degree
+    )
+    return with_backdrop(rng, camera, hard), camera
+
+
+@family("needles along the line of sight", count=10)
+def needles_end_on(rng, width, height, degree, count):
+    camera = camera_for(width, height)
+    film = on_film(rng, camera, count)
+    film[0] = [camera.cx, camera.cy]
+    hard = splats(rng, camera, film, 2.0, [1e-6, 1e-6, 1.0], 1.0, degree, quats=[1, 0, 0, 0])
+    return with_backdrop(rng, camera, hard), camera
+
+
+@family("disks of ratio 1e6", count=20)
+def disks(rng, width, height, degree, count):
+    camera = camera_for(width, height, rng)
+    z = rng.uniform(1, 4, count)
+    size = 10.0 ** rng.uniform(-2, 0, count)
+    hard = splats(
+        rng,
+        camera,
+        on_film(rng, camera, count),
+        z,
+        size[:, None] * [1, 1, 1e-6],
+        rng.normal(1, 1, count),
+        degree,
+    )
+    return with_backdrop(rng, camera, hard), camera
+
+
+@family("disks edge-on and face-on", count=20)
+def disks_aligned(rng, width, height, degree, count):
+    camera = camera_for(width, height)
+    film = on_film(rng, camera, count)
+    quats = np.where(
+        np.arange(count)[:, None] % 2, [np.sqrt(0.5), np.sqrt(0.5), 0, 0], [1, 0, 0, 0]
+    )
+    hard = splats(rng, camera, film, 2.0, [0.3, 0.3, 1e-6], 0.5, degree, quats=quats)
+    return with_backdrop(rng, camera, hard), camera
+
+
+def points_of(rng, width, height, degree, count, scale):
+    camera = camera_for(width, height, rng)
+    film = on_film(rng, camera, count)
+    film[: count // 4] = np.floor(film[: count // 4]) + 0.5
+    film[count // 4 : count // 2] = np.floor(film[count // 4 : count // 2])
+    hard = splats(
+        rng, camera, film, rng.uniform(1, 4, count), scale, rng.normal(1, 1, count), degree
+    )
+    return with_backdrop(rng, camera, hard), camera
+
+
+for size, name, antialiased_name in [
+    (1e-8, "points of scale 1e-8", "points of scale 1e-8, antialiased"),
+    (1e-25, "scales of 1e-25, whose determinant underflows", "scales of 1e-25, antialiased"),
+]:
+    family(name, count=24)(partial(points_of, scale=size))
+    family(antialiased_name, count=24, antialiased=True)(partial(points_of, scale=size))
+
+
+family("a needle whose minor axis underflows", count=12, antialiased=True)(
+    partial(points_of, scale=[1e-2, 1e-22, 1e-22])
+)
+
+
+@family("sub-pixel splats, antialiased", count=30, antialiased=True)
+@family("sub-pixel splats", count=30)
+def sub_pixel(rng, width, height, degree, count):
+    return points_of(rng, width, height, degree, count, 10.0 ** rng.uniform(-3.5, -1.5, (count, 3)))
+
+
+def giants_of(rng, width, height, degree, count, scale):
+    camera = camera_for(width, height, rng)
+    film = on_film(rng, camera, count, 0.5)
+    z = 10.0 ** rng.uniform(-0.5, 1, count)
+    hard = splats(rng, camera, film, z, scale, rng.normal(-2, 1, count), degree)
+    return with_backdrop(rng, camera, hard), camera
+
+
+for size, name, antialiased_name in [
+    (1e4, "giants: scales of 1e4 around the camera", "giants, antialiased"),
+    (1e10, "giants of 1e10, whose determinant overflows", "giants of 1e10, antialiased"),
+]:
+    family(name, count=8)(partial(giants_of, scale=size))
+    family(antialiased_name, count=8, antialiased=True)(partial(giants_of, scale=size))
+
+
+@family("giants that are needles, far away", count=8)
+def giants_far(rng, width, height, degree, count):
+    camera = camera_for(width, height, rng)
+    hard = splats(
+        rng,
+        camera,
+        on_film(rng, camera, count),
+        rng.uniform(1e4, 2e4, count),
+        [1e4, 1e2, 1e1],
+        rng.normal(-1, 1, count),
+        degree,
+    )
+    return with_backdrop(rng, camera, hard), camera
+
+
+@family("opacity logits of +-40 and more", count=24)
+def logits(rng, width, height, degree, count):
+    camera = camera_for(width, height, rng)
+    values = np.resize([40.0, -40.0, 100.0, -100.0, 20.0, -5.0, 0.0, 1e4, -1e4], count)
+    z = rng.uniform(1, 4, count)
+    sizes = rng.uniform(0.02, 0.1, (count, 3)) * width
+    hard = splats(
+        rng, camera, on_film(rng, camera, count), z, sizes * z[:, None] / camera.fx, values, degree
+    )
+    return with_backdrop(rng, camera, hard), camera
+
+
+def stack_of(rng, width, height, degree, count, logits, spread=0.3, sizes=(0.4, 0.9)):
+    camera = camera_for(width, height, rng)
+    film = [0.5 * width, 0.5 * height] + rng.normal(0, spread, (count, 2)) * width
+    z = np.sort(rng.uniform(1, 4, count))
+    sizes = rng.uniform(*sizes, (count, 3)) * width
+    return splats(rng, camera, film, z, sizes * z[:, None] / camera.fx, logits, degree), camera
+
+
+@family("hundreds of near-opaque layers", 13, 11, count=300)
+def opaque_stack(rng, width, height, degree, count):
+    return stack_of(rng, width, height, degree, count, rng.uniform(2, 8, count))
+
+
+@family("hundreds of half-transparent layers, transmittance 1e-30", 13, 11, count=400)
+def transmittance_stack(rng, width, height, degree, count):
+    return stack_of(rng, width, height, degree, count, rng.normal(-1.7, 0.3, count))
+
+
+@family("thousands of layers just above the cut", 7, 6, degree=0, count=2500)
+def above_the_cut(rng, width, height, degree, count):
+    logit = np.log(1.02 / (255 - 1.02))
+    return stack_of(rng, width, height, degree, count, logit, 0.05, (8, 12))
+
+
+@family("thousands of layers just above and below the cut", 7, 6, degree=0, count=3000)
+def around_the_cut(rng, width, height, degree, count):
+    alpha = np.where(rng.random(count) < 0.5, 1.01, 0.99) / 255
+    return stack_of(rng, width, height, degree, count, np.log(alpha / (1 - alpha)), 0.01, (40, 60))
+
+
+@family("equal depths", count=60)
+def equal_depths(rng, width, height, degree, count):
+    camera = camera_for(width, height)
+    hard = splats(
+        rng,
+        camera,
+        on_film(rng, camera, count),
+        2.0,
+        rng.uniform(0.03, 0.15, (count, 3)),
+        rng.normal(1, 1, count),
+        degree,
+    )
+    return hard, camera
+
+
+@family("depths that differ in the last bit", count=60)
+def last_bit_depths(rng, width, height, degree, count):
+    camera = camera_for(width, height)
+    z = 2.0 + rng.permutation(count) * np.spacing(np.float32(2.0)).astype(float)
+    hard = splats(
+        rng,
+        camera,
+        on_film(rng, camera, count),
+        z,
+        rng.uniform(0.03, 0.15, (count, 3)),
+        rng.normal(1, 1, count),
+        degree,
+    )
+    return hard, camera
+
+
+@family("quaternions of norm 0, 1e-20, 1e20 and negated", count=30)
+def quaternions(rng, width, height, degree, count):
+    camera = camera_for(width, height, rng)
+    z = rng.uniform(1, 4, count)
+    sizes = rng.uniform(0.02, 0.15, (count, 3)) * width
+    quats = rng.normal(0, 1, (count, 4))
+    quats *= np.resize([0, 1e-20, 1e20, -1, 1e-30, 1e30], count)[:, None]
+    quats[-3:] = [[1, 0, 0, 0], [0, -1, 0, 0], [1e-20, 1e20, 0, 1]]
+    hard = splats(
+        rng,
+        camera,
+        on_film(rng, camera, count),
+        z,
+        sizes * z[:, None] / camera.fx,
+        1.0,
+        degree,
+        quats,
+    )
+    return with_backdrop(rng, camera, hard), camera
+
+
+@family("SH that drive colour negative", degree=3, count=40)
+def negative_colors(rng, width, height, degree, count):
+    camera = camera_for(width, height, rng)
+    z = rng.uniform(1, 4, count)
+    sizes = rng.uniform(0.03, 0.1, (count, 3)) * width
+    hard = splats(
+        rng,
+        camera,
+        on_film(rng, camera, count),
+        z,
+        sizes * z[:, None] / camera.fx,
+        1.0,
+        degree,
+        sh_size=1.0,
+    )
+    hard.sh0[:] = single(rng.normal(-1.5, 2, hard.sh0.shape))
+    return hard, camera
+
+
+def ordinary(rng, width, height, degree, count, **changes):
+    camera = camera_for(width, height, rng, **changes)
+    none = splats(rng, camera, np.zeros((0, 2)), 1.0, 1.0, 0.0, degree)
+    return with_backdrop(rng, camera, none, count), camera
+
+
+for size in [(1, 1), (1, 40), (40, 1), (2, 17), (17, 33), (16, 16), (3, 5)]:
+    family(f"a film of {size[0]}x{size[1]}", *size, count=30)(ordinary)
+
+
+@family("a principal point on the film's corner", count=30)
+def corner_principal(rng, width, height, degree, count):
+    return ordinary(rng, width, height, degree, count, cx=0.0, cy=float(height))
+
+
+@family("a principal point outside the film", count=30)
+def outside_principal(rng, width, height, degree, count):
+    return ordinary(rng, width, height, degree, count, cx=-3.0 * width, cy=2.5 * height)
+
+
+@family("no visible Gaussian", count=0)
+def none_visible(rng, width, height, degree, count):
+    camera = camera_for(width, height, rng)
+    z = np.array([-1.0, -5.0, 2.0])
+    hard = splats(rng, camera, [[5, 5], [9, 9], [1e4, 1e4]], z, 0.01, 1.0, degree)
+    return hard, camera
+
+
+@family("one Gaussian", count=1)
+def one(rng, width, height, degree, count):
+    return ordinary(rng, width, height, degree, count)
+
+
+def offset_by(rng, width, height, degree, count, distance):
+    """The scene and the camera together; means are rounded there, then given exactly."""
+    gaussians, camera = ordinary(rng, width, height, degree, count)
+    shift = distance * np.array([1.0, -0.7, 0.4])
+    camera = replace(camera, center=single(camera.center + shift))
+    gaussians.means[:] = single(gaussians.means + shift)
+    return gaussians, camera
+
+
+@family("coordinates offset by 1e4", count=30)
+def offset_1e4(rng, width, height, degree, count):
+    return offset_by(rng, width, height, degree, count, 1e4)
+
+
+@family("coordinates offset by 1e6", count=30)
+def offset_1e6(rng, width, height, degree, count):
+    return offset_by(rng, width, height, degree, count, 1e6)
+
+
+@cache
+def cotangents_of(name) -> Cotangents:
+    return Cotangents.random(FAMILIES[name])
+
+
+@cache
+def expected(name) -> tuple[dict, dict]:
+    """Picture and gradients by the reference."""
+    case = FAMILIES[name]
+    picture = {plane: getattr(case.picture, plane) for plane in PLANES}
+    return picture, reference_gradients(case, cotangents_of(name))
+
+
+@cache
+def allowed(name) -> tuple[dict, dict]:
+    """What float32 may be off by: see the module's description."""
+    case = FAMILIES[name]
+    found = noise(case, cotangents_of(name), samples=SAMPLES if case.count < 1000 else 6)
+
+    def bounds(noises, values):
+        return {key: bound_of(case, noises[key], value) for key, value in values.items()}
+
+    pictures, gradients = expected(name)
+    return bounds(found.picture, pictures), bounds(found.gradients, gradients)
+
+
+def bound_of(case, noise, values) -> np.ndarray:
+    """Of one result with its noise: see the module's description."""
+    size = np.abs(values)
+    rounding = noise + U * np.sqrt(1 + len(case.gaussians.means) / ROUNDINGS) * size
+    return BOUND * rounding + UNDERFLOW * size.max(initial=0)
+
+
+def errors_over_bounds(actual, wanted, bounds, precision, left_out=None) -> dict[str, float]:
+    """The largest error over its bound, for each result; everything must be finite."""
+    result = {}
+    for key, value in wanted.items():
+        assert np.isfinite(actual[key]).all() and np.isfinite(value).all(), key
+        error = np.abs(actual[key] - value)
+        if left_out is not None:
+            error = np.where(left_out[..., None] if error.ndim == 3 else left_out, 0, error)
+        bound = SCALES[precision] * bounds[key]
+        if precision is FLOAT64:
+            bound += EXACT * np.abs(value).max(initial=0)
+        ratio = np.divide(error, bound, out=np.zeros_like(error), where=error > 0)
+        result[key] = float(ratio.max(initial=0))
+    return result
+
+
+SCALES = {FLOAT32: 1.0, FLOAT64: 2 * 2.0**-29}
+"""float64 has 2^-29 times the noise; the reference, which is as inexact, doubles it."""
+
+
+EXACT = 1e-11
+"""Of an array's largest value: what the reference itself may be off by. It evaluates the textbook's
+a dx^2 + 2 b dx dy + c dy^2, which loses as many digits as a needle's squared ratio of axes has."""

@@ -1,0 +1,228 @@
+"""The picture of each approximation by scalar loops and textbook formulas."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from drgs.reference.rays import ImageModel
+from drgs.reference.splatting import Camera, Gaussians
+from support.reference_scenes import (
+    BACKGROUND,
+    PARAMETERS,
+    legendre_sh_basis,
+    rotation_about,
+)
+
+UNCUT = ImageModel(alpha_max=1.0, alpha_cut=0.0, transmittance_stop=0.0)
+"""No decisions: every splat touches every pixel."""
+
+
+def camera_gaussian(gaussians, camera, n) -> tuple[np.ndarray, np.ndarray]:
+    """(mean (3,), factor V (3, 3)) in camera axes, the covariance being V V^T."""
+    w, *axis = gaussians.quats[n]
+    angle = 2 * math.atan2(np.linalg.norm(axis), w)
+    turn = rotation_about(axis, angle) if np.any(axis) else np.eye(3)
+    factor = camera.rotation @ turn @ np.diag(np.exp(gaussians.log_scales[n]))
+    return camera.rotation @ (gaussians.means[n] - camera.center), factor
+
+
+def textbook_unscented(mean, factor, function, alpha, beta, kappa):
+    """(mean, covariance) of function(x): the scaled unscented transform as Julier writes it."""
+    n = len(mean)
+    lam = alpha**2 * (n + kappa) - n
+    offsets = math.sqrt(n + lam) * factor.T
+    points = [mean, *(mean + offsets), *(mean - offsets)]
+    mean_weights = [lam / (n + lam)] + 2 * n * [1 / (2 * (n + lam))]
+    cov_weights = [mean_weights[0] + 1 - alpha**2 + beta, *mean_weights[1:]]
+    values = [function(point) for point in points]
+    center = sum(w * value for w, value in zip(mean_weights, values, strict=True))
+    covariance = sum(
+        w * np.outer(value - center, value - center)
+        for w, value in zip(cov_weights, values, strict=True)
+    )
+    return center, covariance
+
+
+def naive_film(mean, factor, camera, model):
+    """(mean2d, C without low-pass, k, w) of one Gaussian in camera axes."""
+    x, y, z = mean
+    focal = np.array([camera.fx, camera.fy])
+    slope = np.array([x / z, y / z])
+    half = np.array([camera.width, camera.height]) / focal / 2
+    low = -np.array([camera.cx, camera.cy]) / focal
+    clamped = np.clip(slope, low - 0.3 * half, low + 2.3 * half)
+
+    def jacobian(slope):
+        return np.column_stack([np.diag(focal), -focal * slope]) / z
+
+    def pinhole(point):
+        return focal * point[:2] / point[2] + [camera.cx, camera.cy]
+
+    sigma = factor @ factor.T
+    mean2d, linear = pinhole(mean), jacobian(slope if model.projection == "exact" else clamped)
+    cov = linear @ sigma @ linear.T
+    is_clamped = not np.array_equal(slope, clamped)
+    if model.projection == "unscented" and is_usable(mean, factor) and not is_clamped:
+        mean2d, cov = textbook_unscented(mean, factor, pinhole, alpha=1, beta=2, kappa=0)
+    return mean2d, cov, linear @ sigma[:, 2] / z, sigma[2, 2] / z**2
+
+
+def is_usable(mean, factor) -> bool:
+    """Whether the nearest sigma point is not nearer than a third of the mean's depth."""
+    return mean[2] - math.sqrt(3) * np.abs(factor[2]).max() >= mean[2] / 3
+
+
+def naive_splat(gaussians, camera, n, model):
+    """A function of the pixel's (x, y): (alpha, sort key, depth), or None where it does not exist.
+
+    None itself if the splat is culled.
+    """
+    mean, factor = camera_gaussian(gaussians, camera, n)
+    z = mean[2]
+    if z < camera.near:
+        return None
+    mean2d, sharp, k, w = naive_film(mean, factor, camera, model)
+    cov = sharp + model.low_pass * np.eye(2)
+    opacity = 1 / (1 + math.exp(-gaussians.logit_opacities[n]))
+    if model.antialiased:
+        opacity *= math.sqrt(np.linalg.det(sharp) / np.linalg.det(cov))
+    if opacity <= model.alpha_cut:
+        return None
+    conic = np.linalg.inv(cov)
+    widening = model.low_pass * z**2 * np.diag([1 / camera.fx**2, 1 / camera.fy**2, 0])
+    precision = np.linalg.inv(factor @ factor.T + widening)
+
+    def along_ray(position):
+        """(rho^2, t, entry) from rho^2(t) = A t^2 - 2 B t + C."""
+        ray = np.array(
+            [(position[0] - camera.cx) / camera.fx, (position[1] - camera.cy) / camera.fy, 1.0]
+        )
+        A, B, C = ray @ precision @ ray, ray @ precision @ mean, mean @ precision @ mean
+        entry = None
+        if math.isfinite(model.extent):
+            roots = np.roots([A, -2 * B, C - model.extent**2])
+            entry = min(roots.real)
+        return C - B**2 / A, B / A, entry
+
+    def on_film(position):
+        d = position - mean2d
+        rho_sq = d @ conic @ d
+        a = 1 - k @ conic @ d
+        h = max(0, w - k @ conic @ k)
+        return rho_sq, z * a / (a**2 + h * rho_sq), None
+
+    def at(position):
+        rho_sq, t, entry = (along_ray if model.projection == "exact" else on_film)(position)
+        raw = opacity * math.exp(-rho_sq / 2)
+        if raw < model.alpha_cut or rho_sq > model.extent**2:
+            return None
+        if (model.order != "center" or model.projection == "exact") and t <= 0:
+            return None
+        if model.order == "entry" and entry <= 0:
+            return None
+        key = {"center": z, "pixel": t, "entry": entry}[model.order]
+        return min(raw, model.alpha_max), key, z if model.order == "center" else t
+
+    return at
+
+
+def naive_basis(gaussians, camera, model, position=None, n=None) -> np.ndarray:
+    """(K,) harmonics in the direction of a pixel's ray, or of the mean of Gaussian n."""
+    if model.sh_direction == "mean":
+        direction = gaussians.means[n] - camera.center
+    else:
+        ray = [(position[0] - camera.cx) / camera.fx, (position[1] - camera.cy) / camera.fy, 1]
+        direction = camera.rotation.T @ ray
+    degree = gaussians.sh_degree if model.sh_degree is None else model.sh_degree
+    return legendre_sh_basis(direction / np.linalg.norm(direction), degree)
+
+
+def naive_color(gaussians, n, basis) -> np.ndarray:
+    coefficients = np.concatenate([gaussians.sh0[n], gaussians.shN[n]])[: len(basis)]
+    return np.maximum(basis @ coefficients + 0.5, 0)
+
+
+def naive_picture(gaussians, camera, model) -> dict[str, np.ndarray]:
+    shape = camera.height, camera.width
+    picture = {
+        "image": np.zeros((*shape, 3)),
+        "depth": np.zeros(shape),
+        "transmittance": np.ones(shape),
+    }
+    indices = range(len(gaussians.means))
+    splats = [naive_splat(gaussians, camera, n, model) for n in indices]
+    if model.sh_direction == "mean":
+        bases = [naive_basis(gaussians, camera, model, n=n) for n in indices]
+    for row, column in np.ndindex(shape):
+        position = np.array([column + 0.5, row + 0.5])
+        if model.sh_direction == "pixel":
+            bases = [naive_basis(gaussians, camera, model, position)] * len(indices)
+        hits = [(splat(position), n) for n, splat in enumerate(splats) if splat]
+        hits = sorted((hit[1], n, hit[0], hit[2]) for hit, n in hits if hit)
+        transmittance, last = 1.0, -math.inf
+        slope = (position - [camera.cx, camera.cy]) / [camera.fx, camera.fy]
+        for key, n, alpha, depth in hits:
+            if (key - last) * math.hypot(*slope, 1) < model.step:
+                continue
+            last = key
+            behind = transmittance * (1 - alpha)
+            if (behind if model.stop == "before" else transmittance) < model.transmittance_stop:
+                break
+            color = naive_color(gaussians, n, bases[n])
+            picture["image"][row, column] += transmittance * alpha * color
+            picture["depth"][row, column] += transmittance * alpha * depth
+            transmittance *= 1 - alpha
+        picture["image"][row, column] += transmittance * BACKGROUND
+        picture["transmittance"][row, column] = transmittance
+    return picture
+
+
+def assert_pictures_agree(picture, expected, atol) -> None:
+    for name in ("image", "depth", "transmittance"):
+        wanted = expected[name] if isinstance(expected, dict) else getattr(expected, name)
+        np.testing.assert_allclose(getattr(picture, name), wanted, rtol=0, atol=atol, err_msg=name)
+
+
+def straight_camera(size=9, focal=20.0, near=0.01) -> Camera:
+    return Camera(np.eye(3), np.zeros(3), focal, focal, size / 2, size / 2, size, size, near)
+
+
+def scene_of(means, log_scales, quats=None, opacity=0.5, colors=None) -> Gaussians:
+    """Gaussians of one opacity, whose colours (N, 3) do not depend on direction."""
+    n = len(means)
+    opacities = np.broadcast_to(opacity, n)
+    colors = np.ones((n, 3)) if colors is None else np.asarray(colors)
+    return Gaussians(
+        means=means,
+        quats=np.tile([1.0, 0, 0, 0], (n, 1)) if quats is None else quats,
+        log_scales=np.broadcast_to(log_scales, (n, 3)),
+        logit_opacities=np.log(opacities / (1 - opacities)),
+        sh0=((colors - 0.5) * math.sqrt(4 * math.pi))[:, None],
+        shN=np.zeros((n, 0, 3)),
+    )
+
+
+def rotated_splats() -> Gaussians:
+    """Eight, with axes up to 30 to 1, off the axis of ``straight_camera`` and near it."""
+    rng = np.random.default_rng(3)
+    slopes = rng.uniform(-0.25, 0.25, (8, 2))
+    z = np.geomspace(0.3, 4.0, 8)
+    return scene_of(
+        means=np.column_stack([slopes * z[:, None], z]),
+        log_scales=rng.uniform(np.log(0.01), np.log(0.3), (8, 3)),
+        quats=rng.normal(0, 1, (8, 4)),
+    )
+
+
+def only(gaussians, kept) -> Gaussians:
+    return Gaussians(**{name: getattr(gaussians, name)[kept] for name in PARAMETERS})
+
+
+def pixel_rays(camera) -> np.ndarray:
+    """(H, W, 3) rays through the pixels' centres, camera axes, z = 1."""
+    x = (np.arange(camera.width) + 0.5 - camera.cx) / camera.fx
+    y = (np.arange(camera.height) + 0.5 - camera.cy) / camera.fy
+    x, y = np.meshgrid(x, y)
+    return np.stack([x, y, np.ones_like(x)], axis=-1)
