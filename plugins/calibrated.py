@@ -1,8 +1,7 @@
 """The ``calibrated`` sensor: a camera as calibration tools describe it.
 
-Executed once per Mitsuba variant (see ``drgs.plugins``). The lenses are in
-``drgs.cameras.radial_tangential``; this file is where they meet Mitsuba's rays, films and
-parameters.
+Executed once per Mitsuba variant (see ``drgs.plugins``). The lenses are in ``drgs.cameras``; this
+file is where they meet Mitsuba's rays, films and parameters.
 """
 
 from __future__ import annotations
@@ -14,7 +13,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from drgs.cameras.camera import Camera, Pinhole
+from drgs.cameras.camera import Camera, Lens, Pinhole
 from drgs.core.constants import SHUTTER_SAMPLES
 from drgs.core.errors import PluginError
 from drgs.integrator.properties import integer, matrix, number, one_of, positive
@@ -274,8 +273,8 @@ class CalibratedSensor(mi.Sensor):
         return mi.ScalarBoundingBox3f()
 
 
-def _lens_type(kind: str) -> Any:
-    """Imported when it is chosen."""
+def _lens_type(kind: str) -> type[Lens]:
+    """The class of one of :data:`LENSES`, imported when it is chosen."""
     if kind == "opencv":
         from drgs.cameras.radial_tangential import RadialTangential
 
@@ -287,7 +286,8 @@ def _lens_type(kind: str) -> Any:
     return Pinhole
 
 
-def _lens(props: mi.Properties) -> Any:
+def _lens(props: mi.Properties) -> Lens:
+    """The lens and those of its coefficients that are given."""
     kind = one_of(props, "lens", LENSES)
     model = _lens_type(kind)
     names = () if model is Pinhole else model.names

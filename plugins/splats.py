@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 import mitsuba as mi
@@ -40,14 +40,20 @@ from drgs.integrator.sensors import camera_from_sensor, read_sensor
 from drgs.integrator.view import accumulate, feature_of
 from drgs.splatting import rendering
 
+if TYPE_CHECKING:  # imported where a scene has shapes of Gaussians
+    from drgs.integrator.ellipsoids import Gathered
+
 SUPPORTED_VARIANTS = ("llvm_ad_rgb", "cuda_ad_rgb")
 
 
 @dataclass(frozen=True)
 class LastBackward:
-    """What a backward pass knows about the 2D splats and ``mi.render`` cannot return."""
+    """What a backward pass knows of the splats on the film and ``mi.render`` cannot return.
 
-    means2d_grad: Any  # TensorXf (N, 2): derivative of the loss with respect to the pixel position
+    Dr.Jit traverses it with the integrator and resolves annotations, whatever variant is active.
+    """
+
+    means2d_grad: Any  # TensorXf (N, 2): derivative of the loss, per px on the film
     visible: Any  # Bool (N,): the Gaussian's extent touches the film
     first_fault: Any  # UInt32 (1,): of the gradients, for rendering.decode_fault
 
@@ -109,9 +115,9 @@ class SplatsIntegrator(mi.CppADIntegrator):
 
      * - near
        - |float|
-       - Gaussians whose centre is closer than this are culled. The sensor's ``near_clip``
-         applies as well: the larger of the two wins. Its ``far_clip`` holds for surfaces alone.
-         (Default: 0.01)
+       - Near plane, in scene units: Gaussians whose centre is closer are culled. The sensor's
+         ``near_clip`` applies as well: the larger of the two wins. Its ``far_clip`` holds for
+         surfaces alone. (Default: 0.01)
 
      * - srgb_primitives
        - |bool|
@@ -132,7 +138,7 @@ class SplatsIntegrator(mi.CppADIntegrator):
 
      * - ignore
        - |string|
-       - What the sensor and the Gaussians call for and is not to be simulated, a list of
+       - Effects that the sensor or the Gaussians call for and that are not simulated: a list of
          ``distortion``, ``defocus``, ``motion`` and ``smoothing``. (Default: none)
 
      * - projection
@@ -201,13 +207,15 @@ class SplatsIntegrator(mi.CppADIntegrator):
     This integrator composites Gaussians front to back over each pixel (Kerbl et al. 2023, "3D
     Gaussian Splatting for Real-Time Radiance Field Rendering"). Meshes and other surfaces of the
     scene are rendered by a nested integrator; each pixel composites what that shows at the depth of
-    the first surface, amid the splats. Light does not pass from one to the other. A scene without
-    surfaces runs no nested integrator. With one sample per pixel and a ``box`` filter it evaluates
-    each pixel at its centre, and both the picture and the gradients are the same to the last bit in
-    every run. With more samples or another filter, pixels are evaluated at the points that the
-    sensor's sampler chooses; ``low_pass`` may then be 0. With a ``box`` filter this, too, is the
-    same in every run; other filters add in an order of their own. No samples are taken beyond the
-    film: its ``sample_border`` makes no difference.
+    the first surface, between the splats. Light does not pass from one to the other. A scene
+    without surfaces runs no nested integrator.
+
+    With one sample per pixel and a ``box`` filter, each pixel is evaluated at its centre, and both
+    the picture and the gradients are the same to the last bit in every run. With more samples or
+    another filter, pixels are evaluated at the points that the sensor's sampler chooses;
+    ``low_pass`` may then be 0. With a ``box`` filter this, too, is the same in every run; other
+    filters add in an order of their own. No samples are taken beyond the film: its
+    ``sample_border`` makes no difference.
 
     Gaussians of shapes (``data``, ``opacities`` and ``sh_coeffs``, as ``volprim_rf_basic`` reads
     them) come behind the integrator's own, in the order of ``scene.shapes()``, and are
@@ -256,10 +264,8 @@ class SplatsIntegrator(mi.CppADIntegrator):
             setattr(self, name, getattr(gaussians, name))
         self.smoothing, self.features = gaussians.smoothing, gaussians.features or {}
         self._has_own, self._turns = gaussians.num_gaussians > 0, turns_of_shapes(props)
-        self._gathered: Any = (
-            None  # with those of the scene's shapes: see drgs.integrator.ellipsoids
-        )
-        self._scene_has_shapes = False  # of Gaussians: the last one that was rendered
+        self._gathered: Gathered | None = None  # with the Gaussians of the scene's shapes
+        self._scene_has_shapes = False  # that are Gaussians: the scene that was rendered last
         self.ignore = ignored_effects(props)
         self.aovs = aovs_of(props, [*AOVS, *self.features])
         self.sh_degree = props.get("sh_degree", gaussians.sh_degree)
@@ -370,7 +376,7 @@ class SplatsIntegrator(mi.CppADIntegrator):
         """Of the channels besides colour and alpha."""
         return [f"{name}.{c}" for name, kind in self.aovs.items() for c in self.channels_of(kind)]
 
-    def channels_of(self, kind: str) -> Iterable[Any]:
+    def channels_of(self, kind: str) -> Iterable[int | str]:
         """What comes behind the dot in the names of an AOV's channels."""
         return AOVS[kind] if kind in AOVS else range(self.features[kind].shape[1])
 
@@ -405,7 +411,7 @@ class SplatsIntegrator(mi.CppADIntegrator):
         self,
         scene: mi.Scene,
         sensor: int | mi.Sensor = 0,
-        seed: Any = 0,
+        seed: int | mi.UInt32 = 0,
         spp: int = 0,
         develop: bool = True,
         evaluate: bool = True,
@@ -424,10 +430,10 @@ class SplatsIntegrator(mi.CppADIntegrator):
     def render_backward(
         self,
         scene: mi.Scene,
-        params: Any,
+        params: object,
         grad_in: mi.TensorXf,
         sensor: int | mi.Sensor = 0,
-        seed: Any = 0,
+        seed: int | mi.UInt32 = 0,
         spp: int = 0,
     ) -> None:
         """Accumulate the derivatives of the loss into the attached parameters.
@@ -458,9 +464,9 @@ class SplatsIntegrator(mi.CppADIntegrator):
     def render_forward(
         self,
         scene: mi.Scene,
-        params: Any,
+        params: object,
         sensor: int | mi.Sensor = 0,
-        seed: Any = 0,
+        seed: int | mi.UInt32 = 0,
         spp: int = 0,
     ) -> mi.TensorXf:
         """Directional derivative of the image along the gradients set on the parameters."""

@@ -11,7 +11,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 from numbers import Integral
-from typing import Any
+from typing import TYPE_CHECKING
 
 import drjit as dr
 import mitsuba as mi
@@ -21,6 +21,9 @@ from drgs.config.approximations import DECLARED, Approximations, Declared, Value
 from drgs.core.errors import PluginError, PluginTypeError, did_you_mean
 from drgs.effects.compose import IGNORABLE
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
+
+if TYPE_CHECKING:  # imported where the ``to_world`` of shapes is given
+    from drgs.integrator.ellipsoids import Turn
 
 AOVS = {"depth": ("T",), "alpha": ("I",), "normal": ("X", "Y", "Z")}
 """What may be put out besides colour, and the names of its channels as Mitsuba has them."""
@@ -72,7 +75,7 @@ def load_gaussians(props: mi.Properties) -> Gaussians:
     return gaussians
 
 
-def turns_of_shapes(props: mi.Properties) -> dict[str, Any]:
+def turns_of_shapes(props: mi.Properties) -> dict[str, Turn]:
     """By ids of shapes, and under "" for all others: how their spherical harmonics turn."""
     names = [name for name in props.keys() if name.startswith(SHAPES_TO_WORLD)]  # noqa: SIM118
     if not names:
@@ -284,7 +287,7 @@ def check_shapes(gaussians: Gaussians) -> None:
         )
 
 
-def degree_of(value: Any) -> int:
+def degree_of(value: object) -> int:
     """A degree of spherical harmonics that Gaussians may have."""
     is_integer = isinstance(value, Integral) and not isinstance(value, bool)
     if not is_integer or value not in range(4):

@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -29,7 +28,7 @@ def make_scene(
     gaussians: Gaussians,
     model: ModelConfig,
     background: tuple[float, float, float] | Path,
-    **settings: Any,
+    **settings: object,
 ) -> mi.Scene:
     """A scene that holds nothing but the ``splats`` integrator, working in display space.
 
@@ -52,7 +51,7 @@ def make_scene(
     return mi.load_dict({"type": "scene", "integrator": integrator})
 
 
-def _picture(path: Path) -> dict[str, Any]:
+def _picture(path: Path) -> dict[str, object]:
     return {"type": "bitmap", "filename": str(path), "wrap_mode": "clamp"}
 
 
@@ -87,7 +86,7 @@ def make_sensors(views: Iterable[View], calibrated: bool = False) -> list[mi.Sen
     return sensors
 
 
-def _film(width: int, height: int) -> dict[str, Any]:
+def _film(width: int, height: int) -> dict[str, object]:
     return {
         "type": "hdrfilm",
         "width": width,
@@ -98,7 +97,7 @@ def _film(width: int, height: int) -> dict[str, Any]:
     }
 
 
-def _sensor(view: View, calibrated: bool) -> dict[str, Any]:
+def _sensor(view: View, calibrated: bool) -> dict[str, object]:
     pose = {
         "to_world": _to_world(view.camera_to_world),
         "near_clip": 1e-3,  # the integrator's own near plane decides
@@ -121,7 +120,7 @@ def _to_world(camera_to_world: np.ndarray) -> mi.ScalarTransform4f:
     return mi.ScalarTransform4f(camera_to_world @ OPENCV_TO_MITSUBA)
 
 
-def _perspective(view: View) -> dict[str, Any]:
+def _perspective(view: View) -> dict[str, object]:
     focal = math.sqrt(view.fx * view.fy)
     return {
         "type": "perspective",
