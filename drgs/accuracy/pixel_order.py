@@ -115,7 +115,7 @@ class _Met:
 
 
 @dataclass(frozen=True)
-class _Lanes:
+class _WalkInputs:
     """What a walk reads: the lanes, the list of each, and what its splats are."""
 
     bins: TileBins
@@ -126,12 +126,12 @@ class _Lanes:
     model: ImageModel  # bound to the lanes
 
     @staticmethod
-    def of(bins: TileBins, records: Records, lists: PixelLists, order: PixelOrder) -> _Lanes:
+    def of(bins: TileBins, records: Records, lists: PixelLists, order: PixelOrder) -> _WalkInputs:
         """Lanes with lists of similar length together."""
         lanes = make_lanes(type(bins.rows), bins.grid)
         begin, end = lists.range(lanes)
         lanes = grouped_by_work(lanes, end - begin)
-        return _Lanes(bins, records, lists, order, lanes, bins.model.bind(lanes, bins.grid))
+        return _WalkInputs(bins, records, lists, order, lanes, bins.model.bind(lanes, bins.grid))
 
     @property
     def size(self) -> int:
@@ -157,7 +157,7 @@ class _Lanes:
 
 
 def _walk(
-    of: _Lanes,
+    inputs: _WalkInputs,
     carry: Callable[[_Met, int], list[Any]],
     visit: Callable[[Any, list[list[Any]]], Any],
     state: Any,
@@ -169,7 +169,8 @@ def _walk(
     pixel, alpha and what was carried, to the next state and whether any pixel is unfinished;
     nothing: what is carried where there is no splat, with an alpha of 0.
     """
-    lists, records, model, lanes, order = of.lists, of.records, of.model, of.lanes, of.order
+    lists, records, lanes = inputs.lists, inputs.records, inputs.lanes
+    model, order = inputs.model, inputs.order
     t = types_of(type(records.rows))
     begin, end = lists.range(lanes)
 
@@ -194,7 +195,7 @@ def _walk(
         state, go_on = visit(state, visited)
         return place + 1, next_queue, state, go_on
 
-    size = of.size
+    size = inputs.size
     empty = [dr.full(t.Float, -dr.inf, size), dr.zeros(t.Float, size), *nothing]
     _, _, state, _ = dr.while_loop(
         state=(
@@ -243,23 +244,23 @@ class _OrderedLayers(Layers):
 def _composite(bins: TileBins, records: Records, order: PixelOrder) -> _OrderedLayers:
     t = types_of(type(bins.rows))
     lists = PixelLists.of(bins, records, order.depths)
-    of = _Lanes.of(bins, records, lists, order)
-    lanes, model, size = of.lanes, of.model, of.size
+    inputs = _WalkInputs.of(bins, records, lists, order)
+    lanes, model, size = inputs.lanes, inputs.model, inputs.size
     count = model.features.num_planes(bins.num_features)
 
     def visit(state: tuple, visited: list[list[Any]]) -> tuple:
         T, C = list(state[0]), [list(plane) for plane in state[1]]
         for pixel, (alpha, *features) in enumerate(visited):
-            weight, T[pixel], _ = composite_step(T[pixel], alpha, of.stop)
+            weight, T[pixel], _ = composite_step(T[pixel], alpha, inputs.stop)
             for k, c in enumerate(features):
                 C[k][pixel] = dr.fma(weight, c, C[k][pixel])
         return (T, C), _unfinished(T)
 
     T, C = _walk(
-        of,
+        inputs,
         carry=lambda met, pixel: model.features.at(met.features, pixel),
         visit=visit,
-        state=(of.transmittance(), of.zeros(count)),
+        state=(inputs.transmittance(), inputs.zeros(count)),
         nothing=[dr.zeros(t.Float, size)] * count,
     )
     dr.eval(T, C)
@@ -288,43 +289,43 @@ def _adjoint(
     d_transmittance: Any,
     order: PixelOrder,
 ) -> SplatGradients:
-    of = _Lanes.of(bins, records, layers.lists, order)
-    g = [load_pixels(plane, of.lanes, bins.grid) for plane in d_features]
-    totals = _totals(of, layers, g, d_transmittance)
-    pairs = _pairs(of, totals, g)
-    return _sum_items(bins, layers.lists, _sum_pixels(of, pairs, g))
+    inputs = _WalkInputs.of(bins, records, layers.lists, order)
+    g = [load_pixels(plane, inputs.lanes, bins.grid) for plane in d_features]
+    totals = _totals(inputs, layers, g, d_transmittance)
+    pairs = _pairs(inputs, totals, g)
+    return _sum_items(bins, layers.lists, _sum_pixels(inputs, pairs, g))
 
 
-def _feature_gradient(of: _Lanes, met: _Met, pixel: int, g: list[list[Any]]) -> Any:
+def _feature_gradient(inputs: _WalkInputs, met: _Met, pixel: int, g: list[list[Any]]) -> Any:
     """c . g of a splat at a pixel; g: [plane][pixel] derivative of the loss."""
-    features = of.model.features
+    features = inputs.model.features
     return features.feature_gradient(met.features, pixel, [plane[pixel] for plane in g])
 
 
 def _totals(
-    of: _Lanes, layers: _OrderedLayers, g: list[list[Any]], d_transmittance: Any
+    inputs: _WalkInputs, layers: _OrderedLayers, g: list[list[Any]], d_transmittance: Any
 ) -> list[tuple[Any, Any]]:
     """First walk: what all splats of each pixel and its background are worth, in two numbers."""
-    t = types_of(type(of.bins.rows))
+    t = types_of(type(inputs.bins.rows))
 
     def add_up(state: tuple, visited: list[list[Any]]) -> tuple:
         T, high, low = (list(column) for column in state)
         for pixel, (alpha, seen) in enumerate(visited):
-            weight, T[pixel], _ = composite_step(T[pixel], alpha, of.stop)
+            weight, T[pixel], _ = composite_step(T[pixel], alpha, inputs.stop)
             high[pixel], low[pixel] = _add_product(high[pixel], low[pixel], weight, seen)
         return (T, high, low), _unfinished(T)
 
     _, *totals = _walk(
-        of,
-        carry=lambda met, pixel: [_feature_gradient(of, met, pixel, g)],
+        inputs,
+        carry=lambda met, pixel: [_feature_gradient(inputs, met, pixel, g)],
         visit=add_up,
-        state=(of.transmittance(), *of.zeros(2)),
-        nothing=[dr.zeros(t.Float, of.size)],
+        state=(inputs.transmittance(), *inputs.zeros(2)),
+        nothing=[dr.zeros(t.Float, inputs.size)],
     )
     background = zip(
         *totals,
-        load_lane_row(layers.values, of.lanes.micro_tile, 1 + layers.count),
-        load_pixels(d_transmittance, of.lanes, of.bins.grid),
+        load_lane_row(layers.values, inputs.lanes.micro_tile, 1 + layers.count),
+        load_pixels(d_transmittance, inputs.lanes, inputs.bins.grid),
         strict=True,
     )
     totals = [_add_product(*numbers) for numbers in background]
@@ -332,17 +333,17 @@ def _totals(
     return totals
 
 
-def _pairs(of: _Lanes, totals: list[tuple[Any, Any]], g: list[list[Any]]) -> list[Any]:
+def _pairs(inputs: _WalkInputs, totals: list[tuple[Any, Any]], g: list[list[Any]]) -> list[Any]:
     """Second walk: each pair's weight and d loss / d ln(alpha), at the place of its splat."""
-    t = types_of(type(of.bins.rows))
-    pairs = [dr.zeros(t.Float, max(of.lists.count, 1) * PIXELS) for _ in range(2)]
+    t = types_of(type(inputs.bins.rows))
+    pairs = [dr.zeros(t.Float, max(inputs.lists.count, 1) * PIXELS) for _ in range(2)]
     dr.eval(pairs)
-    alpha_max = of.model.cutoffs.alpha_max
+    alpha_max = inputs.model.cutoffs.alpha_max
 
     def store(state: tuple, visited: list[list[Any]]) -> tuple:
         T, high, low = (list(column) for column in state)
         for pixel, (alpha, seen, place) in enumerate(visited):
-            weight, T[pixel], goes_on = composite_step(T[pixel], alpha, of.stop)
+            weight, T[pixel], goes_on = composite_step(T[pixel], alpha, inputs.stop)
             high[pixel], low[pixel] = _add_product(high[pixel], low[pixel], weight, seen)
             behind = (totals[pixel][0] - high[pixel]) + (totals[pixel][1] - low[pixel])
             # Of what is behind, alpha / (1 - alpha) is lost: no division by T, which may underflow.
@@ -353,22 +354,23 @@ def _pairs(of: _Lanes, totals: list[tuple[Any, Any]], g: list[list[Any]]) -> lis
         return (T, high, low), _unfinished(T)
 
     result = _walk(
-        of,
-        carry=lambda met, pixel: [_feature_gradient(of, met, pixel, g), met.place],
+        inputs,
+        carry=lambda met, pixel: [_feature_gradient(inputs, met, pixel, g), met.place],
         visit=store,
-        state=(of.transmittance(), *of.zeros(2)),
-        nothing=[dr.zeros(t.Float, of.size), dr.zeros(t.UInt32, of.size)],
+        state=(inputs.transmittance(), *inputs.zeros(2)),
+        nothing=[dr.zeros(t.Float, inputs.size), dr.zeros(t.UInt32, inputs.size)],
     )
     dr.eval(result, pairs)
     return pairs
 
 
-def _sum_pixels(of: _Lanes, pairs: list[Any], g: list[list[Any]]) -> Any:
+def _sum_pixels(inputs: _WalkInputs, pairs: list[Any], g: list[list[Any]]) -> Any:
     """Third walk: the sums over the 16 pixels of each item, rows by place.
 
     pairs: weights and d loss / d ln(alpha), 16 for each place.
     """
-    bins, records, lists, lanes, model = of.bins, of.records, of.lists, of.lanes, of.model
+    bins, records, lists = inputs.bins, inputs.records, inputs.lists
+    lanes, model = inputs.lanes, inputs.model
     t = types_of(type(bins.rows))
     width = model.response.num_moments + bins.num_features
     partials = empty_rows(t.Float, width, max(lists.count, 1))
@@ -431,8 +433,8 @@ def _tangent(
     tangents: SplatGradients,
     order: PixelOrder,
 ) -> Layers:
-    of = _Lanes.of(bins, records, layers.lists, order)
-    model, size = of.model, of.size
+    inputs = _WalkInputs.of(bins, records, layers.lists, order)
+    model, size = inputs.model, inputs.size
     d_records, count = pack_tangents(bins, tangents), layers.count
 
     def carry(met: _Met, pixel: int) -> list[Any]:
@@ -451,7 +453,7 @@ def _tangent(
         for pixel, (alpha, d_alpha, *features) in enumerate(visited):
             d_alpha = dr.select(alpha > 0, d_alpha, 0)  # behind the camera, there is a footprint
             before, d_before = dr.abs(T[pixel]), dT[pixel]
-            weight, T[pixel], goes_on = composite_step(T[pixel], alpha, of.stop)
+            weight, T[pixel], goes_on = composite_step(T[pixel], alpha, inputs.stop)
             d_weight = dr.select(goes_on, dr.fma(before, d_alpha, alpha * d_before), 0)
             dT[pixel] = d_before - d_weight
             for k in range(count):
@@ -460,16 +462,16 @@ def _tangent(
         return (T, dT, dC), _unfinished(T)
 
     _, dT, dC = _walk(
-        of,
+        inputs,
         carry=carry,
         visit=visit,
-        state=(of.transmittance(), of.zeros(1)[0], of.zeros(count)),
+        state=(inputs.transmittance(), inputs.zeros(1)[0], inputs.zeros(count)),
         nothing=[dr.zeros(type(bins.rows), size)] * (1 + 2 * count),
     )
     columns = dT + flat_columns(dC)
     dr.eval(columns)
     return Layers(
-        values=scatter_rows(columns, of.lanes.micro_tile, size),
+        values=scatter_rows(columns, inputs.lanes.micro_tile, size),
         ends=layers.ends,
         stop=layers.stop,
         count=count,

@@ -1,4 +1,4 @@
-"""Splats from sigma points: the projection ``unscented``.
+"""Splats from sigma points: ``projection: unscented``.
 
 Imported when it is chosen. The scaled unscented transform (Julier and Uhlmann 1997; Wan and van der
 Merwe 2000; for splatting: Wu et al. 2025, "3DGUT") with alpha = 1, beta = 2, kappa = 0: the mean
@@ -16,7 +16,7 @@ from typing import Any
 
 import drjit as dr
 
-from drgs.cameras.camera import Camera, Pinhole
+from drgs.cameras.camera import Camera, Lens, Pinhole
 from drgs.core.arrays import types_of
 from drgs.splatting.projection import (
     FilmShape,
@@ -91,7 +91,7 @@ class _SigmaPoints:
 
 
 @singledispatch
-def _sigma_points(lens: Any, rows: GaussianRows, camera: Camera, position: Any) -> _SigmaPoints:
+def _sigma_points(lens: Lens, rows: GaussianRows, camera: Camera, position: Any) -> _SigmaPoints:
     """Through any lens: as it projects points."""
     center, slopes = lens.film_point(camera, position), lens.true_slopes(camera, position)
     not_nearer = replace(camera, near=NEAREST * lens.look(camera, position)[2])

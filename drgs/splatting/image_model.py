@@ -56,7 +56,7 @@ def exp2_short(x: Any) -> Any:
     return dr.reinterpret_array(t.Float, dr.reinterpret_array(t.Int32, p) + exponent)
 
 
-def exp2_function(Float: type) -> Any:
+def exp2_function(Float: type) -> Callable[[Any], Any]:
     """The exponential that compositing uses in this precision."""
     return dr.exp2 if is_float64(Float) else exp2_short
 

@@ -60,7 +60,7 @@ from drgs.core.arrays import (
     types_of,
 )
 from drgs.splatting.grid import GRID, MICRO, MICROS, PIXELS, TILE, TileGrid
-from drgs.splatting.image_model import Alpha
+from drgs.splatting.image_model import Alpha, Features
 from drgs.splatting.lanes import (
     Cursor,
     Entries,
@@ -370,7 +370,7 @@ def _adjoint_step(
     alphas: list[Alpha],
     composited: list[Any],
     stored: list[Any],
-    features: Any,
+    features: Features,
     T: list[Any],
     R: list[Any],
     g: list[list[Any]],
