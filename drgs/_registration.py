@@ -1,6 +1,7 @@
 """Keeps the plugins registered for whichever Mitsuba variant is active.
 
-The only global state of drgs: Mitsuba's plugin registry belongs to a variant.
+The only global state of drgs: Mitsuba's plugin registry belongs to a variant. Mitsuba 3.10 finds
+:mod:`drgs.plugins` by its entry point as well; whichever comes first registers them.
 """
 
 from __future__ import annotations
@@ -10,26 +11,44 @@ import importlib.util
 import sys
 from pathlib import Path
 
-from drgs.core.llvm import ensure_usable_llvm
+BACKENDS = ("scalar_", "llvm_", "cuda_", "metal_")
+"""How the names of Mitsuba's variants begin."""
 
 
 def register_plugins() -> None:
-    """Register for the active variant, if any, and for every one that becomes active later."""
-    import mitsuba as mi
+    """Register for the active variant, if any, and for every one that becomes active later.
 
+    Imports Mitsuba only if something else has done so.
+    """
+    if "mitsuba" in sys.modules:
+        import mitsuba as mi
+
+        _follow_variants()
+        _on_variant(None, mi.variant())
+    if not any(isinstance(finder, _VariantWatch) for finder in sys.meta_path):
+        sys.meta_path.insert(0, _VariantWatch())
+
+
+class _VariantWatch:
+    """An import hook that finds nothing, and follows the variants before one is loaded."""
+
+    def find_spec(self, name: str, path: object = None, target: object = None) -> None:
+        package, _, variant = name.partition(".")
+        if package == "mitsuba" and variant.startswith(BACKENDS):
+            _follow_variants()
+
+
+def _follow_variants() -> None:
+    """Have Mitsuba call :func:`_on_variant` at each change; once is enough, more do no harm."""
     from drgs.core.private import call_on_variant_change  # imports Dr.Jit
 
     call_on_variant_change(_on_variant)
-    if mi.variant() is not None:
-        _on_variant(None, mi.variant())
 
 
 def _on_variant(old: str | None, new: str | None) -> None:
     del old
     if new is None:
         return
-    if new.startswith("llvm_"):
-        ensure_usable_llvm()
     import drgs.plugins
 
     drgs.plugins.register(new)

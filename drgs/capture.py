@@ -29,8 +29,7 @@ import argparse
 import hashlib
 import json
 import sys
-import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
@@ -39,21 +38,22 @@ import mitsuba as mi
 import numpy as np
 from plyfile import PlyData, PlyElement
 
-from drgs.cli.errors import exit_on_user_error
+from drgs.cli.commands import CommandParser, at_least, finite_number, run_command
+from drgs.cli.execution import add_variant_argument, select_variant
 from drgs.cli.interrupts import INTERRUPTED_STATUS
-from drgs.cli.progress import LOG_SECONDS
+from drgs.cli.progress import RunProgress
 from drgs.core.errors import UserError
 from drgs.core.files import atomic_path, why_refused
 from drgs.data.path_tracing import (
+    LEAST,
     SPLITS,
-    Camera,
+    CaptureCamera,
     CaptureSettings,
     CaptureView,
-    _option,
+    capture_views,
     load_scene,
-    orbit,
     picture_path,
-    plan,
+    target_and_distance,
     visible_points,
 )
 from drgs.io.pictures import write_png
@@ -61,48 +61,116 @@ from drgs.io.pictures import write_png
 MANIFEST = "capture.json"
 POINTS = "points3d.ply"
 
+WHOLE_NUMBERS = {
+    "views": "pictures to train on",
+    "val_views": "pictures of the split val",
+    "test_views": "pictures of the split test",
+    "size": "width and height in px",
+    "spp": "paths per pixel",
+    "max_depth": "longest path",
+    "points": f"number of points in {POINTS}",
+    "seed": "of cameras, paths and points",
+}
+"""By name of the setting, what its option says."""
+
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Entry point of the command."""
-    args = vars(_parse(arguments))
-    path, out, variant = Path(args.pop("scene")), Path(args.pop("out")), args.pop("variant")
-    with exit_on_user_error():
-        try:
-            settings = CaptureSettings(**args)
-            if not path.is_file():
-                raise UserError(f"{path}: there is no such scene file")
-            mi.set_variant(variant)
-            scene = load_scene(path)
-            target, distance = orbit(scene, settings)
-            claim_folder(out, manifest(path, settings))
-            run(scene, settings, plan(settings, target, distance), out)
-        except OSError as error:
-            raise UserError(f"{error.filename or out}: {why_refused(error)}") from None
-        except KeyboardInterrupt:
-            print("\ninterrupted; the same command continues", file=sys.stderr)
-            sys.exit(INTERRUPTED_STATUS)
+    """Entry point of ``python -m drgs.capture``."""
+    run_command(add_arguments, "python -m drgs.capture", arguments)
 
 
-def run(scene: mi.Scene, settings: CaptureSettings, shots: list[CaptureView], out: Path) -> None:
-    """Take the pictures that are not in ``out`` yet, then write points and transforms files."""
-    camera = Camera(scene, settings)
-    missing = [shot for shot in shots if not picture_path(out, shot).exists()]
-    for shot in progress(missing, len(shots)):
-        picture = camera.picture(shot)
-        write_png(picture_path(out, shot), picture)
+def add_arguments(parser: CommandParser) -> None:
+    """Add the arguments of the command."""
+    parser.description = "Turn a Mitsuba scene into a training set in the NeRF-synthetic layout."
+    parser.show_examples("%(prog)s scenes/brick_crane.py --views 100 --size 400 --out DIR")
+    parser.add_argument(
+        "scene", type=Path, metavar="SCENE", help="XML file, or Python file with a function scene()"
+    )
+    parser.add_argument("--out", type=Path, metavar="DIR", required=True, help="folder to write")
+    default = {field.name: field.default for field in fields(CaptureSettings)}
+    for name, text in WHOLE_NUMBERS.items():
+        parser.add_argument(
+            f"--{name.replace('_', '-')}",
+            type=at_least(LEAST[name]),
+            default=default[name],
+            metavar="N",
+            help=f"{text} (default: {default[name]})",
+        )
+    parser.add_argument(
+        "--fov",
+        type=finite_number,
+        default=default["fov"],
+        metavar="RADIANS",
+        help="field of view (default: the original's %(default).4f)",
+    )
+    parser.add_argument(
+        "--distance",
+        type=finite_number,
+        help="of the cameras from the target (default: the whole scene is in the picture)",
+    )
+    parser.add_argument(
+        "--target",
+        type=finite_number,
+        nargs=3,
+        metavar=("X", "Y", "Z"),
+        help="what the cameras look at (default: the middle of the bounding box)",
+    )
+    parser.add_argument(
+        "--up", choices=("x", "y", "z"), default=default["up"], help="axis (default: z)"
+    )
+    add_variant_argument(parser)
+    parser.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> None:
+    """Capture what the command line names; end the process with status 130 at a Ctrl-C."""
+    try:
+        given = {field.name: getattr(args, field.name) for field in fields(CaptureSettings)}
+        settings = CaptureSettings(**given | {"target": args.target and tuple(args.target)})
+        if not args.scene.is_file():
+            raise UserError(f"{args.scene}: there is no such scene file")
+        select_variant(args.variant)
+        scene = load_scene(args.scene)
+        views = capture_views(settings, *target_and_distance(scene, settings))
+        claim_folder(args.out, manifest(args.scene, settings))
+        take_pictures(scene, settings, views, args.out)
+        write_dataset(scene, settings, views, args.out)
+    except OSError as error:
+        raise UserError(f"{error.filename or args.out}: {why_refused(error)}") from None
+    except KeyboardInterrupt:
+        print("\ninterrupted; the same command continues", file=sys.stderr)
+        sys.exit(INTERRUPTED_STATUS)
+
+
+def take_pictures(
+    scene: mi.Scene, settings: CaptureSettings, views: list[CaptureView], out: Path
+) -> None:
+    """Take the pictures that are not in ``out`` yet."""
+    camera = CaptureCamera(scene, settings)
+    missing = [view for view in views if not picture_path(out, view).exists()]
+    there = len(views) - len(missing)
+    if there:
+        print(f"{there} of {len(views)} pictures are there already")
+    with RunProgress("picture", len(views), there) as progress:
+        for done, view in enumerate(missing, there + 1):
+            write_png(picture_path(out, view), camera.picture(view))
+            progress.update(done, len(views))
+
+
+def write_dataset(
+    scene: mi.Scene, settings: CaptureSettings, views: list[CaptureView], out: Path
+) -> None:
+    """Write what belongs to the pictures: points and transforms files."""
     if settings.points:
-        positions, colors = visible_points(scene, settings, shots, out)
+        positions, colors = visible_points(scene, settings, views, out)
         write_points(out / POINTS, positions, colors)
         print(f"{len(positions):,} points; start from them: --set init.point_cloud={out / POINTS}")
     # The layout is recognised by the training split's file, so that one comes last.
     for split in reversed(SPLITS):
         if settings.count(split):
-            write_transforms(out / f"transforms_{split}.json", settings, shots, split)
+            write_transforms(out / f"transforms_{split}.json", settings, views, split)
     counted = ", ".join(f"{settings.count(s)} {s}" for s in SPLITS if settings.count(s))
     print(f"written: {out}: {counted} views, {settings.size}x{settings.size}, {settings.spp} spp")
-
-
-# Folder ------------------------------------------------------------------------------------------
 
 
 def manifest(path: Path, settings: CaptureSettings) -> dict[str, Any]:
@@ -153,13 +221,13 @@ def claim_folder(out: Path, wanted: dict[str, Any]) -> None:
 
 
 def write_transforms(
-    path: Path, settings: CaptureSettings, shots: list[CaptureView], split: str
+    path: Path, settings: CaptureSettings, views: list[CaptureView], split: str
 ) -> None:
     """Write one ``transforms_*.json``; numbers have all digits of their float64."""
     frames = [
-        {"file_path": shot.file_path, "transform_matrix": shot.pose.tolist()}
-        for shot in shots
-        if shot.split == split
+        {"file_path": view.file_path, "transform_matrix": view.pose.tolist()}
+        for view in views
+        if view.split == split
     ]
     with atomic_path(path) as temporary:
         content = {"camera_angle_x": settings.fov, "frames": frames}
@@ -176,96 +244,6 @@ def write_points(path: Path, positions: np.ndarray, colors: np.ndarray) -> None:
         rows[name] = colors[:, channel]
     with atomic_path(path) as temporary:
         PlyData([PlyElement.describe(rows, "vertex")], byte_order="<").write(str(temporary))
-
-
-# Scene -------------------------------------------------------------------------------------------
-
-
-# Cameras -----------------------------------------------------------------------------------------
-
-
-# Pictures ----------------------------------------------------------------------------------------
-
-
-# Points ------------------------------------------------------------------------------------------
-
-
-# Command line ------------------------------------------------------------------------------------
-
-
-def progress(missing: list[CaptureView], total: int) -> Iterator[CaptureView]:
-    """The shots one by one, with a line that says how far they are."""
-    terminal = sys.stdout.isatty()
-    started = last = time.monotonic()
-    if len(missing) < total:
-        print(f"{total - len(missing)} of {total} pictures are there already")
-    for done, shot in enumerate(missing, 1):
-        yield shot
-        now = time.monotonic()
-        if terminal or now - last >= LOG_SECONDS or done == len(missing):
-            last = now
-            left = int((now - started) / done * (len(missing) - done))
-            line = (
-                f"picture {total - len(missing) + done}/{total}  left {left // 60}:{left % 60:02d}"
-            )
-            print(f"\r{line}  " if terminal else line, end="" if terminal else "\n", flush=True)
-    if terminal and missing:
-        print()
-
-
-def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(
-        prog="python -m drgs.capture",
-        description="Turn a Mitsuba scene into a training set in the NeRF-synthetic layout.",
-    )
-    parser.add_argument(
-        "scene", metavar="SCENE", help="XML file, or Python file with a function scene()"
-    )
-    parser.add_argument("--out", metavar="DIR", required=True, help="folder to write")
-    default = {field.name: field.default for field in fields(CaptureSettings)}
-    for name, text in {
-        "views": "pictures to train on",
-        "val_views": "pictures of the split val",
-        "test_views": "pictures of the split test",
-        "size": "width and height in px",
-        "spp": "paths per pixel",
-        "max_depth": "longest path",
-        "points": f"number of points in {POINTS}",
-        "seed": "of cameras, paths and points",
-    }.items():
-        text = f"{text} (default: {default[name]})"
-        parser.add_argument(_option(name), type=int, default=default[name], metavar="N", help=text)
-    parser.add_argument(
-        "--fov",
-        type=float,
-        default=default["fov"],
-        metavar="RADIANS",
-        help="field of view (default: the original's %(default).4f)",
-    )
-    parser.add_argument(
-        "--distance",
-        type=float,
-        help="of the cameras from the target (default: the whole scene is in the picture)",
-    )
-    parser.add_argument(
-        "--target",
-        type=float,
-        nargs=3,
-        metavar=("X", "Y", "Z"),
-        help="what the cameras look at (default: the middle of the bounding box)",
-    )
-    parser.add_argument(
-        "--up", choices=("x", "y", "z"), default=default["up"], help="axis (default: z)"
-    )
-    parser.add_argument(
-        "--variant",
-        choices=("llvm_ad_rgb", "cuda_ad_rgb"),
-        default="llvm_ad_rgb",
-        help="of Mitsuba (default: llvm_ad_rgb)",
-    )
-    args = parser.parse_args(arguments)
-    args.target = args.target and tuple(args.target)
-    return args
 
 
 if __name__ == "__main__":

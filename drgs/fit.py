@@ -33,13 +33,13 @@ import mitsuba as mi
 import numpy as np
 
 import drgs
-from drgs.cli.errors import exit_on_user_error
-from drgs.cli.execution import add_options, executing
+from drgs.cli.commands import CommandParser, run_command
+from drgs.cli.execution import add_execution_arguments, executing, select_variant
 from drgs.cli.interrupts import INTERRUPTED_STATUS, StopRequest
-from drgs.cli.progress import FitProgress
+from drgs.cli.progress import RunProgress
 from drgs.config.load import dump_config, load_config
 from drgs.config.schema import FitConfig
-from drgs.core.errors import UserError, one_line
+from drgs.core.errors import UserError
 from drgs.core.files import atomic_path
 from drgs.core.private import llvm_version
 from drgs.data import Dataset, initial_gaussians, load_dataset
@@ -91,29 +91,57 @@ SMOOTHING = 0.9
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Entry point of the command."""
+    """Entry point of ``python -m drgs.fit``."""
+    run_command(add_arguments, "python -m drgs.fit", arguments)
+
+
+def add_arguments(parser: CommandParser) -> None:
+    """Add the arguments of the command."""
+    parser.description = "Fit 3D Gaussians to posed photographs."
+    parser.show_examples(
+        "%(prog)s scenes/lego.yml --data DIR --out out/mine --set iterations=3000",
+        "%(prog)s --resume out/mine",
+    )
+    what = parser.add_mutually_exclusive_group(required=True)
+    what.add_argument("config", nargs="?", metavar="CONFIG.yml", help="what to fit, and how")
+    what.add_argument(
+        "--resume", type=Path, metavar="OUT_DIR", help="go on with a fit that was stopped"
+    )
+    parser.add_argument("--data", metavar="DIR", help="dataset folder (data.path)")
+    parser.add_argument("--out", metavar="DIR", help="output folder (default: out/NAME)")
+    parser.add_argument(
+        "--overwrite", action="store_true", help="replace the run that the output folder holds"
+    )
+    parser.add_argument(
+        "--set",
+        dest="overrides",
+        action="append",
+        default=[],
+        metavar="KEY=VALUE",
+        help="override a value of the configuration, as in densify.every=200; repeatable",
+    )
+    parser.add_argument(
+        "--budget",
+        type=_duration,
+        metavar="TIME",
+        help="90s, 5m, 1h30m: plan a fit that is done, results written, after this time",
+    )
+    add_execution_arguments(parser)
+    parser.set_defaults(run=run, prog=parser.prog)
+
+
+def run(args: argparse.Namespace) -> None:
+    """Fit what the command line names; end the process with status 130 if Ctrl-C stopped it."""
     started = time.perf_counter()
-    args = _parse(arguments)
-    with exit_on_user_error(), executing(args.threads, args.debug) as check_ranges:
-        if args.resume is not None:
-            config, out = load_run_config(args.resume), args.resume
-        else:
-            config = load_config(args.config, args.overrides + _shorthands(args))
-            out = config.output.dir or Path("out") / Path(args.config).stem
+    with executing(args.threads, args.debug) as check_ranges:
+        config, out = what_to_fit(args)
         if is_finished(out, config) and not args.overwrite:
             print(f"{out}: this fit is finished; --overwrite does it again")
             return
         dataset = load_dataset(config.data_for_training)
         select_variant(args.variant)
-        print(dataset.description)
-        print(
-            f"{len(dataset.train)} views to train on, {len(dataset.test)} of split "
-            f"'{dataset.test_split}' to measure on; background {config.data.background}"
-        )
-        print(described(summary_of_fit(config, dataset)))
+        announce(config, dataset)
         # The folder is touched when all of the input has been found to be usable.
-        views, remedy = (*dataset.train, *dataset.test), "set data.ignore_distortion"
-        check_lenses(config.model, views, f"{config.data.path}: ", remedy)
         gaussians = initial_gaussians(config, dataset)
         length, plan = AllIterations(), None
         if args.budget is not None:
@@ -131,18 +159,37 @@ def main(arguments: Sequence[str] | None = None) -> None:
             with atomic_path(out / BUDGET_PLAN) as temporary:
                 temporary.write_text(f"--budget {args.budget:g}s\n{plan.reasons}\n")
             length = Deadline(trainer, end, plan.curve)
-        finished = run(trainer, dataset, out, length, check_ranges)
+        finished = fit_and_write(trainer, dataset, out, length, check_ranges)
     if not finished:
-        print(f"stopped; continue with: python -m drgs.fit --resume {out}")
+        print(f"stopped; continue with: {args.prog} --resume {out}")
         sys.exit(INTERRUPTED_STATUS)
 
 
-def select_variant(name: str) -> None:
-    """Make ``name`` the active Mitsuba variant."""
-    try:
-        mi.set_variant(name)
-    except ImportError as error:
-        raise UserError(f"--variant {name}: not usable here: {one_line(error)}") from None
+def what_to_fit(args: argparse.Namespace) -> tuple[FitConfig, Path]:
+    """The configuration that the command line asks for, and the output folder."""
+    given = {"data.path": args.data, "output.dir": args.out}
+    shorthands = [f"{key}={value}" for key, value in given.items() if value is not None]
+    if args.resume is not None:
+        if shorthands or args.overrides or args.overwrite or args.budget is not None:
+            raise UserError(
+                f"--resume: takes its configuration from {args.resume / CONFIG}: leave out --data, "
+                "--out, --set, --budget and --overwrite"
+            )
+        return load_run_config(args.resume), args.resume
+    config = load_config(args.config, args.overrides + shorthands)
+    return config, config.output.dir or Path("out") / Path(args.config).stem
+
+
+def announce(config: FitConfig, dataset: Dataset) -> None:
+    """Print the data and what is simulated; refuse lenses that the projection cannot show."""
+    print(dataset.description)
+    print(
+        f"{len(dataset.train)} views to train on, {len(dataset.test)} of split "
+        f"'{dataset.test_split}' to measure on; background {config.data.background}"
+    )
+    print(described(summary_of_fit(config, dataset)))
+    views, remedy = (*dataset.train, *dataset.test), "set data.ignore_distortion"
+    check_lenses(config.model, views, f"{config.data.path}: ", remedy)
 
 
 def planned(
@@ -160,7 +207,7 @@ def planned(
     return end, make_plan(config, num_points, side, seconds, second, load_curves())
 
 
-def run(
+def fit_and_write(
     trainer: Trainer,
     dataset: Dataset,
     out: Path,
@@ -223,16 +270,19 @@ def run_iterations(
     False if Ctrl-C stopped it; the state is saved then.
     """
     smooth_psnr, every = None, trainer.config.output.checkpoint_every
-    with FitProgress(length.total(trainer)) as progress, StopRequest() as stop:
+    shown = RunProgress("iteration", length.total(trainer), trainer.iteration)
+    with shown as progress, StopRequest() as stop:
         for done in iterations(trainer, history, length):
             check_ranges()
             if done.row is not None:
                 psnr = done.row.psnr
                 smooth_psnr = psnr if smooth_psnr is None else smooth_psnr
                 smooth_psnr = SMOOTHING * smooth_psnr + (1 - SMOOTHING) * psnr
-                loss, num_gaussians = done.row.loss, done.row.num_gaussians
-                total = length.total(trainer)
-                progress.update(done.row.iteration, total, loss, smooth_psnr, num_gaussians)
+                status = (
+                    f"loss {done.row.loss:.4f}  PSNR {smooth_psnr:5.2f} dB  "
+                    f"Gaussians {done.row.num_gaussians:,}"
+                )
+                progress.update(done.row.iteration, length.total(trainer), status)
             is_due = every and done.report.iteration % every == 0 and not done.is_last
             if stop.requested or is_due:
                 save(trainer, history, out)
@@ -284,60 +334,11 @@ def summarize(
     }
 
 
-def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(
-        prog="python -m drgs.fit", description="Fit 3D Gaussians to posed photographs."
-    )
-    parser.add_argument("config", nargs="?", metavar="CONFIG.yml", help="what to fit, and how")
-    parser.add_argument(
-        "--resume", type=Path, metavar="OUT_DIR", help="go on with a fit that was stopped"
-    )
-    parser.add_argument("--data", metavar="DIR", help="dataset folder (data.path)")
-    parser.add_argument("--out", metavar="DIR", help="output folder (default: out/NAME)")
-    parser.add_argument(
-        "--overwrite", action="store_true", help="replace the run that the output folder holds"
-    )
-    parser.add_argument(
-        "--set",
-        dest="overrides",
-        action="append",
-        default=[],
-        metavar="KEY=VALUE",
-        help="override a value of the configuration, as in densify.every=200; repeatable",
-    )
-    parser.add_argument(
-        "--budget",
-        type=_duration,
-        metavar="TIME",
-        help="90s, 5m, 1h30m: plan a fit that is done, results written, after this time",
-    )
-    parser.add_argument(
-        "--variant",
-        default="llvm_ad_rgb",
-        choices=("llvm_ad_rgb", "cuda_ad_rgb"),
-        help="Mitsuba variant (default: llvm_ad_rgb)",
-    )
-    add_options(parser)
-    args = parser.parse_args(arguments)
-    if (args.config is None) == (args.resume is None):
-        parser.error("give either CONFIG.yml or --resume OUT_DIR")
-    if args.resume and (
-        args.overrides or args.data or args.out or args.overwrite or args.budget is not None
-    ):
-        parser.error("--resume takes its configuration from OUT_DIR/config.yml, and nothing else")
-    return args
-
-
 def _duration(text: str) -> float:
     try:
         return parse_duration(text)
     except ValueError as error:
         raise argparse.ArgumentTypeError(str(error)) from None
-
-
-def _shorthands(args: argparse.Namespace) -> list[str]:
-    given = {"data.path": args.data, "output.dir": args.out}
-    return [f"{key}={value}" for key, value in given.items() if value is not None]
 
 
 if __name__ == "__main__":

@@ -28,8 +28,8 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
-from drgs.cli.errors import exit_on_user_error
-from drgs.cli.execution import add_options, executing
+from drgs.cli.commands import CommandParser, at_least, finite_number, run_command
+from drgs.cli.execution import VARIANTS, add_execution_arguments, executing, select_variant
 from drgs.config.load import load_config
 from drgs.config.schema import NAMED_COLORS, DataConfig, FitConfig, ModelConfig
 from drgs.core.constants import SHUTTER_SAMPLES
@@ -59,8 +59,6 @@ DEFAULT_SIZE = (400, 400)
 
 UP = (0.0, 0.0, 1.0)
 """World: the convention of both dataset layouts."""
-
-SPLATS_VARIANTS = ("llvm_ad_rgb", "cuda_ad_rgb")
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,13 +107,92 @@ class Model:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Entry point of the command."""
-    args = _parse(arguments)
-    with exit_on_user_error(), executing(args.threads, args.debug):
+    """Entry point of ``python -m drgs.render``."""
+    run_command(add_arguments, "python -m drgs.render", arguments)
+
+
+def add_arguments(parser: CommandParser) -> None:
+    """Add the arguments of the command."""
+    parser.description = "Render Gaussians, a fit, or a Mitsuba scene with the splats integrator."
+    parser.show_examples(
+        "%(prog)s out/lego --out DIR                # the test views, with PSNR and SSIM",
+        "%(prog)s out/lego --orbit 60 --out DIR     # an animation",
+        "%(prog)s model.ply --origin 0 -3 2 --target 0 0 0 --out DIR",
+        "%(prog)s scene.xml -D model=model.ply --out DIR",
+    )
+    parser.add_argument(
+        "what", type=Path, metavar="MODEL.ply|SCENE.xml|OUT_DIR", help="what to render"
+    )
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="output folder")
+    _add_cameras(parser)
+    _add_settings(parser)
+    parser.add_argument_group("Mitsuba scenes").add_argument(
+        "--define",
+        "-D",
+        type=_definition,
+        action="append",
+        metavar="NAME=VALUE",
+        help="a parameter of the scene file, as in model=point_cloud.ply; repeatable",
+    )
+    add_execution_arguments(parser, variants=None)
+    parser.set_defaults(run=run)
+
+
+def _add_cameras(parser: CommandParser) -> None:
+    group = parser.add_argument_group("cameras, of Gaussians")
+    vector = {"type": finite_number, "nargs": 3, "metavar": ("X", "Y", "Z")}
+    one_of = group.add_mutually_exclusive_group().add_argument
+    one_of(
+        "--split", choices=("test", "train"), help="the photographs' cameras, with PSNR and SSIM"
+    )
+    one_of(
+        "--orbit", type=at_least(1), metavar="N", help="N frames around the scene, and an animation"
+    )
+    one_of(
+        "--camera", type=Path, metavar="FILE.json", help="cameras in the layout of transforms.json"
+    )
+    one_of("--origin", **vector, help="one camera, here")
+    add = group.add_argument
+    add("--target", **vector, help="what it looks at (default: 0 0 0)")
+    add("--up", **vector, help="up in the picture, of --origin or --orbit (default: 0 0 1)")
+    add("--fov", type=_degrees, metavar="DEGREES", help="horizontal field of view (default: 40)")
+    add("--size", type=at_least(1), nargs=2, metavar=("W", "H"), help="px (default: 400 400)")
+
+
+def _add_settings(parser: CommandParser) -> None:
+    group = parser.add_argument_group("how Gaussians are rendered")
+    group.add_argument(
+        "--background",
+        nargs="+",
+        metavar="COLOR",
+        help="white, black, R G B in 0..1, or a picture's file",
+    )
+    group.add_argument(
+        "--ignore",
+        nargs="+",
+        choices=IGNORABLE,
+        metavar="EFFECT",
+        help=f"what is not to be simulated: {', '.join(IGNORABLE)}",
+    )
+    group.add_argument(
+        "--scene", type=Path, metavar="CONFIG.yml", help="configuration that names the photographs"
+    )
+    group.add_argument("--data", metavar="DIR", help="dataset folder (data.path)")
+    group.add_argument(
+        "--set",
+        action="append",
+        metavar="KEY=VALUE",
+        help="override a value of the configuration, as in data.image_size=200; repeatable",
+    )
+
+
+def run(args: argparse.Namespace) -> None:
+    """Render what the command line names."""
+    with executing(args.threads, args.debug):
         _check(args)
-        mi.set_variant(args.variant)
+        select_variant(args.variant)
         if args.what.suffix == ".xml":
-            render_mitsuba_scene(args.what, args.out, _definitions(args.definitions))
+            render_mitsuba_scene(args.what, args.out, dict(args.define or ()))
         else:
             model = load_model(args)
             if args.orbit is not None:
@@ -157,7 +234,7 @@ def load_model(args: argparse.Namespace) -> Model:
 
 
 def _load_config(path: Path, args: argparse.Namespace) -> FitConfig:
-    overrides = list(args.overrides)
+    overrides = list(args.set or ())
     if args.data is not None:
         overrides.append(f"data.path={args.data}")
     if args.background is not None and not isinstance(color := _background(args), Path):
@@ -297,13 +374,12 @@ def _check(args: argparse.Namespace) -> None:
         raise UserError(f"--out {args.out}: holds a fit, whose {METRICS} would be overwritten")
     if args.what.suffix == ".xml":
         reason = "is not used with a Mitsuba scene, which brings its own cameras and settings"
-        _check_unused(args, reason, _OPTIONS)
+        _check_unused(args, reason, (*PLACING, *OF_CAMERAS, *OF_GAUSSIANS))
         _check_variant(args, mi.variants())
     elif args.what.suffix == ".ply" or args.what.is_dir():
-        _check_unused(args, "is for the parameters of a Mitsuba scene (.xml)", ("definitions",))
-        _check_variant(args, SPLATS_VARIANTS)
+        _check_unused(args, "is for the parameters of a Mitsuba scene (.xml)", ("define",))
+        _check_variant(args, VARIANTS)
         _check_cameras(args)
-        _check_numbers(args)
     else:
         raise UserError(
             f"{args.what}: must be a PLY file, a Mitsuba scene (.xml) or the output folder of a fit"
@@ -316,84 +392,69 @@ def _check_variant(args: argparse.Namespace, allowed: Sequence[str]) -> None:
 
 
 def _check_cameras(args: argparse.Namespace) -> None:
-    """Exactly one way of placing cameras, and no option that it does not use."""
-    modes = {f"--{name}": getattr(args, name) for name in ("split", "orbit", "camera", "origin")}
-    given = [mode for mode, value in modes.items() if value is not None]
+    """A way of placing cameras, and no option that it does not use."""
+    way = next((way for way in PLACING if getattr(args, way) is not None), "split")
     has_photographs = args.scene is not None or args.what.is_dir()
-    if len(given) > 1:
-        raise UserError(f"{' and '.join(given)} exclude each other")
-    if not given and not has_photographs:
-        raise UserError(
-            f"{args.what}: say what to render: --orbit N, --camera FILE.json, --origin X Y Z, "
-            "or --split with --scene CONFIG.yml"
-        )
-    mode = given[0] if given else "--split"
-    if mode == "--split" and args.background and isinstance(_background(args), Path):
+    if not has_photographs:
+        _check_unused(args, "needs --scene CONFIG.yml", ("data", "set"))
+        if way == "split" and args.split is None:
+            raise UserError(
+                f"{args.what}: say what to render: --orbit N, --camera FILE.json, --origin X Y Z, "
+                "or --split with --scene CONFIG.yml"
+            )
+    if way == "split" and args.background and isinstance(_background(args), Path):
         raise UserError(
             "--background: a picture is not what the photographs were composited over; use it with "
             "--orbit, --camera or --origin"
         )
-    _check_unused(args, f"is not used with {mode}", _UNUSED[mode])
-    if has_photographs and mode == "--orbit":
+    unused = [name for name in OF_CAMERAS if name not in PLACING[way]]
+    _check_unused(args, f"is not used with --{way}", unused)
+    if has_photographs and way == "orbit":
         _check_unused(args, "is not used here: it follows from the photographs' cameras", ("up",))
-    if not has_photographs:
-        _check_unused(args, "needs --scene CONFIG.yml", ("data", "overrides"))
-
-
-def _definitions(words: Sequence[str]) -> dict[str, str]:
-    """Parameters of a scene file by name; those of ``mi.load_file`` itself cannot be given."""
-    for word in words:
-        if not word.partition("=")[0].strip() or "=" not in word:
-            raise UserError(f"--define: must be NAME=VALUE, got {word}")
-    pairs = (word.partition("=") for word in words)
-    definitions = {name.strip(): value for name, _, value in pairs}
-    for name in _TAKEN:
-        if name in definitions:
-            raise UserError(
-                f"--define: the name {name} is taken by Mitsuba's loader: rename the parameter in "
-                "the scene file"
-            )
-    return definitions
-
-
-_TAKEN = ("path", "parallel", "optimize")
-"""Arguments of ``mi.load_file``, which takes a file's parameters by name as well."""
-
-
-def _check_numbers(args: argparse.Namespace) -> None:
-    if args.size is not None and min(args.size) < 1:
-        raise UserError(f"--size: must be >= 1 px, got {args.size[0]} {args.size[1]}")
-    if args.orbit is not None and args.orbit < 1:
-        raise UserError(f"--orbit: must be >= 1 frame, got {args.orbit}")
-    if args.fov is not None and not 0 < args.fov < 180:
-        raise UserError(f"--fov: must be between 0 and 180 degrees, got {args.fov:g}")
-    for name in ("origin", "target", "up"):
-        vector = getattr(args, name)
-        if vector is not None and not np.isfinite(vector).all():
-            raise UserError(f"--{name}: must be three finite numbers, got {vector}")
-
-
-_OPTIONS = (
-    *("scene", "data", "overrides", "split", "orbit", "camera", "origin"),
-    *("target", "up", "fov", "size", "background", "ignore"),
-)
-"""All options that concern Gaussians."""
-
-_NAMES = {"overrides": "set", "definitions": "define"}
-"""Of options that are not called as the attribute that holds them."""
-
-_UNUSED = {
-    "--split": ("target", "up", "fov", "size"),
-    "--orbit": ("target",),
-    "--camera": ("target", "up", "fov"),
-    "--origin": (),
-}
 
 
 def _check_unused(args: argparse.Namespace, reason: str, names: Sequence[str]) -> None:
     for name in names:
-        if getattr(args, name) not in (None, []):
-            raise UserError(f"--{_NAMES.get(name, name)}: {reason}")
+        if getattr(args, name) is not None:
+            raise UserError(f"--{name}: {reason}")
+
+
+OF_GAUSSIANS = ("scene", "data", "set", "background", "ignore")
+"""Options that a Mitsuba scene does not use, beside those of cameras."""
+
+OF_CAMERAS = ("target", "up", "fov", "size")
+
+PLACING = {
+    "split": (),
+    "orbit": ("up", "fov", "size"),
+    "camera": ("size",),
+    "origin": OF_CAMERAS,
+}
+"""By the option that places the cameras, the others that it uses."""
+
+TAKEN = ("path", "parallel", "optimize")
+"""Arguments of ``mi.load_file``, which takes a file's parameters by name as well."""
+
+
+def _definition(word: str) -> tuple[str, str]:
+    """NAME=VALUE for a parameter of a scene file."""
+    name, separator, value = word.partition("=")
+    name = name.strip()
+    if not name or not separator:
+        raise argparse.ArgumentTypeError(f"must be NAME=VALUE, got {word}")
+    if name in TAKEN:
+        raise argparse.ArgumentTypeError(
+            f"the name {name} is taken by Mitsuba's loader: rename the parameter in the scene file"
+        )
+    return name, value
+
+
+def _degrees(text: str) -> float:
+    """A field of view."""
+    angle = finite_number(text)
+    if not 0 < angle < 180:
+        raise argparse.ArgumentTypeError(f"must be between 0 and 180 degrees, got {text}")
+    return angle
 
 
 def _background(args: argparse.Namespace) -> tuple[float, float, float] | Path:
@@ -433,60 +494,6 @@ def _first_and_last(message: str) -> str:
     head = head.removesuffix("Traceback (most recent call last):").strip()
     last = re.sub(r"^[\w.]*(Error|Exception): ", "", rest[-1].strip()) if rest else ""
     return f"{head} {last}".strip()
-
-
-def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(
-        prog="python -m drgs.render",
-        description="Render Gaussians, a fit, or a Mitsuba scene with the splats integrator.",
-    )
-    add = parser.add_argument
-    add("what", type=Path, metavar="MODEL.ply|SCENE.xml|OUT_DIR", help="what to render")
-    add("--out", type=Path, required=True, metavar="DIR", help="output folder")
-    add("--split", choices=("test", "train"), help="the photographs' cameras, with PSNR and SSIM")
-    add("--orbit", type=int, metavar="N", help="N frames around the scene, and an animation")
-    add("--camera", type=Path, metavar="FILE.json", help="cameras in the layout of transforms.json")
-    vector = {"type": float, "nargs": 3, "metavar": ("X", "Y", "Z")}
-    add("--origin", **vector, help="one camera, here")
-    add("--target", **vector, help="what it looks at (default: 0 0 0)")
-    add("--up", **vector, help="up in the picture, of --origin or --orbit (default: 0 0 1)")
-    add("--fov", type=float, metavar="DEGREES", help="horizontal field of view (default: 40)")
-    add("--size", type=int, nargs=2, metavar=("W", "H"), help="px (default: 400 400)")
-    add(
-        "--background",
-        nargs="+",
-        metavar="COLOR",
-        help="white, black, R G B in 0..1, or a picture's file",
-    )
-    add(
-        "--ignore",
-        nargs="+",
-        choices=IGNORABLE,
-        metavar="EFFECT",
-        help=f"what is not to be simulated: {', '.join(IGNORABLE)}",
-    )
-    add("--scene", type=Path, metavar="CONFIG.yml", help="configuration that names the photographs")
-    add("--data", metavar="DIR", help="dataset folder (data.path)")
-    add(
-        "--set",
-        dest="overrides",
-        action="append",
-        default=[],
-        metavar="KEY=VALUE",
-        help="override a value of the configuration, as in data.image_size=200; repeatable",
-    )
-    add(
-        "--define",
-        "-D",
-        dest="definitions",
-        action="append",
-        default=[],
-        metavar="NAME=VALUE",
-        help="a parameter of a Mitsuba scene file, as in model=point_cloud.ply; repeatable",
-    )
-    add("--variant", default="llvm_ad_rgb", help="Mitsuba variant (default: llvm_ad_rgb)")
-    add_options(parser)
-    return parser.parse_args(arguments)
 
 
 if __name__ == "__main__":

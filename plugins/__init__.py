@@ -5,6 +5,10 @@ May import ``integrator`` and what that may import.
 A plugin file reads like one of Mitsuba's own: a class that derives from a class of the active
 variant, and a registration that closes the file. Such a class belongs to one variant, so the files
 are executed once for each variant that becomes active, and the results are kept.
+
+Mitsuba 3.10 imports this package by its entry point (group ``mitsuba``) when the first variant
+becomes active and reloads it after each change. To it, as to everybody else, the registration that
+closes this file is one that happens once for each variant, however often it is executed.
 """
 
 from __future__ import annotations
@@ -13,11 +17,20 @@ import importlib.util
 import sys
 from pathlib import Path
 
+import mitsuba as mi
+
+from drgs.core.llvm import ensure_usable_llvm
+
 PLUGINS = ("splats", "calibrated")
 
 
 def register(variant: str) -> None:
-    """Register all plugins for ``variant``, which must be the active one."""
+    """Register all plugins for ``variant``, which must be the active one; once is enough.
+
+    Raises ``LLVMVersionError`` for a variant that needs a libLLVM which is not there.
+    """
+    if variant.startswith("llvm_"):
+        ensure_usable_llvm()
     for name in PLUGINS:
         module_name = f"{__name__}.{variant}.{name}"
         if module_name in sys.modules:
@@ -32,3 +45,7 @@ def register(variant: str) -> None:
         except BaseException:
             del sys.modules[module_name]
             raise
+
+
+if mi.variant() is not None:
+    register(mi.variant())

@@ -1,58 +1,37 @@
-"""Entry point of ``python -m drgs.bench``."""
+"""Entry point of ``drgs bench`` and ``python -m drgs.bench``."""
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Sequence
-from pathlib import Path
 
-from drgs.bench import (
-    accuracy,
-    benefits,
-    effects,
-    hybrid,
-    population,
-    scaling,
-    speed,
-    stability,
-    training,
-    volprim,
-)
-from drgs.cli.errors import exit_on_user_error
+from drgs.cli.commands import CommandParser, Subcommand, run_command
 
 COMMANDS = {
-    "speed": speed,
-    "scaling": scaling,
-    "accuracy": accuracy,
-    "effects": effects,
-    "hybrid": hybrid,
-    "benefits": benefits,
-    "training": training,
-    "volprim": volprim,
-    "stability": stability,
-    "population": population,
+    "speed": "times of drgs and of other renderers on the same scene, in one run",
+    "scaling": "time and memory of a training iteration against the size of the problem",
+    "accuracy": "the error of each approximation against the time that it saves",
+    "effects": "what each effect costs: time and operations with and without it",
+    "hybrid": "what a path-traced object among splats costs",
+    "benefits": "what effects are good for: fits of spoiled data with and without them",
+    "training": "quality over time for several settings of a fit; an hour or two",
+    "volprim": "what sets Mitsuba's volprim_rf_basic apart, by how much it changes the picture",
+    "stability": "error of float32 against float64 as scenes become harder",
+    "population": "how many Gaussians the reference recipe keeps, by picture size and rule; hours",
 }
+"""By name, what each measures; a command is the module of its name."""
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Parse the command line and run one measurement."""
-    parser = argparse.ArgumentParser(
-        prog="python -m drgs.bench", description="Measure drgs; write tables and plots."
-    )
-    commands = parser.add_subparsers(dest="command", required=True)
-    for name, module in COMMANDS.items():
-        command = commands.add_parser(name, help=module.DESCRIPTION)
-        command.add_argument(
-            "--out",
-            type=Path,
-            default=Path("out/bench"),
-            metavar="DIR",
-            help="(default: out/bench)",
-        )
-        module.add_options(command)
-    args = parser.parse_args(arguments)
-    with exit_on_user_error():
-        COMMANDS[args.command].run(args)
+    """Entry point of ``python -m drgs.bench``."""
+    run_command(add_arguments, "python -m drgs.bench", arguments)
+
+
+def add_arguments(parser: CommandParser) -> None:
+    """Add the measurements."""
+    parser.description = "Measure drgs; write tables and plots."
+    parser.show_examples("%(prog)s speed --quick", "%(prog)s accuracy out/lego --out out/bench")
+    commands = {name: Subcommand(text, f"drgs.bench.{name}") for name, text in COMMANDS.items()}
+    parser.add_commands(commands, metavar="MEASUREMENT")
 
 
 if __name__ == "__main__":

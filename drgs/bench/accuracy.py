@@ -27,8 +27,9 @@ import numpy as np
 
 from drgs.accuracy.pipeline import pipeline_of
 from drgs.accuracy.sample_points import SamplePoints
-from drgs.bench.output import machine, markdown_table, write_csv
+from drgs.bench.output import add_out, machine, markdown_table, write_csv
 from drgs.bench.scenes import bench_camera, device_camera, stress_scene
+from drgs.cli.commands import CommandParser
 from drgs.config.approximations import Approximations
 from drgs.config.load import load_config
 from drgs.core.errors import UserError
@@ -43,8 +44,6 @@ from drgs.results import metrics
 from drgs.results.files import CONFIG, GAUSSIANS
 from drgs.splatting import rendering
 from drgs.splatting.image_model import PixelCenters
-
-DESCRIPTION = "the error of each approximation against the time that it saves"
 
 ROUNDS, QUICK_ROUNDS = 9, 3
 SLOW_ROUNDS = 2
@@ -131,14 +130,17 @@ class Measurement:
     photo_psnr: float | None  # dB, against the photographs
 
 
-def add_options(parser: argparse.ArgumentParser) -> None:
-    """Options besides ``--out``."""
+def add_arguments(parser: CommandParser) -> None:
+    """Add the arguments of the command."""
+    parser.show_examples("%(prog)s out/lego")
+    add_out(parser)
     add_scene(parser)
     parser.add_argument("--views", type=int, default=3, help="test views of a fit (default: 3)")
     parser.add_argument("--quick", action="store_true", help="one view, fewer rounds")
+    parser.set_defaults(run=run)
 
 
-def add_scene(parser: argparse.ArgumentParser) -> None:
+def add_scene(parser: CommandParser) -> None:
     """The argument that :func:`load_subject` reads."""
     parser.add_argument(
         "scene",

@@ -19,7 +19,8 @@ import mitsuba as mi
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from drgs.bench.output import machine, markdown_table, write_csv
+from drgs.bench.output import add_out, machine, markdown_table, write_csv
+from drgs.cli.commands import CommandParser
 from drgs.config.changes import changed, with_iterations
 from drgs.config.load import load_config
 from drgs.config.schema import FitConfig
@@ -32,8 +33,6 @@ from drgs.io.figures import new_figure, write_figure
 from drgs.io.pictures import to_uint8
 from drgs.results.metrics import mean_quality
 from drgs.training.trainer import Trainer
-
-DESCRIPTION = "what effects are good for: fits of spoiled data with and without them"
 
 SCENES = Path(__file__).parents[2] / "scenes"
 CONFIG = SCENES / "lego_mini.yml"
@@ -79,10 +78,13 @@ class Result:
     value: float
 
 
-def add_options(parser: argparse.ArgumentParser) -> None:
-    """Options besides ``--out``."""
+def add_arguments(parser: CommandParser) -> None:
+    """Add the arguments of the command."""
+    parser.show_examples("%(prog)s --only masks")
+    add_out(parser)
     parser.add_argument("--quick", action="store_true", help="a few iterations each")
     parser.add_argument("--only", nargs="+", metavar="EFFECT", help="such as masks")
+    parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> None:

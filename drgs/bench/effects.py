@@ -20,12 +20,11 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from drgs.bench.output import machine, markdown_table, write_csv
+from drgs.bench.output import add_out, machine, markdown_table, write_csv
 from drgs.bench.scenes import Scene, bench_camera, bench_gaussians, trainer_of
+from drgs.cli.commands import CommandParser
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 from drgs.io.figures import new_figure, write_figure
-
-DESCRIPTION = "what each effect costs: time and operations with and without it"
 
 SIZE = 400
 """px: width and height of all pictures."""
@@ -68,9 +67,12 @@ class Price:
     operations_more: int
 
 
-def add_options(parser: argparse.ArgumentParser) -> None:
-    """Options besides ``--out``."""
+def add_arguments(parser: CommandParser) -> None:
+    """Add the arguments of the command."""
+    parser.show_examples("%(prog)s --quick")
+    add_out(parser)
     parser.add_argument("--quick", action="store_true", help="10,000 Gaussians, few rounds")
+    parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> None:

@@ -17,11 +17,10 @@ import drjit as dr
 import mitsuba as mi
 
 from drgs.bench.effects import SIZE, perspective, to_world
-from drgs.bench.output import machine, markdown_table, write_csv
+from drgs.bench.output import add_out, machine, markdown_table, write_csv
 from drgs.bench.scenes import bench_camera, bench_gaussians
+from drgs.cli.commands import CommandParser
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
-
-DESCRIPTION = "what a path-traced object among splats costs"
 
 COUNTS, QUICK_COUNTS = (10_000, 100_000), (10_000,)
 
@@ -45,9 +44,12 @@ class Cost:
     again_factor: float  # the same of the second picture
 
 
-def add_options(parser: argparse.ArgumentParser) -> None:
-    """Options besides ``--out``."""
+def add_arguments(parser: CommandParser) -> None:
+    """Add the arguments of the command."""
+    parser.show_examples("%(prog)s --quick")
+    add_out(parser)
     parser.add_argument("--quick", action="store_true", help="10,000 Gaussians, few rounds")
+    parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import csv
 import os
 import platform
@@ -13,6 +14,17 @@ import drjit as dr
 
 from drgs.core.files import atomic_path
 from drgs.core.private import llvm_version
+
+
+def add_out(parser: argparse.ArgumentParser) -> None:
+    """Add ``--out``."""
+    parser.add_argument(
+        "--out",
+        type=Path,
+        default=Path("out/bench"),
+        metavar="DIR",
+        help="output folder (default: out/bench)",
+    )
 
 
 def machine() -> str:

@@ -28,7 +28,8 @@ import numpy as np
 from scipy.special import expit
 
 from drgs import capture, fit
-from drgs.bench.output import markdown_table, write_csv
+from drgs.bench.output import add_out, markdown_table, write_csv
+from drgs.cli.commands import CommandParser
 from drgs.config.load import load_config
 from drgs.config.schema import DensifyConfig, FitConfig
 from drgs.core.arrays import from_host
@@ -36,8 +37,6 @@ from drgs.data import load_dataset
 from drgs.io.figures import new_figure, write_figure
 from drgs.results.files import HISTORY, METRICS
 from drgs.training import densify, optimizer
-
-DESCRIPTION = "how many Gaussians the reference recipe keeps, by picture size and by rule; hours"
 
 SCENES = Path(__file__).parents[2] / "scenes"
 CONFIG = SCENES / "lego_paper.yml"
@@ -160,8 +159,10 @@ CASES = (
 # ----------------------------------------------------------------------------------------------
 
 
-def add_options(parser: argparse.ArgumentParser) -> None:
-    """Options besides ``--out``."""
+def add_arguments(parser: CommandParser) -> None:
+    """Add the arguments of the command."""
+    parser.show_examples("%(prog)s --only 1 2 --iterations 7000")
+    add_out(parser)
     parser.add_argument(
         "--data", type=Path, metavar="DIR", help=f"NeRF-synthetic's Lego (default: as in {CONFIG})"
     )
@@ -171,6 +172,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     parser.add_argument("--threads", type=int, metavar="N", help="(default: one a core)")
     parser.add_argument("--iterations", type=int, metavar="N", help="(default: 30,000)")
+    parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> None:

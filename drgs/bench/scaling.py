@@ -22,13 +22,12 @@ import mitsuba as mi
 import numpy as np
 
 import drgs  # noqa: F401  (registers the plugin, in the fresh process too)
-from drgs.bench.output import machine, markdown_table, write_csv
+from drgs.bench.output import add_out, machine, markdown_table, write_csv
 from drgs.bench.pairs import Work, count_work
 from drgs.bench.scenes import Scene, bench_camera, bench_gaussians, frame_of, trainer_of
+from drgs.cli.commands import CommandParser
 from drgs.core.private import clear_memory_peak, memory_peak
 from drgs.io.figures import new_figure, write_figure
-
-DESCRIPTION = "time and memory of a training iteration against the size of the problem"
 
 STEPS, QUICK_STEPS = 12, 4
 
@@ -62,9 +61,12 @@ class Result:
     work: Work
 
 
-def add_options(parser: argparse.ArgumentParser) -> None:
-    """Options besides ``--out``."""
+def add_arguments(parser: CommandParser) -> None:
+    """Add the arguments of the command."""
+    parser.show_examples("%(prog)s --quick")
+    add_out(parser)
     parser.add_argument("--quick", action="store_true", help="fewer and smaller problems")
+    parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> None:

@@ -26,17 +26,16 @@ import numpy as np
 
 from drgs.bench import peers
 from drgs.bench.limits import MachineLimits, measure_limits
-from drgs.bench.output import machine, markdown_table, write_csv
+from drgs.bench.output import add_out, machine, markdown_table, write_csv
 from drgs.bench.pairs import Work, count_work
 from drgs.bench.profile import STAGES, StageClock, stage_clock
 from drgs.bench.scenes import Scene, bench_camera, bench_gaussians, frame_of, trainer_of
+from drgs.cli.commands import CommandParser
 from drgs.core.files import atomic_path
 from drgs.gaussians.parameters import Gaussians
 from drgs.io.figures import new_figure, write_figure
 from drgs.results.files import GAUSSIANS
 from drgs.training.trainer import Trainer
-
-DESCRIPTION = "times of drgs and of other renderers on the same scene, in one run"
 
 SIZE = 400
 """px: width and height of all pictures."""
@@ -75,8 +74,10 @@ class Timing:
     rounds: int
 
 
-def add_options(parser: argparse.ArgumentParser) -> None:
-    """Options besides ``--out``."""
+def add_arguments(parser: CommandParser) -> None:
+    """Add the arguments of the command."""
+    parser.show_examples("%(prog)s --trained out/lego/point_cloud.ply")
+    add_out(parser)
     parser.add_argument("--quick", action="store_true", help="10,000 Gaussians only; two minutes")
     parser.add_argument(
         "--trained",
@@ -85,6 +86,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         metavar="PLY",
         help="a fitted scene to measure as well (default: out/lego/point_cloud.ply, if it exists)",
     )
+    parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> None:

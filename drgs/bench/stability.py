@@ -21,14 +21,13 @@ from typing import Any
 import drjit.llvm.ad as llvm
 import numpy as np
 
-from drgs.bench.output import machine, markdown_table, write_csv
+from drgs.bench.output import add_out, machine, markdown_table, write_csv
 from drgs.bench.scenes import device_camera
+from drgs.cli.commands import CommandParser
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 from drgs.io.figures import new_figure, write_figure
 from drgs.reference import splatting as reference
 from drgs.splatting import rendering
-
-DESCRIPTION = "error of float32 against float64 as scenes become harder"
 
 WIDTH, HEIGHT, FOCAL = 48, 40, 60.0
 """px: small pictures, since the reference draws each of them many times."""
@@ -67,9 +66,12 @@ class Measurement:
     left_out: float  # part of the pixels
 
 
-def add_options(parser: argparse.ArgumentParser) -> None:
-    """Options besides ``--out``."""
+def add_arguments(parser: CommandParser) -> None:
+    """Add the arguments of the command."""
+    parser.show_examples("%(prog)s --quick")
+    add_out(parser)
     parser.add_argument("--quick", action="store_true", help="fewer steps and samples")
+    parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> None:

@@ -22,15 +22,14 @@ from pathlib import Path
 from typing import Any
 
 from drgs import fit
-from drgs.bench.output import machine, markdown_table, write_csv
+from drgs.bench.output import add_out, machine, markdown_table, write_csv
+from drgs.cli.commands import CommandParser
 from drgs.config.changes import changed, with_iterations
 from drgs.config.load import dump_config, load_config
 from drgs.config.schema import FitConfig
 from drgs.io.figures import new_figure, write_figure
 from drgs.results.files import HISTORY, METRICS
 from drgs.training.budget import STRATEGIES, Strategy
-
-DESCRIPTION = "quality over time for several choices of a fit; an hour or two"
 
 CONFIG = Path(__file__).parents[2] / "scenes" / "lego_mini.yml"
 
@@ -86,8 +85,10 @@ class Point:
     gaussians: int
 
 
-def add_options(parser: argparse.ArgumentParser) -> None:
-    """Options besides ``--out``."""
+def add_arguments(parser: CommandParser) -> None:
+    """Add the arguments of the command."""
+    parser.show_examples("%(prog)s --only 1 2")
+    add_out(parser)
     parser.add_argument("--quick", action="store_true", help="a few hundred iterations")
     parser.add_argument(
         "--config",
@@ -100,6 +101,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "--only", type=int, nargs="+", metavar="K", choices=range(1, len(CHOICES) + 1),
         help="; ".join(f"{k}: {choice.name}" for k, choice in enumerate(CHOICES, 1)),
     )  # fmt: skip
+    parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> None:

@@ -23,14 +23,13 @@ import mitsuba as mi
 import numpy as np
 
 from drgs.bench.accuracy import Subject, add_scene, load_subject
-from drgs.bench.output import markdown_table, write_csv
+from drgs.bench.output import add_out, markdown_table, write_csv
 from drgs.bench.peers import SHELL, sensor_of, volprim_scene
+from drgs.cli.commands import CommandParser
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 from drgs.reference import rays as reference_rays
 from drgs.reference import splatting as reference
 from drgs.results import metrics
-
-DESCRIPTION = "each choice of Mitsuba's volprim_rf_basic, by how much it changes the picture"
 
 VOLPRIM = reference_rays.ImageModel(
     projection="exact",
@@ -71,9 +70,12 @@ class Row:
     largest_error: float
 
 
-def add_options(parser: argparse.ArgumentParser) -> None:
-    """Options besides ``--out``."""
+def add_arguments(parser: CommandParser) -> None:
+    """Add the arguments of the command."""
+    parser.show_examples("%(prog)s out/lego")
+    add_out(parser)
     add_scene(parser)
+    parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> None:

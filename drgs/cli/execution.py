@@ -10,17 +10,27 @@ import argparse
 import ctypes
 import platform
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, redirect_stderr
 from typing import Any, TextIO
 
 import drjit as dr
+import mitsuba as mi
 
 from drgs.core.errors import UserError, one_line
 
+VARIANTS = ("llvm_ad_rgb", "cuda_ad_rgb")
+"""Of Mitsuba, that can render and differentiate Gaussians; the first is the default."""
 
-def add_options(parser: argparse.ArgumentParser) -> None:
-    """Add ``--threads`` and ``--debug``."""
+
+def add_execution_arguments(
+    parser: argparse.ArgumentParser, variants: Sequence[str] | None = VARIANTS
+) -> None:
+    """Add ``--variant``, ``--threads`` and ``--debug``.
+
+    variants: those that can be chosen; None: any, which the command has to check.
+    """
+    add_variant_argument(parser, variants)
     parser.add_argument(
         "--threads", type=int, metavar="N", help="CPU threads to use (default: one a core)"
     )
@@ -29,6 +39,26 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="check the range of every access to memory and stop where one is violated; slow",
     )
+
+
+def add_variant_argument(
+    parser: argparse.ArgumentParser, variants: Sequence[str] | None = VARIANTS
+) -> None:
+    """Add ``--variant``; variants: as for :func:`add_execution_arguments`."""
+    parser.add_argument(
+        "--variant",
+        default=VARIANTS[0],
+        choices=variants,
+        help="Mitsuba variant (default: %(default)s)",
+    )
+
+
+def select_variant(name: str) -> None:
+    """Make ``name`` the active Mitsuba variant; :class:`UserError` where it cannot be used."""
+    try:
+        mi.set_variant(name)
+    except ImportError as error:
+        raise UserError(f"--variant {name}: not usable here: {one_line(error)}") from None
 
 
 @contextmanager

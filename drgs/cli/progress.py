@@ -13,20 +13,23 @@ LOG_SECONDS = 10.0
 """Seconds between two lines where there is no terminal."""
 
 
-class FitProgress:
-    """A progress bar on a terminal; elsewhere a line every ten seconds.
+class RunProgress:
+    """A progress bar on a terminal; elsewhere a line every ten seconds, and at the end.
 
     A context manager: leaving it restores the terminal.
+
+    what: is counted, in the singular. total: how many there will be. done: how many there are.
     """
 
-    def __init__(self, total: int) -> None:
-        self._started = self._last_line = time.monotonic()
-        self._first: int | None = None
+    def __init__(self, what: str, total: int, done: int = 0) -> None:
+        self._what = what
+        self._last_line = time.monotonic()
+        self._first: tuple[int, float] | None = None  # how many were done, and when
         self._bar = None
         console = Console(file=sys.stdout)
         if console.is_terminal:
             self._bar = Progress(
-                TextColumn("iteration"),
+                TextColumn(what),
                 MofNCompleteColumn(),
                 BarColumn(),
                 TextColumn("{task.fields[status]}"),
@@ -34,9 +37,9 @@ class FitProgress:
                 TimeRemainingColumn(),
                 console=console,
             )
-            self._task = self._bar.add_task("fit", total=total, status="")
+            self._task = self._bar.add_task(what, total=total, completed=done, status="")
 
-    def __enter__(self) -> FitProgress:
+    def __enter__(self) -> RunProgress:
         """Start drawing."""
         if self._bar is not None:
             self._bar.start()
@@ -52,23 +55,23 @@ class FitProgress:
         if self._bar is not None:
             self._bar.stop()
 
-    def update(
-        self, iteration: int, total: int, loss: float, psnr: float, num_gaussians: int
-    ) -> None:
-        """Show where the fit is; psnr: dB, smoothed over recent training views."""
-        status = f"loss {loss:.4f}  PSNR {psnr:5.2f} dB  Gaussians {num_gaussians:,}"
+    def update(self, done: int, total: int, status: str = "") -> None:
+        """Show that ``done`` of ``total`` are done, and ``status`` beside it."""
         if self._bar is not None:
-            self._bar.update(self._task, completed=iteration, total=total, status=status)
+            self._bar.update(self._task, completed=done, total=total, status=status)
             return
         now = time.monotonic()
         if self._first is None:
-            self._first, self._started = iteration, now
-        if now - self._last_line >= LOG_SECONDS or iteration == total:
+            self._first = done, now
+        if now - self._last_line >= LOG_SECONDS or done == total:
             self._last_line = now
-            done = max(1, iteration - self._first)
-            left = (now - self._started) / done * (total - iteration)
-            print(f"iteration {iteration}/{total}  {status}  left {_minutes(left)}", flush=True)
+            parts = [f"{self._what} {done}/{total}", status, self._left(done, total, now)]
+            print("  ".join(part for part in parts if part), flush=True)
 
-
-def _minutes(seconds: float) -> str:
-    return f"{int(seconds) // 60}:{int(seconds) % 60:02d}"
+    def _left(self, done: int, total: int, now: float) -> str:
+        """Time that is left at the pace since the first update, which pays for compiling."""
+        first, started = self._first or (done, now)
+        if first == done < total:
+            return ""
+        seconds = int((now - started) / max(1, done - first) * (total - done))
+        return f"left {seconds // 60}:{seconds % 60:02d}"

@@ -34,15 +34,16 @@ def one_line(text: object, limit: int = 300) -> str:
     return line if len(line) <= limit else f"{line[: limit - 3]}..."
 
 
-def did_you_mean(name: str, candidates: Iterable[str]) -> str:
+def did_you_mean(name: str, candidates: Iterable[str], cutoff: float = 0.7) -> str:
     """``"; did you mean X?"`` with the candidate nearest to ``name``, or ``""`` if none is near.
 
-    Of dotted names, one whose last part is near will do: a key in the wrong section.
+    cutoff: how near, 0 to 1 (``difflib``'s ratio). Of dotted names, one whose last part is near
+    will do: a key in the wrong section.
     """
     candidates = list(candidates)
-    nearest = difflib.get_close_matches(name, candidates, n=1, cutoff=0.7)
+    nearest = difflib.get_close_matches(name, candidates, n=1, cutoff=cutoff)
     if not nearest:
         by_leaf = {candidate.rpartition(".")[2]: candidate for candidate in reversed(candidates)}
-        leaf = difflib.get_close_matches(name.rpartition(".")[2], by_leaf, n=1, cutoff=0.7)
+        leaf = difflib.get_close_matches(name.rpartition(".")[2], by_leaf, n=1, cutoff=cutoff)
         nearest = [by_leaf[leaf[0]]] if leaf else []
     return f"; did you mean {nearest[0]}?" if nearest else ""

@@ -23,28 +23,26 @@ from drgs.io.pictures import read_image
 NERF_SYNTHETIC_FOV = 0.6911112070083618
 """Radians: the original's ``camera_angle_x``."""
 
-
 SPLITS = ("train", "val", "test")
-
 
 GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
 
-
 PATHS_PER_PASS = 2**24
 """Paths traced at once, at most: their state takes a few hundred MiB."""
-
 
 SAMPLES_PER_PASS = 64
 """Per pixel, a square: they are stratified together (8x8 multi-jittered), which leaves about half
 the noise variance of as many independent ones."""
 
-
 NEAR_CLIP, FAR_CLIP = 1e-5, 1e5
 """Of the bounding box's diagonal."""
 
-
 MAX_LAMPS_IN_A_ROW = 16
 """Surfaces that shine are passed through on the way to the first hit, this many at most."""
+
+
+LEAST = dict(views=1, val_views=0, test_views=0, size=1, spp=1, max_depth=1, points=0, seed=0)
+"""By name of the setting, its smallest value."""
 
 
 @dataclass(frozen=True)
@@ -65,17 +63,16 @@ class CaptureSettings:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        least = {"views": 1, "val_views": 0, "test_views": 0, "size": 1, "spp": 1, "max_depth": 1}
-        for name, minimum in {**least, "points": 0, "seed": 0}.items():
+        for name, minimum in LEAST.items():
             value = getattr(self, name)
             if value < minimum:
-                raise UserError(f"{_option(name)} must be >= {minimum}, got {value}")
+                raise UserError(f"{name} must be >= {minimum}, got {value}")
         if not 0 < self.fov < math.pi:
-            raise UserError(f"--fov must be between 0 and pi (radians), got {self.fov:g}")
+            raise UserError(f"fov must be between 0 and pi (radians), got {self.fov:g}")
         if self.distance is not None and not 0 < self.distance < math.inf:
-            raise UserError(f"--distance must be > 0, got {self.distance:g}")
+            raise UserError(f"distance must be > 0, got {self.distance:g}")
         if self.target is not None and not np.isfinite(self.target).all():
-            raise UserError(f"--target must be finite, got {self.target}")
+            raise UserError(f"target must be finite, got {self.target}")
 
     def count(self, split: str) -> int:
         """Number of views of a split."""
@@ -96,9 +93,9 @@ class CaptureView:
         return f"./{self.split}/r_{self.index}"
 
 
-def picture_path(out: Path, shot: CaptureView) -> Path:
+def picture_path(out: Path, view: CaptureView) -> Path:
     """Where a picture is written."""
-    return out / f"{shot.file_path}.png"
+    return out / f"{view.file_path}.png"
 
 
 def load_scene(path: Path) -> mi.Scene:
@@ -160,7 +157,7 @@ def bounding_box(scene: mi.Scene) -> tuple[np.ndarray, np.ndarray]:
     return corners[:, 0].min(axis=0), corners[:, 1].max(axis=0)
 
 
-def orbit(scene: mi.Scene, settings: CaptureSettings) -> tuple[np.ndarray, float]:
+def target_and_distance(scene: mi.Scene, settings: CaptureSettings) -> tuple[np.ndarray, float]:
     """What the cameras look at, (3,) world, and their distance from it.
 
     Without ``distance``, the bounding box's sphere just fits between the edges of the picture:
@@ -173,9 +170,11 @@ def orbit(scene: mi.Scene, settings: CaptureSettings) -> tuple[np.ndarray, float
     return target, float(np.linalg.norm(high - low)) / 2 / math.sin(settings.fov / 2)
 
 
-def plan(settings: CaptureSettings, target: np.ndarray, distance: float) -> list[CaptureView]:
+def capture_views(
+    settings: CaptureSettings, target: np.ndarray, distance: float
+) -> list[CaptureView]:
     """All pictures with their cameras, split after split."""
-    shots = []
+    views = []
     for number, split in enumerate(SPLITS):
         rng = np.random.default_rng([settings.seed, number])
         # Test views lie evenly; training views at random, but without gaps.
@@ -183,13 +182,13 @@ def plan(settings: CaptureSettings, target: np.ndarray, distance: float) -> list
         directions = hemisphere(settings.count(split), jitter, rng)
         directions = np.roll(directions, "zxy".index(settings.up), axis=1)
         up = np.eye(3)["xyz".index(settings.up)]
-        shots += [
+        views += [
             CaptureView(
                 split, index, look_at(target + distance * direction, target, up) @ OPENCV_TO_OPENGL
             )
             for index, direction in enumerate(directions)
         ]
-    return shots
+    return views
 
 
 def hemisphere(count: int, jitter: float, rng: np.random.Generator) -> np.ndarray:
@@ -208,7 +207,7 @@ def hemisphere(count: int, jitter: float, rng: np.random.Generator) -> np.ndarra
     return np.stack([radius * np.cos(azimuth), radius * np.sin(azimuth), height], axis=1)
 
 
-class Camera:
+class CaptureCamera:
     """Takes pictures of a scene with one Mitsuba sensor that is moved around."""
 
     def __init__(self, scene: mi.Scene, settings: CaptureSettings) -> None:
@@ -239,23 +238,23 @@ class Camera:
         )
         self._parameters = mi.traverse(self._sensor)
 
-    def picture(self, shot: CaptureView) -> np.ndarray:
+    def picture(self, view: CaptureView) -> np.ndarray:
         """(size, size, 4) uint8: straight alpha, colour in display space."""
-        linear = self.linear(shot)
+        linear = self.linear(view)
         if not np.isfinite(linear).all():
             y, x = np.argwhere(~np.isfinite(linear).all(axis=2))[0]
-            raise UserError(f"{shot.file_path}: the light at pixel x {x}, y {y} is not finite")
+            raise UserError(f"{view.file_path}: the light at pixel x {x}, y {y} is not finite")
         return encode(linear)
 
-    def linear(self, shot: CaptureView) -> np.ndarray:
+    def linear(self, view: CaptureView) -> np.ndarray:
         """(size, size, 4) float64: radiance times alpha, and alpha."""
-        to_world = shot.pose @ OPENGL_TO_MITSUBA
+        to_world = view.pose @ OPENGL_TO_MITSUBA
         self._parameters["to_world"] = mi.Transform4f(to_world)
         self._parameters.update()
         size, spp = self._settings.size, self._settings.spp
         at_once = min(SAMPLES_PER_PASS, max(1, math.isqrt(PATHS_PER_PASS // size**2) ** 2))
         counts = [min(at_once, spp - start) for start in range(0, spp, at_once)]
-        entropy = [self._settings.seed, SPLITS.index(shot.split), shot.index]
+        entropy = [self._settings.seed, SPLITS.index(view.split), view.index]
         seeds = np.random.SeedSequence(entropy).generate_state(len(counts))
         total = np.zeros((size, size, 4))
         for count, seed in zip(counts, seeds, strict=True):
@@ -284,21 +283,21 @@ def encode(linear: np.ndarray) -> np.ndarray:
 
 
 def visible_points(
-    scene: mi.Scene, settings: CaptureSettings, shots: list[CaptureView], out: Path
+    scene: mi.Scene, settings: CaptureSettings, views: list[CaptureView], out: Path
 ) -> tuple[np.ndarray, np.ndarray]:
     """First hits of random rays: positions (N, 3) float32 world, colours (N, 3) uint8.
 
     Each training view has the same share of ``settings.points``, spread evenly over what is
     covered of its picture; the colour is that of the pixel in the written picture.
     """
-    train = [shot for shot in shots if shot.split == "train"]
+    train = [view for view in views if view.split == "train"]
     positions, colors = [], []
-    for number, shot in enumerate(train):
+    for number, view in enumerate(train):
         share = (number + 1) * settings.points // len(train) - number * settings.points // len(
             train
         )
-        rng = np.random.default_rng([settings.seed, len(SPLITS), shot.index])
-        picture = read_image(picture_path(out, shot)).reshape(-1, 4)
+        rng = np.random.default_rng([settings.seed, len(SPLITS), view.index])
+        picture = read_image(picture_path(out, view)).reshape(-1, 4)
         weights = picture[:, 3].astype(np.float64)
         if not weights.any():
             continue
@@ -306,7 +305,7 @@ def visible_points(
         pixels = rng.choice(len(picture), 2 * share + 64, p=weights / weights.sum())
         rows, columns = np.divmod(pixels, settings.size)
         spots = np.stack([columns, rows], axis=1) + rng.uniform(size=(len(pixels), 2))
-        hits, valid = first_hits(scene, shot.pose[:3, 3], view_rays(shot.pose, spots, settings))
+        hits, valid = first_hits(scene, view.pose[:3, 3], view_rays(view.pose, spots, settings))
         positions.append(hits[valid][:share])
         colors.append(np.round(picture[pixels[valid], :3] * 255).astype(np.uint8)[:share])
     if not sum(map(len, positions)):
@@ -335,7 +334,3 @@ def first_hits(
             break
         ray = dr.select(lamp, hit.spawn_ray(ray.d), ray)
     return np.array(hit.p).T, np.array(hit.is_valid() & ~lamp)
-
-
-def _option(name: str) -> str:
-    return "--" + name.replace("_", "-")

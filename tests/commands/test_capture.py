@@ -154,9 +154,9 @@ def test_directions_are_spread_evenly_over_the_upper_hemisphere(jitter):
 
 def test_splits_and_seeds_have_cameras_of_their_own():
     settings = CaptureSettings(views=5, val_views=5, test_views=5)
-    first = path_tracing.plan(settings, np.zeros(3), 4.0)
-    other = path_tracing.plan(replace(settings, seed=1), np.zeros(3), 4.0)
-    centers = np.array([shot.pose[:3, 3] for shot in first + other])
+    first = path_tracing.capture_views(settings, np.zeros(3), 4.0)
+    other = path_tracing.capture_views(replace(settings, seed=1), np.zeros(3), 4.0)
+    centers = np.array([view.pose[:3, 3] for view in first + other])
     distances = np.linalg.norm(centers[:, None] - centers[None], axis=2)
     assert distances[~np.eye(len(centers), dtype=bool)].min() > 0.01
 
@@ -165,10 +165,10 @@ def test_splits_and_seeds_have_cameras_of_their_own():
 def test_hemisphere_stands_on_the_chosen_axis(axis):
     settings = CaptureSettings(up=axis, views=9)
     height = "xyz".index(axis)
-    for shot in path_tracing.plan(settings, np.array([1.0, 2.0, 3.0]), 4.0):
-        assert shot.pose[height, 3] > [1, 2, 3][height]
-        assert shot.pose[height, 1] > 0
-        assert np.linalg.det(shot.pose[:3, :3]) == pytest.approx(1)
+    for view in path_tracing.capture_views(settings, np.array([1.0, 2.0, 3.0]), 4.0):
+        assert view.pose[height, 3] > [1, 2, 3][height]
+        assert view.pose[height, 1] > 0
+        assert np.linalg.det(view.pose[:3, :3]) == pytest.approx(1)
 
 
 # Pictures
@@ -215,13 +215,13 @@ def test_composite_over_white_agrees_with_a_render_before_a_white_sky(ball):
     size, finer = 24, 8
     settings = CaptureSettings(size=size, spp=256)
     scene = path_tracing.load_scene(ball)
-    target, distance = path_tracing.orbit(scene, settings)
-    shot = path_tracing.plan(settings, target, distance)[60]
-    rgba = path_tracing.Camera(scene, settings).picture(shot) / 255
+    target, distance = path_tracing.target_and_distance(scene, settings)
+    view = path_tracing.capture_views(settings, target, distance)[60]
+    rgba = path_tracing.CaptureCamera(scene, settings).picture(view) / 255
     composited = rgba[:, :, :3] * rgba[:, :, 3:] + 1 - rgba[:, :, 3:]
 
     look_at = mi.ScalarTransform4f().look_at(
-        origin=shot.pose[:3, 3].tolist(), target=target.tolist(), up=[0, 0, 1]
+        origin=view.pose[:3, 3].tolist(), target=target.tolist(), up=[0, 0, 1]
     )
     film = {"type": "hdrfilm", "width": size * finer, "height": size * finer}
     film |= {"rfilter": {"type": "box"}, "component_format": "float32"}
@@ -236,7 +236,7 @@ def test_composite_over_white_agrees_with_a_render_before_a_white_sky(ball):
     assert abs(composited - expected).max() < 0.05
     assert abs(composited - expected).mean() < 0.004
     # The check tells: mixed before it is encoded, an edge would be off by much more.
-    linear = path_tracing.Camera(scene, settings).linear(shot)
+    linear = path_tracing.CaptureCamera(scene, settings).linear(view)
     wrong = encode_srgb((linear[:, :, :3] + 1 - linear[:, :, 3:]).clip(0, 1))
     assert abs(wrong - expected).max() > 0.1
 
@@ -276,11 +276,11 @@ def test_points_lie_on_the_sphere_with_its_color(captured):
 def test_each_view_contributes_its_share_of_the_points_it_sees(ball, captured):
     settings = CaptureSettings(**SETTINGS, points=600)
     scene = path_tracing.load_scene(ball)
-    shots = path_tracing.plan(settings, *path_tracing.orbit(scene, settings))
-    positions, _ = path_tracing.visible_points(scene, settings, shots, captured)
+    views = path_tracing.capture_views(settings, *path_tracing.target_and_distance(scene, settings))
+    positions, _ = path_tracing.visible_points(scene, settings, views, captured)
     for number in range(6):
         seen = positions[100 * number : 100 * (number + 1)]
-        towards = shots[number].pose[:3, 3] - CENTER
+        towards = views[number].pose[:3, 3] - CENTER
         # A sphere's visible cap: its normals point to the camera.
         cosines = (seen - CENTER) @ towards / (RADIUS * np.linalg.norm(towards))
         assert (cosines > RADIUS / np.linalg.norm(towards) - 1e-4).all()
@@ -327,15 +327,15 @@ def test_another_seed_gives_other_pictures(ball, captured, tmp_path):
 def test_interrupted_capture_continues_to_the_same_bytes(
     ball, captured, tmp_path, monkeypatch, capsys
 ):
-    picture, calls = path_tracing.Camera.picture, []
+    picture, calls = path_tracing.CaptureCamera.picture, []
 
-    def interrupted(self, shot):
-        calls.append(shot)
+    def interrupted(self, view):
+        calls.append(view)
         if len(calls) == 4:
             raise KeyboardInterrupt
-        return picture(self, shot)
+        return picture(self, view)
 
-    monkeypatch.setattr(path_tracing.Camera, "picture", interrupted)
+    monkeypatch.setattr(path_tracing.CaptureCamera, "picture", interrupted)
     with pytest.raises(SystemExit) as stop:
         run(ball, tmp_path / "out", *SMALL)
     assert stop.value.code == 130
@@ -383,13 +383,13 @@ def test_wrong_scenes_are_refused_in_one_line(tmp_path, capsys, name, text, mess
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"views": 0}, "--views must be >= 1, got 0"),
-        ({"test_views": -1}, "--test-views must be >= 0, got -1"),
-        ({"size": 0}, "--size must be >= 1"),
-        ({"fov": 3.2}, "--fov must be between 0 and pi (radians), got 3.2"),
-        ({"fov": math.nan}, "--fov must be between 0 and pi"),
-        ({"distance": -1.0}, "--distance must be > 0, got -1"),
-        ({"target": (0.0, math.inf, 0.0)}, "--target must be finite"),
+        ({"views": 0}, "views must be >= 1, got 0"),
+        ({"test_views": -1}, "test_views must be >= 0, got -1"),
+        ({"size": 0}, "size must be >= 1"),
+        ({"fov": 3.2}, "fov must be between 0 and pi (radians), got 3.2"),
+        ({"fov": math.nan}, "fov must be between 0 and pi"),
+        ({"distance": -1.0}, "distance must be > 0, got -1"),
+        ({"target": (0.0, math.inf, 0.0)}, "target must be finite"),
     ],
 )
 def test_wrong_numbers_are_refused(options, message):
@@ -458,9 +458,11 @@ def test_shipped_scene_is_in_the_picture_and_has_hundreds_of_parts():
     assert np.abs([low, high]).max() < 1.2
     assert sys.modules["drgs_capture_scene_brick_crane"].build().num_parts > 250
     settings = CaptureSettings(size=48, spp=4, views=8, distance=4.0311, target=(0, 0, 0))
-    camera = path_tracing.Camera(scene, settings)
-    for shot in path_tracing.plan(settings, *path_tracing.orbit(scene, settings))[:8]:
-        alpha = camera.picture(shot)[:, :, 3]
+    camera = path_tracing.CaptureCamera(scene, settings)
+    for view in path_tracing.capture_views(
+        settings, *path_tracing.target_and_distance(scene, settings)
+    )[:8]:
+        alpha = camera.picture(view)[:, :, 3]
         assert not alpha[[0, -1]].any()
         assert not alpha[:, [0, -1]].any()
         assert (alpha == 255).mean() > 0.1

@@ -58,12 +58,13 @@ def run(*arguments):
 
 
 def fails(capsys, *arguments):
-    """The one line that the command prints before it exits with 2."""
+    """The line with the error that the command prints, after its usage if need be, with 2."""
     with pytest.raises(SystemExit) as exit_info:
         run(*arguments)
     assert exit_info.value.code == 2
-    (line,) = capsys.readouterr().err.strip().splitlines()
-    return line.removeprefix("error: ")
+    *usage, line = capsys.readouterr().err.strip().splitlines()
+    assert not usage or usage[0].startswith("usage: python -m drgs.render ")
+    return line.partition("error: ")[2]
 
 
 # A picture of 8 bits is within half a level of what was rendered; the renderer is within 1e-4.
@@ -460,16 +461,24 @@ def test_the_shipped_scene_shows_objects_among_splats(tmp_path):
         ("point_cloud.ply", [], "say what to render: --orbit N"),
         ("point_cloud.ply", ["--split", "test"], "needs photographs"),
         ("point_cloud.ply", ["--orbit", "2", "--data", "x"], "--data: needs --scene"),
-        ("point_cloud.ply", ["--orbit", "0"], "--orbit: must be >= 1 frame, got 0"),
+        (
+            "point_cloud.ply",
+            ["--orbit", "0"],
+            "--orbit: must be a whole number >= 1",
+        ),
         ("point_cloud.ply", ["--orbit", "2", "--up", "0", "0", "0"], "up must not be zero"),
         ("point_cloud.ply", ["--orbit", "2", "--variant", "scalar_rgb"], "--variant: must be"),
-        ("", ["--orbit", "2", "--split", "test"], "--split and --orbit exclude each other"),
+        ("", ["--orbit", "2", "--split", "test"], "--split: not allowed with argument --orbit"),
         ("", ["--orbit", "2", "--up", "0", "0", "1"], "--up: is not used here"),
         ("", ["--size", "8", "8"], "--size: is not used with --split"),
         ("", ["--origin", "0", "0", "0"], "must not be zero or parallel"),
-        ("", ["--origin", "0", "0", "nan"], "--origin: must be three finite numbers"),
+        ("", ["--origin", "0", "0", "nan"], "--origin: must be a finite number, got nan"),
         ("", ["--origin", "3", "0", "0", "--fov", "180"], "--fov: must be between 0 and 180"),
-        ("", ["--origin", "3", "0", "0", "--size", "0", "9"], "--size: must be >= 1 px, got 0 9"),
+        (
+            "",
+            ["--origin", "3", "0", "0", "--size", "0", "9"],
+            "--size: must be a whole",
+        ),
         ("", ["--background", "pink"], "or a picture's file, got pink"),
         ("", ["--background", "0", "0", "1.5"], "got 0 0 1.5"),
         ("", ["--camera", "nowhere.json", "--size", "8", "8"], "nowhere.json: cannot read"),
@@ -562,7 +571,7 @@ def test_options_for_gaussians_are_refused_with_a_scene(tmp_path, capsys):
 def test_parameters_without_a_name_or_a_value_are_refused(tmp_path, capsys, word):
     path = write_scene(tmp_path, sensor(pose_around(0.8, 0.3)))
     message = fails(capsys, path, "-D", word, "--out", tmp_path / "out")
-    assert message.startswith(f"--define: must be NAME=VALUE, got {word}")
+    assert message.startswith(f"argument --define/-D: must be NAME=VALUE, got {word}")
 
 
 @pytest.mark.parametrize("name", ["path", "parallel", "optimize"])
@@ -571,7 +580,10 @@ def test_parameters_that_mitsubas_loader_has_itself_are_refused(tmp_path, capsys
     path = write_scene(tmp_path, sensor(pose_around(0.8, 0.3)))
     path.write_text(path.read_text().replace("model.ply", f"${name}"))
     message = fails(capsys, path, "-D", f"{name}=model.ply", "--out", tmp_path / "out")
-    assert message.startswith(f"--define: the name {name} is taken") and "rename" in message
+    assert (
+        message.startswith(f"argument --define/-D: the name {name} is taken")
+        and "rename" in message
+    )
 
 
 def test_parameters_that_a_scene_file_does_not_have_are_refused(tmp_path, capsys):

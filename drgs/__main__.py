@@ -1,0 +1,39 @@
+"""``drgs COMMAND`` and ``python -m drgs COMMAND``: the commands under one name."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import drgs
+from drgs.cli.commands import CommandParser, Subcommand, run_command
+
+COMMANDS = {
+    "fit": Subcommand("fit 3D Gaussians to posed photographs", "drgs.fit"),
+    "render": Subcommand("render Gaussians, a fit, or a Mitsuba scene", "drgs.render"),
+    "capture": Subcommand("turn a Mitsuba scene into a training set", "drgs.capture"),
+    "bench": Subcommand("measure drgs; write tables and plots", "drgs.bench.__main__"),
+}
+
+
+def main(arguments: Sequence[str] | None = None, prog: str = "drgs") -> None:
+    """Entry point of the console script.
+
+    arguments: the words of the command line; None: those of this process. prog: how it is called.
+    """
+    run_command(add_arguments, prog, arguments)
+
+
+def add_arguments(parser: CommandParser) -> None:
+    """Add the commands."""
+    parser.description = "3D Gaussian splatting inside Mitsuba 3."
+    parser.show_examples(
+        "%(prog)s fit scenes/lego.yml --data DIR --out out/lego",
+        "%(prog)s render out/lego --orbit 60 --out out/lego_orbit",
+        "%(prog)s COMMAND --help",
+    )
+    parser.add_argument("--version", action="version", version=f"drgs {drgs.__version__}")
+    parser.add_commands(COMMANDS, metavar="COMMAND")
+
+
+if __name__ == "__main__":
+    main(prog="python -m drgs")

@@ -1,0 +1,100 @@
+"""Commands and their subcommands: argparse's own, each imported when it is called."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import sys
+from collections.abc import Callable, Sequence
+from importlib import import_module
+from typing import NamedTuple
+
+from drgs.cli.errors import exit_on_user_error
+from drgs.core.errors import did_you_mean
+
+
+class Subcommand(NamedTuple):
+    """One of several commands: what it does, and the module that does it."""
+
+    text: str  # one phrase, in small letters
+    module: str  # has a function add_arguments(parser), which sets run(args) as a default
+
+
+class CommandParser(argparse.ArgumentParser):
+    """A parser that asks ``module`` for its arguments when it has something to parse.
+
+    A list of commands with their help therefore imports none of them.
+    """
+
+    def __init__(self, *, module: str | None = None, **settings: object) -> None:
+        super().__init__(formatter_class=argparse.RawDescriptionHelpFormatter, **settings)
+        self._module = module
+        self._subcommands: tuple[str, ...] = ()
+
+    def show_examples(self, *lines: str) -> None:
+        """End the help with command lines; ``%(prog)s`` in them stands for the command."""
+        self.epilog = "\n  ".join(["example:" if len(lines) == 1 else "examples:", *lines])
+
+    def add_commands(self, commands: dict[str, Subcommand], metavar: str) -> None:
+        """Add subcommands by name, exactly one of which has to be given."""
+        self._subcommands = tuple(commands)
+        subparsers = self.add_subparsers(metavar=metavar, required=True, title="commands")
+        for name, (text, module) in commands.items():
+            description = f"{text[0].upper()}{text[1:]}."
+            subparsers.add_parser(name, help=text, description=description, module=module)
+
+    def parse_known_args(
+        self, args: Sequence[str] | None = None, namespace: argparse.Namespace | None = None
+    ) -> tuple[argparse.Namespace, list[str]]:
+        """As argparse's; called for a subcommand as well, once it has been named."""
+        if self._module is not None:
+            module, self._module = self._module, None
+            import_module(module).add_arguments(self)
+        words = sys.argv[1:] if args is None else args
+        name = next((word for word in words if not word.startswith("-")), None)
+        if self._subcommands and name is not None and name not in self._subcommands:
+            *others, last = self._subcommands
+            nearest = did_you_mean(name, self._subcommands, cutoff=0.5)
+            self.error(f"there is no command {name}, only {', '.join(others)} and {last}{nearest}")
+        return super().parse_known_args(args, namespace)
+
+
+def run_command(
+    add_arguments: Callable[[CommandParser], None],
+    prog: str,
+    arguments: Sequence[str] | None = None,
+) -> None:
+    """Parse a command line and run what it names; an error of the user's ends it with status 2.
+
+    add_arguments: adds the command's arguments, and sets ``run``, a function of the parsed ones.
+    prog: how the command is called. arguments: its words; None: those of this process.
+    """
+    parser = CommandParser(prog=prog)
+    add_arguments(parser)
+    args = parser.parse_args(arguments)
+    with exit_on_user_error():
+        args.run(args)
+
+
+def at_least(minimum: int) -> Callable[[str], int]:
+    """The type of an argument that is a whole number, ``minimum`` or more."""
+
+    def whole_number(text: str) -> int:
+        if not text.strip().lstrip("+-").isdecimal() or int(text) < minimum:
+            raise argparse.ArgumentTypeError(
+                f"must be a whole number >= {minimum}, got {text or 'nothing'}"
+            )
+        return int(text)
+
+    return whole_number
+
+
+def finite_number(text: str) -> float:
+    """The type of an argument that is a finite number."""
+    try:
+        number = float(text)
+    except ValueError:
+        number = math.nan
+    if not math.isfinite(number):
+        raise argparse.ArgumentTypeError(f"must be a finite number, got {text or 'nothing'}")
+    return number

@@ -1,0 +1,108 @@
+"""``drgs COMMAND``: what is called by which words, and what a wrong word is told."""
+
+import argparse
+
+import pytest
+
+from drgs import __main__ as commands
+from drgs import capture, fit, render
+from drgs.bench import __main__ as bench
+from drgs.cli.commands import CommandParser, at_least, finite_number, run_command
+
+NAMES = [*commands.COMMANDS, *(f"bench {name}" for name in bench.COMMANDS)]
+
+
+def ended(capsys, call, *words):
+    """(exit status, standard output, standard error) of a command that ends early."""
+    with pytest.raises(SystemExit) as exit_info:
+        call(list(words))
+    return exit_info.value.code, *capsys.readouterr()
+
+
+@pytest.mark.parametrize("name", ["", *NAMES])
+def test_help_shows_the_command_with_an_example(capsys, name):
+    status, out, _ = ended(capsys, commands.main, *name.split(), "--help")
+    called = f"drgs {name}".strip()
+    assert status == 0
+    assert out.startswith(f"usage: {called} ")
+    _, separator, examples = out.partition("\nexample")
+    assert separator and f"  {called} " in examples
+    assert "%(prog)s" not in out
+
+
+@pytest.mark.parametrize("command", [fit, render, capture, bench])
+def test_modules_are_commands_too_and_say_how_they_are_called(capsys, command):
+    status, out, _ = ended(capsys, command.main, "--help")
+    module = command.__name__.removesuffix(".__main__")
+    assert status == 0 and out.startswith(f"usage: python -m {module} ")
+    assert f"\n  python -m {module} " in out.partition("\nexample")[2]
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["fot"], "there is no command fot, only fit, render, capture and bench; did you mean fit"),
+        (["rendre"], "did you mean render?"),
+        (["xyz"], "there is no command xyz, only fit, render, capture and bench\n"),
+        (["bench", "sped"], "; did you mean speed?"),
+        ([], "the following arguments are required: COMMAND"),
+        (["bench"], "the following arguments are required: MEASUREMENT"),
+        (["fit"], "one of the arguments CONFIG.yml --resume is required"),
+        (["fit", "a.yml", "--resume", "out"], "not allowed with argument"),
+        (["fit", "--resume", "out", "--data", "x"], "configuration from out/config.yml: leave out"),
+        (["fit", "a.yml", "--budget", "soon"], "argument --budget: "),
+        (["capture", "a.xml", "--out", "x", "--size", "0"], "argument --size: must be a whole"),
+        (["capture", "a.xml", "--out", "x", "--fov", "inf"], "argument --fov: must be a finite"),
+        (["render", "a.ply"], "the following arguments are required: --out"),
+    ],
+)
+def test_wrong_command_lines_end_with_2_and_say_why(capsys, words, message):
+    status, out, error = ended(capsys, commands.main, *words)
+    assert (status, out) == (2, "")
+    assert message in error and "Traceback" not in error
+
+
+def test_the_list_of_commands_imports_none_of_them(run_python):
+    program = (
+        "import sys\n"
+        "from drgs.__main__ import main\n"
+        "try:\n"
+        "    main(['--help'])\n"
+        "except SystemExit:\n"
+        "    pass\n"
+        "heavy = {'mitsuba', 'drjit', 'matplotlib', 'drgs.fit', 'drgs.bench'}\n"
+        "print(sorted(heavy & set(sys.modules)))\n"
+    )
+    assert run_python(program).stdout.splitlines()[-1] == "[]"
+
+
+def test_a_command_is_run_with_its_arguments_and_knows_how_it_was_called():
+    seen = []
+
+    def add_arguments(parser):
+        parser.add_argument("--count", type=int)
+        parser.set_defaults(run=seen.append, prog=parser.prog)
+
+    run_command(add_arguments, "some command", ["--count", "3"])
+    assert (seen[0].count, seen[0].prog) == (3, "some command")
+
+
+def test_arguments_are_added_once():
+    parser = CommandParser(prog="drgs", module="drgs.__main__")
+    for _ in range(2):
+        args, _ = parser.parse_known_args(["fit", "a.yml"])
+        assert args.config == "a.yml"
+
+
+@pytest.mark.parametrize("text", ["", "0", "-3", "1.5", "two", "1e3"])
+def test_numbers_that_are_not_whole_or_too_small_are_refused(text):
+    with pytest.raises(argparse.ArgumentTypeError, match="must be a whole number >= 1, got"):
+        at_least(1)(text)
+    assert at_least(0)("0") == 0 and at_least(1)("+7") == 7
+
+
+@pytest.mark.parametrize("text", ["", "nan", "inf", "-inf", "1e999", "x"])
+def test_numbers_that_are_not_finite_are_refused(text):
+    with pytest.raises(argparse.ArgumentTypeError, match="must be a finite number, got"):
+        finite_number(text)
+    assert finite_number("-1e3") == -1000.0
