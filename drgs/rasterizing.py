@@ -164,7 +164,7 @@ def rasterization(
     features += () if render_mode == "RGB" else (depth_feature,)
     pictures = _Pictures(
         dr.detach(inputs),
-        pipeline_of(choices, sh_degree or 0, features=features, rows=activated),
+        replace(pipeline_of(choices, sh_degree or 0, features), rows=activated),
         _Film(int(width), int(height), float(near_plane), sh_degree, render_mode),
         of_camera=any(dr.grad_enabled(inputs[name]) for name in ("viewmats", "Ks")),
     )
