@@ -5,6 +5,7 @@ import re
 import sys
 from contextlib import suppress
 from dataclasses import is_dataclass
+from itertools import groupby
 from pathlib import Path
 from typing import ClassVar
 
@@ -38,8 +39,9 @@ myst_heading_anchors = 3  # links such as results.md#speed work here as on a cod
 
 autodoc_default_options = {"exclude-members": "model_config"}
 autodoc_member_order = "bysource"
-autodoc_typehints = "description"
-autodoc_typehints_description_target = "documented"
+autodoc_typehints_format = "short"
+python_use_unqualified_type_names = True
+python_maximum_signature_line_length = 100
 add_module_names = False
 
 html_theme = "furo"
@@ -65,6 +67,7 @@ def as_restructured_text(app, what, name, obj, options, lines):
         text = re.sub(r"^( *\* - .*?\w)_\.\.\.", r"\1\\_...", text, flags=re.MULTILINE)
         lines[:] = text.split("\n")
         return
+    lines, original = list(_with_argument_lists(obj, lines)), lines
     result, literal = [], False
     for k, line in enumerate(lines):
         indented = line.startswith("    ")
@@ -77,7 +80,25 @@ def as_restructured_text(app, what, name, obj, options, lines):
         elif line.strip() and not indented:
             literal = False
         result.append(line if literal else _escaped(line))
-    lines[:] = result + (["", *_fields(obj), ""] if what == "class" else [])
+    original[:] = result + (["", *_fields(obj), ""] if what == "class" else [])
+
+
+def _with_argument_lists(obj, lines):
+    """Paragraphs such as "means: (N, 3) world; quats: ..." of a function as lists."""
+    try:
+        names = "|".join(inspect.signature(obj).parameters)
+    except (TypeError, ValueError):
+        names = ""
+    for is_text, group in groupby(lines, lambda line: bool(line.strip())):
+        paragraph = list(group)
+        start = rf"(?:{names})(?:,? (?:and )?(?:{names}))*: "
+        if names and is_text and re.match(start, paragraph[0]):
+            for item in re.split(rf"(?:; |\. |\.$)(?={start}|$)", " ".join(paragraph)):
+                if item:
+                    arguments, _, text = item.partition(": ")
+                    yield f"- ``{arguments}``: {text}"
+        else:
+            yield from paragraph
 
 
 def _fields(cls):
