@@ -35,11 +35,11 @@ from drgs.config.schema import NAMED_COLORS, DataConfig, FitConfig, ModelConfig
 from drgs.core.constants import SHUTTER_SAMPLES
 from drgs.core.errors import PluginError, UserError
 from drgs.core.files import atomic_path
-from drgs.data import Dataset, View, load_dataset
+from drgs.data import Dataset, load_dataset
 from drgs.data.orbits import orbit_of_gaussians, orbit_of_views, orbit_size
+from drgs.data.types import Viewpoint
 from drgs.data.viewpoints import (
     FIELD_OF_VIEW,
-    Viewpoint,
     field_of_view,
     look_at,
     pinhole,
@@ -77,7 +77,7 @@ class Model:
         settings = {"ignore": self.ignored} if self.ignored else {}
         return make_scene(self.gaussians, self.settings, self.background, **settings)
 
-    def pictures(self, views: Sequence[View | Viewpoint]) -> Iterator[np.ndarray]:
+    def pictures(self, views: Sequence[Viewpoint]) -> Iterator[np.ndarray]:
         """Pictures (H, W, 3) of the views, after a summary of what is simulated in them."""
         if "distortion" not in self.ignored:
             check_lenses(self.settings, views, where="", remedy="give --ignore distortion")

@@ -107,9 +107,10 @@ def view_of(scene: Scene) -> View:
     image = np.stack([np.array(p).reshape(camera.height, camera.width) for p in planes], axis=-1)
     to_world = np.eye(4)
     to_world[:3, :3], to_world[:3, 3] = camera.rotation.T, camera.center
+    photograph = np.clip(np.roll(image, 1, axis=1), 0, 1).astype(np.float32)
     return View(
-        "bench", np.clip(np.roll(image, 1, axis=1), 0, 1).astype(np.float32), to_world,
-        camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height,
+        "bench", to_world, camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height,
+        image=photograph,
     )  # fmt: skip
 
 

@@ -15,9 +15,9 @@ from drgs.config.schema import DataConfig
 from drgs.core.errors import UserError
 from drgs.data import nerf_synthetic, nerfstudio
 from drgs.data.initial import initial_gaussians
-from drgs.data.types import Dataset, View
+from drgs.data.types import Dataset, View, Viewpoint
 
-__all__ = ["Dataset", "View", "initial_gaussians", "load_dataset"]
+__all__ = ["Dataset", "View", "Viewpoint", "initial_gaussians", "load_dataset"]
 
 _LOADERS: dict[str, Callable[[DataConfig], Dataset]] = {
     "nerf_synthetic": nerf_synthetic.load,

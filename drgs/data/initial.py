@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 
 from drgs.config.schema import FitConfig, InitConfig
 from drgs.core.errors import UserError
-from drgs.data.types import Dataset, View
+from drgs.data.types import Dataset, Viewpoint
 from drgs.gaussians.parameters import Gaussians
 from drgs.gaussians.sh import C0
 from drgs.io.ply import read_points
@@ -85,7 +85,7 @@ def mean_squared_neighbour_distance(points: np.ndarray) -> np.ndarray:
     return np.mean(distances[:, 1:] ** 2, axis=1)
 
 
-def focus_of(views: Sequence[View]) -> tuple[np.ndarray, float]:
+def focus_of(views: Sequence[Viewpoint]) -> tuple[np.ndarray, float]:
     """What the cameras look at: (3,) the point nearest to all optical axes, and the distance.
 
     Minimises sum_i |(I - d_i d_i^T)(p - c_i)|^2 over p, with c_i the centres and d_i the axes;
@@ -113,7 +113,7 @@ def focus_of(views: Sequence[View]) -> tuple[np.ndarray, float]:
     return focus, float(np.median(np.linalg.norm(focus - centers, axis=1)))
 
 
-def points_in_view(views: Sequence[View], count: int, rng: np.random.Generator) -> np.ndarray:
+def points_in_view(views: Sequence[Viewpoint], count: int, rng: np.random.Generator) -> np.ndarray:
     """(count, 3) float64: uniform in what is seen of a cube around the cameras' focus.
 
     The cube's half extent is the distance D to the focus: it holds what is looked at and as much
@@ -134,7 +134,7 @@ def points_in_view(views: Sequence[View], count: int, rng: np.random.Generator) 
     )
 
 
-def _in_view(points: np.ndarray, views: Sequence[View], keep_out: float) -> np.ndarray:
+def _in_view(points: np.ndarray, views: Sequence[Viewpoint], keep_out: float) -> np.ndarray:
     """(N,) bool: inside at least one picture, and at least ``keep_out`` from every camera."""
     seen = np.zeros(len(points), bool)
     clear = np.ones(len(points), bool)

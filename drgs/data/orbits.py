@@ -10,8 +10,8 @@ import numpy as np
 
 from drgs.core.errors import UserError
 from drgs.data.initial import focus_of
-from drgs.data.types import View
-from drgs.data.viewpoints import Viewpoint, look_at, pinhole, shown
+from drgs.data.types import Viewpoint
+from drgs.data.viewpoints import look_at, pinhole, shown
 from drgs.gaussians.parameters import Gaussians
 
 ELEVATION = math.radians(30)
@@ -76,7 +76,7 @@ class Orbit:
         return views
 
 
-def orbit_of_views(views: Sequence[View], gaussians: Gaussians) -> Orbit:
+def orbit_of_views(views: Sequence[Viewpoint], gaussians: Gaussians) -> Orbit:
     """The orbit at the cameras' mean height and median distance around what they look at.
 
     Where their optical axes meet nowhere, what they look at is the middle of ``gaussians``.
@@ -118,7 +118,7 @@ def orbit_of_gaussians(gaussians: Gaussians, up: np.ndarray, fov: float) -> Orbi
     return Orbit(focus, up, start, radius, ELEVATION, half_arc=None)
 
 
-def up_of(views: Sequence[View]) -> np.ndarray:
+def up_of(views: Sequence[Viewpoint]) -> np.ndarray:
     """(3,) unit: the world's up direction, as the photographers held their cameras.
 
     Minimises mean((r_i . u)^2) over unit vectors, r_i the cameras' right vectors: a camera that
@@ -132,7 +132,7 @@ def up_of(views: Sequence[View]) -> np.ndarray:
     return up if up @ mean_up >= 0 else -up
 
 
-def orbit_size(views: Sequence[View]) -> tuple[int, int]:
+def orbit_size(views: Sequence[Viewpoint]) -> tuple[int, int]:
     """Width and height in px: the shape of the first photograph, at most 400 px on either side."""
     first = views[0]
     scale = min(1.0, ORBIT_SIZE / max(first.width, first.height))

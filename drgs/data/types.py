@@ -1,13 +1,16 @@
-"""What every dataset loader returns."""
+"""Cameras, photographs and datasets: what every loader returns."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from drgs.core.constants import SHUTTER_SAMPLES
+
+if TYPE_CHECKING:
+    from drgs.cameras.camera import Lens
 
 
 @dataclass(frozen=True, eq=False)
@@ -20,11 +23,10 @@ class Motion:
 
 
 @dataclass(frozen=True, eq=False)
-class View:
-    """One photograph and the camera that took it."""
+class Viewpoint:
+    """A camera in the world, and the size of its picture."""
 
-    name: str  # unique in its split; a file name without folders or suffix
-    image: np.ndarray  # (height, width, 3) float32, display space 0..1, opaque
+    name: str  # unique among those rendered together; a file name without folders or suffix
     camera_to_world: np.ndarray  # (4, 4) float64, rigid, OpenCV axes: x right, y down, z forward
     fx: float  # px
     fy: float  # px
@@ -32,11 +34,8 @@ class View:
     cy: float  # px
     width: int  # px
     height: int  # px
-    lens: Any = None  # of drgs.cameras.radial_tangential, with numbers of the host; None: a pinhole
-    motion: Motion | None = None  # while the photograph was taken
-    alpha: np.ndarray | None = None  # (height, width) float32: how opaque the picture was
-    mask: np.ndarray | None = None  # (height, width) float32: 1 where a pixel counts, else 0
-    depth: np.ndarray | None = None  # (height, width) float32, scene units; 0 where not known
+    lens: Lens | None = None  # with numbers of the host; None: a pinhole
+    motion: Motion | None = None  # while the shutter is open; None: the camera does not move
 
     @property
     def center(self) -> np.ndarray:
@@ -55,6 +54,16 @@ class View:
         viewmat = np.eye(4)
         viewmat[:3] = np.column_stack([rotation, -rotation @ self.center])
         return viewmat
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class View(Viewpoint):
+    """One photograph and the camera that took it."""
+
+    image: np.ndarray  # (height, width, 3) float32, display space 0..1, opaque
+    alpha: np.ndarray | None = None  # (height, width) float32: how opaque the picture was
+    mask: np.ndarray | None = None  # (height, width) float32: 1 where a pixel counts, else 0
+    depth: np.ndarray | None = None  # (height, width) float32, scene units; 0 where not known
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,18 +1,14 @@
 """Cameras without photographs: where new pictures of a scene are taken from.
 
 Read from a file of poses, placed by hand with :func:`look_at`, or on an orbit that follows from the
-cameras of a dataset (:func:`orbit_of_views`) or from the Gaussians alone
-(:func:`orbit_of_gaussians`). A :class:`Viewpoint` has the fields of :class:`drgs.data.types.View`
-that ``drgs.integrator.scene.make_sensors`` reads.
+cameras of a dataset or from the Gaussians alone (``drgs.data.orbits``).
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -28,26 +24,10 @@ from drgs.data.transforms import (
     positive,
     read_transforms,
 )
-from drgs.data.types import View
+from drgs.data.types import Viewpoint
 
 FIELD_OF_VIEW = 40.0
 """Degrees, horizontal: that of the NeRF-synthetic cameras, rounded."""
-
-
-@dataclass(frozen=True, eq=False)
-class Viewpoint:
-    """A camera and the size of its picture."""
-
-    name: str  # unique among those rendered together; a file name without suffix
-    camera_to_world: np.ndarray  # (4, 4) float64, rigid, OpenCV axes: x right, y down, z forward
-    fx: float  # px
-    fy: float  # px
-    cx: float  # px; pixel centres are at (i + 0.5, j + 0.5)
-    cy: float  # px
-    width: int  # px
-    height: int  # px
-    lens: Any = None  # of drgs.cameras.radial_tangential; None: a pinhole
-    motion: Any = None  # of drgs.data.types; None: it does not move
 
 
 def pinhole(name: str, pose: np.ndarray, width: int, height: int, fov: float) -> Viewpoint:
@@ -78,7 +58,7 @@ def look_at(origin: np.ndarray, target: np.ndarray, up: np.ndarray) -> np.ndarra
     return pose
 
 
-def field_of_view(views: Sequence[View]) -> float:
+def field_of_view(views: Sequence[Viewpoint]) -> float:
     """Degrees: the median horizontal field of view."""
     return math.degrees(np.median([2 * math.atan(0.5 * v.width / v.fx) for v in views]))
 

@@ -17,7 +17,7 @@ import numpy as np
 from drgs.cameras.axes import OPENCV_TO_MITSUBA
 from drgs.config.schema import ModelConfig
 from drgs.core.errors import UserError
-from drgs.data.types import View
+from drgs.data.types import Viewpoint
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 
 SQUARE_PIXEL_TOLERANCE = 0.01
@@ -55,7 +55,7 @@ def _picture(path: Path) -> dict[str, object]:
     return {"type": "bitmap", "filename": str(path), "wrap_mode": "clamp"}
 
 
-def check_lenses(model: ModelConfig, views: Iterable[View], where: str, remedy: str) -> None:
+def check_lenses(model: ModelConfig, views: Iterable[Viewpoint], where: str, remedy: str) -> None:
     """Raise :class:`UserError` for a lens that the projection cannot render.
 
     It would be refused when its view is rendered, perhaps long after a fit has begun. where: the
@@ -70,7 +70,7 @@ def check_lenses(model: ModelConfig, views: Iterable[View], where: str, remedy: 
         )
 
 
-def make_sensors(views: Iterable[View], calibrated: bool = False) -> list[mi.Sensor]:
+def make_sensors(views: Iterable[Viewpoint], calibrated: bool = False) -> list[mi.Sensor]:
     """One sensor per view: box filter, one sample, RGB.
 
     ``perspective`` where Mitsuba's own sensor can be the view's camera, else (or if all are to be)
@@ -97,7 +97,7 @@ def _film(width: int, height: int) -> dict[str, object]:
     }
 
 
-def _sensor(view: View, calibrated: bool) -> dict[str, object]:
+def _sensor(view: Viewpoint, calibrated: bool) -> dict[str, object]:
     pose = {
         "to_world": _to_world(view.camera_to_world),
         "near_clip": 1e-3,  # the integrator's own near plane decides
@@ -120,7 +120,7 @@ def _to_world(camera_to_world: np.ndarray) -> mi.ScalarTransform4f:
     return mi.ScalarTransform4f(camera_to_world @ OPENCV_TO_MITSUBA)
 
 
-def _perspective(view: View) -> dict[str, object]:
+def _perspective(view: Viewpoint) -> dict[str, object]:
     focal = math.sqrt(view.fx * view.fy)
     return {
         "type": "perspective",
@@ -131,7 +131,7 @@ def _perspective(view: View) -> dict[str, object]:
     }
 
 
-def _has_square_pixels(view: View) -> bool:
+def _has_square_pixels(view: Viewpoint) -> bool:
     """To within :data:`SQUARE_PIXEL_TOLERANCE`."""
     focal = math.sqrt(view.fx * view.fy)
     shift = max(
@@ -141,7 +141,7 @@ def _has_square_pixels(view: View) -> bool:
     return shift <= SQUARE_PIXEL_TOLERANCE
 
 
-def render_views(scene: mi.Scene, views: tuple[View, ...]) -> Iterator[np.ndarray]:
+def render_views(scene: mi.Scene, views: Iterable[Viewpoint]) -> Iterator[np.ndarray]:
     """Pictures (H, W, 3) of ``views``, display space, clamped to [0, 1]."""
     for sensor in make_sensors(views):
         with dr.suspend_grad():

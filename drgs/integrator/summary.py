@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import mitsuba as mi
 
 from drgs.cameras.camera import Camera, Lens, Pinhole
-from drgs.data.types import View
+from drgs.data.types import Viewpoint
 from drgs.effects.compose import ignoring
 from drgs.integrator.settings import SplatsSettings
 
@@ -81,7 +81,9 @@ def summary_of_sensors(
     return [*_summary_of_integrator(integrator, environment, of_cameras), surfaces]
 
 
-def summary_of_views(integrator: SplatsSettings, views: Sequence[View]) -> list[SimulatedEffect]:
+def summary_of_views(
+    integrator: SplatsSettings, views: Sequence[Viewpoint]
+) -> list[SimulatedEffect]:
     """The same for views or viewpoints, with nothing behind but the integrator's background."""
     count = f"{len(views)} cameras"
     of_cameras = [
@@ -138,14 +140,14 @@ def view_dependence_effect(degree: int, why: str) -> SimulatedEffect:
     return SimulatedEffect("view dependence", what, why)
 
 
-def lens_effect(views: Sequence[View], of: str = "the dataset's cameras") -> SimulatedEffect:
+def lens_effect(views: Sequence[Viewpoint], of: str = "the dataset's cameras") -> SimulatedEffect:
     """Lenses that are no pinholes; of: whose."""
     bent = [view.lens for view in views if view.lens is not None]
     kinds = sorted({f"{lens.kind} ({', '.join(lens.named())})" for lens in bent})
     return SimulatedEffect("lens distortion", " and ".join(kinds) or None, f"{len(bent)} of {of}")
 
 
-def motion_effect(views: Sequence[View], of: str = "the dataset's cameras") -> SimulatedEffect:
+def motion_effect(views: Sequence[Viewpoint], of: str = "the dataset's cameras") -> SimulatedEffect:
     """Cameras that move while a photograph is taken; of: whose."""
     moving = [view.motion.shutter for view in views if view.motion is not None]
     shutters = " and ".join(f"{kind} shutter" for kind in sorted(set(moving)))

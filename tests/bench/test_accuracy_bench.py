@@ -29,7 +29,9 @@ def subject():
     gaussians = replace(gaussians, log_scales=gaussians.log_scales + np.float32(1.8))
     camera = bench_camera(24)
     grey = np.full((24, 24, 3), 0.5, np.float32)
-    photograph = View("grey", grey, np.eye(4), camera.fx, camera.fy, camera.cx, camera.cy, 24, 24)
+    photograph = View(
+        "grey", np.eye(4), camera.fx, camera.fy, camera.cx, camera.cy, 24, 24, image=grey
+    )
     return accuracy.Subject("small", gaussians, [camera], [photograph], (1.0, 1.0, 1.0))
 
 

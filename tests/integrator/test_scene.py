@@ -36,7 +36,7 @@ def make_view(width=37, height=23, fx=30.0, fy=30.0, cx=20.5, cy=9.25, name="vie
     """An oblique camera with an off-centre principal point."""
     camera_to_world = np.array(pose([0.3, -1.0, 0.5], 40, (0.4, -0.7, 1.1)))
     image = np.zeros((height, width, 3), np.float32)
-    return View(name, image, camera_to_world, fx, fy, cx, cy, width, height)
+    return View(name, camera_to_world, fx, fy, cx, cy, width, height, image=image)
 
 
 def reference_camera(view, near):

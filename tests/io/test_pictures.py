@@ -1,5 +1,7 @@
 import io
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 import pytest
 from PIL import Image
@@ -73,3 +75,17 @@ def test_an_encoded_picture_is_a_file_of_its_format():
     data = pictures.encode(np.zeros((3, 5, 3)), "webp", lossless=True)
     picture = Image.open(io.BytesIO(data))
     assert (picture.format, picture.size) == ("WEBP", (5, 3))
+
+
+def test_an_exr_is_written_with_one_thread(tmp_path):
+    """Mitsuba alone would wait for ever."""
+    mi.set_variant("llvm_ad_rgb")
+    pixels = np.random.default_rng(0).normal(size=(5, 7, 4)).astype(np.float32)
+    threads = dr.thread_count()
+    dr.set_thread_count(1)
+    try:
+        pictures.write_exr(tmp_path / "new" / "a.exr", mi.Bitmap(pixels))
+        assert dr.thread_count() == 1
+    finally:
+        dr.set_thread_count(threads)
+    np.testing.assert_array_equal(np.array(mi.Bitmap(str(tmp_path / "new" / "a.exr"))), pixels)

@@ -26,7 +26,7 @@ def view_at(center, target, width=40, height=30):
     matrix = look_at(center, target)
     matrix[:3, 1:3] *= -1
     image = np.zeros((height, width, 3), np.float32)
-    return View("v", image, matrix, width, width, width / 2, height / 2, width, height)
+    return View("v", matrix, width, width, width / 2, height / 2, width, height, image=image)
 
 
 def dataset_of(views, half_extent=None):

@@ -47,7 +47,7 @@ def pose_around(azimuth: float, elevation: float, radius=RADIUS) -> np.ndarray:
 def view(name: str, pose: np.ndarray, image: np.ndarray) -> View:
     """A view of the small size."""
     focal = WIDTH / 2 / np.tan(FIELD_OF_VIEW / 2)
-    return View(name, image, pose, focal, focal, WIDTH / 2, HEIGHT / 2, WIDTH, HEIGHT)
+    return View(name, pose, focal, focal, WIDTH / 2, HEIGHT / 2, WIDTH, HEIGHT, image=image)
 
 
 def photograph(gaussians: Gaussians, camera, background) -> reference.Picture:

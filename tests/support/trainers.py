@@ -16,7 +16,7 @@ def small_view(name, angle):
     pose[:3, :3] = np.stack([right, np.cross(forward, right), forward], axis=1)
     pose[:3, 3] = center
     image = np.random.default_rng(int(10 * angle)).uniform(size=(16, 20, 3)).astype(np.float32)
-    return View(name, image, pose, 24.0, 24.0, 10.0, 8.0, 20, 16)
+    return View(name, pose, 24.0, 24.0, 10.0, 8.0, 20, 16, image=image)
 
 
 def small_dataset():
