@@ -1,10 +1,10 @@
 """``python -m drgs.bench accuracy SCENE``: what each approximation costs, and what it saves.
 
 A trained scene and a stress scene (wide lens, large splats near the camera, layers that
-interpenetrate) are rendered along a ladder of choices. Each is compared with the most accurate
-form, the float64 numpy reference with splats evaluated along each pixel's ray, all sorted at each
-pixel, to the last transmittance and down to an alpha of a millionth; on crops it is checked against
-the same without any cut. A fit's pictures are also compared with the photographs.
+interpenetrate) are rendered along a ladder of approximations. Each is compared with the most
+accurate form, the float64 numpy reference with splats evaluated along each pixel's ray, all sorted
+at each pixel, to the last transmittance and down to an alpha of a millionth; on crops it is checked
+against the same without any cut. A fit's pictures are also compared with the photographs.
 
 Three things are apart in the tables: *approximations* of one picture, whose error is the distance
 from the most accurate form; *other pictures* (no or another low-pass, samples per pixel, other SH),
@@ -69,7 +69,7 @@ class Rung:
     """One way to render."""
 
     name: str
-    choices: dict[str, Any] = field(default_factory=dict)
+    approximations: dict[str, Any] = field(default_factory=dict)
     is_approximation: bool = True  # of the most accurate form
     samples: int = 1  # per pixel, a square number
     sh_degree: int | None = None  # None: all
@@ -261,7 +261,7 @@ class Renderer:
         """Render; returns when the planes are in memory."""
         stored = self.gaussians.sh_degree
         degree = stored if self.rung.sh_degree is None else min(stored, self.rung.sh_degree)
-        pipeline = pipeline_of(Approximations(**self.rung.choices), degree)
+        pipeline = pipeline_of(Approximations(**self.rung.approximations), degree)
         first, *others = self.positions
         model = replace(pipeline.model, positions=first)
         frame = rendering.render(self.gaussians, self.camera, replace(pipeline, model=model))

@@ -1,4 +1,4 @@
-"""Mutation check of the derivatives of the choices: exact response, order and colours of pixels.
+"""Mutation check of the approximations' derivatives: exact response, order and colours of pixels.
 
 As in ``test_adjoint_mutants``: every partial derivative is scaled by 1.01 and changes its sign, and
 a check of the suite must notice it.
@@ -161,7 +161,7 @@ def outcome():
 
 
 @pytest.mark.slow
-class TestChoices(MutationChecks):
+class TestApproximations(MutationChecks):
     equivalent = EQUIVALENT
     derivatives = """
         exact.RayResponse.moments

@@ -1,4 +1,4 @@
-"""Each choice of accuracy against the float64 reference: picture, gradients, tangents, kernels."""
+"""Each approximation against the float64 reference: picture, gradients, tangents, kernels."""
 
 import math
 from dataclasses import replace
@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from conftest import TESTS
 from support.approximation_checks import (
-    CHOICES,
+    APPROXIMATIONS,
     GRADIENTS,
     MARKED,
     PLANES,
@@ -46,7 +46,7 @@ from drgs.reference import rays as reference_rays
 from drgs.reference import splatting as reference
 from drgs.splatting import rendering
 
-all_choices = pytest.mark.parametrize("name", CHOICES)
+all_approximations = pytest.mark.parametrize("name", APPROXIMATIONS)
 
 
 all_scenes = pytest.mark.parametrize("scene", ("random", "close"))
@@ -59,7 +59,7 @@ all_scenes = pytest.mark.parametrize("scene", ("random", "close"))
 
 @both_precisions
 @all_scenes
-@all_choices
+@all_approximations
 def test_picture_equals_the_reference(precision, scene, name):
     problem = Problem(name, scene)
     picture = problem.picture(MARKED[precision])
@@ -69,8 +69,8 @@ def test_picture_equals_the_reference(precision, scene, name):
     assert_arrays_agree(actual, {"planes": _planes(picture)[kept]}, PLANES[precision])
 
 
-@all_choices
-def test_choice_changes_the_picture(name):
+@all_approximations
+def test_approximation_changes_the_picture(name):
     """Otherwise the tests above would compare the default with itself."""
     default = [reference.render(*_inputs(scene)) for scene in SCENES]
     chosen = [Problem(name, scene).picture(1e-9) for scene in SCENES]
@@ -83,7 +83,7 @@ def test_order_converges_with_the_window():
     expected = scene.picture(1e-9)
     errors = []
     for window in (1, 2, 4, 8):
-        pipeline = pipeline_of(replace(scene.choices, order_window=window), 1)
+        pipeline = pipeline_of(replace(scene.approximations, order_window=window), 1)
         gaussians, camera = scene.inputs
         frame = rendering.render(
             device_gaussians(gaussians, FLOAT64), device_camera(camera, FLOAT64), pipeline
@@ -100,20 +100,20 @@ def test_order_converges_with_the_window():
 
 
 @all_scenes
-@all_choices
+@all_approximations
 def test_gradients_equal_central_differences_of_the_reference(scene, name):
     check_gradients_equal_central_differences_of_the_reference(scene, name)
 
 
 @both_precisions
 @all_scenes
-@all_choices
+@all_approximations
 def test_adjoint_is_the_transpose_of_the_tangent(precision, scene, name):
     check_adjoint_is_the_transpose_of_the_tangent(precision, scene, name)
 
 
 @all_scenes
-@all_choices
+@all_approximations
 def test_single_precision_gradients_equal_double_precision(scene, name):
     problem = Problem(name, scene)
     weights = problem.weights(seed=5)
@@ -121,7 +121,7 @@ def test_single_precision_gradients_equal_double_precision(scene, name):
     assert_arrays_agree(problem.kernel_gradients(FLOAT32, weights), expected, GRADIENTS[FLOAT32])
 
 
-@all_choices
+@all_approximations
 def test_same_bytes_in_every_run(name):
     problem = Problem(name, "random")
     weights = problem.weights(seed=6)
@@ -153,10 +153,12 @@ def test_what_the_order_of_faint_splats_is_worth():
         shN=np.zeros((count, 0, 3)),
     )
     camera = reference.Camera(np.eye(3), np.zeros(3), 20.0, 20.0, 8.0, 8.0, 16, 16)
-    choices = {"order": "pixel", "alpha_cut": 0.0, "transmittance_stop": 0.0}
-    expected = reference_rays.render(gaussians, camera, model=reference_rays.ImageModel(**choices))
+    approximations = {"order": "pixel", "alpha_cut": 0.0, "transmittance_stop": 0.0}
+    expected = reference_rays.render(
+        gaussians, camera, model=reference_rays.ImageModel(**approximations)
+    )
     device = device_gaussians(gaussians, FLOAT64)
-    pipeline = pipeline_of(Approximations(**choices, order_window=4), 0)
+    pipeline = pipeline_of(Approximations(**approximations, order_window=4), 0)
     frame = rendering.render(device, device_camera(camera, FLOAT64), pipeline)
     color = np.stack([rows(plane) for plane in frame.planes()[1:]], axis=-1)
     error = np.abs(color - expected.image.reshape(-1, 3))
@@ -232,14 +234,14 @@ def test_a_colour_at_its_minimum_keeps_its_derivative():
         ({"low_pass": math.inf}, "low_pass must be finite and not negative, got inf"),
     ],
 )
-def test_what_is_no_choice_is_refused(values, message):
+def test_what_is_no_approximation_is_refused(values, message):
     with pytest.raises(ValueError, match=message):
         Approximations(**values)
 
 
-def test_equal_choices_make_equal_pipelines():
+def test_equal_approximations_make_equal_pipelines():
     """The plugin reuses a frame whose pipeline is the same."""
-    for values in ({}, *CHOICES.values()):
+    for values in ({}, *APPROXIMATIONS.values()):
         assert pipeline_of(Approximations(**values), 2) == pipeline_of(Approximations(**values), 2)
         assert values == {} or pipeline_of(Approximations(**values), 2) != pipeline_of(
             Approximations(), 2
@@ -260,17 +262,17 @@ for name in {blocked!r}:
 from support.kernels import kernels_of_a_frame
 from drgs.accuracy.pipeline import pipeline_of
 from drgs.config.approximations import Approximations
-print(json.dumps(kernels_of_a_frame(pipeline_of(Approximations(**{choices!r}), 2))))
+print(json.dumps(kernels_of_a_frame(pipeline_of(Approximations(**{approximations!r}), 2))))
 """
 
 
-def kernels_in_a_new_process(run_python, blocked, **choices):
+def kernels_in_a_new_process(run_python, blocked, **approximations):
 
-    program = PROGRAM.format(tests=TESTS, blocked=blocked, choices=choices)
+    program = PROGRAM.format(tests=TESTS, blocked=blocked, approximations=approximations)
     return run_python(program)
 
 
-def test_a_choice_that_is_not_taken_costs_nothing(run_python):
+def test_an_approximation_that_is_not_taken_costs_nothing(run_python):
     """Hash and operation count of the default's kernels, with all other modules out of reach."""
     import json
 
@@ -281,7 +283,7 @@ def test_a_choice_that_is_not_taken_costs_nothing(run_python):
 
 
 @pytest.mark.parametrize(
-    ("module", "choices"),
+    ("module", "approximations"),
     [
         ("exact", {"projection": "exact"}),
         ("unscented", {"projection": "unscented"}),
@@ -289,13 +291,13 @@ def test_a_choice_that_is_not_taken_costs_nothing(run_python):
         ("ray_colors", {"sh_direction": "pixel"}),
     ],
 )
-def test_a_module_out_of_reach_is_missed_when_it_is_chosen(run_python, module, choices):
-    result = kernels_in_a_new_process(run_python, (module,), **choices)
+def test_a_module_out_of_reach_is_missed_when_it_is_chosen(run_python, module, approximations):
+    result = kernels_in_a_new_process(run_python, (module,), **approximations)
     assert result.returncode != 0 and f"drgs.accuracy.{module}" in result.stderr
 
 
-def test_choices_take_effect_at_their_stage_alone():
-    """Kernels in front of a choice's stage are those of the default."""
+def test_approximations_take_effect_at_their_stage_alone():
+    """Kernels in front of an approximation's stage are those of the default."""
     from support import kernels
 
     plain = kernels.kernels_of_a_frame(pipeline_of(Approximations(), 1))["forward"]
@@ -306,7 +308,7 @@ def test_choices_take_effect_at_their_stage_alone():
     assert sum(a != b for a, b in zip(plain, cut, strict=True)) == 1
 
 
-def test_no_kernel_of_a_choice_reduces_floats_in_memory():
+def test_no_kernel_of_an_approximation_reduces_floats_in_memory():
     from support import kernels
 
     problem = Problem("all three", "random")

@@ -1,4 +1,4 @@
-"""Hard inputs under the choices of accuracy: finite, and as accurate as float32 can be.
+"""Hard inputs under the approximations: finite, and as accurate as float32 can be.
 
 The families are those of ``test_hard_cases``. In float64 the kernels' picture has to be that of the
 float64 reference. In float32, picture and gradients may differ from those in float64 by the bound
@@ -34,7 +34,7 @@ from drgs.reference import rays as reference_rays
 from drgs.reference import splatting as reference
 from drgs.splatting import projection, rendering
 
-CHOICES = {
+APPROXIMATIONS = {
     "exact": {"projection": "exact"},
     "unscented": {"projection": "unscented"},
     "pixel colours": {"sh_direction": "pixel"},
@@ -64,9 +64,9 @@ def planes_and_gradients(gaussians, camera, pipeline, weights, precision) -> tup
 
 
 @cache
-def expected(name, choice):
+def expected(name, approximation):
     """The reference's picture, and weights that are zero where it is near a decision."""
-    case, values = FAMILIES[name], Approximations(**CHOICES[choice])
+    case, values = FAMILIES[name], Approximations(**APPROXIMATIONS[approximation])
     fields = set(reference_rays.ImageModel.__dataclass_fields__) & set(vars(values))
     model = reference_rays.ImageModel(**{field: getattr(values, field) for field in fields})
     picture = reference_rays.render(
@@ -141,13 +141,13 @@ def rounded_axes(seed):
         yield
 
 
-@pytest.mark.parametrize("choice", CHOICES)
+@pytest.mark.parametrize("approximation", APPROXIMATIONS)
 @pytest.mark.parametrize("name", SMALL)
-def test_picture_and_gradients_are_within_the_bound(name, choice):
+def test_picture_and_gradients_are_within_the_bound(name, approximation):
     case = FAMILIES[name]
-    planes, weights, marked = expected(name, choice)
+    planes, weights, marked = expected(name, approximation)
     assert marked.sum() <= max(2, 0.01 * marked.size)
-    pipeline = pipeline_of(Approximations(**CHOICES[choice]), case.degree)
+    pipeline = pipeline_of(Approximations(**APPROXIMATIONS[approximation]), case.degree)
     inputs = case.gaussians, case.camera, pipeline, weights
     double, single_precision = (planes_and_gradients(*inputs, p) for p in (FLOAT64, FLOAT32))
     error = np.abs(double[0]["planes"] - planes)[~marked]
@@ -163,15 +163,15 @@ def test_picture_and_gradients_are_within_the_bound(name, choice):
 
 
 @pytest.mark.parametrize("name", SMALL)
-def test_all_choices_together_stay_finite(name):
+def test_all_approximations_together_stay_finite(name):
     case = FAMILIES[name]
-    choices = Approximations(
+    approximations = Approximations(
         projection="exact", order="pixel", sh_direction="pixel", alpha_cut=0.0,
         transmittance_stop=0.0, low_pass=0.0,
     )  # fmt: skip
     weights = single(
         np.random.default_rng(0).normal(size=(case.camera.height, case.camera.width, 4))
     )
-    pipeline = pipeline_of(choices, case.degree)
+    pipeline = pipeline_of(approximations, case.degree)
     for results in planes_and_gradients(case.gaussians, case.camera, pipeline, weights, FLOAT32):
         assert all(np.isfinite(values).all() for values in results.values())

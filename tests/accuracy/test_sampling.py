@@ -42,7 +42,7 @@ from drgs.splatting import rendering
 
 @dataclass(frozen=True)
 class Sampled(Problem):
-    """A choice, seen at one random point of each pixel."""
+    """An approximation, seen at one random point of each pixel."""
 
     @property
     def points(self) -> np.ndarray:

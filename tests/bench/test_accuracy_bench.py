@@ -35,12 +35,14 @@ def subject():
     return accuracy.Subject("small", gaussians, [camera], [photograph], (1.0, 1.0, 1.0))
 
 
-def image_of(subject, **choices):
-    return accuracy.Renderer.of(accuracy.Rung("", choices), subject, subject.cameras[0]).image()
+def image_of(subject, **approximations):
+    return accuracy.Renderer.of(
+        accuracy.Rung("", approximations), subject, subject.cameras[0]
+    ).image()
 
 
 def test_the_ladder_leads_to_the_most_accurate_form(subject):
-    """Kernels that make every accurate choice agree with it; each step on the way comes closer."""
+    """The most accurate kernels agree with it; each step on the way comes closer."""
     accurate = accuracy.most_accurate(subject, subject.cameras[0], accuracy.LEAST_ALPHA)
     steps = [
         {},

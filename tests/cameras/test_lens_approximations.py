@@ -171,8 +171,8 @@ def test_pixels_in_their_own_order_are_those_of_layers_in_the_centers_order(name
     device = device_gaussians(gaussians, FLOAT64)
     device_camera = lens_camera(camera, LENSES[name], FLOAT64)
     plain, ordered = (
-        planes_of(rendering.render(device, device_camera, pipeline_of(choices, 1)))
-        for choices in (Approximations(), Approximations(**PIXEL_ORDER))
+        planes_of(rendering.render(device, device_camera, pipeline_of(approximations, 1)))
+        for approximations in (Approximations(), Approximations(**PIXEL_ORDER))
     )
     assert plain[0].min() < 0.5 and len(points) > 8
     np.testing.assert_allclose(ordered, plain, rtol=0, atol=1e-13)
@@ -238,7 +238,7 @@ def needles(case, rng):
 
 
 @pytest.mark.parametrize(
-    ("name", "choices"),
+    ("name", "approximations"),
     [
         ("rational", UNSCENTED | PIXEL_ORDER | PIXEL_COLORS),
         ("barrel", PIXEL_COLORS),
@@ -249,12 +249,12 @@ def needles(case, rng):
     ],
     ids=lambda value: value if isinstance(value, str) else ", ".join(value),
 )
-def test_gradients_equal_their_own_central_differences(name, choices):
+def test_gradients_equal_their_own_central_differences(name, approximations):
     """The kernels' adjoint against the kernels' picture. So small a step meets no jump, neither of
     a cut nor of the order of splats at a pixel.
     """
     case = LensCase("choices", 19, 14, 1, 20, lens=LENSES[name])
-    pipeline = pipeline_of(Approximations(**choices), 1)
+    pipeline = pipeline_of(Approximations(**approximations), 1)
     weights = single(np.random.default_rng(1).normal(size=(4, case.height * case.width)))
     gaussians, frame = case.render(FLOAT64, pipeline)
     d_transmittance, *d_features = map(FLOAT64.array, weights)

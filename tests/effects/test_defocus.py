@@ -285,8 +285,12 @@ def test_splats_out_of_focus_end_where_they_do_in_focus():
     an extent of 2 standard deviations it is exp(-2).
     """
     depths = [
-        -np.log(planes_of_wall(pipeline=pipeline_of(choices, 0))[0])
-        for choices in (Approximations(alpha_cut=0.0), Approximations(), Approximations(extent=2.0))
+        -np.log(planes_of_wall(pipeline=pipeline_of(approximations, 0))[0])
+        for approximations in (
+            Approximations(alpha_cut=0.0),
+            Approximations(),
+            Approximations(extent=2.0),
+        )
     ]
     for depth, part in zip(depths, (0, 1 / 51, math.exp(-2)), strict=True):
         # The squares of alphas count half as much, of up to 0.0017; and a circle's edge in pixels.
@@ -377,7 +381,7 @@ def test_single_precision_gradients_equal_double_precision():
     assert_arrays_agree(kernel_gradients(case, FLOAT32, cotangents), expected, GRADIENTS[FLOAT32])
 
 
-CHOICES = {
+APPROXIMATIONS = {
     "exact": {"projection": "exact"},
     "unscented": {"projection": "unscented"},
     "exact, antialiased, pixel order": {
@@ -386,11 +390,13 @@ CHOICES = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("choices", CHOICES.values(), ids=CHOICES)
-def test_gradients_of_other_choices_equal_their_own_central_differences(choices):
+@pytest.mark.parametrize("approximations", APPROXIMATIONS.values(), ids=APPROXIMATIONS)
+def test_gradients_of_other_approximations_equal_their_own_central_differences(approximations):
     """Those of the Gaussians, and those of the aperture; nothing is cut, so that nothing jumps."""
     case = LensCase("choices", 19, 14, 1, 20, defocus=DEFOCUS)
-    pipeline = pipeline_of(Approximations(alpha_cut=0.0, transmittance_stop=0.0, **choices), 1)
+    pipeline = pipeline_of(
+        Approximations(alpha_cut=0.0, transmittance_stop=0.0, **approximations), 1
+    )
     weights = single(np.random.default_rng(1).normal(size=(4, case.height * case.width)))
     gaussians, frame = case.render(FLOAT64, pipeline)
     gradients = rendering.frames_adjoint(

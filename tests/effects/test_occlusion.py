@@ -162,14 +162,14 @@ def test_adjoint_is_the_transpose_of_the_tangent(precision, case):
     assert abs(left.sum() - sum(r.sum() for r in right)) <= limit * size
 
 
-@pytest.mark.parametrize("choices", [{"sh_direction": "pixel"}, {"order": "pixel"}], ids=str)
-def test_with_choices_what_is_covered_is_the_mixture(choices):
+@pytest.mark.parametrize("approximations", [{"sh_direction": "pixel"}, {"order": "pixel"}], ids=str)
+def test_with_approximations_what_is_covered_is_the_mixture(approximations):
     """Linear in the coverage: of nothing and of all; the sum in front does not depend on it."""
     case = clear(CASES[0])
     gaussians = device_gaussians(case.gaussians, FLOAT64)
     camera = device_camera(case.camera, FLOAT64)
     z, coverage = surface_of(case)
-    plain = pipeline_of(Approximations(**choices), 2, features=case.pipeline.features)
+    plain = pipeline_of(Approximations(**approximations), 2, features=case.pipeline.features)
 
     def planes(amount):
         surface = Surface(*(from_host(FLOAT64.Float, p.ravel()) for p in (z, amount)))

@@ -71,8 +71,8 @@ def test_a_file_looks_the_same_through_a_shape(kind, degree, tmp_path):
     assert_images_agree(image_of(loaded), image_of(scene.load()))
 
 
-# With these choices what is left is that volprim_rf_basic composites in the order in which a ray
-# enters the ellipsoids, passes over those entered within 1e-4 behind another, and does not draw
+# With these approximations what is left is that volprim_rf_basic composites in the order in which a
+# ray enters the ellipsoids, passes over those entered within 1e-4 behind another, and does not draw
 # those that contain the camera: test_volprim.py measures each where it is alone. Of the mean
 # of this picture they make 0.025. A tenth less of all opacities makes 0.07, quaternions read
 # otherwise 0.2, coefficients in another order 0.5.

@@ -215,7 +215,7 @@ def test_sensors_of_views_render_without_a_warning(capfd):
     assert "splats" not in "".join(capfd.readouterr())
 
 
-def test_choices_of_accuracy_reach_the_integrator():
+def test_approximations_reach_the_integrator():
     """All of them; and the defaults of the configuration are those of the kernels."""
     values = {
         "projection": "exact",

@@ -100,8 +100,8 @@ def test_the_class_documents_every_parameter():
     integrator = mi.load_dict({"type": "splats", **tensors(Scene().gaussians)})
     documentation = type(integrator).__doc__
     settings = ("filename", "to_world", "shapes_to_world", "sh_degree", "near", "srgb_primitives")
-    choices = [field.name for field in fields(Approximations)]
-    for name in (*settings, *choices, *ALL_PARAMETERS):
+    approximations = [field.name for field in fields(Approximations)]
+    for name in (*settings, *approximations, *ALL_PARAMETERS):
         assert name in documentation, name
 
 
@@ -253,7 +253,7 @@ def test_a_changed_setting_is_rendered_again(name, value, equivalent, renderings
 
 
 @pytest.mark.parametrize(
-    "choices",
+    "approximations",
     [
         {"projection": "exact", "order": "pixel", "sh_direction": "pixel"},
         {"projection": "unscented", "extent": 2.5, "low_pass": 0},
@@ -261,11 +261,11 @@ def test_a_changed_setting_is_rendered_again(name, value, equivalent, renderings
     ],
     ids=["rays", "unscented", "cuts"],
 )
-def test_choices_of_accuracy_are_parameters(choices):
-    """The picture and its gradients are those of the pipeline that these choices name."""
+def test_approximations_are_parameters(approximations):
+    """The picture and its gradients are those of the pipeline that these approximations name."""
     scene = Scene()
-    integrator = mi.load_dict({"type": "splats", **tensors(scene.gaussians), **choices})
-    values = {k: float(v) if k == "low_pass" else v for k, v in choices.items()}
+    integrator = mi.load_dict({"type": "splats", **tensors(scene.gaussians), **approximations})
+    values = {k: float(v) if k == "low_pass" else v for k, v in approximations.items()}
     assert integrator.approximations == Approximations(**values)
     for name, value in values.items():
         if value != getattr(Approximations(), name):

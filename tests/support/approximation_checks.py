@@ -28,7 +28,7 @@ from support.helpers import (
     stacked_scene,
 )
 
-CHOICES = {
+APPROXIMATIONS = {
     "exact": {"projection": "exact"},
     "unscented": {"projection": "unscented"},
     "pixel order": {"order": "pixel", "order_window": 8},
@@ -103,14 +103,14 @@ SCENES = {
 
 @dataclass(frozen=True)
 class Problem:
-    """A choice and a scene, for both sides."""
+    """An approximation and a scene, for both sides."""
 
     name: str
     scene: str
 
     @property
-    def choices(self) -> Approximations:
-        return Approximations(**CHOICES[self.name])
+    def approximations(self) -> Approximations:
+        return Approximations(**APPROXIMATIONS[self.name])
 
     @property
     def inputs(self) -> tuple[reference.Gaussians, reference.Camera]:
@@ -118,7 +118,7 @@ class Problem:
 
     @property
     def pipeline(self) -> rendering.Pipeline:
-        return pipeline_of(self.choices, SCENES[self.scene][3])
+        return pipeline_of(self.approximations, SCENES[self.scene][3])
 
     def picture(self, threshold_width) -> reference.Picture:
         return _picture(self, threshold_width)
@@ -129,8 +129,8 @@ class Problem:
 
     @property
     def model(self) -> reference_rays.ImageModel:
-        names = set(reference_rays.ImageModel.__dataclass_fields__) & set(vars(self.choices))
-        return reference_rays.ImageModel(**{n: getattr(self.choices, n) for n in names})
+        names = set(reference_rays.ImageModel.__dataclass_fields__) & set(vars(self.approximations))
+        return reference_rays.ImageModel(**{n: getattr(self.approximations, n) for n in names})
 
     def render(self, precision):
         gaussians = device_gaussians(self.inputs[0], precision)
