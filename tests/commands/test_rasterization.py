@@ -1,0 +1,397 @@
+"""``drgs.rasterization`` against gsplat, the float64 reference and central differences."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import drjit as dr
+import drjit.llvm.ad as llvm
+import numpy as np
+import pytest
+from conftest import SHARED_DATA
+from support.helpers import Case, bitwise, clear
+from support.kernels import float_reductions
+
+import drgs
+from drgs.reference import splatting as reference
+
+GSPLAT = SHARED_DATA / "gsplat_reference"
+INPUTS = ("means", "quats", "scales", "opacities", "colors", "viewmats", "Ks", "backgrounds")
+
+CASE = Case("front door", width=21, height=18, degree=3, count=24)
+
+
+def matrices(camera):
+    """The world-to-camera matrix and K of a reference camera."""
+    viewmat, intrinsics = np.eye(4), np.eye(3)
+    viewmat[:3, :3] = camera.rotation
+    viewmat[:3, 3] = -camera.rotation @ camera.center
+    intrinsics[0, 0], intrinsics[1, 1] = camera.fx, camera.fy
+    intrinsics[:2, 2] = camera.cx, camera.cy
+    return viewmat, intrinsics
+
+
+@cache
+def cameras():
+    """Of the case, and one that is moved, turned and zoomed."""
+    camera = clear(CASE).camera
+    turn = reference.quat_to_rotation(np.array([[1.0, 0.05, -0.04, 0.08]]))[0]
+    other = replace(
+        camera,
+        rotation=turn @ camera.rotation,
+        center=camera.center + np.array([0.03, -0.05, 0.04]),
+        fx=1.1 * camera.fx,
+    )
+    return camera, other
+
+
+@cache
+def scene():
+    """Arguments by name: float64 numpy arrays of two cameras, with SH coefficients."""
+    gaussians = clear(CASE).gaussians
+    viewmats, intrinsics = zip(*map(matrices, cameras()), strict=True)
+    return {
+        "means": gaussians.means,
+        "quats": gaussians.quats,
+        "scales": np.exp(gaussians.log_scales),
+        "opacities": reference.sigmoid(gaussians.logit_opacities),
+        "colors": np.concatenate([gaussians.sh0, gaussians.shN], axis=1),
+        "viewmats": np.stack(viewmats),
+        "Ks": np.stack(intrinsics),
+        "backgrounds": np.array([[0.875, 0.375, 0.1875], [0.25, 0.5, 0.75]]),
+    }
+
+
+FILM = {"width": CASE.width, "height": CASE.height, "near_plane": 0.25}
+
+
+def tensors(arrays, tensor_type=llvm.TensorXf64):
+    dtype = np.float64 if tensor_type is llvm.TensorXf64 else np.float32
+    return {name: tensor_type(np.asarray(value, dtype)) for name, value in arrays.items()}
+
+
+# ----------------------------------------------------------------------------------------------
+# Pictures
+# ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("mode", ["classic", "antialiased"])
+def test_pictures_equal_the_reference(mode):
+    pictures, alphas, meta = drgs.rasterization(
+        **scene(), **FILM, sh_degree=3, render_mode="RGB+D", rasterize_mode=mode
+    )
+    assert isinstance(pictures, np.ndarray) and pictures.dtype == np.float64
+    assert pictures.shape == (2, CASE.height, CASE.width, 4) and alphas.shape[-1] == 1
+    gaussians, antialiased = clear(CASE).gaussians, mode == "antialiased"
+    for index, camera in enumerate(cameras()):
+        background = scene()["backgrounds"][index]
+        expected = reference.render(gaussians, camera, background, 3, antialiased)
+        # Both are float64; scales and opacities went through logarithms in one of them.
+        found = pictures[index, ..., :3], pictures[index, ..., 3], alphas[index, ..., 0]
+        for a, b in zip(found, (expected.image, expected.depth, expected.alpha), strict=True):
+            np.testing.assert_allclose(a, b, rtol=0, atol=1e-11)
+
+        splats = reference.project(gaussians, camera, antialiased)
+        seen = splats.visible
+        expected = {
+            "means2d": splats.means2d,
+            "depths": splats.depths,
+            "conics": splats.conics[:, [0, 0, 1], [0, 1, 1]],
+            "opacities": splats.opacities,
+        }
+        for name, values in expected.items():
+            found = meta[name][index][seen]
+            np.testing.assert_allclose(found, values[seen], rtol=1e-9, atol=1e-12, err_msg=name)
+        sigmas = np.sqrt(2 * np.log(255 * splats.opacities[seen]))
+        spread = np.sqrt(splats.cov2d[seen][:, [0, 1], [0, 1]])
+        np.testing.assert_array_equal(meta["radii"][index][seen], np.ceil(sigmas[:, None] * spread))
+        assert not meta["radii"][index][~seen].any()
+    assert (meta["width"], meta["height"], meta["n_cameras"]) == (CASE.width, CASE.height, 2)
+
+
+def test_colors_of_any_number_of_channels_are_composited():
+    """As spherical harmonics of degree 0 whose colours they are."""
+    arrays = scene()
+    flat = arrays["colors"][:, 0] * 0.28209479177387814 + 0.5
+    flat = np.maximum(flat, 0)
+    expected, expected_alphas, _ = drgs.rasterization(**arrays, **FILM, sh_degree=0)
+    many = np.concatenate([flat, flat[:, ::-1]], axis=1)
+    backgrounds = np.concatenate([arrays["backgrounds"], arrays["backgrounds"][:, ::-1]], axis=1)
+    arrays = {**arrays, "colors": many, "backgrounds": backgrounds}
+    pictures, alphas, _ = drgs.rasterization(**arrays, **FILM)
+    np.testing.assert_allclose(pictures[..., :3], expected, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(pictures[..., :2:-1], expected, rtol=0, atol=1e-12)
+    np.testing.assert_array_equal(alphas, expected_alphas)
+
+    for_each = np.stack([many, 2 * many])
+    twice, _, _ = drgs.rasterization(**{**arrays, "colors": for_each}, **FILM)
+    np.testing.assert_array_equal(twice[0], pictures[0])
+    missing = (1 - alphas[1]) * backgrounds[1]
+    np.testing.assert_allclose(twice[1] - missing, 2 * (pictures[1] - missing), atol=1e-12)
+
+
+def test_depths_are_sums_or_expectations_and_come_last():
+    arrays = {**scene(), "colors": scene()["colors"][:, 0]}
+    for name in INPUTS[:5]:
+        arrays[name] = arrays[name][8:11]  # few, so that there are pixels without any
+    results = {
+        mode: drgs.rasterization(**arrays, **FILM, render_mode=mode)
+        for mode in ("RGB", "D", "ED", "RGB+D", "RGB+ED")
+    }
+    color, depth, expected_depth, both, both_expected = (found for found, *_ in results.values())
+    alphas = results["D"][1]
+    np.testing.assert_array_equal(both, np.concatenate([color, depth], axis=-1))
+    np.testing.assert_array_equal(both_expected, np.concatenate([color, expected_depth], axis=-1))
+    np.testing.assert_allclose(expected_depth, depth / np.maximum(alphas, 1e-10), rtol=1e-12)
+    assert (alphas == 0).any() and (alphas > 0).any()
+
+
+def test_approximations_are_options():
+    arrays = {name: value for name, value in scene().items() if name != "backgrounds"}
+
+    def picture(**options):
+        return drgs.rasterization(**arrays, **FILM, sh_degree=3, **options)[0]
+
+    plain = picture()
+    for options in ({"projection": "exact"}, {"order": "pixel"}, {"sh_direction": "pixel"}):
+        assert np.isfinite(picture(**options)).all()
+        assert not np.array_equal(picture(**options), plain), options
+    assert np.abs(picture(eps2d=1.0) - plain).max() > 1e-3
+
+
+# ----------------------------------------------------------------------------------------------
+# Derivatives
+# ----------------------------------------------------------------------------------------------
+
+SETTINGS = {
+    "coefficients": {"sh_degree": 3, "rasterize_mode": "antialiased", "render_mode": "RGB+ED"},
+    "colors": {"render_mode": "RGB+D"},
+    "colors of each camera": {"projection": "unscented"},
+    "depths": {"render_mode": "D"},
+    "exact": {"sh_degree": 1, "projection": "exact"},
+}
+
+
+def arguments(name):
+    arrays = dict(scene())
+    if name in ("colors", "depths"):
+        arrays["colors"] = arrays["colors"][:, 0]
+    elif name == "colors of each camera":
+        arrays["colors"] = np.moveaxis(arrays["colors"][:, :2], 1, 0)
+    if name == "depths":
+        del arrays["backgrounds"]
+    return arrays
+
+
+def direction(arrays):
+    """A tangent for each input, of a hundredth of its size; rotations stay so only to first order.
+
+    The scenes' opacities are not all far from the cut: larger steps would cross it.
+    """
+    rng = np.random.default_rng(3)
+    return {name: 0.01 * rng.normal(0, 1, value.shape) for name, value in arrays.items()}
+
+
+def results(arrays, name):
+    pictures, alphas, _ = drgs.rasterization(**arrays, **FILM, **SETTINGS[name])
+    return pictures, alphas
+
+
+STEP = 1e-5
+"""Of 0.01: 1e-7 in a mean, which changes an alpha by 1e-5 at most: no pixel of a clear scene is so
+near to a threshold. Rounding, 1e-16 / 1e-5, and the third derivative, 1e-10 of the first, matter
+less than 1e-7."""
+
+
+@pytest.mark.parametrize("name", SETTINGS)
+def test_tangents_equal_central_differences(name):
+    arrays = arguments(name)
+    tangents = direction(arrays)
+    ahead, behind = (
+        results({k: v + step * tangents[k] for k, v in arrays.items()}, name)
+        for step in (STEP, -STEP)
+    )
+    inputs = tensors(arrays)
+    dr.enable_grad(inputs)
+    dr.set_grad(inputs, tensors(tangents))
+    found = results(inputs, name)
+    dr.forward_to(found)
+    for output, a, b in zip(found, ahead, behind, strict=True):
+        numeric, analytic = (a - b) / (2 * STEP), dr.grad(output).numpy()
+        assert np.abs(numeric).max() > 1e-3
+        np.testing.assert_allclose(analytic, numeric, rtol=0, atol=1e-6 * np.abs(numeric).max())
+
+
+@pytest.mark.parametrize("name", SETTINGS)
+def test_gradients_are_the_transpose_of_the_tangents(name):
+    """<J v, w> = <v, J^T w>, input by input: each has gradients of its own."""
+    arrays = arguments(name)
+    tangents = direction(arrays)
+    rng = np.random.default_rng(4)
+    inputs = tensors(arrays)
+    dr.enable_grad(inputs)
+    found = results(inputs, name)
+    weights = [llvm.TensorXf64(rng.normal(0, 1, output.shape)) for output in found]
+    for output, weight in zip(found, weights, strict=True):
+        dr.set_grad(output, weight)
+    dr.enqueue(dr.ADMode.Backward, found)
+    dr.traverse(dr.ADMode.Backward)
+    gradients = {key: dr.grad(value).numpy() for key, value in inputs.items()}
+
+    unused = {"colors"} if name == "depths" else set()
+    for key, tangent in tangents.items():
+        moved = tensors(arrays)
+        dr.enable_grad(moved)  # all of them: one set of kernels
+        still = {other: np.zeros_like(value) for other, value in arrays.items()}
+        dr.set_grad(moved, tensors({**still, key: tangent}))
+        outputs = results(moved, name)
+        dr.forward_to(outputs)
+        ahead = sum(
+            np.sum(dr.grad(output).numpy() * weight.numpy())
+            for output, weight in zip(outputs, weights, strict=True)
+        )
+        terms = tangent * gradients[key]
+        assert key in unused or np.abs(terms).sum() > 0, key
+        # A few hundred roundings of 1e-16 on either way, of terms of both signs.
+        assert abs(ahead - terms.sum()) <= 1e-11 * max(np.abs(terms).sum(), 1e-12), key
+
+
+def test_gradients_are_the_same_in_every_run_and_use_no_atomics():
+    def gradients():
+        inputs = tensors(scene(), llvm.TensorXf)
+        dr.enable_grad(inputs)
+        pictures, alphas, _ = drgs.rasterization(**inputs, **FILM, sh_degree=3)
+        weights = llvm.TensorXf(np.random.default_rng(6).normal(0, 1, pictures.shape))
+        dr.set_grad(pictures, weights)
+        dr.enqueue(dr.ADMode.Backward, pictures, alphas)
+        dr.traverse(dr.ADMode.Backward)
+        return {name: dr.grad(value).numpy() for name, value in inputs.items()}
+
+    found, count = float_reductions(gradients)
+    assert found == [] and count > 5
+    first, second = gradients(), gradients()
+    assert bitwise(list(first.values())) == bitwise(list(second.values()))
+
+
+def test_extreme_values_have_finite_gradients():
+    """Opacities of 0 and 1 and scales of 0, which no logarithm has."""
+    arrays = {name: value.copy() for name, value in scene().items()}
+    arrays["opacities"][:12:2], arrays["opacities"][1:12:2] = 0, 1
+    arrays["scales"][12:16] = 0
+    inputs = tensors(arrays, llvm.TensorXf)
+    dr.enable_grad(inputs)
+    pictures, _, _ = drgs.rasterization(**inputs, **FILM, sh_degree=3)
+    dr.backward(dr.sum(pictures.array))
+    assert np.isfinite(pictures.numpy()).all()
+    for name, value in inputs.items():
+        assert np.isfinite(dr.grad(value).numpy()).all(), name
+    assert dr.grad(inputs["opacities"]).numpy()[1:12:2].any()
+
+
+# ----------------------------------------------------------------------------------------------
+# gsplat and PyTorch
+# ----------------------------------------------------------------------------------------------
+
+
+def test_picture_and_gradients_agree_with_gsplat():
+    if not GSPLAT.is_dir():
+        pytest.skip("needs the gsplat reference data beside the repository")
+    data, pose = np.load(GSPLAT / "gauss_10k.npz"), np.load(GSPLAT / "cam.npz")
+    names = ("means", "quats", "scales", "opacities", "sh")
+    inputs = [llvm.TensorXf(data[name]) for name in names]
+    dr.enable_grad(inputs)
+    pictures, _, _ = drgs.rasterization(
+        *inputs,
+        pose["viewmat"][None],
+        pose["K"][None],
+        int(pose["width"]),
+        int(pose["height"]),
+        sh_degree=3,
+        backgrounds=np.ones((1, 3)),
+    )
+    errors = np.abs(pictures.numpy()[0] - np.load(GSPLAT / "ref_10k.npy"))
+    # Both are single precision: see test_reference_splatting.py.
+    assert errors.mean() <= 2e-6
+    assert (errors.max(axis=-1) > 1e-4).mean() <= 1e-4
+
+    expected = np.load(GSPLAT / "refgrad_10k.npz")
+    dr.backward(dr.sum(pictures.array * llvm.Float(expected["w"].ravel())))
+    for name, value in zip(names, inputs, strict=True):
+        found, theirs = dr.grad(value).numpy().astype(float), expected[name].astype(float)
+        norm = np.linalg.norm(theirs)
+        # Pixels on the other side of 1 / 255 change single gradients by 0.3 %; measured 3e-6 to
+        # 4e-4 of the norm.
+        assert np.linalg.norm(found - theirs) <= 1e-3 * norm, name
+
+
+def test_torch_differentiates_it():
+    """The example of the docstring, against Dr.Jit's own gradients."""
+    torch = pytest.importorskip("torch")
+
+    @dr.wrap(source="torch", target="drjit")
+    def rasterize(means, quats, scales, opacities, colors, viewmats, Ks):
+        pictures, alphas, _ = drgs.rasterization(
+            means, quats, scales, opacities, colors, viewmats, Ks, **FILM, sh_degree=3
+        )
+        return pictures, alphas
+
+    arrays = [np.asarray(scene()[name], np.float32) for name in INPUTS[:7]]
+    leaves = [torch.tensor(array, requires_grad=True) for array in arrays]
+    pictures, alphas = rasterize(*leaves)
+    assert pictures.shape == (2, CASE.height, CASE.width, 3) and alphas.shape[-1] == 1
+    weights = np.random.default_rng(9).normal(0, 1, pictures.shape).astype(np.float32)
+    ((pictures * torch.tensor(weights)).sum() + alphas.square().sum()).backward()
+
+    inputs = [llvm.TensorXf(array) for array in arrays]
+    dr.enable_grad(inputs)
+    own, own_alphas, _ = drgs.rasterization(*inputs, **FILM, sh_degree=3)
+    loss = dr.sum(own.array * llvm.Float(weights.ravel())) + dr.sum(dr.square(own_alphas.array))
+    dr.backward(loss)
+    np.testing.assert_array_equal(pictures.detach().numpy(), own.numpy())
+    for name, leaf, value in zip(INPUTS, leaves, inputs, strict=False):
+        expected = dr.grad(value).numpy()
+        # The two sum alphas' squares in orders of their own; the rest is the same computation.
+        limit = 1e-5 * np.abs(expected).max()
+        np.testing.assert_allclose(leaf.grad.numpy(), expected, rtol=0, atol=limit, err_msg=name)
+
+
+# ----------------------------------------------------------------------------------------------
+# What is refused
+# ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("changes", "error", "message"),
+    [
+        (
+            {"means": np.zeros((24, 2))},
+            ValueError,
+            r"means must be of shape \(24, 3\), got \(24",
+        ),
+        ({"means": np.zeros((0, 3))}, ValueError, "quats must be of shape"),
+        ({"opacities": np.zeros((24, 1))}, ValueError, r"opacities must be of shape \(24,\)"),
+        ({"viewmats": np.eye(4)}, ValueError, "viewmats must be of shape"),
+        ({"viewmats": np.zeros((2, 4, 4))}, ValueError, r"viewmats\[0\] must be matrices of a rot"),
+        ({"backgrounds": np.zeros(3)}, ValueError, r"backgrounds must be of shape \(2, 3\)"),
+        ({"sh_degree": None}, ValueError, r"colors must be of shape \(24, D\) or \(2, 24, D\)"),
+        ({"sh_degree": 4}, ValueError, "sh_degree must be None or 0 to 3, got 4"),
+        ({"render_mode": "depth"}, ValueError, "render_mode must be one of .*, got 'depth'"),
+        ({"rasterize_mode": "mip"}, ValueError, "rasterize_mode must be one of .*, got 'mip'"),
+        ({"width": 0}, ValueError, "width and height must be 1 px or more"),
+        ({"eps2d": -1.0}, ValueError, "eps2d must be finite and not negative, got -1.0"),
+        ({"projection": "affine"}, ValueError, "projection must be one of ewa, unscented, exact"),
+        ({"packed": False}, TypeError, "packed is a parameter of gsplat's .*; leave it out"),
+        ({"with_ut": True}, TypeError, 'with_ut is .*; give projection="unscented"'),
+        ({"projektion": "ewa"}, TypeError, "no parameter projektion; did you mean projection"),
+    ],
+)
+def test_what_does_not_fit_is_refused_by_name(changes, error, message):
+    with pytest.raises(error, match=rf"rasterization\(\): .*{message}"):
+        drgs.rasterization(**{**scene(), **FILM, "sh_degree": 3, **changes})
+
+
+def test_directions_of_pixels_need_coefficients():
+    arrays = {**scene(), "colors": scene()["colors"][:, 0]}
+    with pytest.raises(ValueError, match="sh_direction is of spherical harmonics; give sh_degree"):
+        drgs.rasterization(**arrays, **FILM, sh_direction="pixel")

@@ -1,0 +1,93 @@
+"""``drgs.train``: a fit in memory is that of the command."""
+
+from __future__ import annotations
+
+import pytest
+import yaml
+from support.small_capture import make_dataset, write_dataset
+
+import drgs
+from drgs import fit
+from drgs.config.load import load_config
+from drgs.core.errors import UserError
+
+CONFIG = {
+    "data": {"path": "data"},
+    "init": {"num_points": 40, "half_extent": 0.5},
+    "model": {"sh_degree": 1},
+    "iterations": 7,
+    "densify": {"start": 1, "stop": 6, "every": 2},
+    "output": {"history_every": 3, "save_renders": False},
+}
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """A dataset, and a configuration of it; the current folder."""
+    write_dataset(tmp_path / "data", make_dataset(train=4, test=1))
+    (tmp_path / "a.yml").write_text(yaml.safe_dump(CONFIG))
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(fit, "write_results", lambda *arguments: None)
+    return tmp_path
+
+
+def test_the_bytes_are_those_of_the_command(folder):
+    """From a file, from nested mappings, and from a configuration with its dataset."""
+    fit.main([str(folder / "a.yml"), "--out", str(folder / "out")])
+    expected = (folder / "out" / "point_cloud.ply").read_bytes()
+    history = (folder / "out" / "history.csv").read_text().splitlines()[1:]
+    dataset = drgs.load_dataset("data")
+    for arguments in ((folder / "a.yml",), (CONFIG,), (load_config("a.yml"), dataset)):
+        result = drgs.train(*arguments)
+        result.gaussians.save(folder / "a.ply")
+        assert (folder / "a.ply").read_bytes() == expected
+        rows = [(row.iteration, f"{row.loss:.6g}") for row in result.history]
+        assert rows == [(int(line.split(",")[0]), line.split(",")[1]) for line in history]
+        assert [iteration for iteration, _ in rows] == [3, 6, 7]
+
+
+def test_a_callback_sees_each_iteration_and_may_end_the_fit(folder):
+    reports = []
+    result = drgs.train(CONFIG, callback=reports.append)
+    assert [report.iteration for report in reports] == [1, 2, 3, 4, 5, 6, 7]
+    assert reports[2].loss == result.history[0].loss
+
+    result = drgs.train(CONFIG, callback=lambda report: report.iteration == 4)
+    assert result.trainer.iteration == 4
+    assert [row.iteration for row in result.history] == [3]
+    assert result.gaussians.num_gaussians == reports[3].num_gaussians
+    result.trainer.step()
+    assert result.trainer.iteration == 5
+
+
+def test_pictures_of_what_was_fitted(folder):
+    result = drgs.train(CONFIG)
+    (view,) = drgs.load_dataset("data").test
+    (picture,) = result.trainer.pictures((view,))
+    assert picture.shape == view.image.shape
+
+
+@pytest.mark.parametrize(
+    ("config", "message"),
+    [
+        ({"iterations": 3}, "train(): config: data is missing"),
+        ({**CONFIG, "iterations": 0}, "train(): config: iterations must be >= 1, got 0"),
+        ({**CONFIG, "data": {"path": "nowhere"}}, "data.path: there is no folder "),
+        ("b.yml", "b.yml: "),
+    ],
+)
+def test_wrong_configurations_are_refused_as_by_the_command(folder, config, message):
+    with pytest.raises(UserError) as error:
+        drgs.train(config)
+    assert str(error.value).startswith(message)
+
+
+def test_datasets_take_their_settings_by_name(folder):
+    plain = drgs.load_dataset("data")
+    black = drgs.load_dataset(folder / "data", background="black", image_size=16)
+    assert black.background == (0.0, 0.0, 0.0) and plain.background == (1.0, 1.0, 1.0)
+    assert black.train[0].width == 16 < plain.train[0].width
+    section = load_config("a.yml").data
+    assert drgs.load_dataset(section, background="black").background == black.background
+    with pytest.raises(UserError, match=r"load_dataset\(\): unknown key data.image_sise; did you"):
+        drgs.load_dataset("data", image_sise=3)
