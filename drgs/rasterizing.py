@@ -24,6 +24,7 @@ from drgs.effects.features import NamedFeature
 from drgs.gaussians.parameters import Gaussians
 from drgs.splatting.projection import GaussianRows, load_rows
 from drgs.splatting.rendering import (
+    Feature,
     Frame,
     Pipeline,
     color_features,
@@ -68,8 +69,8 @@ ELSEWHERE = {
             "rolling_shutter",
             "viewmats_rs",
         ),
-        "cameras other than pinholes at rest are Mitsuba's sensors: mi.render with the integrator "
-        "splats",
+        "leave it out for pinholes at rest; other cameras are Mitsuba's sensors, which mi.render "
+        "takes with the integrator splats",
     ),
 }
 """Parameters of gsplat that there are not, and what to do instead."""
@@ -92,7 +93,7 @@ def rasterization(
     backgrounds: Any = None,
     render_mode: str = "RGB",
     rasterize_mode: str = "classic",
-    **approximations: Any,
+    **approximations: str | float,
 ) -> tuple[Any, Any, dict[str, Any]]:
     """Pictures of N Gaussians as C pinhole cameras see them: (colors, alphas, meta).
 
@@ -138,7 +139,7 @@ def rasterization(
 
     Raises TypeError and ValueError, naming the parameter, what was expected and what was got.
     """
-    choices = _approximations(approximations, eps2d, rasterize_mode, sh_degree)
+    selected = _approximations(approximations, eps2d, rasterize_mode, sh_degree)
     _require(render_mode in RENDER_MODES, "render_mode", f"one of {RENDER_MODES}", render_mode)
     _require(width >= 1 and height >= 1, "width and height", "1 px or more", (width, height))
     given = {
@@ -164,7 +165,7 @@ def rasterization(
     features += () if render_mode == "RGB" else (depth_feature,)
     pictures = _Pictures(
         dr.detach(inputs),
-        replace(pipeline_of(choices, sh_degree or 0, features), rows=activated),
+        replace(pipeline_of(selected, sh_degree or 0, features), rows=activated),
         _Film(int(width), int(height), float(near_plane), sh_degree, render_mode),
         of_camera=any(dr.grad_enabled(inputs[name]) for name in ("viewmats", "Ks")),
     )
@@ -187,7 +188,7 @@ def _require(holds: bool, name: str, expected: str, got: object) -> None:
 
 
 def _approximations(
-    others: Mapping[str, Any], eps2d: float, rasterize_mode: str, sh_degree: int | None
+    others: Mapping[str, str | float], eps2d: float, rasterize_mode: str, sh_degree: int | None
 ) -> Approximations:
     _require(
         rasterize_mode in RASTERIZE_MODES,
@@ -287,7 +288,7 @@ def activated(rows: GaussianRows) -> GaussianRows:
     return replace(rows, log_scales=t.Array3f(logs), dimming=rows.features["opacities"][0])
 
 
-def _color_feature(sh_degree: int | None) -> Any:
+def _color_feature(sh_degree: int | None) -> Feature:
     return NamedFeature("colors") if sh_degree is None else color_features
 
 

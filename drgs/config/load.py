@@ -53,7 +53,7 @@ def load_config(path: str | Path, overrides: Iterable[str] = ()) -> FitConfig:
     return _validated(values, str(path), overridden)
 
 
-def config_from(values: Mapping[str, Any], where: str) -> FitConfig:
+def config_from(values: Mapping[str, object], where: str) -> FitConfig:
     """A configuration from nested mappings, with the keys of the YAML file.
 
     where: the beginning of errors. Paths, text or ``Path``, are relative to the current folder.

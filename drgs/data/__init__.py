@@ -8,7 +8,6 @@ from __future__ import annotations
 import os
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 from drgs.config.load import config_from
 from drgs.config.schema import DataConfig
@@ -30,7 +29,7 @@ _MARKERS = {
 }
 
 
-def load_dataset(source: str | Path | DataConfig, **settings: Any) -> Dataset:
+def load_dataset(source: str | Path | DataConfig, **settings: object) -> Dataset:
     """All views of a dataset: photographs with their cameras, to train on and to measure on.
 
     source: the folder, in the layout of NeRF-synthetic or of nerfstudio / instant-ngp, or the

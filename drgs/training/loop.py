@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Protocol
 
 import mitsuba as mi
 
@@ -78,17 +78,17 @@ class FitResult:
 
 
 def train(
-    config: FitConfig | Mapping[str, Any] | str | Path,
+    config: FitConfig | Mapping[str, object] | str | Path,
     dataset: Dataset | None = None,
     callback: Callable[[StepReport], bool | None] | None = None,
 ) -> FitResult:
     """Fit Gaussians to photographs, in memory: the bytes that ``drgs fit`` writes to its PLY file.
 
     config: what to fit, and how: the path of a YAML file, the same as nested mappings, or a
-    :class:`drgs.config.schema.FitConfig`; dataset: the photographs, by default those of the
-    configuration's section ``data``, which is needed in any case (its background is that of the
-    splats); callback: called after each iteration with what it did, a
-    :class:`drgs.training.trainer.StepReport`; the fit ends early where it returns True.
+    :class:`drgs.config.schema.FitConfig`; dataset: the photographs, whose background is that of
+    the splats, by default those of the configuration's section ``data``; callback: called after
+    each iteration with what it did, a :class:`drgs.training.trainer.StepReport`; the fit ends early
+    where it returns True.
 
     Where no Mitsuba variant is active, ``llvm_ad_rgb`` is made so. Nothing is written.
 
@@ -108,7 +108,7 @@ def train(
     trainer = Trainer(config, dataset, initial_gaussians(config, dataset))
     history = History()
     for done in iterations(trainer, history, AllIterations()):
-        if callback is not None and callback(done.report) is True:
+        if callback is not None and callback(done.report):
             break
     gaussians = as_saved(trainer.gaussians(), trainer)
     return FitResult(gaussians, tuple(history.rows), trainer)
