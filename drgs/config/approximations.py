@@ -59,6 +59,8 @@ class Unrounded:
 class Approximations:
     """The approximations that a picture is made with; the defaults are those of 3DGS.
 
+    What each one means is beside it, and in the section ``model`` of a configuration.
+
     Raises ValueError for a value that is outside of its limits.
     """
 

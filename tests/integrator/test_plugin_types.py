@@ -1,0 +1,63 @@
+"""What the plugins refuse has a type of its own, and what they are is told by types."""
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from drgs.cameras.camera import Pinhole
+from drgs.cameras.fisheye import Fisheye
+from drgs.core.errors import PluginError, PluginTypeError, UnsupportedError, UserError
+from drgs.integrator.sensors import CameraSensor, is_batch, read_sensor
+from drgs.integrator.settings import SummarisingIntegrator
+
+
+@pytest.fixture(autouse=True)
+def variant():
+    mi.set_variant("llvm_ad_rgb")
+
+
+def splats():
+    one = np.zeros((1, 3), np.float32)
+    quats = np.array([[1, 0, 0, 0]], np.float32)
+    tensors = {"means": one, "log_scales": one - 1, "quats": quats}
+    tensors |= {"sh0": one[:, None], "logit_opacities": one[:, 0]}
+    return mi.load_dict({"type": "splats", **{k: mi.TensorXf(v) for k, v in tensors.items()}})
+
+
+def test_errors_of_plugins_can_be_caught_by_what_they_are():
+    """As errors of the user, and as what Python calls them."""
+    assert issubclass(PluginError, UserError) and issubclass(UserError, ValueError)
+    assert issubclass(PluginTypeError, PluginError) and issubclass(PluginTypeError, TypeError)
+    assert issubclass(UnsupportedError, PluginError)
+    assert issubclass(UnsupportedError, NotImplementedError)
+
+
+def test_a_sensor_that_is_not_supported_is_an_error_of_type():
+    sensor = mi.load_dict({"type": "batch", "one": {"type": "perspective"}})
+    with pytest.raises(PluginTypeError, match=r"^splats: the sensor must be of type perspective"):
+        read_sensor(sensor, 0.01)
+
+
+def test_a_degree_that_the_gaussians_lack_is_an_error_of_the_plugin():
+    integrator = splats()
+    integrator.sh_degree = 2
+    scene = mi.load_dict({"type": "scene", "sensor": {"type": "perspective"}})
+    with pytest.raises(PluginError, match=r"^splats: sh_degree must be an integer from 0 to 0"):
+        integrator.render(scene)
+
+
+def test_sensors_are_told_apart_by_what_they_can():
+    calibrated, perspective = (mi.load_dict({"type": t}) for t in ("calibrated", "perspective"))
+    assert isinstance(calibrated, CameraSensor) and not isinstance(perspective, CameraSensor)
+    batch = mi.load_dict({"type": "batch", "one": {"type": "perspective"}})
+    assert is_batch(batch) and not is_batch(perspective) and not is_batch(calibrated)
+
+
+def test_integrators_that_say_what_they_simulate_are_known():
+    assert isinstance(splats(), SummarisingIntegrator)
+    assert not isinstance(mi.load_dict({"type": "path"}), SummarisingIntegrator)
+
+
+def test_messages_have_names_for_lenses():
+    assert (Pinhole.label, Fisheye.label) == ("Pinhole", "Fisheye")
+    assert "lens = Pinhole" in str(mi.load_dict({"type": "calibrated"}))
