@@ -39,8 +39,9 @@ myst_heading_anchors = 3  # links such as results.md#speed work here as on a cod
 
 autodoc_default_options = {"exclude-members": "model_config"}
 autodoc_member_order = "bysource"
-autodoc_typehints_format = "short"
 python_use_unqualified_type_names = True
+# Types in signatures are short names, and the kernels and the reference share some, such as Lens.
+suppress_warnings = ["ref.python"]
 python_maximum_signature_line_length = 100
 add_module_names = False
 
