@@ -6,7 +6,6 @@ So what is imported on demand is ``Any`` here, and named beside it.
 
 from __future__ import annotations
 
-from collections.abc import Hashable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -24,7 +23,7 @@ class Rendered:
 
     frames: list[list[rendering.Frame]]  # by time; one for each sample per pixel
     pipeline: rendering.Pipeline
-    samples: Hashable  # key of the film's samples: see drgs.integrator.film.FilmSamples
+    samples: object  # key of the film's samples: see drgs.integrator.film.FilmSamples
     sensor: SensorState
     gaussians: Gaussians  # detached: holding them keeps their variable indices from being reused
     traced: TracedSurfaces | None  # what was seen besides splats
@@ -32,7 +31,7 @@ class Rendered:
     def matches(
         self,
         pipeline: rendering.Pipeline,
-        samples: Hashable,
+        samples: object,
         sensor: SensorState,
         gaussians: Gaussians,
         traced: TracedSurfaces | None,
@@ -52,11 +51,11 @@ class TracedSurfaces:
     """What a sensor saw of a scene's surfaces, and everything that this depends on."""
 
     surfaces: Any  # drgs.integrator.surfaces.Surfaces
-    settings: tuple[Hashable, ...]  # of samples, integrator and sensor
+    settings: tuple[object, ...]  # of samples, integrator and sensor
     sensor: SensorState
     seen: list[list[Any]]  # by time and by sample: drgs.integrator.surfaces.SeenSurface
 
-    def matches(self, surfaces: Any, settings: tuple[Hashable, ...], sensor: SensorState) -> bool:
+    def matches(self, surfaces: Any, settings: tuple[object, ...], sensor: SensorState) -> bool:
         """Whether tracing these would give the same."""
         same = self.surfaces is surfaces and self.settings == settings
         return same and self.sensor.same_as(sensor)

@@ -7,7 +7,7 @@ the other, for several samples per pixel.
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Sequence
+from collections.abc import Sequence
 from typing import Any, Protocol
 
 import drjit as dr
@@ -47,7 +47,7 @@ class FilmSamples(Protocol):
 
     positions: Sequence[Positions]  # by sample
     within: Sequence[tuple[Any, Any]]  # the same: x and y from the pixels' upper left corners, px
-    key: Hashable  # equal for equal positions; None: pixel centres
+    key: object  # equal for equal positions; None: pixel centres
 
     def develop(self, passes: Sequence[Channels]) -> mi.TensorXf:
         """The image, from the channels of each sample."""

@@ -7,7 +7,7 @@ seen of surfaces. ``drgs.integrator.picture`` asks for a picture, its derivative
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import reduce
 from itertools import chain, repeat
@@ -47,7 +47,7 @@ class View:
     sensor: mi.Sensor
     positions: Sequence[Positions]  # by sample
     within: Sequence[tuple[Any, Any]]  # the same, px from the pixels' upper left corners
-    key: Hashable  # of these: see drgs.integrator.film.FilmSamples
+    key: object  # of these: see drgs.integrator.film.FilmSamples
     has_alpha: bool
     hybrid: Hybrid | None  # the part of surfaces, if there are any
 
