@@ -23,7 +23,7 @@ import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 import mitsuba as mi
 import numpy as np
@@ -339,10 +339,17 @@ def render_mitsuba_scene(path: Path, out: Path, definitions: dict[str, str]) -> 
         print(f"{name}: {width}x{height}")
 
 
+@runtime_checkable
+class _ChoosesSpace(Protocol):
+    """An integrator of primitives with display colours: ``splats``, ``volprim_rf_basic``."""
+
+    srgb_primitives: bool  # whether it returns linear radiance, not display space
+
+
 def _is_linear(integrator: mi.Integrator) -> bool:
     """Whether what it returns is radiance, and that of those that are nested in it."""
     nested = mi.traverse(integrator).hierarchy
-    return all(one.srgb_primitives for one in nested if isinstance(one, SummarisingIntegrator))
+    return all(one.srgb_primitives for one in nested if isinstance(one, _ChoosesSpace))
 
 
 def _print_summary(path: Path, scene: mi.Scene) -> None:

@@ -1,0 +1,71 @@
+"""Progress of ``fit`` and ``capture``: lines in a log file, a bar on a terminal."""
+
+import io
+import sys
+
+import pytest
+
+from drgs.cli import progress
+from drgs.cli.progress import LOG_SECONDS, RunProgress
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    """The time of day, in seconds, that the module sees; set it by ``clock[0] = ...``."""
+    now = [100.0]
+    monkeypatch.setattr(progress.time, "monotonic", lambda: now[0])
+    return now
+
+
+def lines(capsys):
+    return capsys.readouterr().out.splitlines()
+
+
+def test_a_log_file_gets_a_line_every_ten_seconds_and_the_last(clock, capsys):
+    with RunProgress("picture", 50) as shown:
+        for done in range(1, 51):
+            clock[0] += 1.0
+            shown.update(done, 50)
+    assert lines(capsys) == [
+        "picture 10/50  left 0:40",
+        "picture 20/50  left 0:30",
+        "picture 30/50  left 0:20",
+        "picture 40/50  left 0:10",
+        "picture 50/50  left 0:00",
+    ]
+
+
+def test_the_pace_is_that_since_the_first_update(clock, capsys):
+    """What is there already when it begins takes no time, and compiling is no iteration."""
+    with RunProgress("iteration", 1000, done=400) as shown:
+        clock[0] += 60.0
+        shown.update(401, 1000, "loss 0.1")
+        clock[0] += LOG_SECONDS
+        shown.update(501, 1000, "loss 0.05")
+    assert lines(capsys) == [
+        "iteration 401/1000  loss 0.1",  # no pace is known yet
+        "iteration 501/1000  loss 0.05  left 0:49",
+    ]
+
+
+def test_the_total_may_change_on_the_way(clock, capsys):
+    with RunProgress("iteration", 10) as shown:
+        shown.update(1, 10)
+        clock[0] += LOG_SECONDS
+        shown.update(11, 21)
+    assert lines(capsys) == ["iteration 11/21  left 0:10"]
+
+
+def test_a_terminal_gets_a_bar(monkeypatch):
+    class Terminal(io.StringIO):
+        def isatty(self):
+            return True
+
+    terminal = Terminal()
+    monkeypatch.setattr(sys, "stdout", terminal)
+    monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.setenv("COLUMNS", "100")
+    with RunProgress("picture", 3) as shown:
+        shown.update(2, 3, "sharp")
+    written = terminal.getvalue()
+    assert "picture" in written and "2/3" in written and "sharp" in written
