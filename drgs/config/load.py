@@ -9,11 +9,10 @@ from pathlib import Path
 from typing import Any, get_args
 
 import yaml
-from pydantic import (
-    BaseModel,
-    ValidationError,
-)
+from pydantic import BaseModel, ValidationError
+from pydantic_core import ErrorDetails
 
+from drgs.config.explain import expectation
 from drgs.config.schema import FitConfig
 from drgs.core.errors import UserError, did_you_mean, one_line
 from drgs.core.files import atomic_path, read_text
@@ -215,7 +214,7 @@ def _absolute(folder: Path, text: str, where: str) -> str:
     return path
 
 
-def _explain(file: str, item: Any, overridden: set[str]) -> str:
+def _explain(file: str, item: ErrorDetails, overridden: set[str]) -> str:
     """One line for one of pydantic's errors: where, name, expected, got, remedy."""
     key = one_line(".".join(str(part) for part in item["loc"]), limit=60)
     given = [k for k in overridden if key == k or key.startswith(f"{k}.")]
@@ -225,34 +224,11 @@ def _explain(file: str, item: Any, overridden: set[str]) -> str:
         return f"{where}: unknown key {key}{did_you_mean(key, known_keys())}"
     if kind == "missing":
         return f"{where}: {key} is missing: {_description(key)}"
-    got = f", got {_show(item['input'])}"
     if kind == "value_error" and not key:
         # A relation between values that may come from the file and from the command line.
         origin = f"{file} with --set {' '.join(sorted(overridden))}" if overridden else file
         return f"{origin}: {limits['error']}"
-    if kind == "value_error":
-        return f"{where}: {key} {limits['error']}{got}"
-    for relation, sign in _RELATIONS.items():
-        if relation in limits:
-            return f"{where}: {key} must be {sign} {limits[relation]:.10g}{got}"
-    if kind == "literal_error":
-        return f"{where}: {key} must be one of {limits['expected']}{got}"
-    return f"{where}: {key} must be {_EXPECTED.get(kind.split('_')[0], item['msg'])}{got}"
-
-
-_RELATIONS = {"ge": ">=", "gt": ">", "le": "<=", "lt": "<"}
-
-
-_EXPECTED = {
-    "int": "an integer",
-    "float": "a number",
-    "finite": "a finite number",
-    "bool": "true or false",
-    "string": "text",
-    "path": "a path",
-    "list": "a list",
-    "model": "a section of keys",
-}
+    return f"{where}: {key} {expectation(item)}, got {_show(item['input'])}"
 
 
 def _description(key: str) -> str:

@@ -9,7 +9,6 @@ pose, what stands at the top of the file is every frame's that has none of its o
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,16 +16,16 @@ import numpy as np
 from drgs.config.schema import DataConfig
 from drgs.core.errors import UserError
 from drgs.data.images import downscale_depth, downscale_mask, read_depth, read_mask
-from drgs.data.transforms import CLOSE, InheritedValues, image_path, lens_of, motion_of, positive
+from drgs.data.transforms import CLOSE, Frame, image_path, lens_of, motion_of
 
-MASK, DEPTH, UNIT = "mask_path", "depth_file_path", "depth_unit_scale_factor"
+MASK, DEPTH = "mask_path", "depth_file_path"
 
 PICTURE_UNIT = 1e-3
-"""Scene units in a step of a depth picture, unless :data:`UNIT` says otherwise: as nerfstudio has
-it. An ``.npy`` file then holds scene units, which it has numbers for."""
+"""Scene units in a step of a depth picture, unless ``depth_unit_scale_factor`` says otherwise: as
+nerfstudio has it. An ``.npy`` file then holds scene units, which it has numbers for."""
 
 
-def extras_of(config: DataConfig, frame: InheritedValues, size: tuple[int, int]) -> dict[str, Any]:
+def extras_of(config: DataConfig, frame: Frame, size: tuple[int, int]) -> dict[str, Any]:
     """``lens``, ``motion``, ``mask`` and ``depth`` of a :class:`drgs.data.types.View`.
 
     size: of the photograph, W, H, before it is scaled. What the configuration ignores is not
@@ -40,11 +39,11 @@ def extras_of(config: DataConfig, frame: InheritedValues, size: tuple[int, int])
     }
 
 
-def _mask(config: DataConfig, frame: InheritedValues, size: tuple[int, int]) -> np.ndarray | None:
+def _mask(config: DataConfig, frame: Frame, size: tuple[int, int]) -> np.ndarray | None:
     """(H, W) of 1 and 0, at the width that is configured."""
-    if MASK not in frame:
+    if frame.values.mask_path is None:
         return None
-    file = _file(config, frame, MASK)
+    file = image_path(config.path, frame, MASK)
     mask = read_mask(file, size)
     smaller = downscale_mask(mask, config.image_size)
     if not smaller.any():  # its PSNR is the mean of nothing
@@ -57,41 +56,37 @@ def _mask(config: DataConfig, frame: InheritedValues, size: tuple[int, int]) -> 
     return smaller
 
 
-def _depth(config: DataConfig, frame: InheritedValues, size: tuple[int, int]) -> np.ndarray | None:
+def _depth(config: DataConfig, frame: Frame, size: tuple[int, int]) -> np.ndarray | None:
     """(H, W), scene units, 0 where not known, at the width that is configured."""
-    if DEPTH not in frame:
+    if frame.values.depth_file_path is None:
         return None
-    depth = read_depth(_file(config, frame, DEPTH), _unit(frame), size)
+    depth = read_depth(image_path(config.path, frame, DEPTH), _unit(frame), size)
     return downscale_depth(depth, config.image_size)
 
 
-def _file(config: DataConfig, frame: InheritedValues, key: str) -> Path:
-    values, key, where = frame.at(key)
-    return image_path(config.path, values, where, key)
-
-
-def _unit(frame: InheritedValues) -> float:
+def _unit(frame: Frame) -> float:
     """Scene units that a number of the file of depths counts."""
-    if UNIT in frame:
-        return positive(*frame.at(UNIT))
-    return 1.0 if str(frame.get(DEPTH)).endswith(".npy") else PICTURE_UNIT
+    values = frame.values
+    if values.depth_unit_scale_factor is not None:
+        return values.depth_unit_scale_factor
+    return 1.0 if str(values.depth_file_path).endswith(".npy") else PICTURE_UNIT
 
 
-def ignored(config: DataConfig, frames: Sequence[InheritedValues]) -> tuple[str, ...]:
+def ignored(config: DataConfig, frames: Sequence[Frame]) -> tuple[str, ...]:
     """What some frame has and the configuration leaves out.
 
     ``distortion``, ``motion``, ``masks``, ``depth``: see ``data.ignore_*``.
     """
     found = {
-        "distortion": config.ignore_distortion and any(lens_of(frame) for frame in frames),
-        "motion": config.ignore_motion and any(CLOSE in frame.own for frame in frames),
-        "masks": config.ignore_masks and any(MASK in frame for frame in frames),
-        "depth": config.ignore_depth and any(DEPTH in frame for frame in frames),
+        "distortion": config.ignore_distortion and any(map(lens_of, frames)),
+        "motion": config.ignore_motion and any(f.moves for f in frames),
+        "masks": config.ignore_masks and any(f.values.mask_path for f in frames),
+        "depth": config.ignore_depth and any(f.values.depth_file_path for f in frames),
     }
     return tuple(name for name, is_ignored in found.items() if is_ignored)
 
 
-def notes(config: DataConfig, frames: Sequence[InheritedValues]) -> str:
+def notes(config: DataConfig, frames: Sequence[Frame]) -> str:
     """What frames have of it, and what is left out, for a dataset's description."""
     left_out, text = ignored(config, frames), ""
     lenses = filter(None, map(lens_of, frames))
@@ -102,7 +97,7 @@ def notes(config: DataConfig, frames: Sequence[InheritedValues]) -> str:
         text += f"; masks ({MASK}) ignored"
     if "depth" in left_out:
         text += f"; depth ({DEPTH}) ignored"
-    elif units := sorted({_unit(frame) for frame in frames if DEPTH in frame}):
+    elif units := sorted({_unit(f) for f in frames if f.values.depth_file_path}):
         text += f"; depth in units of {' and '.join(f'{unit:g}' for unit in units)}"
     if "motion" in left_out:
         text += f"; motion ({CLOSE}) ignored"

@@ -20,12 +20,11 @@ from drgs.core.errors import UserError
 from drgs.data.extras import extras_of, ignored, notes
 from drgs.data.images import composite, downscale
 from drgs.data.transforms import (
-    InheritedValues,
+    Frame,
     focal_from_angle,
     image_path,
     in_parallel,
-    opencv_camera_to_world,
-    read_transforms,
+    read_frames,
     unique_names,
 )
 from drgs.data.types import Dataset, View
@@ -43,7 +42,7 @@ def load(config: DataConfig) -> Dataset:
     ``val``.
     """
     test_split = _test_split(config)
-    frames = {split: _frames(config, split) for split in ("train", test_split)}
+    frames = {s: read_frames(_transforms_path(config.path, s)) for s in ("train", test_split)}
     train, test = (_load_split(config, split, frames[split]) for split in ("train", test_split))
     all_frames = [frame for of_split in frames.values() for frame in of_split]
     width, height = train[0].width, train[0].height
@@ -78,22 +77,12 @@ def _transforms_path(folder: Path, split: str) -> Path:
     return folder / f"transforms_{split}.json"
 
 
-def _frames(config: DataConfig, split: str) -> list[InheritedValues]:
-    path = _transforms_path(config.path, split)
-    meta = read_transforms(path)
-    return [
-        InheritedValues(own, f"{path}: frames[{index}].", meta, path)
-        for index, own in enumerate(meta["frames"])
-    ]
-
-
-def _load_split(config: DataConfig, split: str, frames: list[InheritedValues]) -> tuple[View, ...]:
-    files = [image_path(config.path, frame.own, frame.where) for frame in frames]
+def _load_split(config: DataConfig, split: str, frames: list[Frame]) -> tuple[View, ...]:
+    files = [image_path(config.path, frame) for frame in frames]
     size = image_size(files[0])
 
     def load_view(index: int, name: str) -> View:
         frame = frames[index]
-        camera_to_world = opencv_camera_to_world(frame.own, frame.where)
         rgba = read_image(files[index])
         _check_promises(rgba, size, files[index], files[0])
         image = downscale(composite(rgba, config.background_rgb), config.image_size)
@@ -101,11 +90,11 @@ def _load_split(config: DataConfig, split: str, frames: list[InheritedValues]) -
         alpha = downscale(rgba[:, :, 3], config.image_size) if split == "train" else None
         height, width = image.shape[:2]
         # The angle spans the full width, so the focal length in pixels follows the image's size.
-        focal = focal_from_angle(frame.meta, "camera_angle_x", frame.top, width)
+        focal = focal_from_angle(_angle(frame), width)
         return View(
             name=name,
             image=image,
-            camera_to_world=camera_to_world,
+            camera_to_world=frame.own.transform_matrix,
             fx=focal,
             fy=focal,
             cx=width / 2,
@@ -116,8 +105,15 @@ def _load_split(config: DataConfig, split: str, frames: list[InheritedValues]) -
             **extras_of(config, frame, size),
         )
 
-    names = unique_names([frame.own for frame in frames])
+    names = unique_names([frame.own.file_path for frame in frames])
     return in_parallel(load_view, range(len(frames)), names)
+
+
+def _angle(frame: Frame) -> float:
+    """Radians, horizontal."""
+    if frame.values.camera_angle_x is None:
+        raise UserError(f"{frame.where('camera_angle_x')} is missing")
+    return frame.values.camera_angle_x
 
 
 def _check_promises(image: np.ndarray, size: tuple[int, int], file: Path, first: Path) -> None:

@@ -18,15 +18,13 @@ from drgs.core.errors import UserError
 from drgs.data.extras import extras_of, ignored, notes
 from drgs.data.images import composite, downscale
 from drgs.data.transforms import (
-    InheritedValues,
+    Frame,
     focal_from_angle,
     focal_length,
     image_path,
     in_parallel,
-    opencv_camera_to_world,
-    positive,
     principal_point,
-    read_transforms,
+    read_frames,
     unique_names,
 )
 from drgs.data.types import Dataset, View
@@ -36,25 +34,21 @@ from drgs.io.pictures import read_image
 def load(config: DataConfig) -> Dataset:
     """Read all views; those at indices 0, n, 2n, ... of the sorted names are the test split."""
     path = config.path / "transforms.json"
-    meta = read_transforms(path)
+    frames = read_frames(path)
     if config.test_split not in (None, "test"):
         raise UserError(
             f"{path}: this layout has no split {config.test_split}; leave data.test_split out "
             "(data.test_every chooses the test views)"
         )
-    if len(meta["frames"]) < 2:
+    if len(frames) < 2:
         raise UserError(f"{path}: at least 2 views are needed, one of them to test; got 1")
-    frames = [
-        InheritedValues(own, f"{path}: frames[{index}].", meta, path)
-        for index, own in enumerate(meta["frames"])
-    ]
-    files = [image_path(config.path, frame.own, frame.where) for frame in frames]
+    files = [image_path(config.path, frame) for frame in frames]
 
     def load_view(index: int, name: str) -> View:
         return _load_view(config, frames[index], files[index], name)
 
-    order = sorted(range(len(frames)), key=lambda index: frames[index].own["file_path"])
-    names = unique_names([frames[index].own for index in order])
+    order = sorted(range(len(frames)), key=lambda index: frames[index].own.file_path)
+    names = unique_names([frames[index].own.file_path for index in order])
     views = in_parallel(load_view, order, names)
     test = views[:: config.test_every]
     train = tuple(v for i, v in enumerate(views) if i % config.test_every != 0)
@@ -74,21 +68,21 @@ def load(config: DataConfig) -> Dataset:
     )
 
 
-def _load_view(config: DataConfig, frame: InheritedValues, file: Path, name: str) -> View:
-    camera_to_world = opencv_camera_to_world(frame.own, frame.where)
+def _load_view(config: DataConfig, frame: Frame, file: Path, name: str) -> View:
     pixels = read_image(file)
     image = composite(pixels, config.background_rgb)
     height, width = image.shape[:2]
-    for key, size in (("w", width), ("h", height)):
-        if key in frame and (given := positive(*frame.at(key))) != size:
+    values = frame.values
+    for key, given, size in (("w", values.w, width), ("h", values.h, height)):
+        if given is not None and given != size:
             raise UserError(
-                f"{frame.at(key)[2]}{key} must be the image's size, {size} px ({file}), got "
+                f"{frame.where(key)} must be the image's size, {size} px ({file}), got "
                 f"{given:g}; scale the intrinsics or the images"
             )
     fx = _focal(frame, "x", width)
-    fy = _focal(frame, "y", height) if "fl_y" in frame or "camera_angle_y" in frame else fx
-    cx = principal_point(*frame.at("cx"), width) if "cx" in frame else width / 2
-    cy = principal_point(*frame.at("cy"), height) if "cy" in frame else height / 2
+    has_fy = values.fl_y is not None or values.camera_angle_y is not None
+    fy = _focal(frame, "y", height) if has_fy else fx
+    cx, cy = (_principal(frame, key, size) for key, size in (("cx", width), ("cy", height)))
 
     max_width = config.image_size
     image = downscale(image, max_width)
@@ -97,7 +91,7 @@ def _load_view(config: DataConfig, frame: InheritedValues, file: Path, name: str
     return View(
         name=name,
         image=image,
-        camera_to_world=camera_to_world,
+        camera_to_world=frame.own.transform_matrix,
         fx=fx * scale_x,
         fy=fy * scale_y,
         cx=cx * scale_x,
@@ -109,9 +103,19 @@ def _load_view(config: DataConfig, frame: InheritedValues, file: Path, name: str
     )
 
 
-def _focal(frame: InheritedValues, axis: str, size: int) -> float:
-    if f"fl_{axis}" in frame:
-        return focal_length(*frame.at(f"fl_{axis}"), size)
-    if f"camera_angle_{axis}" in frame:
-        return focal_from_angle(*frame.at(f"camera_angle_{axis}"), size)
-    raise UserError(f"{frame.top}fl_{axis} is missing, and there is no camera_angle_{axis} either")
+def _focal(frame: Frame, axis: str, size: int) -> float:
+    """Px, of a picture of ``size`` px."""
+    focal, angle = (getattr(frame.values, f"{key}_{axis}") for key in ("fl", "camera_angle"))
+    if focal is not None:
+        return focal_length(focal, frame.where(f"fl_{axis}"), size)
+    if angle is not None:
+        return focal_from_angle(angle, size)
+    raise UserError(
+        f"{frame.where(f'fl_{axis}')} is missing, and there is no camera_angle_{axis} either"
+    )
+
+
+def _principal(frame: Frame, key: str, size: int) -> float:
+    """Px; in the middle of a picture of ``size`` px where nothing else is said."""
+    value = getattr(frame.values, key)
+    return size / 2 if value is None else principal_point(value, frame.where(key), size)

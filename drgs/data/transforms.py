@@ -1,6 +1,7 @@
 """Reading ``transforms*.json`` files: what the NeRF-synthetic and nerfstudio layouts share.
 
-Both store camera-to-world matrices in OpenGL axes (x right, y up, z backward).
+Both store camera-to-world matrices in OpenGL axes (x right, y up, z backward). A file is checked as
+a whole against :class:`Transforms`; keys that it does not name are ignored.
 """
 
 from __future__ import annotations
@@ -10,15 +11,24 @@ import math
 import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
 import numpy as np
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, Strict, ValidationError
+from pydantic_core import ErrorDetails
 
 from drgs.cameras.axes import between_opencv_and_opengl
+from drgs.config.explain import expectation
 from drgs.core.errors import UserError, one_line
 from drgs.core.files import read_text
 from drgs.data.types import Motion
+
+if TYPE_CHECKING:
+    from drgs.cameras.camera import Lens
+    from drgs.cameras.fisheye import Fisheye
+    from drgs.cameras.radial_tangential import RadialTangential
 
 MAX_BYTES = 1 << 28
 """Of a transforms file: 268 MB, a thousand bytes for each of a quarter of a million views."""
@@ -37,179 +47,232 @@ degrees down to 0.006."""
 MAX_OFFSET = 100
 """Image sizes: how far the principal point may lie from the picture."""
 
+SMALLEST_ANGLE, LARGEST_ANGLE = (2 * math.atan(0.5 / focal) for focal in reversed(FOCAL_RANGE))
+"""Radians: the same as full angles of view."""
+
 DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 
-PINHOLE_MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
-"""Values of ``camera_model`` that are a pinhole camera apart from their distortion."""
-
 RATIONAL_MODEL = "FULL_OPENCV"
-"""The one that has k4 to k6."""
+"""The model of a camera that has k4 to k6."""
 
 FISHEYE_MODELS = ("SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "OPENCV_FISHEYE")
+"""The others are a pinhole camera apart from their distortion."""
 
 CLOSE = "transform_matrix_close"
 """Of a frame: where its camera was when the shutter closed, as ``transform_matrix`` is where it was
 when the shutter opened."""
 
-SHUTTERS = ("global", "rolling")
-"""Values of ``shutter``: all pixels see the whole motion, or the rows one time after the other."""
-
 T = TypeVar("T")
 
 
-def read_transforms(path: Path) -> dict[str, Any]:
-    """The content of a transforms file, with at least one frame."""
-    text = read_text(path, "file", MAX_BYTES)
-    try:
-        meta = json.loads(text)
-    except (ValueError, RecursionError) as error:
-        raise UserError(f"{path}: not valid JSON: {one_line(error)}") from None
-    if not isinstance(meta, dict):
-        raise UserError(f"{path}: must hold an object with frames, got {_show(meta)}")
-    if "frames" not in meta:
-        raise UserError(f"{path}: frames is missing; it must be a list of objects, one per view")
-    frames = meta["frames"]
-    if not isinstance(frames, list):
-        raise UserError(f"{path}: frames must be a list of objects, got {_show(frames)}")
-    for index, frame in enumerate(frames):
-        if not isinstance(frame, dict):
-            raise UserError(f"{path}: frames[{index}] must be an object, got {_show(frame)}")
-    if not frames:
-        raise UserError(f"{path}: frames is empty; there must be at least one view")
-    return meta
+# What a file may say
 
 
-def number(values: dict[str, Any], key: str, where: str) -> float:
-    """``values[key]``, a finite number."""
-    value = values.get(key)
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) < math.inf:
-        raise UserError(f"{where}{key} must be a finite number, got {_show(value)}")
-    try:
-        return float(value)
-    except OverflowError:
-        raise UserError(f"{where}{key} must be a finite number, got an integer beyond it") from None
-
-
-def positive(values: dict[str, Any], key: str, where: str) -> float:
-    """``values[key]``, a finite number > 0."""
-    value = number(values, key, where)
-    if value <= 0:
-        raise UserError(f"{where}{key} must be > 0, got {value:g}")
+def _angle(value: float) -> float:
+    if not SMALLEST_ANGLE <= value <= LARGEST_ANGLE:
+        raise ValueError(f"must be between {SMALLEST_ANGLE:.2g} and {LARGEST_ANGLE:.4g} (radians)")
     return value
 
 
-def focal_from_angle(values: dict[str, Any], key: str, where: str, size: int) -> float:
-    """Focal length in px from a full field of view in radians across ``size`` px."""
-    angle = positive(values, key, where)
-    if angle >= math.pi:
-        raise UserError(f"{where}{key} must be < pi (radians), got {angle:g}")
-    low, high = (2 * math.atan(0.5 / focal) for focal in reversed(FOCAL_RANGE))
-    if not low <= angle <= high:
-        raise UserError(
-            f"{where}{key} must be between {low:.2g} and {high:.4g} (radians), got {angle:g}"
+def _coordinate(value: float) -> float:
+    if abs(value) > MAX_COORDINATE:
+        raise ValueError(f"must be at most {MAX_COORDINATE:g} in size (scale the scene down)")
+    return value
+
+
+def _opencv_pose(rows: list[list[float]]) -> np.ndarray:
+    """(4, 4) float64 camera to world in OpenCV axes, from the file's in OpenGL's."""
+    if [len(row) for row in rows] != [4] * 4:
+        lengths = " or ".join(map(str, sorted({len(row) for row in rows})[:3]))
+        raise ValueError(f"must be 4 x 4 numbers ({len(rows)} rows of {lengths or 0})")
+    matrix = np.array(rows, np.float64)
+    rotation = matrix[:3, :3]
+    error, sign = np.abs(rotation @ rotation.T - np.eye(3)).max(), np.linalg.det(rotation)
+    if error > RIGID_TOLERANCE or sign < 0:
+        raise ValueError(
+            f"must be rigid (rotation and translation) to {RIGID_TOLERANCE:g}: "
+            f"|R R^T - I| is {error:.2g}, det R is {sign:.2g}"
         )
+    if np.abs(matrix[3] - [0, 0, 0, 1]).max() > RIGID_TOLERANCE:
+        raise ValueError("must end in the row 0 0 0 1")
+    return between_opencv_and_opengl(matrix)
+
+
+Number = Annotated[float, Field(allow_inf_nan=False)]
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+Angle = Annotated[Number, AfterValidator(_angle)]
+Text = Annotated[str, Field(min_length=1)]
+Rows = list[list[Annotated[Number, AfterValidator(_coordinate)]]]
+Pose = Annotated[Rows, AfterValidator(_opencv_pose)]
+
+
+class CameraValues(BaseModel):
+    """What may stand at the top of a file, for all frames, or in a frame. None: it does not."""
+
+    model_config = ConfigDict(strict=True, frozen=True)
+
+    camera_angle_x: Angle | None = None  # radians, across the picture's width
+    camera_angle_y: Angle | None = None
+    fl_x: Positive | None = None  # px
+    fl_y: Positive | None = None
+    cx: Number | None = None  # px
+    cy: Number | None = None
+    w: Positive | None = None  # px
+    h: Positive | None = None
+    k1: Number | None = None
+    k2: Number | None = None
+    k3: Number | None = None
+    k4: Number | None = None
+    k5: Number | None = None
+    k6: Number | None = None
+    p1: Number | None = None
+    p2: Number | None = None
+    camera_model: (
+        Literal[
+            "SIMPLE_PINHOLE",
+            "PINHOLE",
+            "SIMPLE_RADIAL",
+            "RADIAL",
+            "OPENCV",
+            "FULL_OPENCV",
+            "SIMPLE_RADIAL_FISHEYE",
+            "RADIAL_FISHEYE",
+            "OPENCV_FISHEYE",
+        ]
+        | None
+    ) = None  # as nerfstudio writes it
+    is_fisheye: Annotated[bool | None, Strict(False)] = None  # as instant-ngp does
+    shutter: Literal["global", "rolling"] | None = None  # all pixels at once, or row after row
+    mask_path: Text | None = None
+    depth_file_path: Text | None = None
+    depth_unit_scale_factor: Positive | None = None
+
+
+class FrameValues(CameraValues):
+    """What a frame says; poses are checked, and in OpenCV axes."""
+
+    transform_matrix: Pose
+    transform_matrix_close: Pose | None = None
+    file_path: Text | None = None
+
+
+class Transforms(CameraValues):
+    """A file."""
+
+    frames: Annotated[list[FrameValues], Field(min_length=1)]
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """A view of a file: what its frame says, and where it says nothing, the file's top."""
+
+    values: FrameValues
+    own: FrameValues  # without what it inherits
+    index: int
+    path: Path
+
+    @property
+    def moves(self) -> bool:
+        """Whether it says where its camera was when the shutter closed."""
+        return self.own.transform_matrix_close is not None
+
+    def where(self, key: str) -> str:
+        """The key as messages name it, with the file and the frame that holds it, if one does."""
+        in_frame = getattr(self.own, key) is not None or key not in CameraValues.model_fields
+        return f"{self.path}: frames[{self.index}].{key}" if in_frame else f"{self.path}: {key}"
+
+
+def read_frames(path: Path) -> list[Frame]:
+    """The frames of a transforms file, at least one.
+
+    Raises :class:`UserError` naming the file, the key, what was expected and what was got.
+    """
+    text = read_text(path, "file", MAX_BYTES)
+    try:
+        content = json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise UserError(f"{path}: not valid JSON: {one_line(error)}") from None
+    try:
+        meta = Transforms.model_validate(content)
+    except ValidationError as error:
+        raise UserError(f"{path}: {_explained(error.errors()[0])}") from None
+    return [Frame(_inherited(own, meta), own, index, path) for index, own in enumerate(meta.frames)]
+
+
+def _inherited(own: FrameValues, meta: Transforms) -> FrameValues:
+    missing = [name for name in CameraValues.model_fields if getattr(own, name) is None]
+    return own.model_copy(update={name: getattr(meta, name) for name in missing})
+
+
+def _explained(error: ErrorDetails) -> str:
+    """One of pydantic's errors: the key, what was expected, and what was got."""
+    parts = [f"[{part}]" if isinstance(part, int) else f".{part}" for part in error["loc"]]
+    key = "".join(parts).removeprefix(".")
+    if error["type"] == "missing":
+        remedy = "; it must be a list of objects, one per view" if key == "frames" else ""
+        return f"{key} is missing{remedy}"
+    got = f"got {_show(error['input'])}"
+    if not key:
+        return f"must hold an object with frames, {got}"
+    if key == "frames":
+        expected = "must be a list of objects" if error["input"] else "must have at least one view"
+        return f"{key} {expected}, {got}"
+    if error["type"] == "model_type":
+        return f"{key} must be an object, {got}"
+    return f"{key} {expectation(error)}, {got}"
+
+
+def _show(value: object) -> str:
+    """The value as JSON writes it, shortened."""
+    return one_line(json.dumps(value), limit=60)
+
+
+# What follows from it
+
+
+def focal_from_angle(angle: float, size: int) -> float:
+    """Focal length in px from a full field of view in radians across ``size`` px."""
     return 0.5 * size / math.tan(0.5 * angle)
 
 
-def focal_length(values: dict[str, Any], key: str, where: str, size: int) -> float:
-    """Focal length in px of a picture of ``size`` px."""
-    focal = positive(values, key, where)
+def focal_length(focal: float, where: str, size: int) -> float:
+    """``focal``, px, if a picture of ``size`` px can have it; where: the key."""
     low, high = (size * factor for factor in FOCAL_RANGE)
     if not low <= focal <= high:
         raise UserError(
-            f"{where}{key} must be between {low:g} and {high:g} px for {size} px, got {focal:g}"
+            f"{where} must be between {low:g} and {high:g} px for {size} px, got {focal:g}"
         )
     return focal
 
 
-def principal_point(values: dict[str, Any], key: str, where: str, size: int) -> float:
-    """Coordinate in px of the principal point along ``size`` px."""
-    value = number(values, key, where)
+def principal_point(value: float, where: str, size: int) -> float:
+    """``value``, px, if it is not too far from a picture of ``size`` px; where: the key."""
     if abs(value) > MAX_OFFSET * size:
         raise UserError(
-            f"{where}{key} must be within {MAX_OFFSET * size} px of the picture, got {value:g}"
+            f"{where} must be within {MAX_OFFSET * size} px of the picture, got {value:g}"
         )
     return value
 
 
-def opencv_camera_to_world(
-    frame: dict[str, Any], where: str, name: str = "transform_matrix"
-) -> np.ndarray:
-    """(4, 4) float64 camera to world in OpenCV axes, from the file's in OpenGL's."""
-    key = f"{where}{name}"
-    if name not in frame:
-        raise UserError(f"{key} is missing")
-    matrix = _numbers(frame[name], key)
-    if matrix.shape != (4, 4):
-        raise UserError(f"{key} must be 4 x 4 numbers, got shape {matrix.shape}")
-    if not np.isfinite(matrix).all():
-        row, column = np.argwhere(~np.isfinite(matrix))[0]
-        raise UserError(f"{key}[{row}][{column}] must be finite, got {matrix[row, column]}")
-    if np.abs(matrix).max() > MAX_COORDINATE:
-        row, column = np.unravel_index(np.abs(matrix).argmax(), matrix.shape)
-        raise UserError(
-            f"{key}[{row}][{column}] must be at most {MAX_COORDINATE:g} in size, got "
-            f"{matrix[row, column]:g}; scale the scene down"
-        )
-    rotation = matrix[:3, :3]
-    error = np.abs(rotation @ rotation.T - np.eye(3)).max()
-    if error > RIGID_TOLERANCE or np.linalg.det(rotation) < 0:
-        raise UserError(
-            f"{key} must be rigid (rotation and translation) to {RIGID_TOLERANCE:g}: "
-            f"|R R^T - I| is {error:.2g}, det R is {np.linalg.det(rotation):.2g}"
-        )
-    if np.abs(matrix[3] - [0, 0, 0, 1]).max() > RIGID_TOLERANCE:
-        raise UserError(f"{key} must end in the row 0 0 0 1, got {matrix[3].tolist()}")
-    return between_opencv_and_opengl(matrix)
-
-
-class InheritedValues:
-    """The values of a frame, where what it does not have is the file's; and where they are."""
-
-    def __init__(self, own: dict[str, Any], where: str, meta: dict[str, Any], path: Path) -> None:
-        """own, meta: the frame's values and the file's; where: the prefix of a frame's key."""
-        self.values, self.where = meta | own, where
-        self.own, self.meta, self.top = own, meta, f"{path}: "
-
-    def __contains__(self, key: str) -> bool:
-        return key in self.values
-
-    def get(self, key: str, default: Any = None) -> Any:
-        """Of a key that may be missing."""
-        return self.values.get(key, default)
-
-    def at(self, key: str) -> tuple[dict[str, Any], str, str]:
-        """The object that holds ``key``, the key, and the prefix that messages name it with."""
-        return (self.own, key, self.where) if key in self.own else (self.meta, key, self.top)
-
-
-def lens_of(frame: InheritedValues) -> Any:
-    """The lens that a frame names, with its coefficients; None for a pinhole.
-
-    ``camera_model`` as nerfstudio writes it, ``is_fisheye`` as instant-ngp does.
-    """
-    model = frame.get("camera_model", PINHOLE_MODELS[0])
-    if model not in (*PINHOLE_MODELS, *FISHEYE_MODELS):
-        raise UserError(
-            f"{frame.at('camera_model')[2]}camera_model must be one of "
-            f"{', '.join((*PINHOLE_MODELS, *FISHEYE_MODELS))}, got {one_line(model)}"
-        )
-    is_fisheye = model in FISHEYE_MODELS or bool(frame.get("is_fisheye"))
-    coefficients = distortion_of(frame)
+def lens_of(frame: Frame) -> Lens | None:
+    """The lens that a frame names, with its coefficients; None for a pinhole."""
+    is_fisheye = frame.values.camera_model in FISHEYE_MODELS or bool(frame.values.is_fisheye)
+    given = {name: getattr(frame.values, name) for name in DISTORTION}
+    coefficients = {name: value for name, value in given.items() if value}
     if not is_fisheye and not coefficients:
         return None
-    _check_fourth(frame, coefficients, model, is_fisheye)
+    _check_fourth(frame, coefficients, is_fisheye)
     kind = _lens_type(is_fisheye)
     for name in coefficients:
         if name not in kind.names:
             raise UserError(
-                f"{frame.at(name)[2]}{name}: a fisheye lens has the coefficients "
+                f"{frame.where(name)}: a fisheye lens has the coefficients "
                 f"{', '.join(kind.names)}, got {name} = {coefficients[name]:g}"
             )
     return kind.of(**coefficients)
 
 
-def _lens_type(is_fisheye: bool) -> Any:
+def _lens_type(is_fisheye: bool) -> type[RadialTangential] | type[Fisheye]:
     if is_fisheye:
         from drgs.cameras.fisheye import Fisheye
 
@@ -219,80 +282,51 @@ def _lens_type(is_fisheye: bool) -> Any:
     return RadialTangential
 
 
-def _check_fourth(
-    frame: InheritedValues, coefficients: dict[str, float], model: str, is_fisheye: bool
-) -> None:
+def _check_fourth(frame: Frame, coefficients: dict[str, float], is_fisheye: bool) -> None:
     """Raise UserError for a k4 of which one cannot know what it multiplies.
 
     In OpenCV it is the first coefficient of a denominator, in nerfstudio the fourth of the
     polynomial. Files that have k5 or k6 mean OpenCV's.
     """
+    model = frame.values.camera_model or "PINHOLE"
     if is_fisheye or model == RATIONAL_MODEL or {"k5", "k6"} & set(coefficients):
         return
     if "k4" in coefficients:
         raise UserError(
-            f"{frame.at('k4')[2]}k4 is read as OpenCV's, of a denominator 1 + k4 r^2, where "
+            f"{frame.where('k4')} is read as OpenCV's, of a denominator 1 + k4 r^2, where "
             f"camera_model is {RATIONAL_MODEL}; nerfstudio's, of a term k4 r^8, is not supported. "
             f"Got k4 = {coefficients['k4']:g} and camera_model {model}: set camera_model, or "
             "calibrate without k4"
         )
 
 
-def distortion_of(frame: InheritedValues) -> dict[str, float]:
-    """The coefficients that are not zero."""
-    given = {key: number(*frame.at(key)) for key in DISTORTION if key in frame}
-    return {key: value for key, value in given.items() if value != 0}
-
-
-def motion_of(frame: InheritedValues, samples: int) -> Motion | None:
+def motion_of(frame: Frame, samples: int) -> Motion | None:
     """Of a frame that says where its camera was when the shutter closed.
 
     samples: times at which what a global shutter blurs is rendered.
     """
-    if CLOSE not in frame.own:
+    if not frame.moves:
         return None
-    shutter = frame.get("shutter", SHUTTERS[0])
-    if shutter not in SHUTTERS:
-        raise UserError(
-            f"{frame.at('shutter')[2]}shutter must be one of {', '.join(SHUTTERS)}, got "
-            f"{one_line(shutter)}"
-        )
-    close_to_world = opencv_camera_to_world(frame.own, frame.where, CLOSE)
-    return Motion(close_to_world, shutter, samples)
+    shutter = frame.values.shutter or "global"
+    return Motion(frame.own.transform_matrix_close, shutter, samples)
 
 
-def image_path(folder: Path, frame: dict[str, Any], where: str, key: str = "file_path") -> Path:
+def image_path(folder: Path, frame: Frame, key: str = "file_path") -> Path:
     """The file that ``frame`` names, with ``.png`` added where its name has no suffix."""
-    name = frame.get(key)
-    if not isinstance(name, str) or not name:
-        raise UserError(f"{where}{key} must be text, got {_show(name)}")
+    name = getattr(frame.values, key)
+    if name is None:
+        raise UserError(f"{frame.where(key)} is missing")
     for candidate in (folder / name, folder / f"{name}.png"):
         if os.path.isfile(candidate):  # False, not an error, for a name that no file can have
             return candidate
     raise UserError(
-        f"{where}{key}: there is no image {one_line(folder / name)} (or with .png added)"
+        f"{frame.where(key)}: there is no image {one_line(folder / name)} (or with .png added)"
     )
 
 
-def _numbers(values: Any, key: str) -> np.ndarray:
-    """Nested lists of numbers, float64."""
-    try:
-        array = np.array(values)
-    except ValueError:  # rows of different lengths
-        raise UserError(f"{key} must be 4 x 4 numbers, got {_show(values)}") from None
-    if array.dtype.kind not in "iuf":
-        raise UserError(f"{key} must be 4 x 4 numbers, got {_show(values)}")
-    return array.astype(np.float64)
-
-
-def _show(value: Any) -> str:
-    """The value as JSON writes it, shortened."""
-    return one_line(json.dumps(value), limit=60)
-
-
-def unique_names(frames: Sequence[dict[str, Any]]) -> list[str]:
-    """A name for each frame's outputs: the file's, with its folders where those are needed."""
-    paths = [PurePosixPath(frame["file_path"].replace("\\", "/")) for frame in frames]
+def unique_names(files: Sequence[str]) -> list[str]:
+    """A name for the outputs of each ``file_path``: the file's, with its folders where needed."""
+    paths = [PurePosixPath(file.replace("\\", "/")) for file in files]
     names = [path.stem for path in paths]
     if len(set(names)) < len(names):
         names = ["_".join(path.with_suffix("").parts) for path in paths]

@@ -14,16 +14,7 @@ import numpy as np
 
 from drgs.core.constants import SHUTTER_SAMPLES
 from drgs.core.errors import UserError
-from drgs.data.transforms import (
-    InheritedValues,
-    focal_from_angle,
-    lens_of,
-    motion_of,
-    number,
-    opencv_camera_to_world,
-    positive,
-    read_transforms,
-)
+from drgs.data.transforms import Frame, focal_from_angle, lens_of, motion_of, read_frames
 from drgs.data.types import Viewpoint
 
 FIELD_OF_VIEW = 40.0
@@ -75,46 +66,44 @@ def read_viewpoints(
 
     Raises :class:`UserError` naming the file, the key, what was expected and what was got.
     """
-    meta = read_transforms(path)
-    frames = meta["frames"]
+    frames = read_frames(path)
     digits = len(str(len(frames) - 1))
     return [
-        _read_viewpoint(
-            InheritedValues(own, f"{path}: frames[{i}].", meta, path),
-            f"camera_{i:0{digits}d}",
-            size,
-            shutter_samples,
-        )
-        for i, own in enumerate(frames)
+        _viewpoint_of(frame, f"camera_{index:0{digits}d}", size, shutter_samples)
+        for index, frame in enumerate(frames)
     ]
 
 
-def _read_viewpoint(
-    frame: InheritedValues, name: str, size: tuple[int, int] | None, shutter_samples: int
+def _viewpoint_of(
+    frame: Frame, name: str, size: tuple[int, int] | None, shutter_samples: int
 ) -> Viewpoint:
-    values, where = frame.values, frame.where
-    pose = opencv_camera_to_world(values, where)
+    values = frame.values
     if size is None:
-        missing = [key for key in ("w", "h") if key not in values]
+        missing = [key for key in ("w", "h") if getattr(values, key) is None]
         if missing:
-            raise UserError(f"{where}{missing[0]} is missing; give --size WIDTH HEIGHT instead")
-        size = tuple(max(1, round(positive(values, key, where))) for key in ("w", "h"))
+            where = frame.where(missing[0])
+            raise UserError(f"{where} is missing; give --size WIDTH HEIGHT instead")
+        size = max(1, round(values.w)), max(1, round(values.h))
     width, height = size
-    if "fl_x" in values:
-        scale = width / positive(values, "w", where)
-        focal = scale * positive(values, "fl_x", where)
-    elif "camera_angle_x" in values:
-        focal = focal_from_angle(values, "camera_angle_x", where, width)
+
+    def scaled(value: float, given: str, to: int) -> float:
+        """From px of the file's picture to px of the one that is wanted."""
+        if (of := getattr(values, given)) is None:
+            raise UserError(f"{frame.where(given)} is missing; the file's other numbers need it")
+        return to * value / of
+
+    if values.fl_x is not None:
+        focal = scaled(values.fl_x, "w", width)
+    elif values.camera_angle_x is not None:
+        focal = focal_from_angle(values.camera_angle_x, width)
     else:
-        raise UserError(f"{where}camera_angle_x (or fl_x with w) is missing")
-    focal_y = focal
-    if "fl_x" in values and "fl_y" in values:
-        focal_y = height * positive(values, "fl_y", where) / positive(values, "h", where)
-    cx, cy = width / 2, height / 2
-    if "cx" in values and "cy" in values:
-        cx = width * number(values, "cx", where) / positive(values, "w", where)
-        cy = height * number(values, "cy", where) / positive(values, "h", where)
-    lens, motion = lens_of(frame), motion_of(frame, shutter_samples)
+        raise UserError(f"{frame.where('camera_angle_x')} (or fl_x with w) is missing")
+    focal_y, cx, cy = focal, width / 2, height / 2
+    if values.fl_x is not None and values.fl_y is not None:
+        focal_y = scaled(values.fl_y, "h", height)
+    if values.cx is not None and values.cy is not None:
+        cx, cy = scaled(values.cx, "w", width), scaled(values.cy, "h", height)
+    pose, lens, motion = values.transform_matrix, lens_of(frame), motion_of(frame, shutter_samples)
     return Viewpoint(name, pose, focal, focal_y, cx, cy, width, height, lens, motion)
 
 

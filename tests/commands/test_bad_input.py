@@ -161,14 +161,17 @@ WRONG_INPUTS = {
     ),
     "transforms a list": (write("transforms_train.json", b"[]"), "train.json: must hold an object"),
     "no frames": (edit_transforms(lambda m: m.pop("frames")), "train.json: frames is missing"),
-    "frames empty": (edit_transforms(lambda m: m["frames"].clear()), "frames is empty"),
+    "frames empty": (
+        edit_transforms(lambda m: m["frames"].clear()),
+        "frames must have at least one view",
+    ),
     "matrix 3x4": (
         edit_transforms(lambda m: m["frames"][1]["transform_matrix"].pop()),
-        "transforms_train.json: frames[1].transform_matrix must be 4 x 4 numbers, got shape (3, 4)",
+        "transforms_train.json: frames[1].transform_matrix must be 4 x 4 numbers (3 rows",
     ),
     "matrix not finite": (
         edit_transforms(lambda m: m["frames"][1]["transform_matrix"][0].__setitem__(3, np.nan)),
-        "transforms_train.json: frames[1].transform_matrix[0][3] must be finite, got nan",
+        "transforms_train.json: frames[1].transform_matrix[0][3] must be a finite number, got NaN",
     ),
     "matrix not rigid": (
         edit_transforms(lambda m: m["frames"][1]["transform_matrix"][2].__setitem__(1, 1.0002)),

@@ -114,27 +114,33 @@ def test_a_suffix_in_file_path_is_accepted(blender):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda m: m.update(frames=[]), "frames is empty; there must be at least one view"),
+        (lambda m: m.update(frames=[]), "frames must have at least one view, got []"),
         (lambda m: m.update(frames=3), "frames must be a list of objects, got 3"),
         (
             lambda m: m.pop("frames"),
             "frames is missing; it must be a list of objects, one per view",
         ),
         (lambda m: m["frames"].append(7), "frames[3] must be an object, got 7"),
-        (lambda m: m.pop("camera_angle_x"), "camera_angle_x must be a finite number, got null"),
-        (lambda m: m.update(camera_angle_x=0), "camera_angle_x must be > 0, got 0"),
+        (lambda m: m.pop("camera_angle_x"), "camera_angle_x is missing"),
+        (
+            lambda m: m.update(camera_angle_x=0),
+            "camera_angle_x must be between 0.0001 and 3.102 (radians), got 0",
+        ),
         (
             lambda m: m.update(camera_angle_x=1e-5),
             "camera_angle_x must be between 0.0001 and 3.102 (radians), got 1e-05",
         ),
         (
             lambda m: m.update(camera_angle_x=10**400),
-            "camera_angle_x must be a finite number, got an integer beyond it",
+            f"camera_angle_x must be a number, got 1{56 * '0'}...",
         ),
-        (lambda m: m.update(camera_angle_x=40), "camera_angle_x must be < pi (radians), got 40"),
+        (
+            lambda m: m.update(camera_angle_x=40),
+            "camera_angle_x must be between 0.0001 and 3.102 (radians), got 40",
+        ),
         (
             lambda m: m["frames"][1].pop("file_path"),
-            "frames[1].file_path must be text, got null",
+            "frames[1].file_path is missing",
         ),
         (
             lambda m: m["frames"][1].pop("transform_matrix"),
@@ -142,43 +148,47 @@ def test_a_suffix_in_file_path_is_accepted(blender):
         ),
         (
             lambda m: m["frames"][1].update(transform_matrix=[[1, 2], [3, 4]]),
-            "frames[1].transform_matrix must be 4 x 4 numbers, got shape (2, 2)",
+            "frames[1].transform_matrix must be 4 x 4 numbers (2 rows of 2), got [[1, 2], [3, 4]]",
         ),
         (
             lambda m: m["frames"][1].update(transform_matrix=[[1, 2], [3]]),
-            "frames[1].transform_matrix must be 4 x 4 numbers, got [[1, 2], [3]]",
+            "frames[1].transform_matrix must be 4 x 4 numbers (2 rows of 1 or 2), got "
+            "[[1, 2], [3]]",
         ),
         (
             lambda m: m["frames"][1].update(transform_matrix=np.eye(4)[:3].tolist()),
-            "frames[1].transform_matrix must be 4 x 4 numbers, got shape (3, 4)",
+            "frames[1].transform_matrix must be 4 x 4 numbers (3 rows of 4), got "
+            "[[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1...",
         ),
         (
             lambda m: m["frames"][1].update(transform_matrix=[["1"] * 4] * 4),
-            "frames[1].transform_matrix must be 4 x 4 numbers, got "
-            '[["1", "1", "1", "1"], ["1", "1", "1", "1"], ["1", "1", "...',
+            'frames[1].transform_matrix[0][0] must be a number, got "1"',
         ),
         (
             lambda m: m["frames"][1]["transform_matrix"][2].__setitem__(3, -2e9),
-            "frames[1].transform_matrix[2][3] must be at most 1e+09 in size, got -2e+09; scale the "
-            "scene down",
+            "frames[1].transform_matrix[2][3] must be at most 1e+09 in size (scale the scene "
+            "down), got -2000000000.0",
         ),
         (
             lambda m: m["frames"][2]["transform_matrix"][0].__setitem__(3, math.nan),
-            "frames[2].transform_matrix[0][3] must be finite, got nan",
+            "frames[2].transform_matrix[0][3] must be a finite number, got NaN",
         ),
         (
             lambda m: m["frames"][0].update(transform_matrix=np.diag([2, 2, 2, 1]).tolist()),
             "frames[0].transform_matrix must be rigid (rotation and translation) to 0.0001: "
-            "|R R^T - I| is 3, det R is 8",
+            "|R R^T - I| is 3, det R is 8, got "
+            "[[2, 0, 0, 0], [0, 2, 0, 0], [0, 0, 2, 0], [0, 0, 0, 1]]",
         ),
         (
             lambda m: m["frames"][0].update(transform_matrix=np.diag([1, 1, -1, 1]).tolist()),
             "frames[0].transform_matrix must be rigid (rotation and translation) to 0.0001: "
-            "|R R^T - I| is 0, det R is -1",
+            "|R R^T - I| is 0, det R is -1, got "
+            "[[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, -1, 0], [0, 0, 0, 1]]",
         ),
         (
             lambda m: m["frames"][0].update(transform_matrix=np.diag([1, 1, 1, 2]).tolist()),
-            "frames[0].transform_matrix must end in the row 0 0 0 1, got [0.0, 0.0, 0.0, 2.0]",
+            "frames[0].transform_matrix must end in the row 0 0 0 1, got "
+            "[[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 2]]",
         ),
     ],
 )
@@ -349,12 +359,12 @@ def test_distortion_coefficients_of_zero_are_accepted(photographs):
             "fl_x must be between 0.08 and 80000 px for 8 px, got 0.001",
         ),
         (lambda m: m.update(cy=-700), "cy must be within 600 px of the picture, got -700"),
-        (lambda m: m.update(cx="4"), 'cx must be a finite number, got "4"'),
+        (lambda m: m.update(cx="4"), 'cx must be a number, got "4"'),
         (
             lambda m: m.update(camera_model="EQUIRECTANGULAR"),
-            "camera_model must be one of SIMPLE_PINHOLE, PINHOLE, SIMPLE_RADIAL, RADIAL, OPENCV, "
-            "FULL_OPENCV, SIMPLE_RADIAL_FISHEYE, RADIAL_FISHEYE, OPENCV_FISHEYE, got "
-            "EQUIRECTANGULAR",
+            "camera_model must be one of 'SIMPLE_PINHOLE', 'PINHOLE', 'SIMPLE_RADIAL', 'RADIAL', "
+            "'OPENCV', 'FULL_OPENCV', 'SIMPLE_RADIAL_FISHEYE', 'RADIAL_FISHEYE' or "
+            "'OPENCV_FISHEYE', got \"EQUIRECTANGULAR\"",
         ),
         (
             lambda m: m.update(is_fisheye=True, p1=0.5),

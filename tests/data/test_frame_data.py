@@ -372,10 +372,13 @@ def test_wrong_motion_is_refused_with_the_key(photographs):
     give(photographs, transform_matrix_close=np.diag([2, 2, 2, 1]).tolist())
     assert refusal(photographs) == (
         f"{where}transform_matrix_close must be rigid (rotation and translation) to 0.0001: "
-        "|R R^T - I| is 3, det R is 8"
+        "|R R^T - I| is 3, det R is 8, got "
+        "[[2, 0, 0, 0], [0, 2, 0, 0], [0, 0, 2, 0], [0, 0, 0, 1]]"
     )
     give(photographs, transform_matrix_close=np.eye(4).tolist(), shutter="curtain")
-    assert refusal(photographs) == (f"{where}shutter must be one of global, rolling, got curtain")
+    assert refusal(photographs) == (
+        f"{where}shutter must be one of 'global' or 'rolling', got \"curtain\""
+    )
 
 
 def test_transparency_is_kept(photographs):
