@@ -32,7 +32,6 @@ import sys
 from collections.abc import Sequence
 from dataclasses import asdict, fields
 from pathlib import Path
-from typing import Any
 
 import mitsuba as mi
 import numpy as np
@@ -173,7 +172,7 @@ def write_dataset(
     print(f"written: {out}: {counted} views, {settings.size}x{settings.size}, {settings.spp} spp")
 
 
-def manifest(path: Path, settings: CaptureSettings) -> dict[str, Any]:
+def manifest(path: Path, settings: CaptureSettings) -> dict[str, object]:
     """What decides the bytes of a capture; after :func:`load_scene`."""
     return {
         "scene": path.name,
@@ -191,7 +190,7 @@ def fingerprint(path: Path) -> str:
     return hashlib.sha256(b"".join(source.read_bytes() for source in sources)).hexdigest()
 
 
-def claim_folder(out: Path, wanted: dict[str, Any]) -> None:
+def claim_folder(out: Path, wanted: dict[str, object]) -> None:
     """Make ``out`` the folder of this capture: a new or empty one, or one that it began.
 
     Raises :class:`UserError` where it holds anything else.

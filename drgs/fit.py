@@ -26,7 +26,6 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -307,7 +306,7 @@ def _remedy(out: Path) -> str:
 
 def summarize(
     config: FitConfig, dataset: Dataset, num_gaussians: int, wall_s: float, quality: Quality
-) -> dict[str, Any]:
+) -> dict[str, object]:
     """What ``metrics.json`` holds."""
     return {
         "iterations": config.iterations,

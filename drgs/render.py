@@ -23,7 +23,7 @@ import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
+from typing import Protocol, runtime_checkable
 
 import mitsuba as mi
 import numpy as np
@@ -488,7 +488,7 @@ def _line(psnr: float, ssim: float) -> str:
     return f"{psnr:9.2f}  {ssim:.4f}"
 
 
-def _without_infinities(value: Any) -> Any:
+def _without_infinities(value: object) -> object:
     """The PSNR of equal pictures is infinite, for which JSON has no number: null."""
     if isinstance(value, dict):
         return {key: _without_infinities(item) for key, item in value.items()}

@@ -19,7 +19,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import drjit as dr
 import drjit.llvm.ad as llvm
@@ -29,6 +29,7 @@ from drgs.accuracy.pipeline import pipeline_of
 from drgs.accuracy.sample_points import SamplePoints
 from drgs.bench.output import add_out, machine, markdown_table, write_csv
 from drgs.bench.scenes import bench_camera, device_camera, stress_scene
+from drgs.cameras.camera import Camera
 from drgs.cli.commands import CommandParser
 from drgs.config.approximations import Approximations
 from drgs.config.load import load_config
@@ -43,7 +44,10 @@ from drgs.reference import splatting as reference
 from drgs.results import metrics
 from drgs.results.files import CONFIG, GAUSSIANS
 from drgs.splatting import rendering
-from drgs.splatting.image_model import PixelCenters
+from drgs.splatting.image_model import PixelCenters, Positions
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 ROUNDS, QUICK_ROUNDS = 9, 3
 SLOW_ROUNDS = 2
@@ -69,7 +73,7 @@ class Rung:
     """One way to render."""
 
     name: str
-    approximations: dict[str, Any] = field(default_factory=dict)
+    approximations: dict[str, object] = field(default_factory=dict)
     is_approximation: bool = True  # of the most accurate form
     samples: int = 1  # per pixel, a square number
     sh_degree: int | None = None  # None: all
@@ -230,7 +234,7 @@ def camera_of(view: View, near: float) -> reference.Camera:
 # ----------------------------------------------------------------------------------------------
 
 
-def positions(samples: int, camera: reference.Camera, float_type: type) -> list[Any]:
+def positions(samples: int, camera: reference.Camera, float_type: type) -> list[Positions]:
     """A grid of points in each pixel."""
     if samples == 1:
         return [PixelCenters()]
@@ -245,8 +249,8 @@ class Renderer:
 
     rung: Rung
     gaussians: Gaussians  # on the device
-    camera: Any
-    positions: list[Any]
+    camera: Camera
+    positions: list[Positions]
     background: tuple[float, float, float]
 
     @staticmethod
@@ -298,7 +302,10 @@ class Renderer:
 
 
 def most_accurate(
-    subject: Subject, camera: reference.Camera, least_alpha: float, region: Any = None
+    subject: Subject,
+    camera: reference.Camera,
+    least_alpha: float,
+    region: tuple[slice, slice] | None = None,
 ) -> np.ndarray:
     """The picture that errors are measured against, or a part of it: (rows, columns)."""
     gaussians = reference.Gaussians(
@@ -373,7 +380,7 @@ def measure(
     return results
 
 
-def _seconds(function: Callable[[], Any]) -> float:
+def _seconds(function: Callable[[], object]) -> float:
     started = time.perf_counter()
     function()
     return time.perf_counter() - started
@@ -426,7 +433,7 @@ def _times(milliseconds: float, first: float) -> str:
     return f"{milliseconds:.0f} ms, {milliseconds / first:.2f}x"
 
 
-def plot(results: Sequence[Measurement]) -> Any:
+def plot(results: Sequence[Measurement]) -> Figure:
     """Error over time for each scene, the Pareto front drawn as a line."""
     scenes = list(dict.fromkeys(m.scene for m in results))
     figure = new_figure(4.6 * len(scenes) + 2.6, 4.6)

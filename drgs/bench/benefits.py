@@ -13,7 +13,7 @@ import argparse
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import mitsuba as mi
 import numpy as np
@@ -33,6 +33,9 @@ from drgs.io.figures import new_figure, write_figure
 from drgs.io.pictures import to_uint8
 from drgs.results.metrics import mean_quality
 from drgs.training.trainer import Trainer
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 SCENES = Path(__file__).parents[2] / "scenes"
 CONFIG = SCENES / "lego_mini.yml"
@@ -64,7 +67,7 @@ class Case:
     effect: str
     name: str
     spoil: Callable[[Dataset, np.random.Generator], Dataset] = lambda data, rng: data
-    changes: tuple[tuple[str, Any], ...] = ()  # of the configuration
+    changes: tuple[tuple[str, object], ...] = ()  # of the configuration
     measure: Measure | None = None  # None: quality on the test views
 
 
@@ -389,7 +392,7 @@ def table(results: Sequence[Result]) -> str:
     return markdown_table(["effect", "fit", "measured"], rows)
 
 
-def plot(rows: dict[str, list[np.ndarray]]) -> Any:
+def plot(rows: dict[str, list[np.ndarray]]) -> Figure:
     """Pictures, a row for each name, a column for each of :data:`SIZES`."""
     figure = new_figure(2 * len(SIZES) + 0.4, 2 * len(rows))
     grid = figure.subplots(len(rows), len(SIZES), squeeze=False)

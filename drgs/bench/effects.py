@@ -12,9 +12,9 @@ import argparse
 import math
 import statistics
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import TYPE_CHECKING, Protocol, TypeVar
 
 import drjit as dr
 import mitsuba as mi
@@ -25,6 +25,9 @@ from drgs.bench.scenes import Scene, bench_camera, bench_gaussians, trainer_of
 from drgs.cli.commands import CommandParser
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 from drgs.io.figures import new_figure, write_figure
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 SIZE = 400
 """px: width and height of all pictures."""
@@ -43,9 +46,9 @@ class Case:
 
     effect: str
     variant: str
-    sensor: dict[str, Any] = field(default_factory=dict)  # instead of a perspective one
-    integrator: dict[str, Any] = field(default_factory=dict)
-    scene: dict[str, Any] = field(default_factory=dict)
+    sensor: dict[str, object] = field(default_factory=dict)  # instead of a perspective one
+    integrator: dict[str, object] = field(default_factory=dict)
+    scene: dict[str, object] = field(default_factory=dict)
     sh_degree: int = 3
     smoothing: bool = False
     of_camera: bool = False  # whether derivatives of the pose and the lens are asked for
@@ -145,7 +148,7 @@ def to_world(shift: float) -> mi.ScalarTransform4f:
     return mi.ScalarTransform4f(pose)
 
 
-def perspective() -> dict[str, Any]:
+def perspective() -> dict[str, object]:
     """A sensor as the bench camera, without a pose and a film."""
     camera = bench_camera(SIZE)
     fov = float(np.degrees(2 * np.arctan(SIZE / 2 / camera.fx)))
@@ -228,7 +231,7 @@ class FittingCase:
 
     effect: str
     variant: str
-    changes: dict[str, Any] = field(default_factory=dict)  # of the configuration
+    changes: dict[str, object] = field(default_factory=dict)  # of the configuration
     view: tuple[str, ...] = ()  # what the data has besides colours
     against: str = "none"
 
@@ -277,7 +280,22 @@ def _extra(name: str) -> np.ndarray:
 # ----------------------------------------------------------------------------------------------
 
 
-def measure(cases: list[Any], make: Callable[[Any], Any], rounds: int) -> list[Price]:
+class Measured(Protocol):
+    """What is timed, ready to run."""
+
+    def forward(self) -> None:
+        """Render a picture."""
+
+    def both(self) -> None:
+        """Render one with its derivatives, or do an iteration."""
+
+
+AnyCase = TypeVar("AnyCase", "Case", "FittingCase")
+
+
+def measure(
+    cases: Sequence[AnyCase], make: Callable[[AnyCase], Measured], rounds: int
+) -> list[Price]:
     """Each case and the first one in turns."""
     base, prices = make(cases[0]), []
     base_operations = operations(base)
@@ -312,7 +330,7 @@ def _ratio(times: list[float], base_times: list[float]) -> float:
     return statistics.median(t / base for t, base in zip(times, base_times, strict=True))
 
 
-def operations(subject: Any) -> int:
+def operations(subject: Measured) -> int:
     """In all kernels of a picture and its derivatives, or of an iteration; warms up."""
     for _ in range(2):
         subject.forward()
@@ -343,7 +361,7 @@ def table(prices: list[Price], forward: str, both: str) -> str:
     return markdown_table([*header, "operations"], rows)
 
 
-def plot(rendered: list[Price], fitted: list[Price]) -> Any:
+def plot(rendered: list[Price], fitted: list[Price]) -> Figure:
     """What each effect adds to the time, by bar."""
     parts = {"picture and derivatives": rendered[1:], "training iteration": fitted[1:]}
     heights = [len(prices) for prices in parts.values()]

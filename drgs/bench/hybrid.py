@@ -11,7 +11,6 @@ import argparse
 import statistics
 import time
 from dataclasses import dataclass
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -112,7 +111,7 @@ def _factor(both: list[float], nested: list[float], splats: list[float]) -> floa
     return statistics.median(rests) / statistics.median(splats)
 
 
-def scene(gaussians: Gaussians, samples: int, objects: dict[str, Any]) -> mi.Scene:
+def scene(gaussians: Gaussians, samples: int, objects: dict[str, object]) -> mi.Scene:
     """The bench scene with more objects."""
     uploaded = gaussians.to(mi.TensorXf)
     film = {
@@ -131,7 +130,7 @@ def scene(gaussians: Gaussians, samples: int, objects: dict[str, Any]) -> mi.Sce
     return mi.load_dict({"type": "scene", "integrator": integrator, "sensor": sensor, **objects})
 
 
-def _objects() -> dict[str, Any]:
+def _objects() -> dict[str, object]:
     """A ball and a box in the middle of the splats, and a light above the camera."""
     camera = bench_camera(SIZE)
     transform = mi.ScalarTransform4f

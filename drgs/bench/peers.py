@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from importlib.util import find_spec
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -56,7 +55,7 @@ def volprim_renderer(problem: Problem, shape: str, seconds: float) -> Renderer:
     return _mitsuba_renderer(f"volprim_rf_basic, {shape}", scene, problem, "shapes.", seconds)
 
 
-def volprim_scene(gaussians: Gaussians, shape: str, max_depth: int) -> dict[str, Any]:
+def volprim_scene(gaussians: Gaussians, shape: str, max_depth: int) -> dict[str, object]:
     """A scene of ``ellipsoids`` or ``ellipsoidsmesh``, without a sensor, in display space."""
     quats_xyzw = gaussians.quats / np.linalg.norm(gaussians.quats, axis=1, keepdims=True)
     quats_xyzw = np.roll(quats_xyzw, -1, axis=1)
@@ -114,8 +113,8 @@ def _mitsuba_renderer(
 
 
 def sensor_of(
-    camera: reference.Camera, near_clip: float, sampler: dict[str, Any]
-) -> dict[str, Any]:
+    camera: reference.Camera, near_clip: float, sampler: dict[str, object]
+) -> dict[str, object]:
     """Mitsuba's sensor, with a film of single precision and box filter; fx and fy must agree."""
     to_world = np.eye(4)
     to_world[:3, :3] = camera.rotation.T * [-1, -1, 1]  # Mitsuba's x is to the left, its y up

@@ -20,7 +20,7 @@ from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 from unittest.mock import patch
 
 import drjit as dr
@@ -37,6 +37,10 @@ from drgs.data import load_dataset
 from drgs.io.figures import new_figure, write_figure
 from drgs.results.files import HISTORY, METRICS
 from drgs.training import densify, optimizer
+
+if TYPE_CHECKING:
+    from drjit.opt import Adam
+    from matplotlib.figure import Figure
 
 SCENES = Path(__file__).parents[2] / "scenes"
 CONFIG = SCENES / "lego_paper.yml"
@@ -59,8 +63,8 @@ class Case:
     name: str
     size: int  # px
     generated: bool = False  # pictures of the shipped generator instead of NeRF-synthetic's Lego
-    overrides: Callable[[FitConfig, float], dict[str, Any]] = lambda config, extent: {}
-    rules: Callable[[], Any] = nullcontext  # a context in which the fit runs
+    overrides: Callable[[FitConfig, float], dict[str, object]] = lambda config, extent: {}
+    rules: Callable[[], object] = nullcontext  # a context in which the fit runs
 
 
 @dataclass(frozen=True)
@@ -88,8 +92,8 @@ def _prune_added_rows_at_once() -> Iterator[None]:
     """The prune of a step also meets what the step has added, as in the reference's code."""
 
     def densify_and_prune(
-        opt: Any, statistics: Any, config: DensifyConfig, extent: float, iteration: int,
-        seed: int, prefix: str = "",
+        opt: Adam, statistics: densify.DensityStatistics, config: DensifyConfig, extent: float,
+        iteration: int, seed: int, prefix: str = "",
     ) -> densify.DensityReport:  # fmt: skip
         report = original(opt, statistics, config, extent, iteration, seed, prefix)
         opacities = expit(np.array(opt[prefix + "logit_opacities"], np.float64))
@@ -125,7 +129,7 @@ def _reset_until_the_end() -> Iterator[None]:
         yield
 
 
-def _unscaled_means_rate(config: FitConfig, extent: float) -> dict[str, Any]:
+def _unscaled_means_rate(config: FitConfig, extent: float) -> dict[str, object]:
     rates = config.optimizer
     return {
         "optimizer.means_lr": rates.means_lr / extent,
@@ -133,7 +137,7 @@ def _unscaled_means_rate(config: FitConfig, extent: float) -> dict[str, Any]:
     }
 
 
-def _threshold_in_pixels(config: FitConfig, extent: float) -> dict[str, Any]:
+def _threshold_in_pixels(config: FitConfig, extent: float) -> dict[str, object]:
     # A gradient per pixel is one in NDC divided by half the film's size.
     return {"densify.grad_threshold": config.densify.grad_threshold * SMALL / 2}
 
@@ -202,7 +206,7 @@ def fit_case(
     case = CASES[number - 1]
     if case.generated:
         data = generate(out / f"pictures_{case.size}", case.size)
-    values: dict[str, Any] = {"data.image_size": case.size}
+    values: dict[str, object] = {"data.image_size": case.size}
     if data is not None:
         values["data.path"] = data.resolve()
     if iterations is not None:
@@ -219,7 +223,7 @@ def fit_case(
         fit.main(arguments)
 
 
-def _assignments(values: dict[str, Any]) -> list[str]:
+def _assignments(values: dict[str, object]) -> list[str]:
     return [f"{key}={value}" for key, value in values.items()]
 
 
@@ -273,7 +277,7 @@ def _table(found: list[Outcome]) -> str:
     return markdown_table(header, rows)
 
 
-def plot(folders: dict[str, Path]) -> Any:
+def plot(folders: dict[str, Path]) -> Figure:
     """Population over the iterations, one curve a fit."""
     figure = new_figure(8, 5)
     panel = figure.subplots()

@@ -12,7 +12,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import Any
 
 import drjit as dr
 
@@ -58,7 +57,7 @@ def stage_clock() -> Iterator[StageClock]:
 
     def ends(before: str | None, after: str | None) -> Callable:
         def wrap(function: Callable) -> Callable:
-            def wrapped(*arguments: Any, **keywords: Any) -> Any:
+            def wrapped(*arguments: object, **keywords: object) -> object:
                 if before:
                     clock.end(before)
                 result = function(*arguments, **keywords)

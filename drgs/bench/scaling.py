@@ -15,7 +15,7 @@ import statistics
 import time
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING
 
 import drjit as dr
 import mitsuba as mi
@@ -28,6 +28,10 @@ from drgs.bench.scenes import Scene, bench_camera, bench_gaussians, frame_of, tr
 from drgs.cli.commands import CommandParser
 from drgs.core.private import clear_memory_peak, memory_peak
 from drgs.io.figures import new_figure, write_figure
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+    from matplotlib.ticker import LogLocator
 
 STEPS, QUICK_STEPS = 12, 4
 
@@ -202,13 +206,13 @@ def _short(number: int) -> str:
     return str(number)
 
 
-def _ticks() -> Any:
+def _ticks() -> LogLocator:
     from matplotlib.ticker import LogLocator
 
     return LogLocator(subs=(1, 2, 5))
 
 
-def plot(results: dict[str, list[Result]]) -> Any:
+def plot(results: dict[str, list[Result]]) -> Figure:
     """Time and memory of each sweep, with the fitted exponents."""
     figure = new_figure(11, 5.5)
     panels = figure.subplots(2, len(results))

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any
 
 import drjit.llvm.ad as llvm
 import numpy as np
@@ -115,7 +114,7 @@ def view_of(scene: Scene) -> View:
 
 
 def trainer_of(
-    scene: Scene, changes: Mapping[str, Any] = {}, extras: Mapping[str, np.ndarray] = {}
+    scene: Scene, changes: Mapping[str, object] = {}, extras: Mapping[str, np.ndarray] = {}
 ) -> Trainer:
     """Trains on one view; the population stays, though statistics are gathered as in a fit.
 

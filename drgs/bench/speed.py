@@ -18,7 +18,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import drjit as dr
 import mitsuba as mi
@@ -36,6 +36,9 @@ from drgs.gaussians.parameters import Gaussians
 from drgs.io.figures import new_figure, write_figure
 from drgs.results.files import GAUSSIANS
 from drgs.training.trainer import Trainer
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 SIZE = 400
 """px: width and height of all pictures."""
@@ -300,7 +303,7 @@ def _write(
     print(f"\nwritten: {', '.join(str(out / f'speed.{kind}') for kind in ('csv', 'json', 'png'))}")
 
 
-def plot(timings: list[Timing], reports: list[IterationReport]) -> Any:
+def plot(timings: list[Timing], reports: list[IterationReport]) -> Figure:
     """Times of all implementations, and the stages of an iteration."""
     figure = new_figure(11, 4.5)
     left, right = figure.subplots(1, 2)

@@ -16,7 +16,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING
 
 import drjit.llvm.ad as llvm
 import numpy as np
@@ -28,6 +28,9 @@ from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 from drgs.io.figures import new_figure, write_figure
 from drgs.reference import splatting as reference
 from drgs.splatting import rendering
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 WIDTH, HEIGHT, FOCAL = 48, 40, 60.0
 """px: small pictures, since the reference draws each of them many times."""
@@ -243,7 +246,7 @@ def _root_mean_square(values: list[float]) -> float:
 def _stored(gaussians: reference.Gaussians, camera: reference.Camera) -> Scene:
     """As single precision stores them."""
 
-    def single(values: Any) -> np.ndarray:
+    def single(values: np.ndarray) -> np.ndarray:
         return np.asarray(values, dtype=np.float32).astype(np.float64)
 
     fields = {name: single(getattr(gaussians, name)) for name in PARAMETER_NAMES}
@@ -255,7 +258,7 @@ def _moved(gaussians: reference.Gaussians, camera: reference.Camera, seed: int) 
     """Every number moved by up to one rounding; means and camera relative to each other."""
     rng = np.random.default_rng([6, seed])
 
-    def moved(values: Any) -> np.ndarray:
+    def moved(values: np.ndarray) -> np.ndarray:
         values = np.asarray(values)
         return values * (1 + UNIT_ROUNDOFF * rng.uniform(-1, 1, values.shape))
 
@@ -329,7 +332,7 @@ def _summary(results: dict[str, list[Measurement]]) -> str:
     return markdown_table(header, rows)
 
 
-def plot(results: dict[str, list[Measurement]]) -> Any:
+def plot(results: dict[str, list[Measurement]]) -> Figure:
     """One panel a sweep: errors as lines, their noise dashed in the same colour."""
     figure = new_figure(11, 6)
     axes = figure.subplots(2, 2, sharey=True).ravel()

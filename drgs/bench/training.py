@@ -19,7 +19,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 from drgs import fit
 from drgs.bench.output import add_out, machine, markdown_table, write_csv
@@ -30,6 +30,9 @@ from drgs.config.schema import FitConfig
 from drgs.io.figures import new_figure, write_figure
 from drgs.results.files import HISTORY, METRICS
 from drgs.training.budget import STRATEGIES, Strategy
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 CONFIG = Path(__file__).parents[2] / "scenes" / "lego_mini.yml"
 
@@ -57,7 +60,7 @@ def _strategy(strategy: Strategy) -> Choice:
     return Choice(strategy.name, lambda config: strategy.applied(config, config.init.num_points))
 
 
-def _other(name: str, **values: Any) -> Choice:
+def _other(name: str, **values: object) -> Choice:
     """values: by names of the configuration, with __ for a dot."""
     changes = {key.replace("__", "."): value for key, value in values.items()}
     return Choice(name, lambda config: changed(config, changes))
@@ -190,7 +193,7 @@ def table(points: Sequence[Point]) -> str:
     return markdown_table(header, rows)
 
 
-def plot(points: Sequence[Point]) -> Any:
+def plot(points: Sequence[Point]) -> Figure:
     """PSNR over time, one curve a choice."""
     figure = new_figure(9, 5)
     axes = figure.subplots()

@@ -17,7 +17,6 @@ import argparse
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import mitsuba as mi
 import numpy as np
@@ -44,7 +43,7 @@ VOLPRIM = reference_rays.ImageModel(
     low_pass=0.0,
 )
 
-CHANGES: dict[str, dict[str, Any]] = {
+CHANGES: dict[str, dict[str, object]] = {
     "all of its choices": {},
     "no step behind an entry": {"step": 0.0},
     "a pixel ends at 1e-4, before the splat": {"stop": "before", "transmittance_stop": 1e-4},

@@ -12,7 +12,7 @@ import platform
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, redirect_stderr
-from typing import Any, TextIO
+from typing import TextIO
 
 import drjit as dr
 import mitsuba as mi
@@ -138,7 +138,7 @@ class _RangeReports:
             self._reports.append(one_line(text))
         return self._stream.write(text)
 
-    def __getattr__(self, name: str) -> Any:
+    def __getattr__(self, name: str) -> object:
         """Everything else is the stream's."""
         return getattr(self._stream, name)
 

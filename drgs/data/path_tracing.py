@@ -9,7 +9,6 @@ import traceback
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -115,7 +114,7 @@ def load_scene(path: Path) -> mi.Scene:
     return scene
 
 
-def _scene_dictionary(path: Path) -> dict[str, Any]:
+def _scene_dictionary(path: Path) -> dict[str, object]:
     """What ``scene()`` of a Python file returns."""
     try:
         function = getattr(_import(path), "scene", None)
