@@ -8,7 +8,6 @@ whole.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
 
 from drgs.config.schema import FitConfig
 
@@ -22,9 +21,9 @@ _COUNTS = (
 )
 
 
-def changed(config: FitConfig, changes: Mapping[str, Any]) -> FitConfig:
+def changed(config: FitConfig, changes: Mapping[str, object]) -> FitConfig:
     """``config`` with other values, by names such as ``densify.every``; checked like a file's."""
-    values: dict[str, Any] = config.model_dump()
+    values: dict[str, object] = config.model_dump()
     for key, value in changes.items():
         *sections, name = key.split(".")
         target = values
@@ -45,7 +44,7 @@ def with_iterations(config: FitConfig, iterations: int) -> FitConfig:
     def scaled(count: int | None) -> int | None:
         return count if not count else max(1, round(count * share))  # None, and 0: from the start
 
-    changes: dict[str, Any] = {"iterations": iterations}
+    changes: dict[str, object] = {"iterations": iterations}
     for key in _COUNTS:
         section, name = key.split(".")
         changes[key] = scaled(getattr(getattr(config, section), name))

@@ -6,7 +6,7 @@ import math
 import re
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import Any, get_args
+from typing import get_args
 
 import yaml
 from pydantic import BaseModel, ValidationError
@@ -94,7 +94,7 @@ def known_keys() -> list[str]:
     return [key for key, _ in _fields(FitConfig)]
 
 
-def _fields(model: type[BaseModel], prefix: str = "") -> Iterator[tuple[str, Any]]:
+def _fields(model: type[BaseModel], prefix: str = "") -> Iterator[tuple[str, object]]:
     for name, field in model.model_fields.items():
         yield prefix + name, field.annotation
         section = _section(field.annotation)
@@ -102,7 +102,7 @@ def _fields(model: type[BaseModel], prefix: str = "") -> Iterator[tuple[str, Any
             yield from _fields(section, f"{prefix}{name}.")
 
 
-def _section(annotation: Any) -> type[BaseModel] | None:
+def _section(annotation: object) -> type[BaseModel] | None:
     """The section that a value is, or that the elements of a list are."""
     for candidate in (annotation, *get_args(annotation)):
         if isinstance(candidate, type) and issubclass(candidate, BaseModel):
@@ -120,7 +120,7 @@ class _Loader(yaml.SafeLoader):
 
     depth = 0
 
-    def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node:
+    def compose_node(self, parent: yaml.Node | None, index: object) -> yaml.Node:
         event = self.peek_event()
         if isinstance(event, yaml.AliasEvent):
             raise yaml.MarkedYAMLError(
@@ -170,7 +170,7 @@ def _read_yaml(path: Path) -> dict:
     return values
 
 
-def _parse_override(override: str) -> tuple[str, Any]:
+def _parse_override(override: str) -> tuple[str, object]:
     key, equals, text = override.partition("=")
     key = key.strip()
     if not equals or not key:
@@ -185,7 +185,7 @@ def _parse_override(override: str) -> tuple[str, Any]:
         raise UserError(f"--set {key}: not a YAML value: {one_line(text)}") from None
 
 
-def _insert(values: dict, key: str, value: Any) -> None:
+def _insert(values: dict, key: str, value: object) -> None:
     *sections, leaf = key.split(".")
     for section in sections:
         if not isinstance(values.get(section), dict):
@@ -232,7 +232,7 @@ def _explain(file: str, item: ErrorDetails, overridden: set[str]) -> str:
 
 
 def _description(key: str) -> str:
-    model: Any = FitConfig
+    model = FitConfig
     *sections, leaf = (part for part in key.split(".") if not part.isdigit())
     for section in sections:
         model = _section(model.model_fields[section].annotation)
@@ -240,7 +240,7 @@ def _description(key: str) -> str:
     return field.description or field.annotation.__doc__
 
 
-def _show(value: Any) -> str:
+def _show(value: object) -> str:
     """The value as YAML writes it, on one line and shortened."""
     if isinstance(value, str):
         return one_line(repr(value), limit=60)

@@ -9,14 +9,15 @@ pose, what stands at the top of the file is every frame's that has none of its o
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 
+from drgs.cameras.camera import Lens
 from drgs.config.schema import DataConfig
 from drgs.core.errors import UserError
 from drgs.data.images import downscale_depth, downscale_mask, read_depth, read_mask
 from drgs.data.transforms import CLOSE, Frame, image_path, lens_of, motion_of
+from drgs.data.types import Motion
 
 MASK, DEPTH = "mask_path", "depth_file_path"
 
@@ -25,7 +26,9 @@ PICTURE_UNIT = 1e-3
 nerfstudio has it. An ``.npy`` file then holds scene units, which it has numbers for."""
 
 
-def extras_of(config: DataConfig, frame: Frame, size: tuple[int, int]) -> dict[str, Any]:
+def extras_of(
+    config: DataConfig, frame: Frame, size: tuple[int, int]
+) -> dict[str, Lens | Motion | np.ndarray | None]:
     """``lens``, ``motion``, ``mask`` and ``depth`` of a :class:`drgs.data.types.View`.
 
     size: of the photograph, W, H, before it is scaled. What the configuration ignores is not

@@ -13,7 +13,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
-from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
+from typing import TYPE_CHECKING, Annotated, Literal, TypeVar
 
 import numpy as np
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, Strict, ValidationError
@@ -335,7 +335,7 @@ def unique_names(files: Sequence[str]) -> list[str]:
     return names
 
 
-def in_parallel(function: Callable[..., T], *arguments: Sequence[Any]) -> tuple[T, ...]:
+def in_parallel(function: Callable[..., T], *arguments: Sequence[object]) -> tuple[T, ...]:
     """``map`` on threads, in order: decoding images releases Python's lock."""
     with ThreadPoolExecutor() as pool:
         return tuple(pool.map(function, *arguments))

@@ -5,17 +5,49 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
 from drgs.io.figures import new_figure, write_figure
 
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
 SMOOTHING_PARTS = 50
 """The smooth line of a curve is a running mean over this part of all rows."""
 
 
-def write_curves(path: Path, history: Sequence[Any]) -> None:
+class CurvePoint(Protocol):
+    """What the curves show of an iteration: a row of ``history.csv``."""
+
+    @property
+    def iteration(self) -> int:
+        """The first is 1."""
+
+    @property
+    def loss(self) -> float:
+        """Of the training view."""
+
+    @property
+    def psnr(self) -> float:
+        """Of the training view, dB."""
+
+    @property
+    def num_gaussians(self) -> int:
+        """N."""
+
+    @property
+    def means_lr(self) -> float:
+        """The learning rate of the means, world units."""
+
+    @property
+    def wall_s(self) -> float:
+        """Seconds spent so far."""
+
+
+def write_curves(path: Path, history: Sequence[CurvePoint]) -> None:
     """Write a picture of the loss, the PSNR, the population and the rates over the iterations."""
     write_figure(path, draw_curves(history, LIGHT))
 
@@ -52,7 +84,7 @@ class Panel:
     noisy: bool = False  # drawn with its running mean
 
 
-def _panels(history: Sequence[Any]) -> list[Panel]:
+def _panels(history: Sequence[CurvePoint]) -> list[Panel]:
     def column(name: str) -> np.ndarray:
         return np.array([getattr(row, name) for row in history], np.float64)
 
@@ -69,7 +101,7 @@ def _panels(history: Sequence[Any]) -> list[Panel]:
     ]
 
 
-def draw_curves(history: Sequence[Any], theme: Theme) -> Any:
+def draw_curves(history: Sequence[CurvePoint], theme: Theme) -> Figure:
     """A matplotlib figure of six panels over the iterations."""
     figure = new_figure(11, 5.8, paper=theme.paper)
     figure.get_layout_engine().set(w_pad=0.1, h_pad=0.1)
@@ -82,7 +114,7 @@ def draw_curves(history: Sequence[Any], theme: Theme) -> Any:
     return figure
 
 
-def _draw(axis: Any, panel: Panel, theme: Theme) -> None:
+def _draw(axis: Axes, panel: Panel, theme: Theme) -> None:
     y = panel.y
     axis.set_title(panel.title, fontsize=10, color=theme.ink, loc="left")
     axis.set_yscale(panel.scale)

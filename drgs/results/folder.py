@@ -10,7 +10,6 @@ from __future__ import annotations
 import os
 import shutil
 from pathlib import Path
-from typing import Any
 
 from drgs.config.load import dump_config, load_config
 from drgs.config.schema import FitConfig
@@ -139,12 +138,12 @@ def _which_run(folder: Path, config: FitConfig) -> str:
     )
 
 
-def _values(config: FitConfig) -> dict[str, Any]:
+def _values(config: FitConfig) -> dict[str, object]:
     """What decides a result: everything but the section ``output``."""
     return config.model_dump(mode="json", exclude={"output"})
 
 
-def _differences(theirs: Any, ours: Any, key: str = "") -> list[str]:
+def _differences(theirs: object, ours: object, key: str = "") -> list[str]:
     if isinstance(theirs, dict) and isinstance(ours, dict):
         return [
             difference

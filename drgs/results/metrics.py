@@ -8,9 +8,10 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any
+from typing import TypedDict
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.ndimage import correlate1d
 
 WINDOW = np.exp(-0.5 * (np.arange(-5, 6) / 1.5) ** 2)
@@ -27,7 +28,30 @@ class Quality:
     num_views: int
 
 
-def psnr(image: Any, target: Any, mask: Any = None) -> float:
+class SplitMetrics(TypedDict):
+    """Of the views that were measured, in ``metrics.json``."""
+
+    psnr: float  # dB
+    ssim: float
+    num_views: int
+    split: str
+
+
+class FitMetrics(TypedDict):
+    """What ``metrics.json`` holds of a fit."""
+
+    iterations: int
+    num_gaussians: int
+    wall_s: float  # spent on iterations
+    test: SplitMetrics
+    seed: int
+    versions: dict[str, str]
+    variant: str
+    threads: int
+    config: dict[str, object]
+
+
+def psnr(image: ArrayLike, target: ArrayLike, mask: ArrayLike | None = None) -> float:
     """Return the peak signal-to-noise ratio in dB, -10 log10(mean squared error).
 
     image, target: (H, W, 3) display space, clamped to [0, 1] (the peak is 1). mask: (H, W), 1 where
@@ -38,7 +62,7 @@ def psnr(image: Any, target: Any, mask: Any = None) -> float:
         return float(-10 * np.log10(_mean((image - target) ** 2, mask)))
 
 
-def ssim(image: Any, target: Any, mask: Any = None) -> float:
+def ssim(image: ArrayLike, target: ArrayLike, mask: ArrayLike | None = None) -> float:
     """Return the structural similarity, averaged over all pixels and channels.
 
     image, target: (H, W, 3) display space, clamped to [0, 1]. Windows reach beyond the image into
@@ -57,7 +81,7 @@ def ssim(image: Any, target: Any, mask: Any = None) -> float:
     return float(_mean(luminance * contrast_structure, mask))
 
 
-def mean_quality(pairs: Iterable[tuple[Any, ...]]) -> Quality:
+def mean_quality(pairs: Iterable[tuple[ArrayLike | None, ...]]) -> Quality:
     """Return the means over views of PSNR and SSIM, each view weighing the same.
 
     pairs: (image, target) of each view, perhaps its mask; may be a generator, one view is held at a
@@ -70,7 +94,7 @@ def mean_quality(pairs: Iterable[tuple[Any, ...]]) -> Quality:
     return Quality(psnr=float(mean_psnr), ssim=float(mean_ssim), num_views=len(scores))
 
 
-def _mean(values: np.ndarray, mask: Any) -> float:
+def _mean(values: np.ndarray, mask: ArrayLike | None) -> float:
     """Over the pixels that count; NaN if none does."""
     return np.mean(values) if mask is None else np.mean(values[np.asarray(mask) > 0])
 
@@ -81,7 +105,7 @@ def _windowed(values: np.ndarray) -> np.ndarray:
     return values
 
 
-def _prepare(where: str, image: Any, target: Any) -> tuple[np.ndarray, np.ndarray]:
+def _prepare(where: str, image: ArrayLike, target: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
     image, target = (np.asarray(values, dtype=np.float64) for values in (image, target))
     if image.shape != target.shape or image.ndim != 3 or image.shape[2] != 3:
         raise ValueError(

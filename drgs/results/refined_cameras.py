@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -68,9 +67,9 @@ def _moved_motion(view: View, camera_to_world: np.ndarray) -> Motion | None:
     return replace(view.motion, close_to_world=camera_to_world @ between)
 
 
-def lens_and_motion(view: View) -> dict[str, Any]:
+def lens_and_motion(view: View) -> dict[str, object]:
     """What ``transforms.json`` says of a camera besides its pose and intrinsics."""
-    values: dict[str, Any] = {}
+    values: dict[str, object] = {}
     if view.lens is not None:
         model = {"opencv": "FULL_OPENCV", "fisheye": "OPENCV_FISHEYE"}[view.lens.kind]
         values |= {"camera_model": model, **view.lens.named()}

@@ -14,7 +14,6 @@ from collections.abc import Iterable, Sequence
 from importlib import resources
 from pathlib import Path
 from string import Template
-from typing import Any
 
 import mitsuba as mi
 import numpy as np
@@ -29,9 +28,9 @@ from drgs.gaussians.parameters import Gaussians
 from drgs.integrator.scene import render_views
 from drgs.io.figures import pixels_of
 from drgs.io.pictures import encode, write_animation, write_png
-from drgs.results.curves import THEMES, draw_curves, write_curves
+from drgs.results.curves import THEMES, CurvePoint, draw_curves, write_curves
 from drgs.results.files import CURVES, ORBIT, REPORT, SIDE_BY_SIDE
-from drgs.results.metrics import psnr, ssim
+from drgs.results.metrics import FitMetrics, psnr, ssim
 
 DIFFERENCE_GAIN = 5.0
 """Of difference pictures, 0.5 + gain (fitted - photograph): saturates at 10 % of the range."""
@@ -57,8 +56,8 @@ def write_results(
     scene: mi.Scene,
     gaussians: Gaussians,
     images: Sequence[np.ndarray],
-    history: Sequence[Any],
-    metrics: dict[str, Any],
+    history: Sequence[CurvePoint],
+    metrics: FitMetrics,
 ) -> None:
     """Write ``side_by_side/``, ``curves.png``, ``orbit.webp`` and ``.gif``, ``report.html``.
 
@@ -125,8 +124,8 @@ def write_report(
     title: str,
     dataset: Dataset,
     images: Sequence[np.ndarray],
-    history: Sequence[Any],
-    metrics: dict[str, Any],
+    history: Sequence[CurvePoint],
+    metrics: FitMetrics,
     orbit: bytes,
 ) -> None:
     """Write one HTML file with everything in it, which needs no network and no other file.
@@ -170,7 +169,7 @@ def choose_views(scores: Sequence[float]) -> list[tuple[str, int]]:
     return [("Best", order[0]), ("Median", order[len(order) // 2]), ("Worst", order[-1])]
 
 
-def _headline(metrics: dict[str, Any]) -> list[tuple[str, str, str]]:
+def _headline(metrics: FitMetrics) -> list[tuple[str, str, str]]:
     """(value, unit, label) of the four numbers at the top."""
     test = metrics["test"]
     return [
@@ -181,7 +180,7 @@ def _headline(metrics: dict[str, Any]) -> list[tuple[str, str, str]]:
     ]
 
 
-def _facts(dataset: Dataset, metrics: dict[str, Any]) -> list[tuple[str, str]]:
+def _facts(dataset: Dataset, metrics: FitMetrics) -> list[tuple[str, str]]:
     versions = metrics["versions"]
     names = {"mitsuba": "Mitsuba", "drjit": "Dr.Jit", "numpy": "NumPy", "python": "Python"}
     names["llvm"] = "LLVM"
@@ -246,7 +245,7 @@ def _row(name: str, value: str) -> str:
     return f"<tr><th>{html.escape(name)}</th><td>{html.escape(value)}</td></tr>"
 
 
-def _data_uri(image: np.ndarray, **options: Any) -> str:
+def _data_uri(image: np.ndarray, **options: float) -> str:
     return _uri("image/webp", encode(image, "webp", **options))
 
 
