@@ -19,6 +19,7 @@ import pytest
 import yaml
 from conftest import REPOSITORY
 from PIL import Image
+from support.commands import run_in_process
 
 from drgs import fit
 from drgs.config.load import dump_config, load_config
@@ -266,13 +267,7 @@ def test_a_picture_that_claims_to_be_huge_takes_no_memory(scene, size):
 
 
 def run_command(*arguments):
-    return subprocess.run(
-        [sys.executable, "-m", "drgs.fit", *map(str, arguments)],
-        cwd=REPOSITORY,
-        capture_output=True,
-        text=True,
-        timeout=120,
-    )
+    return run_in_process(fit.main, *arguments)
 
 
 def contents(folder):
@@ -285,9 +280,19 @@ def assert_refused(result, message):
     assert result.stderr.count("\n") == 1, result.stderr
 
 
+def run_process(*arguments):
+    return subprocess.run(
+        [sys.executable, "-m", "drgs.fit", *map(str, arguments)],
+        cwd=REPOSITORY,
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+
+
 def test_the_command_itself_refuses_a_damaged_point_cloud(scene):
     os.truncate(scene / "points.ply", 500)
-    assert_refused(run_command(scene / "a.yml"), "points.ply: not a valid PLY file")
+    assert_refused(run_process(scene / "a.yml"), "points.ply: not a valid PLY file")
     assert not (scene / "out").exists()
 
 

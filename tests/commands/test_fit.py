@@ -13,10 +13,12 @@ import numpy as np
 import pytest
 import yaml
 from conftest import REPOSITORY
+from support.commands import run_in_process
 
 from drgs.cli.execution import executing
 from drgs.config.load import dump_config, load_config
 from drgs.data import initial_gaussians, load_dataset
+from drgs.fit import main
 from drgs.gaussians.parameters import Gaussians
 from drgs.reference import splatting as reference
 
@@ -110,6 +112,10 @@ def configuration(dataset):
 
 
 def fit(*arguments):
+    return run_in_process(main, *arguments)
+
+
+def fit_in_a_process(*arguments):
     return subprocess.run(
         [sys.executable, "-m", "drgs.fit", *map(str, arguments)],
         cwd=REPOSITORY,
@@ -122,7 +128,7 @@ def fit(*arguments):
 @pytest.fixture(scope="module")
 def fitted(configuration, tmp_path_factory):
     out = tmp_path_factory.mktemp("out") / "first"
-    return fit(configuration, "--out", out), out
+    return fit_in_a_process(configuration, "--out", out), out
 
 
 def test_fit_writes_its_outputs_and_nothing_temporary(fitted):
