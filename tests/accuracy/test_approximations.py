@@ -106,15 +106,11 @@ def test_gradients_equal_central_differences_of_the_reference(scene, name):
 
 
 @all_scenes
-<<<<<<< HEAD
-@all_approximations
-=======
 @pytest.mark.parametrize(
     ("name", "precision"),
-    [*((name, FLOAT64) for name in CHOICES), ("all three, other cuts", FLOAT32)],
-    ids=str,
+    [*((name, FLOAT64) for name in APPROXIMATIONS), ("all three, other cuts", FLOAT32)],
+    ids=lambda value: value if isinstance(value, str) else f"float{32 * (1 + (value is FLOAT64))}",
 )
->>>>>>> 827e4b4 (Tests of the commands start a process only where a process is what they test; transposes of approximations in double precision)
 def test_adjoint_is_the_transpose_of_the_tangent(precision, scene, name):
     """Adjoints of both precisions are compared below."""
     check_adjoint_is_the_transpose_of_the_tangent(precision, scene, name)
