@@ -86,15 +86,20 @@ def model(tmp_path):
     return tmp_path / "model.ply"
 
 
-def test_the_package_is_the_wheels_and_complete(scripts, tmp_path):
-    program = (
-        "import drgs, drgs.plugins, drgs.training.budget as budget\n"
-        "assert budget.load_curves()\n"
-        "print(drgs.__file__, drgs.plugins.__file__)"
-    )
-    files = run(scripts / "python", "-c", program, cwd=tmp_path).split()
-    for file in files:
-        assert str(scripts.parent) in file
+def files_of(package):
+    """Paths of a package's files, without what Python compiles."""
+    found = (path.relative_to(package) for path in package.rglob("*") if path.is_file())
+    return {path for path in found if "__pycache__" not in path.parts}
+
+
+def test_the_package_is_the_wheels_and_holds_every_file(scripts, tmp_path):
+    program = "import drgs, drgs.plugins; print(drgs.__file__, drgs.plugins.__file__, sep='\\n')"
+    shown = run(scripts / "python", "-c", program, cwd=tmp_path).splitlines()
+    package, plugins = (Path(file).parent for file in shown)
+    assert package.is_relative_to(scripts.parent) and plugins == package / "plugins"
+    expected = files_of(REPOSITORY / "drgs")
+    expected |= {Path("plugins", path) for path in files_of(REPOSITORY / "plugins")}
+    assert files_of(package) == expected
 
 
 def test_the_console_script_and_the_module_are_the_same_program(scripts, tmp_path):
