@@ -117,6 +117,7 @@ def test_the_stress_scene_is_what_it_says():
     assert (near[:, 2] < 3).all() and np.exp(gaussians.log_scales[1400:1460]).min() > 0.05
 
 
+@pytest.mark.slow
 def test_the_command_measures_a_ply_and_the_stress_scene(tmp_path, capsys, monkeypatch):
     mi.set_variant("llvm_ad_rgb")
     bench_gaussians(50).save(tmp_path / "few.ply")

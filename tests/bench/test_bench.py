@@ -24,6 +24,7 @@ def stability_run(tmp_path_factory):
     return out
 
 
+@pytest.mark.slow
 def test_stability_writes_its_table_and_plot(stability_run):
     with (stability_run / "stability.csv").open() as file:
         rows = list(csv.DictReader(file))
@@ -32,6 +33,7 @@ def test_stability_writes_its_table_and_plot(stability_run):
     assert Image.open(stability_run / "stability.png").size[0] > 800
 
 
+@pytest.mark.slow
 def test_stability_finds_no_error_beyond_the_conditioning(stability_run):
     """As in test_hard_cases.py: 30 times the noise, 4 roundings in the exponential, n in a sum."""
     with (stability_run / "stability.csv").open() as file:

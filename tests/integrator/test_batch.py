@@ -64,15 +64,16 @@ def test_pictures_stand_side_by_side(wall, pixel_format):
 
 
 def test_several_samples_are_those_of_the_whole_film():
-    """A box filter averages them; each picture's are a part of the film's."""
+    """A box filter averages them; each picture's are a part of the film's. Half a percent
+    of noise with 256 of them is a percent with 64."""
     center = image_of(load(batch()))
-    sampled = image_of(load(batch(samples=256)))
-    other = image_of(load(batch(samples=256)), seed=5)
+    sampled = image_of(load(batch(samples=64)))
+    other = image_of(load(batch(samples=64)), seed=5)
     assert np.abs(sampled - other).max() > 0
-    assert np.abs(sampled - other).mean() < 5e-3
-    alone = [image_of(load(view.sensor(samples=256))) for view in SENSORS]
+    assert np.abs(sampled - other).mean() < 1e-2
+    alone = [image_of(load(view.sensor(samples=64))) for view in SENSORS]
     difference = np.abs(sampled - np.concatenate(alone, axis=1))
-    assert difference.mean() < 5e-3
+    assert difference.mean() < 1e-2
     assert np.abs(sampled - center).mean() > difference.mean()
 
 
