@@ -381,7 +381,8 @@ class _Pictures:
     def _background(self, values: Mapping[str, Any], index: int, channel: int) -> Any:
         """Float of one entry."""
         backgrounds = values["backgrounds"]
-        place = self.types.UInt32(index * backgrounds.shape[1] + channel)
+        # Opaque, or each camera would have kernels of its own.
+        place = dr.opaque(self.types.UInt32, index * backgrounds.shape[1] + channel)
         return dr.gather(self.types.Float, backgrounds.array, place)
 
     def _images(self, planes: list[list[Any]]) -> Any:
@@ -394,7 +395,8 @@ class _Pictures:
     def _channels(self, images: Any, index: int) -> list[Any]:
         """Of one camera's picture in (C, H, W, channels), each Float (H * W,)."""
         _, height, width, count = images.shape
-        pixel = dr.arange(self.types.UInt32, height * width) + index * (height * width)
+        first = dr.opaque(self.types.UInt32, index * height * width)
+        pixel = first + dr.arange(self.types.UInt32, height * width)
         return [dr.gather(self.types.Float, images.array, pixel * count + k) for k in range(count)]
 
     def _split(self, channels: list[Any]) -> tuple[list[Any], list[Any]]:
@@ -558,7 +560,10 @@ class _Pictures:
         moved = d_viewmat[:3, 3] + d_viewmat[:3, :3] @ center
         d_center = -np.linalg.solve(viewmat[:3, :3], moved)
         film = [d_K[0, 0], d_K[1, 1], d_K[0, 2], d_K[1, 2]]
-        return [self.types.Float(x) for x in (*d_viewmat[:3, :3].ravel(), *d_center, *film)]
+        # Opaque: each value of a literal would be a new kernel.
+        Float = self.types.Float
+        numbers = (*d_viewmat[:3, :3].ravel(), *d_center, *film)
+        return [dr.opaque(Float, float(x)) for x in numbers]
 
     def meta(self) -> dict[str, Any]:
         """What is known of each splat on its way."""
