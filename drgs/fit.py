@@ -62,7 +62,7 @@ from drgs.results.folder import (
     remove_run,
     require_no_run,
 )
-from drgs.results.metrics import Quality, mean_quality
+from drgs.results.metrics import FitMetrics, Quality, mean_quality
 from drgs.results.report import seconds_to_write, write_results
 from drgs.training.budget import (
     AllIterations,
@@ -306,7 +306,7 @@ def _remedy(out: Path) -> str:
 
 def summarize(
     config: FitConfig, dataset: Dataset, num_gaussians: int, wall_s: float, quality: Quality
-) -> dict[str, object]:
+) -> FitMetrics:
     """What ``metrics.json`` holds."""
     return {
         "iterations": config.iterations,

@@ -52,7 +52,7 @@ from drgs.integrator.settings import SummarisingIntegrator
 from drgs.integrator.summary import described, summary_of_views
 from drgs.io.pictures import read_image, write_animation, write_exr, write_png
 from drgs.results.files import CAMERAS, CONFIG, GAUSSIANS, METRICS, ORBIT
-from drgs.results.metrics import Quality, psnr, ssim
+from drgs.results.metrics import Quality, mean_of, psnr, ssim
 
 DEFAULT_SIZE = (400, 400)
 """px, where nothing else says how large a picture should be."""
@@ -256,11 +256,7 @@ def render_split(model: Model, split: str, out: Path) -> Quality:
         pair = image, view.image, view.mask
         scores.append({"psnr": psnr(*pair), "ssim": ssim(*pair)})
         print(f"{view.name:{column}}  {_line(**scores[-1])}", flush=True)
-    quality = Quality(
-        psnr=float(np.mean([score["psnr"] for score in scores])),
-        ssim=float(np.mean([score["ssim"] for score in scores])),
-        num_views=len(views),
-    )
+    quality = mean_of([(score["psnr"], score["ssim"]) for score in scores])
     print(f"{'mean':{column}}  {_line(quality.psnr, quality.ssim)}")
     report = {
         "split": dataset.test_split if split == "test" else "train",

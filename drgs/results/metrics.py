@@ -6,7 +6,7 @@ Reads finished pictures on the host, (H, W, 3) in display space, and shares no c
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import TypedDict
 
@@ -87,7 +87,11 @@ def mean_quality(pairs: Iterable[tuple[ArrayLike | None, ...]]) -> Quality:
     pairs: (image, target) of each view, perhaps its mask; may be a generator, one view is held at a
     time.
     """
-    scores = [(psnr(*pair), ssim(*pair)) for pair in pairs]
+    return mean_of([(psnr(*pair), ssim(*pair)) for pair in pairs])
+
+
+def mean_of(scores: Sequence[tuple[float, float]]) -> Quality:
+    """Return the means over views of (PSNR, SSIM); of at least one view."""
     if not scores:
         raise ValueError("mean_quality(): needs at least one view, got none")
     mean_psnr, mean_ssim = np.mean(scores, axis=0)
