@@ -1,22 +1,26 @@
 """``python -m drgs.render``, against the float64 reference and PSNR computed plainly."""
 
 import json
-import subprocess
-import sys
 
 import imageio.v3 as iio
-import mitsuba as mi
 import numpy as np
 import pytest
 import yaml
-from conftest import REPOSITORY
 from scipy.spatial.transform import Rotation
+from support.render_command import (
+    EIGHT_BITS,
+    WHITE,
+    assert_shows,
+    picture,
+    run,
+    sensor,
+    write_scene,
+)
 from support.small_capture import (
     FIELD_OF_VIEW,
     FOCUS,
     HEIGHT,
     WIDTH,
-    assert_pictures_agree,
     blobs,
     decibels,
     make_dataset,
@@ -28,8 +32,6 @@ from support.small_capture import view as small_view
 
 from drgs import render
 from drgs.data.orbits import orbit_of_gaussians, orbit_of_views
-
-WHITE = (1.0, 1.0, 1.0)
 
 
 @pytest.fixture(scope="module")
@@ -47,35 +49,6 @@ def photo(fit, name, background, split="test"):
     """A photograph of the dataset over a background."""
     rgba = iio.imread(fit.parent / "data" / split / f"{name}.png") / 255
     return rgba[:, :, :3] * rgba[:, :, 3:] + np.array(background) * (1 - rgba[:, :, 3:])
-
-
-def picture(path):
-    return iio.imread(path) / 255
-
-
-def run(*arguments):
-    render.main([str(argument) for argument in arguments])
-
-
-def fails(capsys, *arguments):
-    """The line with the error that the command prints, after its usage if need be, with 2."""
-    with pytest.raises(SystemExit) as exit_info:
-        run(*arguments)
-    assert exit_info.value.code == 2
-    *usage, line = capsys.readouterr().err.strip().splitlines()
-    assert not usage or usage[0].startswith("usage: python -m drgs.render ")
-    return line.partition("error: ")[2]
-
-
-# A picture of 8 bits is within half a level of what was rendered; the renderer is within 1e-4.
-EIGHT_BITS = 0.5 / 255 + 1e-4
-
-
-def assert_shows(path, camera, background):
-    """The file is the picture that the reference makes of the blobs."""
-    expected = photograph(blobs(), camera, background)
-    assert_pictures_agree(picture(path), np.clip(expected.image, 0, 1), expected, EIGHT_BITS)
-    return np.clip(expected.image, 0, 1)
 
 
 # ----------------------------------------------------------------------------------------------
@@ -297,308 +270,3 @@ def test_a_camera_placed_by_hand_is_that_camera(fit, tmp_path):
     size = ("--size", WIDTH, HEIGHT)
     run(fit / "point_cloud.ply", *arguments, *size, "--out", tmp_path)
     assert_shows(tmp_path / "camera.png", small_view("", pose, None), WHITE)
-
-
-# ----------------------------------------------------------------------------------------------
-# Mitsuba scenes
-# ----------------------------------------------------------------------------------------------
-
-
-def sensor(pose, pixel_format="rgb"):
-    origin, target = (", ".join(map(repr, v)) for v in (pose[:3, 3].tolist(), FOCUS.tolist()))
-    return f"""
-    <sensor type="perspective">
-        <float name="fov" value="{np.degrees(FIELD_OF_VIEW)}"/>
-        <float name="near_clip" value="0.2"/>
-        <transform name="to_world"><lookat origin="{origin}" target="{target}" up="0, 0, 1"/>
-        </transform>
-        <film type="hdrfilm">
-            <integer name="width" value="{WIDTH}"/><integer name="height" value="{HEIGHT}"/>
-            <string name="pixel_format" value="{pixel_format}"/><rfilter type="box"/>
-            <string name="component_format" value="float32"/>
-        </film>
-        <sampler type="independent"><integer name="sample_count" value="1"/></sampler>
-    </sensor>"""
-
-
-def write_scene(folder, *sensors, settings=""):
-    blobs().save(folder / "model.ply")
-    path = folder / "blobs.xml"
-    path.write_text(
-        f"""<scene version="3.0.0">
-        <integrator type="splats">
-            <string name="filename" value="model.ply"/>
-            <rgb name="background" value="1, 1, 1"/>
-            {settings}
-        </integrator>
-        {"".join(sensors)}
-        </scene>"""
-    )
-    return path
-
-
-def to_linear(x):
-    return np.where(x <= 0.04045, x / 12.92, ((x + 0.055) / 1.055) ** 2.4)
-
-
-def to_srgb(x):
-    return np.where(x <= 0.0031308, x * 12.92, 1.055 * x ** (1 / 2.4) - 0.055)
-
-
-def test_a_mitsuba_scene_becomes_linear_exr_and_srgb_png(tmp_path):
-    pose = pose_around(0.8, 0.3)
-    run(write_scene(tmp_path, sensor(pose)), "--out", tmp_path / "out")
-    assert {p.name for p in (tmp_path / "out").iterdir()} == {"blobs.exr", "blobs.png"}
-    # The integrator decodes premultiplied splats and background apart; white stays 1.
-    picture_on_black = photograph(blobs(), small_view("", pose, None), (0, 0, 0))
-    linear = to_linear(picture_on_black.image) + picture_on_black.transmittance[..., None]
-    exr = np.array(mi.Bitmap(str(tmp_path / "out" / "blobs.exr")))
-    assert_pictures_agree(exr, linear, picture_on_black, 1e-4)
-    encoded = np.clip(to_srgb(linear), 0, 1)
-    png = picture(tmp_path / "out" / "blobs.png")
-    assert_pictures_agree(png, encoded, picture_on_black, EIGHT_BITS)
-
-
-def test_a_scene_in_display_space_is_not_encoded_again(tmp_path):
-    pose = pose_around(0.8, 0.3)
-    settings = '<boolean name="srgb_primitives" value="false"/>'
-    run(write_scene(tmp_path, sensor(pose), settings=settings), "--out", tmp_path / "out")
-    camera = small_view("", pose, None)
-    assert_shows(tmp_path / "out" / "blobs.png", camera, WHITE)
-    expected = photograph(blobs(), camera, WHITE)
-    exr = np.array(mi.Bitmap(str(tmp_path / "out" / "blobs.exr")))
-    assert_pictures_agree(exr, expected.image, expected, 1e-4)
-
-
-def test_a_scene_in_display_space_inside_aov_is_not_encoded_again(tmp_path):
-    """Both files have what the rays of ``aov`` see, at points of its own."""
-    pose = pose_around(0.8, 0.3)
-    settings = '<boolean name="srgb_primitives" value="false"/>'
-    path = write_scene(tmp_path, sensor(pose), settings=settings)
-    begin, end = '<integrator type="splats">', "</integrator>"
-    aov = '<integrator type="aov"><string name="aovs" value="d:depth"/>'
-    text = path.read_text().replace(begin, aov + begin).replace(end, end + end)
-    path.write_text(text)
-    run(path, "--out", tmp_path / "out")
-    root = mi.Bitmap(str(tmp_path / "out" / "blobs.exr")).split()[0][1]
-    colors = np.clip(np.array(root.convert(mi.Bitmap.PixelFormat.RGB)), 0, 1)
-    assert np.abs(picture(tmp_path / "out" / "blobs.png") - colors).max() <= EIGHT_BITS
-    assert np.abs(to_srgb(colors) - colors).max() > 0.1
-
-
-def test_every_sensor_of_a_scene_is_rendered(tmp_path):
-    sensors = sensor(pose_around(0.8, 0.3)), sensor(pose_around(2.0, 0.3), "rgba")
-    run(write_scene(tmp_path, *sensors), "--out", tmp_path / "out")
-    expected = {f"blobs_{i}.{suffix}" for i in range(2) for suffix in ("exr", "png")}
-    assert {p.name for p in (tmp_path / "out").iterdir()} == expected
-    assert np.array(mi.Bitmap(str(tmp_path / "out" / "blobs_1.exr"))).shape == (HEIGHT, WIDTH, 4)
-    assert picture(tmp_path / "out" / "blobs_1.png").shape == (HEIGHT, WIDTH, 3)
-
-
-def test_a_scene_of_mitsubas_own_is_rendered_too(tmp_path):
-    path = tmp_path / "sphere.xml"
-    path.write_text(
-        f"""<scene version="3.0.0"><integrator type="direct"/>{sensor(pose_around(0.0, 0.2))}
-        <shape type="sphere"/><emitter type="constant"/></scene>"""
-    )
-    run(path, "--out", tmp_path / "out")
-    assert picture(tmp_path / "out" / "sphere.png").shape == (HEIGHT, WIDTH, 3)
-
-
-def test_ellipsoids_of_a_scene_look_as_the_same_file_of_the_integrator(tmp_path):
-    path = write_scene(tmp_path, sensor(pose_around(0.8, 0.3)))
-    run(path, "--out", tmp_path / "file")
-    name = '<string name="filename" value="model.ply"/>'
-    text = path.read_text()
-    assert name in text
-    shape = f'<shape type="ellipsoids">{name}</shape>'
-    path.write_text(text.replace(name, "").replace("</scene>", f"{shape}</scene>"))
-    run(path, "--out", tmp_path / "shape")
-    pair = (np.array(mi.Bitmap(str(tmp_path / d / "blobs.exr"))) for d in ("file", "shape"))
-    # float32's exp, log and sigmoid: 1e-7 each, as in tests/integrator/test_ellipsoids.py.
-    np.testing.assert_allclose(*pair, atol=1e-5)
-
-
-def test_parameters_of_a_scene_file_can_be_given(tmp_path):
-    path = write_scene(tmp_path, sensor(pose_around(0.8, 0.3)))
-    path.write_text(
-        path.read_text().replace('"model.ply"', '"$model"').replace("1, 1, 1", "$color")
-    )
-    (tmp_path / "model.ply").rename(tmp_path / "a=b.ply")
-    run(path, "-D", "model=a=b.ply", "--define", "color=1, 1, 1", "--out", tmp_path / "given")
-    (tmp_path / "a=b.ply").rename(tmp_path / "model.ply")
-    run(write_scene(tmp_path, sensor(pose_around(0.8, 0.3))), "--out", tmp_path / "written")
-    pictures = [picture(tmp_path / folder / "blobs.png") for folder in ("given", "written")]
-    np.testing.assert_array_equal(*pictures)
-
-
-def test_the_shipped_scene_shows_objects_among_splats(tmp_path):
-    """Some pixels show what is seen there without the model, others do not."""
-    path = REPOSITORY / "scenes" / "hybrid.xml"
-    values = {"model": str(REPOSITORY / "scenes" / "shapes" / "knot.ply"), "spp": "4"}
-    values |= {"width": "60", "height": "40"}
-    definitions = [word for name in values for word in ("-D", f"{name}={values[name]}")]
-    run(path, *definitions, "--out", tmp_path)
-    shown = np.array(mi.Bitmap(str(tmp_path / "hybrid.exr")))
-    scene = mi.load_file(str(path), **values)
-    objects = np.array(mi.render(scene, integrator=scene.integrator().nested, spp=4))
-    # The file has half precision: 11 bits.
-    agree = np.all(np.abs(shown - objects) <= 1e-3 * (1 + objects), axis=-1)
-    assert 0.3 < agree.mean() < 0.9
-
-
-# ----------------------------------------------------------------------------------------------
-# Errors
-# ----------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("what", "arguments", "message"),
-    [
-        ("nowhere.ply", [], "there is no such file or folder"),
-        ("../data", [], "there is no config.yml in it"),
-        ("config.yml", [], "must be a PLY file, a Mitsuba scene (.xml) or the output folder"),
-        ("point_cloud.ply", [], "say what to render: --orbit N"),
-        ("point_cloud.ply", ["--split", "test"], "needs photographs"),
-        ("point_cloud.ply", ["--orbit", "2", "--data", "x"], "--data: needs --scene"),
-        (
-            "point_cloud.ply",
-            ["--orbit", "0"],
-            "--orbit: must be a whole number >= 1",
-        ),
-        ("point_cloud.ply", ["--orbit", "2", "--up", "0", "0", "0"], "up must not be zero"),
-        ("point_cloud.ply", ["--orbit", "2", "--variant", "scalar_rgb"], "--variant: must be"),
-        ("", ["--orbit", "2", "--split", "test"], "--split: not allowed with argument --orbit"),
-        ("", ["--orbit", "2", "--up", "0", "0", "1"], "--up: is not used here"),
-        ("", ["--size", "8", "8"], "--size: is not used with --split"),
-        ("", ["--origin", "0", "0", "0"], "must not be zero or parallel"),
-        ("", ["--origin", "0", "0", "nan"], "--origin: must be a finite number, got nan"),
-        ("", ["--origin", "3", "0", "0", "--fov", "180"], "--fov: must be between 0 and 180"),
-        (
-            "",
-            ["--origin", "3", "0", "0", "--size", "0", "9"],
-            "--size: must be a whole",
-        ),
-        ("", ["--background", "pink"], "or a picture's file, got pink"),
-        ("", ["--background", "0", "0", "1.5"], "got 0 0 1.5"),
-        ("", ["--camera", "nowhere.json", "--size", "8", "8"], "nowhere.json: cannot read"),
-        ("", ["--data", "nowhere"], "data.path: there is no folder"),
-        ("", ["--set", "data.imagesize=3"], "did you mean data.image_size?"),
-        ("", ["-D", "model=x.ply"], "--define: is for the parameters of a Mitsuba scene (.xml)"),
-    ],
-)
-def test_user_errors_are_one_line_and_write_nothing(
-    fit, tmp_path, capsys, what, arguments, message
-):
-    assert message in fails(capsys, fit / what, *arguments, "--out", tmp_path / "out")
-    assert not (tmp_path / "out").exists()
-
-
-EXACT = ["--set", "model.projection=exact"]
-
-
-@pytest.mark.parametrize("mode", ["--camera", "--split"])
-def test_the_exact_projection_of_a_bent_lens_is_refused(tmp_path, capsys, mode):
-    """With status 2, before anything is written; without the distortion it is rendered."""
-    write_dataset(tmp_path / "data", make_dataset(1, 1))
-    blobs().save(tmp_path / "blobs.ply")
-    (tmp_path / "a.yml").write_text(yaml.safe_dump({"data": {"path": "data"}}))
-    path = tmp_path / "data" / "transforms_test.json"
-    path.write_text(json.dumps(json.loads(path.read_text()) | {"k1": 0.1}))
-    arguments = [tmp_path / "blobs.ply", "--scene", tmp_path / "a.yml", *EXACT]
-    if mode == "--split":
-        arguments += ["--split", "test"]
-    else:
-        arguments += ["--camera", path, "--size", WIDTH, HEIGHT]
-    message = fails(capsys, *arguments, "--out", tmp_path / "out")
-    assert message.startswith(
-        "model.projection must be ewa or unscented for lenses that are no pinholes, such as that "
-        f"of view {'r_0' if mode == '--split' else 'camera_0'} (opencv: k1), got exact; or "
-        "give --ignore distortion"
-    )
-    assert not (tmp_path / "out").exists()
-    run(*arguments, "--ignore", "distortion", "--out", tmp_path / "out")
-    assert list((tmp_path / "out").glob("*.png"))
-
-
-def test_the_folder_of_a_fit_is_not_overwritten(fit, capsys):
-    assert "holds a fit" in fails(capsys, fit, "--out", fit)
-
-
-def test_an_output_folder_that_is_a_file_is_an_error(fit, tmp_path, capsys):
-    (tmp_path / "out").write_text("mine")
-    assert "cannot write" in fails(capsys, fit, "--out", tmp_path / "out")
-    assert (tmp_path / "out").read_text() == "mine"
-
-
-@pytest.mark.parametrize(
-    ("content", "message"),
-    [
-        ("no xml", "blobs.xml: "),
-        ('<scene version="3.0.0"/>', "must hold an integrator and at least one sensor"),
-        (
-            '<scene version="3.0.0"><integrator type="splats">'
-            '<string name="filename" value="nowhere.ply"/></integrator></scene>',
-            "nowhere.ply: cannot read the file",
-        ),
-        (
-            '<scene version="3.0.0"><integrator type="splats">'
-            '<string name="filename" value="model.ply"/></integrator>'
-            '<sensor type="irradiancemeter"/></scene>',
-            "the sensor must be of type perspective, thinlens, orthographic or calibrated",
-        ),
-        (
-            '<scene version="3.0.0"><integrator type="splats"/>'
-            '<sensor type="perspective"/></scene>',
-            "splats: there are no Gaussians: give the integrator 'filename' or tensors",
-        ),
-    ],
-    ids=["not XML", "empty", "model missing", "wrong sensor", "no Gaussians"],
-)
-def test_errors_of_a_mitsuba_scene_are_one_line(tmp_path, capsys, content, message):
-    path = write_scene(tmp_path)
-    path.write_text(content)
-    assert message in fails(capsys, path, "--out", tmp_path / "out")
-
-
-def test_options_for_gaussians_are_refused_with_a_scene(tmp_path, capsys):
-    path = write_scene(tmp_path, sensor(pose_around(0.8, 0.3)))
-    message = fails(capsys, path, "--orbit", "3", "--out", tmp_path / "out")
-    assert message.startswith("--orbit: is not used with a Mitsuba scene")
-
-
-@pytest.mark.parametrize("word", ["model", "=model.ply"])
-def test_parameters_without_a_name_or_a_value_are_refused(tmp_path, capsys, word):
-    path = write_scene(tmp_path, sensor(pose_around(0.8, 0.3)))
-    message = fails(capsys, path, "-D", word, "--out", tmp_path / "out")
-    assert message.startswith(f"argument --define/-D: must be NAME=VALUE, got {word}")
-
-
-@pytest.mark.parametrize("name", ["path", "parallel", "optimize"])
-def test_parameters_that_mitsubas_loader_has_itself_are_refused(tmp_path, capsys, name):
-    """Also where the file has one: it cannot be given from Python."""
-    path = write_scene(tmp_path, sensor(pose_around(0.8, 0.3)))
-    path.write_text(path.read_text().replace("model.ply", f"${name}"))
-    message = fails(capsys, path, "-D", f"{name}=model.ply", "--out", tmp_path / "out")
-    assert (
-        message.startswith(f"argument --define/-D: the name {name} is taken")
-        and "rename" in message
-    )
-
-
-def test_parameters_that_a_scene_file_does_not_have_are_refused(tmp_path, capsys):
-    path = write_scene(tmp_path, sensor(pose_around(0.8, 0.3)))
-    message = fails(capsys, path, "-D", "colour=1", "--out", tmp_path / "out")
-    assert message.startswith(f"{path}: ") and "colour" in message
-
-
-def test_it_is_a_command(fit, tmp_path):
-    result = subprocess.run(
-        [sys.executable, "-m", "drgs.render", fit, "--orbit", "1", "--out", tmp_path / "out"],
-        cwd=REPOSITORY,
-        capture_output=True,
-        text=True,
-        timeout=120,
-    )
-    assert result.returncode == 0, result.stderr
-    assert f"orbit_000: {WIDTH}x{HEIGHT}" in result.stdout

@@ -1,0 +1,133 @@
+"""``python -m drgs.render`` on Mitsuba scenes."""
+
+import mitsuba as mi
+import numpy as np
+from conftest import REPOSITORY
+from support.render_command import (
+    EIGHT_BITS,
+    WHITE,
+    assert_shows,
+    picture,
+    run,
+    sensor,
+    write_scene,
+)
+from support.small_capture import (
+    HEIGHT,
+    WIDTH,
+    assert_pictures_agree,
+    blobs,
+    photograph,
+    pose_around,
+)
+from support.small_capture import view as small_view
+
+
+def to_linear(x):
+    return np.where(x <= 0.04045, x / 12.92, ((x + 0.055) / 1.055) ** 2.4)
+
+
+def to_srgb(x):
+    return np.where(x <= 0.0031308, x * 12.92, 1.055 * x ** (1 / 2.4) - 0.055)
+
+
+def test_a_mitsuba_scene_becomes_linear_exr_and_srgb_png(tmp_path):
+    pose = pose_around(0.8, 0.3)
+    run(write_scene(tmp_path, sensor(pose)), "--out", tmp_path / "out")
+    assert {p.name for p in (tmp_path / "out").iterdir()} == {"blobs.exr", "blobs.png"}
+    # The integrator decodes premultiplied splats and background apart; white stays 1.
+    picture_on_black = photograph(blobs(), small_view("", pose, None), (0, 0, 0))
+    linear = to_linear(picture_on_black.image) + picture_on_black.transmittance[..., None]
+    exr = np.array(mi.Bitmap(str(tmp_path / "out" / "blobs.exr")))
+    assert_pictures_agree(exr, linear, picture_on_black, 1e-4)
+    encoded = np.clip(to_srgb(linear), 0, 1)
+    png = picture(tmp_path / "out" / "blobs.png")
+    assert_pictures_agree(png, encoded, picture_on_black, EIGHT_BITS)
+
+
+def test_a_scene_in_display_space_is_not_encoded_again(tmp_path):
+    pose = pose_around(0.8, 0.3)
+    settings = '<boolean name="srgb_primitives" value="false"/>'
+    run(write_scene(tmp_path, sensor(pose), settings=settings), "--out", tmp_path / "out")
+    camera = small_view("", pose, None)
+    assert_shows(tmp_path / "out" / "blobs.png", camera, WHITE)
+    expected = photograph(blobs(), camera, WHITE)
+    exr = np.array(mi.Bitmap(str(tmp_path / "out" / "blobs.exr")))
+    assert_pictures_agree(exr, expected.image, expected, 1e-4)
+
+
+def test_a_scene_in_display_space_inside_aov_is_not_encoded_again(tmp_path):
+    """Both files have what the rays of ``aov`` see, at points of its own."""
+    pose = pose_around(0.8, 0.3)
+    settings = '<boolean name="srgb_primitives" value="false"/>'
+    path = write_scene(tmp_path, sensor(pose), settings=settings)
+    begin, end = '<integrator type="splats">', "</integrator>"
+    aov = '<integrator type="aov"><string name="aovs" value="d:depth"/>'
+    text = path.read_text().replace(begin, aov + begin).replace(end, end + end)
+    path.write_text(text)
+    run(path, "--out", tmp_path / "out")
+    root = mi.Bitmap(str(tmp_path / "out" / "blobs.exr")).split()[0][1]
+    colors = np.clip(np.array(root.convert(mi.Bitmap.PixelFormat.RGB)), 0, 1)
+    assert np.abs(picture(tmp_path / "out" / "blobs.png") - colors).max() <= EIGHT_BITS
+    assert np.abs(to_srgb(colors) - colors).max() > 0.1
+
+
+def test_every_sensor_of_a_scene_is_rendered(tmp_path):
+    sensors = sensor(pose_around(0.8, 0.3)), sensor(pose_around(2.0, 0.3), "rgba")
+    run(write_scene(tmp_path, *sensors), "--out", tmp_path / "out")
+    expected = {f"blobs_{i}.{suffix}" for i in range(2) for suffix in ("exr", "png")}
+    assert {p.name for p in (tmp_path / "out").iterdir()} == expected
+    assert np.array(mi.Bitmap(str(tmp_path / "out" / "blobs_1.exr"))).shape == (HEIGHT, WIDTH, 4)
+    assert picture(tmp_path / "out" / "blobs_1.png").shape == (HEIGHT, WIDTH, 3)
+
+
+def test_a_scene_of_mitsubas_own_is_rendered_too(tmp_path):
+    path = tmp_path / "sphere.xml"
+    path.write_text(
+        f"""<scene version="3.0.0"><integrator type="direct"/>{sensor(pose_around(0.0, 0.2))}
+        <shape type="sphere"/><emitter type="constant"/></scene>"""
+    )
+    run(path, "--out", tmp_path / "out")
+    assert picture(tmp_path / "out" / "sphere.png").shape == (HEIGHT, WIDTH, 3)
+
+
+def test_ellipsoids_of_a_scene_look_as_the_same_file_of_the_integrator(tmp_path):
+    path = write_scene(tmp_path, sensor(pose_around(0.8, 0.3)))
+    run(path, "--out", tmp_path / "file")
+    name = '<string name="filename" value="model.ply"/>'
+    text = path.read_text()
+    assert name in text
+    shape = f'<shape type="ellipsoids">{name}</shape>'
+    path.write_text(text.replace(name, "").replace("</scene>", f"{shape}</scene>"))
+    run(path, "--out", tmp_path / "shape")
+    pair = (np.array(mi.Bitmap(str(tmp_path / d / "blobs.exr"))) for d in ("file", "shape"))
+    # float32's exp, log and sigmoid: 1e-7 each, as in tests/integrator/test_ellipsoids.py.
+    np.testing.assert_allclose(*pair, atol=1e-5)
+
+
+def test_parameters_of_a_scene_file_can_be_given(tmp_path):
+    path = write_scene(tmp_path, sensor(pose_around(0.8, 0.3)))
+    path.write_text(
+        path.read_text().replace('"model.ply"', '"$model"').replace("1, 1, 1", "$color")
+    )
+    (tmp_path / "model.ply").rename(tmp_path / "a=b.ply")
+    run(path, "-D", "model=a=b.ply", "--define", "color=1, 1, 1", "--out", tmp_path / "given")
+    (tmp_path / "a=b.ply").rename(tmp_path / "model.ply")
+    run(write_scene(tmp_path, sensor(pose_around(0.8, 0.3))), "--out", tmp_path / "written")
+    pictures = [picture(tmp_path / folder / "blobs.png") for folder in ("given", "written")]
+    np.testing.assert_array_equal(*pictures)
+
+
+def test_the_shipped_scene_shows_objects_among_splats(tmp_path):
+    """Some pixels show what is seen there without the model, others do not."""
+    path = REPOSITORY / "scenes" / "hybrid.xml"
+    values = {"model": str(REPOSITORY / "scenes" / "shapes" / "knot.ply"), "spp": "4"}
+    values |= {"width": "60", "height": "40"}
+    definitions = [word for name in values for word in ("-D", f"{name}={values[name]}")]
+    run(path, *definitions, "--out", tmp_path)
+    shown = np.array(mi.Bitmap(str(tmp_path / "hybrid.exr")))
+    scene = mi.load_file(str(path), **values)
+    objects = np.array(mi.render(scene, integrator=scene.integrator().nested, spp=4))
+    # The file has half precision: 11 bits.
+    agree = np.all(np.abs(shown - objects) <= 1e-3 * (1 + objects), axis=-1)
+    assert 0.3 < agree.mean() < 0.9
