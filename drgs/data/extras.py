@@ -31,8 +31,8 @@ def extras_of(
 ) -> dict[str, Lens | Motion | np.ndarray | None]:
     """``lens``, ``motion``, ``mask`` and ``depth`` of a :class:`drgs.data.types.View`.
 
-    size: of the photograph, W, H, before it is scaled. What the configuration ignores is not
-    looked at.
+    size: of the photograph, W, H, before it is scaled. No file is opened for what the configuration
+    ignores.
     """
     return {
         "lens": None if config.ignore_distortion else lens_of(frame),

@@ -1,9 +1,9 @@
 """The NeRF-synthetic ("Blender") layout: ``transforms_{train,val,test}.json`` and RGBA images.
 
 Mildenhall et al. 2020. Pinhole cameras with the principal point in the middle and one horizontal
-field of view, ``camera_angle_x``, for all; images of one size in a split, with straight alpha. A
-picture without alpha is refused: what it shows behind the object would be fitted as part of it.
-Opaque photographs belong into the nerfstudio layout.
+field of view, ``camera_angle_x``, for all frames that have none of their own; images of one size in
+a split, with straight alpha. A picture without alpha is refused: what it shows behind the object
+would be fitted as part of it. Opaque photographs belong into the nerfstudio layout.
 
 Frames may have a lens, a second pose, a mask and depths, as there: see ``drgs.data.extras``.
 """
