@@ -19,14 +19,11 @@ SHARED_DATA = REPOSITORY.parent / "shared" / "data"
 
 
 def pytest_configure(config):
-    """Dr.Jit computes on two threads in each worker: they share the cores, and idle threads spin.
-
-    Not on one, on which Mitsuba waits for ever when it reads or writes OpenEXR.
-    """
+    """Dr.Jit computes on one thread in each worker: they share the cores, and idle threads spin."""
     if hasattr(config, "workerinput"):
         import drjit as dr
 
-        dr.set_thread_count(2)
+        dr.set_thread_count(1)
 
 
 def _shared(*parts):

@@ -3,6 +3,7 @@
 import mitsuba as mi
 import numpy as np
 from conftest import REPOSITORY
+from support.openexr import read_exr
 from support.render_command import (
     EIGHT_BITS,
     WHITE,
@@ -38,7 +39,7 @@ def test_a_mitsuba_scene_becomes_linear_exr_and_srgb_png(tmp_path):
     # The integrator decodes premultiplied splats and background apart; white stays 1.
     picture_on_black = photograph(blobs(), small_view("", pose, None), (0, 0, 0))
     linear = to_linear(picture_on_black.image) + picture_on_black.transmittance[..., None]
-    exr = np.array(mi.Bitmap(str(tmp_path / "out" / "blobs.exr")))
+    exr = np.array(read_exr(tmp_path / "out" / "blobs.exr"))
     assert_pictures_agree(exr, linear, picture_on_black, 1e-4)
     encoded = np.clip(to_srgb(linear), 0, 1)
     png = picture(tmp_path / "out" / "blobs.png")
@@ -52,7 +53,7 @@ def test_a_scene_in_display_space_is_not_encoded_again(tmp_path):
     camera = small_view("", pose, None)
     assert_shows(tmp_path / "out" / "blobs.png", camera, WHITE)
     expected = photograph(blobs(), camera, WHITE)
-    exr = np.array(mi.Bitmap(str(tmp_path / "out" / "blobs.exr")))
+    exr = np.array(read_exr(tmp_path / "out" / "blobs.exr"))
     assert_pictures_agree(exr, expected.image, expected, 1e-4)
 
 
@@ -66,7 +67,7 @@ def test_a_scene_in_display_space_inside_aov_is_not_encoded_again(tmp_path):
     text = path.read_text().replace(begin, aov + begin).replace(end, end + end)
     path.write_text(text)
     run(path, "--out", tmp_path / "out")
-    root = mi.Bitmap(str(tmp_path / "out" / "blobs.exr")).split()[0][1]
+    root = read_exr(tmp_path / "out" / "blobs.exr").split()[0][1]
     colors = np.clip(np.array(root.convert(mi.Bitmap.PixelFormat.RGB)), 0, 1)
     assert np.abs(picture(tmp_path / "out" / "blobs.png") - colors).max() <= EIGHT_BITS
     assert np.abs(to_srgb(colors) - colors).max() > 0.1
@@ -77,7 +78,7 @@ def test_every_sensor_of_a_scene_is_rendered(tmp_path):
     run(write_scene(tmp_path, *sensors), "--out", tmp_path / "out")
     expected = {f"blobs_{i}.{suffix}" for i in range(2) for suffix in ("exr", "png")}
     assert {p.name for p in (tmp_path / "out").iterdir()} == expected
-    assert np.array(mi.Bitmap(str(tmp_path / "out" / "blobs_1.exr"))).shape == (HEIGHT, WIDTH, 4)
+    assert np.array(read_exr(tmp_path / "out" / "blobs_1.exr")).shape == (HEIGHT, WIDTH, 4)
     assert picture(tmp_path / "out" / "blobs_1.png").shape == (HEIGHT, WIDTH, 3)
 
 
@@ -100,7 +101,7 @@ def test_ellipsoids_of_a_scene_look_as_the_same_file_of_the_integrator(tmp_path)
     shape = f'<shape type="ellipsoids">{name}</shape>'
     path.write_text(text.replace(name, "").replace("</scene>", f"{shape}</scene>"))
     run(path, "--out", tmp_path / "shape")
-    pair = (np.array(mi.Bitmap(str(tmp_path / d / "blobs.exr"))) for d in ("file", "shape"))
+    pair = (np.array(read_exr(tmp_path / d / "blobs.exr")) for d in ("file", "shape"))
     # float32's exp, log and sigmoid: 1e-7 each, as in tests/integrator/test_ellipsoids.py.
     np.testing.assert_allclose(*pair, atol=1e-5)
 
@@ -125,7 +126,7 @@ def test_the_shipped_scene_shows_objects_among_splats(tmp_path):
     values |= {"width": "60", "height": "40"}
     definitions = [word for name in values for word in ("-D", f"{name}={values[name]}")]
     run(path, *definitions, "--out", tmp_path)
-    shown = np.array(mi.Bitmap(str(tmp_path / "hybrid.exr")))
+    shown = np.array(read_exr(tmp_path / "hybrid.exr"))
     scene = mi.load_file(str(path), **values)
     objects = np.array(mi.render(scene, integrator=scene.integrator().nested, spp=4))
     # The file has half precision: 11 bits.

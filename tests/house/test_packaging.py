@@ -3,6 +3,7 @@
 Setuptools alone builds the installed tree here: offline, and without the package "wheel".
 """
 
+import importlib.util
 import shutil
 import subprocess
 import sys
@@ -26,7 +27,9 @@ def copy_checkout(folder):
 @pytest.fixture
 def installed(tmp_path):
     """A folder that holds what an installation puts into site-packages."""
-    pytest.importorskip("setuptools")
+    # Not imported here: setuptools brings its own distutils, which is to be the first.
+    if importlib.util.find_spec("setuptools") is None:
+        pytest.skip("setuptools is not installed")
     checkout = tmp_path / "checkout"
     checkout.mkdir()
     copy_checkout(checkout)
