@@ -1,48 +1,14 @@
 """Datasets are read as they are, and refused with file and key where they are wrong."""
 
-import json
 import math
 
 import imageio.v3 as iio
 import numpy as np
 import pytest
-from support.datasets import CENTERS, edit, load, look_at, refusal
+from support.datasets import CENTERS, edit, load, refusal
 
 from drgs.cameras.fisheye import Fisheye
 from drgs.cameras.radial_tangential import RadialTangential
-
-
-@pytest.fixture
-def blender(tmp_path):
-    """A NeRF-synthetic folder of 3 random 6x4 RGBA views a split; returns (folder, images)."""
-    rng = np.random.default_rng(0)
-    images = {}
-    for split in ("train", "val"):
-        (tmp_path / split).mkdir()
-        frames = []
-        for i, center in enumerate(CENTERS):
-            images[split, i] = rng.integers(0, 256, (4, 6, 4), np.uint8)
-            iio.imwrite(tmp_path / split / f"r_{i}.png", images[split, i])
-            matrix = look_at(center, (0, 0, 0)).tolist()
-            frames.append({"file_path": f"./{split}/r_{i}", "transform_matrix": matrix})
-        meta = {"camera_angle_x": 0.8, "frames": frames}
-        (tmp_path / f"transforms_{split}.json").write_text(json.dumps(meta))
-    return tmp_path, images
-
-
-@pytest.fixture
-def photographs(tmp_path):
-    """A nerfstudio folder of 10 grey 8x6 photographs, frames in reverse order of names."""
-    (tmp_path / "images").mkdir()
-    frames = []
-    for i in reversed(range(10)):
-        iio.imwrite(tmp_path / "images" / f"{i:02d}.png", np.full((6, 8, 3), 20 * i, np.uint8))
-        center = (4 * math.cos(i), 4 * math.sin(i), 1)
-        matrix = look_at(center, (0, 0, 0)).tolist()
-        frames.append({"file_path": f"images/{i:02d}.png", "transform_matrix": matrix})
-    meta = {"fl_x": 9.0, "fl_y": 8.0, "cx": 3.5, "cy": 3.25, "w": 8, "h": 6, "frames": frames}
-    (tmp_path / "transforms.json").write_text(json.dumps(meta))
-    return tmp_path
 
 
 # NeRF-synthetic

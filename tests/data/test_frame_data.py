@@ -1,53 +1,19 @@
 """Masks, depths, motion and transparency of frames."""
 
 import json
-import math
 from dataclasses import replace
 
 import imageio.v3 as iio
 import numpy as np
 import pytest
 from PIL import Image
-from support.datasets import CENTERS, dataset_of, edit, load, look_at, refusal, view_at
+from support.datasets import dataset_of, edit, load, look_at, refusal, view_at
 
 from drgs.cameras.radial_tangential import RadialTangential
 from drgs.config.schema import FitConfig
 from drgs.core.errors import UserError
 from drgs.data import load_dataset
 from drgs.data.images import smaller_view
-
-
-@pytest.fixture
-def blender(tmp_path):
-    """A NeRF-synthetic folder of 3 random 6x4 RGBA views a split; returns (folder, images)."""
-    rng = np.random.default_rng(0)
-    images = {}
-    for split in ("train", "val"):
-        (tmp_path / split).mkdir()
-        frames = []
-        for i, center in enumerate(CENTERS):
-            images[split, i] = rng.integers(0, 256, (4, 6, 4), np.uint8)
-            iio.imwrite(tmp_path / split / f"r_{i}.png", images[split, i])
-            matrix = look_at(center, (0, 0, 0)).tolist()
-            frames.append({"file_path": f"./{split}/r_{i}", "transform_matrix": matrix})
-        meta = {"camera_angle_x": 0.8, "frames": frames}
-        (tmp_path / f"transforms_{split}.json").write_text(json.dumps(meta))
-    return tmp_path, images
-
-
-@pytest.fixture
-def photographs(tmp_path):
-    """A nerfstudio folder of 10 grey 8x6 photographs, frames in reverse order of names."""
-    (tmp_path / "images").mkdir()
-    frames = []
-    for i in reversed(range(10)):
-        iio.imwrite(tmp_path / "images" / f"{i:02d}.png", np.full((6, 8, 3), 20 * i, np.uint8))
-        center = (4 * math.cos(i), 4 * math.sin(i), 1)
-        matrix = look_at(center, (0, 0, 0)).tolist()
-        frames.append({"file_path": f"images/{i:02d}.png", "transform_matrix": matrix})
-    meta = {"fl_x": 9.0, "fl_y": 8.0, "cx": 3.5, "cy": 3.25, "w": 8, "h": 6, "frames": frames}
-    (tmp_path / "transforms.json").write_text(json.dumps(meta))
-    return tmp_path
 
 
 # What a frame may have besides its photograph

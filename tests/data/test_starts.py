@@ -1,6 +1,5 @@
 """Sizes of pictures, extents of scenes, and the Gaussians that a fit starts from."""
 
-import json
 import math
 
 import imageio.v3 as iio
@@ -8,46 +7,13 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from support.datasets import CENTERS, dataset_of, edit, load, look_at, refusal, view_at
+from support.datasets import dataset_of, edit, load, refusal, view_at
 
 from drgs.config.schema import FitConfig
 from drgs.core.errors import UserError
 from drgs.data import initial_gaussians
 from drgs.data.images import downscale
 from drgs.data.initial import focus_of, mean_squared_neighbour_distance, points_in_view
-
-
-@pytest.fixture
-def blender(tmp_path):
-    """A NeRF-synthetic folder of 3 random 6x4 RGBA views a split; returns (folder, images)."""
-    rng = np.random.default_rng(0)
-    images = {}
-    for split in ("train", "val"):
-        (tmp_path / split).mkdir()
-        frames = []
-        for i, center in enumerate(CENTERS):
-            images[split, i] = rng.integers(0, 256, (4, 6, 4), np.uint8)
-            iio.imwrite(tmp_path / split / f"r_{i}.png", images[split, i])
-            matrix = look_at(center, (0, 0, 0)).tolist()
-            frames.append({"file_path": f"./{split}/r_{i}", "transform_matrix": matrix})
-        meta = {"camera_angle_x": 0.8, "frames": frames}
-        (tmp_path / f"transforms_{split}.json").write_text(json.dumps(meta))
-    return tmp_path, images
-
-
-@pytest.fixture
-def photographs(tmp_path):
-    """A nerfstudio folder of 10 grey 8x6 photographs, frames in reverse order of names."""
-    (tmp_path / "images").mkdir()
-    frames = []
-    for i in reversed(range(10)):
-        iio.imwrite(tmp_path / "images" / f"{i:02d}.png", np.full((6, 8, 3), 20 * i, np.uint8))
-        center = (4 * math.cos(i), 4 * math.sin(i), 1)
-        matrix = look_at(center, (0, 0, 0)).tolist()
-        frames.append({"file_path": f"images/{i:02d}.png", "transform_matrix": matrix})
-    meta = {"fl_x": 9.0, "fl_y": 8.0, "cx": 3.5, "cy": 3.25, "w": 8, "h": 6, "frames": frames}
-    (tmp_path / "transforms.json").write_text(json.dumps(meta))
-    return tmp_path
 
 
 # Either layout
