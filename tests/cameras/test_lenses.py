@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from support.derivative_checks import check_against_differences, check_transpose
 from support.helpers import (
     FLOAT32,
     FLOAT64,
@@ -13,7 +14,6 @@ from support.helpers import (
     device_gaussians,
     frame_tangent,
     picture_of,
-    plane_cotangents,
     rows,
 )
 from support.lens_checks import (
@@ -29,9 +29,7 @@ from support.lens_scenes import (
     LENSES,
     LensCase,
     camera_behind,
-    directions,
     gaussians_at_points,
-    moved,
     points_at,
     points_near_the_end,
 )
@@ -108,6 +106,10 @@ def test_a_lens_changes_the_picture(name):
 DIFFERENCES = 1e-6
 
 
+def in_double(case, cotangents):
+    return kernel_gradients(case, FLOAT64, cotangents)
+
+
 # Those of test_rendering.
 GRADIENTS = {FLOAT64: 1e-12, FLOAT32: 5e-5}
 
@@ -144,41 +146,24 @@ def test_gradients_equal_differences_of_the_reference_along_a_direction(
 ):
     """Of each parameter; in larger scenes, without the pixels that a step may take to a jump."""
     case = clear(case_of(name, antialiased=antialiased, threshold_width=1e-3))
-    cotangents = Cotangents.random(case, seed=2)
     keep_bounds(case, monkeypatch)
-    gradients = kernel_gradients(case, FLOAT64, cotangents)
-    step = 1e-6
-    for parameter, direction in directions(case.gaussians, seed=3).items():
-        forward, backward = (
-            case.reference_picture(moved(case.gaussians, direction, sign * step))
-            for sign in (1, -1)
-        )
-        expected = sum(
-            np.sum(getattr(cotangents, f"d_{n}") * (getattr(forward, n) - getattr(backward, n)))
-            for n in ("image", "alpha", "depth")
-        ) / (2 * step)
-        terms = getattr(direction, parameter) * gradients[parameter]
-        # A sum of terms of both signs: relative to their size.
-        assert abs(terms.sum() - expected) <= DIFFERENCES * np.abs(terms).sum(), parameter
+    check_against_differences(case, in_double, DIFFERENCES)
 
 
 @both_precisions
 @every_form
 def test_adjoint_is_the_transpose_of_the_tangent(precision, name):
     case = clear(case_of(name))
-    cotangents = Cotangents.random(case, seed=4)
-    gradients = kernel_gradients(case, precision, cotangents)
     gaussians, frame = case.render(precision)
-    d_features, d_transmittance = plane_cotangents(case, cotangents, precision)
-    weights = np.array([rows(d) for d in (d_transmittance, *d_features)])
-    for parameter, direction in directions(case.gaussians, seed=5).items():
-        tangents = device_gaussians(direction, precision)
-        planes = frame_tangent(gaussians, frame, tangents)
-        left = weights * np.array([rows(plane) for plane in planes])
-        right = getattr(direction, parameter) * gradients[parameter]
-        size = np.abs(left).sum() + np.abs(right).sum()
-        # Sums of thousands of terms, each as accurate as the arrays are.
-        assert abs(left.sum() - right.sum()) <= GRADIENTS[precision] / 5 * size, parameter
+
+    def planes_along(direction):
+        planes = frame_tangent(gaussians, frame, device_gaussians(direction, precision))
+        return [rows(plane) for plane in planes]
+
+    def in_precision(case, cotangents):
+        return kernel_gradients(case, precision, cotangents)
+
+    check_transpose(case, precision, in_precision, planes_along, GRADIENTS[precision] / 5)
 
 
 @every_form

@@ -8,6 +8,7 @@ import drjit as dr
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from support.derivative_checks import check_against_differences, check_transpose
 from support.helpers import (
     FLOAT32,
     FLOAT64,
@@ -25,7 +26,7 @@ from support.helpers import (
     single,
 )
 from support.lens_checks import keep_bounds, planes_of
-from support.lens_scenes import LENSES, directions, lens_camera, moved
+from support.lens_scenes import LENSES, lens_camera
 from support.motion_checks import MovingCase, time_of
 from support.reference_scenes import rotation_about
 
@@ -268,6 +269,10 @@ def test_times_are_found_though_the_camera_turns_by_a_third_of_the_film(turn):
 DIFFERENCES = 1e-6
 
 
+def in_double(case, cotangents):
+    return kernel_gradients(case, FLOAT64, cotangents)
+
+
 def kernel_gradients(case, precision, cotangents):
     """Of the mean over the times."""
     gaussians, frames = case.frames(precision)
@@ -281,24 +286,12 @@ def kernel_gradients(case, precision, cotangents):
 @kinds_and_samples
 def test_gradients_equal_differences_of_the_reference(name, samples, monkeypatch):
     case = clear(case_of(name, samples=samples, threshold_width=1e-3))
-    cotangents = Cotangents.random(case, seed=2)
     keep_bounds(case, monkeypatch)
-    gradients = kernel_gradients(case, FLOAT64, cotangents)
-    step = 1e-6
-    for parameter, direction in directions(case.gaussians, seed=3).items():
-        forward, backward = (
-            case.reference_picture(moved(case.gaussians, direction, sign * step))
-            for sign in (1, -1)
-        )
-        expected = sum(
-            np.sum(getattr(cotangents, f"d_{n}") * (getattr(forward, n) - getattr(backward, n)))
-            for n in ("image", "alpha", "depth")
-        ) / (2 * step)
-        terms = getattr(direction, parameter) * gradients[parameter]
-        difference = abs(terms.sum() - expected)
-        assert difference <= DIFFERENCES * np.abs(terms).sum(), parameter
+    terms = check_against_differences(case, in_double, DIFFERENCES)
+    for parameter, of_parameter in terms.items():
         # One percent of any parameter's gradient would be noticed.
-        assert np.abs(0.01 * terms.sum()) > DIFFERENCES * np.abs(terms).sum(), parameter
+        noticed = DIFFERENCES * np.abs(of_parameter).sum()
+        assert np.abs(0.01 * of_parameter.sum()) > noticed, parameter
 
 
 @pytest.mark.parametrize(
@@ -311,18 +304,17 @@ def test_gradients_equal_differences_of_the_reference(name, samples, monkeypatch
 )
 def test_adjoint_is_the_transpose_of_the_tangent(precision, name, samples):
     case = clear(case_of(name, samples=samples))
-    cotangents = Cotangents.random(case, seed=4)
-    gradients = kernel_gradients(case, precision, cotangents)
     gaussians, frames = case.frames(precision)
-    d_features, d_transmittance = plane_cotangents(case, cotangents, precision)
-    weights = np.array([rows(d) for d in (d_transmittance, *d_features)])
-    for parameter, direction in directions(case.gaussians, seed=5).items():
+
+    def planes_along(direction):
         tangents = device_gaussians(direction, precision)
         planes = [frame_tangent(gaussians, frame, tangents) for frame in frames]
-        left = weights * np.mean([[rows(plane) for plane in of_time] for of_time in planes], axis=0)
-        right = getattr(direction, parameter) * gradients[parameter]
-        size = np.abs(left).sum() + np.abs(right).sum()
-        assert abs(left.sum() - right.sum()) <= GRADIENTS[precision] / 5 * size, parameter
+        return np.mean([[rows(plane) for plane in of_time] for of_time in planes], axis=0)
+
+    def in_precision(case, cotangents):
+        return kernel_gradients(case, precision, cotangents)
+
+    check_transpose(case, precision, in_precision, planes_along, GRADIENTS[precision] / 5)
 
 
 @pytest.mark.parametrize("samples", [2, 0], ids=["motion blur", "rolling"])

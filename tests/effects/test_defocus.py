@@ -8,6 +8,7 @@ from dataclasses import replace
 import drjit as dr
 import numpy as np
 import pytest
+from support.derivative_checks import check_against_differences, check_transpose
 from support.helpers import (
     FLOAT32,
     FLOAT64,
@@ -61,6 +62,10 @@ all_scenes = pytest.mark.parametrize("scene", SCENES.values(), ids=SCENES)
 PICTURE = {FLOAT64: 1e-11, FLOAT32: 2e-5}
 GRADIENTS = {FLOAT64: 1e-12, FLOAT32: 5e-5}
 DIFFERENCES = 1e-6
+
+
+def in_double(case, cotangents):
+    return kernel_gradients(case, FLOAT64, cotangents)
 
 
 def case_of(scene, **others) -> LensCase:
@@ -340,38 +345,24 @@ def test_each_number_of_the_gradients_equals_a_difference_of_the_reference():
 @all_scenes
 def test_gradients_equal_differences_of_the_reference_along_a_direction(scene, monkeypatch):
     case = clear(case_of(scene, threshold_width=1e-3))
-    cotangents = Cotangents.random(case, seed=2)
     keep_bounds(case, monkeypatch)
-    gradients = kernel_gradients(case, FLOAT64, cotangents)
-    step = 1e-6
-    for parameter, direction in directions(case.gaussians, seed=3).items():
-        forward, backward = (
-            case.reference_picture(moved(case.gaussians, direction, sign * step))
-            for sign in (1, -1)
-        )
-        expected = sum(
-            np.sum(getattr(cotangents, f"d_{n}") * (getattr(forward, n) - getattr(backward, n)))
-            for n in ("image", "alpha", "depth")
-        ) / (2 * step)
-        terms = getattr(direction, parameter) * gradients[parameter]
-        assert abs(terms.sum() - expected) <= DIFFERENCES * np.abs(terms).sum(), parameter
+    check_against_differences(case, in_double, DIFFERENCES)
 
 
 @both_precisions
 @all_scenes
 def test_adjoint_is_the_transpose_of_the_tangent(precision, scene):
     case = clear(case_of(scene))
-    cotangents = Cotangents.random(case, seed=4)
-    gradients = kernel_gradients(case, precision, cotangents)
     gaussians, frame = case.render(precision)
-    d_features, d_transmittance = plane_cotangents(case, cotangents, precision)
-    weights = np.array([rows(d) for d in (d_transmittance, *d_features)])
-    for parameter, direction in directions(case.gaussians, seed=5).items():
+
+    def planes_along(direction):
         planes = frame_tangent(gaussians, frame, device_gaussians(direction, precision))
-        left = weights * np.array([rows(plane) for plane in planes])
-        right = getattr(direction, parameter) * gradients[parameter]
-        size = np.abs(left).sum() + np.abs(right).sum()
-        assert abs(left.sum() - right.sum()) <= GRADIENTS[precision] / 5 * size, parameter
+        return [rows(plane) for plane in planes]
+
+    def in_precision(case, cotangents):
+        return kernel_gradients(case, precision, cotangents)
+
+    check_transpose(case, precision, in_precision, planes_along, GRADIENTS[precision] / 5)
 
 
 def test_single_precision_gradients_equal_double_precision():
