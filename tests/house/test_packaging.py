@@ -1,12 +1,13 @@
 """``drgs.plugins`` is importable from a checkout, editable and installed.
 
-Setuptools alone builds the installed tree here: offline, and without the package "wheel".
+The build backend alone makes what is installed: offline, and without pip.
 """
 
 import importlib.util
 import shutil
 import subprocess
 import sys
+import zipfile
 
 import pytest
 from conftest import REPOSITORY
@@ -24,24 +25,28 @@ def copy_checkout(folder):
     return folder
 
 
+def site_packages(checkout, folder, hook):
+    """A new ``folder`` with what pip would put into site-packages; hook: of the build backend."""
+    if importlib.util.find_spec("hatchling") is None:
+        pytest.skip("hatchling is not installed")
+    program = f"from hatchling import build; build.{hook}({str(folder)!r})"
+    result = subprocess.run(
+        [sys.executable, "-c", program], cwd=checkout, capture_output=True, text=True
+    )
+    assert result.returncode == 0, result.stderr
+    (wheel,) = folder.glob("*.whl")
+    with zipfile.ZipFile(wheel) as file:
+        file.extractall(folder)
+    wheel.unlink()
+    return folder
+
+
 @pytest.fixture
 def installed(tmp_path):
     """A folder that holds what an installation puts into site-packages."""
-    # Not imported here: setuptools brings its own distutils, which is to be the first.
-    if importlib.util.find_spec("setuptools") is None:
-        pytest.skip("setuptools is not installed")
     checkout = tmp_path / "checkout"
     checkout.mkdir()
-    copy_checkout(checkout)
-    build = ["-q", "build", "--build-lib", str(tmp_path / "installed")]
-    result = subprocess.run(
-        [sys.executable, "-c", "from setuptools import setup; setup()", *build],
-        cwd=checkout,
-        capture_output=True,
-        text=True,
-    )
-    assert result.returncode == 0, result.stderr
-    return tmp_path / "installed"
+    return site_packages(copy_checkout(checkout), tmp_path / "installed", "build_wheel")
 
 
 def test_plugins_are_found_in_a_plain_checkout(run_python):
@@ -65,16 +70,41 @@ def test_a_checkout_that_shadows_an_installed_package_finds_its_own_plugins(run_
     assert result.stdout.strip() == str(REPOSITORY / "plugins" / "__init__.py"), result.stderr
 
 
-def test_the_packages_listed_are_all_there_are(installed):
-    def packages(folder):
+def test_an_editable_install_wins_over_a_clone_of_the_same_name(tmp_path):
+    """In the clone's parent folder, where the folder ``drgs`` could be a namespace package."""
+    checkout = tmp_path / "drgs"
+    checkout.mkdir()
+    site = site_packages(copy_checkout(checkout), tmp_path / "site", "build_editable")
+    # -S leaves out this environment's .pth files, such as that of an editable drgs.
+    dependencies = [path for path in sys.path if path.endswith("site-packages")]
+    program = (
+        f"import site, sys; sys.path += {dependencies!r}; site.addsitedir({str(site)!r})\n"
+        "import mitsuba as mi; mi.set_variant('llvm_ad_rgb')\n"
+        "import drgs; print(drgs.__file__); drgs.Gaussians\n"
+        "import drgs.plugins; print(drgs.plugins.__file__)\n"
+        "print(type(mi.load_dict({'type': 'splats'})).__name__)"
+    )
+    result = subprocess.run(
+        [sys.executable, "-S", "-c", program], cwd=tmp_path, capture_output=True, text=True
+    )
+    package, plugins, integrator = result.stdout.splitlines() or [result.stderr] * 3
+    assert package == str(checkout / "drgs" / "__init__.py")
+    assert plugins == str(checkout / "plugins" / "__init__.py")
+    assert integrator == "SplatsIntegrator"
+
+
+def test_every_file_of_the_packages_is_installed(installed):
+    def files(folder):
         return {
-            p.parent.relative_to(folder).as_posix().replace("plugins", "drgs/plugins")
-            for top in ("drgs", "plugins")
-            for p in (folder / top).rglob("__init__.py")
+            path.relative_to(folder).as_posix()
+            for path in folder.rglob("*")
+            if path.is_file() and "__pycache__" not in path.parts
         }
 
-    built = {p.parent.relative_to(installed).as_posix() for p in installed.rglob("__init__.py")}
-    assert built == packages(REPOSITORY)
+    expected = files(REPOSITORY / "drgs")
+    expected |= {f"plugins/{name}" for name in files(REPOSITORY / "plugins")}
+    assert {"results/page.html", "training/training_curves.csv", "__init__.py"} <= expected
+    assert files(installed / "drgs") == expected
 
 
 def test_the_version_is_that_of_the_project_file():

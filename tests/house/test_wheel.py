@@ -20,8 +20,8 @@ from support.small_capture import blobs
 pytestmark = [
     pytest.mark.slow,
     pytest.mark.skipif(
-        find_spec("pip") is None or find_spec("wheel") is None or find_spec("setuptools") is None,
-        reason="needs pip, setuptools and wheel",
+        find_spec("pip") is None or find_spec("hatchling") is None,
+        reason="needs pip and hatchling",
     ),
 ]
 
