@@ -1,0 +1,145 @@
+"""How much memory there is, and what is refused because it cannot be held.
+
+Linux ends a process that takes more than there is, without a word. What may become large is
+therefore estimated before it is allocated.
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+try:
+    import resource
+except ImportError:  # Windows
+    resource = None
+
+MAX_LANES = 2**32 - 1
+"""Entries of an array of Dr.Jit, which counts them in 32 bits."""
+
+PICTURE_BYTES = 250
+"""About what rendering takes for a pixel: splats in its tile, planes, the film's block, the picture
+and its copy on the host."""
+
+SAMPLE_BYTES = 80
+"""The same for each further sample of a pixel, whose planes are kept as well."""
+
+_PROC, _CGROUPS = Path("/proc"), Path("/sys/fs/cgroup")
+
+_UNLIMITED = 1 << 60
+"""Bytes; what version 1 of control groups calls a limit where there is none is more."""
+
+
+def available_memory() -> int:
+    """Bytes that this process can still take.
+
+    The least of what the machine, the process's control groups and its own limit leave it.
+    """
+    return max(0, min(_of_machine(), _of_control_groups(), _of_process()))
+
+
+def readable(count: float) -> str:
+    """A number of bytes as messages write it: ``3.2 GB``."""
+    for unit, size in (("GB", 1e9), ("MB", 1e6)):
+        if count >= 0.9995 * size:
+            return f"{_three_digits(count / size)} {unit}"
+    return f"{count / 1e3:.0f} kB"
+
+
+def why_too_large(width: int, height: int, channels: int = 3, samples: int = 1) -> str | None:
+    """Why a picture of ``width`` x ``height`` px cannot be rendered here; None: it can.
+
+    channels: of the film, without alpha; samples: per pixel, times those of an open shutter.
+    The text says what is asked for, what there is, and how much would do; the caller says where.
+    """
+    asked = f"{width} x {height} px" + (f" with {samples:,} samples each" if samples > 1 else "")
+    pixels, widest = width * height, max(channels + 1, samples)
+    if pixels * widest > MAX_LANES:
+        return (
+            f"{asked} are too many for Dr.Jit, whose arrays end at 2^32 entries; at most "
+            f"{_pixels(MAX_LANES // widest)}"
+        )
+    of_pixel = PICTURE_BYTES + SAMPLE_BYTES * (samples - 1)
+    needed, available = pixels * of_pixel, available_memory()
+    if needed <= available:
+        return None
+    return (
+        f"{asked} need about {readable(needed)} of memory, of which {readable(available)} are "
+        f"available; at most {_pixels(available // of_pixel)}"
+    )
+
+
+def _pixels(count: int) -> str:
+    return (
+        f"{_three_digits(count)} pixels fit"
+        if count < 1e6
+        else (f"{_three_digits(count / 1e6)} million pixels fit")
+    )
+
+
+def _three_digits(number: float) -> str:
+    return f"{float(f'{number:.3g}'):,g}"
+
+
+# ----------------------------------------------------------------------------------------------
+# What limits memory
+# ----------------------------------------------------------------------------------------------
+
+
+def _of_machine() -> int:
+    """What the kernel could give without swapping; elsewhere than on Linux, all there is."""
+    for line in _lines(_PROC / "meminfo"):
+        if line.startswith("MemAvailable:"):
+            return 1024 * int(line.split()[1])
+    try:
+        return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    except (AttributeError, ValueError, OSError):
+        return _UNLIMITED
+
+
+def _of_process() -> int:
+    """What ``ulimit -v`` leaves."""
+    if resource is None:
+        return _UNLIMITED
+    limit, _ = resource.getrlimit(resource.RLIMIT_AS)
+    if limit == resource.RLIM_INFINITY:
+        return _UNLIMITED
+    pages = next(iter(_lines(_PROC / "self" / "statm")), "0").split()[0]
+    return limit - int(pages) * resource.getpagesize()
+
+
+def _of_control_groups() -> int:
+    """What the limits of the control groups leave that the process is in; both versions."""
+    rooms = [_UNLIMITED]
+    for line in _lines(_PROC / "self" / "cgroup"):
+        _, controllers, path = line.split(":", 2)
+        if not controllers:
+            names, root = ("memory.max", "memory.current", "inactive_file"), _CGROUPS
+        elif "memory" in controllers.split(","):
+            names = ("memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file")
+            root = _CGROUPS / "memory"
+        else:
+            continue
+        group = root / path.strip("/")
+        # In a container, its own group is mounted as the root.
+        rooms += [_room(folder, *names) for folder in (group, *group.parents, root)]
+    return min(rooms)
+
+
+def _room(group: Path, limit: str, usage: str, reclaimable: str) -> int:
+    """What a control group has left; files that it keeps in memory make room when asked to."""
+    most, used = (next(iter(_lines(group / name)), "") for name in (limit, usage))
+    if not most.isdigit() or not used.isdigit() or int(most) >= _UNLIMITED:
+        return _UNLIMITED
+    cached = [
+        line.split()[1] for line in _lines(group / "memory.stat") if line.split()[0] == reclaimable
+    ]
+    return int(most) - int(used) + sum(map(int, cached))
+
+
+def _lines(path: Path) -> list[str]:
+    """Of a file of the kernel; none where there is no such file."""
+    try:
+        return path.read_text().splitlines()
+    except OSError:
+        return []

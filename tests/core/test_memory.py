@@ -1,0 +1,109 @@
+"""What memory there is, as the kernel's files say; what is refused because it cannot be held."""
+
+import subprocess
+import sys
+
+import pytest
+
+from drgs.core import memory
+
+GB = 10**9
+
+
+def write(folder, **files):
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, text in files.items():
+        (folder / name.replace("__", ".")).write_text(text)
+
+
+@pytest.fixture
+def kernel(tmp_path, monkeypatch):
+    """A folder with the kernel's files: of a machine with 8 GB to give, and no control group."""
+    monkeypatch.setattr(memory, "_PROC", tmp_path / "proc")
+    monkeypatch.setattr(memory, "_CGROUPS", tmp_path / "cgroup")
+    monkeypatch.setattr(memory, "_of_process", lambda: memory._UNLIMITED)
+    write(tmp_path / "proc", meminfo="MemTotal: 99 kB\nMemAvailable:    8000000 kB\n")
+    write(tmp_path / "proc" / "self", cgroup="")
+    return tmp_path
+
+
+def test_the_machine_has_what_the_kernel_says(kernel):
+    assert memory.available_memory() == 8_000_000 * 1024
+
+
+@pytest.mark.parametrize("path", ["/a/b", "/"])
+def test_a_control_group_of_version_2_limits_it(kernel, path):
+    """Its parents' limits hold as well; what is kept of files makes room."""
+    write(kernel / "proc" / "self", cgroup=f"0::{path}\n")
+    group = kernel / "cgroup" / path.strip("/")
+    write(group, memory__max="max\n", memory__current=f"{GB}\n", memory__stat="anon 7\n")
+    assert memory.available_memory() == 8_000_000 * 1024
+    parent = kernel / "cgroup"
+    stat = f"anon 7\ninactive_file {GB // 2}\n"
+    write(parent, memory__max=f"{4 * GB}\n", memory__current=f"{GB}\n", memory__stat=stat)
+    assert memory.available_memory() == 3.5 * GB
+    write(group, memory__max=f"{GB}\n", memory__current=f"{2 * GB}\n", memory__stat="anon 7\n")
+    assert memory.available_memory() == 0
+
+
+def test_a_control_group_of_version_1_limits_it(kernel):
+    lines = ["9:name=systemd:/", "5:cpu,memory:/jobs/7"]
+    write(kernel / "proc" / "self", cgroup="\n".join(lines))
+    names = ("memory__limit_in_bytes", "memory__usage_in_bytes", "memory__stat")
+    unlimited = dict(zip(names, ("9223372036854771712\n", f"{GB}\n", ""), strict=True))
+    write(kernel / "cgroup" / "memory", **unlimited)
+    assert memory.available_memory() == 8_000_000 * 1024
+    limited = (f"{2 * GB}\n", f"{GB}\n", f"inactive_file 3\ntotal_inactive_file {GB // 4}\n")
+    write(kernel / "cgroup" / "memory" / "jobs" / "7", **dict(zip(names, limited, strict=True)))
+    assert memory.available_memory() == 1.25 * GB
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="the size of a process is read from /proc")
+def test_a_limit_of_the_process_counts():
+    code = (
+        "import resource; resource.setrlimit(resource.RLIMIT_AS, (3 * 10**9,) * 2);"
+        "from drgs.core.memory import available_memory; print(available_memory())"
+    )
+    code = "import sys, types; sys.modules['drgs'] = m = types.ModuleType('drgs');" + (
+        f"m.__path__ = [{str(memory.__file__.rpartition('core')[0])!r}];" + code
+    )  # without what the package loads
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert 2.5e9 < int(done.stdout) < 3e9
+
+
+@pytest.mark.parametrize(
+    ("count", "text"),
+    [(24.06e9, "24.1 GB"), (999.9e6, "1 GB"), (5e12, "5,000 GB"), (123_456, "123 kB")],
+)
+def test_numbers_are_written_with_three_digits(count, text):
+    assert memory.readable(count) == text
+
+
+@pytest.fixture
+def eight_gigabytes(monkeypatch):
+    monkeypatch.setattr(memory, "available_memory", lambda: 8 * GB)
+
+
+def test_a_picture_that_fits_is_not_refused(eight_gigabytes):
+    assert memory.why_too_large(400, 400) is None
+    assert memory.why_too_large(4000, 5000) is None
+
+
+def test_a_picture_that_does_not_fit_is_refused_with_numbers(eight_gigabytes):
+    needed = 20_000**2 * memory.PICTURE_BYTES / GB
+    assert memory.why_too_large(20_000, 20_000) == (
+        f"20000 x 20000 px need about {needed:g} GB of memory, of which 8 GB are available; at "
+        f"most {float(f'{8000 / memory.PICTURE_BYTES:.3g}'):g} million pixels fit"
+    )
+    assert "with 1,000 samples each need about" in memory.why_too_large(400, 400, samples=1000)
+
+
+def test_what_fits_into_memory_may_be_too_many_for_the_library(monkeypatch):
+    monkeypatch.setattr(memory, "available_memory", lambda: 10**15)
+    assert memory.why_too_large(2**15, 2**15 - 1) is None
+    assert memory.why_too_large(10**9, 100) == (
+        "1000000000 x 100 px are too many for Dr.Jit, whose arrays end at 2^32 entries; at most "
+        "1,070 million pixels fit"
+    )
+    assert "too many for Dr.Jit" in memory.why_too_large(400, 400, samples=10**9)
+    assert "too many for Dr.Jit" in memory.why_too_large(2000, 2000, channels=2000)
