@@ -28,6 +28,7 @@ from __future__ import annotations
 import argparse
 import hashlib
 import json
+import math
 import sys
 from collections.abc import Sequence
 from dataclasses import asdict, fields
@@ -37,14 +38,14 @@ import mitsuba as mi
 import numpy as np
 from plyfile import PlyData, PlyElement
 
-from drgs.cli.commands import CommandParser, at_least, finite_number, run_command
+from drgs.cli.commands import CommandParser, at_least, degrees, finite_number, run_command
 from drgs.cli.execution import add_variant_argument, select_variant
 from drgs.cli.interrupts import INTERRUPTED_STATUS
 from drgs.cli.progress import RunProgress
-from drgs.core.errors import UserError
-from drgs.core.files import atomic_path, why_refused
+from drgs.core.errors import UserError, one_line
+from drgs.core.files import atomic_path, read_text, remove_stale_temporaries, why_refused
 from drgs.data.path_tracing import (
-    LEAST,
+    LIMITS,
     SPLITS,
     CaptureCamera,
     CaptureSettings,
@@ -58,13 +59,14 @@ from drgs.data.path_tracing import (
 from drgs.io.pictures import write_png
 
 MANIFEST = "capture.json"
+MAX_MANIFEST_BYTES = 1 << 20
+REMEDY = "choose another --out, or remove it"
 POINTS = "points3d.ply"
 
 WHOLE_NUMBERS = {
     "views": "pictures to train on",
     "val_views": "pictures of the split val",
     "test_views": "pictures of the split test",
-    "size": "width and height in px",
     "spp": "paths per pixel",
     "max_depth": "longest path",
     "points": f"number of points in {POINTS}",
@@ -81,7 +83,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 def add_arguments(parser: CommandParser) -> None:
     """Add the arguments of the command."""
     parser.description = "Turn a Mitsuba scene into a training set in the NeRF-synthetic layout."
-    parser.show_examples("%(prog)s scenes/brick_crane.py --views 100 --size 400 --out DIR")
+    parser.show_examples("%(prog)s scenes/brick_crane.py --views 100 --size 400 400 --out DIR")
     parser.add_argument(
         "scene", type=Path, metavar="SCENE", help="XML file, or Python file with a function scene()"
     )
@@ -90,17 +92,24 @@ def add_arguments(parser: CommandParser) -> None:
     for name, text in WHOLE_NUMBERS.items():
         parser.add_argument(
             f"--{name.replace('_', '-')}",
-            type=at_least(LEAST[name]),
+            type=at_least(*LIMITS[name]),
             default=default[name],
             metavar="N",
             help=f"{text} (default: {default[name]})",
         )
     parser.add_argument(
+        "--size",
+        type=at_least(1),
+        nargs=2,
+        default=default["size"],
+        metavar=("W", "H"),
+        help="px (default: 400 400); their background is transparent",
+    )
+    parser.add_argument(
         "--fov",
-        type=finite_number,
-        default=default["fov"],
-        metavar="RADIANS",
-        help="field of view (default: the original's %(default).4f)",
+        type=_wide_degrees,
+        metavar="DEGREES",
+        help="horizontal field of view (default: the original's 39.6)",
     )
     parser.add_argument(
         "--distance",
@@ -124,8 +133,7 @@ def add_arguments(parser: CommandParser) -> None:
 def run(args: argparse.Namespace) -> None:
     """Capture what the command line names; end the process with status 130 at a Ctrl-C."""
     try:
-        given = {field.name: getattr(args, field.name) for field in fields(CaptureSettings)}
-        settings = CaptureSettings(**given | {"target": args.target and tuple(args.target)})
+        settings = _settings(args)
         if not args.scene.is_file():
             raise UserError(f"{args.scene}: there is no such scene file")
         select_variant(args.variant)
@@ -139,6 +147,24 @@ def run(args: argparse.Namespace) -> None:
     except KeyboardInterrupt:
         print("\ninterrupted; the same command continues", file=sys.stderr)
         sys.exit(INTERRUPTED_STATUS)
+
+
+def _settings(args: argparse.Namespace) -> CaptureSettings:
+    given = {field.name: getattr(args, field.name) for field in fields(CaptureSettings)}
+    fov = CaptureSettings.fov if args.fov is None else math.radians(args.fov)
+    tuples = {"size": tuple(args.size), "target": args.target and tuple(args.target)}
+    return CaptureSettings(**given | tuples | {"fov": fov})
+
+
+def _wide_degrees(text: str) -> float:
+    """A field of view; one of at most pi would be radians, in which it once was given."""
+    angle = degrees(text)
+    if angle <= math.pi:
+        raise argparse.ArgumentTypeError(
+            f"must be in degrees, more than {math.pi:.4g}, got {text}; if these are radians, give "
+            f"--fov {math.degrees(angle):.4g}"
+        )
+    return angle
 
 
 def take_pictures(
@@ -169,7 +195,8 @@ def write_dataset(
         if settings.count(split):
             write_transforms(out / f"transforms_{split}.json", settings, views, split)
     counted = ", ".join(f"{settings.count(s)} {s}" for s in SPLITS if settings.count(s))
-    print(f"written: {out}: {counted} views, {settings.size}x{settings.size}, {settings.spp} spp")
+    width, height = settings.size
+    print(f"written: {out}: {counted} views, {width}x{height}, {settings.spp} spp")
 
 
 def manifest(path: Path, settings: CaptureSettings) -> dict[str, object]:
@@ -193,30 +220,50 @@ def fingerprint(path: Path) -> str:
 def claim_folder(out: Path, wanted: dict[str, object]) -> None:
     """Make ``out`` the folder of this capture: a new or empty one, or one that it began.
 
+    Hidden files do not count: a desktop's, or temporary ones of a capture that was killed before
+    its first file was in place.
+
     Raises :class:`UserError` where it holds anything else.
     """
     path = out / MANIFEST
     wanted = json.loads(json.dumps(wanted))
     if out.exists() and not out.is_dir():
         raise UserError(f"{out}: --out must be a folder, got a file")
-    if not out.exists() or not any(out.iterdir()):
+    if not out.exists() or not any(not child.name.startswith(".") for child in out.iterdir()):
         with atomic_path(path) as temporary:
             temporary.write_text(json.dumps(wanted, indent=2) + "\n")
-        return
-    remedy = "choose another --out, or remove it"
-    if not path.is_file():
-        raise UserError(f"{out}: the folder is not empty and holds no {MANIFEST}; {remedy}")
+    elif not path.is_file():
+        raise UserError(f"{out}: the folder is not empty and holds no {MANIFEST}; {REMEDY}")
+    else:
+        _check_manifest(path, wanted)
+    remove_stale_temporaries(out)
+
+
+def _check_manifest(path: Path, wanted: dict[str, object]) -> None:
+    """Raise :class:`UserError` where ``path`` is of another capture than the one wanted."""
     try:
-        found = json.loads(path.read_text(encoding="utf-8"))
-    except ValueError as error:
-        raise UserError(f"{path}: not valid JSON: {error}; {remedy}") from None
+        found = json.loads(read_text(path, "settings of the capture", MAX_MANIFEST_BYTES))
+    except (ValueError, RecursionError) as error:
+        if isinstance(error, UserError):
+            raise
+        raise UserError(f"{path}: not valid JSON: {one_line(error)}; {REMEDY}") from None
     found = found if isinstance(found, dict) else {}
+    if isinstance(found.get("size"), int):  # earlier versions': pictures were squares
+        found["size"] = [found["size"]] * 2
     for key, value in wanted.items():
         if found.get(key) != value:
+            theirs, ours = (_shown(key, values.get(key)) for values in (found, wanted))
             raise UserError(
-                f"{path}: the folder holds another capture: {key} is {json.dumps(found.get(key))}, "
-                f"asked for is {json.dumps(value)}; {remedy}"
+                f"{path}: the folder holds another capture: {key} is {theirs}, asked for is "
+                f"{ours}; {REMEDY}"
             )
+
+
+def _shown(key: str, value: object) -> str:
+    """A value of the manifest in the unit of its option."""
+    if key == "fov" and isinstance(value, float):
+        value = round(math.degrees(value), 4)
+    return one_line(json.dumps(value), 120)
 
 
 def write_transforms(

@@ -28,10 +28,10 @@ from typing import Protocol, runtime_checkable
 import mitsuba as mi
 import numpy as np
 
-from drgs.cli.commands import CommandParser, at_least, finite_number, run_command
+from drgs.cli.commands import CommandParser, at_least, degrees, finite_number, run_command
 from drgs.cli.execution import VARIANTS, add_execution_arguments, executing, select_variant
 from drgs.config.load import load_config
-from drgs.config.schema import NAMED_COLORS, DataConfig, FitConfig, ModelConfig
+from drgs.config.schema import NAMED_COLORS, FitConfig, ModelConfig
 from drgs.core.constants import SHUTTER_SAMPLES
 from drgs.core.errors import PluginError, UserError
 from drgs.core.files import atomic_path
@@ -56,6 +56,9 @@ from drgs.results.metrics import Quality, mean_of, psnr, ssim
 
 DEFAULT_SIZE = (400, 400)
 """px, where nothing else says how large a picture should be."""
+
+BACKGROUND = "black"
+"""Behind Gaussians without a configuration: that of the integrator ``splats``."""
 
 UP = (0.0, 0.0, 1.0)
 """World: the convention of both dataset layouts."""
@@ -155,8 +158,19 @@ def _add_cameras(parser: CommandParser) -> None:
     add = group.add_argument
     add("--target", **vector, help="what it looks at (default: 0 0 0)")
     add("--up", **vector, help="up in the picture, of --origin or --orbit (default: 0 0 1)")
-    add("--fov", type=_degrees, metavar="DEGREES", help="horizontal field of view (default: 40)")
-    add("--size", type=at_least(1), nargs=2, metavar=("W", "H"), help="px (default: 400 400)")
+    add(
+        "--fov",
+        type=degrees,
+        metavar="DEGREES",
+        help="horizontal field of view (default: 40; of --orbit, the photographs')",
+    )
+    add(
+        "--size",
+        type=at_least(1),
+        nargs=2,
+        metavar=("W", "H"),
+        help="px (default: 400 400; of --orbit, the photographs', within that)",
+    )
 
 
 def _add_settings(parser: CommandParser) -> None:
@@ -165,7 +179,8 @@ def _add_settings(parser: CommandParser) -> None:
         "--background",
         nargs="+",
         metavar="COLOR",
-        help="white, black, R G B in 0..1, or a picture's file",
+        help="white, black, R G B in 0..1, or a picture's file (default: the configuration's; "
+        "without one, black, as the integrator splats has it)",
     )
     group.add_argument(
         "--ignore",
@@ -225,7 +240,7 @@ def load_model(args: argparse.Namespace) -> Model:
         what = what / GAUSSIANS
     config = _load_config(config_path, args) if config_path is not None else None
     gaussians = Gaussians.load(what)
-    model, background = ModelConfig(), NAMED_COLORS[DataConfig.model_fields["background"].default]
+    model, background = ModelConfig(), NAMED_COLORS[BACKGROUND]
     if config is not None:
         model, background = config.model, config.data.background_rgb
     if args.background is not None:
@@ -450,14 +465,6 @@ def _definition(word: str) -> tuple[str, str]:
             f"the name {name} is taken by Mitsuba's loader: rename the parameter in the scene file"
         )
     return name, value
-
-
-def _degrees(text: str) -> float:
-    """A field of view."""
-    angle = finite_number(text)
-    if not 0 < angle < 180:
-        raise argparse.ArgumentTypeError(f"must be between 0 and 180 degrees, got {text}")
-    return angle
 
 
 def _background(args: argparse.Namespace) -> tuple[float, float, float] | Path:

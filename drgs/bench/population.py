@@ -229,7 +229,7 @@ def _assignments(values: dict[str, object]) -> list[str]:
 
 def generate(folder: Path, size: int) -> Path:
     """Path trace the shipped scene at ``size`` px; what is there already is kept."""
-    settings = ["--size", str(size), "--spp", str(LARGE_SPP), "--out", str(folder)]
+    settings = ["--size", str(size), str(size), "--spp", str(LARGE_SPP), "--out", str(folder)]
     if not (folder / "transforms_train.json").exists():
         capture.main([str(GENERATOR), *settings])
     return folder

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import argparse
 import math
+import re
 import sys
 from collections.abc import Callable, Sequence
 from importlib import import_module
-from typing import NamedTuple
+from typing import NamedTuple, NoReturn
 
 from drgs.cli.errors import exit_on_user_error
-from drgs.core.errors import did_you_mean
+from drgs.core.errors import did_you_mean, one_line
 
 
 class Subcommand(NamedTuple):
@@ -58,6 +59,13 @@ class CommandParser(argparse.ArgumentParser):
             self.error(f"there is no command {name}, only {', '.join(others)} and {last}{nearest}")
         return super().parse_known_args(args, namespace)
 
+    def error(self, message: str) -> NoReturn:
+        """As argparse's; an option that wants several words is shown with them."""
+        found = re.fullmatch(r"argument (?:\S+/)?(--\S+): expected \d+ arguments", message)
+        if found and isinstance(metavar := self._option_string_actions[found[1]].metavar, tuple):
+            message = f"{message}: {found[1]} {' '.join(metavar)}"
+        super().error(message)
+
 
 def run_command(
     add_arguments: Callable[[CommandParser], None],
@@ -76,15 +84,21 @@ def run_command(
         args.run(args)
 
 
-def at_least(minimum: int) -> Callable[[str], int]:
-    """The type of an argument that is a whole number, ``minimum`` or more."""
+def at_least(minimum: int, maximum: int | None = None) -> Callable[[str], int]:
+    """The type of an argument that is a whole number, ``minimum`` to ``maximum`` (None: no end)."""
 
     def whole_number(text: str) -> int:
-        if not text.strip().lstrip("+-").isdecimal() or int(text) < minimum:
+        # Python converts no more than 4,300 digits.
+        number = int(text) if re.fullmatch(r"\s*[+-]?[0-9]{1,4000}\s*", text) else None
+        if number is None or number < minimum:
             raise argparse.ArgumentTypeError(
-                f"must be a whole number >= {minimum}, got {text or 'nothing'}"
+                f"must be a whole number >= {minimum}, got {one_line(text, 80) or 'nothing'}"
             )
-        return int(text)
+        if maximum is not None and number > maximum:
+            raise argparse.ArgumentTypeError(
+                f"must be at most {maximum:,}, got {one_line(text, 80)}"
+            )
+        return number
 
     return whole_number
 
@@ -96,5 +110,15 @@ def finite_number(text: str) -> float:
     except ValueError:
         number = math.nan
     if not math.isfinite(number):
-        raise argparse.ArgumentTypeError(f"must be a finite number, got {text or 'nothing'}")
+        raise argparse.ArgumentTypeError(
+            f"must be a finite number, got {one_line(text, 80) or 'nothing'}"
+        )
     return number
+
+
+def degrees(text: str) -> float:
+    """The type of an argument that is a field of view: degrees, as Mitsuba's ``fov``."""
+    angle = finite_number(text)
+    if not 0 < angle < 180:
+        raise argparse.ArgumentTypeError(f"must be between 0 and 180 degrees, got {text}")
+    return angle

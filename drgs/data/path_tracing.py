@@ -40,8 +40,16 @@ MAX_LAMPS_IN_A_ROW = 16
 """Surfaces that shine are passed through on the way to the first hit, this many at most."""
 
 
-LEAST = dict(views=1, val_views=0, test_views=0, size=1, spp=1, max_depth=1, points=0, seed=0)
-"""By name of the setting, its smallest value."""
+LIMITS = {
+    "views": (1, 100_000),
+    "val_views": (0, 100_000),
+    "test_views": (0, 100_000),
+    "spp": (1, 2**20),
+    "max_depth": (1, 2**16),
+    "points": (0, 5_000_000),
+    "seed": (0, 2**64 - 1),
+}
+"""By name of the setting, its smallest and largest value."""
 
 
 @dataclass(frozen=True)
@@ -51,10 +59,10 @@ class CaptureSettings:
     views: int = 100  # to train on
     val_views: int = 0
     test_views: int = 25
-    size: int = 400  # px, width and height
+    size: tuple[int, int] = (400, 400)  # px, width and height
     spp: int = 256  # paths per pixel
     max_depth: int = 8  # segments of a path
-    fov: float = NERF_SYNTHETIC_FOV  # radians
+    fov: float = NERF_SYNTHETIC_FOV  # radians, horizontal
     distance: float | None = None  # of the cameras from the target; None: all is in the picture
     target: tuple[float, float, float] | None = None  # None: centre of the bounding box
     up: str = "z"
@@ -62,16 +70,30 @@ class CaptureSettings:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        for name, minimum in LEAST.items():
+        for name, (least, most) in LIMITS.items():
             value = getattr(self, name)
-            if value < minimum:
-                raise UserError(f"{name} must be >= {minimum}, got {value}")
+            if not least <= value <= most:
+                raise UserError(f"{name} must be between {least} and {most:,}, got {value}")
+        width, height = self.size
+        if min(width, height) < 1 or width * height > PATHS_PER_PASS:
+            raise UserError(
+                f"size must be at least 1 x 1 and at most {PATHS_PER_PASS:,} px in all, got "
+                f"{width} x {height}"
+            )
         if not 0 < self.fov < math.pi:
             raise UserError(f"fov must be between 0 and pi (radians), got {self.fov:g}")
         if self.distance is not None and not 0 < self.distance < math.inf:
             raise UserError(f"distance must be > 0, got {self.distance:g}")
         if self.target is not None and not np.isfinite(self.target).all():
             raise UserError(f"target must be finite, got {self.target}")
+
+    @property
+    def narrower_fov(self) -> float:
+        """Radians: the smaller one of the horizontal and the vertical field of view."""
+        width, height = self.size
+        if height >= width:
+            return self.fov
+        return 2 * math.atan(height / width * math.tan(self.fov / 2))
 
     def count(self, split: str) -> int:
         """Number of views of a split."""
@@ -160,13 +182,14 @@ def target_and_distance(scene: mi.Scene, settings: CaptureSettings) -> tuple[np.
     """What the cameras look at, (3,) world, and their distance from it.
 
     Without ``distance``, the bounding box's sphere just fits between the edges of the picture:
-    radius / sin(fov / 2). The original's 4.03 is 10% less: its box has empty corners.
+    radius / sin(fov / 2), with the narrower field of view. The original's 4.03 is 10% less: its box
+    has empty corners.
     """
     low, high = bounding_box(scene)
     target = (low + high) / 2 if settings.target is None else np.array(settings.target)
     if settings.distance is not None:
         return target, settings.distance
-    return target, float(np.linalg.norm(high - low)) / 2 / math.sin(settings.fov / 2)
+    return target, float(np.linalg.norm(high - low)) / 2 / math.sin(settings.narrower_fov / 2)
 
 
 def capture_views(
@@ -226,8 +249,8 @@ class CaptureCamera:
                 "far_clip": FAR_CLIP * diagonal,
                 "film": {
                     "type": "hdrfilm",
-                    "width": settings.size,
-                    "height": settings.size,
+                    "width": settings.size[0],
+                    "height": settings.size[1],
                     "pixel_format": "rgba",
                     "component_format": "float32",
                     "rfilter": {"type": "box"},
@@ -238,7 +261,7 @@ class CaptureCamera:
         self._parameters = mi.traverse(self._sensor)
 
     def picture(self, view: CaptureView) -> np.ndarray:
-        """(size, size, 4) uint8: straight alpha, colour in display space."""
+        """(H, W, 4) uint8: straight alpha, colour in display space."""
         linear = self.linear(view)
         if not np.isfinite(linear).all():
             y, x = np.argwhere(~np.isfinite(linear).all(axis=2))[0]
@@ -246,16 +269,16 @@ class CaptureCamera:
         return encode(linear)
 
     def linear(self, view: CaptureView) -> np.ndarray:
-        """(size, size, 4) float64: radiance times alpha, and alpha."""
+        """(H, W, 4) float64: radiance times alpha, and alpha."""
         to_world = view.pose @ OPENGL_TO_MITSUBA
         self._parameters["to_world"] = mi.Transform4f(to_world)
         self._parameters.update()
-        size, spp = self._settings.size, self._settings.spp
-        at_once = min(SAMPLES_PER_PASS, max(1, math.isqrt(PATHS_PER_PASS // size**2) ** 2))
+        (width, height), spp = self._settings.size, self._settings.spp
+        at_once = min(SAMPLES_PER_PASS, math.isqrt(PATHS_PER_PASS // (width * height)) ** 2)
         counts = [min(at_once, spp - start) for start in range(0, spp, at_once)]
         entropy = [self._settings.seed, SPLITS.index(view.split), view.index]
         seeds = np.random.SeedSequence(entropy).generate_state(len(counts))
-        total = np.zeros((size, size, 4))
+        total = np.zeros((height, width, 4))
         for count, seed in zip(counts, seeds, strict=True):
             image = mi.render(
                 self._scene,
@@ -302,7 +325,7 @@ def visible_points(
             continue
         # At the edge of a surface a ray can miss it, so draw more than are kept.
         pixels = rng.choice(len(picture), 2 * share + 64, p=weights / weights.sum())
-        rows, columns = np.divmod(pixels, settings.size)
+        rows, columns = np.divmod(pixels, settings.size[0])
         spots = np.stack([columns, rows], axis=1) + rng.uniform(size=(len(pixels), 2))
         hits, valid = first_hits(scene, view.pose[:3, 3], view_rays(view.pose, spots, settings))
         positions.append(hits[valid][:share])
@@ -314,8 +337,9 @@ def visible_points(
 
 def view_rays(pose: np.ndarray, spots: np.ndarray, settings: CaptureSettings) -> np.ndarray:
     """(N, 3): unit directions, world, through (N, 2) places x, y in px of a picture."""
-    focal = 0.5 * settings.size / math.tan(0.5 * settings.fov)
-    offset = (spots - settings.size / 2) / focal
+    width, height = settings.size
+    focal = 0.5 * width / math.tan(0.5 * settings.fov)
+    offset = (spots - np.array([width / 2, height / 2])) / focal
     local = np.stack([offset[:, 0], -offset[:, 1], -np.ones(len(spots))], axis=1)
     directions = local @ pose[:3, :3].T
     return directions / np.linalg.norm(directions, axis=1, keepdims=True)

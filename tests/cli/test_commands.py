@@ -51,7 +51,7 @@ def test_modules_are_commands_too_and_say_how_they_are_called(capsys, command):
         (["fit", "a.yml", "--resume", "out"], "not allowed with argument"),
         (["fit", "--resume", "out", "--data", "x"], "configuration from out/config.yml: leave out"),
         (["fit", "a.yml", "--budget", "soon"], "argument --budget: "),
-        (["capture", "a.xml", "--out", "x", "--size", "0"], "argument --size: must be a whole"),
+        (["capture", "a.xml", "--out", "x", "--spp", "0"], "argument --spp: must be a whole"),
         (["capture", "a.xml", "--out", "x", "--fov", "inf"], "argument --fov: must be a finite"),
         (["render", "a.ply"], "the following arguments are required: --out"),
     ],

@@ -8,6 +8,7 @@ import pytest
 import yaml
 from scipy.spatial.transform import Rotation
 from support.render_command import (
+    BLACK,
     EIGHT_BITS,
     WHITE,
     assert_shows,
@@ -269,4 +270,4 @@ def test_a_camera_placed_by_hand_is_that_camera(fit, tmp_path):
     arguments = ["--origin", *pose[:3, 3], "--target", *FOCUS, "--fov", fov]
     size = ("--size", WIDTH, HEIGHT)
     run(fit / "point_cloud.ply", *arguments, *size, "--out", tmp_path)
-    assert_shows(tmp_path / "camera.png", small_view("", pose, None), WHITE)
+    assert_shows(tmp_path / "camera.png", small_view("", pose, None), BLACK)

@@ -15,6 +15,7 @@ from support.small_capture import (
 )
 
 WHITE = (1.0, 1.0, 1.0)
+BLACK = (0.0, 0.0, 0.0)
 
 
 def picture(path):
