@@ -51,6 +51,11 @@ def _layout(config: DataConfig) -> str:
     except FileNotFoundError:
         remedy = f"; get it from {config.source}" if config.source else ""
         raise UserError(f"data.path: there is no folder {config.path}{remedy}") from None
+    except NotADirectoryError:
+        raise UserError(
+            f"data.path: {config.path} is a file; give the folder of the dataset, such as "
+            f"{config.path.parent}"
+        ) from None
     except OSError as error:
         raise UserError(
             f"data.path: cannot open the folder {config.path}: {error.strerror}"
@@ -60,7 +65,6 @@ def _layout(config: DataConfig) -> str:
     for layout, marker in _MARKERS.items():
         if marker in names:
             return layout
-    raise UserError(
-        f"{config.path}: neither {' nor '.join(_MARKERS.values())} is there; data.path must be a "
-        "folder in the layout of NeRF-synthetic or of nerfstudio / instant-ngp"
-    )
+    from drgs.data.recognition import what_is_there
+
+    raise UserError(f"{config.path}: {what_is_there(config.path, tuple(_MARKERS.values()))}")

@@ -149,8 +149,8 @@ WRONG_INPUTS = {
     "unknown key": (edit_settings(sed=3), "a.yml: unknown key sed; did you mean seed?"),
     "wrong value": (edit_settings(iterations=0), "a.yml: iterations must be >= 1, got 0"),
     "data missing": (edit_settings(data={"path": "none"}), "data.path: there is no folder"),
-    "data is a file": (edit_settings(data={"path": "a.yml"}), "data.path: cannot open the folder"),
-    "data of no layout": (edit_settings(data={"path": "train"}), "train: neither transforms_tr"),
+    "data is a file": (edit_settings(data={"path": "a.yml"}), "a.yml is a file; give the folder"),
+    "data of no layout": (edit_settings(data={"path": "train"}), "but no cameras: where each was"),
     "transforms is a folder": (
         put_folder_in_place_of("transforms_train.json"),
         "transforms_train.json: cannot read the file: Is a directory",

@@ -1,0 +1,136 @@
+"""What a folder holds that is no dataset yet, and how it becomes one.
+
+Imported when no layout's file was found, to say more than that.
+"""
+
+from __future__ import annotations
+
+import os
+import shlex
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+PICTURES = frozenset(
+    {".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp", ".heic", ".dng", ".cr2", ".nef"}
+)
+VIDEOS = frozenset({".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v"})
+
+PICTURE_FOLDERS = ("images", "input", "photos", "rgb")
+"""Where converters expect photographs, or put them."""
+
+COLMAP_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0", "0", ".")
+"""Where COLMAP's models lie in the folders of common tools."""
+
+GUIDE = 'docs/guide.md, "From photographs to a dataset"'
+
+
+def what_is_there(folder: Path, markers: Sequence[str]) -> str:
+    """What ``folder`` was recognised as, and what to do; one line, without the folder's name.
+
+    markers: the files that the layouts have, none of which is there.
+    """
+    names = sorted(os.listdir(folder))
+    recognisers: tuple[Callable[[Path, list[str], Sequence[str]], str | None], ...] = (
+        _output_of_a_fit,
+        _splits_without_training,
+        _dataset_below,
+        _colmap_model,
+        _llff_poses,
+        _pictures,
+        _videos,
+    )
+    for recognise in recognisers:
+        if (found := recognise(folder, names, markers)) is not None:
+            return found
+    return (
+        f"neither {' nor '.join(markers)} is there; data.path must be a folder in the layout of "
+        "NeRF-synthetic or of nerfstudio / instant-ngp"
+    )
+
+
+def _output_of_a_fit(folder: Path, names: list[str], markers: Sequence[str]) -> str | None:
+    if "config.yml" not in names or not {"point_cloud.ply", "checkpoint.npz"} & set(names):
+        return None
+    return (
+        "is the output folder of a fit, not a dataset; data.path must be the folder of the "
+        "photographs, which config.yml there names"
+    )
+
+
+def _splits_without_training(folder: Path, names: list[str], markers: Sequence[str]) -> str | None:
+    splits = [n for n in names if n.startswith("transforms_") and n.endswith(".json")]
+    if not splits:
+        return None
+    return (
+        f"holds {_listed(splits)} of the NeRF-synthetic layout, but not transforms_train.json; get "
+        "the missing file, or rename the one to train on"
+    )
+
+
+def _dataset_below(folder: Path, names: list[str], markers: Sequence[str]) -> str | None:
+    for name in names:
+        for marker in markers:
+            if os.path.isfile(folder / name / marker):
+                return f"holds a dataset in its folder {name}; give {_quoted(folder / name)}"
+    return None
+
+
+def _colmap_model(folder: Path, names: list[str], markers: Sequence[str]) -> str | None:
+    for below in COLMAP_FOLDERS:
+        for suffix in (".bin", ".txt"):
+            if all(os.path.isfile(folder / below / f"{n}{suffix}") for n in ("cameras", "images")):
+                return (
+                    f"is a COLMAP reconstruction ({Path(below, 'cameras' + suffix)}), which is not "
+                    f"read directly yet; copy the files of {_quoted(folder / below)} to "
+                    "DIR/colmap/sparse/0, have transforms.json written: ns-process-data images "
+                    f"--data {_quoted(_folder_of_pictures(folder))} --output-dir DIR "
+                    f"--skip-colmap, then give DIR; see {GUIDE}"
+                )
+    return None
+
+
+def _llff_poses(folder: Path, names: list[str], markers: Sequence[str]) -> str | None:
+    if "poses_bounds.npy" not in names:
+        return None
+    return (
+        "is in the layout of LLFF (poses_bounds.npy), which is not read; convert it to "
+        f"transforms.json; see {GUIDE}"
+    )
+
+
+def _pictures(folder: Path, names: list[str], markers: Sequence[str]) -> str | None:
+    below = _folder_of_pictures(folder)
+    pictures = [n for n in sorted(os.listdir(below)) if Path(n).suffix.lower() in PICTURES]
+    if not pictures:
+        return None
+    count = "1 picture" if len(pictures) == 1 else f"{len(pictures):,} pictures"
+    return (
+        f"holds {count} ({_listed(pictures)}), but no cameras: where each was taken must be known; "
+        f"find it out: ns-process-data images --data {_quoted(below)} --output-dir DIR, then give "
+        f"DIR; see {GUIDE}"
+    )
+
+
+def _videos(folder: Path, names: list[str], markers: Sequence[str]) -> str | None:
+    videos = [n for n in names if Path(n).suffix.lower() in VIDEOS]
+    if not videos:
+        return None
+    return (
+        f"holds a video ({_listed(videos)}), but no photographs with cameras: ns-process-data "
+        f"video --data {_quoted(folder / videos[0])} --output-dir DIR, then give DIR; see {GUIDE}"
+    )
+
+
+def _folder_of_pictures(folder: Path) -> Path:
+    """The folder itself, or the one in it that is for pictures."""
+    below = (folder / name for name in PICTURE_FOLDERS)
+    return next((path for path in below if os.access(path, os.R_OK) and path.is_dir()), folder)
+
+
+def _listed(names: Sequence[str]) -> str:
+    return names[0] if len(names) == 1 else f"{names[0]} and {len(names) - 1} more"
+
+
+def _quoted(path: Path) -> str:
+    """As a shell reads it."""
+    return shlex.quote(str(path))

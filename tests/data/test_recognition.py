@@ -1,0 +1,89 @@
+"""A folder that is no dataset: what it is recognised as, and what its user is told to do."""
+
+import json
+
+import pytest
+from support.datasets import refusal
+
+from drgs.data.recognition import GUIDE
+
+
+def touch(folder, *names):
+    for name in names:
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_bytes(b"")
+
+
+@pytest.mark.parametrize("suffix", [".bin", ".txt"])
+@pytest.mark.parametrize("below", ["sparse/0", "sparse", "colmap/sparse/0", "."])
+def test_a_colmap_reconstruction(tmp_path, below, suffix):
+    touch(tmp_path, f"{below}/cameras{suffix}", f"{below}/images{suffix}", "images/a.jpg")
+    where = "" if below == "." else f"{below}/"
+    assert refusal(tmp_path) == (
+        f"{tmp_path}: is a COLMAP reconstruction ({where}cameras{suffix}), which is not read "
+        f"directly yet; copy the files of {tmp_path / below} to DIR/colmap/sparse/0, have "
+        f"transforms.json written: ns-process-data images --data {tmp_path}/images --output-dir "
+        f"DIR --skip-colmap, then give DIR; see {GUIDE}"
+    )
+
+
+@pytest.mark.parametrize("below", ["", "images/", "input/"])
+def test_photographs_without_cameras(tmp_path, below):
+    touch(tmp_path, *(f"{below}IMG_{i}.JPG" for i in range(3)), f"{below}notes.txt")
+    assert refusal(tmp_path) == (
+        f"{tmp_path}: holds 3 pictures (IMG_0.JPG and 2 more), but no cameras: where each was "
+        f"taken must be known; find it out: ns-process-data images --data "
+        f"{(tmp_path / below)} --output-dir DIR, then give DIR; see {GUIDE}"
+    )
+
+
+def test_a_command_names_folders_as_a_shell_reads_them(tmp_path):
+    touch(tmp_path / "my photos", "a.png")
+    assert "holds 1 picture (a.png), but" in (message := refusal(tmp_path / "my photos"))
+    assert f"--data '{tmp_path}/my photos' --output-dir" in message
+
+
+def test_a_video(tmp_path):
+    touch(tmp_path, "walk.MOV")
+    assert "holds a video (walk.MOV), but no photographs with cameras: ns-process-data video " in (
+        refusal(tmp_path)
+    )
+
+
+def test_a_dataset_one_folder_below(tmp_path):
+    touch(tmp_path, "a/notes.txt", "scene/transforms.json", "b.jpg")
+    assert refusal(tmp_path) == (
+        f"{tmp_path}: holds a dataset in its folder scene; give {tmp_path}/scene"
+    )
+
+
+def test_a_split_without_the_training_views(tmp_path):
+    touch(tmp_path, "transforms_test.json", "transforms_val.json")
+    assert "holds transforms_test.json and 1 more of the NeRF-synthetic layout, but not " in (
+        refusal(tmp_path)
+    )
+
+
+def test_the_output_of_a_fit(tmp_path):
+    touch(tmp_path, "config.yml", "point_cloud.ply", "curves.png")
+    assert "is the output folder of a fit, not a dataset; data.path must be" in refusal(tmp_path)
+
+
+def test_poses_of_llff(tmp_path):
+    touch(tmp_path, "poses_bounds.npy", "images/a.jpg")
+    assert "is in the layout of LLFF (poses_bounds.npy), which is not read" in refusal(tmp_path)
+
+
+def test_a_file_in_the_folders_place(tmp_path):
+    (tmp_path / "transforms.json").write_text(json.dumps({}))
+    assert refusal(tmp_path / "transforms.json") == (
+        f"data.path: {tmp_path}/transforms.json is a file; give the folder of the dataset, such "
+        f"as {tmp_path}"
+    )
+
+
+def test_a_dataset_is_read_whatever_else_lies_beside_it(photographs):
+    touch(photographs, "sparse/0/cameras.bin", "sparse/0/images.bin", "walk.mp4")
+    from support.datasets import load
+
+    assert len(load(photographs).test) == 2
