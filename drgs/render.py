@@ -51,8 +51,9 @@ from drgs.integrator.scene import check_lenses, make_scene, render_views
 from drgs.integrator.settings import SummarisingIntegrator
 from drgs.integrator.summary import described, summary_of_views
 from drgs.io.pictures import read_image, write_animation, write_exr, write_png
-from drgs.results.files import CAMERAS, CONFIG, GAUSSIANS, METRICS, ORBIT
+from drgs.results.files import CAMERAS, CONFIG, GAUSSIANS, METRICS, ORBIT, ORBIT_GIF
 from drgs.results.metrics import Quality, mean_of, psnr, ssim
+from drgs.results.pictures import claiming, refuse_photographs, seal_pictures
 
 DEFAULT_SIZE = (400, 400)
 """px, where nothing else says how large a picture should be."""
@@ -80,13 +81,19 @@ class Model:
         settings = {"ignore": self.ignored} if self.ignored else {}
         return make_scene(self.gaussians, self.settings, self.background, **settings)
 
-    def pictures(self, views: Sequence[Viewpoint]) -> Iterator[np.ndarray]:
-        """Pictures (H, W, 3) of the views, after a summary of what is simulated in them."""
+    def pictures(
+        self, views: Sequence[Viewpoint], out: Path, others: Sequence[str] = ()
+    ) -> Iterator[np.ndarray]:
+        """Pictures (H, W, 3) of the views, after a summary of what is simulated in them.
+
+        They are for the folder ``out``, where a PNG file for each, and ``others``, may be written.
+        """
         if "distortion" not in self.ignored:
             check_lenses(self.settings, views, where="", remedy="give --ignore distortion")
         scene = self.scene()
         print(described(summary_of_views(scene.integrator(), views)), flush=True)
-        return render_views(scene, views)
+        names = [*(f"{view.name}.png" for view in views), *others]
+        return claiming(out, names, render_views(scene, views))
 
     def dataset(self, option: str) -> Dataset:
         """The photographs, without which ``option`` is impossible."""
@@ -210,6 +217,8 @@ def run(args: argparse.Namespace) -> None:
             render_mitsuba_scene(args.what, args.out, dict(args.define or ()))
         else:
             model = load_model(args)
+            if model.config is not None:
+                refuse_photographs(args.out, model.config.data.path)
             if args.orbit is not None:
                 render_orbit(model, args)
             elif args.camera is not None or args.origin is not None:
@@ -217,6 +226,7 @@ def run(args: argparse.Namespace) -> None:
                     pass
             else:
                 render_split(model, args.split or "test", args.out)
+        seal_pictures(args.out)
         print(f"written: {args.out}")
 
 
@@ -266,7 +276,7 @@ def render_split(model: Model, split: str, out: Path) -> Quality:
     column = max(len("view"), *(len(view.name) for view in views))
     print(f"{'view':{column}}  PSNR [dB]    SSIM")
     scores = []
-    for view, image in zip(views, model.pictures(views), strict=True):
+    for view, image in zip(views, model.pictures(views, out, [METRICS]), strict=True):
         write_png(out / f"{view.name}.png", image)
         pair = image, view.image, view.mask
         scores.append({"psnr": psnr(*pair), "ssim": ssim(*pair)})
@@ -295,14 +305,15 @@ def render_orbit(model: Model, args: argparse.Namespace) -> None:
         fov, size = args.fov or field_of_view(views), args.size or orbit_size(views)
         orbit = orbit_of_views(views, model.gaussians)
     viewpoints = orbit.viewpoints(args.orbit, *size, fov)
-    write_animation(args.out / ORBIT, render_cameras(model, viewpoints, args.out))
+    pictures = render_cameras(model, viewpoints, args.out, [ORBIT, ORBIT_GIF])
+    write_animation(args.out / ORBIT, pictures)
 
 
 def render_cameras(
-    model: Model, viewpoints: Sequence[Viewpoint], out: Path
+    model: Model, viewpoints: Sequence[Viewpoint], out: Path, others: Sequence[str] = ()
 ) -> Iterator[np.ndarray]:
-    """Write and yield pictures that no photographs belong to."""
-    for camera, image in zip(viewpoints, model.pictures(viewpoints), strict=True):
+    """Write and yield pictures that no photographs belong to; others: files written besides."""
+    for camera, image in zip(viewpoints, model.pictures(viewpoints, out, others), strict=True):
         write_png(out / f"{camera.name}.png", image)
         print(f"{camera.name}: {camera.width}x{camera.height}", flush=True)
         yield image
@@ -336,10 +347,11 @@ def render_mitsuba_scene(path: Path, out: Path, definitions: dict[str, str]) -> 
     linear = _is_linear(scene.integrator())
     if isinstance(scene.integrator(), SummarisingIntegrator):
         _print_summary(path, scene)
-    for index, sensor in enumerate(scene.sensors()):
-        name = path.stem if len(scene.sensors()) == 1 else f"{path.stem}_{index}"
-        _render_sensor(path, scene, index)
-        bitmap = sensor.film().bitmap()
+    count = len(scene.sensors())
+    names = [path.stem if count == 1 else f"{path.stem}_{index}" for index in range(count)]
+    files = [f"{name}.{suffix}" for name in names for suffix in ("exr", "png")]
+    bitmaps = claiming(out, files, _bitmaps(path, scene))
+    for name, bitmap in zip(names, bitmaps, strict=True):
         width, height = bitmap.size()
         write_exr(out / f"{name}.exr", bitmap)
         # As floats: Mitsuba's own conversion to 8 bits rounds down.
@@ -371,12 +383,14 @@ def _print_summary(path: Path, scene: mi.Scene) -> None:
         raise UserError(f"{path}: {error}") from None
 
 
-def _render_sensor(path: Path, scene: mi.Scene, index: int) -> None:
-    """Leave the picture in the sensor's film."""
-    try:
-        scene.integrator().render(scene, sensor=index)
-    except PluginError as error:  # the scene's fault; anything else is not
-        raise UserError(f"{path}: {_first_and_last(str(error))}") from None
+def _bitmaps(path: Path, scene: mi.Scene) -> Iterator[mi.Bitmap]:
+    """The picture of each sensor, with all channels."""
+    for index, sensor in enumerate(scene.sensors()):
+        try:
+            scene.integrator().render(scene, sensor=index)
+        except PluginError as error:  # the scene's fault; anything else is not
+            raise UserError(f"{path}: {_first_and_last(str(error))}") from None
+        yield sensor.film().bitmap()
 
 
 # ----------------------------------------------------------------------------------------------

@@ -24,6 +24,9 @@ SIDE_BY_SIDE = "side_by_side"
 CAMERAS = "cameras.json"
 """Refined cameras of the training views."""
 
+VIEWS = "views.json"
+"""Cameras of the training views as the data has them: what an orbit needs."""
+
 COLORS = "colors.json"
 """Colour transforms of the training views."""
 
@@ -47,5 +50,6 @@ RESULTS = (
     RENDERS,
     REPORT,
     SIDE_BY_SIDE,
+    VIEWS,
 )
 """All of them but ``config.yml``."""

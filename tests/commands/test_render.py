@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import yaml
 from scipy.spatial.transform import Rotation
+from support.folders import visible
 from support.render_command import (
     BLACK,
     EIGHT_BITS,
@@ -79,7 +80,7 @@ def test_a_ply_is_rendered_under_a_configuration(fit, tmp_path):
     run(fit, "--split", "train", "--out", tmp_path / "fit")
     ply = fit / "point_cloud.ply"
     run(ply, "--scene", fit / "config.yml", "--split", "train", "--out", tmp_path / "ply")
-    names = {path.name for path in (tmp_path / "fit").iterdir()}
+    names = visible(tmp_path / "fit")
     assert names == {"metrics.json", *(f"r_{i}.png" for i in range(8))}
     for name in names:
         assert (tmp_path / "fit" / name).read_bytes() == (tmp_path / "ply" / name).read_bytes()
@@ -161,7 +162,7 @@ def test_a_picture_equal_to_its_photograph_has_no_number_in_json():
 def test_an_orbit_is_around_what_the_photographs_show(fit, tmp_path):
     run(fit, "--orbit", "5", "--out", tmp_path)
     names = [f"orbit_{i:03d}.png" for i in range(5)]
-    assert {path.name for path in tmp_path.iterdir()} == {"orbit.webp", "orbit.gif", *names}
+    assert visible(tmp_path) == {"orbit.webp", "orbit.gif", *names}
     fov = float(np.degrees(FIELD_OF_VIEW))
     cameras = orbit_of_views(make_dataset().train, blobs()).viewpoints(5, WIDTH, HEIGHT, fov)
     for name, camera in zip(names, cameras, strict=True):

@@ -1,0 +1,138 @@
+"""No command replaces a file that it did not write: refused in one line, with nothing changed."""
+
+import json
+
+import pytest
+import yaml
+from support.commands import run_in_process
+from support.folders import contents
+from support.render_command import sensor, write_scene
+from support.small_capture import blobs, make_dataset, pose_around, write_dataset
+
+from drgs import render
+
+
+@pytest.fixture
+def fitted(tmp_path):
+    """A folder as a fit leaves it, with its dataset beside it."""
+    write_dataset(tmp_path / "data", make_dataset(2, 2))
+    blobs().save(tmp_path / "run" / "point_cloud.ply")
+    config = {"data": {"path": str(tmp_path / "data")}}
+    (tmp_path / "run" / "config.yml").write_text(yaml.safe_dump(config))
+    return tmp_path / "run"
+
+
+def assert_refused(main, *arguments, folder, message):
+    """With status 2, in one line, and every file of ``folder`` as it was."""
+    before = contents(folder)
+    outcome = run_in_process(main, *arguments)
+    assert outcome.returncode == 2, outcome.stdout + outcome.stderr
+    assert message in outcome.stderr and len(outcome.stderr.splitlines()) == 1
+    assert contents(folder) == before
+
+
+def assert_rendered(*arguments):
+    outcome = run_in_process(render.main, *arguments)
+    assert outcome.returncode == 0, outcome.stderr
+
+
+VIEWS = {
+    "split": [],
+    "orbit": ["--orbit", 2, "--size", 8, 6],
+    "origin": ["--origin", 3, 0, 1, "--size", 8, 6],
+}
+
+
+@pytest.mark.parametrize("way", VIEWS)
+def test_pictures_are_not_rendered_among_photographs(fitted, way):
+    data = fitted.parent / "data"
+    message = f"--out {data / 'test'}: holds pictures of the dataset (r_0.png, r_1.png); choose"
+    arguments = [fitted, *VIEWS[way], "--out", data / "test"]
+    assert_refused(render.main, *arguments, folder=fitted.parent, message=message)
+
+
+@pytest.mark.parametrize(
+    ("way", "name"),
+    [
+        ("split", "r_1.png"),
+        ("split", "metrics.json"),
+        ("orbit", "orbit_001.png"),
+        ("orbit", "orbit.gif"),
+        ("origin", "camera.png"),
+    ],
+)
+def test_a_file_of_the_users_is_not_replaced_by_a_picture(fitted, tmp_path, way, name):
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / name).write_text("[]")
+    message = f"{out}: holds {name}, which this command would replace and has not written"
+    assert_refused(render.main, fitted, *VIEWS[way], "--out", out, folder=tmp_path, message=message)
+
+
+def test_a_reference_beside_a_scene_is_not_replaced(tmp_path):
+    """Mitsuba's own command writes it there."""
+    scene = write_scene(tmp_path, sensor(pose_around(0.8, 0.3)))
+    (tmp_path / "blobs.exr").write_text("reference")
+    message = "holds blobs.exr, which this command would replace"
+    assert_refused(render.main, scene, "--out", tmp_path, folder=tmp_path, message=message)
+    (tmp_path / "blobs.exr").unlink()
+    assert_rendered(scene, "--out", tmp_path)
+    assert_rendered(scene, "--out", tmp_path)
+
+
+def test_pictures_are_rendered_again_into_their_own_folder_until_they_are_changed(fitted, tmp_path):
+    out = tmp_path / "out"
+    for way in VIEWS:
+        assert_rendered(fitted, *VIEWS[way], "--out", out)
+    for way in VIEWS:
+        assert_rendered(fitted, *VIEWS[way], "--background", "black", "--out", out)
+    (out / "r_0.png").write_bytes((fitted.parent / "data" / "test" / "r_0.png").read_bytes())
+    message = "holds r_0.png, which this command would replace and has not written, or which chang"
+    assert_refused(render.main, fitted, "--out", out, folder=tmp_path, message=message)
+
+
+def test_pictures_that_an_interrupted_command_left_are_rendered_again(
+    fitted, tmp_path, monkeypatch
+):
+    expected, out = tmp_path / "whole", tmp_path / "out"
+    assert_rendered(fitted, "--out", expected)
+    write_png, written = render.write_png, []
+
+    def write_one(path, image):
+        if written:
+            raise KeyboardInterrupt
+        written.append(path)
+        write_png(path, image)
+
+    with monkeypatch.context() as patched, pytest.raises(KeyboardInterrupt):
+        patched.setattr(render, "write_png", write_one)
+        render.main([str(fitted), "--out", str(out)])
+    assert sorted(path.name for path in out.glob("*.png")) == ["r_0.png"]
+    assert_rendered(fitted, "--out", out)
+    assert contents(out) == contents(expected)
+
+
+@pytest.mark.parametrize("ways", [["split"], ["orbit"], ["split", "orbit"]])
+def test_a_folder_that_an_earlier_version_rendered_is_its_own(fitted, tmp_path, ways):
+    out = fitted.parent / "data" / "renders"
+    for way in ways:
+        assert_rendered(fitted, *VIEWS[way], "--out", out)
+    (out / ".drgs-render.json").unlink()
+    for way in [*ways, *ways]:
+        assert_rendered(fitted, *VIEWS[way], "--background", "black", "--out", out)
+
+
+@pytest.mark.parametrize("metrics", ["[", "[]", '{"split": "test"}', "7"])
+def test_other_metrics_are_somebody_elses(fitted, tmp_path, metrics):
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "metrics.json").write_text(metrics)
+    message = "holds metrics.json, which"
+    assert_refused(render.main, fitted, "--out", tmp_path / "out", folder=tmp_path, message=message)
+
+
+def test_the_record_of_a_finished_command_names_every_file(fitted, tmp_path):
+    out = tmp_path / "out"
+    assert_rendered(fitted, *VIEWS["orbit"], "--out", out)
+    files = json.loads((out / ".drgs-render.json").read_text())["files"]
+    assert set(files) == set(contents(out)) - {".drgs-render.json"}
+    assert all(files.values())

@@ -1,0 +1,106 @@
+"""A command knows the files that it wrote into a folder, and replaces no others."""
+
+import json
+
+import pytest
+
+from drgs.core.errors import UserError
+from drgs.core.records import FolderRecord, digest
+
+
+def record(folder, command="render"):
+    return FolderRecord(folder, command)
+
+
+def write(folder, **files):
+    for name, text in files.items():
+        (folder / name).write_text(text)
+
+
+def refusal(function, *arguments, **options):
+    with pytest.raises(UserError) as error:
+        function(*arguments, **options)
+    assert len(str(error.value).splitlines()) == 1
+    return str(error.value)
+
+
+def test_what_is_there_is_somebody_elses(tmp_path):
+    write(tmp_path, a="mine", b="mine")
+    message = refusal(record(tmp_path).claim, ["a", "b", "c"])
+    assert message.startswith(f"{tmp_path}: holds a, b, which this command would replace")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a", "b"]
+
+
+def test_what_was_claimed_may_be_written_again_until_it_is_sealed(tmp_path):
+    """Also by another process, when the first was killed."""
+    record(tmp_path).claim(["a"])
+    write(tmp_path, a="half")
+    record(tmp_path).claim(["a", "b"])
+    write(tmp_path, a="whole", b="whole")
+    record(tmp_path).seal()
+    record(tmp_path).claim(["a", "b"])
+
+
+def test_what_changed_since_is_somebody_elses(tmp_path):
+    record(tmp_path).claim(["a", "b"])
+    write(tmp_path, a="ours", b="ours")
+    record(tmp_path).seal()
+    write(tmp_path, b="theirs")
+    assert "holds b, which this command would replace" in refusal(record(tmp_path).claim, "ab")
+    assert not record(tmp_path).strangers(["a", "c"])
+
+
+def test_what_is_gone_may_be_anybodys(tmp_path):
+    record(tmp_path).claim(["a"])
+    record(tmp_path).seal()
+    write(tmp_path, a="theirs")
+    assert record(tmp_path).strangers(["a"]) == ["a"]
+
+
+def test_a_link_or_a_folder_in_the_way_is_somebody_elses(tmp_path):
+    record(tmp_path).claim(["a", "b"])
+    write(tmp_path, photograph="mine")
+    (tmp_path / "a").symlink_to(tmp_path / "photograph")
+    (tmp_path / "b").mkdir()
+    assert record(tmp_path).strangers(["a", "b"]) == ["a", "b"]
+
+
+def test_files_of_another_command_are_somebody_elses(tmp_path):
+    record(tmp_path, "fit").claim(["a"])
+    write(tmp_path, a="of a fit")
+    assert record(tmp_path).strangers(["a"]) == ["a"]
+
+
+def test_files_of_a_version_without_records_are_known_once(tmp_path):
+    write(tmp_path, a="ours", b="ours")
+    record(tmp_path).claim(["a"], earlier={"a", "b"})
+    record(tmp_path).claim(["b"])
+    write(tmp_path, c="theirs")
+    assert "holds c, which" in refusal(record(tmp_path).claim, ["c"], earlier={"c"})
+
+
+def test_names_of_any_bytes_and_paths_are_kept(tmp_path):
+    name = b"\xff.png".decode(errors="surrogateescape")
+    record(tmp_path).claim([name], {"data.path": "../data"})
+    write(tmp_path, **{name: "ours"})
+    record(tmp_path).seal()
+    assert record(tmp_path).paths == {"data.path": "../data"}
+    assert json.loads(record(tmp_path).path.read_text())["files"] == {name: digest(tmp_path / name)}
+    assert not record(tmp_path).strangers([name])
+
+
+@pytest.mark.parametrize(
+    "text", ["", "[]", "7", '{"files": 7}', '{"files": {"a": 7}}', '{"b": {}}', "[" * 10_000]
+)
+def test_a_damaged_record_is_refused_by_name(tmp_path, text):
+    record(tmp_path).path.write_text(text)
+    assert "must be the record of the files that were written here" in refusal(record, tmp_path)
+
+
+def test_a_forgotten_record_leaves_nothing(tmp_path):
+    kept = record(tmp_path)
+    kept.claim(["a"])
+    kept.remove()
+    kept.remove()
+    kept.seal()
+    assert not list(tmp_path.iterdir())
