@@ -10,6 +10,7 @@ from pathlib import Path
 import imageio.v3 as iio
 import numpy as np
 import pytest
+import yaml
 
 import drgs  # noqa: F401  (chooses libLLVM before Dr.Jit is imported)
 
@@ -45,6 +46,36 @@ def lego_folder():
 @pytest.fixture
 def fox_folder():
     return _shared("fox")
+
+
+@pytest.fixture(scope="module")
+def gsplat():
+    """10,000 Gaussians, their camera, and gsplat's float32 picture, cotangent and gradients."""
+    from drgs.reference.splatting import Camera, Gaussians
+
+    folder = _shared("gsplat_reference")
+    data, pose = np.load(folder / "gauss_10k.npz"), np.load(folder / "cam.npz")
+    scales, opacities = data["scales"].astype(float), data["opacities"].astype(float)
+    gaussians = Gaussians(
+        means=data["means"],
+        quats=data["quats"],
+        log_scales=np.log(scales),
+        logit_opacities=np.log(opacities) - np.log1p(-opacities),
+        sh0=data["sh"][:, :1],
+        shN=data["sh"][:, 1:],
+    )
+    viewmat, K = pose["viewmat"].astype(float), pose["K"].astype(float)
+    camera = Camera(
+        rotation=viewmat[:3, :3],
+        center=-np.linalg.solve(viewmat[:3, :3], viewmat[:3, 3]),
+        fx=K[0, 0],
+        fy=K[1, 1],
+        cx=K[0, 2],
+        cy=K[1, 2],
+        width=int(pose["width"]),
+        height=int(pose["height"]),
+    )
+    return gaussians, camera, np.load(folder / "ref_10k.npy"), np.load(folder / "refgrad_10k.npz")
 
 
 @pytest.fixture
@@ -102,3 +133,16 @@ def photographs(tmp_path):
     meta = {"fl_x": 9.0, "fl_y": 8.0, "cx": 3.5, "cy": 3.25, "w": 8, "h": 6, "frames": frames}
     (tmp_path / "transforms.json").write_text(json.dumps(meta))
     return tmp_path
+
+
+@pytest.fixture(scope="module")
+def fit(tmp_path_factory):
+    """A folder as a fit leaves it, with its dataset."""
+    from support.small_capture import blobs, make_dataset, write_dataset
+
+    folder = tmp_path_factory.mktemp("fit")
+    write_dataset(folder / "data", make_dataset())
+    blobs().save(folder / "run" / "point_cloud.ply")
+    config = {"data": {"path": str(folder / "data"), "background": "white"}}
+    (folder / "run" / "config.yml").write_text(yaml.safe_dump(config))
+    return folder / "run"

@@ -11,10 +11,7 @@ from support.helpers import (
     assert_pictures_agree,
     both_precisions,
     clear,
-    device_gaussians,
-    frame_tangent,
     picture_of,
-    rows,
 )
 from support.lens_checks import (
     FORMS,
@@ -106,10 +103,6 @@ def test_a_lens_changes_the_picture(name):
 DIFFERENCES = 1e-6
 
 
-def in_double(case, cotangents):
-    return kernel_gradients(case, FLOAT64, cotangents)
-
-
 # Those of test_rendering.
 GRADIENTS = {FLOAT64: 1e-12, FLOAT32: 5e-5}
 
@@ -147,7 +140,7 @@ def test_gradients_equal_differences_of_the_reference_along_a_direction(
     """Of each parameter; in larger scenes, without the pixels that a step may take to a jump."""
     case = clear(case_of(name, antialiased=antialiased, threshold_width=1e-3))
     keep_bounds(case, monkeypatch)
-    check_against_differences(case, in_double, DIFFERENCES)
+    check_against_differences(case, kernel_gradients, DIFFERENCES)
 
 
 @both_precisions
@@ -156,14 +149,7 @@ def test_adjoint_is_the_transpose_of_the_tangent(precision, name):
     case = clear(case_of(name))
     gaussians, frame = case.render(precision)
 
-    def planes_along(direction):
-        planes = frame_tangent(gaussians, frame, device_gaussians(direction, precision))
-        return [rows(plane) for plane in planes]
-
-    def in_precision(case, cotangents):
-        return kernel_gradients(case, precision, cotangents)
-
-    check_transpose(case, precision, in_precision, planes_along, GRADIENTS[precision] / 5)
+    check_transpose(case, precision, gaussians, [frame], kernel_gradients, GRADIENTS[precision] / 5)
 
 
 @every_form

@@ -36,17 +36,6 @@ from drgs import render
 from drgs.data.orbits import orbit_of_gaussians, orbit_of_views
 
 
-@pytest.fixture(scope="module")
-def fit(tmp_path_factory):
-    """A folder as a fit leaves it, with its dataset."""
-    folder = tmp_path_factory.mktemp("fit")
-    write_dataset(folder / "data", make_dataset())
-    blobs().save(folder / "run" / "point_cloud.ply")
-    config = {"data": {"path": str(folder / "data"), "background": "white"}}
-    (folder / "run" / "config.yml").write_text(yaml.safe_dump(config))
-    return folder / "run"
-
-
 def photo(fit, name, background, split="test"):
     """A photograph of the dataset over a background."""
     rgba = iio.imread(fit.parent / "data" / split / f"{name}.png") / 255

@@ -18,17 +18,6 @@ from support.small_capture import (
 )
 
 
-@pytest.fixture(scope="module")
-def fit(tmp_path_factory):
-    """A folder as a fit leaves it, with its dataset."""
-    folder = tmp_path_factory.mktemp("fit")
-    write_dataset(folder / "data", make_dataset())
-    blobs().save(folder / "run" / "point_cloud.ply")
-    config = {"data": {"path": str(folder / "data"), "background": "white"}}
-    (folder / "run" / "config.yml").write_text(yaml.safe_dump(config))
-    return folder / "run"
-
-
 def fails(capsys, *arguments):
     """The line with the error that the command prints, after its usage if need be, with 2."""
     with pytest.raises(SystemExit) as exit_info:

@@ -6,8 +6,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from support.helpers import assert_arrays_agree
-from support.views import VIEWS, Scene, clear, gradients_of, image_of, tensors
+from support.helpers import assert_arrays_agree, clear
+from support.views import VIEWS, Scene, gradients_of, image_of, tensors
 
 import drgs  # noqa: F401  (registers the plugin)
 from drgs.gaussians.parameters import PARAMETER_NAMES

@@ -4,8 +4,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from support.helpers import bitwise
-from support.views import VIEWS, Scene, clear, gradient, image_of, tensors
+from support.helpers import bitwise, clear
+from support.views import VIEWS, Scene, gradient, image_of, tensors
 
 import drgs  # noqa: F401  (registers the plugins)
 from drgs.gaussians.parameters import PARAMETER_NAMES

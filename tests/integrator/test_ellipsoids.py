@@ -28,9 +28,9 @@ from support.ellipsoids import (
     transform,
     write_model,
 )
-from support.helpers import assert_arrays_agree, single
+from support.helpers import assert_arrays_agree, clear, single
 from support.kernels import drain_kernels
-from support.views import VIEWS, Scene, clear, image_of, tensors
+from support.views import VIEWS, Scene, image_of, tensors
 
 import drgs  # noqa: F401  (registers the plugin)
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians

@@ -24,9 +24,9 @@ from support.ellipsoids import (
     shape_of,
     transform,
 )
-from support.helpers import assert_arrays_agree, single
+from support.helpers import assert_arrays_agree, clear, single
 from support.kernels import float_reductions
-from support.views import clear, gradient, image_of, tensors
+from support.views import gradient, image_of, tensors
 
 import drgs  # noqa: F401  (registers the plugin)
 from drgs.integrator import ellipsoids as shapes_module

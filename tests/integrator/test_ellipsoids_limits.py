@@ -18,7 +18,8 @@ from support.ellipsoids import (
     transform,
     write_model,
 )
-from support.views import VIEWS, Scene, clear, image_of, tensors
+from support.helpers import clear
+from support.views import VIEWS, Scene, image_of, tensors
 
 import drgs  # noqa: F401  (registers the plugin)
 

@@ -16,8 +16,8 @@ from support.ellipsoids import (
     gradients_held,
     held_gradients,
 )
-from support.helpers import assert_arrays_agree
-from support.views import clear, gradient, gradients_of, image_of, tensors
+from support.helpers import assert_arrays_agree, clear
+from support.views import gradient, gradients_of, image_of, tensors
 
 import drgs  # noqa: F401  (registers the plugin)
 from drgs.gaussians.parameters import PARAMETER_NAMES

@@ -21,11 +21,12 @@ from support.calibrated_sensors import (
     own_camera,
     own_sensor,
 )
+from support.helpers import clear
 from support.lens_scenes import points_at
 from support.openexr import read_exr, two_threads
 from support.splats_checks import GRADIENTS, PICTURE, write_gaussians
 from support.splats_checks import XYZ as TO_XYZ
-from support.views import VIEWS, Scene, View, clear, gradient, image_of, tensors
+from support.views import VIEWS, Scene, View, gradient, image_of, tensors
 
 import drgs  # noqa: F401  (registers the plugins)
 from drgs.gaussians.parameters import PARAMETER_NAMES

@@ -6,6 +6,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from support.helpers import clear
 from support.openexr import read_exr, two_threads
 from support.splats_checks import (
     GRADIENTS,
@@ -16,16 +17,7 @@ from support.splats_checks import (
     fresh_image,
     write_gaussians,
 )
-from support.views import (
-    VIEWS,
-    Scene,
-    View,
-    clear,
-    image_of,
-    pose,
-    tensors,
-    to_linear,
-)
+from support.views import VIEWS, Scene, View, image_of, pose, tensors, to_linear
 
 import drgs  # noqa: F401  (registers the plugin)
 from drgs.gaussians.parameters import PARAMETER_NAMES
@@ -237,7 +229,8 @@ except ImportError as error:
     sys.exit(f"no CUDA: {error}")
 sys.path.insert(0, "tests")
 from support.helpers import relative_errors
-from support.views import Scene, clear, gradients_of, image_of
+from support.helpers import clear
+from support.views import Scene, gradients_of, image_of
 
 scene = clear(Scene())
 expected = {"image": scene.image(), **scene.gradients(scene.weights())}

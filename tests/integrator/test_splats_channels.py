@@ -4,6 +4,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from support.helpers import clear
 from support.splats_checks import (
     GRADIENTS,
     STEP,
@@ -14,14 +15,7 @@ from support.splats_checks import (
     random_directions,
     with_tangents,
 )
-from support.views import (
-    VIEWS,
-    Scene,
-    clear,
-    gradients_of,
-    image_of,
-    tensors,
-)
+from support.views import VIEWS, Scene, gradients_of, image_of, tensors
 
 import drgs  # noqa: F401  (registers the plugin)
 from drgs.gaussians.parameters import PARAMETER_NAMES

@@ -6,7 +6,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from support.helpers import NEAR_THRESHOLD, relative_errors
+from support.helpers import NEAR_THRESHOLD, clear, relative_errors
 from support.splats_checks import (
     ALL_PARAMETERS,
     GRADIENTS,
@@ -20,17 +20,7 @@ from support.splats_checks import (
     random_directions,
     with_tangents,
 )
-from support.views import (
-    VIEWS,
-    Scene,
-    View,
-    clear,
-    gradient,
-    gradients_of,
-    image_of,
-    pose,
-    tensors,
-)
+from support.views import VIEWS, Scene, View, gradient, gradients_of, image_of, pose, tensors
 
 import drgs  # noqa: F401  (registers the plugin)
 from drgs.gaussians.parameters import PARAMETER_NAMES

@@ -5,7 +5,6 @@ from dataclasses import replace
 import drjit as dr
 import numpy as np
 import pytest
-from conftest import SHARED_DATA
 from support.helpers import (
     FLOAT32,
     FLOAT64,
@@ -26,36 +25,6 @@ from drgs.config.approximations import Approximations
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 from drgs.reference import splatting as reference
 from drgs.splatting import rendering
-
-
-@pytest.fixture(scope="module")
-def gsplat():
-    """10,000 Gaussians, their camera, and gsplat's float32 picture, cotangent and gradients."""
-    folder = SHARED_DATA / "gsplat_reference"
-    if not folder.is_dir():
-        pytest.skip("the shared data folder gsplat_reference is not here")
-    data, pose = np.load(folder / "gauss_10k.npz"), np.load(folder / "cam.npz")
-    scales, opacities = data["scales"].astype(float), data["opacities"].astype(float)
-    gaussians = reference.Gaussians(
-        means=data["means"],
-        quats=data["quats"],
-        log_scales=np.log(scales),
-        logit_opacities=np.log(opacities) - np.log1p(-opacities),
-        sh0=data["sh"][:, :1],
-        shN=data["sh"][:, 1:],
-    )
-    viewmat, K = pose["viewmat"].astype(float), pose["K"].astype(float)
-    camera = reference.Camera(
-        rotation=viewmat[:3, :3],
-        center=-np.linalg.solve(viewmat[:3, :3], viewmat[:3, 3]),
-        fx=K[0, 0],
-        fy=K[1, 1],
-        cx=K[0, 2],
-        cy=K[1, 2],
-        width=int(pose["width"]),
-        height=int(pose["height"]),
-    )
-    return gaussians, camera, np.load(folder / "ref_10k.npy"), np.load(folder / "refgrad_10k.npz")
 
 
 def gsplat_frame(scene, precision):

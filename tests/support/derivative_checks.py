@@ -2,7 +2,14 @@
 
 import numpy as np
 
-from support.helpers import Cotangents, plane_cotangents, rows
+from support.helpers import (
+    FLOAT64,
+    Cotangents,
+    device_gaussians,
+    frame_tangent,
+    plane_cotangents,
+    rows,
+)
 from support.lens_scenes import directions, moved
 
 STEP = 1e-6
@@ -12,11 +19,11 @@ STEP = 1e-6
 def check_against_differences(case, kernel_gradients, tolerance) -> dict[str, np.ndarray]:
     """Derivatives in double precision along a direction equal differences of the reference.
 
-    kernel_gradients(case, cotangents) -> arrays by name; tolerance: relative to the sum of the
-    terms' sizes, as they have both signs. Returns the terms, by parameter.
+    kernel_gradients(case, precision, cotangents) -> arrays by name; tolerance: relative to the sum
+    of the terms' sizes, as they have both signs. Returns the terms, by parameter.
     """
     cotangents = Cotangents.random(case, seed=2)
-    gradients, found = kernel_gradients(case, cotangents), {}
+    gradients, found = kernel_gradients(case, FLOAT64, cotangents), {}
     for parameter, direction in directions(case.gaussians, seed=3).items():
         forward, backward = (
             case.reference_picture(moved(case.gaussians, direction, sign * STEP))
@@ -31,18 +38,20 @@ def check_against_differences(case, kernel_gradients, tolerance) -> dict[str, np
     return found
 
 
-def check_transpose(case, precision, kernel_gradients, planes_along, tolerance) -> None:
+def check_transpose(case, precision, gaussians, frames, kernel_gradients, tolerance) -> None:
     """The adjoint is the transpose of the tangent: <w, J v> = <J^T w, v>.
 
-    kernel_gradients(case, cotangents): as above; planes_along(direction): tangents of the planes of
-    pixels; tolerance: relative, of sums of thousands of terms, each as accurate as the arrays are.
+    frames: the case's picture is their mean; kernel_gradients: as above; tolerance: relative, of
+    sums of thousands of terms, each as accurate as the arrays are.
     """
     cotangents = Cotangents.random(case, seed=4)
-    gradients = kernel_gradients(case, cotangents)
+    gradients = kernel_gradients(case, precision, cotangents)
     d_features, d_transmittance = plane_cotangents(case, cotangents, precision)
     weights = np.array([rows(d) for d in (d_transmittance, *d_features)])
     for parameter, direction in directions(case.gaussians, seed=5).items():
-        left = weights * np.array(planes_along(direction))
+        tangents = device_gaussians(direction, precision)
+        planes = [frame_tangent(gaussians, frame, tangents) for frame in frames]
+        left = weights * np.mean([[rows(plane) for plane in of_time] for of_time in planes], axis=0)
         right = getattr(direction, parameter) * gradients[parameter]
         size = np.abs(left).sum() + np.abs(right).sum()
         assert abs(left.sum() - right.sum()) <= tolerance * size, parameter

@@ -220,13 +220,16 @@ def _picture(case):
 
 
 @cache
-def clear(case: Case) -> Case:
-    """The case with the first seed that leaves no pixel near a threshold: nothing may differ."""
+def clear(case):
+    """The case with the first seed that leaves no pixel near a threshold: nothing may differ.
+
+    case: a :class:`Case`, or another dataclass with a ``seed`` and a ``picture``.
+    """
     for seed in range(case.seed, case.seed + 200):
         candidate = replace(case, seed=seed)
         if not candidate.picture.near_threshold.any():
             return candidate
-    raise AssertionError(f"{case.name}: no clear seed among 200")
+    raise AssertionError(f"{case}: no clear seed among 200")
 
 
 # ----------------------------------------------------------------------------------------------

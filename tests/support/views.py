@@ -291,16 +291,6 @@ def _picture(scene):
     )  # fmt: skip
 
 
-@cache
-def clear(scene: Scene) -> Scene:
-    """The scene with the first seed that leaves no pixel near a threshold: nothing may differ."""
-    for seed in range(scene.seed, scene.seed + 200):
-        candidate = replace(scene, seed=seed)
-        if not candidate.picture.near_threshold.any():
-            return candidate
-    raise AssertionError(f"{scene}: no clear seed among 200")
-
-
 def image_of(scene: mi.Scene, **arguments) -> np.ndarray:
     """``mi.render`` as float64 numpy."""
     return np.array(mi.render(scene, **arguments)).astype(np.float64)

@@ -9,13 +9,8 @@ import numpy as np
 import drgs  # noqa: F401  (registers the plugins)
 from drgs.reference import splatting as reference
 from drgs.reference.effects import render_with_surface
-from support.views import (
-    VIEWS,
-    Scene,
-    clear,
-    tensors,
-    to_linear,
-)
+from support.helpers import clear
+from support.views import VIEWS, Scene, tensors, to_linear
 
 # As in test_splats: single precision, relative to the largest value of an array. Conversions to
 # display space multiply errors of dark pixels by up to 13.
