@@ -7,11 +7,15 @@ densify.every must be >= 1, got 0``.
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 
 class UserError(ValueError):
     """A wrong input: a configuration, a dataset, a file. Its text is all that the user needs."""
+
+
+class UserNote(UserWarning):
+    """What a user should know of an input that is used all the same; commands print its text."""
 
 
 class PluginError(UserError):
@@ -32,6 +36,12 @@ def one_line(text: object, limit: int = 300) -> str:
     """
     line = " ".join(str(text).split())
     return line if len(line) <= limit else f"{line[: limit - 3]}..."
+
+
+def listed(names: Sequence[object], most: int = 3, separator: str = ", ") -> str:
+    """The first ``most`` of ``names``, and how many there are besides: ``a, b, c and 4 more``."""
+    more = f" and {len(names) - most:,} more" if len(names) > most else ""
+    return separator.join(str(name) for name in names[:most]) + more
 
 
 def did_you_mean(name: str, candidates: Iterable[str], cutoff: float = 0.7) -> str:

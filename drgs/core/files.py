@@ -1,4 +1,4 @@
-"""Reading text files of a bounded size, and writing files so that a reader never sees half of one.
+"""Reading regular files of a bounded size, and writing so that a reader never sees half of a file.
 
 What the file system refuses becomes a :class:`drgs.core.errors.UserError`: a missing folder, a
 lacking permission or a full disk is the user's to repair.
@@ -9,11 +9,13 @@ from __future__ import annotations
 import errno
 import os
 import re
+import stat
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import IO
 
-from drgs.core.errors import UserError
+from drgs.core.errors import UserError, one_line
 
 _REMEDIES = {
     errno.ENOSPC: "free some space, or choose another disk",
@@ -28,20 +30,58 @@ _REMEDIES = {
 }
 
 
-def read_text(path: Path, what: str, max_bytes: int) -> str:
-    """The text of a UTF-8 file; ``what`` it should be stands in the errors.
+_SPECIAL = {"p": "a named pipe", "c": "a device", "b": "a device", "s": "a socket"}
+"""What is no regular file, by the first letter of ``ls -l``."""
 
-    Raises :class:`UserError` where it cannot be read, is longer than ``max_bytes`` or not UTF-8.
+
+def open_regular(path: str | Path, what: str = "file") -> IO[bytes]:
+    """A regular file, open for reading; ``what`` it should be stands in the errors.
+
+    A pipe would wait for a writer for ever, and a device need not end: neither is read.
+
+    Raises :class:`UserError` where it cannot be opened, or is something else.
     """
     try:
-        with path.open("rb") as file:
+        file = open(path, "rb", opener=_open_without_waiting)  # noqa: SIM115  (the caller closes it)
+    except OSError as error:
+        raise UserError(f"{path}: cannot read the {what}: {error.strerror or error}") from None
+    except ValueError as error:  # a name with a zero byte
+        raise UserError(f"{one_line(repr(path))}: cannot read the {what}: {error}") from None
+    mode = os.fstat(file.fileno()).st_mode
+    if not stat.S_ISREG(mode):
+        file.close()
+        kind = _SPECIAL.get(stat.filemode(mode)[0], "something else")
+        raise UserError(f"{path}: cannot read the {what}: must be a regular file, got {kind}")
+    return file
+
+
+def _open_without_waiting(path: str, flags: int) -> int:
+    """Opening a pipe would otherwise wait for its other end."""
+    return os.open(path, flags | getattr(os, "O_NONBLOCK", 0))
+
+
+def read_bytes(path: Path, what: str, max_bytes: int) -> bytes:
+    """The content of a regular file; ``what`` it should be stands in the errors.
+
+    Raises :class:`UserError` where it cannot be read or is longer than ``max_bytes``.
+    """
+    try:
+        with open_regular(path, what) as file:
             content = file.read(max_bytes + 1)
     except OSError as error:
         raise UserError(f"{path}: cannot read the {what}: {error.strerror or error}") from None
     if len(content) > max_bytes:
         raise UserError(f"{path}: cannot read the {what}: more than {max_bytes:,} bytes")
+    return content
+
+
+def read_text(path: Path, what: str, max_bytes: int) -> str:
+    """The text of a UTF-8 file: see :func:`read_bytes`.
+
+    Raises :class:`UserError` as that does, and where the file is not UTF-8.
+    """
     try:
-        return content.decode("utf-8")
+        return read_bytes(path, what, max_bytes).decode("utf-8")
     except UnicodeDecodeError as error:
         raise UserError(
             f"{path}: cannot read the {what}: not UTF-8 text (byte {error.start})"

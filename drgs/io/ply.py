@@ -13,15 +13,19 @@ more, ``filter_3D``, the filter's standard deviation, as in Mip-Splatting's file
 from __future__ import annotations
 
 import io
+import math
+import warnings
 from collections.abc import Mapping
+from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 from typing import IO
 
 import numpy as np
-from plyfile import PlyData, PlyElement, PlyElementParseError
+from plyfile import PlyData, PlyElement, PlyListProperty
 
-from drgs.core.errors import UserError, one_line
-from drgs.core.files import atomic_path
+from drgs.core.errors import UserError, UserNote, listed, one_line
+from drgs.core.files import atomic_path, open_regular
 
 POSITION = ("x", "y", "z")
 NORMAL = ("nx", "ny", "nz")
@@ -39,15 +43,24 @@ MAX_HEADER_BYTES = 1 << 20
 """The header of 62 properties takes 1.5 kB; the rest is room for comments."""
 
 
+LARGEST_LOGIT = 23 * math.log(2)
+"""Logit of the largest opacity below 1 that a sigmoid in float32 gives: 1 / (1 + 2^-23)."""
+
+SMALLEST_LOGIT = -125 * math.log(2)
+"""Logit of about the smallest opacity that it gives: exp of less is no number in float32."""
+
+
 def read_gaussians(path: str | Path) -> dict[str, np.ndarray]:
     """Gaussians as numpy float32 arrays, with the values and the SH degree that the file holds.
 
     By the names of the fields of :class:`drgs.gaussians.parameters.Gaussians`, whose ``load`` calls
     this; ``smoothing`` is missing where the file has none. Properties are found by name, in any
-    order and of any numeric type; others are ignored.
+    order and of any numeric type; others are ignored. Infinite logits, which formats with opacities
+    of 8 bits leave for 1 and 0, become :data:`LARGEST_LOGIT` and :data:`SMALLEST_LOGIT`, with a
+    :class:`UserNote`.
 
     Raises :class:`UserError` naming the file and what it lacks: it must be whole, hold at least
-    one row, and nothing but finite numbers.
+    one row, and otherwise nothing but finite numbers.
     """
     vertex = _read_vertices(path)
     num_rest = sum(name.startswith("f_rest_") for name in vertex.dtype.names)
@@ -56,15 +69,14 @@ def read_gaussians(path: str | Path) -> dict[str, np.ndarray]:
             f"{path}: the number of f_rest properties must be one of {sorted(NUM_REST)} "
             f"(SH degree 0 to 3), got {num_rest}"
         )
-    _require(
-        path, vertex, (*POSITION, *SH0, *_rest(num_rest), *OPACITY, *SCALE, *ROTATION), "Gaussians"
-    )
+    names = (*POSITION, *SH0, *_rest(num_rest), *OPACITY, *SCALE, *ROTATION)
+    _require(path, vertex, names, "Gaussians", infinite=OPACITY)
     sh_rest = _columns(vertex, _rest(num_rest)).reshape(len(vertex), 3, num_rest // 3)
     gaussians = {
         "means": _columns(vertex, POSITION),
         "quats": _columns(vertex, ROTATION),
         "log_scales": _columns(vertex, SCALE),
-        "logit_opacities": _columns(vertex, OPACITY)[:, 0],
+        "logit_opacities": _finite_logits(path, _columns(vertex, OPACITY)[:, 0]),
         "sh0": _columns(vertex, SH0)[:, None, :],
         "shN": np.ascontiguousarray(sh_rest.transpose(0, 2, 1)),
     }
@@ -130,79 +142,195 @@ def read_points(path: str | Path) -> tuple[np.ndarray, np.ndarray | None]:
 
 
 def _read_vertices(path: str | Path) -> np.ndarray:
-    """The rows of element ``vertex``, a structured array; at least one."""
+    """The rows of element ``vertex``, a structured array of numbers; at least one."""
     try:
-        with open(path, "rb") as file:
-            text = [b"format", b"ascii"] in [line[:2] for line in _read_header(path, file)]
-            stream = io.TextIOWrapper(file, "ascii") if text else file
-            ply = PlyData.read(stream)
-            rest = stream.read()
+        with open_regular(path) as file:
+            layout = _read_layout(path, file)
+            return _text_rows(path, file, layout) if layout.text else _rows(path, file, layout)
     except UserError:
         raise
     except OSError as error:
         raise UserError(f"{path}: cannot read the file: {error.strerror or error}") from None
-    except PlyElementParseError as error:
-        raise UserError(f"{path}: not a valid PLY file: {_explain(error)}") from None
-    except Exception as error:  # plyfile raises many types for a broken file
+    except Exception as error:  # plyfile and NumPy raise many types for a broken file
         reason = one_line(error) or type(error).__name__
         raise UserError(f"{path}: not a valid PLY file: {reason}") from None
-    if rest.strip() if text else rest:
-        promised = ", ".join(f"{element.count} of {element.name}" for element in ply.elements)
-        raise UserError(
-            f"{path}: the file must end after the rows that its header promises ({promised}), got "
-            f"{len(rest):,} bytes more; correct the header's counts, or get the file again"
-        )
-    if "vertex" not in ply:
-        names = ", ".join(element.name for element in ply.elements) or "none"
-        raise UserError(f"{path}: element vertex is missing; elements are: {names}")
-    if not len(ply["vertex"].data):
-        raise UserError(f"{path}: element vertex must have at least 1 row, got 0")
-    return ply["vertex"].data
 
 
-def _read_header(path: str | Path, file: IO[bytes]) -> list[list[bytes]]:
-    """The words of each line of the header, with ``file`` left at its start.
+@dataclass(frozen=True)
+class _Layout:
+    """What a header says. The elements have no rows; ``counts`` says how many are promised."""
+
+    elements: tuple[PlyElement, ...]
+    counts: tuple[int, ...]
+    text: bool
+    byte_order: str  # NumPy's: < or >
+    start: int  # byte: end of the header
+    end: int  # byte: of the file
+
+    @property
+    def vertex(self) -> int:
+        """Index of the element that is read."""
+        return [element.name for element in self.elements].index("vertex")
+
+    def promised(self) -> str:
+        """The rows, as messages name them."""
+        return listed([f"{n} of {e.name}" for e, n in zip(self.elements, self.counts, strict=True)])
+
+
+def _read_layout(path: str | Path, file: IO[bytes]) -> _Layout:
+    """Read and check the header, by plyfile.
 
     Refuses counts of rows that the file cannot hold, each row being a byte or more, before memory
     is allocated for them.
     """
-    header, end, _ = file.read(MAX_HEADER_BYTES).partition(b"end_header")
+    content = file.read(MAX_HEADER_BYTES)
+    newline = next((n for n in (b"\r\n", b"\r") if content.startswith(b"ply" + n)), b"\n")
+    header, end, _ = content.partition(newline + b"end_header" + newline)
     if not end:
         raise UserError(
             f"{path}: not a valid PLY file: the header must end with end_header within the first "
             f"{MAX_HEADER_BYTES:,} bytes"
         )
     size = file.seek(0, io.SEEK_END)
-    file.seek(0)
-    lines = [line.split() for line in header.splitlines()]
-    for words in lines:
-        if words[:1] == [b"element"] and len(words) == 3 and int(words[2]) > size:
-            raise UserError(
-                f"{path}: the file is cut off: its header promises {int(words[2]):,} rows of "
-                f"element {words[1].decode()}, got {size:,} bytes in all"
-            )
-    return lines
+    lines, counts = header.split(newline), []
+    for index, line in enumerate(lines):
+        words = line.split()
+        if words[:1] == [b"element"] and len(words) == 3:
+            counts.append(int(words[2]))
+            lines[index] = b"element %s 0" % words[1]  # plyfile is to read no rows
+            if counts[-1] > size:
+                raise UserError(
+                    f"{path}: the file is cut off: its header promises {counts[-1]:,} rows of "
+                    f"element {one_line(words[1].decode(), 60)}, got {size:,} bytes in all"
+                )
+    ply = PlyData.read(io.BytesIO(b"\n".join([*lines, b"end_header", b""])))
+    start = len(header) + len(end)
+    layout = _Layout(ply.elements, tuple(counts), ply.text, ply.byte_order, start, size)
+    _check_layout(path, layout)
+    return layout
 
 
-def _explain(error: PlyElementParseError) -> str:
-    """Expected and got, for a row that cannot be read."""
-    if error.message == "early end-of-file":
-        return (
-            f"element {error.element.name} must have the {error.element.count:,} rows that the "
-            f"header promises, got {error.row:,}: the file is cut off; get it again"
+def _check_layout(path: str | Path, layout: _Layout) -> None:
+    """Refuse a file without vertices, or whose vertices are not rows of equal length."""
+    names = [element.name for element in layout.elements]
+    if "vertex" not in names:
+        raise UserError(
+            f"{path}: element vertex is missing; elements are: {listed(names) or 'none'}"
         )
-    return one_line(error)
+    if layout.counts[layout.vertex] < 1:
+        raise UserError(
+            f"{path}: element vertex must have at least 1 row, got {layout.counts[layout.vertex]}"
+        )
+    if found := _lists(layout.elements[layout.vertex]):
+        raise UserError(
+            f"{path}: element vertex: properties {listed(found)} must be numbers, got lists; "
+            "write the file without them"
+        )
+    for element in layout.elements[: layout.vertex]:
+        if not layout.text and _lists(element):
+            raise UserError(
+                f"{path}: element {one_line(element.name, 60)}, which has lists, must come behind "
+                "element vertex; write the file with its vertices first"
+            )
 
 
-def _require(path: str | Path, vertex: np.ndarray, names: tuple[str, ...], what: str) -> None:
-    """Refuse properties that are missing, that are lists, or whose numbers are not all finite."""
+def _lists(element: PlyElement) -> list[str]:
+    return [p.name for p in element.properties if isinstance(p, PlyListProperty)]
+
+
+def _rows(path: str | Path, file: IO[bytes], layout: _Layout) -> np.ndarray:
+    """Of a binary file. What stands behind the vertices is not read."""
+    position = layout.start
+    for index, (element, count) in enumerate(zip(layout.elements, layout.counts, strict=True)):
+        if _lists(element):  # behind the vertices: where these end, nobody knows
+            break
+        width = max(1, element.dtype(layout.byte_order).itemsize)
+        if index == layout.vertex:
+            start = position
+        if position + count * width > layout.end:
+            _refuse_end(path, element, count, (layout.end - position) // width)
+        position += count * width
+    else:
+        _check_end(path, layout, layout.end - position)
+    file.seek(start)
+    dtype = layout.elements[layout.vertex].dtype(layout.byte_order)
+    return np.fromfile(file, dtype, layout.counts[layout.vertex])
+
+
+def _text_rows(path: str | Path, file: IO[bytes], layout: _Layout) -> np.ndarray:
+    """Of a text file, where each row is a line."""
+    file.seek(layout.start)
+    lines = io.TextIOWrapper(file, "ascii")
+    rows = None
+    for index, (element, count) in enumerate(zip(layout.elements, layout.counts, strict=True)):
+        if index == layout.vertex:
+            with warnings.catch_warnings():  # of no rows, which are refused below
+                warnings.simplefilter("ignore")
+                kind = element.dtype()
+                rows = np.loadtxt(islice(lines, count), kind, comments=None, ndmin=1)
+            found = len(rows)
+        else:
+            found = sum(1 for _ in islice(lines, count))
+        if found < count:
+            _refuse_end(path, element, count, found)
+    rest = [len(line) for line in lines if line.strip()]
+    _check_end(path, layout, sum(rest))
+    return rows
+
+
+def _refuse_end(path: str | Path, element: PlyElement, promised: int, got: int) -> None:
+    raise UserError(
+        f"{path}: not a valid PLY file: element {one_line(element.name, 60)} must have the "
+        f"{promised:,} rows that the header promises, got {got:,}: the file is cut off; get it "
+        "again"
+    )
+
+
+def _check_end(path: str | Path, layout: _Layout, more: int) -> None:
+    """Refuse what follows the last row; more: bytes."""
+    if more:
+        raise UserError(
+            f"{path}: the file must end after the rows that its header promises "
+            f"({layout.promised()}), got {more:,} bytes more; correct the header's counts, or get "
+            "the file again"
+        )
+
+
+def _finite_logits(path: str | Path, logits: np.ndarray) -> np.ndarray:
+    """With infinite ones at the ends of what sigmoids in float32 tell apart."""
+    count = np.count_nonzero(np.isinf(logits))
+    if count:
+        warnings.warn(
+            UserNote(
+                f"{path}: {count:,} of {len(logits):,} opacities are infinite logits, as formats "
+                f"of 8 bits leave them for 1 and 0; read as {LARGEST_LOGIT:.2f} and "
+                f"{SMALLEST_LOGIT:.2f}"
+            ),
+            stacklevel=2,
+        )
+    ends = {"posinf": np.float32(LARGEST_LOGIT), "neginf": np.float32(SMALLEST_LOGIT)}
+    return np.nan_to_num(logits, copy=False, nan=np.nan, **ends)
+
+
+def _require(
+    path: str | Path,
+    vertex: np.ndarray,
+    names: tuple[str, ...],
+    what: str,
+    infinite: tuple[str, ...] = (),
+) -> None:
+    """Refuse properties that are missing, or whose numbers are not all finite.
+
+    infinite: those of ``names`` that may be infinite, but not NaN.
+    """
     missing = [name for name in names if name not in vertex.dtype.names]
     if missing:
         raise UserError(f"{path}: not a PLY of {what}: properties {', '.join(missing)} are missing")
-    lists = [name for name in names if vertex.dtype[name].hasobject]
-    if lists:
-        raise UserError(f"{path}: properties {', '.join(lists)} must be numbers, got lists")
-    bad = [(np.flatnonzero(~np.isfinite(_columns(vertex, (name,))[:, 0])), name) for name in names]
+    bad = []
+    for name in names:
+        column = _columns(vertex, (name,))[:, 0]
+        wrong = np.isnan(column) if name in infinite else ~np.isfinite(column)
+        bad.append((np.flatnonzero(wrong), name))
     found = [(rows[0], name) for rows, name in bad if len(rows)]
     if found:
         row, name = min(found, key=lambda item: item[0])

@@ -4,7 +4,7 @@ import os
 import pytest
 
 from drgs.core.errors import UserError
-from drgs.core.files import atomic_path, read_text
+from drgs.core.files import atomic_path, open_regular, read_text
 
 
 def test_atomic_path_replaces_the_file_and_creates_folders(tmp_path):
@@ -85,3 +85,22 @@ def test_text_is_read_up_to_a_limit(tmp_path):
     assert str(error.value) == f"{path}: cannot read the poem: not UTF-8 text (byte 2)"
     with pytest.raises(UserError, match="cannot read the poem: Is a directory"):
         read_text(tmp_path, "poem", 9)
+
+
+def test_only_regular_files_are_read_and_none_is_waited_for(tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    (tmp_path / "link").symlink_to(tmp_path / "pipe")
+    for path, kind in ((tmp_path / "pipe", "a named pipe"), (tmp_path / "link", "a named pipe")):
+        with pytest.raises(UserError) as error:
+            read_text(path, "poem", 9)
+        assert str(error.value) == (
+            f"{path}: cannot read the poem: must be a regular file, got {kind}"
+        )
+    with pytest.raises(UserError, match=r"/dev/zero: .* must be a regular file, got a device"):
+        open_regular("/dev/zero")
+    with pytest.raises(UserError, match="cannot read the file: embedded null byte"):
+        open_regular("a\0b")
+    (tmp_path / "a.txt").write_text("x")
+    (tmp_path / "link").unlink()
+    (tmp_path / "link").symlink_to(tmp_path / "a.txt")
+    assert read_text(tmp_path / "link", "poem", 9) == "x"

@@ -127,15 +127,6 @@ def test_a_wrong_number_of_coefficients_is_refused(tmp_path):
     )
 
 
-def test_list_properties_are_refused(tmp_path):
-    rows = np.zeros(1, [("x", object), ("y", "f4"), ("z", "f4")])
-    rows["x"][0] = np.zeros(2, np.float32)
-    element = PlyElement.describe(rows, "vertex", val_types={"x": "f4"})
-    PlyData([element]).write(str(tmp_path / "a.ply"))
-    with pytest.raises(UserError, match=r"a.ply: properties x must be numbers, got lists"):
-        read_points(tmp_path / "a.ply")
-
-
 @pytest.mark.parametrize("read", [Gaussians.load, read_points])
 def test_unreadable_files_are_named(tmp_path, read):
     with pytest.raises(UserError, match=r"none.ply: cannot read the file: No such file"):
