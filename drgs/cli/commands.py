@@ -10,8 +10,14 @@ from collections.abc import Callable, Sequence
 from importlib import import_module
 from typing import NamedTuple, NoReturn
 
-from drgs.cli.errors import exit_on_user_error
+from drgs.cli.errors import USER_ERROR_STATUS, exit_on_user_error
+from drgs.cli.interrupts import exit_on_interrupt
+from drgs.cli.output import notes_printed, printable_anywhere
+from drgs.core.constants import MAX_INT
 from drgs.core.errors import did_you_mean, one_line
+
+MAX_ERROR = 500
+"""Characters of what is wrong with a command line, which may quote all of it."""
 
 
 class Subcommand(NamedTuple):
@@ -60,11 +66,15 @@ class CommandParser(argparse.ArgumentParser):
         return super().parse_known_args(args, namespace)
 
     def error(self, message: str) -> NoReturn:
-        """As argparse's; an option that wants several words is shown with them."""
+        """Say in one line what is wrong with the command line, and exit with status 2.
+
+        An option that wants several words is shown with them.
+        """
         found = re.fullmatch(r"argument (?:\S+/)?(--\S+): expected \d+ arguments", message)
         if found and isinstance(metavar := self._option_string_actions[found[1]].metavar, tuple):
             message = f"{message}: {found[1]} {' '.join(metavar)}"
-        super().error(message)
+        text = one_line(message, MAX_ERROR)
+        self.exit(USER_ERROR_STATUS, f"error: {text}; see {self.prog} --help\n")
 
 
 def run_command(
@@ -74,18 +84,24 @@ def run_command(
 ) -> None:
     """Parse a command line and run what it names; an error of the user's ends it with status 2.
 
+    Ctrl-C ends it with status 130. Whatever the names of files and the terminal's encoding are,
+    they can be printed.
+
     add_arguments: adds the command's arguments, and sets ``run``, a function of the parsed ones.
     prog: how the command is called. arguments: its words; None: those of this process.
     """
-    parser = CommandParser(prog=prog)
-    add_arguments(parser)
-    args = parser.parse_args(arguments)
-    with exit_on_user_error():
+    with printable_anywhere(), notes_printed(), exit_on_interrupt(), exit_on_user_error():
+        parser = CommandParser(prog=prog)
+        add_arguments(parser)
+        args = parser.parse_args(arguments)
         args.run(args)
 
 
-def at_least(minimum: int, maximum: int | None = None) -> Callable[[str], int]:
-    """The type of an argument that is a whole number, ``minimum`` to ``maximum`` (None: no end)."""
+def at_least(minimum: int, maximum: int = MAX_INT, reason: str = "") -> Callable[[str], int]:
+    """The type of an argument that is a whole number, ``minimum`` to ``maximum``.
+
+    reason: for ``maximum``, where the error is to name it.
+    """
 
     def whole_number(text: str) -> int:
         # Python converts no more than 4,300 digits.
@@ -94,9 +110,10 @@ def at_least(minimum: int, maximum: int | None = None) -> Callable[[str], int]:
             raise argparse.ArgumentTypeError(
                 f"must be a whole number >= {minimum}, got {one_line(text, 80) or 'nothing'}"
             )
-        if maximum is not None and number > maximum:
+        if number > maximum:
+            because = f" ({reason})" if reason else ""
             raise argparse.ArgumentTypeError(
-                f"must be at most {maximum:,}, got {one_line(text, 80)}"
+                f"must be at most {maximum:,}{because}, got {one_line(text, 80)}"
             )
         return number
 

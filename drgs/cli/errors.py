@@ -22,5 +22,6 @@ def exit_on_user_error() -> Iterator[None]:
     try:
         yield
     except (UserError, LLVMVersionError) as error:
-        print(f"error: {error}", file=sys.stderr)
+        # Names of files may hold line ends.
+        print(f"error: {' '.join(str(error).splitlines())}", file=sys.stderr)
         sys.exit(USER_ERROR_STATUS)

@@ -17,7 +17,11 @@ from typing import TextIO
 import drjit as dr
 import mitsuba as mi
 
+from drgs.cli.commands import at_least
 from drgs.core.errors import UserError, one_line
+
+MAX_THREADS = 4096
+"""Dr.Jit starts a thread for each, whatever there is to do."""
 
 VARIANTS = ("llvm_ad_rgb", "cuda_ad_rgb")
 """Of Mitsuba, that can render and differentiate Gaussians; the first is the default."""
@@ -32,7 +36,10 @@ def add_execution_arguments(
     """
     add_variant_argument(parser, variants)
     parser.add_argument(
-        "--threads", type=int, metavar="N", help="CPU threads to use (default: one a core)"
+        "--threads",
+        type=at_least(1, MAX_THREADS, "no machine has more cores"),
+        metavar="N",
+        help="CPU threads to use (default: one a core)",
     )
     parser.add_argument(
         "--debug",
@@ -82,8 +89,6 @@ def _thread_count(count: int | None) -> Iterator[None]:
     if count is None:
         yield
         return
-    if count < 1:
-        raise UserError(f"--threads: must be >= 1, got {count}")
     previous = dr.thread_count()
     try:
         try:

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import signal
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from types import FrameType, TracebackType
 
 INTERRUPTED_STATUS = 130
@@ -35,3 +38,31 @@ class StopRequest:
     def _handle(self, number: int, frame: FrameType | None) -> None:
         self.requested = True
         signal.signal(signal.SIGINT, self._previous)
+
+
+@contextmanager
+def exit_on_interrupt() -> Iterator[None]:
+    """Around a command: Ctrl-C ends it with status 130, without a traceback."""
+    try:
+        yield
+    except Exception as error:
+        if not _was_interrupted(error):
+            raise
+        _exit_interrupted()
+    except KeyboardInterrupt:
+        _exit_interrupted()
+
+
+def _was_interrupted(error: BaseException) -> bool:
+    """Whether Ctrl-C is behind it: Dr.Jit raises its own errors for what happens in a callback."""
+    causes: list[BaseException] = []
+    while error is not None and error not in causes:
+        causes.append(error)
+        error = error.__cause__ or error.__context__
+    return any(isinstance(cause, KeyboardInterrupt) for cause in causes)
+
+
+def _exit_interrupted() -> None:
+    signal.signal(signal.SIGINT, signal.SIG_DFL)  # a further one is no error of the clean-up
+    print("interrupted", file=sys.stderr)
+    sys.exit(INTERRUPTED_STATUS)

@@ -14,7 +14,7 @@ from pydantic_core import ErrorDetails
 
 from drgs.config.explain import expectation
 from drgs.config.schema import FitConfig
-from drgs.core.errors import UserError, did_you_mean, one_line
+from drgs.core.errors import UserError, did_you_mean, listed, one_line
 from drgs.core.files import atomic_path, read_text
 
 PATH_KEYS = ("data.path", "init.point_cloud", "output.dir")
@@ -29,8 +29,8 @@ MAX_DEPTH = 20
 """Of nested lists and sections in YAML; a configuration has 3. Python's stack ends at about 100."""
 
 
-MAX_EXPLAINED = 20
-"""Wrong values that an error lists; the rest are counted."""
+MAX_EXPLAINED = 3
+"""Wrong values that an error names; the rest are counted."""
 
 
 def load_config(path: str | Path, overrides: Iterable[str] = ()) -> FitConfig:
@@ -39,7 +39,7 @@ def load_config(path: str | Path, overrides: Iterable[str] = ()) -> FitConfig:
     Relative paths in the file are relative to the file's folder; in ``overrides``, which are
     typed in a shell and need not be YAML, to the current folder. The result holds absolute paths.
 
-    Raises :class:`UserError` with one line for each wrong key.
+    Raises :class:`UserError` that names the wrong keys, the first of many, in one line.
     """
     path = Path(path)
     values = _read_yaml(path)
@@ -57,7 +57,7 @@ def config_from(values: Mapping[str, object], where: str) -> FitConfig:
 
     where: the beginning of errors. Paths, text or ``Path``, are relative to the current folder.
 
-    Raises :class:`UserError` with one line for each wrong key.
+    Raises :class:`UserError` that names the wrong keys, the first of many, in one line.
     """
     values = {
         key: dict(section) if isinstance(section, Mapping) else section
@@ -76,10 +76,10 @@ def _validated(values: dict, where: str, overridden: set[str]) -> FitConfig:
         return FitConfig.model_validate(values)
     except ValidationError as error:
         errors = error.errors()
-        lines = [_explain(where, item, overridden) for item in errors[:MAX_EXPLAINED]]
-        if len(errors) > MAX_EXPLAINED:
-            lines.append(f"{where}: {len(errors) - MAX_EXPLAINED} more values are wrong")
-        raise UserError("\n".join(lines)) from None
+        explained = [_explain(where, item, overridden) for item in errors[:MAX_EXPLAINED]]
+        first, *others = explained + [where] * (len(errors) - MAX_EXPLAINED)
+        others = [text.removeprefix(f"{where}: ") for text in others]
+        raise UserError(listed([first, *others], MAX_EXPLAINED, "; ")) from None
 
 
 def dump_config(config: FitConfig, path: str | Path) -> None:

@@ -25,13 +25,9 @@ from pydantic import (
 )
 
 from drgs.config.approximations import DECLARED, Approximations, Declared
-from drgs.core.constants import SHUTTER_SAMPLES
+from drgs.core.constants import MAX_INT, SHUTTER_SAMPLES
 
 Color = str | tuple[float, float, float]
-
-
-MAX_INT = 2**31 - 1
-"""The counters of Mitsuba and Dr.Jit are of 32 bits."""
 
 NAMED_COLORS = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0)}
 

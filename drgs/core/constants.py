@@ -70,3 +70,6 @@ WHITENING_SCALE = math.sqrt(0.5 * math.log2(math.e))
 """exp(-|u|^2 / 2) = exp2(-|WHITENING_SCALE u|^2). The exponent needs no clamp: it is minus a sum of
 squares, so never positive whatever the rounding, and where it is so small that exp2 underflows,
 alpha is below the cut and discarded."""
+
+MAX_INT = 2**31 - 1
+"""The counters of Mitsuba and Dr.Jit are of 32 bits."""

@@ -87,7 +87,9 @@ def _opencv_pose(rows: list[list[float]]) -> np.ndarray:
         raise ValueError(f"must be 4 x 4 numbers ({len(rows)} rows of {lengths or 0})")
     matrix = np.array(rows, np.float64)
     rotation = matrix[:3, :3]
-    error, sign = np.abs(rotation @ rotation.T - np.eye(3)).max(), np.linalg.det(rotation)
+    error = np.abs(rotation @ rotation.T - np.eye(3)).max()
+    with np.errstate(all="ignore"):  # NumPy takes logarithms, of a determinant of 0 as well
+        sign = np.linalg.det(rotation)
     if error > RIGID_TOLERANCE or sign < 0:
         raise ValueError(
             f"must be rigid (rotation and translation) to {RIGID_TOLERANCE:g}: "

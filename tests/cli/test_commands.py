@@ -43,7 +43,10 @@ def test_modules_are_commands_too_and_say_how_they_are_called(capsys, command):
     [
         (["fot"], "there is no command fot, only fit, render, capture and bench; did you mean fit"),
         (["rendre"], "did you mean render?"),
-        (["xyz"], "there is no command xyz, only fit, render, capture and bench\n"),
+        (
+            ["xyz"],
+            "there is no command xyz, only fit, render, capture and bench; see drgs",
+        ),
         (["bench", "sped"], "; did you mean speed?"),
         ([], "the following arguments are required: COMMAND"),
         (["bench"], "the following arguments are required: MEASUREMENT"),

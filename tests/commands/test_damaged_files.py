@@ -207,8 +207,7 @@ def check(seed, file, read):
     except UserError as error:
         refused = True
         lines = str(error).splitlines()
-        # A configuration lists its wrong values, one a line.
-        assert len(lines) == 1 or file.suffix == ".yml", f"seed {seed}: {error}"
+        assert len(lines) == 1, f"seed {seed}: {error}"
         for line in lines:
             # Cameras that are valid one by one may determine no start box: that names the key.
             named = str(file.parent) in line or line.startswith("init.half_extent: ")

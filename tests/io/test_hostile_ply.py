@@ -57,7 +57,7 @@ def test_finite_logits_are_read_without_a_note(tmp_path):
 
 def test_an_opacity_that_is_no_number_is_refused(tmp_path):
     gaussians_with([np.inf, np.nan]).save(tmp_path / "a.ply")
-    with pytest.raises(UserError, match=r"row 1: opacity must be a finite .* got nan \(1 of 2 rows"):
+    with pytest.raises(UserError, match=r"row 1: opacity must be .* got nan \(1 of 2 rows"):
         Gaussians.load(tmp_path / "a.ply")
 
 
@@ -139,7 +139,7 @@ def test_faces_take_no_memory(tmp_path):
 
 def test_a_pipe_is_refused_and_not_waited_for(tmp_path):
     os.mkfifo(tmp_path / "a.ply")
-    with pytest.raises(UserError, match="cannot read the file: must be a regular file, got a named"):
+    with pytest.raises(UserError, match="must be a regular file, got a named pipe"):
         read_points(tmp_path / "a.ply")
 
 

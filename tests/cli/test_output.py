@@ -1,0 +1,131 @@
+"""How a command ends: one line, whatever names and encodings are, and no traceback of Ctrl-C."""
+
+import io
+import os
+import signal
+import sys
+import warnings
+from contextlib import redirect_stderr, redirect_stdout
+
+import pytest
+from support.commands import run_in_process
+
+from drgs.cli.commands import at_least, run_command
+from drgs.cli.interrupts import exit_on_interrupt
+from drgs.cli.output import printable_anywhere
+from drgs.core.errors import UserError, UserNote
+
+
+def command(act):
+    """``main`` of a command that does nothing else."""
+
+    def add_arguments(parser):
+        parser.add_argument("--size", type=at_least(1, 4096, "as large as anything is"))
+        parser.set_defaults(run=lambda args: act())
+
+    return lambda words: run_command(add_arguments, "some command", words)
+
+
+def ascii_streams():
+    """A standard output and an error output as ``PYTHONIOENCODING=ascii`` makes them."""
+    return [io.TextIOWrapper(io.BytesIO(), "ascii") for _ in range(2)]
+
+
+def printed(stream):
+    stream.flush()
+    return stream.buffer.getvalue()
+
+
+@pytest.mark.parametrize("name", ["f\u00fc\u4e2d", os.fsdecode(b"\xff")], ids=["UTF-8", "other"])
+def test_names_are_printed_in_any_encoding(name):
+    def act():
+        print(f"written: {name}")
+        raise UserError(f"{name}: wrong")
+
+    out, err = ascii_streams()
+    with redirect_stdout(out), redirect_stderr(err), pytest.raises(SystemExit) as end:
+        command(act)([])
+    assert end.value.code == 2
+    escaped = name.encode("ascii", "backslashreplace")
+    assert printed(out) == b"written: " + escaped + b"\n"
+    assert printed(err) == b"error: " + escaped + b": wrong\n"
+    assert out.errors == "strict"  # as before
+
+
+def test_a_closed_stream_is_left_alone():
+    out, err = ascii_streams()
+    with redirect_stdout(out), redirect_stderr(err), printable_anywhere():
+        out.close()
+
+
+def test_a_note_is_a_line_of_the_output():
+    def act():
+        warnings.warn(UserNote("a.ply: clamped"), stacklevel=1)
+
+    outcome = run_in_process(command(act))
+    assert (outcome.returncode, outcome.stdout) == (0, "note: a.ply: clamped\n")
+    assert outcome.stderr == ""
+
+
+def test_an_error_whose_names_hold_line_ends_is_one_line():
+    def act():
+        raise UserError("a\nb.yml: wrong")
+
+    assert run_in_process(command(act)).stderr == "error: a b.yml: wrong\n"
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--size", "0"], "argument --size: must be a whole number >= 1, got 0"),
+        (
+            ["--size", "9" * 4000],
+            "argument --size: must be at most 4,096 (as large as anything is)",
+        ),
+        (["--size", "1" * 20 + "x"], "argument --size: must be a whole number >= 1, got 111"),
+        (["--sise", "a\nb"], "unrecognized arguments: --sise a b"),
+    ],
+)
+def test_a_wrong_command_line_is_answered_in_one_line(words, message):
+    outcome = run_in_process(command(lambda: None), *words)
+    assert outcome.returncode == 2 and outcome.stdout == ""
+    assert outcome.stderr.startswith(f"error: {message}")
+    assert outcome.stderr.endswith("; see some command --help\n")
+    assert outcome.stderr.count("\n") == 1 and len(outcome.stderr) < 300
+
+
+# Ctrl-C
+
+
+@pytest.fixture
+def interrupt_is_given_back():
+    before = signal.getsignal(signal.SIGINT)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+def interrupted():
+    signal.raise_signal(signal.SIGINT)
+
+
+def interrupted_in_a_callback():
+    """As Dr.Jit does it, whose own error hides what was raised within."""
+    try:
+        interrupted()
+    except KeyboardInterrupt as cause:
+        raise RuntimeError("drjit.backward(): failed (see above)") from cause
+
+
+@pytest.mark.usefixtures("interrupt_is_given_back")
+@pytest.mark.parametrize("act", [interrupted, interrupted_in_a_callback])
+def test_an_interrupt_ends_a_command_without_a_traceback(act):
+    outcome = run_in_process(command(act))
+    assert (outcome.returncode, outcome.stdout, outcome.stderr) == (130, "", "interrupted\n")
+    assert signal.getsignal(signal.SIGINT) == signal.SIG_DFL  # what comes now ends it at once
+
+
+def test_other_errors_keep_their_tracebacks():
+    with pytest.raises(ZeroDivisionError), exit_on_interrupt():
+        print(1 / 0)
+    with pytest.raises(SystemExit, match="3"), exit_on_interrupt():
+        sys.exit(3)
