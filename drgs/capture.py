@@ -27,6 +27,7 @@ from __future__ import annotations
 
 import argparse
 import hashlib
+import io
 import json
 import math
 import sys
@@ -288,8 +289,11 @@ def write_points(path: Path, positions: np.ndarray, colors: np.ndarray) -> None:
         rows[name] = positions[:, axis]
     for channel, name in enumerate(("red", "green", "blue")):
         rows[name] = colors[:, channel]
+    # Not to the file itself: numpy's errors of a full disk say neither which file nor why.
+    stream = io.BytesIO()
+    PlyData([PlyElement.describe(rows, "vertex")], byte_order="<").write(stream)
     with atomic_path(path) as temporary:
-        PlyData([PlyElement.describe(rows, "vertex")], byte_order="<").write(str(temporary))
+        temporary.write_bytes(stream.getbuffer())
 
 
 if __name__ == "__main__":

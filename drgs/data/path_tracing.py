@@ -122,10 +122,20 @@ def picture_path(out: Path, view: CaptureView) -> Path:
 def load_scene(path: Path) -> mi.Scene:
     """The scene that an XML or a Python file describes.
 
-    Raises :class:`UserError` where it describes none.
+    Raises :class:`UserError` where it describes none, or one of another variant than the active.
     """
+    variant = mi.variant()
     if path.suffix == ".py":
-        description = _scene_dictionary(path)
+        try:
+            description = _scene_dictionary(path)
+        finally:
+            other = mi.variant()
+            mi.set_variant(variant)
+        if other != variant:
+            raise UserError(
+                f"{path}: must leave Mitsuba's variant at {variant}, got mi.set_variant("
+                f"{other!r}); choose a variant with --variant"
+            )
         mi.file_resolver().append(str(path.parent.resolve()))
     try:
         scene = mi.load_dict(description) if path.suffix == ".py" else mi.load_file(str(path))
@@ -145,7 +155,7 @@ def _scene_dictionary(path: Path) -> dict[str, object]:
         description = function()
     except UserError:
         raise
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         lines = [
             f.lineno for f in traceback.extract_tb(error.__traceback__) if f.filename == str(path)
         ]
@@ -175,7 +185,10 @@ def bounding_box(scene: mi.Scene) -> tuple[np.ndarray, np.ndarray]:
     corners = np.array([[box.min, box.max] for box in boxes if box.valid()]).reshape(-1, 2, 3)
     if not len(corners):
         raise UserError("the scene has no surfaces that cameras could see (lights are hidden)")
-    return corners[:, 0].min(axis=0), corners[:, 1].max(axis=0)
+    low, high = corners[:, 0].min(axis=0), corners[:, 1].max(axis=0)
+    if not 0 < np.linalg.norm(np.float64(high) - low) < math.inf:
+        raise UserError(f"the scene's bounding box must have a size, got {low} to {high}")
+    return low, high
 
 
 def target_and_distance(scene: mi.Scene, settings: CaptureSettings) -> tuple[np.ndarray, float]:
@@ -187,9 +200,16 @@ def target_and_distance(scene: mi.Scene, settings: CaptureSettings) -> tuple[np.
     """
     low, high = bounding_box(scene)
     target = (low + high) / 2 if settings.target is None else np.array(settings.target)
-    if settings.distance is not None:
-        return target, settings.distance
-    return target, float(np.linalg.norm(high - low)) / 2 / math.sin(settings.narrower_fov / 2)
+    diagonal = float(np.linalg.norm(high - low))
+    distance = settings.distance
+    if distance is None:
+        distance = diagonal / 2 / math.sin(settings.narrower_fov / 2)
+    if math.dist(target.tolist(), ((low + high) / 2).tolist()) + distance > FAR_CLIP * diagonal:
+        raise UserError(
+            f"no camera may be farther from the scene than {FAR_CLIP:g} of its diagonals, "
+            f"{FAR_CLIP * diagonal:g}; got target {target.tolist()} and distance {distance:g}"
+        )
+    return target, distance
 
 
 def capture_views(
@@ -319,7 +339,7 @@ def visible_points(
             train
         )
         rng = np.random.default_rng([settings.seed, len(SPLITS), view.index])
-        picture = read_image(picture_path(out, view)).reshape(-1, 4)
+        picture = _taken(picture_path(out, view), settings).reshape(-1, 4)
         weights = picture[:, 3].astype(np.float64)
         if not weights.any():
             continue
@@ -333,6 +353,19 @@ def visible_points(
     if not sum(map(len, positions)):
         raise UserError("the cameras see nothing of the scene: give --target and --distance")
     return np.concatenate(positions), np.concatenate(colors)
+
+
+def _taken(path: Path, settings: CaptureSettings) -> np.ndarray:
+    """(H, W, 4) float32: a picture of this capture, as it was written."""
+    picture = read_image(path)
+    width, height = settings.size
+    if picture.shape != (height, width, 4):
+        raise UserError(
+            f"{path}: must be an RGBA picture of {width} x {height} px of this capture, got "
+            f"{picture.shape[1]} x {picture.shape[0]} with {picture.shape[2]} channels; remove it, "
+            "and the same command takes it again"
+        )
+    return picture
 
 
 def view_rays(pose: np.ndarray, spots: np.ndarray, settings: CaptureSettings) -> np.ndarray:
