@@ -4,8 +4,8 @@ Reads the configuration and the dataset, runs :class:`drgs.training.trainer.Trai
 result on the test views and writes the output folder:
 
 - ``point_cloud.ply``: the Gaussians, in the layout of the 3DGS reference implementation
-- ``metrics.json``: quality on the test views, time, population, versions
-- ``history.csv``: loss, PSNR, population and rate over the iterations
+- ``metrics.json``: quality on the test views, time, population, versions, machine, command
+- ``history.csv``: loss, PSNR, population and rate over the iterations, now and then test PSNR
 - ``renders/<split>/*.png``: the test views as fitted
 - ``side_by_side/<split>/*.png``: fitted, photograph and difference
 - ``curves.png``, ``orbit.webp``, ``orbit.gif``
@@ -25,6 +25,7 @@ import platform
 import sys
 import time
 from collections.abc import Callable, Sequence
+from datetime import datetime
 from pathlib import Path
 
 import drjit as dr
@@ -40,8 +41,9 @@ from drgs.config.load import dump_config, load_config
 from drgs.config.schema import FitConfig
 from drgs.core.errors import UserError
 from drgs.core.files import atomic_path
+from drgs.core.machine import processor
 from drgs.core.private import llvm_version
-from drgs.data import Dataset, initial_gaussians, load_dataset
+from drgs.data import Dataset, View, initial_gaussians, load_dataset
 from drgs.gaussians.parameters import Gaussians
 from drgs.integrator.scene import check_lenses
 from drgs.integrator.summary import described
@@ -54,6 +56,7 @@ from drgs.results.files import (
     HISTORY,
     METRICS,
     RENDERS,
+    REPORT,
 )
 from drgs.results.folder import (
     claim_output_folder,
@@ -82,6 +85,7 @@ from drgs.training.checkpoint import (
 from drgs.training.finite_checks import NonFiniteError
 from drgs.training.history import History, write_history
 from drgs.training.loop import Length, as_saved, iterations
+from drgs.training.quality import measure, measured_views, measurement_is_due
 from drgs.training.summary import summary_of_fit
 from drgs.training.trainer import Trainer
 
@@ -158,7 +162,7 @@ def run(args: argparse.Namespace) -> None:
             with atomic_path(out / BUDGET_PLAN) as temporary:
                 temporary.write_text(f"--budget {args.budget:g}s\n{plan.reasons}\n")
             length = Deadline(trainer, end, plan.curve)
-        finished = fit_and_write(trainer, dataset, out, length, check_ranges)
+        finished = fit_and_write(trainer, dataset, out, length, check_ranges, args.command)
     if not finished:
         print(f"stopped; continue with: {args.prog} --resume {out}")
         sys.exit(INTERRUPTED_STATUS)
@@ -212,10 +216,12 @@ def fit_and_write(
     out: Path,
     length: Length,
     check_ranges: Callable[[], None],
+    command: str,
 ) -> bool:
     """Fit, measure, and write into the folder ``out``; False if stopped by Ctrl-C.
 
-    Goes on from the checkpoint in ``out``, if there is one. check_ranges: raises ``UserError``.
+    Goes on from the checkpoint in ``out``, if there is one. check_ranges: raises ``UserError``;
+    command: the line that was typed, for the report.
     """
     checkpoint = load_checkpoint(out, trainer.config)
     log = History()
@@ -224,7 +230,8 @@ def fit_and_write(
         log = History.from_array(checkpoint.history, checkpoint.wall_s)
         print(f"continues at iteration {trainer.iteration}")
     try:
-        if not run_iterations(trainer, log, out, length, check_ranges):
+        views = measured_views(dataset.test)
+        if not run_iterations(trainer, log, views, out, length, check_ranges):
             return False
         wall_s = log.wall_s
         gaussians = trainer.gaussians()
@@ -243,7 +250,7 @@ def fit_and_write(
     if config.output.save_renders:
         for view, image in zip(dataset.test, images, strict=True):
             write_png(out / RENDERS / dataset.test_split / f"{view.name}.png", image)
-    metrics = summarize(config, dataset, gaussians.num_gaussians, wall_s, quality)
+    metrics = summarize(config, dataset, gaussians.num_gaussians, wall_s, quality, command)
     write_results(out, dataset, trainer.scene, gaussians, images, log.rows, metrics)
     with atomic_path(out / METRICS) as temporary:
         temporary.write_text(json.dumps(metrics, indent=2) + "\n")
@@ -254,19 +261,21 @@ def fit_and_write(
         f"{config.iterations} iterations in {wall_s:.0f} s"
     )
     print(f"written: {out}")
+    print(f"open {out / REPORT}")
     return True
 
 
 def run_iterations(
     trainer: Trainer,
     history: History,
+    views: tuple[View, ...],
     out: Path,
     length: Length,
     check_ranges: Callable[[], None],
 ) -> bool:
     """Run the iterations that are left, showing progress and saving checkpoints.
 
-    False if Ctrl-C stopped it; the state is saved then.
+    views: are measured now and then. False if Ctrl-C stopped it; the state is saved then.
     """
     smooth_psnr, every = None, trainer.config.output.checkpoint_every
     shown = RunProgress("iteration", length.total(trainer), trainer.iteration)
@@ -282,6 +291,8 @@ def run_iterations(
                     f"Gaussians {done.row.num_gaussians:,}"
                 )
                 progress.update(done.row.iteration, length.total(trainer), status)
+                if measurement_is_due(history.rows, trainer.config.iterations):
+                    measure(trainer, history, views)
             is_due = every and done.report.iteration % every == 0 and not done.is_last
             if stop.requested or is_due:
                 save(trainer, history, out)
@@ -305,7 +316,12 @@ def _remedy(out: Path) -> str:
 
 
 def summarize(
-    config: FitConfig, dataset: Dataset, num_gaussians: int, wall_s: float, quality: Quality
+    config: FitConfig,
+    dataset: Dataset,
+    num_gaussians: int,
+    wall_s: float,
+    quality: Quality,
+    command: str,
 ) -> FitMetrics:
     """What ``metrics.json`` holds."""
     return {
@@ -329,6 +345,9 @@ def summarize(
         },
         "variant": mi.variant(),
         "threads": dr.thread_count(),
+        "processor": processor(),
+        "date": datetime.now().astimezone().isoformat(timespec="minutes"),
+        "command": command,
         "config": config.model_dump(mode="json"),
     }
 

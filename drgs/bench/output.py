@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import argparse
 import csv
-import os
-import platform
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import drjit as dr
 
 from drgs.core.files import atomic_path
+from drgs.core.machine import processor
 from drgs.core.private import llvm_version
 
 
@@ -28,13 +27,8 @@ def add_out(parser: argparse.ArgumentParser) -> None:
 
 def machine() -> str:
     """One line: processor, threads, LLVM."""
-    name = platform.processor() or platform.machine()
-    if os.path.exists("/proc/cpuinfo"):
-        with open("/proc/cpuinfo") as file:
-            names = [line.partition(":")[2].strip() for line in file if "model name" in line]
-        name = names[0] if names else name
     version = ".".join(map(str, llvm_version()))
-    return f"{name}, {dr.thread_count()} threads, LLVM {version}"
+    return f"{processor()}, {dr.thread_count()} threads, LLVM {version}"
 
 
 def write_csv(path: Path, header: Sequence[str], rows: Iterable[Sequence[object]]) -> None:

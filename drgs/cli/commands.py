@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import math
 import re
+import shlex
 import sys
 from collections.abc import Callable, Sequence
 from importlib import import_module
@@ -87,13 +88,16 @@ def run_command(
     Ctrl-C ends it with status 130. Whatever the names of files and the terminal's encoding are,
     they can be printed.
 
-    add_arguments: adds the command's arguments, and sets ``run``, a function of the parsed ones.
+    add_arguments: adds the command's arguments, and sets ``run``, a function of the parsed ones,
+    which also hold the whole line as ``command``.
     prog: how the command is called. arguments: its words; None: those of this process.
     """
     with printable_anywhere(), notes_printed(), exit_on_interrupt(), exit_on_user_error():
         parser = CommandParser(prog=prog)
         add_arguments(parser)
         args = parser.parse_args(arguments)
+        words = sys.argv[1:] if arguments is None else arguments
+        args.command = shlex.join([*prog.split(), *words])
         args.run(args)
 
 

@@ -58,6 +58,7 @@ def load(config: DataConfig) -> Dataset:
             f"background {config.background}" + notes(config, all_frames)
         ),
         ignored=ignored(config, all_frames),
+        rendered=True,  # photographs have no alpha, and are refused
     )
 
 

@@ -77,6 +77,7 @@ class Dataset:
     start_half_extent: float | None  # of the layout's own start box [-h, h]^3; None: it has none
     description: str  # one line: what was read, and what was assumed
     ignored: tuple[str, ...] = ()  # that frames have and the configuration leaves out: see extras
+    rendered: bool = False  # the pictures are another renderer's, not photographs
 
     def without_training_images(self) -> Dataset:
         """The same, but that the pictures of the training views are empty: frees their memory.

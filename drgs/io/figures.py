@@ -17,13 +17,13 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-def new_figure(width: float, height: float, paper: str = "white") -> Figure:
-    """An empty figure; width, height: inches; paper: its colour."""
+def new_figure(width: float, height: float, paper: str = "white", dpi: float = 110) -> Figure:
+    """An empty figure; width, height: inches; paper: its colour; dpi: pixels per inch."""
     # Without pyplot no window system is looked for.
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(width, height), dpi=110, facecolor=paper, layout="constrained")
+    figure = Figure(figsize=(width, height), dpi=dpi, facecolor=paper, layout="constrained")
     FigureCanvasAgg(figure)
     return figure
 

@@ -1,4 +1,4 @@
-"""Curves of a fit: loss, PSNR, population and rate over the iterations."""
+"""Curves of a fit: loss, PSNR, population and rate over the iterations, test PSNR over time."""
 
 from __future__ import annotations
 
@@ -17,6 +17,9 @@ if TYPE_CHECKING:
 
 SMOOTHING_PARTS = 50
 """The smooth line of a curve is a running mean over this part of all rows."""
+
+PAGE_DPI = 160
+"""Of a curve in the page, 3.7 inches wide: what fine screens can show."""
 
 
 class CurvePoint(Protocol):
@@ -46,9 +49,13 @@ class CurvePoint(Protocol):
     def wall_s(self) -> float:
         """Seconds spent so far."""
 
+    @property
+    def test_psnr(self) -> float | None:
+        """Mean of some test views, dB; None where it was not measured."""
+
 
 def write_curves(path: Path, history: Sequence[CurvePoint]) -> None:
-    """Write a picture of the loss, the PSNR, the population and the rates over the iterations."""
+    """Write a picture of all curves."""
     write_figure(path, draw_curves(history, LIGHT))
 
 
@@ -77,40 +84,52 @@ class Panel:
     """One curve."""
 
     title: str
-    x: np.ndarray  # (n,) iterations
+    x: np.ndarray  # (n,)
     y: np.ndarray  # (n,)
+    x_label: str = "iteration"
     scale: str = "linear"  # of y: "linear" or "log"
     bottom: float | None = None  # of y's range; None: as the values have it
     noisy: bool = False  # drawn with its running mean
+    marked: bool = False  # with a dot for each value, of which there are few
+    thousands: bool = False  # y's labels are whole numbers, with separators
 
 
-def _panels(history: Sequence[CurvePoint]) -> list[Panel]:
+def panels_of(history: Sequence[CurvePoint]) -> list[Panel]:
+    """The six curves."""
+
     def column(name: str) -> np.ndarray:
         return np.array([getattr(row, name) for row in history], np.float64)
 
     x, wall_s = column("iteration"), column("wall_s")
     # Two rows may carry one time: the clock's resolution, or a run that was resumed.
     speed = np.diff(x) / np.maximum(np.diff(wall_s), 1e-3)
+    measured = [row for row in history if row.test_psnr is not None]
+    minutes = np.array([row.wall_s / 60 for row in measured])
+    test_psnr = np.array([row.test_psnr for row in measured])
+    over_time = {"x_label": "time [min]", "marked": True}
     return [
         Panel("Loss", x, column("loss"), scale="log", noisy=True),
         Panel("PSNR of the training view [dB]", x, column("psnr"), noisy=True),
-        Panel("Gaussians", x, column("num_gaussians"), bottom=0),
+        Panel("Gaussians", x, column("num_gaussians"), bottom=0, thousands=True),
         Panel("Learning rate of the means", x, column("means_lr"), scale="log"),
         Panel("Iterations per second", x[1:], speed, bottom=0, noisy=True),
-        Panel("Time [min]", x, wall_s / 60, bottom=0),
+        Panel("PSNR of test views [dB]", minutes, test_psnr, **over_time),
     ]
 
 
 def draw_curves(history: Sequence[CurvePoint], theme: Theme) -> Figure:
-    """A matplotlib figure of six panels over the iterations."""
-    figure = new_figure(11, 5.8, paper=theme.paper)
+    """A matplotlib figure of all panels."""
+    figure = new_figure(11, 6, paper=theme.paper)
     figure.get_layout_engine().set(w_pad=0.1, h_pad=0.1)
-    axes = figure.subplots(2, 3)
-    for axis, panel in zip(axes.flat, _panels(history), strict=True):
+    for axis, panel in zip(figure.subplots(2, 3).flat, panels_of(history), strict=True):
         _draw(axis, panel, theme)
-    axes[0, 2].yaxis.set_major_formatter("{x:,.0f}")
-    for axis in axes[-1]:
-        axis.set_xlabel("iteration", fontsize=8.5, color=theme.ink)
+    return figure
+
+
+def draw_curve(panel: Panel, theme: Theme) -> Figure:
+    """A matplotlib figure of one panel, for the page, where there may be no room for two."""
+    figure = new_figure(3.7, 2.8, paper=theme.paper, dpi=PAGE_DPI)
+    _draw(figure.subplots(), panel, theme)
     return figure
 
 
@@ -121,9 +140,13 @@ def _draw(axis: Axes, panel: Panel, theme: Theme) -> None:
     if panel.noisy:
         axis.plot(panel.x, y, color=theme.raw, linewidth=0.7)
         y = _running_mean(y)
-    axis.plot(panel.x, y, color=theme.line, linewidth=1.7)
+    marker = {"marker": "o", "markersize": 3.5} if panel.marked else {}
+    axis.plot(panel.x, y, color=theme.line, linewidth=1.7, **marker)
     if panel.bottom is not None:
         axis.set_ylim(bottom=panel.bottom)
+    if panel.thousands:
+        axis.yaxis.set_major_formatter("{x:,.0f}")
+    axis.set_xlabel(panel.x_label, fontsize=8.5, color=theme.ink)
     axis.set_facecolor(theme.paper)
     axis.grid(color=theme.faint, linewidth=0.7)
     axis.tick_params(colors=theme.ink, labelsize=8, length=0, which="both")

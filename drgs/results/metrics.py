@@ -48,6 +48,9 @@ class FitMetrics(TypedDict):
     versions: dict[str, str]
     variant: str
     threads: int
+    processor: str
+    date: str  # when the results were written: ISO 8601, local time
+    command: str  # the line that was typed
     config: dict[str, object]
 
 

@@ -8,9 +8,11 @@ from __future__ import annotations
 
 import base64
 import html
+import io
 import math
 import time
 from collections.abc import Iterable, Sequence
+from datetime import datetime
 from importlib import resources
 from pathlib import Path
 from string import Template
@@ -18,6 +20,7 @@ from string import Template
 import mitsuba as mi
 import numpy as np
 import yaml
+from PIL import Image
 
 from drgs.core.files import atomic_path
 from drgs.data.images import downscale
@@ -28,12 +31,12 @@ from drgs.gaussians.parameters import Gaussians
 from drgs.integrator.scene import render_views
 from drgs.io.figures import pixels_of
 from drgs.io.pictures import encode, write_animation, write_png
-from drgs.results.curves import THEMES, CurvePoint, draw_curves, write_curves
-from drgs.results.files import CURVES, ORBIT, REPORT, SIDE_BY_SIDE
+from drgs.results.curves import THEMES, CurvePoint, Panel, draw_curve, panels_of, write_curves
+from drgs.results.files import CURVES, GAUSSIANS, ORBIT, REPORT, SIDE_BY_SIDE
 from drgs.results.metrics import FitMetrics, psnr, ssim
 
 DIFFERENCE_GAIN = 5.0
-"""Of difference pictures, 0.5 + gain (fitted - photograph): saturates at 10 % of the range."""
+"""Of difference pictures, 0.5 + gain (fitted - truth): saturates at 10 % of the range."""
 
 GAP = 4
 """px between the pictures of a comparison, white."""
@@ -86,19 +89,19 @@ def seconds_to_write(scene: mi.Scene, dataset: Dataset) -> float:
 
 
 def write_side_by_side(folder: Path, dataset: Dataset, images: Iterable[np.ndarray]) -> None:
-    """Write one PNG per test view: fitted, photograph, difference."""
+    """Write one PNG per test view: fitted, truth, difference."""
     for view, image in zip(dataset.test, images, strict=True):
         write_png(folder / f"{view.name}.png", side_by_side(image, view))
 
 
 def side_by_side(image: np.ndarray, view: View) -> np.ndarray:
-    """(H, 3 W + 2 gaps, 3): fitted, photograph, 0.5 + 5 (fitted - photograph)."""
+    """(H, 3 W + 2 gaps, 3): fitted, truth, 0.5 + 5 (fitted - truth)."""
     gap = np.ones((len(image), GAP, 3), np.float32)
     return np.concatenate([image, gap, view.image, gap, difference(image, view)], axis=1)
 
 
 def difference(image: np.ndarray, view: View) -> np.ndarray:
-    """0.5 + 5 (fitted - photograph), clipped; 0.5 where pixels do not count."""
+    """0.5 + 5 (fitted - truth), clipped; 0.5 where pixels do not count."""
     values = (
         image - view.image if view.mask is None else (image - view.image) * view.mask[..., None]
     )
@@ -130,13 +133,10 @@ def write_report(
 ) -> None:
     """Write one HTML file with everything in it, which needs no network and no other file.
 
-    images: of the test views, in their order; metrics: as of ``metrics.json``; orbit: the bytes
-    of an animated WebP.
+    Only its link to the Gaussians leads out, to the file beside it. images: of the test views, in
+    their order; metrics: as of ``metrics.json``; orbit: the bytes of an animated WebP.
     """
     scores = [score(image, view) for image, view in zip(images, dataset.test, strict=True)]
-    light, dark = (
-        _data_uri(pixels_of(draw_curves(history, theme)), lossless=True) for theme in THEMES
-    )
     template = Template(resources.files("drgs.results").joinpath(PAGE).read_text("utf-8"))
     page = template.substitute(
         title=html.escape(title),
@@ -145,12 +145,15 @@ def write_report(
         facts="".join(_row(*fact) for fact in _facts(dataset, metrics)),
         split=html.escape(dataset.test_split),
         orbit=_uri("image/webp", orbit),
+        still=_data_uri(_first_frame(orbit), quality=92),
+        gaussians=GAUSSIANS,
+        command=html.escape(metrics["command"]),
         comparisons="".join(
             _comparison(dataset, images, scores, *choice) for choice in choose_views(scores)
         ),
+        truth=_truth(dataset).lower(),
         gain=f"{DIFFERENCE_GAIN:g}",
-        curves_light=light,
-        curves_dark=dark,
+        curves="".join(_curve(panel) for panel in panels_of(history)),
         views="".join(
             _row(view.name, f"{decibels:.2f}")
             for view, decibels in zip(dataset.test, scores, strict=True)
@@ -158,7 +161,7 @@ def write_report(
         config=html.escape(yaml.safe_dump(metrics["config"], sort_keys=False)),
     )
     with atomic_path(path) as temporary:
-        temporary.write_text(page, encoding="utf-8")
+        temporary.write_text(page, encoding="utf-8", errors="backslashreplace")
 
 
 def choose_views(scores: Sequence[float]) -> list[tuple[str, int]]:
@@ -189,7 +192,8 @@ def _facts(dataset: Dataset, metrics: FitMetrics) -> list[tuple[str, str]]:
         ("Training views", f"{len(dataset.train)}"),
         ("Test views", f"{len(dataset.test)} (split {dataset.test_split})"),
         ("Iterations per second", f"{speed:.1f}"),
-        ("Threads", f"{metrics['threads']}"),
+        ("Processor", f"{metrics['processor']}, {metrics['threads']} threads"),
+        ("Date", f"{datetime.fromisoformat(metrics['date']):%Y-%m-%d %H:%M (UTC%z)}"),
         ("Mitsuba variant", metrics["variant"]),
         ("Seed", f"{metrics['seed']}"),
         ("Versions", ", ".join(f"{names.get(k, k)} {v}" for k, v in versions.items())),
@@ -215,12 +219,13 @@ def _comparison(
     view, image = dataset.test[index], images[index]
     panels = {
         "Fitted": image,
-        "Photograph": view.image,
+        _truth(dataset): view.image,
         "Difference": difference(image, view),
     }
     pictures = "".join(
-        f'<img alt="{name} {html.escape(view.name)}" '
+        f'<div><img alt="{name} {html.escape(view.name)}" '
         f'src="{_data_uri(downscale(np.clip(picture, 0, 1), PANEL_WIDTH), quality=88)}">'
+        f"<span>{name}</span></div>"
         for name, picture in panels.items()
     )
     caption = (
@@ -228,6 +233,28 @@ def _comparison(
         f"SSIM {ssim(image, view.image, view.mask):.4f}"
     )
     return f'<figure><figcaption>{caption}</figcaption><div class="three">{pictures}</div></figure>'
+
+
+def _truth(dataset: Dataset) -> str:
+    """What fitted pictures are compared with: a renderer's pictures are no photographs."""
+    return "Reference" if dataset.rendered else "Photograph"
+
+
+def _curve(panel: Panel) -> str:
+    """For a light and a dark page."""
+    light, dark = (
+        _data_uri(pixels_of(draw_curve(panel, theme)), lossless=True) for theme in THEMES
+    )
+    return (
+        f'<picture><source media="(prefers-color-scheme: dark)" srcset="{dark}">'
+        f'<img alt="{panel.title} over {panel.x_label}" src="{light}"></picture>'
+    )
+
+
+def _first_frame(animation: bytes) -> np.ndarray:
+    """(H, W, 3) uint8."""
+    with Image.open(io.BytesIO(animation)) as image:
+        return np.asarray(image.convert("RGB"))
 
 
 def _decibels(value: float) -> str:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import csv
+import math
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +24,7 @@ class HistoryRow:
     num_gaussians: int
     means_lr: float
     wall_s: float  # since the first iteration
+    test_psnr: float | None = None  # dB, mean of some test views; None: not measured here
 
 
 class History:
@@ -35,16 +37,19 @@ class History:
 
     @staticmethod
     def from_array(rows: np.ndarray, wall_s: float) -> History:
-        """What :meth:`as_array` gave; the clock goes on from ``wall_s``."""
+        """What :meth:`as_array` gave; the clock goes on from ``wall_s``.
+
+        Rows of earlier versions have no PSNR of test views, and one column less.
+        """
         history = History()
-        history.rows = [
-            HistoryRow(int(i), loss, psnr, int(n), lr, at) for i, loss, psnr, n, lr, at in rows
-        ]
+        for i, loss, psnr, n, lr, at, *more in rows:
+            test_psnr = None if not more or math.isnan(more[0]) else float(more[0])
+            history.rows.append(HistoryRow(int(i), loss, psnr, int(n), lr, at, test_psnr))
         history._before = wall_s
         return history
 
     def as_array(self) -> np.ndarray:
-        """(rows, columns) float64."""
+        """(rows, columns) float64; NaN where nothing was measured."""
         columns = len(HistoryRow.__dataclass_fields__)
         return np.array([tuple(vars(r).values()) for r in self.rows], float).reshape(-1, columns)
 
@@ -65,6 +70,14 @@ class History:
         )
         self.rows.append(row)
         return row
+
+    def add_test_psnr(self, psnr: float, seconds: float) -> None:
+        """Note what the last row's Gaussians reach on test views, in dB.
+
+        seconds: what measuring took, which is no part of the fit.
+        """
+        self.rows[-1] = replace(self.rows[-1], test_psnr=psnr)
+        self._started += seconds
 
 
 def write_history(path: Path, history: list[HistoryRow]) -> None:

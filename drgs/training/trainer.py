@@ -207,10 +207,14 @@ class Trainer:
     def gaussians(self) -> Gaussians:
         """The Gaussians as numpy arrays."""
         self.check()
+        self.show()
+        return dr.detach(self.integrator.gaussians).numpy()
+
+    def show(self) -> None:
+        """Bring the scene to where the fit is; the coming iterations do not depend on it."""
         self.params.update(self.optimizer)
         for effect in self.effects:
             effect.finish(self)
-        return dr.detach(self.integrator.gaussians).numpy()
 
     def pictures(self, views: tuple[View, ...]) -> Iterator[np.ndarray]:
         """Pictures (H, W, 3) of views that were not trained on, display space, in [0, 1]."""

@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import time
+from datetime import datetime
 
 import imageio.v3 as iio
 import mitsuba as mi
@@ -137,6 +138,27 @@ def test_fit_writes_its_outputs_and_nothing_temporary(fitted):
     names = {str(p.relative_to(out)) for p in out.rglob("*") if p.is_file()}
     pictures = {f"{kind}/test/r_{i}.png" for kind in ("renders", "side_by_side") for i in range(3)}
     assert names == {*OUTPUTS, *pictures}
+
+
+def test_the_terminal_ends_with_what_to_open(fitted):
+    result, out = fitted
+    assert result.stdout.splitlines()[-1] == f"open {out / 'report.html'}"
+
+
+def test_the_report_says_how_where_and_when_it_was_made(fitted, configuration):
+    _, out = fitted
+    page = (out / "report.html").read_text()
+    metrics = json.loads((out / "metrics.json").read_text())
+    command = f"python -m drgs.fit {configuration} --out {out} --threads 2"
+    assert metrics["command"] == command and command in page
+    assert metrics["processor"] and metrics["processor"] in page
+    assert abs(datetime.fromisoformat(metrics["date"]).timestamp() - time.time()) < 3600
+    assert '<a href="point_cloud.ply" download>' in page
+    with (out / "history.csv").open() as file:
+        measured = {row["iteration"]: row["test_psnr"] for row in csv.DictReader(file)}
+    assert [iteration for iteration, psnr in measured.items() if psnr] == ["100", "200", "300"]
+    # All three test views are measured on the way.
+    assert float(measured["300"]) == pytest.approx(metrics["test"]["psnr"], abs=1e-3)
 
 
 def test_fit_reaches_a_good_picture_of_views_it_has_not_seen(fitted):

@@ -1,6 +1,7 @@
 """What a fit shows of itself, made from a few blobs and noise for photographs."""
 
 import base64
+import io
 import json
 import re
 from dataclasses import replace
@@ -19,12 +20,13 @@ from drgs.integrator.scene import make_scene, render_views
 from drgs.results import curves, report
 from drgs.training.history import HistoryRow
 
-VOID = {"meta", "link", "img", "source", "br"}
+KINDS = ("still", "moving")
+VOID = {"meta", "link", "img", "source", "br", "input"}
 
 
 @pytest.fixture(scope="module")
 def dataset():
-    return make_dataset()
+    return replace(make_dataset(), rendered=True)
 
 
 @pytest.fixture(scope="module")
@@ -40,7 +42,9 @@ def images(dataset, scene):
 
 def history(count=120):
     return [
-        HistoryRow(i, 1 / i, 10 + i / 10, 100 * i, 1e-3 * 0.9**i, 0.5 * i)
+        HistoryRow(
+            i, 1 / i, 10 + i / 10, 100 * i, 1e-3 * 0.9**i, 0.5 * i, None if i % 5 else 8 + i / 10
+        )
         for i in range(1, count + 1)
     ]
 
@@ -56,6 +60,9 @@ def metrics(**data):
         "versions": {"drgs": "1.2.3", "mitsuba": "3.9.1", "llvm": "19.1.7"},
         "variant": "llvm_ad_rgb",
         "threads": 2,
+        "processor": "A <Processor>",
+        "date": "2026-11-23T01:02+01:00",
+        "command": "drgs fit 'my scene.yml' --data <DIR>",
         "config": config.model_dump(mode="json"),
     }
 
@@ -143,12 +150,18 @@ def test_curves_of_unusual_histories_are_drawn(tmp_path, rows):
 
 
 def test_the_panels_are_of_the_history():
-    panels = {panel.title: panel for panel in curves._panels(history(5))}
-    assert panels["Loss"].y == pytest.approx([1, 1 / 2, 1 / 3, 1 / 4, 1 / 5])
-    assert panels["Gaussians"].y.tolist() == [100, 200, 300, 400, 500]
-    assert panels["Iterations per second"].x.tolist() == [2, 3, 4, 5]
-    assert panels["Iterations per second"].y == pytest.approx([2, 2, 2, 2])
-    assert panels["Time [min]"].y[-1] == pytest.approx(2.5 / 60)
+    panels = {panel.title: panel for panel in curves.panels_of(history(12))}
+    assert panels["Loss"].y[:5] == pytest.approx([1, 1 / 2, 1 / 3, 1 / 4, 1 / 5])
+    assert panels["Gaussians"].y[:5].tolist() == [100, 200, 300, 400, 500]
+    assert panels["Iterations per second"].x.tolist() == list(range(2, 13))
+    assert panels["Iterations per second"].y == pytest.approx([2] * 11)
+
+
+def test_the_psnr_of_test_views_is_shown_over_the_time():
+    (panel,) = (p for p in curves.panels_of(history(12)) if "test views" in p.title)
+    assert panel.x_label == "time [min]"
+    assert panel.x == pytest.approx([2.5 / 60, 5 / 60])
+    assert panel.y == pytest.approx([8.5, 9])
 
 
 @pytest.mark.parametrize("count", [1, 7, 50, 333])
@@ -191,7 +204,7 @@ class Page(HTMLParser):
     def images(self):
         """(bytes) of every embedded picture."""
         for reference in self.references:
-            if reference != "data:,":
+            if reference.startswith("data:image"):
                 kind, data = re.fullmatch(r"data:(image/\w+);base64,(.*)", reference).groups()
                 yield kind, base64.b64decode(data, validate=True)
 
@@ -202,11 +215,46 @@ def page(out):
 
 
 def test_the_page_refers_to_nothing_outside(page):
-    assert len(page.references) == 1 + 1 + 3 * 3 + 2  # icon, orbit, comparisons, curves
-    assert all(reference.startswith("data:") for reference in page.references)
+    embedded = [reference for reference in page.references if reference.startswith("data:")]
+    # The icon, the orbit and its first frame, comparisons, curves for light and dark pages.
+    assert len(embedded) == 1 + 2 + 3 * 3 + 6 * 2
+    assert set(page.references) - set(embedded) == {"point_cloud.ply"}  # to be downloaded
     for outside in ("http:", "https:", "file:", "//", "@import", "url(", "<script"):
         assert outside not in re.sub(r"base64,[A-Za-z0-9+/=]*", "", page.source), outside
     assert set(page.tags).isdisjoint({"script", "iframe", "object", "embed"})
+
+
+def test_pictures_and_curves_lie_one_below_the_other_on_a_phone(page):
+    phone = re.search(r"@media \(max-width: 560px\) \{(.*?\}\s*)\}", page.source, re.DOTALL)[1]
+    assert ".three, .curves { grid-template-columns: minmax(0, 1fr); }" in phone
+    text = " ".join(" ".join(page.text).split())
+    assert text.count("Fitted Reference Difference") == 3  # each below its own picture
+    assert page.source.count('<div class="curves"><picture>') == 1
+    assert page.tags.count("picture") == 6
+
+
+def test_the_orbit_can_be_paused_and_honours_reduced_motion(page):
+    assert '<input type="checkbox" id="orbit">' in page.source
+    assert '<label for="orbit">' in page.source
+    still, moving = (re.search(rf'class="{c}"[^>]*src="(.*?)"', page.source)[1] for c in KINDS)
+    frames = []
+    for picture in (still, moving):
+        with Image.open(io.BytesIO(base64.b64decode(picture.partition(",")[2]))) as image:
+            frames.append((image.n_frames, np.asarray(image.convert("RGB")) / 255))
+    assert [count for count, _ in frames] == [1, report.ORBIT_FRAMES]
+    assert np.abs(frames[0][1] - frames[1][1]).mean() < 0.05  # lossy, of small colourful pictures
+    reduced = page.source.partition("prefers-reduced-motion: reduce")[2].partition("\n}\n")[0]
+    assert ".orbit .moving, .orbit .pause" in reduced.partition("display: none")[0]
+
+
+def test_pictures_of_a_renderer_are_no_photographs(tmp_path, dataset, images, out, page):
+    path, taken = tmp_path / "report.html", replace(dataset, rendered=False)
+    orbit = (out / "orbit.webp").read_bytes()
+    report.write_report(path, "a", taken, images, history(2), metrics(), orbit)
+    rendered, photographed = "".join(page.text), "".join(Page(path).text)
+    assert "Reference" in rendered and "fitted \u2212 reference" in rendered
+    assert "Photograph" in photographed and "fitted \u2212 photograph" in photographed
+    assert "Photograph" not in rendered and "Reference" not in photographed
 
 
 def test_the_pages_pictures_are_whole(page, out, tmp_path):
@@ -219,7 +267,7 @@ def test_the_pages_pictures_are_whole(page, out, tmp_path):
             assert kind == f"image/{image.format.lower()}"
             sizes.append(image.size)
     assert (out / "orbit.webp").read_bytes() in [data for _, data in page.images()]
-    assert sizes.count((WIDTH, HEIGHT)) == 1 + 9
+    assert sizes.count((WIDTH, HEIGHT)) == 2 + 9
     assert len(page.source) < 3_000_000
 
 
@@ -227,7 +275,8 @@ def test_the_page_states_the_metrics(page):
     text = " ".join(" ".join(page.text).split())
     for stated in (
         "blobs", "noise <small>", "31.23 dB", "mean of 4 test views", "0.9000", "12,345",
-        "1 min 15 s", "1,200 iterations", "Threads 2", "Seed 7", "drgs 1.2.3, Mitsuba 3.9.1",
+        "1 min 15 s", "1,200 iterations", "A <Processor>, 2 threads", "2026-11-23 01:02 (UTC+0100)",
+        "drgs fit 'my scene.yml' --data <DIR>", "Seed 7", "drgs 1.2.3, Mitsuba 3.9.1",
         "16.0", "LLVM 19.1.7", "sh_increase_every: 1000", "path: photographs",
     ):  # fmt: skip
         assert stated in text, stated

@@ -1,0 +1,87 @@
+"""PSNR of test views on the way: measured where it is due, with no effect on the fit."""
+
+import numpy as np
+import pytest
+from support.small_capture import decibels
+from support.small_fits import everything_of, make_trainer, steps, true_dataset
+
+from drgs.training import quality
+from drgs.training.history import History, HistoryRow, write_history
+
+
+def row(iteration, test_psnr=None):
+    return HistoryRow(iteration, 0.5, 10.0, 100, 1e-3, 2.0, test_psnr)
+
+
+@pytest.mark.parametrize(
+    ("iterations", "every", "expected"),
+    [
+        (7000, 10, list(range(700, 7001, 700))),
+        (1000, 10, list(range(100, 1001, 100))),
+        (300, 7, [105, 210, 300]),  # where there are rows
+        (60, 10, [60]),
+    ],
+)
+def test_a_fit_is_measured_ten_times_or_every_hundred_iterations(iterations, every, expected):
+    rows = []
+    for iteration in [*range(every, iterations, every), iterations]:
+        rows.append(row(iteration))
+        if quality.measurement_is_due(rows, iterations):
+            rows[-1] = row(iteration, 20.0)
+    assert [r.iteration for r in rows if r.test_psnr is not None] == expected
+
+
+@pytest.mark.parametrize(("count", "expected"), [(1, [0]), (8, list(range(8))), (25, None)])
+def test_a_few_views_stand_for_all(count, expected):
+    chosen = quality.measured_views(range(count))
+    assert list(chosen) == (expected or [0, 3, 7, 10, 14, 17, 21, 24])
+
+
+def test_measuring_changes_nothing_that_comes():
+    """With densification, a filter that follows the means, and random backgrounds."""
+    changes = {
+        "model__smoothing": True,
+        "data__random_background": True,
+        "densify__start": 4,
+        "densify__stop": 30,
+        "densify__every": 5,
+    }
+    dataset = true_dataset()
+    plain = steps(make_trainer(dataset, **changes), 14)
+    watched, history = make_trainer(dataset, **changes), History()
+    for count in (2, 3, 4, 5):
+        report = [watched.step() for _ in range(count)][-1]
+        history.add(report)
+        quality.measure(watched, history, dataset.test)
+    assert everything_of(watched) == everything_of(plain)
+
+    plain.show()
+    views = zip(plain.pictures(dataset.test), dataset.test, strict=True)
+    expected = np.mean([decibels(image, view.image) for image, view in views])
+    assert history.rows[-1].test_psnr == pytest.approx(expected, abs=1e-4)
+    assert len({row.test_psnr for row in history.rows}) == 4
+
+
+def test_measuring_is_no_part_of_the_fits_time(monkeypatch):
+    now = [0.0]
+    monkeypatch.setattr("drgs.training.history.time.perf_counter", lambda: now[0])
+    history = History()
+    history.rows.append(row(10))
+    now[0] = 5.0
+    history.add_test_psnr(21.5, 2.0)
+    assert history.wall_s == 3.0
+    assert history.rows == [row(10, 21.5)]
+
+
+def test_the_history_is_kept_with_and_without_measurements(tmp_path):
+    history = History()
+    history.rows += [row(10), row(20, 21.5), row(30, float("inf"))]
+    assert History.from_array(history.as_array(), 1.0).rows == history.rows
+    write_history(tmp_path / "history.csv", history.rows)
+    lines = (tmp_path / "history.csv").read_text().splitlines()
+    assert [line.split(",")[-1] for line in lines] == ["test_psnr", "", "21.5", "inf"]
+
+
+def test_the_history_of_an_earlier_version_goes_on():
+    earlier = np.array([[10, 0.5, 10.0, 100, 1e-3, 2.0]])
+    assert History.from_array(earlier, 1.0).rows == [row(10)]
