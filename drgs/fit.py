@@ -154,7 +154,6 @@ def run(args: argparse.Namespace) -> None:
             config = plan.config
             print(plan.reasons)
         trainer = Trainer(config, dataset, gaussians)
-        dataset = dataset.without_training_images()
         if args.overwrite:
             remove_run(out)
         claim_output_folder(out, config)

@@ -147,7 +147,7 @@ def darken(dataset: Dataset, rng: np.random.Generator) -> Dataset:
     del rng
 
     def dark(view: View) -> View:
-        return _with_image(view, DARK * view.image)
+        return _with_image(view, DARK * np.asarray(view.image))
 
     return replace(_each_train(dataset, dark), test=tuple(map(dark, dataset.test)))
 
@@ -156,7 +156,9 @@ def spoil_exposure(dataset: Dataset, rng: np.random.Generator) -> Dataset:
     """Each training picture has gains of its own, for each colour; their mean is 1."""
     gains = rng.uniform(0.6, 1.4, (len(dataset.train), 3))
     gains = iter(gains / gains.mean(axis=0))
-    return _each_train(darken(dataset, rng), lambda v: _with_image(v, v.image * next(gains)))
+    return _each_train(
+        darken(dataset, rng), lambda v: _with_image(v, np.asarray(v.image) * next(gains))
+    )
 
 
 def spoil_parts(dataset: Dataset, rng: np.random.Generator) -> Dataset:
@@ -234,7 +236,7 @@ def quality_as_exposed(trainer: Trainer, dataset: Dataset, spoiled: Dataset) -> 
     """
     del dataset
     pairs = zip(render_views(trainer.scene, spoiled.test), spoiled.test, strict=True)
-    fitted = ((fitted_colors(picture, view.image), view.image) for picture, view in pairs)
+    fitted = ((fitted_colors(p, np.asarray(v.image)), v.image) for p, v in pairs)
     return {
         **quality(trainer, spoiled, spoiled),
         "with colours fitted, dB": mean_quality(fitted).psnr,
@@ -272,7 +274,7 @@ def seen_at_sizes(trainer: Trainer) -> list[np.ndarray]:
 
 def photographs_at_sizes(config: FitConfig) -> list[np.ndarray]:
     """The same of the data."""
-    return [of_size[0].image for of_size in views_at_sizes(config).values()]
+    return [np.asarray(of_size[0].image) for of_size in views_at_sizes(config).values()]
 
 
 def cameras(trainer: Trainer, dataset: Dataset, spoiled: Dataset) -> dict[str, float]:

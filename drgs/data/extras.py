@@ -16,6 +16,7 @@ from drgs.cameras.camera import Lens
 from drgs.config.schema import DataConfig
 from drgs.core.errors import UserError
 from drgs.data.images import downscale_depth, downscale_mask, read_depth, read_mask
+from drgs.data.kept import Pixels, kept_mask
 from drgs.data.transforms import CLOSE, Frame, image_path, lens_of, motion_of
 from drgs.data.types import Motion
 
@@ -28,7 +29,7 @@ nerfstudio has it. An ``.npy`` file then holds scene units, which it has numbers
 
 def extras_of(
     config: DataConfig, frame: Frame, size: tuple[int, int]
-) -> dict[str, Lens | Motion | np.ndarray | None]:
+) -> dict[str, Lens | Motion | Pixels | None]:
     """``lens``, ``motion``, ``mask`` and ``depth`` of a :class:`drgs.data.types.View`.
 
     size: of the photograph, W, H, before it is scaled. No file is opened for what the configuration
@@ -42,8 +43,8 @@ def extras_of(
     }
 
 
-def _mask(config: DataConfig, frame: Frame, size: tuple[int, int]) -> np.ndarray | None:
-    """(H, W) of 1 and 0, at the width that is configured."""
+def _mask(config: DataConfig, frame: Frame, size: tuple[int, int]) -> Pixels | None:
+    """Of 1 and 0, at the width that is configured."""
     if frame.values.mask_path is None:
         return None
     file = image_path(config.path, frame, MASK)
@@ -56,7 +57,7 @@ def _mask(config: DataConfig, frame: Frame, size: tuple[int, int]) -> np.ndarray
             f"{size_too_small if mask.any() else ';'} remove the view from its file, or set "
             "data.ignore_masks"
         )
-    return smaller
+    return kept_mask(smaller)
 
 
 def _depth(config: DataConfig, frame: Frame, size: tuple[int, int]) -> np.ndarray | None:

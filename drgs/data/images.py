@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from drgs.core.errors import UserError, one_line
+from drgs.data.kept import KeptPicture, Pixels
 from drgs.data.types import View
-from drgs.io.pictures import BITS, image_mode, read_image
+from drgs.io.pictures import BITS, as_numbers, image_mode, read_image
 
 MAX_DEPTH_STEPS = 2**16 - 1
 """White in a picture of 16 bits."""
@@ -78,31 +80,68 @@ def downscale(image: np.ndarray, max_width: int | None) -> np.ndarray:
     after compositing, which gives what scaling premultiplied colours and alpha would.
     """
     height, width = image.shape[:2]
-    if max_width is None or width <= max_width:
+    new_width, new_height = downscaled_size(width, height, max_width)
+    if new_width == width:
         return image
-    new_height = max(1, round(height * max_width / width))
     rows = _average_rows(image, new_height)
-    return np.ascontiguousarray(_average_rows(rows.swapaxes(0, 1), max_width).swapaxes(0, 1))
+    return np.ascontiguousarray(_average_rows(rows.swapaxes(0, 1), new_width).swapaxes(0, 1))
+
+
+def downscaled_size(width: int, height: int, max_width: int | None) -> tuple[int, int]:
+    """Width and height of what :func:`downscale` makes of a picture of ``width`` x ``height``."""
+    if max_width is None or width <= max_width:
+        return width, height
+    return max_width, max(1, round(height * max_width / width))
+
+
+def kept_photograph(
+    pixels: np.ndarray, background: tuple[float, float, float], max_width: int | None
+) -> tuple[Pixels, Pixels | None]:
+    """``image`` and ``alpha`` of a :class:`View`, kept in whichever form takes less memory.
+
+    pixels: what :func:`drgs.io.pictures.read_pixels` gave; background: behind transparent pixels,
+    display space; max_width: see :func:`downscale`.
+    """
+    height, width, channels = pixels.shape
+    new_width, new_height = downscaled_size(width, height, max_width)
+
+    def image() -> np.ndarray:
+        return downscale(composite(as_numbers(pixels), background), max_width)
+
+    def alpha() -> np.ndarray:
+        return downscale(as_numbers(pixels[:, :, 3]), max_width)
+
+    if 4 * new_width * new_height * channels < pixels.nbytes:
+        return image(), alpha() if channels == 4 else None
+    shape = (new_height, new_width)
+    opaqueness = KeptPicture(shape, alpha, 0) if channels == 4 else None
+    return KeptPicture((*shape, 3), image, pixels.nbytes), opaqueness
 
 
 def smaller_view(view: View, factor: int) -> View:
     """The same camera with pixels ``factor`` times as large, each the average over its area."""
     new_width = max(1, round(view.width / factor))
-    image = downscale(view.image, new_width)
-    height, width = image.shape[:2]
+    width, height = downscaled_size(view.width, view.height, new_width)
     x, y = width / view.width, height / view.height
+
+    def smaller(picture: Pixels | None, scaled: Callable = downscale) -> KeptPicture | None:
+        if picture is None:
+            return None
+        shape = (height, width, *picture.shape[2:])
+        return KeptPicture(shape, lambda: scaled(np.asarray(picture), new_width), 0)
+
     return replace(
         view,
-        image=image,
+        image=smaller(view.image),
         fx=view.fx * x,
         fy=view.fy * y,
         cx=view.cx * x,
         cy=view.cy * y,
         width=width,
         height=height,
-        alpha=None if view.alpha is None else downscale(view.alpha, new_width),
-        mask=None if view.mask is None else downscale_mask(view.mask, new_width),
-        depth=None if view.depth is None else downscale_depth(view.depth, new_width),
+        alpha=smaller(view.alpha),
+        mask=smaller(view.mask, downscale_mask),
+        depth=smaller(view.depth, downscale_depth),
     )
 
 

@@ -18,7 +18,7 @@ import numpy as np
 from drgs.config.schema import DataConfig
 from drgs.core.errors import UserError
 from drgs.data.extras import extras_of, ignored, notes
-from drgs.data.images import composite, downscale
+from drgs.data.images import kept_photograph
 from drgs.data.transforms import (
     Frame,
     focal_from_angle,
@@ -28,7 +28,7 @@ from drgs.data.transforms import (
     unique_names,
 )
 from drgs.data.types import Dataset, View
-from drgs.io.pictures import image_size, read_image
+from drgs.io.pictures import image_size, read_pixels
 
 START_HALF_EXTENT = 1.3
 """The 3DGS reference starts from random points in [-1.3, 1.3]^3 for these scenes
@@ -84,11 +84,9 @@ def _load_split(config: DataConfig, split: str, frames: list[Frame]) -> tuple[Vi
 
     def load_view(index: int, name: str) -> View:
         frame = frames[index]
-        rgba = read_image(files[index])
+        rgba = read_pixels(files[index])
         _check_promises(rgba, size, files[index], files[0])
-        image = downscale(composite(rgba, config.background_rgb), config.image_size)
-        # Only training looks at it.
-        alpha = downscale(rgba[:, :, 3], config.image_size) if split == "train" else None
+        image, alpha = kept_photograph(rgba, config.background_rgb, config.image_size)
         height, width = image.shape[:2]
         # The angle spans the full width, so the focal length in pixels follows the image's size.
         focal = focal_from_angle(_angle(frame), width)
@@ -102,7 +100,7 @@ def _load_split(config: DataConfig, split: str, frames: list[Frame]) -> tuple[Vi
             cy=height / 2,
             width=width,
             height=height,
-            alpha=alpha,
+            alpha=alpha if split == "train" else None,  # only training looks at it
             **extras_of(config, frame, size),
         )
 

@@ -16,7 +16,7 @@ from pathlib import Path
 from drgs.config.schema import DataConfig
 from drgs.core.errors import UserError
 from drgs.data.extras import extras_of, ignored, notes
-from drgs.data.images import composite, downscale
+from drgs.data.images import kept_photograph
 from drgs.data.transforms import (
     Frame,
     focal_from_angle,
@@ -28,7 +28,7 @@ from drgs.data.transforms import (
     unique_names,
 )
 from drgs.data.types import Dataset, View
-from drgs.io.pictures import read_image
+from drgs.io.pictures import read_pixels
 
 
 def load(config: DataConfig) -> Dataset:
@@ -69,9 +69,8 @@ def load(config: DataConfig) -> Dataset:
 
 
 def _load_view(config: DataConfig, frame: Frame, file: Path, name: str) -> View:
-    pixels = read_image(file)
-    image = composite(pixels, config.background_rgb)
-    height, width = image.shape[:2]
+    pixels = read_pixels(file)
+    height, width = pixels.shape[:2]
     values = frame.values
     for key, given, size in (("w", values.w, width), ("h", values.h, height)):
         if given is not None and given != size:
@@ -84,10 +83,8 @@ def _load_view(config: DataConfig, frame: Frame, file: Path, name: str) -> View:
     fy = _focal(frame, "y", height) if has_fy else fx
     cx, cy = (_principal(frame, key, size) for key, size in (("cx", width), ("cy", height)))
 
-    max_width = config.image_size
-    image = downscale(image, max_width)
+    image, alpha = kept_photograph(pixels, config.background_rgb, config.image_size)
     scale_x, scale_y = image.shape[1] / width, image.shape[0] / height
-    alpha = downscale(pixels[:, :, 3], max_width) if pixels.shape[2] == 4 else None
     return View(
         name=name,
         image=image,

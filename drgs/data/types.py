@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from drgs.core.constants import SHUTTER_SAMPLES
+from drgs.data.kept import Pixels
 
 if TYPE_CHECKING:
     from drgs.cameras.camera import Lens
@@ -58,12 +59,12 @@ class Viewpoint:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class View(Viewpoint):
-    """One photograph and the camera that took it."""
+    """One photograph and the camera that took it; its pictures become arrays by ``np.asarray``."""
 
-    image: np.ndarray  # (height, width, 3) float32, display space 0..1, opaque
-    alpha: np.ndarray | None = None  # (height, width) float32: how opaque the picture was
-    mask: np.ndarray | None = None  # (height, width) float32: 1 where a pixel counts, else 0
-    depth: np.ndarray | None = None  # (height, width) float32, scene units; 0 where not known
+    image: Pixels  # (height, width, 3) float32, display space 0..1, opaque
+    alpha: Pixels | None = None  # (height, width) float32: how opaque the picture was
+    mask: Pixels | None = None  # (height, width) float32: 1 where a pixel counts, else 0
+    depth: Pixels | None = None  # (height, width) float32, scene units; 0 where not known
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,15 +79,6 @@ class Dataset:
     description: str  # one line: what was read, and what was assumed
     ignored: tuple[str, ...] = ()  # that frames have and the configuration leaves out: see extras
     rendered: bool = False  # the pictures are another renderer's, not photographs
-
-    def without_training_images(self) -> Dataset:
-        """The same, but that the pictures of the training views are empty: frees their memory.
-
-        For a fit, whose trainer has them on the device.
-        """
-        empty = np.empty((0, 0, 3), np.float32)
-        pictures = {"image": empty, "alpha": None, "mask": None, "depth": None}
-        return replace(self, train=tuple(replace(view, **pictures) for view in self.train))
 
     @property
     def extent(self) -> float:

@@ -60,7 +60,17 @@ def image_mode(path: Path) -> str:
 
 
 def read_image(path: Path) -> np.ndarray:
-    """(H, W, C) float32 in 0..1, as stored (EXIF orientation is not applied).
+    """(H, W, C) float32 in 0..1: see :func:`read_pixels`."""
+    return as_numbers(read_pixels(path))
+
+
+def as_numbers(pixels: np.ndarray) -> np.ndarray:
+    """Float32 in 0..1 of what :func:`read_pixels` gave."""
+    return pixels.astype(np.float32) / np.float32(255 if pixels.dtype == np.uint8 else 65535)
+
+
+def read_pixels(path: Path) -> np.ndarray:
+    """(H, W, C) as stored (EXIF orientation is not applied), uint8 or an integer type for 16 bits.
 
     C is 3, or 4 with straight (not premultiplied) alpha; grey images become RGB.
 
@@ -82,12 +92,11 @@ def read_image(path: Path) -> np.ndarray:
                 f"mode {image.mode}; convert it"
             )
         pixels = np.asarray(image)
-        white = 2 ** BITS[image.mode] - 1
     if pixels.ndim == 2:
         pixels = pixels[:, :, None]
     if pixels.shape[2] < 3:
         pixels = np.concatenate([pixels[:, :, :1]] * 3 + [pixels[:, :, 1:]], axis=2)
-    return pixels.astype(np.float32) / np.float32(white)
+    return pixels
 
 
 @contextmanager

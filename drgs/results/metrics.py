@@ -74,7 +74,8 @@ def ssim(image: ArrayLike, target: ArrayLike, mask: ArrayLike | None = None) -> 
     """
     x, y = _prepare("ssim()", image, target)
     if mask is not None:
-        x, y = x * mask[:, :, None], y * mask[:, :, None]
+        counts = np.asarray(mask)[:, :, None]
+        x, y = x * counts, y * counts
     mu_x, mu_y = _windowed(x), _windowed(y)
     var_x = _windowed(x * x) - mu_x**2
     var_y = _windowed(y * y) - mu_y**2

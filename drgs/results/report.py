@@ -103,7 +103,9 @@ def side_by_side(image: np.ndarray, view: View) -> np.ndarray:
 def difference(image: np.ndarray, view: View) -> np.ndarray:
     """0.5 + 5 (fitted - truth), clipped; 0.5 where pixels do not count."""
     values = (
-        image - view.image if view.mask is None else (image - view.image) * view.mask[..., None]
+        image - view.image
+        if view.mask is None
+        else (image - view.image) * np.asarray(view.mask)[..., None]
     )
     return np.clip(0.5 + DIFFERENCE_GAIN * values, 0, 1)
 

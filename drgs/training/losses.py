@@ -32,6 +32,9 @@ C1 = 0.01**2
 C2 = 0.03**2
 """(K2 L)^2 with K2 = 0.03 (same source): stabilises contrast and structure."""
 
+TARGET_BYTES = 36
+"""Of a pixel: three numbers for each of three channels in single precision, see :class:`Target`."""
+
 _TILE = 8  # pixels; 4 and 16 were measured to be slower
 _CHANNELS = 3
 

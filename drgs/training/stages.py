@@ -8,26 +8,54 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import partial
 
-import mitsuba as mi
 import numpy as np
 
 from drgs.config.schema import FitConfig
 from drgs.data.images import smaller_view
 from drgs.data.types import View
 from drgs.integrator.scene import make_sensors
-from drgs.training.effects.base import TrainingEffect
-from drgs.training.losses import prepare_target
+from drgs.training.effects.base import TrainingEffect, as_tensor
+from drgs.training.losses import TARGET_BYTES, Target, prepare_target
 from drgs.training.views import TrainingView
 
+KEPT_BYTES = 1 << 30
+"""Of targets and effects' uploads that stay on the device until their view is drawn again: of 180
+pictures of 400 x 400 px. Without room, they are made anew, in a few per cent of an iteration."""
 
-@dataclass(frozen=True, eq=False)
+
+@dataclass(eq=False)
 class Stage:
     """Iterations that train on pictures of one size."""
 
     until: float  # last iteration
     views: list[TrainingView]
+    view_bytes: int  # of a pixel: what is made of a view's pictures
+    room: int  # bytes left for what stays on the device
+    kept: set[int] = field(default_factory=set)  # indices of the views that have it
+
+    def seen(self, view: TrainingView) -> None:
+        """After an iteration: keep what was made of the view's pictures, or let it go.
+
+        The first views that are drawn are kept. Each round draws all views, in another order: those
+        that were drawn last are no more likely to be drawn next than others.
+        """
+        if view.index in self.kept:
+            return
+        size = view.width * view.height * self.view_bytes
+        if size > self.room:
+            view.let_go()
+        else:
+            self.room -= size
+            self.kept.add(view.index)
+
+    def end(self) -> None:
+        """Free what is kept: the stage will not come again."""
+        for index in self.kept:
+            self.views[index].let_go()
+        self.kept.clear()
 
 
 def make_stages(
@@ -35,37 +63,46 @@ def make_stages(
 ) -> list[Stage]:
     """The configuration's coarse stages, and the last one, of pictures as they are."""
     sizes = [(s.until, [smaller_view(v, s.factor) for v in views]) for s in config.coarse]
+    view_bytes = bytes_on_device(effects)
     return [
-        Stage(until, make_training_views(resized, config, effects))
+        Stage(until, make_training_views(resized, config, effects), view_bytes, KEPT_BYTES)
         for until, resized in [*sizes, (math.inf, views)]
     ]
+
+
+def bytes_on_device(effects: Sequence[TrainingEffect]) -> int:
+    """Of a pixel of a view: its target, and at most what effects upload."""
+    return TARGET_BYTES + sum(effect.upload_bytes for effect in effects)
 
 
 def make_training_views(
     views: Sequence[View], config: FitConfig, effects: Sequence[TrainingEffect]
 ) -> list[TrainingView]:
-    """Sensors, loss targets, and what effects need, for ``views``."""
+    """Sensors, and what makes loss targets and what effects need, for ``views``."""
     sensors = make_sensors(views, calibrated=any(e.moves_sensors for e in effects))
-    result = []
-    for index, (view, sensor) in enumerate(zip(views, sensors, strict=True)):
-        image = view.image
-        for effect in effects:
-            image = effect.target_image(view, image)
-        target = prepare_target(mi.TensorXf(image), config.loss.window, config.loss.sigma)
-        result.append(
-            TrainingView(
-                name=view.name,
-                index=index,
-                sensor=sensor,
-                photograph=target,
-                target=target,
-                width=view.width,
-                height=view.height,
-                counted=1.0 if view.mask is None else max(float(view.mask.mean()), 1e-10),
-                uploads={effect.name: effect.upload(view) for effect in effects},
-            )
+    return [
+        TrainingView(
+            name=view.name,
+            index=index,
+            sensor=sensor,
+            size=(view.width, view.height),
+            counted=_counted(view),
+            make_target=partial(_make_target, view, config, effects),
+            makers={effect.name: partial(effect.upload, view) for effect in effects},
         )
-    return result
+        for index, (view, sensor) in enumerate(zip(views, sensors, strict=True))
+    ]
+
+
+def _make_target(view: View, config: FitConfig, effects: Sequence[TrainingEffect]) -> Target:
+    image = np.asarray(view.image)
+    for effect in effects:
+        image = effect.target_image(view, image)
+    return prepare_target(as_tensor(image), config.loss.window, config.loss.sigma)
+
+
+def _counted(view: View) -> float:
+    return 1.0 if view.mask is None else max(float(np.asarray(view.mask).mean()), 1e-10)
 
 
 def view_of(iteration: int, num_views: int, seed: int) -> int:

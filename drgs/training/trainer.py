@@ -27,7 +27,7 @@ from drgs.training.finite_checks import GradientWatch, check_values, check_view_
 from drgs.training.losses import PhotometricLoss
 from drgs.training.optimizer import make_optimizer, optimizer_state, restore_optimizer
 from drgs.training.rates import learning_rates, means_rate, rate_aims
-from drgs.training.stages import make_stages, view_of
+from drgs.training.stages import Stage, make_stages, view_of
 from drgs.training.views import TrainingView
 
 PREFIX = "integrator."
@@ -87,6 +87,7 @@ class Trainer:
 
     def step(self) -> StepReport:
         """One iteration: one view, one optimizer step, now and then a change of the population."""
+        self._end_stage()
         self.iteration += 1
         view = self.view
         self.integrator.sh_degree = self.sh_degree
@@ -105,6 +106,7 @@ class Trainer:
         self.optimizer.step()
         for effect in self.effects:
             effect.after(self, view)
+        self.stage.seen(view)
 
         report = self._control_density(view)
         return StepReport(
@@ -128,9 +130,14 @@ class Trainer:
         return image, loss
 
     @property
+    def stage(self) -> Stage:
+        """Pictures of the size in use."""
+        return next(stage for stage in self.stages if self.iteration <= stage.until)
+
+    @property
     def views(self) -> list[TrainingView]:
         """The training views, at the size in use."""
-        return next(stage.views for stage in self.stages if self.iteration <= stage.until)
+        return self.stage.views
 
     @property
     def begins_stage(self) -> bool:
@@ -275,6 +282,10 @@ class Trainer:
         if resets:
             densify.reset_opacities(self.optimizer, config, PREFIX)
         return report
+
+    def _end_stage(self) -> None:
+        if self.iteration == self.stage.until:
+            self.stage.end()
 
     def _no_statistics(self) -> densify.DensityStatistics:
         return densify.DensityStatistics.zeros(mi.Float, self.num_gaussians)

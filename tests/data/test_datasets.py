@@ -20,7 +20,7 @@ def test_rgba_is_composited_over_the_background_in_display_space(blender):
         expected = pixels[..., :3] * pixels[..., 3:] + color * (1 - pixels[..., 3:])
         # Four float32 roundings of numbers <= 1.
         np.testing.assert_allclose(view.image, expected, atol=4 * 6e-8)
-        assert view.image.dtype == np.float32
+        assert np.asarray(view.image).dtype == np.float32
 
 
 def test_a_background_colour_is_used_channel_by_channel(blender):
@@ -29,7 +29,7 @@ def test_a_background_colour_is_used_channel_by_channel(blender):
     assert dataset.background == (0.0, 0.5, 1.0)
     alpha = images["train", 0][..., 3] / 255
     expected = images["train", 0][..., 1] / 255 * alpha + 0.5 * (1 - alpha)
-    np.testing.assert_allclose(dataset.train[0].image[..., 1], expected, atol=4 * 6e-8)
+    np.testing.assert_allclose(np.asarray(dataset.train[0].image)[..., 1], expected, atol=4 * 6e-8)
 
 
 def test_the_horizontal_angle_gives_the_focal_length(blender):

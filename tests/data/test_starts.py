@@ -253,7 +253,7 @@ def test_lego_is_read(lego_folder):
     view = dataset.train[0]
     assert (view.width, view.height) == (200, 200)
     assert view.fx == pytest.approx(555.5555 / 2, rel=1e-6)
-    np.testing.assert_array_equal(view.image[0, 0], 1)  # background
+    np.testing.assert_array_equal(np.asarray(view.image)[0, 0], 1)  # background
     # All cameras of this scene look at the origin from one distance.
     focus, distance = focus_of(dataset.train)
     np.testing.assert_allclose(focus, 0, atol=1e-5)

@@ -25,6 +25,7 @@ class RandomBackground(TrainingEffect):
     """
 
     name = "background"
+    upload_bytes = 12
 
     def __init__(
         self, seed: int, background: tuple[float, float, float], window: int, sigma: float
@@ -37,7 +38,9 @@ class RandomBackground(TrainingEffect):
 
     def upload(self, view: View) -> Any:
         """1 - alpha, (H, W, 3); 0 where a mask leaves the background out as well."""
-        transparent = 1 - view.alpha if view.mask is None else (1 - view.alpha) * view.mask
+        transparent = 1 - np.asarray(view.alpha)
+        if view.mask is not None:
+            transparent = transparent * np.asarray(view.mask)
         return as_tensor(np.repeat(transparent[:, :, None], 3, axis=2))
 
     def before(self, fit: FitState, view: TrainingView) -> None:
@@ -52,9 +55,9 @@ class RandomBackground(TrainingEffect):
         channel = dr.arange(mi.UInt32, dr.width(transparent.array)) % 3
         shift = dr.select(channel == 0, shift.x, dr.select(channel == 1, shift.y, shift.z))
         image = view.photograph.image.array + transparent.array * shift
-        view.target = prepare_target(mi.TensorXf(image, transparent.shape), *self.window)
+        view.replacement = prepare_target(mi.TensorXf(image, transparent.shape), *self.window)
 
     def after(self, fit: FitState, view: TrainingView) -> None:
         """Put the dataset's background back."""
         fit.integrator.background = mi.Color3f(*map(float, self.background))
-        view.target = view.photograph
+        view.replacement = None

@@ -60,9 +60,10 @@ class TrainingEffect(Protocol):
     name = ""  # of its part of a checkpoint, and of what it uploads
     moves_sensors = False  # whether it changes the parameters of sensors
     aovs = ""  # what the integrator has to put out besides colour
+    upload_bytes = 0  # of a pixel: what it uploads of a view's pictures, at most
 
     def upload(self, view: View) -> Any:
-        """What the effect needs of a view, on the device; kept in ``TrainingView.uploads``."""
+        """What the effect needs of a view, on the device: see ``TrainingView.uploads``."""
         del view
 
     def target_image(self, view: View, image: np.ndarray) -> np.ndarray:

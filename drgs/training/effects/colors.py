@@ -25,7 +25,7 @@ from drgs.core.arrays import from_host
 from drgs.core.files import atomic_path
 from drgs.data.types import View
 from drgs.results.files import COLORS
-from drgs.training.effects.base import FitState, TrainingEffect
+from drgs.training.effects.base import FitState, TrainingEffect, as_tensor
 from drgs.training.effects.view_parameters import ViewParameters
 from drgs.training.image_ops import transform_colors
 from drgs.training.views import TrainingView
@@ -38,6 +38,7 @@ class ColorCorrection(TrainingEffect):
     """One 3 x 4 transform a view."""
 
     name = "colors"
+    upload_bytes = 12
 
     def __init__(self, config: ColorConfig, num_views: int) -> None:
         """num_views: of the training split."""
@@ -53,7 +54,7 @@ class ColorCorrection(TrainingEffect):
         """How opaque the photograph is, (H, W, 3); None where it is opaque everywhere."""
         if view.alpha is None:
             return None
-        return mi.TensorXf(np.repeat(view.alpha[:, :, None], 3, axis=2))
+        return as_tensor(np.repeat(np.asarray(view.alpha)[:, :, None], 3, axis=2))
 
     def before(self, fit: FitState, view: TrainingView) -> None:
         """Get the view's transform."""

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from typing import Any
 
 import mitsuba as mi
+import numpy as np
 
 from drgs.core.arrays import from_host
 from drgs.data.types import View
@@ -25,6 +26,7 @@ class DepthSupervision(TrainingEffect):
 
     name = "depth"
     aovs = "depth:depth, alpha:alpha"
+    upload_bytes = 8
 
     def __init__(self, weight: float, extent: float) -> None:
         """weight: of the term, per scene extent."""
@@ -34,13 +36,14 @@ class DepthSupervision(TrainingEffect):
         """Depths, and weights of the pixels; None where a view has none that counts."""
         if view.depth is None:
             return None
-        known = view.depth > 0
+        depth = np.asarray(view.depth)
+        known = depth > 0
         if view.mask is not None:
-            known &= view.mask > 0
+            known &= np.asarray(view.mask) > 0
         if not known.any():
             return None
         weights = self.weight * known / known.sum()
-        return from_host(mi.Float, view.depth), from_host(mi.Float, weights)
+        return from_host(mi.Float, depth), from_host(mi.Float, weights)
 
     def adjust(self, image: Any, view: TrainingView) -> Any:
         """The colours; depth and alpha are kept for the penalty."""

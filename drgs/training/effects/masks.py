@@ -18,16 +18,17 @@ class Masks(TrainingEffect):
     """
 
     name = "masks"
+    upload_bytes = 12
 
     def upload(self, view: View) -> Any:
         """The mask, (H, W, 3); None where a view has none."""
         if view.mask is None:
             return None
-        return as_tensor(np.repeat(view.mask[:, :, None], 3, axis=2))
+        return as_tensor(np.repeat(np.asarray(view.mask)[:, :, None], 3, axis=2))
 
     def target_image(self, view: View, image: np.ndarray) -> np.ndarray:
         """The photograph without what the mask leaves out."""
-        return image if view.mask is None else image * view.mask[:, :, None]
+        return image if view.mask is None else image * np.asarray(view.mask)[:, :, None]
 
     def adjust(self, image: Any, view: TrainingView) -> Any:
         """The rendering without it."""

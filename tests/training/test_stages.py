@@ -1,0 +1,82 @@
+"""What is made of photographs stays on the device while there is room, else it is made again."""
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from support import small_fits as fits
+from support.trainers import make_trainer
+
+from drgs.training import stages
+from drgs.training.losses import TARGET_BYTES
+
+PIXELS = 20 * 16
+
+
+@pytest.fixture(autouse=True)
+def variant():
+    mi.set_variant("llvm_ad_rgb")
+
+
+def made(trainer):
+    """Indices of the views whose targets are on the device, by stage."""
+    return [
+        {view.index for view in stage.views if view._photograph is not None}
+        for stage in trainer.stages
+    ]
+
+
+def test_nothing_is_made_before_it_is_needed():
+    trainer = make_trainer()
+    assert made(trainer) == [set()]
+    view = fits.steps(trainer, 1).view
+    assert made(trainer) == [{view.index}]
+    target = view.photograph
+    assert view.photograph is target is view.target
+
+
+def test_targets_stay_while_there_is_room(monkeypatch):
+    monkeypatch.setattr(stages, "KEPT_BYTES", 2 * PIXELS * TARGET_BYTES + 7)
+    trainer, seen = make_trainer(), []
+    for _ in range(8):  # two rounds of four views
+        trainer.step()
+        seen += [trainer.view.index]
+        assert made(trainer) == [set(seen[:2])]
+
+
+@pytest.mark.parametrize("effects", [{}, {"data__random_background": True, "colors__lr": 0.02}])
+def test_a_fit_does_not_depend_on_what_stays(monkeypatch, effects):
+    """Nor on effects that upload something of a view."""
+
+    def result():
+        trainer = fits.make_trainer(fits.true_dataset(), loss__depth_weight=0.2, **effects)
+        return trainer, fits.everything_of(fits.steps(trainer, 8))
+
+    _, kept = result()
+    monkeypatch.setattr(stages, "KEPT_BYTES", 0)
+    trainer, made_again = result()
+    assert made(trainer) == [set()]
+    assert not any(view.uploads for view in trainer.views)
+    assert made_again == kept
+
+
+def test_what_a_view_takes_is_counted():
+    """Effects say what they upload of a pixel."""
+    changes = {"loss__depth_weight": 0.2, "data__random_background": True, "colors__lr": 0.02}
+    trainer = fits.make_trainer(fits.true_dataset(), **changes)
+    view = fits.steps(trainer, 1).view
+    arrays = [view.photograph.values, view.photograph.means, view.photograph.mean_squares]
+    arrays += [view.uploads["colors"].array, view.uploads["background"].array]
+    arrays += view.uploads["depth"]
+    count = sum(len(array) for array in arrays) * 4
+    assert count == view.width * view.height * stages.bytes_on_device(trainer.effects)
+
+
+def test_a_stage_that_ends_leaves_nothing_on_the_device():
+    trainer = make_trainer(coarse=[{"until": 3, "factor": 2}])
+    fits.steps(trainer, 3)
+    coarse, full = made(trainer)
+    assert len(coarse) == 3 and not full
+    fits.steps(trainer, 1)
+    coarse, full = made(trainer)
+    assert not coarse and len(full) == 1
+    assert np.shape(trainer.view.photograph.image) == (16, 20, 3)
