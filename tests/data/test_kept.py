@@ -86,3 +86,22 @@ def test_a_kept_picture_says_that_it_has_to_be_copied():
     assert np.asarray(image, np.float64).dtype == np.float64
     with pytest.raises(ValueError, match="only by a copy"):
         image.__array__(copy=False)
+
+
+def test_a_kept_picture_computes_as_an_array_does():
+    pixels = RNG.integers(0, 255, (4, 6, 3), np.uint8)
+    image, _ = kept_photograph(pixels, GREY, None)
+    numbers = numbers_of(pixels)
+    assert image.dtype == np.float32 and len(image) == 4
+    np.testing.assert_array_equal(image[None], numbers[None])
+    np.testing.assert_array_equal(image[1, ..., 2], numbers[1, ..., 2])
+    for found, expected in (
+        (2 * image, 2 * numbers),
+        (image - numbers, 0 * numbers),
+        (numbers + image, 2 * numbers),
+        (np.square(image), np.square(numbers)),
+        (np.clip(image, 0.2, 0.3), np.clip(numbers, 0.2, 0.3)),
+        (image > 0.5, numbers > 0.5),
+    ):
+        assert isinstance(found, np.ndarray) and found.dtype == expected.dtype
+        np.testing.assert_array_equal(found, expected)
