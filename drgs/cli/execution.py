@@ -7,8 +7,6 @@ thread; a command gives them back when it ends.
 from __future__ import annotations
 
 import argparse
-import ctypes
-import platform
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, redirect_stderr
@@ -18,6 +16,7 @@ import drjit as dr
 import mitsuba as mi
 
 from drgs.cli.commands import at_least
+from drgs.core.denormals import denormals_flushed
 from drgs.core.errors import UserError, one_line
 
 MAX_THREADS = 4096
@@ -75,7 +74,7 @@ def executing(threads: int | None, debug: bool) -> Iterator[Callable[[], None]]:
     Yields a function that raises :class:`UserError` if an access was out of range so far; leaving
     the block does so as well.
     """
-    with _thread_count(threads), _denormals_flushed():
+    with _thread_count(threads), denormals_flushed():
         if not debug:
             yield lambda: None
             return
@@ -98,33 +97,6 @@ def _thread_count(count: int | None) -> Iterator[None]:
         yield
     finally:
         dr.set_thread_count(previous)
-
-
-_FLUSH_DENORMALS = 0x8040
-"""Bits FTZ and DAZ of x86's register MXCSR (Intel, Software Developer's Manual 1, 10.2.3)."""
-
-
-@contextmanager
-def _denormals_flushed() -> Iterator[None]:
-    """Take denormal numbers for zero on this thread within the block, as Dr.Jit's workers do.
-
-    Dr.Jit leaves the calling thread's mode as it is, and runs what is small there, or everything
-    if there is no worker: bits of Adam's moments, and soon all of a fit, would depend on the
-    number of threads. Only where the C library is glibc on x86-64; elsewhere nothing happens.
-    """
-    if (platform.libc_ver()[0], platform.machine()) != ("glibc", "x86_64"):
-        yield
-        return
-    libm = ctypes.CDLL("libm.so.6")
-    before = (ctypes.c_uint32 * 8)()  # fenv_t, the last word of which is MXCSR
-    libm.fegetenv(before)
-    flushing = type(before)(*before)
-    flushing[7] |= _FLUSH_DENORMALS
-    libm.fesetenv(flushing)
-    try:
-        yield
-    finally:
-        libm.fesetenv(before)
 
 
 class _RangeReports:

@@ -8,6 +8,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from drgs.config.schema import FitConfig, InitConfig
+from drgs.core.denormals import denormals_kept
 from drgs.core.errors import UserError
 from drgs.data.types import Dataset, Viewpoint
 from drgs.gaussians.parameters import Gaussians
@@ -80,7 +81,10 @@ def gaussians_from_points(
 
 def mean_squared_neighbour_distance(points: np.ndarray) -> np.ndarray:
     """(N,) float64: mean squared distance of each of (N, 3) points to the 3 nearest others."""
-    distances, _ = cKDTree(points).query(points, k=NUM_NEIGHBOURS + 1)
+    # SciPy divides points by the number next to the least. If that is taken for zero, it divides
+    # points with a coordinate of zero for ever, until the stack ends.
+    with denormals_kept():
+        distances, _ = cKDTree(points).query(points, k=NUM_NEIGHBOURS + 1)
     # The nearest is the point itself, or one at the same place: at distance 0 either way.
     return np.mean(distances[:, 1:] ** 2, axis=1)
 
