@@ -39,7 +39,14 @@ import mitsuba as mi
 import numpy as np
 from plyfile import PlyData, PlyElement
 
-from drgs.cli.commands import CommandParser, at_least, degrees, finite_number, run_command
+from drgs.cli.commands import (
+    CommandParser,
+    at_least,
+    degrees,
+    file_or_folder,
+    finite_number,
+    run_command,
+)
 from drgs.cli.execution import add_variant_argument, select_variant
 from drgs.cli.interrupts import INTERRUPTED_STATUS
 from drgs.cli.progress import RunProgress
@@ -86,9 +93,14 @@ def add_arguments(parser: CommandParser) -> None:
     parser.description = "Turn a Mitsuba scene into a training set in the NeRF-synthetic layout."
     parser.show_examples("%(prog)s scenes/brick_crane.py --views 100 --size 400 400 --out DIR")
     parser.add_argument(
-        "scene", type=Path, metavar="SCENE", help="XML file, or Python file with a function scene()"
+        "scene",
+        type=file_or_folder,
+        metavar="SCENE",
+        help="XML file, or Python file with scene()",
     )
-    parser.add_argument("--out", type=Path, metavar="DIR", required=True, help="folder to write")
+    parser.add_argument(
+        "--out", type=file_or_folder, metavar="DIR", required=True, help="folder to write"
+    )
     default = {field.name: field.default for field in fields(CaptureSettings)}
     for name, text in WHOLE_NUMBERS.items():
         parser.add_argument(

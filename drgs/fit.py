@@ -33,7 +33,7 @@ import mitsuba as mi
 import numpy as np
 
 import drgs
-from drgs.cli.commands import CommandParser, run_command
+from drgs.cli.commands import CommandParser, file_or_folder, run_command
 from drgs.cli.execution import add_execution_arguments, executing, select_variant
 from drgs.cli.interrupts import INTERRUPTED_STATUS, StopRequest
 from drgs.cli.progress import RunProgress
@@ -108,7 +108,7 @@ def add_arguments(parser: CommandParser) -> None:
     what = parser.add_mutually_exclusive_group(required=True)
     what.add_argument("config", nargs="?", metavar="CONFIG.yml", help="what to fit, and how")
     what.add_argument(
-        "--resume", type=Path, metavar="OUT_DIR", help="go on with a fit that was stopped"
+        "--resume", type=file_or_folder, metavar="OUT_DIR", help="go on with a fit that was stopped"
     )
     parser.add_argument("--data", metavar="DIR", help="dataset folder (data.path)")
     parser.add_argument("--out", metavar="DIR", help="output folder (default: out/NAME)")

@@ -19,6 +19,7 @@ from __future__ import annotations
 import argparse
 import json
 import math
+import os
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -28,13 +29,20 @@ from typing import Protocol, runtime_checkable
 import mitsuba as mi
 import numpy as np
 
-from drgs.cli.commands import CommandParser, at_least, degrees, finite_number, run_command
+from drgs.cli.commands import (
+    CommandParser,
+    at_least,
+    degrees,
+    file_or_folder,
+    finite_number,
+    run_command,
+)
 from drgs.cli.execution import VARIANTS, add_execution_arguments, executing, select_variant
 from drgs.config.load import load_config
 from drgs.config.schema import NAMED_COLORS, FitConfig, ModelConfig
 from drgs.core.constants import SHUTTER_SAMPLES
-from drgs.core.errors import PluginError, UserError
-from drgs.core.files import atomic_path
+from drgs.core.errors import PluginError, UserError, one_line
+from drgs.core.files import atomic_path, open_regular
 from drgs.data import Dataset, load_dataset
 from drgs.data.orbits import orbit_of_gaussians, orbit_of_views, orbit_size
 from drgs.data.types import Viewpoint
@@ -50,7 +58,15 @@ from drgs.gaussians.parameters import Gaussians
 from drgs.integrator.scene import check_lenses, make_scene, render_views
 from drgs.integrator.settings import SummarisingIntegrator
 from drgs.integrator.summary import described, summary_of_views
-from drgs.io.pictures import read_image, write_animation, write_exr, write_png
+from drgs.io.pictures import (
+    MITSUBA_FORMATS,
+    check_animation,
+    image_format,
+    read_image,
+    write_animation,
+    write_exr,
+    write_png,
+)
 from drgs.results.files import CAMERAS, CONFIG, GAUSSIANS, METRICS, ORBIT, ORBIT_GIF
 from drgs.results.metrics import Quality, mean_of, psnr, ssim
 from drgs.results.pictures import claiming, refuse_photographs, seal_pictures
@@ -131,9 +147,11 @@ def add_arguments(parser: CommandParser) -> None:
         "%(prog)s scene.xml -D model=model.ply --out DIR",
     )
     parser.add_argument(
-        "what", type=Path, metavar="MODEL.ply|SCENE.xml|OUT_DIR", help="what to render"
+        "what", type=file_or_folder, metavar="MODEL.ply|SCENE.xml|OUT_DIR", help="what to render"
     )
-    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="output folder")
+    parser.add_argument(
+        "--out", type=file_or_folder, required=True, metavar="DIR", help="output folder"
+    )
     _add_cameras(parser)
     _add_settings(parser)
     parser.add_argument_group("Mitsuba scenes").add_argument(
@@ -156,10 +174,16 @@ def _add_cameras(parser: CommandParser) -> None:
         "--split", choices=("test", "train"), help="the photographs' cameras, with PSNR and SSIM"
     )
     one_of(
-        "--orbit", type=at_least(1), metavar="N", help="N frames around the scene, and an animation"
+        "--orbit",
+        type=at_least(1, MAX_FRAMES),
+        metavar="N",
+        help="N frames around the scene, and an animation",
     )
     one_of(
-        "--camera", type=Path, metavar="FILE.json", help="cameras in the layout of transforms.json"
+        "--camera",
+        type=file_or_folder,
+        metavar="FILE.json",
+        help="cameras in the layout of transforms.json",
     )
     one_of("--origin", **vector, help="one camera, here")
     add = group.add_argument
@@ -197,7 +221,10 @@ def _add_settings(parser: CommandParser) -> None:
         help=f"what is not to be simulated: {', '.join(IGNORABLE)}",
     )
     group.add_argument(
-        "--scene", type=Path, metavar="CONFIG.yml", help="configuration that names the photographs"
+        "--scene",
+        type=file_or_folder,
+        metavar="CONFIG.yml",
+        help="configuration that names the photographs",
     )
     group.add_argument("--data", metavar="DIR", help="dataset folder (data.path)")
     group.add_argument(
@@ -213,7 +240,7 @@ def run(args: argparse.Namespace) -> None:
     with executing(args.threads, args.debug):
         _check(args)
         select_variant(args.variant)
-        if args.what.suffix == ".xml":
+        if args.what.suffix.lower() == ".xml":
             render_mitsuba_scene(args.what, args.out, dict(args.define or ()))
         else:
             model = load_model(args)
@@ -304,6 +331,7 @@ def render_orbit(model: Model, args: argparse.Namespace) -> None:
         views = model.dataset("--orbit").train
         fov, size = args.fov or field_of_view(views), args.size or orbit_size(views)
         orbit = orbit_of_views(views, model.gaussians)
+    check_animation(args.orbit, *size)
     viewpoints = orbit.viewpoints(args.orbit, *size, fov)
     pictures = render_cameras(model, viewpoints, args.out, [ORBIT, ORBIT_GIF])
     write_animation(args.out / ORBIT, pictures)
@@ -402,13 +430,15 @@ def _check(args: argparse.Namespace) -> None:
     """Refuse what does not go together, before anything is read or written."""
     if not args.what.exists():
         raise UserError(f"{args.what}: there is no such file or folder")
+    if not args.what.is_dir():
+        open_regular(args.what).close()  # Mitsuba would wait for a pipe
     if (args.out / CONFIG).exists():
         raise UserError(f"--out {args.out}: holds a fit, whose {METRICS} would be overwritten")
-    if args.what.suffix == ".xml":
+    if args.what.suffix.lower() == ".xml":
         reason = "is not used with a Mitsuba scene, which brings its own cameras and settings"
         _check_unused(args, reason, (*PLACING, *OF_CAMERAS, *OF_GAUSSIANS))
         _check_variant(args, mi.variants())
-    elif args.what.suffix == ".ply" or args.what.is_dir():
+    elif args.what.suffix.lower() == ".ply" or args.what.is_dir():
         _check_unused(args, "is for the parameters of a Mitsuba scene (.xml)", ("define",))
         _check_variant(args, VARIANTS)
         _check_cameras(args)
@@ -464,6 +494,9 @@ PLACING = {
 }
 """By the option that places the cameras, the others that it uses."""
 
+MAX_FRAMES = 10_000
+"""Of an orbit: one every two arc minutes. The cameras of all are made before the first is seen."""
+
 TAKEN = ("path", "parallel", "optimize")
 """Arguments of ``mi.load_file``, which takes a file's parameters by name as well."""
 
@@ -486,9 +519,8 @@ def _background(args: argparse.Namespace) -> tuple[float, float, float] | Path:
     words = args.background
     if len(words) == 1 and words[0] in NAMED_COLORS:
         return NAMED_COLORS[words[0]]
-    if len(words) == 1 and Path(words[0]).is_file():
-        read_image(Path(words[0]))  # or says what is wrong with it
-        return Path(words[0])
+    if len(words) == 1 and os.path.lexists(words[0]):
+        return _background_picture(Path(words[0]))
     try:
         color = tuple(float(word) for word in words)
     except ValueError:
@@ -496,9 +528,20 @@ def _background(args: argparse.Namespace) -> tuple[float, float, float] | Path:
     if len(color) != 3 or not all(0 <= value <= 1 for value in color):
         raise UserError(
             "--background: must be white, black, three numbers in 0..1 or a picture's file, got "
-            + " ".join(words)
+            + one_line(" ".join(words), 60)
         )
     return color
+
+
+def _background_picture(path: Path) -> Path:
+    """``path``, if Mitsuba can read the picture; else say what is wrong with it."""
+    read_image(path)
+    if (name := image_format(path)) not in MITSUBA_FORMATS:
+        raise UserError(
+            f"--background: {path} must be a PNG, JPEG, BMP, PPM or TGA picture, got {name}; "
+            "convert it"
+        )
+    return path
 
 
 def _line(psnr: float, ssim: float) -> str:

@@ -9,6 +9,7 @@ import shlex
 import sys
 from collections.abc import Callable, Sequence
 from importlib import import_module
+from pathlib import Path
 from typing import NamedTuple, NoReturn
 
 from drgs.cli.errors import USER_ERROR_STATUS, exit_on_user_error
@@ -16,6 +17,7 @@ from drgs.cli.interrupts import exit_on_interrupt
 from drgs.cli.output import notes_printed, printable_anywhere
 from drgs.core.constants import MAX_INT
 from drgs.core.errors import did_you_mean, one_line
+from drgs.core.files import check_path
 
 MAX_ERROR = 500
 """Characters of what is wrong with a command line, which may quote all of it."""
@@ -122,6 +124,15 @@ def at_least(minimum: int, maximum: int = MAX_INT, reason: str = "") -> Callable
         return number
 
     return whole_number
+
+
+def file_or_folder(text: str) -> Path:
+    """The type of an argument that is the path of a file or folder, which need not exist."""
+    try:
+        check_path(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(f"{error}: {one_line(text, 40)}") from None
+    return Path(text)
 
 
 def finite_number(text: str) -> float:

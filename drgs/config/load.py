@@ -15,7 +15,7 @@ from pydantic_core import ErrorDetails
 from drgs.config.explain import expectation
 from drgs.config.schema import FitConfig
 from drgs.core.errors import UserError, did_you_mean, listed, one_line
-from drgs.core.files import atomic_path, read_text
+from drgs.core.files import atomic_path, check_path, read_text
 
 PATH_KEYS = ("data.path", "init.point_cloud", "output.dir")
 """Values that are made absolute when a configuration is loaded."""
@@ -206,6 +206,7 @@ def _resolve_paths(values: dict, file: Path) -> None:
 def _absolute(folder: Path, text: str, where: str) -> str:
     try:
         path = str((folder / Path(text).expanduser()).resolve())
+        check_path(path)
         path.encode()  # what UTF-8 cannot express could not be written to config.yml
     except (OSError, ValueError, RuntimeError) as error:  # of these, RuntimeError: no such user
         raise UserError(

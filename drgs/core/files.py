@@ -30,6 +30,25 @@ _REMEDIES = {
 }
 
 
+MAX_NAME_BYTES = 255
+"""Of a file or folder, on every file system in use."""
+
+MAX_PATH_BYTES = 3500
+"""Of a path that is given: Linux allows 4,096, and what is written in a folder needs some."""
+
+
+def check_path(path: str | Path) -> None:
+    """Raise ValueError for a path that no file can have, or that leaves no room for files in it."""
+    if "\0" in str(path):
+        raise ValueError("a path cannot hold a zero byte")
+    encoded = os.fsencode(path)
+    longest = max(map(len, encoded.split(os.fsencode(os.sep))))
+    if longest > MAX_NAME_BYTES:
+        raise ValueError(f"a name must have at most {MAX_NAME_BYTES} bytes, got {longest:,}")
+    if len(encoded) > MAX_PATH_BYTES:
+        raise ValueError(f"a path must have at most {MAX_PATH_BYTES:,} bytes, got {len(encoded):,}")
+
+
 _SPECIAL = {"p": "a named pipe", "c": "a device", "b": "a device", "s": "a socket"}
 """What is no regular file, by the first letter of ``ls -l``."""
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zipfile
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -9,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from drgs.core.errors import UserError, one_line
+from drgs.core.files import open_regular
 from drgs.data.kept import KeptPicture, Pixels
 from drgs.data.types import View
 from drgs.io.pictures import BITS, as_numbers, image_mode, read_image
@@ -34,15 +36,10 @@ def read_depth(path: Path, unit: float, size: tuple[int, int]) -> np.ndarray:
     size: W, H. What is not finite or not positive is not known.
     """
     if path.suffix == ".npy":
-        try:
-            depth = np.load(path, allow_pickle=False).astype(np.float64)
-        except (OSError, ValueError, EOFError) as error:
-            raise UserError(f"{path}: cannot read the depth: {one_line(error)}") from None
+        depth = _stored_depth(path)
+        _check_size(path, depth, size)  # before memory is taken for it
         with np.errstate(over="ignore"):  # becomes infinite, and so is not known
-            depth = (depth * unit).astype(np.float32)
-        depth = depth.squeeze(-1) if depth.ndim == 3 and depth.shape[2] == 1 else depth
-        if depth.ndim != 2:
-            raise UserError(f"{path}: depth must be (height, width), got shape {depth.shape}")
+            depth = (depth.astype(np.float64) * unit).astype(np.float32)
     else:
         mode = image_mode(path)
         if BITS.get(mode) != 16:  # of 8 bits, all depths would be 257 times as large
@@ -53,6 +50,23 @@ def read_depth(path: Path, unit: float, size: tuple[int, int]) -> np.ndarray:
         depth = read_image(path)[:, :, 0] * np.float32(MAX_DEPTH_STEPS * unit)
     _check_size(path, depth, size)
     return np.where(np.isfinite(depth) & (depth > 0), depth, 0).astype(np.float32)
+
+
+def _stored_depth(path: Path) -> np.ndarray:
+    """(H, W) of an ``.npy`` file, mapped into memory."""
+    open_regular(path, "depth").close()
+    try:
+        with np.errstate(over="ignore"):  # of the size that a header claims
+            depth = np.load(path, mmap_mode="r", allow_pickle=False)
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
+        raise UserError(f"{path}: cannot read the depth: {one_line(error)}") from None
+    if not isinstance(depth, np.ndarray) or depth.dtype.kind not in "fiu":
+        kind = depth.dtype if isinstance(depth, np.ndarray) else "several arrays"
+        raise UserError(f"{path}: depth must be one array of real numbers, got {one_line(kind)}")
+    depth = depth.squeeze(-1) if depth.ndim == 3 and depth.shape[2] == 1 else depth
+    if depth.ndim != 2:
+        raise UserError(f"{path}: depth must be (height, width), got shape {depth.shape}")
+    return depth
 
 
 def _check_size(path: Path, image: np.ndarray, size: tuple[int, int]) -> None:

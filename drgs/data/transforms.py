@@ -55,6 +55,9 @@ DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 RATIONAL_MODEL = "FULL_OPENCV"
 """The model of a camera that has k4 to k6."""
 
+MAX_NAME_BYTES = 200
+"""Of a view's name, which names files: file systems allow 255, of which suffixes take some."""
+
 FISHEYE_MODELS = ("SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "OPENCV_FISHEYE")
 """The others are a pinhole camera apart from their distortion."""
 
@@ -327,14 +330,24 @@ def image_path(folder: Path, frame: Frame, key: str = "file_path") -> Path:
 
 
 def unique_names(files: Sequence[str]) -> list[str]:
-    """A name for the outputs of each ``file_path``: the file's, with its folders where needed."""
+    """A name for the outputs of each ``file_path``: the file's, with its folders where needed.
+
+    Where that is not enough, or too long for a file's name, numbers precede it.
+    """
     paths = [PurePosixPath(file.replace("\\", "/")) for file in files]
     names = [path.stem for path in paths]
     if len(set(names)) < len(names):
-        names = ["_".join(path.with_suffix("").parts) for path in paths]
-    if len(set(names)) < len(names):
-        names = [f"{index:04d}_{name}" for index, name in enumerate(names)]
+        relative = [path.with_suffix("").relative_to(path.anchor) for path in paths]
+        names = ["_".join(path.parts) for path in relative]
+    longest = max(len(os.fsencode(name)) for name in names)
+    if len(set(names)) < len(names) or longest > MAX_NAME_BYTES:
+        names = [f"{index:04d}_{_cut(name)}" for index, name in enumerate(names)]
     return names
+
+
+def _cut(name: str) -> str:
+    """So much of its beginning as leaves room for a number, a suffix, and temporary names."""
+    return os.fsdecode(os.fsencode(name)[:MAX_NAME_BYTES])
 
 
 def in_parallel(function: Callable[..., T], *arguments: Sequence[object]) -> tuple[T, ...]:

@@ -17,7 +17,7 @@ import numpy as np
 from PIL import Image
 
 from drgs.core.errors import UserError, one_line
-from drgs.core.files import atomic_path
+from drgs.core.files import atomic_path, open_regular
 
 if TYPE_CHECKING:
     import mitsuba as mi
@@ -28,6 +28,15 @@ MAX_PIXELS = 1 << 26
 BITS = {"L": 8, "LA": 8, "RGB": 8, "RGBA": 8, "I;16": 16, "I;16B": 16, "I": 16}
 """Of a channel, by those of Pillow's modes that are read. ``I`` holds 32, but is what some versions
 of Pillow make of a grey PNG of 16."""
+
+MITSUBA_FORMATS = ("PNG", "JPEG", "MPO", "BMP", "PPM", "TGA")
+"""Pillow's names of the formats that Mitsuba reads as well. MPO is a JPEG with several pictures."""
+
+WEBP_SIDE = 16_383
+"""px: the largest width and height that the format can express."""
+
+ANIMATION_BYTES = 2 << 30
+"""Of all frames of an animation, which are held until it is written."""
 
 FRAME_MS = 70
 """Duration of a frame: 60 frames turn once in 4.2 s. A multiple of GIF's unit of 10 ms."""
@@ -57,6 +66,12 @@ def image_mode(path: Path) -> str:
     """Pillow's name of what a pixel holds, from the file's header: see :data:`BITS`."""
     with _opened(path) as image:
         return image.mode
+
+
+def image_format(path: Path) -> str:
+    """Pillow's name of the file's format, from its header: see :data:`MITSUBA_FORMATS`."""
+    with _opened(path) as image:
+        return image.format
 
 
 def read_image(path: Path) -> np.ndarray:
@@ -103,7 +118,7 @@ def read_pixels(path: Path) -> np.ndarray:
 def _opened(path: Path) -> Iterator[Image.Image]:
     """The image before decoding; errors of the file, also within the block, are the user's."""
     try:
-        with Image.open(path) as image:
+        with open_regular(path, "image") as file, Image.open(file) as image:
             yield image
     except UserError:
         raise
@@ -148,6 +163,21 @@ def encode(image: np.ndarray, suffix: str, **options: float) -> bytes:
     """The picture as a file with ``suffix``, png or webp; options: of Pillow's writer."""
     pixels = image if image.dtype == np.uint8 else to_uint8(image)
     return iio.imwrite("<bytes>", pixels, extension=f".{suffix}", plugin="pillow", **options)
+
+
+def check_animation(frames: int, width: int, height: int) -> None:
+    """Raise :class:`UserError` where :func:`write_animation` cannot write so many, or so large."""
+    if max(width, height) > WEBP_SIDE:
+        raise UserError(
+            f"an animation (WebP) must be at most {WEBP_SIDE:,} px wide and high, got {width} x "
+            f"{height}; choose a smaller size"
+        )
+    if frames * width * height * 3 > ANIMATION_BYTES:
+        raise UserError(
+            f"the frames of an animation must take at most {ANIMATION_BYTES / 1e9:.1f} GB, got "
+            f"{frames:,} of {width} x {height} px: {frames * width * height * 3 / 1e9:.1f} GB; "
+            "choose fewer, or a smaller size"
+        )
 
 
 def write_animation(path: Path, frames: Iterable[np.ndarray]) -> None:

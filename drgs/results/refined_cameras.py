@@ -10,7 +10,8 @@ import numpy as np
 
 from drgs.cameras.axes import between_opencv_and_opengl
 from drgs.core.errors import UserError, one_line
-from drgs.data.transforms import CLOSE
+from drgs.core.files import read_text
+from drgs.data.transforms import CLOSE, MAX_BYTES
 from drgs.data.types import Dataset, Motion, View
 from drgs.results.files import CAMERAS
 
@@ -39,11 +40,11 @@ def refined_dataset(dataset: Dataset, folder: Path) -> Dataset:
     if not path.is_file():
         return dataset
     try:
-        found = json.loads(path.read_text())
+        found = json.loads(read_text(path, "refined cameras", MAX_BYTES))
         change = LensChange(**{k: tuple(v) for k, v in found["lens_change"].items()})
         poses = {f["file_path"]: _opencv_pose(f["transform_matrix"]) for f in found["frames"]}
         train = [replace(view, camera_to_world=poses[view.name]) for view in dataset.train]
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise UserError(
             f"{path}: must hold the refined cameras of all training views, as the fit wrote them: "
             f"{one_line(error)}; remove it to use the dataset's own"

@@ -1,0 +1,111 @@
+"""What ``python -m drgs.render`` cannot show, hold or write is refused before anything is."""
+
+import os
+
+import numpy as np
+import pytest
+from PIL import Image
+from support.commands import run_in_process
+from support.small_capture import blobs
+
+from drgs import capture, fit, render
+from drgs.core.errors import UserError
+from drgs.io.pictures import check_animation
+
+
+@pytest.fixture(scope="module")
+def model(tmp_path_factory):
+    path = tmp_path_factory.mktemp("model") / "model.ply"
+    blobs().save(path)
+    return path
+
+
+def refused(main, out, *arguments):
+    """The line that the command prints; nothing is written."""
+    outcome = run_in_process(main, *arguments, "--out", out)
+    assert outcome.returncode == 2, outcome
+    assert outcome.stderr.startswith("error: ") and outcome.stderr.count("\n") == 1
+    assert len(outcome.stderr) < 600
+    assert not os.path.lexists(out)
+    return outcome.stderr
+
+
+CAMERA = ("--origin", 0, -4, 1)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("--orbit", 10**9), "argument --orbit: must be at most 10,000, got 1000000000"),
+        (("--orbit", 10_000, "--size", 3000, 2000), "must take at most 2.1 GB, got 10,000 of 3000"),
+        (("--orbit", 2, "--size", 16384, 1), "must be at most 16,383 px wide and high, got 16384"),
+        (("--orbit", 2, "--size", 1, 16384), "must be at most 16,383 px wide and high, got 1 x"),
+        ((*CAMERA, "--size", 10**20, 10**20), "argument --size: must be at most 2,147,483,647"),
+        ((*CAMERA, "--size", "9" * 5000, 1), "argument --size: must be a whole number"),
+        (("--camera", "x" * 300), "a name must have at most 255 bytes, got 300"),
+        (("--camera", "x/" * 2000), "a path must have at most 3,500 bytes, got 4,000"),
+    ],
+)
+def test_sizes_and_names_beyond_limits_are_refused(model, tmp_path, arguments, message):
+    assert message in refused(render.main, tmp_path / "out", model, *arguments)
+
+
+def test_the_largest_animation_is_allowed():
+    check_animation(60, 800, 800)
+    check_animation(10_000, 1, 1)
+    with pytest.raises(UserError, match="choose a smaller size"):
+        check_animation(1, 16_384, 1)
+
+
+def test_the_suffix_may_have_capital_letters(model, tmp_path):
+    """As Windows programs write it."""
+    (tmp_path / "MODEL.PLY").write_bytes(model.read_bytes())
+    size = ("--size", 8, 6)
+    outcome = run_in_process(
+        render.main, tmp_path / "MODEL.PLY", *CAMERA, *size, "--out", tmp_path / "out"
+    )
+    assert outcome.returncode == 0, outcome.stderr
+
+
+@pytest.mark.parametrize("suffix", ["webp", "gif", "ico", "tif"])
+def test_a_background_that_mitsuba_cannot_read_is_refused(model, tmp_path, suffix):
+    picture = Image.fromarray(np.zeros((16, 16, 3), np.uint8))
+    picture.save(tmp_path / f"a.{suffix}")
+    background = ("--background", tmp_path / f"a.{suffix}")
+    line = refused(render.main, tmp_path / "out", model, *CAMERA, *background)
+    assert "must be a PNG, JPEG, BMP, PPM or TGA picture, got " in line
+
+
+def test_a_background_for_print_is_refused(model, tmp_path):
+    Image.new("CMYK", (16, 16)).save(tmp_path / "a.tif")
+    background = ("--background", tmp_path / "a.tif")
+    assert "mode CMYK" in refused(render.main, tmp_path / "out", model, *CAMERA, *background)
+
+
+@pytest.mark.parametrize("name", ["pipe.ply", "pipe.xml", "pipe.json", "pipe.png"])
+def test_a_pipe_is_not_waited_for(model, tmp_path, name):
+    pipe = tmp_path / name
+    os.mkfifo(pipe)
+    arguments = {
+        "pipe.json": (model, "--camera", pipe),
+        "pipe.png": (model, *CAMERA, "--background", pipe),
+    }.get(name, (pipe, *(CAMERA if name == "pipe.ply" else ())))
+    line = refused(render.main, tmp_path / "out", *arguments)
+    assert f"{pipe}: cannot read the " in line and "must be a regular file" in line
+
+
+@pytest.mark.parametrize("main", [fit.main, render.main, capture.main])
+@pytest.mark.parametrize("what", ["x" * 300, "x" * 300 + ".ply"])
+def test_inputs_of_names_that_no_file_can_have_are_refused(tmp_path, main, what):
+    line = refused(main, tmp_path / "out", what)
+    assert "255 bytes" in line or "File name too long" in line
+
+
+@pytest.mark.parametrize("main", [fit.main, render.main, capture.main])
+def test_folders_of_names_that_none_can_have_are_refused(tmp_path, main):
+    (tmp_path / "a.yml").write_text("data: {path: .}\n")
+    for out in ("x" * 300, "x/" * 2000):
+        outcome = run_in_process(main, tmp_path / "a.yml", "--out", tmp_path / out)
+        assert outcome.returncode == 2 and outcome.stderr.count("\n") == 1
+        assert "must have at most" in outcome.stderr
+    assert os.listdir(tmp_path) == ["a.yml"]
