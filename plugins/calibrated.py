@@ -16,7 +16,14 @@ import numpy as np
 from drgs.cameras.camera import Camera, Lens, Pinhole
 from drgs.core.constants import SHUTTER_SAMPLES
 from drgs.core.errors import PluginError
-from drgs.integrator.properties import integer, matrix, number, one_of, positive
+from drgs.integrator.properties import (
+    integer,
+    matrix,
+    number,
+    one_of,
+    positive,
+    refuse_unknown,
+)
 from drgs.integrator.sensors import (
     SensorState,
     on_crop_window,
@@ -28,6 +35,11 @@ from drgs.integrator.sensors import (
 LENSES = ("pinhole", "opencv", "fisheye")
 SHUTTERS = ("global", "rolling")
 ALL_COEFFICIENTS = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
+KNOWN = (
+    *("to_world", "to_world_close", "fx", "fy", "cx", "cy", "lens", *ALL_COEFFICIENTS),
+    *("near_clip", "far_clip", "shutter", "shutter_open", "shutter_close", "shutter_samples"),
+)
+"""Names of the properties, but for the film, the sampler and what else Mitsuba's sensors have."""
 
 
 class CalibratedSensor(mi.Sensor):
@@ -145,6 +157,7 @@ class CalibratedSensor(mi.Sensor):
             self.to_world_close = mi.AffineTransform4f(close)
         self.shutter = one_of(props, "shutter", SHUTTERS)
         self.shutter_samples = integer(props, "shutter_samples", SHUTTER_SAMPLES, least=1)
+        refuse_unknown(props, KNOWN)
 
     # ------------------------------------------------------------------------------------------
     # Parameters

@@ -6,6 +6,7 @@ Executed once per Mitsuba variant (see ``drgs.plugins``). The rasterizer itself 
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
@@ -22,6 +23,7 @@ from drgs.integrator.cache import Memory
 from drgs.integrator.picture import Picture, sensors_of
 from drgs.integrator.properties import (
     AOVS,
+    KNOWN,
     aovs_of,
     approximations_of,
     background_of,
@@ -34,6 +36,7 @@ from drgs.integrator.properties import (
     load_gaussians,
     nested_integrator,
     positive,
+    refuse_unknown,
     turns_of_shapes,
 )
 from drgs.integrator.sensors import camera_from_sensor, read_sensor
@@ -197,6 +200,7 @@ class SplatsIntegrator(mi.CppADIntegrator):
        - The N Gaussians: centres (N, 3) in world space; quaternions wxyz (N, 4), of any norm;
          natural logarithms of the standard deviations (N, 3); opacities before the sigmoid
          (N); spherical harmonics coefficients of degree 0 (N, 1, 3) and above (N, K - 1, 3).
+         From numpy: ``mi.TensorXf(array)``.
        - |exposed|, |differentiable|
 
      * - feature_...
@@ -277,9 +281,11 @@ class SplatsIntegrator(mi.CppADIntegrator):
         self.srgb_primitives = boolean(props, "srgb_primitives", True)
         self.nested = nested_integrator(props)
         self.nested_spp = integer(props, "nested_spp", 0, least=0)
+        refuse_unknown(props, KNOWN)
 
         self.last: LastBackward | None = None
         self.memory = Memory()
+        self._lock = threading.RLock()  # of the memory, and of what a picture leaves in the film
         self._last_sensor: mi.Sensor | None = None  # that was rendered
         self._logged_summary = ""
 
@@ -418,8 +424,9 @@ class SplatsIntegrator(mi.CppADIntegrator):
     ) -> mi.TensorXf:
         """Render the Gaussians as seen by ``sensor``; see ``mi.Integrator.render``."""
         _refuse_recording()
-        sensor = self._last_sensor = _resolve_sensor(scene, sensor)
-        with dr.suspend_grad():
+        sensor = _resolve_sensor(scene, sensor)
+        with self._lock, dr.suspend_grad():
+            self._last_sensor = sensor
             self._gather(scene)
             self._log_summary(scene, sensor)
             image = Picture.of(self, scene, sensor, seed, spp).image()
@@ -443,7 +450,7 @@ class SplatsIntegrator(mi.CppADIntegrator):
         """
         _refuse_recording()
         sensor = _resolve_sensor(scene, sensor)
-        with dr.suspend_grad():
+        with self._lock, dr.suspend_grad():
             self._gather(scene)
             gradients = Picture.of(self, scene, sensor, seed, spp).backward(params, grad_in)
             self.last = LastBackward(
@@ -472,7 +479,7 @@ class SplatsIntegrator(mi.CppADIntegrator):
         """Directional derivative of the image along the gradients set on the parameters."""
         _refuse_recording()
         sensor = _resolve_sensor(scene, sensor)
-        with dr.suspend_grad():
+        with self._lock, dr.suspend_grad():
             self._gather(scene)
             with dr.resume_grad():
                 features = self._own.features

@@ -35,9 +35,30 @@ SHAPES_TO_WORLD = "shapes_to_world"
 """What the names of parameters begin with that tell the ``to_world`` of shapes."""
 
 
+KNOWN = (
+    *("filename", "to_world", SHAPES_TO_WORLD, "sh_degree", "background", "hide_emitters", "near"),
+    *("srgb_primitives", "nested_spp", "aovs", "ignore", *DECLARED, "smoothing", *PARAMETER_NAMES),
+)
+"""Names of the properties of ``splats``, but for those that begin with :data:`FEATURE` or
+:data:`SHAPES_TO_WORLD`, and nested objects."""
+
+
+def refuse_unknown(props: mi.Properties, known: Sequence[str]) -> None:
+    """Raise PluginError for a property that nobody has read: a mistyped name.
+
+    Mitsuba would refuse it as well, without the name that was meant. Called when everything that
+    is known has been read.
+    """
+    for name in props.unqueried():
+        where = f"{props.plugin_name()}: there is no parameter {name}"
+        hint = did_you_mean(name, known) or f"; there are {', '.join(known)}"
+        raise PluginError(where + hint)
+
+
 def load_gaussians(props: mi.Properties) -> Gaussians:
     """The Gaussians of a scene description: a PLY file, or six tensors; or none."""
     given = [name for name in PARAMETER_NAMES if name in props]
+    given += ["smoothing"] if "smoothing" in props else []
     features = {n: _tensor(props, n) for n in props.keys() if n.startswith(FEATURE)}  # noqa: SIM118
     if "filename" in props:
         if given:
@@ -46,7 +67,7 @@ def load_gaussians(props: mi.Properties) -> Gaussians:
             )
         path = mi.file_resolver().resolve(str(props["filename"]))
         gaussians = replace(Gaussians.load(str(path)).to(mi.TensorXf), features=features)
-    elif given or features or "smoothing" in props or "to_world" in props:
+    elif given or features or "to_world" in props:
         missing = [name for name in PARAMETER_NAMES if name not in given and name != "shN"]
         if missing:
             raise PluginError(
@@ -55,10 +76,10 @@ def load_gaussians(props: mi.Properties) -> Gaussians:
             )
         values = {name: _tensor(props, name) for name in given}
         if "shN" not in given:
-            values["shN"] = dr.zeros(mi.TensorXf, (values["means"].shape[0], 0, 3))
-        values["logit_opacities"] = mi.Float(values["logit_opacities"].array)
-        if "smoothing" in props:
-            values["smoothing"] = mi.Float(_tensor(props, "smoothing").array)
+            values["shN"] = dr.zeros(mi.TensorXf, (next(iter(values["means"].shape), 0), 0, 3))
+        for name in ("logit_opacities", "smoothing"):
+            if name in values:
+                values[name] = _column(name, values[name])
         gaussians = Gaussians(**values, features=features)
     else:
         shapes = {"means": (0, 3), "quats": (0, 4), "log_scales": (0, 3)}
@@ -175,10 +196,16 @@ def _tensor(props: mi.Properties, name: str) -> mi.TensorXf:
     value = props[name]
     if not dr.is_array_v(value):
         raise PluginTypeError(f"splats: {name} must be a tensor, got {type(value).__name__}")
-    if not dr.is_jit_v(value):
-        # Three numbers, which a property set turns into a vector on the host.
-        value = mi.Float(list(value))
+    if not dr.is_jit_v(value):  # of the host, as is what a property set makes of three numbers
+        value = np.array(value, np.float32)
     return mi.TensorXf(value)
+
+
+def _column(name: str, tensor: mi.TensorXf) -> mi.Float:
+    """A tensor of shape (N,) or (N, 1) as the flat array that is kept of it."""
+    if math.prod(tensor.shape[1:]) != 1:
+        raise PluginError(f"splats: {name} must have the shape (N), got {tuple(tensor.shape)}")
+    return mi.Float(tensor.array)
 
 
 # ----------------------------------------------------------------------------------------------
@@ -255,7 +282,7 @@ def _message(props: mi.Properties, name: str, expected: str, got: object) -> str
 
 def check_shapes(gaussians: Gaussians) -> None:
     """Raise PluginError unless all parameters have rows for the same Gaussians."""
-    num = next(iter(gaussians.means.shape), 0)
+    num = next(iter(gaussians.means.shape), 1)
     if num == 0:
         raise PluginError("splats: at least one Gaussian is needed, got none")
     rows = {

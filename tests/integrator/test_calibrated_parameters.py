@@ -249,8 +249,11 @@ def test_wrong_values_are_refused(values, message):
 
 
 def test_a_property_that_there_is_not_is_refused():
-    with pytest.raises(RuntimeError, match=r'unreferenced property[\s\S]*"focal"'):
-        mi.load_dict({"type": "calibrated", "focal": 3.0})
+    message = (
+        r"PluginError: calibrated: there is no parameter shutter_sample; did you mean shutter_s"
+    )
+    with pytest.raises(RuntimeError, match=message):
+        mi.load_dict({"type": "calibrated", "shutter_sample": 3})
 
 
 def test_defaults_are_those_of_the_description():

@@ -1,8 +1,10 @@
 """What the ``splats`` integrator refuses."""
 
+import re
 from dataclasses import replace
 from functools import cache
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -13,6 +15,7 @@ from support.views import (
 
 import drgs  # noqa: F401  (registers the plugin)
 from drgs.gaussians.parameters import PARAMETER_NAMES
+from drgs.integrator.properties import KNOWN
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -143,7 +146,34 @@ REFUSED = {
         {"hide_emitters": 1},
         'The property "hide_emitters" has the wrong type (expected boolean, got integer)',
     ),
-    "unknown": ({"sh_degre": 1}, '- integer "sh_degre": 1'),
+    "unknown": (
+        {"sh_degre": 1},
+        "PluginError: splats: there is no parameter sh_degre; did you mean sh_degree?",
+    ),
+    "unknown, and near to nothing": (
+        {"zzz": 1},
+        "splats: there is no parameter zzz; there are filename, to_world, shapes_to_world, ",
+    ),
+    "an unknown tensor": (
+        {"log_scale": lambda: zeros(8, 3)},
+        "splats: there is no parameter log_scale; did you mean log_scales?",
+    ),
+    "a filter besides a file": (
+        {**NONE, "filename": "x.ply", "smoothing": lambda: zeros(8)},
+        "splats: give either 'filename' or tensors, got both (smoothing)",
+    ),
+    "means a number": (
+        {"means": lambda: mi.TensorXf(3.0)},
+        "splats: means must have the shape (N, 3), with N = 1 the rows of means, got ()",
+    ),
+    "means by axis": (
+        {"means": lambda: mi.Point3f(np.zeros((3, 8), np.float32))},
+        "splats: means must have the shape (N, 3), with N = 3 the rows of means, got (3, 8)",
+    ),
+    "logit_opacities of two axes": (
+        {"logit_opacities": lambda: zeros(2, 4)},
+        "PluginError: splats: logit_opacities must have the shape (N), got (2, 4)",
+    ),
     "a texture under an unknown name": (
         {"backgroud": {"type": "checkerboard"}},
         "PluginError: splats: backgroud must be an integrator, the only object besides the texture "
@@ -168,9 +198,37 @@ def test_wrong_properties_are_refused_in_one_line(case):
     assert expected in refusal_of_dictionary(**changes)
 
 
-def test_an_unknown_property_is_mitsubas_own_error():
-    with pytest.raises(RuntimeError, match="unreferenced property"):
-        mi.load_dict({"type": "splats", **valid(), "sh_degre": 1})
+def test_every_documented_parameter_can_be_meant():
+    """Of those that users misspell, the description knows as many as the code."""
+    documentation = type(mi.load_dict({"type": "splats", **valid()})).__doc__
+    documented = set(re.findall(r"^     \* - ([a-z][\w, .]*)$", documentation, re.M))
+    names = {name.rstrip(".") for line in documented for name in line.split(", ")}
+    assert names - {"shapes_to_world_", "feature_"} <= set(KNOWN) <= names
+
+
+@pytest.mark.parametrize(
+    "kind", [dr.scalar.TensorXf, dr.llvm.TensorXf64, dr.llvm.TensorXi, dr.llvm.ad.TensorXf16]
+)
+def test_tensors_of_other_types_are_converted(kind):
+    means = np.arange(24).reshape(8, 3)
+    integrator = mi.load_dict({"type": "splats", **valid(), "means": kind(means)})
+    assert type(integrator.means) is mi.TensorXf
+    np.testing.assert_array_equal(integrator.means.numpy(), means)
+
+
+def test_parameters_are_assigned_numpy_arrays():
+    integrator = mi.load_dict({"type": "splats", **valid()})
+    params = mi.traverse(integrator)
+    means = np.arange(24, dtype=np.float64).reshape(8, 3)
+    params["means"] = means
+    params.update()
+    np.testing.assert_array_equal(integrator.means.numpy(), means)
+
+
+def test_numpy_arrays_are_refused_by_mitsuba_with_what_to_do():
+    """Before the plugin sees them."""
+    with pytest.raises(RuntimeError, match=r"\[means\] could .* cast this value into a Dr.Jit arr"):
+        mi.load_dict({"type": "splats", **valid(), "means": np.zeros((8, 3))})
 
 
 @pytest.mark.parametrize("degree", [4, -1, 0.0, True])
