@@ -1,0 +1,86 @@
+"""Pictures of one integrator from several threads of a program."""
+
+import threading
+import time
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from support.views import VIEWS, Scene, image_of, tensors
+
+import drgs  # noqa: F401  (registers the plugin)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def variant():
+    mi.set_variant("llvm_ad_rgb")
+
+
+def in_two_threads(work):
+    """What ``work(0)`` and ``work(1)`` return, at once; their exceptions are raised here."""
+    results = [None, None]
+
+    def run(number):
+        try:
+            results[number] = work(number)
+        except BaseException as error:
+            results[number] = error
+
+    threads = [threading.Thread(target=run, args=(number,)) for number in (0, 1)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    for result in results:
+        if isinstance(result, BaseException):
+            raise result
+    return results
+
+
+def scene_of(view, **objects):
+    scene = Scene(view)
+    sensors = {f"sensor_{k}": VIEWS[k].sensor() for k in range(4)}
+    integrator = scene.settings | tensors(scene.gaussians)
+    return mi.load_dict({"type": "scene", "integrator": integrator, **sensors, **objects})
+
+
+@pytest.mark.parametrize("shared", [True, False], ids=["one scene", "two scenes"])
+def test_two_threads_get_the_pictures_that_one_gets(shared):
+    """From sensors in turn, so that no frame is that of the picture before."""
+    first = scene_of(VIEWS[1])
+    scenes = [first, first if shared else scene_of(VIEWS[3])]
+    expected = [[image_of(scenes[k], sensor=2 * k + s) for s in (0, 1)] for k in (0, 1)]
+
+    def work(number):
+        turns = [n % 2 for n in range(10)]
+        return [(s, image_of(scenes[number], sensor=2 * number + s)) for s in turns]
+
+    for number, pictures in enumerate(in_two_threads(work)):
+        for sensor, picture in pictures:
+            np.testing.assert_array_equal(picture, expected[number][sensor])
+
+
+def test_one_integrator_makes_one_picture_at_a_time():
+    """Its frames, its film and the nested integrator's recordings are not those of two."""
+    active, most = [], []
+
+    class Slow(mi.CppADIntegrator):
+        """Sees nothing, for a while."""
+
+        def render(self, scene, sensor, seed=0, spp=0, develop=True, evaluate=True):
+            del scene, seed, spp, develop, evaluate
+            active.append(sensor)
+            most.append(len(active))
+            time.sleep(0.05)
+            active.pop()
+            width, height = sensor.film().crop_size()
+            return dr.zeros(mi.TensorXf, (height, width, 4))
+
+    scene = Scene(VIEWS[1])
+    integrator = scene.settings | tensors(scene.gaussians) | {"inner": Slow(mi.Properties())}
+    sensors = {f"sensor_{k}": VIEWS[k].sensor() for k in range(2)}
+    floor = {"type": "rectangle"}
+    loaded = mi.load_dict({"type": "scene", "integrator": integrator, "floor": floor, **sensors})
+    in_two_threads(lambda number: [image_of(loaded, sensor=number) for _ in range(3)])
+    assert most == [1] * 6
