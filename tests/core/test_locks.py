@@ -1,0 +1,55 @@
+"""Two that want to write into one folder."""
+
+import multiprocessing
+import os
+import signal
+
+import pytest
+
+from drgs.core.errors import UserError
+from drgs.core.locks import sole_writer
+
+
+def test_a_folder_has_one_writer(tmp_path):
+    folder = tmp_path / "new" / "out"
+    with sole_writer(folder):
+        message = r"out: another fit is writing to this folder; wait"
+        with pytest.raises(UserError, match=message), sole_writer(folder):
+            pass
+        with sole_writer(tmp_path / "other"):
+            pass
+        assert os.listdir(folder) == []
+    with sole_writer(folder):
+        pass
+
+
+def test_an_error_gives_the_folder_back(tmp_path):
+    with pytest.raises(KeyError), sole_writer(tmp_path):
+        raise KeyError
+    with sole_writer(tmp_path):
+        pass
+
+
+def _keep(folder, pipe):
+    with sole_writer(folder):
+        pipe.send("kept")
+        pipe.recv()
+
+
+def test_a_killed_process_leaves_no_lock(tmp_path):
+    ours, theirs = multiprocessing.get_context("spawn").Pipe()
+    process = multiprocessing.get_context("spawn").Process(target=_keep, args=(tmp_path, theirs))
+    process.start()
+    assert ours.recv() == "kept"
+    with pytest.raises(UserError), sole_writer(tmp_path):
+        pass
+    os.kill(process.pid, signal.SIGKILL)
+    process.join()
+    with sole_writer(tmp_path):
+        pass
+
+
+def test_what_cannot_be_locked_is_left_to_its_writer(tmp_path):
+    (tmp_path / "file").write_text("")
+    with sole_writer(tmp_path / "file" / "out"):
+        pass
