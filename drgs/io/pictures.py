@@ -46,6 +46,16 @@ WEBP_QUALITIES = (80, 60, 40, 20)
 
 WEBP_BYTES = 1_500_000
 
+FLAT_WEBP_BYTES = 4_000_000
+"""The most that an animation may need that is coded without loss."""
+
+FLAT_SHARE = 0.1
+"""Of all pixels: an animation has a flat background if one colour has as many of them."""
+
+FLAT_STEP = 255 / 31
+"""Levels of 255 between two values of a channel before a flat background: a smaller error than
+that of lossy coding, which halves the resolution of colours, and two thirds of the bytes."""
+
 GIF_WIDTH = 300
 """px: a GIF needs about five times the bytes of a WebP of the same size."""
 
@@ -187,12 +197,42 @@ def write_animation(path: Path, frames: Iterable[np.ndarray]) -> None:
     frames: of one size, at least one; may be a generator, only 8 bits of each are kept.
     """
     large = np.stack([to_uint8(frame) for frame in frames])
-    for quality in WEBP_QUALITIES:
-        data = encode(large, "webp", quality=quality, method=3, duration=FRAME_MS, loop=0)
-        if len(data) <= WEBP_BYTES:
-            break
+    data = _before_flat_background(large)
+    if data is None:
+        for quality in WEBP_QUALITIES:
+            data = encode(large, "webp", quality=quality, method=3, duration=FRAME_MS, loop=0)
+            if len(data) <= WEBP_BYTES:
+                break
     _write(path, data)
     _write_gif(path.with_suffix(".gif"), [_shrink(Image.fromarray(frame)) for frame in large])
+
+
+def _before_flat_background(frames: np.ndarray) -> bytes | None:
+    """A WebP coded without loss; None without a flat background, or where it would be too large.
+
+    Lossy coding leaves a haze around what stands before such a background.
+    """
+    background, share = _commonest_color(frames[:: len(frames) // 8 or 1])
+    if share < FLAT_SHARE:
+        return None
+    options = {"lossless": True, "quality": 20, "method": 1}
+    levels = np.arange(256)
+    coarse = np.round(np.round(levels / FLAT_STEP) * FLAT_STEP).astype(np.uint8)[frames]
+    is_near = np.abs(levels[:, None] - background) <= FLAT_STEP / 2  # (256, 3)
+    coarse[np.logical_and.reduce([is_near[frames[..., k], k] for k in range(3)])] = background
+    if len(frames) * len(encode(coarse[0], "webp", **options)) > 1.5 * FLAT_WEBP_BYTES:
+        return None
+    data = encode(coarse, "webp", duration=FRAME_MS, loop=0, **options)
+    return data if len(data) <= FLAT_WEBP_BYTES else None
+
+
+def _commonest_color(pixels: np.ndarray) -> tuple[np.ndarray, float]:
+    """(3,) uint8, and its share of all pixels (..., 3)."""
+    r, g, b = np.moveaxis(pixels.astype(np.uint32), -1, 0)
+    numbers, counts = np.unique(r << 16 | g << 8 | b, return_counts=True)
+    most = numbers[np.argmax(counts)]
+    color = np.array([most >> 16, most >> 8 & 255, most & 255], np.uint8)
+    return color, float(counts.max() / counts.sum())
 
 
 def _write_gif(path: Path, frames: Sequence[Image.Image]) -> None:
@@ -217,8 +257,7 @@ def _common_palette(frames: Sequence[Image.Image]) -> Image.Image:
     would be taken for it: those are replaced by it.
     """
     strip = np.concatenate([np.asarray(frame) for frame in frames[:: len(frames) // 8 or 1]])
-    colors, counts = np.unique(strip.reshape(-1, 3), axis=0, return_counts=True)
-    background = colors[np.argmax(counts)]
+    background, _ = _commonest_color(strip)
     palette = Image.fromarray(strip).quantize(256, method=Image.Quantize.MEDIANCUT)
     values = np.array(palette.getpalette(), np.int64).reshape(-1, 3)
     values[np.abs(values - background).max(axis=1) <= NEAR_BACKGROUND] = background

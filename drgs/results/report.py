@@ -46,6 +46,9 @@ ORBIT_FRAMES = 60
 PANEL_WIDTH = 360
 """px: of each of the three pictures of a comparison in the page, at most."""
 
+PANEL_QUALITY = {"lossless": True, "quality": 60, "method": 2}
+"""Lossy coding leaves a haze around what stands before a white background."""
+
 PAGE = "page.html"
 """Of this package: the page, with ``$names`` for what :func:`write_report` fills in."""
 
@@ -147,7 +150,7 @@ def write_report(
         facts="".join(_row(*fact) for fact in _facts(dataset, metrics)),
         split=html.escape(dataset.test_split),
         orbit=_uri("image/webp", orbit),
-        still=_data_uri(_first_frame(orbit), quality=92),
+        still=_data_uri(_first_frame(orbit), lossless=True),
         gaussians=GAUSSIANS,
         command=html.escape(metrics["command"]),
         comparisons="".join(
@@ -226,7 +229,7 @@ def _comparison(
     }
     pictures = "".join(
         f'<div><img alt="{name} {html.escape(view.name)}" '
-        f'src="{_data_uri(downscale(np.clip(picture, 0, 1), PANEL_WIDTH), quality=88)}">'
+        f'src="{_data_uri(downscale(np.clip(picture, 0, 1), PANEL_WIDTH), **PANEL_QUALITY)}">'
         f"<span>{name}</span></div>"
         for name, picture in panels.items()
     )

@@ -41,7 +41,38 @@ def test_an_animation_loops_and_holds_every_frame(tmp_path):
     assert picture.info["loop"] == 0
     assert len(decoded) == len(frames)
     for frame, expected in zip(decoded, frames, strict=True):
-        assert np.abs(frame - expected).mean() < 0.02  # lossy
+        assert np.abs(frame - expected).max() <= pictures.FLAT_STEP / 2 / 255 + 1e-9
+
+
+@pytest.mark.parametrize("background", [(255, 255, 255), (0, 0, 0), (131, 97, 202)])
+def test_before_a_flat_background_there_is_no_haze(tmp_path, background):
+    """Soft blobs of noise, whose codes would spread over the blocks around them."""
+    rng = np.random.default_rng(0)
+    y, x = np.mgrid[:64, :96]
+    color, frames = np.array(background) / 255, []
+    for k in range(5):
+        alpha = np.clip(1.4 - np.hypot(x - 30 - 6 * k, y - 30) / 16, 0, 1)[..., None]
+        frames.append(alpha * rng.uniform(size=(64, 96, 3)) + (1 - alpha) * color)
+    pictures.write_animation(tmp_path / "a.webp", frames)
+    _, decoded = frames_of(tmp_path / "a.webp")
+    for frame, expected in zip(decoded, frames, strict=True):
+        empty = (expected == color).all(axis=2)
+        assert 0.3 < empty.mean() < 0.9
+        assert (np.round(frame[empty] * 255) == background).all()
+        assert np.abs(frame - expected).max() <= (pictures.FLAT_STEP + 1) / 2 / 255
+
+
+def test_pictures_that_fill_the_frame_are_coded_with_loss(tmp_path, monkeypatch):
+    noise = list(np.random.default_rng(0).uniform(size=(3, 64, 64, 3)))
+    pictures.write_animation(tmp_path / "full.webp", noise)
+    assert b"VP8 " in (tmp_path / "full.webp").read_bytes()
+    for frame in noise:
+        frame[:, 32:] = 1
+    pictures.write_animation(tmp_path / "half.webp", noise)
+    assert b"VP8L" in (tmp_path / "half.webp").read_bytes()
+    monkeypatch.setattr(pictures, "FLAT_WEBP_BYTES", 10_000)
+    pictures.write_animation(tmp_path / "small.webp", noise)
+    assert b"VP8 " in (tmp_path / "small.webp").read_bytes()
 
 
 def test_the_gif_beside_it_is_smaller_and_keeps_the_background_exactly(tmp_path):
