@@ -17,6 +17,7 @@ from drgs.config.schema import DataConfig
 from drgs.core.errors import UserError
 from drgs.data.extras import extras_of, ignored, notes
 from drgs.data.images import kept_photograph
+from drgs.data.orientation import as_calibrated
 from drgs.data.transforms import (
     Frame,
     focal_from_angle,
@@ -69,7 +70,7 @@ def load(config: DataConfig) -> Dataset:
 
 
 def _load_view(config: DataConfig, frame: Frame, file: Path, name: str) -> View:
-    pixels = read_pixels(file)
+    pixels = as_calibrated(read_pixels(file), file, frame)
     height, width = pixels.shape[:2]
     values = frame.values
     for key, given, size in (("w", values.w, width), ("h", values.h, height)):

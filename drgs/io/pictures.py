@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 import imageio.v3 as iio
 import numpy as np
-from PIL import Image
+from PIL import ExifTags, Image
 
 from drgs.core.errors import UserError, one_line
 from drgs.core.files import atomic_path, open_regular
@@ -29,8 +29,25 @@ BITS = {"L": 8, "LA": 8, "RGB": 8, "RGBA": 8, "I;16": 16, "I;16B": 16, "I": 16}
 """Of a channel, by those of Pillow's modes that are read. ``I`` holds 32, but is what some versions
 of Pillow make of a grey PNG of 16."""
 
+
+def _transposed(pixels: np.ndarray) -> np.ndarray:
+    return pixels.swapaxes(0, 1)
+
+
 MITSUBA_FORMATS = ("PNG", "JPEG", "MPO", "BMP", "PPM", "TGA")
 """Pillow's names of the formats that Mitsuba reads as well. MPO is a JPEG with several pictures."""
+
+ORIENTATIONS = {
+    1: (),
+    2: (np.fliplr,),
+    3: (np.flipud, np.fliplr),
+    4: (np.flipud,),
+    5: (_transposed,),
+    6: (_transposed, np.fliplr),
+    7: (_transposed, np.flipud, np.fliplr),
+    8: (_transposed, np.flipud),
+}
+"""What makes a picture upright, by EXIF's number of how it is stored."""
 
 WEBP_SIDE = 16_383
 """px: the largest width and height that the format can express."""
@@ -82,6 +99,27 @@ def image_format(path: Path) -> str:
     """Pillow's name of the file's format, from its header: see :data:`MITSUBA_FORMATS`."""
     with _opened(path) as image:
         return image.format
+
+
+def image_orientation(path: Path) -> int:
+    """EXIF's number of how :func:`read_pixels` gives a picture: 1, upright or unknown, to 8."""
+    with _opened(path) as image:
+        if image.format == "PNG" and "exif" not in image.info:
+            return 1  # Pillow would decode the picture to look behind it
+        if image.format == "TIFF":
+            return 1  # Pillow turns these, and no others, when it decodes them
+        try:
+            number = image.getexif().get(ExifTags.Base.Orientation, 1)
+        except Exception:  # Pillow raises many types for broken EXIF, which says nothing
+            return 1
+    return number if number in ORIENTATIONS else 1
+
+
+def upright(pixels: np.ndarray, orientation: int) -> np.ndarray:
+    """(H, W, C) as EXIF's ``orientation`` has it seen; a view of ``pixels``."""
+    for turn in ORIENTATIONS[orientation]:
+        pixels = turn(pixels)
+    return pixels
 
 
 def read_image(path: Path) -> np.ndarray:

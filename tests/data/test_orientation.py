@@ -1,0 +1,90 @@
+"""Photographs that are stored on their side, with EXIF's word for it."""
+
+import json
+
+import numpy as np
+import pytest
+from PIL import ExifTags, Image, ImageOps
+from support.datasets import load, look_at
+
+from drgs.core.errors import UserError
+from drgs.io.pictures import image_orientation, read_pixels, upright
+
+STORED = np.random.default_rng(0).integers(0, 256, (6, 8, 3), np.uint8)
+
+
+def save(path, orientation, pixels=STORED):
+    exif = Image.Exif()
+    exif[ExifTags.Base.Orientation] = orientation
+    Image.fromarray(pixels).save(path, exif=exif)
+
+
+def dataset(folder, orientation, pixels=STORED, **size):
+    """Two views of one picture, whose camera has this size in px."""
+    frames = []
+    for i in range(2):
+        save(folder / f"{i}.png", orientation, pixels)
+        pose = look_at((4, i, 1), (0, 0, 0)).tolist()
+        frames.append({"file_path": f"{i}.png", "transform_matrix": pose})
+    meta = {"fl_x": 9.0, "frames": frames, **size}
+    (folder / "transforms.json").write_text(json.dumps(meta))
+
+
+@pytest.mark.parametrize("suffix", ["png", "jpg", "webp", "tif"])
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_pictures_are_turned_as_pillow_turns_them(tmp_path, orientation, suffix):
+    path = tmp_path / f"a.{suffix}"
+    save(path, orientation)
+    found = image_orientation(path)
+    assert found == (1 if suffix == "tif" else orientation)  # of TIFF, Pillow has turned it
+    with Image.open(path) as image:
+        expected = np.asarray(ImageOps.exif_transpose(image).convert("RGB"))
+    np.testing.assert_array_equal(upright(read_pixels(path), found), expected)
+
+
+@pytest.mark.parametrize("orientation", [0, 9, 65535])
+def test_numbers_that_mean_nothing_are_none(tmp_path, orientation):
+    save(tmp_path / "a.jpg", orientation)
+    assert image_orientation(tmp_path / "a.jpg") == 1
+
+
+@pytest.mark.parametrize("orientation", [5, 6, 7, 8])
+def test_the_cameras_size_tells_whether_its_picture_was_turned(tmp_path, orientation):
+    dataset(tmp_path, orientation, w=6, h=8)  # stored is 8 wide
+    view = load(tmp_path).train[0]
+    assert (view.width, view.height) == (6, 8)
+    expected = upright(STORED, orientation) / np.float32(255)
+    np.testing.assert_array_equal(np.asarray(view.image), expected.astype(np.float32))
+    dataset(tmp_path, orientation, w=8)
+    view = load(tmp_path).train[0]
+    assert (view.width, view.height) == (8, 6)
+    np.testing.assert_array_equal(
+        np.asarray(view.image), STORED.astype(np.float32) / np.float32(255)
+    )
+
+
+SQUARE = np.zeros((6, 6, 3), np.uint8)
+
+
+@pytest.mark.parametrize(
+    ("orientation", "pixels", "size"),
+    [
+        (3, STORED, {"w": 8, "h": 6}),
+        (6, STORED, {}),
+        (6, SQUARE, {"w": 6, "h": 6}),
+        (2, SQUARE, {}),
+    ],
+    ids=["half a turn", "no size", "a square", "mirrored"],
+)
+def test_an_orientation_that_may_or_may_not_count_is_refused(tmp_path, orientation, pixels, size):
+    dataset(tmp_path, orientation, pixels, **size)
+    message = rf"\.png: has the EXIF orientation {orientation}, and w and h do not tell"
+    with pytest.raises(UserError, match=message):
+        load(tmp_path)
+
+
+def test_a_wrong_size_of_a_turned_picture_names_both(tmp_path):
+    dataset(tmp_path, 6, w=7, h=8)
+    message = r"w must be the image's size, 8 x 6 px \(.*\), or as EXIF's orientation 6 turns it"
+    with pytest.raises(UserError, match=message):
+        load(tmp_path)
