@@ -47,7 +47,6 @@ from drgs.data import Dataset, View, initial_gaussians, load_dataset
 from drgs.gaussians.parameters import Gaussians
 from drgs.integrator.scene import check_lenses
 from drgs.integrator.summary import described
-from drgs.io.pictures import write_png
 from drgs.results.files import (
     BUDGET_PLAN,
     CHECKPOINT,
@@ -55,7 +54,6 @@ from drgs.results.files import (
     GAUSSIANS,
     HISTORY,
     METRICS,
-    RENDERS,
     REPORT,
 )
 from drgs.results.folder import (
@@ -65,8 +63,8 @@ from drgs.results.folder import (
     remove_run,
     require_no_run,
 )
-from drgs.results.metrics import FitMetrics, Quality, mean_quality
-from drgs.results.report import seconds_to_write, write_results
+from drgs.results.metrics import FitMetrics, Quality, mean_of
+from drgs.results.report import seconds_to_write, write_pictures, write_results
 from drgs.training.budget import (
     AllIterations,
     Deadline,
@@ -240,17 +238,12 @@ def fit_and_write(
     for effect in trainer.effects:
         effect.write(out, dataset.train)
     write_history(out / HISTORY, log.rows)
-    images = list(trainer.pictures(dataset.test))
-    quality = mean_quality(
-        (image, view.image, view.mask) for image, view in zip(images, dataset.test, strict=True)
-    )
-    config = trainer.config
+    config, render = trainer.config, trainer.pictures
     dump_config(config, out / CONFIG)
-    if config.output.save_renders:
-        for view, image in zip(dataset.test, images, strict=True):
-            write_png(out / RENDERS / dataset.test_split / f"{view.name}.png", image)
+    scores = write_pictures(out, dataset, render, config.output.save_renders)
+    quality = mean_of(scores)
     metrics = summarize(config, dataset, gaussians.num_gaussians, wall_s, quality, command)
-    write_results(out, dataset, trainer.scene, gaussians, images, log.rows, metrics)
+    write_results(out, dataset, trainer.scene, gaussians, render, scores, log.rows, metrics)
     with atomic_path(out / METRICS) as temporary:
         temporary.write_text(json.dumps(metrics, indent=2) + "\n")
     remove_checkpoint(out)

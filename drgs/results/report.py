@@ -1,7 +1,7 @@
 """What a fit shows of itself: comparisons, curves, an orbit, and a page that holds all of it.
 
-The fit command calls :func:`write_results` at its end. Everything is computed from what the fit
-already has: its pictures of the test views, its history, its scene.
+The fit command calls :func:`write_pictures` and :func:`write_results` at its end. Everything comes
+from what the fit has: its scene, its history, the test views. One picture is held at a time.
 """
 
 from __future__ import annotations
@@ -11,11 +11,12 @@ import html
 import io
 import math
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from datetime import datetime
 from importlib import resources
 from pathlib import Path
 from string import Template
+from typing import NamedTuple
 
 import mitsuba as mi
 import numpy as np
@@ -32,7 +33,7 @@ from drgs.integrator.scene import render_views
 from drgs.io.figures import pixels_of
 from drgs.io.pictures import encode, write_animation, write_png
 from drgs.results.curves import THEMES, CurvePoint, Panel, draw_curve, panels_of, write_curves
-from drgs.results.files import CURVES, GAUSSIANS, ORBIT, REPORT, SIDE_BY_SIDE
+from drgs.results.files import CURVES, GAUSSIANS, ORBIT, RENDERS, REPORT, SIDE_BY_SIDE
 from drgs.results.metrics import FitMetrics, psnr, ssim
 
 DIFFERENCE_GAIN = 5.0
@@ -56,25 +57,47 @@ PAGE_SECONDS = 4.0
 """Curves and page, which do not depend on the scene."""
 
 
+Render = Callable[[tuple[View, ...]], Iterable[np.ndarray]]
+"""Pictures (H, W, 3) of views as fitted, display space, one after the other."""
+
+
+class Score(NamedTuple):
+    """What one picture scores against its photograph."""
+
+    psnr: float  # dB
+    ssim: float
+
+
+def write_pictures(out: Path, dataset: Dataset, render: Render, with_renders: bool) -> list[Score]:
+    """Score the test views, and write ``side_by_side/`` and, if asked for, ``renders/``."""
+    scores, split = [], dataset.test_split
+    for view, image in zip(dataset.test, render(dataset.test), strict=True):
+        if with_renders:
+            write_png(out / RENDERS / split / f"{view.name}.png", image)
+        write_png(out / SIDE_BY_SIDE / split / f"{view.name}.png", side_by_side(image, view))
+        scores.append(score(image, view))
+    return scores
+
+
 def write_results(
     out: Path,
     dataset: Dataset,
     scene: mi.Scene,
     gaussians: Gaussians,
-    images: Sequence[np.ndarray],
+    render: Render,
+    scores: Sequence[Score],
     history: Sequence[CurvePoint],
     metrics: FitMetrics,
 ) -> None:
-    """Write ``side_by_side/``, ``curves.png``, ``orbit.webp`` and ``.gif``, ``report.html``.
+    """Write ``curves.png``, ``orbit.webp`` and ``.gif``, ``report.html``.
 
-    scene: renders ``gaussians``, in display space; images: (H, W, 3) display space, of the test
-    views, in their order; history: rows as of ``history.csv``; metrics: as of ``metrics.json``.
+    scene: renders ``gaussians``, in display space; scores: of the test views, in their order;
+    history: rows as of ``history.csv``; metrics: as of ``metrics.json``.
     """
-    write_side_by_side(out / SIDE_BY_SIDE / dataset.test_split, dataset, images)
     write_curves(out / CURVES, history)
     write_orbit(out / ORBIT, scene, dataset, gaussians)
     orbit = (out / ORBIT).read_bytes()
-    write_report(out / REPORT, out.name, dataset, images, history, metrics, orbit)
+    write_report(out / REPORT, out.name, dataset, render, scores, history, metrics, orbit)
 
 
 def seconds_to_write(scene: mi.Scene, dataset: Dataset) -> float:
@@ -86,15 +109,9 @@ def seconds_to_write(scene: mi.Scene, dataset: Dataset) -> float:
     rendering = time.perf_counter() - start
     for picture in (image, side_by_side(image, view)):
         encode(picture, "png")
-    score(image, view), ssim(image, view.image, view.mask)
+    score(image, view)
     one_view = time.perf_counter() - start
     return PAGE_SECONDS + len(dataset.test) * one_view + 2 * ORBIT_FRAMES * rendering
-
-
-def write_side_by_side(folder: Path, dataset: Dataset, images: Iterable[np.ndarray]) -> None:
-    """Write one PNG per test view: fitted, truth, difference."""
-    for view, image in zip(dataset.test, images, strict=True):
-        write_png(folder / f"{view.name}.png", side_by_side(image, view))
 
 
 def side_by_side(image: np.ndarray, view: View) -> np.ndarray:
@@ -105,17 +122,16 @@ def side_by_side(image: np.ndarray, view: View) -> np.ndarray:
 
 def difference(image: np.ndarray, view: View) -> np.ndarray:
     """0.5 + 5 (fitted - truth), clipped; 0.5 where pixels do not count."""
-    values = (
-        image - view.image
-        if view.mask is None
-        else (image - view.image) * np.asarray(view.mask)[..., None]
-    )
+    values = image - view.image
+    if view.mask is not None:
+        values = values * view.mask[..., None]
     return np.clip(0.5 + DIFFERENCE_GAIN * values, 0, 1)
 
 
-def score(image: np.ndarray, view: View) -> float:
-    """PSNR, dB."""
-    return psnr(image, view.image, view.mask)
+def score(image: np.ndarray, view: View) -> Score:
+    """Of a picture (H, W, 3) of ``view``, display space."""
+    photograph = np.asarray(view.image)
+    return Score(psnr(image, photograph, view.mask), ssim(image, photograph, view.mask))
 
 
 def write_orbit(path: Path, scene: mi.Scene, dataset: Dataset, gaussians: Gaussians) -> None:
@@ -131,17 +147,18 @@ def write_report(
     path: Path,
     title: str,
     dataset: Dataset,
-    images: Sequence[np.ndarray],
+    render: Render,
+    scores: Sequence[Score],
     history: Sequence[CurvePoint],
     metrics: FitMetrics,
     orbit: bytes,
 ) -> None:
     """Write one HTML file with everything in it, which needs no network and no other file.
 
-    Only its link to the Gaussians leads out, to the file beside it. images: of the test views, in
+    Only its link to the Gaussians leads out, to the file beside it. scores: of the test views, in
     their order; metrics: as of ``metrics.json``; orbit: the bytes of an animated WebP.
     """
-    scores = [score(image, view) for image, view in zip(images, dataset.test, strict=True)]
+    chosen = choose_views([score.psnr for score in scores])
     template = Template(resources.files("drgs.results").joinpath(PAGE).read_text("utf-8"))
     page = template.substitute(
         title=html.escape(title),
@@ -154,14 +171,14 @@ def write_report(
         gaussians=GAUSSIANS,
         command=html.escape(metrics["command"]),
         comparisons="".join(
-            _comparison(dataset, images, scores, *choice) for choice in choose_views(scores)
+            _comparison(dataset, render, label, index, scores[index]) for label, index in chosen
         ),
         truth=_truth(dataset).lower(),
         gain=f"{DIFFERENCE_GAIN:g}",
         curves="".join(_curve(panel) for panel in panels_of(history)),
         views="".join(
-            _row(view.name, f"{decibels:.2f}")
-            for view, decibels in zip(dataset.test, scores, strict=True)
+            _row(view.name, f"{score.psnr:.2f}")
+            for view, score in zip(dataset.test, scores, strict=True)
         ),
         config=html.escape(yaml.safe_dump(metrics["config"], sort_keys=False)),
     )
@@ -216,12 +233,13 @@ def duration(seconds: float) -> str:
 
 def _comparison(
     dataset: Dataset,
-    images: Sequence[np.ndarray],
-    scores: Sequence[float],
+    render: Render,
     label: str,
     index: int,
+    score: Score,
 ) -> str:
-    view, image = dataset.test[index], images[index]
+    view = dataset.test[index]
+    (image,) = render((view,))
     panels = {
         "Fitted": image,
         _truth(dataset): view.image,
@@ -234,8 +252,8 @@ def _comparison(
         for name, picture in panels.items()
     )
     caption = (
-        f"<b>{label}: {html.escape(view.name)}</b> PSNR {_decibels(scores[index])}, "
-        f"SSIM {ssim(image, view.image, view.mask):.4f}"
+        f"<b>{label}: {html.escape(view.name)}</b> PSNR {_decibels(score.psnr)}, "
+        f"SSIM {score.ssim:.4f}"
     )
     return f'<figure><figcaption>{caption}</figcaption><div class="three">{pictures}</div></figure>'
 

@@ -5,6 +5,7 @@ import io
 import json
 import re
 from dataclasses import replace
+from functools import partial
 from html.parser import HTMLParser
 
 import mitsuba as mi
@@ -18,6 +19,7 @@ from drgs.data.orbits import orbit_of_views
 from drgs.data.viewpoints import field_of_view
 from drgs.integrator.scene import make_scene, render_views
 from drgs.results import curves, report
+from drgs.results.metrics import ssim
 from drgs.training.history import HistoryRow
 
 KINDS = ("still", "moving")
@@ -38,6 +40,13 @@ def scene(dataset):
 @pytest.fixture(scope="module")
 def images(dataset, scene):
     return list(render_views(scene, dataset.test))
+
+
+def scored(images, dataset):
+    """What renders the test views as ``images``, and their scores."""
+    by_name = {view.name: image for view, image in zip(dataset.test, images, strict=True)}
+    scores = [report.score(by_name[view.name], view) for view in dataset.test]
+    return lambda views: [by_name[view.name] for view in views], scores
 
 
 def history(count=120):
@@ -71,7 +80,10 @@ def metrics(**data):
 def out(tmp_path_factory, dataset, scene, images):
     folder = tmp_path_factory.mktemp("results") / "blobs"
     folder.mkdir()
-    report.write_results(folder, dataset, scene, blobs(), images, history(), metrics())
+    render = partial(render_views, scene)
+    scores = report.write_pictures(folder, dataset, render, with_renders=False)
+    args = dataset, scene, blobs(), render, scores
+    report.write_results(folder, *args, history(), metrics())
     return folder
 
 
@@ -84,6 +96,25 @@ def test_everything_is_written_and_nothing_temporary(out):
 # ----------------------------------------------------------------------------------------------
 # Pictures
 # ----------------------------------------------------------------------------------------------
+
+
+def test_one_picture_is_held_at_a_time(tmp_path, dataset):
+    """Each is written and scored before the next one is rendered; renders only if asked for."""
+    rendered = []
+
+    def render(views):
+        for index in range(len(views)):
+            done = sorted(path.name for path in tmp_path.rglob("*.png"))
+            assert done == sorted(2 * [f"r_{k}.png" for k in range(index)])
+            rendered.append(np.full((HEIGHT, WIDTH, 3), 0.1 * index, np.float32))
+            yield rendered[-1]
+
+    scores = report.write_pictures(tmp_path, dataset, render, with_renders=True)
+    for score, image, view in zip(scores, rendered, dataset.test, strict=True):
+        assert score.psnr == pytest.approx(decibels(image, view.image))
+        assert score.ssim == ssim(image, view.image)
+        written = np.asarray(Image.open(tmp_path / "renders" / "test" / f"{view.name}.png")) / 255
+        assert np.abs(written - image).max() < 0.5 / 255 + 1e-6
 
 
 def test_a_comparison_is_fitted_photograph_difference(out, dataset, images):
@@ -108,7 +139,7 @@ def test_what_a_mask_leaves_out_is_no_difference(dataset, images):
     whole = report.difference(images[2], dataset.test[2])
     np.testing.assert_array_equal(shown[:, WIDTH // 2 :], whole[:, WIDTH // 2 :])
     error = (images[2] - view.image)[:, WIDTH // 2 :].astype(np.float64)
-    assert report.score(images[2], view) == pytest.approx(-10 * np.log10(np.mean(error**2)))
+    assert report.score(images[2], view).psnr == pytest.approx(-10 * np.log10(np.mean(error**2)))
 
 
 def test_the_orbit_has_the_shape_of_the_photographs_and_shows_the_scene(out, dataset, scene):
@@ -250,7 +281,7 @@ def test_the_orbit_can_be_paused_and_honours_reduced_motion(page):
 def test_pictures_of_a_renderer_are_no_photographs(tmp_path, dataset, images, out, page):
     path, taken = tmp_path / "report.html", replace(dataset, rendered=False)
     orbit = (out / "orbit.webp").read_bytes()
-    report.write_report(path, "a", taken, images, history(2), metrics(), orbit)
+    report.write_report(path, "a", taken, *scored(images, taken), history(2), metrics(), orbit)
     rendered, photographed = "".join(page.text), "".join(Page(path).text)
     assert "Reference" in rendered and "fitted \u2212 reference" in rendered
     assert "Photograph" in photographed and "fitted \u2212 photograph" in photographed
@@ -310,11 +341,12 @@ def test_views_are_chosen_by_their_psnr(scores, expected):
 def test_text_from_outside_is_escaped(tmp_path, dataset, images, out):
     hostile = "</pre><script>alert(1)</script>"
     test = tuple(replace(view, name=f"<b>{view.name}") for view in dataset.test)
+    dataset = replace(dataset, test=test, description=hostile, test_split=hostile)
     report.write_report(
         tmp_path / "report.html",
         hostile,
-        replace(dataset, test=test, description=hostile, test_split=hostile),
-        images,
+        dataset,
+        *scored(images, dataset),
         history(),
         metrics(source=hostile),
         (out / "orbit.webp").read_bytes(),
@@ -330,7 +362,7 @@ def test_a_picture_that_equals_its_photograph_is_infinitely_good(tmp_path, datas
         tmp_path / "report.html",
         "equal",
         equal,
-        [equal.test[0].image],
+        *scored([equal.test[0].image], equal),
         history(2),
         json.loads(json.dumps(metrics())),
         (out / "orbit.webp").read_bytes(),

@@ -363,7 +363,7 @@ def spoil_photograph(monkeypatch, iteration):
 
     def load_and_spoil(config):
         dataset = load(config)
-        image = dataset.train[spoilt].image.copy()
+        image = np.array(dataset.train[spoilt].image)
         image[12, 16, 0] = np.nan
         train = list(dataset.train)
         train[spoilt] = replace(train[spoilt], image=image)
