@@ -149,7 +149,7 @@ def test_derivatives_of_the_loss_are_differences_in_numpy(index):
     dr.backward(loss)
     effect.after(trainer, view)
     gaussians, step = fits.double(start), 1e-7
-    target = photo.image.astype(np.float64)
+    target = np.asarray(photo.image, np.float64)
     assert float(dr.detach(loss)[0]) == pytest.approx(
         loss_in_numpy(gaussians, moved(photo, **row), target), rel=1e-5
     )
