@@ -131,7 +131,7 @@ def test_loss_that_is_not_finite_names_iteration_and_view(dssim_weight, gradient
     photo[8, 10] = np.nan
     target = prepare_target(mi.TensorXf(photo))
     views = trainer.stages[-1].views
-    views[spoilt] = replace(views[spoilt], target=target)
+    views[spoilt].replacement = target
     for _ in range(3):
         trainer.step()
     trainer.check()
