@@ -11,6 +11,7 @@ result on the test views and writes the output folder:
 - ``curves.png``, ``orbit.webp``, ``orbit.gif``
 - ``report.html``: all of it on one page that needs no other file
 - ``config.yml``: every value that the fit used
+- ``views.json``: the cameras of the training views, for orbits
 - ``colors.json``, ``cameras.json``: colour transforms and refined cameras of the training views
 - ``plan.txt``: with ``--budget``, what was planned and why
 
@@ -25,6 +26,7 @@ import platform
 import sys
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 
@@ -37,13 +39,14 @@ from drgs.cli.commands import CommandParser, file_or_folder, run_command
 from drgs.cli.execution import add_execution_arguments, executing, select_variant
 from drgs.cli.interrupts import INTERRUPTED_STATUS, StopRequest
 from drgs.cli.progress import RunProgress
-from drgs.config.load import dump_config, load_config
+from drgs.config.load import load_config
 from drgs.config.schema import FitConfig
 from drgs.core.errors import UserError
 from drgs.core.files import atomic_path
 from drgs.core.machine import processor
 from drgs.core.private import llvm_version
 from drgs.data import Dataset, View, initial_gaussians, load_dataset
+from drgs.data.fingerprint import Fingerprint, fingerprint
 from drgs.gaussians.parameters import Gaussians
 from drgs.integrator.scene import check_lenses
 from drgs.integrator.summary import described
@@ -55,15 +58,24 @@ from drgs.results.files import (
     HISTORY,
     METRICS,
     REPORT,
+    VIEWS,
 )
 from drgs.results.folder import (
+    check_output_folder,
     claim_output_folder,
+    continue_run,
+    found_again,
+    has_results,
     is_finished,
     load_run_config,
+    pictures_of,
     remove_run,
     require_no_run,
+    seal_run,
+    write_run_config,
 )
 from drgs.results.metrics import FitMetrics, Quality, mean_of
+from drgs.results.refined_cameras import write_views
 from drgs.results.report import seconds_to_write, write_pictures, write_results
 from drgs.training.budget import (
     AllIterations,
@@ -76,6 +88,7 @@ from drgs.training.budget import (
 )
 from drgs.training.checkpoint import (
     Checkpoint,
+    check_same_data,
     load_checkpoint,
     remove_checkpoint,
     save_checkpoint,
@@ -131,35 +144,66 @@ def add_arguments(parser: CommandParser) -> None:
     parser.set_defaults(run=run, prog=parser.prog)
 
 
+@dataclass(frozen=True, eq=False)
+class Run:
+    """A fit, and the folder that it is saved to."""
+
+    trainer: Trainer
+    history: History
+    data: Fingerprint
+    out: Path
+
+    @staticmethod
+    def taken_up(
+        trainer: Trainer, data: Fingerprint, out: Path, checkpoint: Checkpoint | None
+    ) -> Run:
+        """From its checkpoint, or from the beginning where there is none (None)."""
+        if checkpoint is None:
+            return Run(trainer, History(), data, out)
+        trainer.restore(checkpoint.trainer)
+        print(f"continues at iteration {trainer.iteration}")
+        return Run(trainer, History.from_array(checkpoint.history, checkpoint.wall_s), data, out)
+
+    def save(self) -> None:
+        """Write the checkpoint."""
+        state, rows, wall_s = self.trainer.state(), self.history.as_array(), self.history.wall_s
+        save_checkpoint(self.out, self.trainer.config, Checkpoint(state, rows, wall_s, self.data))
+
+
 def run(args: argparse.Namespace) -> None:
     """Fit what the command line names; end the process with status 130 if Ctrl-C stopped it."""
     started = time.perf_counter()
     with executing(args.threads, args.debug) as check_ranges:
         config, out = what_to_fit(args)
-        if is_finished(out, config) and not args.overwrite:
+        if not args.overwrite and (has_results(out) if args.resume else is_finished(out, config)):
+            remove_checkpoint(out)  # a process that was killed behind its last file has not
+            seal_run(out)
             print(f"{out}: this fit is finished; --overwrite does it again")
             return
+        checkpoint = earlier_state(args, config, out)
+        if checkpoint is not None:
+            config = checkpoint.config
         dataset = load_dataset(config.data_for_training)
+        data = fingerprint(dataset)
+        if checkpoint is not None:
+            check_same_data(out, config.data.path, checkpoint.data, data)
         select_variant(args.variant)
         announce(config, dataset)
         # The folder is touched when all of the input has been found to be usable.
         gaussians = initial_gaussians(config, dataset)
         length, plan = AllIterations(), None
         if args.budget is not None:
-            if not args.overwrite:
-                require_no_run(out)
             end, plan = planned(config, dataset, gaussians, started + args.budget)
             config = plan.config
             print(plan.reasons)
         trainer = Trainer(config, dataset, gaussians)
-        if args.overwrite:
-            remove_run(out)
-        claim_output_folder(out, config)
+        fit, checkpoint = Run.taken_up(trainer, data, out, checkpoint), None  # frees its arrays
+        take_folder(args, config, dataset, out)
         if plan is not None:
             with atomic_path(out / BUDGET_PLAN) as temporary:
                 temporary.write_text(f"--budget {args.budget:g}s\n{plan.reasons}\n")
             length = Deadline(trainer, end, plan.curve)
-        finished = fit_and_write(trainer, dataset, out, length, check_ranges, args.command)
+        finished = fit_and_write(fit, dataset, length, check_ranges, args.command)
     if not finished:
         print(f"stopped; continue with: {args.prog} --resume {out}")
         sys.exit(INTERRUPTED_STATUS)
@@ -167,17 +211,42 @@ def run(args: argparse.Namespace) -> None:
 
 def what_to_fit(args: argparse.Namespace) -> tuple[FitConfig, Path]:
     """The configuration that the command line asks for, and the output folder."""
-    given = {"data.path": args.data, "output.dir": args.out}
-    shorthands = [f"{key}={value}" for key, value in given.items() if value is not None]
+    data = [] if args.data is None else [f"data.path={args.data}"]
     if args.resume is not None:
-        if shorthands or args.overrides or args.overwrite or args.budget is not None:
+        if args.out is not None or args.overrides or args.overwrite or args.budget is not None:
             raise UserError(
-                f"--resume: takes its configuration from {args.resume / CONFIG}: leave out --data, "
-                "--out, --set, --budget and --overwrite"
+                f"--resume: takes its configuration from {args.resume / CONFIG}: leave out --out, "
+                "--set, --budget and --overwrite"
             )
-        return load_run_config(args.resume), args.resume
-    config = load_config(args.config, args.overrides + shorthands)
+        return found_again(args.resume, load_run_config(args.resume, data)), args.resume
+    out = [] if args.out is None else [f"output.dir={args.out}"]
+    config = load_config(args.config, args.overrides + data + out)
     return config, config.output.dir or Path("out") / Path(args.config).stem
+
+
+def earlier_state(args: argparse.Namespace, config: FitConfig, out: Path) -> Checkpoint | None:
+    """The checkpoint from which the fit in the folder ``out`` goes on; None: there is none.
+
+    Raises ``UserError`` where the folder is not for this fit. Nothing is written.
+    """
+    if args.overwrite:
+        return None
+    if args.budget is not None:
+        require_no_run(out)
+    elif args.resume is None:
+        check_output_folder(out, config)
+    return load_checkpoint(out, config)
+
+
+def take_folder(args: argparse.Namespace, config: FitConfig, dataset: Dataset, out: Path) -> None:
+    """Make ``out`` the folder of the fit, or raise ``UserError`` and leave it as it is."""
+    pictures = pictures_of(dataset.test_split, [view.name for view in dataset.test])
+    if args.overwrite:
+        remove_run(out, pictures)
+    if args.resume is None:
+        claim_output_folder(out, config, pictures)
+    else:
+        continue_run(out, config, pictures)
 
 
 def announce(config: FitConfig, dataset: Dataset) -> None:
@@ -208,27 +277,20 @@ def planned(
 
 
 def fit_and_write(
-    trainer: Trainer,
+    fit: Run,
     dataset: Dataset,
-    out: Path,
     length: Length,
     check_ranges: Callable[[], None],
     command: str,
 ) -> bool:
-    """Fit, measure, and write into the folder ``out``; False if stopped by Ctrl-C.
+    """Fit, measure, and write into the fit's folder; False if stopped by Ctrl-C.
 
-    Goes on from the checkpoint in ``out``, if there is one. check_ranges: raises ``UserError``;
-    command: the line that was typed, for the report.
+    check_ranges: raises ``UserError``; command: the line that was typed, for the report.
     """
-    checkpoint = load_checkpoint(out, trainer.config)
-    log = History()
-    if checkpoint is not None:
-        trainer.restore(checkpoint.trainer)
-        log = History.from_array(checkpoint.history, checkpoint.wall_s)
-        print(f"continues at iteration {trainer.iteration}")
+    trainer, log, out = fit.trainer, fit.history, fit.out
     try:
         views = measured_views(dataset.test)
-        if not run_iterations(trainer, log, views, out, length, check_ranges):
+        if not run_iterations(fit, views, length, check_ranges):
             return False
         wall_s = log.wall_s
         gaussians = trainer.gaussians()
@@ -238,8 +300,9 @@ def fit_and_write(
     for effect in trainer.effects:
         effect.write(out, dataset.train)
     write_history(out / HISTORY, log.rows)
+    write_views(out / VIEWS, dataset.train)
     config, render = trainer.config, trainer.pictures
-    dump_config(config, out / CONFIG)
+    write_run_config(out, config)
     scores = write_pictures(out, dataset, render, config.output.save_renders)
     quality = mean_of(scores)
     metrics = summarize(config, dataset, gaussians.num_gaussians, wall_s, quality, command)
@@ -247,6 +310,7 @@ def fit_and_write(
     with atomic_path(out / METRICS) as temporary:
         temporary.write_text(json.dumps(metrics, indent=2) + "\n")
     remove_checkpoint(out)
+    seal_run(out)
     print(
         f"{quality.num_views} {dataset.test_split} views: PSNR {quality.psnr:.2f} dB, "
         f"SSIM {quality.ssim:.4f}; {gaussians.num_gaussians:,} Gaussians; "
@@ -258,17 +322,15 @@ def fit_and_write(
 
 
 def run_iterations(
-    trainer: Trainer,
-    history: History,
-    views: tuple[View, ...],
-    out: Path,
-    length: Length,
-    check_ranges: Callable[[], None],
+    fit: Run, views: tuple[View, ...], length: Length, check_ranges: Callable[[], None]
 ) -> bool:
     """Run the iterations that are left, showing progress and saving checkpoints.
 
-    views: are measured now and then. False if Ctrl-C stopped it; the state is saved then.
+    views: are measured now and then. False if Ctrl-C stopped it; the state is saved then, and
+    behind the last iteration: what was done is a configuration from then on, which results that
+    are half written belong to.
     """
+    trainer, history = fit.trainer, fit.history
     smooth_psnr, every = None, trainer.config.output.checkpoint_every
     shown = RunProgress("iteration", length.total(trainer), trainer.iteration)
     with shown as progress, StopRequest() as stop:
@@ -285,17 +347,12 @@ def run_iterations(
                 progress.update(done.row.iteration, length.total(trainer), status)
                 if measurement_is_due(history.rows, trainer.config.iterations):
                     measure(trainer, history, views)
-            is_due = every and done.report.iteration % every == 0 and not done.is_last
+            is_due = every and (done.is_last or done.report.iteration % every == 0)
             if stop.requested or is_due:
-                save(trainer, history, out)
+                fit.save()
             if stop.requested:
                 return False
     return True
-
-
-def save(trainer: Trainer, log: History, out: Path) -> None:
-    """Write the checkpoint."""
-    save_checkpoint(out, trainer.config, Checkpoint(trainer.state(), log.as_array(), log.wall_s))
 
 
 def _remedy(out: Path) -> str:

@@ -67,7 +67,8 @@ from drgs.io.pictures import (
     write_exr,
     write_png,
 )
-from drgs.results.files import CAMERAS, CONFIG, GAUSSIANS, METRICS, ORBIT, ORBIT_GIF
+from drgs.results.files import CAMERAS, CONFIG, GAUSSIANS, METRICS, ORBIT, ORBIT_GIF, VIEWS
+from drgs.results.folder import found_again
 from drgs.results.metrics import Quality, mean_of, psnr, ssim
 from drgs.results.pictures import claiming, refuse_photographs, seal_pictures
 
@@ -276,6 +277,8 @@ def load_model(args: argparse.Namespace) -> Model:
         config_path = config_path or what / CONFIG
         what = what / GAUSSIANS
     config = _load_config(config_path, args) if config_path is not None else None
+    if args.what.is_dir() and args.scene is None:
+        config = found_again(args.what, config, ("data.path",))
     gaussians = Gaussians.load(what)
     model, background = ModelConfig(), NAMED_COLORS[BACKGROUND]
     if config is not None:
@@ -328,13 +331,25 @@ def render_orbit(model: Model, args: argparse.Namespace) -> None:
         fov, size = args.fov or FIELD_OF_VIEW, args.size or DEFAULT_SIZE
         orbit = orbit_of_gaussians(model.gaussians, np.array(args.up or UP), fov)
     else:
-        views = model.dataset("--orbit").train
+        views = _orbited(model, args)
         fov, size = args.fov or field_of_view(views), args.size or orbit_size(views)
         orbit = orbit_of_views(views, model.gaussians)
     check_animation(args.orbit, *size)
     viewpoints = orbit.viewpoints(args.orbit, *size, fov)
     pictures = render_cameras(model, viewpoints, args.out, [ORBIT, ORBIT_GIF])
     write_animation(args.out / ORBIT, pictures)
+
+
+def _orbited(model: Model, args: argparse.Namespace) -> Sequence[Viewpoint]:
+    """The training cameras: those that a fit's folder keeps, unless photographs are named."""
+    if args.what.is_dir() and (args.scene, args.data, args.set) == (None, None, None):
+        refined = args.what / CAMERAS
+        if model.config.cameras.optimise and refined.is_file():
+            print(f"cameras: as refined, from {refined}")
+            return read_viewpoints(refined, None)
+        if (args.what / VIEWS).is_file():
+            return read_viewpoints(args.what / VIEWS, None)
+    return model.dataset("--orbit").train
 
 
 def render_cameras(

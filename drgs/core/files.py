@@ -137,9 +137,14 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
 def remove_stale_temporaries(folder: Path) -> None:
     """Remove what writers that were killed have left behind, in ``folder`` and below it."""
     for path in folder.rglob(".*.tmp*"):
-        if _TEMPORARY_NAME.fullmatch(path.name):
+        if is_temporary(path.name):
             with suppress(OSError):
                 path.unlink()
+
+
+def is_temporary(name: str) -> bool:
+    """Whether a file of this name is what :func:`atomic_path` was writing."""
+    return _TEMPORARY_NAME.fullmatch(name) is not None
 
 
 def why_refused(error: OSError) -> str:

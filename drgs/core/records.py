@@ -14,14 +14,11 @@ from collections.abc import Collection, Iterable, Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
-from drgs.core.errors import UserError
-from drgs.core.files import atomic_path, read_text
+from drgs.core.errors import UserError, listed
+from drgs.core.files import atomic_path, open_regular, read_text
 
 MAX_BYTES = 1 << 26
 """Of a record: 67 MB, two hundred bytes for each of a third of a million files."""
-
-MAX_NAMED = 3
-"""Files that a message names; the rest are counted."""
 
 _CHUNK = 1 << 20
 
@@ -91,7 +88,8 @@ class FolderRecord:
             return
         there = [name for name in self._content.files if (self.folder / name).is_file()]
         files = {name: self._content.files[name] or digest(self.folder / name) for name in there}
-        self._write(_Content(files=files, paths=dict(self.paths)))
+        if files != self._content.files:
+            self._write(_Content(files=files, paths=dict(self.paths)))
 
     def remove(self) -> None:
         """Forget all of it."""
@@ -113,17 +111,11 @@ class FolderRecord:
         self.exists, self._content = True, content
 
 
-def listed(names: list[str]) -> str:
-    """The first of the names, and how many more there are."""
-    more = f" and {len(names) - MAX_NAMED} more" if len(names) > MAX_NAMED else ""
-    return ", ".join(names[:MAX_NAMED]) + more
-
-
 def digest(path: Path) -> str:
     """SHA-256 of a file's bytes, as text; :class:`UserError` where it cannot be read."""
     found = hashlib.sha256()
     try:
-        with path.open("rb") as file:
+        with open_regular(path) as file:
             while chunk := file.read(_CHUNK):
                 found.update(chunk)
     except OSError as error:

@@ -49,8 +49,10 @@ def _layout(config: DataConfig) -> str:
     try:
         names = os.listdir(config.path)
     except FileNotFoundError:
-        remedy = f"; get it from {config.source}" if config.source else ""
-        raise UserError(f"data.path: there is no folder {config.path}{remedy}") from None
+        source = f", or get it from {config.source}" if config.source else ""
+        raise UserError(
+            f"data.path: there is no folder {config.path}; say where it is (--data DIR){source}"
+        ) from None
     except NotADirectoryError:
         raise UserError(
             f"data.path: {config.path} is a file; give the folder of the dataset, such as "

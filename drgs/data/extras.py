@@ -9,6 +9,7 @@ pose, what stands at the top of the file is every frame's that has none of its o
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
 
@@ -41,6 +42,16 @@ def extras_of(
         "mask": None if config.ignore_masks else _mask(config, frame, size),
         "depth": None if config.ignore_depth else _depth(config, frame, size),
     }
+
+
+def files_of(config: DataConfig, frame: Frame, photograph: Path) -> dict[str, Path]:
+    """``files`` of a :class:`drgs.data.types.View`: those that were opened for it."""
+    files, values = {"image": photograph}, frame.values
+    if values.mask_path is not None and not config.ignore_masks:
+        files["mask"] = image_path(config.path, frame, MASK)
+    if values.depth_file_path is not None and not config.ignore_depth:
+        files["depth"] = image_path(config.path, frame, DEPTH)
+    return files
 
 
 def _mask(config: DataConfig, frame: Frame, size: tuple[int, int]) -> Pixels | None:

@@ -17,7 +17,7 @@ import numpy as np
 
 from drgs.config.schema import DataConfig
 from drgs.core.errors import UserError
-from drgs.data.extras import extras_of, ignored, notes
+from drgs.data.extras import extras_of, files_of, ignored, notes
 from drgs.data.images import kept_photograph
 from drgs.data.transforms import (
     Frame,
@@ -101,6 +101,7 @@ def _load_split(config: DataConfig, split: str, frames: list[Frame]) -> tuple[Vi
             width=width,
             height=height,
             alpha=alpha if split == "train" else None,  # only training looks at it
+            files=files_of(config, frame, files[index]),
             **extras_of(config, frame, size),
         )
 

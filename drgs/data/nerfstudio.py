@@ -15,7 +15,7 @@ from pathlib import Path
 
 from drgs.config.schema import DataConfig
 from drgs.core.errors import UserError
-from drgs.data.extras import extras_of, ignored, notes
+from drgs.data.extras import extras_of, files_of, ignored, notes
 from drgs.data.images import kept_photograph
 from drgs.data.orientation import as_calibrated
 from drgs.data.transforms import (
@@ -97,6 +97,7 @@ def _load_view(config: DataConfig, frame: Frame, file: Path, name: str) -> View:
         width=image.shape[1],
         height=image.shape[0],
         alpha=alpha,
+        files=files_of(config, frame, file),
         **extras_of(config, frame, (width, height)),
     )
 

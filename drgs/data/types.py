@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -65,6 +67,7 @@ class View(Viewpoint):
     alpha: Pixels | None = None  # (height, width) float32: how opaque the picture was
     mask: Pixels | None = None  # (height, width) float32: 1 where a pixel counts, else 0
     depth: Pixels | None = None  # (height, width) float32, scene units; 0 where not known
+    files: Mapping[str, Path] = field(default_factory=dict)  # it was read from: image, mask, depth
 
 
 @dataclass(frozen=True, eq=False)

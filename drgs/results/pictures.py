@@ -9,9 +9,9 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import TypeVar
 
-from drgs.core.errors import UserError
+from drgs.core.errors import UserError, listed
 from drgs.core.files import read_text
-from drgs.core.records import FolderRecord, listed
+from drgs.core.records import FolderRecord
 from drgs.results.files import METRICS, ORBIT, ORBIT_GIF
 
 COMMAND = "render"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -10,7 +11,7 @@ import numpy as np
 
 from drgs.cameras.axes import between_opencv_and_opengl
 from drgs.core.errors import UserError, one_line
-from drgs.core.files import read_text
+from drgs.core.files import atomic_path, read_text
 from drgs.data.transforms import CLOSE, MAX_BYTES
 from drgs.data.types import Dataset, Motion, View
 from drgs.results.files import CAMERAS
@@ -68,7 +69,27 @@ def _moved_motion(view: View, camera_to_world: np.ndarray) -> Motion | None:
     return replace(view.motion, close_to_world=camera_to_world @ between)
 
 
-def lens_and_motion(view: View) -> dict[str, object]:
+def frames_of(views: Iterable[View]) -> list[dict[str, object]]:
+    """The cameras of views as frames in the layout of ``transforms.json``."""
+    return [
+        {
+            "file_path": view.name,
+            "transform_matrix": between_opencv_and_opengl(view.camera_to_world).tolist(),
+            **{"fl_x": view.fx, "fl_y": view.fy, "cx": view.cx, "cy": view.cy},
+            **{"w": view.width, "h": view.height},
+            **_lens_and_motion(view),
+        }
+        for view in views
+    ]
+
+
+def write_views(path: Path, views: Iterable[View]) -> None:
+    """Write the cameras of the training views, as the data has them."""
+    with atomic_path(path) as temporary:
+        temporary.write_text(json.dumps({"frames": frames_of(views)}, indent=1) + "\n")
+
+
+def _lens_and_motion(view: View) -> dict[str, object]:
     """What ``transforms.json`` says of a camera besides its pose and intrinsics."""
     values: dict[str, object] = {}
     if view.lens is not None:

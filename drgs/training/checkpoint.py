@@ -1,23 +1,33 @@
 """Checkpoints: a fit that was stopped continues to the bytes that it would have given.
 
-One file, ``checkpoint.npz``: the trainer's state, the history so far, the seconds spent, and the
-configuration that it belongs to. It is written whole or not at all.
+One file, ``checkpoint.npz``: the trainer's state, the history so far, the seconds spent, the
+configuration that it belongs to, and what the data was. It is written whole or not at all.
+``config.yml`` follows it: a plan that is revised changes the configuration, and a process may end
+between the two files. So the checkpoint says which configuration stood there before, too.
 """
 
 from __future__ import annotations
 
 import json
+import warnings
 import zipfile
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from drgs.config.load import dump_config
+from drgs.config.changes import changed
 from drgs.config.schema import FitConfig
-from drgs.core.errors import UserError
+from drgs.core.errors import UserError, UserNote, listed
 from drgs.core.files import atomic_path
+from drgs.data.fingerprint import Fingerprint
 from drgs.results.files import CHECKPOINT, CONFIG
+from drgs.results.folder import load_run_config, write_run_config
+
+PLACES = ("data.path", "data.source", "init.point_cloud")
+"""Values that say where something is: a project that was moved has others. The start point is
+needed no more; what the data is has a fingerprint."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,28 +37,39 @@ class Checkpoint:
     trainer: dict[str, np.ndarray]  # Trainer.state()
     history: np.ndarray  # (rows, columns) float64: the rows of history.csv
     wall_s: float  # seconds spent on iterations
+    data: Fingerprint | None = None  # None: of an earlier version, which kept none
+    config: FitConfig | None = None  # of the file it was read from
 
 
 def save_checkpoint(folder: Path, config: FitConfig, checkpoint: Checkpoint) -> None:
-    """Write or replace the checkpoint of the output folder ``folder``, and its ``config.yml``.
+    """Write or replace the checkpoint of the output folder ``folder``, and then its ``config.yml``.
 
-    The configuration's end may have changed. Both files change together: one that does not belong
-    to the other could not be continued.
+    The configuration's end may have changed since ``config.yml`` was written.
     """
+    try:
+        before = load_run_config(folder)
+    except UserError:  # there is none, or somebody is just editing it
+        before = config
     arrays = {f"trainer.{name}": values for name, values in checkpoint.trainer.items()}
+    if checkpoint.data is not None:
+        arrays["data"] = np.frombuffer(checkpoint.data.to_bytes(), np.uint8)
     with atomic_path(folder / CHECKPOINT) as temporary:
         np.savez(
             temporary,
-            config=np.array(_fingerprint(config)),
+            config=np.array(_as_text(config)),
+            config_before=np.array(_as_text(before)),
             history=checkpoint.history,
             wall_s=np.array(checkpoint.wall_s),
             **arrays,
         )
-        dump_config(config, folder / CONFIG)
+    if before != config or not (folder / CONFIG).is_file():
+        write_run_config(folder, config)
 
 
 def load_checkpoint(folder: Path, config: FitConfig) -> Checkpoint | None:
     """The checkpoint of ``folder``, or None if there is none yet.
+
+    config: that of the run; where the plan had just been revised, the checkpoint's is the later.
 
     Raises UserError if the file is damaged or belongs to another configuration.
     """
@@ -59,16 +80,41 @@ def load_checkpoint(folder: Path, config: FitConfig) -> Checkpoint | None:
     try:
         with np.load(path, allow_pickle=False) as file:
             arrays = {name: file[name] for name in file.files}
-        fingerprint, history = str(arrays.pop("config")), arrays.pop("history")
-        wall_s = float(arrays.pop("wall_s"))
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+        texts = [str(arrays.pop(name)) for name in ("config", "config_before") if name in arrays]
+        own, *before = (_at_the_places_of(config, json.loads(text)) for text in texts)
+        data = arrays.pop("data", None)
+        checkpoint = Checkpoint(
+            history=arrays.pop("history"),
+            wall_s=float(arrays.pop("wall_s")),
+            data=None if data is None else Fingerprint.from_bytes(data.tobytes()),
+            config=own,
+            trainer={name.removeprefix("trainer."): values for name, values in arrays.items()},
+        )
+    except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as error:
         raise UserError(f"{path}: not a readable checkpoint ({error}); {remedy}") from None
-    if fingerprint != _fingerprint(config):
+    if config not in (own, *before):
         raise UserError(
             f"{path}: belongs to another configuration than {folder / CONFIG}; {remedy}"
         )
-    trainer = {name.removeprefix("trainer."): values for name, values in arrays.items()}
-    return Checkpoint(trainer=trainer, history=history, wall_s=wall_s)
+    return checkpoint
+
+
+def check_same_data(
+    folder: Path, where: Path, before: Fingerprint | None, now: Fingerprint
+) -> None:
+    """Raise UserError where the data of the checkpoint in ``folder`` is not what it is ``now``.
+
+    where: the dataset's folder. before: of the checkpoint; None: it has none, which is noted.
+    """
+    if before is None:
+        note = f"{folder / CHECKPOINT}: of a version that kept no record of the data: not compared"
+        warnings.warn(UserNote(note), stacklevel=2)
+    elif differences := before.differences(now):
+        raise UserError(
+            f"{folder / CHECKPOINT}: belongs to other data than {where}: {listed(differences)}; "
+            f"give the folder with the data of this fit (--data), or remove {folder / CHECKPOINT} "
+            "to start again from iteration 0"
+        )
 
 
 def remove_checkpoint(folder: Path) -> None:
@@ -76,6 +122,16 @@ def remove_checkpoint(folder: Path) -> None:
     (folder / CHECKPOINT).unlink(missing_ok=True)
 
 
-def _fingerprint(config: FitConfig) -> str:
+def _as_text(config: FitConfig) -> str:
     """Every value but where the output goes and how often it is written."""
     return json.dumps(config.model_dump(mode="json", exclude={"output"}), sort_keys=True)
+
+
+def _at_the_places_of(config: FitConfig, values: Mapping[str, object]) -> FitConfig:
+    """The configuration of a checkpoint, with the places and the section ``output`` of another."""
+    output = config.output.model_dump()
+    places = {}
+    for key in PLACES:
+        section, name = key.split(".")
+        places[key] = getattr(getattr(config, section), name)
+    return changed(FitConfig.model_validate({**values, "output": output}), places)

@@ -246,6 +246,7 @@ class Trainer:
     def restore(self, state: dict[str, np.ndarray]) -> None:
         """Continue where :meth:`state` was taken, to the same bytes."""
         self.iteration = int(state["iteration"])
+        self.integrator.sh_degree = self.sh_degree
         restore_optimizer(self.optimizer, state, PREFIX)
         self.statistics = densify.DensityStatistics(
             mi.Float(state["gradient_norms"]), mi.Float(state["views"])

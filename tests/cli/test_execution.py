@@ -8,6 +8,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 import yaml
+from support.folders import visible
 from support.small_capture import blobs, make_dataset, write_dataset
 
 from drgs import fit, render
@@ -204,7 +205,7 @@ def test_fit_stops_at_an_access_out_of_range_and_keeps_the_last_checkpoint(
     out = tmp_path / "out"
     message = fails(capsys, fit, scene / "a.yml", "--out", out, "--debug").splitlines()[-1]
     assert message.startswith("error: --debug: drjit.gather(): out-of-bounds read from position 7")
-    assert sorted(path.name for path in out.iterdir()) == ["checkpoint.npz", "config.yml"]
+    assert visible(out) == {"checkpoint.npz", "config.yml"}
     assert np.load(out / "checkpoint.npz")["trainer.iteration"] == 1
 
 

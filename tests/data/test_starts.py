@@ -20,9 +20,12 @@ from drgs.data.initial import focus_of, mean_squared_neighbour_distance, points_
 def test_a_missing_folder_is_an_error_that_says_where_to_get_the_data(tmp_path):
     folder = tmp_path / "none"
     assert refusal(folder, source="our server") == (
-        f"data.path: there is no folder {folder}; get it from our server"
+        f"data.path: there is no folder {folder}; say where it is (--data DIR), or get it from our "
+        "server"
     )
-    assert refusal(folder) == f"data.path: there is no folder {folder}"
+    assert refusal(folder) == (
+        f"data.path: there is no folder {folder}; say where it is (--data DIR)"
+    )
 
 
 def test_a_folder_of_neither_layout_is_refused(tmp_path):

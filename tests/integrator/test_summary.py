@@ -11,7 +11,6 @@ from support import small_fits as fits
 from support.views import VIEWS, Scene, tensors
 
 import drgs  # noqa: F401  (registers the plugins)
-from drgs import fit
 from drgs.cameras.camera import Pinhole
 from drgs.cameras.fisheye import Fisheye
 from drgs.cameras.radial_tangential import RadialTangential
@@ -20,7 +19,7 @@ from drgs.data.types import Motion
 from drgs.integrator.sensors import camera_from_sensor, read_sensor
 from drgs.integrator.summary import SimulatedEffect, described, summary_of_sensors, summary_of_views
 from drgs.training import history
-from drgs.training.checkpoint import load_checkpoint
+from drgs.training.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from drgs.training.effects.called_for import integrator_settings, training_effects
 from drgs.training.summary import summary_of_fit
 
@@ -305,7 +304,8 @@ def test_a_checkpoint_file_holds_the_state_of_effects(tmp_path):
     changes = {key: value for key, value in EVERYTHING.items() if key != "model__antialiased"}
     dataset = fits.with_views(fits.true_dataset(), lambda v: replace(v, depth=None))
     trainer = fits.steps(fits.make_trainer(dataset, **changes), 3)
-    fit.save(trainer, history.History(), tmp_path)
+    saved = Checkpoint(trainer.state(), history.History().as_array(), 0.0)
+    save_checkpoint(tmp_path, trainer.config, saved)
     resumed = fits.make_trainer(dataset, **changes)
     resumed.restore(load_checkpoint(tmp_path, trainer.config).trainer)
     expected, got = (fits.everything_of(fits.steps(t, 2)) for t in (trainer, resumed))

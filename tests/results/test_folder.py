@@ -1,18 +1,22 @@
 import os
-from pathlib import Path
 
 import pytest
+from support.folders import contents, visible
 
 from drgs.config.load import load_config
 from drgs.config.schema import FitConfig
 from drgs.core.errors import UserError
 from drgs.results.files import CAMERAS, COLORS, METRICS, RESULTS
 from drgs.results.folder import (
+    FOLDERS,
     claim_output_folder,
     is_finished,
     load_run_config,
+    pictures_of,
     remove_run,
 )
+
+PICTURES = pictures_of("test", ["r_0", "r_1"])
 
 
 @pytest.fixture
@@ -24,9 +28,9 @@ def config(tmp_path):
 def finished(tmp_path, config):
     """The folder of a run that has written something."""
     folder = tmp_path / "out"
-    claim_output_folder(folder, config)
-    (folder / "renders").mkdir()
-    for name in ("point_cloud.ply", "renders/r_0.png"):
+    claim_output_folder(folder, config, PICTURES)
+    for name in ("point_cloud.ply", *PICTURES):
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
         (folder / name).write_text("result")
     return folder
 
@@ -37,13 +41,9 @@ def refusal(function, *arguments):
     return str(error.value)
 
 
-def contents(folder):
-    return {p.relative_to(folder): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
-
-
 def test_a_missing_folder_is_created_and_holds_the_configuration(tmp_path, config):
     claim_output_folder(tmp_path / "a" / "b", config)
-    assert os.listdir(tmp_path / "a" / "b") == ["config.yml"]
+    assert visible(tmp_path / "a" / "b") == {"config.yml"}
     assert load_config(tmp_path / "a" / "b" / "config.yml") == config
 
 
@@ -58,10 +58,10 @@ def test_a_folder_without_results_is_taken(tmp_path, config, present):
 def test_a_run_of_the_same_configuration_may_go_on_in_its_folder(finished, config):
     before = contents(finished)
     same = FitConfig(data=config.data, output={"history_every": 3})
-    claim_output_folder(finished, same)
+    claim_output_folder(finished, same, PICTURES)
     after = contents(finished)
     assert load_run_config(finished) == same
-    assert {**after, Path("config.yml"): None} == {**before, Path("config.yml"): None}
+    assert {**after, "config.yml": None} == {**before, "config.yml": None}
 
 
 def test_a_run_is_finished_when_its_last_file_is_there_and_the_configuration_is_its_own(
@@ -76,12 +76,11 @@ def test_a_run_is_finished_when_its_last_file_is_there_and_the_configuration_is_
 
 
 def test_what_a_killed_run_was_writing_is_removed_and_nothing_else(finished, config):
-    kept = {".DS_Store", ".notes.tmp.txt", "point_cloud.ply", "renders/r_0.png"}
+    kept = {".DS_Store", ".notes.tmp.txt", "point_cloud.ply", *PICTURES}
     for name in (".checkpoint.4711.tmp.npz", "renders/.r_1.4711.tmp.png", *kept):
         (finished / name).write_text("half")
     claim_output_folder(finished, config)
-    left = {str(path) for path in contents(finished)}
-    assert left == {"config.yml", *kept}
+    assert contents(finished).keys() == {".drgs-fit.json", "config.yml", *kept}
 
 
 def test_another_run_is_named_by_what_differs(finished, config):
@@ -144,7 +143,10 @@ def test_a_removed_run_makes_room_for_another(finished, config):
 def test_removing_takes_every_result(tmp_path, config):
     claim_output_folder(tmp_path, config)
     for name in RESULTS:
-        (tmp_path / name).write_text("")
+        if name in FOLDERS:
+            (tmp_path / name / "empty").mkdir(parents=True)
+        else:
+            (tmp_path / name).write_text("")
     remove_run(tmp_path)
     assert os.listdir(tmp_path) == []
 

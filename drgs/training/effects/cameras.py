@@ -18,13 +18,13 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from drgs.cameras.axes import OPENCV_TO_MITSUBA, between_opencv_and_opengl
+from drgs.cameras.axes import OPENCV_TO_MITSUBA
 from drgs.cameras.motion import rotation_matrix
 from drgs.config.schema import CamerasConfig
 from drgs.core.files import atomic_path
 from drgs.data.types import View
 from drgs.results.files import CAMERAS
-from drgs.results.refined_cameras import LensChange, lens_and_motion
+from drgs.results.refined_cameras import LensChange, frames_of
 from drgs.training.effects.base import FitState, TrainingEffect
 from drgs.training.effects.view_parameters import ViewParameters
 from drgs.training.views import TrainingView
@@ -177,18 +177,11 @@ class CameraRefinement(TrainingEffect):
 
         ``lens_change`` says what of the intrinsics is not the data's.
         """
-        frames = [
-            {
-                "file_path": view.name,
-                "transform_matrix": between_opencv_and_opengl(view.camera_to_world).tolist(),
-                **{"fl_x": view.fx, "fl_y": view.fy, "cx": view.cx, "cy": view.cy},
-                **{"w": view.width, "h": view.height},
-                **lens_and_motion(view),
-            }
-            for view in self.refined(views)
-        ]
         with atomic_path(folder / CAMERAS) as temporary:
-            found = {"lens_change": asdict(self.lens_change), "frames": frames}
+            found = {
+                "lens_change": asdict(self.lens_change),
+                "frames": frames_of(self.refined(views)),
+            }
             temporary.write_text(json.dumps(found, indent=1) + "\n")
 
 
