@@ -19,6 +19,7 @@ import numpy as np
 
 import drgs  # noqa: F401  (registers the plugin)
 from drgs.bench.output import machine
+from drgs.cli.commands import at_least
 from drgs.cli.errors import exit_on_user_error
 from drgs.data.orbits import orbit_of_gaussians
 from drgs.gaussians.parameters import Gaussians
@@ -26,8 +27,7 @@ from drgs.io.figures import new_figure, write_figure
 from drgs.io.pictures import to_uint8
 from drgs.results import metrics
 
-FOLDER = Path(__file__).parent
-SCENE, PICTURE = FOLDER / "shapes.xml", FOLDER / "pictures" / "shapes.png"
+SCENE = Path(__file__).parent / "shapes.xml"
 
 REPEATS = {"volprim_rf_basic": 5, "splats": 25}
 
@@ -47,8 +47,14 @@ def main() -> None:
     """Entry point of the command."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("model", type=Path, nargs="?", metavar="MODEL.ply")
-    parser.add_argument("--size", type=int, default=400, help="px (default: 400)")
-    parser.add_argument("--out", type=Path, default=PICTURE, metavar="FILE.png")
+    parser.add_argument("--size", type=at_least(1), default=400, help="px (default: 400)")
+    parser.add_argument(
+        "--out",
+        type=Path,
+        default=Path("out/shapes.png"),
+        metavar="FILE.png",
+        help="(default: %(default)s)",
+    )
     args = parser.parse_args()
     with exit_on_user_error():
         mi.set_variant("llvm_ad_rgb")

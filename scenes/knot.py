@@ -1,12 +1,13 @@
-"""A glossy trefoil knot of Gaussians, computed: ``python scenes/knot.py [FILE.ply]``.
+"""A glossy trefoil knot of Gaussians, computed: ``python scenes/knot.py [--out FILE.ply]``.
 
 A model that is small enough to be shipped and needs no photographs: coloured stripes under two
-lamps, whose highlights are in the spherical harmonics.
+lamps, whose highlights are in the spherical harmonics. The one that is shipped is
+``scenes/shapes/knot.ply``.
 """
 
 from __future__ import annotations
 
-import sys
+import argparse
 from pathlib import Path
 
 import numpy as np
@@ -14,8 +15,6 @@ from scipy.spatial.transform import Rotation
 
 from drgs.gaussians.parameters import Gaussians
 from drgs.reference import splatting as reference
-
-FILE = Path(__file__).parent / "shapes" / "knot.ply"
 
 DEGREE = 2
 SIZE, TUBE = 0.36, 0.2  # scene units: of the knot's centre line, whose radius is 3; of the tube
@@ -89,8 +88,21 @@ def unit(vectors: np.ndarray) -> np.ndarray:
     return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
 
 
+def main() -> None:
+    """Entry point of the command."""
+    parser = argparse.ArgumentParser(description="Compute a glossy knot of Gaussians.")
+    parser.add_argument(
+        "--out",
+        type=Path,
+        default=Path("out/knot.ply"),
+        metavar="FILE.ply",
+        help="(default: %(default)s)",
+    )
+    args = parser.parse_args()
+    args.out.parent.mkdir(parents=True, exist_ok=True)
+    knot().save(args.out)
+    print(f"written: {args.out}")
+
+
 if __name__ == "__main__":
-    path = Path(sys.argv[1]) if len(sys.argv) > 1 else FILE
-    path.parent.mkdir(parents=True, exist_ok=True)
-    knot().save(path)
-    print(f"written: {path}")
+    main()

@@ -1,20 +1,33 @@
-"""Progress of a long run, on a terminal and in a log file."""
+"""Progress of a long run, on a terminal, in a notebook and in a log file."""
 
 from __future__ import annotations
 
+import os
 import sys
 import time
 from types import TracebackType
+from typing import TextIO
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 LOG_SECONDS = 10.0
-"""Seconds between two lines where there is no terminal."""
+"""Seconds between two lines where no bar can be drawn."""
+
+
+def draws_bars(stream: TextIO) -> bool:
+    """Whether ``stream`` is a terminal on which a line can be drawn again.
+
+    Not rich's ``is_terminal``, which believes FORCE_COLOR, as notebooks and continuous integration
+    set it. What a notebook starts with ``!`` has a terminal that keeps each line ever drawn.
+    """
+    variables = os.environ.get
+    in_notebook = "JPY_PARENT_PID" in os.environ or "inline" in variables("MPLBACKEND", "")
+    return stream.isatty() and variables("TERM") not in ("dumb", "unknown") and not in_notebook
 
 
 class RunProgress:
-    """A progress bar on a terminal; elsewhere a line every ten seconds, and at the end.
+    """A progress bar where :func:`draws_bars`; elsewhere a line every ten seconds, and the last.
 
     A context manager: leaving it restores the terminal.
 
@@ -26,8 +39,7 @@ class RunProgress:
         self._last_line = time.monotonic()
         self._first: tuple[int, float] | None = None  # how many were done, and when
         self._bar = None
-        console = Console(file=sys.stdout)
-        if console.is_terminal:
+        if draws_bars(sys.stdout):
             self._bar = Progress(
                 TextColumn(what),
                 MofNCompleteColumn(),
@@ -35,7 +47,7 @@ class RunProgress:
                 TextColumn("{task.fields[status]}"),
                 TextColumn("left"),
                 TimeRemainingColumn(),
-                console=console,
+                console=Console(file=sys.stdout),
             )
             self._task = self._bar.add_task(what, total=total, completed=done, status="")
 

@@ -53,7 +53,7 @@ PANEL_QUALITY = {"lossless": True, "quality": 60, "method": 2}
 PAGE = "page.html"
 """Of this package: the page, with ``$names`` for what :func:`write_report` fills in."""
 
-PAGE_SECONDS = 4.0
+PAGE_SECONDS = 8.0
 """Curves and page, which do not depend on the scene."""
 
 

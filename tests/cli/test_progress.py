@@ -56,16 +56,49 @@ def test_the_total_may_change_on_the_way(clock, capsys):
     assert lines(capsys) == ["iteration 11/21  left 0:10"]
 
 
-def test_a_terminal_gets_a_bar(monkeypatch):
-    class Terminal(io.StringIO):
-        def isatty(self):
-            return True
+@pytest.fixture
+def no_notebook(monkeypatch):
+    """Nor one of those that run the tests."""
+    for name in ("JPY_PARENT_PID", "MPLBACKEND", "FORCE_COLOR", "NO_COLOR", "TTY_COMPATIBLE"):
+        monkeypatch.delenv(name, raising=False)
 
-    terminal = Terminal()
-    monkeypatch.setattr(sys, "stdout", terminal)
-    monkeypatch.setenv("TERM", "xterm")
-    monkeypatch.setenv("COLUMNS", "100")
+
+def written_to(monkeypatch, is_terminal, **variables):
+    """By 2 of 3 pictures, and then the third."""
+
+    class Stream(io.StringIO):
+        def isatty(self):
+            return is_terminal
+
+    stream = Stream()
+    monkeypatch.setattr(sys, "stdout", stream)
+    for name, value in {"TERM": "xterm", "COLUMNS": "100", **variables}.items():
+        monkeypatch.setenv(name, value)
     with RunProgress("picture", 3) as shown:
-        shown.update(2, 3, "sharp")
-    written = terminal.getvalue()
-    assert "picture" in written and "2/3" in written and "sharp" in written
+        shown.update(2, 3, "loss 0.1")
+        shown.update(3, 3, "loss 0.05")
+    return stream.getvalue()
+
+
+def test_a_terminal_gets_a_bar(monkeypatch, no_notebook):
+    written = written_to(monkeypatch, is_terminal=True)
+    assert "picture" in written and "3/3" in written and "loss 0.05" in written
+    assert "\x1b[" in written
+
+
+@pytest.mark.parametrize(
+    ("is_terminal", "variables"),
+    [
+        (True, {"JPY_PARENT_PID": "17", "TERM": "xterm-color", "FORCE_COLOR": "1"}),
+        (True, {"MPLBACKEND": "module://matplotlib_inline.backend_inline"}),
+        (True, {"TERM": "dumb"}),
+        (False, {"FORCE_COLOR": "1"}),
+        (False, {"TTY_COMPATIBLE": "1"}),
+    ],
+    ids=["notebook", "notebook in an editor", "dumb terminal", "forced colours", "as a terminal"],
+)
+def test_notebooks_and_logs_get_lines_without_escape_codes(
+    monkeypatch, no_notebook, is_terminal, variables
+):
+    written = written_to(monkeypatch, is_terminal, **variables)
+    assert written == "picture 3/3  loss 0.05  left 0:00\n"

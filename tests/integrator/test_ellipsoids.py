@@ -226,7 +226,7 @@ def test_the_shipped_model_is_what_its_program_makes(monkeypatch):
     monkeypatch.syspath_prepend(SCENES)
     import knot
 
-    made, shipped = knot.knot(), Gaussians.load(knot.FILE)
+    made, shipped = knot.knot(), Gaussians.load(REPOSITORY / "scenes" / "shapes" / "knot.ply")
     for name in PARAMETER_NAMES:
         if name != "quats":  # either sign is the same rotation
             np.testing.assert_allclose(getattr(made, name), getattr(shipped, name), atol=1e-5)

@@ -1,0 +1,92 @@
+"""No command and no script writes into the checkout unless it is told to."""
+
+import importlib
+import sys
+
+import numpy as np
+import pytest
+from conftest import REPOSITORY
+
+from drgs.__main__ import COMMANDS
+from drgs.bench.__main__ import COMMANDS as MEASUREMENTS
+from drgs.cli.commands import CommandParser
+
+SCENES = REPOSITORY / "scenes"
+FOLDERS = ("docs", "drgs", "plugins", "scenes", "tests")
+SCRIPTS = ("compare_shapes", "knot", "relight")
+MODULES = [c.module for c in COMMANDS.values()] + [f"drgs.bench.{name}" for name in MEASUREMENTS]
+
+
+def files_of_the_checkout():
+    """By path, size and time of the last change."""
+    paths = [path for folder in FOLDERS for path in (REPOSITORY / folder).rglob("*")]
+    kept = [path for path in paths if path.is_file() and "__pycache__" not in path.parts]
+    return {path: (path.stat().st_size, path.stat().st_mtime_ns) for path in kept}
+
+
+def pictures_in(folder):
+    """In the place of what a script computes."""
+    folder.mkdir(parents=True)
+    (folder / "target.png").write_text("a picture")
+
+
+@pytest.fixture
+def script(monkeypatch, tmp_path):
+    """Runs one in another folder, without what takes long: script(name, *arguments)."""
+
+    def run(name, *arguments):
+        monkeypatch.syspath_prepend(SCENES)
+        monkeypatch.chdir(tmp_path)
+        monkeypatch.setattr(sys, "argv", [f"{name}.py", *map(str, arguments)])
+        module = importlib.import_module(name)
+        if name == "compare_shapes":
+            result = module.Result(np.zeros((4, 4, 3)), 1.0)
+            monkeypatch.setattr(module, "measure", lambda *arguments: result)
+        if name == "relight":
+            monkeypatch.setattr(module.Stage, "of", lambda *arguments: None)
+            monkeypatch.setattr(module, "relight", lambda *arguments: pictures_in(arguments[-1]))
+        before = files_of_the_checkout()
+        module.main()
+        assert files_of_the_checkout() == before
+        return {str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*.p*")}
+
+    return run
+
+
+def test_every_script_is_tried():
+    found = {path.stem for path in SCENES.glob("*.py") if "__main__" in path.read_text()}
+    assert found == set(SCRIPTS)
+
+
+def test_pictures_of_shapes_go_where_the_command_is_run(script):
+    assert script("compare_shapes") == {"out/shapes.png"}
+    assert script("compare_shapes", "--out", "a.png") == {"out/shapes.png", "a.png"}
+
+
+def test_the_knot_goes_where_the_command_is_run(script):
+    assert script("knot") == {"out/knot.ply"}
+
+
+def test_what_was_relit_goes_where_the_command_is_run(script):
+    model = SCENES / "shapes" / "knot.ply"
+    assert script("relight", model) == {"out/relight/target.png"}
+
+
+@pytest.mark.parametrize("module", MODULES)
+def test_no_command_writes_anywhere_else_by_default(module):
+    parser = CommandParser(prog="command")
+    importlib.import_module(module).add_arguments(parser)
+    for action in parser._actions:
+        if action.dest == "out":
+            assert action.required or action.default is None or not action.default.is_absolute()
+
+
+def test_a_file_that_is_touched_is_found(tmp_path, monkeypatch):
+    monkeypatch.setattr(sys.modules[__name__], "REPOSITORY", tmp_path)
+    path = tmp_path / "docs" / "a.png"
+    path.parent.mkdir()
+    path.write_text("a")
+    before = files_of_the_checkout()
+    assert set(before) == {path}
+    path.write_text("bb")
+    assert files_of_the_checkout() != before
