@@ -4,7 +4,7 @@ import json
 
 import pytest
 import yaml
-from support.commands import run_in_process
+from support.commands import assert_ends_well, assert_refused, run_in_process
 from support.folders import contents
 from support.render_command import sensor, write_scene
 from support.small_capture import blobs, make_dataset, pose_around, write_dataset
@@ -20,20 +20,6 @@ def fitted(tmp_path):
     config = {"data": {"path": str(tmp_path / "data")}}
     (tmp_path / "run" / "config.yml").write_text(yaml.safe_dump(config))
     return tmp_path / "run"
-
-
-def assert_refused(main, *arguments, folder, message):
-    """With status 2, in one line, and every file of ``folder`` as it was."""
-    before = contents(folder)
-    outcome = run_in_process(main, *arguments)
-    assert outcome.returncode == 2, outcome.stdout + outcome.stderr
-    assert message in outcome.stderr and len(outcome.stderr.splitlines()) == 1
-    assert contents(folder) == before
-
-
-def assert_rendered(*arguments):
-    outcome = run_in_process(render.main, *arguments)
-    assert outcome.returncode == 0, outcome.stderr
 
 
 VIEWS = {
@@ -76,16 +62,16 @@ def test_a_reference_beside_a_scene_is_not_replaced(tmp_path):
     message = "holds blobs.exr, which this command would replace"
     assert_refused(render.main, scene, "--out", tmp_path, folder=tmp_path, message=message)
     (tmp_path / "blobs.exr").unlink()
-    assert_rendered(scene, "--out", tmp_path)
-    assert_rendered(scene, "--out", tmp_path)
+    assert_ends_well(render.main, scene, "--out", tmp_path)
+    assert_ends_well(render.main, scene, "--out", tmp_path)
 
 
 def test_pictures_are_rendered_again_into_their_own_folder_until_they_are_changed(fitted, tmp_path):
     out = tmp_path / "out"
     for way in VIEWS:
-        assert_rendered(fitted, *VIEWS[way], "--out", out)
+        assert_ends_well(render.main, fitted, *VIEWS[way], "--out", out)
     for way in VIEWS:
-        assert_rendered(fitted, *VIEWS[way], "--background", "black", "--out", out)
+        assert_ends_well(render.main, fitted, *VIEWS[way], "--background", "black", "--out", out)
     (out / "r_0.png").write_bytes((fitted.parent / "data" / "test" / "r_0.png").read_bytes())
     message = "holds r_0.png, which this command would replace and has not written, or which chang"
     assert_refused(render.main, fitted, "--out", out, folder=tmp_path, message=message)
@@ -95,7 +81,7 @@ def test_pictures_that_an_interrupted_command_left_are_rendered_again(
     fitted, tmp_path, monkeypatch
 ):
     expected, out = tmp_path / "whole", tmp_path / "out"
-    assert_rendered(fitted, "--out", expected)
+    assert_ends_well(render.main, fitted, "--out", expected)
     write_png, written = render.write_png, []
 
     def write_one(path, image):
@@ -108,7 +94,7 @@ def test_pictures_that_an_interrupted_command_left_are_rendered_again(
         patched.setattr(render, "write_png", write_one)
         assert run_in_process(render.main, fitted, "--out", out).returncode == 130
     assert sorted(path.name for path in out.glob("*.png")) == ["r_0.png"]
-    assert_rendered(fitted, "--out", out)
+    assert_ends_well(render.main, fitted, "--out", out)
     assert contents(out) == contents(expected)
 
 
@@ -116,10 +102,10 @@ def test_pictures_that_an_interrupted_command_left_are_rendered_again(
 def test_a_folder_that_an_earlier_version_rendered_is_its_own(fitted, tmp_path, ways):
     out = fitted.parent / "data" / "renders"
     for way in ways:
-        assert_rendered(fitted, *VIEWS[way], "--out", out)
+        assert_ends_well(render.main, fitted, *VIEWS[way], "--out", out)
     (out / ".drgs-render.json").unlink()
     for way in [*ways, *ways]:
-        assert_rendered(fitted, *VIEWS[way], "--background", "black", "--out", out)
+        assert_ends_well(render.main, fitted, *VIEWS[way], "--background", "black", "--out", out)
 
 
 @pytest.mark.parametrize("metrics", ["[", "[]", '{"split": "test"}', "7"])
@@ -132,7 +118,7 @@ def test_other_metrics_are_somebody_elses(fitted, tmp_path, metrics):
 
 def test_the_record_of_a_finished_command_names_every_file(fitted, tmp_path):
     out = tmp_path / "out"
-    assert_rendered(fitted, *VIEWS["orbit"], "--out", out)
+    assert_ends_well(render.main, fitted, *VIEWS["orbit"], "--out", out)
     files = json.loads((out / ".drgs-render.json").read_text())["files"]
     assert set(files) == set(contents(out)) - {".drgs-render.json"}
     assert all(files.values())

@@ -4,6 +4,9 @@ from collections.abc import Callable
 from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import dataclass
 from io import StringIO
+from pathlib import Path
+
+from support.folders import contents
 
 
 @dataclass(frozen=True)
@@ -25,3 +28,22 @@ def run_in_process(main: Callable[[list[str]], None], *arguments: object) -> Out
         except SystemExit as stop:
             status = stop.code or 0
     return Outcome(status, out.getvalue(), err.getvalue())
+
+
+def assert_ends_well(main: Callable[[list[str]], None], *arguments: object) -> Outcome:
+    """With status 0."""
+    outcome = run_in_process(main, *arguments)
+    assert outcome.returncode == 0, outcome.stderr
+    return outcome
+
+
+def assert_refused(
+    main: Callable[[list[str]], None], *arguments: object, folder: Path, message: str
+) -> None:
+    """With status 2, in one line that holds ``message``, and every file of ``folder`` as it was."""
+    before = contents(folder)
+    outcome = run_in_process(main, *arguments)
+    assert outcome.returncode == 2, outcome.stdout + outcome.stderr
+    assert len(outcome.stderr.splitlines()) == 1, outcome.stderr
+    assert message in outcome.stderr
+    assert contents(folder) == before

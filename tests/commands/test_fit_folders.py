@@ -1,0 +1,313 @@
+"""Folders of ``drgs.fit``: what others wrote stays, and a fit goes on wherever it is moved to."""
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+import yaml
+from support.commands import assert_ends_well, assert_refused
+from support.fit_command import (
+    ITERATIONS,
+    assert_fit_refused,
+    assert_fits,
+    run_fit,
+    stop_after,
+    without_pictures,
+    write_project,
+)
+from support.folders import contents, visible
+
+from drgs import render
+
+POINTS = "out/point_cloud.ply"
+
+
+@pytest.fixture(scope="module")
+def projects(tmp_path_factory):
+    """The folders of a project whose fit has ended, and of one whose fit was stopped."""
+    with pytest.MonkeyPatch.context() as patched:
+        without_pictures(patched)
+        folder = tmp_path_factory.mktemp("projects")
+        for name in ("ended", "stopped"):
+            (folder / name).mkdir()
+            config = write_project(folder / name)
+            if name == "stopped":
+                stop_after(patched, 5)
+            outcome = run_fit(config, "--out", folder / name / "out")
+            assert outcome.returncode == (130 if name == "stopped" else 0), outcome.stderr
+    return folder
+
+
+@pytest.fixture
+def ended(projects, tmp_path):
+    return copied(projects / "ended", tmp_path)
+
+
+@pytest.fixture
+def stopped(projects, tmp_path):
+    return copied(projects / "stopped", tmp_path)
+
+
+def copied(project, folder):
+    """The project, as if it had been made in ``folder``."""
+    project = shutil.copytree(project, folder / project.name)
+    path = project / "out" / "config.yml"
+    values = yaml.safe_load(path.read_text())
+    values["data"]["path"] = str(project / "data")
+    values["output"]["dir"] = str(project / "out")
+    path.write_text(yaml.safe_dump(values, sort_keys=False))
+    return project
+
+
+@pytest.fixture(autouse=True)
+def fast(monkeypatch):
+    without_pictures(monkeypatch)
+
+
+def assert_as_uninterrupted(folder, projects):
+    assert (folder / POINTS).read_bytes() == (projects / "ended" / POINTS).read_bytes()
+    assert visible(folder / "out") == visible(projects / "ended" / "out")
+    rows = (folder / "out" / "history.csv").read_text().splitlines()
+    assert len(rows) == ITERATIONS + 1
+
+
+# ----------------------------------------------------------------------------------------------
+# Files of others
+# ----------------------------------------------------------------------------------------------
+
+
+def test_a_configuration_that_no_fit_has_written_is_kept(tmp_path):
+    """Whether it is the one to be fitted, or another; also with --overwrite."""
+    config = write_project(tmp_path)
+    config = config.rename(tmp_path / "config.yml")
+    text = config.read_text()
+    mine = tmp_path / "mine"
+    mine.mkdir()
+    (mine / "config.yml").write_text(f"# by hand\n{text.replace('path: data', 'path: ../data')}")
+    for file in (config, mine / "config.yml"):
+        message = f"{mine / 'config.yml'}: would be replaced, and was not written by a fit; choose"
+        assert_fit_refused(file, "--out", mine, folder=tmp_path, message=message)
+        message = f"{mine}: must hold nothing but a run to be replaced, got config.yml; move"
+        assert_fit_refused(file, "--out", mine, "--overwrite", folder=tmp_path, message=message)
+    message = "must be new or empty, got one that holds config.yml, data, mine"
+    for options in ([], ["--budget", 60]):
+        assert_fit_refused(
+            config, "--out", tmp_path, *options, folder=tmp_path, message="config.yml"
+        )
+
+
+def test_a_configuration_that_a_fit_has_written_may_be_fitted_where_it_is(ended, projects):
+    (ended / "again").mkdir()
+    shutil.copy(ended / "out" / "config.yml", ended / "again")
+    arguments = (ended / "again" / "config.yml", "--data", ended / "data")
+    assert_fits(*arguments, "--out", ended / "again")
+    expected = (projects / "ended" / POINTS).read_bytes()
+    assert (ended / "again" / "point_cloud.ply").read_bytes() == expected
+
+
+@pytest.mark.parametrize(
+    "name", ["notes.txt", "renders/mine.png", "renders/test/mine.png", "side_by_side/.mine"]
+)
+@pytest.mark.parametrize("recorded", [True, False])
+def test_files_of_others_are_not_removed_with_a_run(ended, name, recorded):
+    out = ended / "out"
+    if not recorded:
+        (out / ".drgs-fit.json").unlink()
+    (out / name).parent.mkdir(exist_ok=True)
+    (out / name).write_text("mine")
+    message = f"must hold nothing but a run to be replaced, got {name}; move that away"
+    arguments = (ended / "a.yml", "--out", out, "--overwrite")
+    assert_fit_refused(*arguments, folder=ended, message=message)
+    if name == "notes.txt":
+        (out / name).unlink()
+        assert_fits(*arguments)
+
+
+def test_results_that_were_changed_are_not_removed(ended):
+    (ended / "out" / "history.csv").write_text("with remarks")
+    arguments = (ended / "a.yml", "--out", ended / "out", "--overwrite")
+    assert_fit_refused(*arguments, folder=ended, message="got history.csv; move")
+
+
+def test_a_picture_of_the_users_in_the_way_of_a_fit_is_kept(stopped):
+    (stopped / "out" / "renders" / "test").mkdir(parents=True)
+    (stopped / "out" / "renders" / "test" / "r_1.png").symlink_to(
+        stopped / "data" / "test" / "r_1.png"
+    )
+    message = "out: holds renders/test/r_1.png, which this command would replace"
+    assert_fit_refused("--resume", stopped / "out", folder=stopped, message=message)
+
+
+def test_every_file_of_a_finished_fit_is_in_its_record(ended):
+    files = json.loads((ended / "out" / ".drgs-fit.json").read_text())["files"]
+    assert set(files) == visible(ended / "out") - {"config.yml"}
+    assert all(files.values())
+
+
+# ----------------------------------------------------------------------------------------------
+# Changed data
+# ----------------------------------------------------------------------------------------------
+
+
+def edit(folder, change, split="train"):
+    """Change the parsed frames of a split."""
+    path = folder / f"transforms_{split}.json"
+    values = json.loads(path.read_text())
+    change(values["frames"])
+    path.write_text(json.dumps(values))
+
+
+def another_picture(folder, split="train"):
+    shutil.copy(folder / split / "r_0.png", folder / split / "r_1.png")
+
+
+def other_sizes(folder):
+    """Of all training pictures."""
+    from PIL import Image
+
+    for path in (folder / "train").iterdir():
+        with Image.open(path) as image:
+            image.resize((16, 12)).save(path)
+
+
+def moved_camera(frames):
+    frames[2]["transform_matrix"][0][3] += 1e-3
+
+
+def masked(folder):
+    from PIL import Image
+
+    Image.new("L", (32, 24), 255).save(folder / "mask.png")
+    edit(folder, lambda frames: frames[0].update(mask_path="mask.png"))
+
+
+CHANGES = {
+    "training view r_1 is missing": lambda data: edit(data, lambda frames: frames.pop(1)),
+    "training view r_9 is new": lambda data: (
+        shutil.copy(data / "train" / "r_0.png", data / "train" / "r_9.png"),
+        edit(data, lambda frames: frames.append({**frames[0], "file_path": "train/r_9"})),
+    ),
+    "the training views are in another order": lambda data: edit(data, list.reverse),
+    "the picture of training view r_1": another_picture,
+    "the size (32x24, now 16x12) of training view r_0, the picture of training view r_0, the size "
+    "(32x24, now 16x12) of training view r_1 and 3 more": other_sizes,
+    "the camera of training view r_2": lambda data: edit(data, moved_camera),
+    "the mask of training view r_0": masked,
+    "the picture of test view r_1": lambda data: another_picture(data, "test"),
+}
+
+
+@pytest.mark.parametrize("text", CHANGES)
+def test_a_fit_whose_data_has_changed_is_not_continued(stopped, text):
+    CHANGES[text](stopped / "data")
+    out, data = stopped / "out", stopped / "data"
+    for arguments in (["--resume", out], [stopped / "a.yml", "--out", out]):
+        message = f"checkpoint.npz: belongs to other data than {data}: {text}; give the folder"
+        assert_fit_refused(*arguments, folder=stopped, message=message)
+
+
+def test_the_same_pictures_written_again_in_place_are_the_same_data(stopped, projects):
+    for path in (stopped / "data").rglob("*"):
+        if path.is_file():
+            path.write_bytes(path.read_bytes())
+    assert "continues at iteration 4" in assert_fits("--resume", stopped / "out").stdout
+    assert_as_uninterrupted(stopped, projects)
+
+
+# ----------------------------------------------------------------------------------------------
+# Moved
+# ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("by", ["resume", "same command"])
+def test_a_project_that_was_moved_as_a_whole_goes_on(stopped, projects, tmp_path, by):
+    moved = stopped.rename(tmp_path / "after")
+    arguments = ["--resume", moved / "out"]
+    if by == "same command":
+        arguments = [moved / "a.yml", "--out", moved / "out"]
+    outcome = assert_fits(*arguments)
+    note = f"data.path: {stopped / 'data'} is not there any more; taken from {moved / 'data'}\n"
+    assert (note in outcome.stdout) == (by == "resume")
+    assert "continues at iteration 4" in outcome.stdout
+    assert_as_uninterrupted(moved, projects)
+
+
+def test_data_that_was_moved_alone_is_named(stopped, projects, tmp_path):
+    (stopped / "data").rename(tmp_path / "elsewhere")
+    message = f"data.path: there is no folder {stopped / 'data'}; say where it is (--data DIR)"
+    assert_fit_refused("--resume", stopped / "out", folder=stopped, message=message)
+    assert_fits("--resume", stopped / "out", "--data", tmp_path / "elsewhere")
+    assert_as_uninterrupted(stopped, projects)
+
+
+def test_a_path_may_be_corrected_by_hand(stopped, projects, tmp_path):
+    (stopped / "data").rename(tmp_path / "elsewhere")
+    path = stopped / "out" / "config.yml"
+    values = yaml.safe_load(path.read_text())
+    values["data"]["path"] = str(tmp_path / "elsewhere")
+    text = f"# moved to elsewhere\n{yaml.safe_dump(values)}"
+    path.write_text(text)
+    assert_fits("--resume", stopped / "out")
+    assert path.read_text() == text
+    assert_as_uninterrupted(stopped, projects)
+
+
+def test_other_data_is_refused_by_its_content(stopped, tmp_path):
+    shutil.copytree(stopped / "data", tmp_path / "other")
+    another_picture(tmp_path / "other")
+    arguments = ("--resume", stopped / "out", "--data", tmp_path / "other")
+    message = f"belongs to other data than {tmp_path / 'other'}: the picture of training view r_1;"
+    assert_fit_refused(*arguments, folder=stopped, message=message)
+
+
+def test_a_finished_fit_is_finished_wherever_its_data_is(ended, tmp_path):
+    before = contents(ended)
+    for options in ([], ["--data", tmp_path]):
+        outcome = assert_fits("--resume", ended / "out", *options)
+        assert "this fit is finished" in outcome.stdout
+    assert contents(ended) == before
+
+
+def test_a_fit_of_an_earlier_version_that_was_moved_is_continued_with_a_note(
+    stopped, projects, tmp_path
+):
+    """It had no fingerprint of the data; the folder had no record, and its files fewer values."""
+    out = stopped.rename(tmp_path / "after") / "out"
+    (out / ".drgs-fit.json").unlink()
+    with np.load(out / "checkpoint.npz") as file:
+        arrays = {name: file[name] for name in file.files if name not in ("data", "config_before")}
+    config = json.loads(str(arrays["config"]))
+    del config["model"]["smoothing"]
+    arrays["config"] = np.array(json.dumps(config, sort_keys=True))
+    np.savez(out / "checkpoint.npz", **arrays)
+    values = yaml.safe_load((out / "config.yml").read_text())
+    del values["model"]["smoothing"]
+    (out / "config.yml").write_text(yaml.safe_dump(values, sort_keys=False))
+    outcome = assert_fits("--resume", out)
+    assert "of a version that kept no record of the data: not compared" in outcome.stdout
+    assert "continues at iteration 4" in outcome.stdout
+    assert_as_uninterrupted(out.parent, projects)
+
+
+def test_an_orbit_needs_nothing_but_the_folder_of_a_fit(ended, tmp_path):
+    """Neither its data nor a path to it; the pictures are those of the cameras of the data."""
+    orbit = ("--orbit", 2, "--out")
+    arguments = (ended / "out", "--data", ended / "data", *orbit, tmp_path / "by data")
+    assert_ends_well(render.main, *arguments)
+    (ended / "out").rename(tmp_path / "alone")
+    shutil.rmtree(ended)
+    assert_ends_well(render.main, tmp_path / "alone", *orbit, tmp_path / "orbit")
+    assert contents(tmp_path / "orbit") == contents(tmp_path / "by data")
+    views = json.loads((tmp_path / "alone" / "views.json").read_text())["frames"]
+    assert [view["file_path"] for view in views] == ["r_0", "r_1", "r_2"]
+
+
+def test_the_test_views_of_a_project_that_was_moved_are_rendered(ended, tmp_path):
+    moved = ended.rename(tmp_path / "moved")
+    outcome = assert_ends_well(render.main, moved / "out", "--out", tmp_path / "renders")
+    assert f"taken from {moved / 'data'}" in outcome.stdout
+    (moved / "data").rename(tmp_path / "elsewhere")
+    message = "there is no folder /"
+    arguments = (moved / "out", "--out", tmp_path / "b")
+    assert_refused(render.main, *arguments, folder=tmp_path, message=message)

@@ -1,0 +1,64 @@
+"""``drgs.fit`` on a scene so small that a fit takes a fraction of a second."""
+
+from pathlib import Path
+
+import pytest
+import yaml
+
+from drgs import fit
+from support.commands import Outcome, assert_ends_well, assert_refused, run_in_process
+from support.small_capture import make_dataset, write_dataset
+
+ITERATIONS = 8
+
+VALUES = {
+    "data": {"path": "data"},
+    "init": {"num_points": 40, "half_extent": 0.5},
+    "model": {"sh_degree": 1, "sh_increase_every": 3},
+    "densify": {"start": 1, "stop": 7, "every": 2, "reset_every": 3, "grad_threshold": 1e-6},
+    "iterations": ITERATIONS,
+    "output": {"checkpoint_every": 2, "history_every": 1},
+}
+
+
+def write_project(folder: Path, **values: object) -> Path:
+    """``data/`` and ``a.yml``, which fits it; values: other sections. Returns ``a.yml``."""
+    write_dataset(folder / "data", make_dataset(train=3, test=2))
+    (folder / "a.yml").write_text(yaml.safe_dump({**VALUES, **values}))
+    return folder / "a.yml"
+
+
+def run_fit(*arguments: object) -> Outcome:
+    """The command, in this process."""
+    return run_in_process(fit.main, *arguments)
+
+
+def assert_fits(*arguments: object) -> Outcome:
+    """The command ends well."""
+    return assert_ends_well(fit.main, *arguments)
+
+
+def assert_fit_refused(*arguments: object, folder: Path, message: str) -> None:
+    """See :func:`assert_refused`."""
+    assert_refused(fit.main, *arguments, folder=folder, message=message)
+
+
+def without_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A report that takes no time: an empty page."""
+
+    def write_page(out: Path, *_: object) -> None:
+        (out / "report.html").write_text("")
+
+    monkeypatch.setattr(fit, "write_results", write_page)
+
+
+def stop_after(monkeypatch: pytest.MonkeyPatch, iteration: int) -> None:
+    """Ctrl-C, without anything being saved, when so many iterations are done."""
+    step = fit.Trainer.step
+
+    def step_and_stop(trainer: fit.Trainer):
+        if trainer.iteration == iteration:
+            raise KeyboardInterrupt
+        return step(trainer)
+
+    monkeypatch.setattr(fit.Trainer, "step", step_and_stop)
