@@ -17,9 +17,10 @@ from drgs.accuracy.pipeline import pipeline_of
 from drgs.cameras.camera import Camera
 from drgs.config.approximations import Approximations
 from drgs.core.arrays import from_host, interleave, types_of
-from drgs.core.constants import ALPHA_CUT, LOW_PASS
+from drgs.core.constants import ALPHA_CUT, LOW_PASS, MAX_FEATURES
 from drgs.core.errors import did_you_mean
 from drgs.core.llvm import ensure_usable_llvm
+from drgs.core.memory import why_too_large
 from drgs.effects.features import NamedFeature
 from drgs.gaussians.parameters import Gaussians
 from drgs.splatting.projection import GaussianRows, load_rows
@@ -102,7 +103,7 @@ def rasterization(
     or float64.
 
     means: (N, 3) world; quats: (N, 4) wxyz, of any norm; scales: (N, 3) standard deviations, world
-    units; opacities: (N,) in 0..1; colors: (N, D) or, for each camera, (C, N, D), of any D; with
+    units; opacities: (N,) in 0..1; colors: (N, D) or, for each camera, (C, N, D), D up to 64; with
     ``sh_degree`` coefficients (N, K, 3) or (C, N, K, 3), K at least (sh_degree + 1)^2, whose colour
     is max(0, SH + 0.5); viewmats: (C, 4, 4) world to camera, x right, y down, z forward; Ks:
     (C, 3, 3), px, pixel centres at (i + 0.5, j + 0.5), no skew; width, height: px.
@@ -142,6 +143,8 @@ def rasterization(
     selected = _approximations(approximations, eps2d, rasterize_mode, sh_degree)
     _require(render_mode in RENDER_MODES, "render_mode", f"one of {RENDER_MODES}", render_mode)
     _require(width >= 1 and height >= 1, "width and height", "1 px or more", (width, height))
+    why = why_too_large(int(width), int(height))
+    _require(why is None, "width and height", f"smaller: {why}", (width, height))
     given = {
         "means": means,
         "quats": quats,
@@ -275,6 +278,8 @@ def _check_shapes(inputs: Mapping[str, Any], sh_degree: int | None) -> None:
         fits = shape[:-2] in ((num,), (views, num)) and shape[-1] == 3 and shape[-2] >= least
         wanted = f"({num}, K, 3) or ({views}, {num}, K, 3), K >= {least}, for sh_degree {sh_degree}"
     _require(fits, "colors", f"of shape {wanted}", shape)
+    width = shape[-1]
+    _require(width <= MAX_FEATURES, "colors", f"of at most {MAX_FEATURES} channels", width)
     if "backgrounds" in inputs:
         wanted, got = (views, shape[-1]), inputs["backgrounds"].shape
         _require(got == wanted, "backgrounds", f"of shape {wanted}", got)

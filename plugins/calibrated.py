@@ -211,6 +211,11 @@ class CalibratedSensor(mi.Sensor):
         camera = self._pinhole(state)
         return camera.with_lens(self.lens.with_named(state.device))
 
+    def num_poses(self) -> int:
+        """Poses whose pictures are averaged: 1 unless motion blurs them."""
+        moves = self.to_world_close is not None and self.shutter == "global"
+        return self.shutter_samples if moves else 1
+
     def _pinhole(self, state: SensorState) -> Camera:
         device = state.device
         focal, principal = (device["fx"], device["fy"]), (device["cx"], device["cy"])

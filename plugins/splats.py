@@ -7,7 +7,7 @@ Executed once per Mitsuba variant (see ``drgs.plugins``). The rasterizer itself 
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterable
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -20,6 +20,7 @@ from drgs.core.constants import NEAR
 from drgs.core.errors import PluginError, UnsupportedError
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 from drgs.integrator.cache import Memory
+from drgs.integrator.limits import check_columns
 from drgs.integrator.picture import Picture, sensors_of
 from drgs.integrator.properties import (
     AOVS,
@@ -137,7 +138,7 @@ class SplatsIntegrator(mi.CppADIntegrator):
          of these weights; ``normal`` (``name.X``, ``.Y``, ``.Z``) the weighted sum of the splats'
          shortest axes, unit vectors in the world that point to the camera; a type that is the name
          of a parameter ``feature_...`` (``name.0``, ``.1``, ...) the weighted sum of its rows.
-         (Default: none)
+         There may be 64 channels besides alphas. (Default: none)
 
      * - ignore
        - |string|
@@ -282,6 +283,7 @@ class SplatsIntegrator(mi.CppADIntegrator):
         self.nested = nested_integrator(props)
         self.nested_spp = integer(props, "nested_spp", 0, least=0)
         refuse_unknown(props, KNOWN)
+        self._check_columns()
 
         self.last: LastBackward | None = None
         self.memory = Memory()
@@ -319,8 +321,12 @@ class SplatsIntegrator(mi.CppADIntegrator):
         if dr.width(self.shN) == 0:  # not exposed, so that its rows could not be set
             self.shN = dr.zeros(mi.TensorXf, (next(iter(self.means.shape), 0), 0, 3))
         check_shapes(replace(self._own, features=self.features))
+        self._check_columns()
         if not (self._sh_degree_is_given or self._scene_has_shapes):
             check_degree(self.sh_degree, self._own)
+
+    def _check_columns(self) -> None:
+        check_columns({n: len(self.channels_of(k)) for n, k in self.aovs.items() if k != "alpha"})
 
     @property
     def sh_degree(self) -> int:
@@ -382,7 +388,7 @@ class SplatsIntegrator(mi.CppADIntegrator):
         """Of the channels besides colour and alpha."""
         return [f"{name}.{c}" for name, kind in self.aovs.items() for c in self.channels_of(kind)]
 
-    def channels_of(self, kind: str) -> Iterable[int | str]:
+    def channels_of(self, kind: str) -> Sequence[int | str]:
         """What comes behind the dot in the names of an AOV's channels."""
         return AOVS[kind] if kind in AOVS else range(self.features[kind].shape[1])
 

@@ -24,6 +24,14 @@ and its copy on the host."""
 SAMPLE_BYTES = 80
 """The same for each further sample of a pixel, whose planes are kept as well."""
 
+CHANNEL_BYTES = 24
+"""The same for each channel of the film besides colour: its plane, and its part of the block, of
+the picture and of the copy."""
+
+UNASKED_BYTES = 1 << 28
+"""A picture that needs less is rendered without asking what there is, which may take a millisecond:
+fits render hundreds in a second."""
+
 _PROC, _CGROUPS = Path("/proc"), Path("/sys/fs/cgroup")
 
 _UNLIMITED = 1 << 60
@@ -59,9 +67,10 @@ def why_too_large(width: int, height: int, channels: int = 3, samples: int = 1) 
             f"{asked} are too many for Dr.Jit, whose arrays end at 2^32 entries; at most "
             f"{_pixels(MAX_LANES // widest)}"
         )
-    of_pixel = PICTURE_BYTES + SAMPLE_BYTES * (samples - 1)
-    needed, available = pixels * of_pixel, available_memory()
-    if needed <= available:
+    of_channels = CHANNEL_BYTES * (channels - 3)
+    of_pixel = PICTURE_BYTES + SAMPLE_BYTES * (samples - 1) + of_channels
+    needed = pixels * of_pixel
+    if needed <= UNASKED_BYTES or needed <= (available := available_memory()):
         return None
     return (
         f"{asked} need about {readable(needed)} of memory, of which {readable(available)} are "

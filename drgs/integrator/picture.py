@@ -22,7 +22,8 @@ import mitsuba as mi
 
 from drgs.gaussians.parameters import Gaussians
 from drgs.integrator.film import CenterSamples, FilmSamples
-from drgs.integrator.sensors import is_batch
+from drgs.integrator.limits import check_picture
+from drgs.integrator.sensors import is_batch, num_poses
 from drgs.integrator.settings import SplatsSettings
 from drgs.integrator.view import Planes, View, constant_background
 from drgs.splatting import rendering
@@ -56,6 +57,9 @@ class Picture:
         hybrid = hybrid_of(integrator, scene, sensor, seed, spp)
         names = integrator.aov_names() + ([] if hybrid is None else hybrid.insertion.channels)
         film, spp = sensor.film(), spp or sensor.sampler().sample_count()
+        poses = 1 if "motion" in integrator.ignore else max(map(num_poses, sensors_of(sensor)))
+        nested_spp = 0 if hybrid is None else hybrid.spp or spp
+        check_picture(film, spp, poses, len(names), nested_spp)
         maps = integrator.memory.film_maps
         if spp == 1 and film.rfilter().is_box_filter():
             samples = CenterSamples(film, maps, names)

@@ -18,6 +18,7 @@ import mitsuba as mi
 import numpy as np
 
 from drgs.config.approximations import DECLARED, Approximations, Declared, Value
+from drgs.core.constants import MAX_INT
 from drgs.core.errors import PluginError, PluginTypeError, did_you_mean
 from drgs.effects.compose import IGNORABLE
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
@@ -222,11 +223,13 @@ def boolean(props: mi.Properties, name: str, default: bool) -> bool:
 
 
 def integer(props: mi.Properties, name: str, default: int, least: int) -> int:
-    """An integer of at least ``least``."""
+    """An integer of at least ``least`` and at most ``MAX_INT``."""
     value, expected = props.get(name, default), f"an integer of at least {least}"
     if isinstance(value, bool) or not isinstance(value, int):
         raise PluginTypeError(_message(props, name, expected, value))
-    if value < least:
+    if value > MAX_INT:
+        expected = f"an integer from {least} to {MAX_INT}"
+    if not least <= value <= MAX_INT:
         raise PluginError(_message(props, name, expected, value))
     return value
 

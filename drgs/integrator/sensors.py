@@ -54,6 +54,14 @@ class CameraSensor(Protocol):
     def camera_from_state(self, state: SensorState) -> Camera:
         """The camera with these values of its parameters; OpenCV axes, px."""
 
+    def num_poses(self) -> int:
+        """Poses whose pictures are averaged: 1 unless motion blurs them."""
+
+
+def num_poses(sensor: mi.Sensor) -> int:
+    """Poses of a sensor whose pictures are averaged: 1 unless motion blurs them."""
+    return sensor.num_poses() if isinstance(sensor, CameraSensor) else 1
+
 
 def is_batch(sensor: mi.Sensor) -> bool:
     """Whether it is one of Mitsuba's type ``batch``, which has no type in Python."""

@@ -6,7 +6,7 @@ is loaded for each variant of Mitsuba, so that its class cannot be imported here
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import Any, Protocol, runtime_checkable
 
 import mitsuba as mi
@@ -44,7 +44,7 @@ class SplatsSettings(Protocol):
     def aov_names(self) -> list[str]:
         """Of the channels besides colour and alpha."""
 
-    def channels_of(self, kind: str) -> Iterable[int | str]:
+    def channels_of(self, kind: str) -> Sequence[int | str]:
         """What comes behind the dot in the names of an AOV's channels."""
 
 

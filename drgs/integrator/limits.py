@@ -1,0 +1,57 @@
+"""What a picture cannot ask for, refused in words before anything is allocated or compiled."""
+
+from __future__ import annotations
+
+import mitsuba as mi
+
+from drgs.core.constants import MAX_FEATURES
+from drgs.core.errors import PluginError
+from drgs.core.memory import MAX_LANES, why_too_large
+
+MAX_SAMPLES = 4096
+"""Of a pixel, times the poses that motion blurs: each is a pass of its own, and its frame takes
+0.15 MB even of the smallest film."""
+
+
+def check_picture(film: mi.Film, spp: int, poses: int, num_aovs: int, nested_spp: int) -> None:
+    """Raise PluginError for a picture that would take more than there is.
+
+    spp: of the splats; poses: of the sensor, whose pictures are averaged; num_aovs: channels
+    besides colour and alpha; nested_spp: of the nested integrator, 0 where there is none.
+    """
+    width, height = film.crop_size()
+    if min(width, height) < 1:
+        raise PluginError(f"splats: the film must have 1 pixel at least, got {width} x {height}")
+    if not isinstance(spp, int) or spp < 1:
+        raise PluginError(
+            "splats: the samples per pixel (spp, or the sampler's sample_count) must be an integer "
+            f"of at least 1, got {spp!r}"
+        )
+    if spp * poses > MAX_SAMPLES:
+        times = f" times {poses:,} poses of the shutter (shutter_samples)" if poses > 1 else ""
+        raise PluginError(
+            f"splats: a pixel can have at most {MAX_SAMPLES:,} samples, got {spp:,}{times}; take "
+            "the mean of pictures with other seeds, or, for surfaces alone, set nested_spp"
+        )
+    why = why_too_large(width, height, 3 + num_aovs, spp * poses)
+    if why is not None:
+        raise PluginError(f"splats: {why}")
+    if width * height * nested_spp > MAX_LANES:
+        raise PluginError(
+            f"splats: on a film of {width} x {height} px, nested_spp (or spp) must be at most "
+            f"{MAX_LANES // (width * height):,}, got {nested_spp:,}; take the mean of pictures "
+            "with other seeds"
+        )
+
+
+def check_columns(columns: dict[str, int]) -> None:
+    """Raise PluginError where more is put out than a kernel can be compiled for.
+
+    columns: of each AOV, by its name.
+    """
+    if sum(columns.values()) > MAX_FEATURES:
+        counts = ", ".join(f"{name} {count:,}" for name, count in columns.items())
+        raise PluginError(
+            f"splats: aovs can have at most {MAX_FEATURES} channels together, got "
+            f"{sum(columns.values()):,} ({counts}); render them in parts, which share a kernel"
+        )

@@ -1,0 +1,156 @@
+"""Pictures that ask for more than there is are refused before anything is allocated or compiled."""
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from support.views import VIEWS, Scene, tensors
+from support.walls import WALL
+
+import drgs
+from drgs.core.constants import MAX_FEATURES, MAX_INT
+from drgs.core.errors import PluginError
+from drgs.integrator.limits import MAX_SAMPLES
+
+SCENE = Scene(VIEWS[1], count=8)  # 37 x 23 px
+
+
+@pytest.fixture(scope="module", autouse=True)
+def variant():
+    mi.set_variant("llvm_ad_rgb")
+
+
+def load(sensor=None, **settings):
+    integrator = SCENE.settings | tensors(SCENE.gaussians) | settings
+    sensor = sensor or SCENE.view.sensor()
+    return mi.load_dict({"type": "scene", "integrator": integrator, "sensor": sensor})
+
+
+def refusal(scene, **arguments) -> str:
+    with pytest.raises(PluginError) as caught:
+        scene.integrator().render(scene, **arguments)
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
+
+
+@pytest.mark.parametrize("sampler", ["independent", "stratified", "orthogonal", "ldsampler"])
+@pytest.mark.parametrize("count", [0, 10**9])
+def test_counts_of_samples_that_cannot_be_taken_are_refused(sampler, count):
+    """Mitsuba makes some samplers' 0 a number of their own; ``independent`` ended the process."""
+    scene = load(SCENE.view.sensor(sampler=sampler, samples=count))
+    taken = scene.sensors()[0].sampler().sample_count()
+    if taken == 0:
+        assert refusal(scene) == (
+            "splats: the samples per pixel (spp, or the sampler's sample_count) must be an integer "
+            "of at least 1, got 0"
+        )
+    elif count:
+        assert refusal(scene) == (
+            f"splats: a pixel can have at most 4,096 samples, got {taken:,}; take the mean of "
+            "pictures with other seeds, or, for surfaces alone, set nested_spp"
+        )
+    else:
+        assert np.isfinite(np.array(mi.render(scene))).all()
+
+
+@pytest.mark.parametrize(
+    ("spp", "message"),
+    [
+        (-1, "at least 1, got -1"),
+        (MAX_SAMPLES + 1, "at most 4,096 samples, got 4,097;"),
+        (2**40, "at most 4,096 samples, got 1,099,511,627,776;"),
+    ],
+)
+def test_samples_that_a_rendering_asks_for_are_refused_as_well(spp, message):
+    assert message in refusal(load(), spp=spp)
+
+
+def test_poses_of_a_shutter_count_as_samples():
+    film, moved = SCENE.view.sensor()["film"], mi.ScalarTransform4f().translate([0.1, 0, 0])
+    sensor = {"type": "calibrated", "film": film, "to_world_close": moved}
+    sensor |= {"shutter_samples": 5000}
+    assert "got 4 times 5,000 poses of the shutter (shutter_samples)" in refusal(
+        load(sensor), spp=4
+    )
+    ignoring = load(sensor, ignore="motion")
+    ignoring.integrator().render(ignoring, spp=1)
+    rolling = load(sensor | {"shutter": "rolling"})
+    rolling.integrator().render(rolling, spp=1)
+
+
+@pytest.mark.parametrize("surfaces", [False, True])
+def test_films_that_cannot_be_held_are_refused(surfaces):
+    sensor = SCENE.view.sensor(width=1_000_000, height=1_000_000)
+    objects = {"wall": WALL.shape(SCENE.view.camera)} if surfaces else {}
+    integrator = SCENE.settings | tensors(SCENE.gaussians)
+    scene = mi.load_dict({"type": "scene", "integrator": integrator, "sensor": sensor, **objects})
+    assert refusal(scene, spp=1).startswith(
+        "splats: 1000000 x 1000000 px are too many for Dr.Jit, whose arrays end at 2^32 entries; "
+        "at most "
+    )
+    assert refusal(load(SCENE.view.sensor(width=0))) == (
+        "splats: the film must have 1 pixel at least, got 0 x 23"
+    )
+
+
+def test_memory_is_compared_with_what_there_is(monkeypatch):
+    monkeypatch.setattr("drgs.core.memory.available_memory", lambda: 10**9)
+    scene = load(SCENE.view.sensor(width=4000, height=4000))
+    assert refusal(scene, spp=1) == (
+        "splats: 4000 x 4000 px need about 4 GB of memory, of which 1 GB are available; at most 4 "
+        "million pixels fit"
+    )
+    with pytest.raises(ValueError, match=r"^rasterization\(\): .* 4000 x 4000 px need about 4 GB"):
+        rasterized(colors=np.ones((1, 3), np.float32), width=4000, height=4000)
+
+
+def test_samples_of_surfaces_that_mitsuba_cannot_count_are_refused():
+    integrator = SCENE.settings | tensors(SCENE.gaussians) | {"nested_spp": 10**9}
+    wall = WALL.shape(SCENE.view.camera)
+    scene = mi.load_dict(
+        {"type": "scene", "integrator": integrator, "sensor": SCENE.view.sensor(), "wall": wall}
+    )
+    assert refusal(scene) == (
+        f"splats: on a film of 37 x 23 px, nested_spp (or spp) must be at most "
+        f"{(2**32 - 1) // (37 * 23):,}, got 1,000,000,000; take the mean of pictures with other "
+        "seeds"
+    )
+    with pytest.raises(RuntimeError, match=f"nested_spp must be an integer from 0 to {MAX_INT}"):
+        load(nested_spp=2**32)
+
+
+def features(count):
+    return mi.TensorXf(np.zeros((8, count), np.float32))
+
+
+def test_features_have_as_many_columns_as_can_be_compiled():
+    """What is not put out is not compiled."""
+    message = (
+        r"splats: aovs can have at most 64 channels together, got 2,003 \(n 3, f 2,000\); render "
+        "them in parts, which share a kernel"
+    )
+    with pytest.raises(RuntimeError, match=message):
+        load(aovs="n:normal, f:feature_x, a:alpha", feature_x=features(2000))
+    load(aovs="n:normal", feature_x=features(2000))
+    load(aovs="f:feature_x, a:alpha", feature_x=features(MAX_FEATURES))
+
+
+def test_features_do_not_grow_beyond_that_later():
+    params = mi.traverse(load(aovs="f:feature_x", feature_x=features(2)))
+    params["integrator.feature_x"] = features(2000)
+    with pytest.raises(ValueError, match="at most 64 channels together, got 2,000"):
+        params.update()
+
+
+def rasterized(colors, width=4, height=4):
+    one = np.zeros((1, 3), np.float32)
+    quats, camera = np.ones((1, 4), np.float32), np.eye(4, dtype=np.float32)[None]
+    return drgs.rasterization(
+        one, quats, one + 1, one[:, 0] + 0.5, colors, camera, camera[:, :3, :3], width, height
+    )
+
+
+def test_colors_of_rasterization_have_as_many_channels():
+    with pytest.raises(ValueError, match=r"colors must be of at most 64 channels, got 2000"):
+        rasterized(colors=np.ones((1, 2000), np.float32))
+    with pytest.raises(ValueError, match=r"width and height must be smaller: .* too many"):
+        rasterized(colors=np.ones((1, 3), np.float32), width=10**6, height=10**6)
