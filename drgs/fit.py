@@ -88,6 +88,7 @@ from drgs.training.budget import (
 )
 from drgs.training.checkpoint import (
     Checkpoint,
+    check_fits,
     check_same_data,
     load_checkpoint,
     remove_checkpoint,
@@ -160,6 +161,7 @@ class Run:
         """From its checkpoint, or from the beginning where there is none (None)."""
         if checkpoint is None:
             return Run(trainer, History(), data, out)
+        check_fits(out, checkpoint, trainer.state())
         trainer.restore(checkpoint.trainer)
         print(f"continues at iteration {trainer.iteration}")
         return Run(trainer, History.from_array(checkpoint.history, checkpoint.wall_s), data, out)

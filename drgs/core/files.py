@@ -7,13 +7,17 @@ lacking permission or a full disk is the user's to repair.
 from __future__ import annotations
 
 import errno
+import math
 import os
 import re
 import stat
+import zipfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO
+
+import numpy as np
 
 from drgs.core.errors import UserError, one_line
 
@@ -105,6 +109,45 @@ def read_text(path: Path, what: str, max_bytes: int) -> str:
         raise UserError(
             f"{path}: cannot read the {what}: not UTF-8 text (byte {error.start})"
         ) from None
+
+
+def read_arrays(path: Path, what: str) -> dict[str, np.ndarray]:
+    """The arrays of an ``.npz`` file that ``np.savez`` wrote; ``what`` it is stands in the errors.
+
+    None takes more memory than the file has bytes: what is compressed, or whose header claims
+    another size, is refused before it is read.
+
+    Raises :class:`UserError` for a file that cannot be read or is damaged.
+    """
+    with open_regular(path, what) as file:
+        try:
+            _check_sizes(file)
+            file.seek(0)
+            with np.load(file, allow_pickle=False) as arrays:
+                return {name: arrays[name] for name in arrays.files}
+        except Exception as error:  # zipfile and NumPy raise many types for a broken file
+            reason = one_line(error) or type(error).__name__
+            raise UserError(f"{path}: cannot read the {what}: {reason}") from None
+
+
+def _check_sizes(file: IO[bytes]) -> None:
+    """Raise ValueError where the arrays of an ``.npz`` file are not as large as their parts."""
+    left = os.fstat(file.fileno()).st_size
+    with zipfile.ZipFile(file) as archive:
+        for part in archive.infolist():
+            left -= part.file_size
+            if left < 0 or part.compress_type != zipfile.ZIP_STORED:
+                raise ValueError(f"{part.filename} is compressed, or larger than the file")
+            with archive.open(part) as content:
+                version = np.lib.format.read_magic(content)
+                read_header = {
+                    (1, 0): np.lib.format.read_array_header_1_0,
+                    (2, 0): np.lib.format.read_array_header_2_0,
+                }[version]
+                shape, _, dtype = read_header(content)
+                claimed = content.tell() + math.prod(shape) * dtype.itemsize
+            if dtype.hasobject or claimed != part.file_size:
+                raise ValueError(f"{part.filename} is not as large as its header claims")
 
 
 _TEMPORARY_NAME = re.compile(r"\..*\.\d+\.tmp(\.[^.]*)?")

@@ -9,8 +9,8 @@ between the two files. So the checkpoint says which configuration stood there be
 from __future__ import annotations
 
 import json
+import os
 import warnings
-import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,11 +19,12 @@ import numpy as np
 
 from drgs.config.changes import changed
 from drgs.config.schema import FitConfig
-from drgs.core.errors import UserError, UserNote, listed
-from drgs.core.files import atomic_path
+from drgs.core.errors import UserError, UserNote, listed, one_line
+from drgs.core.files import atomic_path, read_arrays
 from drgs.data.fingerprint import Fingerprint
 from drgs.results.files import CHECKPOINT, CONFIG
 from drgs.results.folder import load_run_config, write_run_config
+from drgs.training.state_checks import check_history, check_state
 
 PLACES = ("data.path", "data.source", "init.point_cloud")
 """Values that say where something is: a project that was moved has others. The start point is
@@ -38,7 +39,7 @@ class Checkpoint:
     history: np.ndarray  # (rows, columns) float64: the rows of history.csv
     wall_s: float  # seconds spent on iterations
     data: Fingerprint | None = None  # None: of an earlier version, which kept none
-    config: FitConfig | None = None  # of the file it was read from
+    config: FitConfig | None = None  # of the file that it was read from
 
 
 def save_checkpoint(folder: Path, config: FitConfig, checkpoint: Checkpoint) -> None:
@@ -74,14 +75,14 @@ def load_checkpoint(folder: Path, config: FitConfig) -> Checkpoint | None:
     Raises UserError if the file is damaged or belongs to another configuration.
     """
     path = folder / CHECKPOINT
-    if not path.exists():
+    if not os.path.lexists(path):
         return None
-    remedy = f"remove {path} to start again from iteration 0"
     try:
-        with np.load(path, allow_pickle=False) as file:
-            arrays = {name: file[name] for name in file.files}
-        texts = [str(arrays.pop(name)) for name in ("config", "config_before") if name in arrays]
-        own, *before = (_at_the_places_of(config, json.loads(text)) for text in texts)
+        arrays = read_arrays(path, "checkpoint")
+        texts = [arrays.pop("config"), arrays.pop("config_before", None)]
+        own, *before = (
+            _at_the_places_of(config, json.loads(str(t))) for t in texts if t is not None
+        )
         data = arrays.pop("data", None)
         checkpoint = Checkpoint(
             history=arrays.pop("history"),
@@ -90,13 +91,37 @@ def load_checkpoint(folder: Path, config: FitConfig) -> Checkpoint | None:
             config=own,
             trainer={name.removeprefix("trainer."): values for name, values in arrays.items()},
         )
-    except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as error:
-        raise UserError(f"{path}: not a readable checkpoint ({error}); {remedy}") from None
+        check_history(checkpoint.history, checkpoint.wall_s)
+    except UserError as error:
+        raise UserError(f"{error}; {_remedy(path)}") from None
+    except (ValueError, KeyError, TypeError, RecursionError) as error:
+        raise _damaged(path, error) from None
     if config not in (own, *before):
         raise UserError(
-            f"{path}: belongs to another configuration than {folder / CONFIG}; {remedy}"
+            f"{path}: belongs to another configuration than {folder / CONFIG}; {_remedy(path)}"
         )
     return checkpoint
+
+
+def check_fits(folder: Path, checkpoint: Checkpoint, start: Mapping[str, np.ndarray]) -> None:
+    """Raise UserError where a trainer cannot go on from the checkpoint in ``folder``.
+
+    start: ``Trainer.state()`` of that trainer before its first iteration.
+    """
+    config = checkpoint.config
+    try:
+        check_state(checkpoint.trainer, start, config.iterations, config.densify.max_gaussians)
+    except ValueError as error:
+        raise _damaged(folder / CHECKPOINT, error) from None
+
+
+def _damaged(path: Path, error: Exception) -> UserError:
+    reason = f"{error.args[0]} missing" if isinstance(error, KeyError) else one_line(error)
+    return UserError(f"{path}: the checkpoint is damaged: {reason}; {_remedy(path)}")
+
+
+def _remedy(path: Path) -> str:
+    return f"remove {path} to start again from iteration 0"
 
 
 def check_same_data(

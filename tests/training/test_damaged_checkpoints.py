@@ -1,0 +1,161 @@
+"""A checkpoint that is damaged, or edited, is refused in one line, and kept."""
+
+import io
+import os
+import shutil
+import zipfile
+
+import numpy as np
+import pytest
+import yaml
+from support.commands import run_in_process
+from support.small_capture import make_dataset, write_dataset
+
+from drgs import fit
+from drgs.core.errors import UserError
+
+
+@pytest.fixture(scope="module")
+def stopped(tmp_path_factory):
+    """The folder of a fit of 4 iterations that was stopped after the second."""
+    folder = tmp_path_factory.mktemp("fit")
+    write_dataset(folder / "data", make_dataset(train=3, test=1))
+    values = {
+        "data": {"path": "data"},
+        "init": {"num_points": 40, "half_extent": 0.5},
+        "model": {"sh_degree": 1, "smoothing": True},
+        "colors": {"lr": 0.02},
+        "cameras": {"optimise": True},
+        "iterations": 4,
+        "output": {"checkpoint_every": 1, "history_every": 1},
+    }
+    (folder / "a.yml").write_text(yaml.safe_dump(values))
+    step = fit.Trainer.step
+
+    def step_or_stop(trainer):
+        if trainer.iteration == 2:
+            raise UserError("stopped")
+        return step(trainer)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(fit.Trainer, "step", step_or_stop)
+        outcome = run_in_process(fit.main, folder / "a.yml", "--out", folder / "out")
+    assert outcome.stderr == "error: stopped\n"
+    return folder / "out"
+
+
+@pytest.fixture
+def checkpoint(stopped, tmp_path):
+    """Of a copy of that folder."""
+    shutil.copytree(stopped, tmp_path / "out")
+    return tmp_path / "out" / "checkpoint.npz"
+
+
+def arrays_of(checkpoint):
+    with np.load(checkpoint) as file:
+        return dict(file)
+
+
+def edit(name, change):
+    """``change`` of one array; None removes it."""
+
+    def apply(checkpoint):
+        arrays = arrays_of(checkpoint)
+        changed = change(arrays.pop(name))
+        if changed is not None:
+            arrays[name] = changed
+        np.savez(checkpoint, **arrays)
+
+    return apply
+
+
+def with_value(value):
+    """The last number of an array is another."""
+
+    def change(array):
+        array = array.copy()
+        array.reshape(-1)[-1:] = value
+        return array
+
+    return change
+
+
+def with_header(shape):
+    """The file holds one array, with such a header and nothing behind it."""
+
+    def apply(checkpoint):
+        stream = io.BytesIO()
+        header = {"descr": "<f8", "fortran_order": False, "shape": shape}
+        np.lib.format.write_array_header_1_0(stream, header)
+        with zipfile.ZipFile(checkpoint, "w") as archive:
+            archive.writestr("wall_s.npy", stream.getvalue())
+
+    return apply
+
+
+def compress(checkpoint):
+    np.savez_compressed(checkpoint, **arrays_of(checkpoint), zeros=np.zeros(10**8, np.uint8))
+
+
+def as_pipe(checkpoint):
+    checkpoint.unlink()
+    os.mkfifo(checkpoint)
+
+
+DAMAGE = {
+    "means missing": (edit("trainer.means.value", lambda a: None), "means.value missing"),
+    "a moment missing": (edit("trainer.sh0.v", lambda a: None), "sh0.v missing"),
+    "history missing": (edit("history", lambda a: None), "history"),
+    "configuration missing": (edit("config", lambda a: None), "config"),
+    "of an effect missing": (edit("trainer.colors/common", lambda a: None), "colors/common mis"),
+    "fewer columns": (
+        edit("trainer.means.value", lambda a: a[:, :2]),
+        "means.value must be of shape (40, 3) and type float32, got (40, 2)",
+    ),
+    "fewer rows": (edit("trainer.quats.value", lambda a: a[1:]), "quats.value must be of shape"),
+    "no rows": (edit("trainer.means.value", lambda a: a[:0]), "1 to 1,000,000 Gaussians, got 0"),
+    "no array": (edit("trainer.means.value", lambda a: a[0, 0]), "1 to 1,000,000 Gaussians, got"),
+    "a moment of others": (edit("trainer.shN.m", lambda a: a[9:]), "shN.m must be of shape"),
+    "another type": (edit("trainer.sh0.value", lambda a: a.astype("f8")), "type float32, got"),
+    "text": (edit("trainer.sh0.value", lambda a: a.astype("U")), "type float32, got"),
+    "fewer views": (edit("trainer.cameras/turns.value", lambda a: a[1:]), "turns.value must be"),
+    "fewer filters": (edit("trainer.smoothing/filter", lambda a: a[1:]), "filter must be of shape"),
+    "NaN": (edit("trainer.means.value", with_value(np.nan)), "means.value must hold finite num"),
+    "infinite": (edit("trainer.cameras/moves.m", with_value(np.inf)), "moves.m must hold finite"),
+    "negative iteration": (edit("trainer.iteration", lambda a: -a), "between 0 and 4, got -2"),
+    "late iteration": (edit("trainer.iteration", lambda a: a + 9), "between 0 and 4, got 11"),
+    "several iterations": (edit("trainer.iteration", lambda a: np.array([a, a])), "iteration must"),
+    "history of text": (edit("history", lambda a: a.astype("U")), "history must be rows of"),
+    "history of 5 columns": (edit("history", lambda a: a[:, :5]), "history must be rows of"),
+    "NaN in the history": (edit("history", lambda a: a * np.nan), "history must hold finite"),
+    "time that is none": (edit("wall_s", lambda a: a * np.nan), "wall_s must be a number of sec"),
+    "negative time": (edit("wall_s", lambda a: a * 0 - 1), "wall_s must be a number of seconds"),
+    "8 TB": (with_header((10**12,)), "is not as large as its header claims"),
+    "8 EB": (with_header((10**6, 10**6, 10**6)), "is not as large as its header claims"),
+    "a bomb": (compress, "is compressed, or larger than the file"),
+    "a pipe": (as_pipe, "must be a regular file, got a named pipe"),
+    "cut off": (lambda path: os.truncate(path, 999), "cannot read the checkpoint"),
+    "empty": (lambda path: path.write_bytes(b""), "cannot read the checkpoint"),
+    "no numbers": (lambda path: path.write_bytes(b"hello"), "cannot read the checkpoint"),
+}
+
+
+@pytest.mark.parametrize(("damage", "message"), DAMAGE.values(), ids=DAMAGE)
+def test_a_damaged_checkpoint_is_refused_and_kept(checkpoint, damage, message):
+    damage(checkpoint)
+    kept = checkpoint.read_bytes() if checkpoint.is_file() else None
+    before = sorted(os.listdir(checkpoint.parent))
+    outcome = run_in_process(fit.main, "--resume", checkpoint.parent)
+    assert outcome.returncode == 2, outcome
+    assert outcome.stderr.startswith(f"error: {checkpoint}: ") and message in outcome.stderr
+    assert outcome.stderr.count("\n") == 1 and len(outcome.stderr) < 700
+    assert outcome.stderr.endswith(f"remove {checkpoint} to start again from iteration 0\n")
+    assert sorted(os.listdir(checkpoint.parent)) == before
+    assert kept is None or checkpoint.read_bytes() == kept
+
+
+def test_a_checkpoint_that_is_whole_is_continued(checkpoint, monkeypatch):
+    monkeypatch.setattr(fit, "write_results", lambda *arguments: None)
+    outcome = run_in_process(fit.main, "--resume", checkpoint.parent)
+    assert outcome.returncode == 0, outcome.stderr
+    assert "continues at iteration 2" in outcome.stdout
