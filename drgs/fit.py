@@ -64,10 +64,9 @@ from drgs.results.folder import (
     check_output_folder,
     claim_output_folder,
     continue_run,
-    found_again,
     has_results,
     is_finished,
-    load_run_config,
+    load_moved_config,
     pictures_of,
     remove_run,
     require_no_run,
@@ -220,7 +219,7 @@ def what_to_fit(args: argparse.Namespace) -> tuple[FitConfig, Path]:
                 f"--resume: takes its configuration from {args.resume / CONFIG}: leave out --out, "
                 "--set, --budget and --overwrite"
             )
-        return found_again(args.resume, load_run_config(args.resume, data)), args.resume
+        return load_moved_config(args.resume, data), args.resume
     out = [] if args.out is None else [f"output.dir={args.out}"]
     config = load_config(args.config, args.overrides + data + out)
     return config, config.output.dir or Path("out") / Path(args.config).stem

@@ -175,6 +175,19 @@ def load_run_config(folder: Path, overrides: Sequence[str] = ()) -> FitConfig:
     return load_config(folder / CONFIG, overrides)
 
 
+def load_moved_config(folder: Path, overrides: Sequence[str] = ()) -> FitConfig:
+    """The configuration of the run that ``folder`` holds, with paths to where its data is now.
+
+    overrides: see :func:`load_config`; a start point that lay within the data has moved with it.
+    """
+    before = load_run_config(folder)
+    config = found_again(folder, load_run_config(folder, overrides))
+    cloud, data = config.init.point_cloud, before.data.path
+    if cloud is None or cloud.exists() or not cloud.is_relative_to(data):
+        return config
+    return changed(config, {"init.point_cloud": config.data.path / cloud.relative_to(data)})
+
+
 def found_again(folder: Path, config: FitConfig, keys: Sequence[str] = FOUND_AGAIN) -> FitConfig:
     """A run's configuration with paths to where its data is now; keys: which of FOUND_AGAIN.
 

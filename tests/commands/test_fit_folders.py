@@ -17,8 +17,10 @@ from support.fit_command import (
     write_project,
 )
 from support.folders import contents, visible
+from support.small_capture import blobs
 
 from drgs import render
+from drgs.config.load import load_config
 
 POINTS = "out/point_cloud.ply"
 
@@ -90,11 +92,9 @@ def test_a_configuration_that_no_fit_has_written_is_kept(tmp_path):
         assert_fit_refused(file, "--out", mine, folder=tmp_path, message=message)
         message = f"{mine}: must hold nothing but a run to be replaced, got config.yml; move"
         assert_fit_refused(file, "--out", mine, "--overwrite", folder=tmp_path, message=message)
-    message = "must be new or empty, got one that holds config.yml, data, mine"
-    for options in ([], ["--budget", 60]):
-        assert_fit_refused(
-            config, "--out", tmp_path, *options, folder=tmp_path, message="config.yml"
-        )
+    arguments = (config, "--out", tmp_path)
+    for options, expected in (([], "would be replaced"), (["--budget", 60], "new or empty")):
+        assert_fit_refused(*arguments, *options, folder=tmp_path, message=expected)
 
 
 def test_a_configuration_that_a_fit_has_written_may_be_fitted_where_it_is(ended, projects):
@@ -239,6 +239,18 @@ def test_data_that_was_moved_alone_is_named(stopped, projects, tmp_path):
     assert_fit_refused("--resume", stopped / "out", folder=stopped, message=message)
     assert_fits("--resume", stopped / "out", "--data", tmp_path / "elsewhere")
     assert_as_uninterrupted(stopped, projects)
+
+
+def test_a_start_point_that_was_moved_with_the_data_is_found(tmp_path, monkeypatch):
+    config = write_project(tmp_path, init={"point_cloud": "data/points.ply"})
+    blobs().save(tmp_path / "data" / "points.ply")
+    with monkeypatch.context() as patched:
+        stop_after(patched, 2)
+        assert run_fit(config, "--out", tmp_path / "out").returncode == 130
+    (tmp_path / "data").rename(tmp_path / "elsewhere")
+    assert_fits("--resume", tmp_path / "out", "--data", tmp_path / "elsewhere")
+    found = load_config(tmp_path / "out" / "config.yml")
+    assert found.init.point_cloud == tmp_path / "elsewhere" / "points.ply"
 
 
 def test_a_path_may_be_corrected_by_hand(stopped, projects, tmp_path):

@@ -1,0 +1,184 @@
+"""A fit that ends at any moment, before or behind any file that it puts in place, goes on.
+
+The clock of a fit with a budget is replaced: its plan is revised after iterations that are given.
+"""
+
+import os
+from types import SimpleNamespace
+
+import pytest
+from support.fit_command import (
+    ITERATIONS,
+    assert_fits,
+    run_fit,
+    without_pictures,
+    write_project,
+)
+from support.folders import visible
+
+from drgs import fit
+from drgs.config.load import load_config
+
+PLANS = {2: 10, 3: 9, 5: 8}
+"""By iteration: how many there will be, as the plan is revised to; the clock ends it after 7."""
+
+LAST = 7
+
+RESULTS = {
+    *("config.yml", "point_cloud.ply", "history.csv", "views.json", "metrics.json", "report.html"),
+    *(f"{kind}/test/r_{i}.png" for kind in ("renders", "side_by_side") for i in range(2)),
+}
+
+
+class Killed(BaseException):
+    """What no code handles."""
+
+
+class Revised:
+    """The length of a fit whose plan changes on the way."""
+
+    def __init__(self, *_):
+        pass
+
+    def goes_on(self, trainer):
+        done = trainer.iteration
+        if done in PLANS:
+            trainer.replan(PLANS[done], trainer.config.densify.stop)
+        if done == LAST:
+            trainer.replan(done, trainer.config.densify.stop)
+        return done < LAST
+
+    def total(self, trainer):
+        return trainer.config.iterations
+
+
+@pytest.fixture(autouse=True)
+def quick(monkeypatch):
+    """No time is spent on plans and reports."""
+    without_pictures(monkeypatch)
+
+    def plan(config, *_):
+        return 0.0, SimpleNamespace(config=config, reasons="planned", curve=None)
+
+    monkeypatch.setattr(fit, "planned", plan)
+    monkeypatch.setattr(fit, "Deadline", Revised)
+
+
+@pytest.fixture(scope="module")
+def config(tmp_path_factory):
+    return write_project(tmp_path_factory.mktemp("project"))
+
+
+def crashed(moment, behind, *arguments):
+    """Run a fit that is ended at the replacement of a file, before or behind it.
+
+    moment: which, by number; None: none. Returns whether it got so far, and the names of what was
+    put in place until then.
+    """
+    replace, names = os.replace, []
+
+    def replace_or_crash(temporary, path):
+        names.append(os.path.basename(path))
+        is_here = len(names) - 1 == moment
+        if is_here and not behind:
+            raise Killed
+        replace(temporary, path)
+        if is_here:
+            raise Killed
+
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(os, "replace", replace_or_crash)
+        try:
+            outcome = run_fit(*arguments)
+        except Killed:
+            return True, names
+    assert outcome.returncode == 0, outcome.stderr
+    return False, names
+
+
+def assert_done(out, again):
+    """All is there and nothing else; what ``config.yml`` says gives the same bytes."""
+    assert visible(out) - {"plan.txt"} == RESULTS
+    done = load_config(out / "config.yml").iterations
+    rows = (out / "history.csv").read_text().splitlines()
+    assert len(rows) == done + 1
+    assert_fits(out / "config.yml", "--out", again)
+    for name in ("point_cloud.ply", "renders/test/r_1.png"):
+        assert (out / name).read_bytes() == (again / name).read_bytes(), name
+
+
+def assert_goes_on(config, tmp_path, moment, behind, *budget):
+    """False where the fit ends before that moment."""
+    out = tmp_path / f"{moment}{behind}"
+    was_killed, names = crashed(moment, behind, config, "--out", out, *budget)
+    if not was_killed:
+        assert len(names) == moment
+        return False
+    if (out / "config.yml").is_file():
+        again = assert_fits("--resume", out)
+        is_behind_all = (names[-1] == "metrics.json" and behind) or "metrics.json" in names[:-1]
+        assert ("this fit is finished" in again.stdout) == is_behind_all, names
+    else:
+        assert_fits(config, "--out", out, *budget)
+    assert_done(out, tmp_path / f"again {moment}{behind}")
+    return True
+
+
+def moments_of(config, tmp_path, *budget):
+    was_killed, names = crashed(None, False, config, "--out", tmp_path / "whole", *budget)
+    assert not was_killed
+    assert_done(tmp_path / "whole", tmp_path / "whole again")
+    return names
+
+
+BUDGET = ("--budget", "60s")
+
+
+def test_a_fit_with_a_budget_that_is_killed_around_its_revised_plans_goes_on(config, tmp_path):
+    """Between the two files of a revision, behind the last iteration, behind the last file."""
+    names = moments_of(config, tmp_path, *BUDGET)
+    saved = [moment for moment, name in enumerate(names) if name == "checkpoint.npz"]
+    assert [names[moment + 1] for moment in saved] == ["config.yml"] * 4  # after 2, 4, 6 and 7
+    for moment in (saved[1], saved[-1], names.index("metrics.json")):
+        assert assert_goes_on(config, tmp_path, moment, True, *BUDGET)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("behind", [False, True])
+@pytest.mark.parametrize("budget", [(), BUDGET], ids=["plain", "budget"])
+def test_a_fit_that_is_killed_at_any_file_goes_on(config, tmp_path, budget, behind):
+    count = len(moments_of(config, tmp_path, *budget))
+    for moment in range(count):
+        assert assert_goes_on(config, tmp_path, moment, behind, *budget)
+    assert not assert_goes_on(config, tmp_path, count, behind, *budget)
+
+
+def test_a_fit_that_is_killed_while_it_writes_results_repeats_no_iteration(config, tmp_path):
+    names = moments_of(config, tmp_path)
+    assert crashed(names.index("history.csv"), True, config, "--out", tmp_path / "out")[0]
+    outcome = assert_fits("--resume", tmp_path / "out")
+    assert f"continues at iteration {ITERATIONS}\n" in outcome.stdout
+    for name in RESULTS - {"history.csv", "metrics.json", "config.yml"}:  # times, and a folder
+        expected = (tmp_path / "whole" / name).read_bytes()
+        assert (tmp_path / "out" / name).read_bytes() == expected, name
+
+
+def test_a_run_that_is_half_removed_is_not_finished(config, tmp_path):
+    out = tmp_path / "out"
+    assert_fits(config, "--out", out)
+    unlink, removed = os.unlink, []
+
+    with pytest.MonkeyPatch.context() as patched:
+
+        def unlink_two(path, *arguments, **options):
+            if len(removed) == 2:
+                raise Killed
+            removed.append(os.path.basename(path))
+            unlink(path, *arguments, **options)
+
+        patched.setattr(os, "unlink", unlink_two)
+        with pytest.raises(Killed):
+            run_fit(config, "--out", out, "--overwrite")
+    assert removed[0] == "metrics.json"
+    assert "this fit is finished" not in assert_fits(config, "--out", out).stdout
+    assert_done(out, tmp_path / "again")
