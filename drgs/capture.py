@@ -1,8 +1,7 @@
 """``python -m drgs.capture SCENE --out DIR``: turn a Mitsuba scene into a training set.
 
-SCENE is an XML file, or a Python file with a function ``scene()`` that returns a scene dictionary
-without sensors. Its pictures are path traced from cameras on the upper hemisphere around it and
-written in the NeRF-synthetic layout:
+SCENE is an XML file, or a Python file with a function ``scene()`` that returns a scene dictionary.
+Its pictures are path traced and written in the NeRF-synthetic layout:
 
 - ``transforms_{train,val,test}.json``: ``camera_angle_x`` and camera to world, OpenGL axes
 - ``{train,val,test}/r_0.png``, ...: RGBA, 8 bits, straight alpha, colour in sRGB
@@ -10,8 +9,12 @@ written in the NeRF-synthetic layout:
 - ``capture.json``: what was asked for; a second run of the same command continues an interrupted
   one from it
 
-The scene's own sensors and integrator are not used. Lights are not seen, only what they light:
-alpha is the part of a pixel that surfaces cover (an opacity mask counts, glass is opaque).
+Where the cameras stand follows from the scene, if nobody says (``drgs.data.standpoints``): around
+it, inside it if it is a room, or where its own sensors are if it has many.
+
+The scene's own integrator is not used; one with splats is refused, as they would be missing. From
+around a scene, lights are not seen, only what they light: alpha is the part of a pixel that
+surfaces cover (an opacity mask counts, glass is opaque).
 
 Display space: a pixel that is half covered is stored as the mean colour c of its covered part and
 alpha a = 1/2. The colour is encoded first and composited then, a srgb(c) + (1 - a) background,
@@ -30,6 +33,7 @@ import hashlib
 import io
 import json
 import math
+import shlex
 import sys
 from collections.abc import Sequence
 from dataclasses import asdict, fields
@@ -58,17 +62,29 @@ from drgs.data.path_tracing import (
     CaptureCamera,
     CaptureSettings,
     CaptureView,
-    capture_views,
+    lit_part,
     load_scene,
     picture_path,
-    target_and_distance,
     visible_points,
 )
+from drgs.data.standpoints import ENOUGH_SENSORS, KINDS, MOST, settings_for, views_of
+from drgs.integrator.settings import SummarisingIntegrator
 from drgs.io.pictures import write_png
 
 MANIFEST = "capture.json"
 MAX_MANIFEST_BYTES = 1 << 20
 REMEDY = "choose another --out, or remove it"
+
+BEFORE = {"cameras": "around", "azimuth": None, "elevation": None}
+"""Of settings that earlier versions did not have, what they did."""
+
+FIRST = 10
+"""Pictures after which a warning says that most are empty or black."""
+
+LEAST_COVERED = 0.01
+"""Of a picture that is not empty."""
+
+UP_AXES = ("x", "y", "z", "-x", "-y", "-z")
 POINTS = "points3d.ply"
 
 WHOLE_NUMBERS = {
@@ -101,58 +117,79 @@ def add_arguments(parser: CommandParser) -> None:
     parser.add_argument(
         "--out", type=file_or_folder, metavar="DIR", required=True, help="folder to write"
     )
-    default = {field.name: field.default for field in fields(CaptureSettings)}
     for name, text in WHOLE_NUMBERS.items():
         parser.add_argument(
             f"--{name.replace('_', '-')}",
             type=at_least(*LIMITS[name]),
-            default=default[name],
             metavar="N",
-            help=f"{text} (default: {default[name]})",
+            help=f"{text} (default: {getattr(CaptureSettings, name)})",
         )
     parser.add_argument(
         "--size",
         type=at_least(1),
         nargs=2,
-        default=default["size"],
         metavar=("W", "H"),
         help="px (default: 400 400); their background is transparent",
     )
-    parser.add_argument(
+    _add_cameras(parser)
+    add_variant_argument(parser)
+    parser.set_defaults(run=run)
+
+
+def _add_cameras(parser: CommandParser) -> None:
+    group = parser.add_argument_group(
+        "cameras", "A scene's own sensors say what is up, and how it is looked at from around."
+    )
+    add = group.add_argument
+    add(
+        "--cameras",
+        choices=KINDS,
+        help="where they stand (default: inside a room; where the scene's sensors are, if there "
+        f"are {ENOUGH_SENSORS} or more; else around it)",
+    )
+    add(
         "--fov",
         type=_wide_degrees,
         metavar="DEGREES",
-        help="horizontal field of view (default: the original's 39.6)",
+        help="horizontal field of view (default: the original's 39.6; in a room 70)",
     )
-    parser.add_argument(
+    add(
         "--distance",
         type=finite_number,
         help="of the cameras from the target (default: the whole scene is in the picture)",
     )
-    parser.add_argument(
+    add(
         "--target",
         type=finite_number,
         nargs=3,
         metavar=("X", "Y", "Z"),
         help="what the cameras look at (default: the middle of the bounding box)",
     )
-    parser.add_argument(
-        "--up", choices=("x", "y", "z"), default=default["up"], help="axis (default: z)"
+    add("--up", choices=UP_AXES, metavar="AXIS", help="x, y, z, =-x, =-y or =-z (default: z)")
+    ranges = {"type": finite_number, "nargs": 2, "metavar": ("MIN", "MAX")}
+    add(
+        "--azimuth",
+        **ranges,
+        help="degrees about the up axis, from the axis that follows it in x, y, z, x (default: "
+        "all around)",
     )
-    add_variant_argument(parser)
-    parser.set_defaults(run=run)
+    add("--elevation", **ranges, help="degrees above the horizon (default: 0 90; in a room -60 60)")
 
 
 def run(args: argparse.Namespace) -> None:
     """Capture what the command line names; end the process with status 130 at a Ctrl-C."""
     try:
-        settings = _settings(args)
+        given = _given(args)
+        settings = CaptureSettings(**given)
         if not args.scene.is_file():
             raise UserError(f"{args.scene}: there is no such scene file")
         select_variant(args.variant)
         scene = load_scene(args.scene)
-        views = capture_views(settings, *target_and_distance(scene, settings))
+        refuse_splats(args.scene, scene)
+        settings = settings_for(scene, settings, given.keys())
+        views = views_of(scene, settings)
         claim_folder(args.out, manifest(args.scene, settings))
+        print(described(settings, len(views)))
         take_pictures(scene, settings, views, args.out)
         write_dataset(scene, settings, views, args.out)
     except OSError as error:
@@ -162,11 +199,12 @@ def run(args: argparse.Namespace) -> None:
         sys.exit(INTERRUPTED_STATUS)
 
 
-def _settings(args: argparse.Namespace) -> CaptureSettings:
-    given = {field.name: getattr(args, field.name) for field in fields(CaptureSettings)}
-    fov = CaptureSettings.fov if args.fov is None else math.radians(args.fov)
-    tuples = {"size": tuple(args.size), "target": args.target and tuple(args.target)}
-    return CaptureSettings(**given | tuples | {"fov": fov})
+def _given(args: argparse.Namespace) -> dict[str, object]:
+    """The settings that the command line names."""
+    options = {field.name: getattr(args, field.name) for field in fields(CaptureSettings)}
+    given = {name: value for name, value in options.items() if value is not None}
+    given = {name: tuple(v) if isinstance(v, list) else v for name, v in given.items()}
+    return given | ({"fov": math.radians(given["fov"])} if "fov" in given else {})
 
 
 def _wide_degrees(text: str) -> float:
@@ -180,19 +218,69 @@ def _wide_degrees(text: str) -> float:
     return angle
 
 
+def refuse_splats(path: Path, scene: mi.Scene) -> None:
+    """Raise :class:`UserError` for a scene whose pictures by path tracing would lack its splats."""
+    if isinstance(scene.integrator(), SummarisingIntegrator):
+        found = "its integrator is splats"
+    elif any("Ellipsoids" in shape.class_name() for shape in scene.shapes()):
+        found = "it has shapes of type ellipsoids"
+    else:
+        return
+    raise UserError(
+        f"{path}: the scene holds splats ({found}), which path tracing leaves out; take pictures "
+        f"of it with python -m drgs.render {path} --out DIR, or remove the splats from the file"
+    )
+
+
+def described(settings: CaptureSettings, count: int) -> str:
+    """One line: where the cameras stand."""
+    fov = f"field of view {math.degrees(settings.fov):.4g} degrees"
+    if settings.cameras == "sensors":
+        return f"cameras: the scene's own sensors, {count}"
+    if settings.cameras == "inside":
+        spot = ", ".join(f"{value:.4g}" for value in settings.target)
+        return f"cameras: {count} inside the scene, around ({spot}), {fov}"
+    return f"cameras: {count} around the scene, {fov}"
+
+
 def take_pictures(
     scene: mi.Scene, settings: CaptureSettings, views: list[CaptureView], out: Path
 ) -> None:
-    """Take the pictures that are not in ``out`` yet."""
+    """Take the pictures that are not in ``out`` yet; say so where most show nothing."""
     camera = CaptureCamera(scene, settings)
     missing = [view for view in views if not picture_path(out, view).exists()]
     there = len(views) - len(missing)
     if there:
         print(f"{there} of {len(views)} pictures are there already")
+    shown = []
     with RunProgress("picture", len(views), there) as progress:
         for done, view in enumerate(missing, there + 1):
-            write_png(picture_path(out, view), camera.picture(view))
+            picture = camera.picture(view)
+            write_png(picture_path(out, view), picture)
+            shown.append(shows_something(picture))
+            if len(shown) == min(FIRST, len(missing)) and sum(shown) < len(shown) / 2:
+                print(_empty(shown, settings.cameras), file=sys.stderr, flush=True)
             progress.update(done, len(views))
+
+
+def shows_something(picture: np.ndarray) -> bool:
+    """Whether a picture, (H, W, 4) uint8, is not empty, and light reaches most of what it shows."""
+    covered = float((picture[:, :, 3] > 0).mean())
+    return covered >= LEAST_COVERED and lit_part(picture) >= MOST
+
+
+def _empty(shown: list[bool], cameras: str) -> str:
+    """A warning that most pictures are empty, and what to do about it."""
+    remedy = {
+        "around": "give --cameras inside for a room, or --azimuth, --elevation, --target and "
+        "--distance",
+        "inside": "give --target, or --cameras around",
+        "sensors": "give --cameras around or inside",
+    }[cameras]
+    return (
+        f"warning: {len(shown) - sum(shown)} of the first {len(shown)} pictures are empty or "
+        f"black: {remedy}, and another --out; or give the scene light"
+    )
 
 
 def write_dataset(
@@ -202,7 +290,7 @@ def write_dataset(
     if settings.points:
         positions, colors = visible_points(scene, settings, views, out)
         write_points(out / POINTS, positions, colors)
-        print(f"{len(positions):,} points; start from them: --set init.point_cloud={out / POINTS}")
+        print(f"{len(positions):,} points: {out / POINTS}")
     # The layout is recognised by the training split's file, so that one comes last.
     for split in reversed(SPLITS):
         if settings.count(split):
@@ -210,6 +298,17 @@ def write_dataset(
     counted = ", ".join(f"{settings.count(s)} {s}" for s in SPLITS if settings.count(s))
     width, height = settings.size
     print(f"written: {out}: {counted} views, {width}x{height}, {settings.spp} spp")
+    print(f"fit it with: {fitting(out, settings)}")
+
+
+def fitting(out: Path, settings: CaptureSettings) -> str:
+    """The command that fits the capture in ``out``, as a shell reads it."""
+    words = ["python", "-m", "drgs.fit", "scenes/lego.yml", "--data", str(out)]
+    if settings.points:
+        words += ["--set", f"init.point_cloud={out / POINTS}"]
+    if not settings.test_views and not settings.val_views:
+        words += ["--set", "data.test_split=train"]
+    return shlex.join(words)
 
 
 def manifest(path: Path, settings: CaptureSettings) -> dict[str, object]:
@@ -260,7 +359,8 @@ def _check_manifest(path: Path, wanted: dict[str, object]) -> None:
         if isinstance(error, UserError):
             raise
         raise UserError(f"{path}: not valid JSON: {one_line(error)}; {REMEDY}") from None
-    found = found if isinstance(found, dict) else {}
+    # Earlier versions stood around a scene only.
+    found = BEFORE | (found if isinstance(found, dict) else {})
     if isinstance(found.get("size"), int):  # earlier versions': pictures were squares
         found["size"] = [found["size"]] * 2
     for key, value in wanted.items():
@@ -285,6 +385,7 @@ def write_transforms(
     """Write one ``transforms_*.json``; numbers have all digits of their float64."""
     frames = [
         {"file_path": view.file_path, "transform_matrix": view.pose.tolist()}
+        | ({} if view.fov == settings.fov else {"camera_angle_x": view.fov})
         for view in views
         if view.split == split
     ]

@@ -20,7 +20,6 @@ import argparse
 import json
 import math
 import os
-import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -41,7 +40,7 @@ from drgs.cli.execution import VARIANTS, add_execution_arguments, executing, sel
 from drgs.config.load import load_config
 from drgs.config.schema import NAMED_COLORS, FitConfig, ModelConfig
 from drgs.core.constants import SHUTTER_SAMPLES
-from drgs.core.errors import PluginError, UserError, one_line
+from drgs.core.errors import PluginError, UserError, one_line, reason_of_mitsuba
 from drgs.core.files import atomic_path, open_regular
 from drgs.data import Dataset, load_dataset
 from drgs.data.orbits import orbit_of_gaussians, orbit_of_views, orbit_size
@@ -384,7 +383,7 @@ def render_mitsuba_scene(path: Path, out: Path, definitions: dict[str, str]) -> 
     try:
         scene = mi.load_file(str(path), **definitions)
     except RuntimeError as error:
-        raise UserError(f"{path}: {_first_and_last(str(error))}") from None
+        raise UserError(f"{path}: {reason_of_mitsuba(error)}") from None
     if scene.integrator() is None or not scene.sensors():
         raise UserError(f"{path}: the scene must hold an integrator and at least one sensor")
     linear = _is_linear(scene.integrator())
@@ -432,7 +431,7 @@ def _bitmaps(path: Path, scene: mi.Scene) -> Iterator[mi.Bitmap]:
         try:
             scene.integrator().render(scene, sensor=index)
         except PluginError as error:  # the scene's fault; anything else is not
-            raise UserError(f"{path}: {_first_and_last(str(error))}") from None
+            raise UserError(f"{path}: {reason_of_mitsuba(error)}") from None
         yield sensor.film().bitmap()
 
 
@@ -568,14 +567,6 @@ def _without_infinities(value: object) -> object:
     if isinstance(value, dict):
         return {key: _without_infinities(item) for key, item in value.items()}
     return None if isinstance(value, float) and not math.isfinite(value) else value
-
-
-def _first_and_last(message: str) -> str:
-    """One line of Mitsuba's message: where, and the error itself, without a traceback between."""
-    head, *rest = re.sub(r"^\[[\w.]+:\d+\] ", "", message.strip()).splitlines()
-    head = head.removesuffix("Traceback (most recent call last):").strip()
-    last = re.sub(r"^[\w.]*(Error|Exception): ", "", rest[-1].strip()) if rest else ""
-    return f"{head} {last}".strip()
 
 
 if __name__ == "__main__":

@@ -7,6 +7,7 @@ densify.every must be >= 1, got 0``.
 from __future__ import annotations
 
 import difflib
+import re
 from collections.abc import Iterable, Sequence
 
 
@@ -36,6 +37,14 @@ def one_line(text: object, limit: int = 300) -> str:
     """
     line = " ".join(str(text).split())
     return line if len(line) <= limit else f"{line[: limit - 3]}..."
+
+
+def reason_of_mitsuba(error: Exception) -> str:
+    """One line of Mitsuba's message: where, and the error itself, without a traceback between."""
+    head, *rest = re.sub(r"^\[[\w.]+:\d+\] ", "", str(error).strip() or "error").splitlines()
+    head = head.removesuffix("Traceback (most recent call last):").strip()
+    last = re.sub(r"^[\w.]*(Error|Exception): ", "", rest[-1].strip()) if rest else ""
+    return one_line(f"{head} {last}", 1000)
 
 
 def listed(names: Sequence[object], most: int = 3, separator: str = ", ") -> str:

@@ -1,4 +1,7 @@
-"""Pictures of a Mitsuba scene from around it, path traced, as a dataset."""
+"""Pictures of a Mitsuba scene, path traced, as a dataset.
+
+Where the cameras stand is the business of ``drgs.data.standpoints``.
+"""
 
 from __future__ import annotations
 
@@ -14,17 +17,14 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from drgs.cameras.axes import OPENCV_TO_OPENGL, OPENGL_TO_MITSUBA
-from drgs.core.errors import UserError, one_line
-from drgs.data.viewpoints import look_at
+from drgs.cameras.axes import OPENGL_TO_MITSUBA
+from drgs.core.errors import UserError, one_line, reason_of_mitsuba
 from drgs.io.pictures import read_image
 
 NERF_SYNTHETIC_FOV = 0.6911112070083618
 """Radians: the original's ``camera_angle_x``."""
 
 SPLITS = ("train", "val", "test")
-
-GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
 
 PATHS_PER_PASS = 2**24
 """Paths traced at once, at most: their state takes a few hundred MiB."""
@@ -35,6 +35,9 @@ the noise variance of as many independent ones."""
 
 NEAR_CLIP, FAR_CLIP = 1e-5, 1e5
 """Of the bounding box's diagonal."""
+
+DARK = 2
+"""Levels of 255: no channel of a black pixel is lighter."""
 
 MAX_LAMPS_IN_A_ROW = 16
 """Surfaces that shine are passed through on the way to the first hit, this many at most."""
@@ -68,6 +71,9 @@ class CaptureSettings:
     up: str = "z"
     points: int = 100_000
     seed: int = 0
+    cameras: str = "around"  # one of drgs.data.standpoints.KINDS
+    azimuth: tuple[float, float] | None = None  # degrees about up; None: all around
+    elevation: tuple[float, float] | None = None  # degrees; None: as the kind of cameras has it
 
     def __post_init__(self) -> None:
         for name, (least, most) in LIMITS.items():
@@ -86,6 +92,13 @@ class CaptureSettings:
             raise UserError(f"distance must be > 0, got {self.distance:g}")
         if self.target is not None and not np.isfinite(self.target).all():
             raise UserError(f"target must be finite, got {self.target}")
+        for name, turn in (("azimuth", 360), ("elevation", 90)):
+            low, high = getattr(self, name) or (0, 0)
+            if not -turn <= low <= high <= turn:
+                raise UserError(
+                    f"{name} must be two angles in rising order between -{turn} and {turn} "
+                    f"degrees, got {low:g} and {high:g}"
+                )
 
     @property
     def narrower_fov(self) -> float:
@@ -94,6 +107,11 @@ class CaptureSettings:
         if height >= width:
             return self.fov
         return 2 * math.atan(height / width * math.tan(self.fov / 2))
+
+    @property
+    def hides_lights(self) -> bool:
+        """Whether what shines is left out: of an object's studio it is, of a room it is not."""
+        return self.cameras != "inside"
 
     def count(self, split: str) -> int:
         """Number of views of a split."""
@@ -107,6 +125,7 @@ class CaptureView:
     split: str
     index: int
     pose: np.ndarray  # (4, 4) float64 camera to world, OpenGL axes: x right, y up, z backward
+    fov: float  # radians, horizontal
 
     @property
     def file_path(self) -> str:
@@ -140,7 +159,9 @@ def load_scene(path: Path) -> mi.Scene:
     try:
         scene = mi.load_dict(description) if path.suffix == ".py" else mi.load_file(str(path))
     except (RuntimeError, ValueError, TypeError, AttributeError) as error:
-        raise UserError(f"{path}: Mitsuba cannot load the scene: {one_line(error)}") from None
+        raise UserError(
+            f"{path}: Mitsuba cannot load the scene: {reason_of_mitsuba(error)}"
+        ) from None
     if not isinstance(scene, mi.Scene):
         raise UserError(f"{path}: must describe a scene, got a {type(scene).__name__}")
     return scene
@@ -191,64 +212,6 @@ def bounding_box(scene: mi.Scene) -> tuple[np.ndarray, np.ndarray]:
     return low, high
 
 
-def target_and_distance(scene: mi.Scene, settings: CaptureSettings) -> tuple[np.ndarray, float]:
-    """What the cameras look at, (3,) world, and their distance from it.
-
-    Without ``distance``, the bounding box's sphere just fits between the edges of the picture:
-    radius / sin(fov / 2), with the narrower field of view. The original's 4.03 is 10% less: its box
-    has empty corners.
-    """
-    low, high = bounding_box(scene)
-    target = (low + high) / 2 if settings.target is None else np.array(settings.target)
-    diagonal = float(np.linalg.norm(high - low))
-    distance = settings.distance
-    if distance is None:
-        distance = diagonal / 2 / math.sin(settings.narrower_fov / 2)
-    if math.dist(target.tolist(), ((low + high) / 2).tolist()) + distance > FAR_CLIP * diagonal:
-        raise UserError(
-            f"no camera may be farther from the scene than {FAR_CLIP:g} of its diagonals, "
-            f"{FAR_CLIP * diagonal:g}; got target {target.tolist()} and distance {distance:g}"
-        )
-    return target, distance
-
-
-def capture_views(
-    settings: CaptureSettings, target: np.ndarray, distance: float
-) -> list[CaptureView]:
-    """All pictures with their cameras, split after split."""
-    views = []
-    for number, split in enumerate(SPLITS):
-        rng = np.random.default_rng([settings.seed, number])
-        # Test views lie evenly; training views at random, but without gaps.
-        jitter = 0.0 if split == "test" else 1.0
-        directions = hemisphere(settings.count(split), jitter, rng)
-        directions = np.roll(directions, "zxy".index(settings.up), axis=1)
-        up = np.eye(3)["xyz".index(settings.up)]
-        views += [
-            CaptureView(
-                split, index, look_at(target + distance * direction, target, up) @ OPENCV_TO_OPENGL
-            )
-            for index, direction in enumerate(directions)
-        ]
-    return views
-
-
-def hemisphere(count: int, jitter: float, rng: np.random.Generator) -> np.ndarray:
-    """(count, 3): unit vectors with z > 0, of equal density per solid angle.
-
-    A golden-angle spiral from the rim to the pole: equal steps of height are equal areas (the
-    sphere's hat-box theorem). ``jitter`` 1 moves each within its own step, 0 not at all; ``rng``
-    turns the whole spiral.
-    """
-    step = np.arange(count)
-    offset = rng.uniform(0, 2 * math.pi)
-    moved = jitter * rng.uniform(-0.5, 0.5, (2, count))
-    height = (step + 0.5 + moved[0]) / max(count, 1)
-    azimuth = offset + GOLDEN_ANGLE * (step + moved[1])
-    radius = np.sqrt(1 - height**2)
-    return np.stack([radius * np.cos(azimuth), radius * np.sin(azimuth), height], axis=1)
-
-
 class CaptureCamera:
     """Takes pictures of a scene with one Mitsuba sensor that is moved around."""
 
@@ -257,7 +220,11 @@ class CaptureCamera:
         low, high = bounding_box(scene)
         diagonal = float(np.linalg.norm(high - low))
         self._integrator = mi.load_dict(
-            {"type": "path", "max_depth": settings.max_depth, "hide_emitters": True}
+            {
+                "type": "path",
+                "max_depth": settings.max_depth,
+                "hide_emitters": settings.hides_lights,
+            }
         )
         self._sensor = mi.load_dict(
             {
@@ -279,6 +246,7 @@ class CaptureCamera:
             }
         )
         self._parameters = mi.traverse(self._sensor)
+        self._fov = settings.fov
 
     def picture(self, view: CaptureView) -> np.ndarray:
         """(H, W, 4) uint8: straight alpha, colour in display space."""
@@ -292,6 +260,9 @@ class CaptureCamera:
         """(H, W, 4) float64: radiance times alpha, and alpha."""
         to_world = view.pose @ OPENGL_TO_MITSUBA
         self._parameters["to_world"] = mi.Transform4f(to_world)
+        if view.fov != self._fov:
+            self._parameters["x_fov"] = mi.Float(math.degrees(view.fov))
+            self._fov = view.fov
         self._parameters.update()
         (width, height), spp = self._settings.size, self._settings.spp
         at_once = min(SAMPLES_PER_PASS, math.isqrt(PATHS_PER_PASS // (width * height)) ** 2)
@@ -324,6 +295,13 @@ def encode(linear: np.ndarray) -> np.ndarray:
     return rgba
 
 
+def lit_part(rgba: np.ndarray) -> float:
+    """Of the covered pixels of (..., 4) uint8: the part that is not black; 0 without any."""
+    covered = rgba[..., 3] > 0
+    lit = covered & (rgba[..., :3].max(axis=-1) > DARK)
+    return float(lit.sum() / max(1, covered.sum()))
+
+
 def visible_points(
     scene: mi.Scene, settings: CaptureSettings, views: list[CaptureView], out: Path
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -347,7 +325,8 @@ def visible_points(
         pixels = rng.choice(len(picture), 2 * share + 64, p=weights / weights.sum())
         rows, columns = np.divmod(pixels, settings.size[0])
         spots = np.stack([columns, rows], axis=1) + rng.uniform(size=(len(pixels), 2))
-        hits, valid = first_hits(scene, view.pose[:3, 3], view_rays(view.pose, spots, settings))
+        rays = view.pose[:3, 3], view_rays(view, spots, settings)
+        hits, valid = first_hits(scene, *rays, settings.hides_lights)
         positions.append(hits[valid][:share])
         colors.append(np.round(picture[pixels[valid], :3] * 255).astype(np.uint8)[:share])
     if not sum(map(len, positions)):
@@ -368,24 +347,27 @@ def _taken(path: Path, settings: CaptureSettings) -> np.ndarray:
     return picture
 
 
-def view_rays(pose: np.ndarray, spots: np.ndarray, settings: CaptureSettings) -> np.ndarray:
+def view_rays(view: CaptureView, spots: np.ndarray, settings: CaptureSettings) -> np.ndarray:
     """(N, 3): unit directions, world, through (N, 2) places x, y in px of a picture."""
     width, height = settings.size
-    focal = 0.5 * width / math.tan(0.5 * settings.fov)
+    focal = 0.5 * width / math.tan(0.5 * view.fov)
     offset = (spots - np.array([width / 2, height / 2])) / focal
     local = np.stack([offset[:, 0], -offset[:, 1], -np.ones(len(spots))], axis=1)
-    directions = local @ pose[:3, :3].T
+    directions = local @ view.pose[:3, :3].T
     return directions / np.linalg.norm(directions, axis=1, keepdims=True)
 
 
 def first_hits(
-    scene: mi.Scene, origin: np.ndarray, directions: np.ndarray
+    scene: mi.Scene, origin: np.ndarray, directions: np.ndarray, past_lamps: bool
 ) -> tuple[np.ndarray, np.ndarray]:
-    """(N, 3) float32 world, where rays meet a surface that does not shine; (N,) bool if any."""
+    """(N, 3) float32 world, where rays meet a surface; (N,) bool if any.
+
+    past_lamps: whether surfaces that shine do not count.
+    """
     ray = mi.Ray3f(mi.Point3f(origin), mi.Vector3f(directions.T))
     for _ in range(MAX_LAMPS_IN_A_ROW):
         hit = scene.ray_intersect(ray)
-        lamp = hit.is_valid() & hit.shape.is_emitter()
+        lamp = hit.is_valid() & hit.shape.is_emitter() & past_lamps
         if not dr.any(lamp):
             break
         ray = dr.select(lamp, hit.spawn_ray(ray.d), ray)

@@ -1,0 +1,172 @@
+"""``python -m drgs.capture`` of rooms, of scenes with sensors and of scenes with splats."""
+
+import json
+import shlex
+
+import imageio.v3 as iio
+import mitsuba as mi
+import pytest
+from conftest import REPOSITORY
+from support.commands import run_in_process
+from support.render_command import write_scene
+
+from drgs import capture, fit
+from drgs.config.load import load_config
+from drgs.data import initial_gaussians, load_dataset
+from drgs.data.path_tracing import lit_part
+from drgs.io.ply import read_points
+
+CORNELL = "import mitsuba as mi\n\ndef scene():\n    return mi.cornell_box()\n"
+
+TINY = ["--views", 10, "--test-views", 2, "--size", 12, 12, "--spp", 4, "--points", 200]
+
+
+@pytest.fixture(scope="module", autouse=True)
+def variant():
+    mi.set_variant("llvm_ad_rgb")
+
+
+@pytest.fixture(scope="module")
+def cornell(tmp_path_factory):
+    path = tmp_path_factory.mktemp("scene") / "cornell.py"
+    path.write_text(CORNELL)
+    return path
+
+
+def run(scene, out, *options):
+    return run_in_process(capture.main, scene, "--out", out, *TINY, *options)
+
+
+def lit_parts(out):
+    return [lit_part(iio.imread(path)) for path in out.glob("t*/r_*.png")]
+
+
+@pytest.fixture(scope="module")
+def inside(cornell, tmp_path_factory):
+    """The outcome of the command, and its folder; its name has a space."""
+    out = tmp_path_factory.mktemp("captured") / "a room"
+    return run(cornell, out), out
+
+
+def test_a_room_is_photographed_from_inside_and_nothing_is_dark(inside):
+    outcome, out = inside
+    assert (outcome.returncode, outcome.stderr) == (0, "")
+    assert "cameras: 12 inside the scene, around (" in outcome.stdout
+    assert "field of view 70 degrees" in outcome.stdout
+    parts = lit_parts(out)
+    assert len(parts) == 12
+    assert min(parts) > 0.7
+    # Of its lamp, too: white, as a photograph would have it.
+    pictures = [iio.imread(path) for path in out.glob("*/*.png")]
+    assert any((picture[:, :, :3] == 255).all(axis=2).any() for picture in pictures)
+
+
+def fitting_command(outcome):
+    """The configuration and the words behind it, as a shell would split what was printed last."""
+    *_, last = outcome.stdout.splitlines()
+    said, separator, command = last.partition("fit it with: ")
+    assert (said, separator) == ("", "fit it with: ")
+    python, m, module, config, *words = shlex.split(command)
+    assert [python, m, module] == ["python", "-m", "drgs.fit"]
+    return REPOSITORY / config, words
+
+
+def test_it_ends_with_the_command_that_fits_its_result(inside):
+    path, (data, folder, assign, assignment) = fitting_command(inside[0])
+    assert (data, folder, assign) == ("--data", str(inside[1]), "--set")
+    config = load_config(path, [f"data.path={folder}", assignment])
+    dataset = load_dataset(config.data)
+    assert (len(dataset.train), len(dataset.test)) == (10, 2)
+    positions, _ = read_points(inside[1] / "points3d.ply")
+    assert initial_gaussians(config, dataset).means.tolist() == positions.tolist()
+
+
+@pytest.mark.slow
+def test_a_fit_of_a_room_shows_the_room(cornell, tmp_path):
+    """On views that it has not seen; a picture's mean colour alone is at 12 dB."""
+    larger = ["--views", 40, "--test-views", 8, "--size", 32, 32, "--spp", 64, "--points", 4000]
+    outcome = run(cornell, tmp_path / "room", *larger)
+    path, words = fitting_command(outcome)
+    few = ["--set", "iterations=400", "--out", tmp_path / "fit"]
+    fitted = run_in_process(fit.main, path, *words, *few)
+    assert fitted.returncode == 0, fitted.stderr
+    metrics = json.loads((tmp_path / "fit" / "metrics.json").read_text())
+    assert metrics["test"]["psnr"] > 20
+
+
+@pytest.mark.parametrize("options", [["--cameras", "around"], ["--distance", "4"]])
+def test_pictures_that_are_mostly_black_are_warned_of_in_one_line(cornell, tmp_path, options):
+    outcome = run(cornell, tmp_path / "out", *options)
+    assert outcome.returncode == 0
+    (line,) = outcome.stderr.splitlines()
+    assert line.startswith("warning: ")
+    assert "of the first 10 pictures are empty or black: give --cameras inside" in line
+
+
+def test_pictures_that_are_mostly_empty_are_warned_of_in_one_line(cornell, tmp_path):
+    outcome = run(cornell, tmp_path / "out", "--target", 50, 0, 0, "--distance", 9, "--points", 0)
+    assert outcome.returncode == 0
+    (line,) = outcome.stderr.splitlines()
+    assert "warning: 10 of the first 10 pictures are empty or black" in line
+
+
+def test_ranges_of_azimuth_and_elevation_keep_before_the_open_side(cornell, tmp_path):
+    ranges = ["--azimuth", -25, 25, "--elevation", -15, 20]
+    outcome = run(cornell, tmp_path / "out", *ranges)
+    assert (outcome.returncode, outcome.stderr) == (0, "")
+    assert min(lit_parts(tmp_path / "out")) > 0.6
+    noted = json.loads((tmp_path / "out" / "capture.json").read_text())
+    assert (noted["azimuth"], noted["elevation"]) == ([-25, 25], [-15, 20])
+    again = run(cornell, tmp_path / "out", "--azimuth", -25, 30, "--elevation", -15, 20)
+    assert again.returncode == 2
+    assert "azimuth is [-25.0, 25.0], asked for is [-25.0, 30.0]" in again.stderr
+
+
+def test_the_scenes_own_sensors_are_used_where_asked_for(cornell, tmp_path):
+    words = [cornell, "--cameras", "sensors", "--size", 12, 12, "--spp", 4, "--points", 0]
+    outcome = run_in_process(capture.main, *words, "--out", tmp_path / "out")
+    assert (outcome.returncode, outcome.stderr) == (0, "")
+    assert "cameras: the scene's own sensors, 1\n" in outcome.stdout
+    transforms = json.loads((tmp_path / "out" / "transforms_train.json").read_text())
+    (frame,) = transforms["frames"]
+    assert frame["camera_angle_x"] == pytest.approx(0.68605, abs=1e-5)  # 39.3077 degrees
+    assert frame["transform_matrix"][2] == pytest.approx([0, 0, 1, 3.9], abs=1e-6)
+    assert "--set data.test_split=train" in outcome.stdout.splitlines()[-1]
+
+
+def test_splats_are_not_left_out_silently(tmp_path):
+    line = refusal(write_scene(tmp_path), tmp_path / "out")
+    assert "blobs.xml: the scene holds splats (its integrator is splats)" in line
+    assert "python -m drgs.render" in line
+
+
+def test_shapes_of_gaussians_are_not_taken_for_surfaces(tmp_path):
+    path = tmp_path / "s.py"
+    path.write_text(
+        "import mitsuba as mi\n"
+        "import numpy as np\n\n"
+        "def scene():\n"
+        "    row = np.array([[0, 0, 0, 1, 1, 1, 0, 0, 0, 1]], np.float32)\n"
+        "    values = {'opacities': np.ones((1, 1)), 'sh_coeffs': np.ones((1, 3))}\n"
+        "    tensors = {k: mi.TensorXf(v.astype(np.float32)) for k, v in values.items()}\n"
+        "    shape = {'type': 'ellipsoids', 'data': mi.TensorXf(row), **tensors}\n"
+        "    return {'type': 'scene', 'gaussians': shape}\n"
+    )
+    line = refusal(path, tmp_path / "out")
+    assert "the scene holds splats (it has shapes of type ellipsoids)" in line
+
+
+def test_why_mitsuba_cannot_load_a_scene_is_said_without_a_traceback(tmp_path):
+    path = write_scene(tmp_path)
+    (tmp_path / "model.ply").unlink()
+    line = refusal(path, tmp_path / "out")
+    assert "model.ply: cannot read the file: No such file or directory" in line
+    assert "Traceback" not in line
+
+
+def refusal(scene, out):
+    outcome = run(scene, out)
+    assert outcome.returncode == 2
+    assert not out.exists()
+    (line,) = outcome.stderr.splitlines()
+    return line
