@@ -121,7 +121,9 @@ def add_arguments(parser: CommandParser) -> None:
     what.add_argument(
         "--resume", type=file_or_folder, metavar="OUT_DIR", help="go on with a fit that was stopped"
     )
-    parser.add_argument("--data", metavar="DIR", help="dataset folder (data.path)")
+    parser.add_argument(
+        "--data", metavar="DIR", help="dataset folder (data.path), also one that was moved"
+    )
     parser.add_argument("--out", metavar="DIR", help="output folder (default: out/NAME)")
     parser.add_argument(
         "--overwrite", action="store_true", help="replace the run that the output folder holds"
