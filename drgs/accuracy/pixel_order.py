@@ -16,7 +16,7 @@ Nothing jumps: inserting into a sorted window is K comparisons with selections, 
 **Adjoint.** Pixels of a micro-tile composite different splats at the same time, while a splat's
 partial derivatives are sums over pixels. So two walks compute what a pixel contributes, and store w
 = T alpha and d loss / d ln(alpha) where the splat's pixels are together; a third walk sums. What
-light behind a splat is worth, R (see ``drgs.splatting.rasterize``), follows from the sum over all
+lies behind a splat, b (see ``drgs.splatting.rasterize``), follows from the sum over all
 splats less that of the splats in front. That difference would cancel: both sums are kept as two
 numbers each, whose sum is exact to twice the precision.
 """
@@ -305,7 +305,7 @@ def _feature_gradient(inputs: _WalkInputs, met: _Met, pixel: int, g: list[list[A
 def _totals(
     inputs: _WalkInputs, layers: _OrderedLayers, g: list[list[Any]], d_transmittance: Any
 ) -> list[tuple[Any, Any]]:
-    """First walk: what all splats of each pixel and its background are worth, in two numbers."""
+    """First walk: b in front of all splats of each pixel, in two numbers."""
     t = types_of(type(inputs.bins.rows))
 
     def add_up(state: tuple, visited: list[list[Any]]) -> tuple:

@@ -54,8 +54,9 @@ multiply (3); colour: 3 multiply-adds.
 
 Adjoint, 42: the same up to the cut (16); reached: comparison, selection (2); 1 - alpha and
 division (2, though one division costs several); weight (1); c.g and d_color: 6 multiply-adds;
-gain, R, derivative and selection (4); and the sums over the pixels: u v (1), sums of v and u v by
-row, u v by column (3), the column's and the rows' shares of the moments and of the slots (7)."""
+gain, what lies behind, derivative and selection (4); and the sums over the pixels: u v (1), sums
+of v and u v by row, u v by column (3), the column's and the rows' shares of the moments and of the
+slots (7)."""
 
 ROUNDS, QUICK_ROUNDS = 15, 5
 SLOW_ROUNDS = 3

@@ -44,9 +44,9 @@ MISSED = 1e-6
 class RadialTangential(Perspective):
     """OpenCV's lens: slopes (x, y) are distorted before they come to the film.
 
-    With r^2 = x^2 + y^2 and R = (1 + k1 r^2 + k2 r^4 + k3 r^6) / (1 + k4 r^2 + k5 r^4 + k6 r^6),
+    With r^2 = x^2 + y^2 and L = (1 + k1 r^2 + k2 r^4 + k3 r^6) / (1 + k4 r^2 + k5 r^4 + k6 r^6),
 
-        x' = R x + 2 p1 x y + p2 (r^2 + 2 x^2),  y' = R y + p1 (r^2 + 2 y^2) + 2 p2 x y
+        x' = L x + 2 p1 x y + p2 (r^2 + 2 x^2),  y' = L y + p1 (r^2 + 2 y^2) + 2 p2 x y
 
     (Brown 1966; OpenCV's documentation, "Camera Calibration and 3D Reconstruction"). Means whose r
     is beyond ``max_squared_radius`` are not seen.
@@ -212,7 +212,7 @@ class RadialTangential(Perspective):
         return polynomial(self.numerator, squared) / polynomial(self.denominator, squared)
 
     def _radial_derivative(self, squared: Any) -> Any:
-        """d R / d r^2."""
+        """d L / d r^2."""
         denominator = polynomial(self.denominator, squared)
         change = derivative(self.numerator, squared)
         change = change - self._radial(squared) * derivative(self.denominator, squared)
@@ -224,11 +224,11 @@ def _largest_squared_radius(
 ) -> float:
     """r^2 within which no two slopes are distorted to the same; inf: wherever they are.
 
-    With R = N / D and u = r^2, the radial part's Jacobian has the eigenvalues A = G / D^2, with
-    G = N D + 2 u (N' D - N D'), along the slope, and R across it. With ``tangential``, the length
-    q of (p2, p1), no eigenvalue of the tangential part's is below -6 r q. While A and R are larger
+    With L = N / D and u = r^2, the radial part's Jacobian has the eigenvalues A = G / D^2, with
+    G = N D + 2 u (N' D - N D'), along the slope, and L across it. With ``tangential``, the length
+    q of (p2, p1), no eigenvalue of the tangential part's is below -6 r q. While A and L are larger
     than 6 r q, the sum is positive definite (Weyl's inequality), and as it is symmetric, its
-    map one-to-one. The bound is reached where A <= R, on the side of -(p2, p1).
+    map one-to-one. The bound is reached where A <= L, on the side of -(p2, p1).
     """
     u = np.polynomial.Polynomial([0.0, 1.0])
     n, d = (np.polynomial.Polynomial([1.0, *c]) for c in (numerator, denominator))

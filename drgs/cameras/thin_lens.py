@@ -27,7 +27,7 @@ class RoundAperture:
         """Along either axis, px^2, of the disc over which a point at ``depth`` is spread.
 
         Its radius is focal radius |1 / focus_distance - 1 / depth| (similar triangles), and a
-        uniform disc of radius R has the variance R^2 / 4. Pixels are square.
+        uniform disc of radius r has the variance r^2 / 4. Pixels are square.
         """
         radius = camera.focal.x * self.radius * (1 / self.focus_distance - 1 / depth)
         return dr.square(radius) / 4

@@ -118,7 +118,7 @@ class Picture:
         ]
         if self.hybrid is not None:
             self.hybrid.backward(params, d_nested)
-        return reduce(rendering.added, gradients)
+        return reduce(rendering.sum_of_gradients, gradients)
 
     def tangent(self, params: object, tangents: Gaussians) -> mi.TensorXf:
         """Directional derivative of the image.

@@ -139,8 +139,8 @@ class SeenSurface(Surface):
         """What the surface adds its own with; front: sum of the splats' weights in front of it."""
         return self.coverage * (1 - front)
 
-    def added(self, kind: str, front: mi.Float) -> list[mi.Float] | None:
-        """To the channels of an AOV; None: nothing."""
+    def aov_values(self, kind: str, front: mi.Float) -> list[mi.Float] | None:
+        """What the surface contributes to the channels of an AOV; None: nothing."""
         if kind == "depth":
             return [self.share(front) * self.depth]
         if kind == "normal":

@@ -95,7 +95,7 @@ class View:
             if of_camera:
                 numbers = [camera.numbers() for camera in self._attached_cameras(state)]
                 _accumulate_through(numbers, [gradients.camera for gradients in by_time])
-        return reduce(rendering.added, by_time)
+        return reduce(rendering.sum_of_gradients, by_time)
 
     def channels(self, planes: Planes, constant: mi.Color3f | None) -> Passes:
         """What the film gets of each sample per pixel: the mean over the times.
@@ -117,7 +117,7 @@ class View:
             *planes, front = planes
             past = [(1 - surface.coverage) * planes[0], *planes[1:]]
             own = self._composited(
-                past, color, behind.opaque, lambda kind: surface.added(kind, front)
+                past, color, behind.opaque, lambda kind: surface.aov_values(kind, front)
             )
             return own + self.hybrid.insertion.values(surface, front, radiance)
 
@@ -137,11 +137,11 @@ class View:
         planes: list[Any],
         behind: mi.Color3f,
         opaque: bool,
-        added: Callable[[str], Channels | None] = lambda kind: None,
+        of_surface: Callable[[str], Channels | None] = lambda kind: None,
     ) -> Channels:
         """Planes of pixels: red, green, blue, perhaps alpha, AOVs.
 
-        added: to the channels of an AOV of this kind.
+        of_surface: what a surface contributes to the channels of an AOV of this kind.
         """
         transmittance, red, green, blue, *others = planes
         color = mi.Color3f(red, green, blue)
@@ -156,7 +156,7 @@ class View:
                 channels.append(1 - transmittance)
                 continue
             values = [others.pop(0) for _ in self.integrator.channels_of(kind)]
-            more = added(kind)
+            more = of_surface(kind)
             if more is not None:
                 values = [a + b for a, b in zip(values, more, strict=True)]
             channels += values

@@ -393,14 +393,14 @@ def project(
 ) -> Projection:
     """Return the splats that Gaussians leave on the film behind a lens.
 
-    cov2d = J W Sigma W^T J^T + low_pass I + diag(R^2 / 4)    (EWA, section 4)
+    cov2d = J W Sigma W^T J^T + low_pass I + diag(r^2 / 4)    (EWA, section 4)
 
     J is the derivative of ``film_points`` at the mean, its slope clamped where the lens has
     ``slope_bounds``. low_pass: px^2; antialiased: opacities are multiplied by
-    sqrt(det(J W Sigma W^T J^T) / det(cov2d without R)), as in ``reference.project``.
+    sqrt(det(J W Sigma W^T J^T) / det(cov2d without r)), as in ``reference.project``.
 
-    defocus: R (N, 2) px are its ``blur_radii``; the variance of a uniform disc of radius R along
-    an axis is R^2 / 4. Opacities are multiplied by sqrt(det(cov2d without R) / det(cov2d)), so
+    defocus: r (N, 2) px are its ``blur_radii``; the variance of a uniform disc of radius r along
+    an axis is r^2 / 4. Opacities are multiplied by sqrt(det(cov2d without r) / det(cov2d)), so
     that the integral over the film of a splat stays. So are ``Projection.cuts``: a splat that is
     seen in focus is seen out of focus, and ends at as many standard deviations. Both may be small,
     but not below LEAST_CUT. ``Projection.depths`` are the lens's.
@@ -423,7 +423,7 @@ def project(
     opacities = reference.sigmoid(gaussians.logit_opacities)
     if antialiased:
         opacities = opacities * areas / np.sqrt(np.where(singular, 1.0, dets))
-    bright, cuts = opacities > reference.ALPHA_CUT, reference.ALPHA_CUT
+    above_cut, cuts = opacities > reference.ALPHA_CUT, reference.ALPHA_CUT
     if defocus is not None:
         if isinstance(lens, Orthographic):
             raise ValueError(
@@ -436,14 +436,14 @@ def project(
         singular = dets == 0
         dimming = np.sqrt(dets_in_focus / np.where(singular, 1.0, dets))
         opacities, cuts = opacities * dimming, np.maximum(cuts * dimming, LEAST_CUT)
-        bright &= opacities > LEAST_CUT
+        above_cut &= opacities > LEAST_CUT
     return Projection(
         means2d=lens.film_points(camera, points),
         cov2d=cov2d,
         conics=reference._inverses(cov2d, np.where(singular, 1.0, dets)),
         depths=depths,
         opacities=opacities,
-        visible=seen & ~singular & bright,
+        visible=seen & ~singular & above_cut,
         cuts=cuts,
     )
 

@@ -542,14 +542,14 @@ def _film_bounds(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the lowest and highest film positions (N, 2), px, at which a splat may exist.
 
-    rho <= R, from the extent and from o exp(-R^2 / 2) = alpha_cut, bounds a Gaussian on the film
-    by R sqrt(C_xx). An exact one is bounded by the planes through the x or y axis that touch the
-    ellipsoid rho = R: with l = A0^T e_x - y e_z / fx, one that passes y px beside the mean,
-    (l . m)^2 = R^2 l^T S' l is
+    rho <= d, from the extent and from o exp(-d^2 / 2) = alpha_cut, bounds a Gaussian on the film
+    by d sqrt(C_xx). An exact one is bounded by the planes through the x or y axis that touch the
+    ellipsoid rho = d: with l = A0^T e_x - y e_z / fx, one that passes y px beside the mean,
+    (l . m)^2 = d^2 l^T S' l is
 
-        (1 - R^2 w) y^2 + 2 R^2 k_x y - R^2 C_xx = 0
+        (1 - d^2 w) y^2 + 2 d^2 k_x y - d^2 C_xx = 0
 
-    Where R^2 w >= 1 the ellipsoid reaches the plane z = 0, and there is no bound.
+    Where d^2 w >= 1 the ellipsoid reaches the plane z = 0, and there is no bound.
     """
     reach_sq = np.full(len(splats.depths), model.extent**2 * (1 + threshold_width))
     if model.alpha_cut > 0:

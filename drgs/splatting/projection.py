@@ -184,10 +184,10 @@ def project(
     )
     if rows.dimming is not None:
         opacities = opacities * rows.dimming
-    bright = opacities > least_alpha
+    above_cut = opacities > least_alpha
     if film.dimming is not None:
         opacities = opacities * film.dimming
-        bright = bright & (opacities > NEGLIGIBLE_ALPHA)
+        above_cut = above_cut & (opacities > NEGLIGIBLE_ALPHA)
     direction = camera.lens.view_direction(camera, offset)
     colors = (color or color_at_mean)(rows, direction, sh_degree)
     numbers = [*film.means2d, *film.whitening, *colors]
@@ -200,7 +200,7 @@ def project(
         opacities=opacities,
         colors=colors,
         variances=film.variances,
-        visible=seen & bright & finite & dr.isfinite(dr.sum(film.variances)),
+        visible=seen & above_cut & finite & dr.isfinite(dr.sum(film.variances)),
         ray=film.ray,
         dimming=film.dimming,
     )

@@ -12,15 +12,15 @@ below 1e-4. c_i is a vector of any length, the splat's *features*: colour, depth
 else is to be composited. The background is added by the caller, from T.
 
 **Adjoint.** Let g = dL/dC and G = dL/dT. Whatever lies behind splat i contributes to the loss
-through the factor T_{i+1} = T_i (1 - a_i) only. Let R_i be what one unit of light that passes
-splat i is worth: R_last = G, since it reaches the background, and
+through the factor T_{i+1} = T_i (1 - a_i) only. Let b_i ("behind") be the derivative of the loss
+with respect to that factor: b_last = G, since behind the last splat is the background, and
 
-    R_{i-1} = a_i (c_i . g) + (1 - a_i) R_i.
+    b_{i-1} = a_i (c_i . g) + (1 - a_i) b_i.
 
-    dL/dc_i = w_i g,   dL/da_i = T_i (c_i . g - R_i).
+    dL/dc_i = w_i g,   dL/da_i = T_i (c_i . g - b_i).
 
 The adjoint walks the splats back to front, from the last one that the pixel composited, and
-recovers T_i = T_{i+1} / (1 - a_i) (3DGS, section 6), which alpha <= 0.99 keeps accurate. R is a
+recovers T_i = T_{i+1} / (1 - a_i) (3DGS, section 6), which alpha <= 0.99 keeps accurate. b is a
 convex combination of the values behind it: its rounding errors do not grow, and a splat that is
 seen through little transmittance has a gradient as accurate, relative to its own size, as the
 first. (The equivalent sums from front to back, S_i = S_{i-1} - w_i (c_i . g) and dL/da_i =
@@ -338,19 +338,19 @@ def composite_adjoint(
     transmittance = load_lane_row(layers.values, lanes.micro_tile, 1 + layers.count)
     partials = empty_rows(t.Float, width, max(slots.count, 1))
 
-    def body(cursor: Cursor, slot: Any, T: list, R: list) -> tuple:
+    def body(cursor: Cursor, slot: Any, T: list, behind: list) -> tuple:
         entry, active = entries.current(cursor)
         slot = dr.select(active, slot - 1, slot)
         geometry, features = records.load(entry, active)
         footprint = model.footprint(geometry, lanes, active)
         alphas = model.alphas(geometry, footprint)
         composited = [entry < end for end in ends]
-        T, R, d_log_alpha, d_features = _adjoint_step(
-            alphas, composited, features, model.features, T, R, g
+        T, behind, d_log_alpha, d_features = _adjoint_step(
+            alphas, composited, features, model.features, T, behind, g
         )
         moments = model.response.moments(footprint, d_log_alpha, model.positions)
         store_row(partials, moments + d_features, slot, active)
-        return entries.advance(cursor), slot, T, R
+        return entries.advance(cursor), slot, T, behind
 
     loop = dr.while_loop(
         state=(
@@ -359,7 +359,7 @@ def composite_adjoint(
             transmittance,
             load_pixels(d_transmittance, lanes, bins.grid),
         ),
-        cond=lambda cursor, slot, T, R: entries.pending(cursor),
+        cond=lambda cursor, slot, T, behind: entries.pending(cursor),
         body=body,
     )
     dr.eval(loop, partials)
@@ -372,16 +372,16 @@ def _adjoint_step(
     stored: list[Any],
     features: Features,
     T: list[Any],
-    R: list[Any],
+    behind: list[Any],
     g: list[list[Any]],
 ) -> tuple[list, list, list, list]:
-    """One splat at 16 pixels: T and R before it, d loss / d ln(alpha), d loss / d stored (summed).
+    """One splat at 16 pixels: T and b before it, d loss / d ln(alpha), d loss / d stored (summed).
 
     composited: whether each pixel was still unfinished; stored: what is stored of the splat, and
-    features: what they are at a pixel; T, R: past the splat; g: [plane][pixel] derivative of the
-    loss with respect to C.
+    features: what they are at a pixel; T, behind: T and b past the splat; g: [plane][pixel]
+    derivative of the loss with respect to C.
     """
-    T, R = list(T), list(R)
+    T, behind = list(T), list(behind)
     zero = type(T[0])(0)
     d_stored = [zero for _ in stored]
     d_log_alpha = []
@@ -391,11 +391,11 @@ def _adjoint_step(
         weight = value * T[pixel]
         g_pixel = [plane[pixel] for plane in g]
         d_stored = features.add_derivatives(d_stored, stored, pixel, weight, g_pixel)
-        gain = features.feature_gradient(stored, pixel, g_pixel) - R[pixel]
-        R[pixel] = dr.fma(value, gain, R[pixel])
-        # d loss / d ln(alpha) = a T (c.g - R), zero where alpha is clamped.
+        gain = features.feature_gradient(stored, pixel, g_pixel) - behind[pixel]
+        behind[pixel] = dr.fma(value, gain, behind[pixel])
+        # d loss / d ln(alpha) = a T (c.g - b), zero where alpha is clamped.
         d_log_alpha.append(dr.select(alpha.smooth, weight * gain, 0))
-    return T, R, d_log_alpha, d_stored
+    return T, behind, d_log_alpha, d_stored
 
 
 def sum_slots(bins: TileBins, slots: Slots, partials: Any, width: int) -> SplatGradients:

@@ -310,8 +310,8 @@ def _sums(columns: list[Any], visible: Any) -> list[Any]:
     return [dr.sum(column) for column in columns]
 
 
-def added(a: GaussianGradients, b: GaussianGradients) -> GaussianGradients:
-    """Of a loss that depends on what several cameras see."""
+def sum_of_gradients(a: GaussianGradients, b: GaussianGradients) -> GaussianGradients:
+    """Those of a loss that depends on what several cameras see."""
     parameters = {
         name: getattr(a.parameters, name) + getattr(b.parameters, name) for name in PARAMETER_NAMES
     }

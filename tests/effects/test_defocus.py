@@ -78,21 +78,21 @@ def test_picture_equals_the_reference(precision, scene):
     case = clear(case_of(scene))
     _, frame = case.render(precision)
     assert_pictures_agree(picture_of(frame, case), case.picture, PICTURE[precision])
-    sharp = effects.render(*case.scene, case.lens, case.background, case.antialiased)
-    assert np.abs(case.picture.image - sharp.image).max() > 0.05
+    in_focus = effects.render(*case.scene, case.lens, case.background, case.antialiased)
+    assert np.abs(case.picture.image - in_focus.image).max() > 0.05
 
 
 @both_precisions
 def test_an_aperture_of_zero_takes_the_pinholes_picture(precision):
     case = clear(case_of({}, defocus=ThinLens(0.0, 2.0)))
     gaussians, frame = case.render(precision)
-    sharp = render_composed(gaussians, replace(frame.camera, aperture=None), case.pipeline)
+    in_focus = render_composed(gaussians, replace(frame.camera, aperture=None), case.pipeline)
     # The same covariance; the factor of the opacity is x / x.
-    np.testing.assert_array_equal(planes_of(frame), planes_of(sharp))
+    np.testing.assert_array_equal(planes_of(frame), planes_of(in_focus))
 
 
 def splats_of(gaussians, camera, precision, defocus, rule=plain_opacity, low_pass=0.3):
-    """Projected by the kernels, sharp if ``defocus`` is None."""
+    """Projected by the kernels, in_focus if ``defocus`` is None."""
     device = lens_camera(camera, PINHOLE, precision)
     shape = ewa
     if defocus is not None:
@@ -111,15 +111,15 @@ def test_a_splat_in_focus_is_not_blurred(precision):
     gaussians = replace(
         gaussians_at(points, [0.05, 0.1, 0.02]), quats=single([[0.3, 0.8, -0.5, 0.1]] * 3)
     )
-    blurred, sharp = (
+    blurred, in_focus = (
         splats_of(gaussians, camera, precision, defocus) for defocus in (ThinLens(0.125, 2.0), None)
     )
     for name in ("whitening", "variances", "opacities"):
-        a, b = (rows(getattr(splats, name)) for splats in (blurred, sharp))
+        a, b = (rows(getattr(splats, name)) for splats in (blurred, in_focus))
         np.testing.assert_array_equal(a[1], b[1])
         assert (np.abs(a[[0, 2]] / b[[0, 2]] - 1).reshape(2, -1).max(axis=1) > 0.1).all()
-    np.testing.assert_array_equal(rows(blurred.means2d), rows(sharp.means2d))
-    np.testing.assert_array_equal(rows(blurred.depths), rows(sharp.depths))
+    np.testing.assert_array_equal(rows(blurred.means2d), rows(in_focus.means2d))
+    np.testing.assert_array_equal(rows(blurred.depths), rows(in_focus.depths))
 
 
 @both_precisions
@@ -185,8 +185,8 @@ def separate_scene() -> tuple[reference.Gaussians, reference.Camera]:
     return replace(gaussians, sh0=rng.uniform(-1, 1.7, (12, 1, 3))), camera
 
 
-# By aperture: PSNR (dB) of the blurred picture and of the sharp one. Measured: 73.8 and 52.6, 63.5
-# and 41.7, 51.6 and 33.1, 45.5 and 27.7.
+# By aperture: PSNR (dB) of the blurred picture and of the one in focus. Measured: 73.8 and 52.6,
+# 63.5 and 41.7, 51.6 and 33.1, 45.5 and 27.7.
 SAMPLED = {0.03125: (73, 53), 0.0625: (63, 42), 0.125: (51, 34), 0.25: (45, 28)}
 
 
@@ -207,8 +207,8 @@ def test_pictures_are_nearly_those_of_many_samples_of_the_aperture(aperture_radi
         )
         image = np.moveaxis(planes_of(frame)[1:].reshape(3, camera.height, camera.width), 0, -1)
         found.append(-10 * np.log10(np.mean((image - expected) ** 2)))
-    psnr, sharp = SAMPLED[aperture_radius]
-    assert found[0] > psnr and found[1] < sharp
+    psnr, in_focus = SAMPLED[aperture_radius]
+    assert found[0] > psnr and found[1] < in_focus
 
 
 # ----------------------------------------------------------------------------------------------

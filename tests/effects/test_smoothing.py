@@ -203,8 +203,8 @@ def test_picture_is_the_references_of_the_widened_gaussians(precision, antialias
     case = clear(SmoothCase("smooth", 37, 29, 1, antialiased=antialiased))
     _, frame = case.render(precision)
     assert_pictures_agree(picture_of(frame, case), case.picture, PICTURE[precision])
-    sharp = reference.render(*case.scene, case.background, antialiased=antialiased)
-    assert np.abs(sharp.image - case.picture.image).max() > 0.1
+    unfiltered = reference.render(*case.scene, case.background, antialiased=antialiased)
+    assert np.abs(unfiltered.image - case.picture.image).max() > 0.1
 
 
 @both_precisions
@@ -396,11 +396,11 @@ def test_the_plugin_uses_the_filter_of_a_file_unless_it_is_ignored(tmp_path):
     def image(name, **settings):
         return image_of(loaded_with(scene, filename=str(tmp_path / name), **settings))
 
-    sharp, smooth = image("plain.ply"), image("filtered.ply")
-    assert np.abs(sharp - smooth).max() > 0.1
+    unfiltered, smooth = image("plain.ply"), image("filtered.ply")
+    assert np.abs(unfiltered - smooth).max() > 0.1
     # Rounded opacities and scales: as in single precision above.
     np.testing.assert_allclose(image("baked.ply"), smooth, atol=2e-5 * smooth.max())
-    assert np.array_equal(image("filtered.ply", ignore="smoothing"), sharp)
+    assert np.array_equal(image("filtered.ply", ignore="smoothing"), unfiltered)
     by_tensors = tensors(scene.gaussians) | {"smoothing": mi.TensorXf(scene_filter(scene))}
     assert np.array_equal(image_of(loaded_with(scene, **by_tensors)), smooth)
 

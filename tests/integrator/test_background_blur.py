@@ -79,11 +79,11 @@ def test_an_environment_out_of_focus_is_what_path_renders():
         sensor = thin_lens(focus_distance=distance).dictionary()
         image = image_of(load(sensor, hidden_splats(), sky=smooth_sky()))
         traced = image_of(load(sensor, {"type": "path"}, sky=smooth_sky()), spp=2048)
-        sharp = image_of(load(sensor, hidden_splats() | SHARP, sky=smooth_sky()))
+        in_focus = image_of(load(sensor, hidden_splats() | SHARP, sky=smooth_sky()))
         # Rays are also spread over the pixels, and 16 points are few. Measured: 0.036 and 0.017,
         # and four deviations of the mean of 2048 rays, 0.006 each of contrasts of 0.3.
         assert np.abs(image - traced).max() < {1.25: 0.06, 2.5: 0.04}[distance]
-        assert np.abs(sharp - traced).max() > {1.25: 0.24, 2.5: 0.07}[distance]
+        assert np.abs(in_focus - traced).max() > {1.25: 0.24, 2.5: 0.07}[distance]
 
 
 @pytest.mark.parametrize("name", ["sensor.aperture_radius", "sensor.focus_distance", "sky.data"])
@@ -91,8 +91,8 @@ def test_an_environment_out_of_focus_is_differentiated(name):
     """Against differences, in single precision."""
     scene = load(thin_lens().dictionary(), hidden_splats(), sky=smooth_sky())
     # What is lost by blurring: a loss that all of them change.
-    sharp = load(thin_lens().dictionary(), hidden_splats() | SHARP, sky=smooth_sky())
-    weights = image_of(sharp) - image_of(scene)
+    in_focus = load(thin_lens().dictionary(), hidden_splats() | SHARP, sky=smooth_sky())
+    weights = image_of(in_focus) - image_of(scene)
     params = mi.traverse(scene)
     value = type(params[name])(params[name])
     direction = np.random.default_rng(1).uniform(0.5, 1, np.array(value).shape)

@@ -111,8 +111,8 @@ def test_a_picture_through_a_thin_lens_is_that_of_the_reference():
     image = image_of(splats_scene(own_sensor("thinlens", view), gaussians))
     expected = np.concatenate([picture.image, picture.alpha[..., None]], axis=-1)
     np.testing.assert_allclose(image, expected[view.window], rtol=0, atol=5e-5)
-    sharp = effects.render(gaussians, camera)
-    assert np.abs(sharp.image - picture.image)[view.window].max() > 0.05
+    in_focus = effects.render(gaussians, camera)
+    assert np.abs(in_focus.image - picture.image)[view.window].max() > 0.05
 
 
 def test_colours_along_rays_turn_with_a_rolling_shutter():

@@ -127,26 +127,28 @@ def test_blur_radius_is_half_the_spread_of_the_aperture():
 
 def test_no_aperture_and_what_is_in_focus_are_not_blurred():
     gaussians, camera = small_scene()
-    sharp = effects.project(gaussians, camera)
-    for defocus in (ThinLens(0.0, 2.0), ThinLens(0.3, sharp.depths[3])):
+    in_focus = effects.project(gaussians, camera)
+    for defocus in (ThinLens(0.0, 2.0), ThinLens(0.3, in_focus.depths[3])):
         blurred = effects.project(gaussians, camera, defocus=defocus)
         rows = slice(0, 10) if defocus.aperture_radius == 0 else [3]
-        np.testing.assert_allclose(blurred.cov2d[rows], sharp.cov2d[rows], rtol=1e-14)
-        np.testing.assert_allclose(blurred.opacities[rows], sharp.opacities[rows], rtol=1e-14)
-    assert (blurred.opacities[:2] < 0.99 * sharp.opacities[:2]).all()
+        np.testing.assert_allclose(blurred.cov2d[rows], in_focus.cov2d[rows], rtol=1e-14)
+        np.testing.assert_allclose(blurred.opacities[rows], in_focus.opacities[rows], rtol=1e-14)
+    assert (blurred.opacities[:2] < 0.99 * in_focus.opacities[:2]).all()
 
 
 @pytest.mark.parametrize("antialiased", [False, True])
 def test_defocus_keeps_the_integral_of_a_splat(antialiased):
     """2 pi sqrt(det) opacity, and so the sum of alpha over a film that holds the splat."""
     gaussians, camera = small_scene()
-    sharp = effects.project(gaussians, camera, antialiased=antialiased)
+    in_focus = effects.project(gaussians, camera, antialiased=antialiased)
     blurred = effects.project(
         gaussians, camera, antialiased=antialiased, defocus=ThinLens(0.2, 1.2)
     )
-    integrals = [s.opacities[:10] * np.sqrt(np.linalg.det(s.cov2d[:10])) for s in (sharp, blurred)]
+    integrals = [
+        s.opacities[:10] * np.sqrt(np.linalg.det(s.cov2d[:10])) for s in (in_focus, blurred)
+    ]
     np.testing.assert_allclose(*integrals, rtol=1e-9)
-    assert (np.linalg.det(blurred.cov2d[:10]) > np.linalg.det(sharp.cov2d[:10])).all()
+    assert (np.linalg.det(blurred.cov2d[:10]) > np.linalg.det(in_focus.cov2d[:10])).all()
 
 
 @pytest.mark.parametrize("depth", [1.0, 2.0, 5.0])
@@ -328,7 +330,7 @@ def test_motion_blur_widens_by_the_variance_of_the_path():
     close = replace(open, center=np.array([0.5, 0.0, 0.0]))
     gaussians = gaussians_at([0.25, 0.0, 2.0], [0.1, 0.1, 1e-6], opacity=0.985)
     length = 40 * 0.5 / 2
-    blurred, sharp = (
+    blurred, in_focus = (
         picture.alpha
         for picture in (
             effects.render_motion_blur(gaussians, open, close, 50),
@@ -341,12 +343,12 @@ def test_motion_blur_widens_by_the_variance_of_the_path():
         weights = alpha.sum(axis=0) / alpha.sum()
         return weights @ x, weights @ (x - weights @ x) ** 2
 
-    (center, variance), (sharp_center, sharp_variance) = map(mean_and_variance, (blurred, sharp))
-    np.testing.assert_allclose(blurred.sum(), sharp.sum(), rtol=1e-3)
-    np.testing.assert_allclose([center, sharp_center], 20.0, atol=1e-9)
+    (center, variance), (focus_center, focus_variance) = map(mean_and_variance, (blurred, in_focus))
+    np.testing.assert_allclose(blurred.sum(), in_focus.sum(), rtol=1e-3)
+    np.testing.assert_allclose([center, focus_center], 20.0, atol=1e-9)
     # 50 points have the variance of the path to 1 / 50^2, and whether a pixel is cut depends on
     # where the splat is within it. Measured: 6e-5.
-    np.testing.assert_allclose(variance - sharp_variance, length**2 / 12, rtol=1e-3)
+    np.testing.assert_allclose(variance - focus_variance, length**2 / 12, rtol=1e-3)
 
 
 def test_rows_of_a_rolling_shutter_are_rows_of_pictures_in_time():

@@ -209,17 +209,17 @@ def brute_force_picture(gaussians, camera, background, sh_degree, antialiased) -
         w, *axis = gaussians.quats[n]
         turn = rotation_about(axis, 2 * math.atan2(np.linalg.norm(axis), w))
         sigma = turn @ np.diag(np.exp(2 * gaussians.log_scales[n])) @ turn.T
-        sharp = jacobian @ camera.rotation @ sigma @ camera.rotation.T @ jacobian.T
-        blurred = sharp + 0.3 * np.eye(2)
+        projected = jacobian @ camera.rotation @ sigma @ camera.rotation.T @ jacobian.T
+        filtered = projected + 0.3 * np.eye(2)
         opacity = 1 / (1 + math.exp(-gaussians.logit_opacities[n]))
         if antialiased:
-            opacity *= math.sqrt(np.linalg.det(sharp) / np.linalg.det(blurred))
+            opacity *= math.sqrt(np.linalg.det(projected) / np.linalg.det(filtered))
         direction = gaussians.means[n] - camera.center
         basis = legendre_sh_basis(direction / np.linalg.norm(direction), sh_degree)
         coefficients = np.concatenate([gaussians.sh0[n], gaussians.shN[n]])[: len(basis)]
         color = np.maximum(basis @ coefficients + 0.5, 0)
         mean2d = np.array([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy])
-        splats.append((z, mean2d, np.linalg.inv(blurred), opacity, color))
+        splats.append((z, mean2d, np.linalg.inv(filtered), opacity, color))
     splats.sort(key=lambda splat: splat[0])
 
     image = np.zeros((camera.height, camera.width, 3))

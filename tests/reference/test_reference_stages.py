@@ -111,7 +111,7 @@ def test_needle_keeps_its_determinant():
 
 
 def test_lone_splat_smaller_than_a_pixel_keeps_its_energy_when_antialiased():
-    """Compensated, a splat's integral o 2 pi sqrt(det cov2d) is that of the sharp one."""
+    """Compensated, a splat's integral o 2 pi sqrt(det cov2d) is that without the low-pass."""
     gaussians, camera = needle(np.log([0.02, 0.03, 1e-3]))
     splats = reference.project(gaussians, camera, antialiased=True)
     energy = splats.opacities[0] * math.sqrt(np.linalg.det(splats.cov2d[0]))

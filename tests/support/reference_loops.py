@@ -83,11 +83,11 @@ def naive_splat(gaussians, camera, n, model):
     z = mean[2]
     if z < camera.near:
         return None
-    mean2d, sharp, k, w = naive_film(mean, factor, camera, model)
-    cov = sharp + model.low_pass * np.eye(2)
+    mean2d, projected, k, w = naive_film(mean, factor, camera, model)
+    cov = projected + model.low_pass * np.eye(2)
     opacity = 1 / (1 + math.exp(-gaussians.logit_opacities[n]))
     if model.antialiased:
-        opacity *= math.sqrt(np.linalg.det(sharp) / np.linalg.det(cov))
+        opacity *= math.sqrt(np.linalg.det(projected) / np.linalg.det(cov))
     if opacity <= model.alpha_cut:
         return None
     conic = np.linalg.inv(cov)
