@@ -18,6 +18,10 @@ Sources, cited by these names:
 - EWA: Zwicker, Pfister, van Baar, Gross, "EWA Splatting", IEEE TVCG 8(3), 2002.
 - Mip-Splatting: Yu, Chen, Huang, Sattler, Geiger, CVPR 2024.
 
+The paper's symbols, and their names here: mu ``means``, q ``quats``, S ``exp(log_scales)``, R
+``quat_to_rotation``, Sigma ``covariances``, W ``camera.rotation``, J ``jacobians``, Sigma'
+``cov2d``, alpha ``opacities`` (of a Gaussian) and ``alpha`` (at a pixel), c ``colors``.
+
 Spaces: *world*; *camera* (x right, y down, z forward, world units); *film* (pixels, x right,
 y down, pixel (i, j) has its centre at (i + 0.5, j + 0.5)). Images are indexed [row, column].
 Colours are in display space (sRGB-encoded). Quaternions are wxyz.

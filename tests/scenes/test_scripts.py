@@ -13,7 +13,7 @@ from drgs.cli.commands import CommandParser
 
 SCENES = REPOSITORY / "scenes"
 FOLDERS = ("docs", "drgs", "plugins", "scenes", "tests")
-SCRIPTS = ("compare_shapes", "knot", "relight")
+SCRIPTS = ("compare_shapes", "draw_tiles", "knot", "relight")
 MODULES = [c.module for c in COMMANDS.values()] + [f"drgs.bench.{name}" for name in MEASUREMENTS]
 
 
@@ -35,7 +35,8 @@ def script(monkeypatch, tmp_path):
     """Runs one in another folder, without what takes long: script(name, *arguments)."""
 
     def run(name, *arguments):
-        monkeypatch.syspath_prepend(SCENES)
+        for folder in (SCENES, REPOSITORY / "docs"):
+            monkeypatch.syspath_prepend(folder)
         monkeypatch.chdir(tmp_path)
         monkeypatch.setattr(sys, "argv", [f"{name}.py", *map(str, arguments)])
         module = importlib.import_module(name)
@@ -54,7 +55,8 @@ def script(monkeypatch, tmp_path):
 
 
 def test_every_script_is_tried():
-    found = {path.stem for path in SCENES.glob("*.py") if "__main__" in path.read_text()}
+    files = [path for folder in ("docs", "scenes") for path in (REPOSITORY / folder).glob("*.py")]
+    found = {path.stem for path in files if "__main__" in path.read_text()}
     assert found == set(SCRIPTS)
 
 
@@ -65,6 +67,10 @@ def test_pictures_of_shapes_go_where_the_command_is_run(script):
 
 def test_the_knot_goes_where_the_command_is_run(script):
     assert script("knot") == {"out/knot.ply"}
+
+
+def test_the_picture_of_tiles_goes_where_the_command_is_run(script):
+    assert script("draw_tiles") == {"out/tiles.png"}
 
 
 def test_what_was_relit_goes_where_the_command_is_run(script):

@@ -1,0 +1,89 @@
+"""What learners meet: where reading begins, the paper's symbols, and names of the field."""
+
+import ast
+import re
+
+import pytest
+from conftest import REPOSITORY
+
+REFERENCE = "drgs/reference/splatting.py"
+
+
+def section(page, heading):
+    text = (REPOSITORY / page).read_text()
+    return text.partition(f"\n## {heading}\n")[2].partition("\n## ")[0]
+
+
+@pytest.mark.parametrize("page", ["README.md", "docs/guide.md", "docs/how_it_works.md"])
+def test_reading_the_code_begins_at_the_reference(page):
+    first = re.search(r"\]\((.*?)\)", section(page, "Reading the code"))[1]
+    assert first.removeprefix("../") == REFERENCE
+
+
+def rows_of_symbols():
+    """Symbol, and the code in the columns of the reference and of the kernels."""
+    lines = section("docs/how_it_works.md", "Symbols").splitlines()
+    cells = [line.strip("|").split("|") for line in lines if line.startswith("| ")][2:]
+    for symbol, reference, kernels, _ in cells:
+        yield symbol.strip(), *(re.findall(r"`([^`]+)`", cell) for cell in (reference, kernels))
+
+
+def identifiers(*paths):
+    found = set()
+    for path in paths:
+        for node in ast.walk(ast.parse((REPOSITORY / path).read_text())):
+            for field in ("id", "attr", "name", "arg"):
+                name = getattr(node, field, None)
+                found |= {name} if isinstance(name, str) else set()
+    return found
+
+
+def test_the_papers_symbols_have_names_in_the_code():
+    kernels = (
+        *("drgs/splatting/projection.py", "drgs/splatting/image_model.py"),
+        *("drgs/cameras/camera.py", "drgs/gaussians/parameters.py", "drgs/gaussians/sh.py"),
+    )
+    known = identifiers(REFERENCE), identifiers(*kernels)
+    rows = list(rows_of_symbols())
+    symbols = " ".join(symbol for symbol, *_ in rows)
+    for symbol in (r"\mu", "$R$", "S = ", r"\Sigma = R S S^T R^T", "$W$", "$J$", r"\Sigma' = J W"):
+        assert symbol in symbols
+    for symbol, *columns in rows:
+        assert columns[0], symbol
+        for codes, names in zip(columns, known, strict=True):
+            missing = set(re.findall(r"[A-Za-z_]\w*", " ".join(codes))) - names
+            assert not missing, (symbol, missing)
+
+
+def test_both_forms_of_the_projected_covariance_are_there():
+    text = (REPOSITORY / "docs" / "how_it_works.md").read_text()
+    assert r"\Sigma' = J W \Sigma W^T J^T = J W R S S^T R^T W^T J^T = M M^T" in text
+    assert "scenes/pictures/tiles.png" in text
+
+
+PATHS = sorted(
+    path for folder in ("drgs", "plugins", "scenes") for path in (REPOSITORY / folder).rglob("*.py")
+)
+
+INVENTED = {"R", "added", "bright", "sharp"}
+"""Names that said nothing of what they stood for; R is a rotation, in equations alone."""
+
+
+def invented(source):
+    names = set()
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store):
+            names.add(node.id)
+        elif isinstance(node, (ast.FunctionDef, ast.arg)):
+            names.add(getattr(node, "name", None) or node.arg)
+    return names & INVENTED
+
+
+def test_no_function_and_no_variable_has_an_invented_name():
+    found = {str(path.relative_to(REPOSITORY)): invented(path.read_text()) for path in PATHS}
+    # Rows that the optimizer adds: there it is what they are.
+    assert {p: n for p, n in found.items() if n} == {"drgs/training/optimizer.py": {"added"}}
+
+
+def test_an_invented_name_is_found():
+    assert invented("def added(R):\n    sharp = 2") == {"added", "R", "sharp"}
