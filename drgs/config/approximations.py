@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass, fields
 from typing import Annotated, Literal, get_args, get_type_hints
 
 import numpy as np
@@ -29,10 +29,14 @@ class Limits:
     ge: float | None = None
     lt: float | None = None
     le: float | None = None
+    or_infinite: bool = False  # whether infinity may be beyond ``le``
 
     def hold_for(self, value: float) -> bool:
         """Whether they do in single precision, in which kernels compute; they never do for NaN."""
-        value = float(np.float32(value))
+        if self.or_infinite and value == math.inf:
+            return True
+        with np.errstate(over="ignore"):
+            value = float(np.float32(value))
         return (
             (self.gt is None or value > self.gt)
             and (self.ge is None or value >= self.ge)
@@ -44,7 +48,7 @@ class Limits:
     @property
     def finite(self) -> dict[str, float]:
         """By name, those that are given and finite."""
-        given = {name: limit for name, limit in asdict(self).items() if name != "words"}
+        given = {name: getattr(self, name) for name in ("gt", "ge", "lt", "le")}
         return {k: v for k, v in given.items() if v is not None and math.isfinite(v)}
 
 
@@ -105,7 +109,7 @@ class Approximations:
     extent: Annotated[
         float,
         "Standard deviations at which splats end.",
-        Limits("positive", gt=0),
+        Limits("above 0, and at most 1e9 or infinite", gt=0, le=1e9, or_infinite=True),
     ] = math.inf
     low_pass: Annotated[
         float,

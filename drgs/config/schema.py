@@ -50,6 +50,19 @@ ColorField = Annotated[Color, PlainValidator(_color), PlainSerializer(_color_to_
 Count = Annotated[int, Field(le=MAX_INT)]
 PathField = Annotated[Path, Field(strict=False)]
 
+Rate = Annotated[float, Field(le=10)]
+"""A step of Adam is about as long as its rate: ten units of a logarithm or a logit go from next to
+nothing to everything."""
+
+CameraRate = Annotated[float, Field(le=1)]
+"""The same: a radian, a scene's extent, a factor e of focal lengths, a picture's size."""
+
+Decay = Annotated[float, Field(ge=0, le=0.999999)]
+"""A mean over a million steps; float32 knows few numbers between this and 1."""
+
+Weight = Annotated[float, Field(ge=0, le=1e6)]
+"""Of a term of the loss, beside terms of weight 1."""
+
 
 class _Section(BaseModel):
     """Frozen; unknown keys, infinities and silent conversions ("3" for 3) are refused."""
@@ -139,7 +152,9 @@ class _Model(_Section):
     sh_increase_every: Count = Field(
         1000, ge=1, description="Iterations between +1 of the degree in use, which starts at 0."
     )
-    near: float = Field(0.2, gt=0, description="Near plane, scene units: closer means are culled.")
+    near: float = Field(
+        0.2, ge=1e-9, le=1e9, description="Near plane, scene units: closer means are culled."
+    )
 
 
 def _as_field(declared: Declared) -> tuple[Any, Any]:
@@ -196,10 +211,10 @@ class RateAim(_Section):
 class OptimizerConfig(_Section):
     """Adam (Kingma and Ba 2015): learning rates per step and its constants."""
 
-    means_lr: float = Field(
+    means_lr: Rate = Field(
         1.6e-4, gt=0, description="First rate of the means, in units of the scene extent."
     )
-    means_lr_final: float = Field(
+    means_lr_final: Rate = Field(
         1.6e-6, gt=0, description="Last rate of the means, which decays exponentially."
     )
     means_lr_aims: list[RateAim] = Field(
@@ -207,17 +222,20 @@ class OptimizerConfig(_Section):
         description="When the means' rate is to be the last one, as a plan was revised: a list of "
         "{after: iteration, end: iteration}; empty: at the last iteration.",
     )
-    sh0_lr: float = Field(2.5e-3, ge=0, description="Degree-0 colour coefficients.")
-    shN_lr: float = Field(1.25e-4, ge=0, description="Colour coefficients of higher degrees.")  # noqa: N815
-    opacities_lr: float = Field(
+    sh0_lr: Rate = Field(2.5e-3, ge=0, description="Degree-0 colour coefficients.")
+    shN_lr: Rate = Field(1.25e-4, ge=0, description="Colour coefficients of higher degrees.")  # noqa: N815
+    opacities_lr: Rate = Field(
         0.05, ge=0, description="Logit opacities (0.025 in newer releases of the reference)."
     )
-    scales_lr: float = Field(5e-3, ge=0, description="Logarithms of the scales.")
-    quats_lr: float = Field(1e-3, ge=0, description="Quaternions.")
-    beta_1: float = Field(0.9, ge=0, lt=1, description="Decay of the first moment.")
-    beta_2: float = Field(0.999, ge=0, lt=1, description="Decay of the second moment.")
+    scales_lr: Rate = Field(5e-3, ge=0, description="Logarithms of the scales.")
+    quats_lr: Rate = Field(1e-3, ge=0, description="Quaternions.")
+    beta_1: Decay = Field(0.9, description="Decay of the first moment.")
+    beta_2: Decay = Field(0.999, description="Decay of the second moment.")
     epsilon: float = Field(
-        1e-15, gt=0, description="Added to the root of the second moment; gradients are tiny."
+        1e-15,
+        ge=1e-30,
+        le=1,
+        description="Added to the root of the second moment; gradients are tiny.",
     )
 
 
@@ -226,10 +244,9 @@ class LossConfig(_Section):
 
     dssim_weight: float = Field(0.2, ge=0, le=1, description="w; 0 leaves D-SSIM out.")
     window: int = Field(11, ge=3, le=17, description="px: width of SSIM's Gaussian window; odd.")
-    sigma: float = Field(1.5, gt=0, description="px: its standard deviation.")
-    depth_weight: float = Field(
+    sigma: float = Field(1.5, ge=0.1, le=1000, description="px: its standard deviation.")
+    depth_weight: Weight = Field(
         0.2,
-        ge=0,
         description="Of the mean difference in depth, in scene extents, where the data has depth; "
         "0 leaves it out.",
     )
@@ -238,14 +255,14 @@ class LossConfig(_Section):
 class ColorConfig(_Section):
     """A colour transform for each training photograph: exposure and white balance."""
 
-    lr: float | None = Field(
+    lr: Rate | None = Field(
         None,
         gt=0,
         description="First rate of the 3 x 4 numbers of each transform, such as 0.02; falls as "
         "that of the means. null: there are no transforms.",
     )
-    identity_weight: float = Field(
-        1.0, ge=0, description="Of the mean square by which a transform differs from the identity."
+    identity_weight: Weight = Field(
+        1.0, description="Of the mean square by which a transform differs from the identity."
     )
 
 
@@ -258,12 +275,12 @@ class CamerasConfig(_Section):
 
     optimise: bool = Field(False, description="Refine poses, focal lengths and principal points.")
     start: Count = Field(0, ge=0, description="Iterations before it begins.")
-    rotation_lr: float = Field(3e-4, ge=0, description="Radians.")
-    translation_lr: float = Field(3e-4, ge=0, description="In units of the scene extent.")
-    focal_lr: float = Field(
+    rotation_lr: CameraRate = Field(3e-4, ge=0, description="Radians.")
+    translation_lr: CameraRate = Field(3e-4, ge=0, description="In units of the scene extent.")
+    focal_lr: CameraRate = Field(
         0.0, ge=0, description="Relative to the focal lengths, which all views share."
     )
-    principal_lr: float = Field(
+    principal_lr: CameraRate = Field(
         0.0, ge=0, description="In parts of the picture's size; all views share it."
     )
 

@@ -234,7 +234,7 @@ def test_a_colour_at_its_minimum_keeps_its_derivative():
         ({"alpha_max": 1 - 1e-9}, "alpha_max must be above 0 and below 1 in float32, got 0.99999"),
         ({"alpha_cut": -0.1}, "alpha_cut must be from 0 to below 1, got -0.1"),
         ({"transmittance_stop": math.nan}, "transmittance_stop must be from 0 to below 1, got nan"),
-        ({"extent": 0.0}, "extent must be positive, got 0.0"),
+        ({"extent": 0.0}, "extent must be above 0, and at most 1e9 or infinite, got 0.0"),
         ({"low_pass": math.inf}, "low_pass must be finite and not negative, got inf"),
     ],
 )

@@ -87,7 +87,7 @@ def test_a_configuration_is_frozen(load):
         ),
         ('output: {dir: "a\\0b"}', "output.dir must be a path, got 'a\\x00b' (embedded null byte)"),
         ("seed: -1", "seed must be >= 0, got -1"),
-        ("loss: {sigma: 0}", "loss.sigma must be > 0, got 0"),
+        ("loss: {sigma: 0}", "loss.sigma must be >= 0.1, got 0"),
         ("loss: {sigma: big}", "loss.sigma must be a number, got 'big'"),
         ("loss: {sigma: .inf}", "loss.sigma must be a finite number, got .inf"),
         ("loss: {sigma: .nan}", "loss.sigma must be a finite number, got .nan"),

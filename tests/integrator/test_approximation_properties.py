@@ -49,7 +49,7 @@ def test_every_annotation_is_read():
     assert list(DECLARED) == list(Approximations.__dataclass_fields__)
     assert DECLARED["projection"].words == ("ewa", "unscented", "exact")
     assert DECLARED["order_window"].kind is int and DECLARED["antialiased"].kind is bool
-    assert DECLARED["extent"].limits.finite == {"gt": 0}
+    assert DECLARED["extent"].limits.finite == {"gt": 0, "le": 1e9}
 
 
 def test_a_default_that_is_not_rounded_is_the_default():

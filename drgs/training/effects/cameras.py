@@ -21,6 +21,7 @@ import numpy as np
 from drgs.cameras.axes import OPENCV_TO_MITSUBA
 from drgs.cameras.motion import rotation_matrix
 from drgs.config.schema import CamerasConfig
+from drgs.core.errors import UserError
 from drgs.core.files import atomic_path
 from drgs.data.types import View
 from drgs.results.files import CAMERAS
@@ -30,6 +31,9 @@ from drgs.training.effects.view_parameters import ViewParameters
 from drgs.training.views import TrainingView
 
 INTRINSICS = ("fx", "fy", "cx", "cy")
+
+MAX_FOCAL_FACTOR = 1000
+"""Of a focal length that was known when the fit began, up or down."""
 
 
 @dataclass(frozen=True)
@@ -155,10 +159,19 @@ class CameraRefinement(TrainingEffect):
 
     @property
     def lens_change(self) -> LensChange:
-        """Of all cameras."""
+        """Of all cameras.
+
+        Raises :class:`UserError` where it makes no camera of any.
+        """
         numbers = {name: values[0].astype(np.float64) for name, values in self._shared.items()}
         changes = {}
         if "log_focals" in numbers:
+            if np.abs(numbers["log_focals"]).max() > np.log(MAX_FOCAL_FACTOR):
+                raise UserError(
+                    "cameras.focal_lr: focal lengths must be refined by factors up to "
+                    f"{MAX_FOCAL_FACTOR:g}, got e to the power of "
+                    f"{', '.join(f'{n:g}' for n in numbers['log_focals'])}; lower it"
+                )
             changes["focal"] = tuple(np.exp(numbers["log_focals"]).tolist())
         if "shifts" in numbers:
             changes["principal"] = tuple(numbers["shifts"].tolist())

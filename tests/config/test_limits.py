@@ -1,0 +1,127 @@
+"""What a configuration accepts, a fit can compute with."""
+
+import math
+import warnings
+
+import numpy as np
+import pytest
+import yaml
+from annotated_types import Ge, Gt, Le, Lt
+from support.commands import run_in_process
+from support.small_capture import make_dataset, write_dataset
+from support.small_fits import make_trainer, plain_dataset
+
+from drgs import fit
+from drgs.config.load import load_config
+from drgs.config.schema import FitConfig
+from drgs.core.errors import UserError
+
+REFUSED = {
+    "model.alpha_max": ["1e-46", "0.9999999999999999", "1e300"],
+    "model.extent": ["1e308", "1e39", "1e-50"],
+    "model.low_pass": ["1e39", "1e300"],
+    "model.near": ["1e-320", "1e39"],
+    "loss.sigma": ["1e-200", "1e300"],
+    "loss.depth_weight": ["1e300"],
+    "cameras.focal_lr": ["1e10"],
+    "cameras.rotation_lr": ["1e300"],
+    "colors.lr": ["1e20"],
+    "colors.identity_weight": ["1e300"],
+    "optimizer.means_lr": ["1e300"],
+    "optimizer.quats_lr": ["1e38"],
+    "optimizer.beta_1": ["0.9999999999999999"],
+    "optimizer.beta_2": ["0.9999999999999999"],
+    "optimizer.epsilon": ["1e-200", "1e300"],
+}
+
+
+@pytest.mark.parametrize("key", REFUSED)
+def test_a_value_that_no_fit_can_use_is_refused_by_its_name(tmp_path, key):
+    (tmp_path / "a.yml").write_text("data: {path: x}\n")
+    for value in REFUSED[key]:
+        with warnings.catch_warnings(), pytest.raises(UserError) as error:
+            warnings.simplefilter("error")  # as lines of NumPy would be
+            load_config(tmp_path / "a.yml", [f"{key}={value}"])
+        assert str(error.value).startswith(f"--set {key}: {key} must be "), value
+        assert "\n" not in str(error.value)
+
+
+def limits(field):
+    """(least, most) that a number may be, as close as float64 comes to what it must not be."""
+    low, high = -math.inf, math.inf
+    for limit in field.metadata:
+        if isinstance(limit, Ge):
+            low = max(low, limit.ge)
+        elif isinstance(limit, Gt):
+            low = max(low, np.nextafter(limit.gt, math.inf))
+        elif isinstance(limit, Le):
+            high = min(high, limit.le)
+        elif isinstance(limit, Lt):
+            high = min(high, np.nextafter(limit.lt, -math.inf))
+    return low, high
+
+
+def numbers_of(section):
+    """(name, limits) of the section's numbers."""
+    for name, field in FitConfig.model_fields[section].annotation.model_fields.items():
+        if field.annotation in (float, float | None):
+            yield f"{section}.{name}", limits(field)
+
+
+SECTIONS = ["init", "model", "optimizer", "loss", "colors", "cameras", "densify"]
+
+UNLIMITED = {"model.low_pass", "densify.grad_threshold", "densify.clone_scale",
+             "densify.prune_scale", "densify.split_shrink"}  # fmt: skip
+"""Compared with, or finite in float32, however large they are."""
+
+
+@pytest.mark.parametrize(("key", "ends"), [p for s in SECTIONS for p in numbers_of(s)])
+def test_every_number_has_two_limits(key, ends):
+    low, high = ends
+    assert low > -math.inf
+    assert high < math.inf or key in UNLIMITED
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("scene")
+    write_dataset(folder / "data", make_dataset(train=3, test=1))
+    values = {
+        "data": {"path": "data"},
+        "init": {"num_points": 40, "half_extent": 0.5},
+        "model": {"sh_degree": 1, "sh_increase_every": 2, "smoothing": True},
+        "colors": {"lr": 0.02},
+        "cameras": {"optimise": True, "focal_lr": 1e-4, "principal_lr": 1e-4},
+        "densify": {"start": 1, "stop": 4, "every": 2, "reset_every": 3, "grad_threshold": 1e-6},
+        "iterations": 4,
+        "output": {"save_renders": False},
+    }
+    (folder / "a.yml").write_text(yaml.safe_dump(values))
+    return folder
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("key", "ends"), [p for s in SECTIONS for p in numbers_of(s)])
+def test_a_fit_takes_every_number_at_its_limits_or_says_what_is_wrong(
+    scene, tmp_path, monkeypatch, key, ends
+):
+    monkeypatch.setattr(fit, "write_results", lambda *arguments: None)
+    for value in (*ends, 1e-300, 1e300):
+        if math.isfinite(value):
+            arguments = ("--out", tmp_path / f"{value}", "--set", f"{key}={value}")
+            outcome = run_in_process(fit.main, scene / "a.yml", *arguments)
+            assert outcome.returncode in (0, 2), outcome
+            assert outcome.stderr.count("\n") == (outcome.returncode == 2), outcome.stderr
+
+
+def test_focal_lengths_that_run_away_are_an_error_that_names_their_rate():
+    trainer = make_trainer(plain_dataset(), cameras__optimise=True, cameras__focal_lr=1.0)
+    (effect,) = (e for e in trainer.effects if e.name == "cameras")
+    assert effect.lens_change.focal == (1, 1)
+    state = effect.state()
+    state["log_focals.value"][:] = 88
+    effect.restore(state)
+    with pytest.raises(
+        UserError, match=r"cameras.focal_lr: .* up to 1000, got e to the power of 88"
+    ):
+        effect.measured(())
