@@ -63,13 +63,14 @@ def check_output_folder(folder: Path, config: FitConfig, pictures: Sequence[str]
             f"{folder}: the output folder must be new or empty, got one that holds "
             f"{listed(present)}; choose another with --out"
         )
-    record = FolderRecord(folder, COMMAND)
-    if not (record.exists or CHECKPOINT in present or _may_be_replaced(folder / CONFIG)):
+    record, is_own = FolderRecord(folder, COMMAND), _belongs_to(folder, config)
+    is_run, is_written = record.exists or CHECKPOINT in present, _may_be_replaced(folder / CONFIG)
+    if not is_written and (not is_run or (present == [CONFIG] and not is_own)):
         raise UserError(
-            f"{folder / CONFIG}: would be replaced, and was not written by a fit; choose another "
-            "folder with --out"
+            f"{folder / CONFIG}: would be replaced, and was not written by a fit, or changed "
+            "since; choose another folder with --out"
         )
-    if set(present) - {CONFIG} and not _belongs_to(folder, config):
+    if present != [CONFIG] and not is_own:
         raise UserError(
             f"{folder}: already holds {_which_run(folder, config)}; choose another folder with "
             f"--out, continue that run with --resume {folder}, or replace it with --overwrite"

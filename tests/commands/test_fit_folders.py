@@ -88,7 +88,9 @@ def test_a_configuration_that_no_fit_has_written_is_kept(tmp_path):
     mine.mkdir()
     (mine / "config.yml").write_text(f"# by hand\n{text.replace('path: data', 'path: ../data')}")
     for file in (config, mine / "config.yml"):
-        message = f"{mine / 'config.yml'}: would be replaced, and was not written by a fit; choose"
+        message = (
+            f"{mine / 'config.yml'}: would be replaced, and was not written by a fit, or changed"
+        )
         assert_fit_refused(file, "--out", mine, folder=tmp_path, message=message)
         message = f"{mine}: must hold nothing but a run to be replaced, got config.yml; move"
         assert_fit_refused(file, "--out", mine, "--overwrite", folder=tmp_path, message=message)
@@ -104,6 +106,18 @@ def test_a_configuration_that_a_fit_has_written_may_be_fitted_where_it_is(ended,
     assert_fits(*arguments, "--out", ended / "again")
     expected = (projects / "ended" / POINTS).read_bytes()
     assert (ended / "again" / "point_cloud.ply").read_bytes() == expected
+
+
+def test_a_configuration_that_was_changed_before_the_first_checkpoint_is_kept(stopped):
+    (stopped / "out" / "checkpoint.npz").unlink()
+    path = stopped / "out" / "config.yml"
+    path.write_text(f"# by hand\n{path.read_text()}")
+    arguments = (stopped / "a.yml", "--out", stopped / "out")
+    assert_fit_refused(
+        *arguments, "--set", "seed=7", folder=stopped, message=f"{path}: would be replaced"
+    )
+    assert_fits(*arguments)
+    assert path.read_text().startswith("# by hand\n")
 
 
 @pytest.mark.parametrize(
