@@ -66,6 +66,7 @@ from drgs.io.pictures import (
     write_exr,
     write_png,
 )
+from drgs.io.scenes import load_scene_file
 from drgs.results.files import CAMERAS, CONFIG, GAUSSIANS, METRICS, ORBIT, ORBIT_GIF, VIEWS
 from drgs.results.folder import found_again
 from drgs.results.metrics import Quality, mean_of, psnr, ssim
@@ -381,7 +382,7 @@ def render_mitsuba_scene(path: Path, out: Path, definitions: dict[str, str]) -> 
     inside ``aov``.
     """
     try:
-        scene = mi.load_file(str(path), **definitions)
+        scene = load_scene_file(path, **definitions)
     except RuntimeError as error:
         raise UserError(f"{path}: {reason_of_mitsuba(error)}") from None
     if scene.integrator() is None or not scene.sensors():

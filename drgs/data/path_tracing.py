@@ -20,6 +20,7 @@ import numpy as np
 from drgs.cameras.axes import OPENGL_TO_MITSUBA
 from drgs.core.errors import UserError, one_line, reason_of_mitsuba
 from drgs.io.pictures import read_image
+from drgs.io.scenes import load_scene_dictionary, load_scene_file
 
 NERF_SYNTHETIC_FOV = 0.6911112070083618
 """Radians: the original's ``camera_angle_x``."""
@@ -157,7 +158,12 @@ def load_scene(path: Path) -> mi.Scene:
             )
         mi.file_resolver().append(str(path.parent.resolve()))
     try:
-        scene = mi.load_dict(description) if path.suffix == ".py" else mi.load_file(str(path))
+        if path.suffix == ".py":
+            scene = load_scene_dictionary(description, path)
+        else:
+            scene = load_scene_file(path)
+    except UserError:
+        raise
     except (RuntimeError, ValueError, TypeError, AttributeError) as error:
         raise UserError(
             f"{path}: Mitsuba cannot load the scene: {reason_of_mitsuba(error)}"

@@ -193,17 +193,13 @@ def write_png(path: Path, image: np.ndarray) -> None:
 
 def write_exr(path: Path, bitmap: mi.Bitmap) -> None:
     """Write all channels of a bitmap, in its own precision."""
-    import drjit as dr
     import mitsuba as mi
 
+    from drgs.io.scenes import openexr_threads
+
     stream = mi.MemoryStream()  # an error of the disk is then Python's, and names the file
-    # Mitsuba compresses in Dr.Jit's pool, and with a single thread there waits for ever.
-    threads = dr.thread_count()
-    dr.set_thread_count(max(threads, 2))
-    try:
+    with openexr_threads():
         bitmap.write(stream, mi.Bitmap.FileFormat.OpenEXR)
-    finally:
-        dr.set_thread_count(threads)
     _write(path, stream.raw_buffer())
 
 

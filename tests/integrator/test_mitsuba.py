@@ -23,13 +23,14 @@ from support.calibrated_sensors import (
 )
 from support.helpers import clear
 from support.lens_scenes import points_at
-from support.openexr import read_exr, two_threads
+from support.openexr import read_exr
 from support.splats_checks import GRADIENTS, PICTURE, write_gaussians
 from support.splats_checks import XYZ as TO_XYZ
 from support.views import VIEWS, Scene, View, gradient, image_of, tensors
 
 import drgs  # noqa: F401  (registers the plugins)
 from drgs.gaussians.parameters import PARAMETER_NAMES
+from drgs.io.scenes import openexr_threads
 from drgs.reference import splatting as reference
 from drgs.reference.effects import Lens, Orthographic, Pinhole, camera_at
 
@@ -174,7 +175,7 @@ def test_every_format_of_a_film_holds_the_same_picture(colors, alpha, component_
     tolerance = 1e-3 if colors == "luminance" else PICTURE
     np.testing.assert_allclose(image, expected, rtol=0, atol=tolerance * expected.max())
     path = str(tmp_path / "picture.exr")
-    with two_threads():
+    with openexr_threads():
         loaded.sensors()[0].film().write(path)
     bitmap = read_exr(path)
     assert bitmap.component_format() == getattr(mi.Struct.Type, component_format.capitalize())

@@ -7,7 +7,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from support.helpers import clear
-from support.openexr import read_exr, two_threads
+from support.openexr import read_exr
 from support.splats_checks import (
     GRADIENTS,
     PICTURE,
@@ -21,6 +21,7 @@ from support.views import VIEWS, Scene, View, image_of, pose, tensors, to_linear
 
 import drgs  # noqa: F401  (registers the plugin)
 from drgs.gaussians.parameters import PARAMETER_NAMES
+from drgs.io.scenes import openexr_threads
 from drgs.reference import splatting as reference
 
 all_views = pytest.mark.parametrize("view", VIEWS, ids=lambda view: view.name)
@@ -394,7 +395,7 @@ def test_the_film_holds_the_picture(tmp_path):
     image = image_of(loaded)
     film = loaded.sensors()[0].film()
     assert np.array_equal(np.array(film.develop()), image.astype(np.float32))
-    with two_threads():
+    with openexr_threads():
         film.write(str(tmp_path / "picture.exr"))
     written = np.array(read_exr(tmp_path / "picture.exr")).astype(np.float64)
     assert np.allclose(written, image, rtol=2**-11, atol=1e-6)

@@ -1,0 +1,68 @@
+"""Mitsuba scenes from files and dictionaries of others; all that a command is given is loaded here.
+
+What would end the process while Mitsuba loads a scene, or have it wait for ever, is met before.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import drjit as dr
+import mitsuba as mi
+
+from drgs.core.errors import UserError
+from drgs.core.files import open_regular
+
+
+@contextmanager
+def openexr_threads() -> Iterator[None]:
+    """Two threads at least while OpenEXR files are read or written within the block.
+
+    Mitsuba 3.9 has OpenEXR work in Dr.Jit's pool and sleeps until it is done: with a single thread,
+    nobody is left to do it.
+    """
+    threads = dr.thread_count()
+    if threads >= 2:
+        yield
+        return
+    dr.set_thread_count(2)
+    try:
+        yield
+    finally:
+        dr.set_thread_count(threads)
+
+
+def load_scene_file(path: Path, **definitions: str) -> mi.Object:
+    """What an XML file describes; definitions: values for its parameters ($name).
+
+    Raises RuntimeError as Mitsuba does, and :class:`UserError` for what Mitsuba would not survive.
+    """
+    open_regular(path, "scene").close()
+    if not {"config", "filename"} & set(definitions):  # names that the parser does not take
+        config = mi.parser.ParserConfig(mi.variant())
+        _check(mi.parser.parse_file(config, str(path), **definitions).nodes, path)
+    with openexr_threads():
+        return mi.load_file(str(path), **definitions)
+
+
+def load_scene_dictionary(description: dict[str, object], path: Path) -> mi.Object:
+    """What a dictionary describes, which the file ``path`` gave; raises as the above."""
+    config = mi.parser.ParserConfig(mi.variant())
+    with openexr_threads():
+        _check(mi.parser.parse_dict(config, description).nodes, path)
+        return mi.load_dict(description)
+
+
+def _check(nodes: Iterable[mi.parser.SceneNode], path: Path) -> None:
+    """Some samplers divide by their count when they are made."""
+    for node in nodes:
+        if node.type != mi.ObjectType.Sampler:
+            continue
+        for name in ("sample_count", "sampleCount"):  # the latter: of old files
+            if name in node.props and node.props[name] == 0:
+                raise UserError(
+                    f"{path}: the sampler '{node.props.plugin_name()}' must have a {name} of at "
+                    "least 1, got 0"
+                )

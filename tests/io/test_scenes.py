@@ -1,0 +1,99 @@
+"""Scenes that commands are given: on one thread, and with what Mitsuba would not survive."""
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from drgs.core.errors import UserError
+from drgs.data.path_tracing import load_scene
+from drgs.io.pictures import write_exr
+from drgs.io.scenes import load_scene_file, openexr_threads
+
+
+@pytest.fixture(autouse=True)
+def variant():
+    mi.set_variant("llvm_ad_rgb")
+
+
+@pytest.fixture
+def one_thread():
+    before = dr.thread_count()
+    dr.set_thread_count(1)
+    yield
+    assert dr.thread_count() == 1
+    dr.set_thread_count(before)
+
+
+SKY = """<scene version="3.0.0">
+    <default name="sampler" value="independent"/>
+    <default name="count" value="1"/>
+    <emitter type="envmap"><string name="filename" value="sky.exr"/></emitter>
+    <sensor type="perspective"><sampler type="$sampler">
+        <integer name="sample_count" value="$count"/>
+    </sampler></sensor>
+</scene>"""
+
+
+@pytest.fixture
+def sky(tmp_path):
+    pixels = np.random.default_rng(0).random((4, 8, 3), np.float32)
+    write_exr(tmp_path / "sky.exr", mi.Bitmap(pixels))
+    path = tmp_path / "scene.xml"
+    path.write_text(SKY)
+    return path
+
+
+def test_a_scene_with_openexr_files_is_loaded_on_one_thread(sky, one_thread):
+    """Mitsuba alone would wait for ever."""
+    scene = load_scene_file(sky)
+    assert scene.environment() is not None
+
+
+def test_so_is_a_dictionary(sky, one_thread):
+    program = sky.with_name("scene.py")
+    program.write_text(
+        "def scene():\n"
+        '    return {"type": "scene", "sky": {"type": "envmap", "filename": "sky.exr"}}\n'
+    )
+    assert load_scene(program).environment() is not None
+
+
+def test_more_threads_stay():
+    before = dr.thread_count()
+    dr.set_thread_count(3)
+    try:
+        with openexr_threads():
+            assert dr.thread_count() == 3
+    finally:
+        dr.set_thread_count(before)
+
+
+@pytest.mark.parametrize("sampler", ["independent", "multijitter", "stratified"])
+def test_a_sampler_without_samples_is_refused(sky, sampler):
+    """``multijitter`` ended the process with SIGFPE when it was made."""
+    message = rf"^{sky}: the sampler '{sampler}' must have a sample_count of at least 1, got 0$"
+    with pytest.raises(UserError, match=message):
+        load_scene_file(sky, sampler=sampler, count="0")
+    load_scene_file(sky, sampler=sampler, count="4")
+
+
+def test_a_program_without_samples_is_refused_as_well(tmp_path):
+    program = tmp_path / "scene.py"
+    sampler = {"type": "multijitter", "sample_count": 0}
+    description = {"type": "scene", "sensor": {"type": "perspective", "sampler": sampler}}
+    program.write_text(f"def scene():\n    return {description!r}\n")
+    with pytest.raises(
+        UserError, match=r"scene.py: the sampler 'multijitter' must have a sample_c"
+    ):
+        load_scene(program)
+
+
+@pytest.mark.parametrize("name", ["config", "filename"])
+def test_parameters_may_have_the_names_of_the_parsers_own(tmp_path, name):
+    path = tmp_path / "scene.xml"
+    path.write_text(
+        '<scene version="3.0.0"><integrator type="path">'
+        f'<integer name="max_depth" value="${name}"/></integrator></scene>'
+    )
+    assert "max_depth = 3" in str(load_scene_file(path, **{name: "3"}))
