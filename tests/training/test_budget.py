@@ -300,24 +300,34 @@ def test_the_resolved_plan_gives_the_same_bytes(fitted, scene):
     assert changed(configs[0], {"output.dir": None}) == changed(configs[1], {"output.dir": None})
 
 
-@pytest.mark.slow
-def test_a_plan_that_was_revised_since_the_last_checkpoint_can_be_continued(
-    fitted, tmp_path, monkeypatch
-):
-    """Whatever ends the process while the next one is written: both files are as they were."""
-    config = load_config(fitted.out / "config.yml")
+def test_a_plan_that_was_revised_since_the_last_checkpoint_can_be_continued(tmp_path, monkeypatch):
+    """Whatever ends the process while the next one is written: one of both plans goes on."""
+    config = FitConfig(data={"path": tmp_path}, iterations=40_000)
     state = Checkpoint({"iteration": np.array(7)}, np.zeros((0, 6)), 1.0)
     save_checkpoint(tmp_path, config, state)
     revised = changed(config, {"iterations": config.iterations + 10})
-    for module, name in ((checkpoint.np, "savez"), (checkpoint, "dump_config")):
+    for module, name, saved in (
+        (checkpoint.np, "savez", config),
+        (checkpoint, "write_run_config", revised),
+    ):
         with monkeypatch.context() as patched, pytest.raises(KeyboardInterrupt):
             patched.setattr(module, name, interrupt)
             save_checkpoint(tmp_path, revised, state)
         assert load_run_config(tmp_path) == config
-        assert load_checkpoint(tmp_path, config) is not None
+        assert load_checkpoint(tmp_path, config).config == saved
     save_checkpoint(tmp_path, revised, state)
     assert load_run_config(tmp_path) == revised
-    assert load_checkpoint(tmp_path, revised) is not None
+    assert load_checkpoint(tmp_path, revised).config == revised
+
+
+def test_a_checkpoint_of_another_configuration_is_refused(tmp_path):
+    config = FitConfig(data={"path": tmp_path}, iterations=40_000)
+    save_checkpoint(tmp_path, config, Checkpoint({}, np.zeros((0, 6)), 1.0))
+    other = changed(config, {"iterations": 50_000})
+    with pytest.raises(UserError, match="belongs to another configuration than"):
+        load_checkpoint(tmp_path, other)
+    moved = changed(config, {"data.path": tmp_path / "moved", "output.history_every": 3})
+    assert load_checkpoint(tmp_path, moved).config == moved
 
 
 def interrupt(*arguments, **others):
