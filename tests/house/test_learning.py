@@ -6,6 +6,14 @@ import re
 import pytest
 from conftest import REPOSITORY
 
+from drgs import render
+from drgs.config.schema import FitConfig
+from drgs.core import constants, memory
+from drgs.data import transforms
+from drgs.integrator import limits
+from drgs.io import pictures
+from drgs.reference import splatting
+
 REFERENCE = "drgs/reference/splatting.py"
 
 
@@ -87,3 +95,33 @@ def test_no_function_and_no_variable_has_an_invented_name():
 
 def test_an_invented_name_is_found():
     assert invented("def added(R):\n    sharp = 2") == {"added", "R", "sharp"}
+
+
+# ----------------------------------------------------------------------------------------------
+# Limits
+# ----------------------------------------------------------------------------------------------
+
+
+def test_the_limits_are_those_of_the_program():
+    text = section("docs/limits.md", "Sizes")
+    cap = FitConfig.model_fields["densify"].annotation.model_fields["max_gaussians"]
+    (largest,) = (limit.le for limit in cap.metadata if hasattr(limit, "le"))
+    stated = {
+        "a photograph": pictures.MAX_PIXELS,
+        "a rendered picture": memory.PICTURE_BYTES,
+        "samples of a pixel": limits.MAX_SAMPLES,
+        "AOVs": constants.MAX_FEATURES,
+        "Gaussians": largest,
+        "frames of an orbit": render.MAX_FRAMES,
+        "an animated WebP": pictures.WEBP_SIDE,
+        "arrays": memory.MAX_LANES,
+        "coordinates of cameras": int(transforms.MAX_COORDINATE),
+    }
+    rows = dict(re.findall(r"^\| ([^|]+) \| ([^|]+) \|", text, re.MULTILINE))
+    for what, limit in stated.items():
+        assert re.search(rf"(?<![\d,]){limit:,}(?!,?\d)", rows[what]), what
+    assert f"{cap.default:,}" in rows["Gaussians"]
+
+
+def test_the_page_of_splats_says_how_colours_are_stored():
+    assert f"0.5 + {splatting.C_00:.4f} sh0" in (REPOSITORY / "docs" / "mitsuba.md").read_text()
