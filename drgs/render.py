@@ -54,7 +54,7 @@ from drgs.data.viewpoints import (
 )
 from drgs.effects.compose import IGNORABLE
 from drgs.gaussians.parameters import Gaussians
-from drgs.integrator.scene import check_lenses, make_scene, render_views
+from drgs.integrator.scene import check_lenses, check_sizes, make_scene, render_views
 from drgs.integrator.settings import SummarisingIntegrator
 from drgs.integrator.summary import described, summary_of_views
 from drgs.io.pictures import (
@@ -99,12 +99,14 @@ class Model:
         return make_scene(self.gaussians, self.settings, self.background, **settings)
 
     def pictures(
-        self, views: Sequence[Viewpoint], out: Path, others: Sequence[str] = ()
+        self, views: Sequence[Viewpoint], out: Path, others: Sequence[str], remedy: str
     ) -> Iterator[np.ndarray]:
         """Pictures (H, W, 3) of the views, after a summary of what is simulated in them.
 
         They are for the folder ``out``, where a PNG file for each, and ``others``, may be written.
+        remedy: what to do about pictures that are too large.
         """
+        check_sizes(views, remedy)
         if "distortion" not in self.ignored:
             check_lenses(self.settings, views, where="", remedy="give --ignore distortion")
         scene = self.scene()
@@ -304,9 +306,10 @@ def render_split(model: Model, split: str, out: Path) -> Quality:
     print(dataset.description)
     views = dataset.train if split == "train" else dataset.test
     column = max(len("view"), *(len(view.name) for view in views))
+    pictures = model.pictures(views, out, [METRICS], "give --set data.image_size=...")
     print(f"{'view':{column}}  PSNR [dB]    SSIM")
     scores = []
-    for view, image in zip(views, model.pictures(views, out, [METRICS]), strict=True):
+    for view, image in zip(views, pictures, strict=True):
         write_png(out / f"{view.name}.png", image)
         pair = image, view.image, view.mask
         scores.append({"psnr": psnr(*pair), "ssim": ssim(*pair)})
@@ -356,7 +359,8 @@ def render_cameras(
     model: Model, viewpoints: Sequence[Viewpoint], out: Path, others: Sequence[str] = ()
 ) -> Iterator[np.ndarray]:
     """Write and yield pictures that no photographs belong to; others: files written besides."""
-    for camera, image in zip(viewpoints, model.pictures(viewpoints, out, others), strict=True):
+    pictures = model.pictures(viewpoints, out, others, "give a smaller --size")
+    for camera, image in zip(viewpoints, pictures, strict=True):
         write_png(out / f"{camera.name}.png", image)
         print(f"{camera.name}: {camera.width}x{camera.height}", flush=True)
         yield image

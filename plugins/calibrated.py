@@ -14,7 +14,7 @@ import mitsuba as mi
 import numpy as np
 
 from drgs.cameras.camera import Camera, Lens, Pinhole
-from drgs.core.constants import SHUTTER_SAMPLES
+from drgs.core.constants import MAX_SHUTTER_SAMPLES, SHUTTER_SAMPLES
 from drgs.core.errors import PluginError
 from drgs.integrator.properties import (
     integer,
@@ -107,7 +107,7 @@ class CalibratedSensor(mi.Sensor):
        - |int|
        - Times at which the ``splats`` integrator renders what a ``global`` shutter blurs. It takes
          the mean of what the film gets: of radiance, or of display values, which is no longer what
-         a shutter does, where its ``srgb_primitives`` is false. (Default: 8)
+         a shutter does, where its ``srgb_primitives`` is false. At most 1000. (Default: 8)
 
     This sensor has the parameters that photographs are calibrated with. It works with every
     integrator that traces rays from the sensor: they are found by inverting the distortion. Where a
@@ -156,7 +156,9 @@ class CalibratedSensor(mi.Sensor):
             close = matrix(props, "to_world_close").astype(np.float32)
             self.to_world_close = mi.AffineTransform4f(close)
         self.shutter = one_of(props, "shutter", SHUTTERS)
-        self.shutter_samples = integer(props, "shutter_samples", SHUTTER_SAMPLES, least=1)
+        self.shutter_samples = integer(
+            props, "shutter_samples", SHUTTER_SAMPLES, least=1, most=MAX_SHUTTER_SAMPLES
+        )
         refuse_unknown(props, KNOWN)
 
     # ------------------------------------------------------------------------------------------

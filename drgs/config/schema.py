@@ -25,7 +25,7 @@ from pydantic import (
 )
 
 from drgs.config.approximations import DECLARED, Approximations, Declared
-from drgs.core.constants import MAX_INT, SHUTTER_SAMPLES
+from drgs.core.constants import MAX_INT, MAX_SHUTTER_SAMPLES, SHUTTER_SAMPLES
 
 Color = str | tuple[float, float, float]
 
@@ -111,11 +111,12 @@ class DataConfig(_Section):
     ignore_motion: bool = Field(
         False, description="Treat cameras that move while a photograph is taken as if they did not."
     )
-    shutter_samples: Count = Field(
+    shutter_samples: int = Field(
         SHUTTER_SAMPLES,
         ge=1,
+        le=MAX_SHUTTER_SAMPLES,
         description="Times at which a picture is rendered that a moving camera with a global "
-        "shutter blurs.",
+        "shutter blurs; each takes as much memory and time as a picture.",
     )
     ignore_masks: bool = Field(False, description="Use the pixels that masks leave out as well.")
     ignore_depth: bool = Field(

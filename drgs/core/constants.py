@@ -53,6 +53,10 @@ SHUTTER_SAMPLES = 8
 """Times at which a picture is rendered that a moving camera blurs, the default of the sensor
 ``calibrated``: each covers an eighth of the motion, and costs a picture."""
 
+MAX_SHUTTER_SAMPLES = 1000
+"""Each time's picture is kept for the derivatives: a thousand of the smallest film take 90 MB, a
+hundred thousand 9 GB."""
+
 NEGLIGIBLE_ALPHA = 2.0**-60
 """Where alpha is not cut, splats end here: thousands of layers of such an alpha change no rounding,
 in either precision, and the short exp2 of the kernels is exact to well below it."""

@@ -60,7 +60,9 @@ def why_too_large(width: int, height: int, channels: int = 3, samples: int = 1) 
     channels: of the film, without alpha; samples: per pixel, times those of an open shutter.
     The text says what is asked for, what there is, and how much would do; the caller says where.
     """
-    asked = f"{width} x {height} px" + (f" with {samples:,} samples each" if samples > 1 else "")
+    asked = f"{_digits(width)} x {_digits(height)} px" + (
+        f" with {samples:,} samples each" if samples > 1 else ""
+    )
     pixels, widest = width * height, max(channels + 1, samples)
     if pixels * widest > MAX_LANES:
         return (
@@ -76,6 +78,10 @@ def why_too_large(width: int, height: int, channels: int = 3, samples: int = 1) 
         f"{asked} need about {readable(needed)} of memory, of which {readable(available)} are "
         f"available; at most {_pixels(available // of_pixel)}"
     )
+
+
+def _digits(number: int) -> str:
+    return str(number) if number < 10**12 else f"{number:.3g}"
 
 
 def _pixels(count: int) -> str:

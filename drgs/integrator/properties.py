@@ -222,14 +222,14 @@ def boolean(props: mi.Properties, name: str, default: bool) -> bool:
     return value
 
 
-def integer(props: mi.Properties, name: str, default: int, least: int) -> int:
-    """An integer of at least ``least`` and at most ``MAX_INT``."""
+def integer(props: mi.Properties, name: str, default: int, least: int, most: int = MAX_INT) -> int:
+    """An integer of at least ``least`` and at most ``most``."""
     value, expected = props.get(name, default), f"an integer of at least {least}"
     if isinstance(value, bool) or not isinstance(value, int):
         raise PluginTypeError(_message(props, name, expected, value))
-    if value > MAX_INT:
-        expected = f"an integer from {least} to {MAX_INT}"
-    if not least <= value <= MAX_INT:
+    if value > most:
+        expected = f"an integer from {least} to {most}"
+    if not least <= value <= most:
         raise PluginError(_message(props, name, expected, value))
     return value
 

@@ -17,6 +17,7 @@ import numpy as np
 from drgs.cameras.axes import OPENCV_TO_MITSUBA
 from drgs.config.schema import ModelConfig
 from drgs.core.errors import UserError
+from drgs.core.memory import why_too_large
 from drgs.data.types import Viewpoint
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 
@@ -68,6 +69,18 @@ def check_lenses(model: ModelConfig, views: Iterable[Viewpoint], where: str, rem
             f"such as that of view {bent.name} ({bent.lens.kind}: {', '.join(bent.lens.named())}), "
             f"got exact; or {remedy}"
         )
+
+
+def check_sizes(views: Iterable[Viewpoint], remedy: str) -> None:
+    """Raise :class:`UserError` for a picture that cannot be held, before anything is allocated.
+
+    remedy: the message's end.
+    """
+    for view in views:
+        is_blurred = view.motion is not None and view.motion.shutter == "global"
+        samples = view.motion.samples if is_blurred else 1
+        if reason := why_too_large(view.width, view.height, samples=samples):
+            raise UserError(f"view {view.name}: {reason}; {remedy}")
 
 
 def make_sensors(views: Iterable[Viewpoint], calibrated: bool = False) -> list[mi.Sensor]:

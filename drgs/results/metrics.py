@@ -73,8 +73,16 @@ def ssim(image: ArrayLike, target: ArrayLike, mask: ArrayLike | None = None) -> 
     K2 = 0.03, L = 1. mask: (H, W), 1 where a pixel counts; the others are black in both.
     """
     x, y = _prepare("ssim()", image, target)
+    similarity = np.empty_like(x)
+    for channel in range(3):  # one at a time: temporaries are what takes memory
+        similarity[:, :, channel] = _ssim_map(x[:, :, channel], y[:, :, channel], mask)
+    return float(_mean(similarity, mask))
+
+
+def _ssim_map(x: np.ndarray, y: np.ndarray, mask: ArrayLike | None) -> np.ndarray:
+    """(H, W): of one channel."""
     if mask is not None:
-        counts = np.asarray(mask)[:, :, None]
+        counts = np.asarray(mask)
         x, y = x * counts, y * counts
     mu_x, mu_y = _windowed(x), _windowed(y)
     var_x = _windowed(x * x) - mu_x**2
@@ -82,7 +90,7 @@ def ssim(image: ArrayLike, target: ArrayLike, mask: ArrayLike | None = None) -> 
     cov_xy = _windowed(x * y) - mu_x * mu_y
     luminance = (2 * mu_x * mu_y + 0.01**2) / (mu_x**2 + mu_y**2 + 0.01**2)
     contrast_structure = (2 * cov_xy + 0.03**2) / (var_x + var_y + 0.03**2)
-    return float(_mean(luminance * contrast_structure, mask))
+    return luminance * contrast_structure
 
 
 def mean_quality(pairs: Iterable[tuple[ArrayLike | None, ...]]) -> Quality:

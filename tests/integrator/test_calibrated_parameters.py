@@ -230,6 +230,10 @@ REFUSED = {
         {"shutter_samples": 0},
         "PluginError: calibrated: shutter_samples must be an integer of at least 1, got 0",
     ),
+    "too many samples": (
+        {"shutter_samples": 1001},
+        "PluginError: calibrated: shutter_samples must be an integer from 1 to 1000, got 1001",
+    ),
     "part of a sample": (
         {"shutter_samples": 2.5},
         "PluginTypeError: calibrated: shutter_samples must be an integer of at least 1, got 2.5",
