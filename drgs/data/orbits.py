@@ -11,7 +11,7 @@ import numpy as np
 from drgs.core.errors import UserError
 from drgs.data.initial import focus_of
 from drgs.data.types import Viewpoint
-from drgs.data.viewpoints import look_at, pinhole, shown
+from drgs.data.viewpoints import look_at, near_one, pinhole, shown
 from drgs.gaussians.parameters import Gaussians
 
 ELEVATION = math.radians(30)
@@ -108,11 +108,12 @@ def orbit_of_gaussians(gaussians: Gaussians, up: np.ndarray, fov: float) -> Orbi
 
     up: (3,) world, any length; fov: degrees.
     """
-    length = np.linalg.norm(up)
+    up = np.asarray(up, np.float64)
+    length = np.linalg.norm(near_one(up))
     if not length > 0:
-        raise UserError(f"camera: up must not be zero, got {shown(np.asarray(up))}")
+        raise UserError(f"camera: up must not be zero, got {shown(up)}")
     focus, spread = _middle(gaussians)
-    up = np.asarray(up, np.float64) / length
+    up = near_one(up) / length
     start, _ = _level_axes(up, np.array([0.0, -1.0, 0.0]))
     radius = spread / math.sin(math.radians(fov) / 2)
     return Orbit(focus, up, start, radius, ELEVATION, half_arc=None)

@@ -44,6 +44,9 @@ FOCAL_RANGE = (1e-2, 1e4)
 """Focal lengths, in image sizes, that a pinhole camera can have: full angles of view from 178
 degrees down to 0.006."""
 
+MAX_SIDE = 2**24
+"""px: of a larger picture, float32 does not tell neighbouring pixels apart."""
+
 MAX_OFFSET = 100
 """Image sizes: how far the principal point may lie from the picture."""
 
@@ -105,6 +108,7 @@ def _opencv_pose(rows: list[list[float]]) -> np.ndarray:
 
 Number = Annotated[float, Field(allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+Side = Annotated[float, Field(ge=1, le=MAX_SIDE)]
 Angle = Annotated[Number, AfterValidator(_angle)]
 Text = Annotated[str, Field(min_length=1)]
 Rows = list[list[Annotated[Number, AfterValidator(_coordinate)]]]
@@ -122,8 +126,8 @@ class CameraValues(BaseModel):
     fl_y: Positive | None = None
     cx: Number | None = None  # px
     cy: Number | None = None
-    w: Positive | None = None  # px
-    h: Positive | None = None
+    w: Side | None = None  # px
+    h: Side | None = None
     k1: Number | None = None
     k2: Number | None = None
     k3: Number | None = None

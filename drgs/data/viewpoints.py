@@ -14,7 +14,16 @@ import numpy as np
 
 from drgs.core.constants import SHUTTER_SAMPLES
 from drgs.core.errors import UserError
-from drgs.data.transforms import Frame, focal_from_angle, lens_of, motion_of, read_frames
+from drgs.data.transforms import (
+    MAX_COORDINATE,
+    Frame,
+    focal_from_angle,
+    focal_length,
+    lens_of,
+    motion_of,
+    principal_point,
+    read_frames,
+)
 from drgs.data.types import Viewpoint
 
 FIELD_OF_VIEW = 40.0
@@ -35,18 +44,30 @@ def look_at(origin: np.ndarray, target: np.ndarray, up: np.ndarray) -> np.ndarra
     Raises :class:`UserError` where they determine no camera.
     """
     origin, target, up = (np.asarray(v, np.float64) for v in (origin, target, up))
+    for name, place in (("origin", origin), ("target", target)):
+        if not np.abs(place).max() <= MAX_COORDINATE:
+            raise UserError(
+                f"camera: the coordinates of {name} must be at most {MAX_COORDINATE:g} in size, "
+                f"got {shown(place)}; scale the scene down"
+            )
+    given, up = up, near_one(up)
     forward = target - origin
     right = np.cross(forward, up)
     scale = np.linalg.norm(forward) * np.linalg.norm(up)
     if not np.linalg.norm(right) > 1e-6 * scale:
         raise UserError(
             f"camera: the direction from origin {shown(origin)} to target {shown(target)} must "
-            f"not be zero or parallel to up {shown(up)}"
+            f"not be zero or parallel to up {shown(given)}"
         )
     forward, right = (v / np.linalg.norm(v) for v in (forward, right))
     pose = np.eye(4)
     pose[:3] = np.stack([right, np.cross(forward, right), forward, origin], axis=1)
     return pose
+
+
+def near_one(vector: np.ndarray) -> np.ndarray:
+    """The vector times a power of two, which rounds nothing, so that its square is a number."""
+    return np.ldexp(vector, -np.frexp(np.abs(vector).max())[1])
 
 
 def field_of_view(views: Sequence[Viewpoint]) -> float:
@@ -93,16 +114,17 @@ def _viewpoint_of(
         return to * value / of
 
     if values.fl_x is not None:
-        focal = scaled(values.fl_x, "w", width)
+        focal = focal_length(scaled(values.fl_x, "w", width), frame.where("fl_x"), width)
     elif values.camera_angle_x is not None:
         focal = focal_from_angle(values.camera_angle_x, width)
     else:
         raise UserError(f"{frame.where('camera_angle_x')} (or fl_x with w) is missing")
     focal_y, cx, cy = focal, width / 2, height / 2
     if values.fl_x is not None and values.fl_y is not None:
-        focal_y = scaled(values.fl_y, "h", height)
+        focal_y = focal_length(scaled(values.fl_y, "h", height), frame.where("fl_y"), height)
     if values.cx is not None and values.cy is not None:
-        cx, cy = scaled(values.cx, "w", width), scaled(values.cy, "h", height)
+        cx = principal_point(scaled(values.cx, "w", width), frame.where("cx"), width)
+        cy = principal_point(scaled(values.cy, "h", height), frame.where("cy"), height)
     pose, lens, motion = values.transform_matrix, lens_of(frame), motion_of(frame, shutter_samples)
     return Viewpoint(name, pose, focal, focal_y, cx, cy, width, height, lens, motion)
 

@@ -316,14 +316,15 @@ _DURATION = re.compile(
 
 
 def parse_duration(text: str) -> float:
-    """Seconds of ``90``, ``90s``, ``5m``, ``1m30``, ``1h30m``. Raises ValueError for anything else.
+    """Seconds of ``90``, ``90s``, ``5m``, ``1m30s``, ``1h30m``.
 
-    That includes ``1h30``, which would be half a minute.
+    Raises ValueError for anything else. That includes ``1h30`` and ``5m5``: what has several parts
+    has a unit for each.
     """
     match = _DURATION.fullmatch(text.strip())
     parts = match.groupdict(default="0") if match else {"h": "0", "m": "0", "s": "0"}
     seconds = 3600 * float(parts["h"]) + 60 * float(parts["m"]) + float(parts["s"])
-    unclear = re.search(r"h[\d.]+$", text.strip())
+    unclear = re.search(r"[hm][\d.]+$", text.strip())
     if unclear or not 0 < seconds <= LONGEST:
         raise ValueError(f"must be a time such as 90s, 5m or 1h30m, a week at most, got {text!r}")
     return seconds

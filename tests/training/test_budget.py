@@ -31,14 +31,14 @@ def variant():
 
 @pytest.mark.parametrize(
     ("text", "seconds"),
-    [("90", 90), ("90s", 90), ("5m", 300), ("1h30m", 5400), ("0.5h", 1800), ("1m30", 90)],
+    [("90", 90), ("90s", 90), ("5m", 300), ("1h30m", 5400), ("0.5h", 1800), ("1m30s", 90)],
 )
 def test_durations(text, seconds):
     assert parse_duration(text) == seconds
 
 
 @pytest.mark.parametrize(
-    "text", ["", "0", "m", "5 minutes", "-3s", "nan", "1m2h", "0s", "1h30", "9" * 400]
+    "text", ["", "0", "m", "5 minutes", "-3s", "nan", "1m2h", "0s", "1h30", "5m5", "9" * 400]
 )
 def test_what_is_no_duration_is_refused(text):
     with pytest.raises(ValueError, match="must be a time such as 90s, 5m or 1h30m"):
