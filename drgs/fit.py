@@ -46,6 +46,7 @@ from drgs.core.files import atomic_path
 from drgs.core.machine import processor
 from drgs.core.private import llvm_version
 from drgs.data import Dataset, View, initial_gaussians, load_dataset
+from drgs.data.derived import completed, description_of_start
 from drgs.data.fingerprint import Fingerprint, fingerprint
 from drgs.gaussians.parameters import Gaussians
 from drgs.integrator.scene import check_lenses
@@ -113,7 +114,7 @@ def add_arguments(parser: CommandParser) -> None:
     """Add the arguments of the command."""
     parser.description = "Fit 3D Gaussians to posed photographs."
     parser.show_examples(
-        "%(prog)s scenes/lego.yml --data DIR --out out/mine --set iterations=3000",
+        "%(prog)s scenes/photos.yml --data DIR --out out/mine",
         "%(prog)s --resume out/mine",
     )
     what = parser.add_mutually_exclusive_group(required=True)
@@ -190,6 +191,7 @@ def run(args: argparse.Namespace) -> None:
         data = fingerprint(dataset)
         if checkpoint is not None:
             check_same_data(out, config.data.path, checkpoint.data, data)
+        config = completed(config, dataset)
         select_variant(args.variant)
         announce(config, dataset)
         # The folder is touched when all of the input has been found to be usable.
@@ -259,6 +261,7 @@ def announce(config: FitConfig, dataset: Dataset) -> None:
         f"{len(dataset.train)} views to train on, {len(dataset.test)} of split "
         f"'{dataset.test_split}' to measure on; background {config.data.background}"
     )
+    print(description_of_start(config, dataset))
     print(described(summary_of_fit(config, dataset)))
     views, remedy = (*dataset.train, *dataset.test), "set data.ignore_distortion"
     check_lenses(config.model, views, f"{config.data.path}: ", remedy)

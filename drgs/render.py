@@ -37,12 +37,14 @@ from drgs.cli.commands import (
     run_command,
 )
 from drgs.cli.execution import VARIANTS, add_execution_arguments, executing, select_variant
+from drgs.config.changes import is_open
 from drgs.config.load import load_config
 from drgs.config.schema import NAMED_COLORS, FitConfig, ModelConfig
 from drgs.core.constants import SHUTTER_SAMPLES
 from drgs.core.errors import PluginError, UserError, one_line, reason_of_mitsuba
 from drgs.core.files import atomic_path, open_regular
 from drgs.data import Dataset, load_dataset
+from drgs.data.derived import completed
 from drgs.data.orbits import orbit_of_gaussians, orbit_of_views, orbit_size
 from drgs.data.types import Viewpoint
 from drgs.data.viewpoints import (
@@ -297,7 +299,10 @@ def _load_config(path: Path, args: argparse.Namespace) -> FitConfig:
     if args.background is not None and not isinstance(color := _background(args), Path):
         # Photographs with alpha are composited over it as well.
         overrides.append(f"data.background={list(color)}")
-    return load_config(path, overrides)
+    config = load_config(path, overrides)
+    if is_open(config):  # not a fit's own, which says what was used
+        config = completed(config, load_dataset(config.data_for_rendering))
+    return config
 
 
 def render_split(model: Model, split: str, out: Path) -> Quality:

@@ -202,7 +202,7 @@ def load_subject(path: Path, num_views: int) -> Subject:
         step = max(1, len(dataset.test) // num_views)
         views = dataset.test[::step][:num_views]
         _check_pinholes(views, config_file, ply)
-        cameras = [camera_of(view, config.model.near) for view in views]
+        cameras = [camera_of(view, config.model.near_plane) for view in views]
         return Subject(
             path.name, baked(Gaussians.load(ply)), cameras, list(views), dataset.background
         )

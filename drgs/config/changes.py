@@ -54,3 +54,28 @@ def with_iterations(config: FitConfig, iterations: int) -> FitConfig:
     changes["densify.stop"] = max(changes["densify.stop"], changes["densify.start"] + 1)
     changes["optimizer.means_lr_aims"] = []
     return changed(config, changes)
+
+
+OPEN = ("data.background", "model.near")
+"""Values that are null until the dataset has decided: see ``drgs.data.derived``."""
+
+LEFT_TO_THE_DATASET = (*OPEN, "init.half_extent")
+"""The same, and one that may stay null: not every start box is around the world's origin."""
+
+
+def is_open(config: FitConfig) -> bool:
+    """Whether the dataset has not decided yet."""
+    return any(_value(config, key) is None for key in OPEN)
+
+
+def decided_as(config: FitConfig, other: FitConfig) -> FitConfig:
+    """``config``, with those values that it leaves to the dataset as ``other`` has them."""
+    changes = {
+        key: _value(other, key) for key in LEFT_TO_THE_DATASET if _value(config, key) is None
+    }
+    return changed(config, changes)
+
+
+def _value(config: FitConfig, key: str) -> object:
+    section, name = key.split(".")
+    return getattr(getattr(config, section), name)

@@ -31,9 +31,23 @@ Color = str | tuple[float, float, float]
 
 NAMED_COLORS = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0)}
 
+DEFAULT_BACKGROUND = "white"
+"""Where there are no photographs to ask."""
 
-def _color(value: Any) -> Color:
-    if isinstance(value, str) and value in NAMED_COLORS:
+REFERENCE_NEAR = 0.2
+"""Scene units: the reference's near plane, of scenes that are about 4 wide."""
+
+REFERENCE_START, REFERENCE_STOP, REFERENCE_DEGREE = 500, 15_000, 1000
+"""Iterations: the reference's schedule, for 30,000."""
+
+STOP_SHARE, DEGREE_SHARE = 5 / 7, 1 / 7
+"""Of fits that are shorter than that schedule: how long their population changes, and when the
+degree of the harmonics rises. Of 7,000 iterations, 2,000 are left for the last opacities to settle,
+and the degree rises as in the reference."""
+
+
+def _color(value: Any) -> Color | None:
+    if value is None or (isinstance(value, str) and value in NAMED_COLORS):
         return value
     if isinstance(value, (list, tuple)) and len(value) == 3:
         numbers = [v for v in value if isinstance(v, (int, float)) and not isinstance(v, bool)]
@@ -42,11 +56,11 @@ def _color(value: Any) -> Color:
     raise ValueError("must be white, black or three numbers in 0..1")
 
 
-def _color_to_yaml(color: Color) -> Any:
-    return color if isinstance(color, str) else list(color)
+def _color_to_yaml(color: Color | None) -> Any:
+    return list(color) if isinstance(color, tuple) else color
 
 
-ColorField = Annotated[Color, PlainValidator(_color), PlainSerializer(_color_to_yaml)]
+ColorField = Annotated[Color | None, PlainValidator(_color), PlainSerializer(_color_to_yaml)]
 Count = Annotated[int, Field(le=MAX_INT)]
 PathField = Annotated[Path, Field(strict=False)]
 
@@ -86,7 +100,7 @@ class DataConfig(_Section):
         None,
         ge=1,
         description="px. Wider images are scaled down to this width by area averaging; null: "
-        "none is.",
+        "photographs to 1600, as in the reference; pictures of the NeRF-synthetic layout are not.",
     )
     test_split: Literal["train", "val", "test"] | None = Field(
         None,
@@ -96,9 +110,10 @@ class DataConfig(_Section):
         8, ge=2, description="nerfstudio: images 0, n, 2n, ... by file name are the test split."
     )
     background: ColorField = Field(
-        "white",
+        None,
         description="white, black or [r, g, b] in display space: behind transparent images, and "
-        "behind the splats at training, evaluation and rendering.",
+        "behind the splats at training, evaluation and rendering. null: white if any image is "
+        "transparent, else black.",
     )
     random_background: bool = Field(
         False,
@@ -123,10 +138,16 @@ class DataConfig(_Section):
         False, description="Do not open files of depth; nor are they where loss.depth_weight is 0."
     )
 
+    ignore_points: bool = Field(
+        False,
+        description="Start from random points where the dataset names a point cloud of its own.",
+    )
+
     @property
     def background_rgb(self) -> tuple[float, float, float]:
-        """The background's display-space colour, three numbers in 0..1."""
-        return NAMED_COLORS.get(self.background, self.background)
+        """The background's display-space colour, three numbers in 0..1; white if it is null."""
+        background = self.background or DEFAULT_BACKGROUND
+        return NAMED_COLORS.get(background, background)
 
 
 class InitConfig(_Section):
@@ -137,12 +158,15 @@ class InitConfig(_Section):
         None,
         gt=0,
         le=1e9,
-        description="Scene units: the start box is [-h, h]^3. null: the reference's 1.3 for the "
-        "NeRF-synthetic layout, otherwise a box derived from the cameras.",
+        description="Scene units: the start box is [-h, h]^3. null: the reference's 1.3 where "
+        "the cameras are those of NeRF-synthetic scenes, otherwise a box derived from them.",
     )
     opacity: float = Field(0.1, gt=0, lt=1, description="Opacity of every starting Gaussian.")
     point_cloud: PathField | None = Field(
-        None, description="PLY with x, y, z (and red, green, blue) to use instead of random points."
+        None,
+        description="PLY with x, y, z (and red, green, blue) to use instead of random points. "
+        "null: the one that the dataset names (ply_file_path), if it does and no half_extent is "
+        "given.",
     )
 
 
@@ -150,11 +174,19 @@ class _Model(_Section):
     """What of :class:`ModelConfig` stands before the approximations."""
 
     sh_degree: int = Field(3, ge=0, le=3, description="Degree of the spherical harmonics.")
-    sh_increase_every: Count = Field(
-        1000, ge=1, description="Iterations between +1 of the degree in use, which starts at 0."
+    sh_increase_every: Count | None = Field(
+        REFERENCE_DEGREE,
+        ge=1,
+        description="Iterations between +1 of the degree in use, which starts at 0. Not given, or "
+        "null: 1000, or a seventh of fewer than 7,000 iterations.",
     )
-    near: float = Field(
-        0.2, ge=1e-9, le=1e9, description="Near plane, scene units: closer means are culled."
+    near: float | None = Field(
+        None,
+        ge=1e-9,
+        le=1e9,
+        description="Near plane, scene units: closer means are culled. null: the reference's 0.2 "
+        "where the cameras are those of NeRF-synthetic scenes, otherwise a twentieth of their "
+        "distance to what they look at.",
     )
 
 
@@ -195,6 +227,11 @@ class ModelConfig(_ModelWithApproximations):
         if value is not None and not declared.allows(value):
             raise ValueError(f"must be {declared.expected}")
         return value
+
+    @property
+    def near_plane(self) -> float:
+        """Scene units; the reference's where it is null."""
+        return REFERENCE_NEAR if self.near is None else self.near
 
     @property
     def approximations(self) -> Approximations:
@@ -289,9 +326,17 @@ class CamerasConfig(_Section):
 class DensifyConfig(_Section):
     """Adaptive density control: clone, split, prune, opacity reset."""
 
-    start: Count = Field(500, ge=0, description="The population changes only after this iteration.")
-    stop: Count = Field(
-        15_000, ge=1, description="It changes, and is reset, only before this iteration."
+    start: Count | None = Field(
+        REFERENCE_START,
+        ge=0,
+        description="The population changes only after this iteration. Not given, or null: 500, or "
+        "half of stop if that is less.",
+    )
+    stop: Count | None = Field(
+        REFERENCE_STOP,
+        ge=1,
+        description="It changes, and is reset, only before this iteration. Not given, or null: "
+        "15,000, or 5/7 of fewer than 21,000 iterations.",
     )
     every: Count = Field(100, ge=1, description="Iterations between two changes.")
     grad_threshold: float = Field(
@@ -354,6 +399,11 @@ class CoarseStage(_Section):
     factor: int = Field(ge=2, le=64, description="Width and height are divided by this.")
 
 
+def _is_open(section: BaseModel, name: str) -> bool:
+    """Whether a value of the schedule is to follow from the number of iterations."""
+    return name not in section.model_fields_set or getattr(section, name) is None
+
+
 class FitConfig(_Section):
     """Everything that decides a fit."""
 
@@ -385,6 +435,27 @@ class FitConfig(_Section):
     def data_for_rendering(self) -> DataConfig:
         """``data``, without what only a loss looks at."""
         return self.data.model_copy(update={"ignore_depth": True})
+
+    @model_validator(mode="after")
+    def _follow_from_iterations(self) -> FitConfig:
+        """The part of the schedule that is not given."""
+        model, densify, n = self.model, self.densify, self.iterations
+        if _is_open(model, "sh_increase_every"):
+            every = max(1, min(REFERENCE_DEGREE, round(DEGREE_SHARE * n)))
+            self._complete("model", {"sh_increase_every": every})
+        changes, first = {}, densify.start
+        if _is_open(densify, "stop"):
+            least = 1 if _is_open(densify, "start") else first + 1
+            changes["stop"] = max(least, min(REFERENCE_STOP, round(STOP_SHARE * n)))
+        if _is_open(densify, "start"):
+            changes["start"] = min(REFERENCE_START, changes.get("stop", densify.stop) // 2)
+        self._complete("densify", changes)
+        return self
+
+    def _complete(self, section: str, changes: dict[str, int]) -> None:
+        """Of a model that is frozen once it is validated."""
+        completed = getattr(self, section).model_copy(update=changes)
+        object.__setattr__(self, section, completed)
 
     @model_validator(mode="after")
     def _check_relations(self) -> FitConfig:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -10,6 +11,7 @@ from scipy.spatial import cKDTree
 from drgs.config.schema import FitConfig, InitConfig
 from drgs.core.denormals import denormals_kept
 from drgs.core.errors import UserError
+from drgs.data.start_box import in_view, points_in_view, start_box
 from drgs.data.types import Dataset, Viewpoint
 from drgs.gaussians.parameters import Gaussians
 from drgs.gaussians.sh import C0
@@ -21,37 +23,42 @@ that coincide."""
 
 NUM_NEIGHBOURS = 3
 
-PARALLEL_AXES = 1e-3
-"""Smallest eigenvalue of mean(I - d d^T), d the optical axes: about the mean squared sine of
-their angle to a common direction. Below this (1.8 degrees) their nearest point is noise."""
-
-KEEP_OUT = 0.25
-"""Of the distance to what the cameras look at: no starting point is nearer to a camera."""
-
-MAX_BATCHES = 200
-"""Batches of points to draw: enough where half a percent of the box is in view."""
+LEAST_IN_VIEW = 0.1
+"""Of the points of a cloud, those that must be in some picture: far fewer are in another frame of
+reference than the cameras."""
 
 
 def initial_gaussians(config: FitConfig, dataset: Dataset) -> Gaussians:
     """Gaussians at iteration 0, numpy float32, with the SH degree of ``config.model``.
 
-    Positions: ``init.point_cloud``; else uniform in [-h, h]^3 with ``init.half_extent``; else in
-    the layout's own box; else in a box derived from the cameras (:func:`points_in_view`). The
-    same seed gives the same points.
+    Positions: ``init.point_cloud``; else uniform in [-h, h]^3 with ``init.half_extent``; else the
+    point cloud that the dataset names; else in a box derived from the layout and the cameras
+    (``drgs.data.start_box``). The same seed gives the same points.
+
+    Raises :class:`UserError` for points that the cameras do not see.
     """
     init = config.init
-    colors = None
-    if init.point_cloud is not None:
-        means, colors = read_points(init.point_cloud)
-        _check_count(init, len(means), config.densify.max_gaussians)
+    cloud, colors = point_cloud_of(init, dataset), None
+    if cloud is not None:
+        means, colors = read_points(cloud)
+        if colors is not None and not np.any(colors):
+            colors = None  # all black: what is written where no colours were found out
+        _check_cloud(cloud, means, config.densify.max_gaussians, dataset.train)
     else:
         rng = np.random.default_rng(config.seed)
-        half_extent = init.half_extent or dataset.start_half_extent
-        if half_extent is not None:
-            means = rng.uniform(-half_extent, half_extent, (init.num_points, 3))
+        box = start_box(init, dataset)
+        if box is not None:
+            means = box.points(init.num_points, rng)
         else:
             means = points_in_view(dataset.train, init.num_points, rng)
     return gaussians_from_points(means, colors, init.opacity, config.model.sh_degree)
+
+
+def point_cloud_of(init: InitConfig, dataset: Dataset) -> Path | None:
+    """The file that a fit starts from; None: random points."""
+    if init.point_cloud is not None or init.half_extent is not None:
+        return init.point_cloud
+    return dataset.point_cloud
 
 
 def gaussians_from_points(
@@ -89,74 +96,21 @@ def mean_squared_neighbour_distance(points: np.ndarray) -> np.ndarray:
     return np.mean(distances[:, 1:] ** 2, axis=1)
 
 
-def focus_of(views: Sequence[Viewpoint]) -> tuple[np.ndarray, float]:
-    """What the cameras look at: (3,) the point nearest to all optical axes, and the distance.
-
-    Minimises sum_i |(I - d_i d_i^T)(p - c_i)|^2 over p, with c_i the centres and d_i the axes;
-    the distance is the median of |p - c_i|.
-
-    Raises :class:`UserError` where the axes do not determine it or diverge.
-    """
-    centers = np.stack([view.center for view in views])
-    axes = np.stack([view.camera_to_world[:3, 2] for view in views])
-    projectors = np.eye(3) - axes[:, :, None] * axes[:, None, :]
-    normal = projectors.mean(axis=0)
-    remedy = "set init.half_extent, or give a point cloud (init.point_cloud)"
-    if np.linalg.eigvalsh(normal)[0] < PARALLEL_AXES:
-        raise UserError(
-            "init.half_extent: no start box can be derived from the cameras, whose optical axes "
-            f"are parallel; {remedy}"
-        )
-    focus = np.linalg.solve(normal, np.einsum("nij,nj->i", projectors, centers) / len(views))
-    depths = np.einsum("ni,ni->n", focus - centers, axes)
-    if np.median(depths) <= 1e-6 * np.abs(centers - focus).max():
-        raise UserError(
-            "init.half_extent: no start box can be derived from the cameras, which look away from "
-            f"each other; {remedy}"
-        )
-    return focus, float(np.median(np.linalg.norm(focus - centers, axis=1)))
-
-
-def points_in_view(views: Sequence[Viewpoint], count: int, rng: np.random.Generator) -> np.ndarray:
-    """(count, 3) float64: uniform in what is seen of a cube around the cameras' focus.
-
-    The cube's half extent is the distance D to the focus: it holds what is looked at and as much
-    again behind it. Points that no camera sees would never be moved or removed, and one close to
-    a camera covers its picture, so only points are kept that lie in a picture and nowhere nearer
-    than D / 4 to a camera.
-    """
-    focus, distance = focus_of(views)
-    kept = np.empty((0, 3))
-    for _ in range(MAX_BATCHES):
-        points = rng.uniform(focus - distance, focus + distance, (count, 3))
-        kept = np.concatenate([kept, points[_in_view(points, views, KEEP_OUT * distance)]])
-        if len(kept) >= count:
-            return kept[:count]
-    raise UserError(
-        "init.half_extent: no start box can be derived from the cameras, which see too little of "
-        f"what is around {np.round(focus, 3).tolist()}; set it, or give init.point_cloud"
-    )
-
-
-def _in_view(points: np.ndarray, views: Sequence[Viewpoint], keep_out: float) -> np.ndarray:
-    """(N,) bool: inside at least one picture, and at least ``keep_out`` from every camera."""
-    seen = np.zeros(len(points), bool)
-    clear = np.ones(len(points), bool)
-    for view in views:
-        offsets = points - view.center
-        x, y, z = (offsets @ view.camera_to_world[:3, :3]).T
-        clear &= np.einsum("ni,ni->n", offsets, offsets) >= keep_out**2
-        # In pixels times z, so that nothing is divided by a depth near zero.
-        u, v = view.fx * x + view.cx * z, view.fy * y + view.cy * z
-        seen |= (z > 0) & (u >= 0) & (u <= view.width * z) & (v >= 0) & (v <= view.height * z)
-    return seen & clear
-
-
-def _check_count(init: InitConfig, num: int, max_gaussians: int) -> None:
+def _check_cloud(
+    file: Path, points: np.ndarray, max_gaussians: int, views: Sequence[Viewpoint]
+) -> None:
+    """Refuse a cloud (N, 3) of too few or too many points, or that is not what is photographed."""
+    num = len(points)
     if num <= NUM_NEIGHBOURS:
-        raise UserError(f"{init.point_cloud}: at least {NUM_NEIGHBOURS + 1} points, got {num}")
+        raise UserError(f"{file}: at least {NUM_NEIGHBOURS + 1} points, got {num}")
     if num > max_gaussians:
         raise UserError(
-            f"{init.point_cloud}: must hold at most densify.max_gaussians ({max_gaussians}) "
-            f"points, got {num}"
+            f"{file}: must hold at most densify.max_gaussians ({max_gaussians}) points, got {num}"
+        )
+    seen = int(np.count_nonzero(in_view(points, views)))
+    if views and seen < LEAST_IN_VIEW * num:
+        raise UserError(
+            f"{file}: only {seen:,} of {num:,} points are in any picture; they must be where the "
+            "dataset's cameras look, in the same frame of reference; give another init.point_cloud,"
+            " or random points (data.ignore_points, init.point_cloud=null)"
         )

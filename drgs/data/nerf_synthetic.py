@@ -41,6 +41,8 @@ def load(config: DataConfig) -> Dataset:
     That is ``config.test_split``, by default ``test`` if its transforms file is there, else
     ``val``.
     """
+    if config.background is None:
+        config = config.model_copy(update={"background": "white"})
     test_split = _test_split(config)
     frames = {s: read_frames(_transforms_path(config.path, s)) for s in ("train", test_split)}
     train, test = (_load_split(config, split, frames[split]) for split in ("train", test_split))

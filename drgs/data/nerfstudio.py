@@ -11,6 +11,7 @@ length.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 from drgs.config.schema import DataConfig
@@ -24,12 +25,17 @@ from drgs.data.transforms import (
     focal_length,
     image_path,
     in_parallel,
+    point_cloud_note,
+    point_cloud_path,
     principal_point,
     read_frames,
     unique_names,
 )
 from drgs.data.types import Dataset, View
-from drgs.io.pictures import read_pixels
+from drgs.io.pictures import has_alpha, read_pixels
+
+MAX_WIDTH = 1600
+"""px: wider photographs are scaled down to this, as in the 3DGS reference, unless a size is set."""
 
 
 def load(config: DataConfig) -> Dataset:
@@ -44,6 +50,7 @@ def load(config: DataConfig) -> Dataset:
     if len(frames) < 2:
         raise UserError(f"{path}: at least 2 views are needed, one of them to test; got 1")
     files = [image_path(config.path, frame) for frame in frames]
+    config = _completed(config, files)
 
     def load_view(index: int, name: str) -> View:
         return _load_view(config, frames[index], files[index], name)
@@ -64,9 +71,21 @@ def load(config: DataConfig) -> Dataset:
             f"{len(test)} views (every {config.test_every}th by file name), "
             f"{views[0].width}x{views[0].height}, background {config.background}"
             + notes(config, frames)
+            + point_cloud_note(config, frames)
         ),
         ignored=ignored(config, frames),
+        point_cloud=point_cloud_path(config, frames),
     )
+
+
+def _completed(config: DataConfig, files: Sequence[Path]) -> DataConfig:
+    """With what follows from the photographs where nothing is given."""
+    changes: dict[str, object] = {}
+    if config.background is None:
+        changes["background"] = "white" if any(map(has_alpha, files)) else "black"
+    if config.image_size is None:
+        changes["image_size"] = MAX_WIDTH
+    return config.model_copy(update=changes)
 
 
 def _load_view(config: DataConfig, frame: Frame, file: Path, name: str) -> View:

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from drgs.core.errors import UserError
-from drgs.data.initial import focus_of
+from drgs.data.start_box import focus_of
 from drgs.data.types import Viewpoint
 from drgs.data.viewpoints import look_at, near_one, pinhole, shown
 from drgs.gaussians.parameters import Gaussians

@@ -21,6 +21,7 @@ from pydantic_core import ErrorDetails
 
 from drgs.cameras.axes import between_opencv_and_opengl
 from drgs.config.explain import expectation
+from drgs.config.schema import DataConfig
 from drgs.core.errors import UserError, one_line
 from drgs.core.files import read_text
 from drgs.data.types import Motion
@@ -169,6 +170,7 @@ class Transforms(CameraValues):
     """A file."""
 
     frames: Annotated[list[FrameValues], Field(min_length=1)]
+    ply_file_path: Text | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -179,6 +181,7 @@ class Frame:
     own: FrameValues  # without what it inherits
     index: int
     path: Path
+    point_cloud: str | None = None  # what the file's ply_file_path names
 
     @property
     def moves(self) -> bool:
@@ -205,7 +208,10 @@ def read_frames(path: Path) -> list[Frame]:
         meta = Transforms.model_validate(content)
     except ValidationError as error:
         raise UserError(f"{path}: {_explained(error.errors()[0])}") from None
-    return [Frame(_inherited(own, meta), own, index, path) for index, own in enumerate(meta.frames)]
+    return [
+        Frame(_inherited(own, meta), own, index, path, meta.ply_file_path)
+        for index, own in enumerate(meta.frames)
+    ]
 
 
 def _inherited(own: FrameValues, meta: Transforms) -> FrameValues:
@@ -331,6 +337,26 @@ def image_path(folder: Path, frame: Frame, key: str = "file_path") -> Path:
     raise UserError(
         f"{frame.where(key)}: there is no image {one_line(folder / name)} (or with .png added)"
     )
+
+
+def point_cloud_path(config: DataConfig, frames: Sequence[Frame]) -> Path | None:
+    """The point cloud that the frames' file names, if it is there and not to be ignored."""
+    name = frames[0].point_cloud
+    if name is None or config.ignore_points or not os.path.isfile(config.path / name):
+        return None
+    return config.path / name
+
+
+def point_cloud_note(config: DataConfig, frames: Sequence[Frame]) -> str:
+    """What becomes of the file's point cloud if it is not started from, for a description."""
+    name = frames[0].point_cloud
+    if name is None:
+        return ""
+    if config.ignore_points:
+        return "; point cloud (ply_file_path) ignored"
+    if point_cloud_path(config, frames) is None:
+        return f"; its point cloud {one_line(name, 100)} is not there"
+    return ""
 
 
 def unique_names(files: Sequence[str]) -> list[str]:

@@ -82,6 +82,7 @@ class Dataset:
     description: str  # one line: what was read, and what was assumed
     ignored: tuple[str, ...] = ()  # that frames have and the configuration leaves out: see extras
     rendered: bool = False  # the pictures are another renderer's, not photographs
+    point_cloud: Path | None = None  # that the dataset names, to start from: a PLY file
 
     @property
     def extent(self) -> float:

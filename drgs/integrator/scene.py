@@ -43,7 +43,7 @@ def make_scene(
     integrator = {
         "type": "splats",
         "background": _picture(background) if isinstance(background, Path) else list(background),
-        "near": model.near,
+        "near": model.near_plane,
         **model.approximations.others_than_default,
         "srgb_primitives": False,
         **settings,

@@ -122,6 +122,12 @@ def upright(pixels: np.ndarray, orientation: int) -> np.ndarray:
     return pixels
 
 
+def has_alpha(path: Path) -> bool:
+    """Whether :func:`read_image` gives an alpha channel, from the file's header."""
+    with _opened(path) as image:
+        return image.mode in ("LA", "RGBA") or (image.mode == "P" and "transparency" in image.info)
+
+
 def read_image(path: Path) -> np.ndarray:
     """(H, W, C) float32 in 0..1: see :func:`read_pixels`."""
     return as_numbers(read_pixels(path))

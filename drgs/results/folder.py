@@ -15,7 +15,7 @@ from pathlib import Path
 
 import yaml
 
-from drgs.config.changes import changed
+from drgs.config.changes import changed, decided_as
 from drgs.config.load import dump_config, load_config
 from drgs.config.schema import FitConfig
 from drgs.core.errors import UserError, UserNote, listed, one_line
@@ -312,9 +312,10 @@ def _visible_names(folder: Path) -> list[str]:
 
 def _belongs_to(folder: Path, config: FitConfig) -> bool:
     try:
-        return not _differences(_values(_earlier_config(folder)), _values(config))
+        earlier = _earlier_config(folder)
     except UserError:
         return False
+    return not _what_differs(earlier, config)
 
 
 def _earlier_config(folder: Path) -> FitConfig:
@@ -329,9 +330,13 @@ def _which_run(folder: Path, config: FitConfig) -> str:
         earlier = _earlier_config(folder)
     except UserError:
         return f"another run, with a {CONFIG} that is not readable"
-    return (
-        f"another run, which differs in {listed(_differences(_values(earlier), _values(config)))}"
-    )
+    return f"another run, which differs in {listed(_what_differs(earlier, config))}"
+
+
+def _what_differs(earlier: FitConfig, config: FitConfig) -> list[str]:
+    """What one of them leaves to the dataset, the other has from there."""
+    theirs, ours = decided_as(earlier, config), decided_as(config, earlier)
+    return _differences(_values(theirs), _values(ours))
 
 
 def _values(config: FitConfig) -> dict[str, object]:

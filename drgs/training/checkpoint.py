@@ -17,7 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
-from drgs.config.changes import changed
+from drgs.config.changes import changed, decided_as
 from drgs.config.schema import FitConfig
 from drgs.core.errors import UserError, UserNote, listed, one_line
 from drgs.core.files import atomic_path, read_arrays
@@ -96,7 +96,7 @@ def load_checkpoint(folder: Path, config: FitConfig) -> Checkpoint | None:
         raise UserError(f"{error}; {_remedy(path)}") from None
     except (ValueError, KeyError, TypeError, RecursionError) as error:
         raise _damaged(path, error) from None
-    if config not in (own, *before):
+    if not any(_says_the_same(config, earlier) for earlier in (own, *before)):
         raise UserError(
             f"{path}: belongs to another configuration than {folder / CONFIG}; {_remedy(path)}"
         )
@@ -145,6 +145,11 @@ def check_same_data(
 def remove_checkpoint(folder: Path) -> None:
     """A finished fit needs none."""
     (folder / CHECKPOINT).unlink(missing_ok=True)
+
+
+def _says_the_same(config: FitConfig, earlier: FitConfig) -> bool:
+    """What one of them leaves to the dataset, the other has from there."""
+    return decided_as(config, earlier) == decided_as(earlier, config)
 
 
 def _as_text(config: FitConfig) -> str:

@@ -18,6 +18,7 @@ import numpy as np
 
 from drgs.config.changes import changed
 from drgs.config.schema import FitConfig
+from drgs.data.derived import completed
 from drgs.data.types import Dataset, View
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 from drgs.integrator.scene import make_scene, render_views
@@ -61,6 +62,7 @@ class Trainer:
     """Fits ``gaussians`` to the training views of ``dataset``."""
 
     def __init__(self, config: FitConfig, dataset: Dataset, gaussians: Gaussians) -> None:
+        config = completed(config, dataset)
         self.config, self.extent = config, dataset.extent
         self.effects = training_effects(config, dataset)
         settings = integrator_settings(self.effects)

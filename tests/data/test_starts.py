@@ -13,7 +13,8 @@ from drgs.config.schema import FitConfig
 from drgs.core.errors import UserError
 from drgs.data import initial_gaussians
 from drgs.data.images import downscale
-from drgs.data.initial import focus_of, mean_squared_neighbour_distance, points_in_view
+from drgs.data.initial import mean_squared_neighbour_distance
+from drgs.data.start_box import focus_of, points_in_view
 
 
 # Either layout

@@ -85,11 +85,15 @@ def test_what_a_killed_run_was_writing_is_removed_and_nothing_else(finished, con
 
 def test_another_run_is_named_by_what_differs(finished, config):
     other = FitConfig(
-        data=config.data, seed=7, init={"half_extent": 2.0}, iterations=9, loss={"sigma": 2.0}
+        data=config.data,
+        seed=7,
+        init={"half_extent": 2.0},
+        densify={"every": 9},
+        loss={"sigma": 2.0},
     )
     assert (
         "already holds another run, which differs in init.half_extent = None (here 2.0), "
-        "loss.sigma = 1.5 (here 2.0), iterations = 30000 (here 9) and 1 more; choose"
+        "loss.sigma = 1.5 (here 2.0), densify.every = 100 (here 9) and 1 more; choose"
     ) in refusal(claim_output_folder, finished, other)
 
 

@@ -1,0 +1,83 @@
+"""What a configuration leaves to the dataset: values that are null until it has been read."""
+
+from __future__ import annotations
+
+from drgs.config.changes import changed
+from drgs.config.schema import NAMED_COLORS, REFERENCE_NEAR, FitConfig
+from drgs.core.errors import UserError
+from drgs.data.initial import point_cloud_of
+from drgs.data.start_box import focus_of, is_of_the_reference, shown, start_box
+from drgs.data.types import Dataset
+
+NEAR_SHARE = 0.05
+"""Of the cameras' distance to what they look at: the reference's near plane of 0.2 is that for
+NeRF-synthetic scenes, whose distance is 4.03."""
+
+FARTHEST_NEAR = 0.5
+"""Of that distance: a near plane beyond it would cut into what is looked at."""
+
+
+def completed(config: FitConfig, dataset: Dataset) -> FitConfig:
+    """``config`` with the background, start box and near plane that follow from ``dataset``.
+
+    Those that are given stay. Raises :class:`UserError` for a near plane behind which there is
+    nothing left to look at.
+    """
+    changes: dict[str, object] = {}
+    if config.data.background is None:
+        names = {color: name for name, color in NAMED_COLORS.items()}
+        background = tuple(dataset.background)
+        changes["data.background"] = names.get(background, background)
+    if config.init.half_extent is None and _starts_in_reference_box(config, dataset):
+        changes["init.half_extent"] = dataset.start_half_extent
+    if config.model.near is None:
+        changes["model.near"] = _near_plane(dataset)
+    else:
+        _check_near_plane(config.model.near, dataset)
+    return changed(config, changes) if changes else config
+
+
+def _starts_in_reference_box(config: FitConfig, dataset: Dataset) -> bool:
+    """Whether nothing but the layout says where the Gaussians are at iteration 0."""
+    return point_cloud_of(config.init, dataset) is None and is_of_the_reference(dataset)
+
+
+def description_of_start(config: FitConfig, dataset: Dataset) -> str:
+    """What a fit starts from and where its near plane is, one line; config: completed."""
+    cloud, box = point_cloud_of(config.init, dataset), None
+    if cloud is None:
+        box = start_box(config.init, dataset)
+    if cloud is not None:
+        what = f"the points of {cloud}"
+    elif box is not None:
+        what = f"{config.init.num_points:,} random points in {box}"
+    else:
+        focus, distance = focus_of(dataset.train)
+        within = f"within {distance:.3g} of {shown(focus)}"
+        what = f"{config.init.num_points:,} random points that the cameras see {within}"
+    return f"starts from {what}; near plane at {config.model.near:g}"
+
+
+def _near_plane(dataset: Dataset) -> float:
+    if not dataset.train or is_of_the_reference(dataset):
+        return REFERENCE_NEAR
+    return float(f"{NEAR_SHARE * _viewing_distance(dataset):.3g}")
+
+
+def _check_near_plane(near: float, dataset: Dataset) -> None:
+    if not dataset.train:
+        return
+    distance = _viewing_distance(dataset)
+    if near > FARTHEST_NEAR * distance:
+        raise UserError(
+            f"model.near must be less than half of the distance from the cameras to what they look "
+            f"at, {distance:.3g}, got {near:g}; model.near=null lets it follow from the cameras"
+        )
+
+
+def _viewing_distance(dataset: Dataset) -> float:
+    """From the cameras to what they look at; the scene's extent where they look nowhere."""
+    try:
+        return focus_of(dataset.train)[1]
+    except UserError:
+        return dataset.extent

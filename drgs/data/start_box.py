@@ -1,0 +1,218 @@
+"""Where a fit starts: random points in a box that the cameras look into.
+
+Imported when there is no point cloud to start from, and for what follows from where the cameras
+look: orbits, and the near plane.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from drgs.config.schema import InitConfig
+from drgs.core.errors import UserError
+from drgs.data.types import Dataset, Viewpoint
+
+PARALLEL_AXES = 1e-3
+"""Smallest eigenvalue of mean(I - d d^T), d the optical axes: about the mean squared sine of
+their angle to a common direction. Below this (1.8 degrees) their nearest point is noise."""
+
+KEEP_OUT = 0.25
+"""Of the distance to what the cameras look at: no starting point is nearer to a camera."""
+
+MAX_BATCHES = 200
+"""Batches of points to draw: enough where half a percent of the box is in view."""
+
+REFERENCE_FILL = 0.9
+"""Of half of a picture's width: what the reference's box takes up where NeRF-synthetic's cameras
+look, 1.3 / (4.03 tan(0.69 / 2))."""
+
+FILL_RANGE = (0.5, 2.0)
+"""Of half of a picture's width: where that box is taken as it is."""
+
+LEAST_LOOKING = 0.5
+"""Of the cameras, those that must look into a box."""
+
+LEAST_COVERED = 0.005
+"""Of a picture (the median): what a box must cover, or what is around it starts without points."""
+
+RAYS = 32
+"""In each direction, through a picture whose covered part is measured."""
+
+
+@dataclass(frozen=True, eq=False)
+class Box:
+    """A cube along the world's axes."""
+
+    center: np.ndarray  # (3,) world
+    half_extent: float  # world units
+
+    def points(self, count: int, rng: np.random.Generator) -> np.ndarray:
+        """(count, 3) float64: uniform."""
+        return self.center + rng.uniform(-self.half_extent, self.half_extent, (count, 3))
+
+    def __str__(self) -> str:
+        """As messages name it."""
+        if not self.center.any():
+            return f"[-{self.half_extent:g}, {self.half_extent:g}]^3"
+        return f"the cube of half width {self.half_extent:.3g} around {shown(self.center)}"
+
+
+def start_box(init: InitConfig, dataset: Dataset) -> Box | None:
+    """The box of the random points that a fit starts from; None: :func:`points_in_view`.
+
+    Raises :class:`UserError` for a given one (``init.half_extent``) that the cameras do not see.
+    """
+    if init.half_extent is not None:
+        box = Box(np.zeros(3), init.half_extent)
+        check_box(box, dataset.train)
+        return box
+    if dataset.start_half_extent is None:
+        return None
+    if is_of_the_reference(dataset):
+        return Box(np.zeros(3), dataset.start_half_extent)
+    focus, distance = focus_of(dataset.train)
+    return Box(focus, REFERENCE_FILL * distance * _half_width(dataset.train))
+
+
+def is_of_the_reference(dataset: Dataset) -> bool:
+    """Whether the layout has a start box, and the cameras are about as far away as it expects."""
+    half_extent = dataset.start_half_extent
+    if half_extent is None or not dataset.train:
+        return half_extent is not None
+    try:
+        focus, distance = focus_of(dataset.train)
+    except UserError:  # nothing is known that would be better
+        return True
+    fill = half_extent / (distance * _half_width(dataset.train))
+    return bool(FILL_RANGE[0] <= fill <= FILL_RANGE[1] and np.abs(focus).max() <= half_extent)
+
+
+def _half_width(views: Sequence[Viewpoint]) -> float:
+    """Of what is seen at distance 1; the median."""
+    return float(np.median([0.5 * view.width / view.fx for view in views]))
+
+
+def focus_of(views: Sequence[Viewpoint]) -> tuple[np.ndarray, float]:
+    """What the cameras look at: (3,) the point nearest to all optical axes, and the distance.
+
+    Minimises sum_i |(I - d_i d_i^T)(p - c_i)|^2 over p, with c_i the centres and d_i the axes;
+    the distance is the median of |p - c_i|.
+
+    Raises :class:`UserError` where the axes do not determine it or diverge.
+    """
+    centers = np.stack([view.center for view in views])
+    axes = np.stack([view.camera_to_world[:3, 2] for view in views])
+    projectors = np.eye(3) - axes[:, :, None] * axes[:, None, :]
+    normal = projectors.mean(axis=0)
+    remedy = "set init.half_extent, or give a point cloud (init.point_cloud)"
+    if np.linalg.eigvalsh(normal)[0] < PARALLEL_AXES:
+        raise UserError(
+            "init.half_extent: no start box can be derived from the cameras, whose optical axes "
+            f"are parallel; {remedy}"
+        )
+    focus = np.linalg.solve(normal, np.einsum("nij,nj->i", projectors, centers) / len(views))
+    depths = np.einsum("ni,ni->n", focus - centers, axes)
+    if np.median(depths) <= 1e-6 * np.abs(centers - focus).max():
+        raise UserError(
+            "init.half_extent: no start box can be derived from the cameras, which look away from "
+            f"each other; {remedy}"
+        )
+    return focus, float(np.median(np.linalg.norm(focus - centers, axis=1)))
+
+
+def points_in_view(views: Sequence[Viewpoint], count: int, rng: np.random.Generator) -> np.ndarray:
+    """(count, 3) float64: uniform in what is seen of a cube around the cameras' focus.
+
+    The cube's half extent is the distance D to the focus: it holds what is looked at and as much
+    again behind it. Points that no camera sees would never be moved or removed, and one close to
+    a camera covers its picture, so only points are kept that lie in a picture and nowhere nearer
+    than D / 4 to a camera.
+    """
+    focus, distance = focus_of(views)
+    kept = np.empty((0, 3))
+    for _ in range(MAX_BATCHES):
+        points = rng.uniform(focus - distance, focus + distance, (count, 3))
+        seen = in_view(points, views) & _clear_of(points, views, KEEP_OUT * distance)
+        kept = np.concatenate([kept, points[seen]])
+        if len(kept) >= count:
+            return kept[:count]
+    raise UserError(
+        "init.half_extent: no start box can be derived from the cameras, which see too little of "
+        f"what is around {np.round(focus, 3).tolist()}; set it, or give init.point_cloud"
+    )
+
+
+def in_view(points: np.ndarray, views: Sequence[Viewpoint]) -> np.ndarray:
+    """(N,) bool: which of the points (N, 3) are inside at least one picture."""
+    seen = np.zeros(len(points), bool)
+    for view in views:
+        x, y, z = ((points - view.center) @ view.camera_to_world[:3, :3]).T
+        # In pixels times z, so that nothing is divided by a depth near zero.
+        u, v = view.fx * x + view.cx * z, view.fy * y + view.cy * z
+        seen |= (z > 0) & (u >= 0) & (u <= view.width * z) & (v >= 0) & (v <= view.height * z)
+    return seen
+
+
+def _clear_of(points: np.ndarray, views: Sequence[Viewpoint], keep_out: float) -> np.ndarray:
+    """(N,) bool: which are at least ``keep_out`` from every camera."""
+    clear = np.ones(len(points), bool)
+    for view in views:
+        offsets = points - view.center
+        clear &= np.einsum("ni,ni->n", offsets, offsets) >= keep_out**2
+    return clear
+
+
+# Boxes that a configuration gives
+
+
+def check_box(box: Box, views: Sequence[Viewpoint]) -> None:
+    """Raise :class:`UserError` for a box that most cameras do not look into, or hardly see."""
+    covered = np.array([_covered(box, view) for view in views])
+    looking = int(np.count_nonzero(covered))
+    if looking < LEAST_LOOKING * len(views):
+        what = f"only {looking} of {len(views)} cameras look into it"
+    elif np.median(covered) < LEAST_COVERED:
+        what = f"it covers only {100 * np.median(covered):.2g} % of a picture (the median)"
+    else:
+        return
+    raise UserError(
+        f"init.half_extent: the start box {box} must be what the cameras look at, but {what}"
+        f"{_where_they_look(views)}; set init.half_extent=null, and it follows from the cameras"
+    )
+
+
+def _covered(box: Box, view: Viewpoint) -> float:
+    """Which part of a picture shows the box, by rays through it; lenses are taken for pinholes."""
+    u, v = np.meshgrid(
+        *((np.arange(RAYS) + 0.5) / RAYS * size for size in (view.width, view.height))
+    )
+    rays = np.stack([(u - view.cx) / view.fx, (v - view.cy) / view.fy, np.ones_like(u)], axis=-1)
+    # A zero component, of a ray along a face's plane, meets that face nowhere: at infinity.
+    with np.errstate(divide="ignore", invalid="ignore"):
+        directions = rays.reshape(-1, 3) @ view.camera_to_world[:3, :3].T
+        low, high = (
+            (box.center + sign * box.half_extent - view.center) / directions for sign in (-1, 1)
+        )
+        first = np.nanmax(np.minimum(low, high), axis=1)
+        last = np.nanmin(np.maximum(low, high), axis=1)
+    by_rays = float(np.mean((last > 0) & (first <= last)))
+    # One that is smaller than what lies between two rays.
+    return max(by_rays, 0.5 / RAYS**2 if in_view(box.center[None], [view])[0] else 0.0)
+
+
+def _where_they_look(views: Sequence[Viewpoint]) -> str:
+    """At the end of a message."""
+    try:
+        focus, distance = focus_of(views)
+    except UserError:
+        return ""
+    return f"; they look at {shown(focus)} from a distance of {distance:.3g}"
+
+
+def shown(vector: np.ndarray) -> str:
+    """A point as messages write it."""
+    rounded = np.where(np.abs(vector) < 1e-6 * np.abs(vector).max(), 0, vector)
+    return f"({', '.join(f'{v:.3g}' for v in rounded)})"

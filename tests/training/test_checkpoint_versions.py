@@ -1,0 +1,65 @@
+"""Checkpoints of versions whose configuration had fewer values, or left fewer to the data."""
+
+import json
+
+import numpy as np
+import pytest
+
+from drgs.config.changes import changed
+from drgs.config.schema import FitConfig
+from drgs.core.errors import UserError
+from drgs.training.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
+
+DECIDED = {"init.half_extent": 1.3, "data.background": "white", "model.near": 0.2}
+
+
+@pytest.fixture
+def folder(tmp_path):
+    (tmp_path / "out").mkdir()
+    return tmp_path / "out"
+
+
+@pytest.fixture
+def config(tmp_path):
+    return changed(FitConfig(data={"path": tmp_path}, iterations=7000), DECIDED)
+
+
+def saved_as(folder, config, change):
+    """The checkpoint of ``config``, whose words about it are changed."""
+    save_checkpoint(folder, config, Checkpoint({"iteration": np.array(3)}, np.zeros((0, 5)), 1.0))
+    with np.load(folder / "checkpoint.npz") as file:
+        arrays = dict(file)
+    values = json.loads(str(arrays["config"]))
+    change(values)
+    arrays["config"] = np.array(json.dumps(values, sort_keys=True))
+    np.savez(folder / "checkpoint.npz", **arrays)
+
+
+def without_what_is_new(values):
+    del values["data"]["ignore_points"]
+    values["init"]["half_extent"] = None
+
+
+def test_a_checkpoint_of_an_earlier_version_goes_on(folder, config):
+    saved_as(folder, config, without_what_is_new)
+    assert int(load_checkpoint(folder, config).trainer["iteration"]) == 3
+
+
+@pytest.mark.parametrize(
+    ("section", "key", "value"),
+    [("model", "near", 0.1), ("data", "background", "black"), ("densify", "stop", 15_000)],
+)
+def test_one_of_other_values_does_not(folder, config, section, key, value):
+    def change(values):
+        without_what_is_new(values)
+        values[section][key] = value
+
+    saved_as(folder, config, change)
+    with pytest.raises(UserError, match="belongs to another configuration"):
+        load_checkpoint(folder, config)
+
+
+def test_words_that_are_no_configuration_are_another_one(folder, config):
+    saved_as(folder, config, lambda values: values.update(data=3))
+    with pytest.raises(UserError, match="belongs to another configuration"):
+        load_checkpoint(folder, config)
