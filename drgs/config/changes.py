@@ -59,9 +59,6 @@ def with_iterations(config: FitConfig, iterations: int) -> FitConfig:
 OPEN = ("data.background", "model.near")
 """Values that are null until the dataset has decided: see ``drgs.data.derived``."""
 
-LEFT_TO_THE_DATASET = (*OPEN, "init.half_extent")
-"""The same, and one that may stay null: not every start box is around the world's origin."""
-
 
 def is_open(config: FitConfig) -> bool:
     """Whether the dataset has not decided yet."""
@@ -70,9 +67,7 @@ def is_open(config: FitConfig) -> bool:
 
 def decided_as(config: FitConfig, other: FitConfig) -> FitConfig:
     """``config``, with those values that it leaves to the dataset as ``other`` has them."""
-    changes = {
-        key: _value(other, key) for key in LEFT_TO_THE_DATASET if _value(config, key) is None
-    }
+    changes = {key: _value(other, key) for key in OPEN if _value(config, key) is None}
     return changed(config, changes)
 
 

@@ -18,7 +18,7 @@ FARTHEST_NEAR = 0.5
 
 
 def completed(config: FitConfig, dataset: Dataset) -> FitConfig:
-    """``config`` with the background, start box and near plane that follow from ``dataset``.
+    """``config`` with the background and the near plane that follow from ``dataset``.
 
     Those that are given stay. Raises :class:`UserError` for a near plane behind which there is
     nothing left to look at.
@@ -28,18 +28,11 @@ def completed(config: FitConfig, dataset: Dataset) -> FitConfig:
         names = {color: name for name, color in NAMED_COLORS.items()}
         background = tuple(dataset.background)
         changes["data.background"] = names.get(background, background)
-    if config.init.half_extent is None and _starts_in_reference_box(config, dataset):
-        changes["init.half_extent"] = dataset.start_half_extent
     if config.model.near is None:
         changes["model.near"] = _near_plane(dataset)
     else:
         _check_near_plane(config.model.near, dataset)
     return changed(config, changes) if changes else config
-
-
-def _starts_in_reference_box(config: FitConfig, dataset: Dataset) -> bool:
-    """Whether nothing but the layout says where the Gaussians are at iteration 0."""
-    return point_cloud_of(config.init, dataset) is None and is_of_the_reference(dataset)
 
 
 def description_of_start(config: FitConfig, dataset: Dataset) -> str:

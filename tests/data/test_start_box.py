@@ -158,7 +158,7 @@ def test_what_is_decided_is_written_down():
     """So that it is the same when the configuration of a fit is used again."""
     dataset = dataset_of(views_from(AROUND), 1.3)
     decided = completed(config(), dataset)
-    assert (decided.init.half_extent, decided.data.background) == (1.3, "white")
+    assert (decided.model.near, decided.data.background) == (0.2, "white")
     assert completed(decided, dataset) == decided
 
 

@@ -10,7 +10,7 @@ from drgs.config.schema import FitConfig
 from drgs.core.errors import UserError
 from drgs.training.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 
-DECIDED = {"init.half_extent": 1.3, "data.background": "white", "model.near": 0.2}
+DECIDED = {"data.background": "white", "model.near": 0.2}
 
 
 @pytest.fixture
@@ -29,6 +29,7 @@ def saved_as(folder, config, change):
     save_checkpoint(folder, config, Checkpoint({"iteration": np.array(3)}, np.zeros((0, 5)), 1.0))
     with np.load(folder / "checkpoint.npz") as file:
         arrays = dict(file)
+    del arrays["config_before"]  # which no earlier version wrote
     values = json.loads(str(arrays["config"]))
     change(values)
     arrays["config"] = np.array(json.dumps(values, sort_keys=True))
@@ -37,7 +38,6 @@ def saved_as(folder, config, change):
 
 def without_what_is_new(values):
     del values["data"]["ignore_points"]
-    values["init"]["half_extent"] = None
 
 
 def test_a_checkpoint_of_an_earlier_version_goes_on(folder, config):
@@ -55,11 +55,5 @@ def test_one_of_other_values_does_not(folder, config, section, key, value):
         values[section][key] = value
 
     saved_as(folder, config, change)
-    with pytest.raises(UserError, match="belongs to another configuration"):
-        load_checkpoint(folder, config)
-
-
-def test_words_that_are_no_configuration_are_another_one(folder, config):
-    saved_as(folder, config, lambda values: values.update(data=3))
     with pytest.raises(UserError, match="belongs to another configuration"):
         load_checkpoint(folder, config)
