@@ -13,6 +13,9 @@ NEAR_SHARE = 0.05
 """Of the cameras' distance to what they look at: the reference's near plane of 0.2 is that for
 NeRF-synthetic scenes, whose distance is 4.03."""
 
+LEAST_NEAR = 1e-9
+"""What a configuration accepts."""
+
 FARTHEST_NEAR = 0.5
 """Of that distance: a near plane beyond it would cut into what is looked at."""
 
@@ -54,7 +57,7 @@ def description_of_start(config: FitConfig, dataset: Dataset) -> str:
 def _near_plane(dataset: Dataset) -> float:
     if not dataset.train or is_of_the_reference(dataset):
         return REFERENCE_NEAR
-    return float(f"{NEAR_SHARE * _viewing_distance(dataset):.3g}")
+    return float(f"{max(NEAR_SHARE * _viewing_distance(dataset), LEAST_NEAR):.3g}")
 
 
 def _check_near_plane(near: float, dataset: Dataset) -> None:

@@ -9,6 +9,7 @@ from drgs.config.changes import changed
 from drgs.config.schema import FitConfig
 from drgs.core.errors import UserError
 from drgs.training.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
+from drgs.training.history import History
 
 DECIDED = {"data.background": "white", "model.near": 0.2}
 
@@ -26,7 +27,9 @@ def config(tmp_path):
 
 def saved_as(folder, config, change):
     """The checkpoint of ``config``, whose words about it are changed."""
-    save_checkpoint(folder, config, Checkpoint({"iteration": np.array(3)}, np.zeros((0, 5)), 1.0))
+    save_checkpoint(
+        folder, config, Checkpoint({"iteration": np.array(3)}, History().as_array(), 0.0)
+    )
     with np.load(folder / "checkpoint.npz") as file:
         arrays = dict(file)
     del arrays["config_before"]  # which no earlier version wrote
