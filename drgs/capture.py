@@ -56,6 +56,7 @@ from drgs.cli.interrupts import INTERRUPTED_STATUS
 from drgs.cli.progress import RunProgress
 from drgs.core.errors import UserError, one_line
 from drgs.core.files import atomic_path, read_text, remove_stale_temporaries, why_refused
+from drgs.core.memory import why_too_large
 from drgs.data.path_tracing import (
     LIMITS,
     SPLITS,
@@ -181,6 +182,8 @@ def run(args: argparse.Namespace) -> None:
     try:
         given = _given(args)
         settings = CaptureSettings(**given)
+        if reason := why_too_large(*settings.size):
+            raise UserError(f"--size: {reason}")
         if not args.scene.is_file():
             raise UserError(f"{args.scene}: there is no such scene file")
         select_variant(args.variant)
@@ -220,7 +223,9 @@ def _wide_degrees(text: str) -> float:
 
 def refuse_splats(path: Path, scene: mi.Scene) -> None:
     """Raise :class:`UserError` for a scene whose pictures by path tracing would lack its splats."""
-    if isinstance(scene.integrator(), SummarisingIntegrator):
+    integrator = scene.integrator()
+    nested = [] if integrator is None else mi.traverse(integrator).hierarchy  # itself included
+    if any(isinstance(one, SummarisingIntegrator) for one in nested):
         found = "its integrator is splats"
     elif any("Ellipsoids" in shape.class_name() for shape in scene.shapes()):
         found = "it has shapes of type ellipsoids"

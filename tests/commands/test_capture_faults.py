@@ -10,7 +10,7 @@ import pytest
 from support.commands import run_in_process
 
 from drgs import capture
-from drgs.core import files
+from drgs.core import files, memory
 
 BALL = """
 <scene version="3.0.0">
@@ -137,6 +137,15 @@ def test_what_cannot_be_held_is_refused_with_the_limit(ball, tmp_path, options, 
     line = refused(run(ball, tmp_path / "out", *options))
     assert message in line
     assert len(line) < 300
+    assert not (tmp_path / "out").exists()
+
+
+def test_pictures_that_the_memory_does_not_hold_are_refused_with_its_size(
+    ball, tmp_path, monkeypatch
+):
+    monkeypatch.setattr(memory, "available_memory", lambda: 2 * 10**9)
+    line = refused(run(ball, tmp_path / "out", "--size", 4000, 4000))
+    assert "--size: 4000 x 4000 px need about 4 GB of memory, of which 2 GB are available" in line
     assert not (tmp_path / "out").exists()
 
 

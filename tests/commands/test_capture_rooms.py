@@ -134,8 +134,14 @@ def test_the_scenes_own_sensors_are_used_where_asked_for(cornell, tmp_path):
     assert "--set data.test_split=train" in outcome.stdout.splitlines()[-1]
 
 
-def test_splats_are_not_left_out_silently(tmp_path):
-    line = refusal(write_scene(tmp_path), tmp_path / "out")
+@pytest.mark.parametrize("nested", [False, True])
+def test_splats_are_not_left_out_silently(tmp_path, nested):
+    path = write_scene(tmp_path)
+    if nested:
+        text = path.read_text().replace("</integrator>", "</integrator></integrator>")
+        aov = '<integrator type="aov"><string name="aovs" value="n:sh_normal"/><integrator '
+        path.write_text(text.replace("<integrator ", aov, 1))
+    line = refusal(path, tmp_path / "out")
     assert "blobs.xml: the scene holds splats (its integrator is splats)" in line
     assert "python -m drgs.render" in line
 
