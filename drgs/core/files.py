@@ -57,12 +57,13 @@ _SPECIAL = {"p": "a named pipe", "c": "a device", "b": "a device", "s": "a socke
 """What is no regular file, by the first letter of ``ls -l``."""
 
 
-def open_regular(path: str | Path, what: str = "file") -> IO[bytes]:
+def open_regular(path: str | Path, what: str = "file", max_bytes: int | None = None) -> IO[bytes]:
     """A regular file, open for reading; ``what`` it should be stands in the errors.
 
     A pipe would wait for a writer for ever, and a device need not end: neither is read.
 
-    Raises :class:`UserError` where it cannot be opened, or is something else.
+    Raises :class:`UserError` where it cannot be opened, is something else, or has more than
+    ``max_bytes``.
     """
     try:
         file = open(path, "rb", opener=_open_without_waiting)  # noqa: SIM115  (the caller closes it)
@@ -70,7 +71,11 @@ def open_regular(path: str | Path, what: str = "file") -> IO[bytes]:
         raise UserError(f"{path}: cannot read the {what}: {error.strerror or error}") from None
     except ValueError as error:  # a name with a zero byte
         raise UserError(f"{one_line(repr(path))}: cannot read the {what}: {error}") from None
-    mode = os.fstat(file.fileno()).st_mode
+    status = os.fstat(file.fileno())
+    mode, size = status.st_mode, status.st_size
+    if stat.S_ISREG(mode) and max_bytes is not None and size > max_bytes:
+        file.close()
+        raise UserError(f"{path}: cannot read the {what}: more than {max_bytes:,} bytes")
     if not stat.S_ISREG(mode):
         file.close()
         kind = _SPECIAL.get(stat.filemode(mode)[0], "something else")

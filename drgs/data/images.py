@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import zipfile
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -13,7 +12,7 @@ from drgs.core.errors import UserError, one_line
 from drgs.core.files import open_regular
 from drgs.data.kept import KeptPicture, Pixels
 from drgs.data.types import View
-from drgs.io.pictures import BITS, as_numbers, image_mode, read_image
+from drgs.io.pictures import BITS, MAX_BYTES, as_numbers, image_mode, image_size, read_image
 
 MAX_DEPTH_STEPS = 2**16 - 1
 """White in a picture of 16 bits."""
@@ -24,8 +23,8 @@ ALL = 1 - 1e-4
 
 def read_mask(path: Path, size: tuple[int, int]) -> np.ndarray:
     """(H, W) float32: 1 where the picture is brighter than half, 0 elsewhere; size: W, H."""
+    _check_size(path, image_size(path), size)  # before memory is taken for it
     image = read_image(path)
-    _check_size(path, image, size)
     return (image[:, :, 0] > 0.5).astype(np.float32)
 
 
@@ -37,7 +36,7 @@ def read_depth(path: Path, unit: float, size: tuple[int, int]) -> np.ndarray:
     """
     if path.suffix == ".npy":
         depth = _stored_depth(path)
-        _check_size(path, depth, size)  # before memory is taken for it
+        _check_size(path, depth.shape[::-1], size)  # before memory is taken for it
         with np.errstate(over="ignore"):  # becomes infinite, and so is not known
             depth = (depth.astype(np.float64) * unit).astype(np.float32)
     else:
@@ -47,19 +46,20 @@ def read_depth(path: Path, unit: float, size: tuple[int, int]) -> np.ndarray:
                 f"{path}: must be a grey picture of 16 bits or an .npy file, got one of Pillow's "
                 f"mode {mode}; convert it"
             )
+        _check_size(path, image_size(path), size)
         depth = read_image(path)[:, :, 0] * np.float32(MAX_DEPTH_STEPS * unit)
-    _check_size(path, depth, size)
     return np.where(np.isfinite(depth) & (depth > 0), depth, 0).astype(np.float32)
 
 
 def _stored_depth(path: Path) -> np.ndarray:
     """(H, W) of an ``.npy`` file, mapped into memory."""
-    open_regular(path, "depth").close()
+    open_regular(path, "depth", MAX_BYTES).close()
     try:
         with np.errstate(over="ignore"):  # of the size that a header claims
             depth = np.load(path, mmap_mode="r", allow_pickle=False)
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
-        raise UserError(f"{path}: cannot read the depth: {one_line(error)}") from None
+    except Exception as error:  # numpy raises many types for a broken header
+        reason = one_line(error) or type(error).__name__
+        raise UserError(f"{path}: cannot read the depth: {reason}") from None
     if not isinstance(depth, np.ndarray) or depth.dtype.kind not in "fiu":
         kind = depth.dtype if isinstance(depth, np.ndarray) else "several arrays"
         raise UserError(f"{path}: depth must be one array of real numbers, got {one_line(kind)}")
@@ -69,12 +69,11 @@ def _stored_depth(path: Path) -> np.ndarray:
     return depth
 
 
-def _check_size(path: Path, image: np.ndarray, size: tuple[int, int]) -> None:
-    height, width = image.shape[:2]
-    if (width, height) != size:
+def _check_size(path: Path, got: tuple[int, int], size: tuple[int, int]) -> None:
+    if got != size:
         raise UserError(
-            f"{path}: must be {size[0]} x {size[1]} px, as the photograph is, got {width} x "
-            f"{height}; resize it, or leave it out of the frame"
+            f"{path}: must be {size[0]} x {size[1]} px, as the photograph is, got {got[0]} x "
+            f"{got[1]}; resize it, or leave it out of the frame"
         )
 
 

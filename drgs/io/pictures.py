@@ -25,6 +25,9 @@ if TYPE_CHECKING:
 MAX_PIXELS = 1 << 26
 """67 million, as 8192 x 8192: 0.8 GB once decoded to float32."""
 
+MAX_BYTES = 1 << 30
+"""Of a file: twice what so many pixels of 64 bits take when they are not compressed."""
+
 BITS = {"L": 8, "LA": 8, "RGB": 8, "RGBA": 8, "I;16": 16, "I;16B": 16, "I": 16}
 """Of a channel, by those of Pillow's modes that are read. ``I`` holds 32, but is what some versions
 of Pillow make of a grey PNG of 16."""
@@ -172,7 +175,7 @@ def read_pixels(path: Path) -> np.ndarray:
 def _opened(path: Path) -> Iterator[Image.Image]:
     """The image before decoding; errors of the file, also within the block, are the user's."""
     try:
-        with open_regular(path, "image") as file, Image.open(file) as image:
+        with open_regular(path, "image", MAX_BYTES) as file, Image.open(file) as image:
             yield image
     except UserError:
         raise
