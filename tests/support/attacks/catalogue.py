@@ -1,0 +1,54 @@
+"""All attacks, by family and by name."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+
+import numpy as np
+
+from support.attacks.attack import Attack
+from support.attacks.faults import fault_attacks
+from support.attacks.files import damage_attacks, other_file_attacks, special_attacks
+from support.attacks.options import combination_attacks, folder_attacks, name_attacks
+from support.attacks.values import option_attacks, schema_attacks
+from support.attacks.workshop import Workshop
+
+DAMAGED = 40
+"""Of each kind, for each file."""
+
+FAMILIES: dict[str, Callable[[Workshop], Iterable[Attack]]] = {
+    "schema": lambda workshop: schema_attacks(),
+    "option": lambda workshop: option_attacks(),
+    "instead": lambda workshop: other_file_attacks(),
+    "damaged": lambda workshop: damage_attacks(DAMAGED),
+    "special": lambda workshop: special_attacks(),
+    "together": lambda workshop: combination_attacks(),
+    "folder": lambda workshop: folder_attacks(),
+    "name": lambda workshop: name_attacks(),
+    "fault": fault_attacks,
+}
+"""By the first part of an attack's name."""
+
+
+KNOWN_FAILURES: dict[str, str] = {}
+"""By name of an attack that does what it must not: why, until it is mended. A test fails when one
+of them does so no more."""
+
+
+def attacks(family: str, workshop: Workshop) -> list[Attack]:
+    """All of a family."""
+    found = list(FAMILIES[family](workshop))
+    names = [attack.name for attack in found]
+    assert len(set(names)) == len(names), family
+    return found
+
+
+def some(found: list[Attack], count: int, seed: int = 0) -> list[Attack]:
+    """``count`` of them, by a seed, in their order."""
+    chosen = np.random.default_rng(seed).permutation(len(found))[:count]
+    return [found[index] for index in sorted(chosen)]
+
+
+def find(name: str, workshop: Workshop) -> Attack:
+    """The attack of that name."""
+    return next(a for a in attacks(name.partition("/")[0], workshop) if a.name == name)

@@ -1,0 +1,123 @@
+"""Sees every change that Python makes to files, and lets one of them fail.
+
+Python announces whatever it is about to do to the file system to audit hooks, which may raise
+instead. A hook stays until the process ends: there is one, which does nothing between trials.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+import signal
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+
+CHANGES = {
+    "open": 0,
+    "os.rename": 1,
+    "os.remove": 0,
+    "os.mkdir": 0,
+    "os.rmdir": 0,
+    "os.truncate": 0,
+    "os.link": 1,
+    "os.symlink": 1,
+    "os.chmod": 0,
+    "os.chown": 0,
+}
+"""Events that change files, and which of their arguments is the path."""
+
+WRITING = os.O_WRONLY | os.O_RDWR | os.O_CREAT | os.O_TRUNC
+
+KINDS = ("full", "denied", "kill", "interrupt")
+"""Of faults: no space is left; nothing may be removed or replaced any more; SIGKILL; Ctrl-C."""
+
+
+class Killed(BaseException):
+    """What stands for SIGKILL: from here on nothing that the program does has an effect."""
+
+
+@dataclass(frozen=True)
+class Fault:
+    """Strikes at change number ``at`` of the workshop's files, counted from 0."""
+
+    kind: str  # one of KINDS
+    at: int
+
+    def strike(self, number: int, event: str, path: str) -> None:
+        """Called before each change; path: within the workshop."""
+        if number < self.at:
+            return
+        if self.kind == "kill":
+            raise Killed
+        if self.kind == "interrupt" and number == self.at:
+            signal.raise_signal(signal.SIGINT)
+        if self.kind == "full" and event in ("open", "os.mkdir", "os.rename"):
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        if self.kind == "denied" and event in ("os.remove", "os.rename", "os.rmdir"):
+            raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
+
+
+@dataclass
+class Changes:
+    """What a trial did to files, in its order."""
+
+    folder: Path  # of the workshop
+    fault: Fault | None = None
+    inside: list[tuple[str, str]] = field(default_factory=list)  # (event, path in the folder)
+    outside: list[str] = field(default_factory=list)  # paths
+
+    @property
+    def struck(self) -> bool:
+        """Whether the fault happened."""
+        return self.fault is not None and len(self.inside) > self.fault.at
+
+    def add(self, event: str, path: str) -> None:
+        """Note one; may raise what the fault raises."""
+        if not f"{path}{os.sep}".startswith(f"{self.folder}{os.sep}"):
+            self.outside.append(path)
+            return
+        number, path = len(self.inside), os.path.relpath(path, self.folder)
+        self.inside.append((event, path))
+        if self.fault is not None:
+            self.fault.strike(number, event, path)
+
+
+_observing: list[Changes] = []
+"""At most one; a list, because a hook cannot be told anything else."""
+
+
+def _hook(event: str, arguments: tuple) -> None:
+    if not _observing or event not in CHANGES:
+        return
+    path = arguments[CHANGES[event]]
+    if not isinstance(path, (str, bytes, os.PathLike)):
+        return  # a file that is open already
+    if event == "open" and not _writes(*arguments[1:3]):
+        return
+    _observing[0].add(event, os.path.abspath(os.fsdecode(path)))
+
+
+def _writes(mode: str | None, flags: int) -> bool:
+    if mode is not None:
+        return any(letter in mode for letter in "wax+")
+    return bool(flags & WRITING)
+
+
+@contextmanager
+def observed(folder: Path, fault: Fault | None = None) -> Iterator[Changes]:
+    """Within the block, changes are noted, and the fault strikes."""
+    if not _installed:
+        _installed.append(True)
+        sys.addaudithook(_hook)
+    changes = Changes(folder, fault)
+    _observing.append(changes)
+    try:
+        yield changes
+    finally:
+        _observing.clear()
+
+
+_installed: list[bool] = []

@@ -1,0 +1,305 @@
+"""One attack, run in this process, and what it did that no command may do."""
+
+from __future__ import annotations
+
+import os
+import re
+import resource
+import signal
+import sys
+import time
+import traceback
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
+from dataclasses import dataclass, field
+from importlib import import_module
+from pathlib import Path
+from tempfile import TemporaryFile
+
+from support.attacks.attack import Attack
+from support.attacks.observer import Changes, Killed, observed
+from support.attacks.workshop import Workshop, contents, sketched_results, standing_in
+
+KILLED = 137
+INTERRUPTED = 130
+
+CACHES = re.compile(r"/(\.drjit|\.cache|__pycache__|\.nv)/|^/dev/(null|tty)$|^/proc/self/")
+"""Paths outside the workshop that may be written: of libraries, and of these trials."""
+
+TEMPORARY = re.compile(r"\.[^/]*\.\d+\.tmp(\.[^/]*)?$")
+
+MOST_LINE = 2000
+"""Characters in a refusal."""
+
+ADDRESS_SPACE = 4 << 30
+"""Bytes by which it may grow: threads and compilers reserve much more than they use."""
+
+
+MAY_CHANGE = {
+    "fit": {"out", "stopped", "run"},
+    "render": {"out"},
+    "capture": {"out", "captured"},
+}
+"""By command, folders in which files that were there before may be its own."""
+
+
+class TooLong(BaseException):
+    """The trial's time is up."""
+
+
+@dataclass
+class Outcome:
+    """What a process would leave."""
+
+    status: int | None = None  # None: another exception ended it
+    out: str = ""
+    err: str = ""
+    seconds: float = 0.0
+    megabytes: float = 0.0  # by which memory grew at its peak
+    changes: Changes = field(default_factory=lambda: Changes(Path()))
+
+
+def trial(attack: Attack, workshop: Workshop) -> list[str]:
+    """Run an attack and put the workshop back; what is wrong, in a line each."""
+    try:
+        with standing_in(workshop.folder):
+            attack.change(workshop.folder)
+            before = contents(workshop.folder)
+            outcome = run(attack, attack.words)
+            wrong = [*faults_of(attack, outcome), *damage(attack, outcome, before, workshop)]
+            if attack.again and outcome.status != 0:
+                wrong += recovery(attack, workshop)
+        return wrong
+    finally:
+        workshop.put_back()
+
+
+def run(attack: Attack, words: tuple[str, ...], with_fault: bool = True) -> Outcome:
+    """Call the command as its process would be; in the current folder."""
+    main = import_module(f"drgs.{attack.command}").main
+    outcome, fault = Outcome(), attack.fault if with_fault else None
+    drawings = nullcontext() if attack.draws else sketched_results()
+    with (
+        drawings,
+        _captured(attack.encoding, outcome),
+        _measured(outcome, attack.seconds),
+        observed(Path.cwd(), fault) as outcome.changes,
+    ):
+        try:
+            main(list(words))
+            outcome.status = 0
+        except SystemExit as end:
+            outcome.status = end.code if isinstance(end.code, int) else 0 if not end.code else 1
+        except Killed:
+            outcome.status = KILLED
+        except TooLong:
+            print(f"did not end within {attack.seconds:g} s", file=sys.stderr)
+            traceback.print_exc()
+        except BaseException:  # as Python itself ends a process
+            traceback.print_exc()
+    return outcome
+
+
+# ----------------------------------------------------------------------------------------------
+# What is wrong
+# ----------------------------------------------------------------------------------------------
+
+
+def faults_of(attack: Attack, outcome: Outcome) -> list[str]:
+    """What is wrong with how it ended, and with what it said."""
+    wrong = []
+    expected = {0, 2}
+    if attack.fault is not None:
+        own = {"kill": KILLED, "interrupt": INTERRUPTED}.get(attack.fault.kind, 2)
+        expected = {0, own}
+    if outcome.status not in expected:
+        reached = "an exception" if outcome.status is None else f"status {outcome.status}"
+        wrong.append(f"ended with {reached}: {_last_lines(outcome.err)}")
+        return wrong
+    if attack.must_refuse and outcome.status == 0:
+        wrong.append("was not refused")
+    if outcome.status == 2:
+        wrong += _wrong_refusal(attack, outcome.err)
+    elif "Traceback" in outcome.err or "Warning" in outcome.err:
+        wrong.append(f"standard error: {_last_lines(outcome.err)}")
+    if outcome.megabytes > attack.megabytes:
+        wrong.append(f"took {outcome.megabytes:.0f} MB more")
+    tried = f"{os.path.normpath(attack.out)}/"  # a device, of which no folder can be made
+    outside = [
+        path
+        for path in outcome.changes.outside
+        if not CACHES.search(path) and not f"{path}/".startswith(tried)
+    ]
+    if outside:
+        wrong.append(f"wrote outside: {outside[:3]}")
+    return wrong
+
+
+def _wrong_refusal(attack: Attack, err: str) -> list[str]:
+    wrong = []
+    lines = err.splitlines()
+    if len(lines) != 1:
+        wrong.append(f"a refusal of {len(lines)} lines: {_last_lines(err)}")
+    elif "error: " not in lines[0]:
+        wrong.append(f"a refusal that is none: {lines[0]}")
+    if max(map(len, lines), default=0) > MOST_LINE:
+        wrong.append(f"a line of {max(map(len, lines))} characters")
+    if attack.named and attack.named not in err:
+        wrong.append(f"does not name {attack.named}: {_last_lines(err)}")
+    return wrong
+
+
+def damage(
+    attack: Attack, outcome: Outcome, before: dict[str, str], workshop: Workshop
+) -> list[str]:
+    """What is wrong with the files that it left."""
+    after, wrong = contents(workshop.folder), []
+    own = os.path.normpath(attack.out) if "\0" not in attack.out else ""
+
+    def is_own(path: str) -> bool:
+        return own == "." or path == own or path.startswith(f"{own}/")
+
+    # A refusal in the midst of a fit leaves what --resume needs, and says so.
+    kept = outcome.status != 2 or "--resume" in outcome.err or attack.fault is not None
+    may_change = kept and own in MAY_CHANGE[attack.command]
+    for path, what in before.items():
+        is_users = path in attack.theirs or not is_own(path)
+        if after.get(path) != what and (is_users or not may_change):
+            wrong.append(f"{'changed' if path in after else 'removed'} {path}")
+    for path in after.keys() - before.keys():
+        if TEMPORARY.search(path):
+            if not _cannot_tidy(attack):
+                wrong.append(f"left {path}")
+        elif not (kept and is_own(path)):
+            wrong.append(f"made {path}")
+    return sorted(wrong)
+
+
+def _cannot_tidy(attack: Attack) -> bool:
+    """Whether its fault leaves no chance to remove what is temporary."""
+    return attack.fault is not None and attack.fault.kind in ("kill", "denied")
+
+
+def recovery(attack: Attack, workshop: Workshop) -> list[str]:
+    """What is wrong after the command was run again, as its user would."""
+    outcome = run(attack, attack.again, with_fault=False)
+    if outcome.status != 0:
+        return [f"again: ended with {outcome.status}: {_last_lines(outcome.err)}"]
+    found = contents(workshop.folder / attack.out)
+    wrong = [f"again: left {path}" for path in found if TEMPORARY.search(path)]
+    expected = undisturbed(attack, workshop)
+    wrong += [f"again: {n} is missing" for n in expected.keys() - found.keys()]
+    wrong += [f"again: {n} is too much" for n in found.keys() - expected.keys()]
+    return wrong + [
+        f"again: {name} has other bytes"
+        for name in attack.results
+        if name in found and found[name] != expected.get(name)
+    ]
+
+
+_undisturbed: dict[tuple, dict[str, str]] = {}
+
+
+def undisturbed(attack: Attack, workshop: Workshop) -> dict[str, str]:
+    """What the command leaves in its folder when nothing happens; puts the workshop back."""
+    key = str(workshop.folder), attack.command, attack.words
+    if key not in _undisturbed:
+        workshop.put_back()
+        attack.change(workshop.folder)
+        outcome = run(attack, attack.words, with_fault=False)
+        assert outcome.status == 0, outcome.err
+        _undisturbed[key] = contents(workshop.folder / attack.out)
+    return _undisturbed[key]
+
+
+def _last_lines(text: str) -> str:
+    lines = [line.strip() for line in text.strip().splitlines() if line.strip(" ^~")]
+    if any("Traceback" in line for line in lines):
+        places = [line for line in lines if line.startswith("File ") and "/drgs/" in line]
+        lines = [*(_place(line) for line in places[-1:]), lines[-1]]
+    return " | ".join(line[:400] for line in lines[-3:])
+
+
+def _place(line: str) -> str:
+    return re.sub(r'File ".*/(drgs/[^"]*)", line (\d+), in (\w+)', r"\1:\2 \3", line)
+
+
+# ----------------------------------------------------------------------------------------------
+# Around a command
+# ----------------------------------------------------------------------------------------------
+
+
+@contextmanager
+def _captured(encoding: str, outcome: Outcome) -> Iterator[None]:
+    """Both standard streams as they are when they are files, also what libraries write to them."""
+    with TemporaryFile() as out, TemporaryFile() as err:
+        kept = {1: os.dup(1), 2: os.dup(2)}
+        streams, showwarning = (sys.stdout, sys.stderr), warnings.showwarning
+        for stream in streams:
+            stream.flush()
+        os.dup2(out.fileno(), 1)
+        os.dup2(err.fileno(), 2)
+        sys.stdout = open(1, "w", encoding=encoding, errors="strict", closefd=False)  # noqa: SIM115
+        sys.stderr = open(  # noqa: SIM115
+            2, "w", encoding=encoding, errors="backslashreplace", closefd=False, buffering=1
+        )
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("always")
+                for kind in (DeprecationWarning, PendingDeprecationWarning, ResourceWarning):
+                    warnings.simplefilter("ignore", kind)
+                warnings.showwarning = _show_warning
+                yield
+        finally:
+            warnings.showwarning = showwarning
+            try:
+                sys.stdout.flush()
+            except (OSError, UnicodeError) as error:
+                print(f"Traceback: {error}", file=sys.stderr)
+            sys.stderr.flush()
+            sys.stdout, sys.stderr = streams
+            for number, copy in kept.items():
+                os.dup2(copy, number)
+                os.close(copy)
+            out.seek(0)
+            err.seek(0)
+            outcome.out = out.read().decode("utf-8", "replace")
+            outcome.err = err.read().decode("utf-8", "replace")
+
+
+def _show_warning(message: object, category: type, *others: object, **more: object) -> None:
+    print(f"{category.__name__}: {message}", file=sys.stderr)
+
+
+@contextmanager
+def _measured(outcome: Outcome, seconds: float) -> Iterator[None]:
+    """Ends the block by :class:`TooLong`; bounds and measures memory."""
+
+    def ring(number: int, frame: object) -> None:
+        raise TooLong
+
+    previous, interrupt = signal.signal(signal.SIGALRM, ring), signal.getsignal(signal.SIGINT)
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    limits = resource.getrlimit(resource.RLIMIT_AS)
+    start, resident = time.perf_counter(), _memory("VmRSS")
+    most = _memory("VmSize") * 1024 + ADDRESS_SPACE
+    hard = limits[1]
+    resource.setrlimit(resource.RLIMIT_AS, (most if hard < 0 else min(most, hard), hard))
+    Path("/proc/self/clear_refs").write_text("5")  # the peak starts anew
+    signal.setitimer(signal.ITIMER_REAL, seconds)
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.signal(signal.SIGALRM, previous)
+        signal.signal(signal.SIGINT, interrupt)
+        resource.setrlimit(resource.RLIMIT_AS, limits)
+        outcome.seconds = time.perf_counter() - start
+        outcome.megabytes = (_memory("VmHWM") - resident) / 1024
+
+
+def _memory(key: str) -> int:
+    """KiB, of this process."""
+    status = Path("/proc/self/status").read_text()
+    return int(re.search(rf"^{key}:\s+(\d+)", status, re.M).group(1))

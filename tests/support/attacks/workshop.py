@@ -1,0 +1,264 @@
+"""The folder that attacks happen in: every kind of file that the commands read, and a user's own.
+
+It is built once, kept as a copy, and put back after each attack. Its path never changes, since
+some of its files hold it.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import stat
+from collections.abc import Iterator
+from contextlib import contextmanager
+from hashlib import blake2b
+from pathlib import Path
+from unittest.mock import patch
+
+import imageio.v3 as iio
+import numpy as np
+import yaml
+from plyfile import PlyData, PlyElement
+
+from drgs import capture, fit
+from drgs.core.files import atomic_path
+from drgs.results.files import CHECKPOINT, CURVES, ORBIT, ORBIT_GIF, REPORT
+from support.attacks.observer import Fault, observed
+from support.commands import run_in_process
+from support.small_capture import blobs
+
+WIDTH, HEIGHT = 20, 16
+
+SETTINGS = {
+    "data": {"path": "lego"},
+    "init": {"point_cloud": "points.ply"},
+    "model": {"sh_degree": 0},
+    "densify": {"max_gaussians": 100},
+    "output": {"dir": "out", "history_every": 1, "checkpoint_every": 1},
+    "iterations": 2,
+}
+
+PHOTOGRAPHS = {"data": {"path": "photos", "background": "black"}}
+"""Sections of ``photos.yml`` that differ; its masks, depths, lens and motion are all looked at."""
+
+SPLATS = """<scene version="3.0.0">
+    <integrator type="splats">
+        <string name="filename" value="gaussians.ply"/>
+        <rgb name="background" value="1, 1, 1"/>
+    </integrator>
+    <sensor type="perspective">
+        <float name="fov" value="40"/>
+        <transform name="to_world"><lookat origin="4, 0, 1" target="0, 0, 0" up="0, 0, 1"/>
+        </transform>
+        <film type="hdrfilm">
+            <integer name="width" value="20"/><integer name="height" value="16"/>
+            <rfilter type="box"/>
+        </film>
+        <sampler type="independent"><integer name="sample_count" value="1"/></sampler>
+    </sensor>
+</scene>
+"""
+
+BALL = """<scene version="3.0.0">
+    <emitter type="constant"><rgb name="radiance" value="1"/></emitter>
+    <shape type="sphere">
+        <float name="radius" value="0.8"/>
+        <bsdf type="diffuse"><rgb name="reflectance" value="0.2, 0.5, 0.8"/></bsdf>
+    </shape>
+</scene>
+"""
+
+CAPTURE = ("--views", "2", "--test-views", "1", "--spp", "1", "--points", "9", "--max-depth", "2")
+"""A capture of the least there is; the picture's size is given beside it."""
+
+
+def pose(angle: float) -> list[list[float]]:
+    """Camera to world, OpenGL axes, on a circle of radius 4, looking at the origin."""
+    c, s = float(np.cos(angle)), float(np.sin(angle))
+    return [[-s, 0, c, 4 * c], [c, 0, s, 4 * s], [0, 1, 0, 0], [0, 0, 0, 1]]
+
+
+def noise(seed: int, channels: int) -> np.ndarray:
+    """A picture of random bytes."""
+    return np.random.default_rng(seed).integers(0, 256, (HEIGHT, WIDTH, channels), np.uint8)
+
+
+def write_lego(folder: Path) -> None:
+    """The NeRF-synthetic layout: 3 views to train on, 1 to test."""
+    for split, angles in (("train", (0, 2, 4)), ("test", (1,))):
+        (folder / split).mkdir(parents=True)
+        frames = []
+        for i, angle in enumerate(angles):
+            frames.append({"file_path": f"./{split}/r_{i}", "transform_matrix": pose(angle)})
+            iio.imwrite(folder / split / f"r_{i}.png", noise(angle, 4))
+        meta = {"camera_angle_x": 0.7, "frames": frames}
+        (folder / f"transforms_{split}.json").write_text(json.dumps(meta))
+
+
+def write_photos(folder: Path) -> None:
+    """The nerfstudio layout, with a lens, a mask, depths of both kinds, and a camera that moves."""
+    folder.mkdir()
+    frames = []
+    for i in range(4):
+        frames.append({"file_path": f"{i}.png", "transform_matrix": pose(1.5 * i)})
+        iio.imwrite(folder / f"{i}.png", noise(i, 3))
+    frames[1] |= {"mask_path": "mask.png", "transform_matrix_close": pose(1.51)}
+    frames[2] |= {"depth_file_path": "depth.npy"}
+    frames[3] |= {"depth_file_path": "depth.png"}
+    iio.imwrite(folder / "mask.png", np.where(noise(5, 1)[:, :, 0] > 20, 255, 0).astype(np.uint8))
+    iio.imwrite(folder / "depth.png", np.full((HEIGHT, WIDTH), 4000, np.uint16))
+    np.save(folder / "depth.npy", np.full((HEIGHT, WIDTH), 4, np.float32))
+    meta = {"fl_x": 27.0, "fl_y": 27.0, "cx": 10.0, "cy": 8.0, "w": WIDTH, "h": HEIGHT}
+    meta |= {"camera_model": "OPENCV", "k1": 0.01, "frames": frames}
+    (folder / "transforms.json").write_text(json.dumps(meta))
+
+
+def write_points(path: Path) -> None:
+    """A cloud of coloured points."""
+    rng = np.random.default_rng(0)
+    types = [(n, "f4") for n in "xyz"] + [(n, "u1") for n in ("red", "green", "blue")]
+    rows = np.zeros(12, types)
+    for name in rows.dtype.names:
+        is_position = name in "xyz"
+        rows[name] = rng.uniform(-1, 1, 12) if is_position else rng.integers(0, 256, 12)
+    PlyData([PlyElement.describe(rows, "vertex")], byte_order="<").write(str(path))
+
+
+def write_inputs(folder: Path) -> None:
+    """Everything but what the commands write themselves."""
+    write_lego(folder / "lego")
+    write_photos(folder / "photos")
+    write_points(folder / "points.ply")
+    blobs(12).save(folder / "gaussians.ply")
+    (folder / "fit.yml").write_text(yaml.safe_dump(SETTINGS))
+    (folder / "photos.yml").write_text(yaml.safe_dump(SETTINGS | PHOTOGRAPHS))
+    frame = {"transform_matrix": pose(0.5)}
+    camera = {"camera_angle_x": 0.7, "w": WIDTH, "h": HEIGHT, "frames": [frame]}
+    (folder / "camera.json").write_text(json.dumps(camera))
+    (folder / "splats.xml").write_text(SPLATS)
+    (folder / "ball.xml").write_text(BALL)
+    iio.imwrite(folder / "sky.png", noise(9, 3))
+    (folder / "mine").mkdir()
+    (folder / "mine" / "notes.txt").write_text("not to be touched")
+
+
+@contextmanager
+def standing_in(folder: Path) -> Iterator[None]:
+    """The current folder within the block."""
+    before = Path.cwd()
+    os.chdir(folder)
+    try:
+        yield
+    finally:
+        os.chdir(before)
+
+
+@contextmanager
+def sketched_results() -> Iterator[None]:
+    """Within the block a fit writes its drawings, but does not draw: that takes seconds."""
+
+    def write(out: Path, *others: object) -> None:
+        for name in (CURVES, ORBIT, ORBIT_GIF, REPORT):
+            with atomic_path(out / name) as temporary:
+                temporary.write_text("a sketch")
+
+    with patch("drgs.fit.write_results", write):
+        yield
+
+
+class Workshop:
+    """See this module. ``folder`` is where attacks happen."""
+
+    def __init__(self, base: Path) -> None:
+        self.folder, self._kept = base / "workshop", base / "kept"
+        self.folder.mkdir(parents=True)
+        write_inputs(self.folder)
+        with standing_in(self.folder), sketched_results():
+            self._run_commands()
+        shutil.copytree(self.folder, self._kept)
+        self._pristine = contents(self.folder)
+
+    def _run_commands(self) -> None:
+        """``stopped/``, ``run/`` and ``captured/``: a fit with a checkpoint, one that has ended,
+        and a capture.
+        """
+        with observed(self.folder, _CtrlCAtCheckpoint("interrupt", 0)):
+            outcome = run_in_process(fit.main, "fit.yml", "--out", "stopped")
+        assert outcome.returncode == 130, outcome
+        shutil.copytree("stopped", "run")
+        outcome = run_in_process(fit.main, "--resume", "run")
+        assert outcome.returncode == 0, outcome
+        words = ("ball.xml", "--out", "captured", *CAPTURE, *capture_size(6))
+        outcome = run_in_process(capture.main, *words)
+        assert outcome.returncode == 0, outcome
+
+    def put_back(self) -> None:
+        """Undo what an attack did."""
+        now = contents(self.folder)
+        for path in sorted(now.keys() - self._pristine.keys(), reverse=True):
+            _remove(self.folder / path)
+        for path, what in sorted(self._pristine.items()):
+            target, kept = self.folder / path, self._kept / path
+            if now.get(path) == what:
+                continue
+            _remove(target)
+            if what == FOLDER:
+                target.mkdir(exist_ok=True)
+            else:
+                shutil.copy2(kept, target)
+
+
+class _CtrlCAtCheckpoint(Fault):
+    """When the first checkpoint is about to be put in place."""
+
+    def strike(self, number: int, event: str, path: str) -> None:
+        if event == "os.rename" and path.endswith(CHECKPOINT):
+            signal.raise_signal(signal.SIGINT)
+
+
+def capture_size(size: int) -> tuple[str, ...]:
+    """The option for square pictures."""
+    return ("--size", str(size), str(size))
+
+
+FOLDER = "folder"
+
+
+def contents(folder: Path) -> dict[str, str]:
+    """By path relative to ``folder``, of everything below it: what it is, files by their digest."""
+    start, found = len(str(folder)) + 1, {}
+    for parent, folders, files in os.walk(folder):
+        for name in (*folders, *files):
+            path = os.path.join(parent, name)
+            found[path[start:]] = what_it_is(path)
+    return found
+
+
+def what_it_is(path: str) -> str:
+    """A digest, the target of a link, or the kind."""
+    mode = os.lstat(path).st_mode
+    if stat.S_ISDIR(mode):
+        return FOLDER
+    if stat.S_ISLNK(mode):
+        return f"link to {os.readlink(path)}"
+    if not stat.S_ISREG(mode):
+        return f"special {stat.S_IFMT(mode)}"
+    if os.stat(path).st_size > MAX_READ:
+        return f"{os.stat(path).st_size} bytes"
+    with open(path, "rb") as file:
+        return blake2b(file.read(), digest_size=16).hexdigest()
+
+
+MAX_READ = 1 << 26
+"""Bytes: larger ones are sparse files, of which nobody writes a part."""
+
+
+def _remove(path: Path) -> None:
+    if not os.path.lexists(path):
+        return
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path)
+    else:
+        path.unlink()
