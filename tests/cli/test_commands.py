@@ -52,7 +52,7 @@ def test_modules_are_commands_too_and_say_how_they_are_called(capsys, command):
         (["bench"], "the following arguments are required: MEASUREMENT"),
         (["fit"], "one of the arguments CONFIG.yml --resume is required"),
         (["fit", "a.yml", "--resume", "out"], "not allowed with argument"),
-        (["fit", "--resume", "out", "--data", "x"], "configuration from out/config.yml: leave out"),
+        (["fit", "--resume", "out", "--out", "x"], "configuration from out/config.yml: leave out"),
         (["fit", "a.yml", "--budget", "soon"], "argument --budget: "),
         (["capture", "a.xml", "--out", "x", "--spp", "0"], "argument --spp: must be a whole"),
         (["capture", "a.xml", "--out", "x", "--fov", "inf"], "argument --fov: must be a finite"),

@@ -316,7 +316,7 @@ def test_damaged_checkpoint_is_refused_by_name(configuration, tmp_path):
     (out / "checkpoint.npz").write_bytes(b"PK\x03\x04 cut short")
     result = fit("--resume", out)
     assert result.returncode == 2
-    assert "checkpoint.npz: not a readable checkpoint" in result.stderr
+    assert "checkpoint.npz: cannot read the checkpoint" in result.stderr
     assert len(result.stderr.strip().splitlines()) == 1
 
 
