@@ -9,6 +9,9 @@ from drgs.results import files
 
 NAMES = {files.CONFIG, *files.RESULTS}
 
+BELOW = {"drgs/data/recognition.py": {files.CONFIG, files.GAUSSIANS, files.CHECKPOINT}}
+"""Modules below ``results`` recognise a fit's folder by names that they write out themselves."""
+
 MODULES = [
     path
     for path in sorted((REPOSITORY / "drgs").rglob("*.py"))
@@ -28,7 +31,8 @@ def test_no_name_is_given_to_two_files():
 
 @pytest.mark.parametrize("path", MODULES, ids=lambda path: str(path.relative_to(REPOSITORY)))
 def test_no_other_module_writes_a_name_out(path):
-    assert not NAMES & strings(path.read_text())
+    known = BELOW.get(path.relative_to(REPOSITORY).as_posix(), set())
+    assert NAMES & strings(path.read_text()) == known
 
 
 def test_a_name_that_is_written_out_is_found():
