@@ -208,6 +208,8 @@ def _absolute(folder: Path, text: str, where: str) -> str:
         path = str((folder / Path(text).expanduser()).resolve())
         check_path(path)
         path.encode()  # what UTF-8 cannot express could not be written to config.yml
+    except UnicodeEncodeError:
+        raise UserError(f"{where} must be a path in UTF-8, got {_show(text)}") from None
     except (OSError, ValueError, RuntimeError) as error:  # of these, RuntimeError: no such user
         raise UserError(
             f"{where} must be a path, got {_show(text)} ({one_line(error, 100)})"

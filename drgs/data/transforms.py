@@ -377,7 +377,7 @@ def unique_names(files: Sequence[str]) -> list[str]:
 
 def _cut(name: str) -> str:
     """So much of its beginning as leaves room for a number, a suffix, and temporary names."""
-    return os.fsdecode(os.fsencode(name)[:MAX_NAME_BYTES])
+    return os.fsencode(name)[:MAX_NAME_BYTES].decode("utf-8", "ignore")
 
 
 def in_parallel(function: Callable[..., T], *arguments: Sequence[object]) -> tuple[T, ...]:
