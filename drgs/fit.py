@@ -26,6 +26,7 @@ import platform
 import sys
 import time
 from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
@@ -43,6 +44,7 @@ from drgs.config.load import load_config
 from drgs.config.schema import FitConfig
 from drgs.core.errors import UserError
 from drgs.core.files import atomic_path
+from drgs.core.locks import sole_writer
 from drgs.core.machine import processor
 from drgs.core.private import llvm_version
 from drgs.data import Dataset, View, initial_gaussians, load_dataset
@@ -177,8 +179,9 @@ class Run:
 def run(args: argparse.Namespace) -> None:
     """Fit what the command line names; end the process with status 130 if Ctrl-C stopped it."""
     started = time.perf_counter()
-    with executing(args.threads, args.debug) as check_ranges:
+    with executing(args.threads, args.debug) as check_ranges, ExitStack() as blocks:
         config, out = what_to_fit(args)
+        keep_folder = blocks.enter_context(sole_writer(out))
         if not args.overwrite and (has_results(out) if args.resume else is_finished(out, config)):
             remove_checkpoint(out)  # a process that was killed behind its last file has not
             seal_run(out)
@@ -203,6 +206,7 @@ def run(args: argparse.Namespace) -> None:
             print(plan.reasons)
         trainer = Trainer(config, dataset, gaussians)
         fit, checkpoint = Run.taken_up(trainer, data, out, checkpoint), None  # frees its arrays
+        keep_folder()
         take_folder(args, config, dataset, out)
         if plan is not None:
             with atomic_path(out / BUDGET_PLAN) as temporary:

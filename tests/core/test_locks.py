@@ -11,8 +11,10 @@ from drgs.core.locks import sole_writer
 
 
 def test_a_folder_has_one_writer(tmp_path):
-    folder = tmp_path / "new" / "out"
-    with sole_writer(folder):
+    folder = tmp_path / "out"
+    folder.mkdir()
+    with sole_writer(folder) as keep:
+        keep()
         message = r"out: another fit is writing to this folder; wait"
         with pytest.raises(UserError, match=message), sole_writer(folder):
             pass
@@ -21,6 +23,16 @@ def test_a_folder_has_one_writer(tmp_path):
         assert os.listdir(folder) == []
     with sole_writer(folder):
         pass
+
+
+def test_a_new_folder_is_kept_when_it_is_made(tmp_path):
+    folder = tmp_path / "new" / "out"
+    with sole_writer(folder) as keep, sole_writer(folder) as keep_as_well:
+        assert not folder.exists()
+        keep()
+        assert folder.is_dir()
+        with pytest.raises(UserError, match="another fit is writing to this folder"):
+            keep_as_well()
 
 
 def test_an_error_gives_the_folder_back(tmp_path):
@@ -51,5 +63,7 @@ def test_a_killed_process_leaves_no_lock(tmp_path):
 
 def test_what_cannot_be_locked_is_left_to_its_writer(tmp_path):
     (tmp_path / "file").write_text("")
-    with sole_writer(tmp_path / "file" / "out"):
-        pass
+    with sole_writer(tmp_path / "file" / "out") as keep:
+        keep()
+    with sole_writer(tmp_path / "file") as keep:
+        keep()
