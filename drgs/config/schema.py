@@ -184,9 +184,9 @@ class _Model(_Section):
         None,
         ge=1e-9,
         le=1e9,
-        description="Near plane, scene units: closer means are culled. null: the reference's 0.2 "
-        "where the cameras are those of NeRF-synthetic scenes, otherwise a twentieth of their "
-        "distance to what they look at.",
+        description="Near plane, scene units: closer means are culled. null: about a twenty-fifth "
+        "of the cameras' distance to what they look at, the reference's 0.2 for NeRF-synthetic "
+        "scenes.",
     )
 
 

@@ -6,12 +6,13 @@ from drgs.config.changes import changed
 from drgs.config.schema import NAMED_COLORS, REFERENCE_NEAR, FitConfig
 from drgs.core.errors import UserError
 from drgs.data.initial import point_cloud_of
-from drgs.data.start_box import focus_of, is_of_the_reference, shown, start_box
+from drgs.data.start_box import focus_of, shown, start_box
 from drgs.data.types import Dataset
 
-NEAR_SHARE = 0.05
-"""Of the cameras' distance to what they look at: the reference's near plane of 0.2 is that for
-NeRF-synthetic scenes, whose distance is 4.03."""
+NEAR_SHARE = 0.04
+"""Of the cameras' distance to what they look at, rounded to one digit: the near plane. It gives the
+reference's 0.2 for NeRF-synthetic scenes, whose distance is 4.03, as well as for distances of 4 to
+6, which photographs often have in COLMAP's unit of length."""
 
 LEAST_NEAR = 1e-9
 """What a configuration accepts."""
@@ -55,9 +56,9 @@ def description_of_start(config: FitConfig, dataset: Dataset) -> str:
 
 
 def _near_plane(dataset: Dataset) -> float:
-    if not dataset.train or is_of_the_reference(dataset):
+    if not dataset.train:
         return REFERENCE_NEAR
-    return float(f"{max(NEAR_SHARE * _viewing_distance(dataset), LEAST_NEAR):.3g}")
+    return float(f"{max(NEAR_SHARE * _viewing_distance(dataset), LEAST_NEAR):.1g}")
 
 
 def _check_near_plane(near: float, dataset: Dataset) -> None:

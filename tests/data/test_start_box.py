@@ -9,7 +9,7 @@ from drgs.config.schema import FitConfig, InitConfig
 from drgs.core.errors import UserError
 from drgs.data import initial_gaussians
 from drgs.data.derived import completed, description_of_start
-from drgs.data.start_box import focus_of, start_box
+from drgs.data.start_box import start_box
 
 AROUND = [(4.03, 0, 0), (0, 4.03, 0), (-4.03, 0, 0), (0, -4.03, 0.1)]
 
@@ -135,13 +135,12 @@ def test_the_background_follows_from_the_pictures(photographs, mode, background)
     assert completed(given, dataset).data.background == "white"
 
 
-def test_the_near_plane_follows_from_the_cameras():
-    reference = dataset_of(views_from(AROUND), 1.3)
-    assert completed(config(), reference).model.near == 0.2
-    far = dataset_of(views_from(AROUND, scale=1000))
-    distance = focus_of(far.train)[1]
-    assert completed(config(), far).model.near == pytest.approx(0.05 * distance, rel=0.01)
-    assert completed(config(model={"near": 0.3}), far).model.near == 0.3
+@pytest.mark.parametrize(("scale", "near"), [(1, 0.2), (1.5, 0.2), (1000, 200), (0.001, 2e-4)])
+def test_the_near_plane_follows_from_the_cameras(scale, near):
+    dataset = dataset_of(views_from(AROUND, scale=scale))
+    assert completed(config(), dataset).model.near == near
+    given = completed(config(model={"near": 0.0011}), dataset)
+    assert given.model.near == 0.0011
 
 
 def test_a_near_plane_behind_what_the_cameras_look_at_is_refused():

@@ -1,0 +1,118 @@
+"""Every shipped configuration fits every kind of dataset: what depends on it follows from it.
+
+Configurations that ask for the same fit of a dataset share one.
+"""
+
+from functools import cache
+
+import mitsuba as mi
+import pytest
+from conftest import REPOSITORY, SHARED_DATA
+from support.photographs import from_colmap, moved
+
+from drgs.config.changes import changed
+from drgs.config.load import load_config
+from drgs.data import load_dataset
+from drgs.data.derived import completed
+from drgs.results.metrics import mean_quality
+from drgs.training.loop import train
+
+CONFIGURATIONS = sorted(path.stem for path in (REPOSITORY / "scenes").glob("*.yml"))
+
+ALIKE = ("fox", "lego", "lego_paper", "photos")
+"""They differ in data, size and number of iterations alone."""
+
+SMALL = ("data.image_size=60", "iterations=600")
+
+WITHIN = 1.0
+"""dB, of the best: what differs is how many points there are at the start, and when the population
+changes."""
+
+
+def configured(name, folder, *overrides):
+    """The configuration as a fit of ``folder`` completes it, and the dataset."""
+    file = REPOSITORY / "scenes" / f"{name}.yml"
+    config = load_config(file, [f"data.path={folder}", *SMALL, *overrides])
+    dataset = load_dataset(config.data_for_training)
+    return changed(completed(config, dataset), {"data.source": ""}), dataset
+
+
+@pytest.mark.parametrize("kind", ["blender", "photographs"])
+@pytest.mark.parametrize("name", ALIKE)
+def test_the_kind_of_scene_follows_from_the_data_alone(request, kind, name):
+    made = request.getfixturevalue(kind)
+    folder = made[0] if kind == "blender" else made
+    config, _ = configured(name, folder)
+    assert config == configured(ALIKE[0], folder)[0]
+    assert config.data.background == ("white" if kind == "blender" else "black")
+
+
+def test_every_configuration_is_one_of_these_or_is_fitted_below():
+    assert set(CONFIGURATIONS) == {*ALIKE, "lego_mini"}
+
+
+# ----------------------------------------------------------------------------------------------
+# Small fits
+# ----------------------------------------------------------------------------------------------
+
+
+def nerf_synthetic(folder):
+    return SHARED_DATA / "nerf_synthetic" / "lego"
+
+
+def instant_ngp(folder):
+    return SHARED_DATA / "fox"
+
+
+def cameras_of_their_own(folder):
+    """As COLMAP finds them: the origin between the cameras, and another unit of length."""
+    return moved(SHARED_DATA / "fox", folder / "fox", scale=5)
+
+
+def far_smaller(folder):
+    return moved(SHARED_DATA / "fox", folder / "fox", scale=0.05)
+
+
+def colmap_with_points(folder):
+    source = SHARED_DATA / "colmap_robothead"
+    return from_colmap(source / "sparse" / "0", source / "images_4", folder / "robot", factor=4)
+
+
+KINDS = (nerf_synthetic, instant_ngp, cameras_of_their_own, far_smaller, colmap_with_points)
+
+
+@pytest.fixture(scope="module")
+def psnr_of(tmp_path_factory):
+    """psnr_of(name, kind): dB on the test views after a small fit."""
+    folders = cache(lambda kind: kind(tmp_path_factory.mktemp(kind.__name__)))
+    fitted = {}
+
+    def measured(name, kind):
+        config, dataset = configured(name, folders(kind))
+        key = kind, config.model_dump_json()
+        if key not in fitted:
+            trainer = train(config, dataset).trainer
+            pictures = trainer.pictures(dataset.test)
+            pairs = zip(pictures, dataset.test, strict=True)
+            fitted[key] = mean_quality((p, view.image, view.mask) for p, view in pairs).psnr
+        return fitted[key]
+
+    return measured
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not SHARED_DATA.is_dir(), reason="the shared data folder is not here")
+@pytest.mark.parametrize("kind", KINDS, ids=lambda kind: kind.__name__)
+def test_every_configuration_fits_every_kind_of_dataset(psnr_of, kind):
+    mi.set_variant("llvm_ad_rgb")
+    reached = {name: psnr_of(name, kind) for name in CONFIGURATIONS}
+    assert min(reached.values()) >= max(reached.values()) - WITHIN, reached
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not SHARED_DATA.is_dir(), reason="the shared data folder is not here")
+def test_the_frame_of_reference_does_not_matter(psnr_of):
+    """The unit of length, the origin and the directions of the axes are COLMAP's choice."""
+    mi.set_variant("llvm_ad_rgb")
+    reached = {kind.__name__: psnr_of("photos", kind) for kind in KINDS[1:4]}
+    assert min(reached.values()) >= max(reached.values()) - WITHIN, reached
