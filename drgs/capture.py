@@ -308,7 +308,7 @@ def write_dataset(
 
 def fitting(out: Path, settings: CaptureSettings) -> str:
     """The command that fits the capture in ``out``, as a shell reads it."""
-    words = ["python", "-m", "drgs.fit", "scenes/lego.yml", "--data", str(out)]
+    words = ["python", "-m", "drgs.fit", "scenes/photos.yml", "--data", str(out)]
     if settings.points:
         words += ["--set", f"init.point_cloud={out / POINTS}"]
     if not settings.test_views and not settings.val_views:
