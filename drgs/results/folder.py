@@ -272,9 +272,11 @@ def _files(folder: Path) -> Iterator[str]:
             if os.path.lexists(folder / name):
                 yield name
             continue
-        for path, _, files in os.walk(folder / name):
+        for path, folders, files in os.walk(folder / name):
+            folders.sort()
             inside = Path(path).relative_to(folder)
-            yield from ((inside / file).as_posix() for file in files if not is_temporary(file))
+            kept = (file for file in sorted(files) if not is_temporary(file))
+            yield from ((inside / file).as_posix() for file in kept)
 
 
 def _is_other(path: Path, is_kind: Callable[[Path], bool] = Path.is_file) -> bool:
