@@ -139,7 +139,7 @@ def add_arguments(parser: CommandParser) -> None:
 
 def _add_cameras(parser: CommandParser) -> None:
     group = parser.add_argument_group(
-        "cameras", "A scene's own sensors say what is up, and how it is looked at from around."
+        "cameras", "What is not given follows from the scene's own sensors, if it has any."
     )
     add = group.add_argument
     add(
@@ -166,7 +166,12 @@ def _add_cameras(parser: CommandParser) -> None:
         metavar=("X", "Y", "Z"),
         help="what the cameras look at (default: the middle of the bounding box)",
     )
-    add("--up", choices=UP_AXES, metavar="AXIS", help="x, y, z, =-x, =-y or =-z (default: z)")
+    add(
+        "--up",
+        choices=UP_AXES,
+        metavar="AXIS",
+        help="x, y, z or, as in --up=-z, an opposite (default: z)",
+    )
     ranges = {"type": finite_number, "nargs": 2, "metavar": ("MIN", "MAX")}
     add(
         "--azimuth",
@@ -253,7 +258,7 @@ def take_pictures(
 ) -> None:
     """Take the pictures that are not in ``out`` yet; say so where most show nothing."""
     camera = CaptureCamera(scene, settings)
-    missing = [view for view in views if not picture_path(out, view).exists()]
+    missing = spread_first([view for view in views if not picture_path(out, view).exists()])
     there = len(views) - len(missing)
     if there:
         print(f"{there} of {len(views)} pictures are there already")
@@ -266,6 +271,17 @@ def take_pictures(
             if len(shown) == min(FIRST, len(missing)) and sum(shown) < len(shown) / 2:
                 print(_empty(shown, settings.cameras), file=sys.stderr, flush=True)
             progress.update(done, len(views))
+
+
+def spread_first(views: list[CaptureView]) -> list[CaptureView]:
+    """The views in another order: those come first that tell what all will be like.
+
+    Neighbours in the list are at similar heights. What a picture shows does not depend on when it
+    is taken.
+    """
+    chosen = range(0, len(views), max(1, len(views) // FIRST))[:FIRST]
+    rest = sorted(set(range(len(views))) - set(chosen))
+    return [views[index] for index in (*chosen, *rest)]
 
 
 def shows_something(picture: np.ndarray) -> bool:

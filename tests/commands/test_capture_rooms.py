@@ -110,6 +110,15 @@ def test_pictures_that_are_mostly_empty_are_warned_of_in_one_line(cornell, tmp_p
     assert "warning: 10 of the first 10 pictures are empty or black" in line
 
 
+def test_the_first_pictures_are_spread_over_all():
+    """Else those near the horizon would decide whether a warning is due."""
+    order = capture.spread_first(list(range(125)))
+    assert order[:10] == list(range(0, 120, 12))
+    assert sorted(order) == list(range(125))
+    for count in (0, 1, 9, 10, 11, 19):
+        assert sorted(capture.spread_first(list(range(count)))) == list(range(count))
+
+
 def test_ranges_of_azimuth_and_elevation_keep_before_the_open_side(cornell, tmp_path):
     ranges = ["--azimuth", -25, 25, "--elevation", -15, 20]
     outcome = run(cornell, tmp_path / "out", *ranges)
