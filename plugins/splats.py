@@ -132,12 +132,13 @@ class SplatsIntegrator(mi.CppADIntegrator):
      * - aovs
        - |string|
        - What is put out besides colour, as in Mitsuba's ``aov``: a list of ``name:type``, such as
-         ``d:depth, a:alpha``. ``depth`` (channel ``name.T``) is the sum of the splats' depths (z in
-         the camera; with a fisheye lens, the distance from it), weighted by their share in the
-         pixel and not normalised; ``alpha`` (``name.I``) is the sum
-         of these weights; ``normal`` (``name.X``, ``.Y``, ``.Z``) the weighted sum of the splats'
-         shortest axes, unit vectors in the world that point to the camera; a type that is the name
-         of a parameter ``feature_...`` (``name.0``, ``.1``, ...) the weighted sum of its rows.
+         ``d:depth, a:alpha``. ``depth`` (channel ``name.T``) is the sum of the depths (z in the
+         camera, not the distance as in Mitsuba's ``aov``; with a fisheye lens, the distance) of
+         splats and surfaces, weighted by their share in the pixel and not normalised; ``alpha``
+         (``name.I``) the sum of these weights; ``normal`` (``name.X``, ``.Y``, ``.Z``) the
+         weighted sum of surfaces' normals and of splats' shortest axes, unit vectors in the world
+         that point to the camera. A type that is the name of a parameter ``feature_...``
+         (``name.0``, ``.1``, ...) is the weighted sum of its rows: of splats alone, 0 on surfaces.
          There may be 64 channels besides alphas. (Default: none)
 
      * - ignore

@@ -169,7 +169,7 @@ def trace_surfaces(
         with_normals=with_normals,
     )
     film = sensor.film()
-    if len(within) == 1:
+    if len(within) == 1 and dr.width(within[0]) == 1:  # the same place in all pixels
         seen = [[tracer.trace_with_edges(camera, film, *within[0])] for camera in cameras]
     else:
         corner = pixel_corners(film)

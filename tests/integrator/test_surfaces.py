@@ -25,6 +25,7 @@ from support.walls import (
     expected,
     load,
     rgba,
+    to_display,
 )
 
 import drgs  # noqa: F401  (registers the plugins)
@@ -158,6 +159,46 @@ def test_depth_alpha_and_normal_are_those_of_both():
     normals = image_of(load(scene, aovs="n:normal", **bare))[..., 4:]
     normal = scene.camera.rotation.T @ WALL.axes()[2]
     np.testing.assert_allclose(normals, np.broadcast_to(normal, normals.shape), atol=PICTURE)
+
+
+def test_depth_of_surfaces_is_that_of_mitsubas_own_positions():
+    """Where only surfaces are, and in a pixel whose splats are all in front of them."""
+    scene, wall = apart(SCENE), Wall(tilt=(0.3, -0.2))
+    bare = {"logit_opacities": mi.TensorXf(np.full(scene.count, -20, np.float32))}
+    loaded = load(scene, wall=wall, aovs="z:depth, a:alpha, f:feature_x", **bare, **feature(scene))
+    sensor = mi.load_dict(scene.view.sensor())
+    positions = mi.load_dict({"type": "aov", "aovs": "p:position", "img": {"type": "direct"}})
+    # Its rays start anywhere in a pixel: the mean of many is at the middle.
+    seen = image_of(loaded, integrator=positions, sensor=sensor, spp=512)[..., 4:7]
+    z = (seen - scene.camera.center) @ scene.camera.rotation[2]
+    *_, depth, alpha, nothing = np.moveaxis(image_of(loaded), -1, 0)
+    np.testing.assert_allclose(depth, z, rtol=0, atol=2e-3)  # 0.02 a pixel
+    np.testing.assert_allclose(alpha, 1, atol=PICTURE)
+    np.testing.assert_allclose(nothing, 0, atol=PICTURE)
+    # Divided by alpha, it is a mean of what is there: between the nearest splat and the wall.
+    *_, depth, alpha, _ = np.moveaxis(
+        image_of(load(scene, wall=wall, aovs="z:depth, a:alpha, f:feature_x", **feature(scene))),
+        -1, 0,
+    )  # fmt: skip
+    mean = depth / alpha
+    assert (mean <= z + 2e-3).all() and (mean > 0.01).all() and (mean < z - 0.1).any()
+
+
+def feature(scene) -> dict:
+    return {"feature_x": mi.TensorXf(np.ones((scene.count, 1), np.float32))}
+
+
+@pytest.mark.parametrize("rfilter", ["gaussian", "tent"])
+def test_one_sample_that_is_anywhere_in_its_pixel_sees_surfaces(rfilter):
+    """Mitsuba's default filter, with a sample count of 1."""
+    scene = apart(SCENE)
+    bare = {"logit_opacities": mi.TensorXf(np.full(scene.count, -20, np.float32))}
+    sensor = scene.view.sensor(rfilter=rfilter)
+    image = image_of(load(scene, sensor, wall=Wall(tilt=(0, 0)), aovs="z:depth", **bare))
+    np.testing.assert_allclose(image[..., 4], WALL.z, rtol=PICTURE)
+    np.testing.assert_allclose(
+        image[..., :3], np.broadcast_to(to_display(RADIANCE), (23, 37, 3)), rtol=1e-4
+    )
 
 
 def test_emitters_that_are_hidden_are_looked_through():
