@@ -130,9 +130,9 @@ def file_or_folder(text: str) -> Path:
     """The type of an argument that is the path of a file or folder, which need not exist."""
     try:
         check_path(text)
-    except ValueError as error:
-        raise argparse.ArgumentTypeError(f"{error}: {one_line(text, 40)}") from None
-    return Path(text)
+        return Path(text).expanduser()
+    except (ValueError, RuntimeError) as error:  # the latter: there is no such user
+        raise argparse.ArgumentTypeError(f"{one_line(error)}: {one_line(text, 40)}") from None
 
 
 def finite_number(text: str) -> float:

@@ -12,6 +12,9 @@ from drgs.core.llvm import LLVMVersionError
 USER_ERROR_STATUS = 2
 """Exit status of a command that the user has to call differently (as argparse's)."""
 
+MAX_CHARACTERS = 800
+"""Of an error. Names of files may have thousands; where and what to do are at its ends."""
+
 
 @contextmanager
 def exit_on_user_error() -> Iterator[None]:
@@ -22,6 +25,12 @@ def exit_on_user_error() -> Iterator[None]:
     try:
         yield
     except (UserError, LLVMVersionError) as error:
-        # Names of files may hold line ends.
-        print(f"error: {' '.join(str(error).splitlines())}", file=sys.stderr)
+        print(f"error: {_printed(str(error))}", file=sys.stderr)
         sys.exit(USER_ERROR_STATUS)
+
+
+def _printed(text: str) -> str:
+    """One line, whatever names of files hold, of which the middle is left out if it is long."""
+    line = " ".join(text.splitlines())
+    half = MAX_CHARACTERS // 2
+    return line if len(line) <= MAX_CHARACTERS else f"{line[:half]} ... {line[-half:]}"

@@ -1,16 +1,18 @@
 """How a command ends: one line, whatever names and encodings are, and no traceback of Ctrl-C."""
 
+import argparse
 import io
 import os
 import signal
 import sys
 import warnings
 from contextlib import redirect_stderr, redirect_stdout
+from pathlib import Path
 
 import pytest
 from support.commands import run_in_process
 
-from drgs.cli.commands import at_least, run_command
+from drgs.cli.commands import at_least, file_or_folder, run_command
 from drgs.cli.interrupts import exit_on_interrupt
 from drgs.cli.output import printable_anywhere
 from drgs.core.errors import UserError, UserNote
@@ -72,6 +74,22 @@ def test_an_error_whose_names_hold_line_ends_is_one_line():
         raise UserError("a\nb.yml: wrong")
 
     assert run_in_process(command(act)).stderr == "error: a b.yml: wrong\n"
+
+
+def test_of_a_long_error_both_ends_are_shown():
+    def act():
+        raise UserError(f"a.yml: {'x' * 5000}; remove it")
+
+    line = run_in_process(command(act)).stderr
+    assert line.startswith("error: a.yml: xxx") and line.endswith("xxx; remove it\n")
+    assert " ... " in line and len(line) < 1000
+
+
+def test_folders_of_users_are_found_or_refused(monkeypatch):
+    monkeypatch.setenv("HOME", "/home/somebody")
+    assert file_or_folder("~/out") == Path("/home/somebody/out")
+    with pytest.raises(argparse.ArgumentTypeError, match=r"home directory.*: ~no-such-user/out"):
+        file_or_folder("~no-such-user/out")
 
 
 @pytest.mark.parametrize(
