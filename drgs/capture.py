@@ -307,15 +307,19 @@ def _empty(shown: list[bool], cameras: str) -> str:
 def write_dataset(
     scene: mi.Scene, settings: CaptureSettings, views: list[CaptureView], out: Path
 ) -> None:
-    """Write what belongs to the pictures: points and transforms files."""
-    if settings.points:
+    """Write what belongs to the pictures: points and transforms files.
+
+    Those that are there stay, as pictures do: they are whole, and may have been edited since.
+    """
+    if settings.points and not (out / POINTS).exists():
         positions, colors = visible_points(scene, settings, views, out)
         write_points(out / POINTS, positions, colors)
         print(f"{len(positions):,} points: {out / POINTS}")
     # The layout is recognised by the training split's file, so that one comes last.
     for split in reversed(SPLITS):
-        if settings.count(split):
-            write_transforms(out / f"transforms_{split}.json", settings, views, split)
+        path = out / f"transforms_{split}.json"
+        if settings.count(split) and not path.exists():
+            write_transforms(path, settings, views, split)
     counted = ", ".join(f"{settings.count(s)} {s}" for s in SPLITS if settings.count(s))
     width, height = settings.size
     print(f"written: {out}: {counted} views, {width}x{height}, {settings.spp} spp")

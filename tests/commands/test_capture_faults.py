@@ -63,6 +63,17 @@ def refused(outcome):
     return line
 
 
+def test_files_that_were_edited_since_are_kept(ball, captured, tmp_path):
+    """A mask in a frame, a picture that was touched up; what is missing is made again."""
+    run(ball, tmp_path / "out")
+    edited = ("transforms_train.json", "points3d.ply", "train/r_0.png")
+    for name in edited:
+        (tmp_path / "out" / name).write_text("mine")
+    (tmp_path / "out" / "transforms_test.json").unlink()
+    assert run(ball, tmp_path / "out").returncode == 0
+    assert contents(tmp_path / "out") == {**captured, **dict.fromkeys(edited, b"mine")}
+
+
 class Killed(BaseException):
     """What ends the process; nothing of it cleans up."""
 
@@ -174,6 +185,7 @@ def test_a_picture_of_another_size_among_the_captures_is_refused(ball, captured,
     assert run(ball, tmp_path / "other", "--size", 5, 4).returncode == 0
     path = tmp_path / "out" / "train" / "r_1.png"
     path.write_bytes((tmp_path / "other" / "train" / "r_1.png").read_bytes())
+    (tmp_path / "out" / "points3d.ply").unlink()  # or no picture would be looked at
     line = refused(run(ball, tmp_path / "out"))
     assert f"{path}: must be an RGBA picture of 4 x 4 px of this capture, got 5 x 4" in line
     path.unlink()
