@@ -30,7 +30,7 @@ CACHES = re.compile(r"/(\.drjit|\.cache|__pycache__|\.nv)/|^/dev/(null|tty)$|^/p
 TEMPORARY = re.compile(r"\.[^/]*\.\d+\.tmp(\.[^/]*)?$")
 
 MOST_LINE = 2000
-"""Characters in a refusal."""
+"""Characters in a refusal, beside what the user wrote."""
 
 ADDRESS_SPACE = 4 << 30
 """Bytes by which it may grow: threads and compilers reserve much more than they use."""
@@ -143,7 +143,7 @@ def _wrong_refusal(attack: Attack, err: str) -> list[str]:
         wrong.append(f"a refusal of {len(lines)} lines: {_last_lines(err)}")
     elif "error: " not in lines[0]:
         wrong.append(f"a refusal that is none: {lines[0]}")
-    if max(map(len, lines), default=0) > MOST_LINE:
+    if max(map(len, lines), default=0) > MOST_LINE + sum(map(len, attack.words)):
         wrong.append(f"a line of {max(map(len, lines))} characters")
     if attack.named and attack.named not in err:
         wrong.append(f"does not name {attack.named}: {_last_lines(err)}")
@@ -171,7 +171,7 @@ def damage(
         if TEMPORARY.search(path):
             if not _cannot_tidy(attack):
                 wrong.append(f"left {path}")
-        elif not (kept and is_own(path)):
+        elif not (kept and (is_own(path) or own.startswith(f"{path}/"))):
             wrong.append(f"made {path}")
     return sorted(wrong)
 

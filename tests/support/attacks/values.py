@@ -183,7 +183,7 @@ WORDS = {
     "null byte": "a\0b",
     "300 letters": "x" * 300,
     "5000 letters": "x" * 5000,
-    "dots": "../../nowhere",
+    "dots": "mine/../nowhere",
     "home": "~no-such-user/x",
     "null device": "/dev/null",
     "endless device": "/dev/zero",
@@ -227,7 +227,7 @@ OTHER_BASES = {
 """Of ``render``."""
 
 COSTLY = {
-    ("fit", "--budget"): ("1", "3.5", "10^4", "10^5", "1e10", "minutes"),
+    ("fit", "--budget"): ("1", "3.5", "10^4", "10^5", "1e10", "arabic digits"),
     ("render", "--orbit"): ("10^4", "10^5"),
     ("capture", "--views"): ("10^4", "10^5"),
     ("capture", "--val-views"): ("10^4", "10^5"),
