@@ -66,6 +66,7 @@ from drgs.data.path_tracing import (
     lit_part,
     load_scene,
     picture_path,
+    require_sight,
     visible_points,
 )
 from drgs.data.standpoints import ENOUGH_SENSORS, KINDS, MOST, settings_for, views_of
@@ -196,6 +197,7 @@ def run(args: argparse.Namespace) -> None:
         refuse_splats(args.scene, scene)
         settings = settings_for(scene, settings, given.keys())
         views = views_of(scene, settings)
+        require_sight(scene, settings, views)
         claim_folder(args.out, manifest(args.scene, settings))
         print(described(settings, len(views)))
         take_pictures(scene, settings, views, args.out)

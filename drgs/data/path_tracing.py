@@ -308,6 +308,29 @@ def lit_part(rgba: np.ndarray) -> float:
     return float(lit.sum() / max(1, covered.sum()))
 
 
+NOTHING_SEEN = "the cameras see nothing of the scene: give --target and --distance"
+
+SIGHT_RAYS = 64
+"""Through each picture, along both sides: what falls between them is smaller than a fit can use."""
+
+
+def require_sight(scene: mi.Scene, settings: CaptureSettings, views: list[CaptureView]) -> None:
+    """Raise :class:`UserError` where no training view sees a surface, of which points are wanted.
+
+    Before pictures are taken: it would be found out after all of them.
+    """
+    if not settings.points:
+        return
+    train = [view for view in views if view.split == "train"]
+    steps = (np.arange(SIGHT_RAYS) + 0.5) / SIGHT_RAYS
+    spots = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2) * settings.size
+    for view in train:
+        rays = view.pose[:3, 3], view_rays(view, spots, settings)
+        if first_hits(scene, *rays, settings.hides_lights)[1].any():
+            return
+    raise UserError(NOTHING_SEEN)
+
+
 def visible_points(
     scene: mi.Scene, settings: CaptureSettings, views: list[CaptureView], out: Path
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -336,7 +359,7 @@ def visible_points(
         positions.append(hits[valid][:share])
         colors.append(np.round(picture[pixels[valid], :3] * 255).astype(np.uint8)[:share])
     if not sum(map(len, positions)):
-        raise UserError("the cameras see nothing of the scene: give --target and --distance")
+        raise UserError(NOTHING_SEEN)
     return np.concatenate(positions), np.concatenate(colors)
 
 

@@ -420,6 +420,15 @@ def test_folders_of_others_are_left_alone(ball, captured, tmp_path, capsys):
     assert "the folder holds another capture: scene_sha256" in capsys.readouterr().err
 
 
+def test_cameras_that_see_nothing_are_refused_before_pictures_are_taken(ball, tmp_path, capsys):
+    """Of points there are none then, which was found out after all of the pictures."""
+    with pytest.raises(SystemExit) as stop:
+        run(ball, tmp_path / "out", *SMALL, "--distance", 3, "--target", 900, 0, 0)
+    assert stop.value.code == 2
+    assert capsys.readouterr().err.startswith("error: the cameras see nothing of the scene")
+    assert not (tmp_path / "out").exists()
+
+
 def test_a_folder_that_cannot_be_made_is_refused(ball, capsys):
     with pytest.raises(SystemExit) as stop:
         run(ball, "/dev/null/out", *SMALL)

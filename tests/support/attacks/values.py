@@ -81,6 +81,7 @@ SELDOM_RIGHT = ("nan", "inf", "-inf", "-1", "2^63", "10^400")
 """Numbers that hardly any value may be: the others often begin a fit."""
 
 LONG_WORK = {
+    "data.shutter_samples": ("underscores",),
     "iterations": ("1e4", "2^31-1"),
     "init.num_points": (),
     "densify.split_count": (),
