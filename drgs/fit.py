@@ -306,6 +306,7 @@ def fit_and_write(
         gaussians = trainer.gaussians()
     except NonFiniteError as error:
         raise UserError(f"{error}; {_remedy(out)}") from None
+    dr.flush_malloc_cache()  # encoding the orbit's frames takes as much as iterations do
     as_saved(gaussians, trainer).save(out / GAUSSIANS)
     for effect in trainer.effects:
         effect.write(out, dataset.train)

@@ -46,6 +46,11 @@ def available_memory() -> int:
     return max(0, min(_of_machine(), _of_control_groups(), _of_process()))
 
 
+def resident_memory() -> int:
+    """Bytes that this process has; 0 where the system does not say."""
+    return _pages(1)
+
+
 def readable(count: float) -> str:
     """A number of bytes as messages write it: ``3.2 GB``."""
     for unit, size in (("GB", 1e9), ("MB", 1e6)):
@@ -119,8 +124,13 @@ def _of_process() -> int:
     limit, _ = resource.getrlimit(resource.RLIMIT_AS)
     if limit == resource.RLIM_INFINITY:
         return _UNLIMITED
-    pages = next(iter(_lines(_PROC / "self" / "statm")), "0").split()[0]
-    return limit - int(pages) * resource.getpagesize()
+    return limit - _pages(0)
+
+
+def _pages(column: int) -> int:
+    """Bytes of a column of the process's numbers of pages: 0, of addresses; 1, that it has."""
+    numbers = next(iter(_lines(_PROC / "self" / "statm")), "0 0").split()
+    return int(numbers[column]) * os.sysconf("SC_PAGE_SIZE") if int(numbers[column]) else 0
 
 
 def _of_control_groups() -> int:

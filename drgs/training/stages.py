@@ -59,13 +59,16 @@ class Stage:
 
 
 def make_stages(
-    views: tuple[View, ...], config: FitConfig, effects: Sequence[TrainingEffect]
+    views: tuple[View, ...], config: FitConfig, effects: Sequence[TrainingEffect], room: int
 ) -> list[Stage]:
-    """The configuration's coarse stages, and the last one, of pictures as they are."""
+    """The configuration's coarse stages, and the last one, of pictures as they are.
+
+    room: bytes of what is made of pictures that may stay on the device.
+    """
     sizes = [(s.until, [smaller_view(v, s.factor) for v in views]) for s in config.coarse]
     view_bytes = bytes_on_device(effects)
     return [
-        Stage(until, make_training_views(resized, config, effects), view_bytes, KEPT_BYTES)
+        Stage(until, make_training_views(resized, config, effects), view_bytes, room)
         for until, resized in [*sizes, (math.inf, views)]
     ]
 

@@ -26,9 +26,10 @@ from drgs.training import densify
 from drgs.training.effects.called_for import integrator_settings, training_effects
 from drgs.training.finite_checks import GradientWatch, check_values, check_view_values
 from drgs.training.losses import PhotometricLoss
+from drgs.training.memory import room_for_targets
 from drgs.training.optimizer import make_optimizer, optimizer_state, restore_optimizer
 from drgs.training.rates import learning_rates, means_rate, rate_aims
-from drgs.training.stages import Stage, make_stages, view_of
+from drgs.training.stages import KEPT_BYTES, Stage, bytes_on_device, make_stages, view_of
 from drgs.training.views import TrainingView
 
 PREFIX = "integrator."
@@ -65,6 +66,8 @@ class Trainer:
         config = completed(config, dataset)
         self.config, self.extent = config, dataset.extent
         self.effects = training_effects(config, dataset)
+        view_bytes = bytes_on_device(self.effects)
+        room = room_for_targets(config, dataset, gaussians, view_bytes, KEPT_BYTES)
         settings = integrator_settings(self.effects)
         self.scene = make_scene(gaussians, config.model, dataset.background, **settings)
         self.integrator = self.scene.integrator()
@@ -82,7 +85,7 @@ class Trainer:
         self.means_lr = means_rate(config, self.extent)
         self.loss = PhotometricLoss(config.loss.dssim_weight)
         self.white_background = tuple(dataset.background) == (1.0, 1.0, 1.0)
-        self.stages = make_stages(dataset.train, config, self.effects)
+        self.stages = make_stages(dataset.train, config, self.effects, room)
         self.statistics = self._no_statistics()
         self.watch = GradientWatch()
         self.iteration = 0

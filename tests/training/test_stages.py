@@ -7,6 +7,7 @@ from support import small_fits as fits
 from support.trainers import make_trainer
 
 from drgs.training import stages
+from drgs.training import trainer as trainer_module
 from drgs.training.losses import TARGET_BYTES
 
 PIXELS = 20 * 16
@@ -35,7 +36,7 @@ def test_nothing_is_made_before_it_is_needed():
 
 
 def test_targets_stay_while_there_is_room(monkeypatch):
-    monkeypatch.setattr(stages, "KEPT_BYTES", 2 * PIXELS * TARGET_BYTES + 7)
+    monkeypatch.setattr(trainer_module, "KEPT_BYTES", 2 * PIXELS * TARGET_BYTES + 7)
     trainer, seen = make_trainer(), []
     for _ in range(8):  # two rounds of four views
         trainer.step()
@@ -52,7 +53,7 @@ def test_a_fit_does_not_depend_on_what_stays(monkeypatch, effects):
         return trainer, fits.everything_of(fits.steps(trainer, 8))
 
     _, kept = result()
-    monkeypatch.setattr(stages, "KEPT_BYTES", 0)
+    monkeypatch.setattr(trainer_module, "KEPT_BYTES", 0)
     trainer, made_again = result()
     assert made(trainer) == [set()]
     assert not any(view.uploads for view in trainer.views)

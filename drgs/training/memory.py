@@ -1,0 +1,235 @@
+"""What memory a fit will take at its peak, estimated before it starts, and what is refused.
+
+The peak is that of an iteration with as many Gaussians as the configuration allows: photographs as
+they are kept, targets that stay on the device, the Gaussians with all that the optimizer has of
+them, what binning and the adjoint store of splats, planes of pixels. How many entries and slots
+(see ``drgs.splatting``) splats have is counted at the start, where they are largest, for some of
+the views and some of the Gaussians; those of fitted Gaussians were counted once.
+
+The numbers of bytes below were fitted to peaks of resident memory that were measured for 10,000 to
+300,000 Gaussians and pictures of 100 x 100 to 1000 x 1000 px. Approximations other than the default
+ones may take more.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from drgs.config.schema import FitConfig
+from drgs.core.constants import ALPHA_CUT, LOW_PASS, TRANSMITTANCE_STOP
+from drgs.core.errors import UserError
+from drgs.core.memory import available_memory, readable, resident_memory
+from drgs.data.types import Dataset, View, Viewpoint
+from drgs.gaussians.parameters import Gaussians
+from drgs.splatting.grid import MICRO, TILE
+
+PROCESS_BYTES = 230_000_000
+"""Interpreter, libraries and compiled kernels; and results, as far as they come on top."""
+
+NUMBER_BYTES = 34
+"""Of each number of a Gaussian: itself, its gradient, two moments, and their successors."""
+
+GAUSSIAN_BYTES = 700
+"""Of each Gaussian besides: as it is seen, and the derivatives of that."""
+
+GROWTH_BYTES = 1300
+"""More of each where the population changes: rows are copied, and arrays of sizes that will not
+come again are held a while."""
+
+ENTRY_BYTES = 220
+"""Of each (splat, tile) entry: its record, and what sorting takes."""
+
+SLOT_BYTES = 48
+"""Of each composited (entry, micro-tile) pair: moments and derivatives of colours, padded."""
+
+PIXEL_BYTES = 155
+"""Of each pixel: planes, the picture, its gradient, and what the loss stores."""
+
+MEASURED_BYTES = 130
+"""Of each pixel of a test view, when it is measured: numbers in double precision."""
+
+FITTED_REACH = 0.55
+"""Of fitted Gaussians, in units of the root of (pixels per Gaussian): N Gaussians in P pixels have
+about N (1 + FITTED_REACH sqrt(P / N))^2 entries. Counted in fits of the shipped scene with 23,000
+and 114,000 Gaussians at 200 to 800 px: 0.42 to 0.57."""
+
+FITTED_SLOTS = 2.7
+"""Slots of an entry of fitted Gaussians: 2.0 to 3.7 in the same fits."""
+
+COUNTED_VIEWS, COUNTED_GAUSSIANS = 8, 20_000
+"""Enough to know entries and slots to a few per cent."""
+
+LARGEST = 1e6
+"""px: a radius beyond this covers any film."""
+
+MIN_WIDTH = 16
+"""px: no smaller pictures are advised."""
+
+
+@dataclass(frozen=True)
+class FitMemory:
+    """Bytes at the peak of a fit, by what takes them."""
+
+    process: int
+    photographs: int  # as they are kept
+    targets: int  # that would stay on the device if there were room for all
+    gaussians: int
+    splats: int  # entries and slots
+    pixels: int
+
+    @property
+    def needed(self) -> int:
+        """Without targets, which can be made anew."""
+        return self.process + self.photographs + self.gaussians + self.splats + self.pixels
+
+    def room_for_targets(self, available: int, most: int) -> int:
+        """What targets may take of ``available`` bytes, those included that are in use."""
+        return max(0, min(most, self.targets, available - self.needed))
+
+
+def estimate(
+    config: FitConfig,
+    dataset: Dataset,
+    gaussians: Gaussians,
+    view_bytes: int,
+    scale: float = 1.0,
+) -> FitMemory:
+    """The peak of a fit that starts with ``gaussians``.
+
+    view_bytes: of a pixel, what is made of a view's pictures; scale: of all pictures' width and
+    height, for another ``data.image_size``.
+    """
+    train, views = dataset.train, {*dataset.train, *dataset.test}
+    start = gaussians.num_gaussians
+    count = most_gaussians(config, start)
+    pixels = scale**2 * max(view.width * view.height for view in train)
+    measured = scale**2 * max((view.width * view.height for view in dataset.test), default=0)
+    times = max(_times(view) for view in train)
+
+    fitted = count * (1 + FITTED_REACH * math.sqrt(pixels / count)) ** 2
+    entries, slots = _at_start(train, gaussians, config.model.near_plane, scale)
+    entries, slots = max(entries, fitted), max(slots, FITTED_SLOTS * fitted)
+    numbers = 11 + 3 * (config.model.sh_degree + 1) ** 2
+    of_gaussian = NUMBER_BYTES * numbers + GAUSSIAN_BYTES + (GROWTH_BYTES if count > start else 0)
+    return FitMemory(
+        process=PROCESS_BYTES,
+        photographs=round(sum(_kept_bytes(view, scale) for view in views)),
+        targets=round(scale**2 * view_bytes * sum(view.width * view.height for view in train)),
+        gaussians=round(of_gaussian * count),
+        splats=round(ENTRY_BYTES * entries * times + SLOT_BYTES * slots),
+        pixels=round(PIXEL_BYTES * pixels * times + MEASURED_BYTES * measured),
+    )
+
+
+def most_gaussians(config: FitConfig, start: int) -> int:
+    """How many a fit can have that starts with ``start``: each change adds a row for each, or more.
+
+    At most ``densify.max_gaussians``, but for those that are there at the start.
+    """
+    densify, last = config.densify, min(config.iterations, config.densify.stop - 1)
+    changes = max(0, last // densify.every - densify.start // densify.every)
+    doublings = math.log2(max(densify.max_gaussians, start) / start)
+    if changes * math.log2(densify.split_count) >= doublings:
+        return max(start, densify.max_gaussians)
+    return start * densify.split_count**changes
+
+
+def _kept_bytes(view: View, scale: float) -> float:
+    """Of a view's pictures: bytes, or the numbers of smaller ones where these take less."""
+    pictures = [p for p in (view.image, view.alpha, view.mask, view.depth) if p is not None]
+    numbers = 4 * scale**2 * sum(math.prod(picture.shape) for picture in pictures)
+    return min(sum(picture.nbytes for picture in pictures), numbers)
+
+
+def _times(view: View) -> int:
+    """Pictures that are rendered of a view: of a blurred one, several."""
+    is_blurred = view.motion is not None and view.motion.shutter == "global"
+    return view.motion.samples if is_blurred else 1
+
+
+def _at_start(
+    views: Sequence[Viewpoint], gaussians: Gaussians, near: float, scale: float
+) -> tuple[float, float]:
+    """Entries and slots of the view that has most, of some: splats taken as round."""
+    g = gaussians.numpy()
+    step = -(-g.num_gaussians // COUNTED_GAUSSIANS)
+    means, scales = g.means[::step].astype(np.float64), np.exp(g.log_scales[::step].mean(axis=1))
+    opacities = np.maximum(g.opacities[::step], 1.01 * ALPHA_CUT)
+    reach = np.sqrt(2 * np.log(opacities / ALPHA_CUT))
+    counts = []
+    for view in views[:: -(-len(views) // COUNTED_VIEWS)]:
+        x, y, z = ((means - view.center) @ view.camera_to_world[:3, :3]).T
+        seen = z > near
+        z = np.where(seen, z, 1)
+        focal, size = scale * math.sqrt(view.fx * view.fy), np.array([view.width, view.height])
+        radius = np.minimum(reach * np.sqrt((focal * scales / z) ** 2 + LOW_PASS), LARGEST)
+        tiles, boxes = seen.astype(np.float64), np.ones(len(z))
+        centers = scale * (view.fx * x / z + view.cx), scale * (view.fy * y / z + view.cy)
+        for center, length in zip(centers, scale * size, strict=True):
+            inside = np.minimum(center + radius, length) - np.maximum(center - radius, 0)
+            tiles *= np.where(inside > 0, np.maximum(inside, 0) / TILE + 1, 0)
+            boxes *= np.maximum(inside, 0) / (2 * radius)
+        # Cells of a grid that a disc touches on average, and what of it is on the film.
+        micros = boxes * (np.pi * radius**2 + 4 * radius * MICRO + MICRO**2) / MICRO**2
+        alpha = (opacities - ALPHA_CUT) / np.log(opacities / ALPHA_CUT)  # mean over the disc
+        weights = np.where(seen, micros, 0)
+        total = float(weights.sum())
+        layers = -math.log(TRANSMITTANCE_STOP) * total / max(float((weights * alpha).sum()), 1e-9)
+        composited = layers * scale**2 * view.width * view.height / MICRO**2
+        counts.append((step * float(tiles.sum()), min(step * total, composited)))
+    return max(entries for entries, _ in counts), max(slots for _, slots in counts)
+
+
+def room_for_targets(
+    config: FitConfig, dataset: Dataset, gaussians: Gaussians, view_bytes: int, most: int
+) -> int:
+    """Bytes of targets that may stay on the device, at most ``most``.
+
+    view_bytes: see :func:`estimate`. Raises :class:`UserError` where the fit would not fit into
+    memory.
+    """
+    memory = estimate(config, dataset, gaussians, view_bytes)
+    available = available_memory() + resident_memory()
+    if memory.needed > available:
+        raise UserError(_refusal(config, dataset, gaussians, memory, available))
+    return memory.room_for_targets(available, most)
+
+
+def _refusal(
+    config: FitConfig, dataset: Dataset, gaussians: Gaussians, memory: FitMemory, available: int
+) -> str:
+    start, train = gaussians.num_gaussians, dataset.train
+    count = most_gaussians(config, start)
+    parts = [
+        f"{readable(memory.photographs)} for {len({*train, *dataset.test}):,} photographs",
+        f"{readable(memory.gaussians)} for {count:,} Gaussians",
+        f"{readable(memory.splats + memory.pixels)} for a picture of them",
+    ]
+    remedies = []
+    spare = available - memory.needed + memory.gaussians
+    if (fewer := int(0.95 * spare * count / memory.gaussians)) > start:
+        remedies.append(f"densify.max_gaussians={_rounded(fewer)}")
+    width = max(view.width for view in train)
+
+    def fits(scale: float) -> bool:
+        return estimate(config, dataset, gaussians, 0, scale).needed <= 0.95 * available
+
+    scales = (0.95**k for k in range(1, 100))
+    smaller = next((int(width * scale) for scale in scales if fits(scale)), 0)
+    if smaller >= MIN_WIDTH:
+        remedies.append(f"data.image_size={_rounded(smaller)}")
+    advice = f"set {' or '.join(remedies)}" if remedies else "use fewer views and Gaussians"
+    return (
+        f"memory: the fit needs about {readable(memory.needed)} ({', '.join(parts)}), and "
+        f"{readable(available)} are available; {advice}"
+    )
+
+
+def _rounded(number: int) -> int:
+    """Down to two digits."""
+    digits = 10 ** max(0, len(str(number)) - 2)
+    return number // digits * digits

@@ -1,0 +1,262 @@
+"""What a fit needs is estimated before it starts, and refused in words where it does not fit."""
+
+import json
+import math
+from dataclasses import replace
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+import yaml
+from PIL import Image
+
+from drgs.cameras.axes import between_opencv_and_opengl
+from drgs.config.changes import changed
+from drgs.config.schema import FitConfig
+from drgs.core.errors import UserError
+from drgs.data.initial import initial_gaussians
+from drgs.data.kept import KeptPicture
+from drgs.data.types import Dataset, Motion, View
+from drgs.data.viewpoints import look_at, pinhole
+from drgs.integrator.scene import make_scene, make_sensors
+from drgs.splatting import rasterize
+from drgs.training import memory
+from drgs.training.losses import TARGET_BYTES
+from drgs.training.trainer import Trainer
+
+GB = 10**9
+
+
+def dataset_of(width, height, count, channels=3):
+    """Views around the origin whose photographs nobody reads."""
+
+    def view(index):
+        azimuth = 2 * np.pi * 0.618 * index
+        origin = 4 * np.array([np.cos(azimuth) * 0.87, np.sin(azimuth) * 0.87, 0.48])
+        camera = pinhole(f"v{index}", look_at(origin, (0, 0, 0), (0, 0, 1)), width, height, 40.0)
+        image = KeptPicture((height, width, 3), None, width * height * channels)
+        return View(**vars(camera), image=image)
+
+    views = tuple(view(index) for index in range(count + 2))
+    return Dataset(views[2:], views[:2], "test", (1.0, 1.0, 1.0), 1.3, "")
+
+
+def config_of(start, most, **changes):
+    values = {"data.path": ".", "init.num_points": start, "densify.max_gaussians": most}
+    return changed(FitConfig(data={"path": "."}), values | changes)
+
+
+def estimated(config, dataset, view_bytes=TARGET_BYTES, scale=1.0):
+    return memory.estimate(config, dataset, initial_gaussians(config, dataset), view_bytes, scale)
+
+
+# ----------------------------------------------------------------------------------------------
+# The estimate
+# ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("size", "start", "most", "views", "measured_mb"),
+    [
+        (100, 5_000, 10_000, 10, 291),
+        (400, 50_000, 100_000, 20, 1019),
+        (800, 50_000, 100_000, 10, 1954),
+        (400, 150_000, 300_000, 10, 1703),
+        (1000, 10_000, 20_000, 20, 2140),
+        (1000, 50_000, 100_000, 10, 2702),
+        (1000, 150_000, 300_000, 6, 4092),
+    ],
+)
+def test_estimates_are_what_was_measured(size, start, most, views, measured_mb):
+    """Peaks of resident memory, MiB, of fits that grew to their cap, with all targets kept."""
+    dataset = dataset_of(size, size, views)
+    peak = estimated(config_of(start, most), dataset)
+    assert (peak.needed + peak.targets) / 2**20 == pytest.approx(measured_mb, rel=0.18)
+
+
+def test_entries_and_slots_at_the_start_are_those_of_a_rendering(monkeypatch):
+    mi.set_variant("llvm_ad_rgb")
+    dataset = dataset_of(200, 150, 8)
+    config = config_of(3000, 3000)
+    gaussians = initial_gaussians(config, dataset)
+    scene = make_scene(gaussians, config.model, (1.0, 1.0, 1.0))
+    slots, assign = [], rasterize.assign_slots
+
+    def assign_and_count(*arguments):
+        assigned = assign(*arguments)
+        slots.append(assigned.count)
+        return assigned
+
+    monkeypatch.setattr(rasterize, "assign_slots", assign_and_count)
+    params, entries = mi.traverse(scene), []
+    for sensor in make_sensors(dataset.train):
+        dr.enable_grad(params["integrator.means"])
+        params.update()
+        dr.backward(dr.mean(mi.render(scene, params, sensor=sensor, spp=1).array))
+        frame = scene.integrator().memory.rendered[0].frames[0][0]
+        entries.append(frame.bins.num_entries)
+    found = memory._at_start(dataset.train, gaussians, 0.2, 1.0)
+    assert found == pytest.approx((max(entries), max(slots)), rel=0.1)
+
+
+def test_photographs_count_as_they_are_kept():
+    """As bytes, and as numbers at a width where these take less."""
+    config, pixels = config_of(1000, 1000), 300 * 200 * 12
+    dataset = dataset_of(300, 200, 10)
+    assert estimated(config, dataset).photographs == 3 * pixels
+    assert estimated(config, dataset, scale=0.9).photographs == 3 * pixels
+    assert estimated(config, dataset, scale=0.25).photographs == pytest.approx(12 / 16 * pixels)
+    assert estimated(config, dataset).targets == TARGET_BYTES * pixels * 10 / 12
+
+
+def test_each_time_of_a_shutter_counts():
+    config, dataset = config_of(1000, 1000), dataset_of(60, 40, 3)
+    first = dataset.train[0]
+    blurred = replace(first, motion=Motion(first.camera_to_world, "global", 10))
+    blurred = replace(dataset, train=(blurred, *dataset.train[1:]))
+    once, often = (estimated(config, data) for data in (dataset, blurred))
+    assert often.splats > 3 * once.splats and often.pixels > 3 * once.pixels
+    assert often.gaussians == once.gaussians
+
+
+@pytest.mark.parametrize(
+    ("changes", "expected"),
+    [
+        ({"densify.max_gaussians": 5000}, 5000),
+        ({"densify.max_gaussians": 900}, 1000),  # those of the start cloud stay
+        ({"iterations": 400}, 1000),  # no change before
+        ({"iterations": 700}, 4000),  # after 600 and 700
+        ({"iterations": 700, "densify.split_count": 3}, 9000),
+        ({"densify.stop": 700}, 2000),
+        ({"densify.start": 29_000, "densify.stop": 29_050}, 1000),
+    ],
+)
+def test_a_population_grows_to_its_cap_if_there_is_time(changes, expected):
+    config = config_of(500, 10**6, **changes)
+    assert memory.most_gaussians(config, 1000) == expected
+
+
+# ----------------------------------------------------------------------------------------------
+# Refusals
+# ----------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def available(monkeypatch):
+    """Sets how much memory there is."""
+
+    def set_to(count):
+        monkeypatch.setattr(memory, "available_memory", lambda: count)
+        monkeypatch.setattr(memory, "resident_memory", lambda: 0)
+
+    return set_to
+
+
+def room(config, dataset, most=GB):
+    gaussians = initial_gaussians(config, dataset)
+    return memory.room_for_targets(config, dataset, gaussians, TARGET_BYTES, most)
+
+
+def test_targets_get_what_is_left(available):
+    config, dataset = config_of(1000, 1000), dataset_of(100, 100, 20)
+    peak = estimated(config, dataset)
+    assert peak.targets == 7_200_000
+    for left, expected in ((0, 0), (10**6, 10**6), (GB, 7_200_000)):
+        available(peak.needed + left)
+        assert room(config, dataset) == expected
+    assert room(config, dataset, most=3) == 3
+
+
+def test_a_fit_that_does_not_fit_is_refused_with_numbers_and_remedies(available):
+    """What is advised is enough."""
+    config, dataset = config_of(10_000, 10**6), dataset_of(400, 400, 20)
+    available(2 * GB)
+    with pytest.raises(UserError) as error:
+        room(config, dataset)
+    message = str(error.value)
+    assert message.startswith("memory: the fit needs about 4.")
+    assert ", and 2 GB are available; set densify.max_gaussians=" in message
+    assert "\n" not in message and "1,000,000 Gaussians" in message
+    fewer = int(message.partition("max_gaussians=")[2].split()[0])
+    assert 200_000 < fewer < 400_000
+    room(config_of(10_000, fewer), dataset)
+
+
+def test_smaller_pictures_are_advised_where_they_help(available):
+    config, dataset = config_of(10_000, 10_000), dataset_of(5376, 3024, 4)
+    available(3 * GB)
+    with pytest.raises(UserError, match=r"set data\.image_size=") as error:
+        room(config, dataset)
+    width = int(str(error.value).rpartition("image_size=")[2])
+    assert 500 < width < 4000 and "max_gaussians" not in str(error.value)
+    peak = estimated(config, dataset, scale=width / 5376)
+    assert 2 * GB < peak.needed < 3 * GB
+
+
+def test_nothing_is_advised_where_nothing_helps(available):
+    available(100_000_000)
+    with pytest.raises(UserError, match=r"available; use fewer views and Gaussians$"):
+        room(config_of(1000, 1000), dataset_of(20, 20, 4))
+
+
+def test_a_trainer_asks_before_it_takes_anything(available):
+    mi.set_variant("llvm_ad_rgb")
+    config, dataset = config_of(1000, 1000), dataset_of(20, 20, 4)
+    available(100_000_000)
+    with pytest.raises(UserError, match=r"^memory: the fit needs about "):
+        Trainer(config, dataset, initial_gaussians(config, dataset))
+
+
+# ----------------------------------------------------------------------------------------------
+# The peak itself
+# ----------------------------------------------------------------------------------------------
+
+MEASURED = """
+import resource, sys
+from drgs import fit
+from drgs.training import memory
+from drgs.training.stages import KEPT_BYTES
+peaks, estimate = [], memory.estimate
+memory.estimate = lambda *arguments: peaks.append(estimate(*arguments)) or peaks[-1]
+fit.main(sys.argv[1:])
+expected = peaks[0].needed + min(peaks[0].targets, KEPT_BYTES)
+print("peak", expected, 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
+"""
+
+
+def write_photographs(folder, size, count):
+    """JPEGs of waves, from around the origin, in nerfstudio's layout."""
+    folder.mkdir()
+    y, x = np.mgrid[:size, :size]
+    frames = []
+    for index, view in enumerate(dataset_of(size, size, count - 2).train):
+        waves = [127 + 100 * np.sin(x / (7 + c) + index) * np.cos(y / (9 + c)) for c in range(3)]
+        Image.fromarray(np.stack(waves, axis=2).astype(np.uint8)).save(folder / f"{index}.jpg")
+        pose = between_opencv_and_opengl(view.camera_to_world)
+        frames.append({"file_path": f"{index}.jpg", "transform_matrix": pose.tolist()})
+    values = {"camera_angle_x": math.radians(40), "frames": frames}
+    (folder / "transforms.json").write_text(json.dumps(values))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("size", "start", "views"), [(100, 5_000, 12), (400, 30_000, 20)])
+def test_the_peak_of_a_fit_is_within_a_quarter_of_the_estimate(
+    tmp_path, run_python, size, start, views
+):
+    """Results written: the whole command, in a process of its own, with twice as many Gaussians."""
+    write_photographs(tmp_path / "data", size, views)
+    config = {
+        "data": {"path": str(tmp_path / "data")},
+        "init": {"num_points": start, "half_extent": 1.3},
+        "densify": {"start": 2, "every": 3, "stop": 26, "grad_threshold": 1e-12},
+        "model": {"sh_increase_every": 1},
+        "iterations": 30,
+    }
+    config["densify"] |= {"max_gaussians": 2 * start, "white_background_reset": None}
+    (tmp_path / "a.yml").write_text(yaml.safe_dump(config))
+    arguments = ["a.yml", "--out", "out"]
+    done = run_python(f"import sys; sys.argv[1:] = {arguments}\n{MEASURED}", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    _, expected, peak = next(x for x in done.stdout.splitlines() if x.startswith("peak ")).split()
+    assert int(peak) == pytest.approx(int(expected), rel=0.25)
