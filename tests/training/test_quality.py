@@ -1,5 +1,6 @@
 """PSNR of test views on the way: measured where it is due, with no effect on the fit."""
 
+import mitsuba as mi
 import numpy as np
 import pytest
 from support.small_capture import decibels
@@ -46,6 +47,7 @@ def test_measuring_changes_nothing_that_comes():
         "densify__stop": 30,
         "densify__every": 5,
     }
+    mi.set_variant("llvm_ad_rgb")
     dataset = true_dataset()
     plain = steps(make_trainer(dataset, **changes), 14)
     watched, history = make_trainer(dataset, **changes), History()
