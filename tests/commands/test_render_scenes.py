@@ -2,7 +2,9 @@
 
 import mitsuba as mi
 import numpy as np
+import pytest
 from conftest import REPOSITORY
+from support.commands import assert_refused
 from support.folders import visible
 from support.openexr import read_exr
 from support.render_command import (
@@ -23,6 +25,9 @@ from support.small_capture import (
     pose_around,
 )
 from support.small_capture import view as small_view
+
+from drgs import render
+from drgs.io.pictures import write_exr
 
 
 def to_linear(x):
@@ -133,3 +138,38 @@ def test_the_shipped_scene_shows_objects_among_splats(tmp_path):
     # The file has half precision: 11 bits.
     agree = np.all(np.abs(shown - objects) <= 1e-3 * (1 + objects), axis=-1)
     assert 0.3 < agree.mean() < 0.9
+
+
+@pytest.mark.parametrize(
+    ("change", "settings", "message"),
+    [
+        (
+            ('"sample_count" value="1"', '"sample_count" value="0"'),
+            "",
+            "a sample_count of at least",
+        ),
+        (('"sample_count" value="1"', f'"sample_count" value="{10**9}"'), "", "at most 4,096 samp"),
+        ((f'"width" value="{WIDTH}"', '"width" value="1000000000"'), "", "too many for Dr.Jit"),
+        (("", ""), '<integer name="nested_spp" value="4294967296"/>', "from 0 to 2147483647, got"),
+        (("", ""), '<float name="neer" value="1"/>', "no parameter neer; did you mean near?"),
+    ],
+)
+def test_what_a_scene_cannot_ask_for_is_refused_in_one_line(tmp_path, change, settings, message):
+    """Before: SIGFPE, SIGSEGV, tracebacks."""
+    path = write_scene(tmp_path, sensor(pose_around(0.8, 0.3)), settings=settings)
+    path.write_text(path.read_text().replace(*change))
+    arguments = (path, "--out", tmp_path / "out")
+    assert_refused(render.main, *arguments, folder=tmp_path, message=message)
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_scene_with_an_environment_is_rendered_on_one_thread(tmp_path):
+    """Files of OpenEXR are read and written, by threads that there are none of."""
+    write_exr(tmp_path / "sky.exr", mi.Bitmap(np.full((4, 8, 3), 0.5, np.float32)))
+    path = write_scene(tmp_path, sensor(pose_around(0.8, 0.3)))
+    sky = '<emitter type="envmap"><string name="filename" value="sky.exr"/></emitter></scene>'
+    path.write_text(path.read_text().replace("</scene>", sky))
+    for threads in (1, 2):
+        run(path, "--out", tmp_path / f"out_{threads}", "--threads", threads)
+    one, two = (tmp_path / f"out_{threads}" / "blobs.exr" for threads in (1, 2))
+    np.testing.assert_array_equal(np.array(read_exr(one)), np.array(read_exr(two)))
