@@ -42,7 +42,7 @@ from drgs.config.load import load_config
 from drgs.config.schema import NAMED_COLORS, FitConfig, ModelConfig
 from drgs.core.constants import SHUTTER_SAMPLES
 from drgs.core.errors import PluginError, UserError, one_line, reason_of_mitsuba
-from drgs.core.files import atomic_path, open_regular
+from drgs.core.files import atomic_path, open_regular, shortened
 from drgs.data import Dataset, load_dataset
 from drgs.data.derived import completed
 from drgs.data.orbits import orbit_of_gaussians, orbit_of_views, orbit_size
@@ -63,7 +63,7 @@ from drgs.io.pictures import (
     MITSUBA_FORMATS,
     check_animation,
     image_format,
-    read_image,
+    read_pixels,
     write_animation,
     write_exr,
     write_png,
@@ -400,7 +400,8 @@ def render_mitsuba_scene(path: Path, out: Path, definitions: dict[str, str]) -> 
     if isinstance(scene.integrator(), SummarisingIntegrator):
         _print_summary(path, scene)
     count = len(scene.sensors())
-    names = [path.stem if count == 1 else f"{path.stem}_{index}" for index in range(count)]
+    stem = shortened(path.stem)
+    names = [stem if count == 1 else f"{stem}_{index}" for index in range(count)]
     files = [f"{name}.{suffix}" for name in names for suffix in ("exr", "png")]
     bitmaps = claiming(out, files, _bitmaps(path, scene))
     for name, bitmap in zip(names, bitmaps, strict=True):
@@ -559,7 +560,7 @@ def _background(args: argparse.Namespace) -> tuple[float, float, float] | Path:
 
 def _background_picture(path: Path) -> Path:
     """``path``, if Mitsuba can read the picture; else say what is wrong with it."""
-    read_image(path)
+    read_pixels(path)
     if (name := image_format(path)) not in MITSUBA_FORMATS:
         raise UserError(
             f"--background: {path} must be a PNG, JPEG, BMP, PPM or TGA picture, got {name}; "

@@ -53,6 +53,18 @@ def check_path(path: str | Path) -> None:
         raise ValueError(f"a path must have at most {MAX_PATH_BYTES:,} bytes, got {len(encoded):,}")
 
 
+STEM_BYTES = 200
+"""Of a file's name that is made of another: numbers, suffixes and temporary names follow."""
+
+
+def shortened(stem: str) -> str:
+    """The beginning of ``stem``, or all of it: as much as a file's name has room for."""
+    encoded = os.fsencode(stem)
+    if len(encoded) <= STEM_BYTES:
+        return stem
+    return encoded[:STEM_BYTES].decode("utf-8", "ignore")
+
+
 _SPECIAL = {"p": "a named pipe", "c": "a device", "b": "a device", "s": "a socket"}
 """What is no regular file, by the first letter of ``ls -l``."""
 

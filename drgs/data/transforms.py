@@ -23,7 +23,7 @@ from drgs.cameras.axes import between_opencv_and_opengl
 from drgs.config.explain import expectation
 from drgs.config.schema import DataConfig
 from drgs.core.errors import UserError, one_line
-from drgs.core.files import read_text
+from drgs.core.files import read_text, shortened
 from drgs.data.types import Motion
 
 if TYPE_CHECKING:
@@ -58,9 +58,6 @@ DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 
 RATIONAL_MODEL = "FULL_OPENCV"
 """The model of a camera that has k4 to k6."""
-
-MAX_NAME_BYTES = 200
-"""Of a view's name, which names files: file systems allow 255, of which suffixes take some."""
 
 FISHEYE_MODELS = ("SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "OPENCV_FISHEYE")
 """The others are a pinhole camera apart from their distortion."""
@@ -369,15 +366,9 @@ def unique_names(files: Sequence[str]) -> list[str]:
     if len(set(names)) < len(names):
         relative = [path.with_suffix("").relative_to(path.anchor) for path in paths]
         names = ["_".join(path.parts) for path in relative]
-    longest = max(len(os.fsencode(name)) for name in names)
-    if len(set(names)) < len(names) or longest > MAX_NAME_BYTES:
-        names = [f"{index:04d}_{_cut(name)}" for index, name in enumerate(names)]
+    if len(set(names)) < len(names) or any(name != shortened(name) for name in names):
+        names = [f"{index:04d}_{shortened(name)}" for index, name in enumerate(names)]
     return names
-
-
-def _cut(name: str) -> str:
-    """So much of its beginning as leaves room for a number, a suffix, and temporary names."""
-    return os.fsencode(name)[:MAX_NAME_BYTES].decode("utf-8", "ignore")
 
 
 def in_parallel(function: Callable[..., T], *arguments: Sequence[object]) -> tuple[T, ...]:

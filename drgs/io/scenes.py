@@ -12,7 +12,7 @@ from pathlib import Path
 import drjit as dr
 import mitsuba as mi
 
-from drgs.core.errors import UserError
+from drgs.core.errors import UserError, one_line
 from drgs.core.files import open_regular
 
 
@@ -39,6 +39,14 @@ def load_scene_file(path: Path, **definitions: str) -> mi.Object:
 
     Raises RuntimeError as Mitsuba does, and :class:`UserError` for what Mitsuba would not survive.
     """
+    for text in (str(path), *definitions.values()):
+        try:
+            text.encode()
+        except UnicodeEncodeError:
+            shown = one_line(repr(text), 80)
+            raise UserError(
+                f"{path}: Mitsuba takes names in UTF-8 only, got {shown}; rename it"
+            ) from None
     open_regular(path, "scene").close()
     if not {"config", "filename"} & set(definitions):  # names that the parser does not take
         config = mi.parser.ParserConfig(mi.variant())

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from PIL import Image
 from support.commands import run_in_process
-from support.small_capture import blobs
+from support.render_command import sensor, write_scene
+from support.small_capture import blobs, pose_around
 
 from drgs import capture, fit, render
 from drgs.core.errors import UserError
@@ -109,3 +110,18 @@ def test_folders_of_names_that_none_can_have_are_refused(tmp_path, main):
         assert outcome.returncode == 2 and outcome.stderr.count("\n") == 1
         assert "must have at most" in outcome.stderr
     assert os.listdir(tmp_path) == ["a.yml"]
+
+
+def test_pictures_of_a_scene_with_a_long_name_have_a_shorter_one(tmp_path):
+    scene = write_scene(tmp_path, sensor(pose_around(0.3, 0.5)))
+    long = scene.rename(scene.with_name("x" * 251 + ".xml"))
+    outcome = run_in_process(render.main, long, "--out", tmp_path / "out")
+    assert outcome.returncode == 0, outcome.stderr
+    names = {name for name in os.listdir(tmp_path / "out") if not name.startswith(".")}
+    assert names == {"x" * 200 + ".exr", "x" * 200 + ".png"}
+
+
+def test_a_scene_whose_name_is_not_utf_8_is_refused(tmp_path):
+    scene = write_scene(tmp_path, sensor(pose_around(0.3, 0.5)))
+    other = scene.rename(scene.with_name(os.fsdecode(b"\xff.xml")))
+    assert "Mitsuba takes names in UTF-8 only" in refused(render.main, tmp_path / "out", other)

@@ -4,7 +4,7 @@ import os
 import pytest
 
 from drgs.core.errors import UserError
-from drgs.core.files import atomic_path, open_regular, read_text
+from drgs.core.files import atomic_path, open_regular, read_text, shortened
 
 
 def test_atomic_path_replaces_the_file_and_creates_folders(tmp_path):
@@ -104,3 +104,10 @@ def test_only_regular_files_are_read_and_none_is_waited_for(tmp_path):
     (tmp_path / "link").unlink()
     (tmp_path / "link").symlink_to(tmp_path / "a.txt")
     assert read_text(tmp_path / "link", "poem", 9) == "x"
+
+
+def test_names_are_shortened_between_two_characters():
+    assert shortened("a" * 200) == "a" * 200
+    assert shortened("a" * 201) == "a" * 200
+    assert shortened("a" + "\u4e2d" * 90) == "a" + "\u4e2d" * 66
+    assert shortened(os.fsdecode(b"\xff") * 9) == os.fsdecode(b"\xff") * 9
