@@ -48,11 +48,14 @@ def load_scene_file(path: Path, **definitions: str) -> mi.Object:
                 f"{path}: Mitsuba takes names in UTF-8 only, got {shown}; rename it"
             ) from None
     open_regular(path, "scene").close()
-    if not {"config", "filename"} & set(definitions):  # names that the parser does not take
-        config = mi.parser.ParserConfig(mi.variant())
-        _check(mi.parser.parse_file(config, str(path), **definitions).nodes, path)
-    with openexr_threads():
-        return mi.load_file(str(path), **definitions)
+    try:
+        if not {"config", "filename"} & set(definitions):  # names that the parser does not take
+            config = mi.parser.ParserConfig(mi.variant())
+            _check(mi.parser.parse_file(config, str(path), **definitions).nodes, path)
+        with openexr_threads():
+            return mi.load_file(str(path), **definitions)
+    except UnicodeDecodeError:  # Mitsuba's own error, which quotes the file
+        raise UserError(f"{path}: not a valid scene: it holds bytes that are not UTF-8") from None
 
 
 def load_scene_dictionary(description: dict[str, object], path: Path) -> mi.Object:

@@ -125,3 +125,12 @@ def test_a_scene_whose_name_is_not_utf_8_is_refused(tmp_path):
     scene = write_scene(tmp_path, sensor(pose_around(0.3, 0.5)))
     other = scene.rename(scene.with_name(os.fsdecode(b"\xff.xml")))
     assert "Mitsuba takes names in UTF-8 only" in refused(render.main, tmp_path / "out", other)
+
+
+def test_a_scene_that_holds_other_bytes_is_refused(tmp_path):
+    scene = write_scene(tmp_path, sensor(pose_around(0.3, 0.5)))
+    content = scene.read_bytes()
+    assert content.count(b'type="splats"') == 1
+    scene.write_bytes(content.replace(b'type="splats"', b'type="spl\xa9ts"'))
+    line = refused(render.main, tmp_path / "out", scene)
+    assert f"{scene}: not a valid scene: it holds bytes that are not UTF-8" in line
