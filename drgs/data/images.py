@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,9 +10,21 @@ import numpy as np
 
 from drgs.core.errors import UserError, one_line
 from drgs.core.files import open_regular
+from drgs.core.memory import available_memory, readable
 from drgs.data.kept import KeptPicture, Pixels
 from drgs.data.types import View
-from drgs.io.pictures import BITS, MAX_BYTES, as_numbers, image_mode, image_size, read_image
+from drgs.io.pictures import (
+    BITS,
+    MAX_BYTES,
+    as_numbers,
+    image_mode,
+    image_size,
+    read_image,
+    stored_shape,
+)
+
+NUMBERS_AT_ONCE, MOST_THREADS = 1 << 25, 8
+"""Pixels of photographs that are being read: of 40 bytes each, at most."""
 
 MAX_DEPTH_STEPS = 2**16 - 1
 """White in a picture of 16 bits."""
@@ -110,7 +122,10 @@ def downscaled_size(width: int, height: int, max_width: int | None) -> tuple[int
 def kept_photograph(
     pixels: np.ndarray, background: tuple[float, float, float], max_width: int | None
 ) -> tuple[Pixels, Pixels | None]:
-    """``image`` and ``alpha`` of a :class:`View`, kept in whichever form takes less memory.
+    """``image`` and ``alpha`` of a :class:`View`, kept in a form that takes little memory.
+
+    As the file has it; where that is scaled down to less than half, as numbers, which take less;
+    and where it is scaled by no whole factor, which takes long, as numbers rounded to 16 bits.
 
     pixels: what :func:`drgs.io.pictures.read_pixels` gave; background: behind transparent pixels,
     display space; max_width: see :func:`downscale`.
@@ -126,9 +141,47 @@ def kept_photograph(
 
     if 4 * new_width * new_height * channels < pixels.nbytes:
         return image(), alpha() if channels == 4 else None
+    if width % new_width or height % new_height:
+        return kept_rounded(image()), kept_rounded(alpha()) if channels == 4 else None
     shape = (new_height, new_width)
     opaqueness = KeptPicture(shape, alpha, 0) if channels == 4 else None
     return KeptPicture((*shape, 3), image, pixels.nbytes), opaqueness
+
+
+def kept_rounded(numbers: np.ndarray) -> KeptPicture:
+    """Numbers in 0..1, kept in 16 bits each."""
+    kept = np.round(numbers * np.float32(MAX_DEPTH_STEPS)).astype(np.uint16)
+    return KeptPicture(kept.shape, lambda: as_numbers(kept), kept.nbytes)
+
+
+def check_room(files: Sequence[Path], max_width: int | None) -> None:
+    """Raise :class:`UserError` where photographs do not fit into memory as they would be kept.
+
+    Before any is decoded, from the files' headers; max_width: see :func:`downscale`.
+    """
+    needed = numbers = 0
+    for file in files:
+        width, height, channels, depth = stored_shape(file)
+        new_width, new_height = downscaled_size(width, height, max_width)
+        new_size, size = channels * new_width * new_height, channels * depth * width * height
+        is_scaled = width % new_width or height % new_height
+        needed += min(4 * new_size, 2 * new_size if is_scaled else size)
+        numbers += 4 * new_size
+    if needed <= (available := available_memory()):
+        return
+    widest = max(downscaled_size(*image_size(file), max_width)[0] for file in files)
+    fitting = max(1, int(widest * (0.5 * available / numbers) ** 0.5))
+    raise UserError(
+        f"{files[0].parent}: {len(files):,} photographs take {readable(needed)} of memory as they "
+        f"are kept, and {readable(available)} are available; set data.image_size={fitting}, or use "
+        "fewer of them"
+    )
+
+
+def threads_for(files: Sequence[Path]) -> int:
+    """How many photographs to read at once, so that numbers of all of them do not fill memory."""
+    width, height = image_size(files[0])
+    return max(1, min(MOST_THREADS, NUMBERS_AT_ONCE // (width * height)))
 
 
 def smaller_view(view: View, factor: int) -> View:

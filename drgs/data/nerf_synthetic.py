@@ -18,7 +18,7 @@ import numpy as np
 from drgs.config.schema import DataConfig
 from drgs.core.errors import UserError
 from drgs.data.extras import extras_of, files_of, ignored, notes
-from drgs.data.images import kept_photograph
+from drgs.data.images import check_room, kept_photograph, threads_for
 from drgs.data.transforms import (
     Frame,
     focal_from_angle,
@@ -83,6 +83,7 @@ def _transforms_path(folder: Path, split: str) -> Path:
 def _load_split(config: DataConfig, split: str, frames: list[Frame]) -> tuple[View, ...]:
     files = [image_path(config.path, frame) for frame in frames]
     size = image_size(files[0])
+    check_room(files, config.image_size)
 
     def load_view(index: int, name: str) -> View:
         frame = frames[index]
@@ -108,7 +109,7 @@ def _load_split(config: DataConfig, split: str, frames: list[Frame]) -> tuple[Vi
         )
 
     names = unique_names([frame.own.file_path for frame in frames])
-    return in_parallel(load_view, range(len(frames)), names)
+    return in_parallel(load_view, range(len(frames)), names, threads=threads_for(files))
 
 
 def _angle(frame: Frame) -> float:

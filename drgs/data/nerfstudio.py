@@ -17,7 +17,7 @@ from pathlib import Path
 from drgs.config.schema import DataConfig
 from drgs.core.errors import UserError
 from drgs.data.extras import extras_of, files_of, ignored, notes
-from drgs.data.images import kept_photograph
+from drgs.data.images import check_room, kept_photograph, threads_for
 from drgs.data.orientation import as_calibrated
 from drgs.data.transforms import (
     Frame,
@@ -51,13 +51,14 @@ def load(config: DataConfig) -> Dataset:
         raise UserError(f"{path}: at least 2 views are needed, one of them to test; got 1")
     files = [image_path(config.path, frame) for frame in frames]
     config = _completed(config, files)
+    check_room(files, config.image_size)
 
     def load_view(index: int, name: str) -> View:
         return _load_view(config, frames[index], files[index], name)
 
     order = sorted(range(len(frames)), key=lambda index: frames[index].own.file_path)
     names = unique_names([frames[index].own.file_path for index in order])
-    views = in_parallel(load_view, order, names)
+    views = in_parallel(load_view, order, names, threads=threads_for(files))
     test = views[:: config.test_every]
     train = tuple(v for i, v in enumerate(views) if i % config.test_every != 0)
     return Dataset(

@@ -371,7 +371,9 @@ def unique_names(files: Sequence[str]) -> list[str]:
     return names
 
 
-def in_parallel(function: Callable[..., T], *arguments: Sequence[object]) -> tuple[T, ...]:
+def in_parallel(
+    function: Callable[..., T], *arguments: Sequence[object], threads: int | None = None
+) -> tuple[T, ...]:
     """``map`` on threads, in order: decoding images releases Python's lock."""
-    with ThreadPoolExecutor() as pool:
+    with ThreadPoolExecutor(threads) as pool:
         return tuple(pool.map(function, *arguments))

@@ -92,6 +92,17 @@ def image_size(path: Path) -> tuple[int, int]:
         return image.size
 
 
+def stored_shape(path: Path) -> tuple[int, int, int, int]:
+    """Width and height in px, channels, and bytes of each that :func:`read_pixels` would give.
+
+    From the file's header; what it refuses counts as RGB of 8 bits.
+    """
+    with _opened(path) as image:
+        is_transparent = image.mode in ("LA", "RGBA", "P")
+        bits = BITS.get(image.mode, 8)
+        return *image.size, 4 if is_transparent else 3, bits // 8
+
+
 def image_mode(path: Path) -> str:
     """Pillow's name of what a pixel holds, from the file's header: see :data:`BITS`."""
     with _opened(path) as image:

@@ -5,9 +5,10 @@ from dataclasses import replace
 import imageio.v3 as iio
 import numpy as np
 import pytest
-from support.datasets import load, view_at
+from support.datasets import load, refusal, view_at
 
-from drgs.data.images import kept_photograph, smaller_view
+from drgs.data import images, nerfstudio
+from drgs.data.images import check_room, downscale, kept_photograph, smaller_view, threads_for
 from drgs.data.kept import KeptPicture, kept_mask
 
 RNG = np.random.default_rng(8)
@@ -40,14 +41,23 @@ def test_a_photograph_is_kept_as_the_file_has_it(channels, dtype):
         assert np.asarray(alpha).tobytes() == expected.astype(np.float32).tobytes()
 
 
-@pytest.mark.parametrize(("width", "kept"), [(12, "bytes"), (8, "bytes"), (5, "numbers")])
-def test_the_smaller_form_is_kept(width, kept):
-    """Numbers of half the width take as much as bytes, those of a third less."""
+@pytest.mark.parametrize(
+    ("width", "kept"), [(16, "bytes"), (8, "bytes"), (10, "rounded"), (5, "numbers")]
+)
+def test_a_small_form_is_kept(width, kept):
+    """Numbers of half the width take as much as bytes, those of a third less.
+
+    What is scaled by no whole factor is not scaled each time that somebody asks.
+    """
     pixels = RNG.integers(0, 255, (12, 16, 4), np.uint8)
     image, alpha = kept_photograph(pixels, GREY, width)
     of_all = [(image.nbytes, image), (alpha.nbytes, alpha)]
     assert sum(count for count, _ in of_all) <= pixels.nbytes
-    assert all(isinstance(p, KeptPicture) == (kept == "bytes") for _, p in of_all)
+    assert all(isinstance(p, KeptPicture) == (kept != "numbers") for _, p in of_all)
+    if kept == "rounded":
+        assert (image.nbytes, alpha.nbytes) == (2 * 10 * 8 * 3, 2 * 10 * 8)
+        exact = downscale(numbers_of(pixels), width)
+        assert 0 < np.abs(np.asarray(image) - exact).max() <= 0.51 / 65535
     assert image.shape == np.asarray(image).shape and image.shape[1] == width
     if width == 8:
         blocks = numbers_of(pixels).reshape(6, 2, 8, 2, 3).mean(axis=(1, 3))
@@ -105,3 +115,26 @@ def test_a_kept_picture_computes_as_an_array_does():
     ):
         assert isinstance(found, np.ndarray) and found.dtype == expected.dtype
         np.testing.assert_array_equal(found, expected)
+
+
+def test_photographs_that_do_not_fit_are_refused_before_they_are_read(photographs, monkeypatch):
+    """Of ten, one with alpha: (9 x 3 + 4) x 48 bytes."""
+    rgba = RNG.integers(0, 256, (6, 8, 4), np.uint8)
+    iio.imwrite(photographs / "images" / "01.png", rgba)
+    files = sorted((photographs / "images").iterdir())
+    monkeypatch.setattr(images, "available_memory", lambda: 1488)
+    check_room(files, None)
+    monkeypatch.setattr(images, "available_memory", lambda: 1487)
+    monkeypatch.setattr(nerfstudio, "read_pixels", None)
+    message = (
+        f"{photographs / 'images'}: 10 photographs take 1 kB of memory as they are kept, and 1 kB "
+        "are available; set data.image_size=2, or use fewer of them"
+    )
+    assert refusal(photographs) == message
+    check_room(files, 2)
+
+
+def test_large_photographs_are_read_one_after_the_other(tmp_path):
+    for width, expected in ((400, 8), (6000, 1)):
+        iio.imwrite(tmp_path / "a.png", np.zeros((width, width), np.uint8))
+        assert threads_for([tmp_path / "a.png"]) == expected
