@@ -49,7 +49,7 @@ from drgs.core.machine import processor
 from drgs.core.private import llvm_version
 from drgs.data import Dataset, View, initial_gaussians, load_dataset
 from drgs.data.derived import completed, description_of_start
-from drgs.data.fingerprint import Fingerprint, fingerprint
+from drgs.data.fingerprint import Fingerprint, fingerprint_of
 from drgs.gaussians.parameters import Gaussians
 from drgs.integrator.scene import check_lenses
 from drgs.integrator.summary import described
@@ -191,7 +191,7 @@ def run(args: argparse.Namespace) -> None:
         if checkpoint is not None:
             config = checkpoint.config
         dataset = load_dataset(config.data_for_training)
-        data = fingerprint(dataset)
+        data = fingerprint_of(dataset)
         if checkpoint is not None:
             check_same_data(out, config.data.path, checkpoint.data, data)
         config = completed(config, dataset)

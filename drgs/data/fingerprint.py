@@ -61,7 +61,7 @@ class Fingerprint(_Print):
         return [text for pair in pairs for text in _differences(*pair)]
 
 
-def fingerprint(dataset: Dataset) -> Fingerprint:
+def fingerprint_of(dataset: Dataset) -> Fingerprint:
     """Reads the files of the views, which were in memory a moment ago.
 
     Raises :class:`drgs.core.errors.UserError` where one is gone.

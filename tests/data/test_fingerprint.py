@@ -9,7 +9,7 @@ from PIL import Image
 from support.datasets import load
 
 from drgs.core.errors import UserError
-from drgs.data.fingerprint import Fingerprint, fingerprint
+from drgs.data.fingerprint import Fingerprint, fingerprint_of
 
 
 @pytest.fixture
@@ -35,14 +35,14 @@ def change(folder, function):
 
 def differences(folder, function, **settings):
     """Between the data before and after it is changed."""
-    before = fingerprint(load(folder))
+    before = fingerprint_of(load(folder))
     function()
-    return before.differences(fingerprint(load(folder, **settings)))
+    return before.differences(fingerprint_of(load(folder, **settings)))
 
 
 def test_data_that_was_moved_is_the_same(rich, tmp_path):
     there = shutil.copytree(rich, tmp_path / "there")
-    here, there = (fingerprint(load(folder)) for folder in (rich, there))
+    here, there = (fingerprint_of(load(folder)) for folder in (rich, there))
     assert not here.differences(there)
     assert here == there == Fingerprint.from_bytes(here.to_bytes())
     assert len(here.train) + len(here.test) == 10
@@ -78,10 +78,10 @@ def test_the_content_of_each_file_counts(rich, name, what):
 
 def test_what_is_not_read_does_not_count(rich):
     settings = {"ignore_masks": True, "ignore_depth": True}
-    prints = [fingerprint(load(rich, **settings))]
+    prints = [fingerprint_of(load(rich, **settings))]
     for name in ("mask.png", "depth.npy"):
         (rich / name).write_bytes(b"damaged")
-    prints.append(fingerprint(load(rich, **settings)))
+    prints.append(fingerprint_of(load(rich, **settings)))
     assert not prints[0].differences(prints[1])
 
 
@@ -101,7 +101,7 @@ def test_a_file_that_is_gone_is_named(rich):
     dataset = load(rich)
     (rich / "images" / "05.png").unlink()
     with pytest.raises(UserError, match=r"05\.png: cannot read the file: No such file"):
-        fingerprint(dataset)
+        fingerprint_of(dataset)
 
 
 @pytest.mark.parametrize("content", [b"", b"{", b"[]", b'{"train": [7], "test": []}', b"\xff"])
