@@ -352,7 +352,12 @@ class SplatsIntegrator(mi.CppADIntegrator):
         return self._own if self._gathered is None else self._gathered.gaussians
 
     def _gather(self, scene: mi.Scene) -> None:
-        """Find the scene's ellipsoids, and convert them if they have changed."""
+        """Find the scene's ellipsoids, and convert them if they have changed.
+
+        Rows that do not fit, of an update that was refused, would be read beyond their end.
+        """
+        if self._has_own:
+            check_shapes(self._own)
         shapes = _ellipsoids(scene)
         self._scene_has_shapes = bool(shapes)
         if shapes or set(self._turns) - {""}:

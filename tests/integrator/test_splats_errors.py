@@ -270,6 +270,22 @@ def test_parameters_that_do_not_fit_are_refused_when_updated(name, shape, messag
         params.update()
 
 
+@pytest.mark.parametrize("name", ["means", "quats", "sh0"])
+def test_parameters_that_were_refused_are_not_rendered(name):
+    """Rows beyond an array's end would be read. What fits again is rendered again."""
+    loaded = Scene(count=8).load()
+    params, expected = mi.traverse(loaded), np.array(mi.render(loaded))
+    fitting = params[f"integrator.{name}"]
+    params[f"integrator.{name}"] = zeros(3, *fitting.shape[1:])
+    with pytest.raises(ValueError, match="the rows of means, got"):
+        params.update()
+    with pytest.raises(ValueError, match="the rows of means, got"):
+        loaded.integrator().render(loaded)
+    params[f"integrator.{name}"] = valid()[name]
+    params.update()
+    np.testing.assert_array_equal(np.array(mi.render(loaded)), expected)
+
+
 def test_other_sensors_are_refused():
     loaded = mi.load_dict(
         {
