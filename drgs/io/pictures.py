@@ -270,14 +270,21 @@ def _before_flat_background(frames: np.ndarray) -> bytes | None:
     if share < FLAT_SHARE:
         return None
     options = {"lossless": True, "quality": 20, "method": 1}
-    levels = np.arange(256)
-    coarse = np.round(np.round(levels / FLAT_STEP) * FLAT_STEP).astype(np.uint8)[frames]
-    is_near = np.abs(levels[:, None] - background) <= FLAT_STEP / 2  # (256, 3)
-    coarse[np.logical_and.reduce([is_near[frames[..., k], k] for k in range(3)])] = background
-    if len(frames) * len(encode(coarse[0], "webp", **options)) > 1.5 * FLAT_WEBP_BYTES:
+    first = _coarser(frames[0], background)
+    if len(frames) * len(encode(first, "webp", **options)) > 1.5 * FLAT_WEBP_BYTES:
         return None
+    coarse = np.stack([_coarser(frame, background) for frame in frames])
     data = encode(coarse, "webp", duration=FRAME_MS, loop=0, **options)
     return data if len(data) <= FLAT_WEBP_BYTES else None
+
+
+def _coarser(frame: np.ndarray, background: np.ndarray) -> np.ndarray:
+    """uint8 in steps of :data:`FLAT_STEP`, but for the background, which stays as it is."""
+    levels = np.arange(256)
+    is_near = np.abs(levels[:, None] - background) <= FLAT_STEP / 2  # (256, 3)
+    coarse = np.round(np.round(levels / FLAT_STEP) * FLAT_STEP).astype(np.uint8)[frame]
+    coarse[np.logical_and.reduce([is_near[frame[..., k], k] for k in range(3)])] = background
+    return coarse
 
 
 def _commonest_color(pixels: np.ndarray) -> tuple[np.ndarray, float]:
