@@ -50,7 +50,7 @@ def description_of_start(config: FitConfig, dataset: Dataset) -> str:
         what = f"{config.init.num_points:,} random points in {box}"
     else:
         focus, distance = focus_of(dataset.train)
-        within = f"within {distance:.3g} of {shown(focus)}"
+        within = f"within {distance:.3g} of {shown(focus, distance)}"
         what = f"{config.init.num_points:,} random points that the cameras see {within}"
     return f"starts from {what}; near plane at {config.model.near:g}"
 

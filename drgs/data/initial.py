@@ -11,7 +11,13 @@ from scipy.spatial import cKDTree
 from drgs.config.schema import FitConfig, InitConfig
 from drgs.core.denormals import denormals_kept
 from drgs.core.errors import UserError
-from drgs.data.start_box import in_view, points_in_view, start_box
+from drgs.data.start_box import (
+    LEAST_LOOKING,
+    num_looking,
+    points_in_view,
+    start_box,
+    where_they_look,
+)
 from drgs.data.types import Dataset, Viewpoint
 from drgs.gaussians.parameters import Gaussians
 from drgs.gaussians.sh import C0
@@ -22,10 +28,6 @@ MIN_SQUARED_DISTANCE = 1e-7
 that coincide."""
 
 NUM_NEIGHBOURS = 3
-
-LEAST_IN_VIEW = 0.1
-"""Of the points of a cloud, those that must be in some picture: far fewer are in another frame of
-reference than the cameras."""
 
 
 def initial_gaussians(config: FitConfig, dataset: Dataset) -> Gaussians:
@@ -107,10 +109,11 @@ def _check_cloud(
         raise UserError(
             f"{file}: must hold at most densify.max_gaussians ({max_gaussians}) points, got {num}"
         )
-    seen = int(np.count_nonzero(in_view(points, views)))
-    if views and seen < LEAST_IN_VIEW * num:
+    looking = num_looking(points, views)
+    if looking < LEAST_LOOKING * len(views):
         raise UserError(
-            f"{file}: only {seen:,} of {num:,} points are in any picture; they must be where the "
-            "dataset's cameras look, in the same frame of reference; give another init.point_cloud,"
-            " or random points (data.ignore_points, init.point_cloud=null)"
+            f"{file}: must hold what the cameras look at{where_they_look(views)}, in their frame "
+            f"of reference, but only {looking} of {len(views)} have any of its {num:,} points in "
+            "the middle of their pictures; give another init.point_cloud, or start from random "
+            "points (init.point_cloud=null, data.ignore_points=true)"
         )

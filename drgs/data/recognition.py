@@ -123,7 +123,8 @@ def _videos(folder: Path, names: list[str], markers: Sequence[str]) -> str | Non
 
 def _folder_of_pictures(folder: Path) -> Path:
     """The folder itself, or the one in it that is for pictures."""
-    below = (folder / name for name in PICTURE_FOLDERS)
+    smaller = sorted(path.name for path in folder.glob("images_*"))
+    below = (folder / name for name in (*PICTURE_FOLDERS, *smaller))
     return next((path for path in below if os.access(path, os.R_OK) and path.is_dir()), folder)
 
 

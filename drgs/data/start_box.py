@@ -33,10 +33,20 @@ FILL_RANGE = (0.5, 2.0)
 """Of half of a picture's width: where that box is taken as it is."""
 
 LEAST_LOOKING = 0.5
-"""Of the cameras, those that must look into a box."""
+"""Of the cameras, those that must look at where a fit starts."""
+
+MIDDLE = 0.5
+"""Of a picture's width and height: what a camera looks at is in there."""
 
 LEAST_COVERED = 0.005
 """Of a picture (the median): what a box must cover, or what is around it starts without points."""
+
+LEAST_NEAR = 0.01
+"""Of a box, what must be no farther from what the cameras look at than they are: of 100,000 points,
+a thousand for all that matters."""
+
+SAMPLES = 2000
+"""Points that stand for a box."""
 
 RAYS = 32
 """In each direction, through a picture whose covered part is measured."""
@@ -57,7 +67,8 @@ class Box:
         """As messages name it."""
         if not self.center.any():
             return f"[-{self.half_extent:g}, {self.half_extent:g}]^3"
-        return f"the cube of half width {self.half_extent:.3g} around {shown(self.center)}"
+        center = shown(self.center, self.half_extent)
+        return f"the cube of half width {self.half_extent:.3g} around {center}"
 
 
 def start_box(init: InitConfig, dataset: Dataset) -> Box | None:
@@ -149,11 +160,18 @@ def in_view(points: np.ndarray, views: Sequence[Viewpoint]) -> np.ndarray:
     """(N,) bool: which of the points (N, 3) are inside at least one picture."""
     seen = np.zeros(len(points), bool)
     for view in views:
-        x, y, z = ((points - view.center) @ view.camera_to_world[:3, :3]).T
-        # In pixels times z, so that nothing is divided by a depth near zero.
-        u, v = view.fx * x + view.cx * z, view.fy * y + view.cy * z
-        seen |= (z > 0) & (u >= 0) & (u <= view.width * z) & (v >= 0) & (v <= view.height * z)
+        seen |= _in_picture(points, view)
     return seen
+
+
+def _in_picture(points: np.ndarray, view: Viewpoint, part: float = 1.0) -> np.ndarray:
+    """(N,) bool: which are in the middle ``part`` of the picture's width and height."""
+    x, y, z = ((points - view.center) @ view.camera_to_world[:3, :3]).T
+    # In pixels times z, so that nothing is divided by a depth near zero.
+    u, v = view.fx * x + view.cx * z, view.fy * y + view.cy * z
+    left, right = 0.5 * (1 - part), 0.5 * (1 + part)
+    inside = (u >= left * view.width * z) & (u <= right * view.width * z)
+    return inside & (z > 0) & (v >= left * view.height * z) & (v <= right * view.height * z)
 
 
 def _clear_of(points: np.ndarray, views: Sequence[Viewpoint], keep_out: float) -> np.ndarray:
@@ -165,23 +183,51 @@ def _clear_of(points: np.ndarray, views: Sequence[Viewpoint], keep_out: float) -
     return clear
 
 
-# Boxes that a configuration gives
+# Where a configuration or a point cloud says that a fit starts
+
+
+def num_looking(points: np.ndarray, views: Sequence[Viewpoint]) -> int:
+    """How many cameras have one of the points (N, 3) in the middle of their picture."""
+    return sum(bool(_in_picture(points, view, MIDDLE).any()) for view in views)
+
+
+def where_they_look(views: Sequence[Viewpoint]) -> str:
+    """Where what the cameras look at is, for a message; nothing where they look nowhere."""
+    try:
+        focus, distance = focus_of(views)
+    except UserError:
+        return ""
+    return f" (around {shown(focus, distance)}, from {distance:.3g} away)"
 
 
 def check_box(box: Box, views: Sequence[Viewpoint]) -> None:
-    """Raise :class:`UserError` for a box that most cameras do not look into, or hardly see."""
-    covered = np.array([_covered(box, view) for view in views])
-    looking = int(np.count_nonzero(covered))
+    """Raise :class:`UserError` for a box that most cameras do not look into, or hardly see.
+
+    And for one that is so large that next to nothing of it is what they look at.
+    """
+    points = box.points(SAMPLES, np.random.default_rng(0))
+    looking = num_looking(points, views)
+    covered = float(np.median([_covered(box, view) for view in views]))
     if looking < LEAST_LOOKING * len(views):
-        what = f"only {looking} of {len(views)} cameras look into it"
-    elif np.median(covered) < LEAST_COVERED:
-        what = f"it covers only {100 * np.median(covered):.2g} % of a picture (the median)"
+        what = f"only {looking} of {len(views)} have it in the middle of their pictures"
+    elif covered < LEAST_COVERED:
+        what = f"it covers only {100 * covered:.2g} % of a picture (the median)"
+    elif _far_from_focus(points, views):
+        what = f"less than {100 * LEAST_NEAR:g} % of it is as near to that as they are"
     else:
         return
     raise UserError(
-        f"init.half_extent: the start box {box} must be what the cameras look at, but {what}"
-        f"{_where_they_look(views)}; set init.half_extent=null, and it follows from the cameras"
+        f"init.half_extent: the start box {box} must be what the cameras look at"
+        f"{where_they_look(views)}, but {what}; set init.half_extent=null, and it follows from them"
     )
+
+
+def _far_from_focus(points: np.ndarray, views: Sequence[Viewpoint]) -> bool:
+    try:
+        focus, distance = focus_of(views)
+    except UserError:
+        return False
+    return bool(np.mean(np.linalg.norm(points - focus, axis=1) <= distance) < LEAST_NEAR)
 
 
 def _covered(box: Box, view: Viewpoint) -> float:
@@ -203,16 +249,7 @@ def _covered(box: Box, view: Viewpoint) -> float:
     return max(by_rays, 0.5 / RAYS**2 if in_view(box.center[None], [view])[0] else 0.0)
 
 
-def _where_they_look(views: Sequence[Viewpoint]) -> str:
-    """At the end of a message."""
-    try:
-        focus, distance = focus_of(views)
-    except UserError:
-        return ""
-    return f"; they look at {shown(focus)} from a distance of {distance:.3g}"
-
-
-def shown(vector: np.ndarray) -> str:
-    """A point as messages write it."""
-    rounded = np.where(np.abs(vector) < 1e-6 * np.abs(vector).max(), 0, vector)
+def shown(point: np.ndarray, scale: float) -> str:
+    """A point as messages write it; scale: what is around it, beside which rounding is nothing."""
+    rounded = np.where(np.abs(point) < 1e-6 * scale, 0, point)
     return f"({', '.join(f'{v:.3g}' for v in rounded)})"

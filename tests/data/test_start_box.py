@@ -52,20 +52,30 @@ def test_a_box_that_most_cameras_do_not_look_into_is_refused():
     views = views_from(AROUND, target=(50, 0, 0))
     message = refusal(views, half_extent=1.3)
     assert message == (
-        "init.half_extent: the start box [-1.3, 1.3]^3 must be what the cameras look at, but only "
-        "1 of 4 cameras look into it; they look at (50, 0, 0) from a distance of 4.03; set "
-        "init.half_extent=null, and it follows from the cameras"
+        "init.half_extent: the start box [-1.3, 1.3]^3 must be what the cameras look at (around "
+        "(50, 0, 0), from 4.03 away), but only 1 of 4 have it in the middle of their pictures; set "
+        "init.half_extent=null, and it follows from them"
     )
+
+
+def test_a_box_at_the_edge_of_the_pictures_is_refused():
+    views = views_from(AROUND, target=(0, 0, 1.6))
+    assert "but only 0 of 4 have it in the middle of" in refusal(views, half_extent=0.4)
 
 
 def test_a_box_that_hardly_shows_in_the_pictures_is_refused():
     views = views_from(AROUND, scale=100)
-    assert "but it covers only 0.049 % of a picture (the median); they look at" in (
+    assert "(around (0, 0, 0), from 403 away), but it covers only 0.049 % of a picture (the " in (
         refusal(views, half_extent=1.3)
     )
 
 
-@pytest.mark.parametrize("half_extent", [0.3, 1.3, 50.0])
+def test_a_box_of_which_next_to_nothing_is_what_the_cameras_look_at_is_refused():
+    message = refusal(views_from(AROUND, scale=0.1), half_extent=4.0)
+    assert "but less than 1 % of it is as near to that as they are; set" in message
+
+
+@pytest.mark.parametrize("half_extent", [0.3, 1.3, 10.0])
 def test_a_box_that_the_cameras_look_into_or_that_surrounds_them_is_taken(half_extent):
     box = start_box(InitConfig(half_extent=half_extent), dataset_of(views_from(AROUND)))
     assert box.half_extent == half_extent
@@ -81,8 +91,11 @@ def cloud(tmp_path):
 
 def test_a_cloud_in_another_frame_of_reference_is_refused(cloud):
     message = refusal(views_from(AROUND, target=(30, 30, 30)), point_cloud=cloud)
-    assert message.startswith(
-        f"{cloud}: only 0 of 50 points are in any picture; they must be where"
+    assert message == (
+        f"{cloud}: must hold what the cameras look at (around (30, 30, 30), from 4.03 away), in "
+        "their frame of reference, but only 0 of 4 have any of its 50 points in the middle of "
+        "their pictures; give another init.point_cloud, or start from random points "
+        "(init.point_cloud=null, data.ignore_points=true)"
     )
 
 
