@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 
 from drgs.core.errors import UserError
+from drgs.core.files import why_refused
 from drgs.core.llvm import LLVMVersionError
 
 USER_ERROR_STATUS = 2
 """Exit status of a command that the user has to call differently (as argparse's)."""
+
+BROKEN_PIPE_STATUS = 141
+"""As shells report a process that SIGPIPE ended: 128 + 13."""
 
 MAX_CHARACTERS = 800
 """Of an error. Names of files may have thousands; where and what to do are at its ends."""
@@ -20,12 +25,24 @@ MAX_CHARACTERS = 800
 def exit_on_user_error() -> Iterator[None]:
     """Around (or, as a decorator, on) a command: print the error without a traceback, exit with 2.
 
-    Only errors that the user can repair; any other keeps its traceback.
+    Only errors that the user can repair, and what the file system refuses of a file that it names;
+    any other keeps its traceback. Where nobody reads the output any more, as behind ``| head``, it
+    ends without a word.
     """
     try:
         yield
     except (UserError, LLVMVersionError) as error:
         print(f"error: {_printed(str(error))}", file=sys.stderr)
+        sys.exit(USER_ERROR_STATUS)
+    except BrokenPipeError:
+        with suppress(OSError, ValueError):  # or Python would fail again when it ends
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(BROKEN_PIPE_STATUS)
+    except OSError as error:
+        if error.filename is None:
+            raise
+        text = f"{os.fsdecode(error.filename)}: {why_refused(error)}"
+        print(f"error: {_printed(text)}", file=sys.stderr)
         sys.exit(USER_ERROR_STATUS)
 
 

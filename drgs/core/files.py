@@ -15,11 +15,12 @@ import zipfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import IO
-
-import numpy as np
+from typing import IO, TYPE_CHECKING
 
 from drgs.core.errors import UserError, one_line
+
+if TYPE_CHECKING:
+    import numpy as np
 
 _REMEDIES = {
     errno.ENOSPC: "free some space, or choose another disk",
@@ -136,6 +137,8 @@ def read_arrays(path: Path, what: str) -> dict[str, np.ndarray]:
 
     Raises :class:`UserError` for a file that cannot be read or is damaged.
     """
+    import numpy as np  # a list of commands needs none
+
     with open_regular(path, what) as file:
         try:
             _check_sizes(file)
@@ -149,6 +152,8 @@ def read_arrays(path: Path, what: str) -> dict[str, np.ndarray]:
 
 def _check_sizes(file: IO[bytes]) -> None:
     """Raise ValueError where the arrays of an ``.npz`` file are not as large as their parts."""
+    from numpy.lib import format as npy
+
     left = os.fstat(file.fileno()).st_size
     with zipfile.ZipFile(file) as archive:
         for part in archive.infolist():
@@ -156,10 +161,10 @@ def _check_sizes(file: IO[bytes]) -> None:
             if left < 0 or part.compress_type != zipfile.ZIP_STORED:
                 raise ValueError(f"{part.filename} is compressed, or larger than the file")
             with archive.open(part) as content:
-                version = np.lib.format.read_magic(content)
+                version = npy.read_magic(content)
                 read_header = {
-                    (1, 0): np.lib.format.read_array_header_1_0,
-                    (2, 0): np.lib.format.read_array_header_2_0,
+                    (1, 0): npy.read_array_header_1_0,
+                    (2, 0): npy.read_array_header_2_0,
                 }[version]
                 shape, _, dtype = read_header(content)
                 claimed = content.tell() + math.prod(shape) * dtype.itemsize

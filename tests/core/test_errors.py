@@ -33,6 +33,34 @@ def test_commands_report_user_errors_in_one_line(error, capsys):
     assert (captured.out, captured.err) == ("", "error: a.yml: wrong\n")
 
 
+def test_commands_report_what_the_file_system_refuses_of_a_named_file(capsys):
+    for error, line in (
+        (PermissionError(13, "Permission denied", "/a/b"), "Permission denied; choose a folder"),
+        (OSError(36, "File name too long", b"/a/b"), "File name too long; choose a shorter name"),
+    ):
+        with pytest.raises(SystemExit) as exit_info, exit_on_user_error():
+            raise error
+        assert exit_info.value.code == 2
+        assert capsys.readouterr().err.startswith(f"error: /a/b: {line}")
+    with pytest.raises(OSError, match="nameless"), exit_on_user_error():
+        raise OSError("nameless")
+
+
+def test_a_reader_of_the_output_may_go(run_python):
+    """Of two processes: what is printed has to go through a pipe."""
+    program = (
+        "import os, sys\n"
+        "from drgs.cli.errors import exit_on_user_error\n"
+        "read, write = os.pipe()\n"
+        "os.dup2(write, 1)\n"
+        "os.close(write); os.close(read)\n"
+        "with exit_on_user_error():\n"
+        "    print('x', flush=True)\n"
+    )
+    result = run_python(program)
+    assert (result.returncode, result.stderr) == (141, "")
+
+
 def test_commands_keep_the_traceback_of_other_errors():
     with pytest.raises(ZeroDivisionError), exit_on_user_error():
         print(1 / 0, file=sys.stderr)
