@@ -72,7 +72,7 @@ from drgs.io.scenes import load_scene_file
 from drgs.results.files import CAMERAS, CONFIG, GAUSSIANS, METRICS, ORBIT, ORBIT_GIF, VIEWS
 from drgs.results.folder import found_again
 from drgs.results.metrics import Quality, mean_of, psnr, ssim
-from drgs.results.pictures import claiming, refuse_photographs, seal_pictures
+from drgs.results.pictures import claiming, refuse_photographs, sealing
 
 DEFAULT_SIZE = (400, 400)
 """px, where nothing else says how large a picture should be."""
@@ -242,7 +242,7 @@ def _add_settings(parser: CommandParser) -> None:
 
 def run(args: argparse.Namespace) -> None:
     """Render what the command line names."""
-    with executing(args.threads, args.debug):
+    with executing(args.threads, args.debug), sealing(args.out):
         _check(args)
         select_variant(args.variant)
         if args.what.suffix.lower() == ".xml":
@@ -258,7 +258,6 @@ def run(args: argparse.Namespace) -> None:
                     pass
             else:
                 render_split(model, args.split or "test", args.out)
-        seal_pictures(args.out)
         print(f"written: {args.out}")
 
 

@@ -6,6 +6,7 @@ import json
 import os
 import re
 from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TypeVar
 
@@ -41,9 +42,14 @@ def claiming(out: Path, names: Iterable[str], pictures: Iterable[Picture]) -> It
         yield picture
 
 
-def seal_pictures(out: Path) -> None:
-    """Note that all pictures are written."""
-    FolderRecord(out, COMMAND).seal()
+@contextmanager
+def sealing(out: Path) -> Iterator[None]:
+    """Behind the block, note what the pictures in ``out`` are; also where Ctrl-C ended it."""
+    try:
+        yield
+    finally:
+        with suppress(UserError):  # of a disk that is full: all are still known to be ours
+            FolderRecord(out, COMMAND).seal()
 
 
 def refuse_photographs(out: Path, dataset: Path) -> None:

@@ -5,7 +5,7 @@ import json
 import pytest
 import yaml
 from support.commands import assert_ends_well, assert_refused, run_in_process
-from support.folders import contents
+from support.folders import contents, visible
 from support.render_command import sensor, write_scene
 from support.small_capture import blobs, make_dataset, pose_around, write_dataset
 
@@ -93,7 +93,12 @@ def test_pictures_that_an_interrupted_command_left_are_rendered_again(
     with monkeypatch.context() as patched:
         patched.setattr(render, "write_png", write_one)
         assert run_in_process(render.main, fitted, "--out", out).returncode == 130
-    assert sorted(path.name for path in out.glob("*.png")) == ["r_0.png"]
+    assert visible(out) == {"r_0.png"}
+    picture = (out / "r_0.png").read_bytes()
+    (out / "r_0.png").write_text("mine")
+    message = "holds r_0.png, which this command would replace"
+    assert_refused(render.main, fitted, "--out", out, folder=tmp_path, message=message)
+    (out / "r_0.png").write_bytes(picture)
     assert_ends_well(render.main, fitted, "--out", out)
     assert contents(out) == contents(expected)
 

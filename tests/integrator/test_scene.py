@@ -20,7 +20,7 @@ from drgs.config.approximations import Approximations
 from drgs.config.schema import DataConfig, ModelConfig
 from drgs.data.types import Motion, View
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
-from drgs.integrator.scene import SQUARE_PIXEL_TOLERANCE, make_scene, make_sensors
+from drgs.integrator.scene import SQUARE_PIXEL_TOLERANCE, make_scene, make_sensors, render_views
 from drgs.integrator.sensors import camera_from_sensor, read_sensor
 from drgs.reference import splatting as reference
 
@@ -161,6 +161,17 @@ def test_a_scene_renders_the_views_picture_in_display_space(antialiased, near):
     expected = expected_image(gaussians, view, near, antialiased)
     # As for the integrator: see test_splats.
     assert_arrays_agree({"image": image}, {"image": expected}, 1e-5)
+
+
+def test_derivatives_are_possible_between_two_pictures_and_when_no_more_are_asked_for():
+    """A command that was interrupted leaves pictures that nobody takes."""
+    view = make_view()
+    pictures = render_views(make_scene(make_gaussians(view), ModelConfig(), BACKGROUND), [view] * 3)
+    next(pictures)
+    x = mi.Float(2)
+    dr.enable_grad(x)
+    dr.backward(x * x)
+    assert dr.grad(x) == 4
 
 
 def test_settings_of_the_model_change_the_picture():
