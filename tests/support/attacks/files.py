@@ -404,7 +404,9 @@ def special_attacks() -> Iterator[Attack]:
     """Bombs and pictures of every kind."""
     for file, kinds in SPECIAL.items():
         for name, change in kinds.items():
-            yield _attack(f"special/{file}/{name}", file, change)
+            # A background may have so many pixels, which Mitsuba keeps as floats.
+            megabytes = 1200.0 if (file, name) == ("sky.png", "bomb") else 400.0
+            yield _attack(f"special/{file}/{name}", file, change, megabytes=megabytes)
     Image.init()
     formats = set(Image.SAVE) - {"CMYK"}
     for file in ("photos/2.png", "photos/mask.png", "photos/depth.png", "sky.png"):
