@@ -20,7 +20,7 @@ import numpy as np
 from drgs.config.changes import changed, decided_as
 from drgs.config.schema import FitConfig
 from drgs.core.errors import UserError, UserNote, listed, one_line
-from drgs.core.files import atomic_path, read_arrays
+from drgs.core.files import atomic_path, read_arrays, why_refused
 from drgs.data.fingerprint import Fingerprint
 from drgs.results.files import CHECKPOINT, CONFIG
 from drgs.results.folder import load_run_config, write_run_config
@@ -143,8 +143,15 @@ def check_same_data(
 
 
 def remove_checkpoint(folder: Path) -> None:
-    """A finished fit needs none."""
-    (folder / CHECKPOINT).unlink(missing_ok=True)
+    """A finished fit needs none.
+
+    Raises :class:`UserError` where the file system refuses.
+    """
+    path = folder / CHECKPOINT
+    try:
+        path.unlink(missing_ok=True)
+    except OSError as error:
+        raise UserError(f"{path}: cannot be removed: {why_refused(error)}") from None
 
 
 def _says_the_same(config: FitConfig, earlier: FitConfig) -> bool:

@@ -4,7 +4,7 @@ import os
 import pytest
 
 from drgs.core.errors import UserError
-from drgs.core.files import atomic_path, open_regular, read_text, shortened
+from drgs.core.files import atomic_path, is_temporary, open_regular, read_text, shortened
 
 
 def test_atomic_path_replaces_the_file_and_creates_folders(tmp_path):
@@ -111,3 +111,20 @@ def test_names_are_shortened_between_two_characters():
     assert shortened("a" * 201) == "a" * 200
     assert shortened("a" + "\u4e2d" * 90) == "a" + "\u4e2d" * 66
     assert shortened(os.fsdecode(b"\xff") * 9) == os.fsdecode(b"\xff") * 9
+
+
+def test_a_file_may_be_too_large_to_be_opened(tmp_path):
+    (tmp_path / "a.txt").write_bytes(b"abc")
+    open_regular(tmp_path / "a.txt", "poem", 3).close()
+    with pytest.raises(UserError, match=r"a.txt: cannot read the poem: more than 2 bytes"):
+        open_regular(tmp_path / "a.txt", "poem", 2)
+
+
+@pytest.mark.parametrize("letter", ["x", "\u00e4"])
+def test_a_name_may_be_as_long_as_the_file_system_allows(tmp_path, letter):
+    """That of the temporary file would be longer."""
+    path = tmp_path / f"{letter * (250 // len(letter.encode()))}.txt"
+    with atomic_path(path) as temporary:
+        temporary.write_text("x")
+        assert is_temporary(temporary.name)
+    assert [p.name for p in tmp_path.iterdir()] == [path.name]

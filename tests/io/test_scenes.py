@@ -97,3 +97,22 @@ def test_parameters_may_have_the_names_of_the_parsers_own(tmp_path, name):
         f'<integer name="max_depth" value="${name}"/></integrator></scene>'
     )
     assert "max_depth = 3" in str(load_scene_file(path, **{name: "3"}))
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        (
+            "a.xml",
+            b'<scene version="3.0.0"><\xa9/></scene>',
+            "a.xml: not a valid scene: it holds bytes that are not UTF-8",
+        ),
+        ("\udcff.xml", b'<scene version="3.0.0"/>', "Mitsuba takes names in UTF-8 only"),
+    ],
+    ids=["content", "name"],
+)
+def test_what_is_not_utf_8_is_refused(tmp_path, name, content, message):
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(UserError) as error:
+        load_scene_file(tmp_path / name)
+    assert message in str(error.value)
