@@ -82,7 +82,7 @@ SELDOM_RIGHT = ("nan", "inf", "-inf", "-1", "2^63", "10^400")
 
 LONG_WORK = {
     "data.shutter_samples": ("underscores",),
-    "iterations": ("1e4", "2^31-1"),
+    "iterations": ("1e4", "2^31-1", "underscores"),
     "init.num_points": (),
     "densify.split_count": (),
 }

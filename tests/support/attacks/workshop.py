@@ -171,12 +171,14 @@ def sketched_results() -> Iterator[None]:
 class Workshop:
     """See this module. ``folder`` is where attacks happen."""
 
-    def __init__(self, base: Path) -> None:
+    def __init__(self, base: Path, with_results: bool = True) -> None:
+        """with_results: whether there are folders that the commands have written."""
         self.folder, self._kept = base / "workshop", base / "kept"
         self.folder.mkdir(parents=True)
         write_inputs(self.folder)
-        with standing_in(self.folder), sketched_results():
-            self._run_commands()
+        if with_results:
+            with standing_in(self.folder), sketched_results():
+                self._run_commands()
         shutil.copytree(self.folder, self._kept)
         self._pristine = contents(self.folder)
 
