@@ -1,0 +1,33 @@
+"""Configurations that leave values to the data, where no fit has decided on them."""
+
+import argparse
+
+from conftest import REPOSITORY
+
+from drgs import render
+from drgs.config.changes import changed, is_open
+from drgs.config.load import load_config
+from drgs.config.schema import FitConfig
+from drgs.results.files import METRICS
+from drgs.results.folder import claim_output_folder, is_finished
+
+PHOTOS = REPOSITORY / "scenes" / "photos.yml"
+
+
+def test_the_background_of_renderings_is_that_of_a_fit_to_the_photographs(photographs):
+    args = argparse.Namespace(
+        what=photographs, scene=PHOTOS, data=str(photographs), set=None, background=None
+    )
+    config = render._load_config(PHOTOS, args)
+    assert config.data.background_rgb == (0, 0, 0)
+    assert config.model.near == 0.2  # a twenty-fifth of 4.1, to one digit
+    assert not is_open(config) and is_open(load_config(PHOTOS))
+
+
+def test_a_fit_that_decided_is_finished_for_the_configuration_that_left_it_open(tmp_path):
+    given = FitConfig(data={"path": tmp_path})
+    decided = changed(given, {"data.background": "black", "model.near": 0.3})
+    claim_output_folder(tmp_path / "out", decided)
+    (tmp_path / "out" / METRICS).write_text("{}")
+    assert is_finished(tmp_path / "out", given)
+    assert not is_finished(tmp_path / "out", changed(given, {"model.near": 0.2}))
