@@ -161,7 +161,9 @@ class InitConfig(_Section):
         description="Scene units: the start box is [-h, h]^3. null: the reference's 1.3 where "
         "the cameras are those of NeRF-synthetic scenes, otherwise a box derived from them.",
     )
-    opacity: float = Field(0.1, gt=0, lt=1, description="Opacity of every starting Gaussian.")
+    opacity: float = Field(
+        0.1, ge=1e-6, le=0.999999, description="Opacity of every starting Gaussian."
+    )
     point_cloud: PathField | None = Field(
         None,
         description="PLY with x, y, z (and red, green, blue) to use instead of random points. "

@@ -160,4 +160,7 @@ class Gaussians:
 
 
 def _exp(x: Any) -> Any:
-    return np.exp(x) if isinstance(x, np.ndarray) else dr.exp(x)
+    if not isinstance(x, np.ndarray):
+        return dr.exp(x)
+    with np.errstate(over="ignore"):  # infinite: an opacity of 0, a scale beyond all numbers
+        return np.exp(x)

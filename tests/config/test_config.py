@@ -112,7 +112,7 @@ def test_a_configuration_is_frozen(load):
         ("loss: {sigma: .nan}", "loss.sigma must be a finite number, got .nan"),
         ("loss: {dssim_weight: 2}", "loss.dssim_weight must be <= 1, got 2"),
         ("loss: {window: 4}", "loss.window must be odd, got 4"),
-        ("init: {opacity: 1}", "init.opacity must be < 1, got 1"),
+        ("init: {opacity: 1}", "init.opacity must be <= 0.999999, got 1"),
         ("model: {sh_degree: 4}", "model.sh_degree must be <= 3, got 4"),
         ("model: {antialiased: some}", "model.antialiased must be true or false, got 'some'"),
         ("model: 5", "model must be a section of keys, got 5"),

@@ -3,6 +3,7 @@
 import math
 import warnings
 
+import mitsuba as mi
 import numpy as np
 import pytest
 import yaml
@@ -16,7 +17,14 @@ from drgs.config.load import load_config
 from drgs.config.schema import FitConfig
 from drgs.core.errors import UserError
 
+
+@pytest.fixture(scope="module", autouse=True)
+def variant():
+    mi.set_variant("llvm_ad_rgb")
+
+
 REFUSED = {
+    "init.opacity": ["1e-200", "0.9999999999999999"],
     "model.alpha_max": ["1e-46", "0.9999999999999999", "1e300"],
     "model.extent": ["1e308", "1e39", "1e-50"],
     "model.low_pass": ["1e39", "1e300"],

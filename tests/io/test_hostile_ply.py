@@ -48,11 +48,13 @@ def test_infinite_logits_are_opacities_that_a_sigmoid_tells_from_1_and_0(tmp_pat
 
 
 def test_finite_logits_are_read_without_a_note(tmp_path):
-    gaussians_with([0.5, -80.0, 1e30]).save(tmp_path / "a.ply")
+    gaussians_with([0.5, -80.0, 1e30, -1e30]).save(tmp_path / "a.ply")
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         loaded = Gaussians.load(tmp_path / "a.ply")
-    np.testing.assert_array_equal(loaded.logit_opacities, np.float32([0.5, -80, 1e30]))
+        opacities = loaded.opacities
+    np.testing.assert_array_equal(loaded.logit_opacities, np.float32([0.5, -80, 1e30, -1e30]))
+    np.testing.assert_array_equal(opacities[2:], [1, 0])
 
 
 def test_an_opacity_that_is_no_number_is_refused(tmp_path):
