@@ -9,6 +9,8 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
+import drjit as dr
+
 try:
     import resource
 except ImportError:  # Windows
@@ -77,7 +79,10 @@ def why_too_large(width: int, height: int, channels: int = 3, samples: int = 1) 
     of_channels = CHANNEL_BYTES * (channels - 3)
     of_pixel = PICTURE_BYTES + SAMPLE_BYTES * (samples - 1) + of_channels
     needed = pixels * of_pixel
-    if needed <= UNASKED_BYTES or needed <= (available := available_memory()):
+    if needed <= UNASKED_BYTES or needed <= available_memory():
+        return None
+    dr.flush_malloc_cache()  # what Dr.Jit holds for its next arrays is as good as available
+    if needed <= (available := available_memory()):
         return None
     return (
         f"{asked} need about {readable(needed)} of memory, of which {readable(available)} are "

@@ -107,3 +107,13 @@ def test_what_fits_into_memory_may_be_too_many_for_the_library(monkeypatch):
     )
     assert "too many for Dr.Jit" in memory.why_too_large(400, 400, samples=10**9)
     assert "too many for Dr.Jit" in memory.why_too_large(2000, 2000, channels=2000)
+
+
+def test_what_drjit_holds_for_its_next_arrays_is_available(monkeypatch):
+    rooms = [10**9]
+    monkeypatch.setattr(memory, "available_memory", lambda: rooms[-1])
+    monkeypatch.setattr(memory.dr, "flush_malloc_cache", lambda: rooms.append(8 * GB))
+    assert memory.why_too_large(3000, 3000) is None
+    assert len(rooms) == 2
+    assert memory.why_too_large(3000, 3000) is None
+    assert len(rooms) == 2
