@@ -1,7 +1,7 @@
 """Where a fit starts: random points in a box that the cameras look into.
 
-Imported when there is no point cloud to start from, and for what follows from where the cameras
-look: orbits, and the near plane.
+What the cameras look at says more than where a fit starts: orbits and near planes follow from it,
+and points that they do not look at are refused.
 """
 
 from __future__ import annotations
@@ -41,12 +41,15 @@ MIDDLE = 0.5
 LEAST_COVERED = 0.005
 """Of a picture (the median): what a box must cover, or what is around it starts without points."""
 
-LEAST_NEAR = 0.01
+LEAST_NEAR_FOCUS = 0.01
 """Of a box, what must be no farther from what the cameras look at than they are: of 100,000 points,
 a thousand for all that matters."""
 
 SAMPLES = 2000
 """Points that stand for a box."""
+
+MOST_POINTS = 20_000
+"""Points of a cloud that stand for all of it."""
 
 RAYS = 32
 """In each direction, through a picture whose covered part is measured."""
@@ -187,7 +190,11 @@ def _clear_of(points: np.ndarray, views: Sequence[Viewpoint], keep_out: float) -
 
 
 def num_looking(points: np.ndarray, views: Sequence[Viewpoint]) -> int:
-    """How many cameras have one of the points (N, 3) in the middle of their picture."""
+    """How many cameras have one of the points (N, 3) in the middle of their picture.
+
+    Of very many points, which would take long, every n-th is looked at.
+    """
+    points = points[:: max(1, len(points) // MOST_POINTS)]
     return sum(bool(_in_picture(points, view, MIDDLE).any()) for view in views)
 
 
@@ -213,7 +220,7 @@ def check_box(box: Box, views: Sequence[Viewpoint]) -> None:
     elif covered < LEAST_COVERED:
         what = f"it covers only {100 * covered:.2g} % of a picture (the median)"
     elif _far_from_focus(points, views):
-        what = f"less than {100 * LEAST_NEAR:g} % of it is as near to that as they are"
+        what = f"less than {100 * LEAST_NEAR_FOCUS:g} % of it is as near to that as they are"
     else:
         return
     raise UserError(
@@ -227,7 +234,7 @@ def _far_from_focus(points: np.ndarray, views: Sequence[Viewpoint]) -> bool:
         focus, distance = focus_of(views)
     except UserError:
         return False
-    return bool(np.mean(np.linalg.norm(points - focus, axis=1) <= distance) < LEAST_NEAR)
+    return bool(np.mean(np.linalg.norm(points - focus, axis=1) <= distance) < LEAST_NEAR_FOCUS)
 
 
 def _covered(box: Box, view: Viewpoint) -> float:
