@@ -10,7 +10,7 @@ import pytest
 from conftest import REPOSITORY, SHARED_DATA
 from support.photographs import from_colmap, moved
 
-from drgs.config.changes import changed
+from drgs.config.changes import changed, with_iterations
 from drgs.config.load import load_config
 from drgs.data import load_dataset
 from drgs.data.derived import completed
@@ -22,19 +22,24 @@ CONFIGURATIONS = sorted(path.stem for path in (REPOSITORY / "scenes").glob("*.ym
 ALIKE = ("fox", "lego", "lego_paper", "photos")
 """They differ in data, size and number of iterations alone."""
 
-SMALL = ("data.image_size=60", "iterations=600")
+WIDTH, ITERATIONS = 60, 600
 
 WITHIN = 1.0
 """dB, of the best: what differs is how many points there are at the start, and when the population
 changes."""
 
 
-def configured(name, folder, *overrides):
-    """The configuration as a fit of ``folder`` completes it, and the dataset."""
-    file = REPOSITORY / "scenes" / f"{name}.yml"
-    config = load_config(file, [f"data.path={folder}", *SMALL, *overrides])
+def configured(name, folder):
+    """The configuration as a small fit of ``folder`` completes it, and the dataset."""
+    file, small = REPOSITORY / "scenes" / f"{name}.yml", [f"data.image_size={WIDTH}"]
+    if name in ALIKE:
+        small.append(f"iterations={ITERATIONS}")
+    config = load_config(file, [f"data.path={folder}", *small])
+    config = changed(config, {"data.source": ""})
     dataset = load_dataset(config.data_for_training)
-    return changed(completed(config, dataset), {"data.source": ""}), dataset
+    if name not in ALIKE:  # it says for how many iterations its schedule is
+        config = with_iterations(config, ITERATIONS)
+    return completed(config, dataset), dataset
 
 
 @pytest.mark.parametrize("kind", ["blender", "photographs"])
