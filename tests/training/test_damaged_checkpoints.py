@@ -94,7 +94,7 @@ def with_header(shape):
 
 
 def compress(checkpoint):
-    np.savez_compressed(checkpoint, **arrays_of(checkpoint), zeros=np.zeros(10**8, np.uint8))
+    np.savez_compressed(checkpoint, **arrays_of(checkpoint), zeros=np.zeros(10**7, np.uint8))
 
 
 def as_pipe(checkpoint):
