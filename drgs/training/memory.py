@@ -151,6 +151,7 @@ def _times(view: View) -> int:
     return view.motion.samples if is_blurred else 1
 
 
+@np.errstate(over="ignore")  # of scales beyond all pictures, which LARGEST ends
 def _at_start(
     views: Sequence[Viewpoint], gaussians: Gaussians, near: float, scale: float
 ) -> tuple[float, float]:

@@ -7,6 +7,7 @@ import signal
 import numpy as np
 import pytest
 import yaml
+from plyfile import PlyData, PlyElement
 from support.commands import run_in_process
 from support.small_capture import make_dataset, write_dataset
 
@@ -97,3 +98,14 @@ def test_folders_whose_names_are_not_utf_8_are_refused_before_the_fit(scene, opt
     assert outcome.returncode == 2
     assert "must be a path in UTF-8, got " in outcome.stderr and outcome.stderr.count("\n") == 1
     assert sorted(os.listdir(scene)) == ["a.yml", "data"]
+
+
+def test_a_start_cloud_of_points_in_one_place_and_points_far_away_is_fitted(scene, monkeypatch):
+    """Without a line of NumPy's about scales that are beyond float32."""
+    monkeypatch.setattr(fit, "write_results", lambda *arguments: None)
+    points = np.zeros(18, [(axis, "f4") for axis in "xyz"])
+    points[17] = (3e38, -1e30, 1)
+    PlyData([PlyElement.describe(points, "vertex")]).write(str(scene / "points.ply"))
+    cloud = f"init.point_cloud={scene / 'points.ply'}"
+    outcome = run_in_process(fit.main, scene / "a.yml", "--out", scene / "out", "--set", cloud)
+    assert (outcome.returncode, outcome.stderr) == (0, "")
