@@ -66,6 +66,9 @@ COUNTED_VIEWS, COUNTED_GAUSSIANS = 8, 20_000
 LARGEST = 1e6
 """px: a radius beyond this covers any film."""
 
+USABLE = 0.9
+"""Of the memory that is available: estimates are about so exact."""
+
 MIN_WIDTH = 16
 """px: no smaller pictures are advised."""
 
@@ -86,9 +89,9 @@ class FitMemory:
         """Without targets, which can be made anew."""
         return self.process + self.photographs + self.gaussians + self.splats + self.pixels
 
-    def room_for_targets(self, available: int, most: int) -> int:
-        """What targets may take of ``available`` bytes, those included that are in use."""
-        return max(0, min(most, self.targets, available - self.needed))
+    def room_for_targets(self, usable: int, most: int) -> int:
+        """What targets may take of ``usable`` bytes; some are left, as an estimate may be wrong."""
+        return max(0, min(most, self.targets, usable - round(1.15 * self.needed)))
 
 
 def estimate(
@@ -194,14 +197,14 @@ def room_for_targets(
     memory.
     """
     memory = estimate(config, dataset, gaussians, view_bytes)
-    available = available_memory() + resident_memory()
-    if memory.needed > available:
-        raise UserError(_refusal(config, dataset, gaussians, memory, available))
-    return memory.room_for_targets(available, most)
+    usable = round(USABLE * (available_memory() + resident_memory()))
+    if memory.needed > usable:
+        raise UserError(_refusal(config, dataset, gaussians, memory, usable))
+    return memory.room_for_targets(usable, most)
 
 
 def _refusal(
-    config: FitConfig, dataset: Dataset, gaussians: Gaussians, memory: FitMemory, available: int
+    config: FitConfig, dataset: Dataset, gaussians: Gaussians, memory: FitMemory, usable: int
 ) -> str:
     start, train = gaussians.num_gaussians, dataset.train
     count = most_gaussians(config, start)
@@ -211,13 +214,13 @@ def _refusal(
         f"{readable(memory.splats + memory.pixels)} for a picture of them",
     ]
     remedies = []
-    spare = available - memory.needed + memory.gaussians
+    spare = usable - memory.needed + memory.gaussians
     if (fewer := int(0.95 * spare * count / memory.gaussians)) > start:
         remedies.append(f"densify.max_gaussians={_rounded(fewer)}")
     width = max(view.width for view in train)
 
     def fits(scale: float) -> bool:
-        return estimate(config, dataset, gaussians, 0, scale).needed <= 0.95 * available
+        return estimate(config, dataset, gaussians, 0, scale).needed <= 0.95 * usable
 
     scales = (0.95**k for k in range(1, 100))
     smaller = next((int(width * scale) for scale in scales if fits(scale)), 0)
@@ -226,7 +229,7 @@ def _refusal(
     advice = f"set {' or '.join(remedies)}" if remedies else "use fewer views and Gaussians"
     return (
         f"memory: the fit needs about {readable(memory.needed)} ({', '.join(parts)}), and "
-        f"{readable(available)} are available; {advice}"
+        f"may take {readable(usable)}, nine tenths of what is available; {advice}"
     )
 
 
