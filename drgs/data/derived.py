@@ -6,7 +6,7 @@ from drgs.config.changes import changed
 from drgs.config.schema import NAMED_COLORS, REFERENCE_NEAR, FitConfig
 from drgs.core.errors import UserError
 from drgs.data.initial import point_cloud_of
-from drgs.data.start_box import focus_of, shown, start_box
+from drgs.data.start_box import box_to_start_in, focus_of, shown
 from drgs.data.types import Dataset
 
 NEAR_SHARE = 0.04
@@ -43,7 +43,7 @@ def description_of_start(config: FitConfig, dataset: Dataset) -> str:
     """What a fit starts from and where its near plane is, one line; config: completed."""
     cloud, box = point_cloud_of(config.init, dataset), None
     if cloud is None:
-        box = start_box(config.init, dataset)
+        box = box_to_start_in(config.init, dataset)
     if cloud is not None:
         what = f"the points of {cloud}"
     elif box is not None:

@@ -13,9 +13,9 @@ from drgs.core.denormals import denormals_kept
 from drgs.core.errors import UserError
 from drgs.data.start_box import (
     LEAST_LOOKING,
+    box_to_start_in,
     num_looking,
     points_in_view,
-    start_box,
     where_they_look,
 )
 from drgs.data.types import Dataset, Viewpoint
@@ -48,7 +48,7 @@ def initial_gaussians(config: FitConfig, dataset: Dataset) -> Gaussians:
         _check_cloud(cloud, means, config.densify.max_gaussians, dataset.train)
     else:
         rng = np.random.default_rng(config.seed)
-        box = start_box(init, dataset)
+        box = box_to_start_in(init, dataset)
         if box is not None:
             means = box.points(init.num_points, rng)
         else:

@@ -74,7 +74,7 @@ class Box:
         return f"the cube of half width {self.half_extent:.3g} around {center}"
 
 
-def start_box(init: InitConfig, dataset: Dataset) -> Box | None:
+def box_to_start_in(init: InitConfig, dataset: Dataset) -> Box | None:
     """The box of the random points that a fit starts from; None: :func:`points_in_view`.
 
     Raises :class:`UserError` for a given one (``init.half_extent``) that the cameras do not see.

@@ -9,7 +9,7 @@ from drgs.config.schema import FitConfig, InitConfig
 from drgs.core.errors import UserError
 from drgs.data import initial_gaussians
 from drgs.data.derived import completed, description_of_start
-from drgs.data.start_box import start_box
+from drgs.data.start_box import box_to_start_in
 
 AROUND = [(4.03, 0, 0), (0, 4.03, 0), (-4.03, 0, 0), (0, -4.03, 0.1)]
 
@@ -32,14 +32,14 @@ def refusal(views, **init):
 
 # The layout's own box
 def test_the_references_box_is_taken_where_the_cameras_are_as_it_expects():
-    box = start_box(InitConfig(), dataset_of(views_from(AROUND), 1.3))
+    box = box_to_start_in(InitConfig(), dataset_of(views_from(AROUND), 1.3))
     assert (box.center == 0).all() and box.half_extent == 1.3
 
 
 @pytest.mark.parametrize(("scale", "target"), [(100, (0, 0, 0)), (0.01, (0, 0, 0)), (1, (9, 5, 7))])
 def test_elsewhere_it_is_scaled_and_moved_to_where_the_cameras_look(scale, target):
     dataset = dataset_of(views_from(AROUND, target, scale), 1.3)
-    box = start_box(InitConfig(), dataset)
+    box = box_to_start_in(InitConfig(), dataset)
     np.testing.assert_allclose(box.center, scale * np.array(target), atol=0.05 * scale)
     # Views of 40 px with a focal length of 40 px see half a unit to each side at distance 1.
     assert box.half_extent == pytest.approx(0.9 * 0.5 * 4.03 * scale, rel=0.02)
@@ -77,7 +77,7 @@ def test_a_box_of_which_next_to_nothing_is_what_the_cameras_look_at_is_refused()
 
 @pytest.mark.parametrize("half_extent", [0.3, 1.3, 10.0])
 def test_a_box_that_the_cameras_look_into_or_that_surrounds_them_is_taken(half_extent):
-    box = start_box(InitConfig(half_extent=half_extent), dataset_of(views_from(AROUND)))
+    box = box_to_start_in(InitConfig(half_extent=half_extent), dataset_of(views_from(AROUND)))
     assert box.half_extent == half_extent
 
 
