@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from drgs.config.changes import changed
 from drgs.config.schema import NAMED_COLORS, REFERENCE_NEAR, FitConfig
 from drgs.core.errors import UserError
@@ -14,8 +16,8 @@ NEAR_SHARE = 0.04
 reference's 0.2 for NeRF-synthetic scenes, whose distance is 4.03, as well as for distances of 4 to
 6, which photographs often have in COLMAP's unit of length."""
 
-LEAST_NEAR = 1e-9
-"""What a configuration accepts."""
+NEAR_RANGE = (1e-9, 1e9)
+"""Scene units: what a configuration accepts."""
 
 FARTHEST_NEAR = 0.5
 """Of that distance: a near plane beyond it would cut into what is looked at."""
@@ -30,7 +32,7 @@ def completed(config: FitConfig, dataset: Dataset) -> FitConfig:
     changes: dict[str, object] = {}
     if config.data.background is None:
         names = {color: name for name, color in NAMED_COLORS.items()}
-        background = tuple(dataset.background)
+        background = tuple(map(float, dataset.background))
         changes["data.background"] = names.get(background, background)
     if config.model.near is None:
         changes["model.near"] = _near_plane(dataset)
@@ -58,7 +60,7 @@ def description_of_start(config: FitConfig, dataset: Dataset) -> str:
 def _near_plane(dataset: Dataset) -> float:
     if not dataset.train:
         return REFERENCE_NEAR
-    return float(f"{max(NEAR_SHARE * _viewing_distance(dataset), LEAST_NEAR):.1g}")
+    return float(f"{np.clip(NEAR_SHARE * _viewing_distance(dataset), *NEAR_RANGE):.1g}")
 
 
 def _check_near_plane(near: float, dataset: Dataset) -> None:

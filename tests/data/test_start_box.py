@@ -148,12 +148,14 @@ def test_the_background_follows_from_the_pictures(photographs, mode, background)
     assert completed(given, dataset).data.background == "white"
 
 
-@pytest.mark.parametrize(("scale", "near"), [(1, 0.2), (1.5, 0.2), (1000, 200), (0.001, 2e-4)])
+@pytest.mark.parametrize(
+    ("scale", "near"), [(1, 0.2), (1.5, 0.2), (1000, 200), (1e-9, 1e-9), (1e12, 1e9)]
+)
 def test_the_near_plane_follows_from_the_cameras(scale, near):
     dataset = dataset_of(views_from(AROUND, scale=scale))
     assert completed(config(), dataset).model.near == near
-    given = completed(config(model={"near": 0.0011}), dataset)
-    assert given.model.near == 0.0011
+    given = completed(config(model={"near": 1e-9}), dataset)
+    assert given.model.near == 1e-9
 
 
 def test_a_near_plane_behind_what_the_cameras_look_at_is_refused():

@@ -78,18 +78,18 @@ def from_colmap(source, images, folder, factor, with_points=True):
     return folder
 
 
-def moved(source: Path, folder: Path, scale, center_at_cameras=True):
+def moved(source: Path, folder: Path, scale):
     """``folder`` with the photographs of ``source``, whose world is turned, moved and scaled.
 
-    center_at_cameras: the origin is the mean of their positions, as in COLMAP's reconstructions;
-    scale: largest distance of a camera from there.
+    The origin is the mean of the cameras' positions, as in COLMAP's reconstructions; scale: the
+    largest distance of a camera from there.
     """
     meta = json.loads((source / "transforms.json").read_text())
     poses = np.array([frame["transform_matrix"] for frame in meta["frames"]])
     turn = Rotation.from_rotvec([0.4, -0.7, 1.1]).as_matrix()
     centers = poses[:, :3, 3]
-    mean = centers.mean(axis=0) if center_at_cameras else np.zeros(3)
-    size = scale / np.linalg.norm(centers - centers.mean(axis=0), axis=1).max()
+    mean = centers.mean(axis=0)
+    size = scale / np.linalg.norm(centers - mean, axis=1).max()
     for frame, pose in zip(meta["frames"], poses, strict=True):
         new = np.eye(4)
         new[:3, :3] = turn @ pose[:3, :3]
