@@ -70,10 +70,10 @@ def estimated(config, dataset, view_bytes=TARGET_BYTES, scale=1.0):
         (100, 5_000, 10_000, 10, 291),
         (400, 50_000, 100_000, 20, 1019),
         (800, 50_000, 100_000, 10, 1954),
-        (400, 150_000, 300_000, 10, 1703),
+        pytest.param(400, 150_000, 300_000, 10, 1703, marks=pytest.mark.slow),
         (1000, 10_000, 20_000, 20, 2140),
         (1000, 50_000, 100_000, 10, 2702),
-        (1000, 150_000, 300_000, 6, 4092),
+        pytest.param(1000, 150_000, 300_000, 6, 4092, marks=pytest.mark.slow),
     ],
 )
 def test_estimates_are_what_was_measured(size, start, most, views, measured_mb):
