@@ -3,6 +3,7 @@
 import json
 import os
 import signal
+import warnings
 
 import numpy as np
 import pytest
@@ -107,5 +108,7 @@ def test_a_start_cloud_of_points_in_one_place_and_points_far_away_is_fitted(scen
     points[17] = (3e38, -1e30, 1)
     PlyData([PlyElement.describe(points, "vertex")]).write(str(scene / "points.ply"))
     cloud = f"init.point_cloud={scene / 'points.ply'}"
-    outcome = run_in_process(fit.main, scene / "a.yml", "--out", scene / "out", "--set", cloud)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", RuntimeWarning)
+        outcome = run_in_process(fit.main, scene / "a.yml", "--out", scene / "out", "--set", cloud)
     assert (outcome.returncode, outcome.stderr) == (0, "")
