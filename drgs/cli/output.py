@@ -32,7 +32,10 @@ def printable_anywhere() -> Iterator[None]:
 
 @contextmanager
 def notes_printed() -> Iterator[None]:
-    """Within the block, each :class:`UserNote` is a line of the output."""
+    """Within the block, each :class:`UserNote` is a line of the output.
+
+    What Pillow has to note about a file is not: what it cannot read is an error of ours.
+    """
     with warnings.catch_warnings():
         show = warnings.showwarning
 
@@ -46,4 +49,5 @@ def notes_printed() -> Iterator[None]:
 
         warnings.showwarning = show_plainly
         warnings.simplefilter("always", UserNote)
+        warnings.filterwarnings("ignore", module=r"PIL\.")
         yield

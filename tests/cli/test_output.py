@@ -9,13 +9,16 @@ import warnings
 from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
 
+import numpy as np
 import pytest
+from PIL import Image
 from support.commands import run_in_process
 
 from drgs.cli.commands import at_least, file_or_folder, run_command
 from drgs.cli.interrupts import exit_on_interrupt
 from drgs.cli.output import printable_anywhere
 from drgs.core.errors import UserError, UserNote
+from drgs.io.pictures import image_size, write_png
 
 
 def command(act):
@@ -67,6 +70,19 @@ def test_a_note_is_a_line_of_the_output():
     outcome = run_in_process(command(act))
     assert (outcome.returncode, outcome.stdout) == (0, "note: a.ply: clamped\n")
     assert outcome.stderr == ""
+
+
+def test_pillow_notes_nothing(tmp_path, monkeypatch):
+    """Of a picture that is large, but not too large for us."""
+    write_png(tmp_path / "a.png", np.zeros((6, 8, 3), np.uint8))
+    monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 40)
+
+    with pytest.warns(Image.DecompressionBombWarning):
+        image_size(tmp_path / "a.png")
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        outcome = run_in_process(command(lambda: image_size(tmp_path / "a.png")))
+    assert (outcome.returncode, outcome.stderr, caught) == (0, "", [])
 
 
 def test_an_error_whose_names_hold_line_ends_is_one_line():
