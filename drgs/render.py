@@ -410,7 +410,8 @@ def render_mitsuba_scene(path: Path, out: Path, definitions: dict[str, str]) -> 
         colors = bitmap.split()[0][1].convert(
             mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.Float32, srgb_gamma=linear
         )
-        write_png(out / f"{name}.png", np.array(colors))
+        # A scene's light may be no number: black in the PNG, and kept in the EXR.
+        write_png(out / f"{name}.png", np.nan_to_num(np.array(colors)))
         print(f"{name}: {width}x{height}")
 
 

@@ -118,6 +118,8 @@ def background_of(props: mi.Properties) -> mi.Color3f | mi.Texture:
     if isinstance(value, mi.Texture):
         return value
     try:
+        if isinstance(value, str):  # of which nanobind complains itself, beside its error
+            raise TypeError
         return mi.Color3f(value)
     except TypeError:
         raise PluginTypeError(
