@@ -7,9 +7,15 @@ from collections.abc import Callable, Iterable
 import numpy as np
 
 from support.attacks.attack import Attack
-from support.attacks.faults import fault_attacks
+from support.attacks.faults import fault_attacks, size_attacks
 from support.attacks.files import damage_attacks, other_file_attacks, special_attacks
-from support.attacks.options import combination_attacks, folder_attacks, name_attacks
+from support.attacks.options import (
+    combination_attacks,
+    drawn_attacks,
+    folder_attacks,
+    name_attacks,
+)
+from support.attacks.scenes import object_attacks, property_attacks
 from support.attacks.values import option_attacks, schema_attacks
 from support.attacks.workshop import Workshop
 
@@ -26,6 +32,10 @@ FAMILIES: dict[str, Callable[[Workshop], Iterable[Attack]]] = {
     "folder": lambda workshop: folder_attacks(),
     "name": lambda workshop: name_attacks(),
     "fault": fault_attacks,
+    "size": lambda workshop: size_attacks(),
+    "drawn": lambda workshop: drawn_attacks(),
+    "property": lambda workshop: property_attacks(),
+    "object": lambda workshop: object_attacks(),
 }
 """By the first part of an attack's name."""
 

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from support.attacks.attack import Attack
-from support.attacks.observer import KINDS, Fault
+from support.attacks.observer import KINDS, SMALL_FILES, Fault
 from support.attacks.trial import run
 from support.attacks.workshop import CAPTURE, Workshop, capture_size, standing_in
 
@@ -66,6 +66,26 @@ def count_changes(work: Work, workshop: Workshop) -> int:
     workshop.put_back()
     assert outcome.status == 0, outcome.err
     return len(outcome.changes.inside)
+
+
+SIZES = (0, 10, 100, 400, 1000, 2000, 5000)
+"""Bytes."""
+
+
+def size_attacks() -> Iterator[Attack]:
+    """No file may become larger than so many bytes: writing fails in the midst of one."""
+    for name, work in WORKS.items():
+        for size in SIZES:
+            yield Attack(
+                f"size/{name}/{size}",
+                work.command,
+                work.words,
+                out=work.out,
+                fault=Fault(SMALL_FILES, size),
+                again=work.again,
+                results=work.results,
+                is_long=work.command == "fit",
+            )
 
 
 def fault_attacks(workshop: Workshop) -> Iterator[Attack]:

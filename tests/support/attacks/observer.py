@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import errno
 import os
+import resource
 import signal
 import sys
 from collections.abc import Iterator
@@ -32,7 +33,11 @@ CHANGES = {
 WRITING = os.O_WRONLY | os.O_RDWR | os.O_CREAT | os.O_TRUNC
 
 KINDS = ("full", "denied", "kill", "interrupt")
-"""Of faults: no space is left; nothing may be removed or replaced any more; SIGKILL; Ctrl-C."""
+"""Of faults at a change: no space is left; nothing may be removed or replaced any more; SIGKILL;
+Ctrl-C."""
+
+SMALL_FILES = "small files"
+"""A fault of another kind: no file may become larger than ``at`` bytes, and writing stops there."""
 
 
 class Killed(BaseException):
@@ -43,12 +48,12 @@ class Killed(BaseException):
 class Fault:
     """Strikes at change number ``at`` of the workshop's files, counted from 0."""
 
-    kind: str  # one of KINDS
+    kind: str  # one of KINDS, or SMALL_FILES
     at: int
 
     def strike(self, number: int, event: str, path: str) -> None:
         """Called before each change; path: within the workshop."""
-        if number < self.at:
+        if number < self.at or self.kind == SMALL_FILES:
             return
         if self.kind == "kill":
             raise Killed
@@ -113,11 +118,15 @@ def observed(folder: Path, fault: Fault | None = None) -> Iterator[Changes]:
         _installed.append(True)
         sys.addaudithook(_hook)
     changes = Changes(folder, fault)
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    if fault is not None and fault.kind == SMALL_FILES:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (fault.at, limits[1]))
     _observing.append(changes)
     try:
         yield changes
     finally:
         _observing.clear()
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
 
 
 _installed: list[bool] = []

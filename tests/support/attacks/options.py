@@ -10,6 +10,8 @@ from functools import partial
 from itertools import combinations
 from pathlib import Path
 
+import imageio.v3 as iio
+import numpy as np
 import yaml
 
 from support.attacks.attack import Attack
@@ -258,3 +260,30 @@ def name_attacks() -> Iterator[Attack]:
                 partial(_moved, "splats.xml", f"{name}.xml"),
                 **more,
             )
+
+
+# ----------------------------------------------------------------------------------------------
+# What a fit draws
+# ----------------------------------------------------------------------------------------------
+
+
+def _tiny_pictures(folder: Path) -> None:
+    """Of one pixel."""
+    for path in (folder / "lego").glob("*/*.png"):
+        iio.imwrite(path, np.full((1, 1, 4), 200, np.uint8))
+
+
+def drawn_attacks() -> Iterator[Attack]:
+    """Fits with everything that they draw, which takes seconds each."""
+    words = ("fit.yml", "--out", "out")
+    changes = {
+        "as it is": (words, lambda folder: None),
+        "markup": (words, partial(_renamed_picture, NAMES["markup"])),
+        "not UTF-8": (words, partial(_renamed_picture, NAMES["not UTF-8"])),
+        "newline": (("fit.yml", "--out", NAMES["newline"]), lambda folder: None),
+        "one pixel": (words, _tiny_pictures),
+        "photographs": (("photos.yml", "--out", "out"), lambda folder: None),
+        "one iteration": ((*words, "--set", "iterations=1"), lambda folder: None),
+    }
+    for name, (line, change) in changes.items():
+        yield Attack(f"drawn/{name}", "fit", line, change, out=line[2], draws=True, is_long=True)

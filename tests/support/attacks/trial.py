@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
 import re
 import resource
@@ -15,7 +16,6 @@ from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field
 from importlib import import_module
 from pathlib import Path
-from tempfile import TemporaryFile
 
 from support.attacks.attack import Attack
 from support.attacks.observer import Changes, Killed, observed
@@ -24,7 +24,12 @@ from support.attacks.workshop import Workshop, contents, sketched_results, stand
 KILLED = 137
 INTERRUPTED = 130
 
-CACHES = re.compile(r"/(\.drjit|\.cache|__pycache__|\.nv)/|^/dev/(null|tty)$|^/proc/self/")
+PIPE_BYTES = 1 << 20
+"""Of what a command prints."""
+
+CACHES = re.compile(
+    r"/(\.drjit|\.cache|__pycache__|\.nv|\.config/matplotlib)(/|$)|^/dev/(null|tty)$|^/proc/self/"
+)
 """Paths outside the workshop that may be written: of libraries, and of these trials."""
 
 TEMPORARY = re.compile(r"\.[^/]*\.\d+\.tmp(\.[^/]*)?$")
@@ -232,40 +237,44 @@ def _place(line: str) -> str:
 
 @contextmanager
 def _captured(encoding: str, outcome: Outcome) -> Iterator[None]:
-    """Both standard streams as they are when they are files, also what libraries write to them."""
-    with TemporaryFile() as out, TemporaryFile() as err:
-        kept = {1: os.dup(1), 2: os.dup(2)}
-        streams, showwarning = (sys.stdout, sys.stderr), warnings.showwarning
-        for stream in streams:
-            stream.flush()
-        os.dup2(out.fileno(), 1)
-        os.dup2(err.fileno(), 2)
-        sys.stdout = open(1, "w", encoding=encoding, errors="strict", closefd=False)  # noqa: SIM115
-        sys.stderr = open(  # noqa: SIM115
-            2, "w", encoding=encoding, errors="backslashreplace", closefd=False, buffering=1
-        )
+    """Both standard streams, also what libraries write to them, through pipes that hold it all."""
+    pipes = {number: os.pipe() for number in (1, 2)}
+    kept = {number: os.dup(number) for number in pipes}
+    streams, showwarning = (sys.stdout, sys.stderr), warnings.showwarning
+    for stream in streams:
+        stream.flush()
+    for number, (_, end) in pipes.items():
+        fcntl.fcntl(end, fcntl.F_SETPIPE_SZ, PIPE_BYTES)
+        os.dup2(end, number)
+        os.close(end)
+    sys.stdout = open(1, "w", encoding=encoding, errors="strict", closefd=False)  # noqa: SIM115
+    sys.stderr = open(  # noqa: SIM115
+        2, "w", encoding=encoding, errors="backslashreplace", closefd=False, buffering=1
+    )
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("always")
+            for kind in (DeprecationWarning, PendingDeprecationWarning, ResourceWarning):
+                warnings.simplefilter("ignore", kind)
+            warnings.showwarning = _show_warning
+            yield
+    finally:
+        warnings.showwarning = showwarning
         try:
-            with warnings.catch_warnings():
-                warnings.simplefilter("always")
-                for kind in (DeprecationWarning, PendingDeprecationWarning, ResourceWarning):
-                    warnings.simplefilter("ignore", kind)
-                warnings.showwarning = _show_warning
-                yield
-        finally:
-            warnings.showwarning = showwarning
-            try:
-                sys.stdout.flush()
-            except (OSError, UnicodeError) as error:
-                print(f"Traceback: {error}", file=sys.stderr)
-            sys.stderr.flush()
-            sys.stdout, sys.stderr = streams
-            for number, copy in kept.items():
-                os.dup2(copy, number)
-                os.close(copy)
-            out.seek(0)
-            err.seek(0)
-            outcome.out = out.read().decode("utf-8", "replace")
-            outcome.err = err.read().decode("utf-8", "replace")
+            sys.stdout.flush()
+        except (OSError, UnicodeError) as error:
+            print(f"Traceback: {error}", file=sys.stderr)
+        sys.stderr.flush()
+        sys.stdout, sys.stderr = streams
+        for number, copy in kept.items():
+            os.dup2(copy, number)  # closes the pipe's end
+            os.close(copy)
+        outcome.out, outcome.err = (_all_of(start) for start, _ in pipes.values())
+
+
+def _all_of(pipe: int) -> str:
+    with open(pipe, "rb") as file:
+        return file.read().decode("utf-8", "replace")
 
 
 def _show_warning(message: object, category: type, *others: object, **more: object) -> None:
