@@ -120,12 +120,15 @@ def background_of(props: mi.Properties) -> mi.Color3f | mi.Texture:
     try:
         if isinstance(value, str):  # of which nanobind complains itself, beside its error
             raise TypeError
-        return mi.Color3f(value)
+        color = mi.Color3f(value)
     except TypeError:
         raise PluginTypeError(
             "splats: background must be an RGB colour, such as [1, 1, 1] or "
             f"<rgb value='1, 1, 1'/>, or a texture, got {type(value).__name__}"
         ) from None
+    if not np.isfinite(np.array(dr.detach(color))).all():
+        raise PluginError(f"splats: background must be finite numbers, got {value}")
+    return color
 
 
 def ignored_effects(props: mi.Properties) -> tuple[str, ...]:
@@ -237,14 +240,14 @@ def integer(props: mi.Properties, name: str, default: int, least: int, most: int
 
 
 def number(props: mi.Properties, name: str, default: float) -> float:
-    """A finite number."""
+    """A number that is finite in single precision, in which it is kept."""
     return _number(props, name, default, "a finite number")
 
 
 def positive(props: mi.Properties, name: str, default: float) -> float:
-    """A finite number above 0."""
+    """A number above 0 and finite, in single precision as well."""
     value = _number(props, name, default, "a positive number")
-    if value <= 0:
+    if np.float32(value) <= 0:
         raise PluginError(_message(props, name, "a positive number", value))
     return value
 
@@ -253,8 +256,9 @@ def _number(props: mi.Properties, name: str, default: float, expected: str) -> f
     value = props.get(name, default)
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise PluginTypeError(_message(props, name, expected, value))
-    if not math.isfinite(value):
-        raise PluginError(_message(props, name, expected, value))
+    with np.errstate(over="ignore"):
+        if not np.isfinite(np.float32(value)):
+            raise PluginError(_message(props, name, expected, value))
     return float(value)
 
 

@@ -37,6 +37,11 @@ Planes = list[list[list[Any]]]
 """Planes of frames, each Float (H * W,), by time and by sample."""
 
 
+POSES_PER_KERNEL = 16
+"""Of more times at which the shutter is open, sums are evaluated in between: compilers take longer
+than proportionally to a kernel's length."""
+
+
 @dataclass(frozen=True, eq=False)
 class View:
     """What one sensor sees of a picture: all of it, unless it is one of a batch."""
@@ -81,7 +86,8 @@ class View:
             dr.traverse(dr.ADMode.Backward, flags=dr.ADFlag.ClearVertices)
             d_planes = dr.grad(planes)
             d_constant = None if constant is None else dr.grad(constant)
-        dr.eval(d_planes, d_constant)
+        for first in range(0, len(d_planes), POSES_PER_KERNEL):
+            dr.eval(d_planes[first : first + POSES_PER_KERNEL], d_constant)
         with dr.resume_grad():
             state = self._state()
             of_camera = state.is_attached
@@ -125,12 +131,7 @@ class View:
         channels = [
             [channels_of(*sample) for sample in zip(*time, strict=False)] for time in by_time
         ]
-        if len(channels) == 1:
-            return channels[0]
-        return [
-            [sum(values[1:], values[0]) / len(values) for values in zip(*of_sample, strict=True)]
-            for of_sample in zip(*channels, strict=True)
-        ]
+        return channels[0] if len(channels) == 1 else _mean(channels)
 
     def _composited(
         self,
@@ -249,6 +250,21 @@ class View:
         numbers = [camera.numbers() for camera in self._attached_cameras(state)]
         dr.forward_to(numbers, flags=dr.ADFlag.ClearEdges)
         return dr.grad(numbers)
+
+
+def _mean(passes: Sequence[Passes]) -> Passes:
+    """Of what the film gets at several times, summed in their order."""
+    total: list[Passes] = []
+    for first in range(0, len(passes), POSES_PER_KERNEL):
+        dr.eval(total)
+        terms = [*total, *passes[first : first + POSES_PER_KERNEL]]
+        total = [
+            [
+                [sum(values[1:], values[0]) for values in zip(*of_sample, strict=True)]
+                for of_sample in zip(*terms, strict=True)
+            ]
+        ]
+    return [[value / len(passes) for value in of_sample] for of_sample in total[0]]
 
 
 @dataclass(frozen=True)

@@ -111,6 +111,22 @@ def test_gradients_add_up_over_the_times(variant, sensor):
         assert abs(1.01 * terms.sum() - expected) > 2e-5 * np.abs(terms).sum(), parameter
 
 
+def test_poses_that_kernels_share_change_no_byte(variant, monkeypatch):
+    """Of more than :data:`POSES_PER_KERNEL`, which are compiled in parts."""
+    gaussians, _ = clear_gaussians(
+        SENSORS[0], lambda gaussians: picture_by_reference(SENSORS[0], gaussians)
+    )
+    sensor = SENSORS[0].dictionary(shutter_samples=5)
+    weights = np.random.default_rng(1).normal(0, 1, (21, 26, 4))
+    results = []
+    for poses in (16, 2):
+        monkeypatch.setattr("drgs.integrator.view.POSES_PER_KERNEL", poses)
+        gradients = gradients_of(splats_scene(sensor, gaussians), weights, PARAMETER_NAMES)
+        results.append({"image": image_of(splats_scene(sensor, gaussians)), **gradients})
+    for name, expected in results[0].items():
+        np.testing.assert_array_equal(results[1][name], expected, err_msg=name)
+
+
 @pytest.mark.parametrize("sensor", SENSORS[:2], ids=lambda s: f"{s.name}, {s.shutter}")
 def test_forward_derivatives_of_a_moving_camera_are_the_transpose(variant, sensor):
     gaussians, _ = clear_gaussians(

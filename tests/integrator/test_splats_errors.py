@@ -107,6 +107,12 @@ REFUSED = {
     "near infinite": ({"near": float("inf")}, "near must be a positive number, got inf"),
     "near a string": ({"near": "far"}, "got 'far'"),
     "near not a number": ({"near": float("nan")}, "got nan"),
+    "near zero in single precision": ({"near": 1e-300}, "a positive number, got 1e-300"),
+    "near infinite in single precision": ({"near": 1e300}, "a positive number, got 1e+300"),
+    "background not a number": (
+        {"background": [0.0, float("nan"), 0.0]},
+        "PluginError: splats: background must be finite numbers, got ",
+    ),
     "antialiased a string": (
         {"antialiased": "no"},
         "PluginTypeError: splats: antialiased must be true or false, got 'no'",
