@@ -137,11 +137,10 @@ class Measurement:
 def add_arguments(parser: CommandParser) -> None:
     """Add the arguments of the command."""
     parser.show_examples("%(prog)s out/lego")
-    add_out(parser)
+    add_out(parser, run, "accuracy.csv", "accuracy.png")
     add_scene(parser)
     parser.add_argument("--views", type=int, default=3, help="test views of a fit (default: 3)")
     parser.add_argument("--quick", action="store_true", help="one view, fewer rounds")
-    parser.set_defaults(run=run)
 
 
 def add_scene(parser: CommandParser) -> None:

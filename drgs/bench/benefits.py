@@ -84,10 +84,9 @@ class Result:
 def add_arguments(parser: CommandParser) -> None:
     """Add the arguments of the command."""
     parser.show_examples("%(prog)s --only masks")
-    add_out(parser)
+    add_out(parser, run, "benefits.csv", "antialiasing.png")
     parser.add_argument("--quick", action="store_true", help="a few iterations each")
     parser.add_argument("--only", nargs="+", metavar="EFFECT", help="such as masks")
-    parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> None:

@@ -46,9 +46,8 @@ class Cost:
 def add_arguments(parser: CommandParser) -> None:
     """Add the arguments of the command."""
     parser.show_examples("%(prog)s --quick")
-    add_out(parser)
+    add_out(parser, run, "hybrid.csv")
     parser.add_argument("--quick", action="store_true", help="10,000 Gaussians, few rounds")
-    parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import csv
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 
 import drjit as dr
@@ -12,10 +12,19 @@ import drjit as dr
 from drgs.core.files import atomic_path
 from drgs.core.machine import processor
 from drgs.core.private import llvm_version
+from drgs.core.records import FolderRecord
+
+COMMAND = "bench"
 
 
-def add_out(parser: argparse.ArgumentParser) -> None:
-    """Add ``--out``."""
+def add_out(
+    parser: argparse.ArgumentParser, run: Callable[[argparse.Namespace], None], *names: str
+) -> None:
+    """Add ``--out``, and have ``run`` measure with the files ``names`` of that folder for itself.
+
+    A file that no measurement has written is not replaced: it is refused before anything is
+    measured.
+    """
     parser.add_argument(
         "--out",
         type=Path,
@@ -23,6 +32,15 @@ def add_out(parser: argparse.ArgumentParser) -> None:
         metavar="DIR",
         help="output folder (default: out/bench)",
     )
+
+    def run_with_own_files(args: argparse.Namespace) -> None:
+        FolderRecord(args.out, COMMAND).claim(names)
+        try:
+            run(args)
+        finally:
+            FolderRecord(args.out, COMMAND).seal()
+
+    parser.set_defaults(run=run_with_own_files)
 
 
 def machine() -> str:

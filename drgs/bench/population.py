@@ -166,7 +166,7 @@ CASES = (
 def add_arguments(parser: CommandParser) -> None:
     """Add the arguments of the command."""
     parser.show_examples("%(prog)s --only 1 2 --iterations 7000")
-    add_out(parser)
+    add_out(parser, run, "population/population.csv", "population/population.png")
     parser.add_argument(
         "--data", type=Path, metavar="DIR", help=f"NeRF-synthetic's Lego (default: as in {CONFIG})"
     )
@@ -176,7 +176,6 @@ def add_arguments(parser: CommandParser) -> None:
     )  # fmt: skip
     parser.add_argument("--threads", type=int, metavar="N", help="(default: one a core)")
     parser.add_argument("--iterations", type=int, metavar="N", help="(default: 30,000)")
-    parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> None:

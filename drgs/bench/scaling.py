@@ -68,9 +68,8 @@ class Result:
 def add_arguments(parser: CommandParser) -> None:
     """Add the arguments of the command."""
     parser.show_examples("%(prog)s --quick")
-    add_out(parser)
+    add_out(parser, run, "scaling.csv", "scaling.png")
     parser.add_argument("--quick", action="store_true", help="fewer and smaller problems")
-    parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> None:

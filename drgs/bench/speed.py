@@ -81,7 +81,7 @@ class Timing:
 def add_arguments(parser: CommandParser) -> None:
     """Add the arguments of the command."""
     parser.show_examples("%(prog)s --trained out/lego/point_cloud.ply")
-    add_out(parser)
+    add_out(parser, run, "speed.csv", "speed.json", "speed.png")
     parser.add_argument("--quick", action="store_true", help="10,000 Gaussians only; two minutes")
     parser.add_argument(
         "--trained",
@@ -90,7 +90,6 @@ def add_arguments(parser: CommandParser) -> None:
         metavar="PLY",
         help="a fitted scene to measure as well (default: out/lego/point_cloud.ply, if it exists)",
     )
-    parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> None:

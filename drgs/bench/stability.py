@@ -72,9 +72,8 @@ class Measurement:
 def add_arguments(parser: CommandParser) -> None:
     """Add the arguments of the command."""
     parser.show_examples("%(prog)s --quick")
-    add_out(parser)
+    add_out(parser, run, "stability.csv", "stability.png")
     parser.add_argument("--quick", action="store_true", help="fewer steps and samples")
-    parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> None:

@@ -91,7 +91,7 @@ class Point:
 def add_arguments(parser: CommandParser) -> None:
     """Add the arguments of the command."""
     parser.show_examples("%(prog)s --only 1 2")
-    add_out(parser)
+    add_out(parser, run, "training/training.csv", "training/training.png")
     parser.add_argument("--quick", action="store_true", help="a few hundred iterations")
     parser.add_argument(
         "--config",
@@ -104,7 +104,6 @@ def add_arguments(parser: CommandParser) -> None:
         "--only", type=int, nargs="+", metavar="K", choices=range(1, len(CHOICES) + 1),
         help="; ".join(f"{k}: {choice.name}" for k, choice in enumerate(CHOICES, 1)),
     )  # fmt: skip
-    parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> None:

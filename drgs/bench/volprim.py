@@ -72,9 +72,8 @@ class Row:
 def add_arguments(parser: CommandParser) -> None:
     """Add the arguments of the command."""
     parser.show_examples("%(prog)s out/lego")
-    add_out(parser)
+    add_out(parser, run, "volprim.csv")
     add_scene(parser)
-    parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> None:
