@@ -23,7 +23,7 @@ from drgs.training.views import TrainingView
 
 KEPT_BYTES = 1 << 30
 """Of targets and effects' uploads that stay on the device until their view is drawn again: of 180
-pictures of 400 x 400 px. Without room, they are made anew, in a few per cent of an iteration."""
+pictures of 400 x 400 px. Without room, they are made anew, in a tenth of an iteration."""
 
 
 @dataclass(eq=False)
