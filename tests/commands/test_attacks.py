@@ -28,17 +28,17 @@ QUICK = {
 """How many of a family are tried by default."""
 
 SLOW = {
-    "schema": 600,
-    "option": 1200,
-    "instead": 546,
-    "damaged": 500,
+    "schema": 450,
+    "option": 900,
+    "instead": 300,
+    "damaged": 350,
     "special": 93,
-    "together": 708,
-    "folder": 375,
-    "name": 204,
-    "fault": 300,
-    "size": 100,
-    "drawn": 10,
+    "together": 400,
+    "folder": 200,
+    "name": 100,
+    "fault": 150,
+    "size": 20,
+    "drawn": 4,
     "property": 300,
     "object": 100,
 }
