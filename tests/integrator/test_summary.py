@@ -72,7 +72,8 @@ def test_a_plan_is_a_line_for_each_effect_and_one_for_all_others():
 
 
 def test_the_plan_of_a_plain_fit():
-    assert described(summary_of_fit(config_of(), fits.plain_dataset())) == (
+    config = config_of(data__background="white")
+    assert described(summary_of_fit(config, fits.plain_dataset())) == (
         "simulated:\n"
         "  view dependence: spherical harmonics up to degree 3 (model.sh_degree: 3)\n"
         "  background: white (data.background)\n"
