@@ -198,9 +198,10 @@ def run(args: argparse.Namespace) -> None:
         settings = settings_for(scene, settings, given.keys())
         views = views_of(scene, settings)
         require_sight(scene, settings, views)
-        claim_folder(args.out, manifest(args.scene, settings))
+        wanted = manifest(args.scene, settings)
+        check_folder(args.out, wanted)
         print(described(settings, len(views)))
-        take_pictures(scene, settings, views, args.out)
+        take_pictures(scene, settings, views, args.out, wanted)
         write_dataset(scene, settings, views, args.out)
     except OSError as error:
         raise UserError(f"{error.filename or args.out}: {why_refused(error)}") from None
@@ -256,18 +257,30 @@ def described(settings: CaptureSettings, count: int) -> str:
 
 
 def take_pictures(
-    scene: mi.Scene, settings: CaptureSettings, views: list[CaptureView], out: Path
+    scene: mi.Scene,
+    settings: CaptureSettings,
+    views: list[CaptureView],
+    out: Path,
+    wanted: dict[str, object],
 ) -> None:
-    """Take the pictures that are not in ``out`` yet; say so where most show nothing."""
+    """Take the pictures that are not in ``out`` yet; say so where most show nothing.
+
+    wanted: see :func:`manifest`. The folder is claimed when the first picture is taken: until then
+    the scene may turn out to be one that cannot be captured.
+    """
     camera = CaptureCamera(scene, settings)
     missing = spread_first([view for view in views if not picture_path(out, view).exists()])
     there = len(views) - len(missing)
     if there:
         print(f"{there} of {len(views)} pictures are there already")
     shown = []
+    if not missing:
+        claim_folder(out, wanted)
     with RunProgress("picture", len(views), there) as progress:
         for done, view in enumerate(missing, there + 1):
             picture = camera.picture(view)
+            if not shown:
+                claim_folder(out, wanted)
             write_png(picture_path(out, view), picture)
             shown.append(shows_something(picture))
             if len(shown) == min(FIRST, len(missing)) and sum(shown) < len(shown) / 2:
@@ -315,8 +328,11 @@ def write_dataset(
     """
     if settings.points and not (out / POINTS).exists():
         positions, colors = visible_points(scene, settings, views, out)
-        write_points(out / POINTS, positions, colors)
-        print(f"{len(positions):,} points: {out / POINTS}")
+        if len(positions):
+            write_points(out / POINTS, positions, colors)
+            print(f"{len(positions):,} points: {out / POINTS}")
+        else:
+            print("no points: the pictures to train on show no surface")
     # The layout is recognised by the training split's file, so that one comes last.
     for split in reversed(SPLITS):
         path = out / f"transforms_{split}.json"
@@ -331,7 +347,7 @@ def write_dataset(
 def fitting(out: Path, settings: CaptureSettings) -> str:
     """The command that fits the capture in ``out``, as a shell reads it."""
     words = ["python", "-m", "drgs.fit", "scenes/photos.yml", "--data", str(out)]
-    if settings.points:
+    if (out / POINTS).exists():
         words += ["--set", f"init.point_cloud={out / POINTS}"]
     if not settings.test_views and not settings.val_views:
         words += ["--set", "data.test_split=train"]
@@ -356,26 +372,32 @@ def fingerprint(path: Path) -> str:
     return hashlib.sha256(b"".join(source.read_bytes() for source in sources)).hexdigest()
 
 
-def claim_folder(out: Path, wanted: dict[str, object]) -> None:
-    """Make ``out`` the folder of this capture: a new or empty one, or one that it began.
+def check_folder(out: Path, wanted: dict[str, object]) -> None:
+    """Raise :class:`UserError` where ``out`` is neither a new or empty folder nor this capture's.
 
     Hidden files do not count: a desktop's, or temporary ones of a capture that was killed before
-    its first file was in place.
-
-    Raises :class:`UserError` where it holds anything else.
+    its first file was in place. wanted: see :func:`manifest`.
     """
-    path = out / MANIFEST
-    wanted = json.loads(json.dumps(wanted))
     if out.exists() and not out.is_dir():
         raise UserError(f"{out}: --out must be a folder, got a file")
-    if not out.exists() or not any(not child.name.startswith(".") for child in out.iterdir()):
-        with atomic_path(path) as temporary:
-            temporary.write_text(json.dumps(wanted, indent=2) + "\n")
-    elif not path.is_file():
+    if _is_empty(out):
+        return
+    if not (out / MANIFEST).is_file():
         raise UserError(f"{out}: the folder is not empty and holds no {MANIFEST}; {REMEDY}")
-    else:
-        _check_manifest(path, wanted)
+    _check_manifest(out / MANIFEST, json.loads(json.dumps(wanted)))
+
+
+def claim_folder(out: Path, wanted: dict[str, object]) -> None:
+    """Make ``out`` the folder of this capture, or raise as :func:`check_folder`."""
+    check_folder(out, wanted)
+    if _is_empty(out):
+        with atomic_path(out / MANIFEST) as temporary:
+            temporary.write_text(json.dumps(wanted, indent=2) + "\n")
     remove_stale_temporaries(out)
+
+
+def _is_empty(out: Path) -> bool:
+    return not out.exists() or all(child.name.startswith(".") for child in out.iterdir())
 
 
 def _check_manifest(path: Path, wanted: dict[str, object]) -> None:

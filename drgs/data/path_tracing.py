@@ -308,8 +308,6 @@ def lit_part(rgba: np.ndarray) -> float:
     return float(lit.sum() / max(1, covered.sum()))
 
 
-NOTHING_SEEN = "the cameras see nothing of the scene: give --target and --distance"
-
 SIGHT_RAYS = 64
 """Through each picture, along both sides: what falls between them is smaller than a fit can use."""
 
@@ -328,7 +326,7 @@ def require_sight(scene: mi.Scene, settings: CaptureSettings, views: list[Captur
         rays = view.pose[:3, 3], view_rays(view, spots, settings)
         if first_hits(scene, *rays, settings.hides_lights)[1].any():
             return
-    raise UserError(NOTHING_SEEN)
+    raise UserError("the cameras see nothing of the scene: give --target and --distance")
 
 
 def visible_points(
@@ -337,10 +335,11 @@ def visible_points(
     """First hits of random rays: positions (N, 3) float32 world, colours (N, 3) uint8.
 
     Each training view has the same share of ``settings.points``, spread evenly over what is
-    covered of its picture; the colour is that of the pixel in the written picture.
+    covered of its picture; the colour is that of the pixel in the written picture. None (N = 0)
+    where the few paths of a pixel met nothing.
     """
     train = [view for view in views if view.split == "train"]
-    positions, colors = [], []
+    positions, colors = [np.empty((0, 3), np.float32)], [np.empty((0, 3), np.uint8)]
     for number, view in enumerate(train):
         share = (number + 1) * settings.points // len(train) - number * settings.points // len(
             train
@@ -358,8 +357,6 @@ def visible_points(
         hits, valid = first_hits(scene, *rays, settings.hides_lights)
         positions.append(hits[valid][:share])
         colors.append(np.round(picture[pixels[valid], :3] * 255).astype(np.uint8)[:share])
-    if not sum(map(len, positions)):
-        raise UserError(NOTHING_SEEN)
     return np.concatenate(positions), np.concatenate(colors)
 
 

@@ -1,5 +1,6 @@
 """Commands, run in the process of the tests: what takes seconds to start is started once."""
 
+import signal
 from collections.abc import Callable
 from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import dataclass
@@ -21,6 +22,8 @@ class Outcome:
 def run_in_process(main: Callable[[list[str]], None], *arguments: object) -> Outcome:
     """Call a command's ``main`` as its process would."""
     out, err = StringIO(), StringIO()
+    # As a process begins; a command that Ctrl-C has stopped takes the handler away.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     with redirect_stdout(out), redirect_stderr(err):
         try:
             main([str(argument) for argument in arguments])
