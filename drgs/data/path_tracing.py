@@ -9,6 +9,8 @@ import importlib.util
 import math
 import sys
 import traceback
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
@@ -276,16 +278,29 @@ class CaptureCamera:
         entropy = [self._settings.seed, SPLITS.index(view.split), view.index]
         seeds = np.random.SeedSequence(entropy).generate_state(len(counts))
         total = np.zeros((height, width, 4))
-        for count, seed in zip(counts, seeds, strict=True):
-            image = mi.render(
-                self._scene,
-                sensor=self._sensor,
-                integrator=self._integrator,
-                seed=int(seed),
-                spp=count,
-            )
-            total += count * np.array(image, np.float64)
+        with _only_errors_logged():
+            for count, seed in zip(counts, seeds, strict=True):
+                image = mi.render(
+                    self._scene,
+                    sensor=self._sensor,
+                    integrator=self._integrator,
+                    seed=int(seed),
+                    spp=count,
+                )
+                total += count * np.array(image, np.float64)
         return total / spp
+
+
+@contextmanager
+def _only_errors_logged() -> Iterator[None]:
+    """Mitsuba would say for each pass that its sampler rounds the number of paths up."""
+    logger = mi.logger()
+    level = logger.log_level()
+    logger.set_log_level(mi.LogLevel.Error)
+    try:
+        yield
+    finally:
+        logger.set_log_level(level)
 
 
 def encode(linear: np.ndarray) -> np.ndarray:

@@ -447,7 +447,8 @@ def test_a_changed_neighbour_of_a_python_scene_is_another_scene(tmp_path):
 
 
 def test_the_command_runs_as_a_module(ball, tmp_path):
-    options = ["--views", "2", "--test-views", "1", "--size", "8", "8", "--spp", "4"]
+    # No two whole numbers of similar size make 7: Mitsuba's sampler takes one path more.
+    options = ["--views", "2", "--test-views", "1", "--size", "8", "8", "--spp", "7"]
     options += ["--points", "50"]
     command = [sys.executable, "-m", "drgs.capture", str(ball), "--out", str(tmp_path / "out")]
     result = subprocess.run(
@@ -456,7 +457,7 @@ def test_the_command_runs_as_a_module(ball, tmp_path):
     assert result.returncode == 0, result.stderr
     assert "picture 3/3" in result.stdout
     assert "50 points" in result.stdout
-    assert "\r" not in result.stdout
+    assert "\r" not in result.stdout and "WARN" not in result.stdout + result.stderr
 
 
 # The shipped scene
