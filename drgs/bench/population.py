@@ -36,10 +36,10 @@ from drgs.core.arrays import from_host
 from drgs.data import load_dataset
 from drgs.io.figures import new_figure, write_figure
 from drgs.results.files import HISTORY, METRICS
-from drgs.training import densify, optimizer
+from drgs.training.density import adc
+from drgs.training.density.strategy import DensityReport, Population
 
 if TYPE_CHECKING:
-    from drjit.opt import Adam
     from matplotlib.figure import Figure
 
 SCENES = Path(__file__).parents[2] / "scenes"
@@ -92,23 +92,21 @@ def _prune_added_rows_at_once() -> Iterator[None]:
     """The prune of a step also meets what the step has added, as in the reference's code."""
 
     def densify_and_prune(
-        opt: Adam, statistics: densify.DensityStatistics, config: DensifyConfig, extent: float,
-        iteration: int, seed: int, prefix: str = "",
-    ) -> densify.DensityReport:  # fmt: skip
-        report = original(opt, statistics, config, extent, iteration, seed, prefix)
-        opacities = expit(np.array(opt[prefix + "logit_opacities"], np.float64))
-        scales = np.exp(np.array(opt[prefix + "log_scales"], np.float64)).max(axis=1)
-        limit = config.prune_scale * extent if densify.prunes_large(config, iteration) else np.inf
+        rows: Population, statistics: adc.DensityStatistics, config: DensifyConfig, iteration: int
+    ) -> DensityReport:
+        report = original(rows, statistics, config, iteration)
+        opacities = expit(rows.host("logit_opacities"))
+        scales = np.exp(rows.host("log_scales")).max(axis=1)
+        limit = config.prune_scale * rows.extent if adc.prunes_large(config, iteration) else np.inf
         keep = np.flatnonzero((opacities >= config.prune_opacity) & (scales <= limit))
         if len(keep) == report.num_gaussians:
             return report
-        rows = from_host(dr.uint32_array_t(type(statistics.views)), keep)
-        optimizer.edit_rows(opt, rows, None, prefix)
+        rows.edit(from_host(dr.uint32_array_t(type(statistics.views)), keep))
         pruned = report.pruned + report.num_gaussians - len(keep)
         return replace(report, pruned=pruned, num_gaussians=len(keep))
 
-    original = densify.densify_and_prune
-    with patch.object(densify, "densify_and_prune", densify_and_prune):
+    original = adc.densify_and_prune
+    with patch.object(adc, "densify_and_prune", densify_and_prune):
         yield
 
 
@@ -124,8 +122,8 @@ def _reset_until_the_end() -> Iterator[None]:
             return iteration % config.reset_every == 0
         return original(config, iteration, white_background)
 
-    original = densify.should_reset
-    with patch.object(densify, "should_reset", should_reset):
+    original = adc.should_reset
+    with patch.object(adc, "should_reset", should_reset):
         yield
 
 

@@ -31,6 +31,10 @@ PLACES = ("data.path", "data.source", "init.point_cloud")
 needed no more; what the data is has a fingerprint."""
 
 
+EARLIER_NAMES = {"gradient_norms": "density/gradient_norms", "views": "density/views"}
+"""Of the trainer's state, in files of earlier versions."""
+
+
 @dataclass(frozen=True, eq=False)
 class Checkpoint:
     """What a fit has to know of its past."""
@@ -89,7 +93,7 @@ def load_checkpoint(folder: Path, config: FitConfig) -> Checkpoint | None:
             wall_s=float(arrays.pop("wall_s")),
             data=None if data is None else Fingerprint.from_bytes(data.tobytes()),
             config=own,
-            trainer={name.removeprefix("trainer."): values for name, values in arrays.items()},
+            trainer=_named_as_now(arrays),
         )
         check_history(checkpoint.history, checkpoint.wall_s)
     except UserError as error:
@@ -113,6 +117,12 @@ def check_fits(folder: Path, checkpoint: Checkpoint, start: Mapping[str, np.ndar
         check_state(checkpoint.trainer, start, config.iterations, config.densify.max_gaussians)
     except ValueError as error:
         raise _damaged(folder / CHECKPOINT, error) from None
+
+
+def _named_as_now(arrays: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """The trainer's state among the arrays of a file."""
+    names = {name: name.removeprefix("trainer.") for name in arrays}
+    return {EARLIER_NAMES.get(names[name], names[name]): array for name, array in arrays.items()}
 
 
 def _damaged(path: Path, error: Exception) -> UserError:

@@ -83,15 +83,17 @@ def _faults(iteration: _Iteration) -> Iterator[str]:
 def check_values(iteration: int, values: Mapping[str, Any]) -> None:
     """Raise :class:`NonFiniteError` for the first value that is not finite; waits for the device.
 
-    values: arrays by name, one row a Gaussian. A Gaussian of such values is invisible, so that no
-    loss and no gradient ever tells.
+    values: tensors or numpy arrays by name, one row a Gaussian, or single numbers. A Gaussian of
+    such values is invisible, so that no loss and no gradient ever tells.
     """
     for name, array in values.items():
-        array = dr.detach(array)
-        if dr.all(dr.isfinite(array.array)):
+        on_device = not isinstance(array, np.ndarray)
+        if on_device and dr.all(dr.isfinite(dr.detach(array).array)):
             continue
-        row, value = _first_fault(np.array(array))
-        raise NonFiniteError(f"after iteration {iteration}: {name} is {value} in row {row}")
+        host = np.atleast_1d(np.array(dr.detach(array) if on_device else array))
+        if (first := _first_fault(host)) is not None:
+            row, value = first
+            raise NonFiniteError(f"after iteration {iteration}: {name} is {value} in row {row}")
 
 
 def check_view_values(

@@ -26,6 +26,7 @@ from drgs.core.memory import available_memory, readable, resident_memory
 from drgs.data.types import Dataset, View, Viewpoint
 from drgs.gaussians.parameters import Gaussians
 from drgs.splatting.grid import MICRO, TILE
+from drgs.training.density.called_for import density_strategy
 
 PROCESS_BYTES = 290_000_000
 """Interpreter, libraries and compiled kernels; and results, as far as they come on top. Compiling
@@ -130,16 +131,8 @@ def estimate(
 
 
 def most_gaussians(config: FitConfig, start: int) -> int:
-    """How many a fit can have that starts with ``start``: each change adds a row for each, or more.
-
-    At most ``densify.max_gaussians``, but for those that are there at the start.
-    """
-    densify, last = config.densify, min(config.iterations, config.densify.stop - 1)
-    changes = max(0, last // densify.every - densify.start // densify.every)
-    doublings = math.log2(max(densify.max_gaussians, start) / start)
-    if changes * math.log2(densify.split_count) >= doublings:
-        return max(start, densify.max_gaussians)
-    return start * densify.split_count**changes
+    """How many a fit can have that starts with ``start``: see its strategy of density."""
+    return density_strategy(config).most_gaussians(start, config.iterations)
 
 
 def _kept_bytes(view: View, scale: float) -> float:

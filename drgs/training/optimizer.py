@@ -122,18 +122,20 @@ def replace_values(optimizer: Adam, name: str, value: Any, prefix: str = "") -> 
     The step count and the learning rate stay: as in the reference's opacity reset, Adam's bias
     correction does not start again.
     """
-    key = prefix + name
-    old, promoted, rate, (step, *moments) = optimizer.state[key]
-    if tuple(value.shape) != tuple(old.shape):
-        raise ValueError(
-            f"replace_values(): {key} has shape {tuple(old.shape)}, the new values "
-            f"{tuple(value.shape)}: edit_rows() adds and removes rows"
-        )
-    value = type(old)(dr.detach(value))
-    dr.make_opaque(value)
-    dr.enable_grad(value)
+    value, promoted, rate, (step, *moments) = _with_value(
+        "replace_values", optimizer, prefix + name, value
+    )
     moments = [None if m is None else dr.opaque(type(m), 0, m.shape) for m in moments]
-    optimizer.state[key] = value, promoted, rate, (step, *moments)
+    optimizer.state[prefix + name] = value, promoted, rate, (step, *moments)
+
+
+def set_values(optimizer: Adam, name: str, value: Any, prefix: str = "") -> None:
+    """Give a parameter new values of the same shape; moments, step count and rate stay.
+
+    Detached; waits for nothing.
+    """
+    key = prefix + name
+    optimizer.state[key] = _with_value("set_values", optimizer, key, value)
 
 
 def optimizer_state(optimizer: Adam, prefix: str = "") -> dict[str, np.ndarray]:
@@ -160,6 +162,20 @@ def restore_optimizer(optimizer: Adam, state: Mapping[str, np.ndarray], prefix: 
         moments = type(first)(state[f"{name}.m"]), type(second)(state[f"{name}.v"])
         extra = (type(step)(state[f"{name}.t"]), *moments, maximum)
         optimizer.state[prefix + name] = value, promoted, rate, extra
+
+
+def _with_value(caller: str, optimizer: Adam, key: str, value: Any) -> tuple[Any, ...]:
+    """The optimizer's entry of a parameter with other values, which are evaluated."""
+    old, *others = optimizer.state[key]
+    if tuple(value.shape) != tuple(old.shape):
+        raise ValueError(
+            f"{caller}(): {key} has shape {tuple(old.shape)}, the new values "
+            f"{tuple(value.shape)}: edit_rows() adds and removes rows"
+        )
+    value = type(old)(dr.detach(value))
+    dr.make_opaque(value)
+    dr.enable_grad(value)
+    return value, *others
 
 
 def _names(optimizer: Adam, prefix: str) -> list[str]:

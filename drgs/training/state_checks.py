@@ -16,6 +16,9 @@ from drgs.core.errors import listed
 MEANS = "means.value"
 """The array that says how many Gaussians there are."""
 
+DENSITY = "density/"
+"""How names of the strategy's state begin: a row for each Gaussian, or single numbers."""
+
 FILTER = "smoothing/filter"
 """Of an effect, with a number for each Gaussian; a trainer has none at its start."""
 
@@ -64,7 +67,8 @@ def check_history(rows: np.ndarray, wall_s: float) -> None:
 def _shape(name: str, like: Mapping[str, np.ndarray], num: int) -> tuple[int, ...]:
     """Of an array of the state with ``num`` Gaussians; moments are flat, with several for each."""
     shape = like[name].shape
-    belongs_to_gaussians = shape and "/" not in name and not name.endswith(".t")
+    of_effect = "/" in name and not name.startswith(DENSITY)
+    belongs_to_gaussians = shape and not of_effect and not name.endswith(".t")
     if not belongs_to_gaussians:
         return shape
     return (shape[0] // like[MEANS].shape[0] * num, *shape[1:])

@@ -2,7 +2,7 @@
 
 Everything between two optimizer steps is visible in :meth:`Trainer.step`. The picture and its
 gradients come from ``mi.render`` with the ``splats`` integrator, the steps from ``drjit.opt.Adam``,
-changes of the population from ``drgs.training.densify``.
+changes of the population from a strategy of ``drgs.training.density``.
 """
 
 from __future__ import annotations
@@ -22,7 +22,8 @@ from drgs.data.derived import completed
 from drgs.data.types import Dataset, View
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 from drgs.integrator.scene import make_scene, render_views
-from drgs.training import densify
+from drgs.training.density.called_for import density_strategy
+from drgs.training.density.strategy import DensityReport, DensityStrategy, Population, SeenStep
 from drgs.training.effects.called_for import integrator_settings, training_effects
 from drgs.training.finite_checks import GradientWatch, check_values, check_view_values
 from drgs.training.losses import PhotometricLoss
@@ -30,6 +31,7 @@ from drgs.training.memory import room_for_targets
 from drgs.training.optimizer import make_optimizer, optimizer_state, restore_optimizer
 from drgs.training.rates import learning_rates, means_rate, rate_aims
 from drgs.training.stages import KEPT_BYTES, Stage, bytes_on_device, make_stages, view_of
+from drgs.training.state_checks import DENSITY
 from drgs.training.views import TrainingView
 
 PREFIX = "integrator."
@@ -43,7 +45,7 @@ class StepReport:
     iteration: int
     num_gaussians: int
     means_lr: float
-    density: densify.DensityReport | None
+    density: DensityReport | None  # None: rows are what they were
     loss_array: Any  # Float, one entry
     squared_error: Any  # Float, one entry: mean over pixels and channels
     counted: float  # share of the pixels that count
@@ -74,9 +76,10 @@ class Trainer:
         self.params = mi.traverse(self.scene)
         self.params.keep([PREFIX + name for name in PARAMETER_NAMES])
         initial = {key.removeprefix(PREFIX): value for key, value in self.params.items()}
+        self.rates = learning_rates(config.optimizer, self.extent)
         self.optimizer = make_optimizer(
             initial,
-            learning_rates(config.optimizer, self.extent),
+            self.rates,
             prefix=PREFIX,
             beta_1=config.optimizer.beta_1,
             beta_2=config.optimizer.beta_2,
@@ -86,7 +89,8 @@ class Trainer:
         self.loss = PhotometricLoss(config.loss.dssim_weight)
         self.white_background = tuple(dataset.background) == (1.0, 1.0, 1.0)
         self.stages = make_stages(dataset.train, config, self.effects, room)
-        self.statistics = self._no_statistics()
+        self.population = Population(self.optimizer, PREFIX, self.extent, config.seed)
+        self.density = self._density_from({})
         self.watch = GradientWatch()
         self.iteration = 0
 
@@ -96,7 +100,7 @@ class Trainer:
         self.iteration += 1
         view = self.view
         self.integrator.sh_degree = self.sh_degree
-        self.optimizer.set_learning_rate({PREFIX + "means": self.means_lr(self.iteration)})
+        self._set_rates()
         self.params.update(self.optimizer)
         for effect in self.effects:
             effect.before(self, view)
@@ -105,7 +109,8 @@ class Trainer:
         image, loss = self.compared(image, view)
         dr.backward(loss)
         image, loss = dr.detach(image), dr.detach(loss)
-        error = dr.mean(dr.square(image.array - view.target.image.array))
+        photograph = view.target.image
+        error = dr.mean(dr.square(image.array - photograph.array))
         numbers = {f"{e.name}.{k}": v for e in self.effects for k, v in e.numbers_of(view).items()}
         self.watch.add(self.iteration, view.name, loss, self.integrator.last.first_fault, numbers)
         self.optimizer.step()
@@ -113,7 +118,7 @@ class Trainer:
             effect.after(self, view)
         self.stage.seen(view)
 
-        report = self._control_density(view)
+        report = self._control_density(image, photograph)
         return StepReport(
             iteration=self.iteration,
             num_gaussians=self.num_gaussians,
@@ -132,6 +137,8 @@ class Trainer:
         for effect in self.effects:
             for penalty in effect.penalties(view):
                 loss = loss + penalty
+        for penalty in self.density.penalties(self.parameters):
+            loss = loss + penalty
         return image, loss
 
     @property
@@ -164,6 +171,11 @@ class Trainer:
     def view(self) -> TrainingView:
         """What this iteration trains on."""
         return self.views[view_of(self.iteration, len(self.views), self.config.seed)]
+
+    @property
+    def parameters(self) -> dict[str, Any]:
+        """Raw values by name, as the optimizer has them."""
+        return {key.removeprefix(PREFIX): value for key, value in self.optimizer.items()}
 
     @property
     def means(self) -> Any:
@@ -204,6 +216,7 @@ class Trainer:
         }
         self.config = changed(config, changes)
         self.means_lr = means_rate(self.config, self.extent)
+        self.density = self._density_from(self.density.state())
 
     def check(self) -> None:
         """Raise ``NonFiniteError`` if a loss, a gradient or a value is not; waits for the device.
@@ -211,8 +224,7 @@ class Trainer:
         Called before anything that saves, returns or edits the state.
         """
         self.watch.check()
-        values = {key.removeprefix(PREFIX): value for key, value in self.optimizer.items()}
-        check_values(self.iteration, {**values, "gradient_norms": self.statistics.gradient_norms})
+        check_values(self.iteration, {**self.parameters, **self.density.state()})
         of_views = {f"{e.name}.{k}": v for e in self.effects for k, v in e.values().items()}
         check_view_values(self.iteration, of_views, [view.name for view in self.views])
 
@@ -242,8 +254,7 @@ class Trainer:
         self.check()
         return {
             "iteration": np.array(self.iteration),
-            "gradient_norms": np.array(self.statistics.gradient_norms),
-            "views": np.array(self.statistics.views),
+            **{f"{DENSITY}{name}": values for name, values in self.density.state().items()},
             **optimizer_state(self.optimizer, PREFIX),
             **{f"{e.name}/{k}": v for e in self.effects for k, v in e.state().items()},
         }
@@ -253,45 +264,52 @@ class Trainer:
         self.iteration = int(state["iteration"])
         self.integrator.sh_degree = self.sh_degree
         restore_optimizer(self.optimizer, state, PREFIX)
-        self.statistics = densify.DensityStatistics(
-            mi.Float(state["gradient_norms"]), mi.Float(state["views"])
-        )
+        self.density = self._density_from(_part(state, DENSITY))
         for effect in self.effects:
-            start = f"{effect.name}/"
-            own = {k.removeprefix(start): v for k, v in state.items() if k.startswith(start)}
             effect.repopulated(self)
-            effect.restore(own)
+            effect.restore(_part(state, f"{effect.name}/"))
         self.watch = GradientWatch()
         self.params.update(self.optimizer)
 
-    def _control_density(self, view: TrainingView) -> densify.DensityReport | None:
-        config, i = self.config.densify, self.iteration
-        if densify.gathers_statistics(config, i):
-            last = self.integrator.last
-            self.statistics = densify.accumulate(
-                self.statistics, last.means2d_grad, last.visible, view.width, view.height
-            )
-        densifies = densify.should_densify(config, i)
-        resets = densify.should_reset(config, i, self.white_background)
-        if densifies or resets:
-            self.check()
-        report = None
-        if densifies:
-            report = densify.densify_and_prune(
-                self.optimizer, self.statistics, config, self.extent, i, self.config.seed, PREFIX
-            )
-            self.statistics = self._no_statistics()
+    def _density_from(self, state: dict[str, np.ndarray]) -> DensityStrategy:
+        """The strategy of the configuration, with its state; empty: at the beginning."""
+        density = density_strategy(self.config, self.white_background)
+        density.begin(self.population)
+        if state:
+            density.restore(state)
+        return density
+
+    def _set_rates(self) -> None:
+        """The means' rate of this iteration, and what the strategy does to rates."""
+        rates = {"means": self.means_lr(self.iteration)}
+        for name, factor in self.density.rate_factors(self.iteration).items():
+            rates[name] = factor * rates.get(name, self.rates[name])
+        self.optimizer.set_learning_rate({PREFIX + name: rate for name, rate in rates.items()})
+
+    def _control_density(self, image: Any, photograph: Any) -> DensityReport | None:
+        """Tell the strategy what was seen, and let it act; both (H, W, 3), as compared."""
+        density, i = self.density, self.iteration
+        if density.gathers(i):
+            last, (height, width, _) = self.integrator.last, image.shape
+            gradients = last.means2d_grad, last.visible
+            density.gather(SeenStep(i, width, height, *gradients, image, photograph))
+        density.perturb(self.population, i, self.means_lr(i))
+        if not density.acts(i):
+            return None
+        self.check()
+        report = density.act(self.population, i)
+        if report is not None:
             for effect in self.effects:
                 effect.repopulated(self)
             # Freed arrays of sizes that will not come again would stay with Dr.Jit's allocator.
             dr.flush_malloc_cache()
-        if resets:
-            densify.reset_opacities(self.optimizer, config, PREFIX)
         return report
 
     def _end_stage(self) -> None:
         if self.iteration == self.stage.until:
             self.stage.end()
 
-    def _no_statistics(self) -> densify.DensityStatistics:
-        return densify.DensityStatistics.zeros(mi.Float, self.num_gaussians)
+
+def _part(state: dict[str, np.ndarray], prefix: str) -> dict[str, np.ndarray]:
+    """What of a state belongs to somebody whose names begin so, without that beginning."""
+    return {k.removeprefix(prefix): v for k, v in state.items() if k.startswith(prefix)}

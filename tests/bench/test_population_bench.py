@@ -15,7 +15,7 @@ from drgs.bench import population
 from drgs.config.load import load_config
 from drgs.config.schema import DensifyConfig
 from drgs.data import load_dataset
-from drgs.training import densify
+from drgs.training.density import adc
 
 EXTENT = populations.EXTENT
 LATE = 3100  # large Gaussians are pruned from the first regular reset on
@@ -28,9 +28,8 @@ def variant():
 
 def change(optimizer, norms):
     """Through the module's name, as the trainer calls it."""
-    return densify.densify_and_prune(
-        optimizer, populations.statistics(norms), DensifyConfig(), EXTENT, LATE, 0
-    )
+    rows = populations.rows_of(optimizer)
+    return adc.densify_and_prune(rows, populations.statistics(norms), DensifyConfig(), LATE)
 
 
 def test_samples_that_are_still_too_large_are_pruned_at_once():
@@ -52,7 +51,7 @@ def test_resets_go_on_but_for_the_last_iteration_that_counts():
     config = DensifyConfig(stop=15_000, reset_every=3000)
 
     def resets():
-        return [i for i in range(1, 30_001) if densify.should_reset(config, i, True)]
+        return [i for i in range(1, 30_001) if adc.should_reset(config, i, True)]
 
     as_they_are = resets()
     with population._reset_until_the_end():

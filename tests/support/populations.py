@@ -5,9 +5,8 @@ import numpy as np
 from drjit.llvm.ad import Float, TensorXf
 
 from drgs.gaussians.parameters import PARAMETER_NAMES
-from drgs.training.densify import (
-    DensityStatistics,
-)
+from drgs.training.density.adc import DensityStatistics
+from drgs.training.density.strategy import Population
 from drgs.training.optimizer import make_optimizer
 
 EXTENT = 4.0
@@ -48,3 +47,8 @@ def statistics(gradient_norms, views=None):
     norms = np.asarray(gradient_norms, dtype=np.float32)
     views = np.full(len(norms), 4) if views is None else np.asarray(views)
     return DensityStatistics(Float(norms * views), Float(views))
+
+
+def rows_of(optimizer, seed=0, prefix=""):
+    """The same as strategies see them."""
+    return Population(optimizer, prefix, EXTENT, seed)

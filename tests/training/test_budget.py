@@ -169,6 +169,10 @@ class FakeTrainer:
         values = {"iterations": 1000, "densify.start": 100, "densify.stop": 600}
         self.config = changed(CONFIG, {**values, **changes})
         self.means_lr = means_rate(self.config, self.extent)
+        self.density = SimpleNamespace(state=dict)
+
+    def _density_from(self, state):
+        return self.density
 
     def step(self):
         self.iteration += 1

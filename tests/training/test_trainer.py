@@ -11,7 +11,7 @@ from support.trainers import make_trainer, small_dataset, small_view
 from drgs.data.images import smaller_view
 from drgs.data.initial import gaussians_from_points
 from drgs.gaussians.parameters import PARAMETER_NAMES
-from drgs.training import densify
+from drgs.training.density import adc
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -45,9 +45,9 @@ def test_only_sh_steps_compile_kernels_after_the_first_change_of_the_population(
         kind = rng.choice(["keep", "clone", "split", "prune"], len(gradient_norms))
         rows = {name: np.flatnonzero(kind == name).astype(np.uint32) for name in np.unique(kind)}
         kept = np.flatnonzero((kind == "keep") | (kind == "clone")).astype(np.uint32)
-        return densify._ChosenRows(kept, rows["clone"], rows["split"], 0)
+        return adc._ChosenRows(kept, rows["clone"], rows["split"], 0)
 
-    monkeypatch.setattr(densify, "_choose_rows", random_rows)
+    monkeypatch.setattr(adc, "_choose_rows", random_rows)
     trainer = make_trainer(
         model={"sh_degree": 3, "sh_increase_every": 12},
         densify={"start": 3, "stop": 45, "every": 4, "reset_every": 8},

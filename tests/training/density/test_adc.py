@@ -6,14 +6,13 @@ import drjit as dr
 import numpy as np
 import pytest
 from drjit.llvm.ad import Array2f, Bool, Float, TensorXf, TensorXf64
-from support.populations import EXTENT, make, statistics
+from support.populations import EXTENT, make, rows_of, statistics
 
 from drgs.config.schema import DensifyConfig
 from drgs.core.errors import UserError
 from drgs.gaussians.parameters import PARAMETER_NAMES
 from drgs.reference import splatting as reference
-from drgs.training.densify import (
-    DensityReport,
+from drgs.training.density.adc import (
     DensityStatistics,
     accumulate,
     densify_and_prune,
@@ -23,6 +22,7 @@ from drgs.training.densify import (
     should_densify,
     should_reset,
 )
+from drgs.training.density.strategy import DensityReport
 from drgs.training.optimizer import make_optimizer, num_rows
 
 EARLY, LATE = 600, 3100  # before and after the first opacity reset of the default schedule
@@ -35,14 +35,8 @@ HIGH = 3e-4  # a mean gradient norm above the default threshold of 2e-4
 
 
 def run(optimizer, gradient_norms, iteration=EARLY, seed=0, **config):
-    return densify_and_prune(
-        optimizer,
-        statistics(gradient_norms),
-        DensifyConfig(**config),
-        EXTENT,
-        iteration=iteration,
-        seed=seed,
-    )
+    rows = rows_of(optimizer, seed)
+    return densify_and_prune(rows, statistics(gradient_norms), DensifyConfig(**config), iteration)
 
 
 def values(optimizer):
@@ -110,7 +104,7 @@ def test_small_gaussian_is_cloned_in_place():
     optimizer = make([SMALL, SMALL], 0.5)
     before, (m, v) = values(optimizer), moments(optimizer, "means")
     report = run(optimizer, [0, HIGH])
-    assert report == DensityReport(cloned=1, split=0, pruned=0, refused=0, num_gaussians=3)
+    assert report == DensityReport(num_added=1, cloned=1, num_gaussians=3)
     for name, value in values(optimizer).items():
         np.testing.assert_array_equal(value, before[name][[0, 1, 1]])
     new_m, new_v = moments(optimizer, "means")
@@ -124,7 +118,7 @@ def test_large_gaussian_is_replaced_by_smaller_samples():
     optimizer = make([SMALL, LARGE, SMALL], 0.5)
     before = values(optimizer)
     report = run(optimizer, [0, HIGH, 0])
-    assert report == DensityReport(cloned=0, split=1, pruned=0, refused=0, num_gaussians=4)
+    assert report == DensityReport(num_added=1, split=1, num_gaussians=4)
     after = values(optimizer)
     for name in PARAMETER_NAMES:
         np.testing.assert_array_equal(after[name][:2], before[name][[0, 2]])
@@ -171,7 +165,7 @@ def test_transparent_gaussians_are_pruned_and_never_copied():
     optimizer = make([SMALL, SMALL, LARGE, SMALL], [0.5, 0.004, 0.004, 0.006])
     before = values(optimizer)
     report = run(optimizer, [0, HIGH, HIGH, 0])
-    assert report == DensityReport(cloned=0, split=0, pruned=2, refused=0, num_gaussians=2)
+    assert report == DensityReport(pruned=2, num_gaussians=2)
     for name, value in values(optimizer).items():
         np.testing.assert_array_equal(value, before[name][[0, 3]])
 
@@ -193,7 +187,7 @@ def test_just_added_rows_are_not_pruned_in_the_same_step():
     # Half the size of the scene divided by 1.6 is still far above the limit of 0.1 x extent.
     optimizer = make([2.0, SMALL], 0.5)
     report = run(optimizer, [HIGH, 0], iteration=LATE)
-    assert report == DensityReport(cloned=0, split=1, pruned=0, refused=0, num_gaussians=3)
+    assert report == DensityReport(num_added=1, split=1, num_gaussians=3)
     # In the next step they are old.
     assert run(optimizer, [0, 0, 0], iteration=LATE + 100).pruned == 2
 
@@ -201,14 +195,14 @@ def test_just_added_rows_are_not_pruned_in_the_same_step():
 def test_not_a_number_is_pruned_and_never_copied():
     optimizer = make([SMALL, SMALL, SMALL], [0.5, np.nan, 0.5])
     report = run(optimizer, [np.nan, HIGH, 0])
-    assert report == DensityReport(cloned=0, split=0, pruned=1, refused=0, num_gaussians=2)
+    assert report == DensityReport(pruned=1, num_gaussians=2)
 
 
 def test_nothing_to_do_changes_nothing():
     optimizer = make([SMALL, LARGE], 0.5)
     before = dict(optimizer.state)
     report = run(optimizer, [0, 0], iteration=LATE)
-    assert report == DensityReport(cloned=0, split=0, pruned=0, refused=0, num_gaussians=2)
+    assert report == DensityReport(num_gaussians=2)
     assert all(optimizer.state[key] is entry for key, entry in before.items())
 
 
@@ -234,12 +228,10 @@ def test_prefixed_parameters_are_found():
     bare = make([SMALL, LARGE, SMALL], [0.5, 0.5, 0.001])
     rates = dict.fromkeys(PARAMETER_NAMES, 0.0)
     optimizer = make_optimizer(dict(bare.items()), rates, "integrator.")
-    config = DensifyConfig()
-    report = densify_and_prune(
-        optimizer, statistics([HIGH] * 3), config, EXTENT, EARLY, 0, "integrator."
-    )
+    config, rows = DensifyConfig(), rows_of(optimizer, prefix="integrator.")
+    report = densify_and_prune(rows, statistics([HIGH] * 3), config, EARLY)
     assert (report.cloned, report.split, report.pruned) == (1, 1, 1)
-    reset_opacities(optimizer, config, "integrator.")
+    reset_opacities(rows, config)
     assert num_rows(optimizer, "integrator.") == report.num_gaussians
 
 
@@ -255,7 +247,7 @@ def test_cap_takes_the_largest_gradients_and_breaks_ties_by_index():
     before = values(optimizer)["means"]
     gradients = [2 * HIGH, HIGH, 3 * HIGH, HIGH, HIGH, 0]
     report = run(optimizer, gradients, max_gaussians=9)
-    assert report == DensityReport(cloned=3, split=0, pruned=0, refused=2, num_gaussians=9)
+    assert report == DensityReport(num_added=3, cloned=3, refused=2, num_gaussians=9)
     np.testing.assert_array_equal(values(optimizer)["means"][6:], before[[0, 1, 2]])
 
 
@@ -264,7 +256,7 @@ def test_cap_counts_a_clone_as_one_and_a_split_as_its_samples_less_the_parent():
     optimizer = make([LARGE, SMALL, LARGE, SMALL, SMALL], 0.5)
     gradients = [4 * HIGH, 3 * HIGH, 2 * HIGH, 0, 0]
     report = run(optimizer, gradients, max_gaussians=9, split_count=3)
-    assert report == DensityReport(cloned=1, split=1, pruned=0, refused=1, num_gaussians=8)
+    assert report == DensityReport(num_added=3, cloned=1, split=1, refused=1, num_gaussians=8)
 
 
 def test_pruned_rows_make_room():
@@ -275,7 +267,7 @@ def test_pruned_rows_make_room():
 def test_full_population_only_shrinks():
     optimizer = make([SMALL] * 6, [0.5] * 5 + [0.001])
     report = run(optimizer, [HIGH] * 6, max_gaussians=4)
-    assert report == DensityReport(cloned=0, split=0, pruned=1, refused=5, num_gaussians=5)
+    assert report == DensityReport(pruned=1, refused=5, num_gaussians=5)
 
 
 # ---- everything together
@@ -358,7 +350,7 @@ def test_reset_lowers_opacities_and_forgets_their_moments_only():
     config = DensifyConfig()
     optimizer = make([SMALL] * 3, [0.9, 0.01001, 0.007])
     before, (means_m, _) = values(optimizer), moments(optimizer, "means")
-    reset_opacities(optimizer, config)
+    reset_opacities(rows_of(optimizer), config)
     after = values(optimizer)
     opacities = reference.sigmoid(after["logit_opacities"].astype(float))
     # 1e-6: single precision of a logit of -4.6.

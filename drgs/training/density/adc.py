@@ -1,30 +1,29 @@
-"""Adaptive density control: clone, split, prune and the opacity reset.
+"""Adaptive density control, the strategy ``adc``: clone, split, prune and the opacity reset.
 
 Section 5 of the 3DGS paper (Kerbl et al. 2023) with the details of its reference implementation,
 except where a docstring says otherwise. Rows are chosen on the host, every hundred iterations or
 so, and moved by ``drgs.training.optimizer`` together with their moments. Equal inputs give equal
 bytes: no atomics, ties are broken by index, and random numbers depend on seed and iteration alone.
 
-``config`` is the section ``densify`` of the configuration; ``scene_extent`` is in world units.
-Iterations are counted from 1.
+``config`` is the section ``densify`` of the configuration. Iterations are counted from 1.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
 import numpy as np
-from drjit.opt import Adam
 from scipy.special import expit
 
 from drgs.config.schema import DensifyConfig
 from drgs.core.arrays import from_host, types_of
 from drgs.core.errors import UserError
 from drgs.gaussians.quaternions import quat_to_rotation
-from drgs.training.optimizer import edit_rows, num_rows, replace_values, take_rows
+from drgs.training.density.strategy import DensityReport, DensityStrategy, Population, SeenStep
 
 
 @dataclass(frozen=True)
@@ -46,15 +45,66 @@ class DensityStatistics:
         return sums / np.maximum(views, 1)
 
 
-@dataclass(frozen=True)
-class DensityReport:
-    """What one call of :func:`densify_and_prune` changed."""
+@dataclass
+class AdaptiveDensityControl(DensityStrategy):
+    """Clones and splits where gradients are large, prunes what is transparent or too large."""
 
-    cloned: int
-    split: int
-    pruned: int  # parents of a split not counted
-    refused: int  # clones and splits for which max_gaussians left no room
-    num_gaussians: int
+    config: DensifyConfig
+    white_background: bool
+    statistics: DensityStatistics | None = None  # until it begins
+
+    def begin(self, population: Population) -> None:
+        """Start with the statistics of no views."""
+        float_type = type(population.value("means").array)
+        self.statistics = DensityStatistics.zeros(float_type, population.num_rows)
+
+    def gathers(self, iteration: int) -> bool:
+        """See :func:`gathers_statistics`."""
+        return gathers_statistics(self.config, iteration)
+
+    def gather(self, step: SeenStep) -> None:
+        """Add the gradients of one more view."""
+        self.statistics = accumulate(
+            self.statistics, step.means2d_grad, step.visible, step.width, step.height
+        )
+
+    def acts(self, iteration: int) -> bool:
+        """Whether the population changes, or opacities are reset."""
+        return should_densify(self.config, iteration) or self._resets(iteration)
+
+    def act(self, population: Population, iteration: int) -> DensityReport | None:
+        """Clone, split and prune, then lower opacities, each where it is due."""
+        report = None
+        if should_densify(self.config, iteration):
+            report = densify_and_prune(population, self.statistics, self.config, iteration)
+            self.begin(population)
+        if self._resets(iteration):
+            reset_opacities(population, self.config)
+        return report
+
+    def state(self) -> dict[str, np.ndarray]:
+        """The statistics."""
+        sums, views = self.statistics.gradient_norms, self.statistics.views
+        return {"gradient_norms": np.array(sums), "views": np.array(views)}
+
+    def restore(self, state: Mapping[str, np.ndarray]) -> None:
+        """Continue with the statistics of :meth:`state`."""
+        float_type = type(self.statistics.views)
+        self.statistics = DensityStatistics(
+            float_type(state["gradient_norms"]), float_type(state["views"])
+        )
+
+    def most_gaussians(self, start: int, iterations: int) -> int:
+        """Each change adds a row for each, or more, until there are ``max_gaussians``."""
+        config, last = self.config, min(iterations, self.config.stop - 1)
+        changes = max(0, last // config.every - config.start // config.every)
+        doublings = math.log2(max(config.max_gaussians, start) / start)
+        if changes * math.log2(config.split_count) >= doublings:
+            return max(start, config.max_gaussians)
+        return start * config.split_count**changes
+
+    def _resets(self, iteration: int) -> bool:
+        return should_reset(self.config, iteration, self.white_background)
 
 
 def accumulate(
@@ -101,13 +151,7 @@ def prunes_large(config: DensifyConfig, iteration: int) -> bool:
 
 
 def densify_and_prune(
-    optimizer: Adam,
-    statistics: DensityStatistics,
-    config: DensifyConfig,
-    scene_extent: float,
-    iteration: int,
-    seed: int,
-    prefix: str = "",
+    population: Population, statistics: DensityStatistics, config: DensifyConfig, iteration: int
 ) -> DensityReport:
     """Clone, split and prune; the caller then starts again with zero statistics.
 
@@ -121,21 +165,21 @@ def densify_and_prune(
 
     Raises ``UserError`` if no Gaussian would remain: such a fit cannot recover.
     """
-    num_before = num_rows(optimizer, prefix)
+    num_before, extent = population.num_rows, population.extent
     if dr.width(statistics.views) != num_before:
         raise ValueError(
             f"densify_and_prune(): statistics of {dr.width(statistics.views)} Gaussians for "
             f"{num_before} in the optimizer: they start again after every change"
         )
-    limit = config.prune_scale * scene_extent if prunes_large(config, iteration) else np.inf
+    limit = config.prune_scale * extent if prunes_large(config, iteration) else np.inf
     with np.errstate(over="ignore"):
-        scales = np.exp(_host(optimizer, prefix + "log_scales")).max(axis=1)
+        scales = np.exp(population.host("log_scales")).max(axis=1)
     chosen = _choose_rows(
         gradient_norms=statistics.mean_gradient_norms(),
-        opacities=expit(_host(optimizer, prefix + "logit_opacities")),
+        opacities=expit(population.host("logit_opacities")),
         scales=scales,
         config=config,
-        scene_extent=scene_extent,
+        scene_extent=extent,
         largest_scale=limit,
     )
     num_added = len(chosen.clone) + len(chosen.split) * config.split_count
@@ -143,14 +187,14 @@ def densify_and_prune(
         raise UserError(
             f"iteration {iteration}: every Gaussian would be pruned (opacity below "
             f"densify.prune_opacity = {config.prune_opacity}, or scale above densify.prune_scale "
-            f"= {config.prune_scale} x {scene_extent:g}): do the cameras see the start points?"
+            f"= {config.prune_scale} x {extent:g}): do the cameras see the start points?"
         )
     if num_added > 0 or len(chosen.keep) < num_before:
         keep = from_host(dr.uint32_array_t(type(statistics.views)), chosen.keep)
-        key = [seed, iteration]
-        append = _new_rows(optimizer, chosen, config, key, prefix) if num_added > 0 else None
-        edit_rows(optimizer, keep, append, prefix)
+        append = _new_rows(population, chosen, config, iteration) if num_added > 0 else None
+        population.edit(keep, append)
     return DensityReport(
+        num_added=num_added - len(chosen.split),
         cloned=len(chosen.clone),
         split=len(chosen.split),
         pruned=num_before - len(chosen.keep) - len(chosen.split),
@@ -159,15 +203,14 @@ def densify_and_prune(
     )
 
 
-def reset_opacities(optimizer: Adam, config: DensifyConfig, prefix: str = "") -> None:
+def reset_opacities(population: Population, config: DensifyConfig) -> None:
     """Lower every opacity to at most ``reset_opacity`` and forget its moments.
 
     What the photographs need regains opacity; what floats before the cameras is pruned.
     """
     ceiling = math.log(config.reset_opacity / (1 - config.reset_opacity))
-    logits = dr.detach(optimizer[prefix + "logit_opacities"])
-    lowered = dr.select(logits > ceiling, ceiling, logits)
-    replace_values(optimizer, "logit_opacities", lowered, prefix)
+    logits = population.value("logit_opacities")
+    population.replace("logit_opacities", dr.select(logits > ceiling, ceiling, logits))
 
 
 @dataclass(frozen=True)
@@ -217,22 +260,23 @@ def _choose_rows(
 
 
 def _new_rows(
-    optimizer: Adam, chosen: _ChosenRows, config: DensifyConfig, key: list[int], prefix: str
+    population: Population, chosen: _ChosenRows, config: DensifyConfig, iteration: int
 ) -> dict[str, Any]:
     """The clones, then ``split_count`` samples of each row that is split.
 
     A sample is drawn from its parent's own Gaussian: mean + R(q) (s * n), n standard normal. A
-    clone is the same with n = 0. key: what the random numbers depend on.
+    clone is the same with n = 0.
     """
     num_clones = len(chosen.clone)
     samples_of = np.repeat(chosen.split, config.split_count)
     normals = np.zeros((num_clones + len(samples_of), 3))
-    normals[num_clones:] = np.random.default_rng(key).standard_normal((len(samples_of), 3))
+    random = np.random.default_rng([population.seed, iteration])
+    normals[num_clones:] = random.standard_normal((len(samples_of), 3))
     log_shrink = np.zeros_like(normals)
     log_shrink[num_clones:] = math.log(config.split_shrink)
 
-    t = types_of(type(optimizer[prefix + "means"].array))
-    rows = take_rows(optimizer, from_host(t.UInt32, np.append(chosen.clone, samples_of)), prefix)
+    t = types_of(type(population.value("means").array))
+    rows = population.take(from_host(t.UInt32, np.append(chosen.clone, samples_of)))
     mean, log_scale, quat = (
         dr.unravel(vector, rows[name].array)
         for vector, name in ((t.Array3f, "means"), (t.Array3f, "log_scales"), (t.Array4f, "quats"))
@@ -247,10 +291,6 @@ def _new_rows(
 
 def _row_numbers(mask: np.ndarray) -> np.ndarray:
     return np.flatnonzero(mask).astype(np.uint32)
-
-
-def _host(optimizer: Adam, key: str) -> np.ndarray:
-    return np.array(dr.detach(optimizer[key]), dtype=np.float64)
 
 
 def _columns(gradient: Any) -> tuple[Any, Any]:

@@ -1,0 +1,177 @@
+"""What the trainer asks of a strategy that changes the population, and what it hands to it.
+
+Each iteration, :class:`drgs.training.trainer.Trainer` tells the strategy what it has seen
+(:class:`SeenStep`) and lets it act on the rows of the optimizer (:class:`Population`).
+``drgs.training.density.called_for`` says which strategy a configuration calls for.
+
+Iterations are counted from 1. A strategy is a function of the configuration and of
+:meth:`DensityStrategy.state`: where a plan is revised, another one is made and given the state.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import drjit as dr
+import numpy as np
+from drjit.opt import Adam
+
+from drgs.training.optimizer import edit_rows, num_rows, replace_values, set_values, take_rows
+
+
+@dataclass(frozen=True)
+class DensityReport:
+    """What one call of :meth:`DensityStrategy.act` did to the rows."""
+
+    num_gaussians: int  # afterwards
+    num_added: int = 0  # rows on top of those before, parents of a split not counted
+    cloned: int = 0  # Gaussians that were copied
+    split: int = 0  # Gaussians that were replaced by several
+    relocated: int = 0  # rows that became copies of others
+    pruned: int = 0  # rows that were removed, parents of a split not counted
+    refused: int = 0  # Gaussians that were to be cloned or split, but there was no room
+
+
+@dataclass(frozen=True)
+class SeenStep:
+    """What an iteration tells a strategy; nothing of it is differentiated."""
+
+    iteration: int
+    width: int  # px, of the film of the iteration's view
+    height: int
+    means2d_grad: Any  # d loss / d mean2d, per px: Array2f, or a tensor (N, 2)
+    visible: Any  # Bool (N,)
+    image: Any  # tensor (H, W, 3), what was compared with the photograph, display space
+    photograph: Any  # tensor (H, W, 3), display space
+
+    def errors(self) -> Any:
+        """Of each pixel, the mean absolute difference of its channels: Float (H W,)."""
+        difference = dr.abs(dr.detach(self.image) - self.photograph)
+        return dr.mean(difference, axis=2).array
+
+
+@dataclass(frozen=True)
+class Population:
+    """The rows of a fit: what a strategy may read and change.
+
+    A row is a Gaussian: its parameters, named as in ``gaussians.PARAMETER_NAMES``, and the moments
+    that Adam keeps of them. Everything is detached.
+    """
+
+    optimizer: Adam
+    prefix: str  # what precedes a parameter's name in the optimizer
+    extent: float  # of the scene, world units
+    seed: int
+
+    @property
+    def num_rows(self) -> int:
+        """N at the moment."""
+        return num_rows(self.optimizer, self.prefix)
+
+    def value(self, name: str) -> Any:
+        """A parameter as it is at the moment, on the device."""
+        return dr.detach(self.optimizer[self.prefix + name])
+
+    def host(self, name: str) -> np.ndarray:
+        """The same on the host, float64; waits for the device."""
+        return np.array(self.value(name), dtype=np.float64)
+
+    def take(self, rows: Any) -> dict[str, Any]:
+        """Copies of some rows of every parameter by name; rows: (M,) ``UInt32``."""
+        return take_rows(self.optimizer, rows, self.prefix)
+
+    def edit(self, keep: Any, append: Mapping[str, Any] | None = None) -> None:
+        """Keep some rows in the order given and append others: see ``optimizer.edit_rows``.
+
+        keep: (K,) ``UInt32``. append: M new rows of every parameter by name, or None. Kept rows
+        take their moments along, appended ones start with moments of zero.
+        """
+        edit_rows(self.optimizer, keep, append, self.prefix)
+
+    def replace(self, name: str, value: Any) -> None:
+        """Give a parameter new values of the same shape, and moments of zero."""
+        replace_values(self.optimizer, name, value, self.prefix)
+
+    def set_values(self, name: str, value: Any) -> None:
+        """Give a parameter new values of the same shape; its moments stay. Waits for nothing."""
+        set_values(self.optimizer, name, value, self.prefix)
+
+
+class DensityStrategy(Protocol):
+    """What the trainer asks of a strategy; strategies derive from it and override what they need.
+
+    As it is here, a strategy leaves the population as it is. Equal inputs give equal bytes: what is
+    random is a function of seed, iteration and row.
+    """
+
+    def begin(self, population: Population) -> None:
+        """Start with the statistics of no views.
+
+        Called before the first iteration, and when others have changed the rows.
+        """
+        del population
+
+    def gathers(self, iteration: int) -> bool:
+        """Whether :meth:`gather` is to be told of this iteration."""
+        del iteration
+        return False
+
+    def gather(self, step: SeenStep) -> None:
+        """Take note of an iteration, after its optimizer step; waits for nothing."""
+        del step
+
+    def penalties(self, parameters: Mapping[str, Any]) -> Iterator[Any]:
+        """Terms of the loss, Float of one value each.
+
+        parameters: raw values by name, with derivatives.
+        """
+        del parameters
+        yield from ()
+
+    def rate_factors(self, iteration: int) -> Mapping[str, float]:
+        """What the learning rates of this iteration are multiplied by, by parameter.
+
+        A parameter that is named in one iteration is named in all.
+        """
+        del iteration
+        return {}
+
+    def perturb(self, population: Population, iteration: int, means_lr: float) -> None:
+        """Change values after each optimizer step; waits for nothing.
+
+        means_lr: the step's rate of the means, world units.
+        """
+        del population, iteration, means_lr
+
+    def acts(self, iteration: int) -> bool:
+        """Whether :meth:`act` is to be called after this iteration, when all is known to be finite.
+
+        It is called behind :meth:`gather` and :meth:`perturb`.
+        """
+        del iteration
+        return False
+
+    def act(self, population: Population, iteration: int) -> DensityReport | None:
+        """Change rows or values; None: rows are what they were."""
+        del population, iteration
+
+    def state(self) -> dict[str, np.ndarray]:
+        """What the coming iterations depend on: by name, a row for each Gaussian, or one number.
+
+        All of it has to be finite.
+        """
+        return {}
+
+    def restore(self, state: Mapping[str, np.ndarray]) -> None:
+        """Continue from :meth:`state`, where :meth:`begin` was called; unknown names are left."""
+        del state
+
+    def most_gaussians(self, start: int, iterations: int) -> int:
+        """How many a fit of so many iterations can have that starts with ``start``.
+
+        Called for an estimate, without :meth:`begin`.
+        """
+        del iterations
+        return start
