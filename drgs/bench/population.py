@@ -97,8 +97,10 @@ def _prune_added_rows_at_once() -> Iterator[None]:
         report = original(rows, statistics, config, iteration)
         opacities = expit(rows.host("logit_opacities"))
         scales = np.exp(rows.host("log_scales")).max(axis=1)
-        limit = config.prune_scale * rows.extent if adc.prunes_large(config, iteration) else np.inf
-        keep = np.flatnonzero((opacities >= config.prune_opacity) & (scales <= limit))
+        limit = (
+            config.adc.prune_scale * rows.extent if adc.prunes_large(config, iteration) else np.inf
+        )
+        keep = np.flatnonzero((opacities >= config.adc.prune_opacity) & (scales <= limit))
         if len(keep) == report.num_gaussians:
             return report
         rows.edit(from_host(dr.uint32_array_t(type(statistics.views)), keep))
@@ -119,7 +121,7 @@ def _reset_until_the_end() -> Iterator[None]:
 
     def should_reset(config: DensifyConfig, iteration: int, white_background: bool) -> bool:
         if config.stop <= iteration < ITERATIONS:
-            return iteration % config.reset_every == 0
+            return iteration % config.adc.reset_every == 0
         return original(config, iteration, white_background)
 
     original = adc.should_reset
@@ -137,7 +139,7 @@ def _unscaled_means_rate(config: FitConfig, extent: float) -> dict[str, object]:
 
 def _threshold_in_pixels(config: FitConfig, extent: float) -> dict[str, object]:
     # A gradient per pixel is one in NDC divided by half the film's size.
-    return {"densify.grad_threshold": config.densify.grad_threshold * SMALL / 2}
+    return {"densify.adc.grad_threshold": config.densify.adc.grad_threshold * SMALL / 2}
 
 
 CASES = (
@@ -148,7 +150,7 @@ CASES = (
     Case(
         "no reset for white backgrounds",
         SMALL,
-        overrides=lambda config, extent: {"densify.white_background_reset": "null"},
+        overrides=lambda config, extent: {"densify.adc.white_background_reset": "null"},
     ),
     Case("gradient threshold in pixels", SMALL, overrides=_threshold_in_pixels),
     Case("just added rows pruned at once", SMALL, rules=_prune_added_rows_at_once),
@@ -236,7 +238,8 @@ def outcome(case: Case, folder: Path) -> Outcome:
     """What the finished fit in ``folder`` left."""
     metrics = json.loads((folder / METRICS).read_text())
     iterations, population = read_population(folder)
-    early = population[iterations <= metrics["config"]["densify"]["reset_every"]]
+    rules = DensifyConfig.model_validate(metrics["config"]["densify"])
+    early = population[iterations <= rules.adc.reset_every]
     return Outcome(
         case=case.name,
         size=case.size,

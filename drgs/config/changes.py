@@ -8,14 +8,15 @@ whole.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import reduce
 
 from drgs.config.schema import FitConfig
 
 _COUNTS = (
     "densify.start",
     "densify.stop",
-    "densify.reset_every",
-    "densify.white_background_reset",
+    "densify.adc.reset_every",
+    "densify.adc.white_background_reset",
     "model.sh_increase_every",
     "cameras.start",
 )
@@ -46,8 +47,7 @@ def with_iterations(config: FitConfig, iterations: int) -> FitConfig:
 
     changes: dict[str, object] = {"iterations": iterations}
     for key in _COUNTS:
-        section, name = key.split(".")
-        changes[key] = scaled(getattr(getattr(config, section), name))
+        changes[key] = scaled(_value(config, key))
     changes["coarse"] = [
         {"until": scaled(stage.until), "factor": stage.factor} for stage in config.coarse
     ]
@@ -72,5 +72,4 @@ def decided_as(config: FitConfig, other: FitConfig) -> FitConfig:
 
 
 def _value(config: FitConfig, key: str) -> object:
-    section, name = key.split(".")
-    return getattr(getattr(config, section), name)
+    return reduce(getattr, key.split("."), config)

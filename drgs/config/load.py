@@ -12,6 +12,7 @@ import yaml
 from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
+from drgs.config.density import EARLIER_KEYS
 from drgs.config.explain import expectation
 from drgs.config.schema import FitConfig
 from drgs.core.errors import UserError, did_you_mean, listed, one_line
@@ -76,7 +77,10 @@ def _validated(values: dict, where: str, overridden: set[str]) -> FitConfig:
         return FitConfig.model_validate(values)
     except ValidationError as error:
         errors = error.errors()
-        explained = [_explain(where, item, overridden) for item in errors[:MAX_EXPLAINED]]
+        explained = [
+            _explain(where, item, _spelled(_key(item), values), overridden)
+            for item in errors[:MAX_EXPLAINED]
+        ]
         first, *others = explained + [where] * (len(errors) - MAX_EXPLAINED)
         others = [text.removeprefix(f"{where}: ") for text in others]
         raise UserError(listed([first, *others], MAX_EXPLAINED, "; ")) from None
@@ -175,7 +179,7 @@ def _parse_override(override: str) -> tuple[str, object]:
     key = key.strip()
     if not equals or not key:
         raise UserError(f"--set {override}: must be KEY=VALUE, as in densify.every=200")
-    if key not in known_keys():
+    if key not in known_keys() and key not in EARLIER_KEYS:
         raise UserError(f"--set {key}: unknown key {key}{did_you_mean(key, known_keys())}")
     if key in PATH_KEYS:
         return key, None if text == "null" else _absolute(Path(), text, f"--set {key}")
@@ -186,12 +190,39 @@ def _parse_override(override: str) -> tuple[str, object]:
 
 
 def _insert(values: dict, key: str, value: object) -> None:
+    """Put the value where the key says, in place of what it, or its other name, was before."""
+    for names in EARLIER_KEYS.items():
+        if key in names:
+            for name in names:
+                _remove(values, name)
     *sections, leaf = key.split(".")
     for section in sections:
         if not isinstance(values.get(section), dict):
             values[section] = {}
         values = values[section]
     values[leaf] = value
+
+
+def _remove(values: dict, key: str) -> None:
+    section, leaf = _section_of(values, key)
+    section.pop(leaf, None)
+
+
+def _section_of(values: object, key: str) -> tuple[dict, str]:
+    """The section that the key is in, as far as it is there, and its name in it."""
+    *sections, leaf = key.split(".")
+    for section in sections:
+        values = values.get(section) if isinstance(values, dict) else None
+    return (values if isinstance(values, dict) else {}), leaf
+
+
+def _spelled(key: str, values: dict) -> str:
+    """A key as the file has it: earlier versions had other names for some."""
+    for earlier, now in EARLIER_KEYS.items():
+        section, leaf = _section_of(values, earlier)
+        if key == now and leaf in section:
+            return earlier
+    return key
 
 
 def _resolve_paths(values: dict, file: Path) -> None:
@@ -217,9 +248,12 @@ def _absolute(folder: Path, text: str, where: str) -> str:
     return path
 
 
-def _explain(file: str, item: ErrorDetails, overridden: set[str]) -> str:
+def _key(item: ErrorDetails) -> str:
+    return one_line(".".join(str(part) for part in item["loc"]), limit=60)
+
+
+def _explain(file: str, item: ErrorDetails, key: str, overridden: set[str]) -> str:
     """One line for one of pydantic's errors: where, name, expected, got, remedy."""
-    key = one_line(".".join(str(part) for part in item["loc"]), limit=60)
     given = [k for k in overridden if key == k or key.startswith(f"{k}.")]
     where = f"--set {given[0]}" if given else file
     kind, limits = item["type"], item.get("ctx", {})

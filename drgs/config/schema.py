@@ -14,7 +14,6 @@ from typing import Annotated, Any, Literal
 
 from pydantic import (
     BaseModel,
-    ConfigDict,
     Field,
     PlainSerializer,
     PlainValidator,
@@ -25,7 +24,9 @@ from pydantic import (
 )
 
 from drgs.config.approximations import DECLARED, Approximations, Declared
-from drgs.core.constants import MAX_INT, MAX_SHUTTER_SAMPLES, SHUTTER_SAMPLES
+from drgs.config.density import REFERENCE_START, REFERENCE_STOP, DensifyConfig
+from drgs.config.section import Count, Rate, Section, Weight
+from drgs.core.constants import MAX_SHUTTER_SAMPLES, SHUTTER_SAMPLES
 
 Color = str | tuple[float, float, float]
 
@@ -37,7 +38,7 @@ DEFAULT_BACKGROUND = "white"
 REFERENCE_NEAR = 0.2
 """Scene units: the reference's near plane, of scenes that are about 4 wide."""
 
-REFERENCE_START, REFERENCE_STOP, REFERENCE_DEGREE = 500, 15_000, 1000
+REFERENCE_DEGREE = 1000
 """Iterations: the reference's schedule, for 30,000."""
 
 STOP_SHARE, DEGREE_SHARE = 5 / 7, 1 / 7
@@ -61,12 +62,7 @@ def _color_to_yaml(color: Color | None) -> Any:
 
 
 ColorField = Annotated[Color | None, PlainValidator(_color), PlainSerializer(_color_to_yaml)]
-Count = Annotated[int, Field(le=MAX_INT)]
 PathField = Annotated[Path, Field(strict=False)]
-
-Rate = Annotated[float, Field(le=10)]
-"""A step of Adam is about as long as its rate: ten units of a logarithm or a logit go from next to
-nothing to everything."""
 
 CameraRate = Annotated[float, Field(le=1)]
 """The same: a radian, a scene's extent, a factor e of focal lengths, a picture's size."""
@@ -74,17 +70,8 @@ CameraRate = Annotated[float, Field(le=1)]
 Decay = Annotated[float, Field(ge=0, le=0.999999)]
 """A mean over a million steps; float32 knows few numbers between this and 1."""
 
-Weight = Annotated[float, Field(ge=0, le=1e6)]
-"""Of a term of the loss, beside terms of weight 1."""
 
-
-class _Section(BaseModel):
-    """Frozen; unknown keys, infinities and silent conversions ("3" for 3) are refused."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
-
-
-class DataConfig(_Section):
+class DataConfig(Section):
     """Where the photographs and their cameras are, and how they are read."""
 
     path: PathField = Field(description="Dataset folder; relative to the configuration file.")
@@ -150,7 +137,7 @@ class DataConfig(_Section):
         return NAMED_COLORS.get(background, background)
 
 
-class InitConfig(_Section):
+class InitConfig(Section):
     """The Gaussians at iteration 0."""
 
     num_points: Count = Field(100_000, ge=4, description="Random points in the start box.")
@@ -172,7 +159,7 @@ class InitConfig(_Section):
     )
 
 
-class _Model(_Section):
+class _Model(Section):
     """What of :class:`ModelConfig` stands before the approximations."""
 
     sh_degree: int = Field(3, ge=0, le=3, description="Degree of the spherical harmonics.")
@@ -241,14 +228,14 @@ class ModelConfig(_ModelWithApproximations):
         return Approximations.of(vars(self))
 
 
-class RateAim(_Section):
+class RateAim(Section):
     """What a falling rate heads for after an iteration."""
 
     after: Count = Field(ge=0, description="The last iteration that is not affected.")
     end: Count = Field(ge=1, description="Where the rate would be the last one.")
 
 
-class OptimizerConfig(_Section):
+class OptimizerConfig(Section):
     """Adam (Kingma and Ba 2015): learning rates per step and its constants."""
 
     means_lr: Rate = Field(
@@ -279,7 +266,7 @@ class OptimizerConfig(_Section):
     )
 
 
-class LossConfig(_Section):
+class LossConfig(Section):
     """(1 - w) L1 + w (1 - SSIM), in display space."""
 
     dssim_weight: float = Field(0.2, ge=0, le=1, description="w; 0 leaves D-SSIM out.")
@@ -292,7 +279,7 @@ class LossConfig(_Section):
     )
 
 
-class ColorConfig(_Section):
+class ColorConfig(Section):
     """A colour transform for each training photograph: exposure and white balance."""
 
     lr: Rate | None = Field(
@@ -306,7 +293,7 @@ class ColorConfig(_Section):
     )
 
 
-class CamerasConfig(_Section):
+class CamerasConfig(Section):
     """Refinement of the training cameras; first rates per step, which fall as that of the means.
 
     A camera's pose gets a step when its picture is drawn: of 7,000 iterations with 100 pictures 70.
@@ -325,56 +312,7 @@ class CamerasConfig(_Section):
     )
 
 
-class DensifyConfig(_Section):
-    """Adaptive density control: clone, split, prune, opacity reset."""
-
-    start: Count | None = Field(
-        REFERENCE_START,
-        ge=0,
-        description="The population changes only after this iteration. Not given, or null: 500, or "
-        "half of stop if that is less.",
-    )
-    stop: Count | None = Field(
-        REFERENCE_STOP,
-        ge=1,
-        description="It changes, and is reset, only before this iteration. Not given, or null: "
-        "15,000, or 5/7 of fewer than 21,000 iterations.",
-    )
-    every: Count = Field(100, ge=1, description="Iterations between two changes.")
-    grad_threshold: float = Field(
-        2e-4,
-        gt=0,
-        description="A Gaussian is cloned or split if the mean norm of its 2D position gradient, "
-        "in NDC units, over the views that saw it reaches this.",
-    )
-    clone_scale: float = Field(
-        0.01,
-        gt=0,
-        description="Cloned if its largest scale is at most this, split if larger; x extent.",
-    )
-    split_count: int = Field(
-        2, ge=2, le=1_000_000, description="Samples that replace a Gaussian that is split."
-    )
-    split_shrink: float = Field(1.6, gt=1, description="Their scales are the parent's / this.")
-    prune_opacity: float = Field(0.005, ge=0, lt=1, description="Removed if less opaque.")
-    prune_scale: float = Field(
-        0.1,
-        gt=0,
-        description="Removed after the first reset if its largest scale is larger; x extent.",
-    )
-    reset_every: Count = Field(
-        3000, ge=1, description="Iterations between opacity resets, which end with densify.stop."
-    )
-    reset_opacity: float = Field(0.01, gt=0, lt=1, description="A reset lowers opacities to this.")
-    white_background_reset: Count | None = Field(
-        500, ge=1, description="Iteration of an extra reset if the background is white; null: none."
-    )
-    max_gaussians: int = Field(
-        1_000_000, ge=4, le=100_000_000, description="Cap that is never exceeded."
-    )
-
-
-class OutputConfig(_Section):
+class OutputConfig(Section):
     """What a fit leaves behind."""
 
     dir: PathField | None = Field(
@@ -394,7 +332,7 @@ class OutputConfig(_Section):
     )
 
 
-class CoarseStage(_Section):
+class CoarseStage(Section):
     """Iterations that see smaller pictures."""
 
     until: Count = Field(ge=1, description="The stage's last iteration.")
@@ -406,7 +344,7 @@ def _is_open(section: BaseModel, name: str) -> bool:
     return name not in section.model_fields_set or getattr(section, name) is None
 
 
-class FitConfig(_Section):
+class FitConfig(Section):
     """Everything that decides a fit."""
 
     data: DataConfig
@@ -471,11 +409,11 @@ class FitConfig(_Section):
                 f"optimizer.means_lr_final must be <= optimizer.means_lr ({optimizer.means_lr}), "
                 f"got {optimizer.means_lr_final}"
             )
-        if densify.prune_opacity >= densify.reset_opacity:
+        adc = densify.adc
+        if adc.prune_opacity >= adc.reset_opacity:
             raise ValueError(
-                "densify.prune_opacity must be < densify.reset_opacity "
-                f"({densify.reset_opacity}), or a reset removes everything; "
-                f"got {densify.prune_opacity}"
+                f"densify.adc.prune_opacity must be < densify.adc.reset_opacity "
+                f"({adc.reset_opacity}), or a reset removes everything; got {adc.prune_opacity}"
             )
         if self.cameras.optimise and self.model.sh_direction != "mean":
             raise ValueError(

@@ -63,7 +63,9 @@ def test_resets_go_on_but_for_the_last_iteration_that_counts():
 
 def test_changes_of_the_configuration():
     config = load_config(population.CONFIG)
-    assert population._threshold_in_pixels(config, 4.0) == {"densify.grad_threshold": 2e-4 * 100}
+    assert population._threshold_in_pixels(config, 4.0) == {
+        "densify.adc.grad_threshold": 2e-4 * 100
+    }
     rates = population._unscaled_means_rate(config, 4.0)
     assert rates["optimizer.means_lr"] * 4 == config.optimizer.means_lr
     assert rates["optimizer.means_lr_final"] * 4 == config.optimizer.means_lr_final
@@ -84,14 +86,16 @@ def test_fits_of_the_study_run_and_are_not_repeated(tmp_path, capfd):
     configs = {k: yaml.safe_load((folder / f"{k}/config.yml").read_text()) for k in (1, 4, 5)}
     extent = load_dataset(load_config(folder / "1" / "config.yml").data).extent
     recipe = configs[1]
-    assert recipe["data"]["image_size"] == 200 and recipe["densify"]["grad_threshold"] == 2e-4
+    assert (
+        recipe["data"]["image_size"] == 200 and recipe["densify"]["adc"]["grad_threshold"] == 2e-4
+    )
     configs[4]["optimizer"]["means_lr"] *= extent
     configs[4]["optimizer"]["means_lr_final"] *= extent
     rates = [configs[k]["optimizer"] for k in (1, 4)]
     assert [rate.pop("means_lr_aims") for rate in rates] == [[], []]
     assert rates[1] == pytest.approx(rates[0], rel=1e-12)
-    assert configs[5]["densify"].pop("white_background_reset") is None
-    assert recipe["densify"].pop("white_background_reset") == 500
+    assert configs[5]["densify"]["adc"].pop("white_background_reset") is None
+    assert recipe["densify"]["adc"].pop("white_background_reset") == 500
     assert configs[5]["densify"] == recipe["densify"]
 
     written = (folder / "population.csv").read_text()

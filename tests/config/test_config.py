@@ -45,11 +45,13 @@ def test_defaults_are_the_reference_recipe(load):
     assert (config.loss.dssim_weight, config.loss.window, config.loss.sigma) == (0.2, 11, 1.5)
     assert (config.model.sh_degree, config.model.sh_increase_every) == (3, 1000)
     assert (densify.start, densify.stop, densify.every) == (500, 15_000, 100)
-    assert (densify.grad_threshold, densify.clone_scale) == (2e-4, 0.01)
-    assert (densify.split_count, densify.split_shrink) == (2, 1.6)
-    assert (densify.prune_opacity, densify.prune_scale) == (0.005, 0.1)
-    assert (densify.reset_every, densify.reset_opacity) == (3000, 0.01)
-    assert densify.white_background_reset == 500
+    assert densify.strategy == "adc"
+    adc = densify.adc
+    assert (adc.grad_threshold, adc.clone_scale) == (2e-4, 0.01)
+    assert (adc.split_count, adc.split_shrink) == (2, 1.6)
+    assert (adc.prune_opacity, adc.prune_scale) == (0.005, 0.1)
+    assert (adc.reset_every, adc.reset_opacity) == (3000, 0.01)
+    assert adc.white_background_reset == 500
     assert (init.num_points, init.opacity, config.iterations) == (100_000, 0.1, 30_000)
 
 
@@ -93,7 +95,10 @@ def test_a_configuration_is_frozen(load):
     [
         ("densify: {every: 0}", "densify.every must be >= 1, got 0"),
         ("densify: {evry: 3}", "unknown key densify.evry; did you mean densify.every?"),
-        ("grad_threshold: 3", "unknown key grad_threshold; did you mean densify.grad_threshold?"),
+        (
+            "grad_threshold: 3",
+            "unknown key grad_threshold; did you mean densify.adc.grad_threshold?",
+        ),
         ("zzz: 3", "unknown key zzz"),
         ("5: 3", "unknown key 5"),
         ("iterations: 1.5", "iterations must be an integer, got 1.5"),
@@ -148,8 +153,8 @@ def test_a_configuration_is_frozen(load):
         ),
         (
             "densify: {prune_opacity: 0.01}",
-            "densify.prune_opacity must be < densify.reset_opacity (0.01), or a reset removes "
-            "everything; got 0.01",
+            "densify.adc.prune_opacity must be < densify.adc.reset_opacity (0.01), or a reset "
+            "removes everything; got 0.01",
         ),
         (
             "densify: {max_gaussians: 500}",
@@ -326,6 +331,6 @@ def test_shipped_configurations_load(scene):
 def test_the_last_opacity_reset_of_a_short_run_is_long_before_its_end(name, overrides):
     config = load_config(REPOSITORY / "scenes" / f"{name}.yml", overrides)
     densify = config.densify
-    resets = [*range(densify.reset_every, densify.stop, densify.reset_every)]
-    resets.append(densify.white_background_reset)
+    resets = [*range(densify.adc.reset_every, densify.stop, densify.adc.reset_every)]
+    resets.append(densify.adc.white_background_reset)
     assert config.iterations - max(resets) >= 1200

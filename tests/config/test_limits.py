@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import yaml
 from annotated_types import Ge, Gt, Le, Lt
+from pydantic import BaseModel
 from support.commands import run_in_process
 from support.small_capture import make_dataset, write_dataset
 from support.small_fits import make_trainer, plain_dataset
@@ -69,21 +70,25 @@ def limits(field):
     return low, high
 
 
-def numbers_of(section):
-    """(name, limits) of the section's numbers."""
-    for name, field in FitConfig.model_fields[section].annotation.model_fields.items():
+def numbers_of(key, model):
+    """(name, limits) of the numbers of a section, and of the sections in it."""
+    for name, field in model.model_fields.items():
         if field.annotation in (float, float | None):
-            yield f"{section}.{name}", limits(field)
+            yield f"{key}.{name}", limits(field)
+        elif isinstance(field.annotation, type) and issubclass(field.annotation, BaseModel):
+            yield from numbers_of(f"{key}.{name}", field.annotation)
 
 
 SECTIONS = ["init", "model", "optimizer", "loss", "colors", "cameras", "densify"]
 
-UNLIMITED = {"model.low_pass", "densify.grad_threshold", "densify.clone_scale",
-             "densify.prune_scale", "densify.split_shrink"}  # fmt: skip
+NUMBERS = [p for s in SECTIONS for p in numbers_of(s, FitConfig.model_fields[s].annotation)]
+
+UNLIMITED = {"model.low_pass", "densify.adc.grad_threshold", "densify.adc.clone_scale",
+             "densify.adc.prune_scale", "densify.adc.split_shrink"}  # fmt: skip
 """Compared with, or finite in float32, however large they are."""
 
 
-@pytest.mark.parametrize(("key", "ends"), [p for s in SECTIONS for p in numbers_of(s)])
+@pytest.mark.parametrize(("key", "ends"), NUMBERS)
 def test_every_number_has_two_limits(key, ends):
     low, high = ends
     assert low > -math.inf
@@ -109,7 +114,7 @@ def scene(tmp_path_factory):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("key", "ends"), [p for s in SECTIONS for p in numbers_of(s)])
+@pytest.mark.parametrize(("key", "ends"), NUMBERS)
 def test_a_fit_takes_every_number_at_its_limits_or_says_what_is_wrong(
     scene, tmp_path, monkeypatch, key, ends
 ):

@@ -446,7 +446,8 @@ def test_a_fit_with_smoothing_resumes_to_the_same_bytes():
     """The filter depends on where all cameras are, also on those not seen since."""
 
     def make():
-        densify = {"start": 2, "stop": 90, "every": 4, "grad_threshold": 1e-6, "reset_every": 80}
+        densify = {"start": 2, "stop": 90, "every": 4}
+        densify |= {"adc__grad_threshold": 1e-6, "adc__reset_every": 80}
         changes = {f"densify__{key}": value for key, value in densify.items()}
         return make_trainer(**ALL_RATES, model__smoothing=True, **changes)
 

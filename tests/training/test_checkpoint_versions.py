@@ -2,16 +2,24 @@
 
 import json
 
+import mitsuba as mi
 import numpy as np
 import pytest
+from support.trainers import make_trainer
 
 from drgs.config.changes import changed
 from drgs.config.schema import FitConfig
 from drgs.core.errors import UserError
 from drgs.training.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from drgs.training.history import History
+from drgs.training.state_checks import check_state
 
 DECIDED = {"data.background": "white", "model.near": 0.2}
+
+
+@pytest.fixture(scope="module", autouse=True)
+def variant():
+    mi.set_variant("llvm_ad_rgb")
 
 
 @pytest.fixture
@@ -41,11 +49,34 @@ def saved_as(folder, config, change):
 
 def without_what_is_new(values):
     del values["data"]["ignore_points"]
+    densify = values["densify"]
+    adc = densify.pop("adc")
+    kept = {name: densify[name] for name in ("start", "stop", "every", "max_gaussians")}
+    values["densify"] = {**kept, **adc}
 
 
 def test_a_checkpoint_of_an_earlier_version_goes_on(folder, config):
     saved_as(folder, config, without_what_is_new)
     assert int(load_checkpoint(folder, config).trainer["iteration"]) == 3
+
+
+def test_statistics_of_an_earlier_version_are_those_of_adc(folder):
+    """Whose names stood among those of the optimizer."""
+    trainer = make_trainer(densify={"start": 2, "every": 6, "adc": {"grad_threshold": 1e-6}})
+    for _ in range(4):
+        trainer.step()
+    state = trainer.state()
+    earlier = {name.removeprefix("density/"): values for name, values in state.items()}
+    assert {"gradient_norms", "views"} < set(earlier)
+    history = History().as_array()
+    save_checkpoint(folder, trainer.config, Checkpoint(earlier, history, 0.0))
+    read = load_checkpoint(folder, trainer.config).trainer
+    assert {k: v.tobytes() for k, v in read.items()} == {k: v.tobytes() for k, v in state.items()}
+    resumed = make_trainer(densify={"start": 2, "every": 6, "adc": {"grad_threshold": 1e-6}})
+    check_state(read, resumed.state(), 50, 1000)
+    resumed.restore(read)
+    assert resumed.step().loss == trainer.step().loss
+    assert resumed.step().density == trainer.step().density is not None
 
 
 @pytest.mark.parametrize(

@@ -135,7 +135,7 @@ def test_each_time_of_a_shutter_counts():
         ({"densify.max_gaussians": 900}, 1000),  # those of the start cloud stay
         ({"iterations": 400}, 1000),  # no change before
         ({"iterations": 700}, 4000),  # after 600 and 700
-        ({"iterations": 700, "densify.split_count": 3}, 9000),
+        ({"iterations": 700, "densify.adc.split_count": 3}, 9000),
         ({"densify.stop": 700}, 2000),
         ({"densify.start": 29_000, "densify.stop": 29_050}, 1000),
     ],

@@ -99,9 +99,9 @@ class AdaptiveDensityControl(DensityStrategy):
         config, last = self.config, min(iterations, self.config.stop - 1)
         changes = max(0, last // config.every - config.start // config.every)
         doublings = math.log2(max(config.max_gaussians, start) / start)
-        if changes * math.log2(config.split_count) >= doublings:
+        if changes * math.log2(config.adc.split_count) >= doublings:
             return max(start, config.max_gaussians)
-        return start * config.split_count**changes
+        return start * config.adc.split_count**changes
 
     def _resets(self, iteration: int) -> bool:
         return should_reset(self.config, iteration, self.white_background)
@@ -141,13 +141,13 @@ def should_reset(config: DensifyConfig, iteration: int, white_background: bool) 
 
     White backgrounds get one more: white Gaussians in front of white would otherwise stay.
     """
-    extra = white_background and iteration == config.white_background_reset
-    return iteration < config.stop and (iteration % config.reset_every == 0 or extra)
+    extra = white_background and iteration == config.adc.white_background_reset
+    return iteration < config.stop and (iteration % config.adc.reset_every == 0 or extra)
 
 
 def prunes_large(config: DensifyConfig, iteration: int) -> bool:
     """Whether large Gaussians are pruned: once the first regular opacity reset is over."""
-    return iteration > config.reset_every
+    return iteration > config.adc.reset_every
 
 
 def densify_and_prune(
@@ -171,7 +171,7 @@ def densify_and_prune(
             f"densify_and_prune(): statistics of {dr.width(statistics.views)} Gaussians for "
             f"{num_before} in the optimizer: they start again after every change"
         )
-    limit = config.prune_scale * extent if prunes_large(config, iteration) else np.inf
+    limit = config.adc.prune_scale * extent if prunes_large(config, iteration) else np.inf
     with np.errstate(over="ignore"):
         scales = np.exp(population.host("log_scales")).max(axis=1)
     chosen = _choose_rows(
@@ -182,12 +182,12 @@ def densify_and_prune(
         scene_extent=extent,
         largest_scale=limit,
     )
-    num_added = len(chosen.clone) + len(chosen.split) * config.split_count
+    num_added = len(chosen.clone) + len(chosen.split) * config.adc.split_count
     if len(chosen.keep) + num_added == 0:
         raise UserError(
-            f"iteration {iteration}: every Gaussian would be pruned (opacity below "
-            f"densify.prune_opacity = {config.prune_opacity}, or scale above densify.prune_scale "
-            f"= {config.prune_scale} x {extent:g}): do the cameras see the start points?"
+            f"iteration {iteration}: every Gaussian would be pruned (opacity below densify.adc."
+            f"prune_opacity = {config.adc.prune_opacity}, or scale above densify.adc.prune_scale = "
+            f"{config.adc.prune_scale} x {extent:g}): do the cameras see the start points?"
         )
     if num_added > 0 or len(chosen.keep) < num_before:
         keep = from_host(dr.uint32_array_t(type(statistics.views)), chosen.keep)
@@ -208,7 +208,7 @@ def reset_opacities(population: Population, config: DensifyConfig) -> None:
 
     What the photographs need regains opacity; what floats before the cameras is pruned.
     """
-    ceiling = math.log(config.reset_opacity / (1 - config.reset_opacity))
+    ceiling = math.log(config.adc.reset_opacity / (1 - config.adc.reset_opacity))
     logits = population.value("logit_opacities")
     population.replace("logit_opacities", dr.select(logits > ceiling, ceiling, logits))
 
@@ -235,17 +235,17 @@ def _choose_rows(
 
     Comparisons are written such that NaN counts as transparent and as too large.
     """
-    small = scales <= config.clone_scale * scene_extent
-    transparent = ~(opacities >= config.prune_opacity)
+    small = scales <= config.adc.clone_scale * scene_extent
+    transparent = ~(opacities >= config.adc.prune_opacity)
     too_large = ~(scales <= largest_scale)
-    candidate = (gradient_norms >= config.grad_threshold) & ~transparent & np.isfinite(scales)
+    candidate = (gradient_norms >= config.adc.grad_threshold) & ~transparent & np.isfinite(scales)
     candidate &= ~(small & too_large)  # a clone would be as large
 
     # Room is what is left if every candidate survives, so that no choice can exceed it.
     survivors = np.count_nonzero(candidate | ~(transparent | too_large))
     rows = np.flatnonzero(candidate)
     rows = rows[np.argsort(-gradient_norms[rows], kind="stable")]
-    cost = np.where(small[rows], 1, config.split_count - 1)
+    cost = np.where(small[rows], 1, config.adc.split_count - 1)
     affordable = rows[np.cumsum(cost) <= config.max_gaussians - survivors]
 
     taken = np.zeros_like(candidate)
@@ -268,12 +268,12 @@ def _new_rows(
     clone is the same with n = 0.
     """
     num_clones = len(chosen.clone)
-    samples_of = np.repeat(chosen.split, config.split_count)
+    samples_of = np.repeat(chosen.split, config.adc.split_count)
     normals = np.zeros((num_clones + len(samples_of), 3))
     random = np.random.default_rng([population.seed, iteration])
     normals[num_clones:] = random.standard_normal((len(samples_of), 3))
     log_shrink = np.zeros_like(normals)
-    log_shrink[num_clones:] = math.log(config.split_shrink)
+    log_shrink[num_clones:] = math.log(config.adc.split_shrink)
 
     t = types_of(type(population.value("means").array))
     rows = population.take(from_host(t.UInt32, np.append(chosen.clone, samples_of)))

@@ -84,7 +84,7 @@ LONG_WORK = {
     "data.shutter_samples": ("underscores",),
     "iterations": ("1e4", "2^31-1", "underscores"),
     "init.num_points": (),
-    "densify.split_count": (),
+    "densify.adc.split_count": (),
 }
 """By key, values that are right and mean work without end."""
 

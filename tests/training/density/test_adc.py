@@ -273,20 +273,20 @@ def test_full_population_only_shrinks():
 # ---- everything together
 def naive_decisions(norms, scales, opacities, large_is_pruned, config):
     """The rules, one Gaussian after the other: (kept, cloned, split) row numbers."""
-    limit = config.prune_scale * EXTENT if large_is_pruned else math.inf
+    limit = config.adc.prune_scale * EXTENT if large_is_pruned else math.inf
     kinds = []
     for norm, scale, opacity in zip(norms, scales, opacities, strict=True):
-        if opacity < config.prune_opacity:
+        if opacity < config.adc.prune_opacity:
             kinds.append("prune")
-        elif norm >= config.grad_threshold:
-            kinds.append("clone" if scale <= config.clone_scale * EXTENT else "split")
+        elif norm >= config.adc.grad_threshold:
+            kinds.append("clone" if scale <= config.adc.clone_scale * EXTENT else "split")
         else:
             kinds.append("prune" if scale > limit else "keep")
     room = config.max_gaussians - sum(kind != "prune" for kind in kinds)
     candidates = [i for i, kind in enumerate(kinds) if kind in ("clone", "split")]
     full = False
     for i in sorted(candidates, key=lambda i: (-norms[i], i)):
-        cost = 1 if kinds[i] == "clone" else config.split_count - 1
+        cost = 1 if kinds[i] == "clone" else config.adc.split_count - 1
         full = full or cost > room
         if full:
             kinds[i] = "prune" if scales[i] > limit else "keep"
@@ -319,7 +319,7 @@ def test_random_populations_follow_the_rules_and_the_cap(seed):
     kept, cloned, split = naive_decisions(
         norms.astype(float), scales, opacities, iteration == LATE, config
     )
-    parents = [*kept, *cloned, *np.repeat(split, config.split_count)]
+    parents = [*kept, *cloned, *np.repeat(split, config.adc.split_count)]
     assert report.num_gaussians == num_rows(optimizer) == len(parents)
     assert report.num_gaussians <= max(config.max_gaussians, len(kept))
     assert (report.cloned, report.split) == (len(cloned), len(split))
