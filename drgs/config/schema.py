@@ -256,6 +256,29 @@ class OptimizerConfig(Section):
     )
     scales_lr: Rate = Field(5e-3, ge=0, description="Logarithms of the scales.")
     quats_lr: Rate = Field(1e-3, ge=0, description="Quaternions.")
+    decay: float = Field(
+        1.0,
+        ge=1e-6,
+        le=1,
+        description="What the rates but that of the means have fallen to at the last iteration, in "
+        "parts of what they begin with.",
+    )
+    decay_from: float = Field(
+        0.5, ge=0, lt=1, description="When they begin to fall, in parts of the iterations."
+    )
+    views: int = Field(
+        1,
+        ge=1,
+        le=1000,
+        description="Views whose gradients are put together for a step, late in the fit; an "
+        "iteration still renders one.",
+    )
+    views_from: float = Field(
+        0.75,
+        ge=0,
+        lt=1,
+        description="When that begins, in parts of the iterations, and not before densify.stop.",
+    )
     beta_1: Decay = Field(0.9, description="Decay of the first moment.")
     beta_2: Decay = Field(0.999, description="Decay of the second moment.")
     epsilon: float = Field(
@@ -356,7 +379,9 @@ class FitConfig(Section):
     cameras: CamerasConfig = Field(default_factory=CamerasConfig)
     densify: DensifyConfig = Field(default_factory=DensifyConfig)
     output: OutputConfig = Field(default_factory=OutputConfig)
-    iterations: Count = Field(30_000, ge=1, description="Optimizer steps; one view each.")
+    iterations: Count = Field(
+        30_000, ge=1, description="Views that are rendered; one for each step of the optimizer."
+    )
     coarse: list[CoarseStage] = Field(
         default_factory=list,
         description="Stages of smaller training pictures, before those of full size: a list of "

@@ -152,13 +152,25 @@ def optimizer_state(optimizer: Adam, prefix: str = "") -> dict[str, np.ndarray]:
     return state
 
 
+def pending_gradients(optimizer: Adam, prefix: str = "") -> dict[str, np.ndarray]:
+    """What has been accumulated for a step that is not taken yet, as numpy: ``NAME.gradient``."""
+    names = _names(optimizer, prefix)
+    values = {name: optimizer.state[prefix + name][0] for name in names}
+    return {f"{name}.gradient": np.array(dr.grad(value)) for name, value in values.items()}
+
+
 def restore_optimizer(optimizer: Adam, state: Mapping[str, np.ndarray], prefix: str = "") -> None:
-    """Continue from :func:`optimizer_state`, bit by bit; rates stay as they are."""
+    """Continue from :func:`optimizer_state`, bit by bit; rates stay as they are.
+
+    With those of :func:`pending_gradients`, if there are any.
+    """
     for name in _names(optimizer, prefix):
         old, promoted, rate, (step, first, second, maximum) = optimizer.state[prefix + name]
         value = type(old)(state[f"{name}.value"])
         dr.make_opaque(value)
         dr.enable_grad(value)
+        if f"{name}.gradient" in state:
+            dr.set_grad(value, type(old)(state[f"{name}.gradient"]))
         moments = type(first)(state[f"{name}.m"]), type(second)(state[f"{name}.v"])
         extra = (type(step)(state[f"{name}.t"]), *moments, maximum)
         optimizer.state[prefix + name] = value, promoted, rate, extra

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 from drgs.config.schema import FitConfig, OptimizerConfig
@@ -31,11 +32,48 @@ class ExponentialDecay:
 
     def __call__(self, iteration: int) -> float:
         """Return the learning rate of an iteration."""
+        s = self.progress(iteration)
+        return math.exp((1 - s) * math.log(self.initial) + s * math.log(self.final))
+
+    def progress(self, iteration: int) -> float:
+        """s, from 0 to 1."""
         s = 0.0
         for (after, end), until in zip(self.aims, [*self.aims[1:], (math.inf,)], strict=True):
             passed = min(max(iteration, after), until[0]) - after
             s += (1 - s) * min(passed / (end - after), 1.0)
-        return math.exp((1 - s) * math.log(self.initial) + s * math.log(self.final))
+        return s
+
+
+@dataclass(frozen=True)
+class LearningRates:
+    """Those of all parameters of the Gaussians, over the iterations.
+
+    The means' rate falls all the time; the others fall to ``decay`` times themselves, by the same
+    factor at every iteration, behind the share ``decay_from`` of the fit. Rates that are high at
+    first find colours and shapes sooner than constant ones, and leave less noise at the end.
+    """
+
+    means: ExponentialDecay
+    others: Mapping[str, float]  # at the start, by parameter
+    decay: float
+    decay_from: float  # share of the iterations
+
+    def __call__(self, iteration: int) -> dict[str, float]:
+        """The rates of an iteration that are not those of the start; by parameter."""
+        rates = {"means": self.means(iteration)}
+        if self.decay < 1:
+            late = (self.means.progress(iteration) - self.decay_from) / (1 - self.decay_from)
+            factor = self.decay ** max(late, 0.0)
+            rates |= {name: factor * rate for name, rate in self.others.items()}
+        return rates
+
+
+def rates_over_time(config: FitConfig, extent: float) -> LearningRates:
+    """Of all parameters; extent: world units."""
+    optimizer, others = config.optimizer, learning_rates(config.optimizer, extent)
+    others.pop("means")
+    means = means_rate(config, extent)
+    return LearningRates(means, others, optimizer.decay, optimizer.decay_from)
 
 
 def learning_rates(config: OptimizerConfig, extent: float) -> dict[str, float]:

@@ -44,6 +44,8 @@ def check_state(
         raise ValueError(f"must hold 1 to {max_gaussians:,} Gaussians, got {num:,}")
     expected = {name: (_shape(name, like, num), array.dtype) for name, array in like.items()}
     expected[FILTER] = (num,), np.dtype(np.float32)
+    values = [name for name in like if name.endswith(".value")]
+    expected |= {name.replace(".value", ".gradient"): expected[name] for name in values}
     for name in filter(expected.__contains__, state):
         _check_array(name, state[name], *expected[name])
     iteration = int(state["iteration"])

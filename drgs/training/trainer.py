@@ -28,8 +28,13 @@ from drgs.training.effects.called_for import integrator_settings, training_effec
 from drgs.training.finite_checks import GradientWatch, check_values, check_view_values
 from drgs.training.losses import PhotometricLoss
 from drgs.training.memory import room_for_targets
-from drgs.training.optimizer import make_optimizer, optimizer_state, restore_optimizer
-from drgs.training.rates import learning_rates, means_rate, rate_aims
+from drgs.training.optimizer import (
+    make_optimizer,
+    optimizer_state,
+    pending_gradients,
+    restore_optimizer,
+)
+from drgs.training.rates import learning_rates, rate_aims, rates_over_time
 from drgs.training.stages import KEPT_BYTES, Stage, bytes_on_device, make_stages, view_of
 from drgs.training.state_checks import DENSITY
 from drgs.training.views import TrainingView
@@ -76,16 +81,15 @@ class Trainer:
         self.params = mi.traverse(self.scene)
         self.params.keep([PREFIX + name for name in PARAMETER_NAMES])
         initial = {key.removeprefix(PREFIX): value for key, value in self.params.items()}
-        self.rates = learning_rates(config.optimizer, self.extent)
         self.optimizer = make_optimizer(
             initial,
-            self.rates,
+            learning_rates(config.optimizer, self.extent),
             prefix=PREFIX,
             beta_1=config.optimizer.beta_1,
             beta_2=config.optimizer.beta_2,
             epsilon=config.optimizer.epsilon,
         )
-        self.means_lr = means_rate(config, self.extent)
+        self.rates = rates_over_time(config, self.extent)
         self.loss = PhotometricLoss(config.loss.dssim_weight)
         self.white_background = tuple(dataset.background) == (1.0, 1.0, 1.0)
         self.stages = make_stages(dataset.train, config, self.effects, room)
@@ -107,13 +111,14 @@ class Trainer:
 
         image = mi.render(self.scene, self.params, sensor=view.sensor, spp=1)
         image, loss = self.compared(image, view)
-        dr.backward(loss)
+        dr.backward(loss if self.views_a_step == 1 else loss / self.views_a_step)
         image, loss = dr.detach(image), dr.detach(loss)
         photograph = view.target.image
         error = dr.mean(dr.square(image.array - photograph.array))
         numbers = {f"{e.name}.{k}": v for e in self.effects for k, v in e.numbers_of(view).items()}
         self.watch.add(self.iteration, view.name, loss, self.integrator.last.first_fault, numbers)
-        self.optimizer.step()
+        if self.ends_step:
+            self.optimizer.step()
         for effect in self.effects:
             effect.after(self, view)
         self.stage.seen(view)
@@ -122,7 +127,7 @@ class Trainer:
         return StepReport(
             iteration=self.iteration,
             num_gaussians=self.num_gaussians,
-            means_lr=self.means_lr(self.iteration),
+            means_lr=self.means_lr,
             density=report,
             loss_array=loss,
             squared_error=error,
@@ -159,7 +164,24 @@ class Trainer:
     @property
     def rate_decay(self) -> float:
         """What the means' learning rate has fallen to, relative to where it began."""
-        return self.means_lr(self.iteration) / self.means_lr.initial
+        return self.means_lr / self.rates.means.initial
+
+    @property
+    def means_lr(self) -> float:
+        """The means' learning rate of this iteration, world units."""
+        return self.rates.means(self.iteration)
+
+    @property
+    def views_a_step(self) -> int:
+        """How many iterations' gradients are put together for a step of the optimizer."""
+        config = self.config
+        is_late = self.rates.means.progress(self.iteration) > config.optimizer.views_from
+        return config.optimizer.views if is_late and self.iteration >= config.densify.stop else 1
+
+    @property
+    def ends_step(self) -> bool:
+        """Whether this iteration's gradient is the last one of a step of the optimizer."""
+        return self.iteration % self.views_a_step == 0
 
     def place_all(self) -> None:
         """Put all sensors where effects have them now, without derivatives."""
@@ -215,7 +237,7 @@ class Trainer:
             "optimizer.means_lr_aims": [{"after": after, "end": end} for after, end in aims],
         }
         self.config = changed(config, changes)
-        self.means_lr = means_rate(self.config, self.extent)
+        self.rates = rates_over_time(self.config, self.extent)
         self.density = self._density_from(self.density.state())
 
     def check(self) -> None:
@@ -256,6 +278,7 @@ class Trainer:
             "iteration": np.array(self.iteration),
             **{f"{DENSITY}{name}": values for name, values in self.density.state().items()},
             **optimizer_state(self.optimizer, PREFIX),
+            **({} if self.ends_step else pending_gradients(self.optimizer, PREFIX)),
             **{f"{e.name}/{k}": v for e in self.effects for k, v in e.state().items()},
         }
 
@@ -280,11 +303,13 @@ class Trainer:
         return density
 
     def _set_rates(self) -> None:
-        """The means' rate of this iteration, and what the strategy does to rates."""
-        rates = {"means": self.means_lr(self.iteration)}
+        """Those of this iteration, and what the strategy does to them."""
+        rates = self.rates(self.iteration)
         for name, factor in self.density.rate_factors(self.iteration).items():
-            rates[name] = factor * rates.get(name, self.rates[name])
-        self.optimizer.set_learning_rate({PREFIX + name: rate for name, rate in rates.items()})
+            rates[name] = factor * rates.get(name, self.rates.others[name])
+        there = self.optimizer.state  # shN is not, where the degree is 0
+        rates = {PREFIX + name: rate for name, rate in rates.items() if PREFIX + name in there}
+        self.optimizer.set_learning_rate(rates)
 
     def _control_density(self, image: Any, photograph: Any) -> DensityReport | None:
         """Tell the strategy what was seen, and let it act; both (H, W, 3), as compared."""
@@ -293,7 +318,7 @@ class Trainer:
             last, (height, width, _) = self.integrator.last, image.shape
             gradients = last.means2d_grad, last.visible
             density.gather(SeenStep(i, width, height, *gradients, image, photograph))
-        density.perturb(self.population, i, self.means_lr(i))
+        density.perturb(self.population, i, self.means_lr)
         if not density.acts(i):
             return None
         self.check()

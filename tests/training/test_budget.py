@@ -20,7 +20,7 @@ from drgs.training import budget as plan
 from drgs.training import checkpoint
 from drgs.training.budget import Curve, Deadline, Strategy, load_curves, make_plan, parse_duration
 from drgs.training.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
-from drgs.training.rates import means_rate
+from drgs.training.rates import rates_over_time
 from drgs.training.trainer import Trainer
 
 
@@ -168,7 +168,7 @@ class FakeTrainer:
         self.extent = 1.0
         values = {"iterations": 1000, "densify.start": 100, "densify.stop": 600}
         self.config = changed(CONFIG, {**values, **changes})
-        self.means_lr = means_rate(self.config, self.extent)
+        self.rates = rates_over_time(self.config, self.extent)
         self.density = SimpleNamespace(state=dict)
 
     def _density_from(self, state):
@@ -209,7 +209,7 @@ def test_a_fit_ends_in_time_whatever_an_iteration_takes(clock, second):
     assert trainer.config.iterations == n == pytest.approx(100 / second, abs=2)
     assert trainer.config.densify.stop == pytest.approx(0.6 * n, abs=2)
     # Two iterations of 500 in five e-folds.
-    assert trainer.means_lr(n) == pytest.approx(trainer.means_lr.final, rel=0.02)
+    assert trainer.rates.means(n) == pytest.approx(trainer.rates.means.final, rel=0.02)
 
 
 def test_a_fit_that_becomes_slower_is_revised(clock):
@@ -219,13 +219,13 @@ def test_a_fit_that_becomes_slower_is_revised(clock):
     while deadline.goes_on(trainer):
         trainer.second = 0.05 if trainer.iteration < 600 else 0.2
         trainer.step()
-        rates.append(trainer.means_lr(trainer.iteration))
+        rates.append(trainer.rates.means(trainer.iteration))
     assert trainer.iteration == pytest.approx(600 + 70 / 0.2, abs=2)
     # All rates, also those of iterations before a revision, are what the last configuration says.
-    assert rates == [trainer.means_lr(i + 1) for i in range(trainer.iteration)]
+    assert rates == [trainer.rates.means(i + 1) for i in range(trainer.iteration)]
     assert len(trainer.config.optimizer.means_lr_aims) == 10
     # Without revisions after the fit became slower, it would have fallen half the way: 1.7e-5.
-    assert trainer.means_lr.final < rates[-1] < 2 * trainer.means_lr.final
+    assert trainer.rates.means.final < rates[-1] < 2 * trainer.rates.means.final
 
 
 def test_the_expected_end_follows_the_clock(clock):
