@@ -49,6 +49,27 @@ class AdcConfig(Section):
     )
 
 
+class BudgetConfig(Section):
+    """The strategy budget: growth to a number of Gaussians, where errors are."""
+
+    gaussians: Count | None = Field(
+        None,
+        ge=4,
+        description="How many there are to be at densify.stop. null: as many as suit the pictures' "
+        "size, 250 times the root of their pixels: 100,000 for 400 x 400 px.",
+    )
+    error_every: Count = Field(
+        10,
+        ge=1,
+        description="Iterations between those whose errors count. Each of them takes half as long "
+        "again.",
+    )
+    prune_opacity: float = Field(0.005, ge=0, lt=1, description="Removed if less opaque.")
+    prune_scale: float = Field(
+        0.1, gt=0, description="Removed if the largest scale is larger; x extent."
+    )
+
+
 EARLIER_KEYS = {f"densify.{name}": f"densify.adc.{name}" for name in AdcConfig.model_fields}
 """Names of values in files of earlier versions, which had one strategy, and what they are now."""
 
@@ -56,10 +77,10 @@ EARLIER_KEYS = {f"densify.{name}": f"densify.adc.{name}" for name in AdcConfig.m
 class DensifyConfig(Section):
     """How the number of Gaussians changes."""
 
-    strategy: Literal["adc"] = Field(
+    strategy: Literal["adc", "budget"] = Field(
         "adc",
         description="What changes the population. adc: adaptive density control, as in the paper "
-        "(Kerbl et al. 2023).",
+        "(Kerbl et al. 2023); budget: growth to a number of Gaussians, where errors are.",
     )
     start: Count | None = Field(
         REFERENCE_START,
@@ -78,6 +99,7 @@ class DensifyConfig(Section):
         1_000_000, ge=4, le=100_000_000, description="Cap that is never exceeded."
     )
     adc: AdcConfig = Field(default_factory=AdcConfig)
+    budget: BudgetConfig = Field(default_factory=BudgetConfig)
 
     @model_validator(mode="before")
     @classmethod

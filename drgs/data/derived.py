@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from drgs.config.changes import changed
@@ -22,9 +24,12 @@ NEAR_RANGE = (1e-9, 1e9)
 FARTHEST_NEAR = 0.5
 """Of that distance: a near plane beyond it would cut into what is looked at."""
 
+GAUSSIANS_PER_PIXEL_OF_SIDE = 250
+"""Of the strategy budget: numbers of Gaussians are in proportion to the pictures' sides."""
+
 
 def completed(config: FitConfig, dataset: Dataset) -> FitConfig:
-    """``config`` with the background and the near plane that follow from ``dataset``.
+    """``config`` with background, near plane and number of Gaussians as ``dataset`` has them.
 
     Those that are given stay. Raises :class:`UserError` for a near plane behind which there is
     nothing left to look at.
@@ -38,6 +43,8 @@ def completed(config: FitConfig, dataset: Dataset) -> FitConfig:
         changes["model.near"] = _near_plane(dataset)
     else:
         _check_near_plane(config.model.near, dataset)
+    if config.densify.strategy == "budget" and config.densify.budget.gaussians is None:
+        changes["densify.budget.gaussians"] = _number_of_gaussians(dataset)
     return changed(config, changes) if changes else config
 
 
@@ -61,6 +68,11 @@ def _near_plane(dataset: Dataset) -> float:
     if not dataset.train:
         return REFERENCE_NEAR
     return float(f"{np.clip(NEAR_SHARE * _viewing_distance(dataset), *NEAR_RANGE):.1g}")
+
+
+def _number_of_gaussians(dataset: Dataset) -> int:
+    sides = [math.sqrt(view.width * view.height) for view in dataset.train]
+    return round(GAUSSIANS_PER_PIXEL_OF_SIDE * float(np.mean(sides or [1])))
 
 
 def _check_near_plane(near: float, dataset: Dataset) -> None:

@@ -310,6 +310,20 @@ def _sums(columns: list[Any], visible: Any) -> list[Any]:
     return [dr.sum(column) for column in columns]
 
 
+def weighted_sums(frame: Frame, plane: Any) -> Any:
+    """Of each Gaussian, the sum over pixels of its weight times ``plane``: Float (N,).
+
+    plane: x, Float (H * W,). A plane of the frame is C = sum_i w_i c_i, so that the adjoint's
+    derivative with respect to c_i is sum w_i g over pixels: here g is x for the first feature and 0
+    for the others. No other kernel is compiled than that of the adjoint. Where colours are seen
+    along each pixel's ray, what is summed is the first coefficient of red: the same up to a factor.
+    """
+    zeros = dr.opaque(type(plane), 0, dr.width(plane))
+    d_features = [plane, *[zeros] * (frame.layers.count - 1)]
+    gradients = frame.order.adjoint(frame.bins, frame.records, frame.layers, d_features, zeros)
+    return gradients.features[0]
+
+
 def sum_of_gradients(a: GaussianGradients, b: GaussianGradients) -> GaussianGradients:
     """Those of a loss that depends on what several cameras see."""
     parameters = {

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import drjit as dr
@@ -22,6 +23,7 @@ from drgs.data.derived import completed
 from drgs.data.types import Dataset, View
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 from drgs.integrator.scene import make_scene, render_views
+from drgs.integrator.weights import weighted_sums_of_last
 from drgs.training.density.called_for import density_strategy
 from drgs.training.density.strategy import DensityReport, DensityStrategy, Population, SeenStep
 from drgs.training.effects.called_for import integrator_settings, training_effects
@@ -317,7 +319,8 @@ class Trainer:
         if density.gathers(i):
             last, (height, width, _) = self.integrator.last, image.shape
             gradients = last.means2d_grad, last.visible
-            density.gather(SeenStep(i, width, height, *gradients, image, photograph))
+            weigh = partial(weighted_sums_of_last, self.integrator)
+            density.gather(SeenStep(i, width, height, *gradients, image, photograph, weigh))
         density.perturb(self.population, i, self.means_lr)
         if not density.acts(i):
             return None

@@ -309,3 +309,28 @@ def test_camera_gradients_of_two_frames_equal_differences_of_the_reference(case)
 @pytest.mark.parametrize("case", OF_CAMERA, ids=lambda case: case.name)
 def test_camera_tangents_of_two_frames_equal_differences_of_the_reference(case):
     check_camera_tangents_of_two_frames_equal_differences_of_the_reference(case)
+
+
+# ----------------------------------------------------------------------------------------------
+# Sums of weights
+# ----------------------------------------------------------------------------------------------
+
+
+@both_precisions
+def test_weighted_sums_are_what_a_gaussian_adds_to_the_picture_times_the_plane(precision):
+    """The reference composites each Gaussian alone in white, among the others in black."""
+    case = clear(Case("weights", 23, 19, 1, count=12))
+    splats = reference.project(case.gaussians, case.camera)
+    plane = np.random.default_rng(3).uniform(0, 1, (case.height, case.width))
+    expected = []
+    for white in np.eye(12):
+        picture = reference.composite(
+            splats.means2d, splats.conics, splats.opacities, np.repeat(white[:, None], 3, axis=1),
+            splats.depths, splats.visible, np.zeros(3), case.width, case.height,
+            cuts=splats.cuts,
+        )  # fmt: skip
+        expected.append(np.sum(picture.image[..., 0] * plane))
+    _, frame = render(case, precision)
+    got = np.array(rendering.weighted_sums(frame, precision.array(plane)), np.float64)
+    assert np.max(expected) > 1
+    np.testing.assert_allclose(got, expected, atol=PICTURE[precision] * np.max(expected))

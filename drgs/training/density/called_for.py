@@ -14,6 +14,10 @@ def density_strategy(config: FitConfig, white_background: bool = False) -> Densi
 
     white_background: whether what is behind the splats is white.
     """
+    if config.densify.strategy == "budget":
+        from drgs.training.density.budget import GrowthToNumber
+
+        return GrowthToNumber(config.densify)
     from drgs.training.density.adc import AdaptiveDensityControl
 
     return AdaptiveDensityControl(config.densify, white_background)

@@ -10,7 +10,7 @@ Iterations are counted from 1. A strategy is a function of the configuration and
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -45,11 +45,16 @@ class SeenStep:
     visible: Any  # Bool (N,)
     image: Any  # tensor (H, W, 3), what was compared with the photograph, display space
     photograph: Any  # tensor (H, W, 3), display space
+    weighted_sums: Callable[[Any], Any]  # see drgs.splatting.rendering.weighted_sums
 
     def errors(self) -> Any:
         """Of each pixel, the mean absolute difference of its channels: Float (H W,)."""
         difference = dr.abs(dr.detach(self.image) - self.photograph)
         return dr.mean(difference, axis=2).array
+
+    def errors_seen(self) -> Any:
+        """Of each Gaussian, the sum of errors over pixels, times its weight there: Float (N,)."""
+        return self.weighted_sums(self.errors())
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,178 @@
+"""Growth to a number of Gaussians, the strategy ``budget``.
+
+The number is chosen, not what comes out of a threshold: it rises along a curve, and at each change
+there is room for some more. Those are split that see most of the errors that are left,
+
+    s_i = sum over pixels of w_i(p) |C(p) - C*(p)|
+
+with the weights w of compositing, from every tenth view or so: the derivative of the picture
+composited with the errors as cotangent, which the kernels of the adjoint compute anyway. What is
+split are the longest axes of those Gaussians, into two halves. What has become transparent is
+removed, and there are no opacity resets.
+
+A known number with a curve of growth and the split along the longest axis are ideas of Improved-GS
+(Deng et al. 2025), the sum of errors is one of 3DGS densification by error (Rota Bulo et al. 2024,
+"Revising Densification in Gaussian Splatting"). Rows are chosen on the host. Equal inputs give
+equal bytes: nothing is random, and ties are broken by index.
+
+Iterations are counted from 1.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import numpy as np
+from scipy.special import expit, logit
+
+from drgs.config.density import DensifyConfig
+from drgs.core.arrays import from_host, types_of
+from drgs.core.errors import UserError
+from drgs.gaussians.quaternions import quat_to_rotation
+from drgs.training.density.strategy import DensityReport, DensityStrategy, Population, SeenStep
+
+OFFSET = 1.35
+"""Of the halves' means from that of the Gaussian, in standard deviations of its longest axis."""
+
+LONG, OTHERS = 0.55, 0.893
+"""Of the halves' scales: along that axis, and along the two others."""
+
+OPACITY = 0.6
+"""Of the halves: they overlap."""
+
+OPACITY_RANGE = 1e-4, 1 - 1e-4
+"""Of the halves, so that logits stay small."""
+
+
+@dataclass
+class GrowthToNumber(DensityStrategy):
+    """Splits those that see most of the errors, as many as there is room for."""
+
+    config: DensifyConfig
+    errors: Any = None  # Float (N,): sum over views of s; None until it begins
+    first: int = 0  # Gaussians at the start
+
+    def begin(self, population: Population) -> None:
+        """Start with the errors of no views."""
+        float_type = type(population.value("means").array)
+        self.first = self.first or population.num_rows
+        self.errors = dr.zeros(float_type, population.num_rows)
+
+    def gathers(self, iteration: int) -> bool:
+        """Every so many views, as long as the errors can still lead to a change."""
+        return iteration < self.config.stop and iteration % self.config.budget.error_every == 0
+
+    def gather(self, step: SeenStep) -> None:
+        """Add the errors of one more view."""
+        self.errors = self.errors + step.errors_seen()
+        dr.eval(self.errors)
+
+    def acts(self, iteration: int) -> bool:
+        """Whether the population changes after this iteration."""
+        config = self.config
+        return config.start < iteration <= config.stop and iteration % config.every == 0
+
+    def act(self, population: Population, iteration: int) -> DensityReport:
+        """Remove what is transparent or too large, and split where errors are."""
+        config, before = self.config, population.num_rows
+        keep = _useful(population, config)
+        if not keep.any():
+            raise UserError(
+                f"iteration {iteration}: every Gaussian would be pruned (opacity below densify."
+                f"budget.prune_opacity = {config.budget.prune_opacity}, or scale above densify."
+                f"budget.prune_scale = {config.budget.prune_scale} x {population.extent:g}): do "
+                "the cameras see the start points?"
+            )
+        kept = int(np.count_nonzero(keep))
+        room = max(0, self.goal(iteration) - kept)
+        errors = np.where(keep, np.array(self.errors, np.float64), 0)
+        candidates = np.flatnonzero(errors > 0)
+        candidates = candidates[np.argsort(-errors[candidates], kind="stable")]
+        split = np.sort(candidates[:room])
+        if len(split) > 0 or kept < before:
+            keep[split] = False
+            rows = from_host(dr.uint32_array_t(type(self.errors)), _row_numbers(keep))
+            population.edit(rows, halves(population, split) if len(split) > 0 else None)
+        self.begin(population)
+        return DensityReport(
+            num_gaussians=population.num_rows,
+            num_added=len(split),
+            split=len(split),
+            pruned=before - kept,
+            refused=self._uncapped_goal(iteration) - self.goal(iteration),
+        )
+
+    def goal(self, iteration: int) -> int:
+        """How many there are to be after the change of this iteration."""
+        return min(self._uncapped_goal(iteration), max(self.config.max_gaussians, self.first))
+
+    def _uncapped_goal(self, iteration: int) -> int:
+        """N_0 + (N - N_0) sqrt(u), where u rises from 0 at ``start`` to 1 at ``stop``."""
+        config = self.config
+        u = (iteration - config.start) / (config.stop - config.start)
+        return self.first + round((self._final - self.first) * math.sqrt(min(max(u, 0), 1)))
+
+    @property
+    def _final(self) -> int:
+        return max(self.config.budget.gaussians, self.first)
+
+    def state(self) -> dict[str, np.ndarray]:
+        """The errors, and the number at the start."""
+        return {"errors": np.array(self.errors), "first": np.array(self.first)}
+
+    def restore(self, state: Mapping[str, np.ndarray]) -> None:
+        """Continue with :meth:`state`."""
+        self.errors, self.first = type(self.errors)(state["errors"]), int(state["first"])
+
+    def most_gaussians(self, start: int, iterations: int) -> int:
+        """The number that it grows to."""
+        del iterations
+        return max(start, min(self.config.budget.gaussians, self.config.max_gaussians))
+
+
+def halves(population: Population, rows: np.ndarray) -> dict[str, Any]:
+    """Two halves of each of ``rows``: all the first ones, then all the second ones.
+
+    The halves' means lie on both sides of the Gaussian's, on its longest axis.
+    """
+    twice = np.tile(rows, 2)
+    t = types_of(type(population.value("means").array))
+    halves = population.take(from_host(t.UInt32, twice.astype(np.uint32)))
+
+    log_scales = population.host("log_scales")[twice]
+    longest = log_scales.argmax(axis=1)
+    factors = np.full_like(log_scales, OTHERS)
+    np.put_along_axis(factors, longest[:, None], LONG, axis=1)
+    sides = np.repeat([OFFSET, -OFFSET], len(rows))
+    offsets = np.zeros_like(log_scales)
+    reach = sides * np.exp(log_scales.max(axis=1))
+    np.put_along_axis(offsets, longest[:, None], reach[:, None], axis=1)
+
+    quat = dr.unravel(t.Array4f, halves["quats"].array)
+    mean = dr.unravel(t.Array3f, halves["means"].array)
+    mean += quat_to_rotation(quat) @ dr.unravel(t.Array3f, from_host(t.Float, offsets))
+    opacities = np.clip(OPACITY * expit(population.host("logit_opacities")[twice]), *OPACITY_RANGE)
+    shape = offsets.shape
+    return {
+        **halves,
+        "means": t.TensorXf(dr.ravel(mean), shape),
+        "log_scales": t.TensorXf(from_host(t.Float, log_scales + np.log(factors)), shape),
+        "logit_opacities": from_host(t.Float, logit(opacities)),
+    }
+
+
+def _useful(population: Population, config: DensifyConfig) -> np.ndarray:
+    """(N,) bool: neither transparent nor too large; NaN counts as both."""
+    with np.errstate(over="ignore"):
+        scales = np.exp(population.host("log_scales")).max(axis=1)
+    opacities = expit(population.host("logit_opacities"))
+    is_opaque = opacities >= config.budget.prune_opacity
+    return is_opaque & (scales <= config.budget.prune_scale * population.extent)
+
+
+def _row_numbers(mask: np.ndarray) -> np.ndarray:
+    return np.flatnonzero(mask).astype(np.uint32)

@@ -1,0 +1,203 @@
+"""The strategy budget against its rules, written out in numpy."""
+
+import math
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from drjit.llvm.ad import Float, TensorXf, TensorXf64
+from hypothesis import given
+from hypothesis import strategies as st
+from support.populations import logit, make, rows_of
+from support.random_scenes import examples
+from support.trainers import make_trainer
+
+from drgs.config.density import DensifyConfig
+from drgs.core.errors import UserError
+from drgs.gaussians.parameters import PARAMETER_NAMES
+from drgs.reference import splatting as reference
+from drgs.training.density.budget import GrowthToNumber, halves
+from drgs.training.optimizer import make_optimizer, num_rows
+
+
+def strategy(optimizer, errors, first=None, **config):
+    values = {"strategy": "budget", "start": 100, "stop": 1000, "every": 50, **config}
+    made = GrowthToNumber(DensifyConfig.model_validate(values))
+    made.first = first or num_rows(optimizer)
+    made.errors = Float(np.asarray(errors, np.float32))
+    return made
+
+
+def values(optimizer):
+    return {name: np.array(dr.detach(value), np.float64) for name, value in optimizer.items()}
+
+
+def test_room_is_given_to_those_that_see_most_of_the_errors():
+    optimizer = make([0.1] * 6, [0.5] * 6)
+    before = values(optimizer)
+    # Half of the way from 6 to 9 after a quarter of the time: 6 + 3 sqrt(1 / 4) = 7.5, even: 8.
+    growth = strategy(optimizer, [1, 5, 3, 0, 4, 2], budget={"gaussians": 9})
+    report = growth.act(rows_of(optimizer), 325)
+    assert (report.num_gaussians, report.split, report.pruned, report.refused) == (8, 2, 0, 0)
+    after = values(optimizer)
+    assert np.array_equal(after["sh0"][:4], before["sh0"][[0, 2, 3, 5]])
+    assert np.array_equal(after["sh0"][4:], before["sh0"][[1, 4, 1, 4]])
+    assert np.array(growth.errors).tolist() == [0] * 8  # and starts again
+
+
+def test_equal_errors_are_split_by_index_and_none_without_errors():
+    optimizer = make([0.1] * 5, [0.5] * 5)
+    before = values(optimizer)["sh0"]
+    growth = strategy(optimizer, [0, 2, 2, 2, 0], budget={"gaussians": 7})
+    assert growth.act(rows_of(optimizer), 1000).split == 2
+    assert np.array_equal(values(optimizer)["sh0"][3:5], before[[1, 2]])
+    optimizer = make([0.1] * 5, [0.5] * 5)
+    growth = strategy(optimizer, np.zeros(5), budget={"gaussians": 50})
+    assert growth.act(rows_of(optimizer), 1000).num_gaussians == 5
+
+
+def test_the_transparent_and_the_large_are_removed_and_their_room_is_used():
+    scales, opacities = [0.1, 0.1, 0.41, 0.39, 0.1], [0.5, 0.0049, 0.5, 0.5, 0.0051]
+    optimizer = make(scales, opacities)
+    before = values(optimizer)["sh0"]
+    growth = strategy(optimizer, [1, 9, 9, 2, 0.5], budget={"gaussians": 5})
+    report = growth.act(rows_of(optimizer), 500)  # prune_scale 0.1 x extent 4 = 0.4
+    assert (report.num_gaussians, report.split, report.pruned) == (5, 2, 2)
+    after = values(optimizer)["sh0"]
+    assert np.array_equal(after, before[[4, 0, 3, 0, 3]])
+
+
+@pytest.mark.parametrize("tensor_type", [TensorXf, TensorXf64])
+def test_halves_lie_on_both_sides_along_the_longest_axis(tensor_type):
+    optimizer = make([0.1, 0.2, 0.05], [0.5, 0.9, 0.01], tensor_type=tensor_type)
+    before, rows = values(optimizer), np.array([0, 2])
+    got = {k: np.array(v, np.float64) for k, v in halves(rows_of(optimizer), rows).items()}
+    rotations = reference.quat_to_rotation(before["quats"])
+    tolerance = 1e-6 if tensor_type is TensorXf else 1e-14
+    for k, (row, side) in enumerate([(0, 1), (2, 1), (0, -1), (2, -1)]):
+        longest = int(np.argmax(before["log_scales"][row]))
+        sigma = math.exp(before["log_scales"][row, longest])
+        mean = before["means"][row] + side * 1.35 * sigma * rotations[row][:, longest]
+        np.testing.assert_allclose(got["means"][k], mean, atol=10 * tolerance)
+        factors = np.full(3, 0.893)
+        factors[longest] = 0.55
+        expected = np.exp(before["log_scales"][row]) * factors
+        np.testing.assert_allclose(np.exp(got["log_scales"][k]), expected, rtol=10 * tolerance)
+        opacity = reference.sigmoid(got["logit_opacities"][k])
+        parent = reference.sigmoid(before["logit_opacities"][row])
+        np.testing.assert_allclose(opacity, 0.6 * parent, rtol=10 * tolerance)
+        for name in ("quats", "sh0", "shN"):
+            assert np.array_equal(got[name][k], before[name][row])
+
+
+def test_survivors_keep_their_moments_and_halves_start_without():
+    optimizer = make([0.1] * 4, [0.5] * 4)
+    moments = {name: np.array(optimizer.state[name][3][1]) for name in PARAMETER_NAMES}
+    steps = {name: np.array(optimizer.state[name][3][0]) for name in PARAMETER_NAMES}
+    strategy(optimizer, [0, 1, 0, 0], budget={"gaussians": 5}).act(rows_of(optimizer), 1000)
+    for name in PARAMETER_NAMES:
+        value, _, _, (step, first, second, _) = optimizer.state[name]
+        got = np.array(first).reshape(5, -1)
+        assert np.array_equal(got[:3], moments[name].reshape(4, -1)[[0, 2, 3]])
+        assert not got[3:].any() and not np.array(second).reshape(5, -1)[3:].any()
+        assert np.array_equal(np.array(step), steps[name]) and dr.grad_enabled(value)
+
+
+@examples
+@given(
+    seed=st.integers(0, 1000),
+    num=st.integers(1, 20),
+    target=st.integers(4, 60),
+    cap=st.integers(4, 60),
+    iteration=st.integers(101, 1000),
+)
+def test_neither_the_curve_nor_the_cap_is_exceeded(seed, num, target, cap, iteration):
+    random = np.random.default_rng(seed)
+    optimizer = make(random.uniform(0.01, 0.5, num), random.uniform(0.001, 0.9, num))
+    growth = strategy(
+        optimizer,
+        random.choice([0.0, 1.0, 2.0], num),
+        budget={"gaussians": target},
+        max_gaussians=cap,
+    )
+    try:
+        report = growth.act(rows_of(optimizer), iteration)
+    except UserError:
+        return
+    u = (iteration - 100) / 900
+    on_curve = num + max(target - num, 0) * math.sqrt(u)
+    assert report.num_gaussians == num_rows(optimizer)
+    assert report.num_gaussians <= max(num, min(on_curve + 1, cap))
+    assert report.num_gaussians == num + report.num_added - report.pruned
+    assert growth.most_gaussians(num, 1000) >= report.num_gaussians
+
+
+def test_a_population_that_would_vanish_is_refused():
+    optimizer = make([0.1] * 3, [0.001] * 3)
+    with pytest.raises(UserError, match=r"every Gaussian would be pruned .*budget\.prune_opacity"):
+        strategy(optimizer, [1, 1, 1], budget={"gaussians": 5}).act(rows_of(optimizer), 500)
+
+
+# ---- in a fit
+@pytest.fixture(scope="module")
+def variant():
+    mi.set_variant("llvm_ad_rgb")
+
+
+GROWING = {
+    "strategy": "budget",
+    "start": 4,
+    "stop": 24,
+    "every": 4,
+    "budget": {"gaussians": 70, "error_every": 3},
+}
+
+
+def test_errors_are_gathered_in_the_iterations_that_say_so(variant):
+    trainer = make_trainer(densify=GROWING)
+    gathered = []
+    original = trainer.density.gather
+    trainer.density.gather = lambda step: (gathered.append(step.iteration), original(step))
+    for _ in range(30):
+        trainer.step()
+    assert gathered == [3, 6, 9, 12, 15, 18, 21]
+
+
+def test_a_fit_grows_along_the_curve_and_is_resumed_to_the_same_bytes(variant):
+    uninterrupted, first = make_trainer(densify=GROWING), make_trainer(densify=GROWING)
+    counts = []
+    for iteration in range(1, 31):
+        counts.append(uninterrupted.step().num_gaussians)
+        if iteration <= 10:
+            first.step()
+    second = make_trainer(densify=GROWING)
+    second.restore(first.state())
+    for _ in range(20):
+        second.step()
+    on_curve = [40 + 30 * math.sqrt((i - 4) / 20) for i in (8, 12, 16, 20, 24)]
+    assert counts[7:24:4] == pytest.approx(on_curve, abs=1) and counts[-1] == 70
+    expected, got = uninterrupted.gaussians(), second.gaussians()
+    for name in PARAMETER_NAMES:
+        assert getattr(got, name).tobytes() == getattr(expected, name).tobytes(), name
+
+
+def test_the_number_follows_from_the_pictures_where_it_is_not_given(variant):
+    trainer = make_trainer(densify={"strategy": "budget"})
+    assert trainer.config.densify.budget.gaussians == round(250 * math.sqrt(20 * 16))
+
+
+def test_opacities_of_halves_have_logits(variant):
+    optimizer = make_optimizer(
+        {
+            "means": TensorXf(Float([0.0] * 3), (1, 3)),
+            "quats": TensorXf(Float([1.0, 0, 0, 0]), (1, 4)),
+            "log_scales": TensorXf(Float([-2.0] * 3), (1, 3)),
+            "logit_opacities": Float(logit([0.01])),
+            "sh0": TensorXf(Float([0.0] * 3), (1, 1, 3)),
+        },
+        dict.fromkeys(PARAMETER_NAMES, 0.0),
+    )
+    optimizer["logit_opacities"] = Float([60.0])  # an opacity that is 1 in double precision
+    got = halves(rows_of(optimizer), np.array([0]))["logit_opacities"]
+    assert reference.sigmoid(np.array(got, np.float64)) == pytest.approx(0.6)
