@@ -20,7 +20,7 @@ import argparse
 import json
 import math
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol, runtime_checkable
@@ -37,6 +37,7 @@ from drgs.cli.commands import (
     run_command,
 )
 from drgs.cli.execution import VARIANTS, add_execution_arguments, executing, select_variant
+from drgs.config.approximations import said_by
 from drgs.config.changes import is_open
 from drgs.config.load import load_config
 from drgs.config.schema import NAMED_COLORS, FitConfig, ModelConfig
@@ -94,6 +95,7 @@ class Model:
     config: FitConfig | None  # names the dataset
     ignored: str = ""  # effects that are not to be simulated: see the plugin
     folder: Path | None = None  # where they are, perhaps with refined cameras beside them
+    said: Collection[str] = ()  # names of the settings that their file has decided
 
     def scene(self) -> mi.Scene:
         """A Mitsuba scene that renders in display space."""
@@ -112,7 +114,7 @@ class Model:
         if "distortion" not in self.ignored:
             check_lenses(self.settings, views, where="", remedy="give --ignore distortion")
         scene = self.scene()
-        print(described(summary_of_views(scene.integrator(), views)), flush=True)
+        print(described(summary_of_views(scene.integrator(), views, self.said)), flush=True)
         names = [*(f"{view.name}.png" for view in views), *others]
         return claiming(out, names, render_views(scene, views))
 
@@ -286,9 +288,15 @@ def load_model(args: argparse.Namespace) -> Model:
     model, background = ModelConfig(), NAMED_COLORS[BACKGROUND]
     if config is not None:
         model, background = config.model, config.data.background_rgb
+    # --set is the user's word; a configuration may be there for the photographs that it names.
+    asked = {override.partition("=")[0].strip() for override in args.set or ()}
+    values = (gaussians.rendered_with or {}).items()
+    said = said_by(str(what), {k: v for k, v in values if not asked & {"model", f"model.{k}"}})
+    model = model.model_copy(update=said)
     if args.background is not None:
         background = _background(args)
-    return Model(gaussians, model, background, config, ", ".join(args.ignore or ()), folder)
+    ignored = ", ".join(args.ignore or ())
+    return Model(gaussians, model, background, config, ignored, folder, tuple(said))
 
 
 def _load_config(path: Path, args: argparse.Namespace) -> FitConfig:

@@ -38,6 +38,7 @@ from drgs.integrator.properties import (
     nested_integrator,
     positive,
     refuse_unknown,
+    said_by_file,
     turns_of_shapes,
 )
 from drgs.integrator.sensors import camera_from_sensor, read_sensor
@@ -76,6 +77,8 @@ class SplatsIntegrator(mi.CppADIntegrator):
        - A PLY file in the layout of the 3DGS reference implementation. Without it, the
          Gaussians are given as tensors under the names below. With and without them, Gaussians of
          the scene's shapes of type ``ellipsoids`` and ``ellipsoidsmesh`` are rendered as well.
+         What its header says of ``projection`` to ``antialiased`` below holds where these are not
+         given; shapes have no such header.
 
      * - to_world
        - |transform|
@@ -278,7 +281,8 @@ class SplatsIntegrator(mi.CppADIntegrator):
         self._sh_degree_is_given = "sh_degree" in props
         self.background = background_of(props)
         self.hide_emitters = boolean(props, "hide_emitters", False)
-        self.approximations = approximations_of(props)
+        said = said_by_file(props, gaussians)
+        self.approximations, self.said_by_file = approximations_of(props, said), tuple(said)
         self.near = positive(props, "near", NEAR)
         self.srgb_primitives = boolean(props, "srgb_primitives", True)
         self.nested = nested_integrator(props)

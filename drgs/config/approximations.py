@@ -9,6 +9,7 @@ the section ``model`` of a configuration (``drgs.config.schema``), the propertie
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from typing import Annotated, Literal, get_args, get_type_hints
@@ -16,6 +17,7 @@ from typing import Annotated, Literal, get_args, get_type_hints
 import numpy as np
 
 from drgs.core.constants import ALPHA_CUT, ALPHA_MAX, LOW_PASS, TRANSMITTANCE_STOP
+from drgs.core.errors import UserError, UserNote, did_you_mean, listed, one_line
 
 Value = bool | int | float | str
 
@@ -143,6 +145,11 @@ class Approximations:
         values = {name: getattr(self, name) for name in DECLARED}
         return {name: value for name, value in values.items() if value != DECLARED[name].default}
 
+    @property
+    def are_usual(self) -> bool:
+        """Whether viewers of 3DGS files render with the same."""
+        return not self.others_than_default
+
 
 @dataclass(frozen=True)
 class Declared:
@@ -158,13 +165,42 @@ class Declared:
     @property
     def expected(self) -> str:
         """What messages ask for, behind "must be"."""
-        return self.limits.words if self.limits else f"one of {', '.join(self.words)}"
+        if self.limits is not None:
+            return self.limits.words
+        return f"one of {', '.join(self.words)}" if self.words else "true or false"
 
     def allows(self, value: Value) -> bool:
         """Whether a value of this kind is within the limits."""
         if self.limits is not None:
             return self.limits.hold_for(value)
         return not self.words or value in self.words
+
+
+def said_by(where: str, values: Mapping[str, Value]) -> dict[str, Value]:
+    """The approximations among ``values`` that a file gives by name, each of its declared type.
+
+    where: the file, for messages. A name that is not known, of a later version perhaps, is noted
+    and left out.
+
+    Raises :class:`UserError` for a value of another type or outside of its limits.
+    """
+    unknown = [name for name in values if name not in DECLARED]
+    if unknown:
+        hint = did_you_mean(unknown[0], DECLARED)
+        note = f"{where}: says {listed(unknown)}, which is not known here and makes no difference"
+        warnings.warn(UserNote(note + hint), stacklevel=2)
+    found: dict[str, Value] = {}
+    for name in (name for name in DECLARED if name in values):
+        declared, value = DECLARED[name], values[name]
+        if declared.kind is float and type(value) is int:
+            value = float(value)
+        if type(value) is not declared.kind or not declared.allows(value):
+            raise UserError(
+                f"{where}: the header's {name} must be {declared.expected}, got "
+                f"{one_line(value, 60)}; correct the line, or remove it"
+            )
+        found[name] = value
+    return found
 
 
 def _declared() -> dict[str, Declared]:

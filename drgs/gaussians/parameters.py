@@ -8,6 +8,7 @@ from it.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -38,28 +39,35 @@ class Gaussians:
         None  # (N,) world units, not optimised: see drgs.effects.smoothing; None: there is none
     )
     features: Any = None  # by name, (N, C) each: whatever else is to be composited; None: nothing
+    rendered_with: Mapping[str, bool | int | float | str] | None = (
+        None  # by name: approximations that a file says, or is to say, they are made for
+    )
 
     @staticmethod
     def load(path: str | Path) -> Gaussians:
         """The Gaussians of a PLY file in the layout of the 3DGS reference, as numpy arrays.
 
-        float32, with the values and the SH degree that the file holds.
+        float32, with the values and the SH degree that the file holds, and with what its header
+        says they are to be rendered with (see :mod:`drgs.io.ply`), as it stands there.
 
         Raises ``drgs.core.errors.UserError`` (a ValueError) naming the file and what it lacks.
         """
         from drgs.io.ply import read_gaussians
 
-        return Gaussians(**read_gaussians(path))
+        arrays, rendered_with = read_gaussians(path)
+        return Gaussians(**arrays, rendered_with=rendered_with or None)
 
     def save(self, path: str | Path) -> None:
         """Write a PLY file in the layout of the 3DGS reference, atomically.
 
-        Equal Gaussians give equal bytes. Not saved: ``features``.
+        Equal Gaussians give equal bytes. The header says ``rendered_with``. Not saved:
+        ``features``.
         """
         from drgs.io.ply import write_gaussians
 
         host = self.numpy()
-        write_gaussians(path, {name: getattr(host, name) for name in host._names})
+        arrays = {name: getattr(host, name) for name in host._names}
+        write_gaussians(path, arrays, self.rendered_with)
 
     @staticmethod
     def from_numpy(
@@ -136,9 +144,8 @@ class Gaussians:
     def numpy(self) -> Gaussians:
         """The same Gaussians as numpy arrays on the host."""
         features = self.features and {k: np.array(v) for k, v in self.features.items()}
-        return Gaussians(
-            **{name: np.array(getattr(self, name)) for name in self._names}, features=features
-        )
+        arrays = {name: np.array(getattr(self, name)) for name in self._names}
+        return Gaussians(**arrays, features=features, rendered_with=self.rendered_with)
 
     def to(self, tensor_type: type) -> Gaussians:
         """Copy to Dr.Jit tensors of type ``tensor_type`` (``TensorXf`` or ``TensorXf64``)."""
@@ -150,9 +157,8 @@ class Gaussians:
             return flat if values.ndim == 1 else tensor_type(flat, values.shape)
 
         features = self.features and {k: upload(v) for k, v in self.features.items()}
-        return Gaussians(
-            **{name: upload(getattr(self, name)) for name in self._names}, features=features
-        )
+        tensors = {name: upload(getattr(self, name)) for name in self._names}
+        return Gaussians(**tensors, features=features, rendered_with=self.rendered_with)
 
     @property
     def _names(self) -> tuple[str, ...]:

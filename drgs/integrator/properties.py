@@ -8,7 +8,7 @@ expected and what was given; where the type is wrong, its subclass ``PluginTypeE
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from numbers import Integral
 from typing import TYPE_CHECKING
@@ -17,7 +17,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from drgs.config.approximations import DECLARED, Approximations, Declared, Value
+from drgs.config.approximations import DECLARED, Approximations, Declared, Value, said_by
 from drgs.core.constants import MAX_INT
 from drgs.core.errors import PluginError, PluginTypeError, did_you_mean
 from drgs.effects.compose import IGNORABLE
@@ -93,7 +93,7 @@ def load_gaussians(props: mi.Properties) -> Gaussians:
 
         to_world = Similarity.of(matrix(props, "to_world"), "splats: to_world")
         moved = to_world.of_gaussians(gaussians.numpy()).to(mi.TensorXf)
-        gaussians = replace(moved, features=features)
+        gaussians = replace(moved, features=features, rendered_with=gaussians.rendered_with)
     return gaussians
 
 
@@ -176,10 +176,18 @@ def nested_integrator(props: mi.Properties) -> mi.Integrator | None:
     return nested[0] if nested else None
 
 
-def approximations_of(props: mi.Properties) -> Approximations:
-    """The approximations among the properties; all others are the default."""
+def said_by_file(props: mi.Properties, gaussians: Gaussians) -> dict[str, Value]:
+    """The approximations that the file ``filename`` says and that no property gives."""
+    values = gaussians.rendered_with or {}
+    return said_by(
+        str(props.get("filename", "")), {n: v for n, v in values.items() if n not in props}
+    )
+
+
+def approximations_of(props: mi.Properties, said: Mapping[str, Value]) -> Approximations:
+    """The approximations among the properties, else as ``said``; all others are the default."""
     values = {n: _approximation(props, n, d) for n, d in DECLARED.items() if n in props}
-    return Approximations(**values)
+    return Approximations(**{**said, **values})
 
 
 def _approximation(props: mi.Properties, name: str, declared: Declared) -> Value:

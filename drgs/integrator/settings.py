@@ -6,7 +6,7 @@ is loaded for each variant of Mitsuba, so that its class cannot be imported here
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import Any, Protocol, runtime_checkable
 
 import mitsuba as mi
@@ -26,6 +26,7 @@ class SplatsSettings(Protocol):
     srgb_primitives: bool  # whether pictures are linear radiance, not display space
     sh_degree: int  # highest that is evaluated
     approximations: Approximations
+    said_by_file: Collection[str]  # names of the approximations that a file has decided
     smoothing: Any  # Float (N,), scene units; None: the Gaussians have no filter
     ignore: Sequence[str]  # effects that are not simulated
     aovs: dict[str, str]  # what is put out besides colour: kinds by name

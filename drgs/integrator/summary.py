@@ -8,7 +8,7 @@ That of a fit is in ``drgs.training.summary``.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 
 import mitsuba as mi
@@ -17,6 +17,9 @@ from drgs.cameras.camera import Camera, Lens, Pinhole
 from drgs.data.types import Viewpoint
 from drgs.effects.compose import ignoring
 from drgs.integrator.settings import SplatsSettings
+
+AS_THE_FILE_SAYS = "as the file says"
+"""Why something is simulated that the header of the Gaussians' file asks for."""
 
 
 @dataclass(frozen=True)
@@ -78,25 +81,30 @@ def summary_of_sensors(
         "a nested integrator's picture, between the splats" if num_surfaces else None,
         f"{num_surfaces} of the scene's shapes",
     )
-    return [*_summary_of_integrator(integrator, environment, of_cameras), surfaces]
+    said = integrator.said_by_file
+    return [*_summary_of_integrator(integrator, environment, of_cameras, said), surfaces]
 
 
 def summary_of_views(
-    integrator: SplatsSettings, views: Sequence[Viewpoint]
+    integrator: SplatsSettings, views: Sequence[Viewpoint], said: Collection[str] = ()
 ) -> list[SimulatedEffect]:
-    """The same for views or viewpoints, with nothing behind but the integrator's background."""
+    """The same for views or viewpoints, with nothing behind but the integrator's background.
+
+    said: names of the approximations that the Gaussians' file has decided.
+    """
     count = f"{len(views)} cameras"
     of_cameras = [
         effect_of(views, count).unless(word in integrator.ignore)
         for effect_of, word in ((lens_effect, "distortion"), (motion_effect, "motion"))
     ]
-    return _summary_of_integrator(integrator, None, of_cameras)
+    return _summary_of_integrator(integrator, None, of_cameras, said)
 
 
 def _summary_of_integrator(
     integrator: SplatsSettings,
     environment: mi.Emitter | None,
     of_cameras: Sequence[SimulatedEffect],
+    said: Collection[str],
 ) -> list[SimulatedEffect]:
     background = SimulatedEffect("background", "a constant colour", "the integrator's background")
     if environment is not None and not integrator.hide_emitters:
@@ -104,17 +112,22 @@ def _summary_of_integrator(
     elif isinstance(integrator.background, mi.Texture):
         background = SimulatedEffect("background", "a picture", "the integrator's background")
     smooth = integrator.gaussians.smoothing is not None
+    antialiased = AS_THE_FILE_SAYS if "antialiased" in said else "antialiased"
     effects = [
         view_dependence_effect(integrator.sh_degree, "the Gaussians' coefficients"),
         background,
         *of_cameras,
         antialiasing_effect(
-            "antialiased" if integrator.approximations.antialiased else None,
+            antialiased if integrator.approximations.antialiased else None,
             "the Gaussians' filter" if smooth else None,
         ),
     ]
     if integrator.smoothing is not None and not smooth:
         effects.append(SimulatedEffect("smoothing filter", None, ignored=True))
+    others = integrator.approximations.others_than_default
+    values = [f"{k} = {v}" for k, v in others.items() if k in said and k != "antialiased"]
+    if values:
+        effects.append(SimulatedEffect("approximations", ", ".join(values), AS_THE_FILE_SAYS))
     return effects
 
 

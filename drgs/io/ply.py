@@ -8,12 +8,19 @@ with zero normals, the raw values that are optimised (logit opacity, natural log
 scales, unnormalised wxyz quaternion), and ``f_rest`` channel-major: all coefficients of red,
 then of green, then of blue. K = (degree + 1)^2. Gaussians with a smoothing filter have one property
 more, ``filter_3D``, the filter's standard deviation, as in Mip-Splatting's files.
+
+What Gaussians are to be rendered with stands in comments of the header, a line for each value that
+viewers would not take by themselves::
+
+    comment drgs antialiased true
+    comment drgs low_pass 0.1
 """
 
 from __future__ import annotations
 
 import io
 import math
+import re
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -42,6 +49,11 @@ NUM_REST = {3 * ((degree + 1) ** 2 - 1): degree for degree in range(4)}
 MAX_HEADER_BYTES = 1 << 20
 """The header of 62 properties takes 1.5 kB; the rest is room for comments."""
 
+Scalar = bool | int | float | str
+
+STATEMENT = re.compile(r"drgs ([a-z][a-z_]{0,39}) ([!-~]{1,40})")
+"""A comment of ours: a name and its value. Others are somebody else's."""
+
 
 LARGEST_LOGIT = 23 * math.log(2)
 """Logit of the largest opacity below 1 that a sigmoid in float32 gives: 1 / (1 + 2^-23)."""
@@ -50,19 +62,20 @@ SMALLEST_LOGIT = -125 * math.log(2)
 """Logit of about the smallest opacity that it gives: exp of less is no number in float32."""
 
 
-def read_gaussians(path: str | Path) -> dict[str, np.ndarray]:
-    """Gaussians as numpy float32 arrays, with the values and the SH degree that the file holds.
+def read_gaussians(path: str | Path) -> tuple[dict[str, np.ndarray], dict[str, Scalar]]:
+    """Gaussians as numpy float32 arrays, and by name what its header says they are rendered with.
 
-    By the names of the fields of :class:`drgs.gaussians.parameters.Gaussians`, whose ``load`` calls
-    this; ``smoothing`` is missing where the file has none. Properties are found by name, in any
-    order and of any numeric type; others are ignored. Infinite logits, which formats with opacities
-    of 8 bits leave for 1 and 0, become :data:`LARGEST_LOGIT` and :data:`SMALLEST_LOGIT`, with a
-    :class:`UserNote`.
+    The arrays have the values and the SH degree that the file holds. They come by the names of the
+    fields of :class:`drgs.gaussians.parameters.Gaussians`, whose ``load`` calls this; ``smoothing``
+    is missing where the file has none. Properties are found by name, in any order and of any
+    numeric type; others are ignored. Infinite logits, which formats with opacities of 8 bits leave
+    for 1 and 0, become :data:`LARGEST_LOGIT` and :data:`SMALLEST_LOGIT`, with a :class:`UserNote`.
+    What the header says is not checked: its names and limits are not known here.
 
     Raises :class:`UserError` naming the file and what it lacks: it must be whole, hold at least
     one row, and otherwise nothing but finite numbers.
     """
-    vertex = _read_vertices(path)
+    vertex, statements = _read_vertices(path)
     num_rest = sum(name.startswith("f_rest_") for name in vertex.dtype.names)
     if num_rest not in NUM_REST:
         raise UserError(
@@ -83,15 +96,22 @@ def read_gaussians(path: str | Path) -> dict[str, np.ndarray]:
     if set(SMOOTHING) <= set(vertex.dtype.names):
         _require(path, vertex, SMOOTHING, "Gaussians")
         gaussians["smoothing"] = _columns(vertex, SMOOTHING)[:, 0]
-    return gaussians
+    return gaussians, statements
 
 
-def write_gaussians(path: str | Path, gaussians: Mapping[str, np.ndarray]) -> None:
+def write_gaussians(
+    path: str | Path,
+    gaussians: Mapping[str, np.ndarray],
+    rendered_with: Mapping[str, Scalar] | None = None,
+) -> None:
     """Write Gaussians as the 3DGS reference does, binary little-endian, atomically.
 
-    gaussians: numpy arrays by the names that :func:`read_gaussians` gives. Equal Gaussians give
-    equal bytes.
+    gaussians: numpy arrays by the names that :func:`read_gaussians` gives; rendered_with: for the
+    header, None: nothing is said. Equal Gaussians give equal bytes.
+
+    Raises ValueError for what :data:`STATEMENT` cannot say.
     """
+    comments = [_statement(name, value) for name, value in (rendered_with or {}).items()]
     g = gaussians
     num, num_rest = len(g["means"]), 3 * g["shN"].shape[1]
     names = (*POSITION, *NORMAL, *SH0, *_rest(num_rest), *OPACITY, *SCALE, *ROTATION)
@@ -111,7 +131,49 @@ def write_gaussians(path: str | Path, gaussians: Mapping[str, np.ndarray]) -> No
     ).astype("<f4")
     vertex = rows.view([(name, "<f4") for name in names]).reshape(num)
     with atomic_path(path) as temporary:
-        PlyData([PlyElement.describe(vertex, "vertex")], byte_order="<").write(str(temporary))
+        elements = [PlyElement.describe(vertex, "vertex")]
+        PlyData(elements, byte_order="<", comments=comments).write(str(temporary))
+
+
+def _statement(name: str, value: Scalar) -> str:
+    """The comment that says it."""
+    comment = f"drgs {name} {str(value).lower() if isinstance(value, bool) else value}"
+    if STATEMENT.fullmatch(comment) is None:
+        raise ValueError(
+            f"write_gaussians(): rendered_with must be names and values of one word, got {name!r}: "
+            f"{value!r}"
+        )
+    return comment
+
+
+def _statements(path: str | Path, lines: list[bytes]) -> dict[str, Scalar]:
+    """What the comments of a header say; lines: of the header."""
+    found: dict[str, str] = {}
+    for line in lines:
+        match = STATEMENT.fullmatch(
+            line.decode("ascii", "replace").removeprefix("comment ").strip()
+        )
+        if match is None or not line.startswith(b"comment "):
+            continue
+        name, text = match.groups()
+        if found.setdefault(name, text) != text:
+            raise UserError(
+                f"{path}: the header's comments must give {name} once, got {found[name]} and "
+                f"{text}; remove one of the lines"
+            )
+    return {name: _scalar(text) for name, text in found.items()}
+
+
+def _scalar(text: str) -> Scalar:
+    """A truth value or a number, if ``text`` is one."""
+    if text in ("true", "false"):
+        return text == "true"
+    for kind in (int, float):
+        try:
+            return kind(text)
+        except ValueError:
+            continue
+    return text
 
 
 def read_points(path: str | Path) -> tuple[np.ndarray, np.ndarray | None]:
@@ -121,7 +183,7 @@ def read_points(path: str | Path) -> tuple[np.ndarray, np.ndarray | None]:
 
     Raises :class:`UserError` naming the file and what it lacks, as :func:`read_gaussians` does.
     """
-    vertex = _read_vertices(path)
+    vertex, _ = _read_vertices(path)
     _require(path, vertex, POSITION, "points")
     positions = _columns(vertex, POSITION)
     if not set(COLOR) <= set(vertex.dtype.names):
@@ -141,12 +203,16 @@ def read_points(path: str | Path) -> tuple[np.ndarray, np.ndarray | None]:
     return positions, colors
 
 
-def _read_vertices(path: str | Path) -> np.ndarray:
-    """The rows of element ``vertex``, a structured array of numbers; at least one."""
+def _read_vertices(path: str | Path) -> tuple[np.ndarray, dict[str, Scalar]]:
+    """The rows of element ``vertex``, at least one, and what the header's comments say.
+
+    The rows are a structured array of numbers.
+    """
     try:
         with open_regular(path) as file:
             layout = _read_layout(path, file)
-            return _text_rows(path, file, layout) if layout.text else _rows(path, file, layout)
+            read = _text_rows if layout.text else _rows
+            return read(path, file, layout), layout.statements
     except UserError:
         raise
     except OSError as error:
@@ -162,6 +228,7 @@ class _Layout:
 
     elements: tuple[PlyElement, ...]
     counts: tuple[int, ...]
+    statements: dict[str, Scalar]
     text: bool
     byte_order: str  # NumPy's: < or >
     start: int  # byte: end of the header
@@ -205,7 +272,8 @@ def _read_layout(path: str | Path, file: IO[bytes]) -> _Layout:
                 )
     ply = PlyData.read(io.BytesIO(b"\n".join([*lines, b"end_header", b""])))
     start = len(header) + len(end)
-    layout = _Layout(ply.elements, tuple(counts), ply.text, ply.byte_order, start, size)
+    said = _statements(path, lines)
+    layout = _Layout(ply.elements, tuple(counts), said, ply.text, ply.byte_order, start, size)
     _check_layout(path, layout)
     return layout
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Protocol
 
@@ -59,8 +59,11 @@ def iterations(trainer: Trainer, history: History, length: Length) -> Iterator[I
 def as_saved(gaussians: Gaussians, trainer: Trainer) -> Gaussians:
     """What ``point_cloud.ply`` holds: with ``output.bake_smoothing``, the filter in the Gaussians.
 
-    gaussians: what ``trainer.gaussians()`` gave.
+    Its header says which approximations are not the default. gaussians: what
+    ``trainer.gaussians()`` gave.
     """
+    others = trainer.config.model.approximations.others_than_default
+    gaussians = replace(gaussians, rendered_with=others or None)
     if not trainer.config.output.bake_smoothing:
         return gaussians
     from drgs.effects.smoothing import baked

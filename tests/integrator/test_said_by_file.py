@@ -1,0 +1,102 @@
+"""The plugin renders Gaussians as their file says, unless a property says otherwise."""
+
+from dataclasses import replace
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from support.views import VIEWS, Scene, image_of, tensors
+
+from drgs.core.errors import UserError
+from drgs.gaussians.parameters import Gaussians
+
+SAID = {"antialiased": True, "low_pass": 0.1}
+SCENE = Scene()
+
+
+@pytest.fixture(autouse=True)
+def variant():
+    mi.set_variant("llvm_ad_rgb")
+
+
+@pytest.fixture
+def file(tmp_path):
+    """Of Gaussians that are made for SAID."""
+    return saved(tmp_path / "model.ply", SAID)
+
+
+def saved(path, said):
+    fields = {k: np.array(v) for k, v in tensors(SCENE.gaussians).items()}
+    replace(Gaussians(**fields), rendered_with=said).save(path)
+    return path
+
+
+def scene_of(gaussians, **settings):
+    """With the given source of the Gaussians: a file's name, or tensors."""
+    integrator = {"type": "splats", "near": 0.2, **gaussians, **settings}
+    return mi.load_dict({"type": "scene", "integrator": integrator, "sensor": SCENE.view.sensor()})
+
+
+def test_a_file_is_rendered_as_its_header_says(file):
+    by_file = image_of(scene_of({"filename": str(file)}))
+    given = image_of(scene_of(tensors(SCENE.gaussians), **SAID))
+    plain = image_of(scene_of(tensors(SCENE.gaussians)))
+    assert np.array_equal(by_file, given) and not np.array_equal(by_file, plain)
+
+
+def test_a_property_wins_and_leaves_the_others_as_the_file_says(file):
+    by_file = image_of(scene_of({"filename": str(file)}, low_pass=0.3))
+    given = image_of(scene_of(tensors(SCENE.gaussians), antialiased=True, low_pass=0.3))
+    assert np.array_equal(by_file, given)
+    integrator = scene_of({"filename": str(file)}, low_pass=0.3).integrator()
+    assert integrator.said_by_file == ("antialiased",)
+
+
+def test_the_default_can_be_asked_for(file):
+    by_file = image_of(scene_of({"filename": str(file)}, low_pass=0.3, antialiased=False))
+    assert np.array_equal(by_file, image_of(scene_of(tensors(SCENE.gaussians))))
+
+
+def test_gaussians_that_are_moved_are_rendered_as_the_file_says(file):
+    still = mi.ScalarTransform4f().translate([0, 0, 0])
+    integrator = scene_of({"filename": str(file)}, to_world=still).integrator()
+    assert integrator.approximations.others_than_default == SAID
+
+
+def test_the_summary_says_what_the_file_has_decided(file):
+    scene = scene_of({"filename": str(file)})
+    lines = scene.integrator().summary(scene, *scene.sensors()).splitlines()
+    assert (
+        "  antialiasing: opacities compensated for the low-pass filter (as the file says)" in lines
+    )
+    assert "  approximations: low_pass = 0.1 (as the file says)" in lines
+    scene = scene_of({"filename": str(file)}, **SAID)
+    lines = scene.integrator().summary(scene, *scene.sensors()).splitlines()
+    assert "  antialiasing: opacities compensated for the low-pass filter (antialiased)" in lines
+    assert not any("file" in line for line in lines)
+
+
+def test_a_wrong_value_is_refused_unless_a_property_gives_another(tmp_path):
+    file = saved(tmp_path / "model.ply", {"low_pass": -1.0})
+    with pytest.raises((UserError, RuntimeError)) as error:
+        scene_of({"filename": str(file)})
+    assert f"{file}: the header's low_pass must be finite and not negative, got -1.0" in str(
+        error.value
+    )
+    scene_of({"filename": str(file)}, low_pass=0.2)
+
+
+def test_shapes_of_gaussians_ignore_the_header(file):
+    """Mitsuba's loader reads the same file, comments and all, and keeps none of them."""
+    shape = {"type": "ellipsoids", "filename": str(file)}
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "integrator": {"type": "splats"},
+            "shape": shape,
+            "sensor": VIEWS[0].sensor(),
+        }
+    )
+    mi.render(scene)
+    assert scene.integrator().gaussians.num_gaussians == 40
+    assert scene.integrator().approximations.others_than_default == {}
