@@ -247,7 +247,8 @@ class OptimizerConfig(Section):
     means_lr_aims: list[RateAim] = Field(
         default_factory=list,
         description="When the means' rate is to be the last one, as a plan was revised: a list of "
-        "{after: iteration, end: iteration}; empty: at the last iteration.",
+        "{after: iteration, end: iteration}; empty: at the last iteration. It falls when pictures "
+        "are no longer coarse.",
     )
     sh0_lr: Rate = Field(2.5e-3, ge=0, description="Degree-0 colour coefficients.")
     shN_lr: Rate = Field(1.25e-4, ge=0, description="Colour coefficients of higher degrees.")  # noqa: N815
@@ -459,13 +460,9 @@ class FitConfig(Section):
                 )
         aims = optimizer.means_lr_aims
         starts = [aim.after for aim in aims]
-        if (
-            starts != sorted(set(starts))
-            or starts[:1] not in ([], [0])
-            or any(aim.end <= aim.after for aim in aims)
-        ):
+        if starts != sorted(set(starts)) or any(aim.end <= aim.after for aim in aims):
             raise ValueError(
-                "optimizer.means_lr_aims must begin after iteration 0, with growing after < end, "
+                "optimizer.means_lr_aims must have growing after < end, "
                 f"got {', '.join(f'{{after: {aim.after}, end: {aim.end}}}' for aim in aims)}"
             )
         if self.loss.window % 2 == 0:

@@ -15,7 +15,7 @@ class ExponentialDecay:
 
     rate(i) = initial^(1 - s) final^s with s = i / n clamped to [0, 1]: the reference 3DGS schedule
     of the means. n may be revised on the way: each of ``aims``, (after, end), spreads what is left
-    of s at iteration ``after`` until ``end``. The first begins after iteration 0.
+    of s at iteration ``after`` until ``end``.
     """
 
     initial: float
@@ -91,7 +91,28 @@ def learning_rates(config: OptimizerConfig, extent: float) -> dict[str, float]:
 def rate_aims(config: FitConfig) -> list[tuple[int, int]]:
     """(after, end) of the means' rate: see :class:`drgs.training.rates.ExponentialDecay`."""
     aims = [(aim.after, aim.end) for aim in config.optimizer.means_lr_aims]
-    return aims or [(0, config.iterations)]
+    return aims or [aim_until(config, 0, config.iterations)]
+
+
+def aim_until(config: FitConfig, after: int, end: int) -> tuple[int, int]:
+    """What a plan heads for that is made, or revised, after an iteration: (after, end).
+
+    Rates do not fall as long as pictures are coarse, where means have a long way to go
+    (DashGaussian, Chen et al. 2025).
+    """
+    coarse_until = config.coarse[-1].until if config.coarse else 0
+    return max(after, min(coarse_until, end - 1)), end
+
+
+def revised_aims(config: FitConfig, now: int, iterations: int) -> list[tuple[int, int]]:
+    """Those of a plan that ends after ``iterations``, where ``now`` of them are done.
+
+    What has begun stays.
+    """
+    begun = [(after, end) for after, end in rate_aims(config) if after < now]
+    if now < iterations:
+        begun.append(aim_until(config, now, iterations))
+    return begun or rate_aims(config)
 
 
 def means_rate(config: FitConfig, extent: float) -> ExponentialDecay:

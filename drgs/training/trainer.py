@@ -36,7 +36,7 @@ from drgs.training.optimizer import (
     pending_gradients,
     restore_optimizer,
 )
-from drgs.training.rates import learning_rates, rate_aims, rates_over_time
+from drgs.training.rates import learning_rates, rates_over_time, revised_aims
 from drgs.training.stages import KEPT_BYTES, Stage, bytes_on_device, make_stages, view_of
 from drgs.training.state_checks import DENSITY
 from drgs.training.views import TrainingView
@@ -230,9 +230,7 @@ class Trainer:
                 f"Trainer.replan(): densify.stop cannot change from {config.densify.stop} to "
                 f"{densify_stop} after iteration {now}"
             )
-        aims = [(after, end) for after, end in rate_aims(config) if after < now or after == 0]
-        if 0 < now < iterations:
-            aims.append((now, iterations))
+        aims = revised_aims(config, now, iterations)
         changes = {
             "iterations": iterations,
             "densify.stop": densify_stop,

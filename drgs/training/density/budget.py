@@ -21,7 +21,7 @@ Iterations are counted from 1.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -30,6 +30,7 @@ import numpy as np
 from scipy.special import expit, logit
 
 from drgs.config.density import DensifyConfig
+from drgs.config.schema import CoarseStage
 from drgs.core.arrays import from_host, types_of
 from drgs.core.errors import UserError
 from drgs.gaussians.quaternions import quat_to_rotation
@@ -53,6 +54,7 @@ class GrowthToNumber(DensityStrategy):
     """Splits those that see most of the errors, as many as there is room for."""
 
     config: DensifyConfig
+    coarse: Sequence[CoarseStage] = ()
     errors: Any = None  # Float (N,): sum over views of s; None until it begins
     first: int = 0  # Gaussians at the start
 
@@ -111,10 +113,16 @@ class GrowthToNumber(DensityStrategy):
         return min(self._uncapped_goal(iteration), max(self.config.max_gaussians, self.first))
 
     def _uncapped_goal(self, iteration: int) -> int:
-        """N_0 + (N - N_0) sqrt(u), where u rises from 0 at ``start`` to 1 at ``stop``."""
+        """N_0 + (N - N_0) sqrt(u) / r^(2 - u), where u rises from 0 at ``start`` to 1 at ``stop``.
+
+        r: what the pictures' sizes are divided by: coarse pictures need fewer (DashGaussian, Chen
+        et al. 2025).
+        """
         config = self.config
         u = (iteration - config.start) / (config.stop - config.start)
-        return self.first + round((self._final - self.first) * math.sqrt(min(max(u, 0), 1)))
+        u = min(max(u, 0), 1)
+        r = next((stage.factor for stage in self.coarse if iteration <= stage.until), 1)
+        return self.first + round((self._final - self.first) * math.sqrt(u) / r ** (2 - u))
 
     @property
     def _final(self) -> int:

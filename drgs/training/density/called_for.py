@@ -17,7 +17,7 @@ def density_strategy(config: FitConfig, white_background: bool = False) -> Densi
     if config.densify.strategy == "budget":
         from drgs.training.density.budget import GrowthToNumber
 
-        return GrowthToNumber(config.densify)
+        return GrowthToNumber(config.densify, config.coarse)
     from drgs.training.density.adc import AdaptiveDensityControl
 
     return AdaptiveDensityControl(config.densify, white_background)

@@ -182,6 +182,23 @@ def test_a_fit_grows_along_the_curve_and_is_resumed_to_the_same_bytes(variant):
         assert getattr(got, name).tobytes() == getattr(expected, name).tobytes(), name
 
 
+def test_coarse_pictures_have_fewer_gaussians_and_the_means_rate_waits_for_their_end(variant):
+    coarse = [{"until": 9, "factor": 4}, {"until": 17, "factor": 2}]
+    trainer, counts, rates = make_trainer(densify=GROWING, coarse=coarse), [], []
+    for _ in range(50):
+        report = trainer.step()
+        counts.append(report.num_gaussians)
+        rates.append(report.means_lr)
+    expected = []
+    for i, r in ((8, 4), (12, 2), (16, 2), (20, 1), (24, 1)):
+        u = (i - 4) / 20
+        expected.append(40 + 30 * math.sqrt(u) / r ** (2 - u))
+    assert counts[7:24:4] == pytest.approx(expected, abs=1)
+    first = 1.6e-4 * trainer.extent
+    assert rates[:17] == pytest.approx([first] * 17)
+    assert rates[17:] == pytest.approx([first * 100 ** (-k / 33) for k in range(1, 34)])
+
+
 def test_the_number_follows_from_the_pictures_where_it_is_not_given(variant):
     trainer = make_trainer(densify={"strategy": "budget"})
     assert trainer.config.densify.budget.gaussians == round(250 * math.sqrt(20 * 16))
