@@ -6,6 +6,7 @@ result on the test views and writes the output folder:
 - ``point_cloud.ply``: the Gaussians, in the layout of the 3DGS reference implementation
 - ``metrics.json``: quality on the test views, time, population, versions, machine, command
 - ``history.csv``: loss, PSNR, population and rate over the iterations, now and then test PSNR
+- ``density.csv``: what was added to the population and removed from it, where anything was
 - ``renders/<split>/*.png``: the test views as fitted
 - ``side_by_side/<split>/*.png``: fitted, photograph and difference
 - ``curves.png``, ``orbit.webp``, ``orbit.gif``
@@ -57,6 +58,7 @@ from drgs.results.files import (
     BUDGET_PLAN,
     CHECKPOINT,
     CONFIG,
+    DENSITY,
     GAUSSIANS,
     HISTORY,
     METRICS,
@@ -97,7 +99,7 @@ from drgs.training.checkpoint import (
     save_checkpoint,
 )
 from drgs.training.finite_checks import NonFiniteError
-from drgs.training.history import History, write_history
+from drgs.training.history import History, write_density, write_history
 from drgs.training.loop import Length, as_saved, iterations
 from drgs.training.quality import measure, measured_views, measurement_is_due
 from drgs.training.summary import summary_of_fit
@@ -168,12 +170,15 @@ class Run:
         check_fits(out, checkpoint, trainer.state())
         trainer.restore(checkpoint.trainer)
         print(f"continues at iteration {trainer.iteration}")
-        return Run(trainer, History.from_array(checkpoint.history, checkpoint.wall_s), data, out)
+        history = History.from_array(checkpoint.history, checkpoint.wall_s, checkpoint.density)
+        return Run(trainer, history, data, out)
 
     def save(self) -> None:
         """Write the checkpoint."""
-        state, rows, wall_s = self.trainer.state(), self.history.as_array(), self.history.wall_s
-        save_checkpoint(self.out, self.trainer.config, Checkpoint(state, rows, wall_s, self.data))
+        state, history = self.trainer.state(), self.history
+        rows, changes = history.as_array(), history.density_array()
+        checkpoint = Checkpoint(state, rows, history.wall_s, self.data, changes)
+        save_checkpoint(self.out, self.trainer.config, checkpoint)
 
 
 def run(args: argparse.Namespace) -> None:
@@ -311,13 +316,14 @@ def fit_and_write(
     for effect in trainer.effects:
         effect.write(out, dataset.train)
     write_history(out / HISTORY, log.rows)
+    write_density(out / DENSITY, log.density)
     write_views(out / VIEWS, dataset.train)
     config, render = trainer.config, trainer.pictures
     write_run_config(out, config)
     scores = write_pictures(out, dataset, render, config.output.save_renders)
     quality = mean_of(scores)
     metrics = summarize(config, dataset, gaussians.num_gaussians, wall_s, quality, command)
-    write_results(out, dataset, trainer.scene, gaussians, render, scores, log.rows, metrics)
+    write_results(out, dataset, trainer.scene, gaussians, render, scores, log, metrics)
     with atomic_path(out / METRICS) as temporary:
         temporary.write_text(json.dumps(metrics, indent=2) + "\n")
     remove_checkpoint(out)

@@ -1,15 +1,19 @@
-"""Curves of a fit: loss, PSNR, population and rate over the iterations, test PSNR over time."""
+"""Curves of a fit: loss, PSNR, population and rate over the iterations, test PSNR over time.
+
+The panel of the population also shows how many Gaussians were added and removed so far.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
 from drgs.io.figures import new_figure, write_figure
+from drgs.results.population import DensityChange
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -54,7 +58,19 @@ class CurvePoint(Protocol):
         """Mean of some test views, dB; None where it was not measured."""
 
 
-def write_curves(path: Path, history: Sequence[CurvePoint]) -> None:
+class FitHistory(Protocol):
+    """What a fit has written down."""
+
+    @property
+    def rows(self) -> Sequence[CurvePoint]:
+        """Of ``history.csv``."""
+
+    @property
+    def density(self) -> Sequence[DensityChange]:
+        """Of ``density.csv``."""
+
+
+def write_curves(path: Path, history: FitHistory) -> None:
     """Write a picture of all curves."""
     write_figure(path, draw_curves(history, LIGHT))
 
@@ -68,12 +84,27 @@ class Theme:
     faint: str
     raw: str  # single iterations
     line: str
+    others: tuple[str, ...]  # further lines of a panel
 
 
-LIGHT = Theme(paper="#ffffff", ink="#1d2330", faint="#e3e6ec", raw="#b9cdf0", line="#1f5fd0")
+LIGHT = Theme(
+    paper="#ffffff",
+    ink="#1d2330",
+    faint="#e3e6ec",
+    raw="#b9cdf0",
+    line="#1f5fd0",
+    others=("#2b8a57", "#c2543a", "#8b5cb8"),
+)
 
 
-DARK = Theme(paper="#1a1e27", ink="#d8dde8", faint="#333a48", raw="#34507f", line="#7fb0ff")
+DARK = Theme(
+    paper="#1a1e27",
+    ink="#d8dde8",
+    faint="#333a48",
+    raw="#34507f",
+    line="#7fb0ff",
+    others=("#6fca98", "#f0937b", "#c3a2ea"),
+)
 
 
 THEMES = (LIGHT, DARK)
@@ -92,32 +123,47 @@ class Panel:
     noisy: bool = False  # drawn with its running mean
     marked: bool = False  # with a dot for each value, of which there are few
     thousands: bool = False  # y's labels are whole numbers, with separators
+    others: Mapping[str, tuple[np.ndarray, np.ndarray]] = field(default_factory=dict)  # x and y
 
 
-def panels_of(history: Sequence[CurvePoint]) -> list[Panel]:
+def panels_of(history: FitHistory) -> list[Panel]:
     """The six curves."""
 
     def column(name: str) -> np.ndarray:
-        return np.array([getattr(row, name) for row in history], np.float64)
+        return np.array([getattr(row, name) for row in history.rows], np.float64)
 
     x, wall_s = column("iteration"), column("wall_s")
     # Two rows may carry one time: the clock's resolution, or a run that was resumed.
     speed = np.diff(x) / np.maximum(np.diff(wall_s), 1e-3)
-    measured = [row for row in history if row.test_psnr is not None]
+    measured = [row for row in history.rows if row.test_psnr is not None]
     minutes = np.array([row.wall_s / 60 for row in measured])
     test_psnr = np.array([row.test_psnr for row in measured])
     over_time = {"x_label": "time [min]", "marked": True}
+    counted = {"bottom": 0, "thousands": True, "others": _changes_so_far(history.density)}
     return [
         Panel("Loss", x, column("loss"), scale="log", noisy=True),
         Panel("PSNR of the training view [dB]", x, column("psnr"), noisy=True),
-        Panel("Gaussians", x, column("num_gaussians"), bottom=0, thousands=True),
+        Panel("Gaussians", x, column("num_gaussians"), **counted),
         Panel("Learning rate of the means", x, column("means_lr"), scale="log"),
         Panel("Iterations per second", x[1:], speed, bottom=0, noisy=True),
         Panel("PSNR of test views [dB]", minutes, test_psnr, **over_time),
     ]
 
 
-def draw_curves(history: Sequence[CurvePoint], theme: Theme) -> Figure:
+def _changes_so_far(
+    changes: Sequence[DensityChange],
+) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """By what was done, iterations and sums until then; without what was never done."""
+    x = np.array([change.iteration for change in changes], np.float64)
+    columns = {"added": "num_added", "removed": "pruned", "relocated": "relocated"}
+    sums = {
+        name: np.cumsum([getattr(change, key) for change in changes])
+        for name, key in columns.items()
+    }
+    return {name: (x, y) for name, y in sums.items() if len(y) and y[-1] > 0}
+
+
+def draw_curves(history: FitHistory, theme: Theme) -> Figure:
     """A matplotlib figure of all panels."""
     figure = new_figure(11, 6, paper=theme.paper)
     figure.get_layout_engine().set(w_pad=0.1, h_pad=0.1)
@@ -140,6 +186,10 @@ def _draw(axis: Axes, panel: Panel, theme: Theme) -> None:
     if panel.noisy:
         axis.plot(panel.x, y, color=theme.raw, linewidth=0.7)
         y = _running_mean(y)
+    for (name, line), color in zip(panel.others.items(), theme.others, strict=False):
+        axis.plot(*line, color=color, linewidth=1.1, label=f"{name} so far")
+    if panel.others:
+        axis.legend(fontsize=8, frameon=False, labelcolor=theme.ink)
     marker = {"marker": "o", "markersize": 3.5} if panel.marked else {}
     axis.plot(panel.x, y, color=theme.line, linewidth=1.7, **marker)
     if panel.bottom is not None:

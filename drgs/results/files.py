@@ -10,6 +10,9 @@ CHECKPOINT = "checkpoint.npz"
 
 GAUSSIANS = "point_cloud.ply"
 HISTORY = "history.csv"
+DENSITY = "density.csv"
+"""What changed the population, and how; there is none where nothing did."""
+
 CURVES = "curves.png"
 ORBIT = "orbit.webp"
 ORBIT_GIF = "orbit.gif"
@@ -41,6 +44,7 @@ RESULTS = (
     CHECKPOINT,
     COLORS,
     CURVES,
+    DENSITY,
     HISTORY,
     METRICS,
     ORBIT_GIF,

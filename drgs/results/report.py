@@ -32,9 +32,10 @@ from drgs.gaussians.parameters import Gaussians
 from drgs.integrator.scene import render_views
 from drgs.io.figures import pixels_of
 from drgs.io.pictures import encode, write_animation, write_png
-from drgs.results.curves import THEMES, CurvePoint, Panel, draw_curve, panels_of, write_curves
+from drgs.results.curves import THEMES, FitHistory, Panel, draw_curve, panels_of, write_curves
 from drgs.results.files import CURVES, GAUSSIANS, ORBIT, RENDERS, REPORT, SIDE_BY_SIDE
 from drgs.results.metrics import FitMetrics, psnr, ssim
+from drgs.results.population import story_of
 
 DIFFERENCE_GAIN = 5.0
 """Of difference pictures, 0.5 + gain (fitted - truth): saturates at 10 % of the range."""
@@ -86,13 +87,13 @@ def write_results(
     gaussians: Gaussians,
     render: Render,
     scores: Sequence[Score],
-    history: Sequence[CurvePoint],
+    history: FitHistory,
     metrics: FitMetrics,
 ) -> None:
     """Write ``curves.png``, ``orbit.webp`` and ``.gif``, ``report.html``.
 
     scene: renders ``gaussians``, in display space; scores: of the test views, in their order;
-    history: rows as of ``history.csv``; metrics: as of ``metrics.json``.
+    history: as of ``history.csv`` and ``density.csv``; metrics: as of ``metrics.json``.
     """
     write_curves(out / CURVES, history)
     write_orbit(out / ORBIT, scene, dataset, gaussians)
@@ -151,7 +152,7 @@ def write_report(
     dataset: Dataset,
     render: Render,
     scores: Sequence[Score],
-    history: Sequence[CurvePoint],
+    history: FitHistory,
     metrics: FitMetrics,
     orbit: bytes,
 ) -> None:
@@ -166,7 +167,7 @@ def write_report(
         title=html.escape(title),
         description=html.escape(dataset.description),
         tiles="".join(_tile(*tile) for tile in _headline(metrics)),
-        facts="".join(_row(*fact) for fact in _facts(dataset, metrics)),
+        facts="".join(_row(*fact) for fact in _facts(dataset, metrics, history)),
         split=html.escape(dataset.test_split),
         orbit=_uri("image/webp", orbit),
         still=_data_uri(_first_frame(orbit), lossless=True),
@@ -207,14 +208,16 @@ def _headline(metrics: FitMetrics) -> list[tuple[str, str, str]]:
     ]
 
 
-def _facts(dataset: Dataset, metrics: FitMetrics) -> list[tuple[str, str]]:
+def _facts(dataset: Dataset, metrics: FitMetrics, history: FitHistory) -> list[tuple[str, str]]:
     versions = metrics["versions"]
     names = {"mitsuba": "Mitsuba", "drjit": "Dr.Jit", "numpy": "NumPy", "python": "Python"}
     names["llvm"] = "LLVM"
     speed = metrics["iterations"] / max(metrics["wall_s"], 1e-9)
+    story = story_of(metrics["config"]["densify"]["strategy"], history.density)
     return [
         ("Training views", f"{len(dataset.train)}"),
         ("Test views", f"{len(dataset.test)} (split {dataset.test_split})"),
+        *([] if story is None else [("Population", story)]),
         ("Iterations per second", f"{speed:.1f}"),
         ("Processor", f"{metrics['processor']}, {metrics['threads']} threads"),
         ("Date", f"{datetime.fromisoformat(metrics['date']):%Y-%m-%d %H:%M (UTC%z)}"),

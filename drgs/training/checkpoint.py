@@ -24,7 +24,7 @@ from drgs.core.files import atomic_path, read_arrays, why_refused
 from drgs.data.fingerprint import Fingerprint
 from drgs.results.files import CHECKPOINT, CONFIG
 from drgs.results.folder import load_run_config, write_run_config
-from drgs.training.state_checks import check_history, check_state
+from drgs.training.state_checks import check_density, check_history, check_state
 
 PLACES = ("data.path", "data.source", "init.point_cloud")
 """Values that say where something is: a project that was moved has others. The start point is
@@ -43,6 +43,7 @@ class Checkpoint:
     history: np.ndarray  # (rows, columns) float64: the rows of history.csv
     wall_s: float  # seconds spent on iterations
     data: Fingerprint | None = None  # None: of an earlier version, which kept none
+    density: np.ndarray | None = None  # (changes, columns) int64, of density.csv; None: the same
     config: FitConfig | None = None  # of the file that it was read from
 
 
@@ -58,6 +59,8 @@ def save_checkpoint(folder: Path, config: FitConfig, checkpoint: Checkpoint) -> 
     arrays = {f"trainer.{name}": values for name, values in checkpoint.trainer.items()}
     if checkpoint.data is not None:
         arrays["data"] = np.frombuffer(checkpoint.data.to_bytes(), np.uint8)
+    if checkpoint.density is not None:
+        arrays["density"] = checkpoint.density
     with atomic_path(folder / CHECKPOINT) as temporary:
         np.savez(
             temporary,
@@ -91,11 +94,14 @@ def load_checkpoint(folder: Path, config: FitConfig) -> Checkpoint | None:
         checkpoint = Checkpoint(
             history=arrays.pop("history"),
             wall_s=float(arrays.pop("wall_s")),
+            density=arrays.pop("density", None),
             data=None if data is None else Fingerprint.from_bytes(data.tobytes()),
             config=own,
             trainer=_named_as_now(arrays),
         )
         check_history(checkpoint.history, checkpoint.wall_s)
+        if checkpoint.density is not None:
+            check_density(checkpoint.density)
     except UserError as error:
         raise UserError(f"{error}; {_remedy(path)}") from None
     except (ValueError, KeyError, TypeError, RecursionError) as error:

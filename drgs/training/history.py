@@ -5,12 +5,14 @@ from __future__ import annotations
 import csv
 import math
 import time
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from drgs.core.files import atomic_path
+from drgs.training.density.strategy import DENSITY_COLUMNS, DensityReport
 from drgs.training.trainer import StepReport
 
 
@@ -27,21 +29,37 @@ class HistoryRow:
     test_psnr: float | None = None  # dB, mean of some test views; None: not measured here
 
 
+@dataclass(frozen=True, kw_only=True)
+class DensityRow(DensityReport):
+    """One line of ``density.csv``: what the strategy did after an iteration."""
+
+    iteration: int  # the first is 1
+
+
 class History:
-    """Rows of ``history.csv`` and the time spent, also before an interruption."""
+    """Rows of ``history.csv`` and ``density.csv``, and the time spent.
+
+    Also before an interruption.
+    """
 
     def __init__(self) -> None:
         self.rows: list[HistoryRow] = []
+        self.density: list[DensityRow] = []
         self._before = 0.0
         self._started = time.perf_counter()
 
     @staticmethod
-    def from_array(rows: np.ndarray, wall_s: float) -> History:
-        """What :meth:`as_array` gave; the clock goes on from ``wall_s``.
+    def from_array(rows: np.ndarray, wall_s: float, density: np.ndarray | None = None) -> History:
+        """What :meth:`as_array` and :meth:`density_array` gave; the clock goes on from ``wall_s``.
 
-        Rows of earlier versions have no PSNR of test views, and one column less.
+        Rows of earlier versions have no PSNR of test views, and one column less; density: None in
+        theirs.
         """
         history = History()
+        history.density = [
+            DensityRow(**dict(zip(DENSITY_COLUMNS, map(int, row), strict=True)))
+            for row in (() if density is None else density)
+        ]
         for i, loss, psnr, n, lr, at, *more in rows:
             test_psnr = None if not more or math.isnan(more[0]) else float(more[0])
             history.rows.append(HistoryRow(int(i), loss, psnr, int(n), lr, at, test_psnr))
@@ -52,6 +70,11 @@ class History:
         """(rows, columns) float64; NaN where nothing was measured."""
         columns = len(HistoryRow.__dataclass_fields__)
         return np.array([tuple(vars(r).values()) for r in self.rows], float).reshape(-1, columns)
+
+    def density_array(self) -> np.ndarray:
+        """(changes, columns) int64: the rows of ``density.csv``."""
+        rows = [[getattr(row, name) for name in DENSITY_COLUMNS] for row in self.density]
+        return np.array(rows, np.int64).reshape(-1, len(DENSITY_COLUMNS))
 
     @property
     def wall_s(self) -> float:
@@ -71,6 +94,10 @@ class History:
         self.rows.append(row)
         return row
 
+    def add_density(self, iteration: int, report: DensityReport) -> None:
+        """Write down a change of the population; waits for nothing."""
+        self.density.append(DensityRow(**asdict(report), iteration=iteration))
+
     def add_test_psnr(self, psnr: float, seconds: float) -> None:
         """Note what the last row's Gaussians reach on test views, in dB.
 
@@ -80,10 +107,23 @@ class History:
         self._started += seconds
 
 
-def write_history(path: Path, history: list[HistoryRow]) -> None:
+def write_history(path: Path, history: Sequence[HistoryRow]) -> None:
     """Write ``history.csv``."""
+    rows = [
+        [f"{v:.6g}" if isinstance(v, float) else v for v in vars(row).values()] for row in history
+    ]
+    _write_table(path, HistoryRow.__dataclass_fields__, rows)
+
+
+def write_density(path: Path, changes: Sequence[DensityRow]) -> None:
+    """Write ``density.csv``, or nothing where there are no changes."""
+    if changes:
+        rows = [[getattr(change, name) for name in DENSITY_COLUMNS] for change in changes]
+        _write_table(path, DENSITY_COLUMNS, rows)
+
+
+def _write_table(path: Path, columns: Iterable[str], rows: Iterable[Iterable[object]]) -> None:
     with atomic_path(path) as temporary, temporary.open("w", newline="") as file:
         writer = csv.writer(file)
-        writer.writerow(HistoryRow.__dataclass_fields__)
-        for row in history:
-            writer.writerow([f"{v:.6g}" if isinstance(v, float) else v for v in vars(row).values()])
+        writer.writerow(columns)
+        writer.writerows(rows)

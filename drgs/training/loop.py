@@ -49,6 +49,8 @@ def iterations(trainer: Trainer, history: History, length: Length) -> Iterator[I
     goes_on = length.goes_on(trainer)
     while goes_on:
         report, row = trainer.step(), None
+        if report.density is not None:
+            history.add_density(report.iteration, report.density)
         goes_on = length.goes_on(trainer)
         if not goes_on or report.iteration % trainer.config.output.history_every == 0:
             row = history.add(report)

@@ -12,6 +12,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from drgs.core.errors import listed
+from drgs.training.density.strategy import DENSITY_COLUMNS
 
 MEANS = "means.value"
 """The array that says how many Gaussians there are."""
@@ -64,6 +65,18 @@ def check_history(rows: np.ndarray, wall_s: float) -> None:
         raise ValueError("history must hold finite numbers")
     if not 0 <= wall_s < math.inf:
         raise ValueError(f"wall_s must be a number of seconds, got {wall_s:g}")
+
+
+def check_density(rows: np.ndarray) -> None:
+    """Raise ValueError where these cannot be changes of a population."""
+    columns = len(DENSITY_COLUMNS)
+    if rows.ndim != 2 or rows.shape[1] != columns or rows.dtype != np.int64:
+        raise ValueError(
+            f"density must be rows of {columns} int64 numbers, got shape {rows.shape} of "
+            f"{rows.dtype}"
+        )
+    if (rows < 0).any():
+        raise ValueError("density must hold counts, got a negative number")
 
 
 def _shape(name: str, like: Mapping[str, np.ndarray], num: int) -> tuple[int, ...]:

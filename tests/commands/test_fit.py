@@ -27,7 +27,7 @@ from drgs.reference import splatting as reference
 SIZE = 32
 FIELD_OF_VIEW = 0.7
 OUTPUTS = (
-    *("point_cloud.ply", "metrics.json", "history.csv", "config.yml"),
+    *("point_cloud.ply", "metrics.json", "history.csv", "density.csv", "config.yml"),
     *("curves.png", "orbit.webp", "orbit.gif", "report.html", "views.json"),
 )
 

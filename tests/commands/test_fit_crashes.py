@@ -25,7 +25,15 @@ PLANS = {2: 10, 3: 9, 5: 8}
 LAST = 7
 
 RESULTS = {
-    *("config.yml", "point_cloud.ply", "history.csv", "views.json", "metrics.json", "report.html"),
+    *(
+        "config.yml",
+        "point_cloud.ply",
+        "history.csv",
+        "density.csv",
+        "views.json",
+        "metrics.json",
+        "report.html",
+    ),
     *(f"{kind}/test/r_{i}.png" for kind in ("renders", "side_by_side") for i in range(2)),
 }
 

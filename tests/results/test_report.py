@@ -7,6 +7,7 @@ import re
 from dataclasses import replace
 from functools import partial
 from html.parser import HTMLParser
+from types import SimpleNamespace
 
 import mitsuba as mi
 import numpy as np
@@ -20,7 +21,8 @@ from drgs.data.viewpoints import field_of_view
 from drgs.integrator.scene import make_scene, render_views
 from drgs.results import curves, report
 from drgs.results.metrics import ssim
-from drgs.training.history import HistoryRow
+from drgs.results.population import story_of
+from drgs.training.history import DensityRow, HistoryRow
 
 KINDS = ("still", "moving")
 VOID = {"meta", "link", "img", "source", "br", "input"}
@@ -49,13 +51,22 @@ def scored(images, dataset):
     return lambda views: [by_name[view.name] for view in views], scores
 
 
-def history(count=120):
-    return [
+def history(count=120, changes=()):
+    rows = [
         HistoryRow(
             i, 1 / i, 10 + i / 10, 100 * i, 1e-3 * 0.9**i, 0.5 * i, None if i % 5 else 8 + i / 10
         )
         for i in range(1, count + 1)
     ]
+    return SimpleNamespace(rows=rows, density=changes)
+
+
+CHANGES = [
+    DensityRow(iteration=20, num_gaussians=1500, num_added=600, cloned=400, split=200, pruned=100),
+    DensityRow(iteration=40, num_gaussians=1400, pruned=100, refused=3),
+    DensityRow(iteration=60, num_gaussians=2400, num_added=1010, cloned=10, split=1000, pruned=10),
+]
+"""Of a fit that began with 1000."""
 
 
 def metrics(**data):
@@ -83,7 +94,7 @@ def out(tmp_path_factory, dataset, scene, images):
     render = partial(render_views, scene)
     scores = report.write_pictures(folder, dataset, render, with_renders=False)
     args = dataset, scene, blobs(), render, scores
-    report.write_results(folder, *args, history(), metrics())
+    report.write_results(folder, *args, history(changes=CHANGES), metrics())
     return folder
 
 
@@ -167,15 +178,16 @@ def test_curves_are_drawn(out):
     "rows",
     [
         [],
-        history(1),
-        [replace(row, wall_s=1.0) for row in history(3)],
-        [replace(row, loss=float("nan"), psnr=float("nan")) for row in history(3)],
+        history(1).rows,
+        [replace(row, wall_s=1.0) for row in history(3).rows],
+        [replace(row, loss=float("nan"), psnr=float("nan")) for row in history(3).rows],
     ],
     ids=["empty", "one row", "no time between rows", "diverged"],
 )
 @pytest.mark.filterwarnings("error")
 def test_curves_of_unusual_histories_are_drawn(tmp_path, rows):
-    curves.write_curves(tmp_path / "curves.png", rows)
+    shown = SimpleNamespace(rows=rows, density=())
+    curves.write_curves(tmp_path / "curves.png", shown)
     with Image.open(tmp_path / "curves.png") as image:
         assert image.size[0] > 800
 
@@ -186,6 +198,32 @@ def test_the_panels_are_of_the_history():
     assert panels["Gaussians"].y[:5].tolist() == [100, 200, 300, 400, 500]
     assert panels["Iterations per second"].x.tolist() == list(range(2, 13))
     assert panels["Iterations per second"].y == pytest.approx([2] * 11)
+
+
+def test_the_population_is_shown_with_what_was_added_and_removed_so_far(tmp_path):
+    shown = history(60, CHANGES)
+    (panel,) = (p for p in curves.panels_of(shown) if p.title == "Gaussians")
+    assert set(panel.others) == {"added", "removed"}  # nothing was relocated
+    (x, added), (_, removed) = panel.others["added"], panel.others["removed"]
+    assert x.tolist() == [20, 40, 60]
+    now = [change.num_gaussians for change in CHANGES]
+    assert (1000 + added - removed).tolist() == now
+    relocated = [*CHANGES, DensityRow(iteration=80, num_gaussians=2400, relocated=7)]
+    (panel,) = (p for p in curves.panels_of(history(80, relocated)) if p.title == "Gaussians")
+    assert panel.others["relocated"][1].tolist() == [0, 0, 0, 7]
+    (panel,) = (p for p in curves.panels_of(history(80)) if p.title == "Gaussians")
+    assert not panel.others
+
+
+def test_the_story_names_what_was_done_and_always_what_was_refused():
+    assert story_of("adc", []) is None
+    assert story_of("adc", CHANGES) == (
+        "adc: 1,000 \u2192 2,400 Gaussians; 410 cloned, 1,200 split, 210 pruned, 3 refused"
+    )
+    relocated = [DensityRow(iteration=8, num_gaussians=50, relocated=9)]
+    assert story_of("mcmc", relocated) == (
+        "mcmc: 50 \u2192 50 Gaussians; 9 relocated, 0 pruned, 0 refused"
+    )
 
 
 def test_the_psnr_of_test_views_is_shown_over_the_time():
@@ -309,6 +347,7 @@ def test_the_page_states_the_metrics(page):
         "1 min 15 s", "1,200 iterations", "A <Processor>, 2 threads", "2026-11-23 01:02 (UTC+0100)",
         "drgs fit 'my scene.yml' --data <DIR>", "Seed 7", "drgs 1.2.3, Mitsuba 3.9.1",
         "16.0", "LLVM 19.1.7", "sh_increase_every: 1000", "path: photographs",
+        "Population adc: 1,000 \u2192 2,400 Gaussians",
     ):  # fmt: skip
         assert stated in text, stated
 

@@ -128,6 +128,14 @@ DAMAGE = {
     "history of text": (edit("history", lambda a: a.astype("U")), "history must be rows of"),
     "history of 5 columns": (edit("history", lambda a: a[:, :5]), "history must be rows of"),
     "NaN in the history": (edit("history", lambda a: a * np.nan), "history must hold finite"),
+    "changes that are none": (
+        edit("density", lambda a: a[:, :3]),
+        "density must be rows of 8 int64 numbers",
+    ),
+    "less than no changes": (
+        edit("density", lambda a: np.full((1, a.shape[1]), -1)),
+        "density must hold counts",
+    ),
     "time that is none": (edit("wall_s", lambda a: a * np.nan), "wall_s must be a number of sec"),
     "negative time": (edit("wall_s", lambda a: a * 0 - 1), "wall_s must be a number of seconds"),
     "8 TB": (with_header((10**12,)), "is not as large as its header claims"),

@@ -7,7 +7,8 @@ from support.small_capture import decibels
 from support.small_fits import everything_of, make_trainer, steps, true_dataset
 
 from drgs.training import quality
-from drgs.training.history import History, HistoryRow, write_history
+from drgs.training.density.strategy import DENSITY_COLUMNS, DensityReport
+from drgs.training.history import History, HistoryRow, write_density, write_history
 
 
 def row(iteration, test_psnr=None):
@@ -82,6 +83,23 @@ def test_the_history_is_kept_with_and_without_measurements(tmp_path):
     write_history(tmp_path / "history.csv", history.rows)
     lines = (tmp_path / "history.csv").read_text().splitlines()
     assert [line.split(",")[-1] for line in lines] == ["test_psnr", "", "21.5", "inf"]
+
+
+def test_changes_of_the_population_are_kept(tmp_path):
+    history = History()
+    write_density(tmp_path / "density.csv", history.density)
+    assert not list(tmp_path.iterdir())
+    assert history.density_array().shape == (0, len(DENSITY_COLUMNS))
+    history.add_density(20, DensityReport(7, num_added=4, split=2, pruned=3, refused=1))
+    history.add_density(40, DensityReport(5, relocated=6, pruned=2))
+    again = History.from_array(history.as_array(), 1.0, history.density_array())
+    assert again.density == history.density
+    write_density(tmp_path / "density.csv", again.density)
+    assert (tmp_path / "density.csv").read_text().splitlines() == [
+        "iteration,num_gaussians,num_added,cloned,split,relocated,pruned,refused",
+        "20,7,4,0,2,0,3,1",
+        "40,5,0,0,0,6,2,0",
+    ]
 
 
 def test_the_history_of_an_earlier_version_goes_on():

@@ -11,7 +11,7 @@ Iterations are counted from 1. A strategy is a function of the configuration and
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any, Protocol
 
 import drjit as dr
@@ -32,6 +32,10 @@ class DensityReport:
     relocated: int = 0  # rows that became copies of others
     pruned: int = 0  # rows that were removed, parents of a split not counted
     refused: int = 0  # Gaussians that were to be cloned or split, but there was no room
+
+
+DENSITY_COLUMNS = ("iteration", *(field.name for field in fields(DensityReport)))
+"""Of the table of what all calls did."""
 
 
 @dataclass(frozen=True)

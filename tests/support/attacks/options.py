@@ -102,6 +102,7 @@ FOREIGN = (
     "plan.txt",
     "cameras.json",
     "history.csv",
+    "density.csv",
     "capture.json",
     "points3d.ply",
     "transforms_train.json",
