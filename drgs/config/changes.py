@@ -17,6 +17,8 @@ _COUNTS = (
     "densify.stop",
     "densify.adc.reset_every",
     "densify.adc.white_background_reset",
+    "densify.prune.start",
+    "densify.prune.stop",
     "model.sh_increase_every",
     "cameras.start",
 )
@@ -52,6 +54,9 @@ def with_iterations(config: FitConfig, iterations: int) -> FitConfig:
         {"until": scaled(stage.until), "factor": stage.factor} for stage in config.coarse
     ]
     changes["densify.stop"] = max(changes["densify.stop"], changes["densify.start"] + 1)
+    if changes["densify.prune.stop"] is not None:
+        least = max(changes["densify.stop"], changes["densify.prune.start"] or 0) + 1
+        changes["densify.prune.stop"] = max(changes["densify.prune.stop"], least)
     changes["optimizer.means_lr_aims"] = []
     return changed(config, changes)
 

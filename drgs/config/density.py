@@ -74,13 +74,70 @@ EARLIER_KEYS = {f"densify.{name}": f"densify.adc.{name}" for name in AdcConfig.m
 """Names of values in files of earlier versions, which had one strategy, and what they are now."""
 
 
+class McmcConfig(Section):
+    """The strategy ``mcmc`` (Kheradmand et al. 2024): relocation, noise and regularisers."""
+
+    gaussians: Count = Field(
+        100_000, ge=4, description="The population grows to this, and no further."
+    )
+    growth: float = Field(0.05, ge=0, le=10, description="Of the population, at each change.")
+    min_opacity: float = Field(
+        0.005, gt=0, lt=1, description="Gaussians that are not more opaque are moved elsewhere."
+    )
+    noise_lr: float = Field(
+        1e7,
+        ge=0,
+        le=1e12,
+        description="Of the noise on means, times their rate and the covariance in squared scene "
+        "extents: 20 times what it is for covariances in the usual scenes' units.",
+    )
+    opacity_weight: float = Field(
+        0.01, ge=0, le=1e6, description="Of the mean opacity, in the loss."
+    )
+    scale_weight: float = Field(
+        0.05, ge=0, le=1e6, description="Of the mean scale, in scene extents, in the loss."
+    )
+
+
+class PruneConfig(Section):
+    """The population's last phase: down to a number of Gaussians, after any strategy."""
+
+    to: Count | None = Field(
+        None, ge=1, description="Gaussians that are left in the end, at most; null: no such phase."
+    )
+    method: Literal["selection", "importance"] = Field(
+        "selection",
+        description="selection: opacities are lowered until what the photographs do not defend is "
+        "transparent. importance: what contributes least to pictures goes.",
+    )
+    start: Count | None = Field(
+        None,
+        ge=1,
+        description="The phase begins after this iteration, and not before densify.stop. null: "
+        "there.",
+    )
+    stop: Count | None = Field(
+        None,
+        ge=2,
+        description="The iteration of the last change. null: half of what is left for the phase.",
+    )
+    every: Count = Field(50, ge=1, description="Iterations between two changes.")
+    opacity: float = Field(
+        0.005, gt=0, lt=1, description="selection: Gaussians that become less opaque are removed."
+    )
+    opacity_rate: float = Field(
+        4.0, gt=0, le=100, description="selection: factor of optimizer.opacities_lr meanwhile."
+    )
+
+
 class DensifyConfig(Section):
     """How the number of Gaussians changes."""
 
-    strategy: Literal["adc", "budget"] = Field(
+    strategy: Literal["adc", "budget", "mcmc"] = Field(
         "adc",
         description="What changes the population. adc: adaptive density control, as in the paper "
-        "(Kerbl et al. 2023); budget: growth to a number of Gaussians, where errors are.",
+        "(Kerbl et al. 2023); budget: growth to a number of Gaussians, where errors are; mcmc: "
+        "relocation and noise, up to a number of Gaussians (Kheradmand et al. 2024).",
     )
     start: Count | None = Field(
         REFERENCE_START,
@@ -100,6 +157,8 @@ class DensifyConfig(Section):
     )
     adc: AdcConfig = Field(default_factory=AdcConfig)
     budget: BudgetConfig = Field(default_factory=BudgetConfig)
+    mcmc: McmcConfig = Field(default_factory=McmcConfig)
+    prune: PruneConfig = Field(default_factory=PruneConfig)
 
     @model_validator(mode="before")
     @classmethod
@@ -122,6 +181,20 @@ class DensifyConfig(Section):
             **others,
             "adc": {**given, **{name: values[name] for name in earlier}},
         }
+
+    def prune_window(self, iterations: int) -> tuple[int, int]:
+        """The iteration after which the last phase begins, and that of its last change.
+
+        iterations: of the fit. A phase that would begin behind its end does not take place.
+        """
+        start = max(self.stop, self.prune.start or 0)
+        return start, self.prune.stop or (start + iterations + 1) // 2
+
+    def settled_from(self, iterations: int) -> int:
+        """The iteration from which on no row is added or removed; iterations: of the fit."""
+        if self.prune.to is None:
+            return self.stop
+        return max(self.stop, self.prune_window(iterations)[1] + 1)
 
 
 def _keys(values: Any) -> Mapping[str, Any]:

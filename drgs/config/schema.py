@@ -446,11 +446,20 @@ class FitConfig(Section):
                 "model.sh_direction must be mean where cameras.optimise is true (colours along "
                 f"rays are not differentiated in the camera), got {self.model.sh_direction}"
             )
-        if self.init.point_cloud is None and self.init.num_points > densify.max_gaussians:
+        prune = densify.prune
+        if None not in (prune.to, prune.stop) and prune.stop <= densify.prune_window(0)[0]:
             raise ValueError(
-                f"init.num_points must be <= densify.max_gaussians ({densify.max_gaussians}), "
-                f"got {self.init.num_points}"
+                "densify.prune.stop must be > densify.stop and densify.prune.start "
+                f"({densify.prune_window(0)[0]}), got {prune.stop}"
             )
+        caps = {"densify.max_gaussians": densify.max_gaussians}
+        if densify.strategy == "mcmc":
+            caps["densify.mcmc.gaussians"] = densify.mcmc.gaussians
+        for name, cap in caps.items():
+            if self.init.point_cloud is None and self.init.num_points > cap:
+                raise ValueError(
+                    f"init.num_points must be <= {name} ({cap}), got {self.init.num_points}"
+                )
         for before, after in pairwise(self.coarse):
             if not (before.until < after.until and before.factor > after.factor):
                 raise ValueError(

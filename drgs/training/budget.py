@@ -238,7 +238,15 @@ def rehearse(config: FitConfig, dataset: Dataset, gaussians: Gaussians) -> Rehea
     few = replace(dataset, train=views[:REHEARSAL_VIEWS])
     never = config.iterations + WARM_UP + TIMED
     trainer = Trainer(
-        changed(config, {"coarse": [], "densify.start": never, "densify.stop": never + 1}),
+        changed(
+            config,
+            {
+                "coarse": [],
+                "densify.start": never,
+                "densify.stop": never + 1,
+                "densify.prune.to": None,
+            },
+        ),
         few,
         gaussians,
     )

@@ -178,7 +178,8 @@ class Trainer:
         """How many iterations' gradients are put together for a step of the optimizer."""
         config = self.config
         is_late = self.rates.means.progress(self.iteration) > config.optimizer.views_from
-        return config.optimizer.views if is_late and self.iteration >= config.densify.stop else 1
+        is_settled = self.iteration >= config.densify.settled_from(config.iterations)
+        return config.optimizer.views if is_late and is_settled else 1
 
     @property
     def ends_step(self) -> bool:
@@ -234,6 +235,7 @@ class Trainer:
         changes = {
             "iterations": iterations,
             "densify.stop": densify_stop,
+            **_prune_window(config, now, iterations, densify_stop),
             "optimizer.means_lr_aims": [{"after": after, "end": end} for after, end in aims],
         }
         self.config = changed(config, changes)
@@ -319,7 +321,8 @@ class Trainer:
             gradients = last.means2d_grad, last.visible
             weigh = partial(weighted_sums_of_last, self.integrator)
             density.gather(SeenStep(i, width, height, *gradients, image, photograph, weigh))
-        density.perturb(self.population, i, self.means_lr)
+        if self.ends_step:
+            density.perturb(self.population, i, self.means_lr)
         if not density.acts(i):
             return None
         self.check()
@@ -334,6 +337,26 @@ class Trainer:
     def _end_stage(self) -> None:
         if self.iteration == self.stage.until:
             self.stage.end()
+
+
+def _prune_window(
+    config: FitConfig, now: int, iterations: int, densify_stop: int
+) -> dict[str, int | None]:
+    """Where a last phase of pruning is in a fit of other iterations: where it was, if it has begun.
+
+    Else what is given of it keeps its share of the iterations.
+    """
+    prune, names = config.densify.prune, ("densify.prune.start", "densify.prune.stop")
+    window = config.densify.prune_window(config.iterations)
+    if prune.to is None or now > window[0]:
+        return {} if prune.to is None else dict(zip(names, window, strict=True))
+    start, stop = (
+        None if given is None else round(given * iterations / config.iterations)
+        for given in (prune.start, prune.stop)
+    )
+    if stop is not None:
+        stop = max(stop, densify_stop + 1, (start or 0) + 1)
+    return dict(zip(names, (start and max(1, start), stop), strict=True))
 
 
 def _part(state: dict[str, np.ndarray], prefix: str) -> dict[str, np.ndarray]:

@@ -1,0 +1,68 @@
+"""``densify.prune.method: importance``: Gaussians that hardly show are removed.
+
+Part of ``drgs.training.density``; imported where a fit prunes, and by this method.
+
+A Gaussian's score is the sum of its weights T a (3DGS, equation 3) over the pixels of the pictures
+since the last change: how much of what was seen is its colour (as in Mini-Splatting, Fang and Wang
+2024, section 4.2). Those of the lowest scores are removed, a few at a time, so that the others can
+take over what they showed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import drjit as dr
+import numpy as np
+
+from drgs.config.schema import FitConfig
+from drgs.training.density.pruning import PruneSchedule, keep_best
+from drgs.training.density.strategy import DensityReport, DensityStrategy, Population, SeenStep
+
+
+class Importance(DensityStrategy):
+    """Removes Gaussians by what they contribute to pictures."""
+
+    def __init__(self, config: FitConfig) -> None:
+        self.schedule = PruneSchedule.of(config)
+        self.begun_with = 0  # Gaussians, at the first change
+        self.scores: Any = None  # (N,) Float, until it begins None
+
+    def begin(self, population: Population) -> None:
+        """Start with the scores of no pictures."""
+        float_type = type(population.value("means").array)
+        self.scores = dr.zeros(float_type, population.num_rows)
+
+    def gathers(self, iteration: int) -> bool:
+        """Weights count in the iterations of the phase."""
+        return self.schedule.contains(iteration)
+
+    def gather(self, step: SeenStep) -> None:
+        """Add the weights of a picture."""
+        of_all_pixels = dr.opaque(type(self.scores), 1, step.width * step.height)
+        self.scores = self.scores + step.weighted_sums(of_all_pixels)
+        dr.eval(self.scores)
+
+    def acts(self, iteration: int) -> bool:
+        """As the schedule says."""
+        return self.schedule.acts(iteration)
+
+    def act(self, population: Population, iteration: int) -> DensityReport | None:
+        """Remove as many as the schedule says."""
+        before = population.num_rows
+        self.begun_with = self.begun_with or before
+        scores = np.array(self.scores, dtype=np.float64)
+        fewer = min(before, self.schedule.wanted(iteration, self.begun_with))
+        report = keep_best(population, scores, fewer) if fewer < before else None
+        self.begin(population)
+        return report
+
+    def state(self) -> dict[str, np.ndarray]:
+        """The scores so far."""
+        return {"pruned_from": np.array(self.begun_with), "weights": np.array(self.scores)}
+
+    def restore(self, state: Mapping[str, np.ndarray]) -> None:
+        """Continue from :meth:`state`."""
+        self.begun_with = int(state["pruned_from"])
+        self.scores = type(self.scores)(state["weights"])

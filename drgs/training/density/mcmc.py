@@ -1,0 +1,188 @@
+"""The strategy ``mcmc``: relocation, noise and regularisers, up to a number of Gaussians.
+
+Part of ``drgs.training.density``; imported where ``densify.strategy`` is ``mcmc``.
+
+3D Gaussian Splatting as Markov Chain Monte Carlo (Kheradmand et al. 2024): the Gaussians are
+samples of a distribution that the photographs define, and Adam's steps with noise are a walk
+through it. Nothing is cloned or split by a threshold. Gaussians that have become transparent are
+moved to where opaque ones are, such that the picture changes as little as possible.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import numpy as np
+from scipy.special import comb, expit, logit
+
+from drgs.config.density import DensifyConfig
+from drgs.core.arrays import from_host, types_of
+from drgs.core.errors import UserError
+from drgs.gaussians.quaternions import quat_to_rotation
+from drgs.training.density.draws import in_proportion, normals
+from drgs.training.density.strategy import DensityReport, DensityStrategy, Population
+
+MOST_COPIES = 51
+"""In one place, of one Gaussian at a time; as in the paper's code. Binomials up to here are exact
+in double precision."""
+
+MOST_OPAQUE = 1 - 2.0**-23
+"""Of copies: float32's largest opacity that has a logit."""
+
+NOISE_STEEPNESS = 100.0
+"""Noise fades out over some 0.05 of opacity: the paper's equation 8."""
+
+
+@dataclass
+class MarkovChain(DensityStrategy):
+    """Relocates what is transparent, and adds noise to where it is."""
+
+    config: DensifyConfig
+    extent: float = math.nan  # of the scene, world units; known when it begins
+
+    def begin(self, population: Population) -> None:
+        """Know the scene's extent, in which noise and scales are measured."""
+        self.extent = population.extent
+
+    @property
+    def cap(self) -> int:
+        """The number of Gaussians that is never exceeded."""
+        return min(self.config.mcmc.gaussians, self.config.max_gaussians)
+
+    def penalties(self, parameters: Mapping[str, Any]) -> Iterator[Any]:
+        """The paper's equation 10: the mean opacity, and the mean scale in scene extents."""
+        config, logits = self.config.mcmc, parameters["logit_opacities"]
+        log_scales = parameters["log_scales"].array
+        if config.opacity_weight > 0:
+            yield _mean(1 / (1 + dr.exp(-logits)), config.opacity_weight)
+        if config.scale_weight > 0:
+            yield _mean(dr.exp(log_scales), config.scale_weight / self.extent)
+
+    def perturb(self, population: Population, iteration: int, means_lr: float) -> None:
+        """Add noise to the means (the paper's equation 8), which keep their moments.
+
+        Sigma n sigmoid(100 (min_opacity - o)) x strength, n standard normal: along the Gaussian's
+        own axes, and of transparent ones only. The strength is noise_lr times the means' rate;
+        Sigma is in squared scene extents, so that a scene of another size is the same fit.
+        """
+        config = self.config.mcmc
+        if config.noise_lr == 0:
+            return
+        means, quats, log_scales, logits = (
+            population.value(name) for name in ("means", "quats", "log_scales", "logit_opacities")
+        )
+        t = types_of(type(logits))
+        strength = dr.opaque(t.Float, config.noise_lr * means_lr / self.extent**2)
+        iteration, seed = (dr.opaque(t.UInt32, v) for v in (iteration, population.seed))
+        normal = normals(t.Float, dr.width(logits), iteration, seed)
+        opacity = 1 / (1 + dr.exp(-logits))
+        fading = 1 / (1 + dr.exp(NOISE_STEEPNESS * (opacity - config.min_opacity)))
+        rotation = quat_to_rotation(dr.unravel(t.Array4f, quats.array))
+        variances = dr.exp(2 * dr.unravel(t.Array3f, log_scales.array))
+        noise = rotation @ (variances * (rotation.T @ normal))
+        shift = fading * strength * noise
+        mean = dr.unravel(t.Array3f, means.array)
+        moved = dr.select(dr.isfinite(shift), mean + shift, mean)  # scales may have no square
+        population.set_values("means", type(means)(dr.ravel(moved), means.shape))
+
+    def acts(self, iteration: int) -> bool:
+        """Every so many iterations between start and stop."""
+        config = self.config
+        return config.start < iteration < config.stop and iteration % config.every == 0
+
+    def act(self, population: Population, iteration: int) -> DensityReport | None:
+        """Relocate transparent Gaussians, and let the population grow.
+
+        Those that are too transparent are gone, and copies of others take their places, and those
+        of the growth: drawn in proportion to opacity among what remains. Rows end up as: Gaussians
+        that were not drawn, in their order and with their moments; those that were drawn; the
+        copies. The last two begin with moments of zero.
+
+        Raises ``UserError`` if all are too transparent.
+        """
+        config, before = self.config.mcmc, population.num_rows
+        opacities = expit(population.host("logit_opacities"))
+        alive = opacities > config.min_opacity  # a NaN is not
+        num_alive = int(np.count_nonzero(alive))
+        if num_alive == 0:
+            raise UserError(
+                f"iteration {iteration}: no Gaussian is more opaque than densify.mcmc.min_opacity "
+                f"= {config.min_opacity}: do the cameras see the start points?"
+            )
+        aim = max(num_alive, min(self.cap, int(before * (1 + config.growth))))
+        copied = in_proportion(
+            np.where(alive, opacities, 0), aim - num_alive, [population.seed, iteration]
+        )
+        if len(copied):
+            _relocate(population, alive, copied, opacities, config.min_opacity)
+        elif num_alive < before:
+            population.edit(_rows(population, np.flatnonzero(alive)))
+        relocated = min(before - num_alive, len(copied))
+        return DensityReport(
+            num_gaussians=aim,
+            num_added=len(copied) - relocated,
+            relocated=relocated,
+            pruned=before - num_alive - relocated,
+        )
+
+    def most_gaussians(self, start: int, iterations: int) -> int:
+        """The cap, or what is there at the start."""
+        del iterations
+        return max(start, self.cap)
+
+
+def corrected(opacities: np.ndarray, counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Opacities of n coincident Gaussians that look like one, and the factor of their scales.
+
+    opacities: (M,) of the one; counts: (M,) of what there will be, at most ``MOST_COPIES`` of which
+    count. The paper's equation 9: composited, the copies are as opaque at their centre, and along
+    a line through it:
+
+    o' = 1 - (1 - o)^(1/n),   s'/s = o / sum_{j=1..n} C(n, j) (-1)^(j-1) o'^j / sqrt(j)
+
+    (with the paper's sum over i of C(i-1, k) summed up: C(n, k+1)).
+    """
+    counts = np.minimum(counts, MOST_COPIES)
+    opacities = np.minimum(opacities, MOST_OPAQUE)
+    copies = -np.expm1(np.log1p(-opacities) / counts)
+    j = np.arange(1, MOST_COPIES + 1)
+    terms = comb(counts[:, None], j) * np.where(j % 2, 1, -1) / np.sqrt(j)
+    return copies, opacities / (terms * copies[:, None] ** j).sum(axis=1)
+
+
+def _relocate(
+    population: Population,
+    alive: np.ndarray,
+    copied: np.ndarray,
+    opacities: np.ndarray,
+    min_opacity: float,
+) -> None:
+    """Keep what is alive, and copy some of it; copied: row numbers, ascending."""
+    drawn, counts = np.unique(copied, return_counts=True)
+    shared, factors = corrected(opacities[drawn], counts + 1)
+    shared = np.clip(shared, min_opacity, MOST_OPAQUE)
+    alive[drawn] = False
+    rows = population.take(_rows(population, np.append(drawn, copied)))
+    # Of each new row, the place of its source among those that were drawn.
+    source = np.append(np.arange(len(drawn)), np.searchsorted(drawn, copied))
+    t = types_of(type(rows["logit_opacities"]))
+    log_factors = np.repeat(np.log(factors)[source], 3)
+    rows["logit_opacities"] = from_host(t.Float, logit(shared)[source])
+    rows["log_scales"] = rows["log_scales"] + t.TensorXf(
+        from_host(t.Float, log_factors), rows["log_scales"].shape
+    )
+    population.edit(_rows(population, np.flatnonzero(alive)), rows)
+
+
+def _rows(population: Population, numbers: np.ndarray) -> Any:
+    """Row numbers on the device."""
+    return from_host(types_of(type(population.value("means").array)).UInt32, numbers)
+
+
+def _mean(values: Any, weight: float) -> Any:
+    """Times a weight; neither of which is a literal: their number changes."""
+    return dr.sum(values) * dr.opaque(type(values), weight / dr.width(values))

@@ -1,0 +1,276 @@
+"""Relocation, growth, noise and regularisers of the strategy ``mcmc``."""
+
+import math
+
+import drjit as dr
+import numpy as np
+import pytest
+from drjit.llvm.ad import TensorXf64
+from scipy.integrate import quad
+from scipy.special import expit
+from support.populations import EXTENT, make, rows_of
+
+from drgs.config.density import DensifyConfig
+from drgs.core.errors import UserError
+from drgs.gaussians.parameters import PARAMETER_NAMES
+from drgs.reference import splatting as reference
+from drgs.training.density.mcmc import MOST_COPIES, MarkovChain, corrected
+
+SIZE, DEAD = 0.05, 0.001
+
+
+def strategy(max_gaussians=1_000_000, **mcmc):
+    config = DensifyConfig(start=500, stop=15_000, max_gaussians=max_gaussians, mcmc=mcmc)
+    result = MarkovChain(config)
+    result.begin(rows_of(make([SIZE], 0.5)))
+    return result
+
+
+def act(optimizer, iteration=600, seed=0, **config):
+    return strategy(**config).act(rows_of(optimizer, seed), iteration)
+
+
+def values(optimizer):
+    return {name: np.array(dr.detach(value)) for name, value in optimizer.items()}
+
+
+def moments(optimizer, name):
+    value, _, _, (_, m, v, _) = optimizer.state[name]
+    num = value.shape[0]
+    return np.array(m).reshape(num, -1), np.array(v).reshape(num, -1)
+
+
+# ---- what copies look like
+@pytest.mark.parametrize("opacity", [0.006, 0.1, 0.5, 0.99, 0.9999])
+@pytest.mark.parametrize("count", [1, 2, 3, 10, MOST_COPIES])
+def test_copies_composite_to_what_they_are_copies_of(opacity, count):
+    (copies,), (factor,) = corrected(np.array([opacity]), np.array([count]))
+    assert 1 - (1 - copies) ** count == pytest.approx(opacity, rel=1e-12)
+    # Along a line through the centre, x in standard deviations of the copies: as much in all.
+    composited, _ = quad(
+        lambda x: 1 - (1 - copies * math.exp(-x * x / 2)) ** count, -40, 40, epsabs=1e-13, limit=400
+    )
+    assert factor * composited == pytest.approx(opacity * math.sqrt(2 * math.pi), rel=1e-9)
+
+
+def test_more_copies_count_as_many_as_are_exact():
+    for numbers in corrected(np.array([0.7] * 2), np.array([1000, MOST_COPIES])):
+        assert numbers[0] == numbers[1]
+
+
+def test_an_opacity_that_has_no_logit_has_copies():
+    copies, factors = corrected(np.array([1.0]), np.array([2]))
+    assert 0.99 < copies[0] < 1
+    assert 0 < factors[0] < 1
+
+
+# ---- relocation
+def test_transparent_gaussians_become_copies_of_opaque_ones():
+    optimizer = make([SIZE] * 6, [0.5, DEAD, 0.0051, DEAD, 0.6, DEAD], tensor_type=TensorXf64)
+    before, kept_moments = values(optimizer), moments(optimizer, "quats")
+    report = act(optimizer, growth=0.0, seed=1)
+    after = values(optimizer)
+    assert (report.relocated, report.num_added, report.pruned, report.num_gaussians) == (3, 0, 0, 6)
+
+    # Three draws in proportion to 0.5, 0.0051, 0.6.
+    sources = [int(np.argmin(np.abs(before["quats"][:, 0] - q))) for q in after["quats"][:, 0]]
+    counts = np.bincount(sources, minlength=6)
+    assert counts[2] >= 1
+    assert not counts[[1, 3, 5]].any()
+    assert counts.sum() == 6
+    untouched = [row for row in (0, 2, 4) if counts[row] == 1]
+    assert untouched == [2]
+    drawn = [row for row in (0, 2, 4) if counts[row] > 1]
+    assert sources[: len(untouched)] == untouched
+    assert sources[len(untouched) :][: len(drawn)] == drawn
+    for name in ("means", "quats", "sh0", "shN"):
+        np.testing.assert_array_equal(after[name], before[name][sources])
+    opacities = expit(before["logit_opacities"])[sources]
+    expected, factors = corrected(opacities, counts[sources])
+    np.testing.assert_allclose(expit(after["logit_opacities"]), expected, rtol=1e-12)
+    np.testing.assert_allclose(
+        np.exp(after["log_scales"] - before["log_scales"][sources]),
+        np.repeat(factors[:, None], 3, axis=1),
+        rtol=1e-12,
+    )
+    for name in PARAMETER_NAMES:
+        for moment in moments(optimizer, name):
+            assert not moment[len(untouched) :].any()
+    for moment, former in zip(moments(optimizer, "quats"), kept_moments, strict=True):
+        np.testing.assert_array_equal(moment[: len(untouched)], former[untouched])
+
+
+def test_the_picture_before_and_after_is_nearly_the_same():
+    # Seen from far away, whatever the direction: a splat and its copies.
+    camera = reference.Camera(np.eye(3), np.array([0.0, 0, -4]), 40.0, 40.0, 12.0, 12.0, 24, 24)
+    optimizer = make([0.3, 0.3], [DEAD, 0.8], tensor_type=TensorXf64, seed=3)
+
+    def picture():
+        arrays = values(optimizer)
+        gaussians = reference.Gaussians(**arrays | {"means": 0.1 * arrays["means"]})
+        return reference.render(gaussians, camera, np.ones(3)).image
+
+    before = picture()
+    assert act(optimizer, growth=0.0).relocated == 1
+    # As much light in all along lines through the centre; the profile itself is not Gaussian.
+    assert np.abs(before - 1).max() > 0.3
+    assert np.abs(picture() - before).max() < 0.06 * np.abs(before - 1).max()
+
+
+def test_what_is_nearly_transparent_stays_transparent_when_it_is_copied():
+    optimizer = make([SIZE] * 3, [DEAD, DEAD, 0.006])
+    act(optimizer, growth=0.0)
+    np.testing.assert_allclose(expit(values(optimizer)["logit_opacities"]), 0.005, rtol=1e-5)
+
+
+def test_none_that_is_opaque_is_refused_in_words():
+    optimizer = make([SIZE] * 3, DEAD)
+    with pytest.raises(UserError, match="iteration 600: no Gaussian is more opaque than"):
+        act(optimizer)
+
+
+def test_a_value_that_is_no_number_is_moved_as_well():
+    optimizer = make([SIZE] * 3, [0.5, np.nan, 0.5])
+    assert act(optimizer, growth=0.0).relocated == 1
+    assert np.isfinite(values(optimizer)["logit_opacities"]).all()
+
+
+# ---- growth
+def test_the_population_grows_by_a_share_until_its_cap():
+    optimizer = make([SIZE] * 100, 0.5)
+    sizes = [act(optimizer, 100 * i, gaussians=117).num_gaussians for i in range(6, 11)]
+    assert sizes == [105, 110, 115, 117, 117]
+
+
+def test_with_more_than_the_cap_at_the_start_transparent_ones_go():
+    optimizer = make([SIZE] * 10, [0.5] * 6 + [DEAD] * 4)
+    report = act(optimizer, gaussians=8)
+    assert (report.pruned, report.relocated, report.num_added) == (2, 2, 0)
+    assert report.num_gaussians == 8
+    optimizer = make([SIZE] * 10, [0.5] * 9 + [DEAD])
+    report = act(optimizer, gaussians=8)
+    assert (report.pruned, report.relocated, report.num_gaussians) == (1, 0, 9)
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_random_populations_keep_to_both_caps(seed):
+    random = np.random.default_rng(seed)
+    num = int(random.integers(1, 60))
+    opacities = np.where(random.random(num) < 0.4, DEAD, random.uniform(0.01, 0.99, num))
+    opacities[0] = 0.5
+    config = {
+        "gaussians": int(random.integers(4, 70)),
+        "max_gaussians": int(random.integers(4, 70)),
+        "growth": float(random.uniform(0, 0.5)),
+    }
+    optimizer = make([SIZE] * num, opacities, seed=seed)
+    report = act(optimizer, seed=seed, **config)
+    alive = int((opacities > 0.005).sum())
+    cap = min(config["gaussians"], config["max_gaussians"])
+    after = values(optimizer)
+    assert report.num_gaussians == len(after["means"]) <= max(alive, cap)
+    assert report.num_gaussians == num + report.num_added - report.pruned
+    assert report.num_added <= config["growth"] * num
+    assert all(np.isfinite(value).all() for value in after.values())
+    assert strategy(**config).most_gaussians(num, 30_000) >= report.num_gaussians
+
+
+def test_equal_seeds_give_equal_bytes():
+    def population(seed, iteration):
+        optimizer = make([SIZE] * 40, [0.5] * 30 + [DEAD] * 10)
+        act(optimizer, iteration, seed)
+        return b"".join(value.tobytes() for value in values(optimizer).values())
+
+    first = population(3, 600)
+    assert population(3, 600) == first
+    assert population(4, 600) != first
+    assert population(3, 700) != first
+
+
+def test_it_acts_between_start_and_stop():
+    chain = strategy()
+    acting = [i for i in range(1, 20_000) if chain.acts(i)]
+    assert acting == list(range(600, 15_000, 100))
+
+
+# ---- noise
+def test_noise_is_along_the_covariance_of_what_is_transparent():
+    num, rate, seed, iteration = 4000, 1e-3, 7, 12
+    optimizer = make(np.full(num, 0.3), 0.02, tensor_type=TensorXf64)
+    before = values(optimizer)
+    chain = strategy(noise_lr=2e3)
+    chain.perturb(rows_of(optimizer, seed), iteration, rate)
+    after = values(optimizer)
+    for name in PARAMETER_NAMES:
+        assert (name == "means") == (after[name] != before[name]).any()
+    covariances = reference.covariances(before["quats"], before["log_scales"])
+    fading = 1 / (1 + math.exp(100 * (0.02 - 0.005)))
+    factor = 2e3 * rate / EXTENT**2 * fading
+    normal = np.linalg.solve(factor * covariances, (after["means"] - before["means"])[..., None])
+    normal = normal[..., 0]
+    # Five standard deviations of sample means and covariances.
+    assert np.abs(normal.mean(0)).max() < 5 / math.sqrt(num)
+    assert np.abs(np.cov(normal.T) - np.eye(3)).max() < 5 * math.sqrt(2 / num)
+
+
+def test_opaque_gaussians_get_no_noise_and_moments_stay():
+    optimizer = make([SIZE, SIZE], [0.9, 0.001])
+    before, former = values(optimizer)["means"], moments(optimizer, "means")
+    strategy().perturb(rows_of(optimizer), 1, 1e-3)
+    after = values(optimizer)["means"]
+    np.testing.assert_array_equal(after[0], before[0])
+    assert (after[1] != before[1]).all()
+    for moment, expected in zip(moments(optimizer, "means"), former, strict=True):
+        np.testing.assert_array_equal(moment, expected)
+
+
+def test_noise_is_a_function_of_seed_and_iteration():
+    def means(seed, iteration):
+        optimizer = make([SIZE] * 50, 0.001)
+        strategy().perturb(rows_of(optimizer, seed), iteration, 1e-3)
+        return values(optimizer)["means"].tobytes()
+
+    assert means(0, 1) == means(0, 1)
+    assert means(0, 1) != means(0, 2)
+    assert means(0, 1) != means(1, 1)
+
+
+def test_gaussians_of_any_size_stay_numbers():
+    optimizer = make([1e30, SIZE], 0.001)
+    strategy().perturb(rows_of(optimizer), 1, 1e-3)
+    assert np.isfinite(values(optimizer)["means"]).all()
+
+
+def test_noise_compiles_one_kernel():
+    optimizer = make([SIZE] * 5, 0.5)
+    chain, hashes = strategy(), []
+    for iteration in (1, 2, 3):
+        with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
+            dr.kernel_history_clear()
+            chain.perturb(rows_of(optimizer), iteration, 1e-3 / iteration)
+            hashes.append({k["hash"] for k in dr.kernel_history([dr.KernelType.JIT])})
+    assert hashes[0]
+    assert hashes[0] == hashes[1] == hashes[2]
+
+
+# ---- regularisers
+def test_penalties_are_mean_opacity_and_mean_scale():
+    optimizer = make([0.1, 0.2, 0.4], [0.1, 0.5, 0.9], tensor_type=TensorXf64)
+    parameters = dict(optimizer.items())
+    terms = list(strategy(opacity_weight=0.3, scale_weight=0.7).penalties(parameters))
+    before = values(optimizer)
+    opacities, scales = expit(before["logit_opacities"]), np.exp(before["log_scales"])
+    expected = 0.3 * opacities.mean(), 0.7 * scales.mean() / EXTENT
+    np.testing.assert_allclose([float(term[0]) for term in terms], expected, rtol=1e-12)
+
+    dr.set_grad(optimizer, 0)
+    dr.backward(terms[0] + terms[1])
+    slopes = 0.3 * opacities * (1 - opacities) / 3
+    np.testing.assert_allclose(dr.grad(parameters["logit_opacities"]), slopes, rtol=1e-12)
+    d_scales = np.array(dr.grad(parameters["log_scales"]))
+    np.testing.assert_allclose(d_scales, 0.7 * scales / EXTENT / 9, rtol=1e-12)
+
+
+def test_without_weight_there_are_no_terms():
+    parameters = dict(make([SIZE], 0.5).items())
+    assert not list(strategy(opacity_weight=0.0, scale_weight=0.0).penalties(parameters))

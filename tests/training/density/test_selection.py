@@ -1,0 +1,226 @@
+"""The last phase of a population: when it acts, and what it removes."""
+
+import drjit as dr
+import numpy as np
+import pytest
+from drjit.llvm.ad import Float
+from scipy.special import expit, logit
+from support.populations import make, rows_of
+
+from drgs.config.changes import changed, with_iterations
+from drgs.config.schema import FitConfig
+from drgs.gaussians.parameters import PARAMETER_NAMES
+from drgs.training.density.importance import Importance
+from drgs.training.density.pruning import PruneSchedule, keep_best
+from drgs.training.density.selection import LARGEST_PRESSURE, NaturalSelection
+
+SIZE = 0.05
+
+
+def config_of(iterations=4000, grows_until=2000, **prune):
+    return FitConfig(
+        data={"path": "."}, iterations=iterations, densify={"stop": grows_until, "prune": prune}
+    )
+
+
+def values(optimizer):
+    return {name: np.array(dr.detach(value)) for name, value in optimizer.items()}
+
+
+def moments(optimizer, name):
+    _, _, _, (_, m, v, _) = optimizer.state[name]
+    num = len(values(optimizer)[name])
+    return np.array(m).reshape(num, -1), np.array(v).reshape(num, -1)
+
+
+class Step:
+    """What an importance may know of an iteration."""
+
+    width, height = 5, 3
+
+    def __init__(self, weights):
+        self._weights = weights
+
+    def weighted_sums(self, plane):
+        assert (np.array(plane) == np.ones(15)).all()
+        return Float(self._weights)
+
+
+# ---- schedule
+def test_the_phase_follows_growth_and_leaves_half_of_what_is_left():
+    schedule = PruneSchedule.of(config_of(to=100))
+    assert (schedule.start, schedule.stop) == (2000, 3000)
+    reference = PruneSchedule.of(FitConfig(data={"path": "."}, densify={"prune": {"to": 9}}))
+    assert (reference.start, reference.stop) == (15_000, 22_500)
+    acting = [i for i in range(5000) if schedule.acts(i)]
+    assert acting == list(range(2050, 3001, 50))
+
+
+def test_the_phase_can_be_named_and_comes_after_growth_wherever_that_ends():
+    config = config_of(to=100, start=2500, stop=2730, every=100)
+    schedule = PruneSchedule.of(config)
+    assert [i for i in range(5000) if schedule.acts(i)] == [2600, 2700, 2730]
+    later = PruneSchedule.of(changed(config, {"densify.stop": 2600}))
+    assert (later.start, later.stop) == (2600, 2730)
+
+
+def test_each_change_leaves_the_same_share_and_the_last_one_the_number():
+    schedule = PruneSchedule(start=1000, stop=1400, every=100, to=100)
+    wanted = [schedule.wanted(i, 1600) for i in (1100, 1200, 1300, 1400)]
+    assert wanted == [800, 400, 200, 100]
+    assert schedule.wanted(1100, 100) == 100
+    assert schedule.wanted(1100, 50) == 100
+
+
+def test_the_best_stay_in_their_order_with_their_moments():
+    optimizer = make([SIZE] * 6, 0.5)
+    before = values(optimizer)
+    former = {name: moments(optimizer, name) for name in PARAMETER_NAMES}
+    report = keep_best(rows_of(optimizer), np.array([3.0, np.nan, 1.0, 7.0, 1.0, 0.5]), 3)
+    assert (report.pruned, report.num_gaussians) == (3, 3)
+    for name, value in values(optimizer).items():
+        np.testing.assert_array_equal(value, before[name][[0, 2, 3]])
+        for moment, expected in zip(moments(optimizer, name), former[name], strict=True):
+            np.testing.assert_array_equal(moment, expected[[0, 2, 3]])
+
+
+# ---- natural selection
+def test_as_many_fall_below_the_threshold_as_are_to_go():
+    random = np.random.default_rng(0)
+    opacities = random.uniform(0.005, 0.02, 200)
+    optimizer = make([SIZE] * 200, opacities)
+    before = values(optimizer)
+    former = moments(optimizer, "logit_opacities")
+    phase = NaturalSelection(config_of(to=50))
+    report = phase.act(rows_of(optimizer), 2500)
+    left = round(200 * 0.25**0.5)
+    assert (report.pruned, report.num_gaussians) == (200 - left, left)
+    kept = np.sort(np.argsort(-opacities)[:left])
+    after = values(optimizer)
+    np.testing.assert_array_equal(after["means"], before["means"][kept])
+    # All are lowered alike: the most opaque of those that go is at the threshold.
+    pressure = logit(np.sort(opacities)[200 - left - 1]) - logit(0.005)
+    expected = logit(opacities[kept]) - pressure
+    np.testing.assert_allclose(after["logit_opacities"], expected, atol=1e-5)
+    assert expit(after["logit_opacities"]).min() > 0.005
+    for moment, expected in zip(moments(optimizer, "logit_opacities"), former, strict=True):
+        np.testing.assert_array_equal(moment, expected[kept])
+
+
+def test_pressure_has_a_limit_and_then_nobody_goes():
+    optimizer = make([SIZE] * 20, 0.5)
+    phase = NaturalSelection(config_of(to=5))
+    assert phase.act(rows_of(optimizer), 2050) is None
+    logits = values(optimizer)["logit_opacities"]
+    np.testing.assert_allclose(logits, -LARGEST_PRESSURE, rtol=1e-6)
+
+
+def test_in_the_end_exactly_so_many_are_left():
+    opacities = np.linspace(0.3, 0.9, 20)
+    optimizer = make([SIZE] * 20, opacities)
+    before = values(optimizer)["means"]
+    phase = NaturalSelection(config_of(to=5))
+    report = phase.act(rows_of(optimizer), 3000)
+    assert report.num_gaussians == 5
+    np.testing.assert_array_equal(values(optimizer)["means"], before[15:])
+    assert not any(phase.acts(i) for i in range(5000))
+
+
+def test_fewer_than_that_are_left_alone():
+    optimizer = make([SIZE] * 4, 0.5)
+    before = values(optimizer)
+    phase = NaturalSelection(config_of(to=5))
+    assert phase.act(rows_of(optimizer), 2050) is None
+    assert not phase.acts(2100)
+    for name, value in values(optimizer).items():
+        np.testing.assert_array_equal(value, before[name])
+
+
+def test_opacities_are_faster_while_they_are_under_pressure():
+    phase = NaturalSelection(config_of(to=5))
+    optimizer = make([SIZE] * 20, 0.5)
+
+    def factors():
+        return [phase.rate_factors(i)["logit_opacities"] for i in (1000, 2060, 2999, 3001)]
+
+    assert factors() == [1, 1, 1, 1]
+    phase.act(rows_of(optimizer), 2050)
+    assert factors() == [1, 4, 4, 1]
+    phase.act(rows_of(optimizer), 3000)
+    assert factors() == [1, 1, 1, 1]
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_random_populations_end_with_the_number(seed):
+    random = np.random.default_rng(seed)
+    num, to = int(random.integers(4, 120)), int(random.integers(4, 60))
+    method = (NaturalSelection, Importance)[seed % 2]
+    phase = method(config_of(to=to))
+    optimizer = make([SIZE] * num, random.uniform(0.001, 0.99, num), seed=seed)
+    rows, left = rows_of(optimizer), num
+    phase.begin(rows)
+    for iteration in range(2000, 3001):
+        if phase.acts(iteration):
+            if phase.gathers(iteration):
+                phase.gather(Step(random.random(rows.num_rows)))
+            report = phase.act(rows, iteration)
+            assert min(num, to) <= rows.num_rows <= left
+            assert report is None or report.pruned == left - rows.num_rows
+            left = rows.num_rows
+    assert left == min(num, to)
+
+
+# ---- importance
+def test_those_that_show_least_since_the_last_change_go():
+    optimizer = make([SIZE] * 8, 0.5)
+    before = values(optimizer)["means"]
+    phase = Importance(config_of(to=2))
+    rows = rows_of(optimizer)
+    phase.begin(rows)
+    phase.gather(Step([5, 0, 1, 2, 0, 3, 2, 1]))
+    phase.gather(Step([0, 9, 0, 0, 8, 0, 0, 0]))
+    assert phase.act(rows, 2500).num_gaussians == 4
+    np.testing.assert_array_equal(values(optimizer)["means"], before[[0, 1, 4, 5]])
+    phase.gather(Step([0, 1, 0, 2]))
+    assert phase.act(rows, 3000).num_gaussians == 2
+    np.testing.assert_array_equal(values(optimizer)["means"], before[[1, 5]])
+
+
+@pytest.mark.parametrize("method", [NaturalSelection, Importance])
+def test_a_phase_goes_on_from_its_state(method):
+    def begun():
+        phase = method(config_of(to=2))
+        optimizer = make([SIZE] * 8, np.linspace(0.01, 0.6, 8))
+        phase.begin(rows_of(optimizer))
+        if phase.gathers(2050):
+            phase.gather(Step(np.arange(8)))
+        phase.act(rows_of(optimizer), 2050)
+        return phase, optimizer
+
+    first, optimizer = begun()
+    other, again = method(config_of(to=2)), begun()[1]
+    other.begin(rows_of(again))
+    other.restore(first.state())
+    for phase, opt in ((first, optimizer), (other, again)):
+        for iteration in (2500, 2900):
+            if phase.gathers(iteration):
+                phase.gather(Step(np.arange(rows_of(opt).num_rows)[::-1].copy()))
+            phase.act(rows_of(opt), iteration)
+    for name, value in values(optimizer).items():
+        np.testing.assert_array_equal(value, values(again)[name])
+
+
+# ---- the configuration
+def test_a_phase_that_would_end_before_it_begins_is_refused():
+    with pytest.raises(ValueError, match=r"prune\.stop must be > densify\.stop"):
+        config_of(to=5, stop=1999)
+    config_of(stop=1999)  # without a number there is no phase
+
+
+def test_the_phase_keeps_its_share_of_a_longer_fit():
+    config = with_iterations(config_of(to=5, start=2500, stop=3000), 8000)
+    assert config.densify.prune_window(8000) == (5000, 6000)
+    config = with_iterations(config_of(to=5), 8000)
+    assert config.densify.prune_window(8000) == (4000, 6000)
+    assert config.densify.settled_from(8000) == 6001
+    assert config_of().densify.settled_from(4000) == 2000

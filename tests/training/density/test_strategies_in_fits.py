@@ -1,0 +1,124 @@
+"""Small fits by each strategy and last phase: they learn, resume to the same bytes, keep caps."""
+
+import sys
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from support import small_fits as fits
+from support.small_capture import blobs
+
+from drgs.config.schema import FitConfig
+from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
+
+MODULES = {"mcmc", "selection", "importance", "pruning", "phases", "draws"}
+
+MCMC = {
+    "densify__strategy": "mcmc",
+    "densify__mcmc__gaussians": 60,
+    "densify__mcmc__growth": 0.1,
+    "init__num_points": 48,
+}
+
+STRATEGIES = {
+    "mcmc": MCMC,
+    "selection": {"densify__prune__to": 20},
+    "importance": {"densify__prune__to": 20, "densify__prune__method": "importance"},
+    "mcmc and selection": MCMC | {"densify__prune__to": 20},
+}
+
+
+@pytest.fixture(autouse=True)
+def variant():
+    mi.set_variant("llvm_ad_rgb")
+
+
+def many_blobs(count=48) -> Gaussians:
+    """Where a fit begins whose population changes: half of them transparent."""
+    blob = blobs(count, seed=5)
+    logits = np.where(np.arange(count) % 2, -6.0, 0.0).astype(np.float32)
+    return Gaussians(**{n: getattr(blob, n) for n in PARAMETER_NAMES} | {"logit_opacities": logits})
+
+
+def make_trainer(name, **changes):
+    schedule = {
+        "densify__start": 2,
+        "densify__stop": 14,
+        "densify__every": 4,
+        "densify__prune__every": 3,
+        "densify__prune__stop": 24,
+        "iterations": 30,
+    }
+    values = schedule | STRATEGIES[name] | changes
+    return fits.make_trainer(fits.plain_dataset(), many_blobs(), **values)
+
+
+def pauses():
+    """What shows most in one go; the others are slow."""
+    for name in STRATEGIES:
+        is_quick = name in ("mcmc and selection", "importance")
+        yield pytest.param(name, 16, marks=[] if is_quick else pytest.mark.slow)
+        yield pytest.param(name, 5, marks=pytest.mark.slow)
+
+
+@pytest.mark.parametrize(("name", "pause"), list(pauses()))
+def test_a_fit_resumes_to_the_same_bytes_wherever_it_ends(name, pause):
+    whole = make_trainer(name)
+    sizes = []
+    for iteration in range(1, 28):
+        sizes.append(whole.step().num_gaussians)
+        if iteration == pause:
+            state = whole.state()
+    resumed = make_trainer(name)
+    resumed.restore(state)
+    fits.steps(resumed, 27 - pause)
+    expected, got = fits.everything_of(whole), fits.everything_of(resumed)
+    assert got.keys() == expected.keys()
+    assert [key for key in expected if got[key] != expected[key]] == []
+    assert len(set(sizes)) > 2
+    if "mcmc" in name:
+        assert max(sizes) <= 60
+    if name != "mcmc":
+        assert sizes[23:] == [20] * 4
+
+
+@pytest.mark.slow
+def test_mcmc_learns():
+    dataset = fits.plain_dataset()
+    trainer = make_trainer("mcmc", densify__stop=60, densify__every=20, iterations=80)
+    before = fits.test_psnr(trainer, dataset)
+    fits.steps(trainer, 80)
+    assert fits.test_psnr(trainer, dataset) > before + 2
+
+
+def test_a_revised_plan_leaves_a_phase_that_has_begun_where_it_was():
+    trainer = fits.steps(make_trainer("selection", densify__prune__stop=None), 17)
+    assert trainer.config.densify.prune_window(30) == (14, 22)
+    trainer.replan(60, 14)
+    assert trainer.config.densify.prune_window(60) == (14, 22)
+    assert fits.steps(trainer, 5).num_gaussians == 20
+    early = fits.steps(make_trainer("selection", densify__prune__stop=24), 5)
+    early.replan(60, 30)
+    assert early.config.densify.prune_window(60) == (30, 48)
+
+
+def test_what_is_not_chosen_is_not_imported(monkeypatch):
+    from drgs.training.density.called_for import density_strategy
+
+    names = {f"drgs.training.density.{module}" for module in MODULES}
+    for name in names & set(sys.modules):
+        monkeypatch.delitem(sys.modules, name)
+    density_strategy(FitConfig(data={"path": "."}))
+    assert not names & set(sys.modules)
+    density_strategy(FitConfig(data={"path": "."}, densify={"strategy": "mcmc"}))
+    imported = {name.rpartition(".")[2] for name in names & set(sys.modules)}
+    assert imported == {"mcmc", "draws"}
+
+
+def test_steps_of_several_views_come_when_rows_do_not_change_any_more():
+    trainer = make_trainer("selection", optimizer__views=5, optimizer__views_from=0.0)
+    views = []
+    for _ in range(27):
+        trainer.step()
+        views.append(trainer.views_a_step)
+    assert views == [1] * 24 + [5] * 3
