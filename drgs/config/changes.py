@@ -57,7 +57,7 @@ def with_iterations(config: FitConfig, iterations: int) -> FitConfig:
     if changes["densify.prune.stop"] is not None:
         least = max(changes["densify.stop"], changes["densify.prune.start"] or 0) + 1
         changes["densify.prune.stop"] = max(changes["densify.prune.stop"], least)
-    changes["optimizer.means_lr_aims"] = []
+    changes["optimizer.means_lr_aims"] = changes["densify.stop_aims"] = []
     return changed(config, changes)
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field, field_validator, model_validator
 
 from drgs.config.section import Count, Section
 
@@ -130,6 +130,13 @@ class PruneConfig(Section):
     )
 
 
+class StopAim(Section):
+    """Where growth heads for after an iteration."""
+
+    after: Count = Field(ge=0, description="The last iteration that is not affected.")
+    stop: Count = Field(ge=1, description="What densify.stop was then.")
+
+
 class DensifyConfig(Section):
     """How the number of Gaussians changes."""
 
@@ -151,6 +158,11 @@ class DensifyConfig(Section):
         description="It changes, and is reset, only before this iteration. Not given, or null: "
         "15,000, or 5/7 of fewer than 21,000 iterations.",
     )
+    stop_aims: list[StopAim] = Field(
+        default_factory=list,
+        description="What it was in the meantime, as a plan was revised, where growth follows a "
+        "curve to it: a list of {after: iteration, stop: iteration}; empty: what it is.",
+    )
     every: Count = Field(100, ge=1, description="Iterations between two changes.")
     max_gaussians: int = Field(
         1_000_000, ge=4, le=100_000_000, description="Cap that is never exceeded."
@@ -159,6 +171,19 @@ class DensifyConfig(Section):
     budget: BudgetConfig = Field(default_factory=BudgetConfig)
     mcmc: McmcConfig = Field(default_factory=McmcConfig)
     prune: PruneConfig = Field(default_factory=PruneConfig)
+
+    def stop_seen_from(self, iteration: int) -> int:
+        """What ``stop`` was when this iteration was done."""
+        aims = [aim.stop for aim in self.stop_aims if aim.after < iteration]
+        return aims[-1] if aims else self.stop
+
+    @field_validator("stop_aims")
+    @classmethod
+    def _check_order(cls, aims: list[StopAim]) -> list[StopAim]:
+        starts = [aim.after for aim in aims]
+        if starts != sorted(set(starts)) or starts[:1] not in ([], [0]):
+            raise ValueError("must begin after iteration 0, with growing after")
+        return aims
 
     @model_validator(mode="before")
     @classmethod

@@ -6,6 +6,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+from drgs.config.density import StopAim
 from drgs.config.schema import FitConfig, OptimizerConfig
 
 
@@ -113,6 +114,21 @@ def revised_aims(config: FitConfig, now: int, iterations: int) -> list[tuple[int
     if now < iterations:
         begun.append(aim_until(config, now, iterations))
     return begun or rate_aims(config)
+
+
+def revised_stops(config: FitConfig, now: int, stop: int) -> list[dict[str, int]]:
+    """``densify.stop_aims`` of a plan whose growth ends at ``stop``, where ``now`` are done.
+
+    What has begun stays.
+    """
+    densify = config.densify
+    if now == 0:
+        return []
+    begun = densify.stop_aims
+    if stop != densify.stop:
+        begun = [aim for aim in begun if aim.after < now] or [StopAim(after=0, stop=densify.stop)]
+        begun = [*begun, StopAim(after=now, stop=stop)]
+    return [aim.model_dump() for aim in begun]
 
 
 def means_rate(config: FitConfig, extent: float) -> ExponentialDecay:

@@ -36,7 +36,7 @@ from drgs.training.optimizer import (
     pending_gradients,
     restore_optimizer,
 )
-from drgs.training.rates import learning_rates, rates_over_time, revised_aims
+from drgs.training.rates import learning_rates, rates_over_time, revised_aims, revised_stops
 from drgs.training.stages import KEPT_BYTES, Stage, bytes_on_device, make_stages, view_of
 from drgs.training.state_checks import DENSITY
 from drgs.training.views import TrainingView
@@ -236,6 +236,7 @@ class Trainer:
             "iterations": iterations,
             "densify.stop": densify_stop,
             **_prune_window(config, now, iterations, densify_stop),
+            "densify.stop_aims": revised_stops(config, now, densify_stop),
             "optimizer.means_lr_aims": [{"after": after, "end": end} for after, end in aims],
         }
         self.config = changed(config, changes)
@@ -307,8 +308,9 @@ class Trainer:
     def _set_rates(self) -> None:
         """Those of this iteration, and what the strategy does to them."""
         rates = self.rates(self.iteration)
+        at_first = self.rates.others
         for name, factor in self.density.rate_factors(self.iteration).items():
-            rates[name] = factor * rates.get(name, self.rates.others[name])
+            rates[name] = factor * (rates[name] if name in rates else at_first[name])
         there = self.optimizer.state  # shN is not, where the degree is 0
         rates = {PREFIX + name: rate for name, rate in rates.items() if PREFIX + name in there}
         self.optimizer.set_learning_rate(rates)

@@ -140,7 +140,7 @@ def test_a_configuration_is_frozen(load):
         ),
         (
             "optimizer: {means_lr_aims: [{after: 0, end: 9}, {after: 9, end: 9}]}",
-            "optimizer.means_lr_aims must begin after iteration 0, with growing after < end, got "
+            "optimizer.means_lr_aims must have growing after < end, got "
             "{after: 0, end: 9}, {after: 9, end: 9}",
         ),
         (

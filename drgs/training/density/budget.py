@@ -118,9 +118,8 @@ class GrowthToNumber(DensityStrategy):
         r: what the pictures' sizes are divided by: coarse pictures need fewer (DashGaussian, Chen
         et al. 2025).
         """
-        config = self.config
-        u = (iteration - config.start) / (config.stop - config.start)
-        u = min(max(u, 0), 1)
+        start, stop = self.config.start, self.config.stop_seen_from(iteration)
+        u = min(max((iteration - start) / max(stop - start, 1), 0), 1)
         r = next((stage.factor for stage in self.coarse if iteration <= stage.until), 1)
         return self.first + round((self._final - self.first) * math.sqrt(u) / r ** (2 - u))
 

@@ -103,8 +103,8 @@ def leaves() -> list[str]:
     """Keys of the configuration that are no sections."""
     keys = known_keys()
     sections = {key.rpartition(".")[0] for key in keys}
-    of_lists = ("coarse.", "optimizer.means_lr_aims.")
-    lists = {"coarse", "optimizer.means_lr_aims"}
+    lists = {"coarse", "optimizer.means_lr_aims", "densify.stop_aims"}
+    of_lists = tuple(f"{name}." for name in lists)
     return [
         key
         for key in keys

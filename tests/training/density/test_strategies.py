@@ -1,0 +1,267 @@
+"""What the trainer does with any strategy, and strategies that follow one another."""
+
+from dataclasses import dataclass, field
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from support.populations import make, rows_of
+from support.trainers import make_trainer
+
+from drgs.config.density import DensifyConfig
+from drgs.config.schema import FitConfig
+from drgs.training import trainer as trainer_module
+from drgs.training.density.called_for import density_strategy
+from drgs.training.density.phases import Phases
+from drgs.training.density.strategy import DensityReport, DensityStrategy
+from drgs.training.optimizer import set_values
+from drgs.training.rates import revised_stops
+
+
+@pytest.fixture(scope="module", autouse=True)
+def variant():
+    mi.set_variant("llvm_ad_rgb")
+
+
+def trainer_with(monkeypatch, strategy, **changes):
+    monkeypatch.setattr(trainer_module, "density_strategy", lambda config, white: strategy)
+    return make_trainer(**changes)
+
+
+# ----------------------------------------------------------------------------------------------
+# What the trainer asks
+# ----------------------------------------------------------------------------------------------
+
+
+@dataclass
+class Recorded(DensityStrategy):
+    """Writes down what it is asked, and acts after each second iteration."""
+
+    calls: list = field(default_factory=list)
+
+    def begin(self, population):
+        self.calls.append(("begin", population.num_rows))
+
+    def gathers(self, iteration):
+        return iteration != 3
+
+    def gather(self, step):
+        shapes = step.image.shape, step.photograph.shape
+        assert shapes == ((step.height, step.width, 3),) * 2 and dr.width(step.visible) == 40
+        self.calls.append(("gather", step.iteration))
+
+    def perturb(self, population, iteration, means_lr):
+        self.calls.append(("perturb", iteration, means_lr))
+
+    def acts(self, iteration):
+        return iteration % 2 == 0
+
+    def act(self, population, iteration):
+        self.calls.append(("act", iteration))
+
+
+def test_an_iteration_gathers_perturbs_and_acts_in_this_order(monkeypatch):
+    strategy = Recorded()
+    trainer = trainer_with(monkeypatch, strategy)
+    rates = []
+    for _ in range(3):
+        report = trainer.step()
+        rates.append(report.means_lr)
+        assert report.density is None
+    assert strategy.calls == [
+        ("begin", 40),
+        ("gather", 1),
+        ("perturb", 1, rates[0]),
+        ("gather", 2),
+        ("perturb", 2, rates[1]),
+        ("act", 2),
+        ("perturb", 3, rates[2]),
+    ]
+
+
+class Faint(DensityStrategy):
+    """Asks for transparent Gaussians."""
+
+    def penalties(self, parameters):
+        assert parameters["logit_opacities"].shape == (40,)
+        yield 1e6 * dr.mean(parameters["logit_opacities"].array)
+
+
+def test_penalties_are_terms_of_the_loss(monkeypatch):
+    """Of such a weight, and Adam's first step is as long as the rate, with the gradient's sign."""
+    plain = make_trainer()
+    trainer = trainer_with(monkeypatch, Faint())
+    logits = trainer.gaussians().logit_opacities
+    expected = plain.step().loss + 1e6 * logits.astype(np.float64).mean()
+    assert trainer.step().loss == pytest.approx(expected, rel=1e-5)
+    moved = trainer.gaussians().logit_opacities - logits
+    np.testing.assert_allclose(moved, -trainer.config.optimizer.opacities_lr, rtol=1e-4)
+
+
+class Quick(DensityStrategy):
+    """Doubles two rates, in the first iteration alone."""
+
+    def rate_factors(self, iteration):
+        return dict.fromkeys(("means", "sh0"), 2.0 if iteration == 1 else 1.0)
+
+
+def test_rates_are_multiplied_in_the_iterations_that_say_so(monkeypatch):
+    fits = [make_trainer(), trainer_with(monkeypatch, Quick())]
+    before = fits[0].gaussians()
+    for fit in fits:
+        fit.step()
+    plain, quick = (fit.gaussians() for fit in fits)
+    for name, factor in (("means", 2), ("sh0", 2), ("log_scales", 1)):
+        start = getattr(before, name).astype(np.float64)
+        steps = [np.abs(getattr(g, name) - start).max() for g in (plain, quick)]
+        # Values of order 1 in single precision, steps of 1.6e-4 and more.
+        assert steps[1] == pytest.approx(factor * steps[0], rel=2e-3), name
+    rates = []
+    for fit in fits:
+        fit.step()
+        rates.append([entry[2] for entry in fit.optimizer.state.values()])
+    assert rates[0] == rates[1]
+
+
+# ----------------------------------------------------------------------------------------------
+# Values without moments
+# ----------------------------------------------------------------------------------------------
+
+
+def test_values_that_are_set_leave_moments_and_the_step_count():
+    optimizer = make([0.1, 0.2, 0.3], 0.5)
+    before = {name: entry[1:] for name, entry in optimizer.state.items()}
+    rows = rows_of(optimizer)
+    means = rows.value("means") + 1
+    expected = rows.host("means") + 1
+    rows.set_values("means", means)
+    np.testing.assert_allclose(rows.host("means"), expected, rtol=1e-6)
+    assert dr.grad_enabled(optimizer["means"])
+    for name, entry in optimizer.state.items():
+        assert all(now is then for now, then in zip(entry[1:], before[name], strict=True)), name
+    with pytest.raises(ValueError, match=r"set_values\(\): means has shape \(3, 3\), the new valu"):
+        set_values(optimizer, "means", rows.take(dr.llvm.ad.UInt(0))["means"])
+
+
+# ----------------------------------------------------------------------------------------------
+# Strategies that follow one another
+# ----------------------------------------------------------------------------------------------
+
+
+@dataclass
+class Phase(DensityStrategy):
+    """Acts after some iterations; counts what it has seen since it began."""
+
+    name: str
+    when: set
+    num: int = 10
+    seen: int = 0
+
+    def begin(self, population):
+        self.seen = 0
+
+    def gathers(self, iteration):
+        return iteration <= max(self.when)
+
+    def gather(self, step):
+        self.seen += 1
+
+    def rate_factors(self, iteration):
+        return {"means": 2.0, self.name: 3.0}
+
+    def penalties(self, parameters):
+        yield self.name
+
+    def acts(self, iteration):
+        return iteration in self.when
+
+    def act(self, population, iteration):
+        return DensityReport(self.num, num_added=self.num, cloned=2, pruned=1)
+
+    def state(self):
+        return {f"{self.name}_seen": np.array(self.seen)}
+
+    def restore(self, state):
+        self.seen = int(state[f"{self.name}_seen"])
+
+    def most_gaussians(self, start, iterations):
+        return start + self.num
+
+
+@dataclass
+class Seen:
+    iteration: int
+
+
+def test_phases_are_one_strategy_and_begin_anew_where_others_change_rows():
+    first, last = Phase("first", {2, 4}), Phase("last", {4, 6}, num=7)
+    phases = Phases((first, last))
+    assert [i for i in range(1, 9) if phases.acts(i)] == [2, 4, 6]
+    assert [i for i in range(1, 9) if phases.gathers(i)] == [1, 2, 3, 4, 5, 6]
+    assert phases.rate_factors(1) == {"means": 4.0, "first": 3.0, "last": 3.0}
+    assert list(phases.penalties({})) == ["first", "last"]
+    assert phases.most_gaussians(100, 8) == 117
+    for iteration in range(1, 6):
+        phases.gather(Seen(iteration))
+    assert (first.seen, last.seen) == (4, 5)
+    assert phases.act(None, 2) == DensityReport(10, num_added=10, cloned=2, pruned=1)
+    assert (first.seen, last.seen) == (4, 0)
+    assert phases.act(None, 4) == DensityReport(7, num_added=17, cloned=4, pruned=2)
+    assert phases.act(None, 5) is None
+    first.seen, last.seen = 5, 6
+    again = Phases((Phase("first", {2}), Phase("last", {2})))
+    again.restore(phases.state())
+    assert [phase.seen for phase in again.phases] == [5, 6]
+
+
+# ----------------------------------------------------------------------------------------------
+# Configurations
+# ----------------------------------------------------------------------------------------------
+
+
+def test_each_strategy_of_the_configuration_is_made():
+    made = set()
+    for name in DensifyConfig.model_fields["strategy"].annotation.__args__:
+        config = FitConfig(data={"path": "."}, densify={"strategy": name})
+        made.add(type(density_strategy(config)))
+    assert len(made) == len(DensifyConfig.model_fields["strategy"].annotation.__args__)
+
+
+@pytest.mark.parametrize(
+    "densify",
+    [
+        {"strategy": "adc", "adc": {"grad_threshold": 1e-6, "reset_every": 12}},
+        {"strategy": "budget", "budget": {"gaussians": 90, "error_every": 1}},
+    ],
+    ids=lambda densify: densify["strategy"],
+)
+def test_a_plan_that_was_revised_is_one_from_the_start(densify):
+    """Whose growth ends later, and then earlier; with the statistics of the views in between."""
+    densify = {"start": 2, "stop": 20, "every": 4, **densify}
+    revised = make_trainer(densify=densify, iterations=40)
+    for iteration in range(1, 18):
+        revised.step()
+        if iteration in (6, 11):
+            revised.replan(45, {6: 36, 11: 16}[iteration])
+    assert revised.num_gaussians > 40
+    again = make_trainer(**revised.config.model_dump())
+    for _ in range(17):
+        again.step()
+    assert {name: v.tobytes() for name, v in again.state().items()} == {
+        name: v.tobytes() for name, v in revised.state().items()
+    }
+
+
+def test_stops_that_a_plan_had_are_kept_for_the_iterations_that_saw_them():
+    config = FitConfig(data={"path": "."}, densify={"start": 2, "stop": 20})
+    assert revised_stops(config, 0, 30) == []
+    assert revised_stops(config, 6, 20) == []
+    aims = revised_stops(config, 6, 36)
+    densify = {"start": 2, "stop": 36, "stop_aims": aims}
+    config = FitConfig(data={"path": "."}, densify=densify)
+    assert [config.densify.stop_seen_from(i) for i in (1, 6, 7, 30)] == [20, 20, 36, 36]
+    assert revised_stops(config, 6, 36) == revised_stops(config, 9, 36) == aims
+    assert revised_stops(config, 6, 9) == [{"after": 0, "stop": 20}, {"after": 6, "stop": 9}]
+    with pytest.raises(ValueError, match="must begin after iteration 0, with growing after"):
+        DensifyConfig(stop_aims=[{"after": 3, "stop": 9}])
