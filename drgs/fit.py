@@ -4,6 +4,7 @@ Reads the configuration and the dataset, runs :class:`drgs.training.trainer.Trai
 result on the test views and writes the output folder:
 
 - ``point_cloud.ply``: the Gaussians, in the layout of the 3DGS reference implementation
+- ``point_cloud_viewers.ply``: the same for other viewers, where these render otherwise than the fit
 - ``metrics.json``: quality on the test views, time, population, versions, machine, command
 - ``history.csv``: loss, PSNR, population and rate over the iterations, now and then test PSNR
 - ``density.csv``: what was added to the population and removed from it, where anything was
@@ -60,6 +61,7 @@ from drgs.results.files import (
     CONFIG,
     DENSITY,
     GAUSSIANS,
+    GAUSSIANS_FOR_VIEWERS,
     HISTORY,
     METRICS,
     REPORT,
@@ -78,9 +80,9 @@ from drgs.results.folder import (
     seal_run,
     write_run_config,
 )
-from drgs.results.metrics import FitMetrics, Quality, mean_of
+from drgs.results.metrics import FitMetrics, Quality, SplitMetrics, mean_of
 from drgs.results.refined_cameras import write_views
-from drgs.results.report import seconds_to_write, write_pictures, write_results
+from drgs.results.report import score, seconds_to_write, write_pictures, write_results
 from drgs.training.budget import (
     AllIterations,
     Deadline,
@@ -284,7 +286,12 @@ def planned(
     end: of everything, by ``time.perf_counter``.
     """
     rehearsal = rehearse(config, dataset, gaussians)
-    end -= seconds_to_write(rehearsal.trainer.scene, dataset)
+    scene, has_one_file = rehearsal.trainer.scene, config.model.approximations.are_usual
+    end -= seconds_to_write(scene, dataset, measured=1 if has_one_file else 2)
+    if not has_one_file:
+        from drgs.training.viewers import TIME_SHARE
+
+        end -= TIME_SHARE * max(0.0, end - time.perf_counter())
     side = min(min(view.width, view.height) for view in dataset.train)
     seconds = end - time.perf_counter()
     num_points, second = gaussians.num_gaussians, rehearsal.iteration_s
@@ -323,6 +330,10 @@ def fit_and_write(
     scores = write_pictures(out, dataset, render, config.output.save_renders)
     quality = mean_of(scores)
     metrics = summarize(config, dataset, gaussians.num_gaussians, wall_s, quality, command)
+    if not config.model.approximations.are_usual:
+        metrics["viewers"] = measured_split(
+            write_for_viewers(out, trainer, dataset, gaussians), dataset
+        )
     write_results(out, dataset, trainer.scene, gaussians, render, scores, log, metrics)
     with atomic_path(out / METRICS) as temporary:
         temporary.write_text(json.dumps(metrics, indent=2) + "\n")
@@ -333,9 +344,31 @@ def fit_and_write(
         f"SSIM {quality.ssim:.4f}; {gaussians.num_gaussians:,} Gaussians; "
         f"{config.iterations} iterations in {wall_s:.0f} s"
     )
+    if "viewers" in metrics:
+        print(
+            f"as other viewers show {out / GAUSSIANS_FOR_VIEWERS}: "
+            f"PSNR {metrics['viewers']['psnr']:.2f} dB"
+        )
     print(f"written: {out}")
     print(f"open {out / REPORT}")
     return True
+
+
+def write_for_viewers(
+    out: Path, trainer: Trainer, dataset: Dataset, gaussians: Gaussians
+) -> Quality:
+    """Write the Gaussians for other viewers, and measure the test views as these show them.
+
+    trainer: is retired by it, and goes on rendering what it has fitted; gaussians: that.
+    """
+    from drgs.training.viewers import for_viewers, num_iterations
+
+    total = num_iterations(trainer.config)
+    with RunProgress("iteration for viewers", total) as shown:
+        found = for_viewers(trainer, dataset, gaussians, lambda done: shown.update(done, total))
+    found.gaussians.save(out / GAUSSIANS_FOR_VIEWERS)
+    pairs = zip(found.pictures(dataset.test), dataset.test, strict=True)
+    return mean_of([score(image, view) for image, view in pairs])
 
 
 def run_iterations(
@@ -394,12 +427,7 @@ def summarize(
         "iterations": config.iterations,
         "num_gaussians": num_gaussians,
         "wall_s": round(wall_s, 2),
-        "test": {
-            "psnr": quality.psnr,
-            "ssim": quality.ssim,
-            "num_views": quality.num_views,
-            "split": dataset.test_split,
-        },
+        "test": measured_split(quality, dataset),
         "seed": config.seed,
         "versions": {
             "drgs": drgs.__version__,
@@ -416,6 +444,12 @@ def summarize(
         "command": command,
         "config": config.model_dump(mode="json"),
     }
+
+
+def measured_split(quality: Quality, dataset: Dataset) -> SplitMetrics:
+    """Of the test views."""
+    numbers = {"psnr": quality.psnr, "ssim": quality.ssim, "num_views": quality.num_views}
+    return {**numbers, "split": dataset.test_split}
 
 
 def _duration(text: str) -> float:

@@ -9,6 +9,10 @@ CHECKPOINT = "checkpoint.npz"
 """While the fit runs: see :mod:`drgs.training.checkpoint`."""
 
 GAUSSIANS = "point_cloud.ply"
+
+GAUSSIANS_FOR_VIEWERS = "point_cloud_viewers.ply"
+"""For viewers that know nothing of the approximations that the others are rendered with."""
+
 HISTORY = "history.csv"
 DENSITY = "density.csv"
 """What changed the population, and how; there is none where nothing did."""
@@ -51,6 +55,7 @@ RESULTS = (
     ORBIT,
     BUDGET_PLAN,
     GAUSSIANS,
+    GAUSSIANS_FOR_VIEWERS,
     RENDERS,
     REPORT,
     SIDE_BY_SIDE,

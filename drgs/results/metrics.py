@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import TypedDict
+from typing import NotRequired, TypedDict
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -44,6 +44,7 @@ class FitMetrics(TypedDict):
     num_gaussians: int
     wall_s: float  # spent on iterations
     test: SplitMetrics
+    viewers: NotRequired[SplitMetrics]  # of the file for viewers, rendered as these do
     seed: int
     versions: dict[str, str]
     variant: str

@@ -33,7 +33,15 @@ from drgs.integrator.scene import render_views
 from drgs.io.figures import pixels_of
 from drgs.io.pictures import encode, write_animation, write_png
 from drgs.results.curves import THEMES, FitHistory, Panel, draw_curve, panels_of, write_curves
-from drgs.results.files import CURVES, GAUSSIANS, ORBIT, RENDERS, REPORT, SIDE_BY_SIDE
+from drgs.results.files import (
+    CURVES,
+    GAUSSIANS,
+    GAUSSIANS_FOR_VIEWERS,
+    ORBIT,
+    RENDERS,
+    REPORT,
+    SIDE_BY_SIDE,
+)
 from drgs.results.metrics import FitMetrics, psnr, ssim
 from drgs.results.population import story_of
 
@@ -101,8 +109,11 @@ def write_results(
     write_report(out / REPORT, out.name, dataset, render, scores, history, metrics, orbit)
 
 
-def seconds_to_write(scene: mi.Scene, dataset: Dataset) -> float:
-    """About what measuring and :func:`write_results` will take: one test view is tried out."""
+def seconds_to_write(scene: mi.Scene, dataset: Dataset, measured: int) -> float:
+    """About what measuring and :func:`write_results` will take: one test view is tried out.
+
+    measured: how often the test views are.
+    """
     view = dataset.test[0]
     list(render_views(scene, (view,)))  # compiles kernels
     start = time.perf_counter()
@@ -114,7 +125,7 @@ def seconds_to_write(scene: mi.Scene, dataset: Dataset) -> float:
     one_view = time.perf_counter() - start
     encode(image, "webp", **PANEL_QUALITY)
     of_frame = 2 * rendering + time.perf_counter() - start - one_view
-    return PAGE_SECONDS + len(dataset.test) * one_view + ORBIT_FRAMES * of_frame
+    return PAGE_SECONDS + measured * len(dataset.test) * one_view + ORBIT_FRAMES * of_frame
 
 
 def side_by_side(image: np.ndarray, view: View) -> np.ndarray:
@@ -172,6 +183,7 @@ def write_report(
         orbit=_uri("image/webp", orbit),
         still=_data_uri(_first_frame(orbit), lossless=True),
         gaussians=GAUSSIANS,
+        viewers=_viewers(metrics),
         command=html.escape(metrics["command"]),
         comparisons="".join(
             _comparison(dataset, render, label, index, scores[index]) for label, index in chosen
@@ -225,6 +237,17 @@ def _facts(dataset: Dataset, metrics: FitMetrics, history: FitHistory) -> list[t
         ("Seed", f"{metrics['seed']}"),
         ("Versions", ", ".join(f"{names.get(k, k)} {v}" for k, v in versions.items())),
     ]
+
+
+def _viewers(metrics: FitMetrics) -> str:
+    """What splat viewers are to open, as HTML."""
+    if "viewers" not in metrics:
+        return "splat viewers read it"
+    link = f'<a href="{GAUSSIANS_FOR_VIEWERS}" download>{GAUSSIANS_FOR_VIEWERS}</a>'
+    return (
+        f"for drgs; what other splat viewers show right is {link}, in which they show the "
+        f"{metrics['viewers']['split']} views with {metrics['viewers']['psnr']:.2f} dB"
+    )
 
 
 def duration(seconds: float) -> str:

@@ -265,6 +265,15 @@ class Trainer:
         for effect in self.effects:
             effect.finish(self)
 
+    def retire(self) -> None:
+        """Free what only further iterations need, of which there will be none: targets, moments.
+
+        Its scene still renders what was fitted last.
+        """
+        self.stage.end()
+        self.optimizer.state.clear()
+        dr.flush_malloc_cache()
+
     def pictures(self, views: tuple[View, ...]) -> Iterator[np.ndarray]:
         """Pictures (H, W, 3) of views that were not trained on, display space, in [0, 1]."""
         for effect in self.effects:

@@ -98,6 +98,14 @@ def out(tmp_path_factory, dataset, scene, images):
     return folder
 
 
+def test_the_page_says_what_viewers_are_to_open():
+    assert report._viewers(metrics()) == "splat viewers read it"
+    measured = {"psnr": 29.876, "ssim": 0.9, "num_views": 4, "split": "test"}
+    text = report._viewers({**metrics(), "viewers": measured})
+    assert '<a href="point_cloud_viewers.ply" download>point_cloud_viewers.ply</a>' in text
+    assert text.endswith("in which they show the test views with 29.88 dB")
+
+
 def test_everything_is_written_and_nothing_temporary(out):
     names = {str(path.relative_to(out)) for path in out.rglob("*") if path.is_file()}
     comparisons = {f"side_by_side/test/r_{i}.png" for i in range(4)}

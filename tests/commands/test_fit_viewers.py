@@ -1,0 +1,125 @@
+"""``point_cloud_viewers.ply``: Gaussians for viewers that render otherwise than the fit."""
+
+import json
+import sys
+from dataclasses import replace
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from support.commands import assert_ends_well
+from support.fit_command import VALUES, assert_fits, without_pictures, write_project
+from support.folders import contents
+from support.render_command import run as render
+from support.small_capture import decibels
+from support.small_fits import double, photograph
+
+from drgs import fit
+from drgs.config.load import load_config
+from drgs.data import load_dataset
+from drgs.gaussians.parameters import Gaussians
+from drgs.integrator.scene import make_scene, make_sensors, render_views
+from drgs.results.files import GAUSSIANS, GAUSSIANS_FOR_VIEWERS, METRICS
+from drgs.results.folder import remove_run
+
+OTHERWISE = {"antialiased": True, "low_pass": 0.1}
+
+
+@pytest.fixture(scope="module")
+def fitted(tmp_path_factory):
+    """The folder of a fit whose approximations are not those of viewers."""
+    folder = tmp_path_factory.mktemp("viewers")
+    config = write_project(folder, model={**VALUES["model"], **OTHERWISE})
+    with pytest.MonkeyPatch.context() as patch:
+        without_pictures(patch)
+        outcome = assert_fits(config, "--out", folder / "out", "--threads", 1)
+    return folder / "out", outcome
+
+
+def test_both_files_say_what_they_are_rendered_with(fitted):
+    out, _ = fitted
+    assert Gaussians.load(out / GAUSSIANS).rendered_with == OTHERWISE
+    usual = {"antialiased": False, "low_pass": 0.3}
+    assert Gaussians.load(out / GAUSSIANS_FOR_VIEWERS).rendered_with == usual
+    native, other = (Gaussians.load(out / name) for name in (GAUSSIANS, GAUSSIANS_FOR_VIEWERS))
+    assert native.num_gaussians == other.num_gaussians and (native.means != other.means).any()
+
+
+def test_what_viewers_show_is_measured(fitted, tmp_path):
+    """By the float64 reference, which renders as viewers do."""
+    out, outcome = fitted
+    metrics = json.loads((out / METRICS).read_text())
+    dataset = load_dataset(load_config(out / "config.yml").data)
+    gaussians = double(Gaussians.load(out / GAUSSIANS_FOR_VIEWERS))
+    scores = []
+    for view in dataset.test:
+        seen = photograph(gaussians, view, np.array(dataset.background))
+        scores.append(decibels(np.clip(seen.image, 0, 1), np.asarray(view.image)))
+    found = metrics["viewers"]
+    assert found["psnr"] == pytest.approx(np.mean(scores), abs=1e-3)
+    assert (found["split"], found["num_views"]) == ("test", 2)
+    assert f"{GAUSSIANS_FOR_VIEWERS}: PSNR {found['psnr']:.2f} dB" in outcome.stdout
+
+    render(out / GAUSSIANS_FOR_VIEWERS, "--scene", out / "config.yml", "--out", tmp_path)
+    again = json.loads((tmp_path / METRICS).read_text())
+    assert again["mean"]["psnr"] == found["psnr"]
+
+
+def test_the_plugin_shows_the_file_as_the_fit_does(fitted):
+    """To the last bit: by its name alone, and by the scene that the trainer has."""
+    out, _ = fitted
+    config = load_config(out / "config.yml")
+    dataset = load_dataset(config.data)
+    gaussians = Gaussians.load(out / GAUSSIANS)
+    scene = make_scene(gaussians, config.model, dataset.background)
+    (expected,) = render_views(scene, dataset.test[:1])
+    integrator = {
+        "type": "splats",
+        "filename": str(out / GAUSSIANS),
+        "background": list(dataset.background),
+        "near": 0.2,
+        "srgb_primitives": False,
+    }
+    (sensor,) = make_sensors(dataset.test[:1])
+    by_name = mi.render(mi.load_dict({"type": "scene", "integrator": integrator}), sensor=sensor)
+    np.testing.assert_array_equal(np.clip(np.array(by_name), 0, 1), expected)
+
+
+def test_a_fit_that_goes_on_gives_the_same_bytes(fitted, tmp_path, monkeypatch):
+    """Stopped when its iterations are done, with what is for viewers still to come."""
+    out, _ = fitted
+    config = write_project(tmp_path, model={**VALUES["model"], **OTHERWISE})
+    without_pictures(monkeypatch)
+    with monkeypatch.context() as broken:
+        broken.setattr(fit, "write_for_viewers", lambda *_: sys.exit(7))
+        with pytest.raises(SystemExit):
+            fit.main([str(config), "--out", str(tmp_path / "out")])
+    assert not (tmp_path / "out" / GAUSSIANS_FOR_VIEWERS).exists()
+    assert_ends_well(fit.main, "--resume", tmp_path / "out")
+    for name in (GAUSSIANS, GAUSSIANS_FOR_VIEWERS):
+        assert (tmp_path / "out" / name).read_bytes() == (out / name).read_bytes()
+    remove_run(tmp_path / "out")
+    assert contents(tmp_path / "out") == {}
+
+
+def test_a_fit_as_viewers_render_has_one_file(tmp_path, monkeypatch):
+    without_pictures(monkeypatch)
+    monkeypatch.delitem(sys.modules, "drgs.training.viewers", raising=False)
+    monkeypatch.delitem(sys.modules, "drgs.effects.viewers", raising=False)
+    assert_fits(write_project(tmp_path), "--out", tmp_path / "out")
+    assert not (tmp_path / "out" / GAUSSIANS_FOR_VIEWERS).exists()
+    assert "viewers" not in json.loads((tmp_path / "out" / METRICS).read_text())
+    assert not {"drgs.training.viewers", "drgs.effects.viewers"} & set(sys.modules)
+    assert Gaussians.load(tmp_path / "out" / GAUSSIANS).rendered_with is None
+
+
+def test_a_file_of_somebody_else_is_not_replaced(tmp_path, monkeypatch):
+    without_pictures(monkeypatch)
+    config = write_project(tmp_path)
+    assert_fits(config, "--out", tmp_path / "out")
+    replace(Gaussians.load(tmp_path / "out" / GAUSSIANS), rendered_with=None).save(
+        tmp_path / "out" / GAUSSIANS_FOR_VIEWERS
+    )
+    with pytest.raises(SystemExit) as end:
+        fit.main([str(config), "--out", str(tmp_path / "out"), "--overwrite"])
+    assert end.value.code == 2 and (tmp_path / "out" / GAUSSIANS_FOR_VIEWERS).exists()

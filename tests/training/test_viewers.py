@@ -1,0 +1,110 @@
+"""Gaussians that are fitted further as viewers render them."""
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from support import small_fits as fits
+from support.small_capture import decibels
+
+from drgs.config.changes import changed
+from drgs.config.schema import ModelConfig
+from drgs.core.errors import UserNote
+from drgs.integrator.scene import make_scene, render_views
+from drgs.training import viewers
+from drgs.training.trainer import Trainer
+from drgs.training.viewers import for_viewers, num_iterations, tuning
+
+OTHERWISE = {"model.antialiased": True, "model.low_pass": 0.02}
+
+
+@pytest.fixture(autouse=True)
+def variant():
+    mi.set_variant("llvm_ad_rgb")
+
+
+def ended_fit(iterations=20, **changes):
+    """A trainer that has done all of its iterations, its dataset, and its Gaussians."""
+    dataset = fits.plain_dataset()
+    config = changed(fits.config_of(iterations=iterations), {**OTHERWISE, **changes})
+    trainer = Trainer(config, dataset, fits.disturbed_blobs())
+    for _ in range(iterations):
+        trainer.step()
+    return trainer, dataset, trainer.gaussians()
+
+
+def shown_by_viewers(gaussians, dataset):
+    scene = make_scene(gaussians, ModelConfig(near=0.2), dataset.background)
+    pairs = zip(render_views(scene, dataset.test), dataset.test, strict=True)
+    return np.mean([decibels(image, view.image) for image, view in pairs])
+
+
+def test_iterations_bring_viewers_nearer_to_the_photographs(monkeypatch):
+    monkeypatch.setattr(viewers, "SHARE", 1.0)
+    trainer, dataset, gaussians = ended_fit()
+    before = list(trainer.pictures(dataset.test))
+    closed = viewers._started(trainer, gaussians)
+    counted = []
+    found = for_viewers(trainer, dataset, gaussians, counted.append)
+    assert counted == list(range(1, 21))
+    as_it_is, in_closed_form, tuned = (
+        shown_by_viewers(g, dataset) for g in (gaussians, closed, found.gaussians)
+    )
+    assert tuned > max(as_it_is, in_closed_form) + 0.2
+    # What the fit itself has found is shown as before.
+    for image, again in zip(before, trainer.pictures(dataset.test), strict=True):
+        np.testing.assert_array_equal(image, again)
+    pairs = zip(found.pictures(dataset.test), dataset.test, strict=True)
+    assert np.mean([decibels(image, view.image) for image, view in pairs]) == pytest.approx(
+        tuned, abs=1e-6
+    )
+    usual = {"antialiased": False, "low_pass": 0.3}
+    assert found.gaussians.rendered_with == usual
+
+
+def test_the_same_fit_gives_the_same_bytes(tmp_path):
+    for name in ("a", "b"):
+        trainer, dataset, gaussians = ended_fit(8)
+        for_viewers(trainer, dataset, gaussians).gaussians.save(tmp_path / name)
+    assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
+
+
+def test_what_a_fit_found_out_of_cameras_and_colours_stays():
+    """Its rates are next to nothing; the views to measure are those of the refined cameras."""
+    changes = {"cameras.optimise": True, "cameras.rotation_lr": 1e-3, "colors.lr": 0.02}
+    trainer, dataset, gaussians = ended_fit(8, **changes)
+    before = {effect.name: effect.values() for effect in trainer.effects}
+    tuners = []
+    found = for_viewers(trainer, dataset, gaussians, lambda done: tuners.append(done))
+    assert len(tuners) == num_iterations(trainer.config) == 1
+    for effect in found.effects:
+        for name, values in effect.values().items():
+            np.testing.assert_array_equal(values, before[effect.name][name])
+    config = tuning(trainer.config)
+    assert config.colors.lr == viewers.NEXT_TO_NOTHING and config.cameras.rotation_lr == 0
+
+
+def test_numbers_that_are_not_finite_leave_the_closed_form(monkeypatch):
+    trainer, dataset, gaussians = ended_fit(8)
+    expected = viewers._started(trainer, gaussians)
+    monkeypatch.setitem(viewers.RATES, "scales_lr", 10.0)
+    monkeypatch.setattr(viewers, "SHARE", 0.5)
+    step = Trainer.step
+
+    def step_and_break(self):
+        report = step(self)
+        self.optimizer["integrator.means"] = self.optimizer["integrator.means"] * np.nan
+        return report
+
+    monkeypatch.setattr(Trainer, "step", step_and_break)
+    with pytest.warns(UserNote, match="for viewers are not fitted any further"):
+        found = for_viewers(trainer, dataset, gaussians)
+    np.testing.assert_array_equal(found.gaussians.log_scales, expected.log_scales)
+
+
+def test_the_population_and_the_schedule_stay():
+    config = changed(fits.config_of(iterations=400), {**OTHERWISE, "model.order": "pixel"})
+    further = tuning(config)
+    assert further.iterations == 416 and further.densify.stop == 1 and further.coarse == []
+    assert further.model.approximations.are_usual and not config.model.approximations.are_usual
+    assert further.model.sh_degree == config.model.sh_degree
+    assert further.loss == config.loss and further.data == config.data
