@@ -48,10 +48,10 @@ RATES = {
     "means_lr_final": 1.6e-5,
     "quats_lr": 4e-3,
     "scales_lr": 0.02,
-    "opacities_lr": 0.1,
-    "sh0_lr": 0.04,
-    "shN_lr": 2e-3,
-    "decay": 0.05,
+    "opacities_lr": 0.07,
+    "sh0_lr": 0.06,
+    "shN_lr": 4e-3,
+    "decay": 0.1,
 }
 """High, as few iterations have to do; colours move most, by 16 times the reference's rates. Those
 of the reference give 0.8 dB less."""
