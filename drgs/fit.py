@@ -49,9 +49,10 @@ from drgs.core.files import atomic_path
 from drgs.core.locks import sole_writer
 from drgs.core.machine import processor
 from drgs.core.private import llvm_version
-from drgs.data import Dataset, View, initial_gaussians, load_dataset
+from drgs.data import Dataset, View, load_dataset
 from drgs.data.derived import completed, description_of_start
 from drgs.data.fingerprint import Fingerprint, fingerprint_of
+from drgs.data.initial import Start, gaussians_at, start_of
 from drgs.gaussians.parameters import Gaussians
 from drgs.integrator.scene import check_lenses
 from drgs.integrator.summary import described
@@ -203,9 +204,9 @@ def run(args: argparse.Namespace) -> None:
             check_same_data(out, config.data.path, checkpoint.data, data)
         config = completed(config, dataset)
         select_variant(args.variant)
-        announce(config, dataset)
+        start = announced_start(config, dataset)
         # The folder is touched when all of the input has been found to be usable.
-        gaussians = initial_gaussians(config, dataset)
+        gaussians = gaussians_at(start, config)
         length, plan = AllIterations(), None
         if args.budget is not None:
             end, plan = planned(config, dataset, gaussians, started + args.budget)
@@ -265,17 +266,22 @@ def take_folder(args: argparse.Namespace, config: FitConfig, dataset: Dataset, o
         continue_run(out, config, pictures)
 
 
-def announce(config: FitConfig, dataset: Dataset) -> None:
-    """Print the data and what is simulated; refuse lenses that the projection cannot show."""
+def announced_start(config: FitConfig, dataset: Dataset) -> Start:
+    """Where the fit starts; prints that, the data and what is simulated.
+
+    Raises ``UserError`` for lenses that the projection cannot show.
+    """
     print(dataset.description)
     print(
         f"{len(dataset.train)} views to train on, {len(dataset.test)} of split "
         f"'{dataset.test_split}' to measure on; background {config.data.background}"
     )
-    print(description_of_start(config, dataset))
+    start = start_of(config, dataset)
+    print(description_of_start(config, start))
     print(described(summary_of_fit(config, dataset)))
     views, remedy = (*dataset.train, *dataset.test), "set data.ignore_distortion"
     check_lenses(config.model, views, f"{config.data.path}: ", remedy)
+    return start
 
 
 def planned(

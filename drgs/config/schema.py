@@ -140,7 +140,17 @@ class DataConfig(Section):
 class InitConfig(Section):
     """The Gaussians at iteration 0."""
 
-    num_points: Count = Field(100_000, ge=4, description="Random points in the start box.")
+    start: Literal["auto", "masks", "points", "random"] = Field(
+        "auto",
+        description="What the points are. masks: the surface of what no picture shows empty, "
+        "coloured from the pictures, which have to be transparent where there is nothing. points: "
+        "a point cloud. random: in the start box, or where the cameras look. auto: the point_cloud "
+        "or the half_extent that is given; else masks if nearly all training pictures are partly "
+        "transparent; else the dataset's point cloud if it names one; else random.",
+    )
+    num_points: Count = Field(
+        100_000, ge=4, description="Points, random or, at most, on the surface of the masks' hull."
+    )
     half_extent: float | None = Field(
         None,
         gt=0,
@@ -151,11 +161,18 @@ class InitConfig(Section):
     opacity: float = Field(
         0.1, ge=1e-6, le=0.999999, description="Opacity of every starting Gaussian."
     )
+    scale: float = Field(
+        1.0,
+        ge=1e-3,
+        le=1e3,
+        description="Its standard deviation, in units of the root mean square distance to the "
+        "three nearest others.",
+    )
     point_cloud: PathField | None = Field(
         None,
-        description="PLY with x, y, z (and red, green, blue) to use instead of random points. "
-        "null: the one that the dataset names (ply_file_path), if it does and no half_extent is "
-        "given.",
+        description="PLY with x, y, z (and red, green, blue) to use instead of other points. "
+        "null: the one that the dataset names (ply_file_path), if it does, no half_extent is given "
+        "and there are no masks.",
     )
 
 
@@ -422,6 +439,19 @@ class FitConfig(Section):
         """Of a model that is frozen once it is validated."""
         completed = getattr(self, section).model_copy(update=changes)
         object.__setattr__(self, section, completed)
+
+    @model_validator(mode="after")
+    def _check_start(self) -> FitConfig:
+        start, cloud, half_extent = self.init.start, self.init.point_cloud, self.init.half_extent
+        if start in ("masks", "random") and cloud is not None:
+            raise ValueError(
+                f"init.point_cloud must be null where init.start is {start}, got {cloud}"
+            )
+        if start == "points" and half_extent is not None:
+            raise ValueError(
+                f"init.half_extent must be null where init.start is points, got {half_extent}"
+            )
+        return self
 
     @model_validator(mode="after")
     def _check_relations(self) -> FitConfig:

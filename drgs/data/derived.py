@@ -9,8 +9,8 @@ import numpy as np
 from drgs.config.changes import changed
 from drgs.config.schema import NAMED_COLORS, REFERENCE_NEAR, FitConfig
 from drgs.core.errors import UserError
-from drgs.data.initial import point_cloud_of
-from drgs.data.start_box import box_to_start_in, focus_of, shown
+from drgs.data.initial import Start
+from drgs.data.start_box import focus_of
 from drgs.data.types import Dataset
 
 NEAR_SHARE = 0.04
@@ -48,20 +48,9 @@ def completed(config: FitConfig, dataset: Dataset) -> FitConfig:
     return changed(config, changes) if changes else config
 
 
-def description_of_start(config: FitConfig, dataset: Dataset) -> str:
+def description_of_start(config: FitConfig, start: Start) -> str:
     """What a fit starts from and where its near plane is, one line; config: completed."""
-    cloud, box = point_cloud_of(config.init, dataset), None
-    if cloud is None:
-        box = box_to_start_in(config.init, dataset)
-    if cloud is not None:
-        what = f"the points of {cloud}"
-    elif box is not None:
-        what = f"{config.init.num_points:,} random points in {box}"
-    else:
-        focus, distance = focus_of(dataset.train)
-        within = f"within {distance:.3g} of {shown(focus, distance)}"
-        what = f"{config.init.num_points:,} random points that the cameras see {within}"
-    return f"starts from {what}; near plane at {config.model.near:g}"
+    return f"starts from {start.description}; near plane at {config.model.near:g}"
 
 
 def _near_plane(dataset: Dataset) -> float:

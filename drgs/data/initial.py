@@ -1,9 +1,11 @@
-"""The Gaussians that a fit starts from: random points, or a point cloud."""
+"""The Gaussians that a fit starts from: on a visual hull, of a point cloud, or at random points."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -13,15 +15,21 @@ from drgs.core.denormals import denormals_kept
 from drgs.core.errors import UserError
 from drgs.data.start_box import (
     LEAST_LOOKING,
+    box_looked_at,
     box_to_start_in,
+    focus_of,
     num_looking,
     points_in_view,
+    shown,
     where_they_look,
 )
 from drgs.data.types import Dataset, Viewpoint
 from drgs.gaussians.parameters import Gaussians
 from drgs.gaussians.sh import C0
 from drgs.io.ply import read_points
+
+if TYPE_CHECKING:
+    from drgs.data.carving import Silhouette
 
 MIN_SQUARED_DISTANCE = 1e-7
 """World units^2: lower bound of a Gaussian's squared first scale (3DGS reference), for points
@@ -30,53 +38,159 @@ that coincide."""
 NUM_NEIGHBOURS = 3
 
 
+@dataclass(frozen=True, eq=False)
+class Start:
+    """Where a fit starts."""
+
+    means: np.ndarray  # (N, 3) world
+    colors: np.ndarray | None  # (N, 3) display space 0..1; None: not known
+    description: str  # what they are, for the user
+
+
 def initial_gaussians(config: FitConfig, dataset: Dataset) -> Gaussians:
     """Gaussians at iteration 0, numpy float32, with the SH degree of ``config.model``.
 
-    Positions: ``init.point_cloud``; else uniform in [-h, h]^3 with ``init.half_extent``; else the
-    point cloud that the dataset names; else in a box derived from the layout and the cameras
-    (``drgs.data.start_box``). The same seed gives the same points.
-
-    Raises :class:`UserError` for points that the cameras do not see.
+    At the points of :func:`start_of`, with the opacity and the scale of ``config.init``.
     """
-    init = config.init
-    cloud, colors = point_cloud_of(init, dataset), None
-    if cloud is not None:
-        means, colors = read_points(cloud)
-        if colors is not None and not np.any(colors):
-            colors = None  # all black: what is written where no colours were found out
-        _check_cloud(cloud, means, config.densify.max_gaussians, dataset.train)
-    else:
-        rng = np.random.default_rng(config.seed)
-        box = box_to_start_in(init, dataset)
-        if box is not None:
-            means = box.points(init.num_points, rng)
-        else:
-            means = points_in_view(dataset.train, init.num_points, rng)
-    return gaussians_from_points(means, colors, init.opacity, config.model.sh_degree)
+    return gaussians_at(start_of(config, dataset), config)
 
 
-def point_cloud_of(init: InitConfig, dataset: Dataset) -> Path | None:
+def gaussians_at(start: Start, config: FitConfig) -> Gaussians:
+    """Those of :func:`initial_gaussians`."""
+    init, degree = config.init, config.model.sh_degree
+    return gaussians_from_points(start.means, start.colors, init.opacity, degree, init.scale)
+
+
+def start_of(config: FitConfig, dataset: Dataset) -> Start:
+    """The points that a fit starts from, as ``config.init`` says. The same seed gives the same.
+
+    By default: ``init.point_cloud``; else uniform in [-h, h]^3 with ``init.half_extent``; else on
+    the visual hull, where nearly all pictures are partly transparent; else the point cloud that the
+    dataset names; else uniform in a box that follows from the layout and the cameras
+    (``drgs.data.start_box``). Points on the hull, and those of a cloud without colours, are
+    coloured from the pictures. Where masks contradict each other, the description says so, and the
+    fit starts as without them.
+
+    Raises :class:`UserError` for points that the cameras do not see, and for masks or a point cloud
+    that are asked for and not there.
+    """
+    init, note = config.init, ""
+    is_open = init.start == "auto" and init.point_cloud is None and init.half_extent is None
+    if init.start == "masks" or (is_open and any(v.alpha is not None for v in dataset.train)):
+        from drgs.data.carving import are_masks, silhouettes_of
+
+        silhouettes = silhouettes_of(dataset.train)
+        if are_masks(silhouettes, dataset.train):
+            if (start := _on_the_hull(config, dataset, silhouettes)) is not None:
+                return start
+            note = f" (the masks of {len(silhouettes)} pictures have no hull in common)"
+        elif init.start == "masks":
+            raise UserError(
+                "init.start: masks needs nearly all training pictures to be transparent where "
+                f"there is nothing, but {_transparent(silhouettes, dataset)}; cut out what is to "
+                "be fitted, or set init.start=auto"
+            )
+    cloud = _cloud_of(init, dataset)
+    start = _random_points(config, dataset) if cloud is None else _of_cloud(config, dataset, cloud)
+    return replace(start, description=start.description + note)
+
+
+def _cloud_of(init: InitConfig, dataset: Dataset) -> Path | None:
     """The file that a fit starts from; None: random points."""
+    if init.start == "random":
+        return None
     if init.point_cloud is not None or init.half_extent is not None:
         return init.point_cloud
+    if init.start == "points" and dataset.point_cloud is None:
+        raise UserError(
+            "init.start: points needs a point cloud, and the dataset names none that may be used "
+            "(ply_file_path, data.ignore_points); give init.point_cloud, or set init.start=auto"
+        )
     return dataset.point_cloud
 
 
+def _on_the_hull(
+    config: FitConfig, dataset: Dataset, silhouettes: Sequence[Silhouette]
+) -> Start | None:
+    """On the visual hull of the masks; None: they have none."""
+    from drgs.data.carving import hull_points
+
+    try:
+        box = box_to_start_in(config.init, dataset) or box_looked_at(dataset.train)
+    except UserError:
+        if config.init.half_extent is not None:
+            raise
+        return None
+    means = hull_points(silhouettes, box, config.init.num_points, config.seed)
+    if len(means) <= NUM_NEIGHBOURS:
+        return None
+    what = f"{len(means):,} points on the hull of {len(silhouettes)} masks"
+    return _coloured(Start(means.astype(np.float32), None, what), dataset)
+
+
+def _of_cloud(config: FitConfig, dataset: Dataset, cloud: Path) -> Start:
+    """The points of a file."""
+    means, colors = read_points(cloud)
+    if colors is not None and not np.any(colors):
+        colors = None  # all black: what is written where no colours were found out
+    _check_cloud(cloud, means, config.densify.max_gaussians, dataset.train)
+    start = Start(means, colors, f"the points of {cloud}")
+    return _coloured(start, dataset) if colors is None else start
+
+
+def _random_points(config: FitConfig, dataset: Dataset) -> Start:
+    """In a box, or in what the cameras see."""
+    init, rng = config.init, np.random.default_rng(config.seed)
+    box = box_to_start_in(init, dataset)
+    if box is not None:
+        what = f"{init.num_points:,} random points in {box}"
+        return Start(box.points(init.num_points, rng), None, what)
+    means = points_in_view(dataset.train, init.num_points, rng)
+    focus, distance = focus_of(dataset.train)
+    within = f"within {distance:.3g} of {shown(focus, distance)}"
+    what = f"{init.num_points:,} random points that the cameras see {within}"
+    return Start(means, None, what)
+
+
+def _coloured(start: Start, dataset: Dataset) -> Start:
+    """With the colours that the pictures show, if they show any of the points."""
+    from drgs.data.coloring import colors_from_pictures
+
+    spacing = np.sqrt(mean_squared_neighbour_distance(start.means))
+    colors = colors_from_pictures(start.means, spacing, dataset.train, dataset.background)
+    if colors is None:
+        return start
+    return replace(start, colors=colors, description=f"{start.description}, coloured")
+
+
+def _transparent(silhouettes: Sequence[Silhouette], dataset: Dataset) -> str:
+    """How many of the pictures are, for a message."""
+    from drgs.data.carving import LEAST_TRANSPARENT, num_transparent
+
+    return (
+        f"only {num_transparent(silhouettes)} of {len(dataset.train)} are to "
+        f"{100 * LEAST_TRANSPARENT:g} % or more, from a camera that stands still"
+    )
+
+
 def gaussians_from_points(
-    means: np.ndarray, colors: np.ndarray | None, opacity: float, sh_degree: int
+    means: np.ndarray,
+    colors: np.ndarray | None,
+    opacity: float,
+    sh_degree: int,
+    scale: float = 1.0,
 ) -> Gaussians:
     """Isotropic Gaussians at ``means`` (N, 3), N >= 4, as large as the gaps between them.
 
-    The standard deviation is the root mean square distance to the 3 nearest other points, as in
-    the 3DGS reference (``distCUDA2``). ``colors`` (N, 3) in display space 0..1; None: grey.
-    Identity rotations; SH coefficients above degree 0 are zero.
+    The standard deviation is ``scale`` times the root mean square distance to the 3 nearest other
+    points, which is that of the 3DGS reference (``distCUDA2``). ``colors`` (N, 3) in display space
+    0..1; None: grey. Identity rotations; SH coefficients above degree 0 are zero.
     """
     num = len(means)
     means = np.ascontiguousarray(means, np.float32)
     colors = np.full((num, 3), 0.5) if colors is None else colors
     squared = np.maximum(mean_squared_neighbour_distance(means), MIN_SQUARED_DISTANCE)
-    log_scales = np.repeat(0.5 * np.log(squared)[:, None], 3, axis=1)
+    log_scales = np.repeat(0.5 * np.log(squared)[:, None] + np.log(scale), 3, axis=1)
     sh0 = (np.asarray(colors, np.float64) - 0.5) / C0
     return Gaussians(
         means=means,

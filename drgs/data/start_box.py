@@ -87,8 +87,13 @@ def box_to_start_in(init: InitConfig, dataset: Dataset) -> Box | None:
         return None
     if is_of_the_reference(dataset):
         return Box(np.zeros(3), dataset.start_half_extent)
-    focus, distance = focus_of(dataset.train)
-    return Box(focus, REFERENCE_FILL * distance * _half_width(dataset.train))
+    return box_looked_at(dataset.train)
+
+
+def box_looked_at(views: Sequence[Viewpoint]) -> Box:
+    """As the reference's box is to its cameras: nearly as wide as what they see at their focus."""
+    focus, distance = focus_of(views)
+    return Box(focus, REFERENCE_FILL * distance * _half_width(views))
 
 
 def is_of_the_reference(dataset: Dataset) -> bool:

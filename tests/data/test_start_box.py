@@ -1,5 +1,7 @@
 """Start boxes: which one follows from the data, and which are refused as no camera sees them."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from support.datasets import dataset_of, load, view_at
@@ -9,7 +11,9 @@ from drgs.config.schema import FitConfig, InitConfig
 from drgs.core.errors import UserError
 from drgs.data import initial_gaussians
 from drgs.data.derived import completed, description_of_start
+from drgs.data.initial import start_of
 from drgs.data.start_box import box_to_start_in
+from drgs.gaussians.sh import C0
 
 AROUND = [(4.03, 0, 0), (0, 4.03, 0), (-4.03, 0, 0), (0, -4.03, 0.1)]
 
@@ -106,7 +110,7 @@ def test_the_point_cloud_that_a_dataset_names_is_started_from(photographs, cloud
     dataset = load(photographs)
     assert dataset.point_cloud == cloud
     assert initial_gaussians(config(), dataset).num_gaussians == 50
-    shown = description_of_start(completed(config(), dataset), dataset)
+    shown = description_of_start(completed(config(), dataset), start_of(config(), dataset))
     assert shown.startswith(f"starts from the points of {cloud}; near plane at")
     few = {"num_points": 30}
     assert initial_gaussians(config(init={"half_extent": 2.0, **few}), dataset).num_gaussians == 30
@@ -123,14 +127,15 @@ def test_a_point_cloud_that_is_missing_leaves_random_points(photographs):
     assert "gone.ply is not there" in dataset.description
 
 
-def test_points_that_are_all_black_have_no_colours(tmp_path):
+def test_points_that_are_all_black_get_the_colours_of_the_pictures(tmp_path):
     """As of a pipeline that finds out none."""
     positions = np.random.default_rng(0).uniform(-1, 1, (9, 3))
     write_points(tmp_path / "black.ply", positions, np.zeros((9, 3), np.uint8))
-    g = initial_gaussians(
-        config(init={"point_cloud": tmp_path / "black.ply"}), dataset_of(views_from(AROUND))
-    )
-    assert not g.sh0.any()  # grey: colour is SH + 0.5
+    given = config(init={"point_cloud": tmp_path / "black.ply"})
+    views = [replace(view, image=view.image + 0.75) for view in views_from(AROUND)]
+    g = initial_gaussians(given, dataset_of(views))
+    np.testing.assert_allclose(0.5 + C0 * g.sh0, 0.75, rtol=1e-6)
+    assert not initial_gaussians(given, dataset_of([])).sh0.any()  # grey: colour is SH + 0.5
 
 
 # What else follows from the data
