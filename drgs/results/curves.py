@@ -123,7 +123,7 @@ class Panel:
     noisy: bool = False  # drawn with its running mean
     marked: bool = False  # with a dot for each value, of which there are few
     thousands: bool = False  # y's labels are whole numbers, with separators
-    others: Mapping[str, tuple[np.ndarray, np.ndarray]] = field(default_factory=dict)  # x and y
+    others: Mapping[str, tuple[np.ndarray, np.ndarray]] = field(default_factory=dict)  # steps
 
 
 def panels_of(history: FitHistory) -> list[Panel]:
@@ -139,7 +139,7 @@ def panels_of(history: FitHistory) -> list[Panel]:
     minutes = np.array([row.wall_s / 60 for row in measured])
     test_psnr = np.array([row.test_psnr for row in measured])
     over_time = {"x_label": "time [min]", "marked": True}
-    counted = {"bottom": 0, "thousands": True, "others": _changes_so_far(history.density)}
+    counted = {"bottom": 0, "thousands": True, "others": _changes_so_far(history)}
     return [
         Panel("Loss", x, column("loss"), scale="log", noisy=True),
         Panel("PSNR of the training view [dB]", x, column("psnr"), noisy=True),
@@ -150,17 +150,19 @@ def panels_of(history: FitHistory) -> list[Panel]:
     ]
 
 
-def _changes_so_far(
-    changes: Sequence[DensityChange],
-) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """By what was done, iterations and sums until then; without what was never done."""
-    x = np.array([change.iteration for change in changes], np.float64)
+def _changes_so_far(history: FitHistory) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """By what was done, iterations and sums from then on; without what was never done."""
+    changes = history.density
+    x = np.array([0, *(change.iteration for change in changes)], np.float64)
     columns = {"added": "num_added", "removed": "pruned", "relocated": "relocated"}
     sums = {
-        name: np.cumsum([getattr(change, key) for change in changes])
+        name: np.cumsum([0, *(getattr(change, key) for change in changes)])
         for name, key in columns.items()
     }
-    return {name: (x, y) for name, y in sums.items() if len(y) and y[-1] > 0}
+    last = max([row.iteration for row in history.rows[-1:]], default=x[-1])
+    return {
+        name: (np.append(x, last), np.append(y, y[-1])) for name, y in sums.items() if y[-1] > 0
+    }
 
 
 def draw_curves(history: FitHistory, theme: Theme) -> Figure:
@@ -187,7 +189,7 @@ def _draw(axis: Axes, panel: Panel, theme: Theme) -> None:
         axis.plot(panel.x, y, color=theme.raw, linewidth=0.7)
         y = _running_mean(y)
     for (name, line), color in zip(panel.others.items(), theme.others, strict=False):
-        axis.plot(*line, color=color, linewidth=1.1, label=f"{name} so far")
+        axis.step(*line, where="post", color=color, linewidth=1.1, label=f"{name} so far")
     if panel.others:
         axis.legend(fontsize=8, frameon=False, labelcolor=theme.ink)
     marker = {"marker": "o", "markersize": 3.5} if panel.marked else {}

@@ -209,16 +209,16 @@ def test_the_panels_are_of_the_history():
 
 
 def test_the_population_is_shown_with_what_was_added_and_removed_so_far(tmp_path):
-    shown = history(60, CHANGES)
+    shown = history(90, CHANGES)
     (panel,) = (p for p in curves.panels_of(shown) if p.title == "Gaussians")
     assert set(panel.others) == {"added", "removed"}  # nothing was relocated
     (x, added), (_, removed) = panel.others["added"], panel.others["removed"]
-    assert x.tolist() == [20, 40, 60]
-    now = [change.num_gaussians for change in CHANGES]
-    assert (1000 + added - removed).tolist() == now
+    assert x.tolist() == [0, 20, 40, 60, 90]  # the last iteration
+    now = [1000, *(change.num_gaussians for change in CHANGES)]
+    assert (1000 + added - removed).tolist() == [*now, now[-1]]
     relocated = [*CHANGES, DensityRow(iteration=80, num_gaussians=2400, relocated=7)]
     (panel,) = (p for p in curves.panels_of(history(80, relocated)) if p.title == "Gaussians")
-    assert panel.others["relocated"][1].tolist() == [0, 0, 0, 7]
+    assert panel.others["relocated"][1].tolist() == [0, 0, 0, 0, 7, 7]
     (panel,) = (p for p in curves.panels_of(history(80)) if p.title == "Gaussians")
     assert not panel.others
 

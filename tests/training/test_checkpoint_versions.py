@@ -62,7 +62,8 @@ def test_a_checkpoint_of_an_earlier_version_goes_on(folder, config):
 
 def test_statistics_of_an_earlier_version_are_those_of_adc(folder):
     """Whose names stood among those of the optimizer."""
-    trainer = make_trainer(densify={"start": 2, "every": 6, "adc": {"grad_threshold": 1e-6}})
+    densify = {"strategy": "adc", "start": 2, "every": 6, "adc": {"grad_threshold": 1e-6}}
+    trainer = make_trainer(densify=densify)
     for _ in range(4):
         trainer.step()
     state = trainer.state()
@@ -72,7 +73,7 @@ def test_statistics_of_an_earlier_version_are_those_of_adc(folder):
     save_checkpoint(folder, trainer.config, Checkpoint(earlier, history, 0.0))
     read = load_checkpoint(folder, trainer.config).trainer
     assert {k: v.tobytes() for k, v in read.items()} == {k: v.tobytes() for k, v in state.items()}
-    resumed = make_trainer(densify={"start": 2, "every": 6, "adc": {"grad_threshold": 1e-6}})
+    resumed = make_trainer(densify=densify)
     check_state(read, resumed.state(), 50, 1000)
     resumed.restore(read)
     assert resumed.step().loss == trainer.step().loss
