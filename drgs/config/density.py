@@ -81,6 +81,13 @@ class McmcConfig(Section):
         100_000, ge=4, description="The population grows to this, and no further."
     )
     growth: float = Field(0.05, ge=0, le=10, description="Of the population, at each change.")
+    spread: float = Field(
+        0.5,
+        ge=0,
+        le=10,
+        description="How far copies lie from what they are copies of, in standard deviations; 0 in "
+        "the paper: there, they part only by noise and by what happens to be in front.",
+    )
     min_opacity: float = Field(
         0.005, gt=0, lt=1, description="Gaussians that are not more opaque are moved elsewhere."
     )

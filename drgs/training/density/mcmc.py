@@ -114,11 +114,13 @@ class MarkovChain(DensityStrategy):
                 f"= {config.min_opacity}: do the cameras see the start points?"
             )
         aim = max(num_alive, min(self.cap, int(before * (1 + config.growth))))
-        copied = in_proportion(
-            np.where(alive, opacities, 0), aim - num_alive, [population.seed, iteration]
-        )
+        key = [population.seed, iteration]
+        copied = in_proportion(np.where(alive, opacities, 0), aim - num_alive, key)
         if len(copied):
-            _relocate(population, alive, copied, opacities, config.min_opacity)
+            drawn, rows = _copies(population, copied, opacities, config.min_opacity)
+            _spread(rows, len(drawn), config.spread, [*key, 1])
+            alive[drawn] = False
+            population.edit(_rows(population, np.flatnonzero(alive)), rows)
         elif num_alive < before:
             population.edit(_rows(population, np.flatnonzero(alive)))
         relocated = min(before - num_alive, len(copied))
@@ -154,18 +156,16 @@ def corrected(opacities: np.ndarray, counts: np.ndarray) -> tuple[np.ndarray, np
     return copies, opacities / (terms * copies[:, None] ** j).sum(axis=1)
 
 
-def _relocate(
-    population: Population,
-    alive: np.ndarray,
-    copied: np.ndarray,
-    opacities: np.ndarray,
-    min_opacity: float,
-) -> None:
-    """Keep what is alive, and copy some of it; copied: row numbers, ascending."""
+def _copies(
+    population: Population, copied: np.ndarray, opacities: np.ndarray, min_opacity: float
+) -> tuple[np.ndarray, dict[str, Any]]:
+    """Which rows are drawn; and what takes their place: themselves, as corrected, then copies.
+
+    copied: row numbers, ascending; opacities: (N,), of all rows.
+    """
     drawn, counts = np.unique(copied, return_counts=True)
     shared, factors = corrected(opacities[drawn], counts + 1)
     shared = np.clip(shared, min_opacity, MOST_OPAQUE)
-    alive[drawn] = False
     rows = population.take(_rows(population, np.append(drawn, copied)))
     # Of each new row, the place of its source among those that were drawn.
     source = np.append(np.arange(len(drawn)), np.searchsorted(drawn, copied))
@@ -175,7 +175,24 @@ def _relocate(
     rows["log_scales"] = rows["log_scales"] + t.TensorXf(
         from_host(t.Float, log_factors), rows["log_scales"].shape
     )
-    population.edit(_rows(population, np.flatnonzero(alive)), rows)
+    return drawn, rows
+
+
+def _spread(rows: dict[str, Any], num_drawn: int, spread: float, key: list[int]) -> None:
+    """Move the copies, which stand behind those that were drawn, by so many standard deviations.
+
+    By spread R(q) (s * n), n standard normal; key: what the random numbers depend on.
+    """
+    t, shape = types_of(type(rows["logit_opacities"])), rows["means"].shape
+    normals = np.random.default_rng(key).standard_normal(shape)
+    normals[:num_drawn] = 0
+    mean, log_scale, quat = (
+        dr.unravel(vector, rows[name].array)
+        for vector, name in ((t.Array3f, "means"), (t.Array3f, "log_scales"), (t.Array4f, "quats"))
+    )
+    normal = dr.unravel(t.Array3f, from_host(t.Float, spread * normals))
+    moved = mean + quat_to_rotation(quat) @ (dr.exp(log_scale) * normal)
+    rows["means"] = t.TensorXf(dr.ravel(moved), shape)
 
 
 def _rows(population: Population, numbers: np.ndarray) -> Any:

@@ -20,6 +20,8 @@ SIZE, DEAD = 0.05, 0.001
 
 
 def strategy(max_gaussians=1_000_000, **mcmc):
+    """Copies lie where their sources are, unless the test is about that."""
+    mcmc = {"spread": 0.0} | mcmc
     config = DensifyConfig(start=500, stop=15_000, max_gaussians=max_gaussians, mcmc=mcmc)
     result = MarkovChain(config)
     result.begin(rows_of(make([SIZE], 0.5)))
@@ -115,6 +117,22 @@ def test_the_picture_before_and_after_is_nearly_the_same():
     # As much light in all along lines through the centre; the profile itself is not Gaussian.
     assert np.abs(before - 1).max() > 0.3
     assert np.abs(picture() - before).max() < 0.06 * np.abs(before - 1).max()
+
+
+def test_copies_are_spread_over_what_they_are_copies_of():
+    num, opacity = 4000, 0.7
+    optimizer = make(np.full(num, 0.3), opacity, tensor_type=TensorXf64)
+    before = values(optimizer)
+    assert act(optimizer, growth=1.0, spread=0.5).num_added == num
+    after = values(optimizer)["means"]
+    np.testing.assert_array_equal(after[:num], before["means"])  # all are drawn once
+    _, factors = corrected(np.array([opacity]), np.array([2]))
+    covariances = reference.covariances(before["quats"], before["log_scales"])
+    whiten = np.linalg.inv(np.linalg.cholesky((0.5 * factors[0]) ** 2 * covariances))
+    normal = (whiten @ (after[num:] - before["means"])[..., None])[..., 0]
+    # Five standard deviations of sample means and covariances.
+    assert np.abs(normal.mean(0)).max() < 5 / math.sqrt(num)
+    assert np.abs(np.cov(normal.T) - np.eye(3)).max() < 5 * math.sqrt(2 / num)
 
 
 def test_what_is_nearly_transparent_stays_transparent_when_it_is_copied():

@@ -24,6 +24,11 @@ STRATEGIES = {
     "mcmc": MCMC,
     "selection": {"densify__prune__to": 20},
     "importance": {"densify__prune__to": 20, "densify__prune__method": "importance"},
+    "budget and selection": {
+        "densify__strategy": "budget",
+        "densify__budget__gaussians": 60,
+        "densify__prune__to": 20,
+    },
     "mcmc and selection": MCMC | {"densify__prune__to": 20},
 }
 
@@ -76,7 +81,7 @@ def test_a_fit_resumes_to_the_same_bytes_wherever_it_ends(name, pause):
     assert got.keys() == expected.keys()
     assert [key for key in expected if got[key] != expected[key]] == []
     assert len(set(sizes)) > 2
-    if "mcmc" in name:
+    if "mcmc" in name or "budget" in name:
         assert max(sizes) <= 60
     if name != "mcmc":
         assert sizes[23:] == [20] * 4
