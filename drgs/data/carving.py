@@ -11,6 +11,7 @@ lost however thin it is. What is opaque in such a box is counted by a summed-are
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -71,6 +72,9 @@ by this."""
 THIN = 1.5
 """Edges of a cube: one so far from all points of the hull is a part of it too thin to be hit."""
 
+THIN_LEVELS = 3
+"""Divisions of such a cube, after which it is known well enough whether there is one."""
+
 CHUNK = 1 << 15
 """Cubes that are projected at once: their numbers stay in the processor's cache."""
 
@@ -81,22 +85,23 @@ class Silhouette:
 
     view: View
     scale: int
+    opaque: np.ndarray  # (rows, columns) bool
     table: np.ndarray  # (rows + 1, columns + 1) int32: opaque pixels above and to the left
     transparent: float  # part of the picture
 
-    @property
-    def shape(self) -> tuple[int, int]:
-        """Rows and columns."""
-        return self.table.shape[0] - 1, self.table.shape[1] - 1
-
 
 def silhouettes_of(views: Sequence[View]) -> list[Silhouette]:
-    """Those of the views with alpha whose camera stands still.
+    """Those of the views that are looked at and have alpha, and whose camera stands still.
 
     A pixel that a mask leaves out is not known to be empty, and so is part of the silhouette.
     """
-    views = [view for view in views if view.alpha is not None and is_projectable(view)]
-    return [_silhouette(view) for view in views[:: -(-len(views) // MOST_VIEWS) or 1]]
+    views = [v for v in looked_at(views) if v.alpha is not None and is_projectable(v)]
+    return [_silhouette(view) for view in views]
+
+
+def looked_at(views: Sequence[View]) -> Sequence[View]:
+    """All of them, or every n-th of many."""
+    return views[:: -(-len(views) // MOST_VIEWS) or 1]
 
 
 def _silhouette(view: View) -> Silhouette:
@@ -111,7 +116,7 @@ def _silhouette(view: View) -> Silhouette:
     table = np.zeros((opaque.shape[0] + 1, opaque.shape[1] + 1), np.int32)
     np.cumsum(opaque, axis=0, dtype=np.int32, out=table[1:, 1:])
     np.cumsum(table[1:, 1:], axis=1, out=table[1:, 1:])
-    return Silhouette(view, scale, table, transparent)
+    return Silhouette(view, scale, opaque, table, transparent)
 
 
 def num_transparent(silhouettes: Sequence[Silhouette]) -> int:
@@ -120,9 +125,9 @@ def num_transparent(silhouettes: Sequence[Silhouette]) -> int:
 
 
 def are_masks(silhouettes: Sequence[Silhouette], views: Sequence[View]) -> bool:
-    """Whether the alpha of the pictures (of ``views``, all of them) says what is to be fitted."""
-    wanted = min(len(views), MOST_VIEWS)
-    return num_transparent(silhouettes) >= max(LEAST_VIEWS, NEARLY_ALL * wanted)
+    """Whether the alpha of the pictures, whose views are ``views``, says what is to be fitted."""
+    wanted = NEARLY_ALL * len(looked_at(views))
+    return num_transparent(silhouettes) >= max(LEAST_VIEWS, wanted)
 
 
 @dataclass(frozen=True, eq=False)
@@ -171,7 +176,7 @@ def hull_points(silhouettes: Sequence[Silhouette], box: Box, count: int, seed: i
     points = _points_in(silhouettes, coarse, seed)
     if not len(points):
         return points
-    edge = coarse.edge * np.sqrt(len(points) / (SPARE * count))
+    edge = coarse.edge * math.sqrt(len(points) / (SPARE * count))
     centers = coarse.centers()
     low, high = (c + s * coarse.edge / 2 for c, s in ((centers.min(0), -1), (centers.max(0), 1)))
     levels = max(0, int(np.ceil(np.log2((high - low).max() / (ROOTS * edge)))))
@@ -196,22 +201,27 @@ def _surface(silhouettes: Sequence[Silhouette], cubes: Cubes, levels: int, enoug
 
 
 def _points_in(silhouettes: Sequence[Silhouette], cubes: Cubes, seed: int) -> np.ndarray:
-    """(M, 3): points of the hull near its surface, at most one in each eighth of a cube.
-
-    And the middle of a cube that is far from all points of the hull: of a part too thin to be hit.
-    """
+    """(M, 3): points of the hull near its surface, at most one in each eighth of a cube."""
     eighths = cubes.divided()
     jitter = np.random.Generator(np.random.Philox(key=seed)).random((len(eighths), 3)) - 0.5
     inside = eighths.centers() + eighths.edge * jitter
     inside = inside[_shown_by_all(silhouettes, inside, 0.0)]
-    if not len(inside):
-        return cubes.centers()
-    with denormals_kept():
-        distance, _ = cKDTree(inside).query(cubes.centers())
-    thin = cubes.centers()[distance > THIN * cubes.edge]
-    thin = thin[_shown_by_all(silhouettes, thin, cubes.edge)]
+    thin = cubes
+    if len(inside):
+        with denormals_kept():
+            distance, _ = cKDTree(inside).query(cubes.centers())
+        thin = cubes.chosen(distance > THIN * cubes.edge)
     surface = inside[_half_empty(silhouettes, inside, SHELL * eighths.edge)]
-    return np.concatenate([surface, thin])
+    return np.concatenate([surface, _thin_points(silhouettes, thin)])
+
+
+def _thin_points(silhouettes: Sequence[Silhouette], cubes: Cubes) -> np.ndarray:
+    """(M, 3): where cubes without a point have parts of the hull, at most one in each eighth."""
+    for _ in range(THIN_LEVELS):
+        cubes = cubes.divided()
+        cubes = cubes.chosen(_shown_by_all(silhouettes, cubes.centers(), cubes.edge))
+    _, first = np.unique(cubes.index >> (THIN_LEVELS - 1), axis=0, return_index=True)
+    return cubes.centers()[np.sort(first)]
 
 
 def _shown_by_all(
@@ -223,12 +233,13 @@ def _shown_by_all(
     """
     columns = [np.ascontiguousarray(c) for c in centers.T]
     rows, seen = np.arange(len(centers)), np.zeros(len(centers), np.int32)
+    look = _look_at_cubes if edge > 0 else _look_at_points
     for silhouette in silhouettes:
         kept = [rows[:0]]
         for some in _chunks(rows):
-            whole, opaque, area = _opaque_pixels(silhouette, columns, some, edge)
-            seen[some] += area > 0
-            kept.append(some[~(whole & (opaque == 0))])
+            shown, empty = look(silhouette, columns, some, edge)
+            seen[some] += shown
+            kept.append(some[~empty])
         rows = np.concatenate(kept)
     result = np.zeros(len(centers), bool)
     result[rows] = seen[rows] >= LEAST_SEEN * len(silhouettes)
@@ -251,6 +262,26 @@ def _chunks(rows: np.ndarray) -> list[np.ndarray]:
     return [rows[start : start + CHUNK] for start in range(0, len(rows), CHUNK)]
 
 
+def _look_at_points(
+    silhouette: Silhouette, centers: Columns, rows: np.ndarray, _edge: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Whether points are in the picture; whether it shows that there is nothing. See below."""
+    view, (height, width) = silhouette.view, silhouette.opaque.shape
+    u, v, depth = to_film(view, to_camera(view, [c[rows] for c in centers], np.float32))
+    u, v = np.floor(u / silhouette.scale), np.floor(v / silhouette.scale)
+    shown = (depth > 0) & (u >= 0) & (u < width) & (v >= 0) & (v < height)
+    place = np.where(shown, v * width + u, 0).astype(np.int64)
+    return shown, shown & ~silhouette.opaque.ravel()[place]
+
+
+def _look_at_cubes(
+    silhouette: Silhouette, centers: Columns, rows: np.ndarray, edge: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Whether some of each cube is in the picture; whether it shows that there is nothing."""
+    whole, opaque, area = _opaque_pixels(silhouette, centers, rows, edge)
+    return area > 0, whole & (opaque == 0)
+
+
 def _opaque_pixels(
     silhouette: Silhouette, centers: Columns, rows: np.ndarray, edge: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -261,21 +292,20 @@ def _opaque_pixels(
     A pinhole shows p + d at a distance from p of at most |J d| z / (z - d_z), with J the derivative
     at p, which differences bound in the same way.
     """
-    view, (height, width) = silhouette.view, silhouette.shape
-    position = to_camera(view, [c[rows] for c in centers])
+    view, (height, width) = silhouette.view, silhouette.opaque.shape
+    position = to_camera(view, [c[rows] for c in centers], np.float32)
     u, v, depth = to_film(view, position)
     half_u, half_v = np.zeros_like(u), np.zeros_like(v)
-    reach = 0.5 * np.sqrt(3) * edge
+    reach = 0.5 * math.sqrt(3) * edge
     seen = depth > 2 * reach
-    if edge > 0:
-        for step in 0.5 * edge * view.camera_to_world[:3, :3]:
-            moved = to_film(view, [p + s for p, s in zip(position, step, strict=True)])
-            half_u += np.abs(moved[0] - u)
-            half_v += np.abs(moved[1] - v)
-            seen &= moved[2] > 0
-        stretch = (depth + reach) / np.where(seen, depth - reach, 1)
-        half_u *= stretch
-        half_v *= stretch
+    for step in (0.5 * edge * view.camera_to_world[:3, :3]).tolist():
+        moved = to_film(view, [p + s for p, s in zip(position, step, strict=True)])
+        half_u += np.abs(moved[0] - u)
+        half_v += np.abs(moved[1] - v)
+        seen &= moved[2] > 0
+    stretch = (depth + reach) / np.where(seen, depth - reach, 1)
+    half_u *= stretch
+    half_v *= stretch
     stride, flat = width + 1, silhouette.table.ravel()
     whole = seen
     bounds = []
@@ -283,7 +313,7 @@ def _opaque_pixels(
         first = np.floor((place - half) / silhouette.scale)
         last = np.floor((place + half) / silhouette.scale) + 1
         whole = whole & (first >= 0) & (last <= size)
-        bounds += [np.where(seen, np.clip(b, 0, size), 0).astype(np.int64) for b in (first, last)]
+        bounds += [np.where(seen, np.clip(b, 0, size), 0).astype(np.int32) for b in (first, last)]
     left, right, top, bottom = bounds
     area = (right - left) * (bottom - top)
     top *= stride

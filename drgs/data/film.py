@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from drgs.cameras.radial_tangential import RadialTangential
 
 Columns = Sequence[np.ndarray]
-"""Of coordinates: x, y, z, each (N,) float64."""
+"""Of coordinates: x, y, z, each (N,)."""
 
 
 def is_projectable(view: Viewpoint) -> bool:
@@ -27,10 +27,14 @@ def is_projectable(view: Viewpoint) -> bool:
     return view.motion is None and (view.lens is None or view.lens.kind in _PLACES)
 
 
-def to_camera(view: Viewpoint, points: Columns) -> list[np.ndarray]:
-    """Points in the camera's axes (x right, y down, z forward), scene units; points: world."""
-    offsets = [p - c for p, c in zip(points, view.center, strict=True)]
-    axes = view.camera_to_world[:3, :3].T
+def to_camera(view: Viewpoint, points: Columns, dtype: type = np.float64) -> list[np.ndarray]:
+    """Points in the camera's axes (x right, y down, z forward), scene units.
+
+    points: world, float64; dtype: of the result. It is enough to have offsets from the camera in
+    single precision, wherever both are.
+    """
+    center, axes = view.center.tolist(), view.camera_to_world[:3, :3].T.tolist()
+    offsets = [(p - c).astype(dtype, copy=False) for p, c in zip(points, center, strict=True)]
     return [a * offsets[0] + b * offsets[1] + c * offsets[2] for a, b, c in axes]
 
 
@@ -42,7 +46,8 @@ def to_film(view: Viewpoint, position: Columns) -> tuple[np.ndarray, np.ndarray,
     """
     place = _PLACES[None if view.lens is None else view.lens.kind]
     x, y, depth = place(view.lens, *position)
-    return view.fx * x + view.cx, view.fy * y + view.cy, depth
+    fx, fy, cx, cy = map(float, (view.fx, view.fy, view.cx, view.cy))
+    return fx * x + cx, fy * y + cy, depth
 
 
 def _through_pinhole(_lens: None, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> Columns:

@@ -165,10 +165,10 @@ def _coloured(start: Start, dataset: Dataset) -> Start:
 
 def _transparent(silhouettes: Sequence[Silhouette], dataset: Dataset) -> str:
     """How many of the pictures are, for a message."""
-    from drgs.data.carving import LEAST_TRANSPARENT, num_transparent
+    from drgs.data.carving import LEAST_TRANSPARENT, looked_at, num_transparent
 
     return (
-        f"only {num_transparent(silhouettes)} of {len(dataset.train)} are to "
+        f"only {num_transparent(silhouettes)} of {len(looked_at(dataset.train))} are to "
         f"{100 * LEAST_TRANSPARENT:g} % or more, from a camera that stands still"
     )
 

@@ -21,12 +21,12 @@ def carved(views, count=1500, seed=0, within=WHOLE):
 
 @pytest.fixture(scope="module")
 def ball():
-    return pictures_of(sphere(0.8), 24)
+    return pictures_of(sphere(0.8), 16)
 
 
 @pytest.fixture(scope="module")
 def brick():
-    return pictures_of(box((-0.5, -0.25, -0.75), (0.5, 0.25, 0.75)), 24)
+    return pictures_of(box((-0.5, -0.25, -0.75), (0.5, 0.25, 0.75)), 16)
 
 
 def test_points_of_a_ball_are_on_its_surface(ball):
@@ -34,7 +34,7 @@ def test_points_of_a_ball_are_on_its_surface(ball):
     assert 0.7 * 1500 < len(points) <= 1500
     # A shell of area 4 pi r^2 has a cube of this edge for each point.
     cell = np.sqrt(4 * np.pi * 0.8**2 / len(points))
-    # A pixel that is partly covered, at distance 4: 0.04. A hull of 24 views bulges by about that.
+    # A pixel that is partly covered, at distance 4: 0.04. A hull of 16 views bulges by about that.
     off = np.linalg.norm(points, axis=1) - 0.8
     assert off.max() < cell + 0.04
     assert off.min() > -cell - 0.04
@@ -63,12 +63,12 @@ def test_no_picture_shows_a_point_empty(views, request):
 
 
 def test_the_number_of_points_is_never_exceeded_and_nearly_reached(ball):
-    for count in (50, 400, 4000):
+    for count in (50, 400, 3000):
         assert 0.6 * count <= len(carved(ball, count)) <= count
 
 
 def test_a_body_that_is_small_in_its_box_has_as_many_points():
-    views = pictures_of(sphere(0.05, (0.3, 0.2, -0.1)), 24, size=200, samples=1)
+    views = pictures_of(sphere(0.05, (0.3, 0.2, -0.1)), 12, size=200, samples=1)
     points = carved(views, 500)
     assert len(points) > 300
     assert np.linalg.norm(points - [0.3, 0.2, -0.1], axis=1).max() < 0.08
@@ -77,7 +77,7 @@ def test_a_body_that_is_small_in_its_box_has_as_many_points():
 def test_a_thin_pole_is_not_lost():
     """Its width is a fifth of a pixel and a fifteenth of a cube; beside it is a body."""
     pole = box((-0.004, 0.596, -1), (0.004, 0.604, 1))
-    views = pictures_of(together(pole, sphere(0.4)), 12, samples=8)
+    views = pictures_of(together(pole, sphere(0.4)), 10, samples=7)
     points = carved(views, 600)
     near = points[np.linalg.norm(points[:, :2] - [0, 0.6], axis=1) < 0.12]
     assert np.diff(np.sort([-1, *near[:, 2], 1])).max() < 0.25
@@ -93,16 +93,16 @@ def test_little_memory_is_taken(ball):
     """That of a chunk of cubes, and some numbers of each cube."""
     silhouettes = silhouettes_of(ball)
     tracemalloc.start()
-    hull_points(silhouettes, WHOLE, 6000, 0)
+    hull_points(silhouettes, WHOLE, 3000, 0)
     _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
-    assert peak < 30e6
+    assert peak < 20e6
 
 
 def test_large_pictures_are_looked_at_in_larger_pixels(ball):
     large = [replace(v, alpha=np.kron(v.alpha, np.ones((20, 20), np.float32))) for v in ball[:2]]
     for silhouette, view in zip(silhouettes_of(large), ball, strict=False):
-        assert silhouette.scale == 3 and silhouette.shape == (427, 427)
+        assert silhouette.scale == 3 and silhouette.opaque.shape == (427, 427)
         wide = np.pad(np.kron(view.alpha, np.ones((20, 20))) > 4 / 255, ((0, 1), (0, 1)))
         opaque = wide.reshape(427, 3, 427, 3).any(axis=(1, 3))
         for rows, columns in ((427, 427), (200, 210), (1, 1), (250, 1)):
@@ -114,9 +114,7 @@ def test_pixels_that_a_mask_leaves_out_say_nothing(ball):
     hole = np.zeros((64, 64), bool)
     hole[20:40, 20:40] = True
     wrong = [replace(v, alpha=np.where(hole, 0, v.alpha)) for v in ball[:2]]
-    assert len(carved([*wrong, *ball[2:]], 300)) < 0.9 * len(carved(ball, 300)) or (
-        np.linalg.norm(carved([*wrong, *ball[2:]], 300), axis=1).min() < 0.5
-    )
+    assert np.linalg.norm(carved([*wrong, *ball[2:]], 300), axis=1).min() < 0.55
     masked = [replace(v, mask=np.where(hole, 0, 1).astype(np.float32)) for v in wrong]
     points = carved([*masked, *ball[2:]], 300)
     assert np.abs(np.linalg.norm(points, axis=1) - 0.8).max() < 0.3
@@ -124,7 +122,7 @@ def test_pixels_that_a_mask_leaves_out_say_nothing(ball):
 
 def test_a_camera_that_moves_is_left_out(ball):
     moving = replace(ball[0], motion=Motion(np.eye(4), "global"), alpha=0 * ball[0].alpha)
-    assert len(silhouettes_of([moving, *ball[1:]])) == 23
+    assert len(silhouettes_of([moving, *ball[1:]])) == 15
     assert len(carved([moving, *ball[1:]], 300)) > 200
 
 
@@ -156,7 +154,7 @@ def test_alpha_is_a_mask_where_nearly_all_pictures_are_transparent_somewhere(bal
     plain = [replace(view, alpha=None) for view in ball]
     for views, expected in (
         (ball, True),
-        ([*ball[1:], opaque[0]], True),
+        ([*ball, *ball[1:], opaque[0]], True),
         ([*ball[3:], *opaque[:3]], False),
         ([*ball[3:], *plain[:3]], False),
         (opaque, False),

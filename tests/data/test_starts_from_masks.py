@@ -153,6 +153,7 @@ def test_starts_that_contradict_each_other_are_refused(init, message):
         config(**init)
 
 
+@pytest.mark.slow
 def test_the_real_lego_starts_on_its_hull(lego_folder):
     dataset = load(lego_folder, image_size=100)
     start = start_of(config(num_points=3000), dataset)
