@@ -7,9 +7,9 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-import yaml
+from support.fit_command import write_scene
 from support.folders import visible
-from support.small_capture import blobs, make_dataset, write_dataset
+from support.small_capture import blobs
 
 from drgs import fit, render
 from drgs.cli.execution import executing
@@ -145,16 +145,13 @@ def test_number_of_threads_that_the_system_refuses_is_the_users_to_change(monkey
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory):
     folder = tmp_path_factory.mktemp("scene")
-    write_dataset(folder / "data", make_dataset(train=3, test=1))
-    values = {
-        "data": {"path": "data"},
-        "init": {"num_points": 40, "half_extent": 0.5},
-        "model": {"sh_degree": 1, "sh_increase_every": 2},
-        "densify": {"start": 1, "stop": 4, "every": 2, "reset_every": 3, "grad_threshold": 1e-6},
-        "iterations": 3,
-        "output": {"checkpoint_every": 1},
-    }
-    (folder / "a.yml").write_text(yaml.safe_dump(values))
+    write_scene(
+        folder,
+        model={"sh_degree": 1, "sh_increase_every": 2},
+        densify={"start": 1, "stop": 4, "every": 2, "reset_every": 3, "grad_threshold": 1e-6},
+        iterations=3,
+        output={"checkpoint_every": 1},
+    )
     blobs().save(folder / "blobs.ply")
     return folder
 

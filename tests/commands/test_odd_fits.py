@@ -7,26 +7,17 @@ import warnings
 
 import numpy as np
 import pytest
-import yaml
 from plyfile import PlyData, PlyElement
 from support.commands import run_in_process
-from support.small_capture import make_dataset, write_dataset
+from support.fit_command import write_scene
 
 from drgs import fit
 
 
 @pytest.fixture
 def scene(tmp_path):
-    write_dataset(tmp_path / "data", make_dataset(train=3, test=1))
-    values = {
-        "data": {"path": "data"},
-        "init": {"num_points": 40, "half_extent": 0.5},
-        "model": {"sh_degree": 1},
-        "iterations": 3,
-        "output": {"checkpoint_every": 1},
-    }
-    (tmp_path / "a.yml").write_text(yaml.safe_dump(values))
-    return tmp_path
+    often = {"checkpoint_every": 1}
+    return write_scene(tmp_path, model={"sh_degree": 1}, iterations=3, output=often).parent
 
 
 @pytest.fixture

@@ -6,11 +6,10 @@ import warnings
 import mitsuba as mi
 import numpy as np
 import pytest
-import yaml
 from annotated_types import Ge, Gt, Le, Lt
 from pydantic import BaseModel
 from support.commands import run_in_process
-from support.small_capture import make_dataset, write_dataset
+from support.fit_command import write_scene
 from support.small_fits import make_trainer, plain_dataset
 
 from drgs import fit
@@ -98,20 +97,15 @@ def test_every_number_has_two_limits(key, ends):
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("scene")
-    write_dataset(folder / "data", make_dataset(train=3, test=1))
-    values = {
-        "data": {"path": "data"},
-        "init": {"num_points": 40, "half_extent": 0.5},
-        "model": {"sh_degree": 1, "sh_increase_every": 2, "smoothing": True},
-        "colors": {"lr": 0.02},
-        "cameras": {"optimise": True, "focal_lr": 1e-4, "principal_lr": 1e-4},
-        "densify": {"start": 1, "stop": 4, "every": 2, "reset_every": 3, "grad_threshold": 1e-6},
-        "iterations": 4,
-        "output": {"save_renders": False},
-    }
-    (folder / "a.yml").write_text(yaml.safe_dump(values))
-    return folder
+    return write_scene(
+        tmp_path_factory.mktemp("scene"),
+        model={"sh_degree": 1, "sh_increase_every": 2, "smoothing": True},
+        colors={"lr": 0.02},
+        cameras={"optimise": True, "focal_lr": 1e-4, "principal_lr": 1e-4},
+        densify={"start": 1, "stop": 4, "every": 2, "reset_every": 3, "grad_threshold": 1e-6},
+        iterations=4,
+        output={"save_renders": False},
+    ).parent
 
 
 @pytest.mark.slow

@@ -11,9 +11,10 @@ from support.small_capture import make_dataset, write_dataset
 
 ITERATIONS = 8
 
+SMALL = {"data": {"path": "data"}, "init": {"num_points": 40, "half_extent": 0.5}}
+"""Sections that all scenes have here."""
+
 VALUES = {
-    "data": {"path": "data"},
-    "init": {"num_points": 40, "half_extent": 0.5},
     "model": {"sh_degree": 1, "sh_increase_every": 3},
     "densify": {"start": 1, "stop": 7, "every": 2, "reset_every": 3, "grad_threshold": 1e-6},
     "iterations": ITERATIONS,
@@ -21,11 +22,16 @@ VALUES = {
 }
 
 
-def write_project(folder: Path, **values: object) -> Path:
-    """``data/`` and ``a.yml``, which fits it; values: other sections. Returns ``a.yml``."""
-    write_dataset(folder / "data", make_dataset(train=3, test=2))
-    (folder / "a.yml").write_text(yaml.safe_dump({**VALUES, **values}))
+def write_scene(folder: Path, test: int = 1, **values: object) -> Path:
+    """``data/`` and ``a.yml``, which fits it; values: its other sections. Returns ``a.yml``."""
+    write_dataset(folder / "data", make_dataset(train=3, test=test))
+    (folder / "a.yml").write_text(yaml.safe_dump({**SMALL, **values}))
     return folder / "a.yml"
+
+
+def write_project(folder: Path, **values: object) -> Path:
+    """The same, of fits that save often; values: other sections than :data:`VALUES`."""
+    return write_scene(folder, test=2, **{**VALUES, **values})
 
 
 def run_fit(*arguments: object) -> Outcome:

@@ -7,9 +7,8 @@ import zipfile
 
 import numpy as np
 import pytest
-import yaml
 from support.commands import run_in_process
-from support.small_capture import make_dataset, write_dataset
+from support.fit_command import write_scene
 
 from drgs import fit
 from drgs.core.errors import UserError
@@ -19,17 +18,14 @@ from drgs.core.errors import UserError
 def stopped(tmp_path_factory):
     """The folder of a fit of 4 iterations that was stopped after the second."""
     folder = tmp_path_factory.mktemp("fit")
-    write_dataset(folder / "data", make_dataset(train=3, test=1))
-    values = {
-        "data": {"path": "data"},
-        "init": {"num_points": 40, "half_extent": 0.5},
-        "model": {"sh_degree": 1, "smoothing": True},
-        "colors": {"lr": 0.02},
-        "cameras": {"optimise": True},
-        "iterations": 4,
-        "output": {"checkpoint_every": 1, "history_every": 1},
-    }
-    (folder / "a.yml").write_text(yaml.safe_dump(values))
+    write_scene(
+        folder,
+        model={"sh_degree": 1, "smoothing": True},
+        colors={"lr": 0.02},
+        cameras={"optimise": True},
+        iterations=4,
+        output={"checkpoint_every": 1, "history_every": 1},
+    )
     step = fit.Trainer.step
 
     def step_or_stop(trainer):
