@@ -82,7 +82,7 @@ class McmcConfig(Section):
     )
     growth: float = Field(0.05, ge=0, le=10, description="Of the population, at each change.")
     spread: float = Field(
-        0.5,
+        1.0,
         ge=0,
         le=10,
         description="How far copies lie from what they are copies of, in standard deviations; 0 in "
@@ -92,11 +92,12 @@ class McmcConfig(Section):
         0.005, gt=0, lt=1, description="Gaussians that are not more opaque are moved elsewhere."
     )
     noise_lr: float = Field(
-        1e7,
+        1e5,
         ge=0,
         le=1e12,
         description="Of the noise on means, times their rate and the covariance in squared scene "
-        "extents: 20 times what it is for covariances in the usual scenes' units.",
+        "extents. The paper's would be 1e7, at its scenes' extents; in small pictures, where "
+        "Gaussians are large, that costs 2 dB.",
     )
     opacity_weight: float = Field(
         0.01, ge=0, le=1e6, description="Of the mean opacity, in the loss."
