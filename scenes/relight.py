@@ -41,6 +41,7 @@ from scipy.spatial.transform import Rotation
 import drgs  # noqa: F401  (registers the plugin)
 from drgs.bench.output import markdown_table
 from drgs.cli.errors import exit_on_user_error
+from drgs.config.approximations import said_by
 from drgs.core.arrays import interleave
 from drgs.core.errors import UserError
 from drgs.core.files import atomic_path
@@ -186,7 +187,8 @@ class Stage:
         gaussians = model.to(mi.TensorXf)
         names = [*PARAMETER_NAMES, *(["smoothing"] if model.smoothing is not None else [])]
         tensors = {name: mi.TensorXf(getattr(model, name)) for name in names}
-        splats = {"type": "splats", "nested": {"type": "prb", "max_depth": 3}, **tensors}
+        said = said_by("the model's file", model.rendered_with or {})
+        splats = {"type": "splats", "nested": {"type": "prb", "max_depth": 3}, **said, **tensors}
         heights = model.means[model.opacities >= OPAQUE, 2]
         floor = float(np.quantile(heights, 0.01)) if len(heights) else -0.5
         scene = mi.load_dict({"integrator": splats, **surroundings(floor, size)})

@@ -42,7 +42,7 @@ from drgs.io.figures import new_figure, write_figure
 from drgs.reference import rays as reference_rays
 from drgs.reference import splatting as reference
 from drgs.results import metrics
-from drgs.results.files import CONFIG, GAUSSIANS
+from drgs.results.files import CONFIG, GAUSSIANS, GAUSSIANS_FOR_VIEWERS
 from drgs.splatting import rendering
 from drgs.splatting.image_model import PixelCenters, Positions
 
@@ -188,11 +188,14 @@ def run(args: argparse.Namespace) -> None:
 def load_subject(path: Path, num_views: int) -> Subject:
     """A fit's folder with evenly spaced test views, or a PLY file seen by the bench camera.
 
-    A 3D smoothing filter becomes part of the Gaussians. Raises UserError for views that are not
-    those of pinholes at rest.
+    Of a folder, the Gaussians are those for viewers if it has them: what is measured is by how much
+    the defaults approximate. A 3D smoothing filter becomes part of the Gaussians.
+
+    Raises UserError for views that are not those of pinholes at rest.
     """
     if path.is_dir():
-        ply, config_file = path / GAUSSIANS, path / CONFIG
+        ply, config_file = path / GAUSSIANS_FOR_VIEWERS, path / CONFIG
+        ply = ply if ply.exists() else path / GAUSSIANS
         for file in (ply, config_file):
             if not file.exists():
                 raise UserError(f"{file}: not there; {path} must be the folder of a finished fit")
