@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import argparse
 import csv
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 
 import drjit as dr
@@ -34,13 +35,23 @@ def add_out(
     )
 
     def run_with_own_files(args: argparse.Namespace) -> None:
-        FolderRecord(args.out, COMMAND).claim(names)
-        try:
+        with own_files(args.out, names):
             run(args)
-        finally:
-            FolderRecord(args.out, COMMAND).seal()
 
     parser.set_defaults(run=run_with_own_files)
+
+
+@contextmanager
+def own_files(folder: Path, names: Sequence[str]) -> Iterator[None]:
+    """A block that may write the files ``names`` of a folder.
+
+    Raises :class:`UserError` before it begins where one is there that no measurement has written.
+    """
+    FolderRecord(folder, COMMAND).claim(names)
+    try:
+        yield
+    finally:
+        FolderRecord(folder, COMMAND).seal()
 
 
 def machine() -> str:

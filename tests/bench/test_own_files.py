@@ -44,7 +44,7 @@ def test_what_a_measurement_would_write_is_refused_before_it_begins(name, tmp_pa
     module = importlib.import_module(f"drgs.bench.{name}")
     parser = CommandParser()
     module.add_arguments(parser)
-    folder = tmp_path / name if name in ("population", "training") else tmp_path
+    folder = tmp_path / name if name in ("population", "recipes", "training") else tmp_path
     folder.mkdir(exist_ok=True)
     (folder / f"{name}.csv").write_text("mine")
     args = parser.parse_args(["--out", str(tmp_path)])
