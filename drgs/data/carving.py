@@ -26,6 +26,10 @@ from drgs.data.types import View
 TRANSPARENT = 4 / 255
 """Alpha: what is no more opaque than this is empty. Mattes have noise."""
 
+SOLID = 0.5
+"""Alpha: what is less opaque is mostly beside what there is. A point in there would be too far out;
+parts that are nowhere more opaque are found as those are that are too thin to be hit."""
+
 LEAST_TRANSPARENT = 0.02
 """Of a picture whose alpha is a mask. Corners that are empty since distortion was removed are less
 of most."""
@@ -61,11 +65,11 @@ MOST_CUBES = 12
 """Of the wanted number of points: cubes that are divided, at most. Silhouettes of noise have a
 surface everywhere."""
 
-SHELL = 0.67
+SHELL = 1.2
 """Of the points' distance to each other: edge of a cube around a point on the surface, which some
 picture shows half empty."""
 
-MARGIN = 1.5
+MARGIN = 1.6
 """Times the edge of a cube: all of the shell is in cubes that are half empty when they are widened
 by this."""
 
@@ -85,7 +89,7 @@ class Silhouette:
 
     view: View
     scale: int
-    opaque: np.ndarray  # (rows, columns) bool
+    solid: np.ndarray  # (rows, columns) bool: opaque to a half at least
     table: np.ndarray  # (rows + 1, columns + 1) int32: opaque pixels above and to the left
     transparent: float  # part of the picture
 
@@ -105,18 +109,26 @@ def looked_at(views: Sequence[View]) -> Sequence[View]:
 
 
 def _silhouette(view: View) -> Silhouette:
-    opaque = np.asarray(view.alpha) > TRANSPARENT
+    alpha = np.asarray(view.alpha)
+    opaque, solid = alpha > TRANSPARENT, alpha >= SOLID
     transparent = 1 - float(opaque.mean())
     if view.mask is not None:
-        opaque |= np.asarray(view.mask) == 0
+        unknown = np.asarray(view.mask) == 0
+        opaque |= unknown
+        solid |= unknown
     scale = -(-max(opaque.shape) // MOST_PIXELS)
-    for axis in (0, 1):
-        starts = np.arange(0, opaque.shape[axis], scale)
-        opaque = np.logical_or.reduceat(opaque, starts, axis=axis)
+    opaque, solid = (_any_of(pixels, scale) for pixels in (opaque, solid))
     table = np.zeros((opaque.shape[0] + 1, opaque.shape[1] + 1), np.int32)
     np.cumsum(opaque, axis=0, dtype=np.int32, out=table[1:, 1:])
     np.cumsum(table[1:, 1:], axis=1, out=table[1:, 1:])
-    return Silhouette(view, scale, opaque, table, transparent)
+    return Silhouette(view, scale, solid, table, transparent)
+
+
+def _any_of(pixels: np.ndarray, scale: int) -> np.ndarray:
+    """Whether any pixel is set in squares of ``scale``; the last ones may be smaller."""
+    for axis in (0, 1):
+        pixels = np.logical_or.reduceat(pixels, np.arange(0, pixels.shape[axis], scale), axis)
+    return pixels
 
 
 def num_transparent(silhouettes: Sequence[Silhouette]) -> int:
@@ -265,13 +277,13 @@ def _chunks(rows: np.ndarray) -> list[np.ndarray]:
 def _look_at_points(
     silhouette: Silhouette, centers: Columns, rows: np.ndarray, _edge: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Whether points are in the picture; whether it shows that there is nothing. See below."""
-    view, (height, width) = silhouette.view, silhouette.opaque.shape
+    """Whether points are in the picture; whether it shows them beside what is solid."""
+    view, (height, width) = silhouette.view, silhouette.solid.shape
     u, v, depth = to_film(view, to_camera(view, [c[rows] for c in centers], np.float32))
     u, v = np.floor(u / silhouette.scale), np.floor(v / silhouette.scale)
     shown = (depth > 0) & (u >= 0) & (u < width) & (v >= 0) & (v < height)
     place = np.where(shown, v * width + u, 0).astype(np.int64)
-    return shown, shown & ~silhouette.opaque.ravel()[place]
+    return shown, shown & ~silhouette.solid.ravel()[place]
 
 
 def _look_at_cubes(
@@ -292,7 +304,7 @@ def _opaque_pixels(
     A pinhole shows p + d at a distance from p of at most |J d| z / (z - d_z), with J the derivative
     at p, which differences bound in the same way.
     """
-    view, (height, width) = silhouette.view, silhouette.opaque.shape
+    view, (height, width) = silhouette.view, silhouette.solid.shape
     position = to_camera(view, [c[rows] for c in centers], np.float32)
     u, v, depth = to_film(view, position)
     half_u, half_v = np.zeros_like(u), np.zeros_like(v)
