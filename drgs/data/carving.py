@@ -58,7 +58,7 @@ COARSE = 4000
 COARSE_LEVELS = 7
 """Divisions, at most, to find so many: of a box 2,048 times as wide as what is in it."""
 
-SPARE = 1.1
+SPARE = 1.25
 """Of the wanted number of points: what the first division promises, as some are left out."""
 
 MOST_CUBES = 12
