@@ -308,8 +308,12 @@ def test_a_folder_of_photographs_that_is_not_there_is_refused(small, tmp_path):
 
 
 @pytest.mark.slow
-def test_fits_run_each_in_a_process_of_its_own_and_are_not_repeated(small, tmp_path, capfd):
-    """The two ends, and what else was tried."""
+def test_fits_run_each_in_a_process_of_its_own_and_are_not_repeated(tmp_path, capfd, monkeypatch):
+    """The two ends, and what else was tried, on the shipped scene at the size of a stamp."""
+    values = {**ingredients.LEGO.paper, "data.image_size": 32, "init.num_points": 200}
+    scene = replace(ingredients.LEGO, gaussians=150, carved=100, paper=values)
+    monkeypatch.setattr(recipes, "SCENES", (scene,))
+    monkeypatch.setattr(recipes, "QUICK_ITERATIONS", 20)
     numbers = [str(k) for k, case in enumerate(CASES, 1) if k <= 2 or case.varied in EXTRAS]
     command = ["recipes", "--quick", "--out", str(tmp_path), "--scenes", "lego", "--threads", "1"]
     command += ["--only", *numbers]
