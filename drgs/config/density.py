@@ -15,6 +15,14 @@ from drgs.config.section import Count, Section
 REFERENCE_START, REFERENCE_STOP = 500, 15_000
 """Iterations: the reference's schedule, for 30,000."""
 
+START_SHARES = {"adc": 1 / 2, "budget": 1 / 20, "mcmc": 1 / 20}
+"""Of the iterations, the latest first change. It is at half of the way to the last one, at the
+latest."""
+
+STOP_SHARES = {"adc": 5 / 7, "budget": 1 / 2, "mcmc": 5 / 7}
+"""Of the iterations, the last change of fits that are shorter than the reference's schedule. Of
+7,000 iterations, adc leaves 2,000 for the last opacities to settle."""
+
 
 class AdcConfig(Section):
     """The strategy adc, adaptive density control: clone, split, prune, opacity reset."""
@@ -77,8 +85,10 @@ EARLIER_KEYS = {f"densify.{name}": f"densify.adc.{name}" for name in AdcConfig.m
 class McmcConfig(Section):
     """The strategy ``mcmc`` (Kheradmand et al. 2024): relocation, noise and regularisers."""
 
-    gaussians: Count = Field(
-        100_000, ge=4, description="The population grows to this, and no further."
+    gaussians: Count | None = Field(
+        None,
+        ge=4,
+        description="The population grows to this, and no further. null: as with budget.",
     )
     growth: float = Field(0.05, ge=0, le=10, description="Of the population, at each change.")
     spread: float = Field(
@@ -149,7 +159,7 @@ class DensifyConfig(Section):
     """How the number of Gaussians changes."""
 
     strategy: Literal["adc", "budget", "mcmc"] = Field(
-        "adc",
+        "budget",
         description="What changes the population. adc: adaptive density control, as in the paper "
         "(Kerbl et al. 2023); budget: growth to a number of Gaussians, where errors are; mcmc: "
         "relocation and noise, up to a number of Gaussians (Kheradmand et al. 2024).",
@@ -157,14 +167,15 @@ class DensifyConfig(Section):
     start: Count | None = Field(
         REFERENCE_START,
         ge=0,
-        description="The population changes only after this iteration. Not given, or null: 500, or "
-        "half of stop if that is less.",
+        description="The population changes only after this iteration. Not given, or null: 500; "
+        "less where that is more than half of stop, or, with budget and mcmc, than a twentieth of "
+        "all iterations.",
     )
     stop: Count | None = Field(
         REFERENCE_STOP,
         ge=1,
         description="It changes, and is reset, only before this iteration. Not given, or null: "
-        "15,000, or 5/7 of fewer than 21,000 iterations.",
+        "15,000; less in shorter fits: with budget a half of the iterations, else 5/7.",
     )
     stop_aims: list[StopAim] = Field(
         default_factory=list,

@@ -1,8 +1,9 @@
 """The typed configuration of a fit: YAML -> :class:`FitConfig`.
 
-The defaults are the reference 3DGS recipe (Kerbl et al. 2023, section 7 and its released code) for
-30,000 iterations; each field names its unit and range. A configuration is frozen: what a run used
-is what :func:`dump_config` writes.
+The defaults are a recipe that was chosen by measurement (``python -m drgs.bench recipes``);
+``scenes/lego_paper.yml`` spells out that of the paper (Kerbl et al. 2023, section 7, and its
+released code). Each field names its unit and range. A configuration is frozen: what a run used is
+what :func:`dump_config` writes.
 """
 
 from __future__ import annotations
@@ -24,7 +25,13 @@ from pydantic import (
 )
 
 from drgs.config.approximations import DECLARED, Approximations, Declared
-from drgs.config.density import REFERENCE_START, REFERENCE_STOP, DensifyConfig
+from drgs.config.density import (
+    REFERENCE_START,
+    REFERENCE_STOP,
+    START_SHARES,
+    STOP_SHARES,
+    DensifyConfig,
+)
 from drgs.config.section import Count, Rate, Section, Weight
 from drgs.core.constants import MAX_SHUTTER_SAMPLES, SHUTTER_SAMPLES
 
@@ -38,13 +45,14 @@ DEFAULT_BACKGROUND = "white"
 REFERENCE_NEAR = 0.2
 """Scene units: the reference's near plane, of scenes that are about 4 wide."""
 
-REFERENCE_DEGREE = 1000
+LATEST_DEGREE = 1000
 """Iterations: the reference's schedule, for 30,000."""
 
-STOP_SHARE, DEGREE_SHARE = 5 / 7, 1 / 7
-"""Of fits that are shorter than that schedule: how long their population changes, and when the
-degree of the harmonics rises. Of 7,000 iterations, 2,000 are left for the last opacities to settle,
-and the degree rises as in the reference."""
+LAST_RATE = 0.1
+"""What rates fall to, in parts of what they begin with."""
+
+DEGREE_SHARE = 1 / 40
+"""Of the iterations, when the degree of the harmonics rises."""
 
 
 def _color(value: Any) -> Color | None:
@@ -148,8 +156,11 @@ class InitConfig(Section):
         "or the half_extent that is given; else masks if nearly all training pictures are partly "
         "transparent; else the dataset's point cloud if it names one; else random.",
     )
-    num_points: Count = Field(
-        100_000, ge=4, description="Points, random or, at most, on the surface of the masks' hull."
+    num_points: Count | None = Field(
+        None,
+        ge=4,
+        description="Points, random or, at most, on the surface of the masks' hull. null: 100,000 "
+        "with the strategy adc, else two fifths of the number that it grows to.",
     )
     half_extent: float | None = Field(
         None,
@@ -181,10 +192,10 @@ class _Model(Section):
 
     sh_degree: int = Field(3, ge=0, le=3, description="Degree of the spherical harmonics.")
     sh_increase_every: Count | None = Field(
-        REFERENCE_DEGREE,
+        LATEST_DEGREE,
         ge=1,
         description="Iterations between +1 of the degree in use, which starts at 0. Not given, or "
-        "null: 1000, or a seventh of fewer than 7,000 iterations.",
+        "null: a fortieth of all, at most 1000.",
     )
     near: float | None = Field(
         None,
@@ -196,9 +207,14 @@ class _Model(Section):
     )
 
 
-def _as_field(declared: Declared) -> tuple[Any, Any]:
+FITTED_WITH = {"antialiased": True, "low_pass": 0.1}
+"""Approximations that fits make by default, where pictures of files make others: they gave the best
+pictures of views that were not trained on. What was fitted says so in its file."""
+
+
+def _as_field(name: str, declared: Declared) -> tuple[Any, Any]:
     """An approximation as a configuration has it; YAML has no infinity, which is null there."""
-    default, description = declared.default, declared.description
+    default, description = FITTED_WITH.get(name, declared.default), declared.description
     kind = Literal[declared.words] if declared.words else declared.kind
     if declared.unrounded is not None:
         default = declared.unrounded
@@ -212,7 +228,7 @@ def _as_field(declared: Declared) -> tuple[Any, Any]:
 _ModelWithApproximations = create_model(
     "_ModelWithApproximations",
     __base__=_Model,
-    **{name: _as_field(declared) for name, declared in DECLARED.items()},
+    **{name: _as_field(name, declared) for name, declared in DECLARED.items()},
 )
 
 
@@ -256,10 +272,10 @@ class OptimizerConfig(Section):
     """Adam (Kingma and Ba 2015): learning rates per step and its constants."""
 
     means_lr: Rate = Field(
-        1.6e-4, gt=0, description="First rate of the means, in units of the scene extent."
+        3.2e-4, gt=0, description="First rate of the means, in units of the scene extent."
     )
     means_lr_final: Rate = Field(
-        1.6e-6, gt=0, description="Last rate of the means, which decays exponentially."
+        3.2e-6, gt=0, description="Last rate of the means, which decays exponentially."
     )
     means_lr_aims: list[RateAim] = Field(
         default_factory=list,
@@ -267,19 +283,19 @@ class OptimizerConfig(Section):
         "{after: iteration, end: iteration}; empty: at the last iteration. It falls when pictures "
         "are no longer coarse.",
     )
-    sh0_lr: Rate = Field(2.5e-3, ge=0, description="Degree-0 colour coefficients.")
-    shN_lr: Rate = Field(1.25e-4, ge=0, description="Colour coefficients of higher degrees.")  # noqa: N815
+    sh0_lr: Rate = Field(5e-3, ge=0, description="Degree-0 colour coefficients.")
+    shN_lr: Rate = Field(1e-3, ge=0, description="Colour coefficients of higher degrees.")  # noqa: N815
     opacities_lr: Rate = Field(
         0.05, ge=0, description="Logit opacities (0.025 in newer releases of the reference)."
     )
-    scales_lr: Rate = Field(5e-3, ge=0, description="Logarithms of the scales.")
-    quats_lr: Rate = Field(1e-3, ge=0, description="Quaternions.")
-    decay: float = Field(
-        1.0,
+    scales_lr: Rate = Field(1e-2, ge=0, description="Logarithms of the scales.")
+    quats_lr: Rate = Field(2e-3, ge=0, description="Quaternions.")
+    decay: float | None = Field(
+        None,
         ge=1e-6,
         le=1,
         description="What the rates but that of the means have fallen to at the last iteration, in "
-        "parts of what they begin with.",
+        "parts of what they begin with. null: 0.1; with the strategy adc 1, as in the paper.",
     )
     decay_from: float = Field(
         0.5, ge=0, lt=1, description="When they begin to fall, in parts of the iterations."
@@ -424,18 +440,23 @@ class FitConfig(Section):
         """The part of the schedule that is not given."""
         model, densify, n = self.model, self.densify, self.iterations
         if _is_open(model, "sh_increase_every"):
-            every = max(1, min(REFERENCE_DEGREE, round(DEGREE_SHARE * n)))
+            every = max(1, min(LATEST_DEGREE, round(DEGREE_SHARE * n)))
             self._complete("model", {"sh_increase_every": every})
+        if self.optimizer.decay is None:
+            decay = 1.0 if densify.strategy == "adc" else LAST_RATE
+            self._complete("optimizer", {"decay": decay})
         changes, first = {}, densify.start
         if _is_open(densify, "stop"):
             least = 1 if _is_open(densify, "start") else first + 1
-            changes["stop"] = max(least, min(REFERENCE_STOP, round(STOP_SHARE * n)))
+            share = STOP_SHARES[densify.strategy]
+            changes["stop"] = max(least, min(REFERENCE_STOP, round(share * n)))
         if _is_open(densify, "start"):
-            changes["start"] = min(REFERENCE_START, changes.get("stop", densify.stop) // 2)
+            first = max(1, round(START_SHARES[densify.strategy] * n))
+            changes["start"] = min(REFERENCE_START, first, changes.get("stop", densify.stop) // 2)
         self._complete("densify", changes)
         return self
 
-    def _complete(self, section: str, changes: dict[str, int]) -> None:
+    def _complete(self, section: str, changes: dict[str, float]) -> None:
         """Of a model that is frozen once it is validated."""
         completed = getattr(self, section).model_copy(update=changes)
         object.__setattr__(self, section, completed)
@@ -483,10 +504,10 @@ class FitConfig(Section):
                 f"({densify.prune_window(0)[0]}), got {prune.stop}"
             )
         caps = {"densify.max_gaussians": densify.max_gaussians}
-        if densify.strategy == "mcmc":
+        if densify.strategy == "mcmc" and densify.mcmc.gaussians is not None:
             caps["densify.mcmc.gaussians"] = densify.mcmc.gaussians
         for name, cap in caps.items():
-            if self.init.point_cloud is None and self.init.num_points > cap:
+            if self.init.point_cloud is None and (self.init.num_points or 0) > cap:
                 raise ValueError(
                     f"init.num_points must be <= {name} ({cap}), got {self.init.num_points}"
                 )

@@ -25,7 +25,10 @@ FARTHEST_NEAR = 0.5
 """Of that distance: a near plane beyond it would cut into what is looked at."""
 
 GAUSSIANS_PER_PIXEL_OF_SIDE = 250
-"""Of the strategy budget: numbers of Gaussians are in proportion to the pictures' sides."""
+"""Numbers of Gaussians that strategies grow to are in proportion to the pictures' sides."""
+
+SHARE_AT_START, REFERENCE_POINTS = 0.4, 100_000
+"""Of such a number, how many a fit starts with; and how many where there is no such number."""
 
 
 def completed(config: FitConfig, dataset: Dataset) -> FitConfig:
@@ -43,8 +46,7 @@ def completed(config: FitConfig, dataset: Dataset) -> FitConfig:
         changes["model.near"] = _near_plane(dataset)
     else:
         _check_near_plane(config.model.near, dataset)
-    if config.densify.strategy == "budget" and config.densify.budget.gaussians is None:
-        changes["densify.budget.gaussians"] = _number_of_gaussians(dataset)
+    changes |= _numbers_of_gaussians(config, dataset)
     return changed(config, changes) if changes else config
 
 
@@ -59,9 +61,23 @@ def _near_plane(dataset: Dataset) -> float:
     return float(f"{np.clip(NEAR_SHARE * _viewing_distance(dataset), *NEAR_RANGE):.1g}")
 
 
-def _number_of_gaussians(dataset: Dataset) -> int:
+def _numbers_of_gaussians(config: FitConfig, dataset: Dataset) -> dict[str, object]:
+    """At the start and in the end, those of them that are not given."""
+    changes: dict[str, object] = {}
+    densify, at_start = config.densify, REFERENCE_POINTS
+    if densify.strategy != "adc":
+        goal = getattr(densify, densify.strategy).gaussians
+        if goal is None:
+            goal = changes[f"densify.{densify.strategy}.gaussians"] = _suitable_number(dataset)
+        at_start = max(4, round(SHARE_AT_START * goal))
+    if config.init.num_points is None:
+        changes["init.num_points"] = min(at_start, densify.max_gaussians)
+    return changes
+
+
+def _suitable_number(dataset: Dataset) -> int:
     sides = [math.sqrt(view.width * view.height) for view in dataset.train]
-    return round(GAUSSIANS_PER_PIXEL_OF_SIDE * float(np.mean(sides or [1])))
+    return max(4, round(GAUSSIANS_PER_PIXEL_OF_SIDE * float(np.mean(sides or [1]))))
 
 
 def _check_near_plane(near: float, dataset: Dataset) -> None:

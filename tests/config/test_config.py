@@ -5,6 +5,7 @@ import pytest
 from conftest import REPOSITORY
 from pydantic import BaseModel, ValidationError
 
+from drgs.config.approximations import Approximations
 from drgs.config.load import PATH_KEYS, dump_config, known_keys, load_config
 from drgs.config.schema import FitConfig
 from drgs.core.errors import UserError
@@ -35,40 +36,54 @@ def fields_of(model, prefix=""):
             yield prefix + name, field
 
 
-def test_defaults_are_the_reference_recipe(load):
-    config = load(MINIMAL)
+def test_lego_paper_is_the_reference_recipe():
+    config = load_config(REPOSITORY / "scenes" / "lego_paper.yml")
     optimizer, densify, init = config.optimizer, config.densify, config.init
     assert (optimizer.means_lr, optimizer.means_lr_final) == (1.6e-4, 1.6e-6)
     assert (optimizer.sh0_lr, optimizer.shN_lr, optimizer.opacities_lr) == (2.5e-3, 1.25e-4, 0.05)
     assert (optimizer.scales_lr, optimizer.quats_lr, optimizer.epsilon) == (5e-3, 1e-3, 1e-15)
     assert (optimizer.beta_1, optimizer.beta_2) == (0.9, 0.999)
+    assert (optimizer.decay, optimizer.views) == (1, 1)  # of all but the means, constant rates
     assert (config.loss.dssim_weight, config.loss.window, config.loss.sigma) == (0.2, 11, 1.5)
     assert (config.model.sh_degree, config.model.sh_increase_every) == (3, 1000)
+    assert config.model.approximations == Approximations() and not config.model.smoothing
     assert (densify.start, densify.stop, densify.every) == (500, 15_000, 100)
-    assert densify.strategy == "adc"
+    assert densify.strategy == "adc" and densify.prune.to is None
     adc = densify.adc
     assert (adc.grad_threshold, adc.clone_scale) == (2e-4, 0.01)
     assert (adc.split_count, adc.split_shrink) == (2, 1.6)
     assert (adc.prune_opacity, adc.prune_scale) == (0.005, 0.1)
     assert (adc.reset_every, adc.reset_opacity) == (3000, 0.01)
     assert adc.white_background_reset == 500
-    assert (init.num_points, init.opacity, config.iterations) == (100_000, 0.1, 30_000)
+    assert (init.num_points, init.opacity, init.scale, init.start) == (100_000, 0.1, 1, "random")
+    assert config.iterations == 30_000 and config.coarse == []
 
 
-def test_lego_paper_spells_out_the_defaults():
-    paper = load_config(REPOSITORY / "scenes" / "lego_paper.yml")
-    assert paper == FitConfig(data=paper.data, init={"start": "random"})
+def test_rates_fall_unless_the_strategy_is_that_of_the_paper(load):
+    assert load(MINIMAL).optimizer.decay == 0.1
+    assert load(MINIMAL + "densify: {strategy: adc}").optimizer.decay == 1
+    given = load(MINIMAL + "densify: {strategy: adc}\noptimizer: {decay: 0.5}")
+    assert given.optimizer.decay == 0.5
 
 
 @pytest.mark.parametrize(
     ("iterations", "start", "stop", "degree"),
-    [(30_000, 500, 15_000, 1000), (21_000, 500, 15_000, 1000), (7000, 500, 5000, 1000),
-     (1400, 500, 1000, 200), (700, 250, 500, 100), (3, 1, 2, 1), (1, 0, 1, 1)],
+    [(60_000, 500, 15_000, 1000), (30_000, 500, 15_000, 750), (7000, 350, 3500, 175),
+     (700, 35, 350, 18), (3, 1, 2, 1), (1, 0, 1, 1)],
 )  # fmt: skip
 def test_the_schedule_follows_from_the_iterations(load, iterations, start, stop, degree):
     config = load(MINIMAL + f"iterations: {iterations}")
     assert (config.densify.start, config.densify.stop) == (start, stop)
     assert config.model.sh_increase_every == degree
+
+
+@pytest.mark.parametrize(
+    ("iterations", "start", "stop"),
+    [(30_000, 500, 15_000), (7000, 500, 5000), (700, 250, 500), (3, 1, 2), (1, 0, 1)],
+)
+def test_adaptive_density_control_changes_the_population_for_longer(load, iterations, start, stop):
+    config = load(MINIMAL + f"iterations: {iterations}\ndensify: {{strategy: adc}}")
+    assert (config.densify.start, config.densify.stop) == (start, stop)
 
 
 def test_what_is_given_of_the_schedule_stays(load):
@@ -77,7 +92,7 @@ def test_what_is_given_of_the_schedule_stays(load):
     assert (config.densify.start, config.densify.stop) == (400, 401)
     assert config.model.sh_increase_every == 900
     config = load(MINIMAL + given, "densify.start=null", "densify.stop=90")
-    assert (config.densify.start, config.densify.stop) == (45, 90)
+    assert (config.densify.start, config.densify.stop) == (25, 90)
 
 
 def test_every_value_is_described():
@@ -157,8 +172,8 @@ def test_a_configuration_is_frozen(load):
             "removes everything; got 0.01",
         ),
         (
-            "densify: {max_gaussians: 500}",
-            "init.num_points must be <= densify.max_gaussians (500), got 100000",
+            "densify: {max_gaussians: 500}\ninit: {num_points: 501}",
+            "init.num_points must be <= densify.max_gaussians (500), got 501",
         ),
         (
             "cameras: {optimise: true}\nmodel: {sh_direction: pixel}",

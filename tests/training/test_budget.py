@@ -95,7 +95,7 @@ def test_the_best_strategy_in_the_time_is_planned():
     assert result.chosen.strategy is plan.STRATEGIES[3]
     assert result.config.iterations == 2000
     assert [(s.until, s.factor) for s in result.config.coarse] == [(400, 4), (1000, 2)]
-    assert result.config.densify.stop == round(5000 * 2000 / 7000)
+    assert result.config.densify.stop == 1000
     worse = planned(100, fast=replace(FAST, psnr=(28.5, 29.5)))
     assert worse.chosen.strategy is plan.STRATEGIES[0] and worse.config.coarse == []
 

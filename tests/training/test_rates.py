@@ -42,12 +42,12 @@ def test_rates_fall_to_a_part_of_themselves_behind_a_share_of_the_fit():
         np.testing.assert_allclose(measured[20:], expected, rtol=1e-5)
     means = np.array([rate["means"] for rate in rates])
     np.testing.assert_allclose(
-        means, 1.6e-4 * trainer.extent * 100.0 ** (-np.arange(1, 51) / 50), rtol=1e-5
+        means, 3.2e-4 * trainer.extent * 100.0 ** (-np.arange(1, 51) / 50), rtol=1e-5
     )
 
 
 def test_rates_stay_without_a_decay():
-    trainer = make_trainer(densify=STILL)
+    trainer = make_trainer(densify=STILL, optimizer={"decay": 1.0})
     before = rates_of(trainer)
     for _ in range(50):
         trainer.step()
@@ -72,7 +72,7 @@ def test_a_revised_plan_keeps_the_rates_of_the_past():
     assert trainer.rates(40)["sh0"] == pytest.approx(0.1 * trainer.config.optimizer.sh0_lr)
 
 
-LATE = {"views": 3, "views_from": 0.5}
+LATE = {"views": 3, "views_from": 0.5, "decay": 1.0}
 
 
 def test_a_step_of_several_views_is_one_of_their_mean_gradient():

@@ -194,7 +194,7 @@ def test_coarse_pictures_have_fewer_gaussians_and_the_means_rate_waits_for_their
         u = (i - 4) / 20
         expected.append(40 + 30 * math.sqrt(u) / r ** (2 - u))
     assert counts[7:24:4] == pytest.approx(expected, abs=1)
-    first = 1.6e-4 * trainer.extent
+    first = 3.2e-4 * trainer.extent
     assert rates[:17] == pytest.approx([first] * 17)
     assert rates[17:] == pytest.approx([first * 100 ** (-k / 33) for k in range(1, 34)])
 

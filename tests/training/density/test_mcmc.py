@@ -21,7 +21,7 @@ SIZE, DEAD = 0.05, 0.001
 
 def strategy(max_gaussians=1_000_000, **mcmc):
     """Copies lie where their sources are, unless the test is about that."""
-    mcmc = {"spread": 0.0} | mcmc
+    mcmc = {"gaussians": 100_000, "spread": 0.0} | mcmc
     config = DensifyConfig(start=500, stop=15_000, max_gaussians=max_gaussians, mcmc=mcmc)
     result = MarkovChain(config)
     result.begin(rows_of(make([SIZE], 0.5)))
