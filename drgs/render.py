@@ -285,7 +285,7 @@ def load_model(args: argparse.Namespace) -> Model:
     if args.what.is_dir() and args.scene is None:
         config = found_again(args.what, config, ("data.path",))
     gaussians = Gaussians.load(what)
-    model, background = ModelConfig(), NAMED_COLORS[BACKGROUND]
+    model, background = ModelConfig().of_file(), NAMED_COLORS[BACKGROUND]
     if config is not None:
         model, background = config.model, config.data.background_rgb
     # --set is the user's word; a configuration may be there for the photographs that it names.
@@ -307,6 +307,7 @@ def _load_config(path: Path, args: argparse.Namespace) -> FitConfig:
         # Photographs with alpha are composited over it as well.
         overrides.append(f"data.background={list(color)}")
     config = load_config(path, overrides)
+    config = config.model_copy(update={"model": config.model.of_file()})
     if is_open(config):  # not a fit's own, which says what was used
         config = completed(config, load_dataset(config.data_for_rendering))
     return config

@@ -64,15 +64,18 @@ def with_iterations(config: FitConfig, iterations: int) -> FitConfig:
 OPEN = ("data.background", "model.near")
 """Values that are null until the dataset has decided: see ``drgs.data.derived``."""
 
+OPEN_AT_START = (*OPEN, "init.num_points", "densify.budget.gaussians", "densify.mcmc.gaussians")
+"""The same, with those that only a fit needs."""
+
 
 def is_open(config: FitConfig) -> bool:
-    """Whether the dataset has not decided yet."""
+    """Whether the dataset has not decided yet what a rendering needs."""
     return any(_value(config, key) is None for key in OPEN)
 
 
 def decided_as(config: FitConfig, other: FitConfig) -> FitConfig:
     """``config``, with those values that it leaves to the dataset as ``other`` has them."""
-    changes = {key: _value(other, key) for key in OPEN if _value(config, key) is None}
+    changes = {key: _value(other, key) for key in OPEN_AT_START if _value(config, key) is None}
     return changed(config, changes)
 
 

@@ -255,6 +255,14 @@ class ModelConfig(_ModelWithApproximations):
         """Scene units; the reference's where it is null."""
         return REFERENCE_NEAR if self.near is None else self.near
 
+    def of_file(self) -> ModelConfig:
+        """What a file of Gaussians is rendered with that says nothing itself: as 3DGS, but for
+        what is given here.
+        """
+        usual = {name: DECLARED[name].default for name in FITTED_WITH}
+        given = self.model_fields_set
+        return self.model_copy(update={k: v for k, v in usual.items() if k not in given})
+
     @property
     def approximations(self) -> Approximations:
         """Those that are configured."""

@@ -16,6 +16,7 @@ import yaml
 from conftest import REPOSITORY
 from support.commands import run_in_process
 from support.folders import visible
+from support.usual_rule import USUAL
 
 from drgs.cli.execution import executing
 from drgs.config.load import dump_config, load_config
@@ -97,7 +98,7 @@ def configuration(dataset):
     values = {
         "data": {"path": str(dataset), "background": "white"},
         "init": {"num_points": 300, "half_extent": 1.0},
-        "model": {"sh_degree": 1, "sh_increase_every": 100},
+        "model": {"sh_degree": 1, "sh_increase_every": 100, **USUAL},
         "densify": {
             "clone_scale": 0.03,
             "start": 60,

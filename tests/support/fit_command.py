@@ -8,6 +8,7 @@ import yaml
 from drgs import fit
 from support.commands import Outcome, assert_ends_well, assert_refused, run_in_process
 from support.small_capture import make_dataset, write_dataset
+from support.usual_rule import USUAL
 
 ITERATIONS = 8
 
@@ -15,7 +16,7 @@ SMALL = {"data": {"path": "data"}, "init": {"num_points": 40, "half_extent": 0.5
 """Sections that all scenes have here."""
 
 VALUES = {
-    "model": {"sh_degree": 1, "sh_increase_every": 3},
+    "model": {"sh_degree": 1, "sh_increase_every": 3, **USUAL},
     "densify": {"start": 1, "stop": 7, "every": 2, "reset_every": 3, "grad_threshold": 1e-6},
     "iterations": ITERATIONS,
     "output": {"checkpoint_every": 2, "history_every": 1},

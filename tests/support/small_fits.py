@@ -19,6 +19,7 @@ from drgs.reference import splatting as reference
 from drgs.training.trainer import Trainer
 from support import small_capture as capture
 from support.helpers import NEAR_THRESHOLD
+from support.usual_rule import USUAL
 
 WHITE = (1.0, 1.0, 1.0)
 
@@ -93,7 +94,7 @@ def config_of(**changes) -> FitConfig:
     """Of a fit whose population stays; changes: by names such as ``model.smoothing``."""
     config = FitConfig(
         data={"path": "."},
-        model={"sh_degree": 1, "sh_increase_every": 1},
+        model={"sh_degree": 1, "sh_increase_every": 1, **USUAL},
         densify={"start": 1_000_000, "stop": 1_000_001, "reset_every": 1_000_000},
         iterations=400,
     )

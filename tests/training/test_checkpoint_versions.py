@@ -30,7 +30,7 @@ def folder(tmp_path):
 
 @pytest.fixture
 def config(tmp_path):
-    return changed(FitConfig(data={"path": tmp_path}, iterations=7000), DECIDED)
+    return changed(FitConfig(data={"path": tmp_path}, densify={"strategy": "adc"}, iterations=7000), DECIDED)
 
 
 def saved_as(folder, config, change):
@@ -48,7 +48,9 @@ def saved_as(folder, config, change):
 
 
 def without_what_is_new(values):
-    del values["data"]["ignore_points"]
+    del values["data"]["ignore_points"], values["init"]["start"], values["init"]["scale"]
+    for name in ("decay", "decay_from", "views", "views_from"):
+        del values["optimizer"][name]
     densify = values["densify"]
     adc = densify.pop("adc")
     kept = {name: densify[name] for name in ("start", "stop", "every", "max_gaussians")}

@@ -45,7 +45,8 @@ def dataset_of(width, height, count, channels=3):
 
 def config_of(start, most, **changes):
     values = {"data.path": ".", "init.num_points": start, "densify.max_gaussians": most}
-    return changed(FitConfig(data={"path": "."}), values | changes)
+    config = FitConfig(data={"path": "."}, densify={"strategy": "adc"})
+    return changed(config, values | changes)
 
 
 @cache
