@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import math
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from drgs.config.changes import changed
 from drgs.config.schema import NAMED_COLORS, REFERENCE_NEAR, FitConfig
 from drgs.core.errors import UserError
-from drgs.data.initial import Start
 from drgs.data.start_box import focus_of
 from drgs.data.types import Dataset
+
+if TYPE_CHECKING:
+    from drgs.data.initial import Start
 
 NEAR_SHARE = 0.04
 """Of the cameras' distance to what they look at, rounded to one digit: the near plane. It gives the

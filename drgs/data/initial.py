@@ -13,6 +13,7 @@ from scipy.spatial import cKDTree
 from drgs.config.schema import FitConfig, InitConfig
 from drgs.core.denormals import denormals_kept
 from drgs.core.errors import UserError
+from drgs.data.derived import completed
 from drgs.data.start_box import (
     LEAST_LOOKING,
     box_looked_at,
@@ -52,6 +53,7 @@ def initial_gaussians(config: FitConfig, dataset: Dataset) -> Gaussians:
 
     At the points of :func:`start_of`, with the opacity and the scale of ``config.init``.
     """
+    config = completed(config, dataset)
     return gaussians_at(start_of(config, dataset), config)
 
 
@@ -63,6 +65,8 @@ def gaussians_at(start: Start, config: FitConfig) -> Gaussians:
 
 def start_of(config: FitConfig, dataset: Dataset) -> Start:
     """The points that a fit starts from, as ``config.init`` says. The same seed gives the same.
+
+    config: completed.
 
     By default: ``init.point_cloud``; else uniform in [-h, h]^3 with ``init.half_extent``; else on
     the visual hull, where nearly all pictures are partly transparent; else the point cloud that the

@@ -30,7 +30,9 @@ def folder(tmp_path):
 
 @pytest.fixture
 def config(tmp_path):
-    return changed(FitConfig(data={"path": tmp_path}, densify={"strategy": "adc"}, iterations=7000), DECIDED)
+    return changed(
+        FitConfig(data={"path": tmp_path}, densify={"strategy": "adc"}, iterations=7000), DECIDED
+    )
 
 
 def saved_as(folder, config, change):
