@@ -73,9 +73,6 @@ class BudgetConfig(Section):
         "again.",
     )
     prune_opacity: float = Field(0.005, ge=0, lt=1, description="Removed if less opaque.")
-    prune_scale: float = Field(
-        0.1, gt=0, description="Removed if the largest scale is larger; x extent."
-    )
 
 
 EARLIER_KEYS = {f"densify.{name}": f"densify.adc.{name}" for name in AdcConfig.model_fields}

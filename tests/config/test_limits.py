@@ -83,8 +83,7 @@ SECTIONS = ["init", "model", "optimizer", "loss", "colors", "cameras", "densify"
 NUMBERS = [p for s in SECTIONS for p in numbers_of(s, FitConfig.model_fields[s].annotation)]
 
 UNLIMITED = {"model.low_pass", "densify.adc.grad_threshold", "densify.adc.clone_scale",
-             "densify.adc.prune_scale", "densify.adc.split_shrink",
-             "densify.budget.prune_scale"}  # fmt: skip
+             "densify.adc.prune_scale", "densify.adc.split_shrink"}  # fmt: skip
 """Compared with, or finite in float32, however large they are."""
 
 

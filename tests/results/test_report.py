@@ -355,7 +355,7 @@ def test_the_page_states_the_metrics(page):
         "1 min 15 s", "1,200 iterations", "A <Processor>, 2 threads", "2026-11-23 01:02 (UTC+0100)",
         "drgs fit 'my scene.yml' --data <DIR>", "Seed 7", "drgs 1.2.3, Mitsuba 3.9.1",
         "16.0", "LLVM 19.1.7", "sh_increase_every: 750", "path: photographs",
-        "Population adc: 1,000 \u2192 2,400 Gaussians",
+        "Population budget: 1,000 \u2192 2,400 Gaussians",
     ):  # fmt: skip
         assert stated in text, stated
 

@@ -79,15 +79,13 @@ class GrowthToNumber(DensityStrategy):
         return config.start < iteration <= config.stop and iteration % config.every == 0
 
     def act(self, population: Population, iteration: int) -> DensityReport:
-        """Remove what is transparent or too large, and split where errors are."""
-        config, before = self.config, population.num_rows
-        keep = _useful(population, config)
+        """Remove what is transparent, and split where errors are."""
+        before, least = population.num_rows, self.config.budget.prune_opacity
+        keep = expit(population.host("logit_opacities")) >= least  # NaN counts as transparent
         if not keep.any():
             raise UserError(
                 f"iteration {iteration}: every Gaussian would be pruned (opacity below densify."
-                f"budget.prune_opacity = {config.budget.prune_opacity}, or scale above densify."
-                f"budget.prune_scale = {config.budget.prune_scale} x {population.extent:g}): do "
-                "the cameras see the start points?"
+                f"budget.prune_opacity = {least}): do the cameras see the start points?"
             )
         kept = int(np.count_nonzero(keep))
         room = max(0, self.goal(iteration) - kept)
@@ -170,15 +168,6 @@ def halves(population: Population, rows: np.ndarray) -> dict[str, Any]:
         "log_scales": t.TensorXf(from_host(t.Float, log_scales + np.log(factors)), shape),
         "logit_opacities": from_host(t.Float, logit(opacities)),
     }
-
-
-def _useful(population: Population, config: DensifyConfig) -> np.ndarray:
-    """(N,) bool: neither transparent nor too large; NaN counts as both."""
-    with np.errstate(over="ignore"):
-        scales = np.exp(population.host("log_scales")).max(axis=1)
-    opacities = expit(population.host("logit_opacities"))
-    is_opaque = opacities >= config.budget.prune_opacity
-    return is_opaque & (scales <= config.budget.prune_scale * population.extent)
 
 
 def _row_numbers(mask: np.ndarray) -> np.ndarray:
