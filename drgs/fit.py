@@ -50,9 +50,9 @@ from drgs.core.locks import sole_writer
 from drgs.core.machine import processor
 from drgs.core.private import llvm_version
 from drgs.data import Dataset, View, load_dataset
-from drgs.data.derived import completed, description_of_start
+from drgs.data.derived import completed
 from drgs.data.fingerprint import Fingerprint, fingerprint_of
-from drgs.data.initial import Start, gaussians_at, start_of
+from drgs.data.initial import Start, description_of_start, gaussians_at, start_of
 from drgs.gaussians.parameters import Gaussians
 from drgs.integrator.scene import check_lenses
 from drgs.integrator.summary import described

@@ -27,6 +27,8 @@ from drgs.cli.commands import CommandParser
 from drgs.config.changes import changed, with_iterations
 from drgs.config.load import dump_config, load_config
 from drgs.config.schema import FitConfig
+from drgs.data import load_dataset
+from drgs.data.derived import completed
 from drgs.io.figures import new_figure, write_figure
 from drgs.results.files import HISTORY, METRICS
 from drgs.training.budget import STRATEGIES, Strategy
@@ -143,7 +145,9 @@ def fit_point(config: Path, name: str, iterations: int, out: Path) -> None:
     folder = folder_of(choice, iterations, out)
     file = folder.with_suffix(".yml")
     file.parent.mkdir(parents=True, exist_ok=True)
-    dump_config(choice.change(with_iterations(load_config(config), iterations)), file)
+    shipped = load_config(config)
+    shipped = completed(shipped, load_dataset(shipped.data_for_training))
+    dump_config(choice.change(with_iterations(shipped, iterations)), file)
     print(f"\n{choice.name}, {iterations} iterations", flush=True)
     fit.main([str(file), "--out", str(folder)])
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -12,9 +11,6 @@ from drgs.config.schema import NAMED_COLORS, REFERENCE_NEAR, FitConfig
 from drgs.core.errors import UserError
 from drgs.data.start_box import focus_of
 from drgs.data.types import Dataset
-
-if TYPE_CHECKING:
-    from drgs.data.initial import Start
 
 NEAR_SHARE = 0.04
 """Of the cameras' distance to what they look at, rounded to one digit: the near plane. It gives the
@@ -51,11 +47,6 @@ def completed(config: FitConfig, dataset: Dataset) -> FitConfig:
         _check_near_plane(config.model.near, dataset)
     changes |= _numbers_of_gaussians(config, dataset)
     return changed(config, changes) if changes else config
-
-
-def description_of_start(config: FitConfig, start: Start) -> str:
-    """What a fit starts from and where its near plane is, one line; config: completed."""
-    return f"starts from {start.description}; near plane at {config.model.near:g}"
 
 
 def _near_plane(dataset: Dataset) -> float:

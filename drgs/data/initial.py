@@ -99,6 +99,11 @@ def start_of(config: FitConfig, dataset: Dataset) -> Start:
     return replace(start, description=start.description + note)
 
 
+def description_of_start(config: FitConfig, start: Start) -> str:
+    """What a fit starts from and where its near plane is, one line; config: completed."""
+    return f"starts from {start.description}; near plane at {config.model.near:g}"
+
+
 def _cloud_of(init: InitConfig, dataset: Dataset) -> Path | None:
     """The file that a fit starts from; None: random points."""
     if init.start == "random":

@@ -31,7 +31,7 @@ def test_a_shorter_schedule_keeps_its_shares():
     refined = changed(config, {"cameras.start": 1000})
     assert with_iterations(refined, 6000).cameras.start == 200
     assert (short.densify.adc.reset_every, short.densify.adc.white_background_reset) == (600, 100)
-    assert short.model.sh_increase_every == 200 and short.coarse[0].until == 600
+    assert short.model.sh_increase_every == 150 and short.coarse[0].until == 600
     assert with_iterations(short, 30_000) == config
 
 
@@ -45,7 +45,8 @@ def test_a_reset_that_is_off_stays_off_and_no_count_falls_to_zero():
 @pytest.mark.parametrize("iterations", [100, 8000])
 def test_every_choice_is_a_configuration(iterations, tmp_path):
     """And each is another one."""
-    shipped = with_iterations(load_config(training.CONFIG), iterations)
+    decided = changed(load_config(training.CONFIG), {"init.num_points": 20_000})
+    shipped = with_iterations(decided, iterations)
     seen = []
     for choice in training.CHOICES:
         path = tmp_path / "x.yml"

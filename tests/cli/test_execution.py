@@ -10,6 +10,7 @@ import pytest
 from support.fit_command import write_scene
 from support.folders import visible
 from support.small_capture import blobs
+from support.usual_rule import USUAL
 
 from drgs import fit, render
 from drgs.cli.execution import executing
@@ -147,7 +148,7 @@ def scene(tmp_path_factory):
     folder = tmp_path_factory.mktemp("scene")
     write_scene(
         folder,
-        model={"sh_degree": 1, "sh_increase_every": 2},
+        model={"sh_degree": 1, "sh_increase_every": 2, **USUAL},
         densify={"start": 1, "stop": 4, "every": 2, "reset_every": 3, "grad_threshold": 1e-6},
         iterations=3,
         output={"checkpoint_every": 1},

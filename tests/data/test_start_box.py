@@ -10,8 +10,8 @@ from support.photographs import write_points
 from drgs.config.schema import FitConfig, InitConfig
 from drgs.core.errors import UserError
 from drgs.data import initial_gaussians
-from drgs.data.derived import completed, description_of_start
-from drgs.data.initial import start_of
+from drgs.data.derived import completed
+from drgs.data.initial import description_of_start, start_of
 from drgs.data.start_box import box_to_start_in
 from drgs.gaussians.sh import C0
 

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from conftest import TESTS
 from support import small_fits as fits
+from support.usual_rule import USUAL
 from support.views import VIEWS, Scene, tensors
 
 import drgs  # noqa: F401  (registers the plugins)
@@ -15,6 +16,7 @@ from drgs.cameras.camera import Pinhole
 from drgs.cameras.fisheye import Fisheye
 from drgs.cameras.radial_tangential import RadialTangential
 from drgs.config.changes import changed
+from drgs.config.schema import FitConfig
 from drgs.data.types import Motion
 from drgs.integrator.sensors import camera_from_sensor, read_sensor
 from drgs.integrator.summary import SimulatedEffect, described, summary_of_sensors, summary_of_views
@@ -40,11 +42,9 @@ def variant():
 
 
 def config_of(**changes):
-    """The default of everything; ``__`` is written for the dot."""
-    from drgs.config.schema import FitConfig
-
+    """The default of everything but of filters; ``__`` is written for the dot."""
     values = {key.replace("__", "."): value for key, value in changes.items()}
-    return changed(FitConfig(data={"path": "."}), values)
+    return changed(FitConfig(data={"path": "."}, model=USUAL), values)
 
 
 # ----------------------------------------------------------------------------------------------
@@ -80,6 +80,14 @@ def test_the_plan_of_a_plain_fit():
         "  not simulated: lens distortion, motion, antialiasing, exposure and white balance, "
         "masks, depth, camera refinement"
     )
+
+
+def test_the_plan_of_a_fit_by_default_is_antialiased():
+    config = config_of(model__antialiased=True, model__low_pass=0.1, data__background="white")
+    default = FitConfig(data={"path": ".", "background": "white"})
+    plan = described(summary_of_fit(default, fits.plain_dataset()))
+    assert plan == described(summary_of_fit(config, fits.plain_dataset()))
+    assert "antialiasing: opacities compensated for the low-pass filter" in plan
 
 
 def rich_dataset():
@@ -411,6 +419,7 @@ from dataclasses import replace
 from drgs.training.effects.called_for import training_effects
 from drgs.training.summary import summary_of_fit
 from support import small_capture as capture
+from support.usual_rule import USUAL
 from drgs.config.changes import changed
 from drgs.config.schema import FitConfig
 

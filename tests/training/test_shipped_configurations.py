@@ -25,8 +25,10 @@ ALIKE = ("fox", "lego", "lego_mini", "photos")
 WIDTH, ITERATIONS = 60, 600
 
 WITHIN = 1.0
-"""dB, of the best: what differs is how many points there are at the start, and when the population
-changes."""
+"""dB, of the best, in other frames of reference."""
+
+BETTER = 1.0
+"""dB: in so few iterations 2.3 to 12."""
 
 
 def configured(name, folder):
@@ -108,10 +110,11 @@ def psnr_of(tmp_path_factory):
 @pytest.mark.slow
 @pytest.mark.skipif(not SHARED_DATA.is_dir(), reason="the shared data folder is not here")
 @pytest.mark.parametrize("kind", KINDS, ids=lambda kind: kind.__name__)
-def test_every_configuration_fits_every_kind_of_dataset(psnr_of, kind):
+def test_the_recipe_is_better_than_the_papers_on_every_kind_of_dataset(psnr_of, kind):
     mi.set_variant("llvm_ad_rgb")
-    reached = {name: psnr_of(name, kind) for name in CONFIGURATIONS}
-    assert min(reached.values()) >= max(reached.values()) - WITHIN, reached
+    recipe, paper = psnr_of("photos", kind), psnr_of("lego_paper", kind)
+    assert all(psnr_of(name, kind) == recipe for name in ALIKE)  # they share a fit
+    assert recipe > paper + BETTER
 
 
 @pytest.mark.slow

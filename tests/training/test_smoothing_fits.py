@@ -150,7 +150,7 @@ def test_a_fit_writes_the_filter_or_what_it_makes_of_the_gaussians(run_python, t
     config = tmp_path / "small.yml"
     config.write_text(
         f"data: {{path: {tmp_path / 'data'}}}\ninit: {{num_points: 30, half_extent: 1.0}}\n"
-        "iterations: 2\noutput: {save_renders: false}\n"
+        "model: {low_pass: 0.3, antialiased: false}\niterations: 2\noutput: {save_renders: false}\n"
     )
     asked = ("--set", "model.smoothing=true")
     runs = [
