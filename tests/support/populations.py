@@ -52,3 +52,15 @@ def statistics(gradient_norms, views=None):
 def rows_of(optimizer, seed=0, prefix=""):
     """The same as strategies see them."""
     return Population(optimizer, prefix, EXTENT, seed)
+
+
+def values(optimizer):
+    """Of all parameters, on the host."""
+    return {name: np.array(dr.detach(value)) for name, value in optimizer.items()}
+
+
+def moments(optimizer, name):
+    """The first and the second one of a parameter, a row for each Gaussian."""
+    value, _, _, (_, m, v, _) = optimizer.state[name]
+    num = value.shape[0]
+    return np.array(m).reshape(num, -1), np.array(v).reshape(num, -1)

@@ -95,7 +95,7 @@ class GrowthToNumber(DensityStrategy):
         split = np.sort(candidates[:room])
         if len(split) > 0 or kept < before:
             keep[split] = False
-            rows = from_host(dr.uint32_array_t(type(self.errors)), _row_numbers(keep))
+            rows = population.rows(np.flatnonzero(keep))
             population.edit(rows, halves(population, split) if len(split) > 0 else None)
         self.begin(population)
         return DensityReport(
@@ -146,7 +146,7 @@ def halves(population: Population, rows: np.ndarray) -> dict[str, Any]:
     """
     twice = np.tile(rows, 2)
     t = types_of(type(population.value("means").array))
-    halves = population.take(from_host(t.UInt32, twice.astype(np.uint32)))
+    halves = population.take(population.rows(twice))
 
     log_scales = population.host("log_scales")[twice]
     longest = log_scales.argmax(axis=1)
@@ -168,7 +168,3 @@ def halves(population: Population, rows: np.ndarray) -> dict[str, Any]:
         "log_scales": t.TensorXf(from_host(t.Float, log_scales + np.log(factors)), shape),
         "logit_opacities": from_host(t.Float, logit(opacities)),
     }
-
-
-def _row_numbers(mask: np.ndarray) -> np.ndarray:
-    return np.flatnonzero(mask).astype(np.uint32)

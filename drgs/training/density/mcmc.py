@@ -120,9 +120,9 @@ class MarkovChain(DensityStrategy):
             drawn, rows = _copies(population, copied, opacities, config.min_opacity)
             _spread(rows, len(drawn), config.spread, [*key, 1])
             alive[drawn] = False
-            population.edit(_rows(population, np.flatnonzero(alive)), rows)
+            population.edit(population.rows(np.flatnonzero(alive)), rows)
         elif num_alive < before:
-            population.edit(_rows(population, np.flatnonzero(alive)))
+            population.edit(population.rows(np.flatnonzero(alive)))
         relocated = min(before - num_alive, len(copied))
         return DensityReport(
             num_gaussians=aim,
@@ -166,7 +166,7 @@ def _copies(
     drawn, counts = np.unique(copied, return_counts=True)
     shared, factors = corrected(opacities[drawn], counts + 1)
     shared = np.clip(shared, min_opacity, MOST_OPAQUE)
-    rows = population.take(_rows(population, np.append(drawn, copied)))
+    rows = population.take(population.rows(np.append(drawn, copied)))
     # Of each new row, the place of its source among those that were drawn.
     source = np.append(np.arange(len(drawn)), np.searchsorted(drawn, copied))
     t = types_of(type(rows["logit_opacities"]))
@@ -193,11 +193,6 @@ def _spread(rows: dict[str, Any], num_drawn: int, spread: float, key: list[int])
     normal = dr.unravel(t.Array3f, from_host(t.Float, spread * normals))
     moved = mean + quat_to_rotation(quat) @ (dr.exp(log_scale) * normal)
     rows["means"] = t.TensorXf(dr.ravel(moved), shape)
-
-
-def _rows(population: Population, numbers: np.ndarray) -> Any:
-    """Row numbers on the device."""
-    return from_host(types_of(type(population.value("means").array)).UInt32, numbers)
 
 
 def _mean(values: Any, weight: float) -> Any:

@@ -11,7 +11,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from drgs.config.schema import FitConfig
-from drgs.core.arrays import from_host, types_of
 from drgs.training.density.strategy import DensityReport, Population
 
 
@@ -58,6 +57,5 @@ def keep_best(population: Population, scores: np.ndarray, count: int) -> Density
     The rows that stay keep their order, and their moments.
     """
     order = np.argsort(-scores, kind="stable")  # a NaN comes last
-    index_type = types_of(type(population.value("means").array)).UInt32
-    population.edit(from_host(index_type, np.sort(order[:count])))
+    population.edit(population.rows(np.sort(order[:count])))
     return DensityReport(num_gaussians=count, pruned=len(scores) - count)

@@ -18,6 +18,7 @@ import drjit as dr
 import numpy as np
 from drjit.opt import Adam
 
+from drgs.core.arrays import from_host
 from drgs.training.optimizer import edit_rows, num_rows, replace_values, set_values, take_rows
 
 
@@ -86,6 +87,11 @@ class Population:
     def host(self, name: str) -> np.ndarray:
         """The same on the host, float64; waits for the device."""
         return np.array(self.value(name), dtype=np.float64)
+
+    def rows(self, numbers: np.ndarray) -> Any:
+        """Row numbers, (M,) integers on the host, as ``UInt32`` on the device."""
+        index_type = dr.uint32_array_t(type(self.value("means").array))
+        return from_host(index_type, numbers.astype(np.uint32))
 
     def take(self, rows: Any) -> dict[str, Any]:
         """Copies of some rows of every parameter by name; rows: (M,) ``UInt32``."""

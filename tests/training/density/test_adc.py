@@ -2,11 +2,10 @@
 
 import math
 
-import drjit as dr
 import numpy as np
 import pytest
 from drjit.llvm.ad import Array2f, Bool, Float, TensorXf, TensorXf64
-from support.populations import EXTENT, make, rows_of, statistics
+from support.populations import EXTENT, make, moments, rows_of, statistics, values
 
 from drgs.config.schema import DensifyConfig
 from drgs.core.errors import UserError
@@ -37,16 +36,6 @@ HIGH = 3e-4  # a mean gradient norm above the default threshold of 2e-4
 def run(optimizer, gradient_norms, iteration=EARLY, seed=0, **config):
     rows = rows_of(optimizer, seed)
     return densify_and_prune(rows, statistics(gradient_norms), DensifyConfig(**config), iteration)
-
-
-def values(optimizer):
-    return {name: np.array(dr.detach(value)) for name, value in optimizer.items()}
-
-
-def moments(optimizer, name):
-    value, _, _, (_, m, v, _) = optimizer.state[name]
-    num = value.shape[0]
-    return np.array(m).reshape(num, -1), np.array(v).reshape(num, -1)
 
 
 # ---- statistics

@@ -8,7 +8,7 @@ import pytest
 from drjit.llvm.ad import TensorXf64
 from scipy.integrate import quad
 from scipy.special import expit
-from support.populations import EXTENT, make, rows_of
+from support.populations import EXTENT, make, moments, rows_of, values
 
 from drgs.config.density import DensifyConfig
 from drgs.core.errors import UserError
@@ -30,16 +30,6 @@ def strategy(max_gaussians=1_000_000, **mcmc):
 
 def act(optimizer, iteration=600, seed=0, **config):
     return strategy(**config).act(rows_of(optimizer, seed), iteration)
-
-
-def values(optimizer):
-    return {name: np.array(dr.detach(value)) for name, value in optimizer.items()}
-
-
-def moments(optimizer, name):
-    value, _, _, (_, m, v, _) = optimizer.state[name]
-    num = value.shape[0]
-    return np.array(m).reshape(num, -1), np.array(v).reshape(num, -1)
 
 
 # ---- what copies look like

@@ -1,11 +1,10 @@
 """The last phase of a population: when it acts, and what it removes."""
 
-import drjit as dr
 import numpy as np
 import pytest
 from drjit.llvm.ad import Float
 from scipy.special import expit, logit
-from support.populations import make, rows_of
+from support.populations import make, moments, rows_of, values
 
 from drgs.config.changes import changed, with_iterations
 from drgs.config.schema import FitConfig
@@ -21,16 +20,6 @@ def config_of(iterations=4000, grows_until=2000, **prune):
     return FitConfig(
         data={"path": "."}, iterations=iterations, densify={"stop": grows_until, "prune": prune}
     )
-
-
-def values(optimizer):
-    return {name: np.array(dr.detach(value)) for name, value in optimizer.items()}
-
-
-def moments(optimizer, name):
-    _, _, _, (_, m, v, _) = optimizer.state[name]
-    num = len(values(optimizer)[name])
-    return np.array(m).reshape(num, -1), np.array(v).reshape(num, -1)
 
 
 class Step:
