@@ -171,8 +171,9 @@ class DensifyConfig(Section):
     stop: Count | None = Field(
         REFERENCE_STOP,
         ge=1,
-        description="It changes, and is reset, only before this iteration. Not given, or null: "
-        "15,000; less in shorter fits: with budget a half of the iterations, else 5/7.",
+        description="It changes, and is reset, only before this iteration; with budget, at it for "
+        "the last time. Not given, or null: 15,000; less in shorter fits: with budget a half of "
+        "the iterations, else 5/7.",
     )
     stop_aims: list[StopAim] = Field(
         default_factory=list,
@@ -233,9 +234,8 @@ class DensifyConfig(Section):
 
     def settled_from(self, iterations: int) -> int:
         """The iteration from which on no row is added or removed; iterations: of the fit."""
-        if self.prune.to is None:
-            return self.stop
-        return max(self.stop, self.prune_window(iterations)[1] + 1)
+        last = self.stop if self.prune.to is None else self.prune_window(iterations)[1]
+        return max(self.stop, last) + 1
 
 
 def _keys(values: Any) -> Mapping[str, Any]:

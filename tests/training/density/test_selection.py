@@ -212,4 +212,4 @@ def test_the_phase_keeps_its_share_of_a_longer_fit():
     config = with_iterations(config_of(to=5), 8000)
     assert config.densify.prune_window(8000) == (4000, 6000)
     assert config.densify.settled_from(8000) == 6001
-    assert config_of().densify.settled_from(4000) == 2000
+    assert config_of().densify.settled_from(4000) == 2001  # growth may end at 2000
