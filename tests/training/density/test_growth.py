@@ -74,6 +74,7 @@ def test_halves_lie_on_both_sides_along_the_longest_axis(tensor_type):
     before, rows = values(optimizer), np.array([0, 2])
     got = {k: np.array(v, np.float64) for k, v in halves(rows_of(optimizer), rows).items()}
     rotations = reference.quat_to_rotation(before["quats"])
+    # Some ten operations on numbers of order 1, each rounded by 6e-8 or 1e-16.
     tolerance = 1e-6 if tensor_type is TensorXf else 1e-14
     for k, (row, side) in enumerate([(0, 1), (2, 1), (0, -1), (2, -1)]):
         longest = int(np.argmax(before["log_scales"][row]))
