@@ -22,8 +22,13 @@ from scipy.special import expit
 from drgs.config.schema import DensifyConfig
 from drgs.core.arrays import from_host, types_of
 from drgs.core.errors import UserError
-from drgs.gaussians.quaternions import quat_to_rotation
-from drgs.training.density.strategy import DensityReport, DensityStrategy, Population, SeenStep
+from drgs.training.density.strategy import (
+    DensityReport,
+    DensityStrategy,
+    Population,
+    SeenStep,
+    displaced,
+)
 
 
 @dataclass(frozen=True)
@@ -277,15 +282,9 @@ def _new_rows(
 
     t = types_of(type(population.value("means").array))
     rows = population.take(from_host(t.UInt32, np.append(chosen.clone, samples_of)))
-    mean, log_scale, quat = (
-        dr.unravel(vector, rows[name].array)
-        for vector, name in ((t.Array3f, "means"), (t.Array3f, "log_scales"), (t.Array4f, "quats"))
-    )
-    normal = dr.unravel(t.Array3f, from_host(t.Float, normals))
-    mean += quat_to_rotation(quat) @ (dr.exp(log_scale) * normal)
-    shape = normals.shape
-    rows["means"] = t.TensorXf(dr.ravel(mean), shape)
-    rows["log_scales"] = rows["log_scales"] - t.TensorXf(from_host(t.Float, log_shrink), shape)
+    rows["means"] = displaced(rows, normals)
+    shrink = t.TensorXf(from_host(t.Float, log_shrink), normals.shape)
+    rows["log_scales"] = rows["log_scales"] - shrink
     return rows
 
 

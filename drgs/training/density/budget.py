@@ -33,8 +33,13 @@ from drgs.config.density import DensifyConfig
 from drgs.config.schema import CoarseStage
 from drgs.core.arrays import from_host, types_of
 from drgs.core.errors import UserError
-from drgs.gaussians.quaternions import quat_to_rotation
-from drgs.training.density.strategy import DensityReport, DensityStrategy, Population, SeenStep
+from drgs.training.density.strategy import (
+    DensityReport,
+    DensityStrategy,
+    Population,
+    SeenStep,
+    displaced,
+)
 
 OFFSET = 1.35
 """Of the halves' means from that of the Gaussian, in standard deviations of its longest axis."""
@@ -76,7 +81,8 @@ class GrowthToNumber(DensityStrategy):
     def acts(self, iteration: int) -> bool:
         """Whether the population changes after this iteration."""
         config = self.config
-        return config.start < iteration <= config.stop and iteration % config.every == 0
+        turn = iteration % config.every == 0 or iteration == config.stop
+        return config.start < iteration <= config.stop and turn
 
     def act(self, population: Population, iteration: int) -> DensityReport:
         """Remove what is transparent, and split where errors are."""
@@ -145,26 +151,18 @@ def halves(population: Population, rows: np.ndarray) -> dict[str, Any]:
     The halves' means lie on both sides of the Gaussian's, on its longest axis.
     """
     twice = np.tile(rows, 2)
-    t = types_of(type(population.value("means").array))
-    halves = population.take(population.rows(twice))
-
-    log_scales = population.host("log_scales")[twice]
-    longest = log_scales.argmax(axis=1)
-    factors = np.full_like(log_scales, OTHERS)
-    np.put_along_axis(factors, longest[:, None], LONG, axis=1)
-    sides = np.repeat([OFFSET, -OFFSET], len(rows))
-    offsets = np.zeros_like(log_scales)
-    reach = sides * np.exp(log_scales.max(axis=1))
-    np.put_along_axis(offsets, longest[:, None], reach[:, None], axis=1)
-
-    quat = dr.unravel(t.Array4f, halves["quats"].array)
-    mean = dr.unravel(t.Array3f, halves["means"].array)
-    mean += quat_to_rotation(quat) @ dr.unravel(t.Array3f, from_host(t.Float, offsets))
+    new = population.take(population.rows(twice))
+    longest = population.host("log_scales")[twice].argmax(axis=1)
+    offsets = np.zeros((len(twice), 3))
+    offsets[np.arange(len(twice)), longest] = np.repeat([OFFSET, -OFFSET], len(rows))
+    factors = np.where(offsets != 0, LONG, OTHERS)
     opacities = np.clip(OPACITY * expit(population.host("logit_opacities")[twice]), *OPACITY_RANGE)
-    shape = offsets.shape
+
+    t = types_of(type(new["logit_opacities"]))
+    log_factors = t.TensorXf(from_host(t.Float, np.log(factors)), factors.shape)
     return {
-        **halves,
-        "means": t.TensorXf(dr.ravel(mean), shape),
-        "log_scales": t.TensorXf(from_host(t.Float, log_scales + np.log(factors)), shape),
+        **new,
+        "means": displaced(new, offsets),
+        "log_scales": new["log_scales"] + log_factors,
         "logit_opacities": from_host(t.Float, logit(opacities)),
     }

@@ -24,7 +24,7 @@ from drgs.core.arrays import from_host, types_of
 from drgs.core.errors import UserError
 from drgs.gaussians.quaternions import quat_to_rotation
 from drgs.training.density.draws import in_proportion, normals
-from drgs.training.density.strategy import DensityReport, DensityStrategy, Population
+from drgs.training.density.strategy import DensityReport, DensityStrategy, Population, displaced
 
 MOST_COPIES = 51
 """In one place, of one Gaussian at a time; as in the paper's code. Binomials up to here are exact
@@ -183,16 +183,9 @@ def _spread(rows: dict[str, Any], num_drawn: int, spread: float, key: list[int])
 
     By spread R(q) (s * n), n standard normal; key: what the random numbers depend on.
     """
-    t, shape = types_of(type(rows["logit_opacities"])), rows["means"].shape
-    normals = np.random.default_rng(key).standard_normal(shape)
+    normals = np.random.default_rng(key).standard_normal(rows["means"].shape)
     normals[:num_drawn] = 0
-    mean, log_scale, quat = (
-        dr.unravel(vector, rows[name].array)
-        for vector, name in ((t.Array3f, "means"), (t.Array3f, "log_scales"), (t.Array4f, "quats"))
-    )
-    normal = dr.unravel(t.Array3f, from_host(t.Float, spread * normals))
-    moved = mean + quat_to_rotation(quat) @ (dr.exp(log_scale) * normal)
-    rows["means"] = t.TensorXf(dr.ravel(moved), shape)
+    rows["means"] = displaced(rows, spread * normals)
 
 
 def _mean(values: Any, weight: float) -> Any:

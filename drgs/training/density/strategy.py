@@ -18,7 +18,8 @@ import drjit as dr
 import numpy as np
 from drjit.opt import Adam
 
-from drgs.core.arrays import from_host
+from drgs.core.arrays import from_host, types_of
+from drgs.gaussians.quaternions import quat_to_rotation
 from drgs.training.optimizer import edit_rows, num_rows, replace_values, set_values, take_rows
 
 
@@ -112,6 +113,20 @@ class Population:
     def set_values(self, name: str, value: Any) -> None:
         """Give a parameter new values of the same shape; its moments stay. Waits for nothing."""
         set_values(self.optimizer, name, value, self.prefix)
+
+
+def displaced(rows: Mapping[str, Any], offsets: np.ndarray) -> Any:
+    """Means of ``rows``, moved along their own axes: mean + R(q) (s * offset), tensor (M, 3).
+
+    rows: of every parameter by name; offsets: (M, 3), in standard deviations.
+    """
+    means, log_scales = rows["means"], rows["log_scales"]
+    t = types_of(type(means.array))
+    offset = dr.unravel(t.Array3f, from_host(t.Float, offsets))
+    scale = dr.exp(dr.unravel(t.Array3f, log_scales.array))
+    rotation = quat_to_rotation(dr.unravel(t.Array4f, rows["quats"].array))
+    moved = dr.unravel(t.Array3f, means.array) + rotation @ (scale * offset)
+    return t.TensorXf(dr.ravel(moved), offsets.shape)
 
 
 class DensityStrategy(Protocol):
