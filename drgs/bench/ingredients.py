@@ -99,16 +99,16 @@ FOX = Scene(
     "fox",
     "the photographs of the fox",
     SCENES_FOLDER / "fox.yml",
-    iterations=7000,
+    iterations=3000,
     paper={
         "data.image_size": None,
         "init.num_points": 100_000,
-        "model.sh_increase_every": 1000,
-        "densify.start": 500,
-        "densify.stop": 5000,
-        "densify.adc.white_background_reset": 500,
+        "model.sh_increase_every": 430,
+        "densify.start": 210,
+        "densify.stop": 2140,
+        "densify.adc.white_background_reset": 210,
     },
-    gaussians=90_000,
+    gaussians=60_000,
 )
 
 SCENES = (LEGO, FOX)
@@ -144,23 +144,18 @@ def _start(scene: Scene) -> Values:
 
 
 def _growth(scene: Scene) -> Values:
+    """To a number that is larger than that of the points at the start."""
+    start = {"init.num_points": round(0.4 * scene.gaussians)} if scene.carved is None else {}
     return {
         "densify.strategy": "budget",
         "densify.start": 200,
         "densify.stop": scene.iterations // 2,
+        **start,
     }
 
 
 def _harmonics(scene: Scene) -> Values:
     return {"optimizer.shN_lr": 1e-3, "model.sh_increase_every": scene.iterations // 40}
-
-
-def _mcmc(scene: Scene) -> Values:
-    """In the place of growth; it must not begin with more Gaussians than it may have."""
-    changes: dict[str, object] = {"densify.strategy": "mcmc"}
-    if scene.carved is None:
-        changes["init.num_points"] = scene.gaussians // 2
-    return changes
 
 
 INGREDIENTS = (
@@ -196,7 +191,7 @@ EXTRAS = (
         lambda scene: {"densify.prune.to": round(0.6 * scene.gaussians)},
     ),
     Ingredient("3D smoothing filter", lambda scene: {"model.smoothing": True}),
-    Ingredient("mcmc instead of growth", _mcmc),
+    Ingredient("mcmc instead of growth", lambda scene: {"densify.strategy": "mcmc"}),
 )
 """What else was tried in the whole recipe."""
 
