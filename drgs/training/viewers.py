@@ -11,6 +11,8 @@ Measured on ``scenes/lego_mini.yml`` with ``antialiased`` and a low-pass of 0.1,
 iterations behind that 32.7 dB, with 1,000 33.3 dB. A whole fit as viewers render reaches 32.8 dB:
 a filter of 0.3 square pixels lets no more detail through. Gaussians that serve both are not to be
 had: 160 iterations under both rules in turn leave 32.1 dB for the fit and 24.8 dB in viewers.
+With the present recipe, 37.13 dB in 3,400 iterations, further ones of 4, 8 and 10 % give 33.30,
+33.64 and 33.77 dB, and a whole fit as viewers render 34.39 dB.
 """
 
 from __future__ import annotations
@@ -38,10 +40,10 @@ from drgs.training.effects.base import TrainingEffect
 from drgs.training.finite_checks import NonFiniteError
 from drgs.training.trainer import Trainer
 
-SHARE = 0.04
+SHARE = 0.08
 """Of the iterations of the fit, that are added."""
 
-TIME_SHARE = 0.06
+TIME_SHARE = 0.12
 """Of the time of the fit: late iterations take longer than early ones."""
 
 RATES = {

@@ -24,6 +24,7 @@ def stopped(tmp_path_factory):
         colors={"lr": 0.02},
         cameras={"optimise": True},
         iterations=4,
+        densify={"stop": 100},  # the population stays
         output={"checkpoint_every": 1, "history_every": 1},
     )
     step = fit.Trainer.step

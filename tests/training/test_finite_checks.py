@@ -338,6 +338,7 @@ def configuration(tmp_path):
         "data": {"path": "data"},
         "init": {"num_points": 40, "half_extent": 0.5},
         "model": {"sh_degree": 0},
+        "densify": {"stop": 100},  # the population stays
         "iterations": 7,
         "output": {"checkpoint_every": 2, "history_every": 3, "save_renders": False},
     }

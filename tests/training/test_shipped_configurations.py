@@ -22,6 +22,9 @@ CONFIGURATIONS = sorted(path.stem for path in (REPOSITORY / "scenes").glob("*.ym
 ALIKE = ("fox", "lego", "lego_mini", "photos")
 """They differ in data, size and number of iterations alone."""
 
+OTHER_NUMBERS = ("lego_fast",)
+"""They differ from these in the number of Gaussians as well."""
+
 WIDTH, ITERATIONS = 60, 600
 
 WITHIN = 1.0
@@ -34,12 +37,12 @@ BETTER = 1.0
 def configured(name, folder):
     """The configuration as a small fit of ``folder`` completes it, and the dataset."""
     file, small = REPOSITORY / "scenes" / f"{name}.yml", [f"data.image_size={WIDTH}"]
-    if name in ALIKE:
+    if name != "lego_paper":
         small.append(f"iterations={ITERATIONS}")
     config = load_config(file, [f"data.path={folder}", *small])
     config = changed(config, {"data.source": ""})
     dataset = load_dataset(config.data_for_training)
-    if name not in ALIKE:  # it says for how many iterations its schedule is
+    if name == "lego_paper":  # it says for how many iterations its schedule is
         config = with_iterations(config, ITERATIONS)
     return completed(config, dataset), dataset
 
@@ -54,8 +57,18 @@ def test_the_kind_of_scene_follows_from_the_data_alone(request, kind, name):
     assert config.data.background == ("white" if kind == "blender" else "black")
 
 
+@pytest.mark.parametrize("name", OTHER_NUMBERS)
+def test_faster_and_better_fits_have_other_numbers_of_gaussians_only(blender, name):
+    config, _ = configured(name, blender[0])
+    number = "densify.budget.gaussians"
+    start = {"init.num_points": config.init.num_points}
+    usual, _ = configured("lego", blender[0])
+    as_there = changed(usual, {number: config.densify.budget.gaussians, **start})
+    assert config == as_there != usual
+
+
 def test_every_configuration_is_one_of_these_or_is_fitted_below():
-    assert set(CONFIGURATIONS) == {*ALIKE, "lego_paper"}
+    assert set(CONFIGURATIONS) == {*ALIKE, *OTHER_NUMBERS, "lego_paper"}
 
 
 # ----------------------------------------------------------------------------------------------

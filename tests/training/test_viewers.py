@@ -105,7 +105,7 @@ def test_numbers_that_are_not_finite_leave_the_closed_form(monkeypatch):
 def test_the_population_and_the_schedule_stay():
     config = changed(fits.config_of(iterations=400), {**OTHERWISE, "model.order": "pixel"})
     further = tuning(config)
-    assert further.iterations == 416 and further.densify.stop == 1 and further.coarse == []
+    assert further.iterations == 432 and further.densify.stop == 1 and further.coarse == []
     assert further.model.approximations.are_usual and not config.model.approximations.are_usual
     assert further.model.sh_degree == config.model.sh_degree
     assert further.loss == config.loss and further.data == config.data
