@@ -134,6 +134,14 @@ def test_neither_the_curve_nor_the_cap_is_exceeded(seed, num, target, cap, itera
     assert growth.most_gaussians(num, 1000) >= report.num_gaussians
 
 
+def test_the_last_change_is_at_the_end_of_growth_and_reaches_the_number():
+    """Wherever the intervals between the others lead."""
+    optimizer = make([0.1] * 6, [0.5] * 6)
+    growth = strategy(optimizer, [1, 5, 3, 0, 4, 2], budget={"gaussians": 9}, stop=325)
+    assert [k for k in range(1, 500) if growth.acts(k)] == [150, 200, 250, 300, 325]
+    assert growth.act(rows_of(optimizer), 325).num_gaussians == 9
+
+
 def test_a_population_that_would_vanish_is_refused():
     optimizer = make([0.1] * 3, [0.001] * 3)
     with pytest.raises(UserError, match=r"every Gaussian would be pruned .*budget\.prune_opacity"):
