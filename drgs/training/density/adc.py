@@ -195,7 +195,7 @@ def densify_and_prune(
             f"{config.adc.prune_scale} x {extent:g}): do the cameras see the start points?"
         )
     if num_added > 0 or len(chosen.keep) < num_before:
-        keep = from_host(dr.uint32_array_t(type(statistics.views)), chosen.keep)
+        keep = population.rows(chosen.keep)
         append = _new_rows(population, chosen, config, iteration) if num_added > 0 else None
         population.edit(keep, append)
     return DensityReport(
@@ -220,7 +220,7 @@ def reset_opacities(population: Population, config: DensifyConfig) -> None:
 
 @dataclass(frozen=True)
 class _ChosenRows:
-    """Row numbers, uint32, ascending."""
+    """Row numbers, ascending."""
 
     keep: np.ndarray  # stay, those to be cloned among them
     clone: np.ndarray
@@ -257,9 +257,9 @@ def _choose_rows(
     taken[affordable] = True
     split = taken & ~small
     return _ChosenRows(
-        keep=_row_numbers(~(split | transparent | too_large)),
-        clone=_row_numbers(taken & small),
-        split=_row_numbers(split),
+        keep=np.flatnonzero(~(split | transparent | too_large)),
+        clone=np.flatnonzero(taken & small),
+        split=np.flatnonzero(split),
         num_refused=len(rows) - len(affordable),
     )
 
@@ -281,15 +281,11 @@ def _new_rows(
     log_shrink[num_clones:] = math.log(config.adc.split_shrink)
 
     t = types_of(type(population.value("means").array))
-    rows = population.take(from_host(t.UInt32, np.append(chosen.clone, samples_of)))
+    rows = population.take(population.rows(np.append(chosen.clone, samples_of)))
     rows["means"] = displaced(rows, normals)
     shrink = t.TensorXf(from_host(t.Float, log_shrink), normals.shape)
     rows["log_scales"] = rows["log_scales"] - shrink
     return rows
-
-
-def _row_numbers(mask: np.ndarray) -> np.ndarray:
-    return np.flatnonzero(mask).astype(np.uint32)
 
 
 def _columns(gradient: Any) -> tuple[Any, Any]:
