@@ -27,6 +27,7 @@ import json
 import platform
 import sys
 import time
+import warnings
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -44,7 +45,7 @@ from drgs.cli.interrupts import INTERRUPTED_STATUS, StopRequest
 from drgs.cli.progress import RunProgress
 from drgs.config.load import load_config
 from drgs.config.schema import FitConfig
-from drgs.core.errors import UserError
+from drgs.core.errors import UserError, UserNote
 from drgs.core.files import atomic_path
 from drgs.core.locks import sole_writer
 from drgs.core.machine import processor
@@ -324,6 +325,7 @@ def fit_and_write(
         gaussians = trainer.gaussians()
     except NonFiniteError as error:
         raise UserError(f"{error}; {_remedy(out)}") from None
+    _say_what_is_missing(trainer)
     dr.flush_malloc_cache()  # encoding the orbit's frames takes as much as iterations do
     as_saved(gaussians, trainer).save(out / GAUSSIANS)
     for effect in trainer.effects:
@@ -409,6 +411,17 @@ def run_iterations(
             if stop.requested:
                 return False
     return True
+
+
+def _say_what_is_missing(trainer: Trainer) -> None:
+    """A note where a plan was revised and time was up before the last phase had ended."""
+    wanted = trainer.config.densify.prune.to
+    if wanted is not None and trainer.num_gaussians > wanted:
+        note = (
+            f"time was up before there were only densify.prune.to = {wanted:,} Gaussians: there "
+            f"are {trainer.num_gaussians:,}; give --budget more time"
+        )
+        warnings.warn(UserNote(note), stacklevel=2)
 
 
 def _remedy(out: Path) -> str:

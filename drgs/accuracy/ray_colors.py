@@ -61,6 +61,10 @@ class RayColors(SplatFeatures):
             "splats: sh_direction 'pixel' is not differentiable in the camera; use 'mean'"
         )
 
+    def weighing(self) -> RayColors:
+        """What has the weights of compositing as derivatives of the first coefficient."""
+        return Weighing(self.sh_degree, self.camera)
+
     def bind(self, lanes: Lanes, positions: Positions) -> RayColors:
         """The basis functions at the 16 pixels of each lane."""
         points = positions.points(lanes, type(self.camera.near))
@@ -113,3 +117,14 @@ class RayColors(SplatFeatures):
             for value, d in zip(self._sums(stored, pixel), d_colors, strict=True)
         ]
         return d_colors + d_stored[self.num_coefficients :]
+
+
+class Weighing(RayColors):
+    """The same, with the weights of compositing as derivatives of the first coefficient."""
+
+    def add_derivatives(
+        self, totals: list[Any], stored: list[Any], pixel: int, weight: Any, g: list[Any]
+    ) -> list[Any]:
+        """Weights times the derivatives of the first plane; whatever the colour is."""
+        del stored, pixel
+        return [dr.fma(weight, g[0], totals[0]), *totals[1:]]

@@ -99,16 +99,16 @@ FOX = Scene(
     "fox",
     "the photographs of the fox",
     SCENES_FOLDER / "fox.yml",
-    iterations=3000,
+    iterations=2000,
     paper={
         "data.image_size": None,
         "init.num_points": 100_000,
-        "model.sh_increase_every": 430,
-        "densify.start": 210,
-        "densify.stop": 2140,
-        "densify.adc.white_background_reset": 210,
+        "model.sh_increase_every": 286,
+        "densify.start": 143,
+        "densify.stop": 1430,
+        "densify.adc.white_background_reset": 143,
     },
-    gaussians=60_000,
+    gaussians=45_000,
 )
 
 SCENES = (LEGO, FOX)
@@ -215,12 +215,14 @@ class Case:
         return self.varied is None or bool(self.varied.changes(scene))
 
 
-WHOLE = Case("the whole", INGREDIENTS, "the paper's")
+PAPERS = Case("the paper's", ())
+
+WHOLE = Case("the whole", INGREDIENTS, PAPERS.name)
 
 CASES = (
-    Case("the paper's", ()),
+    PAPERS,
     WHOLE,
-    *(Case(f"the paper's + {i.name}", (i,), "the paper's", i) for i in INGREDIENTS),
+    *(Case(f"the paper's + {i.name}", (i,), PAPERS.name, i) for i in INGREDIENTS),
     *(
         Case(f"the whole without {i.name}", tuple(k for k in INGREDIENTS if k != i), WHOLE.name, i)
         for i in INGREDIENTS

@@ -45,7 +45,7 @@ class Problem:
 
 def drgs_renderer(problem: Problem) -> Renderer:
     """The ``splats`` integrator through ``mi.render``, as a user of Mitsuba calls it."""
-    scene = make_scene(problem.gaussians, ModelConfig(), (1.0, 1.0, 1.0))
+    scene = make_scene(problem.gaussians, ModelConfig().of_file(), (1.0, 1.0, 1.0))
     return _mitsuba_renderer("drgs", scene, problem, "integrator.", 0.1)
 
 

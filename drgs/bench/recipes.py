@@ -2,7 +2,7 @@
 
 The paper's recipe, and the whole new one; each ingredient of the new one alone on the paper's, and
 the whole without it; the whole with what else was tried (``drgs.bench.ingredients``). The scenes
-are the shipped one at 200x200 and, where its folder is given, the photographs of the fox. Each fit
+are the shipped one at 200x200 and, where its folder is there, the photographs of the fox. Each fit
 is a run of ``drgs.fit`` in a process and a folder of its own. Interrupted fits go on, finished ones
 are not repeated.
 """

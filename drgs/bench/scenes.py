@@ -15,7 +15,7 @@ import numpy as np
 from drgs.cameras.axes import OPENCV_TO_OPENGL
 from drgs.cameras.camera import Camera
 from drgs.config.changes import changed
-from drgs.config.schema import FitConfig
+from drgs.config.schema import FitConfig, ModelConfig
 from drgs.data.types import Dataset, View
 from drgs.gaussians.parameters import Gaussians
 from drgs.reference import splatting as reference
@@ -118,13 +118,15 @@ def trainer_of(
 ) -> Trainer:
     """Trains on one view; the population stays, though statistics are gathered as in a fit.
 
-    changes: of the configuration, as ``model.smoothing``; extras: of the view, besides colours.
+    changes: of a configuration that renders as 3DGS does, as ``model.smoothing``; extras: of the
+    view, besides colours.
     """
     view = replace(view_of(scene), **extras)
     dataset = Dataset((view,), (view,), "bench", (1.0, 1.0, 1.0), None, "bench")
+    model = ModelConfig(sh_degree=scene.gaussians.sh_degree, sh_increase_every=1).of_file()
     config = FitConfig(
         data={"path": "."},
-        model={"sh_degree": scene.gaussians.sh_degree, "sh_increase_every": 1},
+        model=model.model_dump(),
         densify={"start": 1_000_000, "stop": 1_000_001, "reset_every": 1_000_000},
         iterations=2_000_000,
     )

@@ -64,7 +64,7 @@ class BudgetConfig(Section):
         None,
         ge=4,
         description="How many there are to be at densify.stop. null: as many as suit the pictures' "
-        "size, 250 times the root of their pixels: 100,000 for 400 x 400 px.",
+        "size, 250 times the square root of the number of their pixels: 100,000 for 400 x 400 px.",
     )
     error_every: Count = Field(
         10,
@@ -129,7 +129,7 @@ class PruneConfig(Section):
         None,
         ge=1,
         description="The phase begins after this iteration, and not before densify.stop. null: "
-        "there.",
+        "at densify.stop.",
     )
     stop: Count | None = Field(
         None,
@@ -177,8 +177,9 @@ class DensifyConfig(Section):
     )
     stop_aims: list[StopAim] = Field(
         default_factory=list,
-        description="What it was in the meantime, as a plan was revised, where growth follows a "
-        "curve to it: a list of {after: iteration, stop: iteration}; empty: what it is.",
+        description="Earlier values of stop, where --budget has revised the plan and growth "
+        "followed a curve to each: a list of {after: iteration, stop: iteration}; empty: there "
+        "were none.",
     )
     every: Count = Field(100, ge=1, description="Iterations between two changes.")
     max_gaussians: int = Field(
@@ -212,6 +213,11 @@ class DensifyConfig(Section):
         given = values.get("adc", {})
         if not isinstance(given, Mapping):  # refused by its own check
             return values
+        if (strategy := values.get("strategy", "adc")) != "adc":
+            raise ValueError(
+                f"must hold {earlier[0]} in the section adc, to which it belongs, where strategy "
+                f"is {strategy}"
+            )
         if twice := [name for name in earlier if name in given]:
             raise ValueError(
                 f"must hold {twice[0]} in the section adc or, as in earlier versions, beside it, "

@@ -150,11 +150,11 @@ class InitConfig(Section):
 
     start: Literal["auto", "masks", "points", "random"] = Field(
         "auto",
-        description="What the points are. masks: the surface of what no picture shows empty, "
-        "coloured from the pictures, which have to be transparent where there is nothing. points: "
-        "a point cloud. random: in the start box, or where the cameras look. auto: the point_cloud "
-        "or the half_extent that is given; else masks if nearly all training pictures are partly "
-        "transparent; else the dataset's point cloud if it names one; else random.",
+        description="What the points are. masks: the surface of what no picture's alpha shows "
+        "empty, coloured from the pictures, which have to be transparent where there is nothing. "
+        "points: a point cloud. random: in the start box, or where the cameras look. auto: the "
+        "point_cloud or the half_extent that is given; else masks if nearly all training pictures "
+        "are partly transparent; else the dataset's point cloud if it names one; else random.",
     )
     num_points: Count | None = Field(
         None,
@@ -306,7 +306,10 @@ class OptimizerConfig(Section):
         "parts of what they begin with. null: 0.1; with the strategy adc 1, as in the paper.",
     )
     decay_from: float = Field(
-        0.5, ge=0, lt=1, description="When they begin to fall, in parts of the iterations."
+        0.5,
+        ge=0,
+        lt=1,
+        description="When they begin to fall, in parts of the iterations behind coarse stages.",
     )
     views: int = Field(
         1,
@@ -319,7 +322,8 @@ class OptimizerConfig(Section):
         0.75,
         ge=0,
         lt=1,
-        description="When that begins, in parts of the iterations, and not before densify.stop.",
+        description="When that begins, in parts of the same, and not before the population's last "
+        "change.",
     )
     beta_1: Decay = Field(0.9, description="Decay of the first moment.")
     beta_2: Decay = Field(0.999, description="Decay of the second moment.")
@@ -422,7 +426,10 @@ class FitConfig(Section):
     densify: DensifyConfig = Field(default_factory=DensifyConfig)
     output: OutputConfig = Field(default_factory=OutputConfig)
     iterations: Count = Field(
-        30_000, ge=1, description="Views that are rendered; one for each step of the optimizer."
+        30_000,
+        ge=1,
+        description="Views that are rendered; each is a step of the optimizer, unless "
+        "optimizer.views says otherwise.",
     )
     coarse: list[CoarseStage] = Field(
         default_factory=list,
@@ -482,6 +489,27 @@ class FitConfig(Section):
             )
         return self
 
+    def _check_last_phase(self) -> None:
+        """It takes place, unless a plan was revised: then time may be up before."""
+        prune, n = self.densify.prune, self.iterations
+        start = self.densify.prune_window(n)[0]
+        if prune.stop is not None and prune.stop <= start:
+            raise ValueError(
+                "densify.prune.stop must be > densify.stop and densify.prune.start "
+                f"({start}), got {prune.stop}"
+            )
+        if self.optimizer.means_lr_aims:
+            return
+        last = {"densify.stop": self.densify.stop, "densify.prune.start": prune.start or 0}
+        for name, iteration in last.items():
+            if iteration >= n:
+                raise ValueError(
+                    f"{name} must be < iterations ({n}), or there is none left for "
+                    f"densify.prune.to, got {iteration}"
+                )
+        if prune.stop is not None and prune.stop > n:
+            raise ValueError(f"densify.prune.stop must be <= iterations ({n}), got {prune.stop}")
+
     @model_validator(mode="after")
     def _check_relations(self) -> FitConfig:
         densify, optimizer = self.densify, self.optimizer
@@ -505,12 +533,8 @@ class FitConfig(Section):
                 "model.sh_direction must be mean where cameras.optimise is true (colours along "
                 f"rays are not differentiated in the camera), got {self.model.sh_direction}"
             )
-        prune = densify.prune
-        if None not in (prune.to, prune.stop) and prune.stop <= densify.prune_window(0)[0]:
-            raise ValueError(
-                "densify.prune.stop must be > densify.stop and densify.prune.start "
-                f"({densify.prune_window(0)[0]}), got {prune.stop}"
-            )
+        if densify.prune.to is not None:
+            self._check_last_phase()
         caps = {"densify.max_gaussians": densify.max_gaussians}
         if densify.strategy == "mcmc" and densify.mcmc.gaussians is not None:
             caps["densify.mcmc.gaussians"] = densify.mcmc.gaussians

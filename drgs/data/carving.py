@@ -61,9 +61,9 @@ COARSE_LEVELS = 7
 SPARE = 1.25
 """Of the wanted number of points: what the first division promises, as some are left out."""
 
-MOST_CUBES = 12
-"""Of the wanted number of points: cubes that are divided, at most. Silhouettes of noise have a
-surface everywhere."""
+MOST_CUBES = 3
+"""Of the wanted number of points: cubes that are divided into eight, at most. Silhouettes of noise
+have a surface everywhere."""
 
 SHELL = 1.2
 """Of the points' distance to each other: edge of a cube around a point on the surface, which some
@@ -77,7 +77,8 @@ THIN = 1.5
 """Edges of a cube: one so far from all points of the hull is a part of it too thin to be hit."""
 
 THIN_LEVELS = 3
-"""Divisions of such a cube, after which it is known well enough whether there is one."""
+"""Divisions of such a cube, after which it is known well enough whether there is one; fewer where
+there are many, which are noise."""
 
 CHUNK = 1 << 15
 """Cubes that are projected at once: their numbers stay in the processor's cache."""
@@ -214,25 +215,29 @@ def _surface(silhouettes: Sequence[Silhouette], cubes: Cubes, levels: int, enoug
 
 def _points_in(silhouettes: Sequence[Silhouette], cubes: Cubes, seed: int) -> np.ndarray:
     """(M, 3): points of the hull near its surface, at most one in each eighth of a cube."""
-    eighths = cubes.divided()
-    jitter = np.random.Generator(np.random.Philox(key=seed)).random((len(eighths), 3)) - 0.5
-    inside = eighths.centers() + eighths.edge * jitter
-    inside = inside[_shown_by_all(silhouettes, inside, 0.0)]
+    random, found = np.random.Generator(np.random.Philox(key=seed)), [np.zeros((0, 3))]
+    for some in _chunks(np.arange(len(cubes))):
+        eighths = cubes.chosen(some).divided()
+        points = eighths.centers() + eighths.edge * (random.random((len(eighths), 3)) - 0.5)
+        found.append(points[_shown_by_all(silhouettes, points, 0.0)])
+    inside = np.concatenate(found)
     thin = cubes
     if len(inside):
         with denormals_kept():
             distance, _ = cKDTree(inside).query(cubes.centers())
         thin = cubes.chosen(distance > THIN * cubes.edge)
-    surface = inside[_half_empty(silhouettes, inside, SHELL * eighths.edge)]
+    surface = inside[_half_empty(silhouettes, inside, SHELL * cubes.edge / 2)]
     return np.concatenate([surface, _thin_points(silhouettes, thin)])
 
 
 def _thin_points(silhouettes: Sequence[Silhouette], cubes: Cubes) -> np.ndarray:
     """(M, 3): where cubes without a point have parts of the hull, at most one in each eighth."""
-    for _ in range(THIN_LEVELS):
+    levels = 0
+    while levels == 0 or (levels < THIN_LEVELS and len(cubes) <= CHUNK):
         cubes = cubes.divided()
         cubes = cubes.chosen(_shown_by_all(silhouettes, cubes.centers(), cubes.edge))
-    _, first = np.unique(cubes.index >> (THIN_LEVELS - 1), axis=0, return_index=True)
+        levels += 1
+    _, first = np.unique(cubes.index >> (levels - 1), axis=0, return_index=True)
     return cubes.centers()[np.sort(first)]
 
 

@@ -62,7 +62,8 @@ def _numbers_of_gaussians(config: FitConfig, dataset: Dataset) -> dict[str, obje
     if densify.strategy != "adc":
         goal = getattr(densify, densify.strategy).gaussians
         if goal is None:
-            goal = changes[f"densify.{densify.strategy}.gaussians"] = _suitable_number(dataset)
+            goal = max(_suitable_number(dataset), config.init.num_points or 0)
+            changes[f"densify.{densify.strategy}.gaussians"] = goal
         at_start = max(4, round(SHARE_AT_START * goal))
     if config.init.num_points is None:
         changes["init.num_points"] = min(at_start, densify.max_gaussians)

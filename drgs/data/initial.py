@@ -87,7 +87,7 @@ def start_of(config: FitConfig, dataset: Dataset) -> Start:
         if are_masks(silhouettes, dataset.train):
             if (start := _on_the_hull(config, dataset, silhouettes)) is not None:
                 return start
-            note = f" (the masks of {len(silhouettes)} pictures have no hull in common)"
+            note = f" (the masks of {len(silhouettes)} pictures have no hull to start from)"
         elif init.start == "masks":
             raise UserError(
                 "init.start: masks needs nearly all training pictures to be transparent where "

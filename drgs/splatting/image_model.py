@@ -475,6 +475,10 @@ class SplatFeatures:
     def check_differentiable_in_camera(self) -> None:
         """They do not depend on the camera."""
 
+    def weighing(self) -> SplatFeatures:
+        """What has the weights of compositing as derivatives of the first number that is stored."""
+        return self
+
     def bind(self, lanes: Lanes, positions: Positions) -> SplatFeatures:
         """For the lanes of one kernel: nothing depends on where the pixels are."""
         del lanes, positions

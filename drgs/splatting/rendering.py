@@ -315,12 +315,14 @@ def weighted_sums(frame: Frame, plane: Any) -> Any:
 
     plane: x, Float (H * W,). A plane of the frame is C = sum_i w_i c_i, so that the adjoint's
     derivative with respect to c_i is sum w_i g over pixels: here g is x for the first feature and 0
-    for the others. No other kernel is compiled than that of the adjoint. Where colours are seen
-    along each pixel's ray, what is summed is the first coefficient of red: the same up to a factor.
+    for the others. No other kernel is compiled than that of the adjoint, unless colours are seen
+    along each pixel's ray.
     """
+    model = frame.bins.model
+    bins = replace(frame.bins, model=replace(model, features=model.features.weighing()))
     zeros = dr.opaque(type(plane), 0, dr.width(plane))
     d_features = [plane, *[zeros] * (frame.layers.count - 1)]
-    gradients = frame.order.adjoint(frame.bins, frame.records, frame.layers, d_features, zeros)
+    gradients = frame.order.adjoint(bins, frame.records, frame.layers, d_features, zeros)
     return gradients.features[0]
 
 

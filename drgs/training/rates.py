@@ -50,14 +50,15 @@ class LearningRates:
     """Those of all parameters of the Gaussians, over the iterations.
 
     The means' rate falls all the time; the others fall to ``decay`` times themselves, by the same
-    factor at every iteration, behind the share ``decay_from`` of the fit. Rates that are high at
-    first find colours and shapes sooner than constant ones, and leave less noise at the end.
+    factor at every iteration, behind the share ``decay_from`` of the iterations that follow coarse
+    stages. Rates that are high at first find colours and shapes sooner than constant ones, and
+    leave less noise at the end.
     """
 
     means: ExponentialDecay
     others: Mapping[str, float]  # at the start, by parameter
     decay: float
-    decay_from: float  # share of the iterations
+    decay_from: float  # share of the iterations behind coarse stages
 
     def __call__(self, iteration: int) -> dict[str, float]:
         """The rates of an iteration that are not those of the start; by parameter."""

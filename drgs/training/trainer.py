@@ -355,7 +355,7 @@ def _prune_window(
 ) -> dict[str, int | None]:
     """Where a last phase of pruning is in a fit of other iterations: where it was, if it has begun.
 
-    Else what is given of it keeps its share of the iterations.
+    Else what is given of it keeps its share of the iterations, of those that are ahead.
     """
     prune, names = config.densify.prune, ("densify.prune.start", "densify.prune.stop")
     window = config.densify.prune_window(config.iterations)
@@ -365,9 +365,11 @@ def _prune_window(
         None if given is None else round(given * iterations / config.iterations)
         for given in (prune.start, prune.stop)
     )
+    if start is not None:
+        start = max(1, start, now)
     if stop is not None:
         stop = max(stop, densify_stop + 1, (start or 0) + 1)
-    return dict(zip(names, (start and max(1, start), stop), strict=True))
+    return dict(zip(names, (start, stop), strict=True))
 
 
 def _part(state: dict[str, np.ndarray], prefix: str) -> dict[str, np.ndarray]:

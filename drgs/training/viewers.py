@@ -29,7 +29,7 @@ import numpy as np
 from drgs.config.approximations import DECLARED
 from drgs.config.changes import changed
 from drgs.config.schema import FitConfig, ModelConfig
-from drgs.core.errors import UserNote
+from drgs.core.errors import UserError, UserNote
 from drgs.data.types import Dataset, View
 from drgs.effects.smoothing import baked
 from drgs.effects.viewers import baked_for_viewers
@@ -37,7 +37,6 @@ from drgs.gaussians.parameters import Gaussians
 from drgs.integrator.scene import make_scene, render_views
 from drgs.integrator.sensors import camera_from_sensor, read_sensor
 from drgs.training.effects.base import TrainingEffect
-from drgs.training.finite_checks import NonFiniteError
 from drgs.training.trainer import Trainer
 
 SHARE = 0.08
@@ -95,7 +94,8 @@ def for_viewers(
     trainer: has ended, and is retired: see :meth:`drgs.training.trainer.Trainer.retire`. gaussians:
     what ``trainer.gaussians()`` gave. watch: is called after each iteration with their number.
 
-    Where a number is not finite, the closed form is what is given, with a :class:`UserNote`.
+    Where that cannot be, as where a number is not finite, the closed form is what is given, with a
+    :class:`UserNote`.
     """
     config = trainer.config
     start = _started(trainer, gaussians)
@@ -106,10 +106,11 @@ def for_viewers(
     further = tuning(config)
     try:
         tuned = _tuned(Trainer(further, dataset, start), trainer, watch)
-    except NonFiniteError as error:
+    except UserError as error:  # numbers that are not finite, or too little memory by now
         note = f"the Gaussians for viewers are not fitted any further: {error}"
         warnings.warn(UserNote(note), stacklevel=2)
         tuned = start
+    dr.flush_malloc_cache()  # of what those iterations had
     gaussians = replace(tuned, rendered_with=said)
     return ForViewers(gaussians, further.model, dataset.background, trainer.effects)
 
@@ -123,6 +124,8 @@ def _tuned(tuner: Trainer, trainer: Trainer, watch: Callable[[int], None]) -> Ga
         effect.restore(found[effect.name])
     while tuner.iteration < tuner.config.iterations:
         tuner.step()
+        if tuner.iteration % tuner.config.output.history_every == 0:
+            tuner.watch.check()
         watch(tuner.iteration - before)
     return tuner.gaussians()
 

@@ -1,6 +1,7 @@
 """What effects are good for: the command, shrunk, and what it spoils and measures."""
 
 import csv
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -17,11 +18,9 @@ from drgs.bench import benefits
 def small(tmp_path, monkeypatch):
     """The command's configuration, of a small dataset."""
     write_dataset(tmp_path / "data", make_dataset(train=4, test=2))
-    values = yaml.safe_load(benefits.CONFIG.read_text())
-    values["data"] = {"path": str(tmp_path / "data")}
     config = tmp_path / "small.yml"
-    config.write_text(yaml.safe_dump(values))
-    monkeypatch.setattr(benefits, "CONFIG", config)
+    config.write_text(yaml.safe_dump({"data": {"path": str(tmp_path / "data")}}))
+    monkeypatch.setattr(benefits, "SCENE", replace(benefits.SCENE, config=config))
     for name, value in {"SIZE": 16, "NUM_POINTS": 60, "QUICK_ITERATIONS": 4, "FEW": 2}.items():
         monkeypatch.setattr(benefits, name, value)
     return tmp_path

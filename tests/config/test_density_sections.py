@@ -79,6 +79,12 @@ def test_a_configuration_of_an_earlier_version_is_read(load, tmp_path):
             "x.yml: densify must hold split_count in the section adc or, as in earlier versions, "
             "beside it, not twice, got {adc: {split_count: 3}, split_count: 3}",
         ),
+        (
+            {"strategy": "budget", "prune_opacity": 0.1},
+            (),
+            "x.yml: densify must hold prune_opacity in the section adc, to which it belongs, where "
+            "strategy is budget, got {prune_opacity: 0.1, strategy: budget}",
+        ),
         ({"split_count": 1}, (), "x.yml: densify.split_count must be >= 2, got 1"),
         ({"adc": {"split_count": 1}}, (), "x.yml: densify.adc.split_count must be >= 2, got 1"),
         (

@@ -99,6 +99,17 @@ def test_little_memory_is_taken(ball):
     assert peak < 20e6
 
 
+def test_silhouettes_of_noise_take_little_memory(ball):
+    """Their surface is everywhere."""
+    rng = np.random.default_rng(2)
+    noisy = [replace(v, alpha=rng.uniform(0, 1, v.alpha.shape).astype(np.float32)) for v in ball]
+    tracemalloc.start()
+    hull_points(silhouettes_of(noisy), WHOLE, 3000, 0)
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert peak < 60e6
+
+
 def test_large_pictures_are_looked_at_in_larger_pixels(ball):
     large = [replace(v, alpha=np.kron(v.alpha, np.ones((20, 20), np.float32))) for v in ball[:2]]
     for silhouette, view in zip(silhouettes_of(large), ball, strict=False):

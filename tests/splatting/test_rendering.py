@@ -36,6 +36,8 @@ from support.rendering_checks import (
     expected_gradients,
 )
 
+from drgs.accuracy.pipeline import pipeline_of
+from drgs.config.approximations import Approximations
 from drgs.gaussians.parameters import PARAMETER_NAMES
 from drgs.reference import splatting as reference
 from drgs.splatting import rendering
@@ -316,10 +318,17 @@ def test_camera_tangents_of_two_frames_equal_differences_of_the_reference(case):
 # ----------------------------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize("sh_direction", ["mean", "pixel"])
 @both_precisions
-def test_weighted_sums_are_what_a_gaussian_adds_to_the_picture_times_the_plane(precision):
-    """The reference composites each Gaussian alone in white, among the others in black."""
+def test_weighted_sums_are_what_a_gaussian_adds_to_the_picture_times_the_plane(
+    precision, sh_direction
+):
+    """The reference composites each Gaussian alone in white, among the others in black.
+
+    Whatever its colour is: two are black, as far as negative colours are.
+    """
     case = clear(Case("weights", 23, 19, 1, count=12))
+    case.gaussians.sh0[:2] = -3
     splats = reference.project(case.gaussians, case.camera)
     plane = np.random.default_rng(3).uniform(0, 1, (case.height, case.width))
     expected = []
@@ -330,7 +339,9 @@ def test_weighted_sums_are_what_a_gaussian_adds_to_the_picture_times_the_plane(p
             cuts=splats.cuts,
         )  # fmt: skip
         expected.append(np.sum(picture.image[..., 0] * plane))
-    _, frame = render(case, precision)
+    approximations = Approximations(sh_direction=sh_direction)
+    pipeline = pipeline_of(approximations, case.rendered_degree)
+    _, frame = render(case, precision, pipeline)
     got = np.array(rendering.weighted_sums(frame, precision.array(plane)), np.float64)
     assert np.max(expected) > 1
     np.testing.assert_allclose(got, expected, atol=PICTURE[precision] * np.max(expected))

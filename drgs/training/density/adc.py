@@ -96,7 +96,7 @@ class AdaptiveDensityControl(DensityStrategy):
         """Continue with the statistics of :meth:`state`."""
         float_type = type(self.statistics.views)
         self.statistics = DensityStatistics(
-            float_type(state["gradient_norms"]), float_type(state["views"])
+            from_host(float_type, state["gradient_norms"]), from_host(float_type, state["views"])
         )
 
     def most_gaussians(self, start: int, iterations: int) -> int:

@@ -70,8 +70,15 @@ class GrowthToNumber(DensityStrategy):
         self.errors = dr.zeros(float_type, population.num_rows)
 
     def gathers(self, iteration: int) -> bool:
-        """Every so many views, as long as the errors can still lead to a change."""
-        return iteration < self.config.stop and iteration % self.config.budget.error_every == 0
+        """Every so many views, as long as the errors can still lead to a change.
+
+        Where there was none since the last change, the view of the change itself.
+        """
+        every, stop = self.config.budget.error_every, self.config.stop
+        if iteration < stop and iteration % every == 0:
+            return True
+        last_change = (iteration - 1) // self.config.every * self.config.every
+        return self.acts(iteration) and (iteration - 1) // every * every <= last_change
 
     def gather(self, step: SeenStep) -> None:
         """Add the errors of one more view."""
@@ -137,7 +144,8 @@ class GrowthToNumber(DensityStrategy):
 
     def restore(self, state: Mapping[str, np.ndarray]) -> None:
         """Continue with :meth:`state`."""
-        self.errors, self.first = type(self.errors)(state["errors"]), int(state["first"])
+        self.errors = from_host(type(self.errors), state["errors"])
+        self.first = int(state["first"])
 
     def most_gaussians(self, start: int, iterations: int) -> int:
         """The number that it grows to."""

@@ -50,7 +50,7 @@ class MarkovChain(DensityStrategy):
 
     @property
     def cap(self) -> int:
-        """The number of Gaussians that is never exceeded."""
+        """What the population grows to; one that starts with more stays as it is."""
         return min(self.config.mcmc.gaussians, self.config.max_gaussians)
 
     def penalties(self, parameters: Mapping[str, Any]) -> Iterator[Any]:
@@ -113,7 +113,8 @@ class MarkovChain(DensityStrategy):
                 f"iteration {iteration}: no Gaussian is more opaque than densify.mcmc.min_opacity "
                 f"= {config.min_opacity}: do the cameras see the start points?"
             )
-        aim = max(num_alive, min(self.cap, int(before * (1 + config.growth))))
+        grown = max(int(before * (1 + config.growth)), before + (config.growth > 0))
+        aim = max(num_alive, min(self.cap, grown))
         key = [population.seed, iteration]
         copied = in_proportion(np.where(alive, opacities, 0), aim - num_alive, key)
         if len(copied):

@@ -51,11 +51,16 @@ class PruneSchedule:
         return round(begun_with * (self.to / begun_with) ** share)
 
 
+def best_rows(scores: np.ndarray, count: int) -> np.ndarray:
+    """The ``count`` rows of the highest scores (N,), ascending; ties: the first rows."""
+    order = np.argsort(-scores, kind="stable")  # a NaN comes last
+    return np.sort(order[:count])
+
+
 def keep_best(population: Population, scores: np.ndarray, count: int) -> DensityReport:
     """Remove all but the ``count`` rows of the highest scores (N,); ties: the first rows stay.
 
     The rows that stay keep their order, and their moments.
     """
-    order = np.argsort(-scores, kind="stable")  # a NaN comes last
-    population.edit(population.rows(np.sort(order[:count])))
+    population.edit(population.rows(best_rows(scores, count)))
     return DensityReport(num_gaussians=count, pruned=len(scores) - count)

@@ -149,7 +149,7 @@ class DensityStrategy(Protocol):
         return False
 
     def gather(self, step: SeenStep) -> None:
-        """Take note of an iteration, after its optimizer step; waits for nothing."""
+        """Take note of an iteration, after its optimizer step."""
         del step
 
     def penalties(self, parameters: Mapping[str, Any]) -> Iterator[Any]:
@@ -184,7 +184,7 @@ class DensityStrategy(Protocol):
         return False
 
     def act(self, population: Population, iteration: int) -> DensityReport | None:
-        """Change rows or values; None: rows are what they were."""
+        """Change rows or values; None: it was no change of the population."""
         del population, iteration
 
     def state(self) -> dict[str, np.ndarray]:

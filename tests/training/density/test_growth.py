@@ -173,6 +173,20 @@ def test_errors_are_gathered_in_the_iterations_that_say_so(variant):
     assert gathered == [3, 6, 9, 12, 15, 18, 21]
 
 
+@pytest.mark.parametrize(("every", "stop", "error_every"), [(4, 26, 10), (2, 12, 5), (100, 30, 7)])
+def test_each_change_has_seen_errors(every, stop, error_every):
+    """Those of its own view, if there were none since the last one."""
+    budget = {"gaussians": 70, "error_every": error_every}
+    config = DensifyConfig(start=1, stop=stop, every=every, budget=budget)
+    growth, seen = GrowthToNumber(config), 0
+    for iteration in range(1, stop + 5):
+        seen += growth.gathers(iteration)
+        if growth.acts(iteration):
+            assert seen > 0
+            seen = 0
+    assert seen == 0
+
+
 def test_a_fit_grows_along_the_curve_and_is_resumed_to_the_same_bytes(variant):
     uninterrupted, first = make_trainer(densify=GROWING), make_trainer(densify=GROWING)
     counts = []

@@ -150,6 +150,13 @@ def test_the_population_grows_by_a_share_until_its_cap():
     assert sizes == [105, 110, 115, 117, 117]
 
 
+def test_a_small_population_grows_as_well():
+    """5 % of 6 are less than one."""
+    optimizer = make([SIZE] * 6, 0.5)
+    sizes = [act(optimizer, 100 * i, gaussians=8).num_gaussians for i in range(6, 9)]
+    assert sizes == [7, 8, 8]
+
+
 def test_with_more_than_the_cap_at_the_start_transparent_ones_go():
     optimizer = make([SIZE] * 10, [0.5] * 6 + [DEAD] * 4)
     report = act(optimizer, gaussians=8)

@@ -160,7 +160,8 @@ def test_random_populations_end_with_the_number(seed):
 
 
 # ---- importance
-def test_those_that_show_least_since_the_last_change_go():
+def test_those_that_show_least_in_the_phase_go():
+    """Not since the last change: that is fewer views than there are."""
     optimizer = make([SIZE] * 8, 0.5)
     before = values(optimizer)["means"]
     phase = Importance(config_of(to=2))
@@ -170,9 +171,10 @@ def test_those_that_show_least_since_the_last_change_go():
     phase.gather(Step([0, 9, 0, 0, 8, 0, 0, 0]))
     assert phase.act(rows, 2500).num_gaussians == 4
     np.testing.assert_array_equal(values(optimizer)["means"], before[[0, 1, 4, 5]])
-    phase.gather(Step([0, 1, 0, 2]))
+    phase.gather(Step([2, 0, 0, 6]))
     assert phase.act(rows, 3000).num_gaussians == 2
     np.testing.assert_array_equal(values(optimizer)["means"], before[[1, 5]])
+    assert np.array(phase.scores).tolist() == [9, 9]
 
 
 @pytest.mark.parametrize("method", [NaturalSelection, Importance])
@@ -204,6 +206,19 @@ def test_a_phase_that_would_end_before_it_begins_is_refused():
     with pytest.raises(ValueError, match=r"prune\.stop must be > densify\.stop"):
         config_of(to=5, stop=1999)
     config_of(stop=1999)  # without a number there is no phase
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"iterations": 2000}, r"densify\.stop must be < iterations \(2000\), .* got 2000"),
+        ({"start": 4000}, r"densify\.prune\.start must be < iterations \(4000\), .* got 4000"),
+        ({"stop": 4001}, r"densify\.prune\.stop must be <= iterations \(4000\), got 4001"),
+    ],
+)
+def test_a_phase_that_would_not_be_over_in_time_is_refused(values, message):
+    with pytest.raises(ValueError, match=message):
+        config_of(to=5, **values)
 
 
 def test_the_phase_keeps_its_share_of_a_longer_fit():

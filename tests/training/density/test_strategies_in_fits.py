@@ -10,8 +10,9 @@ from support.small_capture import blobs
 
 from drgs.config.schema import FitConfig
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
+from drgs.training.trainer import Trainer
 
-MODULES = {"mcmc", "selection", "importance", "pruning", "phases", "draws"}
+MODULES = {"adc", "budget", "mcmc", "selection", "importance", "pruning", "phases", "draws"}
 
 MCMC = {
     "densify__strategy": "mcmc",
@@ -107,17 +108,47 @@ def test_a_revised_plan_leaves_a_phase_that_has_begun_where_it_was():
     assert early.config.densify.prune_window(60) == (30, 48)
 
 
+def test_a_revised_plan_is_one_from_the_start_with_a_phase_ahead():
+    """That was to begin earlier than the revision, had it been planned so."""
+    window = {"densify__prune__start": 20, "densify__prune__stop": 26}
+    revised = make_trainer("selection", **window)
+    for iteration in range(1, 25):
+        revised.step()
+        if iteration == 18:
+            revised.replan(24, 14)
+    assert revised.config.densify.prune_window(24)[0] == 18
+    again = fits.steps(replanned(revised), 24)
+    assert {k: v.tobytes() for k, v in again.state().items()} == {
+        k: v.tobytes() for k, v in revised.state().items()
+    }
+
+
+def test_a_phase_for_which_there_is_no_time_does_not_take_place():
+    trainer = fits.steps(make_trainer("selection", densify__prune__start=20), 16)
+    trainer.replan(16, 14)
+    again = fits.steps(replanned(trainer), 16)
+    assert again.num_gaussians == trainer.num_gaussians > 20
+
+
+def replanned(trainer):
+    """A trainer that knows the plan from the start."""
+    return Trainer(trainer.config, fits.plain_dataset(), many_blobs())
+
+
 def test_what_is_not_chosen_is_not_imported(monkeypatch):
     from drgs.training.density.called_for import density_strategy
 
     names = {f"drgs.training.density.{module}" for module in MODULES}
-    for name in names & set(sys.modules):
-        monkeypatch.delitem(sys.modules, name)
-    density_strategy(FitConfig(data={"path": "."}))
-    assert not names & set(sys.modules)
-    density_strategy(FitConfig(data={"path": "."}, densify={"strategy": "mcmc"}))
-    imported = {name.rpartition(".")[2] for name in names & set(sys.modules)}
-    assert imported == {"mcmc", "draws"}
+    for strategy, expected in (
+        ("adc", {"adc"}),
+        ("budget", {"budget"}),
+        ("mcmc", {"mcmc", "draws"}),
+    ):
+        for name in names & set(sys.modules):
+            monkeypatch.delitem(sys.modules, name)
+        density_strategy(FitConfig(data={"path": "."}, densify={"strategy": strategy}))
+        imported = {name.rpartition(".")[2] for name in names & set(sys.modules)}
+        assert imported == expected
 
 
 def test_steps_of_several_views_come_when_rows_do_not_change_any_more():
