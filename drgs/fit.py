@@ -49,6 +49,7 @@ from drgs.core.errors import UserError, UserNote
 from drgs.core.files import atomic_path
 from drgs.core.locks import sole_writer
 from drgs.core.machine import processor
+from drgs.core.memory import release_unused_memory
 from drgs.core.private import llvm_version
 from drgs.data import Dataset, View, load_dataset
 from drgs.data.derived import completed
@@ -326,7 +327,7 @@ def fit_and_write(
     except NonFiniteError as error:
         raise UserError(f"{error}; {_remedy(out)}") from None
     _say_what_is_missing(trainer)
-    dr.flush_malloc_cache()  # encoding the orbit's frames takes as much as iterations do
+    release_unused_memory()  # encoding the orbit's frames takes as much as iterations do
     as_saved(gaussians, trainer).save(out / GAUSSIANS)
     for effect in trainer.effects:
         effect.write(out, dataset.train)

@@ -2,24 +2,29 @@
 
 The shipped scene at 200x200 (``scenes/lego_mini.yml``) is fitted with different numbers of
 iterations, and with one other choice at a time: smaller pictures first, fewer Gaussians, spherical
-harmonics of a lower degree, another window of the loss. Each choice is a curve of the quality on
-the test views over the time that the fit took. Finished fits are not repeated, interrupted ones go
-on.
+harmonics of a lower degree, no SSIM. Each choice is a curve of the quality on the test views over
+the time that the fit took. Finished fits are not repeated, interrupted ones go on.
+
+``--times`` shows what plans make of these curves (``drgs.fit --budget``): a fit for each of several
+times, which count everything from the start of the command to its end.
 """
 
 from __future__ import annotations
 
 import argparse
-import csv
 import json
-import math
 import multiprocessing
 import statistics
+import subprocess
+import sys
+import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
+
+import mitsuba as mi
 
 from drgs import fit
 from drgs.bench.output import add_out, machine, markdown_table, write_csv
@@ -27,25 +32,28 @@ from drgs.cli.commands import CommandParser
 from drgs.config.changes import changed, with_iterations
 from drgs.config.load import dump_config, load_config
 from drgs.config.schema import FitConfig
-from drgs.data import load_dataset
+from drgs.data import initial_gaussians, load_dataset
 from drgs.data.derived import completed
 from drgs.io.figures import new_figure, write_figure
-from drgs.results.files import HISTORY, METRICS
-from drgs.training.budget import STRATEGIES, Strategy
+from drgs.results.files import METRICS
+from drgs.training.budget import STRATEGIES, Strategy, rehearse
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 CONFIG = Path(__file__).parents[2] / "scenes" / "lego_mini.yml"
 
-BUDGETS = (500, 1000, 2000, 4000, 8000)
+BUDGETS = (250, 750, 2000, 5000)
 """Iterations."""
 
 QUICK_BUDGETS = (100, 200)
 
-START_ROWS = 2
-"""Rows of a history, of ten iterations each, after the first one, in which kernels are compiled."""
+TIMES = ("10s", "30s", "1m", "2m", "5m")
+"""For all that a fit does."""
 
+QUICK_TIMES = ("20s",)
+
+REHEARSALS = 3
 
 Change = Callable[[FitConfig], FitConfig]
 
@@ -70,9 +78,7 @@ def _other(name: str, **values: object) -> Choice:
 
 CHOICES = (
     *map(_strategy, STRATEGIES),
-    _other("SH of degree 0", model__sh_degree=0),
     _other("SH of degree 1", model__sh_degree=1),
-    _other("SSIM window of 5 px", loss__window=5, loss__sigma=0.7),
     _other("no SSIM", loss__dssim_weight=0.0),
 )
 
@@ -92,7 +98,7 @@ class Point:
 
 def add_arguments(parser: CommandParser) -> None:
     """Add the arguments of the command."""
-    parser.show_examples("%(prog)s --only 1 2")
+    parser.show_examples("%(prog)s --only 1 2", "%(prog)s --times")
     add_out(parser, run, "training/training.csv", "training/training.png")
     parser.add_argument("--quick", action="store_true", help="a few hundred iterations")
     parser.add_argument(
@@ -107,17 +113,31 @@ def add_arguments(parser: CommandParser) -> None:
         help="; ".join(f"{k}: {choice.name}" for k, choice in enumerate(CHOICES, 1)),
     )  # fmt: skip
 
+    parser.add_argument(
+        "--times",
+        action="store_true",
+        help=f"instead of the curves, fits for {', '.join(TIMES)}: what plans make of them",
+    )
+
 
 def run(args: argparse.Namespace) -> None:
     """Fit what is not finished; table, CSV and plot of all that is."""
     out = args.out / "training"
+    if args.times:
+        run_times(args.config, QUICK_TIMES if args.quick else TIMES, out)
+    else:
+        run_curves(args, out)
+
+
+def run_curves(args: argparse.Namespace, out: Path) -> None:
+    """One fit for each choice and number of iterations."""
     budgets = QUICK_BUDGETS if args.quick else BUDGETS
     numbers = args.only or range(1, len(CHOICES) + 1)
     for iterations in budgets:
         for choice in (CHOICES[k - 1] for k in numbers):
             with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:
                 pool.submit(fit_point, args.config, choice.name, iterations, out).result()
-    second = seconds_at_start(out, budgets)
+    second = seconds_at_start(args.config, out)
     points = [
         point_of(choice, iterations, out, second)
         for choice in CHOICES
@@ -129,6 +149,32 @@ def run(args: argparse.Namespace) -> None:
     write_csv(out / "training.csv", list(Point.__dataclass_fields__), rows)
     write_figure(out / "training.png", plot(points))
     print(f"\nwritten: {out / 'training.csv'}, {out / 'training.png'}")
+
+
+def run_times(config: Path, times: Sequence[str], out: Path) -> None:
+    """One planned fit for each time; a table of those that are finished."""
+    rows = []
+    for duration in times:
+        folder = out / "times" / duration
+        if not (folder / METRICS).exists():
+            folder.parent.mkdir(parents=True, exist_ok=True)
+            arguments = [str(config), "--out", str(folder), "--budget", duration]
+            command = [sys.executable, "-m", "drgs.fit", *arguments]
+            start = time.perf_counter()
+            subprocess.run(command, check=True)
+            folder.with_suffix(".s").write_text(f"{time.perf_counter() - start:.1f}")
+        metrics = json.loads((folder / METRICS).read_text())
+        rows.append(
+            [
+                duration,
+                f"{float(folder.with_suffix('.s').read_text()):.1f} s",
+                f"{metrics['iterations']:,}",
+                f"{metrics['num_gaussians']:,}",
+                f"{metrics['test']['psnr']:.2f} dB",
+            ]
+        )
+    header = ["--budget", "took", "iterations", "Gaussians", "PSNR"]
+    print(f"\n{machine()}\n\n{markdown_table(header, rows)}")
 
 
 def folder_of(choice: Choice, iterations: int, out: Path) -> Path:
@@ -152,21 +198,24 @@ def fit_point(config: Path, name: str, iterations: int, out: Path) -> None:
     fit.main([str(file), "--out", str(folder)])
 
 
-def seconds_at_start(out: Path, budgets: Sequence[int]) -> float:
-    """Seconds of an iteration at the start of a fit as shipped: the median of several fits.
+def seconds_at_start(config: Path, out: Path) -> float:
+    """Seconds of an iteration at the start of a fit as shipped, as plans time them; kept."""
+    path = out / "start.json"
+    if not path.exists():
+        with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:
+            path.write_text(json.dumps(pool.submit(rehearsed, config).result()))
+    return statistics.median(json.loads(path.read_text()))
 
-    The same iterations, or as many, as ``drgs.training.budget.rehearse`` times.
-    """
-    seconds = []
-    for iterations in budgets:
-        path = folder_of(CHOICES[0], iterations, out) / HISTORY
-        if path.exists():
-            with path.open(newline="") as file:
-                rows = {int(row["iteration"]): float(row["wall_s"]) for row in csv.DictReader(file)}
-            first, *others = sorted(rows)
-            last = others[:START_ROWS][-1]
-            seconds.append((rows[last] - rows[first]) / (last - first))
-    return round(statistics.median(seconds), 5) if seconds else math.nan
+
+def rehearsed(path: Path) -> list[float]:
+    """Seconds of an iteration in each of some rehearsals."""
+    mi.set_variant("llvm_ad_rgb")
+    config = load_config(path)
+    dataset = load_dataset(config.data_for_training)
+    gaussians = initial_gaussians(config, dataset)
+    config = completed(config, dataset)
+    seconds = (rehearse(config, dataset, gaussians).iteration_s for _ in range(REHEARSALS))
+    return [round(second, 5) for second in seconds]
 
 
 def point_of(choice: Choice, iterations: int, out: Path, start_s: float) -> Point:

@@ -61,27 +61,39 @@ class Strategy:
 
     name: str  # of its curve
     coarse: tuple[tuple[float, int], ...] = ()  # (end, in shares of all iterations; factor)
-    growth: float | None = None  # most Gaussians, in parts of those at the start; None: as it is
+    share: float | None = None  # of the number of Gaussians; None: as configured
+
+    def concerns(self, config: FitConfig) -> bool:
+        """Whether it can be applied: there is a number of Gaussians to take a share of."""
+        return self.share is None or _target(config) is not None
 
     def applied(self, config: FitConfig, num_points: int) -> FitConfig:
-        """``config`` with this strategy; num_points: Gaussians at the start."""
-        n, most = config.iterations, config.densify.max_gaussians
-        if self.growth is not None:
-            most = min(most, max(num_points, round(self.growth * num_points)))
-        stages = [
-            {"until": max(k + 1, round(share * n)), "factor": factor}
-            for k, (share, factor) in enumerate(self.coarse)
-        ]
-        return changed(config, {"coarse": stages, "densify.max_gaussians": most})
+        """``config`` with this strategy; num_points: Gaussians at the start, the fewest."""
+        changes: dict[str, object] = {
+            "coarse": [
+                {"until": max(k + 1, round(share * config.iterations)), "factor": factor}
+                for k, (share, factor) in enumerate(self.coarse)
+            ]
+        }
+        if self.share is not None:
+            least = max(num_points, config.init.num_points or 0)
+            number = max(least, round(self.share * _target(config)))
+            changes[f"densify.{config.densify.strategy}.gaussians"] = number
+        return changed(config, changes)
+
+
+def _target(config: FitConfig) -> int | None:
+    """The number that the population grows to; None: its strategy knows none."""
+    section = getattr(config.densify, config.densify.strategy)
+    number = getattr(section, "gaussians", None)
+    return None if number is None else min(number, config.densify.max_gaussians)
 
 
 STRATEGIES = (
     Strategy("as shipped"),
     Strategy("half size for the first quarter", coarse=((0.25, 2),)),
-    Strategy("half size for the first half", coarse=((0.5, 2),)),
-    Strategy("quarter, then half size, for the first half", coarse=((0.2, 4), (0.5, 2))),
-    Strategy("never more Gaussians than at the start", growth=1),
-    Strategy("at most a third more Gaussians than at the start", growth=4 / 3),
+    Strategy("half as many Gaussians", share=0.5),
+    Strategy("no more Gaussians than at the start", share=0.0),
 )
 
 
@@ -172,7 +184,7 @@ class Plan:
     @property
     def reasons(self) -> str:
         """What was chosen and why, as text."""
-        most = f"at most {self.config.densify.max_gaussians:,} Gaussians"
+        number = _target(self.config) or self.config.densify.max_gaussians
         stages = [f"1/{s.factor} size until iteration {s.until:,}" for s in self.config.coarse]
         lines = [
             f"An iteration takes {1e3 * self.start_s:.0f} ms at the start here.",
@@ -183,7 +195,8 @@ class Plan:
                 for c in self.candidates
             ),
             f"Planned: {self.config.iterations:,} iterations; "
-            f"{', '.join([*stages, 'then full size']) if stages else 'full size'}; {most}; the "
+            f"{', '.join([*stages, 'then full size']) if stages else 'full size'}; at most "
+            f"{number:,} Gaussians; the "
             f"population changes until iteration {self.config.densify.stop:,}.",
         ]
         return "\n".join(lines)
@@ -206,7 +219,8 @@ def make_plan(
     candidates = []
     for strategy in STRATEGIES:
         smallest = side / max((factor for _, factor in strategy.coarse), default=1)
-        if strategy.name in curves and (smallest >= MIN_SIDE or not strategy.coarse):
+        fits = smallest >= MIN_SIDE or not strategy.coarse
+        if strategy.name in curves and fits and strategy.concerns(config):
             curve = curves[strategy.name]
             iterations = curve.iterations_in(seconds / start_s) if seconds > 0 else 0
             if iterations >= MIN_ITERATIONS:

@@ -19,6 +19,7 @@ import numpy as np
 
 from drgs.config.changes import changed
 from drgs.config.schema import FitConfig
+from drgs.core.memory import release_unused_memory
 from drgs.data.derived import completed
 from drgs.data.types import Dataset, View
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
@@ -272,7 +273,7 @@ class Trainer:
         """
         self.stage.end()
         self.optimizer.state.clear()
-        dr.flush_malloc_cache()
+        release_unused_memory()
 
     def pictures(self, views: tuple[View, ...]) -> Iterator[np.ndarray]:
         """Pictures (H, W, 3) of views that were not trained on, display space, in [0, 1]."""

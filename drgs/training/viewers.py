@@ -30,6 +30,7 @@ from drgs.config.approximations import DECLARED
 from drgs.config.changes import changed
 from drgs.config.schema import FitConfig, ModelConfig
 from drgs.core.errors import UserError, UserNote
+from drgs.core.memory import release_unused_memory
 from drgs.data.types import Dataset, View
 from drgs.effects.smoothing import baked
 from drgs.effects.viewers import baked_for_viewers
@@ -110,7 +111,7 @@ def for_viewers(
         note = f"the Gaussians for viewers are not fitted any further: {error}"
         warnings.warn(UserNote(note), stacklevel=2)
         tuned = start
-    dr.flush_malloc_cache()  # of what those iterations had
+    release_unused_memory()  # of what those iterations had
     gaussians = replace(tuned, rendered_with=said)
     return ForViewers(gaussians, further.model, dataset.background, trainer.effects)
 

@@ -42,10 +42,11 @@ def test_a_reset_that_is_off_stays_off_and_no_count_falls_to_zero():
     assert (short.densify.start, short.densify.stop, short.model.sh_increase_every) == (1, 15, 1)
 
 
-@pytest.mark.parametrize("iterations", [100, 8000])
+@pytest.mark.parametrize("iterations", [100, 5000])
 def test_every_choice_is_a_configuration(iterations, tmp_path):
     """And each is another one."""
-    decided = changed(load_config(training.CONFIG), {"init.num_points": 20_000})
+    numbers = {"init.num_points": 20_000, "densify.budget.gaussians": 50_000}
+    decided = changed(load_config(training.CONFIG), numbers)
     shipped = with_iterations(decided, iterations)
     seen = []
     for choice in training.CHOICES:
@@ -85,3 +86,8 @@ def test_fits_run_and_are_not_repeated(tmp_path, capfd, monkeypatch):
     bench.main(command)
     assert capfd.readouterr().out.count("this fit is finished") == 4
     assert (folder / "training.csv").read_text() == written
+
+    bench.main([*command, "--times"])
+    header, _, row = capfd.readouterr().out.strip().splitlines()[-3:]
+    assert header.split("|")[1:3] == [" --budget ", " took "] and row.startswith("| 20s |")
+    assert float(row.split("|")[2].split()[0]) < 40

@@ -3,6 +3,7 @@
 import subprocess
 import sys
 
+import drjit as dr
 import pytest
 
 from drgs.core import memory
@@ -117,3 +118,23 @@ def test_what_drjit_holds_for_its_next_arrays_is_available(monkeypatch):
     assert len(rooms) == 2
     assert memory.why_too_large(3000, 3000) is None
     assert len(rooms) == 2
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="glibc's malloc_trim")
+def test_what_is_not_used_is_given_back_to_the_system():
+    """Among arrays of 20 MB, which glibc keeps once one as large was freed."""
+    from drjit.llvm.ad import Float
+
+    def filled():
+        arrays = [dr.full(Float, i, 5_000_000) for i in range(10)]
+        dr.make_opaque(arrays)
+        dr.sync_thread()
+        return arrays
+
+    del filled()[:]
+    arrays = filled()
+    with_all = memory.resident_memory()
+    arrays = arrays[-1:]
+    memory.release_unused_memory()
+    assert memory.resident_memory() < with_all - 150e6
+    assert arrays[0][0] == 9

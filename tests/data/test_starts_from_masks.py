@@ -121,7 +121,7 @@ def test_masks_without_a_hull_are_said_and_left_aside(masks, opaque):
     for kind in ("auto", "masks"):
         start = start_of(config(start=kind), nothing)
         assert start.description == (
-            "300 random points in [-1.3, 1.3]^3 (the masks of 12 pictures have no hull in common)"
+            "300 random points in [-1.3, 1.3]^3 (the masks of 12 pictures have no hull to start from)"
         )
 
 

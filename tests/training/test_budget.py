@@ -81,7 +81,7 @@ CONFIG = FitConfig(data={"path": "."}, init={"num_points": 50}, iterations=7000)
 
 
 def curves_of(slow=SLOW, fast=FAST):
-    return {plan.STRATEGIES[0].name: slow, plan.STRATEGIES[3].name: fast}
+    return {plan.STRATEGIES[0].name: slow, plan.STRATEGIES[1].name: fast}
 
 
 def planned(seconds, side=400, start_s=0.1, **curves):
@@ -92,9 +92,9 @@ def test_the_best_strategy_in_the_time_is_planned():
     """A thousand iterations as they are, or two thousand cheaper ones: 30 or 30.5 dB."""
     result = planned(100)
     assert [(c.iterations, c.psnr) for c in result.candidates] == [(1000, 30.0), (2000, 30.5)]
-    assert result.chosen.strategy is plan.STRATEGIES[3]
+    assert result.chosen.strategy is plan.STRATEGIES[1]
     assert result.config.iterations == 2000
-    assert [(s.until, s.factor) for s in result.config.coarse] == [(400, 4), (1000, 2)]
+    assert [(s.until, s.factor) for s in result.config.coarse] == [(500, 2)]
     assert result.config.densify.stop == 1000
     worse = planned(100, fast=replace(FAST, psnr=(28.5, 29.5)))
     assert worse.chosen.strategy is plan.STRATEGIES[0] and worse.config.coarse == []
@@ -108,11 +108,8 @@ def test_reasons_name_all_candidates():
     reasons = planned(100).reasons
     assert "100 ms at the start" in reasons and "100 s are enough" in reasons
     assert "1,000 iterations, 30.00 dB there: as shipped" in reasons
-    assert (
-        "2,000 iterations, 30.50 dB there: quarter, then half size, for the first half (chosen)"
-        in (reasons)
-    )
-    assert "1/4 size until iteration 400, 1/2 size until iteration 1,000, then full size" in reasons
+    assert "2,000 iterations, 30.50 dB there: half size for the first quarter (chosen)" in reasons
+    assert "1/2 size until iteration 500, then full size" in reasons
 
 
 def test_a_configuration_that_cannot_shrink_is_planned():
@@ -127,7 +124,7 @@ def test_a_configuration_that_cannot_shrink_is_planned():
 
 
 def test_small_pictures_do_not_become_smaller():
-    assert planned(100, side=100).chosen.strategy is plan.STRATEGIES[0]
+    assert planned(100, side=50).chosen.strategy is plan.STRATEGIES[0]
 
 
 def test_too_short_a_time_is_refused():
@@ -137,11 +134,32 @@ def test_too_short_a_time_is_refused():
         planned(-3)
 
 
-def test_growth_is_counted_from_the_start_and_keeps_the_cap():
-    strategy = Strategy("x", growth=1.5)
-    assert strategy.applied(CONFIG, 50).densify.max_gaussians == 75
-    capped = changed(CONFIG, {"densify.max_gaussians": 60})
-    assert strategy.applied(capped, 50).densify.max_gaussians == 60
+def test_a_share_of_the_gaussians_is_not_less_than_the_start():
+    half = Strategy("x", share=0.5)
+    growing = changed(CONFIG, {"densify.budget.gaussians": 400})
+    assert half.applied(growing, 50).densify.budget.gaussians == 200
+    assert half.applied(growing, 300).densify.budget.gaussians == 300
+    capped = changed(growing, {"densify.max_gaussians": 160})
+    assert half.applied(capped, 50).densify.budget.gaussians == 80
+    mcmc = changed(growing, {"densify.strategy": "mcmc", "densify.mcmc.gaussians": 600})
+    assert half.applied(mcmc, 50).densify.mcmc.gaussians == 300
+    # A hull may have fewer points than were asked for.
+    more = changed(mcmc, {"init.num_points": 320})
+    assert half.applied(more, 310).densify.mcmc.gaussians == 320
+
+
+def test_a_share_is_planned_only_where_there_is_a_number():
+    """The population of adc comes out of a threshold."""
+    half = next(strategy for strategy in plan.STRATEGIES if strategy.share == 0.5)
+    curves = {plan.STRATEGIES[0].name: SLOW, half.name: replace(FAST, psnr=(31.0, 32.0))}
+    growing = changed(CONFIG, {"densify.budget.gaussians": 400})
+    result = make_plan(growing, 50, 400, 100, 0.1, curves)
+    assert result.chosen.strategy is half and result.config.densify.budget.gaussians == 200
+    assert "at most 200 Gaussians" in result.reasons
+    adc = changed(CONFIG, {"densify.strategy": "adc"})
+    result = make_plan(adc, 50, 400, 100, 0.1, curves)
+    assert [candidate.strategy for candidate in result.candidates] == [plan.STRATEGIES[0]]
+    assert "at most 1,000,000 Gaussians" in result.reasons
 
 
 # ----------------------------------------------------------------------------------------------

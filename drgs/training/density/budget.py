@@ -127,11 +127,12 @@ class GrowthToNumber(DensityStrategy):
         """N_0 + (N - N_0) sqrt(u) / r^(2 - u), where u rises from 0 at ``start`` to 1 at ``stop``.
 
         r: what the pictures' sizes are divided by: coarse pictures need fewer (DashGaussian, Chen
-        et al. 2025).
+        et al. 2025). 1 at ``stop``: no change comes after it.
         """
         start, stop = self.config.start, self.config.stop_seen_from(iteration)
         u = min(max((iteration - start) / max(stop - start, 1), 0), 1)
-        r = next((stage.factor for stage in self.coarse if iteration <= stage.until), 1)
+        size = next((stage.factor for stage in self.coarse if iteration <= stage.until), 1)
+        r = size if iteration < stop else 1
         return self.first + round((self._final - self.first) * math.sqrt(u) / r ** (2 - u))
 
     @property

@@ -14,6 +14,7 @@ from support.random_scenes import examples
 from support.trainers import make_trainer
 
 from drgs.config.density import DensifyConfig
+from drgs.config.schema import CoarseStage
 from drgs.core.errors import UserError
 from drgs.gaussians.parameters import PARAMETER_NAMES
 from drgs.reference import splatting as reference
@@ -203,6 +204,16 @@ def test_a_fit_grows_along_the_curve_and_is_resumed_to_the_same_bytes(variant):
     expected, got = uninterrupted.gaussians(), second.gaussians()
     for name in PARAMETER_NAMES:
         assert getattr(got, name).tobytes() == getattr(expected, name).tobytes(), name
+
+
+def test_the_number_is_reached_where_pictures_are_coarse_until_the_end_of_growth():
+    coarse = [CoarseStage(until=1000, factor=2)]
+    config = DensifyConfig(start=100, stop=1000, every=100, budget={"gaussians": 90})
+    growth = GrowthToNumber(config, coarse, first=50)
+    assert [growth.goal(i) for i in (900, 1000)] == [
+        50 + round(40 * math.sqrt(8 / 9) / 2 ** (10 / 9)),
+        90,
+    ]
 
 
 def test_coarse_pictures_have_fewer_gaussians_and_the_means_rate_waits_for_their_end(variant):
