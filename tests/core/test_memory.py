@@ -4,7 +4,9 @@ import subprocess
 import sys
 
 import drjit as dr
+import numpy as np
 import pytest
+from drjit.llvm.ad import Float
 
 from drgs.core import memory
 
@@ -122,19 +124,16 @@ def test_what_drjit_holds_for_its_next_arrays_is_available(monkeypatch):
 
 @pytest.mark.skipif(sys.platform != "linux", reason="glibc's malloc_trim")
 def test_what_is_not_used_is_given_back_to_the_system():
-    """Among arrays of 20 MB, which glibc keeps once one as large was freed."""
-    from drjit.llvm.ad import Float
-
-    def filled():
-        arrays = [dr.full(Float, i, 5_000_000) for i in range(10)]
-        dr.make_opaque(arrays)
-        dr.sync_thread()
-        return arrays
-
-    del filled()[:]
-    arrays = filled()
+    """Below a block that is used, glibc keeps what was freed; Dr.Jit keeps all of its arrays."""
+    blocks = [np.ones(8_000) for _ in range(2_000)]
+    arrays = [dr.full(Float, i, 1_000_000) for i in range(30)]
+    dr.make_opaque(arrays)
+    dr.sync_thread()
     with_all = memory.resident_memory()
-    arrays = arrays[-1:]
+    blocks, arrays = blocks[-1:], arrays[-1:]
+    dr.flush_malloc_cache()
+    with_blocks = memory.resident_memory()
+    assert with_blocks < with_all - 100e6
     memory.release_unused_memory()
-    assert memory.resident_memory() < with_all - 150e6
-    assert arrays[0][0] == 9
+    assert memory.resident_memory() < with_blocks - 100e6
+    assert blocks[0][0] == 1 and arrays[0][0] == 29

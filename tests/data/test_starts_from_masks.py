@@ -120,9 +120,8 @@ def test_masks_without_a_hull_are_said_and_left_aside(masks, opaque):
     nothing = with_alpha(masks, np.zeros_like)
     for kind in ("auto", "masks"):
         start = start_of(config(start=kind), nothing)
-        assert start.description == (
-            "300 random points in [-1.3, 1.3]^3 (the masks of 12 pictures have no hull to start from)"
-        )
+        reason = "the masks of 12 pictures have no hull to start from"
+        assert start.description == f"300 random points in [-1.3, 1.3]^3 ({reason})"
 
 
 def test_masks_and_clouds_that_are_not_there_are_refused(masks, opaque):
