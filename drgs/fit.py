@@ -11,7 +11,8 @@ result on the test views and writes the output folder:
 - ``renders/<split>/*.png``: the test views as fitted
 - ``side_by_side/<split>/*.png``: fitted, photograph and difference
 - ``curves.png``, ``orbit.webp``, ``orbit.gif``
-- ``report.html``: all of it on one page that needs no other file
+- ``report.html``: all of it on one page that needs no other file (``output.report: false``
+  leaves out this page and what is made for it: comparisons, curves, orbits)
 - ``config.yml``: every value that the fit used
 - ``views.json``: the cameras of the training views, for orbits
 - ``colors.json``, ``cameras.json``: colour transforms and refined cameras of the training views
@@ -43,6 +44,7 @@ from drgs.cli.commands import CommandParser, file_or_folder, run_command
 from drgs.cli.execution import add_execution_arguments, executing, select_variant
 from drgs.cli.interrupts import INTERRUPTED_STATUS, StopRequest
 from drgs.cli.progress import RunProgress
+from drgs.config.changes import changed
 from drgs.config.load import load_config
 from drgs.config.schema import FitConfig
 from drgs.core.errors import UserError, UserNote
@@ -85,7 +87,7 @@ from drgs.results.folder import (
 )
 from drgs.results.metrics import FitMetrics, Quality, SplitMetrics, mean_of
 from drgs.results.refined_cameras import write_views
-from drgs.results.report import score, seconds_to_write, write_pictures, write_results
+from drgs.results.report import score, seconds_of_results, write_pictures, write_results
 from drgs.training.budget import (
     AllIterations,
     Deadline,
@@ -112,6 +114,12 @@ from drgs.training.trainer import Trainer
 
 SMOOTHING = 0.9
 """Weight of the past in the PSNR that the progress line shows."""
+
+LOADING_SECONDS = 1.2
+"""Before :func:`run`: the interpreter and the libraries. ``--budget`` counts them."""
+
+MOST_FOR_PICTURES = 0.33
+"""Of the time that ``--budget`` leaves behind the start."""
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -188,7 +196,7 @@ class Run:
 
 def run(args: argparse.Namespace) -> None:
     """Fit what the command line names; end the process with status 130 if Ctrl-C stopped it."""
-    started = time.perf_counter()
+    started = time.perf_counter() - LOADING_SECONDS
     with executing(args.threads, args.debug) as check_ranges, ExitStack() as blocks:
         config, out = what_to_fit(args)
         keep_folder = blocks.enter_context(sole_writer(out))
@@ -294,8 +302,14 @@ def planned(
     end: of everything, by ``time.perf_counter``.
     """
     rehearsal = rehearse(config, dataset, gaussians)
-    scene, has_one_file = rehearsal.trainer.scene, config.model.approximations.are_usual
-    end -= seconds_to_write(scene, dataset, measured=1 if has_one_file else 2)
+    results = seconds_of_results(rehearsal.trainer.scene, dataset)
+    if results.writing > MOST_FOR_PICTURES * (end - time.perf_counter()):
+        warnings.warn(UserNote(_NO_PICTURES), stacklevel=2)
+        config = changed(config, {"output.report": False, "output.save_renders": False})
+    elif config.output.report:
+        end -= results.writing
+    has_one_file = config.model.approximations.are_usual
+    end -= results.measuring * (1 if has_one_file else 2)
     if not has_one_file:
         from drgs.training.viewers import TIME_SHARE
 
@@ -336,14 +350,16 @@ def fit_and_write(
     write_views(out / VIEWS, dataset.train)
     config, render = trainer.config, trainer.pictures
     write_run_config(out, config)
-    scores = write_pictures(out, dataset, render, config.output.save_renders)
+    output = config.output
+    scores = write_pictures(out, dataset, render, output.save_renders, output.report)
     quality = mean_of(scores)
     metrics = summarize(config, dataset, gaussians.num_gaussians, wall_s, quality, command)
     if not config.model.approximations.are_usual:
         metrics["viewers"] = measured_split(
             write_for_viewers(out, trainer, dataset, gaussians), dataset
         )
-    write_results(out, dataset, trainer.scene, gaussians, render, scores, log, metrics)
+    if output.report:
+        write_results(out, dataset, trainer.scene, gaussians, render, scores, log, metrics)
     with atomic_path(out / METRICS) as temporary:
         temporary.write_text(json.dumps(metrics, indent=2) + "\n")
     remove_checkpoint(out)
@@ -359,7 +375,8 @@ def fit_and_write(
             f"PSNR {metrics['viewers']['psnr']:.2f} dB"
         )
     print(f"written: {out}")
-    print(f"open {out / REPORT}")
+    if output.report:
+        print(f"open {out / REPORT}")
     return True
 
 
@@ -404,7 +421,8 @@ def run_iterations(
                     f"Gaussians {done.row.num_gaussians:,}"
                 )
                 progress.update(done.row.iteration, length.total(trainer), status)
-                if measurement_is_due(history.rows, trainer.config.iterations):
+                is_shown = trainer.config.output.report
+                if is_shown and measurement_is_due(history.rows, trainer.config.iterations):
                     measure(trainer, history, views)
             is_due = every and (done.is_last or done.report.iteration % every == 0)
             if stop.requested or is_due:
@@ -423,6 +441,12 @@ def _say_what_is_missing(trainer: Trainer) -> None:
             f"are {trainer.num_gaussians:,}; give --budget more time"
         )
         warnings.warn(UserNote(note), stacklevel=2)
+
+
+_NO_PICTURES = (
+    "--budget: the time is needed for iterations: no report, orbit and pictures are written "
+    "(output.report, output.save_renders); python -m drgs.render OUT_DIR shows the result"
+)
 
 
 def _remedy(out: Path) -> str:

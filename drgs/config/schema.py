@@ -395,6 +395,9 @@ class OutputConfig(Section):
         "opacities, for viewers that know nothing of it.",
     )
     save_renders: bool = Field(True, description="Write renders/<split>/*.png.")
+    report: bool = Field(
+        True, description="Write report.html, side_by_side/, curves.png and the orbit."
+    )
     history_every: Count = Field(10, ge=1, description="Iterations between rows of history.csv.")
     checkpoint_every: Count | None = Field(
         500, ge=1, description="Iterations between checkpoints, for --resume; null: none."

@@ -32,7 +32,7 @@ from drgs.training.trainer import Trainer
 CURVES = Path(__file__).parent / "training_curves.csv"
 """What ``drgs.bench training`` wrote."""
 
-MIN_ITERATIONS = 200
+MIN_ITERATIONS = 50
 """Fewer fit nothing."""
 
 MIN_SIDE = 32

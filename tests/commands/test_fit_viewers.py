@@ -3,7 +3,6 @@
 import json
 import sys
 from dataclasses import replace
-from types import SimpleNamespace
 
 import mitsuba as mi
 import numpy as np
@@ -13,17 +12,15 @@ from support.fit_command import VALUES, assert_fits, without_pictures, write_pro
 from support.folders import contents
 from support.render_command import run as render
 from support.small_capture import decibels
-from support.small_fits import config_of, double, photograph, plain_dataset, true_blobs
+from support.small_fits import double, photograph
 
 from drgs import fit
-from drgs.config.changes import changed
 from drgs.config.load import load_config
 from drgs.data import load_dataset
 from drgs.gaussians.parameters import Gaussians
 from drgs.integrator.scene import make_scene, make_sensors, render_views
 from drgs.results.files import GAUSSIANS, GAUSSIANS_FOR_VIEWERS, METRICS
 from drgs.results.folder import remove_run
-from drgs.training.viewers import TIME_SHARE
 
 OTHERWISE = {"antialiased": True, "low_pass": 0.1}
 
@@ -126,18 +123,3 @@ def test_a_file_of_somebody_else_is_not_replaced(tmp_path, monkeypatch):
     with pytest.raises(SystemExit) as end:
         fit.main([str(config), "--out", str(tmp_path / "out"), "--overwrite"])
     assert end.value.code == 2 and (tmp_path / "out" / GAUSSIANS_FOR_VIEWERS).exists()
-
-
-def test_a_budget_leaves_time_for_the_second_file(monkeypatch):
-    """And for measuring it."""
-    rehearsal = SimpleNamespace(trainer=SimpleNamespace(scene=None), iteration_s=0.1)
-    monkeypatch.setattr(fit, "rehearse", lambda *_: rehearsal)
-    monkeypatch.setattr(fit, "seconds_to_write", lambda scene, dataset, measured: 10.0 * measured)
-    monkeypatch.setattr(fit, "make_plan", lambda *arguments: arguments)
-    monkeypatch.setattr(fit, "time", SimpleNamespace(perf_counter=lambda: 0.0))
-    dataset = plain_dataset()
-    end, _ = fit.planned(config_of(), dataset, true_blobs(), 100.0)
-    assert end == 90
-    otherwise = changed(config_of(), {f"model.{k}": v for k, v in OTHERWISE.items()})
-    end, plan = fit.planned(otherwise, dataset, true_blobs(), 100.0)
-    assert end == pytest.approx(80 * (1 - TIME_SHARE)) and plan[3] == pytest.approx(end)

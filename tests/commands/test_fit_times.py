@@ -1,0 +1,62 @@
+"""``fit --budget``: what of a time is for iterations. ``output.report: false``."""
+
+import json
+from types import SimpleNamespace
+
+import pytest
+from support.fit_command import assert_fits, write_project
+from support.small_fits import config_of, plain_dataset, true_blobs
+
+from drgs import fit
+from drgs.config.changes import changed
+from drgs.core.errors import UserNote
+from drgs.results.files import CURVES, METRICS, ORBIT, ORBIT_GIF, REPORT, SIDE_BY_SIDE
+from drgs.results.report import Seconds
+from drgs.training.viewers import TIME_SHARE
+
+
+@pytest.fixture
+def planned(monkeypatch):
+    """When iterations end, and for which configuration, by a clock that says 0."""
+    rehearsal = SimpleNamespace(trainer=SimpleNamespace(scene=None), iteration_s=0.1)
+    monkeypatch.setattr(fit, "rehearse", lambda *_: rehearsal)
+    monkeypatch.setattr(fit, "seconds_of_results", lambda *_: Seconds(measuring=6.0, writing=4.0))
+    monkeypatch.setattr(fit, "make_plan", lambda *arguments: arguments)
+    monkeypatch.setattr(fit, "time", SimpleNamespace(perf_counter=lambda: 0.0))
+
+    def plan(config, seconds):
+        end, (planned, *_) = fit.planned(config, plain_dataset(), true_blobs(), seconds)
+        return end, planned
+
+    return plan
+
+
+def test_a_budget_leaves_time_for_the_second_file(planned):
+    """And for measuring it."""
+    end, _ = planned(config_of(), 100.0)
+    assert end == 90
+    end, _ = planned(changed(config_of(), {"model.antialiased": True}), 100.0)
+    assert end == pytest.approx(84 * (1 - TIME_SHARE))
+
+
+def test_a_short_budget_is_for_iterations_and_not_for_pictures(planned):
+    end, config = planned(config_of(), 13.0)
+    assert end == 3 and config.output.report and config.output.save_renders
+    with pytest.warns(UserNote, match=r"no report, orbit and pictures are written"):
+        end, config = planned(config_of(), 12.0)
+    assert end == 6 and not config.output.report and not config.output.save_renders
+    end, config = planned(changed(config_of(), {"output.report": False}), 13.0)
+    assert end == 7 and config.output.save_renders
+
+
+def test_a_fit_without_a_report(tmp_path):
+    """What it has fitted and measured is there, and no less."""
+    config, written = write_project(tmp_path), {}
+    for name in ("true", "false"):
+        out = tmp_path / name
+        assert_fits(config, "--out", out, "--set", f"output.report={name}")
+        written[name] = {path.relative_to(out).parts[0] for path in out.rglob("*")}
+    pages = {REPORT, CURVES, ORBIT, ORBIT_GIF, SIDE_BY_SIDE}
+    assert written["true"] - written["false"] == pages and written["false"] < written["true"]
+    first, second = (json.loads((tmp_path / n / METRICS).read_text())["test"] for n in written)
+    assert first == second
