@@ -50,9 +50,9 @@ def with_iterations(config: FitConfig, iterations: int) -> FitConfig:
     changes: dict[str, object] = {"iterations": iterations}
     for key in _COUNTS:
         changes[key] = scaled(_value(config, key))
-    changes["coarse"] = [
-        {"until": scaled(stage.until), "factor": stage.factor} for stage in config.coarse
-    ]
+    if config.coarse is not None:
+        ends = {scaled(stage.until): stage.factor for stage in reversed(config.coarse)}
+        changes["coarse"] = [{"until": k, "factor": ends[k]} for k in sorted(ends)]
     changes["densify.stop"] = max(changes["densify.stop"], changes["densify.start"] + 1)
     if changes["densify.prune.stop"] is not None:
         least = max(changes["densify.stop"], changes["densify.prune.start"] or 0) + 1
@@ -64,7 +64,13 @@ def with_iterations(config: FitConfig, iterations: int) -> FitConfig:
 OPEN = ("data.background", "model.near")
 """Values that are null until the dataset has decided: see ``drgs.data.derived``."""
 
-OPEN_AT_START = (*OPEN, "init.num_points", "densify.budget.gaussians", "densify.mcmc.gaussians")
+OPEN_AT_START = (
+    *OPEN,
+    "init.num_points",
+    "densify.budget.gaussians",
+    "densify.mcmc.gaussians",
+    "coarse",
+)
 """The same, with those that only a fit needs."""
 
 

@@ -108,10 +108,9 @@ def _fields(model: type[BaseModel], prefix: str = "") -> Iterator[tuple[str, obj
 
 def _section(annotation: object) -> type[BaseModel] | None:
     """The section that a value is, or that the elements of a list are."""
-    for candidate in (annotation, *get_args(annotation)):
-        if isinstance(candidate, type) and issubclass(candidate, BaseModel):
-            return candidate
-    return None
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return annotation
+    return next(filter(None, map(_section, get_args(annotation))), None)
 
 
 class _Loader(yaml.SafeLoader):

@@ -30,8 +30,17 @@ SHARE_AT_START, REFERENCE_POINTS = 0.4, 100_000
 """Of such a number, how many a fit starts with; and how many where there is no such number."""
 
 
+COARSE_SHARE = 0.35
+"""Of a fit's iterations, those that see photographs at half their size."""
+
+LEAST_SIDE = 100
+"""px: of photographs that are made smaller still."""
+
+MASKS_LOOKED_AT = 8
+
+
 def completed(config: FitConfig, dataset: Dataset) -> FitConfig:
-    """``config`` with background, near plane and number of Gaussians as ``dataset`` has them.
+    """``config`` with background, near plane, numbers and coarse stages as ``dataset`` has them.
 
     Those that are given stay. Raises :class:`UserError` for a near plane behind which there is
     nothing left to look at.
@@ -46,6 +55,8 @@ def completed(config: FitConfig, dataset: Dataset) -> FitConfig:
     else:
         _check_near_plane(config.model.near, dataset)
     changes |= _numbers_of_gaussians(config, dataset)
+    if config.coarse is None:
+        changes["coarse"] = _coarse_stages(config, dataset)
     return changed(config, changes) if changes else config
 
 
@@ -73,6 +84,29 @@ def _numbers_of_gaussians(config: FitConfig, dataset: Dataset) -> dict[str, obje
 def _suitable_number(dataset: Dataset) -> int:
     sides = [math.sqrt(view.width * view.height) for view in dataset.train]
     return max(4, round(GAUSSIANS_PER_PIXEL_OF_SIDE * float(np.mean(sides or [1]))))
+
+
+def _coarse_stages(config: FitConfig, dataset: Dataset) -> list[dict[str, int]]:
+    """Photographs are fitted coarse first: what is far off begins anywhere.
+
+    What is cut out of its pictures begins where it is.
+    """
+    until = round(COARSE_SHARE * config.iterations)
+    sides = [min(view.width, view.height) for view in dataset.train]
+    is_small = min(sides, default=0) < LEAST_SIDE
+    if config.densify.strategy == "adc" or until < 1 or is_small or _is_cut_out(dataset):
+        return []
+    return [{"until": until, "factor": 2}]
+
+
+def _is_cut_out(dataset: Dataset) -> bool:
+    """Whether what there is to fit stands before nothing, as far as some of the pictures tell."""
+    if all(view.alpha is None for view in dataset.train):
+        return False
+    from drgs.data.carving import are_masks, silhouettes_of
+
+    some = dataset.train[:: max(1, len(dataset.train) // MASKS_LOOKED_AT)]
+    return are_masks(silhouettes_of(some), some)
 
 
 def _check_near_plane(near: float, dataset: Dataset) -> None:

@@ -60,21 +60,26 @@ class Strategy:
     """What a plan chooses besides the number of iterations."""
 
     name: str  # of its curve
-    coarse: tuple[tuple[float, int], ...] = ()  # (end, in shares of all iterations; factor)
+    coarse: tuple[tuple[float, int], ...] | None = None  # (end, share of all iterations; factor)
     share: float | None = None  # of the number of Gaussians; None: as configured
 
     def concerns(self, config: FitConfig) -> bool:
-        """Whether it can be applied: there is a number of Gaussians to take a share of."""
+        """Whether it can be applied, and changes nothing that is configured.
+
+        There is a number of Gaussians to take a share of; there are no coarse stages already.
+        """
+        if self.coarse is not None and config.coarse:
+            return False
         return self.share is None or _target(config) is not None
 
     def applied(self, config: FitConfig, num_points: int) -> FitConfig:
         """``config`` with this strategy; num_points: Gaussians at the start, the fewest."""
-        changes: dict[str, object] = {
-            "coarse": [
+        changes: dict[str, object] = {}
+        if self.coarse is not None:
+            changes["coarse"] = [
                 {"until": max(k + 1, round(share * config.iterations)), "factor": factor}
                 for k, (share, factor) in enumerate(self.coarse)
             ]
-        }
         if self.share is not None:
             least = max(num_points, config.init.num_points or 0)
             number = max(least, round(self.share * _target(config)))
@@ -185,7 +190,8 @@ class Plan:
     def reasons(self) -> str:
         """What was chosen and why, as text."""
         number = _target(self.config) or self.config.densify.max_gaussians
-        stages = [f"1/{s.factor} size until iteration {s.until:,}" for s in self.config.coarse]
+        coarse = self.config.coarse or ()
+        stages = [f"1/{s.factor} size until iteration {s.until:,}" for s in coarse]
         lines = [
             f"An iteration takes {1e3 * self.start_s:.0f} ms at the start here.",
             f"By the curves of the shipped scene, {self.seconds:.0f} s are enough for",
@@ -212,13 +218,14 @@ def make_plan(
 ) -> Plan:
     """The best plan for ``seconds`` of iterations, of which one takes ``start_s`` at the start.
 
-    num_points: Gaussians at the start. side: px, the shortest of the training pictures.
+    config: completed. num_points: Gaussians at the start. side: px, the shortest of the training
+    pictures.
 
     Raises :class:`UserError` if the time is too short for anything.
     """
     candidates = []
     for strategy in STRATEGIES:
-        smallest = side / max((factor for _, factor in strategy.coarse), default=1)
+        smallest = side / max((factor for _, factor in strategy.coarse or ()), default=1)
         fits = smallest >= MIN_SIDE or not strategy.coarse
         if strategy.name in curves and fits and strategy.concerns(config):
             curve = curves[strategy.name]
@@ -232,7 +239,7 @@ def make_plan(
             "time, or smaller pictures (--set data.image_size=...)"
         )
     chosen = max(candidates, key=lambda candidate: candidate.psnr)
-    planned = with_iterations(changed(config, {"coarse": []}), chosen.iterations)
+    planned = with_iterations(config, chosen.iterations)
     planned = chosen.strategy.applied(planned, num_points)
     curve = curves[chosen.strategy.name]
     return Plan(planned, chosen, tuple(candidates), seconds, start_s, curve)

@@ -77,7 +77,7 @@ def test_measured_curves_are_those_of_the_strategies():
 
 SLOW = Curve((1000, 2000), (1000.0, 2000.0), (30.0, 31.0))
 FAST = Curve((1000, 2000), (500.0, 1000.0), (29.5, 30.5))
-CONFIG = FitConfig(data={"path": "."}, init={"num_points": 50}, iterations=7000)
+CONFIG = FitConfig(data={"path": "."}, init={"num_points": 50}, iterations=7000, coarse=[])
 
 
 def curves_of(slow=SLOW, fast=FAST):
@@ -113,14 +113,16 @@ def test_reasons_name_all_candidates():
 
 
 def test_a_configuration_that_cannot_shrink_is_planned():
-    """Stages of its own, few iterations of changes, revisions of an earlier plan."""
+    """Stages of its own, which stay, few iterations of changes, revisions of an earlier plan."""
     values = {"coarse": [{"until": 10, "factor": 4}, {"until": 20, "factor": 2}]}
     values |= {"densify.start": 500, "densify.stop": 501}
     values |= {"optimizer.means_lr_aims": [{"after": 0, "end": 5}, {"after": 1, "end": 7}]}
     config = changed(CONFIG, values)
     result = make_plan(config, 50, 400, 25, 0.1, curves_of())
-    assert result.config.iterations == 500 and result.config.optimizer.means_lr_aims == []
-    assert (result.config.densify.start, result.config.densify.stop) == (36, 37)
+    assert result.chosen.strategy is plan.STRATEGIES[0]
+    assert result.config.iterations == 250 and result.config.optimizer.means_lr_aims == []
+    assert (result.config.densify.start, result.config.densify.stop) == (18, 19)
+    assert [(s.until, s.factor) for s in result.config.coarse] == [(1, 4)]
 
 
 def test_small_pictures_do_not_become_smaller():

@@ -26,7 +26,7 @@ def _growth(config: FitConfig, white_background: bool) -> DensityStrategy:
     if config.densify.strategy == "budget":
         from drgs.training.density.budget import GrowthToNumber
 
-        return GrowthToNumber(config.densify, config.coarse)
+        return GrowthToNumber(config.densify, config.coarse or ())
     if config.densify.strategy == "mcmc":
         from drgs.training.density.mcmc import MarkovChain
 
