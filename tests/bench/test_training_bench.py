@@ -67,19 +67,19 @@ def test_fits_run_and_are_not_repeated(tmp_path, capfd, monkeypatch):
     values["output"] = {"history_every": 50}
     config = tmp_path / "small.yml"
     config.write_text(yaml.safe_dump(values))
-    command = ["training", "--quick", "--only", "1", "3", "--config", str(config)]
+    command = ["training", "--quick", "--only", "1", "2", "--config", str(config)]
     command += ["--out", str(tmp_path / "out")]
     bench.main(command)
     folder = tmp_path / "out" / "training"
     rows = list(csv.DictReader((folder / "training.csv").open()))
-    names = [training.CHOICES[k].name for k in (0, 2)]
+    names = [training.CHOICES[k].name for k in (0, 1)]
     assert [(row["choice"], int(row["iterations"])) for row in rows] == [
         (name, n) for name in names for n in training.QUICK_BUDGETS
     ]
     assert all(float(row["psnr"]) > 0 and float(row["wall_s"]) > 0 for row in rows)
     assert Image.open(folder / "training.png").size[0] > 500
-    coarse = training.folder_of(training.CHOICES[2], 100, folder)
-    assert load_config(coarse / "config.yml").coarse[0].until == 50
+    coarse = training.folder_of(training.CHOICES[1], 100, folder)
+    assert load_config(coarse / "config.yml").coarse[0].until == 25
 
     written = (folder / "training.csv").read_text()
     capfd.readouterr()
