@@ -6,7 +6,8 @@ harmonics of a lower degree, no SSIM. Each choice is a curve of the quality on t
 the time that the fit took. Finished fits are not repeated, interrupted ones go on.
 
 ``--times`` shows what plans make of these curves (``drgs.fit --budget``): a fit for each of several
-times, which count everything from the start of the command to its end.
+times, which count everything from the start of the command to its end. An interrupted one begins
+anew.
 """
 
 from __future__ import annotations
@@ -156,18 +157,19 @@ def run_times(config: Path, times: Sequence[str], out: Path) -> None:
     rows = []
     for duration in times:
         folder = out / "times" / duration
-        if not (folder / METRICS).exists():
+        seconds = folder.with_suffix(".s")
+        if not seconds.exists():
             folder.parent.mkdir(parents=True, exist_ok=True)
-            arguments = [str(config), "--out", str(folder), "--budget", duration]
+            arguments = [str(config), "--out", str(folder), "--budget", duration, "--overwrite"]
             command = [sys.executable, "-m", "drgs.fit", *arguments]
             start = time.perf_counter()
             subprocess.run(command, check=True)
-            folder.with_suffix(".s").write_text(f"{time.perf_counter() - start:.1f}")
+            seconds.write_text(f"{time.perf_counter() - start:.1f}")
         metrics = json.loads((folder / METRICS).read_text())
         rows.append(
             [
                 duration,
-                f"{float(folder.with_suffix('.s').read_text()):.1f} s",
+                f"{float(seconds.read_text()):.1f} s",
                 f"{metrics['iterations']:,}",
                 f"{metrics['num_gaussians']:,}",
                 f"{metrics['test']['psnr']:.2f} dB",

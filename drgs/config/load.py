@@ -108,9 +108,10 @@ def _fields(model: type[BaseModel], prefix: str = "") -> Iterator[tuple[str, obj
 
 def _section(annotation: object) -> type[BaseModel] | None:
     """The section that a value is, or that the elements of a list are."""
-    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
-        return annotation
-    return next(filter(None, map(_section, get_args(annotation))), None)
+    if arguments := get_args(annotation):
+        return next(filter(None, map(_section, arguments)), None)
+    is_section = isinstance(annotation, type) and issubclass(annotation, BaseModel)
+    return annotation if is_section else None
 
 
 class _Loader(yaml.SafeLoader):

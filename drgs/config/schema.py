@@ -396,7 +396,9 @@ class OutputConfig(Section):
     )
     save_renders: bool = Field(True, description="Write renders/<split>/*.png.")
     report: bool = Field(
-        True, description="Write report.html, side_by_side/, curves.png and the orbit."
+        True,
+        description="Write report.html, side_by_side/, curves.png and the orbit, and measure test "
+        "views on the way for them.",
     )
     history_every: Count = Field(10, ge=1, description="Iterations between rows of history.csv.")
     checkpoint_every: Count | None = Field(
@@ -438,7 +440,8 @@ class FitConfig(Section):
         None,
         description="Stages of smaller training pictures, before those of full size: a list of "
         "{until: iteration, factor: 4}. null: half the size for the first 35 % of a fit to "
-        "photographs that are not cut out, else none; with the strategy adc none, as in the paper.",
+        "photographs of at least 100 px that are not cut out, else none; with the strategy adc "
+        "none, as in the paper.",
     )
     seed: Count = Field(0, ge=0, description="Seed of everything random.")
 

@@ -10,7 +10,7 @@ from drgs.config.changes import changed
 from drgs.config.schema import NAMED_COLORS, REFERENCE_NEAR, FitConfig
 from drgs.core.errors import UserError
 from drgs.data.start_box import focus_of
-from drgs.data.types import Dataset
+from drgs.data.types import Dataset, View
 
 NEAR_SHARE = 0.04
 """Of the cameras' distance to what they look at, rounded to one digit: the near plane. It gives the
@@ -31,12 +31,13 @@ SHARE_AT_START, REFERENCE_POINTS = 0.4, 100_000
 
 
 COARSE_SHARE = 0.35
-"""Of a fit's iterations, those that see photographs at half their size."""
+"""Of a fit's iterations, those that see photographs at half their size: see ``bench recipes``."""
 
 LEAST_SIDE = 100
-"""px: of photographs that are made smaller still."""
+"""px: of photographs that are made smaller still. SSIM's window is 11 px wide."""
 
-MASKS_LOOKED_AT = 8
+ALPHA_LOOKED_AT = 15
+"""Pictures, at most, that tell whether a dataset's are cut out."""
 
 
 def completed(config: FitConfig, dataset: Dataset) -> FitConfig:
@@ -100,13 +101,17 @@ def _coarse_stages(config: FitConfig, dataset: Dataset) -> list[dict[str, int]]:
 
 
 def _is_cut_out(dataset: Dataset) -> bool:
-    """Whether what there is to fit stands before nothing, as far as some of the pictures tell."""
-    if all(view.alpha is None for view in dataset.train):
-        return False
-    from drgs.data.carving import are_masks, silhouettes_of
+    """Whether most of some pictures are transparent where there is nothing to fit."""
+    some = dataset.train[:: -(-len(dataset.train) // ALPHA_LOOKED_AT) or 1]
+    return sum(map(_is_transparent, some)) > len(some) / 2
 
-    some = dataset.train[:: max(1, len(dataset.train) // MASKS_LOOKED_AT)]
-    return are_masks(silhouettes_of(some), some)
+
+def _is_transparent(view: View) -> bool:
+    if view.alpha is None:
+        return False
+    from drgs.data.carving import LEAST_TRANSPARENT, TRANSPARENT
+
+    return float(np.mean(np.asarray(view.alpha) <= TRANSPARENT)) >= LEAST_TRANSPARENT
 
 
 def _check_near_plane(near: float, dataset: Dataset) -> None:

@@ -64,9 +64,9 @@ class Strategy:
     share: float | None = None  # of the number of Gaussians; None: as configured
 
     def concerns(self, config: FitConfig) -> bool:
-        """Whether it can be applied, and changes nothing that is configured.
+        """Whether there is something for it to change.
 
-        There is a number of Gaussians to take a share of; there are no coarse stages already.
+        Coarse stages that there are stay; a share needs a number of Gaussians to be taken of.
         """
         if self.coarse is not None and config.coarse:
             return False
@@ -185,11 +185,11 @@ class Plan:
     seconds: float  # for the iterations
     start_s: float  # of an iteration at the start
     curve: Curve  # of what was chosen
+    most: int  # Gaussians
 
     @property
     def reasons(self) -> str:
         """What was chosen and why, as text."""
-        number = _target(self.config) or self.config.densify.max_gaussians
         coarse = self.config.coarse or ()
         stages = [f"1/{s.factor} size until iteration {s.until:,}" for s in coarse]
         lines = [
@@ -202,7 +202,7 @@ class Plan:
             ),
             f"Planned: {self.config.iterations:,} iterations; "
             f"{', '.join([*stages, 'then full size']) if stages else 'full size'}; at most "
-            f"{number:,} Gaussians; the "
+            f"{self.most:,} Gaussians; the "
             f"population changes until iteration {self.config.densify.stop:,}.",
         ]
         return "\n".join(lines)
@@ -242,7 +242,8 @@ def make_plan(
     planned = with_iterations(config, chosen.iterations)
     planned = chosen.strategy.applied(planned, num_points)
     curve = curves[chosen.strategy.name]
-    return Plan(planned, chosen, tuple(candidates), seconds, start_s, curve)
+    most = max(num_points, _target(planned) or planned.densify.max_gaussians)
+    return Plan(planned, chosen, tuple(candidates), seconds, start_s, curve, most)
 
 
 @dataclass(frozen=True)

@@ -1,5 +1,6 @@
 """``fit --budget``: what of a time is for iterations. ``output.report: false``."""
 
+import csv
 import json
 from types import SimpleNamespace
 
@@ -10,7 +11,7 @@ from support.small_fits import config_of, plain_dataset, true_blobs
 from drgs import fit
 from drgs.config.changes import changed
 from drgs.core.errors import UserNote
-from drgs.results.files import CURVES, METRICS, ORBIT, ORBIT_GIF, REPORT, SIDE_BY_SIDE
+from drgs.results.files import CURVES, HISTORY, METRICS, ORBIT, ORBIT_GIF, REPORT, SIDE_BY_SIDE
 from drgs.results.report import Seconds
 from drgs.training.viewers import TIME_SHARE
 
@@ -20,7 +21,7 @@ def planned(monkeypatch):
     """When iterations end, and for which configuration, by a clock that says 0."""
     rehearsal = SimpleNamespace(trainer=SimpleNamespace(scene=None), iteration_s=0.1)
     monkeypatch.setattr(fit, "rehearse", lambda *_: rehearsal)
-    monkeypatch.setattr(fit, "seconds_of_results", lambda *_: Seconds(measuring=6.0, writing=4.0))
+    monkeypatch.setattr(fit, "seconds_of_results", lambda *_: Seconds(6.0, renders=1.0, report=3.0))
     monkeypatch.setattr(fit, "make_plan", lambda *arguments: arguments)
     monkeypatch.setattr(fit, "time", SimpleNamespace(perf_counter=lambda: 0.0))
 
@@ -45,12 +46,14 @@ def test_a_short_budget_is_for_iterations_and_not_for_pictures(planned):
     with pytest.warns(UserNote, match=r"no report, orbit and pictures are written"):
         end, config = planned(config_of(), 12.0)
     assert end == 6 and not config.output.report and not config.output.save_renders
-    end, config = planned(changed(config_of(), {"output.report": False}), 13.0)
-    assert end == 7 and config.output.save_renders
+    end, config = planned(changed(config_of(), {"output.report": False}), 12.0)
+    assert end == 5 and config.output.save_renders
+    nothing = changed(config_of(), {"output.report": False, "output.save_renders": False})
+    assert planned(nothing, 7.0) == (1, nothing)
 
 
 def test_a_fit_without_a_report(tmp_path):
-    """What it has fitted and measured is there, and no less."""
+    """Everything else is there; no test view is measured on the way."""
     config, written = write_project(tmp_path), {}
     for name in ("true", "false"):
         out = tmp_path / name
@@ -60,3 +63,8 @@ def test_a_fit_without_a_report(tmp_path):
     assert written["true"] - written["false"] == pages and written["false"] < written["true"]
     first, second = (json.loads((tmp_path / n / METRICS).read_text())["test"] for n in written)
     assert first == second
+    first, second = (list(csv.DictReader((tmp_path / n / HISTORY).open())) for n in written)
+    assert any(row["test_psnr"] for row in first) and not any(r["test_psnr"] for r in second)
+    for with_report, without in zip(first, second, strict=True):
+        for name in set(without) - {"wall_s", "test_psnr"}:
+            assert with_report[name] == without[name], name

@@ -13,10 +13,10 @@ from drgs.data.derived import completed
 CONFIG = FitConfig(data={"path": "unused"}, iterations=1000)
 
 
-def photographs_of(width, height):
-    """Ten, from all around, all of them opaque."""
-    angles = 2 * np.pi * np.arange(10) / 10
-    centers = np.stack([4 * np.cos(angles), 4 * np.sin(angles), np.ones(10)], axis=1)
+def photographs_of(width, height, count=10):
+    """From all around, all of them opaque."""
+    angles = 2 * np.pi * np.arange(count) / count
+    centers = np.stack([4 * np.cos(angles), 4 * np.sin(angles), np.ones(count)], axis=1)
     return dataset_of([view_at(center, (0, 0, 0), width, height) for center in centers])
 
 
@@ -53,6 +53,9 @@ def test_photographs_are_fitted_at_half_their_size_first(photographs):
 
 def test_what_is_cut_out_is_not(photographs):
     assert stages(CONFIG, with_alpha(photographs, lambda index: left_of(60 + index))) == []
+    many = photographs_of(120, 100, 100)
+    for opaque in range(12):  # one that is not cut out does not make the others so
+        assert stages(CONFIG, with_alpha(many, lambda i, k=opaque: i == k or left_of(60))) == []
 
 
 def test_neither_are_small_pictures_and_the_papers_recipe(photographs):
