@@ -51,10 +51,7 @@ def available_memory() -> int:
 
 
 def release_unused_memory() -> None:
-    """Give back to the system what Dr.Jit holds for its next arrays, and what glibc holds of that.
-
-    Takes some hundredths of a second, and the next arrays as much again.
-    """
+    """Give back to the system what Dr.Jit holds for its next arrays, and what glibc has free."""
     dr.flush_malloc_cache()
     if sys.platform == "linux":
         trim = getattr(ctypes.CDLL(None), "malloc_trim", None)  # other C libraries have none

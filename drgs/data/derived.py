@@ -29,7 +29,6 @@ GAUSSIANS_PER_PIXEL_OF_SIDE = 250
 SHARE_AT_START, REFERENCE_POINTS = 0.4, 100_000
 """Of such a number, how many a fit starts with; and how many where there is no such number."""
 
-
 COARSE_SHARE = 0.35
 """Of a fit's iterations, those that see photographs at half their size: see ``bench recipes``."""
 

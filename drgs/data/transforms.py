@@ -25,6 +25,7 @@ from drgs.config.schema import DataConfig
 from drgs.core.errors import UserError, one_line
 from drgs.core.files import read_text, shortened
 from drgs.data.types import Motion
+from drgs.io.pictures import MAX_SIDE
 
 if TYPE_CHECKING:
     from drgs.cameras.camera import Lens
@@ -44,9 +45,6 @@ MAX_COORDINATE = 1e9
 FOCAL_RANGE = (1e-2, 1e4)
 """Focal lengths, in image sizes, that a pinhole camera can have: full angles of view from 178
 degrees down to 0.006."""
-
-MAX_SIDE = 2**24
-"""px: of a larger picture, float32 does not tell neighbouring pixels apart."""
 
 MAX_OFFSET = 100
 """Image sizes: how far the principal point may lie from the picture."""

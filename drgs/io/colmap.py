@@ -18,12 +18,11 @@ from pathlib import Path
 from types import ModuleType
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from drgs.core.errors import UserError, one_line
 from drgs.io.colmap_records import MODELS, CameraRecord, ImageRecord, Place, PointRecord
-
-MAX_SIDE = 2**24
-"""px: of a larger picture, float32 does not tell neighbouring pixels apart."""
+from drgs.io.pictures import MAX_SIDE
 
 MAX_NUMBER = 1e12
 """Of any parameter or coordinate, in size."""
@@ -59,17 +58,11 @@ class ColmapImage:
     @property
     def camera_to_world(self) -> np.ndarray:
         """(4, 4) float64, OpenCV axes."""
-        w, x, y, z = np.array(self.quaternion) / math.hypot(*self.quaternion)
-        to_camera = np.array(
-            [
-                [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-                [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-                [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-            ]
-        )
+        w, *xyz = self.quaternion
+        to_world = Rotation.from_quat([*xyz, w]).inv()
         pose = np.eye(4)
-        pose[:3, :3] = to_camera.T
-        pose[:3, 3] = -to_camera.T @ np.array(self.translation)
+        pose[:3, :3] = to_world.as_matrix()
+        pose[:3, 3] = -to_world.apply(self.translation)
         return pose
 
 

@@ -25,6 +25,9 @@ if TYPE_CHECKING:
 MAX_PIXELS = 1 << 26
 """67 million, as 8192 x 8192: 0.8 GB once decoded to float32."""
 
+MAX_SIDE = 2**24
+"""px: of a larger picture, float32 does not tell neighbouring pixels apart."""
+
 MAX_BYTES = 1 << 30
 """Of a file: twice what so many pixels of 64 bits take when they are not compressed."""
 

@@ -85,7 +85,7 @@ def write_pictures(
     dataset: Dataset,
     render: Render,
     with_renders: bool,
-    with_comparisons: bool = True,
+    with_comparisons: bool,
 ) -> list[Score]:
     """Score the test views, and write what is asked for of ``renders/`` and ``side_by_side/``."""
     scores, split = [], dataset.test_split

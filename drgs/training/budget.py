@@ -179,7 +179,7 @@ class Candidate:
 class Plan:
     """A resolved configuration, and where it comes from."""
 
-    config: FitConfig
+    config: FitConfig  # completed
     chosen: Candidate
     candidates: tuple[Candidate, ...]
     seconds: float  # for the iterations
@@ -190,7 +190,7 @@ class Plan:
     @property
     def reasons(self) -> str:
         """What was chosen and why, as text."""
-        coarse = self.config.coarse or ()
+        coarse = self.config.coarse
         stages = [f"1/{s.factor} size until iteration {s.until:,}" for s in coarse]
         lines = [
             f"An iteration takes {1e3 * self.start_s:.0f} ms at the start here.",

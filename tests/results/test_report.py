@@ -92,7 +92,9 @@ def out(tmp_path_factory, dataset, scene, images):
     folder = tmp_path_factory.mktemp("results") / "blobs"
     folder.mkdir()
     render = partial(render_views, scene)
-    scores = report.write_pictures(folder, dataset, render, with_renders=False)
+    scores = report.write_pictures(
+        folder, dataset, render, with_renders=False, with_comparisons=True
+    )
     args = dataset, scene, blobs(), render, scores
     report.write_results(folder, *args, history(changes=CHANGES), metrics())
     return folder
@@ -128,7 +130,9 @@ def test_one_picture_is_held_at_a_time(tmp_path, dataset):
             rendered.append(np.full((HEIGHT, WIDTH, 3), 0.1 * index, np.float32))
             yield rendered[-1]
 
-    scores = report.write_pictures(tmp_path, dataset, render, with_renders=True)
+    scores = report.write_pictures(
+        tmp_path, dataset, render, with_renders=True, with_comparisons=True
+    )
     for score, image, view in zip(scores, rendered, dataset.test, strict=True):
         assert score.psnr == pytest.approx(decibels(image, view.image))
         assert score.ssim == ssim(image, view.image)
