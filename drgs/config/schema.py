@@ -86,10 +86,11 @@ class DataConfig(Section):
     source: str = Field(
         "", description="Where to get the data: printed in the error if the folder is missing."
     )
-    type: Literal["auto", "nerf_synthetic", "nerfstudio"] = Field(
+    type: Literal["auto", "nerf_synthetic", "nerfstudio", "colmap"] = Field(
         "auto",
         description="Layout of the folder. auto: nerf_synthetic if there is a "
-        "transforms_train.json, nerfstudio if there is a transforms.json.",
+        "transforms_train.json, nerfstudio if there is a transforms.json, colmap if there is a "
+        "model in sparse/0, sparse or colmap/sparse/0.",
     )
     image_size: Count | None = Field(
         None,
@@ -97,12 +98,19 @@ class DataConfig(Section):
         description="px. Wider images are scaled down to this width by area averaging; null: "
         "photographs to 1600, as in the reference; pictures of the NeRF-synthetic layout are not.",
     )
+    downscale: Literal[1, 2, 4, 8] | None = Field(
+        None,
+        description="COLMAP's layout: read the pictures of images, images_2, images_4 or images_8; "
+        "null: the smallest that are not smaller than image_size.",
+    )
     test_split: Literal["train", "val", "test"] | None = Field(
         None,
         description="NeRF-synthetic split to measure on; null: test if it is there, else val.",
     )
     test_every: Count = Field(
-        8, ge=2, description="nerfstudio: images 0, n, 2n, ... by file name are the test split."
+        8,
+        ge=2,
+        description="nerfstudio, colmap: images 0, n, 2n, ... by file name are the test split.",
     )
     background: ColorField = Field(
         None,
@@ -181,9 +189,21 @@ class InitConfig(Section):
     )
     point_cloud: PathField | None = Field(
         None,
-        description="PLY with x, y, z (and red, green, blue) to use instead of other points. "
-        "null: the one that the dataset names (ply_file_path), if it does, no half_extent is given "
-        "and there are no masks.",
+        description="PLY with x, y, z (and red, green, blue), or a points3D file of COLMAP, to use "
+        "instead of other points. null: the one that the dataset has (ply_file_path, points3D), if "
+        "it does, no half_extent is given and there are no masks.",
+    )
+    max_point_error: float | None = Field(
+        None,
+        ge=0,
+        le=1e9,
+        description="px: of COLMAP's points, those with a larger mean reprojection error are left "
+        "out; null: none.",
+    )
+    min_track_length: Count | None = Field(
+        None,
+        ge=0,
+        description="Of COLMAP's points, those that fewer images observe are left out; null: none.",
     )
 
 

@@ -18,9 +18,17 @@ from drgs.data.types import Dataset, View, Viewpoint
 
 __all__ = ["Dataset", "View", "Viewpoint", "initial_gaussians", "load_dataset"]
 
+
+def _load_colmap(config: DataConfig) -> Dataset:
+    from drgs.data import colmap
+
+    return colmap.load(config)
+
+
 _LOADERS: dict[str, Callable[[DataConfig], Dataset]] = {
     "nerf_synthetic": nerf_synthetic.load,
     "nerfstudio": nerfstudio.load,
+    "colmap": _load_colmap,
 }
 
 _MARKERS = {
@@ -32,8 +40,8 @@ _MARKERS = {
 def load_dataset(source: str | Path | DataConfig, **settings: object) -> Dataset:
     """All views of a dataset: photographs with their cameras, to train on and to measure on.
 
-    source: the folder, in the layout of NeRF-synthetic or of nerfstudio / instant-ngp, or the
-    section ``data`` of a configuration; settings: other values of that section, such as
+    source: the folder, in the layout of NeRF-synthetic, of nerfstudio / instant-ngp or of COLMAP,
+    or the section ``data`` of a configuration; settings: other values of that section, such as
     ``image_size=400`` (px) or ``background="black"``.
 
     Raises :class:`UserError` naming the file, the key, what was expected and what was got; where
@@ -67,6 +75,8 @@ def _layout(config: DataConfig) -> str:
     for layout, marker in _MARKERS.items():
         if marker in names:
             return layout
-    from drgs.data.recognition import what_is_there
+    from drgs.data.recognition import has_colmap_model, what_is_there
 
+    if has_colmap_model(config.path):
+        return "colmap"
     raise UserError(f"{config.path}: {what_is_there(config.path, tuple(_MARKERS.values()))}")

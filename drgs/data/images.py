@@ -34,10 +34,17 @@ ALL = 1 - 1e-4
 
 
 def read_mask(path: Path, size: tuple[int, int]) -> np.ndarray:
-    """(H, W) float32: 1 where the picture is brighter than half, 0 elsewhere; size: W, H."""
-    _check_size(path, image_size(path), size)  # before memory is taken for it
-    image = read_image(path)
-    return (image[:, :, 0] > 0.5).astype(np.float32)
+    """(H, W) float32: 1 where the picture is brighter than half, 0 elsewhere; size: W, H.
+
+    A mask for a larger photograph of the same shape will do: a pixel counts where all that it
+    covers does.
+    """
+    width, height = image_size(path)
+    is_larger = width > size[0] and abs(height * size[0] / width - size[1]) <= 1
+    if not is_larger:
+        _check_size(path, (width, height), size)  # before memory is taken for it
+    mask = (read_image(path)[:, :, 0] > 0.5).astype(np.float32)
+    return _counting(_resized(mask, *size)) if is_larger else mask
 
 
 def read_depth(path: Path, unit: float, size: tuple[int, int]) -> np.ndarray:
@@ -108,8 +115,7 @@ def downscale(image: np.ndarray, max_width: int | None) -> np.ndarray:
     new_width, new_height = downscaled_size(width, height, max_width)
     if new_width == width:
         return image
-    rows = _average_rows(image, new_height)
-    return np.ascontiguousarray(_average_rows(rows.swapaxes(0, 1), new_width).swapaxes(0, 1))
+    return _resized(image, new_width, new_height)
 
 
 def downscaled_size(width: int, height: int, max_width: int | None) -> tuple[int, int]:
@@ -213,13 +219,24 @@ def smaller_view(view: View, factor: int) -> View:
 
 def downscale_mask(mask: np.ndarray, max_width: int | None) -> np.ndarray:
     """(H, W) of 1 and 0: a pixel counts where all that it covers does."""
-    return (downscale(mask, max_width) > ALL).astype(np.float32)
+    return _counting(downscale(mask, max_width))
+
+
+def _counting(share: np.ndarray) -> np.ndarray:
+    """1 where all of a pixel's area counts, 0 elsewhere."""
+    return (share > ALL).astype(np.float32)
 
 
 def downscale_depth(depth: np.ndarray, max_width: int | None) -> np.ndarray:
     """(H, W): the mean depth where all that a pixel covers has one, else 0."""
     known = downscale((depth > 0).astype(np.float32), max_width)
     return np.where(known > ALL, downscale(depth, max_width), 0).astype(np.float32)
+
+
+def _resized(image: np.ndarray, width: int, height: int) -> np.ndarray:
+    """Averages over the areas of (height, width) pixels."""
+    rows = _average_rows(image, height)
+    return np.ascontiguousarray(_average_rows(rows.swapaxes(0, 1), width).swapaxes(0, 1))
 
 
 def _average_rows(image: np.ndarray, count: int) -> np.ndarray:

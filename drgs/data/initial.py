@@ -38,6 +38,9 @@ that coincide."""
 
 NUM_NEIGHBOURS = 3
 
+POINTS_OF_COLMAP = ("points3D.bin", "points3D.txt")
+"""Names of files that hold not only positions and colours."""
+
 
 @dataclass(frozen=True, eq=False)
 class Start:
@@ -139,12 +142,43 @@ def _on_the_hull(
 
 def _of_cloud(config: FitConfig, dataset: Dataset, cloud: Path) -> Start:
     """The points of a file."""
-    means, colors = read_points(cloud)
+    means, colors, num_read = _read_cloud(config.init, cloud)
     if colors is not None and not np.any(colors):
         colors = None  # all black: what is written where no colours were found out
     _check_cloud(cloud, means, config.densify.max_gaussians, dataset.train)
-    start = Start(means, colors, f"the points of {cloud}")
+    kept = "the" if len(means) == num_read else f"{len(means):,} of {num_read:,}"
+    start = Start(means, colors, f"{kept} points of {cloud}")
     return _coloured(start, dataset) if colors is None else start
+
+
+def _read_cloud(init: InitConfig, cloud: Path) -> tuple[np.ndarray, np.ndarray | None, int]:
+    """Positions (N, 3) float32, colours (N, 3) float32, 0..1, and how many were read."""
+    if cloud.name not in POINTS_OF_COLMAP:
+        for name in ("max_point_error", "min_track_length"):
+            if getattr(init, name) is not None:
+                raise UserError(
+                    f"init.{name}: only COLMAP's points ({' or '.join(POINTS_OF_COLMAP)}) say "
+                    f"that, got {cloud}; leave it out"
+                )
+        positions, colors = read_points(cloud)
+        return positions, colors, len(positions)
+    from drgs.io.colmap import read_points3d
+
+    points = read_points3d(cloud)
+    kept = np.ones(len(points.errors), bool)
+    if init.max_point_error is not None:
+        kept &= points.errors <= init.max_point_error
+    if init.min_track_length is not None:
+        kept &= points.track_lengths >= init.min_track_length
+    if len(kept) and not kept.any():
+        raise UserError(
+            f"{cloud}: init.max_point_error and init.min_track_length leave none of "
+            f"{len(kept):,} points (their errors are {points.errors.min():.3g} to "
+            f"{points.errors.max():.3g} px, and {points.track_lengths.min():,} to "
+            f"{points.track_lengths.max():,} images observe them); set other ones"
+        )
+    positions, colors = points.positions[kept], points.colors[kept]
+    return positions.astype(np.float32), colors / np.float32(255), len(kept)
 
 
 def _random_points(config: FitConfig, dataset: Dataset) -> Start:

@@ -1,8 +1,7 @@
 """The nerfstudio / instant-ngp layout: one ``transforms.json`` with intrinsics, and photographs.
 
 Intrinsics (``fl_x, fl_y, cx, cy, w, h``) stand at the top or, overriding that, in a frame; where
-focal lengths are missing, ``camera_angle_x`` (and ``_y``) give them. Views are sorted by file
-name, and every ``data.test_every``-th is for testing, as in Mip-NeRF 360 and 3DGS.
+focal lengths are missing, ``camera_angle_x`` (and ``_y``) give them.
 
 Frames may have a lens, a second pose, a mask and depths: see ``drgs.data.extras``. Depths are z in
 the camera; with a fisheye, the distance from it, as in nerfstudio, where a fisheye's rays have unit
@@ -11,130 +10,23 @@ length.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from pathlib import Path
-
 from drgs.config.schema import DataConfig
-from drgs.core.errors import UserError
-from drgs.data.extras import extras_of, files_of, ignored, notes
-from drgs.data.images import check_room, kept_photograph, threads_for
-from drgs.data.orientation import as_calibrated
-from drgs.data.transforms import (
-    Frame,
-    focal_from_angle,
-    focal_length,
-    image_path,
-    in_parallel,
-    point_cloud_note,
-    point_cloud_path,
-    principal_point,
-    read_frames,
-    unique_names,
-)
-from drgs.data.types import Dataset, View
-from drgs.io.pictures import has_alpha, read_pixels
-
-MAX_WIDTH = 1600
-"""px: wider photographs are scaled down to this, as in the 3DGS reference, unless a size is set."""
+from drgs.data.photographs import Photographs, check_splits, dataset_of
+from drgs.data.transforms import image_path, point_cloud_note, point_cloud_path, read_frames
+from drgs.data.types import Dataset
 
 
 def load(config: DataConfig) -> Dataset:
-    """Read all views; those at indices 0, n, 2n, ... of the sorted names are the test split."""
+    """Read all views: see :func:`drgs.data.photographs.dataset_of`."""
     path = config.path / "transforms.json"
     frames = read_frames(path)
-    if config.test_split not in (None, "test"):
-        raise UserError(
-            f"{path}: this layout has no split {config.test_split}; leave data.test_split out "
-            "(data.test_every chooses the test views)"
-        )
-    if len(frames) < 2:
-        raise UserError(f"{path}: at least 2 views are needed, one of them to test; got 1")
-    files = [image_path(config.path, frame) for frame in frames]
-    config = _completed(config, files)
-    check_room(files, config.image_size)
-
-    def load_view(index: int, name: str) -> View:
-        return _load_view(config, frames[index], files[index], name)
-
-    order = sorted(range(len(frames)), key=lambda index: frames[index].own.file_path)
-    names = unique_names([frames[index].own.file_path for index in order])
-    views = in_parallel(load_view, order, names, threads=threads_for(files))
-    test = views[:: config.test_every]
-    train = tuple(v for i, v in enumerate(views) if i % config.test_every != 0)
-    return Dataset(
-        train=train,
-        test=test,
-        test_split="test",
-        background=config.background_rgb,
-        start_half_extent=None,
-        description=(
-            f"{config.path.name} (nerfstudio layout): {len(train)} train views, measured on "
-            f"{len(test)} views (every {config.test_every}th by file name), "
-            f"{views[0].width}x{views[0].height}, background {config.background}"
-            + notes(config, frames)
-            + point_cloud_note(config, frames)
-        ),
-        ignored=ignored(config, frames),
+    check_splits(config, path, len(frames))
+    photographs = Photographs(
+        layout="nerfstudio",
+        source=path,
+        frames=frames,
+        files=[image_path(config.path, frame) for frame in frames],
         point_cloud=point_cloud_path(config, frames),
+        note=point_cloud_note(config, frames),
     )
-
-
-def _completed(config: DataConfig, files: Sequence[Path]) -> DataConfig:
-    """With what follows from the photographs where nothing is given."""
-    changes: dict[str, object] = {}
-    if config.background is None:
-        changes["background"] = "white" if any(map(has_alpha, files)) else "black"
-    if config.image_size is None:
-        changes["image_size"] = MAX_WIDTH
-    return config.model_copy(update=changes)
-
-
-def _load_view(config: DataConfig, frame: Frame, file: Path, name: str) -> View:
-    pixels = as_calibrated(read_pixels(file), file, frame)
-    height, width = pixels.shape[:2]
-    values = frame.values
-    for key, given, size in (("w", values.w, width), ("h", values.h, height)):
-        if given is not None and given != size:
-            raise UserError(
-                f"{frame.where(key)} must be the image's size, {size} px ({file}), got "
-                f"{given:g}; scale the intrinsics or the images"
-            )
-    fx = _focal(frame, "x", width)
-    has_fy = values.fl_y is not None or values.camera_angle_y is not None
-    fy = _focal(frame, "y", height) if has_fy else fx
-    cx, cy = (_principal(frame, key, size) for key, size in (("cx", width), ("cy", height)))
-
-    image, alpha = kept_photograph(pixels, config.background_rgb, config.image_size)
-    scale_x, scale_y = image.shape[1] / width, image.shape[0] / height
-    return View(
-        name=name,
-        image=image,
-        camera_to_world=frame.own.transform_matrix,
-        fx=fx * scale_x,
-        fy=fy * scale_y,
-        cx=cx * scale_x,
-        cy=cy * scale_y,
-        width=image.shape[1],
-        height=image.shape[0],
-        alpha=alpha,
-        files=files_of(config, frame, file),
-        **extras_of(config, frame, (width, height)),
-    )
-
-
-def _focal(frame: Frame, axis: str, size: int) -> float:
-    """Px, of a picture of ``size`` px."""
-    focal, angle = (getattr(frame.values, f"{key}_{axis}") for key in ("fl", "camera_angle"))
-    if focal is not None:
-        return focal_length(focal, frame.where(f"fl_{axis}"), size)
-    if angle is not None:
-        return focal_from_angle(angle, size)
-    raise UserError(
-        f"{frame.where(f'fl_{axis}')} is missing, and there is no camera_angle_{axis} either"
-    )
-
-
-def _principal(frame: Frame, key: str, size: int) -> float:
-    """Px; in the middle of a picture of ``size`` px where nothing else is said."""
-    value = getattr(frame.values, key)
-    return size / 2 if value is None else principal_point(value, frame.where(key), size)
+    return dataset_of(config, photographs)

@@ -18,8 +18,11 @@ VIDEOS = frozenset({".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v"})
 PICTURE_FOLDERS = ("images", "input", "photos", "rgb")
 """Where converters expect photographs, or put them."""
 
-COLMAP_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0", "0", ".")
-"""Where COLMAP's models lie in the folders of common tools."""
+COLMAP_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0")
+"""Where COLMAP's models lie in the folders of datasets."""
+
+OTHER_COLMAP_FOLDERS = ("0", ".")
+"""Where they lie in COLMAP's own."""
 
 GUIDE = 'docs/guide.md, "From photographs to a dataset"'
 
@@ -44,7 +47,7 @@ def what_is_there(folder: Path, markers: Sequence[str]) -> str:
             return found
     return (
         f"neither {' nor '.join(markers)} is there; data.path must be a folder in the layout of "
-        "NeRF-synthetic or of nerfstudio / instant-ngp"
+        "NeRF-synthetic, of nerfstudio / instant-ngp or of COLMAP"
     )
 
 
@@ -75,18 +78,28 @@ def _dataset_below(folder: Path, names: list[str], markers: Sequence[str]) -> st
     return None
 
 
-def _colmap_model(folder: Path, names: list[str], markers: Sequence[str]) -> str | None:
-    for below in COLMAP_FOLDERS:
+def has_colmap_model(folder: Path) -> bool:
+    """Whether a model of COLMAP lies where datasets have it."""
+    return _found_model(folder, COLMAP_FOLDERS) is not None
+
+
+def _found_model(folder: Path, folders: Sequence[str]) -> str | None:
+    """The file of the cameras, below ``folder``."""
+    for below in folders:
         for suffix in (".bin", ".txt"):
             if all(os.path.isfile(folder / below / f"{n}{suffix}") for n in ("cameras", "images")):
-                return (
-                    f"is a COLMAP reconstruction ({Path(below, 'cameras' + suffix)}), which is not "
-                    f"read directly yet; copy the files of {_quoted(folder / below)} to "
-                    "DIR/colmap/sparse/0, have transforms.json written: ns-process-data images "
-                    f"--data {_quoted(_folder_of_pictures(folder))} --output-dir DIR "
-                    f"--skip-colmap, then give DIR; see {GUIDE}"
-                )
+                return str(Path(below, f"cameras{suffix}"))
     return None
+
+
+def _colmap_model(folder: Path, names: list[str], markers: Sequence[str]) -> str | None:
+    found = _found_model(folder, OTHER_COLMAP_FOLDERS)
+    if found is None:
+        return None
+    return (
+        f"is a model of COLMAP ({found}) without photographs; give the folder that has it in "
+        "sparse/0 and the photographs in images"
+    )
 
 
 def _llff_poses(folder: Path, names: list[str], markers: Sequence[str]) -> str | None:

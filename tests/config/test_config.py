@@ -200,8 +200,9 @@ def test_a_wrong_value_is_refused_with_file_key_expected_and_got(load, text, mes
             "data.background must be white, black or three numbers in 0..1, got [0, 0, 2]",
         ),
         (
-            "data: {path: x, type: colmap}",
-            "data.type must be one of 'auto', 'nerf_synthetic' or 'nerfstudio', got 'colmap'",
+            "data: {path: x, type: llff}",
+            "data.type must be one of 'auto', 'nerf_synthetic', 'nerfstudio' or 'colmap', got "
+            "'llff'",
         ),
         ("data: {}", "data.path is missing: Dataset folder; relative to the configuration file."),
         (

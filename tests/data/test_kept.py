@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from support.datasets import load, refusal, view_at
 
-from drgs.data import images, nerfstudio
+from drgs.data import images
+from drgs.data import photographs as reader
 from drgs.data.images import check_room, downscale, kept_photograph, smaller_view, threads_for
 from drgs.data.kept import KeptPicture, kept_mask
 
@@ -125,7 +126,7 @@ def test_photographs_that_do_not_fit_are_refused_before_they_are_read(photograph
     monkeypatch.setattr(images, "available_memory", lambda: 1488)
     check_room(files, None)
     monkeypatch.setattr(images, "available_memory", lambda: 1487)
-    monkeypatch.setattr(nerfstudio, "read_pixels", None)
+    monkeypatch.setattr(reader, "read_pixels", None)
     message = (
         f"{photographs / 'images'}: 10 photographs take 1 kB of memory as they are kept, and 1 kB "
         "are available; set data.image_size=2, or use fewer of them"

@@ -15,15 +15,13 @@ def touch(folder, *names):
 
 
 @pytest.mark.parametrize("suffix", [".bin", ".txt"])
-@pytest.mark.parametrize("below", ["sparse/0", "sparse", "colmap/sparse/0", "."])
-def test_a_colmap_reconstruction(tmp_path, below, suffix):
-    touch(tmp_path, f"{below}/cameras{suffix}", f"{below}/images{suffix}", "images/a.jpg")
+@pytest.mark.parametrize("below", ["0", "."])
+def test_a_model_of_colmap_without_photographs(tmp_path, below, suffix):
+    touch(tmp_path, f"{below}/cameras{suffix}", f"{below}/images{suffix}")
     where = "" if below == "." else f"{below}/"
     assert refusal(tmp_path) == (
-        f"{tmp_path}: is a COLMAP reconstruction ({where}cameras{suffix}), which is not read "
-        f"directly yet; copy the files of {tmp_path / below} to DIR/colmap/sparse/0, have "
-        f"transforms.json written: ns-process-data images --data {tmp_path}/images --output-dir "
-        f"DIR --skip-colmap, then give DIR; see {GUIDE}"
+        f"{tmp_path}: is a model of COLMAP ({where}cameras{suffix}) without photographs; give the "
+        "folder that has it in sparse/0 and the photographs in images"
     )
 
 

@@ -32,7 +32,7 @@ def test_a_missing_folder_is_an_error_that_says_where_to_get_the_data(tmp_path):
 def test_a_folder_of_neither_layout_is_refused(tmp_path):
     assert refusal(tmp_path) == (
         f"{tmp_path}: neither transforms_train.json nor transforms.json is there; data.path must "
-        "be a folder in the layout of NeRF-synthetic or of nerfstudio / instant-ngp"
+        "be a folder in the layout of NeRF-synthetic, of nerfstudio / instant-ngp or of COLMAP"
     )
 
 

@@ -1,0 +1,189 @@
+"""COLMAP's layout: a model of cameras, images and points, and photographs.
+
+The model is in ``sparse/0``, ``sparse`` or ``colmap/sparse/0``, the photographs in ``images`` (or
+beside the model's folder) or, at a half, a quarter or an eighth of their size, in ``images_2``,
+``images_4``, ``images_8``; masks are in ``masks``, black where pixels do not count: ``NAME.png`` of
+a picture ``NAME`` as COLMAP has them, or with the picture's suffix replaced.
+
+Cameras are rendered with the lens that COLMAP found, without undistorting. Their numbers are for
+the size that COLMAP saw; the size of the picture that is there decides what they are for that.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+
+from drgs.config.schema import DataConfig
+from drgs.core.errors import UserError, listed, one_line
+from drgs.data.photographs import MAX_WIDTH, Photographs, check_splits, dataset_of
+from drgs.data.recognition import COLMAP_FOLDERS
+from drgs.data.transforms import Frame, FrameValues
+from drgs.data.types import Dataset
+from drgs.io.colmap import ColmapCamera, ColmapImage, ColmapModel, model_files, read_model
+from drgs.io.pictures import image_orientation, image_size
+
+FACTORS = (1, 2, 4, 8)
+"""What pictures in folders of their own are smaller by."""
+
+LENSES = {
+    "SIMPLE_PINHOLE": "PINHOLE",
+    "PINHOLE": "PINHOLE",
+    "SIMPLE_RADIAL": "OPENCV",
+    "RADIAL": "OPENCV",
+    "OPENCV": "OPENCV",
+    "FULL_OPENCV": "FULL_OPENCV",
+    "SIMPLE_FISHEYE": "OPENCV_FISHEYE",
+    "FISHEYE": "OPENCV_FISHEYE",
+    "SIMPLE_RADIAL_FISHEYE": "OPENCV_FISHEYE",
+    "RADIAL_FISHEYE": "OPENCV_FISHEYE",
+    "OPENCV_FISHEYE": "OPENCV_FISHEYE",
+}
+"""Camera models that can be rendered, and what their coefficients are read as."""
+
+ROUNDED = 1.5
+"""px: what a picture's height may differ from the camera's in proportion to its width."""
+
+
+@dataclass(frozen=True, eq=False)
+class ColmapFrame(Frame):
+    """An image of a model."""
+
+    def where(self, key: str) -> str:
+        """Of which image."""
+        return f"{self.path}: image {one_line(self.own.file_path, 100)}: {key}"
+
+
+def model_folder(folder: Path) -> Path | None:
+    """Where a model is; None: there is none."""
+    folders = (folder / below for below in COLMAP_FOLDERS)
+    return next((path for path in folders if model_files(path) is not None), None)
+
+
+def load(config: DataConfig) -> Dataset:
+    """Read all views: see :func:`drgs.data.photographs.dataset_of`."""
+    folder = model_folder(config.path)
+    if folder is None:
+        raise UserError(
+            f"{config.path}: there is no model of COLMAP in {', '.join(COLMAP_FOLDERS)}"
+        )
+    model = read_model(folder)
+    images = sorted(model.images, key=lambda image: image.name)
+    check_splits(config, folder, len(images))
+    pictures = picture_folder(config, model)
+    files = [_file_of(pictures, image, folder) for image in images]
+    frames = [
+        _frame(config.path, model.cameras[image.camera], image, file, folder, index)
+        for index, (image, file) in enumerate(zip(images, files, strict=True))
+    ]
+    cloud, note = None, f"; pictures of {pictures.name}"
+    if len(model.points.errors):
+        if config.ignore_points:
+            note += "; points of the model ignored"
+        else:
+            cloud = model_files(folder)["points3D"]
+    return dataset_of(config, Photographs("COLMAP", folder, frames, files, cloud, note))
+
+
+def picture_folder(config: DataConfig, model: ColmapModel) -> Path:
+    """The folder of the pictures that are to be read.
+
+    That of ``data.downscale``; without it, the one whose pictures are the smallest that still have
+    the width of ``data.image_size``, or the largest ones there are.
+    """
+    there = {
+        factor: config.path / ("images" if factor == 1 else f"images_{factor}")
+        for factor in FACTORS
+    }
+    there = {factor: path for factor, path in there.items() if path.is_dir()}
+    if 1 not in there and any((config.path / image.name).is_file() for image in model.images):
+        there[1] = config.path
+    if not there:
+        raise UserError(
+            f"{config.path}: there is no folder images (or images_2, images_4, images_8) of the "
+            "photographs beside COLMAP's model"
+        )
+    if config.downscale is not None:
+        if config.downscale not in there:
+            names = listed([path.name for path in there.values()], len(FACTORS))
+            raise UserError(
+                f"data.downscale: {config.path} has the folders {names}, got {config.downscale}"
+            )
+        return there[config.downscale]
+    width = min((camera.width for camera in model.cameras.values()), default=1)
+    wanted = min(config.image_size or MAX_WIDTH, width)
+    wide = [factor for factor in there if width / factor >= wanted - 1]
+    return there[max(wide, default=min(there))]
+
+
+def _file_of(pictures: Path, image: ColmapImage, folder: Path) -> Path:
+    file = pictures / image.name
+    if not file.is_file():
+        raise UserError(
+            f"{folder}: image {one_line(image.name, 100)}: there is no picture {one_line(file)}"
+        )
+    return file
+
+
+def _frame(
+    path: Path, camera: ColmapCamera, image: ColmapImage, file: Path, folder: Path, index: int
+) -> ColmapFrame:
+    model = LENSES.get(camera.model)
+    if model is None:
+        raise UserError(
+            f"{folder}: camera {camera.number} is of the model {camera.model}, which cannot be "
+            f"rendered (those that can: {', '.join(LENSES)}); undistort the pictures "
+            "(colmap image_undistorter), or have COLMAP find another model"
+        )
+    width, height = _size_as_calibrated(file, camera, image, folder)
+    named = camera.named()
+    scale_x, scale_y = width / camera.width, height / camera.height
+    focal = named.pop("f", None)
+    values = {
+        "fl_x": scale_x * (named.pop("fx") if focal is None else focal),
+        "fl_y": scale_y * (named.pop("fy") if focal is None else focal),
+        "cx": scale_x * named.pop("cx"),
+        "cy": scale_y * named.pop("cy"),
+        "w": width,
+        "h": height,
+        "camera_model": model,
+        **named,
+    }
+    own = FrameValues.model_construct(
+        file_path=image.name,
+        transform_matrix=image.camera_to_world,
+        mask_path=_mask_of(path, image.name),
+        **values,
+    )
+    return ColmapFrame(own, own, index, folder)
+
+
+def _size_as_calibrated(
+    file: Path, camera: ColmapCamera, image: ColmapImage, folder: Path
+) -> tuple[int, int]:
+    """Width and height of the picture, px, as the camera's numbers have it.
+
+    COLMAP reads pictures as they are stored; what was turned since, as EXIF says, is so here.
+    """
+    width, height = image_size(file)
+    sizes = [(width, height)]
+    if image_orientation(file) >= SIDEWAYS:
+        sizes.append((height, width))
+    for size in sizes:
+        if abs(size[0] * camera.height / camera.width - size[1]) <= ROUNDED:
+            return size
+    raise UserError(
+        f"{folder}: image {one_line(image.name, 100)} was {camera.width} x {camera.height} px for "
+        f"COLMAP, and {file} is {width} x {height} px, of another shape; give the pictures that "
+        "COLMAP saw, or smaller ones of the same shape"
+    )
+
+
+SIDEWAYS = 5
+"""EXIF's numbers from this one exchange width and height."""
+
+
+def _mask_of(path: Path, name: str) -> str | None:
+    """Its file, relative to the dataset's folder; None: there is none."""
+    beside, replaced = f"masks/{name}.png", str(PurePosixPath("masks", name).with_suffix(".png"))
+    return next((mask for mask in (beside, replaced) if (path / mask).is_file()), None)

@@ -1,0 +1,240 @@
+"""COLMAP's layout: models, pictures of several sizes, masks, lenses and points to start from."""
+
+import numpy as np
+import pytest
+from PIL import Image
+from support.colmap_models import PARAMETERS, WRITERS, some_model, write_binary
+from support.datasets import load, refusal
+
+from drgs.config.schema import FitConfig
+from drgs.core.errors import UserError
+from drgs.data.colmap import LENSES
+from drgs.data.derived import completed
+from drgs.data.initial import start_of
+from drgs.io.colmap_records import MODELS
+
+SIZE = 640, 480
+
+NAMES = ("a.jpg", "b.jpg", "cam/1.png", "cam/2.png")
+
+
+def write_pictures(folder, names=NAMES, size=SIZE, **options):
+    """Of a colour for each."""
+    for number, name in enumerate(names):
+        path = folder / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        Image.new("RGB", size, (40 * number, 20, 30)).save(path, **options)
+
+
+def write_dataset(folder, models=("PINHOLE",), below="sparse/0", write=write_binary):
+    """Images are in the file in another order than by name."""
+    model = some_model(np.random.default_rng(1), NAMES[::-1], models)
+    write(folder / below, model)
+    write_pictures(folder / "images")
+    return model
+
+
+def intrinsics(view):
+    return view.fx, view.fy, view.cx, view.cy, view.width, view.height
+
+
+@pytest.mark.parametrize("below", ["sparse/0", "sparse", "colmap/sparse/0"])
+@pytest.mark.parametrize("write", WRITERS.values(), ids=WRITERS)
+def test_views_have_poses_and_intrinsics_of_the_model(tmp_path, below, write):
+    model = write_dataset(tmp_path, below=below, write=write)
+    dataset = load(tmp_path, test_every=3)
+    assert [view.name for view in dataset.test] == ["a", "2"]
+    assert [view.name for view in dataset.train] == ["b", "1"]
+    poses = {name: pose for name, _, pose in model.images}
+    views = dict(
+        zip((NAMES[k] for k in (0, 3, 1, 2)), (*dataset.test, *dataset.train), strict=True)
+    )
+    for name, view in views.items():
+        np.testing.assert_allclose(view.camera_to_world, poses[name], atol=1e-14)
+        assert intrinsics(view) == (600, 620, 320.5, 239, 640, 480) and view.lens is None
+        level = np.asarray(view.image)[0, 0, 0] * 255
+        assert level == pytest.approx(40 * NAMES.index(name), abs=3)
+    assert "(COLMAP layout): 2 train views" in dataset.description
+    assert dataset.background == (0.0, 0.0, 0.0)
+
+
+def test_the_pictures_own_size_decides_the_intrinsics(tmp_path):
+    write_dataset(tmp_path)
+    for factor in (2, 4):
+        write_pictures(tmp_path / f"images_{factor}", size=(640 // factor, 480 // factor))
+    for factor in (1, 2, 4):
+        view = load(tmp_path, downscale=factor).train[0]
+        expected = [value / factor for value in (600, 620, 320.5, 239, 640, 480)]
+        assert intrinsics(view) == pytest.approx(expected)
+    assert refusal(tmp_path, downscale=8).startswith(
+        f"data.downscale: {tmp_path} has the folders images, images_2, images_4, got 8"
+    )
+    # The smallest that are large enough, and from there to the width that is asked for.
+    for width, folder, factor in ((640, "images", 1), (320, "images_2", 2), (100, "images_4", 6.4)):
+        dataset = load(tmp_path, image_size=width)
+        assert f"pictures of {folder}" in dataset.description
+        assert dataset.train[0].width == width
+        assert dataset.train[0].fx == pytest.approx(600 / factor)
+
+
+def test_the_largest_pictures_there_are_may_be_smaller_than_what_is_asked_for(tmp_path):
+    write_dataset(tmp_path)
+    (tmp_path / "images").rename(tmp_path / "originals")
+    for factor in (4, 8):
+        write_pictures(tmp_path / f"images_{factor}", size=(640 // factor, 480 // factor))
+    assert load(tmp_path).train[0].width == 160
+
+
+@pytest.mark.parametrize("name", sorted(LENSES))
+def test_every_lens_that_can_be_rendered_is(tmp_path, name):
+    """Without undistorting; the coefficients are those of the file."""
+    write_dataset(tmp_path, [name])
+    view = load(tmp_path).train[0]
+    coefficients = dict(zip(MODELS[name][1], PARAMETERS[name], strict=True))
+    named = {k: v for k, v in coefficients.items() if k[0] in "kp"}
+    assert ({} if view.lens is None else view.lens.named()) == pytest.approx(named)
+    kind = None if view.lens is None else view.lens.kind
+    assert kind == ("fisheye" if "FISHEYE" in name else None if "PINHOLE" in name else "opencv")
+    assert load(tmp_path, ignore_distortion=True).train[0].lens is None
+
+
+@pytest.mark.parametrize("name", sorted(set(PARAMETERS) - set(LENSES)))
+def test_other_lenses_are_refused_by_name(tmp_path, name):
+    write_dataset(tmp_path, [name])
+    message = refusal(tmp_path)
+    assert f"is of the model {name}, which cannot be rendered" in message
+    assert "colmap image_undistorter" in message
+
+
+def test_masks_lie_beside_their_pictures(tmp_path):
+    write_dataset(tmp_path)
+    mask = np.zeros((480, 640), np.uint8)
+    mask[:, :320] = 255
+    (tmp_path / "masks" / "cam").mkdir(parents=True)
+    Image.fromarray(mask).save(tmp_path / "masks" / "b.jpg.png")  # as COLMAP has it
+    Image.fromarray(255 - mask).save(tmp_path / "masks" / "cam" / "1.png")
+    views = {view.name: view for view in load(tmp_path).train}
+    assert np.asarray(views["b"].mask).sum(axis=0).tolist() == [480] * 320 + [0] * 320
+    assert np.asarray(views["1"].mask).sum(axis=0).tolist() == [0] * 320 + [480] * 320
+    assert views["2"].mask is None
+    assert all(view.mask is None for view in load(tmp_path, ignore_masks=True).train)
+
+
+def test_masks_may_be_for_larger_pictures(tmp_path):
+    """Those of COLMAP's are for the pictures that it saw. A pixel counts where all of it does."""
+    write_dataset(tmp_path)
+    write_pictures(tmp_path / "images_2", size=(320, 240))
+    mask = np.full((480, 640), 255, np.uint8)
+    mask[4:7, 10:12] = 0
+    (tmp_path / "masks").mkdir()
+    Image.fromarray(mask).save(tmp_path / "masks" / "b.png")
+    view = next(view for view in load(tmp_path, downscale=2).train if view.name == "b")
+    expected = np.ones((240, 320))
+    expected[2:4, 5] = 0
+    np.testing.assert_array_equal(np.asarray(view.mask), expected)
+    Image.fromarray(mask[:, :600]).save(tmp_path / "masks" / "b.png")
+    assert "masks/b.png: must be 320 x 240 px, as the photograph is, got 600 x 480" in (
+        refusal(tmp_path, downscale=2)
+    )
+
+
+def test_a_fit_starts_from_the_models_points(tmp_path):
+    model = write_dataset(tmp_path)
+    dataset = load(tmp_path)
+    assert dataset.point_cloud == tmp_path / "sparse" / "0" / "points3D.bin"
+    config = completed(FitConfig(data={"path": tmp_path}, init={"num_points": 9}), dataset)
+    start = start_of(config, dataset)
+    positions, colors, *_ = (np.array(column) for column in zip(*model.points, strict=True))
+    np.testing.assert_allclose(start.means, positions, rtol=1e-6)
+    np.testing.assert_allclose(start.colors, colors / 255, rtol=1e-6)
+    assert start.description == f"the points of {dataset.point_cloud}"
+    assert load(tmp_path, ignore_points=True).point_cloud is None
+
+
+def test_points_of_large_errors_and_of_few_observations_are_left_out(tmp_path):
+    model = write_dataset(tmp_path)
+    dataset = load(tmp_path)
+    positions, _, errors, lengths = (np.array(column) for column in zip(*model.points, strict=True))
+
+    def start(**init):
+        return start_of(completed(FitConfig(data={"path": tmp_path}, init=init), dataset), dataset)
+
+    error, length = float(np.sort(errors)[-3]), int(np.median(lengths))
+    for init, kept in (
+        ({"max_point_error": error}, errors <= error),
+        ({"min_track_length": length}, lengths >= length),
+        (
+            {"max_point_error": error, "min_track_length": length},
+            (errors <= error) & (lengths >= length),
+        ),
+    ):
+        assert 4 <= kept.sum() < len(kept)
+        np.testing.assert_allclose(start(**init).means, positions[kept], rtol=1e-6)
+        assert f"{kept.sum()} of {len(kept)} points of" in start(**init).description
+    with pytest.raises(UserError, match=r"leave none of \d+ points \(their errors are"):
+        start(max_point_error=float(errors.min()) / 2)
+    cloud = tmp_path / "cloud.ply"
+    cloud.touch()
+    with pytest.raises(UserError, match=r"init.max_point_error: only COLMAP's points"):
+        start(max_point_error=1.0, point_cloud=cloud)
+
+
+def test_photographs_may_lie_beside_the_model(tmp_path):
+    write_dataset(tmp_path)
+    for path in (tmp_path / "images").iterdir():
+        path.rename(tmp_path / path.name)
+    (tmp_path / "images").rmdir()
+    assert len(load(tmp_path).train) == 3
+
+
+# ----------------------------------------------------------------------------------------------
+# What is refused
+# ----------------------------------------------------------------------------------------------
+
+
+def test_a_picture_that_is_not_there_is_refused(tmp_path):
+    write_dataset(tmp_path)
+    (tmp_path / "images" / "b.jpg").unlink()
+    message = refusal(tmp_path)
+    assert "image b.jpg: there is no picture" in message and "images/b.jpg" in message
+
+
+def test_a_picture_of_another_shape_is_refused(tmp_path):
+    write_dataset(tmp_path)
+    write_pictures(tmp_path / "images", ["b.jpg"], (480, 640))
+    assert "was 640 x 480 px for COLMAP" in refusal(tmp_path)
+
+
+def test_a_picture_that_was_turned_since_is_turned_as_exif_says(tmp_path):
+    """COLMAP reads pictures as they are stored: where the stored size is the camera's, it is right.
+
+    Where another program has turned what COLMAP saw, EXIF says how it is turned back.
+    """
+    write_dataset(tmp_path)
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    write_pictures(tmp_path / "images", ["b.jpg"], (480, 640), exif=exif)
+    view = next(view for view in load(tmp_path).train if view.name == "b")
+    assert np.asarray(view.image).shape == (480, 640, 3)
+    write_pictures(tmp_path / "images", ["b.jpg"], (640, 480), exif=exif)
+    view = next(view for view in load(tmp_path).train if view.name == "b")
+    assert np.asarray(view.image).shape == (480, 640, 3)
+
+
+def test_folders_without_pictures_and_models_without_folders_are_explained(tmp_path):
+    write_dataset(tmp_path)
+    (tmp_path / "images").rename(tmp_path / "originals")
+    assert "there is no folder images (or images_2, images_4, images_8)" in refusal(tmp_path)
+    assert "is a model of COLMAP (0/cameras.bin) without photographs" in refusal(
+        tmp_path / "sparse"
+    )
+    assert "there is no model of COLMAP in sparse/0" in refusal(
+        tmp_path / "originals", type="colmap"
+    )
+
+
+def test_there_are_two_views_at_least_and_no_other_splits(tmp_path):
+    write_dataset(tmp_path)
+    assert "this layout has no split val" in refusal(tmp_path, test_split="val")
+    write_binary(tmp_path / "sparse" / "0", some_model(np.random.default_rng(1), ["a.jpg"]))
+    assert "at least 2 views are needed" in refusal(tmp_path)
