@@ -1,7 +1,8 @@
-"""``python -m drgs.fit CONFIG.yml``: fit Gaussians to photographs.
+"""``python -m drgs.fit CONFIG.yml|FOLDER``: fit Gaussians to photographs.
 
-Reads the configuration and the dataset, runs :class:`drgs.training.trainer.Trainer`, measures the
-result on the test views and writes the output folder:
+Reads the configuration, or makes one that suits the folder, and the dataset, runs
+:class:`drgs.training.trainer.Trainer`, measures the result on the test views and writes the output
+folder:
 
 - ``point_cloud.ply``: the Gaussians, in the layout of the 3DGS reference implementation
 - ``point_cloud_viewers.ply``: the same for other viewers, where these render otherwise than the fit
@@ -57,6 +58,7 @@ from drgs.core.private import llvm_version
 from drgs.data import Dataset, View, load_dataset
 from drgs.data.derived import completed
 from drgs.data.fingerprint import Fingerprint, fingerprint_of
+from drgs.data.folders import config_for
 from drgs.data.initial import Start, description_of_start, gaussians_at, start_of
 from drgs.gaussians.parameters import Gaussians
 from drgs.integrator.scene import check_lenses
@@ -133,11 +135,18 @@ def add_arguments(parser: CommandParser) -> None:
     """Add the arguments of the command."""
     parser.description = "Fit 3D Gaussians to posed photographs."
     parser.show_examples(
+        "%(prog)s photographs",
         "%(prog)s scenes/photos.yml --data DIR --out out/mine",
         "%(prog)s --resume out/mine",
     )
     what = parser.add_mutually_exclusive_group(required=True)
-    what.add_argument("config", nargs="?", metavar="CONFIG.yml", help="what to fit, and how")
+    what.add_argument(
+        "config",
+        nargs="?",
+        type=file_or_folder,
+        metavar="CONFIG.yml|FOLDER",
+        help="what to fit, and how; or the folder of a dataset, to have that chosen",
+    )
     what.add_argument(
         "--resume", type=file_or_folder, metavar="OUT_DIR", help="go on with a fit that was stopped"
     )
@@ -249,8 +258,15 @@ def what_to_fit(args: argparse.Namespace) -> tuple[FitConfig, Path]:
             )
         return load_moved_config(args.resume, data), args.resume
     out = [] if args.out is None else [f"output.dir={args.out}"]
-    config = load_config(args.config, args.overrides + data + out)
-    return config, config.output.dir or Path("out") / Path(args.config).stem
+    overrides = args.overrides + data + out
+    if args.config.is_dir():
+        if data:
+            raise UserError(f"--data: {args.config} is a folder already; leave one of them out")
+        config, reasons = config_for(args.config, overrides)
+        print(reasons)
+        return config, config.output.dir or Path("out") / args.config.resolve().name
+    config = load_config(args.config, overrides)
+    return config, config.output.dir or Path("out") / args.config.stem
 
 
 def earlier_state(args: argparse.Namespace, config: FitConfig, out: Path) -> Checkpoint | None:
@@ -286,7 +302,8 @@ def announced_start(config: FitConfig, dataset: Dataset) -> Start:
     print(dataset.description)
     print(
         f"{len(dataset.train)} views to train on, {len(dataset.test)} of split "
-        f"'{dataset.test_split}' to measure on; background {config.data.background}"
+        f"'{dataset.test_split}' to measure on; background {config.data.background}; scene extent "
+        f"{dataset.extent:.3g}"
     )
     start = start_of(config, dataset)
     print(description_of_start(config, start))

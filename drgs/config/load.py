@@ -45,18 +45,16 @@ def load_config(path: str | Path, overrides: Iterable[str] = ()) -> FitConfig:
     path = Path(path)
     values = _read_yaml(path)
     _resolve_paths(values, path)
-    overridden = set()
-    for override in overrides:
-        key, value = _parse_override(override)
-        _insert(values, key, value)
-        overridden.add(key)
-    return _validated(values, str(path), overridden)
+    return _validated(values, str(path), _overridden(values, overrides))
 
 
-def config_from(values: Mapping[str, object], where: str) -> FitConfig:
+def config_from(
+    values: Mapping[str, object], where: str, overrides: Iterable[str] = ()
+) -> FitConfig:
     """A configuration from nested mappings, with the keys of the YAML file.
 
     where: the beginning of errors. Paths, text or ``Path``, are relative to the current folder.
+    overrides: see :func:`load_config`.
 
     Raises :class:`UserError` that names the wrong keys, the first of many, in one line.
     """
@@ -69,7 +67,17 @@ def config_from(values: Mapping[str, object], where: str) -> FitConfig:
         entries = values.get(section)
         if isinstance(entries, dict) and isinstance(entries.get(leaf), (str, Path)):
             entries[leaf] = _absolute(Path(), str(entries[leaf]), f"{where}: {key}")
-    return _validated(values, where, set())
+    return _validated(values, where, _overridden(values, overrides))
+
+
+def _overridden(values: dict, overrides: Iterable[str]) -> set[str]:
+    """Put overrides into ``values``; the keys."""
+    keys = set()
+    for override in overrides:
+        key, value = _parse_override(override)
+        _insert(values, key, value)
+        keys.add(key)
+    return keys
 
 
 def _validated(values: dict, where: str, overridden: set[str]) -> FitConfig:

@@ -6,35 +6,36 @@ May import ``io``, ``config``, ``gaussians``, ``cameras`` and ``core``.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from importlib import import_module
 from pathlib import Path
+from typing import Protocol
 
 from drgs.config.load import config_from
 from drgs.config.schema import DataConfig
 from drgs.core.errors import UserError
-from drgs.data import nerf_synthetic, nerfstudio
 from drgs.data.initial import initial_gaussians
 from drgs.data.types import Dataset, View, Viewpoint
 
 __all__ = ["Dataset", "View", "Viewpoint", "initial_gaussians", "load_dataset"]
 
 
-def _load_colmap(config: DataConfig) -> Dataset:
-    from drgs.data import colmap
+class Layout(Protocol):
+    """What reads folders of a kind."""
 
-    return colmap.load(config)
+    def load(self, config: DataConfig) -> Dataset:
+        """All views."""
+
+    def first_picture(self, config: DataConfig) -> Path:
+        """The file of one of them."""
 
 
-_LOADERS: dict[str, Callable[[DataConfig], Dataset]] = {
-    "nerf_synthetic": nerf_synthetic.load,
-    "nerfstudio": nerfstudio.load,
-    "colmap": _load_colmap,
-}
+LAYOUTS = {"nerf_synthetic": "transforms_train.json", "nerfstudio": "transforms.json", "colmap": ""}
+"""By name, which is that of a module: the file that a folder is recognised by."""
 
-_MARKERS = {
-    "nerf_synthetic": "transforms_train.json",
-    "nerfstudio": "transforms.json",
-}
+
+def layout_of(config: DataConfig) -> Layout:
+    """What reads the folder of the dataset, as :func:`layout_name` says."""
+    return import_module(f"drgs.data.{layout_name(config)}")
 
 
 def load_dataset(source: str | Path | DataConfig, **settings: object) -> Dataset:
@@ -50,10 +51,11 @@ def load_dataset(source: str | Path | DataConfig, **settings: object) -> Dataset
     if settings or not isinstance(source, DataConfig):
         given = source.model_dump() if isinstance(source, DataConfig) else {"path": source}
         source = config_from({"data": {**given, **settings}}, "load_dataset()").data
-    return _LOADERS[_layout(source)](source)
+    return layout_of(source).load(source)
 
 
-def _layout(config: DataConfig) -> str:
+def layout_name(config: DataConfig) -> str:
+    """Of :data:`LAYOUTS`. Raises :class:`UserError` for a folder that is none, with what to do."""
     try:
         names = os.listdir(config.path)
     except FileNotFoundError:
@@ -72,11 +74,12 @@ def _layout(config: DataConfig) -> str:
         ) from None
     if config.type != "auto":
         return config.type
-    for layout, marker in _MARKERS.items():
+    markers = [marker for marker in LAYOUTS.values() if marker]
+    for layout, marker in LAYOUTS.items():
         if marker in names:
             return layout
     from drgs.data.recognition import has_colmap_model, what_is_there
 
     if has_colmap_model(config.path):
         return "colmap"
-    raise UserError(f"{config.path}: {what_is_there(config.path, tuple(_MARKERS.values()))}")
+    raise UserError(f"{config.path}: {what_is_there(config.path, markers)}")

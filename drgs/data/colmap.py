@@ -21,7 +21,7 @@ from drgs.data.recognition import COLMAP_FOLDERS
 from drgs.data.transforms import Frame, FrameValues
 from drgs.data.types import Dataset
 from drgs.io.colmap import ColmapCamera, ColmapImage, ColmapModel, model_files, read_model
-from drgs.io.pictures import image_orientation, image_size
+from drgs.io.pictures import MAX_SIDE, image_orientation, image_size
 
 FACTORS = (1, 2, 4, 8)
 """What pictures in folders of their own are smaller by."""
@@ -54,19 +54,27 @@ class ColmapFrame(Frame):
         return f"{self.path}: image {one_line(self.own.file_path, 100)}: {key}"
 
 
-def model_folder(folder: Path) -> Path | None:
-    """Where a model is; None: there is none."""
-    folders = (folder / below for below in COLMAP_FOLDERS)
-    return next((path for path in folders if model_files(path) is not None), None)
+def model_folder(folder: Path) -> Path:
+    """Where a model is. Raises :class:`UserError` where there is none."""
+    for below in COLMAP_FOLDERS:
+        if model_files(folder / below) is not None:
+            return folder / below
+    raise UserError(f"{folder}: there is no model of COLMAP in {', '.join(COLMAP_FOLDERS)}")
+
+
+def first_picture(config: DataConfig) -> Path:
+    """Of the first image, as large as it is there."""
+    folder = model_folder(config.path)
+    model = read_model(folder)
+    if not model.images:
+        raise UserError(f"{folder}: at least 2 views are needed, one of them to test; got 0")
+    widest = config.model_copy(update={"image_size": MAX_SIDE})
+    return _file_of(picture_folder(widest, model), model.images[0], folder)
 
 
 def load(config: DataConfig) -> Dataset:
     """Read all views: see :func:`drgs.data.photographs.dataset_of`."""
     folder = model_folder(config.path)
-    if folder is None:
-        raise UserError(
-            f"{config.path}: there is no model of COLMAP in {', '.join(COLMAP_FOLDERS)}"
-        )
     model = read_model(folder)
     images = sorted(model.images, key=lambda image: image.name)
     check_splits(config, folder, len(images))

@@ -64,6 +64,11 @@ def load(config: DataConfig) -> Dataset:
     )
 
 
+def first_picture(config: DataConfig) -> Path:
+    """Of the training views."""
+    return image_path(config.path, read_frames(_transforms_path(config.path, "train"))[0])
+
+
 def _test_split(config: DataConfig) -> str:
     if config.test_split is not None:
         return config.test_split

@@ -10,6 +10,8 @@ length.
 
 from __future__ import annotations
 
+from pathlib import Path
+
 from drgs.config.schema import DataConfig
 from drgs.data.photographs import Photographs, check_splits, dataset_of
 from drgs.data.transforms import image_path, point_cloud_note, point_cloud_path, read_frames
@@ -30,3 +32,8 @@ def load(config: DataConfig) -> Dataset:
         note=point_cloud_note(config, frames),
     )
     return dataset_of(config, photographs)
+
+
+def first_picture(config: DataConfig) -> Path:
+    """Of the first frame."""
+    return image_path(config.path, read_frames(config.path / "transforms.json")[0])

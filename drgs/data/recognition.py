@@ -116,11 +116,11 @@ def _pictures(folder: Path, names: list[str], markers: Sequence[str]) -> str | N
     pictures = [n for n in sorted(os.listdir(below)) if Path(n).suffix.lower() in PICTURES]
     if not pictures:
         return None
+    there = folder if below.name == "images" else below
     count = "1 picture" if len(pictures) == 1 else f"{len(pictures):,} pictures"
     return (
         f"holds {count} ({_listed(pictures)}), but no cameras: where each was taken must be known; "
-        f"find it out: ns-process-data images --data {_quoted(below)} --output-dir DIR, then give "
-        f"DIR; see {GUIDE}"
+        f"find it out: drgs poses {_quoted(there)}; see {GUIDE}"
     )
 
 
@@ -129,8 +129,9 @@ def _videos(folder: Path, names: list[str], markers: Sequence[str]) -> str | Non
     if not videos:
         return None
     return (
-        f"holds a video ({_listed(videos)}), but no photographs with cameras: ns-process-data "
-        f"video --data {_quoted(folder / videos[0])} --output-dir DIR, then give DIR; see {GUIDE}"
+        f"holds a video ({_listed(videos)}), but no photographs: take two frames of each second "
+        f"(mkdir DIR; ffmpeg -i {_quoted(folder / videos[0])} -r 2 DIR/%04d.jpg), find out where "
+        f"they were taken (drgs poses DIR), and give DIR; see {GUIDE}"
     )
 
 

@@ -1,6 +1,7 @@
 """``drgs COMMAND``: what is called by which words, and what a wrong word is told."""
 
 import argparse
+from pathlib import Path
 
 import pytest
 
@@ -41,16 +42,19 @@ def test_modules_are_commands_too_and_say_how_they_are_called(capsys, command):
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["fot"], "there is no command fot, only fit, render, capture and bench; did you mean fit"),
+        (
+            ["fot"],
+            "there is no command fot, only fit, poses, render, capture and bench; did you mean fit",
+        ),
         (["rendre"], "did you mean render?"),
         (
             ["xyz"],
-            "there is no command xyz, only fit, render, capture and bench; see drgs",
+            "there is no command xyz, only fit, poses, render, capture and bench; see drgs",
         ),
         (["bench", "sped"], "; did you mean speed?"),
         ([], "the following arguments are required: COMMAND"),
         (["bench"], "the following arguments are required: MEASUREMENT"),
-        (["fit"], "one of the arguments CONFIG.yml --resume is required"),
+        (["fit"], "one of the arguments CONFIG.yml|FOLDER --resume is required"),
         (["fit", "a.yml", "--resume", "out"], "not allowed with argument"),
         (["fit", "--resume", "out", "--out", "x"], "configuration from out/config.yml: leave out"),
         (["fit", "a.yml", "--budget", "soon"], "argument --budget: "),
@@ -94,7 +98,7 @@ def test_arguments_are_added_once():
     parser = CommandParser(prog="drgs", module="drgs.__main__")
     for _ in range(2):
         args, _ = parser.parse_known_args(["fit", "a.yml"])
-        assert args.config == "a.yml"
+        assert args.config == Path("a.yml")
 
 
 @pytest.mark.parametrize("text", ["", "0", "-3", "1.5", "two", "1e3"])

@@ -137,7 +137,7 @@ def write(name, content):
 
 WRONG_INPUTS = {
     "config missing": (lambda f: (f / "a.yml").unlink(), "a.yml: cannot read the configuration"),
-    "config is a folder": (put_folder_in_place_of("a.yml"), "a.yml: cannot read the configuration"),
+    "config is a folder": (put_folder_in_place_of("a.yml"), "a.yml: neither transforms_train.json"),
     "config not UTF-8": (write("a.yml", b"\xff"), "a.yml: cannot read the configuration: not UTF"),
     "config not YAML": (write("a.yml", b"a: ["), "a.yml: line 1: not valid YAML"),
     "config not a mapping": (write("a.yml", b"- 1"), "a.yml: must hold sections"),

@@ -2,10 +2,21 @@
 
 import numpy as np
 import pytest
+from conftest import SHARED_DATA
+from drjit.llvm import Array3f64, Float64
 from PIL import Image
-from support.colmap_models import PARAMETERS, WRITERS, some_model, write_binary
+from support.colmap_models import (
+    NAMES,
+    PARAMETERS,
+    WRITERS,
+    some_model,
+    write_binary,
+    write_dataset,
+    write_pictures,
+)
 from support.datasets import load, refusal
 
+from drgs.cameras.camera import Camera, Pinhole
 from drgs.config.schema import FitConfig
 from drgs.core.errors import UserError
 from drgs.data.colmap import LENSES
@@ -13,25 +24,7 @@ from drgs.data.derived import completed
 from drgs.data.initial import start_of
 from drgs.io.colmap_records import MODELS
 
-SIZE = 640, 480
-
-NAMES = ("a.jpg", "b.jpg", "cam/1.png", "cam/2.png")
-
-
-def write_pictures(folder, names=NAMES, size=SIZE, **options):
-    """Of a colour for each."""
-    for number, name in enumerate(names):
-        path = folder / name
-        path.parent.mkdir(parents=True, exist_ok=True)
-        Image.new("RGB", size, (40 * number, 20, 30)).save(path, **options)
-
-
-def write_dataset(folder, models=("PINHOLE",), below="sparse/0", write=write_binary):
-    """Images are in the file in another order than by name."""
-    model = some_model(np.random.default_rng(1), NAMES[::-1], models)
-    write(folder / below, model)
-    write_pictures(folder / "images")
-    return model
+REAL = SHARED_DATA / "colmap_robothead"
 
 
 def intrinsics(view):
@@ -96,6 +89,49 @@ def test_every_lens_that_can_be_rendered_is(tmp_path, name):
     kind = None if view.lens is None else view.lens.kind
     assert kind == ("fisheye" if "FISHEYE" in name else None if "PINHOLE" in name else "opencv")
     assert load(tmp_path, ignore_distortion=True).train[0].lens is None
+
+
+def film_points(view, points):
+    """(N, 2) px: where (N, 3) points in camera axes are seen, in double precision."""
+    K = np.array([[view.fx, 0, view.cx], [0, view.fy, view.cy], [0, 0, 1]])
+    lens = Pinhole() if view.lens is None else view.lens
+    camera = Camera.create(Float64, np.eye(3), np.zeros(3), K, view.width, view.height, 0.1, lens)
+    return np.array(camera.lens.film_point(camera, Array3f64(points.T))).T
+
+
+@pytest.mark.parametrize("name", sorted(LENSES))
+def test_points_are_seen_where_colmap_projects_them(tmp_path, name):
+    """In double precision, over the picture and somewhat beyond, to a few roundings of 1,000 px."""
+    pycolmap = pytest.importorskip("pycolmap")
+    write_dataset(tmp_path, [name])
+    theirs = pycolmap.Camera(model=name, width=640, height=480, params=PARAMETERS[name])
+    points = np.random.default_rng(3).uniform((-0.7, -0.6, 1), (0.7, 0.6, 1), (50, 3))
+    points *= np.linspace(0.5, 9, 50)[:, None]
+    expected = theirs.img_from_cam(points)
+    ours = film_points(load(tmp_path).train[0], points)
+    np.testing.assert_allclose(ours, expected, rtol=0, atol=1e-11)
+
+
+@pytest.mark.skipif(not REAL.is_dir(), reason="the shared data folder is not here")
+def test_real_points_are_seen_where_they_were_observed():
+    """Within the mean error that the model says of itself, through the reader of datasets."""
+    pycolmap = pytest.importorskip("pycolmap")
+    theirs = pycolmap.Reconstruction(str(REAL / "sparse" / "0"))
+    dataset = load(REAL, downscale=2)
+    errors = {number: [] for number in theirs.points3D}
+    for view in (*dataset.train, *dataset.test):
+        image = theirs.find_image_with_name(view.files["image"].name)
+        observed = [p for p in image.points2D if p.has_point3D()]
+        world = np.array([theirs.points3D[p.point3D_id].xyz for p in observed])
+        inside = (world - view.camera_to_world[:3, 3]) @ view.camera_to_world[:3, :3]
+        scale = theirs.cameras[image.camera_id].width / view.width
+        places = scale * film_points(view, inside)
+        for point, place in zip(observed, places, strict=True):
+            errors[point.point3D_id].append(np.linalg.norm(place - point.xy))
+    ours = np.array([np.mean(values) for values in errors.values()])
+    stored = np.array([theirs.points3D[number].error for number in errors])
+    np.testing.assert_allclose(ours, stored, rtol=0, atol=0.01)
+    assert np.mean(ours) == pytest.approx(np.mean(stored), rel=1e-3)
 
 
 @pytest.mark.parametrize("name", sorted(set(PARAMETERS) - set(LENSES)))

@@ -25,27 +25,26 @@ def test_a_model_of_colmap_without_photographs(tmp_path, below, suffix):
     )
 
 
-@pytest.mark.parametrize("below", ["", "images/", "input/"])
-def test_photographs_without_cameras(tmp_path, below):
+@pytest.mark.parametrize(("below", "there"), [("", ""), ("images/", ""), ("input/", "/input")])
+def test_photographs_without_cameras(tmp_path, below, there):
     touch(tmp_path, *(f"{below}IMG_{i}.JPG" for i in range(3)), f"{below}notes.txt")
     assert refusal(tmp_path) == (
         f"{tmp_path}: holds 3 pictures (IMG_0.JPG and 2 more), but no cameras: where each was "
-        f"taken must be known; find it out: ns-process-data images --data "
-        f"{(tmp_path / below)} --output-dir DIR, then give DIR; see {GUIDE}"
+        f"taken must be known; find it out: drgs poses {tmp_path}{there}; see {GUIDE}"
     )
 
 
 def test_a_command_names_folders_as_a_shell_reads_them(tmp_path):
     touch(tmp_path / "my photos", "a.png")
     assert "holds 1 picture (a.png), but" in (message := refusal(tmp_path / "my photos"))
-    assert f"--data '{tmp_path}/my photos' --output-dir" in message
+    assert f"drgs poses '{tmp_path}/my photos';" in message
 
 
 def test_a_video(tmp_path):
     touch(tmp_path, "walk.MOV")
-    assert "holds a video (walk.MOV), but no photographs with cameras: ns-process-data video " in (
-        refusal(tmp_path)
-    )
+    message = refusal(tmp_path)
+    assert "holds a video (walk.MOV), but no photographs: take two frames of each second" in message
+    assert f"ffmpeg -i {tmp_path}/walk.MOV -r 2 DIR/%04d.jpg" in message
 
 
 def test_a_dataset_one_folder_below(tmp_path):

@@ -4,6 +4,7 @@ import struct
 from dataclasses import dataclass, field
 
 import numpy as np
+from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from drgs.io.colmap_records import MODELS
@@ -101,3 +102,24 @@ def write_text(folder, model, with_points=True):
 
 
 WRITERS = {"binary": write_binary, "text": write_text}
+
+
+SIZE = 640, 480  # of some_model's cameras
+
+NAMES = ("a.jpg", "b.jpg", "cam/1.png", "cam/2.png")
+
+
+def write_pictures(folder, names=NAMES, size=SIZE, **options):
+    """Of a colour for each."""
+    for number, name in enumerate(names):
+        path = folder / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        Image.new("RGB", size, (40 * number, 20, 30)).save(path, **options)
+
+
+def write_dataset(folder, models=("PINHOLE",), below="sparse/0", write=write_binary):
+    """Images are in the file in another order than by name."""
+    model = some_model(np.random.default_rng(1), NAMES[::-1], models)
+    write(folder / below, model)
+    write_pictures(folder / "images")
+    return model

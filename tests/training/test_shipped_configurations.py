@@ -9,7 +9,7 @@ from operator import attrgetter
 import mitsuba as mi
 import pytest
 from conftest import REPOSITORY, SHARED_DATA
-from support.photographs import from_colmap, moved
+from support.photographs import moved
 
 from drgs.config.changes import changed, with_iterations
 from drgs.config.load import load_config
@@ -102,8 +102,7 @@ def far_smaller(folder):
 
 
 def colmap_with_points(folder):
-    source = SHARED_DATA / "colmap_robothead"
-    return from_colmap(source / "sparse" / "0", source / "images_4", folder / "robot", factor=4)
+    return SHARED_DATA / "colmap_robothead"
 
 
 KINDS = (nerf_synthetic, instant_ngp, cameras_of_their_own, far_smaller, colmap_with_points)

@@ -1,0 +1,48 @@
+"""A configuration for a folder that has none: what suits its pictures, and a laptop."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from pathlib import Path
+
+from drgs.config.load import config_from
+from drgs.config.schema import FitConfig
+from drgs.data import layout_name, layout_of
+from drgs.io.pictures import image_size
+
+MAX_PIXELS = 600_000
+"""Of a picture that is fitted, as 894 x 671: larger ones are scaled down by a whole number."""
+
+ITERATIONS = {"nerf_synthetic": 4500, "nerfstudio": 7000, "colmap": 7000}
+"""By layout, as ``scenes/lego.yml`` and ``scenes/photos.yml`` have them."""
+
+NAMES = {
+    "nerf_synthetic": "cut-out pictures in the layout of NeRF-synthetic",
+    "nerfstudio": "photographs with the cameras of transforms.json",
+    "colmap": "photographs with the cameras of COLMAP's model",
+}
+
+
+def config_for(folder: Path, overrides: Iterable[str] = ()) -> tuple[FitConfig, str]:
+    """A configuration for the dataset in ``folder``, and why it is that one, as text.
+
+    overrides: as for :func:`drgs.config.load.load_config`; what they give is not chosen.
+
+    Raises :class:`UserError` for a folder that is no dataset, with what to do.
+    """
+    overrides, where = list(overrides), str(folder)
+    given = config_from({"data": {"path": folder}}, where, overrides)
+    layout = layout_name(given.data)
+    width, height = image_size(layout_of(given.data).first_picture(given.data))
+    factor = math.ceil(math.sqrt(width * height / MAX_PIXELS))
+    data = {"path": folder, "type": layout, "image_size": max(1, round(width / factor))}
+    values = {"data": data, "iterations": ITERATIONS[layout]}
+    config = config_from(values, where, overrides)
+    size = "as they are"
+    if config.data.image_size < width:
+        size = f"scaled from {width} x {height} px to a width of {config.data.image_size}"
+    return config, (
+        f"no configuration is given, so that it follows from the folder: {NAMES[layout]}, {size}; "
+        f"{config.iterations:,} iterations (--set changes any value, --budget 10m sets the time)"
+    )

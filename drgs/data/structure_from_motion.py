@@ -1,0 +1,377 @@
+"""Where photographs were taken: structure from motion, by COLMAP.
+
+COLMAP (Schoenberger and Frahm 2016) finds features in each photograph, matches them between pairs
+of photographs, and puts together cameras and points from there. It runs within this process
+through pycolmap, which is imported when it is called.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import tempfile
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+from PIL import ExifTags, Image
+
+from drgs.core.errors import UserError, one_line
+from drgs.core.extras import imported
+from drgs.core.files import why_refused
+from drgs.data.recognition import PICTURES
+from drgs.io.pictures import image_size
+
+CAMERA_MODELS = (
+    "SIMPLE_PINHOLE",
+    "PINHOLE",
+    "SIMPLE_RADIAL",
+    "RADIAL",
+    "OPENCV",
+    "FULL_OPENCV",
+    "SIMPLE_RADIAL_FISHEYE",
+    "RADIAL_FISHEYE",
+    "OPENCV_FISHEYE",
+)
+"""Those that can be looked for; the fits' lenses show all of them."""
+
+ALL_PAIRS = 100
+"""Photographs, at most, of which every two are compared where nothing is said."""
+
+NEIGHBOURS, STRIDE = 10, 8
+"""Of more: each with so many that follow it by name and those at distances of powers of two, and
+every so many-th with each other."""
+
+AT_ONCE = 8
+"""Photographs whose features are looked for in a call of COLMAP; it uses all cores within one."""
+
+PAIRS_AT_ONCE = 64
+
+MAX_SIDE = 3200
+"""px: features are looked for in photographs scaled down to this, which is COLMAP's default."""
+
+LEAST_PLACED = 3
+"""Photographs with which there is a model at all."""
+
+POLL_SECONDS = 0.1
+"""How soon Ctrl-C is noticed."""
+
+SEED = 0
+
+Watch = Callable[[str, int, int], None]
+"""Is called with what is counted, how many are done, and of how many."""
+
+
+@dataclass(frozen=True)
+class Search:
+    """How cameras are looked for."""
+
+    camera_model: str = "OPENCV"  # of CAMERA_MODELS
+    compare: str = "auto"  # pairs: all, neighbours by name, or auto: by ALL_PAIRS
+    share: str = "alike"  # a camera for all of the same size and EXIF (alike), for one, for each
+
+
+@dataclass(frozen=True)
+class Placed:
+    """What was found."""
+
+    names: tuple[str, ...]  # of the photographs that have a camera
+    missing: tuple[str, ...]  # of the others
+    cameras: tuple[str, ...]  # their models and numbers, as text
+    num_points: int
+    error: float  # px: mean distance of points from where they were observed
+    num_models: int  # that do not hang together; the largest is this
+
+
+def pictures_in(folder: Path) -> tuple[Path, list[str]]:
+    """The folder of photographs, ``folder/images`` or ``folder`` itself, and their names there.
+
+    Raises :class:`UserError` where there are none, or one that cannot be read.
+    """
+    below = folder / "images"
+    pictures = below if below.is_dir() else folder
+    try:
+        if pictures == below:
+            found = [Path(root, name) for root, _, names in os.walk(below) for name in names]
+        else:
+            found = [pictures / name for name in os.listdir(pictures)]
+    except OSError as error:
+        raise UserError(f"{folder}: cannot open the folder: {error.strerror or error}") from None
+    files = [path for path in found if path.suffix.lower() in PICTURES and path.is_file()]
+    files.sort(key=_as_counted)
+    if not files:
+        raise UserError(
+            f"{folder}: must hold photographs, or have them in a folder images, got none"
+        )
+    for file in files:
+        image_size(file)  # what cannot be opened is refused before hours of work
+    return pictures, [file.relative_to(pictures).as_posix() for file in files]
+
+
+def _as_counted(file: Path) -> list[tuple[int, str]]:
+    """An order in which ``frame 10`` follows ``frame 9``."""
+    parts = re.split(r"([0-9]+)", str(file))
+    return [(int(part[:18]), part) if part.isdecimal() else (0, part) for part in parts]
+
+
+def place(folder: Path, search: Search, replace: bool, watch: Watch) -> Placed:
+    """Write ``folder/sparse/0``, COLMAP's model of the photographs in ``folder``.
+
+    replace: the model that is there. Nothing is written where none is found.
+
+    Raises :class:`UserError`, with what to do, where no cameras are found, or where a model is
+    there that is not to be replaced.
+    """
+    pycolmap = imported("pycolmap", "colmap", "structure from motion")
+    pictures, names = pictures_in(folder)
+    model = folder / "sparse" / "0"
+    if model.exists() and not replace:
+        raise UserError(
+            f"{model}: is there already; drgs fit {folder} uses it, --overwrite replaces it"
+        )
+    pycolmap.logging.minloglevel = 3  # what goes wrong is said below
+    try:
+        with tempfile.TemporaryDirectory(prefix=".poses-", dir=folder) as temporary:
+            work = _Work(pycolmap, Path(temporary), pictures, names, search, watch)
+            found, count = work.model()
+            written = Path(temporary, "model")
+            written.mkdir()
+            found.write_binary(written)
+            _put(written, model, Path(temporary))
+    except OSError as error:
+        raise UserError(f"{model}: cannot write the model: {why_refused(error)}") from None
+    return _described(found, names, count)
+
+
+def _put(written: Path, model: Path, temporary: Path) -> None:
+    """Move a folder to its place; what is there is removed with ``temporary``."""
+    model.parent.mkdir(exist_ok=True)
+    if model.exists():
+        model.rename(temporary / "former")
+    written.rename(model)
+
+
+@dataclass
+class _Work:
+    pycolmap: ModuleType
+    folder: Path  # for what is written on the way
+    pictures: Path
+    names: Sequence[str]
+    search: Search
+    watch: Watch
+
+    def model(self) -> tuple[Any, int]:
+        """The largest reconstruction, and of how many."""
+        if len(self.names) < LEAST_PLACED:
+            raise UserError(
+                f"{self.pictures}: at least {LEAST_PLACED} photographs, got {len(self.names)}; "
+                "take 30 or more, each showing most of what its neighbours show"
+            )
+        self._extract()
+        self._match()
+        models = self._reconstruct()
+        if not models or max(m.num_reg_images() for m in models) < LEAST_PLACED:
+            raise UserError(f"{self.pictures}: {self._why_none()}")
+        return max(models, key=lambda m: (m.num_reg_images(), m.num_points3D())), len(models)
+
+    @property
+    def database(self) -> Path:
+        return self.folder / "database.db"
+
+    def _extract(self) -> None:
+        """Features of all photographs, and which of them share a camera."""
+        pycolmap, done = self.pycolmap, 0
+        options = pycolmap.FeatureExtractionOptions()
+        options.max_image_size = MAX_SIDE
+        for group in self._groups():
+            reader = pycolmap.ImageReaderOptions()
+            reader.camera_model = self.search.camera_model
+            if (
+                masks := self.pictures.parent / "masks"
+            ).is_dir() and self.pictures.name == "images":
+                reader.mask_path = masks
+            for start in range(0, len(group), AT_ONCE):
+                chunk = group[start : start + AT_ONCE]
+                self.watch("photograph", done, len(self.names))
+                _until_done(
+                    pycolmap,
+                    pycolmap.extract_features,
+                    self.database,
+                    self.pictures,
+                    image_names=chunk,
+                    camera_mode=pycolmap.CameraMode.SINGLE,
+                    reader_options=reader,
+                    extraction_options=options,
+                )
+                reader.existing_camera_id = self._last_camera()
+                done += len(chunk)
+        self.watch("photograph", done, len(self.names))
+
+    def _groups(self) -> list[list[str]]:
+        """Names of photographs that share a camera."""
+        groups: dict[object, list[str]] = {}
+        for name in self.names:
+            key = {"one": 0, "each": name}.get(self.search.share)
+            key = _taken_with(self.pictures / name) if key is None else key
+            groups.setdefault(key, []).append(name)
+        return list(groups.values())
+
+    def _last_camera(self) -> int:
+        with self.pycolmap.Database.open(self.database) as database:
+            return max(camera.camera_id for camera in database.read_all_cameras())
+
+    def _match(self) -> None:
+        """Compare pairs, some at a time.
+
+        COLMAP's lists of pairs have spaces between names, which may hold some themselves: for as
+        long as they are compared, photographs are called by their numbers.
+        """
+        pycolmap, pairs = self.pycolmap, list(self._pairs())
+        listing = self.folder / "pairs.txt"
+        options = pycolmap.ImportedPairingOptions()
+        options.match_list_path = listing
+        self._rename(str)
+        for start in range(0, len(pairs), PAIRS_AT_ONCE):
+            chunk = pairs[start : start + PAIRS_AT_ONCE]
+            self.watch("pair of photographs", start, len(pairs))
+            listing.write_text("".join(f"{a} {b}\n" for a, b in chunk))
+            _until_done(
+                pycolmap, pycolmap.match_image_pairs, self.database, pairing_options=options
+            )
+        self.watch("pair of photographs", len(pairs), len(pairs))
+        self._rename(lambda index: self.names[index])
+
+    def _rename(self, name_of: Callable[[int], str]) -> None:
+        """Call photographs in the database by what ``name_of`` makes of their places in names."""
+        with self.pycolmap.Database.open(self.database) as database:
+            images = {image.name: image for image in database.read_all_images()}
+            for index, name in enumerate(self.names):
+                image = images[name] if name in images else images[str(index)]
+                image.name = name_of(index)
+                database.update_image(image)
+
+    def _pairs(self) -> Iterator[tuple[int, int]]:
+        count = len(self.names)
+        compares_all = {"all": True, "neighbours": False}.get(
+            self.search.compare, count <= ALL_PAIRS
+        )
+        steps = {*range(1, NEIGHBOURS + 1), *(2**k for k in range(count.bit_length()))}
+        for i, j in combinations(range(count), 2):
+            if compares_all or j - i in steps or (i % STRIDE == 0 and j % STRIDE == 0):
+                yield i, j
+
+    def _reconstruct(self) -> list[Any]:
+        options = self.pycolmap.IncrementalPipelineOptions()
+        options.random_seed = SEED
+        placed = 0
+
+        def begin() -> None:
+            nonlocal placed
+            placed = 2
+            self.watch("camera", placed, len(self.names))
+
+        def count() -> None:
+            nonlocal placed
+            placed = min(placed + 1, len(self.names))
+            self.watch("camera", placed, len(self.names))
+
+        found = _until_done(
+            self.pycolmap,
+            self.pycolmap.incremental_mapping,
+            self.database,
+            self.pictures,
+            self.folder / "models",
+            options=options,
+            initial_image_pair_callback=begin,
+            next_image_callback=count,
+        )
+        return list(found.values())
+
+    def _why_none(self) -> str:
+        with self.pycolmap.Database.open(self.database) as database:
+            features = [
+                database.num_keypoints_for_image(image.image_id)
+                for image in database.read_all_images()
+            ]
+            verified = database.num_verified_image_pairs()
+        few = sum(number < FEW_FEATURES for number in features)
+        found = (
+            f"{few} of {len(features)} photographs have hardly any features (blurred, dark, or of "
+            "something plain)"
+            if few > len(features) / 2
+            else f"only {verified} pairs of photographs show the same, as far as one can tell"
+        )
+        return (
+            f"no cameras were found: {found}; take more photographs, each showing most of what "
+            "its neighbours show, while walking around (not turning on the spot), or try --compare "
+            "all, --share one or --camera-model SIMPLE_RADIAL"
+        )
+
+
+FEW_FEATURES = 100
+
+
+def _until_done(pycolmap: ModuleType, step: Callable, *args: object, **options: object) -> Any:
+    """``step(*args, **options)``, which Ctrl-C ends.
+
+    COLMAP gives no room to Python's handlers of signals: it runs in a thread beside them.
+    """
+    token = pycolmap.CancellationToken()
+    result: list[Any] = []
+    errors: list[Exception] = []
+
+    def work() -> None:
+        try:
+            result.append(step(*args, cancellation_token=token, **options))
+        except Exception as error:
+            errors.append(error)
+
+    thread = threading.Thread(target=work)
+    try:
+        thread.start()
+        while thread.is_alive():
+            thread.join(POLL_SECONDS)
+    except BaseException:
+        token.cancel()
+        if thread.ident is not None:
+            thread.join()
+        raise
+    if errors:
+        raise UserError(f"structure from motion failed: COLMAP says: {one_line(errors[0], 500)}")
+    return result[0]
+
+
+def _taken_with(file: Path) -> tuple[object, ...]:
+    """The same for photographs of the same size and, as far as EXIF says, the same lens."""
+    size = image_size(file)
+    tags = ExifTags.Base
+    try:
+        with Image.open(file) as image:
+            exif = image.getexif()
+            details = exif.get_ifd(ExifTags.IFD.Exif)
+            told = (exif.get(tags.Make), exif.get(tags.Model), details.get(tags.FocalLength))
+    except Exception:  # Pillow raises many types for broken EXIF, which says nothing
+        told = ()
+    return *size, *map(str, told)
+
+
+def _described(found: Any, names: Sequence[str], num_models: int) -> Placed:
+    placed = {image.name for image in found.images.values() if image.has_pose}
+    cameras = tuple(
+        f"{camera.model.name} {camera.width} x {camera.height} px "
+        f"({camera.params_info.replace(' ', '')}: "
+        f"{', '.join(f'{value:.5g}' for value in camera.params)})"
+        for _, camera in sorted(found.cameras.items())
+    )
+    return Placed(
+        names=tuple(name for name in names if name in placed),
+        missing=tuple(name for name in names if name not in placed),
+        cameras=cameras,
+        num_points=found.num_points3D(),
+        error=found.compute_mean_reprojection_error(),
+        num_models=num_models,
+    )

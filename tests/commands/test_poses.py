@@ -1,0 +1,63 @@
+"""``drgs poses``: what it says."""
+
+import pytest
+
+from drgs import poses
+from drgs.data.structure_from_motion import Placed, Search
+
+FOUND = Placed(("a.jpg", "b.jpg"), (), ("OPENCV 64 x 48 px (f: 50)",), 1234, 0.456, 1)
+
+
+@pytest.fixture
+def run(tmp_path, monkeypatch, capsys):
+    """Runs the command with a search that finds ``found``: what it was asked for, and its lines."""
+
+    def command(found, *options):
+        asked = []
+
+        def place(folder, search, replace, watch):
+            for done in (0, 1, 2, 1, 2):  # of two models
+                watch("camera", done, 2)
+            asked.append((folder, search, replace))
+            return found
+
+        monkeypatch.setattr(poses, "place", place)
+        poses.main([str(tmp_path), *options])
+        return asked[0], capsys.readouterr().out.splitlines()
+
+    return command
+
+
+def test_what_was_found_is_said(run, tmp_path):
+    asked, lines = run(FOUND)
+    assert asked == (tmp_path, Search(), False)
+    *progress, found, camera, written, following = lines
+    assert progress == ["camera 2/2  left 0:00"]
+    assert found == "2 of 2 photographs placed, mean reprojection error 0.46 px, 1,234 points"
+    assert camera == "camera: OPENCV 64 x 48 px (f: 50)"
+    assert written.startswith(f"written: {tmp_path}/sparse/0 in ")
+    assert following == f"continue with: drgs fit {tmp_path}"
+
+
+def test_photographs_without_a_camera_are_named(run):
+    missing = tuple(f"{k}.jpg" for k in range(7))
+    found = Placed(("a.jpg",), missing, ("x", "y"), 9, 1.0, 3)
+    _, lines = run(found)
+    text = "\n".join(lines)
+    assert "1 of 8 photographs placed" in text and "camera: x\ncamera: y" in text
+    assert "without a camera: 0.jpg, 1.jpg, 2.jpg, 3.jpg, 4.jpg and 2 more" in text
+    assert "there are 2 smaller models that this one does not hang together with" in text
+    assert "--compare all" in text
+
+
+def test_options_say_how_to_search(run):
+    options = ["--camera-model", "RADIAL", "--share", "one", "--compare", "neighbours"]
+    asked, _ = run(FOUND, *options, "--overwrite")
+    assert asked[1:] == (Search("RADIAL", "neighbours", "one"), True)
+
+
+def test_a_wrong_option_is_refused(run, capsys):
+    with pytest.raises(SystemExit) as end:
+        run(FOUND, "--camera-model", "FOV")
+    assert end.value.code == 2
+    assert "invalid choice: 'FOV'" in capsys.readouterr().err

@@ -1,0 +1,182 @@
+"""Structure from motion: cameras as pictures were taken with, or why there are none."""
+
+import _thread
+import sys
+import threading
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from PIL import Image
+from scipy.spatial.transform import Rotation
+from support.corner import FOCAL, SIZE, write_photographs
+from support.datasets import load
+
+from drgs.core.errors import UserError
+from drgs.data import structure_from_motion as sfm
+from drgs.data.structure_from_motion import Search, pictures_in, place
+
+NAMES = [f"corner {k}.png" for k in range(7, 14)]  # 10 follows 9, and has a space
+
+
+def said(*_):
+    """Watches, and says nothing."""
+
+
+@pytest.fixture(scope="module")
+def placed(tmp_path_factory):
+    """A folder, what was found in it, the poses, and what was watched."""
+    pytest.importorskip("pycolmap")
+    folder = tmp_path_factory.mktemp("corner")
+    poses = write_photographs(folder, NAMES)
+    watched = []
+    found = place(folder, Search(camera_model="PINHOLE"), False, lambda *step: watched.append(step))
+    return folder, found, poses, watched
+
+
+def test_cameras_are_those_that_pictures_were_taken_with(placed):
+    """Up to a similarity. Features are found to a tenth of a pixel: an angle of 3e-4."""
+    folder, found, poses, _ = placed
+    assert found.names == tuple(NAMES) and found.missing == ()
+    assert 0 < found.error < 0.5 and found.num_points > 500
+    dataset = load(folder)
+    views = {view.name: view for view in (*dataset.train, *dataset.test)}
+    views = [views[name.removesuffix(".png")] for name in NAMES]
+    for view in views:
+        assert (view.width, view.height) == SIZE
+        assert [view.fx, view.fy] == pytest.approx([FOCAL, FOCAL], rel=0.01)
+    true = np.array([pose[:3, 3] for pose in poses])
+    centers = np.array([view.camera_to_world[:3, 3] for view in views])
+    true_rotations = [pose[:3, :3] @ np.diag([1, -1, -1]) for pose in poses]
+    turns = [a @ v.camera_to_world[:3, :3].T for a, v in zip(true_rotations, views, strict=True)]
+    turn = Rotation.from_matrix(turns).mean()
+    angles = (Rotation.from_matrix(turns) * turn.inv()).magnitude()
+    assert angles.max() < 2e-3
+    around = turn.apply(centers - centers.mean(axis=0))
+    true = true - true.mean(axis=0)
+    scale = np.sum(around * true) / np.sum(around**2)
+    assert np.abs(scale * around - true).max() < 0.005 * np.linalg.norm(true, axis=1).max()
+
+
+def test_steps_are_watched(placed):
+    _, _, _, watched = placed
+    for what, total in (("photograph", 7), ("pair of photographs", 21), ("camera", 7)):
+        steps = [step for step in watched if step[0] == what]
+        assert steps[-1] == (what, total, total)
+
+
+def test_nothing_but_the_model_is_left_behind(placed):
+    folder, _, _, _ = placed
+    assert {path.name for path in folder.iterdir()} == {*NAMES, "sparse"}
+
+
+def test_a_model_is_replaced_only_when_that_is_asked_for(placed, monkeypatch):
+    folder, _, _, _ = placed
+    model = folder / "sparse" / "0"
+    before = (model / "images.bin").read_bytes()
+    with pytest.raises(UserError, match=r"sparse/0: is there already; .*--overwrite replaces it"):
+        place(folder, Search(), False, said)
+    assert (model / "images.bin").read_bytes() == before
+
+    class Found:
+        def write_binary(self, path):
+            (path / "images.bin").write_bytes(b"new")
+
+    monkeypatch.setattr(sfm._Work, "model", lambda self: (Found(), 1))
+    monkeypatch.setattr(sfm, "_described", lambda *_: None)
+    place(folder, Search(), True, said)
+    try:
+        assert [path.name for path in model.iterdir()] == ["images.bin"]
+        assert (model / "images.bin").read_bytes() == b"new"
+    finally:
+        (model / "images.bin").write_bytes(before)
+
+
+def test_pictures_of_nothing_have_no_cameras_and_leave_nothing_behind(tmp_path):
+    pytest.importorskip("pycolmap")
+    for k in range(3):
+        Image.new("RGB", (64, 48), (40 * k, 20, 90)).save(tmp_path / f"{k}.png")
+    with pytest.raises(
+        UserError, match="no cameras were found: 3 of 3 photographs have hardly any"
+    ):
+        place(tmp_path, Search(), False, said)
+    assert {path.name for path in tmp_path.iterdir()} == {"0.png", "1.png", "2.png"}
+
+
+def test_without_pycolmap_one_line_says_what_to_install(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "pycolmap", None)
+    with pytest.raises(UserError, match=r"needs pycolmap, which .*: pip install pycolmap") as error:
+        place(tmp_path, Search(), False, said)
+    assert "\n" not in str(error.value)
+
+
+def test_ctrl_c_ends_a_step_that_runs_in_cpp(monkeypatch):
+    class Token(threading.Event):
+        cancel = threading.Event.set
+
+    ended = []
+
+    def step(cancellation_token):
+        _thread.interrupt_main()
+        ended.append(cancellation_token.wait(60))
+
+    with pytest.raises(KeyboardInterrupt):
+        sfm._until_done(SimpleNamespace(CancellationToken=Token), step)
+    assert ended == [True]
+
+
+def test_what_colmap_refuses_is_said_in_one_line():
+    def step(cancellation_token):
+        raise RuntimeError("[reader.cc:1]\nno such image")
+
+    with pytest.raises(UserError, match=r"COLMAP says: \[reader.cc:1\] no such image$"):
+        sfm._until_done(SimpleNamespace(CancellationToken=threading.Event), step)
+
+
+# ----------------------------------------------------------------------------------------------
+# What is compared, and what shares a camera
+# ----------------------------------------------------------------------------------------------
+
+
+def work(folder, names, **search):
+    return sfm._Work(None, folder, folder, names, Search(**search), said)
+
+
+def test_names_are_in_the_order_of_their_numbers(tmp_path):
+    for name in ("2.png", "10.png", "1.JPG", "b/3.png", "notes.txt"):
+        (tmp_path / "images" / name).parent.mkdir(parents=True, exist_ok=True)
+        Image.new("RGB", (8, 8)).save(tmp_path / "images" / name, format="PNG")
+    pictures, names = pictures_in(tmp_path)
+    assert pictures == tmp_path / "images" and names == ["1.JPG", "2.png", "10.png", "b/3.png"]
+    (tmp_path / "images" / "10.png").write_bytes(b"not a picture")
+    with pytest.raises(UserError, match=r"10\.png: cannot read the image"):
+        pictures_in(tmp_path)
+
+
+def test_photographs_of_one_size_and_lens_share_a_camera(tmp_path):
+    def write(name, size, focal=None):
+        exif = Image.Exif()
+        if focal is not None:
+            exif.get_ifd(0x8769)[0x920A] = focal
+        Image.new("RGB", size).save(tmp_path / name, exif=exif)
+
+    write("a.jpg", (64, 48), 35.0)
+    write("b.jpg", (64, 48), 35.0)
+    write("c.jpg", (64, 48), 70.0)
+    write("d.jpg", (48, 64), 35.0)
+    names = ["a.jpg", "b.jpg", "c.jpg", "d.jpg"]
+    assert work(tmp_path, names)._groups() == [["a.jpg", "b.jpg"], ["c.jpg"], ["d.jpg"]]
+    assert work(tmp_path, names, share="one")._groups() == [names]
+    assert work(tmp_path, names, share="each")._groups() == [[name] for name in names]
+
+
+def test_few_photographs_are_compared_with_all_and_many_with_some(tmp_path):
+    few, many = sfm.ALL_PAIRS, sfm.ALL_PAIRS + 1
+    assert len(list(work(tmp_path, range(few))._pairs())) == few * (few - 1) // 2
+    pairs = set(work(tmp_path, range(many))._pairs())
+    assert pairs == set(work(tmp_path, range(few + 1), compare="neighbours")._pairs())
+    assert len(set(work(tmp_path, range(many), compare="all")._pairs())) == many * (many - 1) // 2
+    for i in range(many):
+        for j in range(i + 1, many):
+            expected = j - i <= 10 or j - i in (16, 32, 64) or i % 8 == j % 8 == 0
+            assert ((i, j) in pairs) == expected
