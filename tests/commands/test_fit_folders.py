@@ -341,3 +341,20 @@ def test_the_test_views_of_a_project_that_was_moved_are_rendered(ended, tmp_path
     message = "there is no folder /"
     arguments = (moved / "out", "--out", tmp_path / "b")
     assert_refused(render.main, *arguments, folder=tmp_path, message=message)
+
+
+def test_a_folder_needs_no_configuration(tmp_path):
+    write_project(tmp_path)
+    folder, few = tmp_path / "data", ["--set", "iterations=2", "--set", "output.report=false"]
+    few += ["--set", "output.save_renders=false", "--out", tmp_path / "out"]
+    outcome = run_fit(folder, *few)
+    assert outcome.returncode == 0, outcome.stderr
+    first = outcome.stdout.splitlines()[0]
+    assert first.startswith(
+        "no configuration is given, so that it follows from the folder: cut-out"
+    )
+    assert "2 iterations" in first
+    used = load_config(tmp_path / "out" / "config.yml")
+    assert used.data.path == folder and used.data.type == "nerf_synthetic"
+    twice = [folder, "--data", folder, "--out", tmp_path / "b"]
+    assert_fit_refused(*twice, folder=tmp_path, message=f"--data: {folder} is a folder already")
