@@ -17,6 +17,7 @@ COMMANDS = {
     "volprim": "what sets Mitsuba's volprim_rf_basic apart, by how much it changes the picture",
     "stability": "error of float32 against float64 as scenes become harder",
     "population": "how many Gaussians the reference recipe keeps, by picture size and rule; hours",
+    "photographs": "fits with cameras as they are, undistorted, found again; an hour",
     "recipes": "what each part of the recipe is worth: alone, and taken out of the whole; hours",
 }
 """By name, what each measures; a command is the module of its name."""

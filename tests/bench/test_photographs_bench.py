@@ -1,0 +1,89 @@
+"""Fits of photographs with their cameras treated in turn: what each sees, and what is written."""
+
+import csv
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support.colmap_models import write_binary, write_dataset, write_pictures
+from support.corner import write_photographs
+from support.datasets import load
+
+from drgs.bench import __main__ as bench
+from drgs.bench import photographs
+from drgs.data.folders import config_for
+
+
+@pytest.fixture
+def fits(monkeypatch):
+    """The command lines of fits, which end at once."""
+    lines = []
+
+    def fit(arguments):
+        lines.append(arguments)
+        out = Path(arguments[arguments.index("--out") + 1])
+        out.mkdir(parents=True)
+        metrics = {"test": {"psnr": 30.5, "ssim": 0.9}, "num_gaussians": 1234}
+        (out / "metrics.json").write_text(json.dumps({**metrics, "iterations": 7000, "wall_s": 61}))
+        return 1_500_000_000
+
+    monkeypatch.setattr(photographs, "fit_in_own_process", fit)
+    return lines
+
+
+def test_each_case_is_fitted_once_and_becomes_a_row(tmp_path, fits, capsys):
+    data, out = tmp_path / "data", tmp_path / "out"
+    write_dataset(data, ["OPENCV"])
+    for _ in range(2):
+        bench.main(["photographs", str(data), "--out", str(out), "--only", "1", "2", "4"])
+    assert [line[0] for line in fits] == [str(data)] * 3
+    size = ["--set", "data.image_size=640"]
+    assert [line[3:] for line in fits] == [
+        size,
+        [*size, "--set", "data.ignore_distortion=true"],
+        [*size, "--set", "init.start=random"],
+    ]
+    assert "| as they are | 30.50 dB | 0.9000 | 1,234 | 61 s | 1.50 GB |" in capsys.readouterr().out
+    with (out / "photographs" / "photographs.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [row["case"] for row in rows] == [
+        "as they are", "distortion ignored", "from random points",
+    ]  # fmt: skip
+
+
+def test_without_a_model_of_colmap_nothing_is_undistorted(photographs, fits, tmp_path, capsys):
+    bench.main(["photographs", str(photographs), "--out", str(tmp_path / "out"), "--only", "3"])
+    assert fits == [] and "undistorted beforehand: left out" in capsys.readouterr().out
+
+
+def test_photographs_are_undistorted_at_their_own_size(tmp_path):
+    """Of pictures half as large as COLMAP saw them: as large again, but for a border."""
+    pytest.importorskip("pycolmap")
+    model = write_dataset(tmp_path, ["SIMPLE_RADIAL"])
+    model.points = []
+    write_binary(tmp_path / "sparse" / "0", model)
+    write_pictures(tmp_path / "images", size=(320, 240))
+    config, _ = config_for(tmp_path)
+    (tmp_path / "out").mkdir()
+    dataset = load(photographs.undistorted(config, tmp_path / "out"))
+    assert len(dataset.train) + len(dataset.test) == 4
+    for view in dataset.train:
+        assert view.lens is None and view.fx == pytest.approx(300)
+        assert 300 <= view.width <= 330 and 225 <= view.height <= 250
+
+
+def test_cameras_are_thrown_away_and_found_again(tmp_path):
+    pytest.importorskip("pycolmap")
+    data, out = tmp_path / "data", tmp_path / "out"
+    names = [f"{k}.png" for k in range(6)]
+    poses = write_photographs(data, names)
+    frames = [
+        {"file_path": name, "transform_matrix": (pose @ np.diag([1, 1, 1, 1])).tolist()}
+        for name, pose in zip(names, poses, strict=True)
+    ]
+    (data / "transforms.json").write_text(json.dumps({"fl_x": 300, "frames": frames}))
+    config, _ = config_for(data)
+    found = load(photographs.placed_again(config, out))
+    assert len(found.train) + len(found.test) == 6
+    assert found.train[0].lens is not None  # not known before
