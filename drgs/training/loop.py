@@ -12,6 +12,7 @@ import mitsuba as mi
 from drgs.config.load import config_from, load_config
 from drgs.config.schema import FitConfig
 from drgs.data import Dataset, initial_gaussians, load_dataset
+from drgs.data.folders import config_for
 from drgs.gaussians.parameters import Gaussians
 from drgs.integrator.scene import check_lenses
 from drgs.training.budget import AllIterations
@@ -89,7 +90,8 @@ def train(
 ) -> FitResult:
     """Fit Gaussians to photographs, in memory: the bytes that ``drgs fit`` writes to its PLY file.
 
-    config: what to fit, and how: the path of a YAML file, the same as nested mappings, or a
+    config: what to fit, and how: the path of a YAML file, or of the folder of a dataset, to have
+    that chosen (``drgs.data.folders``); the same as nested mappings, or a
     :class:`drgs.config.schema.FitConfig`; dataset: the photographs, whose background is that of
     the splats, by default those of the configuration's section ``data``; callback: called after
     each iteration with what it did, a :class:`drgs.training.trainer.StepReport`; the fit ends early
@@ -101,7 +103,8 @@ def train(
     remedy, and ``drgs.training.finite_checks.NonFiniteError`` if a number is not finite.
     """
     if isinstance(config, (str, Path)):
-        config = load_config(config)
+        is_folder = Path(config).is_dir()
+        config = config_for(Path(config))[0] if is_folder else load_config(config)
     elif not isinstance(config, FitConfig):
         config = config_from(config, "train(): config")
     if mi.variant() is None:

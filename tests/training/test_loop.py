@@ -60,6 +60,14 @@ def test_a_callback_sees_each_iteration_and_may_end_the_fit(folder):
     assert result.trainer.iteration == 5
 
 
+def test_a_folder_is_fitted_as_the_command_does(folder):
+    few = ["--set", "iterations=2", "--set", "output.save_renders=false"]
+    fit.main(["data", *few, "--out", "out"])
+    config = load_config("out/config.yml")
+    given = drgs.train("data", callback=lambda report: True).trainer.config
+    assert given.data == config.data and given.iterations == 4500
+
+
 def test_pictures_of_what_was_fitted(folder):
     result = drgs.train(CONFIG)
     (view,) = drgs.load_dataset("data").test
