@@ -34,8 +34,9 @@ class ThinPrismFisheye(PlaneDistortion, Fisheye):
         u' = L u + 2 p1 u v + p2 (r^2 + 2 u^2) + sx1 r^2
         v' = L v + p1 (r^2 + 2 v^2) + 2 p2 u v + sy1 r^2
 
-    (COLMAP's model THIN_PRISM_FISHEYE; thin prisms: Weng, Cohen and Herniou 1992). What else is
-    seen, and what depth is: as with :class:`drgs.cameras.fisheye.Fisheye`.
+    (COLMAP's model THIN_PRISM_FISHEYE, in its ``sensor/models.h``; thin prisms: Weng, Cohen and
+    Herniou 1992). What is seen, and what depth is: as with :class:`drgs.cameras.fisheye.Fisheye`;
+    COLMAP itself shows nothing beside and behind the camera.
     """
 
     label: ClassVar[str] = "ThinPrismFisheye"
