@@ -32,9 +32,9 @@ from drgs.integrator.sensors import (
     read_sensor,
 )
 
-LENSES = ("pinhole", "opencv", "fisheye")
+LENSES = ("pinhole", "opencv", "fisheye", "thin_prism_fisheye")
 SHUTTERS = ("global", "rolling")
-ALL_COEFFICIENTS = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
+ALL_COEFFICIENTS = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2", "sx1", "sy1")
 KNOWN = (
     *("to_world", "to_world_close", "fx", "fy", "cx", "cy", "lens", *ALL_COEFFICIENTS),
     *("near_clip", "far_clip", "shutter", "shutter_open", "shutter_close", "shutter_samples"),
@@ -72,17 +72,20 @@ class CalibratedSensor(mi.Sensor):
      * - lens
        - |string|
        - ``pinhole``; ``opencv``, radial and tangential distortion; ``fisheye``, by the angle from
-         the axis (Kannala and Brandt 2006). (Default: ``pinhole``)
+         the axis (Kannala and Brandt 2006); ``thin_prism_fisheye``, one with tangential and thin
+         prism terms (COLMAP's THIN_PRISM_FISHEYE). (Default: ``pinhole``)
 
-     * - k1, k2, k3, k4, k5, k6, p1, p2
+     * - k1, k2, k3, k4, k5, k6, p1, p2, sx1, sy1
        - |float|
-       - Coefficients of the lens as OpenCV defines them; ``fisheye`` has ``k1`` to ``k4``. Those
-         that are given, be it as 0, are exposed; what is not given costs nothing. (Default: 0)
+       - Coefficients of the lens as OpenCV and COLMAP define them. ``opencv`` has ``k1`` to ``k6``,
+         ``p1`` and ``p2``; ``fisheye`` has ``k1`` to ``k4``, ``thin_prism_fisheye`` ``p1``, ``p2``,
+         ``sx1`` and ``sy1`` besides. Those that are given, be it as 0, are exposed; what is not
+         given costs nothing. (Default: 0)
        - |exposed|, |differentiable|
 
      * - near_clip, far_clip
        - |float|
-       - Depths (with ``fisheye``: distances) between which something is seen. The ``splats``
+       - Depths (with fisheyes: distances) between which something is seen. The ``splats``
          integrator knows no ``far_clip``: it draws splats at any depth beyond ``near_clip``.
          (Default: 0.01, 10000)
 
@@ -303,6 +306,10 @@ def _lens_type(kind: str) -> type[Lens]:
         from drgs.cameras.fisheye import Fisheye
 
         return Fisheye
+    if kind == "thin_prism_fisheye":
+        from drgs.cameras.thin_prism_fisheye import ThinPrismFisheye
+
+        return ThinPrismFisheye
     return Pinhole
 
 

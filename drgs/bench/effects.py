@@ -106,6 +106,8 @@ def rendering_cases() -> list[Case]:
     moving = calibrated | {"to_world_close": to_world(0.02)}
     fox = {"k1": 0.0578421, "k2": -0.0805099, "p1": -0.000980296, "p2": 0.00015575}
     rational = fox | {"k3": 0.01, "k4": 0.02, "k5": -0.01, "k6": 0.005}
+    fisheye = {"k1": 0.03, "k2": -0.01}
+    prism = fisheye | {"p1": 0.001, "p2": -0.002, "sx1": 0.003, "sy1": -0.001}
     sky = {"type": "envmap", "bitmap": _bitmap()}
     # An orthographic film is 2 units wide: the camera is scaled to what the others see.
     wide = mi.ScalarTransform4f().scale([1.4, 1.4, 1])
@@ -120,7 +122,12 @@ def rendering_cases() -> list[Case]:
         ),
         Case("lens", "distortion: k1 k2 p1 p2", calibrated | {"lens": "opencv", **fox}),
         Case("lens", "distortion: k1 to k6, p1 p2", calibrated | {"lens": "opencv", **rational}),
-        Case("lens", "fisheye: k1 k2", calibrated | {"lens": "fisheye", "k1": 0.03, "k2": -0.01}),
+        Case("lens", "fisheye: k1 k2", calibrated | {"lens": "fisheye", **fisheye}),
+        Case(
+            "lens",
+            "fisheye: k1 k2 p1 p2 sx1 sy1",
+            calibrated | {"lens": "thin_prism_fisheye", **prism},
+        ),
         Case(
             "lens",
             "orthographic",

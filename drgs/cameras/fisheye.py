@@ -7,6 +7,7 @@ Imported when a sensor or a dataset has one. Coefficients and what lies beyond t
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
@@ -93,34 +94,14 @@ class Fisheye(Lens):
 
     def film_point(self, camera: Camera, position: Any) -> Any:
         """Where a point is on the film, Array2f, px."""
-        x, y, _ = position
-        per_radius, _ = self._angle_per_radius(position)
-        scale = per_radius * polynomial(
-            self.coefficients, self._squared_angle(position, per_radius)
-        )
-        return camera.focal * types_of(type(x)).Array2f(scale * x, scale * y) + camera.principal
+        place = types_of(type(position.x)).Array2f(*place_of(position, self.coefficients))
+        return camera.focal * place + camera.principal
 
     def film_directions(self, camera: Camera, position: Any, slopes: None) -> list[Any]:
-        """Derivatives of the place on the film, two Array3f, world.
-
-        With rho^2 = x^2 + y^2, n^2 = rho^2 + z^2, a = theta / rho, b = (d a / d rho) / rho, and
-        theta_d = h theta: the place is A (x, y) with A = h a, (d A / d rho) / rho = B = h b +
-        2 h' a^2 z / n^2, where h' = d h / d theta^2, and d A / d z = -(h + 2 h' theta^2) / n^2.
-        """
+        """Derivatives of the place on the film, two Array3f, world."""
         del slopes
-        x, y, z = position
-        a, b = self._angle_per_radius(position)
-        squared = self._squared_angle(position, a)
-        h, dh = polynomial(self.coefficients, squared), derivative(self.coefficients, squared)
-        inverse = dr.rcp(dr.squared_norm(position))
-        scale, bend = h * a, h * b + 2 * dh * (a * a) * (z * inverse)
-        tilt = (h + 2 * dh * squared) * inverse
-        right, down, forward = camera.rotation
-        change = bend * (x * right + y * down) - tilt * forward
-        return [
-            focal * (scale * axis + c * change)
-            for axis, c, focal in zip((right, down), (x, y), camera.focal, strict=True)
-        ]
+        directions = place_directions(camera, position, self.coefficients)
+        return [f * direction for f, direction in zip(camera.focal, directions, strict=True)]
 
     def depth_direction(self, camera: Camera, position: Any) -> Any:
         """Derivative of the distance divided by the distance, Array3f, world."""
@@ -156,27 +137,54 @@ class Fisheye(Lens):
         h, dh = polynomial(self.coefficients, squared), derivative(self.coefficients, squared)
         return h * angle, h + 2 * dh * squared
 
-    @staticmethod
-    def _angle_per_radius(position: Any) -> tuple[Any, Any]:
-        """a = theta / rho, and b = (z / n^2 - a) / rho^2; near the axis by their series.
 
-        With t = rho / z: z a = 1 - t^2 / 3 + t^4 / 5 ..., z^3 b = -2/3 + 4/5 t^2 - 6/7 t^4 ...
-        """
-        x, y, z = position
-        squared = x * x + y * y
-        on_axis = (z > 0) & (squared < NEAR_AXIS * (z * z))
-        depth = dr.select(on_axis, z, 1)
-        t = dr.select(on_axis, squared, 0) / (depth * depth)
-        terms = range(AXIS_TERMS[is_float64(type(z))])
-        series_a = polynomial([(-1) ** (k + 1) / (2 * k + 3) for k in terms], t) / depth
-        series_b = [(-1) ** (k + 1) * (2 * k + 2) / (2 * k + 3) for k in terms]
-        series_b = horner(series_b, t) / (depth * depth * depth)
-        squared = dr.select(on_axis, 1, squared)
-        radius = dr.sqrt(squared)
-        a = dr.atan2(radius, z) / radius
-        b = (z / (squared + z * z) - a) / squared
-        return dr.select(on_axis, series_a, a), dr.select(on_axis, series_b, b)
+def place_of(position: Any, coefficients: Sequence[Any] = ()) -> tuple[Any, Any]:
+    """Where a point (Array3f, camera axes) is on the film, in focal lengths from the middle."""
+    x, y, _ = position
+    per_radius, _ = _angle_per_radius(position)
+    scale = per_radius * polynomial(coefficients, _squared_angle(position, per_radius))
+    return scale * x, scale * y
 
-    @staticmethod
-    def _squared_angle(position: Any, per_radius: Any) -> Any:
-        return (per_radius * per_radius) * (dr.square(position.x) + dr.square(position.y))
+
+def place_directions(camera: Camera, position: Any, coefficients: Sequence[Any] = ()) -> list[Any]:
+    """Derivatives of that place, two Array3f, world: per scene unit.
+
+    With rho^2 = x^2 + y^2, n^2 = rho^2 + z^2, a = theta / rho, b = (d a / d rho) / rho, and
+    theta_d = h theta: the place is A (x, y) with A = h a, (d A / d rho) / rho = B = h b +
+    2 h' a^2 z / n^2, where h' = d h / d theta^2, and d A / d z = -(h + 2 h' theta^2) / n^2.
+    """
+    x, y, z = position
+    a, b = _angle_per_radius(position)
+    squared = _squared_angle(position, a)
+    h, dh = polynomial(coefficients, squared), derivative(coefficients, squared)
+    inverse = dr.rcp(dr.squared_norm(position))
+    scale, bend = h * a, h * b + 2 * dh * (a * a) * (z * inverse)
+    tilt = (h + 2 * dh * squared) * inverse
+    right, down, forward = camera.rotation
+    change = bend * (x * right + y * down) - tilt * forward
+    return [scale * axis + c * change for axis, c in zip((right, down), (x, y), strict=True)]
+
+
+def _angle_per_radius(position: Any) -> tuple[Any, Any]:
+    """a = theta / rho, and b = (z / n^2 - a) / rho^2; near the axis by their series.
+
+    With t = rho / z: z a = 1 - t^2 / 3 + t^4 / 5 ..., z^3 b = -2/3 + 4/5 t^2 - 6/7 t^4 ...
+    """
+    x, y, z = position
+    squared = x * x + y * y
+    on_axis = (z > 0) & (squared < NEAR_AXIS * (z * z))
+    depth = dr.select(on_axis, z, 1)
+    t = dr.select(on_axis, squared, 0) / (depth * depth)
+    terms = range(AXIS_TERMS[is_float64(type(z))])
+    series_a = polynomial([(-1) ** (k + 1) / (2 * k + 3) for k in terms], t) / depth
+    series_b = [(-1) ** (k + 1) * (2 * k + 2) / (2 * k + 3) for k in terms]
+    series_b = horner(series_b, t) / (depth * depth * depth)
+    squared = dr.select(on_axis, 1, squared)
+    radius = dr.sqrt(squared)
+    a = dr.atan2(radius, z) / radius
+    b = (z / (squared + z * z) - a) / squared
+    return dr.select(on_axis, series_a, a), dr.select(on_axis, series_b, b)
+
+
+def _squared_angle(position: Any, per_radius: Any) -> Any:
+    return (per_radius * per_radius) * (dr.square(position.x) + dr.square(position.y))

@@ -11,27 +11,15 @@ at which the model first turns, in whatever direction, is not seen at all.
 
 from __future__ import annotations
 
-import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import drjit as dr
-import numpy as np
 
 from drgs.cameras.camera import Camera, Perspective, uploaded, with_unseen_on_axis
-from drgs.cameras.polynomials import (
-    UNBOUNDED,
-    derivative,
-    first_root,
-    polynomial,
-    radius_at,
-    up_to_the_last,
-)
+from drgs.cameras.distortion import PlaneDistortion, largest_squared_radius, steepest_fall
+from drgs.cameras.polynomials import UNBOUNDED, derivative, polynomial, up_to_the_last
 from drgs.core.arrays import types_of
-
-TANGENTIAL_STEPS = 5
-"""Of Newton's method, for tangential terms: small beside the radial ones, it starts nearby."""
 
 BORDER = 65
 """Points on each side of the film, whose rays tell what the film sees."""
@@ -41,7 +29,7 @@ MISSED = 1e-6
 
 
 @dataclass(frozen=True)
-class RadialTangential(Perspective):
+class RadialTangential(PlaneDistortion, Perspective):
     """OpenCV's lens: slopes (x, y) are distorted before they come to the film.
 
     With r^2 = x^2 + y^2 and L = (1 + k1 r^2 + k2 r^4 + k3 r^6) / (1 + k4 r^2 + k5 r^4 + k6 r^6),
@@ -75,7 +63,9 @@ class RadialTangential(Perspective):
             numerator=numerator,
             denominator=denominator,
             tangential=(p1, p2) if set(coefficients) & set(names[6:]) else (),
-            max_squared_radius=_largest_squared_radius(numerator, denominator, math.hypot(p1, p2)),
+            max_squared_radius=largest_squared_radius(
+                numerator, denominator, steepest_fall((p1, p2))
+            ),
         )
 
     def upload(self, float_type: type) -> RadialTangential:
@@ -99,75 +89,16 @@ class RadialTangential(Perspective):
             tangential=tuple(values[name] for name in p[: len(self.tangential)]),
         )
 
-    def distort(self, x: Any, y: Any) -> tuple[Any, Any]:
-        """Slopes as the film shows them."""
-        squared = x * x + y * y
-        radial = self._radial(squared)
-        if not self.tangential:
-            return radial * x, radial * y
-        p1, p2 = self.tangential
-        return (
-            radial * x + 2 * p1 * (x * y) + p2 * (squared + 2 * x * x),
-            radial * y + p1 * (squared + 2 * y * y) + 2 * p2 * (x * y),
-        )
+    def radial(self, squared: Any) -> Any:
+        """L at r^2."""
+        return polynomial(self.numerator, squared) / polynomial(self.denominator, squared)
 
-    def distortion_jacobian(self, x: Any, y: Any) -> tuple[Any, Any, Any]:
-        """d x' / d x, d x' / d y = d y' / d x, d y' / d y."""
-        squared = x * x + y * y
-        radial, slope = self._radial(squared), 2 * self._radial_derivative(squared)
-        xx, xy, yy = radial + slope * x * x, slope * (x * y), radial + slope * y * y
-        if not self.tangential:
-            return xx, xy, yy
-        p1, p2 = self.tangential
-        return (
-            xx + 2 * p1 * y + 6 * p2 * x,
-            xy + 2 * p1 * x + 2 * p2 * y,
-            yy + 6 * p1 * y + 2 * p2 * x,
-        )
-
-    def undistort(self, x: Any, y: Any) -> tuple[Any, Any]:
-        """The slopes that :meth:`distort` sends to (x, y).
-
-        Where there are none, the result is finite and means nothing: :meth:`sees_slopes` and a
-        second look tell. The search is not differentiated, but its last step: a step of Newton's
-        method from the solution has the solution's derivative (the implicit function theorem).
-        """
-        with dr.suspend_grad():
-            length = dr.sqrt(x * x + y * y)
-            radius = radius_at(self._radius, length, dr.sqrt(self.max_squared_radius))
-            # In the middle, radius and length are the same.
-            scale = dr.select(length > 0, radius / dr.select(length > 0, length, 1), 1)
-            u, v = scale * x, scale * y
-            if self.tangential:
-                _, u, v = dr.while_loop(
-                    state=(types_of(type(x)).UInt32(0), u, v),
-                    cond=lambda count, u, v: count < TANGENTIAL_STEPS,
-                    body=lambda count, u, v: (count + 1, *self._step(u, v, x, y)),
-                    labels=("count", "u", "v"),
-                )
-        return self._step(u, v, x, y)
-
-    def _radius(self, radius: Any) -> tuple[Any, Any]:
-        """Distance from the middle at which a radius is seen, but for the tangential terms."""
-        squared = radius * radius
-        radial = self._radial(squared)
-        return radial * radius, radial + 2 * squared * self._radial_derivative(squared)
-
-    def _step(self, u: Any, v: Any, x: Any, y: Any) -> tuple[Any, Any]:
-        """One step of Newton's method towards (x, y), unless it would leave the lens model."""
-        at_x, at_y = self.distort(u, v)
-        dx, dy = x - at_x, y - at_y
-        with dr.suspend_grad():
-            xx, xy, yy = self.distortion_jacobian(u, v)
-            per_determinant = 1 / (xx * yy - xy * xy)
-            xx, xy, yy = (value * per_determinant for value in (xx, xy, yy))
-        following = u + (yy * dx - xy * dy), v + (xx * dy - xy * dx)
-        inside = self.sees_slopes(*following)
-        return tuple(dr.select(inside, b, a) for a, b in zip((u, v), following, strict=True))
-
-    def sees_slopes(self, x: Any, y: Any) -> Any:
-        """Whether they are within the part that the model is made for."""
-        return x * x + y * y < self.max_squared_radius
+    def radial_derivative(self, squared: Any) -> Any:
+        """d L / d r^2."""
+        denominator = polynomial(self.denominator, squared)
+        change = derivative(self.numerator, squared)
+        change = change - self.radial(squared) * derivative(self.denominator, squared)
+        return change / denominator
 
     # What kernels call: see ``drgs.cameras.camera``.
 
@@ -185,13 +116,13 @@ class RadialTangential(Perspective):
 
     def film_directions(self, camera: Camera, position: Any, slopes: list[Any]) -> list[Any]:
         """Derivatives of the place on the film, two Array3f, world."""
-        xx, xy, yy = self.distortion_jacobian(*slopes)
+        xx, xy, yx, yy = self.distortion_jacobian(*slopes)
         right, down, forward = camera.rotation
         dx, dy = (
             (axis - slope * forward) / position.z
             for axis, slope in zip((right, down), slopes, strict=True)
         )
-        return [camera.focal.x * (xx * dx + xy * dy), camera.focal.y * (xy * dx + yy * dy)]
+        return [camera.focal.x * (xx * dx + xy * dy), camera.focal.y * (yx * dx + yy * dy)]
 
     def fitted(self, camera: Camera) -> RadialTangential:
         """The lens that knows what the film of ``camera`` sees."""
@@ -207,41 +138,6 @@ class RadialTangential(Perspective):
         t = types_of(type(x))
         film = (t.Array2f(x, y) - camera.principal) / camera.focal
         return t.Array3f(*self.undistort(film.x, film.y), 1)
-
-    def _radial(self, squared: Any) -> Any:
-        return polynomial(self.numerator, squared) / polynomial(self.denominator, squared)
-
-    def _radial_derivative(self, squared: Any) -> Any:
-        """d L / d r^2."""
-        denominator = polynomial(self.denominator, squared)
-        change = derivative(self.numerator, squared)
-        change = change - self._radial(squared) * derivative(self.denominator, squared)
-        return change / denominator
-
-
-def _largest_squared_radius(
-    numerator: Sequence[float], denominator: Sequence[float], tangential: float
-) -> float:
-    """r^2 within which no two slopes are distorted to the same; inf: wherever they are.
-
-    With L = N / D and u = r^2, the radial part's Jacobian has the eigenvalues A = G / D^2, with
-    G = N D + 2 u (N' D - N D'), along the slope, and L across it. With ``tangential``, the length
-    q of (p2, p1), no eigenvalue of the tangential part's is below -6 r q. While A and L are larger
-    than 6 r q, the sum is positive definite (Weyl's inequality), and as it is symmetric, its
-    map one-to-one. The bound is reached where A <= L, on the side of -(p2, p1).
-    """
-    u = np.polynomial.Polynomial([0.0, 1.0])
-    n, d = (np.polynomial.Polynomial([1.0, *c]) for c in (numerator, denominator))
-    growth = n * d + 2 * u * (n.deriv() * d - n * d.deriv())
-    first = min(first_root(growth.coef), first_root(d.coef))
-    if tangential == 0:
-        return first
-    r = u
-    folds = (
-        growth(r**2) - 6 * tangential * r * d(r**2) ** 2,
-        n(r**2) - 6 * tangential * r * d(r**2),
-    )
-    return min(first, *(first_root(fold.coef) ** 2 for fold in folds))
 
 
 def _slopes_on_border(lens: RadialTangential, camera: Camera) -> tuple[Any, Any]:
@@ -259,7 +155,7 @@ def _slopes_on_border(lens: RadialTangential, camera: Camera) -> tuple[Any, Any]
     film = (t.Array2f(x, y) - camera.principal) / camera.focal
     slopes = lens.undistort(film.x, film.y)
     missed = dr.squared_norm(t.Array2f(*lens.distort(*slopes)) - film)
-    bounded = dr.all(lens.sees_slopes(*slopes) & (missed < MISSED))
+    bounded = dr.all(lens.is_within(*slopes) & (missed < MISSED))
     return tuple(
         t.Array2f([dr.select(bounded, _mean_where(s, extreme(s)), other) for s in slopes])
         for extreme, other in ((dr.min, -UNBOUNDED), (dr.max, UNBOUNDED))

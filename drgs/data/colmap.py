@@ -38,6 +38,7 @@ LENSES = {
     "SIMPLE_RADIAL_FISHEYE": "OPENCV_FISHEYE",
     "RADIAL_FISHEYE": "OPENCV_FISHEYE",
     "OPENCV_FISHEYE": "OPENCV_FISHEYE",
+    "THIN_PRISM_FISHEYE": "THIN_PRISM_FISHEYE",
 }
 """Camera models that can be rendered, and what their coefficients are read as."""
 

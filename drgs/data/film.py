@@ -17,6 +17,7 @@ from drgs.data.types import Viewpoint
 if TYPE_CHECKING:
     from drgs.cameras.fisheye import Fisheye
     from drgs.cameras.radial_tangential import RadialTangential
+    from drgs.cameras.thin_prism_fisheye import ThinPrismFisheye
 
 Columns = Sequence[np.ndarray]
 """Of coordinates: x, y, z, each (N,)."""
@@ -58,19 +59,36 @@ def _through_pinhole(_lens: None, x: np.ndarray, y: np.ndarray, z: np.ndarray) -
 
 def _through_opencv(lens: RadialTangential, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> Columns:
     x, y, depth = _through_pinhole(None, x, y, z)
-    seen = (depth > 0) & lens.sees_slopes(x, y)
+    seen = (depth > 0) & lens.is_within(x, y)
     return *lens.distort(np.where(seen, x, 0), np.where(seen, y, 0)), np.where(seen, depth, 0)
 
 
 def _through_fisheye(lens: Fisheye, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> Columns:
+    return _by_angle(lens, lens.coefficients, (x, y, z))
+
+
+def _through_thin_prism_fisheye(
+    lens: ThinPrismFisheye, x: np.ndarray, y: np.ndarray, z: np.ndarray
+) -> Columns:
+    u, v, distance = _by_angle(lens, (), (x, y, z))
+    return *lens.distort(u, v), distance
+
+
+def _by_angle(lens: Fisheye, coefficients: Sequence[float], position: Columns) -> Columns:
+    x, y, z = position
     radius = np.hypot(x, y)
     distance = np.hypot(radius, z)
     angle = np.arctan2(radius, z)
-    distorted = angle * polynomial(lens.coefficients, angle * angle)
+    distorted = angle * polynomial(coefficients, angle * angle)
     scale = distorted / np.where(radius > 0, radius, 1)  # times 0 on the axis
     seen = z > lens.min_cosine * distance
     return *(np.where(seen, scale * c, 0) for c in (x, y)), np.where(seen, distance, 0)
 
 
-_PLACES = {None: _through_pinhole, "opencv": _through_opencv, "fisheye": _through_fisheye}
+_PLACES = {
+    None: _through_pinhole,
+    "opencv": _through_opencv,
+    "fisheye": _through_fisheye,
+    "thin_prism_fisheye": _through_thin_prism_fisheye,
+}
 """By kind of lens: the film's plane at distance 1 where a point is shown, and its depth."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import math
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
@@ -52,12 +52,20 @@ MAX_OFFSET = 100
 SMALLEST_ANGLE, LARGEST_ANGLE = (2 * math.atan(0.5 / focal) for focal in reversed(FOCAL_RANGE))
 """Radians: the same as full angles of view."""
 
-DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
+DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2", "sx1", "sy1")
 
 RATIONAL_MODEL = "FULL_OPENCV"
 """The model of a camera that has k4 to k6."""
 
-FISHEYE_MODELS = ("SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "OPENCV_FISHEYE")
+THIN_PRISM_MODEL = "THIN_PRISM_FISHEYE"
+"""The model of a fisheye that has more than k1 to k4."""
+
+FISHEYE_MODELS = (
+    "SIMPLE_RADIAL_FISHEYE",
+    "RADIAL_FISHEYE",
+    "OPENCV_FISHEYE",
+    THIN_PRISM_MODEL,
+)
 """The others are a pinhole camera apart from their distortion."""
 
 CLOSE = "transform_matrix_close"
@@ -132,6 +140,8 @@ class CameraValues(BaseModel):
     k6: Number | None = None
     p1: Number | None = None
     p2: Number | None = None
+    sx1: Number | None = None
+    sy1: Number | None = None
     camera_model: (
         Literal[
             "SIMPLE_PINHOLE",
@@ -143,6 +153,7 @@ class CameraValues(BaseModel):
             "SIMPLE_RADIAL_FISHEYE",
             "RADIAL_FISHEYE",
             "OPENCV_FISHEYE",
+            "THIN_PRISM_FISHEYE",
         ]
         | None
     ) = None  # as nerfstudio writes it
@@ -272,17 +283,25 @@ def lens_of(frame: Frame) -> Lens | None:
     if not is_fisheye and not coefficients:
         return None
     _check_fourth(frame, coefficients, is_fisheye)
-    kind = _lens_type(is_fisheye)
+    kind = _lens_type(frame.values.camera_model, is_fisheye, coefficients)
     for name in coefficients:
         if name not in kind.names:
             raise UserError(
-                f"{frame.where(name)}: a fisheye lens has the coefficients "
-                f"{', '.join(kind.names)}, got {name} = {coefficients[name]:g}"
+                f"{frame.where(name)}: a lens of the kind {kind.kind} has the coefficients "
+                f"{', '.join(kind.names)}, got {name} = {coefficients[name]:g}; set camera_model "
+                f"to the model that was calibrated, or leave {name} out"
             )
     return kind.of(**coefficients)
 
 
-def _lens_type(is_fisheye: bool) -> type[RadialTangential] | type[Fisheye]:
+def _lens_type(
+    model: str | None, is_fisheye: bool, coefficients: Mapping[str, float]
+) -> type[RadialTangential] | type[Fisheye]:
+    """Imported when a frame has it, with the coefficients that are not zero."""
+    if model == THIN_PRISM_MODEL and not set(coefficients) <= {"k1", "k2", "k3", "k4"}:
+        from drgs.cameras.thin_prism_fisheye import ThinPrismFisheye
+
+        return ThinPrismFisheye
     if is_fisheye:
         from drgs.cameras.fisheye import Fisheye
 

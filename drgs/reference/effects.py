@@ -16,6 +16,8 @@ Sources are those of ``reference``, and:
   rational model) and of ``cv::fisheye``.
 - Kannala, Brandt, "A Generic Camera Model and Calibration Method for Conventional, Wide-Angle,
   and Fish-Eye Lenses", IEEE TPAMI 28(8), 2006: the fisheye's polynomial.
+- COLMAP: ``sensor/models.h``, the model THIN_PRISM_FISHEYE; Weng, Cohen, Herniou, "Camera
+  Calibration with Distortion Models and Accuracy Evaluation", IEEE TPAMI 14(10), 1992: thin prisms.
 - Shoemake, "Animating Rotation with Quaternion Curves", SIGGRAPH 1985.
 
 Spaces, units and orders are those of ``reference``. A *slope* is (x/z, y/z) of a point in camera
@@ -42,7 +44,8 @@ BORDER_SAMPLES = 65
 Between two of 65, a border bent like a circle arc bulges 1 / 64^2 of its own bulge."""
 
 FOLD_RADII, FOLD_STEPS = (1e-3, 1e6), 1000
-"""Where a lens with tangential terms is searched for a fold: slopes, in steps of two percent."""
+"""Where a lens with tangential terms is searched for a fold: slopes, or angles in rad, in steps of
+two percent."""
 
 REAL_ROOT = 1e-7
 """A root with a smaller imaginary part (relative) is real: a double root is found to within the
@@ -215,42 +218,15 @@ class OpenCV(Lens):
         where that is least, added (Weyl's inequality).
         """
         radial, tangential = replace(self, p1=0.0, p2=0.0), OpenCV(p1=self.p1, p2=self.p2)
-        # Where the tangential part alone, without x and y themselves, has its least eigenvalue.
-        direction = -np.array([self.p2, self.p1]) / np.hypot(self.p1, self.p2)
-        slopes = radii[:, None] * direction
-        parts = [np.linalg.eigvalsh(lens._jacobians(slopes))[:, 0] for lens in (radial, tangential)]
-        return parts[0] + parts[1] - 1
-
-    def _jacobians(self, slopes: np.ndarray) -> np.ndarray:
-        """Return (M, 2, 2): derivatives of ``distorted`` at slopes (M, 2), by complex steps."""
-        columns = [self.distorted(slopes + 1e-30j * axis).imag / 1e-30 for axis in np.eye(2)]
-        return np.stack(columns, axis=-1)
+        slopes = radii[:, None] * -_unit(np.array([self.p2, self.p1]))
+        return _least_eigenvalues(radial, slopes) + _least_eigenvalues(tangential, slopes) - 1
 
     def undistorted(self, slopes: np.ndarray) -> np.ndarray:
         """Return the slopes (M, 2) within ``valid_radius`` that are distorted to ``slopes`` (M, 2).
 
-        NaN where there is none. Newton's method from the distorted slope; its step is halved until
-        it stays within the radius and lessens the error. Derivatives are complex steps.
+        NaN where there is none.
         """
-        radius = self.valid_radius
-        lengths = np.linalg.norm(slopes, axis=1, keepdims=True)
-        guesses = slopes * np.minimum(1.0, 0.9 * radius / np.maximum(lengths, 1e-300))
-        fractions = 0.5 ** np.arange(40.0)[:, None, None]
-        for _ in range(100):
-            errors = slopes - self.distorted(guesses)
-            steps = np.linalg.solve(self._jacobians(guesses), errors[..., None])[..., 0]
-            candidates = guesses + fractions * steps
-            left = np.linalg.norm(slopes - self.distorted(candidates), axis=-1)
-            better = (np.linalg.norm(candidates, axis=-1) < radius) & (
-                left < np.linalg.norm(errors, axis=-1)
-            )
-            first = np.argmax(better, axis=0)
-            moved = candidates[first, np.arange(len(slopes))]
-            guesses = np.where(better.any(axis=0)[:, None], moved, guesses)
-            if not better.any():
-                break
-        errors = np.linalg.norm(slopes - self.distorted(guesses), axis=1)
-        return np.where((errors <= 1e-12 * (1 + lengths[:, 0]))[:, None], guesses, np.nan)
+        return _undistorted(self, slopes, self.valid_radius)
 
 
 @dataclass(frozen=True)
@@ -297,6 +273,80 @@ class Fisheye(Lens):
 
 
 @dataclass(frozen=True)
+class ThinPrismFisheye(Fisheye):
+    """COLMAP's fisheye with tangential and thin prism terms, also beyond 90 degrees from the axis.
+
+    With (u, v) = theta / rho (x, y), where a fisheye without coefficients shows a point, and
+    r^2 = u^2 + v^2 = theta^2,
+
+        u' = u q + 2 p1 u v + p2 (r^2 + 2 u^2) + sx1 r^2
+        v' = v q + p1 (r^2 + 2 v^2) + 2 p2 u v + sy1 r^2
+        q = 1 + k1 r^2 + k2 r^4 + k3 r^6 + k4 r^8
+
+    and film = (fx u' + cx, fy v' + cy). COLMAP's own vector of coefficients has another order: k1,
+    k2, p1, p2, k3, k4, sx1, sy1.
+    """
+
+    p1: float = 0.0
+    p2: float = 0.0
+    sx1: float = 0.0
+    sy1: float = 0.0
+
+    def film_points(self, camera: Camera, points: np.ndarray) -> np.ndarray:
+        """Return (M, 2), px, film."""
+        rho = np.linalg.norm(points[:, :2], axis=1)
+        theta_by_rho = np.arctan2(rho, points[:, 2]) / np.where(rho == 0, 1.0, rho)
+        distorted = self.distorted(theta_by_rho[:, None] * points[:, :2])
+        return _focal(camera) * distorted + _principal(camera)
+
+    def distorted(self, places: np.ndarray) -> np.ndarray:
+        """Return (..., 2) places (u', v') of places (u, v) (..., 2), which may be complex."""
+        u, v = places[..., 0], places[..., 1]
+        r2 = u * u + v * v
+        q = 1 + self.k1 * r2 + self.k2 * r2**2 + self.k3 * r2**3 + self.k4 * r2**4
+        return np.stack(
+            [
+                u * q + 2 * self.p1 * u * v + self.p2 * (r2 + 2 * u * u) + self.sx1 * r2,
+                v * q + self.p1 * (r2 + 2 * v * v) + 2 * self.p2 * u * v + self.sy1 * r2,
+            ],
+            axis=-1,
+        )
+
+    @property
+    def valid_angle(self) -> float:
+        """rad: an angle within which no two places are distorted to the same.
+
+        That of the radial terms, or where ``least_eigenvalue`` first vanishes, if that comes
+        before. A map is one-to-one in a disc if the symmetric part of its Jacobian is positive
+        definite all over it: on the line between two places, what it adds never turns back.
+        """
+        angle = super().valid_angle
+        is_radial = not (self.p1 or self.p2 or self.sx1 or self.sy1)
+        return angle if is_radial else _first_fold(self, angle)
+
+    def least_eigenvalue(self, radii: np.ndarray) -> np.ndarray:
+        """Return (M,): no eigenvalue of the Jacobian's symmetric part at radii (M,) is smaller.
+
+        The least one of the radial terms and the least one of the others, in the direction where
+        that is least, added (Weyl's inequality). At w = (u, v), with p = (p2, p1) and
+        s = (sx1, sy1), the others are |w|^2 (p + s) + 2 (p . w) w, and the least eigenvalue of
+        their symmetric part is (4 p + s) . w - |w| |2 p + s|.
+        """
+        p, s = np.array([self.p2, self.p1]), np.array([self.sx1, self.sy1])
+        others = ThinPrismFisheye(p1=self.p1, p2=self.p2, sx1=self.sx1, sy1=self.sy1)
+        radial = replace(self, p1=0.0, p2=0.0, sx1=0.0, sy1=0.0)
+        places = radii[:, None] * -_unit(4 * p + s)
+        return _least_eigenvalues(radial, places) + _least_eigenvalues(others, places) - 1
+
+    def undistorted(self, places: np.ndarray) -> np.ndarray:
+        """Return the places (M, 2) within ``valid_angle`` that are distorted to ``places`` (M, 2).
+
+        NaN where there is none.
+        """
+        return _undistorted(self, places, self.valid_angle)
+
+
+@dataclass(frozen=True)
 class Orthographic(Lens):
     """film = (fx x + cx, fy y + cy), with fx and fy in px per world unit."""
 
@@ -310,8 +360,52 @@ class Orthographic(Lens):
         return np.tile(forward, (len(means), 1))
 
 
+def _jacobians(lens: OpenCV | ThinPrismFisheye, places: np.ndarray) -> np.ndarray:
+    """Return (M, 2, 2): derivatives of ``lens.distorted`` at places (M, 2), by complex steps."""
+    columns = [lens.distorted(places + 1e-30j * axis).imag / 1e-30 for axis in np.eye(2)]
+    return np.stack(columns, axis=-1)
+
+
+def _least_eigenvalues(lens: OpenCV | ThinPrismFisheye, places: np.ndarray) -> np.ndarray:
+    """Return (M,): of the symmetric part of the Jacobian at places (M, 2)."""
+    jacobians = _jacobians(lens, places)
+    return np.linalg.eigvalsh((jacobians + np.swapaxes(jacobians, 1, 2)) / 2)[:, 0]
+
+
+def _unit(vector: np.ndarray) -> np.ndarray:
+    """Return the direction (2,) of a vector; any, if it has none."""
+    length = np.hypot(*vector)
+    return vector / length if length > 0 else np.array([1.0, 0.0])
+
+
+def _undistorted(lens: OpenCV | ThinPrismFisheye, targets: np.ndarray, radius: float) -> np.ndarray:
+    """Return the places (M, 2) within ``radius`` that are distorted to targets (M, 2), or NaN.
+
+    Newton's method from the target; its step is halved until it stays within the radius and lessens
+    the error. Derivatives are complex steps.
+    """
+    lengths = np.linalg.norm(targets, axis=1, keepdims=True)
+    guesses = targets * np.minimum(1.0, 0.9 * radius / np.maximum(lengths, 1e-300))
+    fractions = 0.5 ** np.arange(40.0)[:, None, None]
+    for _ in range(100):
+        errors = targets - lens.distorted(guesses)
+        steps = np.linalg.solve(_jacobians(lens, guesses), errors[..., None])[..., 0]
+        candidates = guesses + fractions * steps
+        left = np.linalg.norm(targets - lens.distorted(candidates), axis=-1)
+        better = (np.linalg.norm(candidates, axis=-1) < radius) & (
+            left < np.linalg.norm(errors, axis=-1)
+        )
+        first = np.argmax(better, axis=0)
+        moved = candidates[first, np.arange(len(targets))]
+        guesses = np.where(better.any(axis=0)[:, None], moved, guesses)
+        if not better.any():
+            break
+    errors = np.linalg.norm(targets - lens.distorted(guesses), axis=1)
+    return np.where((errors <= 1e-12 * (1 + lengths[:, 0]))[:, None], guesses, np.nan)
+
+
 @cache
-def _first_fold(lens: OpenCV, radius: float) -> float:
+def _first_fold(lens: OpenCV | ThinPrismFisheye, radius: float) -> float:
     """Return the smallest r below ``radius`` with ``least_eigenvalue`` 0; ``radius``: none is."""
     radii = np.geomspace(*FOLD_RADII, FOLD_STEPS)
     radii = np.append(radii[radii < radius], radius * (1 - 1e-12)) if radius < inf else radii

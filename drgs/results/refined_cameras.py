@@ -16,6 +16,13 @@ from drgs.data.transforms import CLOSE, MAX_BYTES
 from drgs.data.types import Dataset, Motion, View
 from drgs.results.files import CAMERAS
 
+MODELS = {
+    "opencv": "FULL_OPENCV",
+    "fisheye": "OPENCV_FISHEYE",
+    "thin_prism_fisheye": "THIN_PRISM_FISHEYE",
+}
+"""Of cameras, by the kind of their lens."""
+
 
 @dataclass(frozen=True)
 class LensChange:
@@ -93,8 +100,7 @@ def _lens_and_motion(view: View) -> dict[str, object]:
     """What ``transforms.json`` says of a camera besides its pose and intrinsics."""
     values: dict[str, object] = {}
     if view.lens is not None:
-        model = {"opencv": "FULL_OPENCV", "fisheye": "OPENCV_FISHEYE"}[view.lens.kind]
-        values |= {"camera_model": model, **view.lens.named()}
+        values |= {"camera_model": MODELS[view.lens.kind], **view.lens.named()}
     if view.motion is not None:
         values[CLOSE] = between_opencv_and_opengl(view.motion.close_to_world).tolist()
         values["shutter"] = view.motion.shutter

@@ -31,10 +31,11 @@ from drgs.accuracy.pipeline import pipeline_of
 from drgs.accuracy.unscented import unscented_shape
 from drgs.cameras import fisheye, orthographic
 from drgs.cameras.radial_tangential import RadialTangential
+from drgs.cameras.thin_prism_fisheye import ThinPrismFisheye as KernelThinPrism
 from drgs.config.approximations import Approximations
 from drgs.gaussians.parameters import PARAMETER_NAMES
 from drgs.reference import effects
-from drgs.reference.effects import Fisheye, OpenCV, Orthographic
+from drgs.reference.effects import Fisheye, OpenCV, Orthographic, ThinPrismFisheye
 from drgs.splatting import rendering
 from drgs.splatting.projection import ewa
 
@@ -77,6 +78,27 @@ def test_a_fisheye_leaves_out_what_is_not_given():
     assert orthographic.Orthographic().named() == {}
 
 
+@pytest.mark.parametrize(
+    ("given", "named"),
+    [
+        ({}, {}),
+        ({"k2": 0.5}, {"k1": 0.0, "k2": 0.5}),
+        ({"p2": 0.0}, {"p1": 0.0, "p2": 0.0}),
+        ({"k1": 0.5, "sx1": 0.25}, {"k1": 0.5, "sx1": 0.25, "sy1": 0.0}),
+        (
+            dict(zip(KernelThinPrism.names, range(1, 9), strict=True)),
+            dict(zip(KernelThinPrism.names, range(1, 9), strict=True)),
+        ),
+    ],
+)
+def test_a_thin_prism_fisheye_leaves_out_what_is_not_given(given, named):
+    lens = KernelThinPrism.of(**given)
+    assert lens.named() == named
+    values = {name: -value for name, value in named.items()}
+    assert lens.with_named({**values, "fx": 1.0}).named() == values
+    assert lens.with_named(values).min_cosine == lens.min_cosine
+
+
 @every_lens
 def test_where_the_model_ends_is_where_the_reference_ends(name):
     lens = LENSES[name]
@@ -107,6 +129,24 @@ def test_tangential_terms_end_the_model_where_the_reference_does(lens, ends):
     assert radius == pytest.approx(lens.valid_radius, rel=1e-9)
     plain = replace(lens, p1=0.0, p2=0.0).valid_radius
     assert (radius < 0.99 * plain) == ends
+
+
+@pytest.mark.parametrize(
+    ("lens", "ends"),
+    [
+        (ThinPrismFisheye(p1=0.125, p2=-0.0625), True),
+        (ThinPrismFisheye(sx1=-0.25, sy1=0.125), True),
+        (ThinPrismFisheye(-0.0625, 0.03125, p1=0.125, p2=0.0625, sx1=0.25, sy1=-0.125), True),
+        # What one does, the other undoes; and what it does is less than the radial terms do.
+        (ThinPrismFisheye(p1=0.0625, p2=-0.03125, sx1=0.09375, sy1=-0.1875), False),
+        (ThinPrismFisheye(0.25, p1=0.03125, sx1=0.03125), False),
+    ],
+    ids=str,
+)
+def test_prisms_end_the_model_where_the_reference_does(lens, ends):
+    angle = math.acos(kernel_lens(lens).min_cosine)
+    assert angle == pytest.approx(lens.valid_angle, rel=1e-9)
+    assert (angle < 0.99 * Fisheye(lens.k1, lens.k2, lens.k3, lens.k4).valid_angle) == ends
 
 
 def kernels_of(lens, camera_seed=0) -> dict[str, list]:
@@ -143,9 +183,10 @@ def operations(kernels) -> dict[str, int]:
         (LENSES["rational"], OpenCV(0.1, 0.02, -0.01, 0.02, 0.01, 0.003, -0.002, 0.001)),
         (LENSES["fox"], OpenCV(k1=-0.3, k2=0.1, p1=0.001, p2=0.002)),
         (LENSES["fisheye"], Fisheye(0.02, -0.001, 0.003, 0.001)),
+        (LENSES["thin prism"], ThinPrismFisheye(*(0.01 * k for k in range(1, 9)))),
         (Orthographic(), Orthographic()),
     ],
-    ids=["k1", "rational", "fox", "fisheye", "orthographic"],
+    ids=["k1", "rational", "fox", "fisheye", "thin prism", "orthographic"],
 )
 def test_kernels_do_not_depend_on_the_numbers_of_a_lens(lens, other):
     """Otherwise each camera, and each step of a calibration, would compile its own."""
@@ -169,6 +210,8 @@ def test_each_coefficient_adds_operations_where_it_belongs():
 
 def test_each_coefficient_of_a_fisheye_adds_operations():
     steps = [LENSES["plain fisheye"], Fisheye(0.01), LENSES["fisheye"]]
+    with_prism = LENSES["thin prism"]
+    steps += [replace(with_prism, sx1=0.0, sy1=0.0), with_prism]
     for fewer, more in pairwise(kernels_of(lens) for lens in steps):
         before, after = operations(fewer), operations(more)
         assert all(before[name] < after[name] for name in before), (before, after)

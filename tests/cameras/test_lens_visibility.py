@@ -23,7 +23,7 @@ from support.reference_lenses import camera_at_origin, gaussians_at
 
 from drgs.cameras import fisheye, polynomials
 from drgs.reference import effects
-from drgs.reference.effects import Fisheye, OpenCV, Orthographic
+from drgs.reference.effects import Fisheye, OpenCV, Orthographic, ThinPrismFisheye
 
 every_opencv = pytest.mark.parametrize(
     "name", [name for name, lens in LENSES.items() if isinstance(lens, OpenCV)]
@@ -40,7 +40,7 @@ SPLATS = {FLOAT64: 1e-11, FLOAT32: 1e-5}
 
 
 @both_precisions
-@pytest.mark.parametrize("name", ["plain fisheye", "fisheye"])
+@pytest.mark.parametrize("name", ["plain fisheye", "fisheye", "thin prism"])
 def test_a_fisheye_sees_from_the_axis_to_behind_the_camera(precision, name):
     """On the axis, at angles from 1e-12 up, where the series end (17.5 degrees), beside, behind."""
     lens, camera = LENSES[name], camera_at_origin()
@@ -88,6 +88,7 @@ FOLDING = {
     "pole": OpenCV(k4=-0.25),
     "fox": LENSES["fox"],
     "fisheye": Fisheye(-0.125),
+    "thin prism": ThinPrismFisheye(p2=-0.125, sx1=-0.0625),
 }
 
 
@@ -205,7 +206,7 @@ def test_a_ray_is_seen_where_it_starts(precision, name):
 
 
 @both_precisions
-@pytest.mark.parametrize("kind", ["opencv", "fisheye"])
+@pytest.mark.parametrize("kind", ["opencv", "fisheye", "thin prism"])
 def test_rays_of_any_lens_are_found_and_finite(precision, kind):
     """Coefficients as large as they come, films far beyond what some of the lenses show.
 
@@ -217,8 +218,11 @@ def test_rays_of_any_lens_are_found_and_finite(precision, kind):
         if kind == "opencv":
             sizes = [0.3, 0.1, 0.03, 0.3, 0.1, 0.03, 0.01, 0.01]
             lens = OpenCV(*map(float, single(rng.normal(0, sizes))))
-        else:
+        elif kind == "fisheye":
             lens = Fisheye(*map(float, single(rng.normal(0, [0.1, 0.05, 0.02, 0.01]))))
+        else:
+            sizes = [0.1, 0.05, 0.02, 0.01, 0.01, 0.01, 0.01, 0.01]
+            lens = ThinPrismFisheye(*map(float, single(rng.normal(0, sizes))))
         focal = rng.choice([8.0, 15.0, 30.0])
         camera = camera_at_origin(fx=focal, fy=focal, cx=18.5, cy=14.5, width=37, height=29)
         film = single(rng.uniform(0, 1, (200, 2)) * [37, 29])

@@ -84,10 +84,11 @@ def test_every_lens_that_can_be_rendered_is(tmp_path, name):
     write_dataset(tmp_path, [name])
     view = load(tmp_path).train[0]
     coefficients = dict(zip(MODELS[name][1], PARAMETERS[name], strict=True))
-    named = {k: v for k, v in coefficients.items() if k[0] in "kp"}
+    named = {k: v for k, v in coefficients.items() if k[0] in "kps"}
     assert ({} if view.lens is None else view.lens.named()) == pytest.approx(named)
     kind = None if view.lens is None else view.lens.kind
-    assert kind == ("fisheye" if "FISHEYE" in name else None if "PINHOLE" in name else "opencv")
+    fisheye = "thin_prism_fisheye" if "PRISM" in name else "fisheye"
+    assert kind == (fisheye if "FISHEYE" in name else None if "PINHOLE" in name else "opencv")
     assert load(tmp_path, ignore_distortion=True).train[0].lens is None
 
 

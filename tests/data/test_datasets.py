@@ -9,6 +9,7 @@ from support.datasets import CENTERS, edit, load, refusal
 
 from drgs.cameras.fisheye import Fisheye
 from drgs.cameras.radial_tangential import RadialTangential
+from drgs.cameras.thin_prism_fisheye import ThinPrismFisheye
 
 
 # NeRF-synthetic
@@ -296,6 +297,19 @@ def test_a_fisheye_lens_is_read(photographs, says):
     assert dataset.description.endswith("; lens fisheye (k1, k2, k3, k4)")
 
 
+@pytest.mark.parametrize(
+    ("says", "lens"),
+    [
+        ({"p2": 0.01, "sy1": -0.02}, ThinPrismFisheye.of(k1=0.1, p2=0.01, sy1=-0.02)),
+        ({"p1": 0, "sx1": 0.0}, Fisheye.of(k1=0.1)),  # which costs less
+    ],
+)
+def test_a_thin_prism_fisheye_is_read(photographs, says, lens):
+    change = {"camera_model": "THIN_PRISM_FISHEYE", "k1": 0.1, **says}
+    edit(photographs / "transforms.json", lambda m: m.update(change))
+    assert load(photographs).train[0].lens == lens
+
+
 @pytest.mark.parametrize("says", [{"camera_model": "FULL_OPENCV"}, {"k5": 0.125}])
 def test_a_fourth_coefficient_that_is_opencvs_is_read(photographs, says):
     edit(photographs / "transforms.json", lambda m: m.update(k1=0.1, k4=0.25, **says))
@@ -329,12 +343,18 @@ def test_distortion_coefficients_of_zero_are_accepted(photographs):
         (
             lambda m: m.update(camera_model="EQUIRECTANGULAR"),
             "camera_model must be one of 'SIMPLE_PINHOLE', 'PINHOLE', 'SIMPLE_RADIAL', 'RADIAL', "
-            "'OPENCV', 'FULL_OPENCV', 'SIMPLE_RADIAL_FISHEYE', 'RADIAL_FISHEYE' or "
-            "'OPENCV_FISHEYE', got \"EQUIRECTANGULAR\"",
+            "'OPENCV', 'FULL_OPENCV', 'SIMPLE_RADIAL_FISHEYE', 'RADIAL_FISHEYE', "
+            "'OPENCV_FISHEYE' or 'THIN_PRISM_FISHEYE', got \"EQUIRECTANGULAR\"",
         ),
         (
             lambda m: m.update(is_fisheye=True, p1=0.5),
-            "p1: a fisheye lens has the coefficients k1, k2, k3, k4, got p1 = 0.5",
+            "p1: a lens of the kind fisheye has the coefficients k1, k2, k3, k4, got p1 = 0.5; "
+            "set camera_model to the model that was calibrated, or leave p1 out",
+        ),
+        (
+            lambda m: m.update(sx1=0.5),
+            "sx1: a lens of the kind opencv has the coefficients k1, k2, k3, k4, k5, k6, p1, p2, "
+            "got sx1 = 0.5; set camera_model to the model that was calibrated, or leave sx1 out",
         ),
         (
             lambda m: m.update(camera_model="OPENCV", k1=0.1, k4=0.25),

@@ -8,6 +8,7 @@ from support.datasets import view_at
 
 from drgs.cameras.fisheye import Fisheye
 from drgs.cameras.radial_tangential import RadialTangential
+from drgs.cameras.thin_prism_fisheye import ThinPrismFisheye
 from drgs.data.film import is_projectable, to_camera, to_film
 from drgs.data.types import Motion
 from drgs.reference import effects as reference
@@ -15,11 +16,13 @@ from drgs.reference.splatting import Camera
 
 OPENCV = {"k1": -0.25, "k2": 0.0625, "k4": 0.03125, "p1": 0.004, "p2": -0.002}
 FISHEYE = {"k1": -0.03125, "k2": 0.015625}
+THIN_PRISM = {**FISHEYE, "p1": 0.004, "p2": -0.002, "sx1": -0.01, "sy1": 0.02}
 
 LENSES = {
     "pinhole": (None, reference.Pinhole()),
     "opencv": (RadialTangential.of(**OPENCV), reference.OpenCV(**OPENCV)),
     "fisheye": (Fisheye.of(**FISHEYE), reference.Fisheye(**FISHEYE)),
+    "thin prism": (ThinPrismFisheye.of(**THIN_PRISM), reference.ThinPrismFisheye(**THIN_PRISM)),
 }
 
 

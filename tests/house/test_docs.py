@@ -13,6 +13,8 @@ from conftest import REPOSITORY
 from support.views import Scene, tensors
 
 import drgs  # noqa: F401  (registers the plugins)
+from drgs.cameras.radial_tangential import RadialTangential
+from drgs.cameras.thin_prism_fisheye import ThinPrismFisheye
 from drgs.config.approximations import Approximations
 from drgs.gaussians.parameters import PARAMETER_NAMES
 
@@ -91,7 +93,7 @@ OTHERS = {
     "splats": {*PARAMETER_NAMES, *(field.name for field in fields(Approximations))}
     | {NESTED, "feature_...", "shapes_to_world", "shapes_to_world_..."},
     # Coefficients; and what Mitsuba's base class reads.
-    "calibrated": {"k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2", "to_world", "shutter_open"},
+    "calibrated": {*RadialTangential.names, *ThinPrismFisheye.names, "to_world", "shutter_open"},
 }
 
 both_plugins = pytest.mark.parametrize("plugin", ["splats", "calibrated"])
@@ -104,21 +106,24 @@ def test_the_table_lists_every_name_that_is_read(plugin):
     assert set(listed) == names_read(plugin) | OTHERS[plugin]
 
 
-def loaded(plugin) -> mi.Object:
-    """With all that can be exposed."""
+def loaded(plugin) -> list[mi.Object]:
+    """Which, together, have all that can be exposed."""
     if plugin == "splats":
         gaussians = tensors(Scene(count=8).gaussians)
         feature = mi.TensorXf(np.zeros((8, 2), np.float32))
         nested = {"type": "path"}
-        return mi.load_dict(
-            {"type": "splats", **gaussians, "feature_own": feature, "inner": nested}
-        )
-    film = {"type": "hdrfilm", "width": 32, "height": 32}
-    zeros = {f"k{k}": 0.0 for k in range(1, 7)} | {"p1": 0.0, "p2": 0.0}
-    close = mi.ScalarTransform4f().translate([1, 0, 0])
-    return mi.load_dict(
-        {"type": "calibrated", "lens": "opencv", **zeros, "to_world_close": close, "film": film}
-    )
+        settings = {"type": "splats", **gaussians, "feature_own": feature, "inner": nested}
+        return [mi.load_dict(settings)]
+    common = {
+        "type": "calibrated",
+        "to_world_close": mi.ScalarTransform4f().translate([1, 0, 0]),
+        "film": {"type": "hdrfilm", "width": 32, "height": 32},
+    }
+    lenses = (RadialTangential, ThinPrismFisheye)
+    return [
+        mi.load_dict({**common, "lens": lens.kind, **dict.fromkeys(lens.names, 0.0)})
+        for lens in lenses
+    ]
 
 
 @both_plugins
@@ -132,15 +137,15 @@ def test_the_table_marks_what_is_exposed_and_differentiable(plugin):
             del value
             found[name] = flags
 
-    thing = loaded(plugin)
+    things = loaded(plugin)
     if plugin == "splats":
-        thing.traverse(Callback())
+        things[0].traverse(Callback())
         found[NESTED], found["feature_..."] = found.pop("nested"), found.pop("feature_own")
     else:
-        params = mi.traverse(thing)
         of_mitsuba = ("shutter_open", "shutter_open_time")
         found = {
             name: params.flags(name)
+            for params in map(mi.traverse, things)
             for name in params.keys()  # noqa: SIM118
             if "." not in name and name not in of_mitsuba
         }

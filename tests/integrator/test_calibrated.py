@@ -20,6 +20,7 @@ from support.calibrated_sensors import (
     OPENCV,
     PINHOLE,
     STILL,
+    THIN_PRISM,
     Calibrated,
     by_name,
     clear_gaussians,
@@ -185,10 +186,15 @@ def test_rays_are_as_long_as_what_is_seen(sensor):
             assert sensor.lens.depths(camera, point[None])[0] == pytest.approx(depth, rel=2e-6)
 
 
-@pytest.mark.parametrize("name", ["fx", "cy", "k1", "p2"])
-def test_rays_are_differentiable_in_the_calibration(name):
+@pytest.mark.parametrize(
+    ("sensor", "name"),
+    [(OPENCV, name) for name in ("fx", "cy", "k1", "p2")]
+    + [(THIN_PRISM, name) for name in ("fx", "k1", "p2", "sy1")],
+    ids=lambda value: getattr(value, "name", value),
+)
+def test_rays_are_differentiable_in_the_calibration(sensor, name):
     """Against central differences, in single precision; the search for a ray is not unrolled."""
-    loaded = OPENCV.load()
+    loaded = sensor.load()
     params = mi.traverse(loaded)
     value = float(params[name][0])
     sample = mi.Point2f(np.random.default_rng(0).uniform(size=(2, 20)).astype(np.float32))

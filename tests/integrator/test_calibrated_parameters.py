@@ -16,6 +16,7 @@ from support.calibrated_sensors import (
     OPENCV,
     PINHOLE,
     STILL,
+    THIN_PRISM,
     by_name,
     sampled_rays,
     splats_scene,
@@ -94,8 +95,8 @@ def test_coefficients_that_are_not_given_are_not_exposed():
 
 @pytest.mark.parametrize(
     ("sensor", "names"),
-    [(OPENCV, ("k1", "k2", "p1")), (FISHEYE, ("k1", "k4"))],
-    ids=["opencv", "fisheye"],
+    [(OPENCV, ("k1", "k2", "p1")), (FISHEYE, ("k1", "k4")), (THIN_PRISM, ("k1", "p1", "sx1"))],
+    ids=["opencv", "fisheye", "thin prism"],
 )
 def test_coefficients_that_are_given_as_zero_can_be_optimised(sensor, names):
     """Each has a derivative, that of a difference across 0, and stays when another is changed.
@@ -185,12 +186,13 @@ def test_gradients_of_a_picture_reach_the_calibration(sensor):
 REFUSED = {
     "lens": (
         {"lens": "opencvv"},
-        "PluginError: calibrated: lens must be one of pinhole, opencv, fisheye, got 'opencvv'; "
-        "did you mean opencv?",
+        "PluginError: calibrated: lens must be one of pinhole, opencv, fisheye, "
+        "thin_prism_fisheye, got 'opencvv'; did you mean opencv?",
     ),
     "lens that is no name": (
         {"lens": 3},
-        "PluginError: calibrated: lens must be one of pinhole, opencv, fisheye, got 3",
+        "PluginError: calibrated: lens must be one of pinhole, opencv, fisheye, "
+        "thin_prism_fisheye, got 3",
     ),
     "coefficient of another lens": (
         {"lens": "fisheye", "k5": 0.1},

@@ -17,6 +17,7 @@ from drgs.bench.scenes import bench_gaussians
 from drgs.cameras.camera import Pinhole, cameras_in_time
 from drgs.cameras.fisheye import Fisheye
 from drgs.cameras.radial_tangential import RadialTangential
+from drgs.cameras.thin_prism_fisheye import ThinPrismFisheye
 from drgs.config.approximations import Approximations
 from drgs.config.schema import DataConfig, ModelConfig
 from drgs.data.types import Motion, View
@@ -111,7 +112,15 @@ def test_views_of_one_size_share_a_film():
     assert [list(film.size()) for film in (a, b)] == [[37, 23], [23, 37]]
 
 
-@pytest.mark.parametrize("lens", [None, RadialTangential.of(k1=-0.2, p2=0.01), Fisheye.of(k1=0.1)])
+@pytest.mark.parametrize(
+    "lens",
+    [
+        None,
+        RadialTangential.of(k1=-0.2, p2=0.01),
+        Fisheye.of(k1=0.1),
+        ThinPrismFisheye.of(k1=0.1, sx1=0.01),
+    ],
+)
 def test_what_mitsubas_sensors_cannot_express_is_a_calibrated_camera(lens):
     view = replace(make_view(fx=30.0, fy=33.0), lens=lens)
     (sensor,) = make_sensors([view])

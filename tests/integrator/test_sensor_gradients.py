@@ -170,6 +170,7 @@ CLOSE_POSE = {"turn_close": 0.0, "shift_close": 0.0}
 INTRINSICS = {"fx": 40.0, "fy": 37.0, "cx": 18.0, "cy": 12.0}
 OPENCV = {"k1": -0.25, "k2": 0.0625, "p1": 0.0078125, "p2": -0.015625, "k4": 0.125}
 FISHEYE = {"k1": -0.03125, "k2": 0.015625}
+THIN_PRISM = {"k1": -0.03125, "p1": 0.0078125, "p2": -0.015625, "sx1": 0.03125, "sy1": -0.0078125}
 
 
 def calibrated(**values):
@@ -212,6 +213,12 @@ CASES = {
             lens_picture(effects.Fisheye, tuple(FISHEYE)),
             {**POSE, **INTRINSICS, **FISHEYE},
             sensor=calibrated(**INTRINSICS, lens="fisheye", **FISHEYE),
+        ),
+        Case(
+            "thin prism",
+            lens_picture(effects.ThinPrismFisheye, tuple(THIN_PRISM)),
+            {**INTRINSICS, **THIN_PRISM},
+            sensor=calibrated(**INTRINSICS, lens="thin_prism_fisheye", **THIN_PRISM),
         ),
         Case(
             "global shutter",

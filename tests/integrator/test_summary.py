@@ -26,9 +26,10 @@ from drgs.training.effects.called_for import integrator_settings, training_effec
 from drgs.training.summary import summary_of_fit
 
 MODULES = (
-    "cameras.fisheye", "cameras.motion", "cameras.orthographic", "cameras.polynomials",
-    "cameras.radial_tangential", "cameras.thin_lens", "effects.defocus", "effects.features",
-    "effects.occlusion", "effects.smoothing", "integrator.background", "integrator.surfaces",
+    "cameras.distortion", "cameras.fisheye", "cameras.motion", "cameras.orthographic",
+    "cameras.polynomials", "cameras.radial_tangential", "cameras.thin_lens",
+    "cameras.thin_prism_fisheye", "effects.defocus", "effects.features", "effects.occlusion",
+    "effects.smoothing", "integrator.background", "integrator.surfaces",
     "training.effects.background", "training.effects.cameras", "training.effects.colors",
     "training.effects.depth", "training.effects.masks", "training.effects.smoothing",
     "training.effects.view_parameters", "training.image_ops",
@@ -488,7 +489,11 @@ def test_each_effect_imports_its_own_modules(run_python, tmp_path):
         "calibrated": [],
         "perspective": [],
         "environment": ["drgs.integrator.background"],
-        "distorted": ["drgs.cameras.polynomials", "drgs.cameras.radial_tangential"],
+        "distorted": [
+            "drgs.cameras.distortion",
+            "drgs.cameras.polynomials",
+            "drgs.cameras.radial_tangential",
+        ],
         "thin lens": ["drgs.cameras.thin_lens", "drgs.effects.defocus"],
         "surface": ["drgs.effects.occlusion", "drgs.integrator.surfaces"],
     }

@@ -8,7 +8,13 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 from scipy.optimize import brentq
-from support.reference_lenses import FISHEYE, camera_at_origin, gaussians_at, whitened_samples
+from support.reference_lenses import (
+    FISHEYE,
+    THIN_PRISM,
+    camera_at_origin,
+    gaussians_at,
+    whitened_samples,
+)
 from support.reference_scenes import (
     small_camera,
     small_scene,
@@ -16,7 +22,7 @@ from support.reference_scenes import (
 
 from drgs.reference import effects
 from drgs.reference import splatting as reference
-from drgs.reference.effects import Fisheye, OpenCV, Orthographic, Pinhole
+from drgs.reference.effects import Fisheye, OpenCV, Orthographic, Pinhole, ThinPrismFisheye
 
 # Coefficients of sizes that cameras have, exact in binary.
 BARREL = OpenCV(k1=-0.25, k2=0.0625, p1=0.0078125, p2=-0.015625, k3=0.03125)
@@ -28,7 +34,7 @@ RATIONAL = replace(BARREL, k4=0.125, k5=-0.0625, k6=0.015625)
 PINCUSHION = OpenCV(k1=0.125, k2=0.03125)
 
 
-LENSES = [Pinhole(), BARREL, RATIONAL, PINCUSHION, Fisheye(), FISHEYE, Orthographic()]
+LENSES = [Pinhole(), BARREL, RATIONAL, PINCUSHION, Fisheye(), FISHEYE, THIN_PRISM, Orthographic()]
 
 
 every_lens = pytest.mark.parametrize("lens", LENSES, ids=str)
@@ -52,7 +58,7 @@ def points_within(lens, camera, count=200, seed=3) -> np.ndarray:
 
 
 @pytest.mark.parametrize(
-    "lens", [Pinhole(), OpenCV(), BARREL, Fisheye(), FISHEYE, Orthographic()], ids=str
+    "lens", [Pinhole(), OpenCV(), BARREL, Fisheye(), FISHEYE, THIN_PRISM, Orthographic()], ids=str
 )
 def test_a_point_on_the_axis_is_at_the_principal_point(lens):
     camera = camera_at_origin()
@@ -103,12 +109,13 @@ def test_opencv_is_its_vector_equation(lens):
         np.testing.assert_allclose(actual, expected, atol=1e-12)
 
 
-# cv2.projectPoints and cv2.fisheye.projectPoints of opencv-python 5.0.0, of the points
-# (0, 0, 1), (0.5, -0.25, 2), (-1.5, 1, 2), (0.75, 1.5, 1.25), with RATIONAL and FISHEYE.
-OPENCV_POINTS = np.array([[0, 0, 1], [0.5, -0.25, 2], [-1.5, 1, 2], [0.75, 1.5, 1.25]])
+# cv2.projectPoints and cv2.fisheye.projectPoints of opencv-python 5.0.0 and Camera.img_from_cam of
+# pycolmap 4.2.1, of the points (0, 0, 1), (0.5, -0.25, 2), (-1.5, 1, 2), (0.75, 1.5, 1.25), with
+# RATIONAL, FISHEYE and THIN_PRISM.
+KNOWN_POINTS = np.array([[0, 0, 1], [0.5, -0.25, 2], [-1.5, 1, 2], [0.75, 1.5, 1.25]])
 
 
-OPENCV_FILM = {
+KNOWN_FILM = {
     RATIONAL: [
         [140.0, 95.0],
         [195.03270342494275, 72.26910075926278],
@@ -121,13 +128,19 @@ OPENCV_FILM = {
         [1.4869510124012777, 171.282548717808],
         [233.83945348652193, 250.03909706468843],
     ],
+    THIN_PRISM: [
+        [140.0, 95.0],
+        [195.39632835083586, 72.25674147998508],
+        [-2.4925152592528548, 174.13980873487944],
+        [230.88489054148343, 254.79208962844606],
+    ],
 }
 
 
-@pytest.mark.parametrize("lens", OPENCV_FILM, ids=str)
-def test_film_points_are_those_of_opencv(lens):
-    actual = lens.film_points(camera_at_origin(), OPENCV_POINTS)
-    np.testing.assert_allclose(actual, OPENCV_FILM[lens], rtol=1e-13)
+@pytest.mark.parametrize("lens", KNOWN_FILM, ids=str)
+def test_film_points_are_those_of_opencv_and_colmap(lens):
+    actual = lens.film_points(camera_at_origin(), KNOWN_POINTS)
+    np.testing.assert_allclose(actual, KNOWN_FILM[lens], rtol=1e-13)
 
 
 def radial(lens, r) -> float:
@@ -299,6 +312,74 @@ def test_fisheye_sees_up_to_its_first_turn_or_almost_all_around():
         angles = np.array([limit - 1e-9, limit + 1e-9, math.pi])
         points = np.column_stack([np.sin(angles), 0 * angles, np.cos(angles)])
         np.testing.assert_array_equal(lens.is_seen(camera, points), [True, False, False])
+
+
+def test_a_thin_prism_fisheye_is_its_vector_equation():
+    """w q + r^2 (p + s) + 2 (p . w) w with p = (p2, p1), s = (sx1, sy1), of a fisheye's w and q."""
+    camera, lens = camera_at_origin(), THIN_PRISM
+    points = points_within(lens, camera)
+    focal, principal = np.array([230.0, 190.0]), np.array([140.0, 95.0])
+    films = (fisheye.film_points(camera, points) for fisheye in (FISHEYE, Fisheye()))
+    plain, w = ((film - principal) / focal for film in films)
+    p, s = np.array([lens.p2, lens.p1]), np.array([lens.sx1, lens.sy1])
+    r2 = np.arccos(points[:, 2:] / np.linalg.norm(points, axis=1, keepdims=True)) ** 2
+    expected = focal * (plain + r2 * (p + s) + 2 * (w @ p)[:, None] * w) + principal
+    # arccos, as above.
+    np.testing.assert_allclose(lens.film_points(camera, points), expected, rtol=1e-11)
+    without = replace(lens, p1=0.0, p2=0.0, sx1=0.0, sy1=0.0)
+    np.testing.assert_allclose(without.film_points(camera, points), focal * plain + principal)
+    assert without.valid_angle == FISHEYE.valid_angle
+
+
+def test_a_prism_or_a_tangential_term_alone_folds_on_one_side():
+    """Along -s, w becomes (r - |s| r^2) w / r. Tangential terms turn as those of slopes do."""
+    assert ThinPrismFisheye(p1=0.18, p2=-0.24).valid_angle == pytest.approx(1 / 1.8, rel=1e-12)
+    lens = ThinPrismFisheye(sx1=0.3, sy1=-0.4)
+    assert lens.valid_angle == pytest.approx(1.0, rel=1e-12)
+    places = np.array([[0.5], [0.99], [1.5], [1.01]]) * [-0.6, 0.8]
+    shown = lens.distorted(places)
+    np.testing.assert_allclose(shown[:2], shown[2:], rtol=1e-12)
+
+
+def test_thin_prism_fisheyes_have_no_fold_within_their_angle():
+    """The symmetric parts of difference quotients, in a disc of each of 40 lenses, are positive.
+
+    No direction has a smaller eigenvalue than ``least_eigenvalue`` says; where there are no radial
+    terms, one has it.
+    """
+    ended = 0
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        sizes = np.array([0.1, 0.05, 0.02, 0.01, 0.1, 0.1, 0.1, 0.1])
+        lens = ThinPrismFisheye(*rng.normal(0, sizes * (1 if seed % 2 else [0] * 4 + [1] * 4)))
+        limit = lens.valid_angle
+        ended += limit < 0.99 * replace(lens, p1=0.0, p2=0.0, sx1=0.0, sy1=0.0).valid_angle
+        azimuths, parts = np.meshgrid(np.linspace(0, 2 * np.pi, 720), np.linspace(0.01, 0.999, 20))
+        unit = np.stack([np.cos(azimuths), np.sin(azimuths)], axis=-1)
+        places, h = (limit * parts)[..., None] * unit, 1e-6 * limit
+        columns = [
+            (lens.distorted(places + step) - lens.distorted(places - step)) / h
+            for step in h * np.eye(2) / 2
+        ]
+        quotients = np.stack(columns, axis=-1)
+        symmetric = (quotients + np.swapaxes(quotients, -1, -2)) / 2
+        found = np.linalg.eigvalsh(symmetric)[..., 0].min(axis=1)
+        least = lens.least_eigenvalue(limit * parts[:, 0])
+        # Rounding of quotients, over h; half a degree between directions.
+        assert (found > least - 1e-9).all() and (least > 0).all(), lens
+        assert seed % 2 or np.abs(found - least).max() < 1e-4, lens
+    assert ended > 20
+
+
+def test_a_thin_prism_fisheye_is_undone_within_its_angle():
+    """In all directions, of one that ends by its tilted elements, and of one that is wide."""
+    for lens in (ThinPrismFisheye(-0.1, p1=0.06, p2=-0.08, sx1=0.1, sy1=0.05), THIN_PRISM):
+        azimuths, parts = np.meshgrid(np.linspace(0, 6.2, 40), [0.1, 0.5, 0.9, 0.999])
+        angles = parts * lens.valid_angle
+        places = angles[..., None] * np.stack([np.cos(azimuths), np.sin(azimuths)], axis=-1)
+        places = places.reshape(-1, 2)
+        # Next to a fold the inverse is steeper than the distortion by a factor of 1000.
+        np.testing.assert_allclose(lens.undistorted(lens.distorted(places)), places, atol=1e-8)
 
 
 def test_depth_is_distance_for_a_fisheye_and_z_otherwise():

@@ -6,7 +6,16 @@ import pytest
 
 from drgs.accuracy import exact, peak_depths, pixel_lists, pixel_order, ray_colors, unscented
 from drgs.accuracy.sample_points import SamplePoints
-from drgs.cameras import camera, fisheye, motion, orthographic, radial_tangential, thin_lens
+from drgs.cameras import (
+    camera,
+    distortion,
+    fisheye,
+    motion,
+    orthographic,
+    radial_tangential,
+    thin_lens,
+    thin_prism_fisheye,
+)
 from drgs.effects import defocus, features, occlusion
 from drgs.splatting import image_model, projection, rendering
 
@@ -28,7 +37,12 @@ CLASSES = {
         camera.Pinhole,
         radial_tangential.RadialTangential,
         fisheye.Fisheye,
+        thin_prism_fisheye.ThinPrismFisheye,
         orthographic.Orthographic,
+    ),
+    distortion.PlaneDistortion: (
+        radial_tangential.RadialTangential,
+        thin_prism_fisheye.ThinPrismFisheye,
     ),
     camera.Aperture: (thin_lens.RoundAperture,),
     camera.Shutter: (motion.MotionBlur, motion.RollingShutter),

@@ -9,7 +9,7 @@ import numpy as np
 
 from drgs.reference import effects
 from drgs.reference import splatting as reference
-from drgs.reference.effects import Fisheye, OpenCV, Pinhole
+from drgs.reference.effects import Fisheye, OpenCV, Pinhole, ThinPrismFisheye
 from support.lens_scenes import LENSES
 from support.views import VIEWS, View, pose, splats_before, tensors
 
@@ -17,6 +17,14 @@ WINDOW = (13, 7, 29, 18)
 
 
 CLOSE = pose([0.1, -1.0, 0.3], 43, (0.5, -0.65, 1.05))
+
+
+KINDS = {
+    Pinhole: "pinhole",
+    OpenCV: "opencv",
+    Fisheye: "fisheye",
+    ThinPrismFisheye: "thin_prism_fisheye",
+}
 
 
 @dataclass(frozen=True)
@@ -38,7 +46,7 @@ class Calibrated:
 
     def dictionary(self, **others) -> dict:
         common = self.view.sensor()
-        kind = {Pinhole: "pinhole", OpenCV: "opencv", Fisheye: "fisheye"}[type(self.lens)]
+        kind = KINDS[type(self.lens)]
         moves = {} if self.close is None else {"to_world_close": transform(self.close)}
         return {
             "type": "calibrated",
@@ -94,6 +102,9 @@ OPENCV = Calibrated("opencv", LENSES["rational"])
 FISHEYE = Calibrated("fisheye", LENSES["fisheye"], f=(13.0, 14.5))
 
 
+THIN_PRISM = Calibrated("thin prism", LENSES["thin prism"], f=(13.0, 14.5))
+
+
 FILM = View("", 37, 29)  # without a crop window
 
 
@@ -101,7 +112,7 @@ FILM = View("", 37, 29)  # without a crop window
 BARREL = Calibrated("barrel", LENSES["barrel"], FILM, f=(26.0, 26.0), c=(19.0, 14.0))
 
 
-STILL = [PINHOLE, OPENCV, FISHEYE]
+STILL = [PINHOLE, OPENCV, FISHEYE, THIN_PRISM]
 
 
 by_name = {"ids": lambda sensor: sensor.name}

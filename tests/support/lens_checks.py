@@ -26,7 +26,7 @@ from support.lens_scenes import (
 every_lens = pytest.mark.parametrize("name", LENSES)
 
 
-FORMS = ("rational", "barrel", "fisheye", "orthographic")
+FORMS = ("rational", "barrel", "fisheye", "thin prism", "orthographic")
 """One of each form; of a barrel, pixels that show nothing. Where Dr.Jit differentiates, or kernels
 take long to compile, the others, which are these without some terms, tell no more."""
 

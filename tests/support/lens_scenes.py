@@ -8,13 +8,13 @@ from functools import cache
 import drjit as dr
 import numpy as np
 
-from drgs.cameras import fisheye, orthographic, thin_lens
+from drgs.cameras import fisheye, orthographic, thin_lens, thin_prism_fisheye
 from drgs.cameras.camera import Camera
 from drgs.cameras.radial_tangential import RadialTangential
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 from drgs.reference import effects
 from drgs.reference import splatting as reference
-from drgs.reference.effects import Fisheye, OpenCV, Orthographic
+from drgs.reference.effects import Fisheye, OpenCV, Orthographic, ThinPrismFisheye
 from drgs.splatting import rendering
 from support.helpers import (
     Case,
@@ -24,6 +24,7 @@ from support.helpers import (
     render_composed,
     single,
 )
+from support.reference_lenses import FISHEYE, THIN_PRISM
 
 # ----------------------------------------------------------------------------------------------
 # Lenses
@@ -42,7 +43,8 @@ LENSES = {
     ),
     "barrel": OpenCV(k1=-0.3125),
     "plain fisheye": Fisheye(),
-    "fisheye": Fisheye(-0.03125, 0.015625, -0.0078125, 0.001953125),
+    "fisheye": FISHEYE,
+    "thin prism": THIN_PRISM,
     "orthographic": Orthographic(),
 }
 
@@ -55,6 +57,8 @@ def kernel_lens(lens: effects.Lens) -> object:
     given = {name: value for name, value in asdict(lens).items() if value != 0}
     if isinstance(lens, OpenCV):
         return RadialTangential.of(**given)
+    if isinstance(lens, ThinPrismFisheye):
+        return thin_prism_fisheye.ThinPrismFisheye.of(**given)
     return fisheye.Fisheye.of(**given) if isinstance(lens, Fisheye) else orthographic.Orthographic()
 
 
@@ -71,12 +75,16 @@ def points_at(lens: effects.Lens, camera: reference.Camera, film, distances) -> 
     """Points (N, 3), camera axes, that are seen at ``film`` (N, 2), px; NaN where nothing is.
 
     distances (N,): z, or from the centre where that is the depth. By the inverse of the reference:
-    Newton's method with halved steps, or a table of the angle.
+    Newton's method with halved steps, or from a table of the angle.
     """
     plane = (film - [camera.cx, camera.cy]) / [camera.fx, camera.fy]
     if isinstance(lens, Orthographic):
         return np.column_stack([plane, distances])
-    if isinstance(lens, Fisheye):
+    if isinstance(lens, ThinPrismFisheye):
+        places = lens.undistorted(plane)
+        angles = np.linalg.norm(places, axis=1)
+        directions = np.column_stack([np.sinc(angles / np.pi)[:, None] * places, np.cos(angles)])
+    elif isinstance(lens, Fisheye):
         directions = _fisheye_directions(lens, plane)
     else:
         slopes = lens.undistorted(plane) if isinstance(lens, OpenCV) else plane

@@ -13,6 +13,7 @@ from support.helpers import single
 
 from drgs.cameras.fisheye import Fisheye
 from drgs.cameras.radial_tangential import RadialTangential
+from drgs.cameras.thin_prism_fisheye import ThinPrismFisheye
 from drgs.core.errors import UserError
 from drgs.data.images import smaller_view
 from drgs.data.types import Motion
@@ -346,6 +347,7 @@ LENSES = {
     "opencv": RadialTangential.of(k1=0.1, p2=-0.02),
     "rational": RadialTangential.of(k1=0.1, k4=0.25),
     "fisheye": Fisheye.of(k1=0.05, k2=-0.01),
+    "thin prism": ThinPrismFisheye.of(k1=0.05, p2=-0.01, sx1=0.02),
 }
 
 

@@ -1,0 +1,149 @@
+"""Distortion within a plane: mostly along the radius, somewhat beside it.
+
+What lenses with tangential terms share, whatever their plane is: that of slopes
+(``drgs.cameras.radial_tangential``) or that of angles (``drgs.cameras.thin_prism_fisheye``).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any, Protocol
+
+import drjit as dr
+import numpy as np
+
+from drgs.cameras.polynomials import first_root, radius_at
+from drgs.core.arrays import types_of
+
+NEWTON_STEPS = 5
+"""For terms beside the radial ones: small beside these, the search starts nearby."""
+
+
+class PlaneDistortion(Protocol):
+    """Places (x, y) of a plane as the film shows them: with r^2 = x^2 + y^2 and a factor L(r^2),
+
+        x' = L x + 2 p1 x y + p2 (r^2 + 2 x^2),  y' = L y + p1 (r^2 + 2 y^2) + 2 p2 x y
+
+    (Brown 1966). It is one-to-one where r^2 is below ``max_squared_radius``.
+    """
+
+    tangential: tuple[Any, ...]  # p1, p2; or none
+    max_squared_radius: Any  # where the model ends
+
+    def radial(self, squared: Any) -> Any:
+        """L at r^2."""
+        ...
+
+    def radial_derivative(self, squared: Any) -> Any:
+        """d L / d r^2."""
+        ...
+
+    def is_radial(self) -> bool:
+        """Whether places are moved along their radius alone."""
+        return not self.tangential
+
+    def distort(self, x: Any, y: Any) -> tuple[Any, Any]:
+        """Places as the film shows them."""
+        squared = x * x + y * y
+        radial = self.radial(squared)
+        if not self.tangential:
+            return radial * x, radial * y
+        p1, p2 = self.tangential
+        return (
+            radial * x + 2 * p1 * (x * y) + p2 * (squared + 2 * x * x),
+            radial * y + p1 * (squared + 2 * y * y) + 2 * p2 * (x * y),
+        )
+
+    def distortion_jacobian(self, x: Any, y: Any) -> tuple[Any, Any, Any, Any]:
+        """d x' / d x, d x' / d y, d y' / d x, d y' / d y."""
+        squared = x * x + y * y
+        radial, slope = self.radial(squared), 2 * self.radial_derivative(squared)
+        xx, xy, yy = radial + slope * x * x, slope * (x * y), radial + slope * y * y
+        if not self.tangential:
+            return xx, xy, xy, yy
+        p1, p2 = self.tangential
+        xx, xy = xx + 2 * p1 * y + 6 * p2 * x, xy + 2 * p1 * x + 2 * p2 * y
+        return xx, xy, xy, yy + 6 * p1 * y + 2 * p2 * x
+
+    def undistort(self, x: Any, y: Any) -> tuple[Any, Any]:
+        """The places that :meth:`distort` sends to (x, y).
+
+        Where there are none, the result is finite and means nothing: :meth:`is_within` and a second
+        look tell. The search is not differentiated, but its last step: a step of Newton's method
+        from the solution has the solution's derivative (the implicit function theorem).
+        """
+        with dr.suspend_grad():
+            length = dr.sqrt(x * x + y * y)
+            radius = radius_at(self._radius, length, dr.sqrt(self.max_squared_radius))
+            # In the middle, radius and length are the same.
+            scale = dr.select(length > 0, radius / dr.select(length > 0, length, 1), 1)
+            u, v = scale * x, scale * y
+            if not self.is_radial():
+                _, u, v = dr.while_loop(
+                    state=(types_of(type(x)).UInt32(0), u, v),
+                    cond=lambda count, u, v: count < NEWTON_STEPS,
+                    body=lambda count, u, v: (count + 1, *self._step(u, v, x, y)),
+                    labels=("count", "u", "v"),
+                )
+        return self._step(u, v, x, y)
+
+    def _radius(self, radius: Any) -> tuple[Any, Any]:
+        """Distance from the middle at which a radius is seen, by the radial terms alone."""
+        squared = radius * radius
+        radial = self.radial(squared)
+        return radial * radius, radial + 2 * squared * self.radial_derivative(squared)
+
+    def _step(self, u: Any, v: Any, x: Any, y: Any) -> tuple[Any, Any]:
+        """One step of Newton's method towards (x, y), unless it would leave the lens model."""
+        at_x, at_y = self.distort(u, v)
+        dx, dy = x - at_x, y - at_y
+        with dr.suspend_grad():
+            jacobian = self.distortion_jacobian(u, v)
+            xx, xy, yx, yy = jacobian
+            per_determinant = 1 / (xx * yy - xy * yx)
+            xx, xy, yx, yy = (value * per_determinant for value in jacobian)
+        following = u + (yy * dx - xy * dy), v + (xx * dy - yx * dx)
+        inside = self.is_within(*following)
+        return tuple(dr.select(inside, b, a) for a, b in zip((u, v), following, strict=True))
+
+    def is_within(self, x: Any, y: Any) -> Any:
+        """Whether places are in the part that the model is made for."""
+        return x * x + y * y < self.max_squared_radius
+
+
+def steepest_fall(tangential: Sequence[float], prism: Sequence[float] = (0.0, 0.0)) -> float:
+    """c >= 0, with -c r the least eigenvalue that terms beside the radial ones have at a radius r.
+
+    Of the symmetric part of their Jacobian, in the direction in which it is least. tangential: p1,
+    p2; prism: sx1, sy1, of terms sx1 r^2 in x' and sy1 r^2 in y'. At w = (x, y), with p = (p2, p1)
+    and s = (sx1, sy1), all of them are r^2 (p + s) + 2 (p . w) w, the symmetric part is
+    q w^T + w q^T + 2 (p . w) I with q = 2 p + s, and its least eigenvalue (4 p + s) . w - r |q|.
+    """
+    p, s = np.array(tangential)[::-1], np.array(prism)
+    return math.hypot(*(4 * p + s)) + math.hypot(*(2 * p + s))
+
+
+def largest_squared_radius(
+    numerator: Sequence[float], denominator: Sequence[float], fall: float
+) -> float:
+    """r^2 within which no two places are distorted to the same; inf: wherever they are.
+
+    numerator, denominator: of L, coefficients of r^2, r^4, ... beside 1. fall: the
+    :func:`steepest_fall` of the other terms.
+
+    With L = N / D and u = r^2, the radial part's Jacobian has the eigenvalues A = G / D^2, with
+    G = N D + 2 u (N' D - N D'), along the radius, and L across it. While both are larger than
+    ``fall`` r, the symmetric part of the whole Jacobian is positive definite (Weyl's inequality),
+    and its map one-to-one: from one place of a disc to another, what the film shows moves with them
+    all the way. The bound is reached where A <= L, on one side.
+    """
+    u = np.polynomial.Polynomial([0.0, 1.0])
+    n, d = (np.polynomial.Polynomial([1.0, *c]) for c in (numerator, denominator))
+    growth = n * d + 2 * u * (n.deriv() * d - n * d.deriv())
+    first = min(first_root(growth.coef), first_root(d.coef))
+    if fall == 0:
+        return first
+    r = u
+    folds = (growth(r**2) - fall * r * d(r**2) ** 2, n(r**2) - fall * r * d(r**2))
+    return min(first, *(first_root(fold.coef) ** 2 for fold in folds))

@@ -1,0 +1,137 @@
+"""COLMAP's fisheye lens with tangential and thin prism terms.
+
+Imported when a sensor or a dataset has one. Coefficients and what lies beyond the lens model: as in
+``drgs.cameras.radial_tangential``.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar
+
+import drjit as dr
+
+from drgs.cameras.camera import Camera
+from drgs.cameras.distortion import PlaneDistortion, largest_squared_radius, steepest_fall
+from drgs.cameras.fisheye import MAX_ANGLE, Fisheye, place_directions, place_of
+from drgs.cameras.polynomials import derivative, polynomial, up_to_the_last
+from drgs.core.arrays import types_of
+
+RADIAL, TANGENTIAL, PRISM = ("k1", "k2", "k3", "k4"), ("p1", "p2"), ("sx1", "sy1")
+"""Names of coefficients."""
+
+
+@dataclass(frozen=True)
+class ThinPrismFisheye(PlaneDistortion, Fisheye):
+    """A fisheye whose elements are not quite centred and not quite upright.
+
+    A point at the angle theta from the axis is at (u, v) in a fisheye without coefficients, theta
+    from the principal point in its direction. With r^2 = u^2 + v^2 = theta^2 and
+    L = 1 + k1 r^2 + k2 r^4 + k3 r^6 + k4 r^8, this one shows it at
+
+        u' = L u + 2 p1 u v + p2 (r^2 + 2 u^2) + sx1 r^2
+        v' = L v + p1 (r^2 + 2 v^2) + 2 p2 u v + sy1 r^2
+
+    (COLMAP's model THIN_PRISM_FISHEYE, in its ``sensor/models.h``; thin prisms: Weng, Cohen and
+    Herniou 1992). What is seen, and what depth is: as with :class:`drgs.cameras.fisheye.Fisheye`;
+    COLMAP itself shows nothing beside and behind the camera.
+    """
+
+    label: ClassVar[str] = "ThinPrismFisheye"
+    kind: ClassVar[str] = "thin_prism_fisheye"
+    names: ClassVar[tuple[str, ...]] = (*RADIAL, *TANGENTIAL, *PRISM)
+
+    tangential: tuple[Any, ...] = ()  # p1, p2; or none
+    prism: tuple[Any, ...] = ()  # sx1, sy1; or none
+
+    @staticmethod
+    def of(**coefficients: float) -> ThinPrismFisheye:
+        """From COLMAP's names, ``k1`` to ``k4``, ``p1``, ``p2``, ``sx1``, ``sy1``; others are 0."""
+        assert set(coefficients) <= set(ThinPrismFisheye.names)
+        kept = up_to_the_last(RADIAL, coefficients)
+        tangential, prism = (_both_or_none(names, coefficients) for names in (TANGENTIAL, PRISM))
+        fall = steepest_fall(tangential or (0.0, 0.0), prism or (0.0, 0.0))
+        angle = min(math.sqrt(largest_squared_radius(kept, (), fall)), MAX_ANGLE)
+        return ThinPrismFisheye(kept, math.cos(angle), tangential, prism)
+
+    def named(self) -> dict[str, Any]:
+        """The coefficients that are not left out, by COLMAP's names."""
+        tangential = dict(zip(TANGENTIAL, self.tangential, strict=False))
+        prism = dict(zip(PRISM, self.prism, strict=False))
+        return {**super().named(), **tangential, **prism}
+
+    def with_named(self, values: dict[str, Any]) -> ThinPrismFisheye:
+        """Other numbers for the same coefficients; where the model ends stays as it is."""
+        return replace(
+            super().with_named(values),
+            tangential=tuple(values[name] for name in TANGENTIAL if self.tangential),
+            prism=tuple(values[name] for name in PRISM if self.prism),
+        )
+
+    @property
+    def max_squared_radius(self) -> Any:
+        """Of (u, v), where the model ends."""
+        return dr.square(dr.acos(self.min_cosine))
+
+    def radial(self, squared: Any) -> Any:
+        """L at r^2."""
+        return polynomial(self.coefficients, squared)
+
+    def radial_derivative(self, squared: Any) -> Any:
+        """d L / d r^2."""
+        return derivative(self.coefficients, squared)
+
+    def is_radial(self) -> bool:
+        """Whether places are moved along their radius alone."""
+        return not (self.tangential or self.prism)
+
+    def distort(self, x: Any, y: Any) -> tuple[Any, Any]:
+        """Places as the film shows them."""
+        shown_x, shown_y = super().distort(x, y)
+        if not self.prism:
+            return shown_x, shown_y
+        squared, (sx1, sy1) = x * x + y * y, self.prism
+        return shown_x + sx1 * squared, shown_y + sy1 * squared
+
+    def distortion_jacobian(self, x: Any, y: Any) -> tuple[Any, Any, Any, Any]:
+        """d x' / d x, d x' / d y, d y' / d x, d y' / d y."""
+        xx, xy, yx, yy = super().distortion_jacobian(x, y)
+        if not self.prism:
+            return xx, xy, yx, yy
+        sx1, sy1 = self.prism
+        return xx + 2 * sx1 * x, xy + 2 * sx1 * y, yx + 2 * sy1 * x, yy + 2 * sy1 * y
+
+    # What kernels call, where it is not what a fisheye does: see ``drgs.cameras.camera``.
+
+    def film_point(self, camera: Camera, position: Any) -> Any:
+        """Where a point is on the film, Array2f, px."""
+        place = types_of(type(position.x)).Array2f(*self.distort(*place_of(position)))
+        return camera.focal * place + camera.principal
+
+    def film_directions(self, camera: Camera, position: Any, slopes: None) -> list[Any]:
+        """Derivatives of the place on the film, two Array3f, world."""
+        del slopes
+        xx, xy, yx, yy = self.distortion_jacobian(*place_of(position))
+        dx, dy = place_directions(camera, position)
+        return [camera.focal.x * (xx * dx + xy * dy), camera.focal.y * (yx * dx + yy * dy)]
+
+    def ray(self, camera: Camera, x: Any, y: Any) -> Any:
+        """Through a point of the film (px), Array3f, camera axes, of unit length."""
+        t = types_of(type(x))
+        film = (t.Array2f(x, y) - camera.principal) / camera.focal
+        u, v = self.undistort(film.x, film.y)
+        squared = u * u + v * v
+        off_axis = squared > 0
+        angle = dr.sqrt(dr.select(off_axis, squared, 1))
+        sine, cosine = dr.sincos(angle)
+        scale = dr.select(off_axis, sine / angle, 1)
+        return t.Array3f(scale * u, scale * v, dr.select(off_axis, cosine, 1))
+
+
+def _both_or_none(names: Sequence[str], given: Mapping[str, float]) -> tuple[float, ...]:
+    """Coefficients, where one is given; zero for one that is not."""
+    if not set(names) & set(given):
+        return ()
+    return tuple(float(given.get(name, 0.0)) for name in names)
