@@ -36,6 +36,7 @@ CAMERA_MODELS = (
     "SIMPLE_RADIAL_FISHEYE",
     "RADIAL_FISHEYE",
     "OPENCV_FISHEYE",
+    "THIN_PRISM_FISHEYE",
 )
 """Those that can be looked for; the fits' lenses show all of them."""
 
