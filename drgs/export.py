@@ -18,13 +18,14 @@ import numpy as np
 from drgs.cli.commands import CommandParser, file_or_folder, finite_number, run_command
 from drgs.config.approximations import DECLARED, said_by
 from drgs.core.errors import UserError, UserNote, did_you_mean, one_line
+from drgs.core.files import atomic_path
 from drgs.core.records import FolderRecord
 from drgs.data.orbits import up_of
 from drgs.data.viewpoints import read_viewpoints
 from drgs.effects.smoothing import baked
 from drgs.gaussians.cleaning import Selection, taken, turned_towards
-from drgs.gaussians.parameters import Gaussians
-from drgs.io.formats import FORMATS, format_of
+from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
+from drgs.io.formats import FORMATS, Format, format_of
 from drgs.io.morton import morton_order
 from drgs.results.files import CONFIG, GAUSSIANS, GAUSSIANS_FOR_VIEWERS, VIEWS
 
@@ -56,20 +57,32 @@ class Target:
 
     suffix: str  # of files, in small letters
     text: str  # what it is, one phrase
-    write: Callable[[Source, Path], None]
+    encode: Callable[[Source], bytes]  # equal Gaussians give equal bytes
     up: np.ndarray  # (3,) what programs take for up
     has_axes: bool = False  # whether the format says so: then models are always turned
 
 
-def _write_file(source: Source, path: Path) -> None:
-    source.gaussians.save(path)
+def _usd(source: Source) -> bytes:
+    from drgs.io.usd import encode
+
+    return encode({name: getattr(source.gaussians, name) for name in PARAMETER_NAMES})
+
+
+def _of_format(each: Format) -> Target:
+    return Target(
+        each.suffix,
+        each.text,
+        lambda source: source.gaussians.to_bytes(each.name),
+        Z_UP if each.y_up else Y_DOWN,
+        has_axes=each.y_up,
+    )
 
 
 TARGETS = {
-    each.name: Target(
-        each.suffix, each.text, _write_file, Z_UP if each.y_up else Y_DOWN, has_axes=each.y_up
-    )
-    for each in FORMATS
+    **{each.name: _of_format(each) for each in FORMATS},
+    "usd": Target(
+        ".usdc", "OpenUSD's ParticleField3DGaussianSplat (extra usd)", _usd, Z_UP, has_axes=True
+    ),
 }
 """By the name that ``--format`` takes."""
 
@@ -149,11 +162,12 @@ def run(args: argparse.Namespace) -> None:
         gaussians = turned_towards(gaussians, up, target.up)
     if args.order == "morton":
         gaussians = taken(gaussians, morton_order(gaussians.means))
-    record = FolderRecord(out.parent, COMMAND)
-    record.claim([out.name])
-    target.write(replace(source, gaussians=gaussians), out)
+    content = target.encode(replace(source, gaussians=gaussians))
+    FolderRecord(out.parent, COMMAND).claim([out.name])
+    with atomic_path(out) as temporary:
+        temporary.write_bytes(content)
     FolderRecord(out.parent, COMMAND).seal()
-    print(f"written: {out} ({out.stat().st_size / 1e6:.1f} MB)")
+    print(f"written: {out} ({len(content) / 1e6:.1f} MB)")
 
 
 # ----------------------------------------------------------------------------------------------

@@ -1,11 +1,19 @@
 """``drgs.export``: fits and files for other programs."""
 
+import sys
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from support.commands import assert_ends_well, assert_refused
-from support.formats import FLOAT32, PRECISION, assert_within, gaussians_within_ranges, matched
+from support.formats import (
+    FLOAT32,
+    PRECISION,
+    assert_within,
+    gaussians_within_ranges,
+    matched,
+    turned,
+)
 from support.small_capture import make_dataset
 
 from drgs import export
@@ -93,6 +101,38 @@ def test_smoothing_is_baked_in(tmp_path):
     np.testing.assert_allclose(found.opacities, gaussians.opacities * kept, rtol=1e-5)
 
 
+def test_usd_is_written_where_openusd_is_installed(model):
+    pxr = pytest.importorskip("pxr.UsdVol")
+    from pxr import Usd, UsdGeom
+
+    run(model, "--format", "usd", "--up", 0, -1, 0)
+    stage = Usd.Stage.Open(str(model.with_name("model.usdc")))
+    assert UsdGeom.GetStageUpAxis(stage) == "Z"
+    splats = pxr.ParticleField3DGaussianSplat(stage.GetDefaultPrim())
+    expected = turned(Gaussians.load(model), [[1, 0, 0], [0, 0, 1], [0, -1, 0]])
+    quats = [[q.GetReal(), *q.GetImaginary()] for q in splats.GetOrientationsAttr().Get()]
+    harmonics = np.array(splats.GetRadianceSphericalHarmonicsCoefficientsAttr().Get())
+    harmonics = harmonics.reshape(300, 4, 3)
+    opacities = np.array(splats.GetOpacitiesAttr().Get(), np.float64)
+    found = Gaussians(
+        means=np.array(splats.GetPositionsAttr().Get()),
+        quats=np.array(quats),
+        log_scales=np.log(np.array(splats.GetScalesAttr().Get())),
+        logit_opacities=np.log(opacities / (1 - opacities)),
+        sh0=harmonics[:, :1],
+        shN=harmonics[:, 1:],
+    )
+    precision = replace(PRECISION["glb"], means=4 * FLOAT32, harmonics=8 * FLOAT32)
+    assert_within(precision, expected, found)
+    assert splats.GetRadianceSphericalHarmonicsDegreeAttr().Get() == 1
+
+
+def test_without_openusd_a_line_says_what_to_install(model, monkeypatch):
+    monkeypatch.setitem(sys.modules, "pxr", None)
+    message = "USD needs OpenUSD: pip install 'drgs[usd]'"
+    assert_refused(export.main, model, "--format", "usd", folder=model.parent, message=message)
+
+
 # ----------------------------------------------------------------------------------------------
 # What is kept, and how it lies
 # ----------------------------------------------------------------------------------------------
@@ -160,7 +200,10 @@ def test_files_that_say_nothing_of_axes_are_not_turned_unasked(fit, model):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["model.ply"], "--format: must be one of ply, compressed-ply, spz, glb, splat, got none"),
+        (
+            ["model.ply"],
+            "one of ply, compressed-ply, spz, glb, splat, usd, got none",
+        ),
         (["model.ply", "--format", "splt"], "got splt; did you mean splat?"),
         (["model.ply", "--out", "a.obj"], "--format: must be one of"),
         (["model.ply", "--format", "spz", "--out", "a.glb"], "name of a spz file must end in .spz"),

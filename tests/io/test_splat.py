@@ -31,7 +31,7 @@ def test_a_row_is_read_as_the_format_says(tmp_path):
 
 def test_rows_fall_by_opacity_times_volume(tmp_path):
     gaussians = gaussians_within_ranges(100)
-    with pytest.warns(UserNote, match=r"a.splat: the format has no room for harmonics"):
+    with pytest.warns(UserNote, match=r"the format splat has no room for harmonics: left out"):
         gaussians.save(tmp_path / "a.splat")
     importance = gaussians.opacities * gaussians.scales.prod(axis=1)
     order = np.argsort(-importance)
