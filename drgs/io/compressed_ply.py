@@ -177,7 +177,7 @@ def read_gaussians(path: str | Path) -> tuple[dict[str, np.ndarray], dict[str, S
         "sh0": ((color - 0.5) / SH_C0)[:, None, :],
         "shN": _harmonics(path, rows.get("sh"), len(vertex)),
     }
-    return {name: values.astype(np.float32) for name, values in arrays.items()}, statements
+    return {n: np.ascontiguousarray(v, np.float32) for n, v in arrays.items()}, statements
 
 
 def _checked_bounds(path: str | Path, rows: Mapping[str, np.ndarray], colors: bool) -> np.ndarray:
@@ -257,7 +257,8 @@ def _harmonics(path: str | Path, sh: np.ndarray | None, num: int) -> np.ndarray:
             f"the {num:,} vertices, got {len(sh):,} rows of {len(names)}"
         )
     _check_unsigned(path, "sh", sh, names, 1)
-    levels = np.column_stack([sh[name] for name in names])
-    parts = np.select([levels == 0, levels == SH_LEVELS - 1], [0, 1], (levels + 0.5) / SH_LEVELS)
-    rest = (parts - 0.5) * (2 * SH_RANGE)
+    parts = (np.arange(SH_LEVELS) + 0.5) / SH_LEVELS
+    parts[[0, -1]] = 0, 1
+    values = ((parts - 0.5) * (2 * SH_RANGE)).astype(np.float32)
+    rest = values[np.column_stack([sh[name] for name in names])]
     return rest.reshape(num, 3, -1).transpose(0, 2, 1)

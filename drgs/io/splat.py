@@ -29,6 +29,10 @@ from drgs.io.quantized import (
 MAX_BYTES = 1 << 33
 """Of a file: 8.6 GB."""
 
+MAX_NUMBER = 1e12
+"""Of a position or scale, in size: letters, read as numbers, are larger. There is no other sign by
+which a file of another kind could be told."""
+
 ROW = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("quat", "u1", 4)])
 
 
@@ -71,14 +75,15 @@ def read_gaussians(path: str | Path) -> tuple[dict[str, np.ndarray], dict[str, S
             "each Gaussian, at least one; it is damaged, or was cut off"
         )
     rows = np.frombuffer(content, ROW)
-    for name, kind in (("mean", "finite"), ("scale", "finite and not negative")):
+    for name, least in (("mean", -MAX_NUMBER), ("scale", 0)):
         values = rows[name]
-        bad = np.argwhere(~(np.isfinite(values) & ((values >= 0) | (name == "mean"))))
+        bad = np.argwhere(~((values >= least) & (values <= MAX_NUMBER)))
         if len(bad):
             row, axis = bad[0]
             at = row * ROW.itemsize + ROW.fields[name][1] + 4 * axis
             raise UserError(
-                f"{Place(path, 'byte', at)}: a {name} must be {kind}, got {values[row, axis]}"
+                f"{Place(path, 'byte', at)}: a {name} must be from {least:g} to {MAX_NUMBER:g}, got "
+                f"{values[row, axis]}; is it a .splat file?"
             )
     colors = rows["rgba"][:, :3] / 255
     arrays = {

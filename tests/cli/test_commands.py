@@ -43,7 +43,7 @@ def test_modules_are_commands_too_and_say_how_they_are_called(capsys, command):
     [
         (
             ["fot"],
-            "there is no command fot, only fit, render, export, capture and bench; did you mean fit",
+            "no command fot, only fit, render, export, capture and bench; did you mean fit",
         ),
         (["rendre"], "did you mean render?"),
         (

@@ -93,10 +93,11 @@ def test_extensions_are_passed_over(tmp_path):
     content = unpacked(gaussians_within_ranges(5))
     expected, _ = read_gaussians(written(tmp_path / "a.spz", content))
     path = written(tmp_path / "b.spz", content + b"of a vendor" * 99)
-    assert "the end was expected behind the harmonics" in refusal(path)
+    assert "the end was expected, and more follows" in refusal(path)
     content[FLAGS] |= 2
     found, _ = read_gaussians(written(path, content + b"of a vendor" * 99))
     assert all((found[name] == expected[name]).all() for name in expected)
+    assert "more follows" in refusal(written(path, content + bytes(1 << 25)))
 
 
 @pytest.mark.parametrize(
