@@ -188,7 +188,9 @@ def read_gaussians(path: str | Path) -> tuple[dict[str, np.ndarray], dict[str, S
     reader.check(f"{EXTENSION}:SCALE", scales, 0, np.inf, "linear, so not negative")
     opacities = reader.values(f"{EXTENSION}:OPACITY", 1)
     reader.check(f"{EXTENSION}:OPACITY", opacities, 0, 1, "from 0 to 1")
-    harmonics = np.stack([reader.values(name, 3) for name in _harmonics(count)], axis=1)
+    harmonics = np.stack(
+        [reader.values(name, 3).astype(np.float32) for name in _harmonics(count)], axis=1
+    )
     arrays = {
         "means": means,
         "quats": np.roll(reader.values(f"{EXTENSION}:ROTATION", 4), 1, axis=1),

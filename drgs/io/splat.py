@@ -43,16 +43,22 @@ def encode(
 
     gaussians: finite, by the names that :func:`drgs.io.ply.read_gaussians` gives; harmonics above
     degree 0 are left out. rendered_with: has no place.
+
+    Raises :class:`UserError` for positions of more than :data:`MAX_NUMBER`.
     """
     del rendered_with
     g = gaussians
+    if (extent := np.abs(g["means"]).max()) > MAX_NUMBER:
+        raise UserError(
+            f"the format splat holds positions of at most {MAX_NUMBER:g}, got {extent:g}; crop or "
+            "scale the scene"
+        )
     opacities = opacities_of(g["logit_opacities"])
     log_scales = g["log_scales"].astype(np.float64)
     importance = log_scales.sum(axis=1) + np.log(opacities)
     rows = np.empty(len(opacities), ROW)
     rows["mean"] = g["means"]
-    largest = np.log(float(np.finfo(np.float32).max))
-    rows["scale"] = np.exp(np.minimum(log_scales, largest)).astype(np.float32)
+    rows["scale"] = np.exp(np.minimum(log_scales, np.log(MAX_NUMBER))).astype(np.float32)
     colors = 0.5 + SH_C0 * g["sh0"][:, 0].astype(np.float64)
     rows["rgba"] = rounded(np.column_stack([colors, opacities]) * 255, 255)
     rows["quat"] = rounded(unit_quaternions(g["quats"]) * 128 + 128, 255)
@@ -82,8 +88,8 @@ def read_gaussians(path: str | Path) -> tuple[dict[str, np.ndarray], dict[str, S
             row, axis = bad[0]
             at = row * ROW.itemsize + ROW.fields[name][1] + 4 * axis
             raise UserError(
-                f"{Place(path, 'byte', at)}: a {name} must be from {least:g} to {MAX_NUMBER:g}, got "
-                f"{values[row, axis]}; is it a .splat file?"
+                f"{Place(path, 'byte', at)}: a {name} must be from {least:g} to {MAX_NUMBER:g}, "
+                f"got {values[row, axis]}; is it a .splat file?"
             )
     colors = rows["rgba"][:, :3] / 255
     arrays = {

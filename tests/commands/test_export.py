@@ -3,6 +3,7 @@
 import sys
 from dataclasses import replace
 
+import mitsuba as mi
 import numpy as np
 import pytest
 from support.commands import assert_ends_well, assert_refused
@@ -14,9 +15,9 @@ from support.formats import (
     matched,
     turned,
 )
-from support.small_capture import make_dataset
+from support.small_capture import blobs, make_dataset
 
-from drgs import export
+from drgs import export, render
 from drgs.gaussians.parameters import Gaussians
 from drgs.io.formats import FORMATS, read_gaussians
 from drgs.results.refined_cameras import write_views
@@ -87,6 +88,24 @@ def test_a_file_that_is_meant_for_drgs_is_exported_with_a_hint(fit):
     outcome = run(fit / "point_cloud.ply", "--out", fit.with_name("a.compressed.ply"))
     assert f"export {fit}/point_cloud_viewers.ply instead" in outcome.stdout
     assert Gaussians.load(fit.with_name("a.compressed.ply")).rendered_with == OTHERWISE
+
+
+@pytest.mark.parametrize("suffix", [".compressed.ply", ".spz", ".glb"])
+def test_what_is_written_is_rendered_and_loaded_by_the_plugin(tmp_path, suffix):
+    blobs().save(tmp_path / f"model{suffix}")
+    Gaussians.load(tmp_path / f"model{suffix}").save(tmp_path / "again.ply")
+    camera = ["--origin", 0, -4, 1, "--size", 24, 16]
+    for name in (f"model{suffix}", "again.ply"):
+        render.main(
+            [str(word) for word in (tmp_path / name, *camera, "--out", tmp_path / name[:5])]
+        )
+    pictures = [(tmp_path / folder / "camera.png").read_bytes() for folder in ("model", "again")]
+    assert pictures[0] == pictures[1]
+    mi.set_variant("llvm_ad_rgb")
+    plugin = mi.load_dict({"type": "splats", "filename": str(tmp_path / f"model{suffix}")})
+    expected = Gaussians.load(tmp_path / "again.ply")
+    np.testing.assert_array_equal(np.array(plugin.gaussians.means), expected.means)
+    np.testing.assert_array_equal(np.array(plugin.gaussians.shN), expected.shN)
 
 
 def test_smoothing_is_baked_in(tmp_path):
