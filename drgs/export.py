@@ -21,7 +21,7 @@ from drgs.core.errors import UserError, UserNote, did_you_mean, one_line
 from drgs.core.files import atomic_path
 from drgs.core.records import FolderRecord
 from drgs.data.orbits import up_of
-from drgs.data.viewpoints import read_viewpoints
+from drgs.data.viewpoints import near_one, read_viewpoints
 from drgs.effects.smoothing import baked
 from drgs.gaussians.cleaning import Selection, taken, turned_towards
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
@@ -289,11 +289,11 @@ def _direction(words: Sequence[str]) -> np.ndarray:
         up = np.array([float(word) for word in words])
     except ValueError:
         up = np.zeros(0)
-    length = np.linalg.norm(up)
-    if up.shape != (3,) or not (np.isfinite(length) and length > 0):
+    if up.shape != (3,) or not np.isfinite(up).all() or not up.any():
         got = one_line(" ".join(words), 60)
         raise UserError(f"--up: must be cameras, or three numbers not all zero, got {got}")
-    return up / length
+    up = near_one(up)
+    return up / np.linalg.norm(up)
 
 
 def _snapped(up: np.ndarray) -> np.ndarray:

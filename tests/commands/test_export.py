@@ -190,7 +190,7 @@ def test_what_is_up_in_the_model_is_up_in_the_file(model, suffix, up):
     """That of a format that says so; y points down in the others, as in COLMAP's worlds."""
     out = model.with_name(f"out{suffix}")
     direction = np.array([0.0, 3, 4]) / 5
-    run(model, "--out", out, "--up", *(5 * direction))
+    run(model, "--out", out, "--up", *(1e300 * direction))  # of any length
     heights = np.sort(Gaussians.load(model).means @ direction)
     precision = PRECISION["compressed-ply"].means * 2 if "ply" in suffix else 1e-3
     np.testing.assert_allclose(np.sort(means_of(out) @ np.array(up)), heights, atol=precision)
@@ -232,6 +232,7 @@ def test_files_that_say_nothing_of_axes_are_not_turned_unasked(fit, model):
         ([".", "--format", "spz"], "must be the output folder of a fit that has ended"),
         (["model.ply", "--format", "spz", "--up", "cameras"], "--up cameras: needs the output"),
         (["model.ply", "--format", "spz", "--up", "0", "0", "0"], "--up: must be cameras, or thr"),
+        (["model.ply", "--format", "spz", "--up", "inf", "0", "0"], "--up: must be cameras, or t"),
         (["model.ply", "--format", "spz", "--min-opacity", "2"], "--min-opacity: must be between"),
         (["model.ply", "--format", "spz", "--max-size", "0"], "--max-size: must be above 0, got 0"),
         (["model.ply", "--format", "spz", "--max-size", "1e-9"], "nothing is left; crop and filt"),
