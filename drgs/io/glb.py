@@ -54,6 +54,8 @@ POINTS = 0
 COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5126: "<f4"}
 """By number, the types of components that splats may have."""
 
+NOT_NEGATIVE = "linear, so not negative (drafts of the extension had logarithms)"
+
 KINDS = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
 """By number of components."""
 
@@ -185,13 +187,7 @@ def read_gaussians(path: str | Path) -> tuple[dict[str, np.ndarray], dict[str, S
     reader = _Attributes(path, document, binary, start)
     means = reader.values("POSITION", 3)
     scales = reader.values(f"{EXTENSION}:SCALE", 3)
-    reader.check(
-        f"{EXTENSION}:SCALE",
-        scales,
-        0,
-        np.inf,
-        "linear, so not negative, as they were in drafts of the extension",
-    )
+    reader.check(f"{EXTENSION}:SCALE", scales, 0, np.inf, NOT_NEGATIVE)
     opacities = reader.values(f"{EXTENSION}:OPACITY", 1)
     reader.check(f"{EXTENSION}:OPACITY", opacities, 0, 1, "from 0 to 1")
     harmonics = np.stack(
