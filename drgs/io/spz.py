@@ -23,6 +23,7 @@ from __future__ import annotations
 
 import gzip
 import struct
+import warnings
 import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -30,7 +31,7 @@ from pathlib import Path
 
 import numpy as np
 
-from drgs.core.errors import UserError
+from drgs.core.errors import UserError, UserNote
 from drgs.core.files import read_bytes
 from drgs.io.colmap_records import Place
 from drgs.io.ply import Scalar
@@ -180,7 +181,7 @@ def read_gaussians(path: str | Path) -> tuple[dict[str, np.ndarray], dict[str, S
     """Gaussians as numpy float32 arrays with y up, and whether they are ``antialiased``.
 
     As :func:`drgs.io.ply.read_gaussians` gives them; opacities of 0 and 1 are the next ones that
-    sigmoids tell apart. Extensions of vendors are passed over.
+    sigmoids tell apart. Extensions of vendors are passed over, with a :class:`UserNote`.
 
     Raises :class:`UserError` naming the file, the byte, what was expected and what was got.
     """
@@ -195,6 +196,9 @@ def read_gaussians(path: str | Path) -> tuple[dict[str, np.ndarray], dict[str, S
             f"{Place(path, 'byte', 0)}: must begin as gzip does, or with {MAGIC.decode()}: not an "
             "SPZ file"
         )
+    if header.flags & EXTENSIONS:
+        note = "has extensions of a vendor, which are passed over; one may say other axes"
+        warnings.warn(UserNote(f"{path}: {note}"), stacklevel=2)
     said = {"antialiased": True} if header.flags & ANTIALIASED else {}
     return _decoded(header, parts), said
 

@@ -92,7 +92,7 @@ def test_a_compressed_file_needs_no_suffix_of_its_own(tmp_path):
 
 
 @checked
-@pytest.mark.filterwarnings("ignore:.*infinite logits")
+@pytest.mark.filterwarnings("ignore:.*(infinite logits|extensions of a vendor)")
 def test_damaged_files_are_read_or_refused_by_file(tmp_path, each):
     """Nothing comes but finite Gaussians or a UserError that begins with the file."""
     path = tmp_path / f"a{each.suffix}"
