@@ -96,11 +96,19 @@ def encode(
         "vertex": _structured(PACKED, np.column_stack([vertex[n] for n in PACKED]).astype("<u4")),
     }
     if g["shN"].shape[1]:
-        rest = g["shN"].transpose(0, 2, 1).reshape(len(order), -1)
-        levels = np.floor((rest.astype(np.float64) / (2 * SH_RANGE) + 0.5) * SH_LEVELS)
-        names = tuple(f"f_rest_{i}" for i in range(rest.shape[1]))
-        elements["sh"] = _structured(names, np.clip(levels, 0, SH_LEVELS - 1).astype("u1"))
+        elements["sh"] = _packed_harmonics(g["shN"])
     return encode_elements(elements, rendered_with)
+
+
+def _packed_harmonics(sh: np.ndarray) -> np.ndarray:
+    """The rows of the element; coefficient by coefficient, which takes little memory."""
+    num, count, _ = sh.shape
+    levels = np.empty((num, 3 * count), "u1")
+    for column in range(3 * count):
+        values = sh[:, column % count, column // count].astype(np.float64)
+        level = np.floor((values / (2 * SH_RANGE) + 0.5) * SH_LEVELS)
+        levels[:, column] = np.clip(level, 0, SH_LEVELS - 1)
+    return _structured(tuple(f"f_rest_{i}" for i in range(3 * count)), levels)
 
 
 def _chunk_names(colors: bool = True) -> tuple[str, ...]:

@@ -149,9 +149,13 @@ def _packed_rotations(quats: np.ndarray) -> np.ndarray:
 
 
 def _packed_harmonics(sh: np.ndarray) -> np.ndarray:
-    levels = np.floor(sh.astype(np.float64) * 128 + 0.5) + 128
-    steps = np.where(np.arange(sh.shape[1]) < 3, *SH_STEPS)[:, None]
-    return np.clip(np.floor((levels + steps // 2) / steps) * steps, 0, 255)
+    """(N, K - 1, 3) bytes; coefficient by coefficient, which takes little memory."""
+    rounded_levels = np.empty(sh.shape, "u1")
+    for index in range(sh.shape[1]):
+        step = SH_STEPS[0] if index < 3 else SH_STEPS[1]
+        levels = np.floor(sh[:, index].astype(np.float64) * 128 + 0.5) + 128
+        rounded_levels[:, index] = np.clip(np.floor((levels + step // 2) / step) * step, 0, 255)
+    return rounded_levels
 
 
 # ----------------------------------------------------------------------------------------------
