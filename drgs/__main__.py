@@ -11,6 +11,7 @@ COMMANDS = {
     "fit": Subcommand("fit 3D Gaussians to posed photographs", "drgs.fit"),
     "poses": Subcommand("find out where photographs were taken", "drgs.poses"),
     "render": Subcommand("render Gaussians, a fit, or a Mitsuba scene", "drgs.render"),
+    "export": Subcommand("write Gaussians for other programs", "drgs.export"),
     "capture": Subcommand("turn a Mitsuba scene into a training set", "drgs.capture"),
     "bench": Subcommand("measure drgs; write tables and plots", "drgs.bench.__main__"),
 }

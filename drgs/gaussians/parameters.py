@@ -8,8 +8,9 @@ from it.
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,8 @@ import drjit as dr
 import numpy as np
 
 from drgs.core.arrays import from_host
+from drgs.core.errors import UserError, UserNote
+from drgs.core.files import atomic_path
 
 PARAMETER_NAMES = ("means", "quats", "log_scales", "logit_opacities", "sh0", "shN")
 
@@ -45,29 +48,55 @@ class Gaussians:
 
     @staticmethod
     def load(path: str | Path) -> Gaussians:
-        """The Gaussians of a PLY file in the layout of the 3DGS reference, as numpy arrays.
+        """The Gaussians of a file, as numpy arrays: PLY, or another of ``drgs.io.formats``.
 
-        float32, with the values and the SH degree that the file holds, and with what its header
-        says they are to be rendered with (see :mod:`drgs.io.ply`), as it stands there.
+        float32, with the values and the SH degree that the file holds, and with what it says they
+        are to be rendered with, as it stands there. Those of a format whose y axis is up are turned
+        so that z is, as it is in datasets.
 
-        Raises ``drgs.core.errors.UserError`` (a ValueError) naming the file and what it lacks.
+        Raises ``drgs.core.errors.UserError`` (a ValueError) naming the file and what is wrong.
         """
-        from drgs.io.ply import read_gaussians
+        from drgs.io.formats import Z_TO_Y, read_gaussians
 
-        arrays, rendered_with = read_gaussians(path)
-        return Gaussians(**arrays, rendered_with=rendered_with or None)
+        found, arrays, rendered_with = read_gaussians(path)
+        gaussians = Gaussians(**arrays, rendered_with=rendered_with or None)
+        return gaussians._turned(Z_TO_Y.T) if found.y_up else gaussians
 
     def save(self, path: str | Path) -> None:
-        """Write a PLY file in the layout of the 3DGS reference, atomically.
+        """Write a file, atomically, in the format that its suffix names: see ``drgs.io.formats``.
 
-        Equal Gaussians give equal bytes. The header says ``rendered_with``. Not saved:
-        ``features``.
+        Equal Gaussians give equal bytes. Formats whose y axis is up get them turned, as ``load``
+        expects them. Not saved: ``features``, and with a ``UserNote`` what the format has no room
+        for.
+
+        Raises ``drgs.core.errors.UserError`` (a ValueError) for another suffix, or where the format
+        cannot hold them.
         """
-        from drgs.io.ply import write_gaussians
+        from drgs.io.formats import FORMATS, format_of
 
-        host = self.numpy()
-        arrays = {name: getattr(host, name) for name in host._names}
-        write_gaussians(path, arrays, self.rendered_with)
+        chosen = format_of(path)
+        if chosen is None:
+            suffixes = ", ".join(each.suffix for each in FORMATS)
+            raise UserError(f"{path}: the name must end in one of {suffixes}")
+        content = self.to_bytes(chosen.name)
+        with atomic_path(path) as temporary:
+            temporary.write_bytes(content)
+
+    def to_bytes(self, name: str) -> bytes:
+        """The content of a file in the format of that name, one of ``drgs.io.formats.FORMATS``.
+
+        As ``save`` writes it, which see.
+        """
+        from drgs.io.formats import Z_TO_Y, format_named
+
+        chosen, host = format_named(name), self.numpy()
+        lost = [*(["harmonics"] if self.sh_degree > 0 and not chosen.has_harmonics else [])]
+        lost += [f"{name} {value}" for name, value in chosen.unsaid(self.rendered_with).items()]
+        if lost:
+            note = f"the format {chosen.name} has no room for {', '.join(lost)}: left out"
+            warnings.warn(UserNote(note), stacklevel=2)
+        host = host._turned(Z_TO_Y) if chosen.y_up else host
+        return chosen.encode({n: getattr(host, n) for n in host._names}, self.rendered_with)
 
     @staticmethod
     def from_numpy(
@@ -159,6 +188,14 @@ class Gaussians:
         features = self.features and {k: upload(v) for k, v in self.features.items()}
         tensors = {name: upload(getattr(self, name)) for name in self._names}
         return Gaussians(**tensors, features=features, rendered_with=self.rendered_with)
+
+    def _turned(self, rotation: np.ndarray) -> Gaussians:
+        """Numpy arrays turned as a whole; float32."""
+        from drgs.gaussians.turning import turned
+
+        parts = turned(self.means, self.quats, self.shN, rotation)
+        means, quats, shN = (part.astype(np.float32) for part in parts)
+        return replace(self, means=means, quats=quats, shN=shN)
 
     @property
     def _names(self) -> tuple[str, ...]:

@@ -9,11 +9,10 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from drgs.core.errors import PluginError
 from drgs.gaussians.parameters import Gaussians
-from drgs.gaussians.sh_rotation import rotated
+from drgs.gaussians.turning import turned
 
 TOLERANCE = 1e-4
 """Of A^T A / s^2 - I: numbers written with five digits are a rotation, a shear by a pixel in ten
@@ -47,22 +46,16 @@ class Similarity:
 
     def of_gaussians(self, gaussians: Gaussians) -> Gaussians:
         """Gaussians (numpy) moved, with what is seen of them from each side; float32."""
-        wxyz = np.roll(Rotation.from_matrix(self.rotation).as_quat(), 1)
+        g = gaussians
+        means, quats, shN = turned(g.means, g.quats, g.shN, self.rotation)
         g = replace(
-            gaussians,
-            means=self.scale * (gaussians.means @ self.rotation.T) + self.translation,
-            quats=_product(wxyz, gaussians.quats.astype(np.float64)),
-            log_scales=gaussians.log_scales + np.log(self.scale),
-            shN=rotated(gaussians.shN.astype(np.float64), self.rotation),
+            g,
+            means=self.scale * means + self.translation,
+            quats=quats,
+            log_scales=g.log_scales + np.log(self.scale),
+            shN=shN,
         )
         if g.smoothing is not None:
             g = replace(g, smoothing=(g.smoothing * self.scale).astype(np.float32))
         names = ("means", "quats", "log_scales", "shN")
         return replace(g, **{name: getattr(g, name).astype(np.float32) for name in names})
-
-
-def _product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Hamilton's product of a quaternion (4,) and quaternions (N, 4), wxyz: first b, then a."""
-    w, x, y, z = a
-    left = np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]])
-    return b @ left.T

@@ -19,20 +19,20 @@ viewers would not take by themselves::
 from __future__ import annotations
 
 import io
-import math
 import re
 import warnings
-from collections.abc import Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
-from typing import IO
+from typing import IO, TypeVar
 
 import numpy as np
 from plyfile import PlyData, PlyElement, PlyListProperty
 
 from drgs.core.errors import UserError, UserNote, listed, one_line
-from drgs.core.files import atomic_path, open_regular
+from drgs.core.files import open_regular
+from drgs.io.quantized import LARGEST_LOGIT, SMALLEST_LOGIT
 
 POSITION = ("x", "y", "z")
 NORMAL = ("nx", "ny", "nz")
@@ -55,13 +55,6 @@ STATEMENT = re.compile(r"drgs ([a-z][a-z_]{0,39}) ([!-~]{1,40})")
 """A comment of ours: a name and its value. Others are somebody else's."""
 
 
-LARGEST_LOGIT = 23 * math.log(2)
-"""Logit of the largest opacity below 1 that a sigmoid in float32 gives: 1 / (1 + 2^-23)."""
-
-SMALLEST_LOGIT = -125 * math.log(2)
-"""Logit of about the smallest opacity that it gives: exp of less is no number in float32."""
-
-
 def read_gaussians(path: str | Path) -> tuple[dict[str, np.ndarray], dict[str, Scalar]]:
     """Gaussians as numpy float32 arrays, and by name what its header says they are rendered with.
 
@@ -69,8 +62,8 @@ def read_gaussians(path: str | Path) -> tuple[dict[str, np.ndarray], dict[str, S
     fields of :class:`drgs.gaussians.parameters.Gaussians`, whose ``load`` calls this; ``smoothing``
     is missing where the file has none. Properties are found by name, in any order and of any
     numeric type; others are ignored. Infinite logits, which formats with opacities of 8 bits leave
-    for 1 and 0, become :data:`LARGEST_LOGIT` and :data:`SMALLEST_LOGIT`, with a :class:`UserNote`.
-    What the header says is not checked: its names and limits are not known here.
+    for 1 and 0, become the ends of what sigmoids tell apart, with a :class:`UserNote`. What the
+    header says is not checked: its names and limits are not known here.
 
     Raises :class:`UserError` naming the file and what it lacks: it must be whole, hold at least
     one row, and otherwise nothing but finite numbers.
@@ -99,19 +92,16 @@ def read_gaussians(path: str | Path) -> tuple[dict[str, np.ndarray], dict[str, S
     return gaussians, statements
 
 
-def write_gaussians(
-    path: str | Path,
-    gaussians: Mapping[str, np.ndarray],
-    rendered_with: Mapping[str, Scalar] | None = None,
-) -> None:
-    """Write Gaussians as the 3DGS reference does, binary little-endian, atomically.
+def encode(
+    gaussians: Mapping[str, np.ndarray], rendered_with: Mapping[str, Scalar] | None = None
+) -> bytes:
+    """A file of Gaussians as the 3DGS reference writes it, binary little-endian.
 
     gaussians: numpy arrays by the names that :func:`read_gaussians` gives; rendered_with: for the
     header, None: nothing is said. Equal Gaussians give equal bytes.
 
     Raises ValueError for what :data:`STATEMENT` cannot say.
     """
-    comments = [_statement(name, value) for name, value in (rendered_with or {}).items()]
     g = gaussians
     num, num_rest = len(g["means"]), 3 * g["shN"].shape[1]
     names = (*POSITION, *NORMAL, *SH0, *_rest(num_rest), *OPACITY, *SCALE, *ROTATION)
@@ -130,9 +120,21 @@ def write_gaussians(
         axis=1,
     ).astype("<f4")
     vertex = rows.view([(name, "<f4") for name in names]).reshape(num)
-    with atomic_path(path) as temporary:
-        elements = [PlyElement.describe(vertex, "vertex")]
-        PlyData(elements, byte_order="<", comments=comments).write(str(temporary))
+    return encode_elements({"vertex": vertex}, rendered_with)
+
+
+def encode_elements(
+    elements: Mapping[str, np.ndarray], rendered_with: Mapping[str, Scalar] | None = None
+) -> bytes:
+    """A binary little-endian file of structured arrays by name, in their order.
+
+    rendered_with and errors: as of :func:`encode`.
+    """
+    comments = [_statement(name, value) for name, value in (rendered_with or {}).items()]
+    described = [PlyElement.describe(rows, name) for name, rows in elements.items()]
+    file = io.BytesIO()
+    PlyData(described, byte_order="<", comments=comments).write(file)
+    return file.getvalue()
 
 
 def _statement(name: str, value: Scalar) -> str:
@@ -140,8 +142,7 @@ def _statement(name: str, value: Scalar) -> str:
     comment = f"drgs {name} {str(value).lower() if isinstance(value, bool) else value}"
     if STATEMENT.fullmatch(comment) is None:
         raise ValueError(
-            f"write_gaussians(): rendered_with must be names and values of one word, got {name!r}: "
-            f"{value!r}"
+            f"rendered_with must be names and values of one word, got {name!r}: {value!r}"
         )
     return comment
 
@@ -203,16 +204,59 @@ def read_points(path: str | Path) -> tuple[np.ndarray, np.ndarray | None]:
     return positions, colors
 
 
+def properties_of(path: str | Path) -> dict[str, tuple[str, ...]]:
+    """Names of the properties of each element, as the header has them.
+
+    Raises :class:`UserError` as :func:`read_gaussians` does for a header.
+    """
+
+    def names(file: IO[bytes], layout: _Layout) -> dict[str, tuple[str, ...]]:
+        return {e.name: tuple(p.name for p in e.properties) for e in layout.elements}
+
+    return _read(path, names)
+
+
+def read_elements(
+    path: str | Path, names: Collection[str]
+) -> tuple[dict[str, np.ndarray], dict[str, Scalar]]:
+    """The rows of some elements of a binary file, and what the header's comments say.
+
+    names: of elements that are there, among them ``vertex``. The rows are structured arrays of
+    numbers.
+
+    Raises :class:`UserError` as :func:`read_gaussians` does, and for a text file.
+    """
+
+    def rows(file: IO[bytes], layout: _Layout) -> tuple[dict[str, np.ndarray], dict[str, Scalar]]:
+        if layout.text:
+            raise UserError(f"{path}: the file must be binary, got text; convert it")
+        return _rows(path, file, layout, names), layout.statements
+
+    return _read(path, rows)
+
+
 def _read_vertices(path: str | Path) -> tuple[np.ndarray, dict[str, Scalar]]:
     """The rows of element ``vertex``, at least one, and what the header's comments say.
 
     The rows are a structured array of numbers.
     """
+
+    def rows(file: IO[bytes], layout: _Layout) -> tuple[np.ndarray, dict[str, Scalar]]:
+        if layout.text:
+            return _text_rows(path, file, layout), layout.statements
+        return _rows(path, file, layout, ["vertex"])["vertex"], layout.statements
+
+    return _read(path, rows)
+
+
+T = TypeVar("T")
+
+
+def _read(path: str | Path, read: Callable[[IO[bytes], _Layout], T]) -> T:
+    """What ``read`` makes of the file and its header; whatever fails is a :class:`UserError`."""
     try:
         with open_regular(path) as file:
-            layout = _read_layout(path, file)
-            read = _text_rows if layout.text else _rows
-            return read(path, file, layout), layout.statements
+            return read(file, _read_layout(path, file))
     except UserError:
         raise
     except OSError as error:
@@ -306,23 +350,28 @@ def _lists(element: PlyElement) -> list[str]:
     return [p.name for p in element.properties if isinstance(p, PlyListProperty)]
 
 
-def _rows(path: str | Path, file: IO[bytes], layout: _Layout) -> np.ndarray:
-    """Of a binary file. What stands behind the vertices is not read."""
-    position = layout.start
-    for index, (element, count) in enumerate(zip(layout.elements, layout.counts, strict=True)):
+def _rows(
+    path: str | Path, file: IO[bytes], layout: _Layout, names: Collection[str]
+) -> dict[str, np.ndarray]:
+    """Of some elements of a binary file. What stands behind an element with lists is not read."""
+    position, places = layout.start, {}
+    for element, count in zip(layout.elements, layout.counts, strict=True):
         if _lists(element):  # behind the vertices: where these end, nobody knows
             break
-        width = max(1, element.dtype(layout.byte_order).itemsize)
-        if index == layout.vertex:
-            start = position
+        dtype = element.dtype(layout.byte_order)
+        width = max(1, dtype.itemsize)
+        if element.name in names:
+            places[element.name] = position, dtype, count
         if position + count * width > layout.end:
             _refuse_end(path, element, count, (layout.end - position) // width)
         position += count * width
     else:
         _check_end(path, layout, layout.end - position)
-    file.seek(start)
-    dtype = layout.elements[layout.vertex].dtype(layout.byte_order)
-    return np.fromfile(file, dtype, layout.counts[layout.vertex])
+    rows = {}
+    for name, (start, dtype, count) in places.items():
+        file.seek(start)
+        rows[name] = np.fromfile(file, dtype, count)
+    return rows
 
 
 def _text_rows(path: str | Path, file: IO[bytes], layout: _Layout) -> np.ndarray:

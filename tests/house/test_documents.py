@@ -151,6 +151,7 @@ MODULES = {
     "fit": "drgs.fit",
     "render": "drgs.render",
     "poses": "drgs.poses",
+    "export": "drgs.export",
     "capture": "drgs.capture",
     "bench": "drgs.bench.__main__",
 }

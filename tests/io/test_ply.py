@@ -1,3 +1,5 @@
+from pathlib import Path
+
 import numpy as np
 import pytest
 from plyfile import PlyData, PlyElement
@@ -153,12 +155,12 @@ def test_a_failed_write_leaves_the_old_file(tmp_path, monkeypatch):
     random_gaussians(1, 0).save(path)
     before = path.read_bytes()
 
-    def fail(self, stream):
-        with open(stream, "w") as file:
-            file.write("half")
+    def fail(self, content):
+        with self.open("wb") as file:
+            file.write(content[:10])
         raise OSError("disk full")
 
-    monkeypatch.setattr(PlyData, "write", fail)
+    monkeypatch.setattr(Path, "write_bytes", fail)
     with pytest.raises(UserError, match=r"a.ply: cannot write the file: disk full"):
         random_gaussians(2, 0).save(path)
     assert path.read_bytes() == before

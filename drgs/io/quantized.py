@@ -1,0 +1,79 @@
+"""What formats that round numbers to bits have in common; arrays of numpy, a row per Gaussian."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+SH_C0 = 0.28209479177387814
+"""The harmonic of degree 0: a base colour in display space is 0.5 + SH_C0 sh0."""
+
+LARGEST_LOGIT = 23 * math.log(2)
+"""Logit of the largest opacity below 1 that a sigmoid in float32 gives: 1 / (1 + 2^-23)."""
+
+SMALLEST_LOGIT = -125 * math.log(2)
+"""Logit of about the smallest opacity that it gives: exp of less is no number in float32."""
+
+SMALLEST_LOG_SCALE = -126 * math.log(2)
+"""Logarithm of the smallest normal float32: what a scale of 0 becomes."""
+
+_OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
+"""By the index of one of four components: those of the other three."""
+
+
+def rounded(values: np.ndarray, largest: int) -> np.ndarray:
+    """The nearest whole numbers from 0 to ``largest``, as uint32."""
+    return np.clip(np.floor(np.asarray(values, np.float64) + 0.5), 0, largest).astype(np.uint32)
+
+
+def opacities_of(logits: np.ndarray) -> np.ndarray:
+    """Opacities (N,) float64 of logits (N,)."""
+    return 1 / (1 + np.exp(-np.clip(logits.astype(np.float64), -700, 700)))
+
+
+def logits_of(opacities: np.ndarray) -> np.ndarray:
+    """Finite logits (N,) float32 of opacities (N,) in [0, 1], as sigmoids tell them apart."""
+    opacities = opacities.astype(np.float64)
+    with np.errstate(divide="ignore"):
+        logits = np.log(opacities) - np.log1p(-opacities)
+    return np.clip(logits, SMALLEST_LOGIT, LARGEST_LOGIT).astype(np.float32)
+
+
+def log_scales_of(scales: np.ndarray) -> np.ndarray:
+    """Finite logarithms (N, 3) float32 of standard deviations (N, 3) >= 0."""
+    with np.errstate(divide="ignore"):
+        logarithms = np.log(scales.astype(np.float64))
+    return np.maximum(logarithms, SMALLEST_LOG_SCALE).astype(np.float32)
+
+
+def unit_quaternions(quats: np.ndarray) -> np.ndarray:
+    """Quaternions (N, 4) of length 1, float64; one of length 0 is the identity, as in rendering.
+
+    quats: (N, 4) wxyz.
+    """
+    quats = quats.astype(np.float64)
+    lengths = np.linalg.norm(quats, axis=1, keepdims=True)
+    usable = lengths > 0
+    return np.where(usable, quats, [1.0, 0, 0, 0]) / np.where(usable, lengths, 1)
+
+
+def without_largest(quats: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Index (N,) of the largest component, and the other three (N, 3), in their order.
+
+    The sign, which a rotation leaves open, is the one that makes the largest positive. quats:
+    (N, 4) of length 1.
+    """
+    rows = np.arange(len(quats))
+    index = np.argmax(np.abs(quats), axis=1)
+    sign = np.where(quats[rows, index] < 0, -1.0, 1.0)
+    return index, sign[:, None] * quats[rows[:, None], _OTHERS[index]]
+
+
+def with_largest(index: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """Quaternions (N, 4) float64 of length 1: what :func:`without_largest` leaves of them."""
+    rows = np.arange(len(index))
+    quats = np.empty((len(index), 4))
+    quats[rows[:, None], _OTHERS[index]] = others
+    quats[rows, index] = np.sqrt(np.maximum(0, 1 - np.square(others).sum(axis=1)))
+    return quats

@@ -1,0 +1,121 @@
+"""What all formats of Gaussians have in common: what was written is read, and damage is refused."""
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support.formats import (
+    PRECISION,
+    assert_within,
+    damaged,
+    gaussians_within_ranges,
+    matched,
+)
+
+from drgs.core.errors import UserError
+from drgs.gaussians.parameters import Gaussians
+from drgs.io.formats import FORMATS, format_of
+
+pytestmark = pytest.mark.filterwarnings("ignore:.*left out")
+
+MUTATIONS = 300  # of each format
+
+each_format = pytest.mark.parametrize("each", FORMATS, ids=lambda each: each.name)
+checked = pytest.mark.parametrize(
+    "each", [f for f in FORMATS if not f.any_number], ids=lambda each: each.name
+)
+
+
+@each_format
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_what_is_written_is_read_within_the_format_s_precision(tmp_path, each, degree):
+    path, expected = tmp_path / f"a{each.suffix}", gaussians_within_ranges(degree=degree)
+    expected.save(path)
+    found = Gaussians.load(path)
+    assert found.sh_degree == (degree if each.has_harmonics else 0)
+    assert all(getattr(found, n).dtype == np.float32 for n in ("means", "quats", "sh0", "shN"))
+    assert_within(PRECISION[each.name], expected, matched(expected, found))
+
+
+@each_format
+def test_equal_gaussians_give_equal_bytes(each):
+    first, second = (gaussians_within_ranges().to_bytes(each.name) for _ in range(2))
+    assert first == second
+    assert first != gaussians_within_ranges(seed=1).to_bytes(each.name)
+
+
+@each_format
+def test_one_gaussian_is_enough(tmp_path, each):
+    path, expected = tmp_path / f"a{each.suffix}", gaussians_within_ranges(1, degree=0)
+    expected.save(path)
+    assert_within(PRECISION[each.name], expected, Gaussians.load(path))
+
+
+@checked
+def test_what_is_no_number_is_not_written(tmp_path, each):
+    gaussians = gaussians_within_ranges(5)
+    gaussians.log_scales[3, 1] = np.nan
+    with pytest.raises(UserError, match=r"log_scales of Gaussian 3 is nan; remove it"):
+        gaussians.save(tmp_path / f"a{each.suffix}")
+    assert not list(tmp_path.iterdir())
+
+
+@checked
+def test_smoothing_is_not_dropped_silently(tmp_path, each):
+    gaussians = replace(gaussians_within_ranges(5), smoothing=np.ones(5, np.float32))
+    with pytest.raises(UserError, match=r"no room for the smoothing of Gaussians: bake it"):
+        gaussians.save(tmp_path / f"a{each.suffix}")
+
+
+def test_the_longest_suffix_says_the_format():
+    assert format_of("a.compressed.ply").name == "compressed-ply"
+    assert format_of("A.PLY").name == "ply"
+    assert format_of("a.obj") is None
+
+
+def test_another_suffix_is_not_written(tmp_path):
+    with pytest.raises(UserError, match=r"a.obj: the name must end in one of \.ply, "):
+        gaussians_within_ranges(5).save(tmp_path / "a.obj")
+
+
+def test_a_compressed_file_needs_no_suffix_of_its_own(tmp_path):
+    expected = gaussians_within_ranges(300)
+    (tmp_path / "a.ply").write_bytes(expected.to_bytes("compressed-ply"))
+    found = matched(expected, Gaussians.load(tmp_path / "a.ply"))
+    assert_within(PRECISION["compressed-ply"], expected, found)
+
+
+# ----------------------------------------------------------------------------------------------
+# Damage
+# ----------------------------------------------------------------------------------------------
+
+
+@checked
+@pytest.mark.filterwarnings("ignore:.*(infinite logits|extensions of a vendor)")
+def test_damaged_files_are_read_or_refused_by_file(tmp_path, each):
+    """Nothing comes but finite Gaussians or a UserError that begins with the file."""
+    path = tmp_path / f"a{each.suffix}"
+    content = gaussians_within_ranges(40, degree=1).to_bytes(each.name)
+    refused = 0
+    for data in damaged(content, MUTATIONS):
+        path.write_bytes(data)
+        try:
+            found = Gaussians.load(path)
+        except UserError as error:
+            refused += 1
+            assert re.match(rf"{re.escape(str(path))}: \w", str(error)), error
+            continue
+        values = (found.means, found.quats, found.log_scales, found.logit_opacities, found.shN)
+        assert all(np.isfinite(v).all() for v in values)
+    assert refused > MUTATIONS // 5  # the others change a number
+
+
+@checked
+def test_a_file_that_was_cut_off_is_refused_wherever_it_ends(tmp_path, each):
+    path = tmp_path / f"a{each.suffix}"
+    content = gaussians_within_ranges(1, degree=1).to_bytes(each.name)
+    for end in range(0, len(content), max(1, len(content) // 200)):
+        path.write_bytes(content[:end])
+        with pytest.raises(UserError, match=re.escape(str(path))):
+            Gaussians.load(path)
