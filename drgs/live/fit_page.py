@@ -27,11 +27,14 @@ STEP_BACK = 1.25
 SMOOTHING = 0.9
 """Weight of the past in the PSNR of training views, each of which is another photograph."""
 
-SERIES = (
-    {"label": "iteration"},
-    {"label": "training views", "stroke": "#7fb0ff", "width": 2},
-    {"label": "test views", "stroke": "#f0937b", "width": 2, "points": {"show": True}},
-)
+Curve = tuple[np.ndarray, np.ndarray]
+"""Iterations and values, each (n,)."""
+
+CURVES = {
+    "training views": {"stroke": "#7fb0ff", "width": 2, "points": {"show": False}},
+    "test views": {"stroke": "#f0937b", "width": 2, "points": {"show": True}},
+}
+"""By title: how the line is drawn."""
 
 
 class FitPage(Page):
@@ -46,15 +49,9 @@ class FitPage(Page):
         self._end = gui.add_button("End and write results", icon="flag", color="gray")
         self._pause.on_click(self._toggle)
         self._end.on_click(self._ask_for_end)
-        nothing = tuple(np.array([0.0, 1.0]) for _ in SERIES)
-        self._curve = gui.add_uplot(
-            nothing,
-            SERIES,
-            title="PSNR [dB]",
-            aspect=1.7,
-            visible=False,
-            scales={"x": {"time": False}},
-        )
+        self._charts: list[viser.GuiUplotHandle] = []
+        self._total = 0  # iterations that they have room for
+        self._folder = gui.add_folder("PSNR [dB]")
 
     def tell(self, trainer: Trainer, history: History, total: int) -> None:
         """See :class:`FitScreen`."""
@@ -66,15 +63,39 @@ class FitPage(Page):
             f"{trainer.num_gaussians:,} Gaussians"
         )
         self._bar.value = min(100.0, 100.0 * done / max(total, 1))
-        if len(history.rows) > 1:
-            self._curve.data = curves_of(history.rows)
-            self._curve.visible = True
+        curves = curves_of(history.rows)
+        if total != self._total:
+            self._total = total
+            self._draw(curves)
+        for chart, curve in zip(self._charts, curves, strict=True):
+            chart.data, chart.visible = curve, len(curve[0]) > 0
 
     def tell_end(self, iterations: int) -> None:
         """See :class:`FitScreen`."""
         self._status.content = f"**{iterations:,} iterations are done;** results are being written."
         self._bar.value = 100.0
         self._pause.disabled = self._end.disabled = True
+
+    def _draw(self, curves: list[Curve]) -> None:
+        """Charts for so many iterations: viser's own range follows what was shown, not the data.
+
+        Nor does it know gaps, with which both lines would go into one chart.
+        """
+        for chart in self._charts:
+            chart.remove()
+        with self._folder:
+            self._charts = [
+                self.server.gui.add_uplot(
+                    curve,
+                    ({"label": "iteration"}, {"label": "dB", **line}),
+                    title=title,
+                    aspect=2.4,
+                    visible=len(curve[0]) > 0,
+                    scales={"x": {"time": False, "range": (0, self._total)}},
+                    legend={"show": False},
+                )
+                for (title, line), curve in zip(CURVES.items(), curves, strict=True)
+            ]
 
     async def _toggle(self, event: object) -> None:
         del event
@@ -122,10 +143,11 @@ def smoothed(values: Sequence[float]) -> np.ndarray:
     return result
 
 
-def curves_of(rows: Sequence[HistoryRow]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Iterations, smooth PSNR of training views, and that of test views as last measured."""
-    psnr, test, known = smoothed([row.psnr for row in rows]), np.full(len(rows), np.nan), np.nan
-    for i, row in enumerate(rows):
-        known = test[i] = known if row.test_psnr is None else row.test_psnr
+def curves_of(rows: Sequence[HistoryRow]) -> list[Curve]:
+    """PSNR of training views, smooth, and of test views, where it was measured."""
     kept = np.unique(np.linspace(0, len(rows) - 1, min(MOST_POINTS, len(rows))).round().astype(int))
-    return np.array([rows[i].iteration for i in kept], np.float64), psnr[kept], test[kept]
+    iterations = np.array([row.iteration for row in rows], np.float64)
+    measured = [(row.iteration, row.test_psnr) for row in rows if row.test_psnr is not None]
+    of_test = np.array(measured, np.float64).reshape(-1, 2).T
+    of_training = smoothed([row.psnr for row in rows])
+    return [(iterations[kept], of_training[kept]), (of_test[0], of_test[1])]
