@@ -185,18 +185,21 @@ class Page(Screen):
         self.wishes.ask(client.client_id, request)
 
     async def _welcome(self, client: viser.ClientHandle) -> None:
-        """A window that is higher than wide shows as much from side to side as others do."""
-        upright = client.camera.image_height / max(client.camera.image_width, 1)
-        if upright > 1:
-            half = math.tan(client.camera.fov / 2)
-            client.camera.fov = min(2 * math.atan(half * upright), math.radians(MOST_FOV))
         self._texts[client.client_id] = client.gui.add_markdown("…", order=1e6)
 
         @client.camera.on_update
         async def _(camera: object) -> None:
             del camera
-            self._ask(client)
+            self._follow(client)
 
+        self._follow(client)
+
+    def _follow(self, client: viser.ClientHandle) -> None:
+        """The angle of view is that of the window's shorter side, whatever its shape becomes."""
+        camera = client.camera
+        upright = max(1.0, camera.image_height / max(camera.image_width, 1))
+        half = upright * math.tan(math.radians(self._angle.value) / 2)
+        camera.fov = min(2 * math.atan(half), math.radians(MOST_FOV))
         self._ask(client)
 
     async def _part(self, client: viser.ClientHandle) -> None:
@@ -204,10 +207,10 @@ class Page(Screen):
         self._texts.pop(client.client_id, None)
         self._as_fitted.pop(client.client_id, None)
 
-    async def _turn_lens(self, event: viser.GuiEvent) -> None:
+    async def _turn_lens(self, event: object) -> None:
+        del event
         for client in self.server.get_clients().values():
-            client.camera.fov = math.radians(event.target.value)
-            self._ask(client)
+            self._follow(client)
 
     async def _show_frustums(self, event: object) -> None:
         del event

@@ -88,7 +88,7 @@ class Chromium:
             if message.get("id") == number:
                 assert "error" not in message, message["error"]
                 return message["result"]
-            self._note(message.get("method"), message.get("params", {}))
+            self._note(message)
 
     def resize(self, width: int, height: int) -> None:
         """px, of the page."""
@@ -98,8 +98,11 @@ class Chromium:
         )
 
     def open(self, address: str) -> None:
-        """Go to a page."""
+        """Go to a page, and wait until it is there."""
+        self._is_loaded = False
         self.call("Page.navigate", url=address)
+        while not self._is_loaded:
+            self._note(json.loads(self._socket.recv(SECONDS)))
 
     def evaluate(self, expression: str) -> object:
         """What an expression of JavaScript is."""
@@ -147,8 +150,11 @@ class Chromium:
             **({} if moved else {"clickCount": 1}),
         )
 
-    def _note(self, method: str | None, params: dict) -> None:
-        if method == "Runtime.exceptionThrown":
+    def _note(self, message: dict) -> None:
+        method, params = message.get("method"), message.get("params", {})
+        if method == "Page.loadEventFired":
+            self._is_loaded = True
+        elif method == "Runtime.exceptionThrown":
             self.errors.append(str(params["exceptionDetails"]))
         elif method == "Runtime.consoleAPICalled" and params["type"] == "error":
             self.errors.append(str(params["args"]))
