@@ -53,11 +53,6 @@ class Looking:
     approximations: Approximations
     max_side: int  # px
 
-    @property
-    def shows_frustums(self) -> bool:
-        """Whether lines that the browser draws lie on what is rendered."""
-        return isinstance(self.optics, Pinhole | ThinLens)
-
 
 class LookControls:
     """Controls in viser's panel; ``changed`` is called, by a thread of the server, when one is."""
@@ -78,6 +73,11 @@ class LookControls:
         with gui.add_folder("Accuracy", expand_by_default=False):
             self._values = {name: self._told(self._control(name)) for name in SWITCHED}
             gui.add_button("As fitted").on_click(self._reset)
+
+    @property
+    def keeps_lines(self) -> bool:
+        """Whether lines that the browser draws, a pinhole's, lie on what is rendered."""
+        return self._lens.value in ("pinhole", "thin lens")
 
     @property
     def looking(self) -> Looking:

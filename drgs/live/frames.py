@@ -169,8 +169,8 @@ def _error(scene: LiveScene, request: FrameRequest) -> Frame:
     best = replace(given, projection=projection, **MOST_ACCURATE)
     accurate, slowly = scene.picture(replace(request, approximations=best))
     apart = psnr(picture, accurate)
-    note = "none" if math.isinf(apart) else f"{apart:.1f} dB"
-    note = f"PSNR to the most accurate picture: {note}; that one took {1e3 * slowly:.0f} ms"
+    far = "the same as" if math.isinf(apart) else f"PSNR {apart:.1f} dB to"
+    note = f"{far} the most accurate picture, which took {1e3 * slowly:.0f} ms"
     return Frame(to_bytes(0.5 + ERROR_GAIN * (picture - accurate)), seconds, note)
 
 

@@ -7,7 +7,7 @@ controls and leaves requests; pictures come from the thread that renders.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Coroutine, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -85,7 +85,7 @@ class Page(Screen):
         self.server, self.wishes = server, wishes
         self._texts: dict[int, viser.GuiMarkdownHandle] = {}
         self._frustums: list[viser.CameraFrustumHandle] = []
-        self._as_fitted: dict[int, float] = {}  # ms, of the last whole picture, by client
+        self._as_fitted: dict[int, tuple[object, float]] = {}  # by client: of what, and ms
         self._fitted, self._distance = fitted, start.eye.distance
         pose, camera = start.eye.camera_to_world, server.initial_camera
         server.scene.set_up_direction(tuple(start.up))
@@ -152,12 +152,13 @@ class Page(Screen):
 
     def _described(self, client: int, request: FrameRequest, frame: Frame) -> str:
         """How long a picture took, and what its colours mean."""
-        took = 1e3 * frame.seconds
-        text = f"**{took:.0f} ms** for {request.width}×{request.height}"
+        took, size = 1e3 * frame.seconds, (request.width, request.height)
+        text = f"**{took:.0f} ms** for {size[0]}×{size[1]}"
+        of = (*size, request.shows, request.optics, request.eye.camera_to_world.tobytes())
         if request.approximations in (None, self._fitted):
-            self._as_fitted[client] = took
-        elif client in self._as_fitted:
-            text += f"; as fitted {self._as_fitted[client]:.0f} ms"
+            self._as_fitted[client] = of, took
+        elif self._as_fitted.get(client, (None, 0.0))[0] == of:
+            text += f"; as fitted {self._as_fitted[client][1]:.0f} ms"
         return f"{text}\n\n{frame.note}" if frame.note else text
 
     def _say(self, client: int, text: str) -> None:
@@ -219,11 +220,11 @@ class Page(Screen):
     def _place_frustums(self) -> None:
         """Where the browser's lines would not lie on what is rendered, there are none."""
         if self._frustums:
-            visible = self._cameras.value and self.controls.looking.shows_frustums
+            visible = self._cameras.value and self.controls.keeps_lines
             for frustum in self._frustums:
                 frustum.visible = visible
 
-    def _looker_through(self, view: Viewpoint):
+    def _looker_through(self, view: Viewpoint) -> Callable[..., Coroutine]:
         async def look_through(event: viser.SceneNodePointerEvent) -> None:
             camera = event.client.camera
             with event.client.atomic():

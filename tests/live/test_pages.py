@@ -1,5 +1,6 @@
 """Pages as viser serves them, without a browser: what controls and cameras ask for."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import mitsuba as mi
@@ -14,7 +15,7 @@ from support.small_fits import make_trainer, plain_dataset
 from drgs.config.approximations import DECLARED, Approximations
 from drgs.live.controls import LENSES, SWITCHED
 from drgs.live.fit_page import MOST_POINTS, FitPage, curves_of
-from drgs.live.frames import SHOWN
+from drgs.live.frames import SHOWN, Frame
 from drgs.live.optics import FisheyeLens, OpenCVLens, Orthographic, Pinhole, ThinLens
 from drgs.live.page import Page, StartView
 from drgs.live.server import free_port, serving, url
@@ -116,6 +117,24 @@ def test_every_control_is_in_the_request(page):
         controls._values[name].value = other
         assert getattr(asked(page).approximations, name) == other, name
     assert asked(page).approximations.extent == 3.5  # has no control
+
+
+def test_times_are_compared_with_those_of_the_same_picture_as_fitted(page):
+    page._texts[7] = SimpleNamespace(content="")
+    switched = Approximations(order="pixel")
+    frames = [
+        Frame(np.zeros((2, 2, 3), np.uint8), s, note) for s, note in ((0.02, ""), (0.05, "x"))
+    ]
+    request = asked(page)
+    other = replace(request, approximations=switched)
+    assert page._described(7, request, frames[0]) == "**20 ms** for 1280×720"
+    assert page._described(7, other, frames[1]).startswith(
+        "**50 ms** for 1280×720; as fitted 20 ms"
+    )
+    assert page._described(7, other, frames[1]).endswith("\n\nx")
+    elsewhere = replace(other, eye=replace(other.eye, camera_to_world=pose_around(0.1, 0.1)))
+    for changed in (replace(other, width=640), replace(other, shows="depth"), elsewhere):
+        assert "as fitted" not in page._described(7, changed, frames[1])
 
 
 def test_a_number_beyond_its_limits_is_said_and_asked_for_by_nobody(page):
