@@ -27,7 +27,7 @@ REFRESH_SHARE = 0.05
 """Of the time, at most, for pictures of a camera that is still."""
 
 SAID_SECONDS = 0.5
-"""Between two reports of where the fit is."""
+"""Between two reports of where the fit is, where somebody is there to read them."""
 
 WAIT_SECONDS = 0.1
 """In a pause, until Ctrl-C is noticed."""
@@ -74,6 +74,7 @@ class Watching:
         self._spectators = Spectators(wishes, screen, _refreshed_after)
         self._scene: tuple[int, LiveScene] | None = None  # and the iteration that it is of
         self._said = 0.0  # when, by time.monotonic
+        self._of_fit = 0.0  # seconds of the fit's own, waited for here
 
     def after(
         self, trainer: Trainer, history: History, done: Iteration, stops: Callable[[], bool]
@@ -82,16 +83,16 @@ class Watching:
 
         The history's clock stands still meanwhile.
         """
-        start = time.perf_counter()
-        is_due = done.is_last or time.monotonic() - self._said >= SAID_SECONDS
-        if is_due and history.rows:
+        start, self._of_fit = time.perf_counter(), 0.0
+        is_due = self._wishes.asked and time.monotonic() - self._said >= SAID_SECONDS
+        if history.rows and (is_due or done.is_last):
             self._tell(trainer, history)
         self._serve(trainer)
         while self._wishes.paused and not (self._wishes.ended or done.is_last or stops()):
             if not self._serve(trainer):
                 self._wishes.wait(WAIT_SECONDS)
         self._scene = None  # what it holds of the Gaussians would keep memory
-        history.leave_out(time.perf_counter() - start)
+        history.leave_out(time.perf_counter() - start - self._of_fit)
         if done.is_last:
             self._screen.tell_end(trainer.iteration)
 
@@ -105,6 +106,9 @@ class Watching:
     def _scene_of(self, trainer: Trainer) -> LiveScene:
         """The Gaussians as they are after the last iteration."""
         if self._scene is None or self._scene[0] != trainer.iteration:
+            start = time.perf_counter()
+            dr.sync_thread()  # the iteration's kernels may still be running
+            self._of_fit += time.perf_counter() - start
             trainer.show()
             gaussians = dr.detach(trainer.integrator.gaussians)
             model, degree = trainer.config.model, trainer.sh_degree
