@@ -233,6 +233,8 @@ def run(args: argparse.Namespace) -> None:
     started = time.perf_counter() - LOADING_SECONDS
     with executing(args.threads, args.debug) as check_ranges, ExitStack() as blocks:
         server = blocks.enter_context(page_server(args))
+        if args.tensorboard:
+            required("tensorboardX", "tensorboard", "--tensorboard")
         config, out = what_to_fit(args)
         keep_folder = blocks.enter_context(sole_writer(out))
         if not args.overwrite and (has_results(out) if args.resume else is_finished(out, config)):
@@ -284,9 +286,10 @@ def run(args: argparse.Namespace) -> None:
 
 
 def page_server(args: argparse.Namespace) -> AbstractContextManager[LocalServer | None]:
-    """What serves the page that ``--view`` asks for; refuses what the machine does not have."""
-    if args.tensorboard:
-        required("tensorboardX", "tensorboard", "--tensorboard")
+    """What serves the page that ``--view`` asks for; None without it.
+
+    Raises ``UserError`` where it cannot be served, before anything is read or written.
+    """
     if not args.view:
         for name in ("address", "port"):
             if getattr(args, f"view_{name}") is not None:

@@ -26,7 +26,7 @@ from drgs.live.page import Page, StartView
 from drgs.live.spectators import Spectators
 from drgs.live.wishes import Wishes
 from drgs.render import UP, Model, load_model
-from drgs.results.files import VIEWS
+from drgs.results.files import CAMERAS, VIEWS
 
 IDLE_SECONDS = 0.05
 """Between two looks at whether a camera is still, or Ctrl-C was pressed."""
@@ -97,9 +97,12 @@ def model_of(args: argparse.Namespace) -> Model:
 
 
 def cameras_of(args: argparse.Namespace, model: Model) -> Sequence[Viewpoint]:
-    """Those of a fit's training views; else one that sees the Gaussians."""
-    if args.what.is_dir() and (args.what / VIEWS).is_file():
-        return read_viewpoints(args.what / VIEWS, None)
+    """Those of a fit's training views, refined if it has refined them; else one that sees all."""
+    if args.what.is_dir():
+        refined = model.config is not None and model.config.cameras.optimise
+        for name in (CAMERAS, VIEWS) if refined else (VIEWS,):
+            if (args.what / name).is_file():
+                return read_viewpoints(args.what / name, None)
     orbit = orbit_of_gaussians(model.gaussians, np.array(UP), FIELD_OF_VIEW)
     return orbit.viewpoints(1, 400, 400, FIELD_OF_VIEW)
 

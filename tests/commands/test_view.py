@@ -1,16 +1,18 @@
 """``drgs view``: what it shows, and what it refuses; browsers are in ``tests/live``."""
 
+import shutil
 import sys
 
 import numpy as np
 import pytest
+import yaml
 from support.commands import assert_refused
 from support.folders import contents
 from support.small_capture import FOCUS, RADIUS, make_dataset
 
 from drgs import view
 from drgs.cli.commands import CommandParser
-from drgs.results.files import VIEWS
+from drgs.results.files import CAMERAS, VIEWS
 from drgs.results.refined_cameras import write_views
 
 
@@ -20,16 +22,23 @@ def parsed(*arguments):
     return parser.parse_args([str(argument) for argument in arguments])
 
 
-def test_a_fit_is_seen_from_its_training_cameras(fit, tmp_path):
-    args = parsed(fit)
+@pytest.mark.parametrize("refined", [False, True])
+def test_a_fit_is_seen_from_its_training_cameras(fit, tmp_path, refined):
+    """As refined, where the fit has refined them."""
+    run = tmp_path / "run"
+    shutil.copytree(fit, run)
+    config = yaml.safe_load((run / "config.yml").read_text())
+    config["cameras"] = {"optimise": refined}
+    (run / "config.yml").write_text(yaml.safe_dump(config))
+    few, others = make_dataset(train=3).train, make_dataset(train=5).train
+    write_views(run / VIEWS, few)
+    write_views(run / CAMERAS, others)
+    args = parsed(run)
     model = view.model_of(args)
     assert model.background == (1.0, 1.0, 1.0)  # of its configuration
-    dataset = make_dataset()
-    write_views(fit / VIEWS, dataset.train)
     cameras = view.cameras_of(args, model)
-    for camera, expected in zip(cameras, dataset.train, strict=True):
+    for camera, expected in zip(cameras, others if refined else few, strict=True):
         assert np.allclose(camera.camera_to_world, expected.camera_to_world)
-    (fit / VIEWS).unlink()
 
 
 def test_a_file_alone_is_seen_whole(fit):
