@@ -43,7 +43,7 @@ import mitsuba as mi
 import numpy as np
 
 import drgs
-from drgs.cli.commands import CommandParser, at_least, file_or_folder, run_command
+from drgs.cli.commands import MAX_PORT, CommandParser, at_least, file_or_folder, run_command
 from drgs.cli.execution import add_execution_arguments, executing, select_variant
 from drgs.cli.interrupts import INTERRUPTED_STATUS, StopRequest
 from drgs.cli.progress import RunProgress
@@ -126,8 +126,6 @@ SMOOTHING = 0.9
 LOADING_SECONDS = 1.2
 """Before :func:`run`: the interpreter and the libraries; 1.0 to 1.4 s on two cores (AMD Zen 4).
 ``--budget`` counts them."""
-
-MAX_PORT = 65535
 
 MOST_FOR_PICTURES = 0.33
 """Of the time that ``--budget`` leaves behind the start: pictures that take more are left out."""

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from drgs.cli.commands import CommandParser, at_least, file_or_folder, run_command
+from drgs.cli.commands import MAX_PORT, CommandParser, at_least, file_or_folder, run_command
 from drgs.cli.execution import add_execution_arguments, executing, select_variant
 from drgs.cli.interrupts import StopRequest
 from drgs.core.errors import UserError
@@ -20,7 +20,6 @@ from drgs.core.extras import required
 from drgs.data.orbits import orbit_of_gaussians
 from drgs.data.types import Viewpoint
 from drgs.data.viewpoints import FIELD_OF_VIEW, read_viewpoints
-from drgs.fit import MAX_PORT
 from drgs.live.frames import LiveScene
 from drgs.live.page import Page, StartView
 from drgs.live.spectators import Spectators
