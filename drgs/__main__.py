@@ -12,6 +12,7 @@ COMMANDS = {
     "poses": Subcommand("find out where photographs were taken", "drgs.poses"),
     "render": Subcommand("render Gaussians, a fit, or a Mitsuba scene", "drgs.render"),
     "export": Subcommand("write Gaussians for other programs", "drgs.export"),
+    "view": Subcommand("look at Gaussians in a browser, rendered live", "drgs.view"),
     "capture": Subcommand("turn a Mitsuba scene into a training set", "drgs.capture"),
     "bench": Subcommand("measure drgs; write tables and plots", "drgs.bench.__main__"),
 }

@@ -19,6 +19,7 @@ folder:
 - ``views.json``: the cameras of the training views, for orbits
 - ``colors.json``, ``cameras.json``: colour transforms and refined cameras of the training views
 - ``plan.txt``: with ``--budget``, what was planned and why
+- ``tensorboard/``: with ``--tensorboard``, the history as TensorBoard reads it
 
 While it runs there is also ``checkpoint.npz``, from which ``--resume`` continues.
 """
@@ -32,17 +33,18 @@ import sys
 import time
 import warnings
 from collections.abc import Callable, Sequence
-from contextlib import ExitStack
+from contextlib import AbstractContextManager, ExitStack, nullcontext
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 import drgs
-from drgs.cli.commands import CommandParser, file_or_folder, run_command
+from drgs.cli.commands import MAX_PORT, CommandParser, at_least, file_or_folder, run_command
 from drgs.cli.execution import add_execution_arguments, executing, select_variant
 from drgs.cli.interrupts import INTERRUPTED_STATUS, StopRequest
 from drgs.cli.progress import RunProgress
@@ -50,6 +52,7 @@ from drgs.config.changes import changed
 from drgs.config.load import load_config
 from drgs.config.schema import FitConfig
 from drgs.core.errors import UserError, UserNote
+from drgs.core.extras import required
 from drgs.core.files import atomic_path
 from drgs.core.locks import sole_writer
 from drgs.core.machine import processor
@@ -68,6 +71,7 @@ from drgs.results.files import (
     CHECKPOINT,
     CONFIG,
     DENSITY,
+    EVENTS,
     GAUSSIANS,
     GAUSSIANS_FOR_VIEWERS,
     HISTORY,
@@ -110,10 +114,13 @@ from drgs.training.checkpoint import (
 )
 from drgs.training.finite_checks import NonFiniteError
 from drgs.training.history import History, write_density, write_history
-from drgs.training.loop import Length, as_saved, iterations
+from drgs.training.loop import Length, Observer, as_saved, iterations
 from drgs.training.quality import measure, measured_views, measurement_is_due
 from drgs.training.summary import summary_of_fit
 from drgs.training.trainer import Trainer
+
+if TYPE_CHECKING:  # imported where somebody looks on
+    from drgs.live.server import LocalServer
 
 SMOOTHING = 0.9
 """Weight of the past in the PSNR that the progress line shows."""
@@ -171,8 +178,31 @@ def add_arguments(parser: CommandParser) -> None:
         metavar="TIME",
         help="90s, 5m, 1h30m: plan a fit that is done, results written, after this time",
     )
+    _add_looking_on(parser)
     add_execution_arguments(parser)
     parser.set_defaults(run=run, prog=parser.prog)
+
+
+def _add_looking_on(parser: CommandParser) -> None:
+    group = parser.add_argument_group("looking on", "The result has the same bytes without these.")
+    group.add_argument(
+        "--view",
+        action="store_true",
+        help="show the fit on a page while it runs, with a pause and an early end (extra: viewer)",
+    )
+    group.add_argument(
+        "--view-address",
+        metavar="ADDRESS",
+        help="where the page is (default: 127.0.0.1, for this machine alone)",
+    )
+    group.add_argument(
+        "--view-port", type=at_least(1, MAX_PORT), metavar="N", help="(default: the first free one)"
+    )
+    group.add_argument(
+        "--tensorboard",
+        action="store_true",
+        help="write the history for TensorBoard, too (extra: tensorboard)",
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -209,6 +239,9 @@ def run(args: argparse.Namespace) -> None:
     """Fit what the command line names; end the process with status 130 if Ctrl-C stopped it."""
     started = time.perf_counter() - LOADING_SECONDS
     with executing(args.threads, args.debug) as check_ranges, ExitStack() as blocks:
+        server = blocks.enter_context(page_server(args))
+        if args.tensorboard:
+            required("tensorboardX", "tensorboard", "--tensorboard")
         config, out = what_to_fit(args)
         keep_folder = blocks.enter_context(sole_writer(out))
         if not args.overwrite and (has_results(out) if args.resume else is_finished(out, config)):
@@ -241,10 +274,39 @@ def run(args: argparse.Namespace) -> None:
             with atomic_path(out / BUDGET_PLAN) as temporary:
                 temporary.write_text(f"--budget {args.budget:g}s\n{plan.reasons}\n")
             length = Deadline(trainer, end, plan.curve)
-        finished = fit_and_write(fit, dataset, length, check_ranges, args.command)
+        observers: list[Observer] = []
+        if args.tensorboard:
+            from drgs.training.event_log import EventLog
+
+            observers.append(blocks.enter_context(EventLog(out / EVENTS, fit.history)))
+        if server is not None:
+            from drgs.live.fit_page import watch
+            from drgs.live.server import url
+
+            watching, length = watch(server, trainer, dataset, length)
+            observers.append(watching)
+            print(f"look on at {url(server)}", flush=True)
+        finished = fit_and_write(fit, dataset, length, check_ranges, args.command, observers)
     if not finished:
         print(f"stopped; continue with: {args.prog} --resume {out}")
         sys.exit(INTERRUPTED_STATUS)
+
+
+def page_server(args: argparse.Namespace) -> AbstractContextManager[LocalServer | None]:
+    """What serves the page that ``--view`` asks for; None without it.
+
+    Raises ``UserError`` where it cannot be served, before anything is read or written.
+    """
+    if not args.view:
+        for name in ("address", "port"):
+            if getattr(args, f"view_{name}") is not None:
+                raise UserError(f"--view-{name}: needs --view")
+        return nullcontext()
+    required("viser", "viewer", "--view")
+    from drgs.live.server import ADDRESS, serving
+
+    options = ("--view-address", "--view-port")
+    return serving(args.view_address or ADDRESS, args.view_port, options)
 
 
 def what_to_fit(args: argparse.Namespace) -> tuple[FitConfig, Path]:
@@ -347,6 +409,7 @@ def fit_and_write(
     length: Length,
     check_ranges: Callable[[], None],
     command: str,
+    observers: Sequence[Observer] = (),
 ) -> bool:
     """Fit, measure, and write into the fit's folder; False if stopped by Ctrl-C.
 
@@ -355,7 +418,7 @@ def fit_and_write(
     trainer, log, out = fit.trainer, fit.history, fit.out
     try:
         views = measured_views(dataset.test)
-        if not run_iterations(fit, views, length, check_ranges):
+        if not run_iterations(fit, views, length, check_ranges, observers):
             return False
         wall_s = log.wall_s
         gaussians = trainer.gaussians()
@@ -419,7 +482,11 @@ def write_for_viewers(
 
 
 def run_iterations(
-    fit: Run, views: tuple[View, ...], length: Length, check_ranges: Callable[[], None]
+    fit: Run,
+    views: tuple[View, ...],
+    length: Length,
+    check_ranges: Callable[[], None],
+    observers: Sequence[Observer] = (),
 ) -> bool:
     """Run the iterations that are left, showing progress and saving checkpoints.
 
@@ -445,6 +512,8 @@ def run_iterations(
                 is_shown = trainer.config.output.report
                 if is_shown and measurement_is_due(history.rows, trainer.config.iterations):
                     measure(trainer, history, views)
+            for observer in observers:
+                observer.after(trainer, history, done, lambda: stop.requested)
             is_due = every and (done.is_last or done.report.iteration % every == 0)
             if stop.requested or is_due:
                 fit.save()

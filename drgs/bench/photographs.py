@@ -23,7 +23,7 @@ from drgs import fit
 from drgs.bench.output import add_out, machine, markdown_table, write_csv
 from drgs.cli.commands import CommandParser, at_least, file_or_folder
 from drgs.config.schema import FitConfig
-from drgs.core.extras import imported
+from drgs.core.extras import required
 from drgs.core.files import atomic_path
 from drgs.data import layout_name, load_dataset
 from drgs.data.folders import config_for
@@ -74,7 +74,7 @@ def undistorted(config: FitConfig, folder: Path) -> Path:
     from drgs.data.colmap import model_folder, picture_folder
     from drgs.io.colmap import read_model
 
-    pycolmap = imported("pycolmap", "colmap", "undistorting")
+    pycolmap = required("pycolmap", "colmap", "undistorting")
     model = model_folder(config.data.path)
     pictures = picture_folder(config.data, read_model(model))
     found = pycolmap.Reconstruction(str(model))

@@ -22,6 +22,9 @@ from drgs.core.files import check_path
 MAX_ERROR = 500
 """Characters of what is wrong with a command line, which may quote all of it."""
 
+MAX_PORT = 65535
+"""Of TCP."""
+
 
 class Subcommand(NamedTuple):
     """One of several commands: what it does, and the module that does it."""

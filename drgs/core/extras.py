@@ -1,26 +1,24 @@
-"""Libraries that only some of what drgs offers needs: the extras of ``pyproject.toml``."""
+"""What the base installation leaves out: imported when it is asked for."""
 
 from __future__ import annotations
 
 from importlib import import_module
 from types import ModuleType
 
-from drgs.core.errors import UserError, one_line
+from drgs.core.errors import UserError
 
 
-def imported(module: str, extra: str, what_for: str) -> ModuleType:
-    """``module``, which the extra ``extra`` installs.
+def required(module: str, extra: str, asker: str) -> ModuleType:
+    """The module of an extra of ``pyproject.toml``, imported.
 
-    what_for: begins the error, such as ``drgs poses``.
+    asker: what needs it, as the user has written it: ``--view``.
 
-    Raises :class:`UserError` that says what to install.
+    Raises :class:`UserError` with the line that installs it, where it is not there.
     """
     try:
         return import_module(module)
-    except ImportError as error:
-        missing = isinstance(error, ModuleNotFoundError) and error.name == module
-        reason = "is not installed" if missing else f"cannot be imported ({one_line(error, 200)})"
+    except ModuleNotFoundError as error:
+        missing = (error.name or module).partition(".")[0]
         raise UserError(
-            f"{what_for} needs {module}, which {reason}: pip install {module} (it comes with the "
-            f"extra {extra}: pip install 'drgs[{extra}]')"
+            f"{asker}: needs {missing}, which is not installed; pip install 'drgs[{extra}]'"
         ) from None

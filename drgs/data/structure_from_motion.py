@@ -21,7 +21,7 @@ from typing import Any
 from PIL import ExifTags, Image
 
 from drgs.core.errors import UserError, one_line
-from drgs.core.extras import imported
+from drgs.core.extras import required
 from drgs.core.files import why_refused
 from drgs.data.recognition import PICTURES
 from drgs.io.pictures import image_size
@@ -127,7 +127,7 @@ def place(folder: Path, search: Search, replace: bool, watch: Watch) -> Placed:
     Raises :class:`UserError`, with what to do, where no cameras are found, or where a model is
     there that is not to be replaced.
     """
-    pycolmap = imported("pycolmap", "colmap", "structure from motion")
+    pycolmap = required("pycolmap", "colmap", "structure from motion")
     pictures, names = pictures_in(folder)
     model = folder / "sparse" / "0"
     if model.exists() and not replace:

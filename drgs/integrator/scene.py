@@ -94,12 +94,13 @@ def make_sensors(views: Iterable[Viewpoint], calibrated: bool = False) -> list[m
     for view in views:
         size = (view.width, view.height)
         if size not in films:
-            films[size] = mi.load_dict(_film(*size))
+            films[size] = mi.load_dict(film_of(*size))
         sensors.append(mi.load_dict({**_sensor(view, calibrated), "film": films[size]}))
     return sensors
 
 
-def _film(width: int, height: int) -> dict[str, object]:
+def film_of(width: int, height: int) -> dict[str, object]:
+    """The film of one picture (px), for ``mi.load_dict``: RGB, with a box filter."""
     return {
         "type": "hdrfilm",
         "width": width,

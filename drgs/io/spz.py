@@ -32,6 +32,7 @@ from pathlib import Path
 import numpy as np
 
 from drgs.core.errors import UserError, UserNote
+from drgs.core.extras import required
 from drgs.core.files import read_bytes
 from drgs.io.colmap_records import Place
 from drgs.io.ply import Scalar
@@ -366,12 +367,7 @@ def _read_streams(path: Path, content: bytes) -> tuple[_Header, list[np.ndarray]
 
 
 def _unpacked_stream(path: Path, start: int, packed: bytes, expected: int) -> np.ndarray:
-    try:
-        import zstandard
-    except ImportError:
-        raise UserError(
-            f"{path}: an SPZ file of version 4 needs Zstandard: pip install 'drgs[spz]'"
-        ) from None
+    zstandard = required("zstandard", "spz", f"{path}: an SPZ file of version 4")
     place = Place(path, "byte", start)
     try:
         claimed = zstandard.frame_content_size(packed)

@@ -15,6 +15,7 @@ from tempfile import TemporaryDirectory
 import numpy as np
 
 from drgs.core.errors import UserError
+from drgs.core.extras import required
 from drgs.io.formats import check_finite
 from drgs.io.quantized import opacities_of, unit_quaternions
 
@@ -35,10 +36,9 @@ def encode(gaussians: Mapping[str, np.ndarray]) -> bytes:
     Raises :class:`UserError` where OpenUSD is not installed or too old, or a number is not finite.
     """
     check_finite(gaussians, "usd")
-    try:
-        from pxr import Sdf, Usd, UsdGeom, UsdVol, Vt
-    except ImportError:
-        raise UserError("USD needs OpenUSD: pip install 'drgs[usd]'") from None
+    required("pxr", "usd", "USD")
+    from pxr import Sdf, Usd, UsdGeom, UsdVol, Vt
+
     if not hasattr(UsdVol, "ParticleField3DGaussianSplat"):
         raise UserError("USD needs OpenUSD 26.03 or newer: pip install 'drgs[usd]'")
     g = gaussians

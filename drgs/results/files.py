@@ -40,6 +40,12 @@ COLORS = "colors.json"
 BUDGET_PLAN = "plan.txt"
 """What was planned for a budget of time, and why."""
 
+TENSORBOARD = "tensorboard"
+"""A folder, with ``--tensorboard``."""
+
+EVENTS = f"{TENSORBOARD}/events.out.tfevents.fit"
+"""The history as TensorBoard reads it, which knows its files by the word in the middle."""
+
 METRICS = "metrics.json"
 """Written when everything else is there."""
 
@@ -59,6 +65,7 @@ RESULTS = (
     RENDERS,
     REPORT,
     SIDE_BY_SIDE,
+    TENSORBOARD,
     VIEWS,
 )
 """All of them but ``config.yml``."""

@@ -21,15 +21,25 @@ from drgs.config.schema import FitConfig
 from drgs.core.errors import UserError, UserNote, listed, one_line
 from drgs.core.files import is_temporary, read_text, remove_stale_temporaries, why_refused
 from drgs.core.records import FolderRecord
-from drgs.results.files import CHECKPOINT, CONFIG, METRICS, RENDERS, REPORT, RESULTS, SIDE_BY_SIDE
+from drgs.results.files import (
+    CHECKPOINT,
+    CONFIG,
+    EVENTS,
+    METRICS,
+    RENDERS,
+    REPORT,
+    RESULTS,
+    SIDE_BY_SIDE,
+    TENSORBOARD,
+)
 
 COMMAND = "fit"
 
 MAX_BYTES = 1 << 28
 """Of a report."""
 
-FOLDERS = (RENDERS, SIDE_BY_SIDE)
-"""Of pictures, in folders named after splits; the other results are files."""
+FOLDERS = (RENDERS, SIDE_BY_SIDE, TENSORBOARD)
+"""Of pictures, in folders named after splits, and of TensorBoard; the other results are files."""
 
 SECTIONS = {"data", "init", "model", "optimizer", "loss", "densify", "output", "iterations", "seed"}
 """That every version has written into ``config.yml``."""
@@ -94,7 +104,7 @@ def seal_run(folder: Path) -> None:
 
 def pictures_of(split: str, views: Sequence[str]) -> list[str]:
     """The pictures of a split with views of these names, relative to the folder."""
-    return [f"{kind}/{split}/{view}.png" for kind in FOLDERS for view in views]
+    return [f"{kind}/{split}/{view}.png" for kind in (RENDERS, SIDE_BY_SIDE) for view in views]
 
 
 def _take(folder: Path, config: FitConfig, pictures: Sequence[str]) -> None:
@@ -110,7 +120,7 @@ def _take(folder: Path, config: FitConfig, pictures: Sequence[str]) -> None:
 
 def _names(pictures: Sequence[str]) -> list[str]:
     """Files that a fit writes, but for ``config.yml``, which shows by itself who wrote it."""
-    return [*(name for name in RESULTS if name not in FOLDERS), *pictures]
+    return [*(name for name in RESULTS if name not in FOLDERS), EVENTS, *pictures]
 
 
 def write_run_config(folder: Path, config: FitConfig) -> None:

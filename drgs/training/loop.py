@@ -39,6 +39,18 @@ class Iteration:
     is_last: bool
 
 
+class Observer(Protocol):
+    """Somebody who is told of a fit as it runs; its result has the same bytes without them."""
+
+    def after(
+        self, trainer: Trainer, history: History, done: Iteration, stops: Callable[[], bool]
+    ) -> None:
+        """Called after an iteration, by the thread that fits; history: with its row, if it has one.
+
+        stops: whether the fit is to stop at once, which an observer that waits has to ask.
+        """
+
+
 def iterations(trainer: Trainer, history: History, length: Length) -> Iterator[Iteration]:
     """Run the iterations that are left, one each time that the next one is asked for.
 

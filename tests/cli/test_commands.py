@@ -44,12 +44,12 @@ def test_modules_are_commands_too_and_say_how_they_are_called(capsys, command):
     [
         (
             ["fot"],
-            "no command fot, only fit, poses, render, export, capture and bench; did you mean fit",
+            "only fit, poses, render, export, view, capture and bench; did you mean fit?",
         ),
         (["rendre"], "did you mean render?"),
         (
             ["xyz"],
-            "no command xyz, only fit, poses, render, export, capture and bench; see drgs",
+            "no command xyz, only fit, poses, render, export, view, capture and bench; see drgs",
         ),
         (["bench", "sped"], "; did you mean speed?"),
         ([], "the following arguments are required: COMMAND"),

@@ -148,7 +148,7 @@ def test_usd_is_written_where_openusd_is_installed(model):
 
 def test_without_openusd_a_line_says_what_to_install(model, monkeypatch):
     monkeypatch.setitem(sys.modules, "pxr", None)
-    message = "USD needs OpenUSD: pip install 'drgs[usd]'"
+    message = "USD: needs pxr, which is not installed; pip install 'drgs[usd]'"
     assert_refused(export.main, model, "--format", "usd", folder=model.parent, message=message)
 
 

@@ -105,7 +105,9 @@ def test_pictures_of_nothing_have_no_cameras_and_leave_nothing_behind(tmp_path):
 
 def test_without_pycolmap_one_line_says_what_to_install(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "pycolmap", None)
-    with pytest.raises(UserError, match=r"needs pycolmap, which .*: pip install pycolmap") as error:
+    with pytest.raises(
+        UserError, match=r"needs pycolmap, which is not installed; pip install 'drgs\[colmap\]'"
+    ) as error:
         place(tmp_path, Search(), False, said)
     assert "\n" not in str(error.value)
 

@@ -152,6 +152,7 @@ MODULES = {
     "render": "drgs.render",
     "poses": "drgs.poses",
     "export": "drgs.export",
+    "view": "drgs.view",
     "capture": "drgs.capture",
     "bench": "drgs.bench.__main__",
 }

@@ -33,12 +33,13 @@ MAY_IMPORT = {
     "_registration": {"plugins", *GROUND},
     "": {"_registration", "core"},  # drgs/__init__.py; what it offers is imported when it is used
     "rasterizing": {"accuracy", "effects", "splatting", "config", *METHOD},
-    "commands": {"training", "cli", "plugins", *TRAINING},
+    "live": {"training", *TRAINING},
+    "commands": {"live", "training", "cli", "plugins", *TRAINING},
     "bench": {"commands", "rasterizing", "training", "cli", "reference", "", *TRAINING},
 }
 """By package: the others that it may import. ``drgs`` itself may be imported for its version."""
 
-COMMANDS = {"__main__", "fit", "poses", "render", "export", "capture"}
+COMMANDS = {"__main__", "fit", "poses", "render", "export", "view", "capture"}
 
 
 def module_name(path):

@@ -1,0 +1,81 @@
+"""The history of a fit as TensorBoard reads it, written as the fit goes.
+
+Imported with ``--tensorboard``; tensorboardX, of the extra of that name, knows the format: records
+with checksums, each an event of TensorFlow's ``event.proto``.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+from types import TracebackType
+
+from tensorboardX.proto.event_pb2 import Event
+from tensorboardX.record_writer import RecordWriter
+from tensorboardX.summary import scalar
+
+from drgs.training.history import History, HistoryRow
+from drgs.training.loop import Iteration
+from drgs.training.trainer import Trainer
+
+VERSION = "brain.Event:2"
+"""Of the format; the first record says it."""
+
+TAGS = {
+    "loss": "loss",
+    "psnr": "PSNR/training_view",
+    "test_psnr": "PSNR/test_views",
+    "num_gaussians": "Gaussians",
+    "means_lr": "learning_rate/means",
+}
+"""By column of ``history.csv``: the name of its curve."""
+
+
+class EventLog:
+    """Writes a row of the history when it is there: see ``drgs.training.loop.Observer``.
+
+    A context manager. The file begins with the rows that there are already, so that a fit that was
+    stopped and resumed is one curve.
+    """
+
+    def __init__(self, path: Path, history: History) -> None:
+        """path: is replaced."""
+        path.parent.mkdir(parents=True, exist_ok=True)
+        self._writer = RecordWriter(str(path.absolute()))
+        self._writer.write(Event(wall_time=time.time(), file_version=VERSION).SerializeToString())
+        for row in history.rows:
+            self._write(row, history)
+        self._writer.flush()
+
+    def __enter__(self) -> EventLog:
+        """The file is open."""
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """Close the file."""
+        self._writer.close()
+
+    def after(
+        self, trainer: Trainer, history: History, done: Iteration, stops: Callable[[], bool]
+    ) -> None:
+        """Write the last row, if the iteration has one; what the disk takes is no time of a fit."""
+        del trainer, stops
+        if done.row is not None:
+            start = time.perf_counter()
+            self._write(history.rows[-1], history)
+            self._writer.flush()
+            history.leave_out(time.perf_counter() - start)
+
+    def _write(self, row: HistoryRow, history: History) -> None:
+        at = time.time() - (history.wall_s - row.wall_s)
+        for column, tag in TAGS.items():
+            if (value := getattr(row, column)) is not None:
+                summary = scalar(tag, float(value))
+                event = Event(wall_time=at, step=row.iteration, summary=summary)
+                self._writer.write(event.SerializeToString())

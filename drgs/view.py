@@ -1,0 +1,110 @@
+"""``python -m drgs.view WHAT``: look at Gaussians in a browser, rendered by our own kernels.
+
+``WHAT`` is a PLY file or the output folder of a fit. A page on this machine shows what its camera
+sees, small while it moves and whole when it is still: through any lens, with depths, normals and
+opacities, under every approximation, each with the time that it takes. Ctrl-C ends it.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+
+import numpy as np
+
+from drgs.cli.commands import MAX_PORT, CommandParser, at_least, file_or_folder, run_command
+from drgs.cli.execution import add_execution_arguments, executing, select_variant
+from drgs.cli.interrupts import StopRequest
+from drgs.core.errors import UserError
+from drgs.core.extras import required
+from drgs.data.orbits import orbit_of_gaussians
+from drgs.data.types import Viewpoint
+from drgs.data.viewpoints import FIELD_OF_VIEW, read_viewpoints
+from drgs.live.frames import LiveScene
+from drgs.live.page import Page, StartView
+from drgs.live.spectators import Spectators
+from drgs.live.wishes import Wishes
+from drgs.render import UP, Model, load_model
+from drgs.results.files import CAMERAS, VIEWS
+
+IDLE_SECONDS = 0.05
+"""Between two looks at whether a camera is still, or Ctrl-C was pressed."""
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Entry point of ``python -m drgs.view``."""
+    run_command(add_arguments, "python -m drgs.view", arguments)
+
+
+def add_arguments(parser: CommandParser) -> None:
+    """Add the arguments of the command."""
+    parser.description = "Look at Gaussians in a browser, rendered live on this machine."
+    parser.show_examples("%(prog)s out/lego", "%(prog)s model.ply --background white")
+    parser.add_argument("what", type=file_or_folder, metavar="MODEL.ply|OUT_DIR", help="to look at")
+    parser.add_argument(
+        "--background",
+        nargs="+",
+        metavar="COLOR",
+        help="white, black, R G B in 0..1, or a picture's file (default: the configuration's; "
+        "without one, black)",
+    )
+    parser.add_argument(
+        "--address", metavar="ADDRESS", help="of the page (default: 127.0.0.1, this machine alone)"
+    )
+    parser.add_argument(
+        "--port", type=at_least(1, MAX_PORT), metavar="N", help="(default: the first free one)"
+    )
+    add_execution_arguments(parser)
+    parser.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> None:
+    """Serve the page until Ctrl-C."""
+    required("viser", "viewer", "drgs view")
+    from drgs.live.server import ADDRESS, serving, url
+
+    if not args.what.exists():
+        raise UserError(f"{args.what}: there is no such file or folder")
+    with executing(args.threads, args.debug):
+        select_variant(args.variant)
+        model = model_of(args)
+        views = cameras_of(args, model)
+        scene = LiveScene(model.gaussians, model.settings, model.background)
+        wishes = Wishes()
+        options = ("--address", "--port")
+        with serving(args.address or ADDRESS, args.port, options) as server:
+            page = Page(server, wishes, StartView.of(views), scene.approximations)
+            if len(views) > 1:
+                page.add_cameras(views, visible=False)
+            print(f"{model.gaussians.num_gaussians:,} Gaussians: look at {url(server)}", flush=True)
+            print("Ctrl-C ends this", flush=True)
+            serve(scene, Spectators(wishes, page))
+
+
+def serve(scene: LiveScene, spectators: Spectators) -> None:
+    """Render what is due, until Ctrl-C."""
+    with StopRequest() as stop:
+        while not stop.requested:
+            if not spectators.serve(lambda: scene):
+                spectators.wishes.wait(IDLE_SECONDS)
+
+
+def model_of(args: argparse.Namespace) -> Model:
+    """The Gaussians, with the settings that they were fitted with."""
+    others = dict.fromkeys(("scene", "data", "set", "ignore"))
+    return load_model(argparse.Namespace(what=args.what, background=args.background, **others))
+
+
+def cameras_of(args: argparse.Namespace, model: Model) -> Sequence[Viewpoint]:
+    """Those of a fit's training views, refined if it has refined them; else one that sees all."""
+    if args.what.is_dir():
+        refined = model.config is not None and model.config.cameras.optimise
+        for name in (CAMERAS, VIEWS) if refined else (VIEWS,):
+            if (args.what / name).is_file():
+                return read_viewpoints(args.what / name, None)
+    orbit = orbit_of_gaussians(model.gaussians, np.array(UP), FIELD_OF_VIEW)
+    return orbit.viewpoints(1, 400, 400, FIELD_OF_VIEW)
+
+
+if __name__ == "__main__":
+    main()

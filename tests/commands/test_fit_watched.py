@@ -1,0 +1,160 @@
+"""``fit --view``: what the command leaves; the page itself is tested in ``tests/live``."""
+
+import json
+import socket
+import sys
+from contextlib import contextmanager
+from types import ModuleType
+
+import pytest
+import yaml
+from support.commands import run_in_process
+from support.fit_command import (
+    assert_fit_refused,
+    assert_fits,
+    without_pictures,
+    write_project,
+)
+from support.small_capture import HEIGHT, WIDTH, pose_around
+
+from drgs import fit
+from drgs.live import fit_page
+from drgs.live.frames import FrameRequest
+from drgs.live.optics import Eye
+from drgs.live.watching import UntilEnded, Watching
+from drgs.live.wishes import Wishes
+
+EYE = Eye(pose_around(0.4, 0.3), 40.0, 4.0)
+
+
+class Screen:
+    """Somebody who asks for more with each picture, and for an end at an iteration."""
+
+    def __init__(self, wishes, end_at):
+        self.wishes, self.end_at, self.shown = wishes, end_at, 0
+
+    def show(self, client, request, frame, is_whole):
+        self.shown += 1
+        self.wishes.ask(1, FrameRequest(EYE, WIDTH, HEIGHT + self.shown % 2))
+
+    def tell(self, trainer, history, total):
+        if trainer.iteration == self.end_at:
+            self.wishes.end()
+
+    def tell_end(self, iterations):
+        self.iterations = iterations
+
+
+@pytest.fixture
+def looked_on(monkeypatch):
+    """Makes ``--view`` a page for the screen above, without a server."""
+
+    @contextmanager
+    def serving(*arguments):
+        yield "server"
+
+    server = ModuleType("drgs.live.server")
+    server.serving, server.url, server.ADDRESS = serving, lambda _: "http://here", "127.0.0.1"
+    monkeypatch.setitem(sys.modules, "drgs.live.server", server)
+    monkeypatch.setitem(sys.modules, "viser", ModuleType("viser"))
+    monkeypatch.setattr("drgs.live.watching.SAID_SECONDS", 0.0)
+
+    def look_on(end_at=None):
+        screens = []
+
+        def watch(server, trainer, dataset, length):
+            wishes = Wishes()
+            screens.append(Screen(wishes, end_at))
+            wishes.ask(1, FrameRequest(EYE, WIDTH, HEIGHT))
+            length = UntilEnded(length, wishes)
+            return Watching(wishes, screens[0], dataset, length), length
+
+        monkeypatch.setattr(fit_page, "watch", watch)
+        return screens
+
+    without_pictures(monkeypatch)
+    return look_on
+
+
+def files_of(out):
+    """The bytes of what does not tell the time."""
+    paths = (p for p in out.rglob("*") if p.is_file() and p.suffix in (".ply", ".png"))
+    return {path.relative_to(out): path.read_bytes() for path in paths}
+
+
+def test_the_results_have_the_same_bytes_with_and_without_somebody_who_looks_on(
+    tmp_path, looked_on
+):
+    config, screens = write_project(tmp_path), looked_on()
+    outcome = assert_fits(config, "--out", tmp_path / "watched", "--view")
+    assert "look on at http://here" in outcome.stdout
+    assert screens[0].shown == screens[0].iterations == 8
+    assert_fits(config, "--out", tmp_path / "alone")
+    assert files_of(tmp_path / "watched") == files_of(tmp_path / "alone")
+    first, second = ((tmp_path / n / "config.yml").read_text() for n in ("watched", "alone"))
+    assert first.replace("watched", "alone") == second
+
+
+def test_an_early_end_leaves_a_finished_fit_of_as_many_iterations(tmp_path, looked_on):
+    config, out = write_project(tmp_path), tmp_path / "out"
+    looked_on(end_at=4)
+    outcome = assert_fits(config, "--out", out, "--view")
+    assert "5 iterations in" in outcome.stdout
+    metrics = json.loads((out / "metrics.json").read_text())
+    assert metrics["iterations"] == metrics["config"]["iterations"] == 5
+    assert yaml.safe_load((out / "config.yml").read_text())["iterations"] == 5
+    assert not (out / "checkpoint.npz").exists()
+    assert "finished" in assert_fits("--resume", out).stdout
+    assert_fits(out / "config.yml", "--out", tmp_path / "again")
+    assert files_of(tmp_path / "again") == files_of(out)
+
+
+def test_a_fit_that_was_ended_and_then_killed_writes_its_results_when_resumed(
+    tmp_path, looked_on, monkeypatch
+):
+    config, out = write_project(tmp_path), tmp_path / "out"
+    looked_on(end_at=4)
+    with monkeypatch.context() as patch:
+        patch.setattr(fit, "write_pictures", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+        assert run_in_process(fit.main, config, "--out", out, "--view").returncode == 130
+    assert_fits("--resume", out)
+    assert json.loads((out / "metrics.json").read_text())["iterations"] == 5
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("--view-port", "8080"), "--view-port: needs --view"),
+        (("--view-address", "::1"), "--view-address: needs --view"),
+        (("--view", "--view-port", "0"), "--view-port: must be a whole number >= 1, got 0"),
+        (("--view", "--view-port", "65536"), "--view-port: must be at most 65,535"),
+    ],
+)
+def test_options_that_do_not_go_together_are_refused(tmp_path, arguments, message):
+    assert_fit_refused(write_project(tmp_path), *arguments, folder=tmp_path, message=message)
+
+
+def test_without_the_extra_one_line_says_what_to_install(tmp_path, monkeypatch):
+    config = write_project(tmp_path)
+    monkeypatch.setitem(sys.modules, "viser", None)
+    assert_fit_refused(
+        config,
+        "--view",
+        folder=tmp_path,
+        message="--view: needs viser, which is not installed; pip install 'drgs[viewer]'",
+    )
+
+
+def test_a_port_that_is_taken_and_an_address_of_another_machine_are_refused(tmp_path):
+    pytest.importorskip("viser", reason="viser is not installed (the extra viewer)")
+    config = write_project(tmp_path)
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        message = f"--view-port {port}: cannot listen at 127.0.0.1: Address already in use"
+        assert_fit_refused(config, "--view", "--view-port", port, folder=tmp_path, message=message)
+    for address, message in (
+        ("192.0.2.1", "--view-address 192.0.2.1: cannot listen at 192.0.2.1"),
+        ("no address", "--view-address: must be an address of this machine"),
+    ):
+        arguments = (config, "--view", "--view-address", address)
+        assert_fit_refused(*arguments, folder=tmp_path, message=message)

@@ -1,0 +1,68 @@
+"""``drgs view``: what it shows, and what it refuses; browsers are in ``tests/live``."""
+
+import shutil
+import sys
+
+import numpy as np
+import pytest
+import yaml
+from support.commands import assert_refused
+from support.folders import contents
+from support.small_capture import FOCUS, RADIUS, make_dataset
+
+from drgs import view
+from drgs.cli.commands import CommandParser
+from drgs.results.files import CAMERAS, VIEWS
+from drgs.results.refined_cameras import write_views
+
+
+def parsed(*arguments):
+    parser = CommandParser()
+    view.add_arguments(parser)
+    return parser.parse_args([str(argument) for argument in arguments])
+
+
+@pytest.mark.parametrize("refined", [False, True])
+def test_a_fit_is_seen_from_its_training_cameras(fit, tmp_path, refined):
+    """As refined, where the fit has refined them."""
+    run = tmp_path / "run"
+    shutil.copytree(fit, run)
+    config = yaml.safe_load((run / "config.yml").read_text())
+    config["cameras"] = {"optimise": refined}
+    (run / "config.yml").write_text(yaml.safe_dump(config))
+    few, others = make_dataset(train=3).train, make_dataset(train=5).train
+    write_views(run / VIEWS, few)
+    write_views(run / CAMERAS, others)
+    args = parsed(run)
+    model = view.model_of(args)
+    assert model.background == (1.0, 1.0, 1.0)  # of its configuration
+    cameras = view.cameras_of(args, model)
+    for camera, expected in zip(cameras, others if refined else few, strict=True):
+        assert np.allclose(camera.camera_to_world, expected.camera_to_world)
+
+
+def test_a_file_alone_is_seen_whole(fit):
+    args = parsed(fit / "point_cloud.ply", "--background", "0.5", "0.25", "0")
+    model = view.model_of(args)
+    assert model.background == (0.5, 0.25, 0.0)
+    (camera,) = view.cameras_of(args, model)
+    middle = camera.K @ (camera.viewmat @ [*FOCUS, 1])[:3]
+    assert np.abs(middle[:2] / middle[2] - 200).max() < 60  # px of 400
+    assert 0.3 * RADIUS < np.linalg.norm(camera.center - FOCUS) < 2 * RADIUS
+
+
+def test_what_is_not_there_is_refused(fit, tmp_path):
+    pytest.importorskip("viser", reason="viser is not installed (the extra viewer)")
+    for what, message in (
+        (tmp_path / "nothing", "there is no such file or folder"),
+        (tmp_path, "must be the output folder of a fit that has ended"),
+    ):
+        assert_refused(view.main, what, folder=tmp_path, message=message)
+
+
+def test_without_the_extra_one_line_says_what_to_install(fit, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "viser", None)
+    message = "drgs view: needs viser, which is not installed; pip install 'drgs[viewer]'"
+    before = contents(fit)
+    assert_refused(view.main, fit, folder=tmp_path, message=message)
+    assert contents(fit) == before
