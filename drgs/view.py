@@ -40,7 +40,7 @@ def add_arguments(parser: CommandParser) -> None:
     """Add the arguments of the command."""
     parser.description = "Look at Gaussians in a browser, rendered live on this machine."
     parser.show_examples("%(prog)s out/lego", "%(prog)s model.ply --background white")
-    parser.add_argument("what", type=file_or_folder, metavar="MODEL.ply|OUT_DIR", help="to look at")
+    parser.add_argument("what", type=file_or_folder, metavar="MODEL|OUT_DIR", help="to look at")
     parser.add_argument(
         "--background",
         nargs="+",
