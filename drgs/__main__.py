@@ -10,6 +10,7 @@ from drgs.cli.commands import CommandParser, Subcommand, run_command
 COMMANDS = {
     "fit": Subcommand("fit 3D Gaussians to posed photographs", "drgs.fit"),
     "render": Subcommand("render Gaussians, a fit, or a Mitsuba scene", "drgs.render"),
+    "export": Subcommand("write Gaussians for other programs", "drgs.export"),
     "capture": Subcommand("turn a Mitsuba scene into a training set", "drgs.capture"),
     "bench": Subcommand("measure drgs; write tables and plots", "drgs.bench.__main__"),
 }

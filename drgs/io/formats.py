@@ -37,7 +37,7 @@ class Format:
     has_harmonics: bool = True  # above degree 0
     has_smoothing: bool = False  # the filter of each Gaussian
     keeps: frozenset[str] | None = None  # what it can say of rendering, by name; None: everything
-    is_exact: bool = False  # whether it holds float32 numbers, of all that has no fixed range
+    any_number: bool = False  # whether what is no finite number is written as it is
 
     def encode(
         self, gaussians: Mapping[str, np.ndarray], rendered_with: Mapping[str, Scalar] | None
@@ -53,7 +53,7 @@ class Format:
                 f"the format {self.name} has no room for the smoothing of Gaussians: bake it into "
                 "them first, with drgs.effects.smoothing.baked or drgs export"
             )
-        if not self.is_exact:
+        if not self.any_number:
             _check_finite(gaussians, self.name)
         said = {
             name: value
@@ -75,13 +75,36 @@ FORMATS = (
         "drgs.io.ply",
         "the 3DGS reference's PLY, which every program reads",
         has_smoothing=True,
-        is_exact=True,
+        any_number=True,
     ),
     Format(
         "compressed-ply",
         ".compressed.ply",
         "drgs.io.compressed_ply",
         "PlayCanvas's compressed PLY, for SuperSplat and PlayCanvas",
+    ),
+    Format(
+        "spz",
+        ".spz",
+        "drgs.io.spz",
+        "Niantic's SPZ, the smallest",
+        y_up=True,
+        keeps=frozenset({"antialiased"}),
+    ),
+    Format(
+        "glb",
+        ".glb",
+        "drgs.io.glb",
+        "binary glTF with KHR_gaussian_splatting, in full precision",
+        y_up=True,
+    ),
+    Format(
+        "splat",
+        ".splat",
+        "drgs.io.splat",
+        "antimatter15's .splat, for old viewers: no harmonics",
+        has_harmonics=False,
+        keeps=frozenset(),
     ),
 )
 """All that are read and written."""
@@ -118,7 +141,7 @@ def read_gaussians(
 
 
 def _check_finite(gaussians: Mapping[str, np.ndarray], name: str) -> None:
-    """Refuse what has no code among the whole numbers of a format."""
+    """Refuse what formats have no code for."""
     if not len(gaussians["means"]):
         raise UserError(f"the format {name} needs at least one Gaussian, got none")
     for field, values in gaussians.items():

@@ -150,6 +150,7 @@ def test_keys_of_the_configuration_exist(page):
 MODULES = {
     "fit": "drgs.fit",
     "render": "drgs.render",
+    "export": "drgs.export",
     "capture": "drgs.capture",
     "bench": "drgs.bench.__main__",
 }

@@ -38,7 +38,7 @@ MAY_IMPORT = {
 }
 """By package: the others that it may import. ``drgs`` itself may be imported for its version."""
 
-COMMANDS = {"__main__", "fit", "render", "capture"}
+COMMANDS = {"__main__", "fit", "render", "export", "capture"}
 
 
 def module_name(path):

@@ -9,6 +9,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from drgs.gaussians.parameters import Gaussians
+from drgs.gaussians.similarity import Similarity
 
 SH_C0 = 0.28209479177387814
 
@@ -17,7 +18,10 @@ FLOAT32 = 2.0**-23
 
 
 def gaussians_within_ranges(num=600, degree=3, seed=0) -> Gaussians:
-    """Such that no format has to cut anything off; 600: three groups of a compressed PLY."""
+    """Such that no format has to cut anything off; 600: three groups of a compressed PLY.
+
+    Harmonics: when a degree is turned, seven coefficients may add up to sqrt(7) 0.35 < 1.
+    """
     rng = np.random.default_rng(seed)
     opacities = rng.uniform(0.02, 0.98, num)
     colors = rng.uniform(0, 1, (num, 1, 3))
@@ -27,7 +31,7 @@ def gaussians_within_ranges(num=600, degree=3, seed=0) -> Gaussians:
         log_scales=rng.uniform(-7, -1, (num, 3)).astype(np.float32),
         logit_opacities=np.log(opacities / (1 - opacities)).astype(np.float32),
         sh0=((colors - 0.5) / SH_C0).astype(np.float32),
-        shN=rng.uniform(-0.9, 0.9, (num, (degree + 1) ** 2 - 1, 3)).astype(np.float32),
+        shN=rng.uniform(-0.35, 0.35, (num, (degree + 1) ** 2 - 1, 3)).astype(np.float32),
     )
 
 
@@ -36,7 +40,7 @@ class Precision:
     """The largest differences that a format may make in :func:`gaussians_within_ranges`."""
 
     means: float
-    quats: float  # distance of unit quaternions, whichever sign
+    quats: float  # see distance_of_ellipsoids
     log_scales: float
     opacities: float
     colors: float  # 0.5 + SH_C0 sh0
@@ -67,8 +71,39 @@ PRECISION = {
         colors=half_step(1, 8),
         harmonics=8 / 256 / 2 + 4 * FLOAT32,
     ),
+    "spz": Precision(
+        means=2.0**-13 / 2 + 4 * FLOAT32,  # 16 bits for less than 2^2 before the point, and a sign
+        quats=smallest_three(1 / (np.sqrt(2) * 511)),
+        log_scales=1 / 16 / 2 + 4 * FLOAT32,
+        opacities=half_step(1, 8),
+        colors=half_step(SH_C0 / 0.15, 8),
+        # To 1/128, then to 5 of 8 bits. Turning back adds up to sqrt(7) of one row of a rotation.
+        harmonics=np.sqrt(7) * (1 / 256 + 8 / 256) + 4 * FLOAT32,
+    ),
+    "glb": Precision(
+        means=0,  # axes change their names and signs
+        quats=8 * FLOAT32,
+        log_scales=2 * FLOAT32 * 7,
+        opacities=4 * FLOAT32,
+        colors=0,
+        harmonics=8 * FLOAT32,
+    ),
+    "splat": Precision(
+        means=0,
+        # Four components off by 1/256, 1 itself by 1/128, before the quaternion is normalised.
+        quats=2 * np.sqrt(3 / 256**2 + 1 / 128**2),
+        log_scales=2 * FLOAT32 * 7,
+        opacities=half_step(1, 8),
+        colors=half_step(1, 8),
+        harmonics=0,
+    ),
 }
 """By name of a format, from its bits."""
+
+
+def turned(gaussians: Gaussians, rotation: np.ndarray) -> Gaussians:
+    """All of them after x' = R x, by the package's own similarity, which has tests of its own."""
+    return Similarity(1.0, np.asarray(rotation, np.float64), np.zeros(3)).of_gaussians(gaussians)
 
 
 def matched(expected: Gaussians, found: Gaussians) -> Gaussians:
@@ -79,17 +114,24 @@ def matched(expected: Gaussians, found: Gaussians) -> Gaussians:
     return Gaussians(**{name: getattr(found, name)[rows] for name in names})
 
 
-def assert_within(precision: Precision, expected: Gaussians, found: Gaussians) -> None:
-    """Row by row; harmonics that ``found`` lacks are not looked at."""
+def distance_of_ellipsoids(quats: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """Distances (N,) of unit quaternions wxyz; half a turn about an ellipsoid's axis is none."""
     a, b = (
         q / np.linalg.norm(q, axis=1, keepdims=True)
-        for q in (expected.quats.astype(np.float64), found.quats.astype(np.float64))
+        for q in (quats.astype(np.float64), others.astype(np.float64))
     )
-    distances = np.minimum(np.linalg.norm(a - b, axis=1), np.linalg.norm(a + b, axis=1))
+    w, x, y, z = b.T
+    turns = [(w, x, y, z), (-x, w, z, -y), (-y, -z, w, x), (-z, y, -x, w)]  # b 1, b i, b j, b k
+    apart = [np.linalg.norm(a - sign * np.array(t).T, axis=1) for t in turns for sign in (1, -1)]
+    return np.min(apart, axis=0)
+
+
+def assert_within(precision: Precision, expected: Gaussians, found: Gaussians) -> None:
+    """Row by row; harmonics that ``found`` lacks are not looked at."""
     kept = found.shN.shape[1]
     differences = {
         "means": expected.means - found.means,
-        "quats": distances,
+        "quats": distance_of_ellipsoids(expected.quats, found.quats),
         "log_scales": expected.log_scales - found.log_scales,
         "opacities": expected.opacities - found.opacities,
         "colors": SH_C0 * (expected.sh0 - found.sh0),

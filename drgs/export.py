@@ -1,0 +1,292 @@
+"""``python -m drgs.export RUN_OR_FILE --format NAME``: Gaussians for other programs.
+
+Of a fit's output folder, the file that is meant for other programs is taken: see
+``drgs.training.viewers``. The formats are those of ``drgs.io.formats``. Models can be cropped and
+filtered on the way, and turned upright.
+"""
+
+from __future__ import annotations
+
+import argparse
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from drgs.cli.commands import CommandParser, file_or_folder, finite_number, run_command
+from drgs.config.approximations import DECLARED, said_by
+from drgs.core.errors import UserError, UserNote, did_you_mean, one_line
+from drgs.core.records import FolderRecord
+from drgs.data.orbits import up_of
+from drgs.data.viewpoints import read_viewpoints
+from drgs.effects.smoothing import baked
+from drgs.gaussians.cleaning import Selection, taken, turned_towards
+from drgs.gaussians.parameters import Gaussians
+from drgs.io.formats import FORMATS, format_of
+from drgs.io.morton import morton_order
+from drgs.results.files import CONFIG, GAUSSIANS, GAUSSIANS_FOR_VIEWERS, VIEWS
+
+COMMAND = "export"
+
+Z_UP = np.array([0.0, 0.0, 1.0])
+"""Of datasets, and of what ``Gaussians.save`` expects for formats with axes of their own."""
+
+Y_DOWN = np.array([0.0, -1.0, 0.0])
+"""What programs take for up in formats that do not say: that of COLMAP's worlds, in which the 3DGS
+reference fits."""
+
+SNAPPED = np.cos(np.radians(5))
+"""Cosine of the angle to an axis within which the training cameras' up is that axis."""
+
+
+@dataclass(frozen=True)
+class Source:
+    """What is exported."""
+
+    gaussians: Gaussians  # numpy, without a smoothing filter
+    path: Path  # of the file
+    folder: Path | None  # of the fit; None: a file was named
+
+
+@dataclass(frozen=True)
+class Target:
+    """What it is exported to."""
+
+    suffix: str  # of files, in small letters
+    text: str  # what it is, one phrase
+    write: Callable[[Source, Path], None]
+    up: np.ndarray  # (3,) what programs take for up
+    has_axes: bool = False  # whether the format says so: then models are always turned
+
+
+def _write_file(source: Source, path: Path) -> None:
+    source.gaussians.save(path)
+
+
+TARGETS = {
+    each.name: Target(
+        each.suffix, each.text, _write_file, Z_UP if each.y_up else Y_DOWN, has_axes=each.y_up
+    )
+    for each in FORMATS
+}
+"""By the name that ``--format`` takes."""
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Entry point of ``python -m drgs.export``."""
+    run_command(add_arguments, "python -m drgs.export", arguments)
+
+
+def add_arguments(parser: CommandParser) -> None:
+    """Add the arguments of the command."""
+    parser.description = "Write Gaussians in a format of other programs."
+    parser.show_examples(
+        "%(prog)s out/lego --format spz",
+        "%(prog)s out/lego --out lego.glb --min-opacity 0.02",
+        "%(prog)s model.ply --up 0 -1 0 --out model.spz",
+    )
+    parser.add_argument(
+        "what",
+        type=file_or_folder,
+        metavar="OUT_DIR|MODEL",
+        help="the output folder of a fit, or a file of Gaussians",
+    )
+    names = "; ".join(f"{name}: {target.text}" for name, target in TARGETS.items())
+    parser.add_argument(
+        "--format", metavar="NAME", help=f"{names} (default: what the suffix of --out says)"
+    )
+    parser.add_argument(
+        "--out",
+        type=file_or_folder,
+        metavar="FILE",
+        help="the file to write (default: the name of what is exported, with another suffix)",
+    )
+    _add_cleaning(parser)
+    parser.set_defaults(run=run)
+
+
+def _add_cleaning(parser: CommandParser) -> None:
+    add = parser.add_argument_group("what is kept, and how it lies").add_argument
+    corners = tuple(f"{axis}{end}" for end in "01" for axis in "XYZ")
+    number = {"type": finite_number}
+    add("--crop", **number, nargs=6, metavar=corners, help="keep what is between two corners")
+    add("--min-opacity", **number, metavar="P", help="leave out what is less opaque, 0 to 1")
+    add(
+        "--max-size",
+        **number,
+        metavar="S",
+        help="leave out what has a larger standard deviation, scene units",
+    )
+    add(
+        "--up",
+        nargs="+",
+        metavar="UP",
+        help="turn the model so that programs show this direction, X Y Z, upright; cameras: as the "
+        "training cameras were held (default: for formats that say what is up, cameras, or 0 0 1 "
+        "where there are none; others are not turned)",
+    )
+    add(
+        "--order",
+        choices=("file", "morton"),
+        default="file",
+        help="morton: neighbours in space are neighbours in the file (default: as they are; "
+        "formats that need an order of their own bring it)",
+    )
+
+
+def run(args: argparse.Namespace) -> None:
+    """Export what the command line names."""
+    name, out = _destination(args)
+    target = TARGETS[name]
+    selection = _selection(args)
+    source = load_source(args.what)
+    print(f"{source.path}: {source.gaussians.num_gaussians:,} Gaussians", flush=True)
+    up = _up(args, source, target)
+    gaussians = _selected(source, selection)
+    if up is not None:
+        gaussians = turned_towards(gaussians, up, target.up)
+    if args.order == "morton":
+        gaussians = taken(gaussians, morton_order(gaussians.means))
+    record = FolderRecord(out.parent, COMMAND)
+    record.claim([out.name])
+    target.write(replace(source, gaussians=gaussians), out)
+    FolderRecord(out.parent, COMMAND).seal()
+    print(f"written: {out} ({out.stat().st_size / 1e6:.1f} MB)")
+
+
+# ----------------------------------------------------------------------------------------------
+# What is exported, and where to
+# ----------------------------------------------------------------------------------------------
+
+
+def load_source(what: Path) -> Source:
+    """The Gaussians of a fit's folder that are meant for other programs, or those of a file.
+
+    What a file says that other programs would not do is a :class:`UserNote`; what they do anyway
+    is dropped. A smoothing filter is baked in.
+    """
+    if not what.exists():
+        raise UserError(f"{what}: there is no such file or folder")
+    path = what
+    if what.is_dir():
+        names = [name for name in (GAUSSIANS_FOR_VIEWERS, GAUSSIANS) if (what / name).is_file()]
+        if not names or not (what / CONFIG).is_file():
+            raise UserError(
+                f"{what}: must be the output folder of a fit that has ended, but there is no "
+                f"{CONFIG if names else GAUSSIANS} in it"
+            )
+        path = what / names[0]
+    gaussians = Gaussians.load(path)
+    said = said_by(str(path), gaussians.rendered_with or {})
+    others = {name: value for name, value in said.items() if value != DECLARED[name].default}
+    if others:
+        _note_rendering(path, others)
+    gaussians = baked(replace(gaussians, rendered_with=others or None))
+    return Source(gaussians, path, what if what.is_dir() else None)
+
+
+def _note_rendering(path: Path, others: dict[str, object]) -> None:
+    """Programs that do not know of it show something else."""
+    words = ", ".join(f"{name} {str(value).lower()}" for name, value in others.items())
+    beside = path.with_name(GAUSSIANS_FOR_VIEWERS)
+    remedy = f"; export {beside} instead" if beside.is_file() else ""
+    note = f"{path}: made to be rendered with {words}; programs that do not will show it otherwise"
+    warnings.warn(UserNote(note + remedy), stacklevel=2)
+
+
+def _destination(args: argparse.Namespace) -> tuple[str, Path]:
+    """The name of the target, and the file."""
+    name = args.format
+    if name is None and args.out is not None:
+        name = _target_of(args.out)
+    if name not in TARGETS:
+        got = f"got {one_line(name, 40)}{did_you_mean(name, TARGETS)}" if name else "got none"
+        raise UserError(f"--format: must be one of {', '.join(TARGETS)}, {got}")
+    suffix = TARGETS[name].suffix
+    if args.out is None:
+        known = format_of(args.what)
+        stem = args.what.name[: -len(known.suffix)] if known else args.what.resolve().name
+        return name, args.what.resolve().with_name(f"{stem}{suffix}")
+    if not args.out.name.lower().endswith(suffix):
+        raise UserError(f"--out {args.out}: the name of a {name} file must end in {suffix}")
+    if _target_of(args.out) != name:  # as a.compressed.ply is no name for a plain PLY
+        raise UserError(f"--out {args.out}: the name is that of a {_target_of(args.out)} file")
+    return name, args.out
+
+
+def _target_of(path: Path) -> str | None:
+    """The target with the longest suffix that the file's name ends in."""
+    found = [n for n, target in TARGETS.items() if path.name.lower().endswith(target.suffix)]
+    return max(found, key=lambda name: len(TARGETS[name].suffix), default=None)
+
+
+# ----------------------------------------------------------------------------------------------
+# What is kept, and how it lies
+# ----------------------------------------------------------------------------------------------
+
+
+def _selection(args: argparse.Namespace) -> Selection:
+    opacity, size = args.min_opacity, args.max_size
+    if opacity is not None and not 0 <= opacity <= 1:
+        raise UserError(f"--min-opacity: must be between 0 and 1, got {opacity:g}")
+    if size is not None and not size > 0:
+        raise UserError(f"--max-size: must be above 0, got {size:g}")
+    return Selection(None if args.crop is None else tuple(args.crop), opacity, size)
+
+
+def _selected(source: Source, selection: Selection) -> Gaussians:
+    """Those that are kept, with a line of how many that are."""
+    gaussians = source.gaussians
+    kept_by = selection.kept_by(gaussians)
+    if not kept_by:
+        return gaussians
+    kept = np.logical_and.reduce(list(kept_by.values()))
+    lost = ", ".join(f"{name} {np.count_nonzero(~k):,}" for name, k in kept_by.items())
+    print(f"kept: {np.count_nonzero(kept):,}; left out by {lost}", flush=True)
+    if not kept.any():
+        raise UserError(f"{source.path}: nothing is left; crop and filter less")
+    return taken(gaussians, kept)
+
+
+def _up(args: argparse.Namespace, source: Source, target: Target) -> np.ndarray | None:
+    """(3,) what is up in the model's world; None: it is not to be turned. With a line about it."""
+    words, views = args.up, source.folder and source.folder / VIEWS
+    has_cameras = views is not None and views.is_file()
+    if words is None and not target.has_axes:
+        return None
+    if words is None:
+        words = ["cameras"] if has_cameras else ["0", "0", "1"]
+    if words == ["cameras"]:
+        if not has_cameras:
+            raise UserError(
+                f"--up cameras: needs the output folder of a fit with {VIEWS}; give --up X Y Z"
+            )
+        up, why = _snapped(up_of(read_viewpoints(views, None))), " (the training cameras')"
+    else:
+        up, why = _direction(words), "" if args.up else " (give --up otherwise)"
+    print(f"up: {' '.join(f'{x:.3g}' for x in up)}{why}", flush=True)
+    return up
+
+
+def _direction(words: Sequence[str]) -> np.ndarray:
+    try:
+        up = np.array([float(word) for word in words])
+    except ValueError:
+        up = np.zeros(0)
+    length = np.linalg.norm(up)
+    if up.shape != (3,) or not (np.isfinite(length) and length > 0):
+        got = one_line(" ".join(words), 60)
+        raise UserError(f"--up: must be cameras, or three numbers not all zero, got {got}")
+    return up / length
+
+
+def _snapped(up: np.ndarray) -> np.ndarray:
+    """The axis that is next to it, if one is: what was estimated is off by a little."""
+    axis = np.argmax(np.abs(up))
+    return np.sign(up[axis]) * np.eye(3)[axis] if abs(up[axis]) >= SNAPPED else up
+
+
+if __name__ == "__main__":
+    main()

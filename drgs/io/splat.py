@@ -1,0 +1,92 @@
+"""``.splat`` files of antimatter15's viewer: 32 bytes per Gaussian, without harmonics.
+
+Source of the layout: the README and ``convert.py`` of antimatter15/splat. A row has position and
+scale, 3 float32 each, then red, green, blue, opacity and the quaternion wxyz in 8 bits each, that
+as 128 (q + 1). What matters most comes first, so that a viewer shows it while it loads the rest:
+rows fall by the product of opacity and volume. There is no header.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from drgs.core.errors import UserError
+from drgs.core.files import read_bytes
+from drgs.io.colmap_records import Place
+from drgs.io.ply import Scalar
+from drgs.io.quantized import (
+    SH_C0,
+    log_scales_of,
+    logits_of,
+    opacities_of,
+    rounded,
+    unit_quaternions,
+)
+
+MAX_BYTES = 1 << 33
+"""Of a file: 8.6 GB."""
+
+ROW = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("quat", "u1", 4)])
+
+
+def encode(
+    gaussians: Mapping[str, np.ndarray], rendered_with: Mapping[str, Scalar] | None = None
+) -> bytes:
+    """A file of Gaussians. Equal ones give equal bytes.
+
+    gaussians: finite, by the names that :func:`drgs.io.ply.read_gaussians` gives; harmonics above
+    degree 0 are left out. rendered_with: has no place.
+    """
+    del rendered_with
+    g = gaussians
+    opacities = opacities_of(g["logit_opacities"])
+    log_scales = g["log_scales"].astype(np.float64)
+    importance = log_scales.sum(axis=1) + np.log(opacities)
+    rows = np.empty(len(opacities), ROW)
+    rows["mean"] = g["means"]
+    largest = np.log(float(np.finfo(np.float32).max))
+    rows["scale"] = np.exp(np.minimum(log_scales, largest)).astype(np.float32)
+    colors = 0.5 + SH_C0 * g["sh0"][:, 0].astype(np.float64)
+    rows["rgba"] = rounded(np.column_stack([colors, opacities]) * 255, 255)
+    rows["quat"] = rounded(unit_quaternions(g["quats"]) * 128 + 128, 255)
+    return rows[np.argsort(-importance, kind="stable")].tobytes()
+
+
+def read_gaussians(path: str | Path) -> tuple[dict[str, np.ndarray], dict[str, Scalar]]:
+    """Gaussians of degree 0 as numpy float32 arrays, and an empty dictionary.
+
+    As :func:`drgs.io.ply.read_gaussians` gives them; opacities of 0 and 1, and scales of 0, are the
+    next ones that their logits and logarithms tell apart.
+
+    Raises :class:`UserError` naming the file, the byte, what was expected and what was got.
+    """
+    path = Path(path)
+    content = read_bytes(path, "file", MAX_BYTES)
+    if not content or len(content) % ROW.itemsize:
+        raise UserError(
+            f"{Place(path, 'byte', len(content))}: the file must have {ROW.itemsize} bytes for "
+            "each Gaussian, at least one; it is damaged, or was cut off"
+        )
+    rows = np.frombuffer(content, ROW)
+    for name, kind in (("mean", "finite"), ("scale", "finite and not negative")):
+        values = rows[name]
+        bad = np.argwhere(~(np.isfinite(values) & ((values >= 0) | (name == "mean"))))
+        if len(bad):
+            row, axis = bad[0]
+            at = row * ROW.itemsize + ROW.fields[name][1] + 4 * axis
+            raise UserError(
+                f"{Place(path, 'byte', at)}: a {name} must be {kind}, got {values[row, axis]}"
+            )
+    colors = rows["rgba"][:, :3] / 255
+    arrays = {
+        "means": rows["mean"],
+        "quats": rows["quat"].astype(np.float64) / 128 - 1,
+        "log_scales": log_scales_of(rows["scale"]),
+        "logit_opacities": logits_of(rows["rgba"][:, 3] / 255),
+        "sh0": ((colors - 0.5) / SH_C0)[:, None, :],
+        "shN": np.zeros((len(rows), 0, 3)),
+    }
+    return {name: values.astype(np.float32) for name, values in arrays.items()}, {}
