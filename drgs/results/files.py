@@ -22,6 +22,9 @@ ORBIT = "orbit.webp"
 ORBIT_GIF = "orbit.gif"
 REPORT = "report.html"
 
+VIEWER = "viewer.html"
+"""The Gaussians, to walk around in; there is none where it would be too large."""
+
 RENDERS = "renders"
 """A folder for each split that was measured, with a picture for each of its views."""
 
@@ -59,6 +62,7 @@ RESULTS = (
     RENDERS,
     REPORT,
     SIDE_BY_SIDE,
+    VIEWER,
     VIEWS,
 )
 """All of them but ``config.yml``."""

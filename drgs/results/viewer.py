@@ -15,6 +15,7 @@ import gzip
 import html
 import json
 import math
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib import resources
@@ -24,11 +25,14 @@ from string import Template
 import numpy as np
 
 from drgs.config.approximations import Approximations
+from drgs.core.errors import UserNote
 from drgs.core.files import atomic_path
-from drgs.data.orbits import Orbit, orbit_of_views
-from drgs.data.types import Viewpoint
+from drgs.data.orbits import Orbit, orbit_of_gaussians, orbit_of_views
+from drgs.data.types import Dataset, Viewpoint
+from drgs.data.viewpoints import FIELD_OF_VIEW
 from drgs.gaussians.parameters import Gaussians
 from drgs.gaussians.similarity import Similarity
+from drgs.results.files import VIEWER
 
 MOST_BYTES = 25_000_000
 """Of a page that is written without being asked for: what mail services take. It holds 470,000
@@ -37,7 +41,7 @@ Gaussians of degree 3; a browser that computes on one core opens such a page in 
 PAGE = "viewer_page.html"
 """Of this package: the page, with ``$names`` for what :func:`viewer_page` fills in."""
 
-VIEWER = "supersplat_viewer"
+SUPERSPLAT = "supersplat_viewer"
 """Of this package: the folder with the viewer's files."""
 
 HONOURED = {"low_pass", "antialiased"}
@@ -79,6 +83,13 @@ class Standpoint:
         cosines = offsets @ start / np.where(lengths > 0, lengths, 1)
         return Standpoint(views[int(np.argmax(cosines))], orbit)
 
+    @staticmethod
+    def of_gaussians(gaussians: Gaussians, up: np.ndarray) -> Standpoint:
+        """That from which all but outliers are in a square window; up: (3,) world, any length."""
+        orbit = orbit_of_gaussians(gaussians, up, FIELD_OF_VIEW)
+        (camera,) = orbit.viewpoints(1, 1, 1, FIELD_OF_VIEW)
+        return Standpoint(camera, orbit)
+
     @property
     def target(self) -> np.ndarray:
         """(3,) world: the point on the camera's optical axis that is the nearest to the focus.
@@ -99,6 +110,14 @@ class Standpoint:
         return Similarity(float(scale), rotation, -scale * rotation @ self.target)
 
 
+@dataclass(frozen=True, eq=False)
+class Shown:
+    """Gaussians, and how they are to be seen."""
+
+    gaussians: Gaussians  # numpy or Dr.Jit, without a smoothing filter
+    approximations: Approximations  # those of HONOURED count
+
+
 def shows_as_fitted(approximations: Approximations) -> bool:
     """Whether the page renders with all of them that are not the default."""
     return approximations.others_than_default.keys() <= HONOURED
@@ -106,32 +125,47 @@ def shows_as_fitted(approximations: Approximations) -> bool:
 
 def viewer_page(
     title: str,
-    gaussians: Gaussians,
-    approximations: Approximations,
+    shown: Shown,
     standpoint: Standpoint,
     background: tuple[float, float, float],
 ) -> bytes:
     """The page, UTF-8; equal arguments give equal bytes.
 
-    gaussians: without a smoothing filter; approximations: with which they are to be seen, of which
-    those of :data:`HONOURED` count; background: display space. Of the camera are not shown: its
-    roll about the optical axis, its principal point and its lens.
+    background: display space. Of the camera are not shown: its roll about the optical axis, its
+    principal point and its lens.
 
     Raises ``drgs.core.errors.UserError`` for Gaussians with numbers that are not finite.
     """
     move = standpoint.to_page
     in_file = Similarity(move.scale, FILE_AXES @ move.rotation, FILE_AXES @ move.translation)
-    splats = in_file.of_gaussians(gaussians.numpy()).to_bytes("compressed-ply")
+    splats = in_file.of_gaussians(shown.gaussians.numpy()).to_bytes("compressed-ply")
     files = resources.files("drgs.results")
     page = Template(files.joinpath(PAGE).read_text("utf-8")).substitute(
         title=html.escape(title),
-        licence=files.joinpath(VIEWER, "LICENSE").read_text("utf-8"),
-        style=files.joinpath(VIEWER, "viewer.css").read_text("utf-8"),
-        scene=_in_script(_scene(approximations, standpoint, background)),
-        code=_text(files.joinpath(VIEWER, "viewer.js.gz").read_bytes()),
+        licence=files.joinpath(SUPERSPLAT, "LICENSE").read_text("utf-8"),
+        style=files.joinpath(SUPERSPLAT, "viewer.css").read_text("utf-8"),
+        scene=_in_script(_scene(shown.approximations, standpoint, background)),
+        code=_text(files.joinpath(SUPERSPLAT, "viewer.js.gz").read_bytes()),
         splats=_text(gzip.compress(splats, LEVEL, mtime=0)),
     )
     return page.encode("utf-8", "backslashreplace")
+
+
+def write_viewer(out: Path, dataset: Dataset, shown: Shown) -> None:
+    """Write the page of a fit into its folder, atomically.
+
+    Where it would have more than :data:`MOST_BYTES`, a ``UserNote`` says how it can be had.
+    """
+    standpoint = Standpoint.of_views(dataset.train, shown.gaussians)
+    page = viewer_page(out.name, shown, standpoint, dataset.background)
+    if len(page) > MOST_BYTES:
+        note = (
+            f"{out / VIEWER}: not written, as it would have {len(page) / 1e6:.0f} MB, more than "
+            f"{MOST_BYTES / 1e6:.0f}; drgs export {out} --format html writes it"
+        )
+        warnings.warn(UserNote(note), stacklevel=2)
+        return
+    write_page(out / VIEWER, page)
 
 
 def write_page(path: Path, page: bytes) -> None:
@@ -154,9 +188,7 @@ def _scene(
     }
 
 
-def _settings(
-    position: np.ndarray, background: tuple[float, float, float]
-) -> Mapping[str, object]:
+def _settings(position: np.ndarray, background: tuple[float, float, float]) -> Mapping[str, object]:
     """Of the viewer: version 2 of its schema, but for the field of view, which windows decide."""
     off = {"enabled": False}
     return {
