@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from drgs.cli.commands import CommandParser, file_or_folder, finite_number, run_command
-from drgs.config.approximations import DECLARED, said_by
+from drgs.config.approximations import DECLARED, Approximations, said_by
 from drgs.core.errors import UserError, UserNote, did_you_mean, one_line
 from drgs.core.records import FolderRecord
 from drgs.data.orbits import up_of
@@ -27,6 +27,8 @@ from drgs.gaussians.parameters import Gaussians
 from drgs.io.formats import FORMATS, format_of
 from drgs.io.morton import morton_order
 from drgs.results.files import CONFIG, GAUSSIANS, GAUSSIANS_FOR_VIEWERS, VIEWS
+from drgs.results.folder import load_run_config
+from drgs.results.viewer import HONOURED, Shown, Standpoint, viewer_page, write_page
 
 COMMAND = "export"
 
@@ -48,6 +50,7 @@ class Source:
     gaussians: Gaussians  # numpy, without a smoothing filter
     path: Path  # of the file
     folder: Path | None  # of the fit; None: a file was named
+    is_turned: bool = False  # then the fit's cameras are no longer where they were
 
 
 @dataclass(frozen=True)
@@ -59,17 +62,40 @@ class Target:
     write: Callable[[Source, Path], None]
     up: np.ndarray  # (3,) what programs take for up
     has_axes: bool = False  # whether the format says so: then models are always turned
+    honoured: frozenset[str] = frozenset()  # approximations that it shows Gaussians with
 
 
 def _write_file(source: Source, path: Path) -> None:
     source.gaussians.save(path)
 
 
+def _write_page(source: Source, path: Path) -> None:
+    """With the first view and the background of the fit, or before black where there is none."""
+    gaussians, folder = source.gaussians, source.folder
+    background = (0.0, 0.0, 0.0) if folder is None else load_run_config(folder).data.background_rgb
+    if folder is not None and not source.is_turned and (folder / VIEWS).is_file():
+        standpoint = Standpoint.of_views(read_viewpoints(folder / VIEWS, None), gaussians)
+    else:
+        standpoint = Standpoint.of_gaussians(gaussians, Z_UP)
+    title = source.path.name if folder is None else folder.resolve().name
+    shown = Shown(gaussians, Approximations.of(gaussians.rendered_with or {}))
+    write_page(path, viewer_page(title, shown, standpoint, background))
+
+
 TARGETS = {
-    each.name: Target(
-        each.suffix, each.text, _write_file, Z_UP if each.y_up else Y_DOWN, has_axes=each.y_up
-    )
-    for each in FORMATS
+    **{
+        each.name: Target(
+            each.suffix, each.text, _write_file, Z_UP if each.y_up else Y_DOWN, has_axes=each.y_up
+        )
+        for each in FORMATS
+    },
+    "html": Target(
+        ".html",
+        "a page to walk around in, for any browser",
+        _write_page,
+        Z_UP,
+        honoured=HONOURED,
+    ),
 }
 """By the name that ``--format`` takes."""
 
@@ -141,7 +167,7 @@ def run(args: argparse.Namespace) -> None:
     name, out = _destination(args)
     target = TARGETS[name]
     selection = _selection(args)
-    source = load_source(args.what)
+    source = load_source(args.what, target.honoured)
     print(f"{source.path}: {source.gaussians.num_gaussians:,} Gaussians", flush=True)
     up = _up(args, source, target)
     gaussians = _selected(source, selection)
@@ -151,7 +177,7 @@ def run(args: argparse.Namespace) -> None:
         gaussians = taken(gaussians, morton_order(gaussians.means))
     record = FolderRecord(out.parent, COMMAND)
     record.claim([out.name])
-    target.write(replace(source, gaussians=gaussians), out)
+    target.write(replace(source, gaussians=gaussians, is_turned=up is not None), out)
     FolderRecord(out.parent, COMMAND).seal()
     print(f"written: {out} ({out.stat().st_size / 1e6:.1f} MB)")
 
@@ -161,11 +187,12 @@ def run(args: argparse.Namespace) -> None:
 # ----------------------------------------------------------------------------------------------
 
 
-def load_source(what: Path) -> Source:
+def load_source(what: Path, honoured: frozenset[str] = frozenset()) -> Source:
     """The Gaussians of a fit's folder that are meant for other programs, or those of a file.
 
-    What a file says that other programs would not do is a :class:`UserNote`; what they do anyway
-    is dropped. A smoothing filter is baked in.
+    honoured: approximations that the target shows them with. The fit's own Gaussians are taken
+    where they need no others. What a file says that other programs would not do is a
+    :class:`UserNote`; what they do anyway is dropped. A smoothing filter is baked in.
     """
     if not what.exists():
         raise UserError(f"{what}: there is no such file or folder")
@@ -177,14 +204,22 @@ def load_source(what: Path) -> Source:
                 f"{what}: must be the output folder of a fit that has ended, but there is no "
                 f"{CONFIG if names else GAUSSIANS} in it"
             )
-        path = what / names[0]
+        path = what / (GAUSSIANS if _shows_own(what, honoured) else names[0])
     gaussians = Gaussians.load(path)
     said = said_by(str(path), gaussians.rendered_with or {})
     others = {name: value for name, value in said.items() if value != DECLARED[name].default}
-    if others:
-        _note_rendering(path, others)
+    if unknown := {name: value for name, value in others.items() if name not in honoured}:
+        _note_rendering(path, unknown)
     gaussians = baked(replace(gaussians, rendered_with=others or None))
     return Source(gaussians, path, what if what.is_dir() else None)
+
+
+def _shows_own(folder: Path, honoured: frozenset[str]) -> bool:
+    """Whether a fit's own Gaussians are there, and need no other approximations."""
+    if not honoured or not (folder / GAUSSIANS).is_file():
+        return False
+    needed = load_run_config(folder).model.approximations.others_than_default
+    return needed.keys() <= honoured
 
 
 def _note_rendering(path: Path, others: dict[str, object]) -> None:

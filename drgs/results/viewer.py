@@ -44,7 +44,7 @@ PAGE = "viewer_page.html"
 SUPERSPLAT = "supersplat_viewer"
 """Of this package: the folder with the viewer's files."""
 
-HONOURED = {"low_pass", "antialiased"}
+HONOURED = frozenset({"low_pass", "antialiased"})
 """Approximations that the page renders with; of the others it has its own."""
 
 DISTANCE = 3.0
