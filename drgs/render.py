@@ -2,7 +2,7 @@
 
 ``WHAT`` is one of
 
-- ``MODEL.ply``: Gaussians in the layout of the 3DGS reference implementation
+- ``MODEL``: a file of Gaussians: PLY, or another of ``drgs.io.formats``
 - ``OUT_DIR``: the output folder of a fit; its ``point_cloud.ply`` under its own ``config.yml``
 - ``SCENE.xml``: any Mitsuba scene; Mitsuba's own binary cannot load the plugins, which are Python
 
@@ -60,6 +60,7 @@ from drgs.gaussians.parameters import Gaussians
 from drgs.integrator.scene import check_lenses, check_sizes, make_scene, render_views
 from drgs.integrator.settings import SummarisingIntegrator
 from drgs.integrator.summary import described, summary_of_views
+from drgs.io.formats import FORMATS, format_of
 from drgs.io.pictures import (
     MITSUBA_FORMATS,
     check_animation,
@@ -154,7 +155,7 @@ def add_arguments(parser: CommandParser) -> None:
         "%(prog)s scene.xml -D model=model.ply --out DIR",
     )
     parser.add_argument(
-        "what", type=file_or_folder, metavar="MODEL.ply|SCENE.xml|OUT_DIR", help="what to render"
+        "what", type=file_or_folder, metavar="MODEL|SCENE.xml|OUT_DIR", help="what to render"
     )
     parser.add_argument(
         "--out", type=file_or_folder, required=True, metavar="DIR", help="output folder"
@@ -472,13 +473,15 @@ def _check(args: argparse.Namespace) -> None:
         reason = "is not used with a Mitsuba scene, which brings its own cameras and settings"
         _check_unused(args, reason, (*PLACING, *OF_CAMERAS, *OF_GAUSSIANS))
         _check_variant(args, mi.variants())
-    elif args.what.suffix.lower() == ".ply" or args.what.is_dir():
+    elif format_of(args.what) is not None or args.what.is_dir():
         _check_unused(args, "is for the parameters of a Mitsuba scene (.xml)", ("define",))
         _check_variant(args, VARIANTS)
         _check_cameras(args)
     else:
+        suffixes = ", ".join(each.suffix for each in FORMATS)
         raise UserError(
-            f"{args.what}: must be a PLY file, a Mitsuba scene (.xml) or the output folder of a fit"
+            f"{args.what}: must be a file of Gaussians ({suffixes}), a Mitsuba scene (.xml) or the "
+            "output folder of a fit"
         )
 
 

@@ -74,9 +74,11 @@ class SplatsIntegrator(mi.CppADIntegrator):
 
      * - filename
        - |string|
-       - A PLY file in the layout of the 3DGS reference implementation. Without it, the
-         Gaussians are given as tensors under the names below. With and without them, Gaussians of
-         the scene's shapes of type ``ellipsoids`` and ``ellipsoidsmesh`` are rendered as well.
+       - A PLY file in the layout of the 3DGS reference implementation, or a file in one of the
+         formats compressed PLY, SPZ, glTF (``.glb``) and ``.splat``; where a format has y up, z is
+         up in the scene. Without it, the Gaussians are given as tensors under the names below.
+         With and without them, Gaussians of the scene's shapes of type ``ellipsoids`` and
+         ``ellipsoidsmesh`` are rendered as well.
          What its header says of ``projection`` to ``antialiased`` below holds where these are not
          given; shapes have no such header.
 

@@ -13,6 +13,7 @@ COMMANDS = {
     "effects": "what each effect costs: time and operations with and without it",
     "hybrid": "what a path-traced object among splats costs",
     "benefits": "what effects are good for: fits of spoiled data with and without them",
+    "exports": "size of each file format, and the quality that is lost by a round trip",
     "training": "quality over time for several settings of a fit; half an hour",
     "volprim": "what sets Mitsuba's volprim_rf_basic apart, by how much it changes the picture",
     "stability": "error of float32 against float64 as scenes become harder",

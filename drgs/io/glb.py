@@ -183,13 +183,14 @@ def read_gaussians(path: str | Path) -> tuple[dict[str, np.ndarray], dict[str, S
         what = f"all those below {stray[0]}" if stray else "at least that of degree 0"
         raise UserError(f"{path}: {document.place}: harmonics must be complete: {what} is expected")
     reader = _Attributes(path, document, binary, start)
+    means = reader.values("POSITION", 3)
     scales = reader.values(f"{EXTENSION}:SCALE", 3)
     reader.check(f"{EXTENSION}:SCALE", scales, 0, np.inf, "linear, so not negative")
     opacities = reader.values(f"{EXTENSION}:OPACITY", 1)
     reader.check(f"{EXTENSION}:OPACITY", opacities, 0, 1, "from 0 to 1")
     harmonics = np.stack([reader.values(name, 3) for name in _harmonics(count)], axis=1)
     arrays = {
-        "means": reader.values("POSITION", 3),
+        "means": means,
         "quats": np.roll(reader.values(f"{EXTENSION}:ROTATION", 4), 1, axis=1),
         "log_scales": log_scales_of(scales),
         "logit_opacities": logits_of(opacities[:, 0]),
@@ -239,8 +240,9 @@ class _Attributes:
         expected = (self._count, KINDS[width])
         if (accessor.count, accessor.type) != expected or accessor.component_type not in COMPONENTS:
             raise UserError(
-                f"{where}: {expected[0]:,} times {expected[1]} of splats' numbers were expected, "
-                f"got {accessor.count:,} times {accessor.type} of type {accessor.component_type}"
+                f"{where}: {expected[0]:,} times {expected[1]} of floats, bytes or shorts were "
+                f"expected, got {accessor.count:,} times {accessor.type} of the component type "
+                f"{accessor.component_type}"
             )
         dtype = np.dtype(COMPONENTS[accessor.component_type])
         row = width * dtype.itemsize

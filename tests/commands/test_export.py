@@ -1,0 +1,192 @@
+"""``drgs.export``: fits and files for other programs."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support.commands import assert_ends_well, assert_refused
+from support.formats import FLOAT32, PRECISION, assert_within, gaussians_within_ranges, matched
+from support.small_capture import make_dataset
+
+from drgs import export
+from drgs.gaussians.parameters import Gaussians
+from drgs.io.formats import FORMATS, read_gaussians
+from drgs.results.refined_cameras import write_views
+
+OTHERWISE = {"antialiased": True, "low_pass": 0.1}
+USUAL = {"antialiased": False, "low_pass": 0.3}
+
+
+def run(*arguments):
+    return assert_ends_well(export.main, *arguments)
+
+
+@pytest.fixture
+def model(tmp_path):
+    gaussians = gaussians_within_ranges(300, degree=1)
+    gaussians.save(tmp_path / "model.ply")
+    return tmp_path / "model.ply"
+
+
+@pytest.fixture
+def fit(tmp_path):
+    """A folder as a fit leaves it, whose cameras are held with z up."""
+    folder = tmp_path / "run"
+    folder.mkdir()
+    (folder / "config.yml").write_text("")
+    replace(gaussians_within_ranges(20), rendered_with=OTHERWISE).save(folder / "point_cloud.ply")
+    viewers = replace(gaussians_within_ranges(30), rendered_with=USUAL)
+    viewers.save(folder / "point_cloud_viewers.ply")
+    write_views(folder / "views.json", make_dataset(6, 1).train)
+    return folder
+
+
+@pytest.mark.parametrize("each", FORMATS, ids=lambda each: each.name)
+def test_each_format_is_written_beside_what_is_exported(model, each):
+    if each.name == "ply":
+        outcome = run(model, "--format", "ply", "--out", model.with_name("out.ply"))
+        out = model.with_name("out.ply")
+    else:
+        outcome = run(model, "--format", each.name)
+        out = model.with_name(f"model{each.suffix}")
+    assert f"written: {out} (" in outcome.stdout
+    expected = Gaussians.load(model)
+    assert_within(PRECISION[each.name], expected, matched(expected, Gaussians.load(out)))
+    assert read_gaussians(out)[0].name == each.name
+
+
+def test_of_a_fit_the_file_for_other_programs_is_taken(fit):
+    outcome = run(fit, "--format", "glb")
+    assert outcome.stdout.splitlines() == [
+        f"{fit}/point_cloud_viewers.ply: 30 Gaussians",
+        "up: 0 0 1 (the training cameras')",
+        f"written: {fit}.glb (0.0 MB)",
+    ]
+    found = Gaussians.load(fit.with_name("run.glb"))
+    assert found.rendered_with is None and found.num_gaussians == 30
+
+
+def test_without_that_file_the_fit_s_own_is(fit):
+    (fit / "point_cloud_viewers.ply").unlink()
+    outcome = run(fit, "--format", "spz")
+    note = "made to be rendered with low_pass 0.1, antialiased true; programs that do not will show"
+    assert f"note: {fit}/point_cloud.ply: {note}" in outcome.stdout
+    assert "no room for low_pass 0.1" in outcome.stdout
+    assert Gaussians.load(fit.with_name("run.spz")).rendered_with == {"antialiased": True}
+
+
+def test_a_file_that_is_meant_for_drgs_is_exported_with_a_hint(fit):
+    outcome = run(fit / "point_cloud.ply", "--out", fit.with_name("a.compressed.ply"))
+    assert f"export {fit}/point_cloud_viewers.ply instead" in outcome.stdout
+    assert Gaussians.load(fit.with_name("a.compressed.ply")).rendered_with == OTHERWISE
+
+
+def test_smoothing_is_baked_in(tmp_path):
+    gaussians = gaussians_within_ranges(5)
+    replace(gaussians, smoothing=np.full(5, 0.1, np.float32)).save(tmp_path / "model.ply")
+    run(tmp_path / "model.ply", "--format", "glb")
+    found = Gaussians.load(tmp_path / "model.glb")
+    # Mip-Splatting, section 4.1: covariances add up, and the integral stays.
+    scales = np.sqrt(np.square(gaussians.scales.astype(np.float64)) + 0.1**2)
+    np.testing.assert_allclose(found.scales, scales, rtol=1e-5)
+    kept = (gaussians.scales.astype(np.float64) / scales).prod(axis=1)
+    np.testing.assert_allclose(found.opacities, gaussians.opacities * kept, rtol=1e-5)
+
+
+# ----------------------------------------------------------------------------------------------
+# What is kept, and how it lies
+# ----------------------------------------------------------------------------------------------
+
+
+def test_what_is_kept_is_what_the_options_say(model):
+    out = model.with_name("out.ply")
+    limits = ["--crop", -1, -1, -1, 1, 1, 2, "--min-opacity", 0.2, "--max-size", 0.3]
+    outcome = run(model, "--out", out, *limits)
+    g = Gaussians.load(model)
+    inside = ((g.means >= -1) & (g.means <= [1, 1, 2])).all(axis=1)
+    kept = inside & (g.opacities >= 0.2) & (g.scales.max(axis=1) <= 0.3)
+    assert 0 < kept.sum() < 300
+    assert f"kept: {kept.sum()}; left out by box {(~inside).sum()}, opacity " in outcome.stdout
+    np.testing.assert_array_equal(Gaussians.load(out).means, g.means[kept])
+
+
+def test_morton_order_puts_neighbours_together(model):
+    out = model.with_name("out.ply")
+    run(model, "--out", out, "--order", "morton")
+    before, after = (Gaussians.load(path).means for path in (model, out))
+    assert sorted(map(tuple, before)) == sorted(map(tuple, after))
+    steps = [np.linalg.norm(np.diff(means, axis=0), axis=1).mean() for means in (before, after)]
+    assert steps[1] < steps[0] / 2
+
+
+def means_of(path):
+    """In the axes of the file."""
+    return read_gaussians(path)[1]["means"]
+
+
+@pytest.mark.parametrize(
+    ("suffix", "up"), [(".glb", [0, 1, 0]), (".spz", [0, 1, 0]), (".compressed.ply", [0, -1, 0])]
+)
+def test_what_is_up_in_the_model_is_up_in_the_file(model, suffix, up):
+    """That of a format that says so; y points down in the others, as in COLMAP's worlds."""
+    out = model.with_name(f"out{suffix}")
+    direction = np.array([0.0, 3, 4]) / 5
+    run(model, "--out", out, "--up", *(5 * direction))
+    heights = np.sort(Gaussians.load(model).means @ direction)
+    precision = PRECISION["compressed-ply"].means * 2 if "ply" in suffix else 1e-3
+    np.testing.assert_allclose(np.sort(means_of(out) @ np.array(up)), heights, atol=precision)
+
+
+def test_a_world_that_is_as_viewers_expect_it_stays_as_it_is(model):
+    out = model.with_name("out.ply")
+    run(model, "--out", out, "--up", 0, -1, 0)
+    expected = Gaussians.load(model)
+    assert_within(replace(PRECISION["glb"], means=4 * FLOAT32), expected, Gaussians.load(out))
+
+
+def test_files_that_say_nothing_of_axes_are_not_turned_unasked(fit, model):
+    out = model.with_name("out.ply")
+    assert "up:" not in run(model, "--out", out).stdout
+    np.testing.assert_array_equal(Gaussians.load(out).means, Gaussians.load(model).means)
+    outcome = run(fit, "--out", out.with_name("fit.ply"), "--up", "cameras")
+    assert "up: 0 0 1 (the training cameras')" in outcome.stdout
+
+
+# ----------------------------------------------------------------------------------------------
+# What is refused
+# ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["model.ply"], "--format: must be one of ply, compressed-ply, spz, glb, splat, got none"),
+        (["model.ply", "--format", "splt"], "got splt; did you mean splat?"),
+        (["model.ply", "--out", "a.obj"], "--format: must be one of"),
+        (["model.ply", "--format", "spz", "--out", "a.glb"], "name of a spz file must end in .spz"),
+        (["model.ply", "--format", "ply", "--out", "a.compressed.ply"], "that of a compressed-ply"),
+        (["model.ply", "--format", "ply"], "holds model.ply, which this command would replace"),
+        (["none.ply", "--format", "spz"], "none.ply: there is no such file or folder"),
+        ([".", "--format", "spz"], "must be the output folder of a fit that has ended"),
+        (["model.ply", "--format", "spz", "--up", "cameras"], "--up cameras: needs the output"),
+        (["model.ply", "--format", "spz", "--up", "0", "0", "0"], "--up: must be cameras, or thr"),
+        (["model.ply", "--format", "spz", "--min-opacity", "2"], "--min-opacity: must be between"),
+        (["model.ply", "--format", "spz", "--max-size", "0"], "--max-size: must be above 0, got 0"),
+        (["model.ply", "--format", "spz", "--max-size", "1e-9"], "nothing is left; crop and filt"),
+    ],
+)
+def test_what_cannot_be_exported_is_refused(model, monkeypatch, arguments, message):
+    monkeypatch.chdir(model.parent)
+    assert_refused(export.main, *arguments, folder=model.parent, message=message)
+
+
+def test_another_s_file_is_not_replaced_and_one_s_own_is(model):
+    out = model.with_name("model.spz")
+    out.write_bytes(b"mine")
+    message = "holds model.spz, which this command would replace and has not written"
+    assert_refused(export.main, model, "--format", "spz", folder=model.parent, message=message)
+    out.unlink()
+    run(model, "--format", "spz")
+    first = out.read_bytes()
+    run(model, "--format", "spz", "--min-opacity", 0.5)
+    assert out.read_bytes() != first

@@ -1,0 +1,224 @@
+"""Binary glTF: what stands in a file, what others may write, and what is refused by the place."""
+
+import json
+import struct
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support.formats import gaussians_within_ranges
+
+from drgs.core.errors import UserError
+from drgs.gaussians.parameters import Gaussians
+from drgs.io.glb import read_gaussians
+
+NAME = "KHR_gaussian_splatting"
+TYPES = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
+
+
+def split(content):
+    """The JSON part as Python has it, and the binary part: as the specification's section 4.4."""
+    size = struct.unpack_from("<I", content, 12)[0]
+    return json.loads(content[20 : 20 + size]), content[28 + size :]
+
+
+def joined(document, binary):
+    text = json.dumps(document).encode()
+    text += b" " * (-len(text) % 4)
+    length = 28 + len(text) + len(binary)
+    head = struct.pack("<4sIII4s", b"glTF", 2, length, len(text), b"JSON")
+    return head + text + struct.pack("<I4s", len(binary), b"BIN\0") + binary
+
+
+def primitive_of(document):
+    return document["meshes"][0]["primitives"][0]
+
+
+def numbers(document, binary, name):
+    """Of an attribute, as the specification's section 3.6 has them."""
+    accessor = document["accessors"][primitive_of(document)["attributes"][name]]
+    view = document["bufferViews"][accessor["bufferView"]]
+    part = binary[view["byteOffset"] : view["byteOffset"] + view["byteLength"]]
+    kind = {5126: "<f4", 5121: "u1"}[accessor["componentType"]]
+    assert view["byteOffset"] % 4 == 0
+    return np.frombuffer(part, kind).reshape(accessor["count"], TYPES[accessor["type"]])
+
+
+@pytest.fixture
+def gaussians():
+    return gaussians_within_ranges(7, degree=2)
+
+
+@pytest.fixture
+def parts(gaussians):
+    return split(gaussians.to_bytes("glb"))
+
+
+def refusal(path, document, binary):
+    path.write_bytes(joined(document, binary))
+    with pytest.raises(UserError) as error:
+        read_gaussians(path)
+    return str(error.value).removeprefix(f"{path}: ")
+
+
+def test_a_file_holds_what_the_extension_says(gaussians, parts):
+    document, binary = parts
+    assert document["extensionsUsed"] == [NAME] and document["asset"]["version"] == "2.0"
+    primitive = primitive_of(document)
+    assert primitive["mode"] == 0
+    assert primitive["extensions"] == {
+        NAME: {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}
+    }
+    position = numbers(document, binary, "POSITION")
+    x, y, z = gaussians.means.T
+    np.testing.assert_array_equal(position, np.column_stack([x, z, -y]))  # z up -> y up
+    accessor = document["accessors"][primitive["attributes"]["POSITION"]]
+    assert np.float32(accessor["min"]).tolist() == position.min(axis=0).tolist()
+    assert np.float32(accessor["max"]).tolist() == position.max(axis=0).tolist()
+    np.testing.assert_allclose(
+        numbers(document, binary, f"{NAME}:SCALE"), gaussians.scales, rtol=1e-6
+    )
+    np.testing.assert_allclose(
+        numbers(document, binary, f"{NAME}:OPACITY")[:, 0], gaussians.opacities, rtol=1e-6
+    )
+    rotations = numbers(document, binary, f"{NAME}:ROTATION")
+    np.testing.assert_allclose(np.linalg.norm(rotations, axis=1), 1, rtol=1e-6)
+    base = numbers(document, binary, f"{NAME}:SH_DEGREE_0_COEF_0")
+    np.testing.assert_array_equal(base, gaussians.sh0[:, 0])
+    fallback = numbers(document, binary, "COLOR_0") / 255
+    np.testing.assert_allclose(fallback[:, :3], 0.5 + 0.28209479 * base, atol=0.5 / 255 + 1e-6)
+    harmonics = [n for n in primitive["attributes"] if ":SH_DEGREE_" in n]
+    assert harmonics[1:] == [
+        f"{NAME}:SH_DEGREE_{degree}_COEF_{k}" for degree in (1, 2) for k in range(2 * degree + 1)
+    ]
+
+
+def test_what_it_is_rendered_with_stands_beside_it(tmp_path, gaussians):
+    said = {"antialiased": True, "low_pass": 0.1, "projection": "exact"}
+    replace(gaussians, rendered_with=said).save(tmp_path / "a.glb")
+    assert Gaussians.load(tmp_path / "a.glb").rendered_with == said
+
+
+def test_extras_of_others_are_ignored(tmp_path, parts):
+    document, binary = parts
+    primitive_of(document)["extras"] = {"drgs": [1, 2]}
+    (tmp_path / "a.glb").write_bytes(joined(document, binary))
+    assert read_gaussians(tmp_path / "a.glb")[1] == {}
+
+
+def test_interleaved_and_quantised_numbers_are_read(tmp_path, gaussians, parts):
+    """Rotations in 16 bits and opacities in 8, all in rows of one part of the buffer."""
+    document, binary = parts
+    rotation = numbers(document, binary, f"{NAME}:ROTATION")
+    opacity = numbers(document, binary, f"{NAME}:OPACITY")
+    rows = np.zeros(7, [("rotation", "<i2", 4), ("opacity", "u1"), ("gap", "u1", 3)])
+    rows["rotation"] = np.round(rotation * 32767)
+    rows["opacity"] = np.round(opacity[:, 0] * 255)
+    view = {"buffer": 0, "byteOffset": len(binary), "byteLength": rows.nbytes, "byteStride": 12}
+    document["bufferViews"].append(view)
+    where = {"bufferView": len(document["bufferViews"]) - 1, "count": 7, "normalized": True}
+    attributes = primitive_of(document)["attributes"]
+    for name, offset, kind, shape in (
+        ("ROTATION", 0, 5122, "VEC4"),
+        ("OPACITY", 8, 5121, "SCALAR"),
+    ):
+        attributes[f"{NAME}:{name}"] = len(document["accessors"])
+        numbers_here = {**where, "byteOffset": offset, "componentType": kind, "type": shape}
+        document["accessors"].append(numbers_here)
+    (tmp_path / "a.glb").write_bytes(joined(document, binary + rows.tobytes()))
+    found = Gaussians.load(tmp_path / "a.glb")
+    np.testing.assert_allclose(found.opacities, gaussians.opacities, atol=0.5 / 255 + 1e-6)
+    (tmp_path / "b.glb").write_bytes(gaussians.to_bytes("glb"))
+    quats = Gaussians.load(tmp_path / "b.glb").quats
+    np.testing.assert_allclose(found.quats, quats, atol=0.5 / 32767 * 2 + 1e-6)
+
+
+def edited(document, path, value):
+    """The document with one value changed; path: keys, such as ``nodes 0 scale``."""
+    *keys, last = (int(key) if key.isdigit() else key for key in path.split())
+    part = document
+    for key in keys:
+        part = part[key]
+    if value is None:
+        del part[last]
+    else:
+        part[last] = value
+
+
+PRIMITIVE = "meshes 0 primitives 0"
+
+
+@pytest.mark.parametrize(
+    ("path", "value", "message"),
+    [
+        (f"{PRIMITIVE} mode", 4, "meshes[0].primitives[0].mode: Input should be 0, got 4"),
+        (f"{PRIMITIVE} extensions {NAME} kernel", "cube", "meshes[0].primitives[0].extensions."),
+        (
+            f"{PRIMITIVE} extensions {NAME} colorSpace",
+            "lin_rec709_display",
+            "meshes[0].primitives[0].extensions.KHR_gaussian_splatting.colorSpace: Input should be",
+        ),
+        (
+            f"{PRIMITIVE} extensions {NAME} extensions",
+            {f"{NAME}_compression": {}},
+            "meshes[0].primitives[0]: KHR_gaussian_splatting_compression is not read",
+        ),
+        (f"{PRIMITIVE} extensions", {}, "must have one primitive with KHR_gaussian_splatting"),
+        ("extensionsRequired", ["KHR_draco"], "needs KHR_draco, which drgs does not read"),
+        (
+            f"{PRIMITIVE} attributes {NAME}:SCALE",
+            None,
+            "meshes[0].primitives[0]: attributes KHR_gaussian_splatting:SCALE are missing",
+        ),
+        (
+            f"{PRIMITIVE} attributes {NAME}:SH_DEGREE_2_COEF_3",
+            None,
+            "meshes[0].primitives[0]: harmonics must be complete: all those below",
+        ),
+        (f"{PRIMITIVE} attributes POSITION", 99, "meshes[0].primitives[0]: POSITION must be one"),
+        ("accessors 0 count", 8, "meshes[0].primitives[0]: POSITION: 96 bytes within the file"),
+        ("accessors 2 type", "VEC3", "meshes[0].primitives[0]: KHR_gaussian_splatting:ROTATION: 7"),
+        ("accessors 0 sparse", {}, "accessors[0] must name a bufferView, and not be sparse"),
+        ("bufferViews 0 byteLength", 2**31, "meshes[0].primitives[0]: POSITION: 84 bytes within"),
+        ("bufferViews 0 buffer", 1, "bufferViews[0] must be there, and a part of buffer 0"),
+        ("nodes 0 translation", [1, 0, 0], "nodes[0].translation: splats that a node moves are"),
+        ("nodes", [{"mesh": 0}, {"mesh": 0}], "the splats must be shown once, got 2 nodes"),
+        ("nodes", [{"mesh": 0}, {"children": [0], "scale": [2, 2, 2]}], "nodes[1].scale: splats"),
+        ("meshes", {}, "meshes: Input should be a valid list, got {}"),
+    ],
+)
+def test_a_document_that_cannot_be_read_is_refused(tmp_path, parts, path, value, message):
+    document, binary = parts
+    edited(document, path, value)
+    assert refusal(tmp_path / "a.glb", document, binary).startswith(message)
+
+
+@pytest.mark.parametrize(
+    ("attribute", "value", "message"),
+    [
+        ("SCALE", -4.5, "must be linear, so not negative, got -4.5"),
+        ("OPACITY", 1.5, "must be from 0 to 1, got 1.5"),
+        ("ROTATION", np.nan, "must be finite, got nan"),
+    ],
+)
+def test_a_number_out_of_range_is_refused_by_its_row(tmp_path, parts, attribute, value, message):
+    document, binary = parts
+    name = f"{NAME}:{attribute}"
+    numbers_there = numbers(document, binary, name)
+    accessor = document["accessors"][primitive_of(document)["attributes"][name]]
+    start = document["bufferViews"][accessor["bufferView"]]["byteOffset"]
+    at = start + 5 * 4 * numbers_there.shape[1]
+    changed = binary[:at] + struct.pack("<f", value) + binary[at + 4 :]
+    text = refusal(tmp_path / "a.glb", document, changed)
+    assert text.startswith("byte ") and f", row 5: {name} {message}" in text
+
+
+def test_numbers_that_have_no_logarithm_are_the_next_that_have(tmp_path):
+    gaussians = gaussians_within_ranges(3, degree=0)
+    gaussians.log_scales[1] = -300
+    gaussians.logit_opacities[:] = [-300, 0, 300]
+    gaussians.save(tmp_path / "a.glb")
+    found = Gaussians.load(tmp_path / "a.glb")
+    tiny = np.finfo(np.float32).tiny
+    assert (found.scales[1] <= 2 * tiny).all() and np.isfinite(found.log_scales).all()
+    assert found.opacities[0] <= 8 * tiny and 1 - 2.0**-22 < found.opacities[2] < 1
