@@ -160,7 +160,10 @@ def test_files_that_say_nothing_of_axes_are_not_turned_unasked(fit, model):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["model.ply"], "--format: must be one of ply, compressed-ply, spz, glb, splat, got none"),
+        (
+            ["model.ply"],
+            "--format: must be one of ply, compressed-ply, spz, glb, splat, html",
+        ),
         (["model.ply", "--format", "splt"], "got splt; did you mean splat?"),
         (["model.ply", "--out", "a.obj"], "--format: must be one of"),
         (["model.ply", "--format", "spz", "--out", "a.glb"], "name of a spz file must end in .spz"),
