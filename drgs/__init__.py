@@ -6,7 +6,7 @@
 >>> fitted.gaussians.save("lego.ply")
 >>> picture, alpha, _ = drgs.rasterization(means, quats, scales, opacities, colors, ...)
 
-:class:`Gaussians`: a scene, from and to PLY files and numpy arrays; :func:`load_dataset`:
+:class:`Gaussians`: a scene, from and to files and numpy arrays; :func:`load_dataset`:
 photographs with their cameras; :func:`train`: fits Gaussians to them; :func:`rasterization`:
 differentiable pictures, with gsplat's names and conventions.
 

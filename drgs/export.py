@@ -18,17 +18,18 @@ import numpy as np
 from drgs.cli.commands import CommandParser, file_or_folder, finite_number, run_command
 from drgs.config.approximations import DECLARED, Approximations, said_by
 from drgs.core.errors import UserError, UserNote, did_you_mean, one_line
+from drgs.core.files import atomic_path
 from drgs.core.records import FolderRecord
 from drgs.data.orbits import up_of
-from drgs.data.viewpoints import read_viewpoints
+from drgs.data.viewpoints import near_one, read_viewpoints
 from drgs.effects.smoothing import baked
 from drgs.gaussians.cleaning import Selection, taken, turned_towards
-from drgs.gaussians.parameters import Gaussians
-from drgs.io.formats import FORMATS, format_of
+from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
+from drgs.io.formats import FORMATS, Format, format_of
 from drgs.io.morton import morton_order
 from drgs.results.files import CONFIG, GAUSSIANS, GAUSSIANS_FOR_VIEWERS, VIEWS
 from drgs.results.folder import load_run_config
-from drgs.results.viewer import HONOURED, Shown, Standpoint, viewer_page, write_page
+from drgs.results.viewer import HONOURED, Shown, Standpoint, viewer_page
 
 COMMAND = "export"
 
@@ -59,17 +60,29 @@ class Target:
 
     suffix: str  # of files, in small letters
     text: str  # what it is, one phrase
-    write: Callable[[Source, Path], None]
+    encode: Callable[[Source], bytes]  # equal Gaussians give equal bytes
     up: np.ndarray  # (3,) what programs take for up
     has_axes: bool = False  # whether the format says so: then models are always turned
     honoured: frozenset[str] = frozenset()  # approximations that it shows Gaussians with
 
 
-def _write_file(source: Source, path: Path) -> None:
-    source.gaussians.save(path)
+def _usd(source: Source) -> bytes:
+    from drgs.io.usd import encode
+
+    return encode({name: getattr(source.gaussians, name) for name in PARAMETER_NAMES})
 
 
-def _write_page(source: Source, path: Path) -> None:
+def _of_format(each: Format) -> Target:
+    return Target(
+        each.suffix,
+        each.text,
+        lambda source: source.gaussians.to_bytes(each.name),
+        Z_UP if each.y_up else Y_DOWN,
+        has_axes=each.y_up,
+    )
+
+
+def _page(source: Source) -> bytes:
     """With the first view and the background of the fit, or before black where there is none."""
     gaussians, folder = source.gaussians, source.folder
     background = (0.0, 0.0, 0.0) if folder is None else load_run_config(folder).data.background_rgb
@@ -79,22 +92,16 @@ def _write_page(source: Source, path: Path) -> None:
         standpoint = Standpoint.of_gaussians(gaussians, Z_UP)
     title = source.path.name if folder is None else folder.resolve().name
     shown = Shown(gaussians, Approximations.of(gaussians.rendered_with or {}))
-    write_page(path, viewer_page(title, shown, standpoint, background))
+    return viewer_page(title, shown, standpoint, background)
 
 
 TARGETS = {
-    **{
-        each.name: Target(
-            each.suffix, each.text, _write_file, Z_UP if each.y_up else Y_DOWN, has_axes=each.y_up
-        )
-        for each in FORMATS
-    },
+    **{each.name: _of_format(each) for each in FORMATS},
+    "usd": Target(
+        ".usdc", "OpenUSD's ParticleField3DGaussianSplat (extra usd)", _usd, Z_UP, has_axes=True
+    ),
     "html": Target(
-        ".html",
-        "a page to walk around in, for any browser",
-        _write_page,
-        Z_UP,
-        honoured=HONOURED,
+        ".html", "a page to walk around in, for any browser", _page, Z_UP, honoured=HONOURED
     ),
 }
 """By the name that ``--format`` takes."""
@@ -175,11 +182,12 @@ def run(args: argparse.Namespace) -> None:
         gaussians = turned_towards(gaussians, up, target.up)
     if args.order == "morton":
         gaussians = taken(gaussians, morton_order(gaussians.means))
-    record = FolderRecord(out.parent, COMMAND)
-    record.claim([out.name])
-    target.write(replace(source, gaussians=gaussians, is_turned=up is not None), out)
+    content = target.encode(replace(source, gaussians=gaussians, is_turned=up is not None))
+    FolderRecord(out.parent, COMMAND).claim([out.name])
+    with atomic_path(out) as temporary:
+        temporary.write_bytes(content)
     FolderRecord(out.parent, COMMAND).seal()
-    print(f"written: {out} ({out.stat().st_size / 1e6:.1f} MB)")
+    print(f"written: {out} ({len(content) / 1e6:.1f} MB)")
 
 
 # ----------------------------------------------------------------------------------------------
@@ -310,11 +318,11 @@ def _direction(words: Sequence[str]) -> np.ndarray:
         up = np.array([float(word) for word in words])
     except ValueError:
         up = np.zeros(0)
-    length = np.linalg.norm(up)
-    if up.shape != (3,) or not (np.isfinite(length) and length > 0):
+    if up.shape != (3,) or not np.isfinite(up).all() or not up.any():
         got = one_line(" ".join(words), 60)
         raise UserError(f"--up: must be cameras, or three numbers not all zero, got {got}")
-    return up / length
+    up = near_one(up)
+    return up / np.linalg.norm(up)
 
 
 def _snapped(up: np.ndarray) -> np.ndarray:

@@ -107,8 +107,11 @@ def read_bytes(path: Path, what: str, max_bytes: int) -> bytes:
     Raises :class:`UserError` where it cannot be read or is longer than ``max_bytes``.
     """
     try:
-        with open_regular(path, what) as file:
-            content = file.read(max_bytes + 1)
+        with open_regular(path, what, max_bytes) as file:
+            # No more is asked for than there is: so much memory is allocated beforehand. Files of
+            # the system claim to be empty.
+            size = max(os.fstat(file.fileno()).st_size, 1 << 16)
+            content = file.read(min(size, max_bytes) + 1)
     except OSError as error:
         raise UserError(f"{path}: cannot read the {what}: {error.strerror or error}") from None
     if len(content) > max_bytes:

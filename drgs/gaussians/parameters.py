@@ -78,23 +78,23 @@ class Gaussians:
         if chosen is None:
             suffixes = ", ".join(each.suffix for each in FORMATS)
             raise UserError(f"{path}: the name must end in one of {suffixes}")
-        lost = [*(["harmonics"] if self.sh_degree > 0 and not chosen.has_harmonics else [])]
-        lost += [f"{name} {value}" for name, value in chosen.unsaid(self.rendered_with).items()]
         content = self.to_bytes(chosen.name)
         with atomic_path(path) as temporary:
             temporary.write_bytes(content)
-        if lost:
-            note = f"{path}: the format has no room for {', '.join(lost)}, which is left out"
-            warnings.warn(UserNote(note), stacklevel=2)
 
     def to_bytes(self, name: str) -> bytes:
         """The content of a file in the format of that name, one of ``drgs.io.formats.FORMATS``.
 
-        As ``save`` writes it, which see; without its notes.
+        As ``save`` writes it, which see.
         """
         from drgs.io.formats import Z_TO_Y, format_named
 
         chosen, host = format_named(name), self.numpy()
+        lost = [*(["harmonics"] if self.sh_degree > 0 and not chosen.has_harmonics else [])]
+        lost += [f"{name} {value}" for name, value in chosen.unsaid(self.rendered_with).items()]
+        if lost:
+            note = f"the format {chosen.name} has no room for {', '.join(lost)}: left out"
+            warnings.warn(UserNote(note), stacklevel=2)
         host = host._turned(Z_TO_Y) if chosen.y_up else host
         return chosen.encode({n: getattr(host, n) for n in host._names}, self.rendered_with)
 

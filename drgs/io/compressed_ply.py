@@ -96,11 +96,19 @@ def encode(
         "vertex": _structured(PACKED, np.column_stack([vertex[n] for n in PACKED]).astype("<u4")),
     }
     if g["shN"].shape[1]:
-        rest = g["shN"].transpose(0, 2, 1).reshape(len(order), -1)
-        levels = np.floor((rest.astype(np.float64) / (2 * SH_RANGE) + 0.5) * SH_LEVELS)
-        names = tuple(f"f_rest_{i}" for i in range(rest.shape[1]))
-        elements["sh"] = _structured(names, np.clip(levels, 0, SH_LEVELS - 1).astype("u1"))
+        elements["sh"] = _packed_harmonics(g["shN"])
     return encode_elements(elements, rendered_with)
+
+
+def _packed_harmonics(sh: np.ndarray) -> np.ndarray:
+    """The rows of the element; coefficient by coefficient, which takes little memory."""
+    num, count, _ = sh.shape
+    levels = np.empty((num, 3 * count), "u1")
+    for column in range(3 * count):
+        values = sh[:, column % count, column // count].astype(np.float64)
+        level = np.floor((values / (2 * SH_RANGE) + 0.5) * SH_LEVELS)
+        levels[:, column] = np.clip(level, 0, SH_LEVELS - 1)
+    return _structured(tuple(f"f_rest_{i}" for i in range(3 * count)), levels)
 
 
 def _chunk_names(colors: bool = True) -> tuple[str, ...]:
@@ -177,7 +185,7 @@ def read_gaussians(path: str | Path) -> tuple[dict[str, np.ndarray], dict[str, S
         "sh0": ((color - 0.5) / SH_C0)[:, None, :],
         "shN": _harmonics(path, rows.get("sh"), len(vertex)),
     }
-    return {name: values.astype(np.float32) for name, values in arrays.items()}, statements
+    return {n: np.ascontiguousarray(v, np.float32) for n, v in arrays.items()}, statements
 
 
 def _checked_bounds(path: str | Path, rows: Mapping[str, np.ndarray], colors: bool) -> np.ndarray:
@@ -257,7 +265,8 @@ def _harmonics(path: str | Path, sh: np.ndarray | None, num: int) -> np.ndarray:
             f"the {num:,} vertices, got {len(sh):,} rows of {len(names)}"
         )
     _check_unsigned(path, "sh", sh, names, 1)
-    levels = np.column_stack([sh[name] for name in names])
-    parts = np.select([levels == 0, levels == SH_LEVELS - 1], [0, 1], (levels + 0.5) / SH_LEVELS)
-    rest = (parts - 0.5) * (2 * SH_RANGE)
+    parts = (np.arange(SH_LEVELS) + 0.5) / SH_LEVELS
+    parts[[0, -1]] = 0, 1
+    values = ((parts - 0.5) * (2 * SH_RANGE)).astype(np.float32)
+    rest = values[np.column_stack([sh[name] for name in names])]
     return rest.reshape(num, 3, -1).transpose(0, 2, 1)

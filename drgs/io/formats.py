@@ -54,7 +54,7 @@ class Format:
                 "them first, with drgs.effects.smoothing.baked or drgs export"
             )
         if not self.any_number:
-            _check_finite(gaussians, self.name)
+            check_finite(gaussians, self.name)
         said = {
             name: value
             for name, value in (rendered_with or {}).items()
@@ -140,8 +140,11 @@ def read_gaussians(
     return found, *import_module(found.module).read_gaussians(path)
 
 
-def _check_finite(gaussians: Mapping[str, np.ndarray], name: str) -> None:
-    """Refuse what formats have no code for."""
+def check_finite(gaussians: Mapping[str, np.ndarray], name: str) -> None:
+    """Refuse what formats have no code for: what is not finite, and nothing at all.
+
+    gaussians: by the names of the fields of ``Gaussians``; name: of the format.
+    """
     if not len(gaussians["means"]):
         raise UserError(f"the format {name} needs at least one Gaussian, got none")
     for field, values in gaussians.items():

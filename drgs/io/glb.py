@@ -6,7 +6,7 @@ with y up:
 
 - ``POSITION``, and ``COLOR_0`` (base colour and opacity) for programs that show points;
 - ``KHR_gaussian_splatting:ROTATION``, a unit quaternion xyzw; ``:SCALE``, standard deviations,
-  linear; ``:OPACITY``, from 0 to 1, after the sigmoid;
+  linear (drafts of the extension had logarithms); ``:OPACITY``, from 0 to 1, after the sigmoid;
 - ``:SH_DEGREE_l_COEF_n``, the harmonics in the order and with the signs of the 3DGS reference.
 
 Colours are in display space, ``srgb_rec709_display``. What Gaussians are rendered with stands in
@@ -53,6 +53,8 @@ POINTS = 0
 
 COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5126: "<f4"}
 """By number, the types of components that splats may have."""
+
+NOT_NEGATIVE = "linear, so not negative (drafts of the extension had logarithms)"
 
 KINDS = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
 """By number of components."""
@@ -185,10 +187,12 @@ def read_gaussians(path: str | Path) -> tuple[dict[str, np.ndarray], dict[str, S
     reader = _Attributes(path, document, binary, start)
     means = reader.values("POSITION", 3)
     scales = reader.values(f"{EXTENSION}:SCALE", 3)
-    reader.check(f"{EXTENSION}:SCALE", scales, 0, np.inf, "linear, so not negative")
+    reader.check(f"{EXTENSION}:SCALE", scales, 0, np.inf, NOT_NEGATIVE)
     opacities = reader.values(f"{EXTENSION}:OPACITY", 1)
     reader.check(f"{EXTENSION}:OPACITY", opacities, 0, 1, "from 0 to 1")
-    harmonics = np.stack([reader.values(name, 3) for name in _harmonics(count)], axis=1)
+    harmonics = np.stack(
+        [reader.values(name, 3).astype(np.float32) for name in _harmonics(count)], axis=1
+    )
     arrays = {
         "means": means,
         "quats": np.roll(reader.values(f"{EXTENSION}:ROTATION", 4), 1, axis=1),

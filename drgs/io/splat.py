@@ -29,6 +29,10 @@ from drgs.io.quantized import (
 MAX_BYTES = 1 << 33
 """Of a file: 8.6 GB."""
 
+MAX_NUMBER = 1e12
+"""Of a position or scale, in size: letters, read as numbers, are larger. There is no other sign by
+which a file of another kind could be told."""
+
 ROW = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("quat", "u1", 4)])
 
 
@@ -39,16 +43,22 @@ def encode(
 
     gaussians: finite, by the names that :func:`drgs.io.ply.read_gaussians` gives; harmonics above
     degree 0 are left out. rendered_with: has no place.
+
+    Raises :class:`UserError` for positions of more than :data:`MAX_NUMBER`.
     """
     del rendered_with
     g = gaussians
+    if (extent := np.abs(g["means"]).max()) > MAX_NUMBER:
+        raise UserError(
+            f"the format splat holds positions of at most {MAX_NUMBER:g}, got {extent:g}; crop or "
+            "scale the scene"
+        )
     opacities = opacities_of(g["logit_opacities"])
     log_scales = g["log_scales"].astype(np.float64)
     importance = log_scales.sum(axis=1) + np.log(opacities)
     rows = np.empty(len(opacities), ROW)
     rows["mean"] = g["means"]
-    largest = np.log(float(np.finfo(np.float32).max))
-    rows["scale"] = np.exp(np.minimum(log_scales, largest)).astype(np.float32)
+    rows["scale"] = np.exp(np.minimum(log_scales, np.log(MAX_NUMBER))).astype(np.float32)
     colors = 0.5 + SH_C0 * g["sh0"][:, 0].astype(np.float64)
     rows["rgba"] = rounded(np.column_stack([colors, opacities]) * 255, 255)
     rows["quat"] = rounded(unit_quaternions(g["quats"]) * 128 + 128, 255)
@@ -71,14 +81,15 @@ def read_gaussians(path: str | Path) -> tuple[dict[str, np.ndarray], dict[str, S
             "each Gaussian, at least one; it is damaged, or was cut off"
         )
     rows = np.frombuffer(content, ROW)
-    for name, kind in (("mean", "finite"), ("scale", "finite and not negative")):
+    for name, least in (("mean", -MAX_NUMBER), ("scale", 0)):
         values = rows[name]
-        bad = np.argwhere(~(np.isfinite(values) & ((values >= 0) | (name == "mean"))))
+        bad = np.argwhere(~((values >= least) & (values <= MAX_NUMBER)))
         if len(bad):
             row, axis = bad[0]
             at = row * ROW.itemsize + ROW.fields[name][1] + 4 * axis
             raise UserError(
-                f"{Place(path, 'byte', at)}: a {name} must be {kind}, got {values[row, axis]}"
+                f"{Place(path, 'byte', at)}: a {name} must be from {least:g} to {MAX_NUMBER:g}, "
+                f"got {values[row, axis]}; is it a .splat file?"
             )
     colors = rows["rgba"][:, :3] / 255
     arrays = {

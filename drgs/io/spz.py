@@ -23,6 +23,7 @@ from __future__ import annotations
 
 import gzip
 import struct
+import warnings
 import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -30,7 +31,7 @@ from pathlib import Path
 
 import numpy as np
 
-from drgs.core.errors import UserError
+from drgs.core.errors import UserError, UserNote
 from drgs.core.files import read_bytes
 from drgs.io.colmap_records import Place
 from drgs.io.ply import Scalar
@@ -74,11 +75,12 @@ implementation's are twice as wide: on ``scenes/lego_mini.yml``, they save 17 % 
 GZIP_LEVEL = 6
 """The reference implementation's: the highest takes nine times as long for 3 % less."""
 
-DEFLATE_RATIO = 1100
-"""How many times larger a stream may be than its compressed form: deflate's limit is 1,032."""
+MAX_RATIO = 200
+"""How many times larger the numbers may be than the file: those of a scene, whose positions differ,
+compress 3 times, and zeros 1,000 times."""
 
-ZSTD_RATIO = 1 << 17
-"""The same of Zstandard, whose blocks of 128 kB may be a repeated byte."""
+MAX_EXTENSIONS = 1 << 24
+"""Bytes that are passed over."""
 
 XYZW = np.array([1, 2, 3, 0])
 """Columns of a quaternion wxyz."""
@@ -147,9 +149,13 @@ def _packed_rotations(quats: np.ndarray) -> np.ndarray:
 
 
 def _packed_harmonics(sh: np.ndarray) -> np.ndarray:
-    levels = np.floor(sh.astype(np.float64) * 128 + 0.5) + 128
-    steps = np.where(np.arange(sh.shape[1]) < 3, *SH_STEPS)[:, None]
-    return np.clip(np.floor((levels + steps // 2) / steps) * steps, 0, 255)
+    """(N, K - 1, 3) bytes; coefficient by coefficient, which takes little memory."""
+    rounded_levels = np.empty(sh.shape, "u1")
+    for index in range(sh.shape[1]):
+        step = SH_STEPS[0] if index < 3 else SH_STEPS[1]
+        levels = np.floor(sh[:, index].astype(np.float64) * 128 + 0.5) + 128
+        rounded_levels[:, index] = np.clip(np.floor((levels + step // 2) / step) * step, 0, 255)
+    return rounded_levels
 
 
 # ----------------------------------------------------------------------------------------------
@@ -179,7 +185,7 @@ def read_gaussians(path: str | Path) -> tuple[dict[str, np.ndarray], dict[str, S
     """Gaussians as numpy float32 arrays with y up, and whether they are ``antialiased``.
 
     As :func:`drgs.io.ply.read_gaussians` gives them; opacities of 0 and 1 are the next ones that
-    sigmoids tell apart. Extensions of vendors are passed over.
+    sigmoids tell apart. Extensions of vendors are passed over, with a :class:`UserNote`.
 
     Raises :class:`UserError` naming the file, the byte, what was expected and what was got.
     """
@@ -194,6 +200,9 @@ def read_gaussians(path: str | Path) -> tuple[dict[str, np.ndarray], dict[str, S
             f"{Place(path, 'byte', 0)}: must begin as gzip does, or with {MAGIC.decode()}: not an "
             "SPZ file"
         )
+    if header.flags & EXTENSIONS:
+        note = "has extensions of a vendor, which are passed over; one may say other axes"
+        warnings.warn(UserNote(f"{path}: {note}"), stacklevel=2)
     said = {"antialiased": True} if header.flags & ANTIALIASED else {}
     return _decoded(header, parts), said
 
@@ -209,7 +218,7 @@ def _decoded(header: _Header, parts: list[np.ndarray]) -> dict[str, np.ndarray]:
         "log_scales": scales / SCALE_STEPS + LOG_SCALE_LOW,
         "logit_opacities": logits_of(opacities[:, 0] / 255),
         "sh0": ((colors / 255 - 0.5) / COLOR_SCALE)[:, None, :],
-        "shN": (harmonics.astype(np.float64).reshape(header.num, -1, 3) - 128) / 128,
+        "shN": (harmonics.astype(np.float32).reshape(header.num, -1, 3) - 128) / 128,
     }
     return {name: values.astype(np.float32) for name, values in arrays.items()}
 
@@ -253,16 +262,21 @@ def _checked_header(path: Path, fields: tuple, versions: tuple[int, ...]) -> _He
     return _Header(version, num, degree, bits, flags)
 
 
+def _check_room(path: Path, header: _Header, size: int) -> None:
+    """Before memory is allocated for what the header promises."""
+    if sum(header.sizes) > MAX_RATIO * size:
+        raise UserError(
+            f"{Place(path, 'byte', 0)}: {header.num:,} Gaussians were expected, for which a file "
+            f"of {size:,} bytes has no room; it is damaged, or was cut off"
+        )
+
+
 def _read_gzip(path: Path, content: bytes) -> tuple[_Header, list[np.ndarray]]:
     """Versions 2 and 3."""
     stream = _GzipStream(path, content)
     header = _checked_header(path, HEADER.unpack(stream.take(HEADER.size)), (2, 3))
     expected = sum(header.sizes)
-    if expected > DEFLATE_RATIO * len(content):
-        raise UserError(
-            f"{Place(path, 'byte', 0)}: {header.num:,} Gaussians were expected, for which a file "
-            f"of {len(content):,} bytes has no room; it is damaged, or was cut off"
-        )
+    _check_room(path, header, len(content))
     body = stream.take(expected)
     stream.check_end(more_may_follow=bool(header.flags & EXTENSIONS))
     cuts = np.cumsum(header.sizes)[:-1]
@@ -302,10 +316,11 @@ class _GzipStream:
 
     def check_end(self, more_may_follow: bool) -> None:
         """Read on to the end, where the checksum is."""
+        last = self._at + (MAX_EXTENSIONS if more_may_follow else 0)
         while data := self._next(1 << 20):
-            if not more_may_follow:
-                raise UserError(f"{self._place}: the end was expected behind the harmonics")
             self._at += len(data)
+            if self._at > last:
+                raise UserError(f"{self._place}: the end was expected, and more follows")
         if not self._unpack.eof or self._unpack.unused_data:
             raise UserError(
                 f"{self._place}: the file must end with the stream's checksum; it is damaged, or "
@@ -322,6 +337,7 @@ def _read_streams(path: Path, content: bytes) -> tuple[_Header, list[np.ndarray]
         )
     *fields, num_streams, table = HEADER_4.unpack_from(content)
     header = _checked_header(path, tuple(fields), (4,))
+    _check_room(path, header, len(content))
     sizes = [size for size in header.sizes if size]
     if num_streams != len(sizes):
         raise UserError(
@@ -359,7 +375,7 @@ def _unpacked_stream(path: Path, start: int, packed: bytes, expected: int) -> np
     place = Place(path, "byte", start)
     try:
         claimed = zstandard.frame_content_size(packed)
-        if claimed not in (-1, expected) or expected > ZSTD_RATIO * len(packed):
+        if claimed not in (-1, expected):
             raise UserError(f"{place}: {expected:,} bytes were expected, got {claimed:,}")
         data = zstandard.ZstdDecompressor().decompress(packed, max_output_size=expected)
     except zstandard.ZstdError as error:

@@ -11,6 +11,8 @@ from support.small_capture import blobs, decibels, make_dataset, photograph, wri
 from drgs.bench import __main__ as bench
 from drgs.io.formats import FORMATS
 
+pytestmark = pytest.mark.filterwarnings("ignore:.*left out")
+
 
 @pytest.fixture(scope="module")
 def rows(tmp_path_factory):

@@ -41,11 +41,14 @@ def test_modules_are_commands_too_and_say_how_they_are_called(capsys, command):
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["fot"], "there is no command fot, only fit, render, capture and bench; did you mean fit"),
+        (
+            ["fot"],
+            "no command fot, only fit, render, export, capture and bench; did you mean fit",
+        ),
         (["rendre"], "did you mean render?"),
         (
             ["xyz"],
-            "there is no command xyz, only fit, render, capture and bench; see drgs",
+            "there is no command xyz, only fit, render, export, capture and bench; see drgs",
         ),
         (["bench", "sped"], "; did you mean speed?"),
         ([], "the following arguments are required: COMMAND"),

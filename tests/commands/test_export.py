@@ -1,14 +1,23 @@
 """``drgs.export``: fits and files for other programs."""
 
+import sys
 from dataclasses import replace
 
+import mitsuba as mi
 import numpy as np
 import pytest
 from support.commands import assert_ends_well, assert_refused
-from support.formats import FLOAT32, PRECISION, assert_within, gaussians_within_ranges, matched
-from support.small_capture import make_dataset
+from support.formats import (
+    FLOAT32,
+    PRECISION,
+    assert_within,
+    gaussians_within_ranges,
+    matched,
+    turned,
+)
+from support.small_capture import blobs, make_dataset
 
-from drgs import export
+from drgs import export, render
 from drgs.gaussians.parameters import Gaussians
 from drgs.io.formats import FORMATS, read_gaussians
 from drgs.results.refined_cameras import write_views
@@ -81,6 +90,24 @@ def test_a_file_that_is_meant_for_drgs_is_exported_with_a_hint(fit):
     assert Gaussians.load(fit.with_name("a.compressed.ply")).rendered_with == OTHERWISE
 
 
+@pytest.mark.parametrize("suffix", [".compressed.ply", ".spz", ".glb"])
+def test_what_is_written_is_rendered_and_loaded_by_the_plugin(tmp_path, suffix):
+    blobs().save(tmp_path / f"model{suffix}")
+    Gaussians.load(tmp_path / f"model{suffix}").save(tmp_path / "again.ply")
+    camera = ["--origin", 0, -4, 1, "--size", 24, 16]
+    for name in (f"model{suffix}", "again.ply"):
+        render.main(
+            [str(word) for word in (tmp_path / name, *camera, "--out", tmp_path / name[:5])]
+        )
+    pictures = [(tmp_path / folder / "camera.png").read_bytes() for folder in ("model", "again")]
+    assert pictures[0] == pictures[1]
+    mi.set_variant("llvm_ad_rgb")
+    plugin = mi.load_dict({"type": "splats", "filename": str(tmp_path / f"model{suffix}")})
+    expected = Gaussians.load(tmp_path / "again.ply")
+    np.testing.assert_array_equal(np.array(plugin.gaussians.means), expected.means)
+    np.testing.assert_array_equal(np.array(plugin.gaussians.shN), expected.shN)
+
+
 def test_smoothing_is_baked_in(tmp_path):
     gaussians = gaussians_within_ranges(5)
     replace(gaussians, smoothing=np.full(5, 0.1, np.float32)).save(tmp_path / "model.ply")
@@ -91,6 +118,38 @@ def test_smoothing_is_baked_in(tmp_path):
     np.testing.assert_allclose(found.scales, scales, rtol=1e-5)
     kept = (gaussians.scales.astype(np.float64) / scales).prod(axis=1)
     np.testing.assert_allclose(found.opacities, gaussians.opacities * kept, rtol=1e-5)
+
+
+def test_usd_is_written_where_openusd_is_installed(model):
+    pxr = pytest.importorskip("pxr.UsdVol")
+    from pxr import Usd, UsdGeom
+
+    run(model, "--format", "usd", "--up", 0, -1, 0)
+    stage = Usd.Stage.Open(str(model.with_name("model.usdc")))
+    assert UsdGeom.GetStageUpAxis(stage) == "Z"
+    splats = pxr.ParticleField3DGaussianSplat(stage.GetDefaultPrim())
+    expected = turned(Gaussians.load(model), [[1, 0, 0], [0, 0, 1], [0, -1, 0]])
+    quats = [[q.GetReal(), *q.GetImaginary()] for q in splats.GetOrientationsAttr().Get()]
+    harmonics = np.array(splats.GetRadianceSphericalHarmonicsCoefficientsAttr().Get())
+    harmonics = harmonics.reshape(300, 4, 3)
+    opacities = np.array(splats.GetOpacitiesAttr().Get(), np.float64)
+    found = Gaussians(
+        means=np.array(splats.GetPositionsAttr().Get()),
+        quats=np.array(quats),
+        log_scales=np.log(np.array(splats.GetScalesAttr().Get())),
+        logit_opacities=np.log(opacities / (1 - opacities)),
+        sh0=harmonics[:, :1],
+        shN=harmonics[:, 1:],
+    )
+    precision = replace(PRECISION["glb"], means=4 * FLOAT32, harmonics=8 * FLOAT32)
+    assert_within(precision, expected, found)
+    assert splats.GetRadianceSphericalHarmonicsDegreeAttr().Get() == 1
+
+
+def test_without_openusd_a_line_says_what_to_install(model, monkeypatch):
+    monkeypatch.setitem(sys.modules, "pxr", None)
+    message = "USD needs OpenUSD: pip install 'drgs[usd]'"
+    assert_refused(export.main, model, "--format", "usd", folder=model.parent, message=message)
 
 
 # ----------------------------------------------------------------------------------------------
@@ -131,7 +190,7 @@ def test_what_is_up_in_the_model_is_up_in_the_file(model, suffix, up):
     """That of a format that says so; y points down in the others, as in COLMAP's worlds."""
     out = model.with_name(f"out{suffix}")
     direction = np.array([0.0, 3, 4]) / 5
-    run(model, "--out", out, "--up", *(5 * direction))
+    run(model, "--out", out, "--up", *(1e300 * direction))  # of any length
     heights = np.sort(Gaussians.load(model).means @ direction)
     precision = PRECISION["compressed-ply"].means * 2 if "ply" in suffix else 1e-3
     np.testing.assert_allclose(np.sort(means_of(out) @ np.array(up)), heights, atol=precision)
@@ -162,7 +221,7 @@ def test_files_that_say_nothing_of_axes_are_not_turned_unasked(fit, model):
     [
         (
             ["model.ply"],
-            "--format: must be one of ply, compressed-ply, spz, glb, splat, html",
+            "one of ply, compressed-ply, spz, glb, splat, usd, html, got none",
         ),
         (["model.ply", "--format", "splt"], "got splt; did you mean splat?"),
         (["model.ply", "--out", "a.obj"], "--format: must be one of"),
@@ -173,6 +232,7 @@ def test_files_that_say_nothing_of_axes_are_not_turned_unasked(fit, model):
         ([".", "--format", "spz"], "must be the output folder of a fit that has ended"),
         (["model.ply", "--format", "spz", "--up", "cameras"], "--up cameras: needs the output"),
         (["model.ply", "--format", "spz", "--up", "0", "0", "0"], "--up: must be cameras, or thr"),
+        (["model.ply", "--format", "spz", "--up", "inf", "0", "0"], "--up: must be cameras, or t"),
         (["model.ply", "--format", "spz", "--min-opacity", "2"], "--min-opacity: must be between"),
         (["model.ply", "--format", "spz", "--max-size", "0"], "--max-size: must be above 0, got 0"),
         (["model.ply", "--format", "spz", "--max-size", "1e-9"], "nothing is left; crop and filt"),

@@ -4,7 +4,14 @@ import os
 import pytest
 
 from drgs.core.errors import UserError
-from drgs.core.files import atomic_path, is_temporary, open_regular, read_text, shortened
+from drgs.core.files import (
+    atomic_path,
+    is_temporary,
+    open_regular,
+    read_bytes,
+    read_text,
+    shortened,
+)
 
 
 def test_atomic_path_replaces_the_file_and_creates_folders(tmp_path):
@@ -128,3 +135,14 @@ def test_a_name_may_be_as_long_as_the_file_system_allows(tmp_path, letter):
         temporary.write_text("x")
         assert is_temporary(temporary.name)
     assert [p.name for p in tmp_path.iterdir()] == [path.name]
+
+
+def test_a_file_takes_no_more_memory_than_it_has_bytes(tmp_path):
+    (tmp_path / "a").write_bytes(b"abc")
+    assert read_bytes(tmp_path / "a", "file", 1 << 60) == b"abc"
+    with pytest.raises(UserError, match=r"a: cannot read the file: more than 2 bytes"):
+        read_bytes(tmp_path / "a", "file", 2)
+    with (tmp_path / "a").open("wb") as file:
+        file.truncate(1 << 40)
+    with pytest.raises(UserError, match=r"a: cannot read the file: more than 4,096 bytes"):
+        read_bytes(tmp_path / "a", "file", 4096)

@@ -17,6 +17,8 @@ from drgs.core.errors import UserError
 from drgs.gaussians.parameters import Gaussians
 from drgs.io.formats import FORMATS, format_of
 
+pytestmark = pytest.mark.filterwarnings("ignore:.*left out")
+
 MUTATIONS = 300  # of each format
 
 each_format = pytest.mark.parametrize("each", FORMATS, ids=lambda each: each.name)
@@ -26,7 +28,6 @@ checked = pytest.mark.parametrize(
 
 
 @each_format
-@pytest.mark.filterwarnings("ignore:.*left out")
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 def test_what_is_written_is_read_within_the_format_s_precision(tmp_path, each, degree):
     path, expected = tmp_path / f"a{each.suffix}", gaussians_within_ranges(degree=degree)
@@ -91,8 +92,7 @@ def test_a_compressed_file_needs_no_suffix_of_its_own(tmp_path):
 
 
 @checked
-@pytest.mark.filterwarnings("ignore:.*left out")
-@pytest.mark.filterwarnings("ignore:.*infinite logits")
+@pytest.mark.filterwarnings("ignore:.*(infinite logits|extensions of a vendor)")
 def test_damaged_files_are_read_or_refused_by_file(tmp_path, each):
     """Nothing comes but finite Gaussians or a UserError that begins with the file."""
     path = tmp_path / f"a{each.suffix}"

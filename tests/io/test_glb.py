@@ -196,7 +196,7 @@ def test_a_document_that_cannot_be_read_is_refused(tmp_path, parts, path, value,
 @pytest.mark.parametrize(
     ("attribute", "value", "message"),
     [
-        ("SCALE", -4.5, "must be linear, so not negative, got -4.5"),
+        ("SCALE", -4.5, "must be linear, so not negative (drafts of the extension"),
         ("OPACITY", 1.5, "must be from 0 to 1, got 1.5"),
         ("ROTATION", np.nan, "must be finite, got nan"),
     ],

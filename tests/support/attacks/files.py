@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 import io
 import json
 import os
@@ -34,6 +35,10 @@ READERS = {
     "photos/depth.npy": ("fit", ("photos.yml", "--out", "out")),
     "photos/depth.png": ("fit", ("photos.yml", "--out", "out")),
     "gaussians.ply": ("render", ("gaussians.ply", *RENDER)),
+    "gaussians.compressed.ply": ("render", ("gaussians.compressed.ply", *RENDER)),
+    "gaussians.spz": ("render", ("gaussians.spz", *RENDER)),
+    "gaussians.glb": ("render", ("gaussians.glb", *RENDER)),
+    "gaussians.splat": ("render", ("gaussians.splat", *RENDER)),
     "camera.json": ("render", ("gaussians.ply", "--camera", "camera.json", "--out", "out")),
     "sky.png": ("render", ("gaussians.ply", *RENDER, "--background", "sky.png")),
     "run/config.yml": ("render", ("run", "--orbit", "2", "--out", "out")),
@@ -135,6 +140,9 @@ MAY_BE_MISSING = [
 ]
 """A fit without a checkpoint begins anew."""
 
+MAY_BE_READ = [*MAY_BE_MISSING, ("gaussians.splat", "its first half")]
+"""The latter has whole rows, and no header that says how many there were."""
+
 
 def _archive() -> bytes:
     stream = io.BytesIO()
@@ -148,7 +156,7 @@ def other_file_attacks() -> Iterator[Attack]:
     for file in READERS:
         for name, change in OTHERS.items():
             may_be_read = name in HARMLESS or file in REWRITTEN
-            may_be_read |= (file, name) in MAY_BE_MISSING
+            may_be_read |= (file, name) in MAY_BE_READ
             yield _attack(f"instead/{file}/{name}", file, change, must_refuse=not may_be_read)
 
 
@@ -163,6 +171,15 @@ def _damaged(mutate: Callable, seed: int, path: Path) -> None:
 
 def _json_tree(rng: np.random.Generator, content: bytes) -> bytes:
     return json.dumps(mutate_tree(rng, json.loads(content))).encode()
+
+
+def _glb_tree(rng: np.random.Generator, content: bytes) -> bytes:
+    """The JSON part, with the lengths that it then has."""
+    size = struct.unpack_from("<I", content, 12)[0]
+    text = _json_tree(rng, content[20 : 20 + size])
+    text += b" " * (-len(text) % 4)
+    head = struct.pack("<4sIII4s", b"glTF", 2, len(content) - size + len(text), len(text), b"JSON")
+    return head + text + content[20 + size :]
 
 
 def _yaml_tree(rng: np.random.Generator, content: bytes) -> bytes:
@@ -246,6 +263,10 @@ MUTATIONS = {
     "photos/depth.npy": {"bytes": mutate_bytes, "header": _npy_header},
     "photos/depth.png": {"bytes": mutate_bytes, "chunks": mutate_chunks},
     "gaussians.ply": {"bytes": mutate_bytes, "header": mutate_header},
+    "gaussians.compressed.ply": {"bytes": mutate_bytes, "header": mutate_header},
+    "gaussians.spz": {"bytes": mutate_bytes},
+    "gaussians.glb": {"bytes": mutate_bytes, "tree": _glb_tree},
+    "gaussians.splat": {"bytes": mutate_bytes},
     "camera.json": {"bytes": mutate_bytes, "tree": _json_tree},
     "sky.png": {"bytes": mutate_bytes, "chunks": mutate_chunks},
     "run/config.yml": {"bytes": mutate_bytes, "tree": _yaml_tree},
@@ -309,6 +330,25 @@ def _deep(path: Path) -> None:
     path.write_text("[" * 200_000 + "]" * 200_000)
 
 
+def _gzip_bomb(path: Path) -> None:
+    """1 GB of zeros behind the Gaussians, as extensions."""
+    content = bytearray(gzip.decompress(path.read_bytes()))
+    content[14] |= 2
+    path.write_bytes(gzip.compress(bytes(content) + bytes(1 << 30), 1))
+
+
+def _honest_gzip_bomb(path: Path) -> None:
+    """1 GB of zeros, which are as many Gaussians as the header says."""
+    header = struct.pack("<4sIIBBBB", b"NGSP", 3, (1 << 30) // 20, 0, 12, 0, 0)
+    path.write_bytes(gzip.compress(header + bytes((1 << 30) // 20 * 20), 1))
+
+
+def _deep_glb(path: Path) -> None:
+    text = b"[" * 200_000
+    head = struct.pack("<4sIII4s", b"glTF", 2, 28 + len(text), len(text), b"JSON")
+    path.write_bytes(head + text + struct.pack("<I4s", 0, b"BIN\0"))
+
+
 def _deep_object(path: Path) -> None:
     path.write_text('{"a":' * 100_000 + "1" + "}" * 100_000)
 
@@ -362,6 +402,8 @@ SPECIAL = {
         "far": _far_points,
     },
     "gaussians.ply": {"lists": _ply_of_lists, "elements": _ply_of_elements},
+    "gaussians.spz": {"bomb": _gzip_bomb, "larger bomb": _honest_gzip_bomb},
+    "gaussians.glb": {"deep": _deep_glb},
     "lego/transforms_train.json": {"deep": _deep, "object": _deep_object},
     "photos/transforms.json": {"deep": _deep, "object": _deep_object},
     "camera.json": {"deep": _deep, "object": _deep_object},

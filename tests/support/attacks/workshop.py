@@ -13,6 +13,7 @@ import signal
 import stat
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from hashlib import blake2b
 from pathlib import Path
 from unittest.mock import patch
@@ -131,7 +132,9 @@ def write_inputs(folder: Path) -> None:
     write_lego(folder / "lego")
     write_photos(folder / "photos")
     write_points(folder / "points.ply")
-    blobs(12).save(folder / "gaussians.ply")
+    for suffix in (".ply", ".compressed.ply", ".spz", ".glb"):
+        blobs(12).save(folder / f"gaussians{suffix}")
+    replace(blobs(12), shN=np.zeros((12, 0, 3), np.float32)).save(folder / "gaussians.splat")
     (folder / "fit.yml").write_text(yaml.safe_dump(SETTINGS))
     (folder / "photos.yml").write_text(yaml.safe_dump(SETTINGS | PHOTOGRAPHS))
     frame = {"transform_matrix": pose(0.5)}
