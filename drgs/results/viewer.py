@@ -165,12 +165,7 @@ def write_viewer(out: Path, dataset: Dataset, shown: Shown) -> None:
         )
         warnings.warn(UserNote(note), stacklevel=2)
         return
-    write_page(out / VIEWER, page)
-
-
-def write_page(path: Path, page: bytes) -> None:
-    """Write what :func:`viewer_page` gave, atomically."""
-    with atomic_path(path) as temporary:
+    with atomic_path(out / VIEWER) as temporary:
         temporary.write_bytes(page)
 
 

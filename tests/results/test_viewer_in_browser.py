@@ -13,7 +13,7 @@ from drgs.config.schema import ModelConfig
 from drgs.data.viewpoints import pinhole
 from drgs.gaussians.parameters import Gaussians
 from drgs.integrator.scene import make_scene, render_views
-from drgs.results.viewer import Shown, Standpoint, viewer_page, write_page
+from drgs.results.viewer import Shown, Standpoint, viewer_page
 
 browsers = pytest.importorskip("support.browser", reason="needs POSIX", exc_type=ImportError)
 
@@ -72,7 +72,7 @@ def standpoint(gaussians):
 def path(tmp_path_factory, gaussians, standpoint):
     shown = Shown(gaussians, Approximations(**FITTED_WITH))
     path = tmp_path_factory.mktemp("viewer") / "a page & größe.html"
-    write_page(path, viewer_page(TITLE, shown, standpoint, BACKGROUND))
+    path.write_bytes(viewer_page(TITLE, shown, standpoint, BACKGROUND))
     return path
 
 
