@@ -69,7 +69,7 @@ PAGE_SECONDS = 3.5
 """Curves and page, which do not depend on the scene: 2.8 to 3.4 s on two cores (AMD Zen 4)."""
 
 VIEWER_SECONDS = 0.5
-"""The page to walk around in: 0.3 to 0.4 s with 50,000 Gaussians, twice that with 100,000."""
+"""The page to walk around in, with 50,000 Gaussians: 0.4 to 0.5 s on two cores (AMD Zen 4)."""
 
 FILES_SECONDS = 0.3
 """Gaussians, histories and the rest of the files: measured with 50,000 Gaussians."""

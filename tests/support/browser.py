@@ -24,7 +24,7 @@ import numpy as np
 from PIL import Image
 
 PROGRAM = next(
-    filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome", "chrome"))),
+    filter(None, map(shutil.which, ("google-chrome", "chrome", "chromium", "chromium-browser"))),
     None,
 )
 """Debian's package is ``chromium``; None: there is none."""
