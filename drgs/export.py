@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from drgs.cli.commands import CommandParser, file_or_folder, finite_number, run_command
-from drgs.config.approximations import DECLARED, said_by
+from drgs.config.approximations import DECLARED, Approximations, said_by
 from drgs.core.errors import UserError, UserNote, did_you_mean, one_line
 from drgs.core.files import atomic_path
 from drgs.core.records import FolderRecord
@@ -28,6 +28,8 @@ from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 from drgs.io.formats import FORMATS, Format, format_of
 from drgs.io.morton import morton_order
 from drgs.results.files import CONFIG, GAUSSIANS, GAUSSIANS_FOR_VIEWERS, VIEWS
+from drgs.results.folder import load_run_config
+from drgs.results.viewer import HONOURED, Shown, Standpoint, viewer_page
 
 COMMAND = "export"
 
@@ -49,6 +51,7 @@ class Source:
     gaussians: Gaussians  # numpy, without a smoothing filter
     path: Path  # of the file
     folder: Path | None  # of the fit; None: a file was named
+    is_turned: bool = False  # then the fit's cameras are no longer where they were
 
 
 @dataclass(frozen=True)
@@ -60,6 +63,7 @@ class Target:
     encode: Callable[[Source], bytes]  # equal Gaussians give equal bytes
     up: np.ndarray  # (3,) what programs take for up
     has_axes: bool = False  # whether the format says so: then models are always turned
+    honoured: frozenset[str] = frozenset()  # approximations that it shows Gaussians with
 
 
 def _usd(source: Source) -> bytes:
@@ -78,10 +82,26 @@ def _of_format(each: Format) -> Target:
     )
 
 
+def _page(source: Source) -> bytes:
+    """With the first view and the background of the fit, or before black where there is none."""
+    gaussians, folder = source.gaussians, source.folder
+    background = (0.0, 0.0, 0.0) if folder is None else load_run_config(folder).data.background_rgb
+    if folder is not None and not source.is_turned and (folder / VIEWS).is_file():
+        standpoint = Standpoint.of_views(read_viewpoints(folder / VIEWS, None), gaussians)
+    else:
+        standpoint = Standpoint.of_gaussians(gaussians, Z_UP)
+    title = source.path.name if folder is None else folder.resolve().name
+    shown = Shown(gaussians, Approximations.of(gaussians.rendered_with or {}))
+    return viewer_page(title, shown, standpoint, background)
+
+
 TARGETS = {
     **{each.name: _of_format(each) for each in FORMATS},
     "usd": Target(
         ".usdc", "OpenUSD's ParticleField3DGaussianSplat (extra usd)", _usd, Z_UP, has_axes=True
+    ),
+    "html": Target(
+        ".html", "a page to walk around in, for any browser", _page, Z_UP, honoured=HONOURED
     ),
 }
 """By the name that ``--format`` takes."""
@@ -154,7 +174,7 @@ def run(args: argparse.Namespace) -> None:
     name, out = _destination(args)
     target = TARGETS[name]
     selection = _selection(args)
-    source = load_source(args.what)
+    source = load_source(args.what, target.honoured)
     print(f"{source.path}: {source.gaussians.num_gaussians:,} Gaussians", flush=True)
     up = _up(args, source, target)
     gaussians = _selected(source, selection)
@@ -162,7 +182,7 @@ def run(args: argparse.Namespace) -> None:
         gaussians = turned_towards(gaussians, up, target.up)
     if args.order == "morton":
         gaussians = taken(gaussians, morton_order(gaussians.means))
-    content = target.encode(replace(source, gaussians=gaussians))
+    content = target.encode(replace(source, gaussians=gaussians, is_turned=up is not None))
     FolderRecord(out.parent, COMMAND).claim([out.name])
     with atomic_path(out) as temporary:
         temporary.write_bytes(content)
@@ -175,11 +195,12 @@ def run(args: argparse.Namespace) -> None:
 # ----------------------------------------------------------------------------------------------
 
 
-def load_source(what: Path) -> Source:
+def load_source(what: Path, honoured: frozenset[str] = frozenset()) -> Source:
     """The Gaussians of a fit's folder that are meant for other programs, or those of a file.
 
-    What a file says that other programs would not do is a :class:`UserNote`; what they do anyway
-    is dropped. A smoothing filter is baked in.
+    honoured: approximations that the target shows them with. The fit's own Gaussians are taken
+    where they need no others. What a file says that other programs would not do is a
+    :class:`UserNote`; what they do anyway is dropped. A smoothing filter is baked in.
     """
     if not what.exists():
         raise UserError(f"{what}: there is no such file or folder")
@@ -191,14 +212,22 @@ def load_source(what: Path) -> Source:
                 f"{what}: must be the output folder of a fit that has ended, but there is no "
                 f"{CONFIG if names else GAUSSIANS} in it"
             )
-        path = what / names[0]
+        path = what / (GAUSSIANS if _shows_own(what, honoured) else names[0])
     gaussians = Gaussians.load(path)
     said = said_by(str(path), gaussians.rendered_with or {})
     others = {name: value for name, value in said.items() if value != DECLARED[name].default}
-    if others:
-        _note_rendering(path, others)
+    if unknown := {name: value for name, value in others.items() if name not in honoured}:
+        _note_rendering(path, unknown)
     gaussians = baked(replace(gaussians, rendered_with=others or None))
     return Source(gaussians, path, what if what.is_dir() else None)
+
+
+def _shows_own(folder: Path, honoured: frozenset[str]) -> bool:
+    """Whether a fit's own Gaussians are there, and need no other approximations."""
+    if not honoured or not (folder / GAUSSIANS).is_file():
+        return False
+    needed = load_run_config(folder).model.approximations.others_than_default
+    return needed.keys() <= honoured
 
 
 def _note_rendering(path: Path, others: dict[str, object]) -> None:

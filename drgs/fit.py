@@ -14,7 +14,8 @@ folder:
 - ``side_by_side/<split>/*.png``: fitted, photograph and difference
 - ``curves.png``, ``orbit.webp``, ``orbit.gif``
 - ``report.html``: all of it on one page that needs no other file (``output.report: false``
-  leaves out this page and what is made for it: comparisons, curves, orbits)
+  leaves out this page and what is made for it: comparisons, curves, orbits, ``viewer.html``)
+- ``viewer.html``: the Gaussians to walk around in, in a browser, unless they are too many
 - ``config.yml``: every value that the fit used
 - ``views.json``: the cameras of the training views, for orbits
 - ``colors.json``, ``cameras.json``: colour transforms and refined cameras of the training views
@@ -48,6 +49,7 @@ from drgs.cli.commands import MAX_PORT, CommandParser, at_least, file_or_folder,
 from drgs.cli.execution import add_execution_arguments, executing, select_variant
 from drgs.cli.interrupts import INTERRUPTED_STATUS, StopRequest
 from drgs.cli.progress import RunProgress
+from drgs.config.approximations import Approximations
 from drgs.config.changes import changed
 from drgs.config.load import load_config
 from drgs.config.schema import FitConfig
@@ -94,7 +96,14 @@ from drgs.results.folder import (
 )
 from drgs.results.metrics import FitMetrics, Quality, SplitMetrics, mean_of
 from drgs.results.refined_cameras import write_views
-from drgs.results.report import score, seconds_of_results, write_pictures, write_results
+from drgs.results.report import (
+    Fitted,
+    score,
+    seconds_of_results,
+    write_pictures,
+    write_results,
+)
+from drgs.results.viewer import Shown, shows_as_fitted
 from drgs.training.budget import (
     AllIterations,
     Deadline,
@@ -438,12 +447,14 @@ def fit_and_write(
     scores = write_pictures(out, dataset, render, output.save_renders, output.report)
     quality = mean_of(scores)
     metrics = summarize(config, dataset, gaussians.num_gaussians, wall_s, quality, command)
+    for_viewers = None
     if not config.model.approximations.are_usual:
-        metrics["viewers"] = measured_split(
-            write_for_viewers(out, trainer, dataset, gaussians), dataset
-        )
+        seen, for_viewers = write_for_viewers(out, trainer, dataset, gaussians)
+        metrics["viewers"] = measured_split(seen, dataset)
     if output.report:
-        write_results(out, dataset, trainer.scene, gaussians, render, scores, log, metrics)
+        shown = shown_on_page(gaussians, config.model.approximations, for_viewers)
+        fitted = Fitted(trainer.scene, gaussians, render, shown)
+        write_results(out, dataset, fitted, scores, log, metrics)
     with atomic_path(out / METRICS) as temporary:
         temporary.write_text(json.dumps(metrics, indent=2) + "\n")
     remove_checkpoint(out)
@@ -466,8 +477,8 @@ def fit_and_write(
 
 def write_for_viewers(
     out: Path, trainer: Trainer, dataset: Dataset, gaussians: Gaussians
-) -> Quality:
-    """Write the Gaussians for other viewers, and measure the test views as these show them.
+) -> tuple[Quality, Gaussians]:
+    """Write the Gaussians for other viewers; how these show the test views, and the Gaussians.
 
     trainer: is retired by it, and goes on rendering what it has fitted; gaussians: that.
     """
@@ -478,7 +489,23 @@ def write_for_viewers(
         found = for_viewers(trainer, dataset, gaussians, lambda done: shown.update(done, total))
     found.gaussians.save(out / GAUSSIANS_FOR_VIEWERS)
     pairs = zip(found.pictures(dataset.test), dataset.test, strict=True)
-    return mean_of([score(image, view) for image, view in pairs])
+    return mean_of([score(image, view) for image, view in pairs]), found.gaussians
+
+
+def shown_on_page(
+    gaussians: Gaussians, approximations: Approximations, for_viewers: Gaussians | None
+) -> Shown:
+    """What ``viewer.html`` shows: the fit's own, where it renders with their approximations.
+
+    for_viewers: what it shows otherwise; None: there is nothing but the fit's own.
+    """
+    if for_viewers is not None and not shows_as_fitted(approximations):
+        return Shown(for_viewers, Approximations())
+    if gaussians.smoothing is not None:
+        from drgs.effects.smoothing import baked
+
+        gaussians = baked(gaussians)
+    return Shown(gaussians, approximations)
 
 
 def run_iterations(

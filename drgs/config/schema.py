@@ -417,8 +417,8 @@ class OutputConfig(Section):
     save_renders: bool = Field(True, description="Write renders/<split>/*.png.")
     report: bool = Field(
         True,
-        description="Write report.html, side_by_side/, curves.png and the orbit, and measure test "
-        "views on the way for them.",
+        description="Write report.html, viewer.html, side_by_side/, curves.png and the orbit, and "
+        "measure test views on the way for them.",
     )
     history_every: Count = Field(10, ge=1, description="Iterations between rows of history.csv.")
     checkpoint_every: Count | None = Field(

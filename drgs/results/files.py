@@ -22,6 +22,9 @@ ORBIT = "orbit.webp"
 ORBIT_GIF = "orbit.gif"
 REPORT = "report.html"
 
+VIEWER = "viewer.html"
+"""The Gaussians, to walk around in; there is none where it would be too large."""
+
 RENDERS = "renders"
 """A folder for each split that was measured, with a picture for each of its views."""
 
@@ -66,6 +69,7 @@ RESULTS = (
     REPORT,
     SIDE_BY_SIDE,
     TENSORBOARD,
+    VIEWER,
     VIEWS,
 )
 """All of them but ``config.yml``."""

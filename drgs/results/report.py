@@ -12,6 +12,7 @@ import io
 import math
 import time
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
 from datetime import datetime
 from importlib import resources
 from pathlib import Path
@@ -41,9 +42,11 @@ from drgs.results.files import (
     RENDERS,
     REPORT,
     SIDE_BY_SIDE,
+    VIEWER,
 )
 from drgs.results.metrics import FitMetrics, psnr, ssim
 from drgs.results.population import story_of
+from drgs.results.viewer import Shown, write_viewer
 
 DIFFERENCE_GAIN = 5.0
 """Of difference pictures, 0.5 + gain (fitted - truth): saturates at 10 % of the range."""
@@ -64,6 +67,9 @@ PAGE = "page.html"
 
 PAGE_SECONDS = 3.5
 """Curves and page, which do not depend on the scene: 2.8 to 3.4 s on two cores (AMD Zen 4)."""
+
+VIEWER_SECONDS = 0.5
+"""The page to walk around in, with 50,000 Gaussians: 0.4 to 0.5 s on two cores (AMD Zen 4)."""
 
 FILES_SECONDS = 0.3
 """Gaussians, histories and the rest of the files: measured with 50,000 Gaussians."""
@@ -98,25 +104,34 @@ def write_pictures(
     return scores
 
 
+@dataclass(frozen=True, eq=False)
+class Fitted:
+    """What a fit has found."""
+
+    scene: mi.Scene  # renders ``gaussians``, in display space
+    gaussians: Gaussians
+    render: Render
+    shown: Shown  # on the page to walk around in
+
+
 def write_results(
     out: Path,
     dataset: Dataset,
-    scene: mi.Scene,
-    gaussians: Gaussians,
-    render: Render,
+    fitted: Fitted,
     scores: Sequence[Score],
     history: FitHistory,
     metrics: FitMetrics,
 ) -> None:
-    """Write ``curves.png``, ``orbit.webp`` and ``.gif``, ``report.html``.
+    """Write ``curves.png``, ``orbit.webp`` and ``.gif``, ``viewer.html``, ``report.html``.
 
-    scene: renders ``gaussians``, in display space; scores: of the test views, in their order;
-    history: as of ``history.csv`` and ``density.csv``; metrics: as of ``metrics.json``.
+    scores: of the test views, in their order; history: as of ``history.csv`` and ``density.csv``;
+    metrics: as of ``metrics.json``.
     """
     write_curves(out / CURVES, history)
-    write_orbit(out / ORBIT, scene, dataset, gaussians)
+    write_orbit(out / ORBIT, fitted.scene, dataset, fitted.gaussians)
+    write_viewer(out, dataset, fitted.shown)
     orbit = (out / ORBIT).read_bytes()
-    write_report(out / REPORT, out.name, dataset, render, scores, history, metrics, orbit)
+    write_report(out / REPORT, out.name, dataset, fitted.render, scores, history, metrics, orbit)
 
 
 class Seconds(NamedTuple):
@@ -146,7 +161,10 @@ def seconds_of_results(scene: mi.Scene, dataset: Dataset) -> Seconds:
     return Seconds(
         measuring=FILES_SECONDS + views * measured,
         renders=views * (written - measured),
-        report=PAGE_SECONDS + views * (compared - written) + ORBIT_FRAMES * of_frame,
+        report=PAGE_SECONDS
+        + VIEWER_SECONDS
+        + views * (compared - written)
+        + ORBIT_FRAMES * of_frame,
     )
 
 
@@ -191,8 +209,9 @@ def write_report(
 ) -> None:
     """Write one HTML file with everything in it, which needs no network and no other file.
 
-    Only its link to the Gaussians leads out, to the file beside it. scores: of the test views, in
-    their order; metrics: as of ``metrics.json``; orbit: the bytes of an animated WebP.
+    Only its links to the Gaussians, and to the page to walk around in if it is there, lead out, to
+    files beside it. scores: of the test views, in their order; metrics: as of ``metrics.json``;
+    orbit: the bytes of an animated WebP.
     """
     chosen = choose_views([score.psnr for score in scores])
     template = Template(resources.files("drgs.results").joinpath(PAGE).read_text("utf-8"))
@@ -206,6 +225,7 @@ def write_report(
         still=_data_uri(_first_frame(orbit), lossless=True),
         gaussians=GAUSSIANS,
         viewers=_viewers(metrics),
+        walk=_LINK_TO_VIEWER if path.with_name(VIEWER).is_file() else "",
         command=html.escape(metrics["command"]),
         comparisons="".join(
             _comparison(dataset, render, label, index, scores[index]) for label, index in chosen
@@ -259,6 +279,9 @@ def _facts(dataset: Dataset, metrics: FitMetrics, history: FitHistory) -> list[t
         ("Seed", f"{metrics['seed']}"),
         ("Versions", ", ".join(f"{names.get(k, k)} {v}" for k, v in versions.items())),
     ]
+
+
+_LINK_TO_VIEWER = f'<a href="{VIEWER}">Walk around in it</a>. '
 
 
 def _viewers(metrics: FitMetrics) -> str:

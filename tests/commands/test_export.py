@@ -221,7 +221,7 @@ def test_files_that_say_nothing_of_axes_are_not_turned_unasked(fit, model):
     [
         (
             ["model.ply"],
-            "one of ply, compressed-ply, spz, glb, splat, usd, got none",
+            "one of ply, compressed-ply, spz, glb, splat, usd, html, got none",
         ),
         (["model.ply", "--format", "splt"], "got splt; did you mean splat?"),
         (["model.ply", "--out", "a.obj"], "--format: must be one of"),

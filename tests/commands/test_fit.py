@@ -29,7 +29,7 @@ SIZE = 32
 FIELD_OF_VIEW = 0.7
 OUTPUTS = (
     *("point_cloud.ply", "metrics.json", "history.csv", "density.csv", "config.yml"),
-    *("curves.png", "orbit.webp", "orbit.gif", "report.html", "views.json"),
+    *("curves.png", "orbit.webp", "orbit.gif", "report.html", "viewer.html", "views.json"),
 )
 
 
@@ -242,6 +242,8 @@ def test_the_resolved_configuration_gives_the_same_bytes_on_any_number_of_thread
         assert json.loads((folder / "metrics.json").read_text())["threads"] == threads
     for name in ("point_cloud.ply", "renders/test/r_0.png"):
         assert (tmp_path / "again" / name).read_bytes() == (first / name).read_bytes(), name
+    page = (first / "viewer.html").read_text().replace("<title>first:", "<title>again:")
+    assert (tmp_path / "again" / "viewer.html").read_text() == page
 
 
 def test_shipped_scene_gives_the_same_bytes_on_any_number_of_threads():

@@ -11,7 +11,16 @@ from support.small_fits import config_of, plain_dataset, true_blobs
 from drgs import fit
 from drgs.config.changes import changed
 from drgs.core.errors import UserNote
-from drgs.results.files import CURVES, HISTORY, METRICS, ORBIT, ORBIT_GIF, REPORT, SIDE_BY_SIDE
+from drgs.results.files import (
+    CURVES,
+    HISTORY,
+    METRICS,
+    ORBIT,
+    ORBIT_GIF,
+    REPORT,
+    SIDE_BY_SIDE,
+    VIEWER,
+)
 from drgs.results.report import Seconds
 from drgs.training.viewers import TIME_SHARE
 
@@ -59,7 +68,7 @@ def test_a_fit_without_a_report(tmp_path):
         out = tmp_path / name
         assert_fits(config, "--out", out, "--set", f"output.report={name}")
         written[name] = {path.relative_to(out).parts[0] for path in out.rglob("*")}
-    pages = {REPORT, CURVES, ORBIT, ORBIT_GIF, SIDE_BY_SIDE}
+    pages = {REPORT, CURVES, ORBIT, ORBIT_GIF, SIDE_BY_SIDE, VIEWER}
     assert written["true"] - written["false"] == pages and written["false"] < written["true"]
     first, second = (json.loads((tmp_path / n / METRICS).read_text())["test"] for n in written)
     assert first == second

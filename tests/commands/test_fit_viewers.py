@@ -12,9 +12,10 @@ from support.fit_command import VALUES, assert_fits, without_pictures, write_pro
 from support.folders import contents
 from support.render_command import run as render
 from support.small_capture import decibels
-from support.small_fits import double, photograph
+from support.small_fits import disturbed_blobs, double, photograph, true_blobs
 
 from drgs import fit
+from drgs.config.approximations import Approximations
 from drgs.config.load import load_config
 from drgs.data import load_dataset
 from drgs.gaussians.parameters import Gaussians
@@ -123,3 +124,29 @@ def test_a_file_of_somebody_else_is_not_replaced(tmp_path, monkeypatch):
     with pytest.raises(SystemExit) as end:
         fit.main([str(config), "--out", str(tmp_path / "out"), "--overwrite"])
     assert end.value.code == 2 and (tmp_path / "out" / GAUSSIANS_FOR_VIEWERS).exists()
+
+
+@pytest.mark.parametrize(
+    ("approximations", "shown"),
+    [
+        (Approximations(), "the fit's own"),
+        (Approximations(**OTHERWISE), "the fit's own"),
+        (Approximations(order="pixel", low_pass=0.1), "those for viewers"),
+    ],
+)
+def test_the_page_shows_the_fits_own_where_it_can(approximations, shown):
+    own, other = true_blobs(), disturbed_blobs()
+    found = fit.shown_on_page(own, approximations, other)
+    if shown == "the fit's own":
+        assert found.gaussians is own and found.approximations == approximations
+    else:
+        assert found.gaussians is other and found.approximations == Approximations()
+
+
+def test_the_page_shows_what_a_smoothing_filter_makes_of_gaussians():
+    own = true_blobs()
+    own = replace(own, smoothing=np.full(own.num_gaussians, 0.2, np.float32))
+    found = fit.shown_on_page(own, Approximations(), None).gaussians
+    assert found.smoothing is None
+    expected = np.sqrt(np.square(own.scales.astype(np.float64)) + 0.2**2)
+    np.testing.assert_allclose(found.scales, expected, rtol=1e-5)  # float32 logarithms

@@ -15,6 +15,7 @@ import pytest
 from PIL import Image
 from support.small_capture import HEIGHT, WIDTH, blobs, decibels, make_dataset
 
+from drgs.config.approximations import Approximations
 from drgs.config.schema import FitConfig, ModelConfig
 from drgs.data.orbits import orbit_of_views
 from drgs.data.viewpoints import field_of_view
@@ -22,6 +23,7 @@ from drgs.integrator.scene import make_scene, render_views
 from drgs.results import curves, report
 from drgs.results.metrics import ssim
 from drgs.results.population import story_of
+from drgs.results.viewer import Shown
 from drgs.training.history import DensityRow, HistoryRow
 
 KINDS = ("still", "moving")
@@ -95,8 +97,8 @@ def out(tmp_path_factory, dataset, scene, images):
     scores = report.write_pictures(
         folder, dataset, render, with_renders=False, with_comparisons=True
     )
-    args = dataset, scene, blobs(), render, scores
-    report.write_results(folder, *args, history(changes=CHANGES), metrics())
+    fitted = report.Fitted(scene, blobs(), render, Shown(blobs(), Approximations()))
+    report.write_results(folder, dataset, fitted, scores, history(changes=CHANGES), metrics())
     return folder
 
 
@@ -111,7 +113,8 @@ def test_the_page_says_what_viewers_are_to_open():
 def test_everything_is_written_and_nothing_temporary(out):
     names = {str(path.relative_to(out)) for path in out.rglob("*") if path.is_file()}
     comparisons = {f"side_by_side/test/r_{i}.png" for i in range(4)}
-    assert names == {"curves.png", "orbit.webp", "orbit.gif", "report.html", *comparisons}
+    pages = {"report.html", "viewer.html"}
+    assert names == {"curves.png", "orbit.webp", "orbit.gif", *pages, *comparisons}
 
 
 # ----------------------------------------------------------------------------------------------
@@ -299,7 +302,8 @@ def test_the_page_refers_to_nothing_outside(page):
     embedded = [reference for reference in page.references if reference.startswith("data:")]
     # The icon, the orbit and its first frame, comparisons, curves for light and dark pages.
     assert len(embedded) == 1 + 2 + 3 * 3 + 6 * 2
-    assert set(page.references) - set(embedded) == {"point_cloud.ply"}  # to be downloaded
+    # To be downloaded, and to walk around in.
+    assert set(page.references) - set(embedded) == {"point_cloud.ply", "viewer.html"}
     for outside in ("http:", "https:", "file:", "//", "@import", "url(", "<script"):
         assert outside not in re.sub(r"base64,[A-Za-z0-9+/=]*", "", page.source), outside
     assert set(page.tags).isdisjoint({"script", "iframe", "object", "embed"})

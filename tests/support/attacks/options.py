@@ -90,6 +90,7 @@ FOREIGN = (
     "point_cloud.ply",
     "checkpoint.npz",
     "report.html",
+    "viewer.html",
     "orbit.webp",
     "orbit.gif",
     "orbit_0.png",

@@ -25,7 +25,7 @@ from plyfile import PlyData, PlyElement
 
 from drgs import capture, fit
 from drgs.core.files import atomic_path
-from drgs.results.files import CHECKPOINT, CURVES, ORBIT, ORBIT_GIF, REPORT
+from drgs.results.files import CHECKPOINT, CURVES, ORBIT, ORBIT_GIF, REPORT, VIEWER
 from support.attacks.observer import Fault, observed
 from support.commands import run_in_process
 from support.small_capture import blobs
@@ -163,7 +163,7 @@ def sketched_results() -> Iterator[None]:
     """Within the block a fit writes its drawings, but does not draw: that takes seconds."""
 
     def write(out: Path, *others: object) -> None:
-        for name in (CURVES, ORBIT, ORBIT_GIF, REPORT):
+        for name in (CURVES, ORBIT, ORBIT_GIF, REPORT, VIEWER):
             with atomic_path(out / name) as temporary:
                 temporary.write_text("a sketch")
 

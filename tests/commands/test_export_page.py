@@ -1,0 +1,89 @@
+"""``drgs.export --format html``: a page of a fit, or of a file."""
+
+import base64
+import gzip
+import json
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import yaml
+from support.commands import assert_ends_well
+from support.small_capture import RADIUS, blobs, make_dataset
+
+from drgs import export
+from drgs.gaussians.parameters import Gaussians
+from drgs.results.refined_cameras import write_views
+
+OTHERWISE = {"antialiased": True, "low_pass": 0.1}
+
+
+@pytest.fixture
+def fit(tmp_path):
+    """A folder as a fit leaves it: more Gaussians of its own than for viewers."""
+    folder = tmp_path / "run"
+    folder.mkdir()
+    configure(folder, OTHERWISE)
+    replace(blobs(30), rendered_with=OTHERWISE).save(folder / "point_cloud.ply")
+    blobs(20).save(folder / "point_cloud_viewers.ply")
+    write_views(folder / "views.json", make_dataset().train)
+    return folder
+
+
+def configure(folder, model):
+    data = {"path": "photographs", "background": [0.25, 0.5, 0.75]}
+    (folder / "config.yml").write_text(yaml.safe_dump({"data": data, "model": model}))
+
+
+def exported(what, out, *options):
+    """What the command says, the page's scene and its Gaussians."""
+    outcome = assert_ends_well(export.main, what, "--out", out, *options)
+    page = out.read_text("utf-8")
+    scene, splats = (re.search(rf'id="{name}">([^<]*)<', page)[1] for name in ("scene", "splats"))
+    model = out.with_suffix(".ply")
+    model.write_bytes(gzip.decompress(base64.b64decode(splats)))
+    return outcome.stdout, page, json.loads(scene), Gaussians.load(model)
+
+
+def test_of_a_fit_its_own_gaussians_are_shown_as_they_were_fitted(fit, tmp_path):
+    said, page, scene, gaussians = exported(fit, tmp_path / "a.html")
+    assert said.splitlines()[0] == f"{fit}/point_cloud.ply: 30 Gaussians"
+    assert "note" not in said and gaussians.num_gaussians == 30
+    assert (scene["lowPass"], scene["antialiased"]) == (pytest.approx(0.1), True)
+    assert scene["settings"]["background"]["color"] == [0.25, 0.5, 0.75]
+    assert "<title>run: Gaussian splats</title>" in page
+
+
+def test_of_a_fit_that_the_page_cannot_show_those_for_viewers_are(fit, tmp_path):
+    configure(fit, {**OTHERWISE, "order": "pixel"})
+    said, _, scene, gaussians = exported(fit, tmp_path / "a.html")
+    assert said.splitlines()[0] == f"{fit}/point_cloud_viewers.ply: 20 Gaussians"
+    assert gaussians.num_gaussians == 20
+    assert (scene["lowPass"], scene["antialiased"]) == (pytest.approx(0.3), False)
+
+
+def test_the_first_view_of_a_fit_is_that_of_a_training_camera(fit, tmp_path):
+    """The nearest Gaussian and the farthest one are as far away as they are from that camera."""
+    _, _, scene, gaussians = exported(fit, tmp_path / "a.html")
+    back = scene["settings"]["cameras"][0]["initial"]["position"]
+    scale = np.linalg.norm(back) / RADIUS
+    seen = np.linalg.norm(gaussians.means * [-1, -1, 1] - back, axis=1) / scale
+    distances = [
+        np.sort(np.linalg.norm(blobs(30).means - view.center, axis=1))
+        for view in make_dataset().train
+    ]
+    errors = [np.abs(np.sort(seen) - expected).max() for expected in distances]
+    assert min(errors) < 2e-3 and sorted(errors)[1] > 0.01  # 10 bits of 1.2 scene units
+
+
+@pytest.mark.parametrize("options", [(), ("--up", 0, 0, 1)])
+def test_a_file_is_shown_whole_with_z_up(fit, tmp_path, options):
+    what = fit / "point_cloud.ply" if not options else fit
+    _, _, scene, gaussians = exported(what, tmp_path / "a.html", *options)
+    heights = np.sort(-gaussians.means[:, 1])
+    expected = np.sort(blobs(30).means[:, 2])
+    correlation = np.corrcoef(heights, expected)[0, 1]
+    assert correlation > 0.9999  # rounded to 10 bits
+    black = scene["settings"]["background"]["color"] == [0, 0, 0]
+    assert black == (not options)

@@ -1,0 +1,222 @@
+"""``viewer.html``, as text: what a browser makes of it is in ``test_viewer_in_browser.py``."""
+
+import base64
+import gzip
+import hashlib
+import json
+import re
+from dataclasses import replace
+from html.parser import HTMLParser
+from importlib import resources
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from support.small_capture import FOCUS, RADIUS, blobs, make_dataset, pose_around
+
+from drgs.config.approximations import Approximations
+from drgs.core.errors import UserError, UserNote
+from drgs.data.viewpoints import pinhole
+from drgs.gaussians.parameters import Gaussians
+from drgs.results import viewer
+from drgs.results.viewer import Shown, Standpoint, viewer_page
+
+SHIPPED = resources.files("drgs.results").joinpath("supersplat_viewer")
+MANIFEST = json.loads(SHIPPED.joinpath("MANIFEST.json").read_text())
+
+OWN = Approximations(low_pass=0.1, antialiased=True)
+TITLE = '<i>"ü" & </script>'
+
+
+class Page(HTMLParser):
+    """What the elements of a page hold, and where they refer to."""
+
+    def __init__(self, page: bytes):
+        super().__init__()
+        self.texts, self.references, self.tags, self._inside = {}, [], [], None
+        self.feed(page.decode("utf-8"))
+
+    def handle_starttag(self, tag, attrs):
+        attributes = dict(attrs)
+        self.tags.append(tag)
+        self.references += [v for k, v in attributes.items() if k in ("src", "href", "srcset")]
+        self._inside = attributes.get("id", tag)
+
+    def handle_data(self, data):
+        self.texts[self._inside] = self.texts.get(self._inside, "") + data
+
+
+def page_of(gaussians, standpoint, title="title", background=(0.1, 0.2, 0.3)):
+    return viewer_page(title, Shown(gaussians, OWN), standpoint, background)
+
+
+@pytest.fixture(scope="module")
+def standpoint():
+    return Standpoint.of_views(make_dataset().train, blobs())
+
+
+@pytest.fixture(scope="module")
+def page(standpoint):
+    return page_of(blobs(), standpoint, TITLE)
+
+
+# ----------------------------------------------------------------------------------------------
+# What is shipped
+# ----------------------------------------------------------------------------------------------
+
+
+def test_the_shipped_files_are_those_of_the_manifest():
+    files = {entry.name: entry.read_bytes() for entry in SHIPPED.iterdir()}
+    assert files.keys() - {"MANIFEST.json"} == MANIFEST["sha256"].keys()
+    for name, digest in MANIFEST["sha256"].items():
+        assert hashlib.sha256(files[name]).hexdigest() == digest, name
+
+
+def test_the_viewer_is_of_the_pinned_versions_with_all_changes():
+    code = gzip.decompress(SHIPPED.joinpath("viewer.js.gz").read_bytes()).decode()
+    for package in MANIFEST["packages"]:
+        assert f'"{package["version"]}"' in code
+    for change in MANIFEST["changes"]:
+        lines = [line.strip() for line in change["new"].splitlines()]
+        assert all(line in code for line in lines) and change["old"] not in code
+
+
+def test_the_licences_come_with_the_files_and_with_each_page(page):
+    text = SHIPPED.joinpath("LICENSE").read_text()
+    for package in MANIFEST["packages"]:
+        assert f"{package['name']} {package['version']}\n" in text
+    assert text.count("Permission is hereby granted, free of charge") == len(MANIFEST["packages"])
+    assert text in page.decode()
+
+
+# ----------------------------------------------------------------------------------------------
+# The page
+# ----------------------------------------------------------------------------------------------
+
+
+def test_equal_gaussians_give_equal_bytes(page, standpoint):
+    assert page_of(blobs(), standpoint, TITLE) == page
+
+
+def test_the_page_refers_to_nothing_and_may_connect_to_nothing(page):
+    parsed = Page(page)
+    assert parsed.references == ["data:,"]  # the icon
+    policy = re.search(rb'Content-Security-Policy" content="([^"]*)"', page)[1].decode()
+    allowed = {name: values for name, *values in map(str.split, policy.split(";"))}
+    assert allowed["default-src"] == ["'none'"] and "connect-src" not in allowed
+    assert {v for values in allowed.values() for v in values} == {
+        *("'none'", "'unsafe-inline'", "data:", "blob:")
+    }
+
+
+def test_text_from_outside_is_text(page):
+    parsed = Page(page)
+    assert parsed.texts["title"].strip() == f"{TITLE}: Gaussian splats"
+    assert parsed.tags.count("script") == 4
+
+
+def test_a_script_element_cannot_be_ended_by_what_it_holds():
+    text = viewer._in_script({"a": "</script><!--"})
+    assert "<" not in text and json.loads(text) == {"a": "</script><!--"}
+
+
+def test_the_page_says_what_gaussians_are_shown_with(page):
+    scene = json.loads(Page(page).texts["scene"])
+    assert (scene["lowPass"], scene["antialiased"]) == (pytest.approx(0.1), True)
+    assert scene["settings"]["background"]["color"] == [0.1, 0.2, 0.3]
+
+
+def test_the_page_holds_the_gaussians_as_its_first_camera_sees_them(page, standpoint, tmp_path):
+    """Their means in the camera's axes: y is up on the page, which turns files by 180 degrees."""
+    parsed = Page(page)
+    scene = json.loads(parsed.texts["scene"])
+    (tmp_path / "a.ply").write_bytes(gzip.decompress(base64.b64decode(parsed.texts["splats"])))
+    found = Gaussians.load(tmp_path / "a.ply")
+    (first,) = scene["settings"]["cameras"]
+    back = np.array(first["initial"]["position"])
+    assert first["initial"]["target"] == [0, 0, 0] and np.linalg.norm(back) == pytest.approx(3)
+    right = np.cross([0, 1, 0], back)
+    axes = [v / np.linalg.norm(v) for v in (right, np.cross(right, back), -back)]  # OpenCV's
+    seen = (found.means * [-1, -1, 1] - back) @ np.transpose(axes)
+
+    camera = standpoint.camera
+    expected = (blobs().means - camera.center) @ camera.camera_to_world[:3, :3]
+    scale = 3 / RADIUS
+    order = np.argsort(seen[:, 2]), np.argsort(expected[:, 2])
+    # 10 bits and more of a box of 1.2 scene units.
+    np.testing.assert_allclose(seen[order[0]], scale * expected[order[1]], atol=1.2 / 1023)
+    sizes = blobs().log_scales[order[1]] + np.log(scale)
+    np.testing.assert_allclose(found.log_scales[order[0]], sizes, atol=2e-3)  # 10 bits of ln 4
+    assert scene["tangents"] == pytest.approx([np.tan(0.35), np.tan(0.35) * 24 / 32])
+
+
+def test_numbers_that_are_not_finite_are_refused(standpoint):
+    wrong = blobs()
+    wrong.sh0[3, 0, 1] = np.nan
+    with pytest.raises(UserError, match="sh0 of Gaussian 3 is"):
+        page_of(wrong, standpoint)
+
+
+# ----------------------------------------------------------------------------------------------
+# Where one stands
+# ----------------------------------------------------------------------------------------------
+
+
+def cameras(poses):
+    return [pinhole(f"{i}", pose, 32, 24, 40.0) for i, pose in enumerate(poses)]
+
+
+def test_one_stands_at_the_camera_next_to_where_orbits_start():
+    """At their mean height, in the direction that most of them have."""
+    azimuths = [(0.9, 0.2), (1.0, 0.6), (1.1, 0.4), (1.2, 0.4), (1.3, 0.4), (1.4, 0.1)]
+    views = cameras([pose_around(*angles) for angles in azimuths])
+    standpoint = Standpoint.of_views(views, blobs())
+    start = standpoint.orbit.viewpoints(1, 32, 24, 40.0)[0].center
+    distances = [np.linalg.norm(view.center - start) for view in views]
+    assert standpoint.camera is views[int(np.argmin(distances))]
+    np.testing.assert_allclose(standpoint.target, FOCUS, atol=1e-6)
+
+
+def test_what_is_walked_around_is_in_front_of_a_camera_that_looks_elsewhere(standpoint):
+    away = pose_around(0.3, 0.2)
+    away[:3, :3] = away[:3, :3] @ np.diag([-1.0, 1, -1])
+    standpoint = replace(standpoint, camera=cameras([away])[0])
+    expected = away[:3, 3] + standpoint.orbit.radius * away[:3, 2]
+    np.testing.assert_allclose(standpoint.target, expected, rtol=1e-12)
+
+
+def test_of_gaussians_alone_all_are_in_the_window():
+    up = Rotation.from_euler("xyz", [30, 50, 0], degrees=True).apply([0, 0, 1])
+    standpoint = Standpoint.of_gaussians(blobs(), up)
+    camera = standpoint.camera
+    seen = (blobs().means - camera.center) @ camera.camera_to_world[:3, :3]
+    tangents = np.abs(seen[:, :2] / seen[:, 2:])
+    assert (tangents < np.tan(np.radians(40) / 2)).mean() > 0.95
+    assert camera.camera_to_world[:3, 0] @ up == pytest.approx(0, abs=1e-9)
+
+
+# ----------------------------------------------------------------------------------------------
+# Of a fit
+# ----------------------------------------------------------------------------------------------
+
+
+def test_which_approximations_are_shown():
+    assert viewer.shows_as_fitted(Approximations()) and viewer.shows_as_fitted(OWN)
+    assert not viewer.shows_as_fitted(replace(OWN, order="pixel"))
+
+
+def test_a_page_that_is_too_large_is_not_written(tmp_path, monkeypatch):
+    folder, dataset = tmp_path / "blobs", make_dataset()
+    folder.mkdir()
+    viewer.write_viewer(folder, dataset, Shown(blobs(), OWN))
+    size = (folder / "viewer.html").stat().st_size
+    (folder / "viewer.html").unlink()
+    monkeypatch.setattr(viewer, "MOST_BYTES", size - 1)
+    with pytest.warns(
+        UserNote, match=r"blobs/viewer\.html: not written, .*export .* --format html"
+    ):
+        viewer.write_viewer(folder, dataset, Shown(blobs(), OWN))
+    assert list(folder.iterdir()) == []
+    monkeypatch.setattr(viewer, "MOST_BYTES", size)
+    viewer.write_viewer(folder, dataset, Shown(blobs(), OWN))
+    assert (folder / "viewer.html").stat().st_size == size
