@@ -40,6 +40,10 @@ Y_DOWN = np.array([0.0, -1.0, 0.0])
 """What programs take for up in formats that do not say: that of COLMAP's worlds, in which the 3DGS
 reference fits."""
 
+PLAYCANVAS = "compressed-ply"
+"""The format of viewers that add 0.075 square pixels to splats, where others add 0.3: what a fit
+with 0.1 has of its own looks better there than what it has for the others."""
+
 SNAPPED = np.cos(np.radians(5))
 """Cosine of the angle to an axis within which the training cameras' up is that axis."""
 
@@ -63,7 +67,7 @@ class Target:
     encode: Callable[[Source], bytes]  # equal Gaussians give equal bytes
     up: np.ndarray  # (3,) what programs take for up
     has_axes: bool = False  # whether the format says so: then models are always turned
-    honoured: frozenset[str] = frozenset()  # approximations that it shows Gaussians with
+    honoured: frozenset[str] = frozenset()  # approximations that it shows Gaussians with, or nearly
 
 
 def _usd(source: Source) -> bytes:
@@ -79,6 +83,7 @@ def _of_format(each: Format) -> Target:
         lambda source: source.gaussians.to_bytes(each.name),
         Z_UP if each.y_up else Y_DOWN,
         has_axes=each.y_up,
+        honoured=HONOURED if each.name == PLAYCANVAS else frozenset(),
     )
 
 

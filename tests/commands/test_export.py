@@ -85,9 +85,17 @@ def test_without_that_file_the_fit_s_own_is(fit):
 
 
 def test_a_file_that_is_meant_for_drgs_is_exported_with_a_hint(fit):
-    outcome = run(fit / "point_cloud.ply", "--out", fit.with_name("a.compressed.ply"))
+    outcome = run(fit / "point_cloud.ply", "--out", fit.with_name("a.glb"))
     assert f"export {fit}/point_cloud_viewers.ply instead" in outcome.stdout
-    assert Gaussians.load(fit.with_name("a.compressed.ply")).rendered_with == OTHERWISE
+    assert Gaussians.load(fit.with_name("a.glb")).rendered_with == OTHERWISE
+
+
+def test_for_playcanvas_the_fits_own_file_is_taken(fit):
+    """Its viewers add 0.075 square pixels, which is nearer to a fit's 0.1 than to 0.3."""
+    (fit / "config.yml").write_text("data: {path: data}")
+    outcome = run(fit, "--format", "compressed-ply")
+    assert outcome.stdout.splitlines()[0] == f"{fit}/point_cloud.ply: 20 Gaussians"
+    assert Gaussians.load(fit.with_name("run.compressed.ply")).rendered_with == OTHERWISE
 
 
 @pytest.mark.parametrize("suffix", [".compressed.ply", ".spz", ".glb"])

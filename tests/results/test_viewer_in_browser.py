@@ -80,7 +80,8 @@ def path(tmp_path_factory, gaussians, standpoint):
 def page(path):
     with browsers.Browser(*browsers.SOFTWARE_WEBGL) as browser:
         page = browsers.Page(browser, WIDTH, HEIGHT)
-        page.open(path, "?noui")
+        page.cut_off()
+        page.open(path.as_uri() + "?noui")
         page.wait_for("window.viewer?.state.loaded")
         settle(page)
         yield page
@@ -162,6 +163,7 @@ def test_a_title_is_text(page):
 def test_without_webgl_the_page_says_what_it_needs(path):
     with browsers.Browser(*browsers.NO_WEBGL) as browser:
         page = browsers.Page(browser, WIDTH, HEIGHT)
-        page.open(path)
+        page.cut_off()
+        page.open(path.as_uri())
         page.wait_for("document.querySelector('p.trouble') !== null")
         assert "WebGL 2" in page.evaluate("document.querySelector('p.trouble').textContent")

@@ -1,4 +1,4 @@
-"""Chromium without a window, by the DevTools protocol: pages from disk, with the network off.
+"""Chromium without a window, by the DevTools protocol: pages, a mouse, and what went wrong.
 
 It listens to a pipe (``--remote-debugging-pipe``): messages are JSON, each ended by a zero byte, on
 file descriptors 3 and 4 of the browser. Pictures are made by software, as test machines have no
@@ -18,7 +18,8 @@ import signal
 import tempfile
 import threading
 import time
-from pathlib import Path
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 
 import numpy as np
 from PIL import Image
@@ -106,7 +107,7 @@ class Browser:
 
 
 class Page:
-    """A window with the network off."""
+    """A window."""
 
     def __init__(self, browser: Browser, width: int, height: int) -> None:
         """width, height: px, one of the screen for each of the page."""
@@ -116,8 +117,6 @@ class Page:
         self._session = answer["sessionId"]
         for domain in ("Page", "Runtime", "Network", "Log"):
             self.call(f"{domain}.enable")
-        nothing = {"latency": 0, "downloadThroughput": 0, "uploadThroughput": 0}
-        self.call("Network.emulateNetworkConditions", offline=True, **nothing)
         size = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": False}
         self.call("Emulation.setDeviceMetricsOverride", **size)
 
@@ -125,9 +124,15 @@ class Page:
         """Of the protocol."""
         return self._browser.call(method, self._session, **parameters)
 
-    def open(self, path: Path, query: str = "") -> None:
-        """A file."""
-        self.call("Page.navigate", url=path.as_uri() + query)
+    def cut_off(self) -> None:
+        """Turn its network off."""
+        nothing = {"latency": 0, "downloadThroughput": 0, "uploadThroughput": 0}
+        self.call("Network.emulateNetworkConditions", offline=True, **nothing)
+
+    def open(self, address: str) -> None:
+        """Go there; what it shows comes later."""
+        self.call("Page.navigate", url=address)
+        self.wait_for("!!document.body")
 
     def evaluate(self, expression: str) -> object:
         """A JavaScript expression's value, or what its promise becomes."""
@@ -150,6 +155,20 @@ class Page:
         with Image.open(io.BytesIO(base64.b64decode(data))) as image:
             return np.asarray(image.convert("RGB")) / 255
 
+    def click(self, words: str) -> None:
+        """The button with these words, at its middle."""
+        button = (
+            f"[...document.querySelectorAll('button')].find(b => b.innerText.trim() == {words!r})"
+        )
+        self.wait_for(f"!!{button}")
+        x, y = self.evaluate(
+            f"(() => {{ const b = {button}; b.scrollIntoView({{block: 'center'}}); "
+            "const r = b.getBoundingClientRect(); "
+            "return [r.x + r.width / 2, r.y + r.height / 2] })()"
+        )
+        for kind in ("mousePressed", "mouseReleased"):
+            self._mouse(kind, x, y, buttons=1, button="left", clickCount=1)
+
     def drag(self, start: tuple[int, int], end: tuple[int, int], steps: int = 10) -> None:
         """Of the mouse, with its left button; px."""
         held = {"button": "left", "clickCount": 1}
@@ -164,14 +183,14 @@ class Page:
         """The addresses of all that it has asked for."""
         return [p["request"]["url"] for p in self._events("Network.requestWillBeSent")]
 
-    def troubles(self) -> list[str]:
-        """Exceptions, and what stands in the console as an error or a warning."""
+    def troubles(self, levels: Sequence[str] = ("error", "warning")) -> list[str]:
+        """Exceptions, and what stands in the console at these levels."""
         logged = [p["entry"] for p in self._events("Log.entryAdded")]
         said = self._events("Runtime.consoleAPICalled")
         return [
             *(str(p["exceptionDetails"]) for p in self._events("Runtime.exceptionThrown")),
-            *(entry["text"] for entry in logged if entry["level"] in ("error", "warning")),
-            *(str(p["args"]) for p in said if p["type"] in ("error", "warning", "assert")),
+            *(entry["text"] for entry in logged if entry["level"] in levels),
+            *(str(p["args"]) for p in said if p["type"] in ("assert", *levels)),
         ]
 
     def _mouse(self, kind: str, x: float, y: float, **others: object) -> None:
@@ -182,6 +201,21 @@ class Page:
         events = self._browser.events
         mine = (event for event in events if event.get("sessionId") == self._session)
         return [event["params"] for event in mine if event["method"] == method]
+
+
+@contextmanager
+def a_page(width: int, height: int) -> Iterator[Page]:
+    """Of a browser of its own, whose pictures are made by software."""
+    with Browser(*SOFTWARE_WEBGL) as browser:
+        yield Page(browser, width, height)
+
+
+def wait_until(happens: Callable[[], object], what: str) -> None:
+    """Ask until it is true; what: it is that."""
+    end = time.monotonic() + PATIENCE
+    while not happens():
+        assert time.monotonic() < end, f"there never was {what}"
+        time.sleep(0.05)
 
 
 def _pipe() -> tuple[int, int]:
