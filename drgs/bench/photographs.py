@@ -5,6 +5,10 @@ undistorted beforehand, as other trainers need it (a folder of COLMAP's, by pyco
 points instead of those of structure from motion; and with the cameras thrown away and found again
 by ``drgs poses``. Each fit is a run of ``drgs fit`` in a process and a folder of its own. Finished
 ones are not repeated.
+
+A fit is measured on test views as it sees them: of pictures that were undistorted, and thereby
+blurred, on such pictures. Where its world is that of the folder, it is measured a second time on
+the photographs as they were taken, through the lens that they were taken with.
 """
 
 from __future__ import annotations
@@ -19,6 +23,8 @@ from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
+import mitsuba as mi
+
 from drgs import fit
 from drgs.bench.output import add_out, machine, markdown_table, write_csv
 from drgs.cli.commands import CommandParser, at_least, file_or_folder
@@ -28,8 +34,13 @@ from drgs.core.files import atomic_path
 from drgs.data import layout_name, load_dataset
 from drgs.data.folders import config_for
 from drgs.data.structure_from_motion import Search, place
+from drgs.gaussians.parameters import Gaussians
+from drgs.integrator.scene import make_scene, render_views
 from drgs.io.pictures import image_size
-from drgs.results.files import METRICS
+from drgs.results.files import GAUSSIANS, METRICS
+from drgs.results.folder import load_run_config
+from drgs.results.metrics import mean_of
+from drgs.results.report import score
 
 FOLDER = "photographs"
 NAMES = ("photographs.csv",)
@@ -49,6 +60,7 @@ class Case:
     prepare: Callable[[FitConfig, Path], Path] = lambda config, folder: config.data.path
     overrides: tuple[str, ...] = ()
     needs_model: bool = False  # of COLMAP
+    has_own_world: bool = False  # and not that of the folder
 
 
 @dataclass(frozen=True)
@@ -56,8 +68,9 @@ class Measured:
     """A fit that has ended."""
 
     case: str
-    psnr: float  # dB, test views
+    psnr: float  # dB, test views as the fit sees them
     ssim: float
+    psnr_as_taken: float | None  # dB, test views as they were taken; None: in another world
     gaussians: int
     iterations: int
     wall_s: float  # of all iterations
@@ -112,7 +125,7 @@ CASES = (
     Case("distortion ignored", overrides=("data.ignore_distortion=true",)),
     Case("undistorted beforehand", undistorted, needs_model=True),
     Case("from random points", overrides=("init.start=random",)),
-    Case("cameras found by drgs poses", placed_again),
+    Case("cameras found by drgs poses", placed_again, has_own_world=True),
 )
 
 
@@ -171,11 +184,13 @@ def measure(case: Case, config: FitConfig, folder: Path, args: argparse.Namespac
     words = [word for each in (size, *args.overrides, *case.overrides) for word in ("--set", each)]
     words += ["--threads", str(args.threads)] if args.threads is not None else []
     peak = fit_in_own_process([str(data), "--out", str(folder / "fit"), *words])
+    as_taken = None if case.has_own_world else measured_as_taken(folder / "fit", config)
     metrics = json.loads((folder / "fit" / METRICS).read_text())
     measured = Measured(
         case=case.name,
         psnr=metrics["test"]["psnr"],
         ssim=metrics["test"]["ssim"],
+        psnr_as_taken=as_taken,
         gaussians=metrics["num_gaussians"],
         iterations=metrics["iterations"],
         wall_s=metrics["wall_s"],
@@ -200,14 +215,28 @@ def _fitted(arguments: list[str]) -> int:
     return 1024 * int(peak.split()[1])
 
 
+def measured_as_taken(fitted: Path, config: FitConfig) -> float:
+    """dB of the test views of the dataset that ``config`` names, by the Gaussians of a fit."""
+    run_config = load_run_config(fitted)
+    dataset = load_dataset(config.data)
+    if mi.variant() is None:
+        mi.set_variant("llvm_ad_rgb")
+    scene = make_scene(
+        Gaussians.load(fitted / GAUSSIANS), run_config.model, run_config.data.background_rgb
+    )
+    pairs = zip(render_views(scene, dataset.test), dataset.test, strict=True)
+    return mean_of([score(picture, view) for picture, view in pairs]).psnr
+
+
 def table(measured: Sequence[Measured]) -> str:
     """A row for each fit."""
-    header = ["photographs", "PSNR", "SSIM", "Gaussians", "time", "memory"]
+    header = ["photographs", "PSNR", "SSIM", "as taken", "Gaussians", "time", "memory"]
     rows = [
         [
             each.case,
             f"{each.psnr:.2f} dB",
             f"{each.ssim:.4f}",
+            "" if each.psnr_as_taken is None else f"{each.psnr_as_taken:.2f} dB",
             f"{each.gaussians:,}",
             f"{each.wall_s:.0f} s",
             f"{each.peak_bytes / 1e9:.2f} GB",

@@ -10,6 +10,7 @@ from support.colmap_models import write_binary, write_dataset, write_pictures
 from support.corner import write_photographs
 from support.datasets import load
 
+from drgs import fit
 from drgs.bench import __main__ as bench
 from drgs.bench import photographs
 from drgs.data.folders import config_for
@@ -29,6 +30,7 @@ def fits(monkeypatch):
         return 1_500_000_000
 
     monkeypatch.setattr(photographs, "fit_in_own_process", fit)
+    monkeypatch.setattr(photographs, "measured_as_taken", lambda out, config: 29.25)
     return lines
 
 
@@ -44,7 +46,7 @@ def test_each_case_is_fitted_once_and_becomes_a_row(tmp_path, fits, capsys):
         [*size, "--set", "data.ignore_distortion=true"],
         [*size, "--set", "init.start=random"],
     ]
-    assert "| as they are | 30.50 dB | 0.9000 | 1,234 | 61 s | 1.50 GB |" in capsys.readouterr().out
+    assert "| as they are | 30.50 dB | 0.9000 | 29.25 dB | 1,234 |" in capsys.readouterr().out
     with (out / "photographs" / "photographs.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert [row["case"] for row in rows] == [
@@ -87,3 +89,16 @@ def test_cameras_are_thrown_away_and_found_again(tmp_path):
     found = load(photographs.placed_again(config, out))
     assert len(found.train) + len(found.test) == 6
     assert found.train[0].lens is not None  # not known before
+
+
+def test_fits_are_measured_on_photographs_as_they_were_taken(tmp_path):
+    """A fit that sees them as they are is measured to the same number."""
+    data = tmp_path / "data"
+    write_dataset(data, ["OPENCV"])
+    write_pictures(data / "images", size=(160, 120))
+    words = ["--set", "iterations=2", "--set", "output.report=false", "--set", "init.num_points=50"]
+    fit.main([str(data), "--out", str(tmp_path / "out"), *words])
+    config, _ = config_for(data)
+    expected = json.loads((tmp_path / "out" / "metrics.json").read_text())["test"]["psnr"]
+    measured = photographs.measured_as_taken(tmp_path / "out", config)
+    assert measured == pytest.approx(expected, abs=1e-3)
