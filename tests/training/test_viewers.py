@@ -63,10 +63,10 @@ def test_iterations_bring_viewers_nearer_to_the_photographs(monkeypatch):
 
 
 def test_the_same_fit_gives_the_same_bytes(tmp_path):
-    for name in ("a", "b"):
+    for name in ("a.ply", "b.ply"):
         trainer, dataset, gaussians = ended_fit(8)
         for_viewers(trainer, dataset, gaussians).gaussians.save(tmp_path / name)
-    assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
+    assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()
 
 
 def test_what_a_fit_found_out_of_cameras_and_colours_stays():
