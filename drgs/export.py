@@ -180,6 +180,8 @@ def run(args: argparse.Namespace) -> None:
     target = TARGETS[name]
     selection = _selection(args)
     source = load_source(args.what, target.honoured)
+    if out.resolve() == source.path.resolve():
+        raise UserError(f"--out {out}: is what is exported; choose another name")
     print(f"{source.path}: {source.gaussians.num_gaussians:,} Gaussians", flush=True)
     up = _up(args, source, target)
     gaussians = _selected(source, selection)

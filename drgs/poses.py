@@ -13,13 +13,17 @@ Needs pycolmap, which the extra ``colmap`` installs.
 from __future__ import annotations
 
 import argparse
+import shlex
 import time
 from collections.abc import Sequence
 from contextlib import ExitStack
+from pathlib import Path
 
 from drgs.cli.commands import CommandParser, file_or_folder, run_command
 from drgs.cli.progress import RunProgress
+from drgs.config.schema import DataConfig
 from drgs.core.errors import listed
+from drgs.data import layout_name
 from drgs.data.structure_from_motion import (
     ALL_PAIRS,
     CAMERA_MODELS,
@@ -81,7 +85,15 @@ def run(args: argparse.Namespace) -> None:
         placed = place(args.folder, search, args.overwrite, steps.update)
     print(description_of(placed))
     print(f"written: {args.folder / 'sparse' / '0'} in {time.perf_counter() - started:.0f} s")
-    print(f"continue with: drgs fit {args.folder}")
+    print(f"continue with: {fit_command(args.folder)}")
+
+
+def fit_command(folder: Path) -> str:
+    """What to type next; other cameras that lie there would be taken first."""
+    words = ["drgs", "fit", str(folder)]
+    if layout_name(DataConfig(path=folder)) != "colmap":
+        words += ["--set", "data.type=colmap"]
+    return shlex.join(words)
 
 
 def description_of(placed: Placed) -> str:
@@ -96,9 +108,7 @@ def description_of(placed: Placed) -> str:
         lines.append(f"without a camera: {listed(placed.missing, MOST_NAMED)}")
         others = placed.num_models - 1
         if others:
-            lines.append(
-                f"there are {others} smaller models that this one does not hang together with"
-            )
+            lines.append(f"smaller models that do not hang together with this one: {others}")
         lines.append(
             "photographs that show what lies between would place them; so may --compare all"
         )

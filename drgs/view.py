@@ -1,8 +1,8 @@
 """``python -m drgs.view WHAT``: look at Gaussians in a browser, rendered by our own kernels.
 
-``WHAT`` is a PLY file or the output folder of a fit. A page on this machine shows what its camera
-sees, small while it moves and whole when it is still: through any lens, with depths, normals and
-opacities, under every approximation, each with the time that it takes. Ctrl-C ends it.
+``WHAT`` is a file of Gaussians or the output folder of a fit. A page on this machine shows what its
+camera sees, small while it moves and whole when it is still: through any lens, with depths, normals
+and opacities, under most approximations, each with the time that it takes. Ctrl-C ends it.
 """
 
 from __future__ import annotations
@@ -73,7 +73,8 @@ def run(args: argparse.Namespace) -> None:
         wishes = Wishes()
         options = ("--address", "--port")
         with serving(args.address or ADDRESS, args.port, options) as server:
-            page = Page(server, wishes, StartView.of(views), scene.approximations)
+            middle = np.median(model.gaussians.numpy().means, axis=0)
+            page = Page(server, wishes, StartView.of(views, middle), scene.approximations)
             if len(views) > 1:
                 page.add_cameras(views, visible=False)
             print(f"{model.gaussians.num_gaussians:,} Gaussians: look at {url(server)}", flush=True)

@@ -40,7 +40,7 @@ def config_for(folder: Path, overrides: Iterable[str] = ()) -> tuple[FitConfig, 
     values = {"data": data, "iterations": ITERATIONS[layout]}
     config = config_from(values, where, overrides)
     size = "as they are"
-    if config.data.image_size < width:
+    if (config.data.image_size or width) < width:
         size = f"scaled from {width} x {height} px to a width of {config.data.image_size}"
     return config, (
         f"no configuration is given, so that it follows from the folder: {NAMES[layout]}, {size}; "

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import os
 import re
+import shutil
 import tempfile
 import threading
 from collections.abc import Callable, Iterator, Sequence
@@ -137,7 +138,8 @@ def place(folder: Path, search: Search, replace: bool, watch: Watch) -> Placed:
     pycolmap.logging.minloglevel = 3  # what goes wrong is said below
     try:
         with tempfile.TemporaryDirectory(prefix=".poses-", dir=folder) as temporary:
-            work = _Work(pycolmap, Path(temporary), pictures, names, search, watch)
+            masks = folder / "masks"
+            work = _Work(pycolmap, Path(temporary), pictures, masks, names, search, watch)
             found, count = work.model()
             written = Path(temporary, "model")
             written.mkdir()
@@ -161,6 +163,7 @@ class _Work:
     pycolmap: ModuleType
     folder: Path  # for what is written on the way
     pictures: Path
+    masks: Path  # of those that there are; need not exist
     names: Sequence[str]
     search: Search
     watch: Watch
@@ -188,12 +191,11 @@ class _Work:
         pycolmap, done = self.pycolmap, 0
         options = pycolmap.FeatureExtractionOptions()
         options.max_image_size = MAX_SIDE
+        masks = self._masks_for_all()
         for group in self._groups():
             reader = pycolmap.ImageReaderOptions()
             reader.camera_model = self.search.camera_model
-            if (
-                masks := self.pictures.parent / "masks"
-            ).is_dir() and self.pictures.name == "images":
+            if masks is not None:
                 reader.mask_path = masks
             for start in range(0, len(group), AT_ONCE):
                 chunk = group[start : start + AT_ONCE]
@@ -208,22 +210,55 @@ class _Work:
                     reader_options=reader,
                     extraction_options=options,
                 )
-                reader.existing_camera_id = self._last_camera()
+                reader.existing_camera_id = self._camera_of(chunk)
                 done += len(chunk)
         self.watch("photograph", done, len(self.names))
 
     def _groups(self) -> list[list[str]]:
         """Names of photographs that share a camera."""
         groups: dict[object, list[str]] = {}
+        sizes = {image_size(self.pictures / name) for name in self.names}
+        if self.search.share == "one" and len(sizes) > 1:
+            (w, h), (other_w, other_h), *_ = sorted(sizes)
+            raise UserError(
+                f"{self.pictures}: photographs that share one camera must have one size, got "
+                f"{w} x {h} and {other_w} x {other_h} px; use --share alike"
+            )
         for name in self.names:
             key = {"one": 0, "each": name}.get(self.search.share)
             key = _taken_with(self.pictures / name) if key is None else key
             groups.setdefault(key, []).append(name)
         return list(groups.values())
 
-    def _last_camera(self) -> int:
+    def _camera_of(self, names: Sequence[str]) -> int:
+        """The number of the camera that photographs share, now that they have been read."""
         with self.pycolmap.Database.open(self.database) as database:
-            return max(camera.camera_id for camera in database.read_all_cameras())
+            cameras = {image.name: image.camera_id for image in database.read_all_images()}
+        if missing := [name for name in names if name not in cameras]:
+            raise UserError(
+                f"{self.pictures / missing[0]}: COLMAP cannot read this photograph, or its mask; "
+                "convert it, or take it away"
+            )
+        return cameras[names[0]]
+
+    def _masks_for_all(self) -> Path | None:
+        """A folder with a mask for each photograph, white for those without; None: there are none.
+
+        COLMAP leaves out photographs whose mask is missing.
+        """
+        given = {name: self.masks / f"{name}.png" for name in self.names}
+        given = {name: path for name, path in given.items() if path.is_file()}
+        if not given:
+            return None
+        folder = self.folder / "masks"
+        for name in self.names:
+            target = folder / f"{name}.png"
+            target.parent.mkdir(parents=True, exist_ok=True)
+            if name in given:
+                shutil.copyfile(given[name], target)
+            else:
+                Image.new("L", image_size(self.pictures / name), 255).save(target)
+        return folder
 
     def _match(self) -> None:
         """Compare pairs, some at a time.

@@ -367,6 +367,10 @@ def _rows(
         position += count * width
     else:
         _check_end(path, layout, layout.end - position)
+    if missing := [name for name in names if name not in places]:
+        raise UserError(
+            f"{path}: element {missing[0]} must have no lists, and come before elements that have"
+        )
     rows = {}
     for name, (start, dtype, count) in places.items():
         file.seek(start)

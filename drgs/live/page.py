@@ -50,14 +50,18 @@ class StartView:
     up: np.ndarray  # (3,) unit, world
 
     @staticmethod
-    def of(views: Sequence[Viewpoint]) -> StartView:
-        """The first of the cameras of a capture, which turns about what all of them look at."""
+    def of(views: Sequence[Viewpoint], middle: np.ndarray | None = None) -> StartView:
+        """The first of the cameras of a capture, which turns about what all of them look at.
+
+        middle: (3,) world, what that is where their axes meet nowhere; None: not known.
+        """
         first = views[0]
         try:
             focus, _ = focus_of(views)
             distance = float((focus - first.center) @ first.camera_to_world[:3, 2])
         except UserError:  # their axes meet nowhere
-            distance = 0.0
+            offset = np.zeros(3) if middle is None else middle - first.center
+            distance = float(offset @ first.camera_to_world[:3, 2])
         if not distance > 0:
             spread = np.ptp([view.center for view in views], axis=0).max()
             distance = float(spread) or 1.0

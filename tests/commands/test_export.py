@@ -98,6 +98,14 @@ def test_for_playcanvas_the_fits_own_file_is_taken(fit):
     assert Gaussians.load(fit.with_name("run.compressed.ply")).rendered_with == OTHERWISE
 
 
+def test_what_was_exported_is_not_replaced_by_a_part_of_itself(model):
+    run(model, "--format", "spz")
+    source = model.with_name("model.spz")
+    message = f"--out {source}: is what is exported; choose another name"
+    words = [source, "--format", "spz", "--min-opacity", "0.9"]
+    assert_refused(export.main, *words, folder=model.parent, message=message)
+
+
 @pytest.mark.parametrize("suffix", [".compressed.ply", ".spz", ".glb"])
 def test_what_is_written_is_rendered_and_loaded_by_the_plugin(tmp_path, suffix):
     blobs().save(tmp_path / f"model{suffix}")
@@ -235,7 +243,7 @@ def test_files_that_say_nothing_of_axes_are_not_turned_unasked(fit, model):
         (["model.ply", "--out", "a.obj"], "--format: must be one of"),
         (["model.ply", "--format", "spz", "--out", "a.glb"], "name of a spz file must end in .spz"),
         (["model.ply", "--format", "ply", "--out", "a.compressed.ply"], "that of a compressed-ply"),
-        (["model.ply", "--format", "ply"], "holds model.ply, which this command would replace"),
+        (["model.ply", "--format", "ply"], "is what is exported; choose another name"),
         (["none.ply", "--format", "spz"], "none.ply: there is no such file or folder"),
         ([".", "--format", "spz"], "must be the output folder of a fit that has ended"),
         (["model.ply", "--format", "spz", "--up", "cameras"], "--up cameras: needs the output"),

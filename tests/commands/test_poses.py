@@ -22,6 +22,7 @@ def run(tmp_path, monkeypatch, capsys):
             return found
 
         monkeypatch.setattr(poses, "place", place)
+        monkeypatch.setattr(poses, "layout_name", lambda config: "colmap")
         poses.main([str(tmp_path), *options])
         return asked[0], capsys.readouterr().out.splitlines()
 
@@ -46,7 +47,7 @@ def test_photographs_without_a_camera_are_named(run):
     text = "\n".join(lines)
     assert "1 of 8 photographs placed" in text and "camera: x\ncamera: y" in text
     assert "without a camera: 0.jpg, 1.jpg, 2.jpg, 3.jpg, 4.jpg and 2 more" in text
-    assert "there are 2 smaller models that this one does not hang together with" in text
+    assert "smaller models that do not hang together with this one: 2" in text
     assert "--compare all" in text
 
 

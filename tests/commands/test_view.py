@@ -12,6 +12,7 @@ from support.small_capture import FOCUS, RADIUS, make_dataset
 
 from drgs import view
 from drgs.cli.commands import CommandParser
+from drgs.live.page import StartView
 from drgs.results.files import CAMERAS, VIEWS
 from drgs.results.refined_cameras import write_views
 
@@ -49,6 +50,9 @@ def test_a_file_alone_is_seen_whole(fit):
     middle = camera.K @ (camera.viewmat @ [*FOCUS, 1])[:3]
     assert np.abs(middle[:2] / middle[2] - 200).max() < 60  # px of 400
     assert 0.3 * RADIUS < np.linalg.norm(camera.center - FOCUS) < 2 * RADIUS
+    middle = np.median(model.gaussians.numpy().means, axis=0)
+    distance = StartView.of([camera], middle).eye.distance
+    assert distance == pytest.approx(np.linalg.norm(camera.center - middle), rel=0.2)
 
 
 def test_what_is_not_there_is_refused(fit, tmp_path):

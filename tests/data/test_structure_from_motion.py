@@ -103,6 +103,22 @@ def test_pictures_of_nothing_have_no_cameras_and_leave_nothing_behind(tmp_path):
     assert {path.name for path in tmp_path.iterdir()} == {"0.png", "1.png", "2.png"}
 
 
+def test_photographs_without_a_mask_are_looked_at_as_well(tmp_path):
+    pytest.importorskip("pycolmap")
+    names = ["a.png", "b.png", "c.png", "d.png"]
+    write_photographs(tmp_path, names)
+    (tmp_path / "masks").mkdir()
+    Image.new("L", SIZE, 255).save(tmp_path / "masks" / "b.png.png")
+    assert place(tmp_path, Search(), False, said).names == tuple(names)
+
+
+def test_photographs_of_two_sizes_share_no_camera(tmp_path):
+    for k, size in enumerate([(64, 48), (48, 64), (64, 48)]):
+        Image.new("RGB", size).save(tmp_path / f"{k}.png")
+    with pytest.raises(UserError, match=r"one size, got 48 x 64 and 64 x 48 px; use --share alike"):
+        work(tmp_path, ["0.png", "1.png", "2.png"], share="one")._groups()
+
+
 def test_without_pycolmap_one_line_says_what_to_install(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "pycolmap", None)
     with pytest.raises(
@@ -141,7 +157,7 @@ def test_what_colmap_refuses_is_said_in_one_line():
 
 
 def work(folder, names, **search):
-    return sfm._Work(None, folder, folder, names, Search(**search), said)
+    return sfm._Work(None, folder, folder, folder / "masks", names, Search(**search), said)
 
 
 def test_names_are_in_the_order_of_their_numbers(tmp_path):
@@ -168,7 +184,7 @@ def test_photographs_of_one_size_and_lens_share_a_camera(tmp_path):
     write("d.jpg", (48, 64), 35.0)
     names = ["a.jpg", "b.jpg", "c.jpg", "d.jpg"]
     assert work(tmp_path, names)._groups() == [["a.jpg", "b.jpg"], ["c.jpg"], ["d.jpg"]]
-    assert work(tmp_path, names, share="one")._groups() == [names]
+    assert work(tmp_path, names[:3], share="one")._groups() == [names[:3]]
     assert work(tmp_path, names, share="each")._groups() == [[name] for name in names]
 
 

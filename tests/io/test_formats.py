@@ -79,6 +79,16 @@ def test_another_suffix_is_not_written(tmp_path):
         gaussians_within_ranges(5).save(tmp_path / "a.obj")
 
 
+def test_compressed_elements_behind_lists_are_missed(tmp_path):
+    """Where lists end, nobody knows; harmonics behind them are not taken for none."""
+    content = gaussians_within_ranges(5).to_bytes("compressed-ply")
+    lists = b"element foo 1\nproperty list uchar int bar\nelement sh"
+    path = tmp_path / "a.ply"
+    path.write_bytes(content.replace(b"element sh", lists, 1))
+    with pytest.raises(UserError, match=r"a\.ply: element sh must have no lists, and come before"):
+        Gaussians.load(path)
+
+
 def test_a_compressed_file_needs_no_suffix_of_its_own(tmp_path):
     expected = gaussians_within_ranges(300)
     (tmp_path / "a.ply").write_bytes(expected.to_bytes("compressed-ply"))

@@ -228,6 +228,7 @@ OTHER_BASES = {
 """Of ``render``."""
 
 COSTLY = {
+    ("fit", ""): ("photographs",),
     ("fit", "--budget"): ("1", "3.5", "10^4", "10^5", "1e10", "arabic digits"),
     ("render", "--orbit"): ("10^4", "10^5"),
     ("capture", "--views"): ("10^4", "10^5"),
