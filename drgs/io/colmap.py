@@ -14,7 +14,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from types import ModuleType
 
 import numpy as np
@@ -163,6 +163,12 @@ def _images(
         if not name or name in images:
             got = "an empty one" if not name else f"{one_line(name, 100)} a second time"
             raise UserError(f"{place}: each image must have a name of its own, got {got}")
+        path = PurePosixPath(name)
+        if path.is_absolute() or ".." in path.parts:
+            raise UserError(
+                f"{place}: a name must be that of a file below the folder of pictures, got "
+                f"{one_line(name, 100)}"
+            )
         length = math.hypot(*pose[:4])
         if not QUATERNION_RANGE[0] <= length <= QUATERNION_RANGE[1]:
             raise UserError(

@@ -50,7 +50,12 @@ def images(path: Path) -> Iterator[ImageRecord]:
             pose = [line.real(word, key) for word, key in zip(pose, IMAGE[1:], strict=False)]
             camera = line.whole(camera, "CAMERA_ID")
             yield ImageRecord(line.place, name.rstrip(), camera, pose)
-            next(lines, None)  # what it observes, which may be nothing
+            observed = next(lines, None)
+            if observed is not None and len(observed.text.split()) % 3:
+                raise UserError(
+                    f"{observed.place}: what an image observes (X, Y, POINT3D_ID of each point) "
+                    "was expected; each image has two lines, of which the second may be empty"
+                )
 
 
 def points(path: Path) -> Iterator[PointRecord]:
