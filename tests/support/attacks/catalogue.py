@@ -40,7 +40,9 @@ FAMILIES: dict[str, Callable[[Workshop], Iterable[Attack]]] = {
 """By the first part of an attack's name."""
 
 
-KNOWN_FAILURES: dict[str, str] = {}
+KNOWN_FAILURES: dict[str, str] = {
+    "schema/densify.budget.prune_opacity=half": "known once the fit has begun: its folder stays",
+}
 """By name of an attack that does what it must not: why, until it is mended. A test fails when one
 of them does so no more."""
 
