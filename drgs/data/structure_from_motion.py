@@ -24,22 +24,12 @@ from PIL import ExifTags, Image
 from drgs.core.errors import UserError, one_line
 from drgs.core.extras import required
 from drgs.core.files import why_refused
+from drgs.data.colmap import LENSES
 from drgs.data.recognition import PICTURES
 from drgs.io.pictures import image_size
 
-CAMERA_MODELS = (
-    "SIMPLE_PINHOLE",
-    "PINHOLE",
-    "SIMPLE_RADIAL",
-    "RADIAL",
-    "OPENCV",
-    "FULL_OPENCV",
-    "SIMPLE_RADIAL_FISHEYE",
-    "RADIAL_FISHEYE",
-    "OPENCV_FISHEYE",
-    "THIN_PRISM_FISHEYE",
-)
-"""Those that can be looked for; the fits' lenses show all of them."""
+CAMERA_MODELS = tuple(LENSES)
+"""Those that can be looked for: all that can be rendered."""
 
 ALL_PAIRS = 100
 """Photographs, at most, of which every two are compared where nothing is said."""
