@@ -22,6 +22,9 @@ their angle to a common direction. Below this (1.8 degrees) their nearest point 
 KEEP_OUT = 0.25
 """Of the distance to what the cameras look at: no starting point is nearer to a camera."""
 
+FAR_SHARE, FARTHEST = 0.5, 10.0
+"""Of starting points, those behind what is looked at, and how far they go, in distances to it."""
+
 MAX_BATCHES = 200
 """Batches of points to draw: enough where half a percent of the box is in view."""
 
@@ -143,17 +146,19 @@ def focus_of(views: Sequence[Viewpoint]) -> tuple[np.ndarray, float]:
 
 
 def points_in_view(views: Sequence[Viewpoint], count: int, rng: np.random.Generator) -> np.ndarray:
-    """(count, 3) float64: uniform in what is seen of a cube around the cameras' focus.
+    """(count, 3) float64: what is seen of a cube around the cameras' focus, and of what is behind.
 
     The cube's half extent is the distance D to the focus: it holds what is looked at and as much
-    again behind it. Points that no camera sees would never be moved or removed, and one close to
-    a camera covers its picture, so only points are kept that lie in a picture and nowhere nearer
+    again behind it. Half of the points are uniform in it. The others are for walls and skies: in
+    any direction uniform in one over the distance, out to 10 D, as Mip-NeRF 360 (Barron et al.
+    2022) contracts space. Points that no camera sees would never be moved or removed, and one close
+    to a camera covers its picture, so only points are kept that lie in a picture and nowhere nearer
     than D / 4 to a camera.
     """
     focus, distance = focus_of(views)
     kept = np.empty((0, 3))
     for _ in range(MAX_BATCHES):
-        points = rng.uniform(focus - distance, focus + distance, (count, 3))
+        points = focus + distance * _near_and_far(count, rng)
         seen = in_view(points, views) & _clear_of(points, views, KEEP_OUT * distance)
         kept = np.concatenate([kept, points[seen]])
         if len(kept) >= count:
@@ -162,6 +167,15 @@ def points_in_view(views: Sequence[Viewpoint], count: int, rng: np.random.Genera
         "init.half_extent: no start box can be derived from the cameras, which see too little of "
         f"what is around {np.round(focus, 3).tolist()}; set it, or give init.point_cloud"
     )
+
+
+def _near_and_far(count: int, rng: np.random.Generator) -> np.ndarray:
+    """(count, 3): in and around the cube [-1, 1]^3."""
+    points = rng.uniform(-1, 1, (count, 3))
+    is_far = rng.random(count) < FAR_SHARE
+    size = np.abs(points[is_far]).max(axis=1, keepdims=True)  # 1: on the cube's surface
+    points[is_far] /= size * rng.uniform(1 / FARTHEST, 1, size.shape)
+    return points
 
 
 def in_view(points: np.ndarray, views: Sequence[Viewpoint]) -> np.ndarray:

@@ -1,6 +1,7 @@
 """Sizes of pictures, extents of scenes, and the Gaussians that a fit starts from."""
 
 import math
+from dataclasses import replace
 
 import imageio.v3 as iio
 import numpy as np
@@ -214,6 +215,19 @@ def test_points_in_view_are_seen_and_not_in_front_of_a_lens():
         seen |= inside.all(axis=1) & (camera[:, 2] > 0)
         assert np.linalg.norm(points - view.center, axis=1).min() >= 0.25 * focus_of(views)[1]
     assert seen.all()
+
+
+def test_half_of_the_points_in_view_are_behind_it_uniform_in_one_over_the_distance():
+    centers = [(4, 0, 0), (-4, 0, 0), (0, 4, 0), (0, -4, 0), (0, 0.1, 4), (0, 0.1, -4)]
+    views = [replace(view_at(c, (0, 0, 0)), fx=5.0, fy=5.0) for c in centers]  # they see all of it
+    focus, distance = focus_of(views)
+    points = points_in_view(views, 4000, np.random.default_rng(0))
+    nearness = distance / np.abs(points - focus).max(axis=1)
+    behind = nearness[nearness < 1]
+    assert 0.45 < len(behind) / len(points) < 0.65  # parts of the cube are too near to a camera
+    assert behind.min() >= 0.1
+    # Of 2,000, a share of 4/9 varies by 0.011 (one sigma).
+    assert np.mean(behind < 0.5) == pytest.approx((0.5 - 0.1) / (1 - 0.1), abs=0.05)
 
 
 def test_half_extent_wins_over_the_layouts_and_the_cameras_box(blender):
