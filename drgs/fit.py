@@ -99,6 +99,7 @@ from drgs.results.refined_cameras import write_views
 from drgs.results.report import (
     Fitted,
     score,
+    seconds_of_curves,
     seconds_of_results,
     write_pictures,
     write_results,
@@ -394,7 +395,7 @@ def planned(
     rehearsal = rehearse(config, dataset, gaussians)
     results = seconds_of_results(rehearsal.trainer.scene, dataset)
     pictures = results.renders if config.output.save_renders else 0.0
-    pictures += results.report if config.output.report else 0.0
+    pictures += results.report + seconds_of_curves() if config.output.report else 0.0
     if pictures > MOST_FOR_PICTURES * (end - time.perf_counter()):
         warnings.warn(UserNote(_NO_PICTURES), stacklevel=2)
         config = changed(config, {"output.report": False, "output.save_renders": False})
