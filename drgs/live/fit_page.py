@@ -11,7 +11,7 @@ from drgs.data.types import Dataset
 from drgs.live.page import Page, StartView
 from drgs.live.watching import UntilEnded, Watching
 from drgs.live.wishes import Wishes
-from drgs.training.history import History, HistoryRow
+from drgs.training.history import History, HistoryRow, smoothed
 from drgs.training.loop import Length
 from drgs.training.trainer import Trainer
 
@@ -23,9 +23,6 @@ MOST_POINTS = 300
 
 STEP_BACK = 1.25
 """Distance of the first look, in that of a training camera: so that one sees where they stand."""
-
-SMOOTHING = 0.9
-"""Weight of the past in the PSNR of training views, each of which is another photograph."""
 
 Curve = tuple[np.ndarray, np.ndarray]
 """Iterations and values, each (n,)."""
@@ -133,14 +130,6 @@ def watch(
     page = FitPage(server, wishes, start, trainer.config.model.approximations)
     page.add_cameras(dataset.train, visible=True)
     return Watching(wishes, page, dataset, length), length
-
-
-def smoothed(values: Sequence[float]) -> np.ndarray:
-    """Exponential mean of the past, (n,)."""
-    result = np.array(values, np.float64)
-    for i in range(1, len(result)):
-        result[i] = SMOOTHING * result[i - 1] + (1 - SMOOTHING) * result[i]
-    return result
 
 
 def curves_of(rows: Sequence[HistoryRow]) -> list[Curve]:

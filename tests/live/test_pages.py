@@ -183,6 +183,8 @@ def test_curves_have_few_points_their_ends_and_the_measurements():
     (x, y), (at, test) = curves_of(rows)
     assert len(x) == MOST_POINTS and x[0] == 1 and x[-1] == 1000
     assert y == pytest.approx(20)
+    step = [replace(row, psnr=30.0 if row.iteration > 1 else 20.0) for row in rows[:20]]
+    assert curves_of(step)[0][1] == pytest.approx(30 - 10 * 0.9 ** np.arange(20))
     assert list(at) == [400, 800] and list(test) == [25, 25]
     assert [len(curve[0]) for curve in curves_of(rows[:3])] == [3, 0]
 
