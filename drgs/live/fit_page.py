@@ -21,6 +21,9 @@ if TYPE_CHECKING:
 MOST_POINTS = 300
 """Of a curve."""
 
+ROOM = 1.1
+"""Iterations that curves have room for, in those that are expected once this has changed."""
+
 STEP_BACK = 1.25
 """Distance of the first look, in that of a training camera: so that one sees where they stand."""
 
@@ -47,7 +50,7 @@ class FitPage(Page):
         self._pause.on_click(self._toggle)
         self._end.on_click(self._ask_for_end)
         self._charts: list[viser.GuiUplotHandle] = []
-        self._total = 0  # iterations that they have room for
+        self._room = 0  # iterations that they have room for
         self._folder = gui.add_folder("PSNR [dB]")
 
     def tell(self, trainer: Trainer, history: History, total: int) -> None:
@@ -61,8 +64,9 @@ class FitPage(Page):
         )
         self._bar.value = min(100.0, 100.0 * done / max(total, 1))
         curves = curves_of(history.rows)
-        if total != self._total:
-            self._total = total
+        if not self._room / ROOM**2 <= total <= self._room:
+            # What a plan revises, twice a second perhaps, does not redraw them each time.
+            self._room = round(ROOM * total) if self._charts else total
             self._draw(curves)
         for chart, curve in zip(self._charts, curves, strict=True):
             chart.data, chart.visible = curve, len(curve[0]) > 0
@@ -88,7 +92,7 @@ class FitPage(Page):
                     title=title,
                     aspect=2.4,
                     visible=len(curve[0]) > 0,
-                    scales={"x": {"time": False, "range": (0, self._total)}},
+                    scales={"x": {"time": False, "range": (0, self._room)}},
                     legend={"show": False},
                 )
                 for (title, line), curve in zip(CURVES.items(), curves, strict=True)
