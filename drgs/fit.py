@@ -99,6 +99,7 @@ from drgs.results.refined_cameras import write_views
 from drgs.results.report import (
     Fitted,
     score,
+    seconds_of_curves,
     seconds_of_results,
     write_pictures,
     write_results,
@@ -122,7 +123,7 @@ from drgs.training.checkpoint import (
     save_checkpoint,
 )
 from drgs.training.finite_checks import NonFiniteError
-from drgs.training.history import History, write_density, write_history
+from drgs.training.history import History, smoother, write_density, write_history
 from drgs.training.loop import Length, Observer, as_saved, iterations
 from drgs.training.quality import measure, measured_views, measurement_is_due
 from drgs.training.summary import summary_of_fit
@@ -130,9 +131,6 @@ from drgs.training.trainer import Trainer
 
 if TYPE_CHECKING:  # imported where somebody looks on
     from drgs.live.server import LocalServer
-
-SMOOTHING = 0.9
-"""Weight of the past in the PSNR that the progress line shows."""
 
 LOADING_SECONDS = 1.2
 """Before :func:`run`: the interpreter and the libraries; 1.0 to 1.4 s on two cores (AMD Zen 4).
@@ -394,7 +392,7 @@ def planned(
     rehearsal = rehearse(config, dataset, gaussians)
     results = seconds_of_results(rehearsal.trainer.scene, dataset)
     pictures = results.renders if config.output.save_renders else 0.0
-    pictures += results.report if config.output.report else 0.0
+    pictures += results.report + seconds_of_curves() if config.output.report else 0.0
     if pictures > MOST_FOR_PICTURES * (end - time.perf_counter()):
         warnings.warn(UserNote(_NO_PICTURES), stacklevel=2)
         config = changed(config, {"output.report": False, "output.save_renders": False})
@@ -528,9 +526,7 @@ def run_iterations(
         for done in iterations(trainer, history, length):
             check_ranges()
             if done.row is not None:
-                psnr = done.row.psnr
-                smooth_psnr = psnr if smooth_psnr is None else smooth_psnr
-                smooth_psnr = SMOOTHING * smooth_psnr + (1 - SMOOTHING) * psnr
+                smooth_psnr = smoother(smooth_psnr, done.row.psnr)
                 status = (
                     f"loss {done.row.loss:.4f}  PSNR {smooth_psnr:5.2f} dB  "
                     f"Gaussians {done.row.num_gaussians:,}"

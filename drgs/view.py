@@ -12,7 +12,14 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from drgs.cli.commands import MAX_PORT, CommandParser, at_least, file_or_folder, run_command
+from drgs.cli.commands import (
+    MAX_PORT,
+    CommandParser,
+    at_least,
+    file_or_folder,
+    finite_number,
+    run_command,
+)
 from drgs.cli.execution import add_execution_arguments, executing, select_variant
 from drgs.cli.interrupts import StopRequest
 from drgs.core.errors import UserError
@@ -49,6 +56,14 @@ def add_arguments(parser: CommandParser) -> None:
         "without one, black)",
     )
     parser.add_argument(
+        "--up",
+        type=finite_number,
+        nargs=3,
+        metavar=("X", "Y", "Z"),
+        help="what the camera turns about (default: as the training cameras were held; of a file "
+        "alone, 0 0 1)",
+    )
+    parser.add_argument(
         "--address", metavar="ADDRESS", help="of the page (default: 127.0.0.1, this machine alone)"
     )
     parser.add_argument(
@@ -70,11 +85,10 @@ def run(args: argparse.Namespace) -> None:
         model = model_of(args)
         views = cameras_of(args, model)
         scene = LiveScene(model.gaussians, model.settings, model.background)
-        wishes = Wishes()
+        wishes, start = Wishes(), start_of(args, model, views)
         options = ("--address", "--port")
         with serving(args.address or ADDRESS, args.port, options) as server:
-            middle = np.median(model.gaussians.numpy().means, axis=0)
-            page = Page(server, wishes, StartView.of(views, middle), scene.approximations)
+            page = Page(server, wishes, start, scene.approximations)
             if len(views) > 1:
                 page.add_cameras(views, visible=False)
             print(f"{model.gaussians.num_gaussians:,} Gaussians: look at {url(server)}", flush=True)
@@ -103,8 +117,14 @@ def cameras_of(args: argparse.Namespace, model: Model) -> Sequence[Viewpoint]:
         for name in (CAMERAS, VIEWS) if refined else (VIEWS,):
             if (args.what / name).is_file():
                 return read_viewpoints(args.what / name, None)
-    orbit = orbit_of_gaussians(model.gaussians, np.array(UP), FIELD_OF_VIEW)
+    orbit = orbit_of_gaussians(model.gaussians, np.array(args.up or UP), FIELD_OF_VIEW)
     return orbit.viewpoints(1, 400, 400, FIELD_OF_VIEW)
+
+
+def start_of(args: argparse.Namespace, model: Model, views: Sequence[Viewpoint]) -> StartView:
+    """Where the page's camera stands, and what is up."""
+    start = StartView.of(views, np.median(model.gaussians.numpy().means, axis=0))
+    return start if args.up is None else start.upright(np.array(args.up))
 
 
 if __name__ == "__main__":

@@ -17,7 +17,8 @@ SWITCHED = (
     *("projection", "order", "order_window", "sh_direction"),
     *("alpha_cut", "transmittance_stop", "low_pass", "antialiased"),
 )
-"""The approximations that have a control."""
+"""The approximations that have a control: ``extent`` may be infinite, for which fields of numbers
+have no word, and ``alpha_max`` is a part of the model rather than of how it is approximated."""
 
 LENSES = {
     "pinhole": (),

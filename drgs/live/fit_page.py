@@ -11,7 +11,7 @@ from drgs.data.types import Dataset
 from drgs.live.page import Page, StartView
 from drgs.live.watching import UntilEnded, Watching
 from drgs.live.wishes import Wishes
-from drgs.training.history import History, HistoryRow
+from drgs.training.history import History, HistoryRow, smoothed
 from drgs.training.loop import Length
 from drgs.training.trainer import Trainer
 
@@ -21,11 +21,11 @@ if TYPE_CHECKING:
 MOST_POINTS = 300
 """Of a curve."""
 
+ROOM = 1.1
+"""Iterations that curves have room for, in those that are expected once this has changed."""
+
 STEP_BACK = 1.25
 """Distance of the first look, in that of a training camera: so that one sees where they stand."""
-
-SMOOTHING = 0.9
-"""Weight of the past in the PSNR of training views, each of which is another photograph."""
 
 Curve = tuple[np.ndarray, np.ndarray]
 """Iterations and values, each (n,)."""
@@ -50,7 +50,7 @@ class FitPage(Page):
         self._pause.on_click(self._toggle)
         self._end.on_click(self._ask_for_end)
         self._charts: list[viser.GuiUplotHandle] = []
-        self._total = 0  # iterations that they have room for
+        self._room = 0  # iterations that they have room for
         self._folder = gui.add_folder("PSNR [dB]")
 
     def tell(self, trainer: Trainer, history: History, total: int) -> None:
@@ -64,8 +64,9 @@ class FitPage(Page):
         )
         self._bar.value = min(100.0, 100.0 * done / max(total, 1))
         curves = curves_of(history.rows)
-        if total != self._total:
-            self._total = total
+        if not self._room / ROOM**2 <= total <= self._room:
+            # What a plan revises, twice a second perhaps, does not redraw them each time.
+            self._room = round(ROOM * total) if self._charts else total
             self._draw(curves)
         for chart, curve in zip(self._charts, curves, strict=True):
             chart.data, chart.visible = curve, len(curve[0]) > 0
@@ -91,7 +92,7 @@ class FitPage(Page):
                     title=title,
                     aspect=2.4,
                     visible=len(curve[0]) > 0,
-                    scales={"x": {"time": False, "range": (0, self._total)}},
+                    scales={"x": {"time": False, "range": (0, self._room)}},
                     legend={"show": False},
                 )
                 for (title, line), curve in zip(CURVES.items(), curves, strict=True)
@@ -133,14 +134,6 @@ def watch(
     page = FitPage(server, wishes, start, trainer.config.model.approximations)
     page.add_cameras(dataset.train, visible=True)
     return Watching(wishes, page, dataset, length), length
-
-
-def smoothed(values: Sequence[float]) -> np.ndarray:
-    """Exponential mean of the past, (n,)."""
-    result = np.array(values, np.float64)
-    for i in range(1, len(result)):
-        result[i] = SMOOTHING * result[i - 1] + (1 - SMOOTHING) * result[i]
-    return result
 
 
 def curves_of(rows: Sequence[HistoryRow]) -> list[Curve]:

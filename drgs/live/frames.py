@@ -41,8 +41,8 @@ ERROR_GAIN = 5.0
 
 UNCUT = {"alpha_cut": 0.0, "transmittance_stop": 0.0}
 MOST_ACCURATE = {"order": "pixel", "order_window": 16, **UNCUT}
-"""What the picture called ``error`` compares with, beside the most accurate projection of the lens:
-``unscented`` where it bends rays, else ``exact``. Filter and harmonics are the model's own."""
+"""What the picture called ``error`` compares with, beside the most accurate projection that
+knows the lens. Filter and harmonics are the model's own."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,8 +165,7 @@ def _error(scene: LiveScene, request: FrameRequest) -> Frame:
     """The seconds are those of the picture whose error is shown."""
     picture, seconds = scene.picture(request)
     given = request.approximations or scene.approximations
-    projection = "unscented" if request.optics.bends_rays else "exact"
-    best = replace(given, projection=projection, **MOST_ACCURATE)
+    best = replace(given, projection=request.optics.most_accurate, **MOST_ACCURATE)
     accurate, slowly = scene.picture(replace(request, approximations=best))
     apart = psnr(picture, accurate)
     far = "the same as" if math.isinf(apart) else f"PSNR {apart:.1f} dB to"

@@ -39,8 +39,9 @@ class Eye:
 class Optics(Protocol):
     """What stands between the eye and the film."""
 
-    bends_rays: ClassVar[bool] = False
-    """Whether straight lines come to be bent: the projection ``exact`` does not know how."""
+    most_accurate: ClassVar[str] = "exact"
+    """Of the projections that know such rays. ``exact`` does where all go through one point and
+    straight lines stay straight; of parallel rays, ``ewa`` leaves nothing out."""
 
     def sensor(self, eye: Eye, width: int, height: int) -> mi.Sensor:
         """A sensor for one picture (px); the film has a box filter, and is RGB."""
@@ -60,7 +61,7 @@ class Pinhole(Optics):
 class OpenCVLens(Optics):
     """Radial and tangential distortion: see ``drgs.cameras.radial_tangential``."""
 
-    bends_rays: ClassVar[bool] = True
+    most_accurate: ClassVar[str] = "unscented"
 
     coefficients: Mapping[str, float] = field(default_factory=dict)  # k1 to k6, p1, p2
 
@@ -75,7 +76,7 @@ class OpenCVLens(Optics):
 class FisheyeLens(Optics):
     """Kannala and Brandt's: see ``drgs.cameras.fisheye``."""
 
-    bends_rays: ClassVar[bool] = True
+    most_accurate: ClassVar[str] = "unscented"
 
     coefficients: Mapping[str, float] = field(default_factory=dict)  # k1 to k4
 
@@ -91,6 +92,8 @@ class FisheyeLens(Optics):
 @dataclass(frozen=True)
 class Orthographic(Optics):
     """Parallel rays."""
+
+    most_accurate: ClassVar[str] = "ewa"
 
     def sensor(self, eye: Eye, width: int, height: int) -> mi.Sensor:
         """What the camera turns about is as large as through the pinhole."""
@@ -110,6 +113,8 @@ class ThinLens(Optics):
 
     def sensor(self, eye: Eye, width: int, height: int) -> mi.Sensor:
         """See :class:`Optics`."""
+        if self.aperture == 0:  # Mitsuba's would warn of each picture
+            return Pinhole().sensor(eye, width, height)
         lens = {
             "fov": eye.fov,
             "fov_axis": "y",

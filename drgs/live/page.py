@@ -19,6 +19,7 @@ from drgs.core.errors import UserError, one_line
 from drgs.data.orbits import up_of
 from drgs.data.start_box import focus_of
 from drgs.data.types import Viewpoint
+from drgs.data.viewpoints import look_at
 from drgs.live.controls import LookControls
 from drgs.live.frames import Frame, FrameRequest
 from drgs.live.optics import Eye
@@ -73,6 +74,15 @@ class StartView:
         eye, pose = self.eye, self.eye.camera_to_world.copy()
         pose[:3, 3] -= (factor - 1) * eye.distance * pose[:3, 2]
         return replace(self, eye=Eye(pose, eye.fov, factor * eye.distance))
+
+    def upright(self, up: np.ndarray) -> StartView:
+        """From the same place, with another direction upright; up: (3,) world, any length.
+
+        Raises :class:`UserError` where that is how the camera looks, or zero.
+        """
+        eye, place = self.eye, self.eye.camera_to_world[:3, 3]
+        pose = look_at(place, place + eye.distance * eye.camera_to_world[:3, 2], up)
+        return StartView(replace(eye, camera_to_world=pose), up / np.linalg.norm(up))
 
 
 class Page(Screen):

@@ -22,6 +22,9 @@ if TYPE_CHECKING:
 SMOOTHING_PARTS = 50
 """The smooth line of a curve is a running mean over this part of all rows."""
 
+NUM_PANELS = 6
+"""Of a fit: see :func:`panels_of`."""
+
 PAGE_DPI = 160
 """Of a curve in the page, 3.7 inches wide: what fine screens can show."""
 

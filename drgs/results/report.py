@@ -15,6 +15,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from importlib import resources
+from itertools import pairwise
 from pathlib import Path
 from string import Template
 from typing import NamedTuple
@@ -33,7 +34,15 @@ from drgs.gaussians.parameters import Gaussians
 from drgs.integrator.scene import render_views
 from drgs.io.figures import pixels_of
 from drgs.io.pictures import encode, write_animation, write_png
-from drgs.results.curves import THEMES, FitHistory, Panel, draw_curve, panels_of, write_curves
+from drgs.results.curves import (
+    NUM_PANELS,
+    THEMES,
+    FitHistory,
+    Panel,
+    draw_curve,
+    panels_of,
+    write_curves,
+)
 from drgs.results.files import (
     CURVES,
     GAUSSIANS,
@@ -65,8 +74,8 @@ PANEL_QUALITY = {"lossless": True, "quality": 60, "method": 2}
 PAGE = "page.html"
 """Of this package: the page, with ``$names`` for what :func:`write_report` fills in."""
 
-PAGE_SECONDS = 3.5
-"""Curves and page, which do not depend on the scene: 2.8 to 3.4 s on two cores (AMD Zen 4)."""
+TRIED_SECONDS = 0.2
+"""For which a view is tried out at least: one picture of a few milliseconds says little."""
 
 VIEWER_SECONDS = 0.5
 """The page to walk around in, with 50,000 Gaussians: 0.4 to 0.5 s on two cores (AMD Zen 4)."""
@@ -143,29 +152,59 @@ class Seconds(NamedTuple):
 
 
 def seconds_of_results(scene: mi.Scene, dataset: Dataset) -> Seconds:
-    """About what results will take: one test view is tried out."""
-    view = dataset.test[0]
-    for _ in range(2):  # the first time, kernels and libraries are loaded
-        start = time.perf_counter()
-        (image,) = render_views(scene, (view,))
-        rendered = time.perf_counter() - start
-        score(image, view)
-        measured = time.perf_counter() - start
-        encode(image, "png")
-        written = time.perf_counter() - start
-        encode(side_by_side(image, view), "png")
-        compared = time.perf_counter() - start
-        encode(image, "webp", **PANEL_QUALITY)
-        of_frame = 2 * rendered + time.perf_counter() - start - compared
+    """About what results will take without curves: one test view is tried out."""
+    # The first time, kernels and libraries are loaded.
+    _, first = (_seconds_of_view(scene, dataset.test[0]) for _ in range(2))
+    tried = [first]
+    while sum(map(sum, tried)) < TRIED_SECONDS:
+        tried.append(_seconds_of_view(scene, dataset.test[0]))
+    rendered, scored, written, compared, encoded = np.median(tried, axis=0).tolist()
     views = len(dataset.test)
     return Seconds(
-        measuring=FILES_SECONDS + views * measured,
-        renders=views * (written - measured),
-        report=PAGE_SECONDS
-        + VIEWER_SECONDS
-        + views * (compared - written)
-        + ORBIT_FRAMES * of_frame,
+        measuring=FILES_SECONDS + views * (rendered + scored),
+        renders=views * written,
+        report=VIEWER_SECONDS
+        + views * compared
+        + len(choose_views(range(views))) * (rendered + 3 * encoded)
+        + ORBIT_FRAMES * (2 * rendered + encoded),
     )
+
+
+def _seconds_of_view(scene: mi.Scene, view: View) -> tuple[float, ...]:
+    """To render it, to score it, to write it and its comparison, and to code an orbit's frame."""
+    clock = [time.perf_counter()]
+    (image,) = render_views(scene, (view,))
+    clock.append(time.perf_counter())
+    score(image, view)
+    clock.append(time.perf_counter())
+    encode(image, "png")
+    clock.append(time.perf_counter())
+    encode(side_by_side(image, view), "png")
+    clock.append(time.perf_counter())
+    encode(image, "webp", **PANEL_QUALITY)
+    clock.append(time.perf_counter())
+    return tuple(later - earlier for earlier, later in pairwise(clock))
+
+
+def seconds_of_curves() -> float:
+    """What curves will take, in the page and in ``curves.png``: two are tried out."""
+    x = np.linspace(1.0, 100.0, 1000)
+    log, linear = (Panel("", x, x, scale=scale, noisy=True) for scale in ("log", "linear"))
+    _seconds_of_curve(log)  # loads libraries and fonts
+    # A third of the curves are logarithmic, whose labels take longer.
+    return (
+        NUM_PANELS
+        * (_seconds_of_curve(log) + 2 * _seconds_of_curve(linear))
+        / 3
+        * (1 + len(THEMES))
+    )
+
+
+def _seconds_of_curve(panel: Panel) -> float:
+    """For one theme."""
+    start = time.perf_counter()
+    _data_uri(pixels_of(draw_curve(panel, THEMES[0])), lossless=True)
+    return time.perf_counter() - start
 
 
 def side_by_side(image: np.ndarray, view: View) -> np.ndarray:

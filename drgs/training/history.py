@@ -7,6 +7,7 @@ import math
 import time
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
+from itertools import accumulate
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,9 @@ import numpy as np
 from drgs.core.files import atomic_path
 from drgs.training.density.strategy import DENSITY_COLUMNS, DensityReport
 from drgs.training.trainer import StepReport
+
+SMOOTHING = 0.9
+"""Weight of the past in the PSNR of training views, each of which is another photograph."""
 
 
 @dataclass(frozen=True)
@@ -109,6 +113,16 @@ class History:
     def leave_out(self, seconds: float) -> None:
         """So much of the time since the last row was no part of the fit."""
         self._started += seconds
+
+
+def smoother(past: float | None, value: float) -> float:
+    """The next value of a smooth line, given the one before it (None: there is none)."""
+    return value if past is None else SMOOTHING * past + (1 - SMOOTHING) * value
+
+
+def smoothed(values: Iterable[float]) -> np.ndarray:
+    """Exponential mean of the past, (n,) float64."""
+    return np.fromiter(accumulate(values, smoother), np.float64)
 
 
 def write_history(path: Path, history: Sequence[HistoryRow]) -> None:

@@ -12,6 +12,7 @@ from support.small_capture import FOCUS, RADIUS, make_dataset
 
 from drgs import view
 from drgs.cli.commands import CommandParser
+from drgs.core.errors import UserError
 from drgs.live.page import StartView
 from drgs.results.files import CAMERAS, VIEWS
 from drgs.results.refined_cameras import write_views
@@ -53,6 +54,20 @@ def test_a_file_alone_is_seen_whole(fit):
     middle = np.median(model.gaussians.numpy().means, axis=0)
     distance = StartView.of([camera], middle).eye.distance
     assert distance == pytest.approx(np.linalg.norm(camera.center - middle), rel=0.2)
+
+
+@pytest.mark.parametrize("name", ["", "point_cloud.ply"])
+def test_what_is_up_can_be_said(fit, name):
+    args = parsed(fit / name, "--up", "0", "-2", "0")
+    model = view.model_of(args)
+    start = view.start_of(args, model, view.cameras_of(args, model))
+    assert np.array_equal(start.up, [0, -1, 0])
+    right, down, forward = start.eye.camera_to_world[:3, :3].T
+    assert abs(right @ start.up) < 1e-9 and down @ start.up < 0
+    along = [str(-x) for x in forward]
+    for up in (along, ["0", "0", "0"]):
+        with pytest.raises(UserError, match="must not be zero or parallel to up"):
+            view.start_of(parsed(fit / name, "--up", *up), model, view.cameras_of(args, model))
 
 
 def test_what_is_not_there_is_refused(fit, tmp_path):

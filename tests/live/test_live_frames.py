@@ -11,8 +11,9 @@ from drgs.config.approximations import Approximations
 from drgs.config.schema import ModelConfig
 from drgs.core.errors import UserError
 from drgs.integrator.scene import make_scene, render_views
-from drgs.live.frames import BACKDROP, MOST_ACCURATE, FrameRequest, LiveScene
-from drgs.live.optics import Eye, FisheyeLens
+from drgs.live.controls import LENSES
+from drgs.live.frames import BACKDROP, MOST_ACCURATE, SHOWN, FrameRequest, LiveScene
+from drgs.live.optics import Eye, FisheyeLens, OpenCVLens, Orthographic, Pinhole, ThinLens
 
 WHITE = (1.0, 1.0, 1.0)
 EYE = Eye(pose_around(0.4, 0.3), 40.0, RADIUS)
@@ -96,6 +97,38 @@ def test_what_no_kernel_can_do_is_refused_in_words(scene):
     values = Approximations(**{**vars(scene.approximations), "projection": "exact"})
     with pytest.raises(UserError, match="exact"):
         scene.frame(replace(REQUEST, optics=FisheyeLens(), approximations=values))
+
+
+THROUGH = {
+    "pinhole": Pinhole(),
+    "opencv": OpenCVLens({"k1": 0.1}),
+    "fisheye": FisheyeLens({"k1": 0.1}),
+    "orthographic": Orthographic(),
+    "thin lens": ThinLens(0.03),
+}
+
+
+@pytest.mark.parametrize("lens", LENSES)
+def test_everything_is_shown_through_every_lens(scene, lens):
+    """But for the projection ``exact``, which only pinholes and thin lenses have."""
+    optics, refused = THROUGH[lens], set()
+    for projection, order in (("ewa", "center"), ("unscented", "pixel"), ("exact", "pixel")):
+        approximations = replace(scene.approximations, projection=projection, order=order)
+        for shows in SHOWN:
+            request = FrameRequest(EYE, 12, 8, optics, shows, approximations)
+            try:
+                assert scene.frame(request).pixels.shape == (8, 12, 3)
+            except UserError:
+                refused.add(projection)
+    assert refused == ({"exact"} if lens in ("opencv", "fisheye", "orthographic") else set())
+
+
+def test_the_error_through_parallel_rays_is_that_of_the_order():
+    """Of ``ewa``, which is exact there: with the most accurate order there is none."""
+    scene = LiveScene(blobs(), ModelConfig(**MOST_ACCURATE), WHITE)
+    parallel = replace(REQUEST, optics=Orthographic(), shows="error")
+    assert (scene.frame(parallel).pixels == 128).all()
+    assert (scene.frame(replace(parallel, optics=Pinhole())).pixels != 128).any()
 
 
 def test_nothing_to_see_has_no_depth(scene):

@@ -93,6 +93,13 @@ def test_parallel_rays_show_a_thing_where_the_pinhole_does_at_the_distance_of_th
     assert y == pytest.approx(HEIGHT / 2 - FOCAL * 0.5 / RADIUS, abs=0.1)
 
 
+def test_a_closed_aperture_is_a_pinhole(capfd):
+    """Of which Mitsuba says nothing, once a picture."""
+    dot = speck(0.8, -0.5, 2 * RADIUS)
+    assert np.array_equal(seen(ThinLens(0.0), dot), seen(Pinhole(), dot))
+    assert "aperture" not in "".join(capfd.readouterr())
+
+
 def test_a_thin_lens_is_sharp_at_its_focus_and_nowhere_else():
     for focus, depth in ((1.0, RADIUS), (1.5, 1.5 * RADIUS)):
         lens, dot = ThinLens(0.1, focus), speck(0.8, -0.5, depth)

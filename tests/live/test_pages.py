@@ -1,6 +1,8 @@
 """Pages as viser serves them, without a browser: what controls and cameras ask for."""
 
+import warnings
 from dataclasses import replace
+from importlib.metadata import version
 from types import SimpleNamespace
 
 import mitsuba as mi
@@ -11,6 +13,8 @@ pytest.importorskip("viser", reason="viser is not installed (the extra viewer)")
 
 from support.small_capture import FOCUS, RADIUS, make_dataset, pose_around
 from support.small_fits import make_trainer, plain_dataset
+from websockets.exceptions import InvalidStatus
+from websockets.sync.client import connect
 
 from drgs.config.approximations import DECLARED, Approximations
 from drgs.live.controls import LENSES, SWITCHED
@@ -18,7 +22,7 @@ from drgs.live.fit_page import MOST_POINTS, FitPage, curves_of
 from drgs.live.frames import SHOWN, Frame
 from drgs.live.optics import FisheyeLens, OpenCVLens, Orthographic, Pinhole, ThinLens
 from drgs.live.page import Page, StartView
-from drgs.live.server import free_port, serving, url
+from drgs.live.server import free_port, is_own, serving, url
 from drgs.live.wishes import Wishes
 from drgs.training.history import History, HistoryRow
 
@@ -155,6 +159,42 @@ def test_the_server_is_at_the_address_that_is_printed_and_prints_nothing(server,
     assert capfd.readouterr().out == ""
 
 
+@pytest.mark.parametrize(
+    ("host", "origin", "address", "expected"),
+    [
+        ("127.0.0.1:8080", None, "127.0.0.1", True),
+        ("localhost:8080", "http://localhost:8080", "127.0.0.1", True),  # as through a tunnel
+        ("[::1]:8080", "http://[::1]:8080", "::1", True),
+        ("127.0.0.1:8080", "https://elsewhere.org", "127.0.0.1", False),
+        ("127.0.0.1:8080", "http://127.0.0.1:9000", "127.0.0.1", False),
+        ("127.0.0.1:8080", "null", "127.0.0.1", False),
+        ("elsewhere.org:8080", "http://elsewhere.org:8080", "127.0.0.1", False),  # leads here
+        ("machine:8080", "http://machine:8080", "0.0.0.0", True),
+        ("machine:8080", "http://elsewhere.org", "0.0.0.0", False),
+    ],
+)
+def test_only_the_page_itself_is_served(host, origin, address, expected):
+    headers = {"Host": host} | ({} if origin is None else {"Origin": origin})
+    assert is_own(headers, address) == expected
+
+
+def test_a_page_from_elsewhere_cannot_connect(server):
+    protocol, place = f"viser-v{version('viser')}", f"ws://127.0.0.1:{server.get_port()}"
+    with connect(place, subprotocols=[protocol], origin=url(server)) as connection:
+        assert connection.recv(timeout=5)
+    with pytest.raises(InvalidStatus, match="403"):
+        connect(place, subprotocols=[protocol], origin="https://elsewhere.org")
+
+
+def test_nothing_is_said_of_pictures_for_a_browser_that_was_closed():
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        with serving("127.0.0.1", None, ("", "")) as server:
+            server._websock_server._broadcast_buffer.set_done()
+            server.gui.add_markdown("late")
+    assert not said
+
+
 def test_the_page_of_a_fit_follows_its_history(server):
     dataset = plain_dataset()
     trainer = make_trainer(dataset, iterations=40)
@@ -171,6 +211,13 @@ def test_the_page_of_a_fit_follows_its_history(server):
     assert "**12** of 40 iterations, 12.0 a second" in page._status.content
     assert "PSNR 21.00 dB" in page._status.content  # nine tenths of the past
     assert page._bar.value == 30
+    charts, drawn = page._charts, []
+    for total in (39, 41, 42, 43, 40, 30):  # revised: now and then there are others
+        page.tell(trainer, history, total)
+        drawn.append(page._charts is not charts)
+        charts = page._charts
+        assert total <= page._room < 1.3 * total
+    assert drawn == [False, True, False, False, False, True]
     page.tell_end(12)
     assert page._pause.disabled and page._end.disabled
 
@@ -183,6 +230,8 @@ def test_curves_have_few_points_their_ends_and_the_measurements():
     (x, y), (at, test) = curves_of(rows)
     assert len(x) == MOST_POINTS and x[0] == 1 and x[-1] == 1000
     assert y == pytest.approx(20)
+    step = [replace(row, psnr=30.0 if row.iteration > 1 else 20.0) for row in rows[:20]]
+    assert curves_of(step)[0][1] == pytest.approx(30 - 10 * 0.9 ** np.arange(20))
     assert list(at) == [400, 800] and list(test) == [25, 25]
     assert [len(curve[0]) for curve in curves_of(rows[:3])] == [3, 0]
 

@@ -97,7 +97,7 @@ def assert_clean(page, address: str) -> None:
 def expected_view(run: Path, width: int, height: int) -> np.ndarray:
     """What ``drgs.render`` shows of the camera that a page begins with."""
     mi.set_variant("llvm_ad_rgb")
-    args = argparse.Namespace(what=run, background=None)
+    args = argparse.Namespace(what=run, background=None, up=None)
     model = view.model_of(args)
     (camera,) = view.cameras_of(args, model)
     # As wide as high, at least: on a phone the window is narrower than the camera's picture.

@@ -215,6 +215,23 @@ def test_the_panels_are_of_the_history():
     assert panels["Iterations per second"].y == pytest.approx([2] * 11)
 
 
+def test_the_time_of_curves_is_that_of_those_tried_out(monkeypatch):
+    """The first one, of whatever kind, also loads libraries: 9 s here, later ones 1 s, or 0.5 s."""
+    drawn = []
+
+    def seconds(panel):
+        drawn.append(panel)
+        return 9.0 if len(drawn) == 1 else {"log": 1.0, "linear": 0.5}[panel.scale]
+
+    monkeypatch.setattr(report, "_seconds_of_curve", seconds)
+    panels = curves.panels_of(history(12))
+    once = sum(1.0 if panel.scale == "log" else 0.5 for panel in panels)
+    themes = 3  # two in the page, one in the picture of all
+    assert report.seconds_of_curves() == pytest.approx(themes * once)
+    monkeypatch.undo()
+    assert report.seconds_of_curves() > 0
+
+
 def test_the_population_is_shown_with_what_was_added_and_removed_so_far(tmp_path):
     shown = history(90, CHANGES)
     (panel,) = (p for p in curves.panels_of(shown) if p.title == "Gaussians")
