@@ -50,6 +50,11 @@ ROUNDED = 1.5
 class ColmapFrame(Frame):
     """An image of a model."""
 
+    @property
+    def numbers_are_as_stored(self) -> bool:
+        """COLMAP does not turn pictures."""
+        return True
+
     def where(self, key: str) -> str:
         """Of which image."""
         return f"{self.path}: image {one_line(self.own.file_path, 100)}: {key}"

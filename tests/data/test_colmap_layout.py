@@ -258,6 +258,20 @@ def test_a_picture_that_was_turned_since_is_turned_as_exif_says(tmp_path):
     assert np.asarray(view.image).shape == (480, 640, 3)
 
 
+def test_a_picture_that_exif_turns_by_a_half_is_as_colmap_read_it(tmp_path):
+    """Its size does not tell, but COLMAP turns nothing."""
+    pycolmap = pytest.importorskip("pycolmap")
+    write_dataset(tmp_path)
+    exif = Image.Exif()
+    exif[0x0112] = 3
+    pixels = np.random.default_rng(5).integers(0, 256, (480, 640, 3), np.uint8)
+    path = tmp_path / "images" / "cam" / "1.png"
+    Image.fromarray(pixels).save(path, exif=exif)
+    view = next(view for view in load(tmp_path).train if view.name == "1")
+    read = pycolmap.Bitmap.read(str(path), True).to_array()
+    np.testing.assert_array_equal(np.round(np.asarray(view.image) * 255), read)
+
+
 def test_folders_without_pictures_and_models_without_folders_are_explained(tmp_path):
     write_dataset(tmp_path)
     (tmp_path / "images").rename(tmp_path / "originals")
