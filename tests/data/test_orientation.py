@@ -44,9 +44,7 @@ def test_pictures_are_turned_as_pillow_turns_them(tmp_path, orientation, suffix)
 
 @pytest.mark.parametrize("compression", [None, "tiff_lzw"])
 @pytest.mark.parametrize("orientation", range(1, 9))
-def test_tiffs_are_read_as_they_are_stored_as_colmap_reads_them(
-    tmp_path, orientation, compression
-):
+def test_tiffs_are_read_as_they_are_stored_as_colmap_reads_them(tmp_path, orientation, compression):
     pycolmap = pytest.importorskip("pycolmap")
     path = tmp_path / "a.tif"
     save(path, orientation, compression=compression)
