@@ -11,7 +11,10 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 PICTURES = frozenset(
-    {".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp", ".heic", ".dng", ".cr2", ".nef"}
+    {
+        *(".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp"),
+        *(".heic", ".heif", ".dng", ".arw", ".cr2", ".cr3", ".nef"),
+    }
 )
 VIDEOS = frozenset({".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v"})
 
@@ -49,6 +52,11 @@ def what_is_there(folder: Path, markers: Sequence[str]) -> str:
         f"neither {' nor '.join(markers)} is there; data.path must be a folder in the layout of "
         "NeRF-synthetic, of nerfstudio / instant-ngp or of COLMAP"
     )
+
+
+def is_picture(name: str) -> bool:
+    """By its name; hidden files, as systems leave beside photographs (``._a.jpg``), are none."""
+    return not name.startswith(".") and Path(name).suffix.lower() in PICTURES
 
 
 def _output_of_a_fit(folder: Path, names: list[str], markers: Sequence[str]) -> str | None:
@@ -113,7 +121,7 @@ def _llff_poses(folder: Path, names: list[str], markers: Sequence[str]) -> str |
 
 def _pictures(folder: Path, names: list[str], markers: Sequence[str]) -> str | None:
     below = _folder_of_pictures(folder)
-    pictures = [n for n in sorted(os.listdir(below)) if Path(n).suffix.lower() in PICTURES]
+    pictures = list(filter(is_picture, sorted(os.listdir(below))))
     if not pictures:
         return None
     there = folder if below.name == "images" else below
