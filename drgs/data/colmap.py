@@ -16,6 +16,7 @@ from pathlib import Path, PurePosixPath
 
 from drgs.config.schema import DataConfig
 from drgs.core.errors import UserError, listed, one_line
+from drgs.data.images import is_scaled
 from drgs.data.photographs import MAX_WIDTH, Photographs, check_splits, dataset_of
 from drgs.data.recognition import COLMAP_FOLDERS
 from drgs.data.transforms import Frame, FrameValues
@@ -42,9 +43,6 @@ LENSES = {
 }
 """Camera models that can be rendered, and what their coefficients are read as."""
 
-ROUNDED = 1.5
-"""px: what a picture's height may differ from the camera's in proportion to its width."""
-
 
 @dataclass(frozen=True, eq=False)
 class ColmapFrame(Frame):
@@ -68,14 +66,28 @@ def model_folder(folder: Path) -> Path:
     raise UserError(f"{folder}: there is no model of COLMAP in {', '.join(COLMAP_FOLDERS)}")
 
 
-def first_picture(config: DataConfig) -> Path:
-    """Of the first image, as large as it is there."""
+def _note_on_others(model: Path) -> str:
+    """What models of the same photographs lie beside this one, which is ``0``; "": none."""
+    if model.name != "0":
+        return ""
+    numbered = [path for path in model.parent.iterdir() if path.name.isdecimal() and path != model]
+    others = sorted((path.name for path in numbered if model_files(path)), key=int)
+    if not others:
+        return ""
+    return (
+        f"; model {model.parent.name}/0, not {listed(others)}, which do not hang together with it"
+    )
+
+
+def picture_files(config: DataConfig) -> list[Path]:
+    """Of all images, as large as they are there."""
     folder = model_folder(config.path)
     model = read_model(folder)
     if not model.images:
         raise UserError(f"{folder}: at least 2 views are needed, one of them to test; got 0")
     widest = config.model_copy(update={"image_size": MAX_SIDE})
-    return _file_of(picture_folder(widest, model), model.images[0], folder)
+    pictures = picture_folder(widest, model)
+    return [_file_of(pictures, image, folder) for image in model.images]
 
 
 def load(config: DataConfig) -> Dataset:
@@ -90,12 +102,12 @@ def load(config: DataConfig) -> Dataset:
         _frame(config.path, model.cameras[image.camera], image, file, folder, index)
         for index, (image, file) in enumerate(zip(images, files, strict=True))
     ]
-    cloud, note = None, f"; pictures of {pictures.name}"
-    if len(model.points.errors):
+    cloud, note = None, f"; pictures of {pictures.name}{_note_on_others(folder)}"
+    if model.has_points:
         if config.ignore_points:
             note += "; points of the model ignored"
         else:
-            cloud = model_files(folder)["points3D"]
+            cloud = model.points_file
     return dataset_of(config, Photographs("COLMAP", folder, frames, files, cloud, note))
 
 
@@ -180,11 +192,14 @@ def _size_as_calibrated(
     COLMAP reads pictures as they are stored; what was turned since, as EXIF says, is so here.
     """
     width, height = image_size(file)
+    seen = camera.width, camera.height
     sizes = [(width, height)]
     if image_orientation(file) >= SIDEWAYS:
         sizes.append((height, width))
+    if seen in sizes:
+        return seen
     for size in sizes:
-        if abs(size[0] * camera.height / camera.width - size[1]) <= ROUNDED:
+        if is_scaled(size, seen):
             return size
     raise UserError(
         f"{folder}: image {one_line(image.name, 100)} was {camera.width} x {camera.height} px for "

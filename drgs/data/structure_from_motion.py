@@ -27,7 +27,7 @@ from drgs.core.errors import UserError, UserNote, listed, one_line
 from drgs.core.extras import required
 from drgs.core.files import why_refused
 from drgs.data.colmap import LENSES, model_folder
-from drgs.data.recognition import has_colmap_model, is_picture
+from drgs.data.recognition import folders_of_pictures, has_colmap_model, is_picture
 from drgs.io.pictures import check_readable, image_size
 
 CAMERA_MODELS = tuple(LENSES)
@@ -121,7 +121,10 @@ def pictures_in(folder: Path) -> tuple[Path, list[str]]:
     files = [path for path in found if path.suffix.lower() in READ]
     others = [path.relative_to(pictures) for path in found if path.suffix.lower() not in READ]
     if not files:
-        got = f"{listed(others)}, which COLMAP does not read; convert to JPEG" if others else "none"
+        below = folders_of_pictures(folder)
+        got = f"some only {below}" if below else "none"
+        if others:
+            got = f"{listed(others)}, which COLMAP does not read; convert them to JPEG"
         raise UserError(
             f"{folder}: must hold photographs, or have them in a folder images, got {got}"
         )

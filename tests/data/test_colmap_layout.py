@@ -1,5 +1,7 @@
 """COLMAP's layout: models, pictures of several sizes, masks, lenses and points to start from."""
 
+import math
+
 import numpy as np
 import pytest
 from conftest import SHARED_DATA
@@ -21,6 +23,7 @@ from drgs.config.schema import FitConfig
 from drgs.core.errors import UserError
 from drgs.data.colmap import LENSES
 from drgs.data.derived import completed
+from drgs.data.images import is_scaled
 from drgs.data.initial import start_of
 from drgs.io.colmap_records import MODELS
 
@@ -49,6 +52,15 @@ def test_views_have_poses_and_intrinsics_of_the_model(tmp_path, below, write):
         assert level == pytest.approx(40 * NAMES.index(name), abs=3)
     assert "(COLMAP layout): 2 train views" in dataset.description
     assert dataset.background == (0.0, 0.0, 0.0)
+
+
+def test_other_models_beside_the_first_are_named(tmp_path):
+    write_dataset(tmp_path)
+    assert "; model" not in load(tmp_path).description
+    for below in ("sparse/10", "sparse/2"):
+        write_dataset(tmp_path, below=below)
+    (tmp_path / "sparse" / "3").mkdir()
+    assert "; model sparse/0, not 2, 10, which" in load(tmp_path).description
 
 
 def test_the_pictures_own_size_decides_the_intrinsics(tmp_path):
@@ -240,6 +252,19 @@ def test_a_picture_of_another_shape_is_refused(tmp_path):
     write_dataset(tmp_path)
     write_pictures(tmp_path / "images", ["b.jpg"], (480, 640))
     assert "was 640 x 480 px for COLMAP" in refusal(tmp_path)
+
+
+@pytest.mark.parametrize("original", [(4032, 3024), (3000, 4003), (101, 997)])
+def test_scaled_pictures_are_told_from_cropped_ones(original):
+    """However their sides were rounded; a crop by three px of each is none of them."""
+    width, height = original
+    for factor in (1.7, 2, 4, 5.003, 8):
+        for w in (math.floor(width / factor), math.ceil(width / factor)):
+            for h in (math.floor(height / factor), math.ceil(height / factor)):
+                assert is_scaled((w, h), original)
+        cropped = round(width / factor), round(height / factor) - 3 * math.ceil(height / width)
+        assert not is_scaled(cropped, original)
+    assert is_scaled(original, original) and not is_scaled((width, height - 1), original)
 
 
 def test_a_picture_that_was_turned_since_is_turned_as_exif_says(tmp_path):
