@@ -4,8 +4,8 @@ Runs COLMAP's structure from motion on the photographs in FOLDER/images, or in F
 writes its model to FOLDER/sparse/0. ``drgs fit FOLDER`` takes it from there.
 
 Photographs are of something that does not move, from many places around it or along it, each
-showing most of what its neighbours show. Where FOLDER/masks holds pictures ``NAME.png`` of the
-photographs ``NAME``, what is black in them is left out of the search.
+showing most of what its neighbours show. Where FOLDER/masks holds pictures ``a.jpg.png``, or
+``a.png``, of the photographs ``a.jpg``, what is black in them is left out of the search.
 
 Needs pycolmap, which the extra ``colmap`` installs.
 """

@@ -178,7 +178,7 @@ def _frame(
     own = FrameValues.model_construct(
         file_path=image.name,
         transform_matrix=image.camera_to_world,
-        mask_path=_mask_of(path, image.name),
+        mask_path=mask_of(path, image.name),
         **values,
     )
     return ColmapFrame(own, own, index, folder)
@@ -212,7 +212,7 @@ SIDEWAYS = 5
 """EXIF's numbers from this one exchange width and height."""
 
 
-def _mask_of(path: Path, name: str) -> str | None:
-    """Its file, relative to the dataset's folder; None: there is none."""
+def mask_of(path: Path, name: str) -> str | None:
+    """Of the picture ``name``: its file, relative to ``path``, the dataset's folder; None: none."""
     beside, replaced = f"masks/{name}.png", str(PurePosixPath("masks", name).with_suffix(".png"))
     return next((mask for mask in (beside, replaced) if (path / mask).is_file()), None)

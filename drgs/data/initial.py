@@ -89,6 +89,7 @@ def start_of(config: FitConfig, dataset: Dataset) -> Start:
         silhouettes = silhouettes_of(dataset.train)
         if are_masks(silhouettes, dataset.train):
             if (start := _on_the_hull(config, dataset, silhouettes)) is not None:
+                _check_unfiltered(init, start.description)
                 return start
             note = f" (the masks of {len(silhouettes)} pictures have no hull to start from)"
         elif init.start == "masks":
@@ -98,6 +99,8 @@ def start_of(config: FitConfig, dataset: Dataset) -> Start:
                 "be fitted, or set init.start=auto"
             )
     cloud = _cloud_of(init, dataset)
+    if cloud is None or cloud.name not in POINTS_OF_COLMAP:
+        _check_unfiltered(init, "random points" if cloud is None else str(cloud))
     start = _random_points(config, dataset) if cloud is None else _of_cloud(config, dataset, cloud)
     return replace(start, description=start.description + note)
 
@@ -119,6 +122,16 @@ def _cloud_of(init: InitConfig, dataset: Dataset) -> Path | None:
             "(ply_file_path, data.ignore_points); give init.point_cloud, or set init.start=auto"
         )
     return dataset.point_cloud
+
+
+def _check_unfiltered(init: InitConfig, start: str) -> None:
+    """Raise :class:`UserError` where COLMAP's points are to be filtered; start: what is used."""
+    for name in ("max_point_error", "min_track_length"):
+        if getattr(init, name) is not None:
+            raise UserError(
+                f"init.{name}: only COLMAP's points ({' or '.join(POINTS_OF_COLMAP)}) say that, "
+                f"and the fit starts from {start}; leave it out"
+            )
 
 
 def _on_the_hull(
@@ -154,12 +167,6 @@ def _of_cloud(config: FitConfig, dataset: Dataset, cloud: Path) -> Start:
 def _read_cloud(init: InitConfig, cloud: Path) -> tuple[np.ndarray, np.ndarray | None, int]:
     """Positions (N, 3) float32, colours (N, 3) float32, 0..1, and how many were read."""
     if cloud.name not in POINTS_OF_COLMAP:
-        for name in ("max_point_error", "min_track_length"):
-            if getattr(init, name) is not None:
-                raise UserError(
-                    f"init.{name}: only COLMAP's points ({' or '.join(POINTS_OF_COLMAP)}) say "
-                    f"that, got {cloud}; leave it out"
-                )
         positions, colors = read_points(cloud)
         return positions, colors, len(positions)
     from drgs.io.colmap import read_points3d

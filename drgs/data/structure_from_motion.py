@@ -26,7 +26,7 @@ from PIL import ExifTags, Image
 from drgs.core.errors import UserError, UserNote, listed, one_line
 from drgs.core.extras import required
 from drgs.core.files import why_refused
-from drgs.data.colmap import LENSES, model_folder
+from drgs.data.colmap import LENSES, mask_of, model_folder
 from drgs.data.recognition import folders_of_pictures, has_colmap_model, is_picture
 from drgs.io.pictures import check_readable, image_size
 
@@ -158,8 +158,7 @@ def place(folder: Path, search: Search, replace: bool, watch: Watch) -> Placed:
     pycolmap.logging.minloglevel = 3  # what goes wrong is said below
     try:
         with tempfile.TemporaryDirectory(prefix=".poses-", dir=folder) as temporary:
-            masks = folder / "masks"
-            work = _Work(pycolmap, Path(temporary), pictures, masks, names, search, watch)
+            work = _Work(pycolmap, Path(temporary), pictures, folder, names, search, watch)
             found, count = work.model()
             written = Path(temporary, "model")
             written.mkdir()
@@ -197,7 +196,7 @@ class _Work:
     pycolmap: ModuleType
     folder: Path  # for what is written on the way
     pictures: Path
-    masks: Path  # of those that there are; need not exist
+    dataset: Path  # which may have masks
     names: Sequence[str]
     search: Search
     watch: Watch
@@ -280,16 +279,15 @@ class _Work:
 
         COLMAP leaves out photographs whose mask is missing.
         """
-        given = {name: self.masks / f"{name}.png" for name in self.names}
-        given = {name: path for name, path in given.items() if path.is_file()}
-        if not given:
+        given = {name: mask_of(self.dataset, name) for name in self.names}
+        if not any(given.values()):
             return None
         folder = self.folder / "masks"
         for name in self.names:
             target = folder / f"{name}.png"
             target.parent.mkdir(parents=True, exist_ok=True)
-            if name in given:
-                shutil.copyfile(given[name], target)
+            if (mask := given[name]) is not None:
+                shutil.copyfile(self.dataset / mask, target)
             else:
                 Image.new("L", image_size(self.pictures / name), 255).save(target)
         return folder

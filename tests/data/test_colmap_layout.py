@@ -19,12 +19,12 @@ from support.colmap_models import (
 from support.datasets import load, refusal
 
 from drgs.cameras.camera import Camera, Pinhole
-from drgs.config.schema import FitConfig
+from drgs.config.schema import FitConfig, InitConfig
 from drgs.core.errors import UserError
 from drgs.data.colmap import LENSES
 from drgs.data.derived import completed
 from drgs.data.images import is_scaled
-from drgs.data.initial import start_of
+from drgs.data.initial import _read_cloud, start_of
 from drgs.io.colmap_records import MODELS
 
 REAL = SHARED_DATA / "colmap_robothead"
@@ -224,8 +224,21 @@ def test_points_of_large_errors_and_of_few_observations_are_left_out(tmp_path):
         start(max_point_error=float(errors.min()) / 2)
     cloud = tmp_path / "cloud.ply"
     cloud.touch()
-    with pytest.raises(UserError, match=r"init.max_point_error: only COLMAP's points"):
+    with pytest.raises(UserError, match=r"init.max_point_error: only COLMAP's points .*cloud.ply"):
         start(max_point_error=1.0, point_cloud=cloud)
+    with pytest.raises(UserError, match=r"init.min_track_length: .* starts from random points; "):
+        start(min_track_length=2, start="random")
+
+
+def test_points_whose_error_is_not_known_are_kept(tmp_path):
+    model = some_model(np.random.default_rng(1))
+    model.points = [
+        (x, c, -1.0 if k < 6 else 5.0, n) for k, (x, c, _, n) in enumerate(model.points)
+    ]
+    points = write_binary(tmp_path, model) / "points3D.bin"
+    means, _, count = _read_cloud(InitConfig(max_point_error=1.0), points)
+    np.testing.assert_allclose(means, [x for x, *_ in model.points[:6]], rtol=1e-6)
+    assert count == 9
 
 
 def test_photographs_may_lie_beside_the_model(tmp_path):

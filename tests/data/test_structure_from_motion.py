@@ -113,6 +113,19 @@ def test_photographs_without_a_mask_are_looked_at_as_well(tmp_path):
     assert place(tmp_path, Search(), False, said).names == tuple(names)
 
 
+def test_masks_are_found_by_either_name(tmp_path):
+    (tmp_path / "masks").mkdir()
+    for name, level in (("a.jpg.png", 10), ("a.png", 20), ("b.png", 30)):
+        Image.new("L", (8, 8), level).save(tmp_path / "masks" / name)
+    for name in ("a.jpg", "b.jpg", "c.jpg"):
+        Image.new("RGB", (8, 8)).save(tmp_path / name)
+    some = work(tmp_path, ["a.jpg", "b.jpg", "c.jpg"])
+    some.folder = tmp_path / "work"
+    masks = some._masks_for_all()
+    levels = [Image.open(masks / f"{name}.png").getpixel((0, 0)) for name in some.names]
+    assert levels == [10, 30, 255]
+
+
 def test_photographs_of_two_sizes_share_no_camera(tmp_path):
     for k, size in enumerate([(64, 48), (48, 64), (64, 48)]):
         Image.new("RGB", size).save(tmp_path / f"{k}.png")
@@ -158,7 +171,7 @@ def test_what_colmap_refuses_is_said_in_one_line():
 
 
 def work(folder, names, **search):
-    return sfm._Work(None, folder, folder, folder / "masks", names, Search(**search), said)
+    return sfm._Work(None, folder, folder, folder, names, Search(**search), said)
 
 
 def test_names_are_in_the_order_of_their_numbers(tmp_path):
