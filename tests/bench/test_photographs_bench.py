@@ -5,8 +5,9 @@ import json
 from pathlib import Path
 
 import pytest
+from PIL import Image
 from support.colmap_models import write_binary, write_dataset, write_pictures
-from support.corner import write_photographs
+from support.corner import SIZE, write_photographs
 from support.datasets import load
 
 from drgs import fit
@@ -53,6 +54,18 @@ def test_each_case_is_fitted_once_and_becomes_a_row(tmp_path, fits, capsys):
     ]  # fmt: skip
 
 
+def test_fits_of_other_folders_or_with_other_values_are_others(tmp_path, fits):
+    for name in ("a", "b"):
+        write_dataset(tmp_path / name / "data", ["OPENCV"])
+    words = ["--out", str(tmp_path / "out"), "--only", "1"]
+    for name in ("a", "b", "a"):
+        bench.main(["photographs", str(tmp_path / name / "data"), *words])
+    assert len(fits) == 2
+    for _ in range(2):
+        bench.main(["photographs", str(tmp_path / "a" / "data"), *words, "--set", "seed=3"])
+    assert len(fits) == 3
+
+
 def test_without_a_model_of_colmap_nothing_is_undistorted(photographs, fits, tmp_path, capsys):
     bench.main(["photographs", str(photographs), "--out", str(tmp_path / "out"), "--only", "3"])
     assert fits == [] and "undistorted beforehand: left out" in capsys.readouterr().out
@@ -63,6 +76,7 @@ def test_photographs_are_undistorted_at_their_own_size(tmp_path):
     pytest.importorskip("pycolmap")
     model = write_dataset(tmp_path, ["SIMPLE_RADIAL"])
     model.points = []
+    model.cameras.append((99, *model.cameras[0][1:]))  # of no image
     write_binary(tmp_path / "sparse" / "0", model)
     write_pictures(tmp_path / "images", size=(320, 240))
     config, _ = config_for(tmp_path)
@@ -77,17 +91,24 @@ def test_photographs_are_undistorted_at_their_own_size(tmp_path):
 def test_cameras_are_thrown_away_and_found_again(tmp_path):
     pytest.importorskip("pycolmap")
     data, out = tmp_path / "data", tmp_path / "out"
-    names = [f"{k}.png" for k in range(6)]
+    names = [f"cam{k % 2}/{k // 2}.png" for k in range(6)]
+    for folder in ("cam0", "cam1", "masks"):
+        (data / folder).mkdir(parents=True)
+    Image.new("L", SIZE, 255).save(data / "masks" / "0.png")
     poses = write_photographs(data, names)
     frames = [
         {"file_path": name, "transform_matrix": pose.tolist()}
         for name, pose in zip(names, poses, strict=True)
     ]
+    frames[0]["mask_path"] = "masks/0.png"
     (data / "transforms.json").write_text(json.dumps({"fl_x": 300, "frames": frames}))
     config, _ = config_for(data)
     found = load(photographs.placed_again(config, out))
     assert len(found.train) + len(found.test) == 6
     assert found.train[0].lens is not None  # not known before
+    views = (*found.train, *found.test)
+    with_masks = [view.files["image"] for view in views if view.mask is not None]
+    assert with_masks == [out / "images" / "cam0" / "0.png"]
 
 
 def test_fits_are_measured_on_photographs_as_they_were_taken(tmp_path):
