@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 from PIL import Image
-from support.colmap_models import write_binary, write_dataset, write_pictures
+from support.colmap_models import NAMES, write_binary, write_dataset, write_pictures
 from support.corner import SIZE, write_photographs
 from support.datasets import load
 
@@ -88,7 +88,7 @@ def test_photographs_are_undistorted_at_their_own_size(tmp_path):
         assert 300 <= view.width <= 330 and 225 <= view.height <= 250
 
 
-def test_cameras_are_thrown_away_and_found_again(tmp_path):
+def test_cameras_are_thrown_away_and_found_again(tmp_path, fits, capsys):
     pytest.importorskip("pycolmap")
     data, out = tmp_path / "data", tmp_path / "out"
     names = [f"cam{k % 2}/{k // 2}.png" for k in range(6)]
@@ -102,13 +102,15 @@ def test_cameras_are_thrown_away_and_found_again(tmp_path):
     ]
     frames[0]["mask_path"] = "masks/0.png"
     (data / "transforms.json").write_text(json.dumps({"fl_x": 300, "frames": frames}))
-    config, _ = config_for(data)
-    found = load(photographs.placed_again(config, out))
+    bench.main(["photographs", str(data), "--out", str(out), "--only", "5"])
+    assert "| cameras found by drgs poses (6 placed) | 30.50 dB |" in capsys.readouterr().out
+    (words,) = fits
+    found = load(Path(words[0]))
     assert len(found.train) + len(found.test) == 6
     assert found.train[0].lens is not None  # not known before
     views = (*found.train, *found.test)
     with_masks = [view.files["image"] for view in views if view.mask is not None]
-    assert with_masks == [out / "images" / "cam0" / "0.png"]
+    assert with_masks == [Path(words[0]) / "images" / "cam0" / "0.png"]
 
 
 def test_fits_are_measured_on_photographs_as_they_were_taken(tmp_path):
@@ -122,3 +124,30 @@ def test_fits_are_measured_on_photographs_as_they_were_taken(tmp_path):
     expected = json.loads((tmp_path / "out" / "metrics.json").read_text())["test"]["psnr"]
     measured = photographs.measured_as_taken(tmp_path / "out", config)
     assert measured == pytest.approx(expected, abs=1e-3)
+
+
+RATES = ("means_lr", "means_lr_final", "sh0_lr", "shN_lr", "opacities_lr", "scales_lr", "quats_lr")
+
+
+def test_a_fit_that_ignores_the_lens_is_measured_through_it(tmp_path):
+    """With rates of next to nothing, fits with and without the lens end with the same Gaussians: the second's
+    own PSNR is another computation of what the first is as it was taken, but for rounding."""
+    data = tmp_path / "data"
+    model = write_dataset(data, ["OPENCV"])
+    number, *size, values = model.cameras[0]
+    model.cameras[0] = (number, *size, (*values[:4], -0.2, 0.0, 0.0, 0.0))
+    write_binary(data / "sparse" / "0", model)
+    write_pictures(data / "images", NAMES[::-1], size=(160, 120))  # the view to test is not dark
+    rates = [word for rate in RATES for word in ("--set", f"optimizer.{rate}=1e-12")]
+    words = ["--set", "iterations=1", "--set", "output.report=false", *rates]
+    words += ["--set", "densify.max_gaussians=9"]  # those that there are
+    ignoring = ["--set", "data.ignore_distortion=true"]
+    own = {}
+    for name, options in (("as it is", []), ("ignoring", ignoring)):
+        out = tmp_path / name
+        fit.main([str(data), "--out", str(out), *words, *options])
+        own[name] = json.loads((out / "metrics.json").read_text())["test"]["psnr"]
+    config, _ = config_for(data)
+    measured = photographs.measured_as_taken(tmp_path / "ignoring", config)
+    assert measured == pytest.approx(own["as it is"], abs=1e-3)
+    assert abs(measured - own["ignoring"]) > 0.02
