@@ -11,6 +11,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from drgs.config.schema import FitConfig, InitConfig
+from drgs.core.constants import SH_C0
 from drgs.core.denormals import denormals_kept
 from drgs.core.errors import UserError
 from drgs.data.derived import completed
@@ -26,7 +27,6 @@ from drgs.data.start_box import (
 )
 from drgs.data.types import Dataset, Viewpoint
 from drgs.gaussians.parameters import Gaussians
-from drgs.gaussians.sh import C0
 from drgs.io.ply import read_points
 
 if TYPE_CHECKING:
@@ -241,7 +241,7 @@ def gaussians_from_points(
     colors = np.full((num, 3), 0.5) if colors is None else colors
     squared = np.maximum(mean_squared_neighbour_distance(means), MIN_SQUARED_DISTANCE)
     log_scales = np.repeat(0.5 * np.log(squared)[:, None] + np.log(scale), 3, axis=1)
-    sh0 = (np.asarray(colors, np.float64) - 0.5) / C0
+    sh0 = (np.asarray(colors, np.float64) - 0.5) / SH_C0
     return Gaussians(
         means=means,
         quats=np.tile(np.array([1, 0, 0, 0], np.float32), (num, 1)),

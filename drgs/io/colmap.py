@@ -21,8 +21,8 @@ from types import ModuleType
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from drgs.core.errors import UserError, one_line
-from drgs.io.colmap_records import MODELS, CameraRecord, ImageRecord, Place, PointRecord
+from drgs.core.errors import Place, UserError, one_line
+from drgs.io.colmap_records import MODELS, CameraRecord, ImageRecord, PointRecord
 from drgs.io.pictures import MAX_SIDE
 
 MAX_NUMBER = 1e12

@@ -130,8 +130,11 @@ RATES = ("means_lr", "means_lr_final", "sh0_lr", "shN_lr", "opacities_lr", "scal
 
 
 def test_a_fit_that_ignores_the_lens_is_measured_through_it(tmp_path):
-    """With rates of next to nothing, fits with and without the lens end with the same Gaussians: the second's
-    own PSNR is another computation of what the first is as it was taken, but for rounding."""
+    """With rates of next to nothing, fits with and without the lens end with the same Gaussians.
+
+    What the one with it is at by its own measure is what the other is at, as taken, but for
+    rounding.
+    """
     data = tmp_path / "data"
     model = write_dataset(data, ["OPENCV"])
     number, *size, values = model.cameras[0]
