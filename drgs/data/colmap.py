@@ -67,16 +67,14 @@ def model_folder(folder: Path) -> Path:
 
 
 def _note_on_others(model: Path) -> str:
-    """What models of the same photographs lie beside this one, which is ``0``; "": none."""
+    """What models lie beside this one, if it is called ``0``, for a description; "": none."""
     if model.name != "0":
         return ""
     numbered = [path for path in model.parent.iterdir() if path.name.isdecimal() and path != model]
     others = sorted((path.name for path in numbered if model_files(path)), key=int)
     if not others:
         return ""
-    return (
-        f"; model {model.parent.name}/0, not {listed(others)}, which do not hang together with it"
-    )
+    return f"; model {model.parent.name}/0 (others are there: {listed(others)})"
 
 
 def picture_files(config: DataConfig) -> list[Path]:

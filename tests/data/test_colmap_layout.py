@@ -60,7 +60,7 @@ def test_other_models_beside_the_first_are_named(tmp_path):
     for below in ("sparse/10", "sparse/2"):
         write_dataset(tmp_path, below=below)
     (tmp_path / "sparse" / "3").mkdir()
-    assert "; model sparse/0, not 2, 10, which" in load(tmp_path).description
+    assert "; model sparse/0 (others are there: 2, 10)" in load(tmp_path).description
 
 
 def test_the_pictures_own_size_decides_the_intrinsics(tmp_path):
