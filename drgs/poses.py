@@ -4,8 +4,8 @@ Runs COLMAP's structure from motion on the photographs in FOLDER/images, or in F
 writes its model to FOLDER/sparse/0. ``drgs fit FOLDER`` takes it from there.
 
 Photographs are of something that does not move, from many places around it or along it, each
-showing most of what its neighbours show. Where FOLDER/masks holds pictures ``NAME.png`` of the
-photographs ``NAME``, what is black in them is left out of the search.
+showing most of what its neighbours show. Where FOLDER/masks holds pictures ``a.jpg.png``, or
+``a.png``, of the photographs ``a.jpg``, what is black in them is left out of the search.
 
 Needs pycolmap, which the extra ``colmap`` installs.
 """
@@ -83,7 +83,7 @@ def run(args: argparse.Namespace) -> None:
     search = Search(args.camera_model, args.compare, args.share)
     with _Steps() as steps:
         placed = place(args.folder, search, args.overwrite, steps.update)
-    print(description_of(placed))
+    print(description_of(placed, search))
     print(f"written: {args.folder / 'sparse' / '0'} in {time.perf_counter() - started:.0f} s")
     print(f"continue with: {fit_command(args.folder)}")
 
@@ -96,8 +96,8 @@ def fit_command(folder: Path) -> str:
     return shlex.join(words)
 
 
-def description_of(placed: Placed) -> str:
-    """What was found, as text."""
+def description_of(placed: Placed, search: Search) -> str:
+    """What was found, and how to find more, as text."""
     count, total = len(placed.names), len(placed.names) + len(placed.missing)
     lines = [
         f"{count} of {total} photographs placed, mean reprojection error {placed.error:.2f} px, "
@@ -110,7 +110,8 @@ def description_of(placed: Placed) -> str:
         if others:
             lines.append(f"smaller models that do not hang together with this one: {others}")
         lines.append(
-            "photographs that show what lies between would place them; so may --compare all"
+            "photographs that show what lies between would place them; so may "
+            f"{search.others(total)}"
         )
     return "\n".join(lines)
 

@@ -14,8 +14,10 @@ the photographs as they were taken, through the lens that they were taken with.
 from __future__ import annotations
 
 import argparse
+import hashlib
 import json
 import multiprocessing
+import os
 import shutil
 import tempfile
 from collections.abc import Callable, Sequence
@@ -32,11 +34,13 @@ from drgs.config.schema import FitConfig
 from drgs.core.extras import required
 from drgs.core.files import atomic_path
 from drgs.data import layout_name, load_dataset
+from drgs.data.colmap import model_folder, picture_folder
 from drgs.data.folders import config_for
 from drgs.data.structure_from_motion import Search, place
 from drgs.gaussians.parameters import Gaussians
 from drgs.integrator.scene import make_scene, render_views
-from drgs.io.pictures import image_size
+from drgs.io.colmap import read_model
+from drgs.io.pictures import image_size, read_image, write_png
 from drgs.results.files import GAUSSIANS, METRICS
 from drgs.results.folder import load_run_config
 from drgs.results.metrics import mean_of
@@ -75,6 +79,7 @@ class Measured:
     iterations: int
     wall_s: float  # of all iterations
     peak_bytes: int  # of the process
+    placed: int | None = None  # photographs whose cameras were found again; None: as the folder has
 
 
 # ----------------------------------------------------------------------------------------------
@@ -83,23 +88,22 @@ class Measured:
 
 
 def undistorted(config: FitConfig, folder: Path) -> Path:
-    """A dataset in ``folder`` of the same photographs, at their size, without distortion."""
-    from drgs.data.colmap import model_folder, picture_folder
-    from drgs.io.colmap import read_model
+    """A dataset in ``folder`` of the same photographs, at their size, without distortion.
 
+    It has no masks: COLMAP undistorts photographs alone.
+    """
     pycolmap = required("pycolmap", "colmap", "undistorting")
     model = model_folder(config.data.path)
     pictures = picture_folder(config.data, read_model(model))
     found = pycolmap.Reconstruction(str(model))
+    sizes = {}
     for image in found.images.values():
-        camera = found.cameras[image.camera_id]
-        scale = image_size(pictures / image.name)[0] / camera.width
+        sizes[image.camera_id] = size = image_size(pictures / image.name)
+        scale = size[0] / found.cameras[image.camera_id].width
         for point in image.points2D:
             point.xy = point.xy * scale
-    for number in found.cameras:
-        camera = found.cameras[number]
-        name = next(i.name for i in found.images.values() if i.camera_id == number)
-        camera.rescale(*image_size(pictures / name))
+    for number, size in sizes.items():
+        found.cameras[number].rescale(*size)
     with tempfile.TemporaryDirectory() as scaled:
         found.write_binary(scaled)
         pycolmap.logging.minloglevel = 2
@@ -110,10 +114,17 @@ def undistorted(config: FitConfig, folder: Path) -> Path:
 def placed_again(config: FitConfig, folder: Path) -> Path:
     """A dataset in ``folder`` of the same photographs, whose cameras are found from them alone."""
     dataset = load_dataset(config.data)
-    for view in (*dataset.train, *dataset.test):
-        target = folder / "images" / view.files["image"].name
+    found = [view.files for view in (*dataset.train, *dataset.test)]
+    common = os.path.commonpath([files["image"].parent for files in found])
+    for files in found:
+        name = files["image"].relative_to(common)
+        target = folder / "images" / name
         target.parent.mkdir(parents=True, exist_ok=True)
-        shutil.copyfile(view.files["image"], target)
+        shutil.copyfile(files["image"], target)
+        if "mask" in files:
+            mask = folder / "masks" / f"{name}.png"
+            mask.parent.mkdir(parents=True, exist_ok=True)
+            write_png(mask, read_image(files["mask"])[:, :, :3])
     placed = place(folder, Search(), True, lambda *_: None)
     count = len(placed.names)
     print(f"placed {count} of {count + len(placed.missing)}, error {placed.error:.2f} px")
@@ -162,13 +173,19 @@ def run(args: argparse.Namespace) -> None:
         if case.needs_model and not has_model:
             print(f"{case.name}: left out, as {args.data} has no model of COLMAP")
             continue
-        parts = args.data.resolve().name, str(config.iterations), case.name.replace(" ", "_")
-        folder = out.joinpath(*parts)
+        folder = folder_of_fits(out, config) / case.name.replace(" ", "_")
         measured.append(measure(case, config, folder, args))
     print(f"\n{machine()}\n\n{table(measured)}\n")
     path = out / NAMES[0]
     write_csv(path, list(Measured.__dataclass_fields__), [vars(m).values() for m in measured])
     print(f"written: {path}")
+
+
+def folder_of_fits(out: Path, config: FitConfig) -> Path:
+    """Another one for each dataset and each value of the configuration."""
+    data = config.data.path.resolve()
+    told = json.dumps([str(data), config.model_dump(mode="json")], sort_keys=True)
+    return out / data.name / f"{config.iterations}-{hashlib.sha256(told.encode()).hexdigest()[:8]}"
 
 
 def measure(case: Case, config: FitConfig, folder: Path, args: argparse.Namespace) -> Measured:
@@ -195,6 +212,7 @@ def measure(case: Case, config: FitConfig, folder: Path, args: argparse.Namespac
         iterations=metrics["iterations"],
         wall_s=metrics["wall_s"],
         peak_bytes=peak,
+        placed=len(read_model(model_folder(data)).images) if case.has_own_world else None,
     )
     with atomic_path(path) as temporary:
         temporary.write_text(json.dumps(asdict(measured), indent=2) + "\n")
@@ -233,7 +251,7 @@ def table(measured: Sequence[Measured]) -> str:
     header = ["photographs", "PSNR", "SSIM", "as taken", "Gaussians", "time", "memory"]
     rows = [
         [
-            each.case,
+            each.case + ("" if each.placed is None else f" ({each.placed} placed)"),
             f"{each.psnr:.2f} dB",
             f"{each.ssim:.4f}",
             "" if each.psnr_as_taken is None else f"{each.psnr_as_taken:.2f} dB",

@@ -198,7 +198,7 @@ class InitConfig(Section):
         ge=0,
         le=1e9,
         description="px: of COLMAP's points, those with a larger mean reprojection error are left "
-        "out; null: none.",
+        "out, and those whose error is not known (-1) are not; null: none.",
     )
     min_track_length: Count | None = Field(
         None,

@@ -82,3 +82,7 @@ MAX_FEATURES = 64
 """Numbers that a picture composites besides RGB, or instead of it. LLVM compiles the kernels of a
 picture and its derivatives in 5 s for 16 of them, 17 s for 64 and 85 s for 128, once: Dr.Jit keeps
 them."""
+
+SH_C0 = 0.28209479177387814
+"""The spherical harmonic of degree 0, 1 / (2 sqrt(pi)): a base colour in display space is
+0.5 + SH_C0 sh0."""

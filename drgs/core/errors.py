@@ -9,6 +9,8 @@ from __future__ import annotations
 import difflib
 import re
 from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import NamedTuple
 
 
 class UserError(ValueError):
@@ -29,6 +31,17 @@ class PluginTypeError(PluginError, TypeError):
 
 class UnsupportedError(PluginError, NotImplementedError):
     """The same, where the plugin has no code for it."""
+
+
+class Place(NamedTuple):
+    """Where something stands in a file, as messages say it."""
+
+    path: Path
+    unit: str  # byte, or line
+    number: int
+
+    def __str__(self) -> str:
+        return f"{self.path}: {self.unit} {self.number:,}"
 
 
 def one_line(text: object, limit: int = 300) -> str:

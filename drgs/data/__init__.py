@@ -6,6 +6,7 @@ May import ``io``, ``config``, ``gaussians``, ``cameras`` and ``core``.
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from importlib import import_module
 from pathlib import Path
 from typing import Protocol
@@ -25,8 +26,8 @@ class Layout(Protocol):
     def load(self, config: DataConfig) -> Dataset:
         """All views."""
 
-    def first_picture(self, config: DataConfig) -> Path:
-        """The file of one of them."""
+    def picture_files(self, config: DataConfig) -> Sequence[Path]:
+        """The files of those to train on, or of all."""
 
 
 LAYOUTS = {"nerf_synthetic": "transforms_train.json", "nerfstudio": "transforms.json", "colmap": ""}

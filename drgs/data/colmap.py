@@ -16,6 +16,7 @@ from pathlib import Path, PurePosixPath
 
 from drgs.config.schema import DataConfig
 from drgs.core.errors import UserError, listed, one_line
+from drgs.data.images import is_scaled
 from drgs.data.photographs import MAX_WIDTH, Photographs, check_splits, dataset_of
 from drgs.data.recognition import COLMAP_FOLDERS
 from drgs.data.transforms import Frame, FrameValues
@@ -42,13 +43,15 @@ LENSES = {
 }
 """Camera models that can be rendered, and what their coefficients are read as."""
 
-ROUNDED = 1.5
-"""px: what a picture's height may differ from the camera's in proportion to its width."""
-
 
 @dataclass(frozen=True, eq=False)
 class ColmapFrame(Frame):
     """An image of a model."""
+
+    @property
+    def numbers_are_as_stored(self) -> bool:
+        """COLMAP does not turn pictures."""
+        return True
 
     def where(self, key: str) -> str:
         """Of which image."""
@@ -63,14 +66,26 @@ def model_folder(folder: Path) -> Path:
     raise UserError(f"{folder}: there is no model of COLMAP in {', '.join(COLMAP_FOLDERS)}")
 
 
-def first_picture(config: DataConfig) -> Path:
-    """Of the first image, as large as it is there."""
+def _note_on_others(model: Path) -> str:
+    """What models lie beside this one, if it is called ``0``, for a description; "": none."""
+    if model.name != "0":
+        return ""
+    numbered = [path for path in model.parent.iterdir() if path.name.isdecimal() and path != model]
+    others = sorted((path.name for path in numbered if model_files(path)), key=int)
+    if not others:
+        return ""
+    return f"; model {model.parent.name}/0 (others are there: {listed(others)})"
+
+
+def picture_files(config: DataConfig) -> list[Path]:
+    """Of all images, as large as they are there."""
     folder = model_folder(config.path)
     model = read_model(folder)
     if not model.images:
         raise UserError(f"{folder}: at least 2 views are needed, one of them to test; got 0")
     widest = config.model_copy(update={"image_size": MAX_SIDE})
-    return _file_of(picture_folder(widest, model), model.images[0], folder)
+    pictures = picture_folder(widest, model)
+    return [_file_of(pictures, image, folder) for image in model.images]
 
 
 def load(config: DataConfig) -> Dataset:
@@ -85,12 +100,12 @@ def load(config: DataConfig) -> Dataset:
         _frame(config.path, model.cameras[image.camera], image, file, folder, index)
         for index, (image, file) in enumerate(zip(images, files, strict=True))
     ]
-    cloud, note = None, f"; pictures of {pictures.name}"
-    if len(model.points.errors):
+    cloud, note = None, f"; pictures of {pictures.name}{_note_on_others(folder)}"
+    if model.has_points:
         if config.ignore_points:
             note += "; points of the model ignored"
         else:
-            cloud = model_files(folder)["points3D"]
+            cloud = model.points_file
     return dataset_of(config, Photographs("COLMAP", folder, frames, files, cloud, note))
 
 
@@ -161,7 +176,7 @@ def _frame(
     own = FrameValues.model_construct(
         file_path=image.name,
         transform_matrix=image.camera_to_world,
-        mask_path=_mask_of(path, image.name),
+        mask_path=mask_of(path, image.name),
         **values,
     )
     return ColmapFrame(own, own, index, folder)
@@ -175,11 +190,14 @@ def _size_as_calibrated(
     COLMAP reads pictures as they are stored; what was turned since, as EXIF says, is so here.
     """
     width, height = image_size(file)
+    seen = camera.width, camera.height
     sizes = [(width, height)]
     if image_orientation(file) >= SIDEWAYS:
         sizes.append((height, width))
+    if seen in sizes:
+        return seen
     for size in sizes:
-        if abs(size[0] * camera.height / camera.width - size[1]) <= ROUNDED:
+        if is_scaled(size, seen):
             return size
     raise UserError(
         f"{folder}: image {one_line(image.name, 100)} was {camera.width} x {camera.height} px for "
@@ -192,7 +210,7 @@ SIDEWAYS = 5
 """EXIF's numbers from this one exchange width and height."""
 
 
-def _mask_of(path: Path, name: str) -> str | None:
-    """Its file, relative to the dataset's folder; None: there is none."""
+def mask_of(path: Path, name: str) -> str | None:
+    """Of the picture ``name``: its file, relative to ``path``, the dataset's folder; None: none."""
     beside, replaced = f"masks/{name}.png", str(PurePosixPath("masks", name).with_suffix(".png"))
     return next((mask for mask in (beside, replaced) if (path / mask).is_file()), None)

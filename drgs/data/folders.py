@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from drgs.config.load import config_from
 from drgs.config.schema import FitConfig
 from drgs.data import layout_name, layout_of
+from drgs.data.images import downscaled_size
 from drgs.io.pictures import image_size
 
 MAX_PIXELS = 600_000
-"""Of a picture that is fitted, as 894 x 671: larger ones are scaled down by a whole number."""
+"""Of a picture that is fitted, as 894 x 671. The width of larger ones is divided by the smallest
+whole number that brings them there, and rounded down."""
 
 ITERATIONS = {"nerf_synthetic": 4500, "nerfstudio": 7000, "colmap": 7000}
 """By layout, as ``scenes/lego.yml`` and ``scenes/photos.yml`` have them."""
@@ -34,15 +36,25 @@ def config_for(folder: Path, overrides: Iterable[str] = ()) -> tuple[FitConfig, 
     overrides, where = list(overrides), str(folder)
     given = config_from({"data": {"path": folder}}, where, overrides)
     layout = layout_name(given.data)
-    width, height = image_size(layout_of(given.data).first_picture(given.data))
-    factor = math.ceil(math.sqrt(width * height / MAX_PIXELS))
-    data = {"path": folder, "type": layout, "image_size": max(1, round(width / factor))}
+    sizes = [image_size(file) for file in layout_of(given.data).picture_files(given.data)]
+    width, height = max(sizes, key=lambda size: (math.prod(size), size[1]))
+    data = {"path": folder, "type": layout, "image_size": _max_width(width, height, sizes)}
     values = {"data": data, "iterations": ITERATIONS[layout]}
     config = config_from(values, where, overrides)
     size = "as they are"
     if (config.data.image_size or width) < width:
-        size = f"scaled from {width} x {height} px to a width of {config.data.image_size}"
+        which = "" if len(set(sizes)) == 1 else ", the largest,"
+        size = f"scaled from {width} x {height} px{which} to a width of {config.data.image_size}"
     return config, (
         f"no configuration is given, so that it follows from the folder: {NAMES[layout]}, {size}; "
         f"{config.iterations:,} iterations (--set changes any value, --budget 10m sets the time)"
     )
+
+
+def _max_width(width: int, height: int, sizes: Sequence[tuple[int, int]]) -> int:
+    """px, for pictures of ``sizes``, of which ``width`` x ``height`` is the largest."""
+    if width * height <= MAX_PIXELS:
+        return max(each for each, _ in sizes)
+    widths = (width // factor for factor in range(2, width + 1))
+    small = (w for w in widths if math.prod(downscaled_size(width, height, w)) <= MAX_PIXELS)
+    return next(small, 1)

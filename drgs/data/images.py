@@ -40,11 +40,25 @@ def read_mask(path: Path, size: tuple[int, int]) -> np.ndarray:
     covers does.
     """
     width, height = image_size(path)
-    is_larger = width > size[0] and abs(height * size[0] / width - size[1]) <= 1
+    is_larger = width > size[0] and is_scaled(size, (width, height))
     if not is_larger:
         _check_size(path, (width, height), size)  # before memory is taken for it
     mask = (read_image(path)[:, :, 0] > 0.5).astype(np.float32)
     return _counting(_resized(mask, *size)) if is_larger else mask
+
+
+def is_scaled(size: tuple[int, int], original: tuple[int, int]) -> bool:
+    """Whether a picture of ``size`` may be one of the size ``original``, scaled; each W, H, px.
+
+    Sides are whole numbers: each is less than 1 px away from the product of the factor and the
+    original's. A picture with one side of the original and another one beside is cropped, not
+    scaled.
+    """
+    (width, height), (full_width, full_height) = size, original
+    if width == full_width or height == full_height:
+        return size == original
+    ratio = full_height / full_width
+    return abs(width * ratio - height) < 1 + ratio
 
 
 def read_depth(path: Path, unit: float, size: tuple[int, int]) -> np.ndarray:

@@ -11,6 +11,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from drgs.config.schema import FitConfig, InitConfig
+from drgs.core.constants import SH_C0
 from drgs.core.denormals import denormals_kept
 from drgs.core.errors import UserError
 from drgs.data.derived import completed
@@ -26,7 +27,6 @@ from drgs.data.start_box import (
 )
 from drgs.data.types import Dataset, Viewpoint
 from drgs.gaussians.parameters import Gaussians
-from drgs.gaussians.sh import C0
 from drgs.io.ply import read_points
 
 if TYPE_CHECKING:
@@ -89,6 +89,7 @@ def start_of(config: FitConfig, dataset: Dataset) -> Start:
         silhouettes = silhouettes_of(dataset.train)
         if are_masks(silhouettes, dataset.train):
             if (start := _on_the_hull(config, dataset, silhouettes)) is not None:
+                _check_unfiltered(init, start.description)
                 return start
             note = f" (the masks of {len(silhouettes)} pictures have no hull to start from)"
         elif init.start == "masks":
@@ -98,6 +99,8 @@ def start_of(config: FitConfig, dataset: Dataset) -> Start:
                 "be fitted, or set init.start=auto"
             )
     cloud = _cloud_of(init, dataset)
+    if cloud is None or cloud.name not in POINTS_OF_COLMAP:
+        _check_unfiltered(init, "random points" if cloud is None else str(cloud))
     start = _random_points(config, dataset) if cloud is None else _of_cloud(config, dataset, cloud)
     return replace(start, description=start.description + note)
 
@@ -119,6 +122,16 @@ def _cloud_of(init: InitConfig, dataset: Dataset) -> Path | None:
             "(ply_file_path, data.ignore_points); give init.point_cloud, or set init.start=auto"
         )
     return dataset.point_cloud
+
+
+def _check_unfiltered(init: InitConfig, start: str) -> None:
+    """Raise :class:`UserError` where COLMAP's points are to be filtered; start: what is used."""
+    for name in ("max_point_error", "min_track_length"):
+        if getattr(init, name) is not None:
+            raise UserError(
+                f"init.{name}: only COLMAP's points ({' or '.join(POINTS_OF_COLMAP)}) say that, "
+                f"and the fit starts from {start}; leave it out"
+            )
 
 
 def _on_the_hull(
@@ -154,12 +167,6 @@ def _of_cloud(config: FitConfig, dataset: Dataset, cloud: Path) -> Start:
 def _read_cloud(init: InitConfig, cloud: Path) -> tuple[np.ndarray, np.ndarray | None, int]:
     """Positions (N, 3) float32, colours (N, 3) float32, 0..1, and how many were read."""
     if cloud.name not in POINTS_OF_COLMAP:
-        for name in ("max_point_error", "min_track_length"):
-            if getattr(init, name) is not None:
-                raise UserError(
-                    f"init.{name}: only COLMAP's points ({' or '.join(POINTS_OF_COLMAP)}) say "
-                    f"that, got {cloud}; leave it out"
-                )
         positions, colors = read_points(cloud)
         return positions, colors, len(positions)
     from drgs.io.colmap import read_points3d
@@ -234,7 +241,7 @@ def gaussians_from_points(
     colors = np.full((num, 3), 0.5) if colors is None else colors
     squared = np.maximum(mean_squared_neighbour_distance(means), MIN_SQUARED_DISTANCE)
     log_scales = np.repeat(0.5 * np.log(squared)[:, None] + np.log(scale), 3, axis=1)
-    sh0 = (np.asarray(colors, np.float64) - 0.5) / C0
+    sh0 = (np.asarray(colors, np.float64) - 0.5) / SH_C0
     return Gaussians(
         means=means,
         quats=np.tile(np.array([1, 0, 0, 0], np.float32), (num, 1)),

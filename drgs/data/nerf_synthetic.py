@@ -64,9 +64,10 @@ def load(config: DataConfig) -> Dataset:
     )
 
 
-def first_picture(config: DataConfig) -> Path:
+def picture_files(config: DataConfig) -> list[Path]:
     """Of the training views."""
-    return image_path(config.path, read_frames(_transforms_path(config.path, "train"))[0])
+    frames = read_frames(_transforms_path(config.path, "train"))
+    return [image_path(config.path, frame) for frame in frames]
 
 
 def _test_split(config: DataConfig) -> str:

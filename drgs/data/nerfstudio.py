@@ -34,6 +34,7 @@ def load(config: DataConfig) -> Dataset:
     return dataset_of(config, photographs)
 
 
-def first_picture(config: DataConfig) -> Path:
-    """Of the first frame."""
-    return image_path(config.path, read_frames(config.path / "transforms.json")[0])
+def picture_files(config: DataConfig) -> list[Path]:
+    """Of all frames."""
+    frames = read_frames(config.path / "transforms.json")
+    return [image_path(config.path, frame) for frame in frames]

@@ -19,6 +19,8 @@ from drgs.io.pictures import image_orientation, upright
 def as_calibrated(pixels: np.ndarray, file: Path, frame: Frame) -> np.ndarray:
     """The pixels (H, W, C) of ``file``, turned as EXIF says if that is the frame's size.
 
+    Where both sizes are, a frame that knows what its numbers are for decides.
+
     Raises :class:`UserError` where the size does not tell.
     """
     orientation = image_orientation(file)
@@ -26,7 +28,7 @@ def as_calibrated(pixels: np.ndarray, file: Path, frame: Frame) -> np.ndarray:
         return pixels
     turned = upright(pixels, orientation)
     fits, fits_turned = (_has_size(frame, image) for image in (pixels, turned))
-    if fits and not fits_turned:
+    if fits and (frame.numbers_are_as_stored or not fits_turned):
         return pixels
     if fits_turned and not fits:
         return turned

@@ -21,7 +21,7 @@ import numpy as np
 
 from drgs.cameras.axes import OPENGL_TO_MITSUBA
 from drgs.core.errors import UserError, one_line, reason_of_mitsuba
-from drgs.io.pictures import read_image
+from drgs.io.pictures import read_image, to_uint8
 from drgs.io.scenes import load_scene_dictionary, load_scene_file
 
 NERF_SYNTHETIC_FOV = 0.6911112070083618
@@ -311,7 +311,7 @@ def encode(linear: np.ndarray) -> np.ndarray:
     alpha = np.clip(linear[:, :, 3:], 0, 1)
     color = np.clip(linear[:, :, :3] / np.maximum(alpha, 1e-9), 0, 1)
     display = np.where(color <= 0.0031308, 12.92 * color, 1.055 * color ** (1 / 2.4) - 0.055)
-    rgba = np.round(np.concatenate([display, alpha], axis=2) * 255).astype(np.uint8)
+    rgba = to_uint8(np.concatenate([display, alpha], axis=2))
     rgba[rgba[:, :, 3] == 0] = 0
     return rgba
 
@@ -371,7 +371,7 @@ def visible_points(
         rays = view.pose[:3, 3], view_rays(view, spots, settings)
         hits, valid = first_hits(scene, *rays, settings.hides_lights)
         positions.append(hits[valid][:share])
-        colors.append(np.round(picture[pixels[valid], :3] * 255).astype(np.uint8)[:share])
+        colors.append(to_uint8(picture[pixels[valid], :3])[:share])
     return np.concatenate(positions), np.concatenate(colors)
 
 

@@ -10,8 +10,13 @@ import shlex
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
+from drgs.core.errors import listed
+
 PICTURES = frozenset(
-    {".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp", ".heic", ".dng", ".cr2", ".nef"}
+    {
+        *(".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp"),
+        *(".heic", ".heif", ".dng", ".arw", ".cr2", ".cr3", ".nef"),
+    }
 )
 VIDEOS = frozenset({".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v"})
 
@@ -41,6 +46,7 @@ def what_is_there(folder: Path, markers: Sequence[str]) -> str:
         _llff_poses,
         _pictures,
         _videos,
+        _pictures_below,
     )
     for recognise in recognisers:
         if (found := recognise(folder, names, markers)) is not None:
@@ -49,6 +55,11 @@ def what_is_there(folder: Path, markers: Sequence[str]) -> str:
         f"neither {' nor '.join(markers)} is there; data.path must be a folder in the layout of "
         "NeRF-synthetic, of nerfstudio / instant-ngp or of COLMAP"
     )
+
+
+def is_picture(name: str) -> bool:
+    """By its name; hidden files, as systems leave beside photographs (``._a.jpg``), are none."""
+    return not name.startswith(".") and Path(name).suffix.lower() in PICTURES
 
 
 def _output_of_a_fit(folder: Path, names: list[str], markers: Sequence[str]) -> str | None:
@@ -75,6 +86,8 @@ def _dataset_below(folder: Path, names: list[str], markers: Sequence[str]) -> st
         for marker in markers:
             if os.path.isfile(folder / name / marker):
                 return f"holds a dataset in its folder {name}; give {_quoted(folder / name)}"
+        if has_colmap_model(folder / name) and _pictures_in(_folder_of_pictures(folder / name)):
+            return f"holds a dataset in its folder {name}; give {_quoted(folder / name)}"
     return None
 
 
@@ -113,7 +126,7 @@ def _llff_poses(folder: Path, names: list[str], markers: Sequence[str]) -> str |
 
 def _pictures(folder: Path, names: list[str], markers: Sequence[str]) -> str | None:
     below = _folder_of_pictures(folder)
-    pictures = [n for n in sorted(os.listdir(below)) if Path(n).suffix.lower() in PICTURES]
+    pictures = _pictures_in(below)
     if not pictures:
         return None
     there = folder if below.name == "images" else below
@@ -133,6 +146,50 @@ def _videos(folder: Path, names: list[str], markers: Sequence[str]) -> str | Non
         f"(mkdir DIR; ffmpeg -i {_quoted(folder / videos[0])} -r 2 DIR/%04d.jpg), find out where "
         f"they were taken (drgs poses DIR), and give DIR; see {GUIDE}"
     )
+
+
+def _pictures_below(folder: Path, names: list[str], markers: Sequence[str]) -> str | None:
+    if where := folders_of_pictures(folder):
+        return f"holds pictures only {where}; see {GUIDE}"
+    return None
+
+
+def folders_of_pictures(folder: Path) -> str:
+    """Where pictures lie in folders of ``folder``, and what to do; "": nowhere."""
+    if any(map(_pictures_in, _folders_in(folder / "images"))):
+        return (
+            "in folders of its folder images, but no cameras: find out where each was taken: "
+            f"drgs poses {_quoted(folder)}"
+        )
+    found = list(filter(_pictures_in, _folders_in(folder)))
+    if not found:
+        return ""
+    names = [path.name for path in found]
+    remedy = f"find out where each was taken: drgs poses {_quoted(found[0])}"
+    if len(found) > 1:
+        remedy = (
+            f"if they show one scene, move these folders into {_quoted(folder / 'images')} and "
+            f"find out where each was taken: drgs poses {_quoted(folder)}"
+        )
+    return f"in its {_counted(names)}, but no cameras: {remedy}"
+
+
+def _counted(names: Sequence[str]) -> str:
+    return f"folder {names[0]}" if len(names) == 1 else f"folders {listed(names)}"
+
+
+def _folders_in(folder: Path) -> list[Path]:
+    """Sorted; without hidden ones, and those that may not be read."""
+    return [
+        path
+        for path in (sorted(folder.iterdir()) if folder.is_dir() else ())
+        if not path.name.startswith(".") and path.is_dir() and os.access(path, os.R_OK | os.X_OK)
+    ]
+
+
+def _pictures_in(folder: Path) -> list[str]:
+    """Sorted names."""
+    return list(filter(is_picture, sorted(os.listdir(folder))))
 
 
 def _folder_of_pictures(folder: Path) -> Path:

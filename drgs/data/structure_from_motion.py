@@ -9,9 +9,11 @@ from __future__ import annotations
 
 import os
 import re
+import shlex
 import shutil
 import tempfile
 import threading
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import combinations
@@ -21,15 +23,21 @@ from typing import Any
 
 from PIL import ExifTags, Image
 
-from drgs.core.errors import UserError, one_line
+from drgs.core.errors import UserError, UserNote, listed, one_line
 from drgs.core.extras import required
 from drgs.core.files import why_refused
-from drgs.data.colmap import LENSES
-from drgs.data.recognition import PICTURES
-from drgs.io.pictures import image_size
+from drgs.data.colmap import LENSES, mask_of, model_folder
+from drgs.data.recognition import folders_of_pictures, has_colmap_model, is_picture
+from drgs.io.pictures import check_readable, image_size
 
 CAMERA_MODELS = tuple(LENSES)
 """Those that can be looked for: all that can be rendered."""
+
+SIMPLE = "SIMPLE_RADIAL"
+"""The one with the fewest numbers to find that suits photographs."""
+
+READ = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp"})
+"""Suffixes of the pictures that COLMAP reads and that can be fitted."""
 
 ALL_PAIRS = 100
 """Photographs, at most, of which every two are compared where nothing is said."""
@@ -66,6 +74,20 @@ class Search:
     compare: str = "auto"  # pairs: all, neighbours by name, or auto: by ALL_PAIRS
     share: str = "alike"  # a camera for all of the same size and EXIF (alike), for one, for each
 
+    def compares_all(self, count: int) -> bool:
+        """Whether every two of ``count`` photographs are compared."""
+        return self.compare == "all" or (self.compare == "auto" and count <= ALL_PAIRS)
+
+    def others(self, count: int) -> str:
+        """Options that search otherwise, and may find more in ``count`` photographs, as text."""
+        options = {
+            "--compare all": not self.compares_all(count),
+            "--share one": self.share != "one",
+            f"--camera-model {SIMPLE}": self.camera_model != SIMPLE,
+            "--camera-model OPENCV_FISHEYE (a fisheye)": "FISHEYE" not in self.camera_model,
+        }
+        return " or ".join(option for option, is_another in options.items() if is_another)
+
 
 @dataclass(frozen=True)
 class Placed:
@@ -82,7 +104,8 @@ class Placed:
 def pictures_in(folder: Path) -> tuple[Path, list[str]]:
     """The folder of photographs, ``folder/images`` or ``folder`` itself, and their names there.
 
-    Raises :class:`UserError` where there are none, or one that cannot be read.
+    Those that COLMAP does not read are left out, with a :class:`UserNote`. Raises
+    :class:`UserError` where there are no others, or one that cannot be fitted.
     """
     below = folder / "images"
     pictures = below if below.is_dir() else folder
@@ -93,14 +116,23 @@ def pictures_in(folder: Path) -> tuple[Path, list[str]]:
             found = [pictures / name for name in os.listdir(pictures)]
     except OSError as error:
         raise UserError(f"{folder}: cannot open the folder: {error.strerror or error}") from None
-    files = [path for path in found if path.suffix.lower() in PICTURES and path.is_file()]
-    files.sort(key=_as_counted)
+    found = [path for path in found if is_picture(path.name) and path.is_file()]
+    found.sort(key=_as_counted)
+    files = [path for path in found if path.suffix.lower() in READ]
+    others = [path.relative_to(pictures) for path in found if path.suffix.lower() not in READ]
     if not files:
+        below = folders_of_pictures(folder)
+        got = f"some only {below}" if below else "none"
+        if others:
+            got = f"{listed(others)}, which COLMAP does not read; convert them to JPEG"
         raise UserError(
-            f"{folder}: must hold photographs, or have them in a folder images, got none"
+            f"{folder}: must hold photographs, or have them in a folder images, got {got}"
         )
+    if others:
+        note = f"{pictures}: left out, as COLMAP does not read them: {listed(others)}"
+        warnings.warn(UserNote(note), stacklevel=2)
     for file in files:
-        image_size(file)  # what cannot be opened is refused before hours of work
+        check_readable(file)  # what a fit refuses is refused before hours of work
     return pictures, [file.relative_to(pictures).as_posix() for file in files]
 
 
@@ -121,15 +153,12 @@ def place(folder: Path, search: Search, replace: bool, watch: Watch) -> Placed:
     pycolmap = required("pycolmap", "colmap", "structure from motion")
     pictures, names = pictures_in(folder)
     model = folder / "sparse" / "0"
-    if model.exists() and not replace:
-        raise UserError(
-            f"{model}: is there already; drgs fit {folder} uses it, --overwrite replaces it"
-        )
+    if not replace:
+        _check_free(folder, model)
     pycolmap.logging.minloglevel = 3  # what goes wrong is said below
     try:
         with tempfile.TemporaryDirectory(prefix=".poses-", dir=folder) as temporary:
-            masks = folder / "masks"
-            work = _Work(pycolmap, Path(temporary), pictures, masks, names, search, watch)
+            work = _Work(pycolmap, Path(temporary), pictures, folder, names, search, watch)
             found, count = work.model()
             written = Path(temporary, "model")
             written.mkdir()
@@ -138,6 +167,20 @@ def place(folder: Path, search: Search, replace: bool, watch: Watch) -> Placed:
     except OSError as error:
         raise UserError(f"{model}: cannot write the model: {why_refused(error)}") from None
     return _described(found, names, count)
+
+
+def _check_free(folder: Path, model: Path) -> None:
+    """Raise :class:`UserError` where ``folder`` has a model, or ``model`` holds something else."""
+    fit = shlex.join(["drgs", "fit", str(folder)])
+    if has_colmap_model(folder):
+        there = model_folder(folder)
+        does = "replaces it" if there == model else f"writes {model}, which is then used instead"
+        raise UserError(f"{there}: is there already; {fit} uses it, --overwrite {does}")
+    if model.exists() and (not model.is_dir() or any(model.iterdir())):
+        raise UserError(
+            f"{model}: is there already, and holds no model that can be read; move it away, or "
+            "have it replaced by --overwrite"
+        )
 
 
 def _put(written: Path, model: Path, temporary: Path) -> None:
@@ -153,7 +196,7 @@ class _Work:
     pycolmap: ModuleType
     folder: Path  # for what is written on the way
     pictures: Path
-    masks: Path  # of those that there are; need not exist
+    dataset: Path  # which may have masks
     names: Sequence[str]
     search: Search
     watch: Watch
@@ -236,16 +279,15 @@ class _Work:
 
         COLMAP leaves out photographs whose mask is missing.
         """
-        given = {name: self.masks / f"{name}.png" for name in self.names}
-        given = {name: path for name, path in given.items() if path.is_file()}
-        if not given:
+        given = {name: mask_of(self.dataset, name) for name in self.names}
+        if not any(given.values()):
             return None
         folder = self.folder / "masks"
         for name in self.names:
             target = folder / f"{name}.png"
             target.parent.mkdir(parents=True, exist_ok=True)
-            if name in given:
-                shutil.copyfile(given[name], target)
+            if (mask := given[name]) is not None:
+                shutil.copyfile(self.dataset / mask, target)
             else:
                 Image.new("L", image_size(self.pictures / name), 255).save(target)
         return folder
@@ -282,9 +324,7 @@ class _Work:
 
     def _pairs(self) -> Iterator[tuple[int, int]]:
         count = len(self.names)
-        compares_all = {"all": True, "neighbours": False}.get(
-            self.search.compare, count <= ALL_PAIRS
-        )
+        compares_all = self.search.compares_all(count)
         steps = {*range(1, NEIGHBOURS + 1), *(2**k for k in range(count.bit_length()))}
         for i, j in combinations(range(count), 2):
             if compares_all or j - i in steps or (i % STRIDE == 0 and j % STRIDE == 0):
@@ -333,8 +373,8 @@ class _Work:
         )
         return (
             f"no cameras were found: {found}; take more photographs, each showing most of what "
-            "its neighbours show, while walking around (not turning on the spot), or try --compare "
-            "all, --share one or --camera-model SIMPLE_RADIAL"
+            "its neighbours show, while walking around (not turning on the spot), or try "
+            f"{self.search.others(len(features))}"
         )
 
 

@@ -190,6 +190,11 @@ class Frame:
     point_cloud: str | None = None  # what the file's ply_file_path names
 
     @property
+    def numbers_are_as_stored(self) -> bool:
+        """Whether they are known to be for the picture as it is stored, if that has its size."""
+        return False
+
+    @property
     def moves(self) -> bool:
         """Whether it says where its camera was when the shutter closed."""
         return self.own.transform_matrix_close is not None

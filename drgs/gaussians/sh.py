@@ -12,9 +12,8 @@ from typing import Any
 
 import drjit as dr
 
-from drgs.core.constants import COLOR_MIN
+from drgs.core.constants import COLOR_MIN, SH_C0
 
-C0 = 0.28209479177387814
 C1 = 0.4886025119029199
 C2 = (
     1.0925484305920792,
@@ -41,7 +40,7 @@ def num_coefficients(degree: int) -> int:
 
 def sh_basis(direction: Any, degree: int) -> list[Any]:
     """The (degree + 1)^2 basis functions at a unit ``direction`` (Array3f, world)."""
-    basis = [C0]
+    basis = [SH_C0]
     if degree >= 1:
         x, y, z = direction.x, direction.y, direction.z
         basis += [-C1 * y, C1 * z, -C1 * x]
@@ -74,7 +73,7 @@ def sh_color(coefficients: list[Any], direction: Any, degree: int) -> Any:
     centre to the mean. Where the colour is clamped, its derivative is zero; at exactly 0 it passes.
     A NaN stays NaN: projection then drops the Gaussian.
     """
-    color = coefficients[0] * C0 + 0.5
+    color = coefficients[0] * SH_C0 + 0.5
     for basis, coefficient in zip(sh_basis(direction, degree)[1:], coefficients[1:], strict=True):
         color = dr.fma(coefficient, basis, color)
     return dr.select(color < COLOR_MIN, COLOR_MIN, color)

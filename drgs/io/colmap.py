@@ -14,14 +14,15 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path, PurePosixPath
 from types import ModuleType
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from drgs.core.errors import UserError, one_line
-from drgs.io.colmap_records import MODELS, CameraRecord, ImageRecord, Place, PointRecord
+from drgs.core.errors import Place, UserError, one_line
+from drgs.io.colmap_records import MODELS, CameraRecord, ImageRecord, PointRecord
 from drgs.io.pictures import MAX_SIDE
 
 MAX_NUMBER = 1e12
@@ -82,7 +83,18 @@ class ColmapModel:
 
     cameras: Mapping[int, ColmapCamera]  # by number
     images: tuple[ColmapImage, ...]  # as the file has them
-    points: ColmapPoints
+    points_file: Path | None  # None: it has no points
+
+    @property
+    def has_points(self) -> bool:
+        """Whether there are any, from the first record."""
+        file = self.points_file
+        return file is not None and next(_records_of(file).points(file), None) is not None
+
+    @cached_property
+    def points(self) -> ColmapPoints:
+        """Read when they are first asked for; errors as in :func:`read_model`."""
+        return _points(iter(())) if self.points_file is None else read_points3d(self.points_file)
 
 
 def model_files(folder: Path) -> dict[str, Path] | None:
@@ -99,7 +111,7 @@ def model_files(folder: Path) -> dict[str, Path] | None:
 
 
 def read_model(folder: str | Path) -> ColmapModel:
-    """The model in ``folder``. Where there is no file of points, it has none.
+    """The model in ``folder``, of whose points nothing is read yet.
 
     Raises :class:`UserError` naming the file, the byte or the line, what was expected and what was
     got.
@@ -113,8 +125,7 @@ def read_model(folder: str | Path) -> ColmapModel:
     records = _records_of(files["cameras"])
     cameras = _cameras(records.cameras(files["cameras"]))
     images = _images(records.images(files["images"]), cameras)
-    points = records.points(files["points3D"]) if "points3D" in files else iter(())
-    return ColmapModel(cameras, images, _points(points))
+    return ColmapModel(cameras, images, files.get("points3D"))
 
 
 def read_points3d(path: str | Path) -> ColmapPoints:

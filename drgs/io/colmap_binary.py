@@ -6,9 +6,9 @@ import struct
 from collections.abc import Iterator
 from pathlib import Path
 
-from drgs.core.errors import UserError, one_line
+from drgs.core.errors import Place, UserError, one_line
 from drgs.core.files import read_bytes
-from drgs.io.colmap_records import MODELS, CameraRecord, ImageRecord, Place, PointRecord
+from drgs.io.colmap_records import MODELS, CameraRecord, ImageRecord, PointRecord
 
 MAX_BYTES = 1 << 33
 """Of a file: 8.6 GB."""

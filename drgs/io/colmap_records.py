@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import NamedTuple
+
+from drgs.core.errors import Place
 
 _BROWN = ("k1", "k2", "p1", "p2")
 _ONE, _TWO = ("f", "cx", "cy"), ("fx", "fy", "cx", "cy")
@@ -33,17 +34,6 @@ MODELS: Mapping[str, tuple[int, tuple[str, ...]]] = {
     "EQUIRECTANGULAR": (17, ("w", "h")),
 }
 """Camera models by name: COLMAP's number of each, and its parameters in their order."""
-
-
-class Place(NamedTuple):
-    """Where something stands in a file, as messages say it."""
-
-    path: Path
-    unit: str  # byte, or line
-    number: int
-
-    def __str__(self) -> str:
-        return f"{self.path}: {self.unit} {self.number:,}"
 
 
 class CameraRecord(NamedTuple):

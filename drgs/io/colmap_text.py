@@ -7,9 +7,9 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from drgs.core.errors import UserError, did_you_mean, one_line
+from drgs.core.errors import Place, UserError, did_you_mean, one_line
 from drgs.core.files import read_text
-from drgs.io.colmap_records import MODELS, CameraRecord, ImageRecord, Place, PointRecord
+from drgs.io.colmap_records import MODELS, CameraRecord, ImageRecord, PointRecord
 
 MAX_BYTES = 1 << 33
 """Of a file: 8.6 GB."""

@@ -22,11 +22,11 @@ from pathlib import Path
 
 import numpy as np
 
+from drgs.core.constants import SH_C0
 from drgs.core.errors import UserError
 from drgs.io.morton import morton_order
 from drgs.io.ply import NUM_REST, Scalar, encode_elements, properties_of, read_elements
 from drgs.io.quantized import (
-    SH_C0,
     logits_of,
     opacities_of,
     rounded,

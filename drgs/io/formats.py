@@ -18,8 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from drgs.core.errors import UserError
-
-Scalar = bool | int | float | str
+from drgs.io.ply import Scalar
 
 Z_TO_Y = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
 """From our worlds, where datasets have z up, to files of formats that have y up: x' = R x."""

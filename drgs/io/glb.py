@@ -23,13 +23,12 @@ from pathlib import Path
 
 import numpy as np
 
-from drgs.core.errors import UserError
+from drgs.core.constants import SH_C0
+from drgs.core.errors import Place, UserError
 from drgs.core.files import read_bytes
-from drgs.io.colmap_records import Place
 from drgs.io.glb_document import EXTENSION, Document, read_document
 from drgs.io.ply import Scalar
 from drgs.io.quantized import (
-    SH_C0,
     log_scales_of,
     logits_of,
     opacities_of,

@@ -55,6 +55,10 @@ ORIENTATIONS = {
 }
 """What makes a picture upright, by EXIF's number of how it is stored."""
 
+UNDONE_BY = {6: 8, 8: 6}
+"""The orientation that turns an upright picture into one that is stored so; others are their
+own."""
+
 WEBP_SIDE = 16_383
 """px: the largest width and height that the format can express."""
 
@@ -92,7 +96,7 @@ NEAR_BACKGROUND = 8
 def image_size(path: Path) -> tuple[int, int]:
     """(width, height) in px, from the file's header."""
     with _opened(path) as image:
-        return image.size
+        return _stored_size(image)
 
 
 def stored_shape(path: Path) -> tuple[int, int, int, int]:
@@ -103,7 +107,7 @@ def stored_shape(path: Path) -> tuple[int, int, int, int]:
     with _opened(path) as image:
         is_transparent = image.mode in ("LA", "RGBA", "P")
         bits = BITS.get(image.mode, 8)
-        return *image.size, 4 if is_transparent else 3, bits // 8
+        return *_stored_size(image), 4 if is_transparent else 3, bits // 8
 
 
 def image_mode(path: Path) -> str:
@@ -119,17 +123,33 @@ def image_format(path: Path) -> str:
 
 
 def image_orientation(path: Path) -> int:
-    """EXIF's number of how :func:`read_pixels` gives a picture: 1, upright or unknown, to 8."""
+    """EXIF's number of how a picture is stored: 1, upright or unknown, to 8."""
     with _opened(path) as image:
         if image.format == "PNG" and "exif" not in image.info:
             return 1  # Pillow would decode the picture to look behind it
-        if image.format == "TIFF":
-            return 1  # Pillow turns these, and no others, when it decodes them
-        try:
-            number = image.getexif().get(ExifTags.Base.Orientation, 1)
-        except Exception:  # Pillow raises many types for broken EXIF, which says nothing
-            return 1
+        return _orientation(image)
+
+
+def _orientation(image: Image.Image) -> int:
+    """Before it is decoded."""
+    try:
+        number = image.getexif().get(ExifTags.Base.Orientation, 1)
+    except Exception:  # Pillow raises many types for broken EXIF, which says nothing
+        return 1
     return number if number in ORIENTATIONS else 1
+
+
+def _stored_size(image: Image.Image) -> tuple[int, int]:
+    """(width, height) in px; of a TIFF, Pillow says the size of the upright picture."""
+    if image.format == "TIFF":
+        tags = ExifTags.Base
+        return image.tag_v2[tags.ImageWidth], image.tag_v2[tags.ImageLength]
+    return image.size
+
+
+def _turned_by_pillow(image: Image.Image) -> int:
+    """The orientation that Pillow applies, of TIFFs alone, when it decodes the image."""
+    return _orientation(image) if image.format == "TIFF" else 1
 
 
 def upright(pixels: np.ndarray, orientation: int) -> np.ndarray:
@@ -155,6 +175,12 @@ def as_numbers(pixels: np.ndarray) -> np.ndarray:
     return pixels.astype(np.float32) / np.float32(255 if pixels.dtype == np.uint8 else 65535)
 
 
+def check_readable(path: Path) -> None:
+    """Raise :class:`UserError` for what :func:`read_pixels` refuses, as far as a header tells."""
+    with _opened(path) as image:
+        _check(path, image)
+
+
 def read_pixels(path: Path) -> np.ndarray:
     """(H, W, C) as stored (EXIF orientation is not applied), uint8 or an integer type for 16 bits.
 
@@ -163,26 +189,32 @@ def read_pixels(path: Path) -> np.ndarray:
     Raises :class:`UserError` for a file that is no such picture.
     """
     with _opened(path) as image:
-        if image.width * image.height > MAX_PIXELS:  # before memory is allocated for them
-            raise UserError(
-                f"{path}: must have at most {MAX_PIXELS:,} pixels, got {image.width} x "
-                f"{image.height}; scale the images down"
-            )
+        _check(path, image)  # before memory is allocated for it
+        turn, decoded = _turned_by_pillow(image), image
         if image.mode == "P":
-            image = image.convert("RGBA" if "transparency" in image.info else "RGB")
+            decoded = image.convert("RGBA" if "transparency" in image.info else "RGB")
         elif image.mode == "1":
-            image = image.convert("L")
-        if image.mode not in BITS:
-            raise UserError(
-                f"{path}: must be a grey, RGB or RGBA image of 8 or 16 bits, got one of Pillow's "
-                f"mode {image.mode}; convert it"
-            )
-        pixels = np.asarray(image)
+            decoded = image.convert("L")
+        pixels = upright(np.asarray(decoded), UNDONE_BY.get(turn, turn))
     if pixels.ndim == 2:
         pixels = pixels[:, :, None]
     if pixels.shape[2] < 3:
         pixels = np.concatenate([pixels[:, :, :1]] * 3 + [pixels[:, :, 1:]], axis=2)
     return pixels
+
+
+def _check(path: Path, image: Image.Image) -> None:
+    """Raise :class:`UserError` for pictures that are too large, or of another kind."""
+    if image.width * image.height > MAX_PIXELS:
+        raise UserError(
+            f"{path}: must have at most {MAX_PIXELS:,} pixels, got {image.width} x "
+            f"{image.height}; scale the images down"
+        )
+    if image.mode not in (*BITS, "P", "1"):
+        raise UserError(
+            f"{path}: must be a grey, RGB or RGBA image of 8 or 16 bits, got one of Pillow's "
+            f"mode {image.mode}; convert it"
+        )
 
 
 @contextmanager

@@ -6,9 +6,6 @@ import math
 
 import numpy as np
 
-SH_C0 = 0.28209479177387814
-"""The harmonic of degree 0: a base colour in display space is 0.5 + SH_C0 sh0."""
-
 LARGEST_LOGIT = 23 * math.log(2)
 """Logit of the largest opacity below 1 that a sigmoid in float32 gives: 1 / (1 + 2^-23)."""
 

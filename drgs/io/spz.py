@@ -31,10 +31,9 @@ from pathlib import Path
 
 import numpy as np
 
-from drgs.core.errors import UserError, UserNote
+from drgs.core.errors import Place, UserError, UserNote
 from drgs.core.extras import required
 from drgs.core.files import read_bytes
-from drgs.io.colmap_records import Place
 from drgs.io.ply import Scalar
 from drgs.io.quantized import (
     logits_of,

@@ -48,7 +48,7 @@ def test_photographs_without_a_camera_are_named(run):
     assert "1 of 8 photographs placed" in text and "camera: x\ncamera: y" in text
     assert "without a camera: 0.jpg, 1.jpg, 2.jpg, 3.jpg, 4.jpg and 2 more" in text
     assert "smaller models that do not hang together with this one: 2" in text
-    assert "--compare all" in text
+    assert "so may --share one or --camera-model SIMPLE_RADIAL" in text
 
 
 def test_options_say_how_to_search(run):

@@ -1,5 +1,7 @@
 """COLMAP's layout: models, pictures of several sizes, masks, lenses and points to start from."""
 
+import math
+
 import numpy as np
 import pytest
 from conftest import SHARED_DATA
@@ -17,11 +19,12 @@ from support.colmap_models import (
 from support.datasets import load, refusal
 
 from drgs.cameras.camera import Camera, Pinhole
-from drgs.config.schema import FitConfig
+from drgs.config.schema import FitConfig, InitConfig
 from drgs.core.errors import UserError
 from drgs.data.colmap import LENSES
 from drgs.data.derived import completed
-from drgs.data.initial import start_of
+from drgs.data.images import is_scaled
+from drgs.data.initial import _read_cloud, start_of
 from drgs.io.colmap_records import MODELS
 
 REAL = SHARED_DATA / "colmap_robothead"
@@ -49,6 +52,15 @@ def test_views_have_poses_and_intrinsics_of_the_model(tmp_path, below, write):
         assert level == pytest.approx(40 * NAMES.index(name), abs=3)
     assert "(COLMAP layout): 2 train views" in dataset.description
     assert dataset.background == (0.0, 0.0, 0.0)
+
+
+def test_other_models_beside_the_first_are_named(tmp_path):
+    write_dataset(tmp_path)
+    assert "; model" not in load(tmp_path).description
+    for below in ("sparse/10", "sparse/2"):
+        write_dataset(tmp_path, below=below)
+    (tmp_path / "sparse" / "3").mkdir()
+    assert "; model sparse/0 (others are there: 2, 10)" in load(tmp_path).description
 
 
 def test_the_pictures_own_size_decides_the_intrinsics(tmp_path):
@@ -212,8 +224,21 @@ def test_points_of_large_errors_and_of_few_observations_are_left_out(tmp_path):
         start(max_point_error=float(errors.min()) / 2)
     cloud = tmp_path / "cloud.ply"
     cloud.touch()
-    with pytest.raises(UserError, match=r"init.max_point_error: only COLMAP's points"):
+    with pytest.raises(UserError, match=r"init.max_point_error: only COLMAP's points .*cloud.ply"):
         start(max_point_error=1.0, point_cloud=cloud)
+    with pytest.raises(UserError, match=r"init.min_track_length: .* starts from random points; "):
+        start(min_track_length=2, start="random")
+
+
+def test_points_whose_error_is_not_known_are_kept(tmp_path):
+    model = some_model(np.random.default_rng(1))
+    model.points = [
+        (x, c, -1.0 if k < 6 else 5.0, n) for k, (x, c, _, n) in enumerate(model.points)
+    ]
+    points = write_binary(tmp_path, model) / "points3D.bin"
+    means, _, count = _read_cloud(InitConfig(max_point_error=1.0), points)
+    np.testing.assert_allclose(means, [x for x, *_ in model.points[:6]], rtol=1e-6)
+    assert count == 9
 
 
 def test_photographs_may_lie_beside_the_model(tmp_path):
@@ -242,6 +267,19 @@ def test_a_picture_of_another_shape_is_refused(tmp_path):
     assert "was 640 x 480 px for COLMAP" in refusal(tmp_path)
 
 
+@pytest.mark.parametrize("original", [(4032, 3024), (3000, 4003), (101, 997)])
+def test_scaled_pictures_are_told_from_cropped_ones(original):
+    """However their sides were rounded; a crop by three px of each is none of them."""
+    width, height = original
+    for factor in (1.7, 2, 4, 5.003, 8):
+        for w in (math.floor(width / factor), math.ceil(width / factor)):
+            for h in (math.floor(height / factor), math.ceil(height / factor)):
+                assert is_scaled((w, h), original)
+        cropped = round(width / factor), round(height / factor) - 3 * math.ceil(height / width)
+        assert not is_scaled(cropped, original)
+    assert is_scaled(original, original) and not is_scaled((width, height - 1), original)
+
+
 def test_a_picture_that_was_turned_since_is_turned_as_exif_says(tmp_path):
     """COLMAP reads pictures as they are stored: where the stored size is the camera's, it is right.
 
@@ -256,6 +294,20 @@ def test_a_picture_that_was_turned_since_is_turned_as_exif_says(tmp_path):
     write_pictures(tmp_path / "images", ["b.jpg"], (640, 480), exif=exif)
     view = next(view for view in load(tmp_path).train if view.name == "b")
     assert np.asarray(view.image).shape == (480, 640, 3)
+
+
+def test_a_picture_that_exif_turns_by_a_half_is_as_colmap_read_it(tmp_path):
+    """Its size does not tell, but COLMAP turns nothing."""
+    pycolmap = pytest.importorskip("pycolmap")
+    write_dataset(tmp_path)
+    exif = Image.Exif()
+    exif[0x0112] = 3
+    pixels = np.random.default_rng(5).integers(0, 256, (480, 640, 3), np.uint8)
+    path = tmp_path / "images" / "cam" / "1.png"
+    Image.fromarray(pixels).save(path, exif=exif)
+    view = next(view for view in load(tmp_path).train if view.name == "1")
+    read = pycolmap.Bitmap.read(str(path), True).to_array()
+    np.testing.assert_array_equal(np.round(np.asarray(view.image) * 255), read)
 
 
 def test_folders_without_pictures_and_models_without_folders_are_explained(tmp_path):

@@ -4,7 +4,7 @@ import json
 
 import pytest
 from conftest import REPOSITORY
-from support.colmap_models import write_dataset, write_pictures
+from support.colmap_models import NAMES, write_dataset, write_pictures
 
 from drgs.config.load import load_config
 from drgs.core.errors import UserError
@@ -28,6 +28,32 @@ def test_photographs_are_scaled_by_a_whole_number_and_fitted_as_in_photos_yml(tm
     assert "COLMAP's model" in reasons and "7,000 iterations" in reasons
     for section in ("init", "model", "optimizer", "loss", "densify", "coarse"):
         assert getattr(config, section) == getattr(example, section)
+
+
+@pytest.mark.parametrize("size", [(4032, 3024), (3023, 4031), (901, 667), (41, 60001)])
+def test_widths_are_divided_by_the_smallest_whole_number_that_will_do(tmp_path, size):
+    write_dataset(tmp_path)
+    write_pictures(tmp_path / "images", size=size)
+    config, _ = config_for(tmp_path)
+    width, height = size
+    factor = width // config.data.image_size
+    fitted, larger = width // factor, width // (factor - 1)
+    assert config.data.image_size == fitted
+    assert fitted * round(height * fitted / width) <= MAX_PIXELS
+    assert larger * round(height * larger / width) > MAX_PIXELS
+
+
+def test_the_largest_picture_decides(tmp_path):
+    write_dataset(tmp_path)
+    sizes = [(640, 480), (1600, 1200), (1200, 1600), (700, 500)]
+    for name, size in zip(NAMES, sizes, strict=True):
+        write_pictures(tmp_path / "images", [name], size)
+    config, reasons = config_for(tmp_path)
+    assert config.data.image_size == 600 and MAX_PIXELS >= 600 * 800
+    assert "scaled from 1200 x 1600 px, the largest, to a width of 600" in reasons
+    for name, size in zip(NAMES, [(640, 480), (480, 640), (900, 20), (64, 48)], strict=True):
+        write_pictures(tmp_path / "images", [name], size)
+    assert config_for(tmp_path)[0].data.image_size == 900
 
 
 def test_cut_out_pictures_are_fitted_as_in_lego_yml():

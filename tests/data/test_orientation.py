@@ -8,15 +8,15 @@ from PIL import ExifTags, Image, ImageOps
 from support.datasets import load, look_at
 
 from drgs.core.errors import UserError
-from drgs.io.pictures import image_orientation, read_pixels, upright
+from drgs.io.pictures import image_orientation, image_size, read_pixels, stored_shape, upright
 
 STORED = np.random.default_rng(0).integers(0, 256, (6, 8, 3), np.uint8)
 
 
-def save(path, orientation, pixels=STORED):
+def save(path, orientation, pixels=STORED, **options):
     exif = Image.Exif()
     exif[ExifTags.Base.Orientation] = orientation
-    Image.fromarray(pixels).save(path, exif=exif)
+    Image.fromarray(pixels).save(path, exif=exif, **options)
 
 
 def dataset(folder, orientation, pixels=STORED, **size):
@@ -36,10 +36,21 @@ def test_pictures_are_turned_as_pillow_turns_them(tmp_path, orientation, suffix)
     path = tmp_path / f"a.{suffix}"
     save(path, orientation)
     found = image_orientation(path)
-    assert found == (1 if suffix == "tif" else orientation)  # of TIFF, Pillow has turned it
+    assert found == orientation
     with Image.open(path) as image:
         expected = np.asarray(ImageOps.exif_transpose(image).convert("RGB"))
     np.testing.assert_array_equal(upright(read_pixels(path), found), expected)
+
+
+@pytest.mark.parametrize("compression", [None, "tiff_lzw"])
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_tiffs_are_read_as_they_are_stored_as_colmap_reads_them(tmp_path, orientation, compression):
+    pycolmap = pytest.importorskip("pycolmap")
+    path = tmp_path / "a.tif"
+    save(path, orientation, compression=compression)
+    np.testing.assert_array_equal(read_pixels(path), STORED)
+    np.testing.assert_array_equal(pycolmap.Bitmap.read(str(path), True).to_array(), STORED)
+    assert image_size(path) == stored_shape(path)[:2] == (8, 6)
 
 
 @pytest.mark.parametrize("orientation", [0, 9, 65535])

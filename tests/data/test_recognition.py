@@ -1,11 +1,14 @@
 """A folder that is no dataset: what it is recognised as, and what its user is told to do."""
 
 import json
+import re
 
 import pytest
 from support.datasets import refusal
 
+from drgs.core.errors import UserError
 from drgs.data.recognition import GUIDE
+from drgs.data.structure_from_motion import pictures_in
 
 
 def touch(folder, *names):
@@ -52,6 +55,33 @@ def test_a_dataset_one_folder_below(tmp_path):
     assert refusal(tmp_path) == (
         f"{tmp_path}: holds a dataset in its folder scene; give {tmp_path}/scene"
     )
+
+
+def test_a_model_with_its_photographs_one_folder_below(tmp_path):
+    touch(tmp_path, *(f"my scene/sparse/0/{name}.bin" for name in ("cameras", "images")))
+    assert "holds a dataset" not in refusal(tmp_path)
+    touch(tmp_path, "my scene/images/a.jpg")
+    assert refusal(tmp_path) == (
+        f"{tmp_path}: holds a dataset in its folder my scene; give '{tmp_path}/my scene'"
+    )
+
+
+@pytest.mark.parametrize(
+    ("files", "message"),
+    [
+        (["cam 1/a.jpg", "notes/b.txt"], "folder cam 1, but .*: drgs poses '{0}/cam 1'"),
+        (["b/a.jpg", "a/a.jpg"], "folders a, b, .* into {0}/images and .*: drgs poses {0}"),
+        (["images/b/a.jpg"], "folders of its folder images, but no .*: drgs poses {0}"),
+    ],
+    ids=["one", "several", "of images"],
+)
+def test_pictures_in_folders_of_the_folder(tmp_path, files, message):
+    touch(tmp_path, *files, ".thumbs/a.jpg", "._a.jpg")
+    pattern = message.format(tmp_path)
+    assert re.search(f"holds pictures only in .*{pattern}; see ", refusal(tmp_path))
+    if "images/b/a.jpg" not in files:
+        with pytest.raises(UserError, match=f"got some only in its {pattern}"):
+            pictures_in(tmp_path)
 
 
 def test_a_split_without_the_training_views(tmp_path):

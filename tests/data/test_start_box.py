@@ -8,12 +8,12 @@ from support.datasets import dataset_of, load, view_at
 from support.photographs import write_points
 
 from drgs.config.schema import FitConfig, InitConfig
+from drgs.core.constants import SH_C0
 from drgs.core.errors import UserError
 from drgs.data import initial_gaussians
 from drgs.data.derived import completed
 from drgs.data.initial import description_of_start, start_of
 from drgs.data.start_box import box_to_start_in
-from drgs.gaussians.sh import C0
 
 AROUND = [(4.03, 0, 0), (0, 4.03, 0), (-4.03, 0, 0), (0, -4.03, 0.1)]
 
@@ -134,7 +134,7 @@ def test_points_that_are_all_black_get_the_colours_of_the_pictures(tmp_path):
     given = config(init={"point_cloud": tmp_path / "black.ply"})
     views = [replace(view, image=view.image + 0.75) for view in views_from(AROUND)]
     g = initial_gaussians(given, dataset_of(views))
-    np.testing.assert_allclose(0.5 + C0 * g.sh0, 0.75, rtol=1e-6)
+    np.testing.assert_allclose(0.5 + SH_C0 * g.sh0, 0.75, rtol=1e-6)
     assert not initial_gaussians(given, dataset_of([])).sh0.any()  # grey: colour is SH + 0.5
 
 

@@ -9,10 +9,10 @@ from support.datasets import load
 from support.photographs import write_points
 
 from drgs.config.schema import FitConfig
+from drgs.core.constants import SH_C0
 from drgs.core.errors import UserError
 from drgs.data import initial_gaussians
 from drgs.data.initial import start_of
-from drgs.gaussians.sh import C0
 
 
 def config(**init):
@@ -62,7 +62,7 @@ def test_starting_gaussians_have_the_colours_opacity_and_scale(masks):
     g = initial_gaussians(config(opacity=0.3, scale=0.5), masks)
     whole = initial_gaussians(config(), masks)
     np.testing.assert_array_equal(g.means, start.means)
-    np.testing.assert_allclose(0.5 + C0 * g.sh0[:, 0], start.colors, atol=1e-6)
+    np.testing.assert_allclose(0.5 + SH_C0 * g.sh0[:, 0], start.colors, atol=1e-6)
     np.testing.assert_allclose(g.opacities, 0.3, rtol=1e-6)
     np.testing.assert_allclose(g.scales, 0.5 * whole.scales, rtol=1e-6)
     squared = ((g.means[:, None] - g.means[None]) ** 2).sum(axis=2)

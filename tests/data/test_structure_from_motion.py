@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 from PIL import Image
 from scipy.spatial.transform import Rotation
+from support.colmap_models import write_dataset
 from support.corner import FOCAL, SIZE, write_photographs
 from support.datasets import load
 
-from drgs.core.errors import UserError
+from drgs.core.errors import UserError, UserNote
 from drgs.data import structure_from_motion as sfm
 from drgs.data.structure_from_motion import Search, pictures_in, place
 
@@ -112,6 +113,19 @@ def test_photographs_without_a_mask_are_looked_at_as_well(tmp_path):
     assert place(tmp_path, Search(), False, said).names == tuple(names)
 
 
+def test_masks_are_found_by_either_name(tmp_path):
+    (tmp_path / "masks").mkdir()
+    for name, level in (("a.jpg.png", 10), ("a.png", 20), ("b.png", 30)):
+        Image.new("L", (8, 8), level).save(tmp_path / "masks" / name)
+    for name in ("a.jpg", "b.jpg", "c.jpg"):
+        Image.new("RGB", (8, 8)).save(tmp_path / name)
+    some = work(tmp_path, ["a.jpg", "b.jpg", "c.jpg"])
+    some.folder = tmp_path / "work"
+    masks = some._masks_for_all()
+    levels = [Image.open(masks / f"{name}.png").getpixel((0, 0)) for name in some.names]
+    assert levels == [10, 30, 255]
+
+
 def test_photographs_of_two_sizes_share_no_camera(tmp_path):
     for k, size in enumerate([(64, 48), (48, 64), (64, 48)]):
         Image.new("RGB", size).save(tmp_path / f"{k}.png")
@@ -157,7 +171,7 @@ def test_what_colmap_refuses_is_said_in_one_line():
 
 
 def work(folder, names, **search):
-    return sfm._Work(None, folder, folder, folder / "masks", names, Search(**search), said)
+    return sfm._Work(None, folder, folder, folder, names, Search(**search), said)
 
 
 def test_names_are_in_the_order_of_their_numbers(tmp_path):
@@ -169,6 +183,60 @@ def test_names_are_in_the_order_of_their_numbers(tmp_path):
     (tmp_path / "images" / "10.png").write_bytes(b"not a picture")
     with pytest.raises(UserError, match=r"10\.png: cannot read the image"):
         pictures_in(tmp_path)
+
+
+def test_what_colmap_does_not_read_is_left_out_with_a_word(tmp_path):
+    for name in ("b.jpg", "a.tif", "c.webp"):
+        Image.new("RGB", (8, 8)).save(tmp_path / name)
+    for name in ("a.heic", "b.DNG", "._b.jpg"):
+        (tmp_path / name).write_bytes(b"")
+    with pytest.warns(
+        UserNote, match=r"left out, as COLMAP does not read them: a\.heic, b\.DNG, c"
+    ):
+        assert pictures_in(tmp_path)[1] == ["a.tif", "b.jpg"]
+    (tmp_path / "a.tif").unlink()
+    (tmp_path / "b.jpg").unlink()
+    with pytest.raises(UserError, match=r"got a\.heic, .*, which COLMAP does not read; convert"):
+        pictures_in(tmp_path)
+
+
+@pytest.mark.parametrize(("mode", "size", "message"), [
+    ("CMYK", (8, 8), r"Pillow's mode CMYK; convert it"),
+    ("1", (8193, 8192), r"at most 67,108,864 pixels, got 8193 x 8192"),
+])  # fmt: skip
+def test_what_a_fit_refuses_is_refused_before_the_search(tmp_path, mode, size, message):
+    Image.new(mode, size).save(tmp_path / "a.tif", compression="group4" if mode == "1" else None)
+    with pytest.raises(UserError, match=message):
+        pictures_in(tmp_path)
+
+
+@pytest.mark.parametrize("below", ["sparse", "colmap/sparse/0"])
+def test_a_model_elsewhere_in_the_folder_is_said_and_not_doubled(tmp_path, below, monkeypatch):
+    monkeypatch.setitem(sys.modules, "pycolmap", SimpleNamespace())
+    folder = tmp_path / "my photos"
+    write_dataset(folder, below=below)
+    message = rf"{below}: is there already; drgs fit '.*my photos' uses it, --overwrite writes "
+    with pytest.raises(UserError, match=message):
+        place(folder, Search(), False, said)
+
+
+def test_an_empty_folder_is_no_model_and_another_one_is_not_written_over(tmp_path):
+    model = tmp_path / "sparse" / "0"
+    model.mkdir(parents=True)
+    sfm._check_free(tmp_path, model)
+    (model / "notes.txt").touch()
+    with pytest.raises(UserError, match=r"sparse/0: is there already, and holds no model"):
+        sfm._check_free(tmp_path, model)
+
+
+def test_options_that_are_offered_are_others():
+    few, many = sfm.ALL_PAIRS, sfm.ALL_PAIRS + 1
+    assert "--compare all" not in Search().others(few) + Search(compare="all").others(many)
+    assert "--compare all" in Search().others(many) + Search(compare="neighbours").others(few)
+    assert "--share one" in Search().others(9) and "--camera-model SIMPLE" in Search().others(9)
+    assert Search("SIMPLE_RADIAL", "all", "one").others(9) == (
+        "--camera-model OPENCV_FISHEYE (a fisheye)"
+    )
 
 
 def test_photographs_of_one_size_and_lens_share_a_camera(tmp_path):

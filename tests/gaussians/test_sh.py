@@ -6,6 +6,7 @@ import pytest
 from support.helpers import both_precisions, relative_errors, rows, single
 from support.reference_scenes import legendre_sh_basis
 
+from drgs.core.constants import SH_C0
 from drgs.gaussians import sh
 from drgs.reference import splatting as reference
 
@@ -33,11 +34,11 @@ def test_number_of_coefficients(degree):
 
 
 def test_constants_are_those_of_the_normalisation():
-    """C0 to C3 from pi alone, to the last digits of a double."""
+    """Of degrees 0 to 3 from pi alone, to the last digits of a double."""
     pi = np.pi
     c2, c3 = np.sqrt(15 / pi) / 2, np.sqrt(105 / pi)
     expected = {
-        "C0": np.sqrt(1 / pi) / 2,
+        "SH_C0": np.sqrt(1 / pi) / 2,
         "C1": np.sqrt(3 / pi) / 2,
         "C2": [c2, -c2, np.sqrt(5 / pi) / 4, -c2, c2 / 2],
         "C3": [
@@ -113,12 +114,12 @@ def test_clamped_colour_is_zero_and_has_no_gradient(precision):
     dr.enable_grad(coefficient)
     color = sh.sh_color([coefficient], precision.Array3f(0, 0, 1), 0)
     dr.backward(color)
-    below = 0.5 - 1.7 * sh.C0
+    below = 0.5 - 1.7 * SH_C0
     assert below > 0
     np.testing.assert_allclose(
-        rows(dr.detach(color))[0], [0, 0.5 + sh.C0, below], rtol=0, atol=tolerance(precision)
+        rows(dr.detach(color))[0], [0, 0.5 + SH_C0, below], rtol=0, atol=tolerance(precision)
     )
-    np.testing.assert_allclose(rows(dr.grad(coefficient))[0], [0, sh.C0, sh.C0], rtol=1e-6)
+    np.testing.assert_allclose(rows(dr.grad(coefficient))[0], [0, SH_C0, SH_C0], rtol=1e-6)
 
 
 @both_precisions
