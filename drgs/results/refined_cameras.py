@@ -13,8 +13,10 @@ from drgs.cameras.axes import between_opencv_and_opengl
 from drgs.core.errors import UserError, one_line
 from drgs.core.files import atomic_path, read_text
 from drgs.data.transforms import CLOSE, MAX_BYTES
-from drgs.data.types import Dataset, Motion, View
-from drgs.results.files import CAMERAS
+from drgs.data.types import Dataset, Motion, View, Viewpoint
+from drgs.data.viewpoints import read_viewpoints
+from drgs.results.files import CAMERAS, VIEWS
+from drgs.results.folder import load_run_config
 
 MODELS = {
     "opencv": "FULL_OPENCV",
@@ -62,6 +64,16 @@ def refined_dataset(dataset: Dataset, folder: Path) -> Dataset:
     return replace(
         dataset, train=tuple(map(change.of, train)), test=tuple(map(change.of, dataset.test))
     )
+
+
+def training_cameras(folder: Path) -> list[Viewpoint] | None:
+    """The training cameras of a fit's folder: as refined, where its fit refines them.
+
+    None: the folder has none. Raises :class:`UserError` as ``read_viewpoints``.
+    """
+    refined = (folder / CAMERAS).is_file() and load_run_config(folder).cameras.optimise
+    path = folder / (CAMERAS if refined else VIEWS)
+    return read_viewpoints(path, None) if path.is_file() else None
 
 
 def _opencv_pose(rows: list[list[float]]) -> np.ndarray:

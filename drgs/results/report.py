@@ -46,7 +46,7 @@ from drgs.results.files import (
 )
 from drgs.results.metrics import FitMetrics, psnr, ssim
 from drgs.results.population import story_of
-from drgs.results.viewer import Shown, write_viewer
+from drgs.results.viewer import Shown, seconds_of_page, write_viewer
 
 DIFFERENCE_GAIN = 5.0
 """Of difference pictures, 0.5 + gain (fitted - truth): saturates at 10 % of the range."""
@@ -67,9 +67,6 @@ PAGE = "page.html"
 
 PAGE_SECONDS = 3.5
 """Curves and page, which do not depend on the scene: 2.8 to 3.4 s on two cores (AMD Zen 4)."""
-
-VIEWER_SECONDS = 0.5
-"""The page to walk around in, with 50,000 Gaussians: 0.4 to 0.5 s on two cores (AMD Zen 4)."""
 
 FILES_SECONDS = 0.3
 """Gaussians, histories and the rest of the files: measured with 50,000 Gaussians."""
@@ -131,7 +128,8 @@ def write_results(
     write_orbit(out / ORBIT, fitted.scene, dataset, fitted.gaussians)
     write_viewer(out, dataset, fitted.shown)
     orbit = (out / ORBIT).read_bytes()
-    write_report(out / REPORT, out.name, dataset, fitted.render, scores, history, metrics, orbit)
+    title = out.resolve().name
+    write_report(out / REPORT, title, dataset, fitted.render, scores, history, metrics, orbit)
 
 
 class Seconds(NamedTuple):
@@ -142,8 +140,13 @@ class Seconds(NamedTuple):
     report: float  # ``side_by_side/`` and what :func:`write_results` writes
 
 
-def seconds_of_results(scene: mi.Scene, dataset: Dataset) -> Seconds:
-    """About what results will take: one test view is tried out."""
+def seconds_of_results(
+    scene: mi.Scene, dataset: Dataset, num_gaussians: int, sh_degree: int
+) -> Seconds:
+    """About what results will take: one test view is tried out.
+
+    num_gaussians, sh_degree: of what there will be in the end.
+    """
     view = dataset.test[0]
     for _ in range(2):  # the first time, kernels and libraries are loaded
         start = time.perf_counter()
@@ -162,7 +165,7 @@ def seconds_of_results(scene: mi.Scene, dataset: Dataset) -> Seconds:
         measuring=FILES_SECONDS + views * measured,
         renders=views * (written - measured),
         report=PAGE_SECONDS
-        + VIEWER_SECONDS
+        + seconds_of_page(num_gaussians, sh_degree)
         + views * (compared - written)
         + ORBIT_FRAMES * of_frame,
     )
