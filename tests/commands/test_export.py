@@ -171,6 +171,15 @@ def test_usd_is_written_where_openusd_is_installed(model):
     assert splats.GetRadianceSphericalHarmonicsDegreeAttr().Get() == 1
 
 
+def test_usd_of_equal_gaussians_has_equal_bytes(model):
+    pytest.importorskip("pxr.UsdVol")
+    contents = []
+    for name in ("a.usdc", "b.usdc"):
+        run(model, "--out", model.with_name(name))
+        contents.append(model.with_name(name).read_bytes())
+    assert contents[0] == contents[1]
+
+
 def test_without_openusd_a_line_says_what_to_install(model, monkeypatch):
     monkeypatch.setitem(sys.modules, "pxr", None)
     message = "USD: needs pxr, which is not installed; pip install 'drgs[usd]'"
