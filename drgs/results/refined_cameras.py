@@ -66,14 +66,25 @@ def refined_dataset(dataset: Dataset, folder: Path) -> Dataset:
     )
 
 
-def training_cameras(folder: Path) -> list[Viewpoint] | None:
-    """The training cameras of a fit's folder: as refined, where its fit refines them.
+def refined_cameras(folder: Path) -> list[Viewpoint] | None:
+    """The training cameras as the fit in ``folder`` has refined them; None: it has not.
 
-    None: the folder has none. Raises :class:`UserError` as ``read_viewpoints``.
+    Raises :class:`UserError` as ``read_viewpoints``.
     """
-    refined = (folder / CAMERAS).is_file() and load_run_config(folder).cameras.optimise
-    path = folder / (CAMERAS if refined else VIEWS)
-    return read_viewpoints(path, None) if path.is_file() else None
+    path = folder / CAMERAS
+    if not path.is_file() or not load_run_config(folder).cameras.optimise:
+        return None
+    return read_viewpoints(path, None)
+
+
+def training_cameras(folder: Path) -> list[Viewpoint] | None:
+    """The training cameras of the fit in ``folder``, refined if it has refined them.
+
+    None: it has left none. Raises :class:`UserError` as ``read_viewpoints``.
+    """
+    if (refined := refined_cameras(folder)) is not None:
+        return refined
+    return read_viewpoints(folder / VIEWS, None) if (folder / VIEWS).is_file() else None
 
 
 def _opencv_pose(rows: list[list[float]]) -> np.ndarray:

@@ -5,13 +5,14 @@ import gzip
 import hashlib
 import json
 import re
-from dataclasses import asdict, replace
+from dataclasses import replace
 from html.parser import HTMLParser
 from importlib import resources
 from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 from scipy.spatial.transform import Rotation
 from support.formats import gaussians_within_ranges
 from support.small_capture import FOCUS, RADIUS, blobs, make_dataset, pose_around
@@ -21,7 +22,7 @@ from drgs.core.errors import UserError, UserNote
 from drgs.data.viewpoints import pinhole
 from drgs.gaussians.parameters import Gaussians
 from drgs.results import viewer
-from drgs.results.refined_cameras import LensChange, frames_of
+from drgs.results.refined_cameras import write_views
 from drgs.results.viewer import Shown, Standpoint, viewer_page
 
 SHIPPED = resources.files("drgs.results").joinpath("supersplat_viewer")
@@ -254,10 +255,11 @@ def test_the_first_view_is_that_of_the_refined_cameras(tmp_path):
     """All of them twice as far away: what is walked around is half as large on the page."""
     dataset, sizes = make_dataset(), []
     far = [replace(view, camera_to_world=far_pose(view.camera_to_world)) for view in dataset.train]
-    for folder, views in (("given", dataset.train), ("refined", far)):
+    for folder in ("given", "refined"):
         (tmp_path / folder).mkdir()
-        cameras = {"lens_change": asdict(LensChange()), "frames": frames_of(views)}
-        (tmp_path / folder / "cameras.json").write_text(json.dumps(cameras))
+        config = {"data": {"path": "data"}, "cameras": {"optimise": folder == "refined"}}
+        (tmp_path / folder / "config.yml").write_text(yaml.safe_dump(config))
+        write_views(tmp_path / folder / "cameras.json", far)
         viewer.write_viewer(tmp_path / folder, dataset, Shown(blobs(), OWN))
         splats = Page((tmp_path / folder / "viewer.html").read_bytes()).texts["splats"]
         (tmp_path / "a.ply").write_bytes(gzip.decompress(base64.b64decode(splats)))
