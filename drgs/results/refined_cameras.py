@@ -66,7 +66,7 @@ def refined_dataset(dataset: Dataset, folder: Path) -> Dataset:
     )
 
 
-def refined_cameras(folder: Path) -> list[Viewpoint] | None:
+def refined_viewpoints(folder: Path) -> list[Viewpoint] | None:
     """The training cameras as the fit in ``folder`` has refined them; None: it has not.
 
     Raises :class:`UserError` as ``read_viewpoints``.
@@ -82,7 +82,7 @@ def training_cameras(folder: Path) -> list[Viewpoint] | None:
 
     None: it has left none. Raises :class:`UserError` as ``read_viewpoints``.
     """
-    if (refined := refined_cameras(folder)) is not None:
+    if (refined := refined_viewpoints(folder)) is not None:
         return refined
     return read_viewpoints(folder / VIEWS, None) if (folder / VIEWS).is_file() else None
 

@@ -34,7 +34,7 @@ from drgs.data.viewpoints import FIELD_OF_VIEW
 from drgs.gaussians.parameters import Gaussians
 from drgs.gaussians.similarity import Similarity
 from drgs.results.files import VIEWER
-from drgs.results.refined_cameras import refined_cameras
+from drgs.results.refined_cameras import refined_viewpoints
 
 MOST_BYTES = 25_000_000
 """Of a page that is written without being asked for: what mail services take. It holds half a
@@ -185,7 +185,7 @@ def write_viewer(out: Path, dataset: Dataset, shown: Shown) -> None:
     if least > MOST_BYTES:
         _note_size(out, f"at least {least / 1e6:.0f}")
         return
-    standpoint = Standpoint.of_views(refined_cameras(out) or dataset.train, gaussians)
+    standpoint = Standpoint.of_views(refined_viewpoints(out) or dataset.train, gaussians)
     page = viewer_page(out.resolve().name, shown, standpoint, dataset.background)
     if len(page) > MOST_BYTES:
         _note_size(out, f"{len(page) / 1e6:.0f}")
