@@ -2,8 +2,8 @@
 """``python .ci/viewer.py``: fetch the viewer that ``viewer.html`` holds, at a pinned version.
 
 For releases, never at run time: what it writes, ``drgs/results/supersplat_viewer/``, belongs to the
-repository. Needs npm. ``MANIFEST.json`` has the versions, what is changed in the source, and the
-hashes of what is shipped; the same versions give the same bytes.
+repository. Needs npm and Linux on x86-64. ``MANIFEST.json`` has the versions, what is changed in
+the source, and the hashes of what is shipped; the same versions give the same bytes.
 """
 
 from __future__ import annotations
@@ -41,7 +41,12 @@ ENGINE = Package(
 )
 """Whose code the viewer's bundle contains; only its licence is fetched."""
 
-MINIFIER = "esbuild@0.28.2"
+MINIFIER = Package(
+    "@esbuild/linux-x64",
+    "0.28.2",
+    "sha512-4xTZr1FUmSoQW4XIWmit3tzQrUTZM+N3P0XV8xROKYF50XfI7xeO90+1bZvNwxIufQ9hDQVRJH5YhgPVF8A/HQ==",
+)
+"""esbuild's program, which needs nothing else."""
 
 
 class Change(NamedTuple):
@@ -92,11 +97,12 @@ def main() -> None:
     """Write the folder."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        viewer, engine = (fetched(package, folder) for package in (VIEWER, ENGINE))
+        packages = VIEWER, ENGINE, MINIFIER
+        viewer, engine, minifier = (fetched(package, folder) for package in packages)
         bundle = (viewer / "public" / "index.js").read_text("utf-8")
         if f'"{ENGINE.version}"' not in bundle:
             raise SystemExit(f"the bundle does not contain {ENGINE.name} {ENGINE.version}")
-        code = minified(changed(bundle), folder)
+        code = minified(changed(bundle), minifier / "bin" / "esbuild", folder)
         files = {
             "viewer.js.gz": gzip.compress(code, 9, mtime=0),
             "viewer.css": (viewer / "public" / "index.css").read_bytes(),
@@ -133,10 +139,10 @@ def changed(source: str) -> str:
     return source
 
 
-def minified(source: str, folder: Path) -> bytes:
+def minified(source: str, program: Path, folder: Path) -> bytes:
     """The module without what only people read."""
     (folder / "bundle.mjs").write_text(source, "utf-8")
-    command = ["npx", "--yes", MINIFIER, "bundle.mjs", "--minify", "--log-level=error"]
+    command = [program, "bundle.mjs", "--minify", "--log-level=error"]
     return subprocess.run(command, cwd=folder, check=True, stdout=subprocess.PIPE).stdout
 
 
@@ -154,7 +160,7 @@ def manifest(files: dict[str, bytes]) -> dict[str, object]:
     return {
         "made_by": "python .ci/viewer.py",
         "packages": [package._asdict() for package in (VIEWER, ENGINE)],
-        "minifier": MINIFIER,
+        "minifier": MINIFIER._asdict(),
         "changes": [change._asdict() for change in CHANGES],
         "sha256": {name: hashlib.sha256(content).hexdigest() for name, content in files.items()},
     }

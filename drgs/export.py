@@ -17,11 +17,12 @@ import numpy as np
 
 from drgs.cli.commands import CommandParser, file_or_folder, finite_number, run_command
 from drgs.config.approximations import DECLARED, Approximations, said_by
+from drgs.core.constants import LOW_PASS
 from drgs.core.errors import UserError, UserNote, did_you_mean, one_line
 from drgs.core.files import atomic_path
 from drgs.core.records import FolderRecord
 from drgs.data.orbits import up_of
-from drgs.data.viewpoints import near_one, read_viewpoints
+from drgs.data.viewpoints import near_one
 from drgs.effects.smoothing import baked
 from drgs.gaussians.cleaning import Selection, taken, turned_towards
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
@@ -29,6 +30,7 @@ from drgs.io.formats import FORMATS, Format, format_of
 from drgs.io.morton import morton_order
 from drgs.results.files import CONFIG, GAUSSIANS, GAUSSIANS_FOR_VIEWERS, VIEWS
 from drgs.results.folder import load_run_config
+from drgs.results.refined_cameras import training_cameras
 from drgs.results.viewer import HONOURED, Shown, Standpoint, viewer_page
 
 COMMAND = "export"
@@ -41,8 +43,9 @@ Y_DOWN = np.array([0.0, -1.0, 0.0])
 reference fits."""
 
 PLAYCANVAS = "compressed-ply"
-"""The format of viewers that add 0.075 square pixels to splats, where others add 0.3: what a fit
-with 0.1 has of its own looks better there than what it has for the others."""
+
+PLAYCANVAS_LOW_PASS = 0.075
+"""Square pixels that the viewers of that format add to splats, where others add 0.3."""
 
 SNAPPED = np.cos(np.radians(5))
 """Cosine of the angle to an axis within which the training cameras' up is that axis."""
@@ -58,6 +61,17 @@ class Source:
     is_turned: bool = False  # then the fit's cameras are no longer where they were
 
 
+Honoured = Callable[[Approximations], frozenset[str]]
+"""Of the approximations that Gaussians were fitted with, by name, those that they are shown with,
+or nearly."""
+
+
+def _honoured_by_playcanvas(fitted: Approximations) -> frozenset[str]:
+    """A low-pass that is nearer to PlayCanvas's than to that of others, with its compensation."""
+    ours = abs(fitted.low_pass - PLAYCANVAS_LOW_PASS)
+    return HONOURED if ours < abs(fitted.low_pass - LOW_PASS) else frozenset()
+
+
 @dataclass(frozen=True)
 class Target:
     """What it is exported to."""
@@ -67,7 +81,7 @@ class Target:
     encode: Callable[[Source], bytes]  # equal Gaussians give equal bytes
     up: np.ndarray  # (3,) what programs take for up
     has_axes: bool = False  # whether the format says so: then models are always turned
-    honoured: frozenset[str] = frozenset()  # approximations that it shows Gaussians with, or nearly
+    honoured: Honoured | None = None  # None: nothing is
 
 
 def _usd(source: Source) -> bytes:
@@ -83,7 +97,7 @@ def _of_format(each: Format) -> Target:
         lambda source: source.gaussians.to_bytes(each.name),
         Z_UP if each.y_up else Y_DOWN,
         has_axes=each.y_up,
-        honoured=HONOURED if each.name == PLAYCANVAS else frozenset(),
+        honoured=_honoured_by_playcanvas if each.name == PLAYCANVAS else None,
     )
 
 
@@ -91,8 +105,9 @@ def _page(source: Source) -> bytes:
     """With the first view and the background of the fit, or before black where there is none."""
     gaussians, folder = source.gaussians, source.folder
     background = (0.0, 0.0, 0.0) if folder is None else load_run_config(folder).data.background_rgb
-    if folder is not None and not source.is_turned and (folder / VIEWS).is_file():
-        standpoint = Standpoint.of_views(read_viewpoints(folder / VIEWS, None), gaussians)
+    cameras = None if folder is None or source.is_turned else training_cameras(folder)
+    if cameras is not None:
+        standpoint = Standpoint.of_views(cameras, gaussians)
     else:
         standpoint = Standpoint.of_gaussians(gaussians, Z_UP)
     title = source.path.name if folder is None else folder.resolve().name
@@ -106,7 +121,11 @@ TARGETS = {
         ".usdc", "OpenUSD's ParticleField3DGaussianSplat (extra usd)", _usd, Z_UP, has_axes=True
     ),
     "html": Target(
-        ".html", "a page to walk around in, for any browser", _page, Z_UP, honoured=HONOURED
+        ".html",
+        "a page to walk around in, for any browser",
+        _page,
+        Z_UP,
+        honoured=lambda _: HONOURED,
     ),
 }
 """By the name that ``--format`` takes."""
@@ -202,12 +221,12 @@ def run(args: argparse.Namespace) -> None:
 # ----------------------------------------------------------------------------------------------
 
 
-def load_source(what: Path, honoured: frozenset[str] = frozenset()) -> Source:
+def load_source(what: Path, honoured: Honoured | None = None) -> Source:
     """The Gaussians of a fit's folder that are meant for other programs, or those of a file.
 
-    honoured: approximations that the target shows them with. The fit's own Gaussians are taken
-    where they need no others. What a file says that other programs would not do is a
-    :class:`UserNote`; what they do anyway is dropped. A smoothing filter is baked in.
+    honoured: by the target. The fit's own Gaussians are taken where that is all that they need.
+    What a file says that other programs would not do is a :class:`UserNote`; what they do anyway is
+    dropped. A smoothing filter is baked in.
     """
     if not what.exists():
         raise UserError(f"{what}: there is no such file or folder")
@@ -223,18 +242,19 @@ def load_source(what: Path, honoured: frozenset[str] = frozenset()) -> Source:
     gaussians = Gaussians.load(path)
     said = said_by(str(path), gaussians.rendered_with or {})
     others = {name: value for name, value in said.items() if value != DECLARED[name].default}
-    if unknown := {name: value for name, value in others.items() if name not in honoured}:
+    shown = frozenset() if honoured is None else honoured(Approximations.of(said))
+    if unknown := {name: value for name, value in others.items() if name not in shown}:
         _note_rendering(path, unknown)
     gaussians = baked(replace(gaussians, rendered_with=others or None))
     return Source(gaussians, path, what if what.is_dir() else None)
 
 
-def _shows_own(folder: Path, honoured: frozenset[str]) -> bool:
+def _shows_own(folder: Path, honoured: Honoured) -> bool:
     """Whether a fit's own Gaussians are there, and need no other approximations."""
-    if not honoured or not (folder / GAUSSIANS).is_file():
+    if honoured is None or not (folder / GAUSSIANS).is_file():
         return False
-    needed = load_run_config(folder).model.approximations.others_than_default
-    return needed.keys() <= honoured
+    fitted = load_run_config(folder).model.approximations
+    return fitted.others_than_default.keys() <= honoured(fitted)
 
 
 def _note_rendering(path: Path, others: dict[str, object]) -> None:
@@ -302,18 +322,18 @@ def _selected(source: Source, selection: Selection) -> Gaussians:
 
 def _up(args: argparse.Namespace, source: Source, target: Target) -> np.ndarray | None:
     """(3,) what is up in the model's world; None: it is not to be turned. With a line about it."""
-    words, views = args.up, source.folder and source.folder / VIEWS
-    has_cameras = views is not None and views.is_file()
+    words = args.up
     if words is None and not target.has_axes:
         return None
+    cameras = None if source.folder is None else training_cameras(source.folder)
     if words is None:
-        words = ["cameras"] if has_cameras else ["0", "0", "1"]
+        words = ["0", "0", "1"] if cameras is None else ["cameras"]
     if words == ["cameras"]:
-        if not has_cameras:
+        if cameras is None:
             raise UserError(
                 f"--up cameras: needs the output folder of a fit with {VIEWS}; give --up X Y Z"
             )
-        up, why = _snapped(up_of(read_viewpoints(views, None))), " (the training cameras')"
+        up, why = _snapped(up_of(cameras)), " (the training cameras')"
     else:
         up, why = _direction(words), "" if args.up else " (give --up otherwise)"
     print(f"up: {' '.join(f'{x:.3g}' for x in up)}{why}", flush=True)
@@ -335,7 +355,7 @@ def _direction(words: Sequence[str]) -> np.ndarray:
 def _snapped(up: np.ndarray) -> np.ndarray:
     """The axis that is next to it, if one is: what was estimated is off by a little."""
     axis = np.argmax(np.abs(up))
-    return np.sign(up[axis]) * np.eye(3)[axis] if abs(up[axis]) >= SNAPPED else up
+    return np.sign(up[axis]) * np.eye(3)[axis] + 0.0 if abs(up[axis]) >= SNAPPED else up
 
 
 if __name__ == "__main__":

@@ -113,6 +113,7 @@ from drgs.training.budget import (
     make_plan,
     parse_duration,
     rehearse,
+    target_of,
 )
 from drgs.training.checkpoint import (
     Checkpoint,
@@ -390,7 +391,10 @@ def planned(
     end: of everything, by ``time.perf_counter``.
     """
     rehearsal = rehearse(config, dataset, gaussians)
-    results = seconds_of_results(rehearsal.trainer.scene, dataset)
+    num_points, num_gaussians = gaussians.num_gaussians, target_of(config) or 0
+    results = seconds_of_results(
+        rehearsal.trainer.scene, dataset, max(num_points, num_gaussians), config.model.sh_degree
+    )
     pictures = results.renders if config.output.save_renders else 0.0
     pictures += results.report + seconds_of_curves() if config.output.report else 0.0
     if pictures > MOST_FOR_PICTURES * (end - time.perf_counter()):
@@ -406,7 +410,7 @@ def planned(
         end -= TIME_SHARE * max(0.0, end - time.perf_counter())
     side = min(min(view.width, view.height) for view in dataset.train)
     seconds = end - time.perf_counter()
-    num_points, second = gaussians.num_gaussians, rehearsal.iteration_s
+    second = rehearsal.iteration_s
     return end, make_plan(config, num_points, side, seconds, second, load_curves())
 
 

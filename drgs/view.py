@@ -26,13 +26,13 @@ from drgs.core.errors import UserError
 from drgs.core.extras import required
 from drgs.data.orbits import orbit_of_gaussians
 from drgs.data.types import Viewpoint
-from drgs.data.viewpoints import FIELD_OF_VIEW, read_viewpoints
+from drgs.data.viewpoints import FIELD_OF_VIEW
 from drgs.live.frames import LiveScene
 from drgs.live.page import Page, StartView
 from drgs.live.spectators import Spectators
 from drgs.live.wishes import Wishes
 from drgs.render import UP, Model, load_model
-from drgs.results.files import CAMERAS, VIEWS
+from drgs.results.refined_cameras import training_cameras
 
 IDLE_SECONDS = 0.05
 """Between two looks at whether a camera is still, or Ctrl-C was pressed."""
@@ -112,11 +112,8 @@ def model_of(args: argparse.Namespace) -> Model:
 
 def cameras_of(args: argparse.Namespace, model: Model) -> Sequence[Viewpoint]:
     """Those of a fit's training views, refined if it has refined them; else one that sees all."""
-    if args.what.is_dir():
-        refined = model.config is not None and model.config.cameras.optimise
-        for name in (CAMERAS, VIEWS) if refined else (VIEWS,):
-            if (args.what / name).is_file():
-                return read_viewpoints(args.what / name, None)
+    if args.what.is_dir() and (views := training_cameras(args.what)) is not None:
+        return views
     orbit = orbit_of_gaussians(model.gaussians, np.array(args.up or UP), FIELD_OF_VIEW)
     return orbit.viewpoints(1, 400, 400, FIELD_OF_VIEW)
 

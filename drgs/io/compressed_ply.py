@@ -189,7 +189,7 @@ def read_gaussians(path: str | Path) -> tuple[dict[str, np.ndarray], dict[str, S
 
 
 def _checked_bounds(path: str | Path, rows: Mapping[str, np.ndarray], colors: bool) -> np.ndarray:
-    """The rows of element ``chunk``, all of whose numbers are finite."""
+    """The rows of element ``chunk``, whose bounds are finite and in order."""
     chunk, names = rows["chunk"], _chunk_names(colors)
     expected = -(-len(rows["vertex"]) // CHUNK)
     if len(chunk) != expected:
@@ -207,6 +207,14 @@ def _checked_bounds(path: str | Path, rows: Mapping[str, np.ndarray], colors: bo
             raise UserError(
                 f"{path}: element chunk, row {bad[0]}: {name} must be a finite float32 number, got "
                 f"{chunk[name][bad[0]]}"
+            )
+    for high in (name for name in names if name.startswith("max_")):
+        low = high.replace("max_", "min_")
+        bad = np.flatnonzero(chunk[high] < chunk[low])
+        if len(bad):
+            raise UserError(
+                f"{path}: element chunk, row {bad[0]}: {high} must not be below {low}, got "
+                f"{chunk[high][bad[0]]} and {chunk[low][bad[0]]}"
             )
     return chunk
 

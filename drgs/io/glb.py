@@ -26,7 +26,7 @@ import numpy as np
 from drgs.core.constants import SH_C0
 from drgs.core.errors import Place, UserError
 from drgs.core.files import read_bytes
-from drgs.io.glb_document import EXTENSION, Document, read_document
+from drgs.io.glb_document import EXTENSION, OURS, Document, read_document
 from drgs.io.ply import Scalar
 from drgs.io.quantized import (
     log_scales_of,
@@ -68,7 +68,7 @@ def encode(
     up; rendered_with: for ``extras``, None: nothing is said.
     """
     attributes = _attributes(gaussians)
-    extras = {"drgs": dict(rendered_with)} if rendered_with else None
+    extras = {OURS: dict(rendered_with)} if rendered_with else None
     text = json.dumps(_document(attributes, extras), separators=(",", ":")).encode()
     text += b" " * (-len(text) % 4)
     binary = b"".join(values.tobytes() for values in attributes.values())

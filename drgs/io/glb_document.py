@@ -15,13 +15,15 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from pydantic.alias_generators import to_camel
 
 from drgs.core.errors import UserError, listed, one_line
+from drgs.io.ply import STATEMENT, Scalar
 
 EXTENSION = "KHR_gaussian_splatting"
 
 REQUIRED = ("POSITION", *(f"{EXTENSION}:{name}" for name in ("ROTATION", "SCALE", "OPACITY")))
 
 Index = Annotated[int, Field(ge=0, lt=2**32)]
-Scalar = bool | int | float | str
+OURS = "drgs"
+"""The key of extras that are ours."""
 
 IDENTITY = {
     "matrix": [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1],
@@ -66,10 +68,6 @@ class _Extensions(_Part):
     splatting: _Splatting = Field(alias=EXTENSION)
 
 
-class _Extras(_Part):
-    drgs: dict[str, Scalar] = {}
-
-
 class _Primitive(_Part):
     attributes: dict[str, Index]
     mode: Literal[0]
@@ -110,11 +108,22 @@ class Document:
 
     @property
     def rendered_with(self) -> dict[str, Scalar]:
-        """What we have written there; nothing, where somebody else has written it."""
-        try:
-            return _Extras.model_validate(self.primitive.extras).drgs
-        except ValidationError:
+        """What the primitive's extras say of it; nothing, where they are somebody else's."""
+        extras = self.primitive.extras
+        if not isinstance(extras, dict) or OURS not in extras:
             return {}
+        where, said = f"{self.path}: {self.place}.extras.{OURS}", extras[OURS]
+        if not isinstance(said, dict):
+            raise UserError(
+                f"{where}: must be an object, got {one_line(repr(said), 60)}; remove it"
+            )
+        for name, value in said.items():
+            if not isinstance(value, Scalar) or not STATEMENT.fullmatch(f"{OURS} {name} {value}"):
+                raise UserError(
+                    f"{where}: must be names and values of one word, got {one_line(name, 60)!r}: "
+                    f"{one_line(repr(value), 60)}; correct it, or remove it"
+                )
+        return said
 
     def accessor(self, name: str) -> Accessor:
         """Of an attribute."""

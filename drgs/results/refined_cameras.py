@@ -13,8 +13,10 @@ from drgs.cameras.axes import between_opencv_and_opengl
 from drgs.core.errors import UserError, one_line
 from drgs.core.files import atomic_path, read_text
 from drgs.data.transforms import CLOSE, MAX_BYTES
-from drgs.data.types import Dataset, Motion, View
-from drgs.results.files import CAMERAS
+from drgs.data.types import Dataset, Motion, View, Viewpoint
+from drgs.data.viewpoints import read_viewpoints
+from drgs.results.files import CAMERAS, VIEWS
+from drgs.results.folder import load_run_config
 
 MODELS = {
     "opencv": "FULL_OPENCV",
@@ -62,6 +64,27 @@ def refined_dataset(dataset: Dataset, folder: Path) -> Dataset:
     return replace(
         dataset, train=tuple(map(change.of, train)), test=tuple(map(change.of, dataset.test))
     )
+
+
+def refined_viewpoints(folder: Path) -> list[Viewpoint] | None:
+    """The training cameras as the fit in ``folder`` has refined them; None: it has not.
+
+    Raises :class:`UserError` as ``read_viewpoints``.
+    """
+    path = folder / CAMERAS
+    if not path.is_file() or not load_run_config(folder).cameras.optimise:
+        return None
+    return read_viewpoints(path, None)
+
+
+def training_cameras(folder: Path) -> list[Viewpoint] | None:
+    """The training cameras of the fit in ``folder``, refined if it has refined them.
+
+    None: it has left none. Raises :class:`UserError` as ``read_viewpoints``.
+    """
+    if (refined := refined_viewpoints(folder)) is not None:
+        return refined
+    return read_viewpoints(folder / VIEWS, None) if (folder / VIEWS).is_file() else None
 
 
 def _opencv_pose(rows: list[list[float]]) -> np.ndarray:

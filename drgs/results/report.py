@@ -55,7 +55,7 @@ from drgs.results.files import (
 )
 from drgs.results.metrics import FitMetrics, psnr, ssim
 from drgs.results.population import story_of
-from drgs.results.viewer import Shown, write_viewer
+from drgs.results.viewer import Shown, seconds_of_page, write_viewer
 
 DIFFERENCE_GAIN = 5.0
 """Of difference pictures, 0.5 + gain (fitted - truth): saturates at 10 % of the range."""
@@ -76,9 +76,6 @@ PAGE = "page.html"
 
 TRIED_SECONDS = 0.2
 """For which a view is tried out at least: one picture of a few milliseconds says little."""
-
-VIEWER_SECONDS = 0.5
-"""The page to walk around in, with 50,000 Gaussians: 0.4 to 0.5 s on two cores (AMD Zen 4)."""
 
 FILES_SECONDS = 0.3
 """Gaussians, histories and the rest of the files: measured with 50,000 Gaussians."""
@@ -140,7 +137,8 @@ def write_results(
     write_orbit(out / ORBIT, fitted.scene, dataset, fitted.gaussians)
     write_viewer(out, dataset, fitted.shown)
     orbit = (out / ORBIT).read_bytes()
-    write_report(out / REPORT, out.name, dataset, fitted.render, scores, history, metrics, orbit)
+    title = out.resolve().name
+    write_report(out / REPORT, title, dataset, fitted.render, scores, history, metrics, orbit)
 
 
 class Seconds(NamedTuple):
@@ -151,8 +149,13 @@ class Seconds(NamedTuple):
     report: float  # ``side_by_side/`` and what :func:`write_results` writes
 
 
-def seconds_of_results(scene: mi.Scene, dataset: Dataset) -> Seconds:
-    """About what results will take without curves: one test view is tried out."""
+def seconds_of_results(
+    scene: mi.Scene, dataset: Dataset, num_gaussians: int, sh_degree: int
+) -> Seconds:
+    """About what results will take without curves: one test view is tried out.
+
+    num_gaussians, sh_degree: of what there will be in the end.
+    """
     # The first time, kernels and libraries are loaded.
     _, first = (_seconds_of_view(scene, dataset.test[0]) for _ in range(2))
     tried = [first]
@@ -163,7 +166,7 @@ def seconds_of_results(scene: mi.Scene, dataset: Dataset) -> Seconds:
     return Seconds(
         measuring=FILES_SECONDS + views * (rendered + scored),
         renders=views * written,
-        report=VIEWER_SECONDS
+        report=seconds_of_page(num_gaussians, sh_degree)
         + views * compared
         + len(choose_views(range(views))) * (rendered + 3 * encoded)
         + ORBIT_FRAMES * (2 * rendered + encoded),

@@ -70,7 +70,7 @@ class Strategy:
         """
         if self.coarse is not None and config.coarse:
             return False
-        return self.share is None or _target(config) is not None
+        return self.share is None or target_of(config) is not None
 
     def applied(self, config: FitConfig, num_points: int) -> FitConfig:
         """``config`` with this strategy; num_points: Gaussians at the start, the fewest."""
@@ -82,13 +82,13 @@ class Strategy:
             ]
         if self.share is not None:
             least = max(num_points, config.init.num_points or 0)
-            number = max(least, round(self.share * _target(config)))
+            number = max(least, round(self.share * target_of(config)))
             changes[f"densify.{config.densify.strategy}.gaussians"] = number
         return changed(config, changes)
 
 
-def _target(config: FitConfig) -> int | None:
-    """The number that the population grows to; None: its strategy knows none."""
+def target_of(config: FitConfig) -> int | None:
+    """The number of Gaussians that a fit grows to; None: its strategy knows none."""
     section = getattr(config.densify, config.densify.strategy)
     number = getattr(section, "gaussians", None)
     return None if number is None else min(number, config.densify.max_gaussians)
@@ -242,7 +242,7 @@ def make_plan(
     planned = with_iterations(config, chosen.iterations)
     planned = chosen.strategy.applied(planned, num_points)
     curve = curves[chosen.strategy.name]
-    most = max(num_points, _target(planned) or planned.densify.max_gaussians)
+    most = max(num_points, target_of(planned) or planned.densify.max_gaussians)
     return Plan(planned, chosen, tuple(candidates), seconds, start_s, curve, most)
 
 

@@ -6,6 +6,8 @@ from dataclasses import replace
 import mitsuba as mi
 import numpy as np
 import pytest
+import yaml
+from scipy.spatial.transform import Rotation
 from support.commands import assert_ends_well, assert_refused
 from support.formats import (
     FLOAT32,
@@ -90,12 +92,19 @@ def test_a_file_that_is_meant_for_drgs_is_exported_with_a_hint(fit):
     assert Gaussians.load(fit.with_name("a.glb")).rendered_with == OTHERWISE
 
 
-def test_for_playcanvas_the_fits_own_file_is_taken(fit):
-    """Its viewers add 0.075 square pixels, which is nearer to a fit's 0.1 than to 0.3."""
-    (fit / "config.yml").write_text("data: {path: data}")
+@pytest.mark.parametrize(("low_pass", "is_nearer"), [(0.1, True), (0.18, True), (0.2, False)])
+def test_for_playcanvas_the_file_whose_low_pass_is_nearer_is_taken(fit, low_pass, is_nearer):
+    """Its viewers add 0.075 square pixels, and 0.1875 is in the middle to 0.3."""
+    fitted = {"antialiased": True, "low_pass": low_pass}
+    replace(gaussians_within_ranges(20), rendered_with=fitted).save(fit / "point_cloud.ply")
+    (fit / "config.yml").write_text(yaml.safe_dump({"data": {"path": "data"}, "model": fitted}))
     outcome = run(fit, "--format", "compressed-ply")
-    assert outcome.stdout.splitlines()[0] == f"{fit}/point_cloud.ply: 20 Gaussians"
-    assert Gaussians.load(fit.with_name("run.compressed.ply")).rendered_with == OTHERWISE
+    name = "point_cloud.ply: 20" if is_nearer else "point_cloud_viewers.ply: 30"
+    assert outcome.stdout.splitlines()[0] == f"{fit}/{name} Gaussians"
+    found = Gaussians.load(fit.with_name("run.compressed.ply")).rendered_with
+    assert found == (fitted if is_nearer else None)
+    outcome = run(fit / "point_cloud.ply", "--format", "compressed-ply")
+    assert ("made to be rendered with" in outcome.stdout) == (not is_nearer)
 
 
 def test_what_was_exported_is_not_replaced_by_a_part_of_itself(model):
@@ -162,6 +171,15 @@ def test_usd_is_written_where_openusd_is_installed(model):
     assert splats.GetRadianceSphericalHarmonicsDegreeAttr().Get() == 1
 
 
+def test_usd_of_equal_gaussians_has_equal_bytes(model):
+    pytest.importorskip("pxr.UsdVol")
+    contents = []
+    for name in ("a.usdc", "b.usdc"):
+        run(model, "--out", model.with_name(name))
+        contents.append(model.with_name(name).read_bytes())
+    assert contents[0] == contents[1]
+
+
 def test_without_openusd_a_line_says_what_to_install(model, monkeypatch):
     monkeypatch.setitem(sys.modules, "pxr", None)
     message = "USD: needs pxr, which is not installed; pip install 'drgs[usd]'"
@@ -225,6 +243,25 @@ def test_files_that_say_nothing_of_axes_are_not_turned_unasked(fit, model):
     np.testing.assert_array_equal(Gaussians.load(out).means, Gaussians.load(model).means)
     outcome = run(fit, "--out", out.with_name("fit.ply"), "--up", "cameras")
     assert "up: 0 0 1 (the training cameras')" in outcome.stdout
+
+
+@pytest.mark.parametrize("optimise", [True, False])
+def test_cameras_are_those_that_the_fit_has_refined(fit, optimise):
+    turn = Rotation.from_euler("x", 90, degrees=True).as_matrix()
+    views = make_dataset(6, 1).train
+    turned_views = [replace(v, camera_to_world=pose_turned(v, turn)) for v in views]
+    write_views(fit / "cameras.json", turned_views)
+    config = {"data": {"path": "data"}, "cameras": {"optimise": optimise}}
+    (fit / "config.yml").write_text(yaml.safe_dump(config))
+    outcome = run(fit, "--format", "glb", "--up", "cameras")
+    up = "0 -1 0" if optimise else "0 0 1"
+    assert f"up: {up} (the training cameras')" in outcome.stdout
+
+
+def pose_turned(view, rotation):
+    pose = np.eye(4)
+    pose[:3] = rotation @ view.camera_to_world[:3]
+    return pose
 
 
 # ----------------------------------------------------------------------------------------------

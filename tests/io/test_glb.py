@@ -99,11 +99,32 @@ def test_what_it_is_rendered_with_stands_beside_it(tmp_path, gaussians):
     assert Gaussians.load(tmp_path / "a.glb").rendered_with == said
 
 
-def test_extras_of_others_are_ignored(tmp_path, parts):
+@pytest.mark.parametrize("extras", [7, None, [{"drgs": 1}], {"theirs": {"low_pass": []}}])
+def test_extras_of_others_are_ignored(tmp_path, parts, extras):
     document, binary = parts
-    primitive_of(document)["extras"] = {"drgs": [1, 2]}
+    primitive_of(document)["extras"] = extras
     (tmp_path / "a.glb").write_bytes(joined(document, binary))
     assert read_gaussians(tmp_path / "a.glb")[1] == {}
+
+
+@pytest.mark.parametrize(
+    ("said", "message"),
+    [
+        ([1, 2], "must be an object, got [1, 2]"),
+        (None, "must be an object, got None"),
+        ({"low_pass": [0.1]}, "must be names and values of one word, got 'low_pass': [0.1]"),
+        ({"low_pass": None}, "must be names and values of one word, got 'low_pass': None"),
+        ({"low_pass": 10**400}, "must be names and values of one word, got 'low_pass': 10"),
+        ({"order": "by\nhand"}, "must be names and values of one word, got 'order': 'by"),
+        ({"Two words": 1}, "must be names and values of one word, got 'Two words': 1"),
+    ],
+)
+def test_extras_of_ours_that_are_damaged_are_refused(tmp_path, parts, said, message):
+    document, binary = parts
+    primitive_of(document)["extras"] = {"drgs": said}
+    refused = refusal(tmp_path / "a.glb", document, binary)
+    assert refused.startswith(f"meshes[0].primitives[0].extras.drgs: {message}")
+    assert "\n" not in refused and len(refused) < 300
 
 
 def test_interleaved_and_quantised_numbers_are_read(tmp_path, gaussians, parts):

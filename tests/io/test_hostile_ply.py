@@ -8,6 +8,7 @@ import warnings
 import numpy as np
 import pytest
 from plyfile import PlyData, PlyElement
+from support.formats import gaussians_within_ranges
 
 from drgs.core.errors import UserError, UserNote
 from drgs.gaussians.parameters import Gaussians
@@ -134,6 +135,48 @@ def test_faces_take_no_memory(tmp_path):
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     assert read_points(tmp_path / "a.ply")[0].shape == (1, 3)
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 50_000  # kB
+
+
+# Headers that say something else than what follows
+
+
+def edited_headers(lines):
+    """By what was done: headers of a structure that the rows do not have, or of none."""
+    for at, line in enumerate(lines):
+        word, *words = line.split()
+        if words[:1] != [b"sh"]:  # without it, its properties are the vertices': another file
+            yield f"without {line}", lines[:at] + lines[at + 1 :]
+        yield f"twice {line}", [*lines[: at + 1], *lines[at:]]
+        others = []
+        if word == b"property":
+            others = [b"list uchar %s %s" % tuple(words), b"double %s" % words[1]]
+        if word == b"element":
+            others = [b"%s %s" % (words[0], n) for n in (b"1", b"299", b"301", b"99999999999")]
+        for other in others:
+            yield f"{line} as {other}", [*lines[:at], word + b" " + other, *lines[at + 1 :]]
+
+
+def elements_reordered(lines):
+    """The last element comes first."""
+    at = [index for index, line in enumerate(lines) if line.startswith(b"element")]
+    return [*lines[: at[0]], *lines[at[-1] : -1], *lines[at[0] : at[-1]], lines[-1]]
+
+
+@pytest.mark.parametrize("name", ["ply", "compressed-ply"])
+def test_headers_of_another_structure_are_refused(tmp_path, name):
+    path = tmp_path / "a.ply"
+    header, end, rows = gaussians_within_ranges(300, 1).to_bytes(name).partition(b"end_header\n")
+    lines = (header + end).splitlines()
+    edits = dict(edited_headers(lines))
+    assert len(edits) > 3 * len(lines)
+    if name == "compressed-ply":
+        edits["reordered"] = elements_reordered(lines)
+    for done, edited in edits.items():
+        path.write_bytes(b"\n".join([*edited, b""]) + rows)
+        with pytest.raises(UserError) as error:
+            Gaussians.load(path)
+            pytest.fail(f"read: {done}")
+        assert str(error.value).startswith(f"{path}: ") and "\n" not in str(error.value), done
 
 
 # Other files

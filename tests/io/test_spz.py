@@ -107,7 +107,7 @@ def test_extensions_are_passed_over(tmp_path):
         (0, b"XGSP", "byte 0: the header must begin with NGSP, got b'XGSP'"),
         (VERSION, struct.pack("<I", 1), "byte 0: the version must be 2 or 3 in such a stream"),
         (NUM, struct.pack("<I", 0), "byte 0: the number of Gaussians must be from 1 to"),
-        (NUM, struct.pack("<I", 2**31), "byte 0: 2,147,483,648 Gaussians were expected, for"),
+        (NUM, struct.pack("<I", 2**31), "byte 0: 2,147,483,648 Gaussians were expected, 139"),
         (NUM, struct.pack("<I", 6), "byte 16 of the unpacked stream: "),
         (DEGREE, b"\4", "byte 0: the degree of harmonics must be from 0 to 3, got 4"),
         (BITS, b"\x19", "byte 0: the bits behind the point of positions must be from 0 to 24"),
@@ -117,6 +117,24 @@ def test_a_wrong_header_is_refused(tmp_path, at, data, message):
     content = unpacked(gaussians_within_ranges(5))
     content[at : at + len(data)] = data
     assert refusal(written(tmp_path / "a.spz", content)).startswith(message)
+
+
+def test_a_file_that_unpacks_to_far_more_than_scenes_do_is_refused(tmp_path):
+    """The whole stream is there: what is refused is how small it is."""
+    header = struct.pack("<4sIIBBBB", b"NGSP", 3, 100_000, 3, 12, 0, 0)
+    text = refusal(written(tmp_path / "a.spz", header + bytes(65 * 100_000)))
+    assert "100,000 Gaussians were expected, 6,500,000 bytes when unpacked, for which a" in text
+
+
+def test_a_grid_of_equal_gaussians_is_read(tmp_path):
+    grid = np.stack(np.meshgrid(*[np.arange(30) / 10] * 3), axis=-1).reshape(-1, 3)
+    one = gaussians_within_ranges(1)
+    names = ("quats", "log_scales", "logit_opacities", "sh0", "shN")
+    same = {n: np.repeat(getattr(one, n), len(grid), axis=0) for n in names}
+    Gaussians(means=grid.astype(np.float32), **same).save(tmp_path / "a.spz")
+    assert (tmp_path / "a.spz").stat().st_size * 20 < 65 * len(grid)
+    found = Gaussians.load(tmp_path / "a.spz").means
+    np.testing.assert_allclose(found, grid, atol=2.0**-13 + FLOAT32 * 3)
 
 
 def test_a_wrong_checksum_and_what_follows_the_stream_are_refused(tmp_path):

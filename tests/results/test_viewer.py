@@ -8,10 +8,13 @@ import re
 from dataclasses import replace
 from html.parser import HTMLParser
 from importlib import resources
+from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 from scipy.spatial.transform import Rotation
+from support.formats import gaussians_within_ranges
 from support.small_capture import FOCUS, RADIUS, blobs, make_dataset, pose_around
 
 from drgs.config.approximations import Approximations
@@ -19,6 +22,7 @@ from drgs.core.errors import UserError, UserNote
 from drgs.data.viewpoints import pinhole
 from drgs.gaussians.parameters import Gaussians
 from drgs.results import viewer
+from drgs.results.refined_cameras import write_views
 from drgs.results.viewer import Shown, Standpoint, viewer_page
 
 SHIPPED = resources.files("drgs.results").joinpath("supersplat_viewer")
@@ -220,3 +224,50 @@ def test_a_page_that_is_too_large_is_not_written(tmp_path, monkeypatch):
     monkeypatch.setattr(viewer, "MOST_BYTES", size)
     viewer.write_viewer(folder, dataset, Shown(blobs(), OWN))
     assert (folder / "viewer.html").stat().st_size == size
+
+
+def test_what_is_too_large_by_its_number_alone_is_not_built(tmp_path, monkeypatch):
+    monkeypatch.setattr(viewer, "viewer_page", None)
+    monkeypatch.setattr(viewer, "MOST_BYTES", viewer.least_bytes(30, blobs().sh_degree) - 1)
+    with pytest.warns(UserNote, match=r"not written, as it would have at least 0 MB"):
+        viewer.write_viewer(tmp_path, make_dataset(), Shown(blobs(), OWN))
+    assert list(tmp_path.iterdir()) == []
+    assert viewer.seconds_of_page(30, 1) == 0 < viewer.seconds_of_page(29, 0)
+
+
+@pytest.mark.parametrize("sh_degree", [0, 3])
+def test_random_gaussians_take_between_the_least_and_all_of_their_bytes(standpoint, sh_degree):
+    """All: in base64, of them and of 72 bytes for each group of 256, and 1 % that gzip adds."""
+    counts = 256, 256 * 12
+    one, twelve = (len(page_of(gaussians_within_ranges(n, sh_degree), standpoint)) for n in counts)
+    least = viewer.least_bytes(counts[1] - counts[0], sh_degree)
+    assert least <= twelve - one <= 1.01 * (least / viewer.LEAST_SHARE + 11 * 72 * 4 / 3)
+
+
+def test_a_page_in_the_current_folder_is_named_after_it(tmp_path, monkeypatch):
+    (tmp_path / "blobs").mkdir()
+    monkeypatch.chdir(tmp_path / "blobs")
+    viewer.write_viewer(Path(), make_dataset(), Shown(blobs(), OWN))
+    assert Page(Path("viewer.html").read_bytes()).texts["title"].strip() == "blobs: Gaussian splats"
+
+
+def test_the_first_view_is_that_of_the_refined_cameras(tmp_path):
+    """All of them twice as far away: what is walked around is half as large on the page."""
+    dataset, sizes = make_dataset(), []
+    far = [replace(view, camera_to_world=far_pose(view.camera_to_world)) for view in dataset.train]
+    for folder in ("given", "refined"):
+        (tmp_path / folder).mkdir()
+        config = {"data": {"path": "data"}, "cameras": {"optimise": folder == "refined"}}
+        (tmp_path / folder / "config.yml").write_text(yaml.safe_dump(config))
+        write_views(tmp_path / folder / "cameras.json", far)
+        viewer.write_viewer(tmp_path / folder, dataset, Shown(blobs(), OWN))
+        splats = Page((tmp_path / folder / "viewer.html").read_bytes()).texts["splats"]
+        (tmp_path / "a.ply").write_bytes(gzip.decompress(base64.b64decode(splats)))
+        sizes.append(np.ptp(Gaussians.load(tmp_path / "a.ply").means, axis=0))
+    np.testing.assert_allclose(sizes[0], 2 * sizes[1], rtol=0.01)  # 10 bits of a box
+
+
+def far_pose(pose):
+    pose = pose.copy()
+    pose[:3, 3] = FOCUS + 2 * (pose[:3, 3] - FOCUS)
+    return pose

@@ -28,6 +28,14 @@ BACKGROUND = (0.15, 0.35, 0.6)
 TITLE = "</title></script><script>window.intruder = 1</script> & Größe"
 FITTED_WITH = {"low_pass": 0.1, "antialiased": True}
 
+SIZES = {"desktop": (1280, 800), "phone": (390, 844)}
+
+BUTTONS = """
+[...document.querySelectorAll("button")].map((b) => b.getBoundingClientRect())
+  .filter((r) => r.width && r.height).map((r) => [r.left, r.top, r.right, r.bottom])
+"""
+"""Those that are shown: the left, upper, right and lower edge of each, px."""
+
 TURN = Rotation.from_euler("xyz", [40, -70, 25], degrees=True).as_matrix()
 """Of the world, in which up is thus none of the axes."""
 
@@ -153,6 +161,27 @@ def test_dragging_walks_around_the_focus_at_the_same_height(page, gaussians, sta
     assert abs(after.camera_to_world[:3, 0] @ UP) < 1e-3  # upright
     assert decibels(first, page.picture()) < OTHERWISE
     assert_shown_as_fitted(page.picture(), after, gaussians)
+
+
+@pytest.mark.parametrize("size", SIZES)
+def test_with_its_controls_it_fits_the_window_and_turns(path, size):
+    width, height = SIZES[size]
+    with browsers.a_page(width, height) as page:
+        page.cut_off()
+        page.open(path.as_uri())
+        page.wait_for("window.viewer?.state.loaded")
+        settle(page)
+        edges = np.array(page.evaluate(BUTTONS))
+        assert len(edges) >= 7  # play, orbit, fly, settings, keys, about, full screen
+        assert edges.min() >= 0 and (edges[:, 2:] <= [width, height]).all()
+        before, middle = page.picture(), (width // 2, height // 2)
+        page.drag(middle, (middle[0] + 80, middle[1] + 20))
+        settle(page)
+        shown = np.s_[height // 3 : height // 2, width // 4 : 3 * width // 4]
+        assert decibels(page.picture()[shown], before[shown]) < OTHERWISE
+        assert page.troubles() == []
+        own, *others = page.requests()
+        assert own == path.as_uri() and all(a.startswith(("blob:", "data:")) for a in others)
 
 
 def test_a_title_is_text(page):
