@@ -25,7 +25,7 @@ def test_photographs_are_scaled_by_a_whole_number_and_fitted_as_in_photos_yml(tm
     example = load_config(SCENES / "photos.yml")
     assert config.data.path == tmp_path and config.data.type == "colmap"
     assert config.iterations == example.iterations
-    assert "COLMAP's model" in reasons and "7,000 iterations" in reasons
+    assert "COLMAP's model" in reasons and "4,000 iterations" in reasons
     for section in ("init", "model", "optimizer", "loss", "densify", "coarse"):
         assert getattr(config, section) == getattr(example, section)
 
