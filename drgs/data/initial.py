@@ -16,6 +16,7 @@ from drgs.core.denormals import denormals_kept
 from drgs.core.errors import UserError
 from drgs.data.derived import completed
 from drgs.data.start_box import (
+    FARTHEST,
     LEAST_LOOKING,
     box_looked_at,
     box_to_start_in,
@@ -197,8 +198,9 @@ def _random_points(config: FitConfig, dataset: Dataset) -> Start:
         return Start(box.points(init.num_points, rng), None, what)
     means = points_in_view(dataset.train, init.num_points, rng)
     focus, distance = focus_of(dataset.train)
-    within = f"within {distance:.3g} of {shown(focus, distance)}"
-    what = f"{init.num_points:,} random points that the cameras see {within}"
+    near = f"about within {distance:.3g} of {shown(focus, distance)}"
+    far = f"the others up to {FARTHEST:g} times as far"
+    what = f"{init.num_points:,} random points that the cameras see, part of them {near}, {far}"
     return Start(means, None, what)
 
 

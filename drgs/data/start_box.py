@@ -1,4 +1,4 @@
-"""Where a fit starts: random points in a box that the cameras look into.
+"""Where a fit starts: random points in a box that the cameras look into, or in what they see.
 
 What the cameras look at says more than where a fit starts: orbits and near planes follow from it,
 and points that they do not look at are refused.

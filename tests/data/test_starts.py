@@ -14,7 +14,7 @@ from drgs.config.schema import FitConfig
 from drgs.core.errors import UserError
 from drgs.data import initial_gaussians
 from drgs.data.images import downscale
-from drgs.data.initial import mean_squared_neighbour_distance
+from drgs.data.initial import mean_squared_neighbour_distance, start_of
 from drgs.data.start_box import focus_of, points_in_view
 
 
@@ -228,6 +228,15 @@ def test_half_of_the_points_in_view_are_behind_it_uniform_in_one_over_the_distan
     assert behind.min() >= 0.1
     # Of 2,000, a share of 4/9 varies by 0.011 (one sigma).
     assert np.mean(behind < 0.5) == pytest.approx((0.5 - 0.1) / (1 - 0.1), abs=0.05)
+
+
+def test_a_fit_says_that_random_points_reach_behind_what_is_looked_at():
+    dataset = dataset_of([view_at(c, (1, 0, 0)) for c in [(5, 0, 0), (1, 4, 0), (1, -4, 0)]])
+    start = start_of(config(init={"num_points": 99}), dataset)
+    assert start.description == (
+        "99 random points that the cameras see, part of them about within 4 of (1, 0, 0), the "
+        "others up to 10 times as far"
+    )
 
 
 def test_half_extent_wins_over_the_layouts_and_the_cameras_box(blender):
