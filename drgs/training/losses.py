@@ -10,9 +10,9 @@ the gradient is three more blurs: no scatter-add anywhere, and the result is bit
 
 Memory layout: a separable blur wants contiguous inputs in both directions. Each channel is cut
 into 8 x 8 tiles. One lane computes the 8 outputs of one tile row (or column) from the 18 inputs
-that they share, and hands 4-float records to the next pass: four adjacent floats cost a gather
-about as much as one does. Differentiating ``dr.convolve`` instead takes about three times as
-long.
+that they share, which it loads as three packets of 8. It stores the outputs in the order in which
+the next pass reads them: as one packet, or one by one where rows become columns. Maps are blurred
+one after the other, as the inputs of one alone fit into a core's registers.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from typing import Any
 
 import drjit as dr
 
-from drgs.core.arrays import interleave, is_float64, types_of
+from drgs.core.arrays import is_float64, types_of
 
 C1 = 0.01**2
 """(K1 L)^2 with K1 = 0.01, dynamic range L = 1 (Wang et al. 2004): stabilises luminance."""
@@ -75,12 +75,11 @@ def prepare_target(image: Any, window: int = 11, sigma: float = 1.5) -> Target:
     values = tiling.to_tiles(flat)
     dr.eval(values)
 
-    y = tiling.rows.read_values(values)
-    blurred = _blur({k: (y[k], y[k] * y[k]) for k in y}, weights)
-    records = tiling.columns.read_records_across(_store([[*maps, 0, 0] for maps in blurred]))
-    blurred = _blur({k: tuple(record)[:2] for k, record in records.items()}, weights)
-    means = _store([[mean] for mean, _ in blurred])
-    mean_squares = _store([[mean_square] for _, mean_square in blurred])
+    y = tiling.rows.read(values)
+    maps = [tiling.rows.store_across(_blur(z, weights)) for z in (y, _product(y, y))]
+    dr.eval(maps)
+    columns = tiling.columns
+    means, mean_squares = [columns.store(_blur(columns.read(z), weights)) for z in maps]
     dr.eval(means, mean_squares)
     return Target(height, width, weights, values, means, mean_squares)
 
@@ -106,6 +105,14 @@ class PhotometricLoss:
 
     def __call__(self, image: Any, target: Target) -> Any:
         """Return the loss, a ``Float`` of one value; image: (H, W, 3) tensor, display space."""
+        return self.with_squared_error(image, target)[0]
+
+    def with_squared_error(self, image: Any, target: Target) -> tuple[Any, Any]:
+        """The loss, and the mean over pixels and channels of (x - y)^2, a ``Float`` of one value.
+
+        image: (H, W, 3) tensor, display space. Not differentiated: the squared error, which costs
+        next to nothing beside the loss.
+        """
         height, width = _film_size("PhotometricLoss()", image)
         if (height, width) != (target.height, target.width):
             raise ValueError(
@@ -113,8 +120,12 @@ class PhotometricLoss:
                 f"{target.width} x {target.height}: render at the photograph's size"
             )
         if self.dssim_weight == 0:
-            return l1_loss(image, target.image)
-        return dr.custom(_PhotometricOp, image=image, target=target, weight=self.dssim_weight)
+            photograph = target.image
+            error = dr.mean(dr.square(dr.detach(image).array - photograph.array))
+            return l1_loss(image, photograph), error
+        operands = {"image": image, "target": target, "weight": self.dssim_weight}
+        loss, error = dr.custom(_PhotometricOp, **operands)
+        return loss, dr.detach(error)
 
 
 def l1_loss(image: Any, target: Any) -> Any:
@@ -129,56 +140,63 @@ def l1_loss(image: Any, target: Any) -> Any:
 class _PhotometricOp(dr.CustomOp):
     """Two blur passes evaluate the loss and SSIM's partials, two more the gradient."""
 
-    def eval(self, image: Any, target: Target, weight: float) -> Any:
+    def eval(self, image: Any, target: Target, weight: float) -> tuple[Any, Any]:
         self.target, self.weight, self.shape = target, weight, image.shape
-        self.tiling = _tiling(target)
-        records = _blur_along_rows(self.tiling, image.array, target)
-        loss, self.records = _ssim_and_partials(self.tiling, records, target, weight)
-        return loss
+        self.tiling = tiling = _tiling(target)
+        self.values = tiling.to_tiles(image.array)
+        dr.eval(self.values)
+        blurred, absolute, squared = _blur_along_rows(tiling, self.values, target)
+        loss, self.partials = _ssim_and_partials(tiling, blurred, absolute, target, weight)
+        return dr.sum(loss) / tiling.num_values, dr.sum(squared) / tiling.num_values
 
     def gradient(self) -> Any:
         """Return d loss / d image, flat, row-major."""
-        records = _blur_partials_down_columns(self.tiling, self.records)
-        tiles = _assemble_gradient(self.tiling, records, self.target, self.weight)
+        blurred = _blur_partials_down_columns(self.tiling, self.partials)
+        tiles = _assemble_gradient(self.tiling, blurred, self.values, self.target, self.weight)
         return self.tiling.from_tiles(tiles)
 
     def backward(self) -> None:
-        flat = self.gradient() * self.grad_out()
+        flat = self.gradient() * self.grad_out()[0]
         self.set_grad_in("image", types_of(type(flat)).TensorXf(flat, self.shape))
 
     def forward(self) -> None:
-        self.set_grad_out(dr.sum(self.gradient() * self.grad_in("image").array))
+        tangent = dr.sum(self.gradient() * self.grad_in("image").array)
+        self.set_grad_out((tangent, dr.zeros(type(tangent))))
 
     def name(self) -> str:
         return "PhotometricLoss"
 
 
-def _blur_along_rows(tiling: _Tiling, image: Any, target: Target) -> Any:
-    """Pass 1: records (x, x^2, xy, all blurred along rows; x - y), row order."""
-    values = tiling.to_tiles(image)
-    dr.eval(values)
-    x, y = tiling.rows.read_values(values), tiling.rows.read_values(target.values)
-    blurred = _blur({k: (x[k], x[k] * x[k], x[k] * y[k]) for k in x}, tiling.weights)
-    return _store([[*maps, x[k] - y[k]] for k, maps in enumerate(blurred)])
+def _blur_along_rows(tiling: _Tiling, values: Any, target: Target) -> tuple[list[Any], Any, Any]:
+    """Pass 1: x, x^2 and xy blurred along rows, column order; each row's |x - y| and (x - y)^2."""
+    rows = tiling.rows
+    x, y = rows.read(values), rows.read(target.values)
+    maps = (x, _product(x, x), _product(x, y))
+    blurred = [rows.store_across(_blur(z, tiling.weights)) for z in maps]
+    differences = [x[k] - y[k] for k in range(_TILE)]  # beyond the image both are 0
+    absolute = sum(map(dr.abs, differences))
+    squared = sum(map(dr.square, differences))
+    dr.eval(blurred, absolute, squared)
+    return blurred, absolute, squared
 
 
 def _ssim_and_partials(
-    tiling: _Tiling, records: Any, target: Target, weight: float
-) -> tuple[Any, Any]:
-    """Pass 2: the loss, and records (dS/dmu_x, dS/dE[x^2], dS/dE[xy], x - y), column order.
+    tiling: _Tiling, maps: list[Any], absolute: Any, target: Target, weight: float
+) -> tuple[Any, list[Any]]:
+    """Pass 2: each line's share of the loss, and dS/dmu_x, dS/dE[x^2], dS/dE[xy], column order.
 
     With mu = E[.] the windowed means, var and cov from E[x^2] - mu^2 and so on,
         S = A1 A2 / (B1 B2),  A1 = 2 mu_x mu_y + C1,       A2 = 2 cov_xy + C2,
                               B1 = mu_x^2 + mu_y^2 + C1,   B2 = var_x + var_y + C2
     (Wang et al. 2004, equation 13). The partials are those of S(mu_x, E[x^2], E[xy]): each of
-    the three is linear in windows of x, x^2 or xy.
+    the three is linear in windows of x, x^2 or xy. absolute: shares of the sum of |x - y|.
     """
     columns = tiling.columns
-    records = columns.read_records_across(records)
+    blurred = [_blur(columns.read(z), tiling.weights) for z in maps]
     means, mean_squares = columns.read_own(target.means), columns.read_own(target.mean_squares)
-    loss, partials = 0, []
-    for k, (mu_x, mean_xx, mean_xy) in enumerate(_blur_three(records, tiling.weights)):
-        mu_y, mean_yy, difference = means[k], mean_squares[k], records[k][3]
+    dissimilar, partials = 0, []
+    for k, (mu_x, mean_xx, mean_xy) in enumerate(zip(*blurred, strict=True)):
+        mu_y, mean_yy = means[k], mean_squares[k]
         a1 = 2 * mu_x * mu_y + C1
         a2 = 2 * (mean_xy - mu_x * mu_y) + C2
         b1 = mu_x * mu_x + mu_y * mu_y + C1
@@ -192,38 +210,39 @@ def _ssim_and_partials(
 
         # Windows centred beyond the image are no part of the mean, nor of its adjoint.
         inside = columns.inside(k)
-        value = (1 - weight) * dr.abs(difference) + weight * (1 - ssim)
-        loss += dr.select(inside, value, 0)
-        partials.append(
-            [dr.select(inside, d, 0) for d in (d_mu_x, d_mean_xx, d_mean_xy)] + [difference]
-        )
-    stored = _store(partials)
+        dissimilar += dr.select(inside, 1 - ssim, 0)
+        partials.append([dr.select(inside, d, 0) for d in (d_mu_x, d_mean_xx, d_mean_xy)])
+    loss = (1 - weight) * absolute + weight * dissimilar
+    stored = [columns.store(list(values)) for values in zip(*partials, strict=True)]
     dr.eval(loss, stored)
-    return dr.sum(loss) / tiling.num_values, stored
+    return loss, stored
 
 
-def _blur_partials_down_columns(tiling: _Tiling, records: Any) -> Any:
-    """Pass 3: the records with their first three maps blurred along columns, column order."""
-    records = tiling.columns.read_records_along(records)
-    blurred = _blur_three(records, tiling.weights)
-    return _store([[*maps, records[k][3]] for k, maps in enumerate(blurred)])
+def _blur_partials_down_columns(tiling: _Tiling, partials: list[Any]) -> list[Any]:
+    """Pass 3: the partials blurred along columns, row order."""
+    columns = tiling.columns
+    blurred = [columns.store_across(_blur(columns.read(z), tiling.weights)) for z in partials]
+    dr.eval(blurred)
+    return blurred
 
 
-def _assemble_gradient(tiling: _Tiling, records: Any, target: Target, weight: float) -> Any:
+def _assemble_gradient(
+    tiling: _Tiling, partials: list[Any], values: Any, target: Target, weight: float
+) -> Any:
     """Pass 4: d loss / d image, row order.
 
     The windowed means are linear in x, x^2 and xy, and the blur B is its own adjoint:
         d (sum of S) / dx = B dS/dmu_x + 2 x B dS/dE[x^2] + y B dS/dE[xy].
     """
-    records = tiling.rows.read_records_across(records)
-    values = tiling.rows.read_own(target.values)
-    gradients = []
-    for k, (d_mu_x, d_mean_xx, d_mean_xy) in enumerate(_blur_three(records, tiling.weights)):
-        y, difference = values[k], records[k][3]  # x = y + difference
-        d_ssim = d_mu_x + 2 * (y + difference) * d_mean_xx + y * d_mean_xy
-        d_loss = (1 - weight) * _sign(difference) - weight * d_ssim
-        gradients.append([d_loss / tiling.num_values])
-    return _store(gradients)
+    rows = tiling.rows
+    own = rows.read_own(values), rows.read_own(target.values)
+    blurred = [_blur(rows.read(z), tiling.weights) for z in partials]
+    gradient = []
+    for x, y, d_mu_x, d_mean_xx, d_mean_xy in zip(*own, *blurred, strict=True):
+        d_ssim = d_mu_x + 2 * x * d_mean_xx + y * d_mean_xy
+        d_loss = (1 - weight) * _sign(x - y) - weight * d_ssim
+        gradient.append(d_loss / tiling.num_values)
+    return rows.store(gradient)
 
 
 def _variance(mean: Any, mean_square: Any) -> Any:
@@ -272,16 +291,25 @@ class _Tiling:
         return _CHANNELS * math.prod(self.grid) * _TILE
 
     def to_tiles(self, flat: Any) -> Any:
-        """Bring a row-major (H, W, 3) image into tiles, row order."""
-        index = dr.arange(self.index_type, self.num_lines * _TILE)
-        line, column_in_tile = index // _TILE, index % _TILE
-        channel, tile_row, tile_column = self.split(line // _TILE)
-        row = tile_row * _TILE + line % _TILE
-        column = tile_column * _TILE + column_in_tile
-        inside = (row < self.height) & (column < self.width)
-        return dr.gather(
-            type(flat), flat, (row * self.width + column) * _CHANNELS + channel, inside
-        )
+        """Bring a row-major (H, W, 3) image into tiles, row order; one lane a row, all channels."""
+        lines = self.num_lines // _CHANNELS
+        lane = dr.arange(self.index_type, lines)
+        _, tile_row, tile_column = self.split(lane // _TILE)
+        row, column = tile_row * _TILE + lane % _TILE, tile_column * _TILE
+        first = (row * self.width + column) * _CHANNELS
+        tiles = dr.empty(type(flat), self.num_lines * _TILE)
+        for channel in range(_CHANNELS):
+            values = [
+                dr.gather(
+                    type(flat),
+                    flat,
+                    first + (_CHANNELS * k + channel),
+                    (row < self.height) & (column + k < self.width),
+                )
+                for k in range(_TILE)
+            ]
+            _store_packets(tiles, values, lane + channel * lines)
+        return tiles
 
     def from_tiles(self, tiles: Any) -> Any:
         """Bring tiles in row order back to a row-major (H, W, 3) image, not evaluated."""
@@ -311,11 +339,7 @@ class _Tiling:
 
 @dataclass(frozen=True)
 class _Lines:
-    """The lanes of one pass: lane (tile, line) owns a row (column) of 8 pixels in a tile.
-
-    Readers return what the lane's 8 outputs depend on, a dictionary over ``tiling.support``;
-    beyond the image's tiles there are zeros.
-    """
+    """The lanes of one pass: lane (tile, line) owns a row (column) of 8 pixels in a tile."""
 
     tiling: _Tiling
     axis: int  # 0: lines are columns, 1: rows
@@ -335,43 +359,34 @@ class _Lines:
 
     def read_own(self, values: Any) -> Any:
         """The line's own 8 values; ``values`` contiguous along lines."""
-        return dr.gather(
-            _packet_type(type(values)), values, self.lane, shape=(_TILE, self.tiling.num_lines)
-        )
+        return self._read_packet(values, self.lane, True)
 
-    def read_values(self, values: Any) -> dict[int, Any]:
-        """Single values contiguous along lines."""
-        packets = {}
-        for step in (-1, 0, 1):
-            lane, valid = self._neighbour(step)
-            packets[step] = dr.gather(
-                _packet_type(type(values)),
-                values,
-                lane,
-                valid,
-                shape=(_TILE, self.tiling.num_lines),
-            )
-        return {k: packets[k // _TILE][k % _TILE] for k in self.tiling.support}
+    def read(self, values: Any) -> dict[int, Any]:
+        """What the line's 8 outputs depend on, over ``tiling.support``; 0 beyond the tiles.
 
-    def read_records_along(self, records: Any) -> dict[int, Any]:
-        """4-value records contiguous along lines (column order for columns)."""
-        record_type = types_of(type(records)).Array4f
-        result = {}
-        for k in self.tiling.support:
-            lane, valid = self._neighbour(k // _TILE)
-            result[k] = dr.gather(record_type, records, lane * _TILE + k % _TILE, valid)
-        return result
+        values: contiguous along lines.
+        """
+        packets = [self._read_packet(values, *self._neighbour(step)) for step in (-1, 0, 1)]
+        return {k: packets[1 + k // _TILE][k % _TILE] for k in self.tiling.support}
 
-    def read_records_across(self, records: Any) -> dict[int, Any]:
-        """4-value records contiguous across lines (row order for columns)."""
-        record_type = types_of(type(records)).Array4f
+    def store(self, values: list[Any]) -> Any:
+        """Each line's 8 values, contiguous along lines."""
+        flat = dr.empty(type(values[0]), self.tiling.num_lines * _TILE)
+        _store_packets(flat, values, self.lane)
+        return flat
+
+    def store_across(self, values: list[Any]) -> Any:
+        """The same, contiguous across lines: rows in column order, columns in row order."""
+        flat = dr.empty(type(values[0]), self.tiling.num_lines * _TILE)
         line = self.lane % _TILE
-        result = {}
-        for k in self.tiling.support:
-            lane, valid = self._neighbour(k // _TILE)
-            pixel = (lane - line + k % _TILE) * _TILE + line
-            result[k] = dr.gather(record_type, records, pixel, valid)
-        return result
+        first = (self.lane - line) * _TILE + line
+        for k, value in enumerate(values):
+            dr.scatter(flat, value, first + k * _TILE, mode=dr.ReduceMode.NoConflicts)
+        return flat
+
+    def _read_packet(self, values: Any, line: Any, valid: Any) -> Any:
+        shape = (_TILE, self.tiling.num_lines)
+        return dr.gather(_packet_type(type(values)), values, line, valid, shape=shape)
 
     def _neighbour(self, step: int) -> tuple[Any, Any]:
         """The same line in the tile ``step`` further along it, and whether there is one."""
@@ -383,25 +398,28 @@ class _Lines:
         return self.lane, True
 
 
-def _blur(maps: dict[int, Any], weights: tuple[float, ...]) -> list[list[Any]]:
-    """Blurred maps at the line's 8 pixels; maps[k]: the values of all maps at pixel k."""
+def _store_packets(flat: Any, values: list[Any], index: Any) -> None:
+    """8 values a lane as packet ``index`` of an array, which no other lane fills.
+
+    Saying so lets several stores into one array share a kernel.
+    """
+    dr.scatter(flat, _packet_type(type(flat))(values), index, mode=dr.ReduceMode.NoConflicts)
+
+
+def _product(x: dict[int, Any], y: dict[int, Any]) -> dict[int, Any]:
+    return {k: x[k] * y[k] for k in x}
+
+
+def _blur(values: dict[int, Any], weights: tuple[float, ...]) -> list[Any]:
+    """A blurred map at the line's 8 pixels, from its values at all pixels that they depend on."""
     radius = len(weights) // 2
     blurred = []
     for k in range(_TILE):
-        sums = [0] * len(maps[k])
+        total = 0
         for offset, weight in enumerate(weights, start=k - radius):
-            sums = [dr.fma(value, weight, s) for value, s in zip(maps[offset], sums, strict=True)]
-        blurred.append(sums)
+            total = dr.fma(values[offset], weight, total)
+        blurred.append(total)
     return blurred
-
-
-def _blur_three(records: dict[int, Any], weights: tuple[float, ...]) -> list[list[Any]]:
-    return _blur({k: tuple(record)[:3] for k, record in records.items()}, weights)
-
-
-def _store(values: list[list[Any]]) -> Any:
-    """Each lane's values side by side in a flat array: one packet store, hence one kernel."""
-    return interleave([value for record in values for value in record])
 
 
 def _tiling(target: Target) -> _Tiling:

@@ -29,7 +29,7 @@ from drgs.training.density.called_for import density_strategy
 from drgs.training.density.strategy import DensityReport, DensityStrategy, Population, SeenStep
 from drgs.training.effects.called_for import integrator_settings, training_effects
 from drgs.training.finite_checks import GradientWatch, check_values, check_view_values
-from drgs.training.losses import PhotometricLoss
+from drgs.training.losses import PhotometricLoss, Target
 from drgs.training.memory import room_for_targets
 from drgs.training.optimizer import (
     make_optimizer,
@@ -113,11 +113,9 @@ class Trainer:
             effect.before(self, view)
 
         image = mi.render(self.scene, self.params, sensor=view.sensor, spp=1)
-        image, loss = self.compared(image, view)
+        image, loss, error = self.compared(image, view)
         dr.backward(loss if self.views_a_step == 1 else loss / self.views_a_step)
         image, loss = dr.detach(image), dr.detach(loss)
-        photograph = view.target.image
-        error = dr.mean(dr.square(image.array - photograph.array))
         numbers = {f"{e.name}.{k}": v for e in self.effects for k, v in e.numbers_of(view).items()}
         self.watch.add(self.iteration, view.name, loss, self.integrator.last.first_fault, numbers)
         if self.ends_step:
@@ -126,7 +124,7 @@ class Trainer:
             effect.after(self, view)
         self.stage.seen(view)
 
-        report = self._control_density(image, photograph)
+        report = self._control_density(image, view.target)
         return StepReport(
             iteration=self.iteration,
             num_gaussians=self.num_gaussians,
@@ -137,17 +135,17 @@ class Trainer:
             counted=view.counted,
         )
 
-    def compared(self, image: Any, view: TrainingView) -> tuple[Any, Any]:
-        """What a rendering is as a photograph of the view would be, and its loss."""
+    def compared(self, image: Any, view: TrainingView) -> tuple[Any, Any, Any]:
+        """What a rendering is as a photograph of the view would be, its loss and squared error."""
         for effect in self.effects:
             image = effect.adjust(image, view)
-        loss = self.loss(image, view.target)
+        loss, error = self.loss.with_squared_error(image, view.target)
         for effect in self.effects:
             for penalty in effect.penalties(view):
                 loss = loss + penalty
         for penalty in self.density.penalties(self.parameters):
             loss = loss + penalty
-        return image, loss
+        return image, loss, error
 
     @property
     def stage(self) -> Stage:
@@ -325,14 +323,14 @@ class Trainer:
         rates = {PREFIX + name: rate for name, rate in rates.items() if PREFIX + name in there}
         self.optimizer.set_learning_rate(rates)
 
-    def _control_density(self, image: Any, photograph: Any) -> DensityReport | None:
-        """Tell the strategy what was seen, and let it act; both (H, W, 3), as compared."""
+    def _control_density(self, image: Any, target: Target) -> DensityReport | None:
+        """Tell the strategy what was seen, and let it act; image: (H, W, 3), as compared."""
         density, i = self.density, self.iteration
         if density.gathers(i):
             last, (height, width, _) = self.integrator.last, image.shape
             gradients = last.means2d_grad, last.visible
             weigh = partial(weighted_sums_of_last, self.integrator)
-            density.gather(SeenStep(i, width, height, *gradients, image, photograph, weigh))
+            density.gather(SeenStep(i, width, height, *gradients, image, target.image, weigh))
         if self.ends_step:
             density.perturb(self.population, i, self.means_lr)
         if not density.acts(i):

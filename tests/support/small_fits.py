@@ -166,7 +166,7 @@ def gradients_of_loss(trainer: Trainer, view) -> dict[str, np.ndarray]:
     """Of the Gaussians' parameters, through what the effects do; no step is taken."""
     trainer.params.update(trainer.optimizer)
     image = mi.render(trainer.scene, trainer.params, sensor=view.sensor, spp=1)
-    _, loss = trainer.compared(image, view)
+    _, loss, _ = trainer.compared(image, view)
     dr.set_grad(trainer.optimizer, 0)
     dr.backward(loss)
     return {

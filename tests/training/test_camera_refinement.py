@@ -146,7 +146,7 @@ def test_derivatives_of_the_loss_are_differences_in_numpy(index):
     leaves = effect.leaves
     trainer.params.update(trainer.optimizer)
     image = mi.render(trainer.scene, trainer.params, sensor=view.sensor, spp=1)
-    _, loss = trainer.compared(image, view)
+    _, loss, _ = trainer.compared(image, view)
     dr.backward(loss)
     effect.after(trainer, view)
     gaussians, step = fits.double(start), 1e-7

@@ -113,7 +113,7 @@ def test_loss_and_derivatives_of_a_transform_are_those_of_numpy():
     image, target = small_image(), fits.plain_dataset().train[2].image.astype(np.float64)
     view, matrix = trainer.views[2], single(random_matrices()[2])
     effect.before(trainer, view)
-    _, loss = trainer.compared(mi.TensorXf(image.astype(np.float32)), view)
+    _, loss, _ = trainer.compared(mi.TensorXf(image.astype(np.float32)), view)
     assert float(loss[0]) == pytest.approx(numpy_loss(image, matrix, target, weight), rel=2e-6)
     dr.backward(loss)
     actual = np.array(dr.grad(effect.parameters.leaves(2)["matrices"])).astype(np.float64)

@@ -74,7 +74,7 @@ def test_the_loss_is_that_of_the_masked_pictures(weight):
     for index in (0, 3):
         view, photo = trainer.views[index], masked_dataset().train[index]
         image = random_image(index, HEIGHT, WIDTH, 3)
-        shown, loss = trainer.compared(mi.TensorXf(image), view)
+        shown, loss, _ = trainer.compared(mi.TensorXf(image), view)
         mask = mask_of(index)[..., None]
         expected = numpy_loss(image * mask, photo.image * mask, weight)
         assert float(loss[0]) == pytest.approx(expected, rel=VALUE)
@@ -90,7 +90,7 @@ def test_pixels_that_are_left_out_have_no_derivative(weight):
     trainer = fits.make_trainer(masked_dataset(), loss__dssim_weight=weight)
     for index in (0, 3):
         image = attached(random_image(index, HEIGHT, WIDTH, 3))
-        _, loss = trainer.compared(image, trainer.views[index])
+        _, loss, _ = trainer.compared(image, trainer.views[index])
         dr.backward(loss)
         gradient = np.array(dr.grad(image))
         left_out = mask_of(index) == 0
@@ -104,7 +104,7 @@ def test_derivatives_of_a_masked_loss_are_central_differences():
     view, photo, mask = trainer.views[2], masked_dataset().train[2], mask_of(2)[..., None]
     values = random_image(2, HEIGHT, WIDTH, 3)
     image = attached(values)
-    _, loss = trainer.compared(image, view)
+    _, loss, _ = trainer.compared(image, view)
     dr.backward(loss)
     gradient = np.array(dr.grad(image)).astype(np.float64)
     rng, step = np.random.default_rng(0), 1e-6
@@ -220,7 +220,7 @@ def test_the_penalty_is_that_of_the_integrators_depth_and_alpha():
         expected = numpy_loss(channels[..., :3], photo.image) + penalty_in_numpy(
             channels[..., 3], channels[..., 4], photo, dataset.extent
         )
-        shown, loss = trainer.compared(image, view)
+        shown, loss, _ = trainer.compared(image, view)
         assert float(loss[0]) == pytest.approx(expected, rel=10 * VALUE)
         np.testing.assert_array_equal(np.array(shown), channels[..., :3])
         photometric = numpy_loss(channels[..., :3], photo.image)
