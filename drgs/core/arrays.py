@@ -87,6 +87,17 @@ _NUMPY_TYPES = {
 }
 
 
+def quotient(index: Any, divisor: int) -> Any:
+    """index // divisor, UInt32, by a divisor below 2^19 that is not compiled into the kernel.
+
+    No machine divides vectors of integers. The product in double precision is off by less than
+    2^-52 of itself, and (index + 1/2) / divisor is at least 1 / (2 divisor) from an integer.
+    """
+    Float64 = dr.float64_array_t(type(index))
+    reciprocal = dr.opaque(Float64, 1 / divisor)
+    return type(index)((Float64(index) + 0.5) * reciprocal)
+
+
 def interleave(columns: list[Any]) -> Any:
     """Columns of equal length as one row-major flat array, not evaluated.
 

@@ -14,7 +14,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from drgs.core.arrays import from_host, interleave
+from drgs.core.arrays import from_host, interleave, quotient
 from drgs.core.errors import UnsupportedError
 from drgs.splatting.image_model import PixelCenters, Positions
 
@@ -38,7 +38,7 @@ def pixel_corners(film: mi.Film) -> mi.Point2f:
     """The upper left corners of the crop window's pixels, row by row, px."""
     width, height = film.crop_size()
     pixel = dr.arange(mi.UInt32, width * height)
-    row = pixel // dr.opaque(mi.UInt32, width)
+    row = quotient(pixel, width)
     return mi.Point2f(pixel - row * width, row)
 
 

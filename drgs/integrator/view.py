@@ -73,11 +73,14 @@ class View:
     def backward(self, d_channels: Passes) -> rendering.GaussianGradients:
         """Derivatives with respect to the Gaussians; all others are accumulated."""
         planes, constant = self.planes(), constant_background(self.integrator)
-        dr.eval(planes)
+        with dr.resume_grad():
+            of_background = constant is not None and dr.grad_enabled(self.integrator.background)
         # Colour conversion and background are a few operations per pixel, traced again and
         # differentiated by Dr.Jit.
         with dr.resume_grad():
-            dr.enable_grad(planes, constant)
+            dr.enable_grad(planes)
+            if of_background:
+                dr.enable_grad(constant)
             channels = self.channels(planes, constant)
             dr.accum_grad(channels, d_channels)
             dr.enqueue(dr.ADMode.Backward, channels)
@@ -85,7 +88,7 @@ class View:
             # what textures were computed from again.
             dr.traverse(dr.ADMode.Backward, flags=dr.ADFlag.ClearVertices)
             d_planes = dr.grad(planes)
-            d_constant = None if constant is None else dr.grad(constant)
+            d_constant = dr.grad(constant) if of_background else None
         for first in range(0, len(d_planes), POSES_PER_KERNEL):
             dr.eval(d_planes[first : first + POSES_PER_KERNEL], d_constant)
         with dr.resume_grad():
@@ -96,8 +99,8 @@ class View:
             for of_time in zip(self._frames(), d_planes, strict=True)
         ]
         with dr.resume_grad():
-            if constant is not None:
-                accumulate(self.integrator.background, d_constant)
+            if of_background:
+                dr.accum_grad(self.integrator.background, d_constant)
             if of_camera:
                 numbers = [camera.numbers() for camera in self._attached_cameras(state)]
                 _accumulate_through(numbers, [gradients.camera for gradients in by_time])

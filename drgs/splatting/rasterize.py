@@ -55,6 +55,7 @@ from drgs.core.arrays import (
     interleave,
     load_row,
     pack_rows,
+    quotient,
     scatter_rows,
     store_row,
     types_of,
@@ -93,9 +94,8 @@ class Layers:
         """
         t = types_of(type(self.values))
         pixel = dr.arange(t.UInt32, self.grid.width * self.grid.height)
-        width = dr.opaque(t.UInt32, self.grid.width)
-        y = pixel // width
-        x = pixel - y * width
+        y = quotient(pixel, self.grid.width)
+        x = pixel - y * dr.opaque(t.UInt32, self.grid.width)
         tile = (y // TILE) * dr.opaque(t.UInt32, self.grid.columns) + x // TILE
         micro = ((y % TILE) // MICRO) * GRID + (x % TILE) // MICRO
         base = (tile * MICROS + micro) * (PIXELS * (1 + self.count))
