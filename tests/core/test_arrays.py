@@ -11,6 +11,7 @@ from drgs.core.arrays import (
     interleave,
     load_row,
     pack_rows,
+    quotient,
     scatter_rows,
     store_row,
 )
@@ -77,3 +78,12 @@ def test_where_numpy_puts_numbers_makes_no_difference_to_kernels():
             dr.eval(from_host(dr.llvm.ad.Float, values) * 1.25 + 0.5)
             hashes |= {kernel["hash"] for kernel in dr.kernel_history([dr.KernelType.JIT])}
     assert len(hashes) == 1
+
+
+@pytest.mark.parametrize("divisor", [1, 3, 400, 1265, 65535, 2**19 - 1])
+def test_quotients_are_exact_around_every_kind_of_multiple(divisor):
+    last = 2**32 - 1
+    multiples = np.unique(np.linspace(0, last // divisor, 1000).astype(np.uint64)) * divisor
+    index = np.concatenate([multiples, multiples[1:] - 1, multiples + (divisor - 1), [last]])
+    index = index[index <= last].astype(np.uint32)
+    np.testing.assert_array_equal(np.array(quotient(UInt32(index), divisor)), index // divisor)

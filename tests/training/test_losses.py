@@ -138,6 +138,16 @@ def test_target_returns_its_photograph():
     np.testing.assert_array_equal(target.image.numpy(), y)
 
 
+@pytest.mark.parametrize("weight", [0, 0.2])
+def test_squared_error_is_the_mean_over_pixels_and_channels(weight):
+    x, y = images(21, 34)
+    image, target = TensorXf64(x), prepare_target(TensorXf64(y))
+    loss, error = PhotometricLoss(weight).with_squared_error(image, target)
+    assert loss[0] == PhotometricLoss(weight)(image, target)[0]
+    # float64 sums of two thousand terms in another order.
+    assert error[0] == pytest.approx(np.mean((x - y) ** 2), rel=1e-12)
+
+
 def test_ssim_agrees_with_the_metric():
     x, y = images(33, 20)
     loss, _ = value_and_gradient(x, y, weight=1)
