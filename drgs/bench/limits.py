@@ -6,11 +6,12 @@ many bytes it can move, in a second.
 
 from __future__ import annotations
 
-import re
 from dataclasses import dataclass
 
 import drjit as dr
 import drjit.llvm.ad as llvm
+
+from drgs.core.private import vector_width
 
 CHAINS = 10
 """Independent multiply-adds in flight: more than the latency of one times those started a cycle."""
@@ -42,19 +43,9 @@ def measure_limits(repeats: int = 5) -> MachineLimits:
     return MachineLimits(
         multiply_adds=max(_multiply_adds() for _ in range(repeats)),
         bytes_moved=max(_bytes_moved() for _ in range(repeats)),
-        width=_vector_width(),
+        width=vector_width(),
         threads=dr.thread_count(),
     )
-
-
-def _vector_width() -> int:
-    """As the code that Dr.Jit generates says."""
-    x = dr.arange(llvm.Float, 64)
-    with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
-        dr.kernel_history_clear()
-        dr.eval(x * dr.opaque(llvm.Float, 2))
-        kernels = [k for k in dr.kernel_history() if k["type"] == dr.KernelType.JIT]
-    return int(re.search(r"<(\d+) x float>", kernels[0]["ir"].getvalue())[1])
 
 
 def last_kernel_seconds() -> float:
