@@ -1,18 +1,19 @@
 """Into how many blocks Dr.Jit cuts a kernel, and how much more cores could make of them.
 
-A block is what one thread works on; cores beyond the number of blocks have nothing to do. The rules
-are those of Dr.Jit's LLVM backend (``src/llvm_ts.cpp`` of drjit-core), as 1.5 does it: older sources
-have one block a thread where this one has two. A test counts what Dr.Jit submits.
+A block is what one thread works on; cores beyond the number of blocks have nothing to do. The
+rules are those of Dr.Jit's LLVM backend (``src/llvm_ts.cpp`` of drjit-core) in version 1.5: older
+sources have one block a thread where it has two. A test counts what Dr.Jit submits.
 
 The bound on the speed-up is Amdahl's (1967), with each kernel k in place of *the* parallel part:
 
     S(P) = (h + sum_k t_k) / (h + sum_k t_k m_k(P))
 
-h: time of one thread in which no kernel runs (Python, tracing, launching), t_k: of kernel k on one
-thread, m_k(P): the share of its work that the busiest of P cores has, if each takes the next block
-as soon as it is free. Equal blocks are assumed to take equally long; in kernels with loops, each
+h: time of an iteration on one thread in which no kernel runs (Python, tracing, launching), t_k: of
+kernel k on one thread, m_k(P): the share of its work that the busiest of P cores has, if each takes
+the next block as soon as it is free. Equal blocks are assumed to take equally long; in kernels with loops, each
 vector of lanes takes as many steps as the longest of its loops. What several cores share (memory's
-bandwidth, caches, clock) is not in it.
+bandwidth, caches, clock) is not in it, nor what the host does while a kernel runs, which faster
+kernels no longer hide: it is a bound, not a forecast.
 """
 
 from __future__ import annotations
@@ -42,7 +43,7 @@ def blocks_of_lanes(size: int, pool: Pool) -> tuple[int, int]:
     """
     vectors = -(-size // pool.width)
     if pool.threads <= 1:
-        return 1, size
+        return 1, vectors * pool.width
     if vectors <= pool.threads:
         return vectors, pool.width
     if size <= 2 * pool.threads * pool.block:

@@ -31,11 +31,11 @@ class StageCost:
 class LoopCost:
     """Of the loop over pairs of a pixel and a Gaussian, from its machine code.
 
-    All but ``steps`` are instructions *a pair*: those in the loop's body, divided by the pixels of a
-    lane. An instruction that computes, loads or stores a vector, one number for each lane, thus
+    All but ``steps`` are instructions *a pair*: those in the loop's body, divided by the pixels of
+    a lane. An instruction that computes, loads or stores a vector, one number for each lane, thus
     counts as one for each of the pairs that it serves, as in ``INSTRUCTIONS`` of the command. What
-    a lane does for all of its pixels counts a sixteenth; records are loaded lane by lane, since they
-    lie apart. Paths that are hardly ever taken are counted too.
+    a lane does for all of its pixels counts a sixteenth; records are loaded lane by lane, since
+    they lie apart. Paths that are hardly ever taken are counted too.
 
     The stack has what registers have no room for: state of pixels, which the loop stores and loads
     again for each Gaussian.

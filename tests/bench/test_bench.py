@@ -13,6 +13,7 @@ from support.helpers import Case, clear, device_camera, device_gaussians
 
 from drgs.bench import __main__ as bench
 from drgs.bench import limits, pairs, peers, profile, scaling, scenes, speed, stability
+from drgs.core.private import vector_width
 from drgs.reference import splatting as reference
 from drgs.splatting import rendering
 
@@ -156,4 +157,4 @@ def test_gaussians_keep_their_entries_as_their_number_grows():
 
 
 def test_vector_width_is_a_power_of_two():
-    assert limits._vector_width() in (4, 8, 16)
+    assert vector_width() in (4, 8, 16)
