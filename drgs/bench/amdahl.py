@@ -6,17 +6,15 @@ blocks: see :mod:`drgs.bench.blocks`, which also has the formula.
 
 from __future__ import annotations
 
-import statistics
 from dataclasses import dataclass
 from functools import partial
 
 import drjit as dr
 
 from drgs.bench.blocks import Pool, busiest_share, costs_of_blocks
-from drgs.bench.costs import COPIES
 from drgs.bench.profile import STAGES, CountedLaunch, counted_launches
 from drgs.bench.scenes import Scene
-from drgs.bench.speed import clocked_step, time_iterations, warm_trainer
+from drgs.bench.speed import clocked_step, warm_trainer
 from drgs.core.private import lanes_of_a_block, vector_width
 
 CORES = (2, 4, 8, 16, 32, 64)
@@ -60,42 +58,26 @@ def count_blocks(scene: Scene, rounds: int) -> Speedups:
     """
     dr.set_thread_count(1)
     launches = counted_launches(lambda: partial(clocked_step, warm_trainer(scene)))
-    host_ms, times = _time_alone(scene, rounds)
-    kernels = [
-        _blocks_of(stage, counted, milliseconds)
-        for stage in STAGES
-        for counted, milliseconds in zip(_kernels(launches[stage]), times[stage], strict=True)
-    ]
-    return Speedups(kernels, host_ms)
-
-
-def _kernels(launches: list[CountedLaunch]) -> list[CountedLaunch]:
-    return [counted for counted in launches if counted.launch.type not in COPIES]
-
-
-def _time_alone(scene: Scene, rounds: int) -> tuple[float, dict[str, list[float]]]:
-    """Milliseconds without a kernel, and of each kernel by stage: medians."""
-    walls, clocks = time_iterations(warm_trainer(scene), rounds)
-    times = {
-        stage: [
-            statistics.median(launch.milliseconds for launch in same)
-            for same in zip(*(_without_copies(c.launches[stage]) for c in clocks), strict=True)
+    trainer = warm_trainer(scene)
+    clocks = [clocked_step(trainer) for _ in range(rounds)]
+    fastest = min(clocks, key=lambda clock: sum(clock.kernel_ms.values())).kernel_ms
+    kernels = []
+    for stage in STAGES:
+        # Counted once, timed often: entries of other iterations need not be the same ones.
+        once = sum(counted.launch.milliseconds for counted in launches[stage])
+        kernels += [
+            _blocks_of(stage, counted, fastest[stage] / once) for counted in launches[stage]
         ]
-        for stage in STAGES
-    }
-    kernels = statistics.median(sum(clock.kernel_ms.values()) for clock in clocks)
-    return 1e3 * statistics.median(walls) - kernels, times
+    return Speedups(kernels, min(clock.host_ms for clock in clocks))
 
 
-def _without_copies(launches: list) -> list:
-    return [launch for launch in launches if launch.type not in COPIES]
-
-
-def _blocks_of(stage: str, counted: CountedLaunch, milliseconds: float) -> KernelBlocks:
+def _blocks_of(stage: str, counted: CountedLaunch, factor: float) -> KernelBlocks:
+    """factor: of the launch's time."""
     blocks, share = {}, {}
     for cores in CORES:
         pool = Pool(cores, vector_width(), lanes_of_a_block())
         costs = costs_of_blocks(counted.launch, pool, counted.trips)
         blocks[cores], share[cores] = len(costs), busiest_share(costs, cores)
     launch = counted.launch
+    milliseconds = factor * launch.milliseconds
     return KernelBlocks(stage, launch.type, launch.size, milliseconds, blocks, share)

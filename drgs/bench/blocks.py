@@ -8,12 +8,12 @@ The bound on the speed-up is Amdahl's (1967), with each kernel k in place of *th
 
     S(P) = (h + sum_k t_k) / (h + sum_k t_k m_k(P))
 
-h: time of an iteration on one thread in which no kernel runs (Python, tracing, launching), t_k: of
-kernel k on one thread, m_k(P): the share of its work that the busiest of P cores has, if each takes
-the next block as soon as it is free. Equal blocks are assumed to take equally long; in kernels with loops, each
-vector of lanes takes as many steps as the longest of its loops. What several cores share (memory's
-bandwidth, caches, clock) is not in it, nor what the host does while a kernel runs, which faster
-kernels no longer hide: it is a bound, not a forecast.
+h: time of an iteration on one thread in which no kernel runs (Python, tracing, launching); t_k: of
+kernel k on one thread; m_k(P): the share of its work that the busiest of P cores has, if each takes
+the next block as soon as it is free. Equal blocks are assumed to take equally long; in kernels with
+loops, each vector of lanes takes as many steps as the longest of its loops. What several cores
+share (memory's bandwidth, caches, clock) is not in it, nor what the host does while a kernel of the
+same stage runs, which faster kernels no longer hide: it is a bound, not a forecast.
 """
 
 from __future__ import annotations

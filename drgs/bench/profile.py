@@ -9,6 +9,7 @@ is a little more than the computation takes when nobody looks.
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -49,10 +50,13 @@ class StageClock:
     kernel_ms: dict[str, float] = field(default_factory=dict)
     launches: dict[str, list[Launch]] = field(default_factory=dict)
     compiled: int = 0  # kernels that were not in a cache
+    host_ms: float = 0.0  # of the stages, in which no kernel ran
+    started: float = field(default_factory=time.perf_counter)
 
     def end(self, stage: str) -> None:
         """All kernels since the last call belong to ``stage``."""
         dr.sync_thread()
+        passed = 1e3 * (time.perf_counter() - self.started)
         kernels = dr.kernel_history()
         self.compiled += sum(
             not kernel["cache_hit"] for kernel in kernels if kernel["type"] == dr.KernelType.JIT
@@ -61,6 +65,8 @@ class StageClock:
         self.launches.setdefault(stage, []).extend(found)
         spent = sum(launch.milliseconds for launch in found)
         self.kernel_ms[stage] = self.kernel_ms.get(stage, 0.0) + spent
+        self.host_ms += passed - spent
+        self.started = time.perf_counter()  # reading the history is not the stage's
 
 
 def _launches(history: list[dict]) -> list[Launch]:

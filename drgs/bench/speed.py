@@ -227,7 +227,7 @@ class IterationReport:
 
 def profile_training(scene: Scene, limits: MachineLimits, rounds: int) -> IterationReport:
     """Train on one view of the scene itself, with all SH degrees and no change of population."""
-    walls, clocks = time_iterations(warm_trainer(scene), rounds)
+    walls, clocks = _time_iterations(warm_trainer(scene), rounds)
     stage_ms = {
         stage: statistics.median(clock.kernel_ms.get(stage, 0.0) for clock in clocks)
         for stage in STAGES
@@ -250,7 +250,7 @@ def profile_training(scene: Scene, limits: MachineLimits, rounds: int) -> Iterat
     )
 
 
-def time_iterations(trainer: Trainer, rounds: int) -> tuple[list[float], list[StageClock]]:
+def _time_iterations(trainer: Trainer, rounds: int) -> tuple[list[float], list[StageClock]]:
     """Seconds of an iteration that nobody looks into, and the stages of another, each round."""
     walls, clocks = [], []
     for _ in range(rounds):

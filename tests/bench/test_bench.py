@@ -13,7 +13,6 @@ from support.helpers import Case, clear, device_camera, device_gaussians
 
 from drgs.bench import __main__ as bench
 from drgs.bench import limits, pairs, peers, profile, scaling, scenes, speed, stability
-from drgs.core.private import vector_width
 from drgs.reference import splatting as reference
 from drgs.splatting import rendering
 
@@ -154,7 +153,3 @@ def test_gaussians_keep_their_entries_as_their_number_grows():
         )
         ratios.append(pairs.count_work(scenes.frame_of(scene)).entries / point.count)
     assert len(ratios) >= 2 and max(ratios) / min(ratios) < 1.1
-
-
-def test_vector_width_is_a_power_of_two():
-    assert vector_width() in (4, 8, 16)

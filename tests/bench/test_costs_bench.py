@@ -4,6 +4,7 @@ The kernels here are so small that what they load and store is known by construc
 """
 
 import os
+import platform
 import re
 import shutil
 import subprocess
@@ -241,11 +242,10 @@ run
 """
 
 
-@pytest.mark.slow
 def test_blocks_are_those_that_dr_jit_submits(tmp_path):
     """A debugger prints the number of blocks of each task, the fourth argument of its function."""
-    if shutil.which("gdb") is None or sys.platform != "linux":
-        pytest.skip("gdb is not installed")
+    if shutil.which("gdb") is None or platform.machine() != "x86_64":
+        pytest.skip("there is no gdb, or its register has another name")
     (tmp_path / "commands").write_text(DEBUGGER)
     command = ["gdb", "-q", "-batch", "-x", str(tmp_path / "commands"), "--args"]
     program = [sys.executable, "-c", SUBMITTED % (SIZES,)]
@@ -273,7 +273,7 @@ def test_blocks_cover_all_lanes(threads):
     pool = blocks.Pool(threads, 16, 16_384)
     for size in SIZES:
         count, lanes = blocks.blocks_of_lanes(size, pool)
-        assert count * lanes >= size and (lanes % 16 == 0 or threads == 1)
+        assert count * lanes >= size and lanes % 16 == 0
         assert lanes <= pool.block or threads == 1
         launch = profile.Launch("JIT", size, 1.0, "")
         # Blocks beyond the last lane have no cost.
