@@ -12,10 +12,10 @@ from functools import partial
 import drjit as dr
 
 from drgs.bench.blocks import Pool, busiest_share, costs_of_blocks
+from drgs.bench.limits import vector_width
 from drgs.bench.profile import STAGES, CountedLaunch, counted_launches
 from drgs.bench.scenes import Scene
 from drgs.bench.speed import clocked_step, warm_trainer
-from drgs.core.private import lanes_of_a_block, vector_width
 
 CORES = (2, 4, 8, 16, 32, 64)
 
@@ -61,21 +61,20 @@ def count_blocks(scene: Scene, rounds: int) -> Speedups:
     trainer = warm_trainer(scene)
     clocks = [clocked_step(trainer) for _ in range(rounds)]
     fastest = min(clocks, key=lambda clock: sum(clock.kernel_ms.values())).kernel_ms
-    kernels = []
+    kernels, width = [], vector_width()
     for stage in STAGES:
         # Counted once, timed often: entries of other iterations need not be the same ones.
         once = sum(counted.launch.milliseconds for counted in launches[stage])
-        kernels += [
-            _blocks_of(stage, counted, fastest[stage] / once) for counted in launches[stage]
-        ]
+        factor = fastest[stage] / once
+        kernels += [_blocks_of(stage, counted, width, factor) for counted in launches[stage]]
     return Speedups(kernels, min(clock.host_ms for clock in clocks))
 
 
-def _blocks_of(stage: str, counted: CountedLaunch, factor: float) -> KernelBlocks:
-    """factor: of the launch's time."""
+def _blocks_of(stage: str, counted: CountedLaunch, width: int, factor: float) -> KernelBlocks:
+    """width: lanes of a vector; factor: of the launch's time."""
     blocks, share = {}, {}
     for cores in CORES:
-        pool = Pool(cores, vector_width(), lanes_of_a_block())
+        pool = Pool(cores, width)
         costs = costs_of_blocks(counted.launch, pool, counted.trips)
         blocks[cores], share[cores] = len(costs), busiest_share(costs, cores)
     launch = counted.launch

@@ -25,6 +25,9 @@ from typing import Any
 
 import numpy as np
 
+LANES_OF_A_BLOCK = 16_384
+"""Where there are enough lanes: Dr.Jit's default, which its Python interface cannot change."""
+
 
 @dataclass(frozen=True)
 class Pool:
@@ -32,7 +35,7 @@ class Pool:
 
     threads: int
     width: int  # lanes of a vector
-    block: int  # lanes of a block that is not smaller for the sake of more blocks: 16,384
+    block: int = LANES_OF_A_BLOCK
 
 
 def blocks_of_lanes(size: int, pool: Pool) -> tuple[int, int]:

@@ -6,12 +6,11 @@ many bytes it can move, in a second.
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 
 import drjit as dr
 import drjit.llvm.ad as llvm
-
-from drgs.core.private import vector_width
 
 CHAINS = 10
 """Independent multiply-adds in flight: more than the latency of one times those started a cycle."""
@@ -46,6 +45,16 @@ def measure_limits(repeats: int = 5) -> MachineLimits:
         width=vector_width(),
         threads=dr.thread_count(),
     )
+
+
+def vector_width() -> int:
+    """Numbers of 32 bits in a vector, as the code that Dr.Jit generates says."""
+    x = dr.arange(llvm.Float, 64)
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
+        dr.kernel_history_clear()
+        dr.eval(x * dr.opaque(llvm.Float, 2))
+        kernels = [k for k in dr.kernel_history() if k["type"] == dr.KernelType.JIT]
+    return int(re.search(r"<(\d+) x float>", kernels[0]["ir"].getvalue())[1])
 
 
 def last_kernel_seconds() -> float:

@@ -45,16 +45,6 @@ def llvm_version() -> tuple[int, ...]:
     return tuple(dr.detail.llvm_version())
 
 
-def vector_width() -> int:
-    """Numbers of 32 bits in a vector of the LLVM backend's kernels."""
-    return _of_llvm_backend("_Z21jit_llvm_vector_widthv", ctypes.c_uint32)()
-
-
-def lanes_of_a_block() -> int:
-    """Lanes that a thread computes at a time, of a kernel that has enough of them."""
-    return _of_llvm_backend("_Z19jit_llvm_block_sizev", ctypes.c_uint32)()
-
-
 def leave_out_avx512() -> None:
     """From now on, compile for this processor as if it had AVX2 and no AVX-512.
 

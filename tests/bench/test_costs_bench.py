@@ -18,7 +18,7 @@ import pytest
 from drjit.llvm.ad import Array4f, Float, UInt32
 
 from drgs.bench import amdahl, blocks, costs, machine_code, pairs, profile, scenes, speed, traffic
-from drgs.core.private import lanes_of_a_block, vector_width
+from drgs.bench.limits import vector_width
 
 LANES = 1000
 
@@ -260,7 +260,7 @@ def test_blocks_are_those_that_dr_jit_submits(tmp_path):
             current.append(int(number))
         else:
             current = found.setdefault((kind, int(number)), [])
-    pool = blocks.Pool(8, vector_width(), lanes_of_a_block())
+    pool = blocks.Pool(8, vector_width())
     for size in SIZES:
         assert found["JIT", size][0] == blocks.blocks_of_lanes(size, pool)[0], size
         assert found["BlockReduce", size][0] == blocks.blocks_of_sum(size, pool), size
