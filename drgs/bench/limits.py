@@ -42,13 +42,13 @@ def measure_limits(repeats: int = 5) -> MachineLimits:
     return MachineLimits(
         multiply_adds=max(_multiply_adds() for _ in range(repeats)),
         bytes_moved=max(_bytes_moved() for _ in range(repeats)),
-        width=_vector_width(),
+        width=vector_width(),
         threads=dr.thread_count(),
     )
 
 
-def _vector_width() -> int:
-    """As the code that Dr.Jit generates says."""
+def vector_width() -> int:
+    """Numbers of 32 bits in a vector, as the code that Dr.Jit generates says."""
     x = dr.arange(llvm.Float, 64)
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
         dr.kernel_history_clear()

@@ -9,12 +9,15 @@ is a little more than the computation takes when nobody looks.
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 
 import drjit as dr
+import numpy as np
 
+from drgs.bench.traffic import accesses_of, counted_trips
 from drgs.splatting import rasterize, rendering, tiles
 
 STAGES = (
@@ -29,22 +32,58 @@ STAGES = (
 )
 
 
+@dataclass(frozen=True)
+class Launch:
+    """An entry of the kernel history."""
+
+    type: str  # JIT; MkPerm, BlockReduce, ...: kernels that Dr.Jit brings along
+    size: int  # lanes, or what the type counts
+    milliseconds: float
+    ir: str | None  # intermediate representation of a kernel that was compiled
+    counts_of_sort: bool = False  # whether it is the one of a sort that adds up counts
+
+
 @dataclass
 class StageClock:
-    """Milliseconds of kernels by stage."""
+    """Milliseconds of kernels by stage, and the kernels."""
 
     kernel_ms: dict[str, float] = field(default_factory=dict)
+    launches: dict[str, list[Launch]] = field(default_factory=dict)
     compiled: int = 0  # kernels that were not in a cache
+    host_ms: float = 0.0  # of the stages, in which no kernel ran
+    started: float = field(default_factory=time.perf_counter)
 
     def end(self, stage: str) -> None:
         """All kernels since the last call belong to ``stage``."""
         dr.sync_thread()
+        passed = 1e3 * (time.perf_counter() - self.started)
         kernels = dr.kernel_history()
         self.compiled += sum(
             not kernel["cache_hit"] for kernel in kernels if kernel["type"] == dr.KernelType.JIT
         )
-        spent = sum(kernel["execution_time"] for kernel in kernels)
+        found = _launches(kernels)
+        self.launches.setdefault(stage, []).extend(found)
+        spent = sum(launch.milliseconds for launch in found)
         self.kernel_ms[stage] = self.kernel_ms.get(stage, 0.0) + spent
+        self.host_ms += passed - spent
+        self.started = time.perf_counter()  # reading the history is not the stage's
+
+
+def _launches(history: list[dict]) -> list[Launch]:
+    found, passes = [], 0
+    for entry in history:
+        name = entry["type"].name
+        passes += name == "MkPerm"
+        found.append(
+            Launch(
+                type=name,
+                size=entry["size"],
+                milliseconds=entry["execution_time"],
+                ir=entry["ir"].getvalue() if "ir" in entry else None,
+                counts_of_sort=name == "MkPerm" and passes % 3 == 2,  # count, add up, move
+            )
+        )
+    return found
 
 
 @contextmanager
@@ -89,3 +128,40 @@ def stage_clock() -> Iterator[StageClock]:
         finally:
             for module, name, original in originals:
                 setattr(module, name, original)
+
+
+@dataclass(frozen=True)
+class CountedLaunch:
+    """A kernel, and how often its lanes went through its loops."""
+
+    launch: Launch
+    trips: list[np.ndarray]  # UInt32 (size,) of each loop, in their order in the text
+
+
+def counted_launches(
+    prepare: Callable[[], Callable[[], StageClock]],
+) -> dict[str, list[CountedLaunch]]:
+    """The kernels of each stage of a computation, with the trips of their loops.
+
+    prepare: makes a computation that runs under a clock and returns it; the same each time. One
+    runs as it is, and one with loops that count, whose kernels are therefore others.
+    """
+    launches = prepare()().launches
+    computation = prepare()
+    with counted_trips() as counted:
+        computation()
+    trips = iter(counted.take())
+    found: dict[str, list[CountedLaunch]] = {}
+    for stage in STAGES:
+        for launch in launches.get(stage, []):
+            loops = len(accesses_of(launch.ir).in_loops) if launch.ir else 0
+            found.setdefault(stage, []).append(
+                CountedLaunch(launch, [_of_size(next(trips), launch) for _ in range(loops)])
+            )
+    assert next(trips, None) is None, "a loop that no kernel has"
+    return found
+
+
+def _of_size(trips: np.ndarray, launch: Launch) -> np.ndarray:
+    assert len(trips) == launch.size, "loops are not in the order of the kernels"
+    return trips

@@ -1,7 +1,8 @@
 """``python -m drgs.bench scaling``: time and memory against Gaussians, pixels and threads.
 
 Each point is a training iteration (render, loss, gradients, optimizer) on a scene of its own,
-measured in a fresh process, so that its peak of memory is its own.
+measured in a fresh process, so that its peak of memory is its own. Threads go up to the cores that
+there are, since more say nothing; what more cores could do is counted (:mod:`drgs.bench.amdahl`).
 """
 
 from __future__ import annotations
@@ -14,26 +15,42 @@ import resource
 import statistics
 import time
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import TYPE_CHECKING, TypeVar
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 import drgs  # noqa: F401  (registers the plugin, in the fresh process too)
+from drgs.bench.amdahl import CORES, Speedups, count_blocks
 from drgs.bench.output import add_out, machine, markdown_table, write_csv
 from drgs.bench.pairs import Work, count_work
+from drgs.bench.profile import STAGES
 from drgs.bench.scenes import Scene, bench_camera, bench_gaussians, frame_of, trainer_of
+from drgs.bench.speed import clocked_step
 from drgs.cli.commands import CommandParser
 from drgs.core.private import clear_memory_peak, memory_peak
 from drgs.io.figures import new_figure, write_figure
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
     from matplotlib.figure import Figure
     from matplotlib.ticker import LogLocator
 
+T = TypeVar("T")
+
 STEPS, QUICK_STEPS = 12, 4
+
+MORE_CORES = ((100_000, 400), (1_000_000, 1265))
+QUICK_MORE_CORES = ((30_000, 219),)
+"""(Gaussians, px) whose blocks are counted."""
+
+LEAST_SHARE = 0.02
+"""Of an iteration on one thread; kernels that take less are not listed."""
 
 DENSITY = 100_000 / 400**2
 """Gaussians per pixel of the bench scene, which the sweep over N keeps."""
@@ -63,12 +80,13 @@ class Result:
     device_bytes: int  # peak of Dr.Jit's allocations in a training step
     process_bytes: int  # peak resident, interpreter and libraries included
     work: Work
+    stage_ms: dict[str, float] = field(default_factory=dict)  # kernels, medians
 
 
 def add_arguments(parser: CommandParser) -> None:
     """Add the arguments of the command."""
     parser.show_examples("%(prog)s --quick")
-    add_out(parser, run, "scaling.csv", "scaling.png")
+    add_out(parser, run, "scaling.csv", "scaling_stages.csv", "scaling_blocks.csv", "scaling.png")
     parser.add_argument("--quick", action="store_true", help="fewer and smaller problems")
 
 
@@ -78,7 +96,7 @@ def run(args: argparse.Namespace) -> None:
     print(machine())
     results: dict[str, list[Result]] = {}
     for point in points(args.quick):
-        result = in_a_new_process(point, steps)
+        result = in_a_new_process(partial(measure, point, steps))
         results.setdefault(point.sweep, []).append(result)
         print(
             f"{point.sweep}: {point.count:,} Gaussians, {point.size} px, {point.threads} threads: "
@@ -87,6 +105,17 @@ def run(args: argparse.Namespace) -> None:
         )
     for name, found in results.items():
         print(f"\n{name}{_exponents(found)}\n{_table(found)}")
+    print(f"\n{_stage_table(results['threads'])}", flush=True)
+    speedups = {}
+    for count, size in QUICK_MORE_CORES if args.quick else MORE_CORES:
+        found = in_a_new_process(partial(measure_blocks, count, size, steps))
+        speedups[f"{count:,} Gaussians, {size}x{size}"] = found
+        print(f"\n{count:,} Gaussians, {size}x{size}, more cores\n{_bounds(found)}")
+        print(f"\n{_blocks(found)}", flush=True)
+    _write(args.out, results, speedups)
+
+
+def _write(out: Path, results: dict[str, list[Result]], speedups: dict[str, Speedups]) -> None:
     fields = ("milliseconds", "device_bytes", "process_bytes")
     rows = [
         [*vars(r.point).values(), *(getattr(r, f) for f in fields), *vars(r.work).values()]
@@ -94,9 +123,25 @@ def run(args: argparse.Namespace) -> None:
         for r in found
     ]
     header = [*Point.__dataclass_fields__, *fields, *Work.__dataclass_fields__]
-    write_csv(args.out / "scaling.csv", header, rows)
-    write_figure(args.out / "scaling.png", plot(results))
-    print(f"\nwritten: {args.out / 'scaling.csv'}, {args.out / 'scaling.png'}")
+    write_csv(out / "scaling.csv", header, rows)
+    write_csv(
+        out / "scaling_stages.csv",
+        ["threads", "iteration_ms", *STAGES],
+        [[r.point.threads, r.milliseconds, *r.stage_ms.values()] for r in results["threads"]],
+    )
+    write_csv(
+        out / "scaling_blocks.csv",
+        ["scene", "stage", "type", "size", "ms", *(f"blocks_{c}" for c in CORES)]
+        + [f"share_{c}" for c in CORES],
+        [
+            [name, k.stage, k.type, k.size, k.milliseconds, *k.blocks.values(), *k.share.values()]
+            for name, found in speedups.items()
+            for k in found.kernels
+        ],
+    )
+    write_figure(out / "scaling.png", plot(results))
+    names = ("scaling.csv", "scaling_stages.csv", "scaling_blocks.csv", "scaling.png")
+    print(f"\nwritten: {', '.join(str(out / name) for name in names)}")
 
 
 def points(quick: bool) -> list[Point]:
@@ -113,29 +158,21 @@ def points(quick: bool) -> list[Point]:
     ]
     found += [Point("bench scene as it is", n, 400, threads) for n in counts]
     found += [Point("pixels", base, size, threads) for size in sizes]
-    found += [Point("threads", base, 400, t) for t in _powers_of_two(threads)]
+    found += [Point("threads", base, 400, count) for count in range(1, threads + 1)]
     return found
 
 
-def _powers_of_two(largest: int) -> list[int]:
-    return sorted(
-        {1 << k for k in range(largest.bit_length())} & set(range(largest + 1)) | {largest}
-    )
-
-
-def in_a_new_process(point: Point, steps: int) -> Result:
+def in_a_new_process(measurement: Callable[[], T]) -> T:
     """Measure where nothing else was ever allocated."""
     with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:
-        return pool.submit(measure, point, steps).result()
+        return pool.submit(measurement).result()
 
 
 def measure(point: Point, steps: int) -> Result:
     """Time ``steps`` iterations of one problem, after a few to warm up."""
     dr.set_thread_count(point.threads)
     mi.set_variant("llvm_ad_rgb")
-    gaussians = bench_gaussians(point.count)
-    shrunk = gaussians.log_scales + np.float32(math.log(point.scale))
-    scene = Scene(point.sweep, replace(gaussians, log_scales=shrunk), bench_camera(point.size))
+    scene = _bench_scene(point.count, point.size, point.scale)
     work = count_work(frame_of(scene))
     trainer = trainer_of(scene)
     for _ in range(3):
@@ -148,13 +185,29 @@ def measure(point: Point, steps: int) -> Result:
         trainer.step()
         dr.sync_thread()
         times.append(time.perf_counter() - started)
+    device_bytes = memory_peak()
+    clocks = [clocked_step(trainer) for _ in range(steps)]
     return Result(
         point=point,
         milliseconds=1e3 * statistics.median(times),
-        device_bytes=memory_peak(),
+        device_bytes=device_bytes,
         process_bytes=1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss,
         work=work,
+        stage_ms={s: statistics.median(clock.kernel_ms[s] for clock in clocks) for s in STAGES},
     )
+
+
+def measure_blocks(count: int, size: int, rounds: int) -> Speedups:
+    """Blocks of an iteration's kernels, of the bench scene with as many entries a Gaussian as at
+    100,000 and 400 px."""
+    mi.set_variant("llvm_ad_rgb")
+    return count_blocks(_bench_scene(count, size, math.sqrt(100_000 / count)), rounds)
+
+
+def _bench_scene(count: int, size: int, scale: float) -> Scene:
+    gaussians = bench_gaussians(count)
+    shrunk = gaussians.log_scales + np.float32(math.log(scale))
+    return Scene("bench", replace(gaussians, log_scales=shrunk), bench_camera(size))
 
 
 # ----------------------------------------------------------------------------------------------
@@ -196,6 +249,53 @@ def _table(results: list[Result]) -> str:
         for r in results
     ]
     return markdown_table(header, rows)
+
+
+def _stage_table(results: list[Result]) -> str:
+    """Stages by threads: milliseconds, and how many times faster than with one."""
+    counts = [result.point.threads for result in results]
+    header = ["", *("1 thread" if n == 1 else f"{n} threads" for n in counts)]
+    rows = [["a training iteration", *_times_of([r.milliseconds for r in results])]]
+    rows += [[stage, *_times_of([r.stage_ms[stage] for r in results])] for stage in STAGES]
+    rest = [r.milliseconds - sum(r.stage_ms.values()) for r in results]
+    rows.append(["rest of wall time", *(f"{value:.1f} ms" for value in rest)])
+    return markdown_table(header, rows)
+
+
+def _times_of(milliseconds: list[float]) -> list[str]:
+    first, *others = milliseconds
+    return [f"{first:.1f} ms", *(f"{value:.1f} ms, {first / value:.2f}x" for value in others)]
+
+
+def _bounds(found: Speedups) -> str:
+    """Bounds of the speed-up by cores: of the iteration, and of each stage."""
+    alone = found.host_ms + sum(kernel.milliseconds for kernel in found.kernels)
+    stages = [[stage, found.milliseconds(stage), stage] for stage in STAGES]
+    rows = [["a training iteration", alone, None], *stages]
+    table = [
+        [name, f"{spent:.1f} ms", *(f"{found.bound(stage, cores):.1f}x" for cores in CORES)]
+        for name, spent, stage in rows
+    ]
+    table.append(["no kernel", f"{found.host_ms:.1f} ms", *("1.0x" for _ in CORES)])
+    return markdown_table(["at most", "1 core", *(f"{cores} cores" for cores in CORES)], table)
+
+
+def _blocks(found: Speedups) -> str:
+    """Blocks of the kernels that take long."""
+    least = LEAST_SHARE * sum(kernel.milliseconds for kernel in found.kernels)
+    rows = [
+        [
+            kernel.stage,
+            kernel.type,
+            f"{kernel.size:,}",
+            f"{kernel.milliseconds:.1f} ms",
+            *(f"{kernel.blocks[c]}, {1 / kernel.share[c]:.1f}x" for c in CORES),
+        ]
+        for kernel in found.kernels
+        if kernel.milliseconds >= least
+    ]
+    cores = (f"blocks, {cores} cores" for cores in CORES)
+    return markdown_table(["stage", "kernel", "size", "1 core", *cores], rows)
 
 
 def _short(number: int) -> str:

@@ -6,7 +6,11 @@ of them. Medians are reported, and ratios of medians.
 
 For the compositing kernels the command also says how much of their work shows (pairs of a pixel
 and a Gaussian whose alpha reaches 1/255 before the pixel is finished), and what part of the
-machine's vector instructions that work would need: see :data:`INSTRUCTIONS`.
+machine's vector instructions that work would need (:data:`INSTRUCTIONS`) and does execute
+(:class:`drgs.bench.costs.LoopCost`, from the machine code of their loops). Of each stage it counts
+the kernels that are launched and the bytes that they ask for (:mod:`drgs.bench.traffic`).
+
+``--without-avx512`` measures what a processor of AVX2 would execute.
 """
 
 from __future__ import annotations
@@ -16,7 +20,8 @@ import json
 import statistics
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -25,16 +30,20 @@ import mitsuba as mi
 import numpy as np
 
 from drgs.bench import peers
+from drgs.bench.costs import LoopCost, StageCost, loop_cost, stage_costs
 from drgs.bench.limits import MachineLimits, measure_limits
+from drgs.bench.machine_code import MachineCodeError
 from drgs.bench.output import add_out, machine, markdown_table, write_csv
 from drgs.bench.pairs import Work, count_work
-from drgs.bench.profile import STAGES, StageClock, stage_clock
+from drgs.bench.profile import STAGES, StageClock, counted_launches, stage_clock
 from drgs.bench.scenes import Scene, bench_camera, bench_gaussians, frame_of, trainer_of
 from drgs.cli.commands import CommandParser
 from drgs.core.files import atomic_path
+from drgs.core.private import leave_out_avx512
 from drgs.gaussians.parameters import Gaussians
 from drgs.io.figures import new_figure, write_figure
 from drgs.results.files import GAUSSIANS
+from drgs.splatting.grid import PIXELS
 from drgs.training.trainer import Trainer
 
 if TYPE_CHECKING:
@@ -57,6 +66,9 @@ division (2, though one division costs several); weight (1); c.g and d_color: 6 
 gain, what lies behind, derivative and selection (4); and the sums over the pixels: u v (1), sums
 of v and u v by row, u v by column (3), the column's and the rows' shares of the moments and of the
 slots (7)."""
+
+WARM_UP = 3
+"""Iterations before an iteration is looked at."""
 
 ROUNDS, QUICK_ROUNDS = 15, 5
 SLOW_ROUNDS = 3
@@ -84,6 +96,11 @@ def add_arguments(parser: CommandParser) -> None:
     add_out(parser, run, "speed.csv", "speed.json", "speed.png")
     parser.add_argument("--quick", action="store_true", help="10,000 Gaussians only; two minutes")
     parser.add_argument(
+        "--without-avx512",
+        action="store_true",
+        help="compile for this processor as if it ended at AVX2; only where Dr.Jit uses AVX-512",
+    )
+    parser.add_argument(
         "--trained",
         type=Path,
         default=Path("out/lego") / GAUSSIANS,
@@ -95,9 +112,11 @@ def add_arguments(parser: CommandParser) -> None:
 def run(args: argparse.Namespace) -> None:
     """Measure all scenes; write tables, CSV, JSON and a plot."""
     mi.set_variant("llvm_ad_rgb")
+    if args.without_avx512:
+        leave_out_avx512()
     limits = measure_limits()
     print(
-        f"{machine()}\n{limits.multiply_adds / 1e9:.1f} G multiply-adds/s in vectors of "
+        f"{_machine(args)}\n{limits.multiply_adds / 1e9:.1f} G multiply-adds/s in vectors of "
         f"{limits.width}, {limits.bytes_moved / 1e9:.1f} GB/s"
     )
     print(peers.why_no_gsplat())
@@ -108,8 +127,13 @@ def run(args: argparse.Namespace) -> None:
         timings += found
         reports.append(report)
         print(f"\n{scene.name}: {_work_line(report.work)}")
-        print(f"\n{_comparison(found)}\n\n{_stages(report)}", flush=True)
-    _write(args.out, limits, timings, reports)
+        print(f"\n{_comparison(found)}\n\n{_stages(report, limits)}\n")
+        print(_loops(report, limits), flush=True)
+    _write(args, limits, timings, reports)
+
+
+def _machine(args: argparse.Namespace) -> str:
+    return f"{machine()}, without AVX-512" if args.without_avx512 else machine()
 
 
 def scenes_of(args: argparse.Namespace) -> list[Scene]:
@@ -191,6 +215,9 @@ class IterationReport:
     stage_ms: dict[str, float]  # kernels, medians; see profile.STAGES
     wall_ms: float  # a whole iteration that nobody looks into, median
     vector_share: dict[str, float]  # of the machine's vector instructions, by useful pairs
+    costs: dict[str, StageCost]
+    loops: dict[str, LoopCost]  # of the stages of INSTRUCTIONS; empty if there is no machine code
+    no_loops: str  # why
 
     @property
     def kernel_ms(self) -> float:
@@ -200,14 +227,7 @@ class IterationReport:
 
 def profile_training(scene: Scene, limits: MachineLimits, rounds: int) -> IterationReport:
     """Train on one view of the scene itself, with all SH degrees and no change of population."""
-    trainer = trainer_of(scene)
-    for _ in range(3):
-        trainer.step()
-    dr.sync_thread()
-    walls, clocks = [], []
-    for _ in range(rounds):
-        walls.append(_seconds(lambda: _steps(trainer, 4)) / 4)
-        clocks.append(_clocked_step(trainer))
+    walls, clocks = _time_iterations(warm_trainer(scene), rounds)
     stage_ms = {
         stage: statistics.median(clock.kernel_ms.get(stage, 0.0) for clock in clocks)
         for stage in STAGES
@@ -218,7 +238,32 @@ def profile_training(scene: Scene, limits: MachineLimits, rounds: int) -> Iterat
         * 1e3
         for stage, count in INSTRUCTIONS.items()
     }  # fmt: skip
-    return IterationReport(scene.name, work, stage_ms, 1e3 * statistics.median(walls), share)
+    launches = counted_launches(lambda: partial(clocked_step, warm_trainer(scene)))
+    loops, reason = {}, ""
+    try:
+        loops = {stage: loop_cost(launches[stage], limits.width) for stage in INSTRUCTIONS}
+    except MachineCodeError as error:
+        reason = str(error)
+    wall = 1e3 * statistics.median(walls)
+    return IterationReport(
+        scene.name, work, stage_ms, wall, share, stage_costs(launches), loops, reason
+    )
+
+
+def _time_iterations(trainer: Trainer, rounds: int) -> tuple[list[float], list[StageClock]]:
+    """Seconds of an iteration that nobody looks into, and the stages of another, each round."""
+    walls, clocks = [], []
+    for _ in range(rounds):
+        walls.append(_seconds(lambda: _steps(trainer, 4)) / 4)
+        clocks.append(clocked_step(trainer))
+    return walls, clocks
+
+
+def warm_trainer(scene: Scene) -> Trainer:
+    """A trainer whose kernels have been compiled."""
+    trainer = trainer_of(scene)
+    _steps(trainer, WARM_UP)
+    return trainer
 
 
 def _steps(trainer: Trainer, count: int) -> None:
@@ -227,7 +272,8 @@ def _steps(trainer: Trainer, count: int) -> None:
     dr.sync_thread()
 
 
-def _clocked_step(trainer: Trainer) -> StageClock:
+def clocked_step(trainer: Trainer) -> StageClock:
+    """A training iteration, stage by stage."""
     with stage_clock() as clock:
         report = trainer.step()
         dr.eval(report.loss_array, report.squared_error)
@@ -268,34 +314,86 @@ def _milliseconds(seconds: float) -> str:
     return f"{1e3 * seconds:.1f} ms" if seconds < 1 else f"{seconds:.2f} s"
 
 
-def _stages(report: IterationReport) -> str:
-    rows = [
-        [
-            stage,
-            f"{report.stage_ms[stage]:.1f} ms",
-            f"{100 * report.vector_share[stage]:.0f} %" if stage in report.vector_share else "",
-        ]
-        for stage in STAGES
-    ]
+def _stages(report: IterationReport, limits: MachineLimits) -> str:
+    rows = []
+    for stage in STAGES:
+        cost, spent = report.costs[stage], report.stage_ms[stage]
+        rows.append(
+            [
+                stage,
+                f"{spent:.1f} ms",
+                str(cost.kernels),
+                f"{cost.bytes / 1e6:.1f} MB",
+                _percent(cost.bytes / limits.bytes_moved * 1e3 / spent),
+                _percent(report.vector_share[stage]) if stage in report.vector_share else "",
+            ]
+        )
     rest = report.wall_ms - report.kernel_ms
-    rows.append(["rest of wall time", f"{rest:.1f} ms", ""])
-    rows.append(["a training iteration", f"{report.wall_ms:.1f} ms", ""])
-    return markdown_table(["stage", "kernels", "useful part of the vector limit"], rows)
+    rows.append(["rest of wall time", f"{rest:.1f} ms", "", "", "", ""])
+    kernels = str(sum(cost.kernels for cost in report.costs.values()))
+    moved = sum(cost.bytes for cost in report.costs.values())
+    share = _percent(moved / limits.bytes_moved * 1e3 / report.wall_ms)
+    total = [f"{report.wall_ms:.1f} ms", kernels, f"{moved / 1e6:.1f} MB", share, ""]
+    rows.append(["a training iteration", *total])
+    header = ["stage", "time", "kernels", "bytes asked for", "of the memory limit"]
+    return markdown_table([*header, "useful part of the vector limit"], rows)
+
+
+def _loops(report: IterationReport, limits: MachineLimits) -> str:
+    """What the machine code of the loops over pairs does for a pair."""
+    if not report.loops:
+        return f"no machine code: {report.no_loops}"
+    header = ["a (pixel, Gaussian) pair", *report.loops]
+    useful = report.work.useful / report.work.evaluated
+    rows = [
+        ["pairs evaluated", *(f"{report.work.evaluated:,}" for _ in report.loops)],
+        ["of them useful", *(_percent(useful) for _ in report.loops)],
+        ["lanes that vectors keep busy", *(_percent(v) for v in _busy_lanes(report, limits))],
+    ]
+    for title, name in (
+        ("vector instructions", "vectors"),
+        ("loads of data", "loads"),
+        ("stores of data", "stores"),
+        ("loads of the stack", "stack_loads"),
+        ("stores to the stack", "stack_stores"),
+        ("loads of constants", "constants"),
+    ):
+        rows.append([title, *(f"{getattr(loop, name):.1f}" for loop in report.loops.values())])
+    rows.insert(4, ["needed", *(f"{INSTRUCTIONS[stage]:.0f}" for stage in report.loops)])
+    executed = [
+        loop.instructions() / limits.vector_instructions * 1e3 / report.stage_ms[stage]
+        for stage, loop in report.loops.items()
+    ]
+    rows.append(["executed, of the vector limit", *map(_percent, executed)])
+    return markdown_table(header, rows)
+
+
+def _busy_lanes(report: IterationReport, limits: MachineLimits) -> list[float]:
+    evaluated = report.work.evaluated / PIXELS
+    return [evaluated / (loop.steps * limits.width) for loop in report.loops.values()]
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:.0f} %"
 
 
 def _write(
-    out: Path, limits: MachineLimits, timings: list[Timing], reports: list[IterationReport]
+    args: argparse.Namespace,
+    limits: MachineLimits,
+    timings: list[Timing],
+    reports: list[IterationReport],
 ) -> None:
+    out = args.out
     write_csv(
         out / "speed.csv",
         list(Timing.__dataclass_fields__),
         [list(vars(timing).values()) for timing in timings],
     )
     values = {
-        "machine": machine(),
+        "machine": _machine(args),
         "limits": vars(limits),
         "timings": [vars(timing) for timing in timings],
-        "iterations": [{**vars(report), "work": vars(report.work)} for report in reports],
+        "iterations": [asdict(report) for report in reports],
     }
     with atomic_path(out / "speed.json") as temporary:
         temporary.write_text(json.dumps(values, indent=2) + "\n")

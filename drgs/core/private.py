@@ -6,10 +6,14 @@ changes one of them is met here.
 
 from __future__ import annotations
 
+import ctypes
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import drjit as dr
+
+from drgs.core.errors import UserError
 
 
 def bucket_order(buckets: Any, block_size: int, num_buckets: int) -> Any:
@@ -39,6 +43,40 @@ def llvm_version() -> tuple[int, ...]:
     Relies on ``dr.detail.llvm_version`` waiting for Dr.Jit's start-up.
     """
     return tuple(dr.detail.llvm_version())
+
+
+def leave_out_avx512() -> None:
+    """From now on, compile for this processor as if it had AVX2 and no AVX-512.
+
+    To be called before the first kernel. Raises :class:`UserError` where there is no AVX-512, or no
+    way to leave it out.
+
+    Relies on ``jit_llvm_set_target`` of drjit-core, which Dr.Jit's Python interface does not offer.
+    """
+    llvm_version()  # waits until the backend knows its processor
+    place = "jit_llvm_set_target(): cannot leave out AVX-512"
+    try:
+        processor = _of_llvm_backend("_Z19jit_llvm_target_cpuv", ctypes.c_char_p)()
+        features = _of_llvm_backend("_Z24jit_llvm_target_featuresv", ctypes.c_char_p)()
+        set_target = _of_llvm_backend("_Z19jit_llvm_set_targetPKcS0_j", None)
+    except (AttributeError, OSError) as error:
+        raise UserError(f"{place}: this build of Dr.Jit has no such function; omit it") from error
+    names = (features or b"").decode().split(",")
+    if "+avx512vl" not in names:
+        raise UserError(f"{place}: Dr.Jit does not use it on this processor; omit it")
+    wider = ("avx512", "evex512", "avx10", "amx")
+    rest = [f"-{name[1:]}" if name[1:].startswith(wider) else name for name in names]
+    set_target(processor, ",".join(rest).encode(), ctypes.c_uint32(8))
+
+
+def _of_llvm_backend(name: str, result: Any) -> Any:
+    """A C++ function of drjit-core, by its mangled name."""
+    library = next(iter(sorted(Path(dr.__file__).parent.glob("libdrjit-core.*"))), None)
+    if library is None:
+        raise OSError("no library of drjit-core")
+    function = getattr(ctypes.CDLL(str(library)), name)
+    function.restype = result
+    return function
 
 
 def clear_memory_peak() -> None:

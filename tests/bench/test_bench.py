@@ -153,7 +153,3 @@ def test_gaussians_keep_their_entries_as_their_number_grows():
         )
         ratios.append(pairs.count_work(scenes.frame_of(scene)).entries / point.count)
     assert len(ratios) >= 2 and max(ratios) / min(ratios) < 1.1
-
-
-def test_vector_width_is_a_power_of_two():
-    assert limits._vector_width() in (4, 8, 16)

@@ -1,12 +1,15 @@
 """Undocumented functions of Dr.Jit and Mitsuba are called in one module."""
 
 import ast
+import subprocess
+import sys
 
 import drjit as dr
 import numpy as np
 from conftest import REPOSITORY
 from drjit.llvm.ad import Float, UInt32
 
+from drgs.bench.limits import vector_width
 from drgs.core import private
 
 FILES = [path for f in ("drgs", "plugins") for path in sorted((REPOSITORY / f).rglob("*.py"))]
@@ -45,6 +48,32 @@ def test_variables_are_the_same_or_have_equal_values():
 
 def test_the_library_has_a_version():
     assert private.llvm_version()[0] > 10
+
+
+PROGRAM = """
+import drgs, drjit as dr
+from drjit.llvm.ad import Float
+from drgs.core import private
+from drgs.core.errors import UserError
+try:
+    private.leave_out_avx512()
+except UserError as error:
+    print(error)
+dr.set_flag(dr.JitFlag.KernelHistory, True)
+dr.eval(dr.rsqrt(dr.arange(Float, 100) + 1))
+ir = dr.kernel_history()[-1]["ir"].getvalue()
+print("<8 x float>" in ir, "+avx512" in ir, "+avx2" in ir)
+"""
+
+
+def test_a_processor_with_avx512_can_do_without():
+    """In a process of its own, since there is no way back."""
+    run = [sys.executable, "-c", PROGRAM]
+    result = subprocess.run(run, capture_output=True, text=True, check=True).stdout
+    if vector_width() == 16:
+        assert result.split() == ["True", "False", "True"]
+    else:
+        assert "cannot leave out AVX-512" in result and "omit it" in result
 
 
 def test_the_peak_of_memory_is_that_since_it_was_cleared():
