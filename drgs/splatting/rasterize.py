@@ -45,20 +45,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 import drjit as dr
 
-from drgs.core.arrays import (
-    empty_rows,
-    interleave,
-    load_row,
-    pack_rows,
-    scatter_rows,
-    store_row,
-    types_of,
-)
+from drgs.core.arrays import Rows, interleave, scatter_rows, types_of
 from drgs.splatting.grid import GRID, MICRO, MICROS, PIXELS, TILE, TileGrid
 from drgs.splatting.image_model import Alpha, Features
 from drgs.splatting.lanes import (
@@ -125,30 +116,25 @@ class Records:
     memory in order instead of jumping from splat to splat.
     """
 
-    rows: Any  # Float (M padded * packets * 4,): geometry, features, keys, padding
+    rows: Rows  # by sorted entry: geometry, features, keys
     num_geometry: int
     num_features: int
-    num_keys: int
 
     @staticmethod
     def of(bins: TileBins, numbers: Callable[[Any], list[Any]]) -> Records:
-        """Copies, evaluated, of each rank's ``numbers``, such as those of ``bins.splats``."""
-        rows = pack_rows(numbers(bins.ranks))
+        """Copies, evaluated, of each rank's ``numbers``, such as those of ``bins.rows.load``."""
+        rows = Rows.of(numbers(bins.ranks))
         dr.eval(rows)
-        return Records(rows, bins.model.response.num_geometry, bins.num_features, bins.num_keys)
+        return Records(rows, bins.model.response.num_geometry, bins.num_features)
 
     def load(self, entry: Any, active: Any) -> tuple[list[Any], list[Any]]:
         """Geometry and features of a sorted entry."""
-        numbers = self._numbers(entry, active)
+        numbers = self.rows.load(entry, active)
         return numbers[: self.num_geometry], numbers[self.num_geometry :][: self.num_features]
 
     def load_keys(self, entry: Any, active: Any) -> list[Any]:
         """Keys of a sorted entry."""
-        return self._numbers(entry, active)[self.num_geometry + self.num_features :]
-
-    def _numbers(self, entry: Any, active: Any) -> list[Any]:
-        width = self.num_geometry + self.num_features + self.num_keys
-        return load_row(self.rows, width, entry, active)
+        return self.rows.load(entry, active)[self.num_geometry + self.num_features :]
 
 
 # ----------------------------------------------------------------------------------------------
@@ -159,9 +145,9 @@ class Records:
 def composite(bins: TileBins, records: Records) -> Layers:
     """Composite the features of all splats.
 
-    bins: from ``bin_splats``; records: ``Records.of(bins, bins.splats)``.
+    bins: from ``bin_splats``; records: ``Records.of(bins, bins.rows.load)``.
     """
-    t = types_of(type(bins.rows))
+    t = types_of(bins.rows.Float)
     lanes = make_lanes(t.Float, bins.grid)
     end = dr.gather(t.UInt32, bins.tile_start, lanes.tile + 1)
     lanes = grouped_by_work(lanes, count_entries(Entries(bins, lanes, end)))
@@ -169,50 +155,59 @@ def composite(bins: TileBins, records: Records) -> Layers:
     model = bins.model.bind(lanes, bins.grid)
     count = model.features.num_planes(bins.num_features)
 
-    def body(cursor: Cursor, T: list, C: list, ends: list, unfinished: Any) -> tuple:
+    def body(cursor: Cursor, pixels: list, unfinished: Any) -> tuple:
         entry, active = entries.current(cursor)
         geometry, features = records.load(entry, active)
         footprint = model.footprint(geometry, lanes, active)
-        T, C, ends = list(T), [list(c) for c in C], list(ends)
         behind = dr.select(active, entry + 1, entry)
+        composited = []
         for pixel, alpha in enumerate(model.alphas(geometry, footprint)):
-            weight, T[pixel], goes_on = composite_step(T[pixel], alpha.value, stop)
-            ends[pixel] = dr.select(goes_on, behind, ends[pixel])
-            planes = model.features.add([plane[pixel] for plane in C], features, pixel, weight)
-            for plane, value in zip(C, planes, strict=True):
-                plane[pixel] = value
-        return entries.advance(cursor), T, C, ends, _any_positive(T)
+            T, *C, end = pixels[pixel]
+            weight, T, goes_on = composite_step(T, alpha.value, stop)
+            end = dr.select(goes_on, behind, end)
+            composited.append([T, *model.features.add(C, features, pixel, weight), end])
+        return entries.advance(cursor), composited, _any_unfinished(composited)
 
     stop = model.cutoffs.transmittance_stop
     size = dr.width(lanes.tile)
-    zero = dr.zeros(t.Float, size)
-    _, T, C, ends, _ = dr.while_loop(
+    nothing = [*[dr.zeros(t.Float, size)] * count, dr.zeros(t.UInt32, size)]
+    # One pixel after the other: instructions are in the order of the state that they compute, and
+    # what a pixel needs is in registers only for as long as it is at work.
+    _, pixels, _ = dr.while_loop(
         state=(
             entries.begin(),
             # Pixels off the film are finished before they begin.
-            [dr.select(inside, t.Float(1), -1) for _, inside in pixels_of(lanes, bins.grid)],
-            [[t.Float(zero) for _ in range(PIXELS)] for _ in range(count)],
-            [dr.zeros(t.UInt32, size) for _ in range(PIXELS)],
+            [
+                [dr.select(inside, t.Float(1), -1), *[type(x)(x) for x in nothing]]
+                for _, inside in pixels_of(lanes, bins.grid)
+            ],
             dr.full(t.Bool, True, size),
         ),
-        cond=lambda cursor, T, C, ends, unfinished: entries.pending(cursor) & unfinished,
+        cond=lambda cursor, pixels, unfinished: entries.pending(cursor) & unfinished,
         body=body,
     )
-    dr.eval(T, C, ends)
-    columns = [dr.abs(v) for v in T] + [v for plane in C for v in plane]
-    last = largest(ends)
-    dr.eval(columns, last)
-    return Layers(
+    dr.eval(pixels)
+    T, *planes, ends = zip(*pixels, strict=True)
+    columns = [dr.abs(v) for v in T] + [v for plane in planes for v in plane]
+    layers = Layers(
         values=scatter_rows(columns, lanes.micro_tile, size),
-        ends=scatter_rows(ends, lanes.micro_tile, size),
-        stop=scatter_rows([last], lanes.micro_tile, size),
+        ends=scatter_rows([*ends], lanes.micro_tile, size),
+        stop=scatter_rows([largest([*ends])], lanes.micro_tile, size),
         count=count,
         grid=bins.grid,
     )
+    dr.eval(layers.values, layers.ends, layers.stop)
+    return layers
 
 
-def _any_positive(values: list[Any]) -> Any:
-    return largest(values) > 0
+def _any_unfinished(pixels: list[list[Any]]) -> Any:
+    """Whether a transmittance has no negative sign: the bits that all share tell."""
+    transmittances = [T for T, *_ in pixels]
+    Int = dr.int_array_t(type(transmittances[0]))
+    shared = dr.reinterpret_array(Int, transmittances[0])
+    for T in transmittances[1:]:
+        shared &= dr.reinterpret_array(Int, T)
+    return shared >= 0
 
 
 def largest(values: list[Any]) -> Any:
@@ -283,7 +278,7 @@ class Slots:
 
 def assign_slots(bins: TileBins, layers: Layers) -> Slots:
     """Number the slots. The host reads one value, how many there are."""
-    t = types_of(type(bins.rows))
+    t = types_of(bins.rows.Float)
     entry = dr.arange(t.UInt32, dr.width(bins.masks))
     composited = t.UInt32(0)
     for k in range(MICROS // 4):
@@ -323,7 +318,7 @@ def composite_adjoint(
     (H * W,); d_transmittance: plane (H * W,). Not differentiated: the order, the decisions
     (cut, clamp, stop).
     """
-    t = types_of(type(bins.rows))
+    t = types_of(bins.rows.Float)
     slots = assign_slots(bins, layers)
     lanes = make_lanes(t.Float, bins.grid)
     stop = dr.gather(t.UInt32, layers.stop, lanes.micro_tile)
@@ -336,7 +331,7 @@ def composite_adjoint(
     g = [load_pixels(plane, lanes, bins.grid) for plane in d_features]
     ends = load_lane_row(layers.ends, lanes.micro_tile, 1)
     transmittance = load_lane_row(layers.values, lanes.micro_tile, 1 + layers.count)
-    partials = empty_rows(t.Float, width, max(slots.count, 1))
+    partials = Rows.whole(t.Float, width, max(slots.count, 1))
 
     def body(cursor: Cursor, slot: Any, T: list, behind: list) -> tuple:
         entry, active = entries.current(cursor)
@@ -349,7 +344,7 @@ def composite_adjoint(
             alphas, composited, features, model.features, T, behind, g
         )
         moments = model.response.moments(footprint, d_log_alpha, model.positions)
-        store_row(partials, moments + d_features, slot, active)
+        partials.store(moments + d_features, slot, active)
         return entries.advance(cursor), slot, T, behind
 
     loop = dr.while_loop(
@@ -363,7 +358,7 @@ def composite_adjoint(
         body=body,
     )
     dr.eval(loop, partials)
-    return sum_slots(bins, slots, partials, width)
+    return sum_slots(bins, slots, partials)
 
 
 def _adjoint_step(
@@ -398,15 +393,10 @@ def _adjoint_step(
     return T, behind, d_log_alpha, d_stored
 
 
-def sum_slots(bins: TileBins, slots: Slots, partials: Any, width: int) -> SplatGradients:
-    """Add up the slots of each entry, the entries of each splat, and turn sums into derivatives.
-
-    width: numbers in a slot.
-    """
-    t = types_of(type(bins.rows))
-    by_entry = _sum_entries(bins, slots, partials, width)
-    totals = sum_runs(t.Float, bins.first_entry, lambda entry: load_row(by_entry, width, entry))
-    return splat_gradients(bins, totals)
+def sum_slots(bins: TileBins, slots: Slots, partials: Rows) -> SplatGradients:
+    """Add up the slots of each entry, the entries of each splat, and turn sums into derivatives."""
+    by_entry = _sum_entries(bins, slots, partials)
+    return splat_gradients(bins, sum_runs(bins.rows.Float, bins.first_entry, by_entry.load))
 
 
 def sum_runs(Float: type, first: Any, load: Callable[[Any], list[Any]]) -> list[Any]:
@@ -436,22 +426,22 @@ def splat_gradients(bins: TileBins, totals: list[Any]) -> SplatGradients:
 
     totals: moments, and derivatives of the features.
     """
-    t, response = types_of(type(bins.rows)), bins.model.response
-    rank = dr.arange(t.UInt32, dr.width(bins.order))
-    geometry = bins.splats(rank)[: response.num_geometry]
+    t, response = types_of(bins.rows.Float), bins.model.response
+    size = dr.width(bins.order)
+    rank, count = dr.arange(t.UInt32, size), response.num_geometry
+    geometry = bins.rows.load(rank)[:count]
     columns = response.derivatives(geometry, totals[: response.num_moments])
     columns += totals[response.num_moments :]
-    dr.eval(columns)
-    size = dr.width(rank)
-    flat = scatter_rows(columns, bins.order, size)
-    row = [dr.gather(t.Float, flat, rank * len(columns) + k) for k in range(len(columns))]
-    count = response.num_geometry
-    return SplatGradients(geometry=row[:count], features=row[count:])
+    rows = Rows.empty(t.Float, len(columns), size)
+    rows.store(columns, bins.order)
+    dr.eval(rows)
+    numbers = rows.load(rank)
+    return SplatGradients(geometry=numbers[:count], features=numbers[count:])
 
 
-def _sum_entries(bins: TileBins, slots: Slots, partials: Any, width: int) -> Any:
-    """Sums over the micro-tiles of each entry: rows of ``width`` numbers by unsorted entry."""
-    t = types_of(type(bins.rows))
+def _sum_entries(bins: TileBins, slots: Slots, partials: Rows) -> Rows:
+    """Sums over the micro-tiles of each entry, by unsorted entry, evaluated."""
+    t = types_of(bins.rows.Float)
     entry = dr.arange(t.UInt32, max(bins.num_entries, 1))
     group, below = entry // WORD, (t.UInt32(1) << (entry % WORD)) - 1
 
@@ -459,7 +449,7 @@ def _sum_entries(bins: TileBins, slots: Slots, partials: Any, width: int) -> Any
         for _ in range(2):  # two at a time wait for memory together
             active = micros != 0
             first, word = slots.at(group, dr.tzcnt(micros), active)
-            numbers = load_row(partials, width, first + dr.popcnt(word & below), active)
+            numbers = partials.load(first + dr.popcnt(word & below), active)
             totals = [a + b for a, b in zip(totals, numbers, strict=True)]
             micros = micros & (micros - 1)
         return micros, totals
@@ -468,14 +458,15 @@ def _sum_entries(bins: TileBins, slots: Slots, partials: Any, width: int) -> Any
     _, totals = dr.while_loop(
         state=(
             dr.gather(t.UInt32, slots.composited, entry),
-            [t.Float(zero) for _ in range(width)],
+            [t.Float(zero) for _ in range(partials.width)],
         ),
         cond=lambda micros, totals: micros != 0,
         body=body,
     )
     dr.eval(totals)
-    rows = empty_rows(t.Float, width, dr.width(entry))
-    store_row(rows, totals, dr.gather(t.UInt32, bins.source, entry))
+    rows = Rows.whole(t.Float, partials.width, dr.width(entry))
+    rows.store(totals, dr.gather(t.UInt32, bins.source, entry))
+    dr.eval(rows)
     return rows
 
 
@@ -492,7 +483,7 @@ def composite_tangent(
     tangents: the same fields as the gradients, holding the direction. Returns the tangents of
     the planes that :func:`composite` made. Not differentiated: the order, the decisions.
     """
-    t = types_of(type(bins.rows))
+    t = types_of(bins.rows.Float)
     count = layers.count
     lanes = make_lanes(t.Float, bins.grid)
     entries = Entries(bins, lanes, dr.gather(t.UInt32, layers.stop, lanes.micro_tile))
@@ -545,16 +536,16 @@ def composite_tangent(
 
 def pack_tangents(bins: TileBins, tangents: SplatGradients) -> Records:
     """The records' tangents: of the geometry as the response wants it, and of the features."""
-    t = types_of(type(bins.rows))
+    t = types_of(bins.rows.Float)
     rank = dr.arange(t.UInt32, dr.width(bins.order))
 
     def by_rank(columns: list[Any]) -> list[Any]:
         return [dr.gather(t.Float, column, bins.order) for column in columns]
 
-    geometry = bins.splats(rank)[: bins.model.response.num_geometry]
+    geometry = bins.rows.load(rank)[: bins.model.response.num_geometry]
     numbers = bins.model.response.pack_tangents(geometry, by_rank(tangents.geometry))
     numbers += by_rank(tangents.features)
     numbers += [dr.zeros(t.Float, dr.width(rank))] * bins.num_keys  # they have no derivatives
-    rows = pack_rows(numbers)
+    rows = Rows.of(numbers)
     dr.eval(rows)
-    return Records.of(bins, partial(load_row, rows, len(numbers)))
+    return Records.of(bins, rows.load)
