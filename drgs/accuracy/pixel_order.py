@@ -128,9 +128,8 @@ class _WalkInputs:
     @staticmethod
     def of(bins: TileBins, records: Records, lists: PixelLists, order: PixelOrder) -> _WalkInputs:
         """Lanes with lists of similar length together."""
-        lanes = make_lanes(bins.rows.Float, bins.grid)
-        begin, end = lists.range(lanes)
-        lanes = grouped_by_work(lanes, end - begin)
+        begin, end = lists.range(make_lanes(bins.rows.Float, bins.grid))
+        lanes = grouped_by_work(bins.rows.Float, bins.grid, end - begin)
         return _WalkInputs(bins, records, lists, order, lanes, bins.model.bind(lanes, bins.grid))
 
     @property

@@ -150,7 +150,7 @@ def composite(bins: TileBins, records: Records) -> Layers:
     t = types_of(bins.rows.Float)
     lanes = make_lanes(t.Float, bins.grid)
     end = dr.gather(t.UInt32, bins.tile_start, lanes.tile + 1)
-    lanes = grouped_by_work(lanes, count_entries(Entries(bins, lanes, end)))
+    lanes = grouped_by_work(t.Float, bins.grid, count_entries(Entries(bins, lanes, end)))
     entries = Entries(bins, lanes, dr.gather(t.UInt32, bins.tile_start, lanes.tile + 1))
     model = bins.model.bind(lanes, bins.grid)
     count = model.features.num_planes(bins.num_features)
@@ -322,7 +322,7 @@ def composite_adjoint(
     slots = assign_slots(bins, layers)
     lanes = make_lanes(t.Float, bins.grid)
     stop = dr.gather(t.UInt32, layers.stop, lanes.micro_tile)
-    lanes = grouped_by_work(lanes, slots.number(Entries(bins, lanes, stop)))
+    lanes = grouped_by_work(t.Float, bins.grid, slots.number(Entries(bins, lanes, stop)))
     stop = dr.gather(t.UInt32, layers.stop, lanes.micro_tile)
     entries = EntriesBackToFront(bins, lanes, stop)
     model = bins.model.bind(lanes, bins.grid)
@@ -432,6 +432,7 @@ def splat_gradients(bins: TileBins, totals: list[Any]) -> SplatGradients:
     geometry = bins.rows.load(rank)[:count]
     columns = response.derivatives(geometry, totals[: response.num_moments])
     columns += totals[response.num_moments :]
+    dr.eval(columns)
     rows = Rows.empty(t.Float, len(columns), size)
     rows.store(columns, bins.order)
     dr.eval(rows)
@@ -464,7 +465,7 @@ def _sum_entries(bins: TileBins, slots: Slots, partials: Rows) -> Rows:
         body=body,
     )
     dr.eval(totals)
-    rows = Rows.whole(t.Float, partials.width, dr.width(entry))
+    rows = Rows.empty(t.Float, partials.width, dr.width(entry))
     rows.store(totals, dr.gather(t.UInt32, bins.source, entry))
     dr.eval(rows)
     return rows
