@@ -329,7 +329,7 @@ def test_slots_are_a_numbering_of_the_composited_pairs(precision):
     np.testing.assert_array_equal(counted, expected)
     assert len(set(expected)) > 3
     similar = lanes_module.grouped_by_work(
-        lanes, slots.number(lanes_module.Entries(bins, lanes, lane_stop))
+        precision.Float, bins.grid, slots.number(lanes_module.Entries(bins, lanes, lane_stop))
     )
     np.testing.assert_array_equal(np.sort(similar.micro_tile), np.sort(lanes.micro_tile))
     assert slots.count < sum(bin(mask).count("1") for mask in masks), "some pairs are behind a stop"
