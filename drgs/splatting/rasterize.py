@@ -333,28 +333,34 @@ def composite_adjoint(
     transmittance = load_lane_row(layers.values, lanes.micro_tile, 1 + layers.count)
     partials = Rows.whole(t.Float, width, max(slots.count, 1))
 
-    def body(cursor: Cursor, slot: Any, T: list, behind: list) -> tuple:
+    # A packet is stored with a branch for each lane, and across branches numbers wait in memory
+    # instead of registers. A turn therefore begins with storing what the one before has summed.
+    def body(cursor: Cursor, slot: Any, pixels: list, sums: list, is_summed: Any) -> tuple:
+        partials.store(sums, slot, is_summed)
         entry, active = entries.current(cursor)
         slot = dr.select(active, slot - 1, slot)
         geometry, features = records.load(entry, active)
         footprint = model.footprint(geometry, lanes, active)
         alphas = model.alphas(geometry, footprint)
         composited = [entry < end for end in ends]
-        T, behind, d_log_alpha, d_features = _adjoint_step(
-            alphas, composited, features, model.features, T, behind, g
+        pixels, d_log_alpha, d_features = _adjoint_step(
+            alphas, composited, features, model.features, pixels, g
         )
         moments = model.response.moments(footprint, d_log_alpha, model.positions)
-        partials.store(moments + d_features, slot, active)
-        return entries.advance(cursor), slot, T, behind
+        return entries.advance(cursor), slot, pixels, moments + d_features, active
 
+    size = dr.width(lanes.tile)
+    zero = dr.zeros(t.Float, size)
+    behind = load_pixels(d_transmittance, lanes, bins.grid)
     loop = dr.while_loop(
         state=(
             entries.begin(),
             slots.end(entries),
-            transmittance,
-            load_pixels(d_transmittance, lanes, bins.grid),
+            [[*pixel] for pixel in zip(transmittance, behind, strict=True)],
+            [t.Float(zero) for _ in range(width)],
+            dr.full(t.Bool, False, size),
         ),
-        cond=lambda cursor, slot, T, behind: entries.pending(cursor),
+        cond=lambda cursor, slot, pixels, sums, is_summed: entries.pending(cursor) | is_summed,
         body=body,
     )
     dr.eval(loop, partials)
@@ -366,31 +372,28 @@ def _adjoint_step(
     composited: list[Any],
     stored: list[Any],
     features: Features,
-    T: list[Any],
-    behind: list[Any],
+    pixels: list[list[Any]],
     g: list[list[Any]],
-) -> tuple[list, list, list, list]:
+) -> tuple[list, list, list]:
     """One splat at 16 pixels: T and b before it, d loss / d ln(alpha), d loss / d stored (summed).
 
     composited: whether each pixel was still unfinished; stored: what is stored of the splat, and
-    features: what they are at a pixel; T, behind: T and b past the splat; g: [plane][pixel]
+    features: what they are at a pixel; pixels: T and b of each, past the splat; g: [plane][pixel]
     derivative of the loss with respect to C.
     """
-    T, behind = list(T), list(behind)
-    zero = type(T[0])(0)
-    d_stored = [zero for _ in stored]
-    d_log_alpha = []
-    for pixel, alpha in enumerate(alphas):
+    zero = type(pixels[0][0])(0)
+    before, d_log_alpha, d_stored = [], [], [zero for _ in stored]
+    for pixel, (alpha, (T, behind)) in enumerate(zip(alphas, pixels, strict=True)):
         value = dr.select(composited[pixel], alpha.value, 0)
-        T[pixel] = T[pixel] / (1 - value)
-        weight = value * T[pixel]
+        T = T / (1 - value)
+        weight = value * T
         g_pixel = [plane[pixel] for plane in g]
         d_stored = features.add_derivatives(d_stored, stored, pixel, weight, g_pixel)
-        gain = features.feature_gradient(stored, pixel, g_pixel) - behind[pixel]
-        behind[pixel] = dr.fma(value, gain, behind[pixel])
+        gain = features.feature_gradient(stored, pixel, g_pixel) - behind
+        before.append([T, dr.fma(value, gain, behind)])
         # d loss / d ln(alpha) = a T (c.g - b), zero where alpha is clamped.
         d_log_alpha.append(dr.select(alpha.smooth, weight * gain, 0))
-    return T, behind, d_log_alpha, d_stored
+    return before, d_log_alpha, d_stored
 
 
 def sum_slots(bins: TileBins, slots: Slots, partials: Rows) -> SplatGradients:
