@@ -44,8 +44,8 @@ from drgs.splatting.rasterize import (
     largest,
     pack_tangents,
     splat_gradients,
-    sum_runs,
 )
+from drgs.splatting.slots import sum_runs
 from drgs.splatting.tiles import TileBins
 
 UNORDERED_ALPHA = 1e-4

@@ -36,9 +36,8 @@ therefore walk through memory in order: splats are copied into the order of the 
 a lane of the adjoint writes is contiguous.
 
 **No atomics.** In the adjoint, a lane sums each splat's partial derivatives over its 16 pixels
-and writes them into a slot that belongs to this (splat, micro-tile) alone. One lane per entry
-adds up its slots, one lane per splat its entries, in an order of their own. The result is the
-same to the last bit in every run.
+and writes them into a slot that belongs to this (splat, micro-tile) alone: see
+:mod:`drgs.splatting.slots`.
 """
 
 from __future__ import annotations
@@ -49,7 +48,7 @@ from typing import Any
 
 import drjit as dr
 
-from drgs.core.arrays import Rows, interleave, scatter_rows, types_of
+from drgs.core.arrays import Rows, scatter_rows, types_of
 from drgs.splatting.grid import GRID, MICRO, MICROS, PIXELS, TILE, TileGrid
 from drgs.splatting.image_model import Alpha, Features
 from drgs.splatting.lanes import (
@@ -63,7 +62,15 @@ from drgs.splatting.lanes import (
     make_lanes,
     pixels_of,
 )
-from drgs.splatting.tiles import WORD, TileBins, transpose_masks
+from drgs.splatting.slots import (
+    CompositedPairs,
+    Slots,
+    assign_slots,
+    bands_of,
+    sum_entries,
+    sum_runs,
+)
+from drgs.splatting.tiles import TileBins
 
 
 @dataclass(frozen=True)
@@ -246,65 +253,6 @@ class SplatGradients:
         return self.geometry[5]
 
 
-@dataclass(frozen=True)
-class Slots:
-    """Where each composited (entry, micro-tile) pair stores its partial derivatives.
-
-    First come the pairs of all tiles' first micro-tiles, in the order of the sorted entries, then
-    those of the second ones, and so on: what a lane writes is contiguous. (In the order in which
-    the slots are added up, each write would wait for memory of its own.) Pairs behind a
-    micro-tile's stop have no slot, so that every slot is written exactly once.
-    """
-
-    pairs: Any  # UInt32 (M padded / 32 * 16 * 2,): (group of 32, micro-tile) -> first slot, bits
-    composited: Any  # UInt32 (M padded,): sorted -> bit per micro-tile
-    count: int
-
-    def at(self, group: Any, micro: Any, active: Any = True) -> tuple[Any, Any]:
-        """First slot of a group of entries in a micro-tile, and the word of its composited bits."""
-        return dr.gather(types_of(type(group)).Array2u, self.pairs, group * MICROS + micro, active)
-
-    def end(self, entries: Entries) -> Any:
-        """Where each lane's slots end."""
-        first, word = self.at(entries.last, entries.micro)
-        return first + dr.popcnt(word & entries.tail)
-
-    def number(self, entries: Entries) -> Any:
-        """How many slots each lane has."""
-        first, word = self.at(entries.first, entries.micro)
-        begin = first + dr.popcnt(word & ~entries.head)
-        return dr.select(entries.head == 0, 0, self.end(entries) - begin)
-
-
-def assign_slots(bins: TileBins, layers: Layers) -> Slots:
-    """Number the slots. The host reads one value, how many there are."""
-    t = types_of(bins.rows.Float)
-    entry = dr.arange(t.UInt32, dr.width(bins.masks))
-    composited = t.UInt32(0)
-    for k in range(MICROS // 4):
-        stops = dr.gather(t.Array4u, layers.stop, bins.tiles * (MICROS // 4) + k)
-        for m, stop in enumerate(stops):
-            composited |= dr.select(entry < stop, t.UInt32(1 << (4 * k + m)), 0)
-    composited &= bins.masks
-    dr.eval(composited)
-    words = transpose_masks(composited)
-
-    num_words = dr.width(words)
-    groups = dr.opaque(t.UInt32, num_words // MICROS)
-    index = dr.arange(t.UInt32, num_words + 1)
-    micro = index // groups
-    transposed = (index - micro * groups) * MICROS + micro
-    exists = index < dr.opaque(t.UInt32, num_words)
-    first = dr.prefix_sum(dr.popcnt(dr.gather(t.UInt32, words, transposed, exists)))
-    count = int(first[num_words])
-
-    index = dr.arange(t.UInt32, num_words)
-    group, micro = index // MICROS, index % MICROS
-    pairs = interleave([dr.gather(t.UInt32, first, micro * groups + group), words])
-    dr.eval(pairs)
-    return Slots(pairs=pairs, composited=composited, count=count)
-
-
 def composite_adjoint(
     bins: TileBins,
     records: Records,
@@ -318,20 +266,39 @@ def composite_adjoint(
     (H * W,); d_transmittance: plane (H * W,). Not differentiated: the order, the decisions
     (cut, clamp, stop).
     """
-    t = types_of(bins.rows.Float)
-    slots = assign_slots(bins, layers)
-    lanes = make_lanes(t.Float, bins.grid)
+    pairs = CompositedPairs.of(bins, layers.stop)
+    width = bins.model.response.num_moments + bins.num_features
+    sums = Rows.empty(bins.rows.Float, width, max(bins.num_entries, 1))
+    for band in bands_of(bins, pairs):
+        slots = assign_slots(pairs, band)
+        partials = _partials(bins, records, layers, slots, d_features, d_transmittance)
+        sum_entries(pairs, slots, partials, sums, bins.source)
+    return splat_gradients(bins, sum_runs(sums.Float, bins.first_entry, sums.load))
+
+
+def _partials(
+    bins: TileBins,
+    records: Records,
+    layers: Layers,
+    slots: Slots,
+    d_features: list[Any],
+    d_transmittance: Any,
+) -> Rows:
+    """By slot: moments, and derivatives of the features, summed over 16 pixels; evaluated."""
+    t, tiles = types_of(bins.rows.Float), slots.band.tiles
+    lanes = make_lanes(t.Float, bins.grid, tiles=tiles)
     stop = dr.gather(t.UInt32, layers.stop, lanes.micro_tile)
-    lanes = grouped_by_work(t.Float, bins.grid, slots.number(Entries(bins, lanes, stop)))
+    work = slots.number(Entries(bins, lanes, stop))
+    lanes = grouped_by_work(t.Float, bins.grid, work, tiles)
     stop = dr.gather(t.UInt32, layers.stop, lanes.micro_tile)
     entries = EntriesBackToFront(bins, lanes, stop)
     model = bins.model.bind(lanes, bins.grid)
-    width = model.response.num_moments + bins.num_features
 
     g = [load_pixels(plane, lanes, bins.grid) for plane in d_features]
     ends = load_lane_row(layers.ends, lanes.micro_tile, 1)
     transmittance = load_lane_row(layers.values, lanes.micro_tile, 1 + layers.count)
-    partials = Rows.whole(t.Float, width, max(slots.count, 1))
+    width = model.response.num_moments + bins.num_features
+    partials = Rows.whole(t.Float, width, max(slots.band.num_slots, 1))
 
     # A packet is stored with a branch for each lane, and across branches numbers wait in memory
     # instead of registers. A turn therefore begins with storing what the one before has summed.
@@ -364,7 +331,7 @@ def composite_adjoint(
         body=body,
     )
     dr.eval(loop, partials)
-    return sum_slots(bins, slots, partials)
+    return partials
 
 
 def _adjoint_step(
@@ -396,34 +363,6 @@ def _adjoint_step(
     return before, d_log_alpha, d_stored
 
 
-def sum_slots(bins: TileBins, slots: Slots, partials: Rows) -> SplatGradients:
-    """Add up the slots of each entry, the entries of each splat, and turn sums into derivatives."""
-    by_entry = _sum_entries(bins, slots, partials)
-    return splat_gradients(bins, sum_runs(bins.rows.Float, bins.first_entry, by_entry.load))
-
-
-def sum_runs(Float: type, first: Any, load: Callable[[Any], list[Any]]) -> list[Any]:
-    """Sums over runs, one lane a run: run r is from ``first[r]`` to ``first[r + 1]``.
-
-    load: the numbers of an element of a run.
-    """
-    UInt32 = type(first)
-    run = dr.arange(UInt32, dr.width(first) - 1)
-    begin, end = (dr.gather(UInt32, first, run + k) for k in (0, 1))
-    width = len(load(begin))
-
-    def body(element: Any, totals: list) -> tuple:
-        return element + 1, [a + b for a, b in zip(totals, load(element), strict=True)]
-
-    zero = dr.zeros(Float, dr.width(run))
-    _, totals = dr.while_loop(
-        state=(begin, [Float(zero) for _ in range(width)]),
-        cond=lambda element, totals: element < end,
-        body=body,
-    )
-    return totals
-
-
 def splat_gradients(bins: TileBins, totals: list[Any]) -> SplatGradients:
     """From each splat's sums, by rank, to its derivatives, by Gaussian.
 
@@ -441,37 +380,6 @@ def splat_gradients(bins: TileBins, totals: list[Any]) -> SplatGradients:
     dr.eval(rows)
     numbers = rows.load(rank)
     return SplatGradients(geometry=numbers[:count], features=numbers[count:])
-
-
-def _sum_entries(bins: TileBins, slots: Slots, partials: Rows) -> Rows:
-    """Sums over the micro-tiles of each entry, by unsorted entry, evaluated."""
-    t = types_of(bins.rows.Float)
-    entry = dr.arange(t.UInt32, max(bins.num_entries, 1))
-    group, below = entry // WORD, (t.UInt32(1) << (entry % WORD)) - 1
-
-    def body(micros: Any, totals: list) -> tuple:
-        for _ in range(2):  # two at a time wait for memory together
-            active = micros != 0
-            first, word = slots.at(group, dr.tzcnt(micros), active)
-            numbers = partials.load(first + dr.popcnt(word & below), active)
-            totals = [a + b for a, b in zip(totals, numbers, strict=True)]
-            micros = micros & (micros - 1)
-        return micros, totals
-
-    zero = dr.zeros(t.Float, dr.width(entry))
-    _, totals = dr.while_loop(
-        state=(
-            dr.gather(t.UInt32, slots.composited, entry),
-            [t.Float(zero) for _ in range(partials.width)],
-        ),
-        cond=lambda micros, totals: micros != 0,
-        body=body,
-    )
-    dr.eval(totals)
-    rows = Rows.empty(t.Float, partials.width, dr.width(entry))
-    rows.store(totals, dr.gather(t.UInt32, bins.source, entry))
-    dr.eval(rows)
-    return rows
 
 
 # ----------------------------------------------------------------------------------------------
