@@ -268,12 +268,13 @@ def composite_adjoint(
     """
     pairs = CompositedPairs.of(bins, layers.stop)
     width = bins.model.response.num_moments + bins.num_features
-    sums = Rows.empty(bins.rows.Float, width, max(bins.num_entries, 1))
-    for band in bands_of(bins, pairs):
+    bands = bands_of(bins, pairs)
+    sums = Rows.empty(bins.rows.Float, width, max(pairs.num_rows, 1))
+    for band in bands:
         slots = assign_slots(pairs, band)
         partials = _partials(bins, records, layers, slots, d_features, d_transmittance)
-        sum_entries(pairs, slots, partials, sums, bins.source)
-    return splat_gradients(bins, sum_runs(sums.Float, bins.first_entry, sums.load))
+        sum_entries(bins, pairs, slots, partials, sums)
+    return splat_gradients(bins, sum_runs(sums.Float, pairs.first_row, sums.load))
 
 
 def _partials(

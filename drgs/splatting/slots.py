@@ -31,10 +31,15 @@ With fewer, Dr.Jit traces and launches more often than it saves."""
 
 @dataclass(frozen=True)
 class CompositedPairs:
-    """Which pairs of an entry and a micro-tile were composited."""
+    """Which pairs of an entry and a micro-tile were composited.
+
+    An entry with such a pair is *seen* and has a row of sums; those of a splat follow each other.
+    """
 
     masks: Any  # UInt32 (M padded,): sorted -> bit per micro-tile
     words: Any  # UInt32 (M padded / 32 * 16,): (group of 32, micro-tile) -> bit per entry
+    row: Any  # UInt32 (M + 1,): unsorted -> row of sums, or of the next entry that is seen
+    first_row: Any  # UInt32 (N + 1,): rank -> first of its rows
 
     @staticmethod
     def of(bins: TileBins, stop: Any) -> CompositedPairs:
@@ -49,8 +54,17 @@ class CompositedPairs:
         masks &= bins.masks
         dr.eval(masks)
         words = transpose_masks(masks)
-        dr.eval(words)
-        return CompositedPairs(masks, words)
+        seen = dr.zeros(t.UInt32, bins.num_entries + 1)
+        dr.scatter(seen, t.UInt32(1), bins.source, masks != 0)
+        row = dr.prefix_sum(seen)
+        first_row = dr.gather(t.UInt32, row, bins.first_entry)
+        dr.eval(words, first_row)
+        return CompositedPairs(masks, words, row, first_row)
+
+    @property
+    def num_rows(self) -> int:
+        """Entries that are seen. Waits for the device."""
+        return int(self.row[dr.width(self.row) - 1])
 
 
 @dataclass(frozen=True)
@@ -144,10 +158,12 @@ def _words(pairs: CompositedPairs, band: Band, group: Any, micro: Any) -> Any:
     return word & dr.select(first + WORD > stop, ~(ones << (stop % WORD)), ones)
 
 
-def sum_entries(pairs: CompositedPairs, slots: Slots, partials: Rows, sums: Rows, to: Any) -> None:
-    """Sum over the micro-tiles of each entry of a band.
+def sum_entries(
+    bins: TileBins, pairs: CompositedPairs, slots: Slots, partials: Rows, sums: Rows
+) -> None:
+    """Sum over the micro-tiles of each entry of a band that is seen.
 
-    partials: by slot; sums: filled, evaluated; to: UInt32, by sorted entry, the row that it fills.
+    partials: by slot; sums: its rows are filled, and evaluated.
     """
     t = types_of(partials.Float)
     count = max(len(slots.band.entries), 1)
@@ -163,17 +179,18 @@ def sum_entries(pairs: CompositedPairs, slots: Slots, partials: Rows, sums: Rows
             micros = micros & (micros - 1)
         return micros, totals
 
-    zero = dr.zeros(t.Float, count)
+    zero, micros = dr.zeros(t.Float, count), dr.gather(t.UInt32, pairs.masks, entry)
     _, totals = dr.while_loop(
         state=(
-            dr.gather(t.UInt32, pairs.masks, entry),
+            t.UInt32(micros),
             [t.Float(zero) for _ in range(partials.width)],
         ),
         cond=lambda micros, totals: micros != 0,
         body=body,
     )
     dr.eval(totals)
-    sums.store(totals, dr.gather(t.UInt32, to, entry))
+    source = dr.gather(t.UInt32, bins.source, entry)
+    sums.store(totals, dr.gather(t.UInt32, pairs.row, source), micros != 0)
     dr.eval(sums)
 
 
