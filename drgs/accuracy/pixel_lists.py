@@ -77,7 +77,7 @@ class PixelLists:
     @staticmethod
     def of(bins: TileBins, records: Records, depths: PeakDepths) -> PixelLists:
         """Make the lists. The host reads one value, the number of items."""
-        t = types_of(type(bins.rows))
+        t = types_of(bins.rows.Float)
         # Entries as they are made, and one behind the last.
         position = dr.arange(t.UInt32, bins.num_entries)
         entry = dr.zeros(t.UInt32, bins.num_entries + 1)
@@ -141,7 +141,7 @@ class _Items:
         count: int,
     ) -> _Items:
         """entry: sorted entries; masks: their micro-tiles; item: the first of each one's items."""
-        t = types_of(type(bins.rows))
+        t = types_of(bins.rows.Float)
         # A single item that is not made, if there are none.
         items = _Items(
             dr.ones(t.Float, count), dr.zeros(t.UInt32, count), dr.zeros(t.UInt32, count)

@@ -31,7 +31,7 @@ import drjit as dr
 
 from drgs.accuracy.pixel_lists import PeakDepths, PixelLists
 from drgs.cameras.camera import Camera
-from drgs.core.arrays import empty_rows, load_row, scatter_rows, store_row, types_of
+from drgs.core.arrays import Rows, scatter_rows, types_of
 from drgs.splatting.grid import PIXELS, Lanes
 from drgs.splatting.image_model import Alpha, Footprint, ImageModel, flat_columns
 from drgs.splatting.lanes import grouped_by_work, load_lane_row, load_pixels, make_lanes, pixels_of
@@ -44,8 +44,8 @@ from drgs.splatting.rasterize import (
     largest,
     pack_tangents,
     splat_gradients,
-    sum_runs,
 )
+from drgs.splatting.slots import sum_runs
 from drgs.splatting.tiles import TileBins
 
 UNORDERED_ALPHA = 1e-4
@@ -128,9 +128,8 @@ class _WalkInputs:
     @staticmethod
     def of(bins: TileBins, records: Records, lists: PixelLists, order: PixelOrder) -> _WalkInputs:
         """Lanes with lists of similar length together."""
-        lanes = make_lanes(type(bins.rows), bins.grid)
-        begin, end = lists.range(lanes)
-        lanes = grouped_by_work(lanes, end - begin)
+        begin, end = lists.range(make_lanes(bins.rows.Float, bins.grid))
+        lanes = grouped_by_work(bins.rows.Float, bins.grid, end - begin)
         return _WalkInputs(bins, records, lists, order, lanes, bins.model.bind(lanes, bins.grid))
 
     @property
@@ -145,13 +144,13 @@ class _WalkInputs:
 
     def transmittance(self) -> list[Any]:
         """Of the 16 pixels before the first splat; those off the film are finished."""
-        Float = type(self.bins.rows)
+        Float = self.bins.rows.Float
         inside = [inside for _, inside in pixels_of(self.lanes, self.bins.grid)]
         return [dr.select(of_pixel, Float(1), -1) for of_pixel in inside]
 
     def zeros(self, planes: int) -> list[list[Any]]:
         """By plane: of the 16 pixels."""
-        Float = type(self.bins.rows)
+        Float = self.bins.rows.Float
         zero = dr.zeros(Float, self.size)
         return [[Float(zero) for _ in range(PIXELS)] for _ in range(planes)]
 
@@ -171,7 +170,7 @@ def _walk(
     """
     lists, records, lanes = inputs.lists, inputs.records, inputs.lanes
     model, order = inputs.model, inputs.order
-    t = types_of(type(records.rows))
+    t = types_of(records.rows.Float)
     begin, end = lists.range(lanes)
 
     def body(place: Any, queue: list, state: Any, go_on: Any) -> tuple:
@@ -242,7 +241,7 @@ class _OrderedLayers(Layers):
 
 
 def _composite(bins: TileBins, records: Records, order: PixelOrder) -> _OrderedLayers:
-    t = types_of(type(bins.rows))
+    t = types_of(bins.rows.Float)
     lists = PixelLists.of(bins, records, order.depths)
     inputs = _WalkInputs.of(bins, records, lists, order)
     lanes, model, size = inputs.lanes, inputs.model, inputs.size
@@ -306,7 +305,7 @@ def _totals(
     inputs: _WalkInputs, layers: _OrderedLayers, g: list[list[Any]], d_transmittance: Any
 ) -> list[tuple[Any, Any]]:
     """First walk: b in front of all splats of each pixel, in two numbers."""
-    t = types_of(type(inputs.bins.rows))
+    t = types_of(inputs.bins.rows.Float)
 
     def add_up(state: tuple, visited: list[list[Any]]) -> tuple:
         T, high, low = (list(column) for column in state)
@@ -335,7 +334,7 @@ def _totals(
 
 def _pairs(inputs: _WalkInputs, totals: list[tuple[Any, Any]], g: list[list[Any]]) -> list[Any]:
     """Second walk: each pair's weight and d loss / d ln(alpha), at the place of its splat."""
-    t = types_of(type(inputs.bins.rows))
+    t = types_of(inputs.bins.rows.Float)
     pairs = [dr.zeros(t.Float, max(inputs.lists.count, 1) * PIXELS) for _ in range(2)]
     dr.eval(pairs)
     alpha_max = inputs.model.cutoffs.alpha_max
@@ -364,29 +363,29 @@ def _pairs(inputs: _WalkInputs, totals: list[tuple[Any, Any]], g: list[list[Any]
     return pairs
 
 
-def _sum_pixels(inputs: _WalkInputs, pairs: list[Any], g: list[list[Any]]) -> Any:
+def _sum_pixels(inputs: _WalkInputs, pairs: list[Any], g: list[list[Any]]) -> Rows:
     """Third walk: the sums over the 16 pixels of each item, rows by place.
 
     pairs: weights and d loss / d ln(alpha), 16 for each place.
     """
     bins, records, lists = inputs.bins, inputs.records, inputs.lists
     lanes, model = inputs.lanes, inputs.model
-    t = types_of(type(bins.rows))
+    t = types_of(bins.rows.Float)
     width = model.response.num_moments + bins.num_features
-    partials = empty_rows(t.Float, width, max(lists.count, 1))
+    partials = Rows.empty(t.Float, width, max(lists.count, 1))
     begin, end = lists.range(lanes)
 
     def body(place: Any) -> tuple:
         entry = dr.gather(t.UInt32, lists.entries, place)
         geometry, features = records.load(entry, True)
         footprint = model.footprint(geometry, lanes, True)
-        weights, d_log_alpha = (load_row(plane, PIXELS, place) for plane in pairs)
+        weights, d_log_alpha = (Rows((plane,), (PIXELS,), PIXELS).load(place) for plane in pairs)
         d_stored = [t.Float(0) for _ in features]
         for pixel, weight in enumerate(weights):
             g_pixel = [plane[pixel] for plane in g]
             d_stored = model.features.add_derivatives(d_stored, features, pixel, weight, g_pixel)
         moments = model.response.moments(footprint, d_log_alpha, model.positions)
-        store_row(partials, moments + d_stored, place)
+        partials.store(moments + d_stored, place)
         return (place + 1,)
 
     loop = dr.while_loop(state=(begin,), cond=lambda place: place < end, body=body)
@@ -394,15 +393,13 @@ def _sum_pixels(inputs: _WalkInputs, pairs: list[Any], g: list[list[Any]]) -> An
     return partials
 
 
-def _sum_items(bins: TileBins, lists: PixelLists, partials: Any) -> SplatGradients:
+def _sum_items(bins: TileBins, lists: PixelLists, partials: Rows) -> SplatGradients:
     """Add up the items of each splat."""
-    t = types_of(type(bins.rows))
-    width = bins.model.response.num_moments + bins.num_features
     places = lists.places()
     totals = sum_runs(
-        t.Float,
+        partials.Float,
         lists.first_item,
-        lambda item: load_row(partials, width, dr.gather(t.UInt32, places, item)),
+        lambda item: partials.load(dr.gather(type(places), places, item)),
     )
     return splat_gradients(bins, totals)
 
@@ -466,7 +463,7 @@ def _tangent(
         carry=carry,
         visit=visit,
         state=(inputs.transmittance(), inputs.zeros(1)[0], inputs.zeros(count)),
-        nothing=[dr.zeros(type(bins.rows), size)] * (1 + 2 * count),
+        nothing=[dr.zeros(bins.rows.Float, size)] * (1 + 2 * count),
     )
     columns = dT + flat_columns(dC)
     dr.eval(columns)

@@ -26,7 +26,7 @@ class Work:
 def count_work(frame: Frame) -> Work:
     """Count by walking the entries once more."""
     bins, layers = frame.bins, frame.layers
-    t = types_of(type(bins.rows))
+    t = types_of(bins.rows.Float)
     lanes = make_lanes(t.Float, bins.grid)
     stop = dr.gather(t.UInt32, layers.stop, lanes.micro_tile)
     entries = Entries(bins, lanes, stop)

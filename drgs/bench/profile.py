@@ -114,7 +114,8 @@ def stage_clock() -> Iterator[StageClock]:
         (rendering, "bin_splats", ends(None, "binning")),
         (rendering, "composite", ends(None, "compositing")),
         (rendering, "composite_adjoint", ends("image and loss", None)),
-        (rasterize, "sum_slots", ends("adjoint", "reduction")),
+        (rasterize, "sum_entries", ends("adjoint", "reduction")),
+        (rasterize, "splat_gradients", ends(None, "reduction")),
         (rendering, "_as_tensors", ends(None, "projection and SH, adjoint")),
     ]
     originals = [(module, name, getattr(module, name)) for module, name, _ in borders]

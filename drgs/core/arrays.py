@@ -119,49 +119,74 @@ def scatter_rows(columns: list[Any], rows: Any, num_rows: int) -> Any:
     return flat
 
 
-PACKET = 4
-"""Numbers that a lane loads at once: such a load costs about as much as one of a single number."""
+@dataclass(frozen=True)
+class Rows:
+    """Rows of numbers such that a lane loads or stores several of them at once, in packets.
 
-
-def pack_rows(columns: Sequence[Any]) -> Any:
-    """Columns of equal length as rows that fill whole packets, flat, not evaluated."""
-    padding = dr.zeros(type(columns[0]), dr.width(columns[0]))
-    return interleave([*columns, *[padding] * (-len(columns) % PACKET)])
-
-
-def load_row(
-    rows: Any, width: int, row: Any, active: Any = True, *, start: int = 0, end: int | None = None
-) -> list[Any]:
-    """Numbers ``start`` to ``end`` (None: all) of a row a lane of what :func:`pack_rows` made.
-
-    width: of the rows; start: where a packet begins. 0 if not active.
+    A packet of 8 numbers costs a lane less than two of 4, and these less than four of 2; and what
+    is not stored need not come from memory. Rows of 9 are therefore stored as an array of packets
+    of 8 and one of single numbers, where they are read in order.
     """
-    end = width if end is None else end
-    packet, stride = types_of(type(rows)).Array4f, -(-width // PACKET)
-    packets = range(start // PACKET, -(-end // PACKET))
-    loaded = [dr.gather(packet, rows, row * stride + k, active) for k in packets]
-    return [number for packet in loaded for number in packet][: end - start]
 
+    blocks: tuple[Any, ...]  # flat, row-major: the next columns of all rows
+    block_widths: tuple[int, ...]
+    width: int  # numbers in a row, without padding
 
-def empty_rows(float_type: type, width: int, num_rows: int) -> Any:
-    """Memory, not initialised, for rows of ``width`` numbers."""
-    return dr.empty(float_type, num_rows * -(-width // PACKET) * PACKET)
+    @property
+    def Float(self) -> type:  # noqa: N802 (it is a type)
+        """That of the numbers."""
+        return type(self.blocks[0])
 
+    @staticmethod
+    def empty(float_type: type, width: int, num_rows: int) -> Rows:
+        """Memory, not initialised."""
+        rest = width % 8 + (width % 8 in (3, 7))
+        widths = (width // 8 * 8, *(rest & packet for packet in (8, 4, 2, 1)))
+        return Rows._of_blocks(float_type, [each for each in widths if each], width, num_rows)
 
-def store_row(rows: Any, numbers: Sequence[Any], row: Any, active: Any = True) -> None:
-    """Fill one row a lane of what :func:`empty_rows` made; no two lanes may fill the same."""
-    t = types_of(type(rows))
-    padded = [*numbers, *[t.Float(0)] * (-len(numbers) % PACKET)]
-    packets = len(padded) // PACKET
-    for k in range(packets):
-        packet = t.Array4f(padded[PACKET * k : PACKET * (k + 1)])
-        dr.scatter(rows, packet, row * packets + k, active)
+    @staticmethod
+    def whole(float_type: type, width: int, num_rows: int) -> Rows:
+        """Memory, not initialised, of which a row fills whole packets of 4 beside each other.
+
+        Where rows are read in no order, each waits for less memory.
+        """
+        return Rows._of_blocks(float_type, [-(-width // 4) * 4], width, num_rows)
+
+    @staticmethod
+    def _of_blocks(float_type: type, widths: list[int], width: int, num_rows: int) -> Rows:
+        blocks = tuple(dr.empty(float_type, num_rows * block) for block in widths)
+        return Rows(blocks, tuple(widths), width)
+
+    @staticmethod
+    def of(columns: Sequence[Any]) -> Rows:
+        """Columns of equal length, not evaluated."""
+        num_rows = dr.width(columns[0])
+        rows = Rows.empty(type(columns[0]), len(columns), num_rows)
+        rows.store(columns, dr.arange(types_of(rows.Float).UInt32, num_rows))
+        return rows
+
+    def load(self, row: Any, active: Any = True) -> list[Any]:
+        """The numbers of a row a lane; 0 if not active."""
+        numbers, lanes, vector = [], dr.width(row), _dynamic_type(self.Float)
+        for block, width in zip(self.blocks, self.block_widths, strict=True):
+            numbers.extend(dr.gather(vector, block, row, active, shape=(width, lanes)))
+        return numbers[: self.width]
+
+    def store(self, numbers: Sequence[Any], row: Any, active: Any = True) -> None:
+        """Fill one row a lane; no two lanes may fill the same."""
+        padding, start = [type(numbers[0])(0)] * 3, 0
+        for block, width in zip(self.blocks, self.block_widths, strict=True):
+            columns = [*numbers, *padding][start : start + width]
+            dr.scatter(block, _dynamic_vector(columns), row, active)
+            start += width
 
 
 def _dynamic_vector(columns: list[Any]) -> Any:
-    flat_type = type(columns[0])
-    module = sys.modules[flat_type.__module__]
-    return getattr(module, _VECTORS[dr.type_v(flat_type)])(columns)
+    return _dynamic_type(type(columns[0]))(columns)
+
+
+def _dynamic_type(flat_type: type) -> type:
+    return getattr(sys.modules[flat_type.__module__], _VECTORS[dr.type_v(flat_type)])
 
 
 _VECTORS = {

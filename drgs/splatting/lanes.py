@@ -18,19 +18,23 @@ from drgs.splatting.grid import GRID, MICRO, MICROS, PIXELS, TILE, Lanes, TileGr
 from drgs.splatting.tiles import WORD, TileBins
 
 
-def make_lanes(Float: type, grid: TileGrid) -> Lanes:
+def make_lanes(Float: type, grid: TileGrid, order: Any = None, tiles: range | None = None) -> Lanes:
     """Lanes such that neighbours in time are far apart on the film.
 
     Dr.Jit cuts a small launch into few blocks of consecutive lanes. Tiles are visited with a
     stride near the golden section, so that each block gets its share of the busy centre.
+
+    order: UInt32, a permutation of the lanes; None: as they are. tiles: those of some tiles only.
     """
     t = types_of(Float)
-    stride = _coprime_stride(grid.num_tiles)
-    lane = dr.arange(t.UInt32, grid.num_tiles * MICROS)
+    tiles = range(grid.num_tiles) if tiles is None else tiles
+    stride = _coprime_stride(len(tiles))
+    lane = dr.arange(t.UInt32, len(tiles) * MICROS) if order is None else order
     turn, micro = lane // MICROS, lane % MICROS
     tile = t.UInt32(
-        (t.UInt64(turn) * dr.opaque(t.UInt64, stride)) % dr.opaque(t.UInt64, grid.num_tiles)
+        (t.UInt64(turn) * dr.opaque(t.UInt64, stride)) % dr.opaque(t.UInt64, len(tiles))
     )
+    tile += dr.opaque(t.UInt32, tiles.start)
     columns = dr.opaque(t.UInt32, grid.columns)
     row = tile // columns
     return Lanes(
@@ -42,13 +46,16 @@ def make_lanes(Float: type, grid: TileGrid) -> Lanes:
     )
 
 
-def grouped_by_work(lanes: Lanes, work: Any) -> Lanes:
-    """The same lanes, in each block ordered by how many splats they visit, roughly."""
+def grouped_by_work(Float: type, grid: TileGrid, work: Any, tiles: range | None = None) -> Lanes:
+    """Those of :func:`make_lanes`, in each block ordered by how many splats they visit, roughly.
+
+    work: UInt32, of each of those lanes.
+    """
     level = work // 4
     level = dr.select(level < _LEVELS, level, _LEVELS - 1)
     dr.eval(level)
     order = bucket_order(level, min(_BLOCK, dr.width(level)), _LEVELS)
-    return dr.gather(Lanes, lanes, order)
+    return make_lanes(Float, grid, order, tiles)
 
 
 _BLOCK = 32 * MICROS

@@ -36,30 +36,19 @@ therefore walk through memory in order: splats are copied into the order of the 
 a lane of the adjoint writes is contiguous.
 
 **No atomics.** In the adjoint, a lane sums each splat's partial derivatives over its 16 pixels
-and writes them into a slot that belongs to this (splat, micro-tile) alone. One lane per entry
-adds up its slots, one lane per splat its entries, in an order of their own. The result is the
-same to the last bit in every run.
+and writes them into a slot that belongs to this (splat, micro-tile) alone: see
+:mod:`drgs.splatting.slots`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 import drjit as dr
 
-from drgs.core.arrays import (
-    empty_rows,
-    interleave,
-    load_row,
-    pack_rows,
-    quotient,
-    scatter_rows,
-    store_row,
-    types_of,
-)
+from drgs.core.arrays import Rows, quotient, scatter_rows, types_of
 from drgs.splatting.grid import GRID, MICRO, MICROS, PIXELS, TILE, TileGrid
 from drgs.splatting.image_model import Alpha, Features
 from drgs.splatting.lanes import (
@@ -73,7 +62,15 @@ from drgs.splatting.lanes import (
     make_lanes,
     pixels_of,
 )
-from drgs.splatting.tiles import WORD, TileBins, transpose_masks
+from drgs.splatting.slots import (
+    CompositedPairs,
+    Slots,
+    assign_slots,
+    bands_of,
+    sum_entries,
+    sum_runs,
+)
+from drgs.splatting.tiles import TileBins
 
 
 @dataclass(frozen=True)
@@ -125,30 +122,25 @@ class Records:
     memory in order instead of jumping from splat to splat.
     """
 
-    rows: Any  # Float (M padded * packets * 4,): geometry, features, keys, padding
+    rows: Rows  # by sorted entry: geometry, features, keys
     num_geometry: int
     num_features: int
-    num_keys: int
 
     @staticmethod
     def of(bins: TileBins, numbers: Callable[[Any], list[Any]]) -> Records:
-        """Copies, evaluated, of each rank's ``numbers``, such as those of ``bins.splats``."""
-        rows = pack_rows(numbers(bins.ranks))
+        """Copies, evaluated, of each rank's ``numbers``, such as those of ``bins.rows.load``."""
+        rows = Rows.of(numbers(bins.ranks))
         dr.eval(rows)
-        return Records(rows, bins.model.response.num_geometry, bins.num_features, bins.num_keys)
+        return Records(rows, bins.model.response.num_geometry, bins.num_features)
 
     def load(self, entry: Any, active: Any) -> tuple[list[Any], list[Any]]:
         """Geometry and features of a sorted entry."""
-        numbers = self._numbers(entry, active)
+        numbers = self.rows.load(entry, active)
         return numbers[: self.num_geometry], numbers[self.num_geometry :][: self.num_features]
 
     def load_keys(self, entry: Any, active: Any) -> list[Any]:
         """Keys of a sorted entry."""
-        return self._numbers(entry, active)[self.num_geometry + self.num_features :]
-
-    def _numbers(self, entry: Any, active: Any) -> list[Any]:
-        width = self.num_geometry + self.num_features + self.num_keys
-        return load_row(self.rows, width, entry, active)
+        return self.rows.load(entry, active)[self.num_geometry + self.num_features :]
 
 
 # ----------------------------------------------------------------------------------------------
@@ -159,60 +151,69 @@ class Records:
 def composite(bins: TileBins, records: Records) -> Layers:
     """Composite the features of all splats.
 
-    bins: from ``bin_splats``; records: ``Records.of(bins, bins.splats)``.
+    bins: from ``bin_splats``; records: ``Records.of(bins, bins.rows.load)``.
     """
-    t = types_of(type(bins.rows))
+    t = types_of(bins.rows.Float)
     lanes = make_lanes(t.Float, bins.grid)
     end = dr.gather(t.UInt32, bins.tile_start, lanes.tile + 1)
-    lanes = grouped_by_work(lanes, count_entries(Entries(bins, lanes, end)))
+    lanes = grouped_by_work(t.Float, bins.grid, count_entries(Entries(bins, lanes, end)))
     entries = Entries(bins, lanes, dr.gather(t.UInt32, bins.tile_start, lanes.tile + 1))
     model = bins.model.bind(lanes, bins.grid)
     count = model.features.num_planes(bins.num_features)
 
-    def body(cursor: Cursor, T: list, C: list, ends: list, unfinished: Any) -> tuple:
+    def body(cursor: Cursor, pixels: list, unfinished: Any) -> tuple:
         entry, active = entries.current(cursor)
         geometry, features = records.load(entry, active)
         footprint = model.footprint(geometry, lanes, active)
-        T, C, ends = list(T), [list(c) for c in C], list(ends)
         behind = dr.select(active, entry + 1, entry)
+        composited = []
         for pixel, alpha in enumerate(model.alphas(geometry, footprint)):
-            weight, T[pixel], goes_on = composite_step(T[pixel], alpha.value, stop)
-            ends[pixel] = dr.select(goes_on, behind, ends[pixel])
-            planes = model.features.add([plane[pixel] for plane in C], features, pixel, weight)
-            for plane, value in zip(C, planes, strict=True):
-                plane[pixel] = value
-        return entries.advance(cursor), T, C, ends, _any_positive(T)
+            T, *C, end = pixels[pixel]
+            weight, T, goes_on = composite_step(T, alpha.value, stop)
+            end = dr.select(goes_on, behind, end)
+            composited.append([T, *model.features.add(C, features, pixel, weight), end])
+        return entries.advance(cursor), composited, _any_unfinished(composited)
 
     stop = model.cutoffs.transmittance_stop
     size = dr.width(lanes.tile)
-    zero = dr.zeros(t.Float, size)
-    _, T, C, ends, _ = dr.while_loop(
+    nothing = [*[dr.zeros(t.Float, size)] * count, dr.zeros(t.UInt32, size)]
+    # One pixel after the other: instructions are in the order of the state that they compute, and
+    # what a pixel needs is in registers only for as long as it is at work.
+    _, pixels, _ = dr.while_loop(
         state=(
             entries.begin(),
             # Pixels off the film are finished before they begin.
-            [dr.select(inside, t.Float(1), -1) for _, inside in pixels_of(lanes, bins.grid)],
-            [[t.Float(zero) for _ in range(PIXELS)] for _ in range(count)],
-            [dr.zeros(t.UInt32, size) for _ in range(PIXELS)],
+            [
+                [dr.select(inside, t.Float(1), -1), *[type(x)(x) for x in nothing]]
+                for _, inside in pixels_of(lanes, bins.grid)
+            ],
             dr.full(t.Bool, True, size),
         ),
-        cond=lambda cursor, T, C, ends, unfinished: entries.pending(cursor) & unfinished,
+        cond=lambda cursor, pixels, unfinished: entries.pending(cursor) & unfinished,
         body=body,
     )
-    dr.eval(T, C, ends)
-    columns = [dr.abs(v) for v in T] + [v for plane in C for v in plane]
-    last = largest(ends)
-    dr.eval(columns, last)
-    return Layers(
+    dr.eval(pixels)
+    T, *planes, ends = zip(*pixels, strict=True)
+    columns = [dr.abs(v) for v in T] + [v for plane in planes for v in plane]
+    layers = Layers(
         values=scatter_rows(columns, lanes.micro_tile, size),
-        ends=scatter_rows(ends, lanes.micro_tile, size),
-        stop=scatter_rows([last], lanes.micro_tile, size),
+        ends=scatter_rows([*ends], lanes.micro_tile, size),
+        stop=scatter_rows([largest([*ends])], lanes.micro_tile, size),
         count=count,
         grid=bins.grid,
     )
+    dr.eval(layers.values, layers.ends, layers.stop)
+    return layers
 
 
-def _any_positive(values: list[Any]) -> Any:
-    return largest(values) > 0
+def _any_unfinished(pixels: list[list[Any]]) -> Any:
+    """Whether a transmittance has no negative sign: the bits that all share tell."""
+    transmittances = [T for T, *_ in pixels]
+    Int = dr.int_array_t(type(transmittances[0]))
+    shared = dr.reinterpret_array(Int, transmittances[0])
+    for T in transmittances[1:]:
+        shared &= dr.reinterpret_array(Int, T)
+    return shared >= 0
 
 
 def largest(values: list[Any]) -> Any:
@@ -251,65 +252,6 @@ class SplatGradients:
         return self.geometry[5]
 
 
-@dataclass(frozen=True)
-class Slots:
-    """Where each composited (entry, micro-tile) pair stores its partial derivatives.
-
-    First come the pairs of all tiles' first micro-tiles, in the order of the sorted entries, then
-    those of the second ones, and so on: what a lane writes is contiguous. (In the order in which
-    the slots are added up, each write would wait for memory of its own.) Pairs behind a
-    micro-tile's stop have no slot, so that every slot is written exactly once.
-    """
-
-    pairs: Any  # UInt32 (M padded / 32 * 16 * 2,): (group of 32, micro-tile) -> first slot, bits
-    composited: Any  # UInt32 (M padded,): sorted -> bit per micro-tile
-    count: int
-
-    def at(self, group: Any, micro: Any, active: Any = True) -> tuple[Any, Any]:
-        """First slot of a group of entries in a micro-tile, and the word of its composited bits."""
-        return dr.gather(types_of(type(group)).Array2u, self.pairs, group * MICROS + micro, active)
-
-    def end(self, entries: Entries) -> Any:
-        """Where each lane's slots end."""
-        first, word = self.at(entries.last, entries.micro)
-        return first + dr.popcnt(word & entries.tail)
-
-    def number(self, entries: Entries) -> Any:
-        """How many slots each lane has."""
-        first, word = self.at(entries.first, entries.micro)
-        begin = first + dr.popcnt(word & ~entries.head)
-        return dr.select(entries.head == 0, 0, self.end(entries) - begin)
-
-
-def assign_slots(bins: TileBins, layers: Layers) -> Slots:
-    """Number the slots. The host reads one value, how many there are."""
-    t = types_of(type(bins.rows))
-    entry = dr.arange(t.UInt32, dr.width(bins.masks))
-    composited = t.UInt32(0)
-    for k in range(MICROS // 4):
-        stops = dr.gather(t.Array4u, layers.stop, bins.tiles * (MICROS // 4) + k)
-        for m, stop in enumerate(stops):
-            composited |= dr.select(entry < stop, t.UInt32(1 << (4 * k + m)), 0)
-    composited &= bins.masks
-    dr.eval(composited)
-    words = transpose_masks(composited)
-
-    num_words = dr.width(words)
-    groups = dr.opaque(t.UInt32, num_words // MICROS)
-    index = dr.arange(t.UInt32, num_words + 1)
-    micro = index // groups
-    transposed = (index - micro * groups) * MICROS + micro
-    exists = index < dr.opaque(t.UInt32, num_words)
-    first = dr.prefix_sum(dr.popcnt(dr.gather(t.UInt32, words, transposed, exists)))
-    count = int(first[num_words])
-
-    index = dr.arange(t.UInt32, num_words)
-    group, micro = index // MICROS, index % MICROS
-    pairs = interleave([dr.gather(t.UInt32, first, micro * groups + group), words])
-    dr.eval(pairs)
-    return Slots(pairs=pairs, composited=composited, count=count)
-
-
 def composite_adjoint(
     bins: TileBins,
     records: Records,
@@ -323,47 +265,73 @@ def composite_adjoint(
     (H * W,); d_transmittance: plane (H * W,). Not differentiated: the order, the decisions
     (cut, clamp, stop).
     """
-    t = types_of(type(bins.rows))
-    slots = assign_slots(bins, layers)
-    lanes = make_lanes(t.Float, bins.grid)
+    pairs = CompositedPairs.of(bins, layers.stop)
+    width = bins.model.response.num_moments + bins.num_features
+    bands = bands_of(bins, pairs)
+    sums = Rows.empty(bins.rows.Float, width, max(pairs.num_rows, 1))
+    for band in bands:
+        slots = assign_slots(pairs, band)
+        partials = _partials(bins, records, layers, slots, d_features, d_transmittance)
+        sum_entries(bins, pairs, slots, partials, sums)
+    return splat_gradients(bins, sum_runs(sums.Float, pairs.first_row, sums.load))
+
+
+def _partials(
+    bins: TileBins,
+    records: Records,
+    layers: Layers,
+    slots: Slots,
+    d_features: list[Any],
+    d_transmittance: Any,
+) -> Rows:
+    """By slot: moments, and derivatives of the features, summed over 16 pixels; evaluated."""
+    t, tiles = types_of(bins.rows.Float), slots.band.tiles
+    lanes = make_lanes(t.Float, bins.grid, tiles=tiles)
     stop = dr.gather(t.UInt32, layers.stop, lanes.micro_tile)
-    lanes = grouped_by_work(lanes, slots.number(Entries(bins, lanes, stop)))
+    work = slots.number(Entries(bins, lanes, stop))
+    lanes = grouped_by_work(t.Float, bins.grid, work, tiles)
     stop = dr.gather(t.UInt32, layers.stop, lanes.micro_tile)
     entries = EntriesBackToFront(bins, lanes, stop)
     model = bins.model.bind(lanes, bins.grid)
-    width = model.response.num_moments + bins.num_features
 
     g = [load_pixels(plane, lanes, bins.grid) for plane in d_features]
     ends = load_lane_row(layers.ends, lanes.micro_tile, 1)
     transmittance = load_lane_row(layers.values, lanes.micro_tile, 1 + layers.count)
-    partials = empty_rows(t.Float, width, max(slots.count, 1))
+    width = model.response.num_moments + bins.num_features
+    partials = Rows.whole(t.Float, width, max(slots.band.num_slots, 1))
 
-    def body(cursor: Cursor, slot: Any, T: list, behind: list) -> tuple:
+    # A packet is stored with a branch for each lane, and across branches numbers wait in memory
+    # instead of registers. A turn therefore begins with storing what the one before has summed.
+    def body(cursor: Cursor, slot: Any, pixels: list, sums: list, is_summed: Any) -> tuple:
+        partials.store(sums, slot, is_summed)
         entry, active = entries.current(cursor)
         slot = dr.select(active, slot - 1, slot)
         geometry, features = records.load(entry, active)
         footprint = model.footprint(geometry, lanes, active)
         alphas = model.alphas(geometry, footprint)
         composited = [entry < end for end in ends]
-        T, behind, d_log_alpha, d_features = _adjoint_step(
-            alphas, composited, features, model.features, T, behind, g
+        pixels, d_log_alpha, d_features = _adjoint_step(
+            alphas, composited, features, model.features, pixels, g
         )
         moments = model.response.moments(footprint, d_log_alpha, model.positions)
-        store_row(partials, moments + d_features, slot, active)
-        return entries.advance(cursor), slot, T, behind
+        return entries.advance(cursor), slot, pixels, moments + d_features, active
 
+    size = dr.width(lanes.tile)
+    zero = dr.zeros(t.Float, size)
+    behind = load_pixels(d_transmittance, lanes, bins.grid)
     loop = dr.while_loop(
         state=(
             entries.begin(),
             slots.end(entries),
-            transmittance,
-            load_pixels(d_transmittance, lanes, bins.grid),
+            [[*pixel] for pixel in zip(transmittance, behind, strict=True)],
+            [t.Float(zero) for _ in range(width)],
+            dr.full(t.Bool, False, size),
         ),
-        cond=lambda cursor, slot, T, behind: entries.pending(cursor),
+        cond=lambda cursor, slot, pixels, sums, is_summed: entries.pending(cursor) | is_summed,
         body=body,
     )
     dr.eval(loop, partials)
-    return sum_slots(bins, slots, partials, width)
+    return partials
 
 
 def _adjoint_step(
@@ -371,64 +339,28 @@ def _adjoint_step(
     composited: list[Any],
     stored: list[Any],
     features: Features,
-    T: list[Any],
-    behind: list[Any],
+    pixels: list[list[Any]],
     g: list[list[Any]],
-) -> tuple[list, list, list, list]:
+) -> tuple[list, list, list]:
     """One splat at 16 pixels: T and b before it, d loss / d ln(alpha), d loss / d stored (summed).
 
     composited: whether each pixel was still unfinished; stored: what is stored of the splat, and
-    features: what they are at a pixel; T, behind: T and b past the splat; g: [plane][pixel]
+    features: what they are at a pixel; pixels: T and b of each, past the splat; g: [plane][pixel]
     derivative of the loss with respect to C.
     """
-    T, behind = list(T), list(behind)
-    zero = type(T[0])(0)
-    d_stored = [zero for _ in stored]
-    d_log_alpha = []
-    for pixel, alpha in enumerate(alphas):
+    zero = type(pixels[0][0])(0)
+    before, d_log_alpha, d_stored = [], [], [zero for _ in stored]
+    for pixel, (alpha, (T, behind)) in enumerate(zip(alphas, pixels, strict=True)):
         value = dr.select(composited[pixel], alpha.value, 0)
-        T[pixel] = T[pixel] / (1 - value)
-        weight = value * T[pixel]
+        T = T / (1 - value)
+        weight = value * T
         g_pixel = [plane[pixel] for plane in g]
         d_stored = features.add_derivatives(d_stored, stored, pixel, weight, g_pixel)
-        gain = features.feature_gradient(stored, pixel, g_pixel) - behind[pixel]
-        behind[pixel] = dr.fma(value, gain, behind[pixel])
+        gain = features.feature_gradient(stored, pixel, g_pixel) - behind
+        before.append([T, dr.fma(value, gain, behind)])
         # d loss / d ln(alpha) = a T (c.g - b), zero where alpha is clamped.
         d_log_alpha.append(dr.select(alpha.smooth, weight * gain, 0))
-    return T, behind, d_log_alpha, d_stored
-
-
-def sum_slots(bins: TileBins, slots: Slots, partials: Any, width: int) -> SplatGradients:
-    """Add up the slots of each entry, the entries of each splat, and turn sums into derivatives.
-
-    width: numbers in a slot.
-    """
-    t = types_of(type(bins.rows))
-    by_entry = _sum_entries(bins, slots, partials, width)
-    totals = sum_runs(t.Float, bins.first_entry, lambda entry: load_row(by_entry, width, entry))
-    return splat_gradients(bins, totals)
-
-
-def sum_runs(Float: type, first: Any, load: Callable[[Any], list[Any]]) -> list[Any]:
-    """Sums over runs, one lane a run: run r is from ``first[r]`` to ``first[r + 1]``.
-
-    load: the numbers of an element of a run.
-    """
-    UInt32 = type(first)
-    run = dr.arange(UInt32, dr.width(first) - 1)
-    begin, end = (dr.gather(UInt32, first, run + k) for k in (0, 1))
-    width = len(load(begin))
-
-    def body(element: Any, totals: list) -> tuple:
-        return element + 1, [a + b for a, b in zip(totals, load(element), strict=True)]
-
-    zero = dr.zeros(Float, dr.width(run))
-    _, totals = dr.while_loop(
-        state=(begin, [Float(zero) for _ in range(width)]),
-        cond=lambda element, totals: element < end,
-        body=body,
-    )
-    return totals
+    return before, d_log_alpha, d_stored
 
 
 def splat_gradients(bins: TileBins, totals: list[Any]) -> SplatGradients:
@@ -436,47 +368,18 @@ def splat_gradients(bins: TileBins, totals: list[Any]) -> SplatGradients:
 
     totals: moments, and derivatives of the features.
     """
-    t, response = types_of(type(bins.rows)), bins.model.response
-    rank = dr.arange(t.UInt32, dr.width(bins.order))
-    geometry = bins.splats(rank)[: response.num_geometry]
+    t, response = types_of(bins.rows.Float), bins.model.response
+    size = dr.width(bins.order)
+    rank, count = dr.arange(t.UInt32, size), response.num_geometry
+    geometry = bins.rows.load(rank)[:count]
     columns = response.derivatives(geometry, totals[: response.num_moments])
     columns += totals[response.num_moments :]
     dr.eval(columns)
-    size = dr.width(rank)
-    flat = scatter_rows(columns, bins.order, size)
-    row = [dr.gather(t.Float, flat, rank * len(columns) + k) for k in range(len(columns))]
-    count = response.num_geometry
-    return SplatGradients(geometry=row[:count], features=row[count:])
-
-
-def _sum_entries(bins: TileBins, slots: Slots, partials: Any, width: int) -> Any:
-    """Sums over the micro-tiles of each entry: rows of ``width`` numbers by unsorted entry."""
-    t = types_of(type(bins.rows))
-    entry = dr.arange(t.UInt32, max(bins.num_entries, 1))
-    group, below = entry // WORD, (t.UInt32(1) << (entry % WORD)) - 1
-
-    def body(micros: Any, totals: list) -> tuple:
-        for _ in range(2):  # two at a time wait for memory together
-            active = micros != 0
-            first, word = slots.at(group, dr.tzcnt(micros), active)
-            numbers = load_row(partials, width, first + dr.popcnt(word & below), active)
-            totals = [a + b for a, b in zip(totals, numbers, strict=True)]
-            micros = micros & (micros - 1)
-        return micros, totals
-
-    zero = dr.zeros(t.Float, dr.width(entry))
-    _, totals = dr.while_loop(
-        state=(
-            dr.gather(t.UInt32, slots.composited, entry),
-            [t.Float(zero) for _ in range(width)],
-        ),
-        cond=lambda micros, totals: micros != 0,
-        body=body,
-    )
-    dr.eval(totals)
-    rows = empty_rows(t.Float, width, dr.width(entry))
-    store_row(rows, totals, dr.gather(t.UInt32, bins.source, entry))
-    return rows
+    rows = Rows.empty(t.Float, len(columns), size)
+    rows.store(columns, bins.order)
+    dr.eval(rows)
+    numbers = rows.load(rank)
+    return SplatGradients(geometry=numbers[:count], features=numbers[count:])
 
 
 # ----------------------------------------------------------------------------------------------
@@ -492,7 +395,7 @@ def composite_tangent(
     tangents: the same fields as the gradients, holding the direction. Returns the tangents of
     the planes that :func:`composite` made. Not differentiated: the order, the decisions.
     """
-    t = types_of(type(bins.rows))
+    t = types_of(bins.rows.Float)
     count = layers.count
     lanes = make_lanes(t.Float, bins.grid)
     entries = Entries(bins, lanes, dr.gather(t.UInt32, layers.stop, lanes.micro_tile))
@@ -545,16 +448,16 @@ def composite_tangent(
 
 def pack_tangents(bins: TileBins, tangents: SplatGradients) -> Records:
     """The records' tangents: of the geometry as the response wants it, and of the features."""
-    t = types_of(type(bins.rows))
+    t = types_of(bins.rows.Float)
     rank = dr.arange(t.UInt32, dr.width(bins.order))
 
     def by_rank(columns: list[Any]) -> list[Any]:
         return [dr.gather(t.Float, column, bins.order) for column in columns]
 
-    geometry = bins.splats(rank)[: bins.model.response.num_geometry]
+    geometry = bins.rows.load(rank)[: bins.model.response.num_geometry]
     numbers = bins.model.response.pack_tangents(geometry, by_rank(tangents.geometry))
     numbers += by_rank(tangents.features)
     numbers += [dr.zeros(t.Float, dr.width(rank))] * bins.num_keys  # they have no derivatives
-    rows = pack_rows(numbers)
+    rows = Rows.of(numbers)
     dr.eval(rows)
-    return Records.of(bins, partial(load_row, rows, len(numbers)))
+    return Records.of(bins, rows.load)

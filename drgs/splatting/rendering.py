@@ -220,7 +220,7 @@ def render(gaussians: Gaussians, camera: Camera, pipeline: Pipeline) -> Frame:
     grid = TileGrid(camera.width, camera.height)
     order = pipeline.order.seen_by(camera)
     bins = bin_splats(splats, grid, columns, model, order.keys(splats))
-    records = Records.of(bins, bins.splats)
+    records = Records.of(bins, bins.rows.load)
     layers = order.composite(bins, records)
     return Frame(pipeline, camera, order, bins, records, layers)
 
@@ -473,7 +473,7 @@ def _faults(d_rows: GaussianRows) -> Any:
 
 def _on_film(bins: TileBins) -> Any:
     """Bool per Gaussian: it has entries."""
-    t = types_of(type(bins.rows))
+    t = types_of(bins.rows.Float)
     rank = dr.arange(t.UInt32, dr.width(bins.order))
     first, end = (dr.gather(t.UInt32, bins.first_entry, rank + k) for k in (0, 1))
     visible = dr.empty(t.Bool, dr.width(bins.order))

@@ -22,14 +22,11 @@ from typing import Any
 
 import drjit as dr
 
-from drgs.core.arrays import interleave, load_row, pack_rows, types_of
+from drgs.core.arrays import Rows, interleave, types_of
 from drgs.core.private import bucket_order
 from drgs.splatting.grid import GRID, MICRO, MICROS, TILE, TileGrid
 from drgs.splatting.image_model import DEFAULT, ImageModel
 from drgs.splatting.projection import Splats2D
-
-BOX = 4
-"""Numbers of a splat's box of tiles: first column, first row, columns, number of tiles."""
 
 WORD = 32
 """Entries in a word of the transposed masks."""
@@ -45,7 +42,7 @@ class TileBins:
     """
 
     order: Any  # UInt32 (N,): rank -> index of the Gaussian
-    rows: Any  # Float (N * packets * 4,): by rank: box of tiles, geometry, features, keys
+    rows: Rows  # by rank: geometry, features, keys
     num_features: int
     num_keys: int
     first_entry: Any  # UInt32 (N + 1,): rank -> first of its run of unsorted entries
@@ -58,11 +55,6 @@ class TileBins:
     num_entries: int  # M
     grid: TileGrid
     model: ImageModel
-
-    def splats(self, rank: Any) -> list[Any]:
-        """Geometry, features and keys of a splat."""
-        width = BOX + self.model.response.num_geometry + self.num_features + self.num_keys
-        return load_row(self.rows, width, rank, start=BOX)
 
 
 def bin_splats(
@@ -81,22 +73,20 @@ def bin_splats(
     Not differentiated: integer work. The host reads one value, the number of entries.
     """
     t = types_of(type(splats.depths))
-    stored = [*features, *keys]
-    width = BOX + model.response.num_geometry + len(stored)
-    rows, depths = _store_rows(splats, grid, stored, model)
+    boxes, rows, depths = _store_rows(splats, grid, [*features, *keys], model)
     # A stable sort: equal depths stay in the order of the Gaussians.
     order = dr.argsort(depths)
     # A kernel of its own: loads that wait for memory, and for no arithmetic, wait together.
-    numbers = load_row(rows, width, order)
-    rows, counts = pack_rows(numbers), t.UInt32(numbers[BOX - 1])
-    dr.eval(rows, counts)
+    box = boxes.load(order)
+    boxes, rows, counts = Rows.of(box), Rows.of(rows.load(order)), t.UInt32(box[-1])
+    dr.eval(boxes, rows, counts)
     num_splats = dr.width(order)
     rank = dr.arange(t.UInt32, num_splats + 1)
     counts = dr.gather(t.UInt32, counts, rank, rank < dr.opaque(t.UInt32, num_splats))
     first_entry = dr.prefix_sum(counts)
     num_entries = int(first_entry[num_splats])
 
-    tile, entries = _make_entries(first_entry, rows, width, num_entries, grid, model)
+    tile, entries = _make_entries(first_entry, boxes, rows, num_entries, grid, model)
     source = stable_order(tile, grid.num_tiles)
 
     padded = -(-max(num_entries, 1) // WORD) * WORD
@@ -128,13 +118,13 @@ def bin_splats(
 
 def _store_rows(
     splats: Splats2D, grid: TileGrid, stored: Sequence[Any], model: ImageModel
-) -> tuple[Any, Any]:
-    """By Gaussian, evaluated at once: rows of all numbers, and depths to sort by."""
+) -> tuple[Rows, Rows, Any]:
+    """By Gaussian, evaluated at once: boxes of tiles, all other numbers, depths to sort by."""
     geometry = model.response.geometry(splats)
-    rows = pack_rows([*_tile_box(splats, geometry, grid, model), *geometry, *stored])
+    boxes, rows = Rows.of(_tile_box(splats, geometry, grid, model)), Rows.of([*geometry, *stored])
     depths = dr.select(splats.visible, splats.depths, dr.inf)
-    dr.eval(rows, depths)
-    return rows, depths
+    dr.eval(boxes, rows, depths)
+    return boxes, rows, depths
 
 
 def _reach(geometry: list[Any], grid: TileGrid, model: ImageModel) -> Any:
@@ -173,10 +163,10 @@ def _tile_box(
 
 
 def _make_entries(
-    first_entry: Any, rows: Any, width: int, num_entries: int, grid: TileGrid, model: ImageModel
+    first_entry: Any, boxes: Rows, rows: Rows, num_entries: int, grid: TileGrid, model: ImageModel
 ) -> tuple[Any, Any]:
     """Of each entry its tile; and four numbers: rank, tile, mask of micro-tiles, 0."""
-    t = types_of(type(rows))
+    t = types_of(rows.Float)
     # Rank of each entry: write each rank at the start of its run, then a running maximum.
     rank = dr.arange(t.UInt32, dr.width(first_entry) - 1)
     start, end = dr.gather(t.UInt32, first_entry, rank), dr.gather(t.UInt32, first_entry, rank + 1)
@@ -184,8 +174,7 @@ def _make_entries(
     dr.scatter(starts, rank, start, start < end)
     rank = dr.prefix_reduce(dr.ReduceOp.Max, starts, exclusive=False)
 
-    numbers = load_row(rows, width, rank, end=BOX + model.response.num_geometry)
-    tile_x, tile_y, columns = (t.UInt32(number) for number in numbers[: BOX - 1])
+    tile_x, tile_y, columns = (t.UInt32(number) for number in boxes.load(rank)[:3])
     local = dr.arange(t.UInt32, max(num_entries, 1)) - dr.gather(t.UInt32, first_entry, rank)
     # Exact while a splat covers fewer than 2^22 tiles; an integer division by a varying number
     # has no vector instruction.
@@ -193,7 +182,8 @@ def _make_entries(
     tile_x = tile_x + (local - row * columns)
     tile_y = tile_y + row
     tile = dr.fma(tile_y, dr.opaque(t.UInt32, grid.columns), tile_x)
-    mask = _touched_micros(numbers[BOX:], tile_x, tile_y, grid, model)
+    geometry = rows.load(rank)[: model.response.num_geometry]
+    mask = _touched_micros(geometry, tile_x, tile_y, grid, model)
     entries = interleave([rank, tile, mask, dr.zeros(t.UInt32, dr.width(tile))])
     dr.eval(tile, entries)
     return tile, entries

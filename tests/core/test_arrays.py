@@ -5,16 +5,7 @@ import numpy as np
 import pytest
 from support.helpers import both_precisions
 
-from drgs.core.arrays import (
-    empty_rows,
-    from_host,
-    interleave,
-    load_row,
-    pack_rows,
-    quotient,
-    scatter_rows,
-    store_row,
-)
+from drgs.core.arrays import Rows, from_host, interleave, quotient, scatter_rows
 
 UInt32 = dr.llvm.ad.UInt32
 
@@ -38,26 +29,37 @@ def test_columns_become_rows(precision, count):
     np.testing.assert_array_equal(flat[np.array(order)], table(count))
 
 
+LAYOUTS = pytest.mark.parametrize("layout", [Rows.empty, Rows.whole])
+
+
 @both_precisions
-@pytest.mark.parametrize("count", [1, 4, 6, 9, 12])
-def test_rows_are_loaded_as_they_were_packed(precision, count):
-    rows = pack_rows(numbered(precision, count))
-    assert dr.width(rows) == 5 * -(-count // 4) * 4
+@LAYOUTS
+@pytest.mark.parametrize("count", [*range(1, 10), 15, 16, 45])
+def test_rows_are_loaded_as_they_were_stored(precision, layout, count):
+    rows = layout(precision.Float, count, 5)
+    rows.store(numbered(precision, count), dr.arange(UInt32, 5))
     lanes, active = UInt32(4, 4, 0, 2), dr.llvm.ad.Bool(True, False, True, True)
-    loaded = np.stack([np.array(v) for v in load_row(rows, count, lanes, active)], axis=1)
+    loaded = np.stack([np.array(v) for v in rows.load(lanes, active)], axis=1)
     np.testing.assert_array_equal(loaded, table(count)[[4, 4, 0, 2]] * [[1], [0], [1], [1]])
 
 
 @both_precisions
+@LAYOUTS
 @pytest.mark.parametrize("count", [1, 4, 6, 9, 12])
-def test_rows_are_stored_where_a_lane_is_active(precision, count):
-    rows = empty_rows(precision.Float, count, 6)
-    store_row(rows, [precision.array(np.full(6, -1.0))] * count, dr.arange(UInt32, 6))
+def test_rows_are_stored_where_a_lane_is_active(precision, layout, count):
+    rows = layout(precision.Float, count, 6)
+    rows.store([precision.array(np.full(6, -1.0))] * count, dr.arange(UInt32, 6))
     lanes, active = UInt32(5, 0, 2, 3, 1), dr.llvm.ad.Bool(True, True, True, False, True)
-    store_row(rows, numbered(precision, count), lanes, active)
-    stored = np.stack([np.array(v) for v in load_row(rows, count, dr.arange(UInt32, 6))], axis=1)
+    rows.store(numbered(precision, count), lanes, active)
+    stored = np.stack([np.array(v) for v in rows.load(dr.arange(UInt32, 6))], axis=1)
     np.testing.assert_array_equal(stored[[5, 0, 2, 1]], table(count)[[0, 1, 2, 4]])
     assert (stored[[3, 4]] == -1).all()
+
+
+def test_rows_take_little_more_than_their_numbers():
+    widths = {count: Rows.empty(dr.llvm.ad.Float, count, 2).block_widths for count in range(1, 17)}
+    assert all(sum(blocks) - count == (count % 4 == 3) for count, blocks in widths.items())
+    assert widths[9] == (8, 1) and widths[16] == (16,)
 
 
 @both_precisions

@@ -28,12 +28,14 @@ from support.helpers import (
 
 from drgs.core.constants import WHITENING_SCALE
 from drgs.reference import splatting as reference
-from drgs.splatting import image_model, rasterize
+from drgs.splatting import image_model
 from drgs.splatting import lanes as lanes_module
+from drgs.splatting import slots as slots_module
 from drgs.splatting.grid import MICROS, TileGrid
 from drgs.splatting.rasterize import (
     composite_adjoint,
 )
+from drgs.splatting.slots import CompositedPairs, assign_slots, bands_of
 
 # float64: some hundred terms of the size of the result. float32: an exponent of up to 8 carries
 # 1e-6, so alpha 1e-6 and a pixel a few of them; measured 1e-6. In the adjoint, S is the
@@ -283,7 +285,8 @@ def test_records_hold_geometry_and_features_of_each_entry(precision, count):
     features = np.random.default_rng(0).normal(size=(len(scene.depths), count))
     scene = replace(scene, features=single(features))
     bins, records, _ = scene.composite(precision)
-    packed = np.array(records.rows).reshape(len(bins.ranks), -1)[: bins.num_entries]
+    entries = dr.arange(type(bins.ranks), bins.num_entries)
+    packed = np.stack([np.array(column) for column in records.rows.load(entries)], axis=1)
     gaussians = np.array(bins.order)[np.array(bins.ranks)[: bins.num_entries]]
     expected = np.column_stack(
         [
@@ -293,8 +296,7 @@ def test_records_hold_geometry_and_features_of_each_entry(precision, count):
             *(np.array(precision.array(column)) for column in scene.features.T),
         ]
     )
-    np.testing.assert_array_equal(packed[:, : 6 + count], expected[gaussians])
-    assert packed.shape[1] == -(-(6 + count) // 4) * 4 and not packed[:, 6 + count :].any()
+    np.testing.assert_array_equal(packed, expected[gaussians])
 
 
 @both_precisions
@@ -302,8 +304,9 @@ def test_slots_are_a_numbering_of_the_composited_pairs(precision):
     """Every pair that is composited has a slot of its own, and a lane's slots are contiguous."""
     scene = SCENES["opaque"]
     bins, _, layers = scene.composite(precision)
-    slots = rasterize.assign_slots(bins, layers)
-    composited = np.array(slots.composited)
+    composited_pairs = CompositedPairs.of(bins, layers.stop)
+    (band,) = bands_of(bins, composited_pairs)
+    slots, composited = assign_slots(composited_pairs, band), np.array(composited_pairs.masks)
     pairs = np.array(slots.pairs).astype(np.int64).reshape(-1, MICROS, 2)
     tiles, stop = np.array(bins.tiles), np.array(layers.stop).reshape(-1, MICROS)
     masks, found = np.array(bins.masks), {}
@@ -314,7 +317,7 @@ def test_slots_are_a_numbering_of_the_composited_pairs(precision):
             if expected:
                 first, word = pairs[entry // 32, micro]
                 found[micro, entry] = first + bin(word & ((1 << entry % 32) - 1)).count("1")
-    assert list(found.values()) == list(range(slots.count)) and slots.count > 0
+    assert list(found.values()) == list(range(band.num_slots)) and band.num_slots > 0
 
     lanes = lanes_module.make_lanes(precision.Float, bins.grid)
     lane_stop = dr.gather(dr.llvm.ad.UInt32, layers.stop, lanes.micro_tile)
@@ -329,10 +332,34 @@ def test_slots_are_a_numbering_of_the_composited_pairs(precision):
     np.testing.assert_array_equal(counted, expected)
     assert len(set(expected)) > 3
     similar = lanes_module.grouped_by_work(
-        lanes, slots.number(lanes_module.Entries(bins, lanes, lane_stop))
+        precision.Float, bins.grid, slots.number(lanes_module.Entries(bins, lanes, lane_stop))
     )
     np.testing.assert_array_equal(np.sort(similar.micro_tile), np.sort(lanes.micro_tile))
-    assert slots.count < sum(bin(mask).count("1") for mask in masks), "some pairs are behind a stop"
+    assert band.num_slots < sum(bin(mask).count("1") for mask in masks), (
+        "some pairs are behind a stop"
+    )
+
+
+@pytest.mark.parametrize("band_slots", [1, 50, 400])
+def test_bands_make_no_difference(band_slots, monkeypatch):
+    """Not even to the last bit, though fewer tiles than there are in a row have slots at a time."""
+    scene = SCENES["opaque"]
+    bins, records, layers = scene.composite(FLOAT32)
+    rng = np.random.default_rng(0)
+    size = bins.grid.width * bins.grid.height
+    d_planes = [FLOAT32.array(rng.normal(size=size)) for _ in range(1 + layers.count)]
+
+    def gradients() -> list[bytes]:
+        found = composite_adjoint(bins, records, layers, d_planes[1:], d_planes[0])
+        return [np.array(column).tobytes() for column in found.geometry + found.features]
+
+    pairs = CompositedPairs.of(bins, layers.stop)
+    (whole,), expected = bands_of(bins, pairs), gradients()
+    monkeypatch.setattr(slots_module, "BAND_SLOTS", band_slots)
+    bands = bands_of(bins, pairs)
+    assert len(bands) > 1 and sum(band.num_slots for band in bands) == whole.num_slots
+    assert [tile for band in bands for tile in band.tiles] == [*whole.tiles]
+    assert gradients() == expected
 
 
 def test_comparison_is_relative_to_each_array():

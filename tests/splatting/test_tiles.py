@@ -133,7 +133,7 @@ def test_masks_equal_a_brute_force_ellipse_test(precision, case):
     grid = binned.bins.grid
     table = binned.mask_table()
     rank = dr.arange(dr.llvm.ad.UInt32, len(binned.order))
-    geometry = np.stack([np.array(v, float) for v in binned.bins.splats(rank)], axis=1)
+    geometry = np.stack([np.array(v, float) for v in binned.bins.rows.load(rank)], axis=1)
     undecided = total = 0
     tile = np.arange(grid.num_tiles)[:, None]
     micro = np.arange(MICROS)[None, :]

@@ -94,7 +94,7 @@ def test_entries_and_slots_at_the_start_are_those_of_a_rendering(monkeypatch):
 
     def assign_and_count(*arguments):
         assigned = assign(*arguments)
-        slots.append(assigned.count)
+        slots.append(assigned.band.num_slots)
         return assigned
 
     monkeypatch.setattr(rasterize, "assign_slots", assign_and_count)
