@@ -132,6 +132,110 @@ def load_row(
     return [number for packet in loaded for number in packet][: end - start]
 
 
+def load_columns(flat: Any, row: Any, num_rows: Any, stride: int, width: int) -> list[Any]:
+    """The first ``width`` numbers of a row a lane, of rows of ``stride`` numbers back to back.
+
+    row: UInt32; num_rows: UInt32 (1,), evaluated, how many rows ``flat`` has.
+
+    Such rows begin anywhere in a packet: all packets that a row has part in are loaded, and its
+    numbers are moved to their places. That takes less than half the time of single loads.
+    """
+    whole = (dr.width(flat) - 1) // PACKET
+    if whole == 0 or width < PACKET:
+        return [dr.gather(type(flat), flat, row * stride + k) for k in range(width)]
+    if stride % PACKET == 0:
+        return load_row(flat, stride, row, end=width)
+    packets = _Packets(flat, first_numbers(flat, whole * PACKET), num_rows * stride)
+    begin, shift = row * stride // PACKET, row * stride % PACKET
+    always_whole = (stride - 1) // PACKET  # so many packets of a row, wherever it begins
+    numbers: list[Any] = []
+    for k in range(-(-(width + PACKET - 1) // PACKET)):
+        numbers.extend((packets.load if k < always_whole else packets.load_last)(begin + k))
+    for step in (1, 2):
+        moves = (shift & step) != 0
+        numbers = [dr.select(moves, b, a) for a, b in zip(numbers, numbers[step:], strict=False)]
+    return numbers[:width]
+
+
+def store_columns(columns: Sequence[Any]) -> Any:
+    """The same as :func:`interleave`, in a third of the time where there are many columns.
+
+    Packets that a row fills alone are stored as such, what is left at its ends number by number.
+    The array may have up to three numbers more, undefined, for its last packet to be whole:
+    :func:`first_numbers` leaves them out once it is evaluated.
+    """
+    columns, flat_type = list(columns), type(columns[0])
+    width, num_rows = len(columns), dr.width(columns)
+    if width % PACKET == 0 or width < 2 * PACKET:
+        return interleave(columns)
+    size = num_rows * width
+    flat = dr.empty(flat_type, -(-size // PACKET) * PACKET)
+
+    def store(pending: Any, *columns: Any) -> tuple[Any, ...]:
+        _store_shifted(flat, list(columns))
+        return type(pending)(False), *columns
+
+    # Of a loop, as several scatters into an array elsewhere run the kernel once for each.
+    pending = dr.full(types_of(flat_type).Bool, True, num_rows)
+    dr.while_loop((pending, *columns), lambda pending, *_: pending, store)
+    return flat
+
+
+def first_numbers(flat: Any, size: int) -> Any:
+    """The first ``size`` numbers of an evaluated array: the same memory."""
+    return dr.reshape(type(flat), flat, size, shrink=True)
+
+
+def _store_shifted(flat: Any, columns: list[Any]) -> None:
+    """Store a row a lane, each of which begins where the last one ends."""
+    t, width = types_of(type(flat)), len(columns)
+    first = dr.arange(t.UInt32, dr.width(columns)) * width
+    begin, shift = first // PACKET, first % PACKET
+    zero = t.Float(0)
+    numbers = [*columns, *[zero] * PACKET]  # from the begin of the first packet on
+    for step in (1, 2):
+        moves = (shift & step) != 0
+        shifted = [*[zero] * step, *numbers]
+        numbers = [dr.select(moves, a, b) for a, b in zip(shifted, numbers, strict=False)]
+    end = shift + width
+    for k in range(len(numbers) // PACKET):
+        is_own = (end >= PACKET * (k + 1)) & ((shift == 0) | (k > 0))
+        dr.scatter(flat, t.Array4f(numbers[PACKET * k : PACKET * (k + 1)]), begin + k, is_own)
+    for k in range(1, PACKET):
+        dr.scatter(flat, numbers[k], begin * PACKET + k, (shift != 0) & (shift <= k))
+    last = end // PACKET * PACKET  # where the packet begins that the next row fills up
+    for k in range(width - PACKET + 1, width + PACKET - 1):
+        dr.scatter(flat, numbers[k], begin * PACKET + k, (last <= k) & (k < end))
+
+
+@dataclass(frozen=True)
+class _Packets:
+    """An array of any size as packets, the last of which may be a part of one.
+
+    Dr.Jit loads packets from arrays alone that are whole packets. The last one is loaded number by
+    number at any size, which is no literal: neither the size nor its remainder is in a kernel.
+    """
+
+    flat: Any
+    others: Any  # the same memory without the last packet
+    size: Any  # UInt32 (1,), of ``flat``
+
+    def load(self, index: Any) -> list[Any]:
+        """A whole packet a lane."""
+        return list(dr.gather(types_of(type(self.flat)).Array4f, self.others, index))
+
+    def load_last(self, index: Any) -> list[Any]:
+        """Any packet a lane; numbers beyond the array are not defined."""
+        last = (self.size - 1) // PACKET
+        packet = dr.gather(types_of(type(self.flat)).Array4f, self.others, index, index < last)
+        for k in range(PACKET):
+            number = index * PACKET + k
+            is_there = (index == last) & (number < self.size)
+            single = dr.gather(type(self.flat), self.flat, number, is_there)
+            packet[k] = dr.select(is_there, single, packet[k])
+        return list(packet)
+
+
 def empty_rows(float_type: type, width: int, num_rows: int) -> Any:
     """Memory, not initialised, for rows of ``width`` numbers."""
     return dr.empty(float_type, num_rows * -(-width // PACKET) * PACKET)
