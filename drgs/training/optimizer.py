@@ -32,7 +32,7 @@ class LeanAdam(Adam):
 
     ``drjit.opt.Adam`` evaluates all new values and moments at once, while the former ones and all
     gradients are there: seven arrays of each parameter. Here moments come first, each is given the
-    memory of its predecessor, and gradients are cleared when they have been used: five arrays.
+    memory of its predecessor, and gradients are cleared where they have been used: five arrays.
     """
 
     def step(
@@ -42,10 +42,10 @@ class LeanAdam(Adam):
         grad_scale: Any = None,
         active: Any = None,
     ) -> None:
-        """Take a step and clear the gradients; for the arguments see ``drjit.opt.Adam.step``.
+        """Take a step; for the arguments see ``drjit.opt.Adam.step``.
 
-        A step that is scaled, masked or not evaluated is that of ``drjit.opt.Adam``. Waits for the
-        device where arrays are large.
+        Clears the gradients of large arrays, and waits for the device where there are any. A step
+        that is scaled, masked or not evaluated is that of ``drjit.opt.Adam``.
         """
         if not eval or grad_scale is not None or active is not None or self.mask_updates:
             super().step(eval=eval, grad_scale=grad_scale, active=active)
@@ -68,7 +68,8 @@ class LeanAdam(Adam):
         flat, gradient = dr.detach(value).array, value.grad.array
         rate_in_use = self.lr if rate is None else rate
         new, extra = self._step(rates, flat, gradient, rate_in_use, extra)
-        dr.clear_grad(value)
+        if dr.width(value) >= LARGE:
+            dr.clear_grad(value)
         moments = [moment for moment in extra[1:] if moment is not None]
         new_value = type(value)(new, value.shape) if dr.is_tensor_v(value) else type(value)(new)
         dr.enable_grad(new_value)
