@@ -181,6 +181,120 @@ class Rows:
             start += width
 
 
+PACKET = 4
+"""Numbers in a packet of rows that are back to back."""
+
+
+def load_columns(flat: Any, row: Any, num_rows: Any, stride: int, width: int) -> list[Any]:
+    """The first ``width`` numbers of a row a lane, of rows of ``stride`` numbers back to back.
+
+    row: UInt32; num_rows: UInt32 (1,), evaluated, how many rows ``flat`` has.
+
+    Such rows begin anywhere in a packet: all packets that a row has part in are loaded, and its
+    numbers are moved to their places. That takes less than half the time of single loads.
+    """
+    whole = (dr.width(flat) - 1) // PACKET
+    if whole == 0 or width < PACKET:
+        return [dr.gather(type(flat), flat, row * stride + k) for k in range(width)]
+    if stride % PACKET == 0:
+        return _load_packets(flat, row * (stride // PACKET), width)
+    packets = _Packets(flat, first_numbers(flat, whole * PACKET), num_rows * stride)
+    begin, shift = row * stride // PACKET, row * stride % PACKET
+    always_whole = (stride - 1) // PACKET  # so many packets of a row, wherever it begins
+    numbers: list[Any] = []
+    for k in range(-(-(width + PACKET - 1) // PACKET)):
+        numbers.extend((packets.load if k < always_whole else packets.load_last)(begin + k))
+    for step in (1, 2):
+        moves = (shift & step) != 0
+        numbers = [dr.select(moves, b, a) for a, b in zip(numbers, numbers[step:], strict=False)]
+    return numbers[:width]
+
+
+def store_columns(columns: Sequence[Any]) -> Any:
+    """The same as :func:`interleave`, in a third of the time where there are many columns.
+
+    Packets that a row fills alone are stored as such, what is left at its ends number by number.
+    The array may have up to three numbers more, undefined, for its last packet to be whole:
+    :func:`first_numbers` leaves them out once it is evaluated.
+    """
+    columns, flat_type = list(columns), type(columns[0])
+    width, num_rows = len(columns), dr.width(columns)
+    if width % PACKET == 0 or width < 2 * PACKET:
+        return interleave(columns)
+    size = num_rows * width
+    flat = dr.empty(flat_type, -(-size // PACKET) * PACKET)
+
+    _store_shifted(flat, columns)
+    return flat
+
+
+def first_numbers(flat: Any, size: int) -> Any:
+    """The first ``size`` numbers of an evaluated array: the same memory."""
+    return dr.reshape(type(flat), flat, size, shrink=True)
+
+
+def _store_shifted(flat: Any, columns: list[Any]) -> None:
+    """Store a row a lane, each of which begins where the last one ends."""
+    t, width = types_of(type(flat)), len(columns)
+    first = dr.arange(t.UInt32, dr.width(columns)) * width
+    begin, shift = first // PACKET, first % PACKET
+    zero = t.Float(0)
+    # Else each of several scatters into one array runs the kernel once more.
+    alone = dr.ReduceMode.NoConflicts
+    numbers = [*columns, *[zero] * PACKET]  # from the begin of the first packet on
+    for step in (1, 2):
+        moves = (shift & step) != 0
+        shifted = [*[zero] * step, *numbers]
+        numbers = [dr.select(moves, a, b) for a, b in zip(shifted, numbers, strict=False)]
+    end = shift + width
+    for k in range(len(numbers) // PACKET):
+        is_own = (end >= PACKET * (k + 1)) & ((shift == 0) | (k > 0))
+        packet = t.Array4f(numbers[PACKET * k : PACKET * (k + 1)])
+        dr.scatter(flat, packet, begin + k, is_own, mode=alone)
+    for k in range(1, PACKET):
+        is_own = (shift != 0) & (shift <= k)
+        dr.scatter(flat, numbers[k], begin * PACKET + k, is_own, mode=alone)
+    last = end // PACKET * PACKET  # where the packet begins that the next row fills up
+    for k in range(width - PACKET + 1, width + PACKET - 1):
+        is_own = (last <= k) & (k < end)
+        dr.scatter(flat, numbers[k], begin * PACKET + k, is_own, mode=alone)
+
+
+def _load_packets(flat: Any, index: Any, width: int) -> list[Any]:
+    """``width`` numbers a lane of rows that are whole packets."""
+    packet = types_of(type(flat)).Array4f
+    packets = [dr.gather(packet, flat, index + k) for k in range(-(-width // PACKET))]
+    return [number for each in packets for number in each][:width]
+
+
+@dataclass(frozen=True)
+class _Packets:
+    """An array of any size as packets, the last of which may be a part of one.
+
+    Dr.Jit loads packets from arrays alone that are whole packets. The last one is loaded number by
+    number at any size, which is no literal: neither the size nor its remainder is in a kernel.
+    """
+
+    flat: Any
+    others: Any  # the same memory without the last packet
+    size: Any  # UInt32 (1,), of ``flat``
+
+    def load(self, index: Any) -> list[Any]:
+        """A whole packet a lane."""
+        return list(dr.gather(types_of(type(self.flat)).Array4f, self.others, index))
+
+    def load_last(self, index: Any) -> list[Any]:
+        """Any packet a lane; numbers beyond the array are not defined."""
+        last = (self.size - 1) // PACKET
+        packet = dr.gather(types_of(type(self.flat)).Array4f, self.others, index, index < last)
+        for k in range(PACKET):
+            number = index * PACKET + k
+            is_there = (index == last) & (number < self.size)
+            single = dr.gather(type(self.flat), self.flat, number, is_there)
+            packet[k] = dr.select(is_there, single, packet[k])
+        return list(packet)
+
+
 def _dynamic_vector(columns: list[Any]) -> Any:
     return _dynamic_type(type(columns[0]))(columns)
 

@@ -92,6 +92,13 @@ def memory_peak() -> int:
     return dr.detail.malloc_watermark(dr.JitBackend.LLVM)
 
 
+def new_rate_cache() -> Any:
+    """What ``drjit.opt.Adam._step`` keeps scaled learning rates in during a step."""
+    from drjit.opt import _LRCache
+
+    return _LRCache()
+
+
 def call_on_variant_change(callback: Callable[[str | None, str | None], None]) -> None:
     """Have Mitsuba call ``callback(old, new)`` after each change of its variant.
 

@@ -19,7 +19,7 @@ from typing import Any, Protocol
 import drjit as dr
 
 from drgs.cameras.camera import Camera
-from drgs.core.arrays import types_of
+from drgs.core.arrays import load_columns, types_of
 from drgs.core.constants import LEAST_LOW_PASS, LOW_PASS, NEGLIGIBLE_ALPHA
 from drgs.gaussians import sh
 from drgs.gaussians.parameters import Gaussians
@@ -134,24 +134,23 @@ def load_rows(gaussians: Gaussians, sh_degree: int) -> GaussianRows:
     """Load every Gaussian's parameters, detached; of the SH only what ``sh_degree`` needs."""
     flat = dr.detach(gaussians.logit_opacities)
     t = types_of(type(flat))
-    row = dr.arange(t.UInt32, dr.width(flat))
+    row, num_rows = dr.arange(t.UInt32, dr.width(flat)), dr.opaque(t.UInt32, dr.width(flat))
 
-    def load(tensor: Any, start: int, stride: int, width: int) -> list[Any]:
-        source = dr.detach(tensor).array
-        return [dr.gather(t.Float, source, row * stride + (start + k)) for k in range(width)]
+    def load(tensor: Any, stride: int, width: int) -> list[Any]:
+        return load_columns(dr.detach(tensor).array, row, num_rows, stride, width)
 
-    stride = 3 * gaussians.shN.shape[1]
-    higher = range(sh.num_coefficients(sh_degree) - 1)
+    count = 3 * (sh.num_coefficients(sh_degree) - 1)
+    higher = load(gaussians.shN, 3 * gaussians.shN.shape[1], count) if count else []
     return GaussianRows(
-        means=t.Array3f(load(gaussians.means, 0, 3, 3)),
-        quats=dr.gather(t.Array4f, dr.detach(gaussians.quats).array, row),
-        log_scales=t.Array3f(load(gaussians.log_scales, 0, 3, 3)),
+        means=t.Array3f(load(gaussians.means, 3, 3)),
+        quats=t.Array4f(load(gaussians.quats, 4, 4)),
+        log_scales=t.Array3f(load(gaussians.log_scales, 3, 3)),
         logit_opacities=flat,
-        sh=[t.Array3f(load(gaussians.sh0, 0, 3, 3))]
-        + [t.Array3f(load(gaussians.shN, 3 * k, stride, 3)) for k in higher],
+        sh=[t.Array3f(load(gaussians.sh0, 3, 3))]
+        + [t.Array3f(higher[k : k + 3]) for k in range(0, count, 3)],
         smoothing=None if gaussians.smoothing is None else dr.detach(gaussians.smoothing),
         features=gaussians.features
-        and {k: load(v, 0, v.shape[1], v.shape[1]) for k, v in gaussians.features.items()},
+        and {k: load(v, v.shape[1], v.shape[1]) for k, v in gaussians.features.items()},
     )
 
 

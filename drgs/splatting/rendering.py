@@ -20,7 +20,7 @@ from typing import Any, Protocol
 import drjit as dr
 
 from drgs.cameras.camera import Camera
-from drgs.core.arrays import interleave, types_of
+from drgs.core.arrays import first_numbers, store_columns, types_of
 from drgs.core.constants import LOW_PASS
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 from drgs.splatting.grid import TileGrid
@@ -426,27 +426,36 @@ def _as_tensors(d_rows: GaussianRows, gaussians: Gaussians, visible: Any) -> tup
     t = types_of(type(d_rows.logit_opacities))
     higher = [component for vector in d_rows.sh[1:] for component in vector]
     missing = 3 * gaussians.shN.shape[1] - len(higher)
-
-    def tensor(columns: list[Any], like: Any) -> Any:
-        if not columns:
-            return dr.zeros(t.TensorXf, like.shape)
-        columns = [dr.select(visible, column, t.Float(0)) for column in columns]
-        return t.TensorXf(interleave(columns), like.shape)
-
-    features = gaussians.features and {
-        name: tensor(d_rows.features[name], like) for name, like in gaussians.features.items()
+    columns = {
+        # First: scatters that are recorded before the loop that stores many columns are evaluated
+        # there, by a kernel of their own.
+        "shN": [*higher, *[t.Float(0)] * missing] if higher else [],
+        "means": d_rows.means,
+        "quats": d_rows.quats,
+        "log_scales": d_rows.log_scales,
+        "logit_opacities": [d_rows.logit_opacities],
+        "sh0": d_rows.sh[0],
+        **(d_rows.features or {}),
     }
-    gradients = Gaussians(
-        features=features,
-        means=tensor(list(d_rows.means), gaussians.means),
-        quats=tensor(list(d_rows.quats), gaussians.quats),
-        log_scales=tensor(list(d_rows.log_scales), gaussians.log_scales),
-        logit_opacities=dr.select(visible, d_rows.logit_opacities, 0),
-        sh0=tensor(list(d_rows.sh[0]), gaussians.sh0),
-        shN=tensor(higher + [t.Float(0)] * missing, gaussians.shN),
-    )
+    stored = {
+        name: store_columns([dr.select(visible, column, t.Float(0)) for column in own])
+        for name, own in columns.items()
+        if len(own)
+    }
     faults = dr.select(visible, _faults(d_rows), _NO_FAULT)
-    dr.eval(gradients, faults)
+    dr.eval(stored, faults)
+
+    def gradient(name: str, like: Any) -> Any:
+        if name not in stored:
+            return dr.zeros(t.TensorXf, like.shape)
+        flat = first_numbers(stored[name], dr.width(like))
+        return t.TensorXf(flat, like.shape) if dr.is_tensor_v(like) else flat
+
+    features = gaussians.features
+    gradients = Gaussians(
+        **{name: gradient(name, getattr(gaussians, name)) for name in PARAMETER_NAMES},
+        features=features and {name: gradient(name, like) for name, like in features.items()},
+    )
     return gradients, dr.min(faults)
 
 

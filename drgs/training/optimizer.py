@@ -21,6 +21,61 @@ import drjit as dr
 import numpy as np
 from drjit.opt import Adam
 
+from drgs.core.private import new_rate_cache
+
+LARGE = 1 << 20
+"""Numbers of an array, from which on waiting for memory to be freed is better than more memory."""
+
+
+class LeanAdam(Adam):
+    """``drjit.opt.Adam``, to the same bits, with fewer large arrays at a time.
+
+    ``drjit.opt.Adam`` evaluates all new values and moments at once, while the former ones and all
+    gradients are there: seven arrays of each parameter. Here moments come first, each is given the
+    memory of its predecessor, and gradients are cleared where they have been used: five arrays.
+    """
+
+    def step(
+        self,
+        *,
+        eval: bool = True,
+        grad_scale: Any = None,
+        active: Any = None,
+    ) -> None:
+        """Take a step; for the arguments see ``drjit.opt.Adam.step``.
+
+        Clears the gradients of large arrays, and waits for the device where there are any. A step
+        that is scaled, masked or not evaluated is that of ``drjit.opt.Adam``.
+        """
+        if not eval or grad_scale is not None or active is not None or self.mask_updates:
+            super().step(eval=eval, grad_scale=grad_scale, active=active)
+            return
+        rates = new_rate_cache()
+        successors = [self._replaced(key, rates) for key in self.state]
+        for arrays in successors:
+            if dr.width(arrays) >= LARGE:
+                for array in arrays:
+                    dr.eval(array)
+                    dr.sync_thread()  # memory is only free when the last kernel has read it
+        dr.eval(successors)
+
+    def _replaced(self, key: str, rates: Any) -> list[Any]:
+        """Give a parameter its new state, not evaluated.
+
+        Returns its arrays in the order in which each makes a former one superfluous.
+        """
+        value, promoted, rate, extra = self.state[key]
+        flat, gradient = dr.detach(value).array, value.grad.array
+        rate_in_use = self.lr if rate is None else rate
+        new, extra = self._step(rates, flat, gradient, rate_in_use, extra)
+        if dr.width(value) >= LARGE:
+            dr.clear_grad(value)
+        moments = [moment for moment in extra[1:] if moment is not None]
+        new_value = type(value)(new, value.shape) if dr.is_tensor_v(value) else type(value)(new)
+        dr.enable_grad(new_value)
+        self.state[key] = new_value, promoted, rate, extra
+        return [*moments, new]
+
 
 def make_optimizer(
     parameters: Mapping[str, Any],
@@ -36,7 +91,7 @@ def make_optimizer(
     rates: learning rate per step by name. A fixed rate of 0 is allowed.
     epsilon: 3DGS uses 1e-15, because gradients of a mean over pixels are far below 1e-8.
     """
-    optimizer = Adam(lr=0.0, beta_1=beta_1, beta_2=beta_2, epsilon=epsilon)
+    optimizer = LeanAdam(lr=0.0, beta_1=beta_1, beta_2=beta_2, epsilon=epsilon)
     for name, value in parameters.items():
         if name not in rates:
             raise ValueError(

@@ -5,7 +5,16 @@ import numpy as np
 import pytest
 from support.helpers import both_precisions
 
-from drgs.core.arrays import Rows, from_host, interleave, quotient, scatter_rows
+from drgs.core.arrays import (
+    Rows,
+    first_numbers,
+    from_host,
+    interleave,
+    load_columns,
+    quotient,
+    scatter_rows,
+    store_columns,
+)
 
 UInt32 = dr.llvm.ad.UInt32
 
@@ -41,6 +50,22 @@ def test_rows_are_loaded_as_they_were_stored(precision, layout, count):
     lanes, active = UInt32(4, 4, 0, 2), dr.llvm.ad.Bool(True, False, True, True)
     loaded = np.stack([np.array(v) for v in rows.load(lanes, active)], axis=1)
     np.testing.assert_array_equal(loaded, table(count)[[4, 4, 0, 2]] * [[1], [0], [1], [1]])
+
+
+# Of one to five rows of 9, 11 and 45 numbers, arrays end anywhere in a packet.
+@both_precisions
+@pytest.mark.parametrize("num_rows", [1, 2, 3, 4, 5])
+@pytest.mark.parametrize("width", [1, 3, 4, 6, 9, 11, 24, 45])
+def test_rows_back_to_back_are_loaded_and_stored(precision, width, num_rows):
+    flat = precision.array(table(width, num_rows).ravel())
+    lanes = UInt32(np.arange(num_rows)[::-1].copy())
+    for count in {1, width // 2 + 1, width}:
+        loaded = load_columns(flat, lanes, dr.opaque(UInt32, num_rows), width, count)
+        loaded = np.stack([np.array(v) for v in loaded], axis=1)
+        np.testing.assert_array_equal(loaded, table(width, num_rows)[::-1, :count])
+    stored = store_columns(numbered(precision, width, num_rows))
+    dr.eval(stored)
+    np.testing.assert_array_equal(first_numbers(stored, num_rows * width), np.array(flat))
 
 
 @both_precisions

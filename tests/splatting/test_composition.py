@@ -121,8 +121,9 @@ def plain_kernels():
 
 
 def compositing_loop(name, kernels) -> list:
-    """The longest kernel: before the tangent's and after the adjoint's come those of projection."""
-    return max(kernels, key=lambda kernel: kernel[1])
+    """The longest kernel besides projection's: the adjoint's last, the others' first."""
+    others = kernels[:-1] if name == "adjoint" else kernels[1:]
+    return max(others, key=lambda kernel: kernel[1])
 
 
 def operations(kernels) -> dict[str, int]:

@@ -8,8 +8,16 @@ import pytest
 from drjit.llvm.ad import Float, TensorXf, TensorXf64, UInt32
 from drjit.opt import Adam
 
+from drgs.core.private import clear_memory_peak, memory_peak
 from drgs.gaussians.parameters import PARAMETER_NAMES
-from drgs.training.optimizer import edit_rows, make_optimizer, num_rows, replace_values, take_rows
+from drgs.training.optimizer import (
+    LARGE,
+    edit_rows,
+    make_optimizer,
+    num_rows,
+    replace_values,
+    take_rows,
+)
 from drgs.training.rates import ExponentialDecay
 
 PREFIX = "integrator."
@@ -66,6 +74,49 @@ def test_make_optimizer_sets_rates_and_leaves_out_empty_parameters():
     assert list(optimizer.keys()) == [PREFIX + name for name in PARAMETER_NAMES[:-1]]
     for name in PARAMETER_NAMES[:-1]:
         assert optimizer.learning_rate(PREFIX + name) == RATES[name]
+
+
+def adam_and_ours(num):
+    """Both optimizers with the same parameters, whose harmonics are large."""
+    values = parameters(num)
+    assert dr.width(values["shN"]) > LARGE > dr.width(values["quats"])
+    plain = Adam(lr=0.0, epsilon=1e-15)
+    for name, value in values.items():
+        plain[PREFIX + name] = value
+        plain.set_learning_rate({PREFIX + name: RATES[name]})
+    return plain, make_optimizer(values, RATES, PREFIX)
+
+
+def test_steps_are_those_of_adam_and_use_large_gradients_up():
+    num = 25_000
+    plain, ours = adam_and_ours(num)
+    for seed in range(2):
+        former = dict(ours.items())
+        for optimizer in (plain, ours):
+            step(optimizer, seed, np.arange(num) % 100)
+    for key, state in snapshot(ours).items():
+        for array, other in zip(state, snapshot(plain)[key], strict=True):
+            np.testing.assert_array_equal(array, other)
+    left = {key for key, value in former.items() if np.any(np.array(dr.grad(value)))}
+    assert left == set(ours) - {PREFIX + "shN"}
+
+
+def test_a_step_takes_two_blocks_of_harmonics_less_than_that_of_adam():
+    num = 25_000
+    peaks = []
+    for optimizer in adam_and_ours(num):
+        dr.sync_thread()
+        dr.flush_malloc_cache()
+        clear_memory_peak()
+        before = memory_peak()
+        step(optimizer, 0, np.arange(num) % 100)
+        dr.sync_thread()
+        peaks.append(memory_peak() - before)
+        del optimizer
+    block = 1 << 23  # bytes: Dr.Jit's blocks are powers of two
+    assert block / 2 < 4 * 45 * num < block
+    # Arrays of the other parameters are of other sizes, and come and go at other times.
+    assert peaks[0] - peaks[1] > 1.5 * block, peaks
 
 
 def test_tiny_gradients_move_parameters():
