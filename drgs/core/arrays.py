@@ -295,6 +295,19 @@ class _Packets:
         return list(packet)
 
 
+def with_aligned_stack(value: Any) -> Any:
+    """``value``, evaluated nowhere; kernels that need it keep what registers do not hold aligned.
+
+    LLVM aligns a function's stack as its variables ask for, but not for vectors that it puts there
+    when it runs out of registers: such a vector lies in two cache lines. Here the value goes by way
+    of a variable on the stack: written and read at places that are the same, which only we know.
+    """
+    UInt32 = types_of(type(value)).UInt32
+    variable = dr.alloc_local(type(value), 2)
+    variable[dr.opaque(UInt32, 0)] = value
+    return variable[dr.opaque(UInt32, 0)]
+
+
 def _dynamic_vector(columns: list[Any]) -> Any:
     return _dynamic_type(type(columns[0]))(columns)
 

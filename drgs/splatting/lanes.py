@@ -12,7 +12,7 @@ from typing import Any
 
 import drjit as dr
 
-from drgs.core.arrays import types_of
+from drgs.core.arrays import types_of, with_aligned_stack
 from drgs.core.private import bucket_order
 from drgs.splatting.grid import GRID, MICRO, MICROS, PIXELS, TILE, Lanes, TileGrid
 from drgs.splatting.tiles import WORD, TileBins
@@ -55,7 +55,7 @@ def grouped_by_work(Float: type, grid: TileGrid, work: Any, tiles: range | None 
     level = dr.select(level < _LEVELS, level, _LEVELS - 1)
     dr.eval(level)
     order = bucket_order(level, min(_BLOCK, dr.width(level)), _LEVELS)
-    return make_lanes(Float, grid, order, tiles)
+    return make_lanes(Float, grid, with_aligned_stack(order), tiles)
 
 
 _BLOCK = 32 * MICROS
