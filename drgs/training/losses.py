@@ -142,7 +142,8 @@ class _PhotometricOp(dr.CustomOp):
 
     def eval(self, image: Any, target: Target, weight: float) -> tuple[Any, Any]:
         self.target, self.weight, self.shape = target, weight, image.shape
-        self.tiling = tiling = _tiling(target)
+        tiling = _tiling(target)
+        self.tiling = tiling
         self.values = tiling.to_tiles(image.array)
         dr.eval(self.values)
         blurred, absolute, squared = _blur_along_rows(tiling, self.values, target)

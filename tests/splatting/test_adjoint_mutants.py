@@ -43,7 +43,7 @@ from support.mutants import ALWAYS, AT_EQUALITY, NEGATED, NEVER, SCALED, Switchb
 
 from drgs.gaussians.parameters import PARAMETER_NAMES
 from drgs.reference import splatting as reference
-from drgs.splatting import image_model, rasterize, rendering
+from drgs.splatting import image_model, rasterize, rendering, slots
 from drgs.splatting.cutoffs import Cutoffs
 from drgs.training import losses
 
@@ -53,16 +53,7 @@ STAGES = ("composite_adjoint", "composite_tangent")
 
 RESPONSE_DERIVATIVES = ("moments", "derivatives", "pack_tangents", "tangent")
 
-EQUIVALENT = {
-    (
-        "rendering._as_tensors",
-        "dr.select(visible, d_rows.logit_opacities, 0)",
-        "",
-        ALWAYS,
-    ): "an invisible splat's opacity gets a zero, and Dr.Jit multiplies no gradient of zero, not "
-    "even by NaN",
-}
-"""Mutants that change no result, and why: (function, source, part, change)."""
+SUMS = ("CompositedPairs", "bands_of", "assign_slots", "sum_entries", "sum_runs")
 
 
 # ----------------------------------------------------------------------------------------------
@@ -186,6 +177,12 @@ def _detectors(at_thresholds):
         ),
         "loss transpose": loss.check_gradient_is_the_transpose_of_the_tangent,
         "loss at equality": loss.check_l1_gradient_is_the_sign_and_zero_at_equality,
+        "squared error": partial(
+            loss.check_squared_error_is_the_mean_over_pixels_and_channels, 0.2
+        ),
+        "squared error of L1": partial(
+            loss.check_squared_error_is_the_mean_over_pixels_and_channels, 0
+        ),
         "loss overexposed": loss.check_overexposed_images_do_not_blow_up_the_gradient,
     }
     return detectors(general), detectors(special)
@@ -194,11 +191,13 @@ def _detectors(at_thresholds):
 @pytest.fixture(scope="module")
 def outcome():
     board = Switchboard()
+    sums = Instrumented(board, slots, derivatives=["CompositedPairs.of", *SUMS[1:]], forward=[])
     kernels = Instrumented(
         board,
         rasterize,
         derivatives=["composite_adjoint", "composite_tangent"],
         forward=["composite", "Records.of", "Layers.planes"],
+        **{name: sums[name] for name in SUMS},
     )
     chain = Instrumented(
         board,
@@ -289,9 +288,8 @@ def _remembered(board, function):
 
 @pytest.mark.slow
 class TestDefault(MutationChecks):
-    equivalent = EQUIVALENT
     derivatives = """
-        rasterize.composite_adjoint rasterize._adjoint_step rasterize.sum_runs
+        rasterize._partials rasterize._adjoint_step slots.sum_entries slots.sum_runs
         rasterize.composite_tangent rasterize.pack_tangents image_model.AffineResponse.moments
         image_model.AffineResponse.derivatives image_model.AffineResponse.tangent
         image_model.AffineResponse.pack_tangents image_model.SplatFeatures.add_derivatives

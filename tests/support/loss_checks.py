@@ -63,6 +63,15 @@ def check_gradient_is_the_transpose_of_the_tangent():
     assert forward == pytest.approx((gradient * tangent).sum(), rel=1e-12)
 
 
+def check_squared_error_is_the_mean_over_pixels_and_channels(weight):
+    x, y = images(21, 34)
+    image, target = TensorXf64(x), prepare_target(TensorXf64(y))
+    loss, error = PhotometricLoss(weight).with_squared_error(image, target)
+    assert loss[0] == PhotometricLoss(weight)(image, target)[0]
+    # float64 sums of two thousand terms in another order.
+    assert error[0] == pytest.approx(np.mean((x - y) ** 2), rel=1e-12)
+
+
 def check_l1_gradient_is_the_sign_and_zero_at_equality():
     x, y = images(7, 11, levels=3)
     assert (x == y).any()

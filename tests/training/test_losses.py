@@ -9,6 +9,7 @@ from support.loss_checks import (
     check_gradient_is_the_transpose_of_the_tangent,
     check_l1_gradient_is_the_sign_and_zero_at_equality,
     check_overexposed_images_do_not_blow_up_the_gradient,
+    check_squared_error_is_the_mean_over_pixels_and_channels,
     images,
     reference,
     value_and_gradient,
@@ -140,12 +141,7 @@ def test_target_returns_its_photograph():
 
 @pytest.mark.parametrize("weight", [0, 0.2])
 def test_squared_error_is_the_mean_over_pixels_and_channels(weight):
-    x, y = images(21, 34)
-    image, target = TensorXf64(x), prepare_target(TensorXf64(y))
-    loss, error = PhotometricLoss(weight).with_squared_error(image, target)
-    assert loss[0] == PhotometricLoss(weight)(image, target)[0]
-    # float64 sums of two thousand terms in another order.
-    assert error[0] == pytest.approx(np.mean((x - y) ** 2), rel=1e-12)
+    check_squared_error_is_the_mean_over_pixels_and_channels(weight)
 
 
 def test_ssim_agrees_with_the_metric():
