@@ -298,7 +298,7 @@ def _partials(
     ends = load_lane_row(layers.ends, lanes.micro_tile, 1)
     transmittance = load_lane_row(layers.values, lanes.micro_tile, 1 + layers.count)
     width = model.response.num_moments + bins.num_features
-    partials = Rows.whole(t.Float, width, max(slots.band.num_slots, 1))
+    partials = Rows.empty(t.Float, width, max(slots.band.num_slots, 1))
 
     # A packet is stored with a branch for each lane, and across branches numbers wait in memory
     # instead of registers. A turn therefore begins with storing what the one before has summed.
