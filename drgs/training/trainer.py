@@ -122,9 +122,8 @@ class Trainer:
             self.optimizer.step()
         for effect in self.effects:
             effect.after(self, view)
-        self.stage.seen(view)
-
         report = self._control_density(image, view.target)
+        self.stage.seen(view)
         return StepReport(
             iteration=self.iteration,
             num_gaussians=self.num_gaussians,
