@@ -23,6 +23,7 @@ from typing import Any
 import drjit as dr
 
 from drgs.core.arrays import Rows, interleave, types_of
+from drgs.core.errors import UserError
 from drgs.core.private import bucket_order
 from drgs.splatting.grid import GRID, MICRO, MICROS, TILE, TileGrid
 from drgs.splatting.image_model import DEFAULT, ImageModel
@@ -71,8 +72,15 @@ def bin_splats(
     evaluated: the kernel that computes them stores rows.
 
     Not differentiated: integer work. The host reads one value, the number of entries.
+
+    Raises UserError if there are more than 2^26 Gaussians.
     """
     t = types_of(type(splats.depths))
+    if dr.width(splats.depths) > 1 << _RANK_BITS:
+        raise UserError(
+            f"bin_splats(): at most {1 << _RANK_BITS:,} Gaussians can be told apart in a tile, got "
+            f"{dr.width(splats.depths):,}; render them in parts, or prune them"
+        )
     boxes, rows, depths = _store_rows(splats, grid, [*features, *keys], model)
     # A stable sort: equal depths stay in the order of the Gaussians.
     order = dr.argsort(depths)
@@ -88,13 +96,10 @@ def bin_splats(
 
     tile, entries = _make_entries(first_entry, boxes, rows, num_entries, grid, model)
     source = stable_order(tile, grid.num_tiles)
-
-    padded = -(-max(num_entries, 1) // WORD) * WORD
-    position = dr.arange(t.UInt32, padded)
-    active = position < dr.opaque(t.UInt32, num_entries)
-    source = dr.gather(t.UInt32, source, position, active)
-    ranks, tiles, masks, _ = dr.gather(t.Array4u, entries, source, active)
-    dr.eval(source, ranks, tiles, masks)
+    ranks, tiles, masks = _unpack(*dr.gather(t.Array2u, entries, source))
+    dr.eval(ranks, tiles, masks)
+    # Both would wait in memory for the end of the function.
+    del tile, entries
     words = transpose_masks(masks)
     tile_start = lower_bounds(tiles, num_entries, grid.num_tiles)
     dr.eval(words, tile_start)
@@ -165,17 +170,22 @@ def _tile_box(
 def _make_entries(
     first_entry: Any, boxes: Rows, rows: Rows, num_entries: int, grid: TileGrid, model: ImageModel
 ) -> tuple[Any, Any]:
-    """Of each entry its tile; and four numbers: rank, tile, mask of micro-tiles, 0."""
+    """Of each entry its tile; and two words: see :func:`_pack`.
+
+    Entries of the padding touch nothing, in the last tile: a stable sort leaves them at the end.
+    """
     t = types_of(rows.Float)
     # Rank of each entry: write each rank at the start of its run, then a running maximum.
+    padded = -(-max(num_entries, 1) // WORD) * WORD
     rank = dr.arange(t.UInt32, dr.width(first_entry) - 1)
     start, end = dr.gather(t.UInt32, first_entry, rank), dr.gather(t.UInt32, first_entry, rank + 1)
-    starts = dr.zeros(t.UInt32, max(num_entries, 1))
+    starts = dr.zeros(t.UInt32, padded)
     dr.scatter(starts, rank, start, start < end)
     rank = dr.prefix_reduce(dr.ReduceOp.Max, starts, exclusive=False)
 
     tile_x, tile_y, columns = (t.UInt32(number) for number in boxes.load(rank)[:3])
-    local = dr.arange(t.UInt32, max(num_entries, 1)) - dr.gather(t.UInt32, first_entry, rank)
+    entry = dr.arange(t.UInt32, padded)
+    local = entry - dr.gather(t.UInt32, first_entry, rank)
     # Exact while a splat covers fewer than 2^22 tiles; an integer division by a varying number
     # has no vector instruction.
     row = t.UInt32((t.Float(local) + 0.5) / t.Float(columns))
@@ -184,9 +194,30 @@ def _make_entries(
     tile = dr.fma(tile_y, dr.opaque(t.UInt32, grid.columns), tile_x)
     geometry = rows.load(rank)[: model.response.num_geometry]
     mask = _touched_micros(geometry, tile_x, tile_y, grid, model)
-    entries = interleave([rank, tile, mask, dr.zeros(t.UInt32, dr.width(tile))])
+    exists = entry < dr.opaque(t.UInt32, num_entries)
+    tile = dr.select(exists, tile, dr.opaque(t.UInt32, grid.num_tiles - 1))
+    entries = interleave(_pack(rank, tile, dr.select(exists, mask, 0)))
     dr.eval(tile, entries)
     return tile, entries
+
+
+_RANK_BITS = 26
+"""With 64 - 16 - 26 bits for the tile."""
+
+
+def _pack(rank: Any, tile: Any, mask: Any) -> list[Any]:
+    """An entry in two words, as it is read in no order: 26 bits of rank, 22 of tile, 16 of mask.
+
+    2^22 tiles have 2^30 pixels, whose four planes are more numbers than an array of Dr.Jit holds;
+    more ranks are refused by :func:`bin_splats`.
+    """
+    return [rank | ((tile >> MICROS) << _RANK_BITS), mask | (tile << MICROS)]
+
+
+def _unpack(first: Any, second: Any) -> tuple[Any, Any, Any]:
+    """Rank, tile and mask of an entry."""
+    tile = (second >> MICROS) | ((first >> _RANK_BITS) << MICROS)
+    return first & ((1 << _RANK_BITS) - 1), tile, second & ((1 << MICROS) - 1)
 
 
 def stable_order(keys: Any, bound: int) -> Any:

@@ -16,6 +16,7 @@ from support.helpers import (
     stacked_scene,
 )
 
+from drgs.core.errors import UserError
 from drgs.reference import splatting as reference
 from drgs.splatting import tiles
 from drgs.splatting.grid import GRID, MICRO, MICROS, TILE, TileGrid
@@ -371,3 +372,16 @@ def test_a_needle_touches_only_what_its_ellipse_touches():
     # 1.8 px to either side of the diagonal: it and its two neighbours.
     diagonal = film // MICRO
     assert diagonal <= micro_tiles <= 3 * diagonal
+
+
+def test_packed_entries_keep_the_largest_numbers():
+    numbers = [(1 << 26) - 1, 5, 0], [(1 << 22) - 1, 1 << 16, 0], [(1 << 16) - 1, 0, 9]
+    packed = tiles._pack(*(dr.llvm.ad.UInt32(column) for column in numbers))
+    assert [np.array(v).tolist() for v in tiles._unpack(*packed)] == [*numbers]
+
+
+def test_more_splats_than_ranks_are_refused(monkeypatch):
+    monkeypatch.setattr(tiles, "_RANK_BITS", 2)
+    splats = round_splats(FLOAT32, np.full((5, 2), 8.0))
+    with pytest.raises(UserError, match="at most 4 Gaussians"):
+        bin_splats(splats, TileGrid(16, 16))
