@@ -127,9 +127,12 @@ class Records:
     num_features: int
 
     @staticmethod
-    def of(bins: TileBins, numbers: Callable[[Any], list[Any]]) -> Records:
-        """Copies, evaluated, of each rank's ``numbers``, such as those of ``bins.rows.load``."""
-        rows = Rows.of(numbers(bins.ranks))
+    def of(bins: TileBins, numbers: Callable[[Any, Any], list[Any]]) -> Records:
+        """Copies, evaluated, of each rank's ``numbers``, such as those of ``bins.rows.load``.
+
+        numbers: given ranks, and which lanes are active. Entries that touch nothing have zeros.
+        """
+        rows = Rows.of(numbers(bins.ranks, bins.masks != 0))
         dr.eval(rows)
         return Records(rows, bins.model.response.num_geometry, bins.num_features)
 
