@@ -26,27 +26,28 @@ from drgs.core.memory import available_memory, readable, resident_memory
 from drgs.data.types import Dataset, View, Viewpoint
 from drgs.gaussians.parameters import Gaussians
 from drgs.splatting.grid import MICRO, TILE
+from drgs.splatting.slots import BAND_SLOTS
 from drgs.training.density.called_for import density_strategy
 
 PROCESS_BYTES = 290_000_000
 """Interpreter, libraries and compiled kernels; and results, as far as they come on top. Compiling
 takes 130 MB for a while where the kernels are not cached: half of that is among them."""
 
-NUMBER_BYTES = 34
-"""Of each number of a Gaussian: itself, its gradient, two moments, and their successors."""
+NUMBER_BYTES = 28
+"""Of each number of a Gaussian: itself, its gradient, two moments, and one successor at a time."""
 
-GAUSSIAN_BYTES = 700
+GAUSSIAN_BYTES = 100
 """Of each Gaussian besides: as it is seen, and the derivatives of that."""
 
-GROWTH_BYTES = 1300
+GROWTH_BYTES = 500
 """More of each where the population changes: rows are copied, and arrays of sizes that will not
 come again are held a while."""
 
-ENTRY_BYTES = 220
-"""Of each (splat, tile) entry: its record, and what sorting takes."""
+ENTRY_BYTES = 150
+"""Of each (splat, tile) entry: its record, its sums, and what sorting takes."""
 
-SLOT_BYTES = 48
-"""Of each composited (entry, micro-tile) pair: moments and derivatives of colours, padded."""
+SLOT_BYTES = 36
+"""Of each composited (entry, micro-tile) pair of a band: moments and derivatives of colours."""
 
 PIXEL_BYTES = 155
 """Of each pixel: planes, the picture, its gradient, and what the loss stores."""
@@ -125,7 +126,7 @@ def estimate(
         photographs=round(sum(_kept_bytes(view, scale) for view in views)),
         targets=round(scale**2 * view_bytes * sum(view.width * view.height for view in train)),
         gaussians=round(of_gaussian * count),
-        splats=round(ENTRY_BYTES * entries * times + SLOT_BYTES * slots),
+        splats=round(ENTRY_BYTES * entries * times + SLOT_BYTES * min(slots, BAND_SLOTS)),
         pixels=round(PIXEL_BYTES * pixels * times + MEASURED_BYTES * measured),
     )
 
