@@ -40,8 +40,8 @@ from drgs.splatting.rasterize import (
     Layers,
     Records,
     SplatGradients,
+    any_unfinished,
     composite_step,
-    largest,
     pack_tangents,
     splat_gradients,
 )
@@ -224,10 +224,6 @@ def _insert(places: list[list[Any]], item: list[Any]) -> tuple[list[list[Any]], 
     return places, item
 
 
-def _unfinished(T: list[Any]) -> Any:
-    return largest(T) > 0
-
-
 # ----------------------------------------------------------------------------------------------
 # Forward
 # ----------------------------------------------------------------------------------------------
@@ -253,7 +249,7 @@ def _composite(bins: TileBins, records: Records, order: PixelOrder) -> _OrderedL
             weight, T[pixel], _ = composite_step(T[pixel], alpha, inputs.stop)
             for k, c in enumerate(features):
                 C[k][pixel] = dr.fma(weight, c, C[k][pixel])
-        return (T, C), _unfinished(T)
+        return (T, C), any_unfinished(T)
 
     T, C = _walk(
         inputs,
@@ -312,7 +308,7 @@ def _totals(
         for pixel, (alpha, seen) in enumerate(visited):
             weight, T[pixel], _ = composite_step(T[pixel], alpha, inputs.stop)
             high[pixel], low[pixel] = _add_product(high[pixel], low[pixel], weight, seen)
-        return (T, high, low), _unfinished(T)
+        return (T, high, low), any_unfinished(T)
 
     _, *totals = _walk(
         inputs,
@@ -350,7 +346,7 @@ def _pairs(inputs: _WalkInputs, totals: list[tuple[Any, Any]], g: list[list[Any]
             d_log_alpha = dr.select(alpha < alpha_max, change, 0)
             for plane, value in zip(pairs, (weight, d_log_alpha), strict=True):
                 dr.scatter(plane, value, place * PIXELS + pixel, goes_on & (alpha > 0))
-        return (T, high, low), _unfinished(T)
+        return (T, high, low), any_unfinished(T)
 
     result = _walk(
         inputs,
@@ -371,15 +367,14 @@ def _sum_pixels(inputs: _WalkInputs, pairs: list[Any], g: list[list[Any]]) -> Ro
     bins, records, lists = inputs.bins, inputs.records, inputs.lists
     lanes, model = inputs.lanes, inputs.model
     t = types_of(bins.rows.Float)
-    width = model.response.num_moments + bins.num_features
-    partials = Rows.empty(t.Float, width, max(lists.count, 1))
+    partials = Rows.empty(t.Float, bins.num_sums, max(lists.count, 1))
     begin, end = lists.range(lanes)
 
     def body(place: Any) -> tuple:
         entry = dr.gather(t.UInt32, lists.entries, place)
         geometry, features = records.load(entry, True)
         footprint = model.footprint(geometry, lanes, True)
-        weights, d_log_alpha = (Rows((plane,), (PIXELS,), PIXELS).load(place) for plane in pairs)
+        weights, d_log_alpha = (Rows((plane,), PIXELS).load(place) for plane in pairs)
         d_stored = [t.Float(0) for _ in features]
         for pixel, weight in enumerate(weights):
             g_pixel = [plane[pixel] for plane in g]
@@ -456,7 +451,7 @@ def _tangent(
             for k in range(count):
                 change = dr.fma(d_weight, features[k], weight * features[count + k])
                 dC[k][pixel] = dC[k][pixel] + change
-        return (T, dT, dC), _unfinished(T)
+        return (T, dT, dC), any_unfinished(T)
 
     _, dT, dC = _walk(
         inputs,

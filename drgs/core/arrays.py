@@ -129,7 +129,6 @@ class Rows:
     """
 
     blocks: tuple[Any, ...]  # flat, row-major: the next columns of all rows
-    block_widths: tuple[int, ...]
     width: int  # numbers in a row, without padding
 
     @property
@@ -140,22 +139,8 @@ class Rows:
     @staticmethod
     def empty(float_type: type, width: int, num_rows: int) -> Rows:
         """Memory, not initialised."""
-        rest = width % 8 + (width % 8 in (3, 7))
-        widths = (width // 8 * 8, *(rest & packet for packet in (8, 4, 2, 1)))
-        return Rows._of_blocks(float_type, [each for each in widths if each], width, num_rows)
-
-    @staticmethod
-    def whole(float_type: type, width: int, num_rows: int) -> Rows:
-        """Memory, not initialised, of which a row fills whole packets of 4 beside each other.
-
-        Where rows are read in no order, each waits for less memory.
-        """
-        return Rows._of_blocks(float_type, [-(-width // 4) * 4], width, num_rows)
-
-    @staticmethod
-    def _of_blocks(float_type: type, widths: list[int], width: int, num_rows: int) -> Rows:
-        blocks = tuple(dr.empty(float_type, num_rows * block) for block in widths)
-        return Rows(blocks, tuple(widths), width)
+        blocks = tuple(dr.empty(float_type, num_rows * each) for each in block_widths(width))
+        return Rows(blocks, width)
 
     @staticmethod
     def of(columns: Sequence[Any]) -> Rows:
@@ -168,17 +153,27 @@ class Rows:
     def load(self, row: Any, active: Any = True) -> list[Any]:
         """The numbers of a row a lane; 0 if not active."""
         numbers, lanes, vector = [], dr.width(row), _dynamic_type(self.Float)
-        for block, width in zip(self.blocks, self.block_widths, strict=True):
+        for block, width in zip(self.blocks, block_widths(self.width), strict=True):
             numbers.extend(dr.gather(vector, block, row, active, shape=(width, lanes)))
         return numbers[: self.width]
 
     def store(self, numbers: Sequence[Any], row: Any, active: Any = True) -> None:
         """Fill one row a lane; no two lanes may fill the same."""
         padding, start = [type(numbers[0])(0)] * 3, 0
-        for block, width in zip(self.blocks, self.block_widths, strict=True):
+        for block, width in zip(self.blocks, block_widths(self.width), strict=True):
             columns = [*numbers, *padding][start : start + width]
             dr.scatter(block, _dynamic_vector(columns), row, active)
             start += width
+
+
+def block_widths(width: int) -> tuple[int, ...]:
+    """How many numbers of a row each block of :class:`Rows` has: whole packets, of 8 if possible.
+
+    Three numbers are a packet of 4.
+    """
+    rest = width % 8 + (width % 8 in (3, 7))
+    widths = (width // 8 * 8, *(rest & packet for packet in (8, 4, 2, 1)))
+    return tuple(each for each in widths if each)
 
 
 PACKET = 4
@@ -223,7 +218,6 @@ def store_columns(columns: Sequence[Any]) -> Any:
         return interleave(columns)
     size = num_rows * width
     flat = dr.empty(flat_type, -(-size // PACKET) * PACKET)
-
     _store_shifted(flat, columns)
     return flat
 

@@ -175,7 +175,7 @@ def composite(bins: TileBins, records: Records) -> Layers:
             weight, T, goes_on = composite_step(T, alpha.value, stop)
             end = dr.select(goes_on, behind, end)
             composited.append([T, *model.features.add(C, features, pixel, weight), end])
-        return entries.advance(cursor), composited, _any_unfinished(composited)
+        return entries.advance(cursor), composited, any_unfinished([T for T, *_ in composited])
 
     stop = model.cutoffs.transmittance_stop
     size = dr.width(lanes.tile)
@@ -209,9 +209,8 @@ def composite(bins: TileBins, records: Records) -> Layers:
     return layers
 
 
-def _any_unfinished(pixels: list[list[Any]]) -> Any:
+def any_unfinished(transmittances: list[Any]) -> Any:
     """Whether a transmittance has no negative sign: the bits that all share tell."""
-    transmittances = [T for T, *_ in pixels]
     Int = dr.int_array_t(type(transmittances[0]))
     shared = dr.reinterpret_array(Int, transmittances[0])
     for T in transmittances[1:]:
@@ -269,9 +268,8 @@ def composite_adjoint(
     (cut, clamp, stop).
     """
     pairs = CompositedPairs.of(bins, layers.stop)
-    width = bins.model.response.num_moments + bins.num_features
     bands = bands_of(bins, pairs)
-    sums = Rows.empty(bins.rows.Float, width, max(pairs.num_rows, 1))
+    sums = Rows.empty(bins.rows.Float, bins.num_sums, max(pairs.num_rows, 1))
     for band in bands:
         slots = assign_slots(pairs, band)
         partials = _partials(bins, records, layers, slots, d_features, d_transmittance)
@@ -300,8 +298,7 @@ def _partials(
     g = [load_pixels(plane, lanes, bins.grid) for plane in d_features]
     ends = load_lane_row(layers.ends, lanes.micro_tile, 1)
     transmittance = load_lane_row(layers.values, lanes.micro_tile, 1 + layers.count)
-    width = model.response.num_moments + bins.num_features
-    partials = Rows.empty(t.Float, width, max(slots.band.num_slots, 1))
+    partials = Rows.empty(t.Float, bins.num_sums, max(slots.band.num_slots, 1))
 
     # A packet is stored with a branch for each lane, and across branches numbers wait in memory
     # instead of registers. A turn therefore begins with storing what the one before has summed.
@@ -327,7 +324,7 @@ def _partials(
             entries.begin(),
             slots.end(entries),
             [[*pixel] for pixel in zip(transmittance, behind, strict=True)],
-            [t.Float(zero) for _ in range(width)],
+            [t.Float(zero) for _ in range(bins.num_sums)],
             dr.full(t.Bool, False, size),
         ),
         cond=lambda cursor, slot, pixels, sums, is_summed: entries.pending(cursor) | is_summed,

@@ -427,14 +427,12 @@ def _as_tensors(d_rows: GaussianRows, gaussians: Gaussians, visible: Any) -> tup
     higher = [component for vector in d_rows.sh[1:] for component in vector]
     missing = 3 * gaussians.shN.shape[1] - len(higher)
     columns = {
-        # First: scatters that are recorded before the loop that stores many columns are evaluated
-        # there, by a kernel of their own.
-        "shN": [*higher, *[t.Float(0)] * missing] if higher else [],
         "means": d_rows.means,
         "quats": d_rows.quats,
         "log_scales": d_rows.log_scales,
         "logit_opacities": [d_rows.logit_opacities],
         "sh0": d_rows.sh[0],
+        "shN": [*higher, *[t.Float(0)] * missing] if higher else [],
         **(d_rows.features or {}),
     }
     stored = {

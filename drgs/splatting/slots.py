@@ -5,8 +5,8 @@ composited (entry, micro-tile) pair has a *slot*, which that lane alone writes; 
 entry adds up the entry's slots, and one lane per splat its entries. Nothing is added atomically:
 the result is the same to the last bit in every run.
 
-Slots are written and read once. The film is therefore cut into *bands* of tiles whose slots are in
-memory at a time: caches and address translation hold them, and so does a small machine.
+Slots are written and read once. To save memory, the film is cut into *bands* of tiles whose slots
+exist at a time.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from drgs.splatting.lanes import Entries
 from drgs.splatting.tiles import WORD, TileBins, transpose_masks
 
 BAND_SLOTS = 1 << 20
-"""Slots of a band, as far as whole tiles allow: about 50 MB, three colours in single precision.
+"""Slots of a band, as far as whole tiles allow: 38 MB, three colours in single precision.
 With fewer, Dr.Jit traces and launches more often than it saves."""
 
 

@@ -57,6 +57,11 @@ class TileBins:
     grid: TileGrid
     model: ImageModel
 
+    @property
+    def num_sums(self) -> int:
+        """Numbers that the adjoint sums for each splat: moments, and derivatives of features."""
+        return self.model.response.num_moments + self.num_features
+
 
 def bin_splats(
     splats: Splats2D,

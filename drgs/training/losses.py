@@ -142,13 +142,13 @@ class _PhotometricOp(dr.CustomOp):
 
     def eval(self, image: Any, target: Target, weight: float) -> tuple[Any, Any]:
         self.target, self.weight, self.shape = target, weight, image.shape
-        tiling = _tiling(target)
-        self.tiling = tiling
-        self.values = tiling.to_tiles(image.array)
+        self.tiling = _tiling(target)
+        self.values = self.tiling.to_tiles(image.array)
         dr.eval(self.values)
-        blurred, absolute, squared = _blur_along_rows(tiling, self.values, target)
-        loss, self.partials = _ssim_and_partials(tiling, blurred, absolute, target, weight)
-        return dr.sum(loss) / tiling.num_values, dr.sum(squared) / tiling.num_values
+        blurred, absolute, squared = _blur_along_rows(self.tiling, self.values, target)
+        loss, self.partials = _ssim_and_partials(self.tiling, blurred, absolute, target, weight)
+        count = self.tiling.num_values
+        return dr.sum(loss) / count, dr.sum(squared) / count
 
     def gradient(self) -> Any:
         """Return d loss / d image, flat, row-major."""

@@ -25,11 +25,6 @@ _REASONS = {
         (AT_EQUALITY, ALWAYS),
     ): "beyond it alpha is 2^-10000 = 0: it keeps the factors of that 0 from overflowing",
     (
-        "pixel_order._unfinished",
-        "largest(T) > 0",
-        (AT_EQUALITY, ALWAYS),
-    ): "it saves the time to visit what changes nothing",
-    (
         "pixel_order._walk",
         "along > 0",
         (AT_EQUALITY,),

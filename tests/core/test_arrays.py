@@ -7,6 +7,7 @@ from support.helpers import both_precisions
 
 from drgs.core.arrays import (
     Rows,
+    block_widths,
     first_numbers,
     from_host,
     interleave,
@@ -38,14 +39,10 @@ def test_columns_become_rows(precision, count):
     np.testing.assert_array_equal(flat[np.array(order)], table(count))
 
 
-LAYOUTS = pytest.mark.parametrize("layout", [Rows.empty, Rows.whole])
-
-
 @both_precisions
-@LAYOUTS
 @pytest.mark.parametrize("count", [*range(1, 10), 15, 16, 45])
-def test_rows_are_loaded_as_they_were_stored(precision, layout, count):
-    rows = layout(precision.Float, count, 5)
+def test_rows_are_loaded_as_they_were_stored(precision, count):
+    rows = Rows.empty(precision.Float, count, 5)
     rows.store(numbered(precision, count), dr.arange(UInt32, 5))
     lanes, active = UInt32(4, 4, 0, 2), dr.llvm.ad.Bool(True, False, True, True)
     loaded = np.stack([np.array(v) for v in rows.load(lanes, active)], axis=1)
@@ -69,10 +66,9 @@ def test_rows_back_to_back_are_loaded_and_stored(precision, width, num_rows):
 
 
 @both_precisions
-@LAYOUTS
 @pytest.mark.parametrize("count", [1, 4, 6, 9, 12])
-def test_rows_are_stored_where_a_lane_is_active(precision, layout, count):
-    rows = layout(precision.Float, count, 6)
+def test_rows_are_stored_where_a_lane_is_active(precision, count):
+    rows = Rows.empty(precision.Float, count, 6)
     rows.store([precision.array(np.full(6, -1.0))] * count, dr.arange(UInt32, 6))
     lanes, active = UInt32(5, 0, 2, 3, 1), dr.llvm.ad.Bool(True, True, True, False, True)
     rows.store(numbered(precision, count), lanes, active)
@@ -82,7 +78,7 @@ def test_rows_are_stored_where_a_lane_is_active(precision, layout, count):
 
 
 def test_rows_take_little_more_than_their_numbers():
-    widths = {count: Rows.empty(dr.llvm.ad.Float, count, 2).block_widths for count in range(1, 17)}
+    widths = {count: block_widths(count) for count in range(1, 17)}
     assert all(sum(blocks) - count == (count % 4 == 3) for count, blocks in widths.items())
     assert widths[9] == (8, 1) and widths[16] == (16,)
 

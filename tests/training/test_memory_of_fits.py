@@ -178,7 +178,7 @@ def test_targets_get_what_is_left(available):
 
 
 def test_a_fit_that_does_not_fit_is_refused_with_numbers_and_remedies(available):
-    """What is advised is enough."""
+    """What is advised is enough, and half as many again are too many."""
     config, dataset = config_of(10_000, 10**6), dataset_of(400, 400, 20)
     available(GB)
     with pytest.raises(UserError) as error:
@@ -191,8 +191,9 @@ def test_a_fit_that_does_not_fit_is_refused_with_numbers_and_remedies(available)
     )
     assert "\n" not in message and "1,000,000 Gaussians" in message
     fewer = int(message.partition("max_gaussians=")[2].split()[0])
-    assert 100_000 < fewer < 400_000
     room(config_of(10_000, fewer), dataset)
+    with pytest.raises(UserError):
+        room(config_of(10_000, fewer * 3 // 2), dataset)
 
 
 def test_smaller_pictures_are_advised_where_they_help(available):
