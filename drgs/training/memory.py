@@ -208,19 +208,18 @@ def _refusal(
         f"{readable(memory.gaussians)} for {count:,} Gaussians",
         f"{readable(memory.splats + memory.pixels)} for a picture of them",
     ]
-    remedies = []
-    spare = usable - memory.needed + memory.gaussians
-    if (fewer := int(0.95 * spare * count / memory.gaussians)) > start:
-        remedies.append(f"densify.max_gaussians={_rounded(fewer)}")
     width = max(view.width for view in train)
 
-    def fits(scale: float) -> bool:
+    def fits(config: FitConfig, scale: float = 1.0) -> bool:
         return estimate(config, dataset, gaussians, 0, scale).needed <= 0.95 * usable
 
-    scales = (0.95**k for k in range(1, 100))
-    smaller = next((int(width * scale) for scale in scales if fits(scale)), 0)
-    if smaller >= MIN_WIDTH:
-        remedies.append(f"data.image_size={_rounded(smaller)}")
+    shares = [0.95**k for k in range(1, 100)]
+    fewer = (_rounded(share * count) for share in shares if share * count > start)
+    narrower = (_rounded(share * width) for share in shares if share * width >= MIN_WIDTH)
+    most = next((most for most in fewer if fits(_with_at_most(config, most))), None)
+    size = next((size for size in narrower if fits(config, size / width)), None)
+    remedies = [f"densify.max_gaussians={most}"] if most else []
+    remedies += [f"data.image_size={size}"] if size else []
     advice = f"set {' or '.join(remedies)}" if remedies else "use fewer views and Gaussians"
     return (
         f"memory: the fit needs about {readable(memory.needed)} ({', '.join(parts)}), and "
@@ -228,7 +227,13 @@ def _refusal(
     )
 
 
-def _rounded(number: int) -> int:
+def _with_at_most(config: FitConfig, most: int) -> FitConfig:
+    densify = config.densify.model_copy(update={"max_gaussians": most})
+    return config.model_copy(update={"densify": densify})
+
+
+def _rounded(number: float) -> int:
     """Down to two digits."""
+    number = int(number)
     digits = 10 ** max(0, len(str(number)) - 2)
     return number // digits * digits

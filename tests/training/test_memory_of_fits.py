@@ -178,7 +178,7 @@ def test_targets_get_what_is_left(available):
 
 
 def test_a_fit_that_does_not_fit_is_refused_with_numbers_and_remedies(available):
-    """What is advised is enough, and half as many again are too many."""
+    """What is advised is enough, and a quarter more are too many."""
     config, dataset = config_of(10_000, 10**6), dataset_of(400, 400, 20)
     available(GB)
     with pytest.raises(UserError) as error:
@@ -193,7 +193,7 @@ def test_a_fit_that_does_not_fit_is_refused_with_numbers_and_remedies(available)
     fewer = int(message.partition("max_gaussians=")[2].split()[0])
     room(config_of(10_000, fewer), dataset)
     with pytest.raises(UserError):
-        room(config_of(10_000, fewer * 3 // 2), dataset)
+        room(config_of(10_000, fewer * 5 // 4), dataset)
 
 
 def test_smaller_pictures_are_advised_where_they_help(available):
