@@ -37,6 +37,19 @@ def same_variables(tree: Any, other: Any) -> bool:
     return dr.detail.collect_indices(tree) == dr.detail.collect_indices(other)
 
 
+def same_memory(array: Any) -> Any:
+    """An evaluated array that Dr.Jit takes for another one, of the same memory; for LLVM alone.
+
+    What is scattered to one of them is in the other, too. Waits for the device.
+
+    Relies on numpy and Dr.Jit giving each other arrays without copying them.
+    """
+    other = type(array)(array.numpy())
+    if other.numpy().ctypes.data != array.numpy().ctypes.data:
+        raise RuntimeError("same_memory(): Dr.Jit has copied an array of numpy's")
+    return other
+
+
 def llvm_version() -> tuple[int, ...]:
     """Version of the libLLVM that Dr.Jit has loaded, such as (19, 1, 7); (-1, ...) without one.
 

@@ -13,7 +13,6 @@ from typing import Any
 import drjit as dr
 
 from drgs.core.arrays import types_of, with_aligned_stack
-from drgs.core.private import bucket_order
 from drgs.splatting.grid import GRID, MICRO, MICROS, PIXELS, TILE, Lanes, TileGrid
 from drgs.splatting.tiles import WORD, TileBins
 
@@ -53,9 +52,26 @@ def grouped_by_work(Float: type, grid: TileGrid, work: Any, tiles: range | None 
     """
     level = work // 4
     level = dr.select(level < _LEVELS, level, _LEVELS - 1)
-    dr.eval(level)
-    order = bucket_order(level, min(_BLOCK, dr.width(level)), _LEVELS)
-    return make_lanes(Float, grid, with_aligned_stack(order), tiles)
+    return make_lanes(Float, grid, with_aligned_stack(_in_blocks(level)), tiles)
+
+
+def _in_blocks(level: Any) -> Any:
+    """Lanes ordered by level in each block; which of equals comes first is left to chance.
+
+    Nothing depends on it but which lanes share a vector. (The host would wait for the order of
+    Dr.Jit's sorting functions, and the device for the host, which has not traced what comes next.)
+    """
+    UInt32 = type(level)
+    lane = dr.arange(UInt32, dr.width(level))
+    bucket = lane // _BLOCK * _LEVELS + level
+    counts = dr.zeros(UInt32, -(-dr.width(level) // _BLOCK) * _LEVELS)
+    dr.scatter_add(counts, UInt32(1), bucket, mode=dr.ReduceMode.Direct)
+    dr.eval(bucket)
+    place = dr.scatter_inc(dr.prefix_sum(counts), bucket)
+    order = dr.empty(UInt32, dr.width(level))
+    dr.scatter(order, lane, place)
+    dr.eval(order)
+    return order
 
 
 _BLOCK = 32 * MICROS

@@ -15,25 +15,57 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
 import numpy as np
 from drjit.opt import Adam
 
-from drgs.core.private import new_rate_cache
+from drgs.core.arrays import types_of
+from drgs.core.private import new_rate_cache, same_memory
 
 LARGE = 1 << 20
-"""Numbers of an array, from which on waiting for memory to be freed is better than more memory."""
+"""Numbers of an array, from which on memory is worth saving."""
+
+
+@dataclass(frozen=True)
+class _Moments:
+    """The moments of a parameter, and what they are read as while they are overwritten.
+
+    Dr.Jit copies an array before it scatters to it, if anything else refers to it, and the new
+    moments do. The former ones are therefore read under a name that Dr.Jit takes for other memory.
+    """
+
+    arrays: list[Any]  # as in the optimizer's state
+    indices: list[int]  # of the arrays: an array has another one if it was assigned to
+    former: list[Any]  # of the same memory
+
+    @staticmethod
+    def of(arrays: list[Any]) -> _Moments:
+        """Waits for the device."""
+        former = [same_memory(array) for array in arrays]
+        return _Moments(arrays, [array.index for array in arrays], former)
+
+    def are(self, arrays: list[Any]) -> bool:
+        """Whether these are the moments still."""
+        pairs = zip(self.arrays, self.indices, arrays, strict=True)
+        return all(own is array and index == array.index for own, index, array in pairs)
 
 
 class LeanAdam(Adam):
     """``drjit.opt.Adam``, to the same bits, with fewer large arrays at a time.
 
     ``drjit.opt.Adam`` evaluates all new values and moments at once, while the former ones and all
-    gradients are there: seven arrays of each parameter. Here moments come first, each is given the
-    memory of its predecessor, and gradients are cleared where they have been used: five arrays.
+    gradients are there: seven arrays of each parameter. Here large moments are overwritten, and
+    their gradients cleared when they have been used: five arrays. (On CUDA, memory is free for the
+    next kernel as soon as the last one that uses it is launched, and this is ``drjit.opt.Adam``.)
     """
+
+    def __init__(self, *arguments: Any, **settings: Any) -> None:
+        """For the arguments see ``drjit.opt.Adam``."""
+        super().__init__(*arguments, **settings)
+        self._moments: dict[str, _Moments] = {}
 
     def step(
         self,
@@ -44,37 +76,48 @@ class LeanAdam(Adam):
     ) -> None:
         """Take a step; for the arguments see ``drjit.opt.Adam.step``.
 
-        Clears the gradients of large arrays, and waits for the device where there are any. A step
-        that is scaled, masked or not evaluated is that of ``drjit.opt.Adam``.
+        Clears the gradients of large arrays. Waits for nothing, but in the first step after large
+        moments were assigned. A step that is scaled, masked or not evaluated, and one with more
+        than two moments, is that of ``drjit.opt.Adam``.
         """
-        if not eval or grad_scale is not None or active is not None or self.mask_updates:
+        is_plain = eval and grad_scale is None and active is None
+        if not is_plain or self.mask_updates or self.amsgrad:
             super().step(eval=eval, grad_scale=grad_scale, active=active)
             return
         rates = new_rate_cache()
-        successors = [self._replaced(key, rates) for key in self.state]
-        for arrays in successors:
-            if dr.width(arrays) >= LARGE:
-                for array in arrays:
-                    dr.eval(array)
-                    dr.sync_thread()  # memory is only free when the last kernel has read it
-        dr.eval(successors)
+        dr.eval([self._replaced(key, rates) for key in self.state])
+
+    def forget_moments(self) -> None:
+        """Let memory of moments go that are the parameters' no longer."""
+        self._moments.clear()
 
     def _replaced(self, key: str, rates: Any) -> list[Any]:
-        """Give a parameter its new state, not evaluated.
-
-        Returns its arrays in the order in which each makes a former one superfluous.
-        """
-        value, promoted, rate, extra = self.state[key]
-        flat, gradient = dr.detach(value).array, value.grad.array
+        """Give a parameter its new state, not evaluated, and return what is to be evaluated."""
+        value, promoted, rate, (count, *moments, _) = self.state[key]
+        is_large = dr.width(value) >= LARGE and dr.backend_v(value) == dr.JitBackend.LLVM
+        former = self._former(key, moments) if is_large else moments
         rate_in_use = self.lr if rate is None else rate
-        new, extra = self._step(rates, flat, gradient, rate_in_use, extra)
-        if dr.width(value) >= LARGE:
-            dr.clear_grad(value)
-        moments = [moment for moment in extra[1:] if moment is not None]
+        flat, gradient = dr.detach(value).array, value.grad.array
+        new, (count, *new_moments, _) = self._step(
+            rates, flat, gradient, rate_in_use, (count, *former, None)
+        )
         new_value = type(value)(new, value.shape) if dr.is_tensor_v(value) else type(value)(new)
         dr.enable_grad(new_value)
-        self.state[key] = new_value, promoted, rate, extra
-        return [*moments, new]
+        if not is_large:
+            self.state[key] = new_value, promoted, rate, (count, *new_moments, None)
+            return [*new_moments, new]
+        dr.clear_grad(value)
+        element = dr.arange(types_of(type(new)).UInt32, dr.width(new))
+        for moment, new_moment in zip(moments, new_moments, strict=True):
+            dr.scatter(moment, new_moment, element)
+        self.state[key] = new_value, promoted, rate, (count, *moments, None)
+        return [new]  # and by the same kernel the moments, which it reads
+
+    def _former(self, key: str, moments: list[Any]) -> list[Any]:
+        known = self._moments.get(key)
+        if known is None or not known.are(moments):
+            self._moments[key] = known = _Moments.of(moments)
+        return known.former
 
 
 def make_optimizer(
@@ -84,7 +127,7 @@ def make_optimizer(
     beta_1: float = 0.9,
     beta_2: float = 0.999,
     epsilon: float = 1e-15,
-) -> Adam:
+) -> LeanAdam:
     """Return an Adam optimizer (Kingma and Ba 2015) with a learning rate for each parameter.
 
     parameters: tensors by name, without the prefix; those of zero size are left out.
@@ -119,7 +162,7 @@ def num_rows(optimizer: Adam, prefix: str = "") -> int:
 
 
 def edit_rows(
-    optimizer: Adam, keep: Any, append: Mapping[str, Any] | None = None, prefix: str = ""
+    optimizer: LeanAdam, keep: Any, append: Mapping[str, Any] | None = None, prefix: str = ""
 ) -> None:
     """Keep some rows of every parameter, in the order given, and append new ones.
 
@@ -137,7 +180,7 @@ def edit_rows(
     added = _check_rows(optimizer, append, prefix)
     if dr.width(keep) + added == 0:
         raise ValueError("edit_rows(): at least one row must remain, but none is kept or appended")
-
+    optimizer.forget_moments()
     for name in _names(optimizer, prefix):
         value, promoted, rate, (step, *moments) = optimizer.state[prefix + name]
         row_shape = tuple(value.shape[1:])

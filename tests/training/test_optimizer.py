@@ -10,6 +10,7 @@ from drjit.opt import Adam
 
 from drgs.core.private import clear_memory_peak, memory_peak
 from drgs.gaussians.parameters import PARAMETER_NAMES
+from drgs.training import optimizer as optimizer_module
 from drgs.training.optimizer import (
     LARGE,
     edit_rows,
@@ -99,6 +100,41 @@ def test_steps_are_those_of_adam_and_use_large_gradients_up():
             np.testing.assert_array_equal(array, other)
     left = {key for key, value in former.items() if np.any(np.array(dr.grad(value)))}
     assert left == set(ours) - {PREFIX + "shN"}
+
+
+def test_moments_that_are_overwritten_are_those_that_are_not(monkeypatch):
+    """Also after they were assigned, and while somebody else holds them."""
+    num, key = 25_000, PREFIX + "shN"
+    results = []
+    for large in (LARGE, 1 << 40):
+        monkeypatch.setattr(optimizer_module, "LARGE", large)
+        optimizer = make_optimizer(parameters(num), RATES, PREFIX)
+        step(optimizer, 0, np.arange(num) % 100)
+        edit_rows(optimizer, dr.arange(UInt32, num) ^ 1, parameters(7), PREFIX)
+        step(optimizer, 1, np.arange(num + 7) % 100)
+        held = Float(optimizer.state[key][3][1])
+        at_the_time = np.array(held)
+        step(optimizer, 2, np.arange(num + 7) % 100)
+        np.testing.assert_array_equal(np.array(held), at_the_time)
+        replace_values(optimizer, "shN", optimizer[key] + 1, PREFIX)
+        step(optimizer, 3, np.arange(num + 7) % 100)
+        results.append(snapshot(optimizer))
+    for key, arrays in results[0].items():
+        for array, other in zip(arrays, results[1][key], strict=True):
+            np.testing.assert_array_equal(array, other)
+
+
+def test_a_step_waits_for_nothing(monkeypatch):
+    """Once it has large moments, it asks for no memory of theirs again."""
+    optimizer = make_optimizer(parameters(25_000), RATES, PREFIX)
+    asked = []
+    original = optimizer_module.same_memory
+    monkeypatch.setattr(
+        optimizer_module, "same_memory", lambda array: asked.append(0) or original(array)
+    )
+    for seed in range(3):
+        step(optimizer, seed, np.arange(25_000) % 100)
+        assert len(asked) == 2
 
 
 def test_a_step_takes_two_blocks_of_harmonics_less_than_that_of_adam():

@@ -16,11 +16,17 @@ from typing import Any, Protocol
 
 import drjit as dr
 import numpy as np
-from drjit.opt import Adam
 
 from drgs.core.arrays import from_host, types_of
 from drgs.gaussians.quaternions import quat_to_rotation
-from drgs.training.optimizer import edit_rows, num_rows, replace_values, set_values, take_rows
+from drgs.training.optimizer import (
+    LeanAdam,
+    edit_rows,
+    num_rows,
+    replace_values,
+    set_values,
+    take_rows,
+)
 
 
 @dataclass(frozen=True)
@@ -71,7 +77,7 @@ class Population:
     that Adam keeps of them. Everything is detached.
     """
 
-    optimizer: Adam
+    optimizer: LeanAdam
     prefix: str  # what precedes a parameter's name in the optimizer
     extent: float  # of the scene, world units
     seed: int
