@@ -48,7 +48,7 @@ class StageClock:
     """Milliseconds of kernels by stage, and the kernels."""
 
     kernel_ms: dict[str, float] = field(default_factory=dict)
-    launches: dict[str, list[Launch]] = field(default_factory=dict)
+    launches: list[tuple[str, Launch]] = field(default_factory=list)  # stages, as they went
     compiled: int = 0  # kernels that were not in a cache
     host_ms: float = 0.0  # of the stages, in which no kernel ran
     started: float = field(default_factory=time.perf_counter)
@@ -62,7 +62,7 @@ class StageClock:
             not kernel["cache_hit"] for kernel in kernels if kernel["type"] == dr.KernelType.JIT
         )
         found = _launches(kernels)
-        self.launches.setdefault(stage, []).extend(found)
+        self.launches.extend((stage, launch) for launch in found)
         spent = sum(launch.milliseconds for launch in found)
         self.kernel_ms[stage] = self.kernel_ms.get(stage, 0.0) + spent
         self.host_ms += passed - spent
@@ -153,12 +153,11 @@ def counted_launches(
         computation()
     trips = iter(counted.take())
     found: dict[str, list[CountedLaunch]] = {}
-    for stage in STAGES:
-        for launch in launches.get(stage, []):
-            loops = len(accesses_of(launch.ir).in_loops) if launch.ir else 0
-            found.setdefault(stage, []).append(
-                CountedLaunch(launch, [_of_size(next(trips), launch) for _ in range(loops)])
-            )
+    for stage, launch in launches:
+        loops = len(accesses_of(launch.ir).in_loops) if launch.ir else 0
+        found.setdefault(stage, []).append(
+            CountedLaunch(launch, [_of_size(next(trips), launch) for _ in range(loops)])
+        )
     assert next(trips, None) is None, "a loop that no kernel has"
     return found
 
