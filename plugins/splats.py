@@ -25,6 +25,7 @@ from drgs.integrator.picture import Picture, sensors_of
 from drgs.integrator.properties import (
     AOVS,
     KNOWN,
+    LIGHT_SAMPLES,
     aovs_of,
     approximations_of,
     background_of,
@@ -34,6 +35,7 @@ from drgs.integrator.properties import (
     degree_of,
     ignored_effects,
     integer,
+    light_of,
     load_gaussians,
     nested_integrator,
     positive,
@@ -115,12 +117,29 @@ class SplatsIntegrator(mi.CppADIntegrator):
        - :paramtype:`integrator`
        - Renders the scene's meshes and other surfaces, if it has any, between which the splats
          are composited by depth. Its ``hide_emitters`` should be that of this integrator.
-         (Default: ``path``)
+         (Default: ``path``; where ``light`` is not ``none``, ``splatpath``)
        - |exposed|, |differentiable|
 
      * - nested_spp
        - |int|
        - Samples per pixel of the nested integrator. (Default: as many as of the splats)
+
+     * - light
+       - |string|
+       - How light passes between splats and surfaces. ``none``: not at all. ``rays``: the rays of
+         the nested integrator, which must be ``splatpath``, pass the splats from the first surface
+         on: surfaces reflect them, show them bent, take on their colours, and lie in their shadow.
+         (Default: ``none``)
+
+     * - light_samples
+       - |int|
+       - Splats that a ray draws, of those that it passes, where ``light`` is ``rays``; 0: it
+         composites all. (Default: 4)
+
+     * - exposure
+       - |float|
+       - Radiance of a splat whose colour is 1, where surfaces see it: what scales splats against
+         lamps. (Default: 1)
 
      * - near
        - |float|
@@ -218,8 +237,8 @@ class SplatsIntegrator(mi.CppADIntegrator):
     This integrator composites Gaussians front to back over each pixel (Kerbl et al. 2023, "3D
     Gaussian Splatting for Real-Time Radiance Field Rendering"). Meshes and other surfaces of the
     scene are rendered by a nested integrator; each pixel composites what that shows at the depth of
-    the first surface, between the splats. Light does not pass from one to the other. A scene
-    without surfaces runs no nested integrator.
+    the first surface, between the splats. Light passes from one to the other where ``light`` says
+    so; splats are not shaded by surfaces. A scene without surfaces runs no nested integrator.
 
     With one sample per pixel and a ``box`` filter, each pixel is evaluated at its centre, and both
     the picture and the gradients are the same to the last bit in every run. With more samples or
@@ -242,7 +261,8 @@ class SplatsIntegrator(mi.CppADIntegrator):
     one rendering to the next.
 
     .. note:: Not differentiated: visibility, the order of the splats, the cut-offs of alpha and
-        transmittance; the depth and the silhouette of surfaces. Derivatives with respect to a
+        transmittance; the depth and the silhouette of surfaces. Among surfaces that show splats
+        (see ``light``), derivatives with respect to Gaussians are refused. Those with respect to a
         sensor's pose, focal lengths and principal point are computed where they are enabled, though
         Mitsuba's own sensors announce theirs as not differentiable.
 
@@ -289,6 +309,9 @@ class SplatsIntegrator(mi.CppADIntegrator):
         self.srgb_primitives = boolean(props, "srgb_primitives", True)
         self.nested = nested_integrator(props)
         self.nested_spp = integer(props, "nested_spp", 0, least=0)
+        self.light = light_of(props, self.nested)
+        self.exposure = positive(props, "exposure", 1.0)
+        self.light_samples = integer(props, "light_samples", LIGHT_SAMPLES, least=0)
         refuse_unknown(props, KNOWN)
         self._check_columns()
 
@@ -422,6 +445,8 @@ class SplatsIntegrator(mi.CppADIntegrator):
             settings["nested"] = self.nested.class_name()
         if self.nested_spp:
             settings["nested_spp"] = self.nested_spp
+        if self.light != "none":
+            settings["light"], settings["exposure"] = self.light, self.exposure
         if self.ignore:
             settings["ignore"] = ", ".join(self.ignore)
         lines = ",\n".join(f"  {name} = {value}" for name, value in settings.items())
@@ -467,6 +492,7 @@ class SplatsIntegrator(mi.CppADIntegrator):
         :class:`LastBackward` in ``self.last``.
         """
         _refuse_recording()
+        self._refuse_reflected(scene)
         sensor = _resolve_sensor(scene, sensor)
         with self._lock, dr.suspend_grad():
             self._gather(scene)
@@ -496,6 +522,7 @@ class SplatsIntegrator(mi.CppADIntegrator):
     ) -> mi.TensorXf:
         """Directional derivative of the image along the gradients set on the parameters."""
         _refuse_recording()
+        self._refuse_reflected(scene)
         sensor = _resolve_sensor(scene, sensor)
         with self._lock, dr.suspend_grad():
             self._gather(scene)
@@ -510,6 +537,20 @@ class SplatsIntegrator(mi.CppADIntegrator):
             d_image = Picture.of(self, scene, sensor, seed, spp).tangent(params, tangents)
             sensor.film().clear()  # it holds an attached block
         return d_image
+
+    def _refuse_reflected(self, scene: mi.Scene) -> None:
+        """Derivatives of Gaussians that surfaces show: the nested integrator leaves them out."""
+        shapes = scene.shapes()
+        surfaces = [shape for shape in shapes if not shape.is_ellipsoids()]
+        if self.light == "none" or not surfaces:
+            return
+        gaussians = [vars(self._own), *(mi.traverse(s) for s in shapes if s.is_ellipsoids())]
+        if any(dr.grad_enabled(value) for of in gaussians for _, value in of.items()):
+            raise UnsupportedError(
+                f"splats: with light '{self.light}' and surfaces, the Gaussians are not "
+                "differentiated, as surfaces show them, too; detach their parameters, or set light "
+                "to 'none'"
+            )
 
     def sample(
         self, *, scene: mi.Scene, sampler: mi.Sampler, ray: Any, active: Any, **others: Any

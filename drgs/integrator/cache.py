@@ -68,6 +68,7 @@ class Memory:
     rendered: dict[int, Rendered] = field(default_factory=dict)
     traced: dict[int, TracedSurfaces] = field(default_factory=dict)
     surfaces: Any = None  # drgs.integrator.surfaces.Surfaces of the last scene that had some
+    light: Any = None  # drgs.integrator.light.LightOfSplats of the last scene that asked for it
     film_maps: dict[str, np.ndarray] = field(default_factory=dict)  # see drgs.integrator.film
 
     def forget_view(self, index: int) -> None:

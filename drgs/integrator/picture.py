@@ -172,7 +172,12 @@ def hybrid_of(
 
     memory, hide_emitters = integrator.memory, integrator.hide_emitters
     surfaces = memory.surfaces = Surfaces.of(scene, memory.surfaces)
-    nested = integrator.nested or mi.load_dict({"type": "path", "hide_emitters": hide_emitters})
+    if integrator.light == "none":
+        nested = integrator.nested or mi.load_dict({"type": "path", "hide_emitters": hide_emitters})
+    else:
+        from drgs.integrator.light import lit
+
+        nested = lit(integrator.nested, integrator)
     insertion = Insertion(
         sensor.film(),
         memory.film_maps,

@@ -22,6 +22,7 @@ from drgs.core.constants import MAX_INT
 from drgs.core.errors import PluginError, PluginTypeError, did_you_mean
 from drgs.effects.compose import IGNORABLE
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
+from drgs.integrator.settings import LitIntegrator
 
 if TYPE_CHECKING:  # imported where the ``to_world`` of shapes is given
     from drgs.integrator.ellipsoids import Turn
@@ -38,10 +39,41 @@ SHAPES_TO_WORLD = "shapes_to_world"
 
 KNOWN = (
     *("filename", "to_world", SHAPES_TO_WORLD, "sh_degree", "background", "hide_emitters", "near"),
-    *("srgb_primitives", "nested_spp", "aovs", "ignore", *DECLARED, "smoothing", *PARAMETER_NAMES),
+    *(
+        "srgb_primitives",
+        "nested_spp",
+        "light",
+        "light_samples",
+        "exposure",
+        "aovs",
+        "ignore",
+        "smoothing",
+    ),
+    *DECLARED,
+    *PARAMETER_NAMES,
 )
 """Names of the properties of ``splats``, but for those that begin with :data:`FEATURE` or
 :data:`SHAPES_TO_WORLD`, and nested objects."""
+
+
+LIGHT_SAMPLES = 4
+"""Splats that a ray of ``light: rays`` draws."""
+
+LIGHTS = ("none", "rays")
+"""How light passes between splats and surfaces."""
+
+
+def light_of(props: mi.Properties, nested: mi.Integrator | None) -> str:
+    """How light passes between splats and surfaces, of :data:`LIGHTS`."""
+    light = props.get("light", LIGHTS[0])
+    if light not in LIGHTS:
+        raise PluginError(f"splats: light must be one of {', '.join(LIGHTS)}, got {light!r}")
+    if light != LIGHTS[0] and nested is not None and not isinstance(nested, LitIntegrator):
+        raise PluginError(
+            f"splats: with light '{light}', the nested integrator must be splatpath, got "
+            f"{nested.class_name()}; it takes max_depth, rr_depth and hide_emitters as path does"
+        )
+    return light
 
 
 def refuse_unknown(props: mi.Properties, known: Sequence[str]) -> None:

@@ -32,6 +32,9 @@ class SplatsSettings(Protocol):
     aovs: dict[str, str]  # what is put out besides colour: kinds by name
     nested: mi.Integrator | None  # of surfaces
     nested_spp: int  # 0: as many as of the splats
+    light: str  # how light passes between splats and surfaces: see drgs.integrator.properties
+    light_samples: int  # splats that a ray draws; 0: it composites all
+    exposure: float  # factor of the splats' radiance, where surfaces see it
     memory: Memory
 
     @property
@@ -47,6 +50,13 @@ class SplatsSettings(Protocol):
 
     def channels_of(self, kind: str) -> Sequence[int | str]:
         """What comes behind the dot in the names of an AOV's channels."""
+
+
+@runtime_checkable
+class LitIntegrator(Protocol):
+    """An integrator whose rays pass splats, as ``splatpath`` does."""
+
+    light: Any  # drgs.integrator.light.LightOfSplats, once it is rendered; None before
 
 
 @runtime_checkable

@@ -11,7 +11,7 @@ from conftest import REPOSITORY
 
 GROUND = {"core"}
 METHOD = {"gaussians", "cameras", *GROUND}
-INTEGRATOR = {"accuracy", "effects", "splatting", "data", "io", "config", *METHOD}
+INTEGRATOR = {"accuracy", "effects", "light", "splatting", "data", "io", "config", *METHOD}
 TRAINING = {"results", "integrator", *INTEGRATOR}
 
 MAY_IMPORT = {
@@ -25,6 +25,7 @@ MAY_IMPORT = {
     "io": GROUND,
     "accuracy": {"splatting", "config", *METHOD},
     "effects": {"splatting", "config", *METHOD},
+    "light": {"splatting", "config", *METHOD},
     "data": {"io", "config", *METHOD},
     "integrator": INTEGRATOR,
     "results": {"integrator", "data", "io", "config", *METHOD},

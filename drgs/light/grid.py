@@ -1,0 +1,296 @@
+"""Where a ray finds the Gaussians whose peaks lie on it: nested grids of cells.
+
+A cube around most of the Gaussians is cut into R^3 cells, and so is one twice as wide around it,
+and another one, until all are inside: far away, where there is little, cells are large. A point
+belongs to the cell of the smallest cube that it is in. Each cell has a list of the Gaussians that
+reach into it. As a ray meets a Gaussian at one point, the peak, it finds it in the list of the cell
+that this point is in, once, and those in cells that come later are behind it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import numpy as np
+
+from drgs.core.arrays import from_host, types_of
+from drgs.splatting.tiles import lower_bounds
+
+CELLS_PER_GAUSSIAN = 2.0
+"""Of the innermost cube. With more, lists are shorter, and a ray passes more cells."""
+
+RESOLUTIONS = (8, 128)
+"""Least and most cells along an edge. All are multiples of 4: the middle half is a finer cube."""
+
+INNERMOST = 0.9
+"""Part of the means that is in the innermost cube."""
+
+MOST_LEVELS = 24
+"""Cubes; what is farther out than 2^23 times the innermost one's size is in no list."""
+
+MOST_ENTRIES = 32
+"""For each Gaussian, and :data:`FREE_ENTRIES` more: cells become larger until there are no more."""
+
+FREE_ENTRIES = 1 << 20
+
+MARGIN = 1 / 64
+"""Parts of a cell by which Gaussians reach into it from outside: far more than rounding moves a
+ray, and than :data:`STEP`."""
+
+STEP = 1 / 1024
+"""Parts of a cell by which a ray looks ahead for the cell that it is in."""
+
+
+@dataclass(frozen=True)
+class Ellipsoids:
+    """Where N Gaussians show."""
+
+    centers: Any  # Array3f, world
+    axes: list[Any]  # three Array3f, world: principal half axes, as far as the Gaussian shows
+    exist: Any  # Bool
+
+    def half_sizes(self) -> Any:
+        """Array3f: of the boxes around them."""
+        return dr.sqrt(sum((dr.square(axis) for axis in self.axes[1:]), dr.square(self.axes[0])))
+
+
+@dataclass(frozen=True)
+class Cell:
+    """Where rays are, one a lane."""
+
+    first: Any  # UInt32: first entry of its list
+    last: Any  # UInt32: one behind the last
+    exit: Any  # Float: where the ray leaves it, or empty ones around it; at least a step ahead
+
+
+@dataclass(frozen=True)
+class SplatGrid:
+    """Lists of Gaussians by cell."""
+
+    center: Any  # Array3f (1,), world
+    size: Any  # Float (1,): half the innermost cube's edge, world units
+    num_levels: Any  # UInt32 (1,)
+    resolution: Any  # UInt32 (1,): R
+    cells: Any  # UInt32 (2 cells,): number of entries, the first of them; or 0, cells to pass over
+    rows: Any  # UInt32 (entries,): Gaussians
+
+    @property
+    def reach(self) -> Any:
+        """Float (1,): half the outermost cube's edge, world units."""
+        Float = type(self.size)
+        return self.size * dr.exp2(Float(self.num_levels) - 1)
+
+    def span(self, origin: Any, direction: Any) -> tuple[Any, Any]:
+        """Where rays enter and leave the outermost cube; the first is larger where they miss it."""
+        first, last = -dr.inf, dr.inf
+        for o, d, c in zip(origin, direction, self.center, strict=True):
+            inverse = 1 / d
+            a, b = (c - self.reach - o) * inverse, (c + self.reach - o) * inverse
+            # Parallel to a side: 0 / 0 on it, which is not a number, and no bound.
+            low, high = dr.select(a < b, a, b), dr.select(a < b, b, a)
+            first = dr.select(low > first, low, first)
+            last = dr.select(high < last, high, last)
+        return first, last
+
+    def cell(self, origin: Any, direction: Any, t: Any) -> Cell:
+        """The cell that rays enter at t."""
+        t_ = types_of(type(self.size))
+        count = t_.Float(self.resolution)
+        distance = self._distance(origin + direction * t)
+        ahead = t + STEP * self._cell_size(dr.select(distance > 1, distance, 1))
+        point = origin + direction * ahead
+        level, edges = self._cube(self._distance(point))
+        half = self.size * edges
+        index, places = level, []
+        for k in (2, 1, 0):
+            place = dr.floor((point[k] - self.center[k] + half) / half * (0.5 * count))
+            place = dr.select(place > 0, place, 0)
+            place = dr.select(place < count, place, count - 1)
+            index = index * self.resolution + t_.UInt32(place)
+            places.insert(0, place)
+        number, first = dr.gather(t_.Array2u, self.cells, index)
+        # Of an empty cell: how many cells there are to the next list, in any direction.
+        free = t_.Float(dr.select(number == 0, first, 1))
+        leaves = t_.Float(dr.inf)
+        for k, place in enumerate(places):
+            side = dr.select(direction[k] > 0, place + free, place + 1 - free)
+            side = dr.select(side > 0, dr.select(side < count, side, count), 0)
+            until = ((side * (2 / count) - 1) * half + (self.center[k] - origin[k])) / direction[k]
+            leaves = dr.select(until < leaves, until, leaves)
+        return Cell(first, first + number, dr.select(leaves > ahead, leaves, ahead))
+
+    def _cube(self, distance: Any) -> tuple[Any, Any]:
+        """The smallest cube that a point is in: its number, and its size in innermost ones."""
+        Single = dr.float32_array_t(type(distance))
+        # A number from 2^k to 2^(k + 1) has k + 127 above its 23 bits of mantissa.
+        exponent = dr.reinterpret_array(dr.uint32_array_t(Single), Single(distance)) >> 23
+        level = dr.select(exponent > 126, exponent - 126, 0)
+        level = dr.select(level < self.num_levels, level, self.num_levels - 1)
+        return level, type(distance)(dr.reinterpret_array(Single, (level + 127) << 23))
+
+    def _distance(self, point: Any) -> Any:
+        """From the centre, as cubes go, in half edges of the innermost one."""
+        return dr.max(dr.abs(point - self.center)) / self.size
+
+    def _cell_size(self, distance: Any) -> Any:
+        """World units, of the cells there: half of it, to all of it."""
+        return self.size * distance * 2 / type(self.size)(self.resolution)
+
+
+def build_grid(ellipsoids: Ellipsoids) -> SplatGrid:
+    """The lists of all cells. The host waits for the device."""
+    shown = np.array(ellipsoids.exist)
+    centers = np.array(ellipsoids.centers, np.float64)[:, shown]
+    sizes = np.array(ellipsoids.half_sizes(), np.float64)[:, shown]
+    center = np.median(centers, axis=1) if shown.any() else np.zeros(3)
+    distances = np.abs(centers - center[:, None]).max(axis=0)
+    size = np.quantile(distances, INNERMOST) if shown.any() else 1.0
+    farthest = (np.abs(centers - center[:, None]) + sizes).max(initial=0.0)
+    size = max(size, farthest / 2 ** (MOST_LEVELS - 1), np.finfo(np.float32).tiny)
+    # Two cells of a cube with all Gaussians are empty on either side: nothing is at the border.
+    levels = max(1, 1 + int(np.ceil(np.log2(max(1.05 * farthest / size, 1)))))
+    least, most = RESOLUTIONS
+    wanted = (CELLS_PER_GAUSSIAN * max(1, shown.sum())) ** (1 / 3)
+    resolution = 4 * int(np.clip(round(wanted / 4), least // 4, most // 4))
+    affordable = MOST_ENTRIES * len(shown) + FREE_ENTRIES
+    boxes = _Boxes(ellipsoids, center, size)
+    while (
+        resolution > least
+        and sum(boxes.count(level, resolution) for level in range(levels)) > affordable
+    ):
+        resolution -= 4
+    return boxes.grid(levels, resolution)
+
+
+@dataclass(frozen=True)
+class _Boxes:
+    """Makes entries of ellipsoids in cells."""
+
+    ellipsoids: Ellipsoids
+    center: np.ndarray
+    size: float
+
+    def count(self, level: int, resolution: int) -> int:
+        """Cells of a level that are in boxes around the ellipsoids."""
+        return int(dr.sum(dr.prod(self._ranges(level, resolution)[1]))[0])
+
+    def grid(self, levels: int, resolution: int) -> SplatGrid:
+        """Sorted by cell, and in a cell by Gaussian."""
+        Float = type(self.ellipsoids.centers.x)
+        t = types_of(Float)
+        made = [self._entries(level, resolution) for level in range(levels)]
+        rows, cells = (dr.concat([each[k] for each in made]) for k in (0, 1))
+        num_cells, count = levels * resolution**3, dr.width(rows)
+        order = dr.argsort(cells)
+        rows, cells = (dr.gather(t.UInt32, column, order) for column in (rows, cells))
+        starts = np.array(lower_bounds(cells, count, num_cells)).astype(np.int64)
+        grid = SplatGrid(
+            t.Array3f(*(dr.opaque(Float, float(c)) for c in self.center)),
+            dr.opaque(Float, float(self.size)),
+            dr.opaque(t.UInt32, levels),
+            dr.opaque(t.UInt32, resolution),
+            from_host(t.UInt32, _cells(starts, levels, resolution)),
+            rows,
+        )
+        dr.eval(grid)
+        return grid
+
+    def _ranges(self, level: int, resolution: int) -> tuple[Any, Any]:
+        """First cell and number of cells along each axis, of the boxes around the ellipsoids."""
+        Float = type(self.ellipsoids.centers.x)
+        t = types_of(Float)
+        half = dr.opaque(Float, float(self.size * 2.0**level))
+        count = dr.opaque(Float, resolution)
+        sizes = self.ellipsoids.half_sizes()
+        first, number = [], []
+        for k in range(3):
+            offset = self.ellipsoids.centers[k] - dr.opaque(Float, float(self.center[k]))
+            low, high = (
+                dr.floor((offset + sign * sizes[k] + half) / half * (0.5 * count) + sign * MARGIN)
+                for sign in (-1, 1)
+            )
+            misses = ~((high >= 0) & (low < count)) | ~self.ellipsoids.exist
+            low = dr.select(low > 0, low, 0)
+            high = dr.select(high < count - 1, high, count - 1)
+            first.append(t.UInt32(dr.select(misses, 0, low)))
+            number.append(t.UInt32(dr.select(misses, 0, high - low + 1)))
+        Array3u = dr.uint32_array_t(t.Array3f)
+        return Array3u(first), Array3u(number)
+
+    def _entries(self, level: int, resolution: int) -> tuple[Any, Any]:
+        """Rows and cells of a level, in the order of the rows, of what is in both."""
+        Float = type(self.ellipsoids.centers.x)
+        t = types_of(Float)
+        first, number = self._ranges(level, resolution)
+        counts = dr.prod(number)
+        row, local = _expanded(counts)
+        if dr.width(row) == 0:
+            return t.UInt32(), t.UInt32()
+        nx, ny = (dr.gather(t.UInt32, number[k], row) for k in (0, 1))
+        # Exact in double precision; an integer division has no vector instruction.
+        line = t.UInt32((dr.float64_array_t(t.UInt32)(local) + 0.5) / nx)
+        layer = t.UInt32((dr.float64_array_t(t.UInt32)(line) + 0.5) / ny)
+        place = (local - line * nx, line - layer * ny, layer)
+        place = [dr.gather(t.UInt32, first[k], row) + p for k, p in enumerate(place)]
+        keep = self._touches(place, row, level, resolution)
+        if level > 0:
+            within = [(p >= resolution // 4) & (p < 3 * resolution // 4) for p in place]
+            keep &= ~(within[0] & within[1] & within[2])
+        cell = t.UInt32(level)
+        for p in reversed(place):
+            cell = cell * resolution + p
+        kept = dr.compress(keep)
+        return dr.gather(t.UInt32, row, kept), dr.gather(t.UInt32, cell, kept)
+
+    def _touches(self, place: list[Any], row: Any, level: int, resolution: int) -> Any:
+        """Whether no principal axis of an ellipsoid tells it from a cell."""
+        Float = type(self.ellipsoids.centers.x)
+        t = types_of(Float)
+        cell = dr.opaque(Float, float(self.size * 2.0 ** (level + 1) / resolution))
+        middle = t.Array3f([t.Float(p) + 0.5 - resolution / 2 for p in place]) * cell
+        middle += t.Array3f(*(dr.opaque(Float, float(c)) for c in self.center))
+        offset = middle - dr.gather(t.Array3f, self.ellipsoids.centers, row)
+        touches = True
+        for axis in self.ellipsoids.axes:
+            direction = dr.gather(t.Array3f, axis, row)
+            # Along the axis, times its length: how far the cell reaches, and the ellipsoid.
+            of_cell = dr.sum(dr.abs(direction)) * cell * (0.5 + MARGIN)
+            distance = dr.abs(dr.dot(direction, offset))
+            touches &= distance <= of_cell + dr.squared_norm(direction)
+        return touches
+
+
+def _expanded(counts: Any) -> tuple[Any, Any]:
+    """For each of ``counts[row]`` items of each row: the row, and the item's number in it."""
+    UInt32 = type(counts)
+    size = dr.width(counts)
+    row = dr.arange(UInt32, size)
+    ends = dr.cumsum(counts)
+    total = int(ends[size - 1])
+    if total == 0:
+        return UInt32(), UInt32()
+    starts = ends - counts
+    marks = dr.zeros(UInt32, total)
+    dr.scatter(marks, row, starts, counts > 0)
+    rows = dr.prefix_reduce(dr.ReduceOp.Max, marks, exclusive=False)
+    return rows, dr.arange(UInt32, total) - dr.gather(UInt32, starts, rows)
+
+
+def _cells(starts: np.ndarray, levels: int, resolution: int) -> np.ndarray:
+    """What :attr:`SplatGrid.cells` has; starts: (cells + 1,) first entry of each."""
+    from scipy.ndimage import distance_transform_cdt
+
+    shape = (levels, *(resolution,) * 3)
+    number, first = np.diff(starts).reshape(shape), starts[:-1].reshape(shape).copy()
+    middle = slice(resolution // 4, 3 * resolution // 4)
+    for level in range(levels):
+        occupied = number[level] > 0
+        if level > 0:
+            occupied[middle, middle, middle] = True  # by finer cells
+        distance = distance_transform_cdt(~occupied, metric="chessboard")
+        distance[distance < 0] = resolution  # there is nothing at all
+        empty = number[level] == 0
+        first[level][empty] = np.maximum(distance[empty], 1)
+    return np.stack([number.ravel(), first.ravel()], axis=1)

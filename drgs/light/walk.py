@@ -1,0 +1,412 @@
+"""What a ray passes of the splats: their light, and what they let through of the light behind them.
+
+A ray o + t d, with d of unit length, meets a Gaussian at its peak (Moenne-Loccoz et al. 2024, "3D
+Gaussian Ray Tracing", section 4): with o' = W (o - m) and d' = W d in the coordinates in which it
+is the unit Gaussian,
+
+    t = -(o' . d') / |d'|^2,   alpha = min(alpha_max, opacity exp(-|o' + t d'|^2 / 2)).
+
+A segment 0 < t < far composites the Gaussians whose peaks lie on it, in the order of their peaks,
+with the cut-offs of the pipeline and colours seen along the ray. Rays find them in a grid
+(:mod:`drgs.light.grid`). In a cell, a ray reads the list and keeps the :data:`WINDOW` nearest peaks
+that it has not composited yet, composites them, and, if there were more, reads the list again: the
+order is exact however many there are.
+
+Nothing here is differentiated.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Any
+
+import drjit as dr
+
+from drgs.core.arrays import Rows, types_of
+from drgs.core.constants import COLOR_MIN
+from drgs.gaussians.quaternions import quat_to_rotation
+from drgs.gaussians.sh import num_coefficients, sh_basis
+from drgs.light.grid import Ellipsoids, SplatGrid, build_grid
+from drgs.splatting.cutoffs import Cutoffs
+from drgs.splatting.projection import GaussianRows
+from drgs.splatting.rasterize import composite_step
+
+WINDOW = 8
+"""Peaks that a ray keeps before it composites them."""
+
+TURNS = 16
+"""Entries of a list, after which a ray lets others of its vector find their next cell."""
+
+_SHAPE = 13
+"""Numbers of a record: mean, rows of W, base-2 logarithm of the opacity."""
+
+
+@dataclass(frozen=True)
+class Segment:
+    """Rays from where they start to where they end."""
+
+    origin: Any  # Array3f, world
+    direction: Any  # Array3f, unit
+    far: Any  # Float, world units
+    active: Any  # Bool
+
+
+@dataclass(frozen=True)
+class Passed:
+    """What segments pass."""
+
+    color: Any  # Array3f, display space: sum of w_i c_i
+    transmittance: Any  # Float
+
+
+@dataclass(frozen=True)
+class Sampled:
+    """One splat that segments show."""
+
+    color: Any  # Array3f, display space
+    exists: Any  # Bool: else they pass all
+
+
+@dataclass(frozen=True)
+class RaySplats:
+    """Gaussians as rays meet them."""
+
+    shapes: Rows  # by Gaussian: see _SHAPE
+    colors: Rows  # by Gaussian: coefficients of the harmonics, three colours each
+    grid: SplatGrid
+    sh_degree: int
+    cutoffs: Cutoffs
+
+    @staticmethod
+    def of(rows: GaussianRows, sh_degree: int, cutoffs: Cutoffs) -> RaySplats:
+        """Copy the Gaussians, and sort them into a grid. Waits for the device.
+
+        rows: detached, as a pipeline has them. Those that are not finite do not exist.
+        """
+        t = types_of(type(rows.logit_opacities))
+        rotation, scales = quat_to_rotation(rows.quats), dr.exp(rows.log_scales)
+        opacity = 1 / (1 + dr.exp(-rows.logit_opacities))
+        if rows.dimming is not None:
+            opacity = opacity * rows.dimming
+        log2_opacity = dr.log2(opacity)
+        exponent = log2_opacity - cutoffs.log2_floor(log2_opacity)
+        reach = dr.sqrt(2 * math.log(2) * dr.select(exponent > 0, exponent, 0))
+        axes = [t.Array3f([rotation[row, column] for row in range(3)]) for column in range(3)]
+        whitening = [axis / scale for axis, scale in zip(axes, scales, strict=True)]
+        numbers = [*rows.means, *(value for row in whitening for value in row), log2_opacity]
+        sh = [value for coefficient in rows.sh for value in coefficient]
+        half_axes = [axis * (scale * reach) for axis, scale in zip(axes, scales, strict=True)]
+        total = sum([*numbers, *sh, *(value for axis in half_axes for value in axis)], t.Float(0))
+        exists = (exponent > 0) & dr.isfinite(total)
+        shapes = Rows.of([*numbers, *[t.Float(0)] * (16 - _SHAPE)])
+        colors = Rows.of(sh)
+        ellipsoids = Ellipsoids(t.Array3f(rows.means), half_axes, exists)
+        dr.eval(shapes, colors, ellipsoids)
+        return RaySplats(shapes, colors, build_grid(ellipsoids), sh_degree, cutoffs)
+
+    def passed(self, segment: Segment) -> Passed:
+        """Colour and transmittance of segments."""
+        walk = _Walk.along(self, segment)
+        t = types_of(self.shapes.Float)
+        basis = sh_basis(walk.direction, self.sh_degree)
+
+        def body(at: _Place, last: list, T: Any, color: list) -> tuple:
+            at, window, overflows = walk.nearest(at, last, T)
+            T, color, last = walk.composite(window, basis, T, color)
+            # What did not fit comes behind what was composited, and is in the same list.
+            last = [dr.select(overflows, last[0], -dr.inf), last[1]]
+            return at.back(overflows), last, T, color
+
+        size = dr.width(walk.origin)
+        _, _, T, color = dr.while_loop(
+            state=(
+                _Place.first_of(dr.zeros(t.Float, size)),
+                [dr.full(t.Float, -dr.inf, size), dr.zeros(t.UInt32, size)],
+                dr.select(segment.active, t.Float(1), -1),
+                [dr.zeros(t.Float, size) for _ in range(3)],
+            ),
+            cond=lambda at, last, T, color: (T > 0) & walk.goes_on(at),
+            body=body,
+        )
+        return Passed(t.Array3f(color), dr.abs(T))
+
+    def sampled(self, segment: Segment, seed: Any, count: int) -> list[Sampled]:
+        """``count`` splats that segments show, each chosen with its weight.
+
+        A splat lets light pass with the probability 1 - alpha; what is chosen is the first that
+        does not (Enderton et al. 2010, "Stochastic Transparency"; Sun et al. 2025, "Stochastic Ray
+        Tracing of Transparent 3D Gaussians"): with the probability w_i, and nothing with T. Splats
+        need no order for that. seed: UInt32, of each ray; the choices of a ray are independent.
+        """
+        walk = _Walk.along(self, segment)
+        t = types_of(self.shapes.Float)
+
+        def choose(at: _Place, chosen: list) -> tuple:
+            at, row, peak, log2_alpha = walk.next(at)
+            alpha = walk.alpha(log2_alpha)
+            draws = _uniform(row, seed, count)
+            pairs = [
+                (is_nearer, row_, peak_)
+                for (row_, peak_), u in zip(chosen, draws, strict=True)
+                for is_nearer in [(u < alpha) & (peak < peak_)]
+            ]
+            return at, [[dr.select(n, row, r), dr.select(n, peak, p)] for n, r, p in pairs]
+
+        def body(at: _Place, chosen: list) -> tuple:
+            return dr.while_loop(
+                state=(walk.find(at), chosen),
+                cond=lambda at, chosen: at.has_entry(),
+                body=choose,
+            )
+
+        def goes_on(at: _Place, chosen: list) -> Any:
+            # Cells that come later are behind what was chosen in this one.
+            farthest = chosen[0][1]
+            for _, peak in chosen[1:]:
+                farthest = dr.select(peak > farthest, peak, farthest)
+            more = (at.entry < at.last) | ((farthest == dr.inf) & (at.end < walk.stop))
+            return segment.active & more
+
+        size = dr.width(walk.origin)
+        _, chosen = dr.while_loop(
+            state=(
+                _Place.first_of(dr.zeros(t.Float, size)),
+                [[dr.zeros(t.UInt32, size), dr.full(t.Float, dr.inf, size)] for _ in range(count)],
+            ),
+            cond=goes_on,
+            body=body,
+        )
+        basis = sh_basis(walk.direction, self.sh_degree)
+        return [
+            Sampled(t.Array3f(self._color(row, basis, peak < dr.inf)), peak < dr.inf)
+            for row, peak in chosen
+        ]
+
+    def _color(self, row: Any, basis: list[Any], active: Any) -> list[Any]:
+        """Display space, seen along rays."""
+        t = types_of(self.shapes.Float)
+        numbers = self.colors.load(row, active)[: 3 * num_coefficients(self.sh_degree)]
+        color = []
+        for k in range(3):
+            value = t.Float(0.5)
+            for function, coefficient in zip(basis, numbers[k::3], strict=True):
+                value = dr.fma(coefficient, function, value)
+            color.append(dr.select(value > COLOR_MIN, value, COLOR_MIN))
+        return color
+
+    def transmittance(self, segment: Segment, least: Any) -> Any:
+        """Float: what all Gaussians of a segment let through, whichever comes first.
+
+        least: Float; where it is less, it is anything that is less.
+        """
+        walk = _Walk.along(self, segment)
+        t = types_of(self.shapes.Float)
+
+        def weaken(at: _Place, T: Any) -> tuple:
+            at, _, _, log2_alpha = walk.next(at)
+            return at, dr.fma(-walk.alpha(log2_alpha), T, T)
+
+        def body(at: _Place, T: Any) -> tuple:
+            return dr.while_loop(
+                state=(walk.find(at), T),
+                cond=lambda at, T: (least <= T) & at.has_entry(),
+                body=weaken,
+            )
+
+        size = dr.width(walk.origin)
+        _, T = dr.while_loop(
+            state=(
+                _Place.first_of(dr.zeros(t.Float, size)),
+                dr.select(segment.active, t.Float(1), 0),
+            ),
+            cond=lambda at, T: (least <= T) & walk.goes_on(at),
+            body=body,
+        )
+        return T
+
+
+@dataclass
+class _Place:
+    """Where rays are: in a cell, and in its list. Not frozen: Dr.Jit assigns a loop's state."""
+
+    start: Any  # Float: where the ray enters the cell
+    end: Any  # Float: where it leaves it
+    entry: Any  # UInt32: the next one of the list
+    first: Any  # UInt32: of the list
+    last: Any  # UInt32: one behind the list; where that is the next entry, there is another cell
+    turn: Any  # UInt32: entries since rays of a vector waited for each other
+
+    @staticmethod
+    def first_of(start: Any) -> _Place:
+        """Before the first cell."""
+        UInt32, size = types_of(type(start)).UInt32, dr.width(start)
+        return _Place(start, type(start)(start), *(dr.zeros(UInt32, size) for _ in range(4)))
+
+    def has_entry(self) -> Any:
+        """Whether the list goes on, and the others' rays need not find another cell first."""
+        return (self.entry < self.last) & (self.turn < TURNS)
+
+    def back(self, goes_back: Any) -> _Place:
+        """At the beginning of the list that was read last, on some rays."""
+        return replace(self, entry=dr.select(goes_back, self.first, self.entry))
+
+
+@dataclass(frozen=True)
+class _Walk:
+    """Rays on their way through the grid, from where they enter it."""
+
+    splats: RaySplats
+    origin: Any  # Array3f: where a ray enters, or starts
+    direction: Any
+    stop: Any  # Float: where it ends, or leaves the grid
+
+    @staticmethod
+    def along(splats: RaySplats, segment: Segment) -> _Walk:
+        start, end = splats.grid.span(segment.origin, segment.direction)
+        start = dr.select(start > 0, start, 0)
+        end = dr.select(end < segment.far, end, segment.far)
+        origin = segment.origin + segment.direction * dr.select(start < end, start, 0)
+        return _Walk(splats, origin, segment.direction, end - start)
+
+    def goes_on(self, at: _Place) -> Any:
+        """Whether there is another entry, or another cell."""
+        return (at.entry < at.last) | (at.end < self.stop)
+
+    def find(self, at: _Place) -> _Place:
+        """The same place, or where the list is at its end, the next cell that has one."""
+        grid = self.splats.grid
+
+        def body(at: _Place) -> tuple[_Place]:
+            cell = grid.cell(self.origin, self.direction, at.end)
+            return (_Place(at.end, cell.exit, cell.first, cell.first, cell.last, at.turn),)
+
+        (at,) = dr.while_loop(
+            state=(at,),
+            cond=lambda at: (at.entry == at.last) & (at.end < self.stop),
+            body=body,
+        )
+        return replace(at, turn=type(at.turn)(0))
+
+    def next(self, at: _Place) -> tuple[_Place, Any, Any, Any]:
+        """The next entry: the place behind it, the Gaussian, where it is met, log2 of its alpha."""
+        UInt32 = type(at.entry)
+        row = dr.gather(UInt32, self.splats.grid.rows, at.entry)
+        peak, log2_alpha = self.meet(row, True)
+        here = (peak >= at.start) & (peak < at.end) & (peak > 0) & (peak < self.stop)
+        log2_alpha = dr.select(here, log2_alpha, -dr.inf)
+        behind = replace(at, entry=at.entry + 1, turn=at.turn + 1)
+        return behind, row, peak, log2_alpha
+
+    def meet(self, row: Any, active: Any) -> tuple[Any, Any]:
+        """Where a ray meets a Gaussian, and the base-2 logarithm of its alpha, -inf outside."""
+        Array3f = types_of(self.splats.shapes.Float).Array3f
+        numbers = self.splats.shapes.load(row, active)
+        mean, log2_opacity = Array3f(numbers[:3]), numbers[_SHAPE - 1]
+        whitening = [Array3f(numbers[k : k + 3]) for k in (3, 6, 9)]
+        offset = self.origin - mean
+        o = Array3f([dr.dot(row, offset) for row in whitening])
+        d = Array3f([dr.dot(row, self.direction) for row in whitening])
+        peak = -dr.dot(o, d) / dr.squared_norm(d)
+        log2_alpha = dr.fma(
+            dr.squared_norm(dr.fma(d, peak, o)), -0.5 * math.log2(math.e), log2_opacity
+        )
+        shows = log2_alpha >= self.splats.cutoffs.log2_floor(log2_opacity)
+        return peak, dr.select(shows, log2_alpha, -dr.inf)
+
+    def alpha(self, log2_alpha: Any) -> Any:
+        alpha, most = dr.exp2(log2_alpha), self.splats.cutoffs.alpha_max
+        return dr.select(alpha < most, alpha, most)
+
+    def nearest(self, at: _Place, last: list[Any], T: Any) -> tuple[_Place, list[list[Any]], Any]:
+        """The next peaks, and whether the list that was read last has more.
+
+        Rays read one list after the other while half of the window is free, at least, and what
+        they have read lets something through. Of each peak: where it is, the Gaussian, the base-2
+        logarithm of alpha; where there is none, inf. last: of the peaks that were composited, where
+        it is and the Gaussian; T: transmittance before the window.
+        """
+        t = types_of(self.splats.shapes.Float)
+
+        def insert(at: _Place, window: list, overflows: Any) -> tuple:
+            at, row, peak, log2_alpha = self.next(at)
+            behind = (peak > last[0]) | ((peak == last[0]) & (row > last[1]))
+            peak = dr.select(behind & (log2_alpha > -dr.inf), peak, dr.inf)
+            item, kept = [peak, row, log2_alpha], []
+            # Of equals, that of the smaller row, which the list has first, stays before.
+            for place in window:
+                before = item[0] < place[0]
+                pairs = list(zip(place, item, strict=True))
+                kept.append([dr.select(before, new, old) for old, new in pairs])
+                item = [dr.select(before, old, new) for old, new in pairs]
+            return at, kept, overflows | (item[0] < dr.inf)
+
+        def body(at: _Place, window: list, overflows: Any) -> tuple:
+            return dr.while_loop(
+                state=(self.find(at), window, overflows),
+                cond=lambda at, window, overflows: at.has_entry(),
+                body=insert,
+            )
+
+        def goes_on(at: _Place, window: list, overflows: Any) -> Any:
+            through = T
+            for peak, _, log2_alpha in window:
+                alpha = dr.select(peak < dr.inf, self.alpha(log2_alpha), 0)
+                through = dr.fma(-alpha, through, through)
+            more = (window[WINDOW // 2][0] == dr.inf) & (through >= stop)
+            return self.goes_on(at) & ((at.entry < at.last) | more)
+
+        size, stop = dr.width(at.first), self.splats.cutoffs.transmittance_stop
+        empty = [dr.full(t.Float, dr.inf, size), dr.zeros(t.UInt32, size), dr.zeros(t.Float, size)]
+        return dr.while_loop(
+            state=(
+                at,
+                [[type(x)(x) for x in empty] for _ in range(WINDOW)],
+                dr.full(t.Bool, False, size),
+            ),
+            cond=goes_on,
+            body=body,
+        )
+
+    def composite(
+        self, window: list[list[Any]], basis: list[Any], T: Any, color: list[Any]
+    ) -> tuple[Any, list[Any], list[Any]]:
+        """Composite what was kept; returns T, negative where the ray is finished, colour, last."""
+        t = types_of(self.splats.shapes.Float)
+
+        def body(window: list, T: Any, color: list, last: list) -> tuple:
+            (peak, row, log2_alpha), *others = window
+            active = peak < dr.inf
+            weight, T, _ = composite_step(
+                T, self.alpha(log2_alpha), self.splats.cutoffs.transmittance_stop
+            )
+            seen = self.splats._color(row, basis, active)
+            shown = [dr.fma(weight, c, total) for c, total in zip(seen, color, strict=True)]
+            gone = [dr.full(t.Float, dr.inf, dr.width(peak)), row, log2_alpha]
+            return [*others, gone], T, shown, [peak, row]
+
+        size = dr.width(T)
+        nothing = [dr.full(t.Float, -dr.inf, size), dr.zeros(t.UInt32, size)]
+        _, T, color, last = dr.while_loop(
+            state=(window, T, color, nothing),
+            cond=lambda window, T, color, last: (window[0][0] < dr.inf) & (T > 0),
+            body=body,
+        )
+        return T, color, last
+
+
+def _uniform(row: Any, seed: Any, count: int) -> list[Any]:
+    """Numbers in 0..1 of a Gaussian and a ray, Float, in steps of 2^-16.
+
+    Hashes by PCG's output function (O'Neill 2014); two numbers a hash.
+    """
+    UInt32 = type(row)
+    Float = dr.float32_array_t(UInt32)
+    numbers, state = [], row ^ seed
+    for _ in range(-(-count // 2)):
+        state = state * UInt32(747796405) + UInt32(2891336453)
+        word = ((state >> ((state >> 28) + 4)) ^ state) * UInt32(277803737)
+        word = (word >> 22) ^ word
+        state = state ^ seed
+        numbers += [Float(half) * 2**-16 for half in (word & 0xFFFF, word >> 16)]
+    return numbers[:count]

@@ -1,0 +1,359 @@
+"""The ``splatpath`` integrator: a path tracer whose rays pass splats on their way.
+
+Executed once per Mitsuba variant (see ``drgs.plugins``). How rays pass splats is in
+``drgs.light``; this file is where it meets emitters, BSDFs and derivatives.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import drjit as dr
+import mitsuba as mi
+from mitsuba.ad.integrators.common import RBIntegrator, mis_weight, solid_angle_to_area_jacobian
+
+if TYPE_CHECKING:
+    from drgs.integrator.light import LightOfSplats
+
+UNBOUNDED = 0xFFFFFFFF
+"""What Mitsuba's integrators take a ``max_depth`` of -1 for."""
+
+MOST_LIKELY = 0.95
+"""With which a path goes on, at most: as in Mitsuba's ``path``."""
+
+
+class SplatPathIntegrator(RBIntegrator):
+    r"""
+    .. _integrator-splatpath:
+
+    Path tracer among splats (:monosp:`splatpath`)
+    ----------------------------------------------
+
+    .. pluginparameters::
+
+     * - max_depth
+       - |int|
+       - Longest path depth: 1 shows emitters only, 2 adds direct illumination, and so on. -1: no
+         limit. (Default: -1)
+
+     * - rr_depth
+       - |int|
+       - Path depth from which on Russian roulette ends paths. (Default: 5)
+
+     * - hide_emitters
+       - |bool|
+       - Hide directly visible emitters. (Default: |false|)
+
+    To be nested in ``splats`` whose ``light`` is ``rays``: it renders the scene's surfaces as
+    ``path`` does, and as splats light and shade them. What a path meets between two vertices adds
+    its radiance and weakens all that comes behind; so do splats between a vertex and the emitter
+    that it samples. The first segment, which starts at the camera and goes straight on through
+    what lets it pass (``null``, ``mask``, ``thindielectric``), meets no splats: those the
+    integrator ``splats`` puts into the picture. Without it, this is a path tracer.
+
+    Derivatives are those of ``prb`` (path replay, detached sampling), with respect to materials,
+    emitters and poses of objects.
+
+    .. note:: Not differentiated: the splats, and what a path meets of them: that includes how it
+        changes with the ray.
+
+    .. tabs::
+
+        .. code-tab:: xml
+
+            <integrator type="splats">
+                <string name="filename" value="point_cloud.ply"/>
+                <string name="light" value="rays"/>
+                <integrator type="splatpath">
+                    <integer name="max_depth" value="8"/>
+                </integrator>
+            </integrator>
+
+        .. code-tab:: python
+
+            'type': 'splatpath',
+            'max_depth': 8
+    """
+
+    def __init__(self, props: mi.Properties) -> None:
+        super().__init__(props)
+        if "max_depth" not in props:
+            self.max_depth = UNBOUNDED
+        self.light: LightOfSplats | None = None  # of the integrator that this one is nested in
+
+    @dr.syntax
+    def sample(
+        self,
+        mode: dr.ADMode,
+        scene: mi.Scene,
+        sampler: mi.Sampler,
+        ray: mi.Ray3f,
+        active: mi.Bool,
+        **others: Any,
+    ) -> tuple[mi.Spectrum, mi.Bool, list[mi.Float], mi.Spectrum]:
+        """Radiance along rays, or its derivatives; see ``RBIntegrator.sample``, also for others.
+
+        Path replay (Vicini et al. 2021): the second walk takes the same path, and knows of each
+        vertex what radiance is still to come, as the first one has left the sum.
+        """
+        primal = mode == dr.ADMode.Primal
+        path = self._begin(scene, ray, active)
+        L = mi.Spectrum(0 if primal else others["state_in"])  # so far; in a replay, still to come
+        δL = mi.Spectrum(0 if others["δL"] is None else others["δL"])
+        is_seen = mi.Bool(not self.hide_emitters and scene.environment() is not None)
+
+        while dr.hint(path.active, max_iterations=self.max_depth, label=f"splatpath ({mode.name})"):
+            passed = self._pass_splats(path, sampler)
+            with dr.resume_grad(when=not primal):
+                si = path.vertex(attached=not primal)
+            emitted = self._emitted(scene, path, si, primal)
+            goes_on = path.active & (path.depth + 1 < self.max_depth) & si.is_valid()
+            direct = self._direct(scene, sampler, path, si, goes_on, primal)
+            step = self._bounce(scene, sampler, path, si, goes_on)
+            is_seen |= goes_on & ~step.is_null
+            contribution = dr.detach(passed + emitted + direct)
+            L = L + contribution if primal else L - contribution
+            if dr.hint(not primal, mode="scalar"):
+                with dr.resume_grad():
+                    total = emitted + direct + L * step.relative_change(si, path.ray)
+                    if dr.hint(mode == dr.ADMode.Backward, mode="scalar"):
+                        dr.backward_from(δL * total)
+                    else:
+                        δL += dr.forward_to(total)
+            path = path.after(step, si)
+
+        return (L if primal else δL), is_seen, [], L
+
+    def _begin(self, scene: mi.Scene, ray: mi.Ray3f, active: mi.Bool) -> _Path:
+        """A path at the camera, whose first hit is known."""
+        ray, active = mi.Ray3f(dr.detach(ray)), mi.Bool(active)
+        hit = scene.ray_intersect_preliminary(ray, coherent=True, reorder=False, active=active)
+        if self.hide_emitters:
+            hit = self._past_emitters(scene, ray, hit, active)
+        return _Path(
+            ray=ray,
+            hit=hit,
+            active=active,
+            depth=mi.UInt32(0),
+            throughput=mi.Spectrum(1),
+            eta=mi.Float(1),
+            straight=mi.Bool(True),
+            last_ray=mi.Ray3f(ray),
+            last_hit=dr.zeros(mi.PreliminaryIntersection3f),
+            last_si=dr.zeros(mi.SurfaceInteraction3f),
+            last_pdf=mi.Float(1),
+            last_is_delta=mi.Bool(True),
+        )
+
+    def _emitted(
+        self, scene: mi.Scene, path: _Path, si: mi.SurfaceInteraction3f, primal: bool
+    ) -> mi.Spectrum:
+        """Of the emitter that a path has met."""
+        shows = path.active & ~((path.depth == 0) & ~si.is_valid() & self.hide_emitters)
+        ds = mi.DirectionSample3f(scene, si=si, ref=path.last_si)
+        pdf = scene.pdf_emitter_direction(path.last_si, ds, ~path.last_is_delta)
+        weight = mis_weight(path.last_pdf, pdf)
+        with dr.resume_grad(when=not primal):
+            return path.throughput * weight * ds.emitter.eval(si, shows)
+
+    def _direct(
+        self,
+        scene: mi.Scene,
+        sampler: mi.Sampler,
+        path: _Path,
+        si: mi.SurfaceInteraction3f,
+        active: mi.Bool,
+        primal: bool,
+    ) -> mi.Spectrum:
+        """Of an emitter that the vertex samples."""
+        bsdf = si.bsdf(path.ray)
+        active = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
+        ds, weight = scene.sample_emitter_direction(si, sampler.next_2d(), True, active)
+        active &= ds.pdf != 0
+        let_through = self._let_through(si.spawn_ray_to(ds.p), sampler, active)
+        with dr.resume_grad(when=not primal):
+            if not primal:
+                ds, weight = _attached(scene, si, ds, weight, active)
+            wo = si.to_local(ds.d)
+            value, pdf = bsdf.eval_pdf(mi.BSDFContext(), si, wo, active)
+            mis = dr.select(ds.delta, 1, mis_weight(ds.pdf, pdf))
+            return path.throughput * mis * value * weight * let_through
+
+    def _bounce(
+        self,
+        scene: mi.Scene,
+        sampler: mi.Sampler,
+        path: _Path,
+        si: mi.SurfaceInteraction3f,
+        active: mi.Bool,
+    ) -> _Step:
+        """Where a path goes on, if it does."""
+        bsdf = si.bsdf(path.ray)
+        sample, weight = bsdf.sample(
+            mi.BSDFContext(), si, sampler.next_1d(), sampler.next_2d(), active
+        )
+        ray = si.spawn_ray(si.to_world(sample.wo))
+        eta, throughput = path.eta * sample.eta, path.throughput * weight
+        most = dr.max(throughput)
+        active = active & (most != 0)
+        probability = dr.minimum(most * dr.square(eta), MOST_LIKELY)
+        is_played = path.depth >= self.rr_depth
+        throughput[is_played] *= dr.rcp(probability)
+        active &= ~is_played | (sampler.next_1d() < probability)
+        return _Step(
+            ray=dr.detach(ray),
+            hit=scene.ray_intersect_preliminary(ray, coherent=False, reorder=False, active=active),
+            active=active,
+            throughput=throughput,
+            eta=eta,
+            pdf=sample.pdf,
+            type=sample.sampled_type,
+        )
+
+    # ------------------------------------------------------------------------------------------
+    # Splats
+    # ------------------------------------------------------------------------------------------
+
+    def _pass_splats(self, path: _Path, sampler: mi.Sampler) -> mi.Spectrum:
+        """What splats up to the vertex send along the path; what is behind them is weakened."""
+        if self.light is None:
+            return mi.Spectrum(0)
+        far = dr.select(path.hit.is_valid(), path.hit.t, dr.inf)
+        radiance, let_through = self.light.passed(
+            path.ray, far, sampler.next_1d(), path.active & ~path.straight
+        )
+        radiance = path.throughput * radiance
+        path.throughput = path.throughput * let_through
+        return radiance
+
+    def _let_through(self, ray: mi.Ray3f, sampler: mi.Sampler, active: mi.Bool) -> mi.Float:
+        """Of the light that comes from where a ray ends."""
+        if self.light is None:
+            return mi.Float(1)
+        return self.light.transmittance(ray, sampler.next_1d(), active)
+
+    # ------------------------------------------------------------------------------------------
+    # Surfaces
+    # ------------------------------------------------------------------------------------------
+
+    def _past_emitters(
+        self, scene: mi.Scene, ray: mi.Ray3f, hit: mi.PreliminaryIntersection3f, active: mi.Bool
+    ) -> mi.PreliminaryIntersection3f:
+        """The first hit that is no emitter."""
+        skips = hit.is_valid() & (hit.shape.emitter() != None) & active  # noqa: E711
+        si = hit.compute_surface_interaction(ray, mi.RayFlags.Minimal, skips)
+        behind = self.skip_area_emitters(scene, si.spawn_ray(ray.d), True, skips)
+        hit[skips] = behind
+        return hit
+
+
+@dataclass  # not frozen: ``dr.syntax`` carries it through a loop
+class _Path:
+    """A path at a vertex."""
+
+    ray: mi.Ray3f  # that has led here
+    hit: mi.PreliminaryIntersection3f
+    active: mi.Bool
+    depth: mi.UInt32  # vertices before
+    throughput: mi.Spectrum
+    eta: mi.Float  # product of relative indices of refraction
+    straight: mi.Bool  # from the camera on
+    last_ray: mi.Ray3f  # the same of the vertex before
+    last_hit: mi.PreliminaryIntersection3f
+    last_si: mi.SurfaceInteraction3f
+    last_pdf: mi.Float  # of the direction
+    last_is_delta: mi.Bool
+
+    def vertex(self, attached: bool) -> mi.SurfaceInteraction3f:
+        """Where the path is; attached: to the surfaces of this vertex and the one before."""
+        si = self.hit.compute_surface_interaction(self.ray, ray_flags=mi.RayFlags.All)
+        if attached:
+            last = self.last_hit.compute_surface_interaction(
+                self.last_ray, ray_flags=mi.RayFlags.Minimal
+            )
+            here = dr.detach(si)
+            moved = here.to_local(dr.normalize(last.p - here.p))
+            si.wi = dr.replace_grad(si.wi, dr.select(self.depth >= 1, moved, si.wi))
+        return si
+
+    def after(self, step: _Step, si: mi.SurfaceInteraction3f) -> _Path:
+        """At the next vertex."""
+        return _Path(
+            ray=step.ray,
+            hit=step.hit,
+            active=step.active,
+            depth=self.depth + dr.select(si.is_valid(), mi.UInt32(1), 0),
+            throughput=step.throughput,
+            eta=step.eta,
+            straight=self.straight & step.is_null,
+            last_ray=self.ray,
+            last_hit=self.hit,
+            last_si=dr.detach(si, True),
+            last_pdf=step.pdf,
+            last_is_delta=mi.has_flag(step.type, mi.BSDFFlags.Delta),
+        )
+
+
+@dataclass(frozen=True)
+class _Step:
+    """From a vertex to the next one."""
+
+    ray: mi.Ray3f
+    hit: mi.PreliminaryIntersection3f
+    active: mi.Bool
+    throughput: mi.Spectrum
+    eta: mi.Float
+    pdf: mi.Float
+    type: mi.UInt32  # flags of the BSDF's part that was sampled
+
+    @property
+    def is_null(self) -> mi.Bool:
+        """Whether the path goes straight on."""
+        return mi.has_flag(self.type, mi.BSDFFlags.Null)
+
+    def relative_change(self, si: mi.SurfaceInteraction3f, ray: mi.Ray3f) -> mi.Spectrum:
+        """1, attached: how what the vertex reflects of the next segment changes, relatively."""
+        next_si = self.hit.compute_surface_interaction(
+            self.ray, ray_flags=mi.RayFlags.Minimal, active=self.active
+        )
+        hits = self.active & next_si.is_valid()
+        jacobian = solid_angle_to_area_jacobian(si.p, next_si.p, next_si.n, hits)
+        moved = dr.select(next_si.is_valid(), dr.normalize(next_si.p - si.p), self.ray.d)
+        wo = si.to_local(dr.replace_grad(self.ray.d, moved))
+        value = si.bsdf(ray).eval(mi.BSDFContext(), si, wo, self.active)
+        return dr.relative_grad(value) * dr.relative_grad(jacobian)
+
+
+def _attached(
+    scene: mi.Scene,
+    si: mi.SurfaceInteraction3f,
+    ds: mi.DirectionSample3f,
+    weight: mi.Spectrum,
+    active: mi.Bool,
+) -> tuple[mi.DirectionSample3f, mi.Spectrum]:
+    """An emitter's sample and its weight, attached to the emitter and to the vertex."""
+    flags = ds.emitter.flags()
+    is_surface = mi.has_flag(flags, mi.EmitterFlags.Surface)
+    is_infinite = mi.has_flag(flags, mi.EmitterFlags.Infinite)
+    is_textured = active & is_surface & mi.has_flag(flags, mi.EmitterFlags.SpatiallyVarying)
+    # The point of a textured emitter that moves has another radiance.
+    towards = si.spawn_ray_to(ds.p)
+    towards.o = dr.fma(towards.d, towards.maxt, towards.o)
+    towards.maxt = dr.largest(towards.maxt)
+    moved = mi.DirectionSample3f(scene, scene.ray_intersect(towards, is_textured), si)
+    moved = dr.select(is_textured, moved, dr.zeros(mi.DirectionSample3f))
+    moved.d = dr.select(is_textured, moved.d, dr.normalize(ds.p - si.p))
+    moved.d = dr.select(is_infinite, ds.d, moved.d)
+    ds = dr.replace_grad(ds, moved)
+    # Samples are points of the emitter: a vertex that moves sees them in another solid angle.
+    jacobian = solid_angle_to_area_jacobian(
+        si.p, dr.detach(ds.p), dr.detach(ds.n), active & is_surface
+    )
+    emitted = scene.eval_emitter_direction(si, ds, active)
+    density = dr.select(ds.pdf != 0, dr.rcp(dr.detach(ds.pdf)), 0)
+    weight = dr.replace_grad(weight, emitted * density)
+    return ds, weight * dr.relative_grad(jacobian)
+
+
+mi.register_integrator("splatpath", lambda props: SplatPathIntegrator(props))

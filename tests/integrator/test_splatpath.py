@@ -1,0 +1,307 @@
+"""Light between splats and surfaces, against closed forms and Mitsuba's own integrators."""
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from support.helpers import rows
+
+import drgs  # noqa: F401  (registers the plugins)
+from drgs.core.errors import UnsupportedError
+from drgs.reference import light as reference
+from drgs.reference import splatting
+
+
+@pytest.fixture(autouse=True)
+def variant():
+    mi.set_variant("llvm_ad_rgb")
+
+
+def gaussians(means, scale=0.3, opacity=0.9, color=1.0, count=None) -> splatting.Gaussians:
+    """Balls of one size and colour."""
+    means = np.atleast_2d(np.asarray(means, np.float32))
+    n = len(means)
+    color = (np.broadcast_to(color, (n, 3)) - 0.5) / splatting.C_00
+    return splatting.Gaussians(
+        means,
+        np.tile([1.0, 0, 0, 0], (n, 1)),
+        np.broadcast_to(np.log(scale), (n, 3)),
+        np.full(n, np.log(opacity / (1 - opacity))),
+        color[:, None],
+        np.zeros((n, 0, 3)),
+    )
+
+
+def scene_of(splats, light="rays", max_depth=8, nested="splatpath", spp=64, **others):
+    """The objects of ``others`` among the splats, and their camera at ``sensor``."""
+    settings = {key: others.pop(key) for key in ("light_samples", "exposure") if key in others}
+    tensors = {k: mi.TensorXf(v.astype(np.float32)) for k, v in vars(splats).items()}
+    integrator = {
+        "type": "splats",
+        "nested_spp": spp,
+        "nested": {"type": nested, "max_depth": max_depth},
+        **tensors,
+        **settings,
+    }
+    if light is not None:
+        integrator["light"] = light
+    return mi.load_dict({"type": "scene", "integrator": integrator, **others})
+
+
+def camera(origin, target, size=24, fov=40, up=(0, 1, 0)):
+    return {
+        "type": "perspective",
+        "fov": fov,
+        "to_world": mi.ScalarTransform4f().look_at(origin, target, up),
+        "film": {
+            "type": "hdrfilm",
+            "width": size,
+            "height": size,
+            "rfilter": {"type": "box"},
+            "pixel_format": "rgb",
+        },
+        "sampler": {"type": "independent", "sample_count": 1},
+    }
+
+
+FAR_AWAY = gaussians([[0, 0, 1e4]])
+
+
+def room():
+    """A rough floor, a glass ball and a lamp that it may hit."""
+    T = mi.ScalarTransform4f
+    return {
+        "sensor": camera([0, 2, 4], [0, 0.3, 0]),
+        "floor": {
+            "type": "rectangle",
+            "to_world": T().rotate([1, 0, 0], -90).scale(4),
+            "bsdf": {"type": "roughconductor", "alpha": 0.3},
+        },
+        "ball": {
+            "type": "sphere",
+            "center": [0, 0.5, 0],
+            "radius": 0.5,
+            "bsdf": {"type": "dielectric"},
+        },
+        "matt": {
+            "type": "sphere",
+            "center": [1.2, 0.4, 0],
+            "radius": 0.4,
+            "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.7, 0.3, 0.2]}},
+        },
+        "lamp": {
+            "type": "rectangle",
+            "to_world": T().translate([0, 4, 1]).rotate([1, 0, 0], 90),
+            "emitter": {"type": "area", "radiance": {"type": "rgb", "value": 6.0}},
+        },
+        "sky": {"type": "constant", "radiance": {"type": "rgb", "value": [0.3, 0.4, 0.5]}},
+    }
+
+
+def mean_and_error(render, rounds):
+    pictures = np.stack([np.array(render(seed)) for seed in range(rounds)])
+    return pictures.mean(0), pictures.std(0, ddof=1) / np.sqrt(rounds)
+
+
+@pytest.mark.parametrize("max_depth", [1, 2, 3, 8])
+def test_surfaces_alone_look_as_by_path(max_depth):
+    """Within five standard errors everywhere, and within one and a bit on average."""
+    found = []
+    for nested, light in (("splatpath", "rays"), ("path", "none")):
+        scene = scene_of(FAR_AWAY, light, max_depth, nested, **room())
+        found.append(mean_and_error(lambda seed, s=scene: mi.render(s, seed=seed), 24))
+    (ours, our_error), (theirs, their_error) = found
+    error = np.sqrt(our_error**2 + their_error**2) + 1e-6 + 1e-3 * theirs
+    deviation = np.abs(ours - theirs) / error
+    assert theirs.mean() > 0.05
+    assert deviation.max() < 6 and np.sqrt((deviation**2).mean()) < 1.2
+
+
+def test_a_mirror_shows_the_mirrored_gaussians():
+    """Exactly: all splats are composited, and one path is as good as many."""
+    rng = np.random.default_rng(0)
+    means = rng.normal(0, 0.5, (20, 3)) * [1, 1, 0.5] + [0, 0, 6]
+    splats = gaussians(means, 0.3, 0.7, rng.uniform(0, 1, (20, 3)))
+    mirror = {
+        "mirror": {
+            "type": "rectangle",
+            "to_world": mi.ScalarTransform4f().scale(10),
+            "bsdf": {"type": "conductor", "material": "none"},
+        },
+        "sensor": camera([0, 0, 4], [0, 0, 0], up=[0, 1, 0]),
+    }
+    origins, directions = pixel_rays(mi.load_dict(mirror["sensor"]))
+    picture = along_rays(scene_of(splats, light_samples=0, **mirror), origins, directions)
+    mirrored = gaussians(means * [1, 1, -1], 0.3, 0.7)
+    mirrored = splatting.Gaussians(**{**vars(splats), "means": mirrored.means})
+    seen = reference.pass_splats(mirrored, origins, directions, np.full(len(origins), np.inf))
+    expected = radiance_of(seen)
+    np.testing.assert_allclose(picture, expected, atol=2e-4)
+    assert expected.max() > 0.3
+
+
+def pixel_rays(sensor):
+    """Origins and directions through the middles of pixels, row by row."""
+    width, height = sensor.film().crop_size()
+    y, x = np.mgrid[0:height, 0:width]
+    place = mi.Point2f((x.ravel() + 0.5) / width, (y.ravel() + 0.5) / height)
+    ray, _ = sensor.sample_ray(0.0, 0.5, place, mi.Point2f(0.5))
+    directions = rows(ray.d)
+    return np.broadcast_to(rows(ray.o), directions.shape), directions
+
+
+def along_rays(scene, origins, directions):
+    """What the nested integrator finds with one path a ray."""
+    mi.render(scene)  # it gets to know the splats
+    nested, sampler = scene.integrator().nested, mi.load_dict({"type": "independent"})
+    sampler.seed(0, len(origins))
+    ray = mi.Ray3f(mi.Point3f(*_columns(origins)), mi.Vector3f(*_columns(directions)))
+    radiance, *_ = nested.sample(dr.ADMode.Primal, scene, sampler, ray, mi.Bool(True), δL=None)
+    return rows(radiance)
+
+
+def _columns(values):
+    return [mi.Float(np.ascontiguousarray(column, np.float32)) for column in values.T]
+
+
+def radiance_of(seen):
+    coverage = 1 - seen.transmittances[:, None]
+    color = seen.colors / np.where(coverage > 0, coverage, 1)
+    return coverage * linear(color)
+
+
+def linear(color):
+    return np.where(color <= 0.04045, color / 12.92, ((color + 0.055) / 1.055) ** 2.4)
+
+
+def test_a_fog_before_a_lamp_darkens_a_wall_by_its_alpha():
+    """The pixel shows one point of the wall, from which the lamp is seen through every Gaussian."""
+    rng = np.random.default_rng(1)
+    lamp, count = np.array([0.5, 0.3, 3.0]), 30
+    splats = gaussians(rng.uniform(-1, 1, (count, 3)) * [1, 1, 0.3] + [0, 0, 1.5], 0.4, 0.3, 0.0)
+    wall = {
+        "wall": {
+            "type": "rectangle",
+            "to_world": mi.ScalarTransform4f().scale(2),
+            "bsdf": {"type": "diffuse"},
+        },
+        "lamp": {"type": "point", "position": list(lamp), "intensity": 10.0},
+        # Beside the fog: its own splats would be before the wall.
+        "sensor": camera([6, 0, 2], [0, 0, 0], size=12, fov=10),
+    }
+    dark, _ = mean_and_error(
+        lambda seed: mi.render(scene_of(splats, spp=256, max_depth=2, **wall), seed=seed), 8
+    )
+    bright = np.array(mi.render(scene_of(FAR_AWAY, spp=256, max_depth=2, **wall)))
+    sensor = mi.load_dict(wall["sensor"])
+    origins, directions = pixel_rays(sensor)
+    points = origins - directions * (origins[:, 2] / directions[:, 2])[:, None]
+    to_lamp = lamp - points
+    distance = np.linalg.norm(to_lamp, axis=1)
+    seen = reference.pass_splats(splats, points, to_lamp / distance[:, None], distance, stop=0)
+    before = reference.pass_splats(splats, origins, directions, np.full(len(origins), 30.0))
+    ratio = (dark / bright).mean(2).ravel()
+    clear = before.counts == 0
+    assert clear.sum() > 30 and seen.transmittances[clear].min() < 0.3
+    np.testing.assert_allclose(ratio[clear], seen.transmittances[clear], atol=0.02)
+
+
+def test_in_a_white_furnace_everything_is_white():
+    """White splats before a white sky around a white ball: none can be told from the others."""
+    rng = np.random.default_rng(2)
+    directions = rng.normal(size=(300, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    splats = gaussians(2.5 * directions, 0.25, 0.99)
+    scene = scene_of(
+        splats,
+        max_depth=64,
+        spp=128,
+        ball={
+            "type": "sphere",
+            "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": 1.0}},
+        },
+        sky={"type": "constant", "radiance": {"type": "rgb", "value": 1.0}},
+        sensor=camera([0, 0, 2], [0, 0, 0], size=16, fov=35),
+    )
+    mean, error = mean_and_error(lambda seed: mi.render(scene, seed=seed), 8)
+    assert (error < 0.01).all()
+    np.testing.assert_allclose(mean, 1, atol=0.012)
+
+
+@pytest.mark.parametrize("color", [0.02, 0.5, (0.9, 0.3, 0.1)])
+def test_drawn_splats_have_the_colour_of_all_on_average(color):
+    """Of several colours before each other, whose mean is decoded, not they."""
+    rng = np.random.default_rng(3)
+    colors = np.clip(np.asarray(color) * rng.uniform(0, 2, (40, 3)), 0, 1)
+    means = rng.normal(0, 0.4, (40, 3)) + np.array([0, 0, 6])
+    splats = gaussians(means, 0.4, 0.6, colors)
+    mirror = {
+        "mirror": {
+            "type": "rectangle",
+            "to_world": mi.ScalarTransform4f().scale(10),
+            "bsdf": {"type": "conductor", "material": "none"},
+        },
+        "sensor": camera([0, 0, 4], [0, 0, 0], size=8, fov=0.01),
+    }
+    exact = np.array(mi.render(scene_of(splats, light_samples=0, spp=1, **mirror)))
+    scene = scene_of(splats, light_samples=4, spp=1024, **mirror)
+    mean = np.array(mi.render(scene))
+    exact = exact.mean((0, 1))
+    error = mean.std((0, 1)) / np.sqrt(64)
+    assert (error < 2e-3).all() and exact.max() > 1.5e-3
+    np.testing.assert_allclose(mean.mean((0, 1)), exact, atol=2e-3 + 5 * error.max())
+
+
+def test_glass_that_does_not_refract_changes_nothing():
+    splats = gaussians([[0, 0, -1], [0.3, 0.2, -2]], 0.4, 0.8, [[0.9, 0.2, 0.1], [0.1, 0.3, 0.8]])
+    slab = {
+        "slab": {
+            "type": "cube",
+            "to_world": mi.ScalarTransform4f().translate([0, 0, 1]).scale([5, 5, 0.1]),
+            "bsdf": {"type": "dielectric", "int_ior": 1.000001, "ext_ior": 1.0},
+        },
+        "sensor": camera([0, 0, 4], [0, 0, 0], size=16),
+    }
+    origins, directions = pixel_rays(mi.load_dict(slab["sensor"]))
+    picture = along_rays(scene_of(splats, light_samples=0, **slab), origins, directions)
+    seen = reference.pass_splats(splats, origins, directions, np.full(len(origins), np.inf))
+    np.testing.assert_allclose(picture, radiance_of(seen), atol=1e-3)
+    assert picture.max() > 0.3
+
+
+def test_materials_and_lamps_are_differentiated_among_splats():
+    """As central differences of pictures with many paths."""
+    splats = gaussians([[0.3, 1.2, 0.5], [-0.8, 0.6, 0.4]], 0.4, 0.7, 0.8)
+    objects = room()
+    objects["sensor"] = camera([0, 2, 4], [0, 0.3, 0], size=8)
+    scene = scene_of(splats, spp=2048, max_depth=4, **objects)
+    params = mi.traverse(scene)
+    for key in ("floor.bsdf.alpha.value", "matt.bsdf.reflectance.value", "sky.radiance.value"):
+        value = type(params[key])(params[key])
+        params[key] = type(value)(value)
+        dr.enable_grad(params[key])
+        params.update()
+        dr.backward(dr.mean(mi.render(scene, params, seed=1, spp=1).array))
+        gradient = np.sum(np.array(dr.grad(params[key])))
+        step, means = 0.02, []
+        for sign in (-1, 1):
+            params[key] = dr.detach(value) + sign * step
+            params.update()
+            means.append(np.mean([np.array(mi.render(scene, seed=s)).mean() for s in range(3)]))
+        params[key] = dr.detach(value)
+        params.update()
+        assert gradient == pytest.approx((means[1] - means[0]) / (2 * step), rel=0.05), key
+
+
+def test_what_would_be_wrong_is_refused():
+    splats = gaussians([[0, 0, -1]])
+    scene = scene_of(splats, **room())
+    params = mi.traverse(scene)
+    dr.enable_grad(params["integrator.means"])
+    params.update()
+    with pytest.raises(UnsupportedError, match="light 'rays'"):
+        dr.backward(dr.mean(mi.render(scene, params).array))
+    with pytest.raises(RuntimeError, match="must be splatpath, got PathIntegrator"):
+        scene_of(splats, nested="path", **room())
+    with pytest.raises(RuntimeError, match="light must be one of none, rays, got 'beams'"):
+        scene_of(splats, light="beams")

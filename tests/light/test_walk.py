@@ -1,0 +1,118 @@
+"""What rays pass of splats, against a reference that looks at every splat."""
+
+from dataclasses import dataclass
+
+import drjit as dr
+import numpy as np
+import pytest
+from support.helpers import both_precisions, rows
+
+from drgs.core.arrays import types_of
+from drgs.gaussians.parameters import Gaussians
+from drgs.light.walk import RaySplats, Segment
+from drgs.reference import light as reference
+from drgs.reference import splatting
+from drgs.splatting.cutoffs import Cutoffs
+from drgs.splatting.projection import load_rows
+
+
+def random_gaussians(count, seed=0, spread=1.0, size=0.1, degree=3) -> splatting.Gaussians:
+    """Needles, discs and balls of many sizes around the origin; some far out, some large."""
+    rng = np.random.default_rng(seed)
+    means = rng.normal(0, spread, (count, 3))
+    far = rng.random(count) < 0.05
+    means[far] *= 10 ** rng.uniform(0, 3, (far.sum(), 1))
+    log_scales = np.log(size) + rng.normal(0, 1, (count, 3))
+    log_scales[far] += np.log(np.linalg.norm(means[far], axis=1) / spread)[:, None]
+    return splatting.Gaussians(
+        *(
+            np.asarray(values, np.float32)
+            for values in (
+                means,
+                rng.normal(size=(count, 4)),
+                log_scales,
+                rng.normal(0, 2, count),
+                rng.normal(0, 1, (count, 1, 3)),
+                rng.normal(0, 0.3, (count, (degree + 1) ** 2 - 1, 3)),
+            )
+        )
+    )
+
+
+DEFAULT = Cutoffs()
+
+
+def splats_of(gaussians: splatting.Gaussians, precision, cutoffs=DEFAULT) -> RaySplats:
+    ours = Gaussians(
+        **{name: np.asarray(value, precision.dtype) for name, value in vars(gaussians).items()}
+    ).to(precision.TensorXf)
+    return RaySplats.of(load_rows(ours, gaussians.sh_degree), gaussians.sh_degree, cutoffs)
+
+
+@dataclass(frozen=True)
+class Rays:
+    origins: np.ndarray
+    directions: np.ndarray
+    far: np.ndarray
+
+    @staticmethod
+    def towards(origins, targets, far=np.inf) -> "Rays":
+        directions = np.asarray(targets) - origins
+        directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+        return Rays(*map(_single, (origins, directions, np.broadcast_to(far, len(directions)))))
+
+    def segments(self, precision) -> Segment:
+        types = types_of(precision.Float)
+        return Segment(
+            precision.vectors(self.origins),
+            precision.vectors(self.directions),
+            precision.array(self.far),
+            dr.full(types.Bool, True, len(self.far)),
+        )
+
+
+def _single(values) -> np.ndarray:
+    return np.asarray(values, np.float32).astype(np.float64)
+
+
+def random_rays(count, seed=1) -> Rays:
+    """From inside, outside and far away; some end, some are parallel to axes."""
+    rng = np.random.default_rng(seed)
+    origins = rng.normal(0, 1, (count, 3)) * 10 ** rng.uniform(-1, 1.5, (count, 1))
+    targets = rng.normal(0, 1, (count, 3))
+    far = np.where(rng.random(count) < 0.5, np.inf, rng.exponential(3, count))
+    along = rng.random(count) < 0.2
+    axes = np.eye(3)[rng.integers(0, 3, count)] * rng.choice([-1, 1], (count, 1))
+    targets[along] = (origins + axes)[along]
+    found = Rays.towards(origins, targets, far)
+    # Of unit length in double precision: else distances along rays are not in world units.
+    directions = found.directions / np.linalg.norm(found.directions, axis=1, keepdims=True)
+    return Rays(found.origins, np.where(np.abs(directions) < 1e-6, 0, directions), found.far)
+
+
+def passed(splats, rays, precision):
+    found = splats.passed(rays.segments(precision))
+    transmittance = splats.transmittance(rays.segments(precision), precision.array([1e-4]))
+    return rows(found.color), rows(found.transmittance), rows(transmittance)
+
+
+TOLERANCE = {np.float64: 1e-11, np.float32: 2e-4}
+
+
+@both_precisions
+@pytest.mark.parametrize(
+    ("count", "spread", "size"), [(1, 1, 0.5), (30, 1, 0.5), (1000, 1, 0.05), (3000, 0.3, 0.1)]
+)
+def test_rays_pass_what_the_reference_says(precision, count, spread, size):
+    gaussians, rays = random_gaussians(count, count, spread, size), random_rays(600)
+    close = 0 if precision.dtype == np.float64 else 1e-4
+    exact = reference.pass_splats(gaussians, rays.origins, rays.directions, rays.far, close=close)
+    color, T, alone = passed(splats_of(gaussians, precision), rays, precision)
+    sure = ~exact.is_close
+    assert sure.mean() > (0.99 if close == 0 else 0.3) and exact.counts.max() > min(count, 2) - 1
+    tolerance = TOLERANCE[precision.dtype]
+    np.testing.assert_allclose(color[sure], exact.colors[sure], atol=tolerance * 3)
+    np.testing.assert_allclose(T[sure], exact.transmittances[sure], atol=tolerance)
+    # Asked alone, it is that of all, down to where nothing shows.
+    ends = reference.pass_splats(gaussians, rays.origins, rays.directions, rays.far, stop=0)
+    np.testing.assert_allclose(alone[sure], ends.transmittances[sure], atol=tolerance + 1e-4)
