@@ -81,8 +81,14 @@ def summary_of_sensors(
         "a nested integrator's picture, between the splats" if num_surfaces else None,
         f"{num_surfaces} of the scene's shapes",
     )
+    light = SimulatedEffect(
+        "light between splats and surfaces",
+        None if integrator.light == "none" else "along rays of surfaces",
+        "the integrator's light",
+    )
+    of_surfaces = [surfaces, light] if num_surfaces else [surfaces]
     said = integrator.said_by_file
-    return [*_summary_of_integrator(integrator, environment, of_cameras, said), surfaces]
+    return [*_summary_of_integrator(integrator, environment, of_cameras, said), *of_surfaces]
 
 
 def summary_of_views(

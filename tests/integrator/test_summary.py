@@ -29,7 +29,8 @@ MODULES = (
     "cameras.distortion", "cameras.fisheye", "cameras.motion", "cameras.orthographic",
     "cameras.polynomials", "cameras.radial_tangential", "cameras.thin_lens",
     "cameras.thin_prism_fisheye", "effects.defocus", "effects.features", "effects.occlusion",
-    "effects.smoothing", "integrator.background", "integrator.surfaces",
+    "effects.smoothing", "integrator.background", "integrator.light", "integrator.surfaces",
+    "light.grid", "light.walk",
     "training.effects.background", "training.effects.cameras", "training.effects.colors",
     "training.effects.depth", "training.effects.masks", "training.effects.smoothing",
     "training.effects.view_parameters", "training.image_ops",
@@ -457,8 +458,10 @@ for name, scene in (
     ("distorted", {{"sensor": sensor(type="calibrated", lens="opencv", k1=0.1)}}),
     ("thin lens", {{"sensor": sensor(type="thinlens", aperture_radius=0.1, focus_distance=2.0)}}),
     ("surface", {{"sensor": sensor(type="perspective"), "ball": {{"type": "sphere"}}}}),
+    ("light", {{"sensor": sensor(type="perspective"), "ball": {{"type": "sphere"}}}}),
 ):
     integrator = {{"type": "splats", "filename": {ply!r}}}
+    integrator |= {{"light": "rays"}} if name == "light" else {{}}
     mi.render(mi.load_dict({{"type": "scene", "integrator": integrator, **scene}}), spp=1)
     now = set(sys.modules) & set({modules!r})
     found[name] = sorted(now - known)
@@ -496,6 +499,7 @@ def test_each_effect_imports_its_own_modules(run_python, tmp_path):
         ],
         "thin lens": ["drgs.cameras.thin_lens", "drgs.effects.defocus"],
         "surface": ["drgs.effects.occlusion", "drgs.integrator.surfaces"],
+        "light": ["drgs.integrator.light", "drgs.light.grid", "drgs.light.walk"],
     }
 
 
