@@ -41,6 +41,7 @@ from drgs.integrator.properties import (
     positive,
     refuse_unknown,
     said_by_file,
+    shadows_of,
     turns_of_shapes,
 )
 from drgs.integrator.sensors import camera_from_sensor, read_sensor
@@ -141,6 +142,12 @@ class SplatsIntegrator(mi.CppADIntegrator):
        - Radiance of a splat whose colour is 1, where surfaces see it: what scales splats against
          lamps. (Default: 1)
 
+     * - shadows
+       - |string|
+       - Ids of shapes that were put among the splats, separated by commas. The colour of a splat
+         that they shade is darkened by how much less light of the scene's emitters arrives there,
+         estimated once for each splat. (Default: none)
+
      * - near
        - |float|
        - Near plane, in scene units: Gaussians whose centre is closer are culled. The sensor's
@@ -238,7 +245,8 @@ class SplatsIntegrator(mi.CppADIntegrator):
     Gaussian Splatting for Real-Time Radiance Field Rendering"). Meshes and other surfaces of the
     scene are rendered by a nested integrator; each pixel composites what that shows at the depth of
     the first surface, between the splats. Light passes from one to the other where ``light`` says
-    so; splats are not shaded by surfaces. A scene without surfaces runs no nested integrator.
+    so, and surfaces shade splats where ``shadows`` does. A scene without surfaces runs no nested
+    integrator.
 
     With one sample per pixel and a ``box`` filter, each pixel is evaluated at its centre, and both
     the picture and the gradients are the same to the last bit in every run. With more samples or
@@ -311,6 +319,7 @@ class SplatsIntegrator(mi.CppADIntegrator):
         self.nested_spp = integer(props, "nested_spp", 0, least=0)
         self.light = light_of(props, self.nested)
         self.exposure = positive(props, "exposure", 1.0)
+        self.shadows = shadows_of(props)
         self.light_samples = integer(props, "light_samples", LIGHT_SAMPLES, least=0)
         refuse_unknown(props, KNOWN)
         self._check_columns()
@@ -378,6 +387,8 @@ class SplatsIntegrator(mi.CppADIntegrator):
 
         Once a scene with ellipsoids was rendered, theirs as well; then detached.
         """
+        if self.memory.shadows is not None:
+            return self.memory.shadows.gaussians
         return self._own if self._gathered is None else self._gathered.gaussians
 
     def _gather(self, scene: mi.Scene) -> None:
@@ -402,6 +413,15 @@ class SplatsIntegrator(mi.CppADIntegrator):
                 "ellipsoidsmesh"
             )
         check_degree(self.sh_degree, self.gaussians)
+        self._shade(scene)
+
+    def _shade(self, scene: mi.Scene) -> None:
+        """Darken what lies in the shadow of surfaces."""
+        last, self.memory.shadows = self.memory.shadows, None
+        if self.shadows:
+            from drgs.integrator.shadows import Shadows
+
+            self.memory.shadows = Shadows.of(self, self.gaussians, scene, last)
 
     @property
     def _own(self) -> Gaussians:
@@ -542,14 +562,14 @@ class SplatsIntegrator(mi.CppADIntegrator):
         """Derivatives of Gaussians that surfaces show: the nested integrator leaves them out."""
         shapes = scene.shapes()
         surfaces = [shape for shape in shapes if not shape.is_ellipsoids()]
-        if self.light == "none" or not surfaces:
+        if not surfaces or (self.light == "none" and not self.shadows):
             return
         gaussians = [vars(self._own), *(mi.traverse(s) for s in shapes if s.is_ellipsoids())]
         if any(dr.grad_enabled(value) for of in gaussians for _, value in of.items()):
             raise UnsupportedError(
-                f"splats: with light '{self.light}' and surfaces, the Gaussians are not "
-                "differentiated, as surfaces show them, too; detach their parameters, or set light "
-                "to 'none'"
+                f"splats: with light '{self.light}' and shadows '{', '.join(self.shadows)}', the "
+                "Gaussians are not differentiated, as surfaces show and shade them; detach their "
+                "parameters, or set light to 'none' and leave out shadows"
             )
 
     def sample(

@@ -67,13 +67,7 @@ class LightOfSplats:
         ):
             found = replace(last, exposure=exposure, num_samples=integrator.light_samples)
         else:
-            rows = load_rows(gaussians, degree)
-            if rows.smoothing is not None:
-                from drgs.effects.smoothing import smoothed
-
-                rows = smoothed(rows)
-            cutoffs = pipeline_of(approximations, degree).model.cutoffs
-            splats = RaySplats.of(rows, degree, cutoffs)
+            splats = ray_splats_of(gaussians, approximations, degree)
             made_of = (gaussians, approximations, degree)
             found = LightOfSplats(splats, exposure, integrator.light_samples, made_of)
         integrator.memory.light = found
@@ -128,6 +122,16 @@ class LightOfSplats:
         T = self.splats.transmittance(_segment(ray, ray.maxt, active), least)
         T = dr.select(least > T, 0, dr.maximum(T, ROULETTE))
         return dr.select(active, T, 1)
+
+
+def ray_splats_of(gaussians: Gaussians, approximations: Approximations, degree: int) -> RaySplats:
+    """Gaussians as rays meet them, their smoothing filter included."""
+    rows = load_rows(gaussians, degree)
+    if rows.smoothing is not None:
+        from drgs.effects.smoothing import smoothed
+
+        rows = smoothed(rows)
+    return RaySplats.of(rows, degree, pipeline_of(approximations, degree).model.cutoffs)
 
 
 def lit(nested: mi.Integrator | None, integrator: SplatsSettings) -> mi.Integrator:

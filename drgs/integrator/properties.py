@@ -39,16 +39,8 @@ SHAPES_TO_WORLD = "shapes_to_world"
 
 KNOWN = (
     *("filename", "to_world", SHAPES_TO_WORLD, "sh_degree", "background", "hide_emitters", "near"),
-    *(
-        "srgb_primitives",
-        "nested_spp",
-        "light",
-        "light_samples",
-        "exposure",
-        "aovs",
-        "ignore",
-        "smoothing",
-    ),
+    *("srgb_primitives", "nested_spp", "light", "light_samples", "shadows", "exposure", "aovs"),
+    *("ignore", "smoothing"),
     *DECLARED,
     *PARAMETER_NAMES,
 )
@@ -74,6 +66,11 @@ def light_of(props: mi.Properties, nested: mi.Integrator | None) -> str:
             f"{nested.class_name()}; it takes max_depth, rr_depth and hide_emitters as path does"
         )
     return light
+
+
+def shadows_of(props: mi.Properties) -> tuple[str, ...]:
+    """Ids of the shapes that cast shadows on splats."""
+    return tuple(name.strip() for name in props.get("shadows", "").split(",") if name.strip())
 
 
 def refuse_unknown(props: mi.Properties, known: Sequence[str]) -> None:

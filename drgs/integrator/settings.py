@@ -34,6 +34,7 @@ class SplatsSettings(Protocol):
     nested_spp: int  # 0: as many as of the splats
     light: str  # how light passes between splats and surfaces: see drgs.integrator.properties
     light_samples: int  # splats that a ray draws; 0: it composites all
+    shadows: Sequence[str]  # ids of the shapes that cast some on splats
     exposure: float  # factor of the splats' radiance, where surfaces see it
     memory: Memory
 

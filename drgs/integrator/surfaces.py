@@ -77,7 +77,8 @@ class Surfaces:
             and _same(last.parameters, parameters)
         ):
             return last
-        return Surfaces(objects, dr.detach(parameters), _scene(objects) if has_gaussians else None)
+        apart = scene_of(objects) if has_gaussians else None
+        return Surfaces(objects, dr.detach(parameters), apart)
 
     def traced(self, scene: mi.Scene) -> mi.Scene:
         """What the nested integrator renders; scene: the one that these are of."""
@@ -109,7 +110,7 @@ def _same(parameters: list[Any], others: list[Any]) -> bool:
     return on_host[0] == on_host[1] and same_variables(parameters, dr.detach(others))
 
 
-def _scene(objects: list[mi.Object]) -> mi.Scene:
+def scene_of(objects: list[mi.Object]) -> mi.Scene:
     """Of the same objects, so that their parameters are those of the user's scene, and names."""
     names = [node.id() for node in objects]
     scene = mi.load_dict({"type": "scene", **{f"object_{k}": o for k, o in enumerate(objects)}})

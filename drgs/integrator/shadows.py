@@ -1,0 +1,195 @@
+"""Shadows of surfaces on splats.
+
+Imported where a scene asks for it. A splat's colour is that of photographs, in which an object that
+was put among the splats is not. The shadow of such objects is estimated once for each splat, and
+not for each view: with E the irradiance at its mean from the scene's lamps and environment, which
+stand for those of the photographs, and E' that without the objects, its colour is multiplied by
+
+    f = (E / E')^(1 / 2.2),
+
+in each channel: display-encoded colours are about the 2.2nd root of radiance, and f multiplies the
+harmonics. A splat faces along its shortest axis, to both sides. Light that splats weaken counts as
+little as they let through, and at least :data:`HIDDEN`, so that splats below others have a shadow.
+
+Not simulated: light that the objects reflect onto splats.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import drjit as dr
+import mitsuba as mi
+
+from drgs.core.constants import SH_C0
+from drgs.core.errors import PluginError
+from drgs.core.private import same_variables
+from drgs.gaussians.parameters import Gaussians
+from drgs.gaussians.quaternions import quat_to_rotation
+from drgs.integrator.light import ray_splats_of
+from drgs.integrator.settings import SplatsSettings
+from drgs.integrator.surfaces import Surfaces, scene_of
+from drgs.light.walk import RaySplats, Segment
+from drgs.splatting.projection import load_rows
+
+GAMMA = 2.2
+
+HIDDEN = 1 / 64
+"""Of light that splats do not let through."""
+
+SAMPLES = 64
+"""Of the scene's emitters, for each splat; a pixel shows the mean of many."""
+
+LEAST = 1 / 64
+"""Of the light without other splats, what objects hold off at least for a splat to be shaded."""
+
+AHEAD = 3.0
+"""Standard deviations of a splat, along its shortest axis, from its mean to where light is asked
+for: its own alpha does not count."""
+
+
+@dataclass(frozen=True, eq=False)
+class Shadows:
+    """Splats with shadows on them, and all that these depend on."""
+
+    gaussians: Gaussians
+    made_of: tuple[Gaussians, Surfaces, tuple[str, ...]]  # detached: held, see same_variables
+
+    @staticmethod
+    def of(
+        integrator: SplatsSettings, gaussians: Gaussians, scene: mi.Scene, last: Shadows | None
+    ) -> Shadows:
+        """Of the integrator's objects on ``gaussians``, or ``last`` if all is as it was.
+
+        Raises PluginError for the name of an object that the scene does not have.
+        """
+        gaussians, names = dr.detach(gaussians), tuple(integrator.shadows)
+        surfaces = integrator.memory.surfaces = Surfaces.of(scene, integrator.memory.surfaces)
+        if (
+            last is not None
+            and last.made_of[1:] == (surfaces, names)
+            and same_variables(last.made_of[0], gaussians)
+        ):
+            return last
+        estimate = _Estimate(
+            scene=scene_of(surfaces.objects),
+            without=scene_of(_without(surfaces.objects, names)),
+            splats=ray_splats_of(gaussians, integrator.approximations, integrator.sh_degree),
+        )
+        ratio = estimate.ratios(gaussians, integrator.sh_degree)
+        return Shadows(_darkened(gaussians, ratio), (gaussians, surfaces, names))
+
+
+def _without(objects: Sequence[mi.Object], names: Sequence[str]) -> list[mi.Object]:
+    shapes = [node.id() for node in objects if isinstance(node, mi.Shape)]
+    for name in names:
+        if name not in shapes:
+            raise PluginError(
+                f"splats: shadows must be ids of the scene's shapes, got {name!r}; there are "
+                f"{', '.join(shapes)}"
+            )
+    return [node for node in objects if node.id() not in names]
+
+
+@dataclass(frozen=True)
+class _Estimate:
+    """Irradiance of splats with and without objects."""
+
+    scene: mi.Scene
+    without: mi.Scene
+    splats: RaySplats
+
+    def ratios(self, gaussians: Gaussians, sh_degree: int) -> mi.Color3f:
+        """E / E' of each Gaussian, at most 1."""
+        rows = load_rows(gaussians, sh_degree)
+        means, normals = mi.Point3f(rows.means), _shortest_axes(rows.quats, rows.log_scales)
+        dr.eval(means, normals)
+        ratio = dr.ones(mi.Color3f, gaussians.num_gaussians)
+        if not self.scene.emitters():
+            return ratio
+        everyone = dr.arange(mi.UInt32, gaussians.num_gaussians)
+        lit, dark = self._irradiance(means, normals, everyone, SAMPLES, among_splats=False)
+        shaded = dr.compress(dr.max(dark) > LEAST * dr.max(lit + dark))
+        if dr.width(shaded) > 0:
+            place = [dr.gather(type(v), v, shaded) for v in (means, normals)]
+            lit, dark = self._irradiance(*place, shaded, SAMPLES, among_splats=True)
+            found = dr.select(lit + dark > 0, lit / (lit + dark), 1)
+            dr.scatter(ratio, found, shaded)
+        dr.eval(ratio)
+        return ratio
+
+    def _irradiance(
+        self,
+        points: mi.Point3f,
+        normals: mi.Vector3f,
+        row: mi.UInt32,
+        count: int,
+        among_splats: bool,
+    ) -> tuple[mi.Color3f, mi.Color3f]:
+        """What arrives, and what the objects hold off; row: seeds, so that each has its own."""
+        sampler = mi.load_dict({"type": "independent"})
+        sampler.seed(0, dr.width(points))
+        place = dr.zeros(mi.SurfaceInteraction3f, dr.width(points))
+        place.p = points
+
+        def body(k: mi.UInt32, lit: mi.Color3f, dark: mi.Color3f, sampler: mi.Sampler) -> tuple:
+            ds, weight = self.scene.sample_emitter_direction(place, sampler.next_2d(), False, True)
+            cosine = dr.dot(normals, ds.d)  # the normal is as long as the splat is thick
+            start = points + AHEAD * dr.sign(cosine) * normals
+            ray = mi.Ray3f(start, ds.d, ds.dist * (1 - mi.math.ShadowEpsilon), 0, [])
+            weight *= dr.abs(cosine) * dr.rcp(dr.norm(normals))
+            if among_splats:
+                weight *= self._let_through(ray, sampler.next_1d())
+            is_lit = ~self.scene.ray_test(ray)
+            is_held = ~is_lit & ~self.without.ray_test(ray)
+            lit = lit + dr.select(is_lit, weight, 0)
+            dark = dark + dr.select(is_held, weight, 0)
+            return k + 1, lit, dark, sampler
+
+        zero = dr.zeros(mi.Color3f, dr.width(points))
+        _, lit, dark, _ = dr.while_loop(
+            state=(mi.UInt32(0), zero, mi.Color3f(zero), sampler),
+            cond=lambda k, lit, dark, sampler: k < count,
+            body=body,
+        )
+        dr.eval(lit, dark)
+        return lit, dark
+
+    def _let_through(self, ray: mi.Ray3f, sample: mi.Float) -> mi.Float:
+        """HIDDEN and 1: nothing in between, but so on average."""
+        segment = Segment(mi.Vector3f(ray.o), mi.Vector3f(ray.d), ray.maxt, dr.full(mi.Bool, True))
+        T = self.splats.transmittance(segment, sample)
+        return dr.select(sample > T, HIDDEN, mi.Float(1))
+
+
+def _shortest_axes(quats: mi.Vector4f, log_scales: mi.Vector3f) -> mi.Vector3f:
+    """Directions in which splats are thinnest, as long as they are thick."""
+    rotation = quat_to_rotation(quats)
+    axes = [mi.Vector3f([rotation[row, k] for row in range(3)]) for k in range(3)]
+    shortest, thickness = axes[0], log_scales[0]
+    for axis, scale in zip(axes[1:], log_scales[1:], strict=True):
+        is_shorter = scale < thickness
+        shortest = dr.select(is_shorter, axis, shortest)
+        thickness = dr.select(is_shorter, scale, thickness)
+    return shortest * dr.exp(thickness)
+
+
+def _darkened(gaussians: Gaussians, ratio: mi.Color3f) -> Gaussians:
+    """Colours times ratio^(1 / GAMMA): of 0.5 + basis x coefficients."""
+    factor = [dr.power(channel, 1 / GAMMA) for channel in ratio]
+
+    def scaled(tensor: mi.TensorXf, of_half: float) -> mi.TensorXf:
+        flat, width = tensor.array, tensor.shape[1] * 3
+        if width == 0:
+            return tensor
+        element = dr.arange(mi.UInt32, dr.width(flat))
+        row, channel = element // width, element % 3
+        f = dr.zeros(mi.Float, dr.width(flat))
+        for k, values in enumerate(factor):
+            f = dr.select(channel == k, dr.gather(mi.Float, values, row), f)
+        return mi.TensorXf(f * flat + (f - 1) * of_half, tensor.shape)
+
+    found = replace(gaussians, sh0=scaled(gaussians.sh0, 0.5 / SH_C0), shN=scaled(gaussians.shN, 0))
+    dr.eval(found.sh0, found.shN)
+    return found

@@ -1,0 +1,131 @@
+"""Shadows of surfaces on splats, against closed forms."""
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+import drgs  # noqa: F401  (registers the plugins)
+from drgs.core.errors import PluginError, UnsupportedError
+from drgs.integrator import shadows
+from drgs.integrator.shadows import GAMMA
+from drgs.reference import splatting
+
+
+@pytest.fixture(autouse=True)
+def variant():
+    mi.set_variant("llvm_ad_rgb")
+
+
+def discs(means, degree=1):
+    """Thin, faint and grey, in the plane of x and y, with some harmonics."""
+    n, rng = len(means), np.random.default_rng(0)
+    return {
+        "means": means,
+        "quats": np.tile([1.0, 0, 0, 0], (n, 1)),
+        "log_scales": np.tile(np.log([0.02, 0.02, 0.0005]), (n, 1)),
+        "logit_opacities": np.full(n, np.log(0.01 / 0.99)),
+        "sh0": np.full((n, 1, 3), 0.1),
+        "shN": rng.normal(0, 0.1, (n, (degree + 1) ** 2 - 1, 3)),
+    }
+
+
+def scene_of(values, shadows, **objects):
+    T = mi.ScalarTransform4f
+    tensors = {k: mi.TensorXf(v.astype(np.float32)) for k, v in values.items()}
+    film = {"type": "hdrfilm", "width": 8, "height": 8, "rfilter": {"type": "box"}}
+    return mi.load_dict(
+        {
+            "type": "scene",
+            "integrator": {"type": "splats", "shadows": shadows, **tensors},
+            "sensor": {
+                "type": "perspective",
+                "to_world": T().look_at([0, -2, 1], [0, 0, 0], [0, 0, 1]),
+                "film": film,
+            },
+            **objects,
+        }
+    )
+
+
+def disc(height, radius):
+    T = mi.ScalarTransform4f
+    return {"type": "disk", "to_world": T().translate([0, 0, height]).scale(radius)}
+
+
+def factors(scene):
+    """By which colours of 0.5 + 0.282 sh0 were multiplied, and harmonics."""
+    integrator = scene.integrator()
+    mi.render(scene)
+    before = 0.5 + splatting.C_00 * np.array(integrator.sh0)[:, 0]
+    after = 0.5 + splatting.C_00 * np.array(integrator.gaussians.sh0)[:, 0]
+    higher = np.array(integrator.gaussians.shN) / np.array(integrator.shN)
+    return after / before, higher
+
+
+SKY = {"type": "constant"}
+
+
+@pytest.mark.parametrize(("height", "radius"), [(1.0, 1.0), (0.5, 0.2), (2.0, 6.0)])
+def test_a_disc_holds_off_its_part_of_the_sky(height, radius, monkeypatch):
+    """1 - sin^2 of half the angle under which it is seen (Lambert)."""
+    monkeypatch.setattr(shadows, "SAMPLES", 512)  # the quotient of few is biased by a hundredth
+    means = np.random.default_rng(1).normal(0, 0.01, (150, 3)) * [1, 1, 0.01]
+    factor, higher = factors(
+        scene_of(discs(means), "lid", lid=disc(height, radius), sky=SKY, floor=disc(-0.05, 50.0))
+    )
+    expected = height**2 / (height**2 + radius**2)
+    assert np.mean(factor**GAMMA) == pytest.approx(expected, abs=0.01)
+    np.testing.assert_allclose(higher, factor[:, None, :] * np.ones_like(higher), rtol=1e-4)
+
+
+def test_a_lamp_is_shaded_where_the_object_is_before_it():
+    """Sharply, as it is a point: behind the edge of the shadow all is as it was."""
+    x = np.linspace(-2, 2, 81)
+    means = np.stack([x, 0 * x, 0 * x], axis=1)
+    lamp = {"type": "point", "position": [0.0, 0.0, 4.0]}
+    factor, _ = factors(
+        scene_of(discs(means), "lid", lid=disc(2.0, 0.5), lamp=lamp, floor=disc(-0.05, 50.0))
+    )
+    inside = np.abs(x) < 0.98
+    np.testing.assert_allclose(factor[inside], 0, atol=1e-6)
+    np.testing.assert_array_equal(factor[np.abs(x) > 1.02], 1)
+
+
+def test_objects_that_are_not_named_cast_no_shadow():
+    means = np.zeros((10, 3))
+    objects = {
+        "lid": disc(1.0, 1.0),
+        "other": disc(3.0, 0.1),
+        "sky": SKY,
+        "floor": disc(-0.05, 50.0),
+    }
+    factor, _ = factors(scene_of(discs(means), "other", **objects))
+    np.testing.assert_array_equal(factor, 1)  # it is behind the lid
+
+
+def test_shadows_are_kept_until_something_changes():
+    scene = scene_of(
+        discs(np.zeros((4, 3))), "lid", lid=disc(1.0, 1.0), sky=SKY, floor=disc(-0.05, 50.0)
+    )
+    mi.render(scene)
+    first = scene.integrator().memory.shadows
+    mi.render(scene)
+    assert scene.integrator().memory.shadows is first
+    params = mi.traverse(scene)
+    params["lid.to_world"] = mi.Transform4f().translate([5, 0, 1]).scale(0.1)
+    params.update()
+    mi.render(scene)
+    assert scene.integrator().memory.shadows is not first
+
+
+def test_unknown_shapes_and_derivatives_are_refused():
+    scene = scene_of(discs(np.zeros((4, 3))), "lit", lid=disc(1.0, 1.0), sky=SKY)
+    with pytest.raises(PluginError, match="ids of the scene's shapes, got 'lit'; there are lid"):
+        scene.integrator().render(scene)
+    scene = scene_of(discs(np.zeros((4, 3))), "lid", lid=disc(1.0, 1.0), sky=SKY)
+    params = mi.traverse(scene)
+    dr.enable_grad(params["integrator.sh0"])
+    params.update()
+    with pytest.raises((UnsupportedError, RuntimeError), match="shadows 'lid'"):
+        dr.backward(dr.mean(mi.render(scene, params).array))
