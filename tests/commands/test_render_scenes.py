@@ -129,7 +129,7 @@ def test_the_shipped_scene_shows_objects_among_splats(tmp_path):
     """Some pixels show what is seen there without the model, others do not."""
     path = REPOSITORY / "scenes" / "hybrid.xml"
     values = {"model": str(REPOSITORY / "scenes" / "shapes" / "knot.ply"), "spp": "4"}
-    values |= {"width": "60", "height": "40"}
+    values |= {"width": "60", "height": "40", "light": "none", "shadows": ""}
     definitions = [word for name in values for word in ("-D", f"{name}={values[name]}")]
     run(path, *definitions, "--out", tmp_path)
     shown = np.array(read_exr(tmp_path / "hybrid.exr"))
