@@ -66,7 +66,7 @@ def stage_costs(launches: dict[str, list[CountedLaunch]]) -> dict[str, StageCost
 
 
 def loop_cost(launches: list[CountedLaunch], width: int) -> LoopCost:
-    """Of the loop in the kernel of a stage that takes longest.
+    """Of the loop in the kernel of a stage that takes longest, in all launches of that kernel.
 
     Raises :class:`MachineCodeError` where it cannot be had.
     """
@@ -86,5 +86,10 @@ def loop_cost(launches: list[CountedLaunch], width: int) -> LoopCost:
         stack_loads=found.stack_loads / PIXELS,
         stack_stores=found.stack_stores / PIXELS,
         constants=found.constants / PIXELS,
-        steps=sum(vector_trips(trips, width) for trips in longest.trips),
+        steps=sum(
+            vector_trips(trips, width)
+            for counted in launches
+            if counted.launch.ir == longest.launch.ir
+            for trips in counted.trips
+        ),
     )
