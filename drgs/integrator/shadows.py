@@ -16,7 +16,7 @@ Not simulated: light that the objects reflect onto splats.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import drjit as dr
@@ -75,9 +75,9 @@ class Shadows:
         estimate = _Estimate(
             scene=scene_of(surfaces.objects),
             without=scene_of(_without(surfaces.objects, names)),
-            splats=ray_splats_of(gaussians, integrator.approximations, integrator.sh_degree),
+            splats=ray_splats_of(gaussians, integrator.approximations, degree=0),
         )
-        ratio = estimate.ratios(gaussians, integrator.sh_degree)
+        ratio = estimate.ratios(gaussians)
         return Shadows(_darkened(gaussians, ratio), (gaussians, surfaces, names))
 
 
@@ -100,20 +100,19 @@ class _Estimate:
     without: mi.Scene
     splats: RaySplats
 
-    def ratios(self, gaussians: Gaussians, sh_degree: int) -> mi.Color3f:
+    def ratios(self, gaussians: Gaussians) -> mi.Color3f:
         """E / E' of each Gaussian, at most 1."""
-        rows = load_rows(gaussians, sh_degree)
+        rows = load_rows(gaussians, sh_degree=0)
         means, normals = mi.Point3f(rows.means), _shortest_axes(rows.quats, rows.log_scales)
         dr.eval(means, normals)
         ratio = dr.ones(mi.Color3f, gaussians.num_gaussians)
         if not self.scene.emitters():
             return ratio
-        everyone = dr.arange(mi.UInt32, gaussians.num_gaussians)
-        lit, dark = self._irradiance(means, normals, everyone, SAMPLES, among_splats=False)
+        lit, dark = self._irradiance(means, normals, _unhindered)
         shaded = dr.compress(dr.max(dark) > LEAST * dr.max(lit + dark))
         if dr.width(shaded) > 0:
             place = [dr.gather(type(v), v, shaded) for v in (means, normals)]
-            lit, dark = self._irradiance(*place, shaded, SAMPLES, among_splats=True)
+            lit, dark = self._irradiance(*place, self._let_through)
             found = dr.select(lit + dark > 0, lit / (lit + dark), 1)
             dr.scatter(ratio, found, shaded)
         dr.eval(ratio)
@@ -123,11 +122,9 @@ class _Estimate:
         self,
         points: mi.Point3f,
         normals: mi.Vector3f,
-        row: mi.UInt32,
-        count: int,
-        among_splats: bool,
+        let_through: Callable[[mi.Ray3f, mi.Float], mi.Float],
     ) -> tuple[mi.Color3f, mi.Color3f]:
-        """What arrives, and what the objects hold off; row: seeds, so that each has its own."""
+        """What arrives, and what the objects hold off; let_through: by the splats, on a ray."""
         sampler = mi.load_dict({"type": "independent"})
         sampler.seed(0, dr.width(points))
         place = dr.zeros(mi.SurfaceInteraction3f, dr.width(points))
@@ -139,8 +136,7 @@ class _Estimate:
             start = points + AHEAD * dr.sign(cosine) * normals
             ray = mi.Ray3f(start, ds.d, ds.dist * (1 - mi.math.ShadowEpsilon), 0, [])
             weight *= dr.abs(cosine) * dr.rcp(dr.norm(normals))
-            if among_splats:
-                weight *= self._let_through(ray, sampler.next_1d())
+            weight *= let_through(ray, sampler.next_1d())
             is_lit = ~self.scene.ray_test(ray)
             is_held = ~is_lit & ~self.without.ray_test(ray)
             lit = lit + dr.select(is_lit, weight, 0)
@@ -150,7 +146,7 @@ class _Estimate:
         zero = dr.zeros(mi.Color3f, dr.width(points))
         _, lit, dark, _ = dr.while_loop(
             state=(mi.UInt32(0), zero, mi.Color3f(zero), sampler),
-            cond=lambda k, lit, dark, sampler: k < count,
+            cond=lambda k, lit, dark, sampler: k < SAMPLES,
             body=body,
         )
         dr.eval(lit, dark)
@@ -161,6 +157,12 @@ class _Estimate:
         segment = Segment(mi.Vector3f(ray.o), mi.Vector3f(ray.d), ray.maxt, dr.full(mi.Bool, True))
         T = self.splats.transmittance(segment, sample)
         return dr.select(sample > T, HIDDEN, mi.Float(1))
+
+
+def _unhindered(ray: mi.Ray3f, sample: mi.Float) -> mi.Float:
+    """As if there were no splats."""
+    del ray, sample
+    return mi.Float(1)
 
 
 def _shortest_axes(quats: mi.Vector4f, log_scales: mi.Vector3f) -> mi.Vector3f:

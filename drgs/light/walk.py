@@ -145,13 +145,12 @@ class RaySplats:
         def choose(at: _Place, chosen: list) -> tuple:
             at, row, peak, log2_alpha = walk.next(at)
             alpha = walk.alpha(log2_alpha)
-            draws = _uniform(row, seed, count)
-            pairs = [
-                (is_nearer, row_, peak_)
-                for (row_, peak_), u in zip(chosen, draws, strict=True)
-                for is_nearer in [(u < alpha) & (peak < peak_)]
-            ]
-            return at, [[dr.select(n, row, r), dr.select(n, peak, p)] for n, r, p in pairs]
+            nearest = []
+            for (last_row, last_peak), u in zip(chosen, _uniform(row, seed, count), strict=True):
+                is_nearer = (u < alpha) & (peak < last_peak)
+                kept = dr.select(is_nearer, row, last_row), dr.select(is_nearer, peak, last_peak)
+                nearest.append([*kept])
+            return at, nearest
 
         def body(at: _Place, chosen: list) -> tuple:
             return dr.while_loop(

@@ -8,6 +8,7 @@ from support.helpers import rows
 
 import drgs  # noqa: F401  (registers the plugins)
 from drgs.core.errors import UnsupportedError
+from drgs.integrator.light import DECODED_WITHIN, DECODING
 from drgs.reference import light as reference
 from drgs.reference import splatting
 
@@ -250,6 +251,12 @@ def test_drawn_splats_have_the_colour_of_all_on_average(color):
     error = mean.std((0, 1)) / np.sqrt(64)
     assert (error < 2e-3).all() and exact.max() > 1.5e-3
     np.testing.assert_allclose(mean.mean((0, 1)), exact, atol=2e-3 + 5 * error.max())
+
+
+def test_the_sum_of_powers_decodes_within_what_is_said():
+    color = np.linspace(0, 1, 1001)
+    found = sum(factor * color**k for k, factor in enumerate(DECODING, 1))
+    assert np.abs(found - linear(color)).max() < DECODED_WITHIN
 
 
 def test_glass_that_does_not_refract_changes_nothing():

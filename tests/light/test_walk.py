@@ -97,6 +97,8 @@ def passed(splats, rays, precision):
 
 
 TOLERANCE = {np.float64: 1e-11, np.float32: 2e-4}
+"""Of a transmittance. An offset of 30 from a needle 1e-3 thick is 3e4 standard deviations, whose
+rounding of 6e-8 moves its alpha by 2e-3 of itself; of colours up to 3, three times as much."""
 
 
 @both_precisions
