@@ -174,7 +174,7 @@ class _Boxes:
 
     def count(self, level: int, resolution: int) -> int:
         """Cells of a level that are in boxes around the ellipsoids."""
-        return int(dr.sum(dr.prod(self._ranges(level, resolution)[1]))[0])
+        return int(np.array(dr.prod(self._ranges(level, resolution)[1])).sum(dtype=np.int64))
 
     def grid(self, levels: int, resolution: int) -> SplatGrid:
         """Sorted by cell, and in a cell by Gaussian."""
@@ -183,9 +183,13 @@ class _Boxes:
         made = [self._entries(level, resolution) for level in range(levels)]
         rows, cells = (dr.concat([each[k] for each in made]) for k in (0, 1))
         num_cells, count = levels * resolution**3, dr.width(rows)
-        order = dr.argsort(cells)
-        rows, cells = (dr.gather(t.UInt32, column, order) for column in (rows, cells))
-        starts = np.array(lower_bounds(cells, count, num_cells)).astype(np.int64)
+        starts = np.zeros(num_cells + 1, np.int64)
+        if count > 0:
+            order = dr.argsort(cells)
+            rows, cells = (dr.gather(t.UInt32, column, order) for column in (rows, cells))
+            starts = np.array(lower_bounds(cells, count, num_cells)).astype(np.int64)
+        else:
+            rows = dr.zeros(t.UInt32, 1)  # in no list: Dr.Jit does not compute with empty arrays
         grid = SplatGrid(
             t.Array3f(*(dr.opaque(Float, float(c)) for c in self.center)),
             dr.opaque(Float, float(self.size)),

@@ -1,6 +1,6 @@
 """What rays pass of splats, against a reference that looks at every splat."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import drjit as dr
 import numpy as np
@@ -118,3 +118,18 @@ def test_rays_pass_what_the_reference_says(precision, count, spread, size):
     # Asked alone, it is that of all, down to where nothing shows.
     ends = reference.pass_splats(gaussians, rays.origins, rays.directions, rays.far, stop=0)
     np.testing.assert_allclose(alone[sure], ends.transmittances[sure], atol=tolerance + 1e-4)
+
+
+@both_precisions
+def test_splats_that_do_not_show_let_everything_through(precision):
+    """And so do Gaussians that are not finite, beside one that is."""
+    gaussians, rays = random_gaussians(20), random_rays(50)
+    faint = replace(gaussians, logit_opacities=np.full(20, -9.0))
+    color, T, alone = passed(splats_of(faint, precision), rays, precision)
+    assert not color.any() and (T == 1).all() and (alone == 1).all()
+
+    broken = replace(gaussians, means=np.where(np.arange(20)[:, None] > 0, np.nan, gaussians.means))
+    first = splatting.Gaussians(**{k: v[:1] for k, v in vars(gaussians).items()})
+    found, expected = (passed(splats_of(g, precision), rays, precision) for g in (broken, first))
+    for array, other in zip(found, expected, strict=True):
+        np.testing.assert_allclose(array, other, atol=TOLERANCE[precision.dtype])
