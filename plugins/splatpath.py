@@ -13,8 +13,10 @@ import drjit as dr
 import mitsuba as mi
 from mitsuba.ad.integrators.common import RBIntegrator, mis_weight, solid_angle_to_area_jacobian
 
+from drgs.integrator.legs import Leg
+
 if TYPE_CHECKING:
-    from drgs.integrator.light import LightOfSplats
+    from drgs.integrator.legs import Light
 
 UNBOUNDED = 0xFFFFFFFF
 """What Mitsuba's integrators take a ``max_depth`` of -1 for."""
@@ -80,7 +82,7 @@ class SplatPathIntegrator(RBIntegrator):
         super().__init__(props)
         if "max_depth" not in props:
             self.max_depth = UNBOUNDED
-        self.light: LightOfSplats | None = None  # of the integrator that this one is nested in
+        self.light: Light | None = None  # of the integrator that this one is nested in
 
     @dr.syntax
     def sample(
@@ -104,7 +106,7 @@ class SplatPathIntegrator(RBIntegrator):
         is_seen = mi.Bool(not self.hide_emitters and scene.environment() is not None)
 
         while dr.hint(path.active, max_iterations=self.max_depth, label=f"splatpath ({mode.name})"):
-            passed = self._pass_splats(path, sampler)
+            passed = self._pass_splats(scene, path, sampler)
             with dr.resume_grad(when=not primal):
                 si = path.vertex(attached=not primal)
             emitted = self._emitted(scene, path, si, primal)
@@ -171,7 +173,8 @@ class SplatPathIntegrator(RBIntegrator):
         active = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
         ds, weight = scene.sample_emitter_direction(si, sampler.next_2d(), True, active)
         active &= ds.pdf != 0
-        let_through = self._let_through(si.spawn_ray_to(ds.p), sampler, active)
+        leg = Leg(si.spawn_ray_to(ds.p), si.shape, ds.emitter, ds.pdf)
+        let_through = self._let_through(leg, sampler, active)
         with dr.resume_grad(when=not primal):
             if not primal:
                 ds, weight = _attached(scene, si, ds, weight, active)
@@ -215,23 +218,22 @@ class SplatPathIntegrator(RBIntegrator):
     # Splats
     # ------------------------------------------------------------------------------------------
 
-    def _pass_splats(self, path: _Path, sampler: mi.Sampler) -> mi.Spectrum:
+    def _pass_splats(self, scene: mi.Scene, path: _Path, sampler: mi.Sampler) -> mi.Spectrum:
         """What splats up to the vertex send along the path; what is behind them is weakened."""
         if self.light is None:
             return mi.Spectrum(0)
-        far = dr.select(path.hit.is_valid(), path.hit.t, dr.inf)
         radiance, let_through = self.light.passed(
-            path.ray, far, sampler.next_1d(), path.active & ~path.straight
+            path.leg(scene), sampler.next_1d(), path.active & ~path.straight
         )
         radiance = path.throughput * radiance
         path.throughput = path.throughput * let_through
         return radiance
 
-    def _let_through(self, ray: mi.Ray3f, sampler: mi.Sampler, active: mi.Bool) -> mi.Float:
-        """Of the light that comes from where a ray ends."""
+    def _let_through(self, leg: Leg, sampler: mi.Sampler, active: mi.Bool) -> mi.Float:
+        """Of the light of an emitter."""
         if self.light is None:
             return mi.Float(1)
-        return self.light.transmittance(ray, sampler.next_1d(), active)
+        return self.light.transmittance(leg, sampler.next_1d(), active)
 
     # ------------------------------------------------------------------------------------------
     # Surfaces
@@ -264,6 +266,14 @@ class _Path:
     last_si: mi.SurfaceInteraction3f
     last_pdf: mi.Float  # of the direction
     last_is_delta: mi.Bool
+
+    def leg(self, scene: mi.Scene) -> Leg:
+        """That has led here."""
+        ray, hits = mi.Ray3f(self.ray), self.hit.is_valid()
+        ray.maxt = dr.select(hits, self.hit.t, dr.inf)
+        emitter = dr.select(hits, self.hit.shape.emitter(), scene.environment())
+        pdf = dr.select(self.last_is_delta, dr.inf, self.last_pdf)
+        return Leg(ray, self.last_hit.shape, emitter, pdf)
 
     def vertex(self, attached: bool) -> mi.SurfaceInteraction3f:
         """Where the path is; attached: to the surfaces of this vertex and the one before."""

@@ -26,6 +26,7 @@ from drgs.integrator.properties import (
     AOVS,
     KNOWN,
     LIGHT_SAMPLES,
+    UNSEEN,
     aovs_of,
     approximations_of,
     background_of,
@@ -33,15 +34,17 @@ from drgs.integrator.properties import (
     check_degree,
     check_shapes,
     degree_of,
+    ids_of,
     ignored_effects,
     integer,
     light_of,
     load_gaussians,
     nested_integrator,
+    one_of,
     positive,
+    probes_of,
     refuse_unknown,
     said_by_file,
-    shadows_of,
     turns_of_shapes,
 )
 from drgs.integrator.sensors import camera_from_sensor, read_sensor
@@ -130,12 +133,25 @@ class SplatsIntegrator(mi.CppADIntegrator):
        - How light passes between splats and surfaces. ``none``: not at all. ``rays``: the rays of
          the nested integrator, which must be ``splatpath``, pass the splats from the first surface
          on: surfaces reflect them, show them bent, take on their colours, and lie in their shadow.
-         (Default: ``none``)
+         ``probe``: the same for objects that are named by ``probes``, whose rays look at pictures
+         of the splats from the middle of the object. (Default: ``none``)
+
+     * - probes
+       - |string|
+       - Ids of shapes and emitters, separated by commas, that have a probe where ``light`` is
+         ``probe``. Rays that leave such a shape meet splats; rays to such an emitter are weakened
+         by them. (Default: none)
+
+     * - unseen
+       - |string|
+       - What rays meet where a probe cannot tell, as it lies behind what the middle of the object
+         sees. ``none``: nothing. ``rays``: what they do where ``light`` is ``rays``, which takes
+         longer, but is needed where splats are close to the object. (Default: ``none``)
 
      * - light_samples
        - |int|
-       - Splats that a ray draws, of those that it passes, where ``light`` is ``rays``; 0: it
-         composites all. (Default: 4)
+       - Splats that a ray draws, of those that it passes, where ``light`` or ``unseen`` is
+         ``rays``; 0: it composites all. (Default: 4)
 
      * - exposure
        - |float|
@@ -319,7 +335,9 @@ class SplatsIntegrator(mi.CppADIntegrator):
         self.nested_spp = integer(props, "nested_spp", 0, least=0)
         self.light = light_of(props, self.nested)
         self.exposure = positive(props, "exposure", 1.0)
-        self.shadows = shadows_of(props)
+        self.probes = probes_of(props, self.light)
+        self.unseen = one_of(props, "unseen", UNSEEN)
+        self.shadows = ids_of(props, "shadows")
         self.light_samples = integer(props, "light_samples", LIGHT_SAMPLES, least=0)
         refuse_unknown(props, KNOWN)
         self._check_columns()

@@ -69,6 +69,7 @@ class Memory:
     traced: dict[int, TracedSurfaces] = field(default_factory=dict)
     surfaces: Any = None  # drgs.integrator.surfaces.Surfaces of the last scene that had some
     light: Any = None  # drgs.integrator.light.LightOfSplats of the last scene that asked for it
+    probes: Any = None  # of the last scene that asked for some: see drgs.integrator.probes
     shadows: Any = None  # drgs.integrator.shadows.Shadows of the last scene that asked for them
     film_maps: dict[str, np.ndarray] = field(default_factory=dict)  # see drgs.integrator.film
 

@@ -29,6 +29,7 @@ from drgs.accuracy.pipeline import pipeline_of
 from drgs.config.approximations import Approximations
 from drgs.core.private import same_variables
 from drgs.gaussians.parameters import Gaussians
+from drgs.integrator.legs import Leg, Unlit
 from drgs.integrator.settings import SplatsSettings
 from drgs.light.walk import RaySplats, Segment
 from drgs.splatting.projection import load_rows
@@ -47,7 +48,7 @@ few splats make a ray dark, and many more are behind them."""
 
 @dataclass(frozen=True, eq=False)
 class LightOfSplats:
-    """What rays of a scene pass of its splats."""
+    """What rays pass of the splats themselves."""
 
     splats: RaySplats
     exposure: mi.Float  # (1,): factor of the splats' radiance
@@ -73,14 +74,9 @@ class LightOfSplats:
         integrator.memory.light = found
         return found
 
-    def passed(
-        self, ray: mi.Ray3f, far: mi.Float, sample: mi.Float, active: mi.Bool
-    ) -> tuple[mi.Color3f, mi.Float]:
-        """Radiance of the splats up to ``far`` along rays, linear, and what they let through.
-
-        sample: in 0..1, of each ray.
-        """
-        segment = _segment(ray, far, active)
+    def passed(self, leg: Leg, sample: mi.Float, active: mi.Bool) -> tuple[mi.Color3f, mi.Float]:
+        """See :meth:`drgs.integrator.legs.Light.passed`."""
+        segment = _segment(leg.ray, active)
         look = self._sampled if self.num_samples else self._composited
         color, coverage = look(segment, sample)
         radiance = color * (self.exposure * coverage)
@@ -112,14 +108,14 @@ class LightOfSplats:
         a, b, c = DECODING
         return a * mean + b * square + c * cube, hits / self.num_samples
 
-    def transmittance(self, ray: mi.Ray3f, sample: mi.Float, active: mi.Bool) -> mi.Float:
-        """An estimate of that of the splats up to where rays end.
+    def transmittance(self, leg: Leg, sample: mi.Float, active: mi.Bool) -> mi.Float:
+        """An estimate of that of the splats along legs.
 
         Below :data:`ROULETTE`, Russian roulette: a ray that lets through less than ``sample`` (in
         0..1) times that is dark, and all others let through as much as that.
         """
         least = sample * ROULETTE
-        T = self.splats.transmittance(_segment(ray, ray.maxt, active), least)
+        T = self.splats.transmittance(_segment(leg.ray, active), least)
         T = dr.select(least > T, 0, dr.maximum(T, ROULETTE))
         return dr.select(active, T, 1)
 
@@ -134,14 +130,25 @@ def ray_splats_of(gaussians: Gaussians, approximations: Approximations, degree: 
     return RaySplats.of(rows, degree, pipeline_of(approximations, degree).model.cutoffs)
 
 
-def lit(nested: mi.Integrator | None, integrator: SplatsSettings) -> mi.Integrator:
-    """The nested integrator, with the splats of the one that it is nested in."""
+def lit(integrator: SplatsSettings, scene: mi.Scene, num_paths: int) -> mi.Integrator:
+    """The nested integrator, with the splats of the one that it is nested in.
+
+    num_paths: of a pixel.
+    """
+    nested = integrator.nested
     if nested is None:
         settings = {"type": "splatpath", "hide_emitters": integrator.hide_emitters}
         nested = mi.load_dict(settings)
-    nested.light = LightOfSplats.of(integrator)
+    if integrator.light == "rays":
+        nested.light = LightOfSplats.of(integrator)
+    else:
+        from drgs.integrator.probes import LightOfProbes
+
+        traces = integrator.unseen == "rays"
+        unseen = LightOfSplats.of(integrator) if traces else Unlit()
+        nested.light = LightOfProbes.of(integrator, scene, num_paths, unseen)
     return nested
 
 
-def _segment(ray: mi.Ray3f, far: mi.Float, active: mi.Bool) -> Segment:
-    return Segment(mi.Vector3f(ray.o), mi.Vector3f(ray.d), mi.Float(far), mi.Bool(active))
+def _segment(ray: mi.Ray3f, active: mi.Bool) -> Segment:
+    return Segment(mi.Vector3f(ray.o), mi.Vector3f(ray.d), mi.Float(ray.maxt), mi.Bool(active))

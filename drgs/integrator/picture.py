@@ -177,7 +177,8 @@ def hybrid_of(
     else:
         from drgs.integrator.light import lit
 
-        nested = lit(integrator.nested, integrator)
+        num_paths = integrator.nested_spp or spp or sensor.sampler().sample_count()
+        nested = lit(integrator, scene, num_paths)
     insertion = Insertion(
         sensor.film(),
         memory.film_maps,

@@ -39,8 +39,8 @@ SHAPES_TO_WORLD = "shapes_to_world"
 
 KNOWN = (
     *("filename", "to_world", SHAPES_TO_WORLD, "sh_degree", "background", "hide_emitters", "near"),
-    *("srgb_primitives", "nested_spp", "light", "light_samples", "shadows", "exposure", "aovs"),
-    *("ignore", "smoothing"),
+    *("srgb_primitives", "nested_spp", "light", "light_samples", "probes", "shadows", "exposure"),
+    *("unseen", "aovs", "ignore", "smoothing"),
     *DECLARED,
     *PARAMETER_NAMES,
 )
@@ -51,15 +51,16 @@ KNOWN = (
 LIGHT_SAMPLES = 4
 """Splats that a ray of ``light: rays`` draws."""
 
-LIGHTS = ("none", "rays")
+LIGHTS = ("none", "probe", "rays")
 """How light passes between splats and surfaces."""
+
+UNSEEN = ("none", "rays")
+"""What probes do not see."""
 
 
 def light_of(props: mi.Properties, nested: mi.Integrator | None) -> str:
     """How light passes between splats and surfaces, of :data:`LIGHTS`."""
-    light = props.get("light", LIGHTS[0])
-    if light not in LIGHTS:
-        raise PluginError(f"splats: light must be one of {', '.join(LIGHTS)}, got {light!r}")
+    light = one_of(props, "light", LIGHTS)
     if light != LIGHTS[0] and nested is not None and not isinstance(nested, LitIntegrator):
         raise PluginError(
             f"splats: with light '{light}', the nested integrator must be splatpath, got "
@@ -68,9 +69,19 @@ def light_of(props: mi.Properties, nested: mi.Integrator | None) -> str:
     return light
 
 
-def shadows_of(props: mi.Properties) -> tuple[str, ...]:
-    """Ids of the shapes that cast shadows on splats."""
-    return tuple(name.strip() for name in props.get("shadows", "").split(",") if name.strip())
+def ids_of(props: mi.Properties, name: str) -> tuple[str, ...]:
+    """Ids of objects of the scene, separated by commas."""
+    return tuple(part.strip() for part in props.get(name, "").split(",") if part.strip())
+
+
+def probes_of(props: mi.Properties, light: str) -> tuple[str, ...]:
+    """Ids of the objects that have a probe."""
+    names = ids_of(props, "probes")
+    if light == "probe" and not names:
+        raise PluginError(
+            "splats: with light 'probe', probes must be ids of shapes and emitters, got none"
+        )
+    return names
 
 
 def refuse_unknown(props: mi.Properties, known: Sequence[str]) -> None:

@@ -34,6 +34,8 @@ class SplatsSettings(Protocol):
     nested_spp: int  # 0: as many as of the splats
     light: str  # how light passes between splats and surfaces: see drgs.integrator.properties
     light_samples: int  # splats that a ray draws; 0: it composites all
+    probes: Sequence[str]  # ids of the shapes and emitters that have one
+    unseen: str  # what rays meet that probes do not see
     shadows: Sequence[str]  # ids of the shapes that cast some on splats
     exposure: float  # factor of the splats' radiance, where surfaces see it
     memory: Memory
@@ -57,7 +59,7 @@ class SplatsSettings(Protocol):
 class LitIntegrator(Protocol):
     """An integrator whose rays pass splats, as ``splatpath`` does."""
 
-    light: Any  # drgs.integrator.light.LightOfSplats, once it is rendered; None before
+    light: Any  # drgs.integrator.legs.Light, once it is rendered; None before
 
 
 @runtime_checkable

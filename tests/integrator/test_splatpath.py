@@ -310,5 +310,5 @@ def test_what_would_be_wrong_is_refused():
         dr.backward(dr.mean(mi.render(scene, params).array))
     with pytest.raises(RuntimeError, match="must be splatpath, got PathIntegrator"):
         scene_of(splats, nested="path", **room())
-    with pytest.raises(RuntimeError, match="light must be one of none, rays, got 'beams'"):
+    with pytest.raises(RuntimeError, match="light must be one of none, probe, rays, got 'beams'"):
         scene_of(splats, light="beams")

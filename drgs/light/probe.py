@@ -1,0 +1,335 @@
+"""Probes: the splats as they look from one place, in all directions.
+
+A probe is a cube of six pictures around a centre, made by the kernels that make all others: colour,
+coverage, and distance of the splats in each direction. A ray that starts near the centre sees about
+the same points, but not in its own direction. Where it meets the splats is searched on it: it goes
+on, in steps that look the same size from the centre, until it is behind what the probe sees in the
+direction of where it is. What it meets there is what the probe sees. Where it gets behind something
+that it has not met, as what is seen there was nearer all the time, the probe cannot tell what it
+meets: that lies in the shadow of the centre. Such rays are not known.
+
+Rays that stand for others around them look at smaller pictures, of which each texel is the mean
+over a larger angle (Krivanek and Colbert 2008, "Real-time Shading with Filtered Importance
+Sampling").
+
+Nothing here is differentiated.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import numpy as np
+
+from drgs.cameras.camera import Camera
+from drgs.core.arrays import types_of
+from drgs.gaussians.parameters import Gaussians
+from drgs.splatting import rendering
+
+SIZE = 256
+"""Texels of an edge of the largest cube."""
+
+LEVELS = 7
+"""Cubes of a probe; each has half the edges of the one before."""
+
+FINE = 2
+"""The last level in which distances are searched: those of smaller pictures are no surface."""
+
+STEPS = 8
+"""Places of a ray that are looked at, at most."""
+
+REFINEMENTS = 4
+"""Halvings of the step that meets something."""
+
+SOLID = 0.5
+"""Coverage of what ends a ray."""
+
+BORDER = 1
+"""Texels around each picture that show what the neighbours do, for interpolation."""
+
+LEAST_REACH = 0.1
+"""Of the distance to the nearest splats: the first steps of a ray that starts at the centre."""
+
+MARGIN = 0.98
+"""Of the distance before a step, from which on what is seen behind it is met."""
+
+
+@dataclass(frozen=True)
+class Seen:
+    """What rays see."""
+
+    color: Any  # Array3f: times the coverage
+    coverage: Any  # Float
+    is_known: Any  # Bool: whether the probe can tell
+
+
+@dataclass(frozen=True)
+class Probes:
+    """Several ones, whose texels follow each other: by probe, level, face, row and column."""
+
+    centers: Any  # Array3f: world, by probe
+    nearest: Any  # Float: world units, by probe: to the nearest splats
+    colors: Any  # Float: 4 a texel: colour times coverage; the last one is 0
+    places: Any  # Float: 2 a texel: coverage, and coverage by distance
+
+    @staticmethod
+    def of(
+        gaussians: Gaussians,
+        pipeline: rendering.Pipeline,
+        centers: np.ndarray,
+        near: float,
+        decode: Callable[[list[Any]], list[Any]],
+    ) -> Probes:
+        """Render them.
+
+        pipeline: its features are colour and depth; centers: (P, 3) world; near: near plane, world
+        units; decode: makes the colour that is kept from that which splats composite.
+        """
+        t = types_of(type(gaussians.means.array))
+        texels, nearest = [], []
+        for center in centers:
+            faces = [_Face(center, k).render(gaussians, pipeline, near, decode) for k in range(6)]
+            levels = [_joined(faces)]
+            for level in range(1, LEVELS):
+                levels.append(_halved(levels[-1], SIZE >> level))
+            texels.append(_joined(levels))
+            coverage, nearness = levels[0][3:]
+            distance = dr.select(coverage > SOLID, coverage / nearness, dr.inf)
+            nearest.append(dr.select(dr.min(distance) < dr.inf, dr.min(distance), 1))
+        columns = _joined(texels)
+        index = dr.arange(t.UInt32, dr.width(columns[0]))
+        colors, places = (dr.empty(t.Float, n * dr.width(columns[0])) for n in (4, 2))
+        dr.scatter(colors, t.Array4f(*columns[:3], 0), index)
+        dr.scatter(places, t.Array2f(columns[3:]), index)
+        place = t.Array3f(*(t.Float(list(values)) for values in np.float64(centers).T))
+        found = Probes(place, dr.concat(nearest), colors, places)
+        dr.eval(found)
+        return found
+
+    def look(
+        self, probe: Any, origin: Any, direction: Any, far: Any, level: Any, active: Any
+    ) -> Seen:
+        """What rays see up to ``far``.
+
+        probe, level: UInt32, of each ray; direction: unit vectors.
+        """
+        t = types_of(type(far))
+        start = origin - dr.gather(t.Array3f, self.centers, probe, active)
+        reach = LEAST_REACH * dr.gather(t.Float, self.nearest, probe, active)
+        reach = dr.maximum(reach, dr.norm(start))
+        end = dr.select(far < dr.inf, far / (far + reach), 1)
+        line = _Line(start, direction * reach, end)
+        u, meets, is_known = self._search(line, _Cube.of(probe, dr.minimum(level, FINE)), active)
+        v, texels = line.place(u), _Cube.of(probe, level).around(line.place(u))
+        active = active & is_known
+        colors = [w * dr.gather(t.Array4f, self.colors, texel, active) for texel, w in texels]
+        places = [w * dr.gather(t.Array2f, self.places, texel, active) for texel, w in texels]
+        red, green, blue, _ = sum(colors[1:], colors[0])
+        coverage, nearness = sum(places[1:], places[0])
+        # What is too thin to be met counts if it is before the ray's end.
+        is_thin = (coverage < SOLID) & (coverage * (1 - u) < nearness * dr.norm(v))
+        shows = active & (meets | is_thin)
+        color = dr.select(shows, t.Array3f(red, green, blue), 0)
+        return Seen(color, dr.select(shows, coverage, 0), is_known)
+
+    def _search(self, line: _Line, cube: _Cube, active: Any) -> tuple[Any, Any, Any]:
+        """Where lines meet the splats, or end; whether they meet any; whether that is known."""
+        t = types_of(type(line.end))
+
+        def look(u: Any, active: Any) -> tuple[Any, Any, Any]:
+            """How far a place is from the centre, how far splats are there, and which is nearer."""
+            v = line.place(u)
+            coverage, nearness = dr.gather(t.Array2f, self.places, cube.nearest(v), active)
+            is_solid, r = coverage > SOLID, dr.norm(v)
+            is_behind = is_solid & (r * nearness > (1 - u) * coverage)
+            return r / (1 - u), dr.select(is_solid, coverage / nearness, dr.inf), is_behind
+
+        def step(k: Any, before: Any, meets: Any, is_known: Any) -> tuple:
+            r, distance, is_behind = look(line.end * (t.Float(k) / STEPS), active)
+            meets = is_behind & (distance > MARGIN * before)
+            return k + 1, r, meets, meets | ~is_behind
+
+        r, _, is_behind = look(line.end * (0.01 / STEPS), active)
+        nothing = dr.full(t.Bool, False, dr.width(r))
+        k, _, meets, is_known = dr.while_loop(
+            state=(dr.ones(t.UInt32, dr.width(r)), r, nothing, ~is_behind),
+            cond=lambda k, before, meets, is_known: active & (k <= STEPS) & ~meets & is_known,
+            body=step,
+        )
+        high = line.end * (t.Float(k - 1) / STEPS)
+        low = high - line.end / STEPS
+        for _ in range(REFINEMENTS):
+            u = 0.5 * (low + high)
+            _, _, is_behind = look(u, active & meets)
+            low, high = dr.select(is_behind, low, u), dr.select(is_behind, u, high)
+        return dr.select(meets, high, line.end), meets, is_known
+
+
+@dataclass(frozen=True)
+class _Line:
+    """A ray as seen from a centre: at u in 0..1, start (1 - u) + towards u, times 1 / (1 - u)."""
+
+    start: Any  # Array3f, from the centre
+    towards: Any  # Array3f: where it goes, as long as the steps are large
+    end: Any  # Float: u; 1: infinitely far
+
+    def place(self, u: Any) -> Any:
+        """Array3f, times 1 - u."""
+        return self.start * (1 - u) + self.towards * u
+
+
+# ----------------------------------------------------------------------------------------------
+# Cubes
+# ----------------------------------------------------------------------------------------------
+
+
+def _num_texels(level: int) -> int:
+    return 6 * ((SIZE >> level) + 2 * BORDER) ** 2
+
+
+NUM_TEXELS = sum(map(_num_texels, range(LEVELS)))
+
+
+@dataclass(frozen=True)
+class _Cube:
+    """The texels of one level of probes."""
+
+    first: Any  # UInt32
+    size: Any  # UInt32: texels of an edge, without border
+
+    @staticmethod
+    def of(probe: Any, level: Any) -> _Cube:
+        UInt32 = type(level)
+        before, first = 0, UInt32(0)
+        for k in range(LEVELS):
+            first = dr.select(level == k, before, first)
+            before += _num_texels(k)
+        return _Cube(probe * UInt32(NUM_TEXELS) + first, UInt32(SIZE) >> level)
+
+    def nearest(self, v: Any) -> Any:
+        """UInt32: the texel in the direction of a vector."""
+        face, x, y = _place_on_cube(v)
+        UInt32, size = type(self.size), type(x)(self.size)
+        last = self.size - 1
+        column, row = (dr.minimum(UInt32(place * size), last) + BORDER for place in (x, y))
+        return self._texel(face, column, row)
+
+    def around(self, v: Any) -> list[tuple[Any, Any]]:
+        """Four texels around the direction of a vector, and their weights."""
+        face, x, y = _place_on_cube(v)
+        UInt32, Float = type(self.size), type(x)
+        x, y = (place * Float(self.size) + (BORDER - 0.5) for place in (x, y))
+        column, row = UInt32(x), UInt32(y)
+        right, down = x - Float(column), y - Float(row)
+        texel, edge = self._texel(face, column, row), self.size + 2 * BORDER
+        return [
+            (texel, (1 - right) * (1 - down)),
+            (texel + 1, right * (1 - down)),
+            (texel + edge, (1 - right) * down),
+            (texel + edge + 1, right * down),
+        ]
+
+    def _texel(self, face: Any, column: Any, row: Any) -> Any:
+        edge = self.size + 2 * BORDER
+        return self.first + (face * edge + row) * edge + column
+
+
+def _place_on_cube(v: Any) -> tuple[Any, Any, Any]:
+    """The face that a vector points to (+x, -x, +y, ...), and where, 0..1 from its corner.
+
+    On the face of an axis, the next axis points to the right and the one after it down; on that of
+    the opposite direction, the other way around, so that neither is mirrored.
+    """
+    x, y, z = (dr.abs(c) for c in v)
+    is_x = (x >= y) & (x >= z)
+    is_y = ~is_x & (y >= z)
+    along = dr.select(is_x, v[0], dr.select(is_y, v[1], v[2]))
+    right = dr.select(is_x, v[1], dr.select(is_y, v[2], v[0]))
+    down = dr.select(is_x, v[2], dr.select(is_y, v[0], v[1]))
+    is_negative = along < 0
+    half = 0.5 / dr.abs(along)
+    right, down = (dr.clip(dr.fma(c, half, 0.5), 0, 1) for c in (right, down))
+    UInt32 = types_of(type(along)).UInt32
+    face = dr.select(is_x, UInt32(0), dr.select(is_y, UInt32(2), 4))
+    face += dr.select(is_negative, UInt32(1), 0)
+    return face, dr.select(is_negative, down, right), dr.select(is_negative, right, down)
+
+
+@dataclass(frozen=True)
+class _Face:
+    """One of the pictures."""
+
+    center: np.ndarray
+    number: int  # +x, -x, +y, ...
+
+    def render(
+        self,
+        gaussians: Gaussians,
+        pipeline: rendering.Pipeline,
+        near: float,
+        decode: Callable[[list[Any]], list[Any]],
+    ) -> list[Any]:
+        """Red, green, blue, coverage, nearness of its texels, borders included."""
+        Float = type(gaussians.means.array)
+        UInt32, edge = types_of(Float).UInt32, SIZE + 2 * BORDER
+        axis, is_negative = divmod(self.number, 2)
+        forward, right, down = (np.eye(3)[(axis + k) % 3] for k in range(3))
+        if is_negative:
+            forward, right, down = -forward, down, right
+        K = np.array([[SIZE / 2, 0, edge / 2], [0, SIZE / 2, edge / 2], [0, 0, 1]])
+        rotation = np.stack([right, down, forward])
+        camera = Camera.create(Float, rotation, self.center, K, edge, edge, near)
+        T, *color, depth = rendering.render(gaussians, camera, pipeline).planes()
+        coverage = 1 - T
+        shows = coverage > 0
+        color = decode([c / dr.select(shows, coverage, 1) for c in color])
+        texel = dr.arange(UInt32, edge * edge)
+        x, y = ((Float(p) + (0.5 - edge / 2)) * (2 / SIZE) for p in (texel % edge, texel // edge))
+        distance = depth * dr.sqrt(1 + x * x + y * y)  # times coverage
+        nearness = dr.select(shows & (distance > 0), coverage * coverage / distance, 0)
+        columns = [*(c * coverage for c in color), coverage, nearness]
+        dr.eval(columns)
+        return columns
+
+
+def _joined(parts: list[list[Any]]) -> list[Any]:
+    """Texels behind each other."""
+    columns = [dr.concat(columns) for columns in zip(*parts, strict=True)]
+    dr.eval(columns)
+    return columns
+
+
+def _halved(columns: list[Any], size: int) -> list[Any]:
+    """A cube of ``size`` texels an edge from one with twice as many: means of four places each."""
+    t = types_of(type(columns[0]))
+    edge, larger = size + 2 * BORDER, _Cube(t.UInt32(0), t.UInt32(2 * size))
+    index = dr.arange(t.UInt32, 6 * edge * edge)
+    face, row, column = index // (edge * edge), index // edge % edge, index % edge
+    means = [t.Float(0) for _ in columns]
+    for dx, dy in ((0.25, 0.25), (0.75, 0.25), (0.25, 0.75), (0.75, 0.75)):
+        right, down = (
+            (t.Float(p) + (d - BORDER)) * (2 / size) - 1 for p, d in ((column, dx), (row, dy))
+        )
+        for texel, weight in larger.around(_vector_to(face, right, down)):
+            values = (dr.gather(t.Float, values, texel) for values in columns)
+            means = [dr.fma(0.25 * weight, v, m) for v, m in zip(values, means, strict=True)]
+    dr.eval(means)
+    return means
+
+
+def _vector_to(face: Any, right: Any, down: Any) -> Any:
+    """Array3f: to a place of a face, -1..1; beyond it, to a neighbour."""
+    t = types_of(type(right))
+    axis, is_negative = face >> 1, (face & 1) == 1
+    right, down = dr.select(is_negative, down, right), dr.select(is_negative, right, down)
+    along = dr.select(is_negative, t.Float(-1), 1)
+    values = [along, right, down]
+    return t.Array3f(
+        [
+            dr.select(axis == 0, values[k], dr.select(axis == 1, values[k - 1], values[k - 2]))
+            for k in range(3)
+        ]
+    )
