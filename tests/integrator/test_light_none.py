@@ -105,6 +105,19 @@ def test_without_surfaces_there_is_no_light_to_pass():
     assert kernels_and_bytes(tensors, sky, light="rays") == kernels_and_bytes(tensors, sky)
 
 
+def test_a_nested_integrator_forgets_the_light_of_the_one_it_was_nested_in_before():
+    tensors, shared = gaussians(), mi.load_dict({"type": "splatpath"})
+
+    def picture(nested, **settings):
+        return image_of(load(tensors, surfaces(), nested=nested, **settings), seed=1)
+
+    dark = picture({"type": "splatpath"})
+    lit = picture(shared, light="rays")
+    assert np.abs(lit - dark).max() > 0.1
+    np.testing.assert_array_equal(picture(shared, light="none"), dark)
+    np.testing.assert_array_equal(picture(shared, light="rays"), lit)
+
+
 IMPORTS = """
 import json, sys
 sys.path.insert(0, {tests!r})
