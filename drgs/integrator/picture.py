@@ -24,7 +24,7 @@ from drgs.gaussians.parameters import Gaussians
 from drgs.integrator.film import CenterSamples, FilmSamples
 from drgs.integrator.limits import check_picture
 from drgs.integrator.sensors import is_batch, num_poses
-from drgs.integrator.settings import SplatsSettings
+from drgs.integrator.settings import LitIntegrator, SplatsSettings
 from drgs.integrator.view import Planes, View, constant_background
 from drgs.splatting import rendering
 
@@ -174,6 +174,8 @@ def hybrid_of(
     surfaces = memory.surfaces = Surfaces.of(scene, memory.surfaces)
     if integrator.light == "none":
         nested = integrator.nested or mi.load_dict({"type": "path", "hide_emitters": hide_emitters})
+        if isinstance(nested, LitIntegrator):  # that another integrator may have lit
+            nested.light = None
     else:
         from drgs.integrator.light import lit
 

@@ -1,0 +1,162 @@
+"""A scene that asks for no light between splats and surfaces has nothing of it."""
+
+import json
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from conftest import TESTS
+from support.helpers import FLOAT32, device_gaussians
+from support.kernels import drain_kernels
+from support.views import Scene, image_of
+
+import drgs  # noqa: F401  (registers the plugins)
+from drgs.gaussians.parameters import PARAMETER_NAMES
+
+MODULES = ("drgs.integrator.light", "drgs.integrator.probes", "drgs.integrator.shadows")
+"""Of light between splats and surfaces, and of nothing else; and so is this package:"""
+
+PACKAGE = ["drgs", "light"]
+
+
+@pytest.fixture(scope="module", autouse=True)
+def variant():
+    mi.set_variant("llvm_ad_rgb")
+
+
+SCENE = Scene(degree=3, srgb_primitives=True)
+
+
+def gaussians():
+    """The same arrays for all scenes: how one lies in memory is part of a kernel."""
+    on_device = device_gaussians(SCENE.gaussians, FLOAT32)
+    tensors = {name: getattr(on_device, name) for name in PARAMETER_NAMES}
+    dr.eval(tensors)
+    return tensors
+
+
+def surfaces():
+    """A ball of metal amid the splats, a lamp and a sky."""
+    camera = SCENE.view.camera
+    center = camera.center + 3 * camera.rotation[2]
+    return {
+        "ball": {
+            "type": "sphere",
+            "center": center.tolist(),
+            "radius": 0.4,
+            "bsdf": {"type": "roughconductor", "alpha": 0.2},
+        },
+        "lamp": {"type": "point", "position": np.add(camera.center, [0, 0, 1]).tolist()},
+        "sky": {"type": "constant"},
+    }
+
+
+def load(tensors, objects, **settings):
+    return mi.load_dict(
+        {
+            "type": "scene",
+            "integrator": SCENE.settings | tensors | settings,
+            "sensor": SCENE.view.sensor(),
+            **objects,
+        },
+        parallel=False,  # kernels of other threads have no history
+    )
+
+
+def kernels_and_bytes(*arguments, **settings) -> tuple[list, list[bytes]]:
+    """Of loading a scene, its picture, and derivatives with respect to the splats' colours."""
+    dr.eval()  # what is still pending would be found here
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
+        dr.kernel_history_clear()
+        scene = load(*arguments, **settings)
+        params = mi.traverse(scene)
+        dr.enable_grad(params["integrator.sh0"])
+        picture = mi.render(scene, params, seed=1, spp=1)
+        dr.backward(dr.mean(picture, axis=None))
+        gradient = np.array(dr.grad(params["integrator.sh0"]))
+        assert gradient.any()
+        dr.eval()
+        return drain_kernels(), [np.array(picture).tobytes(), gradient.tobytes()]
+
+
+@pytest.mark.parametrize("objects", [dict, surfaces], ids=["splats alone", "splats and surfaces"])
+def test_none_is_what_is_not_said(objects):
+    """The same kernels and bytes, also after another scene had light."""
+    tensors = gaussians()
+    plain = kernels_and_bytes(tensors, objects())
+    assert len(plain[0]) > 30
+    assert kernels_and_bytes(tensors, objects(), light="none") == plain
+
+    pictures = [image_of(load(tensors, surfaces(), light=light)) for light in ("rays", "none")]
+    assert np.abs(pictures[0] - pictures[1]).max() > 0.1
+    assert kernels_and_bytes(tensors, objects()) == plain
+    assert kernels_and_bytes(tensors, objects(), light="none") == plain
+
+
+def test_without_surfaces_there_is_no_light_to_pass():
+    """What asks for it makes no kernel of its own, and no difference."""
+    tensors = gaussians()
+    plain = kernels_and_bytes(tensors, {})
+    assert kernels_and_bytes(tensors, {}, light="rays", exposure=3.0, light_samples=0) == plain
+    assert kernels_and_bytes(tensors, {}, light="rays", nested={"type": "splatpath"}) == plain
+    # An environment sends light, but it has no surface to send it to.
+    sky = {"sky": {"type": "constant"}}
+    assert kernels_and_bytes(tensors, sky, light="rays") == kernels_and_bytes(tensors, sky)
+
+
+def test_a_nested_integrator_forgets_the_light_of_the_one_it_was_nested_in_before():
+    tensors, shared = gaussians(), mi.load_dict({"type": "splatpath"})
+
+    def picture(nested, **settings):
+        return image_of(load(tensors, surfaces(), nested=nested, **settings), seed=1)
+
+    dark = picture({"type": "splatpath"})
+    lit = picture(shared, light="rays")
+    assert np.abs(lit - dark).max() > 0.1
+    np.testing.assert_array_equal(picture(shared, light="none"), dark)
+    np.testing.assert_array_equal(picture(shared, light="rays"), lit)
+
+
+IMPORTS = """
+import json, sys
+sys.path.insert(0, {tests!r})
+import drgs, mitsuba as mi
+mi.set_variant("llvm_ad_rgb")
+from support.views import Scene, tensors
+
+scene = Scene()
+camera = scene.view.camera
+middle = (camera.center + 3 * camera.rotation[2]).tolist()
+ball = {{"type": "sphere", "center": middle, "radius": 0.4}}
+found = []
+for surfaces, settings in {scenes!r}:
+    objects = {{"ball": ball, "sky": {{"type": "constant"}}}} if surfaces else {{}}
+    integrator = scene.settings | tensors(scene.gaussians) | settings
+    mi.render(
+        mi.load_dict(
+            {{"type": "scene", "integrator": integrator, "sensor": scene.view.sensor(), **objects}}
+        )
+    )
+    found.append([m for m in sys.modules if m in {modules!r} or m.split(".")[:2] == {package!r}])
+print(json.dumps(found))
+"""
+
+
+def imported_for(run_python, scenes) -> list[list[str]]:
+    """Modules of light that a new process has imported after each of the scenes."""
+    program = IMPORTS.format(tests=TESTS, scenes=scenes, modules=MODULES, package=PACKAGE)
+    result = run_python(program)
+    assert result.returncode == 0, result.stderr
+    return json.loads(result.stdout)
+
+
+def test_nothing_of_light_is_imported_until_a_scene_asks_for_it(run_python):
+    nested = {"nested": {"type": "path"}}
+    plain = [(s, light) for s in (False, True) for light in ({}, {"light": "none"})]
+    plain += [(True, nested), (True, {"nested": {"type": "splatpath"}}), (False, {"light": "rays"})]
+    lit = [(True, {"light": "rays"}), (True, {"shadows": "ball"})]
+    *before, rays, shadows = imported_for(run_python, plain + lit)
+    assert before == [[]] * len(plain)
+    assert {"drgs.integrator.light", "drgs.light.grid", "drgs.light.walk"} <= set(rays)
+    assert "drgs.integrator.shadows" in shadows

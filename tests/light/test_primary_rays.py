@@ -1,0 +1,202 @@
+"""What primary rays pass of splats, against pictures that others make of them.
+
+A camera's rays meet Gaussians as pictures of the projection ``exact`` show them, whose order and
+colours are those along a pixel's ray. Two things differ by definition, and are configured away:
+
+- The low-pass of a film. Rays have none, so that pictures are made without.
+- What is near. Pictures show Gaussians whose mean is beyond the near plane, rays those whose peak
+  is before them. Here, both are the same ones.
+
+Mitsuba's ``volprim_rf_basic`` takes the peak along a ray as well. It clamps alpha at 0.9999, cuts
+it nowhere, and ends a ray behind the Gaussian that takes its transmittance below 0.01: here, none
+is behind that one. It orders Gaussians by where a ray enters their shells, which here is the order
+of their peaks. Alpha is the value at the peak in all of them, never an integral along the ray.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from support.approximation_checks import MARKED, PLANES
+from support.helpers import (
+    FLOAT32,
+    FLOAT64,
+    assert_arrays_agree,
+    both_precisions,
+    device_gaussians,
+    rows,
+    single,
+)
+from support.views import VIEWS, View, image_of, splats_before, tensors
+from support.volprim import (
+    SCENES,
+    assert_within,
+    covariances,
+    footprints,
+    propagated,
+    volprim_image,
+)
+
+import drgs  # noqa: F401  (registers the plugin)
+from drgs.core.arrays import types_of
+from drgs.light.walk import RaySplats, Segment
+from drgs.reference import light as reference_light
+from drgs.reference import rays as reference_rays
+from drgs.reference import splatting as reference
+from drgs.splatting.cutoffs import Cutoffs
+from drgs.splatting.projection import load_rows
+
+AS_RAYS = {"projection": "exact", "order": "pixel", "sh_direction": "pixel", "low_pass": 0.0}
+"""The approximations of a picture that shows what rays pass."""
+
+MOST_ON_A_RAY = 64
+"""Splats that a pixel may put in order, at most; fewer are on any ray of these scenes."""
+
+OF_VOLPRIM = Cutoffs(alpha_max=0.9999, alpha_cut=0.0, transmittance_stop=0.0)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def variant():
+    mi.set_variant("llvm_ad_rgb")
+
+
+# ----------------------------------------------------------------------------------------------
+# Rays
+# ----------------------------------------------------------------------------------------------
+
+
+def rays_of(camera) -> tuple[np.ndarray, np.ndarray]:
+    """Origins and unit directions (H W, 3) through the middles of pixels, row by row."""
+    y, x = np.mgrid[: camera.height, : camera.width] + 0.5
+    slopes = [(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy]
+    directions = np.stack([*slopes, np.ones_like(x)], axis=-1).reshape(-1, 3) @ camera.rotation
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    return np.broadcast_to(camera.center, directions.shape), directions
+
+
+def rays_of_sensor(view) -> tuple[np.ndarray, np.ndarray]:
+    """The same, as Mitsuba's sensor has them."""
+    y, x = np.mgrid[: view.height, : view.width] + 0.5
+    places = FLOAT32.vectors(np.stack([x / view.width, y / view.height], axis=-1).reshape(-1, 2))
+    ray, _ = mi.load_dict(view.sensor()).sample_ray(0.0, 0.5, mi.Point2f(places), mi.Point2f(0.5))
+    directions = rows(ray.d)
+    return np.broadcast_to(rows(ray.o), directions.shape), directions
+
+
+def pass_all(gaussians, rays, precision, view, cutoffs=None) -> np.ndarray:
+    """Transmittance and colour (H, W, 4) of what rays pass on their whole length."""
+    device = load_rows(device_gaussians(gaussians, precision), gaussians.sh_degree)
+    splats = RaySplats.of(device, gaussians.sh_degree, cutoffs or Cutoffs())
+    types, count = types_of(precision.Float), len(rays[0])
+    far, active = dr.full(types.Float, dr.inf, count), dr.full(types.Bool, True, count)
+    passed = splats.passed(Segment(*map(precision.vectors, rays), far, active))
+    planes = np.column_stack([rows(passed.transmittance), rows(passed.color)])
+    return planes.reshape(view.height, view.width, 4)
+
+
+# ----------------------------------------------------------------------------------------------
+# Exact pictures
+# ----------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Problem:
+    """Splats of all shapes and sizes behind each other, before a view."""
+
+    view: View
+    gaussians: reference.Gaussians
+    camera: reference.Camera
+
+    @staticmethod
+    def of(view) -> Problem:
+        gaussians = splats_before(view, degree=3, count=60, seed=0)
+        larger = replace(gaussians, log_scales=single(gaussians.log_scales + 1))
+        # Orthogonal in double precision too, so that axes of the camera and the world agree.
+        left, _, right = np.linalg.svd(view.camera.rotation)
+        return Problem(view, larger, replace(view.camera, rotation=left @ right))
+
+    def planes_of_reference(self, marked) -> tuple[np.ndarray, np.ndarray]:
+        """Transmittance and colour (H, W, 4), and the pixels (H, W) of no close decision."""
+        picture = reference_rays.render(
+            self.gaussians,
+            self.camera,
+            model=reference_rays.ImageModel(**AS_RAYS),
+            threshold_width=marked,
+        )
+        planes = np.concatenate([picture.transmittance[..., None], picture.image], axis=-1)
+        return planes, ~picture.near_threshold
+
+
+some_views = pytest.mark.parametrize("view", [VIEWS[1], VIEWS[3], VIEWS[10]], ids=lambda v: v.name)
+
+
+@both_precisions
+@some_views
+def test_primary_rays_pass_what_an_exact_picture_shows(precision, view):
+    """Of the reference of pictures, which projects; rays do not. And so does the reference of rays.
+
+    Within what pictures by the kernels are.
+    """
+    problem = Problem.of(view)
+    expected, kept = problem.planes_of_reference(MARKED[precision])
+    rays = rays_of(problem.camera)
+    actual = {"kernels": pass_all(problem.gaussians, rays, precision, view)}
+    if precision is FLOAT64:
+        far = np.full(len(rays[0]), np.inf)
+        passed = reference_light.pass_splats(problem.gaussians, *rays, far)
+        planes = np.column_stack([passed.transmittances, passed.colors])
+        actual["reference of rays"] = planes.reshape(expected.shape)
+        # Many on a ray; and the picture with a window puts all of them in order.
+        assert 20 < passed.counts.max() < MOST_ON_A_RAY
+    assert kept.mean() > 0.9 and expected[..., 0].min() < 0.01 and expected[..., 1:].max() > 0.9
+    assert_arrays_agree(
+        {name: planes[kept] for name, planes in actual.items()},
+        dict.fromkeys(actual, expected[kept]),
+        PLANES[precision],
+    )
+
+
+@some_views
+def test_a_picture_of_the_plugin_shows_what_the_sensors_rays_pass(view):
+    """Both against the reference."""
+    problem = Problem.of(view)
+    expected, kept = problem.planes_of_reference(MARKED[FLOAT32])
+    integrator = {
+        "type": "splats",
+        "srgb_primitives": False,
+        "order_window": MOST_ON_A_RAY,
+        **AS_RAYS,
+        **tensors(problem.gaussians),
+    }
+    image = image_of(
+        mi.load_dict({"type": "scene", "integrator": integrator, "sensor": view.sensor()})
+    )
+    picture = np.concatenate([1 - image[..., 3:], image[..., :3]], axis=-1)
+    passed = pass_all(problem.gaussians, rays_of_sensor(view), FLOAT32, view)
+    assert_arrays_agree(
+        {"picture": picture[kept], "rays": passed[kept]},
+        dict.fromkeys(("picture", "rays"), expected[kept]),
+        PLANES[FLOAT32],
+    )
+
+
+# ----------------------------------------------------------------------------------------------
+# volprim
+# ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("splats", SCENES.values(), ids=SCENES.keys())
+def test_primary_rays_pass_what_volprim_shows(splats):
+    """Within rounding, as the picture of ``splats`` is but for what is derived there."""
+    gaussians, view = splats.gaussians, splats.view
+    quats = gaussians.quats / np.linalg.norm(gaussians.quats, axis=1, keepdims=True)
+    expected = volprim_image(gaussians, view, np.exp(gaussians.log_scales), quats[:, [1, 2, 3, 0]])
+    passed = pass_all(gaussians, rays_of_sensor(view), FLOAT32, view, OF_VOLPRIM)
+    on_film = footprints(gaussians, view.camera, covariances(gaussians))
+    allowed = propagated(on_film, on_film.alpha_rounding, on_film.color_rounding)
+    assert expected.max() > 1000 * allowed.max()
+    assert_within(passed[..., 1:] - expected, allowed)
