@@ -130,8 +130,7 @@ class Probes:
         red, green, blue, _ = sum(colors[1:], colors[0])
         coverage, nearness = sum(places[1:], places[0])
         # What is too thin to be met counts if it is before the ray's end.
-        is_thin = (coverage < SOLID) & (coverage * (1 - u) < nearness * dr.norm(v))
-        shows = active & (meets | is_thin)
+        shows = active & (meets | (coverage * (1 - u) < nearness * dr.norm(v)))
         color = dr.select(shows, t.Array3f(red, green, blue), 0)
         return Seen(color, dr.select(shows, coverage, 0), is_known)
 
