@@ -5,8 +5,8 @@ import itertools
 import drjit as dr
 import numpy as np
 import pytest
-from light.test_walk import Rays
 from support.helpers import FLOAT32, both_precisions, rows
+from support.rays import Rays
 
 from drgs.accuracy.pipeline import pipeline_of
 from drgs.config.approximations import Approximations

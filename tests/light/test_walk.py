@@ -1,15 +1,14 @@
 """What rays pass of splats, against a reference that looks at every splat."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
-import drjit as dr
 import numpy as np
 import pytest
 from support.helpers import both_precisions, rows
+from support.rays import Rays
 
-from drgs.core.arrays import types_of
 from drgs.gaussians.parameters import Gaussians
-from drgs.light.walk import RaySplats, Segment
+from drgs.light.walk import RaySplats
 from drgs.reference import light as reference
 from drgs.reference import splatting
 from drgs.splatting.cutoffs import Cutoffs
@@ -47,32 +46,6 @@ def splats_of(gaussians: splatting.Gaussians, precision, cutoffs=DEFAULT) -> Ray
         **{name: np.asarray(value, precision.dtype) for name, value in vars(gaussians).items()}
     ).to(precision.TensorXf)
     return RaySplats.of(load_rows(ours, gaussians.sh_degree), gaussians.sh_degree, cutoffs)
-
-
-@dataclass(frozen=True)
-class Rays:
-    origins: np.ndarray
-    directions: np.ndarray
-    far: np.ndarray
-
-    @staticmethod
-    def towards(origins, targets, far=np.inf) -> "Rays":
-        directions = np.asarray(targets) - origins
-        directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-        return Rays(*map(_single, (origins, directions, np.broadcast_to(far, len(directions)))))
-
-    def segments(self, precision) -> Segment:
-        types = types_of(precision.Float)
-        return Segment(
-            precision.vectors(self.origins),
-            precision.vectors(self.directions),
-            precision.array(self.far),
-            dr.full(types.Bool, True, len(self.far)),
-        )
-
-
-def _single(values) -> np.ndarray:
-    return np.asarray(values, np.float32).astype(np.float64)
 
 
 def random_rays(count, seed=1) -> Rays:
