@@ -1,0 +1,135 @@
+"""Light between splats and surfaces by probes, against that by rays."""
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from support.lit_scenes import FAR_AWAY, camera, gaussians, scene_of
+
+import drgs  # noqa: F401  (registers the plugins)
+from drgs.core.errors import PluginError, UnsupportedError
+from drgs.light.probe import Probes
+from drgs.reference import splatting
+
+
+@pytest.fixture(autouse=True)
+def variant():
+    mi.set_variant("llvm_ad_rgb")
+
+
+MIRROR = {"type": "conductor", "material": "none"}
+
+
+def mirror_ball(**others):
+    return {
+        "ball": {"type": "sphere", "id": "ball", "radius": 0.5, "bsdf": MIRROR},
+        "sensor": camera([0, 0, 4], [0, 0, 0], fov=15),
+        **others,
+    }
+
+
+def around(count=3000, seed=0, distance=2.5, size=0.1):
+    """Colourful splats around the origin, none before the camera."""
+    rng = np.random.default_rng(seed)
+    towards = rng.normal(size=(count, 3))
+    towards *= distance / np.linalg.norm(towards, axis=1, keepdims=True)
+    kept = (towards[:, 2] < 0.9 * distance) | (distance < 0.5)
+    means = towards[kept]
+    return gaussians(means, size, 0.99, 0.5 + 0.4 * np.sin(2 * means))
+
+
+def render(splats, seed=0, **settings):
+    return np.array(mi.render(scene_of(splats, **settings), seed=seed))
+
+
+def test_a_mirror_ball_reflects_what_rays_show():
+    """30 dB, of which the noise of drawn splats is no part."""
+    splats = around()
+    rays = render(splats, spp=16, light_samples=0, **mirror_ball())
+    probe = render(splats, light="probe", probes="ball", spp=16, **mirror_ball())
+    none = render(splats, light="none", spp=16, **mirror_ball())
+    errors = [((picture - rays) ** 2).mean() for picture in (probe, none)]
+    assert errors[0] < 1e-3 < 0.02 < errors[1]
+
+
+def test_a_lamp_with_a_probe_is_shaded_by_fog():
+    """Where the fog is before the lamp, by its alpha; up to 0.01, as rays with four times that."""
+    rng = np.random.default_rng(1)
+    splats = gaussians(rng.uniform(-1, 1, (30, 3)) * [1, 1, 0.3] + [0, 0, 1.5], 0.4, 0.3, 0.0)
+    wall = {
+        "wall": {"type": "rectangle", "to_world": mi.ScalarTransform4f().scale(2)},
+        "lamp": {"type": "point", "id": "lamp", "position": [0.5, 0.3, 3], "intensity": 10.0},
+        # Beside the fog: its own splats would be before the wall.
+        "sensor": camera([6, 0, 2], [0, 0, 0], size=12, fov=10),
+    }
+    settings = {"max_depth": 2, **wall}
+    bright = render(FAR_AWAY, spp=256, **settings)
+    rays = render(splats, spp=4096, **settings) / bright
+    probe = render(splats, light="probe", probes="lamp", spp=256, **settings) / bright
+    assert rays.min() < 0.4
+    np.testing.assert_allclose(probe.mean(2), rays.mean(2), atol=0.03)
+
+
+def test_objects_without_a_probe_pass_no_splats():
+    # Inside the ball, where no ray comes.
+    other = {"other": {"type": "sphere", "radius": 0.1, "id": "other"}}
+    none = render(around(), light="none", nested="splatpath", spp=4, **mirror_ball(**other))
+    probe = render(around(), light="probe", probes="other", spp=4, **mirror_ball(**other))
+    np.testing.assert_array_equal(probe, none)
+
+
+def test_what_a_probe_does_not_see_is_nothing_or_traced():
+    """Splats in the ball hide all others from the probe, and none from its rays."""
+    parts = [vars(around()), vars(around(count=400, distance=0.3, size=0.08))]
+    splats = splatting.Gaussians(**{k: np.concatenate([p[k] for p in parts]) for k in parts[0]})
+    settings = {"spp": 4, **mirror_ball()}
+    found = {
+        unseen: render(splats, light="probe", probes="ball", unseen=unseen, **settings)
+        for unseen in ("none", "rays")
+    }
+    np.testing.assert_array_equal(found["rays"], render(splats, light="rays", **settings))
+    nothing = render(splats, light="none", nested="splatpath", **settings)
+    np.testing.assert_array_equal(found["none"], nothing)
+
+
+def test_probes_are_kept_until_something_changes(monkeypatch):
+    counts, of = [], Probes.of
+    monkeypatch.setattr(Probes, "of", lambda *values: counts.append(1) or of(*values))
+    scene = scene_of(around(20), light="probe", probes="ball", spp=1, **mirror_ball())
+    changes = {
+        "integrator.sh0": lambda sh0: sh0 + 0.1,
+        "ball.to_world": lambda to_world: mi.Transform4f().translate([0, 0.1, 0]),
+    }
+    mi.render(scene)
+    mi.render(scene, seed=1)
+    assert len(counts) == 1
+    for number, (name, changed) in enumerate(changes.items(), 2):
+        params = mi.traverse(scene)
+        params[name] = changed(params[name])
+        params.update()
+        mi.render(scene)
+        mi.render(scene)
+        assert len(counts) == number, name
+
+
+def test_what_cannot_have_a_probe_is_refused():
+    def scene(**settings):
+        return scene_of(around(4), light="probe", **settings, **mirror_ball(sky=SKY))
+
+    with pytest.raises(RuntimeError, match="probes must be ids of shapes and emitters, got none"):
+        scene()
+    with pytest.raises(RuntimeError, match="unseen must be one of none, rays, got 'guess'"):
+        scene(probes="ball", unseen="guess")
+    for name, message in (("bowl", "got 'bowl'; there are sky, ball"), ("sky", "infinitely far")):
+        found = scene(probes=f"ball, {name}")
+        with pytest.raises(PluginError, match=message):
+            found.integrator().render(found)
+    found = scene(probes="ball")
+    params = mi.traverse(found)
+    dr.enable_grad(params["integrator.means"])
+    params.update()
+    with pytest.raises(UnsupportedError, match="light 'probe'"):
+        dr.backward(dr.mean(mi.render(found, params).array))
+
+
+SKY = {"type": "constant", "id": "sky"}

@@ -1,0 +1,101 @@
+"""Scenes with light between splats and surfaces."""
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from drgs.reference import splatting
+from support.helpers import rows
+
+
+def gaussians(means, scale=0.3, opacity=0.9, color=1.0, count=None) -> splatting.Gaussians:
+    """Balls of one size and colour."""
+    means = np.atleast_2d(np.asarray(means, np.float32))
+    n = len(means)
+    color = (np.broadcast_to(color, (n, 3)) - 0.5) / splatting.C_00
+    return splatting.Gaussians(
+        means,
+        np.tile([1.0, 0, 0, 0], (n, 1)),
+        np.broadcast_to(np.log(scale), (n, 3)),
+        np.full(n, np.log(opacity / (1 - opacity))),
+        color[:, None],
+        np.zeros((n, 0, 3)),
+    )
+
+
+def scene_of(splats, light="rays", max_depth=8, nested="splatpath", spp=64, **others):
+    """The objects of ``others`` among the splats, and their camera at ``sensor``."""
+    settings = {
+        key: others.pop(key)
+        for key in ("light_samples", "exposure", "probes", "unseen")
+        if key in others
+    }
+    tensors = {k: mi.TensorXf(v.astype(np.float32)) for k, v in vars(splats).items()}
+    integrator = {
+        "type": "splats",
+        "nested_spp": spp,
+        "nested": {"type": nested, "max_depth": max_depth},
+        **tensors,
+        **settings,
+    }
+    if light is not None:
+        integrator["light"] = light
+    return mi.load_dict({"type": "scene", "integrator": integrator, **others})
+
+
+def camera(origin, target, size=24, fov=40, up=(0, 1, 0)):
+    return {
+        "type": "perspective",
+        "fov": fov,
+        "to_world": mi.ScalarTransform4f().look_at(origin, target, up),
+        "film": {
+            "type": "hdrfilm",
+            "width": size,
+            "height": size,
+            "rfilter": {"type": "box"},
+            "pixel_format": "rgb",
+        },
+        "sampler": {"type": "independent", "sample_count": 1},
+    }
+
+
+FAR_AWAY = gaussians([[0, 0, 1e4]])
+
+
+def mean_and_error(render, rounds):
+    pictures = np.stack([np.array(render(seed)) for seed in range(rounds)])
+    return pictures.mean(0), pictures.std(0, ddof=1) / np.sqrt(rounds)
+
+
+def pixel_rays(sensor):
+    """Origins and directions through the middles of pixels, row by row."""
+    width, height = sensor.film().crop_size()
+    y, x = np.mgrid[0:height, 0:width]
+    place = mi.Point2f((x.ravel() + 0.5) / width, (y.ravel() + 0.5) / height)
+    ray, _ = sensor.sample_ray(0.0, 0.5, place, mi.Point2f(0.5))
+    directions = rows(ray.d)
+    return np.broadcast_to(rows(ray.o), directions.shape), directions
+
+
+def along_rays(scene, origins, directions):
+    """What the nested integrator finds with one path a ray."""
+    mi.render(scene)  # it gets to know the splats
+    nested, sampler = scene.integrator().nested, mi.load_dict({"type": "independent"})
+    sampler.seed(0, len(origins))
+    ray = mi.Ray3f(mi.Point3f(*_columns(origins)), mi.Vector3f(*_columns(directions)))
+    radiance, *_ = nested.sample(dr.ADMode.Primal, scene, sampler, ray, mi.Bool(True), δL=None)
+    return rows(radiance)
+
+
+def _columns(values):
+    return [mi.Float(np.ascontiguousarray(column, np.float32)) for column in values.T]
+
+
+def radiance_of(seen):
+    coverage = 1 - seen.transmittances[:, None]
+    color = seen.colors / np.where(coverage > 0, coverage, 1)
+    return coverage * linear(color)
+
+
+def linear(color):
+    return np.where(color <= 0.04045, color / 12.92, ((color + 0.055) / 1.055) ** 2.4)
