@@ -12,6 +12,7 @@ COMMANDS = {
     "accuracy": "the error of each approximation against the time that it saves",
     "effects": "what each effect costs: time and operations with and without it",
     "hybrid": "what a path-traced object among splats costs",
+    "light": "price and error of light between splats and surfaces",
     "benefits": "what effects are good for: fits of spoiled data with and without them",
     "exports": "size of each file format, and the quality that is lost by a round trip",
     "training": "quality over time for several settings of a fit; half an hour",
