@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import argparse
 import statistics
-import tempfile
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -48,6 +47,9 @@ SIZE = (300, 200)
 """px: width, height."""
 
 ROUNDS, QUICK_ROUNDS = 5, 1
+
+RING = Path("shapes/ring.ply")
+"""Beside the scene file."""
 
 LIT = 0.98
 """Of an object's light that the splats before a pixel let through, at least."""
@@ -112,19 +114,20 @@ def run(args: argparse.Namespace) -> None:
     mi.set_variant("llvm_ad_rgb")
     path = Path(args.scene)
     ply = path / GAUSSIANS if path.is_dir() else path
-    for file in (ply, args.file):
+    for file in (ply, args.file, args.file.parent / RING):
         if not file.exists():
-            raise UserError(f"{file}: not there; expected a fit's PLY file and a scene file")
+            raise UserError(
+                f"{file}: not there; expected a fit's PLY file, a scene file, and a ring beside it"
+            )
     counts = (QUICK_PATHS, QUICK_MANY, QUICK_ROUNDS) if args.quick else (PATHS, MANY, ROUNDS)
     print(f"{machine()}\n{ply}, {SIZE[0]}x{SIZE[1]}", flush=True)
     results: list[Measurement] = []
     pictures: list[tuple[str, list[np.ndarray]]] = []
-    with tempfile.TemporaryDirectory() as folder:
-        for stage in stages(ply, args.file, Path(folder)):
-            found, shown = measure(stage, *counts)
-            results += found
-            pictures += shown
-            print(f"\n{table(found)}", flush=True)
+    for stage in stages(ply, args.file):
+        found, shown = measure(stage, *counts)
+        results += found
+        pictures += shown
+        print(f"\n{table(found)}", flush=True)
     columns = list(Measurement.__dataclass_fields__)
     write_csv(args.out / "light.csv", columns, [list(vars(m).values()) for m in results])
     write_figure(args.out / "light.png", plot(results))
@@ -138,8 +141,8 @@ def run(args: argparse.Namespace) -> None:
 # ----------------------------------------------------------------------------------------------
 
 
-def stages(ply: Path, file: Path, folder: Path) -> list[Stage]:
-    """A model with one object at a time, and the scene of a file; folder: for files of shapes."""
+def stages(ply: Path, file: Path) -> list[Stage]:
+    """A model with one object at a time, and the scene of a file, beside which a ring is."""
     means = np.asarray(Gaussians.load(ply).means)
     low, high = np.quantile(means, [0.02, 0.98], axis=0)
     center, radius = ((low + high) / 2).tolist(), float((high - low).max() / 2)
@@ -152,9 +155,9 @@ def stages(ply: Path, file: Path, folder: Path) -> list[Stage]:
             "bsdf": {"type": "conductor", "material": "none"},
         },
         "glossy ring": {
-            "type": "bsplinecurve",
-            "filename": _ring(folder / "ring.txt"),
-            "to_world": place @ T().translate([-1.15, 0.9, 0.15]).rotate([1, 1, 0], 75).scale(0.5),
+            "type": "ply",
+            "filename": str(file.parent / RING),
+            "to_world": place @ T().translate([-1.15, 0.9, 0.15]).rotate([1, 1, 0], 75).scale(0.6),
             "bsdf": {"type": "roughconductor", "material": "Au", "alpha": 0.1},
         },
         "shaded plinth": {
@@ -179,14 +182,6 @@ def stages(ply: Path, file: Path, folder: Path) -> list[Stage]:
 
     alone = [Stage(ply.parent.name, load(name), [name]) for name in objects]
     return [*alone, Stage(file.stem, load_file, ["ring", "ball", "globe", "plinth"])]
-
-
-def _ring(path: Path) -> str:
-    """A file of a circle of radius 1 around the z axis, with the radius of its tube."""
-    angles = np.linspace(0, 2 * np.pi, 32, endpoint=False)
-    circle = np.stack([np.cos(angles), np.sin(angles), 0 * angles, 0.25 + 0 * angles], axis=1)
-    np.savetxt(path, np.concatenate([circle, circle[:3]]))
-    return str(path)
 
 
 def _stage(place: mi.ScalarTransform4f, integrator: dict[str, object]) -> dict[str, object]:
