@@ -23,7 +23,7 @@ def model(tmp_path):
     values = {
         "means": means,
         "quats": np.tile(np.float32([1, 0, 0, 0]), (n, 1)),
-        "log_scales": np.full((n, 3), -2.5, np.float32),
+        "log_scales": np.full((n, 3), -3.5, np.float32),
         "logit_opacities": np.full(n, 3, np.float32),
         "sh0": np.random.default_rng(1).normal(0, 1, (n, 1, 3)).astype(np.float32),
         "shN": np.zeros((n, 0, 3), np.float32),
