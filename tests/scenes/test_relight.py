@@ -32,36 +32,52 @@ def run(relight, monkeypatch, *arguments):
     relight.main()
 
 
-def errors(relight, found) -> dict[str, float]:
+def errors(true, found) -> dict[str, float]:
     """Of each unknown, the distance from the truth."""
-    true = asdict(relight.TRUE)
+    true = asdict(true)
     return {name: float(np.linalg.norm(np.subtract(v, true[name]))) for name, v in found.items()}
 
 
-@pytest.mark.slow
-def test_what_the_picture_was_made_of_is_found(relight, monkeypatch, tmp_path, capsys):
-    """In 40 steps, from a start that is half as far away."""
+def from_half_way(relight, monkeypatch, name):
+    """A case whose start is half as far away: (its unknowns by name, at first)."""
+    case = relight.CASES[name]
     start = {
-        name: (np.array(value) + asdict(relight.TRUE)[name]) / 2
-        for name, value in asdict(relight.START).items()
+        key: ((np.array(value) + asdict(case.true)[key]) / 2).tolist()
+        for key, value in asdict(case.start).items()
     }
-    monkeypatch.setattr(relight, "START", replace(relight.START, **start))
+    nearer = replace(case, start=replace(case.start, **start))
+    monkeypatch.setitem(relight.CASES, name, nearer)
     monkeypatch.setattr(relight, "TARGET_SPP", 64)
+    return start
+
+
+def found_by(relight, output, name) -> dict[str, list[float]]:
+    """The unknowns in the table that a run has printed."""
+    rows = re.findall(r"^\| (.*) \| .* \| .* \| (.*) \|$", output, re.MULTILINE)
+    found = {title: [float(x) for x in row.split(", ")] for title, row in rows[2:]}
+    titles = relight.CASES[name].start.TITLES
+    assert list(found) == list(titles.values())
+    return {key: found[title] for key, title in titles.items()}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["objects", "mirror"])
+def test_what_the_picture_was_made_of_is_found(relight, monkeypatch, tmp_path, capsys, name):
+    """In 40 steps, from a start that is half as far away."""
+    start = from_half_way(relight, monkeypatch, name)
     monkeypatch.setattr(relight, "BALL", [0.9, 0.2, 0.45])  # beside the knot
-    run(relight, monkeypatch, MODEL, "--size", 40, "--iterations", 40, "--out", tmp_path)
+    out = ["--out", tmp_path]
+    run(relight, monkeypatch, MODEL, "--case", name, "--size", 40, "--iterations", 40, *out)
     output = capsys.readouterr().out
     losses = [float(x) for x in re.findall(r"loss ([\d.e+-]+)", output)]
     assert losses[-1] < losses[0] / 20
-    rows = re.findall(r"^\| (.*) \| .* \| .* \| (.*) \|$", output, re.MULTILINE)
-    found = {title: [float(x) for x in row.split(", ")] for title, row in rows[2:]}
-    assert list(found) == list(relight.TITLES.values())
-    found = {name: found[title] for name, title in relight.TITLES.items()}
-    at_start, at_end = errors(relight, start), errors(relight, found)
-    for name in start:
-        assert at_end[name] < at_start[name] / 3, name
+    true = relight.CASES[name].true
+    at_start, at_end = errors(true, start), errors(true, found_by(relight, output, name))
+    for key in start:
+        assert at_end[key] < at_start[key] / 3, key
     assert (tmp_path / "parameters.md").read_text() in output
-    for name in ("target", "start", "end", "difference"):
-        assert iio.imread(tmp_path / f"{name}.png").shape == (40, 40, 3)
+    for picture in ("target", "start", "end", "difference"):
+        assert iio.imread(tmp_path / f"{picture}.png").shape == (40, 40, 3)
     with Image.open(tmp_path / "relight.webp") as animation:
         assert animation.n_frames == 14 and animation.size == (80, 40)
     assert (tmp_path / "loss.png").exists() and (tmp_path / "relight.gif").exists()
@@ -70,7 +86,7 @@ def test_what_the_picture_was_made_of_is_found(relight, monkeypatch, tmp_path, c
 def test_a_models_smoothing_filter_reaches_the_integrator(relight):
     model = relight.load(MODEL)
     smoothing = np.full(model.num_gaussians, 0.05, np.float32)
-    stages = [relight.Stage.of(one, 20) for one in (model, replace(model, smoothing=smoothing))]
+    stages = [relight.Objects.of(one, 20) for one in (model, replace(model, smoothing=smoothing))]
     filters = [stage.scene.integrator().smoothing for stage in stages]
     assert filters[0] is None
     np.testing.assert_array_equal(np.array(filters[1]), smoothing)

@@ -44,7 +44,6 @@ def script(monkeypatch, tmp_path):
             result = module.Result(np.zeros((4, 4, 3)), 1.0)
             monkeypatch.setattr(module, "measure", lambda *arguments: result)
         if name == "relight":
-            monkeypatch.setattr(module.Stage, "of", lambda *arguments: None)
             monkeypatch.setattr(module, "relight", lambda *arguments: pictures_in(arguments[-1]))
         before = files_of_the_checkout()
         module.main()
