@@ -39,13 +39,13 @@ def errors(true, found) -> dict[str, float]:
 
 
 def from_half_way(relight, monkeypatch, name):
-    """A case whose start is half as far away: (its unknowns by name, at first)."""
+    """A case whose start is half as far away, of more paths: its unknowns by name, at first."""
     case = relight.CASES[name]
     start = {
         key: ((np.array(value) + asdict(case.true)[key]) / 2).tolist()
         for key, value in asdict(case.start).items()
     }
-    nearer = replace(case, start=replace(case.start, **start))
+    nearer = replace(case, start=replace(case.start, **start), spp=4 * case.spp)
     monkeypatch.setitem(relight.CASES, name, nearer)
     monkeypatch.setattr(relight, "TARGET_SPP", 64)
     return start
