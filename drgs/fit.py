@@ -541,7 +541,7 @@ def run_iterations(
                     measure(trainer, history, views)
             for observer in observers:
                 observer.after(trainer, history, done, lambda: stop.requested)
-            is_due = every and (done.is_last or done.report.iteration % every == 0)
+            is_due = every and (done.is_last or done.report.passes(every))
             if stop.requested or is_due:
                 fit.save()
             if stop.requested:

@@ -42,6 +42,7 @@ PAPER: Values = {
     "optimizer.quats_lr": 1e-3,
     "optimizer.decay": 1.0,
     "optimizer.decay_from": 0.5,
+    "optimizer.views_per_step": 1,
     "optimizer.views": 1,
     "optimizer.views_from": 0.75,
     "optimizer.epsilon": 1e-15,

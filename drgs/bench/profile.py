@@ -111,7 +111,7 @@ def stage_clock() -> Iterator[StageClock]:
 
     borders = [
         (tiles, "_store_rows", ends(None, "projection and SH")),
-        (rendering, "bin_splats", ends(None, "binning")),
+        (rendering, "bin_footprints", ends(None, "binning")),
         (rendering, "composite", ends(None, "compositing")),
         (rendering, "composite_adjoint", ends("image and loss", None)),
         (rasterize, "sum_entries", ends("adjoint", "reduction")),

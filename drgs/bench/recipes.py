@@ -13,6 +13,7 @@ import argparse
 import json
 import multiprocessing
 import re
+import sys
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import ExitStack
@@ -118,6 +119,7 @@ def run(args: argparse.Namespace) -> None:
             for seed in range(args.seeds):
                 for case in (case for case in cases if case.concerns(scene)):
                     config = planned(case, scene, args, seed)
+                    print(f"\n{scene.name}, {CASES.index(case) + 1}: {case.name}, seed {seed}")
                     fit_in_own_process(case, scene, config, out, args.threads)
         points = [
             point
@@ -181,8 +183,7 @@ def fit_in_own_process(
     arguments = [str(file), "--out", str(folder)]
     if threads is not None:
         arguments += ["--threads", str(threads)]
-    number = CASES.index(case) + 1
-    print(f"\n{scene.name}, {number}: {case.name}, seed {config.seed}", flush=True)
+    sys.stdout.flush()
     with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:
         pool.submit(fit.main, arguments).result()
 

@@ -276,7 +276,7 @@ def clocked_step(trainer: Trainer) -> StageClock:
     """A training iteration, stage by stage."""
     with stage_clock() as clock:
         report = trainer.step()
-        dr.eval(report.loss_array, report.squared_error)
+        dr.eval([(view.loss, view.squared_error) for view in report.seen])
         clock.end("optimizer and statistics")
     return clock
 

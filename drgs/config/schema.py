@@ -331,12 +331,20 @@ class OptimizerConfig(Section):
         lt=1,
         description="When they begin to fall, in parts of the iterations behind coarse stages.",
     )
+    views_per_step: int = Field(
+        1,
+        ge=1,
+        le=1000,
+        description="Views B that see the same Gaussians, whose mean gradient is a step; an "
+        "iteration still renders one. Rates are multiplied by the root of B, beta_1 and beta_2 "
+        "become powers of B. What several processes share are the views of a step.",
+    )
     views: int = Field(
         1,
         ge=1,
         le=1000,
-        description="Views whose gradients are put together for a step, late in the fit; an "
-        "iteration still renders one.",
+        description="Views whose gradients are averaged for a step late in the fit, with rates as "
+        "they are; at most views_per_step, or a multiple of it.",
     )
     views_from: float = Field(
         0.75,
@@ -454,7 +462,7 @@ class FitConfig(Section):
         30_000,
         ge=1,
         description="Views that are rendered; each is a step of the optimizer, unless "
-        "optimizer.views says otherwise.",
+        "optimizer.views_per_step or optimizer.views says otherwise.",
     )
     coarse: list[CoarseStage] | None = Field(
         None,
@@ -543,6 +551,12 @@ class FitConfig(Section):
         if densify.start >= densify.stop:
             raise ValueError(
                 f"densify.start must be < densify.stop ({densify.stop}), got {densify.start}"
+            )
+        views, at_once = optimizer.views, optimizer.views_per_step
+        if views > at_once and views % at_once != 0:
+            raise ValueError(
+                "optimizer.views must be a multiple of optimizer.views_per_step "
+                f"({at_once}), or not larger, got {views}"
             )
         if optimizer.means_lr_final > optimizer.means_lr:
             raise ValueError(

@@ -5,10 +5,11 @@ are composited, which approximations are made. It does so by naming functions an
 Dr.Jit traces only what is called: what is not composed in leaves no instruction in any kernel.
 ``drgs.config.approximations`` makes a pipeline from names.
 
-The chain is  Gaussians -> ``project`` -> Splats2D -> ``bin_splats`` -> TileBins
--> ``composite`` -> Layers.  The adjoint runs it backwards: the hand-written adjoint of
-compositing gives the derivatives of the 2D splats, and Dr.Jit differentiates projection and SH,
-which are traced again, one Gaussian per lane, so that no gradient is ever scattered.
+The chain is  Gaussians -> ``project`` -> Splats2D -> ``footprints_of`` -> Footprints
+-> ``bin_footprints`` -> TileBins -> ``composite`` -> Layers.  The adjoint runs it backwards: the
+hand-written adjoint of compositing gives the derivatives of the 2D splats, and Dr.Jit
+differentiates projection and SH, which are traced again, one Gaussian per lane, so that no gradient
+is ever scattered.
 """
 
 from __future__ import annotations
@@ -45,7 +46,7 @@ from drgs.splatting.rasterize import (
     composite_adjoint,
     composite_tangent,
 )
-from drgs.splatting.tiles import TileBins, bin_splats
+from drgs.splatting.tiles import Footprints, TileBins, bin_footprints, footprints_of
 
 
 class Feature(Protocol):
@@ -137,6 +138,36 @@ class CenterOrder:
         return composite_tangent(bins, records, layers, tangents)
 
 
+class Source(Protocol):
+    """Where the splats of a frame come from, and where their derivatives go."""
+
+    def footprints(self, gaussians: Gaussians, camera: Camera, pipeline: Pipeline) -> Footprints:
+        """The splats as ``camera`` sees them."""
+        ...
+
+    def gradients(
+        self, gaussians: Gaussians, frame: Frame, of_splats: SplatGradients, of_camera: bool
+    ) -> GaussianGradients:
+        """Derivatives of the loss, from those with respect to the splats of a frame."""
+        ...
+
+
+@dataclass(frozen=True)
+class Projected:
+    """The Gaussians that are to be rendered, projected."""
+
+    def footprints(self, gaussians: Gaussians, camera: Camera, pipeline: Pipeline) -> Footprints:
+        """Project them."""
+        return footprints_seen_by(gaussians, camera, pipeline)
+
+    def gradients(
+        self, gaussians: Gaussians, frame: Frame, of_splats: SplatGradients, of_camera: bool
+    ) -> GaussianGradients:
+        """Go back through the projection."""
+        found = gradients_of(gaussians, frame.camera, frame.pipeline, of_splats, of_camera)
+        return replace(found, visible=_on_film(frame.bins))
+
+
 def as_loaded(rows: GaussianRows) -> GaussianRows:
     """The Gaussians as they are."""
     return rows
@@ -155,6 +186,7 @@ class Pipeline:
     low_pass: float = LOW_PASS  # px^2
     model: ImageModel = DEFAULT
     order: Order = CenterOrder()
+    source: Source = Projected()
 
     def project(self, rows: GaussianRows, camera: Camera) -> Splats2D:
         """The first stage with this pipeline's approximations."""
@@ -199,7 +231,7 @@ class Frame:
 class GaussianGradients:
     """Derivatives of the loss, shaped like the parameters, and what densification needs."""
 
-    parameters: Gaussians
+    parameters: Gaussians | None  # None: the splats came from elsewhere, where theirs are found
     means2d: Any  # Array2f (N,): loss per px
     visible: Any  # Bool (N,): the Gaussian's extent touches the film
     first_fault: Any  # UInt32 (1,): of ``parameters``, see :func:`decode_fault`
@@ -213,16 +245,22 @@ def render(gaussians: Gaussians, camera: Camera, pipeline: Pipeline) -> Frame:
     :func:`drgs.effects.compose.composed`. The host reads one value, the number of (splat, tile)
     entries.
     """
-    rows = load_rows(gaussians, pipeline.sh_degree)
-    splats = pipeline.project(rows, camera)
-    columns = pipeline.feature_columns(splats, rows, camera)
     model = pipeline.model.seen_by(camera)
     grid = TileGrid(camera.width, camera.height)
     order = pipeline.order.seen_by(camera)
-    bins = bin_splats(splats, grid, columns, model, order.keys(splats))
+    bins = bin_footprints(pipeline.source.footprints(gaussians, camera, pipeline), grid, model)
     records = Records.of(bins, bins.rows.load)
     layers = order.composite(bins, records)
     return Frame(pipeline, camera, order, bins, records, layers)
+
+
+def footprints_seen_by(gaussians: Gaussians, camera: Camera, pipeline: Pipeline) -> Footprints:
+    """What compositing needs of ``gaussians``, from projection; see :func:`render`."""
+    rows = load_rows(gaussians, pipeline.sh_degree)
+    splats = pipeline.project(rows, camera)
+    columns = pipeline.feature_columns(splats, rows, camera)
+    grid, model = TileGrid(camera.width, camera.height), pipeline.model.seen_by(camera)
+    return footprints_of(splats, grid, columns, model, pipeline.order.seen_by(camera).keys(splats))
 
 
 def render_again(frame: Frame, model: ImageModel) -> Frame:
@@ -261,7 +299,7 @@ def frames_adjoint(
         total = gradients if total is None else _sum(total, gradients)
         if len(frames) > 1:
             dr.eval(total)
-    return _gaussian_gradients(gaussians, frames[0], total, of_camera)
+    return frames[0].pipeline.source.gradients(gaussians, frames[0], total, of_camera)
 
 
 def _sum(a: SplatGradients, b: SplatGradients) -> SplatGradients:
@@ -271,21 +309,29 @@ def _sum(a: SplatGradients, b: SplatGradients) -> SplatGradients:
     )
 
 
-def _gaussian_gradients(
-    gaussians: Gaussians, frame: Frame, gradients: SplatGradients, of_camera: bool = False
+def gradients_of(
+    gaussians: Gaussians,
+    camera: Camera,
+    pipeline: Pipeline,
+    of_splats: SplatGradients,
+    of_camera: bool = False,
 ) -> GaussianGradients:
-    """From the derivatives of the 2D splats to those of the parameters, by Dr.Jit."""
-    rows = load_rows(gaussians, frame.pipeline.sh_degree)
-    camera, numbers = frame.camera, []
+    """From the derivatives of the 2D splats to those of the parameters, by Dr.Jit.
+
+    As :func:`frames_adjoint`; ``visible`` is what projection says, without regard to the film.
+    """
+    rows = load_rows(gaussians, pipeline.sh_degree)
+    response, numbers = pipeline.model.seen_by(camera).response, []
     if of_camera:
-        frame.pipeline.model.check_differentiable_in_camera()
+        pipeline.model.check_differentiable_in_camera()
         camera = camera.by_lane(dr.width(rows.logit_opacities))
         numbers = camera.numbers()
     with dr.resume_grad():
         dr.enable_grad(replace(rows, smoothing=None), numbers)
-        splats = frame.pipeline.project(rows, camera)
-        outputs = _differentiable(frame, splats, rows, camera)
-        cotangents = gradients.geometry + gradients.features
+        splats = pipeline.project(rows, camera)
+        outputs = response.differentiable(splats)
+        outputs += pipeline.feature_columns(splats, rows, camera)
+        cotangents = of_splats.geometry + of_splats.features
         for output, cotangent in zip(outputs, cotangents, strict=True):
             dr.accum_grad(output, cotangent)
         dr.enqueue(dr.ADMode.Backward, outputs)
@@ -296,8 +342,8 @@ def _gaussian_gradients(
     parameters, first_fault = _as_tensors(d_rows, gaussians, visible)
     return GaussianGradients(
         parameters=parameters,
-        means2d=gradients.means2d,
-        visible=_on_film(frame.bins),
+        means2d=of_splats.means2d,
+        visible=visible,
         first_fault=first_fault,
         camera=_sums(d_numbers, visible) if of_camera else None,
     )
@@ -399,22 +445,16 @@ def _splat_tangents(
         dr.set_grad(replace(rows, smoothing=None), replace(d_rows, smoothing=None))
         for number, tangent in zip(numbers, camera_tangents or [], strict=True):
             dr.set_grad(number, tangent)
-        outputs = _differentiable(frame, splats, rows, camera)
+        response = frame.bins.model.response
+        outputs = response.differentiable(splats)
+        outputs += frame.pipeline.feature_columns(splats, rows, camera)
         # Some outputs (depths, p of the whitening) are inputs of others: the default would clear
         # the derivatives of such interior variables on the way.
         dr.forward_to(outputs, flags=dr.ADFlag.ClearEdges)
         columns = [dr.grad(output) for output in outputs]
     dr.eval(columns)
-    count = frame.bins.model.response.num_geometry
+    count = response.num_geometry
     return SplatGradients(geometry=columns[:count], features=columns[count:])
-
-
-def _differentiable(
-    frame: Frame, splats: Splats2D, rows: GaussianRows, camera: Camera
-) -> list[Any]:
-    """What compositing reads of the splats, in the order of :class:`SplatGradients`."""
-    features = frame.pipeline.feature_columns(splats, rows, camera)
-    return frame.bins.model.response.differentiable(splats) + features
 
 
 def _as_tensors(d_rows: GaussianRows, gaussians: Gaussians, visible: Any) -> tuple[Gaussians, Any]:

@@ -1,10 +1,10 @@
 """Integer binning: which splats touch which tile, front to back.
 
-The second stage: ``Splats2D`` -> ``TileBins``. The film is cut into tiles of 16x16 pixels, each a
-4x4 grid of micro-tiles of 4x4 pixels. Every (splat, tile) pair of a splat's bounding box is one
-*entry*; an entry carries 16 bits that say which micro-tiles its ellipse touches. All steps are
-flat: no lane loops over a splat's tiles, so a giant splat does not hold up its neighbours, and the
-only value that the host reads is the number of entries.
+The second stage: ``Splats2D`` -> ``Footprints`` -> ``TileBins``. The film is cut into tiles of
+16x16 pixels, each a 4x4 grid of micro-tiles of 4x4 pixels. Every (splat, tile) pair of a splat's
+bounding box is one *entry*; an entry carries 16 bits that say which micro-tiles its ellipse
+touches. All steps are flat: no lane loops over a splat's tiles, so a giant splat does not hold up
+its neighbours, and the only value that the host reads is the number of entries.
 
 1. Store each splat's numbers as a row and count the tiles of its bounding box.
 2. Sort the splats by depth; a prefix sum gives each one its run of entries.
@@ -63,6 +63,21 @@ class TileBins:
         return self.model.response.num_moments + self.num_features
 
 
+@dataclass(frozen=True)
+class Footprints:
+    """What tiles and compositing need to know of splats, stored: a row each.
+
+    Splats of several of these, put behind one another, are binned as if they had been projected
+    together, since every number depends on one splat alone.
+    """
+
+    boxes: Rows  # first column and row of tiles, columns, number of tiles
+    rows: Rows  # geometry, features, keys
+    depths: Any  # Float (N,), to sort by; inf: not visible
+    num_features: int
+    num_keys: int
+
+
 def bin_splats(
     splats: Splats2D,
     grid: TileGrid,
@@ -72,21 +87,44 @@ def bin_splats(
 ) -> TileBins:
     """Distribute the visible ``splats`` over the tiles of ``grid``, front to back.
 
+    For the arguments see :func:`footprints_of`, for errors :func:`bin_footprints`.
+    """
+    return bin_footprints(footprints_of(splats, grid, features, model, keys), grid, model)
+
+
+def footprints_of(
+    splats: Splats2D,
+    grid: TileGrid,
+    features: Sequence[Any] = (),
+    model: ImageModel = DEFAULT,
+    keys: Sequence[Any] = (),
+) -> Footprints:
+    """What is to be binned of ``splats``, evaluated.
+
     features: columns, one value per Gaussian, that compositing will read beside the geometry;
     keys: more of them, that it will not composite. Neither they nor the splats need to be
     evaluated: the kernel that computes them stores rows.
+    """
+    boxes, rows, depths = _store_rows(splats, grid, [*features, *keys], model)
+    return Footprints(boxes, rows, depths, len(features), len(keys))
+
+
+def bin_footprints(footprints: Footprints, grid: TileGrid, model: ImageModel) -> TileBins:
+    """Distribute splats over the tiles of ``grid``, front to back.
 
     Not differentiated: integer work. The host reads one value, the number of entries.
 
     Raises UserError if there are more than 2^26 Gaussians.
     """
-    t = types_of(type(splats.depths))
-    if dr.width(splats.depths) > 1 << _RANK_BITS:
+    boxes, rows, depths = footprints.boxes, footprints.rows, footprints.depths
+    num_features, num_keys = footprints.num_features, footprints.num_keys
+    del footprints  # or what is stored would wait in memory for the end of the function
+    t = types_of(type(depths))
+    if dr.width(depths) > 1 << _RANK_BITS:
         raise UserError(
             f"bin_splats(): at most {1 << _RANK_BITS:,} Gaussians can be told apart in a tile, got "
-            f"{dr.width(splats.depths):,}; render them in parts, or prune them"
+            f"{dr.width(depths):,}; render them in parts, or prune them"
         )
-    boxes, rows, depths = _store_rows(splats, grid, [*features, *keys], model)
     # A stable sort: equal depths stay in the order of the Gaussians.
     order = dr.argsort(depths)
     # A kernel of its own: loads that wait for memory, and for no arithmetic, wait together.
@@ -111,8 +149,8 @@ def bin_splats(
     return TileBins(
         order=order,
         rows=rows,
-        num_features=len(features),
-        num_keys=len(keys),
+        num_features=num_features,
+        num_keys=num_keys,
         first_entry=first_entry,
         source=source,
         ranks=ranks,

@@ -258,7 +258,8 @@ def rehearse(config: FitConfig, dataset: Dataset, gaussians: Gaussians) -> Rehea
     """Time a few iterations on a few of the views."""
     views = dataset.train[:: max(1, len(dataset.train) // REHEARSAL_VIEWS)]
     few = replace(dataset, train=views[:REHEARSAL_VIEWS])
-    never = config.iterations + WARM_UP + TIMED
+    views_per_step = config.optimizer.views_per_step
+    never = config.iterations + (WARM_UP + TIMED) * views_per_step
     trainer = Trainer(
         changed(
             config,
@@ -272,12 +273,14 @@ def rehearse(config: FitConfig, dataset: Dataset, gaussians: Gaussians) -> Rehea
         few,
         gaussians,
     )
-    for count in (WARM_UP, TIMED):
+    # Steps of several views are fewer.
+    warm_up, timed = (max(2, math.ceil(n / views_per_step)) for n in (WARM_UP, TIMED))
+    for count in (warm_up, timed):
         start = time.perf_counter()
         for _ in range(count):
             report = trainer.step()
         _ = report.loss  # waits for the device
-    return Rehearsal(trainer, (time.perf_counter() - start) / TIMED)
+    return Rehearsal(trainer, (time.perf_counter() - start) / (timed * views_per_step))
 
 
 # ----------------------------------------------------------------------------------------------

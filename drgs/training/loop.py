@@ -32,7 +32,7 @@ class Length(Protocol):
 
 @dataclass(frozen=True)
 class Iteration:
-    """An iteration that is done."""
+    """A step that is done, of an iteration or several."""
 
     report: StepReport
     row: HistoryRow | None  # of the history, where this iteration is written down
@@ -52,7 +52,7 @@ class Observer(Protocol):
 
 
 def iterations(trainer: Trainer, history: History, length: Length) -> Iterator[Iteration]:
-    """Run the iterations that are left, one each time that the next one is asked for.
+    """Run the iterations that are left, a step each time that the next one is asked for.
 
     Rows are added to ``history`` every ``output.history_every`` iterations, and for the last one.
 
@@ -65,7 +65,7 @@ def iterations(trainer: Trainer, history: History, length: Length) -> Iterator[I
         if report.density is not None:
             history.add_density(report.iteration, report.density)
         goes_on = length.goes_on(trainer)
-        if not goes_on or report.iteration % trainer.config.output.history_every == 0:
+        if not goes_on or report.passes(trainer.config.output.history_every):
             row = history.add(report)
             trainer.watch.check()  # reading the row has waited for the device
         yield Iteration(report, row, is_last=not goes_on)

@@ -79,14 +79,20 @@ def rates_over_time(config: FitConfig, extent: float) -> LearningRates:
 
 
 def learning_rates(config: OptimizerConfig, extent: float) -> dict[str, float]:
-    """Rate per step of each parameter; extent: world units."""
+    """Rate per step of each parameter; extent: world units.
+
+    Steps of B views are sqrt(B) times as long, and moments forget as much in a step as in B steps
+    of one view (Malladi et al. 2022, "On the SDEs and Scaling Rules for Adaptive Gradient
+    Algorithms"; for splats Zhao et al. 2024, "On Scaling Up 3D Gaussian Splatting Training").
+    """
+    longer = math.sqrt(config.views_per_step)
     return {
-        "means": config.means_lr * extent,
-        "quats": config.quats_lr,
-        "log_scales": config.scales_lr,
-        "logit_opacities": config.opacities_lr,
-        "sh0": config.sh0_lr,
-        "shN": config.shN_lr,
+        "means": longer * config.means_lr * extent,
+        "quats": longer * config.quats_lr,
+        "log_scales": longer * config.scales_lr,
+        "logit_opacities": longer * config.opacities_lr,
+        "sh0": longer * config.sh0_lr,
+        "shN": longer * config.shN_lr,
     }
 
 
@@ -134,6 +140,6 @@ def revised_stops(config: FitConfig, now: int, stop: int) -> list[dict[str, int]
 
 def means_rate(config: FitConfig, extent: float) -> ExponentialDecay:
     """The rate of the means over the iterations; extent: world units."""
-    rates = config.optimizer
-    aims = tuple(rate_aims(config))
-    return ExponentialDecay(rates.means_lr * extent, rates.means_lr_final * extent, aims)
+    rates, longer = config.optimizer, math.sqrt(config.optimizer.views_per_step)
+    first, last = (longer * rate * extent for rate in (rates.means_lr, rates.means_lr_final))
+    return ExponentialDecay(first, last, tuple(rate_aims(config)))

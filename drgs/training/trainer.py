@@ -38,7 +38,14 @@ from drgs.training.optimizer import (
     restore_optimizer,
 )
 from drgs.training.rates import learning_rates, rates_over_time, revised_aims, revised_stops
-from drgs.training.stages import KEPT_BYTES, Stage, bytes_on_device, make_stages, view_of
+from drgs.training.stages import (
+    KEPT_BYTES,
+    Stage,
+    bytes_on_device,
+    make_stages,
+    step_of,
+    view_of,
+)
 from drgs.training.state_checks import DENSITY
 from drgs.training.views import TrainingView
 
@@ -47,26 +54,38 @@ PREFIX = "integrator."
 
 
 @dataclass(frozen=True)
-class StepReport:
-    """What one iteration did; numbers that cost a wait for the device are read on demand."""
+class SeenView:
+    """What an iteration found of its view."""
 
-    iteration: int
-    num_gaussians: int
-    means_lr: float
-    density: DensityReport | None  # None: rows are what they were
-    loss_array: Any  # Float, one entry
+    loss: Any  # Float, one entry
     squared_error: Any  # Float, one entry: mean over pixels and channels
     counted: float  # share of the pixels that count
 
+
+@dataclass(frozen=True)
+class StepReport:
+    """What a step did; numbers that cost a wait for the device are read on demand."""
+
+    iteration: int  # the last one
+    num_gaussians: int
+    means_lr: float
+    density: DensityReport | None  # None: rows are what they were
+    seen: tuple[SeenView, ...]  # by iteration
+
     @property
     def loss(self) -> float:
-        """The loss of this iteration's view."""
-        return float(self.loss_array[0])
+        """The mean loss of the step's views."""
+        return float(np.mean([float(view.loss[0]) for view in self.seen]))
 
     @property
     def psnr(self) -> float:
-        """dB, of this iteration's view before the step."""
-        return -10 * math.log10(max(float(self.squared_error[0]) / self.counted, 1e-10))
+        """dB, the mean of the step's views, before the step."""
+        errors = [float(view.squared_error[0]) / view.counted for view in self.seen]
+        return float(np.mean([-10 * math.log10(max(error, 1e-10)) for error in errors]))
+
+    def passes(self, every: int) -> bool:
+        """Whether an iteration of this step is a multiple of ``every``."""
+        return self.iteration % every < len(self.seen)
 
 
 class Trainer:
@@ -88,8 +107,8 @@ class Trainer:
             initial,
             learning_rates(config.optimizer, self.extent),
             prefix=PREFIX,
-            beta_1=config.optimizer.beta_1,
-            beta_2=config.optimizer.beta_2,
+            beta_1=config.optimizer.beta_1**config.optimizer.views_per_step,
+            beta_2=config.optimizer.beta_2**config.optimizer.views_per_step,
             epsilon=config.optimizer.epsilon,
         )
         self.rates = rates_over_time(config, self.extent)
@@ -102,37 +121,57 @@ class Trainer:
         self.iteration = 0
 
     def step(self) -> StepReport:
-        """One iteration: one view, one optimizer step, now and then a change of the population."""
-        self._end_stage()
-        self.iteration += 1
-        view = self.view
-        self.integrator.sh_degree = self.sh_degree
-        self._set_rates()
-        self.params.update(self.optimizer)
-        for effect in self.effects:
-            effect.before(self, view)
+        """An iteration for each view of a step, the step, now and then a change of the rows.
 
-        image = mi.render(self.scene, self.params, sensor=view.sensor, spp=1)
-        image, loss, error = self.compared(image, view)
-        dr.backward(loss if self.views_a_step == 1 else loss / self.views_a_step)
-        image, loss = dr.detach(image), dr.detach(loss)
-        numbers = {f"{e.name}.{k}": v for e in self.effects for k, v in e.numbers_of(view).items()}
-        self.watch.add(self.iteration, view.name, loss, self.integrator.last.first_fault, numbers)
+        An iteration renders one view. Of several views of a step (``views_per_step``), all see the
+        same Gaussians, and the optimizer steps along their mean gradient.
+        """
+        views, seen = [], []
+        for iteration in self._begin():
+            self.iteration = iteration
+            views.append(self.view)
+            seen.append(self._see(self.view))
         if self.ends_step:
+            self._set_rates()
             self.optimizer.step()
-        for effect in self.effects:
-            effect.after(self, view)
-        report = self._control_density(image, view.target)
-        self.stage.seen(view)
+        for view in views:
+            for effect in self.effects:
+                effect.after(self, view)
+        report = self._control_density()
+        for view in views:
+            self.stage.seen(view)
         return StepReport(
             iteration=self.iteration,
             num_gaussians=self.num_gaussians,
             means_lr=self.means_lr,
             density=report,
-            loss_array=loss,
-            squared_error=error,
-            counted=view.counted,
+            seen=tuple(seen),
         )
+
+    def _begin(self) -> range:
+        """Prepare a step, and return its iterations."""
+        former, iterations = self.stage, self._step_of(self.iteration + 1)
+        self.iteration = iterations[0]
+        if self.stage is not former:
+            former.end()
+        self.integrator.sh_degree = self.sh_degree
+        self.params.update(self.optimizer)
+        for effect in self.effects:
+            effect.begin(self)
+        return iterations
+
+    def _see(self, view: TrainingView) -> SeenView:
+        """Render a view, and add the derivatives of its loss to those of the step."""
+        for effect in self.effects:
+            effect.before(self, view)
+        image = mi.render(self.scene, self.params, sensor=view.sensor, spp=1)
+        image, loss, error = self.compared(image, view)
+        dr.backward(loss / self.num_averaged if self.num_averaged > 1 else loss)
+        image, loss = dr.detach(image), dr.detach(loss)
+        numbers = {f"{e.name}.{k}": v for e in self.effects for k, v in e.numbers_of(view).items()}
+        self.watch.add(self.iteration, view.name, loss, self.integrator.last.first_fault, numbers)
+        self._gather_density(image, view.target)
+        return SeenView(loss, error, view.counted)
 
     def compared(self, image: Any, view: TrainingView) -> tuple[Any, Any, Any]:
         """What a rendering is as a photograph of the view would be, its loss and squared error."""
@@ -148,8 +187,8 @@ class Trainer:
 
     @property
     def stage(self) -> Stage:
-        """Pictures of the size in use."""
-        return next(stage for stage in self.stages if self.iteration <= stage.until)
+        """Pictures of the size in use, which is that of the first iteration of a step."""
+        return next(stage for stage in self.stages if self._first <= stage.until)
 
     @property
     def views(self) -> list[TrainingView]:
@@ -158,8 +197,9 @@ class Trainer:
 
     @property
     def begins_stage(self) -> bool:
-        """Whether the pictures have other sizes than in the iteration before."""
-        return any(self.iteration == stage.until + 1 for stage in self.stages)
+        """Whether the pictures have other sizes than in the step before."""
+        before = self._first - self.config.optimizer.views_per_step
+        return any(before <= stage.until < self._first for stage in self.stages)
 
     @property
     def rate_decay(self) -> float:
@@ -172,17 +212,37 @@ class Trainer:
         return self.rates.means(self.iteration)
 
     @property
-    def views_a_step(self) -> int:
-        """How many iterations' gradients are put together for a step of the optimizer."""
-        config = self.config
-        is_late = self.rates.means.progress(self.iteration) > config.optimizer.views_from
-        is_settled = self.iteration >= config.densify.settled_from(config.iterations)
-        return config.optimizer.views if is_late and is_settled else 1
+    def num_averaged(self) -> int:
+        """How many iterations' gradients are averaged for a step of the optimizer."""
+        return max(self._late_views, len(self.iterations_of_step))
 
     @property
     def ends_step(self) -> bool:
-        """Whether this iteration's gradient is the last one of a step of the optimizer."""
-        return self.iteration % self.views_a_step == 0
+        """Whether the gradient is that of all iterations of a step of the optimizer."""
+        late = self._late_views
+        is_whole = late <= self.config.optimizer.views_per_step
+        return is_whole or self.iteration % late == 0
+
+    @property
+    def _late_views(self) -> int:
+        """Iterations of a step late in the fit, see ``optimizer.views``; 1: it is not late."""
+        config = self.config
+        is_late = self.rates.means.progress(self._first) > config.optimizer.views_from
+        is_settled = self._first >= config.densify.settled_from(config.iterations)
+        return config.optimizer.views if is_late and is_settled else 1
+
+    @property
+    def iterations_of_step(self) -> range:
+        """Those of the step that is under way, or was the last."""
+        return self._step_of(self.iteration)
+
+    @property
+    def _first(self) -> int:
+        return self.iterations_of_step.start
+
+    def _step_of(self, iteration: int) -> range:
+        """The iterations of its step."""
+        return step_of(iteration, self.config.optimizer.views_per_step, self.config.iterations)
 
     def place_all(self) -> None:
         """Put all sensors where effects have them now, without derivatives."""
@@ -193,7 +253,9 @@ class Trainer:
     @property
     def view(self) -> TrainingView:
         """What this iteration trains on."""
-        return self.views[view_of(self.iteration, len(self.views), self.config.seed)]
+        config, count = self.config, len(self.views)
+        views_per_step = config.optimizer.views_per_step
+        return self.views[view_of(self.iteration, count, config.seed, views_per_step)]
 
     @property
     def parameters(self) -> dict[str, Any]:
@@ -322,30 +384,33 @@ class Trainer:
         rates = {PREFIX + name: rate for name, rate in rates.items() if PREFIX + name in there}
         self.optimizer.set_learning_rate(rates)
 
-    def _control_density(self, image: Any, target: Target) -> DensityReport | None:
-        """Tell the strategy what was seen, and let it act; image: (H, W, 3), as compared."""
-        density, i = self.density, self.iteration
-        if density.gathers(i):
+    def _gather_density(self, image: Any, target: Target) -> None:
+        """Tell the strategy what was seen; image: (H, W, 3), as compared."""
+        i = self.iteration
+        if self.density.gathers(i):
             last, (height, width, _) = self.integrator.last, image.shape
-            gradients = last.means2d_grad, last.visible
+            # Of the view alone: what was averaged is a part of it.
+            count, of_mean = self.num_averaged, last.means2d_grad
+            gradients = of_mean * count if count > 1 else of_mean, last.visible
             weigh = partial(weighted_sums_of_last, self.integrator)
-            density.gather(SeenStep(i, width, height, *gradients, image, target.image, weigh))
-        if self.ends_step:
-            density.perturb(self.population, i, self.means_lr)
-        if not density.acts(i):
-            return None
-        self.check()
-        report = density.act(self.population, i)
-        if report is not None:
-            for effect in self.effects:
-                effect.repopulated(self)
-            # Freed arrays of sizes that will not come again would stay with Dr.Jit's allocator.
-            dr.flush_malloc_cache()
-        return report
+            step = SeenStep(i, width, height, *gradients, image, target.image, weigh)
+            self.density.gather(step)
 
-    def _end_stage(self) -> None:
-        if self.iteration == self.stage.until:
-            self.stage.end()
+    def _control_density(self) -> DensityReport | None:
+        """Let the strategy act; of several reports of a step, the last."""
+        density, report = self.density, None
+        if self.ends_step:
+            density.perturb(self.population, self.iteration, self.means_lr)
+        for iteration in filter(density.acts, self.iterations_of_step):
+            self.check()
+            found = density.act(self.population, iteration)
+            if found is not None:
+                report = found
+                for effect in self.effects:
+                    effect.repopulated(self)
+                # Freed arrays of sizes that will not come again would stay with Dr.Jit's allocator.
+                dr.flush_malloc_cache()
+        return report
 
 
 def _prune_window(

@@ -118,14 +118,15 @@ def for_viewers(
 
 def _tuned(tuner: Trainer, trainer: Trainer, watch: Callable[[int], None]) -> Gaussians:
     """After the iterations that follow those of ``trainer``."""
-    tuner.iteration = before = trainer.config.iterations
+    views_per_step = trainer.config.optimizer.views_per_step
+    before = trainer.config.iterations
+    tuner.iteration = -(-before // views_per_step) * views_per_step  # a step begins behind it
     found = {effect.name: effect.state() for effect in trainer.effects}
     for effect in tuner.effects:
         effect.repopulated(tuner)
         effect.restore(found[effect.name])
     while tuner.iteration < tuner.config.iterations:
-        tuner.step()
-        if tuner.iteration % tuner.config.output.history_every == 0:
+        if tuner.step().passes(tuner.config.output.history_every):
             tuner.watch.check()
         watch(tuner.iteration - before)
     return tuner.gaussians()

@@ -44,7 +44,7 @@ def test_what_a_measurement_would_write_is_refused_before_it_begins(name, tmp_pa
     module = importlib.import_module(f"drgs.bench.{name}")
     parser = CommandParser()
     module.add_arguments(parser)
-    of_their_own = ("photographs", "population", "recipes", "training")
+    of_their_own = ("batches", "photographs", "population", "recipes", "training")
     folder = tmp_path / name if name in of_their_own else tmp_path
     folder.mkdir(exist_ok=True)
     (folder / f"{name}.csv").write_text("mine")

@@ -143,7 +143,7 @@ def test_derivatives_of_the_loss_are_differences_in_numpy(index):
     picture = fits.photograph(fits.double(start), moved(photo, **row))
     assert not picture.near_threshold.any() and picture.image.max() <= 1
     effect.before(trainer, view)
-    leaves = effect.leaves
+    leaves = effect.parameters.leaves(view.index)
     trainer.params.update(trainer.optimizer)
     image = mi.render(trainer.scene, trainer.params, sensor=view.sensor, spp=1)
     _, loss, _ = trainer.compared(image, view)
@@ -528,7 +528,7 @@ def test_derivatives_of_a_camera_that_does_not_move_are_those_of_one_that_may():
         trainer.iteration = 1
         effect, view = effect_of(trainer), trainer.views[0]
         effect.before(trainer, view)
-        leaves = effect.leaves
+        leaves = effect.parameters.leaves(view.index)
         fits.gradients_of_loss(trainer, view)
         effect.after(trainer, view)
         found.append(np.concatenate([np.array(dr.grad(leaves[n])) for n in ("turns", "moves")]))

@@ -131,5 +131,5 @@ def test_views_are_put_together_only_when_the_population_is_what_it_will_be():
     counts = []
     for iteration in range(1, 51):
         trainer.iteration = iteration
-        counts.append(trainer.views_a_step)
+        counts.append(trainer.num_averaged)
     assert counts == [1] * 30 + [4] * 20  # at 30, rows may change for the last time

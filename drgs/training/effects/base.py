@@ -28,12 +28,16 @@ class FitState(Protocol):
         """The one that runs; the first is 1."""
 
     @property
+    def iterations_of_step(self) -> range:
+        """Those of the step that is under way."""
+
+    @property
     def rate_decay(self) -> float:
         """What the means' learning rate has fallen to, relative to where it began."""
 
     @property
     def begins_stage(self) -> bool:
-        """Whether the pictures have other sizes than in the iteration before."""
+        """Whether the pictures have other sizes than in the step before."""
 
     @property
     def integrator(self) -> SplatsSettings:
@@ -74,6 +78,9 @@ class TrainingEffect(Protocol):
     def place(self, view: TrainingView) -> None:
         """Put the view's sensor where the effect has it now; without derivatives."""
 
+    def begin(self, fit: FitState) -> None:
+        """Called before the views of a step are rendered."""
+
     def before(self, fit: FitState, view: TrainingView) -> None:
         """Called before the view is rendered."""
 
@@ -88,7 +95,10 @@ class TrainingEffect(Protocol):
         yield from ()
 
     def after(self, fit: FitState, view: TrainingView) -> None:
-        """Called when the derivatives are known, to take a step of its own."""
+        """Called when the derivatives of all views of a step are known, to take a step of its own.
+
+        In the order of the views.
+        """
 
     def repopulated(self, fit: FitState) -> None:
         """Called when Gaussians were added or removed, before the integrator gets the others."""

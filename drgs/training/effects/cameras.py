@@ -62,8 +62,7 @@ class CameraRefinement(TrainingEffect):
         shapes |= {name: (1, 2) for name, rate in shared.items() if rate > 0}
         values = {name: np.zeros(shape) for name, shape in shapes.items()}
         self.parameters = ViewParameters(values, rates | shared)
-        self.leaves: dict[str, mi.Float] = {}
-        self.numbers: dict[str, Any] = {}  # of the sensor that is rendered
+        self.numbers: dict[int, dict[str, Any]] = {}  # of the step's sensors, by view
 
     def upload(self, view: View) -> _Start:
         """The view's camera."""
@@ -82,12 +81,14 @@ class CameraRefinement(TrainingEffect):
 
     def before(self, fit: FitState, view: TrainingView) -> None:
         """Put the sensor where its camera is now."""
-        self.leaves = self.parameters.leaves(view.index)
+        leaves = self.parameters.leaves(view.index)
         # What the sensor depends on are leaves: the rest of the chain is differentiated afterwards.
-        self.numbers = dr.detach(self._camera(view.uploads[self.name], self.leaves))
+        self.numbers[view.index] = numbers = dr.detach(
+            self._camera(view.uploads[self.name], leaves)
+        )
         if fit.iteration > self.first:
-            dr.enable_grad(self.numbers)
-        _put(view.sensor, self.numbers)
+            dr.enable_grad(numbers)
+        _put(view.sensor, numbers)
 
     def place(self, view: TrainingView) -> None:
         """Put the sensor where its camera is now."""
@@ -96,12 +97,14 @@ class CameraRefinement(TrainingEffect):
 
     def after(self, fit: FitState, view: TrainingView) -> None:
         """One step of its own."""
-        if fit.iteration <= self.first:
+        numbers = self.numbers.pop(view.index)
+        if not dr.grad_enabled(numbers["to_world"]):
             return
-        camera = self._camera(view.uploads[self.name], self.leaves)
+        # Views of a step may share numbers, which the one before has moved.
+        camera = self._camera(view.uploads[self.name], self.parameters.leaves(view.index))
         for name, value in camera.items():
             if dr.grad_enabled(value):
-                dr.accum_grad(value, dr.grad(self.numbers[name]))
+                dr.accum_grad(value, dr.grad(numbers[name]))
                 dr.enqueue(dr.ADMode.Backward, value)
         dr.traverse(dr.ADMode.Backward)
         # As the rate of the means, which are what cameras are refined against.

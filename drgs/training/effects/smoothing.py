@@ -8,7 +8,6 @@ import numpy as np
 from drgs.effects.smoothing import smoothing_of
 from drgs.integrator.sensors import camera_from_sensor, read_sensor
 from drgs.training.effects.base import FitState, TrainingEffect
-from drgs.training.views import TrainingView
 
 EVERY = 100
 """Iterations (as in Mip-Splatting's code); also where another stage begins, and after each change
@@ -23,10 +22,10 @@ class TrainingSmoothing(TrainingEffect):
     def __init__(self) -> None:
         self.filter: mi.Float | None = None
 
-    def before(self, fit: FitState, view: TrainingView) -> None:
+    def begin(self, fit: FitState) -> None:
         """Find the filter anew where the means have moved, or are others."""
-        del view
-        if self.filter is None or fit.begins_stage or fit.iteration % EVERY == 1:
+        is_due = any(iteration % EVERY == 1 for iteration in fit.iterations_of_step)
+        if self.filter is None or fit.begins_stage or is_due:
             self.filter = self._found(fit)
         fit.integrator.smoothing = self.filter
 

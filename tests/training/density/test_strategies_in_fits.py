@@ -156,5 +156,5 @@ def test_steps_of_several_views_come_when_rows_do_not_change_any_more():
     views = []
     for _ in range(27):
         trainer.step()
-        views.append(trainer.views_a_step)
+        views.append(trainer.num_averaged)
     assert views == [1] * 24 + [5] * 3

@@ -1,0 +1,219 @@
+"""Steps of several views, all of which see the same Gaussians."""
+
+from dataclasses import replace
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from pydantic import ValidationError
+from support import small_fits as fits
+
+from drgs.gaussians.parameters import PARAMETER_NAMES
+from drgs.training.stages import step_of, view_of
+
+PREFIX = "integrator."
+
+
+@pytest.fixture(scope="module", autouse=True)
+def variant():
+    mi.set_variant("llvm_ad_rgb")
+
+
+def make_trainer(views_per_step, dataset=None, **changes):
+    dataset = dataset or fits.plain_dataset()
+    return fits.make_trainer(dataset, optimizer__views_per_step=views_per_step, **changes)
+
+
+def test_steps_follow_one_another_and_the_last_may_be_shorter():
+    steps, done = [], 0
+    while done < 11:
+        steps.append(step_of(done + 1, 4, 11))
+        assert all(step_of(i, 4, 11) == steps[-1] for i in steps[-1])
+        done = steps[-1][-1]
+    assert steps == [range(1, 5), range(5, 9), range(9, 12)]
+    assert step_of(12, 4, 11) == range(12, 13)  # of somebody who goes on
+
+
+@pytest.mark.parametrize(("num_views", "views_per_step"), [(10, 4), (12, 3), (3, 4)])
+def test_each_place_of_a_step_draws_from_views_of_its_own(num_views, views_per_step):
+    count = 60 * views_per_step
+    drawn = np.array([view_of(i, num_views, 3, views_per_step) for i in range(1, count + 1)])
+    for place, views in enumerate(drawn.reshape(-1, views_per_step).T):
+        own = np.arange(place % num_views, num_views, views_per_step)
+        rounds = views[: 60 // len(own) * len(own)].reshape(-1, len(own))
+        assert np.array_equal(np.sort(rounds, axis=1), np.tile(own, (len(rounds), 1)))
+        assert len(own) == 1 or len({tuple(r) for r in rounds}) > 1
+    assert set(drawn) == set(range(num_views))
+
+
+def test_a_step_is_adams_along_the_mean_gradient_with_scaled_rates_and_decays():
+    """Two steps by hand, in double precision, from gradients of single views."""
+    views_per_step = 3
+    trainer = make_trainer(views_per_step, iterations=8)
+    m, v = (dict.fromkeys(PARAMETER_NAMES, 0.0) for _ in range(2))
+    for t, iterations in ((1, (1, 2, 3)), (2, (4, 5, 6))):
+        before = {name: np.array(value, np.float64) for name, value in trainer.parameters.items()}
+        gradients = []
+        trainer.integrator.sh_degree = 1
+        for iteration in iterations:
+            trainer.iteration = iteration
+            gradients.append(fits.gradients_of_loss(trainer, trainer.view))
+        trainer.iteration = iterations[0] - 1
+        dr.set_grad(trainer.optimizer, 0)
+        report = trainer.step()
+        assert report.iteration == trainer.iteration == iterations[-1]
+        after = {name: np.array(value, np.float64) for name, value in trainer.parameters.items()}
+        b1, b2 = 0.9**views_per_step, 0.999**views_per_step
+        rates = trainer.config.optimizer
+        # The rate of means is that of the step's last iteration.
+        late = iterations[-1] / 8
+        means = trainer.extent * rates.means_lr ** (1 - late) * rates.means_lr_final**late
+        expected_rates = {
+            "means": means,
+            "quats": rates.quats_lr,
+            "log_scales": rates.scales_lr,
+            "logit_opacities": rates.opacities_lr,
+            "sh0": rates.sh0_lr,
+            "shN": rates.shN_lr,
+        }
+        falls = rates.decay ** max(0.0, (late - rates.decay_from) / (1 - rates.decay_from))
+        for name, value in before.items():
+            g = np.mean([gradient[name] for gradient in gradients], axis=0)
+            m[name], v[name] = b1 * m[name] + (1 - b1) * g, b2 * v[name] + (1 - b2) * g * g
+            change = m[name] / (1 - b1**t) / (np.sqrt(v[name] / (1 - b2**t)) + 1e-15)
+            rate = np.sqrt(views_per_step) * expected_rates[name]
+            rate *= 1 if name == "means" else falls
+            # Where a gradient is rounding noise, a step of Adam is as long as any.
+            is_sure = np.abs(g) > 1e-4 * np.abs(g).max()
+            got, expected = (after[name] - value)[is_sure], -(rate * change)[is_sure]
+            np.testing.assert_allclose(got, expected, rtol=2e-2, atol=1e-6, err_msg=name)
+            assert np.abs(got - expected).mean() < 1e-3 * np.abs(expected).mean(), name
+
+
+def test_what_is_reported_is_the_mean_of_the_views():
+    trainer, alone = make_trainer(3), make_trainer(1)
+    losses, psnrs = [], []
+    for index in (view_of(i, 6, 0, 3) for i in (1, 2, 3)):
+        fits_one = fits.make_trainer(
+            replace(fits.plain_dataset(), train=(fits.plain_dataset().train[index],))
+        )
+        report = fits_one.step()
+        losses.append(report.loss)
+        psnrs.append(report.psnr)
+    report = trainer.step()
+    # Single precision.
+    assert report.loss == pytest.approx(np.mean(losses), rel=1e-6)
+    assert report.psnr == pytest.approx(np.mean(psnrs), abs=1e-5)
+    assert len({alone.step().loss for _ in range(2)}) == 2
+
+
+def test_statistics_of_density_are_those_of_single_views():
+    """The same after a step of three views as of each of them alone, and not a third."""
+    settings = {"densify__start": 1, "densify__stop": 100, "densify__every": 50}
+    trainer = make_trainer(3, **settings)
+    norms = 0.0
+    for index in (view_of(i, 6, 0, 3) for i in (1, 2, 3)):
+        one = replace(fits.plain_dataset(), train=(fits.plain_dataset().train[index],))
+        alone = fits.make_trainer(one, **settings)
+        alone.step()
+        norms = norms + alone.state()["density/gradient_norms"].astype(np.float64)
+    trainer.step()
+    # Single precision: gradients that were divided by three, and multiplied again.
+    np.testing.assert_allclose(trainer.state()["density/gradient_norms"], norms, rtol=1e-4)
+    assert norms.max() > 0
+
+
+def test_a_change_that_falls_into_a_step_comes_behind_it():
+    trainer = make_trainer(
+        4, densify__strategy="budget", densify__start=3, densify__stop=20, densify__every=6
+    )
+    changes = []
+    for _ in range(6):
+        report = trainer.step()
+        if report.density is not None:
+            changes.append(report.iteration)
+    assert changes == [8, 12, 20]  # of iterations 6, 12, 18 and 20
+
+
+def test_pictures_change_their_size_with_the_first_step_behind_a_stage():
+    trainer = make_trainer(4, coarse=[{"until": 6, "factor": 2}])
+    widths, begun = [], []
+    for _ in range(4):
+        report = trainer.step()
+        widths.append(trainer.view.width)
+        begun.append(trainer.begins_stage)
+        assert trainer.iteration == report.iteration
+    whole = fits.plain_dataset().train[0].width
+    assert widths == [whole // 2, whole // 2, whole, whole]
+    assert begun == [False, False, True, False]
+
+
+EFFECTS = {
+    "colors__lr": 0.02,
+    "cameras__optimise": True,
+    "cameras__focal_lr": 1e-3,
+    "model__smoothing": True,
+    "data__random_background": True,
+}
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {
+            "densify__strategy": strategy,
+            "densify__start": 2,
+            "densify__stop": 30,
+            "densify__every": 5,
+        }
+        for strategy in ("adc", "budget", "mcmc")
+    ]
+    + [EFFECTS, {"coarse": [{"until": 6, "factor": 2}], "optimizer__views": 8}],
+    ids=["adc", "budget", "mcmc", "effects", "coarse"],
+)
+def test_a_fit_that_is_resumed_continues_to_the_same_bytes(changes):
+    dataset = fits.true_dataset() if changes is EFFECTS else None
+
+    def make():
+        return make_trainer(4, dataset, iterations=40, **changes)
+
+    fits.assert_resumes_to_the_same_bytes(make, 3, 4)
+
+
+def test_effects_of_all_views_of_a_step_begin_with_the_same_numbers():
+    """Focal lengths, which all share, move once the last view of the step was rendered."""
+    trainer = make_trainer(3, cameras__optimise=True, cameras__focal_lr=1e-3)
+    fits.steps(trainer, 2)
+    (effect,) = trainer.effects
+    shared, before = [], effect.before
+
+    def watched(fit, view):
+        before(fit, view)
+        shared.append(effect.parameters.numpy()["log_focals"].copy())
+
+    effect.before = watched
+    start = effect.parameters.numpy()["log_focals"].copy()
+    trainer.step()
+    assert len(shared) == 3 and all(np.array_equal(s, start) for s in shared)
+    assert not np.array_equal(effect.parameters.numpy()["log_focals"], start)
+    turns = effect.parameters.state()["turns.t"]
+    assert turns.sum() == 9  # each view has taken a step when it was seen
+
+
+def test_late_steps_are_made_of_whole_ones():
+    trainer = make_trainer(
+        2, optimizer__views=6, optimizer__views_from=0.5, densify__start=1, densify__stop=2
+    )
+    trainer.iteration = 300
+    counts, steps, step = [], [], trainer.optimizer.step
+    trainer.optimizer.step = lambda: (steps.append(trainer.iteration), step())
+    for _ in range(6):
+        trainer.step()
+        counts.append(trainer.num_averaged)
+    assert counts == [6] * 6 and steps == [306, 312]
+
+
+def test_late_steps_that_are_no_multiple_are_refused():
+    with pytest.raises(ValidationError, match=r"views must be a multiple .*\(4\).*, got 6"):
+        make_trainer(4, optimizer__views=6)
