@@ -343,6 +343,7 @@ class SplatsIntegrator(mi.CppADIntegrator):
         self._check_columns()
 
         self.last: LastBackward | None = None
+        self.source: rendering.Source | None = None  # of the splats; None: they are projected here
         self.memory = Memory()
         self._lock = threading.RLock()  # of the memory, and of what a picture leaves in the film
         self._last_sensor: mi.Sensor | None = None  # that was rendered
@@ -453,9 +454,9 @@ class SplatsIntegrator(mi.CppADIntegrator):
     def pipeline(self) -> rendering.Pipeline:
         """What this integrator's settings call for."""
         others = [feature_of(kind) for kind in self.aovs.values() if kind != "alpha"]
-        return pipeline_of(
-            self.approximations, self.sh_degree, features=(rendering.color_features, *others)
-        )
+        features = (rendering.color_features, *others)
+        pipeline = pipeline_of(self.approximations, self.sh_degree, features=features)
+        return pipeline if self.source is None else replace(pipeline, source=self.source)
 
     def aov_names(self) -> list[str]:
         """Of the channels besides colour and alpha."""
@@ -540,15 +541,19 @@ class SplatsIntegrator(mi.CppADIntegrator):
                 visible=gradients.visible,
                 first_fault=gradients.first_fault,
             )
-            with dr.resume_grad():
-                own = gradients.parameters
-                if self._gathered is not None:
-                    own = self._gathered.accumulate(_ellipsoids(scene), own)
-                for name in PARAMETER_NAMES:
-                    accumulate(getattr(self, name), getattr(own, name))
-                for name, gradient in (own.features or {}).items():
-                    accumulate(self.features[name], gradient)
+            if gradients.parameters is not None:
+                with dr.resume_grad():
+                    self.accumulate(scene, gradients.parameters)
             sensor.film().clear()  # it may hold an attached block
+
+    def accumulate(self, scene: mi.Scene, own: Gaussians) -> None:
+        """Add derivatives with respect to the Gaussians to those of the attached parameters."""
+        if self._gathered is not None:
+            own = self._gathered.accumulate(_ellipsoids(scene), own)
+        for name in PARAMETER_NAMES:
+            accumulate(getattr(self, name), getattr(own, name))
+        for name, gradient in (own.features or {}).items():
+            accumulate(self.features[name], gradient)
 
     def render_forward(
         self,

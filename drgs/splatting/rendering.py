@@ -374,14 +374,8 @@ def weighted_sums(frame: Frame, plane: Any) -> Any:
 
 def sum_of_gradients(a: GaussianGradients, b: GaussianGradients) -> GaussianGradients:
     """Those of a loss that depends on what several cameras see."""
-    parameters = {
-        name: getattr(a.parameters, name) + getattr(b.parameters, name) for name in PARAMETER_NAMES
-    }
-    if a.parameters.features:
-        others = b.parameters.features
-        parameters["features"] = {k: v + others[k] for k, v in a.parameters.features.items()}
     total = GaussianGradients(
-        parameters=Gaussians(**parameters),
+        parameters=None if a.parameters is None else _sum_of(a.parameters, b.parameters),
         means2d=a.means2d + b.means2d,
         visible=a.visible | b.visible,
         first_fault=dr.select(a.first_fault < b.first_fault, a.first_fault, b.first_fault),
@@ -391,19 +385,27 @@ def sum_of_gradients(a: GaussianGradients, b: GaussianGradients) -> GaussianGrad
     return total
 
 
+def _sum_of(a: Gaussians, b: Gaussians) -> Gaussians:
+    total = {name: getattr(a, name) + getattr(b, name) for name in PARAMETER_NAMES}
+    if a.features:
+        total["features"] = {name: v + b.features[name] for name, v in a.features.items()}
+    return Gaussians(**total)
+
+
 def decode_fault(fault: int) -> tuple[int, str] | None:
     """The row and the parameter of :attr:`GaussianGradients.first_fault`; None if there is none.
 
     A row's gradient of a parameter is at fault if its squared norm is not finite: it is NaN or
     infinite, or Adam's second moment, which holds squares, would be.
     """
-    if fault == _NO_FAULT:
+    if fault == NO_FAULT:
         return None
     row, parameter = divmod(fault, len(PARAMETER_NAMES))
     return row, PARAMETER_NAMES[parameter]
 
 
-_NO_FAULT = 2**32 - 1
+NO_FAULT = 2**32 - 1
+"""No row is at fault."""
 
 
 def frames_tangent(
@@ -480,7 +482,7 @@ def _as_tensors(d_rows: GaussianRows, gaussians: Gaussians, visible: Any) -> tup
         for name, own in columns.items()
         if len(own)
     }
-    faults = dr.select(visible, _faults(d_rows), _NO_FAULT)
+    faults = dr.select(visible, _faults(d_rows), NO_FAULT)
     dr.eval(stored, faults)
 
     def gradient(name: str, like: Any) -> Any:
@@ -498,7 +500,7 @@ def _as_tensors(d_rows: GaussianRows, gaussians: Gaussians, visible: Any) -> tup
 
 
 def _faults(d_rows: GaussianRows) -> Any:
-    """UInt32 (N,): row * 6 + number of the first parameter at fault there, or ``_NO_FAULT``."""
+    """UInt32 (N,): row * 6 + number of the first parameter at fault there, or ``NO_FAULT``."""
     UInt32 = types_of(type(d_rows.logit_opacities)).UInt32
     row = dr.arange(UInt32, dr.width(d_rows.logit_opacities))
     higher = [component for vector in d_rows.sh[1:] for component in vector]
@@ -510,7 +512,7 @@ def _faults(d_rows: GaussianRows) -> Any:
         "sh0": d_rows.sh[0],
         "shN": higher,
     }
-    faults = UInt32(_NO_FAULT)
+    faults = UInt32(NO_FAULT)
     for number, name in reversed(list(enumerate(PARAMETER_NAMES))):
         squared_norm = sum(dr.square(component) for component in columns[name])
         # Written such that NaN is a fault.

@@ -8,7 +8,7 @@ changes of the population from a strategy of ``drgs.training.density``.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -115,10 +115,13 @@ class Trainer:
         self.loss = PhotometricLoss(config.loss.dssim_weight)
         self.white_background = tuple(dataset.background) == (1.0, 1.0, 1.0)
         self.stages = make_stages(dataset.train, config, self.effects, room)
-        self.population = Population(self.optimizer, PREFIX, self.extent, config.seed)
+        self.population = self._population()
         self.density = self._density_from({})
         self.watch = GradientWatch()
         self.iteration = 0
+
+    def _population(self) -> Population:
+        return Population(self.optimizer, PREFIX, self.extent, self.config.seed)
 
     def step(self) -> StepReport:
         """An iteration for each view of a step, the step, now and then a change of the rows.
@@ -126,14 +129,12 @@ class Trainer:
         An iteration renders one view. Of several views of a step (``views_per_step``), all see the
         same Gaussians, and the optimizer steps along their mean gradient.
         """
-        views, seen = [], []
-        for iteration in self._begin():
-            self.iteration = iteration
-            views.append(self.view)
-            seen.append(self._see(self.view))
+        iterations = self._begin()
+        seen = self._differentiate(iterations)
         if self.ends_step:
             self._set_rates()
             self.optimizer.step()
+        views = [self.view_at(iteration) for iteration in self._own(iterations)]
         for view in views:
             for effect in self.effects:
                 effect.after(self, view)
@@ -160,18 +161,30 @@ class Trainer:
             effect.begin(self)
         return iterations
 
-    def _see(self, view: TrainingView) -> SeenView:
-        """Render a view, and add the derivatives of its loss to those of the step."""
-        for effect in self.effects:
-            effect.before(self, view)
-        image = mi.render(self.scene, self.params, sensor=view.sensor, spp=1)
-        image, loss, error = self.compared(image, view)
-        dr.backward(loss / self.num_averaged if self.num_averaged > 1 else loss)
-        image, loss = dr.detach(image), dr.detach(loss)
-        numbers = {f"{e.name}.{k}": v for e in self.effects for k, v in e.numbers_of(view).items()}
-        self.watch.add(self.iteration, view.name, loss, self.integrator.last.first_fault, numbers)
-        self._gather_density(image, view.target)
-        return SeenView(loss, error, view.counted)
+    def _own(self, iterations: range) -> Sequence[int]:
+        """Those whose views are rendered here: all of them, unless there are other processes."""
+        return iterations
+
+    def _differentiate(self, iterations: range) -> list[SeenView]:
+        """Add up the derivatives of the mean loss of a step's views; ends at the last iteration."""
+        seen = []
+        for iteration in iterations:
+            self.iteration, view = iteration, self.view_at(iteration)
+            for effect in self.effects:
+                effect.before(self, view)
+            image, loss, error = self.compared(self._rendered(view), view)
+            loss = self._regularised(loss)
+            self._backward(loss)
+            image, loss = dr.detach(image), dr.detach(loss)
+            self._watch(view, loss, self.integrator.last.first_fault)
+            if self.density.gathers(iteration):
+                self.density.gather(self._seen_step(image, view.target))
+            seen.append(SeenView(loss, error, view.counted))
+        return seen
+
+    def _rendered(self, view: TrainingView) -> Any:
+        """The Gaussians as the view's sensor sees them, with derivatives."""
+        return mi.render(self.scene, self.params, sensor=view.sensor, spp=1)
 
     def compared(self, image: Any, view: TrainingView) -> tuple[Any, Any, Any]:
         """What a rendering is as a photograph of the view would be, its loss and squared error."""
@@ -181,9 +194,31 @@ class Trainer:
         for effect in self.effects:
             for penalty in effect.penalties(view):
                 loss = loss + penalty
-        for penalty in self.density.penalties(self.parameters):
-            loss = loss + penalty
         return image, loss, error
+
+    def _regularised(self, loss: Any) -> Any:
+        """A view's loss with the terms of the strategy of density."""
+        for penalty in self.density.penalties(self.parameters, self.num_gaussians):
+            loss = loss + penalty
+        return loss
+
+    def _backward(self, loss: Any) -> None:
+        """Add the derivatives of a view's part of the mean."""
+        dr.backward(loss / self.num_averaged if self.num_averaged > 1 else loss)
+
+    def _watch(self, view: TrainingView, loss: Any, first_fault: Any) -> None:
+        """Write down what may not be finite; see :class:`GradientWatch`."""
+        numbers = {f"{e.name}.{k}": v for e in self.effects for k, v in e.numbers_of(view).items()}
+        self.watch.add(self.iteration, view.name, loss, first_fault, numbers)
+
+    def _seen_step(self, image: Any, target: Target) -> SeenStep:
+        """For the strategy of density; image: (H, W, 3), as compared."""
+        last, (height, width, _) = self.integrator.last, image.shape
+        # Of the view alone: what was averaged is a part of it.
+        count, of_mean = self.num_averaged, last.means2d_grad
+        gradients = of_mean * count if count > 1 else of_mean, last.visible
+        weigh = partial(weighted_sums_of_last, self.integrator)
+        return SeenStep(self.iteration, width, height, *gradients, image, target.image, weigh)
 
     @property
     def stage(self) -> Stage:
@@ -253,9 +288,13 @@ class Trainer:
     @property
     def view(self) -> TrainingView:
         """What this iteration trains on."""
+        return self.view_at(self.iteration)
+
+    def view_at(self, iteration: int) -> TrainingView:
+        """What an iteration of the stage in use trains on."""
         config, count = self.config, len(self.views)
         views_per_step = config.optimizer.views_per_step
-        return self.views[view_of(self.iteration, count, config.seed, views_per_step)]
+        return self.views[view_of(iteration, count, config.seed, views_per_step)]
 
     @property
     def parameters(self) -> dict[str, Any]:
@@ -383,18 +422,6 @@ class Trainer:
         there = self.optimizer.state  # shN is not, where the degree is 0
         rates = {PREFIX + name: rate for name, rate in rates.items() if PREFIX + name in there}
         self.optimizer.set_learning_rate(rates)
-
-    def _gather_density(self, image: Any, target: Target) -> None:
-        """Tell the strategy what was seen; image: (H, W, 3), as compared."""
-        i = self.iteration
-        if self.density.gathers(i):
-            last, (height, width, _) = self.integrator.last, image.shape
-            # Of the view alone: what was averaged is a part of it.
-            count, of_mean = self.num_averaged, last.means2d_grad
-            gradients = of_mean * count if count > 1 else of_mean, last.visible
-            weigh = partial(weighted_sums_of_last, self.integrator)
-            step = SeenStep(i, width, height, *gradients, image, target.image, weigh)
-            self.density.gather(step)
 
     def _control_density(self) -> DensityReport | None:
         """Let the strategy act; of several reports of a step, the last."""

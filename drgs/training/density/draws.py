@@ -37,16 +37,16 @@ def in_proportion(weights: np.ndarray, count: int, key: list[int]) -> np.ndarray
     return np.minimum(np.searchsorted(ends, positions, side="right"), last)
 
 
-def normals(float_type: type, count: int, iteration: Any, seed: Any) -> Any:
-    """Return standard normal vectors, Array3f (count,), a function of iteration, seed and row.
+def normals(float_type: type, rows: Any, iteration: Any, seed: Any) -> Any:
+    """Return standard normal vectors, Array3f (N,), a function of iteration, seed and row.
 
-    iteration, seed: UInt32 (1,), opaque, so that each value is no new kernel.
+    rows: UInt32 (N,); iteration, seed: UInt32 (1,), opaque, so that each value is no new kernel.
 
     Box and Muller's transform of a hash of the three (``pcg4d``: Jarzynski and Olano 2020, Hash
     Functions for GPU Rendering).
     """
     t = types_of(float_type)
-    words = pcg4d(dr.arange(t.UInt32, count), t.UInt32(iteration), t.UInt32(seed), t.UInt32(0))
+    words = pcg4d(rows, t.UInt32(iteration), t.UInt32(seed), t.UInt32(0))
     first, second, third, fourth = (t.Float(word >> 8) * _WORD for word in words)
     # 1 - u is above 0, of which there is a logarithm.
     radius, other = (dr.sqrt(-2 * dr.log(1 - u)) for u in (first, third))

@@ -53,14 +53,14 @@ class MarkovChain(DensityStrategy):
         """What the population grows to; one that starts with more stays as it is."""
         return min(self.config.mcmc.gaussians, self.config.max_gaussians)
 
-    def penalties(self, parameters: Mapping[str, Any]) -> Iterator[Any]:
+    def penalties(self, parameters: Mapping[str, Any], num_rows: int) -> Iterator[Any]:
         """The paper's equation 10: the mean opacity, and the mean scale in scene extents."""
         config, logits = self.config.mcmc, parameters["logit_opacities"]
         log_scales = parameters["log_scales"].array
         if config.opacity_weight > 0:
-            yield _mean(1 / (1 + dr.exp(-logits)), config.opacity_weight)
+            yield _mean(1 / (1 + dr.exp(-logits)), config.opacity_weight, num_rows)
         if config.scale_weight > 0:
-            yield _mean(dr.exp(log_scales), config.scale_weight / self.extent)
+            yield _mean(dr.exp(log_scales), config.scale_weight / self.extent, 3 * num_rows)
 
     def perturb(self, population: Population, iteration: int, means_lr: float) -> None:
         """Add noise to the means (the paper's equation 8), which keep their moments.
@@ -78,7 +78,7 @@ class MarkovChain(DensityStrategy):
         t = types_of(type(logits))
         strength = dr.opaque(t.Float, config.noise_lr * means_lr / self.extent**2)
         iteration, seed = (dr.opaque(t.UInt32, v) for v in (iteration, population.seed))
-        normal = normals(t.Float, dr.width(logits), iteration, seed)
+        normal = normals(t.Float, population.row_numbers(), iteration, seed)
         opacity = 1 / (1 + dr.exp(-logits))
         fading = 1 / (1 + dr.exp(NOISE_STEEPNESS * (opacity - config.min_opacity)))
         rotation = quat_to_rotation(dr.unravel(t.Array4f, quats.array))
@@ -189,6 +189,6 @@ def _spread(rows: dict[str, Any], num_drawn: int, spread: float, key: list[int])
     rows["means"] = displaced(rows, spread * normals)
 
 
-def _mean(values: Any, weight: float) -> Any:
-    """Times a weight; neither of which is a literal: their number changes."""
-    return dr.sum(values) * dr.opaque(type(values), weight / dr.width(values))
+def _mean(values: Any, weight: float, count: int) -> Any:
+    """Their sum, divided by ``count``, times a weight; no literals: their number changes."""
+    return dr.sum(values) * dr.opaque(type(values), weight / count)

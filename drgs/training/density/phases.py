@@ -39,9 +39,9 @@ class Phases(DensityStrategy):
             if phase.gathers(step.iteration):
                 phase.gather(step)
 
-    def penalties(self, parameters: Mapping[str, Any]) -> Iterator[Any]:
+    def penalties(self, parameters: Mapping[str, Any], num_rows: int) -> Iterator[Any]:
         """Those of all of them."""
-        return chain.from_iterable(phase.penalties(parameters) for phase in self.phases)
+        return chain.from_iterable(p.penalties(parameters, num_rows) for p in self.phases)
 
     def rate_factors(self, iteration: int) -> Mapping[str, float]:
         """The products of theirs."""

@@ -100,6 +100,11 @@ class Population:
         index_type = dr.uint32_array_t(type(self.value("means").array))
         return from_host(index_type, numbers.astype(np.uint32))
 
+    def row_numbers(self) -> Any:
+        """Of the rows that :meth:`value` has: UInt32 (N,)."""
+        index_type = dr.uint32_array_t(type(self.value("means").array))
+        return dr.arange(index_type, self.num_rows)
+
     def take(self, rows: Any) -> dict[str, Any]:
         """Copies of some rows of every parameter by name; rows: (M,) ``UInt32``."""
         return take_rows(self.optimizer, rows, self.prefix)
@@ -158,12 +163,12 @@ class DensityStrategy(Protocol):
         """Take note of an iteration, after its optimizer step."""
         del step
 
-    def penalties(self, parameters: Mapping[str, Any]) -> Iterator[Any]:
+    def penalties(self, parameters: Mapping[str, Any], num_rows: int) -> Iterator[Any]:
         """Terms of the loss, Float of one value each.
 
-        parameters: raw values by name, with derivatives.
+        parameters: raw values by name, with derivatives, of ``num_rows`` Gaussians or of some.
         """
-        del parameters
+        del parameters, num_rows
         yield from ()
 
     def rate_factors(self, iteration: int) -> Mapping[str, float]:

@@ -69,7 +69,11 @@ def test_the_hash_is_that_of_the_paper():
 def test_normals_are_independent_standard_normal_numbers(float_type):
     count = 20_000
     draws = [
-        np.array(normals(float_type, count, dr.opaque(UInt32, i), dr.opaque(UInt32, seed))).T
+        np.array(
+            normals(
+                float_type, dr.arange(UInt32, count), dr.opaque(UInt32, i), dr.opaque(UInt32, seed)
+            )
+        ).T
         for i, seed in ((1, 0), (2, 0), (1, 1))
     ]
     columns = np.concatenate(draws, axis=1)
@@ -88,7 +92,9 @@ def test_normals_repeat_to_the_last_bit_with_any_number_of_threads():
         before = dr.thread_count()
         dr.set_thread_count(threads)
         try:
-            drawn = normals(Float, 10_000, dr.opaque(UInt32, 9), dr.opaque(UInt32, 4))
+            drawn = normals(
+                Float, dr.arange(UInt32, 10_000), dr.opaque(UInt32, 9), dr.opaque(UInt32, 4)
+            )
             return np.array(drawn).tobytes()
         finally:
             dr.set_thread_count(before)

@@ -272,7 +272,7 @@ def test_noise_compiles_one_kernel():
 def test_penalties_are_mean_opacity_and_mean_scale():
     optimizer = make([0.1, 0.2, 0.4], [0.1, 0.5, 0.9], tensor_type=TensorXf64)
     parameters = dict(optimizer.items())
-    terms = list(strategy(opacity_weight=0.3, scale_weight=0.7).penalties(parameters))
+    terms = list(strategy(opacity_weight=0.3, scale_weight=0.7).penalties(parameters, 3))
     before = values(optimizer)
     opacities, scales = expit(before["logit_opacities"]), np.exp(before["log_scales"])
     expected = 0.3 * opacities.mean(), 0.7 * scales.mean() / EXTENT
@@ -288,4 +288,4 @@ def test_penalties_are_mean_opacity_and_mean_scale():
 
 def test_without_weight_there_are_no_terms():
     parameters = dict(make([SIZE], 0.5).items())
-    assert not list(strategy(opacity_weight=0.0, scale_weight=0.0).penalties(parameters))
+    assert not list(strategy(opacity_weight=0.0, scale_weight=0.0).penalties(parameters, 3))

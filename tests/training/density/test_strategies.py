@@ -83,8 +83,8 @@ def test_an_iteration_gathers_perturbs_and_acts_in_this_order(monkeypatch):
 class Faint(DensityStrategy):
     """Asks for transparent Gaussians."""
 
-    def penalties(self, parameters):
-        assert parameters["logit_opacities"].shape == (40,)
+    def penalties(self, parameters, num_rows):
+        assert parameters["logit_opacities"].shape == (40,) and num_rows == 40
         yield 1e6 * dr.mean(parameters["logit_opacities"].array)
 
 
@@ -170,7 +170,7 @@ class Phase(DensityStrategy):
     def rate_factors(self, iteration):
         return {"means": 2.0, self.name: 3.0}
 
-    def penalties(self, parameters):
+    def penalties(self, parameters, num_rows):
         yield self.name
 
     def acts(self, iteration):
@@ -200,7 +200,7 @@ def test_phases_are_one_strategy_and_begin_anew_where_others_change_rows():
     assert [i for i in range(1, 9) if phases.acts(i)] == [2, 4, 6]
     assert [i for i in range(1, 9) if phases.gathers(i)] == [1, 2, 3, 4, 5, 6]
     assert phases.rate_factors(1) == {"means": 4.0, "first": 3.0, "last": 3.0}
-    assert list(phases.penalties({})) == ["first", "last"]
+    assert list(phases.penalties({}, 5)) == ["first", "last"]
     assert phases.most_gaussians(100, 8) == 117
     for iteration in range(1, 6):
         phases.gather(Seen(iteration))

@@ -1,0 +1,299 @@
+"""The training loop of several processes; the same bytes as one process gives.
+
+A step of B views is taken in three parts: every process projects its rows for the cameras of all
+views, and sends what they see (``drgs.distributed.exchange``); renders the views that are its own,
+and sends derivatives back; and takes those of its rows, view by view in the order of the step,
+through the projection into the gradients that its optimizer steps along. Sums over views are
+therefore added up by the owner of a row, in the same order for any number of processes.
+
+What strategies of density know of each row is small, and everywhere; so each process decides alike.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property, reduce
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from drgs.cameras.camera import cameras_in_time
+from drgs.config.schema import FitConfig
+from drgs.core.arrays import from_host
+from drgs.core.errors import UserError
+from drgs.data.types import Dataset
+from drgs.distributed.exchange import Post, Received, Sight, joined
+from drgs.distributed.ranks import Ranks
+from drgs.distributed.shards import Shard, SpreadPopulation
+from drgs.effects.compose import composed, ignoring
+from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
+from drgs.integrator.sensors import camera_from_sensor, read_sensor
+from drgs.splatting.rendering import (
+    NO_FAULT,
+    Frame,
+    gradients_of,
+    sum_of_gradients,
+    weighted_sums,
+)
+from drgs.training.density.strategy import SeenStep
+from drgs.training.trainer import PREFIX, SeenView, Trainer
+
+
+@dataclass(frozen=True, eq=False)
+class Picture:
+    """A view that this process has rendered."""
+
+    frames: list[Frame]  # by time
+    image: Any  # as compared, (H, W, 3)
+    photograph: Any
+
+
+class DistributedTrainer(Trainer):
+    """A process's part of a fit: an interval of the rows, and some of the views of each step."""
+
+    def __init__(
+        self, config: FitConfig, dataset: Dataset, gaussians: Gaussians, ranks: Ranks
+    ) -> None:
+        """gaussians: all of them, on each process."""
+        check_can_be_shared(config, ranks.size, gaussians.num_gaussians)
+        self.ranks, self.post = ranks, Post(ranks)
+        self.shard = Shard(gaussians.num_gaussians, ranks.rank, ranks.size)
+        super().__init__(config, dataset, self.shard.of(gaussians))
+
+    def _population(self) -> SpreadPopulation:
+        common = {"optimizer": self.optimizer, "prefix": PREFIX, "extent": self.extent}
+        return SpreadPopulation(**common, seed=self.config.seed, ranks=self.ranks, shard=self.shard)
+
+    @property
+    def num_gaussians(self) -> int:
+        """N at the moment, of all processes."""
+        return self.shard.total
+
+    def renderer_of(self, iteration: int) -> int:
+        """Which process renders its view: the places of a step are dealt out in equal parts."""
+        views_per_step = self.config.optimizer.views_per_step
+        return (iteration - 1) % views_per_step * self.ranks.size // views_per_step
+
+    def _own(self, iterations: range) -> Sequence[int]:
+        return [i for i in iterations if self.renderer_of(i) == self.ranks.rank]
+
+    # ------------------------------------------------------------------------------------------
+    # A step
+    # ------------------------------------------------------------------------------------------
+
+    def _differentiate(self, iterations: range) -> list[SeenView]:
+        """See :meth:`Trainer._differentiate`."""
+        sights = [self._sights(iteration) for iteration in iterations]
+        counts = self.ranks.told(np.array([[sight.count for sight in each] for each in sights]))
+        for place, iteration in enumerate(iterations):
+            for time, sight in enumerate(sights[place]):
+                self.post.send(sight.numbers, self.renderer_of(iteration), place, time)
+        found, pictures = np.zeros((len(iterations), 3)), {}
+        for iteration in self._own(iterations):
+            place = iterations.index(iteration)
+            self.iteration = iteration
+            found[place], pictures[place] = self._render(place, sights[place], counts[:, place])
+        found = self.ranks.told(found).sum(axis=0)  # of a view, those of all but one are 0
+        for place, iteration in enumerate(iterations):
+            self.iteration = iteration
+            self._add_gradients(place, sights[place], counts[:, place], pictures.get(place))
+        self.post.finish()
+        return [SeenView([loss], [error], counted) for loss, error, counted in found]
+
+    def _sights(self, iteration: int) -> list[Sight]:
+        """What the view's camera sees of the rows of this process, at each time."""
+        sensor = self.view_at(iteration).sensor
+        with dr.suspend_grad():
+            state = read_sensor(sensor, self.integrator.near)
+            camera = ignoring(camera_from_sensor(state), self.integrator.ignore)
+            gaussians, pipeline = dr.detach(self.integrator.gaussians), self.integrator.pipeline
+            return [
+                Sight.of(gaussians, of_time, composed(pipeline, gaussians, of_time))
+                for of_time in cameras_in_time(camera)
+            ]
+
+    def _render(
+        self, place: int, sights: Sequence[Sight], counts: np.ndarray
+    ) -> tuple[list[float], Picture | None]:
+        """Render a view of this process, and send derivatives back: loss, error, counted; picture.
+
+        counts: splats by process and time. The picture is there if the strategy of density asks.
+        """
+        iteration, view = self.iteration, self.view
+        received = self._received(place, sights, counts)
+        for effect in self.effects:
+            effect.before(self, view)
+        self.integrator.source = received
+        image, loss, error = self.compared(self._rendered(view), view)
+        self._backward(loss)
+        self.integrator.source = None
+        image, loss = dr.detach(image), dr.detach(loss)
+        for time, numbers in enumerate(received.numbers(counts.sum(axis=0))):
+            self.send_to_owners(numbers, counts[:, time], place, time)
+        self._watch(view, loss, mi.UInt32(NO_FAULT))
+        picture = None
+        if self.density.gathers(iteration):
+            frames = [of_time[0] for of_time in self.integrator.memory.rendered[0].frames]
+            picture = Picture(frames, image, view.target.image)
+        return [float(loss[0]), float(error[0]), view.counted], picture
+
+    def _received(self, place: int, sights: Sequence[Sight], counts: np.ndarray) -> Received:
+        """The splats of all processes."""
+        in_time = []
+        for time, sight in enumerate(sights):
+            parts = [
+                self.post.receive(sight.empty(count), rank, place, time)
+                for rank, count in enumerate(counts[:, time])
+            ]
+            in_time.append(joined(parts, sight.layout, type(self.means.array)))
+        return Received(in_time)
+
+    def send_to_owners(
+        self, numbers: np.ndarray, counts: np.ndarray, place: int, time: int
+    ) -> None:
+        """Rows for the splats of a view, to those who projected them."""
+        for rank, part in enumerate(np.split(numbers, np.cumsum(counts)[:-1])):
+            self.post.send(part, rank, place, time)
+
+    def _add_gradients(
+        self, place: int, sights: Sequence[Sight], counts: np.ndarray, picture: Picture | None
+    ) -> None:
+        """Of the rows of this process, from a view's derivatives with respect to its splats."""
+        renderer, of_splats = self.renderer_of(self.iteration), []
+        for time, sight in enumerate(sights):
+            into = sight.empty(sight.count, sight.layout.num_gradients)
+            of_splats.append(sight.splat_gradients(self.post.receive(into, renderer, place, time)))
+        penalties = list(self.density.penalties(self.parameters, self.num_gaussians))
+        if penalties:
+            self._backward(sum(penalties[1:], penalties[0]))
+        gaussians = dr.detach(self.integrator.gaussians)
+        with dr.suspend_grad():
+            of_times = [
+                gradients_of(gaussians, sight.camera, sight.pipeline, gradients)
+                for sight, gradients in zip(sights, of_splats, strict=True)
+            ]
+            found = reduce(sum_of_gradients, of_times)
+            with dr.resume_grad():
+                self.integrator.accumulate(self.scene, found.parameters)
+        first = dr.opaque(mi.UInt32, self.shard.own.start * len(PARAMETER_NAMES))
+        fault = found.first_fault
+        fault = dr.select(fault == NO_FAULT, fault, fault + first)
+        self.watch.add(self.iteration, self.view.name, mi.Float(0), fault)
+        if self.density.gathers(self.iteration):
+            step = SharedStep(self, place, sights, counts, found.means2d, picture)
+            self.density.gather(step)
+
+    # ------------------------------------------------------------------------------------------
+    # All of it, on the first process
+    # ------------------------------------------------------------------------------------------
+
+    def gaussians(self) -> Gaussians:
+        """All Gaussians as numpy arrays, on all processes."""
+        own = super().gaussians()
+        rows = {name: self.ranks.rows_of_all(getattr(own, name)) for name in PARAMETER_NAMES}
+        smoothing = own.smoothing
+        if smoothing is not None:
+            smoothing = self.ranks.rows_of_all(smoothing)
+        return Gaussians(**rows, smoothing=smoothing)
+
+    def state(self) -> dict[str, np.ndarray]:
+        """See :meth:`Trainer.state`; on the first process."""
+        state, own = super().state(), self.population.num_own
+        for name, array in state.items():
+            if name.partition(".")[0] in PARAMETER_NAMES and not name.endswith(".t"):
+                rows = self.ranks.rows_on_first(array.reshape(own, -1))
+                if rows is not None:
+                    shape = array.shape[1:] if array.ndim > 1 else ()
+                    state[name] = (
+                        rows.reshape(self.num_gaussians, *shape) if shape else rows.ravel()
+                    )
+        return state
+
+
+class SharedStep:
+    """What a strategy of density is told of a view that one process has rendered.
+
+    It answers as :class:`drgs.training.density.strategy.SeenStep`, about all rows. Every process
+    asks for the same, in the same order: answers take all of them.
+    """
+
+    def __init__(
+        self,
+        trainer: DistributedTrainer,
+        place: int,
+        sights: Sequence[Sight],
+        counts: np.ndarray,
+        means2d: Any,
+        picture: Picture | None,
+    ) -> None:
+        """means2d: derivatives with respect to them, of this process's rows.
+
+        For the others see :class:`DistributedTrainer`.
+        """
+        view = trainer.view
+        self.iteration, self.width, self.height = trainer.iteration, view.width, view.height
+        self._trainer, self._place, self._sights, self._counts = trainer, place, sights, counts
+        self._renderer = trainer.renderer_of(self.iteration)
+        self._means2d, self._picture = means2d, picture
+
+    @cached_property
+    def means2d_grad(self) -> Any:
+        """Tensor (N, 2): see :class:`SeenStep`."""
+        count = self._trainer.num_averaged
+        own = mi.TensorXf(dr.ravel(self._means2d), (dr.width(self._means2d), 2))
+        own = own * count if count > 1 else own
+        return mi.TensorXf(self._trainer.ranks.rows_of_all(np.array(own)))
+
+    @cached_property
+    def visible(self) -> Any:
+        """Bool (N,): see :class:`SeenStep`."""
+        columns = [sight.of_rows(np.ones((sight.count, 1)))[0] for sight in self._sights]
+        return self._of_all(sum(columns[1:], columns[0])) > 0
+
+    def errors_seen(self) -> Any:
+        """Float (N,): see :class:`SeenStep`."""
+        errors = None
+        if self._picture is not None:
+            image, photograph = self._picture.image, self._picture.photograph
+            seen = SeenStep(
+                self.iteration, *image.shape[1::-1], None, None, image, photograph, None
+            )
+            errors = seen.errors()
+        return self.weighted_sums(errors)
+
+    def weighted_sums(self, plane: Any) -> Any:
+        """Of each Gaussian, the sum over pixels of its weight times ``plane``: Float (N,).
+
+        plane: Float (H * W,), on the process that has rendered the view.
+        """
+        post = self._trainer.post
+        if self._picture is not None:
+            for time, frame in enumerate(self._picture.frames):
+                count = int(self._counts[:, time].sum())
+                sums = np.array(weighted_sums(frame, plane))[:count, None]
+                self._trainer.send_to_owners(sums, self._counts[:, time], self._place, time)
+        columns = []
+        for time, sight in enumerate(self._sights):
+            into = sight.empty(sight.count, 1)
+            numbers = post.receive(into, self._renderer, self._place, time)
+            columns.append(sight.of_rows(numbers)[0])
+        return self._of_all(sum(columns[1:], columns[0]) / len(columns))
+
+    def _of_all(self, column: Any) -> Any:
+        """Float (N,), from that of this process's rows."""
+        return from_host(type(column), self._trainer.ranks.rows_of_all(np.array(column)))
+
+
+def check_can_be_shared(config: FitConfig, size: int, num_gaussians: int) -> None:
+    """Raise ``UserError`` for a fit that so many processes cannot share."""
+    views = config.optimizer.views_per_step
+    if views < size:
+        raise UserError(
+            f"optimizer.views_per_step must be at least the number of processes ({size}), which "
+            f"share the views of a step, got {views}; give it with --set"
+        )
+    if num_gaussians < size:
+        raise UserError(f"{size} processes cannot share {num_gaussians} Gaussians")
