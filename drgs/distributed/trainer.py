@@ -11,7 +11,9 @@ What strategies of density know of each row is small, and everywhere; so each pr
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import json
+import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property, reduce
 from typing import Any
@@ -39,7 +41,11 @@ from drgs.splatting.rendering import (
     weighted_sums,
 )
 from drgs.training.density.strategy import SeenStep
+from drgs.training.finite_checks import NonFiniteError
 from drgs.training.trainer import PREFIX, SeenView, Trainer
+
+NEVER = 2**62
+"""The iteration of no fault."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,6 +68,12 @@ class DistributedTrainer(Trainer):
         self.ranks, self.post = ranks, Post(ranks)
         self.shard = Shard(gaussians.num_gaussians, ranks.rank, ranks.size)
         super().__init__(config, dataset, self.shard.of(gaussians))
+        for effect in self.effects:
+            if not effect.shares_rendering:
+                raise UserError(
+                    f"{effect.name}: one process alone can fit with what this section of the "
+                    "configuration asks for; leave it out, or run without mpiexec"
+                )
 
     def _population(self) -> SpreadPopulation:
         common = {"optimizer": self.optimizer, "prefix": PREFIX, "extent": self.extent}
@@ -101,7 +113,35 @@ class DistributedTrainer(Trainer):
             self.iteration = iteration
             self._add_gradients(place, sights[place], counts[:, place], pictures.get(place))
         self.post.finish()
-        return [SeenView([loss], [error], counted) for loss, error, counted in found]
+        losses = self._regularised_losses(iterations, found[:, 0])
+        numbers = zip(losses, found[:, 1], found[:, 2], strict=True)
+        return [SeenView([loss], [error], counted) for loss, error, counted in numbers]
+
+    def _regularised_losses(self, iterations: range, losses: np.ndarray) -> np.ndarray:
+        """Losses with the terms of the strategy of density, where they are written down.
+
+        These are sums over all Gaussians: the sum of what processes have would be rounded
+        otherwise.
+        """
+        config = self.config
+        is_shown = any(i % config.output.history_every == 0 for i in iterations)
+        if not (is_shown or iterations[-1] >= config.iterations):
+            return losses
+        losses = losses.astype(np.float32)
+        for penalty in self.density.penalties(_OfAll(self.population), self.num_gaussians):
+            losses = losses + np.float32(penalty[0])
+        return losses
+
+    def _end_views(self, iterations: range) -> None:
+        """See :meth:`Trainer._end_views`: every process takes the steps of all views."""
+        for iteration in iterations:
+            view, renderer = self.view_at(iteration), self.renderer_of(iteration)
+            for effect in self.effects:
+                derivatives = {}
+                for name, leaf in effect.leaves(view).items():
+                    found = np.array(dr.grad(leaf), np.float32)
+                    derivatives[name] = type(leaf)(self.ranks.from_rank(renderer, found))
+                effect.after(self, view, derivatives)
 
     def _sights(self, iteration: int) -> list[Sight]:
         """What the view's camera sees of the rows of this process, at each time."""
@@ -199,18 +239,83 @@ class DistributedTrainer(Trainer):
             smoothing = self.ranks.rows_of_all(smoothing)
         return Gaussians(**rows, smoothing=smoothing)
 
+    @property
+    def first_row(self) -> int:
+        """The number of this process's first Gaussian."""
+        return self.shard.own.start
+
+    def check_iterations(self) -> None:
+        """See :meth:`Trainer.check_iterations`; all processes raise the same."""
+        self._agree(super().check_iterations)
+
+    def check(self) -> None:
+        """See :meth:`Trainer.check`; all processes raise the same."""
+        self._agree(super().check)
+
+    def _agree(self, check: Callable[[], None]) -> None:
+        """Raise what the process has found that has found the earliest fault."""
+        message, iteration = "", NEVER
+        try:
+            check()
+        except NonFiniteError as error:
+            message, iteration = str(error), error.iteration
+        found = self.ranks.told(np.array(iteration))
+        if found.min() < NEVER:
+            message = self.ranks.text_of(int(found.argmin()), message)
+            raise NonFiniteError(message, int(found.min()))
+
     def state(self) -> dict[str, np.ndarray]:
-        """See :meth:`Trainer.state`; on the first process."""
-        state, own = super().state(), self.population.num_own
-        for name, array in state.items():
-            if name.partition(".")[0] in PARAMETER_NAMES and not name.endswith(".t"):
-                rows = self.ranks.rows_on_first(array.reshape(own, -1))
-                if rows is not None:
-                    shape = array.shape[1:] if array.ndim > 1 else ()
-                    state[name] = (
-                        rows.reshape(self.num_gaussians, *shape) if shape else rows.ravel()
-                    )
+        """See :meth:`Trainer.state`; what concerns rows is whole on the first process alone."""
+        state = super().state()
+        for name in filter(self._is_by_row, state):
+            array = state[name]
+            rows = self.ranks.rows_on_first(array.reshape(self.population.num_own, -1))
+            if rows is not None:
+                shape = (-1,) if array.ndim == 1 else (self.num_gaussians, *array.shape[1:])
+                state[name] = rows.reshape(shape)
         return state
+
+    def restore(self, state: dict[str, np.ndarray]) -> None:
+        """Continue where :meth:`state` was taken, by any number of processes.
+
+        state: of the first process; others may give an empty one.
+        """
+        described = [[name, array.dtype.str, array.shape] for name, array in state.items()]
+        described = json.loads(self.ranks.text_of(0, json.dumps(described)))
+        (total,) = (shape[0] for name, _, shape in described if name == "means.value")
+        self.shard.total = total
+        own, count = {}, self.shard.own.stop - self.shard.own.start
+        for name, dtype, shape in described:
+            array = state.get(name)
+            if self._is_by_row(name):
+                width = math.prod(shape) // total
+                rows = None if array is None else array.reshape(total, width)
+                rows = self.ranks.rows_from_first(rows, np.empty((count, width), dtype))
+                own[name] = rows.reshape((-1,) if len(shape) == 1 else (count, *shape[1:]))
+            else:
+                array = np.empty(shape, dtype) if array is None else array
+                own[name] = self.ranks.from_rank(0, array).reshape(shape)
+        super().restore(own)
+
+    def _is_by_row(self, name: str) -> bool:
+        """Whether an array of the state has a row for each Gaussian, in one place each."""
+        of_effects = {f"{effect.name}/{key}" for effect in self.effects for key in effect.by_row}
+        parameter, _, kind = name.partition(".")
+        return name in of_effects or (parameter in PARAMETER_NAMES and kind != "t")
+
+
+class _OfAll(dict[str, Any]):
+    """Parameters of the Gaussians of all processes, by name; fetched when they are asked for."""
+
+    def __init__(self, population: SpreadPopulation) -> None:
+        super().__init__()
+        self._population = population
+
+    def __missing__(self, name: str) -> Any:
+        """A tensor of all rows."""
+        value = self._population.value(name)
+        self[name] = type(value)(self._population.ranks.rows_of_all(np.array(value)))
+        return self[name]
 
 
 class SharedStep:

@@ -23,6 +23,11 @@ from drgs.splatting.rendering import decode_fault
 class NonFiniteError(UserError):
     """A loss, a gradient or a value is NaN or infinite: what the fit has become is of no use."""
 
+    def __init__(self, message: str, iteration: int) -> None:
+        """iteration: where it was found."""
+        super().__init__(message)
+        self.iteration = iteration
+
 
 @dataclass(frozen=True)
 class _Iteration:
@@ -63,7 +68,7 @@ class GradientWatch:
         for iteration in self._iterations:
             if faults := list(_faults(iteration)):
                 where = f"iteration {iteration.number}, view {iteration.view}"
-                raise NonFiniteError(f"{where}: {' and '.join(faults)}")
+                raise NonFiniteError(f"{where}: {' and '.join(faults)}", iteration.number)
         self._iterations.clear()
 
 
@@ -80,11 +85,12 @@ def _faults(iteration: _Iteration) -> Iterator[str]:
         yield f"the gradient of {name} in row {row} is not finite, or too large to be squared"
 
 
-def check_values(iteration: int, values: Mapping[str, Any]) -> None:
+def check_values(iteration: int, values: Mapping[str, Any], first_row: int = 0) -> None:
     """Raise :class:`NonFiniteError` for the first value that is not finite; waits for the device.
 
-    values: tensors or numpy arrays by name, one row a Gaussian, or single numbers. A Gaussian of
-    such values is invisible, so that no loss and no gradient ever tells.
+    values: tensors or numpy arrays by name, one row a Gaussian, or single numbers; first_row: the
+    number of their first one. A Gaussian of such values is invisible, so that no loss and no
+    gradient ever tells.
     """
     for name, array in values.items():
         on_device = not isinstance(array, np.ndarray)
@@ -93,7 +99,10 @@ def check_values(iteration: int, values: Mapping[str, Any]) -> None:
         host = np.atleast_1d(np.array(dr.detach(array) if on_device else array))
         if (first := _first_fault(host)) is not None:
             row, value = first
-            raise NonFiniteError(f"after iteration {iteration}: {name} is {value} in row {row}")
+            where = f"in row {first_row + row}"
+            raise NonFiniteError(
+                f"after iteration {iteration}: {name} is {value} {where}", iteration
+            )
 
 
 def check_view_values(
@@ -109,7 +118,7 @@ def check_view_values(
             row, value = first
             view = f"view {views[row]}" if len(array) > 1 else "all views"
             raise NonFiniteError(
-                f"after iteration {iteration}: {name} is {value} in row {row} ({view})"
+                f"after iteration {iteration}: {name} is {value} in row {row} ({view})", iteration
             )
 
 

@@ -67,7 +67,7 @@ def iterations(trainer: Trainer, history: History, length: Length) -> Iterator[I
         goes_on = length.goes_on(trainer)
         if not goes_on or report.passes(trainer.config.output.history_every):
             row = history.add(report)
-            trainer.watch.check()  # reading the row has waited for the device
+            trainer.check_iterations()  # reading the row has waited for the device
         yield Iteration(report, row, is_last=not goes_on)
 
 

@@ -134,13 +134,10 @@ class Trainer:
         if self.ends_step:
             self._set_rates()
             self.optimizer.step()
-        views = [self.view_at(iteration) for iteration in self._own(iterations)]
-        for view in views:
-            for effect in self.effects:
-                effect.after(self, view)
+        self._end_views(iterations)
         report = self._control_density()
-        for view in views:
-            self.stage.seen(view)
+        for iteration in self._own(iterations):
+            self.stage.seen(self.view_at(iteration))
         return StepReport(
             iteration=self.iteration,
             num_gaussians=self.num_gaussians,
@@ -195,6 +192,13 @@ class Trainer:
             for penalty in effect.penalties(view):
                 loss = loss + penalty
         return image, loss, error
+
+    def _end_views(self, iterations: range) -> None:
+        """Let effects take the steps of their own."""
+        for view in map(self.view_at, iterations):
+            for effect in self.effects:
+                derivatives = {name: dr.grad(v) for name, v in effect.leaves(view).items()}
+                effect.after(self, view, derivatives)
 
     def _regularised(self, loss: Any) -> Any:
         """A view's loss with the terms of the strategy of density."""
@@ -342,13 +346,26 @@ class Trainer:
         self.rates = rates_over_time(self.config, self.extent)
         self.density = self._density_from(self.density.state())
 
+    @property
+    def first_row(self) -> int:
+        """The number of the first Gaussian in the optimizer here."""
+        return 0
+
+    def check_iterations(self) -> None:
+        """Raise ``NonFiniteError`` if a loss or a gradient of an iteration so far is not finite.
+
+        Waits for the device.
+        """
+        self.watch.check()
+
     def check(self) -> None:
         """Raise ``NonFiniteError`` if a loss, a gradient or a value is not; waits for the device.
 
         Called before anything that saves, returns or edits the state.
         """
         self.watch.check()
-        check_values(self.iteration, {**self.parameters, **self.density.state()})
+        check_values(self.iteration, self.parameters, self.first_row)
+        check_values(self.iteration, self.density.state())
         of_views = {f"{e.name}.{k}": v for e in self.effects for k, v in e.values().items()}
         check_view_values(self.iteration, of_views, [view.name for view in self.views])
 

@@ -127,7 +127,7 @@ def _tuned(tuner: Trainer, trainer: Trainer, watch: Callable[[int], None]) -> Ga
         effect.restore(found[effect.name])
     while tuner.iteration < tuner.config.iterations:
         if tuner.step().passes(tuner.config.output.history_every):
-            tuner.watch.check()
+            tuner.check_iterations()
         watch(tuner.iteration - before)
     return tuner.gaussians()
 

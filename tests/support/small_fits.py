@@ -16,6 +16,7 @@ from drgs.data.types import Dataset, View
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 from drgs.integrator.scene import render_views
 from drgs.reference import splatting as reference
+from drgs.training.effects.base import TrainingEffect
 from drgs.training.trainer import Trainer
 from support import small_capture as capture
 from support.helpers import NEAR_THRESHOLD
@@ -160,6 +161,12 @@ def assert_no_new_kernels(trainer: Trainer, warm=7, count=5) -> None:
         assert hashes
         assert iteration < warm or hashes <= seen, f"{len(hashes - seen)} at {iteration + 1}"
         seen |= hashes
+
+
+def end_view(effect: TrainingEffect, trainer: Trainer, view) -> None:
+    """Let an effect take its step, as the trainer does."""
+    derivatives = {name: dr.grad(leaf) for name, leaf in effect.leaves(view).items()}
+    effect.after(trainer, view, derivatives)
 
 
 def gradients_of_loss(trainer: Trainer, view) -> dict[str, np.ndarray]:

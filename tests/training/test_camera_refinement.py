@@ -148,7 +148,7 @@ def test_derivatives_of_the_loss_are_differences_in_numpy(index):
     image = mi.render(trainer.scene, trainer.params, sensor=view.sensor, spp=1)
     _, loss, _ = trainer.compared(image, view)
     dr.backward(loss)
-    effect.after(trainer, view)
+    fits.end_view(effect, trainer, view)
     gaussians, step = fits.double(start), 1e-7
     target = np.asarray(photo.image, np.float64)
     assert float(dr.detach(loss)[0]) == pytest.approx(
@@ -530,7 +530,7 @@ def test_derivatives_of_a_camera_that_does_not_move_are_those_of_one_that_may():
         effect.before(trainer, view)
         leaves = effect.parameters.leaves(view.index)
         fits.gradients_of_loss(trainer, view)
-        effect.after(trainer, view)
+        fits.end_view(effect, trainer, view)
         found.append(np.concatenate([np.array(dr.grad(leaves[n])) for n in ("turns", "moves")]))
     assert np.abs(found[0]).max() > 0
     for other in found[1:]:

@@ -145,7 +145,7 @@ def test_the_penalty_pulls_to_the_identity():
             expected = 0.1 * np.square(start - IDENTITY).mean()
             assert float(penalty[0]) == pytest.approx(expected, rel=1e-5)
         dr.backward(penalty)
-        effect.after(trainer, view)
+        fits.end_view(effect, trainer, view)
         if iteration == 0:
             moved = matrices_of(trainer) - random_matrices()
             step = -0.01 * np.sign(start - IDENTITY)

@@ -437,7 +437,7 @@ def test_colors_fill_the_cube():
         trainer.iteration = iteration
         effect.before(trainer, trainer.views[0])
         found.append(color_of(trainer))
-    effect.after(trainer, trainer.views[0])
+    fits.end_view(effect, trainer, trainer.views[0])
     found = np.array(found)
     assert found.min() >= 0 and found.max() <= 1
     # Standard errors: 0.289 / 20 = 0.0145, and 0.0037 for the variance; five of them.
@@ -465,7 +465,7 @@ def test_the_target_is_the_transparent_picture_over_the_color():
         clear = (premultiplied + (1 - photo.alpha[..., None]) * np.array(GREY) <= 1).all(axis=-1)
         assert clear.mean() > 0.9  # the others were clipped when the photograph was made
         np.testing.assert_allclose(target_of(view)[clear], expected[clear], atol=4e-7)
-        effect.after(trainer, view)
+        fits.end_view(effect, trainer, view)
 
 
 def test_the_rendering_is_over_the_same_color():

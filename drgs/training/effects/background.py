@@ -57,7 +57,8 @@ class RandomBackground(TrainingEffect):
         image = view.photograph.image.array + transparent.array * shift
         view.replacement = prepare_target(mi.TensorXf(image, transparent.shape), *self.window)
 
-    def after(self, fit: FitState, view: TrainingView) -> None:
+    def after(self, fit: FitState, view: TrainingView, derivatives: dict[str, Any]) -> None:
         """Put the dataset's background back."""
+        del derivatives
         fit.integrator.background = mi.Color3f(*map(float, self.background))
         view.replacement = None

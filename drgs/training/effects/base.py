@@ -65,6 +65,8 @@ class TrainingEffect(Protocol):
     moves_sensors = False  # whether it changes the parameters of sensors
     aovs = ""  # what the integrator has to put out besides colour
     upload_bytes = 0  # of a pixel: what it uploads of a view's pictures, at most
+    by_row: frozenset[str] = frozenset()  # names in its state that have a row for each Gaussian
+    shares_rendering = True  # whether the processes of a fit may render its views apart
 
     def upload(self, view: View) -> Any:
         """What the effect needs of a view, on the device: see ``TrainingView.uploads``."""
@@ -94,10 +96,19 @@ class TrainingEffect(Protocol):
         del view
         yield from ()
 
-    def after(self, fit: FitState, view: TrainingView) -> None:
-        """Called when the derivatives of all views of a step are known, to take a step of its own.
+    def leaves(self, view: TrainingView) -> dict[str, Any]:
+        """What it optimises of the view, as :meth:`before` has left it: by name, with derivatives.
 
-        In the order of the views.
+        Where several processes fit, each knows the numbers of all views.
+        """
+        del view
+        return {}
+
+    def after(self, fit: FitState, view: TrainingView, derivatives: dict[str, Any]) -> None:
+        """Called when those of all views of a step are known, to take a step of its own.
+
+        derivatives: of the step's loss, with respect to the view's :meth:`leaves`. Called in the
+        order of the views, of which this process may have rendered some alone.
         """
 
     def repopulated(self, fit: FitState) -> None:

@@ -51,6 +51,7 @@ class CameraRefinement(TrainingEffect):
 
     name = "cameras"
     moves_sensors = True
+    shares_rendering = False  # its derivatives are sums over all Gaussians
 
     def __init__(self, config: CamerasConfig, num_views: int, extent: float) -> None:
         """num_views: of the training split; extent: world units."""
@@ -86,25 +87,32 @@ class CameraRefinement(TrainingEffect):
         self.numbers[view.index] = numbers = dr.detach(
             self._camera(view.uploads[self.name], leaves)
         )
-        if fit.iteration > self.first:
+        if self._begun(fit):
             dr.enable_grad(numbers)
         _put(view.sensor, numbers)
+
+    def _begun(self, fit: FitState) -> bool:
+        return fit.iterations_of_step[0] > self.first
 
     def place(self, view: TrainingView) -> None:
         """Put the sensor where its camera is now."""
         leaves = self.parameters.leaves(view.index)
         _put(view.sensor, dr.detach(self._camera(view.uploads[self.name], leaves)))
 
-    def after(self, fit: FitState, view: TrainingView) -> None:
+    def leaves(self, view: TrainingView) -> dict[str, Any]:
+        """The numbers of the view's sensor."""
+        return self.numbers[view.index]
+
+    def after(self, fit: FitState, view: TrainingView, derivatives: dict[str, Any]) -> None:
         """One step of its own."""
-        numbers = self.numbers.pop(view.index)
-        if not dr.grad_enabled(numbers["to_world"]):
+        del self.numbers[view.index]
+        if not self._begun(fit):
             return
         # Views of a step may share numbers, which the one before has moved.
         camera = self._camera(view.uploads[self.name], self.parameters.leaves(view.index))
         for name, value in camera.items():
             if dr.grad_enabled(value):
-                dr.accum_grad(value, dr.grad(numbers[name]))
+                dr.accum_grad(value, derivatives[name])
                 dr.enqueue(dr.ADMode.Backward, value)
         dr.traverse(dr.ADMode.Backward)
         # As the rate of the means, which are what cameras are refined against.

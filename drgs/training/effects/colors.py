@@ -73,9 +73,14 @@ class ColorCorrection(TrainingEffect):
         difference = self.matrix - from_host(mi.Float, IDENTITY)
         yield self.weight * dr.mean(dr.square(difference))
 
-    def after(self, fit: FitState, view: TrainingView) -> None:
+    def leaves(self, view: TrainingView) -> dict[str, Any]:
+        """The view's transform."""
+        return self.parameters.leaves(view.index)
+
+    def after(self, fit: FitState, view: TrainingView, derivatives: dict[str, Any]) -> None:
         """One step of its own, and a little one back for all: their mean stays."""
         decay = fit.rate_decay
+        dr.set_grad(self.leaves(view), derivatives)
         before = dr.detach(self.parameters.leaves(view.index)["matrices"])
         self.parameters.step(view.index, decay)
         after = dr.detach(self.parameters.leaves(view.index)["matrices"])

@@ -18,6 +18,7 @@ class TrainingSmoothing(TrainingEffect):
     """The filter of ``drgs.effects.smoothing``, from the training cameras at the size in use."""
 
     name = "smoothing"
+    by_row = frozenset({"filter"})
 
     def __init__(self) -> None:
         self.filter: mi.Float | None = None
