@@ -117,6 +117,7 @@ class Trainer:
         self.stages = make_stages(dataset.train, config, self.effects, room)
         self.population = self._population()
         self.density = self._density_from({})
+        self._not_gathered: SeenStep | None = None
         self.watch = GradientWatch()
         self.iteration = 0
 
@@ -135,6 +136,7 @@ class Trainer:
             self._set_rates()
             self.optimizer.step()
         self._end_views(iterations)
+        self._gather()
         report = self._control_density()
         for iteration in self._own(iterations):
             self.stage.seen(self.view_at(iteration))
@@ -166,6 +168,7 @@ class Trainer:
         """Add up the derivatives of the mean loss of a step's views; ends at the last iteration."""
         seen = []
         for iteration in iterations:
+            self._gather()  # of the view before, whose frames make room
             self.iteration, view = iteration, self.view_at(iteration)
             for effect in self.effects:
                 effect.before(self, view)
@@ -175,7 +178,7 @@ class Trainer:
             image, loss = dr.detach(image), dr.detach(loss)
             self._watch(view, loss, self.integrator.last.first_fault)
             if self.density.gathers(iteration):
-                self.density.gather(self._seen_step(image, view.target))
+                self._not_gathered = self._seen_step(image, view.target)
             seen.append(SeenView(loss, error, view.counted))
         return seen
 
@@ -192,6 +195,12 @@ class Trainer:
             for penalty in effect.penalties(view):
                 loss = loss + penalty
         return image, loss, error
+
+    def _gather(self) -> None:
+        """Tell the strategy of density what was seen last, if it asks and was not told."""
+        step, self._not_gathered = self._not_gathered, None
+        if step is not None:
+            self.density.gather(step)
 
     def _end_views(self, iterations: range) -> None:
         """Let effects take the steps of their own."""

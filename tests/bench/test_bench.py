@@ -97,12 +97,12 @@ def small_scene():
 def test_every_kernel_of_an_iteration_belongs_to_a_stage(small_scene):
     trainer = scenes.trainer_of(small_scene)
     trainer.step()
-    before = rendering.bin_splats
+    before = rendering.bin_footprints
     with profile.stage_clock() as clock:
         report = trainer.step()
         dr.eval(report.loss_array)
         clock.end("optimizer and statistics")
-    assert rendering.bin_splats is before
+    assert rendering.bin_footprints is before
     assert set(clock.kernel_ms) == set(profile.STAGES)
     assert all(spent > 0 for spent in clock.kernel_ms.values())
 
