@@ -37,6 +37,7 @@ from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, ExitStack, nullcontext
 from dataclasses import dataclass
 from datetime import datetime
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -60,6 +61,7 @@ from drgs.core.locks import sole_writer
 from drgs.core.machine import processor
 from drgs.core.memory import release_unused_memory
 from drgs.core.private import llvm_version
+from drgs.core.processes import process_number
 from drgs.data import Dataset, View, load_dataset
 from drgs.data.derived import completed
 from drgs.data.fingerprint import Fingerprint, fingerprint_of
@@ -243,8 +245,23 @@ class Run:
         save_checkpoint(self.out, self.trainer.config, checkpoint)
 
 
+MakeTrainer = Callable[[FitConfig, Dataset, Gaussians], Trainer]
+"""Of the fit's configuration, its photographs, and where it starts."""
+
+
 def run(args: argparse.Namespace) -> None:
     """Fit what the command line names; end the process with status 130 if Ctrl-C stopped it."""
+    if process_number() is None:
+        fit(args, Trainer)
+        return
+    required("mpi4py", "mpi", "mpiexec")
+    from drgs.distributed.fitting import run_together
+
+    run_together(args, partial(fit, args))
+
+
+def fit(args: argparse.Namespace, make_trainer: MakeTrainer) -> None:
+    """The command, on the process that reads, decides, writes and prints."""
     started = time.perf_counter() - LOADING_SECONDS
     with executing(args.threads, args.debug) as check_ranges, ExitStack() as blocks:
         server = blocks.enter_context(page_server(args))
@@ -271,11 +288,14 @@ def run(args: argparse.Namespace) -> None:
         gaussians = gaussians_at(start, config)
         length, plan = AllIterations(), None
         if args.budget is not None:
-            end, plan = planned(config, dataset, gaussians, started + args.budget)
+            end, plan = planned(config, dataset, gaussians, started + args.budget, make_trainer)
             config = plan.config
             print(plan.reasons)
-        trainer = Trainer(config, dataset, gaussians)
-        fit, checkpoint = Run.taken_up(trainer, data, out, checkpoint), None  # frees its arrays
+        trainer = make_trainer(config, dataset, gaussians)
+        taken_up, checkpoint = (
+            Run.taken_up(trainer, data, out, checkpoint),
+            None,
+        )  # frees its arrays
         keep_folder()
         take_folder(args, config, dataset, out)
         if plan is not None:
@@ -286,7 +306,7 @@ def run(args: argparse.Namespace) -> None:
         if args.tensorboard:
             from drgs.training.event_log import EventLog
 
-            observers.append(blocks.enter_context(EventLog(out / EVENTS, fit.history)))
+            observers.append(blocks.enter_context(EventLog(out / EVENTS, taken_up.history)))
         if server is not None:
             from drgs.live.fit_page import watch
             from drgs.live.server import url
@@ -294,7 +314,7 @@ def run(args: argparse.Namespace) -> None:
             watching, length = watch(server, trainer, dataset, length)
             observers.append(watching)
             print(f"look on at {url(server)}", flush=True)
-        finished = fit_and_write(fit, dataset, length, check_ranges, args.command, observers)
+        finished = fit_and_write(taken_up, dataset, length, check_ranges, args.command, observers)
     if not finished:
         print(f"stopped; continue with: {args.prog} --resume {out}")
         sys.exit(INTERRUPTED_STATUS)
@@ -384,16 +404,23 @@ def announced_start(config: FitConfig, dataset: Dataset) -> Start:
 
 
 def planned(
-    config: FitConfig, dataset: Dataset, gaussians: Gaussians, end: float
+    config: FitConfig,
+    dataset: Dataset,
+    gaussians: Gaussians,
+    end: float,
+    make_trainer: MakeTrainer = Trainer,
 ) -> tuple[float, Plan]:
     """When the iterations are to end, and a plan until then.
 
     end: of everything, by ``time.perf_counter``.
     """
-    rehearsal = rehearse(config, dataset, gaussians)
+    rehearsal = rehearse(config, dataset, gaussians, make_trainer)
     num_points, num_gaussians = gaussians.num_gaussians, target_of(config) or 0
     results = seconds_of_results(
-        rehearsal.trainer.scene, dataset, max(num_points, num_gaussians), config.model.sh_degree
+        rehearsal.trainer.scene_of_all(),
+        dataset,
+        max(num_points, num_gaussians),
+        config.model.sh_degree,
     )
     pictures = results.renders if config.output.save_renders else 0.0
     pictures += results.report + seconds_of_curves() if config.output.report else 0.0
@@ -455,7 +482,7 @@ def fit_and_write(
         metrics["viewers"] = measured_split(seen, dataset)
     if output.report:
         shown = shown_on_page(gaussians, config.model.approximations, for_viewers)
-        fitted = Fitted(trainer.scene, gaussians, render, shown)
+        fitted = Fitted(trainer.scene_of_all(), gaussians, render, shown)
         write_results(out, dataset, fitted, scores, log, metrics)
     with atomic_path(out / METRICS) as temporary:
         temporary.write_text(json.dumps(metrics, indent=2) + "\n")

@@ -18,6 +18,7 @@ from drgs.cli.output import notes_printed, printable_anywhere
 from drgs.core.constants import MAX_INT
 from drgs.core.errors import did_you_mean, one_line
 from drgs.core.files import check_path
+from drgs.core.processes import one_voice
 
 MAX_ERROR = 500
 """Characters of what is wrong with a command line, which may quote all of it."""
@@ -97,7 +98,13 @@ def run_command(
     which also hold the whole line as ``command``.
     prog: how the command is called. arguments: its words; None: those of this process.
     """
-    with printable_anywhere(), notes_printed(), exit_on_interrupt(), exit_on_user_error():
+    with (
+        one_voice(),
+        printable_anywhere(),
+        notes_printed(),
+        exit_on_interrupt(),
+        exit_on_user_error(),
+    ):
         parser = CommandParser(prog=prog)
         add_arguments(parser)
         args = parser.parse_args(arguments)

@@ -34,6 +34,7 @@ class Ranks:
 
     comm: MPI.Comm
     times: Times = field(default_factory=Times)
+    is_broken: bool = False  # whether others wait for what this process will not say
 
     @staticmethod
     def world() -> Ranks:
@@ -54,6 +55,11 @@ class Ranks:
     def is_first(self) -> bool:
         """Whether this is the one that reads, writes and speaks for all."""
         return self.rank == 0
+
+    @property
+    def on_this_machine(self) -> int:
+        """How many of them share this one's cores."""
+        return self.comm.Split_type(MPI.COMM_TYPE_SHARED).Get_size()
 
     @contextmanager
     def exchanging(self):

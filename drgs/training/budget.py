@@ -17,7 +17,7 @@ import csv
 import math
 import re
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
@@ -254,13 +254,18 @@ class Rehearsal:
     iteration_s: float  # of an iteration: full pictures, the first Gaussians
 
 
-def rehearse(config: FitConfig, dataset: Dataset, gaussians: Gaussians) -> Rehearsal:
+def rehearse(
+    config: FitConfig,
+    dataset: Dataset,
+    gaussians: Gaussians,
+    make_trainer: Callable[[FitConfig, Dataset, Gaussians], Trainer] = Trainer,
+) -> Rehearsal:
     """Time a few iterations on a few of the views."""
     views = dataset.train[:: max(1, len(dataset.train) // REHEARSAL_VIEWS)]
     few = replace(dataset, train=views[:REHEARSAL_VIEWS])
     views_per_step = config.optimizer.views_per_step
     never = config.iterations + (WARM_UP + TIMED) * views_per_step
-    trainer = Trainer(
+    trainer = make_trainer(
         changed(
             config,
             {

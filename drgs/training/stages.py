@@ -89,7 +89,7 @@ def make_training_views(
             index=index,
             sensor=sensor,
             size=(view.width, view.height),
-            counted=_counted(view),
+            count=partial(_counted, view),
             make_target=partial(_make_target, view, config, effects),
             makers={effect.name: partial(effect.upload, view) for effect in effects},
         )

@@ -403,7 +403,11 @@ class Trainer:
         """Pictures (H, W, 3) of views that were not trained on, display space, in [0, 1]."""
         for effect in self.effects:
             views = effect.measured(views)
-        return render_views(self.scene, views)
+        return render_views(self.scene_of_all(), views)
+
+    def scene_of_all(self) -> mi.Scene:
+        """A scene of all Gaussians, as they were shown last: see :meth:`show`."""
+        return self.scene
 
     def state(self) -> dict[str, np.ndarray]:
         """Everything that the coming iterations depend on, as numpy arrays.

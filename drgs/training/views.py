@@ -7,6 +7,7 @@ stays on the device as long as there is room: see :class:`drgs.training.stages.S
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from functools import cached_property
 from typing import Any
 
 import mitsuba as mi
@@ -23,20 +24,24 @@ class TrainingView:
         index: int,
         sensor: mi.Sensor,
         size: tuple[int, int],
-        counted: float,
+        count: Callable[[], float],
         make_target: Callable[[], Target],
         makers: Mapping[str, Callable[[], Any]],
     ) -> None:
-        """index: among the training views; size: W, H, px; counted: see there.
+        """index: among the training views; size: W, H, px; count: makes ``counted``.
 
         make_target: makes the photograph's target; makers: by effect, make its upload.
         """
         self.name, self.index, self.sensor = name, index, sensor
         self.width, self.height = size
-        self.counted = counted  # share of the pixels that count: those that no mask leaves out
         self.uploads = Uploads(makers)
         self.replacement: Target | None = None  # an effect's
-        self._make_target, self._photograph = make_target, None
+        self._make_target, self._photograph, self._count = make_target, None, count
+
+    @cached_property
+    def counted(self) -> float:
+        """The share of the pixels that count: those that no mask leaves out."""
+        return self._count()
 
     @property
     def photograph(self) -> Target:

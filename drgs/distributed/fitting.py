@@ -1,0 +1,82 @@
+"""``mpiexec -n K drgs fit``: what a process of several does for the command."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from drgs.cli.execution import executing, select_variant
+from drgs.config.schema import FitConfig
+from drgs.core.errors import UserError
+from drgs.data import Dataset, View, load_dataset
+from drgs.data.kept import KeptPicture, Pixels
+from drgs.distributed.ranks import Ranks
+from drgs.distributed.together import follow, lead
+from drgs.training.trainer import Trainer
+
+
+def run_together(args: argparse.Namespace, work: Callable[[Callable[..., Trainer]], None]) -> None:
+    """Lead the others through the command, or follow; ends the process where it follows.
+
+    work: the command, given what makes the trainer.
+    """
+    ranks = Ranks.world()
+    if args.threads is None:
+        args.threads = max(1, len(os.sched_getaffinity(0)) // ranks.on_this_machine)
+    if ranks.is_first:
+        lead(ranks, lambda make: work_alone(args, work, make))
+        return
+    with executing(args.threads, args.debug):
+        select_variant(args.variant)
+        sys.exit(follow(ranks, lambda config: own_photographs(config, ranks)))
+
+
+def work_alone(
+    args: argparse.Namespace,
+    work: Callable[[Callable[..., Trainer]], None],
+    make: Callable[..., Trainer],
+) -> None:
+    """The command, of which not everything has several processes."""
+    if args.view:
+        raise UserError("--view: shows the fit of one process alone; leave it out, or mpiexec")
+    work(make)
+
+
+def own_photographs(config: FitConfig, ranks: Ranks) -> Dataset:
+    """The dataset with the pictures of those training views that a process renders.
+
+    Of the others there are sizes and cameras.
+    """
+    dataset = load_dataset(config.data_for_training)
+    own = own_views(len(dataset.train), config.optimizer.views_per_step, ranks.rank, ranks.size)
+    views = (
+        view if index in own else without_pictures(view) for index, view in enumerate(dataset.train)
+    )
+    return replace(dataset, train=tuple(views), test=tuple(map(without_pictures, dataset.test)))
+
+
+def own_views(count: int, views_per_step: int, rank: int, size: int) -> set[int]:
+    """Which of ``count`` training views a process renders: see ``drgs.training.stages.view_of``."""
+    places = (p for p in range(views_per_step) if p * size // views_per_step == rank)
+    return {view for p in places for view in range(p % count, count, views_per_step)}
+
+
+def without_pictures(view: View) -> View:
+    """A view whose pictures have sizes alone."""
+
+    def elsewhere(picture: Pixels | None) -> KeptPicture | None:
+        if picture is None:
+            return None
+        return KeptPicture(picture.shape, lambda: _refuse(view.name), nbytes=0)
+
+    names = ("image", "alpha", "mask", "depth")
+    return replace(view, **{name: elsewhere(getattr(view, name)) for name in names})
+
+
+def _refuse(name: str) -> np.ndarray:
+    raise RuntimeError(f"the pictures of view {name} are with another process")

@@ -1,0 +1,217 @@
+"""One process leads, the others follow: what the first calls of its trainer, all call.
+
+So the command that runs on the first process is written as if it were alone: it reads, decides by
+the clock, writes and speaks. The others wait for what it calls next, until it says that this is the
+end.
+"""
+
+from __future__ import annotations
+
+import json
+import signal
+import sys
+import traceback
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import replace
+from functools import partial, wraps
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+
+from drgs.config.schema import FitConfig
+from drgs.core.errors import UserError
+from drgs.data.types import Dataset
+from drgs.distributed.ranks import Ranks
+from drgs.distributed.trainer import DistributedTrainer, check_can_be_shared
+from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
+from drgs.integrator.scene import make_scene
+from drgs.training.finite_checks import NonFiniteError
+from drgs.training.trainer import StepReport, Trainer
+
+START, RESTORE, END = "start", "restore", "end"
+"""What is said besides the names of methods."""
+
+
+@contextmanager
+def _others_waiting(ranks: Ranks) -> Iterator[None]:
+    """Around what all do together: who fails in it leaves the others waiting."""
+    try:
+        yield
+    except NonFiniteError:
+        raise  # of all
+    except BaseException:
+        ranks.is_broken = True
+        raise
+
+
+def _called_by_all(method: Callable) -> Callable:
+    """Of the leader: have the others call it, too, with arguments that JSON knows.
+
+    What a method calls of itself, the others call by themselves.
+    """
+
+    @wraps(method)
+    def call(self: Leader, *arguments: Any) -> Any:
+        if self.is_calling:
+            return method(self, *arguments)
+        self.ranks.text_of(0, json.dumps([method.__name__, *arguments]))
+        self.is_calling = True
+        try:
+            with _others_waiting(self.ranks):
+                return method(self, *arguments)
+        finally:
+            self.is_calling = False
+
+    return call
+
+
+class Leader(DistributedTrainer):
+    """The first process's trainer, which all others follow."""
+
+    def __init__(
+        self, config: FitConfig, dataset: Dataset, gaussians: Gaussians, ranks: Ranks
+    ) -> None:
+        """gaussians: all of them."""
+        self.is_calling, self.dataset = True, dataset
+        check_can_be_shared(config, ranks.size, gaussians.num_gaussians)
+        names = [view.name for view in dataset.train]
+        ranks.text_of(0, json.dumps([START, config.model_dump_json(), names]))
+        share_gaussians(ranks, gaussians)
+        with _others_waiting(ranks):
+            super().__init__(config, dataset, gaussians, ranks)
+        self.is_calling = False
+        self._latest: tuple[int, mi.Scene] | None = None
+
+    @_called_by_all
+    def step(self) -> StepReport:
+        """See :meth:`Trainer.step`."""
+        return super().step()
+
+    @_called_by_all
+    def check_iterations(self) -> None:
+        """See :meth:`Trainer.check_iterations`."""
+        super().check_iterations()
+
+    @_called_by_all
+    def check(self) -> None:
+        """See :meth:`Trainer.check`."""
+        super().check()
+
+    @_called_by_all
+    def gaussians(self) -> Gaussians:
+        """See :meth:`Trainer.gaussians`."""
+        return super().gaussians()
+
+    @_called_by_all
+    def state(self) -> dict[str, np.ndarray]:
+        """See :meth:`Trainer.state`."""
+        return super().state()
+
+    @_called_by_all
+    def replan(self, iterations: int, densify_stop: int) -> None:
+        """See :meth:`Trainer.replan`."""
+        super().replan(iterations, densify_stop)
+
+    @_called_by_all
+    def retire(self) -> None:
+        """See :meth:`Trainer.retire`."""
+        super().retire()
+
+    @_called_by_all
+    def show(self) -> None:
+        """See :meth:`Trainer.show`."""
+        super().show()
+
+    def restore(self, state: dict[str, np.ndarray]) -> None:
+        """See :meth:`Trainer.restore`; state: of this process, which tells the others."""
+        self.ranks.text_of(0, json.dumps([RESTORE]))
+        self.is_calling = True
+        with _others_waiting(self.ranks):
+            super().restore(state)
+        self.is_calling = False
+
+    def scene_of_all(self) -> mi.Scene:
+        """See :meth:`Trainer.scene_of_all`: on this process."""
+        if self._latest is None or self._latest[0] != self.iteration:
+            scene = make_scene(self.gaussians(), self.config.model, self.dataset.background)
+            scene.integrator().sh_degree = self.integrator.sh_degree
+            self._latest = self.iteration, scene
+        return self._latest[1]
+
+
+def lead(ranks: Ranks, work: Callable[[Callable[..., Trainer]], None]) -> None:
+    """Run what a single process would, with a trainer of all; then let the others go.
+
+    work: is given what makes the trainer.
+    """
+    status = 0
+    try:
+        work(partial(Leader, ranks=ranks))
+    except SystemExit as end:
+        status = end.code if isinstance(end.code, int) else 1
+        raise
+    except BaseException as error:
+        status = 2 if isinstance(error, UserError) else 1
+        raise
+    finally:
+        if ranks.is_broken:
+            print(f"error: {sys.exc_info()[1]}", file=sys.stderr, flush=True)
+            ranks.comm.Abort(status)
+        ranks.text_of(0, json.dumps([END, status]))
+
+
+def follow(ranks: Ranks, load: Callable[[FitConfig], Dataset]) -> int:
+    """Do what the first process does; return the status that it ends with.
+
+    load: the photographs that a configuration names.
+    """
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the first process decides when to stop
+    trainer, datasets = None, {}
+    try:
+        while True:
+            name, *arguments = json.loads(ranks.text_of(0, ""))
+            if name == END:
+                return arguments[0]
+            if name == START:
+                trainer = _another(ranks, load, datasets, *arguments)
+            elif name == RESTORE:
+                trainer.restore({})
+            else:
+                with suppress(NonFiniteError):  # the first process says so
+                    getattr(trainer, name)(*arguments)
+    except BaseException as error:
+        told = isinstance(error, UserError)
+        text = f"error: {error}" if told else "".join(traceback.format_exception(error))
+        print(f"process {ranks.rank}: {text}", file=sys.__stderr__, flush=True)
+        ranks.comm.Abort(2 if told else 1)
+        raise
+
+
+def _another(
+    ranks: Ranks,
+    load: Callable[[FitConfig], Dataset],
+    datasets: dict[str, Dataset],
+    text: str,
+    names: list[str],
+) -> DistributedTrainer:
+    """A follower's trainer; datasets: that have been loaded, by their configuration."""
+    config = FitConfig.model_validate_json(text)
+    gaussians = share_gaussians(ranks, None)
+    key = config.data.model_dump_json()
+    if key not in datasets:
+        datasets[key] = load(config)
+    of_fit = set(names)
+    views = tuple(view for view in datasets[key].train if view.name in of_fit)
+    dataset = replace(datasets[key], train=views)
+    return DistributedTrainer(config, dataset, gaussians, ranks)
+
+
+def share_gaussians(ranks: Ranks, gaussians: Gaussians | None) -> Gaussians:
+    """Those of the first process (numpy), on all."""
+    own = [] if gaussians is None else [getattr(gaussians, name) for name in PARAMETER_NAMES]
+    described = json.loads(ranks.text_of(0, json.dumps([[a.dtype.str, a.shape] for a in own])))
+    arrays = own or [np.empty(shape, dtype) for dtype, shape in described]
+    arrays = [ranks.from_rank(0, a).reshape(a.shape) for a in arrays]
+    return Gaussians(**dict(zip(PARAMETER_NAMES, arrays, strict=True)))
