@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import os
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -33,7 +33,7 @@ def run_together(args: argparse.Namespace, work: Callable[[Callable[..., Trainer
         return
     with executing(args.threads, args.debug):
         select_variant(args.variant)
-        sys.exit(follow(ranks, lambda config: own_photographs(config, ranks)))
+        sys.exit(follow(ranks, lambda config, names: own_photographs(config, names, ranks)))
 
 
 def work_alone(
@@ -47,17 +47,17 @@ def work_alone(
     work(make)
 
 
-def own_photographs(config: FitConfig, ranks: Ranks) -> Dataset:
-    """The dataset with the pictures of those training views that a process renders.
+def own_photographs(config: FitConfig, names: Sequence[str], ranks: Ranks) -> Dataset:
+    """The dataset with the training views of these names; pictures of those that are rendered here.
 
-    Of the others there are sizes and cameras.
+    Of the others, and of those to measure on, there are sizes and cameras.
     """
     dataset = load_dataset(config.data_for_training)
-    own = own_views(len(dataset.train), config.optimizer.views_per_step, ranks.rank, ranks.size)
-    views = (
-        view if index in own else without_pictures(view) for index, view in enumerate(dataset.train)
-    )
-    return replace(dataset, train=tuple(views), test=tuple(map(without_pictures, dataset.test)))
+    by_name = {view.name: view for view in dataset.train}
+    views = [by_name[name] for name in names]
+    own = own_views(len(views), config.optimizer.views_per_step, ranks.rank, ranks.size)
+    train = (v if index in own else without_pictures(v) for index, v in enumerate(views))
+    return replace(dataset, train=tuple(train), test=tuple(map(without_pictures, dataset.test)))
 
 
 def own_views(count: int, views_per_step: int, rank: int, size: int) -> set[int]:

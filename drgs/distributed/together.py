@@ -13,7 +13,6 @@ import sys
 import traceback
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import replace
 from functools import partial, wraps
 from typing import Any
 
@@ -162,20 +161,23 @@ def lead(ranks: Ranks, work: Callable[[Callable[..., Trainer]], None]) -> None:
         ranks.text_of(0, json.dumps([END, status]))
 
 
-def follow(ranks: Ranks, load: Callable[[FitConfig], Dataset]) -> int:
+def follow(ranks: Ranks, load: Callable[[FitConfig, list[str]], Dataset]) -> int:
     """Do what the first process does; return the status that it ends with.
 
-    load: the photographs that a configuration names.
+    load: the dataset of a configuration, with the training views of these names.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the first process decides when to stop
-    trainer, datasets = None, {}
+    trainer = None
     try:
         while True:
             name, *arguments = json.loads(ranks.text_of(0, ""))
             if name == END:
                 return arguments[0]
             if name == START:
-                trainer = _another(ranks, load, datasets, *arguments)
+                text, names = arguments
+                config = FitConfig.model_validate_json(text)
+                gaussians = share_gaussians(ranks, None)
+                trainer = DistributedTrainer(config, load(config, names), gaussians, ranks)
             elif name == RESTORE:
                 trainer.restore({})
             else:
@@ -187,25 +189,6 @@ def follow(ranks: Ranks, load: Callable[[FitConfig], Dataset]) -> int:
         print(f"process {ranks.rank}: {text}", file=sys.__stderr__, flush=True)
         ranks.comm.Abort(2 if told else 1)
         raise
-
-
-def _another(
-    ranks: Ranks,
-    load: Callable[[FitConfig], Dataset],
-    datasets: dict[str, Dataset],
-    text: str,
-    names: list[str],
-) -> DistributedTrainer:
-    """A follower's trainer; datasets: that have been loaded, by their configuration."""
-    config = FitConfig.model_validate_json(text)
-    gaussians = share_gaussians(ranks, None)
-    key = config.data.model_dump_json()
-    if key not in datasets:
-        datasets[key] = load(config)
-    of_fit = set(names)
-    views = tuple(view for view in datasets[key].train if view.name in of_fit)
-    dataset = replace(datasets[key], train=views)
-    return DistributedTrainer(config, dataset, gaussians, ranks)
 
 
 def share_gaussians(ranks: Ranks, gaussians: Gaussians | None) -> Gaussians:
