@@ -7,6 +7,7 @@ signatures; a comment says which type it is (Float, Array3f, ...), and of what s
 
 from __future__ import annotations
 
+import math
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -69,12 +70,27 @@ def from_host(flat_type: type, values: Any) -> Any:
     Dr.Jit wraps numpy's memory on the CPU, and loads from memory that is not aligned are another
     kernel: whether one has to be compiled would depend on where numpy put the numbers.
     """
-    values = np.asarray(values, dtype=_NUMPY_TYPES[dr.type_v(flat_type)]).ravel()
-    storage = np.empty(values.nbytes + _ALIGNMENT, np.uint8)
-    start = -storage.ctypes.data % _ALIGNMENT
-    aligned = storage[start : start + values.nbytes].view(values.dtype)
-    aligned[:] = values
+    values = np.asarray(values, dtype=_NUMPY_TYPES[dr.type_v(flat_type)])
+    aligned = empty_on_host(flat_type, (values.size,))
+    aligned[:] = values.ravel()
     return flat_type(aligned)
+
+
+def empty_on_host(flat_type: type, shape: tuple[int, ...]) -> np.ndarray:
+    """Memory of the host for numbers of this type, not initialised, aligned as Dr.Jit's own is."""
+    dtype = np.dtype(_NUMPY_TYPES[dr.type_v(flat_type)])
+    size = math.prod(shape) * dtype.itemsize
+    storage = np.empty(size + _ALIGNMENT, np.uint8)
+    start = -storage.ctypes.data % _ALIGNMENT
+    return storage[start : start + size].view(dtype).reshape(shape)
+
+
+def wrapped(flat_type: type, values: np.ndarray) -> Any:
+    """An array of these numbers, which Dr.Jit does not copy on the CPU: nobody may change them.
+
+    values: from :func:`empty_on_host`.
+    """
+    return flat_type(values.reshape(-1))
 
 
 _ALIGNMENT = 64

@@ -11,7 +11,7 @@ rows lie one behind the other in the order of the processes, nothing depends on 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -19,7 +19,7 @@ import drjit as dr
 import numpy as np
 
 from drgs.cameras.camera import Camera
-from drgs.core.arrays import Rows, from_host, interleave, types_of
+from drgs.core.arrays import Rows, block_widths, empty_on_host, types_of, wrapped
 from drgs.distributed.ranks import Ranks, wait
 from drgs.gaussians.parameters import Gaussians
 from drgs.splatting.rasterize import SplatGradients
@@ -28,12 +28,16 @@ from drgs.splatting.rendering import (
     Frame,
     GaussianGradients,
     Pipeline,
+    SeenSplats,
     footprints_seen_by,
 )
 from drgs.splatting.tiles import Footprints
 
 MOST_TIMES = 4096
 """Of an open shutter; see ``drgs.integrator.limits``."""
+
+Blocks = list[np.ndarray]
+"""Rows of numbers as they travel: (M, columns) for each block of :class:`drgs.core.arrays.Rows`."""
 
 BOX = 4
 """Numbers of a splat's box of tiles: see :class:`drgs.splatting.tiles.Footprints`."""
@@ -46,12 +50,16 @@ class Layout:
     num_stored: int  # geometry, features, keys
     num_features: int
     num_keys: int
-    num_gradients: int  # with respect to geometry and features
 
     @property
-    def width(self) -> int:
-        """Numbers of a splat: box, what is stored, depth."""
-        return BOX + self.num_stored + 1
+    def num_gradients(self) -> int:
+        """With respect to geometry and features."""
+        return self.num_stored - self.num_keys
+
+    @property
+    def widths(self) -> tuple[int, ...]:
+        """Of the blocks of a splat: its box, what is stored, its depth."""
+        return (BOX, *block_widths(self.num_stored), 1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,74 +69,64 @@ class Sight:
     camera: Camera
     pipeline: Pipeline  # composed for the camera
     layout: Layout
+    float_type: type
     num_rows: int  # of this process
     rows: Any  # UInt32 (M,): those on the film, ascending
-    numbers: np.ndarray  # (M, width), as they travel
-
-    @property
-    def count(self) -> int:
-        """M: how many rows are on the film."""
-        return len(self.numbers)
-
-    def empty(self, count: int, width: int | None = None) -> np.ndarray:
-        """Rows to put others into that are received; width: None: of a splat as it travels."""
-        shape = int(count), self.layout.width if width is None else width
-        return np.empty(shape, self.numbers.dtype)
+    blocks: Blocks  # of these
+    count: int  # M
 
     @staticmethod
     def of(gaussians: Gaussians, camera: Camera, pipeline: Pipeline) -> Sight:
         """Project, and pack what is on the film. The host reads how many there are."""
         found = footprints_seen_by(gaussians, camera, pipeline)
-        stored = found.rows.width
-        layout = Layout(
-            num_stored=stored,
-            num_features=found.num_features,
-            num_keys=found.num_keys,
-            num_gradients=stored - found.num_keys,
-        )
+        layout = Layout(found.rows.width, found.num_features, found.num_keys)
         t, num_rows = types_of(type(found.depths)), dr.width(found.depths)
         tiles = found.boxes.load(dr.arange(t.UInt32, num_rows))[-1]
         rows = dr.compress(tiles > 0)
-        numbers = np.empty((0, layout.width), _dtype(t.Float))
-        if dr.width(rows) > 0:
+        count, blocks = dr.width(rows), empty_blocks(0, layout.widths, t.Float)
+        if count > 0:
+            boxes, stored = (Rows.of(each.load(rows)) for each in (found.boxes, found.rows))
             depths = dr.gather(t.Float, found.depths, rows)
-            flat = interleave([*found.boxes.load(rows), *found.rows.load(rows), depths])
-            numbers = np.array(flat).reshape(-1, layout.width)
-        return Sight(camera, pipeline, layout, num_rows, rows, numbers)
+            dr.eval(boxes, stored, depths)
+            flat = [*boxes.blocks, *stored.blocks, depths]
+            blocks = [each.numpy().reshape(count, -1) for each in flat]
+        return Sight(camera, pipeline, layout, t.Float, num_rows, rows, blocks, count)
 
-    def of_rows(self, numbers: np.ndarray) -> list[Any]:
-        """Columns of all rows of this process, of numbers (M, C) of those on the film; else 0."""
-        t = types_of(type(self.rows))
-        count = numbers.shape[1]
+    def of_rows(self, blocks: Blocks, width: int) -> list[Any]:
+        """Columns of all rows of this process, of numbers of those on the film; else 0."""
+        t = types_of(self.float_type)
         if self.count == 0:
-            return [dr.zeros(t.Float, self.num_rows) for _ in range(count)]
-        flat = from_host(t.Float, numbers)
+            return [dr.zeros(t.Float, self.num_rows) for _ in range(width)]
         nowhere = 0xFFFFFFFF
         place = dr.full(t.UInt32, nowhere, self.num_rows)
         dr.scatter(place, dr.arange(t.UInt32, self.count), self.rows)
         dr.eval(place)
-        is_there = place != nowhere
-        return [dr.gather(t.Float, flat, place * count + k, is_there) for k in range(count)]
+        rows = Rows(tuple(wrapped(t.Float, block) for block in blocks), width)
+        return rows.load(place, place != nowhere)
 
-    def splat_gradients(self, numbers: np.ndarray) -> SplatGradients:
-        """Of all rows of this process, from those (M, C) that came back."""
-        columns = self.of_rows(numbers)
+    def seen_splats(self, blocks: Blocks) -> SeenSplats:
+        """All rows of this process, with the derivatives of those that came back."""
+        columns = self.of_rows(blocks, self.layout.num_gradients)
         of_geometry = len(columns) - self.layout.num_features
-        return SplatGradients(geometry=columns[:of_geometry], features=columns[of_geometry:])
+        gradients = SplatGradients(columns[:of_geometry], columns[of_geometry:])
+        return SeenSplats(self.camera, self.pipeline, gradients)
 
 
-def joined(parts: Sequence[np.ndarray], layout: Layout, float_type: type) -> Footprints:
-    """The splats of several processes behind one another, evaluated."""
-    numbers = np.concatenate(parts)
-    if len(numbers) == 0:  # Dr.Jit does not compute with empty arrays: one that is not visible
-        numbers = np.zeros((1, layout.width), _dtype(float_type))
-        numbers[:, -1] = np.inf
-    t, width = types_of(float_type), layout.width
-    flat, row = from_host(t.Float, numbers), dr.arange(t.UInt32, len(numbers))
-    columns = [dr.gather(t.Float, flat, row * width + k) for k in range(width)]
-    boxes, rows = Rows.of(columns[:BOX]), Rows.of(columns[BOX:-1])
-    dr.eval(boxes, rows, columns[-1])
-    return Footprints(boxes, rows, columns[-1], layout.num_features, layout.num_keys)
+def joined(blocks: Blocks, layout: Layout, float_type: type) -> Footprints:
+    """The splats of several processes, behind one another in each block."""
+    if len(blocks[0]) == 0:  # Dr.Jit does not compute with empty arrays: one that is not visible
+        blocks = empty_blocks(1, layout.widths, float_type)
+        for block in blocks:
+            block[:] = 0
+        blocks[-1][:] = np.inf
+    box, *stored, depths = (wrapped(float_type, block) for block in blocks)
+    rows = Rows(tuple(stored), layout.num_stored)
+    return Footprints(Rows((box,), BOX), rows, depths, layout.num_features, layout.num_keys)
+
+
+def empty_blocks(count: int, widths: Sequence[int], float_type: type) -> Blocks:
+    """Memory for rows that are received, aligned as Dr.Jit's is."""
+    return [empty_on_host(float_type, (count, width)) for width in widths]
 
 
 class Post:
@@ -137,29 +135,35 @@ class Post:
     def __init__(self, ranks: Ranks) -> None:
         self.ranks = ranks
         self._sending: list[Any] = []
-        self._staying: dict[tuple[int, int], deque[np.ndarray]] = {}  # from this process to itself
+        self._sent: list[Blocks] = []  # as long as they are on their way
+        self._staying: dict[tuple[int, int], deque[Blocks]] = {}  # from this process to itself
 
-    def send(self, rows: np.ndarray, to: int, place: int, time: int) -> None:
+    def send(self, blocks: Blocks, to: int, place: int, time: int) -> None:
         """Begin to send rows to a process."""
         if to == self.ranks.rank:
-            self._staying.setdefault((place, time), deque()).append(rows)
-        else:
-            rows = np.ascontiguousarray(rows)
-            self._sending.append(self.ranks.send(rows, to, place * MOST_TIMES + time))
+            self._staying.setdefault((place, time), deque()).append(blocks)
+            return
+        self._sent.append(blocks)
+        for block in blocks:
+            self._sending.append(self.ranks.send(block, to, place * MOST_TIMES + time))
 
-    def receive(self, into: np.ndarray, of: int, place: int, time: int) -> np.ndarray:
-        """The next rows that a process sends."""
+    def receive(self, into: Blocks, of: int, place: int, time: int) -> None:
+        """Wait for the next rows that a process sends."""
         if of == self.ranks.rank:
-            return self._staying[place, time].popleft()
+            own = self._staying[place, time].popleft()
+            for block, rows in zip(into, own, strict=True):
+                block[:] = rows
+            return
+        tag = place * MOST_TIMES + time
         with self.ranks.exchanging():
-            wait(self.ranks.receive(into, of, place * MOST_TIMES + time))
-        return into
+            wait(*(self.ranks.receive(block, of, tag) for block in into))
 
     def finish(self) -> None:
         """Wait until all has been sent."""
         with self.ranks.exchanging():
             wait(*self._sending)
         self._sending.clear()
+        self._sent.clear()
 
 
 @dataclass(eq=False)
@@ -187,16 +191,12 @@ class Received:
         nothing = t.UInt32(NO_FAULT)
         return GaussianGradients(None, of_splats.means2d, visible, nothing)
 
-    def numbers(self, counts: np.ndarray) -> list[np.ndarray]:
-        """Of each time the derivatives of its splats, (count, C); waits for the device."""
-        columns = [[*g.geometry, *g.features] for g in self.gradients_in_time]
-        flat = [interleave(each) for each in columns]
-        dr.eval(flat)
-        return [
-            np.array(values).reshape(-1, len(each))[:count]
-            for values, each, count in zip(flat, columns, counts, strict=True)
-        ]
+    def blocks(self) -> list[Blocks]:
+        """Of each time the derivatives of its splats; waits for the device."""
+        rows = [Rows.of([*g.geometry, *g.features]) for g in self.gradients_in_time]
+        dr.eval(rows)
+        return [[b.numpy().reshape(-1, w) for b, w in _by_width(each)] for each in rows]
 
 
-def _dtype(float_type: type) -> Any:
-    return np.float64 if dr.type_v(float_type) == dr.VarType.Float64 else np.float32
+def _by_width(rows: Rows) -> Iterator[tuple[Any, int]]:
+    return zip(rows.blocks, block_widths(rows.width), strict=True)

@@ -13,7 +13,8 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Sequence
+import operator
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, reduce
 from typing import Any
@@ -24,10 +25,17 @@ import numpy as np
 
 from drgs.cameras.camera import cameras_in_time
 from drgs.config.schema import FitConfig
-from drgs.core.arrays import from_host
+from drgs.core.arrays import block_widths, from_host
 from drgs.core.errors import UserError
 from drgs.data.types import Dataset
-from drgs.distributed.exchange import Post, Received, Sight, joined
+from drgs.distributed.exchange import (
+    Blocks,
+    Post,
+    Received,
+    Sight,
+    empty_blocks,
+    joined,
+)
 from drgs.distributed.ranks import Ranks
 from drgs.distributed.shards import Shard, SpreadPopulation
 from drgs.effects.compose import composed, ignoring
@@ -36,13 +44,12 @@ from drgs.integrator.sensors import camera_from_sensor, read_sensor
 from drgs.splatting.rendering import (
     NO_FAULT,
     Frame,
-    gradients_of,
-    sum_of_gradients,
     weighted_sums,
 )
+from drgs.training.deferred import VIEWS_AT_ONCE
 from drgs.training.density.strategy import SeenStep
 from drgs.training.finite_checks import NonFiniteError
-from drgs.training.trainer import PREFIX, SeenView, Trainer
+from drgs.training.trainer import PREFIX, SeenView, Trainer, Waiting
 
 NEVER = 2**62
 """The iteration of no fault."""
@@ -102,18 +109,17 @@ class DistributedTrainer(Trainer):
         counts = self.ranks.told(np.array([[sight.count for sight in each] for each in sights]))
         for place, iteration in enumerate(iterations):
             for time, sight in enumerate(sights[place]):
-                self.post.send(sight.numbers, self.renderer_of(iteration), place, time)
+                self.post.send(sight.blocks, self.renderer_of(iteration), place, time)
         found, pictures = np.zeros((len(iterations), 3)), {}
         for iteration in self._own(iterations):
             place = iterations.index(iteration)
             self.iteration = iteration
             found[place], pictures[place] = self._render(place, sights[place], counts[:, place])
         found = self.ranks.told(found).sum(axis=0)  # of a view, those of all but one are 0
-        for place, iteration in enumerate(iterations):
-            self.iteration = iteration
-            self._add_gradients(place, sights[place], counts[:, place], pictures.get(place))
+        penalties = self._go_back_penalties(len(iterations))
+        losses = self._regularised_losses(iterations, found[:, 0]) if penalties else found[:, 0]
+        self._add_gradients(sights, counts, pictures, losses)
         self.post.finish()
-        losses = self._regularised_losses(iterations, found[:, 0])
         numbers = zip(losses, found[:, 1], found[:, 2], strict=True)
         return [SeenView([loss], [error], counted) for loss, error, counted in numbers]
 
@@ -171,9 +177,8 @@ class DistributedTrainer(Trainer):
         self._backward(loss)
         self.integrator.source = None
         image, loss = dr.detach(image), dr.detach(loss)
-        for time, numbers in enumerate(received.numbers(counts.sum(axis=0))):
-            self.send_to_owners(numbers, counts[:, time], place, time)
-        self._watch(view, loss, mi.UInt32(NO_FAULT))
+        for time, blocks in enumerate(received.blocks()):
+            self.send_to_owners(blocks, counts[:, time], place, time)
         picture = None
         if self.density.gathers(iteration):
             frames = [of_time[0] for of_time in self.integrator.memory.rendered[0].frames]
@@ -182,49 +187,66 @@ class DistributedTrainer(Trainer):
 
     def _received(self, place: int, sights: Sequence[Sight], counts: np.ndarray) -> Received:
         """The splats of all processes."""
-        in_time = []
+        in_time, float_type = [], type(self.means.array)
         for time, sight in enumerate(sights):
-            parts = [
-                self.post.receive(sight.empty(count), rank, place, time)
-                for rank, count in enumerate(counts[:, time])
-            ]
-            in_time.append(joined(parts, sight.layout, type(self.means.array)))
+            ends = np.cumsum(counts[:, time])
+            blocks = empty_blocks(int(ends[-1]), sight.layout.widths, float_type)
+            for rank, end in enumerate(ends):
+                rows = slice(end - counts[rank, time], end)
+                self.post.receive([block[rows] for block in blocks], rank, place, time)
+            in_time.append(joined(blocks, sight.layout, float_type))
         return Received(in_time)
 
-    def send_to_owners(
-        self, numbers: np.ndarray, counts: np.ndarray, place: int, time: int
-    ) -> None:
+    def send_to_owners(self, blocks: Blocks, counts: np.ndarray, place: int, time: int) -> None:
         """Rows for the splats of a view, to those who projected them."""
-        for rank, part in enumerate(np.split(numbers, np.cumsum(counts)[:-1])):
-            self.post.send(part, rank, place, time)
+        for rank, end in enumerate(np.cumsum(counts)):
+            rows = slice(end - counts[rank], end)
+            self.post.send([block[rows] for block in blocks], rank, place, time)
+
+    def receive_of_rows(
+        self, sights: Sequence[Sight], place: int, width: int
+    ) -> list[tuple[Sight, Blocks]]:
+        """What :meth:`send_to_owners` has sent of the rows of this process, ``width`` numbers."""
+        renderer, found = self.renderer_of(self.iteration), []
+        for time, sight in enumerate(sights):
+            blocks = empty_blocks(sight.count, block_widths(width), sight.float_type)
+            self.post.receive(blocks, renderer, place, time)
+            found.append((sight, blocks))
+        return found
 
     def _add_gradients(
-        self, place: int, sights: Sequence[Sight], counts: np.ndarray, picture: Picture | None
+        self,
+        sights: Sequence[Sequence[Sight]],
+        counts: np.ndarray,
+        pictures: Mapping[int, Picture],
+        losses: np.ndarray,
     ) -> None:
-        """Of the rows of this process, from a view's derivatives with respect to its splats."""
-        renderer, of_splats = self.renderer_of(self.iteration), []
-        for time, sight in enumerate(sights):
-            into = sight.empty(sight.count, sight.layout.num_gradients)
-            of_splats.append(sight.splat_gradients(self.post.receive(into, renderer, place, time)))
-        penalties = list(self.density.penalties(self.parameters, self.num_gaussians))
-        if penalties:
-            self._backward(sum(penalties[1:], penalties[0]))
-        gaussians = dr.detach(self.integrator.gaussians)
-        with dr.suspend_grad():
-            of_times = [
-                gradients_of(gaussians, sight.camera, sight.pipeline, gradients)
-                for sight, gradients in zip(sights, of_splats, strict=True)
-            ]
-            found = reduce(sum_of_gradients, of_times)
-            with dr.resume_grad():
-                self.integrator.accumulate(self.scene, found.parameters)
-        first = dr.opaque(mi.UInt32, self.shard.own.start * len(PARAMETER_NAMES))
-        fault = found.first_fault
-        fault = dr.select(fault == NO_FAULT, fault, fault + first)
-        self.watch.add(self.iteration, self.view.name, mi.Float(0), fault)
-        if self.density.gathers(self.iteration):
-            step = SharedStep(self, place, sights, counts, found.means2d, picture)
-            self.density.gather(step)
+        """Of the rows of this process, from what has come back of all views, in their order.
+
+        counts: splats by process, view and time.
+        """
+        iterations = self.iterations_of_step
+        for first in range(0, len(iterations), VIEWS_AT_ONCE):
+            places, waiting = range(len(iterations))[first : first + VIEWS_AT_ONCE], []
+            for place in places:
+                width = sights[place][0].layout.num_gradients
+                self.iteration = iterations[place]
+                arrived = self.receive_of_rows(sights[place], place, width)
+                seen = [sight.seen_splats(blocks) for sight, blocks in arrived]
+                waiting.append(Waiting(self.iteration, [losses[place]], seen, None))
+            self._add(waiting)
+            for place, view in zip(places, waiting, strict=True):
+                self.iteration = view.iteration
+                if self.density.gathers(view.iteration):
+                    means2d = reduce(operator.add, (each.gradients.means2d for each in view.seen))
+                    own = counts[:, place], means2d, pictures.get(place)
+                    self.density.gather(SharedStep(self, place, sights[place], *own))
+
+    def _watch(self, iteration: int, loss: Any, first_fault: Any) -> None:
+        """See :meth:`Trainer._watch`; rows are counted over all processes."""
+        first = dr.opaque(mi.UInt32, self.first_row * len(PARAMETER_NAMES))
+        fault = dr.select(first_fault == NO_FAULT, first_fault, first_fault + first)
+        super()._watch(iteration, loss, fault)
 
     # ------------------------------------------------------------------------------------------
     # All of it, on the first process
@@ -341,7 +363,6 @@ class SharedStep:
         view = trainer.view
         self.iteration, self.width, self.height = trainer.iteration, view.width, view.height
         self._trainer, self._place, self._sights, self._counts = trainer, place, sights, counts
-        self._renderer = trainer.renderer_of(self.iteration)
         self._means2d, self._picture = means2d, picture
 
     @cached_property
@@ -355,7 +376,8 @@ class SharedStep:
     @cached_property
     def visible(self) -> Any:
         """Bool (N,): see :class:`SeenStep`."""
-        columns = [sight.of_rows(np.ones((sight.count, 1)))[0] for sight in self._sights]
+        ones = [np.ones((sight.count, 1), np.float32) for sight in self._sights]
+        columns = [s.of_rows([each], 1)[0] for s, each in zip(self._sights, ones, strict=True)]
         return self._of_all(sum(columns[1:], columns[0])) > 0
 
     def errors_seen(self) -> Any:
@@ -374,17 +396,12 @@ class SharedStep:
 
         plane: Float (H * W,), on the process that has rendered the view.
         """
-        post = self._trainer.post
         if self._picture is not None:
             for time, frame in enumerate(self._picture.frames):
-                count = int(self._counts[:, time].sum())
-                sums = np.array(weighted_sums(frame, plane))[:count, None]
-                self._trainer.send_to_owners(sums, self._counts[:, time], self._place, time)
-        columns = []
-        for time, sight in enumerate(self._sights):
-            into = sight.empty(sight.count, 1)
-            numbers = post.receive(into, self._renderer, self._place, time)
-            columns.append(sight.of_rows(numbers)[0])
+                sums = np.array(weighted_sums(frame, plane))[:, None]
+                self._trainer.send_to_owners([sums], self._counts[:, time], self._place, time)
+        arrived = self._trainer.receive_of_rows(self._sights, self._place, 1)
+        columns = [sight.of_rows(blocks, 1)[0] for sight, blocks in arrived]
         return self._of_all(sum(columns[1:], columns[0]) / len(columns))
 
     def _of_all(self, column: Any) -> Any:

@@ -14,8 +14,9 @@ is ever scattered.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import reduce
 from typing import Any, Protocol
 
 import drjit as dr
@@ -165,7 +166,7 @@ class Projected:
     ) -> GaussianGradients:
         """Go back through the projection."""
         found = gradients_of(gaussians, frame.camera, frame.pipeline, of_splats, of_camera)
-        return replace(found, visible=_on_film(frame.bins))
+        return replace(found, visible=on_film(frame.bins))
 
 
 def as_loaded(rows: GaussianRows) -> GaussianRows:
@@ -321,7 +322,64 @@ def gradients_of(
     As :func:`frames_adjoint`; ``visible`` is what projection says, without regard to the film.
     """
     rows = load_rows(gaussians, pipeline.sh_degree)
+    d_rows, visible, d_numbers = _back_to_rows(rows, camera, pipeline, of_splats, of_camera)
+    columns = _columns_of(d_rows, gaussians, visible)
+    parameters, (faults,) = _as_tensors(columns, gaussians, [_faults(d_rows, visible)])
+    return GaussianGradients(
+        parameters=parameters,
+        means2d=of_splats.means2d,
+        visible=visible,
+        first_fault=dr.min(faults),
+        camera=_sums(d_numbers, visible) if of_camera else None,
+    )
+
+
+@dataclass(frozen=True)
+class SeenSplats:
+    """What one camera saw of Gaussians, and derivatives with respect to it."""
+
+    camera: Camera
+    pipeline: Pipeline
+    gradients: SplatGradients
+
+
+def sum_of_views(
+    gaussians: Gaussians, views: Sequence[Sequence[SeenSplats]]
+) -> tuple[Gaussians, list[Any]]:
+    """The sum of what :func:`gradients_of` gives for several views, by one kernel.
+
+    views: what is seen at each time of each view, in which order they are added. What the views
+    share is computed once, and the sum stays in registers.
+
+    Returns the derivatives, and the first fault of each view.
+    """
+    rows, total, faults = load_rows(gaussians, views[0][0].pipeline.sh_degree), None, []
+    for view in views:
+        of_times = []
+        for seen in view:
+            d_rows, visible, _ = _back_to_rows(rows, seen.camera, seen.pipeline, seen.gradients)
+            columns = _columns_of(d_rows, gaussians, visible)
+            total = columns if total is None else _sum_of_columns(total, columns)
+            of_times.append(_faults(d_rows, visible))
+        faults.append(reduce(dr.minimum, of_times))
+    parameters, faults = _as_tensors(total, gaussians, faults)
+    return parameters, [dr.min(each) for each in faults]
+
+
+def _sum_of_columns(a: dict[str, list[Any]], b: dict[str, list[Any]]) -> dict[str, list[Any]]:
+    return {name: [x + y for x, y in zip(own, b[name], strict=True)] for name, own in a.items()}
+
+
+def _back_to_rows(
+    rows: GaussianRows,
+    camera: Camera,
+    pipeline: Pipeline,
+    of_splats: SplatGradients,
+    of_camera: bool = False,
+) -> tuple[GaussianRows, Any, list[Any]]:
+    """Derivatives per lane, which of them are visible, and derivatives of the camera's numbers."""
     response, numbers = pipeline.model.seen_by(camera).response, []
+    rows = dr.copy(rows)  # whose derivatives are of this camera alone
     if of_camera:
         pipeline.model.check_differentiable_in_camera()
         camera = camera.by_lane(dr.width(rows.logit_opacities))
@@ -337,16 +395,7 @@ def gradients_of(
         dr.enqueue(dr.ADMode.Backward, outputs)
         dr.traverse(dr.ADMode.Backward)
         d_rows = dr.grad(replace(rows, smoothing=None))
-        visible = dr.detach(splats.visible)
-        d_numbers = [dr.grad(number) for number in numbers]
-    parameters, first_fault = _as_tensors(d_rows, gaussians, visible)
-    return GaussianGradients(
-        parameters=parameters,
-        means2d=of_splats.means2d,
-        visible=visible,
-        first_fault=first_fault,
-        camera=_sums(d_numbers, visible) if of_camera else None,
-    )
+        return d_rows, dr.detach(splats.visible), [dr.grad(number) for number in numbers]
 
 
 def _sums(columns: list[Any], visible: Any) -> list[Any]:
@@ -459,8 +508,8 @@ def _splat_tangents(
     return SplatGradients(geometry=columns[:count], features=columns[count:])
 
 
-def _as_tensors(d_rows: GaussianRows, gaussians: Gaussians, visible: Any) -> tuple[Gaussians, Any]:
-    """Per-lane derivatives as tensors shaped like the parameters, and their first fault, evaluated.
+def _columns_of(d_rows: GaussianRows, gaussians: Gaussians, visible: Any) -> dict[str, list[Any]]:
+    """Per-lane derivatives by parameter, as many columns as it has.
 
     Rows that are not visible have zero gradient, also where their values are not finite; so have
     SH coefficients above the pipeline's degree.
@@ -477,13 +526,20 @@ def _as_tensors(d_rows: GaussianRows, gaussians: Gaussians, visible: Any) -> tup
         "shN": [*higher, *[t.Float(0)] * missing] if higher else [],
         **(d_rows.features or {}),
     }
-    stored = {
-        name: store_columns([dr.select(visible, column, t.Float(0)) for column in own])
+    return {
+        name: [dr.select(visible, column, t.Float(0)) for column in own]
         for name, own in columns.items()
         if len(own)
     }
-    faults = dr.select(visible, _faults(d_rows), NO_FAULT)
-    dr.eval(stored, faults)
+
+
+def _as_tensors(
+    columns: dict[str, list[Any]], gaussians: Gaussians, others: list[Any]
+) -> tuple[Gaussians, list[Any]]:
+    """Columns as tensors shaped like the parameters; evaluated together with ``others``."""
+    t = types_of(type(gaussians.logit_opacities))
+    stored = {name: store_columns(own) for name, own in columns.items()}
+    dr.eval(stored, others)
 
     def gradient(name: str, like: Any) -> Any:
         if name not in stored:
@@ -496,10 +552,10 @@ def _as_tensors(d_rows: GaussianRows, gaussians: Gaussians, visible: Any) -> tup
         **{name: gradient(name, getattr(gaussians, name)) for name in PARAMETER_NAMES},
         features=features and {name: gradient(name, like) for name, like in features.items()},
     )
-    return gradients, dr.min(faults)
+    return gradients, others
 
 
-def _faults(d_rows: GaussianRows) -> Any:
+def _faults(d_rows: GaussianRows, visible: Any) -> Any:
     """UInt32 (N,): row * 6 + number of the first parameter at fault there, or ``NO_FAULT``."""
     UInt32 = types_of(type(d_rows.logit_opacities)).UInt32
     row = dr.arange(UInt32, dr.width(d_rows.logit_opacities))
@@ -517,10 +573,10 @@ def _faults(d_rows: GaussianRows) -> Any:
         squared_norm = sum(dr.square(component) for component in columns[name])
         # Written such that NaN is a fault.
         faults = dr.select(squared_norm < dr.inf, faults, row * len(PARAMETER_NAMES) + number)
-    return faults
+    return dr.select(visible, faults, NO_FAULT)
 
 
-def _on_film(bins: TileBins) -> Any:
+def on_film(bins: TileBins) -> Any:
     """Bool per Gaussian: it has entries."""
     t = types_of(bins.rows.Float)
     rank = dr.arange(t.UInt32, dr.width(bins.order))

@@ -25,6 +25,8 @@ from drgs.data.types import Dataset, View
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 from drgs.integrator.scene import make_scene, render_views
 from drgs.integrator.weights import weighted_sums_of_last
+from drgs.splatting.rendering import SeenSplats, sum_of_views
+from drgs.training.deferred import VIEWS_AT_ONCE, Deferred
 from drgs.training.density.called_for import density_strategy
 from drgs.training.density.strategy import DensityReport, DensityStrategy, Population, SeenStep
 from drgs.training.effects.called_for import integrator_settings, training_effects
@@ -60,6 +62,16 @@ class SeenView:
     loss: Any  # Float, one entry
     squared_error: Any  # Float, one entry: mean over pixels and channels
     counted: float  # share of the pixels that count
+
+
+@dataclass(frozen=True)
+class Waiting:
+    """A view whose derivatives are to be taken from its splats to the Gaussians."""
+
+    iteration: int
+    loss: Any  # Float, one entry
+    seen: Sequence[SeenSplats]  # by time; none: its derivatives have been added
+    first_fault: Any  # UInt32, one entry; of a view whose derivatives have been added
 
 
 @dataclass(frozen=True)
@@ -166,21 +178,50 @@ class Trainer:
 
     def _differentiate(self, iterations: range) -> list[SeenView]:
         """Add up the derivatives of the mean loss of a step's views; ends at the last iteration."""
-        seen = []
+        seen, waiting = [], []
+        penalties = self._go_back_penalties(len(iterations))
         for iteration in iterations:
             self._gather()  # of the view before, whose frames make room
             self.iteration, view = iteration, self.view_at(iteration)
             for effect in self.effects:
                 effect.before(self, view)
+            self.integrator.source = source = Deferred()
             image, loss, error = self.compared(self._rendered(view), view)
-            loss = self._regularised(loss)
             self._backward(loss)
-            image, loss = dr.detach(image), dr.detach(loss)
-            self._watch(view, loss, self.integrator.last.first_fault)
+            self.integrator.source = None
+            image, loss = dr.detach(image), dr.detach(sum(penalties, loss))
             if self.density.gathers(iteration):
                 self._not_gathered = self._seen_step(image, view.target)
             seen.append(SeenView(loss, error, view.counted))
+            last = self.integrator.last
+            waiting.append(Waiting(iteration, loss, source.taken(), last.first_fault))
+            if len(waiting) == VIEWS_AT_ONCE or iteration == iterations[-1]:
+                self._add(waiting)
+                waiting.clear()
         return seen
+
+    def _go_back_penalties(self, count: int) -> list[Any]:
+        """Terms of the strategy of density; their derivatives are added for so many views."""
+        terms = list(self.density.penalties(self.parameters, self.num_gaussians))
+        if terms:
+            weight = self.num_averaged / count
+            total = sum(terms[1:], terms[0])
+            dr.backward(total / weight if weight > 1 else total)
+        return [dr.detach(term) for term in terms]
+
+    def _add(self, waiting: Sequence[Waiting]) -> None:
+        """Add the derivatives of some views to those of the step."""
+        deferred = [view for view in waiting if view.seen]
+        faults = {view.iteration: view.first_fault for view in waiting}
+        if deferred:
+            with dr.suspend_grad():
+                gaussians = dr.detach(self.integrator.gaussians)
+                total, found = sum_of_views(gaussians, [view.seen for view in deferred])
+                with dr.resume_grad():
+                    self.integrator.accumulate(self.scene, total)
+            faults |= {view.iteration: f for view, f in zip(deferred, found, strict=True)}
+        for view in waiting:
+            self._watch(view.iteration, view.loss, faults[view.iteration])
 
     def _rendered(self, view: TrainingView) -> Any:
         """The Gaussians as the view's sensor sees them, with derivatives."""
@@ -209,20 +250,15 @@ class Trainer:
                 derivatives = {name: dr.grad(v) for name, v in effect.leaves(view).items()}
                 effect.after(self, view, derivatives)
 
-    def _regularised(self, loss: Any) -> Any:
-        """A view's loss with the terms of the strategy of density."""
-        for penalty in self.density.penalties(self.parameters, self.num_gaussians):
-            loss = loss + penalty
-        return loss
-
     def _backward(self, loss: Any) -> None:
         """Add the derivatives of a view's part of the mean."""
         dr.backward(loss / self.num_averaged if self.num_averaged > 1 else loss)
 
-    def _watch(self, view: TrainingView, loss: Any, first_fault: Any) -> None:
+    def _watch(self, iteration: int, loss: Any, first_fault: Any) -> None:
         """Write down what may not be finite; see :class:`GradientWatch`."""
+        view = self.view_at(iteration)
         numbers = {f"{e.name}.{k}": v for e in self.effects for k, v in e.numbers_of(view).items()}
-        self.watch.add(self.iteration, view.name, loss, first_fault, numbers)
+        self.watch.add(iteration, view.name, loss, first_fault, numbers)
 
     def _seen_step(self, image: Any, target: Target) -> SeenStep:
         """For the strategy of density; image: (H, W, 3), as compared."""
