@@ -34,8 +34,9 @@ MAY_IMPORT = {
     "_registration": {"plugins", *GROUND},
     "": {"_registration", "core"},  # drgs/__init__.py; what it offers is imported when it is used
     "rasterizing": {"accuracy", "effects", "splatting", "config", *METHOD},
+    "distributed": {"training", "cli", *TRAINING},
     "live": {"training", *TRAINING},
-    "commands": {"live", "training", "cli", "plugins", *TRAINING},
+    "commands": {"distributed", "live", "training", "cli", "plugins", *TRAINING},
     "bench": {"commands", "rasterizing", "training", "cli", "reference", "", *TRAINING},
 }
 """By package: the others that it may import. ``drgs`` itself may be imported for its version."""

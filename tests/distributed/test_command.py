@@ -1,0 +1,109 @@
+"""``mpiexec -n K python -m drgs.fit``: one voice, one folder, and nobody who waits for ever."""
+
+import csv
+import json
+import os
+import random
+import signal
+import time
+
+import pytest
+from support import together
+
+CONFIG = """
+data: {{path: {data}, image_size: 50}}
+iterations: {iterations}
+init: {{num_points: 300}}
+optimizer: {{views_per_step: {views}}}
+densify: {{budget: {{gaussians: 600}}}}
+output: {{report: false, save_renders: false, checkpoint_every: 20, history_every: 20}}
+"""
+
+
+@pytest.fixture
+def config(tmp_path):
+    """Writes a configuration: config(iterations)."""
+
+    def write(iterations=60, views=4):
+        path = tmp_path / "fit.yml"
+        data = together.REPOSITORY / "scenes" / "lego"
+        path.write_text(CONFIG.format(data=data, iterations=iterations, views=views))
+        return path
+
+    return write
+
+
+def command(*words):
+    return ["-m", "drgs.fit", *words]
+
+
+def result(folder):
+    with (folder / "history.csv").open(newline="") as file:
+        rows = [{k: v for k, v in row.items() if k != "wall_s"} for row in csv.DictReader(file)]
+    return (folder / "point_cloud.ply").read_bytes(), rows
+
+
+def test_a_fit_that_is_shared_and_resumed_by_others_is_the_same(config, tmp_path):
+    path = config()
+    status, output, errors = together.run(2, command(path, "--out", tmp_path / "two"))
+    assert status == 0, errors
+    assert output.count("written: ") == 1 and "Traceback" not in errors
+    assert together.run(1, command(path, "--out", tmp_path / "one"))[0] == 0
+    assert result(tmp_path / "two") == result(tmp_path / "one")
+    metrics = json.loads((tmp_path / "two" / "metrics.json").read_text())
+    assert metrics["config"]["optimizer"]["views_per_step"] == 4
+
+
+def test_too_many_processes_are_refused_once(config, tmp_path):
+    status, _, errors = together.run(3, command(config(views=2), "--out", tmp_path / "out"))
+    assert status == 2
+    assert errors.count("error: ") == 1
+    assert "optimizer.views_per_step must be at least the number of processes (3)" in errors
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_wrong_command_line_is_refused_once(tmp_path):
+    status, _, errors = together.run(2, command("nothing.yml", "--out", tmp_path / "out"))
+    assert status == 2 and errors.count("error: ") == 1
+
+
+def started(path, out, size=2):
+    """A fit that has saved a checkpoint and goes on."""
+    process = together.start(size, command(path, "--out", out))
+    end = time.monotonic() + 60
+    while not (out / "checkpoint.npz").exists():
+        assert process.poll() is None and time.monotonic() < end
+        time.sleep(0.1)
+    return process
+
+
+@pytest.mark.slow
+def test_ctrl_c_saves_and_another_number_goes_on(config, tmp_path):
+    path = config(iterations=800)
+    process = started(path, tmp_path / "out")
+    process.send_signal(signal.SIGINT)
+    output, _ = process.communicate(timeout=60)
+    assert process.returncode == 130 and "stopped; continue with" in output
+    assert together.run(3, command("--resume", tmp_path / "out"))[0] == 0
+    assert together.run(1, command(path, "--out", tmp_path / "whole"))[0] == 0
+    assert result(tmp_path / "out") == result(tmp_path / "whole")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(3))
+def test_a_process_that_dies_takes_the_others_along(config, tmp_path, seed):
+    """At any moment; the checkpoint is whole, and others go on with it."""
+    out, rng = tmp_path / "out", random.Random(seed)
+    process = started(config(iterations=800), out, 3)
+    time.sleep(2 * rng.random())
+    ranks = together.ranks_of(str(out))
+    assert len(ranks) == 3
+    os.kill(rng.choice(ranks), signal.SIGKILL)
+    process.communicate(timeout=30)
+    assert process.returncode != 0
+    end = time.monotonic() + 10
+    while together.ranks_of(str(out)):
+        assert time.monotonic() < end
+        time.sleep(0.1)
+    assert together.run(2, command("--resume", out))[0] == 0
+    assert (out / "metrics.json").exists()

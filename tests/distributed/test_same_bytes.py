@@ -1,0 +1,103 @@
+"""However many processes share a fit, it is the same."""
+
+import mitsuba as mi
+import pytest
+from support import small_fits as fits
+from support import together
+
+
+@pytest.fixture(scope="module", autouse=True)
+def variant():
+    mi.set_variant("llvm_ad_rgb")
+
+
+def settings(views_per_step=4, **changes):
+    values = {"optimizer.views_per_step": views_per_step, "output.history_every": 4}
+    return values | {key.replace("__", "."): value for key, value in changes.items()}
+
+
+def assert_the_same(changes, sizes, steps=8, alpha=False):
+    dataset = fits.true_dataset() if alpha else fits.plain_dataset()
+    alone = fits.Trainer(fits.config_of(**changes), dataset, fits.disturbed_blobs())
+    expected = together.found_by(alone, steps)
+    for size in sizes:
+        state, reports = together.fitted(size, steps, changes, alpha)
+        assert reports == expected[1], size
+        assert state == expected[0], size
+
+
+CHANGING = {"densify__start": 2, "densify__stop": 30, "densify__every": 5}
+
+STRATEGIES = {
+    "adc": {**CHANGING, "densify__strategy": "adc", "densify__adc__grad_threshold": 1e-6},
+    "budget": {
+        **CHANGING,
+        "densify__strategy": "budget",
+        "densify__budget__gaussians": 60,
+        "densify__budget__error_every": 3,
+    },
+    "mcmc": {
+        **CHANGING,
+        "densify__strategy": "mcmc",
+        "densify__mcmc__gaussians": 60,
+        "densify__mcmc__min_opacity": 0.3,
+    },
+    "importance": {
+        "densify__start": 1,
+        "densify__stop": 2,
+        "densify__prune__to": 15,
+        "densify__prune__method": "importance",
+        "densify__prune__start": 4,
+        "densify__prune__stop": 24,
+        "densify__prune__every": 7,
+    },
+    "selection": {
+        "densify__start": 1,
+        "densify__stop": 2,
+        "densify__prune__to": 15,
+        "densify__prune__method": "selection",
+        "densify__prune__start": 4,
+        "densify__prune__stop": 24,
+        "densify__prune__every": 7,
+    },
+}
+
+EFFECTS = {
+    "data__random_background": True,
+    "model__smoothing": True,
+    "colors__lr": 0.02,
+    "coarse": [{"until": 10, "factor": 2}],
+}
+
+
+def test_two_processes_grow_the_same_population():
+    assert_the_same(settings(**STRATEGIES["budget"]), [2])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("strategy", STRATEGIES)
+def test_one_to_four_processes_and_every_strategy(strategy):
+    assert_the_same(settings(**STRATEGIES[strategy]), [1, 2, 3, 4])
+
+
+@pytest.mark.slow
+def test_six_views_a_step():
+    assert_the_same(settings(6, **STRATEGIES["adc"]), [1, 2, 3])
+
+
+@pytest.mark.slow
+def test_effects_of_the_views():
+    assert_the_same(settings(**EFFECTS), [1, 2, 3], alpha=True)
+
+
+@pytest.mark.slow
+def test_late_steps_of_more_views():
+    late = {"optimizer__views": 8, "optimizer__views_from": 0.0, "densify__stop": 2}
+    assert_the_same(settings(**late, densify__start=1), [2, 3])
+
+
+def test_all_processes_say_which_number_is_none():
+    alone = fits.make_trainer(fits.plain_dataset(), optimizer__views_per_step=4)
+    expected = together.spoiled(alone, 17)
+    assert "in row 17" in expected
+    assert together.said_of(3, 17) == expected

@@ -1,0 +1,153 @@
+"""Several processes that do something together: started by ``mpiexec``, as users start them.
+
+``python -m support.together`` is a program that each of them runs.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+TESTS = Path(__file__).resolve().parent.parent
+REPOSITORY = TESTS.parent
+TIMEOUT = 240
+"""Seconds."""
+
+
+def mpiexec() -> str:
+    """The launcher; skips the test where it, or what talks to it, is not installed."""
+    pytest.importorskip("mpi4py", reason="the extra mpi is not installed")
+    beside = Path(sys.executable).parent / "mpiexec"
+    found = str(beside) if beside.exists() else shutil.which("mpiexec")
+    if found is None:
+        pytest.skip("there is no mpiexec")
+    return found
+
+
+def environment() -> dict[str, str]:
+    """For processes that find ``support`` and this checkout, and were not started by others."""
+    kept = {k: v for k, v in os.environ.items() if not k.startswith(("PMI", "PYTEST"))}
+    return {**kept, "PYTHONPATH": f"{TESTS}{os.pathsep}{REPOSITORY}"}
+
+
+def start(size: int, words: Sequence[str], cwd: Path = REPOSITORY) -> subprocess.Popen:
+    """Begin to run ``python WORDS`` on so many processes."""
+    return subprocess.Popen(
+        [mpiexec(), "-n", str(size), sys.executable, *map(str, words)],
+        cwd=cwd,
+        env=environment(),
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+def run(size: int, words: Sequence[str], cwd: Path = REPOSITORY) -> tuple[int, str, str]:
+    """Status, output and errors of ``python WORDS`` on so many processes."""
+    process = start(size, words, cwd)
+    output, errors = process.communicate(timeout=TIMEOUT)
+    return process.returncode, output, errors
+
+
+def ranks_of(word: str) -> list[int]:
+    """The running processes of MPI whose command line has this word (Linux)."""
+    found = []
+    for folder in Path("/proc").iterdir():
+        try:
+            words = (folder / "cmdline").read_bytes().split(b"\0")
+            variables = (folder / "environ").read_bytes()
+        except OSError:  # no process, or one that is gone
+            continue
+        if word.encode() in words and b"PMI_RANK=" in variables:
+            found.append(int(folder.name))
+    return found
+
+
+def fitted(size: int, steps: int, changes: Mapping[str, Any], alpha: bool = False) -> list:
+    """What :func:`found_by` gives of a small fit on so many processes."""
+    task = json.dumps({"steps": steps, "changes": dict(changes), "alpha": alpha})
+    status, output, errors = run(size, ["-m", "support.together", task])
+    assert status == 0, errors
+    return json.loads(output)
+
+
+def said_of(size: int, row: int) -> str:
+    """What :func:`spoiled` gives on so many processes."""
+    task = json.dumps({"spoiled": row, "changes": {"optimizer.views_per_step": 4}, "alpha": False})
+    status, output, errors = run(size, ["-m", "support.together", task])
+    assert status == 0, errors
+    return json.loads(output)
+
+
+def found_by(trainer: Any, steps: int) -> list:
+    """After some steps: hashes of the state by name, and what each step has reported."""
+    reports = [trainer.step() for _ in range(steps)]
+    state = trainer.state()
+    hashes = {name: hashlib.sha256(v.tobytes()).hexdigest()[:12] for name, v in state.items()}
+    shown = [[r.iteration, r.loss, r.psnr, r.num_gaussians, r.means_lr] for r in reports]
+    return [hashes, shown]
+
+
+def main() -> None:
+    """A process's part of :func:`fitted`."""
+    import drjit as dr
+    import mitsuba as mi
+
+    mi.set_variant("llvm_ad_rgb")
+    dr.set_thread_count(1)
+    from drgs.distributed.ranks import Ranks
+    from drgs.distributed.trainer import DistributedTrainer
+    from support import small_fits as fits
+
+    task = json.loads(sys.argv[1])
+    dataset = fits.true_dataset() if task["alpha"] else fits.plain_dataset()
+    ranks = Ranks.world()
+    config = fits.config_of(**task["changes"])
+    trainer = DistributedTrainer(config, dataset, fits.disturbed_blobs(), ranks)
+    if "spoiled" in task:
+        found = spoiled(trainer, task["spoiled"])
+    else:
+        found = found_by(trainer, task["steps"])
+    if ranks.is_first:
+        print(json.dumps(found))
+
+
+def spoiled(trainer: Any, row: int) -> str:
+    """What a trainer says, everywhere, where a row has an opacity that is no number."""
+    import drjit as dr
+    import numpy as np
+
+    from drgs.training.finite_checks import NonFiniteError
+
+    logits = trainer.population.value("logit_opacities")
+    here = row - trainer.first_row
+    changed = dr.select(
+        dr.arange(dr.uint32_array_t(type(logits)), len(logits)) == here, dr.nan, logits
+    )
+    trainer.population.set_values("logit_opacities", changed)
+    try:
+        trainer.check()
+    except NonFiniteError as error:
+        said = str(error)
+    if hasattr(trainer, "ranks"):
+        same = trainer.ranks.told(np.array([hash_of(said)]))
+        assert (same == same[0]).all()
+    return said
+
+
+def hash_of(text: str) -> int:
+    """The same in all processes."""
+    return int(hashlib.sha256(text.encode()).hexdigest()[:12], 16)
+
+
+if __name__ == "__main__":
+    main()
