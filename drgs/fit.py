@@ -252,15 +252,15 @@ MakeTrainer = Callable[[FitConfig, Dataset, Gaussians], Trainer]
 def run(args: argparse.Namespace) -> None:
     """Fit what the command line names; end the process with status 130 if Ctrl-C stopped it."""
     if process_number() is None:
-        fit(args, Trainer)
+        run_with(args, Trainer)
         return
     required("mpi4py", "mpi", "mpiexec")
     from drgs.distributed.fitting import run_together
 
-    run_together(args, partial(fit, args))
+    run_together(args, partial(run_with, args))
 
 
-def fit(args: argparse.Namespace, make_trainer: MakeTrainer) -> None:
+def run_with(args: argparse.Namespace, make_trainer: MakeTrainer) -> None:
     """The command, on the process that reads, decides, writes and prints."""
     started = time.perf_counter() - LOADING_SECONDS
     with executing(args.threads, args.debug) as check_ranges, ExitStack() as blocks:

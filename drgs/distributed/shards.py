@@ -98,14 +98,14 @@ class SpreadPopulation(Population):
     def edit(self, keep: Any, append: Mapping[str, Any] | None = None) -> None:
         """Keep some of all rows in the order given and append others: see ``Population.edit``."""
         before, kept = replace(self.shard), np.array(keep)
-        added = np.empty((0, 0))
+        appended = np.empty((0, 0))
         if append is not None:
-            added = self._packed(append, append["means"].shape[0])
-        after = Shard(len(kept) + len(added), before.rank, before.size)
+            appended = self._packed(append, append["means"].shape[0])
+        after = Shard(len(kept) + len(appended), before.rank, before.size)
         if after.total < after.size:
             raise ValueError(f"SpreadPopulation.edit(): {after.total} rows for {after.size} ranks")
         moved = self._moved(before, after, kept)
-        own = added[max(after.own.start - len(kept), 0) : max(after.own.stop - len(kept), 0)]
+        own = appended[max(after.own.start - len(kept), 0) : max(after.own.stop - len(kept), 0)]
         self._replace(moved, own)
         self.shard.total = after.total
 
@@ -134,7 +134,7 @@ class SpreadPopulation(Population):
                 arrays.append(np.array(flat).reshape(self.num_own, self._width(key)))
         return [np.concatenate(arrays, axis=1) for arrays in found]
 
-    def _replace(self, kept: np.ndarray, added: np.ndarray) -> None:
+    def _replace(self, kept: np.ndarray, appended: np.ndarray) -> None:
         """Give the optimizer other rows: kept ones with their moments, then new ones."""
         optimizer, start = self.optimizer, 0
         optimizer.forget_moments()
@@ -146,9 +146,9 @@ class SpreadPopulation(Population):
 
             def rows_of(which: int, begin: int = start, width: int = width) -> np.ndarray:
                 at = columns * which + begin
-                new = np.zeros((len(added), width), kept.dtype)
-                if which == 0 and len(added):
-                    new = added[:, begin : begin + width]
+                new = np.zeros((len(appended), width), kept.dtype)
+                if which == 0 and len(appended):
+                    new = appended[:, begin : begin + width]
                 return np.concatenate([kept[:, at : at + width], new])
 
             flat_type, rows = type(first), rows_of(0)

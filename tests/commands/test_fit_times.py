@@ -28,7 +28,7 @@ from drgs.training.viewers import TIME_SHARE
 @pytest.fixture
 def planned(monkeypatch):
     """When iterations end, and for which configuration, by a clock that says 0."""
-    rehearsal = SimpleNamespace(trainer=SimpleNamespace(scene=None), iteration_s=0.1)
+    rehearsal = SimpleNamespace(trainer=SimpleNamespace(scene_of_all=lambda: None), iteration_s=0.1)
     monkeypatch.setattr(fit, "rehearse", lambda *_: rehearsal)
     monkeypatch.setattr(fit, "seconds_of_results", lambda *_: Seconds(6.0, renders=1.0, report=1.0))
     monkeypatch.setattr(fit, "seconds_of_curves", lambda: 2.0)

@@ -51,9 +51,10 @@ def with_value(vector, row, value):
 
 def poison_gradient(monkeypatch, trainer, name, iteration, value=np.nan, row=ROW):
     """One component of one row's gradient is ``value`` in that iteration."""
-    real = rendering._as_tensors
+    real = rendering._back_to_rows
 
-    def poisoned(d_rows, gaussians, visible):
+    def poisoned(*arguments):
+        d_rows, visible, numbers = real(*arguments)
         if trainer.iteration == iteration:
             assert visible[row]
             if name in ("sh0", "shN"):
@@ -62,9 +63,9 @@ def poison_gradient(monkeypatch, trainer, name, iteration, value=np.nan, row=ROW
                 d_rows = replace(d_rows, sh=sh)
             else:
                 d_rows = replace(d_rows, **{name: with_value(getattr(d_rows, name), row, value)})
-        return real(d_rows, gaussians, visible)
+        return d_rows, visible, numbers
 
-    monkeypatch.setattr(rendering, "_as_tensors", poisoned)
+    monkeypatch.setattr(rendering, "_back_to_rows", poisoned)
 
 
 def poison_value(trainer, name, value=np.nan, row=ROW):
@@ -288,7 +289,7 @@ def test_bytes_of_a_good_fit_are_those_without_guards(monkeypatch):
         return [getattr(trainer.gaussians(), name).tobytes() for name in PARAMETER_NAMES]
 
     guarded = result()
-    monkeypatch.setattr(rendering, "_faults", lambda d_rows: mi.UInt32(0))
+    monkeypatch.setattr(rendering, "_faults", lambda d_rows, visible: mi.UInt32(0))
     monkeypatch.setattr(GradientWatch, "add", lambda *arguments: None)
     assert result() == guarded
 
