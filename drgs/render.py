@@ -20,8 +20,9 @@ import argparse
 import json
 import math
 import os
-from collections.abc import Collection, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Collection, Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Protocol, runtime_checkable
 
@@ -43,7 +44,9 @@ from drgs.config.load import load_config
 from drgs.config.schema import NAMED_COLORS, FitConfig, ModelConfig
 from drgs.core.constants import SHUTTER_SAMPLES
 from drgs.core.errors import PluginError, UserError, one_line, reason_of_mitsuba
+from drgs.core.extras import required
 from drgs.core.files import atomic_path, open_regular, shortened
+from drgs.core.processes import process_number
 from drgs.data import Dataset, load_dataset
 from drgs.data.derived import completed
 from drgs.data.orbits import orbit_of_gaussians, orbit_of_views, orbit_size
@@ -86,6 +89,10 @@ UP = (0.0, 0.0, 1.0)
 """World: the convention of both dataset layouts."""
 
 
+Render = Callable[..., Iterator[np.ndarray]]
+"""Of a scene and views, pictures (H, W, 3): ``render_views``, or with the help of others."""
+
+
 @dataclass(frozen=True, eq=False)
 class Model:
     """Gaussians, and how they are to be rendered."""
@@ -97,6 +104,7 @@ class Model:
     ignored: str = ""  # effects that are not to be simulated: see the plugin
     folder: Path | None = None  # where they are, perhaps with refined cameras beside them
     said: Collection[str] = ()  # names of the settings that their file has decided
+    render: Render = render_views
 
     def scene(self) -> mi.Scene:
         """A Mitsuba scene that renders in display space."""
@@ -117,7 +125,7 @@ class Model:
         scene = self.scene()
         print(described(summary_of_views(scene.integrator(), views, self.said)), flush=True)
         names = [*(f"{view.name}.png" for view in views), *others]
-        return claiming(out, names, render_views(scene, views))
+        return claiming(out, names, self.render(scene, views))
 
     def dataset(self, option: str) -> Dataset:
         """The photographs, without which ``option`` is impossible."""
@@ -245,13 +253,24 @@ def _add_settings(parser: CommandParser) -> None:
 
 def run(args: argparse.Namespace) -> None:
     """Render what the command line names."""
+    if process_number() is None:
+        run_with(args, render_views)
+        return
+    required("mpi4py", "mpi", "mpiexec")
+    from drgs.distributed.pictures import run_together
+
+    run_together(args, partial(run_with, args))
+
+
+def run_with(args: argparse.Namespace, render: Render) -> None:
+    """The command; render: renders views, here or elsewhere."""
     with executing(args.threads, args.debug), sealing(args.out):
         _check(args)
         select_variant(args.variant)
         if args.what.suffix.lower() == ".xml":
             render_mitsuba_scene(args.what, args.out, dict(args.define or ()))
         else:
-            model = load_model(args)
+            model = replace(load_model(args), render=render)
             if model.config is not None:
                 refuse_photographs(args.out, model.config.data.path)
             if args.orbit is not None:

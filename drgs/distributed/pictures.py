@@ -1,0 +1,101 @@
+"""``mpiexec -n K drgs render``: processes share the pictures; the first one writes them.
+
+Every process reads what the command line names and finds the same cameras. The pictures go round:
+the first process renders the first one, the second the second, and so on.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import sys
+import traceback
+from collections.abc import Callable, Iterator, Sequence
+
+import mitsuba as mi
+import numpy as np
+
+from drgs.core.errors import UserError
+from drgs.data.types import Viewpoint
+from drgs.distributed.ranks import Ranks, wait
+from drgs.integrator.scene import render_views
+
+GO, END = "go", "end"
+"""What the first process says: that it waits for pictures; that this is all."""
+
+Render = Callable[..., Iterator[np.ndarray]]
+"""Of a scene and views, pictures (H, W, 3)."""
+
+
+def run_together(args: argparse.Namespace, work: Callable[[Render], None]) -> None:
+    """Run the command on all processes; work: the command, given what renders views."""
+    ranks = Ranks.world()
+    if args.threads is None:
+        args.threads = max(1, len(os.sched_getaffinity(0)) // ranks.on_this_machine)
+    if ranks.is_first:
+        _lead(ranks, work)
+    else:
+        _follow(ranks, work)
+
+
+def _lead(ranks: Ranks, work: Callable[[Render], None]) -> None:
+    status = 1
+    try:
+        work(lambda scene, views: _gathered(ranks, scene, views))
+        status = 0
+    except UserError:
+        status = 2
+        raise
+    finally:
+        if ranks.is_broken:
+            print(f"error: {sys.exc_info()[1]}", file=sys.stderr, flush=True)
+            ranks.comm.Abort(status)
+        ranks.text_of(0, json.dumps([END, status]))
+
+
+def _gathered(ranks: Ranks, scene: mi.Scene, views: Sequence[Viewpoint]) -> Iterator[np.ndarray]:
+    """All pictures in order, of which this process renders its own."""
+    ranks.text_of(0, json.dumps([GO]))
+    ranks.is_broken = True  # if it ends here, the others wait for somebody to take their pictures
+    own = render_views(scene, views[:: ranks.size])
+    for index, view in enumerate(views):
+        source = index % ranks.size
+        if source == 0:
+            yield next(own)
+            continue
+        picture = np.empty((view.height, view.width, 3), np.float32)
+        wait(ranks.receive(picture, source, 0))
+        yield picture
+    ranks.is_broken = False
+
+
+def _follow(ranks: Ranks, work: Callable[[Render], None]) -> None:
+    """Render what falls to this process, and end with the status of the first one."""
+
+    def render(scene: mi.Scene, views: Sequence[Viewpoint]) -> Iterator[np.ndarray]:
+        _end_if_told(ranks)
+        own = views[ranks.rank :: ranks.size]
+        for picture in render_views(scene, own):
+            wait(ranks.send(np.ascontiguousarray(picture, np.float32), 0, 0))
+        _end_if_told(ranks)
+        raise RuntimeError("the first process goes on with pictures that nobody has asked for")
+
+    try:
+        work(render)
+        _end_if_told(ranks)  # it had nothing to share
+    except SystemExit:
+        raise
+    except BaseException as error:
+        if isinstance(error, UserError):
+            _end_if_told(ranks)  # the first process has found the same
+        text = "".join(traceback.format_exception(error))
+        print(f"process {ranks.rank}: {text}", file=sys.__stderr__, flush=True)
+        ranks.comm.Abort(1)
+
+
+def _end_if_told(ranks: Ranks) -> None:
+    """Hear what the first process says; end where that is the end."""
+    said, *status = json.loads(ranks.text_of(0, ""))
+    if said == END:
+        sys.exit(status[0])
