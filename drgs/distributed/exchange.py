@@ -17,6 +17,7 @@ from typing import Any
 
 import drjit as dr
 import numpy as np
+from mpi4py import MPI
 
 from drgs.cameras.camera import Camera
 from drgs.core.arrays import Rows, block_widths, empty_on_host, types_of, wrapped
@@ -72,8 +73,14 @@ class Sight:
     float_type: type
     num_rows: int  # of this process
     rows: Any  # UInt32 (M,): those on the film, ascending
-    blocks: Blocks  # of these
     count: int  # M
+    _blocks: Blocks  # of these rows
+
+    def taken_blocks(self) -> Blocks:
+        """The rows as they travel, which are not kept here."""
+        blocks = self._blocks[:]
+        self._blocks.clear()
+        return blocks
 
     @staticmethod
     def of(gaussians: Gaussians, camera: Camera, pipeline: Pipeline) -> Sight:
@@ -90,7 +97,7 @@ class Sight:
             dr.eval(boxes, stored, depths)
             flat = [*boxes.blocks, *stored.blocks, depths]
             blocks = [each.numpy().reshape(count, -1) for each in flat]
-        return Sight(camera, pipeline, layout, t.Float, num_rows, rows, blocks, count)
+        return Sight(camera, pipeline, layout, t.Float, num_rows, rows, count, blocks)
 
     def of_rows(self, blocks: Blocks, width: int) -> list[Any]:
         """Columns of all rows of this process, of numbers of those on the film; else 0."""
@@ -134,8 +141,7 @@ class Post:
 
     def __init__(self, ranks: Ranks) -> None:
         self.ranks = ranks
-        self._sending: list[Any] = []
-        self._sent: list[Blocks] = []  # as long as they are on their way
+        self._sending: list[tuple[list[MPI.Request], Blocks]] = []  # and what is on its way
         self._staying: dict[tuple[int, int], deque[Blocks]] = {}  # from this process to itself
 
     def send(self, blocks: Blocks, to: int, place: int, time: int) -> None:
@@ -143,9 +149,8 @@ class Post:
         if to == self.ranks.rank:
             self._staying.setdefault((place, time), deque()).append(blocks)
             return
-        self._sent.append(blocks)
-        for block in blocks:
-            self._sending.append(self.ranks.send(block, to, place * MOST_TIMES + time))
+        tag = place * MOST_TIMES + time
+        self._sending.append(([self.ranks.send(block, to, tag) for block in blocks], blocks))
 
     def receive(self, into: Blocks, of: int, place: int, time: int) -> None:
         """Wait for the next rows that a process sends."""
@@ -158,12 +163,16 @@ class Post:
         with self.ranks.exchanging():
             wait(*(self.ranks.receive(block, of, tag) for block in into))
 
+    def forget_received(self) -> None:
+        """Free what has arrived."""
+        arrived = [MPI.Request.Testall(requests) for requests, _ in self._sending]
+        self._sending = [s for s, done in zip(self._sending, arrived, strict=True) if not done]
+
     def finish(self) -> None:
         """Wait until all has been sent."""
         with self.ranks.exchanging():
-            wait(*self._sending)
+            wait(*(request for requests, _ in self._sending for request in requests))
         self._sending.clear()
-        self._sent.clear()
 
 
 @dataclass(eq=False)

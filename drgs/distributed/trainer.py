@@ -109,13 +109,14 @@ class DistributedTrainer(Trainer):
         counts = self.ranks.told(np.array([[sight.count for sight in each] for each in sights]))
         for place, iteration in enumerate(iterations):
             for time, sight in enumerate(sights[place]):
-                self.post.send(sight.blocks, self.renderer_of(iteration), place, time)
+                self.post.send(sight.taken_blocks(), self.renderer_of(iteration), place, time)
         found, pictures = np.zeros((len(iterations), 3)), {}
         for iteration in self._own(iterations):
             place = iterations.index(iteration)
             self.iteration = iteration
             found[place], pictures[place] = self._render(place, sights[place], counts[:, place])
         found = self.ranks.told(found).sum(axis=0)  # of a view, those of all but one are 0
+        self.post.forget_received()
         penalties = self._go_back_penalties(len(iterations))
         losses = self._regularised_losses(iterations, found[:, 0]) if penalties else found[:, 0]
         self._add_gradients(sights, counts, pictures, losses)
