@@ -48,7 +48,7 @@ def test_what_a_measurement_would_write_is_refused_before_it_begins(name, tmp_pa
     folder = tmp_path / name if name in of_their_own else tmp_path
     folder.mkdir(exist_ok=True)
     (folder / f"{name}.csv").write_text("mine")
-    what = [str(tmp_path)] if name == "photographs" else []
+    what = [str(tmp_path)] if name in ("photographs", "processes") else []
     args = parser.parse_args(["--out", str(tmp_path), *what])
     with pytest.raises(UserError, match=rf"holds .*{name}\.csv"):
         args.run(args)
