@@ -15,7 +15,7 @@ from drgs.config.load import config_from
 from drgs.config.schema import DataConfig
 from drgs.core.errors import UserError
 from drgs.data.initial import initial_gaussians
-from drgs.data.types import Dataset, View, Viewpoint
+from drgs.data.types import Dataset, Keeps, View, Viewpoint, all_of_them
 
 __all__ = ["Dataset", "View", "Viewpoint", "initial_gaussians", "load_dataset"]
 
@@ -23,8 +23,8 @@ __all__ = ["Dataset", "View", "Viewpoint", "initial_gaussians", "load_dataset"]
 class Layout(Protocol):
     """What reads folders of a kind."""
 
-    def load(self, config: DataConfig) -> Dataset:
-        """All views."""
+    def load(self, config: DataConfig, keeps: Keeps = all_of_them) -> Dataset:
+        """All views, some of them perhaps without their pictures."""
 
     def picture_files(self, config: DataConfig) -> Sequence[Path]:
         """The files of those to train on, or of all."""
@@ -39,11 +39,14 @@ def layout_of(config: DataConfig) -> Layout:
     return import_module(f"drgs.data.{layout_name(config)}")
 
 
-def load_dataset(source: str | Path | DataConfig, **settings: object) -> Dataset:
+def load_dataset(
+    source: str | Path | DataConfig, keeps: Keeps = all_of_them, **settings: object
+) -> Dataset:
     """All views of a dataset: photographs with their cameras, to train on and to measure on.
 
     source: the folder, in the layout of NeRF-synthetic, of nerfstudio / instant-ngp or of COLMAP,
-    or the section ``data`` of a configuration; settings: other values of that section, such as
+    or the section ``data`` of a configuration; keeps: of which views pictures are kept, by name;
+    settings: other values of that section, such as
     ``image_size=400`` (px) or ``background="black"``.
 
     Raises :class:`UserError` naming the file, the key, what was expected and what was got; where
@@ -52,7 +55,7 @@ def load_dataset(source: str | Path | DataConfig, **settings: object) -> Dataset
     if settings or not isinstance(source, DataConfig):
         given = source.model_dump() if isinstance(source, DataConfig) else {"path": source}
         source = config_from({"data": {**given, **settings}}, "load_dataset()").data
-    return layout_of(source).load(source)
+    return layout_of(source).load(source, keeps)
 
 
 def layout_name(config: DataConfig) -> str:

@@ -20,7 +20,7 @@ from drgs.data.images import is_scaled
 from drgs.data.photographs import MAX_WIDTH, Photographs, check_splits, dataset_of
 from drgs.data.recognition import COLMAP_FOLDERS
 from drgs.data.transforms import Frame, FrameValues
-from drgs.data.types import Dataset
+from drgs.data.types import Dataset, Keeps, all_of_them
 from drgs.io.colmap import ColmapCamera, ColmapImage, ColmapModel, model_files, read_model
 from drgs.io.pictures import MAX_SIDE, image_orientation, image_size
 
@@ -88,7 +88,7 @@ def picture_files(config: DataConfig) -> list[Path]:
     return [_file_of(pictures, image, folder) for image in model.images]
 
 
-def load(config: DataConfig) -> Dataset:
+def load(config: DataConfig, keeps: Keeps = all_of_them) -> Dataset:
     """Read all views: see :func:`drgs.data.photographs.dataset_of`."""
     folder = model_folder(config.path)
     model = read_model(folder)
@@ -106,7 +106,8 @@ def load(config: DataConfig) -> Dataset:
             note += "; points of the model ignored"
         else:
             cloud = model.points_file
-    return dataset_of(config, Photographs("COLMAP", folder, frames, files, cloud, note))
+    photographs = Photographs("COLMAP", folder, frames, files, cloud, note)
+    return dataset_of(config, photographs, keeps)
 
 
 def picture_folder(config: DataConfig, model: ColmapModel) -> Path:

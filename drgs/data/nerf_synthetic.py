@@ -27,7 +27,7 @@ from drgs.data.transforms import (
     read_frames,
     unique_names,
 )
-from drgs.data.types import Dataset, View
+from drgs.data.types import Dataset, Keeps, View, all_of_them
 from drgs.io.pictures import image_size, read_pixels
 
 START_HALF_EXTENT = 1.3
@@ -35,7 +35,7 @@ START_HALF_EXTENT = 1.3
 (``readNerfSyntheticInfo``)."""
 
 
-def load(config: DataConfig) -> Dataset:
+def load(config: DataConfig, keeps: Keeps = all_of_them) -> Dataset:
     """Read split ``train`` and the split to measure on.
 
     That is ``config.test_split``, by default ``test`` if its transforms file is there, else
@@ -45,7 +45,9 @@ def load(config: DataConfig) -> Dataset:
         config = config.model_copy(update={"background": "white"})
     test_split = _test_split(config)
     frames = {s: read_frames(_transforms_path(config.path, s)) for s in ("train", test_split)}
-    train, test = (_load_split(config, split, frames[split]) for split in ("train", test_split))
+    train, test = (
+        _load_split(config, split, frames[split], keeps) for split in ("train", test_split)
+    )
     all_frames = [frame for of_split in frames.values() for frame in of_split]
     width, height = train[0].width, train[0].height
     return Dataset(
@@ -86,7 +88,9 @@ def _transforms_path(folder: Path, split: str) -> Path:
     return folder / f"transforms_{split}.json"
 
 
-def _load_split(config: DataConfig, split: str, frames: list[Frame]) -> tuple[View, ...]:
+def _load_split(
+    config: DataConfig, split: str, frames: list[Frame], keeps: Keeps
+) -> tuple[View, ...]:
     files = [image_path(config.path, frame) for frame in frames]
     size = image_size(files[0])
     check_room(files, config.image_size)
@@ -99,7 +103,7 @@ def _load_split(config: DataConfig, split: str, frames: list[Frame]) -> tuple[Vi
         height, width = image.shape[:2]
         # The angle spans the full width, so the focal length in pixels follows the image's size.
         focal = focal_from_angle(_angle(frame), width)
-        return View(
+        view = View(
             name=name,
             image=image,
             camera_to_world=frame.own.transform_matrix,
@@ -113,6 +117,7 @@ def _load_split(config: DataConfig, split: str, frames: list[Frame]) -> tuple[Vi
             files=files_of(config, frame, files[index]),
             **extras_of(config, frame, size),
         )
+        return view if keeps(name) else view.without_pictures()
 
     names = unique_names([frame.own.file_path for frame in frames])
     return in_parallel(load_view, range(len(frames)), names, threads=threads_for(files))

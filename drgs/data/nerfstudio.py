@@ -15,10 +15,10 @@ from pathlib import Path
 from drgs.config.schema import DataConfig
 from drgs.data.photographs import Photographs, check_splits, dataset_of
 from drgs.data.transforms import image_path, point_cloud_note, point_cloud_path, read_frames
-from drgs.data.types import Dataset
+from drgs.data.types import Dataset, Keeps, all_of_them
 
 
-def load(config: DataConfig) -> Dataset:
+def load(config: DataConfig, keeps: Keeps = all_of_them) -> Dataset:
     """Read all views: see :func:`drgs.data.photographs.dataset_of`."""
     path = config.path / "transforms.json"
     frames = read_frames(path)
@@ -31,7 +31,7 @@ def load(config: DataConfig) -> Dataset:
         point_cloud=point_cloud_path(config, frames),
         note=point_cloud_note(config, frames),
     )
-    return dataset_of(config, photographs)
+    return dataset_of(config, photographs, keeps)
 
 
 def picture_files(config: DataConfig) -> list[Path]:

@@ -23,7 +23,7 @@ from drgs.data.transforms import (
     principal_point,
     unique_names,
 )
-from drgs.data.types import Dataset, View
+from drgs.data.types import Dataset, Keeps, View, all_of_them
 from drgs.io.pictures import has_alpha, read_pixels
 
 MAX_WIDTH = 1600
@@ -55,14 +55,15 @@ def check_splits(config: DataConfig, source: Path, num_views: int) -> None:
         )
 
 
-def dataset_of(config: DataConfig, photographs: Photographs) -> Dataset:
+def dataset_of(config: DataConfig, photographs: Photographs, keeps: Keeps = all_of_them) -> Dataset:
     """All views; those at indices 0, n, 2n, ... of the sorted names are the test split."""
     frames, files = photographs.frames, photographs.files
     config = _completed(config, files)
     check_room(files, config.image_size)
 
     def load_view(index: int, name: str) -> View:
-        return _load_view(config, frames[index], files[index], name)
+        view = _load_view(config, frames[index], files[index], name)
+        return view if keeps(name) else view.without_pictures()
 
     order = sorted(range(len(frames)), key=lambda index: frames[index].own.file_path)
     names = unique_names([frames[index].own.file_path for index in order])

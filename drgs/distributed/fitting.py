@@ -8,13 +8,10 @@ import sys
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
-import numpy as np
-
 from drgs.cli.execution import executing, select_variant
 from drgs.config.schema import FitConfig
 from drgs.core.errors import UserError
-from drgs.data import Dataset, View, load_dataset
-from drgs.data.kept import KeptPicture, Pixels
+from drgs.data import Dataset, load_dataset
 from drgs.distributed.ranks import Ranks
 from drgs.distributed.together import follow, lead
 from drgs.training.trainer import Trainer
@@ -52,31 +49,15 @@ def own_photographs(config: FitConfig, names: Sequence[str], ranks: Ranks) -> Da
 
     Of the others, and of those to measure on, there are sizes and cameras.
     """
-    dataset = load_dataset(config.data_for_training)
+    own = own_views(len(names), config.optimizer.views_per_step, ranks.rank, ranks.size)
+    rendered = {names[index] for index in own}
+    dataset = load_dataset(config.data_for_training, keeps=rendered.__contains__)
     by_name = {view.name: view for view in dataset.train}
-    views = [by_name[name] for name in names]
-    own = own_views(len(views), config.optimizer.views_per_step, ranks.rank, ranks.size)
-    train = (v if index in own else without_pictures(v) for index, v in enumerate(views))
-    return replace(dataset, train=tuple(train), test=tuple(map(without_pictures, dataset.test)))
+    test = tuple(view.without_pictures() for view in dataset.test)
+    return replace(dataset, train=tuple(by_name[name] for name in names), test=test)
 
 
 def own_views(count: int, views_per_step: int, rank: int, size: int) -> set[int]:
     """Which of ``count`` training views a process renders: see ``drgs.training.stages.view_of``."""
     places = (p for p in range(views_per_step) if p * size // views_per_step == rank)
     return {view for p in places for view in range(p % count, count, views_per_step)}
-
-
-def without_pictures(view: View) -> View:
-    """A view whose pictures have sizes alone."""
-
-    def elsewhere(picture: Pixels | None) -> KeptPicture | None:
-        if picture is None:
-            return None
-        return KeptPicture(picture.shape, lambda: _refuse(view.name), nbytes=0)
-
-    names = ("image", "alpha", "mask", "depth")
-    return replace(view, **{name: elsewhere(getattr(view, name)) for name in names})
-
-
-def _refuse(name: str) -> np.ndarray:
-    raise RuntimeError(f"the pictures of view {name} are with another process")

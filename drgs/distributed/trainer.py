@@ -106,7 +106,7 @@ class DistributedTrainer(Trainer):
     def _differentiate(self, iterations: range) -> list[SeenView]:
         """See :meth:`Trainer._differentiate`."""
         sights = [self._sights(iteration) for iteration in iterations]
-        counts = self.ranks.told(np.array([[sight.count for sight in each] for each in sights]))
+        counts = self._counts(sights)
         for place, iteration in enumerate(iterations):
             for time, sight in enumerate(sights[place]):
                 self.post.send(sight.taken_blocks(), self.renderer_of(iteration), place, time)
@@ -114,7 +114,7 @@ class DistributedTrainer(Trainer):
         for iteration in self._own(iterations):
             place = iterations.index(iteration)
             self.iteration = iteration
-            found[place], pictures[place] = self._render(place, sights[place], counts[:, place])
+            found[place], pictures[place] = self._render(place, sights[place], counts[place])
         found = self.ranks.told(found).sum(axis=0)  # of a view, those of all but one are 0
         self.post.forget_received()
         penalties = self._go_back_penalties(len(iterations))
@@ -123,6 +123,12 @@ class DistributedTrainer(Trainer):
         self.post.finish()
         numbers = zip(losses, found[:, 1], found[:, 2], strict=True)
         return [SeenView([loss], [error], counted) for loss, error, counted in numbers]
+
+    def _counts(self, sights: Sequence[Sequence[Sight]]) -> list[np.ndarray]:
+        """Of each view, how many splats each process sends at each time: (K, times)."""
+        own = np.array([sight.count for of_view in sights for sight in of_view])
+        ends = np.cumsum([len(of_view) for of_view in sights])
+        return np.split(self.ranks.told(own), ends[:-1], axis=1)
 
     def _regularised_losses(self, iterations: range, losses: np.ndarray) -> np.ndarray:
         """Losses with the terms of the strategy of density, where they are written down.
@@ -218,13 +224,13 @@ class DistributedTrainer(Trainer):
     def _add_gradients(
         self,
         sights: Sequence[Sequence[Sight]],
-        counts: np.ndarray,
+        counts: Sequence[np.ndarray],
         pictures: Mapping[int, Picture],
         losses: np.ndarray,
     ) -> None:
         """Of the rows of this process, from what has come back of all views, in their order.
 
-        counts: splats by process, view and time.
+        counts: splats of each view, by process and time.
         """
         iterations = self.iterations_of_step
         for first in range(0, len(iterations), VIEWS_AT_ONCE):
@@ -240,7 +246,7 @@ class DistributedTrainer(Trainer):
                 self.iteration = view.iteration
                 if self.density.gathers(view.iteration):
                     means2d = reduce(operator.add, (each.gradients.means2d for each in view.seen))
-                    own = counts[:, place], means2d, pictures.get(place)
+                    own = counts[place], means2d, pictures.get(place)
                     self.density.gather(SharedStep(self, place, sights[place], *own))
 
     def _watch(self, iteration: int, loss: Any, first_fault: Any) -> None:
@@ -254,13 +260,14 @@ class DistributedTrainer(Trainer):
     # ------------------------------------------------------------------------------------------
 
     def gaussians(self) -> Gaussians:
-        """All Gaussians as numpy arrays, on all processes."""
+        """All Gaussians as numpy arrays, on the first process; on others, their own."""
         own = super().gaussians()
-        rows = {name: self.ranks.rows_of_all(getattr(own, name)) for name in PARAMETER_NAMES}
-        smoothing = own.smoothing
-        if smoothing is not None:
-            smoothing = self.ranks.rows_of_all(smoothing)
-        return Gaussians(**rows, smoothing=smoothing)
+        columns = {name: getattr(own, name) for name in (*PARAMETER_NAMES, "smoothing")}
+        found = {}
+        for name, rows in columns.items():
+            of_all = None if rows is None else self.ranks.rows_on_first(rows)
+            found[name] = rows if of_all is None else of_all
+        return Gaussians(**found)
 
     @property
     def first_row(self) -> int:

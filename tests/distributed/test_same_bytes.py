@@ -16,12 +16,12 @@ def settings(views_per_step=4, **changes):
     return values | {key.replace("__", "."): value for key, value in changes.items()}
 
 
-def assert_the_same(changes, sizes, steps=8, alpha=False):
-    dataset = fits.true_dataset() if alpha else fits.plain_dataset()
+def assert_the_same(changes, sizes, steps=8, data="plain"):
+    dataset = together.DATASETS[data]()
     alone = fits.Trainer(fits.config_of(**changes), dataset, fits.disturbed_blobs())
     expected = together.found_by(alone, steps)
     for size in sizes:
-        state, reports = together.fitted(size, steps, changes, alpha)
+        state, reports = together.fitted(size, steps, changes, data)
         assert reports == expected[1], size
         assert state == expected[0], size
 
@@ -87,7 +87,7 @@ def test_six_views_a_step():
 
 @pytest.mark.slow
 def test_effects_of_the_views():
-    assert_the_same(settings(**EFFECTS), [1, 2, 3], alpha=True)
+    assert_the_same(settings(**EFFECTS), [1, 2, 3], data="transparent")
 
 
 @pytest.mark.slow
@@ -101,3 +101,9 @@ def test_all_processes_say_which_number_is_none():
     expected = together.spoiled(alone, 17)
     assert "in row 17" in expected
     assert together.said_of(3, 17) == expected
+
+
+@pytest.mark.slow
+def test_cameras_of_which_some_move():
+    """A view that is blurred is projected at several times, and others once."""
+    assert_the_same(settings(), [2, 3], steps=3, data="blurred")

@@ -72,9 +72,40 @@ def ranks_of(word: str) -> list[int]:
     return found
 
 
-def fitted(size: int, steps: int, changes: Mapping[str, Any], alpha: bool = False) -> list:
-    """What :func:`found_by` gives of a small fit on so many processes."""
-    task = json.dumps({"steps": steps, "changes": dict(changes), "alpha": alpha})
+def _blurred() -> Any:
+    """Photographs of which every other one was taken by a camera that moved."""
+    from dataclasses import replace
+
+    from drgs.data.types import Motion
+    from support import small_fits as fits
+
+    dataset = fits.plain_dataset()
+    views = list(dataset.train)
+    for index in range(0, len(views), 2):
+        closed = views[index].camera_to_world.copy()
+        closed[:3, 3] += 0.05
+        views[index] = replace(views[index], motion=Motion(closed, "global", samples=3))
+    return replace(dataset, train=tuple(views))
+
+
+def _plain() -> Any:
+    from support import small_fits as fits
+
+    return fits.plain_dataset()
+
+
+def _transparent() -> Any:
+    from support import small_fits as fits
+
+    return fits.true_dataset()
+
+
+DATASETS = {"plain": _plain, "transparent": _transparent, "blurred": _blurred}
+
+
+def fitted(size: int, steps: int, changes: Mapping[str, Any], data: str = "plain") -> list:
+    """What :func:`found_by` gives of a small fit on so many processes; data: of DATASETS."""
+    task = json.dumps({"steps": steps, "changes": dict(changes), "data": data})
     status, output, errors = run(size, ["-m", "support.together", task])
     assert status == 0, errors
     return json.loads(output)
@@ -82,7 +113,7 @@ def fitted(size: int, steps: int, changes: Mapping[str, Any], alpha: bool = Fals
 
 def said_of(size: int, row: int) -> str:
     """What :func:`spoiled` gives on so many processes."""
-    task = json.dumps({"spoiled": row, "changes": {"optimizer.views_per_step": 4}, "alpha": False})
+    task = json.dumps({"spoiled": row, "changes": {"optimizer.views_per_step": 4}, "data": "plain"})
     status, output, errors = run(size, ["-m", "support.together", task])
     assert status == 0, errors
     return json.loads(output)
@@ -109,7 +140,7 @@ def main() -> None:
     from support import small_fits as fits
 
     task = json.loads(sys.argv[1])
-    dataset = fits.true_dataset() if task["alpha"] else fits.plain_dataset()
+    dataset = DATASETS[task["data"]]()
     ranks = Ranks.world()
     config = fits.config_of(**task["changes"])
     trainer = DistributedTrainer(config, dataset, fits.disturbed_blobs(), ranks)
