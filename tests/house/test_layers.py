@@ -37,7 +37,16 @@ MAY_IMPORT = {
     "distributed": {"training", "cli", *TRAINING},
     "live": {"training", *TRAINING},
     "commands": {"distributed", "live", "training", "cli", "plugins", *TRAINING},
-    "bench": {"commands", "rasterizing", "training", "cli", "reference", "", *TRAINING},
+    "bench": {
+        "commands",
+        "distributed",
+        "rasterizing",
+        "training",
+        "cli",
+        "reference",
+        "",
+        *TRAINING,
+    },
 }
 """By package: the others that it may import. ``drgs`` itself may be imported for its version."""
 
