@@ -202,8 +202,8 @@ def outcome():
     chain = Instrumented(
         board,
         rendering,
-        derivatives=CHAIN,
-        forward=["render", "Frame.planes"],
+        derivatives=[*CHAIN, "Projected.gradients"],
+        forward=["render", "Frame.planes", "Projected.footprints"],
     )
     model = Instrumented(
         board,
@@ -252,6 +252,8 @@ def outcome():
         ):
             for name in names:
                 patch.setattr(module, name, copy[name])
+        # Frames of the forward pass, which is not the copy's, go back through this.
+        patch.setattr(rendering.Projected, "gradients", chain["Projected"].gradients)
         # The forward pass is the same for all mutants.
         for module in (helpers, rendering_checks):
             patch.setattr(module, "render", cache(helpers.render))
@@ -293,8 +295,9 @@ class TestDefault(MutationChecks):
         rasterize.composite_tangent rasterize.pack_tangents image_model.AffineResponse.moments
         image_model.AffineResponse.derivatives image_model.AffineResponse.tangent
         image_model.AffineResponse.pack_tangents image_model.SplatFeatures.add_derivatives
-        image_model.PixelCenters.sum_dx rendering._gaussian_gradients rendering._splat_tangents
-        rendering._sum rendering._sums rendering._differentiable rendering._as_tensors
+        image_model.PixelCenters.sum_dx rendering._splat_tangents
+        rendering.gradients_of rendering._back_to_rows rendering._columns_of rendering._sum
+        rendering._sums rendering._as_tensors
         losses._ssim_and_partials losses._assemble_gradient losses._PhotometricOp.backward
         losses._PhotometricOp.forward losses.l1_loss
     """
