@@ -357,7 +357,8 @@ def sum_of_views(
     for view in views:
         of_times = []
         for seen in view:
-            d_rows, visible, _ = _back_to_rows(rows, seen.camera, seen.pipeline, seen.gradients)
+            own = dr.copy(rows)  # whose derivatives are of this camera alone
+            d_rows, visible, _ = _back_to_rows(own, seen.camera, seen.pipeline, seen.gradients)
             columns = _columns_of(d_rows, gaussians, visible)
             total = columns if total is None else _sum_of_columns(total, columns)
             of_times.append(_faults(d_rows, visible))
@@ -379,7 +380,6 @@ def _back_to_rows(
 ) -> tuple[GaussianRows, Any, list[Any]]:
     """Derivatives per lane, which of them are visible, and derivatives of the camera's numbers."""
     response, numbers = pipeline.model.seen_by(camera).response, []
-    rows = dr.copy(rows)  # whose derivatives are of this camera alone
     if of_camera:
         pipeline.model.check_differentiable_in_camera()
         camera = camera.by_lane(dr.width(rows.logit_opacities))
