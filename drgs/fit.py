@@ -292,10 +292,8 @@ def run_with(args: argparse.Namespace, make_trainer: MakeTrainer) -> None:
             config = plan.config
             print(plan.reasons)
         trainer = make_trainer(config, dataset, gaussians)
-        taken_up, checkpoint = (
-            Run.taken_up(trainer, data, out, checkpoint),
-            None,
-        )  # frees its arrays
+        taken_up = Run.taken_up(trainer, data, out, checkpoint)
+        del checkpoint  # and its arrays
         keep_folder()
         take_folder(args, config, dataset, out)
         if plan is not None:

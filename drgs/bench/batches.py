@@ -12,7 +12,6 @@ import argparse
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 from drgs.bench.ingredients import (
     INGREDIENTS,
@@ -25,7 +24,15 @@ from drgs.bench.ingredients import (
     config_of,
 )
 from drgs.bench.output import add_out, machine, markdown_table, write_csv
-from drgs.bench.recipes import Point, fit_in_own_process, iterations_of, planned, points_of, usable
+from drgs.bench.recipes import (
+    Point,
+    add_scenes,
+    fit_in_own_process,
+    iterations_of,
+    planned,
+    points_of,
+    usable,
+)
 from drgs.cli.commands import CommandParser
 from drgs.config.schema import OptimizerConfig
 
@@ -87,15 +94,7 @@ def add_arguments(parser: CommandParser) -> None:
     """Add the arguments of the command."""
     parser.show_examples("%(prog)s --scenes lego", "%(prog)s --data DIR")
     add_out(parser, run, f"{FOLDER}/batches.csv")
-    parser.add_argument("--quick", action="store_true", help="a few hundred iterations")
-    names = [scene.name for scene in SCENES]
-    parser.add_argument(
-        "--scenes", nargs="+", choices=names, default=names, metavar="SCENE",
-        help="; ".join(f"{scene.name}: {scene.title}" for scene in SCENES) + " (default: all)",
-    )  # fmt: skip
-    parser.add_argument(
-        "--data", type=Path, metavar="DIR", help="the photographs of the fox (default: data/fox)"
-    )
+    add_scenes(parser)
     parser.add_argument("--threads", type=int, metavar="N", help="(default: one a core)")
 
 

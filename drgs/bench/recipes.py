@@ -81,15 +81,7 @@ def add_arguments(parser: CommandParser) -> None:
         "%(prog)s --scenes lego --only 1 2", "%(prog)s --data DIR --seeds 2 --keep"
     )
     add_out(parser, run, *(f"{FOLDER}/{name}" for name in NAMES))
-    parser.add_argument("--quick", action="store_true", help="a few hundred iterations")
-    names = [scene.name for scene in SCENES]
-    parser.add_argument(
-        "--scenes", nargs="+", choices=names, default=names, metavar="SCENE",
-        help="; ".join(f"{scene.name}: {scene.title}" for scene in SCENES) + " (default: all)",
-    )  # fmt: skip
-    parser.add_argument(
-        "--data", type=Path, metavar="DIR", help="the photographs of the fox (default: data/fox)"
-    )
+    add_scenes(parser)
     parser.add_argument(
         "--only", type=int, nargs="+", metavar="K", choices=range(1, len(CASES) + 1),
         help="; ".join(f"{k}: {case.name}" for k, case in enumerate(CASES, 1)).replace("%", "%%"),
@@ -103,6 +95,19 @@ def add_arguments(parser: CommandParser) -> None:
         "--keep", type=Path, nargs="?", const=KEPT, metavar="DIR",
         help=f"write table and plots there as well, for the documents (default: {KEPT})",
     )  # fmt: skip
+
+
+def add_scenes(parser: CommandParser) -> None:
+    """Add what is fitted, and how long."""
+    parser.add_argument("--quick", action="store_true", help="a few hundred iterations")
+    names = [scene.name for scene in SCENES]
+    parser.add_argument(
+        "--scenes", nargs="+", choices=names, default=names, metavar="SCENE",
+        help="; ".join(f"{scene.name}: {scene.title}" for scene in SCENES) + " (default: all)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--data", type=Path, metavar="DIR", help="the photographs of the fox (default: data/fox)"
+    )
 
 
 def run(args: argparse.Namespace) -> None:

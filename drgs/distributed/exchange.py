@@ -21,6 +21,7 @@ from mpi4py import MPI
 
 from drgs.cameras.camera import Camera
 from drgs.core.arrays import Rows, block_widths, empty_on_host, types_of, wrapped
+from drgs.core.constants import MAX_SHUTTER_SAMPLES
 from drgs.distributed.ranks import Ranks, wait
 from drgs.gaussians.parameters import Gaussians
 from drgs.splatting.rasterize import SplatGradients
@@ -33,9 +34,6 @@ from drgs.splatting.rendering import (
     footprints_seen_by,
 )
 from drgs.splatting.tiles import Footprints
-
-MOST_TIMES = 4096
-"""Of an open shutter; see ``drgs.integrator.limits``."""
 
 Blocks = list[np.ndarray]
 """Rows of numbers as they travel: (M, columns) for each block of :class:`drgs.core.arrays.Rows`."""
@@ -149,7 +147,7 @@ class Post:
         if to == self.ranks.rank:
             self._staying.setdefault((place, time), deque()).append(blocks)
             return
-        tag = place * MOST_TIMES + time
+        tag = place * MAX_SHUTTER_SAMPLES + time
         self._sending.append(([self.ranks.send(block, to, tag) for block in blocks], blocks))
 
     def receive(self, into: Blocks, of: int, place: int, time: int) -> None:
@@ -159,7 +157,7 @@ class Post:
             for block, rows in zip(into, own, strict=True):
                 block[:] = rows
             return
-        tag = place * MOST_TIMES + time
+        tag = place * MAX_SHUTTER_SAMPLES + time
         with self.ranks.exchanging():
             wait(*(self.ranks.receive(block, of, tag) for block in into))
 

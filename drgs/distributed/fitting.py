@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import os
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -13,6 +12,7 @@ from drgs.config.schema import FitConfig
 from drgs.core.errors import UserError
 from drgs.data import Dataset, load_dataset
 from drgs.distributed.ranks import Ranks
+from drgs.distributed.shards import renderer_of
 from drgs.distributed.together import follow, lead
 from drgs.training.trainer import Trainer
 
@@ -24,7 +24,7 @@ def run_together(args: argparse.Namespace, work: Callable[[Callable[..., Trainer
     """
     ranks = Ranks.world()
     if args.threads is None:
-        args.threads = max(1, len(os.sched_getaffinity(0)) // ranks.on_this_machine)
+        args.threads = ranks.own_cores
     if ranks.is_first:
         lead(ranks, lambda make: work_alone(args, work, make))
         return
@@ -59,5 +59,5 @@ def own_photographs(config: FitConfig, names: Sequence[str], ranks: Ranks) -> Da
 
 def own_views(count: int, views_per_step: int, rank: int, size: int) -> set[int]:
     """Which of ``count`` training views a process renders: see ``drgs.training.stages.view_of``."""
-    places = (p for p in range(views_per_step) if p * size // views_per_step == rank)
+    places = (p for p in range(views_per_step) if renderer_of(p, views_per_step, size) == rank)
     return {view for p in places for view in range(p % count, count, views_per_step)}

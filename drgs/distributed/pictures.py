@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 import sys
 import traceback
 from collections.abc import Callable, Iterator, Sequence
@@ -19,10 +18,11 @@ import numpy as np
 from drgs.core.errors import UserError
 from drgs.data.types import Viewpoint
 from drgs.distributed.ranks import Ranks, wait
+from drgs.distributed.together import END, leading
 from drgs.integrator.scene import render_views
 
-GO, END = "go", "end"
-"""What the first process says: that it waits for pictures; that this is all."""
+GO = "go"
+"""What the first process says when it waits for pictures."""
 
 Render = Callable[..., Iterator[np.ndarray]]
 """Of a scene and views, pictures (H, W, 3)."""
@@ -32,26 +32,12 @@ def run_together(args: argparse.Namespace, work: Callable[[Render], None]) -> No
     """Run the command on all processes; work: the command, given what renders views."""
     ranks = Ranks.world()
     if args.threads is None:
-        args.threads = max(1, len(os.sched_getaffinity(0)) // ranks.on_this_machine)
+        args.threads = ranks.own_cores
     if ranks.is_first:
-        _lead(ranks, work)
+        with leading(ranks):
+            work(lambda scene, views: _gathered(ranks, scene, views))
     else:
         _follow(ranks, work)
-
-
-def _lead(ranks: Ranks, work: Callable[[Render], None]) -> None:
-    status = 1
-    try:
-        work(lambda scene, views: _gathered(ranks, scene, views))
-        status = 0
-    except UserError:
-        status = 2
-        raise
-    finally:
-        if ranks.is_broken:
-            print(f"error: {sys.exc_info()[1]}", file=sys.stderr, flush=True)
-            ranks.comm.Abort(status)
-        ranks.text_of(0, json.dumps([END, status]))
 
 
 def _gathered(ranks: Ranks, scene: mi.Scene, views: Sequence[Viewpoint]) -> Iterator[np.ndarray]:

@@ -6,6 +6,7 @@ again and again, so that Ctrl-C is seen and the other processes of a crowded mac
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Sequence
 from contextlib import contextmanager
@@ -57,9 +58,12 @@ class Ranks:
         return self.rank == 0
 
     @property
-    def on_this_machine(self) -> int:
-        """How many of them share this one's cores."""
-        return self.comm.Split_type(MPI.COMM_TYPE_SHARED).Get_size()
+    def own_cores(self) -> int:
+        """Cores for this process, where those of a machine are shared by all that run on it."""
+        on_this_machine = self.comm.Split_type(MPI.COMM_TYPE_SHARED).Get_size()
+        has_affinity = hasattr(os, "sched_getaffinity")  # Linux
+        cores = len(os.sched_getaffinity(0)) if has_affinity else os.cpu_count() or 1
+        return max(1, cores // on_this_machine)
 
     @contextmanager
     def exchanging(self):

@@ -23,6 +23,11 @@ from drgs.training.density.strategy import Population
 from drgs.training.optimizer import num_rows, take_rows
 
 
+def renderer_of(place: int, views_per_step: int, size: int) -> int:
+    """Which of ``size`` processes renders a view of a step: places are dealt out in equal parts."""
+    return place * size // views_per_step
+
+
 @dataclass
 class Shard:
     """The interval of ``total`` rows that one of ``size`` processes has."""

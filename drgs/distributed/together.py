@@ -145,14 +145,21 @@ def lead(ranks: Ranks, work: Callable[[Callable[..., Trainer]], None]) -> None:
 
     work: is given what makes the trainer.
     """
+    with leading(ranks):
+        work(partial(Leader, ranks=ranks))
+
+
+@contextmanager
+def leading(ranks: Ranks) -> Iterator[None]:
+    """Around the first process's work: then the others end, with the same status."""
     status = 0
     try:
-        work(partial(Leader, ranks=ranks))
+        yield
     except SystemExit as end:
         status = end.code if isinstance(end.code, int) else 1
         raise
     except BaseException as error:
-        status = 2 if isinstance(error, UserError) else 1
+        status = 2 if isinstance(error, (UserError, OSError)) else 1
         raise
     finally:
         if ranks.is_broken:

@@ -37,7 +37,7 @@ from drgs.distributed.exchange import (
     joined,
 )
 from drgs.distributed.ranks import Ranks
-from drgs.distributed.shards import Shard, SpreadPopulation
+from drgs.distributed.shards import Shard, SpreadPopulation, renderer_of
 from drgs.effects.compose import composed, ignoring
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 from drgs.integrator.sensors import camera_from_sensor, read_sensor
@@ -92,9 +92,9 @@ class DistributedTrainer(Trainer):
         return self.shard.total
 
     def renderer_of(self, iteration: int) -> int:
-        """Which process renders its view: the places of a step are dealt out in equal parts."""
+        """Which process renders its view."""
         views_per_step = self.config.optimizer.views_per_step
-        return (iteration - 1) % views_per_step * self.ranks.size // views_per_step
+        return renderer_of((iteration - 1) % views_per_step, views_per_step, self.ranks.size)
 
     def _own(self, iterations: range) -> Sequence[int]:
         return [i for i in iterations if self.renderer_of(i) == self.ranks.rank]
