@@ -80,9 +80,13 @@ class SpreadPopulation(Population):
         """How many of them this process has."""
         return num_rows(self.optimizer, self.prefix)
 
-    def host(self, name: str) -> np.ndarray:
-        """A parameter of all rows on the host, float64; waits for the device."""
-        return self.ranks.rows_of_all(np.array(self.value(name))).astype(np.float64)
+    def of_all(self, values: Any) -> np.ndarray:
+        """Values for the rows of all processes: see ``Population.of_all``."""
+        return self.ranks.rows_of_all(np.array(values)).astype(np.float64)
+
+    def own(self, values: np.ndarray) -> np.ndarray:
+        """Of values for all rows, those of this process."""
+        return values[self.shard.own]
 
     def row_numbers(self) -> Any:
         """Of the rows that :meth:`value` has: UInt32."""

@@ -6,7 +6,8 @@ and sends derivatives back; and takes those of its rows, view by view in the ord
 through the projection into the gradients that its optimizer steps along. Sums over views are
 therefore added up by the owner of a row, in the same order for any number of processes.
 
-What strategies of density know of each row is small, and everywhere; so each process decides alike.
+What a strategy of density takes note of stays with the rows. When it acts, it is told everywhere
+what all have found, which is a number or two of each row, and decides everywhere alike.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ import numpy as np
 
 from drgs.cameras.camera import cameras_in_time
 from drgs.config.schema import FitConfig
-from drgs.core.arrays import block_widths, from_host
+from drgs.core.arrays import block_widths
 from drgs.core.errors import UserError
 from drgs.data.types import Dataset
 from drgs.distributed.exchange import (
@@ -49,7 +50,7 @@ from drgs.splatting.rendering import (
 from drgs.training.deferred import VIEWS_AT_ONCE
 from drgs.training.density.strategy import SeenStep
 from drgs.training.finite_checks import NonFiniteError
-from drgs.training.trainer import PREFIX, SeenView, Trainer, Waiting
+from drgs.training.trainer import DENSITY, PREFIX, SeenView, Trainer, Waiting
 
 NEVER = 2**62
 """The iteration of no fault."""
@@ -329,9 +330,10 @@ class DistributedTrainer(Trainer):
 
     def _is_by_row(self, name: str) -> bool:
         """Whether an array of the state has a row for each Gaussian, in one place each."""
-        of_effects = {f"{effect.name}/{key}" for effect in self.effects for key in effect.by_row}
+        others = {f"{effect.name}/{key}" for effect in self.effects for key in effect.by_row}
+        others |= {f"{DENSITY}{key}" for key in self.density.by_row}
         parameter, _, kind = name.partition(".")
-        return name in of_effects or (parameter in PARAMETER_NAMES and kind != "t")
+        return name in others or (parameter in PARAMETER_NAMES and kind != "t")
 
 
 class _OfAll(dict[str, Any]):
@@ -351,8 +353,8 @@ class _OfAll(dict[str, Any]):
 class SharedStep:
     """What a strategy of density is told of a view that one process has rendered.
 
-    It answers as :class:`drgs.training.density.strategy.SeenStep`, about all rows. Every process
-    asks for the same, in the same order: answers take all of them.
+    It answers as :class:`drgs.training.density.strategy.SeenStep`, about the rows of this process.
+    Every process asks for the same, in the same order: some answers take all of them.
     """
 
     def __init__(
@@ -376,17 +378,16 @@ class SharedStep:
     @cached_property
     def means2d_grad(self) -> Any:
         """Tensor (N, 2): see :class:`SeenStep`."""
-        count = self._trainer.num_averaged
-        own = mi.TensorXf(dr.ravel(self._means2d), (dr.width(self._means2d), 2))
-        own = own * count if count > 1 else own
-        return mi.TensorXf(self._trainer.ranks.rows_of_all(np.array(own)))
+        count, own = self._trainer.num_averaged, self._means2d
+        found = mi.TensorXf(dr.ravel(own), (dr.width(own), 2))
+        return found * count if count > 1 else found
 
     @cached_property
     def visible(self) -> Any:
         """Bool (N,): see :class:`SeenStep`."""
         ones = [np.ones((sight.count, 1), np.float32) for sight in self._sights]
         columns = [s.of_rows([each], 1)[0] for s, each in zip(self._sights, ones, strict=True)]
-        return self._of_all(sum(columns[1:], columns[0])) > 0
+        return sum(columns[1:], columns[0]) > 0
 
     def errors_seen(self) -> Any:
         """Float (N,): see :class:`SeenStep`."""
@@ -410,11 +411,7 @@ class SharedStep:
                 self._trainer.send_to_owners([sums], self._counts[:, time], self._place, time)
         arrived = self._trainer.receive_of_rows(self._sights, self._place, 1)
         columns = [sight.of_rows(blocks, 1)[0] for sight, blocks in arrived]
-        return self._of_all(sum(columns[1:], columns[0]) / len(columns))
-
-    def _of_all(self, column: Any) -> Any:
-        """Float (N,), from that of this process's rows."""
-        return from_host(type(column), self._trainer.ranks.rows_of_all(np.array(column)))
+        return sum(columns[1:], columns[0]) / len(columns)
 
 
 def check_can_be_shared(config: FitConfig, size: int, num_gaussians: int) -> None:

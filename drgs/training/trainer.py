@@ -410,7 +410,7 @@ class Trainer:
         """
         self.watch.check()
         check_values(self.iteration, self.parameters, self.first_row)
-        check_values(self.iteration, self.density.state())
+        check_values(self.iteration, self.density.state(), self.first_row)
         of_views = {f"{e.name}.{k}": v for e in self.effects for k, v in e.values().items()}
         check_view_values(self.iteration, of_views, [view.name for view in self.views])
 

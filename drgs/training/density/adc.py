@@ -57,11 +57,12 @@ class AdaptiveDensityControl(DensityStrategy):
     config: DensifyConfig
     white_background: bool
     statistics: DensityStatistics | None = None  # until it begins
+    by_row = ("gradient_norms", "views")
 
     def begin(self, population: Population) -> None:
         """Start with the statistics of no views."""
         float_type = type(population.value("means").array)
-        self.statistics = DensityStatistics.zeros(float_type, population.num_rows)
+        self.statistics = DensityStatistics.zeros(float_type, population.num_own)
 
     def gathers(self, iteration: int) -> bool:
         """See :func:`gathers_statistics`."""
@@ -171,16 +172,16 @@ def densify_and_prune(
     Raises ``UserError`` if no Gaussian would remain: such a fit cannot recover.
     """
     num_before, extent = population.num_rows, population.extent
-    if dr.width(statistics.views) != num_before:
+    if dr.width(statistics.views) != population.num_own:
         raise ValueError(
             f"densify_and_prune(): statistics of {dr.width(statistics.views)} Gaussians for "
-            f"{num_before} in the optimizer: they start again after every change"
+            f"{population.num_own} in the optimizer: they start again after every change"
         )
     limit = config.adc.prune_scale * extent if prunes_large(config, iteration) else np.inf
     with np.errstate(over="ignore"):
         scales = np.exp(population.host("log_scales")).max(axis=1)
     chosen = _choose_rows(
-        gradient_norms=statistics.mean_gradient_norms(),
+        gradient_norms=population.of_all(statistics.mean_gradient_norms()),
         opacities=expit(population.host("logit_opacities")),
         scales=scales,
         config=config,

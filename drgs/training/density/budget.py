@@ -62,12 +62,13 @@ class GrowthToNumber(DensityStrategy):
     coarse: Sequence[CoarseStage] = ()
     errors: Any = None  # Float (N,): sum over views of s; None until it begins
     first: int = 0  # Gaussians at the start
+    by_row = ("errors",)
 
     def begin(self, population: Population) -> None:
         """Start with the errors of no views."""
         float_type = type(population.value("means").array)
         self.first = self.first or population.num_rows
-        self.errors = dr.zeros(float_type, population.num_rows)
+        self.errors = dr.zeros(float_type, population.num_own)
 
     def gathers(self, iteration: int) -> bool:
         """Every so many views, as long as the errors can still lead to a change.
@@ -102,7 +103,7 @@ class GrowthToNumber(DensityStrategy):
             )
         kept = int(np.count_nonzero(keep))
         room = max(0, self.goal(iteration) - kept)
-        errors = np.where(keep, np.array(self.errors, np.float64), 0)
+        errors = np.where(keep, population.of_all(self.errors), 0)
         candidates = np.flatnonzero(errors > 0)
         candidates = candidates[np.argsort(-errors[candidates], kind="stable")]
         split = np.sort(candidates[:room])

@@ -25,6 +25,8 @@ from drgs.training.density.strategy import DensityReport, DensityStrategy, Popul
 class Importance(DensityStrategy):
     """Removes Gaussians by what they contribute to pictures."""
 
+    by_row = ("weights",)
+
     def __init__(self, config: FitConfig) -> None:
         self.schedule = PruneSchedule.of(config)
         self.begun_with = 0  # Gaussians, at the first change
@@ -33,7 +35,7 @@ class Importance(DensityStrategy):
     def begin(self, population: Population) -> None:
         """Start with the scores of no pictures."""
         float_type = type(population.value("means").array)
-        self.scores = dr.zeros(float_type, population.num_rows)
+        self.scores = dr.zeros(float_type, population.num_own)
 
     def gathers(self, iteration: int) -> bool:
         """Weights count in the iterations of the phase."""
@@ -53,13 +55,15 @@ class Importance(DensityStrategy):
         """Remove as many as the schedule says."""
         before = population.num_rows
         self.begun_with = self.begun_with or before
-        scores = np.array(self.scores, dtype=np.float64)
+        scores = population.of_all(self.scores)
         fewer = min(before, self.schedule.wanted(iteration, self.begun_with))
         if fewer == before:
             return None
+        report = keep_best(population, scores, fewer)
         # Others' scores stay: few of the views were seen since the last change.
-        self.scores = from_host(type(self.scores), scores[best_rows(scores, fewer)])
-        return keep_best(population, scores, fewer)
+        left = population.own(scores[best_rows(scores, fewer)])
+        self.scores = from_host(type(self.scores), left)
+        return report
 
     def state(self) -> dict[str, np.ndarray]:
         """The scores so far."""

@@ -24,6 +24,11 @@ class Phases(DensityStrategy):
 
     phases: Sequence[DensityStrategy]
 
+    @property
+    def by_row(self) -> Sequence[str]:
+        """Those of all of them."""
+        return [name for phase in self.phases for name in phase.by_row]
+
     def begin(self, population: Population) -> None:
         """Start with the statistics of no views."""
         for phase in self.phases:

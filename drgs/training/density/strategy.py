@@ -10,7 +10,7 @@ Iterations are counted from 1. A strategy is a function of the configuration and
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
 from typing import Any, Protocol
 
@@ -48,7 +48,10 @@ DENSITY_COLUMNS = ("iteration", *(field.name for field in fields(DensityReport))
 
 @dataclass(frozen=True)
 class SeenStep:
-    """What an iteration tells a strategy; nothing of it is differentiated."""
+    """What an iteration tells a strategy; nothing of it is differentiated.
+
+    N are the rows that :meth:`Population.value` has.
+    """
 
     iteration: int
     width: int  # px, of the film of the iteration's view
@@ -87,13 +90,29 @@ class Population:
         """N at the moment."""
         return num_rows(self.optimizer, self.prefix)
 
+    @property
+    def num_own(self) -> int:
+        """How many of them :meth:`value` has: all, where no other process has some."""
+        return self.num_rows
+
     def value(self, name: str) -> Any:
         """A parameter as it is at the moment, on the device."""
         return dr.detach(self.optimizer[self.prefix + name])
 
     def host(self, name: str) -> np.ndarray:
         """The same on the host, float64; waits for the device."""
-        return np.array(self.value(name), dtype=np.float64)
+        return self.of_all(self.value(name))
+
+    def of_all(self, values: Any) -> np.ndarray:
+        """Of values for the rows that :meth:`value` has, those of all rows: on the host, float64.
+
+        Waits for the device.
+        """
+        return np.array(values, dtype=np.float64)
+
+    def own(self, values: np.ndarray) -> np.ndarray:
+        """The inverse: of values for all rows, those for the rows that :meth:`value` has."""
+        return values
 
     def rows(self, numbers: np.ndarray) -> Any:
         """Row numbers, (M,) integers on the host, as ``UInt32`` on the device."""
@@ -101,9 +120,9 @@ class Population:
         return from_host(index_type, numbers.astype(np.uint32))
 
     def row_numbers(self) -> Any:
-        """Of the rows that :meth:`value` has: UInt32 (N,)."""
+        """Of the rows that :meth:`value` has: UInt32."""
         index_type = dr.uint32_array_t(type(self.value("means").array))
-        return dr.arange(index_type, self.num_rows)
+        return dr.arange(index_type, self.num_own)
 
     def take(self, rows: Any) -> dict[str, Any]:
         """Copies of some rows of every parameter by name; rows: (M,) ``UInt32``."""
@@ -145,7 +164,13 @@ class DensityStrategy(Protocol):
 
     As it is here, a strategy leaves the population as it is. Equal inputs give equal bytes: what is
     random is a function of seed, iteration and row.
+
+    Where several processes have some of the rows each, so do their strategies, of which each takes
+    note of its own; whoever acts asks for :meth:`Population.of_all`, and all decide alike.
     """
+
+    by_row: Sequence[str] = ()
+    """Names in :meth:`state` of what has a row for each Gaussian."""
 
     def begin(self, population: Population) -> None:
         """Start with the statistics of no views.
@@ -199,7 +224,7 @@ class DensityStrategy(Protocol):
         del population, iteration
 
     def state(self) -> dict[str, np.ndarray]:
-        """What the coming iterations depend on: by name, a row for each Gaussian, or one number.
+        """What the coming iterations depend on: by name, a row for each Gaussian here, or a number.
 
         All of it has to be finite.
         """
