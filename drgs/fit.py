@@ -292,6 +292,7 @@ def run_with(args: argparse.Namespace, make_trainer: MakeTrainer) -> None:
             config = plan.config
             print(plan.reasons)
         trainer = make_trainer(config, dataset, gaussians)
+        dataset = trainer.dataset  # of which others may have a part
         taken_up = Run.taken_up(trainer, data, out, checkpoint)
         del checkpoint  # and its arrays
         keep_folder()
@@ -513,7 +514,7 @@ def write_for_viewers(
 
     total = num_iterations(trainer.config)
     with RunProgress("iteration for viewers", total) as shown:
-        found = for_viewers(trainer, dataset, gaussians, lambda done: shown.update(done, total))
+        found = for_viewers(trainer, gaussians, lambda done: shown.update(done, total))
     found.gaussians.save(out / GAUSSIANS_FOR_VIEWERS)
     pairs = zip(found.pictures(dataset.test), dataset.test, strict=True)
     return mean_of([score(image, view) for image, view in pairs]), found.gaussians

@@ -28,17 +28,21 @@ PICTURE_UNIT = 1e-3
 nerfstudio has it. An ``.npy`` file then holds scene units, which it has numbers for."""
 
 
-def extras_of(
-    config: DataConfig, frame: Frame, size: tuple[int, int]
-) -> dict[str, Lens | Motion | Pixels | None]:
-    """``lens``, ``motion``, ``mask`` and ``depth`` of a :class:`drgs.data.types.View`.
+def optics_of(config: DataConfig, frame: Frame) -> dict[str, Lens | Motion | None]:
+    """``lens`` and ``motion`` of a :class:`drgs.data.types.View`."""
+    return {
+        "lens": None if config.ignore_distortion else lens_of(frame),
+        "motion": None if config.ignore_motion else motion_of(frame, config.shutter_samples),
+    }
+
+
+def extras_of(config: DataConfig, frame: Frame, size: tuple[int, int]) -> dict[str, Pixels | None]:
+    """``mask`` and ``depth`` of a :class:`drgs.data.types.View`.
 
     size: of the photograph, W, H, before it is scaled. No file is opened for what the configuration
     ignores.
     """
     return {
-        "lens": None if config.ignore_distortion else lens_of(frame),
-        "motion": None if config.ignore_motion else motion_of(frame, config.shutter_samples),
         "mask": None if config.ignore_masks else _mask(config, frame, size),
         "depth": None if config.ignore_depth else _depth(config, frame, size),
     }

@@ -17,8 +17,9 @@ import numpy as np
 
 from drgs.config.schema import DataConfig
 from drgs.core.errors import UserError
-from drgs.data.extras import extras_of, files_of, ignored, notes
-from drgs.data.images import check_room, kept_photograph, threads_for
+from drgs.data.extras import files_of, ignored, notes, optics_of
+from drgs.data.images import check_room, threads_for
+from drgs.data.reading import READ, SIZES_ALONE
 from drgs.data.transforms import (
     Frame,
     focal_from_angle,
@@ -28,7 +29,7 @@ from drgs.data.transforms import (
     unique_names,
 )
 from drgs.data.types import Dataset, Keeps, View, all_of_them
-from drgs.io.pictures import image_size, read_pixels
+from drgs.io.pictures import image_size
 
 START_HALF_EXTENT = 1.3
 """The 3DGS reference starts from random points in [-1.3, 1.3]^3 for these scenes
@@ -93,19 +94,20 @@ def _load_split(
 ) -> tuple[View, ...]:
     files = [image_path(config.path, frame) for frame in frames]
     size = image_size(files[0])
-    check_room(files, config.image_size)
 
     def load_view(index: int, name: str) -> View:
-        frame = frames[index]
-        rgba = read_pixels(files[index])
-        _check_promises(rgba, size, files[index], files[0])
-        image, alpha = kept_photograph(rgba, config.background_rgb, config.image_size)
-        height, width = image.shape[:2]
+        frame, file = frames[index], files[index]
+        reading = READ if keeps(name) else SIZES_ALONE
+        rgba = reading.pixels(file)
+        _check_promises(rgba, size, file, files[0])
+        pictures = reading.pictures(config, frame, file, rgba)
+        height, width = pictures["image"].shape[:2]
         # The angle spans the full width, so the focal length in pixels follows the image's size.
         focal = focal_from_angle(_angle(frame), width)
-        view = View(
+        if split != "train":
+            pictures["alpha"] = None  # only training looks at it
+        return View(
             name=name,
-            image=image,
             camera_to_world=frame.own.transform_matrix,
             fx=focal,
             fy=focal,
@@ -113,13 +115,14 @@ def _load_split(
             cy=height / 2,
             width=width,
             height=height,
-            alpha=alpha if split == "train" else None,  # only training looks at it
-            files=files_of(config, frame, files[index]),
-            **extras_of(config, frame, size),
+            files=files_of(config, frame, file),
+            **optics_of(config, frame),
+            **pictures,
         )
-        return view if keeps(name) else view.without_pictures()
 
     names = unique_names([frame.own.file_path for frame in frames])
+    kept = [file for file, name in zip(files, names, strict=True) if keeps(name)]
+    check_room(kept, config.image_size)
     return in_parallel(load_view, range(len(frames)), names, threads=threads_for(files))
 
 

@@ -12,9 +12,10 @@ from pathlib import Path
 
 from drgs.config.schema import DataConfig
 from drgs.core.errors import UserError
-from drgs.data.extras import extras_of, files_of, ignored, notes
-from drgs.data.images import check_room, kept_photograph, threads_for
+from drgs.data.extras import files_of, ignored, notes, optics_of
+from drgs.data.images import check_room, threads_for
 from drgs.data.orientation import as_calibrated
+from drgs.data.reading import READ, SIZES_ALONE, Reading
 from drgs.data.transforms import (
     Frame,
     focal_from_angle,
@@ -24,7 +25,7 @@ from drgs.data.transforms import (
     unique_names,
 )
 from drgs.data.types import Dataset, Keeps, View, all_of_them
-from drgs.io.pictures import has_alpha, read_pixels
+from drgs.io.pictures import has_alpha
 
 MAX_WIDTH = 1600
 """px: wider photographs are scaled down to this, as in the 3DGS reference, unless a size is set."""
@@ -59,14 +60,15 @@ def dataset_of(config: DataConfig, photographs: Photographs, keeps: Keeps = all_
     """All views; those at indices 0, n, 2n, ... of the sorted names are the test split."""
     frames, files = photographs.frames, photographs.files
     config = _completed(config, files)
-    check_room(files, config.image_size)
 
     def load_view(index: int, name: str) -> View:
-        view = _load_view(config, frames[index], files[index], name)
-        return view if keeps(name) else view.without_pictures()
+        reading = READ if keeps(name) else SIZES_ALONE
+        return _load_view(config, frames[index], files[index], name, reading)
 
     order = sorted(range(len(frames)), key=lambda index: frames[index].own.file_path)
     names = unique_names([frames[index].own.file_path for index in order])
+    kept = [files[index] for index, name in zip(order, names, strict=True) if keeps(name)]
+    check_room(kept, config.image_size)
     views = in_parallel(load_view, order, names, threads=threads_for(files))
     test = views[:: config.test_every]
     train = tuple(v for i, v in enumerate(views) if i % config.test_every != 0)
@@ -98,8 +100,8 @@ def _completed(config: DataConfig, files: Sequence[Path]) -> DataConfig:
     return config.model_copy(update=changes)
 
 
-def _load_view(config: DataConfig, frame: Frame, file: Path, name: str) -> View:
-    pixels = as_calibrated(read_pixels(file), file, frame)
+def _load_view(config: DataConfig, frame: Frame, file: Path, name: str, reading: Reading) -> View:
+    pixels = as_calibrated(reading.pixels(file), file, frame)
     height, width = pixels.shape[:2]
     values = frame.values
     for key, given, size in (("w", values.w, width), ("h", values.h, height)):
@@ -113,21 +115,21 @@ def _load_view(config: DataConfig, frame: Frame, file: Path, name: str) -> View:
     fy = _focal(frame, "y", height) if has_fy else fx
     cx, cy = (_principal(frame, key, size) for key, size in (("cx", width), ("cy", height)))
 
-    image, alpha = kept_photograph(pixels, config.background_rgb, config.image_size)
-    scale_x, scale_y = image.shape[1] / width, image.shape[0] / height
+    pictures = reading.pictures(config, frame, file, pixels)
+    new_height, new_width = pictures["image"].shape[:2]
+    scale_x, scale_y = new_width / width, new_height / height
     return View(
         name=name,
-        image=image,
         camera_to_world=frame.own.transform_matrix,
         fx=fx * scale_x,
         fy=fy * scale_y,
         cx=cx * scale_x,
         cy=cy * scale_y,
-        width=image.shape[1],
-        height=image.shape[0],
-        alpha=alpha,
+        width=new_width,
+        height=new_height,
         files=files_of(config, frame, file),
-        **extras_of(config, frame, (width, height)),
+        **optics_of(config, frame),
+        **pictures,
     )
 
 

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from drgs.core.constants import SHUTTER_SAMPLES
-from drgs.data.kept import KeptPicture, Pixels
+from drgs.data.kept import Pixels
 
 if TYPE_CHECKING:
     from drgs.cameras.camera import Lens
@@ -69,27 +69,13 @@ class View(Viewpoint):
     depth: Pixels | None = None  # (height, width) float32, scene units; 0 where not known
     files: Mapping[str, Path] = field(default_factory=dict)  # it was read from: image, mask, depth
 
-    def without_pictures(self) -> View:
-        """The same with pictures that have sizes alone: somebody else looks at them."""
-
-        message = f"the pictures of view {self.name} are not kept here"  # and the view is not
-
-        def refuse() -> np.ndarray:
-            raise RuntimeError(message)
-
-        def elsewhere(picture: Pixels | None) -> KeptPicture | None:
-            return None if picture is None else KeptPicture(picture.shape, refuse, nbytes=0)
-
-        names = ("image", "alpha", "mask", "depth")
-        return replace(self, **{name: elsewhere(getattr(self, name)) for name in names})
-
 
 Keeps = Callable[[str], bool]
-"""Whether the pictures of the view of this name are kept, once they have been read."""
+"""Whether the pictures of the view of this name are read; of others there are sizes."""
 
 
 def all_of_them(name: str) -> bool:
-    """Keep the pictures of all views."""
+    """Read the pictures of all views."""
     del name
     return True
 

@@ -12,7 +12,7 @@ from drgs.config.schema import FitConfig
 from drgs.core.errors import UserError
 from drgs.data import Dataset, load_dataset
 from drgs.distributed.ranks import Ranks
-from drgs.distributed.shards import renderer_of
+from drgs.distributed.shards import own_views
 from drgs.distributed.together import follow, lead
 from drgs.training.trainer import Trainer
 
@@ -47,17 +47,10 @@ def work_alone(
 def own_photographs(config: FitConfig, names: Sequence[str], ranks: Ranks) -> Dataset:
     """The dataset with the training views of these names; pictures of those that are rendered here.
 
-    Of the others, and of those to measure on, there are sizes and cameras.
+    Of the others, and of those to measure on, there are cameras and sizes, from files' headers.
     """
     own = own_views(len(names), config.optimizer.views_per_step, ranks.rank, ranks.size)
     rendered = {names[index] for index in own}
     dataset = load_dataset(config.data_for_training, keeps=rendered.__contains__)
     by_name = {view.name: view for view in dataset.train}
-    test = tuple(view.without_pictures() for view in dataset.test)
-    return replace(dataset, train=tuple(by_name[name] for name in names), test=test)
-
-
-def own_views(count: int, views_per_step: int, rank: int, size: int) -> set[int]:
-    """Which of ``count`` training views a process renders: see ``drgs.training.stages.view_of``."""
-    places = (p for p in range(views_per_step) if renderer_of(p, views_per_step, size) == rank)
-    return {view for p in places for view in range(p % count, count, views_per_step)}
+    return replace(dataset, train=tuple(by_name[name] for name in names))

@@ -34,13 +34,15 @@ class Ranks:
     """The processes of a run, numbered from 0; this one is ``rank``."""
 
     comm: MPI.Comm
+    on_machine: int = 1  # of them, that run where this one does
     times: Times = field(default_factory=Times)
     is_broken: bool = False  # whether others wait for what this process will not say
 
     @staticmethod
     def world() -> Ranks:
         """All processes that ``mpiexec`` has started."""
-        return Ranks(MPI.COMM_WORLD.Dup())
+        here = MPI.COMM_WORLD.Split_type(MPI.COMM_TYPE_SHARED)
+        return Ranks(MPI.COMM_WORLD.Dup(), here.Get_size())
 
     @property
     def rank(self) -> int:
@@ -60,10 +62,9 @@ class Ranks:
     @property
     def own_cores(self) -> int:
         """Cores for this process, where those of a machine are shared by all that run on it."""
-        on_this_machine = self.comm.Split_type(MPI.COMM_TYPE_SHARED).Get_size()
         has_affinity = hasattr(os, "sched_getaffinity")  # Linux
         cores = len(os.sched_getaffinity(0)) if has_affinity else os.cpu_count() or 1
-        return max(1, cores // on_this_machine)
+        return max(1, cores // self.on_machine)
 
     @contextmanager
     def exchanging(self):

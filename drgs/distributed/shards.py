@@ -28,6 +28,12 @@ def renderer_of(place: int, views_per_step: int, size: int) -> int:
     return place * size // views_per_step
 
 
+def own_views(count: int, views_per_step: int, rank: int, size: int) -> set[int]:
+    """Which of ``count`` training views a process renders: see ``drgs.training.stages.view_of``."""
+    places = (p for p in range(views_per_step) if renderer_of(p, views_per_step, size) == rank)
+    return {view for p in places for view in range(p % count, count, views_per_step)}
+
+
 @dataclass
 class Shard:
     """The interval of ``total`` rows that one of ``size`` processes has."""

@@ -13,6 +13,7 @@ import sys
 import traceback
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from dataclasses import replace
 from functools import partial, wraps
 from typing import Any
 
@@ -21,15 +22,17 @@ import numpy as np
 
 from drgs.config.schema import FitConfig
 from drgs.core.errors import UserError
+from drgs.data.reading import without_pictures
 from drgs.data.types import Dataset
 from drgs.distributed.ranks import Ranks
+from drgs.distributed.shards import own_views
 from drgs.distributed.trainer import DistributedTrainer, check_can_be_shared
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 from drgs.integrator.scene import make_scene
 from drgs.training.finite_checks import NonFiniteError
 from drgs.training.trainer import StepReport, Trainer
 
-START, RESTORE, END = "start", "restore", "end"
+START, RESTORE, TAKE_OVER, END = "start", "restore", "take over", "end"
 """What is said besides the names of methods."""
 
 
@@ -72,9 +75,10 @@ class Leader(DistributedTrainer):
     def __init__(
         self, config: FitConfig, dataset: Dataset, gaussians: Gaussians, ranks: Ranks
     ) -> None:
-        """gaussians: all of them."""
-        self.is_calling, self.dataset = True, dataset
+        """gaussians: all of them; dataset: with all pictures, of which it keeps its own."""
+        self.is_calling = True
         check_can_be_shared(config, ranks.size, gaussians.num_gaussians)
+        dataset = with_own_pictures(dataset, config.optimizer.views_per_step, ranks)
         names = [view.name for view in dataset.train]
         ranks.text_of(0, json.dumps([START, config.model_dump_json(), names]))
         share_gaussians(ranks, gaussians)
@@ -131,6 +135,16 @@ class Leader(DistributedTrainer):
             super().restore(state)
         self.is_calling = False
 
+    def another(self, config: FitConfig, gaussians: Gaussians) -> Leader:
+        """See :meth:`Trainer.another`; the others follow that one from now on."""
+        return Leader(config, self.dataset, gaussians, self.ranks)
+
+    def take_over(self, former: Trainer) -> None:
+        """See :meth:`Trainer.take_over`; former: whom the others have followed before."""
+        self.ranks.text_of(0, json.dumps([TAKE_OVER]))
+        with _others_waiting(self.ranks):
+            super().take_over(former)
+
     def scene_of_all(self) -> mi.Scene:
         """See :meth:`Trainer.scene_of_all`: on this process."""
         if self._latest is None or self._latest[0] != self.iteration:
@@ -174,7 +188,7 @@ def follow(ranks: Ranks, load: Callable[[FitConfig, list[str]], Dataset]) -> int
     load: the dataset of a configuration, with the training views of these names.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the first process decides when to stop
-    trainer = None
+    trainer = former = None
     try:
         while True:
             name, *arguments = json.loads(ranks.text_of(0, ""))
@@ -182,9 +196,13 @@ def follow(ranks: Ranks, load: Callable[[FitConfig, list[str]], Dataset]) -> int
                 return arguments[0]
             if name == START:
                 text, names = arguments
-                config = FitConfig.model_validate_json(text)
+                config, former = FitConfig.model_validate_json(text), trainer
                 gaussians = share_gaussians(ranks, None)
-                trainer = DistributedTrainer(config, load(config, names), gaussians, ranks)
+                if former is None or names != [view.name for view in former.dataset.train]:
+                    dataset = load(config, names)
+                trainer = DistributedTrainer(config, dataset, gaussians, ranks)
+            elif name == TAKE_OVER:
+                trainer.take_over(former)
             elif name == RESTORE:
                 trainer.restore({})
             else:
@@ -196,6 +214,13 @@ def follow(ranks: Ranks, load: Callable[[FitConfig, list[str]], Dataset]) -> int
         print(f"process {ranks.rank}: {text}", file=sys.__stderr__, flush=True)
         ranks.comm.Abort(2 if told else 1)
         raise
+
+
+def with_own_pictures(dataset: Dataset, views_per_step: int, ranks: Ranks) -> Dataset:
+    """Without the pictures of training views that other processes render."""
+    own = own_views(len(dataset.train), views_per_step, ranks.rank, ranks.size)
+    train = (v if i in own else without_pictures(v) for i, v in enumerate(dataset.train))
+    return replace(dataset, train=tuple(train))
 
 
 def share_gaussians(ranks: Ranks, gaussians: Gaussians | None) -> Gaussians:

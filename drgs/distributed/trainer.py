@@ -50,6 +50,7 @@ from drgs.splatting.rendering import (
 from drgs.training.deferred import VIEWS_AT_ONCE
 from drgs.training.density.strategy import SeenStep
 from drgs.training.finite_checks import NonFiniteError
+from drgs.training.memory import ALONE, Share
 from drgs.training.trainer import DENSITY, PREFIX, SeenView, Trainer, Waiting
 
 NEVER = 2**62
@@ -75,13 +76,20 @@ class DistributedTrainer(Trainer):
         check_can_be_shared(config, ranks.size, gaussians.num_gaussians)
         self.ranks, self.post = ranks, Post(ranks)
         self.shard = Shard(gaussians.num_gaussians, ranks.rank, ranks.size)
+        self._at_start: Gaussians | None = gaussians
         super().__init__(config, dataset, self.shard.of(gaussians))
+        self._at_start = None
         for effect in self.effects:
             if not effect.shares_rendering:
                 raise UserError(
                     f"{effect.name}: one process alone can fit with what this section of the "
                     "configuration asks for; leave it out, or run without mpiexec"
                 )
+
+    def _room(self, gaussians: Gaussians, share: Share = ALONE) -> int:
+        """See :meth:`Trainer._room`: pictures show the Gaussians of all processes."""
+        del gaussians, share
+        return super()._room(self._at_start, Share(self.ranks.size, self.ranks.on_machine))
 
     def _population(self) -> SpreadPopulation:
         common = {"optimizer": self.optimizer, "prefix": PREFIX, "extent": self.extent}

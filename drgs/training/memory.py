@@ -97,14 +97,26 @@ class FitMemory:
         return max(0, min(most, self.targets, usable - round(1.15 * self.needed)))
 
 
+@dataclass(frozen=True)
+class Share:
+    """What one of several processes has of a fit and of its machine."""
+
+    processes: int = 1  # that share the Gaussians; each renders pictures of all of them
+    on_machine: int = 1  # of these, that share the machine's memory
+
+
+ALONE = Share()
+
+
 def estimate(
     config: FitConfig,
     dataset: Dataset,
     gaussians: Gaussians,
     view_bytes: int,
     scale: float = 1.0,
+    share: Share = ALONE,
 ) -> FitMemory:
-    """The peak of a fit that starts with ``gaussians``.
+    """The peak, of one process, of a fit that starts with ``gaussians``.
 
     view_bytes: of a pixel, what is made of a view's pictures; scale: of all pictures' width and
     height, for another ``data.image_size``.
@@ -125,7 +137,7 @@ def estimate(
         process=PROCESS_BYTES,
         photographs=round(sum(_kept_bytes(view, scale) for view in views)),
         targets=round(scale**2 * view_bytes * sum(view.width * view.height for view in train)),
-        gaussians=round(of_gaussian * count),
+        gaussians=round(of_gaussian * count / share.processes),
         splats=round(ENTRY_BYTES * entries * times + SLOT_BYTES * min(slots, BAND_SLOTS)),
         pixels=round(PIXEL_BYTES * pixels * times + MEASURED_BYTES * measured),
     )
@@ -184,34 +196,44 @@ def _at_start(
 
 
 def room_for_targets(
-    config: FitConfig, dataset: Dataset, gaussians: Gaussians, view_bytes: int, most: int
+    config: FitConfig,
+    dataset: Dataset,
+    gaussians: Gaussians,
+    view_bytes: int,
+    most: int,
+    share: Share = ALONE,
 ) -> int:
     """Bytes of targets that may stay on the device, at most ``most``.
 
     view_bytes: see :func:`estimate`. Raises :class:`UserError` where the fit would not fit into
     memory.
     """
-    memory = estimate(config, dataset, gaussians, view_bytes)
-    usable = round(USABLE * (available_memory() + resident_memory()))
+    memory = estimate(config, dataset, gaussians, view_bytes, share=share)
+    usable = round(USABLE * (available_memory() / share.on_machine + resident_memory()))
     if memory.needed > usable:
-        raise UserError(_refusal(config, dataset, gaussians, memory, usable))
+        raise UserError(_refusal(config, dataset, gaussians, memory, usable, share))
     return memory.room_for_targets(usable, most)
 
 
 def _refusal(
-    config: FitConfig, dataset: Dataset, gaussians: Gaussians, memory: FitMemory, usable: int
+    config: FitConfig,
+    dataset: Dataset,
+    gaussians: Gaussians,
+    memory: FitMemory,
+    usable: int,
+    share: Share,
 ) -> str:
     start, train = gaussians.num_gaussians, dataset.train
     count = most_gaussians(config, start)
     parts = [
         f"{readable(memory.photographs)} for {len({*train, *dataset.test}):,} photographs",
-        f"{readable(memory.gaussians)} for {count:,} Gaussians",
+        f"{readable(memory.gaussians)} for {_part(share)}{count:,} Gaussians",
         f"{readable(memory.splats + memory.pixels)} for a picture of them",
     ]
     width = max(view.width for view in train)
 
     def fits(config: FitConfig, scale: float = 1.0) -> bool:
-        return estimate(config, dataset, gaussians, 0, scale).needed <= 0.95 * usable
+        return estimate(config, dataset, gaussians, 0, scale, share).needed <= 0.95 * usable
 
     shares = [0.95**k for k in range(1, 100)]
     fewer = (_rounded(share * count) for share in shares if share * count > start)
@@ -221,10 +243,15 @@ def _refusal(
     remedies = [f"densify.max_gaussians={most}"] if most else []
     remedies += [f"data.image_size={size}"] if size else []
     advice = f"set {' or '.join(remedies)}" if remedies else "use fewer views and Gaussians"
+    who = "the fit" if share == ALONE else "a process of the fit"
     return (
-        f"memory: the fit needs about {readable(memory.needed)} ({', '.join(parts)}), and "
+        f"memory: {who} needs about {readable(memory.needed)} ({', '.join(parts)}), and "
         f"may take {readable(usable)}, nine tenths of what is available; {advice}"
     )
+
+
+def _part(share: Share) -> str:
+    return "" if share.processes == 1 else f"1/{share.processes} of "
 
 
 def _with_at_most(config: FitConfig, most: int) -> FitConfig:

@@ -32,7 +32,7 @@ from drgs.training.density.strategy import DensityReport, DensityStrategy, Popul
 from drgs.training.effects.called_for import integrator_settings, training_effects
 from drgs.training.finite_checks import GradientWatch, check_values, check_view_values
 from drgs.training.losses import PhotometricLoss, Target
-from drgs.training.memory import room_for_targets
+from drgs.training.memory import ALONE, Share, room_for_targets
 from drgs.training.optimizer import (
     make_optimizer,
     optimizer_state,
@@ -105,10 +105,9 @@ class Trainer:
 
     def __init__(self, config: FitConfig, dataset: Dataset, gaussians: Gaussians) -> None:
         config = completed(config, dataset)
-        self.config, self.extent = config, dataset.extent
+        self.config, self.dataset, self.extent = config, dataset, dataset.extent
         self.effects = training_effects(config, dataset)
-        view_bytes = bytes_on_device(self.effects)
-        room = room_for_targets(config, dataset, gaussians, view_bytes, KEPT_BYTES)
+        room = self._room(gaussians)
         settings = integrator_settings(self.effects)
         self.scene = make_scene(gaussians, config.model, dataset.background, **settings)
         self.integrator = self.scene.integrator()
@@ -132,6 +131,11 @@ class Trainer:
         self._not_gathered: SeenStep | None = None
         self.watch = GradientWatch()
         self.iteration = 0
+
+    def _room(self, gaussians: Gaussians, share: Share = ALONE) -> int:
+        """Bytes of targets that may stay on the device."""
+        of_pixel, most = bytes_on_device(self.effects), KEPT_BYTES
+        return room_for_targets(self.config, self.dataset, gaussians, of_pixel, most, share)
 
     def _population(self) -> Population:
         return Population(self.optimizer, PREFIX, self.extent, self.config.seed)
@@ -425,6 +429,19 @@ class Trainer:
         self.params.update(self.optimizer)
         for effect in self.effects:
             effect.finish(self)
+
+    def another(self, config: FitConfig, gaussians: Gaussians) -> Trainer:
+        """A trainer with the same photographs; config: that of another fit."""
+        return Trainer(config, self.dataset, gaussians)
+
+    def take_over(self, former: Trainer) -> None:
+        """Begin behind the iterations of another trainer, with what its effects have found."""
+        before, views_per_step = former.config.iterations, former.config.optimizer.views_per_step
+        self.iteration = -(-before // views_per_step) * views_per_step  # a step begins behind it
+        found = {effect.name: effect.state() for effect in former.effects}
+        for effect in self.effects:
+            effect.repopulated(self)
+            effect.restore(found[effect.name])
 
     def retire(self) -> None:
         """Free what only further iterations need, of which there will be none: targets, moments.

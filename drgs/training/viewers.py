@@ -31,7 +31,7 @@ from drgs.config.changes import changed
 from drgs.config.schema import FitConfig, ModelConfig
 from drgs.core.errors import UserError, UserNote
 from drgs.core.memory import release_unused_memory
-from drgs.data.types import Dataset, View
+from drgs.data.types import View
 from drgs.effects.smoothing import baked
 from drgs.effects.viewers import baked_for_viewers
 from drgs.gaussians.parameters import Gaussians
@@ -86,7 +86,6 @@ def num_iterations(config: FitConfig) -> int:
 
 def for_viewers(
     trainer: Trainer,
-    dataset: Dataset,
     gaussians: Gaussians,
     watch: Callable[[int], None] = lambda done: None,
 ) -> ForViewers:
@@ -106,25 +105,20 @@ def for_viewers(
     trainer.retire()
     further = tuning(config)
     try:
-        tuned = _tuned(Trainer(further, dataset, start), trainer, watch)
+        tuned = _tuned(trainer.another(further, start), trainer, watch)
     except UserError as error:  # numbers that are not finite, or too little memory by now
         note = f"the Gaussians for viewers are not fitted any further: {error}"
         warnings.warn(UserNote(note), stacklevel=2)
         tuned = start
     release_unused_memory()  # of what those iterations had
     gaussians = replace(tuned, rendered_with=said)
-    return ForViewers(gaussians, further.model, dataset.background, trainer.effects)
+    return ForViewers(gaussians, further.model, trainer.dataset.background, trainer.effects)
 
 
 def _tuned(tuner: Trainer, trainer: Trainer, watch: Callable[[int], None]) -> Gaussians:
     """After the iterations that follow those of ``trainer``."""
-    views_per_step = trainer.config.optimizer.views_per_step
     before = trainer.config.iterations
-    tuner.iteration = -(-before // views_per_step) * views_per_step  # a step begins behind it
-    found = {effect.name: effect.state() for effect in trainer.effects}
-    for effect in tuner.effects:
-        effect.repopulated(tuner)
-        effect.restore(found[effect.name])
+    tuner.take_over(trainer)
     while tuner.iteration < tuner.config.iterations:
         if tuner.step().passes(tuner.config.output.history_every):
             tuner.check_iterations()
@@ -147,13 +141,14 @@ def tuning(config: FitConfig) -> FitConfig:
     before = config.iterations
     total = before + num_iterations(config)
     kept = {"max_gaussians": config.densify.max_gaussians}
+    views_per_step = config.optimizer.views_per_step  # which processes may share
     changes = {
         **{f"model.{name}": _as_configured(name) for name in DECLARED},
         "model.smoothing": False,
         "iterations": total,
         "coarse": [],
         "densify": {"strategy": "adc", "start": 0, "stop": 1, **kept},  # never changes
-        "optimizer": {**RATES, "decay_from": before / total},
+        "optimizer": {**RATES, "decay_from": before / total, "views_per_step": views_per_step},
         **{f"cameras.{name}_lr": 0.0 for name in ("rotation", "translation", "focal", "principal")},
     }
     if config.colors.lr is not None:

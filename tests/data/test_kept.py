@@ -126,7 +126,7 @@ def test_photographs_that_do_not_fit_are_refused_before_they_are_read(photograph
     monkeypatch.setattr(images, "available_memory", lambda: 1488)
     check_room(files, None)
     monkeypatch.setattr(images, "available_memory", lambda: 1487)
-    monkeypatch.setattr(reader, "read_pixels", None)
+    monkeypatch.setattr(reader, "READ", None)
     message = (
         f"{photographs / 'images'}: 10 photographs take 1 kB of memory as they are kept, and 1 kB "
         "are available; set data.image_size=2, or use fewer of them"

@@ -4,7 +4,10 @@ import csv
 import json
 import os
 import random
+import shutil
 import signal
+import subprocess
+import sys
 import time
 
 import pytest
@@ -14,6 +17,7 @@ CONFIG = """
 data: {{path: {data}, image_size: 50}}
 iterations: {iterations}
 init: {{num_points: 300}}
+model: {{antialiased: true}}
 optimizer: {{views_per_step: {views}}}
 densify: {{budget: {{gaussians: 600}}}}
 output: {{report: false, save_renders: false, checkpoint_every: 20, history_every: 20}}
@@ -40,7 +44,8 @@ def command(*words):
 def result(folder):
     with (folder / "history.csv").open(newline="") as file:
         rows = [{k: v for k, v in row.items() if k != "wall_s"} for row in csv.DictReader(file)]
-    return (folder / "point_cloud.ply").read_bytes(), rows
+    names = ("point_cloud.ply", "point_cloud_viewers.ply")
+    return [(folder / name).read_bytes() for name in names], rows
 
 
 def test_a_fit_that_is_shared_and_resumed_by_others_is_the_same(config, tmp_path):
@@ -107,3 +112,37 @@ def test_a_process_that_dies_takes_the_others_along(config, tmp_path, seed):
         time.sleep(0.1)
     assert together.run(2, command("--resume", out))[0] == 0
     assert (out / "metrics.json").exists()
+
+
+ON_A_SMALL_DISK = """
+disk=$1 kept=$2
+shift 2
+mount -t tmpfs -o size=600k none "$disk" || exit 77
+"$@"
+status=$?
+cp -r "$disk" "$kept"
+exit $status
+"""
+
+
+@pytest.mark.slow
+def test_a_full_disk_ends_all_and_others_go_on(config, tmp_path):
+    """One checkpoint has room, and not another one beside it, as it is written."""
+    if os.geteuid() != 0 or shutil.which("unshare") is None:
+        pytest.skip("only root can mount a small disk")
+    path, disk, kept = config(iterations=800), tmp_path / "disk", tmp_path / "kept"
+    disk.mkdir()
+    words = [together.mpiexec(), "-n", "2", sys.executable, *command(path, "--out", disk / "out")]
+    done = subprocess.run(
+        ["unshare", "--mount", "sh", "-c", ON_A_SMALL_DISK, "-", disk, kept, *words],
+        cwd=together.REPOSITORY,
+        env=together.environment(),
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+    if done.returncode == 77:
+        pytest.skip("no small disk can be mounted")
+    assert done.returncode == 2
+    assert done.stderr.count("error: ") == 1 and "No space left" in done.stderr
+    assert together.run(3, command("--resume", kept / "out"))[0] == 0

@@ -177,6 +177,25 @@ def test_targets_get_what_is_left(available):
     assert room(config, dataset, most=3) == 3
 
 
+def test_processes_share_gaussians_and_the_memory_of_their_machine(available):
+    """Four of them, on two machines: a quarter of the Gaussians, in half of a machine."""
+    config, dataset = config_of(10_000, 10**6), dataset_of(400, 400, 20)
+    gaussians, share = start_of(10_000), memory.Share(processes=4, on_machine=2)
+    alone = estimated(config, dataset)
+    shared = memory.estimate(config, dataset, gaussians, TARGET_BYTES, share=share)
+    assert shared.gaussians == pytest.approx(alone.gaussians / 4, abs=1)
+    assert (shared.splats, shared.pixels) == (alone.splats, alone.pixels)
+    assert shared.needed < alone.needed / 1.5
+    for factor, fits in ((2.1, True), (1.9, False)):
+        available(factor * shared.needed)
+        arguments = config, dataset, gaussians, TARGET_BYTES, GB, share
+        if fits:
+            memory.room_for_targets(*arguments)
+            continue
+        with pytest.raises(UserError, match=r"a process of the fit needs .* for 1/4 of 1,000,000"):
+            memory.room_for_targets(*arguments)
+
+
 def test_a_fit_that_does_not_fit_is_refused_with_numbers_and_remedies(available):
     """What is advised is enough, and a quarter more are too many."""
     config, dataset = config_of(10_000, 10**6), dataset_of(400, 400, 20)

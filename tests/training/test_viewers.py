@@ -45,7 +45,7 @@ def test_iterations_bring_viewers_nearer_to_the_photographs(monkeypatch):
     before = list(trainer.pictures(dataset.test))
     closed = viewers._started(trainer, gaussians)
     counted = []
-    found = for_viewers(trainer, dataset, gaussians, counted.append)
+    found = for_viewers(trainer, gaussians, counted.append)
     assert counted == list(range(1, 21))
     as_it_is, in_closed_form, tuned = (
         shown_by_viewers(g, dataset) for g in (gaussians, closed, found.gaussians)
@@ -64,18 +64,18 @@ def test_iterations_bring_viewers_nearer_to_the_photographs(monkeypatch):
 
 def test_the_same_fit_gives_the_same_bytes(tmp_path):
     for name in ("a.ply", "b.ply"):
-        trainer, dataset, gaussians = ended_fit(8)
-        for_viewers(trainer, dataset, gaussians).gaussians.save(tmp_path / name)
+        trainer, _, gaussians = ended_fit(8)
+        for_viewers(trainer, gaussians).gaussians.save(tmp_path / name)
     assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()
 
 
 def test_what_a_fit_found_out_of_cameras_and_colours_stays():
     """Its rates are next to nothing; the views to measure are those of the refined cameras."""
     changes = {"cameras.optimise": True, "cameras.rotation_lr": 1e-3, "colors.lr": 0.02}
-    trainer, dataset, gaussians = ended_fit(8, **changes)
+    trainer, _, gaussians = ended_fit(8, **changes)
     before = {effect.name: effect.values() for effect in trainer.effects}
     tuners = []
-    found = for_viewers(trainer, dataset, gaussians, lambda done: tuners.append(done))
+    found = for_viewers(trainer, gaussians, lambda done: tuners.append(done))
     assert len(tuners) == num_iterations(trainer.config) == 1
     for effect in found.effects:
         for name, values in effect.values().items():
@@ -85,7 +85,7 @@ def test_what_a_fit_found_out_of_cameras_and_colours_stays():
 
 
 def test_numbers_that_are_not_finite_leave_the_closed_form(monkeypatch):
-    trainer, dataset, gaussians = ended_fit(8)
+    trainer, _, gaussians = ended_fit(8)
     expected = viewers._started(trainer, gaussians)
     monkeypatch.setitem(viewers.RATES, "scales_lr", 10.0)
     monkeypatch.setattr(viewers, "SHARE", 0.5)
@@ -98,7 +98,7 @@ def test_numbers_that_are_not_finite_leave_the_closed_form(monkeypatch):
 
     monkeypatch.setattr(Trainer, "step", step_and_break)
     with pytest.warns(UserNote, match="for viewers are not fitted any further"):
-        found = for_viewers(trainer, dataset, gaussians)
+        found = for_viewers(trainer, gaussians)
     np.testing.assert_array_equal(found.gaussians.log_scales, expected.log_scales)
 
 

@@ -1,0 +1,78 @@
+"""How the pictures of a view are read, or left to others.
+
+Of several processes that fit together, each reads the photographs of the views that it renders. Of
+the others it knows the sizes, from the headers of their files.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from drgs.config.schema import DataConfig
+from drgs.data.extras import extras_of, files_of
+from drgs.data.images import downscaled_size, kept_photograph
+from drgs.data.kept import KeptPicture, Pixels
+from drgs.data.transforms import Frame
+from drgs.data.types import View
+from drgs.io.pictures import read_pixels, stored_shape
+
+ViewPictures = dict[str, Pixels | None]
+"""``image``, ``alpha``, ``mask`` and ``depth`` of a :class:`drgs.data.types.View`."""
+
+
+@dataclass(frozen=True)
+class Reading:
+    """What becomes of a photograph's file, and of what belongs to it."""
+
+    pixels: Callable[[Path], np.ndarray]  # (H, W, C), as it is stored
+    pictures: Callable[[DataConfig, Frame, Path, np.ndarray], ViewPictures]
+
+
+def _read(config: DataConfig, frame: Frame, file: Path, pixels: np.ndarray) -> ViewPictures:
+    """pixels: of ``file``, upright."""
+    del file
+    height, width = pixels.shape[:2]
+    image, alpha = kept_photograph(pixels, config.background_rgb, config.image_size)
+    return {"image": image, "alpha": alpha, **extras_of(config, frame, (width, height))}
+
+
+def _sized_pixels(file: Path) -> np.ndarray:
+    """An array of that shape, which takes no memory and shows nothing."""
+    width, height, channels, _ = stored_shape(file)
+    return np.broadcast_to(np.uint8(0), (height, width, channels))
+
+
+def _sized(config: DataConfig, frame: Frame, file: Path, pixels: np.ndarray) -> ViewPictures:
+    """Pictures that refuse to become numbers."""
+    height, width, channels = pixels.shape
+    new_width, new_height = downscaled_size(width, height, config.image_size)
+
+    files, plane = files_of(config, frame, file), _unread((new_height, new_width), file)
+    return {
+        "image": _unread((new_height, new_width, 3), file),
+        "alpha": plane if channels == 4 else None,
+        "mask": plane if "mask" in files else None,
+        "depth": plane if "depth" in files else None,
+    }
+
+
+def without_pictures(view: View) -> View:
+    """The view as if others had read its pictures."""
+    there = {name: getattr(view, name) for name in ("image", "alpha", "mask", "depth")}
+    unread = {name: _unread(p.shape, view.name) for name, p in there.items() if p is not None}
+    return replace(view, **unread)
+
+
+def _unread(shape: tuple[int, ...], name: object) -> KeptPicture:
+    def refuse() -> np.ndarray:
+        raise RuntimeError(f"{name}: another process has its picture")
+
+    return KeptPicture(shape, refuse, nbytes=0)
+
+
+READ = Reading(read_pixels, _read)
+SIZES_ALONE = Reading(_sized_pixels, _sized)
