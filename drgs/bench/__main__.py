@@ -21,6 +21,7 @@ COMMANDS = {
     "population": "how many Gaussians the reference recipe keeps, by picture size and rule; hours",
     "photographs": "fits with cameras as they are, undistorted, found again; an hour",
     "processes": "steps of one process and of several, and what exchanging takes",
+    "cluster": "what machines on a network would make of a fit: a model, measured and predicted",
     "batches": "what larger steps cost in quality for as many views: 1 to 16 views a step; an hour",
     "recipes": "what each part of the recipe is worth: alone, and taken out of the whole; hours",
 }

@@ -123,16 +123,21 @@ def trainer_of(
     """
     view = replace(view_of(scene), **extras)
     dataset = Dataset((view,), (view,), "bench", (1.0, 1.0, 1.0), None, "bench")
-    model = ModelConfig(sh_degree=scene.gaussians.sh_degree, sh_increase_every=1).of_file()
-    config = FitConfig(
+    config = bench_config(scene.gaussians)
+    trainer = Trainer(changed(config, changes), dataset, scene.gaussians)
+    trainer.iteration = 10  # all SH degrees are in use
+    return trainer
+
+
+def bench_config(gaussians: Gaussians) -> FitConfig:
+    """Of a fit of these Gaussians that renders as 3DGS does and leaves the population as it is."""
+    model = ModelConfig(sh_degree=gaussians.sh_degree, sh_increase_every=1).of_file()
+    return FitConfig(
         data={"path": "."},
         model=model.model_dump(),
         densify={"start": 1_000_000, "stop": 1_000_001, "reset_every": 1_000_000},
         iterations=2_000_000,
     )
-    trainer = Trainer(changed(config, changes), dataset, scene.gaussians)
-    trainer.iteration = 10  # all SH degrees are in use
-    return trainer
 
 
 def stress_scene(size: int, seed: int = 0) -> tuple[Gaussians, list[reference.Camera]]:

@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 from mpi4py import MPI
 
-SPINS, LONGEST_NAP = 50, 2e-4
-"""Questions without a pause, for answers that are nearly there; seconds between later ones."""
+SPINS, LONGEST_NAP = 50, 1e-3
+"""Questions without a pause, for answers that are nearly there; seconds between much later ones."""
 
 
 @dataclass
