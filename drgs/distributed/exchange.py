@@ -70,6 +70,7 @@ class Sight:
     layout: Layout
     float_type: type
     num_rows: int  # of this process
+    of_camera: bool  # whether derivatives with respect to the camera are asked for
     rows: Any  # UInt32 (M,): those on the film, ascending
     count: int  # M
     _blocks: Blocks  # of these rows
@@ -81,7 +82,7 @@ class Sight:
         return blocks
 
     @staticmethod
-    def of(gaussians: Gaussians, camera: Camera, pipeline: Pipeline) -> Sight:
+    def of(gaussians: Gaussians, camera: Camera, pipeline: Pipeline, of_camera: bool) -> Sight:
         """Project, and pack what is on the film. The host reads how many there are."""
         found = footprints_seen_by(gaussians, camera, pipeline)
         layout = Layout(found.rows.width, found.num_features, found.num_keys)
@@ -95,7 +96,8 @@ class Sight:
             dr.eval(boxes, stored, depths)
             flat = [*boxes.blocks, *stored.blocks, depths]
             blocks = [each.numpy().reshape(count, -1) for each in flat]
-        return Sight(camera, pipeline, layout, t.Float, num_rows, rows, count, blocks)
+        kind = layout, t.Float, num_rows, of_camera
+        return Sight(camera, pipeline, *kind, rows, count, blocks)
 
     def of_rows(self, blocks: Blocks, width: int) -> list[Any]:
         """Columns of all rows of this process, of numbers of those on the film; else 0."""
@@ -188,15 +190,12 @@ class Received:
     def gradients(
         self, gaussians: Gaussians, frame: Frame, of_splats: SplatGradients, of_camera: bool
     ) -> GaussianGradients:
-        """Keep them, for those who have projected the splats."""
-        del gaussians, frame
-        if of_camera:
-            raise NotImplementedError("Received: derivatives with respect to cameras")
+        """Keep them, for those who have projected the splats, and find those of the camera."""
+        del gaussians, frame, of_camera
         self.gradients_in_time.append(of_splats)
         t = types_of(type(of_splats.geometry[0]))
-        visible = dr.full(t.Bool, True, dr.width(of_splats.geometry[0]))
-        nothing = t.UInt32(NO_FAULT)
-        return GaussianGradients(None, of_splats.means2d, visible, nothing)
+        nothing = dr.zeros(t.Array2f), t.Bool(False), t.UInt32(NO_FAULT)  # here; at any time
+        return GaussianGradients(None, *nothing)
 
     def blocks(self) -> list[Blocks]:
         """Of each time the derivatives of its splats; waits for the device."""

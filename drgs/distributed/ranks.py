@@ -98,16 +98,18 @@ class Ranks:
         self.times.sent_bytes += rows.nbytes * (self.size - 1)
         return found
 
-    def rows_on_first(self, rows: np.ndarray) -> np.ndarray | None:
-        """The same on the first rank alone; None on the others."""
+    def rows_on(self, rank: int, rows: np.ndarray) -> np.ndarray | None:
+        """The same on one rank alone; None on the others."""
         rows = np.ascontiguousarray(rows)
         counts = self.told(np.array(len(rows)))
-        found = None
-        if self.is_first:
+        found = into = None
+        if rank == self.rank:
             found = np.empty((int(counts.sum()), *rows.shape[1:]), rows.dtype)
-        sizes = counts * _row_bytes(rows)
-        into = _parts(found, sizes) if self.is_first else None
-        wait(self.comm.Igatherv(_bytes(rows), into))
+            into = _parts(found, counts * _row_bytes(rows))
+        else:
+            self.times.sent_bytes += rows.nbytes
+        with self.exchanging():
+            wait(self.comm.Igatherv(_bytes(rows), into, root=rank))
         return found
 
     def rows_from_first(self, rows: np.ndarray | None, like: np.ndarray) -> np.ndarray:

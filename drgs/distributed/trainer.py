@@ -26,7 +26,7 @@ import numpy as np
 
 from drgs.cameras.camera import cameras_in_time
 from drgs.config.schema import FitConfig
-from drgs.core.arrays import block_widths
+from drgs.core.arrays import block_widths, from_host
 from drgs.core.errors import UserError
 from drgs.data.types import Dataset
 from drgs.distributed.exchange import (
@@ -42,9 +42,13 @@ from drgs.distributed.shards import Shard, SpreadPopulation, renderer_of
 from drgs.effects.compose import composed, ignoring
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 from drgs.integrator.sensors import camera_from_sensor, read_sensor
+from drgs.integrator.view import accumulate_in_sensor
 from drgs.splatting.rendering import (
     NO_FAULT,
     Frame,
+    SeenSplats,
+    gradients_by_row,
+    sum_of_gradients,
     weighted_sums,
 )
 from drgs.training.deferred import VIEWS_AT_ONCE
@@ -79,12 +83,6 @@ class DistributedTrainer(Trainer):
         self._at_start: Gaussians | None = gaussians
         super().__init__(config, dataset, self.shard.of(gaussians))
         self._at_start = None
-        for effect in self.effects:
-            if not effect.shares_rendering:
-                raise UserError(
-                    f"{effect.name}: one process alone can fit with what this section of the "
-                    "configuration asks for; leave it out, or run without mpiexec"
-                )
 
     def _room(self, gaussians: Gaussians, share: Share = ALONE) -> int:
         """See :meth:`Trainer._room`: pictures show the Gaussians of all processes."""
@@ -167,13 +165,18 @@ class DistributedTrainer(Trainer):
 
     def _sights(self, iteration: int) -> list[Sight]:
         """What the view's camera sees of the rows of this process, at each time."""
-        sensor = self.view_at(iteration).sensor
+        view = self.view_at(iteration)
+        for effect in self.effects:
+            if effect.moves_sensors:
+                effect.before(self, view)
+        sensor = view.sensor
+        of_camera = read_sensor(sensor, self.integrator.near).is_attached
         with dr.suspend_grad():
             state = read_sensor(sensor, self.integrator.near)
             camera = ignoring(camera_from_sensor(state), self.integrator.ignore)
             gaussians, pipeline = dr.detach(self.integrator.gaussians), self.integrator.pipeline
             return [
-                Sight.of(gaussians, of_time, composed(pipeline, gaussians, of_time))
+                Sight.of(gaussians, of_time, composed(pipeline, gaussians, of_time), of_camera)
                 for of_time in cameras_in_time(camera)
             ]
 
@@ -244,19 +247,48 @@ class DistributedTrainer(Trainer):
         iterations = self.iterations_of_step
         for first in range(0, len(iterations), VIEWS_AT_ONCE):
             places, waiting = range(len(iterations))[first : first + VIEWS_AT_ONCE], []
+            means2d = {}
             for place in places:
                 width = sights[place][0].layout.num_gradients
                 self.iteration = iterations[place]
                 arrived = self.receive_of_rows(sights[place], place, width)
-                seen = [sight.seen_splats(blocks) for sight, blocks in arrived]
-                waiting.append(Waiting(self.iteration, [losses[place]], seen, None))
+                seen, fault = [sight.seen_splats(blocks) for sight, blocks in arrived], None
+                means2d[place] = reduce(operator.add, (each.gradients.means2d for each in seen))
+                if sights[place][0].of_camera:
+                    fault, seen = self._add_with_camera(seen), []
+                waiting.append(Waiting(self.iteration, [losses[place]], seen, fault))
             self._add(waiting)
             for place, view in zip(places, waiting, strict=True):
                 self.iteration = view.iteration
                 if self.density.gathers(view.iteration):
-                    means2d = reduce(operator.add, (each.gradients.means2d for each in view.seen))
-                    own = counts[place], means2d, pictures.get(place)
+                    own = counts[place], means2d[place], pictures.get(place)
                     self.density.gather(SharedStep(self, place, sights[place], *own))
+
+    def _add_with_camera(self, seen: Sequence[SeenSplats]) -> Any:
+        """Of the rows of this process, from one view; returns its first fault.
+
+        What rows add to the derivatives of its camera is summed by the process that renders it, as
+        if it had them all.
+        """
+        renderer = self.renderer_of(self.iteration)
+        with dr.suspend_grad():
+            gaussians, found, of_cameras = dr.detach(self.integrator.gaussians), [], []
+            for each in seen:
+                of_view, of_rows = gradients_by_row(
+                    gaussians, each.camera, each.pipeline, each.gradients, of_camera=True
+                )
+                found.append(of_view)
+                of_all = self.ranks.rows_on(renderer, np.stack([*map(np.array, of_rows)], axis=1))
+                if of_all is not None:
+                    sums = [dr.sum(from_host(type(of_rows[0]), column)) for column in of_all.T]
+                    of_cameras.append(sums)
+            total = reduce(sum_of_gradients, found)
+            with dr.resume_grad():
+                self.integrator.accumulate(self.scene, total.parameters)
+        if of_cameras:
+            state = read_sensor(self.view.sensor, self.integrator.near)
+            accumulate_in_sensor(self.integrator, state, of_cameras)
+        return total.first_fault
 
     def _watch(self, iteration: int, loss: Any, first_fault: Any) -> None:
         """See :meth:`Trainer._watch`; rows are counted over all processes."""
@@ -274,7 +306,7 @@ class DistributedTrainer(Trainer):
         columns = {name: getattr(own, name) for name in (*PARAMETER_NAMES, "smoothing")}
         found = {}
         for name, rows in columns.items():
-            of_all = None if rows is None else self.ranks.rows_on_first(rows)
+            of_all = None if rows is None else self.ranks.rows_on(0, rows)
             found[name] = rows if of_all is None else of_all
         return Gaussians(**found)
 
@@ -308,7 +340,7 @@ class DistributedTrainer(Trainer):
         state = super().state()
         for name in filter(self._is_by_row, state):
             array = state[name]
-            rows = self.ranks.rows_on_first(array.reshape(self.population.num_own, -1))
+            rows = self.ranks.rows_on(0, array.reshape(self.population.num_own, -1))
             if rows is not None:
                 shape = (-1,) if array.ndim == 1 else (self.num_gaussians, *array.shape[1:])
                 state[name] = rows.reshape(shape)

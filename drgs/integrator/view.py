@@ -101,9 +101,9 @@ class View:
         with dr.resume_grad():
             if of_background:
                 dr.accum_grad(self.integrator.background, d_constant)
-            if of_camera:
-                numbers = [camera.numbers() for camera in self._attached_cameras(state)]
-                _accumulate_through(numbers, [gradients.camera for gradients in by_time])
+            of_cameras = [gradients.camera for gradients in by_time if gradients.camera]
+            if of_cameras:
+                accumulate_in_sensor(self.integrator, state, of_cameras)
         return reduce(rendering.sum_of_gradients, by_time)
 
     def channels(self, planes: Planes, constant: mi.Color3f | None) -> Passes:
@@ -242,8 +242,7 @@ class View:
 
     def _attached_cameras(self, state: SensorState) -> list[Camera]:
         """The same, attached to the sensor's parameters."""
-        dr.make_opaque(state.device)  # or each value of a literal would be a new kernel
-        return cameras_in_time(ignoring(state.make(state), self.integrator.ignore))
+        return _attached_cameras(self.integrator, state)
 
     def _camera_tangents(self, count: int) -> list[list[mi.Float] | None]:
         """Of each time's camera, derivatives of its numbers along those set on the sensor."""
@@ -327,6 +326,22 @@ def accumulate(parameter: Any, gradient: Any) -> None:
     """Add to a parameter's gradient, if it has one."""
     if dr.width(parameter) > 0 and dr.grad_enabled(parameter):
         dr.accum_grad(parameter, gradient)
+
+
+def accumulate_in_sensor(
+    integrator: SplatsSettings, state: SensorState, gradients: list[list[Any]]
+) -> None:
+    """Accumulate derivatives of a sensor's cameras into what its parameters were computed from.
+
+    state: attached; gradients: by time, of ``Camera.numbers()``.
+    """
+    numbers = [camera.numbers() for camera in _attached_cameras(integrator, state)]
+    _accumulate_through(numbers, gradients)
+
+
+def _attached_cameras(integrator: SplatsSettings, state: SensorState) -> list[Camera]:
+    dr.make_opaque(state.device)  # or each value of a literal would be a new kernel
+    return cameras_in_time(ignoring(state.make(state), integrator.ignore))
 
 
 def _accumulate_through(values: list[list[Any]], gradients: list[list[mi.Float]]) -> None:

@@ -236,7 +236,7 @@ class GaussianGradients:
     means2d: Any  # Array2f (N,): loss per px
     visible: Any  # Bool (N,): the Gaussian's extent touches the film
     first_fault: Any  # UInt32 (1,): of ``parameters``, see :func:`decode_fault`
-    camera: list[Any] | None = None  # Float (1,): of ``camera.numbers()``, where asked for
+    camera: list[Any] | None = None  # Float (1,): of ``camera.numbers()``, where found here
 
 
 def render(gaussians: Gaussians, camera: Camera, pipeline: Pipeline) -> Frame:
@@ -321,17 +321,35 @@ def gradients_of(
 
     As :func:`frames_adjoint`; ``visible`` is what projection says, without regard to the film.
     """
+    found, of_rows = gradients_by_row(gaussians, camera, pipeline, of_splats, of_camera)
+    # In an order that is the same in every run.
+    return replace(found, camera=[dr.sum(each) for each in of_rows]) if of_camera else found
+
+
+def gradients_by_row(
+    gaussians: Gaussians,
+    camera: Camera,
+    pipeline: Pipeline,
+    of_splats: SplatGradients,
+    of_camera: bool,
+) -> tuple[GaussianGradients, list[Any]]:
+    """As :func:`gradients_of`, with what each Gaussian adds to the derivatives of the camera.
+
+    These are evaluated: Float (N,) of each of ``camera.numbers()``, none if not ``of_camera``.
+    """
     rows = load_rows(gaussians, pipeline.sh_degree)
     d_rows, visible, d_numbers = _back_to_rows(rows, camera, pipeline, of_splats, of_camera)
     columns = _columns_of(d_rows, gaussians, visible)
     parameters, (faults,) = _as_tensors(columns, gaussians, [_faults(d_rows, visible)])
-    return GaussianGradients(
+    of_rows = [dr.select(visible, number, 0) for number in d_numbers]
+    dr.eval(of_rows)
+    found = GaussianGradients(
         parameters=parameters,
         means2d=of_splats.means2d,
         visible=visible,
         first_fault=dr.min(faults),
-        camera=_sums(d_numbers, visible) if of_camera else None,
     )
+    return found, of_rows
 
 
 @dataclass(frozen=True)
@@ -396,13 +414,6 @@ def _back_to_rows(
         dr.traverse(dr.ADMode.Backward)
         d_rows = dr.grad(replace(rows, smoothing=None))
         return d_rows, dr.detach(splats.visible), [dr.grad(number) for number in numbers]
-
-
-def _sums(columns: list[Any], visible: Any) -> list[Any]:
-    """Over the Gaussians that are visible, in an order that is the same in every run."""
-    columns = [dr.select(visible, column, 0) for column in columns]
-    dr.eval(columns)
-    return [dr.sum(column) for column in columns]
 
 
 def weighted_sums(frame: Frame, plane: Any) -> Any:

@@ -103,7 +103,28 @@ def test_all_processes_say_which_number_is_none():
     assert together.said_of(3, 17) == expected
 
 
+REFINED = {
+    "cameras__optimise": True,
+    "cameras__start": 5,
+    "cameras__rotation_lr": 1e-3,
+    "cameras__focal_lr": 1e-3,
+    "cameras__principal_lr": 1e-3,
+    **STRATEGIES["adc"],
+}
+
+
+def test_cameras_that_are_refined():
+    """What Gaussians of all processes add to the derivatives of a camera is summed in one place."""
+    assert_the_same(settings(**REFINED), [3])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("data", ["plain", "blurred"])
+def test_cameras_that_are_refined_by_one_to_four_processes(data):
+    assert_the_same(settings(**REFINED), [1, 2, 4], data=data)
+
+
 @pytest.mark.slow
 def test_cameras_of_which_some_move():
     """A view that is blurred is projected at several times, and others once."""
-    assert_the_same(settings(), [2, 3], steps=3, data="blurred")
+    assert_the_same(settings(**STRATEGIES["adc"]), [2, 3], data="blurred")

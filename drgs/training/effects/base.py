@@ -66,7 +66,6 @@ class TrainingEffect(Protocol):
     aovs = ""  # what the integrator has to put out besides colour
     upload_bytes = 0  # of a pixel: what it uploads of a view's pictures, at most
     by_row: frozenset[str] = frozenset()  # names in its state that have a row for each Gaussian
-    shares_rendering = True  # whether the processes of a fit may render its views apart
 
     def upload(self, view: View) -> Any:
         """What the effect needs of a view, on the device: see ``TrainingView.uploads``."""

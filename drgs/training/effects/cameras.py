@@ -51,7 +51,6 @@ class CameraRefinement(TrainingEffect):
 
     name = "cameras"
     moves_sensors = True
-    shares_rendering = False  # its derivatives are sums over all Gaussians
 
     def __init__(self, config: CamerasConfig, num_views: int, extent: float) -> None:
         """num_views: of the training split; extent: world units."""
