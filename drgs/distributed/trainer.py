@@ -169,11 +169,10 @@ class DistributedTrainer(Trainer):
         for effect in self.effects:
             if effect.moves_sensors:
                 effect.before(self, view)
-        sensor = view.sensor
-        of_camera = read_sensor(sensor, self.integrator.near).is_attached
+        state = read_sensor(view.sensor, self.integrator.near)
+        of_camera = state.is_attached
         with dr.suspend_grad():
-            state = read_sensor(sensor, self.integrator.near)
-            camera = ignoring(camera_from_sensor(state), self.integrator.ignore)
+            camera = ignoring(camera_from_sensor(state.detached()), self.integrator.ignore)
             gaussians, pipeline = dr.detach(self.integrator.gaussians), self.integrator.pipeline
             return [
                 Sight.of(gaussians, of_time, composed(pipeline, gaussians, of_time), of_camera)
