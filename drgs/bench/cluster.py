@@ -292,7 +292,8 @@ def run(args: argparse.Namespace) -> None:
 
 def _compare(task: Task, costs: Costs, args: argparse.Namespace) -> None:
     cores = len(os.sched_getaffinity(0))  # networks are Linux's
-    crowding = crowding_of(costs, task, cores)
+    is_crowded = 1 < cores <= max(CHECKED_PROCESSES)
+    crowding = crowding_of(costs, task, cores) if is_crowded else 1.0
     checks = [
         checked(costs, task, k, rate, crowding * k / cores if k >= cores > 1 else 1.0)
         for rate in CHECKED_RATES

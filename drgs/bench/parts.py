@@ -65,7 +65,6 @@ class Part:
 class Measured:
     """Medians of steps, on the first process."""
 
-    views: int  # of a step
     step_ms: float  # that nobody looks into
     project: Part  # a view
     render: Part  # a view
@@ -75,8 +74,6 @@ class Measured:
     splats: float  # of a view, on its film
     splat_bytes: int  # of one that travels
     gradient_bytes: int  # of the derivatives with respect to one
-    waiting_ms: float
-    exchanging_ms: float
     sent_bytes: float  # a step
 
     @staticmethod
@@ -152,10 +149,9 @@ def measure(task: Task) -> Measured:
         kernels = statistics.median(step.kernel_ms[name] for step in looked_into)
         return Part(wall / count, min(wall, kernels) / count)
 
-    own = len(trainer.own_views())
+    own = len(trainer.own_iterations())
     layout = trainer.layout
     return Measured(
-        views=task.views,
         step_ms=statistics.median(steps),
         project=part("project", task.views),
         render=part("render", own),
@@ -165,8 +161,6 @@ def measure(task: Task) -> Measured:
         splats=trainer.num_splats / task.views,
         splat_bytes=NUMBER * sum(layout.widths),
         gradient_bytes=NUMBER * sum(block_widths(layout.num_gradients)),
-        waiting_ms=1e3 * times.waiting / task.steps,
-        exchanging_ms=1e3 * times.exchanging / task.steps,
         sent_bytes=times.sent_bytes / task.steps,
     )
 
@@ -199,7 +193,7 @@ def _timed_trainer() -> type:
         clock: StepClock | None = None
         num_splats = 0  # of the last step's views
 
-        def own_views(self) -> Sequence[int]:
+        def own_iterations(self) -> Sequence[int]:
             return self._own(self.iterations_of_step)
 
         def clocked_step(self) -> StepClock:

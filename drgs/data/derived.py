@@ -43,8 +43,14 @@ def completed(config: FitConfig, dataset: Dataset) -> FitConfig:
     """``config`` with background, near plane, numbers and coarse stages as ``dataset`` has them.
 
     Those that are given stay. Raises :class:`UserError` for a near plane behind which there is
-    nothing left to look at.
+    nothing left to look at, and for steps of more views than there are.
     """
+    count = len(dataset.train)
+    if 0 < count < config.optimizer.views_per_step:
+        raise UserError(
+            f"optimizer.views_per_step must be at most the number of training views ({count}), got "
+            f"{config.optimizer.views_per_step}"
+        )
     changes: dict[str, object] = {}
     if config.data.background is None:
         names = {color: name for name, color in NAMED_COLORS.items()}

@@ -18,7 +18,7 @@ from drgs.data.images import downscaled_size, kept_photograph
 from drgs.data.kept import KeptPicture, Pixels
 from drgs.data.transforms import Frame
 from drgs.data.types import View
-from drgs.io.pictures import read_pixels, stored_shape
+from drgs.io.pictures import has_alpha, image_size, read_pixels
 
 ViewPictures = dict[str, Pixels | None]
 """``image``, ``alpha``, ``mask`` and ``depth`` of a :class:`drgs.data.types.View`."""
@@ -42,8 +42,8 @@ def _read(config: DataConfig, frame: Frame, file: Path, pixels: np.ndarray) -> V
 
 def _sized_pixels(file: Path) -> np.ndarray:
     """An array of that shape, which takes no memory and shows nothing."""
-    width, height, channels, _ = stored_shape(file)
-    return np.broadcast_to(np.uint8(0), (height, width, channels))
+    width, height = image_size(file)
+    return np.broadcast_to(np.uint8(0), (height, width, 4 if has_alpha(file) else 3))
 
 
 def _sized(config: DataConfig, frame: Frame, file: Path, pixels: np.ndarray) -> ViewPictures:

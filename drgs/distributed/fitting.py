@@ -6,6 +6,7 @@ import argparse
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 
 from drgs.cli.execution import executing, select_variant
 from drgs.config.schema import FitConfig
@@ -13,7 +14,7 @@ from drgs.core.errors import UserError
 from drgs.data import Dataset, load_dataset
 from drgs.distributed.ranks import Ranks
 from drgs.distributed.shards import own_views
-from drgs.distributed.together import follow, lead
+from drgs.distributed.together import end_all, end_if_told, follow, lead
 from drgs.training.trainer import Trainer
 
 
@@ -28,9 +29,14 @@ def run_together(args: argparse.Namespace, work: Callable[[Callable[..., Trainer
     if ranks.is_first:
         lead(ranks, lambda make: work_alone(args, work, make))
         return
-    with executing(args.threads, args.debug):
-        select_variant(args.variant)
-        sys.exit(follow(ranks, lambda config, names: own_photographs(config, names, ranks)))
+    try:
+        with executing(args.threads, args.debug) as check_ranges:
+            select_variant(args.variant)
+            load = partial(own_photographs, ranks=ranks)
+            sys.exit(follow(ranks, load, check_ranges))
+    except UserError as error:  # of this machine, or of all
+        end_if_told(ranks)
+        end_all(ranks, f"error: {error}", 2)
 
 
 def work_alone(

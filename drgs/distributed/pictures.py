@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import sys
 import traceback
 from collections.abc import Callable, Iterator, Sequence
 
@@ -18,7 +17,7 @@ import numpy as np
 from drgs.core.errors import UserError
 from drgs.data.types import Viewpoint
 from drgs.distributed.ranks import Ranks, wait
-from drgs.distributed.together import END, leading
+from drgs.distributed.together import end_all, end_if_told, leading
 from drgs.integrator.scene import render_views
 
 GO = "go"
@@ -33,11 +32,18 @@ def run_together(args: argparse.Namespace, work: Callable[[Render], None]) -> No
     ranks = Ranks.world()
     if args.threads is None:
         args.threads = ranks.own_cores
+    if args.what.suffix.lower() == ".xml" and ranks.size > 1:
+        work = _refuse
     if ranks.is_first:
         with leading(ranks):
             work(lambda scene, views: _gathered(ranks, scene, views))
     else:
         _follow(ranks, work)
+
+
+def _refuse(render: Render) -> None:
+    del render
+    raise UserError("mpiexec: a scene of Mitsuba is rendered by one process; leave mpiexec out")
 
 
 def _gathered(ranks: Ranks, scene: mi.Scene, views: Sequence[Viewpoint]) -> Iterator[np.ndarray]:
@@ -60,28 +66,21 @@ def _follow(ranks: Ranks, work: Callable[[Render], None]) -> None:
     """Render what falls to this process, and end with the status of the first one."""
 
     def render(scene: mi.Scene, views: Sequence[Viewpoint]) -> Iterator[np.ndarray]:
-        _end_if_told(ranks)
+        end_if_told(ranks)
+        ranks.is_broken = True  # if it ends here, the first process waits for pictures
         own = views[ranks.rank :: ranks.size]
         for picture in render_views(scene, own):
             wait(ranks.send(np.ascontiguousarray(picture, np.float32), 0, 0))
-        _end_if_told(ranks)
+        ranks.is_broken = False
+        end_if_told(ranks)
         raise RuntimeError("the first process goes on with pictures that nobody has asked for")
 
     try:
         work(render)
-        _end_if_told(ranks)  # it had nothing to share
+        end_if_told(ranks)  # it had nothing to share
     except SystemExit:
         raise
     except BaseException as error:
-        if isinstance(error, UserError):
-            _end_if_told(ranks)  # the first process has found the same
-        text = "".join(traceback.format_exception(error))
-        print(f"process {ranks.rank}: {text}", file=sys.__stderr__, flush=True)
-        ranks.comm.Abort(1)
-
-
-def _end_if_told(ranks: Ranks) -> None:
-    """Hear what the first process says; end where that is the end."""
-    said, *status = json.loads(ranks.text_of(0, ""))
-    if said == END:
-        sys.exit(status[0])
+        if isinstance(error, UserError) and not ranks.is_broken:
+            end_if_told(ranks)  # the first process has found the same
+        end_all(ranks, "".join(traceback.format_exception(error)), 1)

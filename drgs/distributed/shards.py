@@ -17,10 +17,22 @@ import drjit as dr
 import numpy as np
 
 from drgs.core.arrays import from_host, types_of
+from drgs.core.errors import UserError
 from drgs.distributed.ranks import Ranks
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 from drgs.training.density.strategy import Population
 from drgs.training.optimizer import num_rows, take_rows
+
+
+class AgreedError(UserError):
+    """What all processes raise together."""
+
+
+def too_few(num_gaussians: int, size: int) -> str:
+    """Why so many processes cannot share Gaussians; empty: they can."""
+    if num_gaussians >= size:
+        return ""
+    return f"{size} processes cannot share {num_gaussians} Gaussians; start fewer of them"
 
 
 def renderer_of(place: int, views_per_step: int, size: int) -> int:
@@ -117,8 +129,8 @@ class SpreadPopulation(Population):
         if append is not None:
             appended = self._packed(append, append["means"].shape[0])
         after = Shard(len(kept) + len(appended), before.rank, before.size)
-        if after.total < after.size:
-            raise ValueError(f"SpreadPopulation.edit(): {after.total} rows for {after.size} ranks")
+        if refusal := too_few(after.total, after.size):
+            raise AgreedError(refusal)
         moved = self._moved(before, after, kept)
         own = appended[max(after.own.start - len(kept), 0) : max(after.own.stop - len(kept), 0)]
         self._replace(moved, own)

@@ -13,7 +13,7 @@ import sys
 import traceback
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial, wraps
 from typing import Any
 
@@ -25,7 +25,7 @@ from drgs.core.errors import UserError
 from drgs.data.reading import without_pictures
 from drgs.data.types import Dataset
 from drgs.distributed.ranks import Ranks
-from drgs.distributed.shards import own_views
+from drgs.distributed.shards import AgreedError, own_views
 from drgs.distributed.trainer import DistributedTrainer, check_can_be_shared
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 from drgs.integrator.scene import make_scene
@@ -35,14 +35,21 @@ from drgs.training.trainer import StepReport, Trainer
 START, RESTORE, TAKE_OVER, END = "start", "restore", "take over", "end"
 """What is said besides the names of methods."""
 
+AGREED = (NonFiniteError, AgreedError)
+"""Errors that all processes raise alike."""
+
+
+INTERRUPTED = 130
+"""Status of a process that Ctrl-C has ended."""
+
 
 @contextmanager
 def _others_waiting(ranks: Ranks) -> Iterator[None]:
-    """Around what all do together: who fails in it leaves the others waiting."""
+    """Around what all do together, and before that hear of: who fails leaves the others waiting."""
     try:
         yield
-    except NonFiniteError:
-        raise  # of all
+    except AGREED:
+        raise
     except BaseException:
         ranks.is_broken = True
         raise
@@ -58,10 +65,10 @@ def _called_by_all(method: Callable) -> Callable:
     def call(self: Leader, *arguments: Any) -> Any:
         if self.is_calling:
             return method(self, *arguments)
-        self.ranks.text_of(0, json.dumps([method.__name__, *arguments]))
         self.is_calling = True
         try:
             with _others_waiting(self.ranks):
+                self.ranks.text_of(0, json.dumps([method.__name__, *arguments]))
                 return method(self, *arguments)
         finally:
             self.is_calling = False
@@ -80,9 +87,9 @@ class Leader(DistributedTrainer):
         check_can_be_shared(config, ranks.size, gaussians.num_gaussians)
         dataset = with_own_pictures(dataset, config.optimizer.views_per_step, ranks)
         names = [view.name for view in dataset.train]
-        ranks.text_of(0, json.dumps([START, config.model_dump_json(), names]))
-        share_gaussians(ranks, gaussians)
         with _others_waiting(ranks):
+            ranks.text_of(0, json.dumps([START, config.model_dump_json(), names]))
+            share_gaussians(ranks, gaussians)
             super().__init__(config, dataset, gaussians, ranks)
         self.is_calling = False
         self._latest: tuple[int, mi.Scene] | None = None
@@ -90,6 +97,7 @@ class Leader(DistributedTrainer):
     @_called_by_all
     def step(self) -> StepReport:
         """See :meth:`Trainer.step`."""
+        self._latest = None
         return super().step()
 
     @_called_by_all
@@ -129,9 +137,9 @@ class Leader(DistributedTrainer):
 
     def restore(self, state: dict[str, np.ndarray]) -> None:
         """See :meth:`Trainer.restore`; state: of this process, which tells the others."""
-        self.ranks.text_of(0, json.dumps([RESTORE]))
         self.is_calling = True
         with _others_waiting(self.ranks):
+            self.ranks.text_of(0, json.dumps([RESTORE]))
             super().restore(state)
         self.is_calling = False
 
@@ -141,8 +149,8 @@ class Leader(DistributedTrainer):
 
     def take_over(self, former: Trainer) -> None:
         """See :meth:`Trainer.take_over`; former: whom the others have followed before."""
-        self.ranks.text_of(0, json.dumps([TAKE_OVER]))
         with _others_waiting(self.ranks):
+            self.ranks.text_of(0, json.dumps([TAKE_OVER]))
             super().take_over(former)
 
     def scene_of_all(self) -> mi.Scene:
@@ -172,48 +180,90 @@ def leading(ranks: Ranks) -> Iterator[None]:
     except SystemExit as end:
         status = end.code if isinstance(end.code, int) else 1
         raise
+    except KeyboardInterrupt:
+        status = INTERRUPTED
+        raise
     except BaseException as error:
         status = 2 if isinstance(error, (UserError, OSError)) else 1
         raise
     finally:
         if ranks.is_broken:
-            print(f"error: {sys.exc_info()[1]}", file=sys.stderr, flush=True)
+            said = "stopped" if status == INTERRUPTED else f"error: {sys.exc_info()[1]}"
+            print(said, file=sys.stderr, flush=True)
             ranks.comm.Abort(status)
         ranks.text_of(0, json.dumps([END, status]))
 
 
-def follow(ranks: Ranks, load: Callable[[FitConfig, list[str]], Dataset]) -> int:
+def follow(
+    ranks: Ranks,
+    load: Callable[[FitConfig, list[str]], Dataset],
+    check_ranges: Callable[[], None],
+) -> int:
     """Do what the first process does; return the status that it ends with.
 
-    load: the dataset of a configuration, with the training views of these names.
+    load: the dataset of a configuration, with the training views of these names; check_ranges:
+    raises ``UserError``.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the first process decides when to stop
-    trainer = former = None
+    follower = Follower(ranks, load)
     try:
         while True:
             name, *arguments = json.loads(ranks.text_of(0, ""))
             if name == END:
                 return arguments[0]
-            if name == START:
-                text, names = arguments
-                config, former = FitConfig.model_validate_json(text), trainer
-                gaussians = share_gaussians(ranks, None)
-                if former is None or names != [view.name for view in former.dataset.train]:
-                    dataset = load(config, names)
-                trainer = DistributedTrainer(config, dataset, gaussians, ranks)
-            elif name == TAKE_OVER:
-                trainer.take_over(former)
-            elif name == RESTORE:
-                trainer.restore({})
-            else:
-                with suppress(NonFiniteError):  # the first process says so
-                    getattr(trainer, name)(*arguments)
+            with suppress(*AGREED):  # the first process says so
+                follower.do(name, *arguments)
+            check_ranges()
     except BaseException as error:
         told = isinstance(error, UserError)
         text = f"error: {error}" if told else "".join(traceback.format_exception(error))
-        print(f"process {ranks.rank}: {text}", file=sys.__stderr__, flush=True)
-        ranks.comm.Abort(2 if told else 1)
+        end_all(ranks, text, 2 if told else 1)
         raise
+
+
+def end_all(ranks: Ranks, text: str, status: int) -> None:
+    """Say why, and end all processes."""
+    print(f"process {ranks.rank}: {text}", file=sys.__stderr__, flush=True)
+    ranks.comm.Abort(status)
+
+
+def end_if_told(ranks: Ranks) -> None:
+    """Hear what the first process says next; end where that is the end."""
+    said, *status = json.loads(ranks.text_of(0, ""))
+    if said == END:
+        sys.exit(status[0])
+
+
+@dataclass
+class Follower:
+    """What a process that follows has, and does when it is told."""
+
+    ranks: Ranks
+    load: Callable[[FitConfig, list[str]], Dataset]
+    trainer: DistributedTrainer | None = None
+    former: DistributedTrainer | None = None  # whose dataset the trainer has
+
+    def do(self, name: str, *arguments: Any) -> None:
+        """name: of a method of the trainer, or what else is said."""
+        if name == START:
+            self.start(*arguments)
+        elif name == RESTORE:
+            self.trainer.restore({})
+        elif name == TAKE_OVER:
+            self.trainer.take_over(self.former)
+            self.former = None
+        else:
+            getattr(self.trainer, name)(*arguments)
+
+    def start(self, text: str, names: list[str]) -> None:
+        """Make a trainer; text: its configuration; names: of its views."""
+        config, gaussians = FitConfig.model_validate_json(text), share_gaussians(self.ranks, None)
+        former = self.trainer
+        if former is not None and names != [view.name for view in former.dataset.train]:
+            former = self.trainer = None  # of a rehearsal
+        dataset = self.load(config, names) if former is None else former.dataset
+        self.trainer = DistributedTrainer(config, dataset, gaussians, self.ranks)
+        self.former = former
 
 
 def with_own_pictures(dataset: Dataset, views_per_step: int, ranks: Ranks) -> Dataset:

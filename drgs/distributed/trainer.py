@@ -15,7 +15,7 @@ from __future__ import annotations
 import json
 import math
 import operator
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property, reduce
 from typing import Any
@@ -38,7 +38,13 @@ from drgs.distributed.exchange import (
     joined,
 )
 from drgs.distributed.ranks import Ranks
-from drgs.distributed.shards import Shard, SpreadPopulation, renderer_of
+from drgs.distributed.shards import (
+    AgreedError,
+    Shard,
+    SpreadPopulation,
+    renderer_of,
+    too_few,
+)
 from drgs.effects.compose import composed, ignoring
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 from drgs.integrator.sensors import camera_from_sensor, read_sensor
@@ -87,7 +93,19 @@ class DistributedTrainer(Trainer):
     def _room(self, gaussians: Gaussians, share: Share = ALONE) -> int:
         """See :meth:`Trainer._room`: pictures show the Gaussians of all processes."""
         del gaussians, share
-        return super()._room(self._at_start, Share(self.ranks.size, self.ranks.on_machine))
+        room, refusal = 0, ""
+        try:
+            room = super()._room(self._at_start, Share(self.ranks.size, self.ranks.on_machine))
+        except UserError as error:
+            refusal = str(error)
+        self._agree_on(refusal)
+        return room
+
+    def _agree_on(self, refusal: str) -> None:
+        """Raise what a process has found, if any has, on all of them; refusal: empty, or that."""
+        refused = self.ranks.told(np.array(bool(refusal)))
+        if refused.any():
+            raise AgreedError(self.ranks.text_of(int(refused.argmax()), refusal))
 
     def _population(self) -> SpreadPopulation:
         common = {"optimizer": self.optimizer, "prefix": PREFIX, "extent": self.extent}
@@ -125,7 +143,7 @@ class DistributedTrainer(Trainer):
         found = self.ranks.told(found).sum(axis=0)  # of a view, those of all but one are 0
         self.post.forget_received()
         penalties = self._go_back_penalties(len(iterations))
-        losses = self._regularised_losses(iterations, found[:, 0]) if penalties else found[:, 0]
+        losses = self._regularised_losses(found[:, 0]) if penalties else found[:, 0]
         self._add_gradients(sights, counts, pictures, losses)
         self.post.finish()
         numbers = zip(losses, found[:, 1], found[:, 2], strict=True)
@@ -137,16 +155,12 @@ class DistributedTrainer(Trainer):
         ends = np.cumsum([len(of_view) for of_view in sights])
         return np.split(self.ranks.told(own), ends[:-1], axis=1)
 
-    def _regularised_losses(self, iterations: range, losses: np.ndarray) -> np.ndarray:
-        """Losses with the terms of the strategy of density, where they are written down.
+    def _regularised_losses(self, losses: np.ndarray) -> np.ndarray:
+        """Losses with the terms of the strategy of density.
 
         These are sums over all Gaussians: the sum of what processes have would be rounded
         otherwise.
         """
-        config = self.config
-        is_shown = any(i % config.output.history_every == 0 for i in iterations)
-        if not (is_shown or iterations[-1] >= config.iterations):
-            return losses
         losses = losses.astype(np.float32)
         for penalty in self.density.penalties(_OfAll(self.population), self.num_gaussians):
             losses = losses + np.float32(penalty[0])
@@ -198,7 +212,7 @@ class DistributedTrainer(Trainer):
         for time, blocks in enumerate(received.blocks()):
             self.send_to_owners(blocks, counts[:, time], place, time)
         picture = None
-        if self.density.gathers(iteration):
+        if self.density.gathers(iteration) and self.density.looks_at_pictures:
             frames = [of_time[0] for of_time in self.integrator.memory.rendered[0].frames]
             picture = Picture(frames, image, view.target.image)
         return [float(loss[0]), float(error[0]), view.counted], picture
@@ -236,7 +250,7 @@ class DistributedTrainer(Trainer):
         self,
         sights: Sequence[Sequence[Sight]],
         counts: Sequence[np.ndarray],
-        pictures: Mapping[int, Picture],
+        pictures: dict[int, Picture],
         losses: np.ndarray,
     ) -> None:
         """Of the rows of this process, from what has come back of all views, in their order.
@@ -260,7 +274,7 @@ class DistributedTrainer(Trainer):
             for place, view in zip(places, waiting, strict=True):
                 self.iteration = view.iteration
                 if self.density.gathers(view.iteration):
-                    own = counts[place], means2d[place], pictures.get(place)
+                    own = counts[place], means2d[place], pictures.pop(place, None)
                     self.density.gather(SharedStep(self, place, sights[place], *own))
 
     def _add_with_camera(self, seen: Sequence[SeenSplats]) -> Any:
@@ -353,6 +367,7 @@ class DistributedTrainer(Trainer):
         described = [[name, array.dtype.str, array.shape] for name, array in state.items()]
         described = json.loads(self.ranks.text_of(0, json.dumps(described)))
         (total,) = (shape[0] for name, _, shape in described if name == "means.value")
+        self._agree_on(too_few(total, self.ranks.size))
         self.shard.total = total
         own, count = {}, self.shard.own.stop - self.shard.own.start
         for name, dtype, shape in described:
@@ -461,5 +476,6 @@ def check_can_be_shared(config: FitConfig, size: int, num_gaussians: int) -> Non
             f"optimizer.views_per_step must be at least the number of processes ({size}), which "
             f"share the views of a step, got {views}; give it with --set"
         )
-    if num_gaussians < size:
-        raise UserError(f"{size} processes cannot share {num_gaussians} Gaussians")
+    to = config.densify.prune.to
+    if refusal := too_few(min(num_gaussians, to or num_gaussians), size):
+        raise UserError(refusal)

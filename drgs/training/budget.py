@@ -261,9 +261,10 @@ def rehearse(
     make_trainer: Callable[[FitConfig, Dataset, Gaussians], Trainer] = Trainer,
 ) -> Rehearsal:
     """Time a few iterations on a few of the views."""
-    views = dataset.train[:: max(1, len(dataset.train) // REHEARSAL_VIEWS)]
-    few = replace(dataset, train=views[:REHEARSAL_VIEWS])
     views_per_step = config.optimizer.views_per_step
+    count = max(REHEARSAL_VIEWS, views_per_step)
+    views = dataset.train[:: max(1, len(dataset.train) // count)]
+    few = replace(dataset, train=views[:count])
     never = config.iterations + (WARM_UP + TIMED) * views_per_step
     trainer = make_trainer(
         changed(

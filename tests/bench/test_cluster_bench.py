@@ -83,7 +83,7 @@ def test_fewer_views_than_machines_are_refused():
 
 def measured_as(ms, kernels):
     part = Part(ms, kernels)
-    return Measured(8, 1.0, part, part, part, part, [ms], 9.0, 56, 36, 0.0, 0.0, 0.0)
+    return Measured(1.0, part, part, part, part, [ms], 9.0, 56, 36, 0.0)
 
 
 def test_costs_are_what_few_gaussians_take_and_the_rest():
@@ -120,7 +120,9 @@ def test_tables_and_plot(tmp_path):
 
 @pytest.mark.slow
 def test_what_is_predicted_is_what_processes_on_a_slow_network_take():
-    """Within 15 %. Other load counts as sharing; where it changes, another try may tell."""
+    """Within 15 %. Where there are more processes than cores, how much they disturb each other, and
+    other load, is measured without a network. Another try may tell where load changes.
+    """
     together.mpiexec()
     if os.name != "posix" or os.geteuid() != 0 or network.obstacle():
         pytest.skip("only root can make a network, where the kernel has one to give")
@@ -133,8 +135,9 @@ def test_what_is_predicted_is_what_processes_on_a_slow_network_take():
     for processes in (1, 2, 4):
         checks = []
         while len(checks) < 6 and not (checks and abs(checks[-1].error) < 0.15):
-            found = costs()
-            sharing = cluster.crowding_of(found, task, processes)
+            found, sharing = costs(), 1.0
+            if processes >= len(os.sched_getaffinity(0)):
+                sharing = cluster.crowding_of(found, task, processes)
             checks.append(checked(found, task, processes, 5e7, sharing))
         assert abs(checks[-1].error) < 0.15, checks
         assert checks[-1].measured_bytes == pytest.approx(checks[-1].predicted_bytes, rel=0.01)

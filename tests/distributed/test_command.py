@@ -48,7 +48,7 @@ def result(folder):
     return [(folder / name).read_bytes() for name in names], rows
 
 
-def test_a_fit_that_is_shared_and_resumed_by_others_is_the_same(config, tmp_path):
+def test_a_fit_that_is_shared_is_the_same(config, tmp_path):
     path = config()
     status, output, errors = together.run(2, command(path, "--out", tmp_path / "two"))
     assert status == 0, errors
@@ -67,9 +67,42 @@ def test_too_many_processes_are_refused_once(config, tmp_path):
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--set", "optimizer.views_per_step=101"], "at most the number of training views (100)"),
+        (["--set", "densify.prune.to=1"], "2 processes cannot share 1 Gaussians"),
+        (["--variant", "cuda_ad_rgb"], "--variant cuda_ad_rgb: not usable here"),
+        (["--threads", "100000"], "--threads"),
+        (["--view"], "--view: shows the fit of one process alone"),
+    ],
+)
+def test_what_cannot_be_shared_or_done_is_refused_once(config, tmp_path, words, message):
+    status, _, errors = together.run(2, command(config(), "--out", tmp_path / "out", *words))
+    assert (status, errors.count("error: ")) == (2, 1), errors
+    assert message in errors
+
+
 def test_a_wrong_command_line_is_refused_once(tmp_path):
     status, _, errors = together.run(2, command("nothing.yml", "--out", tmp_path / "out"))
     assert status == 2 and errors.count("error: ") == 1
+
+
+@pytest.mark.slow
+def test_ctrl_c_while_everybody_is_busy_with_something_else_ends_all(config, tmp_path):
+    """In a rehearsal: nothing is to be saved, and nobody is left behind."""
+    path, out = config(iterations=100_000), tmp_path / "out"
+    process = together.start(2, command(path, "--out", out, "--budget", "1h"))
+    end = time.monotonic() + 60
+    while len(together.ranks_of(str(out))) < 2:
+        assert process.poll() is None and time.monotonic() < end
+        time.sleep(0.05)
+    time.sleep(2.5)
+    process.send_signal(signal.SIGINT)
+    _, errors = process.communicate(timeout=60)
+    assert process.returncode == 130, errors
+    assert "Traceback" not in errors
+    assert not together.ranks_of(str(out))
 
 
 def started(path, out, size=2):

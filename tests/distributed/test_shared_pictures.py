@@ -10,6 +10,13 @@ def rendered(size, out, *words):
     return together.run(size, command)
 
 
+def test_a_scene_of_mitsuba_is_refused(tmp_path):
+    scene = together.REPOSITORY / "scenes" / "hybrid.xml"
+    status, _, errors = together.run(2, ["-m", "drgs.render", scene, "--out", tmp_path / "a.png"])
+    assert status == 2 and errors.count("error: ") == 1
+    assert "a scene of Mitsuba is rendered by one process" in errors
+
+
 def files_of(folder):
     return {path.name: path.read_bytes() for path in folder.iterdir() if path.suffix != ".json"}
 

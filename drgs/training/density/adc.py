@@ -58,6 +58,7 @@ class AdaptiveDensityControl(DensityStrategy):
     white_background: bool
     statistics: DensityStatistics | None = None  # until it begins
     by_row = ("gradient_norms", "views")
+    looks_at_pictures = False
 
     def begin(self, population: Population) -> None:
         """Start with the statistics of no views."""

@@ -29,6 +29,11 @@ class Phases(DensityStrategy):
         """Those of all of them."""
         return [name for phase in self.phases for name in phase.by_row]
 
+    @property
+    def looks_at_pictures(self) -> bool:
+        """Whether any of them does."""
+        return any(phase.looks_at_pictures for phase in self.phases)
+
     def begin(self, population: Population) -> None:
         """Start with the statistics of no views."""
         for phase in self.phases:

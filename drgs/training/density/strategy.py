@@ -172,6 +172,9 @@ class DensityStrategy(Protocol):
     by_row: Sequence[str] = ()
     """Names in :meth:`state` of what has a row for each Gaussian."""
 
+    looks_at_pictures: bool = True
+    """Whether :meth:`gather` asks for anything that a picture has to be kept for."""
+
     def begin(self, population: Population) -> None:
         """Start with the statistics of no views.
 
