@@ -250,7 +250,7 @@ from drgs import fit
 from drgs.training import memory
 from drgs.training.stages import KEPT_BYTES
 peaks, estimate = [], memory.estimate
-memory.estimate = lambda *arguments: peaks.append(estimate(*arguments)) or peaks[-1]
+memory.estimate = lambda *a, **k: peaks.append(estimate(*a, **k)) or peaks[-1]
 fit.main(sys.argv[1:])
 expected = peaks[0].needed + min(peaks[0].targets, KEPT_BYTES)
 # What getrusage says may be the peak of the process that started this one.
