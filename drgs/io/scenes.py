@@ -54,7 +54,10 @@ def load_scene_file(path: Path, **definitions: str) -> mi.Object:
             _check(mi.parser.parse_file(config, str(path), **definitions).nodes, path)
         with openexr_threads():
             return mi.load_file(str(path), **definitions)
-    except UnicodeDecodeError:  # Mitsuba's own error, which quotes the file
+    except (UnicodeDecodeError, RuntimeError) as error:
+        # Mitsuba's own error quotes the file; on its way to Python, the quotation fails or is lost.
+        if not isinstance(error, UnicodeDecodeError) and str(error):
+            raise
         raise UserError(f"{path}: not a valid scene: it holds bytes that are not UTF-8") from None
 
 
