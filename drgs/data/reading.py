@@ -50,7 +50,6 @@ def _sized(config: DataConfig, frame: Frame, file: Path, pixels: np.ndarray) -> 
     """Pictures that refuse to become numbers."""
     height, width, channels = pixels.shape
     new_width, new_height = downscaled_size(width, height, config.image_size)
-
     files, plane = files_of(config, frame, file), _unread((new_height, new_width), file)
     return {
         "image": _unread((new_height, new_width, 3), file),

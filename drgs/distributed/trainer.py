@@ -58,7 +58,7 @@ from drgs.splatting.rendering import (
     weighted_sums,
 )
 from drgs.training.deferred import VIEWS_AT_ONCE
-from drgs.training.density.strategy import SeenStep
+from drgs.training.density.strategy import DensityReport, SeenStep
 from drgs.training.finite_checks import NonFiniteError
 from drgs.training.memory import ALONE, Share
 from drgs.training.trainer import DENSITY, PREFIX, SeenView, Trainer, Waiting
@@ -176,6 +176,15 @@ class DistributedTrainer(Trainer):
                     found = np.array(dr.grad(leaf), np.float32)
                     derivatives[name] = type(leaf)(self.ranks.from_rank(renderer, found))
                 effect.after(self, view, derivatives)
+
+    def _control_density(self) -> DensityReport | None:
+        """See :meth:`Trainer._control_density`; where it refuses, all processes do alike."""
+        try:
+            return super()._control_density()
+        except NonFiniteError:
+            raise
+        except UserError as error:
+            raise AgreedError(str(error)) from None
 
     def _sights(self, iteration: int) -> list[Sight]:
         """What the view's camera sees of the rows of this process, at each time."""

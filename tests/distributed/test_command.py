@@ -75,6 +75,7 @@ def test_too_many_processes_are_refused_once(config, tmp_path):
         (["--variant", "cuda_ad_rgb"], "--variant cuda_ad_rgb: not usable here"),
         (["--threads", "100000"], "--threads"),
         (["--view"], "--view: shows the fit of one process alone"),
+        (["--set", "densify.budget.prune_opacity=0.999"], "every Gaussian would be pruned"),
     ],
 )
 def test_what_cannot_be_shared_or_done_is_refused_once(config, tmp_path, words, message):
