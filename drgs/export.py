@@ -87,7 +87,8 @@ class Target:
 def _usd(source: Source) -> bytes:
     from drgs.io.usd import encode
 
-    return encode({name: getattr(source.gaussians, name) for name in PARAMETER_NAMES})
+    g = source.gaussians
+    return encode({name: getattr(g, name) for name in PARAMETER_NAMES}, g.origin)
 
 
 def _of_format(each: Format) -> Target:
@@ -105,7 +106,9 @@ def _page(source: Source) -> bytes:
     """With the first view and the background of the fit, or before black where there is none."""
     gaussians, folder = source.gaussians, source.folder
     background = (0.0, 0.0, 0.0) if folder is None else load_run_config(folder).data.background_rgb
-    cameras = None if folder is None or source.is_turned else training_cameras(folder)
+    cameras = (
+        None if folder is None or source.is_turned else training_cameras(folder, gaussians.origin)
+    )
     if cameras is not None:
         standpoint = Standpoint.of_views(cameras, gaussians)
     else:
@@ -325,7 +328,8 @@ def _up(args: argparse.Namespace, source: Source, target: Target) -> np.ndarray 
     words = args.up
     if words is None and not target.has_axes:
         return None
-    cameras = None if source.folder is None else training_cameras(source.folder)
+    folder, origin = source.folder, source.gaussians.origin
+    cameras = None if folder is None else training_cameras(folder, origin)
     if words is None:
         words = ["0", "0", "1"] if cameras is None else ["cameras"]
     if words == ["cameras"]:

@@ -465,10 +465,10 @@ def fit_and_write(
     release_unused_memory()  # encoding the orbit's frames takes as much as iterations do
     as_saved(gaussians, trainer).save(out / GAUSSIANS)
     for effect in trainer.effects:
-        effect.write(out, dataset.train)
+        effect.write(out, dataset)
     write_history(out / HISTORY, log.rows)
     write_density(out / DENSITY, log.density)
-    write_views(out / VIEWS, dataset.train)
+    write_views(out / VIEWS, dataset)
     config, render = trainer.config, trainer.pictures
     write_run_config(out, config)
     output = config.output

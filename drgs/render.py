@@ -74,10 +74,11 @@ from drgs.io.pictures import (
     write_png,
 )
 from drgs.io.scenes import load_scene_file
-from drgs.results.files import CAMERAS, CONFIG, GAUSSIANS, METRICS, ORBIT, ORBIT_GIF, VIEWS
+from drgs.results.files import CAMERAS, CONFIG, GAUSSIANS, METRICS, ORBIT, ORBIT_GIF
 from drgs.results.folder import found_again
 from drgs.results.metrics import Quality, mean_of, psnr, ssim
 from drgs.results.pictures import claiming, refuse_photographs, sealing
+from drgs.results.refined_cameras import refined_dataset, training_cameras
 
 DEFAULT_SIZE = (400, 400)
 """px, where nothing else says how large a picture should be."""
@@ -134,6 +135,7 @@ class Model:
                 f"{option}: needs photographs: give the configuration of a fit (--scene CONFIG.yml)"
             )
         dataset = load_dataset(self.config.data_for_rendering)
+        dataset = dataset.relative_to(self.gaussians.origin)
         if self.folder is None or not (path := self.folder / CAMERAS).is_file():
             return dataset
         if not self.config.cameras.optimise:
@@ -142,8 +144,6 @@ class Model:
                 "--set cameras.optimise=true"
             )
             return dataset
-        from drgs.results.refined_cameras import refined_dataset
-
         print(f"cameras: as refined, from {path}")
         return refined_dataset(dataset, self.folder)
 
@@ -203,7 +203,7 @@ def _add_cameras(parser: CommandParser) -> None:
     )
     one_of("--origin", **vector, help="one camera, here")
     add = group.add_argument
-    add("--target", **vector, help="what it looks at (default: 0 0 0)")
+    add("--target", **vector, help="what it looks at (default: the model's origin, 0 0 0)")
     add("--up", **vector, help="up in the picture, of --origin or --orbit (default: 0 0 1)")
     add(
         "--fov",
@@ -382,9 +382,8 @@ def _orbited(model: Model, args: argparse.Namespace) -> Sequence[Viewpoint]:
         refined = args.what / CAMERAS
         if model.config.cameras.optimise and refined.is_file():
             print(f"cameras: as refined, from {refined}")
-            return read_viewpoints(refined, None)
-        if (args.what / VIEWS).is_file():
-            return read_viewpoints(args.what / VIEWS, None)
+        if (views := training_cameras(args.what, model.gaussians.origin)) is not None:
+            return views
     return model.dataset("--orbit").train
 
 
@@ -400,13 +399,15 @@ def render_cameras(
 
 
 def viewpoints_of(args: argparse.Namespace, model: Model) -> list[Viewpoint]:
-    """The cameras of ``--camera``, or the one of ``--origin``."""
-    size = tuple(args.size) if args.size else None
+    """The cameras of ``--camera``, or the one of ``--origin``, relative to the model's origin."""
+    size, origin = tuple(args.size) if args.size else None, model.gaussians.origin
     if args.camera is not None:
         samples = model.config.data.shutter_samples if model.config else SHUTTER_SAMPLES
-        return read_viewpoints(args.camera, size, samples)
-    pose = look_at(args.origin, args.target or (0.0, 0.0, 0.0), args.up or UP)
-    return [pinhole("camera", pose, *(size or DEFAULT_SIZE), args.fov or FIELD_OF_VIEW)]
+        views = read_viewpoints(args.camera, size, samples)
+    else:
+        pose = look_at(args.origin, args.target or origin, args.up or UP)
+        views = [pinhole("camera", pose, *(size or DEFAULT_SIZE), args.fov or FIELD_OF_VIEW)]
+    return [view.moved(-np.array(origin)) for view in views]
 
 
 def render_mitsuba_scene(path: Path, out: Path, definitions: dict[str, str]) -> None:

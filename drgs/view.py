@@ -112,7 +112,8 @@ def model_of(args: argparse.Namespace) -> Model:
 
 def cameras_of(args: argparse.Namespace, model: Model) -> Sequence[Viewpoint]:
     """Those of a fit's training views, refined if it has refined them; else one that sees all."""
-    if args.what.is_dir() and (views := training_cameras(args.what)) is not None:
+    origin = model.gaussians.origin
+    if args.what.is_dir() and (views := training_cameras(args.what, origin)) is not None:
         return views
     orbit = orbit_of_gaussians(model.gaussians, np.array(args.up or UP), FIELD_OF_VIEW)
     return orbit.viewpoints(1, 400, 400, FIELD_OF_VIEW)

@@ -7,13 +7,17 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
+from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
 from typing import Protocol
 
+import numpy as np
+
 from drgs.config.load import config_from
 from drgs.config.schema import DataConfig
 from drgs.core.errors import UserError
+from drgs.core.origin import WORLD, near_origin, shown_origin
 from drgs.data.initial import initial_gaussians
 from drgs.data.types import Dataset, Keeps, View, Viewpoint, all_of_them
 
@@ -49,13 +53,28 @@ def load_dataset(
     settings: other values of that section, such as
     ``image_size=400`` (px) or ``background="black"``.
 
+    Where the cameras are far from the world's origin, their positions are relative to the
+    dataset's ``origin``, the middle of the training cameras.
+
     Raises :class:`UserError` naming the file, the key, what was expected and what was got; where
     the folder is missing, it says where to get the data.
     """
     if settings or not isinstance(source, DataConfig):
         given = source.model_dump() if isinstance(source, DataConfig) else {"path": source}
         source = config_from({"data": {**given, **settings}}, "load_dataset()").data
-    return layout_of(source).load(source, keeps)
+    return _near(layout_of(source).load(source, keeps))
+
+
+def _near(dataset: Dataset) -> Dataset:
+    """The dataset about the middle of its cameras, where that is far from the world's origin."""
+    if not dataset.train:
+        return dataset
+    middle = np.mean([view.center for view in dataset.train], axis=0)
+    origin = near_origin(middle, dataset.extent)
+    if origin == WORLD:
+        return dataset
+    note = f"; far from the origin: coordinates are relative to {shown_origin(origin)}"
+    return replace(dataset.relative_to(origin), description=dataset.description + note)
 
 
 def layout_name(config: DataConfig) -> str:

@@ -26,16 +26,16 @@ from drgs.data.start_box import (
     shown,
     where_they_look,
 )
-from drgs.data.types import Dataset, Viewpoint
+from drgs.data.types import Dataset
 from drgs.gaussians.parameters import Gaussians
 from drgs.io.ply import read_points
 
 if TYPE_CHECKING:
     from drgs.data.carving import Silhouette
 
-MIN_SQUARED_DISTANCE = 1e-7
-"""World units^2: lower bound of a Gaussian's squared first scale (3DGS reference), for points
-that coincide."""
+MIN_SPACING = 2.5e-4
+"""Smallest first scale, for points that coincide, relative to the median distance of points from
+their middle. The 3DGS reference has 3.2e-4 world units, for scenes of about that size."""
 
 NUM_NEIGHBOURS = 3
 
@@ -157,16 +157,17 @@ def _on_the_hull(
 def _of_cloud(config: FitConfig, dataset: Dataset, cloud: Path) -> Start:
     """The points of a file."""
     means, colors, num_read = _read_cloud(config.init, cloud)
+    means = (means - dataset.origin).astype(np.float32)
     if colors is not None and not np.any(colors):
         colors = None  # all black: what is written where no colours were found out
-    _check_cloud(cloud, means, config.densify.max_gaussians, dataset.train)
+    _check_cloud(cloud, means, config.densify.max_gaussians, dataset)
     kept = "the" if len(means) == num_read else f"{len(means):,} of {num_read:,}"
     start = Start(means, colors, f"{kept} points of {cloud}")
     return _coloured(start, dataset) if colors is None else start
 
 
 def _read_cloud(init: InitConfig, cloud: Path) -> tuple[np.ndarray, np.ndarray | None, int]:
-    """Positions (N, 3) float32, colours (N, 3) float32, 0..1, and how many were read."""
+    """Positions (N, 3) float64, world, colours (N, 3) float32, 0..1, and the number read."""
     if cloud.name not in POINTS_OF_COLMAP:
         positions, colors = read_points(cloud)
         return positions, colors, len(positions)
@@ -186,7 +187,7 @@ def _read_cloud(init: InitConfig, cloud: Path) -> tuple[np.ndarray, np.ndarray |
             f"{points.track_lengths.max():,} images observe them); set other ones"
         )
     positions, colors = points.positions[kept], points.colors[kept]
-    return positions.astype(np.float32), colors / np.float32(255), len(kept)
+    return positions, colors / np.float32(255), len(kept)
 
 
 def _random_points(config: FitConfig, dataset: Dataset) -> Start:
@@ -241,8 +242,9 @@ def gaussians_from_points(
     num = len(means)
     means = np.ascontiguousarray(means, np.float32)
     colors = np.full((num, 3), 0.5) if colors is None else colors
-    squared = np.maximum(mean_squared_neighbour_distance(means), MIN_SQUARED_DISTANCE)
-    log_scales = np.repeat(0.5 * np.log(squared)[:, None] + np.log(scale), 3, axis=1)
+    spacing = np.sqrt(mean_squared_neighbour_distance(means))
+    spacing = np.maximum(spacing, MIN_SPACING * _size_of(means))
+    log_scales = np.repeat(np.log(scale * spacing)[:, None], 3, axis=1)
     sh0 = (np.asarray(colors, np.float64) - 0.5) / SH_C0
     return Gaussians(
         means=means,
@@ -252,6 +254,13 @@ def gaussians_from_points(
         sh0=sh0.astype(np.float32)[:, None, :],
         shN=np.zeros((num, (sh_degree + 1) ** 2 - 1, 3), np.float32),
     )
+
+
+def _size_of(points: np.ndarray) -> float:
+    """The median distance of points (N, 3) from their middle, or the largest where that is 0."""
+    points = points.astype(np.float64)
+    distances = np.linalg.norm(points - np.median(points, axis=0), axis=1)
+    return float(np.median(distances) or distances.max())
 
 
 def mean_squared_neighbour_distance(points: np.ndarray) -> np.ndarray:
@@ -264,13 +273,13 @@ def mean_squared_neighbour_distance(points: np.ndarray) -> np.ndarray:
     return np.mean(distances[:, 1:] ** 2, axis=1)
 
 
-def _check_cloud(
-    file: Path, points: np.ndarray, max_gaussians: int, views: Sequence[Viewpoint]
-) -> None:
+def _check_cloud(file: Path, points: np.ndarray, max_gaussians: int, dataset: Dataset) -> None:
     """Refuse a cloud (N, 3) of too few or too many points, or that is not what is photographed."""
-    num = len(points)
+    num, views = len(points), dataset.train
     if num <= NUM_NEIGHBOURS:
         raise UserError(f"{file}: at least {NUM_NEIGHBOURS + 1} points, got {num}")
+    if not np.ptp(points, axis=0).any():
+        raise UserError(f"{file}: its {num:,} points must not all be the same")
     if num > max_gaussians:
         raise UserError(
             f"{file}: must hold at most densify.max_gaussians ({max_gaussians}) points, got {num}"
@@ -278,7 +287,7 @@ def _check_cloud(
     looking = num_looking(points, views)
     if looking < LEAST_LOOKING * len(views):
         raise UserError(
-            f"{file}: must hold what the cameras look at{where_they_look(views)}, in their frame "
+            f"{file}: must hold what the cameras look at{where_they_look(dataset)}, in their frame "
             f"of reference, but only {looking} of {len(views)} have any of its {num:,} points in "
             "the middle of their pictures; give another init.point_cloud, or start from random "
             "points (init.point_cloud=null, data.ignore_points=true)"

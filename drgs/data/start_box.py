@@ -6,6 +6,7 @@ and points that they do not look at are refused.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -83,13 +84,13 @@ def box_to_start_in(init: InitConfig, dataset: Dataset) -> Box | None:
     Raises :class:`UserError` for a given one (``init.half_extent``) that the cameras do not see.
     """
     if init.half_extent is not None:
-        box = Box(np.zeros(3), init.half_extent)
-        check_box(box, dataset.train)
+        box = Box(-np.array(dataset.origin), init.half_extent)
+        check_box(box, dataset)
         return box
     if dataset.start_half_extent is None:
         return None
     if is_of_the_reference(dataset):
-        return Box(np.zeros(3), dataset.start_half_extent)
+        return Box(-np.array(dataset.origin), dataset.start_half_extent)
     return box_looked_at(dataset.train)
 
 
@@ -109,7 +110,8 @@ def is_of_the_reference(dataset: Dataset) -> bool:
     except UserError:  # nothing is known that would be better
         return True
     fill = half_extent / (distance * _half_width(dataset.train))
-    return bool(FILL_RANGE[0] <= fill <= FILL_RANGE[1] and np.abs(focus).max() <= half_extent)
+    off = np.abs(focus + dataset.origin).max()
+    return bool(FILL_RANGE[0] <= fill <= FILL_RANGE[1] and off <= half_extent)
 
 
 def _half_width(views: Sequence[Viewpoint]) -> float:
@@ -217,21 +219,21 @@ def num_looking(points: np.ndarray, views: Sequence[Viewpoint]) -> int:
     return sum(bool(_in_picture(points, view, MIDDLE).any()) for view in views)
 
 
-def where_they_look(views: Sequence[Viewpoint]) -> str:
-    """Where what the cameras look at is, for a message; nothing where they look nowhere."""
+def where_they_look(dataset: Dataset) -> str:
+    """Where what the cameras look at is, world, for a message; "" where they look nowhere."""
     try:
-        focus, distance = focus_of(views)
+        focus, distance = focus_of(dataset.train)
     except UserError:
         return ""
-    return f" (around {shown(focus, distance)}, from {distance:.3g} away)"
+    return f" (around {shown(focus + dataset.origin, distance)}, from {distance:.3g} away)"
 
 
-def check_box(box: Box, views: Sequence[Viewpoint]) -> None:
+def check_box(box: Box, dataset: Dataset) -> None:
     """Raise :class:`UserError` for a box that most cameras do not look into, or hardly see.
 
     And for one that is so large that next to nothing of it is what they look at.
     """
-    points = box.points(SAMPLES, np.random.default_rng(0))
+    points, views = box.points(SAMPLES, np.random.default_rng(0)), dataset.train
     looking = num_looking(points, views)
     covered = float(np.median([_covered(box, view) for view in views]))
     if looking < LEAST_LOOKING * len(views):
@@ -242,9 +244,11 @@ def check_box(box: Box, views: Sequence[Viewpoint]) -> None:
         what = f"less than {100 * LEAST_NEAR_FOCUS:g} % of it is as near to that as they are"
     else:
         return
+    in_world = Box(box.center + dataset.origin, box.half_extent)
     raise UserError(
-        f"init.half_extent: the start box {box} must be what the cameras look at"
-        f"{where_they_look(views)}, but {what}; set init.half_extent=null, and it follows from them"
+        f"init.half_extent: the start box {in_world} must be what the cameras look at"
+        f"{where_they_look(dataset)}, but {what}; set init.half_extent=null, and it follows "
+        "from them"
     )
 
 
@@ -278,4 +282,5 @@ def _covered(box: Box, view: Viewpoint) -> float:
 def shown(point: np.ndarray, scale: float) -> str:
     """A point as messages write it; scale: what is around it, beside which rounding is nothing."""
     rounded = np.where(np.abs(point) < 1e-6 * scale, 0, point)
-    return f"({', '.join(f'{v:.3g}' for v in rounded)})"
+    digits = max(3, math.ceil(math.log10(max(np.abs(point).max() / scale, 1))) + 2)
+    return f"({', '.join(f'{v:.{digits}g}' for v in rounded)})"

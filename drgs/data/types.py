@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
 from drgs.core.constants import SHUTTER_SAMPLES
+from drgs.core.origin import WORLD, Origin
 from drgs.data.kept import Pixels
 
 if TYPE_CHECKING:
@@ -58,6 +59,32 @@ class Viewpoint:
         viewmat[:3] = np.column_stack([rotation, -rotation @ self.center])
         return viewmat
 
+    def moved(self: V, offset: np.ndarray) -> V:
+        """The same camera with ``offset`` (3,) added to its position."""
+        if not np.any(offset):
+            return self
+        motion = self.motion
+        if motion is not None:
+            motion = replace(motion, close_to_world=_translated(motion.close_to_world, offset))
+        return replace(
+            self, camera_to_world=_translated(self.camera_to_world, offset), motion=motion
+        )
+
+
+V = TypeVar("V", bound=Viewpoint)
+
+
+def _spread(views: Sequence[Viewpoint]) -> float:
+    centers = np.stack([view.center for view in views])
+    distances = np.linalg.norm(centers - centers.mean(axis=0), axis=1)
+    return float(1.1 * distances.max())
+
+
+def _translated(pose: np.ndarray, offset: np.ndarray) -> np.ndarray:
+    pose = pose.copy()
+    pose[:3, 3] += offset
+    return pose
+
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class View(Viewpoint):
@@ -93,13 +120,21 @@ class Dataset:
     ignored: tuple[str, ...] = ()  # that frames have and the configuration leaves out: see extras
     rendered: bool = False  # the pictures are another renderer's, not photographs
     point_cloud: Path | None = None  # that the dataset names, to start from: a PLY file
+    origin: Origin = WORLD  # world: what the positions of the views are relative to
 
     @property
     def extent(self) -> float:
         """Scale of the scene: 1.1 x the largest distance of a train camera from their centroid.
 
-        As the 3DGS reference defines it (``getNerfppNorm``); 1 where all cameras share a centre.
+        As the 3DGS reference defines it (``getNerfppNorm``). Of all cameras where those of the
+        train views share a centre; 1 where all do.
         """
-        centers = np.stack([view.center for view in self.train])
-        distances = np.linalg.norm(centers - centers.mean(axis=0), axis=1)
-        return float(1.1 * distances.max()) or 1.0
+        return _spread(self.train) or _spread((*self.train, *self.test)) or 1.0
+
+    def relative_to(self, origin: Origin) -> Dataset:
+        """The same views with positions relative to ``origin``, world."""
+        offset = np.subtract(self.origin, origin)
+        train, test = (
+            tuple(view.moved(offset) for view in views) for views in (self.train, self.test)
+        )
+        return replace(self, train=train, test=test, origin=origin)

@@ -26,7 +26,7 @@ class Selection:
         kept = {}
         if self.box is not None:
             corners = np.reshape(self.box, (2, 3))
-            means = gaussians.means.astype(np.float64)
+            means = gaussians.means.astype(np.float64) + gaussians.origin
             inside = (means >= corners.min(axis=0)) & (means <= corners.max(axis=0))
             kept["box"] = inside.all(axis=1)
         if self.min_opacity is not None:

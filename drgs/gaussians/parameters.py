@@ -20,6 +20,7 @@ import numpy as np
 from drgs.core.arrays import from_host
 from drgs.core.errors import UserError, UserNote
 from drgs.core.files import atomic_path
+from drgs.core.origin import WORLD, Origin, shown_origin
 
 PARAMETER_NAMES = ("means", "quats", "log_scales", "logit_opacities", "sh0", "shN")
 
@@ -45,6 +46,7 @@ class Gaussians:
     rendered_with: Mapping[str, bool | int | float | str] | None = (
         None  # by name: approximations that a file says, or is to say, they are made for
     )
+    origin: Origin = WORLD  # world: what the means are relative to
 
     @staticmethod
     def load(path: str | Path) -> Gaussians:
@@ -57,9 +59,11 @@ class Gaussians:
         Raises ``drgs.core.errors.UserError`` (a ValueError) naming the file and what is wrong.
         """
         from drgs.io.formats import Z_TO_Y, read_gaussians
+        from drgs.io.ply import origin_among
 
         found, arrays, rendered_with = read_gaussians(path)
-        gaussians = Gaussians(**arrays, rendered_with=rendered_with or None)
+        origin = origin_among(path, rendered_with)
+        gaussians = Gaussians(**arrays, rendered_with=rendered_with or None, origin=origin)
         return gaussians._turned(Z_TO_Y.T) if found.y_up else gaussians
 
     def save(self, path: str | Path) -> None:
@@ -88,15 +92,21 @@ class Gaussians:
         As ``save`` writes it, which see.
         """
         from drgs.io.formats import Z_TO_Y, format_named
+        from drgs.io.ply import ORIGIN
 
         chosen, host = format_named(name), self.numpy()
         lost = [*(["harmonics"] if self.sh_degree > 0 and not chosen.has_harmonics else [])]
         lost += [f"{name} {value}" for name, value in chosen.unsaid(self.rendered_with).items()]
+        if self.origin != WORLD and not chosen.has_origin:
+            lost.append(f"the origin {shown_origin(self.origin)} of its coordinates")
         if lost:
             note = f"the format {chosen.name} has no room for {', '.join(lost)}: left out"
             warnings.warn(UserNote(note), stacklevel=2)
         host = host._turned(Z_TO_Y) if chosen.y_up else host
-        return chosen.encode({n: getattr(host, n) for n in host._names}, self.rendered_with)
+        said = dict(self.rendered_with or {})
+        if self.origin != WORLD:
+            said |= dict(zip(ORIGIN, host.origin, strict=True))
+        return chosen.encode({n: getattr(host, n) for n in host._names}, said or None)
 
     @staticmethod
     def from_numpy(
@@ -174,7 +184,7 @@ class Gaussians:
         """The same Gaussians as numpy arrays on the host."""
         features = self.features and {k: np.array(v) for k, v in self.features.items()}
         arrays = {name: np.array(getattr(self, name)) for name in self._names}
-        return Gaussians(**arrays, features=features, rendered_with=self.rendered_with)
+        return replace(self, **arrays, features=features)
 
     def to(self, tensor_type: type) -> Gaussians:
         """Copy to Dr.Jit tensors of type ``tensor_type`` (``TensorXf`` or ``TensorXf64``)."""
@@ -187,7 +197,7 @@ class Gaussians:
 
         features = self.features and {k: upload(v) for k, v in self.features.items()}
         tensors = {name: upload(getattr(self, name)) for name in self._names}
-        return Gaussians(**tensors, features=features, rendered_with=self.rendered_with)
+        return replace(self, **tensors, features=features)
 
     def _turned(self, rotation: np.ndarray) -> Gaussians:
         """Numpy arrays turned as a whole; float32."""
@@ -195,7 +205,8 @@ class Gaussians:
 
         parts = turned(self.means, self.quats, self.shN, rotation)
         means, quats, shN = (part.astype(np.float32) for part in parts)
-        return replace(self, means=means, quats=quats, shN=shN)
+        x, y, z = (rotation @ self.origin).tolist()
+        return replace(self, means=means, quats=quats, shN=shN, origin=(x, y, z))
 
     @property
     def _names(self) -> tuple[str, ...]:

@@ -45,7 +45,10 @@ class Similarity:
         )
 
     def of_gaussians(self, gaussians: Gaussians) -> Gaussians:
-        """Gaussians (numpy) moved, with what is seen of them from each side; float32."""
+        """Gaussians (numpy) moved, with what is seen of them from each side; float32.
+
+        Their origin is rotated and scaled, and the translation is added to the means.
+        """
         g = gaussians
         means, quats, shN = turned(g.means, g.quats, g.shN, self.rotation)
         g = replace(
@@ -54,6 +57,7 @@ class Similarity:
             quats=quats,
             log_scales=g.log_scales + np.log(self.scale),
             shN=shN,
+            origin=tuple((self.scale * (self.rotation @ g.origin)).tolist()),
         )
         if g.smoothing is not None:
             g = replace(g, smoothing=(g.smoothing * self.scale).astype(np.float32))

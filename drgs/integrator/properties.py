@@ -8,6 +8,7 @@ expected and what was given; where the type is wrong, its subclass ``PluginTypeE
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from numbers import Integral
@@ -19,7 +20,8 @@ import numpy as np
 
 from drgs.config.approximations import DECLARED, Approximations, Declared, Value, said_by
 from drgs.core.constants import MAX_INT
-from drgs.core.errors import PluginError, PluginTypeError, did_you_mean
+from drgs.core.errors import PluginError, PluginTypeError, UserNote, did_you_mean
+from drgs.core.origin import WORLD, shown_origin
 from drgs.effects.compose import IGNORABLE
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 from drgs.integrator.settings import LitIntegrator
@@ -107,7 +109,7 @@ def load_gaussians(props: mi.Properties) -> Gaussians:
                 f"splats: give either 'filename' or tensors, got both ({', '.join(given)})"
             )
         path = mi.file_resolver().resolve(str(props["filename"]))
-        gaussians = replace(Gaussians.load(str(path)).to(mi.TensorXf), features=features)
+        gaussians = replace(_loaded(str(path)).to(mi.TensorXf), features=features)
     elif given or features or "to_world" in props:
         missing = [name for name in PARAMETER_NAMES if name not in given and name != "shN"]
         if missing:
@@ -135,6 +137,18 @@ def load_gaussians(props: mi.Properties) -> Gaussians:
         moved = to_world.of_gaussians(gaussians.numpy()).to(mi.TensorXf)
         gaussians = replace(moved, features=features, rendered_with=gaussians.rendered_with)
     return gaussians
+
+
+def _loaded(path: str) -> Gaussians:
+    """The Gaussians of a file, in coordinates that Mitsuba's float32 can tell apart."""
+    gaussians = Gaussians.load(path)
+    if gaussians.origin != WORLD:
+        note = (
+            f"{path}: positions are relative to {shown_origin(gaussians.origin)}; place sensors "
+            "and shapes relative to that"
+        )
+        warnings.warn(UserNote(note), stacklevel=2)
+    return replace(gaussians, origin=WORLD)
 
 
 def turns_of_shapes(props: mi.Properties) -> dict[str, Turn]:

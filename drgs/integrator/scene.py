@@ -21,6 +21,9 @@ from drgs.core.memory import why_too_large
 from drgs.data.types import Viewpoint
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 
+NEAR_CLIP = 1e-9
+"""Scene units: the smallest near plane of a configuration, so that the integrator's own decides."""
+
 SQUARE_PIXEL_TOLERANCE = 0.01
 """px: largest shift at the image's border that may come from treating pixels as square."""
 
@@ -114,7 +117,7 @@ def film_of(width: int, height: int) -> dict[str, object]:
 def _sensor(view: Viewpoint, calibrated: bool) -> dict[str, object]:
     pose = {
         "to_world": _to_world(view.camera_to_world),
-        "near_clip": 1e-3,  # the integrator's own near plane decides
+        "near_clip": NEAR_CLIP,
         "sampler": {"type": "independent", "sample_count": 1},
     }
     is_perspective = view.lens is None and view.motion is None and _has_square_pixels(view)

@@ -5,7 +5,9 @@ A format is a module with two functions, imported when it is used::
     read_gaussians(path) -> (arrays by the names of Gaussians' fields, what it is rendered with)
     encode(gaussians, rendered_with) -> bytes
 
-with arrays as :mod:`drgs.io.ply` has them, in the axes of the file.
+with arrays as :mod:`drgs.io.ply` has them, in the axes of the file. Where means are relative to an
+origin (:mod:`drgs.core.origin`), its coordinates stand among the values of ``rendered_with``, by
+the names :data:`drgs.io.ply.ORIGIN`.
 """
 
 from __future__ import annotations
@@ -37,6 +39,11 @@ class Format:
     has_smoothing: bool = False  # the filter of each Gaussian
     keeps: frozenset[str] | None = None  # what it can say of rendering, by name; None: everything
     any_number: bool = False  # whether what is no finite number is written as it is
+
+    @property
+    def has_origin(self) -> bool:
+        """Whether it can record what means are relative to."""
+        return self.keeps is None
 
     def encode(
         self, gaussians: Mapping[str, np.ndarray], rendered_with: Mapping[str, Scalar] | None

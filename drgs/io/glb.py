@@ -26,8 +26,9 @@ import numpy as np
 from drgs.core.constants import SH_C0
 from drgs.core.errors import Place, UserError
 from drgs.core.files import read_bytes
+from drgs.core.origin import WORLD
 from drgs.io.glb_document import EXTENSION, OURS, Document, read_document
-from drgs.io.ply import Scalar
+from drgs.io.ply import ORIGIN, Scalar, near_means, origin_among
 from drgs.io.quantized import (
     log_scales_of,
     logits_of,
@@ -65,11 +66,15 @@ def encode(
     """A file of Gaussians. Equal Gaussians give equal bytes.
 
     gaussians: finite, by the names that :func:`drgs.io.ply.read_gaussians` gives, in axes with y
-    up; rendered_with: for ``extras``, None: nothing is said.
+    up; rendered_with: for ``extras``, None: nothing is said; the origin becomes the translation of
+    the node.
     """
-    attributes = _attributes(gaussians)
-    extras = {OURS: dict(rendered_with)} if rendered_with else None
-    text = json.dumps(_document(attributes, extras), separators=(",", ":")).encode()
+    attributes, said = _attributes(gaussians), dict(rendered_with or {})
+    origin = origin_among("rendered_with", said)
+    document = _document(attributes, {OURS: said} if said else None)
+    if origin != WORLD:
+        document["nodes"][0]["translation"] = list(origin)
+    text = json.dumps(document, separators=(",", ":")).encode()
     text += b" " * (-len(text) % 4)
     binary = b"".join(values.tobytes() for values in attributes.values())
     length = HEADER.size + 2 * CHUNK.size + len(text) + len(binary)
@@ -171,8 +176,9 @@ def read_gaussians(path: str | Path) -> tuple[dict[str, np.ndarray], dict[str, S
     quantised as the extension allows. Other meshes of the file are passed over.
 
     Raises :class:`UserError` naming the file, the place, what was expected and what was got: also
-    for splats that the file moves or shows several times, for compressed ones and for kernels and
-    colour spaces other than those that are written here.
+    for splats that the file rotates, scales or shows several times, for compressed ones and for
+    kernels and colour spaces other than those that are written here. A translation is added to the
+    means or, where it is far away, is their origin.
     """
     path = Path(path)
     text, binary, start = _chunks(path, read_bytes(path, "file", MAX_BYTES))
@@ -200,7 +206,11 @@ def read_gaussians(path: str | Path) -> tuple[dict[str, np.ndarray], dict[str, S
         "sh0": harmonics[:, :1],
         "shN": harmonics[:, 1:],
     }
-    return {n: values.astype(np.float32) for n, values in arrays.items()}, document.rendered_with
+    arrays["means"], origin = near_means(means + document.translation)
+    said = document.rendered_with
+    if origin != WORLD:  # exactly what the file has, not what would do
+        arrays["means"], said = means, said | dict(zip(ORIGIN, document.translation, strict=True))
+    return {n: values.astype(np.float32) for n, values in arrays.items()}, said
 
 
 def _chunks(path: Path, content: bytes) -> tuple[bytes, bytes, int]:

@@ -15,19 +15,19 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from pydantic.alias_generators import to_camel
 
 from drgs.core.errors import UserError, listed, one_line
-from drgs.io.ply import STATEMENT, Scalar
+from drgs.io.ply import MAX_ORIGIN, STATEMENT, Scalar
 
 EXTENSION = "KHR_gaussian_splatting"
 
 REQUIRED = ("POSITION", *(f"{EXTENSION}:{name}" for name in ("ROTATION", "SCALE", "OPACITY")))
 
 Index = Annotated[int, Field(ge=0, lt=2**32)]
+Coordinate = Annotated[float, Field(ge=-MAX_ORIGIN, le=MAX_ORIGIN)]
 OURS = "drgs"
 """The key of extras that are ours."""
 
 IDENTITY = {
     "matrix": [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1],
-    "translation": [0, 0, 0],
     "rotation": [0, 0, 0, 1],
     "scale": [1, 1, 1],
 }
@@ -83,7 +83,7 @@ class _Node(_Part):
     mesh: Index | None = None
     children: list[Index] = []
     matrix: list[float] = IDENTITY["matrix"]
-    translation: list[float] = IDENTITY["translation"]
+    translation: tuple[Coordinate, Coordinate, Coordinate] = (0.0, 0.0, 0.0)
     rotation: list[float] = IDENTITY["rotation"]
     scale: list[float] = IDENTITY["scale"]
 
@@ -105,6 +105,7 @@ class Document:
     primitive: _Primitive
     accessors: list[Accessor]
     views: list[View]
+    translation: tuple[float, float, float]  # of the splats, by their node and its parents
 
     @property
     def rendered_with(self) -> dict[str, Scalar]:
@@ -183,8 +184,8 @@ def read_document(path: Path, text: bytes) -> Document:
     missing = [name for name in REQUIRED if name not in primitive.attributes]
     if missing:
         raise UserError(f"{path}: {place}: attributes {', '.join(missing)} are missing")
-    _check_nodes(path, file.nodes, mesh)
-    return Document(path, place, primitive, file.accessors, file.buffer_views)
+    translation = _translation(path, file.nodes, mesh)
+    return Document(path, place, primitive, file.accessors, file.buffer_views, translation)
 
 
 def _has_splats(primitive: dict[str, object]) -> bool:
@@ -204,20 +205,26 @@ def _validated(path: Path, place: str, kind: type[BaseModel], content: object) -
         ) from None
 
 
-def _check_nodes(path: Path, nodes: list[_Node], mesh: int) -> None:
-    """Refuse splats that nodes move: they would have to be read moved."""
+def _translation(path: Path, nodes: list[_Node], mesh: int) -> tuple[float, float, float]:
+    """Add up the translations of the node that shows the splats, and of its parents.
+
+    Raises :class:`UserError` for nodes that rotate or scale them.
+    """
     showing = [index for index, node in enumerate(nodes) if node.mesh == mesh]
     if len(showing) > 1:
         raise UserError(f"{path}: the splats must be shown once, got {len(showing)} nodes")
     parents = {child: index for index, node in enumerate(nodes) for child in node.children}
-    seen = set()
+    seen, total = set(), (0.0, 0.0, 0.0)
     while showing and showing[0] not in seen:
         index = showing[0]
         seen.add(index)
         moved = [n for n, same in IDENTITY.items() if getattr(nodes[index], n) != same]
         if moved:
             raise UserError(
-                f"{path}: nodes[{index}].{moved[0]}: splats that a node moves are not read; apply "
-                "it to them in the program that wrote the file"
+                f"{path}: nodes[{index}].{moved[0]}: splats that a node rotates or scales are not "
+                "read; apply it to them in the program that wrote the file"
             )
+        x, y, z = (a + b for a, b in zip(total, nodes[index].translation, strict=True))
+        total = x, y, z
         showing = [parents[index]] if index in parents else []
+    return total

@@ -14,6 +14,10 @@ viewers would not take by themselves::
 
     comment drgs antialiased true
     comment drgs low_pass 0.1
+
+What positions are relative to, where that is far from the world's origin, stands there as well::
+
+    comment drgs origin_x 4200000.0
 """
 
 from __future__ import annotations
@@ -32,6 +36,7 @@ from plyfile import PlyData, PlyElement, PlyListProperty
 
 from drgs.core.errors import UserError, UserNote, listed, one_line
 from drgs.core.files import open_regular
+from drgs.core.origin import WORLD, Origin, near_origin
 from drgs.io.quantized import LARGEST_LOGIT, SMALLEST_LOGIT
 
 POSITION = ("x", "y", "z")
@@ -42,6 +47,12 @@ SCALE = ("scale_0", "scale_1", "scale_2")
 ROTATION = ("rot_0", "rot_1", "rot_2", "rot_3")
 SMOOTHING = ("filter_3D",)
 COLOR = ("red", "green", "blue")
+
+ORIGIN = ("origin_x", "origin_y", "origin_z")
+"""In comments: world coordinates of what positions are relative to."""
+
+MAX_ORIGIN = 1e12
+"""World units."""
 
 NUM_REST = {3 * ((degree + 1) ** 2 - 1): degree for degree in range(4)}
 """Number of ``f_rest`` properties -> degree: 0, 9, 24, 45 -> 0, 1, 2, 3."""
@@ -61,9 +72,10 @@ def read_gaussians(path: str | Path) -> tuple[dict[str, np.ndarray], dict[str, S
     The arrays have the values and the SH degree that the file holds. They come by the names of the
     fields of :class:`drgs.gaussians.parameters.Gaussians`, whose ``load`` calls this; ``smoothing``
     is missing where the file has none. Properties are found by name, in any order and of any
-    numeric type; others are ignored. Infinite logits, which formats with opacities of 8 bits leave
-    for 1 and 0, become the ends of what sigmoids tell apart, with a :class:`UserNote`. What the
-    header says is not checked: its names and limits are not known here.
+    numeric type; others are ignored. Positions of float64 that are far from the origin are relative
+    to another one, which is then among what the header says. Infinite logits, which formats with
+    opacities of 8 bits leave for 1 and 0, become the ends of what sigmoids tell apart, with a
+    :class:`UserNote`. What the header says is not checked: its names and limits are not known here.
 
     Raises :class:`UserError` naming the file and what it lacks: it must be whole, hold at least
     one row, and otherwise nothing but finite numbers.
@@ -78,8 +90,13 @@ def read_gaussians(path: str | Path) -> tuple[dict[str, np.ndarray], dict[str, S
     names = (*POSITION, *SH0, *_rest(num_rest), *OPACITY, *SCALE, *ROTATION)
     _require(path, vertex, names, "Gaussians", infinite=OPACITY)
     sh_rest = _columns(vertex, _rest(num_rest)).reshape(len(vertex), 3, num_rest // 3)
+    means = _columns(vertex, POSITION, np.float64)
+    if vertex.dtype["x"] == np.float64:
+        means, origin = near_means(means)
+        if origin != WORLD:
+            statements |= zip(ORIGIN, origin, strict=True)
     gaussians = {
-        "means": _columns(vertex, POSITION),
+        "means": means.astype(np.float32),
         "quats": _columns(vertex, ROTATION),
         "log_scales": _columns(vertex, SCALE),
         "logit_opacities": _finite_logits(path, _columns(vertex, OPACITY)[:, 0]),
@@ -178,15 +195,15 @@ def _scalar(text: str) -> Scalar:
 
 
 def read_points(path: str | Path) -> tuple[np.ndarray, np.ndarray | None]:
-    """Positions (N, 3) float32, world, and colours (N, 3) float32 in 0..1, or None without any.
+    """Positions (N, 3) float64, world, and colours (N, 3) float32 in 0..1, or None without any.
 
     Integer colours are scaled by their type's range, floats are taken as they are.
 
     Raises :class:`UserError` naming the file and what it lacks, as :func:`read_gaussians` does.
     """
-    vertex, _ = _read_vertices(path)
+    vertex, statements = _read_vertices(path)
     _require(path, vertex, POSITION, "points")
-    positions = _columns(vertex, POSITION)
+    positions = _columns(vertex, POSITION, np.float64) + origin_among(path, statements)
     if not set(COLOR) <= set(vertex.dtype.names):
         return positions, None
     _require(path, vertex, COLOR, "coloured points")
@@ -466,9 +483,38 @@ def _rest(num_rest: int) -> tuple[str, ...]:
     return tuple(f"f_rest_{i}" for i in range(num_rest))
 
 
-def _columns(vertex: np.ndarray, names: tuple[str, ...]) -> np.ndarray:
-    """(N, len(names)) float32, a copy."""
-    rows = np.empty((len(vertex), len(names)), np.float32)
+def origin_among(path: str | Path, statements: dict[str, Scalar]) -> Origin:
+    """Take the coordinates of the origin out of a header's statements.
+
+    Raises :class:`UserError` where some are missing, or are no numbers.
+    """
+    values = [statements.pop(name, None) for name in ORIGIN]
+    if values == [None, None, None]:
+        return WORLD
+    if not all(type(value) in (int, float) and abs(value) <= MAX_ORIGIN for value in values):
+        got = ", ".join("nothing" if value is None else str(value) for value in values)
+        raise UserError(
+            f"{path}: {', '.join(ORIGIN)} must be three numbers of at most {MAX_ORIGIN:g} in size, "
+            f"got {one_line(got, 80)}; correct the header, or remove them"
+        )
+    x, y, z = map(float, values)
+    return x, y, z
+
+
+def near_means(means: np.ndarray) -> tuple[np.ndarray, Origin]:
+    """Positions (N, 3) float64, and the origin that they are relative to.
+
+    means: (N, 3) float64, world, relative to another origin than the world's where most of them
+    are far away from that.
+    """
+    middle = np.median(means, axis=0)
+    origin = near_origin(middle, float(np.median(np.linalg.norm(means - middle, axis=1))))
+    return means - origin, origin
+
+
+def _columns(vertex: np.ndarray, names: tuple[str, ...], kind: type = np.float32) -> np.ndarray:
+    """(N, len(names)) of a float type, a copy."""
+    rows = np.empty((len(vertex), len(names)), kind)
     with np.errstate(over="ignore"):  # a float64 beyond float32 becomes inf, which is refused
         for column, name in enumerate(names):
             rows[:, column] = vertex[name]

@@ -16,6 +16,7 @@ import numpy as np
 
 from drgs.core.errors import UserError
 from drgs.core.extras import required
+from drgs.core.origin import WORLD, Origin
 from drgs.io.formats import check_finite
 from drgs.io.quantized import opacities_of, unit_quaternions
 
@@ -28,10 +29,11 @@ EXTENT = 3.0
 """Standard deviations of a Gaussian that count for the extent."""
 
 
-def encode(gaussians: Mapping[str, np.ndarray]) -> bytes:
+def encode(gaussians: Mapping[str, np.ndarray], origin: Origin = WORLD) -> bytes:
     """A binary USD file of Gaussians. Equal Gaussians give equal bytes.
 
-    gaussians: by the names that :func:`drgs.io.ply.read_gaussians` gives, with z up.
+    gaussians: by the names that :func:`drgs.io.ply.read_gaussians` gives, with z up; origin: of
+    their means, becomes the translation of the prim.
 
     Raises :class:`UserError` where OpenUSD is not installed or too old, or a number is not finite.
     """
@@ -47,6 +49,8 @@ def encode(gaussians: Mapping[str, np.ndarray]) -> bytes:
     UsdGeom.SetStageMetersPerUnit(stage, 1.0)
     splats = UsdVol.ParticleField3DGaussianSplat.Define(stage, Sdf.Path(PRIM))
     stage.SetDefaultPrim(splats.GetPrim())
+    if origin != WORLD:
+        UsdGeom.Xformable(splats).AddTranslateOp(UsdGeom.XformOp.PrecisionDouble).Set(origin)
     Usd.ColorSpaceAPI.Apply(splats.GetPrim()).CreateColorSpaceNameAttr(COLOR_SPACE)
     means = _float32(g["means"])
     scales = _float32(np.exp(np.minimum(g["log_scales"].astype(np.float64), 80)))

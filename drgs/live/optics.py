@@ -17,7 +17,7 @@ from drgs.cameras.axes import OPENCV_TO_MITSUBA
 from drgs.cameras.camera import Lens
 from drgs.data.types import Viewpoint
 from drgs.data.viewpoints import pinhole
-from drgs.integrator.scene import film_of, make_sensors
+from drgs.integrator.scene import NEAR_CLIP, film_of, make_sensors
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,7 +144,7 @@ def _mitsubas(
         {
             "type": kind,
             "to_world": mi.ScalarTransform4f(to_world),
-            "near_clip": 1e-3,  # the integrator's own near plane decides
+            "near_clip": NEAR_CLIP,
             "sampler": {"type": "independent", "sample_count": 1},
             "film": film_of(width, height),
             **settings,

@@ -12,6 +12,7 @@ import numpy as np
 from drgs.cameras.axes import between_opencv_and_opengl
 from drgs.core.errors import UserError, one_line
 from drgs.core.files import atomic_path, read_text
+from drgs.core.origin import WORLD, Origin
 from drgs.data.transforms import CLOSE, MAX_BYTES
 from drgs.data.types import Dataset, Motion, View, Viewpoint
 from drgs.data.viewpoints import read_viewpoints
@@ -53,6 +54,8 @@ def refined_dataset(dataset: Dataset, folder: Path) -> Dataset:
         found = json.loads(read_text(path, "refined cameras", MAX_BYTES))
         change = LensChange(**{k: tuple(v) for k, v in found["lens_change"].items()})
         poses = {f["file_path"]: _opencv_pose(f["transform_matrix"]) for f in found["frames"]}
+        for pose in poses.values():
+            pose[:3, 3] -= dataset.origin
         train = [replace(view, camera_to_world=poses[view.name]) for view in dataset.train]
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise UserError(
@@ -66,25 +69,31 @@ def refined_dataset(dataset: Dataset, folder: Path) -> Dataset:
     )
 
 
-def refined_viewpoints(folder: Path) -> list[Viewpoint] | None:
+def refined_viewpoints(folder: Path, origin: Origin) -> list[Viewpoint] | None:
     """The training cameras as the fit in ``folder`` has refined them; None: it has not.
 
-    Raises :class:`UserError` as ``read_viewpoints``.
+    origin: what their positions are to be relative to, world. Raises :class:`UserError` as
+    ``read_viewpoints``.
     """
     path = folder / CAMERAS
     if not path.is_file() or not load_run_config(folder).cameras.optimise:
         return None
-    return read_viewpoints(path, None)
+    return _read_relative(path, origin)
 
 
-def training_cameras(folder: Path) -> list[Viewpoint] | None:
+def training_cameras(folder: Path, origin: Origin) -> list[Viewpoint] | None:
     """The training cameras of the fit in ``folder``, refined if it has refined them.
 
-    None: it has left none. Raises :class:`UserError` as ``read_viewpoints``.
+    origin: what their positions are to be relative to, world. None: it has left none. Raises
+    :class:`UserError` as ``read_viewpoints``.
     """
-    if (refined := refined_viewpoints(folder)) is not None:
+    if (refined := refined_viewpoints(folder, origin)) is not None:
         return refined
-    return read_viewpoints(folder / VIEWS, None) if (folder / VIEWS).is_file() else None
+    return _read_relative(folder / VIEWS, origin) if (folder / VIEWS).is_file() else None
+
+
+def _read_relative(path: Path, origin: Origin) -> list[Viewpoint]:
+    return [view.moved(-np.array(origin)) for view in read_viewpoints(path, None)]
 
 
 def _opencv_pose(rows: list[list[float]]) -> np.ndarray:
@@ -99,9 +108,13 @@ def _moved_motion(view: View, camera_to_world: np.ndarray) -> Motion | None:
     return replace(view.motion, close_to_world=camera_to_world @ between)
 
 
-def frames_of(views: Iterable[View]) -> list[dict[str, object]]:
-    """The cameras of views as frames in the layout of ``transforms.json``."""
-    return [
+def cameras_json(views: Iterable[View], origin: Origin) -> dict[str, object]:
+    """The cameras of views in the layout of ``transforms.json``, in world coordinates.
+
+    origin: what the views' positions are relative to, world; recorded where it is not the world's.
+    """
+    recorded = {"origin": list(origin)} if origin != WORLD else {}
+    frames = [
         {
             "file_path": view.name,
             "transform_matrix": between_opencv_and_opengl(view.camera_to_world).tolist(),
@@ -109,14 +122,16 @@ def frames_of(views: Iterable[View]) -> list[dict[str, object]]:
             **{"w": view.width, "h": view.height},
             **_lens_and_motion(view),
         }
-        for view in views
+        for view in (view.moved(np.array(origin)) for view in views)
     ]
+    return {**recorded, "frames": frames}
 
 
-def write_views(path: Path, views: Iterable[View]) -> None:
+def write_views(path: Path, dataset: Dataset) -> None:
     """Write the cameras of the training views, as the data has them."""
     with atomic_path(path) as temporary:
-        temporary.write_text(json.dumps({"frames": frames_of(views)}, indent=1) + "\n")
+        content = cameras_json(dataset.train, dataset.origin)
+        temporary.write_text(json.dumps(content, indent=1) + "\n")
 
 
 def _lens_and_motion(view: View) -> dict[str, object]:

@@ -18,7 +18,7 @@ import json
 import math
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib import resources
 from pathlib import Path
 from string import Template
@@ -28,6 +28,7 @@ import numpy as np
 from drgs.config.approximations import Approximations
 from drgs.core.errors import UserNote
 from drgs.core.files import atomic_path
+from drgs.core.origin import WORLD
 from drgs.data.orbits import Orbit, orbit_of_gaussians, orbit_of_views
 from drgs.data.types import Dataset, Viewpoint
 from drgs.data.viewpoints import FIELD_OF_VIEW
@@ -147,7 +148,8 @@ def viewer_page(
     """
     move = standpoint.to_page
     in_file = Similarity(move.scale, FILE_AXES @ move.rotation, FILE_AXES @ move.translation)
-    splats = in_file.of_gaussians(shown.gaussians.numpy()).to_bytes("compressed-ply")
+    gaussians = replace(shown.gaussians.numpy(), origin=WORLD)  # the page has no world
+    splats = in_file.of_gaussians(gaussians).to_bytes("compressed-ply")
     files = resources.files("drgs.results")
     page = Template(files.joinpath(PAGE).read_text("utf-8")).substitute(
         title=html.escape(title),
@@ -185,7 +187,8 @@ def write_viewer(out: Path, dataset: Dataset, shown: Shown) -> None:
     if least > MOST_BYTES:
         _note_size(out, f"at least {least / 1e6:.0f}")
         return
-    standpoint = Standpoint.of_views(refined_viewpoints(out) or dataset.train, gaussians)
+    views = refined_viewpoints(out, dataset.origin) or dataset.train
+    standpoint = Standpoint.of_views(views, gaussians)
     page = viewer_page(out.resolve().name, shown, standpoint, dataset.background)
     if len(page) > MOST_BYTES:
         _note_size(out, f"{len(page) / 1e6:.0f}")

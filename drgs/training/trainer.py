@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -422,7 +422,7 @@ class Trainer:
         """The Gaussians as numpy arrays."""
         self.check()
         self.show()
-        return dr.detach(self.integrator.gaussians).numpy()
+        return replace(dr.detach(self.integrator.gaussians).numpy(), origin=self.dataset.origin)
 
     def show(self) -> None:
         """Bring the scene to where the fit is; the coming iterations do not depend on it."""

@@ -15,7 +15,7 @@ import mitsuba as mi
 import numpy as np
 
 from drgs.core.arrays import from_host
-from drgs.data.types import View
+from drgs.data.types import Dataset, View
 from drgs.integrator.settings import SplatsSettings
 from drgs.training.views import TrainingView
 
@@ -120,8 +120,8 @@ class TrainingEffect(Protocol):
         """Views of other photographs, with what the fit found out about their cameras."""
         return views
 
-    def write(self, folder: Path, views: tuple[View, ...]) -> None:
-        """Write what was found into the output folder; views: those of the training split."""
+    def write(self, folder: Path, dataset: Dataset) -> None:
+        """Write what was found for the training views into the output folder."""
 
     def numbers_of(self, view: TrainingView) -> dict[str, Any]:
         """What it has optimised that the view depends on: Float by name, without derivatives."""

@@ -23,9 +23,9 @@ from drgs.cameras.motion import rotation_matrix
 from drgs.config.schema import CamerasConfig
 from drgs.core.errors import UserError
 from drgs.core.files import atomic_path
-from drgs.data.types import View
+from drgs.data.types import Dataset, View
 from drgs.results.files import CAMERAS
-from drgs.results.refined_cameras import LensChange, frames_of
+from drgs.results.refined_cameras import LensChange, cameras_json
 from drgs.training.effects.base import FitState, TrainingEffect
 from drgs.training.effects.view_parameters import ViewParameters
 from drgs.training.views import TrainingView
@@ -195,16 +195,14 @@ class CameraRefinement(TrainingEffect):
         """With the lens that was found; where the cameras are is not known better than before."""
         return tuple(map(self.lens_change.of, views))
 
-    def write(self, folder: Path, views: tuple[View, ...]) -> None:
+    def write(self, folder: Path, dataset: Dataset) -> None:
         """``cameras.json``: the refined training cameras, in the layout of ``transforms.json``.
 
         ``lens_change`` says what of the intrinsics is not the data's.
         """
         with atomic_path(folder / CAMERAS) as temporary:
-            found = {
-                "lens_change": asdict(self.lens_change),
-                "frames": frames_of(self.refined(views)),
-            }
+            cameras = cameras_json(self.refined(dataset.train), dataset.origin)
+            found = {"lens_change": asdict(self.lens_change), **cameras}
             temporary.write_text(json.dumps(found, indent=1) + "\n")
 
 

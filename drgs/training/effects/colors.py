@@ -23,7 +23,7 @@ import numpy as np
 from drgs.config.schema import ColorConfig
 from drgs.core.arrays import from_host
 from drgs.core.files import atomic_path
-from drgs.data.types import View
+from drgs.data.types import Dataset, View
 from drgs.results.files import COLORS
 from drgs.training.effects.base import FitState, TrainingEffect, as_tensor
 from drgs.training.effects.view_parameters import ViewParameters
@@ -109,8 +109,9 @@ class ColorCorrection(TrainingEffect):
         self.parameters.restore(state)
         self.common = from_host(mi.Float, state["common"])
 
-    def write(self, folder: Path, views: tuple[View, ...]) -> None:
+    def write(self, folder: Path, dataset: Dataset) -> None:
         """``colors.json``: the transform of each training view, 3 x 4, by name."""
-        by_view = {v.name: m.tolist() for v, m in zip(views, self.transforms(), strict=True)}
+        found = zip(dataset.train, self.transforms(), strict=True)
+        by_view = {view.name: matrix.tolist() for view, matrix in found}
         with atomic_path(folder / COLORS) as temporary:
             temporary.write_text(json.dumps(by_view, indent=1) + "\n")

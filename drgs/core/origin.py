@@ -1,0 +1,41 @@
+"""Coordinates far from their origin, which float32 cannot tell apart: kept relative to a near one.
+
+At 4 million metres, as in Earth-centred coordinates, float32 has steps of half a metre. Positions
+are therefore read as float64, and what lies far away is stored relative to an *origin*, three
+float64 numbers that travel beside it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+Origin = tuple[float, float, float]
+"""World position of zero, exact in float64."""
+
+WORLD: Origin = (0.0, 0.0, 0.0)
+"""The world's own origin."""
+
+FAR = 100
+"""Sizes of a scene: farther away, its positions are kept relative to another origin. At that
+distance float32 resolves 4e-6 of the size, a hundredth of a pixel."""
+
+
+def near_origin(middle: Sequence[float], size: float) -> Origin:
+    """The origin to which positions around ``middle`` are to be relative.
+
+    middle: (3,) world; size: of what is there, world units. :data:`WORLD` unless that is far away;
+    else ``middle``, rounded to as many decimal digits as do not matter beside ``size``.
+    """
+    if not (size > 0 and np.abs(middle).max() > FAR * size):
+        return WORLD
+    digits = -math.floor(math.log10(size))
+    x, y, z = (round(float(value), digits) + 0.0 for value in middle)
+    return x, y, z
+
+
+def shown_origin(origin: Origin) -> str:
+    """The origin as messages write it."""
+    return f"({', '.join(f'{value:.15g}' for value in origin)})"
