@@ -74,6 +74,10 @@ class PixelOrder:
         """Columns that the depth at a pixel depends on."""
         return self.depths.keys(splats)
 
+    def records(self, bins: TileBins) -> Records:
+        """All numbers of each entry's splat, with what the depth at a pixel depends on."""
+        return Records.of(bins, bins.rows.load)
+
     def composite(self, bins: TileBins, records: Records) -> _OrderedLayers:
         """See :func:`drgs.splatting.rasterize.composite`."""
         return _composite(bins, records, self)

@@ -25,6 +25,7 @@ from drgs.cameras.camera import Camera
 from drgs.core.arrays import first_numbers, store_columns, types_of
 from drgs.core.constants import LOW_PASS
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
+from drgs.splatting.feature_groups import in_groups
 from drgs.splatting.grid import TileGrid
 from drgs.splatting.image_model import DEFAULT, ImageModel
 from drgs.splatting.projection import (
@@ -81,7 +82,11 @@ class Order(Protocol):
         """Columns that compositing needs for the order, besides the order of the entries."""
         ...
 
-    def composite(self, bins: TileBins, records: Records) -> Layers:
+    def records(self, bins: TileBins) -> Any:
+        """What compositing loads of each sorted entry, evaluated."""
+        ...
+
+    def composite(self, bins: TileBins, records: Any) -> Layers:
         """See :func:`drgs.splatting.rasterize.composite`."""
         ...
 
@@ -116,6 +121,10 @@ class CenterOrder:
         """Columns that compositing needs for the order, besides the order of the entries."""
         del splats
         return []
+
+    def records(self, bins: TileBins) -> Records:
+        """All numbers of each entry's splat."""
+        return Records.of(bins, bins.rows.load)
 
     def composite(self, bins: TileBins, records: Records) -> Layers:
         """Composite front to back."""
@@ -220,8 +229,8 @@ class Frame:
     camera: Camera
     order: Order  # the pipeline's, for this camera
     bins: TileBins
-    records: Records
-    layers: Layers
+    records: Any  # of that order
+    layers: Layers  # of that order
 
     def planes(self) -> list[Any]:
         """Transmittance, then the pipeline's features, each Float (H * W,), unevaluated."""
@@ -248,9 +257,9 @@ def render(gaussians: Gaussians, camera: Camera, pipeline: Pipeline) -> Frame:
     """
     model = pipeline.model.seen_by(camera)
     grid = TileGrid(camera.width, camera.height)
-    order = pipeline.order.seen_by(camera)
     bins = bin_footprints(pipeline.source.footprints(gaussians, camera, pipeline), grid, model)
-    records = Records.of(bins, bins.rows.load)
+    order = in_groups(pipeline.order.seen_by(camera), bins)
+    records = order.records(bins)
     layers = order.composite(bins, records)
     return Frame(pipeline, camera, order, bins, records, layers)
 
