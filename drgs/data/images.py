@@ -15,6 +15,7 @@ from drgs.data.kept import KeptPicture, Pixels
 from drgs.data.types import View
 from drgs.io.pictures import (
     BITS,
+    MAX_16_BITS,
     MAX_BYTES,
     as_numbers,
     image_mode,
@@ -25,9 +26,6 @@ from drgs.io.pictures import (
 
 NUMBERS_AT_ONCE, MOST_THREADS = 1 << 25, 8
 """Pixels of photographs that are being read: of 40 bytes each, at most."""
-
-MAX_DEPTH_STEPS = 2**16 - 1
-"""White in a picture of 16 bits."""
 
 ALL = 1 - 1e-4
 """Of an area, up to rounding."""
@@ -43,8 +41,13 @@ def read_mask(path: Path, size: tuple[int, int]) -> np.ndarray:
     is_larger = width > size[0] and is_scaled(size, (width, height))
     if not is_larger:
         _check_size(path, (width, height), size)  # before memory is taken for it
-    mask = (read_image(path)[:, :, 0] > 0.5).astype(np.float32)
+    mask = pixels_that_count(path).astype(np.float32)
     return _counting(_resized(mask, *size)) if is_larger else mask
+
+
+def pixels_that_count(path: Path) -> np.ndarray:
+    """(H, W) bool: where the brightest channel of a mask is above half, over black."""
+    return composite(read_image(path), (0.0, 0.0, 0.0)).max(axis=2) > 0.5
 
 
 def is_scaled(size: tuple[int, int], original: tuple[int, int]) -> bool:
@@ -80,7 +83,7 @@ def read_depth(path: Path, unit: float, size: tuple[int, int]) -> np.ndarray:
                 f"mode {mode}; convert it"
             )
         _check_size(path, image_size(path), size)
-        depth = read_image(path)[:, :, 0] * np.float32(MAX_DEPTH_STEPS * unit)
+        depth = read_image(path)[:, :, 0] * np.float32(MAX_16_BITS * unit)
     return np.where(np.isfinite(depth) & (depth > 0), depth, 0).astype(np.float32)
 
 
@@ -170,7 +173,7 @@ def kept_photograph(
 
 def kept_rounded(numbers: np.ndarray) -> KeptPicture:
     """Numbers in 0..1, kept in 16 bits each."""
-    kept = np.round(numbers * np.float32(MAX_DEPTH_STEPS)).astype(np.uint16)
+    kept = np.round(numbers * np.float32(MAX_16_BITS)).astype(np.uint16)
     return KeptPicture(kept.shape, lambda: as_numbers(kept), kept.nbytes)
 
 

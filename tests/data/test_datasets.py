@@ -5,7 +5,7 @@ import math
 import imageio.v3 as iio
 import numpy as np
 import pytest
-from support.datasets import CENTERS, edit, load, refusal
+from support.datasets import CENTERS, edit, load, load_noting, refusal
 
 from drgs.cameras.fisheye import Fisheye
 from drgs.cameras.radial_tangential import RadialTangential
@@ -196,12 +196,18 @@ def test_a_picture_of_another_size_is_refused(blender):
     )
 
 
-def test_a_missing_image_is_named(blender):
+def test_a_missing_image_is_left_out_and_named(blender):
     folder = blender[0]
     (folder / "train" / "r_1.png").unlink()
+    path = folder / "transforms_train.json"
+    dataset, notes = load_noting(folder)
+    assert [view.name for view in dataset.train] == ["r_0", "r_2"]
+    assert notes == [f"{path}: not there: 1 of 3 photographs (./train/r_1); left out"]
+    (folder / "train" / "r_0.png").unlink()
     assert refusal(folder) == (
-        f"{folder / 'transforms_train.json'}: frames[1].file_path: there is no image "
-        f"{folder / 'train' / 'r_1'} (or with .png added)"
+        f"{path}: frames[0].file_path: there is no image {folder / 'train' / 'r_0'} (or with .png "
+        "added); put them there, or take their frames out of the file; 2 of 3 photographs are not "
+        "there"
     )
 
 
@@ -407,3 +413,59 @@ def test_equal_file_names_in_two_folders_stay_apart(photographs):
     )
     names = [view.name for view in load(photographs).train]
     assert {"images_01", "more_01"} <= set(names)
+
+
+# Keys and files that are passed over are said
+def test_keys_that_are_not_read_are_said_once(photographs):
+    path = photographs / "transforms.json"
+
+    def change(meta):
+        meta.update(skew=0.5, from_na=True, aabb_scale=4, applied_transform=[[1, 0, 0, 0]])
+        for frame in meta["frames"][:2]:
+            frame.update(sharpness=3.0, exposure=1.5)
+
+    edit(path, change)
+    _, notes = load_noting(photographs)
+    assert notes == [f"{path}: keys that are not read: from_na, skew, frames[].exposure"]
+
+
+def test_files_from_outside_of_the_folder_are_said_once(photographs, tmp_path_factory):
+    elsewhere = tmp_path_factory.mktemp("elsewhere")
+    (photographs / "images" / "03.png").rename(elsewhere / "03.png")
+    (photographs / "images" / "03.png").symlink_to(elsewhere / "03.png")
+    assert load_noting(photographs)[1] == [
+        f"{photographs}: files from outside of the folder: 1 ({elsewhere / '03.png'})"
+    ]
+    (photographs / "images").rename(elsewhere / "images")
+    (photographs / "images").symlink_to(elsewhere / "images")
+    (note,) = load_noting(photographs)[1]
+    assert "files from outside of the folder: 10 (" in note
+
+
+def test_equal_and_empty_photographs_are_said(photographs):
+    images = photographs / "images"
+    (images / "05.png").write_bytes((images / "03.png").read_bytes())
+    (images / "08.png").write_bytes((images / "02.png").read_bytes())  # 08 is measured on
+    iio.imwrite(images / "07.png", np.zeros((6, 8, 4), np.uint8))
+    dataset, notes = load_noting(photographs)
+    assert len(dataset.train) == 8
+    assert notes == [
+        f"{photographs}: photographs that are transparent everywhere: 1 (images/07.png)",
+        f"{photographs}: the same photograph more than once: 2 (images/02.png = images/08.png, "
+        "images/03.png = images/05.png); 1 of them both trained and measured on",
+    ]
+
+
+def test_a_photograph_that_is_listed_twice_is_said(photographs):
+    edit(photographs / "transforms.json", lambda m: m["frames"].append(m["frames"][4]))
+    assert load_noting(photographs)[1] == [
+        f"{photographs}: the same photograph more than once: 1 (images/05.png = images/05.png)"
+    ]
+
+
+def test_a_transforms_file_may_begin_with_a_mark_of_byte_order(photographs):
+    path = photographs / "transforms.json"
+    path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes())
+    assert len(load(photographs).train) == 8
+    path.write_bytes(path.read_text("utf-8-sig").encode("utf-16"))
+    assert refusal(photographs).startswith(f"{path}: cannot read the file: not UTF-8 text")
