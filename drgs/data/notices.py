@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from drgs.core.errors import UserNote, listed
+from drgs.core.files import open_regular
 from drgs.core.records import digest
 from drgs.data.types import View
 from drgs.io.pictures import unused_content
@@ -70,7 +71,7 @@ class Notices:
     def _equal(self, train: Sequence[View], test: Sequence[View]) -> list[str]:
         """A note on photographs that are there more than once, or none."""
         groups = [[*train, *test]]
-        for key in (_size, _sample, digest):
+        for key in (_sample, digest):
             groups = [part for group in groups for part in _grouped(group, cache(key))]
         if not groups:
             return []
@@ -95,11 +96,9 @@ def _grouped(views: Sequence[View], key: Callable[[Path], object]) -> list[list[
     return [group for group in groups.values() if len(group) > 1]
 
 
-def _size(file: Path) -> int:
-    return file.stat().st_size
-
-
-def _sample(file: Path) -> int:
-    with file.open("rb") as stream:
-        stream.seek(max(0, (file.stat().st_size - SAMPLE_BYTES) // 2))
-        return zlib.crc32(stream.read(SAMPLE_BYTES))
+def _sample(file: Path) -> tuple[int, int]:
+    """The size of a file, and a checksum of its middle."""
+    with open_regular(file, "image") as stream:
+        size = stream.seek(0, os.SEEK_END)
+        stream.seek(max(0, (size - SAMPLE_BYTES) // 2))
+        return size, zlib.crc32(stream.read(SAMPLE_BYTES))

@@ -203,7 +203,7 @@ def test_point_colours_out_of_range_are_refused(tmp_path):
     write_elements(tmp_path / "a.ply", vertex=points(**channels(np.array([0, 255], "f4"))))
     with pytest.raises(
         UserError,
-        match=r"row 1: red, green, blue must be integers in 0..255 or floats in 0..1, got red = 255.0",
+        match=r"row 1: red, green, blue must be integers in 0..255 or floats in 0..1, got red = 25",
     ):
         read_points(tmp_path / "a.ply")
 
