@@ -15,7 +15,7 @@ import numpy as np
 from drgs.cameras.camera import Lens
 from drgs.config.schema import DataConfig
 from drgs.core.errors import UserError
-from drgs.data.images import downscale_depth, downscale_mask, read_depth, read_mask
+from drgs.data.images import downscale_depth, downscale_mask, is_array, read_depth, read_mask
 from drgs.data.kept import Pixels, kept_mask
 from drgs.data.transforms import CLOSE, Frame, lens_of, motion_of
 from drgs.data.types import Motion
@@ -72,7 +72,7 @@ def _unit(frame: Frame) -> float:
     values = frame.values
     if values.depth_unit_scale_factor is not None:
         return values.depth_unit_scale_factor
-    return 1.0 if str(values.depth_file_path).endswith(".npy") else PICTURE_UNIT
+    return 1.0 if is_array(frame.files["depth"]) else PICTURE_UNIT
 
 
 def ignored(config: DataConfig, frames: Sequence[Frame]) -> tuple[str, ...]:

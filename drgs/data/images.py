@@ -70,7 +70,7 @@ def read_depth(path: Path, unit: float, size: tuple[int, int]) -> np.ndarray:
     unit: scene units that a number of the ``.npy`` file, or a step of the 16 bit picture, counts;
     size: W, H. What is not finite or not positive is not known.
     """
-    if path.suffix == ".npy":
+    if is_array(path):
         depth = _stored_depth(path)
         _check_size(path, depth.shape[::-1], size)  # before memory is taken for it
         with np.errstate(over="ignore"):  # becomes infinite, and so is not known
@@ -85,6 +85,11 @@ def read_depth(path: Path, unit: float, size: tuple[int, int]) -> np.ndarray:
         _check_size(path, image_size(path), size)
         depth = read_image(path)[:, :, 0] * np.float32(MAX_16_BITS * unit)
     return np.where(np.isfinite(depth) & (depth > 0), depth, 0).astype(np.float32)
+
+
+def is_array(path: Path) -> bool:
+    """Whether depths are stored as an array, not as a picture; by the name."""
+    return path.suffix.lower() == ".npy"
 
 
 def _stored_depth(path: Path) -> np.ndarray:

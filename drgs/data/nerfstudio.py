@@ -18,7 +18,7 @@ from drgs.core.errors import listed
 from drgs.data.frame_files import frames_with_files, point_cloud_of
 from drgs.data.mask_names import note_unnamed_masks
 from drgs.data.photographs import Photographs, dataset_of
-from drgs.data.splits import Lists, listed_frames, lists_by_folders
+from drgs.data.splits import Lists, listed_frames, lists_by_folders, lists_in_files
 from drgs.data.transforms import TransformsFile, read_transforms
 from drgs.data.types import Dataset, Keeps, all_of_them
 
@@ -49,7 +49,7 @@ def _lists(meta: TransformsFile, notes: list[str]) -> Lists | None:
     """The splits that the file names, or that folders are called after."""
     names = [frame.own.file_path for frame in meta.frames]
     if not meta.lists:
-        return lists_by_folders(names)
+        return lists_in_files((meta.path.parent,), names, notes) or lists_by_folders(names)
     found = {
         split: listed_frames(meta.path, f"{split}_filenames", listing, names, notes)
         for split, listing in meta.lists.items()

@@ -37,13 +37,19 @@ class Notices:
         for what in unused_content(file):
             self._unused.setdefault(what, []).append(name)
 
-    def say(self, notes: Sequence[str], train: Sequence[View], test: Sequence[View]) -> None:
+    def say(
+        self,
+        notes: Sequence[str],
+        train: Sequence[View],
+        test: Sequence[View],
+        cloud: Path | None = None,
+    ) -> None:
         """Say ``notes``, and what was found, each once: as a :class:`UserNote`."""
-        views = {view.name: view for view in (*train, *test)}.values()
+        files = {path for view in (*train, *test) for path in view.files.values()}
         own = [f"photographs {what}: {_listed(names)}" for what, names in self._unused.items()]
         if self._transparent:
             own.append(f"photographs that are transparent everywhere: {_listed(self._transparent)}")
-        if outside := self._outside(views):
+        if outside := self._outside(files if cloud is None else {*files, cloud}):
             own.append(f"files from outside of the folder: {_listed(outside)}")
         own += self._equal(train, test)
         for note in (*notes, *(f"{self._folder}: {text}" for text in own)):
@@ -55,11 +61,11 @@ class Notices:
         except ValueError:
             return str(file)
 
-    def _outside(self, views: Iterable[View]) -> list[str]:
+    def _outside(self, files: Iterable[Path]) -> list[str]:
         """Files that lie elsewhere, by their names or by links."""
         root, folders = os.path.realpath(self._folder), {}
         found = []
-        for file in {path for view in views for path in view.files.values()}:
+        for file in files:
             if file.parent not in folders:
                 folders[file.parent] = os.path.realpath(file.parent)
             there = os.path.join(folders[file.parent], file.name)

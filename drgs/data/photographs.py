@@ -71,7 +71,8 @@ def dataset_of(config: DataConfig, photographs: Photographs, keeps: Keeps = all_
         zip(used, in_parallel(load_view, used, [*names.values()], threads=threads), strict=True)
     )
     train, test = (tuple(views[i] for i in indices) for indices in (split.train, split.test))
-    notices.say(said, train, () if split.name == "train" else test)
+    measured = () if split.name == "train" else test
+    notices.say(said, train, measured, photographs.point_cloud)
     return Dataset(
         train=train,
         test=test,

@@ -51,18 +51,7 @@ def listed_frames(
 
     Raises :class:`UserError` where fewer than half of a list are names of frames.
     """
-    exact = {"/".join(parts_of(name)): name for name in names}
-    loose: dict[str, list[str]] = {}
-    for name in names:
-        loose.setdefault(_loose(name), []).append(name)
-    found, unknown = set(), []
-    for name in listing:
-        same = exact.get("/".join(parts_of(name)))
-        candidates = loose.get(_loose(name), []) if same is None else [same]
-        if len(candidates) == 1:
-            found.add(candidates[0])
-        else:
-            unknown.append(one_line(name, 100))
+    found, unknown = _matched(listing, names)
     if len(unknown) > (1 - LEAST_SHARE) * len(listing):
         raise UserError(
             f"{source}: {key} must list the photographs of frames, but {len(unknown):,} of its "
@@ -74,6 +63,23 @@ def listed_frames(
     return found
 
 
+def _matched(listing: Sequence[str], names: Sequence[str]) -> tuple[set[str], list[str]]:
+    """Those of ``names`` that a list has, and what it has besides, for messages."""
+    exact = {"/".join(parts_of(name)): name for name in names}
+    loose: dict[str, set[str]] = {}
+    for name in names:
+        loose.setdefault(_loose(name), set()).add(name)
+    found, unknown = set(), []
+    for name in listing:
+        same = exact.get("/".join(parts_of(name)))
+        candidates = loose.get(_loose(name), set()) if same is None else {same}
+        if len(candidates) == 1:
+            found |= candidates
+        else:
+            unknown.append(one_line(name, 100))
+    return found, unknown
+
+
 def _loose(name: str) -> str:
     """Without the picture's suffix and the folder of photographs, in any case."""
     parts = [key_of(part) for part in parts_of(name)] or [""]
@@ -83,17 +89,27 @@ def _loose(name: str) -> str:
 
 
 def lists_in_files(folders: Sequence[Path], names: Sequence[str], notes: list[str]) -> Lists | None:
-    """Those of the first of ``folders`` with ``test.txt``, ``val.txt`` or ``train.txt``."""
+    """Those of the first of ``folders`` with ``test.txt``, ``val.txt`` or ``train.txt``.
+
+    A file that has no name of a frame is another's: a note says that it is not read. Other files
+    that may be lists are noted as well, where there is none.
+    """
     for folder in folders:
         found = {}
         for split in SPLITS:
             if (file := folder / f"{split}.txt").is_file():
                 lines = map(str.strip, read_text(file, "list of names", MAX_BYTES).split("\n"))
                 listing = [line for line in lines if line and not line.startswith("#")]
-                if chosen := listed_frames(folder, file.name, listing, names, notes):
-                    found[split] = chosen
+                if _matched(listing, names)[0]:
+                    found[split] = listed_frames(folder, file.name, listing, names, notes)
+                else:
+                    notes.append(f"{file}: lists no photograph, and is not read")
         if found:
             return Lists(found, " and ".join(f"{split}.txt" for split in found))
+    for file in sorted(folders[-1].glob("*split*.json")):
+        notes.append(
+            f"{file}: is not read; test.txt can list what is to be measured on, a name a line"
+        )
     return None
 
 
@@ -140,7 +156,7 @@ def split_of(
     left = [n for n in names if n not in set().union(train, test, *lists.names.values())]
     if left:
         notes.append(
-            f"{source}: left out, as {lists.where} have them not: {len(left):,} of "
+            f"{source}: left out, as no list has them ({lists.where}): {len(left):,} of "
             f"{len(names):,} photographs ({listed(left)})"
         )
     trained, measured = ([i for i, n in enumerate(names) if n in m] for m in (train, test))

@@ -469,3 +469,33 @@ def test_a_transforms_file_may_begin_with_a_mark_of_byte_order(photographs):
     assert len(load(photographs).train) == 8
     path.write_bytes(path.read_text("utf-8-sig").encode("utf-16"))
     assert refusal(photographs).startswith(f"{path}: cannot read the file: not UTF-8 text")
+
+
+@pytest.mark.parametrize(
+    "name", ["POINTS.PLY", "/home/someone/scan/points.ply", "images\\points.ply"]
+)
+def test_a_point_cloud_is_found_under_nearly_its_name(photographs, name):
+    cloud = photographs / ("images/points.ply" if "images" in name else "points.ply")
+    cloud.touch()
+    edit(photographs / "transforms.json", lambda m: m.update(ply_file_path=name))
+    dataset, (note,) = load_noting(photographs)
+    assert dataset.point_cloud == cloud
+    assert note.endswith(f"nearly the same name: 1 point cloud, such as {cloud} for {name}")
+
+
+def test_depths_and_masks_are_found_under_nearly_their_names(photographs):
+    """A depth of another format has another unit: it is not taken."""
+    with (photographs / "D.NPY").open("wb") as file:
+        np.save(file, np.full((6, 8), 2.0))
+    iio.imwrite(photographs / "mask.webp", np.full((6, 8, 3), 255, np.uint8), lossless=True)
+
+    def change(meta):
+        meta["frames"][2].update(depth_file_path="d.npy", mask_path="Mask.png")
+
+    edit(photographs / "transforms.json", change)
+    dataset, notes = load_noting(photographs)
+    view = next(view for view in dataset.train if view.name == "07")
+    np.testing.assert_array_equal(view.depth, np.full((6, 8), 2, np.float32))
+    assert np.asarray(view.mask).all() and len(notes) == 2
+    edit(photographs / "transforms.json", lambda m: m["frames"][2].update(depth_file_path="d.png"))
+    assert "d.png (or with .png added)" in refusal(photographs)

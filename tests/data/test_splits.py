@@ -35,9 +35,7 @@ def test_the_lists_are_the_splits(photographs, keys, test_split, train, test):
     give(photographs, **{f"{key}_filenames": LISTS[f"{key}_filenames"] for key in keys})
     dataset, notes = load_noting(photographs, test_split=test_split)
     assert names(dataset.train) == list(train) and names(dataset.test) == list(test)
-    assert dataset.test_split == test_split or "val" if "test" not in keys else "test"
-    left_out = set(range(10)) - set(train) - set(test) - {6, 7, 8, 9}
-    assert not left_out
+    assert dataset.test_split == (test_split or ("val" if keys == ("train", "val") else "test"))
     unlisted = keys == ("train", "val")
     assert [": left out, as " in note for note in notes] == [True] * unlisted
     if unlisted:
@@ -95,3 +93,18 @@ def test_splits_that_are_not_there_or_empty_are_refused(photographs):
 def test_empty_lists_are_none(photographs):
     give(photographs, train_filenames=[], val_filenames=[], test_filenames=[])
     assert names(load_noting(photographs)[0].test) == [0, 8]
+
+
+def test_a_list_in_a_file_counts_as_well(photographs):
+    (photographs / "train.txt").write_text("loss 0.5\nloss 0.4\n")  # a log of some program
+    (photographs / "test.txt").write_text("images/03.png\n05\n")
+    dataset, notes = load_noting(photographs)
+    assert names(dataset.test) == [3, 5] and len(dataset.train) == 8
+    assert notes == [f"{photographs}/train.txt: lists no photograph, and is not read"]
+
+
+def test_files_that_may_be_lists_are_said_not_to_be_read(photographs):
+    (photographs / "train_test_split_3.json").write_text("{}")
+    dataset, (note,) = load_noting(photographs)
+    assert names(dataset.test) == [0, 8]
+    assert note.startswith(f"{photographs}/train_test_split_3.json: is not read; ")
