@@ -17,7 +17,13 @@ from pathlib import Path
 
 from drgs.config.schema import DataConfig
 from drgs.core.errors import UserError, listed, one_line
-from drgs.data.file_names import PICTURE_SUFFIXES, FileFinder, note_near, without_missing
+from drgs.data.file_names import (
+    PICTURE_SUFFIXES,
+    FileFinder,
+    key_of,
+    note_near,
+    without_missing,
+)
 from drgs.data.images import is_scaled
 from drgs.data.mask_names import masks_of
 from drgs.data.photographs import MAX_WIDTH, Photographs, dataset_of
@@ -103,12 +109,12 @@ def load(config: DataConfig, keeps: Keeps = all_of_them) -> Dataset:
     there = _images_there(config, folder, model, notes)
     pictures = picture_folder(config, model)
     names = [file.relative_to(pictures).as_posix() for _, file in there]
-    masks = masks_of(root, names, [] if config.ignore_masks else notes)
+    masks = masks_of(root, names, [] if config.ignore_masks else notes, pictures)
     frames = []
     for index, ((image, file), mask) in enumerate(zip(there, masks, strict=True)):
         own = _values(model.cameras[image.camera], image, file, mask, folder)
         has_mask = mask is not None and not config.ignore_masks
-        files = {"image": file} | ({"mask": root / mask} if has_mask else {})
+        files = {"image": file} | ({"mask": mask} if has_mask else {})
         frames.append(ColmapFrame(own, own, index, folder, files))
     all_names = [image.name for image in model.images]
     lists = lists_in_files((folder, root), all_names, notes) or lists_by_folders(all_names)
@@ -155,8 +161,9 @@ def picture_folder(config: DataConfig, model: ColmapModel) -> Path:
     the width of ``data.image_size``, or the largest ones there are.
     """
     root, _ = _root_and_model(config.path)
-    there = {factor: root / ("images" if factor == 1 else f"images_{factor}") for factor in FACTORS}
-    there = {factor: path for factor, path in there.items() if path.is_dir()}
+    factors = {"images" if factor == 1 else f"images_{factor}": factor for factor in FACTORS}
+    folders = [path for path in sorted(root.iterdir()) if path.is_dir()]
+    there = {factors[key]: path for path in folders if (key := key_of(path.name)) in factors}
     if 1 not in there and any((root / image.name).is_file() for image in model.images):
         there[1] = root
     if not there:
@@ -178,7 +185,7 @@ def picture_folder(config: DataConfig, model: ColmapModel) -> Path:
 
 
 def _values(
-    camera: ColmapCamera, image: ColmapImage, file: Path, mask: str | None, folder: Path
+    camera: ColmapCamera, image: ColmapImage, file: Path, mask: Path | None, folder: Path
 ) -> FrameValues:
     """What a frame of a transforms file would have, for the size of ``file``."""
     model = LENSES.get(camera.model)
@@ -205,7 +212,7 @@ def _values(
     return FrameValues.model_construct(
         file_path=image.name,
         transform_matrix=image.camera_to_world,
-        mask_path=mask,
+        mask_path=None if mask is None else str(mask),
         **values,
     )
 

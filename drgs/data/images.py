@@ -27,6 +27,10 @@ from drgs.io.pictures import (
 NUMBERS_AT_ONCE, MOST_THREADS = 1 << 25, 8
 """Pixels of photographs that are being read: of 40 bytes each, at most."""
 
+NEITHER, MOST_EDGES = 0.8, 0.1
+"""Of brightness, the middle part that is neither black nor white; and how many of a mask's pixels
+may be so, at the edges of what it leaves out."""
+
 ALL = 1 - 1e-4
 """Of an area, up to rounding."""
 
@@ -46,8 +50,17 @@ def read_mask(path: Path, size: tuple[int, int]) -> np.ndarray:
 
 
 def pixels_that_count(path: Path) -> np.ndarray:
-    """(H, W) bool: where the brightest channel of a mask is above half, over black."""
-    return composite(read_image(path), (0.0, 0.0, 0.0)).max(axis=2) > 0.5
+    """(H, W) bool: where a mask is opaque, and its brightest channel is above half.
+
+    A photograph that is cut out, not black and white, is a mask by its alpha channel alone.
+    """
+    image = read_image(path)
+    bright = image[:, :, :3].max(axis=2)
+    if image.shape[2] == 3 or (image[:, :, 3] > 0.5).all():
+        return bright > 0.5
+    opaque = image[:, :, 3] > 0.5
+    is_photograph = np.mean(np.abs(bright[opaque] - 0.5) < NEITHER / 2) > MOST_EDGES
+    return opaque if is_photograph else opaque & (bright > 0.5)
 
 
 def is_scaled(size: tuple[int, int], original: tuple[int, int]) -> bool:

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from drgs.config.schema import DataConfig
-from drgs.core.errors import UserError, listed
+from drgs.core.errors import UserError
 from drgs.data.extras import ignored, notes, optics_of
 from drgs.data.frame_files import frames_with_files
 from drgs.data.images import check_room, threads_for
@@ -26,6 +26,7 @@ from drgs.data.transforms import (
     Frame,
     focal_from_angle,
     in_parallel,
+    note_unread,
     read_transforms,
     unique_names,
 )
@@ -78,7 +79,7 @@ def _frames(config: DataConfig, split: str, notes: list[str]) -> list[Frame]:
     """Those of a split whose photographs are there."""
     meta = read_transforms(_transforms_path(config.path, split))
     if meta.unread:
-        notes.append(f"{meta.path}: keys that are not read: {listed(meta.unread, 8)}")
+        notes.append(note_unread(meta))
     return frames_with_files(config, meta, notes)
 
 

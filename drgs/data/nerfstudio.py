@@ -14,12 +14,11 @@ from __future__ import annotations
 from pathlib import Path
 
 from drgs.config.schema import DataConfig
-from drgs.core.errors import listed
 from drgs.data.frame_files import frames_with_files, point_cloud_of
 from drgs.data.mask_names import note_unnamed_masks
 from drgs.data.photographs import Photographs, dataset_of
 from drgs.data.splits import Lists, listed_frames, lists_by_folders, lists_in_files
-from drgs.data.transforms import TransformsFile, read_transforms
+from drgs.data.transforms import TransformsFile, note_unread, read_transforms
 from drgs.data.types import Dataset, Keeps, all_of_them
 
 
@@ -30,7 +29,7 @@ def load(config: DataConfig, keeps: Keeps = all_of_them) -> Dataset:
     frames = frames_with_files(config, meta, notes)
     cloud, note = point_cloud_of(config, meta, notes)
     if meta.unread:
-        notes.append(f"{meta.path}: keys that are not read: {listed(meta.unread, 8)}")
+        notes.append(note_unread(meta))
     if not config.ignore_masks and not any("mask" in frame.files for frame in frames):
         note_unnamed_masks(config.path, notes)
     photographs = Photographs(

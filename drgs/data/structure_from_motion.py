@@ -280,7 +280,9 @@ class _Work:
 
         COLMAP leaves out photographs whose mask is missing.
         """
-        given = dict(zip(self.names, masks_of(self.dataset, self.names, []), strict=True))
+        given = dict(
+            zip(self.names, masks_of(self.dataset, self.names, [], self.pictures), strict=True)
+        )
         if not any(given.values()):
             return None
         folder = self.folder / "masks"
@@ -288,7 +290,7 @@ class _Work:
             target = folder / f"{name}.png"
             target.parent.mkdir(parents=True, exist_ok=True)
             if (mask := given[name]) is not None:
-                Image.fromarray(pixels_that_count(self.dataset / mask)).convert("L").save(target)
+                Image.fromarray(pixels_that_count(mask)).convert("L").save(target)
             else:
                 Image.new("L", image_size(self.pictures / name), 255).save(target)
         return folder

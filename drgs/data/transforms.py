@@ -20,7 +20,7 @@ from pydantic_core import ErrorDetails
 
 from drgs.cameras.axes import between_opencv_and_opengl
 from drgs.config.explain import expectation
-from drgs.core.errors import UserError, one_line
+from drgs.core.errors import UserError, listed, one_line
 from drgs.core.files import read_text, shortened
 from drgs.data.types import Motion
 from drgs.io.pictures import MAX_SIDE
@@ -226,11 +226,6 @@ class TransformsFile:
     unread: Sequence[str]  # keys that are passed over
 
 
-def read_frames(path: Path) -> Sequence[Frame]:
-    """The frames of a transforms file: see :func:`read_transforms`."""
-    return read_transforms(path).frames
-
-
 def read_transforms(path: Path) -> TransformsFile:
     """Read and check a transforms file.
 
@@ -249,6 +244,11 @@ def read_transforms(path: Path) -> TransformsFile:
     names = {split: getattr(meta, f"{split}_filenames") for split in ("train", "val", "test")}
     lists = {split: listing for split, listing in names.items() if listing}
     return TransformsFile(path, frames, meta.ply_file_path, lists, _unread(content))
+
+
+def note_unread(meta: TransformsFile) -> str:
+    """What the user should know of keys that are passed over."""
+    return f"{meta.path}: keys that are not read: {listed(meta.unread, 8)}"
 
 
 def _unread(content: Mapping[str, object]) -> list[str]:

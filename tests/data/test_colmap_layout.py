@@ -64,6 +64,14 @@ def test_other_models_beside_the_first_are_named(tmp_path):
     assert "; model sparse/0 (others are there: 2, 10)" in load(tmp_path).description
 
 
+def test_folders_may_be_called_in_another_case(tmp_path):
+    write_dataset(tmp_path)
+    (tmp_path / "images").rename(tmp_path / "Images")
+    write_pictures(tmp_path / "IMAGES_2", size=(320, 240))
+    assert load(tmp_path).train[0].files["image"].parent == tmp_path / "Images"
+    assert load(tmp_path, downscale=2).train[0].width == 320
+
+
 def test_the_pictures_own_size_decides_the_intrinsics(tmp_path):
     write_dataset(tmp_path)
     for factor in (2, 4):
@@ -186,7 +194,7 @@ def test_masks_lie_beside_their_pictures(tmp_path):
     [
         *("masks/{0}.jpg.png", "masks/{0}.png", "masks/{0}.jpg", "MASKS/{1}.PNG", "mask/{0}.png"),
         *("masks/{0}_mask.png", "masks/{0}.png.mask.png", "masks/{1}.Mask.PNG"),
-        "masks/{0}-mask.webp",
+        *("masks/{0}-mask.webp", "images/{0}.mask.png", "images/{0}_mask.png"),
     ],
 )
 def test_masks_are_called_as_programs_call_them(tmp_path, pattern):
@@ -212,7 +220,7 @@ def test_the_mask_of_the_whole_name_is_preferred(tmp_path):
         (tmp_path / "masks").mkdir(exist_ok=True)
         (tmp_path / "masks" / file).touch()
     notes = []
-    expected = ["masks/a.jpg.png", "masks/b.png", "masks/b_mask.png"]
+    expected = [tmp_path / "masks" / name for name in ("a.jpg.png", "b.png", "b_mask.png")]
     assert masks_of(tmp_path, names, notes) == expected
     assert len(notes) == 1 and "masks of no photograph that has a camera: masks/a.png" in notes[0]
 

@@ -139,13 +139,15 @@ def test_a_mask_may_be_an_alpha_channel_or_any_colour(photographs):
     pictures["03"].putpalette([0, 0, 0, 0, 128, 0])  # labels, as annotation tools write them
     pictures["04"] = Image.fromarray((40_000 * counts).astype(np.uint16))
     pictures["05"] = Image.fromarray(np.dstack([zero, 255 * counts, zero]).astype(np.uint8))
+    photograph = np.random.default_rng(1).integers(0, 256, (6, 8, 3))  # cut out
+    pictures["06"] = Image.fromarray(np.dstack([photograph, 255 * counts]).astype(np.uint8))
     for name, picture in pictures.items():
         picture.save(photographs / f"mask{name}.png")
         give(photographs, f"{name}.png", mask_path=f"mask{name}.png")
     dataset = load(photographs)
     for name in pictures:
         np.testing.assert_array_equal(view_named(dataset, name).mask, counts, err_msg=name)
-    assert dataset.description.endswith("; masks of 5 of 10 photographs")
+    assert dataset.description.endswith("; masks of 6 of 10 photographs")
 
 
 def test_a_folder_of_masks_that_nothing_names_is_said_not_to_count(photographs):
