@@ -21,8 +21,8 @@ from drgs.data.file_names import (
     PICTURE_SUFFIXES,
     FileFinder,
     key_of,
+    note_missing,
     note_near,
-    without_missing,
 )
 from drgs.data.images import is_scaled
 from drgs.data.mask_names import masks_of
@@ -141,17 +141,16 @@ def _images_there(
     found, near = finder.find_all(names, PICTURE_SUFFIXES)
     note_near(folder, near, "photographs", notes)
 
-    def explain(image: ColmapImage) -> str:
+    def explain(index: int) -> str:
+        name = names[index]
         return (
-            f"{folder}: image {one_line(image.name, 100)}: there is no picture "
-            f"{one_line(finder.folder / image.name)}"
-            f"{finder.suggestion(image.name, PICTURE_SUFFIXES)}; put the photographs there that "
-            "COLMAP saw"
+            f"{folder}: image {one_line(name, 100)}: there is no picture "
+            f"{one_line(finder.folder / name)}{finder.suggestion(name, PICTURE_SUFFIXES)}; put the "
+            "photographs there that COLMAP saw"
         )
 
-    what = "photographs", "left out"
-    there = without_missing(folder, images, names, found, explain, what, notes)
-    return [(image, found[image.name]) for image in there]
+    note_missing(folder, names, found, explain, ("photographs", "left out"), notes)
+    return [(image, found[image.name]) for image in images if image.name in found]
 
 
 def picture_folder(config: DataConfig, model: ColmapModel) -> Path:

@@ -12,7 +12,6 @@ import unicodedata
 from collections import Counter
 from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
-from typing import TypeVar
 
 from drgs.core.errors import UserError, did_you_mean, listed, one_line
 
@@ -30,8 +29,6 @@ LEAST_SHARE = 0.5
 """Of the photographs that are named, those that must be there."""
 
 _PICTURE_FOLDER = re.compile(rf"(?:{'|'.join(PICTURE_FOLDERS)})(?:_[0-9]+)?")
-
-T = TypeVar("T")
 
 
 def parts_of(name: str) -> list[str]:
@@ -79,12 +76,6 @@ class FileFinder:
                 if found:
                     return found
         return []
-
-    def find(self, name: str, suffixes: Collection[str] = ()) -> Path | None:
-        """The file of that name, or the only one that is there under nearly the same."""
-        found = self.exact(name)
-        near = [] if found else self.near(name, suffixes)
-        return near[0] if len(near) == 1 else found
 
     def find_all(
         self, names: Collection[str], suffixes: Collection[str] = ()
@@ -157,31 +148,27 @@ def note_near(source: Path, near: Mapping[str, Path], what: str, notes: list[str
         )
 
 
-def without_missing(
+def note_missing(
     source: Path,
-    items: Sequence[T],
     names: Sequence[str],
     found: Collection[str],
-    explain: Callable[[T], str],
+    explain: Callable[[int], str],
     what: tuple[str, str],
     notes: list[str],
-) -> list[T]:
-    """The items whose files were found; a note counts and names the others.
+) -> None:
+    """Add one note that counts and names the files that were not found, if any.
 
-    source: for the note; names: of the items' files; explain: the message for an item without one;
-    what: the files are called, and what becomes of those that are not there.
+    source: what names them, for the note; explain: the message for the one at an index of
+    ``names``; what: the files are called, and what becomes of those that are not there.
 
     Raises :class:`UserError` where fewer than half were found.
     """
-    there = [item for item, name in zip(items, names, strict=True) if name in found]
-    if len(there) == len(items):
-        return there
-    gone = [item for item, name in zip(items, names, strict=True) if name not in found]
+    gone = [index for index, name in enumerate(names) if name not in found]
+    if not gone:
+        return
     kind, consequence = what
-    if len(there) < LEAST_SHARE * len(items):
-        several = f"; {len(gone):,} of {len(items):,} {kind} are not there" if len(gone) > 1 else ""
-        raise UserError(f"{explain(gone[0])}{several}")
-    missing = [one_line(name, 100) for name in names if name not in found]
-    count = f"{len(missing):,} of {len(items):,} {kind}"
-    notes.append(f"{source}: not there: {count} ({listed(missing)}); {consequence}")
-    return there
+    count = f"{len(gone):,} of {len(names):,} {kind}"
+    if len(names) - len(gone) < LEAST_SHARE * len(names):
+        raise UserError(explain(gone[0]) + (f"; {count} are not there" if len(gone) > 1 else ""))
+    missing = listed([one_line(names[index], 100) for index in gone])
+    notes.append(f"{source}: not there: {count} ({missing}); {consequence}")

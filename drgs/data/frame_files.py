@@ -8,7 +8,7 @@ from pathlib import Path
 
 from drgs.config.schema import DataConfig
 from drgs.core.errors import UserError, one_line
-from drgs.data.file_names import PICTURE_SUFFIXES, FileFinder, note_near, without_missing
+from drgs.data.file_names import PICTURE_SUFFIXES, FileFinder, note_missing, note_near
 from drgs.data.transforms import Frame, TransformsFile
 
 
@@ -47,8 +47,10 @@ def frames_with_files(config: DataConfig, meta: TransformsFile, notes: list[str]
 
     Raises :class:`UserError` where fewer than half of the files of a kind are there.
     """
-    finder, frames = FileFinder(config.path), list(meta.frames)
-    frames = _with_files(finder, meta.path, frames, IMAGE, notes)
+    if nameless := [frame for frame in meta.frames if frame.values.file_path is None]:
+        raise UserError(f"{nameless[0].where(IMAGE.key)} is missing")
+    finder = FileFinder(config.path)
+    frames = _with_files(finder, meta.path, meta.frames, IMAGE, notes)
     if not config.ignore_masks:
         frames = _with_files(finder, meta.path, frames, MASK, notes)
     if not config.ignore_depth:
@@ -60,36 +62,27 @@ def _with_files(
     finder: FileFinder, source: Path, frames: Sequence[Frame], kind: _Kind, notes: list[str]
 ) -> list[Frame]:
     """All frames but those whose file of this kind is needed and missing."""
+    given = [getattr(frame.values, kind.key) for frame in frames]
+    naming = [frame for frame, name in zip(frames, given, strict=True) if name is not None]
+    names = [name for name in given if name is not None]
 
-    def explain(frame: Frame) -> str:
-        name = getattr(frame.values, kind.key)
+    def explain(index: int) -> str:
         return (
-            f"{frame.where(kind.key)}: there is no image {one_line(finder.folder / name)} (or with "
-            f".png added){finder.suggestion(name, kind.suffixes)}; {kind.remedy}"
+            f"{naming[index].where(kind.key)}: there is no image "
+            f"{one_line(finder.folder / names[index])} (or with .png added)"
+            f"{finder.suggestion(names[index], kind.suffixes)}; {kind.remedy}"
         )
 
-    asking = [frame for frame in frames if getattr(frame.values, kind.key) is not None]
-    if kind is IMAGE and len(asking) < len(frames):
-        missing = next(frame for frame in frames if frame.values.file_path is None)
-        raise UserError(f"{missing.where(kind.key)} is missing")
-    names = [getattr(frame.values, kind.key) for frame in asking]
     found, near = finder.find_all(names, kind.suffixes)
     note_near(source, near, kind.plural, notes)
-    what = kind.plural, kind.consequence
-    there = without_missing(source, asking, names, found, explain, what, notes)
-    kept = {frame.index for frame in there}
-    with_file = {
-        frame.index: replace(
-            frame, files={**frame.files, kind.name: found[getattr(frame.values, kind.key)]}
-        )
-        for frame in there
-    }
-    asked = {frame.index for frame in asking}
-    return [
-        with_file.get(frame.index, frame)
-        for frame in frames
-        if frame.index in kept or frame.index not in asked or not kind.is_needed
-    ]
+    note_missing(source, names, found, explain, (kind.plural, kind.consequence), notes)
+    kept = []
+    for frame, name in zip(frames, given, strict=True):
+        if name in found:
+            kept.append(replace(frame, files={**frame.files, kind.name: found[name]}))
+        elif name is None or not kind.is_needed:
+            kept.append(frame)
+    return kept
 
 
 def point_cloud_of(

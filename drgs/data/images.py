@@ -55,12 +55,12 @@ def pixels_that_count(path: Path) -> np.ndarray:
     A photograph that is cut out, not black and white, is a mask by its alpha channel alone.
     """
     image = read_image(path)
-    bright = image[:, :, :3].max(axis=2)
+    brightness = image[:, :, :3].max(axis=2)
     if image.shape[2] == 3 or (image[:, :, 3] > 0.5).all():
-        return bright > 0.5
+        return brightness > 0.5
     opaque = image[:, :, 3] > 0.5
-    is_photograph = np.mean(np.abs(bright[opaque] - 0.5) < NEITHER / 2) > MOST_EDGES
-    return opaque if is_photograph else opaque & (bright > 0.5)
+    is_photograph = np.mean(np.abs(brightness[opaque] - 0.5) < NEITHER / 2) > MOST_EDGES
+    return opaque if is_photograph else opaque & (brightness > 0.5)
 
 
 def is_scaled(size: tuple[int, int], original: tuple[int, int]) -> bool:
