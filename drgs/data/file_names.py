@@ -25,8 +25,8 @@ PICTURE_SUFFIXES = frozenset(
 PICTURE_FOLDERS = ("images", "input", "photos", "rgb")
 """Where converters expect photographs, or put them."""
 
-LEAST_SHARE = 0.5
-"""Of the photographs that are named, those that must be there."""
+LEAST_SHARE, LEAST_LEFT = 0.5, 2
+"""Of the files of a kind that are named, those that must be there."""
 
 _PICTURE_FOLDER = re.compile(rf"(?:{'|'.join(PICTURE_FOLDERS)})(?:_[0-9]+)?")
 
@@ -67,15 +67,15 @@ class FileFinder:
         suffixes: that the last part may have instead of its own.
         """
         parts = parts_of(name)
-        is_whole = name[:1] in ("/", "\\") or name[1:2] == ":"
-        for start, part in enumerate(parts):
+        is_elsewhere = name[:1] in ("/", "\\") or name[1:2] == ":" or ".." in parts
+        for start in range(len(parts)):
             before = parts[start - 1] if start else ""
             is_folder = _PICTURE_FOLDER.fullmatch(key_of(before)) or before == self.folder.name
-            if (start == 0 or is_whole or is_folder or before == "..") and part != "..":
+            if (start == 0 or is_elsewhere or is_folder) and ".." not in parts[start:]:
                 found = self._below(parts[start:], suffixes)
                 if found:
                     return found
-        return []
+        return self._below([PICTURE_FOLDERS[0], *parts], suffixes) if ".." not in parts else []
 
     def find_all(
         self, names: Collection[str], suffixes: Collection[str] = ()
@@ -93,11 +93,14 @@ class FileFinder:
         return found | candidates, candidates
 
     def suggestion(self, name: str, suffixes: Collection[str] = ()) -> str:
-        """``"; did you mean X?"``, with a file whose name has the same digits; "": there is none"""
+        """``"; did you mean X?"``, with a file elsewhere, or of the same digits; else ""."""
         if near := self.near(name, suffixes):
             return f"; did you mean {' or '.join(str(path) for path in near[:3])}?"
         parts = parts_of(name) or [""]
         folder = self.folder.joinpath(*parts[:-1])
+        for other in sorted(self.folder.iterdir()):
+            if other.is_dir() and self._called(other, parts[-1]):
+                return f"; did you mean {other / parts[-1]}?"
         names = [n for names in self._names(folder).values() for n in names]
         same = [n for n in names if re.findall("[0-9]+", n) == re.findall("[0-9]+", parts[-1])]
         return did_you_mean(parts[-1], same)
@@ -161,14 +164,14 @@ def note_missing(
     source: what names them, for the note; explain: the message for the one at an index of
     ``names``; what: the files are called, and what becomes of those that are not there.
 
-    Raises :class:`UserError` where fewer than half were found.
+    Raises :class:`UserError` where fewer than half were found, or only one of several.
     """
     gone = [index for index, name in enumerate(names) if name not in found]
     if not gone:
         return
     kind, consequence = what
     count = f"{len(gone):,} of {len(names):,} {kind}"
-    if len(names) - len(gone) < LEAST_SHARE * len(names):
-        raise UserError(explain(gone[0]) + (f"; {count} are not there" if len(gone) > 1 else ""))
+    if len(names) - len(gone) < max(LEAST_SHARE * len(names), LEAST_LEFT):
+        raise UserError(f"{explain(gone[0])}; not there: {count}")
     missing = listed([one_line(names[index], 100) for index in gone])
     notes.append(f"{source}: not there: {count} ({missing}); {consequence}")

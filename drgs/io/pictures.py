@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 
 import imageio.v3 as iio
 import numpy as np
-from PIL import ExifTags, Image, ImageCms
+from PIL import ExifTags, Image, ImageCms, UnidentifiedImageError
 
 from drgs.core.errors import UserError, one_line
 from drgs.core.files import atomic_path, open_regular
@@ -284,6 +284,11 @@ def _opened(path: Path) -> Iterator[Image.Image]:
             yield image
     except UserError:
         raise
+    except UnidentifiedImageError:
+        raise UserError(
+            f"{path}: cannot read the image: it is of no format that is read, such as PNG, JPEG, "
+            "TIFF or WebP; convert it"
+        ) from None
     except OSError as error:
         reason = error.strerror or one_line(error) or type(error).__name__
         raise UserError(f"{path}: cannot read the image: {reason}") from None

@@ -206,8 +206,8 @@ def test_a_missing_image_is_left_out_and_named(blender):
     (folder / "train" / "r_0.png").unlink()
     assert refusal(folder) == (
         f"{path}: frames[0].file_path: there is no image {folder / 'train' / 'r_0'} (or with .png "
-        "added); put them there, or take their frames out of the file; 2 of 3 photographs are not "
-        "there"
+        "added); put them there, or take their frames out of the file; not there: 2 of 3 "
+        "photographs"
     )
 
 
@@ -499,3 +499,42 @@ def test_depths_and_masks_are_found_under_nearly_their_names(photographs):
     assert np.asarray(view.mask).all() and len(notes) == 2
     edit(photographs / "transforms.json", lambda m: m["frames"][2].update(depth_file_path="d.png"))
     assert "d.png (or with .png added)" in refusal(photographs)
+
+
+@pytest.mark.parametrize(
+    ("call", "folder"),
+    [
+        (lambda name: name, "."),
+        (lambda name: f"../scan/images/{name}", "images"),
+        (lambda name: name[:-4], "images"),
+        (lambda name: f"/home/me/scan/images/{name}", "images"),
+        (lambda name: f"images\\{name}", "Images"),
+    ],
+)
+def test_photographs_are_found_where_they_lie_now(photographs, call, folder):
+    def change(meta):
+        for frame in meta["frames"]:
+            frame["file_path"] = call(frame["file_path"].removeprefix("images/"))
+
+    edit(photographs / "transforms.json", change)
+    if folder != "images":
+        (photographs / "images").rename(photographs / "elsewhere")
+        (photographs / folder).mkdir(exist_ok=True)
+        for file in (photographs / "elsewhere").iterdir():
+            file.rename(photographs / folder / file.name)
+    dataset, notes = load_noting(photographs)
+    for view in (*dataset.train, *dataset.test):
+        assert view.files["image"] == photographs / folder / f"{view.name}.png"
+        np.testing.assert_allclose(view.image, 20 * int(view.name) / 255, rtol=1e-6)
+    assert [": taken under nearly the same name: 10 photographs" in n for n in notes] == (
+        [True] if folder != "." else []
+    )
+
+
+def test_a_folder_that_was_renamed_is_named(photographs):
+    (photographs / "images").rename(photographs / "pictures")
+    assert f"; did you mean {photographs}/pictures/09.png?; put them there" in refusal(photographs)
+    (photographs / "pictures").rename(photographs / "images")
+    edit(photographs / "transforms.json", lambda m: m.update(frames=m["frames"][:2]))
+    (photographs / "images" / "09.png").unlink()
+    assert refusal(photographs).endswith("; not there: 1 of 2 photographs")

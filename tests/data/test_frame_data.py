@@ -98,13 +98,16 @@ def test_a_picture_of_another_size_than_the_photograph_is_refused(photographs, k
     )
 
 
-@pytest.mark.parametrize(("key", "ignore"), [("mask_path", "masks"), ("depth_file_path", "depth")])
-def test_a_missing_mask_or_depth_is_named(photographs, key, ignore):
+@pytest.mark.parametrize(
+    ("key", "ignore", "kind"),
+    [("mask_path", "masks", "masks"), ("depth_file_path", "depth", "files of depth")],
+)
+def test_a_missing_mask_or_depth_is_named(photographs, key, ignore, kind):
     give(photographs, **{key: "nowhere.png"})
     where = f"{photographs / 'transforms.json'}: frames[{index_of(photographs)}].{key}"
     assert refusal(photographs) == (
         f"{where}: there is no image {photographs / 'nowhere.png'} (or with .png added); put them "
-        f"there, or set data.ignore_{ignore}"
+        f"there, or set data.ignore_{ignore}; not there: 1 of 1 {kind}"
     )
     give(photographs, **{key: 3})
     assert refusal(photographs) == f"{where} must be text, got 3"
@@ -114,7 +117,7 @@ def test_few_missing_masks_take_their_photographs_along_and_depths_do_not(photog
     """What a mask hides is not to be fitted; what has no depth can be."""
     iio.imwrite(photographs / "mask.png", GREY_MASK)
     np.save(photographs / "depth.npy", np.ones((6, 8)))
-    for name in ("01", "02", "03"):
+    for name in ("01", "02", "03", "04"):
         give(photographs, f"{name}.png", mask_path="mask.png", depth_file_path="depth.npy")
     give(photographs, "02.png", mask_path="gone.png")
     give(photographs, "03.png", depth_file_path="gone.npy")
@@ -123,8 +126,8 @@ def test_few_missing_masks_take_their_photographs_along_and_depths_do_not(photog
     assert view_named(dataset, "03").mask is not None and view_named(dataset, "03").depth is None
     path = photographs / "transforms.json"
     assert notes == [
-        f"{path}: not there: 1 of 3 masks (gone.png); their photographs are left out",
-        f"{path}: not there: 1 of 2 files of depth (gone.npy); their photographs have no depth",
+        f"{path}: not there: 1 of 4 masks (gone.png); their photographs are left out",
+        f"{path}: not there: 1 of 3 files of depth (gone.npy); their photographs have no depth",
     ]
 
 
