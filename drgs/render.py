@@ -49,7 +49,7 @@ from drgs.core.files import atomic_path, open_regular, shortened
 from drgs.core.processes import process_number
 from drgs.data import Dataset, load_dataset
 from drgs.data.derived import completed
-from drgs.data.orbits import orbit_of_gaussians, orbit_of_views, orbit_size
+from drgs.data.orbits import near_plane_of, orbit_of_gaussians, orbit_of_views, orbit_size
 from drgs.data.types import Viewpoint
 from drgs.data.viewpoints import (
     FIELD_OF_VIEW,
@@ -305,9 +305,11 @@ def load_model(args: argparse.Namespace) -> Model:
     if args.what.is_dir() and args.scene is None:
         config = found_again(args.what, config, ("data.path",))
     gaussians = Gaussians.load(what)
-    model, background = ModelConfig().of_file(), NAMED_COLORS[BACKGROUND]
     if config is not None:
         model, background = config.model, config.data.background_rgb
+    else:
+        model = ModelConfig(near=near_plane_of(gaussians)).of_file()
+        background = NAMED_COLORS[BACKGROUND]
     # --set is the user's word; a configuration may be there for the photographs that it names.
     asked = {override.partition("=")[0].strip() for override in args.set or ()}
     values = (gaussians.rendered_with or {}).items()

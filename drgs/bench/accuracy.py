@@ -200,14 +200,13 @@ def load_subject(path: Path, num_views: int) -> Subject:
             if not file.exists():
                 raise UserError(f"{file}: not there; {path} must be the folder of a finished fit")
         config = load_config(str(config_file), [])
-        dataset = load_dataset(config.data)
+        gaussians = baked(Gaussians.load(ply))
+        dataset = load_dataset(config.data).relative_to(gaussians.origin)
         step = max(1, len(dataset.test) // num_views)
         views = dataset.test[::step][:num_views]
         _check_pinholes(views, config_file, ply)
         cameras = [camera_of(view, config.model.near_plane) for view in views]
-        return Subject(
-            path.name, baked(Gaussians.load(ply)), cameras, list(views), dataset.background
-        )
+        return Subject(path.name, gaussians, cameras, list(views), dataset.background)
     return Subject(
         path.stem, baked(Gaussians.load(path)), [bench_camera(SIZE)], [], (1.0, 1.0, 1.0)
     )

@@ -236,12 +236,11 @@ def _fitted(arguments: list[str]) -> int:
 def measured_as_taken(fitted: Path, config: FitConfig) -> float:
     """dB of the test views of the dataset that ``config`` names, by the Gaussians of a fit."""
     run_config = load_run_config(fitted)
-    dataset = load_dataset(config.data)
+    gaussians = Gaussians.load(fitted / GAUSSIANS)
+    dataset = load_dataset(config.data).relative_to(gaussians.origin)
     if mi.variant() is None:
         mi.set_variant("llvm_ad_rgb")
-    scene = make_scene(
-        Gaussians.load(fitted / GAUSSIANS), run_config.model, run_config.data.background_rgb
-    )
+    scene = make_scene(gaussians, run_config.model, run_config.data.background_rgb)
     pairs = zip(render_views(scene, dataset.test), dataset.test, strict=True)
     return mean_of([score(picture, view) for picture, view in pairs]).psnr
 

@@ -18,9 +18,10 @@ Origin = tuple[float, float, float]
 WORLD: Origin = (0.0, 0.0, 0.0)
 """The world's own origin."""
 
-FAR = 100
+FAR = 1000
 """Sizes of a scene: farther away, its positions are kept relative to another origin. At that
-distance float32 resolves 4e-6 of the size, a hundredth of a pixel."""
+distance float32 resolves 6e-5 of the size, which costs a fit nothing that was measured; three times
+as far it costs 0.3 dB, a million times as far 5 dB."""
 
 
 def near_origin(middle: Sequence[float], size: float) -> Origin:

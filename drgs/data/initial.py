@@ -58,7 +58,7 @@ def initial_gaussians(config: FitConfig, dataset: Dataset) -> Gaussians:
     At the points of :func:`start_of`, with the opacity and the scale of ``config.init``.
     """
     config = completed(config, dataset)
-    return gaussians_at(start_of(config, dataset), config)
+    return replace(gaussians_at(start_of(config, dataset), config), origin=dataset.origin)
 
 
 def gaussians_at(start: Start, config: FitConfig) -> Gaussians:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from drgs.config.schema import REFERENCE_NEAR
 from drgs.core.errors import UserError
 from drgs.data.start_box import focus_of
 from drgs.data.types import Viewpoint
@@ -16,6 +17,10 @@ from drgs.gaussians.parameters import Gaussians
 
 ELEVATION = math.radians(30)
 """Of an orbit around Gaussians whose cameras are unknown."""
+
+
+LENGTHS = np.finfo(np.float32).tiny, 1e9
+"""Scene units, from which and up to which a distance is taken from standard deviations."""
 
 
 MAX_ELEVATION = math.radians(80)
@@ -41,6 +46,11 @@ anything larger is what no photograph shows."""
 
 AMPLITUDE = 0.8
 """Of the cameras' own arc, for the sway of an orbit that must not go all the way round."""
+
+
+NEAR_RANGE, NEAR_SHARE = (0.01, 0.5), 0.1
+"""Of the median distance of Gaussians from their middle: where the reference's near plane suits
+them, and what does where it does not."""
 
 
 TILT_WEIGHT = 1e-3
@@ -119,6 +129,12 @@ def orbit_of_gaussians(gaussians: Gaussians, up: np.ndarray, fov: float) -> Orbi
     return Orbit(focus, up, start, radius, ELEVATION, half_arc=None)
 
 
+def near_plane_of(gaussians: Gaussians) -> float:
+    """The near plane, scene units, for Gaussians of which no fit says one."""
+    size, (low, high) = _middle(gaussians, share=0.5)[1], NEAR_RANGE
+    return REFERENCE_NEAR if low * size <= REFERENCE_NEAR <= high * size else NEAR_SHARE * size
+
+
 def up_of(views: Sequence[Viewpoint]) -> np.ndarray:
     """(3,) unit: the world's up direction, as the photographers held their cameras.
 
@@ -140,14 +156,18 @@ def orbit_size(views: Sequence[Viewpoint]) -> tuple[int, int]:
     return max(1, round(scale * first.width)), max(1, round(scale * first.height))
 
 
-def _middle(gaussians: Gaussians) -> tuple[np.ndarray, float]:
-    """(3,) the median position of the opaque Gaussians, and the distance that holds most."""
+def _middle(gaussians: Gaussians, share: float = SPREAD) -> tuple[np.ndarray, float]:
+    """(3,) the median position of the opaque Gaussians, and the distance within which a share is.
+
+    Where they all are at one place, the distance is the largest standard deviation.
+    """
     g = gaussians.numpy()
     means = g.means.astype(np.float64)
     opaque = means[g.opacities >= OPAQUE]
     means = opaque if len(opaque) else means
     middle = np.median(means, axis=0)
-    return middle, float(np.quantile(np.linalg.norm(means - middle, axis=1), SPREAD)) or 1.0
+    distance = float(np.quantile(np.linalg.norm(means - middle, axis=1), share))
+    return middle, distance or float(np.clip(g.scales.max(), *LENGTHS))
 
 
 def _level_axes(up: np.ndarray, towards: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -83,7 +83,7 @@ class _Node(_Part):
     mesh: Index | None = None
     children: list[Index] = []
     matrix: list[float] = IDENTITY["matrix"]
-    translation: tuple[Coordinate, Coordinate, Coordinate] = (0.0, 0.0, 0.0)
+    translation: Annotated[list[Coordinate], Field(min_length=3, max_length=3)] = [0, 0, 0]
     rotation: list[float] = IDENTITY["rotation"]
     scale: list[float] = IDENTITY["scale"]
 

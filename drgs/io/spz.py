@@ -99,9 +99,11 @@ def encode(
     gaussians: finite, by the names that :func:`drgs.io.ply.read_gaussians` gives, in axes with y
     up; rendered_with: only ``antialiased`` has a place.
 
-    Raises :class:`UserError` for positions of more than 2^23.
+    Raises :class:`UserError` for positions of more than 2^23, or where most Gaussians are smaller
+    or larger than scales can be here; a :class:`UserNote` tells where some are.
     """
     g = gaussians
+    _check_scales(g["log_scales"])
     num, degree = len(g["means"]), round(np.sqrt(g["shN"].shape[1] + 1)) - 1
     bits = _fractional_bits(g["means"])
     flags = ANTIALIASED if (rendered_with or {}).get("antialiased") else 0
@@ -116,6 +118,22 @@ def encode(
     header = HEADER.pack(MAGIC, WRITTEN, num, degree, bits, flags, 0)
     content = b"".join([header, *(part.astype("u1").tobytes() for part in parts)])
     return gzip.compress(content, GZIP_LEVEL, mtime=0)
+
+
+def _check_scales(log_scales: np.ndarray) -> None:
+    """Refuse scenes whose unit does not suit the format; thin Gaussians may become thicker."""
+    low, high = LOG_SCALE_LOW, LOG_SCALE_LOW + 255 / SCALE_STEPS
+    largest = log_scales.max(axis=1)  # of each Gaussian
+    outside = int(np.count_nonzero((largest < low) | (largest > high)))
+    if not outside:
+        return
+    what = (
+        f"the format spz holds standard deviations from {np.exp(low):.2g} to {np.exp(high):.3g}, "
+        f"and those of {outside:,} of {len(largest):,} Gaussians are outside"
+    )
+    if 2 * outside > len(largest):
+        raise UserError(f"{what}; scale the scene, or choose another format")
+    warnings.warn(UserNote(f"{what}: cut off"), stacklevel=2)
 
 
 def _fractional_bits(means: np.ndarray) -> int:

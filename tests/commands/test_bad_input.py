@@ -35,6 +35,7 @@ from drgs.training.checkpoint import Checkpoint, save_checkpoint
 def some_gaussians(num):
     shapes = {"means": 3, "quats": 4, "log_scales": 3}
     arrays = {name: np.zeros((num, width), np.float32) for name, width in shapes.items()}
+    arrays["means"][:, 0] = np.linspace(-0.1, 0.1, num)
     return Gaussians(
         **arrays,
         logit_opacities=np.zeros(num, np.float32),

@@ -48,7 +48,7 @@ def fit(tmp_path):
     replace(gaussians_within_ranges(20), rendered_with=OTHERWISE).save(folder / "point_cloud.ply")
     viewers = replace(gaussians_within_ranges(30), rendered_with=USUAL)
     viewers.save(folder / "point_cloud_viewers.ply")
-    write_views(folder / "views.json", make_dataset(6, 1).train)
+    write_views(folder / "views.json", make_dataset(6, 1))
     return folder
 
 
@@ -248,9 +248,9 @@ def test_files_that_say_nothing_of_axes_are_not_turned_unasked(fit, model):
 @pytest.mark.parametrize("optimise", [True, False])
 def test_cameras_are_those_that_the_fit_has_refined(fit, optimise):
     turn = Rotation.from_euler("x", 90, degrees=True).as_matrix()
-    views = make_dataset(6, 1).train
-    turned_views = [replace(v, camera_to_world=pose_turned(v, turn)) for v in views]
-    write_views(fit / "cameras.json", turned_views)
+    dataset = make_dataset(6, 1)
+    turned_views = [replace(v, camera_to_world=pose_turned(v, turn)) for v in dataset.train]
+    write_views(fit / "cameras.json", replace(dataset, train=turned_views))
     config = {"data": {"path": "data"}, "cameras": {"optimise": optimise}}
     (fit / "config.yml").write_text(yaml.safe_dump(config))
     outcome = run(fit, "--format", "glb", "--up", "cameras")

@@ -27,7 +27,7 @@ def fit(tmp_path):
     configure(folder, OTHERWISE)
     replace(blobs(30), rendered_with=OTHERWISE).save(folder / "point_cloud.ply")
     blobs(20).save(folder / "point_cloud_viewers.ply")
-    write_views(folder / "views.json", make_dataset().train)
+    write_views(folder / "views.json", make_dataset())
     return folder
 
 

@@ -174,16 +174,22 @@ def test_a_point_cloud_gives_positions_colours_and_scales(tmp_path):
 
 
 def test_coinciding_points_keep_a_positive_scale(tmp_path):
-    path = points_file(tmp_path / "p.ply", positions=[(1, 2, 3)] * 5)
-    g = initial_gaussians(config(init={"point_cloud": path}), dataset_of([]))
-    np.testing.assert_allclose(g.scales, math.sqrt(1e-7), rtol=1e-6)
+    positions = np.concatenate([[(1, 2, 3)] * 4, np.random.default_rng(0).normal(size=(95, 3))])
+    size = np.median(np.linalg.norm(positions - np.median(positions, axis=0), axis=1))
+    for unit in (1e-6, 1.0, 1e6):
+        path = points_file(tmp_path / "p.ply", positions=unit * positions)
+        g = initial_gaussians(config(init={"point_cloud": path}), dataset_of([]))
+        np.testing.assert_allclose(g.scales[:4], 2.5e-4 * size * unit, rtol=1e-5)
 
 
 def test_a_point_cloud_of_the_wrong_size_is_refused(tmp_path):
     path = points_file(tmp_path / "p.ply", positions=[(0, 0, 0)] * 3)
     with pytest.raises(UserError, match=r"p.ply: at least 4 points, got 3"):
         initial_gaussians(config(init={"point_cloud": path}), dataset_of([]))
-    path = points_file(tmp_path / "p.ply", positions=[(0, 0, 0)] * 9)
+    path = points_file(tmp_path / "p.ply", positions=[(0, 0, 0)] * 4)
+    with pytest.raises(UserError, match=r"p.ply: its 4 points must not all be the same"):
+        initial_gaussians(config(init={"point_cloud": path}), dataset_of([]))
+    path = points_file(tmp_path / "p.ply", positions=[(0, 0, i) for i in range(9)])
     with pytest.raises(UserError) as error:
         initial_gaussians(
             config(init={"point_cloud": path}, densify={"max_gaussians": 8}), dataset_of([])

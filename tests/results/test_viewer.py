@@ -259,7 +259,7 @@ def test_the_first_view_is_that_of_the_refined_cameras(tmp_path):
         (tmp_path / folder).mkdir()
         config = {"data": {"path": "data"}, "cameras": {"optimise": folder == "refined"}}
         (tmp_path / folder / "config.yml").write_text(yaml.safe_dump(config))
-        write_views(tmp_path / folder / "cameras.json", far)
+        write_views(tmp_path / folder / "cameras.json", replace(dataset, train=far))
         viewer.write_viewer(tmp_path / folder, dataset, Shown(blobs(), OWN))
         splats = Page((tmp_path / folder / "viewer.html").read_bytes()).texts["splats"]
         (tmp_path / "a.ply").write_bytes(gzip.decompress(base64.b64decode(splats)))

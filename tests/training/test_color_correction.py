@@ -311,10 +311,10 @@ def test_exposures_that_differ_spoil_a_fit_less_with_transforms():
 def test_the_transforms_are_written_by_name(tmp_path):
     trainer = fits.steps(make_trainer(), 9)
     (effect,) = trainer.effects
-    views = fits.plain_dataset().train
-    effect.write(tmp_path, views)
+    dataset = fits.plain_dataset()
+    effect.write(tmp_path, dataset)
     written = json.loads((tmp_path / COLORS).read_text())
-    assert list(written) == [view.name for view in views]
+    assert list(written) == [view.name for view in dataset.train]
     np.testing.assert_array_equal(list(written.values()), matrices_of(trainer))
     assert len({str(matrix) for matrix in written.values()}) == 6
 

@@ -1,0 +1,147 @@
+"""Coordinates far from the origin, from files and to files."""
+
+import json
+import struct
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from plyfile import PlyData, PlyElement
+from support.small_capture import blobs
+
+from drgs.core.errors import UserError, UserNote
+from drgs.core.origin import FAR, WORLD, near_origin
+from drgs.gaussians.parameters import Gaussians
+from drgs.io.ply import read_points
+
+EARTH = (4200000.0, 170000.5, -4780000.25)
+
+
+def world(gaussians: Gaussians) -> np.ndarray:
+    """Positions (N, 3) float64."""
+    return gaussians.means.astype(np.float64) + gaussians.origin
+
+
+def written_as_float64(path, source, offset):
+    """A PLY file whose positions are float64, moved by ``offset``."""
+    source.save(path)
+    rows = PlyData.read(str(path))["vertex"].data
+    kinds = [(name, "<f8" if name in "xyz" else "<f4") for name in rows.dtype.names]
+    moved = rows.astype(kinds)
+    for axis, distance in zip("xyz", offset, strict=True):
+        moved[axis] += distance
+    PlyData([PlyElement.describe(moved, "vertex")]).write(str(path))
+    return path
+
+
+def test_what_is_near_stays_and_what_is_far_gets_a_short_origin():
+    assert near_origin((0.9 * FAR * 4.8, 0, 0), 4.8) == WORLD
+    assert near_origin((1.1 * FAR * 4.8, 0, 0), 4.8) == (1.1 * FAR * 4.8, 0, 0)
+    assert near_origin((4200003.21, 170000.6, 1e-9), 4.8) == (4200003.0, 170001.0, 0.0)
+    assert near_origin((4.2e6, 17, 0), 480.0) == (4200000.0, 0.0, 0.0)
+    assert near_origin((-5.4321e-3, 0, 0), 1.3e-7) == (-5.4321e-3, 0.0, 0.0)
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".compressed.ply", ".glb"])
+def test_an_origin_is_read_as_it_was_written(tmp_path, suffix):
+    path = tmp_path / f"a{suffix}"
+    replace(blobs(), origin=EARTH, rendered_with={"low_pass": 0.1}).save(path)
+    read = Gaussians.load(path)
+    assert (read.origin, read.rendered_with) == (EARTH, {"low_pass": 0.1})
+    blobs().save(path)
+    near = Gaussians.load(path)
+    assert near.origin == WORLD
+    np.testing.assert_array_equal(read.means, near.means)
+
+
+@pytest.mark.parametrize("suffix", [".spz", ".splat"])
+@pytest.mark.filterwarnings("ignore:.*harmonics")
+def test_a_format_without_room_for_an_origin_says_so(tmp_path, suffix):
+    with pytest.warns(UserNote, match=r"origin \(4200000, 170000.5, -4780000.25\)"):
+        replace(blobs(), sh0=blobs().sh0, origin=EARTH).save(tmp_path / f"a{suffix}")
+
+
+def nodes_of(content):
+    length = struct.unpack_from("<I", content, 12)[0]
+    return json.loads(content[20 : 20 + length])["nodes"]
+
+
+def test_gltf_has_the_origin_as_the_translation_of_its_node():
+    """Its y axis is our z axis."""
+    assert nodes_of(blobs().to_bytes("glb")) == [{"mesh": 0}]
+    (node,) = nodes_of(replace(blobs(), origin=EARTH).to_bytes("glb"))
+    assert node["translation"] == [EARTH[0], EARTH[2], -EARTH[1]]
+
+
+def test_a_small_translation_of_a_gltf_node_is_added_to_the_means(tmp_path):
+    path = tmp_path / "a.glb"
+    replace(blobs(), origin=(0.5, -1.5, 2.0)).save(path)
+    read = Gaussians.load(path)
+    assert read.origin == WORLD
+    np.testing.assert_allclose(read.means, blobs().means + np.array([0.5, -1.5, 2.0]), atol=1e-6)
+
+
+def test_usd_has_the_origin_as_the_translation_of_its_prim(tmp_path):
+    pxr = pytest.importorskip("pxr")
+    from drgs.gaussians.parameters import PARAMETER_NAMES
+    from drgs.io.usd import PRIM, encode
+
+    (tmp_path / "a.usdc").write_bytes(
+        encode({name: getattr(blobs(), name) for name in PARAMETER_NAMES}, EARTH)
+    )
+    from pxr import UsdGeom
+
+    stage = pxr.Usd.Stage.Open(str(tmp_path / "a.usdc"))
+    to_world = UsdGeom.Xformable(stage.GetPrimAtPath(PRIM)).GetLocalTransformation()
+    assert tuple(to_world.ExtractTranslation()) == EARTH
+
+
+def test_far_positions_of_float64_are_kept_to_the_last_digit(tmp_path):
+    path = written_as_float64(tmp_path / "a.ply", blobs(), EARTH)
+    read = Gaussians.load(path)
+    np.testing.assert_allclose(world(read), blobs().means + np.array(EARTH), rtol=0, atol=1e-6)
+    assert np.abs(read.means).max() < 10
+    near = Gaussians.load(written_as_float64(tmp_path / "a.ply", blobs(), (0, 0, 0)))
+    assert near.origin == WORLD
+    np.testing.assert_array_equal(near.means, blobs().means)
+
+
+def test_points_of_a_file_with_an_origin_are_where_they_belong(tmp_path):
+    replace(blobs(), origin=EARTH).save(tmp_path / "a.ply")
+    positions, _ = read_points(tmp_path / "a.ply")
+    np.testing.assert_array_equal(positions, blobs().means.astype(np.float64) + EARTH)
+
+
+@pytest.mark.parametrize("line", ["origin_x 5.0", "origin_x a", "origin_x 1e13", "origin_x true"])
+def test_an_origin_that_is_no_three_numbers_is_refused(tmp_path, line):
+    path = tmp_path / "a.ply"
+    replace(blobs(), origin=EARTH).save(path)
+    header = b"comment drgs origin_x 4200000.0\n"
+    content = path.read_bytes()
+    assert header in content
+    others = b"" if line.endswith("5.0") else b"comment drgs " + line.encode() + b"\n"
+    path.write_bytes(content.replace(header, others))
+    with pytest.raises(UserError, match=r"a.ply: origin_x, origin_y, origin_z must be three numb"):
+        Gaussians.load(path)
+
+
+def test_turning_turns_the_origin_as_well():
+    from drgs.gaussians.cleaning import turned_towards
+
+    far = replace(blobs(), origin=EARTH)
+    turned = turned_towards(far, np.array([0.0, -1, 0]), np.array([0.0, 0, 1]))
+    rotation = np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]])  # -y becomes z
+    np.testing.assert_allclose(world(turned), world(far) @ rotation.T, atol=1e-5)
+
+
+def test_spz_refuses_a_scene_that_is_too_small_for_its_scales():
+    small = replace(blobs(), log_scales=blobs().log_scales + np.float32(np.log(1e-6)))
+    with pytest.raises(UserError, match=r"from 4.5e-05 to 379, and those of 30 of 30 Gaussians"):
+        small.to_bytes("spz")
+    few = blobs().log_scales.copy()
+    few[:3] = -12
+    with pytest.warns(UserNote, match="those of 3 of 30 Gaussians are outside: cut off"):
+        replace(blobs(), log_scales=few).to_bytes("spz")
+    thin = blobs().log_scales.copy()
+    thin[:, 0] = -12  # flat Gaussians are a little thicker, which nobody sees
+    replace(blobs(), log_scales=thin).to_bytes("spz")
