@@ -24,6 +24,7 @@ from drgs.data.notices import Notices
 from drgs.data.reading import READ, SIZES_ALONE
 from drgs.data.transforms import (
     Frame,
+    TransformsFile,
     focal_from_angle,
     in_parallel,
     note_unread,
@@ -36,6 +37,10 @@ from drgs.io.pictures import image_size
 START_HALF_EXTENT = 1.3
 """The 3DGS reference starts from random points in [-1.3, 1.3]^3 for these scenes
 (``readNerfSyntheticInfo``)."""
+
+
+OF_OTHERS = ("camera_angle_y", "fl_x", "fl_y", "cx", "cy", "w", "h")
+"""Intrinsics that the layout does not have."""
 
 
 def load(config: DataConfig, keeps: Keeps = all_of_them) -> Dataset:
@@ -78,9 +83,18 @@ def picture_files(config: DataConfig) -> list[Path]:
 def _frames(config: DataConfig, split: str, notes: list[str]) -> list[Frame]:
     """Those of a split whose photographs are there."""
     meta = read_transforms(_transforms_path(config.path, split))
-    if meta.unread:
-        notes.append(note_unread(meta))
+    if unread := [*meta.unread, *_passed_over(meta)]:
+        notes.append(note_unread(meta.path, unread))
     return frames_with_files(config, meta, notes)
+
+
+def _passed_over(meta: TransformsFile) -> list[str]:
+    """Keys that other layouts read."""
+    keys = [
+        key for key in OF_OTHERS if any(getattr(f.values, key) is not None for f in meta.frames)
+    ]
+    keys += [] if meta.point_cloud is None else ["ply_file_path"]
+    return keys + [f"{split}_filenames" for split in meta.lists]
 
 
 def _test_split(config: DataConfig) -> str:

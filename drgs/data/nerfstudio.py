@@ -29,7 +29,7 @@ def load(config: DataConfig, keeps: Keeps = all_of_them) -> Dataset:
     frames = frames_with_files(config, meta, notes)
     cloud, note = point_cloud_of(config, meta, notes)
     if meta.unread:
-        notes.append(note_unread(meta))
+        notes.append(note_unread(meta.path, meta.unread))
     if not config.ignore_masks and not any("mask" in frame.files for frame in frames):
         note_unnamed_masks(config.path, notes)
     photographs = Photographs(

@@ -106,7 +106,8 @@ def lists_in_files(folders: Sequence[Path], names: Sequence[str], notes: list[st
                     notes.append(f"{file}: lists no photograph, and is not read")
         if found:
             return Lists(found, " and ".join(f"{split}.txt" for split in found))
-    for file in sorted(folders[-1].glob("*split*.json")):
+    suffixes = (".json", ".txt", ".csv")
+    for file in sorted(f for f in folders[-1].glob("*split*") if f.suffix in suffixes):
         notes.append(
             f"{file}: is not read; test.txt can list what is to be measured on, a name a line"
         )

@@ -246,9 +246,9 @@ def read_transforms(path: Path) -> TransformsFile:
     return TransformsFile(path, frames, meta.ply_file_path, lists, _unread(content))
 
 
-def note_unread(meta: TransformsFile) -> str:
+def note_unread(path: Path, keys: Sequence[str]) -> str:
     """What the user should know of keys that are passed over."""
-    return f"{meta.path}: keys that are not read: {listed(meta.unread, 8)}"
+    return f"{path}: keys that are not read: {listed(keys, 8)}"
 
 
 def _unread(content: Mapping[str, object]) -> list[str]:

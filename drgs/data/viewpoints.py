@@ -91,7 +91,7 @@ def read_viewpoints(
     """
     meta = read_transforms(path)
     if meta.unread:
-        warnings.warn(UserNote(note_unread(meta)), stacklevel=2)
+        warnings.warn(UserNote(note_unread(meta.path, meta.unread)), stacklevel=2)
     frames = meta.frames
     digits = len(str(len(frames) - 1))
     return [

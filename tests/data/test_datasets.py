@@ -538,3 +538,13 @@ def test_a_folder_that_was_renamed_is_named(photographs):
     edit(photographs / "transforms.json", lambda m: m.update(frames=m["frames"][:2]))
     (photographs / "images" / "09.png").unlink()
     assert refusal(photographs).endswith("; not there: 1 of 2 photographs")
+
+
+def test_keys_of_other_layouts_are_said_not_to_be_read(blender):
+    path = blender[0] / "transforms_train.json"
+    edit(path, lambda m: m.update(cx=2.5, w=6, h=4, ply_file_path="a.ply", near=1))
+    edit(path, lambda m: m.update(train_filenames=["a"], frames=[{**m["frames"][0], "fl_x": 9.0}]))
+    dataset, notes = load_noting(blender[0])
+    keys = "near, fl_x, cx, w, h, ply_file_path, train_filenames"
+    assert notes[0] == f"{path}: keys that are not read: {keys}"
+    assert dataset.train[0].cx == 3
