@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from drgs.core.errors import UserNote, listed
+from drgs.core.errors import UserNote, listed, one_line
 from drgs.core.files import open_regular
 from drgs.core.records import digest
 from drgs.data.types import View
@@ -19,6 +19,10 @@ from drgs.io.pictures import unused_content
 
 SAMPLE_BYTES = 1 << 12
 """Of a file, from its middle: files that differ there are not the same."""
+
+
+MAX_NOTE_LENGTH = 1000
+"""Of a note, characters."""
 
 
 class Notices:
@@ -53,7 +57,7 @@ class Notices:
             own.append(f"files from outside of the folder: {_listed(outside)}")
         own += self._equal(train, test)
         for note in (*notes, *(f"{self._folder}: {text}" for text in own)):
-            warnings.warn(UserNote(note), stacklevel=2)
+            warnings.warn(UserNote(one_line(note, MAX_NOTE_LENGTH)), stacklevel=2)
 
     def _name(self, file: Path) -> str:
         try:

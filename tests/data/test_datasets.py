@@ -548,3 +548,17 @@ def test_keys_of_other_layouts_are_said_not_to_be_read(blender):
     keys = "near, fl_x, cx, w, h, ply_file_path, train_filenames"
     assert notes[0] == f"{path}: keys that are not read: {keys}"
     assert dataset.train[0].cx == 3
+
+
+def test_a_note_on_a_strange_name_is_one_line(photographs):
+    """Which load_noting checks."""
+    (photographs / "images" / "03.png").rename(photographs / "images" / "a\nb.png")
+    (photographs / "images" / "04.png").write_bytes(
+        (photographs / "images" / "a\nb.png").read_bytes()
+    )
+    edit(
+        photographs / "transforms.json",
+        lambda m: m["frames"][6].update(file_path="images/a\nb.png"),
+    )
+    (note,) = load_noting(photographs)[1]
+    assert note.endswith("1 (images/04.png = images/a b.png)")
