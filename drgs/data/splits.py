@@ -146,7 +146,8 @@ def split_of(
     if both and name != "train":
         raise UserError(
             f"{source}: a photograph must be either to train or to measure on, but {lists.where} "
-            f"have {len(both):,} in both train and {name}: {one_line(listed(both))}; take them out of one"
+            f"have {len(both):,} in both train and {name}: {one_line(listed(both))}; take them out "
+            "of one"
         )
     for split, members in (("train", train), (name, test)):
         if not members:
