@@ -390,12 +390,12 @@ def test_test_views_are_those_of_a_list(tmp_path, below):
 
 
 def test_folders_may_be_the_splits(tmp_path):
-    names = ("train/a.jpg", "test/a.jpg", "train/b.jpg", "train/c.jpg")
+    names = ("train/a.jpg", "test/a.jpg", "test/b.jpg", "train/c.jpg")
     write_binary(tmp_path / "sparse" / "0", some(names))
     write_pictures(tmp_path / "images", names)
     dataset = load(tmp_path)
-    assert [view.name for view in dataset.test] == ["test_a"]
-    assert [view.name for view in dataset.train] == ["train_a", "train_b", "train_c"]
+    assert [view.name for view in dataset.test] == ["test_a", "test_b"]
+    assert [view.name for view in dataset.train] == ["train_a", "train_c"]
 
 
 # ----------------------------------------------------------------------------------------------
