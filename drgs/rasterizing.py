@@ -41,6 +41,9 @@ RASTERIZE_MODES = ("classic", "antialiased")
 LEAST_ALPHA = 1e-10
 """What expected depths are divided by at least, as in gsplat."""
 
+MAX_SKEW = 1e-6
+"""Of the largest number in K: what is rounding where a pinhole without skew has 0."""
+
 LEAST_SCALE = 1e-18
 """World units: a smaller standard deviation is taken as this one, whose square float32 holds."""
 
@@ -254,23 +257,23 @@ def _tensor(name: str, value: Any, tensor_type: type) -> Any:
 
 def _check_shapes(inputs: Mapping[str, Any], sh_degree: int | None) -> None:
     """Raise ValueError for a shape that does not fit."""
-    num, views, shape = (
-        inputs["means"].shape[0],
-        inputs["viewmats"].shape[0],
-        inputs["colors"].shape,
-    )
+    for name, rest, letters, what in (
+        ("means", (3,), "(N, 3)", "Gaussian"),
+        ("viewmats", (4, 4), "(C, 4, 4)", "camera"),
+    ):
+        got = inputs[name].shape
+        _require(len(got) > 0 and got[1:] == rest, name, f"of shape {letters}", got)
+        _require(got[0] >= 1, name, f"of one {what} at least", got)
+    num, views = inputs["means"].shape[0], inputs["viewmats"].shape[0]
+    shape = inputs["colors"].shape
     expected = {
-        "means": (num, 3),
         "quats": (num, 4),
         "scales": (num, 3),
         "opacities": (num,),
-        "viewmats": (views, 4, 4),
         "Ks": (views, 3, 3),
     }
     for name, wanted in expected.items():
         _require(inputs[name].shape == wanted, name, f"of shape {wanted}", inputs[name].shape)
-    _require(num >= 1, "means", "of one Gaussian at least", inputs["means"].shape)
-    _require(views >= 1, "viewmats", "of one camera at least", inputs["viewmats"].shape)
     if sh_degree is None:
         fits, wanted = shape[:-1] in ((num,), (views, num)), f"({num}, D) or ({views}, {num}, D)"
     else:
@@ -283,6 +286,13 @@ def _check_shapes(inputs: Mapping[str, Any], sh_degree: int | None) -> None:
     if "backgrounds" in inputs:
         wanted, got = (views, shape[-1]), inputs["backgrounds"].shape
         _require(got == wanted, "backgrounds", f"of shape {wanted}", got)
+
+
+def _check_pinhole(name: str, K: np.ndarray) -> None:
+    """Raise ValueError for a matrix with numbers that a pinhole has not."""
+    pinhole = np.array([[K[0, 0], 0, K[0, 2]], [0, K[1, 1], K[1, 2]], [0, 0, 1]])
+    fits = np.abs(K - pinhole).max() <= MAX_SKEW * np.abs(K).max() or np.isnan(K).any()
+    _require(fits, name, "((fx, 0, cx), (0, fy, cy), (0, 0, 1)), without skew", K.tolist())
 
 
 def activated(rows: GaussianRows) -> GaussianRows:
@@ -334,6 +344,8 @@ class _Pictures:
         # The few numbers of cameras are read to the host: their centre is found in float64 there.
         self.viewmats = np.array(inputs["viewmats"], np.float64)
         self.Ks = np.array(inputs["Ks"], np.float64)
+        for index, K in enumerate(self.Ks):
+            _check_pinhole(f"Ks[{index}]", K)
         self.count = len(self.viewmats)
         self.gaussians = [self._gaussians(inputs, index) for index in range(self.count)]
         self.frames = [self._frame(index) for index in range(self.count)]

@@ -90,7 +90,7 @@ class DataConfig(Section):
         "auto",
         description="Layout of the folder. auto: nerf_synthetic if there is a "
         "transforms_train.json, nerfstudio if there is a transforms.json, colmap if there is a "
-        "model in sparse/0, sparse or colmap/sparse/0.",
+        "model in sparse/0, sparse, colmap/sparse/0 or dense/0, or beside the photographs.",
     )
     image_size: Count | None = Field(
         None,
@@ -105,12 +105,14 @@ class DataConfig(Section):
     )
     test_split: Literal["train", "val", "test"] | None = Field(
         None,
-        description="NeRF-synthetic split to measure on; null: test if it is there, else val.",
+        description="Split to measure on, of NeRF-synthetic's and of those that the data lists; "
+        "null: test if it is there, else val.",
     )
     test_every: Count = Field(
         8,
         ge=2,
-        description="nerfstudio, colmap: images 0, n, 2n, ... by file name are the test split.",
+        description="nerfstudio, colmap: images 0, n, 2n, ... by file name are the test split, "
+        "unless the data lists its splits.",
     )
     background: ColorField = Field(
         None,

@@ -120,12 +120,12 @@ def read_bytes(path: Path, what: str, max_bytes: int) -> bytes:
 
 
 def read_text(path: Path, what: str, max_bytes: int) -> str:
-    """The text of a UTF-8 file: see :func:`read_bytes`.
+    """The text of a UTF-8 file, without the mark of byte order that some editors write first.
 
-    Raises :class:`UserError` as that does, and where the file is not UTF-8.
+    Raises :class:`UserError` as :func:`read_bytes` does, and where the file is not UTF-8.
     """
     try:
-        return read_bytes(path, what, max_bytes).decode("utf-8")
+        return read_bytes(path, what, max_bytes).decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise UserError(
             f"{path}: cannot read the {what}: not UTF-8 text (byte {error.start})"

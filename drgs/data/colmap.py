@@ -1,9 +1,10 @@
 """COLMAP's layout: a model of cameras, images and points, and photographs.
 
-The model is in ``sparse/0``, ``sparse`` or ``colmap/sparse/0``, the photographs in ``images`` (or
+The model is in ``sparse/0``, ``sparse`` or ``colmap/sparse/0``, beside the photographs, or in
+``dense/0`` as COLMAP's automatic reconstruction leaves it. The photographs are in ``images`` (or
 beside the model's folder) or, at a half, a quarter or an eighth of their size, in ``images_2``,
-``images_4``, ``images_8``; masks are in ``masks``, black where pixels do not count: ``NAME.png`` of
-a picture ``NAME`` as COLMAP has them, or with the picture's suffix replaced.
+``images_4``, ``images_8``; masks are in ``masks``, black where pixels do not count: see
+``drgs.data.mask_names``.
 
 Cameras are rendered with the lens that COLMAP found, without undistorting. Their numbers are for
 the size that COLMAP saw; the size of the picture that is there decides what they are for that.
@@ -12,13 +13,22 @@ the size that COLMAP saw; the size of the picture that is there decides what the
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 
 from drgs.config.schema import DataConfig
 from drgs.core.errors import UserError, listed, one_line
+from drgs.data.file_names import (
+    PICTURE_SUFFIXES,
+    FileFinder,
+    key_of,
+    note_missing,
+    note_near,
+)
 from drgs.data.images import is_scaled
-from drgs.data.photographs import MAX_WIDTH, Photographs, check_splits, dataset_of
-from drgs.data.recognition import COLMAP_FOLDERS
+from drgs.data.mask_names import masks_of
+from drgs.data.photographs import MAX_WIDTH, Photographs, dataset_of
+from drgs.data.recognition import COLMAP_FOLDERS, colmap_dataset
+from drgs.data.splits import lists_by_folders, lists_in_files
 from drgs.data.transforms import Frame, FrameValues
 from drgs.data.types import Dataset, Keeps, all_of_them
 from drgs.io.colmap import ColmapCamera, ColmapImage, ColmapModel, model_files, read_model
@@ -59,15 +69,21 @@ class ColmapFrame(Frame):
 
 
 def model_folder(folder: Path) -> Path:
-    """Where a model is. Raises :class:`UserError` where there is none."""
-    for below in COLMAP_FOLDERS:
-        if model_files(folder / below) is not None:
-            return folder / below
-    raise UserError(f"{folder}: there is no model of COLMAP in {', '.join(COLMAP_FOLDERS)}")
+    """The folder of the model. Raises :class:`UserError` where there is none."""
+    return _root_and_model(folder)[1]
 
 
-def _note_on_others(model: Path) -> str:
-    """What models lie beside this one, if it is called ``0``, for a description; "": none."""
+def _root_and_model(folder: Path) -> tuple[Path, Path]:
+    """The folder of the photographs' folders and masks, and that of the model."""
+    if (found := colmap_dataset(folder)) is None:
+        raise UserError(f"{folder}: there is no model of COLMAP in {', '.join(COLMAP_FOLDERS)}")
+    return found
+
+
+def _where(folder: Path, model: Path) -> str:
+    """Which model is read where there are several places or models, for a description; else ""."""
+    if (below := model.relative_to(folder)) != Path() and below.parts[0] == "dense":
+        return f"; model {below}"
     if model.name != "0":
         return ""
     numbered = [path for path in model.parent.iterdir() if path.name.isdecimal() and path != model]
@@ -78,36 +94,63 @@ def _note_on_others(model: Path) -> str:
 
 
 def picture_files(config: DataConfig) -> list[Path]:
-    """Of all images, as large as they are there."""
+    """The photographs of all images, as large as they are there."""
     folder = model_folder(config.path)
     model = read_model(folder)
-    if not model.images:
-        raise UserError(f"{folder}: at least 2 views are needed, one of them to test; got 0")
     widest = config.model_copy(update={"image_size": MAX_SIDE})
-    pictures = picture_folder(widest, model)
-    return [_file_of(pictures, image, folder) for image in model.images]
+    return [file for _, file in _images_there(widest, folder, model, [])]
 
 
 def load(config: DataConfig, keeps: Keeps = all_of_them) -> Dataset:
     """Read all views: see :func:`drgs.data.photographs.dataset_of`."""
-    folder = model_folder(config.path)
+    notes: list[str] = []
+    root, folder = _root_and_model(config.path)
     model = read_model(folder)
-    images = sorted(model.images, key=lambda image: image.name)
-    check_splits(config, folder, len(images))
+    there = _images_there(config, folder, model, notes)
     pictures = picture_folder(config, model)
-    files = [_file_of(pictures, image, folder) for image in images]
-    frames = [
-        _frame(config.path, model.cameras[image.camera], image, file, folder, index)
-        for index, (image, file) in enumerate(zip(images, files, strict=True))
-    ]
-    cloud, note = None, f"; pictures of {pictures.name}{_note_on_others(folder)}"
+    names = [file.relative_to(pictures).as_posix() for _, file in there]
+    masks = masks_of(root, names, [] if config.ignore_masks else notes, pictures)
+    frames = []
+    for index, ((image, file), mask) in enumerate(zip(there, masks, strict=True)):
+        own = _values(model.cameras[image.camera], image, file, mask, folder)
+        has_mask = mask is not None and not config.ignore_masks
+        files = {"image": file} | ({"mask": mask} if has_mask else {})
+        frames.append(ColmapFrame(own, own, index, folder, files))
+    all_names = [image.name for image in model.images]
+    lists = lists_in_files((folder, root), all_names, notes) or lists_by_folders(all_names)
+    cloud, note = None, f"; pictures of {pictures.name}"
+    note += _where(config.path, folder)
     if model.has_points:
         if config.ignore_points:
             note += "; points of the model ignored"
         else:
             cloud = model.points_file
-    photographs = Photographs("COLMAP", folder, frames, files, cloud, note)
+    photographs = Photographs("COLMAP", folder, frames, lists, cloud, note, notes)
     return dataset_of(config, photographs, keeps)
+
+
+def _images_there(
+    config: DataConfig, folder: Path, model: ColmapModel, notes: list[str]
+) -> list[tuple[ColmapImage, Path]]:
+    """Images of the model, by name, and their files; those without one are left out."""
+    if not model.images:
+        raise UserError(f"{folder}: at least 2 views are needed, one of them to test; got 0")
+    images = sorted(model.images, key=lambda image: image.name)
+    names = [image.name for image in images]
+    finder = FileFinder(picture_folder(config, model))
+    found, near = finder.find_all(names, PICTURE_SUFFIXES)
+    note_near(folder, near, "photographs", notes)
+
+    def explain(index: int) -> str:
+        name = names[index]
+        return (
+            f"{folder}: image {one_line(name, 100)}: there is no picture "
+            f"{one_line(finder.folder / name)}{finder.suggestion(name, PICTURE_SUFFIXES)}; put the "
+            "photographs there that COLMAP saw"
+        )
+
+    note_missing(folder, names, found, explain, ("photographs", "left out"), notes)
+    return [(image, found[image.name]) for image in images if image.name in found]
 
 
 def picture_folder(config: DataConfig, model: ColmapModel) -> Path:
@@ -116,23 +159,22 @@ def picture_folder(config: DataConfig, model: ColmapModel) -> Path:
     That of ``data.downscale``; without it, the one whose pictures are the smallest that still have
     the width of ``data.image_size``, or the largest ones there are.
     """
-    there = {
-        factor: config.path / ("images" if factor == 1 else f"images_{factor}")
-        for factor in FACTORS
-    }
-    there = {factor: path for factor, path in there.items() if path.is_dir()}
-    if 1 not in there and any((config.path / image.name).is_file() for image in model.images):
-        there[1] = config.path
+    root, _ = _root_and_model(config.path)
+    factors = {"images" if factor == 1 else f"images_{factor}": factor for factor in FACTORS}
+    folders = [path for path in sorted(root.iterdir()) if path.is_dir()]
+    there = {factors[key]: path for path in folders if (key := key_of(path.name)) in factors}
+    if 1 not in there and any((root / image.name).is_file() for image in model.images):
+        there[1] = root
     if not there:
         raise UserError(
-            f"{config.path}: there is no folder images (or images_2, images_4, images_8) of the "
+            f"{root}: there is no folder images (or images_2, images_4, images_8) of the "
             "photographs beside COLMAP's model"
         )
     if config.downscale is not None:
         if config.downscale not in there:
             names = listed([path.name for path in there.values()], len(FACTORS))
             raise UserError(
-                f"data.downscale: {config.path} has the folders {names}, got {config.downscale}"
+                f"data.downscale: {root} has the folders {names}, got {config.downscale}"
             )
         return there[config.downscale]
     width = min((camera.width for camera in model.cameras.values()), default=1)
@@ -141,18 +183,10 @@ def picture_folder(config: DataConfig, model: ColmapModel) -> Path:
     return there[max(wide, default=min(there))]
 
 
-def _file_of(pictures: Path, image: ColmapImage, folder: Path) -> Path:
-    file = pictures / image.name
-    if not file.is_file():
-        raise UserError(
-            f"{folder}: image {one_line(image.name, 100)}: there is no picture {one_line(file)}"
-        )
-    return file
-
-
-def _frame(
-    path: Path, camera: ColmapCamera, image: ColmapImage, file: Path, folder: Path, index: int
-) -> ColmapFrame:
+def _values(
+    camera: ColmapCamera, image: ColmapImage, file: Path, mask: Path | None, folder: Path
+) -> FrameValues:
+    """What a frame of a transforms file would have, for the size of ``file``."""
     model = LENSES.get(camera.model)
     if model is None:
         raise UserError(
@@ -174,13 +208,12 @@ def _frame(
         "camera_model": model,
         **named,
     }
-    own = FrameValues.model_construct(
+    return FrameValues.model_construct(
         file_path=image.name,
         transform_matrix=image.camera_to_world,
-        mask_path=mask_of(path, image.name),
+        mask_path=None if mask is None else str(mask),
         **values,
     )
-    return ColmapFrame(own, own, index, folder)
 
 
 def _size_as_calibrated(
@@ -209,9 +242,3 @@ def _size_as_calibrated(
 
 SIDEWAYS = 5
 """EXIF's numbers from this one exchange width and height."""
-
-
-def mask_of(path: Path, name: str) -> str | None:
-    """Of the picture ``name``: its file, relative to ``path``, the dataset's folder; None: none."""
-    beside, replaced = f"masks/{name}.png", str(PurePosixPath("masks", name).with_suffix(".png"))
-    return next((mask for mask in (beside, replaced) if (path / mask).is_file()), None)

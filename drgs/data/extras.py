@@ -9,16 +9,15 @@ pose, what stands at the top of the file is every frame's that has none of its o
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
 
 from drgs.cameras.camera import Lens
 from drgs.config.schema import DataConfig
 from drgs.core.errors import UserError
-from drgs.data.images import downscale_depth, downscale_mask, read_depth, read_mask
+from drgs.data.images import downscale_depth, downscale_mask, is_array, read_depth, read_mask
 from drgs.data.kept import Pixels, kept_mask
-from drgs.data.transforms import CLOSE, Frame, image_path, lens_of, motion_of
+from drgs.data.transforms import CLOSE, Frame, lens_of, motion_of
 from drgs.data.types import Motion
 
 MASK, DEPTH = "mask_path", "depth_file_path"
@@ -39,30 +38,17 @@ def optics_of(config: DataConfig, frame: Frame) -> dict[str, Lens | Motion | Non
 def extras_of(config: DataConfig, frame: Frame, size: tuple[int, int]) -> dict[str, Pixels | None]:
     """``mask`` and ``depth`` of a :class:`drgs.data.types.View`.
 
-    size: of the photograph, W, H, before it is scaled. No file is opened for what the configuration
-    ignores.
+    size: of the photograph, W, H, before it is scaled.
     """
     return {
-        "mask": None if config.ignore_masks else _mask(config, frame, size),
-        "depth": None if config.ignore_depth else _depth(config, frame, size),
+        "mask": _mask(config, frame, size) if "mask" in frame.files else None,
+        "depth": _depth(config, frame, size) if "depth" in frame.files else None,
     }
 
 
-def files_of(config: DataConfig, frame: Frame, photograph: Path) -> dict[str, Path]:
-    """``files`` of a :class:`drgs.data.types.View`: those that were opened for it."""
-    files, values = {"image": photograph}, frame.values
-    if values.mask_path is not None and not config.ignore_masks:
-        files["mask"] = image_path(config.path, frame, MASK)
-    if values.depth_file_path is not None and not config.ignore_depth:
-        files["depth"] = image_path(config.path, frame, DEPTH)
-    return files
-
-
-def _mask(config: DataConfig, frame: Frame, size: tuple[int, int]) -> Pixels | None:
-    """Of 1 and 0, at the width that is configured."""
-    if frame.values.mask_path is None:
-        return None
-    file = image_path(config.path, frame, MASK)
+def _mask(config: DataConfig, frame: Frame, size: tuple[int, int]) -> Pixels:
+    """The mask of 1 and 0, at the width that is configured."""
+    file = frame.files["mask"]
     mask = read_mask(file, size)
     smaller = downscale_mask(mask, config.image_size)
     if not smaller.any():  # its PSNR is the mean of nothing
@@ -75,11 +61,9 @@ def _mask(config: DataConfig, frame: Frame, size: tuple[int, int]) -> Pixels | N
     return kept_mask(smaller)
 
 
-def _depth(config: DataConfig, frame: Frame, size: tuple[int, int]) -> np.ndarray | None:
+def _depth(config: DataConfig, frame: Frame, size: tuple[int, int]) -> np.ndarray:
     """(H, W), scene units, 0 where not known, at the width that is configured."""
-    if frame.values.depth_file_path is None:
-        return None
-    depth = read_depth(image_path(config.path, frame, DEPTH), _unit(frame), size)
+    depth = read_depth(frame.files["depth"], _unit(frame), size)
     return downscale_depth(depth, config.image_size)
 
 
@@ -88,7 +72,7 @@ def _unit(frame: Frame) -> float:
     values = frame.values
     if values.depth_unit_scale_factor is not None:
         return values.depth_unit_scale_factor
-    return 1.0 if str(values.depth_file_path).endswith(".npy") else PICTURE_UNIT
+    return 1.0 if is_array(frame.files["depth"]) else PICTURE_UNIT
 
 
 def ignored(config: DataConfig, frames: Sequence[Frame]) -> tuple[str, ...]:
@@ -114,9 +98,11 @@ def notes(config: DataConfig, frames: Sequence[Frame]) -> str:
         text += " ignored" if "distortion" in left_out else ""
     if "masks" in left_out:
         text += f"; masks ({MASK}) ignored"
+    elif count := sum("mask" in frame.files for frame in frames):
+        text += f"; masks of {count:,} of {len(frames):,} photographs"
     if "depth" in left_out:
         text += f"; depth ({DEPTH}) ignored"
-    elif units := sorted({_unit(f) for f in frames if f.values.depth_file_path}):
+    elif units := sorted({_unit(f) for f in frames if "depth" in f.files}):
         text += f"; depth in units of {' and '.join(f'{unit:g}' for unit in units)}"
     if "motion" in left_out:
         text += f"; motion ({CLOSE}) ignored"

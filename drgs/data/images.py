@@ -15,6 +15,7 @@ from drgs.data.kept import KeptPicture, Pixels
 from drgs.data.types import View
 from drgs.io.pictures import (
     BITS,
+    MAX_16_BITS,
     MAX_BYTES,
     as_numbers,
     image_mode,
@@ -26,8 +27,9 @@ from drgs.io.pictures import (
 NUMBERS_AT_ONCE, MOST_THREADS = 1 << 25, 8
 """Pixels of photographs that are being read: of 40 bytes each, at most."""
 
-MAX_DEPTH_STEPS = 2**16 - 1
-"""White in a picture of 16 bits."""
+NEITHER, MOST_EDGES = 0.8, 0.1
+"""Of brightness, the middle part that is neither black nor white; and how many of a mask's pixels
+may be so, at the edges of what it leaves out."""
 
 ALL = 1 - 1e-4
 """Of an area, up to rounding."""
@@ -43,8 +45,22 @@ def read_mask(path: Path, size: tuple[int, int]) -> np.ndarray:
     is_larger = width > size[0] and is_scaled(size, (width, height))
     if not is_larger:
         _check_size(path, (width, height), size)  # before memory is taken for it
-    mask = (read_image(path)[:, :, 0] > 0.5).astype(np.float32)
+    mask = pixels_that_count(path).astype(np.float32)
     return _counting(_resized(mask, *size)) if is_larger else mask
+
+
+def pixels_that_count(path: Path) -> np.ndarray:
+    """(H, W) bool: where a mask is opaque, and its brightest channel is above half.
+
+    A photograph that is cut out, not black and white, is a mask by its alpha channel alone.
+    """
+    image = read_image(path)
+    brightness = image[:, :, :3].max(axis=2)
+    if image.shape[2] == 3 or (image[:, :, 3] > 0.5).all():
+        return brightness > 0.5
+    opaque = image[:, :, 3] > 0.5
+    is_photograph = np.mean(np.abs(brightness[opaque] - 0.5) < NEITHER / 2) > MOST_EDGES
+    return opaque if is_photograph else opaque & (brightness > 0.5)
 
 
 def is_scaled(size: tuple[int, int], original: tuple[int, int]) -> bool:
@@ -67,7 +83,7 @@ def read_depth(path: Path, unit: float, size: tuple[int, int]) -> np.ndarray:
     unit: scene units that a number of the ``.npy`` file, or a step of the 16 bit picture, counts;
     size: W, H. What is not finite or not positive is not known.
     """
-    if path.suffix == ".npy":
+    if is_array(path):
         depth = _stored_depth(path)
         _check_size(path, depth.shape[::-1], size)  # before memory is taken for it
         with np.errstate(over="ignore"):  # becomes infinite, and so is not known
@@ -80,8 +96,13 @@ def read_depth(path: Path, unit: float, size: tuple[int, int]) -> np.ndarray:
                 f"mode {mode}; convert it"
             )
         _check_size(path, image_size(path), size)
-        depth = read_image(path)[:, :, 0] * np.float32(MAX_DEPTH_STEPS * unit)
+        depth = read_image(path)[:, :, 0] * np.float32(MAX_16_BITS * unit)
     return np.where(np.isfinite(depth) & (depth > 0), depth, 0).astype(np.float32)
+
+
+def is_array(path: Path) -> bool:
+    """Whether depths are stored as an array, not as a picture; by the name."""
+    return path.suffix.lower() == ".npy"
 
 
 def _stored_depth(path: Path) -> np.ndarray:
@@ -170,7 +191,7 @@ def kept_photograph(
 
 def kept_rounded(numbers: np.ndarray) -> KeptPicture:
     """Numbers in 0..1, kept in 16 bits each."""
-    kept = np.round(numbers * np.float32(MAX_DEPTH_STEPS)).astype(np.uint16)
+    kept = np.round(numbers * np.float32(MAX_16_BITS)).astype(np.uint16)
     return KeptPicture(kept.shape, lambda: as_numbers(kept), kept.nbytes)
 
 

@@ -17,15 +17,18 @@ import numpy as np
 
 from drgs.config.schema import DataConfig
 from drgs.core.errors import UserError
-from drgs.data.extras import files_of, ignored, notes, optics_of
+from drgs.data.extras import ignored, notes, optics_of
+from drgs.data.frame_files import frames_with_files
 from drgs.data.images import check_room, threads_for
+from drgs.data.notices import Notices
 from drgs.data.reading import READ, SIZES_ALONE
 from drgs.data.transforms import (
     Frame,
+    TransformsFile,
     focal_from_angle,
-    image_path,
     in_parallel,
-    read_frames,
+    note_unread,
+    read_transforms,
     unique_names,
 )
 from drgs.data.types import Dataset, Keeps, View, all_of_them
@@ -36,6 +39,10 @@ START_HALF_EXTENT = 1.3
 (``readNerfSyntheticInfo``)."""
 
 
+OF_OTHERS = ("camera_angle_y", "fl_x", "fl_y", "cx", "cy", "w", "h")
+"""Intrinsics that the layout does not have."""
+
+
 def load(config: DataConfig, keeps: Keeps = all_of_them) -> Dataset:
     """Read split ``train`` and the split to measure on.
 
@@ -44,11 +51,12 @@ def load(config: DataConfig, keeps: Keeps = all_of_them) -> Dataset:
     """
     if config.background is None:
         config = config.model_copy(update={"background": "white"})
-    test_split = _test_split(config)
-    frames = {s: read_frames(_transforms_path(config.path, s)) for s in ("train", test_split)}
+    test_split, said, notices = _test_split(config), [], Notices(config.path)
+    frames = {split: _frames(config, split, said) for split in ("train", test_split)}
     train, test = (
-        _load_split(config, split, frames[split], keeps) for split in ("train", test_split)
+        _load_split(config, split, frames[split], keeps, notices) for split in ("train", test_split)
     )
+    notices.say(said, train, () if test_split == "train" else test)
     all_frames = [frame for of_split in frames.values() for frame in of_split]
     width, height = train[0].width, train[0].height
     return Dataset(
@@ -68,9 +76,25 @@ def load(config: DataConfig, keeps: Keeps = all_of_them) -> Dataset:
 
 
 def picture_files(config: DataConfig) -> list[Path]:
-    """Of the training views."""
-    frames = read_frames(_transforms_path(config.path, "train"))
-    return [image_path(config.path, frame) for frame in frames]
+    """The photographs of the training views."""
+    return [frame.files["image"] for frame in _frames(config, "train", [])]
+
+
+def _frames(config: DataConfig, split: str, notes: list[str]) -> list[Frame]:
+    """Those of a split whose photographs are there."""
+    meta = read_transforms(_transforms_path(config.path, split))
+    if unread := [*meta.unread, *_passed_over(meta)]:
+        notes.append(note_unread(meta.path, unread))
+    return frames_with_files(config, meta, notes)
+
+
+def _passed_over(meta: TransformsFile) -> list[str]:
+    """Keys that other layouts read."""
+    keys = [
+        key for key in OF_OTHERS if any(getattr(f.values, key) is not None for f in meta.frames)
+    ]
+    keys += [] if meta.point_cloud is None else ["ply_file_path"]
+    return keys + [f"{split}_filenames" for split in meta.lists]
 
 
 def _test_split(config: DataConfig) -> str:
@@ -90,9 +114,9 @@ def _transforms_path(folder: Path, split: str) -> Path:
 
 
 def _load_split(
-    config: DataConfig, split: str, frames: list[Frame], keeps: Keeps
+    config: DataConfig, split: str, frames: list[Frame], keeps: Keeps, notices: Notices
 ) -> tuple[View, ...]:
-    files = [image_path(config.path, frame) for frame in frames]
+    files = [frame.files["image"] for frame in frames]
     size = image_size(files[0])
 
     def load_view(index: int, name: str) -> View:
@@ -100,6 +124,8 @@ def _load_split(
         reading = READ if keeps(name) else SIZES_ALONE
         rgba = reading.pixels(file)
         _check_promises(rgba, size, file, files[0])
+        if reading is READ:
+            notices.look_at(file, rgba)
         pictures = reading.pictures(config, frame, file, rgba)
         height, width = pictures["image"].shape[:2]
         # The angle spans the full width, so the focal length in pixels follows the image's size.
@@ -115,7 +141,7 @@ def _load_split(
             cy=height / 2,
             width=width,
             height=height,
-            files=files_of(config, frame, file),
+            files=frame.files,
             **optics_of(config, frame),
             **pictures,
         )

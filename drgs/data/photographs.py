@@ -1,21 +1,24 @@
 """Photographs with frames that say where their cameras were, as views of a dataset.
 
 Views are sorted by file name, and every ``data.test_every``-th is for testing, as in Mip-NeRF 360
-and 3DGS. Frames may have a lens, a second pose, a mask and depths: see ``drgs.data.extras``.
+and 3DGS, unless the dataset lists the views of its splits: see ``drgs.data.splits``. Frames may
+have a lens, a second pose, a mask and depths: see ``drgs.data.extras``.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from drgs.config.schema import DataConfig
 from drgs.core.errors import UserError
-from drgs.data.extras import files_of, ignored, notes, optics_of
+from drgs.data.extras import ignored, notes, optics_of
 from drgs.data.images import check_room, threads_for
+from drgs.data.notices import Notices
 from drgs.data.orientation import as_calibrated
 from drgs.data.reading import READ, SIZES_ALONE, Reading
+from drgs.data.splits import Lists, split_of
 from drgs.data.transforms import (
     Frame,
     focal_from_angle,
@@ -37,53 +40,49 @@ class Photographs:
 
     layout: str  # its name
     source: Path  # what says it, for messages
-    frames: Sequence[Frame]
-    files: Sequence[Path]  # the frames' pictures
+    frames: Sequence[Frame]  # whose photographs are there
+    lists: Lists | None = None  # of splits
     point_cloud: Path | None = None  # to start from
     note: str = ""  # what else there is to say, for the dataset's description
-
-
-def check_splits(config: DataConfig, source: Path, num_views: int) -> None:
-    """Raise :class:`UserError` where there is no split as configured, or nothing to measure on."""
-    if config.test_split not in (None, "test"):
-        raise UserError(
-            f"{source}: this layout has no split {config.test_split}; leave data.test_split out "
-            "(data.test_every chooses the test views)"
-        )
-    if num_views < 2:
-        raise UserError(
-            f"{source}: at least 2 views are needed, one of them to test; got {num_views}"
-        )
+    notes: list[str] = field(default_factory=list)  # for the user, a line each
 
 
 def dataset_of(config: DataConfig, photographs: Photographs, keeps: Keeps = all_of_them) -> Dataset:
-    """All views; those at indices 0, n, 2n, ... of the sorted names are the test split."""
-    frames, files = photographs.frames, photographs.files
+    """All views of the splits, by :func:`drgs.data.splits.split_of`; what there is to note is said.
+
+    Raises :class:`UserError` as that does, and for a photograph or a frame that cannot be read.
+    """
+    frames = sorted(photographs.frames, key=lambda frame: frame.own.file_path)
+    file_names, said = [frame.own.file_path for frame in frames], photographs.notes
+    split = split_of(config, photographs.source, photographs.lists, file_names, said)
+    files = [frame.files["image"] for frame in frames]
     config = _completed(config, files)
+    notices = Notices(config.path)
 
     def load_view(index: int, name: str) -> View:
         reading = READ if keeps(name) else SIZES_ALONE
-        return _load_view(config, frames[index], files[index], name, reading)
+        return _load_view(config, frames[index], name, reading, notices)
 
-    order = sorted(range(len(frames)), key=lambda index: frames[index].own.file_path)
-    names = unique_names([frames[index].own.file_path for index in order])
-    kept = [files[index] for index, name in zip(order, names, strict=True) if keeps(name)]
-    check_room(kept, config.image_size)
-    views = in_parallel(load_view, order, names, threads=threads_for(files))
-    test = views[:: config.test_every]
-    train = tuple(v for i, v in enumerate(views) if i % config.test_every != 0)
+    used = sorted({*split.train, *split.test})
+    names = dict(zip(used, unique_names([file_names[index] for index in used]), strict=True))
+    check_room([files[index] for index in used if keeps(names[index])], config.image_size)
+    threads = threads_for(files)
+    views = dict(
+        zip(used, in_parallel(load_view, used, [*names.values()], threads=threads), strict=True)
+    )
+    train, test = (tuple(views[i] for i in indices) for indices in (split.train, split.test))
+    measured = () if split.name == "train" else test
+    notices.say(said, train, measured, photographs.point_cloud)
     return Dataset(
         train=train,
         test=test,
-        test_split="test",
+        test_split=split.name,
         background=config.background_rgb,
         start_half_extent=None,
         description=(
             f"{config.path.name} ({photographs.layout} layout): {len(train)} train views, measured "
-            f"on {len(test)} views (every {config.test_every}th by file name), "
-            f"{views[0].width}x{views[0].height}, background {config.background}"
-            + notes(config, frames)
-            + photographs.note
+            f"on {len(test)} views ({split.how}), {train[0].width}x{train[0].height}, background "
+            f"{config.background}{notes(config, frames)}{photographs.note}"
         ),
         ignored=ignored(config, frames),
         point_cloud=photographs.point_cloud,
@@ -100,8 +99,13 @@ def _completed(config: DataConfig, files: Sequence[Path]) -> DataConfig:
     return config.model_copy(update=changes)
 
 
-def _load_view(config: DataConfig, frame: Frame, file: Path, name: str, reading: Reading) -> View:
+def _load_view(
+    config: DataConfig, frame: Frame, name: str, reading: Reading, notices: Notices
+) -> View:
+    file = frame.files["image"]
     pixels = as_calibrated(reading.pixels(file), file, frame)
+    if reading is READ:
+        notices.look_at(file, pixels)
     height, width = pixels.shape[:2]
     values = frame.values
     for key, given, size in (("w", values.w, width), ("h", values.h, height)):
@@ -127,7 +131,7 @@ def _load_view(config: DataConfig, frame: Frame, file: Path, name: str, reading:
         cy=cy * scale_y,
         width=new_width,
         height=new_height,
-        files=files_of(config, frame, file),
+        files=frame.files,
         **optics_of(config, frame),
         **pictures,
     )

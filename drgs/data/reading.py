@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from drgs.config.schema import DataConfig
-from drgs.data.extras import extras_of, files_of
+from drgs.data.extras import extras_of
 from drgs.data.images import downscaled_size, kept_photograph
 from drgs.data.kept import KeptPicture, Pixels
 from drgs.data.transforms import Frame
@@ -50,7 +50,7 @@ def _sized(config: DataConfig, frame: Frame, file: Path, pixels: np.ndarray) -> 
     """Pictures that refuse to become numbers."""
     height, width, channels = pixels.shape
     new_width, new_height = downscaled_size(width, height, config.image_size)
-    files, plane = files_of(config, frame, file), _unread((new_height, new_width), file)
+    files, plane = frame.files, _unread((new_height, new_width), file)
     return {
         "image": _unread((new_height, new_width, 3), file),
         "alpha": plane if channels == 4 else None,

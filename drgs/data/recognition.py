@@ -11,23 +11,18 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from drgs.core.errors import listed
+from drgs.data.file_names import PICTURE_FOLDERS, PICTURE_SUFFIXES
 
-PICTURES = frozenset(
-    {
-        *(".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp"),
-        *(".heic", ".heif", ".dng", ".arw", ".cr2", ".cr3", ".nef"),
-    }
-)
 VIDEOS = frozenset({".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v"})
-
-PICTURE_FOLDERS = ("images", "input", "photos", "rgb")
-"""Where converters expect photographs, or put them."""
 
 COLMAP_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0")
 """Where COLMAP's models lie in the folders of datasets."""
 
+WORKSPACES = ("", "dense/0", "dense")
+"""Where such a folder lies in that of COLMAP's automatic reconstruction, with its photographs."""
+
 OTHER_COLMAP_FOLDERS = ("0", ".")
-"""Where they lie in COLMAP's own."""
+"""Where models lie in COLMAP's own folders and, beside the photographs, in flat exports."""
 
 GUIDE = 'docs/guide.md, "From photographs to a dataset"'
 
@@ -59,7 +54,7 @@ def what_is_there(folder: Path, markers: Sequence[str]) -> str:
 
 def is_picture(name: str) -> bool:
     """By its name; hidden files, as systems leave beside photographs (``._a.jpg``), are none."""
-    return not name.startswith(".") and Path(name).suffix.lower() in PICTURES
+    return not name.startswith(".") and Path(name).suffix.lower() in PICTURE_SUFFIXES
 
 
 def _output_of_a_fit(folder: Path, names: list[str], markers: Sequence[str]) -> str | None:
@@ -93,7 +88,30 @@ def _dataset_below(folder: Path, names: list[str], markers: Sequence[str]) -> st
 
 def has_colmap_model(folder: Path) -> bool:
     """Whether a model of COLMAP lies where datasets have it."""
-    return _found_model(folder, COLMAP_FOLDERS) is not None
+    return colmap_dataset(folder) is not None
+
+
+def colmap_dataset(folder: Path) -> tuple[Path, Path] | None:
+    """The folder of the photographs' folders and masks, and that of the model; None: no model.
+
+    The first that has both photographs and a model; else the first model in a place of its own.
+    """
+    for workspace in WORKSPACES:
+        root = folder / workspace
+        for below in (*COLMAP_FOLDERS, "."):
+            if _found_model(root, (below,)) and _has_pictures(root):
+                return root, root / below
+    for below in COLMAP_FOLDERS:
+        if _found_model(folder, (below,)):
+            return folder, folder / below
+    return None
+
+
+def _has_pictures(root: Path) -> bool:
+    """Whether photographs lie where those of a model do."""
+    if any((root / f"images{suffix}").is_dir() for suffix in ("", "_2", "_4", "_8")):
+        return True
+    return any(map(_pictures_in, (root, *_folders_in(root))))
 
 
 def _found_model(folder: Path, folders: Sequence[str]) -> str | None:

@@ -132,6 +132,11 @@ def focus_of(views: Sequence[Viewpoint]) -> tuple[np.ndarray, float]:
     projectors = np.eye(3) - axes[:, :, None] * axes[:, None, :]
     normal = projectors.mean(axis=0)
     remedy = "set init.half_extent, or give a point cloud (init.point_cloud)"
+    if len(views) == 1:
+        raise UserError(
+            "init.half_extent: no start box can be derived from one training camera, which does "
+            f"not tell how far away it looks; train on more views, or {remedy}"
+        )
     if np.linalg.eigvalsh(normal)[0] < PARALLEL_AXES:
         raise UserError(
             "init.half_extent: no start box can be derived from the cameras, whose optical axes "

@@ -10,7 +10,6 @@ from __future__ import annotations
 import os
 import re
 import shlex
-import shutil
 import tempfile
 import threading
 import warnings
@@ -26,7 +25,9 @@ from PIL import ExifTags, Image
 from drgs.core.errors import UserError, UserNote, listed, one_line
 from drgs.core.extras import required
 from drgs.core.files import why_refused
-from drgs.data.colmap import LENSES, mask_of, model_folder
+from drgs.data.colmap import LENSES, model_folder
+from drgs.data.images import pixels_that_count
+from drgs.data.mask_names import masks_of
 from drgs.data.recognition import folders_of_pictures, has_colmap_model, is_picture
 from drgs.io.pictures import check_readable, image_size
 
@@ -279,7 +280,9 @@ class _Work:
 
         COLMAP leaves out photographs whose mask is missing.
         """
-        given = {name: mask_of(self.dataset, name) for name in self.names}
+        given = dict(
+            zip(self.names, masks_of(self.dataset, self.names, [], self.pictures), strict=True)
+        )
         if not any(given.values()):
             return None
         folder = self.folder / "masks"
@@ -287,7 +290,7 @@ class _Work:
             target = folder / f"{name}.png"
             target.parent.mkdir(parents=True, exist_ok=True)
             if (mask := given[name]) is not None:
-                shutil.copyfile(self.dataset / mask, target)
+                Image.fromarray(pixels_that_count(mask)).convert("L").save(target)
             else:
                 Image.new("L", image_size(self.pictures / name), 255).save(target)
         return folder

@@ -1,17 +1,16 @@
 """Reading ``transforms*.json`` files: what the NeRF-synthetic and nerfstudio layouts share.
 
 Both store camera-to-world matrices in OpenGL axes (x right, y up, z backward). A file is checked as
-a whole against :class:`Transforms`; keys that it does not name are ignored.
+a whole against :class:`Transforms`; keys that it does not name are not read (``unread``).
 """
 
 from __future__ import annotations
 
 import json
 import math
-import os
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Annotated, Literal, TypeVar
 
@@ -21,8 +20,7 @@ from pydantic_core import ErrorDetails
 
 from drgs.cameras.axes import between_opencv_and_opengl
 from drgs.config.explain import expectation
-from drgs.config.schema import DataConfig
-from drgs.core.errors import UserError, one_line
+from drgs.core.errors import UserError, listed, one_line
 from drgs.core.files import read_text, shortened
 from drgs.data.types import Motion
 from drgs.io.pictures import MAX_SIDE
@@ -67,6 +65,15 @@ FISHEYE_MODELS = (
     THIN_PRISM_MODEL,
 )
 """The others are a pinhole camera apart from their distortion."""
+
+WITHOUT_EFFECT = frozenset(
+    {
+        *("applied_transform", "applied_scale", "orientation_override"),  # nerfstudio: done already
+        *("aabb_scale", "scale", "offset", "up"),  # instant-ngp: where its grid lies
+        *("colmap_im_id", "sharpness", "rotation"),
+    }
+)
+"""Keys that change nothing of what is read here: none is missed."""
 
 CLOSE = "transform_matrix_close"
 """Of a frame: where its camera was when the shutter closed, as ``transform_matrix`` is where it was
@@ -177,6 +184,9 @@ class Transforms(CameraValues):
 
     frames: Annotated[list[FrameValues], Field(min_length=1)]
     ply_file_path: Text | None = None
+    train_filenames: list[Text] | None = None
+    val_filenames: list[Text] | None = None
+    test_filenames: list[Text] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -187,7 +197,7 @@ class Frame:
     own: FrameValues  # without what it inherits
     index: int
     path: Path
-    point_cloud: str | None = None  # what the file's ply_file_path names
+    files: Mapping[str, Path] = field(default_factory=dict)  # found: image, mask, depth
 
     @property
     def numbers_are_as_stored(self) -> bool:
@@ -205,8 +215,19 @@ class Frame:
         return f"{self.path}: frames[{self.index}].{key}" if in_frame else f"{self.path}: {key}"
 
 
-def read_frames(path: Path) -> list[Frame]:
-    """The frames of a transforms file, at least one.
+@dataclass(frozen=True, eq=False)
+class TransformsFile:
+    """A file as it was read."""
+
+    path: Path
+    frames: Sequence[Frame]  # at least one
+    point_cloud: str | None  # what ply_file_path names
+    lists: Mapping[str, Sequence[str]]  # file names of train, val, test: those that it has
+    unread: Sequence[str]  # keys that are passed over
+
+
+def read_transforms(path: Path) -> TransformsFile:
+    """Read and check a transforms file.
 
     Raises :class:`UserError` naming the file, the key, what was expected and what was got.
     """
@@ -219,10 +240,23 @@ def read_frames(path: Path) -> list[Frame]:
         meta = Transforms.model_validate(content)
     except ValidationError as error:
         raise UserError(f"{path}: {_explained(error.errors()[0])}") from None
-    return [
-        Frame(_inherited(own, meta), own, index, path, meta.ply_file_path)
-        for index, own in enumerate(meta.frames)
-    ]
+    frames = [Frame(_inherited(own, meta), own, i, path) for i, own in enumerate(meta.frames)]
+    names = {split: getattr(meta, f"{split}_filenames") for split in ("train", "val", "test")}
+    lists = {split: listing for split, listing in names.items() if listing}
+    return TransformsFile(path, frames, meta.ply_file_path, lists, _unread(content))
+
+
+def note_unread(path: Path, keys: Sequence[str]) -> str:
+    """What the user should know of keys that are passed over."""
+    return f"{path}: keys that are not read: {listed(keys, 8)}"
+
+
+def _unread(content: Mapping[str, object]) -> list[str]:
+    """Sorted; those of frames as ``frames[].key``."""
+    top = content.keys() - Transforms.model_fields.keys() - WITHOUT_EFFECT
+    in_frames = set().union(*content["frames"]) - FrameValues.model_fields.keys() - WITHOUT_EFFECT
+    keys = [*sorted(top), *(f"frames[].{key}" for key in sorted(in_frames))]
+    return [one_line(key, 60) for key in keys]
 
 
 def _inherited(own: FrameValues, meta: Transforms) -> FrameValues:
@@ -343,39 +377,6 @@ def motion_of(frame: Frame, samples: int) -> Motion | None:
         return None
     shutter = frame.values.shutter or "global"
     return Motion(frame.own.transform_matrix_close, shutter, samples)
-
-
-def image_path(folder: Path, frame: Frame, key: str = "file_path") -> Path:
-    """The file that ``frame`` names, with ``.png`` added where its name has no suffix."""
-    name = getattr(frame.values, key)
-    if name is None:
-        raise UserError(f"{frame.where(key)} is missing")
-    for candidate in (folder / name, folder / f"{name}.png"):
-        if os.path.isfile(candidate):  # False, not an error, for a name that no file can have
-            return candidate
-    raise UserError(
-        f"{frame.where(key)}: there is no image {one_line(folder / name)} (or with .png added)"
-    )
-
-
-def point_cloud_path(config: DataConfig, frames: Sequence[Frame]) -> Path | None:
-    """The point cloud that the frames' file names, if it is there and not to be ignored."""
-    name = frames[0].point_cloud
-    if name is None or config.ignore_points or not os.path.isfile(config.path / name):
-        return None
-    return config.path / name
-
-
-def point_cloud_note(config: DataConfig, frames: Sequence[Frame]) -> str:
-    """What becomes of the file's point cloud if it is not started from, for a description."""
-    name = frames[0].point_cloud
-    if name is None:
-        return ""
-    if config.ignore_points:
-        return "; point cloud (ply_file_path) ignored"
-    if point_cloud_path(config, frames) is None:
-        return f"; its point cloud {one_line(name, 100)} is not there"
-    return ""
 
 
 def unique_names(files: Sequence[str]) -> list[str]:

@@ -7,13 +7,14 @@ cameras of a dataset or from the Gaussians alone (``drgs.data.orbits``).
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
 from drgs.core.constants import SHUTTER_SAMPLES
-from drgs.core.errors import UserError
+from drgs.core.errors import UserError, UserNote
 from drgs.data.transforms import (
     MAX_COORDINATE,
     Frame,
@@ -21,8 +22,9 @@ from drgs.data.transforms import (
     focal_length,
     lens_of,
     motion_of,
+    note_unread,
     principal_point,
-    read_frames,
+    read_transforms,
 )
 from drgs.data.types import Viewpoint
 
@@ -87,7 +89,10 @@ def read_viewpoints(
 
     Raises :class:`UserError` naming the file, the key, what was expected and what was got.
     """
-    frames = read_frames(path)
+    meta = read_transforms(path)
+    if meta.unread:
+        warnings.warn(UserNote(note_unread(meta.path, meta.unread)), stacklevel=2)
+    frames = meta.frames
     digits = len(str(len(frames) - 1))
     return [
         _viewpoint_of(frame, f"camera_{index:0{digits}d}", size, shutter_samples)

@@ -128,10 +128,12 @@ class Gaussians:
         means, quats, scales, opacities, sh = (
             np.asarray(values, np.float32) for values in (means, quats, scales, opacities, sh)
         )
-        num, where = len(means), "Gaussians.from_numpy(): "
+        where = "Gaussians.from_numpy(): "
+        if means.shape[1:] != (3,):
+            raise ValueError(f"{where}means must be of shape (N, 3), got {means.shape}")
+        num = len(means)
         coefficients = [(degree + 1) ** 2 for degree in range(4)]
         for name, values, shapes in (
-            ("means", means, [(num, 3)]),
             ("quats", quats, [(num, 4)]),
             ("scales", scales, [(num, 3)]),
             ("opacities", opacities, [(num,)]),

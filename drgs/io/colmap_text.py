@@ -1,4 +1,8 @@
-"""Text files of COLMAP's models: a record a line (an image's are two), ``#`` before comments."""
+"""Text files of COLMAP's models: a record a line, ``#`` before comments.
+
+An image's are two lines, of which the second has what it observes, or nothing. Some programs leave
+out the second.
+"""
 
 from __future__ import annotations
 
@@ -44,18 +48,38 @@ def cameras(path: Path) -> Iterator[CameraRecord]:
 def images(path: Path) -> Iterator[ImageRecord]:
     """Of ``images.txt``."""
     lines = _lines(path)
-    for line in lines:
+    line = next(lines, None)
+    while line is not None:
+        following = next(lines, None)
         if line.is_record:
             _, *pose, camera, name = line.words(IMAGE, "an image")
             pose = [line.real(word, key) for word, key in zip(pose, IMAGE[1:], strict=False)]
             camera = line.whole(camera, "CAMERA_ID")
             yield ImageRecord(line.place, name.rstrip(), camera, pose)
-            observed = next(lines, None)
-            if observed is not None and len(observed.text.split()) % 3:
-                raise UserError(
-                    f"{observed.place}: what an image observes (X, Y, POINT3D_ID of each point) "
-                    "was expected; each image has two lines, of which the second may be empty"
-                )
+            if following is not None and not _is_image(following):
+                _check_observations(following)
+                following = next(lines, None)
+        line = following
+
+
+def _is_image(line: _Line) -> bool:
+    """Whether a line is as long as an image's first one and ends in a name, not in a number."""
+    words = line.text.split()
+    if len(words) < len(IMAGE):
+        return False
+    try:
+        float(words[-1])
+    except ValueError:
+        return True
+    return False
+
+
+def _check_observations(line: _Line) -> None:
+    if len(line.text.split()) % 3:
+        raise UserError(
+            f"{line.place}: what an image observes (X, Y, POINT3D_ID of each point) was expected; "
+            "each image has two lines, of which the second may be empty"
+        )
 
 
 def points(path: Path) -> Iterator[PointRecord]:

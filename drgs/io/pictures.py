@@ -1,12 +1,14 @@
 """Pictures from files and to files; all that drgs reads or writes goes through here.
 
-Read: 8 and 16 bits, with and without alpha. Written: 8-bit PNG and WebP, animations as WebP and
-GIF, Mitsuba's bitmaps as EXR. Pictures are (H, W, C) in display space, rounded to 8 bits and
-clamped to [0, 1] here; files are written whole or not at all.
+Read: 8 bits, with and without alpha, and grey of 16 bits; of colours of 16 bits, the upper 8.
+Written: 8-bit PNG and WebP, animations as WebP and GIF, Mitsuba's bitmaps as EXR. Pictures are
+(H, W, C) in display space, rounded to 8 bits and clamped to [0, 1] here; files are written whole or
+not at all.
 """
 
 from __future__ import annotations
 
+import io
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -14,7 +16,7 @@ from typing import TYPE_CHECKING
 
 import imageio.v3 as iio
 import numpy as np
-from PIL import ExifTags, Image
+from PIL import ExifTags, Image, ImageCms, UnidentifiedImageError
 
 from drgs.core.errors import UserError, one_line
 from drgs.core.files import atomic_path, open_regular
@@ -34,6 +36,9 @@ MAX_BYTES = 1 << 30
 BITS = {"L": 8, "LA": 8, "RGB": 8, "RGBA": 8, "I;16": 16, "I;16B": 16, "I": 16}
 """Of a channel, by those of Pillow's modes that are read. ``I`` holds 32, but is what some versions
 of Pillow make of a grey PNG of 16."""
+
+
+MAX_16_BITS = 2**16 - 1
 
 
 def _transposed(pixels: np.ndarray) -> np.ndarray:
@@ -105,7 +110,7 @@ def stored_shape(path: Path) -> tuple[int, int, int, int]:
     From the file's header; what it refuses counts as RGB of 8 bits.
     """
     with _opened(path) as image:
-        is_transparent = image.mode in ("LA", "RGBA", "P")
+        is_transparent = image.mode in ("LA", "RGBA", "P") or _has_alpha(image)
         bits = BITS.get(image.mode, 8)
         return *_stored_size(image), 4 if is_transparent else 3, bits // 8
 
@@ -162,7 +167,54 @@ def upright(pixels: np.ndarray, orientation: int) -> np.ndarray:
 def has_alpha(path: Path) -> bool:
     """Whether :func:`read_image` gives an alpha channel, from the file's header."""
     with _opened(path) as image:
-        return image.mode in ("LA", "RGBA") or (image.mode == "P" and "transparency" in image.info)
+        return _has_alpha(image)
+
+
+def _has_alpha(image: Image.Image) -> bool:
+    """Before it is decoded; a PNG may name a colour that is transparent."""
+    has_colour = image.mode in ("P", "L", "RGB", "1") and "transparency" in image.info
+    return image.mode in ("LA", "RGBA") or has_colour
+
+
+def unused_content(path: Path) -> list[str]:
+    """What a picture has that :func:`read_pixels` passes over, from its header; for messages."""
+    with _opened(path) as image:
+        found = []
+        if _bits(image) > BITS.get(image.mode, 8):
+            found.append(f"of {_bits(image)} bits a channel, of which 8 are used")
+        if profile := _colour_profile(image.info.get("icc_profile")):
+            found.append(f"with the colour profile {profile}, which is not applied")
+        gamma = image.info.get("gamma")
+        if gamma and not profile and abs(gamma - 1 / 2.2) > 0.02:
+            found.append(f"of gamma {gamma:.3g}, which is taken for sRGB")
+        # The other pictures of an MPO are smaller ones, or say how bright a display may be.
+        if image.format != "MPO" and getattr(image, "n_frames", 1) > 1:
+            found.append("with several pictures each, of which the first is used")
+        return found
+
+
+def _bits(image: Image.Image) -> int:
+    """Of a channel in the file; Pillow decodes colours to 8."""
+    if image.format == "TIFF":
+        return max(image.tag_v2.get(ExifTags.Base.BitsPerSample, (8,)))
+    if image.format == "JPEG2000" or not image.tile:
+        return 8
+    args = image.tile[0].args
+    if image.format == "PPM" and isinstance(args, tuple) and isinstance(args[-1], int):
+        return args[-1].bit_length()
+    mode = args if isinstance(args, str) else str(args[0] if args else "")
+    return 16 if ";16" in mode else 8
+
+
+def _colour_profile(profile: bytes | None) -> str:
+    """The name of a profile of other colours than sRGB; "": there is none."""
+    if not profile:
+        return ""
+    try:
+        name = one_line(ImageCms.getProfileDescription(io.BytesIO(profile)), 60)
+    except Exception:  # Pillow raises many types for a broken profile, which says nothing
+        return ""
+    return "" if "srgb" in name.lower() else name
 
 
 def read_image(path: Path) -> np.ndarray:
@@ -172,7 +224,7 @@ def read_image(path: Path) -> np.ndarray:
 
 def as_numbers(pixels: np.ndarray) -> np.ndarray:
     """Float32 in 0..1 of what :func:`read_pixels` gave."""
-    return pixels.astype(np.float32) / np.float32(255 if pixels.dtype == np.uint8 else 65535)
+    return pixels.astype(np.float32) / np.float32(255 if pixels.dtype == np.uint8 else MAX_16_BITS)
 
 
 def check_readable(path: Path) -> None:
@@ -191,11 +243,18 @@ def read_pixels(path: Path) -> np.ndarray:
     with _opened(path) as image:
         _check(path, image)  # before memory is allocated for it
         turn, decoded = _turned_by_pillow(image), image
-        if image.mode == "P":
-            decoded = image.convert("RGBA" if "transparency" in image.info else "RGB")
+        if image.mode != "RGBA" and image.mode != "LA" and _has_alpha(image):
+            decoded = image.convert("RGBA")
+        elif image.mode == "P":
+            decoded = image.convert("RGB")
         elif image.mode == "1":
             decoded = image.convert("L")
         pixels = upright(np.asarray(decoded), UNDONE_BY.get(turn, turn))
+        if image.mode == "I" and not 0 <= pixels.min() <= pixels.max() <= MAX_16_BITS:
+            raise UserError(
+                f"{path}: must have values of 16 bits, 0 to {MAX_16_BITS}, got {pixels.min()} to "
+                f"{pixels.max()}; convert it"
+            )
     if pixels.ndim == 2:
         pixels = pixels[:, :, None]
     if pixels.shape[2] < 3:
@@ -225,6 +284,11 @@ def _opened(path: Path) -> Iterator[Image.Image]:
             yield image
     except UserError:
         raise
+    except UnidentifiedImageError:
+        raise UserError(
+            f"{path}: cannot read the image: it is of no format that is read, such as PNG, JPEG, "
+            "TIFF or WebP; convert it"
+        ) from None
     except OSError as error:
         reason = error.strerror or one_line(error) or type(error).__name__
         raise UserError(f"{path}: cannot read the image: {reason}") from None

@@ -197,7 +197,8 @@ def _scalar(text: str) -> Scalar:
 def read_points(path: str | Path) -> tuple[np.ndarray, np.ndarray | None]:
     """Positions (N, 3) float64, world, and colours (N, 3) float32 in 0..1, or None without any.
 
-    Integer colours are scaled by their type's range, floats are taken as they are.
+    Integer colours count from 0 to 255, or to 65535 in unsigned 16 bits; floats are taken as they
+    are.
 
     Raises :class:`UserError` naming the file and what it lacks, as :func:`read_gaussians` does.
     """
@@ -210,13 +211,13 @@ def read_points(path: str | Path) -> tuple[np.ndarray, np.ndarray | None]:
     colors = _columns(vertex, COLOR)
     kind = vertex.dtype["red"]
     if np.issubdtype(kind, np.integer):
-        colors = colors / np.float32(np.iinfo(kind).max)
+        colors = colors / np.float32(65535 if kind == np.uint16 else 255)
     bad = np.argwhere(~((colors >= 0) & (colors <= 1)))
     if len(bad):
         row, channel = bad[0]
         raise UserError(
-            f"{path}: element vertex, row {row}: red, green, blue must be integers or floats in "
-            f"0..1, got {COLOR[channel]} = {vertex[COLOR[channel]][row]}"
+            f"{path}: element vertex, row {row}: red, green, blue must be integers in 0..255 or "
+            f"floats in 0..1, got {COLOR[channel]} = {vertex[COLOR[channel]][row]}"
         )
     return positions, colors
 

@@ -179,13 +179,13 @@ WRONG_INPUTS = {
         edit_transforms(lambda m: m["frames"][1]["transform_matrix"][2].__setitem__(1, 1.0002)),
         "transforms_train.json: frames[1].transform_matrix must be rigid",
     ),
-    "image missing": (
-        lambda f: (f / "train" / "1.png").unlink(),
+    "images missing": (
+        lambda f: [(f / "train" / f"{i}.png").unlink() for i in (1, 2)],
         "transforms_train.json: frames[1].file_path: there is no image",
     ),
-    "image is a folder": (
-        put_folder_in_place_of("train/1.png"),
-        "transforms_train.json: frames[1].file_path: there is no image",
+    "all test images are folders": (
+        put_folder_in_place_of("test/0.png"),
+        "transforms_test.json: frames[0].file_path: there is no image",
     ),
     "image not an image": (write("train/1.png", b"hello"), "1.png: cannot read the image"),
     "image empty": (write("train/1.png", b""), "1.png: cannot read the image"),

@@ -3,6 +3,7 @@
 Each mutation is made by a generator with its own seed, which a failure prints.
 """
 
+import copy
 import io
 import json
 import os
@@ -14,6 +15,7 @@ import pytest
 import yaml
 from plyfile import PlyData, PlyElement
 from support.attacks.mutations import mutate_bytes, mutate_chunks, mutate_header, mutate_tree
+from support.colmap_models import Model, write_binary
 
 from drgs.config.load import dump_config, load_config
 from drgs.config.schema import DataConfig, FitConfig
@@ -23,6 +25,8 @@ from drgs.data.images import composite
 from drgs.gaussians.parameters import Gaussians
 from drgs.io.pictures import read_image
 from drgs.io.ply import read_points
+
+pytestmark = pytest.mark.filterwarnings("ignore::drgs.core.errors.UserNote")
 
 COUNT = 600
 """Mutations of each format."""
@@ -39,6 +43,13 @@ def write_image(path, seed):
     iio.imwrite(path, pixels)
 
 
+def write_mask(path):
+    """White, and transparent where pixels do not count."""
+    pixels = np.full((5, 7, 2), 255, np.uint8)
+    pixels[:2, :3, 1] = 0
+    iio.imwrite(path, pixels, mode="LA")
+
+
 def camera_at(angle):
     """A camera on a circle of radius 4 in OpenGL axes, looking at the origin."""
     c, s = float(np.cos(angle)), float(np.sin(angle))
@@ -49,11 +60,14 @@ def camera_at(angle):
 def photographs(tmp_path):
     """A valid nerfstudio folder (nerf_synthetic reads its frames by the same functions)."""
     frames = []
-    for i in range(3):
+    for i in range(4):
         write_image(tmp_path / f"{i}.png", i)
         frames.append({"file_path": f"{i}.png", "transform_matrix": camera_at(i)})
     meta = {"fl_x": 9.0, "fl_y": 9.0, "cx": 3.5, "cy": 2.5, "w": 7, "h": 5, "k1": 0.0}
     meta |= {"camera_model": "OPENCV", "camera_angle_x": 0.7, "frames": frames}
+    meta |= {"train_filenames": ["0.png", "1.png", "./3.png"], "test_filenames": ["2"]}
+    frames[1]["mask_path"] = "mask.png"
+    write_mask(tmp_path / "mask.png")
     (tmp_path / "transforms.json").write_text(json.dumps(meta))
     return tmp_path
 
@@ -133,6 +147,78 @@ def test_damaged_transforms_files_are_read_or_refused(photographs):
             path.write_bytes(mutate_bytes(rng, content))
         refused.append(check(seed, path, read))
     assert_both_happen(refused)
+
+
+@pytest.mark.parametrize("layout", ["transforms.json", "COLMAP"])
+def test_damaged_masks_are_read_or_refused(photographs, layout):
+    """Of 1 and 0, whatever the file is, where the photograph still has one."""
+    folder = photographs / "masks" if layout == "COLMAP" else photographs
+    if layout == "COLMAP":
+        (photographs / "transforms.json").unlink()
+        cameras = [(1, "PINHOLE", 7, 5, (9.0, 9.0, 3.5, 2.5))]
+        axes = np.diag([1, -1, -1, 1])
+        images = [(f"{i}.png", 1, np.array(camera_at(i)) @ axes) for i in range(4)]
+        write_binary(photographs / "sparse", Model(cameras, images, []))
+        folder.mkdir()
+    names = ["mask.png"] if layout != "COLMAP" else ["1.png.mask.png", "1.PNG", "1_mask.png"]
+    (photographs / "mask.png").rename(folder / names[0])
+    content = (folder / names[0]).read_bytes()
+
+    def read():
+        views = load_dataset(DataConfig(path=photographs)).train
+        masks = [np.asarray(view.mask) for view in views if view.mask is not None]
+        assert all(np.isin(mask, (0, 1)).all() and mask.any() for mask in masks)
+        assert len(masks) == 1
+
+    refused = []
+    for seed in range(COUNT):
+        rng = np.random.default_rng(seed)
+        path = folder / names[seed % len(names)]
+        mutate = mutate_chunks if seed % 2 else mutate_bytes
+        path.write_bytes(mutate(rng, content))
+        refused.append(check(seed, path, read))
+        path.unlink()
+    assert_both_happen(refused)
+
+
+def test_strange_names_are_found_or_said(photographs):
+    """Of photographs, masks, clouds and lists: what is taken is a file, and none is taken twice."""
+    path, refused = photographs / "transforms.json", []
+    meta = json.loads(path.read_text())
+    parts = [
+        *"0123",
+        "2",
+        "images",
+        "..",
+        ".",
+        "",
+        "C:",
+        "\\",
+        "/",
+        "//",
+        "a" * 300,
+        "\0",
+        "\ud800",
+    ]
+    parts += [".png", ".PNG", ".jpg", "é", "e\u0301", "*", "~", " ", "\n", str(photographs), "mask"]
+
+    def read():
+        dataset = load_dataset(DataConfig(path=photographs))
+        files = [view.files["image"] for view in (*dataset.train, *dataset.test)]
+        assert all(file.is_file() for file in files) and len(set(files)) == len(files)
+
+    for seed in range(COUNT):
+        rng = np.random.default_rng(seed)
+        changed = copy.deepcopy(meta)
+        places = [(frame, "file_path") for frame in changed["frames"]]
+        places += [(changed["frames"][1], "mask_path"), (changed, "ply_file_path")]
+        places += [(changed["test_filenames"], 0), (changed["train_filenames"], 1)]
+        container, key = places[rng.integers(len(places))]
+        chosen = [parts[k] for k in rng.integers(len(parts), size=rng.integers(1, 4))]
+        container[key] = ["/", "", "\\"][rng.integers(3)].join(chosen)
+        path.write_text(json.dumps(changed))
+        refused.append(check(seed, path, read))
+    assert 0.1 * COUNT < sum(refused) < 0.9 * COUNT
 
 
 def test_damaged_pictures_are_read_or_refused(tmp_path):

@@ -366,17 +366,25 @@ def test_torch_differentiates_it():
 # ----------------------------------------------------------------------------------------------
 
 
+SKEWED = np.tile(np.array([[9.0, 0, 4], [0, 9, 3], [0, 0, 1]]), (2, 1, 1))
+SKEWED[1, 0, 1] = 0.5
+
+
 @pytest.mark.parametrize(
     ("changes", "error", "message"),
     [
         (
             {"means": np.zeros((24, 2))},
             ValueError,
-            r"means must be of shape \(24, 3\), got \(24",
+            r"means must be of shape \(N, 3\), got \(24",
         ),
-        ({"means": np.zeros((0, 3))}, ValueError, "quats must be of shape"),
+        ({"means": np.zeros((3, 24))}, ValueError, r"means must be of shape \(N, 3\), got \(3"),
+        ({"means": 1.0}, ValueError, r"means must be of shape \(N, 3\), got \(\)"),
+        ({"means": np.zeros((0, 3))}, ValueError, "means must be of one Gaussian at least"),
         ({"opacities": np.zeros((24, 1))}, ValueError, r"opacities must be of shape \(24,\)"),
-        ({"viewmats": np.eye(4)}, ValueError, "viewmats must be of shape"),
+        ({"viewmats": np.eye(4)}, ValueError, r"viewmats must be of shape \(C, 4, 4\), got \(4"),
+        ({"Ks": np.eye(3)}, ValueError, r"Ks must be of shape \(2, 3, 3\), got \(3, 3\)"),
+        ({"Ks": SKEWED}, ValueError, r"Ks\[1\] must be \(\(fx, 0, cx\), .*, without skew, got"),
         ({"viewmats": np.zeros((2, 4, 4))}, ValueError, r"viewmats\[0\] must be matrices of a rot"),
         ({"backgrounds": np.zeros(3)}, ValueError, r"backgrounds must be of shape \(2, 3\)"),
         ({"sh_degree": None}, ValueError, r"colors must be of shape \(24, D\) or \(2, 24, D\)"),

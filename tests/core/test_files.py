@@ -83,6 +83,8 @@ def test_text_is_read_up_to_a_limit(tmp_path):
     path = tmp_path / "a.txt"
     path.write_bytes(b"\xc3\xa4b")
     assert read_text(path, "poem", 3) == "äb"
+    (tmp_path / "marked.txt").write_bytes(b"\xef\xbb\xbfa")  # as editors of Windows begin files
+    assert read_text(tmp_path / "marked.txt", "poem", 4) == "a"
     with pytest.raises(UserError) as error:
         read_text(path, "poem", 2)
     assert str(error.value) == f"{path}: cannot read the poem: more than 2 bytes"

@@ -16,7 +16,7 @@ from support.colmap_models import (
     write_dataset,
     write_pictures,
 )
-from support.datasets import load, refusal
+from support.datasets import load, load_noting, refusal
 
 from drgs.cameras.camera import Camera, Pinhole
 from drgs.config.schema import FitConfig, InitConfig
@@ -25,6 +25,7 @@ from drgs.data.colmap import LENSES
 from drgs.data.derived import completed
 from drgs.data.images import is_scaled
 from drgs.data.initial import _read_cloud, start_of
+from drgs.data.mask_names import masks_of
 from drgs.io.colmap_records import MODELS
 
 REAL = SHARED_DATA / "colmap_robothead"
@@ -61,6 +62,14 @@ def test_other_models_beside_the_first_are_named(tmp_path):
         write_dataset(tmp_path, below=below)
     (tmp_path / "sparse" / "3").mkdir()
     assert "; model sparse/0 (others are there: 2, 10)" in load(tmp_path).description
+
+
+def test_folders_may_be_called_in_another_case(tmp_path):
+    write_dataset(tmp_path)
+    (tmp_path / "images").rename(tmp_path / "Images")
+    write_pictures(tmp_path / "IMAGES_2", size=(320, 240))
+    assert load(tmp_path).train[0].files["image"].parent == tmp_path / "Images"
+    assert load(tmp_path, downscale=2).train[0].width == 320
 
 
 def test_the_pictures_own_size_decides_the_intrinsics(tmp_path):
@@ -167,6 +176,53 @@ def test_masks_lie_beside_their_pictures(tmp_path):
     assert np.asarray(views["1"].mask).sum(axis=0).tolist() == [0] * 320 + [480] * 320
     assert views["2"].mask is None
     assert all(view.mask is None for view in load(tmp_path, ignore_masks=True).train)
+    (tmp_path / "masks" / "c.png").touch()
+    dataset, notes = load_noting(tmp_path)
+    assert "; masks of 2 of 4 photographs" in dataset.description
+    assert notes == [
+        f"{tmp_path}: all pixels count of 2 of 4 photographs, which have no mask (a.jpg, "
+        "cam/2.png)",
+        f"{tmp_path}: masks of no photograph that has a camera: masks/c.png (the mask of a.jpg is "
+        "a.jpg.png or a.png)",
+    ]
+    dataset, notes = load_noting(tmp_path, ignore_masks=True)
+    assert dataset.ignored == ("masks",) and notes == []
+
+
+@pytest.mark.parametrize(
+    "pattern",
+    [
+        *("masks/{0}.jpg.png", "masks/{0}.png", "masks/{0}.jpg", "MASKS/{1}.PNG", "mask/{0}.png"),
+        *("masks/{0}_mask.png", "masks/{0}.png.mask.png", "masks/{1}.Mask.PNG"),
+        *("masks/{0}-mask.webp", "images/{0}.mask.png", "images/{0}_mask.png"),
+    ],
+)
+def test_masks_are_called_as_programs_call_them(tmp_path, pattern):
+    write_dataset(tmp_path)
+    mask = np.zeros((480, 640), np.uint8)
+    mask[:, :320] = 255
+    for stem in ("a", "cam/1"):
+        folder, _, last = stem.rpartition("/")
+        file = tmp_path / pattern.format(stem, f"{folder}/{last.upper()}".strip("/"))
+        file.parent.mkdir(parents=True, exist_ok=True)
+        Image.fromarray(mask).save(file)
+    dataset, notes = load_noting(tmp_path)
+    views = {view.name: view for view in (*dataset.train, *dataset.test)}
+    for name in ("a", "1"):
+        assert np.asarray(views[name].mask).sum(axis=0).tolist() == [480] * 320 + [0] * 320
+    assert views["b"].mask is None
+    assert len(notes) == 1 and "2 of 4 photographs, which have no mask (b.jpg" in notes[0]
+
+
+def test_the_mask_of_the_whole_name_is_preferred(tmp_path):
+    names = ["a.jpg", "b.jpg", "b_mask.jpg"]
+    for file in ("a.png", "a.jpg.png", "b.png", "b_mask.png"):
+        (tmp_path / "masks").mkdir(exist_ok=True)
+        (tmp_path / "masks" / file).touch()
+    notes = []
+    expected = [tmp_path / "masks" / name for name in ("a.jpg.png", "b.png", "b_mask.png")]
+    assert masks_of(tmp_path, names, notes) == expected
+    assert len(notes) == 1 and "masks of no photograph that has a camera: masks/a.png" in notes[0]
 
 
 def test_masks_may_be_for_larger_pictures(tmp_path):
@@ -249,16 +305,115 @@ def test_photographs_may_lie_beside_the_model(tmp_path):
     assert len(load(tmp_path).train) == 3
 
 
+@pytest.mark.parametrize(
+    ("place", "model", "pictures"),
+    [
+        ("flat", ".", "images"),
+        ("flat, beside", ".", "."),
+        ("workspace", "dense/0/sparse", "dense/0/images"),
+        ("undistorted", "dense/sparse", "dense/images"),
+    ],
+)
+@pytest.mark.parametrize("write", WRITERS.values(), ids=WRITERS)
+def test_models_and_photographs_are_found_where_programs_put_them(
+    tmp_path, place, model, pictures, write
+):
+    there = some(NAMES)
+    write(tmp_path / model, there)
+    write_pictures(tmp_path / pictures)
+    if place in ("workspace", "undistorted"):  # beside the model of the photographs as taken
+        write(tmp_path / "sparse" / "0", some_model(np.random.default_rng(2), NAMES))
+    dataset, notes = load_noting(tmp_path)
+    view = dataset.test[0]
+    np.testing.assert_allclose(view.camera_to_world, there.images[0][2], atol=1e-14)
+    assert view.files["image"] == tmp_path / pictures / "a.jpg" and notes == []
+
+
+def test_a_model_with_its_photographs_is_preferred_to_an_undistorted_one(tmp_path):
+    write_dataset(tmp_path)
+    write_binary(tmp_path / "dense" / "sparse", some_model(np.random.default_rng(2), NAMES))
+    write_pictures(tmp_path / "dense" / "images")
+    assert load(tmp_path).train[0].files["image"].parent == tmp_path / "images"
+
+
+def some(names):
+    return some_model(np.random.default_rng(1), names, ["PINHOLE"])
+
+
+@pytest.mark.parametrize(
+    ("call", "is_said"),
+    [
+        (str, False),
+        (str.upper, True),
+        (lambda name: name.replace(".jpg", ".png").replace("1.png", "1.tif"), True),
+        (lambda name: f"images/{name}", True),
+        (lambda name: name.replace("/", "\\"), True),
+        (lambda name: f"C:\\scans\\garden\\{name}".replace("/", "\\"), True),
+    ],
+    ids=["right", "case", "suffix", "images", "backslashes", "of another machine"],
+)
+def test_a_photograph_is_found_under_nearly_its_name(tmp_path, call, is_said):
+    model = some(NAMES)
+    model.images = [(call(name), camera, pose) for name, camera, pose in model.images]
+    write_binary(tmp_path / "sparse" / "0", model)
+    write_pictures(tmp_path / "images")
+    dataset, notes = load_noting(tmp_path, test_every=2)
+    views = [view for pair in zip(dataset.test, dataset.train, strict=True) for view in pair]
+    assert [view.files["image"] for view in views] == [tmp_path / "images" / n for n in NAMES]
+    for view, (_, _, pose) in zip(views, model.images, strict=True):
+        np.testing.assert_allclose(view.camera_to_world, pose, atol=1e-14)
+    assert [": taken under nearly the same name: " in note for note in notes] == [True] * is_said
+
+
+def test_a_file_is_not_taken_for_two_photographs(tmp_path):
+    """Nor one that another is called by, nor one of several: none of these is the only one."""
+    write_binary(tmp_path / "sparse" / "0", some(["a.jpg", "A.tif", "b.jpg", "c.jpg", "d.bmp"]))
+    write_pictures(tmp_path / "images", ["a.jpg", "b.png", "b.webp", "c.jpg", "d.bmp"])
+    dataset, notes = load_noting(tmp_path)
+    assert [view.name for view in (*dataset.test, *dataset.train)] == ["a", "c", "d"]
+    assert len(notes) == 1 and "2 of 5 photographs (A.tif, b.jpg); left out" in notes[0]
+
+
+@pytest.mark.parametrize("below", ["sparse/0", "."])
+def test_test_views_are_those_of_a_list(tmp_path, below):
+    """As the 3DGS reference reads it."""
+    write_dataset(tmp_path)
+    (tmp_path / below / "test.txt").write_text("\ufeff# held out\r\nb.jpg\r\ncam/2.png\r\n")
+    dataset, notes = load_noting(tmp_path)
+    assert [view.name for view in dataset.test] == ["b", "2"]
+    assert [view.name for view in dataset.train] == ["a", "1"]
+    assert "measured on 2 views (split test, by test.txt)" in dataset.description and not notes
+    (tmp_path / below / "test.txt").write_text("b\nz.jpg\n")
+    dataset, notes = load_noting(tmp_path)
+    assert [view.name for view in dataset.test] == ["b"]
+    assert len(notes) == 1 and notes[0].endswith("test.txt has names that no frame has: z.jpg")
+
+
+def test_folders_may_be_the_splits(tmp_path):
+    names = ("train/a.jpg", "test/a.jpg", "test/b.jpg", "train/c.jpg")
+    write_binary(tmp_path / "sparse" / "0", some(names))
+    write_pictures(tmp_path / "images", names)
+    dataset = load(tmp_path)
+    assert [view.name for view in dataset.test] == ["test_a", "test_b"]
+    assert [view.name for view in dataset.train] == ["train_a", "train_c"]
+
+
 # ----------------------------------------------------------------------------------------------
 # What is refused
 # ----------------------------------------------------------------------------------------------
 
 
-def test_a_picture_that_is_not_there_is_refused(tmp_path):
+def test_a_picture_that_is_not_there_is_left_out_unless_most_are(tmp_path):
     write_dataset(tmp_path)
     (tmp_path / "images" / "b.jpg").unlink()
+    dataset, notes = load_noting(tmp_path)
+    assert [view.name for view in (*dataset.test, *dataset.train)] == ["a", "1", "2"]
+    assert notes == [f"{tmp_path}/sparse/0: not there: 1 of 4 photographs (b.jpg); left out"]
+    for name in NAMES[2:]:
+        (tmp_path / "images" / name).unlink()
     message = refusal(tmp_path)
     assert "image b.jpg: there is no picture" in message and "images/b.jpg" in message
+    assert message.endswith("; not there: 3 of 4 photographs")
 
 
 def test_a_picture_of_another_shape_is_refused(tmp_path):

@@ -5,7 +5,7 @@ import math
 import imageio.v3 as iio
 import numpy as np
 import pytest
-from support.datasets import CENTERS, edit, load, refusal
+from support.datasets import CENTERS, edit, load, load_noting, refusal
 
 from drgs.cameras.fisheye import Fisheye
 from drgs.cameras.radial_tangential import RadialTangential
@@ -196,12 +196,18 @@ def test_a_picture_of_another_size_is_refused(blender):
     )
 
 
-def test_a_missing_image_is_named(blender):
+def test_a_missing_image_is_left_out_and_named(blender):
     folder = blender[0]
     (folder / "train" / "r_1.png").unlink()
+    path = folder / "transforms_train.json"
+    dataset, notes = load_noting(folder)
+    assert [view.name for view in dataset.train] == ["r_0", "r_2"]
+    assert notes == [f"{path}: not there: 1 of 3 photographs (./train/r_1); left out"]
+    (folder / "train" / "r_0.png").unlink()
     assert refusal(folder) == (
-        f"{folder / 'transforms_train.json'}: frames[1].file_path: there is no image "
-        f"{folder / 'train' / 'r_1'} (or with .png added)"
+        f"{path}: frames[0].file_path: there is no image {folder / 'train' / 'r_0'} (or with .png "
+        "added); put them there, or take their frames out of the file; not there: 2 of 3 "
+        "photographs"
     )
 
 
@@ -407,3 +413,152 @@ def test_equal_file_names_in_two_folders_stay_apart(photographs):
     )
     names = [view.name for view in load(photographs).train]
     assert {"images_01", "more_01"} <= set(names)
+
+
+# Keys and files that are passed over are said
+def test_keys_that_are_not_read_are_said_once(photographs):
+    path = photographs / "transforms.json"
+
+    def change(meta):
+        meta.update(skew=0.5, from_na=True, aabb_scale=4, applied_transform=[[1, 0, 0, 0]])
+        for frame in meta["frames"][:2]:
+            frame.update(sharpness=3.0, exposure=1.5)
+
+    edit(path, change)
+    _, notes = load_noting(photographs)
+    assert notes == [f"{path}: keys that are not read: from_na, skew, frames[].exposure"]
+
+
+def test_files_from_outside_of_the_folder_are_said_once(photographs, tmp_path_factory):
+    elsewhere = tmp_path_factory.mktemp("elsewhere")
+    (photographs / "images" / "03.png").rename(elsewhere / "03.png")
+    (photographs / "images" / "03.png").symlink_to(elsewhere / "03.png")
+    assert load_noting(photographs)[1] == [
+        f"{photographs}: files from outside of the folder: 1 ({elsewhere / '03.png'})"
+    ]
+    (photographs / "images").rename(elsewhere / "images")
+    (photographs / "images").symlink_to(elsewhere / "images")
+    (note,) = load_noting(photographs)[1]
+    assert "files from outside of the folder: 10 (" in note
+
+
+def test_equal_and_empty_photographs_are_said(photographs):
+    images = photographs / "images"
+    (images / "05.png").write_bytes((images / "03.png").read_bytes())
+    (images / "08.png").write_bytes((images / "02.png").read_bytes())  # 08 is measured on
+    iio.imwrite(images / "07.png", np.zeros((6, 8, 4), np.uint8))
+    dataset, notes = load_noting(photographs)
+    assert len(dataset.train) == 8
+    assert notes == [
+        f"{photographs}: photographs that are transparent everywhere: 1 (images/07.png)",
+        f"{photographs}: the same photograph more than once: 2 (images/02.png = images/08.png, "
+        "images/03.png = images/05.png); 1 of them both trained and measured on",
+    ]
+
+
+def test_a_photograph_that_is_listed_twice_is_said(photographs):
+    edit(photographs / "transforms.json", lambda m: m["frames"].append(m["frames"][4]))
+    assert load_noting(photographs)[1] == [
+        f"{photographs}: the same photograph more than once: 1 (images/05.png = images/05.png)"
+    ]
+
+
+def test_a_transforms_file_may_begin_with_a_mark_of_byte_order(photographs):
+    path = photographs / "transforms.json"
+    path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes())
+    assert len(load(photographs).train) == 8
+    path.write_bytes(path.read_text("utf-8-sig").encode("utf-16"))
+    assert refusal(photographs).startswith(f"{path}: cannot read the file: not UTF-8 text")
+
+
+@pytest.mark.parametrize(
+    "name", ["POINTS.PLY", "/home/someone/scan/points.ply", "images\\points.ply"]
+)
+def test_a_point_cloud_is_found_under_nearly_its_name(photographs, name):
+    cloud = photographs / ("images/points.ply" if "images" in name else "points.ply")
+    cloud.touch()
+    edit(photographs / "transforms.json", lambda m: m.update(ply_file_path=name))
+    dataset, (note,) = load_noting(photographs)
+    assert dataset.point_cloud == cloud
+    assert note.endswith(f"nearly the same name: 1 point cloud, such as {cloud} for {name}")
+
+
+def test_depths_and_masks_are_found_under_nearly_their_names(photographs):
+    """A depth of another format has another unit: it is not taken."""
+    with (photographs / "D.NPY").open("wb") as file:
+        np.save(file, np.full((6, 8), 2.0))
+    iio.imwrite(photographs / "mask.webp", np.full((6, 8, 3), 255, np.uint8), lossless=True)
+
+    def change(meta):
+        meta["frames"][2].update(depth_file_path="d.npy", mask_path="Mask.png")
+
+    edit(photographs / "transforms.json", change)
+    dataset, notes = load_noting(photographs)
+    view = next(view for view in dataset.train if view.name == "07")
+    np.testing.assert_array_equal(view.depth, np.full((6, 8), 2, np.float32))
+    assert np.asarray(view.mask).all() and len(notes) == 2
+    edit(photographs / "transforms.json", lambda m: m["frames"][2].update(depth_file_path="d.png"))
+    assert "d.png (or with .png added)" in refusal(photographs)
+
+
+@pytest.mark.parametrize(
+    ("call", "folder"),
+    [
+        (lambda name: name, "."),
+        (lambda name: f"../scan/images/{name}", "images"),
+        (lambda name: name[:-4], "images"),
+        (lambda name: f"/home/me/scan/images/{name}", "images"),
+        (lambda name: f"images\\{name}", "Images"),
+    ],
+)
+def test_photographs_are_found_where_they_lie_now(photographs, call, folder):
+    def change(meta):
+        for frame in meta["frames"]:
+            frame["file_path"] = call(frame["file_path"].removeprefix("images/"))
+
+    edit(photographs / "transforms.json", change)
+    if folder != "images":
+        (photographs / "images").rename(photographs / "elsewhere")
+        (photographs / folder).mkdir(exist_ok=True)
+        for file in (photographs / "elsewhere").iterdir():
+            file.rename(photographs / folder / file.name)
+    dataset, notes = load_noting(photographs)
+    for view in (*dataset.train, *dataset.test):
+        assert view.files["image"] == photographs / folder / f"{view.name}.png"
+        np.testing.assert_allclose(view.image, 20 * int(view.name) / 255, rtol=1e-6)
+    assert [": taken under nearly the same name: 10 photographs" in n for n in notes] == (
+        [True] if folder != "." else []
+    )
+
+
+def test_a_folder_that_was_renamed_is_named(photographs):
+    (photographs / "images").rename(photographs / "pictures")
+    assert f"; did you mean {photographs}/pictures/09.png?; put them there" in refusal(photographs)
+    (photographs / "pictures").rename(photographs / "images")
+    edit(photographs / "transforms.json", lambda m: m.update(frames=m["frames"][:2]))
+    (photographs / "images" / "09.png").unlink()
+    assert refusal(photographs).endswith("; not there: 1 of 2 photographs")
+
+
+def test_keys_of_other_layouts_are_said_not_to_be_read(blender):
+    path = blender[0] / "transforms_train.json"
+    edit(path, lambda m: m.update(cx=2.5, w=6, h=4, ply_file_path="a.ply", near=1))
+    edit(path, lambda m: m.update(train_filenames=["a"], frames=[{**m["frames"][0], "fl_x": 9.0}]))
+    dataset, notes = load_noting(blender[0])
+    keys = "near, fl_x, cx, w, h, ply_file_path, train_filenames"
+    assert notes[0] == f"{path}: keys that are not read: {keys}"
+    assert dataset.train[0].cx == 3
+
+
+def test_a_note_on_a_strange_name_is_one_line(photographs):
+    """Which load_noting checks."""
+    (photographs / "images" / "03.png").rename(photographs / "images" / "a\nb.png")
+    (photographs / "images" / "04.png").write_bytes(
+        (photographs / "images" / "a\nb.png").read_bytes()
+    )
+    edit(
+        photographs / "transforms.json",
+        lambda m: m["frames"][6].update(file_path="images/a\nb.png"),
+    )
+    (note,) = load_noting(photographs)[1]
+    assert note.endswith("1 (images/04.png = images/a b.png)")

@@ -7,7 +7,7 @@ import imageio.v3 as iio
 import numpy as np
 import pytest
 from PIL import Image
-from support.datasets import edit, load, look_at, refusal, view_at
+from support.datasets import edit, load, load_noting, look_at, refusal, view_at
 
 from drgs.cameras.radial_tangential import RadialTangential
 from drgs.config.schema import FitConfig
@@ -98,15 +98,71 @@ def test_a_picture_of_another_size_than_the_photograph_is_refused(photographs, k
     )
 
 
-@pytest.mark.parametrize("key", ["mask_path", "depth_file_path"])
-def test_a_missing_mask_or_depth_is_named(photographs, key):
+@pytest.mark.parametrize(
+    ("key", "ignore", "kind"),
+    [("mask_path", "masks", "masks"), ("depth_file_path", "depth", "files of depth")],
+)
+def test_a_missing_mask_or_depth_is_named(photographs, key, ignore, kind):
     give(photographs, **{key: "nowhere.png"})
     where = f"{photographs / 'transforms.json'}: frames[{index_of(photographs)}].{key}"
     assert refusal(photographs) == (
-        f"{where}: there is no image {photographs / 'nowhere.png'} (or with .png added)"
+        f"{where}: there is no image {photographs / 'nowhere.png'} (or with .png added); put them "
+        f"there, or set data.ignore_{ignore}; not there: 1 of 1 {kind}"
     )
     give(photographs, **{key: 3})
     assert refusal(photographs) == f"{where} must be text, got 3"
+
+
+def test_few_missing_masks_take_their_photographs_along_and_depths_do_not(photographs):
+    """What a mask hides is not to be fitted; what has no depth can be."""
+    iio.imwrite(photographs / "mask.png", GREY_MASK)
+    np.save(photographs / "depth.npy", np.ones((6, 8)))
+    for name in ("01", "02", "03", "04"):
+        give(photographs, f"{name}.png", mask_path="mask.png", depth_file_path="depth.npy")
+    give(photographs, "02.png", mask_path="gone.png")
+    give(photographs, "03.png", depth_file_path="gone.npy")
+    dataset, notes = load_noting(photographs)
+    assert [view.name for view in dataset.train] == ["01", "03", "04", "05", "06", "07", "08"]
+    assert view_named(dataset, "03").mask is not None and view_named(dataset, "03").depth is None
+    path = photographs / "transforms.json"
+    assert notes == [
+        f"{path}: not there: 1 of 4 masks (gone.png); their photographs are left out",
+        f"{path}: not there: 1 of 3 files of depth (gone.npy); their photographs have no depth",
+    ]
+
+
+def test_a_mask_may_be_an_alpha_channel_or_any_colour(photographs):
+    """What is transparent, or dark in all channels, does not count."""
+    counts = np.random.default_rng(0).integers(0, 2, (6, 8)).astype(bool)
+    white, zero = np.full((6, 8, 3), 255), 0 * counts
+    pictures = {}
+    pictures["01"] = Image.fromarray(np.dstack([white, 255 * counts]).astype(np.uint8))
+    pictures["02"] = pictures["01"].convert("LA")
+    pictures["03"] = Image.fromarray(counts.astype(np.uint8))
+    pictures["03"].putpalette([0, 0, 0, 0, 128, 0])  # labels, as annotation tools write them
+    pictures["04"] = Image.fromarray((40_000 * counts).astype(np.uint16))
+    pictures["05"] = Image.fromarray(np.dstack([zero, 255 * counts, zero]).astype(np.uint8))
+    photograph = np.random.default_rng(1).integers(0, 256, (6, 8, 3))  # cut out
+    pictures["06"] = Image.fromarray(np.dstack([photograph, 255 * counts]).astype(np.uint8))
+    for name, picture in pictures.items():
+        picture.save(photographs / f"mask{name}.png")
+        give(photographs, f"{name}.png", mask_path=f"mask{name}.png")
+    dataset = load(photographs)
+    for name in pictures:
+        np.testing.assert_array_equal(view_named(dataset, name).mask, counts, err_msg=name)
+    assert dataset.description.endswith("; masks of 6 of 10 photographs")
+
+
+def test_a_folder_of_masks_that_nothing_names_is_said_not_to_count(photographs):
+    (photographs / "masks").mkdir()
+    iio.imwrite(photographs / "masks" / "01.png", GREY_MASK)
+    dataset, (note,) = load_noting(photographs)
+    assert view_named(dataset).mask is None
+    assert note == (
+        f"{photographs}: masks are not used, as no mask_path names them: masks/01.png; all pixels "
+        "of the photographs count"
+    )
+    assert load_noting(photographs, ignore_masks=True)[1] == []
 
 
 @pytest.mark.parametrize("name", ["01.png", "08.png"], ids=["train", "test"])
@@ -383,7 +439,9 @@ def test_frames_of_the_synthetic_layout_may_have_the_same(blender):
         edit(folder / f"transforms_{split}.json", lambda m: m["frames"][1].update(values))
     dataset = load(folder, ignore_distortion=True)
     assert dataset.ignored == ("distortion",)
-    assert dataset.description.endswith("; lens opencv (k1) ignored; depth in units of 1")
+    assert dataset.description.endswith(
+        "; lens opencv (k1) ignored; masks of 2 of 6 photographs; depth in units of 1"
+    )
     assert load(folder).train[1].lens == RadialTangential.of(k1=0.1)
     for views in (dataset.train, dataset.test):
         np.testing.assert_array_equal(views[1].mask, mask)

@@ -273,6 +273,17 @@ def test_cameras_that_determine_no_box_are_refused(views, reason):
     )
 
 
+def test_one_camera_determines_no_box():
+    """It is parallel to nothing."""
+    with pytest.raises(UserError) as error:
+        initial_gaussians(config(), dataset_of([view_at((4, 0, 0), (0, 0, 0))]))
+    assert str(error.value) == (
+        "init.half_extent: no start box can be derived from one training camera, which does not "
+        "tell how far away it looks; train on more views, or set init.half_extent, or give a point "
+        "cloud (init.point_cloud)"
+    )
+
+
 def test_starting_gaussians_can_be_written(blender, tmp_path):
     g = initial_gaussians(config(init={"num_points": 5}), load(blender[0]))
     g.save(tmp_path / "start.ply")

@@ -114,16 +114,22 @@ def test_photographs_without_a_mask_are_looked_at_as_well(tmp_path):
 
 
 def test_masks_are_found_by_either_name(tmp_path):
+    """COLMAP gets black and white, whatever their files are."""
     (tmp_path / "masks").mkdir()
-    for name, level in (("a.jpg.png", 10), ("a.png", 20), ("b.png", 30)):
+    alpha = Image.new("LA", (8, 8), (255, 255))
+    alpha.putpixel((3, 2), (255, 0))
+    alpha.save(tmp_path / "masks" / "b_mask.png")
+    for name, level in (("a.jpg.png", 200), ("a.png", 20)):
         Image.new("L", (8, 8), level).save(tmp_path / "masks" / name)
     for name in ("a.jpg", "b.jpg", "c.jpg"):
         Image.new("RGB", (8, 8)).save(tmp_path / name)
     some = work(tmp_path, ["a.jpg", "b.jpg", "c.jpg"])
     some.folder = tmp_path / "work"
     masks = some._masks_for_all()
-    levels = [Image.open(masks / f"{name}.png").getpixel((0, 0)) for name in some.names]
-    assert levels == [10, 30, 255]
+    written = [np.asarray(Image.open(masks / f"{name}.png")) for name in some.names]
+    expected = np.full((3, 8, 8), 255)
+    expected[1, 2, 3] = 0
+    np.testing.assert_array_equal(written, expected)
 
 
 def test_photographs_of_two_sizes_share_no_camera(tmp_path):

@@ -13,7 +13,7 @@ from support.small_capture import (
     view,
 )
 
-from drgs.core.errors import UserError
+from drgs.core.errors import UserError, UserNote
 from drgs.data.orbits import Orbit, orbit_of_gaussians, orbit_of_views, orbit_size, up_of
 from drgs.data.viewpoints import look_at, read_viewpoints
 
@@ -225,3 +225,10 @@ def test_wrong_motion_of_a_camera_is_refused_with_the_key(tmp_path):
     assert str(error.value) == (
         f"{path}: frames[1].shutter must be one of 'global' or 'rolling', got \"curtain\""
     )
+
+
+def test_keys_of_a_file_of_cameras_that_are_not_read_are_said(tmp_path):
+    frame = {"transform_matrix": np.eye(4).tolist(), "camera_angle_x": 0.7, "dof": 0.1}
+    (tmp_path / "a.json").write_text(json.dumps({"frames": [frame], "up": [0, 0, 1], "lens": 3}))
+    with pytest.warns(UserNote, match=r"a.json: keys that are not read: lens, frames\[\].dof$"):
+        read_viewpoints(tmp_path / "a.json", (4, 3))

@@ -46,7 +46,8 @@ def test_files_give_back_what_was_saved(tmp_path):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"means": np.zeros((COUNT, 2))}, r"means must be of shape \(7, 3\), got \(7, 2\)"),
+        ({"means": np.zeros((COUNT, 2))}, r"means must be of shape \(N, 3\), got \(7, 2\)"),
+        ({"means": np.zeros((3, COUNT))}, r"means must be of shape \(N, 3\), got \(3, 7\)"),
         ({"opacities": np.zeros((COUNT, 1))}, r"opacities must be of shape \(7,\)"),
         (
             {"sh": np.zeros((COUNT, 5, 3))},

@@ -177,7 +177,7 @@ def test_a_wrong_number_in_a_binary_file_is_refused(tmp_path, model, file, at, d
         ("cameras", "600.0", "nan", "line 3: a parameter must be a number, got nan"),
         ("images", " a.jpg", "", "line 2: an image (IMAGE_ID, QW, QX, QY"),
         ("images", "b c.jpg", "a.jpg", "line 4: each image must have a name of its own"),
-        ("images", "\n\n", "\n", "line 3: what an image observes (X, Y, POINT3D_ID"),
+        ("images", "\n\n", "\n1 2\n", "line 3: what an image observes (X, Y, POINT3D_ID"),
         ("images", " a.jpg", " ../a.jpg", "line 2: a name must be that of a file below"),
         ("images", " a.jpg", " /a.jpg", "line 2: a name must be that of a file below"),
         ("images", " 7 a.jpg", " 5 a.jpg", "line 2: the number of a camera was expected, got 5"),
@@ -191,6 +191,20 @@ def test_a_wrong_word_in_a_text_file_is_refused(tmp_path, model, file, old, new,
     assert old in text
     path.write_text(text.replace(old, new, 1))
     assert refusal(tmp_path).startswith(f"{path}: {message}")
+
+
+@pytest.mark.parametrize("ending", ["\n", "\r\n"])
+@pytest.mark.parametrize("name", ["a.jpg", "my photo 1.jpg"])  # the latter line has 12 words
+def test_images_of_one_line_each_are_read(tmp_path, model, ending, name):
+    """Exporters leave out the lines of what images observe."""
+    model.images = [(name, *model.images[0][1:]), *model.images[1:]]
+    file = write_text(tmp_path, model) / "images.txt"
+    expected = read_model(tmp_path).images
+    lines = file.read_text().splitlines()
+    assert len(lines) == 7 and expected[0].name == name
+    file.write_bytes(("\ufeff" + ending.join(lines[:1] + lines[1::2]) + ending).encode())
+    read = read_model(tmp_path).images
+    assert [vars(image) for image in read] == [vars(image) for image in expected]
 
 
 def test_colors_are_bytes(tmp_path, model):

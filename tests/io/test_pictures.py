@@ -1,12 +1,15 @@
 import io
+import struct
+import zlib
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from PIL import Image
+from PIL import Image, ImageCms
 from support.openexr import read_exr
 
+from drgs.core.errors import UserError
 from drgs.io import pictures
 
 
@@ -121,3 +124,82 @@ def test_an_exr_is_written_with_one_thread(tmp_path):
     finally:
         dr.set_thread_count(threads)
     np.testing.assert_array_equal(np.array(read_exr(tmp_path / "new" / "a.exr")), pixels)
+
+
+# What is read, and what is said not to be
+
+
+def write_tiff16(path, pixels):
+    """Little-endian, one strip of RGB of 16 bits, as scanners and raw converters write it."""
+    height, width, channels = pixels.shape
+    data = pixels.astype("<u2").tobytes()
+    bits = 8 + 2 + 9 * 12 + 4
+    entries = [(256, 4, 1, width), (257, 4, 1, height), (258, 3, channels, bits), (259, 3, 1, 1)]
+    entries += [(262, 3, 1, 2), (273, 4, 1, bits + 6), (277, 3, 1, channels), (278, 4, 1, height)]
+    entries += [(279, 4, 1, len(data))]
+    content = b"II*\0" + struct.pack("<IH", 8, len(entries))
+    content += b"".join(struct.pack("<HHII", *entry) for entry in entries) + bytes(4)
+    path.write_bytes(content + struct.pack("<3H", 16, 16, 16) + data)
+
+
+def test_colours_of_16_bits_keep_the_upper_8_and_that_is_said(tmp_path):
+    pixels = np.random.default_rng(0).integers(0, 2**16, (4, 5, 3), np.uint16)
+    mi.Bitmap(pixels).write(str(tmp_path / "a.png"))
+    write_tiff16(tmp_path / "a.tif", pixels)
+    (tmp_path / "a.ppm").write_bytes(b"P6 5 4 65535\n" + pixels.astype(">u2").tobytes())
+    for name in ("a.png", "a.tif", "a.ppm"):
+        read = pictures.read_pixels(tmp_path / name)
+        assert np.abs(read.astype(int) - pixels / 257).max() <= 1 and read.dtype == np.uint8
+        (what,) = pictures.unused_content(tmp_path / name)
+        assert what == "of 16 bits a channel, of which 8 are used"
+    Image.fromarray(pixels[:, :, 0]).save(tmp_path / "grey.png")
+    np.testing.assert_array_equal(
+        pictures.read_pixels(tmp_path / "grey.png")[..., 1], pixels[..., 0]
+    )
+    assert pictures.unused_content(tmp_path / "grey.png") == []
+
+
+def test_a_colour_that_a_png_names_is_transparent(tmp_path):
+    pixels = np.zeros((2, 3, 3), np.uint8)
+    pixels[0, 1] = 9, 8, 7
+    for array, key in ((pixels, (9, 8, 7)), (pixels[:, :, 0], 9)):
+        Image.fromarray(array).save(tmp_path / "a.png", transparency=key)
+        assert pictures.has_alpha(tmp_path / "a.png")
+        assert pictures.stored_shape(tmp_path / "a.png") == (3, 2, 4, 1)
+        alpha = pictures.read_pixels(tmp_path / "a.png")[:, :, 3]
+        np.testing.assert_array_equal(alpha == 0, pixels[:, :, 0] == 9)
+
+
+def test_profiles_gammas_and_further_pictures_are_said(tmp_path):
+    grey = Image.new("RGB", (3, 2), (90, 90, 90))
+    lab, srgb = (
+        ImageCms.ImageCmsProfile(ImageCms.createProfile(name)).tobytes() for name in ("LAB", "sRGB")
+    )
+    for options, said in (
+        ({"icc_profile": srgb}, []),
+        (
+            {"icc_profile": lab},
+            ["with the colour profile Lab identity built-in, which is not applied"],
+        ),
+        ({"icc_profile": b"broken"}, []),
+    ):
+        for name in ("a.jpg", "a.png", "a.tif"):
+            grey.save(tmp_path / name, **options)
+            assert pictures.unused_content(tmp_path / name) == said
+    grey.save(tmp_path / "a.png")
+    content = (tmp_path / "a.png").read_bytes()
+    chunk = b"gAMA" + struct.pack(">I", 100_000)
+    chunk = struct.pack(">I", 4) + chunk + struct.pack(">I", zlib.crc32(chunk))
+    (tmp_path / "a.png").write_bytes(content[:33] + chunk + content[33:])
+    assert pictures.unused_content(tmp_path / "a.png") == ["of gamma 1, which is taken for sRGB"]
+    for name in ("a.tif", "a.gif", "a.webp", "b.png"):
+        grey.save(tmp_path / name, save_all=True, append_images=[Image.new("RGB", (3, 2))])
+        several = "with several pictures each, of which the first is used"
+        assert pictures.unused_content(tmp_path / name) == [several]
+
+
+@pytest.mark.parametrize("value", [-1, 70_000])
+def test_whole_numbers_of_more_than_16_bits_are_refused(tmp_path, value):
+    Image.fromarray(np.full((2, 3), value, np.int32)).save(tmp_path / "a.tif")
+    with pytest.raises(UserError, match=f"must have values of 16 bits, 0 to 65535, got {value} to"):
+        pictures.read_pixels(tmp_path / "a.tif")

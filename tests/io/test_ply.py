@@ -184,8 +184,11 @@ def test_points_without_colours_are_read(tmp_path):
 
 @pytest.mark.parametrize(
     "values",
-    [np.array([255, 51], "u1"), np.array([65535, 13107], "u2"), np.array([1, 0.2], "f4")],
-    ids=["uint8", "uint16", "float32"],
+    [
+        *(np.array([255, 51], kind) for kind in ("u1", "i2", "i4", "u4")),
+        *(np.array([65535, 13107], "u2"), np.array([1, 0.2], "f4")),
+    ],
+    ids=["uint8", "int16", "int32", "uint32", "uint16", "float32"],
 )
 def test_point_colours_are_scaled_to_0_1(tmp_path, values):
     write_elements(tmp_path / "a.ply", vertex=points(**channels(values)))
@@ -199,7 +202,7 @@ def test_point_colours_out_of_range_are_refused(tmp_path):
     write_elements(tmp_path / "a.ply", vertex=points(**channels(np.array([0, 255], "f4"))))
     with pytest.raises(
         UserError,
-        match=r"row 1: red, green, blue must be integers or floats in 0..1, got red = 255.0",
+        match=r"row 1: red, green, blue must be integers in 0..255 or floats in 0..1, got red = 25",
     ):
         read_points(tmp_path / "a.ply")
 

@@ -1,12 +1,13 @@
 """Folders of small datasets in both layouts."""
 
 import json
+import warnings
 
 import numpy as np
 import pytest
 
 from drgs.config.schema import DataConfig
-from drgs.core.errors import UserError
+from drgs.core.errors import UserError, UserNote
 from drgs.data import load_dataset
 from drgs.data.types import Dataset, View
 
@@ -45,6 +46,17 @@ def edit(path, change):
 
 def load(folder, **options):
     return load_dataset(DataConfig(path=folder, **options))
+
+
+def load_noting(folder, **options):
+    """The dataset, and the notes that loading it gave."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        dataset = load(folder, **options)
+    assert all(issubclass(warning.category, UserNote) for warning in caught)
+    notes = [str(warning.message) for warning in caught]
+    assert not any("\n" in note for note in notes) and len(set(notes)) == len(notes)
+    return dataset, notes
 
 
 def refusal(folder, **options):

@@ -140,7 +140,23 @@ MAY_BE_MISSING = [
 ]
 """A fit without a checkpoint begins anew."""
 
-MAY_BE_READ = [*MAY_BE_MISSING, ("gaussians.splat", "its first half")]
+NO_FILES = (
+    *("nothing", "a folder", "a pipe", "a terminal", "a link to nowhere", "a link to itself"),
+    *("an endless device", "an empty device"),
+)
+"""In whose place there is no file of any kind."""
+
+LEFT_OUT = [
+    (file, name)
+    for file in (
+        *("photos/2.png", "photos/depth.npy", "photos/depth.png"),
+        *("lego/train/r_1.png", "lego/test/r_0.png"),
+    )
+    for name in NO_FILES
+]
+"""One of several files that are named: the others are fitted."""
+
+MAY_BE_READ = [*MAY_BE_MISSING, *LEFT_OUT, ("gaussians.splat", "its first half")]
 """The latter has whole rows, and no header that says how many there were."""
 
 

@@ -1,0 +1,110 @@
+"""Splits that transforms.json lists, as nerfstudio has them."""
+
+import pytest
+from support.datasets import edit, load_noting, refusal
+
+IMAGES = [f"images/{i:02d}.png" for i in range(10)]
+LISTS = {
+    "train_filenames": IMAGES[:6],
+    "val_filenames": IMAGES[6:8],
+    "test_filenames": IMAGES[8:],
+}
+
+
+def give(folder, **lists):
+    edit(folder / "transforms.json", lambda m: m.update(lists))
+
+
+def names(views):
+    return [int(view.name) for view in views]
+
+
+@pytest.mark.parametrize(
+    ("keys", "test_split", "train", "test"),
+    [
+        (("train", "val", "test"), None, range(6), [8, 9]),
+        (("train", "val", "test"), "val", range(6), [6, 7]),
+        (("train", "val", "test"), "train", range(6), range(6)),
+        (("train", "val"), None, range(6), [6, 7]),
+        (("test",), None, range(8), [8, 9]),
+        (("val", "test"), None, range(6), [8, 9]),
+        (("train",), None, range(6), range(6, 10)),
+    ],
+)
+def test_the_lists_are_the_splits(photographs, keys, test_split, train, test):
+    give(photographs, **{f"{key}_filenames": LISTS[f"{key}_filenames"] for key in keys})
+    dataset, notes = load_noting(photographs, test_split=test_split)
+    assert names(dataset.train) == list(train) and names(dataset.test) == list(test)
+    assert dataset.test_split == (test_split or ("val" if keys == ("train", "val") else "test"))
+    unlisted = keys == ("train", "val")
+    assert [": left out, as " in note for note in notes] == [True] * unlisted
+    if unlisted:
+        assert "2 of 10 photographs (images/08.png, images/09.png)" in notes[0]
+
+
+def test_names_are_compared_as_paths_and_by_what_programs_change(photographs):
+    give(photographs, train_filenames=["./images/00.png", "images\\01.png", "02", "IMAGES/03.PNG"])
+    assert names(load_noting(photographs)[0].train) == [0, 1, 2, 3]
+
+
+def test_names_of_no_frame_are_said_or_if_most_are_refused(photographs):
+    give(photographs, test_filenames=["images/02.png", "images/xx.png"])
+    dataset, notes = load_noting(photographs)
+    path = photographs / "transforms.json"
+    assert names(dataset.test) == [2]
+    assert notes == [f"{path}: test_filenames has names that no frame has: images/xx.png"]
+    give(photographs, test_filenames=["images/2.jpg", "images/xx.png"])
+    assert refusal(photographs).startswith(
+        f"{path}: test_filenames must list the photographs of frames, but 2 of its 2 names are not "
+        "theirs: images/2.jpg, images/xx.png; did you mean images/"
+    )
+
+
+def test_a_photograph_that_is_gone_is_no_unknown_name(photographs):
+    give(photographs, **LISTS)
+    (photographs / IMAGES[8]).unlink()
+    dataset, notes = load_noting(photographs)
+    assert names(dataset.test) == [9]
+    assert len(notes) == 1 and "not there: 1 of 10 photographs (images/08.png)" in notes[0]
+
+
+def test_a_photograph_in_both_splits_is_refused(photographs):
+    give(photographs, train_filenames=IMAGES, test_filenames=IMAGES[3:5])
+    assert refusal(photographs) == (
+        f"{photographs / 'transforms.json'}: a photograph must be either to train or to measure "
+        "on, but train_filenames and test_filenames have 2 in both train and test: "
+        "images/03.png, images/04.png; take them out of one"
+    )
+
+
+def test_splits_that_are_not_there_or_empty_are_refused(photographs):
+    give(photographs, test_filenames=IMAGES[:2])
+    assert "there is no split val, only test; set data.test_split" in (
+        refusal(photographs, test_split="val")
+    )
+    give(photographs, test_filenames=IMAGES)
+    assert "at least 1 view of the split train is needed, and test_filenames" in (
+        refusal(photographs)
+    )
+    give(photographs, test_filenames=["a", 3])
+    assert refusal(photographs).endswith("test_filenames[1] must be text, got 3")
+
+
+def test_empty_lists_are_none(photographs):
+    give(photographs, train_filenames=[], val_filenames=[], test_filenames=[])
+    assert names(load_noting(photographs)[0].test) == [0, 8]
+
+
+def test_a_list_in_a_file_counts_as_well(photographs):
+    (photographs / "train.txt").write_text("loss 0.5\nloss 0.4\n")  # a log of some program
+    (photographs / "test.txt").write_text("images/03.png\n05\n")
+    dataset, notes = load_noting(photographs)
+    assert names(dataset.test) == [3, 5] and len(dataset.train) == 8
+    assert notes == [f"{photographs}/train.txt: lists no photograph, and is not read"]
+
+
+def test_files_that_may_be_lists_are_said_not_to_be_read(photographs):
+    (photographs / "train_test_split_3.json").write_text("{}")
+    dataset, (note,) = load_noting(photographs)
+    assert names(dataset.test) == [0, 8]
+    assert note.startswith(f"{photographs}/train_test_split_3.json: is not read; ")
