@@ -74,7 +74,7 @@ def check_views(ranks: Ranks, dataset: Dataset, own: Collection[str], path: Path
 def check_pictures(ranks: Ranks, scene: mi.Scene, views: Sequence[Viewpoint], path: Path) -> None:
     """Raise ``UserError`` unless the scene and its views are those of the first process.
 
-    path: the model's, for the message. Called by all processes.
+    path: the model's, for the message. Called by all processes; returns when all have agreed.
     """
     own = {**versions(), **_digests(scene), "cameras": _digest_of_cameras(views)}
     first = json.loads(ranks.text_of(0, json.dumps(own)))
@@ -84,13 +84,14 @@ def check_pictures(ranks: Ranks, scene: mi.Scene, views: Sequence[Viewpoint], pa
             f"{path}: not the same on {platform.node()} as for process 0: {listed(other)}; all "
             "processes must see the same files and options"
         )
+    ranks.told(np.array(True))
 
 
 def _digests(scene: mi.Scene) -> dict[str, str]:
     """Digests of the parameters of the integrator, and of its settings, by name."""
     integrator = scene.integrator()
     parameters = {**mi.traverse(integrator), "smoothing": integrator.smoothing}
-    found = {name: _digest(np.array(v)) for name, v in parameters.items() if v is not None}
+    found = {name: _digest(np.asarray(v)) for name, v in parameters.items() if v is not None}
     return {**found, "settings": str(integrator)}
 
 
