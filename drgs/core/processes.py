@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import os
 import signal
+import stat
 import sys
 import time
 import traceback
@@ -30,7 +31,7 @@ LAUNCHERS = (
 )
 """Variables that hold the number of a process, from 0, and the number of processes."""
 
-MPICH_PIPE = "PMI_FD"
+MPICH_SOCKET = "PMI_FD"
 """Variable that holds the file descriptor to MPICH's launcher, which reads lines of PMI-1 from it.
 MPICH's launcher goes on when a process fails before MPI has started; others end the job."""
 
@@ -123,10 +124,12 @@ def end_job(status: int) -> NoReturn:
             stream.flush()
     time.sleep(OUTPUT_S)
     with suppress(KeyError, OSError, ValueError):  # it is another launcher
-        os.write(int(os.environ[MPICH_PIPE]), f"cmd=abort exitcode={status}\n".encode())
-        time.sleep(ABORT_S)
+        launcher = int(os.environ[MPICH_SOCKET])
+        if stat.S_ISSOCK(os.fstat(launcher).st_mode):  # not a file, in a child that inherits less
+            os.write(launcher, f"cmd=abort exitcode={status}\n".encode())
+            time.sleep(ABORT_S)
     mpi = sys.modules.get("mpi4py.MPI")
-    if mpi is not None and mpi.Is_initialized() and not mpi.Is_finalized():
+    if mpi is not None and not mpi.Is_finalized() and mpi.COMM_WORLD.Get_size() > 1:
         mpi.COMM_WORLD.Abort(status)
     os._exit(status)
 
@@ -150,7 +153,7 @@ def start_mpi() -> None:
                 f"mpiexec: mpi4py finds no MPI: {one_line(error)}; pip install 'drgs[mpi]'"
             ) from None
     started, known = process_count(), mpi.COMM_WORLD.Get_size()
-    if started not in (None, known):
+    if started is not None and started > known:
         raise UserError(
             f"mpiexec: has started {started} processes, but MPI knows of {known}; use the mpiexec "
             f"of the MPI that mpi4py was built for: {one_line(mpi.Get_library_version(), 80)}"
@@ -161,7 +164,7 @@ def start_mpi() -> None:
 def _others_watched() -> Iterator[None]:
     """End the job where another process of this machine ends before MPI has started.
 
-    MPICH alone needs this: see :data:`MPICH_PIPE`. Starting MPI holds Python's lock, so that a
+    MPICH alone needs this: see :data:`MPICH_SOCKET`. Starting MPI holds Python's lock, so that a
     process has to do it, not a thread.
     """
     launcher = _launcher_of_mpich()
@@ -184,7 +187,7 @@ def _others_watched() -> Iterator[None]:
 
 def _launcher_of_mpich() -> Path | None:
     """The file that lists the processes that it has started on this machine (Linux)."""
-    if not {MPICH_PIPE, MPICH_LOCAL_COUNT} <= os.environ.keys():
+    if not {MPICH_SOCKET, MPICH_LOCAL_COUNT} <= os.environ.keys():
         return None
     process = os.getppid()
     with suppress(OSError, IndexError, ValueError):  # another system, or out of sight

@@ -70,3 +70,13 @@ def test_without_the_extra_mpiexec_is_refused(run_python):
     result = run_python(code, PMI_RANK="0")
     assert result.returncode == 2
     assert "mpiexec: needs mpi4py" in result.stderr and "drgs[mpi]" in result.stderr
+
+
+def test_the_launcher_of_another_mpi_is_refused(run_python):
+    """Each of its processes would fit alone, into the same folder."""
+    pytest.importorskip("mpi4py", reason="the extra mpi is not installed")
+    code = "from drgs.fit import main; main(['scenes/lego_mini.yml'])"
+    launcher = {"OMPI_COMM_WORLD_RANK": "0", "OMPI_COMM_WORLD_SIZE": "2"}
+    result = run_python(code, **launcher)
+    assert result.returncode == 2
+    assert "has started 2 processes, but MPI knows of 1; use the mpiexec of" in result.stderr
