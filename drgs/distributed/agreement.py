@@ -71,27 +71,34 @@ def check_views(ranks: Ranks, dataset: Dataset, own: Collection[str], path: Path
         )
 
 
-def check_pictures(ranks: Ranks, scene: mi.Scene, views: Sequence[Viewpoint], path: Path) -> None:
+def check_pictures(
+    ranks: Ranks, scene: mi.Scene, views: Sequence[Viewpoint], files: Mapping[str, object]
+) -> None:
     """Raise ``UserError`` unless the scene and its views are those of the first process.
 
-    path: the model's, for the message. Called by all processes; returns when all have agreed.
+    files: for the message, the origin of ``cameras`` and ``background``, and of the ``model``.
+    Called by all processes; returns when all have agreed.
     """
     own = {**versions(), **_digests(scene), "cameras": _digest_of_cameras(views)}
     first = json.loads(ranks.text_of(0, json.dumps(own)))
     check_versions({name: first[name] for name in versions()})
     if other := [name for name in {**first, **own} if first.get(name) != own.get(name)]:
+        file = files.get(other[0].partition(".")[0]) or files["model"]
         raise UserError(
-            f"{path}: not the same on {platform.node()} as for process 0: {listed(other)}; all "
+            f"{file}: not the same on {platform.node()} as for process 0: {listed(other)}; all "
             "processes must see the same files and options"
         )
     ranks.told(np.array(True))
 
 
 def _digests(scene: mi.Scene) -> dict[str, str]:
-    """Digests of the parameters of the integrator, and of its settings, by name."""
+    """Digests of the parameters of the integrator, and its settings, by name."""
     integrator = scene.integrator()
     parameters = {**mi.traverse(integrator), "smoothing": integrator.smoothing}
-    found = {name: _digest(np.asarray(v)) for name, v in parameters.items() if v is not None}
+    found = {}
+    for name, value in parameters.items():
+        array = np.asarray(value)  # of what is no array, a reference
+        found[name] = str(value) if array.dtype == object else _digest(array)
     return {**found, "settings": str(integrator)}
 
 

@@ -8,9 +8,8 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
-from pathlib import Path
 from typing import NoReturn
 
 import mitsuba as mi
@@ -28,6 +27,9 @@ END = "end"
 Render = Callable[..., Iterator[np.ndarray]]
 """Of a scene and views, pictures (H, W, 3)."""
 
+Files = Mapping[str, object]
+"""Where models, cameras and backgrounds come from, for messages."""
+
 
 def run_together(args: argparse.Namespace, work: Callable[[Render], None]) -> None:
     """Run the command on all processes; work: the command, given what renders views."""
@@ -36,18 +38,20 @@ def run_together(args: argparse.Namespace, work: Callable[[Render], None]) -> No
         args.threads = ranks.own_cores
     if args.what.suffix.lower() == ".xml" and ranks.size > 1:
         raise UserError("mpiexec: a scene of Mitsuba is rendered by one process; leave mpiexec out")
+    background = " ".join(args.background or ())
+    files = {"cameras": args.camera, "background": background, "model": args.what}
     if ranks.is_first:
-        work(partial(_gathered, ranks, args.what))
+        work(partial(_gathered, ranks, files))
         ranks.text_of(0, END)
     else:
-        work(partial(_contributed, ranks, args.what))
+        work(partial(_contributed, ranks, files))
 
 
 def _gathered(
-    ranks: Ranks, path: Path, scene: mi.Scene, views: Sequence[Viewpoint]
+    ranks: Ranks, files: Files, scene: mi.Scene, views: Sequence[Viewpoint]
 ) -> Iterator[np.ndarray]:
     """All pictures in order, of which this process renders its own."""
-    check_pictures(ranks, scene, views, path)
+    check_pictures(ranks, scene, views, files)
     own = render_views(scene, views[:: ranks.size])
     for index, view in enumerate(views):
         source = index % ranks.size
@@ -59,9 +63,11 @@ def _gathered(
         yield picture
 
 
-def _contributed(ranks: Ranks, path: Path, scene: mi.Scene, views: Sequence[Viewpoint]) -> NoReturn:
+def _contributed(
+    ranks: Ranks, files: Files, scene: mi.Scene, views: Sequence[Viewpoint]
+) -> NoReturn:
     """Render what falls to this process, and end when the first process has."""
-    check_pictures(ranks, scene, views, path)
+    check_pictures(ranks, scene, views, files)
     for picture in render_views(scene, views[ranks.rank :: ranks.size]):
         wait(ranks.send(np.ascontiguousarray(picture, np.float32), 0, 0))
     ranks.text_of(0, "")

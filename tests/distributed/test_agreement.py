@@ -6,6 +6,7 @@ from functools import partial
 from types import SimpleNamespace
 
 import mitsuba as mi
+import numpy as np
 import pytest
 from support import together
 from support.datasets import edit, load
@@ -14,6 +15,7 @@ from support.small_capture import make_dataset, write_dataset
 from drgs.core.errors import UserError
 from drgs.data.fingerprint import fingerprint_of
 from drgs.gaussians.parameters import Gaussians
+from drgs.io.pictures import write_png
 
 SETTINGS = (
     "iterations=8",
@@ -104,18 +106,33 @@ def test_views_are_compared_with_those_of_the_first_process(
         check()
 
 
-def test_pictures_of_another_model_are_refused(tmp_path):
+def test_pictures_of_other_files_are_refused(tmp_path):
+    """Of a background that is another one; then of a model, with the same background."""
+    here, there, out = (tmp_path / name for name in ("first", "second", "out"))
     knot = Gaussians.load(together.REPOSITORY / "scenes" / "shapes" / "knot.ply")
-    for folder, shift in (("first", 0.0), ("second", 0.01)):
-        (tmp_path / folder).mkdir()
-        replace(knot, means=knot.means + shift).save(tmp_path / folder / "model.ply")
-    out = tmp_path / "out"
-    words = ["-m", "drgs.render", "model.ply", "--origin", 0, -3, 2, "--out", out]
-    here, there = tmp_path / "first", tmp_path / "second"
-    status, _, errors = together.run(2, words, cwd=here, on_second=f"cd {there}")
+    for folder, shade in ((here, 0), (there, 9)):
+        folder.mkdir()
+        knot.save(folder / "model.ply")
+        write_png(folder / "behind.png", np.full((4, 4, 3), shade / 255))
+    words = ["model.ply", "--origin", 0, -3, 2, "--background", "behind.png", "--out", out]
+
+    def rendered():
+        command = ["-m", "drgs.render", *words]
+        status, _, errors = together.run(2, command, cwd=here, on_second=f"cd {there}")
+        return status, errors
+
+    status, errors = rendered()
     assert (status, errors.count("error: ")) == (2, 1), errors
-    assert errors.startswith("process 1: error: model.ply: not the same on ") and "means" in errors
+    assert errors.startswith("process 1: error: behind.png: not the same on ")
+    shutil.copy(here / "behind.png", there)
+    replace(knot, means=knot.means + 0.01).save(there / "model.ply")
+    status, errors = rendered()
+    assert (status, errors.count("error: ")) == (2, 1), errors
+    assert errors.startswith("process 1: error: model.ply: not the same on ")
+    assert "process 0: means; all processes" in errors
     assert not out.exists()
+    shutil.copy(here / "model.ply", there)
+    assert rendered() == (0, "")
 
 
 def test_other_versions_are_refused(agreement):
