@@ -61,7 +61,7 @@ from drgs.core.locks import sole_writer
 from drgs.core.machine import processor
 from drgs.core.memory import release_unused_memory
 from drgs.core.private import llvm_version
-from drgs.core.processes import process_number
+from drgs.core.processes import process_number, start_mpi
 from drgs.data import Dataset, View, load_dataset
 from drgs.data.derived import completed
 from drgs.data.fingerprint import Fingerprint, fingerprint_of
@@ -190,7 +190,7 @@ def add_arguments(parser: CommandParser) -> None:
     )
     _add_looking_on(parser)
     add_execution_arguments(parser)
-    parser.set_defaults(run=run, prog=parser.prog)
+    parser.set_defaults(run=run, is_shared=True, prog=parser.prog)
 
 
 def _add_looking_on(parser: CommandParser) -> None:
@@ -254,7 +254,7 @@ def run(args: argparse.Namespace) -> None:
     if process_number() is None:
         run_with(args, Trainer)
         return
-    required("mpi4py", "mpi", "mpiexec")
+    start_mpi()
     from drgs.distributed.fitting import run_together
 
     run_together(args, partial(run_with, args))

@@ -44,9 +44,8 @@ from drgs.config.load import load_config
 from drgs.config.schema import NAMED_COLORS, FitConfig, ModelConfig
 from drgs.core.constants import SHUTTER_SAMPLES
 from drgs.core.errors import PluginError, UserError, one_line, reason_of_mitsuba
-from drgs.core.extras import required
 from drgs.core.files import atomic_path, open_regular, shortened
-from drgs.core.processes import process_number
+from drgs.core.processes import process_number, start_mpi
 from drgs.data import Dataset, load_dataset
 from drgs.data.derived import completed
 from drgs.data.orbits import near_plane_of, orbit_of_gaussians, orbit_of_views, orbit_size
@@ -179,7 +178,7 @@ def add_arguments(parser: CommandParser) -> None:
         help="a parameter of the scene file, as in model=point_cloud.ply; repeatable",
     )
     add_execution_arguments(parser, variants=None)
-    parser.set_defaults(run=run)
+    parser.set_defaults(run=run, is_shared=True)
 
 
 def _add_cameras(parser: CommandParser) -> None:
@@ -256,7 +255,7 @@ def run(args: argparse.Namespace) -> None:
     if process_number() is None:
         run_with(args, render_views)
         return
-    required("mpi4py", "mpi", "mpiexec")
+    start_mpi()
     from drgs.distributed.pictures import run_together
 
     run_together(args, partial(run_with, args))

@@ -25,6 +25,7 @@ from drgs.bench.scenes import BENCH_FIELD_OF_VIEW, bench_config, bench_gaussians
 from drgs.config.changes import changed
 from drgs.core.arrays import block_widths
 from drgs.core.denormals import denormals_flushed
+from drgs.core.processes import ending_together
 from drgs.data.types import Dataset, View
 from drgs.gaussians.parameters import Gaussians
 
@@ -241,6 +242,7 @@ def _timed_trainer() -> type:
     return TimedTrainer
 
 
+@ending_together()
 def main() -> None:
     """A process's part."""
     task = Task(**json.loads(sys.argv[1]))

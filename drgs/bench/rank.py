@@ -19,7 +19,7 @@ import numpy as np
 
 from drgs.config.changes import changed
 from drgs.core.denormals import denormals_flushed
-from drgs.core.processes import process_number
+from drgs.core.processes import ending_together, process_number
 from drgs.data import load_dataset
 from drgs.gaussians.parameters import Gaussians
 from drgs.results.files import GAUSSIANS
@@ -27,6 +27,7 @@ from drgs.results.folder import load_run_config
 from drgs.training.trainer import Trainer
 
 
+@ending_together()
 def main() -> None:
     """Time steps of a fit that has ended; its population stays, and all harmonics are in use."""
     folder, views, steps, threads = Path(sys.argv[1]), *map(int, sys.argv[2:5])

@@ -12,13 +12,13 @@ from importlib import import_module
 from pathlib import Path
 from typing import NamedTuple, NoReturn
 
-from drgs.cli.errors import USER_ERROR_STATUS, exit_on_user_error
+from drgs.cli.errors import exit_on_user_error
 from drgs.cli.interrupts import exit_on_interrupt
 from drgs.cli.output import notes_printed, printable_anywhere
 from drgs.core.constants import MAX_INT
-from drgs.core.errors import did_you_mean, one_line
+from drgs.core.errors import UserError, did_you_mean, one_line
 from drgs.core.files import check_path
-from drgs.core.processes import one_voice
+from drgs.core.processes import ending_together, one_voice, process_count
 
 MAX_ERROR = 500
 """Characters of what is wrong with a command line, which may quote all of it."""
@@ -73,15 +73,14 @@ class CommandParser(argparse.ArgumentParser):
         return super().parse_known_args(args, namespace)
 
     def error(self, message: str) -> NoReturn:
-        """Say in one line what is wrong with the command line, and exit with status 2.
+        """Raise :class:`UserError`, which says in one line what is wrong with the command line.
 
         An option that wants several words is shown with them.
         """
         found = re.fullmatch(r"argument (?:\S+/)?(--\S+): expected \d+ arguments", message)
         if found and isinstance(metavar := self._option_string_actions[found[1]].metavar, tuple):
             message = f"{message}: {found[1]} {' '.join(metavar)}"
-        text = one_line(message, MAX_ERROR)
-        self.exit(USER_ERROR_STATUS, f"error: {text}; see {self.prog} --help\n")
+        raise UserError(f"{one_line(message, MAX_ERROR)}; see {self.prog} --help")
 
 
 def run_command(
@@ -95,21 +94,28 @@ def run_command(
     they can be printed.
 
     add_arguments: adds the command's arguments, and sets ``run``, a function of the parsed ones,
-    which also hold the whole line as ``command``.
+    which also hold the whole line as ``command``; and ``is_shared``, where several processes may
+    run it together.
     prog: how the command is called. arguments: its words; None: those of this process.
     """
     with (
-        one_voice(),
+        ending_together(),
         printable_anywhere(),
-        notes_printed(),
         exit_on_interrupt(),
         exit_on_user_error(),
+        one_voice(),
+        notes_printed(),
     ):
         parser = CommandParser(prog=prog)
+        parser.set_defaults(is_shared=False)
         add_arguments(parser)
         args = parser.parse_args(arguments)
         words = sys.argv[1:] if arguments is None else arguments
         args.command = shlex.join([*prog.split(), *words])
+        if not args.is_shared and (process_count() or 1) > 1:
+            raise UserError(
+                "mpiexec: processes can share fit and render, no other command; leave it out"
+            )
         args.run(args)
 
 

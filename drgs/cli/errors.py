@@ -25,14 +25,20 @@ MAX_CHARACTERS = 800
 def exit_on_user_error() -> Iterator[None]:
     """Around (or, as a decorator, on) a command: print the error without a traceback, exit with 2.
 
-    Only errors that the user can repair, and what the file system refuses of a file that it names;
-    any other keeps its traceback. Where nobody reads the output any more, as behind ``| head``, it
-    ends without a word.
+    Only errors that the user can repair, packages that cannot be imported, and what the file system
+    refuses of a file that it names; any other keeps its traceback. Where nobody reads the output
+    any more, as behind ``| head``, it ends without a word.
     """
     try:
         yield
     except (UserError, LLVMVersionError) as error:
         print(f"error: {_printed(str(error))}", file=sys.stderr)
+        sys.exit(USER_ERROR_STATUS)
+    except ImportError as error:
+        if error.name is None or error.name.partition(".")[0] == "drgs":
+            raise
+        text = f"{error}, by {sys.executable}; install drgs there with all that it needs"
+        print(f"error: {_printed(text)}", file=sys.stderr)
         sys.exit(USER_ERROR_STATUS)
     except BrokenPipeError:
         with suppress(OSError, ValueError):  # or Python would fail again when it ends

@@ -58,6 +58,19 @@ def llvm_version() -> tuple[int, ...]:
     return tuple(dr.detail.llvm_version())
 
 
+def llvm_vector_width() -> int:
+    """Lanes of the vectors that Dr.Jit compiles for; 0 where this build of it does not tell.
+
+    Relies on ``jit_llvm_vector_width`` of drjit-core, which Dr.Jit's Python interface does not
+    offer.
+    """
+    llvm_version()  # waits until the backend knows its processor
+    try:
+        return _of_llvm_backend("_Z21jit_llvm_vector_widthv", ctypes.c_uint32)()
+    except (AttributeError, OSError):
+        return 0
+
+
 def leave_out_avx512() -> None:
     """From now on, compile for this processor as if it had AVX2 and no AVX-512.
 

@@ -7,14 +7,14 @@ that it was read from. Where the dataset lies is no part of it.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from drgs.core.records import digest
 from drgs.data.transforms import in_parallel
-from drgs.data.types import Dataset, View
+from drgs.data.types import Dataset, Keeps, View, all_of_them
 
 TOLERANCE = 1e-9
 """Relative and absolute, of a camera's numbers: what another machine's mathematics may change."""
@@ -34,7 +34,7 @@ class ViewPrint(_Print):
     size: tuple[int, int]  # px, width and height, as configured
     camera: list[float]  # pose, intrinsics, lens, second pose
     kind: str  # of lens and shutter
-    files: dict[str, str]  # digests, by what is in the file
+    files: dict[str, str]  # digests, by what is in the file; empty: not read, equal to any
 
 
 class Fingerprint(_Print):
@@ -60,13 +60,26 @@ class Fingerprint(_Print):
         pairs = ((self.train, now.train, "training"), (self.test, now.test, "test"))
         return [text for pair in pairs for text in _differences(*pair)]
 
+    def other_files(self, views: Iterable[View], now: Fingerprint) -> list[Path]:
+        """Files of training views (all of them, in the order of ``now``) that are different."""
+        was = {view.name: view.files for view in self.train}
+        return [
+            path
+            for view, is_now in zip(views, now.train, strict=True)
+            for what, path in view.files.items()
+            if _is_other(was.get(view.name, {}).get(what), is_now.files[what])
+        ]
 
-def fingerprint_of(dataset: Dataset) -> Fingerprint:
+
+def fingerprint_of(dataset: Dataset, reads: Keeps = all_of_them) -> Fingerprint:
     """Reads the files of the views, which were in memory a moment ago.
+
+    reads: of which views, by name; the files of others have empty digests.
 
     Raises :class:`drgs.core.errors.UserError` where one is gone.
     """
-    files = {path for view in (*dataset.train, *dataset.test) for path in view.files.values()}
+    views = [view for view in (*dataset.train, *dataset.test) if reads(view.name)]
+    files = {path for view in views for path in view.files.values()}
     ordered = sorted(files)
     digests = dict(zip(ordered, in_parallel(digest, ordered), strict=True))
     train, test = (
@@ -88,7 +101,7 @@ def _print_of(view: View, digests: dict[Path, str]) -> ViewPrint:
         size=(view.width, view.height),
         camera=[float(number) for number in camera],
         kind=", ".join(kinds),
-        files={what: digests[path] for what, path in view.files.items()},
+        files={what: digests.get(path, "") for what, path in view.files.items()},
     )
 
 
@@ -114,8 +127,12 @@ def _changes(was: ViewPrint, now: ViewPrint) -> Iterator[str]:
     elif was.kind != now.kind or not _close(was.camera, now.camera):
         yield "the camera"
     for what in {**was.files, **now.files}:
-        if was.files.get(what) != now.files.get(what):
+        if _is_other(was.files.get(what), now.files.get(what)):
             yield PICTURES.get(what, what)
+
+
+def _is_other(was: str | None, now: str | None) -> bool:
+    return was != now and "" not in (was, now)
 
 
 def _size(view: ViewPrint) -> str:

@@ -7,24 +7,28 @@ the first process renders the first one, the second the second, and so on.
 from __future__ import annotations
 
 import argparse
-import json
-import traceback
-from collections.abc import Callable, Iterator, Sequence
+import sys
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
+from typing import NoReturn
 
 import mitsuba as mi
 import numpy as np
 
 from drgs.core.errors import UserError
 from drgs.data.types import Viewpoint
+from drgs.distributed.agreement import check_pictures
 from drgs.distributed.ranks import Ranks, wait
-from drgs.distributed.together import end_all, end_if_told, leading
 from drgs.integrator.scene import render_views
 
-GO = "go"
-"""What the first process says when it waits for pictures."""
+END = "end"
+"""What the first process says when all pictures are written."""
 
 Render = Callable[..., Iterator[np.ndarray]]
 """Of a scene and views, pictures (H, W, 3)."""
+
+Files = Mapping[str, object]
+"""Where models, cameras and backgrounds come from, for messages."""
 
 
 def run_together(args: argparse.Namespace, work: Callable[[Render], None]) -> None:
@@ -33,23 +37,21 @@ def run_together(args: argparse.Namespace, work: Callable[[Render], None]) -> No
     if args.threads is None:
         args.threads = ranks.own_cores
     if args.what.suffix.lower() == ".xml" and ranks.size > 1:
-        work = _refuse
+        raise UserError("mpiexec: a scene of Mitsuba is rendered by one process; leave mpiexec out")
+    background = " ".join(args.background or ())
+    files = {"cameras": args.camera, "background": background, "model": args.what}
     if ranks.is_first:
-        with leading(ranks):
-            work(lambda scene, views: _gathered(ranks, scene, views))
+        work(partial(_gathered, ranks, files))
+        ranks.text_of(0, END)
     else:
-        _follow(ranks, work)
+        work(partial(_contributed, ranks, files))
 
 
-def _refuse(render: Render) -> None:
-    del render
-    raise UserError("mpiexec: a scene of Mitsuba is rendered by one process; leave mpiexec out")
-
-
-def _gathered(ranks: Ranks, scene: mi.Scene, views: Sequence[Viewpoint]) -> Iterator[np.ndarray]:
+def _gathered(
+    ranks: Ranks, files: Files, scene: mi.Scene, views: Sequence[Viewpoint]
+) -> Iterator[np.ndarray]:
     """All pictures in order, of which this process renders its own."""
-    ranks.text_of(0, json.dumps([GO]))
-    ranks.is_broken = True  # if it ends here, the others wait for somebody to take their pictures
+    check_pictures(ranks, scene, views, files)
     own = render_views(scene, views[:: ranks.size])
     for index, view in enumerate(views):
         source = index % ranks.size
@@ -59,28 +61,14 @@ def _gathered(ranks: Ranks, scene: mi.Scene, views: Sequence[Viewpoint]) -> Iter
         picture = np.empty((view.height, view.width, 3), np.float32)
         wait(ranks.receive(picture, source, 0))
         yield picture
-    ranks.is_broken = False
 
 
-def _follow(ranks: Ranks, work: Callable[[Render], None]) -> None:
-    """Render what falls to this process, and end with the status of the first one."""
-
-    def render(scene: mi.Scene, views: Sequence[Viewpoint]) -> Iterator[np.ndarray]:
-        end_if_told(ranks)
-        ranks.is_broken = True  # if it ends here, the first process waits for pictures
-        own = views[ranks.rank :: ranks.size]
-        for picture in render_views(scene, own):
-            wait(ranks.send(np.ascontiguousarray(picture, np.float32), 0, 0))
-        ranks.is_broken = False
-        end_if_told(ranks)
-        raise RuntimeError("the first process goes on with pictures that nobody has asked for")
-
-    try:
-        work(render)
-        end_if_told(ranks)  # it had nothing to share
-    except SystemExit:
-        raise
-    except BaseException as error:
-        if isinstance(error, UserError) and not ranks.is_broken:
-            end_if_told(ranks)  # the first process has found the same
-        end_all(ranks, "".join(traceback.format_exception(error)), 1)
+def _contributed(
+    ranks: Ranks, files: Files, scene: mi.Scene, views: Sequence[Viewpoint]
+) -> NoReturn:
+    """Render what falls to this process, and end when the first process has."""
+    check_pictures(ranks, scene, views, files)
+    for picture in render_views(scene, views[ranks.rank :: ranks.size]):
+        wait(ranks.send(np.ascontiguousarray(picture, np.float32), 0, 0))
+    ranks.text_of(0, "")
+    sys.exit()

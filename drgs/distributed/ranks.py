@@ -36,7 +36,6 @@ class Ranks:
     comm: MPI.Comm
     on_machine: int = 1  # of them, that run where this one does
     times: Times = field(default_factory=Times)
-    is_broken: bool = False  # whether others wait for what this process will not say
 
     @staticmethod
     def world() -> Ranks:

@@ -9,10 +9,8 @@ from __future__ import annotations
 
 import json
 import signal
-import sys
-import traceback
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial, wraps
 from typing import Any
@@ -21,9 +19,9 @@ import mitsuba as mi
 import numpy as np
 
 from drgs.config.schema import FitConfig
-from drgs.core.errors import UserError
 from drgs.data.reading import without_pictures
 from drgs.data.types import Dataset
+from drgs.distributed.agreement import check_versions, send_fingerprint, versions
 from drgs.distributed.ranks import Ranks
 from drgs.distributed.shards import AgreedError, own_views
 from drgs.distributed.trainer import DistributedTrainer, check_can_be_shared
@@ -39,22 +37,6 @@ AGREED = (NonFiniteError, AgreedError)
 """Errors that all processes raise alike."""
 
 
-INTERRUPTED = 130
-"""Status of a process that Ctrl-C has ended."""
-
-
-@contextmanager
-def _others_waiting(ranks: Ranks) -> Iterator[None]:
-    """Around what all do together, and before that hear of: who fails leaves the others waiting."""
-    try:
-        yield
-    except AGREED:
-        raise
-    except BaseException:
-        ranks.is_broken = True
-        raise
-
-
 def _called_by_all(method: Callable) -> Callable:
     """Of the leader: have the others call it, too, with arguments that JSON knows.
 
@@ -67,9 +49,8 @@ def _called_by_all(method: Callable) -> Callable:
             return method(self, *arguments)
         self.is_calling = True
         try:
-            with _others_waiting(self.ranks):
-                self.ranks.text_of(0, json.dumps([method.__name__, *arguments]))
-                return method(self, *arguments)
+            self.ranks.text_of(0, json.dumps([method.__name__, *arguments]))
+            return method(self, *arguments)
         finally:
             self.is_calling = False
 
@@ -85,12 +66,13 @@ class Leader(DistributedTrainer):
         """gaussians: all of them; dataset: with all pictures, of which it keeps its own."""
         self.is_calling = True
         check_can_be_shared(config, ranks.size, gaussians.num_gaussians)
-        dataset = with_own_pictures(dataset, config.optimizer.views_per_step, ranks)
         names = [view.name for view in dataset.train]
-        with _others_waiting(ranks):
-            ranks.text_of(0, json.dumps([START, config.model_dump_json(), names]))
-            share_gaussians(ranks, gaussians)
-            super().__init__(config, dataset, gaussians, ranks)
+        ranks.text_of(0, json.dumps([START, config.model_dump_json(), names, versions()]))
+        share_gaussians(ranks, gaussians)
+        if _others_read(ranks):
+            send_fingerprint(ranks, dataset)  # made while they do
+        dataset = with_own_pictures(dataset, config.optimizer.views_per_step, ranks)
+        super().__init__(config, dataset, gaussians, ranks)
         self.is_calling = False
         self._latest: tuple[int, mi.Scene] | None = None
 
@@ -138,9 +120,8 @@ class Leader(DistributedTrainer):
     def restore(self, state: dict[str, np.ndarray]) -> None:
         """See :meth:`Trainer.restore`; state: of this process, which tells the others."""
         self.is_calling = True
-        with _others_waiting(self.ranks):
-            self.ranks.text_of(0, json.dumps([RESTORE]))
-            super().restore(state)
+        self.ranks.text_of(0, json.dumps([RESTORE]))
+        super().restore(state)
         self.is_calling = False
 
     def another(self, config: FitConfig, gaussians: Gaussians) -> Leader:
@@ -149,9 +130,8 @@ class Leader(DistributedTrainer):
 
     def take_over(self, former: Trainer) -> None:
         """See :meth:`Trainer.take_over`; former: whom the others have followed before."""
-        with _others_waiting(self.ranks):
-            self.ranks.text_of(0, json.dumps([TAKE_OVER]))
-            super().take_over(former)
+        self.ranks.text_of(0, json.dumps([TAKE_OVER]))
+        super().take_over(former)
 
     def scene_of_all(self) -> mi.Scene:
         """See :meth:`Trainer.scene_of_all`: on this process."""
@@ -165,73 +145,32 @@ class Leader(DistributedTrainer):
 def lead(ranks: Ranks, work: Callable[[Callable[..., Trainer]], None]) -> None:
     """Run what a single process would, with a trainer of all; then let the others go.
 
-    work: is given what makes the trainer.
+    work: is given what makes the trainer. An error is the end of all processes: see
+    :mod:`drgs.core.processes`.
     """
-    with leading(ranks):
-        work(partial(Leader, ranks=ranks))
-
-
-@contextmanager
-def leading(ranks: Ranks) -> Iterator[None]:
-    """Around the first process's work: then the others end, with the same status."""
-    status = 0
-    try:
-        yield
-    except SystemExit as end:
-        status = end.code if isinstance(end.code, int) else 1
-        raise
-    except KeyboardInterrupt:
-        status = INTERRUPTED
-        raise
-    except BaseException as error:
-        status = 2 if isinstance(error, (UserError, OSError)) else 1
-        raise
-    finally:
-        if ranks.is_broken:
-            said = "stopped" if status == INTERRUPTED else f"error: {sys.exc_info()[1]}"
-            print(said, file=sys.stderr, flush=True)
-            ranks.comm.Abort(status)
-        ranks.text_of(0, json.dumps([END, status]))
+    work(partial(Leader, ranks=ranks))
+    ranks.text_of(0, json.dumps([END]))
 
 
 def follow(
     ranks: Ranks,
     load: Callable[[FitConfig, list[str]], Dataset],
     check_ranges: Callable[[], None],
-) -> int:
-    """Do what the first process does; return the status that it ends with.
+) -> None:
+    """Do what the first process does, until it has ended.
 
-    load: the dataset of a configuration, with the training views of these names; check_ranges:
-    raises ``UserError``.
+    load: the dataset of a configuration, with the training views of these names, after
+    :func:`drgs.distributed.agreement.check_views`; check_ranges: raises ``UserError``.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the first process decides when to stop
     follower = Follower(ranks, load)
-    try:
-        while True:
-            name, *arguments = json.loads(ranks.text_of(0, ""))
-            if name == END:
-                return arguments[0]
-            with suppress(*AGREED):  # the first process says so
-                follower.do(name, *arguments)
-            check_ranges()
-    except BaseException as error:
-        told = isinstance(error, UserError)
-        text = f"error: {error}" if told else "".join(traceback.format_exception(error))
-        end_all(ranks, text, 2 if told else 1)
-        raise
-
-
-def end_all(ranks: Ranks, text: str, status: int) -> None:
-    """Say why, and end all processes."""
-    print(f"process {ranks.rank}: {text}", file=sys.__stderr__, flush=True)
-    ranks.comm.Abort(status)
-
-
-def end_if_told(ranks: Ranks) -> None:
-    """Hear what the first process says next; end where that is the end."""
-    said, *status = json.loads(ranks.text_of(0, ""))
-    if said == END:
-        sys.exit(status[0])
+    while True:
+        name, *arguments = json.loads(ranks.text_of(0, ""))
+        if name == END:
+            return
+        with suppress(*AGREED):  # the first process says so
+            follower.do(name, *arguments)
+        check_ranges()
 
 
 @dataclass
@@ -255,15 +194,23 @@ class Follower:
         else:
             getattr(self.trainer, name)(*arguments)
 
-    def start(self, text: str, names: list[str]) -> None:
+    def start(self, text: str, names: list[str], versions_of_first: dict[str, str]) -> None:
         """Make a trainer; text: its configuration; names: of its views."""
+        check_versions(versions_of_first)
         config, gaussians = FitConfig.model_validate_json(text), share_gaussians(self.ranks, None)
         former = self.trainer
         if former is not None and names != [view.name for view in former.dataset.train]:
             former = self.trainer = None  # of a rehearsal
-        dataset = self.load(config, names) if former is None else former.dataset
+        reads = former is None
+        _others_read(self.ranks, reads)
+        dataset = self.load(config, names) if reads else former.dataset
         self.trainer = DistributedTrainer(config, dataset, gaussians, self.ranks)
         self.former = former
+
+
+def _others_read(ranks: Ranks, reads: bool = False) -> bool:
+    """Whether those that follow read their photographs now, as each of them says."""
+    return bool(ranks.told(np.array(reads)).any())
 
 
 def with_own_pictures(dataset: Dataset, views_per_step: int, ranks: Ranks) -> Dataset:

@@ -46,6 +46,17 @@ def test_commands_report_what_the_file_system_refuses_of_a_named_file(capsys):
         raise OSError("nameless")
 
 
+def test_commands_name_a_package_that_cannot_be_imported(capsys):
+    with pytest.raises(SystemExit) as exit_info, exit_on_user_error():
+        raise ModuleNotFoundError("No module named 'numpy'", name="numpy")
+    assert exit_info.value.code == 2
+    line = f"error: No module named 'numpy', by {sys.executable}; install drgs there with all"
+    assert capsys.readouterr().err.startswith(line)
+    for name in (None, "drgs.nothing"):  # a defect of a package, or of this one
+        with pytest.raises(ImportError), exit_on_user_error():
+            raise ImportError("x", name=name)
+
+
 def test_a_reader_of_the_output_may_go(run_python):
     """Of two processes: what is printed has to go through a pipe."""
     program = (

@@ -97,6 +97,16 @@ def test_rounding_of_another_machine_does_not_count(rich):
     assert not differences(rich, lambda: change(rich, round_off))
 
 
+def test_files_that_were_not_read_are_as_good_as_any(rich):
+    before = fingerprint_of(load(rich))
+    shutil.copy(rich / "images" / "05.png", rich / "images" / "04.png")
+    dataset = load(rich)
+    for read, other in (({"04"}, ["04.png"]), ({"05"}, [])):
+        now = fingerprint_of(dataset, read.__contains__)
+        assert [path.name for path in before.other_files(dataset.train, now)] == other
+        assert len(before.differences(now)) == len(other)
+
+
 def test_a_file_that_is_gone_is_named(rich):
     dataset = load(rich)
     (rich / "images" / "05.png").unlink()

@@ -48,6 +48,14 @@ def result(folder):
     return [(folder / name).read_bytes() for name in names], rows
 
 
+def assert_all_end(word):
+    """The launcher may have ended a moment before its processes."""
+    end = time.monotonic() + 10
+    while together.ranks_of(str(word)):
+        assert time.monotonic() < end
+        time.sleep(0.05)
+
+
 def test_a_fit_that_is_shared_is_the_same(config, tmp_path):
     path = config()
     status, output, errors = together.run(2, command(path, "--out", tmp_path / "two"))
@@ -89,6 +97,51 @@ def test_a_wrong_command_line_is_refused_once(tmp_path):
     assert status == 2 and errors.count("error: ") == 1
 
 
+MISSING = "ModuleNotFoundError('No module named mpi4py', name='mpi4py')"
+
+
+@pytest.mark.parametrize(
+    ("on_second", "message"),
+    [
+        ("export DRJIT_LIBLLVM_PATH=/nonexistent.so", "process 1: error: --variant llvm_ad_rgb"),
+        (MISSING, "process 1: error: mpiexec: needs mpi4py"),
+        ("exit 3", "error: mpiexec: a process of this machine has ended before MPI has started"),
+    ],
+    ids=["behind the start", "before the start", "before Python"],
+)
+def test_a_process_that_fails_alone_is_heard_once_and_ends_all(
+    config, tmp_path, on_second, message
+):
+    if on_second is MISSING:
+        on_second = together.failing_import(tmp_path, "mpi4py", MISSING)
+    words, start = command(config(), "--out", tmp_path / "out"), time.monotonic()
+    status, _, errors = together.run(2, words, on_second=on_second)
+    assert (status, errors.count("error: ")) == (2, 1), errors
+    assert message in errors and "Traceback" not in errors and "Fatal" not in errors
+    assert time.monotonic() - start < 60  # 4 to 8 s; without an end, for ever
+    assert_all_end(tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_an_unexpected_error_of_one_process_is_traced_once_and_ends_all(config, tmp_path):
+    failing = together.failing_import(tmp_path, "drgs.distributed.shards", "RuntimeError('a bug')")
+    words = command(config(), "--out", tmp_path / "out")
+    status, _, errors = together.run(2, words, on_second=failing)
+    assert status == 1, errors
+    assert errors.startswith("process 1: Traceback") and errors.count("Traceback") == 1
+    assert errors.endswith("RuntimeError: a bug\n")
+
+
+def test_a_command_of_one_process_is_refused_once(tmp_path):
+    model = together.REPOSITORY / "scenes" / "shapes" / "knot.ply"
+    words = ["-m", "drgs.export", model, "--out", tmp_path / "a.spz"]
+    status, _, errors = together.run(2, words)
+    assert (status, errors.count("error: ")) == (2, 1), errors
+    assert "mpiexec: processes can share fit and render" in errors
+    assert not (tmp_path / "a.spz").exists()
+    assert together.run(1, words)[0] == 0 and (tmp_path / "a.spz").exists()
+
+
 @pytest.mark.slow
 def test_ctrl_c_while_everybody_is_busy_with_something_else_ends_all(config, tmp_path):
     """In a rehearsal: nothing is to be saved, and nobody is left behind."""
@@ -103,7 +156,7 @@ def test_ctrl_c_while_everybody_is_busy_with_something_else_ends_all(config, tmp
     _, errors = process.communicate(timeout=60)
     assert process.returncode == 130, errors
     assert "Traceback" not in errors
-    assert not together.ranks_of(str(out))
+    assert_all_end(out)
 
 
 def started(path, out, size=2):
@@ -140,10 +193,7 @@ def test_a_process_that_dies_takes_the_others_along(config, tmp_path, seed):
     os.kill(rng.choice(ranks), signal.SIGKILL)
     process.communicate(timeout=30)
     assert process.returncode != 0
-    end = time.monotonic() + 10
-    while together.ranks_of(str(out)):
-        assert time.monotonic() < end
-        time.sleep(0.1)
+    assert_all_end(out)
     assert together.run(2, command("--resume", out))[0] == 0
     assert (out / "metrics.json").exists()
 

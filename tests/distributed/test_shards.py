@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from drgs.core.processes import NUMBERS, process_number
+from drgs.core.processes import LAUNCHERS, process_count, process_number
 from drgs.training.stages import view_of
 
 
@@ -39,13 +39,16 @@ def test_a_process_has_the_photographs_that_it_will_see(modules, count, views_pe
 
 
 def test_launchers_tell_a_process_its_number(monkeypatch):
-    for name in NUMBERS:
+    for name in (name for names in LAUNCHERS for name in names):
         monkeypatch.delenv(name, raising=False)
-    assert process_number() is None
+    monkeypatch.setenv("SLURM_STEP_NUM_TASKS", "4")  # of a batch script, which is no process of MPI
+    assert (process_number(), process_count()) == (None, None)
+    monkeypatch.setenv("PMIX_RANK", "2")
+    assert (process_number(), process_count()) == (2, 4)
     monkeypatch.setenv("OMPI_COMM_WORLD_RANK", "3")
-    assert process_number() == 3
+    assert (process_number(), process_count()) == (3, None)
     monkeypatch.setenv("OMPI_COMM_WORLD_RANK", "none")
-    assert process_number() is None
+    assert process_number() == 2
 
 
 def test_one_process_imports_nothing_of_it(run_python, tmp_path):
@@ -67,3 +70,13 @@ def test_without_the_extra_mpiexec_is_refused(run_python):
     result = run_python(code, PMI_RANK="0")
     assert result.returncode == 2
     assert "mpiexec: needs mpi4py" in result.stderr and "drgs[mpi]" in result.stderr
+
+
+def test_the_launcher_of_another_mpi_is_refused(run_python):
+    """Each of its processes would fit alone, into the same folder."""
+    pytest.importorskip("mpi4py", reason="the extra mpi is not installed")
+    code = "from drgs.fit import main; main(['scenes/lego_mini.yml'])"
+    launcher = {"OMPI_COMM_WORLD_RANK": "0", "OMPI_COMM_WORLD_SIZE": "2"}
+    result = run_python(code, **launcher)
+    assert result.returncode == 2
+    assert "has started 2 processes, but MPI knows of 1; use the mpiexec of" in result.stderr

@@ -39,10 +39,16 @@ def environment() -> dict[str, str]:
     return {**kept, "PYTHONPATH": f"{TESTS}{os.pathsep}{REPOSITORY}"}
 
 
-def start(size: int, words: Sequence[str], cwd: Path = REPOSITORY) -> subprocess.Popen:
-    """Begin to run ``python WORDS`` on so many processes."""
+def start(
+    size: int, words: Sequence[str], cwd: Path = REPOSITORY, on_second: str = ":"
+) -> subprocess.Popen:
+    """Begin to run ``python WORDS`` on so many processes.
+
+    on_second: what a shell does before, on the second of them.
+    """
+    shell = f'if [ "$PMI_RANK" = 1 ]; then {on_second}; fi; exec "$@"'
     return subprocess.Popen(
-        [mpiexec(), "-n", str(size), sys.executable, *map(str, words)],
+        [mpiexec(), "-n", str(size), "sh", "-c", shell, "sh", sys.executable, *map(str, words)],
         cwd=cwd,
         env=environment(),
         stdout=subprocess.PIPE,
@@ -51,11 +57,26 @@ def start(size: int, words: Sequence[str], cwd: Path = REPOSITORY) -> subprocess
     )
 
 
-def run(size: int, words: Sequence[str], cwd: Path = REPOSITORY) -> tuple[int, str, str]:
-    """Status, output and errors of ``python WORDS`` on so many processes."""
-    process = start(size, words, cwd)
+def run(
+    size: int, words: Sequence[str], cwd: Path = REPOSITORY, on_second: str = ":"
+) -> tuple[int, str, str]:
+    """Status, output and errors of ``python WORDS`` on so many processes: see :func:`start`."""
+    process = start(size, words, cwd, on_second)
     output, errors = process.communicate(timeout=TIMEOUT)
     return process.returncode, output, errors
+
+
+def failing_import(folder: Path, module: str, error: str) -> str:
+    """For a shell: from now on, importing ``module`` raises ``error``, an expression of Python."""
+    (folder / "sitecustomize.py").write_text(
+        "import sys\n"
+        "class Failing:\n"
+        "    def find_spec(self, name, path=None, target=None):\n"
+        f"        if name == {module!r}:\n"
+        f"            raise {error}\n"
+        "sys.meta_path.insert(0, Failing())\n"
+    )
+    return f'export PYTHONPATH="{folder}:$PYTHONPATH"'
 
 
 def ranks_of(word: str) -> list[int]:
