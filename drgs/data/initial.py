@@ -278,7 +278,7 @@ def _check_cloud(file: Path, points: np.ndarray, max_gaussians: int, dataset: Da
     num, views = len(points), dataset.train
     if num <= NUM_NEIGHBOURS:
         raise UserError(f"{file}: at least {NUM_NEIGHBOURS + 1} points, got {num}")
-    if not np.ptp(points, axis=0).any():
+    if (points == points[0]).all():
         raise UserError(f"{file}: its {num:,} points must not all be the same")
     if num > max_gaussians:
         raise UserError(
