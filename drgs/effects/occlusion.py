@@ -26,7 +26,7 @@ import drjit as dr
 
 from drgs.cameras.camera import Camera
 from drgs.splatting.grid import Lanes, TileGrid
-from drgs.splatting.image_model import Features, ImageModel, Positions
+from drgs.splatting.image_model import FeatureGroup, Features, ImageModel, Positions
 from drgs.splatting.lanes import load_pixels
 
 
@@ -50,6 +50,18 @@ class OccludedFeatures:
     surface: Surface
     grid: TileGrid
     bound: list[tuple[Any, Any]] = field(default_factory=list)  # the 16 of each lane: z, 1 - c
+
+    def groups(self, num_stored: int, size: int) -> list[FeatureGroup]:
+        """Divide as without a surface; each group has the depth, and the weights in front."""
+        depth, front = num_stored - 1, self.num_planes(num_stored) - 1
+        return [
+            FeatureGroup(
+                stored=[*group.stored, depth],
+                planes=[*group.planes, front],
+                features=replace(self, features=group.features),
+            )
+            for group in self.features.groups(num_stored - 1, size)
+        ]
 
     def num_planes(self, num_stored: int) -> int:
         """Planes that come of ``num_stored`` numbers per splat."""

@@ -6,18 +6,19 @@ groups, whose kernels are compiled once. Each group walks the splats again, so t
 transmittance, its decisions and its weights are those of all others.
 
 The adjoint is linear in the derivatives of the planes: the groups' derivatives of the geometry are
-added up, with that of the transmittance in the first group alone.
+added up, with those of planes that several groups have, as the transmittance, in the first alone.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import drjit as dr
 
-from drgs.splatting.image_model import SplatFeatures
+from drgs.splatting.image_model import FeatureGroup
 from drgs.splatting.rasterize import Layers, Records, SplatGradients
 from drgs.splatting.tiles import TileBins
 
@@ -30,54 +31,55 @@ def in_groups(order: Any, bins: TileBins) -> Any:
     """``order``, or one that composites in groups where there are many features.
 
     Each is a :class:`drgs.splatting.rendering.Order`.
-
-    Not where a pixel's features depend on all that is stored of a splat.
     """
-    is_many = bins.num_features > FEATURES_AT_ONCE[dr.itemsize_v(bins.rows.Float)]
-    return FeatureGroups(order) if is_many and type(bins.model.features) is SplatFeatures else order
+    return InGroups(order) if len(_groups(bins)) > 1 else order
 
 
 @dataclass(frozen=True)
 class GroupedLayers:
     """What compositing makes of each group."""
 
-    parts: tuple[Layers, ...]
-
-    @property
-    def count(self) -> int:
-        """Planes besides the transmittance."""
-        return sum(part.count for part in self.parts)
+    groups: tuple[FeatureGroup, ...]
+    parts: tuple[Layers, ...]  # of each of them
+    count: int  # planes besides the transmittance
 
     def planes(self) -> list[Any]:
         """See :meth:`drgs.splatting.rasterize.Layers.planes`."""
-        first, *others = (part.planes() for part in self.parts)
-        return first + [plane for planes in others for plane in planes[1:]]
+        planes = [None] * (1 + self.count)
+        for group, part in zip(self.groups, self.parts, strict=True):
+            planes[0], *own = part.planes()
+            for place, plane in zip(group.planes, own, strict=True):
+                planes[1 + place] = plane
+        return planes
 
 
 @dataclass(frozen=True)
-class FeatureGroups:
+class InGroups:
     """Composites in another order, group by group."""
 
     order: Any  # drgs.splatting.rendering.Order: of each group
 
     def records(self, bins: TileBins) -> tuple[Records, ...]:
         """Those of each group."""
-        geometry, num_features = bins.model.response.num_geometry, bins.num_features
+        geometry, end = bins.model.response.num_geometry, bins.num_features
 
-        def numbers(group: slice, rank: Any, active: Any) -> list[Any]:
+        def numbers(group: FeatureGroup, rank: Any, active: Any) -> list[Any]:
             row = bins.rows.load(rank, active)
-            features, keys = row[geometry:][:num_features], row[geometry + num_features :]
-            return row[:geometry] + features[group] + keys
+            features, keys = row[geometry:], row[geometry + end :]
+            return row[:geometry] + [features[place] for place in group.stored] + keys
 
         return tuple(
-            Records.of(own, lambda rank, active, group=group: numbers(group, rank, active))
-            for group, own in _groups(bins)
+            Records.of(_only(group, bins), partial(numbers, group)) for group in _groups(bins)
         )
 
     def composite(self, bins: TileBins, records: Sequence[Records]) -> GroupedLayers:
         """See :func:`drgs.splatting.rasterize.composite`."""
-        groups = zip(_groups(bins), records, strict=True)
-        return GroupedLayers(tuple(self.order.composite(own, rows) for (_, own), rows in groups))
+        groups, count = _groups(bins), bins.model.features.num_planes(bins.num_features)
+        parts = [
+            self.order.composite(_only(group, bins), own)
+            for group, own in zip(groups, records, strict=True)
+        ]
+        return GroupedLayers(groups, tuple(parts), count)
 
     def adjoint(
         self,
@@ -88,16 +90,21 @@ class FeatureGroups:
         d_transmittance: Any,
     ) -> SplatGradients:
         """See :func:`drgs.splatting.rasterize.composite_adjoint`."""
-        dr.eval(d_features, d_transmittance)  # or each group would have kernels of its own
-        geometry, features = None, []
-        groups = zip(_groups(bins), records, layers.parts, strict=True)
-        for (group, own), rows, part in groups:
-            found = self.order.adjoint(own, rows, part, d_features[group], d_transmittance)
+        cotangents = [d_transmittance, *d_features]
+        dr.eval(cotangents)  # or each group would have kernels of its own
+        zeros = dr.opaque(type(d_transmittance), 0, dr.width(d_transmittance))
+        geometry, features = None, [bins.rows.Float(0)] * bins.num_features
+        for group, own, part in zip(_groups(bins), records, layers.parts, strict=True):
+            places = [0, *(1 + place for place in group.planes)]
+            d_own, *d_planes = [cotangents[place] for place in places]
+            for place in places:  # planes of several groups count once
+                cotangents[place] = zeros
+            found = self.order.adjoint(_only(group, bins), own, part, d_planes, d_own)
             total = zip(geometry or [0] * len(found.geometry), found.geometry, strict=True)
             geometry = [a + b for a, b in total]
-            features += found.features
+            for place, derivative in zip(group.stored, found.features, strict=True):
+                features[place] = features[place] + derivative
             dr.eval(geometry, features)
-            d_transmittance = dr.opaque(type(d_transmittance), 0, dr.width(d_transmittance))
         return SplatGradients(geometry, features)
 
     def tangent(
@@ -108,20 +115,19 @@ class FeatureGroups:
         tangents: SplatGradients,
     ) -> GroupedLayers:
         """See :func:`drgs.splatting.rasterize.composite_tangent`."""
-        groups = zip(_groups(bins), records, layers.parts, strict=True)
-        return GroupedLayers(
-            tuple(
-                self.order.tangent(
-                    own, rows, part, replace(tangents, features=tangents.features[group])
-                )
-                for (group, own), rows, part in groups
-            )
-        )
+        parts = []
+        for group, own, part in zip(_groups(bins), records, layers.parts, strict=True):
+            direction = replace(tangents, features=[tangents.features[k] for k in group.stored])
+            parts.append(self.order.tangent(_only(group, bins), own, part, direction))
+        return replace(layers, parts=tuple(parts))
 
 
-def _groups(bins: TileBins) -> Iterator[tuple[slice, TileBins]]:
-    """Which features are in each group, and the bins as if there were no others."""
+def _groups(bins: TileBins) -> tuple[FeatureGroup, ...]:
     size = FEATURES_AT_ONCE[dr.itemsize_v(bins.rows.Float)]
-    for start in range(0, bins.num_features, size):
-        end = min(start + size, bins.num_features)
-        yield slice(start, end), replace(bins, num_features=end - start)
+    return tuple(bins.model.features.groups(bins.num_features, size))
+
+
+def _only(group: FeatureGroup, bins: TileBins) -> TileBins:
+    """The bins as if there were no other features."""
+    model = replace(bins.model, features=group.features)
+    return replace(bins, num_features=len(group.stored), model=model)

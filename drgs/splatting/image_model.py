@@ -414,8 +414,21 @@ class AffineResponse:
 # ----------------------------------------------------------------------------------------------
 
 
+@dataclass(frozen=True)
+class FeatureGroup:
+    """Features that one kernel composites, of many."""
+
+    stored: list[int]  # places of the numbers that they need among all that are stored
+    planes: list[int]  # places of their planes among all; one may be of several groups
+    features: Features
+
+
 class Features(Protocol):
     """What is composited of a splat, from the numbers that are stored of it."""
+
+    def groups(self, num_stored: int, size: int) -> list[FeatureGroup]:
+        """Divide the features into groups of about ``size`` planes."""
+        ...
 
     def num_planes(self, num_stored: int) -> int:
         """Planes that come of ``num_stored`` numbers per splat."""
@@ -462,6 +475,21 @@ class Features(Protocol):
 @dataclass(frozen=True)
 class SplatFeatures:
     """A splat's features are the same at every pixel: what is stored is what is composited."""
+
+    def groups(self, num_stored: int, size: int) -> list[FeatureGroup]:
+        """Divide the features into groups of at most ``size`` planes.
+
+        Numbers that are stored for more than their own plane are of the first group, the others
+        are composited as they are.
+        """
+        more, plain = num_stored - self.num_planes(num_stored), SplatFeatures()
+        groups = []
+        for first in range(0, max(num_stored - more, 1), size):
+            planes = list(range(num_stored - more))[first : first + size]
+            stored = [more + plane for plane in planes]
+            groups.append(FeatureGroup(stored, planes, plain))
+        groups[0] = FeatureGroup([*range(more), *groups[0].stored], groups[0].planes, self)
+        return groups
 
     def num_planes(self, num_stored: int) -> int:
         """Planes that come of ``num_stored`` numbers per splat."""

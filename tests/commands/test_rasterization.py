@@ -15,6 +15,7 @@ from support.kernels import float_reductions
 
 import drgs
 from drgs.reference import splatting as reference
+from drgs.splatting.feature_groups import FEATURES_AT_ONCE
 
 GSPLAT = SHARED_DATA / "gsplat_reference"
 INPUTS = ("means", "quats", "scales", "opacities", "colors", "viewmats", "Ks", "backgrounds")
@@ -203,26 +204,27 @@ near to a threshold. Rounding, 1e-16 / 1e-5, and the third derivative, 1e-10 of 
 less than 1e-7."""
 
 
-def tangents_of(arrays, tangents, name):
-    """Tangents of pictures and alphas, numpy."""
-    inputs = tensors(arrays)
-    dr.enable_grad(inputs)
-    dr.set_grad(inputs, tensors(tangents))
+def tangents_of(arrays, tangents, name, fixed=()):
+    """Tangents of pictures and alphas, numpy; fixed: inputs that are not differentiated."""
+    inputs, directions = tensors(arrays), tensors(tangents)
+    for key in inputs.keys() - set(fixed):
+        dr.enable_grad(inputs[key])
+        dr.set_grad(inputs[key], directions[key])
     found = results(inputs, name)
     dr.forward_to(found)
     return [dr.grad(output).numpy() for output in found]
 
 
-def gradients_of(arrays, weights, name):
-    """Of the sum of weighted pictures and alphas, numpy, by input."""
+def gradients_of(arrays, weights, name, fixed=()):
+    """Of the sum of weighted pictures and alphas, numpy, by input that is not fixed."""
     inputs = tensors(arrays)
-    dr.enable_grad(inputs)
+    dr.enable_grad([value for key, value in inputs.items() if key not in fixed])
     found = results(inputs, name)
     for output, weight in zip(found, weights, strict=True):
         dr.set_grad(output, llvm.TensorXf64(weight))
     dr.enqueue(dr.ADMode.Backward, found)
     dr.traverse(dr.ADMode.Backward)
-    return {key: dr.grad(value).numpy() for key, value in inputs.items()}
+    return {key: dr.grad(value).numpy() for key, value in inputs.items() if key not in fixed}
 
 
 def check_tangents_equal_central_differences(arrays, tangents, name):
@@ -251,6 +253,42 @@ def check_gradients_are_the_transpose_of_the_tangents(arrays, tangents, name):
         assert key in unused or np.abs(terms).sum() > 0, key
         # A few hundred roundings of 1e-16 on either way, of terms of both signs.
         assert abs(ahead - terms.sum()) <= 1e-11 * max(np.abs(terms).sum(), 1e-12), key
+
+
+@pytest.mark.parametrize(
+    "options",
+    [{}, {"order": "pixel"}, {"sh_direction": "pixel", "sh_degree": 1}],
+    ids=["center", "pixel order", "pixel colors"],
+)
+def test_groups_of_channels_change_no_picture(monkeypatch, options):
+    """All channels in one kernel, and three at a time; tangents and gradients to rounding."""
+    arrays = dict(scene())
+    if not options.get("sh_degree"):
+        arrays["colors"] = arrays["colors"][:, 0]
+    monkeypatch.setitem(SETTINGS, "groups", {"render_mode": "RGB+D", **options})
+    tangents, rng = direction(arrays), np.random.default_rng(5)
+    fixed = ("viewmats", "Ks") if "sh_direction" in options else ()
+    weights = [rng.normal(0, 1, output.shape) for output in results(arrays, "groups")]
+
+    def found():
+        pictures = results(arrays, "groups")
+        return (
+            pictures,
+            tangents_of(arrays, tangents, "groups", fixed),
+            gradients_of(arrays, weights, "groups", fixed),
+        )
+
+    pictures, ahead, back = found()
+    monkeypatch.setitem(FEATURES_AT_ONCE, 8, 3)
+    grouped, grouped_ahead, grouped_back = found()
+    for a, b in zip(pictures, grouped, strict=True):
+        np.testing.assert_array_equal(a, b)
+    for a, b in zip(ahead, grouped_ahead, strict=True):
+        np.testing.assert_array_equal(a, b)
+    for name, a in back.items():
+        # Sums of a few hundred terms in another order, each rounded to 1e-16.
+        atol = 1e-12 * np.abs(a).max()
+        np.testing.assert_allclose(a, grouped_back[name], rtol=0, atol=atol, err_msg=name)
 
 
 @pytest.mark.parametrize("name", SETTINGS)

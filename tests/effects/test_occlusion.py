@@ -28,7 +28,7 @@ from drgs.core.arrays import from_host
 from drgs.effects.occlusion import OccludedFeatures, Surface
 from drgs.gaussians.parameters import PARAMETER_NAMES
 from drgs.reference.effects import render_with_surface
-from drgs.splatting import rendering
+from drgs.splatting import feature_groups, rendering
 from drgs.splatting.grid import TileGrid
 from drgs.splatting.image_model import DEFAULT
 
@@ -160,6 +160,14 @@ def test_adjoint_is_the_transpose_of_the_tangent(precision, case):
     size = np.sqrt(np.sum(left**2) + sum(np.sum(r**2) for r in right))
     limit = 1e-12 if precision is FLOAT64 else 5e-5
     assert abs(left.sum() - sum(r.sum() for r in right)) <= limit * size
+
+
+def test_a_surface_hides_each_group_of_features(monkeypatch):
+    """Two planes at a time, and the weights in front with each."""
+    monkeypatch.setitem(feature_groups.FEATURES_AT_ONCE, 8, 2)
+    test_planes_are_those_of_the_reference(FLOAT64, CASES[0])
+    test_gradients_equal_differences_of_the_reference(FLOAT64, CASES[0])
+    test_adjoint_is_the_transpose_of_the_tangent(FLOAT64, CASES[0])
 
 
 @pytest.mark.parametrize("approximations", [{"sh_direction": "pixel"}, {"order": "pixel"}], ids=str)
