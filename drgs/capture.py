@@ -52,7 +52,6 @@ from drgs.cli.commands import (
     run_command,
 )
 from drgs.cli.execution import add_variant_argument, select_variant
-from drgs.cli.interrupts import INTERRUPTED_STATUS
 from drgs.cli.progress import RunProgress
 from drgs.core.errors import UserError, one_line
 from drgs.core.files import atomic_path, read_text, remove_stale_temporaries, why_refused
@@ -184,7 +183,7 @@ def _add_cameras(parser: CommandParser) -> None:
 
 
 def run(args: argparse.Namespace) -> None:
-    """Capture what the command line names; end the process with status 130 at a Ctrl-C."""
+    """Capture what the command line names; say at a Ctrl-C that the same command continues."""
     try:
         given = _given(args)
         settings = CaptureSettings(**given)
@@ -206,8 +205,8 @@ def run(args: argparse.Namespace) -> None:
     except OSError as error:
         raise UserError(f"{error.filename or args.out}: {why_refused(error)}") from None
     except KeyboardInterrupt:
-        print("\ninterrupted; the same command continues", file=sys.stderr)
-        sys.exit(INTERRUPTED_STATUS)
+        print("\nthe same command continues", file=sys.stderr)
+        raise
 
 
 def _given(args: argparse.Namespace) -> dict[str, object]:

@@ -62,8 +62,7 @@ class FolderRecord:
         if strangers:
             raise UserError(
                 f"{self.folder}: holds {listed(strangers)}, which this command would replace and "
-                "has not written, or which changed since; choose another folder with --out, or "
-                "move that away"
+                "has not written, or which changed since; move that away, or choose another folder"
             )
 
     def claim(
@@ -134,6 +133,6 @@ def _read(path: Path) -> _Content:
             raise
         raise UserError(
             f"{path}: must be the record of the files that were written here, as the command left "
-            "it; remove it if those files are no longer needed, or choose another folder with --out"
+            "it; remove it if those files are no longer needed, or choose another folder"
         ) from None
     return content
