@@ -92,6 +92,8 @@ def _interrupt_behind(error: BaseException) -> KeyboardInterrupt | None:
 def _exit_interrupted(interrupt: KeyboardInterrupt) -> None:
     for number in (signal.SIGINT, signal.SIGTERM):  # a further one is no error of the clean-up
         signal.signal(number, signal.SIG_DFL)
+    # Where it came within one, as dataclasses use them, CPython ends by SIGINT: this forgets it.
+    exec("")
     is_terminated = isinstance(interrupt, Terminated)
     print("terminated" if is_terminated else "interrupted", file=sys.stderr)
     sys.exit(TERMINATED_STATUS if is_terminated else INTERRUPTED_STATUS)

@@ -116,6 +116,7 @@ def run_in_child(
             with suppress(BrokenPipeError):
                 child.communicate()
     if status < 0:
+        text = text.partition("***")[0]  # where glog's stack trace begins
         name = signal.Signals(-status).name
         raise ChildEndedError(": ".join(filter(None, (name, one_line(text)))))
     raise RuntimeError(f"the child process ended with status {status}:\n{text}")

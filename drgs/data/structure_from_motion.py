@@ -142,7 +142,11 @@ def pictures_in(folder: Path) -> tuple[Path, list[str]]:
         warnings.warn(UserNote(note), stacklevel=2)
     for file in files:
         check_readable(file)  # what a fit refuses is refused before hours of work
-    return pictures, [file.relative_to(pictures).as_posix() for file in files]
+    names = [file.relative_to(pictures).as_posix() for file in files]
+    for name in names:
+        if os.fsencode(name) != name.encode(errors="replace"):
+            raise UserError(f"{pictures / name}: COLMAP knows names in UTF-8 only; rename it")
+    return pictures, names
 
 
 def _as_counted(file: Path) -> list[tuple[int, str]]:
@@ -243,11 +247,18 @@ def _find(
     """Write ``folder/model``: what runs in a process of its own."""
     pycolmap = required("pycolmap", "colmap", "structure from motion")
     pycolmap.logging.minloglevel = 3  # what goes wrong is said below
-    found, count = _Work(pycolmap, folder, pictures, dataset, names, search, watch).model()
-    written = folder / "model"
-    written.mkdir()
-    found.write_binary(written)
-    return _described(found, names, count)
+    try:
+        found, count = _Work(pycolmap, folder, pictures, dataset, names, search, watch).model()
+        written = folder / "model"
+        written.mkdir()
+        found.write_binary(written)
+        return _described(found, names, count)
+    except UserError:
+        raise
+    except (RuntimeError, ValueError) as error:  # pycolmap's, for errors of the user and its own
+        raise UserError(
+            f"{pictures}: structure from motion failed: COLMAP says: {one_line(error, 500)}"
+        ) from None
 
 
 @dataclass
@@ -292,8 +303,7 @@ class _Work:
             for start in range(0, len(group), AT_ONCE):
                 chunk = group[start : start + AT_ONCE]
                 self.watch("photograph", done, len(self.names))
-                _call(
-                    pycolmap.extract_features,
+                pycolmap.extract_features(
                     self.database,
                     self.pictures,
                     image_names=chunk,
@@ -367,7 +377,7 @@ class _Work:
             chunk = pairs[start : start + PAIRS_AT_ONCE]
             self.watch("pair of photographs", start, len(pairs))
             listing.write_text("".join(f"{a} {b}\n" for a, b in chunk))
-            _call(pycolmap.match_image_pairs, self.database, pairing_options=options)
+            pycolmap.match_image_pairs(self.database, pairing_options=options)
         self.watch("pair of photographs", len(pairs), len(pairs))
         self._rename(lambda index: self.names[index])
 
@@ -403,8 +413,7 @@ class _Work:
             placed = min(placed + 1, len(self.names))
             self.watch("camera", placed, len(self.names))
 
-        found = _call(
-            self.pycolmap.incremental_mapping,
+        found = self.pycolmap.incremental_mapping(
             self.database,
             self.pictures,
             self.folder / "models",
@@ -436,16 +445,6 @@ class _Work:
 
 
 FEW_FEATURES = 100
-
-
-def _call(step: Callable, *args: object, **options: object) -> Any:
-    """``step(*args, **options)`` of COLMAP, whose errors become :class:`UserError`."""
-    try:
-        return step(*args, **options)
-    except Exception as error:  # pycolmap raises many types
-        raise UserError(
-            f"structure from motion failed: COLMAP says: {one_line(error, 500)}"
-        ) from None
 
 
 def _taken_with(file: Path) -> tuple[object, ...]:

@@ -145,12 +145,15 @@ def test_without_pycolmap_one_line_says_what_to_install(tmp_path, monkeypatch):
     assert "\n" not in str(error.value)
 
 
-def test_what_colmap_refuses_is_said_in_one_line():
-    def step():
+def test_what_colmap_refuses_is_said_in_one_line(tmp_path, monkeypatch):
+    pytest.importorskip("pycolmap")
+
+    def refuse(self):
         raise RuntimeError("[reader.cc:1]\nno such image")
 
+    monkeypatch.setattr(sfm._Work, "model", refuse)
     with pytest.raises(UserError, match=r"COLMAP says: \[reader.cc:1\] no such image$"):
-        sfm._call(step)
+        sfm._find(Search(), tmp_path, tmp_path, [], tmp_path, said)
 
 
 # ----------------------------------------------------------------------------------------------
@@ -335,6 +338,13 @@ def test_names_are_in_the_order_of_their_numbers(tmp_path):
     assert pictures == tmp_path / "images" and names == ["1.JPG", "2.png", "10.png", "b/3.png"]
     (tmp_path / "images" / "10.png").write_bytes(b"not a picture")
     with pytest.raises(UserError, match=r"10\.png: cannot read the image"):
+        pictures_in(tmp_path)
+
+
+def test_a_name_that_colmap_cannot_hold_is_refused(tmp_path):
+    Image.new("RGB", (8, 8)).save(tmp_path / "a.png")
+    (tmp_path / "a.png").rename(tmp_path / "a\udcff.png")
+    with pytest.raises(UserError, match=r"COLMAP knows names in UTF-8 only; rename it"):
         pictures_in(tmp_path)
 
 
