@@ -15,7 +15,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 from drgs.core.errors import UserError, listed
-from drgs.core.files import atomic_path, open_regular, read_text
+from drgs.core.files import atomic_path, open_regular, read_text, remove_temporaries_of
 
 MAX_BYTES = 1 << 26
 """Of a record: 67 MB, two hundred bytes for each of a third of a million files."""
@@ -71,12 +71,13 @@ class FolderRecord:
         paths: Mapping[str, str] | None = None,
         earlier: Collection[str] = (),
     ) -> None:
-        """Note that the files ``names`` are written from now on.
+        """Note that the files ``names`` are written from now on; remove half-written ones.
 
         paths: kept besides, see :attr:`paths`; earlier: as for :meth:`check`, which comes first.
         """
         names = list(names)
         self.check(names, earlier)
+        remove_temporaries_of(self.folder, [*names, self.path.name])
         known = self._content.files if self.exists else dict.fromkeys(earlier)
         claimed = {**known, **dict.fromkeys(names)}
         self._write(_Content(files=claimed, paths={**self.paths, **(paths or {})}))

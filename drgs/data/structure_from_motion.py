@@ -26,7 +26,7 @@ from PIL import ExifTags, Image
 from drgs.core.child_process import ChildEndedError, DeferredInterrupts, run_in_child
 from drgs.core.errors import UserError, UserNote, listed, one_line
 from drgs.core.extras import required
-from drgs.core.files import remove_stale_temporaries, why_refused
+from drgs.core.files import why_refused
 from drgs.core.locks import sole_writer
 from drgs.core.records import FolderRecord
 from drgs.data.colmap import LENSES, mask_of, model_folder
@@ -70,6 +70,9 @@ TEMPORARY = ".drgs-poses-"
 """Names of folders begin so that are removed in the end, or by the next run."""
 
 SEED = 0
+
+REMEDY = "if memory or the disk is full, free some of it, or take fewer or smaller photographs"
+"""Where COLMAP gives up: it does not always tell the reason."""
 
 Watch = Callable[[str, int, int], None]
 """Is called with what is counted, how many are done, and of how many."""
@@ -183,8 +186,7 @@ def place(folder: Path, search: Search, replace: bool, watch: Watch) -> Placed:
             raise UserError(f"{model}: cannot write the model: {why_refused(error)}") from None
         except ChildEndedError as error:
             raise UserError(
-                f"{pictures}: structure from motion was ended: {error}; where that is for want of "
-                "memory, take fewer or smaller photographs"
+                f"{pictures}: structure from motion was ended: {error}; {REMEDY}"
             ) from None
     return found
 
@@ -216,7 +218,6 @@ def _remove_left_behind(folder: Path, model: Path) -> None:
     for path in (folder, model.parent, model):
         for left in path.glob(f"{TEMPORARY}*"):
             shutil.rmtree(left, ignore_errors=True)
-    remove_stale_temporaries(model)
 
 
 def _put(written: Path, model: Path) -> None:
@@ -257,7 +258,8 @@ def _find(
         raise
     except (RuntimeError, ValueError) as error:  # pycolmap's, for errors of the user and its own
         raise UserError(
-            f"{pictures}: structure from motion failed: COLMAP says: {one_line(error, 500)}"
+            f"{pictures}: structure from motion failed: COLMAP says: {one_line(error, 500)}; "
+            f"{REMEDY}"
         ) from None
 
 
