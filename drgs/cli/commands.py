@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import NamedTuple, NoReturn
 
 from drgs.cli.errors import USER_ERROR_STATUS, exit_on_user_error
-from drgs.cli.interrupts import exit_on_interrupt
+from drgs.cli.interrupts import exit_on_interrupt, importing
 from drgs.cli.output import notes_printed, printable_anywhere
 from drgs.core.constants import MAX_INT
 from drgs.core.errors import did_you_mean, one_line
@@ -107,7 +107,8 @@ def run_command(
     ):
         parser = CommandParser(prog=prog)
         add_arguments(parser)
-        args = parser.parse_args(arguments)
+        with importing():
+            args = parser.parse_args(arguments)
         words = sys.argv[1:] if arguments is None else arguments
         args.command = shlex.join([*prog.split(), *words])
         args.run(args)

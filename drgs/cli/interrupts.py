@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import sys
 import threading
@@ -72,6 +73,31 @@ def exit_on_interrupt() -> Iterator[None]:
     finally:
         if is_taken:
             signal.signal(signal.SIGTERM, previous)
+
+
+@contextmanager
+def importing() -> Iterator[None]:
+    """Around imports within a command: Ctrl-C and SIGTERM end the process at once.
+
+    Extension modules may abort, or hide what was raised, where it is raised while they are
+    imported. To be used where nothing is being written.
+    """
+    handlers = {signal.SIGINT: signal.default_int_handler, signal.SIGTERM: _terminate}
+    taken = {n: h for n, h in handlers.items() if signal.getsignal(n) == h}
+    if threading.current_thread() is not threading.main_thread():
+        taken = {}
+    try:
+        for number in taken:
+            signal.signal(number, _end_at_once)
+        yield
+    finally:
+        for number, handler in taken.items():
+            signal.signal(number, handler)
+
+
+def _end_at_once(number: int, frame: FrameType | None) -> None:
+    os.write(2, b"interrupted\n" if number == signal.SIGINT else b"terminated\n")
+    os._exit(INTERRUPTED_STATUS if number == signal.SIGINT else TERMINATED_STATUS)
 
 
 def _terminate(number: int, frame: FrameType | None) -> None:

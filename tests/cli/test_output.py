@@ -175,17 +175,32 @@ def test_sigterm_ends_a_command_as_ctrl_c_does(tmp_path):
     assert signal.getsignal(signal.SIGTERM) == before and not list(tmp_path.iterdir())
 
 
-def test_an_interrupt_within_an_import_ends_a_process_with_its_status():
-    """CPython would end by SIGINT where one came within an ``exec``, as dataclasses use it."""
-    program = (
-        "import signal\n"
-        "from drgs.cli.interrupts import exit_on_interrupt\n"
-        "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
-        "with exit_on_interrupt():\n"
-        "    exec('signal.raise_signal(signal.SIGINT)')\n"
-    )
+def ended_process(*lines):
+    """Status and standard error output of a process that does this within a command."""
+    program = "\n".join([
+        "import signal",
+        "from drgs.cli.interrupts import exit_on_interrupt, importing",
+        "signal.signal(signal.SIGINT, signal.default_int_handler)",
+        "with exit_on_interrupt():",
+        *(f"    {line}" for line in lines),
+    ])  # fmt: skip
     ended = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
-    assert (ended.returncode, ended.stderr) == (130, "interrupted\n")
+    return ended.returncode, ended.stderr
+
+
+def test_an_interrupt_within_an_exec_ends_a_process_with_its_status():
+    """CPython would end by SIGINT then; dataclasses are made so, while modules are imported."""
+    act = "exec('signal.raise_signal(signal.SIGINT)')"
+    assert ended_process(act) == (130, "interrupted\n")
+
+
+@pytest.mark.parametrize(
+    ("name", "expected"), [("SIGINT", (130, "interrupted\n")), ("SIGTERM", (143, "terminated\n"))]
+)
+def test_a_signal_within_an_import_ends_a_process_at_once(name, expected):
+    """Modules may hide what is raised."""
+    lines = "with importing():", "  try:", f"    signal.raise_signal(signal.{name})"
+    assert ended_process(*lines, "  except BaseException:", "    pass") == expected
 
 
 def test_other_errors_keep_their_tracebacks():
