@@ -167,9 +167,9 @@ def place(folder: Path, search: Search, replace: bool, watch: Watch) -> Placed:
     Raises :class:`UserError`, with what to do, where no cameras are found, where a model is there
     that is not to be replaced, and while another process writes to ``folder``.
     """
+    pictures, names = pictures_in(folder)
+    model = folder / "sparse" / "0"
     with DeferredInterrupts() as interrupts, sole_writer(folder) as keep:
-        pictures, names = pictures_in(folder)
-        model = folder / "sparse" / "0"
         _check_free(folder, model, replace)
         try:
             if keep():
