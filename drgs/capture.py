@@ -35,7 +35,7 @@ import json
 import math
 import shlex
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, fields
 from pathlib import Path
 
@@ -52,10 +52,10 @@ from drgs.cli.commands import (
     run_command,
 )
 from drgs.cli.execution import add_variant_argument, select_variant
-from drgs.cli.interrupts import INTERRUPTED_STATUS
 from drgs.cli.progress import RunProgress
 from drgs.core.errors import UserError, one_line
 from drgs.core.files import atomic_path, read_text, remove_stale_temporaries, why_refused
+from drgs.core.locks import sole_writer
 from drgs.core.memory import why_too_large
 from drgs.data.path_tracing import (
     LIMITS,
@@ -184,7 +184,7 @@ def _add_cameras(parser: CommandParser) -> None:
 
 
 def run(args: argparse.Namespace) -> None:
-    """Capture what the command line names; end the process with status 130 at a Ctrl-C."""
+    """Capture what the command line names; say at a Ctrl-C that the same command continues."""
     try:
         given = _given(args)
         settings = CaptureSettings(**given)
@@ -199,15 +199,23 @@ def run(args: argparse.Namespace) -> None:
         views = views_of(scene, settings)
         require_sight(scene, settings, views)
         wanted = manifest(args.scene, settings)
-        check_folder(args.out, wanted)
-        print(described(settings, len(views)))
-        take_pictures(scene, settings, views, args.out, wanted)
-        write_dataset(scene, settings, views, args.out)
+        with sole_writer(args.out) as keep:
+            check_folder(args.out, wanted)
+            print(described(settings, len(views)))
+
+            def claim() -> None:
+                keep()
+                claim_folder(args.out, wanted)
+
+            take_pictures(scene, settings, views, args.out, claim)
+            write_dataset(scene, settings, views, args.out)
+    except BrokenPipeError:  # of the output, whose reader has gone
+        raise
     except OSError as error:
         raise UserError(f"{error.filename or args.out}: {why_refused(error)}") from None
     except KeyboardInterrupt:
-        print("\ninterrupted; the same command continues", file=sys.stderr)
-        sys.exit(INTERRUPTED_STATUS)
+        print("\nthe same command continues", file=sys.stderr)
+        raise
 
 
 def _given(args: argparse.Namespace) -> dict[str, object]:
@@ -261,11 +269,11 @@ def take_pictures(
     settings: CaptureSettings,
     views: list[CaptureView],
     out: Path,
-    wanted: dict[str, object],
+    claim: Callable[[], None],
 ) -> None:
     """Take the pictures that are not in ``out`` yet; say so where most show nothing.
 
-    wanted: see :func:`manifest`. The folder is claimed when the first picture is taken: until then
+    claim: makes the folder this capture's. It is called when the first picture is taken: until then
     the scene may turn out to be one that cannot be captured.
     """
     camera = CaptureCamera(scene, settings)
@@ -275,12 +283,12 @@ def take_pictures(
         print(f"{there} of {len(views)} pictures are there already")
     shown = []
     if not missing:
-        claim_folder(out, wanted)
+        claim()
     with RunProgress("picture", len(views), there) as progress:
         for done, view in enumerate(missing, there + 1):
             picture = camera.picture(view)
             if not shown:
-                claim_folder(out, wanted)
+                claim()
             write_png(picture_path(out, view), picture)
             shown.append(shows_something(picture))
             if len(shown) == min(FIRST, len(missing)) and sum(shown) < len(shown) / 2:

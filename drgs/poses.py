@@ -7,6 +7,9 @@ Photographs are of something that does not move, from many places around it or a
 showing most of what its neighbours show. Where FOLDER/masks holds pictures ``a.jpg.png``, or
 ``a.png``, of the photographs ``a.jpg``, what is black in them is left out of the search.
 
+Files in FOLDER/sparse/0 that this command has not written stay; where they are in its way, it does
+not begin. Of two runs in one folder, the second is refused.
+
 Needs pycolmap, which the extra ``colmap`` installs.
 """
 
@@ -72,7 +75,7 @@ def add_arguments(parser: CommandParser) -> None:
         f"frames of a video; auto: all of up to {ALL_PAIRS} photographs (default: %(default)s)",
     )
     parser.add_argument(
-        "--overwrite", action="store_true", help="replace the model that the folder holds"
+        "--overwrite", action="store_true", help="replace the model that an earlier run wrote"
     )
     parser.set_defaults(run=run, prog=parser.prog)
 

@@ -105,6 +105,7 @@ class Model:
     folder: Path | None = None  # where they are, perhaps with refined cameras beside them
     said: Collection[str] = ()  # names of the settings that their file has decided
     render: Render = render_views
+    keep: Callable[[], object] = lambda: None  # the output folder: see ``sealing``
 
     def scene(self) -> mi.Scene:
         """A Mitsuba scene that renders in display space."""
@@ -125,7 +126,7 @@ class Model:
         scene = self.scene()
         print(described(summary_of_views(scene.integrator(), views, self.said)), flush=True)
         names = [*(f"{view.name}.png" for view in views), *others]
-        return claiming(out, names, self.render(scene, views))
+        return claiming(out, names, self.render(scene, views), self.keep)
 
     def dataset(self, option: str) -> Dataset:
         """The photographs, without which ``option`` is impossible."""
@@ -263,13 +264,13 @@ def run(args: argparse.Namespace) -> None:
 
 def run_with(args: argparse.Namespace, render: Render) -> None:
     """The command; render: renders views, here or elsewhere."""
-    with executing(args.threads, args.debug), sealing(args.out):
+    with executing(args.threads, args.debug), sealing(args.out) as keep:
         _check(args)
         select_variant(args.variant)
         if args.what.suffix.lower() == ".xml":
-            render_mitsuba_scene(args.what, args.out, dict(args.define or ()))
+            render_mitsuba_scene(args.what, args.out, dict(args.define or ()), keep)
         else:
-            model = replace(load_model(args), render=render)
+            model = replace(load_model(args), render=render, keep=keep)
             if model.config is not None:
                 refuse_photographs(args.out, model.config.data.path)
             if args.orbit is not None:
@@ -411,10 +412,13 @@ def viewpoints_of(args: argparse.Namespace, model: Model) -> list[Viewpoint]:
     return [view.moved(-np.array(origin)) for view in views]
 
 
-def render_mitsuba_scene(path: Path, out: Path, definitions: dict[str, str]) -> None:
+def render_mitsuba_scene(
+    path: Path, out: Path, definitions: dict[str, str], keep: Callable[[], object]
+) -> None:
     """Render every sensor of a Mitsuba scene with the scene's own integrator.
 
-    definitions: values for the parameters ($name) of the scene file.
+    definitions: values for the parameters ($name) of the scene file; keep: see
+    :func:`drgs.results.pictures.claiming`.
 
     The EXR holds all channels as the film has them, the PNG the colours alone, sRGB-encoded. What
     a ``splats`` integrator with ``srgb_primitives`` false returns is display space already, also
@@ -433,7 +437,7 @@ def render_mitsuba_scene(path: Path, out: Path, definitions: dict[str, str]) -> 
     stem = shortened(path.stem)
     names = [stem if count == 1 else f"{stem}_{index}" for index in range(count)]
     files = [f"{name}.{suffix}" for name in names for suffix in ("exr", "png")]
-    bitmaps = claiming(out, files, _bitmaps(path, scene))
+    bitmaps = claiming(out, files, _bitmaps(path, scene), keep)
     for name, bitmap in zip(names, bitmaps, strict=True):
         width, height = bitmap.size()
         write_exr(out / f"{name}.exr", bitmap)

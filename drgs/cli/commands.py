@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import NamedTuple, NoReturn
 
 from drgs.cli.errors import exit_on_user_error
-from drgs.cli.interrupts import exit_on_interrupt
+from drgs.cli.interrupts import exit_on_interrupt, importing
 from drgs.cli.output import notes_printed, printable_anywhere
 from drgs.core.constants import MAX_INT
 from drgs.core.errors import UserError, did_you_mean, one_line
@@ -109,7 +109,8 @@ def run_command(
         parser = CommandParser(prog=prog)
         parser.set_defaults(is_shared=False)
         add_arguments(parser)
-        args = parser.parse_args(arguments)
+        with importing():
+            args = parser.parse_args(arguments)
         words = sys.argv[1:] if arguments is None else arguments
         args.command = shlex.join([*prog.split(), *words])
         if not args.is_shared and (process_count() or 1) > 1:

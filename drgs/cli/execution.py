@@ -16,6 +16,7 @@ import drjit as dr
 import mitsuba as mi
 
 from drgs.cli.commands import at_least
+from drgs.cli.interrupts import importing
 from drgs.core.denormals import denormals_flushed
 from drgs.core.errors import UserError, one_line
 
@@ -62,7 +63,8 @@ def add_variant_argument(
 def select_variant(name: str) -> None:
     """Make ``name`` the active Mitsuba variant; :class:`UserError` where it cannot be used."""
     try:
-        mi.set_variant(name)
+        with importing():
+            mi.set_variant(name)
     except ImportError as error:
         raise UserError(f"--variant {name}: not usable here: {one_line(error)}") from None
 

@@ -12,7 +12,7 @@ import os
 import re
 import stat
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO, TYPE_CHECKING
@@ -175,7 +175,7 @@ def _check_sizes(file: IO[bytes]) -> None:
                 raise ValueError(f"{part.filename} is not as large as its header claims")
 
 
-_TEMPORARY_NAME = re.compile(r"\..*\.\d+\.tmp(\.[^.]*)?")
+_TEMPORARY_NAME = re.compile(r"\.(.*)\.(\d+)\.tmp(\.[^.]*)?")
 """Names that :func:`atomic_path` makes: .STEM.PROCESS.tmp.SUFFIX."""
 
 
@@ -208,6 +208,32 @@ def remove_stale_temporaries(folder: Path) -> None:
         if is_temporary(path.name):
             with suppress(OSError):
                 path.unlink()
+
+
+def remove_temporaries_of(folder: Path, names: Iterable[str]) -> None:
+    """Remove what writers of the files ``names`` that were killed have left behind in ``folder``.
+
+    Those that still run keep theirs, and so do writers of other files.
+    """
+    wanted = {(shortened(path.stem), path.suffix) for path in map(Path, names)}
+    for path in folder.glob(".*.tmp*"):
+        found = _TEMPORARY_NAME.fullmatch(path.name)
+        if found and (found[1], found[3] or "") in wanted and not _is_running(int(found[2])):
+            with suppress(OSError):
+                path.unlink()
+
+
+def _is_running(process: int) -> bool:
+    """Whether there is a process of this number on this machine; where that is not known, yes."""
+    if os.name != "posix":  # where signal 0 is Ctrl-C
+        return True
+    try:
+        os.kill(process, 0)
+    except (ProcessLookupError, OverflowError):
+        return False
+    except PermissionError:  # of another user
+        pass
+    return True
 
 
 def is_temporary(name: str) -> bool:

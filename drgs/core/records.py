@@ -15,7 +15,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 from drgs.core.errors import UserError, listed
-from drgs.core.files import atomic_path, open_regular, read_text
+from drgs.core.files import atomic_path, open_regular, read_text, remove_temporaries_of
 
 MAX_BYTES = 1 << 26
 """Of a record: 67 MB, two hundred bytes for each of a third of a million files."""
@@ -62,8 +62,7 @@ class FolderRecord:
         if strangers:
             raise UserError(
                 f"{self.folder}: holds {listed(strangers)}, which this command would replace and "
-                "has not written, or which changed since; choose another folder with --out, or "
-                "move that away"
+                "has not written, or which changed since; move that away, or choose another folder"
             )
 
     def claim(
@@ -72,12 +71,13 @@ class FolderRecord:
         paths: Mapping[str, str] | None = None,
         earlier: Collection[str] = (),
     ) -> None:
-        """Note that the files ``names`` are written from now on.
+        """Note that the files ``names`` are written from now on; remove half-written ones.
 
         paths: kept besides, see :attr:`paths`; earlier: as for :meth:`check`, which comes first.
         """
         names = list(names)
         self.check(names, earlier)
+        remove_temporaries_of(self.folder, [*names, self.path.name])
         known = self._content.files if self.exists else dict.fromkeys(earlier)
         claimed = {**known, **dict.fromkeys(names)}
         self._write(_Content(files=claimed, paths={**self.paths, **(paths or {})}))
@@ -134,6 +134,6 @@ def _read(path: Path) -> _Content:
             raise
         raise UserError(
             f"{path}: must be the record of the files that were written here, as the command left "
-            "it; remove it if those files are no longer needed, or choose another folder with --out"
+            "it; remove it if those files are no longer needed, or choose another folder"
         ) from None
     return content

@@ -55,6 +55,12 @@ def masks_of(
     return chosen
 
 
+def without_masks(files: Sequence[Path]) -> list[Path]:
+    """The files that are not called as the mask of another one of them."""
+    keys = {key(file.as_posix()) for file in files for key in (key_of, _key)}
+    return [file for file in files if _without_ending(_key(file.as_posix())) not in keys]
+
+
 def _marked_beside(pictures: Path, names: Sequence[str]) -> list[Path]:
     """Files beside photographs that are called as masks, and are no photographs themselves."""
     folders = {(pictures / name).parent for name in names}

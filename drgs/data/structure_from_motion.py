@@ -1,8 +1,8 @@
 """Where photographs were taken: structure from motion, by COLMAP.
 
 COLMAP (Schoenberger and Frahm 2016) finds features in each photograph, matches them between pairs
-of photographs, and puts together cameras and points from there. It runs within this process
-through pycolmap, which is imported when it is called.
+of photographs, and puts together cameras and points from there. It runs through pycolmap, in a
+process of its own: there, neither Ctrl-C nor what it may abort for can take this one with it.
 """
 
 from __future__ import annotations
@@ -10,8 +10,8 @@ from __future__ import annotations
 import os
 import re
 import shlex
+import shutil
 import tempfile
-import threading
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -20,16 +20,20 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+import numpy as np
 from PIL import ExifTags, Image
 
+from drgs.core.child_process import ChildEndedError, DeferredInterrupts, run_in_child
 from drgs.core.errors import UserError, UserNote, listed, one_line
 from drgs.core.extras import required
 from drgs.core.files import why_refused
+from drgs.core.locks import sole_writer
+from drgs.core.records import FolderRecord
 from drgs.data.colmap import LENSES, model_folder
-from drgs.data.images import pixels_that_count
-from drgs.data.mask_names import masks_of
+from drgs.data.images import read_mask
+from drgs.data.mask_names import masks_of, without_masks
 from drgs.data.recognition import folders_of_pictures, has_colmap_model, is_picture
-from drgs.io.pictures import check_readable, image_size
+from drgs.io.pictures import check_readable, image_size, write_png
 
 CAMERA_MODELS = tuple(LENSES)
 """Those that can be looked for: all that can be rendered."""
@@ -58,10 +62,18 @@ MAX_SIDE = 3200
 LEAST_PLACED = 3
 """Photographs with which there is a model at all."""
 
-POLL_SECONDS = 0.1
-"""How soon Ctrl-C is noticed."""
+COMMAND = "poses"
+
+MODEL_FILES = ("cameras.bin", "frames.bin", "points3D.bin", "rigs.bin", "images.bin")
+"""In the order in which they are put in place: without the last there is no model."""
+
+TEMPORARY = ".drgs-poses-"
+"""Names of folders begin so that are removed in the end, or by the next run."""
 
 SEED = 0
+
+REMEDY = "if memory or the disk is full, free some of it, or take fewer or smaller photographs"
+"""Where COLMAP gives up: it does not always tell the reason."""
 
 Watch = Callable[[str, int, int], None]
 """Is called with what is counted, how many are done, and of how many."""
@@ -117,7 +129,7 @@ def pictures_in(folder: Path) -> tuple[Path, list[str]]:
             found = [pictures / name for name in os.listdir(pictures)]
     except OSError as error:
         raise UserError(f"{folder}: cannot open the folder: {error.strerror or error}") from None
-    found = [path for path in found if is_picture(path.name) and path.is_file()]
+    found = without_masks([p for p in found if is_picture(p.name) and p.is_file()])
     found.sort(key=_as_counted)
     files = [path for path in found if path.suffix.lower() in READ]
     others = [path.relative_to(pictures) for path in found if path.suffix.lower() not in READ]
@@ -134,7 +146,11 @@ def pictures_in(folder: Path) -> tuple[Path, list[str]]:
         warnings.warn(UserNote(note), stacklevel=2)
     for file in files:
         check_readable(file)  # what a fit refuses is refused before hours of work
-    return pictures, [file.relative_to(pictures).as_posix() for file in files]
+    names = [file.relative_to(pictures).as_posix() for file in files]
+    for name in names:
+        if os.fsencode(name) != name.encode(errors="replace"):
+            raise UserError(f"{pictures / name}: COLMAP knows names in UTF-8 only; rename it")
+    return pictures, names
 
 
 def _as_counted(file: Path) -> list[tuple[int, str]]:
@@ -146,50 +162,106 @@ def _as_counted(file: Path) -> list[tuple[int, str]]:
 def place(folder: Path, search: Search, replace: bool, watch: Watch) -> Placed:
     """Write ``folder/sparse/0``, COLMAP's model of the photographs in ``folder``.
 
-    replace: the model that is there. Nothing is written where none is found.
+    replace: the model that is there, if it was written here. Nothing is written where none is
+    found, and other files in that folder stay.
 
-    Raises :class:`UserError`, with what to do, where no cameras are found, or where a model is
-    there that is not to be replaced.
+    Raises :class:`UserError`, with what to do, where no cameras are found, where a model is there
+    that is not to be replaced, and while another process writes to ``folder``.
     """
-    pycolmap = required("pycolmap", "colmap", "structure from motion")
     pictures, names = pictures_in(folder)
     model = folder / "sparse" / "0"
-    if not replace:
-        _check_free(folder, model)
+    with DeferredInterrupts() as interrupts, sole_writer(folder) as keep:
+        _check_free(folder, model, replace)
+        try:
+            if keep():
+                _remove_left_behind(folder, model)
+            with tempfile.TemporaryDirectory(prefix=TEMPORARY, dir=_place_of(model)) as temporary:
+                found = run_in_child(
+                    _find, search, pictures, folder, names, Path(temporary),
+                    watch=watch, interrupts=interrupts,
+                )  # fmt: skip
+                _put(Path(temporary, "model"), model)
+        except BrokenPipeError:  # of the output, whose reader has gone
+            raise
+        except OSError as error:
+            raise UserError(f"{model}: cannot write the model: {why_refused(error)}") from None
+        except ChildEndedError as error:
+            raise UserError(
+                f"{pictures}: structure from motion was ended: {error}; {REMEDY}"
+            ) from None
+    return found
+
+
+def _check_free(folder: Path, model: Path, replace: bool) -> None:
+    """Raise :class:`UserError` where a model is there, or files that are not to be replaced."""
+    for path in (model.parent, model):
+        if os.path.lexists(path) and not path.is_dir():
+            raise UserError(f"{path}: must be a folder, got something else; move it away")
+    record = FolderRecord(model, COMMAND)
+    if not replace and has_colmap_model(folder):
+        there = model_folder(folder)
+        does = f"--overwrite writes {model}, which is then used instead"
+        if there == model:
+            is_own = not record.strangers(MODEL_FILES)
+            does = "--overwrite replaces it" if is_own else "for another, move it away"
+        fit = shlex.join(["drgs", "fit", str(folder)])
+        raise UserError(f"{there}: is there already; {fit} uses it, {does}")
+    record.check(MODEL_FILES)
+
+
+def _place_of(model: Path) -> Path:
+    """The folder for temporary files: the one to which they are moved, or the next above it."""
+    return next(path for path in (model, *model.parents) if path.is_dir())
+
+
+def _remove_left_behind(folder: Path, model: Path) -> None:
+    """Remove temporary files of runs that were killed; to be called by the only writer."""
+    for path in (folder, model.parent, model):
+        for left in path.glob(f"{TEMPORARY}*"):
+            shutil.rmtree(left, ignore_errors=True)
+
+
+def _put(written: Path, model: Path) -> None:
+    """Move the files of a model to their place, where an earlier one is replaced.
+
+    Before the first of them is in place the last one is gone: there is no mixture of two models.
+    """
+    record = FolderRecord(model, COMMAND)
+    record.claim(MODEL_FILES)
+    (model / MODEL_FILES[-1]).unlink(missing_ok=True)
+    for name in MODEL_FILES:
+        (written / name).replace(model / name)
+    record.seal()
+    if stale := sorted(path.name for path in model.glob("*.txt") if path.stem in _STEMS):
+        note = (
+            f"{model}: {listed(stale)} of another model stay there; what reads both takes the "
+            "binary files, which are new"
+        )
+        warnings.warn(UserNote(note), stacklevel=2)
+
+
+_STEMS = frozenset(Path(name).stem for name in MODEL_FILES)
+
+
+def _find(
+    search: Search, pictures: Path, dataset: Path, names: Sequence[str], folder: Path, watch: Watch
+) -> Placed:
+    """Write ``folder/model``: what runs in a process of its own."""
+    pycolmap = required("pycolmap", "colmap", "structure from motion")
     pycolmap.logging.minloglevel = 3  # what goes wrong is said below
     try:
-        with tempfile.TemporaryDirectory(prefix=".poses-", dir=folder) as temporary:
-            work = _Work(pycolmap, Path(temporary), pictures, folder, names, search, watch)
-            found, count = work.model()
-            written = Path(temporary, "model")
-            written.mkdir()
-            found.write_binary(written)
-            _put(written, model, Path(temporary))
-    except OSError as error:
-        raise UserError(f"{model}: cannot write the model: {why_refused(error)}") from None
-    return _described(found, names, count)
-
-
-def _check_free(folder: Path, model: Path) -> None:
-    """Raise :class:`UserError` where ``folder`` has a model, or ``model`` holds something else."""
-    fit = shlex.join(["drgs", "fit", str(folder)])
-    if has_colmap_model(folder):
-        there = model_folder(folder)
-        does = "replaces it" if there == model else f"writes {model}, which is then used instead"
-        raise UserError(f"{there}: is there already; {fit} uses it, --overwrite {does}")
-    if model.exists() and (not model.is_dir() or any(model.iterdir())):
+        found, count = _Work(pycolmap, folder, pictures, dataset, names, search, watch).model()
+        written = folder / "model"
+        written.mkdir()
+        found.write_binary(written)
+        return _described(found, names, count)
+    except UserError:
+        raise
+    except (RuntimeError, ValueError) as error:  # pycolmap's, for errors of the user and its own
         raise UserError(
-            f"{model}: is there already, and holds no model that can be read; move it away, or "
-            "have it replaced by --overwrite"
-        )
-
-
-def _put(written: Path, model: Path, temporary: Path) -> None:
-    """Move a folder to its place; what is there is removed with ``temporary``."""
-    model.parent.mkdir(exist_ok=True)
-    if model.exists():
-        model.rename(temporary / "former")
-    written.rename(model)
+            f"{pictures}: structure from motion failed: COLMAP says: {one_line(error, 500)}; "
+            f"{REMEDY}"
+        ) from None
 
 
 @dataclass
@@ -234,9 +306,7 @@ class _Work:
             for start in range(0, len(group), AT_ONCE):
                 chunk = group[start : start + AT_ONCE]
                 self.watch("photograph", done, len(self.names))
-                _until_done(
-                    pycolmap,
-                    pycolmap.extract_features,
+                pycolmap.extract_features(
                     self.database,
                     self.pictures,
                     image_names=chunk,
@@ -278,7 +348,8 @@ class _Work:
     def _masks_for_all(self) -> Path | None:
         """A folder with a mask for each photograph, white for those without; None: there are none.
 
-        COLMAP leaves out photographs whose mask is missing.
+        Of the photographs' sizes, as a fit reads them. COLMAP leaves out photographs whose mask is
+        missing.
         """
         given = dict(
             zip(self.names, masks_of(self.dataset, self.names, [], self.pictures), strict=True)
@@ -289,10 +360,11 @@ class _Work:
         for name in self.names:
             target = folder / f"{name}.png"
             target.parent.mkdir(parents=True, exist_ok=True)
-            if (mask := given[name]) is not None:
-                Image.fromarray(pixels_that_count(mask)).convert("L").save(target)
-            else:
-                Image.new("L", image_size(self.pictures / name), 255).save(target)
+            width, height = image_size(self.pictures / name)
+            mask = np.ones((height, width), np.float32)
+            if (file := given[name]) is not None:
+                mask = read_mask(file, (width, height))
+            write_png(target, mask)
         return folder
 
     def _match(self) -> None:
@@ -310,9 +382,7 @@ class _Work:
             chunk = pairs[start : start + PAIRS_AT_ONCE]
             self.watch("pair of photographs", start, len(pairs))
             listing.write_text("".join(f"{a} {b}\n" for a, b in chunk))
-            _until_done(
-                pycolmap, pycolmap.match_image_pairs, self.database, pairing_options=options
-            )
+            pycolmap.match_image_pairs(self.database, pairing_options=options)
         self.watch("pair of photographs", len(pairs), len(pairs))
         self._rename(lambda index: self.names[index])
 
@@ -348,9 +418,7 @@ class _Work:
             placed = min(placed + 1, len(self.names))
             self.watch("camera", placed, len(self.names))
 
-        found = _until_done(
-            self.pycolmap,
-            self.pycolmap.incremental_mapping,
+        found = self.pycolmap.incremental_mapping(
             self.database,
             self.pictures,
             self.folder / "models",
@@ -382,36 +450,6 @@ class _Work:
 
 
 FEW_FEATURES = 100
-
-
-def _until_done(pycolmap: ModuleType, step: Callable, *args: object, **options: object) -> Any:
-    """``step(*args, **options)``, which Ctrl-C ends.
-
-    COLMAP gives no room to Python's handlers of signals: it runs in a thread beside them.
-    """
-    token = pycolmap.CancellationToken()
-    result: list[Any] = []
-    errors: list[Exception] = []
-
-    def work() -> None:
-        try:
-            result.append(step(*args, cancellation_token=token, **options))
-        except Exception as error:
-            errors.append(error)
-
-    thread = threading.Thread(target=work)
-    try:
-        thread.start()
-        while thread.is_alive():
-            thread.join(POLL_SECONDS)
-    except BaseException:
-        token.cancel()
-        if thread.ident is not None:
-            thread.join()
-        raise
-    if errors:
-        raise UserError(f"structure from motion failed: COLMAP says: {one_line(errors[0], 500)}")
-    return result[0]
 
 
 def _taken_with(file: Path) -> tuple[object, ...]:

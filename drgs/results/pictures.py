@@ -5,13 +5,14 @@ from __future__ import annotations
 import json
 import os
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TypeVar
 
 from drgs.core.errors import UserError, listed
 from drgs.core.files import read_text
+from drgs.core.locks import sole_writer
 from drgs.core.records import FolderRecord
 from drgs.results.files import METRICS, ORBIT, ORBIT_GIF
 
@@ -28,8 +29,12 @@ EARLIER_ORBIT = re.compile(r"orbit_\d{3,}\.png")
 Picture = TypeVar("Picture")
 
 
-def claiming(out: Path, names: Iterable[str], pictures: Iterable[Picture]) -> Iterator[Picture]:
+def claiming(
+    out: Path, names: Iterable[str], pictures: Iterable[Picture], keep: Callable[[], object]
+) -> Iterator[Picture]:
     """The pictures, after the files ``names`` of the folder ``out`` were claimed for them.
+
+    keep: what :func:`sealing` yields.
 
     Raises :class:`UserError`, before the first picture is made, where one of these files is there
     and was not rendered.
@@ -38,18 +43,26 @@ def claiming(out: Path, names: Iterable[str], pictures: Iterable[Picture]) -> It
     record.check(names, earlier)
     for index, picture in enumerate(pictures):
         if index == 0:  # which has shown that there is something to write
+            keep()
             record.claim(names, earlier=earlier)
         yield picture
 
 
 @contextmanager
-def sealing(out: Path) -> Iterator[None]:
-    """Behind the block, note what the pictures in ``out`` are; also where Ctrl-C ended it."""
-    try:
-        yield
-    finally:
-        with suppress(UserError):  # of a disk that is full: all are still known to be ours
-            FolderRecord(out, COMMAND).seal()
+def sealing(out: Path) -> Iterator[Callable[[], object]]:
+    """After the block, note what the pictures in ``out`` are; also where Ctrl-C ended it.
+
+    Yields what keeps the folder from other commands: see :func:`drgs.core.locks.sole_writer`.
+    """
+    with sole_writer(out) as keep:
+        try:
+            yield keep
+        finally:
+            with suppress(UserError):  # of a disk that is full: all are still known to be ours
+                record = FolderRecord(out, COMMAND)
+                if record.exists:
+                    keep()  # or it is another command's
+                    record.seal()
 
 
 def refuse_photographs(out: Path, dataset: Path) -> None:

@@ -4,6 +4,7 @@ import argparse
 import io
 import os
 import signal
+import subprocess
 import sys
 import warnings
 from contextlib import redirect_stderr, redirect_stdout
@@ -18,6 +19,7 @@ from drgs.cli.commands import at_least, file_or_folder, run_command
 from drgs.cli.interrupts import exit_on_interrupt
 from drgs.cli.output import printable_anywhere
 from drgs.core.errors import UserError, UserNote
+from drgs.core.files import atomic_path
 from drgs.io.pictures import image_size, write_png
 
 
@@ -156,6 +158,49 @@ def test_an_interrupt_ends_a_command_without_a_traceback(act):
     outcome = run_in_process(command(act))
     assert (outcome.returncode, outcome.stdout, outcome.stderr) == (130, "", "interrupted\n")
     assert signal.getsignal(signal.SIGINT) == signal.SIG_DFL  # what comes now ends it at once
+
+
+@pytest.mark.usefixtures("interrupt_is_given_back")
+def test_sigterm_ends_a_command_as_ctrl_c_does(tmp_path):
+    """Files that it was writing are removed. Afterwards the signal is what it was."""
+    before = signal.getsignal(signal.SIGTERM)
+
+    def act():
+        with atomic_path(tmp_path / "a.png") as temporary:
+            temporary.touch()
+            signal.raise_signal(signal.SIGTERM)
+
+    outcome = run_in_process(command(act))
+    assert (outcome.returncode, outcome.stdout, outcome.stderr) == (143, "", "terminated\n")
+    assert signal.getsignal(signal.SIGTERM) == before and not list(tmp_path.iterdir())
+
+
+def ended_process(*lines):
+    """Status and standard error output of a process that does this within a command."""
+    program = "\n".join([
+        "import signal",
+        "from drgs.cli.interrupts import exit_on_interrupt, importing",
+        "signal.signal(signal.SIGINT, signal.default_int_handler)",
+        "with exit_on_interrupt():",
+        *(f"    {line}" for line in lines),
+    ])  # fmt: skip
+    ended = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    return ended.returncode, ended.stderr
+
+
+def test_an_interrupt_within_an_exec_ends_a_process_with_its_status():
+    """CPython would end by SIGINT then; dataclasses are made so, while modules are imported."""
+    act = "exec('signal.raise_signal(signal.SIGINT)')"
+    assert ended_process(act) == (130, "interrupted\n")
+
+
+@pytest.mark.parametrize(
+    ("name", "expected"), [("SIGINT", (130, "interrupted\n")), ("SIGTERM", (143, "terminated\n"))]
+)
+def test_a_signal_within_an_import_ends_a_process_at_once(name, expected):
+    """Modules may hide what is raised."""
+    lines = "with importing():", "  try:", f"    signal.raise_signal(signal.{name})"
+    assert ended_process(*lines, "  except BaseException:", "    pass") == expected
 
 
 def test_other_errors_keep_their_tracebacks():

@@ -16,6 +16,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from conftest import REPOSITORY
+from support.commands import assert_refused
 
 from drgs import capture
 from drgs.config.schema import DataConfig
@@ -323,6 +324,21 @@ def test_another_seed_gives_other_pictures(ball, captured, tmp_path):
     run(ball, tmp_path / "other", *SMALL, "--seed", 1)
     for name in ("train/r_0.png", "test/r_0.png", "points3d.ply"):
         assert (tmp_path / "other" / name).read_bytes() != (captured / name).read_bytes()
+
+
+def test_a_folder_that_another_capture_writes_to_is_refused(ball, captured, tmp_path, monkeypatch):
+    out, message = tmp_path / "out", "out: another command is writing to this folder; wait"
+    write_png, refused = capture.write_png, []
+
+    def write_while_another_begins(path, picture):
+        if not refused:
+            refused.append(path)
+            assert_refused(capture.main, ball, "--out", out, *SMALL, folder=out, message=message)
+        write_png(path, picture)
+
+    monkeypatch.setattr(capture, "write_png", write_while_another_begins)
+    run(ball, out, *SMALL)
+    assert refused and contents(out) == contents(captured)
 
 
 def test_interrupted_capture_continues_to_the_same_bytes(

@@ -16,7 +16,9 @@ from support.folders import contents
 from drgs import fit
 from drgs.core.locks import sole_writer
 
-MESSAGE = "out: another fit is writing to this folder; wait until it has ended, or choose another"
+MESSAGE = (
+    "out: another command is writing to this folder; wait until it has ended, or choose another"
+)
 
 
 @pytest.fixture

@@ -77,6 +77,22 @@ def test_pictures_are_rendered_again_into_their_own_folder_until_they_are_change
     assert_refused(render.main, fitted, "--out", out, folder=tmp_path, message=message)
 
 
+def test_a_folder_that_another_command_writes_to_is_refused(fitted, tmp_path, monkeypatch):
+    """The one that was refused leaves what the other notes of its pictures alone."""
+    out, message = tmp_path / "out", "out: another command is writing to this folder; wait"
+    write_png, refused = render.write_png, []
+
+    def write_while_another_begins(path, image):
+        write_png(path, image)
+        if not refused:
+            refused.append(path)
+            assert_refused(render.main, fitted, "--out", out, folder=tmp_path, message=message)
+
+    monkeypatch.setattr(render, "write_png", write_while_another_begins)
+    assert_ends_well(render.main, fitted, "--out", out)
+    assert refused and visible(out) == {"r_0.png", "r_1.png", "metrics.json"}
+
+
 def test_pictures_that_an_interrupted_command_left_are_rendered_again(
     fitted, tmp_path, monkeypatch
 ):

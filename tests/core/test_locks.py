@@ -14,8 +14,8 @@ def test_a_folder_has_one_writer(tmp_path):
     folder = tmp_path / "out"
     folder.mkdir()
     with sole_writer(folder) as keep:
-        keep()
-        message = r"out: another fit is writing to this folder; wait"
+        assert keep()
+        message = r"out: another command is writing to this folder; wait"
         with pytest.raises(UserError, match=message), sole_writer(folder):
             pass
         with sole_writer(tmp_path / "other"):
@@ -29,9 +29,9 @@ def test_a_new_folder_is_kept_when_it_is_made(tmp_path):
     folder = tmp_path / "new" / "out"
     with sole_writer(folder) as keep, sole_writer(folder) as keep_as_well:
         assert not folder.exists()
-        keep()
+        assert keep()
         assert folder.is_dir()
-        with pytest.raises(UserError, match="another fit is writing to this folder"):
+        with pytest.raises(UserError, match="another command is writing to this folder"):
             keep_as_well()
 
 
@@ -63,7 +63,6 @@ def test_a_killed_process_leaves_no_lock(tmp_path):
 
 def test_what_cannot_be_locked_is_left_to_its_writer(tmp_path):
     (tmp_path / "file").write_text("")
-    with sole_writer(tmp_path / "file" / "out") as keep:
-        keep()
-    with sole_writer(tmp_path / "file") as keep:
-        keep()
+    for path in (tmp_path / "file" / "out", tmp_path / "file"):
+        with sole_writer(path) as keep:
+            assert not keep()

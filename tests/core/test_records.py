@@ -1,6 +1,9 @@
 """A command knows the files that it wrote into a folder, and replaces no others."""
 
 import json
+import os
+import subprocess
+import sys
 
 import pytest
 
@@ -104,3 +107,16 @@ def test_a_forgotten_record_leaves_nothing(tmp_path):
     kept.remove()
     kept.seal()
     assert not list(tmp_path.iterdir())
+
+
+def test_what_killed_writers_of_the_same_files_left_is_removed(tmp_path):
+    """Other files' may be another command's, and a process that runs goes on."""
+    with subprocess.Popen([sys.executable, "-c", ""]) as dead:
+        pass
+    dead = dead.pid
+    gone = [f".a.{dead}.tmp.png", f".metrics.{dead}.tmp.json", f".notes.{dead}.tmp"]
+    kept = [f".a.{os.getpid()}.tmp.png", f".b.{dead}.tmp.png", ".a.tmp.png", f".a.{dead}.tmp"]
+    for name in (*gone, *kept):
+        (tmp_path / name).touch()
+    record(tmp_path).claim(["a.png", "metrics.json", "notes"])
+    assert {path.name for path in tmp_path.iterdir()} == {*kept, ".drgs-render.json"}

@@ -1,9 +1,8 @@
 """Structure from motion: cameras as pictures were taken with, or why there are none."""
 
-import _thread
+import signal
 import sys
-import threading
-from types import SimpleNamespace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,7 +12,9 @@ from support.colmap_models import write_dataset
 from support.corner import FOCAL, SIZE, write_photographs
 from support.datasets import load
 
+from drgs.core.child_process import ChildEndedError
 from drgs.core.errors import UserError, UserNote
+from drgs.core.locks import sole_writer
 from drgs.data import structure_from_motion as sfm
 from drgs.data.structure_from_motion import Search, pictures_in, place
 
@@ -69,28 +70,8 @@ def test_steps_are_watched(placed):
 def test_nothing_but_the_model_is_left_behind(placed):
     folder, _, _, _ = placed
     assert {path.name for path in folder.iterdir()} == {*NAMES, "sparse"}
-
-
-def test_a_model_is_replaced_only_when_that_is_asked_for(placed, monkeypatch):
-    folder, _, _, _ = placed
-    model = folder / "sparse" / "0"
-    before = (model / "images.bin").read_bytes()
-    with pytest.raises(UserError, match=r"sparse/0: is there already; .*--overwrite replaces it"):
-        place(folder, Search(), False, said)
-    assert (model / "images.bin").read_bytes() == before
-
-    class Found:
-        def write_binary(self, path):
-            (path / "images.bin").write_bytes(b"new")
-
-    monkeypatch.setattr(sfm._Work, "model", lambda self: (Found(), 1))
-    monkeypatch.setattr(sfm, "_described", lambda *_: None)
-    place(folder, Search(), True, said)
-    try:
-        assert [path.name for path in model.iterdir()] == ["images.bin"]
-        assert (model / "images.bin").read_bytes() == b"new"
-    finally:
-        (model / "images.bin").write_bytes(before)
+    files = {path.name for path in (folder / "sparse" / "0").iterdir()}
+    assert files == {*sfm.MODEL_FILES, ".drgs-poses.json"}
 
 
 def test_pictures_of_nothing_have_no_cameras_and_leave_nothing_behind(tmp_path):
@@ -113,23 +94,46 @@ def test_photographs_without_a_mask_are_looked_at_as_well(tmp_path):
     assert place(tmp_path, Search(), False, said).names == tuple(names)
 
 
-def test_masks_are_found_by_either_name(tmp_path):
-    """COLMAP gets black and white, whatever their files are."""
-    (tmp_path / "masks").mkdir()
-    alpha = Image.new("LA", (8, 8), (255, 255))
-    alpha.putpixel((3, 2), (255, 0))
-    alpha.save(tmp_path / "masks" / "b_mask.png")
-    for name, level in (("a.jpg.png", 200), ("a.png", 20)):
-        Image.new("L", (8, 8), level).save(tmp_path / "masks" / name)
+def masks_for_colmap(folder, masks):
+    """What COLMAP is given for photographs of 8 x 6 px; masks: (H, W) by name of the file."""
+    (folder / "masks").mkdir(exist_ok=True)
+    for name, mask in masks.items():
+        Image.fromarray(np.uint8(mask)).save(folder / "masks" / name)
     for name in ("a.jpg", "b.jpg", "c.jpg"):
-        Image.new("RGB", (8, 8)).save(tmp_path / name)
-    some = work(tmp_path, ["a.jpg", "b.jpg", "c.jpg"])
-    some.folder = tmp_path / "work"
-    masks = some._masks_for_all()
-    written = [np.asarray(Image.open(masks / f"{name}.png")) for name in some.names]
-    expected = np.full((3, 8, 8), 255)
-    expected[1, 2, 3] = 0
-    np.testing.assert_array_equal(written, expected)
+        Image.new("RGB", (8, 6)).save(folder / name)
+    some = work(folder, ["a.jpg", "b.jpg", "c.jpg"])
+    some.folder = folder / "work"
+    given = some._masks_for_all()
+    return [np.asarray(Image.open(given / f"{name}.png")) for name in some.names]
+
+
+def test_masks_are_found_by_any_name(tmp_path):
+    """As fits find them; transparent pixels do not count."""
+    alpha = Image.new("LA", (8, 6), (255, 255))
+    alpha.putpixel((3, 2), (255, 0))
+    (tmp_path / "masks").mkdir()
+    alpha.save(tmp_path / "masks" / "c_mask.png")
+    first, second, third = np.zeros((3, 6, 8))
+    first[0], second[1], third[2] = 255, 255, 255
+    masks = masks_for_colmap(tmp_path, {"a.jpg.png": first, "a.png": second, "b.png": third})
+    expected = np.full((6, 8), 255)
+    expected[2, 3] = 0
+    np.testing.assert_array_equal(masks, [first, third, expected])
+
+
+def test_masks_are_read_as_a_fit_reads_them(tmp_path):
+    """Black or white, and of larger photographs scaled: COLMAP would look elsewhere in them."""
+    grey = np.repeat([[100, 150]], 6, axis=0).repeat(4, axis=1)
+    larger = np.zeros((12, 16))
+    larger[:6] = 255
+    masks = masks_for_colmap(tmp_path, {"a.jpg.png": grey, "b.jpg.png": larger})
+    np.testing.assert_array_equal(masks[0], np.where(grey > 127, 255, 0))
+    np.testing.assert_array_equal(masks[1], larger[::2, ::2])
+
+
+def test_a_mask_of_another_shape_is_refused(tmp_path):
+    with pytest.raises(UserError, match=r"b\.jpg\.png: must be 8 x 6 px, as the ph.*, got 6 x 8"):
+        masks_for_colmap(tmp_path, {"b.jpg.png": np.zeros((8, 6))})
 
 
 def test_photographs_of_two_sizes_share_no_camera(tmp_path):
@@ -144,31 +148,184 @@ def test_without_pycolmap_one_line_says_what_to_install(tmp_path, monkeypatch):
     with pytest.raises(
         UserError, match=r"needs pycolmap, which is not installed; pip install 'drgs\[colmap\]'"
     ) as error:
-        place(tmp_path, Search(), False, said)
+        sfm._find(Search(), tmp_path, tmp_path, [], tmp_path, said)
     assert "\n" not in str(error.value)
 
 
-def test_ctrl_c_ends_a_step_that_runs_in_cpp(monkeypatch):
-    class Token(threading.Event):
-        cancel = threading.Event.set
+def test_what_colmap_refuses_is_said_in_one_line(tmp_path, monkeypatch):
+    pytest.importorskip("pycolmap")
 
-    ended = []
-
-    def step(cancellation_token):
-        _thread.interrupt_main()
-        ended.append(cancellation_token.wait(60))
-
-    with pytest.raises(KeyboardInterrupt):
-        sfm._until_done(SimpleNamespace(CancellationToken=Token), step)
-    assert ended == [True]
-
-
-def test_what_colmap_refuses_is_said_in_one_line():
-    def step(cancellation_token):
+    def refuse(self):
         raise RuntimeError("[reader.cc:1]\nno such image")
 
-    with pytest.raises(UserError, match=r"COLMAP says: \[reader.cc:1\] no such image$"):
-        sfm._until_done(SimpleNamespace(CancellationToken=threading.Event), step)
+    monkeypatch.setattr(sfm._Work, "model", refuse)
+    with pytest.raises(UserError, match=r"COLMAP says: \[reader.cc:1\] no such image; if memory"):
+        sfm._find(Search(), tmp_path, tmp_path, [], tmp_path, said)
+
+
+# ----------------------------------------------------------------------------------------------
+# What is replaced, and what is left behind
+# ----------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def search(tmp_path, monkeypatch):
+    """Searches a folder of three photographs: finds a model whose files hold ``content``.
+
+    act: is called with the temporary folder before the model is written.
+    """
+    for k in range(3):
+        Image.new("RGB", (8, 8)).save(tmp_path / f"{k}.png")
+
+    def found(content, replace=False, act=lambda temporary: None):
+        def run(function, search, pictures, folder, names, temporary, **_):
+            act(temporary)
+            (temporary / "model").mkdir()
+            for name in sfm.MODEL_FILES:
+                (temporary / "model" / name).write_text(content)
+            return content
+
+        monkeypatch.setattr(sfm, "run_in_child", run)
+        return place(tmp_path, Search(), replace, said)
+
+    return found
+
+
+def model_in(folder):
+    """Names and texts of ``sparse/0``, without the record."""
+    files = (folder / "sparse" / "0").iterdir()
+    return {path.name: path.read_text() for path in files if path.name != ".drgs-poses.json"}
+
+
+def test_a_model_is_replaced_only_when_that_is_asked_for(search, tmp_path):
+    assert search("first") == "first"
+    with pytest.raises(UserError, match=r"sparse/0: is there already; .*--overwrite replaces it"):
+        search("second")
+    assert model_in(tmp_path) == dict.fromkeys(sfm.MODEL_FILES, "first")
+    search("second", replace=True)
+    assert model_in(tmp_path) == dict.fromkeys(sfm.MODEL_FILES, "second")
+
+
+def test_other_files_beside_a_model_stay(search, tmp_path):
+    model = tmp_path / "sparse" / "0"
+    model.mkdir(parents=True)
+    own = {"notes.txt": "mine", "project.ini": "COLMAP's", "cameras.txt": "a copy"}
+    for name, text in own.items():
+        (model / name).write_text(text)
+    for content in ("first", "second"):
+        with pytest.warns(UserNote, match=r"sparse/0: cameras\.txt of another model stay there"):
+            search(content, replace=True)
+        assert model_in(tmp_path) == own | dict.fromkeys(sfm.MODEL_FILES, content)
+
+
+def test_a_model_of_another_program_is_not_replaced(search, tmp_path):
+    """Nor one that was changed since."""
+    model = tmp_path / "sparse" / "0"
+    model.mkdir(parents=True)
+    for name in ("cameras.bin", "images.bin"):
+        (model / name).write_text("COLMAP's")
+    with pytest.raises(UserError, match=r"drgs fit .* uses it, for another, move it away"):
+        search("new")
+    with pytest.raises(UserError, match=r"sparse/0: holds cameras\.bin, images\.bin, which .*move"):
+        search("new", replace=True)
+    assert model_in(tmp_path) == dict.fromkeys(("cameras.bin", "images.bin"), "COLMAP's")
+    for name in ("cameras.bin", "images.bin"):
+        (model / name).unlink()
+    search("new")
+    (model / "points3D.bin").write_text("refined")
+    with pytest.raises(UserError, match=r"sparse/0: holds points3D\.bin, which .*changed since"):
+        search("newer", replace=True)
+
+
+@pytest.mark.parametrize("name", ["sparse", "sparse/0"])
+def test_a_file_in_the_place_of_the_model_is_refused_before_the_search(search, tmp_path, name):
+    (tmp_path / name).parent.mkdir(exist_ok=True)
+    (tmp_path / name).write_text("mine")
+    with pytest.raises(UserError, match=rf"{name}: must be a folder, got something else; move"):
+        search("new", replace=True, act=lambda temporary: pytest.fail("searched"))
+    assert (tmp_path / name).read_text() == "mine"
+
+
+def test_what_a_killed_run_left_is_removed_by_the_next(search, tmp_path):
+    """But not by one that is refused, as another is running."""
+    for below in (".", "sparse", "sparse/0"):
+        (tmp_path / below / ".drgs-poses-abc" / "masks").mkdir(parents=True)
+    (tmp_path / ".poses-notes").mkdir()  # somebody's
+    message = "another command is writing to this folder"
+    with sole_writer(tmp_path), pytest.raises(UserError, match=message):
+        search("new")
+    assert len(list(tmp_path.rglob(".drgs-poses-abc"))) == 3
+    search("new")
+    assert not list(tmp_path.rglob(".drgs-poses-*/"))
+    assert {path.name for path in tmp_path.iterdir() if path.is_dir()} == {"sparse", ".poses-notes"}
+
+
+def test_a_second_search_in_the_same_folder_is_refused(search, tmp_path):
+    def second(temporary):
+        with pytest.raises(UserError, match="another command is writing to this folder; wait"):
+            place(tmp_path, Search(), True, said)
+        assert temporary.is_dir()
+
+    search("first", act=second)
+    assert model_in(tmp_path) == dict.fromkeys(sfm.MODEL_FILES, "first")
+
+
+def test_an_interrupt_while_files_are_moved_leaves_a_whole_model(search, tmp_path, monkeypatch):
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    replace = Path.replace
+
+    def interrupted(self, target):
+        signal.raise_signal(signal.SIGINT)
+        return replace(self, target)
+
+    monkeypatch.setattr(Path, "replace", interrupted)
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            search("new")
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert model_in(tmp_path) == dict.fromkeys(sfm.MODEL_FILES, "new")
+    assert not list(tmp_path.glob(".drgs-*"))
+
+
+def test_a_run_killed_while_files_are_moved_leaves_no_mixture(search, tmp_path, monkeypatch):
+    """There is no model then; the next run makes one."""
+    search("first")
+    replace, replaced = Path.replace, []
+
+    def killed(self, target):
+        if len(replaced) == 2:
+            raise MemoryError
+        replaced.append(target)
+        return replace(self, target)
+
+    with monkeypatch.context() as context, pytest.raises(MemoryError):
+        context.setattr(Path, "replace", killed)
+        search("second", replace=True)
+    assert "images.bin" not in model_in(tmp_path)
+    search("third")
+    assert model_in(tmp_path) == dict.fromkeys(sfm.MODEL_FILES, "third")
+
+
+def test_a_crash_is_a_sentence_and_leaves_nothing_behind(search, tmp_path):
+    def crash(temporary):
+        (temporary / "database.db").touch()
+        raise ChildEndedError("SIGKILL")
+
+    with pytest.raises(UserError, match=r"structure from motion was ended: SIGKILL; if memory"):
+        search("new", act=crash)
+    assert {path.name for path in tmp_path.iterdir()} == {"0.png", "1.png", "2.png"}
+
+
+def test_temporary_files_are_on_the_disk_of_the_model(search, tmp_path):
+    """``sparse`` may be a link to another one, to which nothing can be moved."""
+    elsewhere = tmp_path / "other disk"
+    elsewhere.mkdir()
+    (tmp_path / "sparse").symlink_to(elsewhere)
+    places = []
+    search("new", act=lambda temporary: places.append(temporary.resolve()))
+    assert [path.parent for path in places] == [elsewhere]
+    assert model_in(tmp_path) == dict.fromkeys(sfm.MODEL_FILES, "new")
 
 
 # ----------------------------------------------------------------------------------------------
@@ -180,6 +337,12 @@ def work(folder, names, **search):
     return sfm._Work(None, folder, folder, folder, names, Search(**search), said)
 
 
+def test_masks_beside_photographs_are_no_photographs(tmp_path):
+    for name in ("a.jpg", "a_mask.png", "b.jpg", "b.jpg.mask.png", "face_mask.jpg"):
+        Image.new("RGB", (8, 6)).save(tmp_path / name)
+    assert pictures_in(tmp_path)[1] == ["a.jpg", "b.jpg", "face_mask.jpg"]
+
+
 def test_names_are_in_the_order_of_their_numbers(tmp_path):
     for name in ("2.png", "10.png", "1.JPG", "b/3.png", "notes.txt"):
         (tmp_path / "images" / name).parent.mkdir(parents=True, exist_ok=True)
@@ -188,6 +351,13 @@ def test_names_are_in_the_order_of_their_numbers(tmp_path):
     assert pictures == tmp_path / "images" and names == ["1.JPG", "2.png", "10.png", "b/3.png"]
     (tmp_path / "images" / "10.png").write_bytes(b"not a picture")
     with pytest.raises(UserError, match=r"10\.png: cannot read the image"):
+        pictures_in(tmp_path)
+
+
+def test_a_name_that_colmap_cannot_hold_is_refused(tmp_path):
+    Image.new("RGB", (8, 8)).save(tmp_path / "a.png")
+    (tmp_path / "a.png").rename(tmp_path / "a\udcff.png")
+    with pytest.raises(UserError, match=r"COLMAP knows names in UTF-8 only; rename it"):
         pictures_in(tmp_path)
 
 
@@ -217,22 +387,12 @@ def test_what_a_fit_refuses_is_refused_before_the_search(tmp_path, mode, size, m
 
 
 @pytest.mark.parametrize("below", ["sparse", "colmap/sparse/0"])
-def test_a_model_elsewhere_in_the_folder_is_said_and_not_doubled(tmp_path, below, monkeypatch):
-    monkeypatch.setitem(sys.modules, "pycolmap", SimpleNamespace())
+def test_a_model_elsewhere_in_the_folder_is_said_and_not_doubled(tmp_path, below):
     folder = tmp_path / "my photos"
     write_dataset(folder, below=below)
     message = rf"{below}: is there already; drgs fit '.*my photos' uses it, --overwrite writes "
     with pytest.raises(UserError, match=message):
         place(folder, Search(), False, said)
-
-
-def test_an_empty_folder_is_no_model_and_another_one_is_not_written_over(tmp_path):
-    model = tmp_path / "sparse" / "0"
-    model.mkdir(parents=True)
-    sfm._check_free(tmp_path, model)
-    (model / "notes.txt").touch()
-    with pytest.raises(UserError, match=r"sparse/0: is there already, and holds no model"):
-        sfm._check_free(tmp_path, model)
 
 
 def test_options_that_are_offered_are_others():

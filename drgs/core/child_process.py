@@ -1,0 +1,151 @@
+"""A function that runs in a process of its own, which ends with its caller.
+
+For libraries that leave no room to Ctrl-C, or that may abort: what happens to the child, the parent
+says in a sentence.
+"""
+
+from __future__ import annotations
+
+import os
+import pickle
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from types import FrameType
+from typing import IO, Any
+
+from drgs.core.errors import UserError, one_line
+
+SIGNALS = (signal.SIGINT, signal.SIGTERM)
+
+
+class ChildEndedError(RuntimeError):
+    """The child was ended by a signal; the message names it, and what the child said last."""
+
+
+class DeferredInterrupts:
+    """A context manager within which Ctrl-C and SIGTERM wait until its end.
+
+    Only :meth:`allowed` lets them through: what cleans up or moves files is not interrupted.
+    Outside of the main thread, which has the signals, it does nothing.
+    """
+
+    def __init__(self) -> None:
+        self._arrived: int | None = None
+        self._raises = False
+        self._previous: dict[int, Any] = {}
+
+    def __enter__(self) -> DeferredInterrupts:
+        """Take over the signals, unless they are ignored."""
+        if threading.current_thread() is threading.main_thread():
+            handlers = {number: signal.getsignal(number) for number in SIGNALS}
+            self._previous = {n: h for n, h in handlers.items() if h not in (signal.SIG_IGN, None)}
+            for number in self._previous:
+                signal.signal(number, self._handle)
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        """Give the signals back, and send again what arrived."""
+        for number, handler in self._previous.items():
+            signal.signal(number, handler)
+        if self._arrived is not None:
+            signal.raise_signal(self._arrived)
+
+    @contextmanager
+    def allowed(self) -> Iterator[None]:
+        """Within the block, the first signal raises KeyboardInterrupt, also if it came before."""
+        try:
+            self._raises = True
+            if self._arrived is not None:
+                raise KeyboardInterrupt
+            yield
+        finally:
+            self._raises = False
+
+    def _handle(self, number: int, frame: FrameType | None) -> None:
+        self._arrived = number
+        if self._raises:
+            self._raises = False
+            raise KeyboardInterrupt
+
+
+def run_in_child(
+    function: Callable[..., Any],
+    *arguments: object,
+    watch: Callable[..., None],
+    interrupts: DeferredInterrupts,
+) -> Any:
+    """Return ``function(*arguments, report)``, called in a new process.
+
+    function, arguments: can be pickled. watch: is called here with what the child gives to
+    ``report``. interrupts: end the child, which Ctrl-C itself does not reach; it also ends when
+    this process does, however that ends.
+
+    Raises the child's :class:`UserError` or OSError, :class:`ChildEndedError` where a signal ended
+    it, and RuntimeError with its traceback for any other error.
+    """
+    # Not -m, which would look for modules in the current folder first.
+    code = f"import sys; sys.path[:] = {sys.path!r}; from {__name__} import serve; serve()"
+    pipe = subprocess.PIPE
+    with tempfile.TemporaryFile() as said:
+        child = subprocess.Popen(
+            [sys.executable, "-c", code], stdin=pipe, stdout=pipe, stderr=said,
+            start_new_session=True,
+        )  # fmt: skip
+        try:
+            with suppress(BrokenPipeError):  # it has ended: see below
+                _send(child.stdin, (function, arguments))
+            while True:
+                with interrupts.allowed():
+                    kind, content = pickle.load(child.stdout)
+                if kind == "result":
+                    return content
+                if kind == "error":
+                    raise content
+                watch(*content)
+        except (EOFError, pickle.UnpicklingError):  # at its end, or within a message
+            status = child.wait()
+            said.seek(0)
+            text = said.read().decode(errors="replace")
+        finally:
+            child.kill()
+            with suppress(BrokenPipeError):
+                child.communicate()
+    if status < 0:
+        text = text.partition("***")[0]  # where glog's stack trace begins
+        name = signal.Signals(-status).name
+        raise ChildEndedError(": ".join(filter(None, (name, one_line(text)))))
+    raise RuntimeError(f"the child process ended with status {status}:\n{text}")
+
+
+def serve() -> None:
+    """Do in the child what :func:`run_in_child` sends."""
+    answers = os.fdopen(os.dup(sys.stdout.fileno()), "wb")
+    os.dup2(sys.stderr.fileno(), sys.stdout.fileno())  # libraries may print
+    function, arguments = pickle.load(sys.stdin.buffer)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+
+    def report(*content: object) -> None:
+        _send(answers, ("report", content))
+
+    try:
+        answer = "result", function(*arguments, report)
+    except (UserError, OSError) as error:
+        answer = "error", error
+    _send(answers, answer)
+    os._exit(0)  # without waiting for what the library does at its end
+
+
+def _send(stream: IO[bytes], message: object) -> None:
+    stream.write(pickle.dumps(message))
+    stream.flush()
+
+
+def _end_with_parent() -> None:
+    """Wait for the end of the input, which the parent holds open."""
+    os.read(sys.stdin.fileno(), 1)
+    os._exit(1)
