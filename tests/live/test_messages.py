@@ -1,8 +1,12 @@
 """What browsers may send to a page: invalid messages change nothing, and print nothing."""
 
+import contextlib
 import gc
 import http.client
+import re
 import socket
+import subprocess
+import sys
 import threading
 import time
 from types import SimpleNamespace
@@ -13,9 +17,19 @@ import pytest
 pytest.importorskip("viser", reason="viser is not installed (the extra viewer)")
 
 import msgspec
-from support.hostile_client import CAMERA, CLICK, VALUES, connect_to, hostile_messages, send_all
+from conftest import REPOSITORY
+from support.fit_command import write_scene
+from support.hostile_client import (
+    CAMERA,
+    CLICK,
+    VALUES,
+    connect_to,
+    hostile_messages,
+    labels_of_controls,
+    send_all,
+)
 from support.small_fits import everything_of, make_trainer, true_dataset
-from websockets.exceptions import ConnectionClosed, InvalidStatus
+from websockets.exceptions import ConnectionClosed, InvalidStatus, WebSocketException
 
 from drgs.config.approximations import Approximations
 from drgs.live.fit_page import FitPage, watch
@@ -26,6 +40,9 @@ from drgs.live.wishes import Wishes
 from drgs.training.budget import AllIterations
 from drgs.training.history import History
 from drgs.training.loop import iterations
+
+STOPPING = ("Pause", "End and write results")
+"""Buttons that any client may press."""
 
 NAN, INF = float("nan"), float("inf")
 
@@ -46,16 +63,12 @@ def controls_of(server):
 
 
 def uuids_that_stop_nothing(server):
-    """Those of all controls but the buttons Pause and End, which anybody may press."""
-    return [
-        uuid
-        for uuid, control in controls_of(server).items()
-        if getattr(control, "label", "") not in ("Pause", "End and write results")
-    ]
+    controls = controls_of(server).items()
+    return [uuid for uuid, control in controls if getattr(control, "label", "") not in STOPPING]
 
 
-def wait_until(condition):
-    deadline = time.monotonic() + 10
+def wait_until(condition, seconds=10):
+    deadline = time.monotonic() + seconds
     while not condition():
         assert time.monotonic() < deadline
         time.sleep(0.02)
@@ -121,28 +134,31 @@ def test_a_message_that_is_too_long_ends_its_connection_only(server, capfd):
     assert capfd.readouterr() == ("", "")
 
 
+def is_closed(connection):
+    """Whether the server has closed a connection to which it sends nothing."""
+    try:
+        return connection.recv(1) == b""
+    except BlockingIOError:
+        return False
+    except ConnectionError:
+        return True
+
+
 def test_a_flood_of_connections_leaves_room_for_files_and_for_clients(server, capfd):
-    port, flood = server.get_port(), []
-    for _ in range(3 * MAX_CONNECTIONS):
-        flood.append(socket.create_connection(("127.0.0.1", port)))
-        flood[-1].settimeout(5)
-    closed = 0
+    address = "127.0.0.1", server.get_port()
+    flood = [socket.create_connection(address) for _ in range(3 * MAX_CONNECTIONS)]
     for connection in flood:
         connection.setblocking(False)
-    time.sleep(1)
-    for connection in flood:
-        try:
-            closed += connection.recv(1) == b""
-        except BlockingIOError:
-            pass
-        except ConnectionError:
-            closed += 1
-    assert closed == 2 * MAX_CONNECTIONS
+    wait_until(lambda: sum(map(is_closed, flood)) == 2 * MAX_CONNECTIONS)
     for connection in flood:
         connection.close()
-    time.sleep(0.5)
-    with connect_to(port) as connection:
-        assert connection.recv(timeout=5)
+
+    def is_served():
+        with contextlib.suppress(OSError, EOFError, WebSocketException):
+            with connect_to(server.get_port()) as connection:
+                return bool(connection.recv(timeout=5))
+
+    wait_until(is_served)
     assert capfd.readouterr() == ("", "")
 
 
@@ -227,3 +243,31 @@ def test_a_fit_among_hostile_clients_has_the_bytes_of_one_alone(server, capfd):
     assert not [name for name, value in expected.items() if got[name] != value]
     gc.collect()
     assert capfd.readouterr() == ("", "")
+
+
+@pytest.mark.slow
+def test_the_command_writes_the_same_bytes_among_hostile_clients(tmp_path):
+    config = write_scene(tmp_path, iterations=150, densify={"start": 1, "stop": 100})
+    words = [sys.executable, "-m", "drgs", "fit", config, "--set", "output.report=false"]
+    alone, watched, log = tmp_path / "alone", tmp_path / "watched", tmp_path / "log"
+    subprocess.run([*words, "--out", alone], cwd=REPOSITORY, check=True, capture_output=True)
+    with log.open("w") as output:
+        fit = subprocess.Popen(
+            [*words, "--out", watched, "--view"], cwd=REPOSITORY, stdout=output, stderr=output
+        )
+    try:
+        wait_until(lambda: fit.poll() is not None or "look on at" in log.read_text(), 120)
+        port, seed = int(re.search(r"http://\S+:(\d+)", log.read_text())[1]), 0
+        labels = labels_of_controls(port, "As fitted")
+        uuids = [uuid for uuid, label in labels.items() if label not in STOPPING]
+        while fit.poll() is None:
+            seed += 1
+            with contextlib.suppress(OSError, WebSocketException):
+                send_all(port, hostile_messages(seed, 100, uuids))
+    finally:
+        fit.kill()
+        fit.wait()
+    assert seed > 1 and fit.returncode == 0, log.read_text()
+    assert "Traceback" not in log.read_text()
+    clouds = [(folder / "point_cloud.ply").read_bytes() for folder in (alone, watched)]
+    assert clouds[0] == clouds[1]
