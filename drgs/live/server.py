@@ -5,20 +5,24 @@ Imported when somebody wants to look on; viser is of the extra ``viewer``.
 
 from __future__ import annotations
 
+import asyncio
+import logging
 import socket
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from functools import partial
 from http import HTTPStatus
 from typing import Any
-from urllib.parse import urlsplit
+from urllib.parse import unquote, urlsplit
 
 import rich
 import viser
 import websockets.asyncio.server
 from websockets.asyncio.server import Request, Response, ServerConnection
 
-from drgs.core.errors import UserError
+from drgs.core.errors import UserError, UserNote, one_line
+from drgs.live.messages import MAX_MESSAGE_BYTES, PageConnection
 
 ADDRESS = "127.0.0.1"
 """Where only this machine reaches it."""
@@ -51,8 +55,13 @@ def serving(address: str, port: int | None, options: tuple[str, str]) -> Iterato
     Raises :class:`UserError` where it cannot listen there.
     """
     port = free_port(address, port, options)
-    with _silent(), _own_page_only(address):
+
+    def control(uuid: str) -> Any:
+        return server.gui._gui_input_handle_from_uuid.get(uuid)
+
+    with _silent(), _guarded(address, control):
         server = LocalServer(address, port, verbose=False)
+    server.get_event_loop().set_exception_handler(_NoteOnce())
     server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
     try:
         with warnings.catch_warnings():
@@ -109,20 +118,38 @@ def is_own(headers: Mapping[str, str], address: str) -> bool:
     return is_here and (origin is None or urlsplit(origin).netloc == host)
 
 
-@contextmanager
-def _own_page_only(address: str) -> Iterator[None]:
-    """Within the block, servers that viser starts refuse what :func:`is_own` says no to.
+def _refusal(request: Request, address: str) -> str:
+    """Return why a request is refused; empty: it is not."""
+    headers = request.headers
+    if not is_own(headers, address):
+        return "Open the address that was printed.\n"
+    if ":" in unquote(request.path.partition("?")[0]):
+        return "There is no such file.\n"  # Windows: a path with a drive leaves viser's folder
+    protocols = headers.get_all("Sec-WebSocket-Protocol")
+    if "Upgrade" in headers and protocols != [f"viser-v{viser.__version__}"]:
+        return "Reload the page.\n"  # viser would print a line for each of them
+    return ""
 
-    viser has no setting for it.
+
+@contextmanager
+def _guarded(address: str, control: Callable[[str], Any]) -> Iterator[None]:
+    """Within the block, servers that viser starts serve only valid requests and messages.
+
+    viser has no setting for it. control: see :func:`drgs.live.messages.is_valid`. The logger prints
+    nothing: websockets would print a traceback for each connection that breaks.
     """
     serve = websockets.asyncio.server.serve
+    connection_type = partial(PageConnection, control=control, connections=set())
+    logger = logging.Logger("page", logging.CRITICAL)
 
     def guarded(*arguments: Any, process_request: Callable, **settings: Any) -> object:
         def process(connection: ServerConnection, request: Request) -> Response | None:
-            if is_own(request.headers, address):
-                return process_request(connection, request)
-            return connection.respond(HTTPStatus.FORBIDDEN, "Open the address that was printed.\n")
+            if reason := _refusal(request, address):
+                return connection.respond(HTTPStatus.FORBIDDEN, reason)
+            return process_request(connection, request)
 
+        settings |= {"create_connection": connection_type, "logger": logger}
+        settings["max_size"] = MAX_MESSAGE_BYTES
         return serve(*arguments, process_request=process, **settings)
 
     websockets.asyncio.server.serve = guarded
@@ -130,6 +157,23 @@ def _own_page_only(address: str) -> Iterator[None]:
         yield
     finally:
         websockets.asyncio.server.serve = serve
+
+
+class _NoteOnce:
+    """Exception handler of an event loop: one line for each type of error."""
+
+    def __init__(self) -> None:
+        self._noted: set[str] = set()
+
+    def __call__(self, loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
+        """Note the error."""
+        del loop
+        error = context.get("exception")
+        kind = type(error).__name__
+        if kind not in self._noted:
+            self._noted.add(kind)
+            reason = context["message"] if error is None else f"{kind}: {error}"
+            warnings.warn(UserNote(f"the viewer's page: {one_line(reason)}"), stacklevel=1)
 
 
 @contextmanager

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Protocol
 
-from drgs.core.errors import UserError
+from drgs.core.errors import UserError, reason_of_mitsuba
 from drgs.live.frames import Frame, FrameRequest, LiveScene
 from drgs.live.wishes import Asked, Wishes
 
@@ -120,11 +120,11 @@ class Spectators:
         start = time.monotonic()
         try:
             frame = scene().frame(request)
-        except UserError as error:
-            self.screen.refuse(client, str(error))
-            divisor = 1  # nor would a larger one be any better
-        else:
             self.screen.show(client, request, frame, divisor == 1)
+        except Exception as error:  # a client's request must not end the fit
+            text = str(error) if isinstance(error, UserError) else reason_of_mitsuba(error)
+            self.screen.refuse(client, text)
+            divisor = 1  # nor would a larger one be any better
         drawn.number, drawn.divisor, drawn.at = wish.number, divisor, time.monotonic()
         drawn.seconds = drawn.at - start
         if is_moving:

@@ -149,3 +149,21 @@ def test_what_cannot_be_rendered_is_said_once(clock):
     clock.now += 10
     assert not served(them, stage)
     assert stage.refused == [(1, "that cannot be seen")] and not stage.shown
+
+
+def test_a_request_that_cannot_be_rendered_is_a_line_on_its_page_and_others_are_served(clock):
+    """Mitsuba, for one, wraps what a plugin refuses as RuntimeError."""
+    stage, left, them = make(clock)
+    frame = stage.frame
+
+    def fail(request):
+        if request.width <= 3:
+            raise RuntimeError("calibrated: fx must be positive\n  somewhere\nRuntimeError: here")
+        return frame(request)
+
+    stage.frame = fail
+    left.ask(1, FrameRequest(REQUEST.eye, 3, 3))
+    left.ask(2, REQUEST)
+    assert served(them, stage) and served(them, stage) and not served(them, stage)
+    assert stage.refused == [(1, "calibrated: fx must be positive here")]
+    assert [client for client, *_ in stage.shown] == [2]
