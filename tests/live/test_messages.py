@@ -154,9 +154,11 @@ def test_a_flood_of_connections_leaves_room_for_files_and_for_clients(server, ca
         connection.close()
 
     def is_served():
-        with contextlib.suppress(OSError, EOFError, WebSocketException):
+        try:
             with connect_to(server.get_port()) as connection:
                 return bool(connection.recv(timeout=5))
+        except (OSError, EOFError, WebSocketException):
+            return False
 
     wait_until(is_served)
     assert capfd.readouterr() == ("", "")
