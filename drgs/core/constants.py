@@ -78,6 +78,9 @@ alpha is below the cut and discarded."""
 MAX_INT = 2**31 - 1
 """The counters of Mitsuba and Dr.Jit are of 32 bits."""
 
+MAX_COEFFICIENT = 1e6
+"""A coefficient of distortion, in size: calibrations give less than 1e3."""
+
 MAX_FEATURES = 64
 """Numbers that a picture composites besides RGB, or instead of it. LLVM compiles the kernels of a
 picture and its derivatives in 5 s for 16 of them, 17 s for 64 and 85 s for 128, once: Dr.Jit keeps

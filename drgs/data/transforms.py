@@ -22,6 +22,7 @@ from pydantic_core import ErrorDetails
 from drgs.cameras.axes import between_opencv_and_opengl
 from drgs.config.explain import expectation
 from drgs.config.schema import DataConfig
+from drgs.core.constants import MAX_COEFFICIENT
 from drgs.core.errors import UserError, one_line
 from drgs.core.files import read_text, shortened
 from drgs.data.types import Motion
@@ -111,6 +112,7 @@ def _opencv_pose(rows: list[list[float]]) -> np.ndarray:
 
 
 Number = Annotated[float, Field(allow_inf_nan=False)]
+Coefficient = Annotated[float, Field(ge=-MAX_COEFFICIENT, le=MAX_COEFFICIENT)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 Side = Annotated[float, Field(ge=1, le=MAX_SIDE)]
 Angle = Annotated[Number, AfterValidator(_angle)]
@@ -132,16 +134,16 @@ class CameraValues(BaseModel):
     cy: Number | None = None
     w: Side | None = None  # px
     h: Side | None = None
-    k1: Number | None = None
-    k2: Number | None = None
-    k3: Number | None = None
-    k4: Number | None = None
-    k5: Number | None = None
-    k6: Number | None = None
-    p1: Number | None = None
-    p2: Number | None = None
-    sx1: Number | None = None
-    sy1: Number | None = None
+    k1: Coefficient | None = None
+    k2: Coefficient | None = None
+    k3: Coefficient | None = None
+    k4: Coefficient | None = None
+    k5: Coefficient | None = None
+    k6: Coefficient | None = None
+    p1: Coefficient | None = None
+    p2: Coefficient | None = None
+    sx1: Coefficient | None = None
+    sy1: Coefficient | None = None
     camera_model: (
         Literal[
             "SIMPLE_PINHOLE",

@@ -31,6 +31,8 @@ def warnings_are_errors():
         ({"h": 1e20}, "h must be <= 16777216, got 1e+20"),
         ({"h": 1e-300}, "h must be >= 1, got 1e-300"),
         ({"cx": 1e300, "cy": 0.0}, "cx must be within 1600 px of the picture, got 1e+300"),
+        ({"k1": 1e308}, "k1 must be <= 1000000, got 1e+308"),
+        ({"p2": -2e6}, "p2 must be >= -1000000, got -2000000.0"),
         ({"cx": 8.0, "cy": -1e5}, "cy must be within 1200 px of the picture, got -100000"),
     ],
 )
