@@ -10,6 +10,7 @@ from contextlib import contextmanager, suppress
 from drgs.core.errors import UserError
 from drgs.core.files import why_refused
 from drgs.core.llvm import LLVMVersionError
+from drgs.core.memory import why_out_of_memory
 
 USER_ERROR_STATUS = 2
 """Exit status of a command that the user has to call differently (as argparse's)."""
@@ -25,9 +26,9 @@ MAX_CHARACTERS = 800
 def exit_on_user_error() -> Iterator[None]:
     """Around (or, as a decorator, on) a command: print the error without a traceback, exit with 2.
 
-    Only errors that the user can repair, and what the file system refuses of a file that it names;
-    any other keeps its traceback. Where nobody reads the output any more, as behind ``| head``, it
-    ends without a word.
+    Only errors that the user can repair, exhausted memory, and what the file system refuses of a
+    file that it names; any other keeps its traceback. Where nobody reads the output
+    any more, as behind ``| head``, it ends without a word.
     """
     try:
         yield
@@ -38,8 +39,11 @@ def exit_on_user_error() -> Iterator[None]:
         with suppress(OSError, ValueError):  # or Python would fail again when it ends
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(BROKEN_PIPE_STATUS)
-    except OSError as error:
-        if error.filename is None:
+    except (MemoryError, OSError, RuntimeError, ImportError) as error:
+        if reason := why_out_of_memory(error):
+            print(f"error: {_printed(reason)}", file=sys.stderr)
+            sys.exit(USER_ERROR_STATUS)
+        if not isinstance(error, OSError) or error.filename is None:
             raise
         text = f"{os.fsdecode(error.filename)}: {why_refused(error)}"
         print(f"error: {_printed(text)}", file=sys.stderr)

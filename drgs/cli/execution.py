@@ -18,6 +18,7 @@ import mitsuba as mi
 from drgs.cli.commands import at_least
 from drgs.core.denormals import denormals_flushed
 from drgs.core.errors import UserError, one_line
+from drgs.core.memory import why_out_of_memory
 
 MAX_THREADS = 4096
 """Dr.Jit starts a thread for each, whatever there is to do."""
@@ -64,6 +65,8 @@ def select_variant(name: str) -> None:
     try:
         mi.set_variant(name)
     except ImportError as error:
+        if why_out_of_memory(error):
+            raise
         raise UserError(f"--variant {name}: not usable here: {one_line(error)}") from None
 
 

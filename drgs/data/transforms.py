@@ -40,6 +40,9 @@ RIGID_TOLERANCE = 1e-4
 """Largest entry of |R R^T - I|: eighty times what files written with float32 show (1.3e-6), far
 below any shear or scale that matters."""
 
+MEMORY_RATIO = 30
+"""Memory that JSON takes as Python's objects, in bytes of the text."""
+
 MAX_COORDINATE = 1e9
 """Scene units, of a camera's position: far beyond what float32 can tell apart within a scene."""
 
@@ -212,7 +215,7 @@ def read_frames(path: Path) -> list[Frame]:
 
     Raises :class:`UserError` naming the file, the key, what was expected and what was got.
     """
-    text = read_text(path, "file", MAX_BYTES)
+    text = read_text(path, "file", MAX_BYTES, MEMORY_RATIO)
     try:
         content = json.loads(text)
     except (ValueError, RecursionError) as error:
