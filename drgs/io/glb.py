@@ -229,7 +229,7 @@ def _check_memory(path: Path, document: Document, harmonics: int, size: int) -> 
     Attributes may lie in the same bytes.
     """
     num = document.accessor("POSITION").count
-    needed, what = gaussians_bytes(num, harmonics), f"a scene of {num:,} Gaussians"
+    needed, what = gaussians_bytes(num, harmonics, turned=True), f"a scene of {num:,} Gaussians"
     if needed > MAX_RATIO * size and needed > UNASKED_FILE_BYTES:
         raise UserError(
             f"{path}: {document.place}: {what} takes about {readable(needed)} of memory, and a "

@@ -291,7 +291,7 @@ def _check_room(path: Path, header: _Header, size: int) -> None:
             f"when unpacked, for which a file of {size:,} bytes has no room: at most {MAX_RATIO} "
             "times as many; it is damaged, or was cut off"
         )
-    needed = gaussians_bytes(header.num, (header.degree + 1) ** 2)
+    needed = gaussians_bytes(header.num, (header.degree + 1) ** 2, turned=True)
     require_memory(path, needed, f"a scene of {header.num:,} Gaussians")
 
 
