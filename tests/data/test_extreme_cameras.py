@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from drgs.core.errors import UserError
-from drgs.data.orbits import orbit_of_gaussians
+from drgs.data.orbits import near_plane_of, orbit_of_gaussians
 from drgs.data.viewpoints import look_at, near_one, read_viewpoints
 from drgs.gaussians.parameters import Gaussians
 
@@ -57,6 +57,14 @@ def test_coordinates_that_float32_cannot_tell_apart_are_refused(where, size):
     places = {"origin": (0, -4, 1), "target": (0, 0, 0), where: (0, size, 0)}
     with pytest.raises(UserError, match=f"camera: the coordinates of {where} must be at most"):
         look_at(**places, up=(0, 0, 1))
+
+
+@pytest.mark.parametrize(("size", "near"), [(1e38, 1e9), (1e-30, 1e-9)])
+def test_near_planes_of_scenes_of_any_size_are_within_their_limits(size, near):
+    means = np.random.default_rng(0).normal(size=(20, 3)) * size
+    ones = np.ones((20, 4))
+    gaussians = Gaussians.from_numpy(means, ones, ones[:, :3], 0.5 * ones[:, 0], ones[:, None, :3])
+    assert near_plane_of(gaussians) == near
 
 
 @pytest.mark.parametrize("length", [1e-300, 1e-200, 0.3, 1e200, 1e300])
