@@ -58,7 +58,7 @@ def test_one_gaussian_is_enough(tmp_path, each):
 @pytest.mark.parametrize("degree", [0, 3])
 def test_what_does_not_fit_is_refused_before_it_is_allocated(tmp_path, monkeypatch, each, degree):
     path = tmp_path / f"a{each.suffix}"
-    gaussians_within_ranges(20_000, degree=degree).save(path)
+    gaussians_within_ranges(50_000, degree=degree).save(path)
     Gaussians.load(path)  # imports
     tracemalloc.start()
     Gaussians.load(path)
