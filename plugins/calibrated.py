@@ -15,7 +15,7 @@ import numpy as np
 
 from drgs.cameras.camera import Camera, Lens, Pinhole
 from drgs.core.constants import MAX_SHUTTER_SAMPLES, SHUTTER_SAMPLES
-from drgs.core.errors import PluginError
+from drgs.core.errors import PluginError, UserError
 from drgs.integrator.properties import (
     integer,
     matrix,
@@ -183,7 +183,7 @@ class CalibratedSensor(mi.Sensor):
         """Where the lens model ends depends on its coefficients, which are read back."""
         if not keys or set(keys) & set(self.coefficients):
             values = {name: float(value[0]) for name, value in self.coefficients.items()}
-            self.lens = type(self.lens).of(**values) if values else self.lens
+            self.lens = _with_coefficients(type(self.lens), values) if values else self.lens
 
     def near_clip(self) -> float:
         """Nearer means and surfaces are not seen."""
@@ -326,7 +326,14 @@ def _lens(props: mi.Properties) -> Lens:
                 f"{'the coefficients ' + ', '.join(names) if names else 'no coefficients'}, "
                 f"got {name}"
             )
-    return model.of(**given) if names else model()
+    return _with_coefficients(model, given) if names else model()
+
+
+def _with_coefficients(model: type[Lens], coefficients: dict[str, float]) -> Lens:
+    try:
+        return model.of(**coefficients)
+    except UserError as error:
+        raise PluginError(f"calibrated: {error}") from None
 
 
 mi.register_sensor("calibrated", lambda props: CalibratedSensor(props))

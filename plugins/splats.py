@@ -26,6 +26,7 @@ from drgs.integrator.properties import (
     AOVS,
     KNOWN,
     LIGHT_SAMPLES,
+    MAX_LIGHT_SAMPLES,
     UNSEEN,
     aovs_of,
     approximations_of,
@@ -151,7 +152,7 @@ class SplatsIntegrator(mi.CppADIntegrator):
      * - light_samples
        - |int|
        - Splats that a ray draws, of those that it passes, where ``light`` or ``unseen`` is
-         ``rays``; 0: it composites all. (Default: 4)
+         ``rays``, at most 4096; 0: it composites all. (Default: 4)
 
      * - exposure
        - |float|
@@ -338,7 +339,9 @@ class SplatsIntegrator(mi.CppADIntegrator):
         self.probes = probes_of(props, self.light)
         self.unseen = one_of(props, "unseen", UNSEEN)
         self.shadows = ids_of(props, "shadows")
-        self.light_samples = integer(props, "light_samples", LIGHT_SAMPLES, least=0)
+        self.light_samples = integer(
+            props, "light_samples", LIGHT_SAMPLES, least=0, most=MAX_LIGHT_SAMPLES
+        )
         refuse_unknown(props, KNOWN)
         self._check_columns()
 

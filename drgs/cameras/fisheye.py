@@ -22,6 +22,7 @@ from drgs.cameras.polynomials import (
     polynomial,
     radius_at,
     up_to_the_last,
+    usable_coefficients,
 )
 from drgs.core.arrays import is_float64, types_of
 
@@ -59,7 +60,7 @@ class Fisheye(Lens):
     def of(**coefficients: float) -> Fisheye:
         """From OpenCV's names, ``k1`` to ``k4``; what is not given is zero."""
         assert set(coefficients) <= set(Fisheye.names)
-        kept = up_to_the_last(Fisheye.names, coefficients)
+        kept = up_to_the_last(Fisheye.names, usable_coefficients(coefficients))
         growth = [1.0, *((2 * n + 3) * k for n, k in enumerate(kept))]
         turn = math.sqrt(first_root(np.array(growth)))
         return Fisheye(kept, math.cos(min(turn, MAX_ANGLE)))

@@ -13,6 +13,12 @@ import drjit as dr
 import numpy as np
 
 from drgs.core.arrays import types_of
+from drgs.core.constants import MAX_COEFFICIENT
+from drgs.core.errors import UserError
+
+NEGLIGIBLE_COEFFICIENT = 1e-30
+"""A smaller one is as good as 0: at a slope of 1e4, k3 r^6 is 1e-6. Roots of polynomials with
+smaller ones overflow."""
 
 RADIUS_STEPS = 24
 """When the radius is looked for that a lens shows at a place: most need 4 or 5. Next to the place
@@ -83,6 +89,20 @@ def _between(low: Any, high: Any) -> Any:
     """In the middle on the scale r / (1 + r): a bracket may reach from 0 to very far."""
     middle = (low / (1 + low) + high / (1 + high)) / 2
     return middle / (1 - middle)
+
+
+def usable_coefficients(given: Mapping[str, float]) -> dict[str, float]:
+    """Return the same coefficients with 0 for negligible ones.
+
+    Raises :class:`UserError` naming the first that is larger than :data:`MAX_COEFFICIENT`.
+    """
+    for name, value in given.items():
+        if not abs(value) <= MAX_COEFFICIENT:
+            raise UserError(
+                f"{name} must be a coefficient of at most {MAX_COEFFICIENT:g} in size, got "
+                f"{value:g}; calibrate the camera again"
+            )
+    return {n: v if abs(v) >= NEGLIGIBLE_COEFFICIENT else 0.0 for n, v in given.items()}
 
 
 def up_to_the_last(names: Sequence[str], given: Mapping[str, float]) -> tuple[float, ...]:

@@ -18,7 +18,13 @@ import drjit as dr
 
 from drgs.cameras.camera import Camera, Perspective, uploaded, with_unseen_on_axis
 from drgs.cameras.distortion import PlaneDistortion, largest_squared_radius, steepest_fall
-from drgs.cameras.polynomials import UNBOUNDED, derivative, polynomial, up_to_the_last
+from drgs.cameras.polynomials import (
+    UNBOUNDED,
+    derivative,
+    polynomial,
+    up_to_the_last,
+    usable_coefficients,
+)
 from drgs.core.arrays import types_of
 
 BORDER = 65
@@ -56,6 +62,7 @@ class RadialTangential(PlaneDistortion, Perspective):
         """From OpenCV's names, ``k1`` to ``k6``, ``p1``, ``p2``; what is not given is zero."""
         names = RadialTangential.names
         assert set(coefficients) <= set(names)
+        coefficients = usable_coefficients(coefficients)
         p1, p2 = (float(coefficients.get(name, 0.0)) for name in names[6:])
         numerator = up_to_the_last(names[:3], coefficients)
         denominator = up_to_the_last(names[3:6], coefficients)

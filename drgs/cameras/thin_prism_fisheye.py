@@ -16,7 +16,7 @@ import drjit as dr
 from drgs.cameras.camera import Camera
 from drgs.cameras.distortion import PlaneDistortion, largest_squared_radius, steepest_fall
 from drgs.cameras.fisheye import MAX_ANGLE, Fisheye, place_directions, place_of
-from drgs.cameras.polynomials import derivative, polynomial, up_to_the_last
+from drgs.cameras.polynomials import derivative, polynomial, up_to_the_last, usable_coefficients
 from drgs.core.arrays import types_of
 
 RADIAL, TANGENTIAL, PRISM = ("k1", "k2", "k3", "k4"), ("p1", "p2"), ("sx1", "sy1")
@@ -50,6 +50,7 @@ class ThinPrismFisheye(PlaneDistortion, Fisheye):
     def of(**coefficients: float) -> ThinPrismFisheye:
         """From COLMAP's names, ``k1`` to ``k4``, ``p1``, ``p2``, ``sx1``, ``sy1``; others are 0."""
         assert set(coefficients) <= set(ThinPrismFisheye.names)
+        coefficients = usable_coefficients(coefficients)
         kept = up_to_the_last(RADIAL, coefficients)
         tangential, prism = (_both_or_none(names, coefficients) for names in (TANGENTIAL, PRISM))
         fall = steepest_fall(tangential or (0.0, 0.0), prism or (0.0, 0.0))

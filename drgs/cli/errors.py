@@ -10,6 +10,7 @@ from contextlib import contextmanager, suppress
 from drgs.core.errors import UserError
 from drgs.core.files import why_refused
 from drgs.core.llvm import LLVMVersionError
+from drgs.core.memory import why_out_of_memory
 
 USER_ERROR_STATUS = 2
 """Exit status of a command that the user has to call differently (as argparse's)."""
@@ -25,31 +26,35 @@ MAX_CHARACTERS = 800
 def exit_on_user_error() -> Iterator[None]:
     """Around (or, as a decorator, on) a command: print the error without a traceback, exit with 2.
 
-    Only errors that the user can repair, packages that cannot be imported, and what the file system
-    refuses of a file that it names; any other keeps its traceback. Where nobody reads the output
-    any more, as behind ``| head``, it ends without a word.
+    Only errors that the user can repair, packages that cannot be imported, exhausted memory, and
+    what the file system refuses of a file that it names; any other keeps its traceback. Where
+    nobody reads the output any more, as behind ``| head``, it ends without a word.
     """
     try:
         yield
-    except (UserError, LLVMVersionError) as error:
-        print(f"error: {_printed(str(error))}", file=sys.stderr)
-        sys.exit(USER_ERROR_STATUS)
-    except ImportError as error:
-        if error.name is None or error.name.partition(".")[0] == "drgs":
-            raise
-        text = f"{error}, by {sys.executable}; install drgs there with all that it needs"
-        print(f"error: {_printed(text)}", file=sys.stderr)
-        sys.exit(USER_ERROR_STATUS)
     except BrokenPipeError:
         with suppress(OSError, ValueError):  # or Python would fail again when it ends
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(BROKEN_PIPE_STATUS)
-    except OSError as error:
-        if error.filename is None:
+    except Exception as error:
+        text = _sentence(error)
+        if text is None:
             raise
-        text = f"{os.fsdecode(error.filename)}: {why_refused(error)}"
         print(f"error: {_printed(text)}", file=sys.stderr)
         sys.exit(USER_ERROR_STATUS)
+
+
+def _sentence(error: Exception) -> str | None:
+    """Return what to tell the user of an error; None: it is a fault of the program."""
+    if isinstance(error, (UserError, LLVMVersionError)):
+        return str(error)
+    if (reason := why_out_of_memory(error)) is not None:
+        return reason
+    if isinstance(error, OSError) and error.filename is not None:
+        return f"{os.fsdecode(error.filename)}: {why_refused(error)}"
+    if isinstance(error, ImportError) and error.name and error.name.partition(".")[0] != "drgs":
+        return f"{error}, by {sys.executable}; install drgs there with all that it needs"
+    return None
 
 
 def _printed(text: str) -> str:

@@ -19,6 +19,7 @@ from drgs.cli.commands import at_least
 from drgs.cli.interrupts import importing
 from drgs.core.denormals import denormals_flushed
 from drgs.core.errors import UserError, one_line
+from drgs.core.memory import why_out_of_memory
 
 MAX_THREADS = 4096
 """Dr.Jit starts a thread for each, whatever there is to do."""
@@ -66,6 +67,8 @@ def select_variant(name: str) -> None:
         with importing():
             mi.set_variant(name)
     except ImportError as error:
+        if why_out_of_memory(error):
+            raise
         raise UserError(f"--variant {name}: not usable here: {one_line(error)}") from None
 
 

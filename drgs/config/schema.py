@@ -42,6 +42,9 @@ NAMED_COLORS = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0)}
 DEFAULT_BACKGROUND = "white"
 """Where there are no photographs to ask."""
 
+NEAR_LIMITS = (1e-9, 1e9)
+"""Scene units, of near planes."""
+
 REFERENCE_NEAR = 0.2
 """Scene units: the reference's near plane, of scenes that are about 4 wide."""
 
@@ -169,6 +172,7 @@ class InitConfig(Section):
     num_points: Count | None = Field(
         None,
         ge=4,
+        le=100_000_000,
         description="Points, random or, at most, on the surface of the masks' hull. null: 100,000 "
         "with the strategy adc, else two fifths of the number that it grows to.",
     )
@@ -221,8 +225,8 @@ class _Model(Section):
     )
     near: float | None = Field(
         None,
-        ge=1e-9,
-        le=1e9,
+        ge=NEAR_LIMITS[0],
+        le=NEAR_LIMITS[1],
         description="Near plane, scene units: closer means are culled. null: about a twenty-fifth "
         "of the cameras' distance to what they look at, the reference's 0.2 for NeRF-synthetic "
         "scenes.",

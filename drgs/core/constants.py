@@ -78,6 +78,9 @@ alpha is below the cut and discarded."""
 MAX_INT = 2**31 - 1
 """The counters of Mitsuba and Dr.Jit are of 32 bits."""
 
+MAX_COEFFICIENT = 1e6
+"""A coefficient of distortion, in size: calibrations give less than 1e3."""
+
 MAX_FEATURES = 64
 """Numbers that a picture composites besides RGB, or instead of it: see
 :mod:`drgs.splatting.feature_groups`. The kernels of 64 and their derivatives compile in 8 s with

@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import IO, TYPE_CHECKING
 
 from drgs.core.errors import UserError, one_line
+from drgs.core.memory import require_memory
 
 if TYPE_CHECKING:
     import numpy as np
@@ -101,16 +102,20 @@ def _open_without_waiting(path: str, flags: int) -> int:
     return os.open(path, flags | getattr(os, "O_NONBLOCK", 0))
 
 
-def read_bytes(path: Path, what: str, max_bytes: int) -> bytes:
+def read_bytes(path: Path, what: str, max_bytes: int, memory_ratio: int = 1) -> bytes:
     """The content of a regular file; ``what`` it should be stands in the errors.
 
-    Raises :class:`UserError` where it cannot be read or is longer than ``max_bytes``.
+    memory_ratio: how many times the file's size the caller takes.
+
+    Raises :class:`UserError` where it cannot be read, is longer than ``max_bytes``, or takes more
+    memory than is available.
     """
     try:
         with open_regular(path, what, max_bytes) as file:
             # No more is asked for than there is: so much memory is allocated beforehand. Files of
             # the system claim to be empty.
             size = max(os.fstat(file.fileno()).st_size, 1 << 16)
+            require_memory(path, memory_ratio * size, f"the {what}")
             content = file.read(min(size, max_bytes) + 1)
     except OSError as error:
         raise UserError(f"{path}: cannot read the {what}: {error.strerror or error}") from None
@@ -119,13 +124,13 @@ def read_bytes(path: Path, what: str, max_bytes: int) -> bytes:
     return content
 
 
-def read_text(path: Path, what: str, max_bytes: int) -> str:
+def read_text(path: Path, what: str, max_bytes: int, memory_ratio: int = 2) -> str:
     """The text of a UTF-8 file, without the mark of byte order that some editors write first.
 
     Raises :class:`UserError` as :func:`read_bytes` does, and where the file is not UTF-8.
     """
     try:
-        return read_bytes(path, what, max_bytes).decode("utf-8-sig")
+        return read_bytes(path, what, max_bytes, memory_ratio).decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise UserError(
             f"{path}: cannot read the {what}: not UTF-8 text (byte {error.start})"
@@ -146,8 +151,11 @@ def read_arrays(path: Path, what: str) -> dict[str, np.ndarray]:
         try:
             _check_sizes(file)
             file.seek(0)
+            require_memory(path, os.fstat(file.fileno()).st_size, f"the {what}")
             with np.load(file, allow_pickle=False) as arrays:
                 return {name: arrays[name] for name in arrays.files}
+        except (UserError, MemoryError):
+            raise
         except Exception as error:  # zipfile and NumPy raise many types for a broken file
             reason = one_line(error) or type(error).__name__
             raise UserError(f"{path}: cannot read the {what}: {reason}") from None

@@ -7,16 +7,27 @@ therefore estimated before it is allocated.
 from __future__ import annotations
 
 import ctypes
+import errno
 import os
+import re
 import sys
 from pathlib import Path
 
-import drjit as dr
+from drgs.core.errors import UserError, one_line
 
 try:
     import resource
 except ImportError:  # Windows
     resource = None
+
+FREE_MEMORY = (
+    "close other programs, raise the limit (ulimit -v, or the container's), or use smaller input"
+)
+"""Remedy in messages."""
+
+_EXHAUSTED = re.compile(
+    "out of memory|std::bad_alloc|cannot allocate memory|failed to map segment", re.IGNORECASE
+)
 
 MAX_LANES = 2**32 - 1
 """Entries of an array of Dr.Jit, which counts them in 32 bits."""
@@ -31,6 +42,9 @@ SAMPLE_BYTES = 80
 CHANNEL_BYTES = 24
 """The same for each channel of the film besides colour: its plane, and its part of the block, of
 the picture and of the copy."""
+
+UNASKED_FILE_BYTES = 1 << 24
+"""A file that takes less is read without asking: a fit reads hundreds of photographs."""
 
 UNASKED_BYTES = 1 << 28
 """A picture that needs less is rendered without asking what there is, which may take a millisecond:
@@ -52,7 +66,7 @@ def available_memory() -> int:
 
 def release_unused_memory() -> None:
     """Give back to the system what Dr.Jit holds for its next arrays, and what glibc has free."""
-    dr.flush_malloc_cache()
+    _flush_cache_of_drjit()
     if sys.platform == "linux":
         trim = getattr(ctypes.CDLL(None), "malloc_trim", None)  # other C libraries have none
         if trim is not None:
@@ -70,6 +84,35 @@ def readable(count: float) -> str:
         if count >= 0.9995 * size:
             return f"{_three_digits(count / size)} {unit}"
     return f"{count / 1e3:.0f} kB"
+
+
+def require_memory(path: str | Path, needed: int, what: str) -> None:
+    """Raise :class:`UserError` unless ``needed`` bytes are available for ``what`` a file contains.
+
+    Called before they are allocated.
+    """
+    if needed <= UNASKED_FILE_BYTES or needed <= available_memory():
+        return
+    _flush_cache_of_drjit()
+    if needed > (available := available_memory()):
+        raise UserError(
+            f"{path}: {what} takes about {readable(needed)} of memory, of which "
+            f"{readable(available)} are available; {FREE_MEMORY}"
+        )
+
+
+def why_out_of_memory(error: BaseException) -> str | None:
+    """Return what to tell the user where an error means that memory is exhausted, else None.
+
+    Python and NumPy raise MemoryError, Dr.Jit a RuntimeError, and the loader of libraries an
+    ImportError or an OSError.
+    """
+    text = one_line(error)
+    is_of_system = isinstance(error, OSError) and error.errno == errno.ENOMEM
+    if isinstance(error, MemoryError) or is_of_system or _EXHAUSTED.search(text):
+        reason = f" ({text})" if text else ""
+        return f"out of memory{reason}: {readable(available_memory())} are available; {FREE_MEMORY}"
+    return None
 
 
 def why_too_large(width: int, height: int, channels: int = 3, samples: int = 1) -> str | None:
@@ -92,13 +135,19 @@ def why_too_large(width: int, height: int, channels: int = 3, samples: int = 1) 
     needed = pixels * of_pixel
     if needed <= UNASKED_BYTES or needed <= available_memory():
         return None
-    dr.flush_malloc_cache()  # what Dr.Jit holds for its next arrays is as good as available
+    _flush_cache_of_drjit()
     if needed <= (available := available_memory()):
         return None
     return (
         f"{asked} need about {readable(needed)} of memory, of which {readable(available)} are "
         f"available; at most {_pixels(available // of_pixel)}"
     )
+
+
+def _flush_cache_of_drjit() -> None:
+    """Free what Dr.Jit, where it is loaded, holds for its next arrays: as good as available."""
+    if drjit := sys.modules.get("drjit"):
+        drjit.flush_malloc_cache()
 
 
 def _digits(number: int) -> str:

@@ -10,7 +10,7 @@ import numpy as np
 
 from drgs.core.errors import UserError, one_line
 from drgs.core.files import open_regular
-from drgs.core.memory import available_memory, readable
+from drgs.core.memory import available_memory, readable, require_memory
 from drgs.data.kept import KeptPicture, Pixels
 from drgs.data.types import View
 from drgs.io.pictures import (
@@ -86,6 +86,7 @@ def read_depth(path: Path, unit: float, size: tuple[int, int]) -> np.ndarray:
     if is_array(path):
         depth = _stored_depth(path)
         _check_size(path, depth.shape[::-1], size)  # before memory is taken for it
+        require_memory(path, DEPTH_BYTES * depth.size, "the depth")
         with np.errstate(over="ignore"):  # becomes infinite, and so is not known
             depth = (depth.astype(np.float64) * unit).astype(np.float32)
     else:
@@ -100,6 +101,10 @@ def read_depth(path: Path, unit: float, size: tuple[int, int]) -> np.ndarray:
     return np.where(np.isfinite(depth) & (depth > 0), depth, 0).astype(np.float32)
 
 
+DEPTH_BYTES = 24
+"""About what a depth of an ``.npy`` file takes while it is converted."""
+
+
 def is_array(path: Path) -> bool:
     """Whether depths are stored as an array, not as a picture; by the name."""
     return path.suffix.lower() == ".npy"
@@ -111,6 +116,8 @@ def _stored_depth(path: Path) -> np.ndarray:
     try:
         with np.errstate(over="ignore"):  # of the size that a header claims
             depth = np.load(path, mmap_mode="r", allow_pickle=False)
+    except MemoryError:
+        raise
     except Exception as error:  # numpy raises many types for a broken header
         reason = one_line(error) or type(error).__name__
         raise UserError(f"{path}: cannot read the depth: {reason}") from None

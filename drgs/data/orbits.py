@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from drgs.config.schema import REFERENCE_NEAR
+from drgs.config.schema import NEAR_LIMITS, REFERENCE_NEAR
 from drgs.core.errors import UserError
 from drgs.data.start_box import focus_of
 from drgs.data.types import Viewpoint
@@ -132,7 +132,9 @@ def orbit_of_gaussians(gaussians: Gaussians, up: np.ndarray, fov: float) -> Orbi
 def near_plane_of(gaussians: Gaussians) -> float:
     """The near plane, scene units, for Gaussians of which no fit says one."""
     size, (low, high) = _middle(gaussians, share=0.5)[1], NEAR_RANGE
-    return REFERENCE_NEAR if low * size <= REFERENCE_NEAR <= high * size else NEAR_SHARE * size
+    if low * size <= REFERENCE_NEAR <= high * size:
+        return REFERENCE_NEAR
+    return float(np.clip(NEAR_SHARE * size, *NEAR_LIMITS))
 
 
 def up_of(views: Sequence[Viewpoint]) -> np.ndarray:

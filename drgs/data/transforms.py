@@ -20,6 +20,7 @@ from pydantic_core import ErrorDetails
 
 from drgs.cameras.axes import between_opencv_and_opengl
 from drgs.config.explain import expectation
+from drgs.core.constants import MAX_COEFFICIENT
 from drgs.core.errors import UserError, listed, one_line
 from drgs.core.files import read_text, shortened
 from drgs.data.types import Motion
@@ -36,6 +37,9 @@ MAX_BYTES = 1 << 28
 RIGID_TOLERANCE = 1e-4
 """Largest entry of |R R^T - I|: eighty times what files written with float32 show (1.3e-6), far
 below any shear or scale that matters."""
+
+MEMORY_RATIO = 30
+"""Memory that JSON takes as Python's objects, in bytes of the text."""
 
 MAX_COORDINATE = 1e9
 """Scene units, of a camera's position: far beyond what float32 can tell apart within a scene."""
@@ -118,6 +122,7 @@ def _opencv_pose(rows: list[list[float]]) -> np.ndarray:
 
 
 Number = Annotated[float, Field(allow_inf_nan=False)]
+Coefficient = Annotated[float, Field(ge=-MAX_COEFFICIENT, le=MAX_COEFFICIENT)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 Side = Annotated[float, Field(ge=1, le=MAX_SIDE)]
 Angle = Annotated[Number, AfterValidator(_angle)]
@@ -139,16 +144,16 @@ class CameraValues(BaseModel):
     cy: Number | None = None
     w: Side | None = None  # px
     h: Side | None = None
-    k1: Number | None = None
-    k2: Number | None = None
-    k3: Number | None = None
-    k4: Number | None = None
-    k5: Number | None = None
-    k6: Number | None = None
-    p1: Number | None = None
-    p2: Number | None = None
-    sx1: Number | None = None
-    sy1: Number | None = None
+    k1: Coefficient | None = None
+    k2: Coefficient | None = None
+    k3: Coefficient | None = None
+    k4: Coefficient | None = None
+    k5: Coefficient | None = None
+    k6: Coefficient | None = None
+    p1: Coefficient | None = None
+    p2: Coefficient | None = None
+    sx1: Coefficient | None = None
+    sy1: Coefficient | None = None
     camera_model: (
         Literal[
             "SIMPLE_PINHOLE",
@@ -231,7 +236,7 @@ def read_transforms(path: Path) -> TransformsFile:
 
     Raises :class:`UserError` naming the file, the key, what was expected and what was got.
     """
-    text = read_text(path, "file", MAX_BYTES)
+    text = read_text(path, "file", MAX_BYTES, MEMORY_RATIO)
     try:
         content = json.loads(text)
     except (ValueError, RecursionError) as error:

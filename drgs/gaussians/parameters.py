@@ -203,10 +203,11 @@ class Gaussians:
 
     def _turned(self, rotation: np.ndarray) -> Gaussians:
         """Numpy arrays turned as a whole; float32."""
-        from drgs.gaussians.turning import turned
+        from drgs.gaussians.turning import as_float32, turned
 
         parts = turned(self.means, self.quats, self.shN, rotation)
-        means, quats, shN = (part.astype(np.float32) for part in parts)
+        names = ("means", "quats", "shN")
+        means, quats, shN = (as_float32(n, p) for n, p in zip(names, parts, strict=True))
         x, y, z = (rotation @ self.origin).tolist()
         return replace(self, means=means, quats=quats, shN=shN, origin=(x, y, z))
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from drgs.core.errors import PluginError
 from drgs.gaussians.parameters import Gaussians
-from drgs.gaussians.turning import turned
+from drgs.gaussians.turning import as_float32, turned
 
 TOLERANCE = 1e-4
 """Of A^T A / s^2 - I: numbers written with five digits are a rotation, a shear by a pixel in ten
@@ -62,4 +62,4 @@ class Similarity:
         if g.smoothing is not None:
             g = replace(g, smoothing=(g.smoothing * self.scale).astype(np.float32))
         names = ("means", "quats", "log_scales", "shN")
-        return replace(g, **{name: getattr(g, name).astype(np.float32) for name in names})
+        return replace(g, **{name: as_float32(name, getattr(g, name)) for name in names})

@@ -5,7 +5,25 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from drgs.core.errors import UserError
 from drgs.gaussians.sh_rotation import rotated
+
+MAX_QUATERNION = 1e30
+"""Components of larger ones might leave float32 when they are turned."""
+
+
+def as_float32(name: str, values: np.ndarray) -> np.ndarray:
+    """The numbers in single precision.
+
+    Raises :class:`UserError` where finite ones are beyond it.
+    """
+    bad = np.argwhere(np.isfinite(values) & (np.abs(values) > np.finfo(np.float32).max))
+    if len(bad):
+        raise UserError(
+            f"{name} of Gaussian {bad[0][0]} is {values[tuple(bad[0])]:g} once it is moved, and "
+            "float32 ends at 3.4e38; crop or scale the scene"
+        )
+    return values.astype(np.float32)
 
 
 def turned(
@@ -16,13 +34,15 @@ def turned(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Positions, quaternions and harmonics after x' = R x; float64, of the same shapes.
 
-    means: (N, 3); quats: (N, 4) wxyz, of any norm, which they keep; shN: (N, K - 1, 3) of degree 1
-    and above; rotation: R (3, 3), orthonormal, determinant 1.
+    means: (N, 3); quats: (N, 4) wxyz, of any norm, which they keep up to 1e30; shN: (N, K - 1, 3)
+    of degree 1 and above; rotation: R (3, 3), orthonormal, determinant 1.
     """
     wxyz = np.roll(Rotation.from_matrix(rotation).as_quat(), 1)
+    quats = quats.astype(np.float64)
+    sizes = np.abs(quats).max(axis=1, keepdims=True, initial=MAX_QUATERNION)
     return (
         means @ rotation.T,
-        _product(wxyz, quats.astype(np.float64)),
+        _product(wxyz, quats / (sizes / MAX_QUATERNION)),
         rotated(shN.astype(np.float64), rotation),
     )
 

@@ -53,6 +53,9 @@ KNOWN = (
 LIGHT_SAMPLES = 4
 """Splats that a ray of ``light: rays`` draws."""
 
+MAX_LIGHT_SAMPLES = 4096
+"""As many as a pixel may have samples. All those that a ray passes are composited with 0."""
+
 LIGHTS = ("none", "probe", "rays")
 """How light passes between splats and surfaces."""
 

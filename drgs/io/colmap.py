@@ -21,6 +21,7 @@ from types import ModuleType
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from drgs.core.constants import MAX_COEFFICIENT
 from drgs.core.errors import Place, UserError, one_line
 from drgs.io.colmap_records import MODELS, CameraRecord, ImageRecord, PointRecord
 from drgs.io.pictures import MAX_SIDE
@@ -159,7 +160,8 @@ def _cameras(records: Iterator[CameraRecord]) -> dict[int, ColmapCamera]:
                 f"({', '.join(names)}), got {len(values)}"
             )
         for name, value in zip(names, values, strict=True):
-            _check_number(place, name, value)
+            is_length = name in ("f", "fx", "fy", "cx", "cy", "w", "h")
+            _check_number(place, name, value, MAX_NUMBER if is_length else MAX_COEFFICIENT)
         if number in cameras:
             raise UserError(f"{place}: each camera must be there once, got a second one {number}")
         cameras[number] = ColmapCamera(number, model, width, height, tuple(values))
@@ -210,8 +212,8 @@ def _points(records: Iterator[PointRecord]) -> ColmapPoints:
     return ColmapPoints(*(np.ascontiguousarray(table[name]) for name in _POINT.names))
 
 
-def _check_number(place: Place, name: str, value: float) -> None:
-    if not abs(value) <= MAX_NUMBER:
+def _check_number(place: Place, name: str, value: float, most: float = MAX_NUMBER) -> None:
+    if not abs(value) <= most:
         raise UserError(
-            f"{place}: {name} must be a number of at most {MAX_NUMBER:g} in size, got {value:g}"
+            f"{place}: {name} must be a number of at most {most:g} in size, got {value:g}"
         )

@@ -13,6 +13,9 @@ from drgs.io.colmap_records import MODELS, CameraRecord, ImageRecord, PointRecor
 MAX_BYTES = 1 << 33
 """Of a file: 8.6 GB."""
 
+MEMORY_RATIO = 4
+"""Memory that reading takes, in bytes of the file: its content and the table of its records."""
+
 MAX_NAME = 4096
 """Bytes of an image's name."""
 
@@ -70,7 +73,7 @@ class _File:
 
     def __init__(self, path: Path) -> None:
         self._path, self._at = path, 0
-        self._data = read_bytes(path, "file", MAX_BYTES)
+        self._data = read_bytes(path, "file", MAX_BYTES, MEMORY_RATIO)
 
     @property
     def place(self) -> Place:

@@ -18,6 +18,9 @@ from drgs.io.colmap_records import MODELS, CameraRecord, ImageRecord, PointRecor
 MAX_BYTES = 1 << 33
 """Of a file: 8.6 GB."""
 
+MEMORY_RATIO = 8
+"""Memory that reading takes, in bytes of the file: its text, lines and numbers."""
+
 MAX_DIGITS = 19
 """Of a whole number."""
 
@@ -150,7 +153,7 @@ class _Line:
 
 def _lines(path: Path) -> Iterator[_Line]:
     """All of them."""
-    text = read_text(path, "file", MAX_BYTES)
+    text = read_text(path, "file", MAX_BYTES, MEMORY_RATIO)
     return (_Line(path, number, line) for number, line in enumerate(text.split("\n"), 1))
 
 

@@ -24,9 +24,11 @@ import numpy as np
 
 from drgs.core.constants import SH_C0
 from drgs.core.errors import UserError
+from drgs.core.memory import require_memory
 from drgs.io.morton import morton_order
 from drgs.io.ply import NUM_REST, Scalar, encode_elements, properties_of, read_elements
 from drgs.io.quantized import (
+    gaussians_bytes,
     logits_of,
     opacities_of,
     rounded,
@@ -166,6 +168,9 @@ def read_gaussians(path: str | Path) -> tuple[dict[str, np.ndarray], dict[str, S
     there = properties_of(path)
     rows, statements = read_elements(path, [n for n in ("chunk", "vertex", "sh") if n in there])
     vertex = rows["vertex"]
+    harmonics = 1 + len(rows["sh"].dtype.names) // 3 if "sh" in rows else 1
+    needed = gaussians_bytes(len(vertex), harmonics)
+    require_memory(path, needed, f"a scene of {len(vertex):,} Gaussians")
     bounds = _checked_bounds(path, rows, colors="min_r" in there["chunk"])
     _check_unsigned(path, "vertex", vertex, PACKED, 4)
     group = np.arange(len(vertex)) // CHUNK

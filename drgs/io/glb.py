@@ -26,16 +26,25 @@ import numpy as np
 from drgs.core.constants import SH_C0
 from drgs.core.errors import Place, UserError
 from drgs.core.files import read_bytes
+from drgs.core.memory import UNASKED_FILE_BYTES, readable, require_memory
 from drgs.core.origin import WORLD
 from drgs.io.glb_document import EXTENSION, OURS, Document, read_document
 from drgs.io.ply import ORIGIN, Scalar, near_means, origin_among
 from drgs.io.quantized import (
+    gaussians_bytes,
     log_scales_of,
     logits_of,
     opacities_of,
     rounded,
     unit_quaternions,
 )
+
+MAX_RATIO = 64
+"""How many times more memory a scene may take than its file has bytes: those with a byte for each
+number take 10 times."""
+
+MAX_JSON_BYTES = 1 << 24
+"""Of the JSON part, which takes up to 30 times as much memory."""
 
 MAX_BYTES = (1 << 32) - 1
 """Of a file: its length is a number of 32 bits."""
@@ -189,6 +198,7 @@ def read_gaussians(path: str | Path) -> tuple[dict[str, np.ndarray], dict[str, S
     if not count or stray:
         what = f"all those below {stray[0]}" if stray else "at least that of degree 0"
         raise UserError(f"{path}: {document.place}: harmonics must be complete: {what} is expected")
+    _check_memory(path, document, count, len(text) + len(binary))
     reader = _Attributes(path, document, binary, start)
     means = reader.values("POSITION", 3)
     scales = reader.values(f"{EXTENSION}:SCALE", 3)
@@ -213,6 +223,22 @@ def read_gaussians(path: str | Path) -> tuple[dict[str, np.ndarray], dict[str, S
     return {n: values.astype(np.float32) for n, values in arrays.items()}, said
 
 
+def _check_memory(path: Path, document: Document, harmonics: int, size: int) -> None:
+    """Refuse what takes more memory than there is, or than a file of ``size`` bytes should.
+
+    Attributes may lie in the same bytes.
+    """
+    num = document.accessor("POSITION").count
+    needed, what = gaussians_bytes(num, harmonics, turned=True), f"a scene of {num:,} Gaussians"
+    if needed > MAX_RATIO * size and needed > UNASKED_FILE_BYTES:
+        raise UserError(
+            f"{path}: {document.place}: {what} takes about {readable(needed)} of memory, and a "
+            f"file of {size:,} bytes must take at most {MAX_RATIO} times as many; its attributes "
+            "lie in the same bytes: write each in bytes of its own"
+        )
+    require_memory(path, needed, what)
+
+
 def _chunks(path: Path, content: bytes) -> tuple[bytes, bytes, int]:
     """The JSON part, the binary part, and the byte at which that begins."""
     if len(content) < HEADER.size or not content.startswith(MAGIC):
@@ -226,6 +252,11 @@ def _chunks(path: Path, content: bytes) -> tuple[bytes, bytes, int]:
     chunks, at = [], HEADER.size
     for kind in (JSON, BINARY):
         size, found = CHUNK.unpack_from(content, at) if at + CHUNK.size <= length else (0, b"")
+        if kind == JSON and size > MAX_JSON_BYTES:
+            raise UserError(
+                f"{Place(path, 'byte', at)}: the JSON part must have at most {MAX_JSON_BYTES:,} "
+                f"bytes, got {size:,}; write the splats into a file of their own"
+            )
         if found != kind or size > length - at - CHUNK.size:
             raise UserError(
                 f"{Place(path, 'byte', at)}: a chunk {kind.decode().strip(chr(0))} within the file "

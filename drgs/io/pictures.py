@@ -20,12 +20,16 @@ from PIL import ExifTags, Image, ImageCms, UnidentifiedImageError
 
 from drgs.core.errors import UserError, one_line
 from drgs.core.files import atomic_path, open_regular
+from drgs.core.memory import require_memory
 
 if TYPE_CHECKING:
     import mitsuba as mi
 
 MAX_PIXELS = 1 << 26
 """67 million, as 8192 x 8192: 0.8 GB once decoded to float32."""
+
+PIXEL_BYTES = 16
+"""About what decoding takes for a pixel, with the copies that are made of it."""
 
 MAX_SIDE = 2**24
 """px: of a larger picture, float32 does not tell neighbouring pixels apart."""
@@ -242,6 +246,8 @@ def read_pixels(path: Path) -> np.ndarray:
     """
     with _opened(path) as image:
         _check(path, image)  # before memory is allocated for it
+        needed = image.width * image.height * PIXEL_BYTES
+        require_memory(path, needed, f"a picture of {image.width} x {image.height} px")
         turn, decoded = _turned_by_pillow(image), image
         if image.mode != "RGBA" and image.mode != "LA" and _has_alpha(image):
             decoded = image.convert("RGBA")
@@ -282,7 +288,7 @@ def _opened(path: Path) -> Iterator[Image.Image]:
     try:
         with open_regular(path, "image", MAX_BYTES) as file, Image.open(file) as image:
             yield image
-    except UserError:
+    except (UserError, MemoryError):
         raise
     except UnidentifiedImageError:
         raise UserError(

@@ -36,6 +36,7 @@ from plyfile import PlyData, PlyElement, PlyListProperty
 
 from drgs.core.errors import UserError, UserNote, listed, one_line
 from drgs.core.files import open_regular
+from drgs.core.memory import require_memory
 from drgs.core.origin import WORLD, Origin, near_origin
 from drgs.io.quantized import LARGEST_LOGIT, SMALLEST_LOGIT
 
@@ -56,6 +57,9 @@ MAX_ORIGIN = 1e12
 
 NUM_REST = {3 * ((degree + 1) ** 2 - 1): degree for degree in range(4)}
 """Number of ``f_rest`` properties -> degree: 0, 9, 24, 45 -> 0, 1, 2, 3."""
+
+ROWS_AND_COPIES = 3
+"""Memory that reading takes, in rows: Gaussians take 2.8 times theirs, from text as well."""
 
 MAX_HEADER_BYTES = 1 << 20
 """The header of 62 properties takes 1.5 kB; the rest is room for comments."""
@@ -275,7 +279,7 @@ def _read(path: str | Path, read: Callable[[IO[bytes], _Layout], T]) -> T:
     try:
         with open_regular(path) as file:
             return read(file, _read_layout(path, file))
-    except UserError:
+    except (UserError, MemoryError):
         raise
     except OSError as error:
         raise UserError(f"{path}: cannot read the file: {error.strerror or error}") from None
@@ -389,6 +393,8 @@ def _rows(
         raise UserError(
             f"{path}: element {missing[0]} must have no lists, and come before elements that have"
         )
+    of_rows = sum(dtype.itemsize * count for _, dtype, count in places.values())
+    require_memory(path, ROWS_AND_COPIES * of_rows, layout.promised())
     rows = {}
     for name, (start, dtype, count) in places.items():
         file.seek(start)
@@ -406,6 +412,7 @@ def _text_rows(path: str | Path, file: IO[bytes], layout: _Layout) -> np.ndarray
             with warnings.catch_warnings():  # of no rows, which are refused below
                 warnings.simplefilter("ignore")
                 kind = element.dtype()
+                require_memory(path, ROWS_AND_COPIES * kind.itemsize * count, layout.promised())
                 rows = np.loadtxt(islice(lines, count), kind, comments=None, ndmin=1)
             found = len(rows)
         else:

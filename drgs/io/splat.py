@@ -16,8 +16,10 @@ import numpy as np
 from drgs.core.constants import SH_C0
 from drgs.core.errors import Place, UserError
 from drgs.core.files import read_bytes
+from drgs.core.memory import require_memory
 from drgs.io.ply import Scalar
 from drgs.io.quantized import (
+    gaussians_bytes,
     log_scales_of,
     logits_of,
     opacities_of,
@@ -80,6 +82,7 @@ def read_gaussians(path: str | Path) -> tuple[dict[str, np.ndarray], dict[str, S
             "each Gaussian, at least one; it is damaged, or was cut off"
         )
     rows = np.frombuffer(content, ROW)
+    require_memory(path, gaussians_bytes(len(rows), 1), f"a scene of {len(rows):,} Gaussians")
     for name, least in (("mean", -MAX_NUMBER), ("scale", 0)):
         values = rows[name]
         bad = np.argwhere(~((values >= least) & (values <= MAX_NUMBER)))

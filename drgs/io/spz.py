@@ -34,8 +34,10 @@ import numpy as np
 from drgs.core.errors import Place, UserError, UserNote
 from drgs.core.extras import required
 from drgs.core.files import read_bytes
+from drgs.core.memory import require_memory
 from drgs.io.ply import Scalar
 from drgs.io.quantized import (
+    gaussians_bytes,
     logits_of,
     opacities_of,
     rounded,
@@ -289,6 +291,8 @@ def _check_room(path: Path, header: _Header, size: int) -> None:
             f"when unpacked, for which a file of {size:,} bytes has no room: at most {MAX_RATIO} "
             "times as many; it is damaged, or was cut off"
         )
+    needed = gaussians_bytes(header.num, (header.degree + 1) ** 2, turned=True)
+    require_memory(path, needed, f"a scene of {header.num:,} Gaussians")
 
 
 def _read_gzip(path: Path, content: bytes) -> tuple[_Header, list[np.ndarray]]:

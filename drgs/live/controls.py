@@ -44,6 +44,11 @@ FIRST_SIDE = "1280"
 """px: of the longer side of a picture."""
 
 
+MAX_NUMBER = 100.0
+"""The largest value of an approximation without an upper limit: of ``low_pass``, a standard
+deviation of 10 px. With more, each splat soon covers the whole film, for which memory runs out."""
+
+
 @dataclass(frozen=True)
 class Looking:
     """What the controls say."""
@@ -110,8 +115,9 @@ class LookControls:
             return gui.add_checkbox(name, value, hint=declared.description)
         limits = declared.limits
         step = 1 if declared.kind is int else 1e-4
+        most = max(MAX_NUMBER, value) if limits.le is None else limits.le
         return gui.add_number(
-            name, value, min=limits.ge, max=limits.le, step=step, hint=declared.description
+            name, value, min=limits.ge, max=most, step=step, hint=declared.description
         )
 
     def _told(self, control: Any) -> Any:

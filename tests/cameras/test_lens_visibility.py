@@ -22,6 +22,9 @@ from support.lens_scenes import (
 from support.reference_lenses import camera_at_origin, gaussians_at
 
 from drgs.cameras import fisheye, polynomials
+from drgs.cameras.fisheye import Fisheye as CameraFisheye
+from drgs.cameras.radial_tangential import RadialTangential
+from drgs.cameras.thin_prism_fisheye import ThinPrismFisheye as CameraThinPrismFisheye
 from drgs.reference import effects
 from drgs.reference.effects import Fisheye, OpenCV, Orthographic, ThinPrismFisheye
 
@@ -66,6 +69,12 @@ def test_a_fisheye_sees_from_the_axis_to_behind_the_camera(precision, name):
     size = np.abs(expected.cov2d).max(axis=(1, 2), keepdims=True)
     errors = np.abs(covariances(splats) - expected.cov2d) / size
     assert errors.max() < tolerance, np.argmax(errors.max(axis=(1, 2)))
+
+
+@pytest.mark.parametrize("lens", [RadialTangential, CameraFisheye, CameraThinPrismFisheye])
+@pytest.mark.parametrize("tiny", [5e-324, -1e-200, 1e-31])
+def test_coefficients_that_change_nothing_are_zero(lens, tiny):
+    assert lens.of(**dict.fromkeys(lens.names, tiny)) == lens.of(**dict.fromkeys(lens.names, 0.0))
 
 
 def folded_points(lens) -> np.ndarray:

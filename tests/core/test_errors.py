@@ -42,6 +42,10 @@ def test_commands_report_what_the_file_system_refuses_of_a_named_file(capsys):
             raise error
         assert exit_info.value.code == 2
         assert capsys.readouterr().err.startswith(f"error: /a/b: {line}")
+    with pytest.raises(SystemExit) as exit_info, exit_on_user_error():
+        raise MemoryError("Unable to allocate 64 MiB")
+    assert exit_info.value.code == 2
+    assert capsys.readouterr().err.startswith("error: out of memory (Unable to allocate 64 MiB): ")
     with pytest.raises(OSError, match="nameless"), exit_on_user_error():
         raise OSError("nameless")
 

@@ -1,5 +1,6 @@
 """What memory there is, as the kernel's files say; what is refused because it cannot be held."""
 
+import errno
 import subprocess
 import sys
 
@@ -9,6 +10,7 @@ import pytest
 from drjit.llvm.ad import Float
 
 from drgs.core import memory
+from drgs.core.errors import UserError
 
 GB = 10**9
 
@@ -47,6 +49,33 @@ def test_a_control_group_of_version_2_limits_it(kernel, path):
     assert memory.available_memory() == 3.5 * GB
     write(group, memory__max=f"{GB}\n", memory__current=f"{2 * GB}\n", memory__stat="anon 7\n")
     assert memory.available_memory() == 0
+
+
+@pytest.mark.parametrize(
+    ("error", "is_exhausted"),
+    [
+        (MemoryError(), True),
+        (RuntimeError("jit_malloc(): out of memory! Could not allocate 9 bytes"), True),
+        (ImportError("libtiff.so: failed to map segment from shared object"), True),
+        (OSError(errno.ENOMEM, "Cannot allocate memory"), True),
+        (OSError(errno.ENOENT, "No such file"), False),
+        (RuntimeError("no memory of it"), False),
+    ],
+)
+def test_exhausted_memory_is_told_from_other_errors(kernel, error, is_exhausted):
+    reason = memory.why_out_of_memory(error)
+    assert (reason is not None) == is_exhausted
+    assert reason is None or "8.19 GB are available; close other programs" in reason
+
+
+def test_what_does_not_fit_is_refused_with_what_there_is(kernel):
+    memory.require_memory("a.ply", 8_000_000 * 1024, "a scene")
+    with pytest.raises(UserError) as error:
+        memory.require_memory("a.ply", 8_000_000 * 1024 + 1, "a scene")
+    assert str(error.value) == (
+        "a.ply: a scene takes about 8.19 GB of memory, of which 8.19 GB are available; "
+        f"{memory.FREE_MEMORY}"
+    )
 
 
 def test_a_control_group_of_version_1_limits_it(kernel):
@@ -115,7 +144,7 @@ def test_what_fits_into_memory_may_be_too_many_for_the_library(monkeypatch):
 def test_what_drjit_holds_for_its_next_arrays_is_available(monkeypatch):
     rooms = [10**9]
     monkeypatch.setattr(memory, "available_memory", lambda: rooms[-1])
-    monkeypatch.setattr(memory.dr, "flush_malloc_cache", lambda: rooms.append(8 * GB))
+    monkeypatch.setattr(dr, "flush_malloc_cache", lambda: rooms.append(8 * GB))
     assert memory.why_too_large(3000, 3000) is None
     assert len(rooms) == 2
     assert memory.why_too_large(3000, 3000) is None

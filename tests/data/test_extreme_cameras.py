@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from drgs.core.errors import UserError
-from drgs.data.orbits import orbit_of_gaussians
+from drgs.data.orbits import near_plane_of, orbit_of_gaussians
 from drgs.data.viewpoints import look_at, near_one, read_viewpoints
 from drgs.gaussians.parameters import Gaussians
 
@@ -31,6 +31,8 @@ def warnings_are_errors():
         ({"h": 1e20}, "h must be <= 16777216, got 1e+20"),
         ({"h": 1e-300}, "h must be >= 1, got 1e-300"),
         ({"cx": 1e300, "cy": 0.0}, "cx must be within 1600 px of the picture, got 1e+300"),
+        ({"k1": 1e308}, "k1 must be <= 1000000, got 1e+308"),
+        ({"p2": -2e6}, "p2 must be >= -1000000, got -2000000.0"),
         ({"cx": 8.0, "cy": -1e5}, "cy must be within 1200 px of the picture, got -100000"),
     ],
 )
@@ -55,6 +57,14 @@ def test_coordinates_that_float32_cannot_tell_apart_are_refused(where, size):
     places = {"origin": (0, -4, 1), "target": (0, 0, 0), where: (0, size, 0)}
     with pytest.raises(UserError, match=f"camera: the coordinates of {where} must be at most"):
         look_at(**places, up=(0, 0, 1))
+
+
+@pytest.mark.parametrize(("size", "near"), [(1e38, 1e9), (1e-30, 1e-9)])
+def test_near_planes_of_scenes_of_any_size_are_within_their_limits(size, near):
+    means = np.random.default_rng(0).normal(size=(20, 3)) * size
+    ones = np.ones((20, 4))
+    gaussians = Gaussians.from_numpy(means, ones, ones[:, :3], 0.5 * ones[:, 0], ones[:, None, :3])
+    assert near_plane_of(gaussians) == near
 
 
 @pytest.mark.parametrize("length", [1e-300, 1e-200, 0.3, 1e200, 1e300])

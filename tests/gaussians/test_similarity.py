@@ -7,6 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from support.views import Scene
 
+from drgs.core.errors import UserError
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 from drgs.gaussians.similarity import Similarity
 from drgs.reference import splatting as reference
@@ -93,6 +94,16 @@ def test_a_smoothing_filter_grows_with_the_model():
     moved = Similarity.of(MATRIX, "x").of_gaussians(model(smoothing=filters))
     np.testing.assert_allclose(moved.smoothing, SCALE * filters, rtol=1e-6)
     assert moved.smoothing.dtype == np.float32
+
+
+def test_positions_that_leave_float32_are_refused_and_quaternions_do_not():
+    turn = Similarity.of(matrix_of(Rotation.from_euler("z", 45, degrees=True).as_matrix()), "it")
+    far = model()
+    far.quats[:] = 3e38
+    assert np.isfinite(turn.of_gaussians(far).quats).all()
+    far.means[2] = 3e38, 3e38, 0
+    with pytest.raises(UserError, match=r"means of Gaussian 2 is 4.24264e\+38 once it is moved"):
+        turn.of_gaussians(far)
 
 
 def test_what_a_move_does_not_touch_stays():

@@ -240,6 +240,11 @@ REFUSED = {
         {"shutter_samples": 2.5},
         "PluginTypeError: calibrated: shutter_samples must be an integer of at least 1, got 2.5",
     ),
+    "large coefficient": (
+        {"lens": "fisheye", "k2": 1e7},
+        "PluginError: calibrated: k2 must be a coefficient of at most 1e+06 in size, got 1e+07; "
+        "calibrate the camera again",
+    ),
     "pose": (
         {"to_world_close": 3.0},
         "PluginTypeError: calibrated: to_world_close must be a transform, got float",

@@ -97,6 +97,10 @@ REFUSED = {
         "PluginError: splats: sh_degree must be an integer from 0 to 3, got 4",
     ),
     "sh_degree negative": ({"sh_degree": -1}, "got -1"),
+    "too many light_samples": (
+        {"light_samples": 10**9},
+        "splats: light_samples must be an integer from 0 to 4096, got 1000000000",
+    ),
     "sh_degree not an integer": ({"sh_degree": 0.5}, "got 0.5"),
     "sh_degree a float": ({"sh_degree": 0.0}, "sh_degree must be an integer from 0 to 3, got 0.0"),
     "sh_degree a boolean": ({"sh_degree": True}, "got True"),

@@ -1,6 +1,7 @@
 """What all formats of Gaussians have in common: what was written is read, and damage is refused."""
 
 import re
+import tracemalloc
 from dataclasses import replace
 
 import numpy as np
@@ -13,6 +14,7 @@ from support.formats import (
     matched,
 )
 
+from drgs.core import memory
 from drgs.core.errors import UserError
 from drgs.gaussians.parameters import Gaussians
 from drgs.io.formats import FORMATS, format_of
@@ -50,6 +52,26 @@ def test_one_gaussian_is_enough(tmp_path, each):
     path, expected = tmp_path / f"a{each.suffix}", gaussians_within_ranges(1, degree=0)
     expected.save(path)
     assert_within(PRECISION[each.name], expected, Gaussians.load(path))
+
+
+@each_format
+@pytest.mark.parametrize("degree", [0, 3])
+def test_what_does_not_fit_is_refused_before_it_is_allocated(tmp_path, monkeypatch, each, degree):
+    path = tmp_path / f"a{each.suffix}"
+    gaussians_within_ranges(50_000, degree=degree).save(path)
+    Gaussians.load(path)  # imports
+    tracemalloc.start()
+    Gaussians.load(path)
+    peak = tracemalloc.get_traced_memory()[1]
+    monkeypatch.setattr(memory, "UNASKED_FILE_BYTES", 0)
+    monkeypatch.setattr(memory, "available_memory", lambda: 0.9 * peak)
+    tracemalloc.reset_peak()
+    with pytest.raises(UserError, match=f"^{re.escape(str(path))}: .* of memory, of which"):
+        Gaussians.load(path)
+    assert tracemalloc.get_traced_memory()[1] < 0.6 * peak
+    tracemalloc.stop()
+    monkeypatch.setattr(memory, "available_memory", lambda: 3 * peak)
+    Gaussians.load(path)
 
 
 @checked

@@ -235,6 +235,20 @@ def test_a_number_out_of_range_is_refused_by_its_row(tmp_path, parts, attribute,
     assert text.startswith("byte ") and f", row 5: {name} {message}" in text
 
 
+def test_attributes_in_the_same_bytes_may_not_take_many_times_the_file(tmp_path, parts):
+    document, _ = parts
+    num, (view, *_) = 100_000, document["bufferViews"]
+    for accessor in document["accessors"]:
+        accessor.pop("min", None), accessor.pop("max", None)
+        accessor.update(bufferView=0, byteOffset=0, componentType=5121, normalized=True, count=num)
+    view.clear()
+    view.update(buffer=0, byteLength=4 * num)
+    document["buffers"] = [{"byteLength": 4 * num}]
+    message = refusal(tmp_path / "a.glb", document, bytes([200]) * (4 * num))
+    assert "a scene of 100,000 Gaussians takes about" in message
+    assert "its attributes lie in the same bytes" in message
+
+
 def test_numbers_that_have_no_logarithm_are_the_next_that_have(tmp_path):
     gaussians = gaussians_within_ranges(3, degree=0)
     gaussians.log_scales[1] = -300
