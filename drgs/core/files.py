@@ -232,7 +232,7 @@ def remove_temporaries_of(folder: Path, names: Iterable[str]) -> None:
 
 
 def _is_running(process: int) -> bool:
-    """Whether there is a process of this number on this machine; where that is not known, yes."""
+    """Return whether a process of this number runs on this machine; True where that is unknown."""
     if os.name != "posix":  # where signal 0 is Ctrl-C
         return True
     try:

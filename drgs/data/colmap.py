@@ -81,7 +81,7 @@ def _root_and_model(folder: Path) -> tuple[Path, Path]:
 
 
 def _where(folder: Path, model: Path) -> str:
-    """Which model is read where there are several places or models, for a description; else ""."""
+    """Name the model that is read, for a description, where there are several; else ""."""
     if (below := model.relative_to(folder)) != Path() and below.parts[0] == "dense":
         return f"; model {below}"
     if model.name != "0":
@@ -186,7 +186,7 @@ def picture_folder(config: DataConfig, model: ColmapModel) -> Path:
 def _values(
     camera: ColmapCamera, image: ColmapImage, file: Path, mask: Path | None, folder: Path
 ) -> FrameValues:
-    """What a frame of a transforms file would have, for the size of ``file``."""
+    """Return the values of a frame in a transforms file, for the size of ``file``."""
     model = LENSES.get(camera.model)
     if model is None:
         raise UserError(

@@ -26,7 +26,7 @@ PICTURE_FOLDERS = ("images", "input", "photos", "rgb")
 """Where converters expect photographs, or put them."""
 
 LEAST_SHARE, LEAST_LEFT = 0.5, 2
-"""Of the files of a kind that are named, those that must be there."""
+"""Smallest share of the named files of a kind that must be there."""
 
 _PICTURE_FOLDER = re.compile(rf"(?:{'|'.join(PICTURE_FOLDERS)})(?:_[0-9]+)?")
 
@@ -126,7 +126,7 @@ class FileFinder:
         return [name] if name in names else names
 
     def _names(self, folder: Path) -> dict[str, list[str]]:
-        """Of a folder, by :func:`key_of`, and of pictures without their suffixes with ``.*``."""
+        """List a folder by :func:`key_of`; pictures also without their suffixes, with ``.*``."""
         if folder not in self._listings:
             listing: dict[str, list[str]] = {}
             try:

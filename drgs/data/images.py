@@ -28,7 +28,7 @@ NUMBERS_AT_ONCE, MOST_THREADS = 1 << 25, 8
 """Pixels of photographs that are being read: of 40 bytes each, at most."""
 
 NEITHER, MOST_EDGES = 0.8, 0.1
-"""Of brightness, the middle part that is neither black nor white; and how many of a mask's pixels
+"""Middle part of brightness that is neither black nor white; and how many of a mask's pixels
 may be so, at the edges of what it leaves out."""
 
 ALL = 1 - 1e-4
@@ -106,7 +106,7 @@ DEPTH_BYTES = 24
 
 
 def is_array(path: Path) -> bool:
-    """Whether depths are stored as an array, not as a picture; by the name."""
+    """Return whether depths are stored as an array, not as a picture; by the name."""
     return path.suffix.lower() == ".npy"
 
 

@@ -81,7 +81,7 @@ def picture_files(config: DataConfig) -> list[Path]:
 
 
 def _frames(config: DataConfig, split: str, notes: list[str]) -> list[Frame]:
-    """Those of a split whose photographs are there."""
+    """Return the frames of a split whose photographs are there."""
     meta = read_transforms(_transforms_path(config.path, split))
     if unread := [*meta.unread, *_passed_over(meta)]:
         notes.append(note_unread(meta.path, unread))

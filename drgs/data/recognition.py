@@ -22,7 +22,7 @@ WORKSPACES = ("", "dense/0", "dense")
 """Where such a folder lies in that of COLMAP's automatic reconstruction, with its photographs."""
 
 OTHER_COLMAP_FOLDERS = ("0", ".")
-"""Where models lie in COLMAP's own folders and, beside the photographs, in flat exports."""
+"""Folders of models in COLMAP's own folders and, beside the photographs, in flat exports."""
 
 GUIDE = 'docs/guide.md, "From photographs to a dataset"'
 
@@ -108,7 +108,7 @@ def colmap_dataset(folder: Path) -> tuple[Path, Path] | None:
 
 
 def _has_pictures(root: Path) -> bool:
-    """Whether photographs lie where those of a model do."""
+    """Return whether photographs lie where those of a model do."""
     if any((root / f"images{suffix}").is_dir() for suffix in ("", "_2", "_4", "_8")):
         return True
     return any(map(_pictures_in, (root, *_folders_in(root))))

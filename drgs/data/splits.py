@@ -20,7 +20,7 @@ from drgs.data.file_names import LEAST_SHARE, PICTURE_FOLDERS, key_of, parts_of,
 SPLITS = ("train", "val", "test")
 
 MAX_BYTES = 1 << 26
-"""Of a list of names."""
+"""Largest list of names."""
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ class Split:
 def listed_frames(
     source: Path, key: str, listing: Sequence[str], names: Sequence[str], notes: list[str]
 ) -> set[str]:
-    """Those of ``names``, which frames have, that a list has.
+    """Return the ``names``, which frames have, that a list has.
 
     source, key: of the list, for messages. A name may differ in its suffix, in case and by the
     folder of the photographs, where only one frame has such a name.
@@ -64,7 +64,7 @@ def listed_frames(
 
 
 def _matched(listing: Sequence[str], names: Sequence[str]) -> tuple[set[str], list[str]]:
-    """Those of ``names`` that a list has, and what it has besides, for messages."""
+    """Return the ``names`` that a list has, and what it has besides, for messages."""
     exact = {"/".join(parts_of(name)): name for name in names}
     loose: dict[str, set[str]] = {}
     for name in names:
@@ -89,7 +89,7 @@ def _loose(name: str) -> str:
 
 
 def lists_in_files(folders: Sequence[Path], names: Sequence[str], notes: list[str]) -> Lists | None:
-    """Those of the first of ``folders`` with ``test.txt``, ``val.txt`` or ``train.txt``.
+    """Read the lists in the first of ``folders`` with ``test.txt``, ``val.txt`` or ``train.txt``.
 
     A file that has no name of a frame is another's: a note says that it is not read. Other files
     that may be lists are noted as well, where there is none.
@@ -115,7 +115,7 @@ def lists_in_files(folders: Sequence[Path], names: Sequence[str], notes: list[st
 
 
 def lists_by_folders(names: Sequence[str]) -> Lists | None:
-    """Where each photograph lies in a folder of a split, and some are not to train on."""
+    """Return lists where each photograph lies in a folder of a split, not all in ``train``."""
     found: dict[str, set[str]] = {}
     for name in names:
         folders = [part for part in map(key_of, parts_of(name)[:-1]) if part in SPLITS]
@@ -177,7 +177,7 @@ def _measured(config: DataConfig, source: Path, lists: Lists) -> str:
 
 
 def _members(lists: Lists, name: str, names: set[str]) -> tuple[set[str], set[str]]:
-    """Of ``names``, those to train on and those to measure on; without a list, all others."""
+    """Divide ``names`` into those to train on and to measure on; without a list, all others."""
     for_others = [chosen for split, chosen in lists.names.items() if split != "train"]
     train = names.intersection(lists.names.get("train", names.difference(*for_others)))
     if name == "train":

@@ -225,7 +225,7 @@ def num_looking(points: np.ndarray, views: Sequence[Viewpoint]) -> int:
 
 
 def where_they_look(dataset: Dataset) -> str:
-    """Where what the cameras look at is, world, for a message; "" where they look nowhere."""
+    """Place of what the cameras look at, world, for a message; "" where they look nowhere."""
     try:
         focus, distance = focus_of(dataset.train)
     except UserError:

@@ -252,7 +252,7 @@ def read_transforms(path: Path) -> TransformsFile:
 
 
 def note_unread(path: Path, keys: Sequence[str]) -> str:
-    """What the user should know of keys that are passed over."""
+    """Describe keys that are not read, for the user."""
     return f"{path}: keys that are not read: {listed(keys, 8)}"
 
 

@@ -209,7 +209,7 @@ class Follower:
 
 
 def _others_read(ranks: Ranks, reads: bool = False) -> bool:
-    """Whether those that follow read their photographs now, as each of them says."""
+    """Return whether all followers read their photographs now."""
     return bool(ranks.told(np.array(reads)).any())
 
 

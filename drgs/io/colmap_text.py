@@ -66,7 +66,7 @@ def images(path: Path) -> Iterator[ImageRecord]:
 
 
 def _is_image(line: _Line) -> bool:
-    """Whether a line is as long as an image's first one and ends in a name, not in a number."""
+    """Return whether a line is as long as an image's first and ends in a name, not a number."""
     words = line.text.split()
     if len(words) < len(IMAGE):
         return False

@@ -42,7 +42,7 @@ class Format:
 
     @property
     def has_origin(self) -> bool:
-        """Whether it can record what means are relative to."""
+        """True where the format can record what means are relative to."""
         return self.keeps is None
 
     def encode(

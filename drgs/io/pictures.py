@@ -181,7 +181,7 @@ def _has_alpha(image: Image.Image) -> bool:
 
 
 def unused_content(path: Path) -> list[str]:
-    """What a picture has that :func:`read_pixels` passes over, from its header; for messages."""
+    """Describe content of a picture that :func:`read_pixels` does not use; from its header."""
     with _opened(path) as image:
         found = []
         if _bits(image) > BITS.get(image.mode, 8):
@@ -198,7 +198,7 @@ def unused_content(path: Path) -> list[str]:
 
 
 def _bits(image: Image.Image) -> int:
-    """Of a channel in the file; Pillow decodes colours to 8."""
+    """Bits of a channel in the file; Pillow decodes colours to 8."""
     if image.format == "TIFF":
         return max(image.tag_v2.get(ExifTags.Base.BitsPerSample, (8,)))
     if image.format == "JPEG2000" or not image.tile:

@@ -23,7 +23,7 @@ from drgs.splatting.rasterize import Layers, Records, SplatGradients
 from drgs.splatting.tiles import TileBins
 
 FEATURES_AT_ONCE = {4: 32, 8: 8}
-"""By the bytes of a number, the most features of a group. With AVX2, kernels of so many compile in
+"""Most features of a group, by the bytes of a number. With AVX2, kernels of so many compile in
 7 s and 3 s, forward and backward; those of twice as many in 25 s and 12 s."""
 
 
@@ -37,7 +37,7 @@ def in_groups(order: Any, bins: TileBins) -> Any:
 
 @dataclass(frozen=True)
 class GroupedLayers:
-    """What compositing makes of each group."""
+    """Layers of each group."""
 
     groups: tuple[FeatureGroup, ...]
     parts: tuple[Layers, ...]  # of each of them
@@ -60,7 +60,7 @@ class InGroups:
     order: Any  # drgs.splatting.rendering.Order: of each group
 
     def records(self, bins: TileBins) -> tuple[Records, ...]:
-        """Those of each group."""
+        """Records of each group."""
         geometry, end = bins.model.response.num_geometry, bins.num_features
 
         def numbers(group: FeatureGroup, rank: Any, active: Any) -> list[Any]:

@@ -83,7 +83,7 @@ class Order(Protocol):
         ...
 
     def records(self, bins: TileBins) -> Any:
-        """What compositing loads of each sorted entry, evaluated."""
+        """Copies of the numbers that compositing loads of each sorted entry, evaluated."""
         ...
 
     def composite(self, bins: TileBins, records: Any) -> Layers:
