@@ -75,6 +75,7 @@ WITHOUT_EFFECT = frozenset(
         *("applied_transform", "applied_scale", "orientation_override"),  # nerfstudio: done already
         *("aabb_scale", "scale", "offset", "up"),  # instant-ngp: where its grid lies
         *("colmap_im_id", "sharpness", "rotation"),
+        *("origin", "lens_change"),  # ours: what a fit has used, beside cameras in the world
     }
 )
 """Keys that change nothing of what is read here: none is missed."""

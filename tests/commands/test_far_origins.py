@@ -1,6 +1,7 @@
 """Commands and the plugin show a fit in Earth-centred coordinates like one at the origin."""
 
 import json
+import warnings
 from dataclasses import replace
 
 import mitsuba as mi
@@ -24,6 +25,7 @@ from support.small_capture import view as small_view
 from drgs import export, view
 from drgs.core.errors import UserNote
 from drgs.data import load_dataset
+from drgs.data.viewpoints import read_viewpoints
 from drgs.gaussians.parameters import Gaussians
 from drgs.results.files import VIEWS
 from drgs.results.refined_cameras import write_views
@@ -52,6 +54,9 @@ def far(tmp_path_factory):
 def test_cameras_are_written_in_world_coordinates_with_the_origin(far):
     content = json.loads((far / VIEWS).read_text())
     assert content["origin"] == list(load_dataset(far.parent / "data").origin)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        read_viewpoints(far / VIEWS, None)
     centers = [np.array(f["transform_matrix"])[:3, 3] for f in content["frames"]]
     expected = [v.center + PLACE for v in make_dataset().train]
     np.testing.assert_allclose(centers, expected, rtol=0, atol=1e-6)
