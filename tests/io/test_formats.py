@@ -18,6 +18,7 @@ from drgs.core import memory
 from drgs.core.errors import UserError
 from drgs.gaussians.parameters import Gaussians
 from drgs.io.formats import FORMATS, format_of
+from drgs.io.ply import encode_elements, read_elements
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*left out")
 
@@ -151,3 +152,20 @@ def test_a_file_that_was_cut_off_is_refused_wherever_it_ends(tmp_path, each):
         path.write_bytes(content[:end])
         with pytest.raises(UserError, match=re.escape(str(path))):
             Gaussians.load(path)
+
+
+def test_bounds_of_a_compressed_file_leave_finite_numbers_or_are_refused(tmp_path):
+    path = tmp_path / "a.compressed.ply"
+    gaussians_within_ranges().save(path)
+    rows, _ = read_elements(path, ["chunk", "vertex", "sh"])
+    for names in (("x", "y", "z"), ("scale_x", "scale_y", "scale_z")):
+        wide = {name: values.copy() for name, values in rows.items()}
+        for name in names:
+            wide["chunk"][f"min_{name}"], wide["chunk"][f"max_{name}"] = -3e38, 3e38
+        path.write_bytes(encode_elements(wide))
+        read = Gaussians.load(path)
+        assert np.isfinite(read.means).all() and np.isfinite(read.log_scales).all()
+    rows["chunk"]["min_r"], rows["chunk"]["max_r"] = -3e38, 3e38
+    path.write_bytes(encode_elements(rows))
+    with pytest.raises(UserError, match=r"element chunk, row 0: colours of the bounds must leave"):
+        Gaussians.load(path)
