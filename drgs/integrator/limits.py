@@ -6,11 +6,14 @@ import mitsuba as mi
 
 from drgs.core.constants import MAX_FEATURES
 from drgs.core.errors import PluginError
-from drgs.core.memory import MAX_LANES, why_too_large
+from drgs.core.memory import MAX_LANES, UNASKED_BYTES, available_memory, why_too_large
 
 MAX_SAMPLES = 4096
 """Of a pixel, times the poses that motion blurs: each is a pass of its own, and its frame takes
 0.15 MB even of the smallest film."""
+
+NESTED_SAMPLE_BYTES = 64
+"""About what Mitsuba's path tracers take at least for a sample: its ray, sampler and radiance."""
 
 
 def check_picture(film: mi.Film, spp: int, poses: int, num_aovs: int, nested_spp: int) -> None:
@@ -36,10 +39,13 @@ def check_picture(film: mi.Film, spp: int, poses: int, num_aovs: int, nested_spp
     why = why_too_large(width, height, 3 + num_aovs, spp * poses)
     if why is not None:
         raise PluginError(f"splats: {why}")
-    if width * height * nested_spp > MAX_LANES:
+    samples, most = width * height * nested_spp, MAX_LANES
+    if samples * NESTED_SAMPLE_BYTES > UNASKED_BYTES:
+        most = min(most, available_memory() // NESTED_SAMPLE_BYTES)
+    if samples > most:
         raise PluginError(
             f"splats: on a film of {width} x {height} px, nested_spp (or spp) must be at most "
-            f"{MAX_LANES // (width * height):,}, got {nested_spp:,}; take the mean of pictures "
+            f"{most // (width * height):,}, got {nested_spp:,}; take the mean of pictures "
             "with other seeds"
         )
 

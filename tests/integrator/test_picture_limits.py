@@ -9,6 +9,7 @@ from support.walls import WALL
 import drgs
 from drgs.core.constants import MAX_FEATURES, MAX_INT
 from drgs.core.errors import PluginError
+from drgs.integrator import limits
 from drgs.integrator.limits import MAX_SAMPLES
 
 SCENE = Scene(VIEWS[1], count=8)  # 37 x 23 px
@@ -102,7 +103,11 @@ def test_memory_is_compared_with_what_there_is(monkeypatch):
         rasterized(colors=np.ones((1, 3), np.float32), width=4000, height=4000)
 
 
-def test_samples_of_surfaces_that_mitsuba_cannot_count_are_refused():
+@pytest.mark.parametrize(("available", "most"), [(2**50, 2**32 - 1), (2**33, 2**27)])
+def test_samples_of_surfaces_that_cannot_be_held_or_counted_are_refused(
+    monkeypatch, available, most
+):
+    monkeypatch.setattr(limits, "available_memory", lambda: available)
     integrator = SCENE.settings | tensors(SCENE.gaussians) | {"nested_spp": 10**9}
     wall = WALL.shape(SCENE.view.camera)
     scene = mi.load_dict(
@@ -110,11 +115,17 @@ def test_samples_of_surfaces_that_mitsuba_cannot_count_are_refused():
     )
     assert refusal(scene) == (
         f"splats: on a film of 37 x 23 px, nested_spp (or spp) must be at most "
-        f"{(2**32 - 1) // (37 * 23):,}, got 1,000,000,000; take the mean of pictures with other "
+        f"{most // (37 * 23):,}, got 1,000,000,000; take the mean of pictures with other "
         "seeds"
     )
     with pytest.raises(RuntimeError, match=f"nested_spp must be an integer from 0 to {MAX_INT}"):
         load(nested_spp=2**32)
+
+
+def test_samples_of_light_have_a_limit():
+    with pytest.raises(RuntimeError, match="light_samples must be an integer from 0 to 4096"):
+        load(light_samples=4097)
+    load(light_samples=4096)
 
 
 def features(count):
