@@ -42,7 +42,7 @@ LEAST_ALPHA = 1e-10
 """What expected depths are divided by at least, as in gsplat."""
 
 MAX_SKEW = 1e-6
-"""Of the largest number in K: what is rounding where a pinhole without skew has 0."""
+"""Rounding, relative to the largest number in K, where a pinhole without skew has 0."""
 
 LEAST_SCALE = 1e-18
 """World units: a smaller standard deviation is taken as this one, whose square float32 holds."""

@@ -1,4 +1,4 @@
-"""What a user should know of the photographs of a dataset, a line for each kind."""
+"""Notes for the user on the photographs of a dataset, a line for each kind."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from drgs.data.types import View
 from drgs.io.pictures import unused_content
 
 SAMPLE_BYTES = 1 << 12
-"""Of a file, from its middle: files that differ there are not the same."""
+"""Bytes from the middle of a file: files that differ there are not the same."""
 
 
 MAX_NOTE_LENGTH = 1000
-"""Of a note, characters."""
+"""Characters of a note."""
 
 
 class Notices:

@@ -49,7 +49,7 @@ AMPLITUDE = 0.8
 
 
 NEAR_RANGE, NEAR_SHARE = (0.01, 0.5), 0.1
-"""Of the median distance of Gaussians from their middle: where the reference's near plane suits
+"""Shares of the median distance of Gaussians from their middle: where the reference's plane suits
 them, and what does where it does not."""
 
 

@@ -19,7 +19,7 @@ COLMAP_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0")
 """Where COLMAP's models lie in the folders of datasets."""
 
 WORKSPACES = ("", "dense/0", "dense")
-"""Where such a folder lies in that of COLMAP's automatic reconstruction, with its photographs."""
+"""Folders of that kind in COLMAP's automatic reconstruction, with their photographs."""
 
 OTHER_COLMAP_FOLDERS = ("0", ".")
 """Folders of models in COLMAP's own folders and, beside the photographs, in flat exports."""

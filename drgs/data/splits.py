@@ -1,4 +1,4 @@
-"""Which views are to train on and which to measure on, where a dataset specifies it.
+"""Views to train on and views to measure on, where a dataset specifies them.
 
 Lists are those of ``transforms.json`` (``train_filenames``, ``val_filenames``, ``test_filenames``,
 as nerfstudio has them), and those of ``train.txt``, ``val.txt`` and ``test.txt`` beside COLMAP's

@@ -22,13 +22,13 @@ from drgs.distributed.ranks import Ranks, wait
 from drgs.integrator.scene import render_views
 
 END = "end"
-"""What the first process says when all pictures are written."""
+"""Message of the first process when all images are written."""
 
 Render = Callable[..., Iterator[np.ndarray]]
 """Of a scene and views, pictures (H, W, 3)."""
 
 Files = Mapping[str, object]
-"""Where models, cameras and backgrounds come from, for messages."""
+"""Files of models, cameras and backgrounds, for messages."""
 
 
 def run_together(args: argparse.Namespace, work: Callable[[Render], None]) -> None:

@@ -54,7 +54,7 @@ LIGHT_SAMPLES = 4
 """Splats that a ray of ``light: rays`` draws."""
 
 MAX_LIGHT_SAMPLES = 4096
-"""As many as a pixel may have samples. All those that a ray passes are composited with 0."""
+"""Limit of a pixel's samples, too. With 0, all splats that a ray passes are composited."""
 
 LIGHTS = ("none", "probe", "rays")
 """How light passes between splats and surfaces."""

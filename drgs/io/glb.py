@@ -44,7 +44,7 @@ MAX_RATIO = 64
 number take 10 times."""
 
 MAX_JSON_BYTES = 1 << 24
-"""Of the JSON part, which takes up to 30 times as much memory."""
+"""Limit of the JSON part, which takes up to 30 times as much memory."""
 
 MAX_BYTES = (1 << 32) - 1
 """Of a file: its length is a number of 32 bits."""
