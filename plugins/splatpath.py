@@ -117,7 +117,7 @@ class SplatPathIntegrator(RBIntegrator):
             emitted = self._emitted(scene, path, si, arrives, primal)
             goes_on = path.active & (path.depth + 1 < self.max_depth) & si.is_valid()
             direct = self._direct(scene, sampler, path, si, arrives, goes_on, primal)
-            step = self._bounce(scene, sampler, path, si, arrives, goes_on)
+            step = self._bounce(scene, sampler, path, si, arrives)
             passed = dr.select(step.is_null, 0, splats)  # or composited with what follows
             is_seen |= goes_on & ~step.is_null
             contribution = dr.detach(passed + emitted + direct)
@@ -210,9 +210,11 @@ class SplatPathIntegrator(RBIntegrator):
         path: _Path,
         si: mi.SurfaceInteraction3f,
         arrives: mi.Spectrum,
-        active: mi.Bool,
     ) -> _Step:
         """Where a path goes on, if it does."""
+        has_bounces = path.depth + 1 < self.max_depth
+        may_pass = mi.Bool(self.straight_rays.sees_through)
+        active = path.active & si.is_valid() & (has_bounces | may_pass)
         bsdf = si.bsdf(path.ray)
         sample, weight = bsdf.sample(
             mi.BSDFContext(), si, sampler.next_1d(), sampler.next_2d(), active
@@ -222,7 +224,7 @@ class SplatPathIntegrator(RBIntegrator):
         eta = path.eta * sample.eta
         throughput = dr.select(is_null, path.throughput, arrives) * weight
         most = dr.max(throughput)
-        active = active & (most != 0)
+        active = active & (most != 0) & (has_bounces | is_null)
         probability = dr.minimum(most * dr.square(eta), MOST_LIKELY)
         is_played = path.depth >= self.rr_depth
         throughput[is_played] *= dr.rcp(probability)
