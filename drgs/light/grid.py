@@ -180,16 +180,17 @@ class _Boxes:
         """Sorted by cell, and in a cell by Gaussian."""
         Float = type(self.ellipsoids.centers.x)
         t = types_of(Float)
+        # Dr.Jit does not compute with empty arrays, and a level may have no entries.
         made = [self._entries(level, resolution) for level in range(levels)]
-        rows, cells = (dr.concat([each[k] for each in made]) for k in (0, 1))
-        num_cells, count = levels * resolution**3, dr.width(rows)
-        starts = np.zeros(num_cells + 1, np.int64)
-        if count > 0:
+        made = [each for each in made if dr.width(each[0]) > 0]
+        num_cells = levels * resolution**3
+        if made:
+            rows, cells = (dr.concat([each[k] for each in made]) for k in (0, 1))
             order = dr.argsort(cells)
             rows, cells = (dr.gather(t.UInt32, column, order) for column in (rows, cells))
-            starts = np.array(lower_bounds(cells, count, num_cells)).astype(np.int64)
+            starts = np.array(lower_bounds(cells, dr.width(rows), num_cells)).astype(np.int64)
         else:
-            rows = dr.zeros(t.UInt32, 1)  # in no list: Dr.Jit does not compute with empty arrays
+            rows, starts = dr.zeros(t.UInt32, 1), np.zeros(num_cells + 1, np.int64)
         grid = SplatGrid(
             t.Array3f(*(dr.opaque(Float, float(c)) for c in self.center)),
             dr.opaque(Float, float(self.size)),
