@@ -38,6 +38,9 @@ WINDOW = 8
 TURNS = 16
 """Entries of a list, after which a ray lets others of its vector find their next cell."""
 
+FARTHEST = 1e18
+"""World units from the origin, beyond which Gaussians do not exist: their squares overflow."""
+
 _SHAPE = 13
 """Numbers of a record: mean, rows of W, base-2 logarithm of the opacity."""
 
@@ -82,7 +85,8 @@ class RaySplats:
     def of(rows: GaussianRows, sh_degree: int, cutoffs: Cutoffs) -> RaySplats:
         """Copy the Gaussians, and sort them into a grid. Waits for the device.
 
-        rows: detached, as a pipeline has them. Those that are not finite do not exist.
+        rows: detached, as a pipeline has them. Those that are not finite, or reach beyond
+        :data:`FARTHEST`, do not exist.
         """
         t = types_of(type(rows.logit_opacities))
         rotation, scales = quat_to_rotation(rows.quats), dr.exp(rows.log_scales)
@@ -99,9 +103,11 @@ class RaySplats:
         half_axes = [axis * (scale * reach) for axis, scale in zip(axes, scales, strict=True)]
         total = sum([*numbers, *sh, *(value for axis in half_axes for value in axis)], t.Float(0))
         exists = (exponent > 0) & dr.isfinite(total)
+        ellipsoids = Ellipsoids(t.Array3f(rows.means), half_axes, exists)
+        exists &= dr.max(dr.abs(ellipsoids.centers) + ellipsoids.half_sizes()) < FARTHEST
         shapes = Rows.of([*numbers, *[t.Float(0)] * (16 - _SHAPE)])
         colors = Rows.of(sh)
-        ellipsoids = Ellipsoids(t.Array3f(rows.means), half_axes, exists)
+        ellipsoids = replace(ellipsoids, exist=exists)
         dr.eval(shapes, colors, ellipsoids)
         return RaySplats(shapes, colors, build_grid(ellipsoids), sh_degree, cutoffs)
 
