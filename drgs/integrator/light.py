@@ -6,16 +6,18 @@ of them, C with transmittance T, is the colour C / (1 - T) with the coverage 1 -
     exposure (1 - T) lin(C / (1 - T)),
 
 so that what is opaque looks the same in a mirror, and a white fog before a white wall stays white.
+Where a ray leaves a scene that has no environment, black is the last splat: exposure lin(C).
 
 To composite all that a ray passes takes long. By default, a few splats are drawn with their weights
-instead, n of them, of which h exist. h / n estimates 1 - T, and the colours c of those that exist
-the powers of C / (1 - T), without bias: from the sums s_k of c^k,
+instead, n of them. Their colours c estimate the powers of C / (1 - T), without bias: from the sums
+s_k of c^k,
 
-    m: s_1 / h,   m^2: (s_1^2 - s_2) / (h (h - 1)),
-    m^3: (s_1^3 - 3 s_1 s_2 + 2 s_3) / (h (h - 1) (h - 2))
+    m: s_1 / n,   m^2: (s_1^2 - s_2) / (n (n - 1)),
+    m^3: (s_1^3 - 3 s_1 s_2 + 2 s_3) / (n (n - 1) (n - 2))
 
-(Hoeffding 1948), of which lin is a sum to within :data:`DECODED_WITHIN`. Of one or two splats, the
-missing powers are those of their mean.
+(Hoeffding 1948), of which lin is a sum to within :data:`DECODED_WITHIN`. How far the draws had to
+look for splats estimates T, and does not depend on which splats they have: the product of both is
+without bias as well. For rays that meet black at last, a draw is black with the probability T.
 """
 
 from __future__ import annotations
@@ -41,6 +43,9 @@ DECODING = (0.012522878, 0.682171111, 0.305306011)
 
 DECODED_WITHIN = 2e-3
 """Of a colour in 0..1, decoded by :data:`DECODING`."""
+
+LEAST_SAMPLES = 3
+"""Splats that a ray draws, at least: for the third power."""
 
 ROULETTE = 0.25
 """Transmittance to an emitter, below which the rest of the splats is asked for with a probability:
@@ -95,23 +100,20 @@ class LightOfSplats:
         self, segment: Segment, is_open: mi.Bool, sample: mi.Float
     ) -> tuple[mi.Color3f, mi.Float]:
         """Estimates of the same."""
-        seed = dr.reinterpret_array(mi.UInt32, sample)
-        drawn = self.splats.sampled(segment, seed, self.num_samples)
-        hits, sums = mi.Float(0), [mi.Color3f(0)] * 3
-        for one in drawn:
-            hits += dr.select(one.exists, 1, mi.Float(0))
-            color = dr.select(one.exists, mi.Color3f(one.color), 0)
-            sums = [s + color**k for k, s in enumerate(sums, 1)]
-        s1, s2, s3 = sums
-        h = dr.select(is_open, self.num_samples, dr.maximum(hits, 1))
-        mean = s1 / h
-        square = dr.select(h > 1, (s1 * s1 - s2) / dr.maximum(h * (h - 1), 1), mean * mean)
-        cube = (s1 * s1 * s1 - 3 * s1 * s2 + 2 * s3) / dr.maximum(h * (h - 1) * (h - 2), 1)
-        cube = dr.select(h > 2, cube, mean * square)
+        seed, n = dr.reinterpret_array(mi.UInt32, sample), max(self.num_samples, LEAST_SAMPLES)
+        drawn = self.splats.sampled(segment, seed, n)
+        colors = [
+            dr.select(is_open & ~exists, 0, mi.Color3f(color))
+            for color, exists in zip(drawn.colors, drawn.exist, strict=True)
+        ]
+        s1, s2, s3 = (sum(color**k for color in colors) for k in (1, 2, 3))
+        mean = s1 / n
+        square = (s1 * s1 - s2) / (n * (n - 1))
+        cube = (s1 * s1 * s1 - 3 * s1 * s2 + 2 * s3) / (n * (n - 1) * (n - 2))
         a, b, c = DECODING
-        coverage = hits / self.num_samples
-        decoded = a * mean + b * square + c * cube
-        return dr.select(is_open, 1, coverage) * decoded, coverage
+        coverage = 1 - drawn.transmittance
+        whole = dr.select(is_open, 1, coverage)
+        return whole * (a * mean + b * square + c * cube), coverage
 
     def transmittance(self, leg: Leg, sample: mi.Float, active: mi.Bool) -> mi.Float:
         """An estimate of that of the splats along legs.

@@ -99,7 +99,9 @@ class SplatGrid:
         t_ = types_of(type(self.size))
         count = t_.Float(self.resolution)
         distance = self._distance(origin + direction * t)
-        ahead = t + STEP * self._cell_size(dr.select(distance > 1, distance, 1))
+        step = STEP * self._cell_size(dr.select(distance > 1, distance, 1))
+        rounding = 4 * dr.epsilon(t) * t  # a ray from far away goes on where cells are smaller
+        ahead = t + dr.select(step > rounding, step, rounding)
         point = origin + direction * ahead
         level, edges = self._cube(self._distance(point))
         half = self.size * edges
@@ -146,7 +148,9 @@ def build_grid(ellipsoids: Ellipsoids) -> SplatGrid:
     sizes = np.array(ellipsoids.half_sizes(), np.float64)[:, shown]
     center = np.median(centers, axis=1) if shown.any() else np.zeros(3)
     distances = np.abs(centers - center[:, None]).max(axis=0)
-    size = np.quantile(distances, INNERMOST) if shown.any() else 1.0
+    # Equal or few centres: no cell is much smaller than what it holds.
+    spreads = np.stack([distances, sizes.max(axis=0)])
+    size = np.quantile(spreads, INNERMOST, axis=1).max() if shown.any() else 1.0
     farthest = (np.abs(centers - center[:, None]) + sizes).max(initial=0.0)
     size = max(size, farthest / 2 ** (MOST_LEVELS - 1), np.finfo(np.float32).tiny)
     # Two cells of a cube with all Gaussians are empty on either side: nothing is at the border.
@@ -180,16 +184,17 @@ class _Boxes:
         """Sorted by cell, and in a cell by Gaussian."""
         Float = type(self.ellipsoids.centers.x)
         t = types_of(Float)
+        # Dr.Jit does not compute with empty arrays, and a level may have no entries.
         made = [self._entries(level, resolution) for level in range(levels)]
-        rows, cells = (dr.concat([each[k] for each in made]) for k in (0, 1))
-        num_cells, count = levels * resolution**3, dr.width(rows)
-        starts = np.zeros(num_cells + 1, np.int64)
-        if count > 0:
+        made = [each for each in made if dr.width(each[0]) > 0]
+        num_cells = levels * resolution**3
+        if made:
+            rows, cells = (dr.concat([each[k] for each in made]) for k in (0, 1))
             order = dr.argsort(cells)
             rows, cells = (dr.gather(t.UInt32, column, order) for column in (rows, cells))
-            starts = np.array(lower_bounds(cells, count, num_cells)).astype(np.int64)
+            starts = np.array(lower_bounds(cells, dr.width(rows), num_cells)).astype(np.int64)
         else:
-            rows = dr.zeros(t.UInt32, 1)  # in no list: Dr.Jit does not compute with empty arrays
+            rows, starts = dr.zeros(t.UInt32, 1), np.zeros(num_cells + 1, np.int64)
         grid = SplatGrid(
             t.Array3f(*(dr.opaque(Float, float(c)) for c in self.center)),
             dr.opaque(Float, float(self.size)),

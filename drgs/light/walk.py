@@ -38,6 +38,9 @@ WINDOW = 8
 TURNS = 16
 """Entries of a list, after which a ray lets others of its vector find their next cell."""
 
+FARTHEST = 1e18
+"""World units from the origin, beyond which Gaussians do not exist: their squares overflow."""
+
 _SHAPE = 13
 """Numbers of a record: mean, rows of W, base-2 logarithm of the opacity."""
 
@@ -62,10 +65,11 @@ class Passed:
 
 @dataclass(frozen=True)
 class Sampled:
-    """One splat that segments show."""
+    """Estimates of what segments pass. The colours are independent of all others."""
 
-    color: Any  # Array3f, display space
-    exists: Any  # Bool: else they pass all
+    colors: list[Any]  # Array3f, display space: of independent draws, with w_i / (1 - T)
+    exist: list[Any]  # Bool, independent, of each draw: true with the probability 1 - T
+    transmittance: Any  # Float: T on average
 
 
 @dataclass(frozen=True)
@@ -82,7 +86,8 @@ class RaySplats:
     def of(rows: GaussianRows, sh_degree: int, cutoffs: Cutoffs) -> RaySplats:
         """Copy the Gaussians, and sort them into a grid. Waits for the device.
 
-        rows: detached, as a pipeline has them. Those that are not finite do not exist.
+        rows: detached, as a pipeline has them. Those that are not finite, or reach beyond
+        :data:`FARTHEST`, do not exist.
         """
         t = types_of(type(rows.logit_opacities))
         rotation, scales = quat_to_rotation(rows.quats), dr.exp(rows.log_scales)
@@ -99,9 +104,11 @@ class RaySplats:
         half_axes = [axis * (scale * reach) for axis, scale in zip(axes, scales, strict=True)]
         total = sum([*numbers, *sh, *(value for axis in half_axes for value in axis)], t.Float(0))
         exists = (exponent > 0) & dr.isfinite(total)
+        ellipsoids = Ellipsoids(t.Array3f(rows.means), half_axes, exists)
+        exists &= dr.max(dr.abs(ellipsoids.centers) + ellipsoids.half_sizes()) < FARTHEST
         shapes = Rows.of([*numbers, *[t.Float(0)] * (16 - _SHAPE)])
         colors = Rows.of(sh)
-        ellipsoids = Ellipsoids(t.Array3f(rows.means), half_axes, exists)
+        ellipsoids = replace(ellipsoids, exist=exists)
         dr.eval(shapes, colors, ellipsoids)
         return RaySplats(shapes, colors, build_grid(ellipsoids), sh_degree, cutoffs)
 
@@ -131,56 +138,51 @@ class RaySplats:
         )
         return Passed(t.Array3f(color), dr.abs(T))
 
-    def sampled(self, segment: Segment, seed: Any, count: int) -> list[Sampled]:
-        """``count`` splats that segments show, each chosen with its weight.
+    def sampled(self, segment: Segment, seed: Any, count: int) -> Sampled:
+        """Draw ``count`` splats that segments show, with their weights.
 
-        A splat lets light pass with the probability 1 - alpha; what is chosen is the first that
-        does not (Enderton et al. 2010, "Stochastic Transparency"; Sun et al. 2025, "Stochastic Ray
-        Tracing of Transparent 3D Gaussians"): with the probability w_i, and nothing with T. Splats
-        need no order for that. seed: UInt32, of each ray; the choices of a ray are independent.
+        A splat lets light pass with the probability 1 - alpha; the first that does not is drawn
+        (Enderton et al. 2010, "Stochastic Transparency"; Sun et al. 2025, "Stochastic Ray Tracing
+        of Transparent 3D Gaussians"): with the probability w_i, and none with T. That needs no
+        order: a later splat of the list that does not, either, replaces the last one if it is
+        nearer. See :class:`_Draws` for when none does.
+
+        seed: UInt32, of each ray; count: at least 1.
         """
         walk = _Walk.along(self, segment)
         t = types_of(self.shapes.Float)
+        draws = _Draws.of(seed, count)
 
-        def choose(at: _Place, chosen: list) -> tuple:
+        def choose(at: _Place, coverage: Any, chosen: list) -> tuple:
             at, row, peak, log2_alpha = walk.next(at)
-            alpha = walk.alpha(log2_alpha)
-            nearest = []
-            for (last_row, last_peak), u in zip(chosen, _uniform(row, seed, count), strict=True):
-                is_nearer = (u < alpha) & (peak < last_peak)
-                kept = dr.select(is_nearer, row, last_row), dr.select(is_nearer, peak, last_peak)
-                nearest.append([*kept])
-            return at, nearest
+            return at, *draws.pass_splat(row, peak, walk.alpha(log2_alpha), coverage, chosen)
 
-        def body(at: _Place, chosen: list) -> tuple:
+        def body(at: _Place, coverage: Any, chosen: list) -> tuple:
             return dr.while_loop(
-                state=(walk.find(at), chosen),
-                cond=lambda at, chosen: at.has_entry(),
+                state=(walk.find(at), coverage, chosen),
+                cond=lambda at, coverage, chosen: at.has_entry(),
                 body=choose,
             )
 
-        def goes_on(at: _Place, chosen: list) -> Any:
-            # Cells that come later are behind what was chosen in this one.
-            farthest = chosen[0][1]
-            for _, peak in chosen[1:]:
-                farthest = dr.select(peak > farthest, peak, farthest)
-            more = (at.entry < at.last) | ((farthest == dr.inf) & (at.end < walk.stop))
+        def goes_on(at: _Place, coverage: Any, chosen: list) -> Any:
+            # Cells that come later are behind what was drawn in this one.
+            more = (at.entry < at.last) | (~draws.all_stop(coverage) & (at.end < walk.stop))
             return segment.active & more
 
         size = dr.width(walk.origin)
-        _, chosen = dr.while_loop(
+        _, coverage, chosen = dr.while_loop(
             state=(
                 _Place.first_of(dr.zeros(t.Float, size)),
+                dr.zeros(t.Float, size),
                 [[dr.zeros(t.UInt32, size), dr.full(t.Float, dr.inf, size)] for _ in range(count)],
             ),
             cond=goes_on,
             body=body,
         )
         basis = sh_basis(walk.direction, self.sh_degree)
-        return [
-            Sampled(t.Array3f(self._color(row, basis, peak < dr.inf)), peak < dr.inf)
-            for row, peak in chosen
-        ]
+        colors = [t.Array3f(self._color(row, basis, peak < dr.inf)) for row, peak in chosen]
+        exist = [coverage > stop for stop in draws.stops]
+        return Sampled(colors, exist, draws.transmittance(coverage))
 
     def _color(self, row: Any, basis: list[Any], active: Any) -> list[Any]:
         """Display space, seen along rays."""
@@ -394,10 +396,69 @@ class _Walk:
         return T, color, last
 
 
-def _uniform(row: Any, seed: Any, count: int) -> list[Any]:
-    """Numbers in 0..1 of a Gaussian and a ray, Float, in steps of 2^-16.
+@dataclass(frozen=True)
+class _Draws:
+    """Draws of splats along rays, each with the weights of a segment's splats by their sum.
 
-    Hashes by PCG's output function (O'Neill 2014); two numbers a hash.
+    A draw is stopped by the first splat, in the order of the lists, after which the coverage is
+    more than a random number: with the probability by which splats of an alpha stop light. If no
+    splat does, it still has one, drawn as if any had: from the splats that were read, each is the
+    first to stop light with v = (1 - A) alpha, where A is the coverage before, and given that any
+    does, with v / A'; that is decided anew for each splat (as in reservoir sampling).
+
+    So all draws have splats as soon as there are any, wherever they stop; and a walk ends when all
+    are stopped, which happens with the probability A^n.
+    """
+
+    seed: Any  # UInt32
+    stops: list[Any]  # Float: the coverage at which each draw is stopped
+
+    @staticmethod
+    def of(seed: Any, count: int) -> _Draws:
+        """``count`` independent draws of each ray."""
+        no_row = type(seed)(0xFFFFFFFF)
+        return _Draws(seed, _uniform(no_row, seed, count))
+
+    def pass_splat(
+        self, row: Any, peak: Any, alpha: Any, coverage: Any, chosen: list
+    ) -> tuple[Any, list]:
+        """The coverage and the drawn splats, their rows and peaks, after one more of the list."""
+        added = (1 - coverage) * alpha
+        after = coverage + added
+        is_first = dr.select(added > 0, added / after, 0)
+        nearest = []
+        numbers = _uniform(row, self.seed, len(chosen))
+        for (last_row, last_peak), stop, u in zip(chosen, self.stops, numbers, strict=True):
+            first = dr.select(coverage > stop, 0, dr.select(after > stop, 1, is_first))
+            is_nearer = (peak < last_peak) & (u < dr.fma(1 - first, alpha, first))
+            takes = is_nearer | (u < first)
+            nearest.append([dr.select(takes, row, last_row), dr.select(takes, peak, last_peak)])
+        return after, nearest
+
+    def all_stop(self, coverage: Any) -> Any:
+        """Whether every draw is stopped."""
+        stops = True
+        for stop in self.stops:
+            stops &= coverage > stop
+        return stops
+
+    def transmittance(self, coverage: Any) -> Any:
+        """1 - A by Russian roulette: 0 where all draws are stopped, which ended the walk.
+
+        That has the probability A^n: else it is (1 - A) / (1 - A^n), the inverse of a sum of
+        powers.
+        """
+        powers = type(coverage)(1)
+        for _ in self.stops[1:]:
+            powers = dr.fma(powers, coverage, 1)
+        return dr.select(self.all_stop(coverage), 0, 1 / powers)
+
+
+def _uniform(row: Any, seed: Any, count: int) -> list[Any]:
+    """Numbers in 0..1 of a Gaussian and a ray, Float, in steps of 2^-24.
+
+    Hashes by PCG's output function (O'Neill 2014). Two numbers a hash, whose first 16 bits are the
+    one's and the other's; what follows in one are the first bits of the other.
     """
     UInt32 = type(row)
     Float = dr.float32_array_t(UInt32)
@@ -407,5 +468,5 @@ def _uniform(row: Any, seed: Any, count: int) -> list[Any]:
         word = ((state >> ((state >> 28) + 4)) ^ state) * UInt32(277803737)
         word = (word >> 22) ^ word
         state = state ^ seed
-        numbers += [Float(half) * 2**-16 for half in (word & 0xFFFF, word >> 16)]
+        numbers += [Float(each >> 8) * 2**-24 for each in (word, (word << 16) | (word >> 16))]
     return numbers[:count]

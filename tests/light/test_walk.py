@@ -5,14 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from support.helpers import both_precisions, rows
-from support.rays import Rays
+from support.rays import Rays, splats_of
 
-from drgs.gaussians.parameters import Gaussians
-from drgs.light.walk import RaySplats
 from drgs.reference import light as reference
 from drgs.reference import splatting
-from drgs.splatting.cutoffs import Cutoffs
-from drgs.splatting.projection import load_rows
 
 
 def random_gaussians(count, seed=0, spread=1.0, size=0.1, degree=3) -> splatting.Gaussians:
@@ -36,16 +32,6 @@ def random_gaussians(count, seed=0, spread=1.0, size=0.1, degree=3) -> splatting
             )
         )
     )
-
-
-DEFAULT = Cutoffs()
-
-
-def splats_of(gaussians: splatting.Gaussians, precision, cutoffs=DEFAULT) -> RaySplats:
-    ours = Gaussians(
-        **{name: np.asarray(value, precision.dtype) for name, value in vars(gaussians).items()}
-    ).to(precision.TensorXf)
-    return RaySplats.of(load_rows(ours, gaussians.sh_degree), gaussians.sh_degree, cutoffs)
 
 
 def random_rays(count, seed=1) -> Rays:

@@ -1,4 +1,4 @@
-"""Rays for tests of light."""
+"""Rays for tests of light, and splats as they meet them."""
 
 from __future__ import annotations
 
@@ -8,7 +8,11 @@ import drjit as dr
 import numpy as np
 
 from drgs.core.arrays import types_of
-from drgs.light.walk import Segment
+from drgs.gaussians.parameters import Gaussians
+from drgs.light.walk import RaySplats, Segment
+from drgs.reference import splatting
+from drgs.splatting.cutoffs import Cutoffs
+from drgs.splatting.projection import load_rows
 
 
 @dataclass(frozen=True)
@@ -35,3 +39,13 @@ class Rays:
 
 def _single(values) -> np.ndarray:
     return np.asarray(values, np.float32).astype(np.float64)
+
+
+DEFAULT = Cutoffs()
+
+
+def splats_of(gaussians: splatting.Gaussians, precision, cutoffs=DEFAULT) -> RaySplats:
+    ours = Gaussians(
+        **{name: np.asarray(value, precision.dtype) for name, value in vars(gaussians).items()}
+    ).to(precision.TensorXf)
+    return RaySplats.of(load_rows(ours, gaussians.sh_degree), gaussians.sh_degree, cutoffs)
