@@ -14,6 +14,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -22,10 +23,12 @@ import numpy as np
 from drgs.accuracy.pipeline import pipeline_of
 from drgs.core.errors import PluginError
 from drgs.core.private import same_variables
+from drgs.gaussians.parameters import Gaussians
 from drgs.integrator.legs import Leg, Light
+from drgs.integrator.sensors import SensorState, read_sensor
 from drgs.integrator.settings import SplatsSettings
 from drgs.light.probe import LEVELS, SIZE, Probes, Seen
-from drgs.splatting.rendering import color_features, depth_feature
+from drgs.splatting.rendering import Feature, Pipeline, color_features, depth_feature
 
 LOW_PASS = 0.03
 """px^2 of a probe's pictures: rays have none at all."""
@@ -39,17 +42,25 @@ class LightOfProbes:
     """What probes see of a scene's splats."""
 
     probes: Probes
+    mirrors: Any  # drgs.integrator.mirrors.Mirrors of the shapes that are some; None: none is
     exposure: mi.Float  # (1,): factor of the splats' radiance
     shapes: dict[int, mi.ShapePtr]  # that have a probe, by its number
     emitters: dict[int, mi.EmitterPtr]  # likewise
+    flat: dict[int, int]  # numbers of the mirrors, by that of the probe
     num_paths: mi.Float  # (1,): of a pixel
     unseen: Light  # for rays of which probes do not know what they meet
 
     @staticmethod
     def of(
-        integrator: SplatsSettings, scene: mi.Scene, num_paths: int, unseen: Light
+        integrator: SplatsSettings,
+        scene: mi.Scene,
+        num_paths: int,
+        sensors: Sequence[mi.Sensor],
+        unseen: Light,
     ) -> LightOfProbes:
         """Those of an integrator's objects, or the last ones if nothing has changed.
+
+        sensors: those that flat mirrors are seen by.
 
         Raises PluginError for the name of an object that the scene does not have, and for an
         emitter that is nowhere.
@@ -57,11 +68,14 @@ class LightOfProbes:
         objects = _objects(scene, integrator.probes)
         shapes = {k: node for k, node in enumerate(objects) if isinstance(node, mi.Shape)}
         emitters = {k: shapes[k].emitter() if k in shapes else o for k, o in enumerate(objects)}
+        mirrors = _mirrors(integrator, scene, shapes, sensors)
         return LightOfProbes(
             _probes(integrator, np.array(list(map(_center, objects)))),
+            mirrors.pictures,
             dr.opaque(mi.Float, integrator.exposure),
             {k: mi.ShapePtr(shape) for k, shape in shapes.items()},
             {k: mi.EmitterPtr(node) for k, node in emitters.items() if node},
+            {k: number for number, k in enumerate(mirrors.planes)},
             dr.opaque(mi.Float, num_paths),
             unseen,
         )
@@ -90,6 +104,7 @@ class LightOfProbes:
             other = dr.select(leg.end == emitter, mi.UInt32(k), other)
         is_reversed = active & (probe == NOBODY) & (other != NOBODY)
         is_asked = active & ((probe != NOBODY) | is_reversed)
+        mirrored = self._look_in_mirrors(probe, leg, is_asked)
         ray, far = leg.ray, leg.ray.maxt
         back = dr.select(is_reversed, far, 0)
         seen = self.probes.look(
@@ -98,9 +113,23 @@ class LightOfProbes:
             mi.Vector3f(dr.select(is_reversed, -ray.d, ray.d)),
             mi.Float(far),
             dr.select(is_reversed, 0, self._level(leg.pdf)),
-            is_asked,
+            is_asked & ~mirrored.is_known,
+        )
+        seen = Seen(
+            dr.select(mirrored.is_known, mirrored.color, seen.color),
+            dr.select(mirrored.is_known, mirrored.coverage, seen.coverage),
+            seen.is_known | mirrored.is_known,
         )
         return seen, is_asked, is_reversed
+
+    def _look_in_mirrors(self, probe: mi.UInt32, leg: Leg, active: mi.Bool) -> Seen:
+        """What is known of legs that leave flat mirrors; probe: that of the shape they leave."""
+        if self.mirrors is None:
+            return Seen(mi.Color3f(0), mi.Float(0), mi.Bool(False))
+        mirror = mi.UInt32(NOBODY)
+        for k, number in self.flat.items():
+            mirror = dr.select(probe == k, mi.UInt32(number), mirror)
+        return self.mirrors.look(mirror, leg, active & (mirror != NOBODY))
 
     def _level(self, pdf: mi.Float) -> mi.UInt32:
         """Of the cube whose texels are as large as what a path of a pixel stands for."""
@@ -116,11 +145,73 @@ def _probes(integrator: SplatsSettings, centers: np.ndarray) -> Probes:
     last = integrator.memory.probes
     if last is not None and last[0] == how and same_variables(last[1], gaussians):
         return last[2]
-    approximations = replace(integrator.approximations, projection="exact", low_pass=LOW_PASS)
-    pipeline = pipeline_of(approximations, degree, (color_features, depth_feature))
+    pipeline = _pipeline(integrator, color_features, depth_feature)
     probes = Probes.of(gaussians, pipeline, centers, integrator.near, _decoded)
     integrator.memory.probes = (how, gaussians, probes)  # holding Gaussians keeps their indices
     return probes
+
+
+@dataclass(frozen=True, eq=False)
+class _KeptMirrors:
+    """The flat mirrors of a scene, and everything that their pictures depend on."""
+
+    surfaces: Any  # drgs.integrator.surfaces.Surfaces
+    how: tuple[object, ...]
+    gaussians: Gaussians  # detached: holding them keeps their indices
+    sensors: list[SensorState]
+    planes: dict[int, Any]  # by the probe's number: see drgs.integrator.mirrors.plane_of
+    pictures: Any  # drgs.integrator.mirrors.Mirrors; None: there are none
+
+    def matches(
+        self,
+        surfaces: Any,
+        how: tuple[object, ...],
+        gaussians: Gaussians,
+        sensors: list[SensorState],
+    ) -> bool:
+        """Whether these would give the same pictures."""
+        return (
+            self.surfaces is surfaces
+            and self.how == how
+            and same_variables(self.gaussians, gaussians)
+            and len(self.sensors) == len(sensors)
+            and all(a.same_as(b) for a, b in zip(self.sensors, sensors, strict=True))
+        )
+
+
+def _mirrors(
+    integrator: SplatsSettings,
+    scene: mi.Scene,
+    shapes: dict[int, mi.Shape],
+    sensors: Sequence[mi.Sensor],
+) -> _KeptMirrors:
+    """Those of the shapes that are flat mirrors; the last ones if all is the same.
+
+    shapes: by the probe's number.
+    """
+    from drgs.integrator.mirrors import Mirrors, plane_of
+
+    gaussians, degree = dr.detach(integrator.gaussians), integrator.sh_degree
+    memory, names = integrator.memory, tuple(integrator.probes)
+    how = integrator.approximations, degree, integrator.near, names
+    states = [read_sensor(sensor, integrator.near).detached() for sensor in sensors]
+    key = memory.surfaces, how, gaussians, states
+    if memory.mirrors is None or not memory.mirrors.matches(*key):
+        found = {k: plane_of(shape) for k, shape in shapes.items()}
+        planes = {k: plane for k, plane in found.items() if plane is not None}
+        pictures = None
+        if planes:
+            pipeline = _pipeline(integrator, color_features)
+            traced = memory.surfaces.traced(scene)
+            pictures = Mirrors.of(list(planes.values()), states, traced, gaussians, pipeline)
+        memory.mirrors = _KeptMirrors(*key, planes, pictures)
+    return memory.mirrors
+
+
+def _pipeline(integrator: SplatsSettings, *features: Feature) -> Pipeline:
+    """What renders the pictures: as rays see Gaussians."""
+    approximations = replace(integrator.approximations, projection="exact", low_pass=LOW_PASS)
+    return pipeline_of(approximations, integrator.sh_degree, features)
 
 
 def _objects(scene: mi.Scene, names: Sequence[str]) -> list[mi.Object]:

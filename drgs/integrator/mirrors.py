@@ -1,0 +1,316 @@
+"""Flat mirrors among probes: the splats as cameras see them that are mirrored in their planes.
+
+Imported where a flat mirror has a probe. A ray of a camera that a plane mirrors goes on along a ray
+of the camera that is mirrored in it: what it meets of splats is a pixel of the latter's picture.
+That is rendered by the kernels that make all others, with a few texels for each pixel. Splats on
+the other side of the plane are left out, and so are those behind the surface that the mirrored ray
+meets: a ray that ends elsewhere, as at the edge of such a surface, looks at those of the texels
+around it that end where it does.
+
+A ray that leaves the plane on none of the mirrored camera's rays, after other bounces or scattered,
+is not known.
+
+Nothing here is differentiated.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from drgs.cameras.camera import Camera
+from drgs.effects.compose import composed
+from drgs.effects.occlusion import Surface, occluded_by
+from drgs.gaussians.parameters import Gaussians
+from drgs.integrator.legs import Leg
+from drgs.integrator.sensors import SensorState, camera_from_sensor
+from drgs.light.probe import Seen
+from drgs.splatting import rendering
+from drgs.splatting.projection import GaussianRows
+
+TEXELS_PER_PIXEL = 2
+"""Along either axis."""
+
+MAX_TEXELS = 2**24
+"""Of all pictures together, 20 bytes each, before they have one texel a pixel."""
+
+BORDER = 8
+"""Texels around a picture: filters of the film reach beyond its edge."""
+
+FLAT = 1e-5
+"""How far from their plane vertices may be, relative to the size of what they make."""
+
+ROUNDED = 1e-6
+"""The same, relative to their coordinates."""
+
+OFF_RAY = 1e-3
+"""How far a ray may pass by the camera, relative to the distance that it has come."""
+
+OFF_SURFACE = 2e-4
+"""The same, relative to the coordinates: Mitsuba starts rays half as far off a surface."""
+
+LEAST_WEIGHT = 1e-3
+"""Of the four texels around a ray, that of those which end where it does."""
+
+SAME_END = (0.1, 0.01)
+"""How much farther a ray may end than another that looks the same: relative to where that ends, and
+to where it starts."""
+
+
+# ----------------------------------------------------------------------------------------------
+# Planes
+# ----------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Plane:
+    """Points x with normal . x = offset, world; arrays of them, by mirror, in :class:`Mirrors`."""
+
+    normal: mi.Vector3f  # unit
+    offset: mi.Float
+
+    def height(self, point: mi.Vector3f) -> mi.Float:
+        """Signed distance of a point."""
+        return dr.dot(self.normal, point) - self.offset
+
+    def at(self, mirror: mi.UInt32, active: mi.Bool = True) -> Plane:
+        """Those of some of the mirrors."""
+        normal = dr.gather(mi.Vector3f, self.normal, mirror, active)
+        return Plane(normal, dr.gather(mi.Float, self.offset, mirror, active))
+
+    def mirror(self, camera: Camera) -> Camera:
+        """The mirrored camera, whose axes have the other handedness: each pixel sees the mirror
+        image of what it saw."""
+        n = self.normal
+        turned = [
+            list(axis - 2 * dr.dot(axis, n) * n) for axis in map(mi.Vector3f, camera.rotation)
+        ]
+        center = mi.Vector3f(camera.center)
+        return replace(
+            camera,
+            rotation=type(camera.rotation)(turned),
+            center=type(camera.center)(center - 2 * self.height(center) * n),
+        )
+
+
+def plane_of(shape: mi.Shape) -> tuple[list[float], float] | None:
+    """Normal and offset of a flat shape whose BSDF mirrors; None for all others."""
+    bsdf = shape.bsdf()
+    if bsdf is None or not mi.has_flag(bsdf.flags(), mi.BSDFFlags.DeltaReflection):
+        return None
+    if shape.is_mesh():
+        return _plane_through(np.array(shape.vertex_positions_buffer(), np.float64))
+    if shape.class_name() != "Disk":
+        return None
+    matrix = np.array(mi.traverse(shape)["to_world"].matrix, np.float64).reshape(4, 4)
+    return _plane_through(np.array([[0, 0, 0, 1], [1, 0, 0, 1], [0, 1, 0, 1]]) @ matrix[:3].T)
+
+
+def _plane_through(points: np.ndarray) -> tuple[list[float], float] | None:
+    """points: of (N, 3). None if they are in no plane, or in several."""
+    points = points.reshape(-1, 3)
+    if len(points) < 3 or not np.isfinite(points).all():
+        return None
+    middle = points.mean(0)
+    offsets = points - middle
+    extents, axes = np.linalg.eigh(offsets.T @ offsets)  # from the least on
+    slack = FLAT * np.abs(offsets).max() + ROUNDED * np.abs(points).max()
+    if extents[1] <= 1e-10 * extents[2] or np.abs(offsets @ axes[:, 0]).max() > slack:
+        return None
+    return axes[:, 0].tolist(), float(axes[:, 0] @ middle)
+
+
+# ----------------------------------------------------------------------------------------------
+# Pictures
+# ----------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class Mirrors:
+    """What cameras see in mirrors."""
+
+    planes: Plane  # by mirror
+    views: list[_View]  # by camera
+
+    @staticmethod
+    def of(
+        planes: Sequence[tuple[list[float], float]],
+        states: Sequence[SensorState],
+        scene: mi.Scene,
+        gaussians: Gaussians,
+        pipeline: rendering.Pipeline,
+    ) -> Mirrors:
+        """Render the pictures. Cameras that move have none.
+
+        planes: by mirror, see :func:`plane_of`; scene: of the surfaces; pipeline: its features are
+        colours.
+        """
+        normals, offsets = zip(*planes, strict=True)
+        every = Plane(mi.Vector3f(np.array(normals, np.float32).T), mi.Float(offsets))
+        cameras = [c for c in map(camera_from_sensor, states) if c.shutter is None]
+        num_pixels = len(planes) * sum(c.width * c.height for c in cameras)
+        scale = TEXELS_PER_PIXEL if num_pixels * TEXELS_PER_PIXEL**2 <= MAX_TEXELS else 1
+        cameras = [_enlarged(camera, scale) for camera in cameras]
+        views = []
+        for camera in cameras:
+            pictures = [
+                _picture(camera, every.at(mi.UInt32(k)), scene, gaussians, pipeline)
+                for k in range(len(planes))
+            ]
+            colors, ends = (dr.concat(parts) for parts in zip(*pictures, strict=True))
+            views.append(_View(camera, colors, ends))
+        dr.eval(every, views)
+        return Mirrors(every, views)
+
+    def look(self, mirror: mi.UInt32, leg: Leg, active: mi.Bool) -> Seen:
+        """What legs meet that leave a mirror; mirror: its number, of each leg."""
+        plane, ray = self.planes.at(mirror, active), leg.ray
+        origin = ray.o - 2 * plane.height(ray.o) * plane.normal
+        direction = ray.d - 2 * dr.dot(plane.normal, ray.d) * plane.normal
+        color, coverage, is_known = mi.Color3f(0), mi.Float(0), mi.Bool(False)
+        for view in self.views:
+            seen = view.look(mirror, origin, direction, ray.maxt, active & ~is_known)
+            color = dr.select(seen.is_known, seen.color, color)
+            coverage = dr.select(seen.is_known, seen.coverage, coverage)
+            is_known |= seen.is_known
+        return Seen(color, coverage, is_known)
+
+
+@dataclass(frozen=True, eq=False)
+class _View:
+    """What one camera sees in each mirror."""
+
+    camera: Camera  # of a film that has a pixel for each texel
+    colors: mi.Float  # 4 a texel: linear red, green, blue, times the coverage; coverage
+    ends: mi.Float  # of each texel: how far from the camera its ray ends
+
+    def look(
+        self,
+        mirror: mi.UInt32,
+        origin: mi.Vector3f,
+        direction: mi.Vector3f,
+        far: mi.Float,
+        active: mi.Bool,
+    ) -> Seen:
+        """What rays meet, as far as they go on along those of the camera.
+
+        origin, direction: those of the mirrored rays, as if they had gone through the mirror.
+        """
+        camera = self.camera
+        origin = camera.rotation @ (mi.Vector3f(origin) - camera.center)
+        direction = camera.rotation @ mi.Vector3f(direction)
+        place, off = camera.place_of_ray(origin, direction)
+        start, towards, is_seen = camera.look_through(place.x, place.y)
+        way = origin - start
+        distance = dr.norm(way)
+        off += OFF_RAY * distance + OFF_SURFACE * (1 + dr.max(dr.abs(way)))
+        active = active & is_seen & (dr.dot(towards, direction) > 0) & (dr.dot(way, direction) > 0)
+        active &= dr.norm(dr.cross(way, direction)) <= off
+        x, y = place - 0.5
+        active &= (x >= 0) & (y >= 0) & (x < camera.width - 1) & (y < camera.height - 1)
+        column, row = mi.UInt32(x), mi.UInt32(y)
+        right, down = x - mi.Float(column), y - mi.Float(row)
+        width = dr.opaque(mi.UInt32, camera.width)
+        first = mirror * (width * camera.height) + row * width + column
+        total, weights = mi.Vector4f(0), mi.Float(0)
+        for texel, weight in (
+            (first, (1 - right) * (1 - down)),
+            (first + 1, right * (1 - down)),
+            (first + width, (1 - right) * down),
+            (first + width + 1, right * down),
+        ):
+            end = dr.gather(mi.Float, self.ends, texel, active)
+            weight = dr.select(_is_same(distance, far, end), weight, 0)
+            total += weight * dr.gather(mi.Vector4f, self.colors, texel, active)
+            weights += weight
+        is_known = active & (weights > LEAST_WEIGHT)
+        *color, coverage = dr.select(is_known, total / weights, 0)
+        return Seen(mi.Color3f(color), coverage, is_known)
+
+
+def _is_same(distance: mi.Float, far: mi.Float, end: mi.Float) -> mi.Bool:
+    """Whether a ray that has come from ``distance`` and goes on for ``far`` ends at ``end``."""
+    of_far, of_distance = SAME_END
+    is_near = dr.abs(distance + far - end) <= of_far * far + of_distance * distance
+    return dr.select((far < dr.inf) & (end < dr.inf), is_near, (far < dr.inf) == (end < dr.inf))
+
+
+def _enlarged(camera: Camera, scale: int) -> Camera:
+    """The camera with more pixels, and a border around them."""
+    changes = {
+        name: scale * getattr(camera, name) + BORDER
+        for name in ("principal", "film_start", "film_end")
+    }
+    camera = replace(
+        camera,
+        focal=scale * camera.focal,
+        width=scale * camera.width + 2 * BORDER,
+        height=scale * camera.height + 2 * BORDER,
+        **changes,
+    )
+    dr.make_opaque(camera)
+    return camera
+
+
+def _picture(
+    camera: Camera,
+    plane: Plane,
+    scene: mi.Scene,
+    gaussians: Gaussians,
+    pipeline: rendering.Pipeline,
+) -> tuple[mi.Float, mi.Float]:
+    """What the camera sees in a mirror: see :class:`_View`."""
+    side = dr.sign(plane.height(mi.Vector3f(camera.center)))
+    plane = Plane(side * plane.normal, side * plane.offset)
+    camera = plane.mirror(camera)
+    dr.make_opaque(plane, camera)
+    surface, ends = _trace(camera, plane, scene)
+    pipeline = composed(pipeline, gaussians, camera)
+    frame = rendering.render(
+        gaussians,
+        camera,
+        replace(
+            pipeline,
+            rows=lambda rows: _in_front(plane, pipeline.rows(rows)),
+            features=(*pipeline.features, rendering.depth_feature),
+            model=occluded_by(pipeline.model, surface, camera),
+        ),
+    )
+    _, *color, coverage = frame.planes()
+    part = dr.select(coverage > 0, coverage, 1)
+    color = coverage * mi.math.srgb_to_linear(mi.Color3f(color) / part)
+    colors = dr.ravel(mi.Vector4f(*color, coverage))
+    dr.eval(colors, ends)
+    return colors, ends
+
+
+def _in_front(plane: Plane, rows: GaussianRows) -> GaussianRows:
+    """Those Gaussians alone whose means are."""
+    is_in_front = plane.height(mi.Vector3f(rows.means)) > 0
+    return replace(rows, logit_opacities=dr.select(is_in_front, rows.logit_opacities, -dr.inf))
+
+
+def _trace(camera: Camera, plane: Plane, scene: mi.Scene) -> tuple[Surface, mi.Float]:
+    """What ends the rays of a mirrored camera, and how far from it they end."""
+    texel = dr.arange(mi.UInt32, camera.width * camera.height)
+    width = dr.opaque(mi.UInt32, camera.width)
+    row = texel // width
+    x, y = mi.Float(texel - row * width) + 0.5, mi.Float(row) + 0.5
+    origin, direction, is_seen = camera.look_through(x, y)
+    to_world = camera.rotation.T
+    origin = mi.Point3f(camera.center + to_world @ origin)
+    direction = mi.Vector3f(dr.normalize(to_world @ direction))
+    t = -plane.height(mi.Vector3f(origin)) / dr.dot(plane.normal, direction)
+    start = dr.fma(direction, t, origin)
+    start += (OFF_SURFACE * (1 + dr.max(dr.abs(start)))) * plane.normal
+    hit = scene.ray_intersect_preliminary(mi.Ray3f(start, direction), active=is_seen & (t > 0))
+    point = camera.rotation @ (mi.Vector3f(start) + hit.t * direction - camera.center)
+    _, _, depth = camera.lens.look(camera, point)
+    depth = dr.select(hit.is_valid(), depth, dr.inf)
+    ends = dr.select(hit.is_valid(), t + hit.t, dr.inf)
+    dr.eval(depth, ends)
+    return Surface(depth, dr.full(mi.Float, 1, dr.width(depth))), ends
