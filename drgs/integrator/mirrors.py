@@ -22,15 +22,16 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from drgs.cameras.camera import Camera
+from drgs.accuracy.peak_depths import BoundedDepths
+from drgs.accuracy.pipeline import pipeline_of
+from drgs.cameras.camera import Camera, Lens, Pinhole
+from drgs.config.approximations import Approximations
 from drgs.effects.compose import composed
-from drgs.effects.occlusion import Surface, occluded_by
 from drgs.gaussians.parameters import Gaussians
 from drgs.integrator.legs import Leg
 from drgs.integrator.sensors import SensorState, camera_from_sensor
-from drgs.light.probe import Seen
+from drgs.light.probe import LOW_PASS, Seen
 from drgs.splatting import rendering
-from drgs.splatting.projection import GaussianRows
 
 TEXELS_PER_PIXEL = 2
 """Along either axis."""
@@ -142,12 +143,12 @@ class Mirrors:
         states: Sequence[SensorState],
         scene: mi.Scene,
         gaussians: Gaussians,
-        pipeline: rendering.Pipeline,
+        approximations: Approximations,
+        sh_degree: int,
     ) -> Mirrors:
         """Render the pictures. Cameras that move have none.
 
-        planes: by mirror, see :func:`plane_of`; scene: of the surfaces; pipeline: its features are
-        colours.
+        planes: by mirror, see :func:`plane_of`; scene: of the surfaces.
         """
         normals, offsets = zip(*planes, strict=True)
         every = Plane(mi.Vector3f(np.array(normals, np.float32).T), mi.Float(offsets))
@@ -157,6 +158,7 @@ class Mirrors:
         cameras = [_enlarged(camera, scale) for camera in cameras]
         views = []
         for camera in cameras:
+            pipeline = _pipeline(approximations, sh_degree, camera.lens)
             pictures = [
                 _picture(camera, every.at(mi.UInt32(k)), scene, gaussians, pipeline)
                 for k in range(len(planes))
@@ -239,6 +241,15 @@ def _is_same(distance: mi.Float, far: mi.Float, end: mi.Float) -> mi.Bool:
     return dr.select((far < dr.inf) & (end < dr.inf), is_near, (far < dr.inf) == (end < dr.inf))
 
 
+def _pipeline(approximations: Approximations, sh_degree: int, lens: Lens) -> rendering.Pipeline:
+    """What renders the pictures: Gaussians as rays meet them, as far as a lens allows it."""
+    projection = "exact"
+    if not isinstance(lens, Pinhole):
+        projection = "ewa" if lens.parallel else "unscented"  # the former is exact then
+    along_rays = {"low_pass": LOW_PASS, "order": "pixel", "sh_direction": "pixel"}
+    return pipeline_of(replace(approximations, projection=projection, **along_rays), sh_degree)
+
+
 def _enlarged(camera: Camera, scale: int) -> Camera:
     """The camera with more pixels, and a border around them."""
     changes = {
@@ -268,34 +279,25 @@ def _picture(
     plane = Plane(side * plane.normal, side * plane.offset)
     camera = plane.mirror(camera)
     dr.make_opaque(plane, camera)
-    surface, ends = _trace(camera, plane, scene)
+    nearest, farthest, ends = _trace(camera, plane, scene)
     pipeline = composed(pipeline, gaussians, camera)
-    frame = rendering.render(
-        gaussians,
-        camera,
-        replace(
-            pipeline,
-            rows=lambda rows: _in_front(plane, pipeline.rows(rows)),
-            features=(*pipeline.features, rendering.depth_feature),
-            model=occluded_by(pipeline.model, surface, camera),
-        ),
-    )
-    _, *color, coverage = frame.planes()
-    part = dr.select(coverage > 0, coverage, 1)
-    color = coverage * mi.math.srgb_to_linear(mi.Color3f(color) / part)
+    depths = BoundedDepths(pipeline.order.depths, nearest, farthest)
+    order = replace(pipeline.order, depths=depths)
+    frame = rendering.render(gaussians, camera, replace(pipeline, order=order))
+    T, *color = frame.planes()
+    coverage = 1 - T
+    color = mi.Color3f(color) / dr.select(coverage > 0, coverage, 1)
+    color = coverage * mi.math.srgb_to_linear(color)
     colors = dr.ravel(mi.Vector4f(*color, coverage))
     dr.eval(colors, ends)
     return colors, ends
 
 
-def _in_front(plane: Plane, rows: GaussianRows) -> GaussianRows:
-    """Those Gaussians alone whose means are."""
-    is_in_front = plane.height(mi.Vector3f(rows.means)) > 0
-    return replace(rows, logit_opacities=dr.select(is_in_front, rows.logit_opacities, -dr.inf))
+def _trace(camera: Camera, plane: Plane, scene: mi.Scene) -> tuple[mi.Float, mi.Float, mi.Float]:
+    """Depths at which the rays of a mirrored camera pass the mirror, and at which they end.
 
-
-def _trace(camera: Camera, plane: Plane, scene: mi.Scene) -> tuple[Surface, mi.Float]:
-    """What ends the rays of a mirrored camera, and how far from it they end."""
+    The last is how far from the camera they end.
+    """
     texel = dr.arange(mi.UInt32, camera.width * camera.height)
     width = dr.opaque(mi.UInt32, camera.width)
     row = texel // width
@@ -305,12 +307,18 @@ def _trace(camera: Camera, plane: Plane, scene: mi.Scene) -> tuple[Surface, mi.F
     origin = mi.Point3f(camera.center + to_world @ origin)
     direction = mi.Vector3f(dr.normalize(to_world @ direction))
     t = -plane.height(mi.Vector3f(origin)) / dr.dot(plane.normal, direction)
+    is_seen &= t > 0
     start = dr.fma(direction, t, origin)
-    start += (OFF_SURFACE * (1 + dr.max(dr.abs(start)))) * plane.normal
-    hit = scene.ray_intersect_preliminary(mi.Ray3f(start, direction), active=is_seen & (t > 0))
-    point = camera.rotation @ (mi.Vector3f(start) + hit.t * direction - camera.center)
-    _, _, depth = camera.lens.look(camera, point)
-    depth = dr.select(hit.is_valid(), depth, dr.inf)
-    ends = dr.select(hit.is_valid(), t + hit.t, dr.inf)
-    dr.eval(depth, ends)
-    return Surface(depth, dr.full(mi.Float, 1, dr.width(depth))), ends
+
+    def depth(far: mi.Float, exists: mi.Bool) -> mi.Float:
+        point = camera.rotation @ (mi.Vector3f(start) + far * direction - camera.center)
+        return dr.select(exists, camera.lens.look(camera, point)[2], dr.inf)
+
+    off = OFF_SURFACE * (1 + dr.max(dr.abs(start)))
+    hit = scene.ray_intersect_preliminary(
+        mi.Ray3f(start + off * plane.normal, direction), active=is_seen
+    )
+    hits = is_seen & hit.is_valid()
+    found = depth(mi.Float(0), is_seen), depth(hit.t, hits), dr.select(hits, t + hit.t, dr.inf)
+    dr.eval(found)
+    return found

@@ -27,11 +27,8 @@ from drgs.gaussians.parameters import Gaussians
 from drgs.integrator.legs import Leg, Light
 from drgs.integrator.sensors import SensorState, read_sensor
 from drgs.integrator.settings import SplatsSettings
-from drgs.light.probe import LEVELS, SIZE, Probes, Seen
-from drgs.splatting.rendering import Feature, Pipeline, color_features, depth_feature
-
-LOW_PASS = 0.03
-"""px^2 of a probe's pictures: rays have none at all."""
+from drgs.light.probe import LEVELS, LOW_PASS, SIZE, Probes, Seen
+from drgs.splatting.rendering import color_features, depth_feature
 
 NOBODY = 0xFFFFFFFF
 """In place of a probe's number."""
@@ -145,7 +142,8 @@ def _probes(integrator: SplatsSettings, centers: np.ndarray) -> Probes:
     last = integrator.memory.probes
     if last is not None and last[0] == how and same_variables(last[1], gaussians):
         return last[2]
-    pipeline = _pipeline(integrator, color_features, depth_feature)
+    approximations = replace(integrator.approximations, projection="exact", low_pass=LOW_PASS)
+    pipeline = pipeline_of(approximations, degree, (color_features, depth_feature))
     probes = Probes.of(gaussians, pipeline, centers, integrator.near, _decoded)
     integrator.memory.probes = (how, gaussians, probes)  # holding Gaussians keeps their indices
     return probes
@@ -201,17 +199,11 @@ def _mirrors(
         planes = {k: plane for k, plane in found.items() if plane is not None}
         pictures = None
         if planes:
-            pipeline = _pipeline(integrator, color_features)
             traced = memory.surfaces.traced(scene)
-            pictures = Mirrors.of(list(planes.values()), states, traced, gaussians, pipeline)
+            look = integrator.approximations, degree
+            pictures = Mirrors.of(list(planes.values()), states, traced, gaussians, *look)
         memory.mirrors = _KeptMirrors(*key, planes, pictures)
     return memory.mirrors
-
-
-def _pipeline(integrator: SplatsSettings, *features: Feature) -> Pipeline:
-    """What renders the pictures: as rays see Gaussians."""
-    approximations = replace(integrator.approximations, projection="exact", low_pass=LOW_PASS)
-    return pipeline_of(approximations, integrator.sh_degree, features)
 
 
 def _objects(scene: mi.Scene, names: Sequence[str]) -> list[mi.Object]:

@@ -35,6 +35,9 @@ SIZE = 256
 LEVELS = 7
 """Cubes of a probe; each has half the edges of the one before."""
 
+LOW_PASS = 0.03
+"""px^2 of the pictures: rays have none at all."""
+
 FINE = 2
 """The last level in which distances are searched: those of smaller pictures are no surface."""
 
