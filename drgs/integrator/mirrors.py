@@ -202,14 +202,14 @@ class _View:
 
         origin, direction: those of the mirrored rays, as if they had gone through the mirror.
         """
-        camera = self.camera
+        camera, rounding = self.camera, OFF_SURFACE * (1 + dr.max(dr.abs(origin)))
         origin = camera.rotation @ (mi.Vector3f(origin) - camera.center)
         direction = camera.rotation @ mi.Vector3f(direction)
         place, off = camera.place_of_ray(origin, direction)
         start, towards, is_seen = camera.look_through(place.x, place.y)
         way = origin - start
         distance = dr.norm(way)
-        off += OFF_RAY * distance + OFF_SURFACE * (1 + dr.max(dr.abs(way)))
+        off += OFF_RAY * distance + rounding
         active = active & is_seen & (dr.dot(towards, direction) > 0) & (dr.dot(way, direction) > 0)
         active &= dr.norm(dr.cross(way, direction)) <= off
         x, y = place - 0.5
