@@ -98,22 +98,53 @@ class Plane:
         )
 
 
-def plane_of(shape: mi.Shape) -> tuple[list[float], float] | None:
-    """Normal and offset of a flat shape whose BSDF mirrors; None for all others."""
-    bsdf = shape.bsdf()
-    if bsdf is None or not mi.has_flag(bsdf.flags(), mi.BSDFFlags.DeltaReflection):
-        return None
+@dataclass(frozen=True)
+class FlatMirror:
+    """A flat shape that reflects light about where a mirror would."""
+
+    normal: list[float]  # world, unit
+    offset: float  # of the plane along it
+    is_sharp: bool  # whether a part of the light goes exactly there
+    is_bright: bool  # whether all that goes on does so about there
+
+    @staticmethod
+    def of(shape: mi.Shape) -> FlatMirror | None:
+        """None for a shape that is none, or shines itself."""
+        bsdf = shape.bsdf()
+        if bsdf is None or shape.is_emitter():
+            return None
+        sharp, glossy, diffuse, through = (
+            mi.has_flag(bsdf.flags(), flag)
+            for flag in (
+                mi.BSDFFlags.DeltaReflection,
+                mi.BSDFFlags.GlossyReflection,
+                mi.BSDFFlags.DiffuseReflection,
+                mi.BSDFFlags.Transmission,
+            )
+        )
+        plane = _plane_through(_points(shape)) if sharp or glossy else None
+        return plane and FlatMirror(*plane, sharp, not (diffuse or through))
+
+    def behind(self, center: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Where the mirrored camera is, (3,), and the plane, (4,), with the camera before it."""
+        normal = np.array(self.normal)
+        height = normal @ center - self.offset
+        plane = np.sign(height) * np.array([*normal, self.offset])
+        return center - 2 * height * normal, plane
+
+
+def _points(shape: mi.Shape) -> np.ndarray:
+    """Points (N, 3) of a shape, world, that tell whether it is flat; none if it cannot be."""
     if shape.is_mesh():
-        return _plane_through(np.array(shape.vertex_positions_buffer(), np.float64))
+        return np.array(shape.vertex_positions_buffer(), np.float64).reshape(-1, 3)
     if shape.class_name() != "Disk":
-        return None
+        return np.zeros((0, 3))
     matrix = np.array(mi.traverse(shape)["to_world"].matrix, np.float64).reshape(4, 4)
-    return _plane_through(np.array([[0, 0, 0, 1], [1, 0, 0, 1], [0, 1, 0, 1]]) @ matrix[:3].T)
+    return np.array([[0, 0, 0, 1], [1, 0, 0, 1], [0, 1, 0, 1]]) @ matrix[:3].T
 
 
 def _plane_through(points: np.ndarray) -> tuple[list[float], float] | None:
-    """points: of (N, 3). None if they are in no plane, or in several."""
-    points = points.reshape(-1, 3)
+    """Normal and offset; points: (N, 3). None if they are in no plane, or in several."""
     if len(points) < 3 or not np.isfinite(points).all():
         return None
     middle = points.mean(0)
@@ -139,7 +170,7 @@ class Mirrors:
 
     @staticmethod
     def of(
-        planes: Sequence[tuple[list[float], float]],
+        mirrors: Sequence[FlatMirror],
         states: Sequence[SensorState],
         scene: mi.Scene,
         gaussians: Gaussians,
@@ -148,12 +179,12 @@ class Mirrors:
     ) -> Mirrors:
         """Render the pictures. Cameras that move have none.
 
-        planes: by mirror, see :func:`plane_of`; scene: of the surfaces.
+        scene: of the surfaces.
         """
-        normals, offsets = zip(*planes, strict=True)
-        every = Plane(mi.Vector3f(np.array(normals, np.float32).T), mi.Float(offsets))
+        normals = np.array([mirror.normal for mirror in mirrors], np.float32)
+        every = Plane(mi.Vector3f(normals.T), mi.Float([mirror.offset for mirror in mirrors]))
         cameras = [c for c in map(camera_from_sensor, states) if c.shutter is None]
-        num_pixels = len(planes) * sum(c.width * c.height for c in cameras)
+        num_pixels = len(mirrors) * sum(c.width * c.height for c in cameras)
         scale = TEXELS_PER_PIXEL if num_pixels * TEXELS_PER_PIXEL**2 <= MAX_TEXELS else 1
         cameras = [_enlarged(camera, scale) for camera in cameras]
         views = []
@@ -161,7 +192,7 @@ class Mirrors:
             pipeline = _pipeline(approximations, sh_degree, camera.lens)
             pictures = [
                 _picture(camera, every.at(mi.UInt32(k)), scene, gaussians, pipeline)
-                for k in range(len(planes))
+                for k in range(len(mirrors))
             ]
             colors, ends = (dr.concat(parts) for parts in zip(*pictures, strict=True))
             views.append(_View(camera, colors, ends))

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import drjit as dr
@@ -25,7 +25,7 @@ from drgs.core.errors import PluginError
 from drgs.core.private import same_variables
 from drgs.gaussians.parameters import Gaussians
 from drgs.integrator.legs import Leg, Light
-from drgs.integrator.sensors import SensorState, read_sensor
+from drgs.integrator.sensors import SensorState, camera_from_sensor, read_sensor
 from drgs.integrator.settings import SplatsSettings
 from drgs.light.probe import LEVELS, LOW_PASS, SIZE, Probes, Seen
 from drgs.splatting.rendering import color_features, depth_feature
@@ -67,12 +67,12 @@ class LightOfProbes:
         emitters = {k: shapes[k].emitter() if k in shapes else o for k, o in enumerate(objects)}
         mirrors = _mirrors(integrator, scene, shapes, sensors)
         return LightOfProbes(
-            _probes(integrator, np.array(list(map(_center, objects)))),
+            _probes(integrator, *_places(objects, mirrors)),
             mirrors.pictures,
             dr.opaque(mi.Float, integrator.exposure),
             {k: mi.ShapePtr(shape) for k, shape in shapes.items()},
             {k: mi.EmitterPtr(node) for k, node in emitters.items() if node},
-            {k: number for number, k in enumerate(mirrors.planes)},
+            {k: number for number, k in enumerate(mirrors.sharp)},
             dr.opaque(mi.Float, num_paths),
             unseen,
         )
@@ -135,16 +135,19 @@ class LightOfProbes:
         return mi.UInt32(dr.clip(level + 0.5, 0, LEVELS - 1))
 
 
-def _probes(integrator: SplatsSettings, centers: np.ndarray) -> Probes:
-    """Those at (P, 3) places among an integrator's Gaussians; the last ones if all is the same."""
+def _probes(integrator: SplatsSettings, centers: np.ndarray, planes: np.ndarray) -> Probes:
+    """Those of an integrator's Gaussians; the last ones if all is the same.
+
+    centers: (P, 3); planes: (P, 4), see :meth:`drgs.light.probe.Probes.of`.
+    """
     gaussians, degree = dr.detach(integrator.gaussians), integrator.sh_degree
-    how = (integrator.approximations, degree, integrator.near, centers.tolist())
+    how = (integrator.approximations, degree, integrator.near, centers.tolist(), planes.tolist())
     last = integrator.memory.probes
     if last is not None and last[0] == how and same_variables(last[1], gaussians):
         return last[2]
     approximations = replace(integrator.approximations, projection="exact", low_pass=LOW_PASS)
     pipeline = pipeline_of(approximations, degree, (color_features, depth_feature))
-    probes = Probes.of(gaussians, pipeline, centers, integrator.near, _decoded)
+    probes = Probes.of(gaussians, pipeline, centers, integrator.near, _decoded, planes)
     integrator.memory.probes = (how, gaussians, probes)  # holding Gaussians keeps their indices
     return probes
 
@@ -154,26 +157,32 @@ class _KeptMirrors:
     """The flat mirrors of a scene, and everything that their pictures depend on."""
 
     surfaces: Any  # drgs.integrator.surfaces.Surfaces
+    names: tuple[str, ...]
     how: tuple[object, ...]
     gaussians: Gaussians  # detached: holding them keeps their indices
     sensors: list[SensorState]
-    planes: dict[int, Any]  # by the probe's number: see drgs.integrator.mirrors.plane_of
-    pictures: Any  # drgs.integrator.mirrors.Mirrors; None: there are none
+    flat: dict[int, Any] = field(
+        default_factory=dict
+    )  # drgs.integrator.mirrors.FlatMirror by probe
+    pictures: Any = None  # drgs.integrator.mirrors.Mirrors; None: there are none
 
-    def matches(
-        self,
-        surfaces: Any,
-        how: tuple[object, ...],
-        gaussians: Gaussians,
-        sensors: list[SensorState],
-    ) -> bool:
-        """Whether these would give the same pictures."""
+    @property
+    def sharp(self) -> dict[int, Any]:
+        """Those that have pictures."""
+        return {k: mirror for k, mirror in self.flat.items() if mirror.is_sharp}
+
+    def same_shapes(self, other: _KeptMirrors) -> bool:
+        """Whether both are of the same shapes."""
+        return self.surfaces is other.surfaces and self.names == other.names
+
+    def same_pictures(self, other: _KeptMirrors) -> bool:
+        """Whether both have the same pictures."""
         return (
-            self.surfaces is surfaces
-            and self.how == how
-            and same_variables(self.gaussians, gaussians)
-            and len(self.sensors) == len(sensors)
-            and all(a.same_as(b) for a, b in zip(self.sensors, sensors, strict=True))
+            self.same_shapes(other)
+            and self.how == other.how
+            and same_variables(self.gaussians, other.gaussians)
+            and len(self.sensors) == len(other.sensors)
+            and all(a.same_as(b) for a, b in zip(self.sensors, other.sensors, strict=True))
         )
 
 
@@ -187,23 +196,43 @@ def _mirrors(
 
     shapes: by the probe's number.
     """
-    from drgs.integrator.mirrors import Mirrors, plane_of
+    from drgs.integrator.mirrors import FlatMirror, Mirrors
 
     gaussians, degree = dr.detach(integrator.gaussians), integrator.sh_degree
-    memory, names = integrator.memory, tuple(integrator.probes)
-    how = integrator.approximations, degree, integrator.near, names
+    memory, approximations = integrator.memory, integrator.approximations
     states = [read_sensor(sensor, integrator.near).detached() for sensor in sensors]
-    key = memory.surfaces, how, gaussians, states
-    if memory.mirrors is None or not memory.mirrors.matches(*key):
-        found = {k: plane_of(shape) for k, shape in shapes.items()}
-        planes = {k: plane for k, plane in found.items() if plane is not None}
-        pictures = None
-        if planes:
-            traced = memory.surfaces.traced(scene)
-            look = integrator.approximations, degree
-            pictures = Mirrors.of(list(planes.values()), states, traced, gaussians, *look)
-        memory.mirrors = _KeptMirrors(*key, planes, pictures)
-    return memory.mirrors
+    how = approximations, degree
+    found = _KeptMirrors(memory.surfaces, tuple(integrator.probes), how, gaussians, states)
+    last = memory.mirrors
+    if last is not None and found.same_pictures(last):
+        return last
+    if last is not None and found.same_shapes(last):
+        flat = last.flat
+    else:
+        every = {k: FlatMirror.of(shape) for k, shape in shapes.items()}
+        flat = {k: mirror for k, mirror in every.items() if mirror is not None}
+    found = memory.mirrors = replace(found, flat=flat)
+    if found.sharp:
+        traced = memory.surfaces.traced(scene)
+        sharp = list(found.sharp.values())
+        pictures = Mirrors.of(sharp, states, traced, gaussians, approximations, degree)
+        found = memory.mirrors = replace(found, pictures=pictures)
+    return found
+
+
+def _places(objects: Sequence[mi.Object], mirrors: _KeptMirrors) -> tuple[np.ndarray, np.ndarray]:
+    """Where the probes of objects are, (P, 3), and planes beyond which they see, (P, 4).
+
+    That of a bright flat mirror is where the first camera is in it: rays of the camera that it
+    reflects pass close by.
+    """
+    centers, planes = np.array(list(map(_center, objects))), np.zeros((len(objects), 4))
+    bright = {k: mirror for k, mirror in mirrors.flat.items() if mirror.is_bright}
+    if bright:
+        camera = np.array(camera_from_sensor(mirrors.sensors[0]).center, np.float64).ravel()
+        for k, mirror in bright.items():
+            centers[k], planes[k] = mirror.behind(camera)
+    return centers, planes
 
 
 def _objects(scene: mi.Scene, names: Sequence[str]) -> list[mi.Object]:
