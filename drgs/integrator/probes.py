@@ -25,10 +25,19 @@ from drgs.core.errors import PluginError
 from drgs.core.private import same_variables
 from drgs.gaussians.parameters import Gaussians
 from drgs.integrator.legs import Leg, Light
+from drgs.integrator.limits import check_ids
 from drgs.integrator.sensors import SensorState, camera_from_sensor, read_sensor
 from drgs.integrator.settings import SplatsSettings
 from drgs.light.probe import LEVELS, LOW_PASS, SIZE, Probes, Seen
 from drgs.splatting.rendering import color_features, depth_feature
+
+CLOSE = 1.25
+"""Of half the size of an object: where splats are nearer to its middle, its surface sees others."""
+
+TOO_CLOSE = (
+    "splats: splats are so close to '{}' for its size that its surface sees others than its middle "
+    "does, where its probe is: its picture may be far from that of light 'rays'"
+)
 
 NOBODY = 0xFFFFFFFF
 """In place of a probe's number."""
@@ -67,7 +76,7 @@ class LightOfProbes:
         emitters = {k: shapes[k].emitter() if k in shapes else o for k, o in enumerate(objects)}
         mirrors = _mirrors(integrator, scene, shapes, sensors)
         return LightOfProbes(
-            _probes(integrator, *_places(objects, mirrors)),
+            _probes(integrator, objects, mirrors),
             mirrors.pictures,
             dr.opaque(mi.Float, integrator.exposure),
             {k: mi.ShapePtr(shape) for k, shape in shapes.items()},
@@ -135,21 +144,58 @@ class LightOfProbes:
         return mi.UInt32(dr.clip(level + 0.5, 0, LEVELS - 1))
 
 
-def _probes(integrator: SplatsSettings, centers: np.ndarray, planes: np.ndarray) -> Probes:
-    """Those of an integrator's Gaussians; the last ones if all is the same.
+def _probes(
+    integrator: SplatsSettings, objects: Sequence[mi.Object], mirrors: _KeptMirrors
+) -> Probes:
+    """Those of objects among an integrator's Gaussians; the last ones if all is the same.
 
-    centers: (P, 3); planes: (P, 4), see :meth:`drgs.light.probe.Probes.of`.
+    Logs a warning for objects that are too close to splats, the first time that one is.
     """
     gaussians, degree = dr.detach(integrator.gaussians), integrator.sh_degree
-    how = (integrator.approximations, degree, integrator.near, centers.tolist(), planes.tolist())
+    centers, planes = _places(objects, mirrors)
+    how = (
+        integrator.approximations,
+        degree,
+        integrator.near,
+        integrator.probes,
+        centers.tolist(),
+        planes.tolist(),
+    )
     last = integrator.memory.probes
-    if last is not None and last[0] == how and same_variables(last[1], gaussians):
-        return last[2]
+    if last is not None and last.how == how and same_variables(last.gaussians, gaussians):
+        return last.probes
     approximations = replace(integrator.approximations, projection="exact", low_pass=LOW_PASS)
     pipeline = pipeline_of(approximations, degree, (color_features, depth_feature))
+    if gaussians.smoothing is not None:
+        from drgs.effects.smoothing import smoothed
+
+        pipeline = replace(pipeline, rows=smoothed)
     probes = Probes.of(gaussians, pipeline, centers, integrator.near, _decoded, planes)
-    integrator.memory.probes = (how, gaussians, probes)  # holding Gaussians keeps their indices
+    known = frozenset() if last is None else last.close
+    close = {
+        node.id()
+        for k, node in enumerate(objects)
+        if isinstance(node, mi.Shape) and not planes[k].any() and _is_close(node, probes.nearest[k])
+    }
+    for name in sorted(close - known):
+        mi.Log(mi.LogLevel.Warn, TOO_CLOSE.format(name))
+    integrator.memory.probes = _KeptProbes(how, gaussians, probes, known | close)
     return probes
+
+
+def _is_close(shape: mi.Shape, nearest: float) -> bool:
+    """Whether splats, the nearest of which is that far from its middle, are close to a shape."""
+    return nearest < CLOSE * float(dr.max(shape.bbox().extents())) / 2
+
+
+@dataclass(frozen=True, eq=False)
+class _KeptProbes:
+    """Probes, and everything that they depend on."""
+
+    how: tuple[object, ...]
+    gaussians: Gaussians  # detached: holding them keeps their indices
+    probes: Probes
+    close: frozenset[str]  # ids of objects of which a warning was given
 
 
 @dataclass(frozen=True, eq=False)
@@ -236,13 +282,9 @@ def _places(objects: Sequence[mi.Object], mirrors: _KeptMirrors) -> tuple[np.nda
 
 
 def _objects(scene: mi.Scene, names: Sequence[str]) -> list[mi.Object]:
-    known = {node.id(): node for node in (*scene.emitters(), *scene.shapes())}
-    for name in names:
-        if name not in known:
-            raise PluginError(
-                "splats: probes must be ids of the scene's shapes and emitters, got "
-                f"{name!r}; there are {', '.join(known)}"
-            )
+    nodes = [*scene.emitters(), *scene.shapes()]
+    check_ids("probes must be ids of the scene's shapes and emitters", names, nodes)
+    known = {node.id(): node for node in nodes}
     return [known[name] for name in names]
 
 
