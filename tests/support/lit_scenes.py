@@ -27,7 +27,7 @@ def scene_of(splats, light="rays", max_depth=8, nested="splatpath", spp=64, **ot
     """The objects of ``others`` among the splats, and their camera at ``sensor``."""
     settings = {
         key: others.pop(key)
-        for key in ("light_samples", "exposure", "probes", "unseen")
+        for key in ("light_samples", "exposure", "probes", "unseen", "smoothing")
         if key in others
     }
     tensors = {k: mi.TensorXf(v.astype(np.float32)) for k, v in vars(splats).items()}
