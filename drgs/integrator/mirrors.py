@@ -1,6 +1,6 @@
 """Flat mirrors among probes: the splats as cameras see them that are mirrored in their planes.
 
-Imported where a flat mirror has a probe. A ray of a camera that a plane mirrors goes on along a ray
+Imported where a scene has probes. A ray of a camera that a plane mirrors goes on along a ray
 of the camera that is mirrored in it: what it meets of splats is a pixel of the latter's picture.
 That is rendered by the kernels that make all others, with a few texels for each pixel. Splats on
 the other side of the plane are left out, and so are those behind the surface that the mirrored ray
@@ -36,7 +36,7 @@ from drgs.splatting import rendering
 TEXELS_PER_PIXEL = 2
 """Along either axis."""
 
-MAX_TEXELS = 2**24
+MAX_TEXELS = 2**21
 """Of all pictures together, 20 bytes each, before they have one texel a pixel."""
 
 BORDER = 8
@@ -104,8 +104,8 @@ class FlatMirror:
 
     normal: list[float]  # world, unit
     offset: float  # of the plane along it
-    is_sharp: bool  # whether a part of the light goes exactly there
-    is_bright: bool  # whether all that goes on does so about there
+    has_delta: bool  # whether a part of the light goes exactly there
+    is_specular: bool  # whether all that goes on does so about there
 
     @staticmethod
     def of(shape: mi.Shape) -> FlatMirror | None:
@@ -113,7 +113,7 @@ class FlatMirror:
         bsdf = shape.bsdf()
         if bsdf is None or shape.is_emitter():
             return None
-        sharp, glossy, diffuse, through = (
+        delta, glossy, diffuse, through = (
             mi.has_flag(bsdf.flags(), flag)
             for flag in (
                 mi.BSDFFlags.DeltaReflection,
@@ -122,8 +122,8 @@ class FlatMirror:
                 mi.BSDFFlags.Transmission,
             )
         )
-        plane = _plane_through(_points(shape)) if sharp or glossy else None
-        return plane and FlatMirror(*plane, sharp, not (diffuse or through))
+        plane = _plane_through(_points(shape)) if delta or glossy else None
+        return plane and FlatMirror(*plane, delta, not (diffuse or through))
 
     def behind(self, center: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Where the mirrored camera is, (3,), and the plane, (4,), with the camera before it."""

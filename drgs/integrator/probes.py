@@ -81,7 +81,7 @@ class LightOfProbes:
             dr.opaque(mi.Float, integrator.exposure),
             {k: mi.ShapePtr(shape) for k, shape in shapes.items()},
             {k: mi.EmitterPtr(node) for k, node in emitters.items() if node},
-            {k: number for number, k in enumerate(mirrors.sharp)},
+            {k: number for number, k in enumerate(mirrors.delta_mirrors)},
             dr.opaque(mi.Float, num_paths),
             unseen,
         )
@@ -213,9 +213,9 @@ class _KeptMirrors:
     pictures: Any = None  # drgs.integrator.mirrors.Mirrors; None: there are none
 
     @property
-    def sharp(self) -> dict[int, Any]:
+    def delta_mirrors(self) -> dict[int, Any]:
         """Those that have pictures."""
-        return {k: mirror for k, mirror in self.flat.items() if mirror.is_sharp}
+        return {k: mirror for k, mirror in self.flat.items() if mirror.has_delta}
 
     def same_shapes(self, other: _KeptMirrors) -> bool:
         """Whether both are of the same shapes."""
@@ -258,10 +258,10 @@ def _mirrors(
         every = {k: FlatMirror.of(shape) for k, shape in shapes.items()}
         flat = {k: mirror for k, mirror in every.items() if mirror is not None}
     found = memory.mirrors = replace(found, flat=flat)
-    if found.sharp:
+    if found.delta_mirrors:
         traced = memory.surfaces.traced(scene)
-        sharp = list(found.sharp.values())
-        pictures = Mirrors.of(sharp, states, traced, gaussians, approximations, degree)
+        delta_mirrors = list(found.delta_mirrors.values())
+        pictures = Mirrors.of(delta_mirrors, states, traced, gaussians, approximations, degree)
         found = memory.mirrors = replace(found, pictures=pictures)
     return found
 
@@ -269,14 +269,14 @@ def _mirrors(
 def _places(objects: Sequence[mi.Object], mirrors: _KeptMirrors) -> tuple[np.ndarray, np.ndarray]:
     """Where the probes of objects are, (P, 3), and planes beyond which they see, (P, 4).
 
-    That of a bright flat mirror is where the first camera is in it: rays of the camera that it
+    That of a specular flat mirror is where the first camera is in it: rays of the camera that it
     reflects pass close by.
     """
     centers, planes = np.array(list(map(_center, objects))), np.zeros((len(objects), 4))
-    bright = {k: mirror for k, mirror in mirrors.flat.items() if mirror.is_bright}
-    if bright:
+    specular = {k: mirror for k, mirror in mirrors.flat.items() if mirror.is_specular}
+    if specular:
         camera = np.array(camera_from_sensor(mirrors.sensors[0]).center, np.float64).ravel()
-        for k, mirror in bright.items():
+        for k, mirror in specular.items():
             centers[k], planes[k] = mirror.behind(camera)
     return centers, planes
 

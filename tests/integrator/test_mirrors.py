@@ -185,7 +185,7 @@ def test_flat_shapes_are_known_by_their_vertices():
         sign = np.sign(found.offset)
         np.testing.assert_allclose(sign * np.array(found.normal), normal, atol=1e-6)
         assert abs(found.offset) == pytest.approx(normal @ [1, 2, 3], abs=1e-5)
-        assert (found.is_sharp, found.is_bright) == (True, True)
+        assert (found.has_delta, found.is_specular) == (True, True)
     for kind in ("cube", "sphere", "cylinder"):
         assert plane({"type": kind, "to_world": at(0, 0, 1)}) is None
     lamp = {"type": "rectangle", "emitter": {"type": "area"}}
@@ -193,12 +193,12 @@ def test_flat_shapes_are_known_by_their_vertices():
 
 
 @pytest.mark.parametrize(
-    ("bsdf", "is_sharp", "is_bright"),
+    ("bsdf", "has_delta", "is_specular"),
     [("plastic", True, False), ("dielectric", True, False), ("roughconductor", False, True)],
 )
 def test_what_is_reflected_elsewhere_is_no_business_of_the_mirrored_camera(
-    bsdf, is_sharp, is_bright
+    bsdf, has_delta, is_specular
 ):
     found = FlatMirror.of(mi.load_dict(floor(bsdf={"type": bsdf})))
-    assert (found.is_sharp, found.is_bright) == (is_sharp, is_bright)
+    assert (found.has_delta, found.is_specular) == (has_delta, is_specular)
     assert FlatMirror.of(mi.load_dict(floor(bsdf={"type": "diffuse"}))) is None
