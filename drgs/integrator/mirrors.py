@@ -15,6 +15,7 @@ Nothing here is differentiated.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -34,10 +35,11 @@ from drgs.light.probe import LOW_PASS, Seen
 from drgs.splatting import rendering
 
 TEXELS_PER_PIXEL = 2
-"""Along either axis."""
+"""Along either axis, of small films."""
 
-MAX_TEXELS = 2**21
-"""Of all pictures together, 20 bytes each, before they have one texel a pixel."""
+FINE_TEXELS, MAX_TEXELS = 2**21, 2**26
+"""Texels of all pictures together, 20 bytes each, from which on there are fewer of a pixel; and
+from which on there are fewer than one."""
 
 BORDER = 8
 """Texels around a picture: filters of the film reach beyond its edge."""
@@ -184,8 +186,9 @@ class Mirrors:
         normals = np.array([mirror.normal for mirror in mirrors], np.float32)
         every = Plane(mi.Vector3f(normals.T), mi.Float([mirror.offset for mirror in mirrors]))
         cameras = [c for c in map(camera_from_sensor, states) if c.shutter is None]
-        num_pixels = len(mirrors) * sum(c.width * c.height for c in cameras)
-        scale = TEXELS_PER_PIXEL if num_pixels * TEXELS_PER_PIXEL**2 <= MAX_TEXELS else 1
+        num_pixels = max(1, len(mirrors) * sum(c.width * c.height for c in cameras))
+        fine, least = (math.sqrt(most / num_pixels) for most in (FINE_TEXELS, MAX_TEXELS))
+        scale = min(TEXELS_PER_PIXEL, max(1.0, fine), least)
         cameras = [_enlarged(camera, scale) for camera in cameras]
         views = []
         for camera in cameras:
@@ -195,7 +198,8 @@ class Mirrors:
                 for k in range(len(mirrors))
             ]
             colors, ends = (dr.concat(parts) for parts in zip(*pictures, strict=True))
-            views.append(_View(camera, colors, ends))
+            size = mi.Vector2u(*(dr.opaque(mi.UInt32, n) for n in (camera.width, camera.height)))
+            views.append(_View(camera, size, colors, ends))
         dr.eval(every, views)
         return Mirrors(every, views)
 
@@ -218,6 +222,7 @@ class _View:
     """What one camera sees in each mirror."""
 
     camera: Camera  # of a film that has a pixel for each texel
+    size: mi.Vector2u  # width and height, not to be compiled into kernels
     colors: mi.Float  # 4 a texel: linear red, green, blue, times the coverage; coverage
     ends: mi.Float  # of each texel: how far from the camera its ray ends
 
@@ -244,11 +249,11 @@ class _View:
         active = active & is_seen & (dr.dot(towards, direction) > 0) & (dr.dot(way, direction) > 0)
         active &= dr.norm(dr.cross(way, direction)) <= off
         x, y = place - 0.5
-        active &= (x >= 0) & (y >= 0) & (x < camera.width - 1) & (y < camera.height - 1)
+        width, height = self.size
+        active &= (x >= 0) & (y >= 0) & (x + 1 < mi.Float(width)) & (y + 1 < mi.Float(height))
         column, row = mi.UInt32(x), mi.UInt32(y)
         right, down = x - mi.Float(column), y - mi.Float(row)
-        width = dr.opaque(mi.UInt32, camera.width)
-        first = mirror * (width * camera.height) + row * width + column
+        first = mirror * (width * height) + row * width + column
         total, weights = mi.Vector4f(0), mi.Float(0)
         for texel, weight in (
             (first, (1 - right) * (1 - down)),
@@ -281,17 +286,18 @@ def _pipeline(approximations: Approximations, sh_degree: int, lens: Lens) -> ren
     return pipeline_of(replace(approximations, projection=projection, **along_rays), sh_degree)
 
 
-def _enlarged(camera: Camera, scale: int) -> Camera:
-    """The camera with more pixels, and a border around them."""
+def _enlarged(camera: Camera, scale: float) -> Camera:
+    """The camera with other pixels, and a border around them."""
+    factor = dr.opaque(mi.Float, scale)
     changes = {
-        name: scale * getattr(camera, name) + BORDER
+        name: factor * getattr(camera, name) + BORDER
         for name in ("principal", "film_start", "film_end")
     }
     camera = replace(
         camera,
-        focal=scale * camera.focal,
-        width=scale * camera.width + 2 * BORDER,
-        height=scale * camera.height + 2 * BORDER,
+        focal=factor * camera.focal,
+        width=math.ceil(scale * camera.width) + 2 * BORDER,
+        height=math.ceil(scale * camera.height) + 2 * BORDER,
         **changes,
     )
     dr.make_opaque(camera)

@@ -172,10 +172,13 @@ def _probes(
         pipeline = replace(pipeline, rows=smoothed)
     probes = Probes.of(gaussians, pipeline, centers, integrator.near, _decoded, planes)
     known = frozenset() if last is None else last.close
+    seen_mirrored = {k for k, m in mirrors.flat.items() if m.has_delta or m.is_specular}
     close = {
         node.id()
         for k, node in enumerate(objects)
-        if isinstance(node, mi.Shape) and not planes[k].any() and _is_close(node, probes.nearest[k])
+        if isinstance(node, mi.Shape)
+        and k not in seen_mirrored
+        and _is_close(node, probes.nearest[k])
     }
     for name in sorted(close - known):
         mi.Log(mi.LogLevel.Warn, TOO_CLOSE.format(name))
