@@ -35,7 +35,7 @@ from drgs.light.probe import LOW_PASS, Seen
 from drgs.splatting import rendering
 
 TEXELS_PER_PIXEL = 2
-"""Along either axis, of small films."""
+"""Texels of a small film's pixel, along either axis."""
 
 FINE_TEXELS, MAX_TEXELS = 2**21, 2**26
 """Texels of all pictures together, 20 bytes each, from which on there are fewer of a pixel; and
@@ -45,23 +45,23 @@ BORDER = 8
 """Texels around a picture: filters of the film reach beyond its edge."""
 
 FLAT = 1e-5
-"""How far from their plane vertices may be, relative to the size of what they make."""
+"""Largest distance of a vertex from the plane of a flat shape, relative to the shape's size."""
 
 ROUNDED = 1e-6
-"""The same, relative to their coordinates."""
+"""The same, relative to the coordinates: both are allowed."""
 
 OFF_RAY = 1e-3
-"""How far a ray may pass by the camera, relative to the distance that it has come."""
+"""Largest distance between a ray and the camera's, relative to the distance from the camera."""
 
 OFF_SURFACE = 2e-4
-"""The same, relative to the coordinates: Mitsuba starts rays half as far off a surface."""
+"""The same, relative to the coordinates: twice as far as Mitsuba starts rays off a surface."""
 
 LEAST_WEIGHT = 1e-3
-"""Of the four texels around a ray, that of those which end where it does."""
+"""Smallest weight, of 1, of the texels around a ray that end where it does."""
 
 SAME_END = (0.1, 0.01)
-"""How much farther a ray may end than another that looks the same: relative to where that ends, and
-to where it starts."""
+"""Largest distance between the ends of rays that are taken for the same, relative to their length
+from the mirror on, and to that from the camera to the mirror: both are allowed."""
 
 
 # ----------------------------------------------------------------------------------------------
@@ -81,13 +81,15 @@ class Plane:
         return dr.dot(self.normal, point) - self.offset
 
     def at(self, mirror: mi.UInt32, active: mi.Bool = True) -> Plane:
-        """Those of some of the mirrors."""
+        """Gather the planes of some of the mirrors."""
         normal = dr.gather(mi.Vector3f, self.normal, mirror, active)
         return Plane(normal, dr.gather(mi.Float, self.offset, mirror, active))
 
     def mirror(self, camera: Camera) -> Camera:
-        """The mirrored camera, whose axes have the other handedness: each pixel sees the mirror
-        image of what it saw."""
+        """Mirror a camera: each pixel sees what the mirror shows there.
+
+        Its axes have the other handedness, which the projection does not notice.
+        """
         n = self.normal
         turned = [
             list(axis - 2 * dr.dot(axis, n) * n) for axis in map(mi.Vector3f, camera.rotation)
@@ -111,7 +113,7 @@ class FlatMirror:
 
     @staticmethod
     def of(shape: mi.Shape) -> FlatMirror | None:
-        """None for a shape that is none, or shines itself."""
+        """Recognise one; None for all other shapes, and for emitters."""
         bsdf = shape.bsdf()
         if bsdf is None or shape.is_emitter():
             return None
@@ -128,7 +130,7 @@ class FlatMirror:
         return plane and FlatMirror(*plane, delta, not (diffuse or through))
 
     def behind(self, center: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Where the mirrored camera is, (3,), and the plane, (4,), with the camera before it."""
+        """Mirror a camera's centre, (3,); and give the plane, (4,), with its normal to the camera."""
         normal = np.array(self.normal)
         height = normal @ center - self.offset
         plane = np.sign(height) * np.array([*normal, self.offset])
@@ -146,7 +148,7 @@ def _points(shape: mi.Shape) -> np.ndarray:
 
 
 def _plane_through(points: np.ndarray) -> tuple[list[float], float] | None:
-    """Normal and offset; points: (N, 3). None if they are in no plane, or in several."""
+    """Find normal and offset of the one plane of points (N, 3); None where there is not one."""
     if len(points) < 3 or not np.isfinite(points).all():
         return None
     middle = points.mean(0)
@@ -165,7 +167,7 @@ def _plane_through(points: np.ndarray) -> tuple[list[float], float] | None:
 
 @dataclass(frozen=True, eq=False)
 class Mirrors:
-    """What cameras see in mirrors."""
+    """Pictures of the splats that cameras see in mirrors."""
 
     planes: Plane  # by mirror
     views: list[_View]  # by camera
@@ -204,7 +206,7 @@ class Mirrors:
         return Mirrors(every, views)
 
     def look(self, mirror: mi.UInt32, leg: Leg, active: mi.Bool) -> Seen:
-        """What legs meet that leave a mirror; mirror: its number, of each leg."""
+        """Look up what legs meet that leave a mirror; mirror: its number, of each leg."""
         plane, ray = self.planes.at(mirror, active), leg.ray
         origin = ray.o - 2 * plane.height(ray.o) * plane.normal
         direction = ray.d - 2 * dr.dot(plane.normal, ray.d) * plane.normal
@@ -219,7 +221,7 @@ class Mirrors:
 
 @dataclass(frozen=True, eq=False)
 class _View:
-    """What one camera sees in each mirror."""
+    """Pictures of what one camera sees in each mirror."""
 
     camera: Camera  # of a film that has a pixel for each texel
     size: mi.Vector2u  # width and height, not to be compiled into kernels
@@ -234,7 +236,7 @@ class _View:
         far: mi.Float,
         active: mi.Bool,
     ) -> Seen:
-        """What rays meet, as far as they go on along those of the camera.
+        """Look up what rays meet, as far as they go on along those of the camera.
 
         origin, direction: those of the mirrored rays, as if they had gone through the mirror.
         """
@@ -271,14 +273,14 @@ class _View:
 
 
 def _is_same(distance: mi.Float, far: mi.Float, end: mi.Float) -> mi.Bool:
-    """Whether a ray that has come from ``distance`` and goes on for ``far`` ends at ``end``."""
+    """Tell whether a ray, as long to the mirror and as far from there, ends at ``end``."""
     of_far, of_distance = SAME_END
     is_near = dr.abs(distance + far - end) <= of_far * far + of_distance * distance
     return dr.select((far < dr.inf) & (end < dr.inf), is_near, (far < dr.inf) == (end < dr.inf))
 
 
 def _pipeline(approximations: Approximations, sh_degree: int, lens: Lens) -> rendering.Pipeline:
-    """What renders the pictures: Gaussians as rays meet them, as far as a lens allows it."""
+    """Build the pipeline that shows Gaussians as rays meet them, as far as a lens allows it."""
     projection = "exact"
     if not isinstance(lens, Pinhole):
         projection = "ewa" if lens.parallel else "unscented"  # the former is exact then
@@ -287,7 +289,7 @@ def _pipeline(approximations: Approximations, sh_degree: int, lens: Lens) -> ren
 
 
 def _enlarged(camera: Camera, scale: float) -> Camera:
-    """The camera with other pixels, and a border around them."""
+    """Scale a camera's film, and add a border."""
     factor = dr.opaque(mi.Float, scale)
     changes = {
         name: factor * getattr(camera, name) + BORDER
@@ -311,7 +313,7 @@ def _picture(
     gaussians: Gaussians,
     pipeline: rendering.Pipeline,
 ) -> tuple[mi.Float, mi.Float]:
-    """What the camera sees in a mirror: see :class:`_View`."""
+    """Render what the camera sees in a mirror: see :class:`_View`."""
     side = dr.sign(plane.height(mi.Vector3f(camera.center)))
     plane = Plane(side * plane.normal, side * plane.offset)
     camera = plane.mirror(camera)
@@ -331,10 +333,7 @@ def _picture(
 
 
 def _trace(camera: Camera, plane: Plane, scene: mi.Scene) -> tuple[mi.Float, mi.Float, mi.Float]:
-    """Depths at which the rays of a mirrored camera pass the mirror, and at which they end.
-
-    The last is how far from the camera they end.
-    """
+    """Find the depths where a mirrored camera's rays pass the mirror and end, and their lengths."""
     texel = dr.arange(mi.UInt32, camera.width * camera.height)
     width = dr.opaque(mi.UInt32, camera.width)
     row = texel // width
@@ -351,7 +350,7 @@ def _trace(camera: Camera, plane: Plane, scene: mi.Scene) -> tuple[mi.Float, mi.
         point = camera.rotation @ (mi.Vector3f(start) + far * direction - camera.center)
         return dr.select(exists, camera.lens.look(camera, point)[2], dr.inf)
 
-    off = OFF_SURFACE * (1 + dr.max(dr.abs(start)))
+    off = mi.math.RayEpsilon * (1 + dr.max(dr.abs(start)))  # as Mitsuba does
     hit = scene.ray_intersect_preliminary(
         mi.Ray3f(start + off * plane.normal, direction), active=is_seen
     )

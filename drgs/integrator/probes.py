@@ -32,7 +32,8 @@ from drgs.light.probe import LEVELS, LOW_PASS, SIZE, Probes, Seen
 from drgs.splatting.rendering import color_features, depth_feature
 
 CLOSE = 1.25
-"""Of half the size of an object: where splats are nearer to its middle, its surface sees others."""
+"""Distance of splats from an object's middle, in halves of its size, below which its surface sees
+others."""
 
 TOO_CLOSE = (
     "splats: splats are so close to '{}' for its size that its surface sees others than its middle "
@@ -129,7 +130,7 @@ class LightOfProbes:
         return seen, is_asked, is_reversed
 
     def _look_in_mirrors(self, probe: mi.UInt32, leg: Leg, active: mi.Bool) -> Seen:
-        """What is known of legs that leave flat mirrors; probe: that of the shape they leave."""
+        """Look up legs that leave flat mirrors; probe: that of the shape they leave."""
         if self.mirrors is None:
             return Seen(mi.Color3f(0), mi.Float(0), mi.Bool(False))
         mirror = mi.UInt32(NOBODY)
@@ -147,7 +148,7 @@ class LightOfProbes:
 def _probes(
     integrator: SplatsSettings, objects: Sequence[mi.Object], mirrors: _KeptMirrors
 ) -> Probes:
-    """Those of objects among an integrator's Gaussians; the last ones if all is the same.
+    """Render the probes of objects, or return the last ones if all is the same.
 
     Logs a warning for objects that are too close to splats, the first time that one is.
     """
@@ -187,7 +188,7 @@ def _probes(
 
 
 def _is_close(shape: mi.Shape, nearest: float) -> bool:
-    """Whether splats, the nearest of which is that far from its middle, are close to a shape."""
+    """Tell whether splats, the nearest that far from its middle, are close for a shape's size."""
     return nearest < CLOSE * float(dr.max(shape.bbox().extents())) / 2
 
 
@@ -217,15 +218,15 @@ class _KeptMirrors:
 
     @property
     def delta_mirrors(self) -> dict[int, Any]:
-        """Those that have pictures."""
+        """Mirrors that have pictures."""
         return {k: mirror for k, mirror in self.flat.items() if mirror.has_delta}
 
     def same_shapes(self, other: _KeptMirrors) -> bool:
-        """Whether both are of the same shapes."""
+        """Tell whether both are of the same shapes."""
         return self.surfaces is other.surfaces and self.names == other.names
 
     def same_pictures(self, other: _KeptMirrors) -> bool:
-        """Whether both have the same pictures."""
+        """Tell whether both have the same pictures."""
         return (
             self.same_shapes(other)
             and self.how == other.how
@@ -241,7 +242,7 @@ def _mirrors(
     shapes: dict[int, mi.Shape],
     sensors: Sequence[mi.Sensor],
 ) -> _KeptMirrors:
-    """Those of the shapes that are flat mirrors; the last ones if all is the same.
+    """Find the shapes that are flat mirrors, and render their pictures unless all is the same.
 
     shapes: by the probe's number.
     """
@@ -270,7 +271,7 @@ def _mirrors(
 
 
 def _places(objects: Sequence[mi.Object], mirrors: _KeptMirrors) -> tuple[np.ndarray, np.ndarray]:
-    """Where the probes of objects are, (P, 3), and planes beyond which they see, (P, 4).
+    """Find where the probes of objects are, (P, 3), and planes beyond which they see, (P, 4).
 
     That of a specular flat mirror is where the first camera is in it: rays of the camera that it
     reflects pass close by.
