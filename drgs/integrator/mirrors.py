@@ -130,7 +130,7 @@ class FlatMirror:
         return plane and FlatMirror(*plane, delta, not (diffuse or through))
 
     def behind(self, center: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Mirror a camera's centre, (3,); and give the plane, (4,), with its normal to the camera."""
+        """Mirror a camera's centre, (3,); give the plane, (4,), with its normal to the camera."""
         normal = np.array(self.normal)
         height = normal @ center - self.offset
         plane = np.sign(height) * np.array([*normal, self.offset])
