@@ -135,7 +135,8 @@ class SplatsIntegrator(mi.CppADIntegrator):
          the nested integrator, which must be ``splatpath``, pass the splats from the first surface
          on: surfaces reflect them, show them bent, take on their colours, and lie in their shadow.
          ``probe``: the same for objects that are named by ``probes``, whose rays look at pictures
-         of the splats from the middle of the object. (Default: ``none``)
+         of the splats from the middle of the object, or, for a flat mirror, from where the camera
+         is in it. (Default: ``none``)
 
      * - probes
        - |string|

@@ -2,19 +2,23 @@
 
 :class:`RayDepths` where the response finds the peak anyway (``drgs.accuracy.exact``, whose formulas
 these are), :class:`AffineDepths` where it does not, :class:`ParallelDepths` where rays do not meet.
+:class:`BoundedDepths` are those of one of them where each pixel sees a part of its ray.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import drjit as dr
 
 from drgs.accuracy.exact import RayFootprint, closest_on_film, ray_denominator
+from drgs.accuracy.pixel_lists import PeakDepths
 from drgs.cameras.camera import Camera
 from drgs.core.constants import WHITENING_SCALE
+from drgs.splatting.grid import Lanes, TileGrid
 from drgs.splatting.image_model import Footprint, Response, flat_columns
+from drgs.splatting.lanes import load_pixels
 from drgs.splatting.projection import Splats2D
 
 
@@ -36,6 +40,11 @@ class AffineDepths:
     ) -> tuple[Any, Any]:
         """a and D of a splat at a point of the film, px."""
         return self._at(keys, *response.coordinates(geometry, x, y))
+
+    def bind(self, lanes: Lanes, grid: TileGrid) -> AffineDepths:
+        """For the lanes of one kernel: nothing has to be loaded."""
+        del lanes, grid
+        return self
 
     def along(self, footprint: Footprint, keys: list[Any]) -> list[Any]:
         """Depths at the 16 pixels, divided by the mean's; not positive where there is none."""
@@ -83,7 +92,55 @@ class RayDepths:
         _, a, denominator = ray_denominator(geometry, u, v, x - anchor.x, y - anchor.y)
         return a, denominator
 
+    def bind(self, lanes: Lanes, grid: TileGrid) -> RayDepths:
+        """For the lanes of one kernel: nothing has to be loaded."""
+        del lanes, grid
+        return self
+
     def along(self, footprint: RayFootprint, keys: list[Any]) -> list[Any]:
         """Depths at the 16 pixels, divided by the key; not positive where there is none."""
         del keys
         return footprint.along
+
+
+@dataclass(frozen=True)
+class BoundedDepths:
+    """Depths of peaks between two bounds of each pixel: there are no others."""
+
+    depths: PeakDepths
+    nearest: Any  # Float (H * W,), scene units
+    farthest: Any  # the same
+    bounds: list[tuple[Any, Any]] = field(default_factory=list)  # the 16 of each lane
+
+    def seen_by(self, camera: Camera) -> BoundedDepths:
+        """For one camera."""
+        return replace(self, depths=self.depths.seen_by(camera))
+
+    def keys(self, splats: Splats2D) -> list[Any]:
+        """Columns that the depths are computed from."""
+        return self.depths.keys(splats)
+
+    def at(
+        self, response: Response, geometry: list[Any], keys: list[Any], x: Any, y: Any
+    ) -> tuple[Any, Any]:
+        """a and D of a splat at a point of the film, px, wherever its peak is."""
+        return self.depths.at(response, geometry, keys, x, y)
+
+    def bind(self, lanes: Lanes, grid: TileGrid) -> BoundedDepths:
+        """For the lanes of one kernel: loads the bounds."""
+        near, far = (load_pixels(bound, lanes, grid) for bound in (self.nearest, self.farthest))
+        return replace(
+            self,
+            depths=self.depths.bind(lanes, grid),
+            bounds=list(zip(near, far, strict=True)),
+        )
+
+    def along(self, footprint: Footprint, keys: list[Any]) -> list[Any]:
+        """Depths in the unit at the 16 pixels; not positive where there is none."""
+        unit = keys[-1]
+        return [
+            dr.select((unit * along > near) & (unit * along < far), along, -1)
+            for along, (near, far) in zip(
+                self.depths.along(footprint, keys), self.bounds, strict=True
+            )
+        ]

@@ -13,7 +13,7 @@ import drjit as dr
 
 from drgs.cameras.camera import Camera
 from drgs.core.arrays import types_of
-from drgs.splatting.grid import GRID, MICRO, MICROS, TILE, Lanes
+from drgs.splatting.grid import GRID, MICRO, MICROS, TILE, Lanes, TileGrid
 from drgs.splatting.image_model import Footprint, Response
 from drgs.splatting.projection import Splats2D
 from drgs.splatting.rasterize import (
@@ -40,6 +40,10 @@ class PeakDepths(Protocol):
         self, response: Response, geometry: list[Any], keys: list[Any], x: Any, y: Any
     ) -> tuple[Any, Any]:
         """a and D at a point of the film, px: the depth is a / D in the unit, if a is positive."""
+        ...
+
+    def bind(self, lanes: Lanes, grid: TileGrid) -> PeakDepths:
+        """For the lanes of one kernel: loads what they need. The result knows :meth:`along`."""
         ...
 
     def along(self, footprint: Footprint, keys: list[Any]) -> list[Any]:

@@ -134,6 +134,7 @@ class _WalkInputs:
         """Lanes with lists of similar length together."""
         begin, end = lists.range(make_lanes(bins.rows.Float, bins.grid))
         lanes = grouped_by_work(bins.rows.Float, bins.grid, end - begin)
+        order = replace(order, depths=order.depths.bind(lanes, bins.grid))
         return _WalkInputs(bins, records, lists, order, lanes, bins.model.bind(lanes, bins.grid))
 
     @property

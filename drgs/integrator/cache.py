@@ -70,6 +70,7 @@ class Memory:
     surfaces: Any = None  # drgs.integrator.surfaces.Surfaces of the last scene that had some
     light: Any = None  # drgs.integrator.light.LightOfSplats of the last scene that asked for it
     probes: Any = None  # of the last scene that asked for some: see drgs.integrator.probes
+    mirrors: Any = None  # the same of flat mirrors
     shadows: Any = None  # drgs.integrator.shadows.Shadows of the last scene that asked for them
     film_maps: dict[str, np.ndarray] = field(default_factory=dict)  # see drgs.integrator.film
 

@@ -22,6 +22,7 @@ without bias as well. For rays that meet black at last, a draw is black with the
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import drjit as dr
@@ -137,10 +138,12 @@ def ray_splats_of(gaussians: Gaussians, approximations: Approximations, degree: 
     return RaySplats.of(rows, degree, pipeline_of(approximations, degree).model.cutoffs)
 
 
-def lit(integrator: SplatsSettings, scene: mi.Scene, num_paths: int) -> mi.Integrator:
+def lit(
+    integrator: SplatsSettings, scene: mi.Scene, num_paths: int, sensors: Sequence[mi.Sensor]
+) -> mi.Integrator:
     """The nested integrator, with the splats of the one that it is nested in.
 
-    num_paths: of a pixel.
+    num_paths: of a pixel; sensors: whose picture is rendered.
     """
     nested = integrator.nested
     if nested is None:
@@ -153,7 +156,7 @@ def lit(integrator: SplatsSettings, scene: mi.Scene, num_paths: int) -> mi.Integ
 
         traces = integrator.unseen == "rays"
         unseen = LightOfSplats.of(integrator) if traces else Unlit()
-        nested.light = LightOfProbes.of(integrator, scene, num_paths, unseen)
+        nested.light = LightOfProbes.of(integrator, scene, num_paths, sensors, unseen)
     return nested
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import mitsuba as mi
 
 from drgs.core.constants import MAX_FEATURES
@@ -61,3 +63,20 @@ def check_columns(columns: dict[str, int]) -> None:
             f"splats: aovs can have at most {MAX_FEATURES} channels together, got "
             f"{sum(columns.values()):,} ({counts}); render them in parts, which share a kernel"
         )
+
+
+def check_ids(parameter: str, names: Sequence[str], nodes: Sequence[mi.Object]) -> None:
+    """Raise PluginError for names that none of a scene's nodes has for its id.
+
+    parameter: what has the names, and of what they must be ids.
+    """
+    known = [node.id() for node in nodes]
+    for name in names:
+        if name not in known:
+            message = f"splats: {parameter}, got {name!r}; there are {', '.join(known)}"
+            if any(isinstance(node, mi.Mesh) and not node.id() for node in nodes):
+                message += (
+                    "; Mitsuba merges meshes with equal BSDFs, which then have no id: load the "
+                    "scene with optimize=False"
+                )
+            raise PluginError(message)

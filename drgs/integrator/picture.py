@@ -189,7 +189,7 @@ def hybrid_of(
         from drgs.integrator.light import lit
 
         num_paths = integrator.nested_spp or spp or sensor.sampler().sample_count()
-        nested = lit(integrator, scene, num_paths)
+        nested = lit(integrator, scene, num_paths, sensors_of(sensor))
     insertion = Insertion(
         sensor.film(),
         memory.film_maps,

@@ -13,7 +13,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -22,13 +23,22 @@ import numpy as np
 from drgs.accuracy.pipeline import pipeline_of
 from drgs.core.errors import PluginError
 from drgs.core.private import same_variables
+from drgs.gaussians.parameters import Gaussians
 from drgs.integrator.legs import Leg, Light
+from drgs.integrator.limits import check_ids
+from drgs.integrator.sensors import SensorState, camera_from_sensor, read_sensor
 from drgs.integrator.settings import SplatsSettings
-from drgs.light.probe import LEVELS, SIZE, Probes, Seen
+from drgs.light.probe import LEVELS, LOW_PASS, SIZE, Probes, Seen
 from drgs.splatting.rendering import color_features, depth_feature
 
-LOW_PASS = 0.03
-"""px^2 of a probe's pictures: rays have none at all."""
+CLOSE = 1.25
+"""Distance of splats from an object's middle, in halves of its size, below which its surface sees
+others."""
+
+TOO_CLOSE = (
+    "splats: splats are so close to '{}' for its size that its surface sees others than its middle "
+    "does, where its probe is: its picture may be far from that of light 'rays'"
+)
 
 NOBODY = 0xFFFFFFFF
 """In place of a probe's number."""
@@ -39,17 +49,25 @@ class LightOfProbes:
     """What probes see of a scene's splats."""
 
     probes: Probes
+    mirrors: Any  # drgs.integrator.mirrors.Mirrors of the shapes that are some; None: none is
     exposure: mi.Float  # (1,): factor of the splats' radiance
     shapes: dict[int, mi.ShapePtr]  # that have a probe, by its number
     emitters: dict[int, mi.EmitterPtr]  # likewise
+    flat: dict[int, int]  # numbers of the mirrors, by that of the probe
     num_paths: mi.Float  # (1,): of a pixel
     unseen: Light  # for rays of which probes do not know what they meet
 
     @staticmethod
     def of(
-        integrator: SplatsSettings, scene: mi.Scene, num_paths: int, unseen: Light
+        integrator: SplatsSettings,
+        scene: mi.Scene,
+        num_paths: int,
+        sensors: Sequence[mi.Sensor],
+        unseen: Light,
     ) -> LightOfProbes:
         """Those of an integrator's objects, or the last ones if nothing has changed.
+
+        sensors: those that flat mirrors are seen by.
 
         Raises PluginError for the name of an object that the scene does not have, and for an
         emitter that is nowhere.
@@ -57,11 +75,14 @@ class LightOfProbes:
         objects = _objects(scene, integrator.probes)
         shapes = {k: node for k, node in enumerate(objects) if isinstance(node, mi.Shape)}
         emitters = {k: shapes[k].emitter() if k in shapes else o for k, o in enumerate(objects)}
+        mirrors = _mirrors(integrator, scene, shapes, sensors)
         return LightOfProbes(
-            _probes(integrator, np.array(list(map(_center, objects)))),
+            _probes(integrator, objects, mirrors),
+            mirrors.pictures,
             dr.opaque(mi.Float, integrator.exposure),
             {k: mi.ShapePtr(shape) for k, shape in shapes.items()},
             {k: mi.EmitterPtr(node) for k, node in emitters.items() if node},
+            {k: number for number, k in enumerate(mirrors.delta_mirrors)},
             dr.opaque(mi.Float, num_paths),
             unseen,
         )
@@ -92,6 +113,7 @@ class LightOfProbes:
             other = dr.select(leg.end == emitter, mi.UInt32(k), other)
         is_reversed = active & (probe == NOBODY) & (other != NOBODY)
         is_asked = active & ((probe != NOBODY) | is_reversed)
+        mirrored = self._look_in_mirrors(probe, leg, is_asked)
         ray, far = leg.ray, leg.ray.maxt
         back = dr.select(is_reversed, far, 0)
         seen = self.probes.look(
@@ -100,9 +122,23 @@ class LightOfProbes:
             mi.Vector3f(dr.select(is_reversed, -ray.d, ray.d)),
             mi.Float(far),
             dr.select(is_reversed, 0, self._level(leg.pdf)),
-            is_asked,
+            is_asked & ~mirrored.is_known,
+        )
+        seen = Seen(
+            dr.select(mirrored.is_known, mirrored.color, seen.color),
+            dr.select(mirrored.is_known, mirrored.coverage, seen.coverage),
+            seen.is_known | mirrored.is_known,
         )
         return seen, is_asked, is_reversed
+
+    def _look_in_mirrors(self, probe: mi.UInt32, leg: Leg, active: mi.Bool) -> Seen:
+        """Look up legs that leave flat mirrors; probe: that of the shape they leave."""
+        if self.mirrors is None:
+            return Seen(mi.Color3f(0), mi.Float(0), mi.Bool(False))
+        mirror = mi.UInt32(NOBODY)
+        for k, number in self.flat.items():
+            mirror = dr.select(probe == k, mi.UInt32(number), mirror)
+        return self.mirrors.look(mirror, leg, active & (mirror != NOBODY))
 
     def _level(self, pdf: mi.Float) -> mi.UInt32:
         """Of the cube whose texels are as large as what a path of a pixel stands for."""
@@ -111,28 +147,150 @@ class LightOfProbes:
         return mi.UInt32(dr.clip(level + 0.5, 0, LEVELS - 1))
 
 
-def _probes(integrator: SplatsSettings, centers: np.ndarray) -> Probes:
-    """Those at (P, 3) places among an integrator's Gaussians; the last ones if all is the same."""
+def _probes(
+    integrator: SplatsSettings, objects: Sequence[mi.Object], mirrors: _KeptMirrors
+) -> Probes:
+    """Render the probes of objects, or return the last ones if all is the same.
+
+    Logs a warning for objects that are too close to splats, the first time that one is.
+    """
     gaussians, degree = dr.detach(integrator.gaussians), integrator.sh_degree
-    how = (integrator.approximations, degree, integrator.near, centers.tolist())
+    centers, planes = _places(objects, mirrors)
+    how = (
+        integrator.approximations,
+        degree,
+        integrator.near,
+        integrator.probes,
+        centers.tolist(),
+        planes.tolist(),
+    )
     last = integrator.memory.probes
-    if last is not None and last[0] == how and same_variables(last[1], gaussians):
-        return last[2]
+    if last is not None and last.how == how and same_variables(last.gaussians, gaussians):
+        return last.probes
     approximations = replace(integrator.approximations, projection="exact", low_pass=LOW_PASS)
     pipeline = pipeline_of(approximations, degree, (color_features, depth_feature))
-    probes = Probes.of(gaussians, pipeline, centers, integrator.near, _decoded)
-    integrator.memory.probes = (how, gaussians, probes)  # holding Gaussians keeps their indices
+    if gaussians.smoothing is not None:
+        from drgs.effects.smoothing import smoothed
+
+        pipeline = replace(pipeline, rows=smoothed)
+    probes = Probes.of(gaussians, pipeline, centers, integrator.near, _decoded, planes)
+    known = frozenset() if last is None else last.close
+    seen_mirrored = {k for k, m in mirrors.flat.items() if m.has_delta or m.is_specular}
+    close = {
+        node.id()
+        for k, node in enumerate(objects)
+        if isinstance(node, mi.Shape)
+        and k not in seen_mirrored
+        and _is_close(node, probes.nearest[k])
+    }
+    for name in sorted(close - known):
+        mi.Log(mi.LogLevel.Warn, TOO_CLOSE.format(name))
+    integrator.memory.probes = _KeptProbes(how, gaussians, probes, known | close)
     return probes
 
 
+def _is_close(shape: mi.Shape, nearest: float) -> bool:
+    """Tell whether splats, the nearest that far from its middle, are close for a shape's size."""
+    return nearest < CLOSE * float(dr.max(shape.bbox().extents())) / 2
+
+
+@dataclass(frozen=True, eq=False)
+class _KeptProbes:
+    """Probes, and everything that they depend on."""
+
+    how: tuple[object, ...]
+    gaussians: Gaussians  # detached: holding them keeps their indices
+    probes: Probes
+    close: frozenset[str]  # ids of objects of which a warning was given
+
+
+@dataclass(frozen=True, eq=False)
+class _KeptMirrors:
+    """The flat mirrors of a scene, and everything that their pictures depend on."""
+
+    surfaces: Any  # drgs.integrator.surfaces.Surfaces
+    names: tuple[str, ...]
+    how: tuple[object, ...]
+    gaussians: Gaussians  # detached: holding them keeps their indices
+    sensors: list[SensorState]
+    flat: dict[int, Any] = field(
+        default_factory=dict
+    )  # drgs.integrator.mirrors.FlatMirror by probe
+    pictures: Any = None  # drgs.integrator.mirrors.Mirrors; None: there are none
+
+    @property
+    def delta_mirrors(self) -> dict[int, Any]:
+        """Mirrors that have pictures."""
+        return {k: mirror for k, mirror in self.flat.items() if mirror.has_delta}
+
+    def same_shapes(self, other: _KeptMirrors) -> bool:
+        """Tell whether both are of the same shapes."""
+        return self.surfaces is other.surfaces and self.names == other.names
+
+    def same_pictures(self, other: _KeptMirrors) -> bool:
+        """Tell whether both have the same pictures."""
+        return (
+            self.same_shapes(other)
+            and self.how == other.how
+            and same_variables(self.gaussians, other.gaussians)
+            and len(self.sensors) == len(other.sensors)
+            and all(a.same_as(b) for a, b in zip(self.sensors, other.sensors, strict=True))
+        )
+
+
+def _mirrors(
+    integrator: SplatsSettings,
+    scene: mi.Scene,
+    shapes: dict[int, mi.Shape],
+    sensors: Sequence[mi.Sensor],
+) -> _KeptMirrors:
+    """Find the shapes that are flat mirrors, and render their pictures unless all is the same.
+
+    shapes: by the probe's number.
+    """
+    from drgs.integrator.mirrors import FlatMirror, Mirrors
+
+    gaussians, degree = dr.detach(integrator.gaussians), integrator.sh_degree
+    memory, approximations = integrator.memory, integrator.approximations
+    states = [read_sensor(sensor, integrator.near).detached() for sensor in sensors]
+    how = approximations, degree
+    found = _KeptMirrors(memory.surfaces, tuple(integrator.probes), how, gaussians, states)
+    last = memory.mirrors
+    if last is not None and found.same_pictures(last):
+        return last
+    if last is not None and found.same_shapes(last):
+        flat = last.flat
+    else:
+        every = {k: FlatMirror.of(shape) for k, shape in shapes.items()}
+        flat = {k: mirror for k, mirror in every.items() if mirror is not None}
+    found = memory.mirrors = replace(found, flat=flat)
+    if found.delta_mirrors:
+        traced = memory.surfaces.traced(scene)
+        delta_mirrors = list(found.delta_mirrors.values())
+        pictures = Mirrors.of(delta_mirrors, states, traced, gaussians, approximations, degree)
+        found = memory.mirrors = replace(found, pictures=pictures)
+    return found
+
+
+def _places(objects: Sequence[mi.Object], mirrors: _KeptMirrors) -> tuple[np.ndarray, np.ndarray]:
+    """Find where the probes of objects are, (P, 3), and planes beyond which they see, (P, 4).
+
+    That of a specular flat mirror is where the first camera is in it: rays of the camera that it
+    reflects pass close by.
+    """
+    centers, planes = np.array(list(map(_center, objects))), np.zeros((len(objects), 4))
+    specular = {k: mirror for k, mirror in mirrors.flat.items() if mirror.is_specular}
+    if specular:
+        camera = np.array(camera_from_sensor(mirrors.sensors[0]).center, np.float64).ravel()
+        for k, mirror in specular.items():
+            centers[k], planes[k] = mirror.behind(camera)
+    return centers, planes
+
+
 def _objects(scene: mi.Scene, names: Sequence[str]) -> list[mi.Object]:
-    known = {node.id(): node for node in (*scene.emitters(), *scene.shapes())}
-    for name in names:
-        if name not in known:
-            raise PluginError(
-                "splats: probes must be ids of the scene's shapes and emitters, got "
-                f"{name!r}; there are {', '.join(known)}"
-            )
+    nodes = [*scene.emitters(), *scene.shapes()]
+    check_ids("probes must be ids of the scene's shapes and emitters", names, nodes)
+    known = {node.id(): node for node in nodes}
     return [known[name] for name in names]
 
 

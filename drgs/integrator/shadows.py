@@ -23,11 +23,11 @@ import drjit as dr
 import mitsuba as mi
 
 from drgs.core.constants import SH_C0
-from drgs.core.errors import PluginError
 from drgs.core.private import same_variables
 from drgs.gaussians.parameters import Gaussians
 from drgs.gaussians.quaternions import quat_to_rotation
 from drgs.integrator.light import ray_splats_of
+from drgs.integrator.limits import check_ids
 from drgs.integrator.settings import SplatsSettings
 from drgs.integrator.surfaces import Surfaces, scene_of
 from drgs.integrator.transparency import StraightRays, has_transparent_parts
@@ -83,13 +83,8 @@ class Shadows:
 
 
 def _without(objects: Sequence[mi.Object], names: Sequence[str]) -> list[mi.Object]:
-    shapes = [node.id() for node in objects if isinstance(node, mi.Shape)]
-    for name in names:
-        if name not in shapes:
-            raise PluginError(
-                f"splats: shadows must be ids of the scene's shapes, got {name!r}; there are "
-                f"{', '.join(shapes)}"
-            )
+    shapes = [node for node in objects if isinstance(node, mi.Shape)]
+    check_ids("shadows must be ids of the scene's shapes", names, shapes)
     return [node for node in objects if node.id() not in names]
 
 

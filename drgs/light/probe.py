@@ -18,7 +18,7 @@ Nothing here is differentiated.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import drjit as dr
@@ -28,12 +28,16 @@ from drgs.cameras.camera import Camera
 from drgs.core.arrays import types_of
 from drgs.gaussians.parameters import Gaussians
 from drgs.splatting import rendering
+from drgs.splatting.projection import GaussianRows
 
 SIZE = 256
 """Texels of an edge of the largest cube."""
 
 LEVELS = 7
 """Cubes of a probe; each has half the edges of the one before."""
+
+LOW_PASS = 0.03
+"""px^2 of the pictures: rays have none at all."""
 
 FINE = 2
 """The last level in which distances are searched: those of smaller pictures are no surface."""
@@ -71,6 +75,7 @@ class Probes:
     """Several ones, whose texels follow each other: by probe, level, face, row and column."""
 
     centers: Any  # Array3f: world, by probe
+    normals: Any  # Array3f: of the planes beyond which they see, by probe; 0: there is none
     nearest: Any  # Float: world units, by probe: to the nearest splats
     colors: Any  # Float: 4 a texel: colour times coverage; the last one is 0
     places: Any  # Float: 2 a texel: coverage, and coverage by distance
@@ -82,16 +87,20 @@ class Probes:
         centers: np.ndarray,
         near: float,
         decode: Callable[[list[Any]], list[Any]],
+        planes: np.ndarray | None = None,
     ) -> Probes:
         """Render them.
 
         pipeline: its features are colour and depth; centers: (P, 3) world; near: near plane, world
-        units; decode: makes the colour that is kept from that which splats composite.
+        units; decode: makes the colour that is kept from that which splats composite; planes:
+        (P, 4), a normal n and an offset h of each, which sees the splats at n . x >= h alone.
         """
         t = types_of(type(gaussians.means.array))
+        planes = np.zeros((len(centers), 4)) if planes is None else planes
         texels, nearest = [], []
-        for center in centers:
-            faces = [_Face(center, k).render(gaussians, pipeline, near, decode) for k in range(6)]
+        for center, plane in zip(centers, planes, strict=True):
+            beyond = _beyond(t, plane, pipeline)
+            faces = [_Face(center, k).render(gaussians, beyond, near, decode) for k in range(6)]
             levels = [_joined(faces)]
             for level in range(1, LEVELS):
                 levels.append(_halved(levels[-1], SIZE >> level))
@@ -104,8 +113,11 @@ class Probes:
         colors, places = (dr.empty(t.Float, n * dr.width(columns[0])) for n in (4, 2))
         dr.scatter(colors, t.Array4f(*columns[:3], 0), index)
         dr.scatter(places, t.Array2f(columns[3:]), index)
-        place = t.Array3f(*(t.Float(list(values)) for values in np.float64(centers).T))
-        found = Probes(place, dr.concat(nearest), colors, places)
+        place, normals = (
+            t.Array3f(*(t.Float(list(values)) for values in np.float64(vectors).T))
+            for vectors in (centers, planes[:, :3])
+        )
+        found = Probes(place, normals, dr.concat(nearest), colors, places)
         dr.eval(found)
         return found
 
@@ -122,15 +134,16 @@ class Probes:
         reach = dr.maximum(reach, dr.norm(start))
         end = dr.select(far < dr.inf, far / (far + reach), 1)
         line = _Line(start, direction * reach, end)
+        active &= dr.dot(dr.gather(t.Array3f, self.normals, probe, active), direction) >= 0
         u, meets, is_known = self._search(line, _Cube.of(probe, dr.minimum(level, FINE)), active)
+        is_known &= active
         v, texels = line.place(u), _Cube.of(probe, level).around(line.place(u))
-        active = active & is_known
-        colors = [w * dr.gather(t.Array4f, self.colors, texel, active) for texel, w in texels]
-        places = [w * dr.gather(t.Array2f, self.places, texel, active) for texel, w in texels]
+        colors = [w * dr.gather(t.Array4f, self.colors, texel, is_known) for texel, w in texels]
+        places = [w * dr.gather(t.Array2f, self.places, texel, is_known) for texel, w in texels]
         red, green, blue, _ = sum(colors[1:], colors[0])
         coverage, nearness = sum(places[1:], places[0])
         # What is too thin to be met counts if it is before the ray's end.
-        shows = active & (meets | (coverage * (1 - u) < nearness * dr.norm(v)))
+        shows = is_known & (meets | (coverage * (1 - u) < nearness * dr.norm(v)))
         color = dr.select(shows, t.Array3f(red, green, blue), 0)
         return Seen(color, dr.select(shows, coverage, 0), is_known)
 
@@ -178,6 +191,18 @@ class _Line:
     def place(self, u: Any) -> Any:
         """Array3f, times 1 - u."""
         return self.start * (1 - u) + self.towards * u
+
+
+def _beyond(t: Any, plane: np.ndarray, pipeline: rendering.Pipeline) -> rendering.Pipeline:
+    """A pipeline that leaves out Gaussians whose means are on the other side of a plane."""
+    *normal, offset = (dr.opaque(t.Float, float(value)) for value in plane)
+
+    def rows(rows: GaussianRows) -> GaussianRows:
+        rows = pipeline.rows(rows)
+        is_beyond = dr.dot(t.Array3f(*normal), t.Array3f(rows.means)) >= offset
+        return replace(rows, logit_opacities=dr.select(is_beyond, rows.logit_opacities, -dr.inf))
+
+    return replace(pipeline, rows=rows)
 
 
 # ----------------------------------------------------------------------------------------------

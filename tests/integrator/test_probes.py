@@ -112,6 +112,44 @@ def test_probes_are_kept_until_something_changes(monkeypatch):
         assert len(counts) == number, name
 
 
+def test_probes_see_smoothed_gaussians():
+    """A filter of 0.2 makes Gaussians of 0.1 as large as those of 0.224, and fainter."""
+    means = around(60).means
+    wide = gaussians(means, np.hypot(0.1, 0.2), 0.9 * (0.1 / np.hypot(0.1, 0.2)) ** 3, 0.8)
+    settings = {"light": "probe", "probes": "ball", "spp": 4, **mirror_ball()}
+    smoothing = mi.Float(np.full(len(means), 0.2, np.float32))
+    smoothed = render(gaussians(means, 0.1, 0.9, 0.8), smoothing=smoothing, **settings)
+    np.testing.assert_allclose(smoothed, render(wide, **settings), atol=1e-3)
+
+
+def test_objects_that_splats_are_close_to_are_named_once():
+    """Where they are nearer to its middle than 1.25 of its radii, however often they change."""
+    lines = []
+
+    class Lines(mi.Appender):
+        def append(self, level, text):
+            lines.append(text)
+
+        def log_progress(self, *others):
+            pass
+
+    logger, appender = mi.logger(), Lines()
+    logger.add_appender(appender)
+    try:
+        for distance, count in ((0.6, 1), (1.5, 1)):
+            found = scene_of(
+                around(distance=distance), light="probe", probes="ball", **mirror_ball()
+            )
+            for seed in range(2):
+                params = mi.traverse(found)
+                params["integrator.sh0"] = params["integrator.sh0"] + 0.1
+                params.update()
+                mi.render(found, spp=1, seed=seed)
+            assert sum("so close to 'ball'" in line for line in lines) == count
+    finally:
+        logger.remove_appender(appender)
+
+
 def test_what_cannot_have_a_probe_is_refused():
     def scene(**settings):
         return scene_of(around(4), light="probe", **settings, **mirror_ball(sky=SKY))
@@ -124,6 +162,12 @@ def test_what_cannot_have_a_probe_is_refused():
         found = scene(probes=f"ball, {name}")
         with pytest.raises(PluginError, match=message):
             found.integrator().render(found)
+    twins = {name: {"type": "rectangle", "id": name, "bsdf": MIRROR} for name in ("a", "b")}
+    found = scene_of(around(4), light="probe", probes="a", **twins, **mirror_ball())
+    with pytest.raises(
+        PluginError, match=r"got 'a'; there are .*load the scene with optimize=False"
+    ):
+        found.integrator().render(found)
     found = scene(probes="ball")
     params = mi.traverse(found)
     dr.enable_grad(params["integrator.means"])

@@ -13,7 +13,7 @@ from drgs.cli.commands import CommandParser
 
 SCENES = REPOSITORY / "scenes"
 FOLDERS = ("docs", "drgs", "plugins", "scenes", "tests")
-SCRIPTS = ("compare_shapes", "draw_tiles", "knot", "relight")
+SCRIPTS = ("compare_shapes", "draw_tiles", "flat_mirror", "knot", "relight")
 MODULES = [c.module for c in COMMANDS.values()] + [f"drgs.bench.{name}" for name in MEASUREMENTS]
 
 
@@ -69,6 +69,11 @@ def test_the_knot_goes_where_the_command_is_run(script):
 
 def test_the_picture_of_tiles_goes_where_the_command_is_run(script):
     assert script("draw_tiles") == {"out/tiles.png"}
+
+
+def test_the_table_of_a_flat_mirror_goes_nowhere(script, capsys):
+    assert script("flat_mirror", "--size", 8, "--splats", 20) == set()
+    assert capsys.readouterr().out.count("\n") == 6
 
 
 def test_what_was_relit_goes_where_the_command_is_run(script):

@@ -23,13 +23,13 @@ def gaussians(means, scale=0.3, opacity=0.9, color=1.0, count=None) -> splatting
     )
 
 
+SETTINGS = ("light_samples", "exposure", "probes", "unseen", "shadows", "aovs", "smoothing")
+"""Of the integrator, that :func:`scene_of` takes."""
+
+
 def scene_of(splats, light="rays", max_depth=8, nested="splatpath", spp=64, **others):
     """The objects of ``others`` among the splats, and their camera at ``sensor``."""
-    settings = {
-        key: others.pop(key)
-        for key in ("light_samples", "exposure", "probes", "unseen", "shadows", "aovs")
-        if key in others
-    }
+    settings = {key: others.pop(key) for key in SETTINGS if key in others}
     tensors = {k: mi.TensorXf(v.astype(np.float32)) for k, v in vars(splats).items()}
     integrator = {
         "type": "splats",

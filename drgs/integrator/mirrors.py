@@ -1,0 +1,360 @@
+"""Flat mirrors among probes: the splats as cameras see them that are mirrored in their planes.
+
+Imported where a scene has probes. A ray of a camera that a plane mirrors goes on along a ray
+of the camera that is mirrored in it: what it meets of splats is a pixel of the latter's picture.
+That is rendered by the kernels that make all others, with a few texels for each pixel. Splats on
+the other side of the plane are left out, and so are those behind the surface that the mirrored ray
+meets: a ray that ends elsewhere, as at the edge of such a surface, looks at those of the texels
+around it that end where it does.
+
+A ray that leaves the plane on none of the mirrored camera's rays, after other bounces or scattered,
+is not known.
+
+Nothing here is differentiated.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from drgs.accuracy.peak_depths import BoundedDepths
+from drgs.accuracy.pipeline import pipeline_of
+from drgs.cameras.camera import Camera, Lens, Pinhole
+from drgs.config.approximations import Approximations
+from drgs.effects.compose import composed
+from drgs.gaussians.parameters import Gaussians
+from drgs.integrator.legs import Leg
+from drgs.integrator.sensors import SensorState, camera_from_sensor
+from drgs.light.probe import LOW_PASS, Seen
+from drgs.splatting import rendering
+
+TEXELS_PER_PIXEL = 2
+"""Texels of a small film's pixel, along either axis."""
+
+FINE_TEXELS, MAX_TEXELS = 2**21, 2**26
+"""Texels of all pictures together, 20 bytes each, from which on there are fewer of a pixel; and
+from which on there are fewer than one."""
+
+BORDER = 8
+"""Texels around a picture: filters of the film reach beyond its edge."""
+
+FLAT = 1e-5
+"""Largest distance of a vertex from the plane of a flat shape, relative to the shape's size."""
+
+ROUNDED = 1e-6
+"""The same, relative to the coordinates: both are allowed."""
+
+OFF_RAY = 1e-3
+"""Largest distance between a ray and the camera's, relative to the distance from the camera."""
+
+OFF_SURFACE = 2e-4
+"""The same, relative to the coordinates: twice as far as Mitsuba starts rays off a surface."""
+
+LEAST_WEIGHT = 1e-3
+"""Smallest weight, of 1, of the texels around a ray that end where it does."""
+
+SAME_END = (0.1, 0.01)
+"""Largest distance between the ends of rays that are taken for the same, relative to their length
+from the mirror on, and to that from the camera to the mirror: both are allowed."""
+
+
+# ----------------------------------------------------------------------------------------------
+# Planes
+# ----------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Plane:
+    """Points x with normal . x = offset, world; arrays of them, by mirror, in :class:`Mirrors`."""
+
+    normal: mi.Vector3f  # unit
+    offset: mi.Float
+
+    def height(self, point: mi.Vector3f) -> mi.Float:
+        """Signed distance of a point."""
+        return dr.dot(self.normal, point) - self.offset
+
+    def at(self, mirror: mi.UInt32, active: mi.Bool = True) -> Plane:
+        """Gather the planes of some of the mirrors."""
+        normal = dr.gather(mi.Vector3f, self.normal, mirror, active)
+        return Plane(normal, dr.gather(mi.Float, self.offset, mirror, active))
+
+    def mirror(self, camera: Camera) -> Camera:
+        """Mirror a camera: each pixel sees what the mirror shows there.
+
+        Its axes have the other handedness, which the projection does not notice.
+        """
+        n = self.normal
+        turned = [
+            list(axis - 2 * dr.dot(axis, n) * n) for axis in map(mi.Vector3f, camera.rotation)
+        ]
+        center = mi.Vector3f(camera.center)
+        return replace(
+            camera,
+            rotation=type(camera.rotation)(turned),
+            center=type(camera.center)(center - 2 * self.height(center) * n),
+        )
+
+
+@dataclass(frozen=True)
+class FlatMirror:
+    """A flat shape that reflects light about where a mirror would."""
+
+    normal: list[float]  # world, unit
+    offset: float  # of the plane along it
+    has_delta: bool  # whether a part of the light goes exactly there
+    is_specular: bool  # whether all that goes on does so about there
+
+    @staticmethod
+    def of(shape: mi.Shape) -> FlatMirror | None:
+        """Recognise one; None for all other shapes, and for emitters."""
+        bsdf = shape.bsdf()
+        if bsdf is None or shape.is_emitter():
+            return None
+        delta, glossy, diffuse, through = (
+            mi.has_flag(bsdf.flags(), flag)
+            for flag in (
+                mi.BSDFFlags.DeltaReflection,
+                mi.BSDFFlags.GlossyReflection,
+                mi.BSDFFlags.DiffuseReflection,
+                mi.BSDFFlags.Transmission,
+            )
+        )
+        plane = _plane_through(_points(shape)) if delta or glossy else None
+        return plane and FlatMirror(*plane, delta, not (diffuse or through))
+
+    def behind(self, center: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Mirror a camera's centre, (3,); give the plane, (4,), with its normal to the camera."""
+        normal = np.array(self.normal)
+        height = normal @ center - self.offset
+        plane = np.sign(height) * np.array([*normal, self.offset])
+        return center - 2 * height * normal, plane
+
+
+def _points(shape: mi.Shape) -> np.ndarray:
+    """Points (N, 3) of a shape, world, that tell whether it is flat; none if it cannot be."""
+    if shape.is_mesh():
+        return np.array(shape.vertex_positions_buffer(), np.float64).reshape(-1, 3)
+    if shape.class_name() != "Disk":
+        return np.zeros((0, 3))
+    matrix = np.array(mi.traverse(shape)["to_world"].matrix, np.float64).reshape(4, 4)
+    return np.array([[0, 0, 0, 1], [1, 0, 0, 1], [0, 1, 0, 1]]) @ matrix[:3].T
+
+
+def _plane_through(points: np.ndarray) -> tuple[list[float], float] | None:
+    """Find normal and offset of the one plane of points (N, 3); None where there is not one."""
+    if len(points) < 3 or not np.isfinite(points).all():
+        return None
+    middle = points.mean(0)
+    offsets = points - middle
+    extents, axes = np.linalg.eigh(offsets.T @ offsets)  # from the least on
+    slack = FLAT * np.abs(offsets).max() + ROUNDED * np.abs(points).max()
+    if extents[1] <= 1e-10 * extents[2] or np.abs(offsets @ axes[:, 0]).max() > slack:
+        return None
+    return axes[:, 0].tolist(), float(axes[:, 0] @ middle)
+
+
+# ----------------------------------------------------------------------------------------------
+# Pictures
+# ----------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class Mirrors:
+    """Pictures of the splats that cameras see in mirrors."""
+
+    planes: Plane  # by mirror
+    views: list[_View]  # by camera
+
+    @staticmethod
+    def of(
+        mirrors: Sequence[FlatMirror],
+        states: Sequence[SensorState],
+        scene: mi.Scene,
+        gaussians: Gaussians,
+        approximations: Approximations,
+        sh_degree: int,
+    ) -> Mirrors:
+        """Render the pictures. Cameras that move have none.
+
+        scene: of the surfaces.
+        """
+        normals = np.array([mirror.normal for mirror in mirrors], np.float32)
+        every = Plane(mi.Vector3f(normals.T), mi.Float([mirror.offset for mirror in mirrors]))
+        cameras = [c for c in map(camera_from_sensor, states) if c.shutter is None]
+        num_pixels = max(1, len(mirrors) * sum(c.width * c.height for c in cameras))
+        fine, least = (math.sqrt(most / num_pixels) for most in (FINE_TEXELS, MAX_TEXELS))
+        scale = min(TEXELS_PER_PIXEL, max(1.0, fine), least)
+        cameras = [_enlarged(camera, scale) for camera in cameras]
+        views = []
+        for camera in cameras:
+            pipeline = _pipeline(approximations, sh_degree, camera.lens)
+            pictures = [
+                _picture(camera, every.at(mi.UInt32(k)), scene, gaussians, pipeline)
+                for k in range(len(mirrors))
+            ]
+            colors, ends = (dr.concat(parts) for parts in zip(*pictures, strict=True))
+            size = mi.Vector2u(*(dr.opaque(mi.UInt32, n) for n in (camera.width, camera.height)))
+            views.append(_View(camera, size, colors, ends))
+        dr.eval(every, views)
+        return Mirrors(every, views)
+
+    def look(self, mirror: mi.UInt32, leg: Leg, active: mi.Bool) -> Seen:
+        """Look up what legs meet that leave a mirror; mirror: its number, of each leg."""
+        plane, ray = self.planes.at(mirror, active), leg.ray
+        origin = ray.o - 2 * plane.height(ray.o) * plane.normal
+        direction = ray.d - 2 * dr.dot(plane.normal, ray.d) * plane.normal
+        color, coverage, is_known = mi.Color3f(0), mi.Float(0), mi.Bool(False)
+        for view in self.views:
+            seen = view.look(mirror, origin, direction, ray.maxt, active & ~is_known)
+            color = dr.select(seen.is_known, seen.color, color)
+            coverage = dr.select(seen.is_known, seen.coverage, coverage)
+            is_known |= seen.is_known
+        return Seen(color, coverage, is_known)
+
+
+@dataclass(frozen=True, eq=False)
+class _View:
+    """Pictures of what one camera sees in each mirror."""
+
+    camera: Camera  # of a film that has a pixel for each texel
+    size: mi.Vector2u  # width and height, not to be compiled into kernels
+    colors: mi.Float  # 4 a texel: linear red, green, blue, times the coverage; coverage
+    ends: mi.Float  # of each texel: how far from the camera its ray ends
+
+    def look(
+        self,
+        mirror: mi.UInt32,
+        origin: mi.Vector3f,
+        direction: mi.Vector3f,
+        far: mi.Float,
+        active: mi.Bool,
+    ) -> Seen:
+        """Look up what rays meet, as far as they go on along those of the camera.
+
+        origin, direction: those of the mirrored rays, as if they had gone through the mirror.
+        """
+        camera, rounding = self.camera, OFF_SURFACE * (1 + dr.max(dr.abs(origin)))
+        origin = camera.rotation @ (mi.Vector3f(origin) - camera.center)
+        direction = camera.rotation @ mi.Vector3f(direction)
+        place, off = camera.place_of_ray(origin, direction)
+        start, towards, is_seen = camera.look_through(place.x, place.y)
+        way = origin - start
+        distance = dr.norm(way)
+        off += OFF_RAY * distance + rounding
+        active = active & is_seen & (dr.dot(towards, direction) > 0) & (dr.dot(way, direction) > 0)
+        active &= dr.norm(dr.cross(way, direction)) <= off
+        x, y = place - 0.5
+        width, height = self.size
+        active &= (x >= 0) & (y >= 0) & (x + 1 < mi.Float(width)) & (y + 1 < mi.Float(height))
+        column, row = mi.UInt32(x), mi.UInt32(y)
+        right, down = x - mi.Float(column), y - mi.Float(row)
+        first = mirror * (width * height) + row * width + column
+        total, weights = mi.Vector4f(0), mi.Float(0)
+        for texel, weight in (
+            (first, (1 - right) * (1 - down)),
+            (first + 1, right * (1 - down)),
+            (first + width, (1 - right) * down),
+            (first + width + 1, right * down),
+        ):
+            end = dr.gather(mi.Float, self.ends, texel, active)
+            weight = dr.select(_is_same(distance, far, end), weight, 0)
+            total += weight * dr.gather(mi.Vector4f, self.colors, texel, active)
+            weights += weight
+        is_known = active & (weights > LEAST_WEIGHT)
+        *color, coverage = dr.select(is_known, total / weights, 0)
+        return Seen(mi.Color3f(color), coverage, is_known)
+
+
+def _is_same(distance: mi.Float, far: mi.Float, end: mi.Float) -> mi.Bool:
+    """Tell whether a ray, as long to the mirror and as far from there, ends at ``end``."""
+    of_far, of_distance = SAME_END
+    is_near = dr.abs(distance + far - end) <= of_far * far + of_distance * distance
+    return dr.select((far < dr.inf) & (end < dr.inf), is_near, (far < dr.inf) == (end < dr.inf))
+
+
+def _pipeline(approximations: Approximations, sh_degree: int, lens: Lens) -> rendering.Pipeline:
+    """Build the pipeline that shows Gaussians as rays meet them, as far as a lens allows it."""
+    projection = "exact"
+    if not isinstance(lens, Pinhole):
+        projection = "ewa" if lens.parallel else "unscented"  # the former is exact then
+    along_rays = {"low_pass": LOW_PASS, "order": "pixel", "sh_direction": "pixel"}
+    return pipeline_of(replace(approximations, projection=projection, **along_rays), sh_degree)
+
+
+def _enlarged(camera: Camera, scale: float) -> Camera:
+    """Scale a camera's film, and add a border."""
+    factor = dr.opaque(mi.Float, scale)
+    changes = {
+        name: factor * getattr(camera, name) + BORDER
+        for name in ("principal", "film_start", "film_end")
+    }
+    camera = replace(
+        camera,
+        focal=factor * camera.focal,
+        width=math.ceil(scale * camera.width) + 2 * BORDER,
+        height=math.ceil(scale * camera.height) + 2 * BORDER,
+        **changes,
+    )
+    dr.make_opaque(camera)
+    return camera
+
+
+def _picture(
+    camera: Camera,
+    plane: Plane,
+    scene: mi.Scene,
+    gaussians: Gaussians,
+    pipeline: rendering.Pipeline,
+) -> tuple[mi.Float, mi.Float]:
+    """Render what the camera sees in a mirror: see :class:`_View`."""
+    side = dr.sign(plane.height(mi.Vector3f(camera.center)))
+    plane = Plane(side * plane.normal, side * plane.offset)
+    camera = plane.mirror(camera)
+    dr.make_opaque(plane, camera)
+    nearest, farthest, ends = _trace(camera, plane, scene)
+    pipeline = composed(pipeline, gaussians, camera)
+    depths = BoundedDepths(pipeline.order.depths, nearest, farthest)
+    order = replace(pipeline.order, depths=depths)
+    frame = rendering.render(gaussians, camera, replace(pipeline, order=order))
+    T, *color = frame.planes()
+    coverage = 1 - T
+    color = mi.Color3f(color) / dr.select(coverage > 0, coverage, 1)
+    color = coverage * mi.math.srgb_to_linear(color)
+    colors = dr.ravel(mi.Vector4f(*color, coverage))
+    dr.eval(colors, ends)
+    return colors, ends
+
+
+def _trace(camera: Camera, plane: Plane, scene: mi.Scene) -> tuple[mi.Float, mi.Float, mi.Float]:
+    """Find the depths where a mirrored camera's rays pass the mirror and end, and their lengths."""
+    texel = dr.arange(mi.UInt32, camera.width * camera.height)
+    width = dr.opaque(mi.UInt32, camera.width)
+    row = texel // width
+    x, y = mi.Float(texel - row * width) + 0.5, mi.Float(row) + 0.5
+    origin, direction, is_seen = camera.look_through(x, y)
+    to_world = camera.rotation.T
+    origin = mi.Point3f(camera.center + to_world @ origin)
+    direction = mi.Vector3f(dr.normalize(to_world @ direction))
+    t = -plane.height(mi.Vector3f(origin)) / dr.dot(plane.normal, direction)
+    is_seen &= t > 0
+    start = dr.fma(direction, t, origin)
+
+    def depth(far: mi.Float, exists: mi.Bool) -> mi.Float:
+        point = camera.rotation @ (mi.Vector3f(start) + far * direction - camera.center)
+        return dr.select(exists, camera.lens.look(camera, point)[2], dr.inf)
+
+    off = mi.math.RayEpsilon * (1 + dr.max(dr.abs(start)))  # as Mitsuba does
+    hit = scene.ray_intersect_preliminary(
+        mi.Ray3f(start + off * plane.normal, direction), active=is_seen
+    )
+    hits = is_seen & hit.is_valid()
+    found = depth(mi.Float(0), is_seen), depth(hit.t, hits), dr.select(hits, t + hit.t, dr.inf)
+    dr.eval(found)
+    return found
