@@ -13,7 +13,7 @@ from drgs.cli.commands import CommandParser
 
 SCENES = REPOSITORY / "scenes"
 FOLDERS = ("docs", "drgs", "plugins", "scenes", "tests")
-SCRIPTS = ("compare_shapes", "draw_tiles", "flat_mirror", "knot", "relight")
+SCRIPTS = ("among_surfaces", "compare_shapes", "draw_tiles", "flat_mirror", "knot", "relight")
 MODULES = [c.module for c in COMMANDS.values()] + [f"drgs.bench.{name}" for name in MEASUREMENTS]
 
 
@@ -45,6 +45,9 @@ def script(monkeypatch, tmp_path):
             monkeypatch.setattr(module, "measure", lambda *arguments: result)
         if name == "relight":
             monkeypatch.setattr(module, "relight", lambda *arguments: pictures_in(arguments[-1]))
+        if name == "among_surfaces":
+            for rows in ("furnace_rows", "shadow_rows"):
+                monkeypatch.setattr(module, rows, lambda *arguments: [])
         before = files_of_the_checkout()
         module.main()
         assert files_of_the_checkout() == before
@@ -74,6 +77,11 @@ def test_the_picture_of_tiles_goes_where_the_command_is_run(script):
 def test_the_table_of_a_flat_mirror_goes_nowhere(script, capsys):
     assert script("flat_mirror", "--size", 8, "--splats", 20) == set()
     assert capsys.readouterr().out.count("\n") == 6
+
+
+def test_the_tables_of_what_is_known_go_nowhere(script, capsys):
+    assert script("among_surfaces") == set()
+    assert capsys.readouterr().out.count("\n") == 4
 
 
 def test_what_was_relit_goes_where_the_command_is_run(script):
