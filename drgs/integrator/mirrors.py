@@ -202,7 +202,7 @@ class Mirrors:
             colors, ends = (dr.concat(parts) for parts in zip(*pictures, strict=True))
             size = mi.Vector2u(*(dr.opaque(mi.UInt32, n) for n in (camera.width, camera.height)))
             views.append(_View(camera, size, colors, ends))
-        dr.eval(every, views)
+        dr.make_opaque(every, views)
         return Mirrors(every, views)
 
     def look(self, mirror: mi.UInt32, leg: Leg, active: mi.Bool) -> Seen:

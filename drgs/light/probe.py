@@ -118,7 +118,7 @@ class Probes:
             for vectors in (centers, planes[:, :3])
         )
         found = Probes(place, normals, dr.concat(nearest), colors, places)
-        dr.eval(found)
+        dr.make_opaque(found)  # or each place would be a new kernel
         return found
 
     def look(

@@ -1,5 +1,6 @@
 """Probes of flat mirrors: cameras that are mirrored, against rays."""
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -172,6 +173,20 @@ def test_pictures_are_kept_until_something_changes(monkeypatch):
         found.integrator().memory.mirrors = found.integrator().memory.probes = None
         np.testing.assert_array_equal(mi.render(found, seed=2), kept, err_msg=name)
         counts.pop()
+
+
+def test_a_camera_that_goes_on_needs_no_new_kernels():
+    found, kernels = scene(), []
+    for _ in range(3):
+        params = mi.traverse(found)
+        step = mi.Transform4f().translate(mi.Point3f(dr.opaque(mi.Float, 0.05), 0, 0))
+        params["sensor.to_world"] = step @ params["sensor.to_world"]
+        params.update()
+        with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
+            dr.kernel_history_clear()
+            dr.eval(mi.render(found))
+            kernels.append({kernel["hash"] for kernel in dr.kernel_history([dr.KernelType.JIT])})
+    assert kernels[2] == kernels[1]
 
 
 def test_flat_shapes_are_known_by_their_vertices():
