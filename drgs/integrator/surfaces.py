@@ -40,7 +40,14 @@ from drgs.core.arrays import image_of, planes_of
 from drgs.core.errors import PluginError
 from drgs.core.private import same_variables
 from drgs.effects.occlusion import Surface
-from drgs.integrator.film import Channels, develop_pixels, film_map, num_colors, pixel_corners
+from drgs.integrator.film import (
+    Channels,
+    develop_pixels,
+    film_map,
+    num_colors,
+    pixel_corners,
+    samples_in,
+)
 from drgs.integrator.film import pixels_adjoint as film_adjoint
 
 EDGE_GRID = 4
@@ -157,9 +164,9 @@ def trace_surfaces(
     hide_emitters: bool,
     with_normals: bool,
 ) -> list[list[SeenSurface]]:
-    """What is seen of the surfaces, by time and by sample, evaluated.
+    """What is seen of the surfaces, by time and by pass, evaluated.
 
-    cameras: of each time; within: of each sample, x and y from the pixel's upper left corner, px;
+    cameras: of each time; within: of each pass, x and y from the pixel's upper left corner, px;
     hide_emitters: whether rays pass through surfaces that are emitters.
     """
     tracer = _Tracer(
@@ -173,8 +180,8 @@ def trace_surfaces(
     if len(within) == 1 and dr.width(within[0]) == 1:  # the same place in all pixels
         seen = [[tracer.trace_with_edges(camera, film, *within[0])] for camera in cameras]
     else:
-        corner = pixel_corners(film)
-        seen = [[tracer.trace(camera, corner, *place) for place in within] for camera in cameras]
+        places = [(pixel_corners(film, samples_in(film, x)), x, y) for x, y in within]
+        seen = [[tracer.trace(camera, *place) for place in places] for camera in cameras]
     dr.eval(seen)
     return seen
 

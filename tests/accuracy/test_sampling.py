@@ -149,9 +149,10 @@ def exposure_of(loaded, samples, seed=0):
     sensor = loaded.sensors()[0]
     exposure = DrawnSamples(sensor, seed, samples, {})
     width, height = sensor.film().crop_size()
-    return np.array(
-        [np.array([p.x, p.y]).T.reshape(height, width, 2) for p in exposure.positions], np.float64
-    )
+    passes = [
+        np.array([p.x, p.y], np.float64).T.reshape(-1, height, width, 2) for p in exposure.positions
+    ]
+    return np.concatenate(passes)
 
 
 def pictures_at(points) -> np.ndarray:
