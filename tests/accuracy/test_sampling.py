@@ -311,8 +311,8 @@ def test_more_samples_need_no_longer_kernels_for_a_filter(action):
         with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
             dr.kernel_history_clear()
             if action == "develop":
-                planes = [[dr.opaque(mi.Float, 1, width * height)] * 4] * samples
-                dr.eval(exposure.develop(planes))
+                sizes = [dr.width(points.x) for points in exposure.positions]
+                dr.eval(exposure.develop([[dr.opaque(mi.Float, 1, n)] * 4 for n in sizes]))
             else:
                 dr.eval(exposure.adjoint(dr.full(mi.TensorXf, 1, (height, width, 4))))
             kernels = dr.kernel_history([dr.KernelType.JIT])
