@@ -398,14 +398,18 @@ def splat_gradients(
     rank, count = dr.arange(t.UInt32, size), response.num_geometry
     geometry = bins.rows.load(rank)[:count]
 
-    def add(sample: Any, columns: list[Any]) -> tuple[Any, list[Any]]:
+    def terms(sample: Any) -> list[Any]:
         sums = totals(rank, sample)
-        terms = response.derivatives(geometry, sums[: response.num_moments])
-        terms += sums[response.num_moments :]
-        return sample + 1, [a + b for a, b in zip(columns, terms, strict=True)]
+        columns = response.derivatives(geometry, sums[: response.num_moments])
+        return columns + sums[response.num_moments :]
+
+    def add(sample: Any, columns: list[Any]) -> tuple[Any, list[Any]]:
+        is_first = (sample == 0) & (before is None)  # 0 + x would lose the sign of zeros
+        pairs = zip(columns, terms(sample), strict=True)
+        return sample + 1, [dr.select(is_first, x, total + x) for total, x in pairs]
 
     if before is None:
-        columns = [dr.full(t.Float, -0.0, size)] * (count + bins.num_features)  # -0 + x = x
+        columns = [t.Float(0)] * (count + bins.num_features)
     else:
         columns = before.geometry + before.features
         columns = [dr.gather(t.Float, column, bins.order) for column in columns]

@@ -49,8 +49,8 @@ class CompositedPairs:
         t, count = types_of(bins.rows.Float), len(samples)
         padded, num_entries = dr.width(bins.masks), bins.num_entries
         _, entry = divide(dr.arange(t.UInt32, count * padded), padded, count)
-        tiles = repeat_array(bins.tiles, count, bins.grid.num_tiles)
-        tiles += dr.opaque(t.UInt32, bins.grid.tiles_of(samples).start)
+        first_tile = dr.opaque(t.UInt32, bins.grid.tiles_of(samples).start)
+        tiles = first_tile + repeat_array(bins.tiles, count, bins.grid.num_tiles)
         masks = t.UInt32(0)
         for k in range(MICROS // 4):
             stops = dr.gather(t.Array4u, stop, tiles * (MICROS // 4) + k)
@@ -222,9 +222,8 @@ def sum_entries(
     )
     dr.eval(totals)
     sample, entry = divide(entry, dr.width(bins.masks), len(pairs.samples))
-    source = sample * dr.opaque(t.UInt32, bins.num_entries) + dr.gather(
-        t.UInt32, bins.source, entry
-    )
+    first_source = sample * dr.opaque(t.UInt32, bins.num_entries)
+    source = first_source + dr.gather(t.UInt32, bins.source, entry)
     sums.store(totals, dr.gather(t.UInt32, pairs.row, source), micros != 0)
     dr.eval(sums)
 
