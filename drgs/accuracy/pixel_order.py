@@ -157,10 +157,9 @@ class _WalkInputs:
 
     def first_place(self) -> Any:
         """Where the places of each lane's sample begin."""
-        UInt32, sample = type(self.lanes.sample), self.lanes.sample
-        if self.samples.start > 0:
-            sample = sample - dr.opaque(UInt32, self.samples.start)
-        return sample * dr.opaque(UInt32, self.lists.count)
+        start, count = self.samples.start, self.lists.count
+        start, count = (dr.opaque(type(self.lanes.sample), number) for number in (start, count))
+        return (self.lanes.sample - start) * count
 
     @property
     def size(self) -> int:

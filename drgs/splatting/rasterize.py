@@ -404,20 +404,16 @@ def splat_gradients(
         return columns + sums[response.num_moments :]
 
     def add(sample: Any, columns: list[Any]) -> tuple[Any, list[Any]]:
-        is_first = (sample == 0) & (before is None)  # 0 + x would lose the sign of zeros
-        pairs = zip(columns, terms(sample), strict=True)
-        return sample + 1, [dr.select(is_first, x, total + x) for total, x in pairs]
+        return sample + 1, [total + x for total, x in zip(columns, terms(sample), strict=True)]
 
     if before is None:
-        columns = [t.Float(0)] * (count + bins.num_features)
+        first, columns = 1, terms(t.UInt32(0))
     else:
-        columns = before.geometry + before.features
+        first, columns = 0, before.geometry + before.features
         columns = [dr.gather(t.Float, column, bins.order) for column in columns]
-    if num_samples == 1:
-        _, columns = add(t.UInt32(0), columns)
-    else:
+    if first < num_samples:
         _, columns = dr.while_loop(
-            state=(dr.zeros(t.UInt32, size), [t.Float(column) for column in columns]),
+            state=(dr.full(t.UInt32, first, size), [t.Float(column) for column in columns]),
             cond=lambda sample, columns: sample < dr.opaque(t.UInt32, num_samples),
             body=add,
         )

@@ -156,10 +156,9 @@ class Slots:
 
     def _first_of_sample(self, entries: Entries) -> Any:
         """The first group of each lane's sample."""
-        UInt32, sample = type(self.first_group), entries.sample
-        if self.samples.start > 0:
-            sample = sample - dr.opaque(UInt32, self.samples.start)
-        return sample * dr.opaque(UInt32, self.groups_of_sample)
+        start, groups = self.samples.start, self.groups_of_sample
+        start, groups = (dr.opaque(type(self.first_group), number) for number in (start, groups))
+        return (entries.sample - start) * groups
 
 
 def assign_slots(pairs: CompositedPairs, band: Band) -> Slots:
