@@ -14,6 +14,7 @@ import mitsuba as mi
 from mitsuba.ad.integrators.common import RBIntegrator, mis_weight, solid_angle_to_area_jacobian
 
 from drgs.integrator.legs import Leg
+from drgs.integrator.transparency import StraightRays, has_transparent_parts
 
 if TYPE_CHECKING:
     from drgs.integrator.legs import Light
@@ -50,9 +51,12 @@ class SplatPathIntegrator(RBIntegrator):
     To be nested in ``splats`` whose ``light`` is ``rays``: it renders the scene's surfaces as
     ``path`` does, and as splats light and shade them. What a path meets between two vertices adds
     its radiance and weakens all that comes behind; so do splats between a vertex and the emitter
-    that it samples. The first segment, which starts at the camera and goes straight on through
-    what lets it pass (``null``, ``mask``, ``thindielectric``), meets no splats: those the
+    that it samples. The first segment, which starts at the camera, meets no splats: those the
     integrator ``splats`` puts into the picture. Without it, this is a path tracer.
+
+    What lets light pass straight on (``null``, ``mask``, ``thindielectric``) is no vertex for a
+    path that passes: it does not count as a bounce, splats before and behind it are composited
+    together, and emitters are sampled through it, also those that ``path`` cannot see there.
 
     Derivatives are those of ``prb`` (path replay, detached sampling), with respect to materials,
     emitters and poses of objects.
@@ -100,19 +104,21 @@ class SplatPathIntegrator(RBIntegrator):
         vertex what radiance is still to come, as the first one has left the sum.
         """
         primal = mode == dr.ADMode.Primal
+        self.straight_rays = StraightRays(scene, False, has_transparent_parts(scene))
         path = self._begin(scene, ray, active)
         L = mi.Spectrum(0 if primal else others["state_in"])  # so far; in a replay, still to come
         δL = mi.Spectrum(0 if others["δL"] is None else others["δL"])
         is_seen = mi.Bool(not self.hide_emitters and scene.environment() is not None)
 
         while dr.hint(path.active, max_iterations=self.max_depth, label=f"splatpath ({mode.name})"):
-            passed = self._pass_splats(scene, path, sampler)
             with dr.resume_grad(when=not primal):
                 si = path.vertex(attached=not primal)
-            emitted = self._emitted(scene, path, si, primal)
+            splats, arrives = self._pass_splats(scene, path, sampler)
+            emitted = self._emitted(scene, path, si, arrives, primal)
             goes_on = path.active & (path.depth + 1 < self.max_depth) & si.is_valid()
-            direct = self._direct(scene, sampler, path, si, goes_on, primal)
-            step = self._bounce(scene, sampler, path, si, goes_on)
+            direct = self._direct(scene, sampler, path, si, arrives, goes_on, primal)
+            step = self._bounce(scene, sampler, path, si, arrives)
+            passed = dr.select(step.is_null, 0, splats)  # or composited with what follows
             is_seen |= goes_on & ~step.is_null
             contribution = dr.detach(passed + emitted + direct)
             L = L + contribution if primal else L - contribution
@@ -141,6 +147,8 @@ class SplatPathIntegrator(RBIntegrator):
             throughput=mi.Spectrum(1),
             eta=mi.Float(1),
             straight=mi.Bool(True),
+            origin=mi.Point3f(ray.o),
+            length=mi.Float(0),
             last_ray=mi.Ray3f(ray),
             last_hit=dr.zeros(mi.PreliminaryIntersection3f),
             last_si=dr.zeros(mi.SurfaceInteraction3f),
@@ -149,7 +157,12 @@ class SplatPathIntegrator(RBIntegrator):
         )
 
     def _emitted(
-        self, scene: mi.Scene, path: _Path, si: mi.SurfaceInteraction3f, primal: bool
+        self,
+        scene: mi.Scene,
+        path: _Path,
+        si: mi.SurfaceInteraction3f,
+        arrives: mi.Spectrum,
+        primal: bool,
     ) -> mi.Spectrum:
         """Of the emitter that a path has met."""
         shows = path.active & ~((path.depth == 0) & ~si.is_valid() & self.hide_emitters)
@@ -157,7 +170,7 @@ class SplatPathIntegrator(RBIntegrator):
         pdf = scene.pdf_emitter_direction(path.last_si, ds, ~path.last_is_delta)
         weight = mis_weight(path.last_pdf, pdf)
         with dr.resume_grad(when=not primal):
-            return path.throughput * weight * ds.emitter.eval(si, shows)
+            return arrives * weight * ds.emitter.eval(si, shows)
 
     def _direct(
         self,
@@ -165,23 +178,30 @@ class SplatPathIntegrator(RBIntegrator):
         sampler: mi.Sampler,
         path: _Path,
         si: mi.SurfaceInteraction3f,
+        arrives: mi.Spectrum,
         active: mi.Bool,
         primal: bool,
     ) -> mi.Spectrum:
         """Of an emitter that the vertex samples."""
         bsdf = si.bsdf(path.ray)
         active = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
-        ds, weight = scene.sample_emitter_direction(si, sampler.next_2d(), True, active)
+        rays = self.straight_rays
+        ds, weight = scene.sample_emitter_direction(
+            si, sampler.next_2d(), not rays.sees_through, active
+        )
         active &= ds.pdf != 0
-        leg = Leg(si.spawn_ray_to(ds.p), si.shape, ds.emitter, ds.pdf)
+        ray = si.spawn_ray_to(ds.p)
+        leg = Leg(ray, si.shape, ds.emitter, ds.pdf, is_open=mi.Bool(False))
         let_through = self._let_through(leg, sampler, active)
+        if dr.hint(rays.sees_through, mode="scalar"):
+            let_through *= rays.transmittance(ray, active)
         with dr.resume_grad(when=not primal):
             if not primal:
                 ds, weight = _attached(scene, si, ds, weight, active)
             wo = si.to_local(ds.d)
             value, pdf = bsdf.eval_pdf(mi.BSDFContext(), si, wo, active)
             mis = dr.select(ds.delta, 1, mis_weight(ds.pdf, pdf))
-            return path.throughput * mis * value * weight * let_through
+            return arrives * mis * value * weight * let_through
 
     def _bounce(
         self,
@@ -189,17 +209,22 @@ class SplatPathIntegrator(RBIntegrator):
         sampler: mi.Sampler,
         path: _Path,
         si: mi.SurfaceInteraction3f,
-        active: mi.Bool,
+        arrives: mi.Spectrum,
     ) -> _Step:
         """Where a path goes on, if it does."""
+        has_bounces = path.depth + 1 < self.max_depth
+        may_pass = mi.Bool(self.straight_rays.sees_through)
+        active = path.active & si.is_valid() & (has_bounces | may_pass)
         bsdf = si.bsdf(path.ray)
         sample, weight = bsdf.sample(
             mi.BSDFContext(), si, sampler.next_1d(), sampler.next_2d(), active
         )
         ray = si.spawn_ray(si.to_world(sample.wo))
-        eta, throughput = path.eta * sample.eta, path.throughput * weight
+        is_null = mi.has_flag(sample.sampled_type, mi.BSDFFlags.Null)
+        eta = path.eta * sample.eta
+        throughput = dr.select(is_null, path.throughput, arrives) * weight
         most = dr.max(throughput)
-        active = active & (most != 0)
+        active = active & (most != 0) & (has_bounces | is_null)
         probability = dr.minimum(most * dr.square(eta), MOST_LIKELY)
         is_played = path.depth >= self.rr_depth
         throughput[is_played] *= dr.rcp(probability)
@@ -208,6 +233,7 @@ class SplatPathIntegrator(RBIntegrator):
             ray=dr.detach(ray),
             hit=scene.ray_intersect_preliminary(ray, coherent=False, reorder=False, active=active),
             active=active,
+            is_null=active & is_null,
             throughput=throughput,
             eta=eta,
             pdf=sample.pdf,
@@ -218,16 +244,16 @@ class SplatPathIntegrator(RBIntegrator):
     # Splats
     # ------------------------------------------------------------------------------------------
 
-    def _pass_splats(self, scene: mi.Scene, path: _Path, sampler: mi.Sampler) -> mi.Spectrum:
-        """What splats up to the vertex send along the path; what is behind them is weakened."""
+    def _pass_splats(
+        self, scene: mi.Scene, path: _Path, sampler: mi.Sampler
+    ) -> tuple[mi.Spectrum, mi.Spectrum]:
+        """What splats up to the vertex send along the path, and its throughput past them."""
         if self.light is None:
-            return mi.Spectrum(0)
+            return mi.Spectrum(0), mi.Spectrum(path.throughput)
         radiance, let_through = self.light.passed(
             path.leg(scene), sampler.next_1d(), path.active & ~path.straight
         )
-        radiance = path.throughput * radiance
-        path.throughput = path.throughput * let_through
-        return radiance
+        return path.throughput * radiance, path.throughput * let_through
 
     def _let_through(self, leg: Leg, sampler: mi.Sampler, active: mi.Bool) -> mi.Float:
         """Of the light of an emitter."""
@@ -261,7 +287,9 @@ class _Path:
     throughput: mi.Spectrum
     eta: mi.Float  # product of relative indices of refraction
     straight: mi.Bool  # from the camera on
-    last_ray: mi.Ray3f  # the same of the vertex before
+    origin: mi.Point3f  # of the ray before it went straight on
+    length: mi.Float  # from there to where the ray starts
+    last_ray: mi.Ray3f  # the same of the vertex before, which is not straight on
     last_hit: mi.PreliminaryIntersection3f
     last_si: mi.SurfaceInteraction3f
     last_pdf: mi.Float  # of the direction
@@ -270,10 +298,13 @@ class _Path:
     def leg(self, scene: mi.Scene) -> Leg:
         """That has led here."""
         ray, hits = mi.Ray3f(self.ray), self.hit.is_valid()
-        ray.maxt = dr.select(hits, self.hit.t, dr.inf)
-        emitter = dr.select(hits, self.hit.shape.emitter(), scene.environment())
+        ray.o = self.origin
+        ray.maxt = dr.select(hits, self.length + self.hit.t, dr.inf)
+        environment = scene.environment()
+        emitter = dr.select(hits, self.hit.shape.emitter(), environment)
         pdf = dr.select(self.last_is_delta, dr.inf, self.last_pdf)
-        return Leg(ray, self.last_hit.shape, emitter, pdf)
+        is_open = mi.Bool(False) if environment is not None else ~hits
+        return Leg(ray, self.last_hit.shape, emitter, pdf, is_open)
 
     def vertex(self, attached: bool) -> mi.SurfaceInteraction3f:
         """Where the path is; attached: to the surfaces of this vertex and the one before."""
@@ -289,19 +320,25 @@ class _Path:
 
     def after(self, step: _Step, si: mi.SurfaceInteraction3f) -> _Path:
         """At the next vertex."""
+        passes = step.is_null
+        length = self.length + dr.dot(step.ray.o - self.ray.o, self.ray.d)
         return _Path(
             ray=step.ray,
             hit=step.hit,
             active=step.active,
-            depth=self.depth + dr.select(si.is_valid(), mi.UInt32(1), 0),
+            depth=self.depth + dr.select(si.is_valid() & ~passes, mi.UInt32(1), 0),
             throughput=step.throughput,
             eta=step.eta,
-            straight=self.straight & step.is_null,
-            last_ray=self.ray,
-            last_hit=self.hit,
-            last_si=dr.detach(si, True),
-            last_pdf=step.pdf,
-            last_is_delta=mi.has_flag(step.type, mi.BSDFFlags.Delta),
+            straight=self.straight & passes,
+            origin=dr.select(passes, self.origin, step.ray.o),
+            length=dr.select(passes, length, 0),
+            last_ray=dr.select(passes, self.last_ray, self.ray),
+            last_hit=dr.select(passes, self.last_hit, self.hit),
+            last_si=dr.select(passes, self.last_si, dr.detach(si, True)),
+            last_pdf=dr.select(passes, self.last_pdf, step.pdf),
+            last_is_delta=dr.select(
+                passes, self.last_is_delta, mi.has_flag(step.type, mi.BSDFFlags.Delta)
+            ),
         )
 
 
@@ -312,15 +349,11 @@ class _Step:
     ray: mi.Ray3f
     hit: mi.PreliminaryIntersection3f
     active: mi.Bool
+    is_null: mi.Bool  # whether the path goes straight on
     throughput: mi.Spectrum
     eta: mi.Float
     pdf: mi.Float
     type: mi.UInt32  # flags of the BSDF's part that was sampled
-
-    @property
-    def is_null(self) -> mi.Bool:
-        """Whether the path goes straight on."""
-        return mi.has_flag(self.type, mi.BSDFFlags.Null)
 
     def relative_change(self, si: mi.SurfaceInteraction3f, ray: mi.Ray3f) -> mi.Spectrum:
         """1, attached: how what the vertex reflects of the next segment changes, relatively."""

@@ -1,63 +1,66 @@
 """Surfaces between the splats: what they hide of each splat, at each pixel.
 
-Imported when a scene has surfaces. At a pixel, a surface at depth z that covers the part c of it
-lies between splats like one more splat, of alpha c. With w_i = T_i a_i the weights of the splats as
-they are without it (see ``drgs.splatting.rasterize``),
+Imported when a scene has surfaces. At a pixel, a surface k at depth z_k that stops the part p_k of
+the light behind it lies between splats like one more splat. With w_i = T_i a_i the weights of the
+splats as they are without it (see ``drgs.splatting.rasterize``),
 
-    C = sum_i s_i w_i c_i,   s_i = 1 in front (z_i <= z), 1 - c behind,
+    C = sum_i s_i w_i c_i,   s_i = 1 - sum of p_k over the surfaces in front (z_k < z_i),
 
-and the surface's own share is c times T_s, the transmittance in front of it:
+and each surface's own share is p_k times T_k, the transmittance in front of it:
 
-    T_s = 1 - sum_{i in front} w_i.
+    T_k = 1 - sum_{i: z_i <= z_k} w_i.
 
-So a surface changes no alpha and no transmittance: it scales features, and one more plane sums the
-weights in front. Adjoint and tangent follow from the features', and nothing else has to know.
+So surfaces change no alpha and no transmittance: they scale features, and one more plane for each
+sums the weights in front. Adjoint and tangent follow from the features', and nothing else has to
+know.
 
 Which splats are in front is decided by the depths of their means, as their order is. Not
-differentiated: z, c, and that decision.
+differentiated: z, p, and that decision.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 import drjit as dr
 
 from drgs.cameras.camera import Camera
-from drgs.splatting.grid import Lanes, TileGrid
+from drgs.splatting.grid import PIXELS, Lanes, TileGrid
 from drgs.splatting.image_model import FeatureGroup, Features, ImageModel, Positions
 from drgs.splatting.lanes import load_pixels
 
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """The nearest surface at each pixel."""
+    """One surface at each pixel: the nearest, or the next one that is seen through others."""
 
-    depth: Any  # Float (H * W,): as that of the splats, scene units; anything where nothing is
-    coverage: Any  # Float (H * W,) in [0, 1]
+    depth: Any  # Float (H * W,): as that of the splats, scene units; the largest where nothing is
+    coverage: Any  # Float (H * W,) in [0, 1]: p, the part of all light that it stops
 
 
 @dataclass(frozen=True)
 class OccludedFeatures:
-    """Features of splats that a surface may hide.
+    """Features of splats that surfaces may hide.
 
-    Of what is stored, the last is the splat's depth; of the planes, the last is the sum of the
-    weights in front of the surface.
+    The last stored number is the splat's depth; the last planes are the sums of the weights in
+    front of each surface.
     """
 
     features: Features
-    surface: Surface
+    surfaces: tuple[Surface, ...]  # nearest first
     grid: TileGrid
-    bound: list[tuple[Any, Any]] = field(default_factory=list)  # the 16 of each lane: z, 1 - c
+    bound: list[Any] = field(default_factory=list)  # at the 16 pixels of a lane: (z, rest behind)
 
     def groups(self, num_stored: int, size: int) -> list[FeatureGroup]:
-        """Divide as without a surface; each group has the depth, and the weights in front."""
-        depth, front = num_stored - 1, self.num_planes(num_stored) - 1
+        """Divide as without surfaces; each group has the depth, and the weights in front."""
+        depth, end = num_stored - 1, self.num_planes(num_stored)
+        fronts = range(end - len(self.surfaces), end)
         return [
             FeatureGroup(
                 stored=[*group.stored, depth],
-                planes=[*group.planes, front],
+                planes=[*group.planes, *fronts],
                 features=replace(self, features=group.features),
             )
             for group in self.features.groups(num_stored - 1, size)
@@ -65,45 +68,54 @@ class OccludedFeatures:
 
     def num_planes(self, num_stored: int) -> int:
         """Planes that come of ``num_stored`` numbers per splat."""
-        return self.features.num_planes(num_stored - 1) + 1
+        return self.features.num_planes(num_stored - 1) + len(self.surfaces)
 
     def seen_by(self, camera: Camera) -> OccludedFeatures:
         """For one camera."""
         return replace(self, features=self.features.seen_by(camera))
 
     def check_differentiable_in_camera(self) -> None:
-        """As the features; the surface stays where it is."""
+        """As the features; surfaces stay where they are."""
         self.features.check_differentiable_in_camera()
 
     def bind(self, lanes: Lanes, positions: Positions) -> OccludedFeatures:
-        """For the lanes of one kernel: loads the surface."""
-        depths = load_pixels(self.surface.depth, lanes, self.grid)
-        coverage = load_pixels(self.surface.coverage, lanes, self.grid)
+        """For the lanes of one kernel: loads the surfaces."""
+        rests, bound = [1.0] * PIXELS, []
+        for surface in self.surfaces:
+            depths = load_pixels(surface.depth, lanes, self.grid)
+            coverage = load_pixels(surface.coverage, lanes, self.grid)
+            rests = [rest - c for rest, c in zip(rests, coverage, strict=True)]
+            bound.append(list(zip(depths, rests, strict=True)))
         return replace(
             self,
             features=self.features.bind(lanes, positions),
-            bound=[(z, 1 - c) for z, c in zip(depths, coverage, strict=True)],
+            bound=list(zip(*bound, strict=True)),
         )
 
     def at(self, stored: list[Any], pixel: int) -> list[Any]:
-        """The splat's features at a pixel, as far as they are seen; 1 in front, 0 behind."""
+        """Return the splat's features at a pixel, as far as they are seen, and 1 in front."""
         *others, depth = stored
-        values = self.features.at(others, pixel)
-        front = self._in_front(type(depth)(1), depth, pixel)
-        return [self._seen(value, depth, pixel) for value in values] + [front]
+        seen = self._seen(depth, pixel)
+        values = [seen * value for value in self.features.at(others, pixel)]
+        return values + self._in_front(type(depth)(1), depth, pixel)
 
     def add(self, planes: list[Any], stored: list[Any], pixel: int, weight: Any) -> list[Any]:
         """As :meth:`at` says; it is the weight that is scaled, once for all features."""
         *others, depth = stored
-        *planes, front = planes
-        seen = self.features.add(planes, others, pixel, self._seen(weight, depth, pixel))
-        return [*seen, front + self._in_front(weight, depth, pixel)]
+        own, fronts = self._split(planes)
+        seen = self.features.add(own, others, pixel, self._seen(depth, pixel) * weight)
+        added = zip(fronts, self._in_front(weight, depth, pixel), strict=True)
+        return [*seen, *(front + more for front, more in added)]
 
     def feature_gradient(self, stored: list[Any], pixel: int, g: list[Any]) -> Any:
         """As :meth:`at` says; it is the sum that is scaled."""
         *others, depth = stored
-        gradient = self._seen(self.features.feature_gradient(others, pixel, g[:-1]), depth, pixel)
-        return gradient + self._in_front(g[-1], depth, pixel)
+        own, fronts = self._split(g)
+        gradient = self._seen(depth, pixel) * self.features.feature_gradient(others, pixel, own)
+        return gradient + sum(
+            dr.select(depth <= z, d_front, 0)
+            for (z, _), d_front in zip(self.bound[pixel], fronts, strict=True)
+        )
 
     def add_derivatives(
         self, totals: list[Any], stored: list[Any], pixel: int, weight: Any, g: list[Any]
@@ -111,28 +123,38 @@ class OccludedFeatures:
         """As :meth:`at` says; the depth has none."""
         *others, depth = stored
         *totals, nothing = totals
-        weight = self._seen(weight, depth, pixel)
-        sums = self.features.add_derivatives(totals, others, pixel, weight, g[:-1])
+        weight = self._seen(depth, pixel) * weight
+        sums = self.features.add_derivatives(totals, others, pixel, weight, self._split(g)[0])
         return [*sums, nothing]
 
     def tangents(self, stored: list[Any], d_stored: list[Any], pixel: int) -> list[Any]:
         """Tangents of the features at a pixel."""
         *others, depth = stored
+        seen = self._seen(depth, pixel)
         tangents = self.features.tangents(others, d_stored[:-1], pixel)
-        return [self._seen(value, depth, pixel) for value in tangents] + [type(depth)(0)]
+        return [seen * value for value in tangents] + [type(depth)(0)] * len(self.surfaces)
 
-    def _seen(self, value: Any, depth: Any, pixel: int) -> Any:
-        """What is left of a splat's number: all of it in front, 1 - c behind."""
-        z, passes = self.bound[pixel]
-        return dr.select(depth <= z, value, passes * value)
+    def _split(self, planes: list[Any]) -> tuple[list[Any], list[Any]]:
+        """Split planes into those of the features and the sums in front of each surface."""
+        count = len(self.surfaces)
+        return planes[:-count], planes[-count:]
 
-    def _in_front(self, value: Any, depth: Any, pixel: int) -> Any:
-        """A splat's number in front, 0 behind."""
-        z, _ = self.bound[pixel]
-        return dr.select(depth <= z, value, 0)
+    def _seen(self, depth: Any, pixel: int) -> Any:
+        """Return s, the part of a splat that surfaces in front of it let through."""
+        Float = type(depth)
+        farther_first = reversed(self.bound[pixel])
+        nearer_rests = [*reversed([rest for _, rest in self.bound[pixel][:-1]]), Float(1)]
+        seen = self.bound[pixel][-1][1]
+        for (z, _), rest in zip(farther_first, nearer_rests, strict=True):
+            seen = dr.select(depth <= z, rest, seen)
+        return seen
+
+    def _in_front(self, value: Any, depth: Any, pixel: int) -> list[Any]:
+        """Return a splat's number for each surface that it is in front of, 0 for others."""
+        return [dr.select(depth <= z, value, 0) for z, _ in self.bound[pixel]]
 
 
-def occluded_by(model: ImageModel, surface: Surface, camera: Camera) -> ImageModel:
-    """An image model of splats some of which the surface hides."""
+def occluded_by(model: ImageModel, surfaces: Sequence[Surface], camera: Camera) -> ImageModel:
+    """Return an image model of splats that the surfaces may hide; nearest surface first."""
     grid = TileGrid(camera.width, camera.height)
-    return replace(model, features=OccludedFeatures(model.features, surface, grid))
+    return replace(model, features=OccludedFeatures(model.features, tuple(surfaces), grid))

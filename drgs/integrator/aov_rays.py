@@ -14,7 +14,7 @@ these very points.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import drjit as dr
@@ -115,6 +115,9 @@ class PictureRays:
             has_alpha=True,
             hybrid=hybrid,
         )
+        if hybrid is not None:
+            hybrid = hybrid.with_surfaces(view.num_surfaces())
+            view = replace(view, hybrid=hybrid)
         channels = self._gathered(view.channels(view.planes(), constant_background(integrator)))
         integrator.memory.forget_view(NESTED)
         if hybrid is not None:
@@ -133,15 +136,12 @@ class PictureRays:
 
         hybrid: see ``drgs.integrator.surfaces.Hybrid``, whose own channels are at the end.
         """
-        # Of the base class, as integrators written in Python have another signature.
-        radiance, *_ = mi.SamplingIntegrator.sample(
-            hybrid.integrator, hybrid.scene, sampler, self.ray, None, active
-        )
-        if hybrid.insertion.display_space:
-            radiance = mi.math.linear_to_srgb(dr.maximum(mi.Color3f(radiance), 0))
-        share = channels[-len(hybrid.insertion.channels)]
-        shown = [dr.fma(share, s, c) for s, c in zip(radiance, channels[:3], strict=True)]
-        return [*shown, *channels[3 : -len(hybrid.insertion.channels)]]
+        insertion = hybrid.insertion
+        aovs, own = channels[3 : -len(insertion.channels)], channels[-len(insertion.channels) :]
+        behind = own[2 * insertion.num_surfaces :] or [mi.Float(0)] * 3
+        pictures = [*map(list, hybrid.radiances(self.ray, sampler, active)), behind]
+        shown = insertion.shown(own, pictures)
+        return [*(s + c for s, c in zip(shown, channels[:3], strict=True)), *aovs]
 
 
 def _look_back(camera: Camera, ray: mi.Ray3f) -> tuple[mi.Point2f, mi.Bool]:

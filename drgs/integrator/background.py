@@ -26,8 +26,6 @@ as so many pictures of itself."""
 class Background(Protocol):
     """What is seen past the splats."""
 
-    opaque: bool  # whether it covers the film: alpha is then 1
-
     def radiance(self, film: mi.Film, camera: Camera, place: mi.Point2f) -> mi.Color3f:
         """At places in the crop window, px."""
 
@@ -37,7 +35,6 @@ class Environment:
     """An emitter that surrounds the scene, in the directions of the camera's rays."""
 
     emitter: mi.Emitter
-    opaque = True  # as in Mitsuba's other integrators, an environment that is seen is covered film
 
     def radiance(self, film: mi.Film, camera: Camera, place: mi.Point2f) -> mi.Color3f:
         """At places in the crop window, px; black where the lens model ends."""
@@ -59,7 +56,6 @@ class StretchedTexture:
     """A texture that is stretched over the whole film."""
 
     texture: mi.Texture
-    opaque = False
 
     def radiance(self, film: mi.Film, camera: Camera, place: mi.Point2f) -> mi.Color3f:
         """At places in the crop window, px."""

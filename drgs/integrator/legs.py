@@ -16,6 +16,7 @@ class Leg:
     start: mi.ShapePtr  # that it leaves
     end: mi.EmitterPtr  # that it reaches, if it is one
     pdf: mi.Float  # of the direction, by solid angle; inf: there was no other
+    is_open: mi.Bool  # whether it leaves a scene without an environment: black is the last splat
 
 
 class Light(Protocol):

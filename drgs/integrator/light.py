@@ -31,6 +31,7 @@ from drgs.core.private import same_variables
 from drgs.gaussians.parameters import Gaussians
 from drgs.integrator.legs import Leg, Unlit
 from drgs.integrator.settings import SplatsSettings
+from drgs.integrator.view import decode
 from drgs.light.walk import RaySplats, Segment
 from drgs.splatting.projection import load_rows
 
@@ -78,19 +79,21 @@ class LightOfSplats:
         """See :meth:`drgs.integrator.legs.Light.passed`."""
         segment = _segment(leg.ray, active)
         look = self._sampled if self.num_samples else self._composited
-        color, coverage = look(segment, sample)
-        radiance = color * (self.exposure * coverage)
-        return dr.select(active, radiance, 0), dr.select(active, 1 - coverage, 1)
+        color, coverage = look(segment, leg.is_open, sample)
+        return dr.select(active, self.exposure * color, 0), dr.select(active, 1 - coverage, 1)
 
-    def _composited(self, segment: Segment, sample: mi.Float) -> tuple[mi.Color3f, mi.Float]:
-        """Linear colour, and coverage."""
+    def _composited(
+        self, segment: Segment, is_open: mi.Bool, sample: mi.Float
+    ) -> tuple[mi.Color3f, mi.Float]:
+        """Linear colour, times coverage, and coverage."""
         del sample
         passed = self.splats.passed(segment)
         coverage = 1 - passed.transmittance
-        part = dr.select(coverage > 0, coverage, 1)
-        return mi.math.srgb_to_linear(mi.Color3f(passed.color) / part), coverage
+        return decode(mi.Color3f(passed.color), dr.select(is_open, 1, coverage)), coverage
 
-    def _sampled(self, segment: Segment, sample: mi.Float) -> tuple[mi.Color3f, mi.Float]:
+    def _sampled(
+        self, segment: Segment, is_open: mi.Bool, sample: mi.Float
+    ) -> tuple[mi.Color3f, mi.Float]:
         """Estimates of the same."""
         seed = dr.reinterpret_array(mi.UInt32, sample)
         drawn = self.splats.sampled(segment, seed, self.num_samples)
@@ -100,13 +103,15 @@ class LightOfSplats:
             color = dr.select(one.exists, mi.Color3f(one.color), 0)
             sums = [s + color**k for k, s in enumerate(sums, 1)]
         s1, s2, s3 = sums
-        h = dr.maximum(hits, 1)
+        h = dr.select(is_open, self.num_samples, dr.maximum(hits, 1))
         mean = s1 / h
         square = dr.select(h > 1, (s1 * s1 - s2) / dr.maximum(h * (h - 1), 1), mean * mean)
         cube = (s1 * s1 * s1 - 3 * s1 * s2 + 2 * s3) / dr.maximum(h * (h - 1) * (h - 2), 1)
         cube = dr.select(h > 2, cube, mean * square)
         a, b, c = DECODING
-        return a * mean + b * square + c * cube, hits / self.num_samples
+        coverage = hits / self.num_samples
+        decoded = a * mean + b * square + c * cube
+        return dr.select(is_open, 1, coverage) * decoded, coverage
 
     def transmittance(self, leg: Leg, sample: mi.Float, active: mi.Bool) -> mi.Float:
         """An estimate of that of the splats along legs.

@@ -55,7 +55,7 @@ class Picture:
         seed, spp: as ``mi.render`` has them; 0 samples per pixel: those of the sensor's sampler.
         """
         hybrid = hybrid_of(integrator, scene, sensor, seed, spp)
-        names = integrator.aov_names() + ([] if hybrid is None else hybrid.insertion.channels)
+        names = integrator.aov_names()
         film, spp = sensor.film(), spp or sensor.sampler().sample_count()
         poses = 1 if "motion" in integrator.ignore else max(map(num_poses, sensors_of(sensor)))
         nested_spp = 0 if hybrid is None else hybrid.spp or spp
@@ -79,7 +79,7 @@ class Picture:
             hybrid=hybrid,
         )
         if not is_batch(sensor):
-            return Picture([whole], samples, hybrid)
+            return Picture([whole], samples, hybrid)._with_surfaces()
         from drgs.integrator.batch import SideBySide
 
         batch = SideBySide.of(sensor)
@@ -93,14 +93,22 @@ class Picture:
             )
             for index, one in enumerate(batch.sensors)
         ]
-        return Picture(views, samples, hybrid, batch)
+        return Picture(views, samples, hybrid, batch)._with_surfaces()
+
+    def _with_surfaces(self) -> Picture:
+        """Return the same with channels for all surfaces that are seen one through the other."""
+        if self.hybrid is None:
+            return self
+        hybrid = self.hybrid.with_surfaces(max(view.num_surfaces() for view in self.views))
+        self.samples.aovs += hybrid.insertion.channels
+        return replace(self, views=[replace(v, hybrid=hybrid) for v in self.views], hybrid=hybrid)
 
     def image(self) -> mi.TensorXf:
         """The developed picture."""
         image = self._image_of_splats()
         if self.hybrid is None:
             return image
-        return self.hybrid.insertion.develop(image, self.hybrid.picture())
+        return self.hybrid.insertion.develop(image, self.hybrid.pictures())
 
     def backward(self, params: object, grad_in: mi.TensorXf) -> rendering.GaussianGradients:
         """Derivatives with respect to the Gaussians; all others are accumulated.
@@ -109,7 +117,7 @@ class Picture:
         image.
         """
         if self.hybrid is not None:
-            own, nested = self._image_of_splats(), self.hybrid.picture()
+            own, nested = self._image_of_splats(), self.hybrid.pictures()
             grad_in, d_nested = self.hybrid.insertion.adjoint(own, nested, grad_in)
         d_passes = self.samples.adjoint(grad_in)
         gradients = [
@@ -142,8 +150,8 @@ class Picture:
             d_image = dr.grad(image)
         if self.hybrid is None:
             return d_image
-        nested = self.hybrid.picture()
-        d_nested = self.hybrid.tangent(params, nested)
+        nested = self.hybrid.pictures()
+        d_nested = self.hybrid.tangents(params, nested)
         return self.hybrid.insertion.tangent(dr.detach(image), nested, d_image, d_nested)
 
     def _image_of_splats(self) -> mi.TensorXf:
@@ -169,6 +177,7 @@ def hybrid_of(
     if all(shape.is_ellipsoids() for shape in scene.shapes()):
         return None
     from drgs.integrator.surfaces import Hybrid, Insertion, Surfaces
+    from drgs.integrator.transparency import StraightRays
 
     memory, hide_emitters = integrator.memory, integrator.hide_emitters
     surfaces = memory.surfaces = Surfaces.of(scene, memory.surfaces)
@@ -188,8 +197,9 @@ def hybrid_of(
         shows_background=not hide_emitters and scene.environment() is not None,
         display_space=not integrator.srgb_primitives,
     )
-    traced = surfaces.traced(scene)
-    return Hybrid(traced, surfaces, nested, sensor, seed, integrator.nested_spp or spp, insertion)
+    traced, count = surfaces.traced(scene), integrator.nested_spp or spp
+    rays = StraightRays(traced, hide_emitters, hide_emitters or surfaces.is_transparent)
+    return Hybrid(traced, surfaces, nested, sensor, seed, count, insertion, rays)
 
 
 def sensors_of(sensor: mi.Sensor) -> list[mi.Sensor]:

@@ -71,7 +71,9 @@ class LightOfProbes:
         seen, is_asked, is_reversed = self._look(leg, active)
         is_known = is_asked & seen.is_known
         radiance, T = self.unseen.passed(leg, sample, is_asked & ~seen.is_known)
-        radiance = dr.select(is_known, self.exposure * mi.Color3f(seen.color), radiance)
+        color = mi.Color3f(seen.color)
+        color = dr.select(leg.is_open, _over_black(color, seen.coverage), color)
+        radiance = dr.select(is_known, self.exposure * color, radiance)
         # An emitter knows how much of its light arrives, but not how splats look from elsewhere.
         radiance = dr.select(is_reversed, 0, radiance)
         return radiance, dr.select(is_known, 1 - seen.coverage, T)
@@ -143,6 +145,12 @@ def _center(node: mi.Object) -> list[float]:
             f"{node.id()!r}, which is infinitely far away"
         )
     return np.array(box.center(), np.float64).ravel().tolist()
+
+
+def _over_black(color: mi.Color3f, coverage: mi.Float) -> mi.Color3f:
+    """D(C), of A D(C / A) and A: with black as the last splat."""
+    display = mi.math.linear_to_srgb(color / dr.select(coverage > 0, coverage, 1))
+    return mi.math.srgb_to_linear(coverage * display)
 
 
 def _decoded(color: list[mi.Float]) -> list[mi.Float]:

@@ -30,6 +30,7 @@ from drgs.gaussians.quaternions import quat_to_rotation
 from drgs.integrator.light import ray_splats_of
 from drgs.integrator.settings import SplatsSettings
 from drgs.integrator.surfaces import Surfaces, scene_of
+from drgs.integrator.transparency import StraightRays, has_transparent_parts
 from drgs.light.walk import RaySplats, Segment
 from drgs.splatting.projection import load_rows
 
@@ -73,8 +74,8 @@ class Shadows:
         ):
             return last
         estimate = _Estimate(
-            scene=scene_of(surfaces.objects),
-            without=scene_of(_without(surfaces.objects, names)),
+            scene=_rays_through(surfaces.objects),
+            without=_rays_through(_without(surfaces.objects, names)),
             splats=ray_splats_of(gaussians, integrator.approximations, degree=0),
         )
         ratio = estimate.ratios(gaussians)
@@ -92,12 +93,17 @@ def _without(objects: Sequence[mi.Object], names: Sequence[str]) -> list[mi.Obje
     return [node for node in objects if node.id() not in names]
 
 
+def _rays_through(objects: Sequence[mi.Object]) -> StraightRays:
+    scene = scene_of(list(objects))
+    return StraightRays(scene, False, has_transparent_parts(scene))
+
+
 @dataclass(frozen=True)
 class _Estimate:
     """Irradiance of splats with and without objects."""
 
-    scene: mi.Scene
-    without: mi.Scene
+    scene: StraightRays
+    without: StraightRays
     splats: RaySplats
 
     def ratios(self, gaussians: Gaussians) -> mi.Color3f:
@@ -106,7 +112,7 @@ class _Estimate:
         means, normals = mi.Point3f(rows.means), _shortest_axes(rows.quats, rows.log_scales)
         dr.eval(means, normals)
         ratio = dr.ones(mi.Color3f, gaussians.num_gaussians)
-        if not self.scene.emitters():
+        if not self.scene.scene.emitters():
             return ratio
         lit, dark = self._irradiance(means, normals, _unhindered)
         shaded = dr.compress(dr.max(dark) > LEAST * dr.max(lit + dark))
@@ -131,16 +137,18 @@ class _Estimate:
         place.p = points
 
         def body(k: mi.UInt32, lit: mi.Color3f, dark: mi.Color3f, sampler: mi.Sampler) -> tuple:
-            ds, weight = self.scene.sample_emitter_direction(place, sampler.next_2d(), False, True)
+            ds, weight = self.scene.scene.sample_emitter_direction(
+                place, sampler.next_2d(), False, True
+            )
             cosine = dr.dot(normals, ds.d)  # the normal is as long as the splat is thick
             start = points + AHEAD * dr.sign(cosine) * normals
             ray = mi.Ray3f(start, ds.d, ds.dist * (1 - mi.math.ShadowEpsilon), 0, [])
             weight *= dr.abs(cosine) * dr.rcp(dr.norm(normals))
             weight *= let_through(ray, sampler.next_1d())
-            is_lit = ~self.scene.ray_test(ray)
-            is_held = ~is_lit & ~self.without.ray_test(ray)
-            lit = lit + dr.select(is_lit, weight, 0)
-            dark = dark + dr.select(is_held, weight, 0)
+            passes = self.scene.transmittance(ray, mi.Bool(True))
+            held = dr.maximum(self.without.transmittance(ray, passes < 1) - passes, 0)
+            lit = lit + passes * weight
+            dark = dark + dr.select(passes < 1, held * weight, 0)
             return k + 1, lit, dark, sampler
 
         zero = dr.zeros(mi.Color3f, dr.width(points))

@@ -28,7 +28,8 @@ from drgs.splatting.image_model import Positions
 
 if TYPE_CHECKING:  # imported where a scene calls for them
     from drgs.integrator.background import Background
-    from drgs.integrator.surfaces import Hybrid, SeenSurface
+    from drgs.integrator.surfaces import Hybrid
+    from drgs.integrator.visible_surfaces import Layers
 
 Passes = list[Channels]
 """Channels by sample per pixel."""
@@ -114,53 +115,70 @@ class View:
         behind = self._behind(constant)
         traced = self.integrator.memory.rendered[self.index].traced
         seen = repeat(repeat(None)) if traced is None else traced.seen
-
-        def channels_of(
-            planes: list[Any],
-            surface: SeenSurface | None,
-            color: mi.Color3f,
-            radiance: mi.Color3f | None,
-        ) -> Channels:
-            if surface is None:
-                return self._composited(planes, color, behind.opaque)
-            *planes, front = planes
-            past = [(1 - surface.coverage) * planes[0], *planes[1:]]
-            own = self._composited(
-                past, color, behind.opaque, lambda kind: surface.aov_values(kind, front)
-            )
-            return own + self.hybrid.insertion.values(surface, front, radiance)
-
         by_time = zip(planes, seen, behind.colors, behind.radiance, strict=False)
         channels = [
-            [channels_of(*sample) for sample in zip(*time, strict=False)] for time in by_time
+            [self._channels_of(behind, *sample) for sample in zip(*time, strict=False)]
+            for time in by_time
         ]
         return channels[0] if len(channels) == 1 else _mean(channels)
+
+    def _channels_of(
+        self,
+        behind: _Behind,
+        planes: list[Any],
+        layers: Layers | None,
+        color: mi.Color3f,
+        radiance: mi.Color3f | None,
+    ) -> Channels:
+        """Channels of one sample; layers: surfaces that it sees, None where there are none."""
+        if layers is None:
+            return self._composited(planes, mi.Float(1), behind, color)
+        from drgs.integrator.visible_surfaces import rest_behind
+
+        planes, fronts = planes[: -len(layers)], planes[-len(layers) :]
+        pairs = list(zip(layers, fronts, strict=True))
+        whole = mi.Float(1)
+        for surface, front in pairs:
+            whole = whole - surface.share(front)
+
+        def of_surfaces(kind: str) -> Channels | None:
+            values = [surface.aov_values(kind, front) for surface, front in pairs]
+            return None if values[0] is None else list(map(sum, zip(*values, strict=True)))
+
+        past = [rest_behind(layers) * planes[0], *planes[1:]]
+        own = self._composited(past, whole, behind, color, of_surfaces)
+        return own + self.hybrid.insertion.values(layers, fronts, radiance)
 
     def _composited(
         self,
         planes: list[Any],
-        behind: mi.Color3f,
-        opaque: bool,
-        of_surface: Callable[[str], Channels | None] = lambda kind: None,
+        whole: mi.Float,
+        behind: _Behind,
+        color_behind: mi.Color3f,
+        of_surfaces: Callable[[str], Channels | None] = lambda kind: None,
     ) -> Channels:
         """Planes of pixels: red, green, blue, perhaps alpha, AOVs.
 
-        of_surface: what a surface contributes to the channels of an AOV of this kind.
+        whole: sum of the weights of splats and background, 1 less the shares of surfaces;
+        of_surfaces: what surfaces contribute to the channels of an AOV of this kind.
         """
         transmittance, red, green, blue, *others = planes
-        color = mi.Color3f(red, green, blue)
-        if self.integrator.srgb_primitives:
-            color = mi.math.srgb_to_linear(color)
-        channels = list(dr.fma(transmittance, behind, color))
+        color, alpha = mi.Color3f(red, green, blue), 1 - transmittance
+        if not self.integrator.srgb_primitives:
+            color = dr.fma(transmittance, color_behind, color)
+        elif behind.is_radiance:
+            color = dr.fma(transmittance, color_behind, decode(color, whole - transmittance))
+        else:  # the background is the last splat
+            color = decode(dr.fma(transmittance, color_behind, color), whole)
+        channels = list(color)
         if self.has_alpha:
-            alpha = 1 - transmittance
-            channels.append(dr.full(mi.Float, 1, dr.width(alpha)) if opaque else alpha)
+            channels.append(dr.full(mi.Float, 1, dr.width(alpha)) if behind.is_radiance else alpha)
         for kind in self.integrator.aovs.values():
             if kind == "alpha":
-                channels.append(1 - transmittance)
+                channels.append(alpha)
                 continue
             values = [others.pop(0) for _ in self.integrator.channels_of(kind)]
-            more = of_surface(kind)
+            more = of_surfaces(kind)
             if more is not None:
                 values = [a + b for a, b in zip(values, more, strict=True)]
             channels += values
@@ -171,9 +189,8 @@ class View:
         integrator = self.integrator
         environment = None if integrator.hide_emitters else self.scene.environment()
         if environment is None and constant is not None:
-            if integrator.srgb_primitives:
-                constant = mi.math.srgb_to_linear(constant)
-            return _Behind(repeat(repeat(constant)), opaque=False, radiance=repeat(repeat(None)))
+            nothing = repeat(repeat(None))
+            return _Behind(repeat(repeat(constant)), is_radiance=False, radiance=nothing)
         from drgs.integrator.background import Environment, StretchedTexture, seen_by
 
         if environment is not None:
@@ -185,9 +202,9 @@ class View:
         if state.is_attached:
             cameras = self._attached_cameras(state)
         colors = radiance = seen_by(self.sensor.film(), behind, cameras, self.within)
-        if not integrator.srgb_primitives:
+        if environment is None or not integrator.srgb_primitives:
             colors = [[mi.math.linear_to_srgb(color) for color in of_time] for of_time in colors]
-        return _Behind(colors, behind.opaque, radiance)
+        return _Behind(colors, environment is not None, radiance)
 
     # ------------------------------------------------------------------------------------------
     # Frames
@@ -215,7 +232,7 @@ class View:
 
     def _traced_surfaces(self, state: SensorState) -> TracedSurfaces:
         """What is seen of the scene's surfaces, traced unless the last time was the same."""
-        from drgs.integrator.surfaces import trace_surfaces
+        from drgs.integrator.visible_surfaces import trace_surfaces
 
         surfaces, kept = self.hybrid.surfaces, self.integrator.memory.traced
         settings = self.key, self.integrator.hide_emitters, self.sensor.far_clip()
@@ -223,15 +240,18 @@ class View:
         last = kept.get(self.index)
         if last is None or not last.matches(*key):
             seen = trace_surfaces(
-                self.hybrid.scene,
+                self.hybrid.rays,
                 self.sensor,
                 self._cameras(state),
                 self.within,
-                self.integrator.hide_emitters,
                 with_normals="normal" in self.integrator.aovs.values(),
             )
             last = kept[self.index] = TracedSurfaces(*key, seen)
         return last
+
+    def num_surfaces(self) -> int:
+        """Number of surfaces that are seen one through the other."""
+        return len(self._traced_surfaces(self._state().detached()).seen[0][0])
 
     def _state(self) -> SensorState:
         return read_sensor(self.sensor, self.integrator.near)
@@ -273,9 +293,19 @@ def _mean(passes: Sequence[Passes]) -> Passes:
 class _Behind:
     """What is seen past the splats."""
 
-    colors: Iterable[Iterable[mi.Color3f]]  # by time and by sample, in the channels' space
-    opaque: bool  # whether it covers the film
-    radiance: Iterable[Iterable[mi.Color3f | None]]  # the same, linear; None: of a constant
+    colors: Iterable[Iterable[mi.Color3f]]  # by time and by sample; display space, or see below
+    is_radiance: bool  # of an environment: it covers the film, and its colours are linear where
+    # the channels are
+    radiance: Iterable[Iterable[mi.Color3f | None]]  # linear, of an environment or a texture
+
+
+def decode(color: mi.Color3f, coverage: mi.Float) -> mi.Color3f:
+    """Return the linear radiance of splats, A D(C / A), where something else may be behind them.
+
+    color: C, display space, premultiplied; coverage: A, the sum of the weights.
+    """
+    covered = coverage > 0
+    return coverage * mi.math.srgb_to_linear(color / dr.select(covered, coverage, 1))
 
 
 def _render(
@@ -283,7 +313,7 @@ def _render(
     camera: Camera,
     pipeline: rendering.Pipeline,
     positions: Sequence[Positions],
-    surfaces: Sequence[SeenSurface] | None,
+    surfaces: Sequence[Layers] | None,
 ) -> list[rendering.Frame]:
     """A frame for each sample per pixel; surfaces: what is seen of them at each."""
     pipeline = composed(pipeline, gaussians, camera)
@@ -292,8 +322,8 @@ def _render(
         from drgs.effects.occlusion import occluded_by
 
         models = [
-            occluded_by(model, surface, camera)
-            for model, surface in zip(models, surfaces, strict=True)
+            occluded_by(model, layers, camera)
+            for model, layers in zip(models, surfaces, strict=True)
         ]
         pipeline = replace(pipeline, features=(*pipeline.features, rendering.depth_feature))
     first, *others = models

@@ -836,22 +836,23 @@ def sampling_rates(means: np.ndarray, cameras: Sequence[Camera]) -> np.ndarray:
 
 @dataclass(frozen=True)
 class SurfacePicture:
-    """What a camera sees of splats and of a surface between them."""
+    """What a camera sees of splats and of surfaces between them."""
 
     color: np.ndarray  # (H, W, 3) display space, of the splats: premultiplied
+    coverage: np.ndarray  # (H, W) sum of the weights that ``color`` was premultiplied with
     depth: np.ndarray  # (H, W) sum of weights times depths of the splats, world units
-    before: np.ndarray  # (H, W) transmittance in front of the surface
+    before: np.ndarray  # (K, H, W) transmittance of the splats in front of each surface
     transmittance: np.ndarray  # (H, W) share of the background that is seen past all
 
 
-def render_with_surface(
-    gaussians: Gaussians, camera: Camera, surface_depth: np.ndarray, coverage: np.ndarray
+def render_with_surfaces(
+    gaussians: Gaussians, camera: Camera, surfaces: Sequence[tuple[np.ndarray, np.ndarray]]
 ) -> SurfacePicture:
-    """Composite splats, front to back, and a surface as one more layer of alpha ``coverage``.
+    """Composite splats and K surfaces front to back, a surface as one more layer.
 
-    surface_depth (H, W) camera z, world units; coverage (H, W) in [0, 1]. A splat is behind the
-    surface where its mean's depth is larger. Which splat is the last that a pixel composites is
-    decided as without the surface.
+    surfaces: nearest first, depth (H, W) camera z, world units, and alpha (H, W) in [0, 1]. A splat
+    is behind a surface where its mean's depth is larger. Which splat is the last that a pixel
+    composites is decided as without surfaces.
     """
     splats = reference.project(gaussians, camera)
     colors = reference.sh_colors(gaussians, camera, gaussians.sh_degree)
@@ -859,13 +860,24 @@ def render_with_surface(
     order = order[np.argsort(splats.depths[order], kind="stable")]
     shape = camera.height, camera.width
     y, x = np.mgrid[: camera.height, : camera.width] + 0.5
-    color, depth, before = np.zeros((*shape, 3)), np.zeros(shape), np.ones(shape)
-    seen, without = np.ones(shape), np.ones(shape)  # transmittance with and without the surface
-    passed, finished = np.zeros(shape, dtype=bool), np.zeros(shape, dtype=bool)
+    color, depth, coverage = np.zeros((*shape, 3)), np.zeros(shape), np.zeros(shape)
+    seen, without = np.ones(shape), np.ones(shape)  # transmittance with and without surfaces
+    finished = np.zeros(shape, dtype=bool)
+    before = np.ones((len(surfaces), *shape))
+    passed = np.zeros((len(surfaces), *shape), dtype=bool)
+
+    def pass_surfaces(behind: np.ndarray) -> np.ndarray:
+        """The transmittance behind the surfaces that a splat (of the mask ``behind``) is behind."""
+        through = seen
+        for k, (_, alpha) in enumerate(surfaces):
+            passes = behind[k] & ~passed[k]
+            before[k] = np.where(passes, without, before[k])
+            through = np.where(passes, through * (1 - alpha), through)
+            passed[k] |= behind[k]
+        return through
+
     for i in order:
-        behind = splats.depths[i] > surface_depth
-        seen = np.where(behind & ~passed, seen * (1 - coverage), seen)
-        passed |= behind
+        seen = pass_surfaces(np.array([splats.depths[i] > z for z, _ in surfaces]))
         offset = np.stack([x, y], axis=-1) - splats.means2d[i]
         exponent = -0.5 * np.einsum("...a,ab,...b", offset, splats.conics[i], offset)
         alpha = np.minimum(splats.opacities[i] * np.exp(exponent), reference.ALPHA_MAX)
@@ -873,8 +885,8 @@ def render_with_surface(
         finished |= (alpha > 0) & (without * (1 - alpha) < reference.TRANSMITTANCE_STOP)
         alpha = np.where(finished, 0, alpha)
         color += (seen * alpha)[..., None] * colors[i]
+        coverage += seen * alpha
         depth += seen * alpha * splats.depths[i]
-        before = np.where(passed, before, before * (1 - alpha))
         seen, without = seen * (1 - alpha), without * (1 - alpha)
-    seen = np.where(passed, seen, seen * (1 - coverage))
-    return SurfacePicture(color, depth, before, seen)
+    seen = pass_surfaces(np.ones_like(passed))
+    return SurfacePicture(color, coverage, depth, before, seen)

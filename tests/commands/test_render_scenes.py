@@ -42,9 +42,8 @@ def test_a_mitsuba_scene_becomes_linear_exr_and_srgb_png(tmp_path):
     pose = pose_around(0.8, 0.3)
     run(write_scene(tmp_path, sensor(pose)), "--out", tmp_path / "out")
     assert visible(tmp_path / "out") == {"blobs.exr", "blobs.png"}
-    # The integrator decodes premultiplied splats and background apart; white stays 1.
     picture_on_black = photograph(blobs(), small_view("", pose, None), (0, 0, 0))
-    linear = to_linear(picture_on_black.image) + picture_on_black.transmittance[..., None]
+    linear = to_linear(picture_on_black.image + picture_on_black.transmittance[..., None])
     exr = np.array(read_exr(tmp_path / "out" / "blobs.exr"))
     assert_pictures_agree(exr, linear, picture_on_black, 1e-4)
     encoded = np.clip(to_srgb(linear), 0, 1)

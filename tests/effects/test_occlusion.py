@@ -27,7 +27,7 @@ from drgs.config.approximations import Approximations
 from drgs.core.arrays import from_host
 from drgs.effects.occlusion import OccludedFeatures, Surface
 from drgs.gaussians.parameters import PARAMETER_NAMES
-from drgs.reference.effects import render_with_surface
+from drgs.reference.effects import render_with_surfaces
 from drgs.splatting import feature_groups, rendering
 from drgs.splatting.grid import TileGrid
 from drgs.splatting.image_model import DEFAULT
@@ -51,14 +51,27 @@ def of(table, precision) -> float:
 
 
 @cache
-def surface_of(case) -> tuple[np.ndarray, np.ndarray]:
-    """Depths (H, W) amid the splats, no one's, and coverages: 0, 1 and between."""
+def surfaces_of(case) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Two surfaces' depths (H, W) amid the splats, no one's, and alphas: 0, 1 and between."""
     rng = np.random.default_rng(2)
     depths = np.sort(reference_depths(case))
     gaps = (depths[1:] + depths[:-1]) / 2
-    z = rng.choice(gaps[len(gaps) // 8 :], (case.height, case.width)) if len(gaps) else depths
-    coverage = rng.choice([0.0, 0.25, 0.625, 1.0], (case.height, case.width))
-    return single(np.resize(z, (case.height, case.width))), coverage
+    shape, surfaces = (case.height, case.width), []
+    for first in (len(gaps) // 8, len(gaps) // 2):
+        z = rng.choice(gaps[first:], shape) if len(gaps) else depths
+        z = single(np.resize(z, shape))
+        z = np.maximum(z, surfaces[0][0]) if surfaces else z
+        surfaces.append((z, rng.choice([0.0, 0.25, 0.625, 1.0], shape)))
+    return surfaces
+
+
+def on_device(surfaces, precision) -> tuple[Surface, ...]:
+    """The same with the part of all light that each stops, in place of its alpha."""
+    found, rest = [], 1.0
+    for z, alpha in surfaces:
+        found.append(Surface(*(from_host(precision.Float, p.ravel()) for p in (z, rest * alpha))))
+        rest = rest * (1 - alpha)
+    return tuple(found)
 
 
 def reference_depths(case) -> np.ndarray:
@@ -69,8 +82,8 @@ def reference_depths(case) -> np.ndarray:
 
 
 def occluded_pipeline(case, precision, features=DEFAULT.features, degree=None):
-    surface = Surface(*(from_host(precision.Float, p.ravel()) for p in surface_of(case)))
-    features = OccludedFeatures(features, surface, TileGrid(case.width, case.height))
+    surfaces = on_device(surfaces_of(case), precision)
+    features = OccludedFeatures(features, surfaces, TileGrid(case.width, case.height))
     return replace(
         case.pipeline,
         model=replace(DEFAULT, features=features),
@@ -79,13 +92,13 @@ def occluded_pipeline(case, precision, features=DEFAULT.features, degree=None):
 
 
 def expected_planes(case, gaussians=None) -> np.ndarray:
-    """(6, H W): the splats' own transmittance, color, depth, weights in front."""
-    picture = render_with_surface(gaussians or case.gaussians, case.camera, *surface_of(case))
+    """(7, H W): the splats' own transmittance, color, depth, weights in front of each surface."""
+    picture = render_with_surfaces(gaussians or case.gaussians, case.camera, surfaces_of(case))
     from drgs.reference import splatting as reference
 
     plain = reference.render(gaussians or case.gaussians, case.camera)
     planes = [plain.transmittance, *np.moveaxis(picture.color, -1, 0), picture.depth]
-    return np.reshape([*planes, 1 - picture.before], (6, -1))
+    return np.reshape([*planes, *(1 - picture.before)], (7, -1))
 
 
 def render(case, precision):
@@ -101,7 +114,7 @@ def test_planes_are_those_of_the_reference(precision, case):
     _, frame = render(case, precision)
     planes = rows(frame.planes()).T
     expected = expected_planes(case)
-    names = ("transmittance", "red", "green", "blue", "depth", "front")
+    names = ("transmittance", "red", "green", "blue", "depth", "front", "second front")
     assert_arrays_agree(
         dict(zip(names, planes, strict=True)),
         dict(zip(names, expected, strict=True)),
@@ -111,14 +124,12 @@ def test_planes_are_those_of_the_reference(precision, case):
 
 @all_cases
 def test_what_is_seen_past_all_follows_from_the_planes(case):
-    """The reference composites the surface as a layer; the kernels scale."""
+    """The reference composites surfaces as layers; the kernels scale."""
     case = clear(case)
-    _, coverage = surface_of(case)
-    picture = render_with_surface(case.gaussians, case.camera, *surface_of(case))
+    rest = np.prod([1 - alpha.ravel() for _, alpha in surfaces_of(case)], axis=0)
+    picture = render_with_surfaces(case.gaussians, case.camera, surfaces_of(case))
     transmittance, *_ = expected_planes(case)
-    np.testing.assert_allclose(
-        picture.transmittance.ravel(), transmittance * (1 - coverage.ravel()), atol=1e-15
-    )
+    np.testing.assert_allclose(picture.transmittance.ravel(), transmittance * rest, atol=1e-15)
 
 
 @both_precisions
@@ -176,14 +187,13 @@ def test_with_approximations_what_is_covered_is_the_mixture(approximations):
     case = clear(CASES[0])
     gaussians = device_gaussians(case.gaussians, FLOAT64)
     camera = device_camera(case.camera, FLOAT64)
-    z, coverage = surface_of(case)
+    z, coverage = surfaces_of(case)[0]
     plain = pipeline_of(Approximations(**approximations), 2, features=case.pipeline.features)
 
     def planes(amount):
-        surface = Surface(*(from_host(FLOAT64.Float, p.ravel()) for p in (z, amount)))
-        features = OccludedFeatures(
-            plain.model.features, surface, TileGrid(case.width, case.height)
-        )
+        surfaces = on_device([(z, amount)], FLOAT64)
+        grid = TileGrid(case.width, case.height)
+        features = OccludedFeatures(plain.model.features, surfaces, grid)
         pipeline = replace(
             plain,
             model=replace(plain.model, features=features),

@@ -359,16 +359,14 @@ def test_two_pictures_have_twice_the_derivatives_of_one(name):
 
 
 def test_derivatives_in_linear_radiance():
-    """The conversion to what films expect is behind the splats, and before the background."""
+    """The conversion to what films expect comes after the background, the last splat."""
     case, scene = CASES["perspective"], clear_scene("perspective")
 
     def picture(step):
         camera = camera_of(case.view, {"turn": step})
         premultiplied = reference.render(scene.gaussians, camera, np.zeros(3))
-        behind = premultiplied.transmittance[..., None] * to_linear(BACKGROUND)
-        return np.concatenate(
-            [to_linear(premultiplied.image) + behind, premultiplied.alpha[..., None]], axis=-1
-        )
+        whole = premultiplied.image + premultiplied.transmittance[..., None] * BACKGROUND
+        return np.concatenate([to_linear(whole), premultiplied.alpha[..., None]], axis=-1)
 
     expected = (picture(STEP) - picture(-STEP)) / (2 * STEP)
     weights = weights_like(expected)

@@ -79,14 +79,17 @@ def test_a_disc_holds_off_its_part_of_the_sky(height, radius, monkeypatch):
     np.testing.assert_allclose(higher, factor[:, None, :] * np.ones_like(higher), rtol=1e-4)
 
 
-def test_a_lamp_is_shaded_where_the_object_is_before_it():
-    """Sharply, as it is a point: behind the edge of the shadow all is as it was."""
+@pytest.mark.parametrize("pane", [None, 3.0, 1.0], ids=["alone", "pane above", "pane below"])
+def test_a_lamp_is_shaded_where_the_object_is_before_it(pane):
+    """Sharply, as it is a point: behind the edge of the shadow all is as it was. A pane that lets
+    everything pass makes no difference."""
     x = np.linspace(-2, 2, 81)
     means = np.stack([x, 0 * x, 0 * x], axis=1)
     lamp = {"type": "point", "position": [0.0, 0.0, 4.0]}
-    factor, _ = factors(
-        scene_of(discs(means), "lid", lid=disc(2.0, 0.5), lamp=lamp, floor=disc(-0.05, 50.0))
-    )
+    objects = {"lid": disc(2.0, 0.5), "lamp": lamp, "floor": disc(-0.05, 50.0)}
+    if pane is not None:
+        objects["pane"] = disc(pane, 50.0) | {"bsdf": {"type": "null"}}
+    factor, _ = factors(scene_of(discs(means), "lid", **objects))
     inside = np.abs(x) < 0.98
     np.testing.assert_allclose(factor[inside], 0, atol=1e-6)
     np.testing.assert_array_equal(factor[np.abs(x) > 1.02], 1)

@@ -75,7 +75,8 @@ def test_surfaces_alone_look_as_by_path(max_depth):
     assert deviation.max() < 6 and np.sqrt((deviation**2).mean()) < 1.2
 
 
-def test_a_mirror_shows_the_mirrored_gaussians():
+@pytest.mark.parametrize("has_sky", [False, True])
+def test_a_mirror_shows_the_mirrored_gaussians(has_sky):
     """Exactly: all splats are composited, and one path is as good as many."""
     rng = np.random.default_rng(0)
     means = rng.normal(0, 0.5, (20, 3)) * [1, 1, 0.5] + [0, 0, 6]
@@ -88,12 +89,14 @@ def test_a_mirror_shows_the_mirrored_gaussians():
         },
         "sensor": camera([0, 0, 4], [0, 0, 0], up=[0, 1, 0]),
     }
+    if has_sky:
+        mirror["sky"] = {"type": "constant", "radiance": {"type": "rgb", "value": 0.0}}
     origins, directions = pixel_rays(mi.load_dict(mirror["sensor"]))
     picture = along_rays(scene_of(splats, light_samples=0, **mirror), origins, directions)
     mirrored = gaussians(means * [1, 1, -1], 0.3, 0.7)
     mirrored = splatting.Gaussians(**{**vars(splats), "means": mirrored.means})
     seen = reference.pass_splats(mirrored, origins, directions, np.full(len(origins), np.inf))
-    expected = radiance_of(seen)
+    expected = radiance_of(seen, is_open=not has_sky)
     np.testing.assert_allclose(picture, expected, atol=2e-4)
     assert expected.max() > 0.3
 

@@ -27,7 +27,7 @@ def scene_of(splats, light="rays", max_depth=8, nested="splatpath", spp=64, **ot
     """The objects of ``others`` among the splats, and their camera at ``sensor``."""
     settings = {
         key: others.pop(key)
-        for key in ("light_samples", "exposure", "probes", "unseen")
+        for key in ("light_samples", "exposure", "probes", "unseen", "shadows", "aovs")
         if key in others
     }
     tensors = {k: mi.TensorXf(v.astype(np.float32)) for k, v in vars(splats).items()}
@@ -91,10 +91,11 @@ def _columns(values):
     return [mi.Float(np.ascontiguousarray(column, np.float32)) for column in values.T]
 
 
-def radiance_of(seen):
+def radiance_of(seen, is_open=True):
+    """Radiance of what the reference's rays pass; is_open: black is behind it, and no radiance."""
     coverage = 1 - seen.transmittances[:, None]
-    color = seen.colors / np.where(coverage > 0, coverage, 1)
-    return coverage * linear(color)
+    whole = np.ones_like(coverage) if is_open else np.where(coverage > 0, coverage, 1)
+    return whole * linear(seen.colors / whole)
 
 
 def linear(color):

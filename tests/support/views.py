@@ -175,6 +175,12 @@ def to_linear(x) -> np.ndarray:
     return np.where(x <= 0.04045, x / 12.92, ((np.maximum(x, 0) + 0.055) / 1.055) ** 2.4)
 
 
+def decode(color, coverage) -> np.ndarray:
+    """A D(C / A): linear radiance of premultiplied colours (H, W, 3) of a coverage (H, W)."""
+    covered = np.where(coverage > 0, coverage, 1)[..., None]
+    return coverage[..., None] * to_linear(color / covered)
+
+
 def to_linear_derivative(x) -> np.ndarray:
     """Its derivative."""
     x = np.asarray(x, dtype=np.float64)
@@ -244,27 +250,24 @@ class Scene:
         """The developed RGBA image (H, W, 4) of the window: linear radiance if so set."""
         picture = picture or self.picture
         decode = to_linear if self.srgb_primitives else np.asarray
-        color = decode(picture.image) + picture.transmittance[..., None] * decode(self.background)
+        color = decode(picture.image + picture.transmittance[..., None] * self.background)
         return np.concatenate([color, picture.alpha[..., None]], axis=-1)[self.view.window]
 
     def gradients(self, weights) -> dict[str, np.ndarray]:
         """Gradients of sum(weights * image()), weights (H, W, 4), by the reference.
 
         With P the premultiplied picture, D the decoding and B the background, the image is
-        D(P) + T D(B), and alpha is 1 - T.
+        D(P + T B), and alpha is 1 - T.
         """
         d_window = np.zeros((self.view.height, self.view.width, 4))
         d_window[self.view.window] = weights
         d_image, d_alpha = d_window[..., :3], d_window[..., 3]
-        background = np.array(self.background)
-        d_background = np.einsum("hw,hwc->c", self.picture.transmittance, d_image)
-        behind = background
+        background, transmittance = np.array(self.background), self.picture.transmittance
         if self.srgb_primitives:
-            behind = to_linear(background)
-            d_background = d_background * to_linear_derivative(background)
-        d_alpha = d_alpha - d_image @ behind
-        if self.srgb_primitives:
-            d_image = d_image * to_linear_derivative(self.picture.image)
+            whole = self.picture.image + transmittance[..., None] * background
+            d_image = d_image * to_linear_derivative(whole)
+        d_background = np.einsum("hw,hwc->c", transmittance, d_image)
+        d_alpha = d_alpha - d_image @ background
         gradients = reference.render_gradients(
             self.gaussians, self.camera, np.zeros(3), d_image, d_alpha, None,
             self.rendered_degree, self.antialiased,

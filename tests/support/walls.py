@@ -8,9 +8,9 @@ import numpy as np
 
 import drgs  # noqa: F401  (registers the plugins)
 from drgs.reference import splatting as reference
-from drgs.reference.effects import render_with_surface
+from drgs.reference.effects import render_with_surfaces
 from support.helpers import clear
-from support.views import VIEWS, Scene, tensors, to_linear
+from support.views import VIEWS, Scene, decode, tensors
 
 # As in test_splats: single precision, relative to the largest value of an array. Conversions to
 # display space multiply errors of dark pixels by up to 13.
@@ -92,23 +92,41 @@ def to_display(linear) -> np.ndarray:
     return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
 
 
-def expected(scene, gaussians=None, wall=WALL, coverage=1.0, sky=None) -> dict[str, np.ndarray]:
-    """Planes of the window: color (RGB as the integrator has it), alpha, depth, share."""
+def expected(
+    scene, gaussians=None, wall=WALL, coverage=1.0, sky=None, windows=()
+) -> dict[str, np.ndarray]:
+    """Planes of the window: color (RGB as the integrator has it), alpha, depth, share.
+
+    windows: black walls in front of the first one, with the parts that they stop of what arrives.
+    """
     camera = scene.camera
-    depth = wall.depth(camera)
-    coverage = np.broadcast_to(coverage, depth.shape)
-    picture = render_with_surface(gaussians or scene.gaussians, camera, depth, coverage)
-    share = coverage * picture.before
-    linear = scene.srgb_primitives
-    decode, encode = (to_linear, np.asarray) if linear else (np.asarray, to_display)
-    behind = decode(scene.background) if sky is None else encode(sky)
-    color = decode(picture.color) + share[..., None] * encode(RADIANCE)
+    walls = [*((pane, alpha, np.zeros(3)) for pane, alpha in windows), (wall, coverage, RADIANCE)]
+    layers = [
+        (w.depth(camera), np.broadcast_to(c, (camera.height, camera.width))) for w, c, _ in walls
+    ]
+    picture = render_with_surfaces(gaussians or scene.gaussians, camera, layers)
+    T = picture.transmittance[..., None]
+    if not scene.srgb_primitives:
+        color = picture.color + T * (scene.background if sky is None else to_display(sky))
+    elif sky is None:
+        color = decode(picture.color + T * scene.background, picture.coverage + T[..., 0])
+    else:
+        color = decode(picture.color, picture.coverage) + T * sky
+    depth, light, shares, rest = picture.depth, 0, 0, 1.0
+    for (z, alpha), before, (_, _, radiance) in zip(layers, picture.before, walls, strict=True):
+        share, rest = rest * alpha * before, rest * (1 - alpha)
+        light, shares = light + share[..., None] * radiance, shares + share
+        depth = depth + share * z
+    if not scene.srgb_primitives:  # the mean of what the surfaces show
+        mean = light / np.where(shares > 0, shares, 1)[..., None]
+        light = shares[..., None] * to_display(mean)
+    color = color + light
     planes = {
-        "color": color + picture.transmittance[..., None] * behind,
-        "alpha": 1 - picture.transmittance if sky is None else np.ones_like(share),
-        "depth": picture.depth + share * depth,
-        "share": share,
-        "transmittance": picture.transmittance,
+        "color": color,
+        "alpha": 1 - T[..., 0] if sky is None else np.ones_like(depth),
+        "depth": depth,
+        "share": shares,
+        "transmittance": T[..., 0],
     }
     return {name: plane[scene.view.window] for name, plane in planes.items()}
 

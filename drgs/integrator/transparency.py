@@ -1,0 +1,83 @@
+"""Surfaces that let light pass straight on: ``null``, ``mask``, ``thindielectric``.
+
+Imported when a scene has surfaces. The opacity of a surface at a point is what it does not let pass
+straight on, averaged over red, green and blue. What is less opaque than :data:`INVISIBLE` is not
+there: rays go on as if it were not.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+INVISIBLE = 1e-6
+"""Opacity, of which rounding leaves up to 2e-7 where there is none."""
+
+
+def has_transparent_parts(scene: mi.Scene) -> bool:
+    """Return whether any BSDF of a scene lets light pass straight on."""
+    bsdfs = (node for node in mi.traverse(scene).hierarchy if isinstance(node, mi.BSDF))
+    return any(mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null) for bsdf in bsdfs)
+
+
+@dataclass  # not frozen: ``dr.syntax`` carries it through a loop
+class StraightRays:
+    """Rays through a scene that go straight on until something is visible."""
+
+    scene: mi.Scene
+    hide_emitters: bool  # whether surfaces that are emitters are invisible
+    sees_through: bool  # whether anything in the scene may let light pass
+
+    @dr.syntax
+    def next_visible(
+        self, ray: mi.Ray3f, active: mi.Bool
+    ) -> tuple[mi.Ray3f, mi.PreliminaryIntersection3f, mi.Float]:
+        """Return a ray that starts behind all that is invisible, its hit, and the hit's opacity.
+
+        The opacity is 0 where nothing is hit.
+        """
+        ray = mi.Ray3f(ray)
+        hit = self.scene.ray_intersect_preliminary(ray, coherent=True, active=active)
+        opacity = self._opacity(ray, hit)
+        if dr.hint(self.sees_through, mode="scalar"):
+            goes_on = hit.is_valid() & (opacity <= INVISIBLE)
+            while goes_on:
+                ray = self.behind(ray, hit, goes_on)
+                hit = self.scene.ray_intersect_preliminary(ray, coherent=True, active=goes_on)
+                opacity = self._opacity(ray, hit)
+                goes_on &= hit.is_valid() & (opacity <= INVISIBLE)
+        return ray, hit, opacity
+
+    def behind(self, ray: mi.Ray3f, hit: mi.PreliminaryIntersection3f, active: mi.Bool) -> mi.Ray3f:
+        """Return the rest of rays behind what they hit; ``ray`` where not active."""
+        si = hit.compute_surface_interaction(ray, mi.RayFlags.Minimal, active)
+        rest = mi.Ray3f(ray)
+        rest.o = dr.select(active, si.spawn_ray(ray.d).o, ray.o)
+        rest.maxt = dr.select(active, ray.maxt - hit.t, ray.maxt)
+        return rest
+
+    @dr.syntax
+    def transmittance(self, ray: mi.Ray3f, active: mi.Bool) -> mi.Float:
+        """Return what all surfaces up to the ray's end let pass straight on, 0..1."""
+        if dr.hint(not self.sees_through, mode="scalar"):
+            return dr.select(active & self.scene.ray_test(ray, active), 0, mi.Float(1))
+        ray, passes = mi.Ray3f(ray), dr.full(mi.Float, 1, dr.width(ray))
+        goes_on = mi.Bool(active)
+        while goes_on:
+            hit = self.scene.ray_intersect_preliminary(ray, coherent=False, active=goes_on)
+            passes *= 1 - self._opacity(ray, hit)
+            goes_on &= hit.is_valid() & (passes > INVISIBLE)
+            ray = self.behind(ray, hit, goes_on)
+        return dr.select(passes > INVISIBLE, passes, 0)
+
+    def _opacity(self, ray: mi.Ray3f, hit: mi.PreliminaryIntersection3f) -> mi.Float:
+        """Return the opacity of what is hit; 0 where nothing is."""
+        if not self.sees_through:
+            return dr.select(hit.is_valid(), mi.Float(1), 0)
+        si = hit.compute_surface_interaction(ray, mi.RayFlags.All, hit.is_valid())
+        opacity = dr.mean(1 - si.bsdf().eval_null_transmission(si, hit.is_valid()))
+        if self.hide_emitters:
+            opacity = dr.select(si.shape.is_emitter(), 0, opacity)
+        return dr.select(hit.is_valid(), opacity, 0)

@@ -1,0 +1,223 @@
+"""The surfaces that a camera sees at each pixel: depths, and what they stop of the light behind.
+
+Imported when a scene has surfaces. Rays go from the camera to the first visible surface, and past
+what lets light pass straight on (``null``, ``mask``, ``thindielectric``) to the next one: each is
+seen by the part of the light that it stops of what arrives there.
+
+Where a surface ends within a pixel, it covers a part of it. With one sample per pixel, rays are
+traced through :data:`EDGE_SAMPLES` places of each pixel next to where surfaces end and the
+background begins; with several samples, each has its own depth. A ``thinlens`` sees depths and
+coverage from the middle of its aperture.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from drgs.cameras.camera import Camera
+from drgs.effects.occlusion import Surface
+from drgs.integrator.film import pixel_corners, samples_in
+from drgs.integrator.transparency import INVISIBLE, StraightRays
+
+EDGE_GRID = 4
+
+EDGE_SAMPLES = EDGE_GRID**2
+"""Rays through a pixel in which a surface ends."""
+
+MAX_SURFACES = 4
+"""Surfaces that are seen one through the other; the last of them stands for all that follow."""
+
+FAR_AWAY = 1e30
+"""Depth of a surface that is not there: behind all splats, and 0 times it is 0."""
+
+
+@dataclass(frozen=True, eq=False)
+class VisibleSurface(Surface):
+    """One visible surface at each pixel."""
+
+    normal: Any  # Normal3f, world, times the coverage; None where no AOV needs it
+
+    def at(self, pixel: mi.UInt32) -> VisibleSurface:
+        """Return the surface at some of the pixels."""
+        planes = (dr.gather(mi.Float, plane, pixel) for plane in (self.depth, self.coverage))
+        normal = None if self.normal is None else dr.gather(mi.Normal3f, self.normal, pixel)
+        return VisibleSurface(*planes, normal)
+
+    def share(self, front: mi.Float) -> mi.Float:
+        """Return the weight of the surface; front: sum of the splats' weights in front of it."""
+        return self.coverage * (1 - front)
+
+    def aov_values(self, kind: str, front: mi.Float) -> list[mi.Float] | None:
+        """Return what the surface contributes to the channels of an AOV; None: nothing."""
+        if kind == "depth":
+            return [self.share(front) * self.depth]
+        if kind == "normal":
+            return [(1 - front) * component for component in self.normal]
+        return None
+
+
+Layers = list[VisibleSurface]
+"""The surfaces of each pixel, nearest first."""
+
+
+def rest_behind(surfaces: Sequence[Surface]) -> mi.Float:
+    """Return the part of each pixel's light that all surfaces let through."""
+    rest = mi.Float(1)
+    for surface in surfaces:
+        rest = rest - surface.coverage
+    return dr.maximum(rest, 0)
+
+
+def trace_surfaces(
+    rays: StraightRays,
+    sensor: mi.Sensor,
+    cameras: Sequence[Camera],
+    within: Sequence[tuple[Any, Any]],
+    with_normals: bool,
+) -> list[list[Layers]]:
+    """Return what is seen of the surfaces, by time and by sample, evaluated.
+
+    cameras: of each time; within: of each pass, x and y from the pixel's upper left corner, px.
+    All have the same number of surfaces. The host reads whether more are seen through others.
+    """
+    tracer = _Tracer(rays, dr.opaque(mi.Float, sensor.far_clip()), with_normals)
+    film = sensor.film()
+    if len(within) == 1 and dr.width(within[0]) == 1:  # the same place in all pixels
+        seen = [[tracer.trace_with_edges(camera, film, *within[0])] for camera in cameras]
+    else:
+        places = [(pixel_corners(film, samples_in(film, x)), x, y) for x, y in within]
+        seen = [[tracer.trace(camera, *place) for place in places] for camera in cameras]
+    most = max(len(layers) for of_time in seen for layers in of_time)
+    seen = [[_padded(layers, most) for layers in of_time] for of_time in seen]
+    dr.eval(seen)
+    return seen
+
+
+def _padded(layers: Layers, count: int) -> Layers:
+    """Return ``count`` surfaces, the last of which are not there."""
+    first = layers[0]
+    zero = dr.zeros(mi.Float, dr.width(first.coverage))
+    far = zero + FAR_AWAY
+    normal = None if first.normal is None else dr.zeros(mi.Normal3f, dr.width(zero))
+    return layers + [VisibleSurface(far, zero, normal)] * (count - len(layers))
+
+
+@dataclass(frozen=True)
+class _Tracer:
+    """Traces rays of a camera to the surfaces of a scene."""
+
+    rays: StraightRays
+    far: mi.Float  # depth, scene units: farther surfaces are not seen
+    with_normals: bool
+
+    def trace(self, camera: Camera, corner: mi.Point2f, x: Any, y: Any) -> Layers:
+        """Return what rays meet at places of pixels.
+
+        corner: upper left corners of the pixels, px; x, y: from there.
+        """
+        place = corner + mi.Point2f(x, y)
+        camera = camera.at_row(place.y)
+        ray, active = self._camera_rays(camera, place)
+        layers, rest = [], dr.ones(mi.Float, dr.width(ray))
+        while True:
+            ray, hit, opacity = self.rays.next_visible(ray, active)
+            active = active & (rest * (1 - opacity) > INVISIBLE) & hit.is_valid()
+            goes_on = self.rays.sees_through and dr.any(active)
+            is_last = len(layers) == MAX_SURFACES - 1
+            if goes_on and is_last:
+                opacity = 1 - (1 - opacity) * self.rays.transmittance(
+                    self.rays.behind(ray, hit, active), active
+                )
+            layers.append(self._surface(camera, ray, hit, rest * opacity))
+            if not goes_on or is_last:
+                return layers
+            rest = dr.select(active, rest * (1 - opacity), 0)
+            ray = self.rays.behind(ray, hit, active)
+            dr.eval(ray, rest, active)
+
+    def _camera_rays(self, camera: Camera, place: mi.Point2f) -> tuple[mi.Ray3f, mi.Bool]:
+        """Return rays through places of the film (px), and whether the lens sees anything there."""
+        origin, direction, seen = camera.look_through(place.x, place.y)
+        direction = dr.normalize(direction)
+        start, end = camera.lens.ray_range(direction, camera.near, self.far)
+        to_world = camera.rotation.T
+        ray = mi.Ray3f(
+            o=mi.Point3f(camera.center + to_world @ (origin + start * direction)),
+            d=mi.Vector3f(to_world @ direction),
+        )
+        ray.maxt = end - start
+        return ray, dr.full(mi.Bool, True, dr.width(ray)) & mi.Bool(seen)
+
+    def _surface(
+        self,
+        camera: Camera,
+        ray: mi.Ray3f,
+        hit: mi.PreliminaryIntersection3f,
+        coverage: mi.Float,
+    ) -> VisibleSurface:
+        """Return what has been hit."""
+        valid = coverage > 0
+        point = ray.o + dr.select(valid, hit.t, 1) * ray.d
+        _, _, depth = camera.lens.look(camera, camera.rotation @ (point - camera.center))
+        normal = None
+        if self.with_normals:
+            frame = hit.compute_surface_interaction(ray, mi.RayFlags.ShadingFrame, valid).sh_frame
+            normal = dr.select(valid, coverage * mi.Normal3f(frame.n), 0)
+        return VisibleSurface(dr.select(valid, depth, FAR_AWAY), coverage, normal)
+
+    def trace_with_edges(self, camera: Camera, film: mi.Film, x: Any, y: Any) -> Layers:
+        """The same at one place of each pixel, or at several where coverage changes next to it.
+
+        Around the crop window is a row of pixels more, so that its edges are those of the film.
+        The host reads how many of the latter there are.
+        """
+        count = dr.prod(film.crop_size() + 2)
+        width = dr.opaque(mi.UInt32, film.crop_size()[0] + 2)
+        row = dr.arange(mi.UInt32, count) // width
+        column = dr.arange(mi.UInt32, count) - row * width
+        around = self.trace(camera, mi.Point2f(column, row) - 1, x, y)
+        rest = rest_behind(around)
+        dr.eval(around, rest)
+
+        corner = pixel_corners(film)
+        number = mi.UInt32(corner.y + 1) * width + mi.UInt32(corner.x + 1)
+        own, differs = dr.gather(mi.Float, rest, number), mi.Bool(False)
+        for down in (number - width, number, number + width):
+            for neighbour in (down - 1, down, down + 1):
+                differs |= dr.gather(mi.Float, rest, neighbour) != own
+        edge = dr.compress(differs)
+        layers = [surface.at(number) for surface in around]
+        if dr.width(edge) == 0:
+            return layers
+        corner = dr.gather(mi.Point2f, corner, edge)
+        places = [(k + 0.5) / EDGE_GRID for k in range(EDGE_GRID)]
+        hits = [self.trace(camera, corner, x, y) for y in places for x in places]
+        most = max(map(len, [layers, *hits]))
+        layers, hits = _padded(layers, most), [_padded(found, most) for found in hits]
+        return [
+            _with_means(surface, [found[k] for found in hits], edge)
+            for k, surface in enumerate(layers)
+        ]
+
+
+def _with_means(
+    surface: VisibleSurface, hits: Sequence[VisibleSurface], edge: mi.UInt32
+) -> VisibleSurface:
+    """Return ``surface`` with means over several rays in the pixels ``edge``."""
+    covered = sum((h.coverage for h in hits), mi.Float(0))
+    depth = sum((h.coverage * h.depth for h in hits), mi.Float(0))
+    depth = dr.select(covered > 0, depth / dr.select(covered > 0, covered, 1), FAR_AWAY)
+    means, planes = [depth, covered / len(hits)], [surface.depth, surface.coverage]
+    if surface.normal is not None:
+        means += list(sum((h.normal for h in hits), mi.Normal3f(0)) / len(hits))
+        planes += list(surface.normal)
+    planes = [mi.Float(plane) for plane in planes]
+    for plane, mean in zip(planes, means, strict=True):
+        dr.scatter(plane, mean, edge)
+    depth, coverage, *normal = planes
+    return VisibleSurface(depth, coverage, mi.Normal3f(*normal) if normal else None)

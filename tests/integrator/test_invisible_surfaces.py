@@ -1,0 +1,92 @@
+"""Surfaces that let all light pass change no picture, wherever they are."""
+
+from functools import cache
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from support.lit_scenes import camera, gaussians, scene_of
+from support.views import image_of
+
+import drgs  # noqa: F401  (registers the plugins)
+
+ROUNDING = 4e-4
+"""Mitsuba moves rays that go on from a surface by 1e-4: so much is the shift of what they see."""
+
+
+@pytest.fixture(scope="module", autouse=True)
+def variant():
+    mi.set_variant("llvm_ad_rgb")
+
+
+PANES = {
+    "null": {"type": "null"},
+    "mask": {"type": "mask", "opacity": 0.0, "bsdf": {"type": "diffuse"}},
+    "thindielectric": {"type": "thindielectric", "int_ior": 1.0, "ext_ior": 1.0},
+}
+
+
+@cache
+def cloud():
+    """Soft splats of many colours, between a camera at z = 4 and a wall at z = -2."""
+    rng = np.random.default_rng(5)
+    means = rng.uniform(-0.8, 0.8, (30, 3))
+    return gaussians(means, 0.3, 0.4, rng.uniform(0, 1, (30, 3)))
+
+
+def plane(z, bsdf) -> dict:
+    """A square across the axis along which the camera looks; 16 wide."""
+    return {"type": "rectangle", "z": z, "bsdf": bsdf}
+
+
+SKY = {"sky": {"type": "constant", "radiance": {"type": "rgb", "value": [0.3, 0.5, 0.9]}}}
+LAMP = {"lamp": {"type": "point", "position": [0.5, 1.0, 5.0], "intensity": 30.0}}
+DIRECTIONAL = {"lamp": {"type": "directional", "direction": [0.2, -0.3, -1.0]}}
+MIRROR = {"wall": plane(-2, {"type": "conductor", "material": "none"})}
+MATT = {"wall": plane(-2, {"type": "diffuse"})}
+RAYS = {"light": "rays", "light_samples": 0}
+PROBE = {"light": "probe", "probes": "wall"}
+
+# Without noise: a mirror under a sky, or a matt wall under a lamp that is a point.
+SCENES = {
+    "no wall": (SKY, {"light": "none", "nested": "path"}),
+    "no wall, no sky": ({}, {"light": "none", "nested": "prb"}),
+    "mirror, path": (SKY | MIRROR, {"light": "none", "nested": "path"}),
+    "mirror, rays": (SKY | MIRROR, RAYS),
+    "mirror, rays, no sky": (MIRROR, RAYS),
+    "mirror, probe": (SKY | MIRROR, PROBE),
+    "matt wall, point lamp, no light": (MATT | LAMP, {"light": "none"}),
+    "matt wall, point lamp, rays": (MATT | LAMP, RAYS | {"max_depth": 2}),
+    "matt wall, directional lamp, rays": (MATT | DIRECTIONAL, RAYS | {"max_depth": 2}),
+}
+
+
+def placed(node) -> dict:
+    """For ``mi.load_dict``, once there is a variant."""
+    if "z" not in node:
+        return node
+    to_world = mi.ScalarTransform4f().translate([0, 0, node["z"]]).scale(8)
+    return {k: v for k, v in node.items() if k != "z"} | {"to_world": to_world}
+
+
+def picture(objects, settings) -> np.ndarray:
+    sensor = camera([0, 0, 4], [0, 0, 0], size=12)
+    objects = {name: placed(node) for name, node in objects.items()}
+    scene = scene_of(cloud(), **({"spp": 4, "max_depth": 4} | settings), sensor=sensor, **objects)
+    return image_of(scene, seed=1)
+
+
+@cache
+def without_panes(name) -> np.ndarray:
+    return picture(*SCENES[name])
+
+
+@pytest.mark.parametrize("z", [2.0, 0.05, -1.5], ids=["before", "amid", "behind"])
+@pytest.mark.parametrize("name", SCENES)
+@pytest.mark.parametrize("pane", PANES)
+def test_what_is_invisible_changes_no_picture(pane, name, z):
+    objects, settings = SCENES[name]
+    found = picture(objects | {"pane": plane(z, PANES[pane])}, settings)
+    expected = without_panes(name)
+    np.testing.assert_allclose(found, expected, rtol=0, atol=ROUNDING)
+    assert expected.std() > 0.05
