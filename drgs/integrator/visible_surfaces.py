@@ -80,7 +80,7 @@ def trace_surfaces(
     within: Sequence[tuple[Any, Any]],
     with_normals: bool,
 ) -> list[list[Layers]]:
-    """Return what is seen of the surfaces, by time and by sample, evaluated.
+    """Return what is seen of the surfaces, by time and by pass, evaluated.
 
     cameras: of each time; within: of each pass, x and y from the pixel's upper left corner, px.
     All have the same number of surfaces. The host reads whether more are seen through others.
