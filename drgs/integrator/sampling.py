@@ -50,6 +50,19 @@ def in_passes(points: mi.Point2f, count: int, num_pixels: int) -> tuple[SamplePo
     return tuple(passes)
 
 
+def by_sample(positions: Sequence[SamplePoints], passes: Sequence[Channels]) -> Iterator[Channels]:
+    """Divide the channels of passes into those of each sample, Float (H * W,)."""
+    for points, channels in zip(positions, passes, strict=True):
+        if points.samples == 1:
+            yield channels
+            continue
+        dr.eval(channels)
+        num_pixels = dr.width(points.x) // points.samples
+        for sample in range(points.samples):
+            pixel = dr.arange(mi.UInt32, num_pixels) + dr.opaque(mi.UInt32, sample * num_pixels)
+            yield [dr.gather(mi.Float, p, pixel, mode=dr.ReduceMode.Permute) for p in channels]
+
+
 class HeldSeed:
     """A seed that is an array, as it is now: its owner may change it in place.
 
@@ -98,7 +111,7 @@ class DrawnSamples:
         if film.rfilter().is_box_filter():
             count = sum(point.samples for point in self.positions)
             sums = [mi.Float(0)] * len(passes[0])
-            for number, channels in enumerate(self._by_sample(passes), 1):
+            for number, channels in enumerate(by_sample(self.positions, passes), 1):
                 sums = [total + plane for total, plane in zip(sums, channels, strict=True)]
                 if number % SAMPLES_PER_KERNEL == 0 and number < count:
                     dr.eval(sums)
@@ -112,18 +125,6 @@ class DrawnSamples:
             dr.eval(block.tensor())  # a kernel for each pass: all are the same one
         film.put_block(block)
         return film.develop()
-
-    def _by_sample(self, passes: Sequence[Channels]) -> Iterator[Channels]:
-        """The channels of each sample, Float (H * W,) each, from those of passes."""
-        num_pixels = dr.prod(self.film.crop_size())
-        for point, channels in zip(self.positions, passes, strict=True):
-            if point.samples == 1:
-                yield channels
-                continue
-            dr.eval(channels)
-            for sample in range(point.samples):
-                pixel = dr.arange(mi.UInt32, num_pixels) + dr.opaque(mi.UInt32, sample * num_pixels)
-                yield [dr.gather(mi.Float, p, pixel, mode=dr.ReduceMode.Permute) for p in channels]
 
     def adjoint(self, grad_in: mi.TensorXf) -> list[Channels]:
         """Derivatives of the loss with respect to the channels, given those of the image."""

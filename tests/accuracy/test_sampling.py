@@ -33,7 +33,8 @@ from support.walls import load as load_wall
 import drgs  # noqa: F401  (registers the plugin)
 from drgs.accuracy.sample_points import SamplePoints
 from drgs.gaussians.parameters import PARAMETER_NAMES
-from drgs.integrator.sampling import DrawnSamples
+from drgs.integrator.sampling import PIXELS_PER_PASS, SAMPLES_PER_KERNEL, DrawnSamples
+from drgs.integrator.weights import weighted_sums_of_last
 from drgs.reference import rays as reference_rays
 from drgs.reference import splatting as reference
 from drgs.splatting import rendering
@@ -420,8 +421,8 @@ SCENES = {
 }
 
 
-def outcome(name, samples=3) -> dict[str, np.ndarray]:
-    """Image, tangent, and gradients of the Gaussians, of a scene that is loaded anew."""
+def outcome(name, samples=3) -> tuple[dict[str, np.ndarray], int]:
+    """Image, tangent, and gradients of the Gaussians, of a new scene; and the number of passes."""
     loaded = SCENES[name]()
     integrator, sensor, params = loaded.integrator(), loaded.sensors()[0], mi.traverse(loaded)
     values = {key: params[f"integrator.{key}"] for key in PARAMETER_NAMES}
@@ -463,3 +464,39 @@ def test_passes_of_several_samples_give_the_bytes_of_single_ones(name, monkeypat
     monkeypatch.setattr("drgs.integrator.sampling.PIXELS_PER_PASS", 2 * width * height)
     monkeypatch.setattr("drgs.splatting.slots.BAND_SLOTS", 16)
     assert check() == 2
+
+
+def test_a_pass_of_a_large_film_has_one_sample():
+    film = {"width": 512, "height": PIXELS_PER_PASS // 512 + 1}
+    large = scene_with(sensor=FEW.view.sensor(**film)).sensors()[0]
+    assert [p.samples for p in DrawnSamples(large, 0, 3, {}).positions] == [1, 1, 1]
+    small = scene_with().sensors()[0]
+    at_once = PIXELS_PER_PASS // (FEW.view.width * FEW.view.height)
+    passes = DrawnSamples(small, 0, 2 * at_once + 1, {}).positions
+    assert [p.samples for p in passes] == [at_once, at_once, 1]
+
+
+def test_more_samples_of_a_small_film_need_no_more_kernels():
+    """But for their sums over samples, of 16 at a time."""
+
+    def launches(samples) -> int:
+        loaded = scene_with()
+        with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
+            loaded.integrator().render(loaded, spp=samples)
+            return len(dr.kernel_history([dr.KernelType.JIT]))
+
+    launches(2)
+    assert launches(64) <= launches(2) + 64 // SAMPLES_PER_KERNEL
+
+
+def test_weights_are_means_over_the_samples_of_all_passes(monkeypatch):
+    def weights() -> np.ndarray:
+        loaded = scene_with()
+        dr.eval(loaded.integrator().render(loaded, spp=3))
+        plane = dr.arange(mi.Float, FEW.view.width * FEW.view.height)
+        return np.array(weighted_sums_of_last(loaded.integrator(), plane))
+
+    found = weights()
+    monkeypatch.setattr("drgs.integrator.sampling.PIXELS_PER_PASS", 1)
+    assert found.max() > 0
+    np.testing.assert_allclose(found, weights(), rtol=1e-6)
