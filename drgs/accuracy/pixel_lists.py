@@ -67,9 +67,8 @@ class PixelLists:
 
     def range(self, lanes: Lanes) -> tuple[Any, Any]:
         """First place, and one behind the last, of each lane."""
-        UInt32 = type(self.start)
-        first = dr.gather(UInt32, self.start, lanes.micro_tile)
-        return first, dr.gather(UInt32, self.start, lanes.micro_tile + 1)
+        UInt32, number = type(self.start), lanes.tile * MICROS + lanes.micro
+        return tuple(dr.gather(UInt32, self.start, number + k) for k in (0, 1))
 
     def places(self) -> Any:
         """UInt32 (items,): item as made -> place in the lists."""

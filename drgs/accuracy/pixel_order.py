@@ -37,6 +37,7 @@ from drgs.splatting.image_model import Alpha, Footprint, ImageModel, flat_column
 from drgs.splatting.lanes import grouped_by_work, load_lane_row, load_pixels, make_lanes, pixels_of
 from drgs.splatting.projection import Splats2D
 from drgs.splatting.rasterize import (
+    ONE_SAMPLE,
     Layers,
     Records,
     SplatGradients,
@@ -89,9 +90,12 @@ class PixelOrder:
         layers: _OrderedLayers,
         d_features: list[Any],
         d_transmittance: Any,
+        samples: range = ONE_SAMPLE,
+        before: SplatGradients | None = None,
     ) -> SplatGradients:
         """See :func:`drgs.splatting.rasterize.composite_adjoint`."""
-        return _adjoint(bins, records, layers, d_features, d_transmittance, self)
+        inputs = _WalkInputs.of(bins, records, layers.lists, self, samples)
+        return _adjoint(inputs, layers, d_features, d_transmittance, before)
 
     def tangent(
         self, bins: TileBins, records: Records, layers: _OrderedLayers, tangents: SplatGradients
@@ -128,14 +132,35 @@ class _WalkInputs:
     order: PixelOrder
     lanes: Lanes
     model: ImageModel  # bound to the lanes
+    samples: range  # of the lanes
 
     @staticmethod
-    def of(bins: TileBins, records: Records, lists: PixelLists, order: PixelOrder) -> _WalkInputs:
-        """Lanes with lists of similar length together."""
-        begin, end = lists.range(make_lanes(bins.rows.Float, bins.grid))
-        lanes = grouped_by_work(bins.rows.Float, bins.grid, end - begin)
+    def of(
+        bins: TileBins,
+        records: Records,
+        lists: PixelLists,
+        order: PixelOrder,
+        samples: range | None = None,
+    ) -> _WalkInputs:
+        """Lanes with lists of similar length together; samples: None for all."""
+        samples = range(bins.grid.samples) if samples is None else samples
+        tiles = bins.grid.tiles_of(samples)
+        begin, end = lists.range(make_lanes(bins.rows.Float, bins.grid, tiles=tiles))
+        lanes = grouped_by_work(bins.rows.Float, bins.grid, end - begin, tiles)
         order = replace(order, depths=order.depths.bind(lanes, bins.grid))
-        return _WalkInputs(bins, records, lists, order, lanes, bins.model.bind(lanes, bins.grid))
+        model = bins.model.bind(lanes, bins.grid)
+        return _WalkInputs(bins, records, lists, order, lanes, model, samples)
+
+    @property
+    def num_places(self) -> int:
+        """Places in the lists of all samples, one at least."""
+        return max(len(self.samples) * self.lists.count, 1)
+
+    def first_place(self) -> Any:
+        """Where the places of each lane's sample begin."""
+        start, count = self.samples.start, self.lists.count
+        start, count = (dr.opaque(type(self.lanes.sample), number) for number in (start, count))
+        return (self.lanes.sample - start) * count
 
     @property
     def size(self) -> int:
@@ -282,18 +307,16 @@ def _composite(bins: TileBins, records: Records, order: PixelOrder) -> _OrderedL
 
 
 def _adjoint(
-    bins: TileBins,
-    records: Records,
+    inputs: _WalkInputs,
     layers: _OrderedLayers,
     d_features: list[Any],
     d_transmittance: Any,
-    order: PixelOrder,
+    before: SplatGradients | None,
 ) -> SplatGradients:
-    inputs = _WalkInputs.of(bins, records, layers.lists, order)
-    g = [load_pixels(plane, inputs.lanes, bins.grid) for plane in d_features]
+    g = [load_pixels(plane, inputs.lanes, inputs.bins.grid) for plane in d_features]
     totals = _totals(inputs, layers, g, d_transmittance)
     pairs = _pairs(inputs, totals, g)
-    return _sum_items(bins, layers.lists, _sum_pixels(inputs, pairs, g))
+    return _sum_items(inputs, _sum_pixels(inputs, pairs, g), before)
 
 
 def _feature_gradient(inputs: _WalkInputs, met: _Met, pixel: int, g: list[list[Any]]) -> Any:
@@ -336,8 +359,9 @@ def _totals(
 def _pairs(inputs: _WalkInputs, totals: list[tuple[Any, Any]], g: list[list[Any]]) -> list[Any]:
     """Second walk: each pair's weight and d loss / d ln(alpha), at the place of its splat."""
     t = types_of(inputs.bins.rows.Float)
-    pairs = [dr.zeros(t.Float, max(inputs.lists.count, 1) * PIXELS) for _ in range(2)]
+    pairs = [dr.zeros(t.Float, inputs.num_places * PIXELS) for _ in range(2)]
     dr.eval(pairs)
+    first_place = inputs.first_place()
     alpha_max = inputs.model.cutoffs.alpha_max
 
     def store(state: tuple, visited: list[list[Any]]) -> tuple:
@@ -355,7 +379,10 @@ def _pairs(inputs: _WalkInputs, totals: list[tuple[Any, Any]], g: list[list[Any]
 
     result = _walk(
         inputs,
-        carry=lambda met, pixel: [_feature_gradient(inputs, met, pixel, g), met.place],
+        carry=lambda met, pixel: [
+            _feature_gradient(inputs, met, pixel, g),
+            first_place + met.place,
+        ],
         visit=store,
         state=(inputs.transmittance(), *inputs.zeros(2)),
         nothing=[dr.zeros(t.Float, inputs.size), dr.zeros(t.UInt32, inputs.size)],
@@ -372,20 +399,22 @@ def _sum_pixels(inputs: _WalkInputs, pairs: list[Any], g: list[list[Any]]) -> Ro
     bins, records, lists = inputs.bins, inputs.records, inputs.lists
     lanes, model = inputs.lanes, inputs.model
     t = types_of(bins.rows.Float)
-    partials = Rows.empty(t.Float, bins.num_sums, max(lists.count, 1))
+    partials = Rows.empty(t.Float, bins.num_sums, inputs.num_places)
     begin, end = lists.range(lanes)
+    first_place = inputs.first_place()
 
     def body(place: Any) -> tuple:
         entry = dr.gather(t.UInt32, lists.entries, place)
         geometry, features = records.load(entry, True)
         footprint = model.footprint(geometry, lanes, True)
-        weights, d_log_alpha = (Rows((plane,), PIXELS).load(place) for plane in pairs)
+        own = first_place + place
+        weights, d_log_alpha = (Rows((plane,), PIXELS).load(own) for plane in pairs)
         d_stored = [t.Float(0) for _ in features]
         for pixel, weight in enumerate(weights):
             g_pixel = [plane[pixel] for plane in g]
             d_stored = model.features.add_derivatives(d_stored, features, pixel, weight, g_pixel)
         moments = model.response.moments(footprint, d_log_alpha, model.positions)
-        partials.store(moments + d_stored, place)
+        partials.store(moments + d_stored, own)
         return (place + 1,)
 
     loop = dr.while_loop(state=(begin,), cond=lambda place: place < end, body=body)
@@ -393,15 +422,22 @@ def _sum_pixels(inputs: _WalkInputs, pairs: list[Any], g: list[list[Any]]) -> Ro
     return partials
 
 
-def _sum_items(bins: TileBins, lists: PixelLists, partials: Rows) -> SplatGradients:
+def _sum_items(
+    inputs: _WalkInputs, partials: Rows, before: SplatGradients | None
+) -> SplatGradients:
     """Add up the items of each splat."""
-    places = lists.places()
-    totals = sum_runs(
-        partials.Float,
-        lists.first_item,
-        lambda item: partials.load(dr.gather(type(places), places, item)),
-    )
-    return splat_gradients(bins, totals)
+    lists, places = inputs.lists, inputs.lists.places()
+    UInt32 = type(places)
+
+    def totals(rank: Any, sample: Any) -> list[Any]:
+        first_place = sample * dr.opaque(UInt32, lists.count)
+
+        def load(item: Any) -> list[Any]:
+            return partials.load(first_place + dr.gather(UInt32, places, item))
+
+        return sum_runs(partials.Float, lists.first_item, rank, load)
+
+    return splat_gradients(inputs.bins, totals, len(inputs.samples), before)
 
 
 def _add_product(high: Any, low: Any, a: Any, b: Any) -> tuple[Any, Any]:

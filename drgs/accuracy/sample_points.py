@@ -18,7 +18,7 @@ from drgs.splatting.lanes import load_pixels
 
 @dataclass(frozen=True)
 class SamplePoints:
-    """One point in each pixel.
+    """One point in each pixel, for each of some samples.
 
     Equality is identity of the arrays: those of another pass are another model.
     """
@@ -26,8 +26,9 @@ class SamplePoints:
     margin: ClassVar[float] = 0.5
     """px: how far from its centre a pixel may be evaluated."""
 
-    x: Any = None  # Float (H * W,) in [0, 1): from the pixel's left border, px
-    y: Any = None  # Float (H * W,), from its upper border
+    x: Any = None  # Float (samples * H * W,) in [0, 1): from the pixel's left border, px
+    y: Any = None  # the same, from its upper border
+    samples: int = 1
     bound: tuple[list[Any], list[Any]] | None = None  # the 16 of each lane
 
     def bind(self, lanes: Lanes, grid: TileGrid) -> SamplePoints:

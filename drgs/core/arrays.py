@@ -104,14 +104,39 @@ _NUMPY_TYPES = {
 
 
 def quotient(index: Any, divisor: int) -> Any:
-    """index // divisor, UInt32, by a divisor below 2^19 that is not compiled into the kernel.
+    """index // divisor, UInt32, by a divisor that is not compiled into the kernel.
 
     No machine divides vectors of integers. The product in double precision is off by less than
-    2^-52 of itself, and (index + 1/2) / divisor is at least 1 / (2 divisor) from an integer.
+    2^-52 of itself, hence by less than 2^-20 / divisor, and (index + 1/2) / divisor is at least
+    1 / (2 divisor) from an integer.
     """
     Float64 = dr.float64_array_t(type(index))
     reciprocal = dr.opaque(Float64, 1 / divisor)
     return type(index)((Float64(index) + 0.5) * reciprocal)
+
+
+def divide(index: Any, divisor: int, parts: int) -> tuple[Any, Any]:
+    """index // divisor, which is below ``parts``, and the rest; literal zeros of a single part.
+
+    Those make later products and sums vanish from the kernel.
+    """
+    if parts == 1:
+        return type(index)(0), index
+    part = quotient(index, divisor)
+    return part, index - part * dr.opaque(type(index), divisor)
+
+
+def repeat_array(values: Any, count: int, step: int = 0) -> Any:
+    """``count`` copies of an array, each by ``step`` more than the one before it.
+
+    Not evaluated, if there are several.
+    """
+    if count == 1:
+        return values
+    UInt32, size = types_of(type(values)).UInt32, dr.width(values)
+    part, index = divide(dr.arange(UInt32, count * size), size, count)
+    copies = dr.gather(type(values), values, index)
+    return copies + part * dr.opaque(UInt32, step) if step else copies
 
 
 def interleave(columns: list[Any]) -> Any:

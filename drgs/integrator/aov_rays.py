@@ -26,6 +26,7 @@ from drgs.core.arrays import interleave
 from drgs.core.errors import UnsupportedError
 from drgs.integrator.film import Channels, pixel_corners
 from drgs.integrator.picture import hybrid_of
+from drgs.integrator.sampling import by_sample, in_passes
 from drgs.integrator.sensors import camera_from_sensor, is_batch, read_sensor
 from drgs.integrator.settings import SplatsSettings
 from drgs.integrator.view import View, constant_background
@@ -54,7 +55,7 @@ class PictureRays:
 
     ray: Any  # RayDifferential3f (H * W * count,): those of a pixel are neighbours
     count: int  # rays per pixel
-    positions: tuple[SamplePoints, ...]  # by sample
+    positions: tuple[SamplePoints, ...]  # by pass
 
     @staticmethod
     def of(sensor: mi.Sensor | None, near: float, ray: mi.RayDifferential3f) -> PictureRays:
@@ -82,14 +83,13 @@ class PictureRays:
         if not dr.all(inside & on_camera):
             raise UnsupportedError(_unknown(sensor))
         within = dr.clip(within, 0, 1 - dr.epsilon(mi.Float))
-        pixel = dr.arange(mi.UInt32, width * height)
-        positions = [dr.gather(mi.Point2f, within, pixel * count + s) for s in range(count)]
-        dr.eval(positions)
-        return PictureRays(ray, count, tuple(SamplePoints(*p) for p in positions))
+        positions = in_passes(within, count, width * height)
+        dr.eval([(p.x, p.y) for p in positions])
+        return PictureRays(ray, count, positions)
 
     @property
     def within(self) -> tuple[tuple[Any, Any], ...]:
-        """Where they start, by sample: x and y from their pixels' upper left corners, px."""
+        """Where they start, by pass: x and y from their pixels' upper left corners, px."""
         return tuple((p.x, p.y) for p in self.positions)
 
     def channels(
@@ -125,8 +125,9 @@ class PictureRays:
         return channels
 
     def _gathered(self, passes: Sequence[Channels]) -> Channels:
-        """Channels by ray, from those by pixel of each sample."""
-        planes = zip(*passes[: self.count], strict=True)
+        """Channels by ray, from those by pixel of each pass."""
+        samples = by_sample(self.positions, passes[: len(self.positions)])
+        planes = zip(*samples, strict=True)
         return [mi.Float(interleave(list(of_samples))) for of_samples in planes]
 
     def _with_surfaces(

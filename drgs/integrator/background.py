@@ -15,7 +15,7 @@ import drjit as dr
 import mitsuba as mi
 
 from drgs.cameras.camera import Camera
-from drgs.integrator.film import pixel_corners
+from drgs.integrator.film import pixel_corners, samples_in
 
 LENS_POINTS = 16
 """At which an aperture is sampled, for each place on the film: always the same, so that nothing is
@@ -72,10 +72,9 @@ def seen_by(
     cameras: Sequence[Camera],
     within: Sequence[tuple[mi.Float | float, mi.Float | float]],
 ) -> list[list[mi.Color3f]]:
-    """Radiance of all pixels, by time and by sample.
+    """Radiance of all pixels, by time and by pass.
 
-    cameras: of each time; within: of each sample, x and y from the pixel's upper left corner, px.
+    cameras: of each time; within: of each pass, x and y from the pixel's upper left corner, px.
     """
-    corner = pixel_corners(film)
-    places = [corner + mi.Vector2f(x, y) for x, y in within]
+    places = [pixel_corners(film, samples_in(film, x)) + mi.Vector2f(x, y) for x, y in within]
     return [[background.radiance(film, camera, place) for place in places] for camera in cameras]

@@ -35,7 +35,7 @@ class SideBySide:
         return SideBySide(sensors, film.size()[0] // len(sensors), film.size()[1])
 
     def positions(self, positions: Sequence[Positions], index: int) -> tuple[Positions, ...]:
-        """Where the pixels of one picture are evaluated, by sample."""
+        """Where the pixels of one picture are evaluated, by pass."""
         return tuple(
             p
             if isinstance(p, PixelCenters)
@@ -50,25 +50,25 @@ class SideBySide:
         ]
 
     def cut(self, passes: Sequence[Channels], index: int) -> list[Channels]:
-        """The part of one picture of what the film gets, by sample."""
+        """The part of one picture of what the film gets, by pass."""
         return [[self._cut(plane, index) for plane in channels] for channels in passes]
 
     def put_together(self, pictures: Sequence[Sequence[Channels]]) -> list[Channels]:
-        """What the film gets, by sample; pictures: by sensor, each by sample."""
+        """What the film gets, by pass; pictures: by sensor, each by pass."""
         return [
-            [self._joined(planes) for planes in zip(*of_sample, strict=True)]
-            for of_sample in zip(*pictures, strict=True)
+            [self._joined(planes) for planes in zip(*of_pass, strict=True)]
+            for of_pass in zip(*pictures, strict=True)
         ]
 
     def _cut(self, plane: mi.Float, index: int) -> mi.Float:
-        pixel = dr.arange(mi.UInt32, self.width * self.height)
+        pixel = dr.arange(mi.UInt32, dr.width(plane) // len(self.sensors))
         row = pixel // dr.opaque(mi.UInt32, self.width)
         place = pixel + row * ((len(self.sensors) - 1) * self.width) + index * self.width
         return dr.gather(mi.Float, plane, place, mode=dr.ReduceMode.Permute)
 
     def _joined(self, planes: Sequence[mi.Float]) -> mi.Float:
         whole = len(self.sensors) * self.width
-        pixel = dr.arange(mi.UInt32, whole * self.height)
+        pixel = dr.arange(mi.UInt32, len(planes) * dr.width(planes[0]))
         row = pixel // dr.opaque(mi.UInt32, whole)
         column = pixel - row * whole
         sensor = column // dr.opaque(mi.UInt32, self.width)

@@ -21,7 +21,7 @@ from drgs.splatting import rendering
 class Rendered:
     """The last frames of a view, and everything that they depend on."""
 
-    frames: list[list[rendering.Frame]]  # by time; one for each sample per pixel
+    frames: list[list[rendering.Frame]]  # by time; one for each pass
     pipeline: rendering.Pipeline
     samples: object  # key of the film's samples: see drgs.integrator.film.FilmSamples
     sensor: SensorState
@@ -53,7 +53,7 @@ class TracedSurfaces:
     surfaces: Any  # drgs.integrator.surfaces.Surfaces
     settings: tuple[object, ...]  # of samples, integrator and sensor
     sensor: SensorState
-    seen: list[list[Any]]  # by time and by sample: drgs.integrator.surfaces.SeenSurface
+    seen: list[list[Any]]  # by time and by pass: drgs.integrator.surfaces.SeenSurface
 
     def matches(self, surfaces: Any, settings: tuple[object, ...], sensor: SensorState) -> bool:
         """Whether tracing these would give the same."""

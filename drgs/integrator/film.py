@@ -14,13 +14,13 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from drgs.core.arrays import from_host, interleave, quotient
+from drgs.core.arrays import divide, from_host, interleave, quotient
 from drgs.core.errors import UnsupportedError
 from drgs.splatting.image_model import PixelCenters, Positions
 
 Channels = list[Any]
-"""What a film gets of one pass, each Float (H * W,): red, green, blue, perhaps alpha, then what the
-integrator puts out besides (AOVs)."""
+"""What a film gets of one pass, each Float (samples * H * W,): red, green, blue, perhaps alpha,
+then what the integrator puts out besides (AOVs)."""
 
 
 def num_colors(film: mi.Film) -> int:
@@ -34,23 +34,28 @@ def with_weight(film: mi.Film, channels: Channels, weight: Any) -> Channels:
     return [*channels[:count], weight, *channels[count:]]
 
 
-def pixel_corners(film: mi.Film) -> mi.Point2f:
-    """The upper left corners of the crop window's pixels, row by row, px."""
+def pixel_corners(film: mi.Film, samples: int = 1) -> mi.Point2f:
+    """The upper left corners of the crop window's pixels, row by row, px; again for each sample."""
     width, height = film.crop_size()
-    pixel = dr.arange(mi.UInt32, width * height)
+    _, pixel = divide(dr.arange(mi.UInt32, samples * width * height), width * height, samples)
     row = quotient(pixel, width)
     return mi.Point2f(pixel - row * width, row)
 
 
-class FilmSamples(Protocol):
-    """The samples of a picture."""
+def samples_in(film: mi.Film, x: Any) -> int:
+    """How many samples of each pixel a plane has; x may be a number for all pixels."""
+    return max(dr.width(x) // dr.prod(film.crop_size()), 1)
 
-    positions: Sequence[Positions]  # by sample
+
+class FilmSamples(Protocol):
+    """The samples of a picture, in passes of one or several for each pixel."""
+
+    positions: Sequence[Positions]  # by pass
     within: Sequence[tuple[Any, Any]]  # the same: x and y from the pixels' upper left corners, px
     key: object  # equal for equal positions; None: pixel centres
 
     def develop(self, passes: Sequence[Channels]) -> mi.TensorXf:
-        """The image, from the channels of each sample."""
+        """The image, from the channels of each pass."""
 
     def adjoint(self, grad_in: mi.TensorXf) -> list[Channels]:
         """Derivatives of the loss with respect to the channels, given those of the image."""

@@ -11,8 +11,8 @@ from drgs.core.errors import PluginError
 from drgs.core.memory import MAX_LANES, UNASKED_BYTES, available_memory, why_too_large
 
 MAX_SAMPLES = 4096
-"""Of a pixel, times the poses that motion blurs: each is a pass of its own, and its frame takes
-0.15 MB even of the smallest film."""
+"""Most samples of a pixel, times the poses that motion blurs, whose frames take 0.15 MB each even
+of the smallest film."""
 
 NESTED_SAMPLE_BYTES = 64
 """About what Mitsuba's path tracers take at least for a sample: its ray, sampler and radiance."""

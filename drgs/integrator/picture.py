@@ -2,7 +2,7 @@
 
 A :class:`Picture` has a :class:`View` for each sensor, which are several only for a batch. A view
 renders frames (``drgs.splatting.rendering``), one for each time at which its shutter is open and
-each sample per pixel; puts what is behind the splats behind them; and gives the film its channels.
+each pass of samples; puts what is behind the splats behind them; and gives the film its channels.
 The film develops these (``drgs.integrator.film``), and a nested integrator's picture of surfaces
 comes in between (``drgs.integrator.surfaces``). :meth:`Picture.backward` and
 :meth:`Picture.tangent` run the same way back and along.

@@ -32,15 +32,15 @@ if TYPE_CHECKING:  # imported where a scene calls for them
     from drgs.integrator.visible_surfaces import Layers
 
 Passes = list[Channels]
-"""Channels by sample per pixel."""
+"""Channels by pass: of one sample per pixel or, on a small film, of several."""
 
 Planes = list[list[list[Any]]]
-"""Planes of frames, each Float (H * W,), by time and by sample."""
+"""Planes of frames, each Float (samples * H * W,), by time and by pass."""
 
 
-POSES_PER_KERNEL = 16
-"""Of more times at which the shutter is open, sums are evaluated in between: compilers take longer
-than proportionally to a kernel's length."""
+PASSES_PER_KERNEL = 16
+"""Of more passes, or times at which the shutter is open, planes and sums are evaluated in between:
+compilers take longer than proportionally to a kernel's length."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,7 +51,7 @@ class View:
     scene: mi.Scene
     index: int  # of the view, in the integrator's memory
     sensor: mi.Sensor
-    positions: Sequence[Positions]  # by sample
+    positions: Sequence[Positions]  # by pass
     within: Sequence[tuple[Any, Any]]  # the same, px from the pixels' upper left corners
     key: object  # of these: see drgs.integrator.film.FilmSamples
     has_alpha: bool
@@ -90,8 +90,9 @@ class View:
             dr.traverse(dr.ADMode.Backward, flags=dr.ADFlag.ClearVertices)
             d_planes = dr.grad(planes)
             d_constant = dr.grad(constant) if of_background else None
-        for first in range(0, len(d_planes), POSES_PER_KERNEL):
-            dr.eval(d_planes[first : first + POSES_PER_KERNEL], d_constant)
+        d_passes = list(chain(*d_planes))
+        for first in range(0, len(d_passes), PASSES_PER_KERNEL):
+            dr.eval(d_passes[first : first + PASSES_PER_KERNEL], d_constant)
         with dr.resume_grad():
             state = self._state()
             of_camera = state.is_attached
@@ -108,7 +109,7 @@ class View:
         return reduce(rendering.sum_of_gradients, by_time)
 
     def channels(self, planes: Planes, constant: mi.Color3f | None) -> Passes:
-        """What the film gets of each sample per pixel: the mean over the times.
+        """What the film gets of each pass: the mean over the times.
 
         constant: the background, where it is a colour; display space.
         """
@@ -213,7 +214,7 @@ class View:
     def _frames(self) -> list[list[rendering.Frame]]:
         """Render, or reuse the last frames if nothing that they depend on has changed.
 
-        One list for each time at which the shutter is open, of a frame for each sample per pixel.
+        One list for each time at which the shutter is open, of a frame for each pass.
         """
         pipeline, gaussians = self.integrator.pipeline, dr.detach(self.integrator.gaussians)
         state = self._state().detached()
@@ -277,9 +278,9 @@ class View:
 def _mean(passes: Sequence[Passes]) -> Passes:
     """Of what the film gets at several times, summed in their order."""
     total: list[Passes] = []
-    for first in range(0, len(passes), POSES_PER_KERNEL):
+    for first in range(0, len(passes), PASSES_PER_KERNEL):
         dr.eval(total)
-        terms = [*total, *passes[first : first + POSES_PER_KERNEL]]
+        terms = [*total, *passes[first : first + PASSES_PER_KERNEL]]
         total = [
             [
                 [sum(values[1:], values[0]) for values in zip(*of_sample, strict=True)]
@@ -293,7 +294,7 @@ def _mean(passes: Sequence[Passes]) -> Passes:
 class _Behind:
     """What is seen past the splats."""
 
-    colors: Iterable[Iterable[mi.Color3f]]  # by time and by sample; display space, or see below
+    colors: Iterable[Iterable[mi.Color3f]]  # by time and by pass; display space, or see below
     is_radiance: bool  # of an environment: it covers the film, and its colours are linear where
     # the channels are
     radiance: Iterable[Iterable[mi.Color3f | None]]  # linear, of an environment or a texture
@@ -315,7 +316,7 @@ def _render(
     positions: Sequence[Positions],
     surfaces: Sequence[Layers] | None,
 ) -> list[rendering.Frame]:
-    """A frame for each sample per pixel; surfaces: what is seen of them at each."""
+    """A frame for each pass; surfaces: what is seen of them at each."""
     pipeline = composed(pipeline, gaussians, camera)
     models = [replace(pipeline.model, positions=points) for points in positions]
     if surfaces is not None:

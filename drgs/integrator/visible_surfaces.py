@@ -21,7 +21,7 @@ import mitsuba as mi
 
 from drgs.cameras.camera import Camera
 from drgs.effects.occlusion import Surface
-from drgs.integrator.film import pixel_corners
+from drgs.integrator.film import pixel_corners, samples_in
 from drgs.integrator.transparency import INVISIBLE, StraightRays
 
 EDGE_GRID = 4
@@ -80,9 +80,9 @@ def trace_surfaces(
     within: Sequence[tuple[Any, Any]],
     with_normals: bool,
 ) -> list[list[Layers]]:
-    """Return what is seen of the surfaces, by time and by sample, evaluated.
+    """Return what is seen of the surfaces, by time and by pass, evaluated.
 
-    cameras: of each time; within: of each sample, x and y from the pixel's upper left corner, px.
+    cameras: of each time; within: of each pass, x and y from the pixel's upper left corner, px.
     All have the same number of surfaces. The host reads whether more are seen through others.
     """
     tracer = _Tracer(rays, dr.opaque(mi.Float, sensor.far_clip()), with_normals)
@@ -90,8 +90,8 @@ def trace_surfaces(
     if len(within) == 1 and dr.width(within[0]) == 1:  # the same place in all pixels
         seen = [[tracer.trace_with_edges(camera, film, *within[0])] for camera in cameras]
     else:
-        corner = pixel_corners(film)
-        seen = [[tracer.trace(camera, corner, *place) for place in within] for camera in cameras]
+        places = [(pixel_corners(film, samples_in(film, x)), x, y) for x, y in within]
+        seen = [[tracer.trace(camera, *place) for place in places] for camera in cameras]
     most = max(len(layers) for of_time in seen for layers in of_time)
     seen = [[_padded(layers, most) for layers in of_time] for of_time in seen]
     dr.eval(seen)

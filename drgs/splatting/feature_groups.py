@@ -19,7 +19,7 @@ from typing import Any
 import drjit as dr
 
 from drgs.splatting.image_model import FeatureGroup
-from drgs.splatting.rasterize import Layers, Records, SplatGradients
+from drgs.splatting.rasterize import ONE_SAMPLE, Layers, Records, SplatGradients
 from drgs.splatting.tiles import TileBins
 
 FEATURES_AT_ONCE = {4: 32, 8: 8}
@@ -88,8 +88,27 @@ class InGroups:
         layers: GroupedLayers,
         d_features: list[Any],
         d_transmittance: Any,
+        samples: range = ONE_SAMPLE,
+        before: SplatGradients | None = None,
     ) -> SplatGradients:
-        """See :func:`drgs.splatting.rasterize.composite_adjoint`."""
+        """See :func:`drgs.splatting.rasterize.composite_adjoint`. One sample is added at a time."""
+        for sample in samples:
+            sample = range(sample, sample + 1)
+            found = self._adjoint(bins, records, layers, d_features, d_transmittance, sample)
+            before = found if before is None else before.plus(found)
+            dr.eval(before)
+        return before
+
+    def _adjoint(
+        self,
+        bins: TileBins,
+        records: Sequence[Records],
+        layers: GroupedLayers,
+        d_features: list[Any],
+        d_transmittance: Any,
+        samples: range,
+    ) -> SplatGradients:
+        """Add up the groups' derivatives, of one sample."""
         cotangents = [d_transmittance, *d_features]
         dr.eval(cotangents)  # or each group would have kernels of its own
         zeros = dr.opaque(type(d_transmittance), 0, dr.width(d_transmittance))
@@ -99,7 +118,7 @@ class InGroups:
             d_own, *d_planes = [cotangents[place] for place in places]
             for place in places:  # planes of several groups count once
                 cotangents[place] = zeros
-            found = self.order.adjoint(_only(group, bins), own, part, d_planes, d_own)
+            found = self.order.adjoint(_only(group, bins), own, part, d_planes, d_own, samples)
             total = zip(geometry or [0] * len(found.geometry), found.geometry, strict=True)
             geometry = [a + b for a, b in total]
             for place, derivative in zip(group.stored, found.features, strict=True):

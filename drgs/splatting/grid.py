@@ -25,10 +25,15 @@ MICROS = GRID * GRID
 
 @dataclass(frozen=True)
 class TileGrid:
-    """The tiles of a film of ``width`` x ``height`` px, in rows from the upper left corner."""
+    """The tiles of a film of ``width`` x ``height`` px, in rows from the upper left corner.
+
+    With several samples per pixel, compositing sees the film as many times: its planes hold the
+    pixels of the first sample, then those of the second one, and its tiles are numbered alike.
+    """
 
     width: int
     height: int
+    samples: int = 1
 
     @property
     def columns(self) -> int:
@@ -46,6 +51,15 @@ class TileGrid:
         return self.columns * self.rows
 
     @property
+    def num_pixels(self) -> int:
+        """Pixels of a plane: those of all samples."""
+        return self.samples * self.width * self.height
+
+    def tiles_of(self, samples: range) -> range:
+        """The tiles of some samples, among those of all."""
+        return range(samples.start * self.num_tiles, samples.stop * self.num_tiles)
+
+    @property
     def cull_margin(self) -> float:
         """What rounding may take from an exponent (base 2) on this film."""
         return CULL_MARGIN + CULL_MARGIN_PER_PX * max(self.width, self.height)
@@ -55,8 +69,9 @@ class TileGrid:
 class Lanes:
     """One lane per micro-tile, in the order in which Dr.Jit starts them."""
 
-    micro_tile: Any  # UInt32: tile * 16 + micro-tile within the tile
+    micro_tile: Any  # UInt32: tile among those of all samples * 16 + micro-tile within the tile
     micro: Any  # UInt32: micro-tile within the tile
-    tile: Any  # UInt32
+    tile: Any  # UInt32: on the film
+    sample: Any  # UInt32
     x: Any  # UInt32: first pixel column
     y: Any  # UInt32: first pixel row

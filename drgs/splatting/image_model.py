@@ -91,6 +91,11 @@ class Positions(Protocol):
         """px: how far from its centre a pixel may be evaluated, along either axis."""
         ...
 
+    @property
+    def samples(self) -> int:
+        """How many times each pixel is evaluated."""
+        ...
+
     def bind(self, lanes: Lanes, grid: TileGrid) -> Positions:
         """For the lanes of one kernel: loads what they need. The rest is called of the result."""
         ...
@@ -125,6 +130,7 @@ class PixelCenters:
     """Every pixel is evaluated at its centre: offsets are shared by rows and columns."""
 
     margin: ClassVar[float] = 0.0
+    samples: ClassVar[int] = 1
 
     def points(self, lanes: Lanes, Float: type) -> list[tuple[Any, Any]]:
         """x and y (px) of the 16 pixels."""

@@ -12,7 +12,7 @@ from typing import Any
 
 import drjit as dr
 
-from drgs.core.arrays import types_of, with_aligned_stack
+from drgs.core.arrays import divide, types_of, with_aligned_stack
 from drgs.splatting.grid import GRID, MICRO, MICROS, PIXELS, TILE, Lanes, TileGrid
 from drgs.splatting.tiles import WORD, TileBins
 
@@ -23,10 +23,11 @@ def make_lanes(Float: type, grid: TileGrid, order: Any = None, tiles: range | No
     Dr.Jit cuts a small launch into few blocks of consecutive lanes. Tiles are visited with a
     stride near the golden section, so that each block gets its share of the busy centre.
 
-    order: UInt32, a permutation of the lanes; None: as they are. tiles: those of some tiles only.
+    order: UInt32, a permutation of the lanes; None: as they are. tiles: those of some tiles only,
+    among those of all samples.
     """
     t = types_of(Float)
-    tiles = range(grid.num_tiles) if tiles is None else tiles
+    tiles = grid.tiles_of(range(grid.samples)) if tiles is None else tiles
     stride = _coprime_stride(len(tiles))
     lane = dr.arange(t.UInt32, len(tiles) * MICROS) if order is None else order
     turn, micro = lane // MICROS, lane % MICROS
@@ -34,12 +35,15 @@ def make_lanes(Float: type, grid: TileGrid, order: Any = None, tiles: range | No
         (t.UInt64(turn) * dr.opaque(t.UInt64, stride)) % dr.opaque(t.UInt64, len(tiles))
     )
     tile += dr.opaque(t.UInt32, tiles.start)
+    micro_tile = tile * MICROS + micro
+    sample, tile = divide(tile, grid.num_tiles, grid.samples)
     columns = dr.opaque(t.UInt32, grid.columns)
     row = tile // columns
     return Lanes(
-        micro_tile=tile * MICROS + micro,
+        micro_tile=micro_tile,
         micro=micro,
         tile=tile,
+        sample=sample,
         x=(tile - row * columns) * TILE + (micro % GRID) * MICRO,
         y=row * TILE + (micro // GRID) * MICRO,
     )
@@ -104,7 +108,7 @@ class Entries:
 
     def __init__(self, bins: TileBins, lanes: Lanes, end: Any) -> None:
         UInt32 = type(lanes.tile)
-        self.words, self.micro = bins.words, lanes.micro
+        self.words, self.micro, self.sample = bins.words, lanes.micro, lanes.sample
         start = dr.gather(UInt32, bins.tile_start, lanes.tile)
         occupied = start < end
         # An empty lane gets first == last and no bits: it is over before it begins.
@@ -190,21 +194,24 @@ def _highest_bit(word: Any) -> Any:
 
 
 def load_pixels(plane: Any, lanes: Lanes, grid: TileGrid) -> list[Any]:
-    """The 16 values of a row-major plane of pixels in each micro-tile; 0 off the film."""
+    """The 16 values of a row-major plane of all samples in each micro-tile; 0 off the film."""
     return [
         dr.gather(type(plane), plane, index, inside) for index, inside in pixels_of(lanes, grid)
     ]
 
 
 def pixels_of(lanes: Lanes, grid: TileGrid) -> list[tuple[Any, Any]]:
-    """For the 16 pixels of each micro-tile: row-major index, and whether it is on the film."""
+    """For the 16 pixels of each micro-tile: row-major index, and whether it is on the film.
+
+    The index is that in a plane of all samples.
+    """
     UInt32 = type(lanes.x)
     width, height = dr.opaque(UInt32, grid.width), dr.opaque(UInt32, grid.height)
-    pixels = []
+    first_row, pixels = lanes.sample * height, []
     for pixel in range(PIXELS):
         row, column = divmod(pixel, MICRO)
         x, y = lanes.x + column, lanes.y + row
-        pixels.append((y * width + x, (x < width) & (y < height)))
+        pixels.append(((first_row + y) * width + x, (x < width) & (y < height)))
     return pixels
 
 

@@ -48,7 +48,7 @@ from typing import Any
 
 import drjit as dr
 
-from drgs.core.arrays import Rows, quotient, scatter_rows, types_of
+from drgs.core.arrays import Rows, divide, quotient, scatter_rows, types_of
 from drgs.splatting.grid import GRID, MICRO, MICROS, PIXELS, TILE, TileGrid
 from drgs.splatting.image_model import Alpha, Features
 from drgs.splatting.lanes import (
@@ -75,7 +75,7 @@ from drgs.splatting.tiles import TileBins
 
 @dataclass(frozen=True)
 class Layers:
-    """What compositing makes of the splats, stored one row per micro-tile."""
+    """What compositing makes of the splats, stored one row per micro-tile of each sample."""
 
     values: Any  # Float (tiles * 16 * (1 + C) * 16,): row: transmittance, then each plane
     ends: Any  # UInt32 (tiles * 16 * 16,): sorted entry from which on a pixel composited nothing
@@ -84,16 +84,18 @@ class Layers:
     grid: TileGrid
 
     def planes(self) -> list[Any]:
-        """1 + C planes in row-major pixel order, Float (H * W,), not evaluated.
+        """1 + C planes in row-major pixel order, Float (samples * H * W,), not evaluated.
 
         The first is T, the transmittance left for the background; then sum_i w_i c_i for each
         component of c.
         """
         t = types_of(type(self.values))
-        pixel = dr.arange(t.UInt32, self.grid.width * self.grid.height)
-        y = quotient(pixel, self.grid.width)
-        x = pixel - y * dr.opaque(t.UInt32, self.grid.width)
-        tile = (y // TILE) * dr.opaque(t.UInt32, self.grid.columns) + x // TILE
+        pixel, grid = dr.arange(t.UInt32, self.grid.num_pixels), self.grid
+        y = quotient(pixel, grid.width)
+        x = pixel - y * dr.opaque(t.UInt32, grid.width)
+        sample, y = divide(y, grid.height, grid.samples)
+        tile = (y // TILE) * dr.opaque(t.UInt32, grid.columns) + x // TILE
+        tile += sample * dr.opaque(t.UInt32, grid.num_tiles)
         micro = ((y % TILE) // MICRO) * GRID + (x % TILE) // MICRO
         base = (tile * MICROS + micro) * (PIXELS * (1 + self.count))
         index = base + (y % MICRO) * MICRO + x % MICRO
@@ -230,6 +232,9 @@ def largest(values: list[Any]) -> Any:
 # Adjoint
 # ----------------------------------------------------------------------------------------------
 
+ONE_SAMPLE = range(1)
+"""Samples of layers that have one."""
+
 
 @dataclass(frozen=True)
 class SplatGradients:
@@ -237,6 +242,13 @@ class SplatGradients:
 
     geometry: list[Any]  # Float each: mean x, y (per px), p, r, s, opacity, more of the response's
     features: list[Any]  # Float each
+
+    def plus(self, other: SplatGradients) -> SplatGradients:
+        """The sum."""
+        return SplatGradients(
+            geometry=[a + b for a, b in zip(self.geometry, other.geometry, strict=True)],
+            features=[a + b for a, b in zip(self.features, other.features, strict=True)],
+        )
 
     @property
     def means2d(self) -> Any:
@@ -260,21 +272,28 @@ def composite_adjoint(
     layers: Layers,
     d_features: list[Any],
     d_transmittance: Any,
+    samples: range = ONE_SAMPLE,
+    before: SplatGradients | None = None,
 ) -> SplatGradients:
     """Derivatives with respect to the splats, given those with respect to the planes.
 
     layers: what :func:`composite` returned for the same bins and records; d_features: C planes
-    (H * W,); d_transmittance: plane (H * W,). Not differentiated: the order, the decisions
-    (cut, clamp, stop).
+    (samples * H * W,); d_transmittance: plane (samples * H * W,); samples: those of the layers that
+    are added, one after the other, to the derivatives ``before``. Not differentiated: the order,
+    the decisions (cut, clamp, stop).
     """
-    pairs = CompositedPairs.of(bins, layers.stop)
+    pairs = CompositedPairs.of(bins, layers.stop, samples)
     bands = bands_of(bins, pairs)
     sums = Rows.empty(bins.rows.Float, bins.num_sums, max(pairs.num_rows, 1))
     for band in bands:
         slots = assign_slots(pairs, band)
         partials = _partials(bins, records, layers, slots, d_features, d_transmittance)
         sum_entries(bins, pairs, slots, partials, sums)
-    return splat_gradients(bins, sum_runs(sums.Float, pairs.first_row, sums.load))
+
+    def totals(rank: Any, sample: Any) -> list[Any]:
+        return sum_runs(sums.Float, pairs.first_row, pairs.run(rank, sample), sums.load)
+
+    return splat_gradients(bins, totals, len(samples), before)
 
 
 def _partials(
@@ -363,17 +382,41 @@ def _adjoint_step(
     return before, d_log_alpha, d_stored
 
 
-def splat_gradients(bins: TileBins, totals: list[Any]) -> SplatGradients:
+def splat_gradients(
+    bins: TileBins,
+    totals: Callable[[Any, Any], list[Any]],
+    num_samples: int,
+    before: SplatGradients | None,
+) -> SplatGradients:
     """From each splat's sums, by rank, to its derivatives, by Gaussian.
 
-    totals: moments, and derivatives of the features.
+    totals: from ranks and a sample to moments, and derivatives of the features; before: what the
+    samples' derivatives are added to, in their order.
     """
     t, response = types_of(bins.rows.Float), bins.model.response
     size = dr.width(bins.order)
     rank, count = dr.arange(t.UInt32, size), response.num_geometry
     geometry = bins.rows.load(rank)[:count]
-    columns = response.derivatives(geometry, totals[: response.num_moments])
-    columns += totals[response.num_moments :]
+
+    def terms(sample: Any) -> list[Any]:
+        sums = totals(rank, sample)
+        columns = response.derivatives(geometry, sums[: response.num_moments])
+        return columns + sums[response.num_moments :]
+
+    def add(sample: Any, columns: list[Any]) -> tuple[Any, list[Any]]:
+        return sample + 1, [total + x for total, x in zip(columns, terms(sample), strict=True)]
+
+    if before is None:
+        first, columns = 1, terms(t.UInt32(0))
+    else:
+        first, columns = 0, before.geometry + before.features
+        columns = [dr.gather(t.Float, column, bins.order) for column in columns]
+    if first < num_samples:
+        _, columns = dr.while_loop(
+            state=(dr.full(t.UInt32, first, size), [t.Float(column) for column in columns]),
+            cond=lambda sample, columns: sample < dr.opaque(t.UInt32, num_samples),
+            body=add,
+        )
     dr.eval(columns)
     rows = Rows.empty(t.Float, len(columns), size)
     rows.store(columns, bins.order)

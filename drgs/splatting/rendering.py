@@ -22,7 +22,7 @@ from typing import Any, Protocol
 import drjit as dr
 
 from drgs.cameras.camera import Camera
-from drgs.core.arrays import first_numbers, store_columns, types_of
+from drgs.core.arrays import first_numbers, repeat_array, store_columns, types_of
 from drgs.core.constants import LOW_PASS
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 from drgs.splatting.feature_groups import in_groups
@@ -41,6 +41,7 @@ from drgs.splatting.projection import (
     project,
 )
 from drgs.splatting.rasterize import (
+    ONE_SAMPLE,
     Layers,
     Records,
     SplatGradients,
@@ -97,6 +98,8 @@ class Order(Protocol):
         layers: Layers,
         d_features: list[Any],
         d_transmittance: Any,
+        samples: range = ONE_SAMPLE,
+        before: SplatGradients | None = None,
     ) -> SplatGradients:
         """See :func:`drgs.splatting.rasterize.composite_adjoint`."""
         ...
@@ -137,9 +140,12 @@ class CenterOrder:
         layers: Layers,
         d_features: list[Any],
         d_transmittance: Any,
+        samples: range = ONE_SAMPLE,
+        before: SplatGradients | None = None,
     ) -> SplatGradients:
         """See :func:`drgs.splatting.rasterize.composite_adjoint`."""
-        return composite_adjoint(bins, records, layers, d_features, d_transmittance)
+        d_planes = d_features, d_transmittance
+        return composite_adjoint(bins, records, layers, *d_planes, samples, before)
 
     def tangent(
         self, bins: TileBins, records: Records, layers: Layers, tangents: SplatGradients
@@ -233,7 +239,10 @@ class Frame:
     layers: Layers  # of that order
 
     def planes(self) -> list[Any]:
-        """Transmittance, then the pipeline's features, each Float (H * W,), unevaluated."""
+        """Transmittance, then the pipeline's features, unevaluated.
+
+        Each Float (samples * H * W,): the pixels of the first sample, then those of the second.
+        """
         return self.layers.planes()
 
 
@@ -256,7 +265,7 @@ def render(gaussians: Gaussians, camera: Camera, pipeline: Pipeline) -> Frame:
     entries.
     """
     model = pipeline.model.seen_by(camera)
-    grid = TileGrid(camera.width, camera.height)
+    grid = TileGrid(camera.width, camera.height, model.positions.samples)
     bins = bin_footprints(pipeline.source.footprints(gaussians, camera, pipeline), grid, model)
     order = in_groups(pipeline.order.seen_by(camera), bins)
     records = order.records(bins)
@@ -279,7 +288,8 @@ def render_again(frame: Frame, model: ImageModel) -> Frame:
     model: that of the frame's pipeline, but for points of the pixels within the same margin, or
     for features that are composited of the same stored numbers.
     """
-    bins = replace(frame.bins, model=model.seen_by(frame.camera))
+    grid = replace(frame.bins.grid, samples=model.positions.samples)
+    bins = replace(frame.bins, grid=grid, model=model.seen_by(frame.camera))
     return replace(frame, bins=bins, layers=frame.order.composite(bins, frame.records))
 
 
@@ -294,8 +304,8 @@ def frames_adjoint(
     The loss depends on several frames of the same splats and one camera.
 
     gaussians: those that ``frames`` were rendered from; d_planes: of each frame, derivatives of the
-    loss with respect to its planes (see :meth:`Frame.planes`), Float (H * W,) each; of_camera:
-    whether those with respect to the camera are asked for.
+    loss with respect to its planes (see :meth:`Frame.planes`); of_camera: whether those with
+    respect to the camera are asked for. All samples are added in their order.
 
     Raises NotImplementedError if they are, and the pipeline has none.
 
@@ -303,20 +313,17 @@ def frames_adjoint(
     """
     total = None
     for frame, (d_transmittance, *d_features) in zip(frames, d_planes, strict=True):
-        gradients = frame.order.adjoint(
-            frame.bins, frame.records, frame.layers, d_features, d_transmittance
-        )
-        total = gradients if total is None else _sum(total, gradients)
-        if len(frames) > 1:
-            dr.eval(total)
+        bins, inputs = frame.bins, (frame.records, frame.layers, d_features, d_transmittance)
+        at_once = max(1, ENTRIES_AT_ONCE // max(bins.num_entries, dr.width(bins.order)))
+        for first in range(0, bins.grid.samples, at_once):
+            samples = range(first, min(first + at_once, bins.grid.samples))
+            total = frame.order.adjoint(bins, *inputs, samples, total)
     return frames[0].pipeline.source.gradients(gaussians, frames[0], total, of_camera)
 
 
-def _sum(a: SplatGradients, b: SplatGradients) -> SplatGradients:
-    return SplatGradients(
-        geometry=[x + y for x, y in zip(a.geometry, b.geometry, strict=True)],
-        features=[x + y for x, y in zip(a.features, b.features, strict=True)],
-    )
+ENTRIES_AT_ONCE = 1 << 19
+"""Entries, and splats, of the samples that the adjoint adds at once. Of each entry it stores
+about 40 bytes besides its slots, whose memory is bounded by itself."""
 
 
 def gradients_of(
@@ -428,16 +435,18 @@ def _back_to_rows(
 def weighted_sums(frame: Frame, plane: Any) -> Any:
     """Of each Gaussian, the sum over pixels of its weight times ``plane``: Float (N,).
 
-    plane: x, Float (H * W,). A plane of the frame is C = sum_i w_i c_i, so that the adjoint's
-    derivative with respect to c_i is sum w_i g over pixels: here g is x for the first feature and 0
-    for the others. No other kernel is compiled than that of the adjoint, unless colours are seen
-    along each pixel's ray.
+    plane: x, Float (H * W,), the same for all samples. A plane of the frame is C = sum_i w_i c_i,
+    so that the adjoint's derivative with respect to c_i is sum w_i g over pixels: here g is x for
+    the first feature and 0 for the others. No other kernel is compiled than that of the adjoint,
+    unless colours are seen along each pixel's ray.
     """
-    model = frame.bins.model
+    model, samples = frame.bins.model, frame.bins.grid.samples
     bins = replace(frame.bins, model=replace(model, features=model.features.weighing()))
+    plane = repeat_array(plane, samples)
     zeros = dr.opaque(type(plane), 0, dr.width(plane))
     d_features = [plane, *[zeros] * (frame.layers.count - 1)]
-    gradients = frame.order.adjoint(bins, frame.records, frame.layers, d_features, zeros)
+    inputs = frame.records, frame.layers, d_features, zeros
+    gradients = frame.order.adjoint(bins, *inputs, range(samples))
     return gradients.features[0]
 
 

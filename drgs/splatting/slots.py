@@ -19,7 +19,7 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from drgs.core.arrays import Rows, interleave, types_of
+from drgs.core.arrays import Rows, divide, interleave, repeat_array, types_of
 from drgs.splatting.grid import MICROS
 from drgs.splatting.lanes import Entries
 from drgs.splatting.tiles import WORD, TileBins, transpose_masks
@@ -31,35 +31,45 @@ With fewer, Dr.Jit traces and launches more often than it saves."""
 
 @dataclass(frozen=True)
 class CompositedPairs:
-    """Which pairs of an entry and a micro-tile were composited.
+    """Which pairs of an entry and a micro-tile were composited, in each of S samples.
 
     An entry with such a pair is *seen* and has a row of sums; those of a splat follow each other.
+    Entries, sorted and unsorted, and ranks are counted on from sample to sample.
     """
 
-    masks: Any  # UInt32 (M padded,): sorted -> bit per micro-tile
-    words: Any  # UInt32 (M padded / 32 * 16,): (group of 32, micro-tile) -> bit per entry
-    row: Any  # UInt32 (M + 1,): unsorted -> row of sums, or of the next entry that is seen
-    first_row: Any  # UInt32 (N + 1,): rank -> first of its rows
+    masks: Any  # UInt32 (S * M padded,): sorted -> bit per micro-tile
+    words: Any  # UInt32 (S * M padded / 32 * 16,): (group of 32, micro-tile) -> bit per entry
+    row: Any  # UInt32 (S * M + 1,): unsorted -> row of sums, or of the next entry that is seen
+    first_row: Any  # UInt32 (S * (N + 1),): rank -> first of its rows; one more for each sample
+    samples: range  # of the layers
 
     @staticmethod
-    def of(bins: TileBins, stop: Any) -> CompositedPairs:
+    def of(bins: TileBins, stop: Any, samples: range) -> CompositedPairs:
         """Those before each micro-tile's ``stop``, see :class:`drgs.splatting.rasterize.Layers`."""
-        t = types_of(bins.rows.Float)
-        entry = dr.arange(t.UInt32, dr.width(bins.masks))
+        t, count = types_of(bins.rows.Float), len(samples)
+        padded, num_entries = dr.width(bins.masks), bins.num_entries
+        _, entry = divide(dr.arange(t.UInt32, count * padded), padded, count)
+        first_tile = dr.opaque(t.UInt32, bins.grid.tiles_of(samples).start)
+        tiles = first_tile + repeat_array(bins.tiles, count, bins.grid.num_tiles)
         masks = t.UInt32(0)
         for k in range(MICROS // 4):
-            stops = dr.gather(t.Array4u, stop, bins.tiles * (MICROS // 4) + k)
+            stops = dr.gather(t.Array4u, stop, tiles * (MICROS // 4) + k)
             for m, of_micro in enumerate(stops):
                 masks |= dr.select(entry < of_micro, t.UInt32(1 << (4 * k + m)), 0)
-        masks &= bins.masks
+        masks &= repeat_array(bins.masks, count)
         dr.eval(masks)
         words = transpose_masks(masks)
-        seen = dr.zeros(t.UInt32, bins.num_entries + 1)
-        dr.scatter(seen, t.UInt32(1), bins.source, masks != 0)
+        seen = dr.zeros(t.UInt32, count * num_entries + 1)
+        dr.scatter(seen, t.UInt32(1), repeat_array(bins.source, count, num_entries), masks != 0)
         row = dr.prefix_sum(seen)
-        first_row = dr.gather(t.UInt32, row, bins.first_entry)
+        first_row = dr.gather(t.UInt32, row, repeat_array(bins.first_entry, count, num_entries))
         dr.eval(words, first_row)
-        return CompositedPairs(masks, words, row, first_row)
+        return CompositedPairs(masks, words, row, first_row, samples)
+
+    def run(self, rank: Any, sample: Any) -> Any:
+        """Where ``first_row`` has the rows of a splat; sample: number among the samples."""
+        num_ranks = dr.width(self.first_row) // len(self.samples)
+        return sample * dr.opaque(type(rank), num_ranks) + rank
 
     @property
     def num_rows(self) -> int:
@@ -71,8 +81,8 @@ class CompositedPairs:
 class Band:
     """Consecutive tiles, their sorted entries, and how many slots these have."""
 
-    tiles: range
-    entries: range
+    tiles: range  # of all samples of the layers
+    entries: range  # of all samples of the pairs
     num_slots: int
 
     @property
@@ -83,20 +93,27 @@ class Band:
 
 
 def bands_of(bins: TileBins, pairs: CompositedPairs) -> list[Band]:
-    """The film in bands. The host reads how many entries and slots each tile has."""
-    t = types_of(bins.rows.Float)
+    """The film of each sample in bands. The host reads how many slots and entries each tile has."""
+    t, count = types_of(bins.rows.Float), len(pairs.samples)
     running = dr.cumsum(dr.popcnt(pairs.masks))
-    before = bins.tile_start > 0
-    slots = dr.gather(t.UInt32, running, bins.tile_start - 1, before)
-    dr.eval(slots)
-    starts, slots = np.array(bins.tile_start, np.int64), np.array(slots, np.int64)
+    starts = repeat_array(bins.tile_start, count, dr.width(bins.masks))
+    slots = dr.gather(t.UInt32, running, starts - 1, starts > 0)
+    dr.eval(starts, slots)
+    starts, slots = (_without_inner_ends(column, count) for column in (starts, slots))
     count = -(-max(slots[-1], 1) // BAND_SLOTS)
     targets = slots[-1] * np.arange(1, count) / count
     edges = np.unique([0, *np.searchsorted(slots, targets, side="right") - 1, len(slots) - 1])
+    first = bins.grid.tiles_of(pairs.samples).start
     return [
-        Band(range(a, b), range(starts[a], starts[b]), int(slots[b] - slots[a]))
+        Band(range(first + a, first + b), range(starts[a], starts[b]), int(slots[b] - slots[a]))
         for a, b in pairwise(edges.tolist())
     ]
+
+
+def _without_inner_ends(column: Any, count: int) -> np.ndarray:
+    """Starts of all tiles and the end of the last, of ``count`` columns with an end each."""
+    columns = np.array(column, np.int64).reshape(count, -1)
+    return np.append(columns[:, :-1], columns[-1, -1])
 
 
 @dataclass(frozen=True)
@@ -112,23 +129,36 @@ class Slots:
     pairs: Any  # UInt32 (groups * 16 * 2,): (group, micro-tile) -> first slot, bits
     first_group: Any  # UInt32 (1,): of the band
     band: Band
+    samples: range  # of the pairs
+    groups_of_sample: int
 
     def at(self, group: Any, micro: Any, active: Any = True) -> tuple[Any, Any]:
-        """First slot of a group of entries in a micro-tile, and the word of its composited bits."""
+        """First slot of a group of entries in a micro-tile, and the word of its composited bits.
+
+        group: among those of all samples of the pairs.
+        """
         index = (group - self.first_group) * MICROS + micro
         return dr.gather(types_of(type(group)).Array2u, self.pairs, index, active)
 
     def end(self, entries: Entries) -> Any:
         """Where each lane's slots end."""
-        first, word = self.at(entries.last, entries.micro, entries.head != 0)
+        last = self._first_of_sample(entries) + entries.last
+        first, word = self.at(last, entries.micro, entries.head != 0)
         return first + dr.popcnt(word & entries.tail)
 
     def number(self, entries: Entries) -> Any:
         """How many slots each lane has."""
         occupied = entries.head != 0
-        first, word = self.at(entries.first, entries.micro, occupied)
+        first_group = self._first_of_sample(entries) + entries.first
+        first, word = self.at(first_group, entries.micro, occupied)
         begin = first + dr.popcnt(word & ~entries.head)
         return dr.select(occupied, self.end(entries) - begin, 0)
+
+    def _first_of_sample(self, entries: Entries) -> Any:
+        """The first group of each lane's sample."""
+        start, groups = self.samples.start, self.groups_of_sample
+        start, groups = (dr.opaque(type(self.first_group), number) for number in (start, groups))
+        return (entries.sample - start) * groups
 
 
 def assign_slots(pairs: CompositedPairs, band: Band) -> Slots:
@@ -145,7 +175,8 @@ def assign_slots(pairs: CompositedPairs, band: Band) -> Slots:
     words = _words(pairs, band, first_group + group, micro)
     table = interleave([dr.gather(t.UInt32, first, micro * num_groups + group), words])
     dr.eval(table)
-    return Slots(table, first_group, band)
+    of_sample = dr.width(pairs.words) // MICROS // len(pairs.samples)
+    return Slots(table, first_group, band, pairs.samples, of_sample)
 
 
 def _words(pairs: CompositedPairs, band: Band, group: Any, micro: Any) -> Any:
@@ -189,18 +220,19 @@ def sum_entries(
         body=body,
     )
     dr.eval(totals)
-    source = dr.gather(t.UInt32, bins.source, entry)
+    sample, entry = divide(entry, dr.width(bins.masks), len(pairs.samples))
+    first_source = sample * dr.opaque(t.UInt32, bins.num_entries)
+    source = first_source + dr.gather(t.UInt32, bins.source, entry)
     sums.store(totals, dr.gather(t.UInt32, pairs.row, source), micros != 0)
     dr.eval(sums)
 
 
-def sum_runs(Float: type, first: Any, load: Callable[[Any], Sequence[Any]]) -> list[Any]:
+def sum_runs(Float: type, first: Any, run: Any, load: Callable[[Any], Sequence[Any]]) -> list[Any]:
     """Sums over runs, one lane a run: run r is from ``first[r]`` to ``first[r + 1]``.
 
-    load: the numbers of an element of a run.
+    run: r of each lane; load: the numbers of an element of a run.
     """
     UInt32 = type(first)
-    run = dr.arange(UInt32, dr.width(first) - 1)
     begin, end = (dr.gather(UInt32, first, run + k) for k in (0, 1))
     width = len(load(begin))
 

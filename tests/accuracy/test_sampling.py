@@ -16,6 +16,7 @@ from support.approximation_checks import (
     _planes,
     direction,
 )
+from support.backgrounds import CLOSE, EMITTERS, picture, texels
 from support.helpers import (
     FLOAT32,
     FLOAT64,
@@ -25,12 +26,15 @@ from support.helpers import (
     device_gaussians,
     single,
 )
-from support.views import Scene, image_of, tensors
+from support.views import VIEWS, Scene, image_of, tensors
+from support.walls import Wall
+from support.walls import load as load_wall
 
 import drgs  # noqa: F401  (registers the plugin)
 from drgs.accuracy.sample_points import SamplePoints
 from drgs.gaussians.parameters import PARAMETER_NAMES
-from drgs.integrator.sampling import DrawnSamples
+from drgs.integrator.sampling import PIXELS_PER_PASS, SAMPLES_PER_KERNEL, DrawnSamples
+from drgs.integrator.weights import weighted_sums_of_last
 from drgs.reference import rays as reference_rays
 from drgs.reference import splatting as reference
 from drgs.splatting import rendering
@@ -149,9 +153,10 @@ def exposure_of(loaded, samples, seed=0):
     sensor = loaded.sensors()[0]
     exposure = DrawnSamples(sensor, seed, samples, {})
     width, height = sensor.film().crop_size()
-    return np.array(
-        [np.array([p.x, p.y]).T.reshape(height, width, 2) for p in exposure.positions], np.float64
-    )
+    passes = [
+        np.array([p.x, p.y], np.float64).T.reshape(-1, height, width, 2) for p in exposure.positions
+    ]
+    return np.concatenate(passes)
 
 
 def pictures_at(points) -> np.ndarray:
@@ -310,8 +315,8 @@ def test_more_samples_need_no_longer_kernels_for_a_filter(action):
         with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
             dr.kernel_history_clear()
             if action == "develop":
-                planes = [[dr.opaque(mi.Float, 1, width * height)] * 4] * samples
-                dr.eval(exposure.develop(planes))
+                sizes = [dr.width(points.x) for points in exposure.positions]
+                dr.eval(exposure.develop([[dr.opaque(mi.Float, 1, n)] * 4 for n in sizes]))
             else:
                 dr.eval(exposure.adjoint(dr.full(mi.TensorXf, 1, (height, width, 4))))
             kernels = dr.kernel_history([dr.KernelType.JIT])
@@ -353,3 +358,145 @@ def test_more_samples_come_closer_to_the_area_of_a_pixel():
     exact = image(256, 1)
     errors = [np.sqrt(np.mean((image(n, 2) - exact) ** 2)) for n in (1, 4, 16, 64)]
     assert all(after < 0.7 * before for before, after in pairwise(errors)), errors
+
+
+# ----------------------------------------------------------------------------------------------
+# Several samples a pass
+# ----------------------------------------------------------------------------------------------
+
+FEW = Scene(count=12, degree=1)
+
+
+def scene_with(settings=(), sensor=None, **objects):
+    integrator = FEW.settings | tensors(FEW.gaussians) | dict(settings)
+    sensor = FEW.view.sensor() if sensor is None else sensor
+    return mi.load_dict({"type": "scene", "integrator": integrator, "sensor": sensor, **objects})
+
+
+def batch_of_two():
+    whole = FEW.view.sensor()
+    whole["film"]["width"] *= 2
+    children = {"a": FEW.view.sensor(), "b": VIEWS[2].sensor()}
+    return {"type": "batch", "film": whole["film"], "sampler": whole["sampler"], **children}
+
+
+def thin_lens():
+    common = {name: FEW.view.sensor()[name] for name in ("film", "sampler", "to_world")}
+    return {
+        "type": "thinlens",
+        "fov": 50.0,
+        "aperture_radius": 0.05,
+        "focus_distance": 2.3,
+    } | common
+
+
+def moving():
+    common = {name: FEW.view.sensor()[name] for name in ("film", "sampler", "to_world")}
+    lens = {"fx": 30.0, "fy": 27.0, "cx": 17.0, "cy": 12.5, "shutter": "global"}
+    close = mi.ScalarTransform4f(CLOSE)
+    moves = {"to_world_close": close, "shutter_samples": 2}
+    return {"type": "calibrated", **lens, **common, **moves}
+
+
+def feature_tensor(channels):
+    rng = np.random.default_rng(3)
+    return mi.TensorXf(rng.normal(0, 1, (FEW.count, channels)).astype(np.float32))
+
+
+SCENES = {
+    "plain": lambda: scene_with(),
+    "linear, antialiased": lambda: scene_with({"srgb_primitives": True, "antialiased": True}),
+    "exact, order of each pixel": lambda: scene_with({"projection": "exact", "order": "pixel"}),
+    "unscented, colours of each pixel": lambda: scene_with(
+        {"projection": "unscented", "sh_direction": "pixel", "low_pass": 0.0}
+    ),
+    "features in groups": lambda: scene_with(
+        {"aovs": "z:depth, n:normal, f:feature_f", "feature_f": feature_tensor(4)}
+    ),
+    "texture": lambda: scene_with({"background": picture(texels())}),
+    "environment, thin lens": lambda: scene_with(sensor=thin_lens(), sky=EMITTERS["envmap"]()),
+    "surface, environment": lambda: load_wall(FEW, sky=True, wall=Wall(half=0.5), aovs="z:depth"),
+    "batch": lambda: scene_with({"aovs": "z:depth"}, batch_of_two()),
+    "motion": lambda: scene_with(sensor=moving()),
+}
+
+
+def outcome(name, samples=3) -> tuple[dict[str, np.ndarray], int]:
+    """Image, tangent, and gradients of the Gaussians, of a new scene; and the number of passes."""
+    loaded = SCENES[name]()
+    integrator, sensor, params = loaded.integrator(), loaded.sensors()[0], mi.traverse(loaded)
+    values = {key: params[f"integrator.{key}"] for key in PARAMETER_NAMES}
+    rng = np.random.default_rng(0)
+    image = integrator.render(loaded, sensor, seed=5, spp=samples)
+    for value in values.values():
+        dr.enable_grad(value)
+        d = rng.normal(size=np.array(value).shape).astype(np.float32)
+        dr.set_grad(value, type(value)(d))
+    tangent = integrator.render_forward(loaded, params, sensor, 5, samples)
+    dr.clear_grad(list(values.values()))
+    weights = mi.TensorXf(rng.normal(size=image.shape).astype(np.float32))
+    integrator.render_backward(loaded, params, weights, sensor, 5, samples)
+    gradients = {key: np.array(dr.grad(value)) for key, value in values.items()}
+    assert all(np.abs(gradient).max() > 0 for gradient in gradients.values())
+    (frames, *_) = integrator.memory.rendered[0].frames
+    return {"image": np.array(image), "tangent": np.array(tangent), **gradients}, len(frames)
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_passes_of_several_samples_give_the_bytes_of_single_ones(name, monkeypatch):
+    monkeypatch.setattr("drgs.splatting.feature_groups.FEATURES_AT_ONCE", {4: 4, 8: 4})
+    monkeypatch.setattr("drgs.integrator.sampling.PIXELS_PER_PASS", 1)
+    expected, passes = outcome(name)
+    assert passes == 3
+
+    def check():
+        found, passes = outcome(name)
+        for key, value in expected.items():
+            assert found[key].tobytes() == value.tobytes(), key
+        return passes
+
+    monkeypatch.undo()
+    monkeypatch.setattr("drgs.splatting.feature_groups.FEATURES_AT_ONCE", {4: 4, 8: 4})
+    assert check() == 1
+    monkeypatch.setattr("drgs.splatting.rendering.ENTRIES_AT_ONCE", 1)
+    assert check() == 1
+    width, height = SCENES[name]().sensors()[0].film().crop_size()
+    monkeypatch.setattr("drgs.integrator.sampling.PIXELS_PER_PASS", 2 * width * height)
+    monkeypatch.setattr("drgs.splatting.slots.BAND_SLOTS", 16)
+    assert check() == 2
+
+
+def test_a_pass_of_a_large_film_has_one_sample():
+    film = {"width": 512, "height": PIXELS_PER_PASS // 512 + 1}
+    large = scene_with(sensor=FEW.view.sensor(**film)).sensors()[0]
+    assert [p.samples for p in DrawnSamples(large, 0, 3, {}).positions] == [1, 1, 1]
+    small = scene_with().sensors()[0]
+    at_once = PIXELS_PER_PASS // (FEW.view.width * FEW.view.height)
+    passes = DrawnSamples(small, 0, 2 * at_once + 1, {}).positions
+    assert [p.samples for p in passes] == [at_once, at_once, 1]
+
+
+def test_more_samples_of_a_small_film_need_no_more_kernels():
+    """But for their sums over samples, of 16 at a time."""
+
+    def launches(samples) -> int:
+        loaded = scene_with()
+        with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
+            loaded.integrator().render(loaded, spp=samples)
+            return len(dr.kernel_history([dr.KernelType.JIT]))
+
+    launches(2)
+    assert launches(64) <= launches(2) + 64 // SAMPLES_PER_KERNEL
+
+
+def test_weights_are_means_over_the_samples_of_all_passes(monkeypatch):
+    def weights() -> np.ndarray:
+        loaded = scene_with()
+        dr.eval(loaded.integrator().render(loaded, spp=3))
+        plane = dr.arange(mi.Float, FEW.view.width * FEW.view.height)
+        return np.array(weighted_sums_of_last(loaded.integrator(), plane))
+
+    found = weights()
+    monkeypatch.setattr("drgs.integrator.sampling.PIXELS_PER_PASS", 1)
+    assert found.max() > 0
+    np.testing.assert_allclose(found, weights(), rtol=1e-6)

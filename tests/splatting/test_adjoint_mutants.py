@@ -296,7 +296,7 @@ class TestDefault(MutationChecks):
         image_model.AffineResponse.derivatives image_model.AffineResponse.tangent
         image_model.AffineResponse.pack_tangents image_model.SplatFeatures.add_derivatives
         image_model.PixelCenters.sum_dx rendering._splat_tangents
-        rendering.gradients_of rendering._back_to_rows rendering._sum
+        rendering.gradients_of rendering._back_to_rows
         rendering.gradients_by_row rendering._as_tensors
         losses._ssim_and_partials losses._assemble_gradient losses._PhotometricOp.backward
         losses._PhotometricOp.forward losses.l1_loss

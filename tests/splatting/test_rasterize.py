@@ -32,9 +32,7 @@ from drgs.splatting import image_model
 from drgs.splatting import lanes as lanes_module
 from drgs.splatting import slots as slots_module
 from drgs.splatting.grid import MICROS, TileGrid
-from drgs.splatting.rasterize import (
-    composite_adjoint,
-)
+from drgs.splatting.rasterize import ONE_SAMPLE, composite_adjoint
 from drgs.splatting.slots import CompositedPairs, assign_slots, bands_of
 
 # float64: some hundred terms of the size of the result. float32: an exponent of up to 8 carries
@@ -306,7 +304,7 @@ def test_slots_are_a_numbering_of_the_composited_pairs(precision):
     """Every pair that is composited has a slot of its own, and a lane's slots are contiguous."""
     scene = SCENES["opaque"]
     bins, _, layers = scene.composite(precision)
-    composited_pairs = CompositedPairs.of(bins, layers.stop)
+    composited_pairs = CompositedPairs.of(bins, layers.stop, ONE_SAMPLE)
     (band,) = bands_of(bins, composited_pairs)
     slots, composited = assign_slots(composited_pairs, band), np.array(composited_pairs.masks)
     pairs = np.array(slots.pairs).astype(np.int64).reshape(-1, MICROS, 2)
@@ -355,7 +353,7 @@ def test_bands_make_no_difference(band_slots, monkeypatch):
         found = composite_adjoint(bins, records, layers, d_planes[1:], d_planes[0])
         return [np.array(column).tobytes() for column in found.geometry + found.features]
 
-    pairs = CompositedPairs.of(bins, layers.stop)
+    pairs = CompositedPairs.of(bins, layers.stop, ONE_SAMPLE)
     (whole,), expected = bands_of(bins, pairs), gradients()
     monkeypatch.setattr(slots_module, "BAND_SLOTS", band_slots)
     bands = bands_of(bins, pairs)
