@@ -46,16 +46,20 @@ from drgs.integrator.properties import (
     probes_of,
     refuse_unknown,
     said_by_file,
+    to_world_of,
     turns_of_shapes,
 )
 from drgs.integrator.sensors import camera_from_sensor, read_sensor
 from drgs.integrator.view import accumulate, feature_of
 from drgs.splatting import rendering
 
-if TYPE_CHECKING:  # imported where a scene has shapes of Gaussians
-    from drgs.integrator.ellipsoids import Gathered
+if TYPE_CHECKING:  # imported where a scene has other Gaussians than the integrator's, unmoved
+    from drgs.integrator.gathering import Gathered, Part
 
 SUPPORTED_VARIANTS = ("llvm_ad_rgb", "cuda_ad_rgb")
+
+PLACE = "splats: to_world"
+"""Begins messages about a transform."""
 
 
 @dataclass(frozen=True)
@@ -320,6 +324,8 @@ class SplatsIntegrator(mi.CppADIntegrator):
             setattr(self, name, getattr(gaussians, name))
         self.smoothing, self.features = gaussians.smoothing, gaussians.features or {}
         self._has_own, self._turns = gaussians.num_gaussians > 0, turns_of_shapes(props)
+        self.to_world, self._is_moved = to_world_of(props), "to_world" in props
+        self._check_place()
         self._gathered: Gathered | None = None  # with the Gaussians of the scene's shapes
         self._scene_has_shapes = False  # that are Gaussians: the scene that was rendered last
         self.ignore = ignored_effects(props)
@@ -364,6 +370,8 @@ class SplatsIntegrator(mi.CppADIntegrator):
                 callback.put(name, value, mi.ParamFlags.Differentiable)
         for name, value in self.features.items():
             callback.put(name, value, mi.ParamFlags.Differentiable)
+        if self._has_own:
+            callback.put("to_world", self.to_world, mi.ParamFlags.Differentiable)
         callback.put("background", self.background, mi.ParamFlags.Differentiable)
         if self.nested is not None:
             callback.put("nested", self.nested, mi.ParamFlags.Differentiable)
@@ -381,10 +389,20 @@ class SplatsIntegrator(mi.CppADIntegrator):
             return
         if dr.width(self.shN) == 0:  # not exposed, so that its rows could not be set
             self.shN = dr.zeros(mi.TensorXf, (next(iter(self.means.shape), 0), 0, 3))
+        if not keys or "to_world" in keys:
+            self._is_moved = True
+            self._check_place()
         check_shapes(replace(self._own, features=self.features))
         self._check_columns()
         if not (self._sh_degree_is_given or self._scene_has_shapes):
             check_degree(self.sh_degree, self._own)
+
+    def _check_place(self) -> None:
+        """Refuse a ``to_world`` that is no similarity; one that moves nothing costs nothing."""
+        if self._is_moved:
+            from drgs.integrator.placement import similarity_of
+
+            self._is_moved = not similarity_of(self.to_world.matrix, PLACE).is_identity
 
     def _check_columns(self) -> None:
         check_columns({n: len(self.channels_of(k)) for n, k in self.aovs.items() if k != "alpha"})
@@ -407,10 +425,13 @@ class SplatsIntegrator(mi.CppADIntegrator):
     def gaussians(self) -> Gaussians:
         """What is rendered, as one value: the parameters, whose arrays may be attached.
 
-        Once a scene with ellipsoids was rendered, theirs as well; then detached.
+        Where they are moved, in world space. Once a scene with ellipsoids was rendered, theirs as
+        well; both are detached.
         """
         if self.memory.shadows is not None:
             return self.memory.shadows.gaussians
+        if self._gathered is None and self._is_moved:
+            self._gather_parts([])
         return self._own if self._gathered is None else self._gathered.gaussians
 
     def _gather(self, scene: mi.Scene) -> None:
@@ -422,12 +443,7 @@ class SplatsIntegrator(mi.CppADIntegrator):
             check_shapes(self._own)
         shapes = _ellipsoids(scene)
         self._scene_has_shapes = bool(shapes)
-        if shapes or set(self._turns) - {""}:
-            from drgs.integrator.ellipsoids import gather
-
-            self._gathered = gather(self._own, shapes, self._turns, self._gathered)
-        else:
-            self._gathered = None
+        self._gather_parts(shapes)
         if self.gaussians.num_gaussians == 0:
             raise PluginError(
                 "splats: there are no Gaussians: give the integrator 'filename' or tensors "
@@ -436,6 +452,36 @@ class SplatsIntegrator(mi.CppADIntegrator):
             )
         check_degree(self.sh_degree, self.gaussians)
         self._shade(scene)
+
+    def _gather_parts(self, shapes: Sequence[mi.Shape]) -> None:
+        """Put the Gaussians of the integrator and of shapes together, unless they are its own."""
+        with dr.resume_grad():
+            is_alone = not shapes and not set(self._turns) - {""} and not self._is_placed
+            parts = None if is_alone else self._parts(shapes)
+        if parts is None:
+            self._gathered = None
+        else:
+            from drgs.integrator.gathering import gather
+
+            self._gathered = gather(parts, self._gathered)
+
+    @property
+    def _is_placed(self) -> bool:
+        """Whether the Gaussians are moved, or are to be differentiated along a move."""
+        return self._is_moved or (self._has_own and dr.grad_enabled(self.to_world))
+
+    def _parts(self, shapes: Sequence[mi.Shape]) -> list[Part]:
+        """What is rendered, attached, in its order."""
+        from drgs.integrator.placement import PlacedGaussians, Placement
+
+        parts = []
+        if self._has_own:
+            parts.append(Placement(PlacedGaussians(self._own, self.to_world.matrix), PLACE))
+        if shapes or self._turns:
+            from drgs.integrator.ellipsoids import conversions_of
+
+            parts += conversions_of(shapes, self._turns)
+        return parts
 
     def _shade(self, scene: mi.Scene) -> None:
         """Darken what lies in the shadow of surfaces."""
@@ -552,7 +598,8 @@ class SplatsIntegrator(mi.CppADIntegrator):
     def accumulate(self, scene: mi.Scene, own: Gaussians) -> None:
         """Add derivatives with respect to the Gaussians to those of the attached parameters."""
         if self._gathered is not None:
-            own = self._gathered.accumulate(_ellipsoids(scene), own)
+            self._gathered.accumulate(self._parts(_ellipsoids(scene)), own)
+            return
         for name in PARAMETER_NAMES:
             accumulate(getattr(self, name), getattr(own, name))
         for name, gradient in (own.features or {}).items():
@@ -573,16 +620,20 @@ class SplatsIntegrator(mi.CppADIntegrator):
         with self._lock, dr.suspend_grad():
             self._gather(scene)
             with dr.resume_grad():
-                features = self._own.features
-                tangents = Gaussians(
-                    **{name: _tangent(getattr(self, name)) for name in PARAMETER_NAMES},
-                    features=features and {k: _tangent(v) for k, v in features.items()},
-                )
-                if self._gathered is not None:
-                    tangents = self._gathered.tangents(_ellipsoids(scene), tangents)
+                tangents = self._tangents(scene)
             d_image = Picture.of(self, scene, sensor, seed, spp).tangent(params, tangents)
             sensor.film().clear()  # it holds an attached block
         return d_image
+
+    def _tangents(self, scene: mi.Scene) -> Gaussians:
+        """Derivatives of the Gaussians along those set on what they are made of."""
+        if self._gathered is not None:
+            return self._gathered.tangents(self._parts(_ellipsoids(scene)))
+        features = self._own.features
+        return Gaussians(
+            **{name: _tangent(getattr(self, name)) for name in PARAMETER_NAMES},
+            features=features and {k: _tangent(v) for k, v in features.items()},
+        )
 
     def _refuse_reflected(self, scene: mi.Scene) -> None:
         """Derivatives of Gaussians that surfaces show: the nested integrator leaves them out."""
@@ -590,7 +641,11 @@ class SplatsIntegrator(mi.CppADIntegrator):
         surfaces = [shape for shape in shapes if not shape.is_ellipsoids()]
         if not surfaces or (self.light == "none" and not self.shadows):
             return
-        gaussians = [vars(self._own), *(mi.traverse(s) for s in shapes if s.is_ellipsoids())]
+        gaussians = [
+            vars(self._own),
+            {"to_world": self.to_world},
+            *(mi.traverse(s) for s in shapes if s.is_ellipsoids()),
+        ]
         if any(dr.grad_enabled(value) for of in gaussians for _, value in of.items()):
             raise UnsupportedError(
                 f"splats: with light '{self.light}' and shadows '{', '.join(self.shadows)}', the "

@@ -31,6 +31,24 @@ def sh_rotation_matrices(rotation: np.ndarray, degree: int) -> list[np.ndarray]:
     return [np.linalg.lstsq(after[:, b], before[:, b], rcond=None)[0] for b in bands]
 
 
+def sh_rotation_generators(degree: int) -> list[list[np.ndarray]]:
+    """For rotations about x, y and z, derivatives of :func:`sh_rotation_matrices` at the identity.
+
+    A rotation by the small vector w turns c into c + sum_a w_a G_a c. Functions of x - w_a e_a x x
+    are differentiated by a complex step, which is exact for polynomials. float64.
+    """
+    directions, step = _directions(), 1e-20
+    values = _basis(directions, degree)
+    bands = [slice(num_coefficients(k - 1), num_coefficients(k)) for k in range(1, degree + 1)]
+    generators = []
+    for axis in np.eye(3):
+        slopes = _basis(directions - 1j * step * np.cross(axis, directions), degree).imag / step
+        generators.append(
+            [np.linalg.lstsq(values[:, b], slopes[:, b], rcond=None)[0] for b in bands]
+        )
+    return generators
+
+
 def rotated(coefficients: np.ndarray, rotation: np.ndarray) -> np.ndarray:
     """Coefficients (N, K - 1, 3) of degree 1 and above, rotated; K = (degree + 1)^2."""
     degree = round(np.sqrt(coefficients.shape[1] + 1)) - 1

@@ -27,7 +27,7 @@ from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 from drgs.integrator.settings import LitIntegrator
 
 if TYPE_CHECKING:  # imported where the ``to_world`` of shapes is given
-    from drgs.integrator.ellipsoids import Turn
+    from drgs.integrator.harmonics import Turn
 
 AOVS = {"depth": ("T",), "alpha": ("I",), "normal": ("X", "Y", "Z")}
 """What may be put out besides colour, and the names of its channels as Mitsuba has them."""
@@ -133,12 +133,6 @@ def load_gaussians(props: mi.Properties) -> Gaussians:
         tensors = {name: dr.zeros(mi.TensorXf, shape) for name, shape in shapes.items()}
         return Gaussians(**tensors, logit_opacities=mi.Float())
     check_shapes(gaussians)
-    if "to_world" in props:
-        from drgs.gaussians.similarity import Similarity
-
-        to_world = Similarity.of(matrix(props, "to_world"), "splats: to_world")
-        moved = to_world.of_gaussians(gaussians.numpy()).to(mi.TensorXf)
-        gaussians = replace(moved, features=features, rendered_with=gaussians.rendered_with)
     return gaussians
 
 
@@ -154,13 +148,20 @@ def _loaded(path: str) -> Gaussians:
     return replace(gaussians, origin=WORLD)
 
 
+def to_world_of(props: mi.Properties) -> mi.AffineTransform4f:
+    """The transform that places Gaussians in the scene; the identity where none is given."""
+    if "to_world" not in props:
+        return mi.AffineTransform4f()
+    return mi.AffineTransform4f(matrix(props, "to_world").astype(np.float32))
+
+
 def turns_of_shapes(props: mi.Properties) -> dict[str, Turn]:
     """By ids of shapes, and under "" for all others: how their spherical harmonics turn."""
     names = [name for name in props.keys() if name.startswith(SHAPES_TO_WORLD)]  # noqa: SIM118
     if not names:
         return {}
     from drgs.gaussians.similarity import Similarity
-    from drgs.integrator.ellipsoids import Turn
+    from drgs.integrator.harmonics import Turn
 
     turns = {}
     for name in names:
