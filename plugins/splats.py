@@ -505,6 +505,8 @@ class SplatsIntegrator(mi.CppADIntegrator):
         others = [feature_of(kind) for kind in self.aovs.values() if kind != "alpha"]
         features = (rendering.color_features, *others)
         pipeline = pipeline_of(self.approximations, self.sh_degree, features=features)
+        if self._gathered is not None and self._gathered.gaussians.smoothing is not None:
+            pipeline = replace(pipeline, of_smoothing=True)  # which grows with an object
         return pipeline if self.source is None else replace(pipeline, source=self.source)
 
     def aov_names(self) -> list[str]:

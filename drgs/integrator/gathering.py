@@ -155,9 +155,16 @@ def _rows(gaussians: Gaussians, start: int, num: int, degree: int) -> Gaussians:
         name: _block(value, start, num, value.shape[1:])
         for name, value in (gaussians.features or {}).items()
     }
-    logits = gaussians.logit_opacities
-    column = _block(mi.TensorXf(logits, (dr.width(logits), 1)), start, num, (1,))
-    return Gaussians(**tensors, logit_opacities=column.array, features=features or None)
+    logits, smoothing = (
+        None if flat is None else _block(mi.TensorXf(flat, (dr.width(flat), 1)), start, num, (1,))
+        for flat in (gaussians.logit_opacities, gaussians.smoothing)
+    )
+    return Gaussians(
+        **tensors,
+        logit_opacities=logits.array,
+        smoothing=None if smoothing is None else smoothing.array,
+        features=features or None,
+    )
 
 
 def columns(flat: Any, width: int) -> list[Any]:

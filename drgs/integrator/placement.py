@@ -79,9 +79,6 @@ class Placement:
         if self._place.is_identity:
             return own
         numbers, turned = self._numbers, self._turned(_Columns.of(vars(own)))
-        smoothing = own.smoothing
-        if smoothing is not None:
-            smoothing = smoothing * number_of(numbers.scale, 0)
         means = [mean + number_of(numbers.translation, k) for k, mean in enumerate(turned.means)]
         return replace(
             own,
@@ -95,6 +92,7 @@ class Placement:
     def tangent(self, tangent: Mapping[str, Any]) -> Gaussians:
         """Derivatives of the parameters along those of ``values.parameters()``."""
         own, motion = self.values.gaussians, self._motion_along(tangent[TO_WORLD])
+        smoothing = self._smoothing
         turned, moving = self._turned(_Columns.of(tangent)), self._moving(motion)
         sums = [
             [a + b for a, b in zip(*both, strict=True)] for both in zip(turned, moving, strict=True)
@@ -104,6 +102,7 @@ class Placement:
             log_scales=_plus(tangent["log_scales"], motion.scale),
             logit_opacities=tangent["logit_opacities"],
             sh0=tangent["sh0"],
+            smoothing=None if smoothing is None else smoothing * motion.scale,
             features=own.features and {name: tangent[name] for name in own.features},
         )
 
@@ -139,6 +138,12 @@ class Placement:
             numbers.harmonics.of(of.shN, transposed),
         )
 
+    @property
+    def _smoothing(self) -> Any:
+        """The filter as large as the object is."""
+        own = self.values.gaussians.smoothing
+        return None if own is None else own * number_of(self._numbers.scale, 0)
+
     @cached_property
     def _arms(self) -> _Columns:
         """The Gaussians turned and scaled, about the object's origin.
@@ -170,6 +175,8 @@ class Placement:
         d_means, (d_real, *d_imaginary) = mi.Vector3f(of.means), of.quats
         d_v = mi.Vector3f(d_imaginary)
         scale = dr.dot(d_means, r) + sum(columns(gradients.log_scales.array, 3))
+        if gradients.smoothing is not None and self._smoothing is not None:
+            scale += gradients.smoothing * self._smoothing
         rotation = dr.cross(r, d_means) + (real * d_v - d_real * v + dr.cross(v, d_v)) / 2
         for axis, turn in enumerate(Turn.generators()):
             for d_c, c in zip(of.shN, turn.of(arms.shN), strict=True):

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from support.ellipsoids import GRADIENTS, PICTURE, ROTATION, SCALE, TRANSLATION, assert_images_agree
 from support.helpers import assert_arrays_agree, clear, single
+from support.smoothing import smoothed_reference
 from support.views import Scene, gradient, gradients_of, image_of, tensors
 
 import drgs  # noqa: F401  (registers the plugin)
@@ -127,6 +128,28 @@ def slopes() -> np.ndarray:
         ends = [picture(scene, moved_by(MATRIX + s * step, model)) for s in (1, -1)]
         found[cell] = np.sum(scene.weights() * (ends[0] - ends[1])) / (2 * STEP)
     return found
+
+
+def test_a_filter_that_grows_with_an_object_is_differentiated():
+    """At a fifth of the splats' size, and at five times of it."""
+    scene, model = scene_and_object()
+    filters = single(np.geomspace(0.005, 0.1, len(model.means)))
+    weights = scene.weights()
+
+    def loss(matrix):
+        k = Similarity.of(matrix, "it").scale
+        return np.sum(
+            weights * picture(scene, smoothed_reference(moved_by(matrix, model), k * filters))
+        )
+
+    smoothing = {"smoothing": mi.TensorXf(filters.astype(np.float32))}
+    found = gradient_of_matrix(load(scene, model, **smoothing), weights)
+    grown = np.diag([1, 1, 1, 0.0])
+    expected = (
+        loss(MATRIX @ (np.eye(4) + STEP * grown)) - loss(MATRIX @ (np.eye(4) - STEP * grown))
+    ) / (2 * STEP)
+    terms = MATRIX[:3, :3] * found[:3, :3]
+    assert terms.sum() == pytest.approx(expected, abs=GRADIENTS * np.abs(terms).max())
 
 
 def gradient_of_matrix(loaded, weights) -> np.ndarray:
