@@ -28,11 +28,13 @@ from drgs.integrator.properties import (
     LIGHT_SAMPLES,
     MAX_LIGHT_SAMPLES,
     UNSEEN,
+    agreed,
     aovs_of,
     approximations_of,
     background_of,
     boolean,
     check_degree,
+    check_object,
     check_shapes,
     degree_of,
     ids_of,
@@ -40,8 +42,9 @@ from drgs.integrator.properties import (
     integer,
     light_of,
     load_gaussians,
-    nested_integrator,
+    nested_integrators,
     one_of,
+    only_one,
     positive,
     probes_of,
     refuse_unknown,
@@ -319,6 +322,7 @@ class SplatsIntegrator(mi.CppADIntegrator):
                 f"use mi.set_variant('{SUPPORTED_VARIANTS[0]}')"
             )
         super().__init__(props)
+        self._given = tuple(props.keys())
         gaussians = load_gaussians(props)
         for name in PARAMETER_NAMES:
             setattr(self, name, getattr(gaussians, name))
@@ -329,16 +333,20 @@ class SplatsIntegrator(mi.CppADIntegrator):
         self._gathered: Gathered | None = None  # with the Gaussians of the scene's shapes
         self._scene_has_shapes = False  # that are Gaussians: the scene that was rendered last
         self.ignore = ignored_effects(props)
-        self.aovs = aovs_of(props, [*AOVS, *self.features])
-        self.sh_degree = props.get("sh_degree", gaussians.sh_degree)
+        self._read_nested(props)
+        self.aovs = aovs_of(props, [*AOVS, *self._feature_widths])
+        degrees = [one.sh_degree for one in self.objects.values()]
+        self.sh_degree = props.get("sh_degree", max(gaussians.sh_degree, *degrees, 0))
         self._sh_degree_is_given = "sh_degree" in props
         self.background = background_of(props)
         self.hide_emitters = boolean(props, "hide_emitters", False)
         said = said_by_file(props, gaussians)
-        self.approximations, self.said_by_file = approximations_of(props, said), tuple(said)
+        self.file = str(props.get("filename", ""))
+        files = {self.file: said, **{v.file: v.said_by_file for v in self.objects.values()}}
+        self.said_by_file = agreed(props, {k: v for k, v in files.items() if k})
+        self.approximations = approximations_of(props, self.said_by_file)
         self.near = positive(props, "near", NEAR)
         self.srgb_primitives = boolean(props, "srgb_primitives", True)
-        self.nested = nested_integrator(props)
         self.nested_spp = integer(props, "nested_spp", 0, least=0)
         self.light = light_of(props, self.nested)
         self.exposure = positive(props, "exposure", 1.0)
@@ -358,6 +366,15 @@ class SplatsIntegrator(mi.CppADIntegrator):
         self._last_sensor: mi.Sensor | None = None  # that was rendered
         self._logged_summary = ""
 
+    def _read_nested(self, props: mi.Properties) -> None:
+        """Tell splat objects from the integrator of surfaces."""
+        nested = nested_integrators(props)
+        self.objects = {k: v for k, v in nested.items() if isinstance(v, SplatsIntegrator)}
+        self.nested = only_one([v for k, v in nested.items() if k not in self.objects])
+        self._is_object = False  # nested in another
+        for name, one in self.objects.items():
+            one.become_object(name)
+
     # ------------------------------------------------------------------------------------------
     # Parameters
     # ------------------------------------------------------------------------------------------
@@ -372,6 +389,10 @@ class SplatsIntegrator(mi.CppADIntegrator):
             callback.put(name, value, mi.ParamFlags.Differentiable)
         if self._has_own:
             callback.put("to_world", self.to_world, mi.ParamFlags.Differentiable)
+        for name, one in self.objects.items():
+            callback.put(name, one, mi.ParamFlags.Differentiable)
+        if self._is_object:
+            return
         callback.put("background", self.background, mi.ParamFlags.Differentiable)
         if self.nested is not None:
             callback.put("nested", self.nested, mi.ParamFlags.Differentiable)
@@ -394,8 +415,41 @@ class SplatsIntegrator(mi.CppADIntegrator):
             self._check_place()
         check_shapes(replace(self._own, features=self.features))
         self._check_columns()
-        if not (self._sh_degree_is_given or self._scene_has_shapes):
+        others = self._scene_has_shapes or self._is_object or self.objects
+        if not (self._sh_degree_is_given or others):
             check_degree(self.sh_degree, self._own)
+
+    def become_object(self, name: str) -> None:
+        """Leave rendering to the integrator that this one is nested in.
+
+        Raises PluginError for settings of rendering.
+        """
+        check_object(name, self._given)
+        self._is_object = True
+
+    @property
+    def _all_objects(self) -> dict[str, SplatsIntegrator]:
+        """By what the names of their parameters begin with: those that have Gaussians."""
+        own = {"": self} if self._has_own else {}
+        return own | {f"{name}.": one for name, one in self.objects.items()}
+
+    @property
+    def _feature_widths(self) -> dict[str, int]:
+        """Columns of features, by name."""
+        found: dict[str, int] = {}
+        for prefix, one in self._all_objects.items():
+            for name, value in one.features.items():
+                if found.setdefault(name, value.shape[1]) != value.shape[1]:
+                    raise PluginError(
+                        f"splats: {prefix}{name} must have the {found[name]} columns of the other "
+                        f"objects' {name}, got {value.shape[1]}"
+                    )
+        return found
+
+    @property
+    def has_smoothing(self) -> bool:
+        """Whether Gaussians have a smoothing filter, be it ignored."""
+        return any(one.smoothing is not None for one in self._all_objects.values())
 
     def _check_place(self) -> None:
         """Refuse a ``to_world`` that is no similarity; one that moves nothing costs nothing."""
@@ -430,7 +484,7 @@ class SplatsIntegrator(mi.CppADIntegrator):
         """
         if self.memory.shadows is not None:
             return self.memory.shadows.gaussians
-        if self._gathered is None and self._is_moved:
+        if self._gathered is None and (self._is_moved or self.objects):
             self._gather_parts([])
         return self._own if self._gathered is None else self._gathered.gaussians
 
@@ -439,8 +493,8 @@ class SplatsIntegrator(mi.CppADIntegrator):
 
         Rows that do not fit, of an update that was refused, would be read beyond their end.
         """
-        if self._has_own:
-            check_shapes(self._own)
+        for one in self._all_objects.values():
+            check_shapes(self._gaussians_of(one))
         shapes = _ellipsoids(scene)
         self._scene_has_shapes = bool(shapes)
         self._gather_parts(shapes)
@@ -467,16 +521,17 @@ class SplatsIntegrator(mi.CppADIntegrator):
 
     @property
     def _is_placed(self) -> bool:
-        """Whether the Gaussians are moved, or are to be differentiated along a move."""
-        return self._is_moved or (self._has_own and dr.grad_enabled(self.to_world))
+        """Whether Gaussians are moved, or are to be differentiated along a move."""
+        return bool(self.objects) or self._is_moved or dr.grad_enabled(self.to_world)
 
     def _parts(self, shapes: Sequence[mi.Shape]) -> list[Part]:
         """What is rendered, attached, in its order."""
         from drgs.integrator.placement import PlacedGaussians, Placement
 
-        parts = []
-        if self._has_own:
-            parts.append(Placement(PlacedGaussians(self._own, self.to_world.matrix), PLACE))
+        parts: list[Part] = []
+        for prefix, one in self._all_objects.items():
+            placed = PlacedGaussians(self._gaussians_of(one), one.to_world.matrix)
+            parts.append(Placement(placed, f"splats: {prefix}to_world"))
         if shapes or self._turns:
             from drgs.integrator.ellipsoids import conversions_of
 
@@ -493,10 +548,14 @@ class SplatsIntegrator(mi.CppADIntegrator):
 
     @property
     def _own(self) -> Gaussians:
-        parameters = {name: getattr(self, name) for name in PARAMETER_NAMES}
-        smoothing = None if "smoothing" in self.ignore else self.smoothing
+        return self._gaussians_of(self)
+
+    def _gaussians_of(self, one: SplatsIntegrator) -> Gaussians:
+        """Gaussians of this integrator or of an object in it, in the object's own space."""
+        parameters = {name: getattr(one, name) for name in PARAMETER_NAMES}
+        smoothing = None if "smoothing" in self.ignore else one.smoothing
         # What is not put out is not loaded.
-        features = {k: v for k, v in self.features.items() if k in self.aovs.values()}
+        features = {k: v for k, v in one.features.items() if k in self.aovs.values()}
         return Gaussians(**parameters, smoothing=smoothing, features=features or None)
 
     @property
@@ -515,7 +574,7 @@ class SplatsIntegrator(mi.CppADIntegrator):
 
     def channels_of(self, kind: str) -> Sequence[int | str]:
         """What comes behind the dot in the names of an AOV's channels."""
-        return AOVS[kind] if kind in AOVS else range(self.features[kind].shape[1])
+        return AOVS[kind] if kind in AOVS else range(self._feature_widths[kind])
 
     def to_string(self) -> str:
         """One line a setting; of those that are off or as usual, none."""
@@ -527,6 +586,8 @@ class SplatsIntegrator(mi.CppADIntegrator):
             "srgb_primitives": self.srgb_primitives,
             **self.approximations.others_than_default,
         }
+        if self.objects:
+            settings["objects"] = ", ".join(self.objects)
         if self.hide_emitters:
             settings["hide_emitters"] = True
         if self.aovs:
@@ -639,16 +700,10 @@ class SplatsIntegrator(mi.CppADIntegrator):
 
     def _refuse_reflected(self, scene: mi.Scene) -> None:
         """Derivatives of Gaussians that surfaces show: the nested integrator leaves them out."""
-        shapes = scene.shapes()
-        surfaces = [shape for shape in shapes if not shape.is_ellipsoids()]
-        if not surfaces or (self.light == "none" and not self.shadows):
+        if (self.light == "none" and not self.shadows) or not _surfaces(scene):
             return
-        gaussians = [
-            vars(self._own),
-            {"to_world": self.to_world},
-            *(mi.traverse(s) for s in shapes if s.is_ellipsoids()),
-        ]
-        if any(dr.grad_enabled(value) for of in gaussians for _, value in of.items()):
+        values = [part.values.parameters() for part in self._parts(_ellipsoids(scene))]
+        if any(dr.grad_enabled(value) for of in values for value in of.values()):
             raise UnsupportedError(
                 f"splats: with light '{self.light}' and shadows '{', '.join(self.shadows)}', the "
                 "Gaussians are not differentiated, as surfaces show and shade them; detach their "
@@ -687,7 +742,7 @@ class SplatsIntegrator(mi.CppADIntegrator):
         self._gather(scene)
         alone = [one for sensor in sensors for one in sensors_of(sensor)]
         states = [read_sensor(one, self.near).detached() for one in alone]
-        surfaces = [shape for shape in scene.shapes() if not shape.is_ellipsoids()]
+        surfaces = _surfaces(scene)
         cameras = list(map(camera_from_sensor, states))
         return described(summary_of_sensors(self, cameras, scene.environment(), len(surfaces)))
 
@@ -703,6 +758,10 @@ class SplatsIntegrator(mi.CppADIntegrator):
 
 def _ellipsoids(scene: mi.Scene) -> list[mi.Shape]:
     return [shape for shape in scene.shapes() if shape.is_ellipsoids()]
+
+
+def _surfaces(scene: mi.Scene) -> list[mi.Shape]:
+    return [shape for shape in scene.shapes() if not shape.is_ellipsoids()]
 
 
 def _refuse_recording() -> None:

@@ -84,9 +84,7 @@ class Placement:
             own,
             **turned._replace(means=means).tensors(),
             log_scales=_plus(own.log_scales, number_of(numbers.scale, 1)),
-            smoothing=None
-            if own.smoothing is None
-            else own.smoothing * number_of(numbers.scale, 0),
+            smoothing=self._smoothing,
         )
 
     def tangent(self, tangent: Mapping[str, Any]) -> Gaussians:
