@@ -18,6 +18,7 @@ from drgs.accuracy.pipeline import pipeline_of
 from drgs.core.arrays import interleave
 from drgs.core.constants import NEAR
 from drgs.core.errors import PluginError, UnsupportedError
+from drgs.core.variants import check_variant
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 from drgs.integrator.cache import Memory
 from drgs.integrator.limits import check_columns
@@ -53,13 +54,12 @@ from drgs.integrator.properties import (
     turns_of_shapes,
 )
 from drgs.integrator.sensors import camera_from_sensor, read_sensor
+from drgs.integrator.shapes import check_instances, ellipsoids_in, surfaces_in
 from drgs.integrator.view import accumulate, feature_of
 from drgs.splatting import rendering
 
 if TYPE_CHECKING:  # imported where a scene has other Gaussians than the integrator's, unmoved
     from drgs.integrator.gathering import Gathered, Part
-
-SUPPORTED_VARIANTS = ("llvm_ad_rgb", "cuda_ad_rgb")
 
 PLACE = "splats: to_world"
 """Begins messages about a transform."""
@@ -316,11 +316,7 @@ class SplatsIntegrator(mi.CppADIntegrator):
 
     def __init__(self, props: mi.Properties) -> None:
         # Before the base class, which has a warning of its own about scalar variants.
-        if mi.variant() not in SUPPORTED_VARIANTS:
-            raise PluginError(
-                f"splats: the variant '{mi.variant()}' is not supported, "
-                f"use mi.set_variant('{SUPPORTED_VARIANTS[0]}')"
-            )
+        check_variant("splats", mi.variant())
         super().__init__(props)
         self._given = tuple(props.keys())
         gaussians = load_gaussians(props)
@@ -332,6 +328,7 @@ class SplatsIntegrator(mi.CppADIntegrator):
         self._check_place()
         self._gathered: Gathered | None = None  # with the Gaussians of the scene's shapes
         self._scene_has_shapes = False  # that are Gaussians: the scene that was rendered last
+        self._instances: list[mi.Shape] = []  # of that scene, checked
         self.ignore = ignored_effects(props)
         self._read_nested(props)
         self.aovs = aovs_of(props, [*AOVS, *self._feature_widths])
@@ -495,7 +492,8 @@ class SplatsIntegrator(mi.CppADIntegrator):
         """
         for one in self._all_objects.values():
             check_shapes(self._gaussians_of(one))
-        shapes = _ellipsoids(scene)
+        self._instances = check_instances(scene, self._instances)
+        shapes = ellipsoids_in(scene)
         self._scene_has_shapes = bool(shapes)
         self._gather_parts(shapes)
         if self.gaussians.num_gaussians == 0:
@@ -661,7 +659,7 @@ class SplatsIntegrator(mi.CppADIntegrator):
     def accumulate(self, scene: mi.Scene, own: Gaussians) -> None:
         """Add derivatives with respect to the Gaussians to those of the attached parameters."""
         if self._gathered is not None:
-            self._gathered.accumulate(self._parts(_ellipsoids(scene)), own)
+            self._gathered.accumulate(self._parts(ellipsoids_in(scene)), own)
             return
         for name in PARAMETER_NAMES:
             accumulate(getattr(self, name), getattr(own, name))
@@ -691,7 +689,7 @@ class SplatsIntegrator(mi.CppADIntegrator):
     def _tangents(self, scene: mi.Scene) -> Gaussians:
         """Derivatives of the Gaussians along those set on what they are made of."""
         if self._gathered is not None:
-            return self._gathered.tangents(self._parts(_ellipsoids(scene)))
+            return self._gathered.tangents(self._parts(ellipsoids_in(scene)))
         features = self._own.features
         return Gaussians(
             **{name: _tangent(getattr(self, name)) for name in PARAMETER_NAMES},
@@ -700,9 +698,9 @@ class SplatsIntegrator(mi.CppADIntegrator):
 
     def _refuse_reflected(self, scene: mi.Scene) -> None:
         """Derivatives of Gaussians that surfaces show: the nested integrator leaves them out."""
-        if (self.light == "none" and not self.shadows) or not _surfaces(scene):
+        if (self.light == "none" and not self.shadows) or not surfaces_in(scene):
             return
-        values = [part.values.parameters() for part in self._parts(_ellipsoids(scene))]
+        values = [part.values.parameters() for part in self._parts(ellipsoids_in(scene))]
         if any(dr.grad_enabled(value) for of in values for value in of.values()):
             raise UnsupportedError(
                 f"splats: with light '{self.light}' and shadows '{', '.join(self.shadows)}', the "
@@ -742,7 +740,7 @@ class SplatsIntegrator(mi.CppADIntegrator):
         self._gather(scene)
         alone = [one for sensor in sensors for one in sensors_of(sensor)]
         states = [read_sensor(one, self.near).detached() for one in alone]
-        surfaces = _surfaces(scene)
+        surfaces = surfaces_in(scene)
         cameras = list(map(camera_from_sensor, states))
         return described(summary_of_sensors(self, cameras, scene.environment(), len(surfaces)))
 
@@ -754,14 +752,6 @@ class SplatsIntegrator(mi.CppADIntegrator):
         if summary != self._logged_summary:
             mi.Log(mi.LogLevel.Info, f"splats: {summary}")
             self._logged_summary = summary
-
-
-def _ellipsoids(scene: mi.Scene) -> list[mi.Shape]:
-    return [shape for shape in scene.shapes() if shape.is_ellipsoids()]
-
-
-def _surfaces(scene: mi.Scene) -> list[mi.Shape]:
-    return [shape for shape in scene.shapes() if not shape.is_ellipsoids()]
 
 
 def _refuse_recording() -> None:

@@ -110,6 +110,59 @@ def test_a_moved_object_looks_as_a_file_saved_moved(tmp_path):
     assert np.abs(unfiltered - expected).max() > 0.02
 
 
+def surfaces(scene) -> dict:
+    """A mirror amid the splats, and a lamp and a sky that shade them."""
+    camera = scene.view.camera
+    return {
+        "ball": {
+            "type": "sphere",
+            "center": (camera.center + 2.5 * camera.rotation[2]).tolist(),
+            "radius": 0.4,
+            "bsdf": {"type": "conductor"},
+        },
+        "lamp": {"type": "point", "position": np.add(camera.center, [0, 0, 1]).tolist()},
+        "sky": {"type": "constant"},
+    }
+
+
+def batch(sensor) -> dict:
+    film = sensor["film"] | {"width": 2 * sensor["film"]["width"]}
+    own = {k: v for k, v in sensor.items() if k != "film"}
+    return {"type": "batch", "film": film, "sampler": sensor["sampler"], "a": own, "b": own}
+
+
+ROUTES = {
+    "a batch": {},
+    "normals and depths": {"aovs": "n:normal, z:depth, a:alpha"},
+    "rays of surfaces": {"light": "rays", "nested_spp": 4},
+    "shadows": {"shadows": "ball", "nested_spp": 4},
+    "inside aov": {},
+}
+
+
+@pytest.mark.parametrize("route", ROUTES)
+def test_every_route_sees_the_moved_object(route):
+    """The same bytes as of the Gaussians that the integrator says it renders."""
+    scene, model = scene_and_object()
+    sensor = scene.view.sensor()
+    around = surfaces(scene) if "light" in ROUTES[route] or "shadows" in ROUTES[route] else {}
+    place = {"to_world": mi.ScalarTransform4f(MATRIX)}
+    moved = mi.load_dict(scene.settings | tensors(model) | place).gaussians.numpy()
+
+    def rendered(gaussians, **settings):
+        integrator = scene.settings | tensors(gaussians) | ROUTES[route] | settings
+        if route == "inside aov":
+            integrator = {"type": "aov", "aovs": "far:depth", "img": integrator}
+        sensors = {"sensor": batch(sensor) if route == "a batch" else sensor}
+        return image_of(
+            mi.load_dict({"type": "scene", "integrator": integrator, **sensors, **around}), spp=1
+        )
+
+    actual = rendered(model, **place)
+    np.testing.assert_array_equal(actual, rendered(moved))
+    assert np.abs(actual - rendered(model)).max() > 0.1
+
+
 # ----------------------------------------------------------------------------------------------
 # Derivatives
 # ----------------------------------------------------------------------------------------------
