@@ -99,8 +99,10 @@ class SplatsIntegrator(mi.CppADIntegrator):
      * - to_world
        - |transform|
        - Rotates, scales (the same along all axes) and moves the Gaussians of ``filename`` or the
-         tensors when they are loaded; what is seen of them from each side turns with them.
+         tensors, with what is seen of them from each side. Their own parameters, such as ``means``,
+         stay as they are given. Its derivatives are those of the nearest such transform.
          (Default: none)
+       - |exposed|, |differentiable|
 
      * - shapes_to_world, shapes_to_world_...
        - |transform|
@@ -130,6 +132,9 @@ class SplatsIntegrator(mi.CppADIntegrator):
        - Renders the scene's meshes and other surfaces, if it has any, between which the splats
          are composited by depth. Its ``hide_emitters`` should be that of this integrator.
          (Default: ``path``; where ``light`` is not ``none``, ``splatpath``)
+         Those of type ``splats``, any number, are splat objects instead: each takes ``filename`` or
+         tensors, ``to_world``, ``smoothing`` and ``feature_...``, and is rendered by this
+         integrator, with its settings, together with its own Gaussians.
        - |exposed|, |differentiable|
 
      * - nested_spp
@@ -254,7 +259,7 @@ class SplatsIntegrator(mi.CppADIntegrator):
 
      * - means, quats, log_scales, logit_opacities, sh0, shN
        - |tensor|
-       - The N Gaussians: centres (N, 3) in world space; quaternions wxyz (N, 4), of any norm;
+       - The N Gaussians, before ``to_world``: centres (N, 3); quaternions wxyz (N, 4), of any norm;
          natural logarithms of the standard deviations (N, 3); opacities before the sigmoid
          (N); spherical harmonics coefficients of degree 0 (N, 1, 3) and above (N, K - 1, 3).
          From numpy: ``mi.TensorXf(array)``.
@@ -279,8 +284,12 @@ class SplatsIntegrator(mi.CppADIntegrator):
     filters add in an order of their own. No samples are taken beyond the film: its
     ``sample_border`` makes no difference.
 
+    Gaussians of nested objects come behind the integrator's own, in the order in which they are
+    given, and are sorted with them by depth. Degrees of spherical harmonics may differ. Where the
+    headers of files specify different approximations, the integrator must be given one.
+
     Gaussians of shapes (``data``, ``opacities`` and ``sh_coeffs``, as ``volprim_rf_basic`` reads
-    them) come behind the integrator's own, in the order of ``scene.shapes()``, and are
+    them) come behind all of these, in the order of ``scene.shapes()``, and are
     differentiated with respect to the shapes' own parameters. Their quaternions are normalised,
     opacities are clamped to 0..1, and where a splat ends is up to this integrator, not to a shape's
     ``extent``. Of features such Gaussians have zeros, and no smoothing filter.
@@ -294,9 +303,9 @@ class SplatsIntegrator(mi.CppADIntegrator):
 
     .. note:: Not differentiated: visibility, the order of the splats, the cut-offs of alpha and
         transmittance; the depth and the silhouette of surfaces. Among surfaces that show splats
-        (see ``light``), derivatives with respect to Gaussians are refused. Those with respect to a
-        sensor's pose, focal lengths and principal point are computed where they are enabled, though
-        Mitsuba's own sensors announce theirs as not differentiable.
+        (see ``light``), derivatives with respect to Gaussians and their ``to_world`` are refused.
+        Those with respect to a sensor's pose, focal lengths and principal point are computed where
+        they are enabled, though Mitsuba's own sensors announce theirs as not differentiable.
 
     .. tabs::
 
@@ -339,9 +348,10 @@ class SplatsIntegrator(mi.CppADIntegrator):
         self.hide_emitters = boolean(props, "hide_emitters", False)
         said = said_by_file(props, gaussians)
         self.file = str(props.get("filename", ""))
-        files = {self.file: said, **{v.file: v.said_by_file for v in self.objects.values()}}
-        self.said_by_file = agreed(props, {k: v for k, v in files.items() if k})
-        self.approximations = approximations_of(props, self.said_by_file)
+        files = {self.file: said, **{v.file: v.header for v in self.objects.values()}}
+        self.header = agreed(props, {file: said for file, said in files.items() if file})
+        self.approximations = approximations_of(props, self.header)
+        self.said_by_file = tuple(self.header)
         self.near = positive(props, "near", NEAR)
         self.srgb_primitives = boolean(props, "srgb_primitives", True)
         self.nested_spp = integer(props, "nested_spp", 0, least=0)

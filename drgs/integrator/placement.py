@@ -19,9 +19,10 @@ generators of D. Sums over Gaussians have an order that is the same in every run
 from __future__ import annotations
 
 import math
+import operator
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, reduce
 from typing import Any, NamedTuple
 
 import drjit as dr
@@ -74,15 +75,20 @@ class Placement:
         """Nothing besides the values."""
 
     def gaussians(self) -> Gaussians:
-        """All parameters, detached; where nothing is moved, the object's own."""
+        """All parameters, detached; where nothing is moved, the object's own.
+
+        Raises PluginError where they leave float32.
+        """
         own = self.values.gaussians
         if self._place.is_identity:
             return own
         numbers, turned = self._numbers, self._turned(_Columns.of(vars(own)))
         means = [mean + number_of(numbers.translation, k) for k, mean in enumerate(turned.means)]
+        moved = turned._replace(means=means)
+        self._check_finite(moved)
         return replace(
             own,
-            **turned._replace(means=means).tensors(),
+            **moved.tensors(),
             log_scales=_plus(own.log_scales, number_of(numbers.scale, 1)),
             smoothing=self._smoothing,
         )
@@ -124,6 +130,18 @@ class Placement:
     @cached_property
     def _numbers(self) -> _Numbers:
         return _Numbers.of(self._place)
+
+    def _check_finite(self, moved: _Columns) -> None:
+        own = _Columns.of(vars(self.values.gaussians))
+        columns = zip(own.means + own.quats, moved.means + moved.quats, strict=True)
+        dr.eval(moved.means, moved.quats)
+        beyond = [dr.isfinite(before) & ~dr.isfinite(after) for before, after in columns]
+        rows = dr.compress(reduce(operator.or_, beyond))
+        if dr.width(rows) > 0:
+            raise PluginError(
+                f"{self.name} moves Gaussian {rows[0]} beyond the end of float32, 3.4e38; crop or "
+                "scale the object"
+            )
 
     def _turned(self, of: _Columns, transposed: bool = False) -> _Columns:
         """The linear part of the move, or its transpose."""

@@ -177,7 +177,35 @@ def test_files_that_say_different_things_are_refused_unless_the_integrator_decid
     }
     assert mi.load_dict(given).approximations.low_pass == 0.2
     agreeing = mi.load_dict({"type": "splats", "a": {"type": "splats"} | paths["lego"]})
-    assert agreeing.approximations.low_pass == 0.1 and list(agreeing.said_by_file) == ["low_pass"]
+    assert agreeing.approximations.low_pass == 0.1 and agreeing.said_by_file == ("low_pass",)
+
+
+def test_forward_mode_is_the_transpose_for_one_object_of_two():
+    """<J v, w> = <v, J^T w>, along positions of an object that is moved."""
+    place = {"to_world": mi.ScalarTransform4f().translate([0.1, 0, 0.2]).rotate([1, 0, 0], 20)}
+    scene, rng = load(nested(fox=place), SCENE.gaussians), np.random.default_rng(4)
+    params = mi.traverse(scene)
+    means = params["integrator.fox.means"]
+    direction = rng.normal(0, 0.1, means.shape)
+    dr.enable_grad(means)
+    dr.set_grad(means, mi.TensorXf(direction.astype(np.float32)))
+    d_image = np.array(dr.forward_to(mi.render(scene, params))).astype(np.float64)
+    again = load(nested(fox=place), SCENE.gaussians)
+    terms = direction * gradients_of(again, SCENE.weights(), ["fox.means"])["fox.means"]
+    left = np.sum(d_image * SCENE.weights())
+    assert left == pytest.approx(terms.sum(), abs=1e-5 * np.abs(terms).sum()) and left != 0
+
+
+def test_an_object_that_stands_twice_receives_both_derivatives():
+    lego = mi.load_dict({"type": "splats"} | tensors(MODELS["lego"]))
+    integrator = SCENE.settings | {"a": lego, "b": lego}
+    twice = mi.load_dict({"type": "scene", "integrator": integrator, "sensor": SCENE.view.sensor()})
+    apart = concatenated(MODELS["lego"], MODELS["lego"])
+    np.testing.assert_array_equal(image_of(twice), image_of(apart))
+    found = gradients_of(twice, SCENE.weights(), ["a.means"])["a.means"]
+    both = gradients_of(apart, SCENE.weights(), ["means"])["means"]
+    expected = both[: len(found)] + both[len(found) :]
+    np.testing.assert_allclose(found, expected, atol=1e-5 * np.abs(both).max())
 
 
 def test_gradient_descent_finds_where_an_object_stands():

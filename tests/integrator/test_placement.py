@@ -311,3 +311,26 @@ def test_a_matrix_that_is_no_similarity_is_refused_when_it_is_set():
     params[KEY] = mi.Transform4f(MATRIX)
     params.update()
     np.testing.assert_array_equal(image_of(loaded), image_of(load(scene, model)))
+
+
+def test_gaussians_that_leave_float32_are_refused():
+    scene, model = scene_and_object()
+    means = model.means.copy()
+    means[2] = 3e38
+    loaded = load(scene, replace(model, means=means))
+    with pytest.raises(ValueError, match="splats: to_world moves Gaussian 2 beyond the end of flo"):
+        loaded.integrator().render(loaded)
+
+
+def test_gaussians_that_are_no_numbers_add_nothing_to_derivatives():
+    scene, model = scene_and_object()
+    means, shN = model.means.copy(), model.shN.copy()
+    means[5], shN[6] = np.nan, np.inf
+    loaded = load(scene, replace(model, means=means, shN=shN))
+    assert np.isfinite(gradient_of_matrix(loaded, scene.weights())).all()
+
+
+def test_the_derivative_of_a_matrix_is_the_same_in_every_run():
+    scene, model = scene_and_object()
+    found = [gradient_of_matrix(load(scene, model), scene.weights()) for _ in range(2)]
+    np.testing.assert_array_equal(*found)
