@@ -492,7 +492,7 @@ class SplatsIntegrator(mi.CppADIntegrator):
         if self.memory.shadows is not None:
             return self.memory.shadows.gaussians
         if self._gathered is None and (self._is_moved or self.objects):
-            self._gather_parts([])
+            self._gathered = _gather_parts(self._placements(), None)
         return self._own if self._gathered is None else self._gathered.gaussians
 
     def _gather(self, scene: mi.Scene) -> None:
@@ -505,7 +505,10 @@ class SplatsIntegrator(mi.CppADIntegrator):
         self._instances = check_instances(scene, self._instances)
         shapes = ellipsoids_in(scene)
         self._scene_has_shapes = bool(shapes)
-        self._gather_parts(shapes)
+        with dr.resume_grad():
+            is_alone = not shapes and not set(self._turns) - {""} and not self._is_placed
+            parts = [] if is_alone else self._parts(shapes)
+        self._gathered = None if is_alone else _gather_parts(parts, self._gathered)
         if self.gaussians.num_gaussians == 0:
             raise PluginError(
                 "splats: there are no Gaussians: give the integrator 'filename' or tensors "
@@ -515,36 +518,31 @@ class SplatsIntegrator(mi.CppADIntegrator):
         check_degree(self.sh_degree, self.gaussians)
         self._shade(scene)
 
-    def _gather_parts(self, shapes: Sequence[mi.Shape]) -> None:
-        """Put the Gaussians of the integrator and of shapes together, unless they are its own."""
-        with dr.resume_grad():
-            is_alone = not shapes and not set(self._turns) - {""} and not self._is_placed
-            parts = None if is_alone else self._parts(shapes)
-        if parts is None:
-            self._gathered = None
-        else:
-            from drgs.integrator.gathering import gather
-
-            self._gathered = gather(parts, self._gathered)
-
     @property
     def _is_placed(self) -> bool:
         """Whether Gaussians are moved, or are to be differentiated along a move."""
         return bool(self.objects) or self._is_moved or dr.grad_enabled(self.to_world)
 
     def _parts(self, shapes: Sequence[mi.Shape]) -> list[Part]:
-        """What is rendered, attached, in its order."""
-        from drgs.integrator.placement import PlacedGaussians, Placement
-
-        parts: list[Part] = []
-        for prefix, one in self._all_objects.items():
-            placed = PlacedGaussians(self._gaussians_of(one), one.to_world.matrix)
-            parts.append(Placement(placed, f"splats: {prefix}to_world"))
+        """Gaussians of objects and shapes, attached, in the order in which they are rendered."""
+        parts = self._placements()
         if shapes or self._turns:
             from drgs.integrator.ellipsoids import conversions_of
 
             parts += conversions_of(shapes, self._turns)
         return parts
+
+    def _placements(self) -> list[Part]:
+        """Gaussians of objects, attached."""
+        from drgs.integrator.placement import PlacedGaussians, Placement
+
+        return [
+            Placement(
+                PlacedGaussians(self._gaussians_of(one), one.to_world.matrix),
+                f"splats: {prefix}to_world",
+            )
+            for prefix, one in self._all_objects.items()
+        ]
 
     def _shade(self, scene: mi.Scene) -> None:
         """Darken what lies in the shadow of surfaces."""
@@ -586,8 +584,12 @@ class SplatsIntegrator(mi.CppADIntegrator):
 
     def to_string(self) -> str:
         """One line a setting; of those that are off or as usual, none."""
+        if self._gathered is None:
+            count = sum(one.means.shape[0] for one in self._all_objects.values())
+        else:
+            count = self._gathered.gaussians.num_gaussians
         settings = {
-            "gaussians": self.gaussians.num_gaussians or "those of the scene's shapes",
+            "gaussians": count or "those of the scene's shapes",
             "sh_degree": self.sh_degree,
             "background": self.background,
             "near": self.near,
@@ -762,6 +764,12 @@ class SplatsIntegrator(mi.CppADIntegrator):
         if summary != self._logged_summary:
             mi.Log(mi.LogLevel.Info, f"splats: {summary}")
             self._logged_summary = summary
+
+
+def _gather_parts(parts: Sequence[Part], last: Gathered | None) -> Gathered:
+    from drgs.integrator.gathering import gather
+
+    return gather(parts, last)
 
 
 def _refuse_recording() -> None:
