@@ -110,6 +110,22 @@ def test_a_moved_object_looks_as_a_file_saved_moved(tmp_path):
     assert np.abs(unfiltered - expected).max() > 0.02
 
 
+@pytest.mark.parametrize("later", [False, True])
+def test_the_identity_costs_nothing(later):
+    """Given, or set after another place: the arrays that are rendered are the integrator's own."""
+    scene, model = scene_and_object()
+    loaded = load(scene, model, MATRIX if later else np.eye(4))
+    if later:
+        params = mi.traverse(loaded)
+        image_of(loaded)
+        params[KEY] = mi.Transform4f()
+        params.update()
+    np.testing.assert_array_equal(image_of(loaded), image_of(load(scene, model, None)))
+    integrator = loaded.integrator()
+    for name in PARAMETER_NAMES:
+        assert getattr(integrator.gaussians, name) is getattr(integrator, name)
+
+
 def surfaces(scene) -> dict:
     """A mirror amid the splats, and a lamp and a sky that shade them."""
     camera = scene.view.camera
