@@ -243,7 +243,7 @@ def refuse_splats(path: Path, scene: mi.Scene) -> None:
     nested = [] if integrator is None else mi.traverse(integrator).hierarchy  # itself included
     if any(isinstance(one, SummarisingIntegrator) for one in nested):
         found = "its integrator is splats"
-    elif any("Ellipsoids" in shape.class_name() for shape in scene.shapes()):
+    elif any("Ellipsoids" in node.class_name() for node in mi.traverse(scene).hierarchy):
         found = "it has shapes of type ellipsoids"
     else:
         return

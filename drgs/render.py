@@ -37,7 +37,7 @@ from drgs.cli.commands import (
     finite_number,
     run_command,
 )
-from drgs.cli.execution import VARIANTS, add_execution_arguments, executing, select_variant
+from drgs.cli.execution import add_execution_arguments, executing, select_variant
 from drgs.config.approximations import said_by
 from drgs.config.changes import is_open
 from drgs.config.load import load_config
@@ -46,6 +46,7 @@ from drgs.core.constants import SHUTTER_SAMPLES
 from drgs.core.errors import PluginError, UserError, one_line, reason_of_mitsuba
 from drgs.core.files import atomic_path, open_regular, shortened
 from drgs.core.processes import process_number, start_mpi
+from drgs.core.variants import VARIANTS
 from drgs.data import Dataset, load_dataset
 from drgs.data.derived import completed
 from drgs.data.orbits import near_plane_of, orbit_of_gaussians, orbit_of_views, orbit_size

@@ -16,6 +16,7 @@ import numpy as np
 from drgs.cameras.camera import Camera, Lens, Pinhole
 from drgs.core.constants import MAX_SHUTTER_SAMPLES, SHUTTER_SAMPLES
 from drgs.core.errors import PluginError, UserError
+from drgs.core.variants import check_variant
 from drgs.integrator.properties import (
     integer,
     matrix,
@@ -137,6 +138,7 @@ class CalibratedSensor(mi.Sensor):
     """
 
     def __init__(self, props: mi.Properties) -> None:
+        check_variant("calibrated", mi.variant())
         if "to_world_close" in props and "shutter_close" not in props:
             # Integrators that trace rays choose their times within these two.
             props["shutter_close"] = props.get("shutter_open", 0.0) + 1.0

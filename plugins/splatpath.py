@@ -13,6 +13,7 @@ import drjit as dr
 import mitsuba as mi
 from mitsuba.ad.integrators.common import RBIntegrator, mis_weight, solid_angle_to_area_jacobian
 
+from drgs.core.variants import check_variant
 from drgs.integrator.legs import Leg
 from drgs.integrator.transparency import StraightRays, has_transparent_parts
 
@@ -83,6 +84,7 @@ class SplatPathIntegrator(RBIntegrator):
     """
 
     def __init__(self, props: mi.Properties) -> None:
+        check_variant("splatpath", mi.variant())
         super().__init__(props)
         if "max_depth" not in props:
             self.max_depth = UNBOUNDED

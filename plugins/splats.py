@@ -18,6 +18,7 @@ from drgs.accuracy.pipeline import pipeline_of
 from drgs.core.arrays import interleave
 from drgs.core.constants import NEAR
 from drgs.core.errors import PluginError, UnsupportedError
+from drgs.core.variants import check_variant
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 from drgs.integrator.cache import Memory
 from drgs.integrator.limits import check_columns
@@ -28,11 +29,13 @@ from drgs.integrator.properties import (
     LIGHT_SAMPLES,
     MAX_LIGHT_SAMPLES,
     UNSEEN,
+    agreed,
     aovs_of,
     approximations_of,
     background_of,
     boolean,
     check_degree,
+    check_object,
     check_shapes,
     degree_of,
     ids_of,
@@ -40,22 +43,26 @@ from drgs.integrator.properties import (
     integer,
     light_of,
     load_gaussians,
-    nested_integrator,
+    nested_integrators,
     one_of,
+    only_one,
     positive,
     probes_of,
     refuse_unknown,
     said_by_file,
+    to_world_of,
     turns_of_shapes,
 )
 from drgs.integrator.sensors import camera_from_sensor, read_sensor
+from drgs.integrator.shapes import check_instances, ellipsoids_in, surfaces_in
 from drgs.integrator.view import accumulate, feature_of
 from drgs.splatting import rendering
 
-if TYPE_CHECKING:  # imported where a scene has shapes of Gaussians
-    from drgs.integrator.ellipsoids import Gathered
+if TYPE_CHECKING:  # imported where a scene has other Gaussians than the integrator's, unmoved
+    from drgs.integrator.gathering import Gathered, Part
 
-SUPPORTED_VARIANTS = ("llvm_ad_rgb", "cuda_ad_rgb")
+PLACE = "splats: to_world"
+"""Begins messages about a transform."""
 
 
 @dataclass(frozen=True)
@@ -92,8 +99,10 @@ class SplatsIntegrator(mi.CppADIntegrator):
      * - to_world
        - |transform|
        - Rotates, scales (the same along all axes) and moves the Gaussians of ``filename`` or the
-         tensors when they are loaded; what is seen of them from each side turns with them.
+         tensors, with what is seen of them from each side. Their own parameters, such as ``means``,
+         stay as they are given. Its derivatives are those of the nearest such transform.
          (Default: none)
+       - |exposed|, |differentiable|
 
      * - shapes_to_world, shapes_to_world_...
        - |transform|
@@ -123,6 +132,9 @@ class SplatsIntegrator(mi.CppADIntegrator):
        - Renders the scene's meshes and other surfaces, if it has any, between which the splats
          are composited by depth. Its ``hide_emitters`` should be that of this integrator.
          (Default: ``path``; where ``light`` is not ``none``, ``splatpath``)
+         Those of type ``splats``, any number, are splat objects instead: each takes ``filename`` or
+         tensors, ``to_world``, ``smoothing`` and ``feature_...``, and is rendered by this
+         integrator, with its settings, together with its own Gaussians.
        - |exposed|, |differentiable|
 
      * - nested_spp
@@ -248,7 +260,7 @@ class SplatsIntegrator(mi.CppADIntegrator):
 
      * - means, quats, log_scales, logit_opacities, sh0, shN
        - |tensor|
-       - The N Gaussians: centres (N, 3) in world space; quaternions wxyz (N, 4), of any norm;
+       - The N Gaussians, before ``to_world``: centres (N, 3); quaternions wxyz (N, 4), of any norm;
          natural logarithms of the standard deviations (N, 3); opacities before the sigmoid
          (N); spherical harmonics coefficients of degree 0 (N, 1, 3) and above (N, K - 1, 3).
          From numpy: ``mi.TensorXf(array)``.
@@ -273,8 +285,12 @@ class SplatsIntegrator(mi.CppADIntegrator):
     filters add in an order of their own. No samples are taken beyond the film: its
     ``sample_border`` makes no difference.
 
+    Gaussians of nested objects come behind the integrator's own, in the order in which they are
+    given, and are sorted with them by depth. Degrees of spherical harmonics may differ. Where the
+    headers of files specify different approximations, the integrator must be given one.
+
     Gaussians of shapes (``data``, ``opacities`` and ``sh_coeffs``, as ``volprim_rf_basic`` reads
-    them) come behind the integrator's own, in the order of ``scene.shapes()``, and are
+    them) come behind all of these, in the order of ``scene.shapes()``, and are
     differentiated with respect to the shapes' own parameters. Their quaternions are normalised,
     opacities are clamped to 0..1, and where a splat ends is up to this integrator, not to a shape's
     ``extent``. Of features such Gaussians have zeros, and no smoothing filter.
@@ -288,9 +304,9 @@ class SplatsIntegrator(mi.CppADIntegrator):
 
     .. note:: Not differentiated: visibility, the order of the splats, the cut-offs of alpha and
         transmittance; the depth and the silhouette of surfaces. Among surfaces that show splats
-        (see ``light``), derivatives with respect to Gaussians are refused. Those with respect to a
-        sensor's pose, focal lengths and principal point are computed where they are enabled, though
-        Mitsuba's own sensors announce theirs as not differentiable.
+        (see ``light``), derivatives with respect to Gaussians and their ``to_world`` are refused.
+        Those with respect to a sensor's pose, focal lengths and principal point are computed where
+        they are enabled, though Mitsuba's own sensors announce theirs as not differentiable.
 
     .. tabs::
 
@@ -310,30 +326,35 @@ class SplatsIntegrator(mi.CppADIntegrator):
 
     def __init__(self, props: mi.Properties) -> None:
         # Before the base class, which has a warning of its own about scalar variants.
-        if mi.variant() not in SUPPORTED_VARIANTS:
-            raise PluginError(
-                f"splats: the variant '{mi.variant()}' is not supported, "
-                f"use mi.set_variant('{SUPPORTED_VARIANTS[0]}')"
-            )
+        check_variant("splats", mi.variant())
         super().__init__(props)
+        self._given = tuple(props.keys())
         gaussians = load_gaussians(props)
         for name in PARAMETER_NAMES:
             setattr(self, name, getattr(gaussians, name))
         self.smoothing, self.features = gaussians.smoothing, gaussians.features or {}
         self._has_own, self._turns = gaussians.num_gaussians > 0, turns_of_shapes(props)
+        self.to_world, self._is_moved = to_world_of(props), "to_world" in props
+        self._check_place()
         self._gathered: Gathered | None = None  # with the Gaussians of the scene's shapes
         self._scene_has_shapes = False  # that are Gaussians: the scene that was rendered last
+        self._instances: list[mi.Shape] = []  # of that scene, checked
         self.ignore = ignored_effects(props)
-        self.aovs = aovs_of(props, [*AOVS, *self.features])
-        self.sh_degree = props.get("sh_degree", gaussians.sh_degree)
+        self._read_nested(props)
+        self.aovs = aovs_of(props, [*AOVS, *self._feature_widths])
+        degrees = [one.sh_degree for one in self.objects.values()]
+        self.sh_degree = props.get("sh_degree", max(gaussians.sh_degree, *degrees, 0))
         self._sh_degree_is_given = "sh_degree" in props
         self.background = background_of(props)
         self.hide_emitters = boolean(props, "hide_emitters", False)
         said = said_by_file(props, gaussians)
-        self.approximations, self.said_by_file = approximations_of(props, said), tuple(said)
+        self.file = str(props.get("filename", ""))
+        files = {self.file: said, **{v.file: v.header for v in self.objects.values()}}
+        self.header = agreed(props, {file: said for file, said in files.items() if file})
+        self.approximations = approximations_of(props, self.header)
+        self.said_by_file = tuple(self.header)
         self.near = positive(props, "near", NEAR)
         self.srgb_primitives = boolean(props, "srgb_primitives", True)
-        self.nested = nested_integrator(props)
         self.nested_spp = integer(props, "nested_spp", 0, least=0)
         self.light = light_of(props, self.nested)
         self.exposure = positive(props, "exposure", 1.0)
@@ -353,6 +374,15 @@ class SplatsIntegrator(mi.CppADIntegrator):
         self._last_sensor: mi.Sensor | None = None  # that was rendered
         self._logged_summary = ""
 
+    def _read_nested(self, props: mi.Properties) -> None:
+        """Tell splat objects from the integrator of surfaces."""
+        nested = nested_integrators(props)
+        self.objects = {k: v for k, v in nested.items() if isinstance(v, SplatsIntegrator)}
+        self.nested = only_one([v for k, v in nested.items() if k not in self.objects])
+        self._is_object = False  # nested in another
+        for name, one in self.objects.items():
+            one.become_object(name)
+
     # ------------------------------------------------------------------------------------------
     # Parameters
     # ------------------------------------------------------------------------------------------
@@ -365,6 +395,12 @@ class SplatsIntegrator(mi.CppADIntegrator):
                 callback.put(name, value, mi.ParamFlags.Differentiable)
         for name, value in self.features.items():
             callback.put(name, value, mi.ParamFlags.Differentiable)
+        if self._has_own:
+            callback.put("to_world", self.to_world, mi.ParamFlags.Differentiable)
+        for name, one in self.objects.items():
+            callback.put(name, one, mi.ParamFlags.Differentiable)
+        if self._is_object:
+            return
         callback.put("background", self.background, mi.ParamFlags.Differentiable)
         if self.nested is not None:
             callback.put("nested", self.nested, mi.ParamFlags.Differentiable)
@@ -382,10 +418,53 @@ class SplatsIntegrator(mi.CppADIntegrator):
             return
         if dr.width(self.shN) == 0:  # not exposed, so that its rows could not be set
             self.shN = dr.zeros(mi.TensorXf, (next(iter(self.means.shape), 0), 0, 3))
+        if not keys or "to_world" in keys:
+            self._is_moved = True
+            self._check_place()
         check_shapes(replace(self._own, features=self.features))
         self._check_columns()
-        if not (self._sh_degree_is_given or self._scene_has_shapes):
+        others = self._scene_has_shapes or self._is_object or self.objects
+        if not (self._sh_degree_is_given or others):
             check_degree(self.sh_degree, self._own)
+
+    def become_object(self, name: str) -> None:
+        """Leave rendering to the integrator that this one is nested in.
+
+        Raises PluginError for settings of rendering.
+        """
+        check_object(name, self._given)
+        self._is_object = True
+
+    @property
+    def _all_objects(self) -> dict[str, SplatsIntegrator]:
+        """By what the names of their parameters begin with: those that have Gaussians."""
+        own = {"": self} if self._has_own else {}
+        return own | {f"{name}.": one for name, one in self.objects.items()}
+
+    @property
+    def _feature_widths(self) -> dict[str, int]:
+        """Columns of features, by name."""
+        found: dict[str, int] = {}
+        for prefix, one in self._all_objects.items():
+            for name, value in one.features.items():
+                if found.setdefault(name, value.shape[1]) != value.shape[1]:
+                    raise PluginError(
+                        f"splats: {prefix}{name} must have the {found[name]} columns of the other "
+                        f"objects' {name}, got {value.shape[1]}"
+                    )
+        return found
+
+    @property
+    def has_smoothing(self) -> bool:
+        """Whether Gaussians have a smoothing filter, be it ignored."""
+        return any(one.smoothing is not None for one in self._all_objects.values())
+
+    def _check_place(self) -> None:
+        """Refuse a ``to_world`` that is no similarity; one that moves nothing costs nothing."""
+        if self._is_moved:
+            from drgs.integrator.placement import similarity_of
+
+            self._is_moved = not similarity_of(self.to_world.matrix, PLACE).is_identity
 
     def _check_columns(self) -> None:
         check_columns({n: len(self.channels_of(k)) for n, k in self.aovs.items() if k != "alpha"})
@@ -408,10 +487,13 @@ class SplatsIntegrator(mi.CppADIntegrator):
     def gaussians(self) -> Gaussians:
         """What is rendered, as one value: the parameters, whose arrays may be attached.
 
-        Once a scene with ellipsoids was rendered, theirs as well; then detached.
+        Where they are moved, in world space. Once a scene with ellipsoids was rendered, theirs as
+        well; both are detached.
         """
         if self.memory.shadows is not None:
             return self.memory.shadows.gaussians
+        if self._gathered is None and (self._is_moved or self.objects):
+            self._gathered = _gather_parts(self._placements(), None)
         return self._own if self._gathered is None else self._gathered.gaussians
 
     def _gather(self, scene: mi.Scene) -> None:
@@ -419,16 +501,15 @@ class SplatsIntegrator(mi.CppADIntegrator):
 
         Rows that do not fit, of an update that was refused, would be read beyond their end.
         """
-        if self._has_own:
-            check_shapes(self._own)
-        shapes = _ellipsoids(scene)
+        for one in self._all_objects.values():
+            check_shapes(self._gaussians_of(one))
+        self._instances = check_instances(scene, self._instances)
+        shapes = ellipsoids_in(scene)
         self._scene_has_shapes = bool(shapes)
-        if shapes or set(self._turns) - {""}:
-            from drgs.integrator.ellipsoids import gather
-
-            self._gathered = gather(self._own, shapes, self._turns, self._gathered)
-        else:
-            self._gathered = None
+        with dr.resume_grad():
+            is_alone = not shapes and not set(self._turns) - {""} and not self._is_placed
+            parts = [] if is_alone else self._parts(shapes)
+        self._gathered = None if is_alone else _gather_parts(parts, self._gathered)
         if self.gaussians.num_gaussians == 0:
             raise PluginError(
                 "splats: there are no Gaussians: give the integrator 'filename' or tensors "
@@ -437,6 +518,32 @@ class SplatsIntegrator(mi.CppADIntegrator):
             )
         check_degree(self.sh_degree, self.gaussians)
         self._shade(scene)
+
+    @property
+    def _is_placed(self) -> bool:
+        """Whether Gaussians are moved, or are to be differentiated along a move."""
+        return bool(self.objects) or self._is_moved or dr.grad_enabled(self.to_world)
+
+    def _parts(self, shapes: Sequence[mi.Shape]) -> list[Part]:
+        """Gaussians of objects and shapes, attached, in the order in which they are rendered."""
+        parts = self._placements()
+        if shapes or self._turns:
+            from drgs.integrator.ellipsoids import conversions_of
+
+            parts += conversions_of(shapes, self._turns)
+        return parts
+
+    def _placements(self) -> list[Part]:
+        """Gaussians of objects, attached."""
+        from drgs.integrator.placement import PlacedGaussians, Placement
+
+        return [
+            Placement(
+                PlacedGaussians(self._gaussians_of(one), one.to_world.matrix),
+                f"splats: {prefix}to_world",
+            )
+            for prefix, one in self._all_objects.items()
+        ]
 
     def _shade(self, scene: mi.Scene) -> None:
         """Darken what lies in the shadow of surfaces."""
@@ -448,10 +555,14 @@ class SplatsIntegrator(mi.CppADIntegrator):
 
     @property
     def _own(self) -> Gaussians:
-        parameters = {name: getattr(self, name) for name in PARAMETER_NAMES}
-        smoothing = None if "smoothing" in self.ignore else self.smoothing
+        return self._gaussians_of(self)
+
+    def _gaussians_of(self, one: SplatsIntegrator) -> Gaussians:
+        """Gaussians of this integrator or of an object in it, in the object's own space."""
+        parameters = {name: getattr(one, name) for name in PARAMETER_NAMES}
+        smoothing = None if "smoothing" in self.ignore else one.smoothing
         # What is not put out is not loaded.
-        features = {k: v for k, v in self.features.items() if k in self.aovs.values()}
+        features = {k: v for k, v in one.features.items() if k in self.aovs.values()}
         return Gaussians(**parameters, smoothing=smoothing, features=features or None)
 
     @property
@@ -460,6 +571,8 @@ class SplatsIntegrator(mi.CppADIntegrator):
         others = [feature_of(kind) for kind in self.aovs.values() if kind != "alpha"]
         features = (rendering.color_features, *others)
         pipeline = pipeline_of(self.approximations, self.sh_degree, features=features)
+        if self._gathered is not None and self._gathered.gaussians.smoothing is not None:
+            pipeline = replace(pipeline, of_smoothing=True)  # which grows with an object
         return pipeline if self.source is None else replace(pipeline, source=self.source)
 
     def aov_names(self) -> list[str]:
@@ -468,18 +581,24 @@ class SplatsIntegrator(mi.CppADIntegrator):
 
     def channels_of(self, kind: str) -> Sequence[int | str]:
         """What comes behind the dot in the names of an AOV's channels."""
-        return AOVS[kind] if kind in AOVS else range(self.features[kind].shape[1])
+        return AOVS[kind] if kind in AOVS else range(self._feature_widths[kind])
 
     def to_string(self) -> str:
         """One line a setting; of those that are off or as usual, none."""
+        if self._gathered is None:
+            count = sum(one.means.shape[0] for one in self._all_objects.values())
+        else:
+            count = self._gathered.gaussians.num_gaussians
         settings = {
-            "gaussians": self.gaussians.num_gaussians or "those of the scene's shapes",
+            "gaussians": count or "those of the scene's shapes",
             "sh_degree": self.sh_degree,
             "background": self.background,
             "near": self.near,
             "srgb_primitives": self.srgb_primitives,
             **self.approximations.others_than_default,
         }
+        if self.objects:
+            settings["objects"] = ", ".join(self.objects)
         if self.hide_emitters:
             settings["hide_emitters"] = True
         if self.aovs:
@@ -553,7 +672,8 @@ class SplatsIntegrator(mi.CppADIntegrator):
     def accumulate(self, scene: mi.Scene, own: Gaussians) -> None:
         """Add derivatives with respect to the Gaussians to those of the attached parameters."""
         if self._gathered is not None:
-            own = self._gathered.accumulate(_ellipsoids(scene), own)
+            self._gathered.accumulate(self._parts(ellipsoids_in(scene)), own)
+            return
         for name in PARAMETER_NAMES:
             accumulate(getattr(self, name), getattr(own, name))
         for name, gradient in (own.features or {}).items():
@@ -574,25 +694,27 @@ class SplatsIntegrator(mi.CppADIntegrator):
         with self._lock, dr.suspend_grad():
             self._gather(scene)
             with dr.resume_grad():
-                features = self._own.features
-                tangents = Gaussians(
-                    **{name: _tangent(getattr(self, name)) for name in PARAMETER_NAMES},
-                    features=features and {k: _tangent(v) for k, v in features.items()},
-                )
-                if self._gathered is not None:
-                    tangents = self._gathered.tangents(_ellipsoids(scene), tangents)
+                tangents = self._tangents(scene)
             d_image = Picture.of(self, scene, sensor, seed, spp).tangent(params, tangents)
             sensor.film().clear()  # it holds an attached block
         return d_image
 
+    def _tangents(self, scene: mi.Scene) -> Gaussians:
+        """Derivatives of the Gaussians along those set on what they are made of."""
+        if self._gathered is not None:
+            return self._gathered.tangents(self._parts(ellipsoids_in(scene)))
+        features = self._own.features
+        return Gaussians(
+            **{name: _tangent(getattr(self, name)) for name in PARAMETER_NAMES},
+            features=features and {k: _tangent(v) for k, v in features.items()},
+        )
+
     def _refuse_reflected(self, scene: mi.Scene) -> None:
         """Derivatives of Gaussians that surfaces show: the nested integrator leaves them out."""
-        shapes = scene.shapes()
-        surfaces = [shape for shape in shapes if not shape.is_ellipsoids()]
-        if not surfaces or (self.light == "none" and not self.shadows):
+        if (self.light == "none" and not self.shadows) or not surfaces_in(scene):
             return
-        gaussians = [vars(self._own), *(mi.traverse(s) for s in shapes if s.is_ellipsoids())]
-        if any(dr.grad_enabled(value) for of in gaussians for _, value in of.items()):
+        values = [part.values.parameters() for part in self._parts(ellipsoids_in(scene))]
+        if any(dr.grad_enabled(value) for of in values for value in of.values()):
             raise UnsupportedError(
                 f"splats: with light '{self.light}' and shadows '{', '.join(self.shadows)}', the "
                 "Gaussians are not differentiated, as surfaces show and shade them; detach their "
@@ -631,7 +753,7 @@ class SplatsIntegrator(mi.CppADIntegrator):
         self._gather(scene)
         alone = [one for sensor in sensors for one in sensors_of(sensor)]
         states = [read_sensor(one, self.near).detached() for one in alone]
-        surfaces = [shape for shape in scene.shapes() if not shape.is_ellipsoids()]
+        surfaces = surfaces_in(scene)
         cameras = list(map(camera_from_sensor, states))
         return described(summary_of_sensors(self, cameras, scene.environment(), len(surfaces)))
 
@@ -645,8 +767,10 @@ class SplatsIntegrator(mi.CppADIntegrator):
             self._logged_summary = summary
 
 
-def _ellipsoids(scene: mi.Scene) -> list[mi.Shape]:
-    return [shape for shape in scene.shapes() if shape.is_ellipsoids()]
+def _gather_parts(parts: Sequence[Part], last: Gathered | None) -> Gathered:
+    from drgs.integrator.gathering import gather
+
+    return gather(parts, last)
 
 
 def _refuse_recording() -> None:

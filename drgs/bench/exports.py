@@ -19,10 +19,10 @@ import numpy as np
 
 from drgs.bench.output import add_out, machine, markdown_table, write_csv
 from drgs.cli.commands import CommandParser
-from drgs.cli.execution import VARIANTS
 from drgs.config.load import load_config
 from drgs.config.schema import ModelConfig
 from drgs.core.errors import UserError
+from drgs.core.variants import VARIANTS
 from drgs.data import Dataset, load_dataset
 from drgs.export import load_source
 from drgs.gaussians.parameters import Gaussians

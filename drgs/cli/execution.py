@@ -20,12 +20,10 @@ from drgs.cli.interrupts import importing
 from drgs.core.denormals import denormals_flushed
 from drgs.core.errors import UserError, one_line
 from drgs.core.memory import why_out_of_memory
+from drgs.core.variants import VARIANTS
 
 MAX_THREADS = 4096
 """Dr.Jit starts a thread for each, whatever there is to do."""
-
-VARIANTS = ("llvm_ad_rgb", "cuda_ad_rgb")
-"""Of Mitsuba, that can render and differentiate Gaussians; the first is the default."""
 
 
 def add_execution_arguments(

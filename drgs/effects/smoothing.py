@@ -32,9 +32,9 @@ FILM_MARGIN = 0.15
 def smoothed(rows: GaussianRows) -> GaussianRows:
     """Gaussians whose covariance is widened by ``rows.smoothing``^2, and dimmed in proportion.
 
-    Not differentiated: the filter.
+    The filter is differentiated where an object is scaled with it, and is no parameter itself.
     """
-    variance = dr.square(dr.detach(rows.smoothing))
+    variance = dr.square(rows.smoothing)
     log_scales = dr.log(dr.exp(2 * rows.log_scales) + variance) / 2
     dimming = dr.exp(dr.sum(rows.log_scales - log_scales))
     return replace(rows, log_scales=log_scales, smoothing=None, dimming=dimming)

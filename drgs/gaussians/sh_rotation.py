@@ -1,6 +1,6 @@
 """Spherical harmonics coefficients of a function that is rotated.
 
-Host code: a model is rotated once, when it is loaded. The functions of one degree transform among
+Host code. The functions of one degree transform among
 themselves (Green 2003, "Spherical Harmonic Lighting: The Gritty Details"), and their matrix is
 found by projection: it is determined by the functions' values in enough directions, whatever their
 order and signs.
@@ -8,6 +8,7 @@ order and signs.
 
 from __future__ import annotations
 
+from functools import cache
 from types import SimpleNamespace
 
 import numpy as np
@@ -26,9 +27,27 @@ def sh_rotation_matrices(rotation: np.ndarray, degree: int) -> list[np.ndarray]:
     was in d: sum_k Y_k(d') c'_k = sum_k Y_k(R^T d') c_k for all unit d'. float64.
     """
     directions = _directions()
-    after, before = _basis(directions, degree), _basis(directions @ rotation, degree)
+    return _projected(_basis(directions @ rotation, degree), degree)
+
+
+@cache
+def sh_rotation_generators(degree: int) -> list[list[np.ndarray]]:
+    """For rotations about x, y and z, derivatives of :func:`sh_rotation_matrices` at the identity.
+
+    A rotation by the small vector w turns c into c + sum_a w_a G_a c: the function's value at d is
+    then that at d - w x d, differentiated here by a complex step, which is exact for polynomials.
+    float64.
+    """
+    directions, step = _directions(), 1e-20
+    ahead = [directions - 1j * step * np.cross(axis, directions) for axis in np.eye(3)]
+    return [_projected(_basis(points, degree).imag / step, degree) for points in ahead]
+
+
+def _projected(values: np.ndarray, degree: int) -> list[np.ndarray]:
+    """Matrices, by degree from 1 on, of functions with these values in :func:`_directions`."""
+    basis = _basis(_directions(), degree)
     bands = [slice(num_coefficients(k - 1), num_coefficients(k)) for k in range(1, degree + 1)]
-    return [np.linalg.lstsq(after[:, b], before[:, b], rcond=None)[0] for b in bands]
+    return [np.linalg.lstsq(basis[:, b], values[:, b], rcond=None)[0] for b in bands]
 
 
 def rotated(coefficients: np.ndarray, rotation: np.ndarray) -> np.ndarray:

@@ -1,6 +1,6 @@
 """Rotation, uniform scale and translation of a model, as a ``to_world`` gives them.
 
-Host code, applied once when a model is loaded: Gaussians stay Gaussians with the same opacities,
+Host code: Gaussians stay Gaussians with the same opacities,
 and what they look like from the side stays the same.
 """
 
@@ -43,6 +43,12 @@ class Similarity:
             f"{name} must be made of rotations, translations and scales that are the same along "
             f"all axes and positive, got the matrix [{rows}]"
         )
+
+    @property
+    def is_identity(self) -> bool:
+        """Whether it moves nothing."""
+        unmoved = not self.translation.any() and (self.rotation == np.eye(3)).all()
+        return self.scale == 1 and bool(unmoved)
 
     def of_gaussians(self, gaussians: Gaussians) -> Gaussians:
         """Gaussians (numpy) moved, with what is seen of them from each side; float32.

@@ -37,18 +37,19 @@ def turned(
     means: (N, 3); quats: (N, 4) wxyz, of any norm, which they keep up to 1e30; shN: (N, K - 1, 3)
     of degree 1 and above; rotation: R (3, 3), orthonormal, determinant 1.
     """
-    wxyz = np.roll(Rotation.from_matrix(rotation).as_quat(), 1)
     quats = quats.astype(np.float64)
     sizes = np.abs(quats).max(axis=1, keepdims=True, initial=MAX_QUATERNION)
     return (
         means @ rotation.T,
-        _product(wxyz, quats / (sizes / MAX_QUATERNION)),
+        quats / (sizes / MAX_QUATERNION) @ left_product(rotation).T,
         rotated(shN.astype(np.float64), rotation),
     )
 
 
-def _product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Hamilton's product of a quaternion (4,) and quaternions (N, 4), wxyz: first b, then a."""
-    w, x, y, z = a
-    left = np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]])
-    return b @ left.T
+def left_product(rotation: np.ndarray) -> np.ndarray:
+    """(4, 4): Hamilton's product with a rotation's quaternion from the left, of wxyz.
+
+    rotation: (3, 3), orthonormal, determinant 1.
+    """
+    x, y, z, w = Rotation.from_matrix(rotation).as_quat()
+    return np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]])

@@ -27,7 +27,7 @@ from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 from drgs.integrator.settings import LitIntegrator
 
 if TYPE_CHECKING:  # imported where the ``to_world`` of shapes is given
-    from drgs.integrator.ellipsoids import Turn
+    from drgs.integrator.harmonics import Turn
 
 AOVS = {"depth": ("T",), "alpha": ("I",), "normal": ("X", "Y", "Z")}
 """What may be put out besides colour, and the names of its channels as Mitsuba has them."""
@@ -49,6 +49,12 @@ KNOWN = (
 """Names of the properties of ``splats``, but for those that begin with :data:`FEATURE` or
 :data:`SHAPES_TO_WORLD`, and nested objects."""
 
+
+OF_OBJECTS = ("filename", "to_world", "smoothing", *PARAMETER_NAMES)
+"""Names of the properties of a ``splats`` that is nested in another, but for :data:`FEATURE`."""
+
+UNNAMED = "_arg_"
+"""What the names begin with that Mitsuba gives to nested objects without one."""
 
 LIGHT_SAMPLES = 4
 """Splats that a ray of ``light: rays`` draws."""
@@ -133,12 +139,6 @@ def load_gaussians(props: mi.Properties) -> Gaussians:
         tensors = {name: dr.zeros(mi.TensorXf, shape) for name, shape in shapes.items()}
         return Gaussians(**tensors, logit_opacities=mi.Float())
     check_shapes(gaussians)
-    if "to_world" in props:
-        from drgs.gaussians.similarity import Similarity
-
-        to_world = Similarity.of(matrix(props, "to_world"), "splats: to_world")
-        moved = to_world.of_gaussians(gaussians.numpy()).to(mi.TensorXf)
-        gaussians = replace(moved, features=features, rendered_with=gaussians.rendered_with)
     return gaussians
 
 
@@ -154,13 +154,20 @@ def _loaded(path: str) -> Gaussians:
     return replace(gaussians, origin=WORLD)
 
 
+def to_world_of(props: mi.Properties) -> mi.AffineTransform4f:
+    """The transform that places Gaussians in the scene; the identity where none is given."""
+    if "to_world" not in props:
+        return mi.AffineTransform4f()
+    return mi.AffineTransform4f(matrix(props, "to_world").astype(np.float32))
+
+
 def turns_of_shapes(props: mi.Properties) -> dict[str, Turn]:
     """By ids of shapes, and under "" for all others: how their spherical harmonics turn."""
     names = [name for name in props.keys() if name.startswith(SHAPES_TO_WORLD)]  # noqa: SIM118
     if not names:
         return {}
     from drgs.gaussians.similarity import Similarity
-    from drgs.integrator.ellipsoids import Turn
+    from drgs.integrator.harmonics import Turn
 
     turns = {}
     for name in names:
@@ -215,8 +222,8 @@ def aovs_of(props: mi.Properties, kinds: Sequence[str]) -> dict[str, str]:
     return aovs
 
 
-def nested_integrator(props: mi.Properties) -> mi.Integrator | None:
-    """The nested integrator, under whatever name it was given."""
+def nested_integrators(props: mi.Properties) -> dict[str, mi.Integrator]:
+    """Nested integrators by name: their key, or in XML the id where no name is given."""
     # Objects alone: whatever is read counts as known, and a mistyped name would not be refused.
     is_object = mi.Properties.Type.Object
     names = [name for name in props.keys() if props.type(name) == is_object]  # noqa: SIM118
@@ -227,10 +234,55 @@ def nested_integrator(props: mi.Properties) -> mi.Integrator | None:
                 f"splats: {name} must be an integrator, the only object besides the texture "
                 f"background, got {value.class_name()}{did_you_mean(name, ['background'])}"
             )
-    nested = list(objects.values())
+    return {
+        (value.id() or name) if name.startswith(UNNAMED) else name: value
+        for name, value in objects.items()
+    }
+
+
+def only_one(nested: Sequence[mi.Integrator]) -> mi.Integrator | None:
+    """The integrator of surfaces, if there is one."""
     if len(nested) > 1:
-        raise PluginError(f"splats: at most one integrator can be nested, got {len(nested)}")
+        raise PluginError(
+            f"splats: at most one integrator can be nested besides splats, got {len(nested)}"
+        )
     return nested[0] if nested else None
+
+
+def check_object(name: str, given: Sequence[str]) -> None:
+    """Raise PluginError for properties of a nested ``splats`` that are not those of an object."""
+    others = [n for n in given if n not in OF_OBJECTS and not n.startswith(FEATURE)]
+    if others:
+        raise PluginError(
+            f"splats: {name} is nested in another splats integrator, whose settings hold for all "
+            f"that it renders: give {others[0]} to that one, or leave it out; a nested one takes "
+            f"{', '.join(OF_OBJECTS)} and {FEATURE}..."
+        )
+    if not given:
+        raise PluginError(
+            f"splats: {name} has no Gaussians: give it 'filename', or tensors "
+            f"{', '.join(PARAMETER_NAMES)}"
+        )
+
+
+def agreed(props: mi.Properties, files: Mapping[str, Mapping[str, Value]]) -> dict[str, Value]:
+    """The approximations that files say and that no property gives.
+
+    files: by name, what a file says; for the others it is made with the defaults.
+
+    Raises PluginError where files differ.
+    """
+    made_with = {file: Approximations.of(said) for file, said in files.items()}
+    names = [name for name in DECLARED if name not in props]
+    for name in names:
+        values = {file: getattr(made, name) for file, made in made_with.items()}
+        if len(set(values.values())) > 1:
+            words = ", ".join(f"{value} ({file})" for file, value in values.items())
+            raise PluginError(
+                f"splats: files that are rendered together must be made for the same {name}, got "
+                f"{words}; give the integrator {name}, which then holds for all"
+            )
+    return {name: said[name] for said in files.values() for name in names if name in said}
 
 
 def said_by_file(props: mi.Properties, gaussians: Gaussians) -> dict[str, Value]:

@@ -27,7 +27,6 @@ class SplatsSettings(Protocol):
     sh_degree: int  # highest that is evaluated
     approximations: Approximations
     said_by_file: Collection[str]  # names of the approximations that a file has decided
-    smoothing: Any  # Float (N,), scene units; None: the Gaussians have no filter
     ignore: Sequence[str]  # effects that are not simulated
     aovs: dict[str, str]  # what is put out besides colour: kinds by name
     nested: mi.Integrator | None  # of surfaces
@@ -44,6 +43,10 @@ class SplatsSettings(Protocol):
     @property
     def gaussians(self) -> Gaussians:
         """All that is rendered, those of the scene's shapes included."""
+
+    @property
+    def has_smoothing(self) -> bool:
+        """Whether Gaussians have a smoothing filter, be it ignored."""
 
     @property
     def pipeline(self) -> Pipeline:

@@ -128,7 +128,7 @@ def _summary_of_integrator(
             "the Gaussians' filter" if smooth else None,
         ),
     ]
-    if integrator.smoothing is not None and not smooth:
+    if integrator.has_smoothing and not smooth:
         effects.append(SimulatedEffect("smoothing filter", None, ignored=True))
     others = integrator.approximations.others_than_default
     values = [f"{k} = {v}" for k, v in others.items() if k in said and k != "antialiased"]

@@ -203,6 +203,11 @@ class Pipeline:
     model: ImageModel = DEFAULT
     order: Order = CenterOrder()
     source: Source = Projected()
+    of_smoothing: bool = False  # whether derivatives include those of a smoothing filter
+
+    def differentiated(self, rows: GaussianRows) -> GaussianRows:
+        """The numbers with respect to which derivatives are computed."""
+        return rows if self.of_smoothing else replace(rows, smoothing=None)
 
     def project(self, rows: GaussianRows, camera: Camera) -> Splats2D:
         """The first stage with this pipeline's approximations."""
@@ -419,7 +424,7 @@ def _back_to_rows(
         camera = camera.by_lane(dr.width(rows.logit_opacities))
         numbers = camera.numbers()
     with dr.resume_grad():
-        dr.enable_grad(replace(rows, smoothing=None), numbers)
+        dr.enable_grad(pipeline.differentiated(rows), numbers)
         splats = pipeline.project(rows, camera)
         outputs = response.differentiable(splats)
         outputs += pipeline.feature_columns(splats, rows, camera)
@@ -428,7 +433,7 @@ def _back_to_rows(
             dr.accum_grad(output, cotangent)
         dr.enqueue(dr.ADMode.Backward, outputs)
         dr.traverse(dr.ADMode.Backward)
-        d_rows = dr.grad(replace(rows, smoothing=None))
+        d_rows = pipeline.differentiated(dr.grad(rows))
         return d_rows, dr.detach(splats.visible), [dr.grad(number) for number in numbers]
 
 
@@ -465,6 +470,8 @@ def sum_of_gradients(a: GaussianGradients, b: GaussianGradients) -> GaussianGrad
 
 def _sum_of(a: Gaussians, b: Gaussians) -> Gaussians:
     total = {name: getattr(a, name) + getattr(b, name) for name in PARAMETER_NAMES}
+    if a.smoothing is not None:
+        total["smoothing"] = a.smoothing + b.smoothing
     if a.features:
         total["features"] = {name: v + b.features[name] for name, v in a.features.items()}
     return Gaussians(**total)
@@ -519,10 +526,11 @@ def _splat_tangents(
         camera = camera.by_lane(dr.width(rows.logit_opacities))
         numbers = camera.numbers()
     with dr.resume_grad():
-        dr.enable_grad(replace(rows, smoothing=None), numbers)
+        differentiated = frame.pipeline.differentiated(rows)
+        dr.enable_grad(differentiated, numbers)
         splats = frame.pipeline.project(rows, camera)
         d_rows = load_rows(tangents, frame.pipeline.sh_degree)
-        dr.set_grad(replace(rows, smoothing=None), replace(d_rows, smoothing=None))
+        dr.set_grad(differentiated, frame.pipeline.differentiated(d_rows))
         for number, tangent in zip(numbers, camera_tangents or [], strict=True):
             dr.set_grad(number, tangent)
         response = frame.bins.model.response
@@ -553,6 +561,7 @@ def _columns_of(d_rows: GaussianRows, gaussians: Gaussians, visible: Any) -> dic
         "logit_opacities": [d_rows.logit_opacities],
         "sh0": d_rows.sh[0],
         "shN": [*higher, *[t.Float(0)] * missing] if higher else [],
+        "smoothing": [] if d_rows.smoothing is None else [d_rows.smoothing],
         **(d_rows.features or {}),
     }
     return {
@@ -579,6 +588,7 @@ def _as_tensors(
     features = gaussians.features
     gradients = Gaussians(
         **{name: gradient(name, getattr(gaussians, name)) for name in PARAMETER_NAMES},
+        smoothing=gradient("smoothing", gaussians.smoothing) if "smoothing" in stored else None,
         features=features and {name: gradient(name, like) for name, like in features.items()},
     )
     return gradients, others

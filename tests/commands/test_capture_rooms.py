@@ -155,7 +155,14 @@ def test_splats_are_not_left_out_silently(tmp_path, nested):
     assert "python -m drgs.render" in line
 
 
-def test_shapes_of_gaussians_are_not_taken_for_surfaces(tmp_path):
+INSTANCED = (
+    "{'type': 'scene', 'g': {'type': 'shapegroup', 'id': 'g', 'gaussians': shape}, "
+    "'i': {'type': 'instance', 'r': {'type': 'ref', 'id': 'g'}}}"
+)
+
+
+@pytest.mark.parametrize("scene", ["{'type': 'scene', 'gaussians': shape}", INSTANCED])
+def test_shapes_of_gaussians_are_not_taken_for_surfaces(tmp_path, scene):
     path = tmp_path / "s.py"
     path.write_text(
         "import mitsuba as mi\n"
@@ -165,7 +172,7 @@ def test_shapes_of_gaussians_are_not_taken_for_surfaces(tmp_path):
         "    values = {'opacities': np.ones((1, 1)), 'sh_coeffs': np.ones((1, 3))}\n"
         "    tensors = {k: mi.TensorXf(v.astype(np.float32)) for k, v in values.items()}\n"
         "    shape = {'type': 'ellipsoids', 'data': mi.TensorXf(row), **tensors}\n"
-        "    return {'type': 'scene', 'gaussians': shape}\n"
+        f"    return {scene}\n"
     )
     line = refusal(path, tmp_path / "out")
     assert "the scene holds splats (it has shapes of type ellipsoids)" in line

@@ -4,7 +4,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from drgs.gaussians.sh_rotation import rotated, sh_rotation_matrices
+from drgs.gaussians.sh_rotation import (
+    rotated,
+    sh_rotation_generators,
+    sh_rotation_matrices,
+)
 from drgs.reference import splatting as reference
 
 # Values of a basis of at most 1.5 with 1e-16 of rounding, through a least-squares problem of a
@@ -50,3 +54,17 @@ def test_matrices_are_as_many_as_degrees():
     assert sh_rotation_matrices(ROTATIONS[0], 0) == []
     for matrix in sh_rotation_matrices(np.eye(3), 3):
         np.testing.assert_allclose(matrix, np.eye(len(matrix)), atol=ROUNDING)
+
+
+@pytest.mark.parametrize("axis", range(3))
+def test_generators_are_the_derivatives_of_matrices(axis):
+    """Of their central differences: third derivatives are at most 27, l^3."""
+    step = 1e-4
+    ends = [
+        sh_rotation_matrices(Rotation.from_rotvec(sign * step * np.eye(3)[axis]).as_matrix(), 3)
+        for sign in (1, -1)
+    ]
+    for generator, ahead, behind in zip(sh_rotation_generators(3)[axis], *ends, strict=True):
+        np.testing.assert_allclose(generator, (ahead - behind) / (2 * step), atol=27 * step**2)
+        np.testing.assert_allclose(generator, -generator.T, atol=ROUNDING)
+        assert np.abs(generator).max() > 0.9

@@ -290,10 +290,15 @@ print(json.dumps([kernels, [] if blocked else loaded_modules]))
 """
 
 
-MODULES = ("integrator.ellipsoids", "gaussians.similarity", "gaussians.sh_rotation")
+MODULES = (
+    *("integrator.ellipsoids", "integrator.gathering", "integrator.placement"),
+    *("integrator.harmonics", "gaussians.similarity", "gaussians.sh_rotation"),
+)
 
 
-def test_without_such_shapes_nothing_of_this_is_imported_and_kernels_are_the_same(run_python):
+def test_without_such_shapes_or_a_place_nothing_of_this_is_imported_and_kernels_are_the_same(
+    run_python,
+):
     results = [
         run_python(KERNELS.format(blocked=blocked, modules=MODULES)) for blocked in ((), MODULES)
     ]

@@ -22,6 +22,8 @@ from support.helpers import clear
 from support.views import VIEWS, Scene, image_of, tensors
 
 import drgs  # noqa: F401  (registers the plugin)
+from drgs.core.errors import UnsupportedError
+from drgs.integrator import shapes
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -255,3 +257,64 @@ def test_wrong_properties_are_refused(case):
     with pytest.raises(RuntimeError) as caught:
         mi.load_dict({"type": "splats", **make()})
     assert expected in str(caught.value).strip().splitlines()[-1]
+
+
+# ----------------------------------------------------------------------------------------------
+# Instances
+# ----------------------------------------------------------------------------------------------
+
+
+def instanced(kind="ellipsoids", group="shapegroup", **settings) -> mi.Scene:
+    """A scene whose Gaussians are in a group, beside a ball that stands alone."""
+    scene = Held(kind=kind)
+    return mi.load_dict(
+        {
+            "type": "scene",
+            "integrator": scene.settings | tensors(Scene(count=8).gaussians) | settings,
+            "sensor": scene.view.sensor(),
+            "ball": {"type": "sphere", "radius": 0.1},
+            "herd": {"type": group, "id": "herd", "cow": scene.shape},
+            "one": {"type": "instance", "herd": {"type": "ref", "id": "herd"}},
+        }
+    )
+
+
+@pytest.mark.parametrize("kind", ["ellipsoids", "ellipsoidsmesh"])
+@pytest.mark.parametrize(
+    "settings",
+    [{}, {"light": "rays"}, {"shadows": "ball"}, {"aovs": "d:depth"}],
+    ids=lambda settings: str(settings),
+)
+def test_instances_of_gaussians_are_refused_in_every_route(kind, settings):
+    loaded = instanced(kind, **settings)
+    integrator, grad = loaded.integrator(), mi.TensorXf(np.zeros((23, 37, 4), np.float32))
+    message = "^splats: shape group 'herd' holds Gaussians .shape 'cow'., whose instances are not"
+    routes = [
+        lambda: integrator.render(loaded),
+        lambda: integrator.render_backward(loaded, None, grad),
+        lambda: integrator.render_forward(loaded, None),
+        lambda: integrator.summary(loaded),
+        lambda: integrator.render(loaded),  # the refusal is no result that is kept
+    ]
+    for route in routes:
+        with pytest.raises(UnsupportedError, match=message):
+            route()
+
+
+def test_instances_of_surfaces_are_rendered_and_checked_once(monkeypatch):
+    """Every scene anew, and none again."""
+    ball = {"type": "sphere", "radius": 0.3}
+    objects = {
+        "herd": {"type": "shapegroup", "id": "herd", "cow": ball},
+        "one": {"type": "instance", "herd": {"type": "ref", "id": "herd"}},
+        "sky": {"type": "constant"},
+    }
+    scene = Scene(count=8)
+    loaded = scene_with(tensors(scene.gaussians), scene.view, **objects)
+    held, checked = shapes.check_instances(loaded, []), []
+    monkeypatch.setattr(shapes.mi, "traverse", checked.append)
+    assert shapes.check_instances(loaded, held) and not checked
+    monkeypatch.undo()
+    mi.render(loaded, spp=1)
+    with pytest.raises(UnsupportedError, match="shape group 'herd' holds Gaussians"):
+        loaded.integrator().render(instanced())

@@ -188,9 +188,9 @@ import sys
 sys.path.insert(0, "tests")
 from support.views import Scene, image_of
 
-def refusal():
+def refusal(plugin):
     try:
-        mi.load_dict({{"type": "splats", "filename": "nothing.ply"}})
+        mi.load_dict({{"type": plugin}})
     except Exception as error:
         return str(error).strip().splitlines()[-1]
 
@@ -199,7 +199,8 @@ loaded = scene.load()
 first = image_of(loaded)
 for variant in ("scalar_rgb", "llvm_ad_mono", "llvm_ad_spectral"):
     mi.set_variant(variant)
-    print(refusal())
+    for plugin in ("splats", "splatpath", "calibrated"):
+        print(refusal(plugin))
     mi.set_variant("llvm_ad_rgb")
     assert type(scene.load().integrator()) is type(loaded.integrator())
     assert (image_of(scene.load()) == first).all() and (image_of(loaded) == first).all()
@@ -215,9 +216,10 @@ def test_variants_may_be_switched_and_others_refuse_in_one_line(order, run_pytho
     result = run_python(SWITCHING.format(order=order))
     assert result.returncode == 0, result.stderr
     assert result.stdout.splitlines() == [
-        f"PluginError: splats: the variant '{variant}' is not supported, "
+        f"PluginError: {plugin}: the variant '{variant}' is not supported, "
         "use mi.set_variant('llvm_ad_rgb')"
         for variant in ("scalar_rgb", "llvm_ad_mono", "llvm_ad_spectral")
+        for plugin in ("splats", "splatpath", "calibrated")
     ]
 
 

@@ -383,7 +383,9 @@ def test_numbers_of_the_host_count_too():
 
 def test_two_nested_integrators_are_refused():
     nested = {"first": {"type": "path"}, "second": {"type": "direct"}}
-    with pytest.raises(RuntimeError, match="at most one integrator can be nested, got 2"):
+    with pytest.raises(
+        RuntimeError, match="at most one integrator can be nested besides splats, got 2"
+    ):
         load(SCENE, **nested)
 
 

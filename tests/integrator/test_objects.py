@@ -1,0 +1,239 @@
+"""Several splat objects in one scene: nested ``splats``, each with a place of its own."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from support.ellipsoids import joined, write_model
+from support.views import Scene, gradients_of, image_of, tensors
+
+import drgs  # noqa: F401  (registers the plugin)
+from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
+
+SCENE = Scene(degree=1)
+MODELS = {
+    name: Scene(degree=d, count=20 + d, seed=d).gaussians for name, d in (("lego", 2), ("fox", 0))
+}
+
+
+@pytest.fixture(scope="module", autouse=True)
+def variant():
+    mi.set_variant("llvm_ad_rgb")
+
+
+def load(objects, own=None, **others) -> mi.Scene:
+    integrator = SCENE.settings | (tensors(own) if own else {})
+    integrator |= {name: {"type": "splats"} | settings for name, settings in objects.items()}
+    return mi.load_dict(
+        {"type": "scene", "integrator": integrator, "sensor": SCENE.view.sensor(), **others}
+    )
+
+
+def nested(**others) -> dict:
+    return {name: tensors(model) | others.get(name, {}) for name, model in MODELS.items()}
+
+
+def concatenated(*models) -> mi.Scene:
+    settings = SCENE.settings | tensors(joined(*models))
+    return mi.load_dict({"type": "scene", "integrator": settings, "sensor": SCENE.view.sensor()})
+
+
+@pytest.mark.parametrize("own", [None, SCENE.gaussians], ids=["objects alone", "own besides"])
+def test_objects_are_sorted_together(own):
+    """The same bytes as of one file with all Gaussians, and the same derivatives."""
+    models = ([own] if own else []) + list(MODELS.values())
+    together, apart = load(nested(), own), concatenated(*models)
+    np.testing.assert_array_equal(image_of(together), image_of(apart))
+    assert together.integrator().sh_degree == 2
+    names = [f"{name}.{p}" for name in MODELS for p in PARAMETER_NAMES if p != "shN"]
+    found = gradients_of(together, SCENE.weights(), names)
+    expected = gradients_of(apart, SCENE.weights(), PARAMETER_NAMES)
+    start = len(own.means) if own else 0
+    for name, model in MODELS.items():
+        end = start + len(model.means)
+        for p in PARAMETER_NAMES[:-1]:
+            np.testing.assert_array_equal(found[f"{name}.{p}"], expected[p][start:end])
+        start = end
+
+
+def test_each_object_has_a_place_of_its_own(tmp_path):
+    place = mi.ScalarTransform4f().translate([0.2, 0, 0.1]).rotate([0, 1, 0], 25)
+    later = mi.Transform4f().translate([-0.1, 0.1, 0])
+    files = {
+        name: {"filename": write_model(tmp_path / f"{name}.ply", model)}
+        for name, model in MODELS.items()
+    }
+    files["lego"]["to_world"] = place
+    scene = load(files)
+    assert scene.integrator().gaussians.num_gaussians == 42
+    params = mi.traverse(scene)
+    assert {"integrator.lego.to_world", "integrator.lego.means", "integrator.fox.sh0"} <= set(
+        params.keys()
+    )
+    assert "integrator.lego.background" not in params and "integrator.to_world" not in params
+    params["integrator.fox.to_world"] = later
+    params.update()
+    alone = [load({}, MODELS[name]) for name in MODELS]
+    for one, to_world in zip(alone, (mi.Transform4f(place), later), strict=True):
+        values = mi.traverse(one)
+        values["integrator.to_world"] = to_world
+        values.update()
+    parts = [one.integrator().gaussians.numpy() for one in alone]
+    np.testing.assert_array_equal(image_of(scene), image_of(concatenated(*parts)))
+    assert "objects = lego, fox" in str(scene.integrator())
+
+
+def test_xml_names_objects_by_their_ids(tmp_path):
+    paths = {name: write_model(tmp_path / f"{name}.ply", model) for name, model in MODELS.items()}
+    objects = "".join(
+        f'<integrator type="splats" id="{name}">'
+        f'<string name="filename" value="{path}"/></integrator>'
+        for name, path in paths.items()
+    )
+    scene = mi.load_string(
+        f'<scene version="3.0.0"><integrator type="splats" id="all">{objects}</integrator></scene>'
+    )
+    assert list(scene.integrator().objects) == ["lego", "fox"]
+    assert "all.lego.to_world" in mi.traverse(scene)
+
+
+def test_features_of_objects_without_them_are_zeros():
+    values = mi.TensorXf(np.random.default_rng(2).normal(0, 1, (22, 2)).astype(np.float32))
+    feature = {"feature_x": values}
+    objects = nested(lego=feature)
+    integrator = SCENE.settings | {"aovs": "x:feature_x"}
+    integrator |= {name: {"type": "splats"} | one for name, one in objects.items()}
+    sensor = SCENE.view.sensor()
+    scene = mi.load_dict({"type": "scene", "integrator": integrator, "sensor": sensor})
+    whole = np.pad(np.array(values), [(0, 20), (0, 0)])
+    own = tensors(joined(*MODELS.values())) | {
+        "feature_x": mi.TensorXf(whole),
+        "aovs": "x:feature_x",
+    }
+    expected = mi.load_dict({"type": "scene", "integrator": SCENE.settings | own, "sensor": sensor})
+    np.testing.assert_array_equal(image_of(scene), image_of(expected))
+    other = mi.TensorXf(np.zeros((20, 3), np.float32))
+    with pytest.raises(Exception, match=r"fox\.feature_x must have the 2 columns of the other"):
+        load(nested(lego=feature, fox={"feature_x": other}))
+
+
+def test_a_nested_integrator_of_another_kind_renders_surfaces():
+    objects = nested() | {"inner": {"type": "path", "max_depth": 2}}
+    integrator = load(objects).integrator()
+    assert integrator.nested.class_name() == "PathIntegrator" and list(integrator.objects) == [
+        "lego",
+        "fox",
+    ]
+    with pytest.raises(
+        Exception, match="at most one integrator can be nested besides splats, got 2"
+    ):
+        load(objects | {"another": {"type": "path"}})
+
+
+@pytest.mark.parametrize(
+    "name", ["background", "aovs", "light", "low_pass", "sh_degree", "srgb_primitives"]
+)
+def test_settings_of_rendering_are_refused_of_an_object(name):
+    value = {"aovs": "d:depth", "light": "none", "low_pass": 0.1, "sh_degree": 0}.get(name, True)
+    if name == "background":
+        value = [1, 1, 1]
+    message = f"splats: lego is nested in another splats integrator, .*: give {name} to that one"
+    with pytest.raises(Exception, match=message):
+        load(nested(lego={name: value}))
+
+
+def test_what_holds_no_gaussians_or_objects_of_its_own_is_refused():
+    with pytest.raises(Exception, match="splats: lego has no Gaussians: give it 'filename'"):
+        load({"lego": {}})
+    with pytest.raises(Exception, match="give deeper to that one"):
+        load(nested(lego={"deeper": {"type": "splats"} | tensors(MODELS["fox"])}))
+    twisted = mi.ScalarTransform4f().scale([1, 1, 2])
+    with pytest.raises(Exception, match="splats: to_world must be made of rotations"):
+        load(nested(fox={"to_world": twisted}))
+    scene = load(nested())
+    params = mi.traverse(scene)
+    params["integrator.fox.to_world"] = mi.Transform4f(twisted)
+    with pytest.raises(ValueError, match="splats: to_world must be made of rotations"):
+        params.update()
+    with pytest.raises(ValueError, match=r"splats: fox\.to_world must be made of rotations"):
+        scene.integrator().render(scene)
+
+
+def test_files_that_say_different_things_are_refused_unless_the_integrator_decides(tmp_path):
+    paths = {}
+    for name, said in (("lego", {"low_pass": 0.1}), ("fox", None)):
+        arrays = {n: getattr(MODELS[name], n).astype(np.float32) for n in PARAMETER_NAMES}
+        paths[name] = {"filename": str(tmp_path / f"{name}.ply")}
+        Gaussians(**arrays, rendered_with=said).save(paths[name]["filename"])
+    message = r"made for the same low_pass, got 0.1 \(.*lego.ply\), 0.3.* \(.*fox.ply\); give the"
+    with pytest.raises(Exception, match=message):
+        load(paths)
+    given = {
+        "type": "splats",
+        "low_pass": 0.2,
+        **{n: {"type": "splats"} | p for n, p in paths.items()},
+    }
+    assert mi.load_dict(given).approximations.low_pass == 0.2
+    agreeing = mi.load_dict({"type": "splats", "a": {"type": "splats"} | paths["lego"]})
+    assert agreeing.approximations.low_pass == 0.1 and agreeing.said_by_file == ("low_pass",)
+
+
+def test_forward_mode_is_the_transpose_for_one_object_of_two():
+    """<J v, w> = <v, J^T w>, along positions of an object that is moved."""
+    place = {"to_world": mi.ScalarTransform4f().translate([0.1, 0, 0.2]).rotate([1, 0, 0], 20)}
+    scene, rng = load(nested(fox=place), SCENE.gaussians), np.random.default_rng(4)
+    params = mi.traverse(scene)
+    means = params["integrator.fox.means"]
+    direction = rng.normal(0, 0.1, means.shape)
+    dr.enable_grad(means)
+    dr.set_grad(means, mi.TensorXf(direction.astype(np.float32)))
+    d_image = np.array(dr.forward_to(mi.render(scene, params))).astype(np.float64)
+    again = load(nested(fox=place), SCENE.gaussians)
+    terms = direction * gradients_of(again, SCENE.weights(), ["fox.means"])["fox.means"]
+    left = np.sum(d_image * SCENE.weights())
+    assert left == pytest.approx(terms.sum(), abs=1e-5 * np.abs(terms).sum()) and left != 0
+
+
+def test_an_object_that_stands_twice_receives_both_derivatives():
+    lego = mi.load_dict({"type": "splats"} | tensors(MODELS["lego"]))
+    integrator = SCENE.settings | {"a": lego, "b": lego}
+    twice = mi.load_dict({"type": "scene", "integrator": integrator, "sensor": SCENE.view.sensor()})
+    apart = concatenated(MODELS["lego"], MODELS["lego"])
+    np.testing.assert_array_equal(image_of(twice), image_of(apart))
+    found = gradients_of(twice, SCENE.weights(), ["a.means"])["a.means"]
+    both = gradients_of(apart, SCENE.weights(), ["means"])["means"]
+    expected = both[: len(found)] + both[len(found) :]
+    np.testing.assert_allclose(found, expected, atol=1e-5 * np.abs(both).max())
+
+
+def test_gradient_descent_finds_where_an_object_stands():
+    """One of two, turned by 12 degrees and moved by a fifth of a unit, from one picture."""
+    scene = load(nested())
+    true = {"axis_angle": [0.12, -0.15, 0.1], "position": [0.15, -0.1, 0.08]}
+    middle = np.mean(MODELS["lego"].means, axis=0).tolist()
+    params = mi.traverse(scene)
+
+    def place(values):
+        turn = mi.Transform4f()
+        for axis, angle in zip(np.eye(3).tolist(), values["axis_angle"], strict=True):
+            turn = turn @ mi.Transform4f().rotate(axis, dr.rad2deg(mi.Float(angle)))
+        position = mi.Vector3f(values["position"]) + mi.Vector3f(middle)
+        there = mi.Transform4f().translate(position)
+        back = mi.Transform4f().translate(-mi.Vector3f(middle))
+        params["integrator.lego.to_world"] = there @ turn @ back
+        params.update()
+
+    place(true)
+    target = dr.detach(mi.render(scene))
+    optimizer = mi.ad.Adam(lr=0.03)
+    for name in true:
+        optimizer[name] = mi.Vector3f(0)
+    for _ in range(150):
+        place(optimizer)
+        image = mi.render(scene, params)
+        dr.backward(dr.mean(dr.square(image - target), axis=None))
+        optimizer.step()
+    for name, values in true.items():
+        np.testing.assert_allclose(np.array(optimizer[name])[:, 0], values, atol=0.01)

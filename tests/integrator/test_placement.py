@@ -1,0 +1,352 @@
+"""Splat objects that a ``to_world`` places, against the float64 reference of moved Gaussians."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from support.ellipsoids import GRADIENTS, PICTURE, ROTATION, SCALE, TRANSLATION, assert_images_agree
+from support.helpers import assert_arrays_agree, clear, single
+from support.smoothing import smoothed_reference
+from support.views import Scene, gradient, gradients_of, image_of, tensors
+
+import drgs  # noqa: F401  (registers the plugin)
+from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
+from drgs.gaussians.similarity import Similarity
+from drgs.gaussians.turning import turned
+from drgs.reference import splatting as reference
+
+MATRIX = np.eye(4)
+MATRIX[:3, :3], MATRIX[:3, 3] = SCALE * ROTATION, TRANSLATION
+MATRIX = single(MATRIX)
+
+KEY = "integrator.to_world"
+
+
+@pytest.fixture(scope="module", autouse=True)
+def variant():
+    mi.set_variant("llvm_ad_rgb")
+
+
+def moved_by(matrix, gaussians) -> reference.Gaussians:
+    """Gaussians moved in double precision."""
+    place = Similarity.of(matrix, "the test's matrix")
+    means, quats, shN = turned(gaussians.means, gaussians.quats, gaussians.shN, place.rotation)
+    return replace(
+        gaussians,
+        means=place.scale * means + place.translation,
+        quats=quats,
+        log_scales=gaussians.log_scales + np.log(place.scale),
+        shN=shN,
+    )
+
+
+@cache
+def scene_and_object(**settings) -> tuple[Scene, reference.Gaussians]:
+    """A view, and float32 Gaussians that :data:`MATRIX` moves before it."""
+    scene = clear(Scene(degree=3, **settings))
+    model = moved_by(np.linalg.inv(MATRIX), scene.gaussians)
+    return scene, reference.Gaussians(**{n: single(getattr(model, n)) for n in PARAMETER_NAMES})
+
+
+def load(scene, model, matrix=MATRIX, **settings) -> mi.Scene:
+    settings = scene.settings | tensors(model) | settings
+    if matrix is not None:
+        settings["to_world"] = mi.ScalarTransform4f(matrix)
+    return mi.load_dict({"type": "scene", "integrator": settings, "sensor": scene.view.sensor()})
+
+
+def picture(scene, gaussians) -> np.ndarray:
+    return scene.image(reference.render(gaussians, scene.camera, np.zeros(3), 3))
+
+
+# ----------------------------------------------------------------------------------------------
+# Pictures
+# ----------------------------------------------------------------------------------------------
+
+
+def test_a_moved_object_looks_as_the_reference_draws_its_gaussians():
+    scene, model = scene_and_object()
+    expected = picture(scene, moved_by(MATRIX, model))
+    given = load(scene, model)
+    assert_images_agree(image_of(given), expected, 3 * PICTURE)
+    assert np.abs(expected - picture(scene, model)).max() > 0.1
+    later = load(scene, model, matrix=None)
+    params = mi.traverse(later)
+    params[KEY] = mi.Transform4f(MATRIX)
+    params.update()
+    np.testing.assert_array_equal(image_of(later), image_of(given))
+    for name in PARAMETER_NAMES:
+        np.testing.assert_array_equal(gradient_free(params, name), getattr(model, name))
+
+
+def gradient_free(params, name) -> np.ndarray:
+    return np.array(params[f"integrator.{name}"]).astype(np.float64)
+
+
+def test_a_moved_object_looks_as_a_file_saved_moved(tmp_path):
+    """With its smoothing filter."""
+    scene, model = scene_and_object()
+    filters = np.linspace(0.005, 0.05, len(model.means), dtype=np.float32)
+    arrays = {n: getattr(model, n).astype(np.float32) for n in PARAMETER_NAMES}
+    stored = Gaussians(**arrays, smoothing=filters)
+    stored.save(tmp_path / "object.ply")
+    Similarity.of(MATRIX, "it").of_gaussians(stored).save(tmp_path / "moved.ply")
+
+    def file(name, **settings):
+        settings = scene.settings | {"filename": str(tmp_path / name)} | settings
+        return mi.load_dict(
+            {"type": "scene", "integrator": settings, "sensor": scene.view.sensor()}
+        )
+
+    expected = image_of(file("moved.ply"))
+    place = mi.ScalarTransform4f(MATRIX)
+    assert_images_agree(image_of(file("object.ply", to_world=place)), expected, 3 * PICTURE)
+    unfiltered = image_of(file("moved.ply", ignore="smoothing"))
+    assert np.abs(unfiltered - expected).max() > 0.02
+
+
+@pytest.mark.parametrize("later", [False, True])
+def test_the_identity_costs_nothing(later):
+    """Given, or set after another place: the arrays that are rendered are the integrator's own."""
+    scene, model = scene_and_object()
+    loaded = load(scene, model, MATRIX if later else np.eye(4))
+    if later:
+        params = mi.traverse(loaded)
+        image_of(loaded)
+        params[KEY] = mi.Transform4f()
+        params.update()
+    np.testing.assert_array_equal(image_of(loaded), image_of(load(scene, model, None)))
+    integrator = loaded.integrator()
+    for name in PARAMETER_NAMES:
+        assert getattr(integrator.gaussians, name) is getattr(integrator, name)
+
+
+def surfaces(scene) -> dict:
+    """A mirror amid the splats, and a lamp and a sky that shade them."""
+    camera = scene.view.camera
+    return {
+        "ball": {
+            "type": "sphere",
+            "center": (camera.center + 2.5 * camera.rotation[2]).tolist(),
+            "radius": 0.4,
+            "bsdf": {"type": "conductor"},
+        },
+        "lamp": {"type": "point", "position": np.add(camera.center, [0, 0, 1]).tolist()},
+        "sky": {"type": "constant"},
+    }
+
+
+def batch(sensor) -> dict:
+    film = sensor["film"] | {"width": 2 * sensor["film"]["width"]}
+    own = {k: v for k, v in sensor.items() if k != "film"}
+    return {"type": "batch", "film": film, "sampler": sensor["sampler"], "a": own, "b": own}
+
+
+ROUTES = {
+    "a batch": {},
+    "normals and depths": {"aovs": "n:normal, z:depth, a:alpha"},
+    "rays of surfaces": {"light": "rays", "nested_spp": 4},
+    "shadows": {"shadows": "ball", "nested_spp": 4},
+    "inside aov": {},
+}
+
+
+@pytest.mark.parametrize("route", ROUTES)
+def test_every_route_sees_the_moved_object(route):
+    """The same bytes as of the Gaussians that the integrator says it renders."""
+    scene, model = scene_and_object()
+    sensor = scene.view.sensor()
+    around = surfaces(scene) if "light" in ROUTES[route] or "shadows" in ROUTES[route] else {}
+    place = {"to_world": mi.ScalarTransform4f(MATRIX)}
+    moved = mi.load_dict(scene.settings | tensors(model) | place).gaussians.numpy()
+
+    def rendered(gaussians, **settings):
+        integrator = scene.settings | tensors(gaussians) | ROUTES[route] | settings
+        if route == "inside aov":
+            integrator = {"type": "aov", "aovs": "far:depth", "img": integrator}
+        sensors = {"sensor": batch(sensor) if route == "a batch" else sensor}
+        return image_of(
+            mi.load_dict({"type": "scene", "integrator": integrator, **sensors, **around}), spp=1
+        )
+
+    actual = rendered(model, **place)
+    np.testing.assert_array_equal(actual, rendered(moved))
+    assert np.abs(actual - rendered(model)).max() > 0.1
+
+
+# ----------------------------------------------------------------------------------------------
+# Derivatives
+# ----------------------------------------------------------------------------------------------
+
+STEP = 1e-6
+
+
+@cache
+def slopes() -> np.ndarray:
+    """(3, 4): derivatives of sum(weights * image), by central differences of the reference."""
+    scene, model = scene_and_object()
+    found = np.zeros((3, 4))
+    for cell in np.ndindex(3, 4):
+        step = np.zeros((4, 4))
+        step[cell] = STEP
+        ends = [picture(scene, moved_by(MATRIX + s * step, model)) for s in (1, -1)]
+        found[cell] = np.sum(scene.weights() * (ends[0] - ends[1])) / (2 * STEP)
+    return found
+
+
+def test_a_filter_that_grows_with_an_object_is_differentiated():
+    """At a fifth of the splats' size, and at five times of it."""
+    scene, model = scene_and_object()
+    filters = single(np.geomspace(0.005, 0.1, len(model.means)))
+    weights = scene.weights()
+
+    def loss(matrix):
+        k = Similarity.of(matrix, "it").scale
+        return np.sum(
+            weights * picture(scene, smoothed_reference(moved_by(matrix, model), k * filters))
+        )
+
+    smoothing = {"smoothing": mi.TensorXf(filters.astype(np.float32))}
+    found = gradient_of_matrix(load(scene, model, **smoothing), weights)
+    grown = np.diag([1, 1, 1, 0.0])
+    expected = (
+        loss(MATRIX @ (np.eye(4) + STEP * grown)) - loss(MATRIX @ (np.eye(4) - STEP * grown))
+    ) / (2 * STEP)
+    terms = MATRIX[:3, :3] * found[:3, :3]
+    assert terms.sum() == pytest.approx(expected, abs=GRADIENTS * np.abs(terms).max())
+
+
+def gradient_of_matrix(loaded, weights) -> np.ndarray:
+    params = mi.traverse(loaded)
+    dr.enable_grad(params[KEY])
+    image = mi.render(loaded, params)
+    dr.backward(dr.sum(image * mi.TensorXf(weights.astype(np.float32)), axis=None))
+    return np.array(dr.grad(params[KEY]).matrix).astype(np.float64)[:, :, 0]
+
+
+def test_each_number_of_the_matrix_has_the_derivative_of_central_differences():
+    scene, model = scene_and_object()
+    found = gradient_of_matrix(load(scene, model), scene.weights())
+    assert_arrays_agree({"to_world": found[:3]}, {"to_world": slopes()}, GRADIENTS)
+    assert not found[3].any()
+
+
+def test_an_object_that_is_not_moved_has_the_same_derivatives():
+    """Of a move of what lies where it is seen: by the chain rule, those above times MATRIX^-1."""
+    scene, _ = scene_and_object()
+    unmoved = load(scene, scene.gaussians, matrix=None)
+    before = image_of(unmoved)
+    found = gradient_of_matrix(unmoved, scene.weights())
+    np.testing.assert_array_equal(image_of(unmoved), before)
+    weights, world = scene.weights(), scene.gaussians
+
+    def loss(matrix):
+        return np.sum(weights * picture(scene, moved_by(matrix, world)))
+
+    for cell in [(0, 1), (1, 3), (2, 2)]:
+        step = np.zeros((4, 4))
+        step[cell] = STEP
+        expected = (loss(np.eye(4) + step) - loss(np.eye(4) - step)) / (2 * STEP)
+        assert found[cell] == pytest.approx(expected, abs=GRADIENTS * np.abs(found).max())
+
+
+def test_raw_parameters_have_derivatives_in_the_objects_space():
+    """Turned back: of quaternions by their product, of harmonics by their rotation."""
+    scene, model = scene_and_object()
+    world = reference.render_gradients(moved_by(MATRIX, model), *_cotangents(scene), None, 3, False)
+    found = gradients_of(load(scene, model), scene.weights(), PARAMETER_NAMES)
+    back = Similarity.of(np.linalg.inv(MATRIX), "it")
+    means, quats, shN = turned(world["means"], world["quats"], world["shN"], back.rotation)
+    expected = world | {"means": SCALE * means, "quats": quats, "shN": shN}
+    expected = {name: expected[name] for name in PARAMETER_NAMES}
+    assert_arrays_agree(found, expected, GRADIENTS)
+
+
+def _cotangents(scene):
+    weights = np.zeros((scene.view.height, scene.view.width, 4))
+    weights[scene.view.window] = scene.weights()
+    d_image = weights[..., :3]
+    d_alpha = weights[..., 3] - d_image @ np.array(scene.background)
+    return scene.camera, np.zeros(3), d_image, d_alpha
+
+
+def test_forward_and_backward_mode_are_transposed():
+    """<J v, w> = <v, J^T w>, along the matrix and along raw parameters."""
+    scene, model = scene_and_object()
+    rng = np.random.default_rng(3)
+    direction = rng.normal(0, 1, (4, 4)) * (np.arange(4) < 3)[:, None]
+    loaded = load(scene, model)
+    params = mi.traverse(loaded)
+    dr.enable_grad(params[KEY])
+    moved = mi.Transform4f()
+    moved.matrix = mi.Matrix4f(direction)
+    dr.set_grad(params[KEY], moved)
+    d_raw = {n: rng.normal(0, 0.1, getattr(model, n).shape) for n in PARAMETER_NAMES}
+    for name, values in d_raw.items():
+        parameter = params[f"integrator.{name}"]
+        dr.enable_grad(parameter)
+        dr.set_grad(parameter, type(parameter)(values.astype(np.float32)))
+    d_image = np.array(dr.forward_to(mi.render(loaded, params))).astype(np.float64)
+    weights = scene.weights()
+    of_raw = gradients_of(load(scene, model), weights, PARAMETER_NAMES)
+    of_matrix = gradient_of_matrix(load(scene, model), weights)
+    terms = [np.sum(direction * of_matrix), *(np.sum(d_raw[n] * of_raw[n]) for n in d_raw)]
+    assert np.sum(d_image * weights) == pytest.approx(sum(terms), abs=1e-5 * np.abs(terms).max())
+
+
+def test_derivatives_reach_what_a_transform_was_computed_from():
+    scene, model = scene_and_object()
+    loaded = load(scene, model)
+    params = mi.traverse(loaded)
+    shift = mi.Float(0)
+    dr.enable_grad(shift)
+    place = mi.Transform4f().translate([shift, 2 * shift, 0]) @ mi.Transform4f(MATRIX)
+    params[KEY] = place
+    params.update()
+    image = mi.render(loaded, params)
+    dr.backward(dr.sum(image * mi.TensorXf(scene.weights().astype(np.float32)), axis=None))
+    expected = slopes()[0, 3] + 2 * slopes()[1, 3]
+    assert gradient(shift)[0] == pytest.approx(expected, abs=GRADIENTS * np.abs(slopes()).max())
+
+
+def test_a_matrix_that_is_no_similarity_is_refused_when_it_is_set():
+    scene, model = scene_and_object()
+    loaded = load(scene, model)
+    params = mi.traverse(loaded)
+    params[KEY] = mi.Transform4f().scale([1, 1, 2])
+    message = "splats: to_world must be made of rotations, translations and scales that are"
+    with pytest.raises(ValueError, match=message):
+        params.update()
+    with pytest.raises(ValueError, match=message):
+        loaded.integrator().render(loaded)
+    params[KEY] = mi.Transform4f(MATRIX)
+    params.update()
+    np.testing.assert_array_equal(image_of(loaded), image_of(load(scene, model)))
+
+
+def test_gaussians_that_leave_float32_are_refused():
+    scene, model = scene_and_object()
+    means = model.means.copy()
+    means[2] = 3e38
+    loaded = load(scene, replace(model, means=means))
+    with pytest.raises(ValueError, match="splats: to_world moves Gaussian 2 beyond the end of flo"):
+        loaded.integrator().render(loaded)
+
+
+def test_gaussians_that_are_no_numbers_add_nothing_to_derivatives():
+    scene, model = scene_and_object()
+    means, shN = model.means.copy(), model.shN.copy()
+    means[5], shN[6] = np.nan, np.inf
+    loaded = load(scene, replace(model, means=means, shN=shN))
+    assert np.isfinite(gradient_of_matrix(loaded, scene.weights())).all()
+
+
+def test_the_derivative_of_a_matrix_is_the_same_in_every_run():
+    scene, model = scene_and_object()
+    found = [gradient_of_matrix(load(scene, model), scene.weights()) for _ in range(2)]
+    np.testing.assert_array_equal(*found)
