@@ -193,9 +193,8 @@ class SplatPathIntegrator(RBIntegrator):
     ) -> _Step:
         """Where a path goes on, if it does."""
         bsdf = si.bsdf(path.ray)
-        sample, weight = bsdf.sample(
-            mi.BSDFContext(), si, sampler.next_1d(), sampler.next_2d(), active
-        )
+        numbers = sampler.next_1d(), sampler.next_2d()
+        sample, weight = bsdf.sample(mi.BSDFContext(), si, *numbers, active)
         ray = si.spawn_ray(si.to_world(sample.wo))
         eta, throughput = path.eta * sample.eta, path.throughput * weight
         most = dr.max(throughput)
@@ -212,6 +211,7 @@ class SplatPathIntegrator(RBIntegrator):
             eta=eta,
             pdf=sample.pdf,
             type=sample.sampled_type,
+            numbers=numbers,
         )
 
     # ------------------------------------------------------------------------------------------
@@ -301,7 +301,7 @@ class _Path:
             last_hit=self.hit,
             last_si=dr.detach(si, True),
             last_pdf=step.pdf,
-            last_is_delta=mi.has_flag(step.type, mi.BSDFFlags.Delta),
+            last_is_delta=step.is_delta,
         )
 
 
@@ -316,6 +316,12 @@ class _Step:
     eta: mi.Float
     pdf: mi.Float
     type: mi.UInt32  # flags of the BSDF's part that was sampled
+    numbers: tuple[mi.Float, mi.Point2f]  # in 0..1, that it was sampled with
+
+    @property
+    def is_delta(self) -> mi.Bool:
+        """Whether the BSDF had no other direction to choose from."""
+        return mi.has_flag(self.type, mi.BSDFFlags.Delta)
 
     @property
     def is_null(self) -> mi.Bool:
@@ -324,14 +330,20 @@ class _Step:
 
     def relative_change(self, si: mi.SurfaceInteraction3f, ray: mi.Ray3f) -> mi.Spectrum:
         """1, attached: how what the vertex reflects of the next segment changes, relatively."""
+        bsdf, is_delta = si.bsdf(ray), self.is_delta
         next_si = self.hit.compute_surface_interaction(
             self.ray, ray_flags=mi.RayFlags.Minimal, active=self.active
         )
-        hits = self.active & next_si.is_valid()
+        # A vertex that moves sees the next one in another solid angle. That moves along the ray.
+        next_si = dr.detach(next_si)
+        hits = self.active & next_si.is_valid() & ~is_delta
         jacobian = solid_angle_to_area_jacobian(si.p, next_si.p, next_si.n, hits)
         moved = dr.select(next_si.is_valid(), dr.normalize(next_si.p - si.p), self.ray.d)
         wo = si.to_local(dr.replace_grad(self.ray.d, moved))
-        value = si.bsdf(ray).eval(mi.BSDFContext(), si, wo, self.active)
+        value = bsdf.eval(mi.BSDFContext(), si, wo, self.active & ~is_delta)
+        # A perfect reflection evaluates to 0; the same numbers sample it again.
+        again, weight = bsdf.sample(mi.BSDFContext(), si, *self.numbers, self.active & is_delta)
+        value = dr.select(is_delta, weight * again.pdf, value)
         return dr.relative_grad(value) * dr.relative_grad(jacobian)
 
 
