@@ -13,6 +13,7 @@ import drjit as dr
 import mitsuba as mi
 from mitsuba.ad.integrators.common import RBIntegrator, mis_weight, solid_angle_to_area_jacobian
 
+from drgs.core.errors import UnsupportedError
 from drgs.integrator.legs import Leg
 
 if TYPE_CHECKING:
@@ -119,6 +120,11 @@ class SplatPathIntegrator(RBIntegrator):
             if dr.hint(not primal, mode="scalar"):
                 with dr.resume_grad():
                     total = emitted + direct + L * step.relative_change(si, path.ray)
+                    if not dr.grad_enabled(total):
+                        raise UnsupportedError(
+                            "splatpath: nothing that a path meets changes with the parameters that "
+                            "derivatives are asked for"
+                        )
                     if dr.hint(mode == dr.ADMode.Backward, mode="scalar"):
                         dr.backward_from(δL * total)
                     else:
@@ -171,13 +177,14 @@ class SplatPathIntegrator(RBIntegrator):
         """Of an emitter that the vertex samples."""
         bsdf = si.bsdf(path.ray)
         active = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
-        ds, weight = scene.sample_emitter_direction(si, sampler.next_2d(), True, active)
+        numbers = sampler.next_2d()
+        ds, weight = scene.sample_emitter_direction(si, numbers, True, active)
         active &= ds.pdf != 0
         leg = Leg(si.spawn_ray_to(ds.p), si.shape, ds.emitter, ds.pdf)
         let_through = self._let_through(leg, sampler, active)
         with dr.resume_grad(when=not primal):
             if not primal:
-                ds, weight = _attached(scene, si, ds, weight, active)
+                ds, weight = _attached(scene, si, ds, weight, numbers, active)
             wo = si.to_local(ds.d)
             value, pdf = bsdf.eval_pdf(mi.BSDFContext(), si, wo, active)
             mis = dr.select(ds.delta, 1, mis_weight(ds.pdf, pdf))
@@ -352,9 +359,13 @@ def _attached(
     si: mi.SurfaceInteraction3f,
     ds: mi.DirectionSample3f,
     weight: mi.Spectrum,
+    numbers: mi.Point2f,
     active: mi.Bool,
 ) -> tuple[mi.DirectionSample3f, mi.Spectrum]:
-    """An emitter's sample and its weight, attached to the emitter and to the vertex."""
+    """An emitter's sample and its weight, attached to the emitter and to the vertex.
+
+    numbers: in 0..1, that it was sampled with.
+    """
     flags = ds.emitter.flags()
     is_surface = mi.has_flag(flags, mi.EmitterFlags.Surface)
     is_infinite = mi.has_flag(flags, mi.EmitterFlags.Infinite)
@@ -367,6 +378,9 @@ def _attached(
     moved = dr.select(is_textured, moved, dr.zeros(mi.DirectionSample3f))
     moved.d = dr.select(is_textured, moved.d, dr.normalize(ds.p - si.p))
     moved.d = dr.select(is_infinite, ds.d, moved.d)
+    # A lamp without a surface is sampled where it is: the same numbers find it again.
+    again, of_lamp = scene.sample_emitter_direction(si, numbers, False, active & ds.delta)
+    moved.d = dr.select(ds.delta, again.d, moved.d)
     ds = dr.replace_grad(ds, moved)
     # Samples are points of the emitter: a vertex that moves sees them in another solid angle.
     jacobian = solid_angle_to_area_jacobian(
@@ -374,7 +388,7 @@ def _attached(
     )
     emitted = scene.eval_emitter_direction(si, ds, active)
     density = dr.select(ds.pdf != 0, dr.rcp(dr.detach(ds.pdf)), 0)
-    weight = dr.replace_grad(weight, emitted * density)
+    weight = dr.replace_grad(weight, dr.select(ds.delta, of_lamp, emitted * density))
     return ds, weight * dr.relative_grad(jacobian)
 
 

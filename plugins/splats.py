@@ -534,8 +534,8 @@ class SplatsIntegrator(mi.CppADIntegrator):
         :class:`LastBackward` in ``self.last``.
         """
         _refuse_recording()
-        self._refuse_reflected(scene)
         sensor = _resolve_sensor(scene, sensor)
+        self._check_derivatives(scene, sensor)
         with self._lock, dr.suspend_grad():
             self._gather(scene)
             gradients = Picture.of(self, scene, sensor, seed, spp).backward(params, grad_in)
@@ -568,8 +568,8 @@ class SplatsIntegrator(mi.CppADIntegrator):
     ) -> mi.TensorXf:
         """Directional derivative of the image along the gradients set on the parameters."""
         _refuse_recording()
-        self._refuse_reflected(scene)
         sensor = _resolve_sensor(scene, sensor)
+        self._check_derivatives(scene, sensor)
         with self._lock, dr.suspend_grad():
             self._gather(scene)
             with dr.resume_grad():
@@ -584,19 +584,16 @@ class SplatsIntegrator(mi.CppADIntegrator):
             sensor.film().clear()  # it holds an attached block
         return d_image
 
-    def _refuse_reflected(self, scene: mi.Scene) -> None:
-        """Derivatives of Gaussians that surfaces show: the nested integrator leaves them out."""
+    def _check_derivatives(self, scene: mi.Scene, sensor: mi.Sensor) -> None:
+        """Refuse those that would be wrong."""
         shapes = scene.shapes()
-        surfaces = [shape for shape in shapes if not shape.is_ellipsoids()]
-        if not surfaces or (self.light == "none" and not self.shadows):
+        if all(shape.is_ellipsoids() for shape in shapes):
             return
+        from drgs.integrator.derivatives import check_derivatives
+
         gaussians = [vars(self._own), *(mi.traverse(s) for s in shapes if s.is_ellipsoids())]
-        if any(dr.grad_enabled(value) for of in gaussians for _, value in of.items()):
-            raise UnsupportedError(
-                f"splats: with light '{self.light}' and shadows '{', '.join(self.shadows)}', the "
-                "Gaussians are not differentiated, as surfaces show and shade them; detach their "
-                "parameters, or set light to 'none' and leave out shadows"
-            )
+        attached = any(dr.grad_enabled(value) for of in gaussians for _, value in of.items())
+        check_derivatives(self, scene, sensor, attached)
 
     def sample(
         self, *, scene: mi.Scene, sampler: mi.Sampler, ray: Any, active: Any, **others: Any

@@ -37,9 +37,15 @@ import numpy as np
 
 from drgs.cameras.camera import Camera
 from drgs.core.arrays import image_of, planes_of
-from drgs.core.errors import PluginError
+from drgs.core.errors import PluginError, UnsupportedError, listed, one_line, root_cause
 from drgs.core.private import same_variables
 from drgs.effects.occlusion import Surface
+from drgs.integrator.derivatives import (
+    Parameter,
+    attached_parameters,
+    parameter_value,
+    type_of,
+)
 from drgs.integrator.film import Channels, develop_pixels, film_map, num_colors, pixel_corners
 from drgs.integrator.film import pixels_adjoint as film_adjoint
 
@@ -101,7 +107,7 @@ def _surroundings(scene: mi.Scene) -> tuple[list[mi.Object], list[Any]]:
             if isinstance(node, mi.Sensor):
                 left_out.add(node)
     names = [name for name, (_, _, node, _) in params.properties.items() if node not in left_out]
-    return objects, [params[name] for name in names]
+    return objects, [parameter_value(params, name) for name in names]
 
 
 def _same(parameters: list[Any], others: list[Any]) -> bool:
@@ -428,7 +434,8 @@ class Hybrid:
 
     scene: mi.Scene  # what the nested integrator is given
     surfaces: Surfaces
-    integrator: mi.Integrator
+    integrator: mi.Integrator  # of the picture
+    adjoint_integrator: mi.Integrator  # of its derivatives
     sensor: mi.Sensor
     seed: int | mi.UInt32
     spp: int  # of the nested integrator; 0: as the sensor's sampler has it
@@ -443,26 +450,41 @@ class Hybrid:
 
     def backward(self, params: object, d_picture: mi.TensorXf) -> None:
         """Accumulate derivatives into the parameters of surfaces and emitters."""
-        with dr.resume_grad(), _sample_count_kept(self.sensor):
-            if self._is_attached():
-                self.integrator.render_backward(
+        with self._differentiating() as parameters:
+            if parameters:
+                self.adjoint_integrator.render_backward(
                     self.scene, params, d_picture, self.sensor, self.seed, self.spp
                 )
 
     def tangent(self, params: object, picture: mi.TensorXf) -> mi.TensorXf:
         """Directional derivative of the nested picture, along those set on the parameters."""
-        with dr.resume_grad(), _sample_count_kept(self.sensor):
-            if self._is_attached():
-                return self.integrator.render_forward(
+        with self._differentiating() as parameters:
+            if parameters:
+                # A loop sees tangents of what is inside of it alone, so that those of all that
+                # objects have computed from their parameters must be known before.
+                dr.enqueue(dr.ADMode.Forward, [parameter.value for parameter in parameters])
+                dr.traverse(dr.ADMode.Forward, flags=dr.ADFlag.ClearEdges)
+                return self.adjoint_integrator.render_forward(
                     self.scene, params, self.sensor, self.seed, self.spp
                 )
         return dr.zeros(mi.TensorXf, picture.shape)
 
-    def _is_attached(self) -> bool:
-        """Whether derivatives are asked for that the nested integrator gives."""
-        _, parameters = _surroundings(self.scene)
-        sensor = [value for _, value in mi.traverse(self.sensor)]
-        return any(map(dr.grad_enabled, parameters + sensor))
+    @contextmanager
+    def _differentiating(self) -> Iterator[list[Parameter]]:
+        """What the nested integrator is to differentiate.
+
+        Its errors, which are about variables, are raised again with the parameters' names.
+        """
+        with dr.resume_grad(), _sample_count_kept(self.sensor):
+            parameters = list(attached_parameters(self.scene))
+            try:
+                yield parameters
+            except Exception as error:
+                raise UnsupportedError(
+                    f"splats: {type_of(self.adjoint_integrator)} does not differentiate the "
+                    f"surfaces with respect to {listed([p.name for p in parameters])}: "
+                    f"{one_line(root_cause(error))}"
+                ) from None
 
 
 @contextmanager
