@@ -15,9 +15,13 @@ from mitsuba.ad.integrators.common import RBIntegrator, mis_weight, solid_angle_
 
 from drgs.core.errors import UnsupportedError
 from drgs.integrator.legs import Leg
+from drgs.integrator.properties import boolean, integer, refuse_unknown
 
 if TYPE_CHECKING:
     from drgs.integrator.legs import Light
+
+KNOWN = ("max_depth", "rr_depth", "hide_emitters")
+"""Names of its properties."""
 
 UNBOUNDED = 0xFFFFFFFF
 """What Mitsuba's integrators take a ``max_depth`` of -1 for."""
@@ -80,7 +84,11 @@ class SplatPathIntegrator(RBIntegrator):
     """
 
     def __init__(self, props: mi.Properties) -> None:
+        integer(props, "max_depth", -1, least=-1)  # before the base class, which names no plugin
+        integer(props, "rr_depth", 5, least=1)
+        boolean(props, "hide_emitters", False)
         super().__init__(props)
+        refuse_unknown(props, KNOWN)
         if "max_depth" not in props:
             self.max_depth = UNBOUNDED
         self.light: Light | None = None  # of the integrator that this one is nested in

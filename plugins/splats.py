@@ -535,7 +535,7 @@ class SplatsIntegrator(mi.CppADIntegrator):
         """
         _refuse_recording()
         sensor = _resolve_sensor(scene, sensor)
-        self._check_derivatives(scene, sensor)
+        self._check_derivatives(scene, sensor, dr.ADMode.Backward)
         with self._lock, dr.suspend_grad():
             self._gather(scene)
             gradients = Picture.of(self, scene, sensor, seed, spp).backward(params, grad_in)
@@ -569,7 +569,7 @@ class SplatsIntegrator(mi.CppADIntegrator):
         """Directional derivative of the image along the gradients set on the parameters."""
         _refuse_recording()
         sensor = _resolve_sensor(scene, sensor)
-        self._check_derivatives(scene, sensor)
+        self._check_derivatives(scene, sensor, dr.ADMode.Forward)
         with self._lock, dr.suspend_grad():
             self._gather(scene)
             with dr.resume_grad():
@@ -584,7 +584,7 @@ class SplatsIntegrator(mi.CppADIntegrator):
             sensor.film().clear()  # it holds an attached block
         return d_image
 
-    def _check_derivatives(self, scene: mi.Scene, sensor: mi.Sensor) -> None:
+    def _check_derivatives(self, scene: mi.Scene, sensor: mi.Sensor, mode: dr.ADMode) -> None:
         """Refuse those that would be wrong."""
         shapes = scene.shapes()
         if all(shape.is_ellipsoids() for shape in shapes):
@@ -593,7 +593,7 @@ class SplatsIntegrator(mi.CppADIntegrator):
 
         gaussians = [vars(self._own), *(mi.traverse(s) for s in shapes if s.is_ellipsoids())]
         attached = any(dr.grad_enabled(value) for of in gaussians for _, value in of.items())
-        check_derivatives(self, scene, sensor, attached)
+        check_derivatives(self, scene, sensor, mode, attached)
 
     def sample(
         self, *, scene: mi.Scene, sampler: mi.Sampler, ray: Any, active: Any, **others: Any

@@ -72,7 +72,11 @@ class Parameter:
 
 
 def check_derivatives(
-    integrator: SplatsSettings, scene: mi.Scene, sensor: mi.Sensor, has_gaussians: bool
+    integrator: SplatsSettings,
+    scene: mi.Scene,
+    sensor: mi.Sensor,
+    mode: dr.ADMode,
+    has_gaussians: bool,
 ) -> None:
     """Raise UnsupportedError for a parameter whose derivative would be wrong.
 
@@ -95,6 +99,8 @@ def check_derivatives(
     parameters, reasons = list(attached_parameters(scene)), {}
     for parameter in parameters:
         reason = _why_not(parameter, integrator)
+        if reason is None and mode == dr.ADMode.Forward and _is_padded(parameter):
+            reason = "forward mode does not reach its texels; use dr.backward"
         if reason is not None:
             reasons.setdefault(reason, []).append(parameter.name)
     for reason, names in reasons.items():
@@ -142,10 +148,18 @@ def _is_elsewhere(node: mi.Object) -> bool:
     return is_gaussians or isinstance(node, (mi.Sensor, mi.Integrator))
 
 
+def _is_padded(parameter: Parameter) -> bool:
+    """Whether Mitsuba renders another array than the parameter, made of what that was made of."""
+    return parameter.owners[0].class_name() == "EnvironmentMapEmitter" and parameter.key == "data"
+
+
 def _why_not(parameter: Parameter, integrator: SplatsSettings) -> str | None:
     """Why a derivative would be wrong, and what to do; None: it is right."""
     nested, owner = integrator.nested, parameter.owners[0]
     kind = SPLATPATH if nested is None else type_of(nested)
+    is_of_emitter = any(isinstance(node, mi.Emitter) for node in parameter.owners)
+    if integrator.shadows and (is_of_emitter or parameter.is_geometry):
+        return "how surfaces shade splats, which changes with it, is not; leave out shadows"
     if parameter.bsdfs:
         return _why_not_of_bsdf(parameter, kind)
     if parameter.is_geometry and kind in (SPLATPATH, *ATTACHED, *REPLAYED):
