@@ -59,11 +59,12 @@ class SplatPathIntegrator(RBIntegrator):
     what lets it pass (``null``, ``mask``, ``thindielectric``), meets no splats: those the
     integrator ``splats`` puts into the picture. Without it, this is a path tracer.
 
-    Derivatives are those of ``prb`` (path replay, detached sampling), with respect to materials,
-    emitters and poses of objects.
+    Derivatives are found as by ``prb`` (path replay, detached sampling), with respect to materials,
+    emitters and poses of objects. Unlike there, those of perfect mirrors and glass are, and those
+    of lamps without a surface that move.
 
     .. note:: Not differentiated: the splats, and what a path meets of them: that includes how it
-        changes with the ray.
+        changes with the ray; where perfect mirrors and glass send light; silhouettes.
 
     .. tabs::
 

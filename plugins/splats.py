@@ -287,9 +287,11 @@ class SplatsIntegrator(mi.CppADIntegrator):
 
     .. note:: Not differentiated: visibility, the order of the splats, the cut-offs of alpha and
         transmittance; the depth and the silhouette of surfaces. Among surfaces that show splats
-        (see ``light``), derivatives with respect to Gaussians are refused. Those with respect to a
-        sensor's pose, focal lengths and principal point are computed where they are enabled, though
-        Mitsuba's own sensors announce theirs as not differentiable.
+        (see ``light``), derivatives with respect to Gaussians are refused, and among any surfaces
+        those with respect to a sensor. Without surfaces, those with respect to its pose, focal
+        lengths and principal point are computed where they are enabled, though Mitsuba's own
+        sensors announce theirs as not differentiable. Parameters of surfaces and emitters whose
+        derivative would be wrong are refused by their names.
 
     .. tabs::
 

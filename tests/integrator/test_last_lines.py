@@ -1,4 +1,4 @@
-"""The last line that a user sees of an error names its cause, whatever Mitsuba and Dr.Jit put around.
+"""The last line of an error names its cause, whatever Mitsuba and Dr.Jit put around it.
 
 Programs run one after the other in a process of their own, which shows each error as Python does.
 """
