@@ -37,7 +37,7 @@ ALONE = "no surfaces"
 
 REFUSED, IN_PART = "refused", "in part"
 
-BOUNDS = (1, 2, 5)
+BOUNDS = (1, 2, 5, 10)
 """Per cent, that the table has."""
 
 
@@ -51,6 +51,7 @@ class Case:
     move: Callable[[Any, mi.Float], Any] = lambda value, theta: value + theta
     step: float = 0.01
     is_seen_alone: bool = False  # where there are no surfaces
+    spp: int = 512  # of the nested integrator
 
 
 def rgb(*value):
@@ -164,7 +165,10 @@ def cases() -> dict[str, Case]:
             "panel.bsdf.specular_reflectance.value", {"type": "dielectric", **GLASS}
         ),
         "`roughdielectric` `alpha`": Case(
-            "panel.bsdf.alpha.value", {"type": "roughdielectric", "alpha": 0.4}, {"sky": None}
+            "panel.bsdf.alpha.value",
+            {"type": "roughdielectric", "alpha": 0.4},
+            {"sky": None},
+            spp=4096,
         ),
         "`roughdielectric` `eta`": Case("panel.bsdf.eta", {"type": "roughdielectric"}),
         "`thindielectric` `specular_reflectance`": Case(
@@ -239,7 +243,7 @@ def load(case: Case, route: str) -> mi.Scene:
         objects["panel"] = None
     objects["integrator"] = {
         "type": "splats",
-        "nested_spp": 512,
+        "nested_spp": case.spp,
         "alpha_cut": 0.0,
         "extent": 6.0,
         "transmittance_stop": 0.0,
@@ -311,15 +315,17 @@ class Found:
 
     @property
     def text(self) -> str:
-        """For the table; errors are rounded up."""
+        """For the table; errors are rounded up, with room for another processor's rounding."""
         if self.is_refused:
             return REFUSED
-        return next((f"{b} %" for b in BOUNDS if 100 * self.error <= b), IN_PART)
+        return next((f"{b} %" for b in BOUNDS if 130 * self.error <= b), IN_PART)
 
     def fits(self, cell: str) -> bool:
         """Whether this is what the table has."""
-        if self.is_refused or cell in (REFUSED, IN_PART):
+        if self.is_refused or cell == REFUSED:
             return self.text == cell
+        if cell == IN_PART:
+            return True
         return 100 * self.error <= float(cell.removesuffix(" %"))
 
 
