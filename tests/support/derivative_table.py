@@ -76,7 +76,11 @@ def rotate(x, y, z):
     return lambda to_world, theta: to_world @ mi.Transform4f().rotate(mi.Vector3f(x, y, z), theta)
 
 
-T = mi.ScalarTransform4f
+def identity():
+    """No transform, of the variant that is set."""
+    return mi.ScalarTransform4f()
+
+
 DIFFUSE = {"type": "diffuse", "reflectance": rgb(0.6)}
 METAL = {"type": "roughconductor", "alpha": 0.4}
 COPPER = {"eta": rgb(0.2, 0.9, 1.1), "k": rgb(3.9, 2.4, 2.1)}
@@ -86,7 +90,7 @@ PLASTIC = {"diffuse_reflectance": rgb(0.4), "specular_reflectance": rgb(0.8)}
 
 
 def spot():
-    to_world = T().look_at([1, 3, 0], [0, 0, 0.3], [0, 0, 1])
+    to_world = identity().look_at([1, 3, 0], [0, 0, 0.3], [0, 0, 1])
     return {"type": "spot", "to_world": to_world, "cutoff_angle": 80.0, "beam_width": 5.0}
 
 
@@ -100,14 +104,14 @@ def sky():
 def area_lamp():
     return {
         "type": "rectangle",
-        "to_world": T().translate([0, 4, -4]).rotate([1, 0, 0], 45),
+        "to_world": identity().translate([0, 4, -4]).rotate([1, 0, 0], 45),
         "emitter": {"type": "area", "radiance": rgb(3.0)},
         "bsdf": {"type": "diffuse", "reflectance": rgb(0.0)},
     }
 
 
 def panel_to_world():
-    return T().rotate([1, 0, 0], -90).scale(8)
+    return identity().rotate([1, 0, 0], -90).scale(8)
 
 
 def mixed(*materials, **others):
