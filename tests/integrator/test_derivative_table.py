@@ -91,7 +91,7 @@ def test_an_object_that_others_see_moves():
     to_world = identity().translate([0, 3, -3]).rotate([1, 0, 0], 45).scale(30)
     bsdf = {"type": "diffuse", "reflectance": rgb(0.7)}  # or Mitsuba would merge it with the panel
     others = {"sky": None, "wall": {"type": "rectangle", "to_world": to_world, "bsdf": bsdf}}
-    case = Case("wall.to_world", others=others, move=translate(0, 0, 1), spp=4096)
+    case = Case("wall.to_world", others=others, move=translate(0, 0, 1), spp=2**15)
     assert measure(case, "`splatpath`").error < 0.01
 
 
