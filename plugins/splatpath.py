@@ -13,12 +13,17 @@ import drjit as dr
 import mitsuba as mi
 from mitsuba.ad.integrators.common import RBIntegrator, mis_weight, solid_angle_to_area_jacobian
 
+from drgs.core.errors import UnsupportedError
 from drgs.core.variants import check_variant
 from drgs.integrator.legs import Leg
+from drgs.integrator.properties import boolean, integer, refuse_unknown
 from drgs.integrator.transparency import StraightRays, has_transparent_parts
 
 if TYPE_CHECKING:
     from drgs.integrator.legs import Light
+
+KNOWN = ("max_depth", "rr_depth", "hide_emitters")
+"""Names of its properties."""
 
 UNBOUNDED = 0xFFFFFFFF
 """What Mitsuba's integrators take a ``max_depth`` of -1 for."""
@@ -59,11 +64,12 @@ class SplatPathIntegrator(RBIntegrator):
     path that passes: it does not count as a bounce, splats before and behind it are composited
     together, and emitters are sampled through it, also those that ``path`` cannot see there.
 
-    Derivatives are those of ``prb`` (path replay, detached sampling), with respect to materials,
-    emitters and poses of objects.
+    Derivatives are found as by ``prb`` (path replay, detached sampling), with respect to materials,
+    emitters and poses of objects. Unlike there, those of perfect mirrors and glass are, and those
+    of lamps without a surface that move.
 
     .. note:: Not differentiated: the splats, and what a path meets of them: that includes how it
-        changes with the ray.
+        changes with the ray; where perfect mirrors and glass send light; silhouettes.
 
     .. tabs::
 
@@ -85,7 +91,11 @@ class SplatPathIntegrator(RBIntegrator):
 
     def __init__(self, props: mi.Properties) -> None:
         check_variant("splatpath", mi.variant())
+        integer(props, "max_depth", -1, least=-1)  # before the base class, which names no plugin
+        integer(props, "rr_depth", 5, least=1)
+        boolean(props, "hide_emitters", False)
         super().__init__(props)
+        refuse_unknown(props, KNOWN)
         if "max_depth" not in props:
             self.max_depth = UNBOUNDED
         self.light: Light | None = None  # of the integrator that this one is nested in
@@ -127,6 +137,11 @@ class SplatPathIntegrator(RBIntegrator):
             if dr.hint(not primal, mode="scalar"):
                 with dr.resume_grad():
                     total = emitted + direct + L * step.relative_change(si, path.ray)
+                    if not dr.grad_enabled(total):
+                        raise UnsupportedError(
+                            "splatpath: nothing that a path meets changes with the parameters that "
+                            "derivatives are asked for"
+                        )
                     if dr.hint(mode == dr.ADMode.Backward, mode="scalar"):
                         dr.backward_from(δL * total)
                     else:
@@ -187,10 +202,8 @@ class SplatPathIntegrator(RBIntegrator):
         """Of an emitter that the vertex samples."""
         bsdf = si.bsdf(path.ray)
         active = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
-        rays = self.straight_rays
-        ds, weight = scene.sample_emitter_direction(
-            si, sampler.next_2d(), not rays.sees_through, active
-        )
+        rays, numbers = self.straight_rays, sampler.next_2d()
+        ds, weight = scene.sample_emitter_direction(si, numbers, not rays.sees_through, active)
         active &= ds.pdf != 0
         ray = si.spawn_ray_to(ds.p)
         leg = Leg(ray, si.shape, ds.emitter, ds.pdf, is_open=mi.Bool(False))
@@ -199,7 +212,7 @@ class SplatPathIntegrator(RBIntegrator):
             let_through *= rays.transmittance(ray, active)
         with dr.resume_grad(when=not primal):
             if not primal:
-                ds, weight = _attached(scene, si, ds, weight, active)
+                ds, weight = _attached(scene, si, ds, weight, numbers, active)
             wo = si.to_local(ds.d)
             value, pdf = bsdf.eval_pdf(mi.BSDFContext(), si, wo, active)
             mis = dr.select(ds.delta, 1, mis_weight(ds.pdf, pdf))
@@ -218,9 +231,8 @@ class SplatPathIntegrator(RBIntegrator):
         may_pass = mi.Bool(self.straight_rays.sees_through)
         active = path.active & si.is_valid() & (has_bounces | may_pass)
         bsdf = si.bsdf(path.ray)
-        sample, weight = bsdf.sample(
-            mi.BSDFContext(), si, sampler.next_1d(), sampler.next_2d(), active
-        )
+        numbers = sampler.next_1d(), sampler.next_2d()
+        sample, weight = bsdf.sample(mi.BSDFContext(), si, *numbers, active)
         ray = si.spawn_ray(si.to_world(sample.wo))
         is_null = mi.has_flag(sample.sampled_type, mi.BSDFFlags.Null)
         eta = path.eta * sample.eta
@@ -240,6 +252,7 @@ class SplatPathIntegrator(RBIntegrator):
             eta=eta,
             pdf=sample.pdf,
             type=sample.sampled_type,
+            numbers=numbers,
         )
 
     # ------------------------------------------------------------------------------------------
@@ -338,9 +351,7 @@ class _Path:
             last_hit=dr.select(passes, self.last_hit, self.hit),
             last_si=dr.select(passes, self.last_si, dr.detach(si, True)),
             last_pdf=dr.select(passes, self.last_pdf, step.pdf),
-            last_is_delta=dr.select(
-                passes, self.last_is_delta, mi.has_flag(step.type, mi.BSDFFlags.Delta)
-            ),
+            last_is_delta=dr.select(passes, self.last_is_delta, step.is_delta),
         )
 
 
@@ -356,17 +367,29 @@ class _Step:
     eta: mi.Float
     pdf: mi.Float
     type: mi.UInt32  # flags of the BSDF's part that was sampled
+    numbers: tuple[mi.Float, mi.Point2f]  # in 0..1, that it was sampled with
+
+    @property
+    def is_delta(self) -> mi.Bool:
+        """Whether the BSDF had no other direction to choose from."""
+        return mi.has_flag(self.type, mi.BSDFFlags.Delta)
 
     def relative_change(self, si: mi.SurfaceInteraction3f, ray: mi.Ray3f) -> mi.Spectrum:
         """1, attached: how what the vertex reflects of the next segment changes, relatively."""
+        bsdf, is_delta = si.bsdf(ray), self.is_delta
         next_si = self.hit.compute_surface_interaction(
             self.ray, ray_flags=mi.RayFlags.Minimal, active=self.active
         )
-        hits = self.active & next_si.is_valid()
+        # A vertex that moves sees the next one in another solid angle. That moves along the ray.
+        next_si = dr.detach(next_si)
+        hits = self.active & next_si.is_valid() & ~is_delta
         jacobian = solid_angle_to_area_jacobian(si.p, next_si.p, next_si.n, hits)
         moved = dr.select(next_si.is_valid(), dr.normalize(next_si.p - si.p), self.ray.d)
         wo = si.to_local(dr.replace_grad(self.ray.d, moved))
-        value = si.bsdf(ray).eval(mi.BSDFContext(), si, wo, self.active)
+        value = bsdf.eval(mi.BSDFContext(), si, wo, self.active & ~is_delta)
+        # A perfect reflection evaluates to 0; the same numbers sample it again.
+        again, weight = bsdf.sample(mi.BSDFContext(), si, *self.numbers, self.active & is_delta)
+        value = dr.select(is_delta, weight * again.pdf, value)
         return dr.relative_grad(value) * dr.relative_grad(jacobian)
 
 
@@ -375,9 +398,13 @@ def _attached(
     si: mi.SurfaceInteraction3f,
     ds: mi.DirectionSample3f,
     weight: mi.Spectrum,
+    numbers: mi.Point2f,
     active: mi.Bool,
 ) -> tuple[mi.DirectionSample3f, mi.Spectrum]:
-    """An emitter's sample and its weight, attached to the emitter and to the vertex."""
+    """An emitter's sample and its weight, attached to the emitter and to the vertex.
+
+    numbers: in 0..1, that it was sampled with.
+    """
     flags = ds.emitter.flags()
     is_surface = mi.has_flag(flags, mi.EmitterFlags.Surface)
     is_infinite = mi.has_flag(flags, mi.EmitterFlags.Infinite)
@@ -390,6 +417,9 @@ def _attached(
     moved = dr.select(is_textured, moved, dr.zeros(mi.DirectionSample3f))
     moved.d = dr.select(is_textured, moved.d, dr.normalize(ds.p - si.p))
     moved.d = dr.select(is_infinite, ds.d, moved.d)
+    # A lamp without a surface is sampled where it is: the same numbers find it again.
+    again, of_lamp = scene.sample_emitter_direction(si, numbers, False, active & ds.delta)
+    moved.d = dr.select(ds.delta, again.d, moved.d)
     ds = dr.replace_grad(ds, moved)
     # Samples are points of the emitter: a vertex that moves sees them in another solid angle.
     jacobian = solid_angle_to_area_jacobian(
@@ -397,7 +427,7 @@ def _attached(
     )
     emitted = scene.eval_emitter_direction(si, ds, active)
     density = dr.select(ds.pdf != 0, dr.rcp(dr.detach(ds.pdf)), 0)
-    weight = dr.replace_grad(weight, emitted * density)
+    weight = dr.replace_grad(weight, dr.select(ds.delta, of_lamp, emitted * density))
     return ds, weight * dr.relative_grad(jacobian)
 
 

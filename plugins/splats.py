@@ -304,9 +304,11 @@ class SplatsIntegrator(mi.CppADIntegrator):
 
     .. note:: Not differentiated: visibility, the order of the splats, the cut-offs of alpha and
         transmittance; the depth and the silhouette of surfaces. Among surfaces that show splats
-        (see ``light``), derivatives with respect to Gaussians and their ``to_world`` are refused.
-        Those with respect to a sensor's pose, focal lengths and principal point are computed where
-        they are enabled, though Mitsuba's own sensors announce theirs as not differentiable.
+        (see ``light``), derivatives with respect to Gaussians and their ``to_world`` are refused,
+        and among any surfaces those with respect to a sensor. Without surfaces, those with respect
+        to its pose, focal lengths and principal point are computed where they are enabled, though
+        Mitsuba's own sensors announce theirs as not differentiable. Parameters of surfaces and
+        emitters whose derivative would be wrong are refused by their names.
 
     .. tabs::
 
@@ -654,8 +656,8 @@ class SplatsIntegrator(mi.CppADIntegrator):
         :class:`LastBackward` in ``self.last``.
         """
         _refuse_recording()
-        self._refuse_reflected(scene)
         sensor = _resolve_sensor(scene, sensor)
+        self._check_derivatives(scene, sensor, dr.ADMode.Backward)
         with self._lock, dr.suspend_grad():
             self._gather(scene)
             gradients = Picture.of(self, scene, sensor, seed, spp).backward(params, grad_in)
@@ -689,8 +691,8 @@ class SplatsIntegrator(mi.CppADIntegrator):
     ) -> mi.TensorXf:
         """Directional derivative of the image along the gradients set on the parameters."""
         _refuse_recording()
-        self._refuse_reflected(scene)
         sensor = _resolve_sensor(scene, sensor)
+        self._check_derivatives(scene, sensor, dr.ADMode.Forward)
         with self._lock, dr.suspend_grad():
             self._gather(scene)
             with dr.resume_grad():
@@ -709,17 +711,15 @@ class SplatsIntegrator(mi.CppADIntegrator):
             features=features and {k: _tangent(v) for k, v in features.items()},
         )
 
-    def _refuse_reflected(self, scene: mi.Scene) -> None:
-        """Derivatives of Gaussians that surfaces show: the nested integrator leaves them out."""
-        if (self.light == "none" and not self.shadows) or not surfaces_in(scene):
+    def _check_derivatives(self, scene: mi.Scene, sensor: mi.Sensor, mode: dr.ADMode) -> None:
+        """Refuse those that would be wrong."""
+        if not surfaces_in(scene):
             return
+        from drgs.integrator.derivatives import check_derivatives
+
         values = [part.values.parameters() for part in self._parts(ellipsoids_in(scene))]
-        if any(dr.grad_enabled(value) for of in values for value in of.values()):
-            raise UnsupportedError(
-                f"splats: with light '{self.light}' and shadows '{', '.join(self.shadows)}', the "
-                "Gaussians are not differentiated, as surfaces show and shade them; detach their "
-                "parameters, or set light to 'none' and leave out shadows"
-            )
+        attached = any(dr.grad_enabled(value) for of in values for value in of.values())
+        check_derivatives(self, scene, sensor, mode, attached)
 
     def sample(
         self, *, scene: mi.Scene, sampler: mi.Sampler, ray: Any, active: Any, **others: Any

@@ -52,6 +52,13 @@ def one_line(text: object, limit: int = 300) -> str:
     return line if len(line) <= limit else f"{line[: limit - 3]}..."
 
 
+def root_cause(error: BaseException) -> BaseException:
+    """The exception that a chain of exceptions started with."""
+    while before := error.__cause__ or error.__context__:
+        error = before
+    return error
+
+
 def reason_of_mitsuba(error: Exception) -> str:
     """One line of Mitsuba's message: where, and the error itself, without a traceback between."""
     head, *rest = re.sub(r"^\[[\w.]+:\d+\] ", "", str(error).strip() or "error").splitlines()

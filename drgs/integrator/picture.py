@@ -182,14 +182,18 @@ def hybrid_of(
     memory, hide_emitters = integrator.memory, integrator.hide_emitters
     surfaces = memory.surfaces = Surfaces.of(scene, memory.surfaces)
     if integrator.light == "none":
-        nested = integrator.nested or mi.load_dict({"type": "path", "hide_emitters": hide_emitters})
+        nested = adjoint = integrator.nested
+        if nested is None:
+            nested = mi.load_dict({"type": "path", "hide_emitters": hide_emitters})
+            # The same paths, whose derivatives are right for more of their parameters.
+            adjoint = mi.load_dict({"type": "splatpath", "hide_emitters": hide_emitters})
         if isinstance(nested, LitIntegrator):  # that another integrator may have lit
             nested.light = None
     else:
         from drgs.integrator.light import lit
 
         num_paths = integrator.nested_spp or spp or sensor.sampler().sample_count()
-        nested = lit(integrator, scene, num_paths, sensors_of(sensor))
+        nested = adjoint = lit(integrator, scene, num_paths, sensors_of(sensor))
     insertion = Insertion(
         sensor.film(),
         memory.film_maps,
@@ -199,7 +203,7 @@ def hybrid_of(
     )
     traced, count = surfaces.traced(scene), integrator.nested_spp or spp
     rays = StraightRays(traced, hide_emitters, hide_emitters or surfaces.is_transparent)
-    return Hybrid(traced, surfaces, nested, sensor, seed, count, insertion, rays)
+    return Hybrid(traced, surfaces, nested, adjoint, sensor, seed, count, insertion, rays)
 
 
 def sensors_of(sensor: mi.Sensor) -> list[mi.Sensor]:

@@ -32,10 +32,17 @@ import mitsuba as mi
 import numpy as np
 
 from drgs.core.arrays import image_of, planes_of
-from drgs.core.errors import PluginError
+from drgs.core.errors import PluginError, UnsupportedError, listed, one_line, root_cause
 from drgs.core.private import same_variables
+from drgs.integrator.derivatives import (
+    Parameter,
+    attached_parameters,
+    parameter_value,
+    type_of,
+)
 from drgs.integrator.film import Channels, develop_pixels, film_map, num_colors
 from drgs.integrator.film import pixels_adjoint as film_adjoint
+from drgs.integrator.settings import LitIntegrator
 from drgs.integrator.transparency import StraightRays, has_transparent_parts
 from drgs.integrator.visible_surfaces import Layers, rest_behind
 
@@ -95,7 +102,7 @@ def _surroundings(scene: mi.Scene) -> tuple[list[mi.Object], list[Any]]:
             if isinstance(node, mi.Sensor):
                 left_out.add(node)
     names = [name for name, (_, _, node, _) in params.properties.items() if node not in left_out]
-    return objects, [params[name] for name in names]
+    return objects, [parameter_value(params, name) for name in names]
 
 
 def _same(parameters: list[Any], others: list[Any]) -> bool:
@@ -260,7 +267,8 @@ class Hybrid:
 
     scene: mi.Scene  # what the nested integrator is given
     surfaces: Surfaces
-    integrator: mi.Integrator
+    integrator: mi.Integrator  # of the picture
+    adjoint_integrator: mi.Integrator  # of its derivatives
     sensor: mi.Sensor
     seed: int | mi.UInt32
     spp: int  # of the nested integrator; 0: as the sensor's sampler has it
@@ -299,20 +307,26 @@ class Hybrid:
 
     def backward(self, params: object, d_pictures: list[mi.TensorXf]) -> None:
         """Accumulate derivatives into the parameters of surfaces and emitters."""
-        with dr.resume_grad():
-            if not self._is_attached():
+        with self._differentiating() as parameters:
+            if not parameters:
                 return
             for sensor, d_picture in zip(self._sensors(), d_pictures, strict=True):
-                self.integrator.render_backward(
+                self.adjoint_integrator.render_backward(
                     self.scene, params, d_picture, sensor, self.seed, self.spp
                 )
 
     def tangents(self, params: object, pictures: list[mi.TensorXf]) -> list[mi.TensorXf]:
         """Directional derivatives of the nested pictures, along those set on the parameters."""
-        with dr.resume_grad():
-            if self._is_attached():
+        with self._differentiating() as parameters:
+            if parameters:
+                # A loop sees tangents of what is inside of it alone, so that those of all that
+                # objects have computed from their parameters must be known before.
+                dr.enqueue(dr.ADMode.Forward, [parameter.value for parameter in parameters])
+                dr.traverse(dr.ADMode.Forward, flags=dr.ADFlag.ClearEdges)
                 return [
-                    self.integrator.render_forward(self.scene, params, sensor, self.seed, self.spp)
+                    self.adjoint_integrator.render_forward(
+                        self.scene, params, sensor, self.seed, self.spp
+                    )
                     for sensor in self._sensors()
                 ]
         return [dr.zeros(mi.TensorXf, picture.shape) for picture in pictures]
@@ -331,21 +345,37 @@ class Hybrid:
 
         for count in range(self.insertion.num_surfaces):
             sensor = sensor_behind(self.sensor, RaysBehind(self.rays, count))
-            with _sample_count_kept(self.sensor), _depth_reduced(self.integrator, count):
+            with (
+                _sample_count_kept(self.sensor),
+                _depth_reduced(self.integrator, count),
+                _depth_reduced(self.adjoint_integrator, count),
+            ):
                 yield sensor
 
-    def _is_attached(self) -> bool:
-        """Whether derivatives are asked for that the nested integrator gives."""
-        _, parameters = _surroundings(self.scene)
-        sensor = [value for _, value in mi.traverse(self.sensor)]
-        return any(map(dr.grad_enabled, parameters + sensor))
+    @contextmanager
+    def _differentiating(self) -> Iterator[list[Parameter]]:
+        """What the nested integrator is to differentiate.
+
+        Its errors, which are about variables, are raised again with the parameters' names.
+        """
+        with dr.resume_grad(), _sample_count_kept(self.sensor):
+            parameters = list(attached_parameters(self.scene))
+            try:
+                yield parameters
+            except Exception as error:
+                raise UnsupportedError(
+                    f"splats: {type_of(self.adjoint_integrator)} does not differentiate the "
+                    f"surfaces with respect to {listed([p.name for p in parameters])}: "
+                    f"{one_line(root_cause(error))}"
+                ) from None
 
 
 @contextmanager
 def _depth_reduced(integrator: mi.Integrator, count: int) -> Iterator[None]:
     """Shorten paths by ``count`` bounces, where they are bounded by an attribute of Python."""
     depth = getattr(integrator, "max_depth", None)
-    is_bounded = isinstance(depth, int) and depth < UNBOUNDED
+    counts_windows = not isinstance(integrator, LitIntegrator)
+    is_bounded = counts_windows and isinstance(depth, int) and depth < UNBOUNDED
     if is_bounded:
         integrator.max_depth = max(depth - count, 0)
     try:

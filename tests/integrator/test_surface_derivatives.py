@@ -18,6 +18,7 @@ from support.views import (
 from support.walls import GRADIENTS, PICTURE, SCENE, Wall, apart, blob, expected, load, rgba
 
 import drgs  # noqa: F401  (registers the plugins)
+from drgs.core.errors import UnsupportedError
 from drgs.gaussians.parameters import PARAMETER_NAMES
 from drgs.reference import splatting as reference
 
@@ -111,6 +112,65 @@ def test_forward_mode_is_the_transpose_of_the_gradients(srgb_primitives):
     tangent = dr.forward_to(mi.render(loaded, params, seed=1, seed_grad=2))
     tangent = np.array(tangent).astype(np.float64)
     assert np.sum(tangent * weights) == pytest.approx(total, abs=GRADIENTS * size)
+
+
+SENSORS = {
+    "perspective": (
+        {"type": "perspective"},
+        ["to_world", "x_fov", "principal_point_offset_x", "principal_point_offset_y"],
+    ),
+    "thinlens": (
+        {"type": "thinlens", "aperture_radius": 0.1, "focus_distance": 2.0},
+        ["to_world", "aperture_radius", "focus_distance"],
+    ),
+    "orthographic": ({"type": "orthographic"}, ["to_world"]),
+    "calibrated": (
+        {"type": "calibrated", "fx": 8.0, "lens": "opencv", "k1": 0.01},
+        ["to_world", "fx", "cx", "k1"],
+    ),
+    "batch": (
+        {
+            "type": "batch",
+            "left": {"type": "perspective"},
+            "right": {"type": "perspective", "fov": 50},
+        },
+        ["left.to_world", "right.x_fov"],
+    ),
+}
+"""With parameters that can be differentiated where there are no surfaces."""
+
+NESTED = {
+    "the default": {},
+    "path": {"nested": {"type": "path"}},
+    "prb": {"nested": {"type": "prb"}},
+    "splatpath": {"nested": {"type": "splatpath"}},
+    "rays": {"light": "rays"},
+    "probe": {"light": "probe", "probes": "wall"},
+}
+
+
+@pytest.mark.parametrize("mode", ["backward", "forward"])
+@pytest.mark.parametrize("nested", NESTED)
+def test_a_camera_that_moves_surfaces_is_refused_by_its_parameters_name(nested, mode):
+    check_refused("perspective", ["to_world"], NESTED[nested], mode)
+
+
+@pytest.mark.parametrize("kind", SENSORS)
+def test_parameters_of_all_cameras_are_refused(kind):
+    check_refused(kind, SENSORS[kind][1], {}, "backward")
+
+
+def check_refused(kind, keys, settings, mode):
+    film = {"type": "hdrfilm", "width": 8, "height": 4, "rfilter": {"type": "box"}}
+    loaded = load(SCENE, wall=Wall(), **settings)
+    for key in keys:
+        sensor = mi.load_dict({**SENSORS[kind][0], "film": film, "id": "eye"})
+        params = mi.traverse(sensor)
+        dr.enable_grad(params[key])
+        image = mi.render(loaded, params, sensor=sensor)
+        derivative = dr.backward if mode == "backward" else dr.forward_to
+        with pytest.raises(UnsupportedError, match=rf"^splats: eye\.{key} is not differentiated"):
+            derivative(image)
 
 
 def test_gradients_are_the_same_to_the_last_bit():

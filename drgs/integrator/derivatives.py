@@ -1,0 +1,214 @@
+"""Refusals of derivatives that a picture with surfaces does not have.
+
+Imported when a picture with surfaces is differentiated. What is refused would be wrong: the terms
+that are missing are no noise. Each message begins with the parameter's name.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from drgs.core.errors import UnsupportedError, listed
+from drgs.integrator.settings import LitIntegrator, SplatsSettings
+
+ATTACHED = ("PathIntegrator", "DirectIntegrator")
+"""Classes of Mitsuba's integrators whose samples move with parameters."""
+
+REPLAYED = ("PRBIntegrator", "BasicPRBIntegrator")
+"""Classes of Mitsuba's integrators whose samples stay where they are."""
+
+DIFFERENTIATED_BY_PATH = (
+    *("SmoothDiffuse", "SmoothConductor", "RoughConductor"),
+    *("SmoothDielectric", "RoughDielectric", "ThinDielectric", "TwoSidedBRDF"),
+)
+"""Classes of BSDFs that do not choose between parts with a probability that parameters change."""
+
+COVERAGE = {"MaskBSDF": ("opacity",), "ThinDielectric": ("eta", "specular_transmittance")}
+"""Parameters that change how much of a pixel a surface covers, by the class of the BSDF."""
+
+WRONG_IN_MITSUBA = {
+    "RoughPlastic": ("alpha", "eta"),  # tables of its transmittance are not differentiated
+    "RoughDielectric": ("eta",),
+    "NormalMap": ("normalmap",),
+}
+"""Parameters of which the derivative of Mitsuba's own ``eval`` is not that of its values."""
+
+SPLATPATH = "splatpath"
+
+TO_SPLATPATH = f"nest {SPLATPATH}, which does"
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """A parameter of a scene or sensor, derivatives with respect to which are asked for."""
+
+    name: str  # as mi.traverse has it
+    key: str  # the same within its object
+    owners: list[mi.Object]  # its object, the one that this belongs to, and so on
+    value: Any  # attached
+    has_nested: bool  # whether the material that it belongs to has others in it
+
+    @property
+    def is_geometry(self) -> bool:
+        """Whether it moves points of a shape."""
+        is_attribute = self.key.startswith(("vertex_", "face_"))
+        moves = not is_attribute or self.key in ("vertex_positions", "vertex_normals")
+        return isinstance(self.owners[0], mi.Shape) and moves
+
+    @property
+    def bsdfs(self) -> list[mi.BSDF]:
+        """The material that it belongs to, and those around that."""
+        return [owner for owner in self.owners if isinstance(owner, mi.BSDF)]
+
+    def name_in(self, bsdf: mi.BSDF) -> str:
+        """The parameter, or the texture that it belongs to, as the material names it."""
+        depth = self.owners.index(bsdf)
+        return self.name.split(".")[-1 - depth]
+
+
+def check_derivatives(
+    integrator: SplatsSettings,
+    scene: mi.Scene,
+    sensor: mi.Sensor,
+    mode: dr.ADMode,
+    has_gaussians: bool,
+) -> None:
+    """Raise UnsupportedError for a parameter whose derivative would be wrong.
+
+    scene: with surfaces; has_gaussians: whether derivatives with respect to these are asked for.
+    """
+    shown = integrator.light != "none" or integrator.shadows
+    if has_gaussians and shown:
+        raise UnsupportedError(
+            f"splats: with light '{integrator.light}' and shadows "
+            f"'{', '.join(integrator.shadows)}', the Gaussians are not differentiated, as surfaces "
+            "show and shade them; detach their parameters, or set light to 'none' and leave out "
+            "shadows"
+        )
+    for name, value in mi.traverse(sensor):
+        if dr.grad_enabled(value):
+            raise UnsupportedError(
+                f"splats: {sensor.id()}.{name} is not differentiated in a scene with surfaces, as "
+                "it moves these in the picture; detach it, or leave out the surfaces"
+            )
+    parameters, reasons = list(attached_parameters(scene)), {}
+    for parameter in parameters:
+        reason = _why_not(parameter, integrator)
+        if reason is None and mode == dr.ADMode.Forward and _is_padded(parameter):
+            reason = "forward mode does not reach its texels; use dr.backward"
+        if reason is not None:
+            reasons.setdefault(reason, []).append(parameter.name)
+    for reason, names in reasons.items():
+        are = "is" if len(names) == 1 else "are"
+        raise UnsupportedError(
+            f"splats: {listed(names)} {are} not differentiated, as {reason}; or detach "
+            f"{'it' if are == 'is' else 'them'}"
+        )
+
+
+def attached_parameters(scene: mi.Scene) -> Iterator[Parameter]:
+    """Those of a scene's surfaces and emitters."""
+    params = mi.traverse(scene)
+    for name, (_, _, node, _) in params.properties.items():
+        value = parameter_value(params, name)
+        if not dr.grad_enabled(value):
+            continue
+        owners = [node]
+        while (parent := params.hierarchy[owners[-1]][0]) is not None:
+            owners.append(parent)
+        if any(_is_elsewhere(owner) for owner in owners):
+            continue
+        bsdf = next((owner for owner in owners if isinstance(owner, mi.BSDF)), None)
+        nested = (n for n, (p, _) in params.hierarchy.items() if bsdf is not None and p is bsdf)
+        has_nested = any(isinstance(node, mi.BSDF) for node in nested)
+        yield Parameter(name, name.rpartition(".")[2], owners, value, has_nested)
+
+
+def parameter_value(params: mi.SceneParameters, name: str) -> Any:
+    """As ``params[name]``, which fails where ``hair`` has no value for one of its parameters."""
+    value, kind, node, _ = params.properties[name]
+    return value if kind is None else mi.get_property(value, kind, node)
+
+
+def type_of(integrator: mi.Integrator) -> str:
+    """Name of its class; those that are written in Python have one name for Mitsuba."""
+    if isinstance(integrator, LitIntegrator):
+        return SPLATPATH
+    name = integrator.class_name()
+    return type(integrator).__name__ if name == "SamplingIntegrator" else name
+
+
+def _is_elsewhere(node: mi.Object) -> bool:
+    is_gaussians = isinstance(node, mi.Shape) and node.is_ellipsoids()
+    return is_gaussians or isinstance(node, (mi.Sensor, mi.Integrator))
+
+
+def _is_padded(parameter: Parameter) -> bool:
+    """Whether Mitsuba renders another array than the parameter, made of what that was made of."""
+    return parameter.owners[0].class_name() == "EnvironmentMapEmitter" and parameter.key == "data"
+
+
+def _why_not(parameter: Parameter, integrator: SplatsSettings) -> str | None:
+    """Why a derivative would be wrong, and what to do; None: it is right."""
+    nested, owner = integrator.nested, parameter.owners[0]
+    kind = SPLATPATH if nested is None else type_of(nested)
+    is_of_emitter = any(isinstance(node, mi.Emitter) for node in parameter.owners)
+    if integrator.shadows and (is_of_emitter or parameter.is_geometry):
+        return "how surfaces shade splats, which changes with it, is not; leave out shadows"
+    if parameter.bsdfs:
+        return _why_not_of_bsdf(parameter, kind)
+    if parameter.is_geometry and kind in (SPLATPATH, *ATTACHED, *REPLAYED):
+        return _why_not_of_geometry(owner, kind)
+    if isinstance(owner, mi.Emitter) and parameter.key in ("position", "to_world"):
+        if kind in (ATTACHED if owner.is_environment() else REPLAYED):
+            return f"{kind} does not follow a lamp that moves; {TO_SPLATPATH}"
+        if integrator.light != "none" and not owner.is_environment():
+            return "the shadows that splats throw move with it; set light to 'none'"
+    return None
+
+
+def _why_not_of_geometry(shape: mi.Shape, kind: str) -> str | None:
+    if kind in ATTACHED:
+        return f"{kind} does not differentiate where paths hit surfaces; {TO_SPLATPATH}"
+    if shape.is_emitter():
+        return "the edge of a lamp that moves is not; optimise the lamp's radiance"
+    if shape.bsdf() is not None and _is_mirror(shape.bsdf()):
+        return (
+            "its BSDF is a perfect mirror or glass, and where that sends light is not; give it a "
+            "rough one"
+        )
+    return None
+
+
+def _why_not_of_bsdf(parameter: Parameter, kind: str) -> str | None:
+    bsdf, outer = parameter.bsdfs[0], parameter.bsdfs[-1]
+    name, own = bsdf.class_name(), parameter.name_in(bsdf)
+    if own in COVERAGE.get(name, ()):
+        return "how much of a pixel its surface covers is not; optimise reflectances"
+    if own in WRONG_IN_MITSUBA.get(name, ()):
+        return f"Mitsuba's derivative of {name} is wrong there; use another BSDF"
+    if parameter.has_nested and _is_mirror(bsdf):
+        is_mixed = _has_flag(bsdf, mi.BSDFFlags.Smooth, mi.BSDFFlags.Null)
+        if name != "BlendBSDF" or is_mixed:
+            return f"{name} is around a perfect mirror or glass; use a rough one"
+    if kind in REPLAYED and _is_mirror(outer):
+        return f"{kind} leaves out what perfect mirrors and glass reflect; {TO_SPLATPATH}"
+    if kind in ATTACHED and any(
+        b.class_name() not in DIFFERENTIATED_BY_PATH for b in parameter.bsdfs
+    ):
+        return f"{kind} does not differentiate which part of a {name} it samples; {TO_SPLATPATH}"
+    return None
+
+
+def _is_mirror(bsdf: mi.BSDF) -> bool:
+    """Whether a part of it has one direction, and not straight on."""
+    return _has_flag(bsdf, mi.BSDFFlags.DeltaReflection, mi.BSDFFlags.DeltaTransmission)
+
+
+def _has_flag(bsdf: mi.BSDF, *flags: mi.BSDFFlags) -> bool:
+    return any(mi.has_flag(bsdf.flags(), flag) for flag in flags)
