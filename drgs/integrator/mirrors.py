@@ -31,6 +31,7 @@ from drgs.effects.compose import composed
 from drgs.gaussians.parameters import Gaussians
 from drgs.integrator.legs import Leg
 from drgs.integrator.sensors import SensorState, camera_from_sensor
+from drgs.integrator.transparency import StraightRays, has_transparent_parts
 from drgs.light.probe import LOW_PASS, Seen
 from drgs.splatting import rendering
 
@@ -351,10 +352,10 @@ def _trace(camera: Camera, plane: Plane, scene: mi.Scene) -> tuple[mi.Float, mi.
         return dr.select(exists, camera.lens.look(camera, point)[2], dr.inf)
 
     off = mi.math.RayEpsilon * (1 + dr.max(dr.abs(start)))  # as Mitsuba does
-    hit = scene.ray_intersect_preliminary(
-        mi.Ray3f(start + off * plane.normal, direction), active=is_seen
-    )
+    rays = StraightRays(scene, False, has_transparent_parts(scene))
+    ray, hit, _ = rays.next_visible(mi.Ray3f(start + off * plane.normal, direction), is_seen)
     hits = is_seen & hit.is_valid()
-    found = depth(mi.Float(0), is_seen), depth(hit.t, hits), dr.select(hits, t + hit.t, dr.inf)
+    end = dr.dot(ray.o - start, direction) + hit.t
+    found = depth(mi.Float(0), is_seen), depth(end, hits), dr.select(hits, t + end, dr.inf)
     dr.eval(found)
     return found
