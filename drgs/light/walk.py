@@ -40,7 +40,7 @@ TURNS = 16
 """Entries of a list, after which a ray lets others of its vector find their next cell."""
 
 MOST_RANDOM = 2.0**32 - 2**8
-"""Of random numbers, for a certainty: the largest number of 32 bits that is one of float32."""
+"""Bound of random numbers for a certainty: the largest number of 32 bits in float32."""
 
 FARTHEST = 1e18
 """World units from the origin, beyond which Gaussians do not exist: their squares overflow."""
@@ -71,9 +71,7 @@ class Passed:
 class Sampled:
     """Estimates of what segments pass; those of the two fields are independent."""
 
-    colors: list[
-        Any
-    ]  # Array3f, display space: of independent splats, each drawn with w_i / (1 - T)
+    colors: list[Any]  # Array3f, display space: independent, of splats drawn with w_i / (1 - T)
     transmittance: Any  # Float: T on average
 
 
@@ -449,7 +447,7 @@ class _Draw:
 
 @dataclass(frozen=True)
 class _Chances:
-    """Of a splat in draws: random numbers below these, UInt32, of 2^32.
+    """Probabilities of a splat in draws, as bounds of random numbers: UInt32, of 2^32.
 
     With A the coverage by the splats before it in the list and A' that after it, it is the first
     to stop light with the probability v = (1 - A) alpha; given that any does, with v / A'. A draw

@@ -19,7 +19,7 @@ from drgs.splatting.cutoffs import Cutoffs
 RAYS, PATHS = 4, 8192
 
 ROUNDING = 3e-6
-"""Of coverages: products of up to 100 transmittances in single precision, and their means."""
+"""Error of coverages: products of up to 100 transmittances in single precision, and their means."""
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -79,13 +79,13 @@ def decode(color):
 
 
 def missed(coverage):
-    """Of a mean, where one of the two ways that roulette ends is seen by less than 20 paths."""
+    """Share of a mean that is left out if roulette ends in one of two ways for under 20 paths."""
     share = np.minimum(coverage**3, 1 - coverage)  # of at least three draws
     return np.where(share * PATHS < 20, share, 0)
 
 
 def assert_mean(values, expected, missed):
-    """Of each ray's paths, (RAYS PATHS, channels), within 4 standard errors, and these are chance.
+    """Compare means of paths, (RAYS PATHS, channels), within 4 standard errors; these are chance.
 
     The mean square of distances in standard errors is 1 on average; of four independent ones, it is
     beyond 4 once in 300 times. expected: (RAYS, channels); missed: what chance may leave out.
@@ -101,7 +101,7 @@ def assert_mean(values, expected, missed):
     ("fog", "num_samples"), [*((fog, 4) for fog in FOGS), (FOGS[2], 1), (FOGS[7], 2)]
 )
 def test_light_of_drawn_splats_is_that_of_all_on_average(fog, num_samples):
-    """Decoded by the same polynomial, which is sRGB's curve within its distance."""
+    """The same polynomial decodes both, which is sRGB's curve within its distance."""
     light = fog.light(num_samples)
     seen = light.splats.passed(segments(1))
     coverage = 1 - rows(seen.transmittance)[:, None]
