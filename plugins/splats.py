@@ -165,7 +165,8 @@ class SplatsIntegrator(mi.CppADIntegrator):
      * - light_samples
        - |int|
        - Splats that a ray draws, of those that it passes, where ``light`` or ``unseen`` is
-         ``rays``, at most 4096; 0: it composites all. (Default: 4)
+         ``rays``, at least 3 (1 and 2 are as 3) and at most 4096; 0: it composites all. (Default:
+         4)
 
      * - exposure
        - |float|

@@ -19,6 +19,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import reduce
 from typing import Any
 
 import drjit as dr
@@ -37,6 +38,9 @@ WINDOW = 8
 
 TURNS = 16
 """Entries of a list, after which a ray lets others of its vector find their next cell."""
+
+MOST_RANDOM = 2.0**32 - 2**8
+"""Bound of random numbers for a certainty: the largest number of 32 bits in float32."""
 
 FARTHEST = 1e18
 """World units from the origin, beyond which Gaussians do not exist: their squares overflow."""
@@ -145,44 +149,60 @@ class RaySplats:
         (Enderton et al. 2010, "Stochastic Transparency"; Sun et al. 2025, "Stochastic Ray Tracing
         of Transparent 3D Gaussians"): with the probability w_i, and none with T. That needs no
         order: a later splat of the list that does not, either, replaces the last one if it is
-        nearer. See :class:`_Draws` for when none does.
+        nearer. See :class:`_Draw` for when none does.
 
         seed: UInt32, of each ray; count: at least 1.
         """
         walk = _Walk.along(self, segment)
         t = types_of(self.shapes.Float)
-        draws = _Draws.of(seed, count)
 
-        def choose(at: _Place, coverage: Any, chosen: list) -> tuple:
+        def offer(coverage: Any, draws: list, row: Any, peak: Any, log2_alpha: Any) -> tuple:
+            chances = _Chances.of(walk.alpha(log2_alpha), coverage)
+            words = _hashes(row, seed, count)
+            drawn = [one.offer(row, peak, chances, u) for one, u in zip(draws, words, strict=True)]
+            return chances.coverage, drawn
+
+        def choose(at: _Place, coverage: Any, draws: list) -> tuple:
             at, row, peak, log2_alpha = walk.next(at)
-            return at, *draws.pass_splat(row, peak, walk.alpha(log2_alpha), coverage, chosen)
+            return at, *dr.if_stmt(
+                args=(coverage, draws, row, peak, log2_alpha),
+                cond=(log2_alpha > -dr.inf) & (peak < _farthest(draws)),
+                true_fn=offer,
+                false_fn=lambda coverage, draws, *_: (coverage, draws),
+            )
 
-        def body(at: _Place, coverage: Any, chosen: list) -> tuple:
+        def body(at: _Place, coverage: Any, draws: list) -> tuple:
             return dr.while_loop(
-                state=(walk.find(at), coverage, chosen),
-                cond=lambda at, coverage, chosen: at.has_entry(),
+                state=(walk.find(at), coverage, draws),
+                cond=lambda at, coverage, draws: at.has_entry(),
                 body=choose,
             )
 
-        def goes_on(at: _Place, coverage: Any, chosen: list) -> Any:
+        def goes_on(at: _Place, coverage: Any, draws: list) -> Any:
             # Cells that come later are behind what was drawn in this one.
-            more = (at.entry < at.last) | (~draws.all_stop(coverage) & (at.end < walk.stop))
+            more = (at.entry < at.last) | ((_farthest(draws) == dr.inf) & (at.end < walk.stop))
             return segment.active & more
 
         size = dr.width(walk.origin)
-        _, coverage, chosen = dr.while_loop(
+        _, coverage, draws = dr.while_loop(
             state=(
                 _Place.first_of(dr.zeros(t.Float, size)),
                 dr.zeros(t.Float, size),
-                [[dr.zeros(t.UInt32, size), dr.full(t.Float, dr.inf, size)] for _ in range(count)],
+                [_Draw.without_splat(t, size) for _ in range(count)],
             ),
             cond=goes_on,
             body=body,
         )
         basis = sh_basis(walk.direction, self.sh_degree)
-        colors = [t.Array3f(self._color(row, basis, peak < dr.inf)) for row, peak in chosen]
-        exist = [coverage > stop for stop in draws.stops]
-        return Sampled(colors, exist, draws.transmittance(coverage))
+        found = [self._color(one.row, basis, one.peak < dr.inf) for one in draws]
+        # Russian roulette: with the probability A^n, all are stopped, and the walk has ended early.
+        # Else T is (1 - A) / (1 - A^n), the inverse of a sum of powers.
+        powers = t.Float(1)
+        for _ in range(count - 1):
+            powers = dr.fma(powers, coverage, 1)
+        T = dr.select(_farthest(draws) < dr.inf, 0, 1 / powers)
+        exist = [one.is_stopped for one in draws]
+        return Sampled([t.Array3f(color) for color in found], exist, T)
 
     def _color(self, row: Any, basis: list[Any], active: Any) -> list[Any]:
         """Display space, seen along rays."""
@@ -396,77 +416,82 @@ class _Walk:
         return T, color, last
 
 
-@dataclass(frozen=True)
-class _Draws:
-    """Draws of splats along rays, each with the weights of a segment's splats by their sum.
+@dataclass
+class _Draw:
+    """A splat that rays draw. Not frozen: Dr.Jit assigns a loop's state.
 
-    A draw is stopped by the first splat, in the order of the lists, after which the coverage is
-    more than a random number: with the probability by which splats of an alpha stop light. If no
-    splat does, it still has one, drawn as if any had: from the splats that were read, each is the
-    first to stop light with v = (1 - A) alpha, where A is the coverage before, and given that any
-    does, with v / A'; that is decided anew for each splat (as in reservoir sampling).
-
-    So all draws have splats as soon as there are any, wherever they stop; and a walk ends when all
-    are stopped, which happens with the probability A^n.
+    A splat of the list stops it with the probability alpha. If none does, it still has one, drawn
+    as if any had: so all draws have splats as soon as there are any, with weights by their sum,
+    and whether they are stopped does not depend on which splats these are.
     """
 
-    seed: Any  # UInt32
-    stops: list[Any]  # Float: the coverage at which each draw is stopped
+    row: Any  # UInt32
+    peak: Any  # Float, inf: it has none
+    is_stopped: Any  # Bool
 
     @staticmethod
-    def of(seed: Any, count: int) -> _Draws:
-        """``count`` independent draws of each ray."""
-        no_row = type(seed)(0xFFFFFFFF)
-        return _Draws(seed, _uniform(no_row, seed, count))
+    def without_splat(t: Any, size: int) -> _Draw:
+        """Before the first entry of a list; t: types."""
+        none = dr.full(t.Float, dr.inf, size)
+        return _Draw(dr.zeros(t.UInt32, size), none, dr.full(t.Bool, False, size))
 
-    def pass_splat(
-        self, row: Any, peak: Any, alpha: Any, coverage: Any, chosen: list
-    ) -> tuple[Any, list]:
-        """The coverage and the drawn splats, their rows and peaks, after one more of the list."""
+    def offer(self, row: Any, peak: Any, chances: _Chances, u: Any) -> _Draw:
+        """The draw after another splat; u: UInt32, a random number."""
+        replaces = u < dr.select(self.is_stopped, 0, chances.replaces)
+        competes = u < dr.select(self.is_stopped, chances.stops, chances.competes)
+        takes = replaces | (competes & (peak < self.peak))
+        return _Draw(
+            dr.select(takes, row, self.row),
+            dr.select(takes, peak, self.peak),
+            self.is_stopped | (u < chances.stops),
+        )
+
+
+@dataclass(frozen=True)
+class _Chances:
+    """Probabilities of a splat in draws, as bounds of random numbers: UInt32, of 2^32.
+
+    With A the coverage by the splats before it in the list and A' that after it, it is the first
+    to stop light with the probability v = (1 - A) alpha; given that any does, with v / A'. A draw
+    that is not stopped is decided anew by that, as in reservoir sampling.
+    """
+
+    stops: Any  # alpha
+    replaces: Any  # the last splat of a draw that was not stopped: it stops it, or is the first
+    competes: Any  # that, or it stops light too: of those, the nearest is drawn
+    coverage: Any  # Float: A'
+
+    @staticmethod
+    def of(alpha: Any, coverage: Any) -> _Chances:
+        """coverage: before the splat."""
+        Float, UInt32 = type(alpha), types_of(type(alpha)).UInt32
         added = (1 - coverage) * alpha
         after = coverage + added
-        is_first = dr.select(added > 0, added / after, 0)
-        nearest = []
-        numbers = _uniform(row, self.seed, len(chosen))
-        for (last_row, last_peak), stop, u in zip(chosen, self.stops, numbers, strict=True):
-            first = dr.select(coverage > stop, 0, dr.select(after > stop, 1, is_first))
-            is_nearer = (peak < last_peak) & (u < dr.fma(1 - first, alpha, first))
-            takes = is_nearer | (u < first)
-            nearest.append([dr.select(takes, row, last_row), dr.select(takes, peak, last_peak)])
-        return after, nearest
-
-    def all_stop(self, coverage: Any) -> Any:
-        """Whether every draw is stopped."""
-        stops = True
-        for stop in self.stops:
-            stops &= coverage > stop
-        return stops
-
-    def transmittance(self, coverage: Any) -> Any:
-        """1 - A by Russian roulette: 0 where all draws are stopped, which ended the walk.
-
-        That has the probability A^n: else it is (1 - A) / (1 - A^n), the inverse of a sum of
-        powers.
-        """
-        powers = type(coverage)(1)
-        for _ in self.stops[1:]:
-            powers = dr.fma(powers, coverage, 1)
-        return dr.select(self.all_stop(coverage), 0, 1 / powers)
+        is_first = added * dr.rcp(dr.select(after > 0, after, 1))
+        replaces = dr.fma(1 - alpha, is_first, alpha)
+        competes = dr.fma(1 - replaces, alpha, replaces)
+        below = [UInt32(Float(p) * MOST_RANDOM) for p in (alpha, replaces, competes)]
+        return _Chances(*below, after)
 
 
-def _uniform(row: Any, seed: Any, count: int) -> list[Any]:
-    """Numbers in 0..1 of a Gaussian and a ray, Float, in steps of 2^-24.
+def _farthest(draws: list[_Draw]) -> Any:
+    """Peak of the farthest splat; inf if another one may be farther: not all are stopped."""
+    peaks = [dr.select(one.is_stopped, one.peak, dr.inf) for one in draws]
+    return reduce(lambda a, b: dr.select(a > b, a, b), peaks)
 
-    Hashes by PCG's output function (O'Neill 2014). Two numbers a hash, whose first 16 bits are the
-    one's and the other's; what follows in one are the first bits of the other.
+
+def _hashes(row: Any, seed: Any, count: int) -> list[Any]:
+    """Random numbers of a Gaussian and a ray, UInt32.
+
+    By PCG's output function (O'Neill 2014). Two numbers a hash: its first 16 bits are those of the
+    one, its last 16 bits of the other; what follows in one are the first bits of the other.
     """
     UInt32 = type(row)
-    Float = dr.float32_array_t(UInt32)
     numbers, state = [], row ^ seed
     for _ in range(-(-count // 2)):
         state = state * UInt32(747796405) + UInt32(2891336453)
         word = ((state >> ((state >> 28) + 4)) ^ state) * UInt32(277803737)
         word = (word >> 22) ^ word
         state = state ^ seed
-        numbers += [Float(each >> 8) * 2**-24 for each in (word, (word << 16) | (word >> 16))]
+        numbers += [word, (word << 16) | (word >> 16)]
     return numbers[:count]

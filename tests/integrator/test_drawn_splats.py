@@ -1,0 +1,143 @@
+"""Splats that rays draw, whose light is on average that of all."""
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from support.helpers import FLOAT32, rows
+from support.lit_scenes import gaussians
+from support.rays import Rays, splats_of
+
+import drgs  # noqa: F401  (registers the plugin)
+from drgs.integrator.legs import Leg
+from drgs.integrator.light import DECODED_WITHIN, DECODING, ROULETTE, LightOfSplats
+from drgs.light.walk import _hashes
+from drgs.splatting.cutoffs import Cutoffs
+
+RAYS, PATHS = 4, 8192
+
+ROUNDING = 3e-6
+"""Error of coverages: products of up to 100 transmittances in single precision, and their means."""
+
+
+@pytest.fixture(scope="module", autouse=True)
+def variant():
+    mi.set_variant("llvm_ad_rgb")
+
+
+@dataclass(frozen=True)
+class Fog:
+    """Balls of one opacity around the origin."""
+
+    count: int
+    opacity: float
+    is_contrasty: bool  # black and white splats
+    radius: float = 0.3
+    spread: float = 0.3
+
+    def light(self, num_samples):
+        rng = np.random.default_rng(self.count)
+        colors = rng.uniform(0, 1, (self.count, 3))
+        colors = np.round(colors) if self.is_contrasty else colors
+        means = rng.normal(0, self.spread, (self.count, 3))
+        splats = gaussians(means, self.radius, self.opacity, colors)
+        cutoffs = Cutoffs(transmittance_stop=0.0)
+        return LightOfSplats(splats_of(splats, FLOAT32, cutoffs), mi.Float(1), num_samples, None)
+
+
+FOGS = [
+    Fog(2, 0.1, True),
+    Fog(3, 0.02, True),
+    Fog(10, 0.05, True),
+    Fog(40, 0.02, True),
+    Fog(200, 0.01, False),
+    Fog(1000, 0.005, True),
+    Fog(10000, 0.005, True, spread=3),
+    Fog(5, 0.9, False),
+    Fog(5, 0.99, True),
+    Fog(40, 0.5, False),
+]
+
+
+def segments(num_paths):
+    """Rays from one point past the origin, each ``num_paths`` times."""
+    rng = np.random.default_rng(1)
+    targets = np.repeat(rng.normal(0, 0.3, (RAYS, 3)), num_paths, axis=0)
+    return Rays.towards(np.broadcast_to([0, 0, 20], targets.shape), targets).segments(FLOAT32)
+
+
+def samples():
+    """As a sampler draws them, of which there are 2^23."""
+    rng = np.random.default_rng(2)
+    return mi.Float(rng.integers(0, 2**23, RAYS * PATHS).astype(np.float32) / 2**23)
+
+
+def decode(color):
+    return sum(factor * color**k for k, factor in enumerate(DECODING, 1))
+
+
+def missed(coverage):
+    """Share of a mean that is left out if roulette ends in one of two ways for under 20 paths."""
+    share = np.minimum(coverage**3, 1 - coverage)  # of at least three draws
+    return np.where(share * PATHS < 20, share, 0)
+
+
+def assert_mean(values, expected, missed):
+    """Compare means of paths, (RAYS PATHS, channels), within 4 standard errors; these are chance.
+
+    The mean square of distances in standard errors is 1 on average; of four independent ones, it is
+    beyond 4 once in 300 times. expected: (RAYS, channels); missed: what chance may leave out.
+    """
+    values = values.reshape(RAYS, PATHS, -1)
+    error = values.std(axis=1, ddof=1) / np.sqrt(PATHS)
+    distance = np.maximum(np.abs(values.mean(axis=1) - expected) - ROUNDING - missed, 0)
+    z = np.divide(distance, error, out=np.where(distance > 0, np.inf, 0), where=error > 0)
+    assert (z <= 4).all() and np.square(z).mean() <= 4, z
+
+
+@pytest.mark.parametrize(
+    ("fog", "num_samples"), [*((fog, 4) for fog in FOGS), (FOGS[2], 1), (FOGS[7], 2)]
+)
+def test_light_of_drawn_splats_is_that_of_all_on_average(fog, num_samples):
+    """The same polynomial decodes both, which is sRGB's curve within its distance."""
+    light = fog.light(num_samples)
+    seen = light.splats.passed(segments(1))
+    coverage = 1 - rows(seen.transmittance)[:, None]
+    color = rows(seen.color) / np.maximum(coverage, 1e-9)
+    assert coverage.max() > fog.opacity / 2
+    drawn, covered = map(rows, light._sampled(segments(PATHS), samples()))
+    assert_mean(covered, coverage, missed(coverage))
+    assert_mean(drawn * covered[:, None], coverage * decode(color), missed(coverage))
+    exact, _ = light._composited(segments(1), mi.Float(0))
+    assert (np.abs(rows(exact) - decode(color)) < DECODED_WITHIN).all()
+
+
+def test_roulette_lets_as_much_light_through_to_an_emitter():
+    light = Fog(40, 0.12, True).light(4)
+    T = rows(light.splats.passed(segments(1)).transmittance)[:, None]
+    assert T.min() < ROULETTE / 2 and T.max() > ROULETTE, T
+    found = segments(PATHS)
+    ray = mi.Ray3f(mi.Point3f(found.origin), found.direction)
+    leg = Leg(ray, dr.zeros(mi.ShapePtr), dr.zeros(mi.EmitterPtr), mi.Float(1))
+    assert_mean(rows(light.transmittance(leg, samples(), mi.Bool(True))), T, 0)
+
+
+@pytest.mark.parametrize("apart", [1, 2, 255])
+def test_draws_of_two_splats_are_independent(apart):
+    """Of neighbours in memory, too, and of those that differ in one bit.
+
+    As often as by chance: within 5 standard errors of 2^20 seeds.
+    """
+    seed = dr.reinterpret_array(mi.UInt32, 8 * dr.arange(mi.Float, 2**20) / 2**23)
+    row = mi.UInt32(12345)
+    words = [*_hashes(row, seed, 4), *_hashes(row ^ mi.UInt32(apart), seed, 4)]
+    for alpha in (1 / 255, 0.1, 0.6):
+        below = [word < mi.UInt32(int(alpha * 2**32)) for word in words]
+        pairs = [(one, other) for k, one in enumerate(below) for other in below[:k]]
+        counts = [*(dr.count(one & other) for one, other in pairs), *map(dr.count, below)]
+        chances = np.array([alpha**2] * len(pairs) + [alpha] * len(below))
+        error = np.sqrt(chances * (1 - chances) / 2**20)
+        found = np.array([int(count[0]) for count in counts]) / 2**20
+        assert (np.abs(found - chances) <= 5 * error).all()
