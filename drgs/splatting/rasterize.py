@@ -413,7 +413,7 @@ def splat_gradients(
         dr.eval(stored)
         first, columns = 0, stored.load(bins.order)
     if first + 1 == num_samples:  # inside of a loop, the sums would take longer
-        _, columns = add(t.UInt32(0), columns)
+        _, columns = add(t.UInt32(first), columns)
     elif first < num_samples:
         _, columns = dr.while_loop(
             state=(dr.full(t.UInt32, first, size), [t.Float(column) for column in columns]),
