@@ -409,9 +409,12 @@ def splat_gradients(
     if before is None:
         first, columns = 1, terms(t.UInt32(0))
     else:
-        first, columns = 0, before.geometry + before.features
-        columns = [dr.gather(t.Float, column, bins.order) for column in columns]
-    if first < num_samples:
+        stored = Rows.of(before.geometry + before.features)  # a packet is read at once
+        dr.eval(stored)
+        first, columns = 0, stored.load(bins.order)
+    if first + 1 == num_samples:  # inside of a loop, the sums would take longer
+        _, columns = add(t.UInt32(first), columns)
+    elif first < num_samples:
         _, columns = dr.while_loop(
             state=(dr.full(t.UInt32, first, size), [t.Float(column) for column in columns]),
             cond=lambda sample, columns: sample < dr.opaque(t.UInt32, num_samples),

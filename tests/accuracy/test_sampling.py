@@ -458,8 +458,9 @@ def test_passes_of_several_samples_give_the_bytes_of_single_ones(name, monkeypat
     monkeypatch.undo()
     monkeypatch.setattr("drgs.splatting.feature_groups.FEATURES_AT_ONCE", {4: 4, 8: 4})
     assert check() == 1
-    monkeypatch.setattr("drgs.splatting.rendering.ENTRIES_AT_ONCE", 1)
-    assert check() == 1
+    with monkeypatch.context() as patch:
+        patch.setattr("drgs.splatting.rendering.ENTRIES_AT_ONCE", 1)
+        assert check() == 1
     width, height = SCENES[name]().sensors()[0].film().crop_size()
     monkeypatch.setattr("drgs.integrator.sampling.PIXELS_PER_PASS", 2 * width * height)
     monkeypatch.setattr("drgs.splatting.slots.BAND_SLOTS", 16)

@@ -4,9 +4,11 @@ import math
 from dataclasses import replace
 from functools import cache
 
+import drjit as dr
 import numpy as np
 import pytest
 
+from drgs.accuracy.sample_points import SamplePoints
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 from drgs.reference import splatting as reference
 from drgs.splatting import rendering
@@ -167,13 +169,20 @@ def two_frames(case) -> tuple[Gaussians, list[rendering.Frame]]:
 
 
 def check_camera_gradients_of_two_frames_equal_differences_of_the_reference(case):
-    """And those of the parameters are the reference's. Differences: as for the tangents."""
+    """And those of the parameters are the reference's. Differences: as for the tangents.
+
+    The second frame has two samples per pixel.
+    """
     case = clear(case)
-    gaussians, frames = two_frames(case)
+    gaussians, (frame, _) = two_frames(case)
+    centers = dr.full(FLOAT64.Float, 0.5, 2 * case.width * case.height)
+    points = SamplePoints(centers, centers, samples=2)
+    model = replace(frame.pipeline.model, positions=points)
+    frames = [frame, rendering.render_again(frame, model)]
     cotangents = Cotangents.random(case)
     d_features, d_transmittance = plane_cotangents(case, cotangents, FLOAT64)
     weights = [d_transmittance, *d_features]
-    parts = [[0.25 * w for w in weights], [0.75 * w for w in weights]]
+    parts = [[0.25 * w for w in weights], [dr.tile(0.375 * w, 2) for w in weights]]
     gradients = rendering.frames_adjoint(gaussians, frames, parts, of_camera=True)
     expected = np.sum(camera_differences(case) * rows(weights).T, axis=(1, 2))
     actual = rows(gradients.camera)[0]
