@@ -227,7 +227,7 @@ def mask_of(scene: mi.Scene, name: str) -> np.ndarray:
     hit = scene.ray_intersect_preliminary(ray)
     shape = next(shape for shape in scene.shapes() if shape.id() == name)
     ray.maxt = dr.select(hit.is_valid(), hit.t, dr.inf)
-    leg = Leg(ray, hit.shape, hit.shape.emitter(), mi.Float(dr.inf))
+    leg = Leg(ray, hit.shape, hit.shape.emitter(), mi.Float(dr.inf), is_open=mi.Bool(False))
     T = LightOfSplats.of(integrator).transmittance(leg, mi.Float(0), mi.Bool(True))
     shows = hit.is_valid() & (hit.shape == mi.ShapePtr(shape)) & (T > LIT)
     return np.array(shows).reshape(height, width)

@@ -107,11 +107,13 @@ def test_light_of_drawn_splats_is_that_of_all_on_average(fog, num_samples):
     coverage = 1 - rows(seen.transmittance)[:, None]
     color = rows(seen.color) / np.maximum(coverage, 1e-9)
     assert coverage.max() > fog.opacity / 2
-    drawn, covered = map(rows, light._sampled(segments(PATHS), samples()))
-    assert_mean(covered, coverage, missed(coverage))
-    assert_mean(drawn * covered[:, None], coverage * decode(color), missed(coverage))
-    exact, _ = light._composited(segments(1), mi.Float(0))
-    assert (np.abs(rows(exact) - decode(color)) < DECODED_WITHIN).all()
+    for is_open, expected in ((False, coverage * decode(color)), (True, decode(rows(seen.color)))):
+        which = dr.full(mi.Bool, is_open, RAYS * PATHS)
+        drawn, covered = map(rows, light._sampled(segments(PATHS), which, samples()))
+        assert_mean(covered, coverage, missed(coverage))
+        assert_mean(drawn, expected, missed(coverage))
+        exact, _ = light._composited(segments(1), mi.Bool(is_open), mi.Float(0))
+        assert (np.abs(rows(exact) - expected) < DECODED_WITHIN).all()
 
 
 def test_roulette_lets_as_much_light_through_to_an_emitter():
@@ -120,7 +122,8 @@ def test_roulette_lets_as_much_light_through_to_an_emitter():
     assert T.min() < ROULETTE / 2 and T.max() > ROULETTE, T
     found = segments(PATHS)
     ray = mi.Ray3f(mi.Point3f(found.origin), found.direction)
-    leg = Leg(ray, dr.zeros(mi.ShapePtr), dr.zeros(mi.EmitterPtr), mi.Float(1))
+    ends = dr.zeros(mi.ShapePtr), dr.zeros(mi.EmitterPtr)
+    leg = Leg(ray, *ends, mi.Float(1), is_open=mi.Bool(False))
     assert_mean(rows(light.transmittance(leg, samples(), mi.Bool(True))), T, 0)
 
 
