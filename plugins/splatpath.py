@@ -98,6 +98,7 @@ class SplatPathIntegrator(RBIntegrator):
         refuse_unknown(props, KNOWN)
         if "max_depth" not in props:
             self.max_depth = UNBOUNDED
+        self.sees_through = False  # whether anything in the scene lets light pass straight on
         self.light: Light | None = None  # of the integrator that this one is nested in
 
     @dr.syntax
@@ -116,7 +117,7 @@ class SplatPathIntegrator(RBIntegrator):
         vertex what radiance is still to come, as the first one has left the sum.
         """
         primal = mode == dr.ADMode.Primal
-        self.straight_rays = StraightRays(scene, False, has_transparent_parts(scene))
+        self.sees_through = has_transparent_parts(scene)
         path = self._begin(scene, ray, active)
         L = mi.Spectrum(0 if primal else others["state_in"])  # so far; in a replay, still to come
         δL = mi.Spectrum(0 if others["δL"] is None else others["δL"])
@@ -202,7 +203,7 @@ class SplatPathIntegrator(RBIntegrator):
         """Of an emitter that the vertex samples."""
         bsdf = si.bsdf(path.ray)
         active = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
-        rays, numbers = self.straight_rays, sampler.next_2d()
+        rays, numbers = StraightRays(scene, False, self.sees_through), sampler.next_2d()
         ds, weight = scene.sample_emitter_direction(si, numbers, not rays.sees_through, active)
         active &= ds.pdf != 0
         ray = si.spawn_ray_to(ds.p)
@@ -228,7 +229,7 @@ class SplatPathIntegrator(RBIntegrator):
     ) -> _Step:
         """Where a path goes on, if it does."""
         has_bounces = path.depth + 1 < self.max_depth
-        may_pass = mi.Bool(self.straight_rays.sees_through)
+        may_pass = mi.Bool(self.sees_through)
         active = path.active & si.is_valid() & (has_bounces | may_pass)
         bsdf = si.bsdf(path.ray)
         numbers = sampler.next_1d(), sampler.next_2d()

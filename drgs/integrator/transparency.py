@@ -18,19 +18,23 @@ INVISIBLE = 1e-6
 
 def has_transparent_parts(scene: mi.Scene) -> bool:
     """Return whether any BSDF of a scene lets light pass straight on."""
-    bsdfs = (node for node in mi.traverse(scene).hierarchy if isinstance(node, mi.BSDF))
+    with dr.suspend_grad():  # or values that are read would be new nodes of a graph in use
+        nodes = mi.traverse(scene).hierarchy
+    bsdfs = (node for node in nodes if isinstance(node, mi.BSDF))
     return any(mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null) for bsdf in bsdfs)
 
 
-@dataclass  # not frozen: ``dr.syntax`` carries it through a loop
+@dataclass(frozen=True)
 class StraightRays:
-    """Rays through a scene that go straight on until something is visible."""
+    """Rays through a scene that go straight on until something is visible.
+
+    Loops name their state: a scene in it would carry its attached parameters into them.
+    """
 
     scene: mi.Scene
     hide_emitters: bool  # whether surfaces that are emitters are invisible
     sees_through: bool  # whether anything in the scene may let light pass
 
-    @dr.syntax
     def next_visible(
         self, ray: mi.Ray3f, active: mi.Bool
     ) -> tuple[mi.Ray3f, mi.PreliminaryIntersection3f, mi.Float]:
@@ -38,17 +42,18 @@ class StraightRays:
 
         The opacity is 0 where nothing is hit.
         """
-        ray = mi.Ray3f(ray)
-        hit = self.scene.ray_intersect_preliminary(ray, coherent=True, active=active)
-        opacity = self._opacity(ray, hit)
-        if dr.hint(self.sees_through, mode="scalar"):
-            goes_on = hit.is_valid() & (opacity <= INVISIBLE)
-            while goes_on:
-                ray = self.behind(ray, hit, goes_on)
-                hit = self.scene.ray_intersect_preliminary(ray, coherent=True, active=goes_on)
-                opacity = self._opacity(ray, hit)
-                goes_on &= hit.is_valid() & (opacity <= INVISIBLE)
-        return ray, hit, opacity
+        hit, opacity = self._meet(ray, active)
+        if not self.sees_through:
+            return ray, hit, opacity
+
+        def is_invisible(ray: mi.Ray3f, hit: mi.PreliminaryIntersection3f, opacity: mi.Float):
+            return hit.is_valid() & (opacity <= INVISIBLE)
+
+        def go_on(ray: mi.Ray3f, hit: mi.PreliminaryIntersection3f, opacity: mi.Float) -> tuple:
+            ray = self.behind(ray, hit, mi.Bool(True))
+            return ray, *self._meet(ray, mi.Bool(True))
+
+        return dr.while_loop(state=(mi.Ray3f(ray), hit, opacity), cond=is_invisible, body=go_on)
 
     def behind(self, ray: mi.Ray3f, hit: mi.PreliminaryIntersection3f, active: mi.Bool) -> mi.Ray3f:
         """Return the rest of rays behind what they hit; ``ray`` where not active."""
@@ -58,19 +63,31 @@ class StraightRays:
         rest.maxt = dr.select(active, ray.maxt - hit.t, ray.maxt)
         return rest
 
-    @dr.syntax
     def transmittance(self, ray: mi.Ray3f, active: mi.Bool) -> mi.Float:
         """Return what all surfaces up to the ray's end let pass straight on, 0..1."""
-        if dr.hint(not self.sees_through, mode="scalar"):
+        if not self.sees_through:
             return dr.select(active & self.scene.ray_test(ray, active), 0, mi.Float(1))
-        ray, passes = mi.Ray3f(ray), dr.full(mi.Float, 1, dr.width(ray))
-        goes_on = mi.Bool(active)
-        while goes_on:
-            hit = self.scene.ray_intersect_preliminary(ray, coherent=False, active=goes_on)
-            passes *= 1 - self._opacity(ray, hit)
-            goes_on &= hit.is_valid() & (passes > INVISIBLE)
-            ray = self.behind(ray, hit, goes_on)
+
+        def go_on(ray: mi.Ray3f, passes: mi.Float, goes_on: mi.Bool) -> tuple:
+            hit, opacity = self._meet(ray, goes_on)
+            passes = passes * (1 - opacity)
+            goes_on = goes_on & hit.is_valid() & (passes > INVISIBLE)
+            return self.behind(ray, hit, goes_on), passes, goes_on
+
+        ones = dr.full(mi.Float, 1, dr.width(ray))
+        _, passes, _ = dr.while_loop(
+            state=(mi.Ray3f(ray), ones, mi.Bool(active)),
+            cond=lambda ray, passes, goes_on: goes_on,
+            body=go_on,
+        )
         return dr.select(passes > INVISIBLE, passes, 0)
+
+    def _meet(
+        self, ray: mi.Ray3f, active: mi.Bool
+    ) -> tuple[mi.PreliminaryIntersection3f, mi.Float]:
+        """Return what rays hit, and its opacity."""
+        hit = self.scene.ray_intersect_preliminary(ray, coherent=True, active=active)
+        return hit, self._opacity(ray, hit)
 
     def _opacity(self, ray: mi.Ray3f, hit: mi.PreliminaryIntersection3f) -> mi.Float:
         """Return the opacity of what is hit; 0 where nothing is."""
