@@ -107,8 +107,12 @@ def furnace_rows(size: int, rounds: int = ROUNDS) -> list[tuple[str, str, float,
 
 def furnace_table(size: int) -> str:
     """Mean and standard error of each material and each way of light."""
-    rows = [(m, light, f"{mean:.4f} ± {error:.4f}") for m, light, mean, error in furnace_rows(size)]
-    return markdown_table(("object", "light", "mean, 1 in truth"), rows)
+    cells: dict[str, dict[str, str]] = {}
+    for material, light, mean, error in furnace_rows(size):
+        cells.setdefault(material, {})[light] = f"{mean:.4f} ± {error:.4f}"
+    lights = list(dict.fromkeys(light for found in cells.values() for light in found))
+    rows = [(name, *(found.get(light, "") for light in lights)) for name, found in cells.items()]
+    return markdown_table(("object", *lights), rows)
 
 
 # ----------------------------------------------------------------------------------------------

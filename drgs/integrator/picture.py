@@ -203,7 +203,8 @@ def hybrid_of(
     )
     traced, count = surfaces.traced(scene), integrator.nested_spp or spp
     rays = StraightRays(traced, hide_emitters, hide_emitters or surfaces.is_transparent)
-    return Hybrid(traced, surfaces, nested, adjoint, sensor, seed, count, insertion, rays)
+    sensors = sensors_of(sensor)
+    return Hybrid(traced, surfaces, nested, adjoint, sensor, sensors, seed, count, insertion, rays)
 
 
 def sensors_of(sensor: mi.Sensor) -> list[mi.Sensor]:

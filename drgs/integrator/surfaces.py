@@ -157,7 +157,8 @@ class Insertion:
         values = []
         for surface, front in zip(layers, fronts, strict=True):
             values += [surface.share(front), surface.coverage]
-        values += [mi.Float(0)] * (2 * (self.num_surfaces - len(layers)))
+        nothing = dr.zeros(mi.Float, dr.width(layers[0].coverage))
+        values += [nothing] * (2 * (self.num_surfaces - len(layers)))
         if self.shows_background:
             values += list(rest_behind(layers) * radiance)
         return values
@@ -270,6 +271,7 @@ class Hybrid:
     integrator: mi.Integrator  # of the picture
     adjoint_integrator: mi.Integrator  # of its derivatives
     sensor: mi.Sensor
+    sensors: list[mi.Sensor]  # those of a batch, or the same
     seed: int | mi.UInt32
     spp: int  # of the nested integrator; 0: as the sensor's sampler has it
     insertion: Insertion
@@ -344,7 +346,8 @@ class Hybrid:
         from drgs.integrator.windows import RaysBehind, sensor_behind
 
         for count in range(self.insertion.num_surfaces):
-            sensor = sensor_behind(self.sensor, RaysBehind(self.rays, count))
+            behind = RaysBehind(self.rays, count)
+            sensor = sensor_behind(self.sensor, self.sensors, behind)
             with (
                 _sample_count_kept(self.sensor),
                 _depth_reduced(self.integrator, count),

@@ -6,6 +6,7 @@ the first k visible surfaces has a nested integrator render what these let throu
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from typing import Any
@@ -43,9 +44,12 @@ class RaysBehind:
             return ray, dr.select(weight > INVISIBLE, weight, 0)
 
 
-def sensor_behind(sensor: mi.Sensor, behind: RaysBehind) -> mi.Sensor:
-    """Return a sensor with the same film, sampler and rays, which start behind surfaces."""
-    return _sensor_type(mi.variant())(sensor, behind)
+def sensor_behind(sensor: mi.Sensor, sensors: Sequence[mi.Sensor], behind: RaysBehind) -> mi.Sensor:
+    """Return a sensor with the same film, sampler and rays, which start behind surfaces.
+
+    sensors: those of a ``batch``, side by side; else the sensor itself.
+    """
+    return _sensor_type(mi.variant())(sensor, sensors, behind)
 
 
 @cache
@@ -56,28 +60,40 @@ def _sensor_type(variant: str) -> type:
     class SensorBehind(mi.Sensor):
         """Another sensor's rays, without their beginning."""
 
-        def __init__(self, sensor: mi.Sensor, behind: RaysBehind) -> None:
+        def __init__(
+            self, sensor: mi.Sensor, sensors: Sequence[mi.Sensor], behind: RaysBehind
+        ) -> None:
             props = mi.Properties("behind")
             props["film"], props["sampler"] = sensor.film(), sensor.sampler()
             props["shutter_open"] = sensor.shutter_open()
             props["shutter_close"] = sensor.shutter_open() + sensor.shutter_open_time()
             super().__init__(props)
-            self.sensor, self.behind = sensor, behind
+            self.sensors, self.behind = sensors, behind
             self.m_needs_sample_2 = sensor.needs_sample_2()
             self.m_needs_sample_3 = sensor.needs_sample_3()
 
-        def sample_ray(self, *args: Any, **named: Any) -> tuple[mi.Ray3f, mi.Spectrum]:
+        def sample_ray(
+            self, time: Any, sample1: Any, sample2: Any, sample3: Any, active: Any = True
+        ) -> tuple[mi.Ray3f, mi.Spectrum]:
             """See ``mi.Sensor.sample_ray``."""
-            return self._moved(*self.sensor.sample_ray(*args, **named))
+            ray, weight = self.sample_ray_differential(time, sample1, sample2, sample3, active)
+            return mi.Ray3f(ray), weight
 
         def sample_ray_differential(
-            self, *args: Any, **named: Any
+            self, time: Any, sample1: Any, sample2: Any, sample3: Any, active: Any = True
         ) -> tuple[mi.RayDifferential3f, mi.Spectrum]:
             """See ``mi.Sensor.sample_ray_differential``."""
-            return self._moved(*self.sensor.sample_ray_differential(*args, **named))
+            # Not by the batch, whose calls reach all sensors that there are, this one included.
+            place, found = sample2.x * len(self.sensors), None
+            for k, sensor in enumerate(self.sensors):
+                point = mi.Point2f(place - k, sample2.y)
+                own = sensor.sample_ray_differential(time, sample1, point, sample3, active)
+                found = own if found is None else dr.select(place >= k, own, found)
+            ray, passes = self.behind.moved(found[0], mi.Bool(active))
+            return ray, found[1] * passes
 
-        def _moved(self, ray: mi.Ray3f, weight: mi.Spectrum) -> tuple[mi.Ray3f, mi.Spectrum]:
-            ray, passes = self.behind.moved(ray, mi.Bool(True))
-            return ray, weight * passes
+        def to_string(self) -> str:
+            """What Mitsuba prints."""
+            return f"SensorBehind[{self.sensors}]"
 
     return SensorBehind

@@ -90,3 +90,42 @@ def test_what_is_invisible_changes_no_picture(pane, name, z):
     expected = without_panes(name)
     np.testing.assert_allclose(found, expected, rtol=0, atol=ROUNDING)
     assert expected.std() > 0.05
+
+
+WINDOW = {"pane": {"type": "rectangle", "bsdf": {"type": "thindielectric"}}}
+
+
+def sensor_of(kind, origin) -> dict:
+    sensor = camera(origin, [0, 0, 0], size=12)
+    if kind == "thinlens":
+        sensor |= {"type": "thinlens", "aperture_radius": 1e-4, "focus_distance": 4.0}
+    return sensor
+
+
+@pytest.mark.parametrize("kind", ["batch", "thinlens", "aov"])
+def test_windows_are_seen_by_every_sensor(kind):
+    """As by a pinhole alone: two sensors side by side, one of which sees no window; and ``aov``."""
+    to_world = mi.ScalarTransform4f().translate([0, 0, -1.2]).scale(0.4)
+    window = {"pane": WINDOW["pane"] | {"to_world": to_world}}
+    mirror = {"wall": placed(MIRROR["wall"])}
+    settings = {"light": "none", "nested": "path", "spp": 256, "max_depth": 4}
+    origins = ([0, 0, 4], [0, 0, -4])
+    scene = scene_of(
+        cloud(), **settings, sensor=sensor_of("", origins[0]), **SKY, **mirror, **window
+    )
+    alone = [image_of(scene, sensor=mi.load_dict(sensor_of("", o)), seed=1) for o in origins]
+    if kind == "batch":
+        views = {f"view_{k}": sensor_of("", o) for k, o in enumerate(origins)}
+        film = sensor_of("", origins[0])["film"] | {"width": 24}
+        sampler = {"type": "independent", "sample_count": 1}
+        batch = mi.load_dict({"type": "batch", "film": film, "sampler": sampler, **views})
+        found, expected = image_of(scene, sensor=batch, seed=1), np.concatenate(alone, axis=1)
+    elif kind == "thinlens":
+        sensor = mi.load_dict(sensor_of("thinlens", origins[0]))
+        found, expected = image_of(scene, sensor=sensor, seed=1), alone[0]
+    else:
+        outer = mi.load_dict({"type": "aov", "aovs": "d:depth", "img": scene.integrator()})
+        found, expected = image_of(scene, integrator=outer, seed=1)[..., :3], alone[0]
+    # Five standard errors of 256 paths that pass the window or are reflected by it.
+    np.testing.assert_allclose(found, expected, rtol=0, atol=5 * 0.3 / 16 * 0.9)
+    assert np.abs(found - expected).mean() < 0.01 and expected.std() > 0.05
