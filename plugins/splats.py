@@ -718,8 +718,10 @@ class SplatsIntegrator(mi.CppADIntegrator):
             return
         from drgs.integrator.derivatives import check_derivatives
 
-        values = [part.values.parameters() for part in self._parts(ellipsoids_in(scene))]
-        attached = any(dr.grad_enabled(value) for of in values for value in of.values())
+        attached = False
+        if self.light != "none" or self.shadows:
+            values = [part.values.parameters() for part in self._parts(ellipsoids_in(scene))]
+            attached = any(dr.grad_enabled(value) for of in values for value in of.values())
         check_derivatives(self, scene, sensor, mode, attached)
 
     def sample(

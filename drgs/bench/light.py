@@ -292,7 +292,7 @@ def _times(scenes: dict[str, mi.Scene], paths: int, rounds: int) -> dict[str, fl
 def _seconds(scene: mi.Scene, paths: int) -> float:
     """Of a picture from another place, so that no splats are known."""
     params = mi.traverse(scene.sensors()[0])
-    params["to_world"] = mi.Transform4f(params["to_world"].matrix + 0)
+    params["to_world"] = mi.Transform4f(params["to_world"].matrix + dr.opaque(mi.Float, 0))
     params.update()
     dr.eval(params["to_world"])
     dr.sync_thread()

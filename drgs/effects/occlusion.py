@@ -104,8 +104,8 @@ class OccludedFeatures:
         *others, depth = stored
         own, fronts = self._split(planes)
         seen = self.features.add(own, others, pixel, self._seen(depth, pixel) * weight)
-        added = zip(fronts, self._in_front(weight, depth, pixel), strict=True)
-        return [*seen, *(front + more for front, more in added)]
+        pairs = zip(fronts, self._in_front(weight, depth, pixel), strict=True)
+        return [*seen, *(front + more for front, more in pairs)]
 
     def feature_gradient(self, stored: list[Any], pixel: int, g: list[Any]) -> Any:
         """As :meth:`at` says; it is the sum that is scaled."""

@@ -465,9 +465,9 @@ class _Chances:
     def of(alpha: Any, coverage: Any) -> _Chances:
         """coverage: before the splat."""
         Float, UInt32 = type(alpha), types_of(type(alpha)).UInt32
-        added = (1 - coverage) * alpha
-        after = coverage + added
-        is_first = added * dr.rcp(dr.select(after > 0, after, 1))
+        stopped = (1 - coverage) * alpha
+        after = coverage + stopped
+        is_first = stopped * dr.rcp(dr.select(after > 0, after, 1))
         replaces = dr.fma(1 - alpha, is_first, alpha)
         competes = dr.fma(1 - replaces, alpha, replaces)
         below = [UInt32(Float(p) * MOST_RANDOM) for p in (alpha, replaces, competes)]
