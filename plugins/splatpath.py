@@ -269,6 +269,9 @@ class SplatPathIntegrator(RBIntegrator):
         radiance, let_through = self.light.passed(
             path.leg(scene), sampler.next_1d(), path.active & ~path.straight
         )
+        # Within glass of index n, radiance is n^2 times as large as what arrives outside: so is that
+        # of splats, or they would be darker there.
+        radiance *= dr.square(path.eta)
         return path.throughput * radiance, path.throughput * let_through
 
     def _let_through(self, leg: Leg, sampler: mi.Sampler, active: mi.Bool) -> mi.Float:
