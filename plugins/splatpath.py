@@ -263,14 +263,14 @@ class SplatPathIntegrator(RBIntegrator):
     def _pass_splats(
         self, scene: mi.Scene, path: _Path, sampler: mi.Sampler
     ) -> tuple[mi.Spectrum, mi.Spectrum]:
-        """What splats up to the vertex send along the path, and its throughput past them."""
+        """Return the radiance of splats up to the vertex, and the path's throughput past them."""
         if self.light is None:
             return mi.Spectrum(0), mi.Spectrum(path.throughput)
         radiance, let_through = self.light.passed(
             path.leg(scene), sampler.next_1d(), path.active & ~path.straight
         )
-        # Within glass of index n, radiance is n^2 times as large as what arrives outside: so is that
-        # of splats, or they would be darker there.
+        # Within glass of index n, radiance is n^2 times what arrives outside: so is that of splats,
+        # or they would be darker there.
         radiance *= dr.square(path.eta)
         return path.throughput * radiance, path.throughput * let_through
 
@@ -375,7 +375,7 @@ class _Step:
 
     @property
     def is_delta(self) -> mi.Bool:
-        """Whether the BSDF had no other direction to choose from."""
+        """True where the BSDF had no other direction to choose from."""
         return mi.has_flag(self.type, mi.BSDFFlags.Delta)
 
     def relative_change(self, si: mi.SurfaceInteraction3f, ray: mi.Ray3f) -> mi.Spectrum:

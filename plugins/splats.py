@@ -440,7 +440,7 @@ class SplatsIntegrator(mi.CppADIntegrator):
 
     @property
     def _all_objects(self) -> dict[str, SplatsIntegrator]:
-        """By what the names of their parameters begin with: those that have Gaussians."""
+        """Objects that have Gaussians, by the prefix of their parameters' names."""
         own = {"": self} if self._has_own else {}
         return own | {f"{name}.": one for name, one in self.objects.items()}
 
@@ -459,7 +459,7 @@ class SplatsIntegrator(mi.CppADIntegrator):
 
     @property
     def has_smoothing(self) -> bool:
-        """Whether Gaussians have a smoothing filter, be it ignored."""
+        """True where Gaussians have a smoothing filter, be it ignored."""
         return any(one.smoothing is not None for one in self._all_objects.values())
 
     def _check_place(self) -> None:
@@ -524,7 +524,7 @@ class SplatsIntegrator(mi.CppADIntegrator):
 
     @property
     def _is_placed(self) -> bool:
-        """Whether Gaussians are moved, or are to be differentiated along a move."""
+        """True where Gaussians are moved, or are to be differentiated along a move."""
         return bool(self.objects) or self._is_moved or dr.grad_enabled(self.to_world)
 
     def _parts(self, shapes: Sequence[mi.Shape]) -> list[Part]:

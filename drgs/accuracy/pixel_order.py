@@ -157,7 +157,7 @@ class _WalkInputs:
         return max(len(self.samples) * self.lists.count, 1)
 
     def first_place(self) -> Any:
-        """Where the places of each lane's sample begin."""
+        """Return the first place of each lane's sample."""
         start, count = self.samples.start, self.lists.count
         start, count = (dr.opaque(type(self.lanes.sample), number) for number in (start, count))
         return (self.lanes.sample - start) * count

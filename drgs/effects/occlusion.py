@@ -75,7 +75,7 @@ class OccludedFeatures:
         return replace(self, features=self.features.seen_by(camera))
 
     def check_differentiable_in_camera(self) -> None:
-        """As the features; surfaces stay where they are."""
+        """Check the features; surfaces stay where they are."""
         self.features.check_differentiable_in_camera()
 
     def bind(self, lanes: Lanes, positions: Positions) -> OccludedFeatures:

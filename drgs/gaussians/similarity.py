@@ -46,7 +46,7 @@ class Similarity:
 
     @property
     def is_identity(self) -> bool:
-        """Whether it moves nothing."""
+        """True where it moves nothing."""
         unmoved = not self.translation.any() and (self.rotation == np.eye(3)).all()
         return self.scale == 1 and bool(unmoved)
 

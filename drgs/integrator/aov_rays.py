@@ -89,7 +89,7 @@ class PictureRays:
 
     @property
     def within(self) -> tuple[tuple[Any, Any], ...]:
-        """Where they start, by pass: x and y from their pixels' upper left corners, px."""
+        """Starting points by pass: x and y from their pixels' upper left corners, px."""
         return tuple((p.x, p.y) for p in self.positions)
 
     def channels(

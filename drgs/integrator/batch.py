@@ -35,7 +35,7 @@ class SideBySide:
         return SideBySide(sensors, film.size()[0] // len(sensors), film.size()[1])
 
     def positions(self, positions: Sequence[Positions], index: int) -> tuple[Positions, ...]:
-        """Where the pixels of one picture are evaluated, by pass."""
+        """Return the points at which the pixels of one image are evaluated, by pass."""
         return tuple(
             p
             if isinstance(p, PixelCenters)
@@ -54,7 +54,7 @@ class SideBySide:
         return [[self._cut(plane, index) for plane in channels] for channels in passes]
 
     def put_together(self, pictures: Sequence[Sequence[Channels]]) -> list[Channels]:
-        """What the film gets, by pass; pictures: by sensor, each by pass."""
+        """Return the channels for the film, by pass; pictures: by sensor, each by pass."""
         return [
             [self._joined(planes) for planes in zip(*of_pass, strict=True)]
             for of_pass in zip(*pictures, strict=True)

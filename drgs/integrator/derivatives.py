@@ -55,7 +55,7 @@ class Parameter:
 
     @property
     def is_geometry(self) -> bool:
-        """Whether it moves points of a shape."""
+        """True for parameters that move points of a shape."""
         is_attribute = self.key.startswith(("vertex_", "face_"))
         moves = not is_attribute or self.key in ("vertex_positions", "vertex_normals")
         return isinstance(self.owners[0], mi.Shape) and moves
@@ -112,7 +112,7 @@ def check_derivatives(
 
 
 def attached_parameters(scene: mi.Scene) -> Iterator[Parameter]:
-    """Those of a scene's surfaces and emitters."""
+    """Yield the attached parameters of a scene's surfaces and emitters."""
     params = mi.traverse(scene)
     for name, (_, _, node, _) in params.properties.items():
         value = parameter_value(params, name)
@@ -130,7 +130,7 @@ def attached_parameters(scene: mi.Scene) -> Iterator[Parameter]:
 
 
 def parameter_value(params: mi.SceneParameters, name: str) -> Any:
-    """As ``params[name]``, which fails where ``hair`` has no value for one of its parameters."""
+    """Return ``params[name]``, which fails where ``hair`` has no value for a parameter."""
     value, kind, node, _ = params.properties[name]
     return value if kind is None else mi.get_property(value, kind, node)
 
@@ -149,7 +149,7 @@ def _is_elsewhere(node: mi.Object) -> bool:
 
 
 def _is_padded(parameter: Parameter) -> bool:
-    """Whether Mitsuba renders another array than the parameter, made of what that was made of."""
+    """True where Mitsuba renders another array than the parameter, made from the same values."""
     return parameter.owners[0].class_name() == "EnvironmentMapEmitter" and parameter.key == "data"
 
 
@@ -206,7 +206,7 @@ def _why_not_of_bsdf(parameter: Parameter, kind: str) -> str | None:
 
 
 def _is_mirror(bsdf: mi.BSDF) -> bool:
-    """Whether a part of it has one direction, and not straight on."""
+    """True where a part of it has one direction, and not straight on."""
     return _has_flag(bsdf, mi.BSDFFlags.DeltaReflection, mi.BSDFFlags.DeltaTransmission)
 
 

@@ -216,7 +216,7 @@ class Conversion:
 
 
 def conversions_of(shapes: Sequence[mi.Shape], turns: Mapping[str, Turn]) -> list[Conversion]:
-    """What shapes hold now, attached.
+    """Read the current values of shapes, attached.
 
     turns: by the ids of shapes, and under "" of all others.
 

@@ -19,7 +19,7 @@ from drgs.core.errors import UnsupportedError
 from drgs.splatting.image_model import PixelCenters, Positions
 
 Channels = list[Any]
-"""What a film gets of one pass, each Float (samples * H * W,): red, green, blue, perhaps alpha,
+"""Channels of one pass for a film, each Float (samples * H * W,): red, green, blue, perhaps alpha,
 then what the integrator puts out besides (AOVs)."""
 
 

@@ -64,7 +64,7 @@ class Gathered:
     gaussians: Gaussians  # detached and evaluated
 
     def matches(self, parts: Sequence[Part]) -> bool:
-        """Whether gathering these would give the same Gaussians."""
+        """True if gathering these would give the same Gaussians."""
         return same_variables(
             [part.values for part in self.parts], [part.values for part in parts]
         ) and [part.fixed for part in self.parts] == [part.fixed for part in parts]

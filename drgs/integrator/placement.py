@@ -253,7 +253,7 @@ class _Columns(NamedTuple):
         return _Columns(*(columns(t.array, math.prod(t.shape[1:])) for t in found))
 
     def tensors(self) -> dict[str, Any]:
-        """By name, (N, ...)."""
+        """Arrays by name, (N, ...)."""
         num = dr.width(self.means)
         shapes = {"means": (num, 3), "quats": (num, 4), "shN": (num, len(self.shN) // 3, 3)}
         return {n: mi.TensorXf(interleaved(getattr(self, n)), s) for n, s in shapes.items()}

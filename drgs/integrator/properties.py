@@ -54,7 +54,7 @@ OF_OBJECTS = ("filename", "to_world", "smoothing", *PARAMETER_NAMES)
 """Names of the properties of a ``splats`` that is nested in another, but for :data:`FEATURE`."""
 
 UNNAMED = "_arg_"
-"""What the names begin with that Mitsuba gives to nested objects without one."""
+"""Prefix of the names that Mitsuba gives to nested objects without one."""
 
 LIGHT_SAMPLES = 4
 """Splats that a ray of ``light: rays`` draws."""

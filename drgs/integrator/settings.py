@@ -46,7 +46,7 @@ class SplatsSettings(Protocol):
 
     @property
     def has_smoothing(self) -> bool:
-        """Whether Gaussians have a smoothing filter, be it ignored."""
+        """True where Gaussians have a smoothing filter, be it ignored."""
 
     @property
     def pipeline(self) -> Pipeline:

@@ -357,7 +357,7 @@ class Hybrid:
 
     @contextmanager
     def _differentiating(self) -> Iterator[list[Parameter]]:
-        """What the nested integrator is to differentiate.
+        """Yield the parameters that the nested integrator is to differentiate.
 
         Its errors, which are about variables, are raised again with the parameters' names.
         """

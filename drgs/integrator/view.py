@@ -39,7 +39,7 @@ Planes = list[list[list[Any]]]
 
 
 PASSES_PER_KERNEL = 16
-"""Of more passes, or times at which the shutter is open, planes and sums are evaluated in between:
+"""Passes, or times at which the shutter is open, after which planes and sums are evaluated:
 compilers take longer than proportionally to a kernel's length."""
 
 
@@ -109,7 +109,7 @@ class View:
         return reduce(rendering.sum_of_gradients, by_time)
 
     def channels(self, planes: Planes, constant: mi.Color3f | None) -> Passes:
-        """What the film gets of each pass: the mean over the times.
+        """Return the channels of each pass for the film: the mean over the times.
 
         constant: the background, where it is a colour; display space.
         """

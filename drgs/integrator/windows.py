@@ -93,7 +93,7 @@ def _sensor_type(variant: str) -> type:
             return ray, found[1] * passes
 
         def to_string(self) -> str:
-            """What Mitsuba prints."""
+            """Return the text that Mitsuba prints."""
             return f"SensorBehind[{self.sensors}]"
 
     return SensorBehind

@@ -836,7 +836,7 @@ def sampling_rates(means: np.ndarray, cameras: Sequence[Camera]) -> np.ndarray:
 
 @dataclass(frozen=True)
 class SurfacePicture:
-    """What a camera sees of splats and of surfaces between them."""
+    """The view of splats, and of surfaces between them, from one camera."""
 
     color: np.ndarray  # (H, W, 3) display space, of the splats: premultiplied
     coverage: np.ndarray  # (H, W) sum of the weights that ``color`` was premultiplied with

@@ -75,7 +75,7 @@ from drgs.splatting.tiles import TileBins
 
 @dataclass(frozen=True)
 class Layers:
-    """What compositing makes of the splats, stored one row per micro-tile of each sample."""
+    """The composited image, stored one row per micro-tile of each sample."""
 
     values: Any  # Float (tiles * 16 * (1 + C) * 16,): row: transmittance, then each plane
     ends: Any  # UInt32 (tiles * 16 * 16,): sorted entry from which on a pixel composited nothing

@@ -31,7 +31,7 @@ With fewer, Dr.Jit traces and launches more often than it saves."""
 
 @dataclass(frozen=True)
 class CompositedPairs:
-    """Which pairs of an entry and a micro-tile were composited, in each of S samples.
+    """Pairs of an entry and a micro-tile that were composited, in each of S samples.
 
     An entry with such a pair is *seen* and has a row of sums; those of a splat follow each other.
     Entries, sorted and unsorted, and ranks are counted on from sample to sample.
@@ -67,7 +67,7 @@ class CompositedPairs:
         return CompositedPairs(masks, words, row, first_row, samples)
 
     def run(self, rank: Any, sample: Any) -> Any:
-        """Where ``first_row`` has the rows of a splat; sample: number among the samples."""
+        """Return the place of a splat's rows in ``first_row``; sample: number among the samples."""
         num_ranks = dr.width(self.first_row) // len(self.samples)
         return sample * dr.opaque(type(rank), num_ranks) + rank
 
