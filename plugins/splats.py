@@ -131,7 +131,8 @@ class SplatsIntegrator(mi.CppADIntegrator):
        - :paramtype:`integrator`
        - Renders the scene's meshes and other surfaces, if it has any, between which the splats
          are composited by depth. Its ``hide_emitters`` should be that of this integrator.
-         (Default: ``path``; where ``light`` is not ``none``, ``splatpath``)
+         (Default: ``path``; where ``light`` is not ``none``, or anything lets light pass
+         straight on, ``splatpath``)
          Those of type ``splats``, any number, are splat objects instead: each takes ``filename`` or
          tensors, ``to_world``, ``smoothing`` and ``feature_...``, and is rendered by this
          integrator, with its settings, together with its own Gaussians.

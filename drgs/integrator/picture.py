@@ -184,9 +184,12 @@ def hybrid_of(
     if integrator.light == "none":
         nested = adjoint = integrator.nested
         if nested is None:
-            nested = mi.load_dict({"type": "path", "hide_emitters": hide_emitters})
-            # The same paths, whose derivatives are right for more of their parameters.
+            # The same paths, whose derivatives are right for more of their parameters, and which
+            # see lamps through what lets light pass straight on.
             adjoint = mi.load_dict({"type": "splatpath", "hide_emitters": hide_emitters})
+            nested = adjoint
+            if not surfaces.is_transparent:
+                nested = mi.load_dict({"type": "path", "hide_emitters": hide_emitters})
         if isinstance(nested, LitIntegrator):  # that another integrator may have lit
             nested.light = None
     else:

@@ -56,6 +56,7 @@ SCENES = {
     "mirror, rays, no sky": (MIRROR, RAYS),
     "mirror, probe": (SKY | MIRROR, PROBE),
     "matt wall, point lamp, no light": (MATT | LAMP, {"light": "none"}),
+    "matt wall, point lamp, default": (MATT | LAMP, {"light": "none", "nested": None}),
     "matt wall, point lamp, rays": (MATT | LAMP, RAYS | {"max_depth": 2}),
     "matt wall, directional lamp, rays": (MATT | DIRECTIONAL, RAYS | {"max_depth": 2}),
 }

@@ -28,13 +28,16 @@ SETTINGS = ("light_samples", "exposure", "probes", "unseen", "shadows", "aovs", 
 
 
 def scene_of(splats, light="rays", max_depth=8, nested="splatpath", spp=64, **others):
-    """The objects of ``others`` among the splats, and their camera at ``sensor``."""
+    """The objects of ``others`` among the splats, and their camera at ``sensor``.
+
+    nested: type of the nested integrator; None: the default.
+    """
     settings = {key: others.pop(key) for key in SETTINGS if key in others}
     tensors = {k: mi.TensorXf(v.astype(np.float32)) for k, v in vars(splats).items()}
     integrator = {
         "type": "splats",
         "nested_spp": spp,
-        "nested": {"type": nested, "max_depth": max_depth},
+        **({} if nested is None else {"nested": {"type": nested, "max_depth": max_depth}}),
         **tensors,
         **settings,
     }
