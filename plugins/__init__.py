@@ -21,7 +21,7 @@ import mitsuba as mi
 
 from drgs.core.llvm import ensure_usable_llvm
 
-PLUGINS = ("splats", "splatpath", "calibrated")
+PLUGINS = ("splats", "splatpath", "calibrated", "minimal")
 
 
 def register(variant: str) -> None:

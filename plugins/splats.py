@@ -2,6 +2,7 @@
 
 Executed once per Mitsuba variant (see ``drgs.plugins``). The rasterizer itself is
 ``drgs.splatting.rendering``; this file is where it meets sensors, films, parameters and gradients.
+Read ``minimal.py`` first: the same without options, on one page.
 """
 
 from __future__ import annotations

@@ -36,7 +36,7 @@ set_variant("llvm_ad_rgb")
 again = type(mi.load_dict({"type": "splats"})), type(mi.load_dict({"type": "calibrated"}))
 assert again == first and issubclass(again[0], mi.Integrator)
 llvm = {name for name in sys.modules if name.startswith("drgs.plugins.llvm_ad_rgb")}
-names = ("splats", "splatpath", "calibrated")
+names = ("splats", "splatpath", "calibrated", "minimal")
 assert llvm == {f"drgs.plugins.llvm_ad_rgb.{name}" for name in names}
 assert sys.modules["drgs.plugins.llvm_ad_rgb.splats"].SplatsIntegrator is first[0]
 print("fine")

@@ -1,0 +1,118 @@
+"""The ``splats_minimal`` integrator: 3D Gaussian splatting on one page, to be read first.
+
+Executed once per Mitsuba variant (see ``drgs.plugins``). The stages are those of ``splats``, which
+gives the same bytes at its defaults; that plugin adds what a scene may ask for besides.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from drgs.cameras.camera import Camera
+from drgs.core.constants import NEAR
+from drgs.core.variants import check_variant
+from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
+from drgs.integrator.film import develop_pixels, pixels_adjoint
+from drgs.integrator.sensors import camera_from_sensor, read_sensor
+from drgs.splatting.grid import TileGrid
+from drgs.splatting.image_model import DEFAULT
+from drgs.splatting.projection import load_rows
+from drgs.splatting.rasterize import Layers, Records, composite, composite_adjoint
+from drgs.splatting.rendering import Pipeline, gradients_of
+from drgs.splatting.tiles import TileBins, bin_footprints, footprints_of
+
+
+class MinimalSplatsIntegrator(mi.CppADIntegrator):
+    r"""
+    .. _integrator-splats_minimal:
+
+    3D Gaussian splatting, minimal (:monosp:`splats_minimal`)
+    ---------------------------------------------------------
+
+    .. pluginparameters::
+
+     * - filename
+       - |string|
+       - A file of Gaussians, such as the PLY files of the 3DGS reference implementation.
+
+     * - means, quats, log_scales, logit_opacities, sh0, shN
+       - |tensor|
+       - The Gaussians, as ``splats`` documents them.
+       - |exposed|, |differentiable|
+
+    Renders splats alone over black, for a ``perspective`` sensor and a box filter: one sample at
+    the centre of each pixel. Not differentiated: the sensor, visibility, the order of the splats.
+    """
+
+    def __init__(self, props: mi.Properties) -> None:
+        check_variant("splats_minimal", mi.variant())
+        super().__init__(props)
+        gaussians = Gaussians.load(props["filename"]).to(mi.TensorXf)
+        for name in PARAMETER_NAMES:
+            setattr(self, name, getattr(gaussians, name))
+        self.pipeline = Pipeline(gaussians.sh_degree)
+
+    def traverse(self, callback: mi.TraversalCallback) -> None:
+        """Expose the Gaussians."""
+        for name in PARAMETER_NAMES:
+            callback.put(name, getattr(self, name), mi.ParamFlags.Differentiable)
+
+    def render(
+        self, scene: mi.Scene, sensor: Any = 0, seed: Any = 0, spp: int = 0,
+        develop: bool = True, evaluate: bool = True,
+    ) -> mi.TensorXf:  # fmt: skip
+        """Return the linear image (H, W, 3 or 4); ``seed`` and ``spp`` make no difference."""
+        with dr.suspend_grad():
+            film, _, _, _, layers = self._composited(scene, sensor)
+            return develop_pixels(film, _channels(film, layers.planes()), [])
+
+    def render_backward(
+        self, scene: mi.Scene, params: Any, grad_in: mi.TensorXf,
+        sensor: Any = 0, seed: Any = 0, spp: int = 0,
+    ) -> None:  # fmt: skip
+        """Add the derivatives of a loss to those of the Gaussians; grad_in: by the image."""
+        with dr.suspend_grad():
+            film, camera, bins, records, layers = self._composited(scene, sensor)
+            planes = layers.planes()
+            with dr.resume_grad():  # colours are converted again, and differentiated by Dr.Jit
+                dr.enable_grad(planes)
+                channels = _channels(film, planes)
+                dr.accum_grad(channels, pixels_adjoint(film, {}, grad_in, []))
+                dr.enqueue(dr.ADMode.Backward, channels)
+                dr.traverse(dr.ADMode.Backward)
+                d_transmittance, *d_colors = dr.grad(planes)
+            of_splats = composite_adjoint(bins, records, layers, d_colors, d_transmittance)
+            found = gradients_of(self._gaussians, camera, self.pipeline, of_splats).parameters
+        for name in PARAMETER_NAMES:
+            if dr.grad_enabled(getattr(self, name)):
+                dr.accum_grad(getattr(self, name), getattr(found, name))
+
+    @property
+    def _gaussians(self) -> Gaussians:
+        return Gaussians(**{name: dr.detach(getattr(self, name)) for name in PARAMETER_NAMES})
+
+    def _composited(
+        self, scene: mi.Scene, sensor: int | mi.Sensor
+    ) -> tuple[mi.Film, Camera, TileBins, Records, Layers]:
+        """Project the Gaussians, sort them into tiles, and composite each tile's front to back."""
+        sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
+        camera = camera_from_sensor(read_sensor(sensor, NEAR))
+        rows = load_rows(self._gaussians, self.pipeline.sh_degree)
+        splats = self.pipeline.project(rows, camera)
+        grid = TileGrid(camera.width, camera.height)
+        bins = bin_footprints(footprints_of(splats, grid, list(splats.colors)), grid, DEFAULT)
+        records = Records.of(bins, bins.rows.load)
+        return sensor.film(), camera, bins, records, composite(bins, records)
+
+
+def _channels(film: mi.Film, planes: list[mi.Float]) -> list[mi.Float]:
+    """Linear red, green and blue of display-encoded colours, and alpha if the film has it."""
+    transmittance, *colors = planes
+    linear = list(mi.math.srgb_to_linear(mi.Color3f(colors)))
+    return linear + [1 - transmittance] * mi.has_flag(film.flags(), mi.FilmFlags.Alpha)
+
+
+mi.register_integrator("splats_minimal", lambda props: MinimalSplatsIntegrator(props))
