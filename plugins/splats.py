@@ -189,9 +189,9 @@ class SplatsIntegrator(mi.CppADIntegrator):
 
      * - srgb_primitives
        - |bool|
-       - Splat colours live in display space. If true, the image is converted to linear
-         radiance, which is what Mitsuba's films expect. If false, it is returned in display
-         space, as splat trainers and viewers use it. (Default: |true|)
+       - Splat colours live in display space. If true, the image is linear radiance, which is
+         what Mitsuba's films expect. If false, it is returned in display space, as splat
+         trainers and viewers use it. (Default: |true|)
 
      * - aovs
        - |string|
@@ -276,10 +276,14 @@ class SplatsIntegrator(mi.CppADIntegrator):
 
     This integrator composites Gaussians front to back over each pixel (Kerbl et al. 2023, "3D
     Gaussian Splatting for Real-Time Radiance Field Rendering"). Meshes and other surfaces of the
-    scene are rendered by a nested integrator; each pixel composites what that shows at the depth of
-    the first surface, between the splats. Light passes from one to the other where ``light`` says
-    so, and surfaces shade splats where ``shadows`` does. A scene without surfaces runs no nested
-    integrator.
+    scene are rendered by a nested integrator; each pixel composites what that shows at the depths
+    of the surfaces that its ray meets, between the splats. Light passes from one to the other where
+    ``light`` says so, and surfaces shade splats where ``shadows`` does. A scene without surfaces
+    runs no nested integrator.
+
+    Splats of colours c_i (display space) and weights w_i on a ray, with A = sum w_i and decoding D,
+    are seen before a radiance L as A D(sum w_i c_i / A) + (1 - A) L, on the film, in mirrors and
+    through glass. The own ``background`` is the last splat of the film's rays.
 
     With one sample per pixel and a ``box`` filter, each pixel is evaluated at its centre, and both
     the picture and the gradients are the same to the last bit in every run. With more samples or
