@@ -22,7 +22,7 @@ with that its silhouette.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Any
@@ -45,6 +45,9 @@ from drgs.integrator.film import pixels_adjoint as film_adjoint
 from drgs.integrator.settings import LitIntegrator
 from drgs.integrator.transparency import StraightRays, has_transparent_parts
 from drgs.integrator.visible_surfaces import Layers, rest_behind
+
+INDEPENDENT = ("does not depend", "nothing that a path meets changes")
+"""Words of errors of Dr.Jit and ``splatpath`` about a picture that no parameter changes."""
 
 UNBOUNDED = 0xFFFFFFFF
 """``max_depth`` of Mitsuba's integrators where there is no limit."""
@@ -309,29 +312,53 @@ class Hybrid:
 
     def backward(self, params: object, d_pictures: list[mi.TensorXf]) -> None:
         """Accumulate derivatives into the parameters of surfaces and emitters."""
+        gradients = iter(d_pictures)
+
+        def add(sensor: mi.Sensor) -> None:
+            self.adjoint_integrator.render_backward(
+                self.scene, params, next(gradients), sensor, self.seed, self.spp
+            )
+
         with self._differentiating() as parameters:
-            if not parameters:
-                return
-            for sensor, d_picture in zip(self._sensors(), d_pictures, strict=True):
-                self.adjoint_integrator.render_backward(
-                    self.scene, params, d_picture, sensor, self.seed, self.spp
-                )
+            if parameters:
+                self._where_they_matter(add)
 
     def tangents(self, params: object, pictures: list[mi.TensorXf]) -> list[mi.TensorXf]:
         """Directional derivatives of the nested pictures, along those set on the parameters."""
+
+        def along(sensor: mi.Sensor) -> mi.TensorXf:
+            return self.adjoint_integrator.render_forward(
+                self.scene, params, sensor, self.seed, self.spp
+            )
+
+        found = [None] * len(pictures)
         with self._differentiating() as parameters:
             if parameters:
                 # A loop sees tangents of what is inside of it alone, so that those of all that
                 # objects have computed from their parameters must be known before.
                 dr.enqueue(dr.ADMode.Forward, [parameter.value for parameter in parameters])
                 dr.traverse(dr.ADMode.Forward, flags=dr.ADFlag.ClearEdges)
-                return [
-                    self.adjoint_integrator.render_forward(
-                        self.scene, params, sensor, self.seed, self.spp
-                    )
-                    for sensor in self._sensors()
-                ]
-        return [dr.zeros(mi.TensorXf, picture.shape) for picture in pictures]
+                found = self._where_they_matter(along)
+        pairs = zip(found, pictures, strict=True)
+        return [dr.zeros(mi.TensorXf, p.shape) if d is None else d for d, p in pairs]
+
+    def _where_they_matter(self, differentiate: Callable[[mi.Sensor], Any]) -> list[Any]:
+        """Differentiate each nested picture; None for those that do not depend on parameters.
+
+        What is behind a window may not show the window. Raises the error if no picture depends.
+        """
+        found, errors = [], []
+        for sensor in self._sensors():
+            try:
+                found.append(differentiate(sensor))
+            except Exception as error:
+                if not any(words in str(root_cause(error)) for words in INDEPENDENT):
+                    raise
+                found.append(None)
+                errors.append(error)
+        if len(errors) == len(found):
+            raise errors[0]
+        return found
 
     def _sensors(self) -> Iterator[mi.Sensor]:
         """Yield sensors that see what is behind 0, 1, ... surfaces, while nested pictures are made.

@@ -24,7 +24,7 @@ def test_a_white_cloud_before_white_is_white_in_every_pixel(script, settings):
 @pytest.mark.slow
 def test_a_furnace_is_white_whichever_way_light_takes(script):
     """Within four standard errors, and half a thousandth that probes leave."""
-    rows = script.furnace_rows(8, rounds=4)
+    rows = script.furnace_rows(16, rounds=4)
     assert len(rows) == 2 + len(script.MATERIALS) * len(script.LIGHTS)
     for material, light, mean, error in rows:
         assert abs(mean - 1) < 4 * error + 5e-4, (material, light)
