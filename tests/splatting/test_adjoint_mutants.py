@@ -301,6 +301,14 @@ class TestDefault(MutationChecks):
         losses._ssim_and_partials losses._assemble_gradient losses._PhotometricOp.backward
         losses._PhotometricOp.forward losses.l1_loss
     """
+    elsewhere = {  # noqa: RUF012
+        site: "test_placement: a smoothing filter that grows with an object"
+        for site in (
+            "rendering.Pipeline.differentiated"
+            "return rows if self.of_smoothing else replace(rows, smoothing=None)",
+            "rendering._columns_ofd_rows.smoothing",
+        )
+    }
 
 
 # ----------------------------------------------------------------------------------------------
