@@ -34,7 +34,7 @@ tracebacks.show_causes_last()
 
 _MODULES = {
     "Gaussians": "drgs.gaussians.parameters",
-    "load_dataset": "drgs.data",
+    "load_dataset": "drgs.datasets",
     "rasterization": "drgs.rasterizing",
     "train": "drgs.training.loop",
 }

@@ -9,11 +9,11 @@ from drgs.cli.commands import CommandParser, Subcommand, run_command
 
 COMMANDS = {
     "fit": Subcommand("fit 3D Gaussians to posed photographs", "drgs.fit"),
-    "poses": Subcommand("find out where photographs were taken", "drgs.poses"),
+    "poses": Subcommand("find out where photographs were taken", "drgs.poses.__main__"),
     "render": Subcommand("render Gaussians, a fit, or a Mitsuba scene", "drgs.render"),
     "export": Subcommand("write Gaussians for other programs", "drgs.export"),
     "view": Subcommand("look at Gaussians in a browser, rendered live", "drgs.view"),
-    "capture": Subcommand("turn a Mitsuba scene into a training set", "drgs.capture"),
+    "capture": Subcommand("turn a Mitsuba scene into a training set", "drgs.capture.__main__"),
     "bench": Subcommand("measure drgs; write tables and plots", "drgs.bench.__main__"),
 }
 

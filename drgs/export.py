@@ -21,8 +21,8 @@ from drgs.core.constants import LOW_PASS
 from drgs.core.errors import UserError, UserNote, did_you_mean, one_line
 from drgs.core.files import atomic_path
 from drgs.core.records import FolderRecord
-from drgs.data.orbits import up_of
-from drgs.data.viewpoints import near_one
+from drgs.datasets.orbits import up_of
+from drgs.datasets.viewpoints import near_one
 from drgs.effects.smoothing import baked
 from drgs.gaussians.cleaning import Selection, taken, turned_towards
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians

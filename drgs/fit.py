@@ -62,12 +62,17 @@ from drgs.core.machine import processor
 from drgs.core.memory import release_unused_memory
 from drgs.core.private import llvm_version
 from drgs.core.processes import process_number, start_mpi
-from drgs.data import Dataset, View, load_dataset
-from drgs.data.derived import completed
-from drgs.data.fingerprint import Fingerprint, fingerprint_of
-from drgs.data.folders import config_for
-from drgs.data.initial import Start, description_of_start, gaussians_at, start_of
+from drgs.datasets import Dataset, View, load_dataset
+from drgs.datasets.fingerprint import Fingerprint, fingerprint_of
+from drgs.datasets.folders import config_for
 from drgs.gaussians.parameters import Gaussians
+from drgs.initialization.defaults import completed
+from drgs.initialization.start import (
+    Start,
+    description_of_start,
+    gaussians_at,
+    start_of,
+)
 from drgs.integrator.scene import check_lenses
 from drgs.integrator.summary import described
 from drgs.results.files import (
@@ -133,7 +138,7 @@ from drgs.training.summary import summary_of_fit
 from drgs.training.trainer import Trainer
 
 if TYPE_CHECKING:  # imported where somebody looks on
-    from drgs.live.server import LocalServer
+    from drgs.viewer.server import LocalServer
 
 LOADING_SECONDS = 1.2
 """Before :func:`run`: the interpreter and the libraries; 1.0 to 1.4 s on two cores (AMD Zen 4).
@@ -255,7 +260,7 @@ def run(args: argparse.Namespace) -> None:
         run_with(args, Trainer)
         return
     start_mpi()
-    from drgs.distributed.fitting import run_together
+    from drgs.training.parallel.fitting import run_together
 
     run_together(args, partial(run_with, args))
 
@@ -307,8 +312,8 @@ def run_with(args: argparse.Namespace, make_trainer: MakeTrainer) -> None:
 
             observers.append(blocks.enter_context(EventLog(out / EVENTS, taken_up.history)))
         if server is not None:
-            from drgs.live.fit_page import watch
-            from drgs.live.server import url
+            from drgs.viewer.fit_page import watch
+            from drgs.viewer.server import url
 
             watching, length = watch(server, trainer, dataset, length)
             observers.append(watching)
@@ -330,7 +335,7 @@ def page_server(args: argparse.Namespace) -> AbstractContextManager[LocalServer 
                 raise UserError(f"--view-{name}: needs --view")
         return nullcontext()
     required("viser", "viewer", "--view")
-    from drgs.live.server import ADDRESS, serving
+    from drgs.viewer.server import ADDRESS, serving
 
     options = ("--view-address", "--view-port")
     return serving(args.view_address or ADDRESS, args.view_port, options)

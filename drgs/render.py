@@ -47,11 +47,10 @@ from drgs.core.errors import PluginError, UserError, one_line, reason_of_mitsuba
 from drgs.core.files import atomic_path, open_regular, shortened
 from drgs.core.processes import process_number, start_mpi
 from drgs.core.variants import VARIANTS
-from drgs.data import Dataset, load_dataset
-from drgs.data.derived import completed
-from drgs.data.orbits import near_plane_of, orbit_of_gaussians, orbit_of_views, orbit_size
-from drgs.data.types import Viewpoint
-from drgs.data.viewpoints import (
+from drgs.datasets import Dataset, load_dataset
+from drgs.datasets.orbits import near_plane_of, orbit_of_gaussians, orbit_of_views, orbit_size
+from drgs.datasets.types import Viewpoint
+from drgs.datasets.viewpoints import (
     FIELD_OF_VIEW,
     field_of_view,
     look_at,
@@ -60,6 +59,7 @@ from drgs.data.viewpoints import (
 )
 from drgs.effects.compose import IGNORABLE
 from drgs.gaussians.parameters import Gaussians
+from drgs.initialization.defaults import completed
 from drgs.integrator.scene import check_lenses, check_sizes, make_scene, render_views
 from drgs.integrator.settings import SummarisingIntegrator
 from drgs.integrator.summary import described, summary_of_views
@@ -258,7 +258,7 @@ def run(args: argparse.Namespace) -> None:
         run_with(args, render_views)
         return
     start_mpi()
-    from drgs.distributed.pictures import run_together
+    from drgs.training.parallel.pictures import run_together
 
     run_together(args, partial(run_with, args))
 

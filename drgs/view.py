@@ -24,15 +24,15 @@ from drgs.cli.execution import add_execution_arguments, executing, select_varian
 from drgs.cli.interrupts import StopRequest
 from drgs.core.errors import UserError
 from drgs.core.extras import required
-from drgs.data.orbits import orbit_of_gaussians
-from drgs.data.types import Viewpoint
-from drgs.data.viewpoints import FIELD_OF_VIEW
-from drgs.live.frames import LiveScene
-from drgs.live.page import Page, StartView
-from drgs.live.spectators import Spectators
-from drgs.live.wishes import Wishes
+from drgs.datasets.orbits import orbit_of_gaussians
+from drgs.datasets.types import Viewpoint
+from drgs.datasets.viewpoints import FIELD_OF_VIEW
 from drgs.render import UP, Model, load_model
 from drgs.results.refined_cameras import training_cameras
+from drgs.viewer.frames import LiveScene
+from drgs.viewer.page import Page, StartView
+from drgs.viewer.requests import Wishes
+from drgs.viewer.scheduler import Spectators
 
 IDLE_SECONDS = 0.05
 """Between two looks at whether a camera is still, or Ctrl-C was pressed."""
@@ -76,7 +76,7 @@ def add_arguments(parser: CommandParser) -> None:
 def run(args: argparse.Namespace) -> None:
     """Serve the page until Ctrl-C."""
     required("viser", "viewer", "drgs view")
-    from drgs.live.server import ADDRESS, serving, url
+    from drgs.viewer.server import ADDRESS, serving, url
 
     if not args.what.exists():
         raise UserError(f"{args.what}: there is no such file or folder")

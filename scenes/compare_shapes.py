@@ -21,7 +21,7 @@ import drgs  # noqa: F401  (registers the plugin)
 from drgs.bench.output import machine
 from drgs.cli.commands import at_least
 from drgs.cli.errors import exit_on_user_error
-from drgs.data.orbits import orbit_of_gaussians
+from drgs.datasets.orbits import orbit_of_gaussians
 from drgs.gaussians.parameters import Gaussians
 from drgs.io.figures import new_figure, write_figure
 from drgs.io.pictures import to_uint8

@@ -63,7 +63,7 @@ from drgs.config.approximations import said_by
 from drgs.core.arrays import interleave
 from drgs.core.errors import UserError
 from drgs.core.files import atomic_path
-from drgs.data.orbits import OPAQUE, orbit_of_gaussians
+from drgs.datasets.orbits import OPAQUE, orbit_of_gaussians
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 from drgs.gaussians.sh import sh_basis
 from drgs.gaussians.similarity import Similarity

@@ -34,8 +34,8 @@ from drgs.cli.commands import CommandParser
 from drgs.config.approximations import Approximations
 from drgs.config.load import load_config
 from drgs.core.errors import UserError
-from drgs.data import load_dataset
-from drgs.data.types import View
+from drgs.datasets import load_dataset
+from drgs.datasets.types import View
 from drgs.effects.smoothing import baked
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 from drgs.io.figures import new_figure, write_figure

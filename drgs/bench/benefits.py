@@ -21,13 +21,14 @@ from scipy.spatial.transform import Rotation
 
 from drgs.bench.ingredients import LEGO, PAPERS, config_of
 from drgs.bench.output import add_out, machine, markdown_table, write_csv
+from drgs.capture.path_tracing import first_hits, load_scene
 from drgs.cli.commands import CommandParser
 from drgs.config.changes import changed, with_iterations
 from drgs.config.schema import FitConfig
-from drgs.data import initial_gaussians, load_dataset
-from drgs.data.images import smaller_view
-from drgs.data.path_tracing import first_hits, load_scene
-from drgs.data.types import Dataset, View
+from drgs.datasets import load_dataset
+from drgs.datasets.images import smaller_view
+from drgs.datasets.types import Dataset, View
+from drgs.initialization.start import initial_gaussians
 from drgs.integrator.scene import render_views
 from drgs.io.figures import new_figure, write_figure
 from drgs.io.pictures import to_uint8

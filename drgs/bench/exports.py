@@ -23,7 +23,7 @@ from drgs.config.load import load_config
 from drgs.config.schema import ModelConfig
 from drgs.core.errors import UserError
 from drgs.core.variants import VARIANTS
-from drgs.data import Dataset, load_dataset
+from drgs.datasets import Dataset, load_dataset
 from drgs.export import load_source
 from drgs.gaussians.parameters import Gaussians
 from drgs.integrator.scene import make_scene, render_views

@@ -26,7 +26,7 @@ from drgs.config.changes import changed
 from drgs.core.arrays import block_widths
 from drgs.core.denormals import denormals_flushed
 from drgs.core.processes import ending_together
-from drgs.data.types import Dataset, View
+from drgs.datasets.types import Dataset, View
 from drgs.gaussians.parameters import Gaussians
 
 DISTANCE, GAP = 4.0, 40.0
@@ -127,7 +127,7 @@ def views_of(task: Task) -> tuple[View, ...]:
 
 def measure(task: Task) -> Measured:
     """Times of steps, then of their parts, on one of several processes."""
-    from drgs.distributed.ranks import Ranks, Times
+    from drgs.training.parallel.ranks import Ranks, Times
 
     gaussians, views = boxes(task), views_of(task)
     dataset = Dataset(views, views[:1], "bench", (1.0, 1.0, 1.0), None, "bench")
@@ -186,7 +186,7 @@ class StepClock:
 
 def _timed_trainer() -> type:
     """A class whose base can be imported where there is MPI."""
-    from drgs.distributed.trainer import DistributedTrainer
+    from drgs.training.parallel.trainer import DistributedTrainer
 
     class TimedTrainer(DistributedTrainer):
         """Waits for the device after each part of a step, and writes down what it took."""
@@ -250,7 +250,7 @@ def main() -> None:
     dr.set_thread_count(task.threads)
     with denormals_flushed():
         found = measure(task)
-    from drgs.distributed.ranks import Ranks
+    from drgs.training.parallel.ranks import Ranks
 
     if Ranks.world().is_first:
         print(json.dumps(asdict(found)))

@@ -33,14 +33,14 @@ from drgs.cli.commands import CommandParser, at_least, file_or_folder
 from drgs.config.schema import FitConfig
 from drgs.core.extras import required
 from drgs.core.files import atomic_path
-from drgs.data import layout_name, load_dataset
-from drgs.data.colmap import model_folder, picture_folder
-from drgs.data.folders import config_for
-from drgs.data.structure_from_motion import Search, place
+from drgs.datasets import layout_name, load_dataset
+from drgs.datasets.colmap import model_folder, picture_folder
+from drgs.datasets.folders import config_for
 from drgs.gaussians.parameters import Gaussians
 from drgs.integrator.scene import make_scene, render_views
 from drgs.io.colmap import read_model
 from drgs.io.pictures import image_size, read_image, write_png
+from drgs.poses.structure_from_motion import Search, place
 from drgs.results.files import GAUSSIANS, METRICS
 from drgs.results.folder import load_run_config
 from drgs.results.metrics import mean_of

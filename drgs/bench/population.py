@@ -27,13 +27,14 @@ import drjit as dr
 import numpy as np
 from scipy.special import expit
 
-from drgs import capture, fit
+from drgs import fit
 from drgs.bench.output import add_out, markdown_table, write_csv
+from drgs.capture import __main__ as capture
 from drgs.cli.commands import CommandParser
 from drgs.config.load import load_config
 from drgs.config.schema import DensifyConfig, FitConfig
 from drgs.core.arrays import from_host
-from drgs.data import load_dataset
+from drgs.datasets import load_dataset
 from drgs.io.figures import new_figure, write_figure
 from drgs.results.files import HISTORY, METRICS
 from drgs.training.density import adc

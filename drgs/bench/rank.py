@@ -20,7 +20,7 @@ import numpy as np
 from drgs.config.changes import changed
 from drgs.core.denormals import denormals_flushed
 from drgs.core.processes import ending_together, process_number
-from drgs.data import load_dataset
+from drgs.datasets import load_dataset
 from drgs.gaussians.parameters import Gaussians
 from drgs.results.files import GAUSSIANS
 from drgs.results.folder import load_run_config
@@ -53,8 +53,8 @@ def main() -> None:
         if process_number() is None:
             trainer = Trainer(config, dataset, gaussians)
         else:
-            from drgs.distributed.ranks import Ranks, Times
-            from drgs.distributed.trainer import DistributedTrainer
+            from drgs.training.parallel.ranks import Ranks, Times
+            from drgs.training.parallel.trainer import DistributedTrainer
 
             ranks = Ranks.world()
             trainer = DistributedTrainer(config, dataset, gaussians, ranks)

@@ -16,7 +16,7 @@ from drgs.cameras.axes import OPENCV_TO_OPENGL
 from drgs.cameras.camera import Camera
 from drgs.config.changes import changed
 from drgs.config.schema import FitConfig, ModelConfig
-from drgs.data.types import Dataset, View
+from drgs.datasets.types import Dataset, View
 from drgs.gaussians.parameters import Gaussians
 from drgs.reference import splatting as reference
 from drgs.splatting import rendering

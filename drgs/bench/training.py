@@ -33,8 +33,9 @@ from drgs.cli.commands import CommandParser
 from drgs.config.changes import changed, with_iterations
 from drgs.config.load import dump_config, load_config
 from drgs.config.schema import FitConfig
-from drgs.data import initial_gaussians, load_dataset
-from drgs.data.derived import completed
+from drgs.datasets import load_dataset
+from drgs.initialization.defaults import completed
+from drgs.initialization.start import initial_gaussians
 from drgs.io.figures import new_figure, write_figure
 from drgs.results.files import METRICS
 from drgs.training.budget import STRATEGIES, Strategy, rehearse

@@ -62,7 +62,7 @@ def with_iterations(config: FitConfig, iterations: int) -> FitConfig:
 
 
 OPEN = ("data.background", "model.near")
-"""Values that are null until the dataset has decided: see ``drgs.data.derived``."""
+"""Values that are null until the dataset has decided: see ``drgs.initialization.defaults``."""
 
 OPEN_AT_START = (
     *OPEN,

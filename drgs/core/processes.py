@@ -1,7 +1,7 @@
 """One process among several, as ``mpiexec`` starts them: how the job speaks, starts and ends.
 
 Launchers describe a job by variables of the environment. MPI itself is imported by
-:func:`start_mpi` and by ``drgs.distributed`` alone.
+:func:`start_mpi` and by ``drgs.training.parallel`` alone.
 
 A process that fails ends the whole job, with its own exit status. Where all fail alike, the first
 one is heard: the others wait before they speak, and are ended meanwhile.

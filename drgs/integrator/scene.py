@@ -18,7 +18,7 @@ from drgs.cameras.axes import OPENCV_TO_MITSUBA
 from drgs.config.schema import ModelConfig
 from drgs.core.errors import UserError
 from drgs.core.memory import why_too_large
-from drgs.data.types import Viewpoint
+from drgs.datasets.types import Viewpoint
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 
 NEAR_CLIP = 1e-9

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import mitsuba as mi
 
 from drgs.cameras.camera import Camera, Lens, Pinhole
-from drgs.data.types import Viewpoint
+from drgs.datasets.types import Viewpoint
 from drgs.effects.compose import ignoring
 from drgs.integrator.settings import SplatsSettings
 

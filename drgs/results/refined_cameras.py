@@ -13,9 +13,9 @@ from drgs.cameras.axes import between_opencv_and_opengl
 from drgs.core.errors import UserError, one_line
 from drgs.core.files import atomic_path, read_text
 from drgs.core.origin import WORLD, Origin
-from drgs.data.transforms import CLOSE, MAX_BYTES
-from drgs.data.types import Dataset, Motion, View, Viewpoint
-from drgs.data.viewpoints import read_viewpoints
+from drgs.datasets.transforms import CLOSE, MAX_BYTES
+from drgs.datasets.types import Dataset, Motion, View, Viewpoint
+from drgs.datasets.viewpoints import read_viewpoints
 from drgs.results.files import CAMERAS, VIEWS
 from drgs.results.folder import load_run_config
 

@@ -26,10 +26,10 @@ import yaml
 from PIL import Image
 
 from drgs.core.files import atomic_path
-from drgs.data.images import downscale
-from drgs.data.orbits import orbit_of_views, orbit_size
-from drgs.data.types import Dataset, View
-from drgs.data.viewpoints import field_of_view
+from drgs.datasets.images import downscale
+from drgs.datasets.orbits import orbit_of_views, orbit_size
+from drgs.datasets.types import Dataset, View
+from drgs.datasets.viewpoints import field_of_view
 from drgs.gaussians.parameters import Gaussians
 from drgs.integrator.scene import render_views
 from drgs.io.figures import pixels_of

@@ -29,9 +29,9 @@ from drgs.config.approximations import Approximations
 from drgs.core.errors import UserNote
 from drgs.core.files import atomic_path
 from drgs.core.origin import WORLD
-from drgs.data.orbits import Orbit, orbit_of_gaussians, orbit_of_views
-from drgs.data.types import Dataset, Viewpoint
-from drgs.data.viewpoints import FIELD_OF_VIEW
+from drgs.datasets.orbits import Orbit, orbit_of_gaussians, orbit_of_views
+from drgs.datasets.types import Dataset, Viewpoint
+from drgs.datasets.viewpoints import FIELD_OF_VIEW
 from drgs.gaussians.parameters import Gaussians
 from drgs.gaussians.similarity import Similarity
 from drgs.results.files import VIEWER

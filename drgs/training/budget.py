@@ -25,7 +25,7 @@ from pathlib import Path
 from drgs.config.changes import changed, with_iterations
 from drgs.config.schema import FitConfig
 from drgs.core.errors import UserError
-from drgs.data.types import Dataset
+from drgs.datasets.types import Dataset
 from drgs.gaussians.parameters import Gaussians
 from drgs.training.trainer import Trainer
 

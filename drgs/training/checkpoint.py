@@ -21,7 +21,7 @@ from drgs.config.changes import changed, decided_as
 from drgs.config.schema import FitConfig
 from drgs.core.errors import UserError, UserNote, listed, one_line
 from drgs.core.files import atomic_path, read_arrays, why_refused
-from drgs.data.fingerprint import Fingerprint
+from drgs.datasets.fingerprint import Fingerprint
 from drgs.results.files import CHECKPOINT, CONFIG
 from drgs.results.folder import load_run_config, write_run_config
 from drgs.training.state_checks import check_density, check_history, check_state

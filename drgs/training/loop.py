@@ -11,9 +11,10 @@ import mitsuba as mi
 
 from drgs.config.load import config_from, load_config
 from drgs.config.schema import FitConfig
-from drgs.data import Dataset, initial_gaussians, load_dataset
-from drgs.data.folders import config_for
+from drgs.datasets import Dataset, load_dataset
+from drgs.datasets.folders import config_for
 from drgs.gaussians.parameters import Gaussians
+from drgs.initialization.start import initial_gaussians
 from drgs.integrator.scene import check_lenses
 from drgs.training.budget import AllIterations
 from drgs.training.history import History, HistoryRow
@@ -103,7 +104,7 @@ def train(
     """Fit Gaussians to photographs, in memory: the bytes that ``drgs fit`` writes to its PLY file.
 
     config: what to fit, and how: the path of a YAML file, or of the folder of a dataset, to have
-    that chosen (``drgs.data.folders``); the same as nested mappings, or a
+    that chosen (``drgs.datasets.folders``); the same as nested mappings, or a
     :class:`drgs.config.schema.FitConfig`; dataset: the photographs, whose background is that of
     the splats, by default those of the configuration's section ``data``; callback: called after
     each iteration with what it did, a :class:`drgs.training.trainer.StepReport`; the fit ends early

@@ -23,7 +23,7 @@ from drgs.config.schema import FitConfig
 from drgs.core.constants import ALPHA_CUT, LOW_PASS, TRANSMITTANCE_STOP
 from drgs.core.errors import UserError
 from drgs.core.memory import available_memory, readable, resident_memory
-from drgs.data.types import Dataset, View, Viewpoint
+from drgs.datasets.types import Dataset, View, Viewpoint
 from drgs.gaussians.parameters import Gaussians
 from drgs.splatting.grid import MICRO, TILE
 from drgs.splatting.slots import BAND_SLOTS

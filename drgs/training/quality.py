@@ -10,7 +10,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from drgs.data.types import View
+from drgs.datasets.types import View
 from drgs.results.metrics import psnr
 from drgs.training.history import History, HistoryRow
 from drgs.training.trainer import Trainer

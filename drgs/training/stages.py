@@ -14,8 +14,8 @@ from functools import partial
 import numpy as np
 
 from drgs.config.schema import FitConfig
-from drgs.data.images import smaller_view
-from drgs.data.types import View
+from drgs.datasets.images import smaller_view
+from drgs.datasets.types import View
 from drgs.integrator.scene import make_sensors
 from drgs.training.effects.base import TrainingEffect, as_tensor
 from drgs.training.losses import TARGET_BYTES, Target, prepare_target

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from drgs.config.schema import FitConfig
-from drgs.data.types import Dataset
+from drgs.datasets.types import Dataset
 from drgs.integrator.summary import (
     SimulatedEffect,
     antialiasing_effect,

@@ -20,9 +20,9 @@ import numpy as np
 from drgs.config.changes import changed
 from drgs.config.schema import FitConfig
 from drgs.core.memory import release_unused_memory
-from drgs.data.derived import completed
-from drgs.data.types import Dataset, View
+from drgs.datasets.types import Dataset, View
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
+from drgs.initialization.defaults import completed
 from drgs.integrator.scene import make_scene, render_views
 from drgs.integrator.weights import weighted_sums_of_last
 from drgs.splatting.rendering import SeenSplats, sum_of_views

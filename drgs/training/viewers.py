@@ -31,7 +31,7 @@ from drgs.config.changes import changed
 from drgs.config.schema import FitConfig, ModelConfig
 from drgs.core.errors import UserError, UserNote
 from drgs.core.memory import release_unused_memory
-from drgs.data.types import View
+from drgs.datasets.types import View
 from drgs.effects.smoothing import baked
 from drgs.effects.viewers import baked_for_viewers
 from drgs.gaussians.parameters import Gaussians

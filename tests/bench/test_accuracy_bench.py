@@ -17,7 +17,7 @@ from drgs.bench import accuracy
 from drgs.bench.scenes import bench_camera, bench_gaussians, stress_scene
 from drgs.config.load import dump_config
 from drgs.config.schema import FitConfig
-from drgs.data.types import View
+from drgs.datasets.types import View
 from drgs.reference import rays as reference_rays
 from drgs.results import metrics
 

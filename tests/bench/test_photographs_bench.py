@@ -13,7 +13,7 @@ from support.datasets import load
 from drgs import fit
 from drgs.bench import __main__ as bench
 from drgs.bench import photographs
-from drgs.data.folders import config_for
+from drgs.datasets.folders import config_for
 
 
 @pytest.fixture

@@ -14,7 +14,7 @@ from drgs.bench import __main__ as bench
 from drgs.bench import population
 from drgs.config.load import load_config
 from drgs.config.schema import DensifyConfig
-from drgs.data import load_dataset
+from drgs.datasets import load_dataset
 from drgs.training.density import adc
 
 EXTENT = populations.EXTENT

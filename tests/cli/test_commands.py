@@ -6,8 +6,9 @@ from pathlib import Path
 import pytest
 
 from drgs import __main__ as commands
-from drgs import capture, fit, render
+from drgs import fit, render
 from drgs.bench import __main__ as bench
+from drgs.capture import __main__ as capture
 from drgs.cli.commands import CommandParser, at_least, finite_number, run_command
 
 NAMES = [*commands.COMMANDS, *(f"bench {name}" for name in bench.COMMANDS)]

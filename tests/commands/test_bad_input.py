@@ -25,7 +25,7 @@ from drgs import fit
 from drgs.config.load import dump_config, load_config
 from drgs.config.schema import FitConfig
 from drgs.core.errors import UserError
-from drgs.data import load_dataset
+from drgs.datasets import load_dataset
 from drgs.gaussians.parameters import Gaussians
 from drgs.io.ply import read_points
 from drgs.results.folder import claim_output_folder

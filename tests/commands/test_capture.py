@@ -18,11 +18,12 @@ import pytest
 from conftest import REPOSITORY
 from support.commands import assert_refused
 
-from drgs import capture
+from drgs.capture import __main__ as capture
+from drgs.capture import camera_placement, path_tracing
+from drgs.capture.path_tracing import CaptureSettings
 from drgs.config.schema import DataConfig
 from drgs.core.errors import UserError
-from drgs.data import load_dataset, path_tracing, standpoints
-from drgs.data.path_tracing import CaptureSettings
+from drgs.datasets import load_dataset
 from drgs.io.ply import read_points
 
 CENTER = np.array([0.3, -0.2, 0.5])
@@ -140,7 +141,7 @@ def test_dataset_loads_and_its_cameras_look_at_the_object_from_above(captured):
 @pytest.mark.parametrize("jitter", [0.0, 1.0])
 def test_directions_are_spread_evenly_over_the_upper_hemisphere(jitter):
     count = 100
-    directions = standpoints.hemisphere(count, jitter, np.random.default_rng(3))
+    directions = camera_placement.hemisphere(count, jitter, np.random.default_rng(3))
     np.testing.assert_allclose(np.linalg.norm(directions, axis=1), 1, atol=1e-12)
     assert (directions[:, 2] > 0).all()
     # Uniform on the hemisphere: the mean is (0, 0, 1/2) and z is uniform in 0..1.
@@ -156,8 +157,8 @@ def test_directions_are_spread_evenly_over_the_upper_hemisphere(jitter):
 
 def test_splits_and_seeds_have_cameras_of_their_own():
     settings = CaptureSettings(views=5, val_views=5, test_views=5)
-    first = standpoints.views_around(settings, np.zeros(3), 4.0)
-    other = standpoints.views_around(replace(settings, seed=1), np.zeros(3), 4.0)
+    first = camera_placement.views_around(settings, np.zeros(3), 4.0)
+    other = camera_placement.views_around(replace(settings, seed=1), np.zeros(3), 4.0)
     centers = np.array([view.pose[:3, 3] for view in first + other])
     distances = np.linalg.norm(centers[:, None] - centers[None], axis=2)
     assert distances[~np.eye(len(centers), dtype=bool)].min() > 0.01
@@ -167,7 +168,7 @@ def test_splits_and_seeds_have_cameras_of_their_own():
 def test_hemisphere_stands_on_the_chosen_axis(axis):
     settings = CaptureSettings(up=axis, views=9)
     height = "xyz".index(axis)
-    for view in standpoints.views_around(settings, np.array([1.0, 2.0, 3.0]), 4.0):
+    for view in camera_placement.views_around(settings, np.array([1.0, 2.0, 3.0]), 4.0):
         assert view.pose[height, 3] > [1, 2, 3][height]
         assert view.pose[height, 1] > 0
         assert np.linalg.det(view.pose[:3, :3]) == pytest.approx(1)
@@ -217,8 +218,8 @@ def test_composite_over_white_agrees_with_a_render_before_a_white_sky(ball):
     size, finer = 24, 8
     settings = CaptureSettings(size=(size, size), spp=256)
     scene = path_tracing.load_scene(ball)
-    target, distance = standpoints.target_and_distance(scene, settings)
-    view = standpoints.views_around(settings, target, distance)[60]
+    target, distance = camera_placement.target_and_distance(scene, settings)
+    view = camera_placement.views_around(settings, target, distance)[60]
     rgba = path_tracing.CaptureCamera(scene, settings).picture(view) / 255
     composited = rgba[:, :, :3] * rgba[:, :, 3:] + 1 - rgba[:, :, 3:]
 
@@ -278,7 +279,9 @@ def test_points_lie_on_the_sphere_with_its_color(captured):
 def test_each_view_contributes_its_share_of_the_points_it_sees(ball, captured):
     settings = CaptureSettings(**SETTINGS, points=600)
     scene = path_tracing.load_scene(ball)
-    views = standpoints.views_around(settings, *standpoints.target_and_distance(scene, settings))
+    views = camera_placement.views_around(
+        settings, *camera_placement.target_and_distance(scene, settings)
+    )
     positions, _ = path_tracing.visible_points(scene, settings, views, captured)
     for number in range(6):
         seen = positions[100 * number : 100 * (number + 1)]
@@ -487,8 +490,8 @@ def test_shipped_scene_is_in_the_picture_and_has_hundreds_of_parts():
     assert sys.modules["drgs_capture_scene_brick_crane"].build().num_parts > 250
     settings = CaptureSettings(size=(48, 48), spp=4, views=8, distance=4.0311, target=(0, 0, 0))
     camera = path_tracing.CaptureCamera(scene, settings)
-    for view in standpoints.views_around(
-        settings, *standpoints.target_and_distance(scene, settings)
+    for view in camera_placement.views_around(
+        settings, *camera_placement.target_and_distance(scene, settings)
     )[:8]:
         alpha = camera.picture(view)[:, :, 3]
         assert not alpha[[0, -1]].any()

@@ -9,7 +9,7 @@ import mitsuba as mi
 import pytest
 from support.commands import run_in_process
 
-from drgs import capture
+from drgs.capture import __main__ as capture
 from drgs.core import files, memory
 
 BALL = """

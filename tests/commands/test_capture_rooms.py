@@ -10,10 +10,12 @@ from conftest import REPOSITORY
 from support.commands import run_in_process
 from support.render_command import write_scene
 
-from drgs import capture, fit
+from drgs import fit
+from drgs.capture import __main__ as capture
+from drgs.capture.path_tracing import lit_part
 from drgs.config.load import load_config
-from drgs.data import initial_gaussians, load_dataset
-from drgs.data.path_tracing import lit_part
+from drgs.datasets import load_dataset
+from drgs.initialization.start import initial_gaussians
 from drgs.io.ply import read_points
 
 CORNELL = "import mitsuba as mi\n\ndef scene():\n    return mi.cornell_box()\n"

@@ -20,9 +20,10 @@ from support.colmap_models import Model, write_binary
 from drgs.config.load import dump_config, load_config
 from drgs.config.schema import DataConfig, FitConfig
 from drgs.core.errors import UserError
-from drgs.data import initial_gaussians, load_dataset
-from drgs.data.images import composite
+from drgs.datasets import load_dataset
+from drgs.datasets.images import composite
 from drgs.gaussians.parameters import Gaussians
+from drgs.initialization.start import initial_gaussians
 from drgs.io.pictures import read_image
 from drgs.io.ply import read_points
 

@@ -24,8 +24,8 @@ from support.small_capture import view as small_view
 
 from drgs import export, view
 from drgs.core.errors import UserNote
-from drgs.data import load_dataset
-from drgs.data.viewpoints import read_viewpoints
+from drgs.datasets import load_dataset
+from drgs.datasets.viewpoints import read_viewpoints
 from drgs.gaussians.parameters import Gaussians
 from drgs.results.files import VIEWS
 from drgs.results.refined_cameras import write_views

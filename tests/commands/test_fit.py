@@ -20,9 +20,10 @@ from support.usual_rule import USUAL
 
 from drgs.cli.execution import executing
 from drgs.config.load import dump_config, load_config
-from drgs.data import initial_gaussians, load_dataset
+from drgs.datasets import load_dataset
 from drgs.fit import main
 from drgs.gaussians.parameters import Gaussians
+from drgs.initialization.start import initial_gaussians
 from drgs.reference import splatting as reference
 
 SIZE = 32

@@ -17,7 +17,7 @@ from support.small_fits import disturbed_blobs, double, photograph, true_blobs
 from drgs import fit
 from drgs.config.approximations import Approximations
 from drgs.config.load import load_config
-from drgs.data import load_dataset
+from drgs.datasets import load_dataset
 from drgs.gaussians.parameters import Gaussians
 from drgs.integrator.scene import make_scene, make_sensors, render_views
 from drgs.results.files import GAUSSIANS, GAUSSIANS_FOR_VIEWERS, METRICS

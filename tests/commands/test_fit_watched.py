@@ -18,11 +18,11 @@ from support.fit_command import (
 from support.small_capture import HEIGHT, WIDTH, pose_around
 
 from drgs import fit
-from drgs.live import fit_page
-from drgs.live.frames import FrameRequest
-from drgs.live.optics import Eye
-from drgs.live.watching import UntilEnded, Watching
-from drgs.live.wishes import Wishes
+from drgs.viewer import fit_page
+from drgs.viewer.frames import FrameRequest
+from drgs.viewer.optics import Eye
+from drgs.viewer.requests import Wishes
+from drgs.viewer.training_viewer import UntilEnded, Watching
 
 EYE = Eye(pose_around(0.4, 0.3), 40.0, 4.0)
 
@@ -53,11 +53,11 @@ def looked_on(monkeypatch):
     def serving(*arguments):
         yield "server"
 
-    server = ModuleType("drgs.live.server")
+    server = ModuleType("drgs.viewer.server")
     server.serving, server.url, server.ADDRESS = serving, lambda _: "http://here", "127.0.0.1"
-    monkeypatch.setitem(sys.modules, "drgs.live.server", server)
+    monkeypatch.setitem(sys.modules, "drgs.viewer.server", server)
     monkeypatch.setitem(sys.modules, "viser", ModuleType("viser"))
-    monkeypatch.setattr("drgs.live.watching.SAID_SECONDS", 0.0)
+    monkeypatch.setattr("drgs.viewer.training_viewer.SAID_SECONDS", 0.0)
 
     def look_on(end_at=None):
         screens = []

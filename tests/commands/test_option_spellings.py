@@ -10,7 +10,8 @@ import pytest
 from support.commands import run_in_process
 from support.small_capture import blobs
 
-from drgs import capture, render
+from drgs import render
+from drgs.capture import __main__ as capture
 
 BALL = """
 <scene version="3.0.0">

@@ -2,8 +2,8 @@
 
 import pytest
 
-from drgs import poses
-from drgs.data.structure_from_motion import Placed, Search
+from drgs.poses import __main__ as poses
+from drgs.poses.structure_from_motion import Placed, Search
 
 FOUND = Placed(("a.jpg", "b.jpg"), (), ("OPENCV 64 x 48 px (f: 50)",), 1234, 0.456, 1)
 

@@ -33,7 +33,7 @@ from support.small_capture import (
 from support.small_capture import view as small_view
 
 from drgs import render
-from drgs.data.orbits import orbit_of_gaussians, orbit_of_views
+from drgs.datasets.orbits import orbit_of_gaussians, orbit_of_views
 
 
 def photo(fit, name, background, split="test"):

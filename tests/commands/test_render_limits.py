@@ -9,7 +9,8 @@ from support.commands import run_in_process
 from support.render_command import sensor, write_scene
 from support.small_capture import blobs, pose_around
 
-from drgs import capture, fit, render
+from drgs import fit, render
+from drgs.capture import __main__ as capture
 from drgs.core.errors import UserError
 from drgs.io.pictures import check_animation
 

@@ -13,9 +13,9 @@ from support.small_capture import FOCUS, RADIUS, make_dataset
 from drgs import view
 from drgs.cli.commands import CommandParser
 from drgs.core.errors import UserError
-from drgs.live.page import StartView
 from drgs.results.files import CAMERAS, VIEWS
 from drgs.results.refined_cameras import write_views
+from drgs.viewer.page import StartView
 
 
 def parsed(*arguments):

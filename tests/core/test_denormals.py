@@ -34,7 +34,7 @@ def test_neighbours_of_equal_points_at_zero_are_found_in_a_command(run_python):
     result = run_python("""
 import numpy as np
 from drgs.core.denormals import denormals_flushed
-from drgs.data.initial import mean_squared_neighbour_distance
+from drgs.initialization.start import mean_squared_neighbour_distance
 points = np.zeros((40, 3), np.float32)
 points[17] = 1          # all others are one point
 points[20:, 1] = np.arange(20)  # and these lie in a plane through zero

@@ -150,10 +150,10 @@ def test_keys_of_the_configuration_exist(page):
 MODULES = {
     "fit": "drgs.fit",
     "render": "drgs.render",
-    "poses": "drgs.poses",
+    "poses": "drgs.poses.__main__",
     "export": "drgs.export",
     "view": "drgs.view",
-    "capture": "drgs.capture",
+    "capture": "drgs.capture.__main__",
     "bench": "drgs.bench.__main__",
 }
 

@@ -11,8 +11,9 @@ from conftest import REPOSITORY
 
 GROUND = {"core"}
 METHOD = {"gaussians", "cameras", *GROUND}
-INTEGRATOR = {"accuracy", "effects", "light", "splatting", "data", "io", "config", *METHOD}
-TRAINING = {"results", "integrator", *INTEGRATOR}
+LOADERS = {"initialization", "datasets", "io", "config", *METHOD}
+INTEGRATOR = {"accuracy", "effects", "light", "splatting", *LOADERS}
+TRAINING = {"results", "integrator", "cli", *INTEGRATOR}
 
 MAY_IMPORT = {
     "core": set(),
@@ -26,20 +27,19 @@ MAY_IMPORT = {
     "accuracy": {"splatting", "config", *METHOD},
     "effects": {"splatting", "config", *METHOD},
     "light": {"splatting", "config", *METHOD},
-    "data": {"io", "config", *METHOD},
+    "datasets": {"io", "config", *METHOD},
+    "initialization": LOADERS,
     "integrator": INTEGRATOR,
-    "results": {"integrator", "data", "io", "config", *METHOD},
+    "results": {"integrator", *LOADERS},
     "training": TRAINING,
     "plugins": {"integrator", *INTEGRATOR},
     "_registration": {"plugins", *GROUND},
     "": {"_registration", "core"},  # drgs/__init__.py; what it offers is imported when it is used
     "rasterizing": {"accuracy", "effects", "splatting", "config", *METHOD},
-    "distributed": {"training", "cli", *TRAINING},
-    "live": {"training", *TRAINING},
-    "commands": {"distributed", "live", "training", "cli", "plugins", *TRAINING},
+    "viewer": {"training", *TRAINING},
+    "commands": {"viewer", "training", "cli", "plugins", *TRAINING},
     "bench": {
         "commands",
-        "distributed",
         "rasterizing",
         "training",
         "cli",

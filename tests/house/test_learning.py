@@ -9,7 +9,7 @@ from conftest import REPOSITORY
 from drgs import render
 from drgs.config.schema import FitConfig
 from drgs.core import constants, memory
-from drgs.data import transforms
+from drgs.datasets import transforms
 from drgs.integrator import limits
 from drgs.io import pictures
 from drgs.reference import splatting

@@ -12,7 +12,7 @@ import zipfile
 import pytest
 from conftest import REPOSITORY
 
-SHOW = "import drgs, drgs.plugins, drgs.io, drgs.data; print(drgs.plugins.__file__)"
+SHOW = "import drgs, drgs.plugins, drgs.io, drgs.datasets; print(drgs.plugins.__file__)"
 
 
 def copy_checkout(folder):

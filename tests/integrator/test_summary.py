@@ -17,7 +17,7 @@ from drgs.cameras.fisheye import Fisheye
 from drgs.cameras.radial_tangential import RadialTangential
 from drgs.config.changes import changed
 from drgs.config.schema import FitConfig
-from drgs.data.types import Motion
+from drgs.datasets.types import Motion
 from drgs.integrator.sensors import camera_from_sensor, read_sensor
 from drgs.integrator.summary import SimulatedEffect, described, summary_of_sensors, summary_of_views
 from drgs.training import history

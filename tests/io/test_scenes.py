@@ -5,8 +5,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from drgs.capture.path_tracing import load_scene
 from drgs.core.errors import UserError
-from drgs.data.path_tracing import load_scene
 from drgs.io.pictures import write_exr
 from drgs.io.scenes import load_scene_file, openexr_threads
 

@@ -17,8 +17,8 @@ from support.small_capture import HEIGHT, WIDTH, blobs, decibels, make_dataset
 
 from drgs.config.approximations import Approximations
 from drgs.config.schema import FitConfig, ModelConfig
-from drgs.data.orbits import orbit_of_views
-from drgs.data.viewpoints import field_of_view
+from drgs.datasets.orbits import orbit_of_views
+from drgs.datasets.viewpoints import field_of_view
 from drgs.integrator.scene import make_scene, render_views
 from drgs.results import curves, report
 from drgs.results.metrics import ssim

@@ -19,7 +19,7 @@ from support.small_capture import FOCUS, RADIUS, blobs, make_dataset, pose_aroun
 
 from drgs.config.approximations import Approximations
 from drgs.core.errors import UserError, UserNote
-from drgs.data.viewpoints import pinhole
+from drgs.datasets.viewpoints import pinhole
 from drgs.gaussians.parameters import Gaussians
 from drgs.results import viewer
 from drgs.results.refined_cameras import write_views

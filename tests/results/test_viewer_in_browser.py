@@ -10,7 +10,7 @@ from support.small_capture import FOCUS, RADIUS, decibels, pose_around
 
 from drgs.config.approximations import Approximations
 from drgs.config.schema import ModelConfig
-from drgs.data.viewpoints import pinhole
+from drgs.datasets.viewpoints import pinhole
 from drgs.gaussians.parameters import Gaussians
 from drgs.integrator.scene import make_scene, render_views
 from drgs.results.viewer import Shown, Standpoint, viewer_page

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from drgs.data.types import Dataset, View
+from drgs.datasets.types import Dataset, View
 from drgs.reference import effects as reference
 from drgs.reference.splatting import Camera
 from support.datasets import look_at

@@ -8,8 +8,8 @@ import pytest
 
 from drgs.config.schema import DataConfig
 from drgs.core.errors import UserError, UserNote
-from drgs.data import load_dataset
-from drgs.data.types import Dataset, View
+from drgs.datasets import load_dataset
+from drgs.datasets.types import Dataset, View
 
 
 def look_at(center, target, up=(0, 0, 1)):

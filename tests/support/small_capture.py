@@ -8,7 +8,7 @@ from pathlib import Path
 import imageio.v3 as iio
 import numpy as np
 
-from drgs.data.types import Dataset, View
+from drgs.datasets.types import Dataset, View
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 from drgs.reference import splatting as reference
 from support.helpers import NEAR_THRESHOLD

@@ -12,7 +12,7 @@ import numpy as np
 
 from drgs.config.changes import changed
 from drgs.config.schema import FitConfig
-from drgs.data.types import Dataset, View
+from drgs.datasets.types import Dataset, View
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 from drgs.integrator.scene import render_views
 from drgs.reference import splatting as reference

@@ -97,7 +97,7 @@ def _blurred() -> Any:
     """Photographs of which every other one was taken by a camera that moved."""
     from dataclasses import replace
 
-    from drgs.data.types import Motion
+    from drgs.datasets.types import Motion
     from support import small_fits as fits
 
     dataset = fits.plain_dataset()
@@ -156,8 +156,8 @@ def main() -> None:
 
     mi.set_variant("llvm_ad_rgb")
     dr.set_thread_count(1)
-    from drgs.distributed.ranks import Ranks
-    from drgs.distributed.trainer import DistributedTrainer
+    from drgs.training.parallel.ranks import Ranks
+    from drgs.training.parallel.trainer import DistributedTrainer
     from support import small_fits as fits
 
     task = json.loads(sys.argv[1])

@@ -3,8 +3,8 @@
 import numpy as np
 
 from drgs.config.schema import FitConfig
-from drgs.data.initial import gaussians_from_points
-from drgs.data.types import Dataset, View
+from drgs.datasets.types import Dataset, View
+from drgs.initialization.start import gaussians_from_points
 
 
 def small_view(name, angle):

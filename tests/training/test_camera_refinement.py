@@ -15,9 +15,9 @@ from drgs.cameras.fisheye import Fisheye
 from drgs.cameras.radial_tangential import RadialTangential
 from drgs.cameras.thin_prism_fisheye import ThinPrismFisheye
 from drgs.core.errors import UserError
-from drgs.data.images import smaller_view
-from drgs.data.types import Motion
-from drgs.data.viewpoints import read_viewpoints
+from drgs.datasets.images import smaller_view
+from drgs.datasets.types import Motion
+from drgs.datasets.viewpoints import read_viewpoints
 from drgs.gaussians.parameters import PARAMETER_NAMES
 from drgs.integrator.scene import render_views
 from drgs.reference import splatting as reference

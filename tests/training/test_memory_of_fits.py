@@ -16,10 +16,10 @@ from drgs.cameras.axes import between_opencv_and_opengl
 from drgs.config.changes import changed
 from drgs.config.schema import FitConfig
 from drgs.core.errors import UserError
-from drgs.data.initial import initial_gaussians
-from drgs.data.kept import KeptPicture
-from drgs.data.types import Dataset, Motion, View
-from drgs.data.viewpoints import look_at, pinhole
+from drgs.datasets.lazy_image import KeptPicture
+from drgs.datasets.types import Dataset, Motion, View
+from drgs.datasets.viewpoints import look_at, pinhole
+from drgs.initialization.start import initial_gaussians
 from drgs.integrator.scene import make_scene, make_sensors
 from drgs.splatting import rasterize
 from drgs.training import memory

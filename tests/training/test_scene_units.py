@@ -14,7 +14,7 @@ from support.small_fits import double
 
 import drgs
 from drgs.core.origin import FAR, WORLD
-from drgs.data import Dataset, load_dataset
+from drgs.datasets import Dataset, load_dataset
 from drgs.reference import splatting as reference
 
 CASES = {

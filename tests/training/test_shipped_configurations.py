@@ -13,8 +13,8 @@ from support.photographs import moved
 
 from drgs.config.changes import changed, with_iterations
 from drgs.config.load import load_config
-from drgs.data import load_dataset
-from drgs.data.derived import completed
+from drgs.datasets import load_dataset
+from drgs.initialization.defaults import completed
 from drgs.results.metrics import mean_quality
 from drgs.training.loop import train
 

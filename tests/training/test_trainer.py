@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from support.trainers import make_trainer, small_dataset, small_view
 
-from drgs.data.images import smaller_view
-from drgs.data.initial import gaussians_from_points
+from drgs.datasets.images import smaller_view
 from drgs.gaussians.parameters import PARAMETER_NAMES
+from drgs.initialization.start import gaussians_from_points
 from drgs.training.density import adc
 
 

@@ -8,7 +8,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from drgs.data.types import View
+from drgs.datasets.types import View
 from drgs.training.effects.base import FitState, TrainingEffect, as_tensor
 from drgs.training.losses import prepare_target
 from drgs.training.views import TrainingView

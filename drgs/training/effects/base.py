@@ -15,7 +15,7 @@ import mitsuba as mi
 import numpy as np
 
 from drgs.core.arrays import from_host
-from drgs.data.types import Dataset, View
+from drgs.datasets.types import Dataset, View
 from drgs.integrator.settings import SplatsSettings
 from drgs.training.views import TrainingView
 

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 
 from drgs.config.schema import FitConfig
 from drgs.core.errors import UserError
-from drgs.data.types import Dataset
+from drgs.datasets.types import Dataset
 from drgs.training.effects.base import TrainingEffect
 
 

@@ -23,7 +23,7 @@ from drgs.cameras.motion import rotation_matrix
 from drgs.config.schema import CamerasConfig
 from drgs.core.errors import UserError
 from drgs.core.files import atomic_path
-from drgs.data.types import Dataset, View
+from drgs.datasets.types import Dataset, View
 from drgs.results.files import CAMERAS
 from drgs.results.refined_cameras import LensChange, cameras_json
 from drgs.training.effects.base import FitState, TrainingEffect

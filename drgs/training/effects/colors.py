@@ -23,7 +23,7 @@ import numpy as np
 from drgs.config.schema import ColorConfig
 from drgs.core.arrays import from_host
 from drgs.core.files import atomic_path
-from drgs.data.types import Dataset, View
+from drgs.datasets.types import Dataset, View
 from drgs.results.files import COLORS
 from drgs.training.effects.base import FitState, TrainingEffect, as_tensor
 from drgs.training.effects.view_parameters import ViewParameters

@@ -9,7 +9,7 @@ import mitsuba as mi
 import numpy as np
 
 from drgs.core.arrays import from_host
-from drgs.data.types import View
+from drgs.datasets.types import View
 from drgs.training.effects.base import TrainingEffect
 from drgs.training.image_ops import depth_error, split
 from drgs.training.views import TrainingView

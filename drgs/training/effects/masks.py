@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from drgs.data.types import View
+from drgs.datasets.types import View
 from drgs.training.effects.base import TrainingEffect, as_tensor
 from drgs.training.views import TrainingView
 

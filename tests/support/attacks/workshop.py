@@ -23,7 +23,8 @@ import numpy as np
 import yaml
 from plyfile import PlyData, PlyElement
 
-from drgs import capture, fit
+from drgs import fit
+from drgs.capture import __main__ as capture
 from drgs.core.files import atomic_path
 from drgs.results.files import CHECKPOINT, CURVES, ORBIT, ORBIT_GIF, REPORT, VIEWER
 from support.attacks.observer import Fault, observed

@@ -1,0 +1,397 @@
+"""Where the cameras of a capture stand: around a scene, inside it, or where its own sensors are.
+
+What nobody says follows from the scene (:func:`settings_for`). A room is photographed from inside:
+its walls are dark, or not there, from behind. Sensors of the scene say which way is up, what is
+looked at and from how far; if there are many of them, their own pictures are taken.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Set
+from dataclasses import dataclass, replace
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from drgs.cameras.axes import OPENCV_TO_OPENGL, OPENGL_TO_MITSUBA
+from drgs.capture.path_tracing import (
+    FAR_CLIP,
+    SPLITS,
+    CaptureCamera,
+    CaptureSettings,
+    CaptureView,
+    bounding_box,
+    lit_part,
+)
+from drgs.core.errors import UserError
+from drgs.datasets.viewpoints import look_at
+
+KINDS = ("around", "inside", "sensors")
+"""Of cameras: around the scene, inside it, those of the scene itself."""
+
+ELEVATIONS = {"around": (0.0, 90.0), "inside": (-60.0, 60.0)}
+"""Degrees above the horizon, lowest and highest. Inside, the ceiling is seen from below."""
+
+INSIDE_FOV = math.radians(70)
+"""In a room, walls are near."""
+
+INSIDE_PART = 0.6
+"""Of the way from what is looked at to the wall behind a camera: where that camera stands."""
+
+ENOUGH_SENSORS = 10
+"""A scene with so many is photographed from where they are."""
+
+TEST_EVERY = 8
+"""Of the scene's own sensors, every eighth is for testing, as in the nerfstudio layout."""
+
+COUNTS = {"views", "val_views", "test_views"}
+
+ORBITING = {"distance", "azimuth", "elevation"}
+"""Settings that say how cameras stand around a scene."""
+
+CLOSED = 0.75
+"""Part of all directions in which something stands: at least this in a room. Cornell's box, which
+has five of six sides, has 5/6."""
+
+NUM_SPOTS, NUM_DIRECTIONS = 128, 128
+"""Points of the bounding box from which we look for a room, and rays from each."""
+
+CLEARANCE = 0.1
+"""Quantile of the distances from a spot to what is around it: how much room there is."""
+
+PREVIEWS, PREVIEW_SIZE, PREVIEW_SPP = 12, (16, 16), 4
+
+MOST = 0.5
+"""Of what surfaces cover of the pictures: less than this is lit where a camera stands wrong."""
+
+GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
+
+PLASTIC = 1.2207440846057596
+"""The root of x^4 = x + 1: its powers spread points evenly over a box (Roberts 2018, "R_3")."""
+
+
+@dataclass(frozen=True, eq=False)
+class OwnCamera:
+    """A pinhole (or a thin lens's) of the scene itself."""
+
+    pose: np.ndarray  # (4, 4) float64 camera to world, OpenGL axes
+    narrower_fov: float  # radians, along the film's smaller side
+
+    @property
+    def center(self) -> np.ndarray:
+        """(3,) world."""
+        return self.pose[:3, 3]
+
+
+def own_cameras(scene: mi.Scene) -> list[OwnCamera]:
+    """The scene's sensors of the types ``perspective`` and ``thinlens``."""
+    found = []
+    for sensor in scene.sensors():
+        parameters = mi.traverse(sensor)
+        if "x_fov" not in parameters:
+            continue
+        pose = np.array(sensor.world_transform().matrix, np.float64).reshape(4, 4)
+        pose[:3, :3] /= np.linalg.norm(pose[:3, :3], axis=0)
+        width, height = sensor.film().size()
+        fov = math.radians(parameters["x_fov"][0])
+        if height < width:
+            fov = 2 * math.atan(height / width * math.tan(fov / 2))
+        found.append(OwnCamera(pose @ OPENGL_TO_MITSUBA, fov))
+    return found
+
+
+def settings_for(scene: mi.Scene, settings: CaptureSettings, given: Set[str]) -> CaptureSettings:
+    """``settings`` with what is not among the names ``given`` as the scene calls for it.
+
+    Raises :class:`UserError` for a setting that the cameras do not use.
+    """
+    own = own_cameras(scene)
+    if "cameras" not in given:
+        kind = _kind_for(scene, settings, given, own)
+        return settings_for(scene, replace(settings, cameras=kind), {*given, "cameras"})
+    derived = _DERIVED[settings.cameras](scene, settings, given, own)
+    return replace(settings, **{name: derived[name] for name in derived.keys() - given})
+
+
+def views_of(scene: mi.Scene, settings: CaptureSettings) -> list[CaptureView]:
+    """All pictures with their cameras, split after split; settings: of :func:`settings_for`."""
+    if settings.cameras == "sensors":
+        return views_of_sensors(own_cameras(scene), settings)
+    if settings.cameras == "inside":
+        return views_inside(scene, settings)
+    return views_around(settings, *target_and_distance(scene, settings))
+
+
+# ----------------------------------------------------------------------------------------------
+# What follows from the scene
+# ----------------------------------------------------------------------------------------------
+
+
+def _kind_for(
+    scene: mi.Scene, settings: CaptureSettings, given: Set[str], own: list[OwnCamera]
+) -> str:
+    """One of :data:`KINDS`."""
+    if given & ORBITING:
+        return "around"
+    if len(own) >= ENOUGH_SENSORS and not given & {*COUNTS, "target", "up", "fov"}:
+        return "sensors"
+    if not _room(scene, settings).is_closed:
+        return "around"
+    author_is_inside = any(_look_around(scene, [o.center for o in own])[0] >= CLOSED)
+    if not author_is_inside and _is_lit(scene, replace(settings, cameras="around"), given):
+        return "around"
+    return "inside" if _is_lit(scene, replace(settings, cameras="inside"), given) else "around"
+
+
+def _is_lit(scene: mi.Scene, settings: CaptureSettings, given: Set[str]) -> bool:
+    """Whether light reaches most of what surfaces cover in a few small pictures of this kind."""
+    settings = settings_for(scene, settings, {*given, "cameras"})
+    few = replace(
+        settings, size=PREVIEW_SIZE, spp=PREVIEW_SPP, views=PREVIEWS, val_views=0, test_views=0
+    )
+    camera = CaptureCamera(scene, few)
+    return lit_part(np.stack([camera.picture(view) for view in views_of(scene, few)])) >= MOST
+
+
+def _around(
+    scene: mi.Scene, settings: CaptureSettings, given: Set[str], own: list[OwnCamera]
+) -> dict[str, object]:
+    """As the scene's own sensors look at it."""
+    if not own:
+        return {}
+    derived = {"up": _up(own)}
+    middle = np.mean(bounding_box(scene), axis=0, dtype=np.float64)
+    ahead = [(o.center, -o.pose[:3, 2]) for o in own]
+    seen = [c + ((middle - c) @ axis) * axis for c, axis in ahead if (middle - c) @ axis > 0]
+    if not seen or given & {"fov", "distance"}:
+        return derived
+    target = np.mean(seen, axis=0) if settings.target is None else np.array(settings.target)
+    distance = float(np.median([np.linalg.norm(o.center - target) for o in own]))
+    fov = _fov(settings, float(np.median([o.narrower_fov for o in own])))
+    return derived | {"target": tuple(target.tolist()), "distance": distance, "fov": fov}
+
+
+def _inside(
+    scene: mi.Scene, settings: CaptureSettings, given: Set[str], own: list[OwnCamera]
+) -> dict[str, object]:
+    """What is looked at is where there is most room."""
+    _refuse_unused(settings, given & {"distance"})
+    spot = tuple(_room(scene, settings).spot.tolist())
+    derived = {"target": spot, "fov": _fov(settings, INSIDE_FOV)}
+    return derived | {"up": _up(own)} if own else derived
+
+
+def _sensors(
+    scene: mi.Scene, settings: CaptureSettings, given: Set[str], own: list[OwnCamera]
+) -> dict[str, object]:
+    """As many pictures as there are sensors."""
+    _refuse_unused(settings, given & {*COUNTS, *ORBITING, "target", "up", "fov"})
+    if not own:
+        raise UserError(
+            "--cameras sensors: the scene has no sensor of type perspective or thinlens; leave the "
+            "option out"
+        )
+    tests = len(own[::TEST_EVERY]) if len(own) > 1 else 0
+    return {"views": len(own) - tests, "val_views": 0, "test_views": tests}
+
+
+_DERIVED = {"around": _around, "inside": _inside, "sensors": _sensors}
+
+
+def _refuse_unused(settings: CaptureSettings, names: Set[str]) -> None:
+    for name in sorted(names):
+        option = f"--{name.replace('_', '-')}"
+        raise UserError(f"{option}: is not used with --cameras {settings.cameras}; leave it out")
+
+
+def _up(own: list[OwnCamera]) -> str:
+    """The axis that is nearest to what is up in the sensors' pictures, such as ``z`` or ``-y``."""
+    up = np.mean([o.pose[:3, 1] for o in own], axis=0)
+    axis = int(np.argmax(np.abs(up)))
+    return f"{'-' if up[axis] < 0 else ''}{'xyz'[axis]}"
+
+
+def _fov(settings: CaptureSettings, narrower: float) -> float:
+    """Radians, horizontal, from the field of view along the picture's smaller side."""
+    width, height = settings.size
+    if height >= width:
+        return narrower
+    return 2 * math.atan(width / height * math.tan(narrower / 2))
+
+
+@dataclass(frozen=True, eq=False)
+class _Room:
+    """The place with most room, among those with something in most directions, if there are any."""
+
+    spot: np.ndarray  # (3,) world
+    is_closed: bool
+
+
+def _room(scene: mi.Scene, settings: CaptureSettings) -> _Room:
+    low, high = np.array(bounding_box(scene), np.float64)
+    if settings.target is not None:
+        spots = np.array([settings.target])
+        if not ((low < spots[0]) & (spots[0] < high)).all():
+            return _Room(spots[0], is_closed=False)
+    else:
+        steps = np.arange(NUM_SPOTS)[:, None] * PLASTIC ** -np.arange(1.0, 4.0)
+        spots = low + (high - low) * ((0.5 + steps) % 1)
+    closed, room = _look_around(scene, spots)
+    is_closed = closed >= CLOSED
+    best = np.argmax(np.where(is_closed, room, -1)) if is_closed.any() else np.argmax(closed)
+    return _Room(spots[best], bool(is_closed.any()))
+
+
+def _look_around(scene: mi.Scene, spots: object) -> tuple[np.ndarray, np.ndarray]:
+    """Of (N, 3) places, (N,) the part of all directions with a surface, and the room around.
+
+    A surface that is seen from behind does not count: that is what is inside an object.
+    """
+    spots = np.array(spots, np.float64).reshape(-1, 3)
+    up = hemisphere(NUM_DIRECTIONS // 2, 0.0, np.random.default_rng(0))
+    directions = np.concatenate([up, -up])
+    pairs = np.repeat(spots, len(directions), axis=0), np.tile(directions, (len(spots), 1))
+    distances, is_front = _free_way(scene, *pairs)
+    shape = len(spots), len(directions)
+    room = np.quantile(distances.reshape(shape), CLEARANCE, axis=1, method="lower")
+    return is_front.reshape(shape).mean(axis=1), room
+
+
+def _free_way(
+    scene: mi.Scene, origins: np.ndarray, directions: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """(N,) distances to the first surface, lamps included, infinite where there is none.
+
+    And (N,) bool: whether there is one, and it reflects or transmits on the side that is seen.
+    """
+    if not len(origins):
+        return np.empty(0), np.empty(0, bool)
+    hit = scene.ray_intersect(mi.Ray3f(mi.Point3f(origins.T), mi.Vector3f(directions.T)))
+    side = dr.select(hit.wi.z > 0, int(mi.BSDFFlags.FrontSide), int(mi.BSDFFlags.BackSide))
+    is_front = hit.is_valid() & ((hit.bsdf().flags() & side) != 0)
+    return np.array(hit.t, np.float64), np.array(is_front)
+
+
+# ----------------------------------------------------------------------------------------------
+# Cameras
+# ----------------------------------------------------------------------------------------------
+
+
+def target_and_distance(scene: mi.Scene, settings: CaptureSettings) -> tuple[np.ndarray, float]:
+    """What cameras around a scene look at, (3,) world, and their distance from it.
+
+    Without ``distance``, the bounding box's sphere just fits between the edges of the picture:
+    radius / sin(fov / 2), with the narrower field of view. The original's 4.03 is 10% less: its box
+    has empty corners.
+    """
+    low, high = bounding_box(scene)
+    target = (low + high) / 2 if settings.target is None else np.array(settings.target)
+    diagonal = float(np.linalg.norm(high - low))
+    distance = settings.distance
+    if distance is None:
+        distance = diagonal / 2 / math.sin(settings.narrower_fov / 2)
+    if math.dist(target.tolist(), ((low + high) / 2).tolist()) + distance > FAR_CLIP * diagonal:
+        raise UserError(
+            f"no camera may be farther from the scene than {FAR_CLIP:g} of its diagonals, "
+            f"{FAR_CLIP * diagonal:g}; got target {target.tolist()} and distance {distance:g}"
+        )
+    return target, distance
+
+
+def views_around(
+    settings: CaptureSettings, target: np.ndarray, distance: float
+) -> list[CaptureView]:
+    """From all sides, at one distance from what is looked at."""
+    return _views(settings, target, lambda directions: np.full(len(directions), distance))
+
+
+def views_inside(scene: mi.Scene, settings: CaptureSettings) -> list[CaptureView]:
+    """From between ``settings.target`` and what is around it, looking at it."""
+    target = np.array(settings.target)
+    low, high = np.array(bounding_box(scene), np.float64)
+    if not ((low < target) & (target < high)).all():
+        raise UserError(
+            f"target must lie within the scene's bounding box, {low.tolist()} to {high.tolist()}, "
+            f"for cameras inside it, got {target.tolist()}"
+        )
+
+    def distances(directions: np.ndarray) -> np.ndarray:
+        with np.errstate(divide="ignore"):
+            leaving = (np.where(directions > 0, high, low) - target) / directions
+        leaving = np.where(directions == 0, np.inf, leaving).min(axis=1)
+        way, _ = _free_way(scene, np.tile(target, (len(directions), 1)), directions)
+        return INSIDE_PART * np.minimum(way, leaving)
+
+    return _views(settings, target, distances)
+
+
+def views_of_sensors(own: list[OwnCamera], settings: CaptureSettings) -> list[CaptureView]:
+    """From where the scene's own sensors are."""
+    is_test = [settings.test_views > 0 and n % TEST_EVERY == 0 for n in range(len(own))]
+    views = []
+    for split, wanted in (("train", False), ("test", True)):
+        chosen = [o for o, test in zip(own, is_test, strict=True) if test == wanted]
+        views += [
+            CaptureView(split, index, o.pose, _fov(settings, o.narrower_fov))
+            for index, o in enumerate(chosen)
+        ]
+    return views
+
+
+def _views(
+    settings: CaptureSettings,
+    target: np.ndarray,
+    distances: Callable[[np.ndarray], np.ndarray],
+) -> list[CaptureView]:
+    """Cameras that look at ``target``; distances: from it, (N,), in directions (N, 3)."""
+    views = []
+    up = _axis(settings.up)
+    for number, split in enumerate(SPLITS):
+        rng = np.random.default_rng([settings.seed, number])
+        # Test views lie evenly; training views at random, but without gaps.
+        jitter = 0.0 if split == "test" else 1.0
+        directions = within(hemisphere(settings.count(split), jitter, rng), settings)
+        directions = np.roll(directions, "zxy".index(settings.up[-1]), axis=1) * up.sum()
+        for index, (direction, distance) in enumerate(
+            zip(directions, distances(directions), strict=True)
+        ):
+            pose = look_at(target + distance * direction, target, up) @ OPENCV_TO_OPENGL
+            views.append(CaptureView(split, index, pose, settings.fov))
+    return views
+
+
+def _axis(name: str) -> np.ndarray:
+    """(3,) unit: ``x`` to ``z``, or their opposites, such as ``-y``."""
+    return np.eye(3)["xyz".index(name[-1])] * (-1 if name.startswith("-") else 1)
+
+
+def within(directions: np.ndarray, settings: CaptureSettings) -> np.ndarray:
+    """Directions (N, 3) of the upper hemisphere about z, moved evenly into the settings' ranges."""
+    elevation = settings.elevation or ELEVATIONS[settings.cameras]
+    if settings.azimuth is None and elevation == ELEVATIONS["around"]:
+        return directions
+    low, high = np.sin(np.radians(elevation))
+    height = low + (high - low) * directions[:, 2]
+    turn = (np.arctan2(directions[:, 1], directions[:, 0]) / (2 * math.pi)) % 1
+    first, last = np.radians(settings.azimuth or (0.0, 360.0))
+    azimuth = first + (last - first) * turn
+    radius = np.sqrt(np.maximum(1 - height**2, 0))
+    return np.stack([radius * np.cos(azimuth), radius * np.sin(azimuth), height], axis=1)
+
+
+def hemisphere(count: int, jitter: float, rng: np.random.Generator) -> np.ndarray:
+    """(count, 3): unit vectors with z > 0, of equal density per solid angle.
+
+    A golden-angle spiral from the rim to the pole: equal steps of height are equal areas (the
+    sphere's hat-box theorem). ``jitter`` 1 moves each within its own step, 0 not at all; ``rng``
+    turns the whole spiral.
+    """
+    step = np.arange(count)
+    offset = rng.uniform(0, 2 * math.pi)
+    moved = jitter * rng.uniform(-0.5, 0.5, (2, count))
+    height = (step + 0.5 + moved[0]) / max(count, 1)
+    azimuth = offset + GOLDEN_ANGLE * (step + moved[1])
+    radius = np.sqrt(1 - height**2)
+    return np.stack([radius * np.cos(azimuth), radius * np.sin(azimuth), height], axis=1)

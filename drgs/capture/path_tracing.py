@@ -1,0 +1,415 @@
+"""Pictures of a Mitsuba scene, path traced, as a dataset.
+
+Where the cameras stand is the business of ``drgs.capture.camera_placement``.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import math
+import sys
+import traceback
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from types import ModuleType
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from drgs.cameras.axes import OPENGL_TO_MITSUBA
+from drgs.core.errors import UserError, one_line, reason_of_mitsuba
+from drgs.io.pictures import read_image, to_uint8
+from drgs.io.scenes import load_scene_dictionary, load_scene_file
+
+NERF_SYNTHETIC_FOV = 0.6911112070083618
+"""Radians: the original's ``camera_angle_x``."""
+
+SPLITS = ("train", "val", "test")
+
+PATHS_PER_PASS = 2**24
+"""Paths traced at once, at most: their state takes a few hundred MiB."""
+
+SAMPLES_PER_PASS = 64
+"""Per pixel, a square: they are stratified together (8x8 multi-jittered), which leaves about half
+the noise variance of as many independent ones."""
+
+NEAR_CLIP, FAR_CLIP = 1e-5, 1e5
+"""Of the bounding box's diagonal."""
+
+DARK = 2
+"""Levels of 255: no channel of a black pixel is lighter."""
+
+MAX_LAMPS_IN_A_ROW = 16
+"""Surfaces that shine are passed through on the way to the first hit, this many at most."""
+
+
+LIMITS = {
+    "views": (1, 100_000),
+    "val_views": (0, 100_000),
+    "test_views": (0, 100_000),
+    "spp": (1, 2**20),
+    "max_depth": (1, 2**16),
+    "points": (0, 5_000_000),
+    "seed": (0, 2**64 - 1),
+}
+"""By name of the setting, its smallest and largest value."""
+
+
+@dataclass(frozen=True)
+class CaptureSettings:
+    """What the pictures depend on, beside the scene."""
+
+    views: int = 100  # to train on
+    val_views: int = 0
+    test_views: int = 25
+    size: tuple[int, int] = (400, 400)  # px, width and height
+    spp: int = 256  # paths per pixel
+    max_depth: int = 8  # segments of a path
+    fov: float = NERF_SYNTHETIC_FOV  # radians, horizontal
+    distance: float | None = None  # of the cameras from the target; None: all is in the picture
+    target: tuple[float, float, float] | None = None  # None: centre of the bounding box
+    up: str = "z"
+    points: int = 100_000
+    seed: int = 0
+    cameras: str = "around"  # one of drgs.capture.camera_placement.KINDS
+    azimuth: tuple[float, float] | None = None  # degrees about up; None: all around
+    elevation: tuple[float, float] | None = None  # degrees; None: as the kind of cameras has it
+
+    def __post_init__(self) -> None:
+        for name, (least, most) in LIMITS.items():
+            value = getattr(self, name)
+            if not least <= value <= most:
+                raise UserError(f"{name} must be between {least} and {most:,}, got {value}")
+        width, height = self.size
+        if min(width, height) < 1 or width * height > PATHS_PER_PASS:
+            raise UserError(
+                f"size must be at least 1 x 1 and at most {PATHS_PER_PASS:,} px in all, got "
+                f"{width} x {height}"
+            )
+        if not 0 < self.fov < math.pi:
+            raise UserError(f"fov must be between 0 and pi (radians), got {self.fov:g}")
+        if self.distance is not None and not 0 < self.distance < math.inf:
+            raise UserError(f"distance must be > 0, got {self.distance:g}")
+        if self.target is not None and not np.isfinite(self.target).all():
+            raise UserError(f"target must be finite, got {self.target}")
+        for name, turn in (("azimuth", 360), ("elevation", 90)):
+            low, high = getattr(self, name) or (0, 0)
+            if not -turn <= low <= high <= turn:
+                raise UserError(
+                    f"{name} must be two angles in rising order between -{turn} and {turn} "
+                    f"degrees, got {low:g} and {high:g}"
+                )
+
+    @property
+    def narrower_fov(self) -> float:
+        """Radians: the smaller one of the horizontal and the vertical field of view."""
+        width, height = self.size
+        if height >= width:
+            return self.fov
+        return 2 * math.atan(height / width * math.tan(self.fov / 2))
+
+    @property
+    def hides_lights(self) -> bool:
+        """Whether what shines is left out: of an object's studio it is, of a room it is not."""
+        return self.cameras != "inside"
+
+    def count(self, split: str) -> int:
+        """Number of views of a split."""
+        return {"train": self.views, "val": self.val_views, "test": self.test_views}[split]
+
+
+@dataclass(frozen=True, eq=False)
+class CaptureView:
+    """One picture to take."""
+
+    split: str
+    index: int
+    pose: np.ndarray  # (4, 4) float64 camera to world, OpenGL axes: x right, y up, z backward
+    fov: float  # radians, horizontal
+
+    @property
+    def file_path(self) -> str:
+        """As the transforms file names it, without the suffix."""
+        return f"./{self.split}/r_{self.index}"
+
+
+def picture_path(out: Path, view: CaptureView) -> Path:
+    """Where a picture is written."""
+    return out / f"{view.file_path}.png"
+
+
+def load_scene(path: Path) -> mi.Scene:
+    """The scene that an XML or a Python file describes.
+
+    Raises :class:`UserError` where it describes none, or one of another variant than the active.
+    """
+    variant = mi.variant()
+    if path.suffix == ".py":
+        try:
+            description = _scene_dictionary(path)
+        finally:
+            other = mi.variant()
+            mi.set_variant(variant)
+        if other != variant:
+            raise UserError(
+                f"{path}: must leave Mitsuba's variant at {variant}, got mi.set_variant("
+                f"{other!r}); choose a variant with --variant"
+            )
+        mi.file_resolver().append(str(path.parent.resolve()))
+    try:
+        if path.suffix == ".py":
+            scene = load_scene_dictionary(description, path)
+        else:
+            scene = load_scene_file(path)
+    except UserError:
+        raise
+    except (RuntimeError, ValueError, TypeError, AttributeError) as error:
+        raise UserError(
+            f"{path}: Mitsuba cannot load the scene: {reason_of_mitsuba(error)}"
+        ) from None
+    if not isinstance(scene, mi.Scene):
+        raise UserError(f"{path}: must describe a scene, got a {type(scene).__name__}")
+    return scene
+
+
+def _scene_dictionary(path: Path) -> dict[str, object]:
+    """What ``scene()`` of a Python file returns."""
+    try:
+        function = getattr(_import(path), "scene", None)
+        if not callable(function):
+            raise UserError(f"{path}: must define a function scene() that returns a dictionary")
+        description = function()
+    except UserError:
+        raise
+    except (Exception, SystemExit) as error:
+        lines = [
+            f.lineno for f in traceback.extract_tb(error.__traceback__) if f.filename == str(path)
+        ]
+        if isinstance(error, SyntaxError):
+            lines = [error.lineno]
+        line = f":{lines[-1]}" if lines else ""
+        raise UserError(f"{path}{line}: {type(error).__name__}: {one_line(error)}") from None
+    if not isinstance(description, dict) or description.get("type") != "scene":
+        raise UserError(f'{path}: scene() must return a dictionary with "type": "scene"')
+    return description
+
+
+def _import(path: Path) -> ModuleType:
+    name = f"drgs_capture_scene_{path.stem}"
+    spec = importlib.util.spec_from_file_location(name, path)
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module  # dataclasses look their module up
+    # As for a script: its neighbours can be imported.
+    sys.path.insert(0, str(path.parent.resolve()))
+    spec.loader.exec_module(module)
+    return module
+
+
+def bounding_box(scene: mi.Scene) -> tuple[np.ndarray, np.ndarray]:
+    """(3,) lowest and highest coordinates of the surfaces that do not shine."""
+    boxes = [shape.bbox() for shape in scene.shapes() if not shape.is_emitter()]
+    corners = np.array([[box.min, box.max] for box in boxes if box.valid()]).reshape(-1, 2, 3)
+    if not len(corners):
+        raise UserError("the scene has no surfaces that cameras could see (lights are hidden)")
+    low, high = corners[:, 0].min(axis=0), corners[:, 1].max(axis=0)
+    if not 0 < np.linalg.norm(np.float64(high) - low) < math.inf:
+        raise UserError(f"the scene's bounding box must have a size, got {low} to {high}")
+    return low, high
+
+
+class CaptureCamera:
+    """Takes pictures of a scene with one Mitsuba sensor that is moved around."""
+
+    def __init__(self, scene: mi.Scene, settings: CaptureSettings) -> None:
+        self._scene, self._settings = scene, settings
+        low, high = bounding_box(scene)
+        diagonal = float(np.linalg.norm(high - low))
+        self._integrator = mi.load_dict(
+            {
+                "type": "path",
+                "max_depth": settings.max_depth,
+                "hide_emitters": settings.hides_lights,
+            }
+        )
+        self._sensor = mi.load_dict(
+            {
+                "type": "perspective",
+                "fov_axis": "x",
+                "fov": math.degrees(settings.fov),
+                # Rays start at the near plane: nothing in front of a camera is left out.
+                "near_clip": NEAR_CLIP * diagonal,
+                "far_clip": FAR_CLIP * diagonal,
+                "film": {
+                    "type": "hdrfilm",
+                    "width": settings.size[0],
+                    "height": settings.size[1],
+                    "pixel_format": "rgba",
+                    "component_format": "float32",
+                    "rfilter": {"type": "box"},
+                },
+                "sampler": {"type": "multijitter"},
+            }
+        )
+        self._parameters = mi.traverse(self._sensor)
+        self._fov = settings.fov
+
+    def picture(self, view: CaptureView) -> np.ndarray:
+        """(H, W, 4) uint8: straight alpha, colour in display space."""
+        linear = self.linear(view)
+        if not np.isfinite(linear).all():
+            y, x = np.argwhere(~np.isfinite(linear).all(axis=2))[0]
+            raise UserError(f"{view.file_path}: the light at pixel x {x}, y {y} is not finite")
+        return encode(linear)
+
+    def linear(self, view: CaptureView) -> np.ndarray:
+        """(H, W, 4) float64: radiance times alpha, and alpha."""
+        to_world = view.pose @ OPENGL_TO_MITSUBA
+        self._parameters["to_world"] = mi.Transform4f(to_world)
+        if view.fov != self._fov:
+            self._parameters["x_fov"] = mi.Float(math.degrees(view.fov))
+            self._fov = view.fov
+        self._parameters.update()
+        (width, height), spp = self._settings.size, self._settings.spp
+        at_once = min(SAMPLES_PER_PASS, math.isqrt(PATHS_PER_PASS // (width * height)) ** 2)
+        counts = [min(at_once, spp - start) for start in range(0, spp, at_once)]
+        entropy = [self._settings.seed, SPLITS.index(view.split), view.index]
+        seeds = np.random.SeedSequence(entropy).generate_state(len(counts))
+        total = np.zeros((height, width, 4))
+        with _only_errors_logged():
+            for count, seed in zip(counts, seeds, strict=True):
+                image = mi.render(
+                    self._scene,
+                    sensor=self._sensor,
+                    integrator=self._integrator,
+                    seed=int(seed),
+                    spp=count,
+                )
+                total += count * np.array(image, np.float64)
+        return total / spp
+
+
+@contextmanager
+def _only_errors_logged() -> Iterator[None]:
+    """Mitsuba would say for each pass that its sampler rounds the number of paths up."""
+    logger = mi.logger()
+    level = logger.log_level()
+    logger.set_log_level(mi.LogLevel.Error)
+    try:
+        yield
+    finally:
+        logger.set_log_level(level)
+
+
+def encode(linear: np.ndarray) -> np.ndarray:
+    """(H, W, 4) uint8 straight sRGB and alpha, from premultiplied linear radiance and alpha.
+
+    Light beyond white is cut off. Where alpha rounds to zero the colour is black, not noise.
+    """
+    alpha = np.clip(linear[:, :, 3:], 0, 1)
+    color = np.clip(linear[:, :, :3] / np.maximum(alpha, 1e-9), 0, 1)
+    display = np.where(color <= 0.0031308, 12.92 * color, 1.055 * color ** (1 / 2.4) - 0.055)
+    rgba = to_uint8(np.concatenate([display, alpha], axis=2))
+    rgba[rgba[:, :, 3] == 0] = 0
+    return rgba
+
+
+def lit_part(rgba: np.ndarray) -> float:
+    """Of the covered pixels of (..., 4) uint8: the part that is not black; 0 without any."""
+    covered = rgba[..., 3] > 0
+    lit = covered & (rgba[..., :3].max(axis=-1) > DARK)
+    return float(lit.sum() / max(1, covered.sum()))
+
+
+SIGHT_RAYS = 64
+"""Through each picture, along both sides: what falls between them is smaller than a fit can use."""
+
+
+def require_sight(scene: mi.Scene, settings: CaptureSettings, views: list[CaptureView]) -> None:
+    """Raise :class:`UserError` where no training view sees a surface, of which points are wanted.
+
+    Before pictures are taken: it would be found out after all of them.
+    """
+    if not settings.points:
+        return
+    train = [view for view in views if view.split == "train"]
+    steps = (np.arange(SIGHT_RAYS) + 0.5) / SIGHT_RAYS
+    spots = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2) * settings.size
+    for view in train:
+        rays = view.pose[:3, 3], view_rays(view, spots, settings)
+        if first_hits(scene, *rays, settings.hides_lights)[1].any():
+            return
+    raise UserError("the cameras see nothing of the scene: give --target and --distance")
+
+
+def visible_points(
+    scene: mi.Scene, settings: CaptureSettings, views: list[CaptureView], out: Path
+) -> tuple[np.ndarray, np.ndarray]:
+    """First hits of random rays: positions (N, 3) float32 world, colours (N, 3) uint8.
+
+    Each training view has the same share of ``settings.points``, spread evenly over what is
+    covered of its picture; the colour is that of the pixel in the written picture. None (N = 0)
+    where the few paths of a pixel met nothing.
+    """
+    train = [view for view in views if view.split == "train"]
+    positions, colors = [np.empty((0, 3), np.float32)], [np.empty((0, 3), np.uint8)]
+    for number, view in enumerate(train):
+        share = (number + 1) * settings.points // len(train) - number * settings.points // len(
+            train
+        )
+        rng = np.random.default_rng([settings.seed, len(SPLITS), view.index])
+        picture = _taken(picture_path(out, view), settings).reshape(-1, 4)
+        weights = picture[:, 3].astype(np.float64)
+        if not weights.any():
+            continue
+        # At the edge of a surface a ray can miss it, so draw more than are kept.
+        pixels = rng.choice(len(picture), 2 * share + 64, p=weights / weights.sum())
+        rows, columns = np.divmod(pixels, settings.size[0])
+        spots = np.stack([columns, rows], axis=1) + rng.uniform(size=(len(pixels), 2))
+        rays = view.pose[:3, 3], view_rays(view, spots, settings)
+        hits, valid = first_hits(scene, *rays, settings.hides_lights)
+        positions.append(hits[valid][:share])
+        colors.append(to_uint8(picture[pixels[valid], :3])[:share])
+    return np.concatenate(positions), np.concatenate(colors)
+
+
+def _taken(path: Path, settings: CaptureSettings) -> np.ndarray:
+    """(H, W, 4) float32: a picture of this capture, as it was written."""
+    picture = read_image(path)
+    width, height = settings.size
+    if picture.shape != (height, width, 4):
+        raise UserError(
+            f"{path}: must be an RGBA picture of {width} x {height} px of this capture, got "
+            f"{picture.shape[1]} x {picture.shape[0]} with {picture.shape[2]} channels; remove it, "
+            "and the same command takes it again"
+        )
+    return picture
+
+
+def view_rays(view: CaptureView, spots: np.ndarray, settings: CaptureSettings) -> np.ndarray:
+    """(N, 3): unit directions, world, through (N, 2) places x, y in px of a picture."""
+    width, height = settings.size
+    focal = 0.5 * width / math.tan(0.5 * view.fov)
+    offset = (spots - np.array([width / 2, height / 2])) / focal
+    local = np.stack([offset[:, 0], -offset[:, 1], -np.ones(len(spots))], axis=1)
+    directions = local @ view.pose[:3, :3].T
+    return directions / np.linalg.norm(directions, axis=1, keepdims=True)
+
+
+def first_hits(
+    scene: mi.Scene, origin: np.ndarray, directions: np.ndarray, past_lamps: bool
+) -> tuple[np.ndarray, np.ndarray]:
+    """(N, 3) float32 world, where rays meet a surface; (N,) bool if any.
+
+    past_lamps: whether surfaces that shine do not count.
+    """
+    ray = mi.Ray3f(mi.Point3f(origin), mi.Vector3f(directions.T))
+    for _ in range(MAX_LAMPS_IN_A_ROW):
+        hit = scene.ray_intersect(ray)
+        lamp = hit.is_valid() & hit.shape.is_emitter() & past_lamps
+        if not dr.any(lamp):
+            break
+        ray = dr.select(lamp, hit.spawn_ray(ray.d), ray)
+    return np.array(hit.p).T, np.array(hit.is_valid() & ~lamp)

@@ -1,0 +1,194 @@
+"""Cameras on a circle around what was photographed, or around Gaussians."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from drgs.config.schema import NEAR_LIMITS, REFERENCE_NEAR
+from drgs.core.errors import UserError
+from drgs.datasets.focus import focus_of
+from drgs.datasets.types import Viewpoint
+from drgs.datasets.viewpoints import look_at, near_one, pinhole, shown
+from drgs.gaussians.parameters import Gaussians
+
+ELEVATION = math.radians(30)
+"""Of an orbit around Gaussians whose cameras are unknown."""
+
+
+LENGTHS = np.finfo(np.float32).tiny, 1e9
+"""Scene units, from which and up to which a distance is taken from standard deviations."""
+
+
+MAX_ELEVATION = math.radians(80)
+"""Beyond this an orbit is a spin on the spot."""
+
+
+ORBIT_SIZE = 400
+"""px: the longer side of an orbit's pictures, at most."""
+
+
+OPAQUE = 0.5
+"""Gaussians with at least this opacity decide where an orbit without cameras looks."""
+
+
+SPREAD = 0.98
+"""Part of those Gaussians that such an orbit keeps in the picture; the rest may be outliers."""
+
+
+LARGEST_GAP = math.radians(100)
+"""Azimuth that may lie between two neighbouring cameras of a capture from all sides: behind
+anything larger is what no photograph shows."""
+
+
+AMPLITUDE = 0.8
+"""Of the cameras' own arc, for the sway of an orbit that must not go all the way round."""
+
+
+NEAR_RANGE, NEAR_SHARE = (0.01, 0.5), 0.1
+"""Shares of the median distance of Gaussians from their middle: where the reference's plane suits
+them, and what does where it does not."""
+
+
+TILT_WEIGHT = 1e-3
+"""Weight of the mean of the cameras' up vectors where their right vectors leave ``up`` open."""
+
+
+@dataclass(frozen=True, eq=False)
+class Orbit:
+    """A closed path around ``focus`` at constant height, all of whose cameras look at it.
+
+    The azimuth runs all the way round (``half_arc`` None), or sways by ``half_arc`` about its
+    start: there and back again, where the scene was photographed from one side only.
+    """
+
+    focus: np.ndarray  # (3,) world
+    up: np.ndarray  # (3,) unit, world: the axis of rotation
+    start: np.ndarray  # (3,) unit, world, perpendicular to up: from the focus to azimuth zero
+    radius: float  # world units: distance of the cameras to the focus
+    elevation: float  # radians above the plane through the focus
+    half_arc: float | None  # radians
+
+    def viewpoints(self, count: int, width: int, height: int, fov: float) -> list[Viewpoint]:
+        """``count`` cameras in equal steps of time; fov: degrees, horizontal."""
+        side = np.cross(self.up, self.start)
+        views = []
+        for index in range(count):
+            phase = 2 * math.pi * index / count
+            azimuth = phase if self.half_arc is None else self.half_arc * math.sin(phase)
+            level = math.cos(azimuth) * self.start + math.sin(azimuth) * side
+            offset = math.cos(self.elevation) * level + math.sin(self.elevation) * self.up
+            pose = look_at(self.focus + self.radius * offset, self.focus, self.up)
+            views.append(pinhole(f"orbit_{index:03d}", pose, width, height, fov))
+        return views
+
+
+def orbit_of_views(views: Sequence[Viewpoint], gaussians: Gaussians) -> Orbit:
+    """The orbit at the cameras' mean height and median distance around what they look at.
+
+    Where their optical axes meet nowhere, what they look at is the middle of ``gaussians``.
+    """
+    centers = np.stack([view.center for view in views])
+    try:
+        focus, radius = focus_of(views)
+    except UserError:
+        focus = _middle(gaussians)[0]
+        radius = float(np.median(np.linalg.norm(centers - focus, axis=1)))
+    up = up_of(views)
+    start, side = _level_axes(up, (centers - focus).mean(axis=0))
+    offsets = centers - focus
+    distances = np.maximum(np.linalg.norm(offsets, axis=1), np.finfo(np.float64).tiny)
+    elevation = float(np.mean(np.arcsin(np.clip(offsets @ up / distances, -1, 1))))
+    middle, half_arc = _covered_arc(np.arctan2(offsets @ side, offsets @ start))
+    return Orbit(
+        focus=focus,
+        up=up,
+        start=math.cos(middle) * start + math.sin(middle) * side,
+        radius=radius,
+        elevation=float(np.clip(elevation, -MAX_ELEVATION, MAX_ELEVATION)),
+        half_arc=half_arc,
+    )
+
+
+def orbit_of_gaussians(gaussians: Gaussians, up: np.ndarray, fov: float) -> Orbit:
+    """The orbit from which all but outliers of the opaque Gaussians are in a square picture.
+
+    up: (3,) world, any length; fov: degrees.
+    """
+    up = np.asarray(up, np.float64)
+    length = np.linalg.norm(near_one(up))
+    if not length > 0:
+        raise UserError(f"camera: up must not be zero, got {shown(up)}")
+    focus, spread = _middle(gaussians)
+    up = near_one(up) / length
+    start, _ = _level_axes(up, np.array([0.0, -1.0, 0.0]))
+    radius = spread / math.sin(math.radians(fov) / 2)
+    return Orbit(focus, up, start, radius, ELEVATION, half_arc=None)
+
+
+def near_plane_of(gaussians: Gaussians) -> float:
+    """The near plane, scene units, for Gaussians of which no fit says one."""
+    size, (low, high) = _middle(gaussians, share=0.5)[1], NEAR_RANGE
+    if low * size <= REFERENCE_NEAR <= high * size:
+        return REFERENCE_NEAR
+    return float(np.clip(NEAR_SHARE * size, *NEAR_LIMITS))
+
+
+def up_of(views: Sequence[Viewpoint]) -> np.ndarray:
+    """(3,) unit: the world's up direction, as the photographers held their cameras.
+
+    Minimises mean((r_i . u)^2) over unit vectors, r_i the cameras' right vectors: a camera that
+    is tilted but not rolled keeps it horizontal. A small term draws u to the mean of the cameras'
+    own up vectors, which decides where the right vectors are parallel, and the sign.
+    """
+    right = np.stack([view.camera_to_world[:3, 0] for view in views])
+    mean_up = np.mean([-view.camera_to_world[:3, 1] for view in views], axis=0)
+    matrix = right.T @ right / len(views) - TILT_WEIGHT * np.outer(mean_up, mean_up)
+    up = np.linalg.eigh(matrix)[1][:, 0]
+    return up if up @ mean_up >= 0 else -up
+
+
+def orbit_size(views: Sequence[Viewpoint]) -> tuple[int, int]:
+    """Width and height in px: the shape of the first photograph, at most 400 px on either side."""
+    first = views[0]
+    scale = min(1.0, ORBIT_SIZE / max(first.width, first.height))
+    return max(1, round(scale * first.width)), max(1, round(scale * first.height))
+
+
+def _middle(gaussians: Gaussians, share: float = SPREAD) -> tuple[np.ndarray, float]:
+    """(3,) the median position of the opaque Gaussians, and the distance within which a share is.
+
+    Where they all are at one place, the distance is the largest standard deviation.
+    """
+    g = gaussians.numpy()
+    means = g.means.astype(np.float64)
+    opaque = means[g.opacities >= OPAQUE]
+    means = opaque if len(opaque) else means
+    middle = np.median(means, axis=0)
+    distance = float(np.quantile(np.linalg.norm(means - middle, axis=1), share))
+    return middle, distance or float(np.clip(g.scales.max(), *LENGTHS))
+
+
+def _level_axes(up: np.ndarray, towards: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Two unit vectors that complete ``up``: the level part of ``towards``, and up x that."""
+    level = towards - (towards @ up) * up
+    if np.linalg.norm(level) <= 1e-6 * np.linalg.norm(towards):
+        level = np.eye(3)[np.argmin(np.abs(up))]
+        level = level - (level @ up) * up
+    level = level / np.linalg.norm(level)
+    return level, np.cross(up, level)
+
+
+def _covered_arc(azimuths: np.ndarray) -> tuple[float, float | None]:
+    """Where an orbit starts, and how far it may sway: None if there are cameras all around."""
+    azimuths = np.sort(azimuths)
+    gaps = np.diff(azimuths, append=azimuths[0] + 2 * math.pi)
+    widest = int(np.argmax(gaps))
+    if gaps[widest] <= LARGEST_GAP:
+        return 0.0, None
+    arc = 2 * math.pi - gaps[widest]
+    first = azimuths[(widest + 1) % len(azimuths)]
+    return float(first + arc / 2), float(AMPLITUDE * arc / 2)

@@ -1,0 +1,196 @@
+"""Views to train on and views to measure on, where a dataset specifies them.
+
+Lists are those of ``transforms.json`` (``train_filenames``, ``val_filenames``, ``test_filenames``,
+as nerfstudio has them), and those of ``train.txt``, ``val.txt`` and ``test.txt`` beside COLMAP's
+model or in the dataset's folder, a name a line: the 3DGS reference reads ``sparse/0/test.txt``.
+Photographs that all lie in folders ``train`` and ``test`` or ``val`` are listed by these.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from drgs.config.schema import DataConfig
+from drgs.core.errors import UserError, did_you_mean, listed, one_line
+from drgs.core.files import read_text
+from drgs.datasets.file_names import LEAST_SHARE, PICTURE_FOLDERS, key_of, parts_of, stem_of
+
+SPLITS = ("train", "val", "test")
+
+MAX_BYTES = 1 << 26
+"""Largest list of names."""
+
+
+@dataclass(frozen=True)
+class Lists:
+    """Names of the photographs of each split."""
+
+    names: Mapping[str, Collection[str]]  # by SPLITS: those of frames; at least one
+    where: str  # for the description: what has the lists
+
+
+@dataclass(frozen=True)
+class Split:
+    """Indices of views."""
+
+    train: Sequence[int]
+    test: Sequence[int]
+    name: str  # of what ``test`` is
+    how: str  # it was chosen, for the description
+
+
+def listed_frames(
+    source: Path, key: str, listing: Sequence[str], names: Sequence[str], notes: list[str]
+) -> set[str]:
+    """Return the ``names``, which frames have, that a list has.
+
+    source, key: of the list, for messages. A name may differ in its suffix, in case and by the
+    folder of the photographs, where only one frame has such a name.
+
+    Raises :class:`UserError` where fewer than half of a list are names of frames.
+    """
+    found, unknown = _matched(listing, names)
+    if len(unknown) > (1 - LEAST_SHARE) * len(listing):
+        raise UserError(
+            f"{source}: {key} must list the photographs of frames, but {len(unknown):,} of its "
+            f"{len(listing):,} names are not theirs: {listed(unknown)}"
+            f"{did_you_mean(unknown[0], names)}"
+        )
+    if unknown:
+        notes.append(f"{source}: {key} has names that no frame has: {listed(unknown)}")
+    return found
+
+
+def _matched(listing: Sequence[str], names: Sequence[str]) -> tuple[set[str], list[str]]:
+    """Return the ``names`` that a list has, and what it has besides, for messages."""
+    exact = {"/".join(parts_of(name)): name for name in names}
+    loose: dict[str, set[str]] = {}
+    for name in names:
+        loose.setdefault(_loose(name), set()).add(name)
+    found, unknown = set(), []
+    for name in listing:
+        same = exact.get("/".join(parts_of(name)))
+        candidates = loose.get(_loose(name), set()) if same is None else {same}
+        if len(candidates) == 1:
+            found |= candidates
+        else:
+            unknown.append(one_line(name, 100))
+    return found, unknown
+
+
+def _loose(name: str) -> str:
+    """Without the picture's suffix and the folder of photographs, in any case."""
+    parts = [key_of(part) for part in parts_of(name)] or [""]
+    if len(parts) > 1 and parts[0] in PICTURE_FOLDERS:
+        del parts[0]
+    return "/".join([*parts[:-1], stem_of(parts[-1])])
+
+
+def lists_in_files(folders: Sequence[Path], names: Sequence[str], notes: list[str]) -> Lists | None:
+    """Read the lists in the first of ``folders`` with ``test.txt``, ``val.txt`` or ``train.txt``.
+
+    A file that has no name of a frame is another's: a note says that it is not read. Other files
+    that may be lists are noted as well, where there is none.
+    """
+    for folder in folders:
+        found = {}
+        for split in SPLITS:
+            if (file := folder / f"{split}.txt").is_file():
+                lines = map(str.strip, read_text(file, "list of names", MAX_BYTES).split("\n"))
+                listing = [line for line in lines if line and not line.startswith("#")]
+                if _matched(listing, names)[0]:
+                    found[split] = listed_frames(folder, file.name, listing, names, notes)
+                else:
+                    notes.append(f"{file}: lists no photograph, and is not read")
+        if found:
+            return Lists(found, " and ".join(f"{split}.txt" for split in found))
+    suffixes = (".json", ".txt", ".csv")
+    for file in sorted(f for f in folders[-1].glob("*split*") if f.suffix in suffixes):
+        notes.append(
+            f"{file}: is not read; test.txt can list what is to be measured on, a name a line"
+        )
+    return None
+
+
+def lists_by_folders(names: Sequence[str]) -> Lists | None:
+    """Return lists where each photograph lies in a folder of a split, not all in ``train``."""
+    found: dict[str, set[str]] = {}
+    for name in names:
+        folders = [part for part in map(key_of, parts_of(name)[:-1]) if part in SPLITS]
+        if not folders:
+            return None
+        found.setdefault(folders[-1], set()).add(name)
+    return Lists(found, "folders") if len(found) > 1 and "train" in found else None
+
+
+def split_of(
+    config: DataConfig, source: Path, lists: Lists | None, names: Sequence[str], notes: list[str]
+) -> Split:
+    """How views of frames called ``names``, in this order, are to train on and to measure on.
+
+    Without lists, those at indices 0, n, 2n, ... are to measure on, n being ``data.test_every``.
+    Raises :class:`UserError` where there is no split as configured, nothing to train or to measure
+    on, or a photograph for both.
+    """
+    if len(names) < 2:
+        raise UserError(
+            f"{source}: at least 2 views are needed, one of them to test; got {len(names)}"
+        )
+    if lists is None:
+        return _every_nth(config, source, len(names))
+    name = _measured(config, source, lists)
+    train, test = _members(lists, name, set(names))
+    both = sorted(train & test)
+    if both and name != "train":
+        raise UserError(
+            f"{source}: a photograph must be either to train or to measure on, but {lists.where} "
+            f"have {len(both):,} in both train and {name}: {one_line(listed(both))}; take them out "
+            "of one"
+        )
+    for split, members in (("train", train), (name, test)):
+        if not members:
+            raise UserError(
+                f"{source}: at least 1 view of the split {split} is needed, and {lists.where} "
+                "leave none"
+            )
+    left = [n for n in names if n not in set().union(train, test, *lists.names.values())]
+    if left:
+        notes.append(
+            f"{source}: left out, as no list has them ({lists.where}): {len(left):,} of "
+            f"{len(names):,} photographs ({listed(left)})"
+        )
+    trained, measured = ([i for i, n in enumerate(names) if n in m] for m in (train, test))
+    return Split(trained, measured, name, f"split {name}, by {lists.where}")
+
+
+def _measured(config: DataConfig, source: Path, lists: Lists) -> str:
+    """The split to measure on."""
+    name = config.test_split
+    if name is None:
+        return "val" if "val" in lists.names and "test" not in lists.names else "test"
+    if name not in (*lists.names, "train"):
+        there = " and ".join(lists.names)
+        raise UserError(f"{source}: there is no split {name}, only {there}; set data.test_split")
+    return name
+
+
+def _members(lists: Lists, name: str, names: set[str]) -> tuple[set[str], set[str]]:
+    """Divide ``names`` into those to train on and to measure on; without a list, all others."""
+    for_others = [chosen for split, chosen in lists.names.items() if split != "train"]
+    train = names.intersection(lists.names.get("train", names.difference(*for_others)))
+    if name == "train":
+        return train, train
+    return train, names.intersection(lists.names.get(name, names - train))
+
+
+def _every_nth(config: DataConfig, source: Path, num_views: int) -> Split:
+    if config.test_split not in (None, "test"):
+        raise UserError(
+            f"{source}: this layout has no split {config.test_split}; leave data.test_split out "
+            "(data.test_every chooses the test views)"
+        )
+    n = config.test_every
+    train = [index for index in range(num_views) if index % n]
+    return Split(train, range(0, num_views, n), "test", f"every {n}th by file name")

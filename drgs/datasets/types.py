@@ -1,0 +1,140 @@
+"""Cameras, photographs and datasets: what every loader returns."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, TypeVar
+
+import numpy as np
+
+from drgs.core.constants import SHUTTER_SAMPLES
+from drgs.core.origin import WORLD, Origin
+from drgs.datasets.lazy_image import Pixels
+
+if TYPE_CHECKING:
+    from drgs.cameras.camera import Lens
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """Of a camera while its shutter was open."""
+
+    close_to_world: np.ndarray  # (4, 4) float64, OpenCV axes: where the camera was in the end
+    shutter: str  # global: all pixels were open all the time; rolling: row after row
+    samples: int = SHUTTER_SAMPLES  # global: times at which the picture is rendered
+
+
+@dataclass(frozen=True, eq=False)
+class Viewpoint:
+    """A camera in the world, and the size of its picture."""
+
+    name: str  # unique among those rendered together; a file name without folders or suffix
+    camera_to_world: np.ndarray  # (4, 4) float64, rigid, OpenCV axes: x right, y down, z forward
+    fx: float  # px
+    fy: float  # px
+    cx: float  # px; pixel centres are at (i + 0.5, j + 0.5)
+    cy: float  # px
+    width: int  # px
+    height: int  # px
+    lens: Lens | None = None  # with numbers of the host; None: a pinhole
+    motion: Motion | None = None  # while the shutter is open; None: the camera does not move
+
+    @property
+    def center(self) -> np.ndarray:
+        """(3,) position of the camera, world."""
+        return self.camera_to_world[:3, 3]
+
+    @property
+    def K(self) -> np.ndarray:  # noqa: N802
+        """(3, 3) float64: camera coordinates to homogeneous pixel coordinates."""
+        return np.array([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1]], np.float64)
+
+    @property
+    def viewmat(self) -> np.ndarray:
+        """(4, 4) float64, world to camera, OpenCV axes: what ``drgs.rasterization`` takes."""
+        rotation = self.camera_to_world[:3, :3].T
+        viewmat = np.eye(4)
+        viewmat[:3] = np.column_stack([rotation, -rotation @ self.center])
+        return viewmat
+
+    def moved(self: V, offset: np.ndarray) -> V:
+        """The same camera with ``offset`` (3,) added to its position."""
+        if not np.any(offset):
+            return self
+        motion = self.motion
+        if motion is not None:
+            motion = replace(motion, close_to_world=_translated(motion.close_to_world, offset))
+        return replace(
+            self, camera_to_world=_translated(self.camera_to_world, offset), motion=motion
+        )
+
+
+V = TypeVar("V", bound=Viewpoint)
+
+
+def _spread(views: Sequence[Viewpoint]) -> float:
+    centers = np.stack([view.center for view in views])
+    distances = np.linalg.norm(centers - centers.mean(axis=0), axis=1)
+    return float(1.1 * distances.max())
+
+
+def _translated(pose: np.ndarray, offset: np.ndarray) -> np.ndarray:
+    pose = pose.copy()
+    pose[:3, 3] += offset
+    return pose
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class View(Viewpoint):
+    """One photograph and the camera that took it; its pictures become arrays by ``np.asarray``."""
+
+    image: Pixels  # (height, width, 3) float32, display space 0..1, opaque
+    alpha: Pixels | None = None  # (height, width) float32: how opaque the picture was
+    mask: Pixels | None = None  # (height, width) float32: 1 where a pixel counts, else 0
+    depth: Pixels | None = None  # (height, width) float32, scene units; 0 where not known
+    files: Mapping[str, Path] = field(default_factory=dict)  # it was read from: image, mask, depth
+
+
+Keeps = Callable[[str], bool]
+"""Whether the pictures of the view of this name are read; of others there are sizes."""
+
+
+def all_of_them(name: str) -> bool:
+    """Read the pictures of all views."""
+    del name
+    return True
+
+
+@dataclass(frozen=True, eq=False)
+class Dataset:
+    """Views to train on and views to measure on."""
+
+    train: tuple[View, ...]
+    test: tuple[View, ...]
+    test_split: str  # name of the split that ``test`` is
+    background: tuple[float, float, float]  # display space, what the images were composited over
+    start_half_extent: float | None  # of the layout's own start box [-h, h]^3; None: it has none
+    description: str  # one line: what was read, and what was assumed
+    ignored: tuple[str, ...] = ()  # that frames have and the configuration leaves out: see extras
+    rendered: bool = False  # the pictures are another renderer's, not photographs
+    point_cloud: Path | None = None  # that the dataset names, to start from: a PLY file
+    origin: Origin = WORLD  # world: what the positions of the views are relative to
+
+    @property
+    def extent(self) -> float:
+        """Scale of the scene: 1.1 x the largest distance of a train camera from their centroid.
+
+        As the 3DGS reference defines it (``getNerfppNorm``). Of all cameras where those of the
+        train views share a centre; 1 where all do.
+        """
+        return _spread(self.train) or _spread((*self.train, *self.test)) or 1.0
+
+    def relative_to(self, origin: Origin) -> Dataset:
+        """The same views with positions relative to ``origin``, world."""
+        offset = np.subtract(self.origin, origin)
+        train, test = (
+            tuple(view.moved(offset) for view in views) for views in (self.train, self.test)
+        )
+        return replace(self, train=train, test=test, origin=origin)

@@ -1,0 +1,112 @@
+"""Colours of points from the pictures that see them.
+
+A picture sees a point if no other point is clearly nearer to its camera at about the same place: in
+a picture of depths (a z-buffer) whose pixels are as wide as the points are apart. Points on a
+surface that turns away from the camera hide each other there, so that pictures count that look onto
+it. Of the colours that a point has in its pictures, the middle half is averaged: the rest may be a
+highlight, or what hides the point.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from drgs.core.denormals import denormals_kept
+from drgs.datasets.types import View
+from drgs.initialization.film import is_projectable, to_camera, to_film
+
+MOST_VIEWS, LEAST_VIEWS = 60, 8
+"""Whose pictures are looked at: most points are seen by a third of them."""
+
+MOST_BYTES = 1 << 27
+"""Of colours that are kept at once: of a million points, fewer views are looked at."""
+
+PIXEL, BEHIND = 1.5, 1.5
+"""Of the points' distance to each other: a pixel of the depths, and how far behind what is nearest
+in there a point is still seen. In smaller pixels, points are seen through gaps of a surface."""
+
+OPAQUE = 0.5
+"""Alpha: what is less opaque has mostly the colour of what is behind it."""
+
+SORTED_AT_ONCE = 1 << 13
+"""Points."""
+
+
+def colors_from_pictures(
+    points: np.ndarray,
+    spacing: np.ndarray,
+    views: Sequence[View],
+    background: tuple[float, float, float],
+) -> np.ndarray | None:
+    """(N, 3) float32, display space 0..1; None: no picture shows any of the points.
+
+    points: (N, 3) world; spacing: (N,) scene units, of each to its neighbours; background: what the
+    pictures were composited over, display space. A point that no picture sees gets the colour of
+    the nearest one that is seen.
+    """
+    views = [view for view in views if is_projectable(view)]
+    most = max(LEAST_VIEWS, min(MOST_VIEWS, MOST_BYTES // (12 * len(points))))
+    views = views[:: -(-len(views) // most) or 1]
+    samples = np.full((len(views), len(points), 3), np.inf, np.float32)
+    columns = [np.ascontiguousarray(c, np.float64) for c in np.asarray(points).T]
+    for view, sample in zip(views, samples, strict=True):
+        rows, colors = _seen(view, columns, spacing, background)
+        sample[rows] = colors
+    colors = np.concatenate(
+        [_middle(samples[:, k : k + SORTED_AT_ONCE]) for k in range(0, len(points), SORTED_AT_ONCE)]
+    )
+    unseen = np.isnan(colors[:, 0])
+    if unseen.all():
+        return None
+    if unseen.any():
+        with denormals_kept():
+            _, nearest = cKDTree(points[~unseen]).query(points[unseen])
+        colors[unseen] = colors[~unseen][nearest]
+    return colors
+
+
+def _seen(
+    view: View,
+    columns: Sequence[np.ndarray],
+    spacing: np.ndarray,
+    background: tuple[float, float, float],
+) -> tuple[np.ndarray, np.ndarray]:
+    """Points (indices) that the picture shows opaque, and their colours (M, 3) float32, 0..1."""
+    u, v, depth = to_film(view, to_camera(view, columns))
+    on_film = (depth > 0) & (u >= 0) & (u < view.width) & (v >= 0) & (v < view.height)
+    rows = np.flatnonzero(on_film)
+    if not len(rows):
+        return rows, np.empty((0, 3), np.float32)
+    u, v, depth = u[rows], v[rows], depth[rows]
+    pixel = max(1.0, PIXEL * view.fx * float(np.median(spacing[rows] / depth)))
+    place = np.floor(v / pixel).astype(np.int64) * (int(view.width / pixel) + 1)
+    place += np.floor(u / pixel).astype(np.int64)
+    nearest = np.full(place.max() + 1, np.inf)
+    np.minimum.at(nearest, place, depth)
+    seen = depth <= nearest[place] + BEHIND * spacing[rows]
+    rows, at = rows[seen], (v[seen].astype(np.int64), u[seen].astype(np.int64))
+    colors, opaque = np.asarray(view.image)[at], np.ones(len(rows), bool)
+    if view.alpha is not None:
+        alpha = np.asarray(view.alpha)[at][:, None]
+        opaque = alpha[:, 0] >= OPAQUE
+        behind = (1 - alpha) * np.asarray(background, np.float32)
+        colors = (colors - behind) / np.maximum(alpha, OPAQUE)
+    if view.mask is not None:
+        opaque &= np.asarray(view.mask)[at] > 0
+    return rows[opaque], np.clip(colors[opaque], 0, 1)
+
+
+def _middle(samples: np.ndarray) -> np.ndarray:
+    """(N, 3): means of the middle half of (V, N, 3), channel by channel; NaN: there are none.
+
+    inf: not a sample. Of n, floor(n / 4) are left out at either end.
+    """
+    ordered, count = np.sort(samples, axis=0), np.isfinite(samples[:, :, 0]).sum(axis=0)
+    rank, left_out = np.arange(len(samples))[:, None], count // 4
+    kept = (rank >= left_out) & (rank < count - left_out)
+    total = np.where(kept[:, :, None], ordered, 0).sum(axis=0, dtype=np.float64)
+    with np.errstate(invalid="ignore"):
+        return (total / kept.sum(axis=0)[:, None]).astype(np.float32)

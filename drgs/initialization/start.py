@@ -1,0 +1,294 @@
+"""The Gaussians that a fit starts from: on a visual hull, of a point cloud, or at random points."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from drgs.config.schema import FitConfig, InitConfig
+from drgs.core.constants import SH_C0
+from drgs.core.denormals import denormals_kept
+from drgs.core.errors import UserError
+from drgs.datasets.types import Dataset
+from drgs.gaussians.parameters import Gaussians
+from drgs.initialization.defaults import completed
+from drgs.initialization.start_box import (
+    FARTHEST,
+    LEAST_LOOKING,
+    box_looked_at,
+    box_to_start_in,
+    focus_of,
+    num_looking,
+    points_in_view,
+    shown,
+    where_they_look,
+)
+from drgs.io.ply import read_points
+
+if TYPE_CHECKING:
+    from drgs.initialization.visual_hull import Silhouette
+
+MIN_SPACING = 2.5e-4
+"""Smallest first scale, for points that coincide, relative to the median distance of points from
+their middle. The 3DGS reference has 3.2e-4 world units, for scenes of about that size."""
+
+NUM_NEIGHBOURS = 3
+
+POINTS_OF_COLMAP = ("points3D.bin", "points3D.txt")
+"""Names of files that hold not only positions and colours."""
+
+
+@dataclass(frozen=True, eq=False)
+class Start:
+    """Where a fit starts."""
+
+    means: np.ndarray  # (N, 3) world
+    colors: np.ndarray | None  # (N, 3) display space 0..1; None: not known
+    description: str  # what they are, for the user
+
+
+def initial_gaussians(config: FitConfig, dataset: Dataset) -> Gaussians:
+    """Gaussians at iteration 0, numpy float32, with the SH degree of ``config.model``.
+
+    At the points of :func:`start_of`, with the opacity and the scale of ``config.init``.
+    """
+    config = completed(config, dataset)
+    return replace(gaussians_at(start_of(config, dataset), config), origin=dataset.origin)
+
+
+def gaussians_at(start: Start, config: FitConfig) -> Gaussians:
+    """Those of :func:`initial_gaussians`."""
+    init, degree = config.init, config.model.sh_degree
+    return gaussians_from_points(start.means, start.colors, init.opacity, degree, init.scale)
+
+
+def start_of(config: FitConfig, dataset: Dataset) -> Start:
+    """The points that a fit starts from, as ``config.init`` says. The same seed gives the same.
+
+    config: completed.
+
+    By default: ``init.point_cloud``; else uniform in [-h, h]^3 with ``init.half_extent``; else on
+    the visual hull, where nearly all pictures are partly transparent; else the point cloud that the
+    dataset names; else uniform in a box that follows from the layout and the cameras
+    (``drgs.initialization.start_box``). Points on the hull, and those of a cloud without
+    colours, are coloured from the pictures. Where masks contradict each other, the
+    description says so, and the fit starts as without them.
+
+    Raises :class:`UserError` for points that the cameras do not see, and for masks or a point cloud
+    that are asked for and not there.
+    """
+    init, note = config.init, ""
+    is_open = init.start == "auto" and init.point_cloud is None and init.half_extent is None
+    if init.start == "masks" or (is_open and any(v.alpha is not None for v in dataset.train)):
+        from drgs.initialization.visual_hull import are_masks, silhouettes_of
+
+        silhouettes = silhouettes_of(dataset.train)
+        if are_masks(silhouettes, dataset.train):
+            if (start := _on_the_hull(config, dataset, silhouettes)) is not None:
+                _check_unfiltered(init, start.description)
+                return start
+            note = f" (the masks of {len(silhouettes)} pictures have no hull to start from)"
+        elif init.start == "masks":
+            raise UserError(
+                "init.start: masks needs nearly all training pictures to be transparent where "
+                f"there is nothing, but {_transparent(silhouettes, dataset)}; cut out what is to "
+                "be fitted, or set init.start=auto"
+            )
+    cloud = _cloud_of(init, dataset)
+    if cloud is None or cloud.name not in POINTS_OF_COLMAP:
+        _check_unfiltered(init, "random points" if cloud is None else str(cloud))
+    start = _random_points(config, dataset) if cloud is None else _of_cloud(config, dataset, cloud)
+    return replace(start, description=start.description + note)
+
+
+def description_of_start(config: FitConfig, start: Start) -> str:
+    """What a fit starts from and where its near plane is, one line; config: completed."""
+    return f"starts from {start.description}; near plane at {config.model.near:g}"
+
+
+def _cloud_of(init: InitConfig, dataset: Dataset) -> Path | None:
+    """The file that a fit starts from; None: random points."""
+    if init.start == "random":
+        return None
+    if init.point_cloud is not None or init.half_extent is not None:
+        return init.point_cloud
+    if init.start == "points" and dataset.point_cloud is None:
+        raise UserError(
+            "init.start: points needs a point cloud, and the dataset names none that may be used "
+            "(ply_file_path, data.ignore_points); give init.point_cloud, or set init.start=auto"
+        )
+    return dataset.point_cloud
+
+
+def _check_unfiltered(init: InitConfig, start: str) -> None:
+    """Raise :class:`UserError` where COLMAP's points are to be filtered; start: what is used."""
+    for name in ("max_point_error", "min_track_length"):
+        if getattr(init, name) is not None:
+            raise UserError(
+                f"init.{name}: only COLMAP's points ({' or '.join(POINTS_OF_COLMAP)}) say that, "
+                f"and the fit starts from {start}; leave it out"
+            )
+
+
+def _on_the_hull(
+    config: FitConfig, dataset: Dataset, silhouettes: Sequence[Silhouette]
+) -> Start | None:
+    """On the visual hull of the masks; None: they have none."""
+    from drgs.initialization.visual_hull import hull_points
+
+    try:
+        box = box_to_start_in(config.init, dataset) or box_looked_at(dataset.train)
+    except UserError:
+        if config.init.half_extent is not None:
+            raise
+        return None
+    means = hull_points(silhouettes, box, config.init.num_points, config.seed)
+    if len(means) <= NUM_NEIGHBOURS:
+        return None
+    what = f"{len(means):,} points on the hull of {len(silhouettes)} masks"
+    return _coloured(Start(means.astype(np.float32), None, what), dataset)
+
+
+def _of_cloud(config: FitConfig, dataset: Dataset, cloud: Path) -> Start:
+    """The points of a file."""
+    means, colors, num_read = _read_cloud(config.init, cloud)
+    means = (means - dataset.origin).astype(np.float32)
+    if colors is not None and not np.any(colors):
+        colors = None  # all black: what is written where no colours were found out
+    _check_cloud(cloud, means, config.densify.max_gaussians, dataset)
+    kept = "the" if len(means) == num_read else f"{len(means):,} of {num_read:,}"
+    start = Start(means, colors, f"{kept} points of {cloud}")
+    return _coloured(start, dataset) if colors is None else start
+
+
+def _read_cloud(init: InitConfig, cloud: Path) -> tuple[np.ndarray, np.ndarray | None, int]:
+    """Positions (N, 3) float64, world, colours (N, 3) float32, 0..1, and the number read."""
+    if cloud.name not in POINTS_OF_COLMAP:
+        positions, colors = read_points(cloud)
+        return positions, colors, len(positions)
+    from drgs.io.colmap import read_points3d
+
+    points = read_points3d(cloud)
+    kept = np.ones(len(points.errors), bool)
+    if init.max_point_error is not None:
+        kept &= points.errors <= init.max_point_error
+    if init.min_track_length is not None:
+        kept &= points.track_lengths >= init.min_track_length
+    if len(kept) and not kept.any():
+        raise UserError(
+            f"{cloud}: init.max_point_error and init.min_track_length leave none of "
+            f"{len(kept):,} points (their errors are {points.errors.min():.3g} to "
+            f"{points.errors.max():.3g} px, and {points.track_lengths.min():,} to "
+            f"{points.track_lengths.max():,} images observe them); set other ones"
+        )
+    positions, colors = points.positions[kept], points.colors[kept]
+    return positions, colors / np.float32(255), len(kept)
+
+
+def _random_points(config: FitConfig, dataset: Dataset) -> Start:
+    """In a box, or in what the cameras see."""
+    init, rng = config.init, np.random.default_rng(config.seed)
+    box = box_to_start_in(init, dataset)
+    if box is not None:
+        what = f"{init.num_points:,} random points in {box}"
+        return Start(box.points(init.num_points, rng), None, what)
+    means = points_in_view(dataset.train, init.num_points, rng)
+    focus, distance = focus_of(dataset.train)
+    near = f"about within {distance:.3g} of {shown(focus, distance)}"
+    far = f"the others up to {FARTHEST:g} times as far"
+    what = f"{init.num_points:,} random points that the cameras see, part of them {near}, {far}"
+    return Start(means, None, what)
+
+
+def _coloured(start: Start, dataset: Dataset) -> Start:
+    """With the colours that the pictures show, if they show any of the points."""
+    from drgs.initialization.point_colors import colors_from_pictures
+
+    spacing = np.sqrt(mean_squared_neighbour_distance(start.means))
+    colors = colors_from_pictures(start.means, spacing, dataset.train, dataset.background)
+    if colors is None:
+        return start
+    return replace(start, colors=colors, description=f"{start.description}, coloured")
+
+
+def _transparent(silhouettes: Sequence[Silhouette], dataset: Dataset) -> str:
+    """How many of the pictures are, for a message."""
+    from drgs.initialization.visual_hull import LEAST_TRANSPARENT, looked_at, num_transparent
+
+    return (
+        f"only {num_transparent(silhouettes)} of {len(looked_at(dataset.train))} are to "
+        f"{100 * LEAST_TRANSPARENT:g} % or more, from a camera that stands still"
+    )
+
+
+def gaussians_from_points(
+    means: np.ndarray,
+    colors: np.ndarray | None,
+    opacity: float,
+    sh_degree: int,
+    scale: float = 1.0,
+) -> Gaussians:
+    """Isotropic Gaussians at ``means`` (N, 3), N >= 4, as large as the gaps between them.
+
+    The standard deviation is ``scale`` times the root mean square distance to the 3 nearest other
+    points, which is that of the 3DGS reference (``distCUDA2``). ``colors`` (N, 3) in display space
+    0..1; None: grey. Identity rotations; SH coefficients above degree 0 are zero.
+    """
+    num = len(means)
+    means = np.ascontiguousarray(means, np.float32)
+    colors = np.full((num, 3), 0.5) if colors is None else colors
+    spacing = np.sqrt(mean_squared_neighbour_distance(means))
+    spacing = np.maximum(spacing, MIN_SPACING * _size_of(means))
+    log_scales = np.repeat(np.log(scale * spacing)[:, None], 3, axis=1)
+    sh0 = (np.asarray(colors, np.float64) - 0.5) / SH_C0
+    return Gaussians(
+        means=means,
+        quats=np.tile(np.array([1, 0, 0, 0], np.float32), (num, 1)),
+        log_scales=log_scales.astype(np.float32),
+        logit_opacities=np.full(num, np.log(opacity / (1 - opacity)), np.float32),
+        sh0=sh0.astype(np.float32)[:, None, :],
+        shN=np.zeros((num, (sh_degree + 1) ** 2 - 1, 3), np.float32),
+    )
+
+
+def _size_of(points: np.ndarray) -> float:
+    """The median distance of points (N, 3) from their middle, or the largest where that is 0."""
+    points = points.astype(np.float64)
+    distances = np.linalg.norm(points - np.median(points, axis=0), axis=1)
+    return float(np.median(distances) or distances.max())
+
+
+def mean_squared_neighbour_distance(points: np.ndarray) -> np.ndarray:
+    """(N,) float64: mean squared distance of each of (N, 3) points to the 3 nearest others."""
+    # SciPy divides points by the number next to the least. If that is taken for zero, it divides
+    # points with a coordinate of zero for ever, until the stack ends.
+    with denormals_kept():
+        distances, _ = cKDTree(points).query(points, k=NUM_NEIGHBOURS + 1)
+    # The nearest is the point itself, or one at the same place: at distance 0 either way.
+    return np.mean(distances[:, 1:] ** 2, axis=1)
+
+
+def _check_cloud(file: Path, points: np.ndarray, max_gaussians: int, dataset: Dataset) -> None:
+    """Refuse a cloud (N, 3) of too few or too many points, or that is not what is photographed."""
+    num, views = len(points), dataset.train
+    if num <= NUM_NEIGHBOURS:
+        raise UserError(f"{file}: at least {NUM_NEIGHBOURS + 1} points, got {num}")
+    if (points == points[0]).all():
+        raise UserError(f"{file}: its {num:,} points must not all be the same")
+    if num > max_gaussians:
+        raise UserError(
+            f"{file}: must hold at most densify.max_gaussians ({max_gaussians}) points, got {num}"
+        )
+    looking = num_looking(points, views)
+    if looking < LEAST_LOOKING * len(views):
+        raise UserError(
+            f"{file}: must hold what the cameras look at{where_they_look(dataset)}, in their frame "
+            f"of reference, but only {looking} of {len(views)} have any of its {num:,} points in "
+            "the middle of their pictures; give another init.point_cloud, or start from random "
+            "points (init.point_cloud=null, data.ignore_points=true)"
+        )

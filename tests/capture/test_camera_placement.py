@@ -1,0 +1,242 @@
+"""Where the cameras of a capture stand, if nobody says."""
+
+import math
+from dataclasses import replace
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from drgs.capture import camera_placement
+from drgs.capture.path_tracing import CaptureCamera, CaptureSettings, lit_part
+from drgs.core.errors import UserError
+
+
+@pytest.fixture(scope="module", autouse=True)
+def variant():
+    mi.set_variant("llvm_ad_rgb")
+
+
+def loaded(**parts):
+    return mi.load_dict({"type": "scene", **parts})
+
+
+TWO_SIDED = {"type": "twosided", "bsdf": {"type": "diffuse"}}
+
+ROOM = {"type": "cube", "bsdf": TWO_SIDED}
+"""Of side 2; the outer sides of its walls are the fronts."""
+
+LAMP = {
+    "type": "sphere",
+    "radius": 0.1,
+    "center": [0.3, 0.2, 0.7],
+    "emitter": {"type": "area", "radiance": 10.0},
+}
+SKY = {"type": "constant"}
+
+
+def sensor(origin, target, up=(0, 1, 0), fov=40.0, width=8, height=8):
+    to_world = mi.ScalarTransform4f().look_at(list(origin), list(target), list(up))
+    film = {"type": "hdrfilm", "width": width, "height": height, "rfilter": {"type": "box"}}
+    pose = {"to_world": to_world, "film": film, "sampler": {"type": "multijitter"}}
+    return {"type": "perspective", "fov": fov, **pose}
+
+
+def derived(scene, **given):
+    return camera_placement.settings_for(scene, CaptureSettings(**given), given.keys())
+
+
+def centers(scene, settings):
+    return np.array([view.pose[:3, 3] for view in camera_placement.views_of(scene, settings)])
+
+
+# Which kind
+
+
+def test_cornells_box_is_photographed_from_inside():
+    scene = mi.load_dict(mi.cornell_box())
+    settings = derived(scene, views=12, test_views=4, size=(16, 16), spp=4)
+    assert (settings.cameras, settings.up) == ("inside", "y")
+    assert math.degrees(settings.fov) == pytest.approx(70)
+    assert np.abs(centers(scene, settings)).max() < 1
+    camera = CaptureCamera(scene, settings)
+    for view in camera_placement.views_of(scene, settings):
+        picture = camera.picture(view)
+        assert lit_part(picture) > 0.8
+        # Its front is open, and a picture may look through it.
+        assert (picture[:, :, 3] > 0).mean() > 0.15
+
+
+def test_a_room_of_two_sided_walls_is_photographed_from_inside():
+    """No light comes out: from around, all is black."""
+    scene = loaded(room=ROOM, lamp=LAMP)
+    settings = derived(scene)
+    assert (settings.cameras, settings.up) == ("inside", "z")
+    assert (np.abs(centers(scene, settings)) < 1).all()
+
+
+def test_a_room_that_is_lit_outside_as_well_is_one_where_its_own_sensor_stands_inside():
+    parts = {"room": ROOM, "lamp": LAMP, "sky": SKY}
+    assert derived(loaded(**parts)).cameras == "around"
+    inside = sensor((0.5, 0, 0), (-1, 0, 0))
+    assert derived(loaded(**parts, sensor=inside)).cameras == "inside"
+
+
+@pytest.mark.parametrize("bsdf", [{"type": "diffuse"}, TWO_SIDED], ids=["one side", "two"])
+def test_an_object_is_photographed_from_around(bsdf):
+    """It is closed as a room is, but dark inside."""
+    settings = derived(loaded(ball={"type": "sphere", "bsdf": bsdf}, sky=SKY))
+    assert settings == CaptureSettings()
+
+
+def test_a_place_around_the_scene_that_is_given_is_kept():
+    scene = mi.load_dict(mi.cornell_box())
+    for given in ({"distance": 3.0}, {"azimuth": (-20.0, 20.0)}, {"elevation": (0.0, 20.0)}):
+        assert derived(scene, **given).cameras == "around"
+
+
+# Sensors of the scene
+
+
+def test_one_sensor_says_up_distance_target_and_field_of_view():
+    # It looks past the middle at (1.5, 2, 3); the film's smaller side spans 30 degrees.
+    seen_from = sensor((1.5, 2, 9), (1.5, 2, 3), fov=30.0, width=16)
+    seen_from["fov_axis"] = "smaller"
+    ball = {"type": "sphere", "center": [1, 2, 3]}
+    scene = loaded(ball=ball, sky=SKY, sensor=seen_from)
+    settings = derived(scene)
+    assert (settings.cameras, settings.up) == ("around", "y")
+    assert settings.target == pytest.approx((1.5, 2, 3), abs=1e-5)
+    assert settings.distance == pytest.approx(6, abs=1e-5)
+    assert math.degrees(settings.fov) == pytest.approx(30, abs=1e-4)
+    wide = derived(scene, size=(20, 10))
+    assert wide.narrower_fov == pytest.approx(settings.fov)
+    given = derived(scene, fov=0.5, up="x")
+    assert (given.fov, given.up, given.target, given.distance) == (0.5, "x", None, None)
+
+
+def test_up_may_point_down_the_axis():
+    scene = loaded(ball={"type": "sphere"}, sky=SKY, s=sensor((5, -1, 0), (0, 0, 0), (0, -1, 0)))
+    settings = derived(scene)
+    assert settings.up == "-y"
+    assert (centers(scene, settings)[:, 1] < 0).all()
+    for view in camera_placement.views_of(scene, settings):
+        assert view.pose[1, 1] < 0, "upside down"
+        assert np.linalg.det(view.pose[:3, :3]) == pytest.approx(1)
+
+
+def ring(count):
+    """Sensors around a ball, each with a field of view of its own."""
+    angles = 2 * np.pi * np.arange(count) / count
+    return {
+        f"sensor{k:02d}": sensor((4 * math.cos(a), 1.0, 4 * math.sin(a)), (0, 0, 0), fov=40.0 + k)
+        for k, a in enumerate(angles)
+    }
+
+
+BALL = {
+    "type": "sphere",
+    "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.05, 0.2, 0.6]}},
+}
+
+
+def test_many_sensors_take_the_pictures_themselves():
+    scene = loaded(ball=BALL, sky=SKY, **ring(17))
+    settings = derived(scene, size=(8, 8), spp=64)
+    assert (settings.cameras, settings.views, settings.test_views) == ("sensors", 14, 3)
+    views = camera_placement.views_of(scene, settings)
+    assert [view.split for view in views] == ["train"] * 14 + ["test"] * 3
+    assert [view.index for view in views] == [*range(14), *range(3)]
+    order = [n for n in range(17) if n % 8] + [0, 8, 16]
+    camera = CaptureCamera(scene, settings)
+    integrator = mi.load_dict({"type": "path", "hide_emitters": True})
+    for view, number in zip(views, order, strict=True):
+        assert math.degrees(view.fov) == pytest.approx(40 + number, abs=1e-4)
+        # By Mitsuba, through the sensor itself. At an edge, 64 samples in 8x8 strata err by 1/8 of
+        # the largest channel, 0.6, at most.
+        own = scene.sensors()[number]
+        shown = np.array(mi.render(scene, sensor=own, integrator=integrator, spp=64))
+        np.testing.assert_allclose(camera.linear(view)[:, :, :3], shown[:, :, :3], atol=0.075)
+
+
+@pytest.mark.parametrize("name", ["views", "test_views", "target", "distance", "fov", "azimuth"])
+def test_sensors_leave_nothing_to_be_placed(name):
+    values = {"views": 3, "test_views": 1, "target": (0.0, 0.0, 0.0), "distance": 2.0, "fov": 0.5}
+    value = values.get(name, (0.0, 1.0))
+    scene = loaded(ball=BALL, sky=SKY, **ring(12))
+    assert derived(scene, **{name: value}).cameras == "around"
+    with pytest.raises(UserError) as error:
+        derived(scene, cameras="sensors", **{name: value})
+    option = f"--{name.replace('_', '-')}"
+    assert str(error.value) == f"{option}: is not used with --cameras sensors; leave it out"
+
+
+def test_settings_that_do_not_go_together_are_refused():
+    scene = loaded(ball=BALL, sky=SKY)
+    with pytest.raises(UserError, match="--cameras sensors: the scene has no sensor of type"):
+        derived(scene, cameras="sensors")
+    with pytest.raises(UserError, match="--distance: is not used with --cameras inside"):
+        derived(scene, cameras="inside", distance=1.0)
+    outside = derived(scene, cameras="inside", target=(3.0, 0.0, 0.0))
+    with pytest.raises(UserError, match="target must lie within the scene's bounding box"):
+        camera_placement.views_of(scene, outside)
+
+
+# Where exactly
+
+
+def test_cameras_inside_stand_between_what_they_look_at_and_what_is_around():
+    scene = loaded(room=ROOM)
+    target = (0.4, -0.3, 0.1)
+    settings = derived(scene, cameras="inside", target=target, views=40, test_views=0)
+    for view in camera_placement.views_of(scene, settings):
+        offset = view.pose[:3, 3] - target
+        np.testing.assert_allclose(view.pose[:3, 2], offset / np.linalg.norm(offset), atol=1e-9)
+        # 60 % of the way to the wall behind.
+        assert np.abs(np.array(target) + offset / 0.6).max() == pytest.approx(1, abs=1e-5)
+
+
+@pytest.mark.parametrize("up", ["x", "y", "z", "-z"])
+def test_ranges_of_angles_are_kept_and_filled_evenly(up):
+    settings = CaptureSettings(
+        test_views=200, up=up, azimuth=(-30.0, 60.0), elevation=(-10.0, 40.0)
+    )
+    views = camera_placement.views_around(settings, np.array([1.0, 2.0, 3.0]), 2.0)[-200:]
+    offsets = np.array([(view.pose[:3, 3] - [1, 2, 3]) / 2 for view in views])
+    sign = -1 if up.startswith("-") else 1
+    axis = "xyz".index(up[-1])
+    level = sign * offsets[:, [(axis + 1) % 3, (axis + 2) % 3]]
+    azimuth = np.degrees(np.arctan2(level[:, 1], level[:, 0]))
+    height = sign * offsets[:, axis]
+    np.testing.assert_allclose(np.linalg.norm(offsets, axis=1), 1)
+    low, high = np.sin(np.radians([-10, 40]))
+    for values, first, last in ((azimuth, -30, 60), (height, low, high)):
+        assert values.min() >= first - 1e-9
+        assert values.max() <= last + 1e-9
+        # Each tenth of the range has a tenth of the cameras: the spiral leaves no gaps.
+        counts, _ = np.histogram(values, 10, (first, last))
+        assert np.abs(counts - 20).max() <= 2
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"azimuth": (30.0, -30.0)}, "azimuth must be two angles in rising order between -360"),
+        ({"elevation": (-91.0, 0.0)}, "elevation must be two angles in rising order between -90"),
+        ({"elevation": (0.0, math.nan)}, "elevation must be two angles"),
+    ],
+)
+def test_wrong_ranges_are_refused(given, message):
+    with pytest.raises(UserError, match=message):
+        CaptureSettings(**given)
+
+
+def test_the_whole_hemisphere_needs_no_range():
+    settings = CaptureSettings(views=7)
+    same = replace(settings, elevation=(0.0, 90.0))
+    for one, other in zip(
+        camera_placement.views_around(settings, np.zeros(3), 4.0),
+        camera_placement.views_around(same, np.zeros(3), 4.0),
+        strict=True,
+    ):
+        assert (one.pose == other.pose).all()

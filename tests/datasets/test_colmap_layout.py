@@ -1,0 +1,484 @@
+"""COLMAP's layout: models, pictures of several sizes, masks, lenses and points to start from."""
+
+import math
+
+import numpy as np
+import pytest
+from conftest import SHARED_DATA
+from drjit.llvm import Array3f64, Float64
+from PIL import Image
+from support.colmap_models import (
+    NAMES,
+    PARAMETERS,
+    WRITERS,
+    some_model,
+    write_binary,
+    write_dataset,
+    write_pictures,
+)
+from support.datasets import load, load_noting, refusal
+
+from drgs.cameras.camera import Camera, Pinhole
+from drgs.config.schema import FitConfig, InitConfig
+from drgs.core.errors import UserError
+from drgs.datasets.colmap import LENSES
+from drgs.datasets.images import is_scaled
+from drgs.datasets.mask_names import masks_of
+from drgs.initialization.defaults import completed
+from drgs.initialization.start import _read_cloud, start_of
+from drgs.io.colmap_records import MODELS
+
+REAL = SHARED_DATA / "colmap_robothead"
+
+
+def intrinsics(view):
+    return view.fx, view.fy, view.cx, view.cy, view.width, view.height
+
+
+@pytest.mark.parametrize("below", ["sparse/0", "sparse", "colmap/sparse/0"])
+@pytest.mark.parametrize("write", WRITERS.values(), ids=WRITERS)
+def test_views_have_poses_and_intrinsics_of_the_model(tmp_path, below, write):
+    model = write_dataset(tmp_path, below=below, write=write)
+    dataset = load(tmp_path, test_every=3)
+    assert [view.name for view in dataset.test] == ["a", "2"]
+    assert [view.name for view in dataset.train] == ["b", "1"]
+    poses = {name: pose for name, _, pose in model.images}
+    views = dict(
+        zip((NAMES[k] for k in (0, 3, 1, 2)), (*dataset.test, *dataset.train), strict=True)
+    )
+    for name, view in views.items():
+        np.testing.assert_allclose(view.camera_to_world, poses[name], atol=1e-14)
+        assert intrinsics(view) == (600, 620, 320.5, 239, 640, 480) and view.lens is None
+        level = np.asarray(view.image)[0, 0, 0] * 255
+        assert level == pytest.approx(40 * NAMES.index(name), abs=3)
+    assert "(COLMAP layout): 2 train views" in dataset.description
+    assert dataset.background == (0.0, 0.0, 0.0)
+
+
+def test_other_models_beside_the_first_are_named(tmp_path):
+    write_dataset(tmp_path)
+    assert "; model" not in load(tmp_path).description
+    for below in ("sparse/10", "sparse/2"):
+        write_dataset(tmp_path, below=below)
+    (tmp_path / "sparse" / "3").mkdir()
+    assert "; model sparse/0 (others are there: 2, 10)" in load(tmp_path).description
+
+
+def test_folders_may_be_called_in_another_case(tmp_path):
+    write_dataset(tmp_path)
+    (tmp_path / "images").rename(tmp_path / "Images")
+    write_pictures(tmp_path / "IMAGES_2", size=(320, 240))
+    assert load(tmp_path).train[0].files["image"].parent == tmp_path / "Images"
+    assert load(tmp_path, downscale=2).train[0].width == 320
+
+
+def test_the_pictures_own_size_decides_the_intrinsics(tmp_path):
+    write_dataset(tmp_path)
+    for factor in (2, 4):
+        write_pictures(tmp_path / f"images_{factor}", size=(640 // factor, 480 // factor))
+    for factor in (1, 2, 4):
+        view = load(tmp_path, downscale=factor).train[0]
+        expected = [value / factor for value in (600, 620, 320.5, 239, 640, 480)]
+        assert intrinsics(view) == pytest.approx(expected)
+    assert refusal(tmp_path, downscale=8).startswith(
+        f"data.downscale: {tmp_path} has the folders images, images_2, images_4, got 8"
+    )
+    # The smallest that are large enough, and from there to the width that is asked for.
+    for width, folder, factor in ((640, "images", 1), (320, "images_2", 2), (100, "images_4", 6.4)):
+        dataset = load(tmp_path, image_size=width)
+        assert f"pictures of {folder}" in dataset.description
+        assert dataset.train[0].width == width
+        assert dataset.train[0].fx == pytest.approx(600 / factor)
+
+
+def test_the_largest_pictures_there_are_may_be_smaller_than_what_is_asked_for(tmp_path):
+    write_dataset(tmp_path)
+    (tmp_path / "images").rename(tmp_path / "originals")
+    for factor in (4, 8):
+        write_pictures(tmp_path / f"images_{factor}", size=(640 // factor, 480 // factor))
+    assert load(tmp_path).train[0].width == 160
+
+
+@pytest.mark.parametrize("name", sorted(LENSES))
+def test_every_lens_that_can_be_rendered_is(tmp_path, name):
+    """Without undistorting; the coefficients are those of the file."""
+    write_dataset(tmp_path, [name])
+    view = load(tmp_path).train[0]
+    coefficients = dict(zip(MODELS[name][1], PARAMETERS[name], strict=True))
+    named = {k: v for k, v in coefficients.items() if k[0] in "kps"}
+    assert ({} if view.lens is None else view.lens.named()) == pytest.approx(named)
+    kind = None if view.lens is None else view.lens.kind
+    fisheye = "thin_prism_fisheye" if "PRISM" in name else "fisheye"
+    assert kind == (fisheye if "FISHEYE" in name else None if "PINHOLE" in name else "opencv")
+    assert load(tmp_path, ignore_distortion=True).train[0].lens is None
+
+
+def film_points(view, points):
+    """(N, 2) px: where (N, 3) points in camera axes are seen, in double precision."""
+    K = np.array([[view.fx, 0, view.cx], [0, view.fy, view.cy], [0, 0, 1]])
+    lens = Pinhole() if view.lens is None else view.lens
+    camera = Camera.create(Float64, np.eye(3), np.zeros(3), K, view.width, view.height, 0.1, lens)
+    return np.array(camera.lens.film_point(camera, Array3f64(points.T))).T
+
+
+@pytest.mark.parametrize("name", sorted(LENSES))
+def test_points_are_seen_where_colmap_projects_them(tmp_path, name):
+    """In double precision, over the picture and somewhat beyond, to a few roundings of 1,000 px."""
+    pycolmap = pytest.importorskip("pycolmap")
+    write_dataset(tmp_path, [name])
+    theirs = pycolmap.Camera(model=name, width=640, height=480, params=PARAMETERS[name])
+    points = np.random.default_rng(3).uniform((-0.7, -0.6, 1), (0.7, 0.6, 1), (50, 3))
+    points *= np.linspace(0.5, 9, 50)[:, None]
+    expected = theirs.img_from_cam(points)
+    ours = film_points(load(tmp_path).train[0], points)
+    np.testing.assert_allclose(ours, expected, rtol=0, atol=1e-11)
+
+
+@pytest.mark.skipif(not REAL.is_dir(), reason="the shared data folder is not here")
+def test_real_points_are_seen_where_they_were_observed():
+    """Within the mean error that the model says of itself, through the reader of datasets."""
+    pycolmap = pytest.importorskip("pycolmap")
+    theirs = pycolmap.Reconstruction(str(REAL / "sparse" / "0"))
+    dataset = load(REAL, downscale=2)
+    errors = {number: [] for number in theirs.points3D}
+    for view in (*dataset.train, *dataset.test):
+        image = theirs.find_image_with_name(view.files["image"].name)
+        observed = [p for p in image.points2D if p.has_point3D()]
+        world = np.array([theirs.points3D[p.point3D_id].xyz for p in observed])
+        inside = (world - view.camera_to_world[:3, 3]) @ view.camera_to_world[:3, :3]
+        scale = theirs.cameras[image.camera_id].width / view.width
+        places = scale * film_points(view, inside)
+        for point, place in zip(observed, places, strict=True):
+            errors[point.point3D_id].append(np.linalg.norm(place - point.xy))
+    ours = np.array([np.mean(values) for values in errors.values()])
+    stored = np.array([theirs.points3D[number].error for number in errors])
+    np.testing.assert_allclose(ours, stored, rtol=0, atol=0.01)
+    assert np.mean(ours) == pytest.approx(np.mean(stored), rel=1e-3)
+
+
+@pytest.mark.parametrize("name", sorted(set(PARAMETERS) - set(LENSES)))
+def test_other_lenses_are_refused_by_name(tmp_path, name):
+    write_dataset(tmp_path, [name])
+    message = refusal(tmp_path)
+    assert f"is of the model {name}, which cannot be rendered" in message
+    assert "colmap image_undistorter" in message
+
+
+def test_masks_lie_beside_their_pictures(tmp_path):
+    write_dataset(tmp_path)
+    mask = np.zeros((480, 640), np.uint8)
+    mask[:, :320] = 255
+    (tmp_path / "masks" / "cam").mkdir(parents=True)
+    Image.fromarray(mask).save(tmp_path / "masks" / "b.jpg.png")  # as COLMAP has it
+    Image.fromarray(255 - mask).save(tmp_path / "masks" / "cam" / "1.png")
+    views = {view.name: view for view in load(tmp_path).train}
+    assert np.asarray(views["b"].mask).sum(axis=0).tolist() == [480] * 320 + [0] * 320
+    assert np.asarray(views["1"].mask).sum(axis=0).tolist() == [0] * 320 + [480] * 320
+    assert views["2"].mask is None
+    assert all(view.mask is None for view in load(tmp_path, ignore_masks=True).train)
+    (tmp_path / "masks" / "c.png").touch()
+    dataset, notes = load_noting(tmp_path)
+    assert "; masks of 2 of 4 photographs" in dataset.description
+    assert notes == [
+        f"{tmp_path}: all pixels count of 2 of 4 photographs, which have no mask (a.jpg, "
+        "cam/2.png)",
+        f"{tmp_path}: masks of no photograph that has a camera: masks/c.png (the mask of a.jpg is "
+        "a.jpg.png or a.png)",
+    ]
+    dataset, notes = load_noting(tmp_path, ignore_masks=True)
+    assert dataset.ignored == ("masks",) and notes == []
+
+
+@pytest.mark.parametrize(
+    "pattern",
+    [
+        *("masks/{0}.jpg.png", "masks/{0}.png", "masks/{0}.jpg", "MASKS/{1}.PNG", "mask/{0}.png"),
+        *("masks/{0}_mask.png", "masks/{0}.png.mask.png", "masks/{1}.Mask.PNG"),
+        *("masks/{0}-mask.webp", "images/{0}.mask.png", "images/{0}_mask.png"),
+    ],
+)
+def test_masks_are_called_as_programs_call_them(tmp_path, pattern):
+    write_dataset(tmp_path)
+    mask = np.zeros((480, 640), np.uint8)
+    mask[:, :320] = 255
+    for stem in ("a", "cam/1"):
+        folder, _, last = stem.rpartition("/")
+        file = tmp_path / pattern.format(stem, f"{folder}/{last.upper()}".strip("/"))
+        file.parent.mkdir(parents=True, exist_ok=True)
+        Image.fromarray(mask).save(file)
+    dataset, notes = load_noting(tmp_path)
+    views = {view.name: view for view in (*dataset.train, *dataset.test)}
+    for name in ("a", "1"):
+        assert np.asarray(views[name].mask).sum(axis=0).tolist() == [480] * 320 + [0] * 320
+    assert views["b"].mask is None
+    assert len(notes) == 1 and "2 of 4 photographs, which have no mask (b.jpg" in notes[0]
+
+
+def test_the_mask_of_the_whole_name_is_preferred(tmp_path):
+    names = ["a.jpg", "b.jpg", "b_mask.jpg"]
+    for file in ("a.png", "a.jpg.png", "b.png", "b_mask.png"):
+        (tmp_path / "masks").mkdir(exist_ok=True)
+        (tmp_path / "masks" / file).touch()
+    notes = []
+    expected = [tmp_path / "masks" / name for name in ("a.jpg.png", "b.png", "b_mask.png")]
+    assert masks_of(tmp_path, names, notes) == expected
+    assert len(notes) == 1 and "masks of no photograph that has a camera: masks/a.png" in notes[0]
+
+
+def test_masks_may_be_for_larger_pictures(tmp_path):
+    """Those of COLMAP's are for the pictures that it saw. A pixel counts where all of it does."""
+    write_dataset(tmp_path)
+    write_pictures(tmp_path / "images_2", size=(320, 240))
+    mask = np.full((480, 640), 255, np.uint8)
+    mask[4:7, 10:12] = 0
+    (tmp_path / "masks").mkdir()
+    Image.fromarray(mask).save(tmp_path / "masks" / "b.png")
+    view = next(view for view in load(tmp_path, downscale=2).train if view.name == "b")
+    expected = np.ones((240, 320))
+    expected[2:4, 5] = 0
+    np.testing.assert_array_equal(np.asarray(view.mask), expected)
+    Image.fromarray(mask[:, :600]).save(tmp_path / "masks" / "b.png")
+    assert "masks/b.png: must be 320 x 240 px, as the photograph is, got 600 x 480" in (
+        refusal(tmp_path, downscale=2)
+    )
+
+
+def test_a_fit_starts_from_the_models_points(tmp_path):
+    model = write_dataset(tmp_path)
+    dataset = load(tmp_path)
+    assert dataset.point_cloud == tmp_path / "sparse" / "0" / "points3D.bin"
+    config = completed(FitConfig(data={"path": tmp_path}, init={"num_points": 9}), dataset)
+    start = start_of(config, dataset)
+    positions, colors, *_ = (np.array(column) for column in zip(*model.points, strict=True))
+    np.testing.assert_allclose(start.means, positions, rtol=1e-6)
+    np.testing.assert_allclose(start.colors, colors / 255, rtol=1e-6)
+    assert start.description == f"the points of {dataset.point_cloud}"
+    assert load(tmp_path, ignore_points=True).point_cloud is None
+
+
+def test_points_of_large_errors_and_of_few_observations_are_left_out(tmp_path):
+    model = write_dataset(tmp_path)
+    dataset = load(tmp_path)
+    positions, _, errors, lengths = (np.array(column) for column in zip(*model.points, strict=True))
+
+    def start(**init):
+        return start_of(completed(FitConfig(data={"path": tmp_path}, init=init), dataset), dataset)
+
+    error, length = float(np.sort(errors)[-3]), int(np.median(lengths))
+    for init, kept in (
+        ({"max_point_error": error}, errors <= error),
+        ({"min_track_length": length}, lengths >= length),
+        (
+            {"max_point_error": error, "min_track_length": length},
+            (errors <= error) & (lengths >= length),
+        ),
+    ):
+        assert 4 <= kept.sum() < len(kept)
+        np.testing.assert_allclose(start(**init).means, positions[kept], rtol=1e-6)
+        assert f"{kept.sum()} of {len(kept)} points of" in start(**init).description
+    with pytest.raises(UserError, match=r"leave none of \d+ points \(their errors are"):
+        start(max_point_error=float(errors.min()) / 2)
+    cloud = tmp_path / "cloud.ply"
+    cloud.touch()
+    with pytest.raises(UserError, match=r"init.max_point_error: only COLMAP's points .*cloud.ply"):
+        start(max_point_error=1.0, point_cloud=cloud)
+    with pytest.raises(UserError, match=r"init.min_track_length: .* starts from random points; "):
+        start(min_track_length=2, start="random")
+
+
+def test_points_whose_error_is_not_known_are_kept(tmp_path):
+    model = some_model(np.random.default_rng(1))
+    model.points = [
+        (x, c, -1.0 if k < 6 else 5.0, n) for k, (x, c, _, n) in enumerate(model.points)
+    ]
+    points = write_binary(tmp_path, model) / "points3D.bin"
+    means, _, count = _read_cloud(InitConfig(max_point_error=1.0), points)
+    np.testing.assert_allclose(means, [x for x, *_ in model.points[:6]], rtol=1e-6)
+    assert count == 9
+
+
+def test_photographs_may_lie_beside_the_model(tmp_path):
+    write_dataset(tmp_path)
+    for path in (tmp_path / "images").iterdir():
+        path.rename(tmp_path / path.name)
+    (tmp_path / "images").rmdir()
+    assert len(load(tmp_path).train) == 3
+
+
+@pytest.mark.parametrize(
+    ("place", "model", "pictures"),
+    [
+        ("flat", ".", "images"),
+        ("flat, beside", ".", "."),
+        ("workspace", "dense/0/sparse", "dense/0/images"),
+        ("undistorted", "dense/sparse", "dense/images"),
+    ],
+)
+@pytest.mark.parametrize("write", WRITERS.values(), ids=WRITERS)
+def test_models_and_photographs_are_found_where_programs_put_them(
+    tmp_path, place, model, pictures, write
+):
+    there = some(NAMES)
+    write(tmp_path / model, there)
+    write_pictures(tmp_path / pictures)
+    if place in ("workspace", "undistorted"):  # beside the model of the photographs as taken
+        write(tmp_path / "sparse" / "0", some_model(np.random.default_rng(2), NAMES))
+    dataset, notes = load_noting(tmp_path)
+    view = dataset.test[0]
+    np.testing.assert_allclose(view.camera_to_world, there.images[0][2], atol=1e-14)
+    assert view.files["image"] == tmp_path / pictures / "a.jpg" and notes == []
+
+
+def test_a_model_with_its_photographs_is_preferred_to_an_undistorted_one(tmp_path):
+    write_dataset(tmp_path)
+    write_binary(tmp_path / "dense" / "sparse", some_model(np.random.default_rng(2), NAMES))
+    write_pictures(tmp_path / "dense" / "images")
+    assert load(tmp_path).train[0].files["image"].parent == tmp_path / "images"
+
+
+def some(names):
+    return some_model(np.random.default_rng(1), names, ["PINHOLE"])
+
+
+@pytest.mark.parametrize(
+    ("call", "is_said"),
+    [
+        (str, False),
+        (str.upper, True),
+        (lambda name: name.replace(".jpg", ".png").replace("1.png", "1.tif"), True),
+        (lambda name: f"images/{name}", True),
+        (lambda name: name.replace("/", "\\"), True),
+        (lambda name: f"C:\\scans\\garden\\{name}".replace("/", "\\"), True),
+    ],
+    ids=["right", "case", "suffix", "images", "backslashes", "of another machine"],
+)
+def test_a_photograph_is_found_under_nearly_its_name(tmp_path, call, is_said):
+    model = some(NAMES)
+    model.images = [(call(name), camera, pose) for name, camera, pose in model.images]
+    write_binary(tmp_path / "sparse" / "0", model)
+    write_pictures(tmp_path / "images")
+    dataset, notes = load_noting(tmp_path, test_every=2)
+    views = [view for pair in zip(dataset.test, dataset.train, strict=True) for view in pair]
+    assert [view.files["image"] for view in views] == [tmp_path / "images" / n for n in NAMES]
+    for view, (_, _, pose) in zip(views, model.images, strict=True):
+        np.testing.assert_allclose(view.camera_to_world, pose, atol=1e-14)
+    assert [": taken under nearly the same name: " in note for note in notes] == [True] * is_said
+
+
+def test_a_file_is_not_taken_for_two_photographs(tmp_path):
+    """Nor one that another is called by, nor one of several: none of these is the only one."""
+    write_binary(tmp_path / "sparse" / "0", some(["a.jpg", "A.tif", "b.jpg", "c.jpg", "d.bmp"]))
+    write_pictures(tmp_path / "images", ["a.jpg", "b.png", "b.webp", "c.jpg", "d.bmp"])
+    dataset, notes = load_noting(tmp_path)
+    assert [view.name for view in (*dataset.test, *dataset.train)] == ["a", "c", "d"]
+    assert len(notes) == 1 and "2 of 5 photographs (A.tif, b.jpg); left out" in notes[0]
+
+
+@pytest.mark.parametrize("below", ["sparse/0", "."])
+def test_test_views_are_those_of_a_list(tmp_path, below):
+    """As the 3DGS reference reads it."""
+    write_dataset(tmp_path)
+    (tmp_path / below / "test.txt").write_text("\ufeff# held out\r\nb.jpg\r\ncam/2.png\r\n")
+    dataset, notes = load_noting(tmp_path)
+    assert [view.name for view in dataset.test] == ["b", "2"]
+    assert [view.name for view in dataset.train] == ["a", "1"]
+    assert "measured on 2 views (split test, by test.txt)" in dataset.description and not notes
+    (tmp_path / below / "test.txt").write_text("b\nz.jpg\n")
+    dataset, notes = load_noting(tmp_path)
+    assert [view.name for view in dataset.test] == ["b"]
+    assert len(notes) == 1 and notes[0].endswith("test.txt has names that no frame has: z.jpg")
+
+
+def test_folders_may_be_the_splits(tmp_path):
+    names = ("train/a.jpg", "test/a.jpg", "test/b.jpg", "train/c.jpg")
+    write_binary(tmp_path / "sparse" / "0", some(names))
+    write_pictures(tmp_path / "images", names)
+    dataset = load(tmp_path)
+    assert [view.name for view in dataset.test] == ["test_a", "test_b"]
+    assert [view.name for view in dataset.train] == ["train_a", "train_c"]
+
+
+# ----------------------------------------------------------------------------------------------
+# What is refused
+# ----------------------------------------------------------------------------------------------
+
+
+def test_a_picture_that_is_not_there_is_left_out_unless_most_are(tmp_path):
+    write_dataset(tmp_path)
+    (tmp_path / "images" / "b.jpg").unlink()
+    dataset, notes = load_noting(tmp_path)
+    assert [view.name for view in (*dataset.test, *dataset.train)] == ["a", "1", "2"]
+    assert notes == [f"{tmp_path}/sparse/0: not there: 1 of 4 photographs (b.jpg); left out"]
+    for name in NAMES[2:]:
+        (tmp_path / "images" / name).unlink()
+    message = refusal(tmp_path)
+    assert "image b.jpg: there is no picture" in message and "images/b.jpg" in message
+    assert message.endswith("; not there: 3 of 4 photographs")
+
+
+def test_a_picture_of_another_shape_is_refused(tmp_path):
+    write_dataset(tmp_path)
+    write_pictures(tmp_path / "images", ["b.jpg"], (480, 640))
+    assert "was 640 x 480 px for COLMAP" in refusal(tmp_path)
+
+
+@pytest.mark.parametrize("original", [(4032, 3024), (3000, 4003), (101, 997)])
+def test_scaled_pictures_are_told_from_cropped_ones(original):
+    """However their sides were rounded; a crop by three px of each is none of them."""
+    width, height = original
+    for factor in (1.7, 2, 4, 5.003, 8):
+        for w in (math.floor(width / factor), math.ceil(width / factor)):
+            for h in (math.floor(height / factor), math.ceil(height / factor)):
+                assert is_scaled((w, h), original)
+        cropped = round(width / factor), round(height / factor) - 3 * math.ceil(height / width)
+        assert not is_scaled(cropped, original)
+    assert is_scaled(original, original) and not is_scaled((width, height - 1), original)
+
+
+def test_a_picture_that_was_turned_since_is_turned_as_exif_says(tmp_path):
+    """COLMAP reads pictures as they are stored: where the stored size is the camera's, it is right.
+
+    Where another program has turned what COLMAP saw, EXIF says how it is turned back.
+    """
+    write_dataset(tmp_path)
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    write_pictures(tmp_path / "images", ["b.jpg"], (480, 640), exif=exif)
+    view = next(view for view in load(tmp_path).train if view.name == "b")
+    assert np.asarray(view.image).shape == (480, 640, 3)
+    write_pictures(tmp_path / "images", ["b.jpg"], (640, 480), exif=exif)
+    view = next(view for view in load(tmp_path).train if view.name == "b")
+    assert np.asarray(view.image).shape == (480, 640, 3)
+
+
+def test_a_picture_that_exif_turns_by_a_half_is_as_colmap_read_it(tmp_path):
+    """Its size does not tell, but COLMAP turns nothing."""
+    pycolmap = pytest.importorskip("pycolmap")
+    write_dataset(tmp_path)
+    exif = Image.Exif()
+    exif[0x0112] = 3
+    pixels = np.random.default_rng(5).integers(0, 256, (480, 640, 3), np.uint8)
+    path = tmp_path / "images" / "cam" / "1.png"
+    Image.fromarray(pixels).save(path, exif=exif)
+    view = next(view for view in load(tmp_path).train if view.name == "1")
+    read = pycolmap.Bitmap.read(str(path), True).to_array()
+    np.testing.assert_array_equal(np.round(np.asarray(view.image) * 255), read)
+
+
+def test_folders_without_pictures_and_models_without_folders_are_explained(tmp_path):
+    write_dataset(tmp_path)
+    (tmp_path / "images").rename(tmp_path / "originals")
+    assert "there is no folder images (or images_2, images_4, images_8)" in refusal(tmp_path)
+    assert "is a model of COLMAP (0/cameras.bin) without photographs" in refusal(
+        tmp_path / "sparse"
+    )
+    assert "there is no model of COLMAP in sparse/0" in refusal(
+        tmp_path / "originals", type="colmap"
+    )
+
+
+def test_there_are_two_views_at_least_and_no_other_splits(tmp_path):
+    write_dataset(tmp_path)
+    assert "this layout has no split val" in refusal(tmp_path, test_split="val")
+    write_binary(tmp_path / "sparse" / "0", some_model(np.random.default_rng(1), ["a.jpg"]))
+    assert "at least 2 views are needed" in refusal(tmp_path)

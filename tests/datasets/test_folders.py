@@ -1,0 +1,85 @@
+"""Folders that are fitted without a configuration."""
+
+import json
+
+import pytest
+from conftest import REPOSITORY
+from support.colmap_models import NAMES, write_dataset, write_pictures
+
+from drgs.config.load import load_config
+from drgs.core.errors import UserError
+from drgs.datasets.folders import MAX_PIXELS, config_for
+
+SCENES = REPOSITORY / "scenes"
+
+
+def test_photographs_are_scaled_by_a_whole_number_and_fitted_as_in_photos_yml(tmp_path):
+    write_dataset(tmp_path)
+    for size, expected in (((640, 480), 640), ((1600, 1200), 800), ((2400, 1800), 800)):
+        write_pictures(tmp_path / "images", size=size)
+        config, reasons = config_for(tmp_path)
+        assert config.data.image_size == expected
+        assert expected**2 * 3 / 4 <= MAX_PIXELS
+        scaled = f"scaled from {size[0]} x {size[1]} px to a width of {expected}"
+        assert (scaled if expected < size[0] else "as they are") in reasons
+    example = load_config(SCENES / "photos.yml")
+    assert config.data.path == tmp_path and config.data.type == "colmap"
+    assert config.iterations == example.iterations
+    assert "COLMAP's model" in reasons and "4,000 iterations" in reasons
+    for section in ("init", "model", "optimizer", "loss", "densify", "coarse"):
+        assert getattr(config, section) == getattr(example, section)
+
+
+@pytest.mark.parametrize("size", [(4032, 3024), (3023, 4031), (901, 667), (41, 60001)])
+def test_widths_are_divided_by_the_smallest_whole_number_that_will_do(tmp_path, size):
+    write_dataset(tmp_path)
+    write_pictures(tmp_path / "images", size=size)
+    config, _ = config_for(tmp_path)
+    width, height = size
+    factor = width // config.data.image_size
+    fitted, larger = width // factor, width // (factor - 1)
+    assert config.data.image_size == fitted
+    assert fitted * round(height * fitted / width) <= MAX_PIXELS
+    assert larger * round(height * larger / width) > MAX_PIXELS
+
+
+def test_the_largest_picture_decides(tmp_path):
+    write_dataset(tmp_path)
+    sizes = [(640, 480), (1600, 1200), (1200, 1600), (700, 500)]
+    for name, size in zip(NAMES, sizes, strict=True):
+        write_pictures(tmp_path / "images", [name], size)
+    config, reasons = config_for(tmp_path)
+    assert config.data.image_size == 600 and MAX_PIXELS >= 600 * 800
+    assert "scaled from 1200 x 1600 px, the largest, to a width of 600" in reasons
+    for name, size in zip(NAMES, [(640, 480), (480, 640), (900, 20), (64, 48)], strict=True):
+        write_pictures(tmp_path / "images", [name], size)
+    assert config_for(tmp_path)[0].data.image_size == 900
+
+
+def test_cut_out_pictures_are_fitted_as_in_lego_yml():
+    config, reasons = config_for(SCENES / "lego")
+    example = load_config(SCENES / "lego.yml")
+    assert config.data.type == "nerf_synthetic" and config.iterations == example.iterations
+    assert config.data.image_size == example.data.image_size
+    assert "cut-out pictures in the layout of NeRF-synthetic, as they are" in reasons
+
+
+def test_transforms_json_is_recognised(photographs):
+    config, reasons = config_for(photographs)
+    assert config.data.type == "nerfstudio" and config.data.image_size == 8
+    assert "cameras of transforms.json" in reasons
+
+
+def test_what_is_given_is_not_chosen(tmp_path):
+    write_dataset(tmp_path)
+    config, _ = config_for(tmp_path, ["data.image_size=100", "iterations=30", "seed=3"])
+    assert (config.data.image_size, config.iterations, config.seed) == (100, 30, 3)
+
+
+def test_folders_that_are_none_are_explained(tmp_path):
+    with pytest.raises(UserError, match=r"drgs poses"):
+        write_pictures(tmp_path / "images")
+        config_for(tmp_path)
+    (tmp_path / "transforms.json").write_text(json.dumps({"frames": []}))
+    with pytest.raises(UserError, match=r"transforms\.json: frames"):
+        config_for(tmp_path)

@@ -1,0 +1,234 @@
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support.small_capture import (
+    FIELD_OF_VIEW,
+    FOCUS,
+    RADIUS,
+    blobs,
+    make_dataset,
+    pose_around,
+    view,
+)
+
+from drgs.core.errors import UserError, UserNote
+from drgs.datasets.orbits import Orbit, orbit_of_gaussians, orbit_of_views, orbit_size, up_of
+from drgs.datasets.viewpoints import look_at, read_viewpoints
+
+
+def views_at(azimuths, elevations):
+    return [
+        view(f"{i}", pose_around(a, e), None)
+        for i, (a, e) in enumerate(zip(azimuths, elevations, strict=True))
+    ]
+
+
+def rolled(v, angle):
+    """The same camera turned about its optical axis."""
+    turn = np.eye(4)
+    turn[:2, :2] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
+    return replace(v, camera_to_world=v.camera_to_world @ turn)
+
+
+def assert_looks_at(viewpoint, target):
+    """The target is on the optical axis, in front, and projects to the middle of the picture."""
+    x, y, z = viewpoint.camera_to_world[:3, :3].T @ (target - viewpoint.camera_to_world[:3, 3])
+    assert z > 0
+    assert [x, y] == pytest.approx([0, 0], abs=1e-9 * z)
+    assert (viewpoint.cx, viewpoint.cy) == (viewpoint.width / 2, viewpoint.height / 2)
+
+
+def test_look_at_is_rigid_and_shows_up_as_up():
+    pose = look_at([1, 2, 3], [0, 0.5, -1], [0, 0, 5])
+    rotation = pose[:3, :3]
+    assert rotation.T @ rotation == pytest.approx(np.eye(3), abs=1e-12)
+    assert np.linalg.det(rotation) == pytest.approx(1)
+    assert pose[:3, 3].tolist() == [1, 2, 3]
+    right, down, _ = rotation.T
+    assert right[2] == pytest.approx(0, abs=1e-12)
+    assert down[2] < 0
+
+
+@pytest.mark.parametrize(
+    ("origin", "target", "up"),
+    [((1, 1, 1), (1, 1, 1), (0, 0, 1)), ((0, 0, 2), (0, 0, 0), (0, 0, 1)), ((1, 0, 0),) * 3],
+)
+def test_look_at_refuses_what_determines_no_camera(origin, target, up):
+    with pytest.raises(UserError, match="must not be zero or parallel to up"):
+        look_at(origin, target, up)
+
+
+def test_an_orbit_looks_at_the_focus_from_the_cameras_distance_and_height():
+    views = views_at(np.arange(7) * 2 * np.pi / 7, np.linspace(0.2, 0.8, 7))
+    orbit = orbit_of_views(views, blobs())
+    assert orbit.focus == pytest.approx(FOCUS, abs=1e-9)
+    frames = orbit.viewpoints(12, 40, 30, np.degrees(FIELD_OF_VIEW))
+    assert len({frame.name for frame in frames}) == 12
+    offsets = np.stack([frame.camera_to_world[:3, 3] for frame in frames]) - FOCUS
+    assert np.linalg.norm(offsets, axis=1) == pytest.approx(np.full(12, RADIUS))
+    # Camera heights of the views average to sin(0.5): not exactly, the axis is a least-squares fit.
+    assert np.arcsin(offsets[:, 2] / RADIUS) == pytest.approx(np.full(12, 0.5), abs=1e-3)
+    for frame in frames:
+        assert_looks_at(frame, FOCUS)
+        assert frame.fx == pytest.approx(20 / np.tan(FIELD_OF_VIEW / 2))
+
+
+def test_an_orbit_goes_all_the_way_round_in_equal_steps():
+    views = views_at(np.arange(9) * 2 * np.pi / 9, np.full(9, 0.4))
+    frames = orbit_of_views(views, blobs()).viewpoints(8, 40, 40, 40)
+    offsets = np.stack([frame.camera_to_world[:3, 3] for frame in frames]) - FOCUS
+    azimuths = np.unwrap(np.arctan2(offsets[:, 1], offsets[:, 0]))
+    assert np.diff(azimuths) == pytest.approx(np.full(7, 2 * np.pi / 8), abs=1e-3)
+
+
+def test_an_orbit_stays_on_the_side_that_was_photographed():
+    azimuths = np.linspace(2.5, 4.0, 6)
+    frames = orbit_of_views(views_at(azimuths, np.full(6, 0.1)), blobs()).viewpoints(20, 40, 40, 40)
+    offsets = np.stack([frame.camera_to_world[:3, 3] for frame in frames]) - FOCUS
+    swept = np.arctan2(offsets[:, 1], offsets[:, 0]) % (2 * np.pi)
+    assert swept.min() > 2.5
+    assert swept.max() < 4.0
+    assert np.ptp(swept) > 1.0
+    # There and back: no jump where the animation starts again.
+    assert np.abs(np.diff(swept, append=swept[0])).max() < 0.25
+
+
+def test_an_orbit_of_parallel_cameras_is_around_the_gaussians():
+    views = [
+        replace(v, camera_to_world=np.block([[v.camera_to_world[:, :3], offset[:, None]]]))
+        for v, offset in zip(
+            views_at([0, 0], [0, 0]), np.array([[5, 0, 0, 1.0], [5, 1, 0, 1.0]]), strict=True
+        )
+    ]
+    gaussians = blobs()
+    orbit = orbit_of_views(views, gaussians)
+    opaque = gaussians.means[gaussians.opacities >= 0.5]
+    assert orbit.focus == pytest.approx(np.median(opaque, axis=0))
+    assert_looks_at(orbit.viewpoints(1, 10, 10, 40)[0], orbit.focus)
+
+
+def test_up_is_what_level_cameras_keep_upright_from_any_side():
+    """Where the cameras stand only on one side, the mean of their own up vectors leans over."""
+    views = views_at([0.1, 0.4, 0.5, 0.9], [0.9, 1.0, 0.8, 1.1])
+    mean_up = np.mean([-v.camera_to_world[:3, 1] for v in views], axis=0)
+    assert mean_up[2] / np.linalg.norm(mean_up) < 0.7
+    assert up_of(views)[2] > 0.999
+
+
+def test_up_of_one_camera_is_its_own():
+    v = rolled(views_at([0.3], [0.2])[0], 0.5)
+    assert up_of([v, v]) == pytest.approx(-v.camera_to_world[:3, 1], abs=1e-9)
+
+
+def test_an_orbit_of_gaussians_shows_them():
+    gaussians = blobs(count=200)
+    orbit = orbit_of_gaussians(gaussians, np.array([0.0, 0.0, 2.0]), fov=40)
+    for frame in orbit.viewpoints(5, 50, 50, 40):
+        assert_looks_at(frame, orbit.focus)
+        pose = frame.camera_to_world
+        x, y, z = ((gaussians.means - pose[:3, 3]) @ pose[:3, :3]).T
+        u, v = frame.fx * x / z + frame.cx, frame.fy * y / z + frame.cy
+        inside = (z > 0) & (u >= 0) & (u <= 50) & (v >= 0) & (v <= 50)
+        assert inside.mean() >= 0.95
+
+
+def test_an_orbit_straight_above_is_still_an_orbit():
+    orbit = Orbit(FOCUS, np.eye(3)[2], np.eye(3)[0], 2.0, 1.3, None)
+    assert_looks_at(orbit.viewpoints(3, 10, 10, 40)[2], FOCUS)
+    views = views_at(np.arange(5.0), np.full(5, 1.55))
+    assert orbit_of_views(views, blobs()).elevation < 1.4
+
+
+@pytest.mark.parametrize(
+    ("size", "expected"), [((800, 800), (400, 400)), ((270, 480), (225, 400)), ((32, 24), (32, 24))]
+)
+def test_orbit_pictures_have_the_photographs_shape_and_at_most_400_px(size, expected):
+    first = replace(make_dataset().train[0], width=size[0], height=size[1])
+    assert orbit_size([first]) == expected
+
+
+# ----------------------------------------------------------------------------------------------
+# Files
+# ----------------------------------------------------------------------------------------------
+
+
+def write_cameras(path, top, *frames):
+    pose = (pose_around(0.3, 0.2) * [1, -1, -1, 1]).tolist()
+    path.write_text(
+        json.dumps({**top, "frames": [{"transform_matrix": pose, **f} for f in frames]})
+    )
+    return path
+
+
+def test_cameras_of_a_file_are_opencv_poses_with_its_lens(tmp_path):
+    path = write_cameras(tmp_path / "c.json", {"camera_angle_x": 0.7}, {}, {"camera_angle_x": 0.9})
+    first, second = read_viewpoints(path, (64, 48))
+    assert first.camera_to_world == pytest.approx(pose_around(0.3, 0.2), abs=1e-12)
+    assert (first.width, first.height, first.cx, first.cy) == (64, 48, 32, 24)
+    assert first.fx == first.fy == pytest.approx(32 / np.tan(0.35))
+    assert second.fx == pytest.approx(32 / np.tan(0.45))
+    assert (first.name, second.name) == ("camera_0", "camera_1")
+
+
+def test_another_size_keeps_the_field_of_view(tmp_path):
+    lens = {"fl_x": 100.0, "w": 200, "h": 100, "cx": 90.0, "cy": 60.0}
+    path = write_cameras(tmp_path / "c.json", lens, {})
+    (own,), (half,) = read_viewpoints(path, None), read_viewpoints(path, (100, 50))
+    assert (own.fx, own.cx, own.cy, own.width, own.height) == (100, 90, 60, 200, 100)
+    assert (half.fx, half.cx, half.cy) == (50, 45, 30)
+
+
+@pytest.mark.parametrize(
+    ("top", "size", "message"),
+    [
+        ({"camera_angle_x": 0.7}, None, "w is missing; give --size"),
+        ({}, (8, 8), r"camera_angle_x \(or fl_x with w\) is missing"),
+        ({"camera_angle_x": 4.0}, (8, 8), "must be between 0.0001 and 3.102"),
+        ({"fl_x": 10}, (8, 8), "w is missing"),
+        ({"camera_angle_x": 0.7, "w": -1, "h": 3}, None, "w must be >= 1, got -1"),
+    ],
+)
+def test_errors_name_the_file_and_the_key(tmp_path, top, size, message):
+    path = write_cameras(tmp_path / "c.json", top, {})
+    with pytest.raises(UserError, match=message) as error:
+        read_viewpoints(path, size)
+    assert str(path) in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("place", "says", "shutter"),
+    [
+        ("top", {}, "global"),
+        ("top", {"shutter": "rolling"}, "rolling"),
+        ("frame", {"shutter": "rolling"}, "rolling"),
+    ],
+)
+def test_cameras_of_a_file_move_as_its_frames_say(tmp_path, place, says, shutter):
+    close = pose_around(0.4, 0.25)
+    frame = {"transform_matrix_close": (close * [1, -1, -1, 1]).tolist()}
+    top = {"camera_angle_x": 0.7}
+    (top if place == "top" else frame).update(says)
+    path = write_cameras(tmp_path / "c.json", top, {}, frame)
+    still, moving = read_viewpoints(path, (64, 48))
+    assert still.motion is None
+    assert moving.motion.close_to_world == pytest.approx(close, abs=1e-12)
+    assert moving.motion.shutter == shutter
+
+
+def test_wrong_motion_of_a_camera_is_refused_with_the_key(tmp_path):
+    frame = {"transform_matrix_close": np.eye(4).tolist(), "shutter": "curtain"}
+    path = write_cameras(tmp_path / "c.json", {"camera_angle_x": 0.7}, {}, frame)
+    with pytest.raises(UserError) as error:
+        read_viewpoints(path, (8, 8))
+    assert str(error.value) == (
+        f"{path}: frames[1].shutter must be one of 'global' or 'rolling', got \"curtain\""
+    )
+
+
+def test_keys_of_a_file_of_cameras_that_are_not_read_are_said(tmp_path):
+    frame = {"transform_matrix": np.eye(4).tolist(), "camera_angle_x": 0.7, "dof": 0.1}
+    (tmp_path / "a.json").write_text(json.dumps({"frames": [frame], "up": [0, 0, 1], "lens": 3}))
+    with pytest.warns(UserNote, match=r"a.json: keys that are not read: lens, frames\[\].dof$"):
+        read_viewpoints(tmp_path / "a.json", (4, 3))

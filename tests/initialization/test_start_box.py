@@ -1,0 +1,194 @@
+"""Start boxes: which one follows from the data, and which are refused as no camera sees them."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support.datasets import dataset_of, load, view_at
+from support.photographs import write_points
+
+from drgs.config.schema import FitConfig, InitConfig
+from drgs.core.constants import SH_C0
+from drgs.core.errors import UserError
+from drgs.initialization.defaults import completed
+from drgs.initialization.start import description_of_start, initial_gaussians, start_of
+from drgs.initialization.start_box import box_to_start_in
+
+AROUND = [(4.03, 0, 0), (0, 4.03, 0), (-4.03, 0, 0), (0, -4.03, 0.1)]
+
+
+def config(**sections):
+    return FitConfig(data={"path": "unused"}, **sections)
+
+
+def views_from(centers, target=(0, 0, 0), scale=1.0):
+    """Cameras that look at ``target``, all of it scaled."""
+    target = np.array(target, float)
+    return [view_at(scale * (target + c), scale * target) for c in np.array(centers, float)]
+
+
+def refusal(views, **init):
+    with pytest.raises(UserError) as error:
+        initial_gaussians(config(init={"num_points": 20, **init}), dataset_of(views))
+    return str(error.value)
+
+
+# The layout's own box
+def test_the_references_box_is_taken_where_the_cameras_are_as_it_expects():
+    box = box_to_start_in(InitConfig(), dataset_of(views_from(AROUND), 1.3))
+    assert (box.center == 0).all() and box.half_extent == 1.3
+
+
+@pytest.mark.parametrize(("scale", "target"), [(100, (0, 0, 0)), (0.01, (0, 0, 0)), (1, (9, 5, 7))])
+def test_elsewhere_it_is_scaled_and_moved_to_where_the_cameras_look(scale, target):
+    dataset = dataset_of(views_from(AROUND, target, scale), 1.3)
+    box = box_to_start_in(InitConfig(), dataset)
+    np.testing.assert_allclose(box.center, scale * np.array(target), atol=0.05 * scale)
+    # Views of 40 px with a focal length of 40 px see half a unit to each side at distance 1.
+    assert box.half_extent == pytest.approx(0.9 * 0.5 * 4.03 * scale, rel=0.02)
+    points = initial_gaussians(config(init={"num_points": 500}), dataset).means
+    assert np.abs(points - box.center).max() <= box.half_extent * (1 + 1e-6)
+
+
+# A box that is given
+def test_a_box_that_most_cameras_do_not_look_into_is_refused():
+    views = views_from(AROUND, target=(50, 0, 0))
+    message = refusal(views, half_extent=1.3)
+    assert message == (
+        "init.half_extent: the start box [-1.3, 1.3]^3 must be what the cameras look at (around "
+        "(50, 0, 0), from 4.03 away), but only 1 of 4 have it in the middle of their pictures; set "
+        "init.half_extent=null, and it follows from them"
+    )
+
+
+def test_a_box_at_the_edge_of_the_pictures_is_refused():
+    views = views_from(AROUND, target=(0, 0, 1.6))
+    assert "but only 0 of 4 have it in the middle of" in refusal(views, half_extent=0.4)
+
+
+def test_a_box_that_hardly_shows_in_the_pictures_is_refused():
+    views = views_from(AROUND, scale=100)
+    assert "(around (0, 0, 0), from 403 away), but it covers only 0.049 % of a picture (the " in (
+        refusal(views, half_extent=1.3)
+    )
+
+
+def test_a_box_of_which_next_to_nothing_is_what_the_cameras_look_at_is_refused():
+    message = refusal(views_from(AROUND, scale=0.1), half_extent=4.0)
+    assert "but less than 1 % of it is as near to that as they are; set" in message
+
+
+@pytest.mark.parametrize("half_extent", [0.3, 1.3, 10.0])
+def test_a_box_that_the_cameras_look_into_or_that_surrounds_them_is_taken(half_extent):
+    box = box_to_start_in(InitConfig(half_extent=half_extent), dataset_of(views_from(AROUND)))
+    assert box.half_extent == half_extent
+
+
+# A cloud of points
+@pytest.fixture
+def cloud(tmp_path):
+    positions = np.random.default_rng(0).uniform(-1, 1, (50, 3))
+    write_points(tmp_path / "cloud.ply", positions, np.full((50, 3), 200, np.uint8))
+    return tmp_path / "cloud.ply"
+
+
+def test_a_cloud_in_another_frame_of_reference_is_refused(cloud):
+    message = refusal(views_from(AROUND, target=(30, 30, 30)), point_cloud=cloud)
+    assert message == (
+        f"{cloud}: must hold what the cameras look at (around (30, 30, 30), from 4.03 away), in "
+        "their frame of reference, but only 0 of 4 have any of its 50 points in the middle of "
+        "their pictures; give another init.point_cloud, or start from random points "
+        "(init.point_cloud=null, data.ignore_points=true)"
+    )
+
+
+def test_the_point_cloud_that_a_dataset_names_is_started_from(photographs, cloud):
+    from support.datasets import edit
+
+    edit(photographs / "transforms.json", lambda meta: meta.update(ply_file_path="cloud.ply"))
+    dataset = load(photographs)
+    assert dataset.point_cloud == cloud
+    assert initial_gaussians(config(), dataset).num_gaussians == 50
+    shown = description_of_start(completed(config(), dataset), start_of(config(), dataset))
+    assert shown.startswith(f"starts from the points of {cloud}; near plane at")
+    few = {"num_points": 30}
+    assert initial_gaussians(config(init={"half_extent": 2.0, **few}), dataset).num_gaussians == 30
+    ignoring = load(photographs, ignore_points=True)
+    assert initial_gaussians(config(init=few), ignoring).num_gaussians == 30
+
+
+def test_a_point_cloud_that_is_missing_leaves_random_points(photographs):
+    from support.datasets import edit
+
+    edit(photographs / "transforms.json", lambda meta: meta.update(ply_file_path="gone.ply"))
+    dataset = load(photographs)
+    assert dataset.point_cloud is None
+    assert "gone.ply is not there" in dataset.description
+
+
+def test_points_that_are_all_black_get_the_colours_of_the_pictures(tmp_path):
+    """As of a pipeline that finds out none."""
+    positions = np.random.default_rng(0).uniform(-1, 1, (9, 3))
+    write_points(tmp_path / "black.ply", positions, np.zeros((9, 3), np.uint8))
+    given = config(init={"point_cloud": tmp_path / "black.ply"})
+    views = [replace(view, image=view.image + 0.75) for view in views_from(AROUND)]
+    g = initial_gaussians(given, dataset_of(views))
+    np.testing.assert_allclose(0.5 + SH_C0 * g.sh0, 0.75, rtol=1e-6)
+    assert not initial_gaussians(given, dataset_of([])).sh0.any()  # grey: colour is SH + 0.5
+
+
+# What else follows from the data
+@pytest.mark.parametrize(("mode", "background"), [("RGB", "black"), ("RGBA", "white")])
+def test_the_background_follows_from_the_pictures(photographs, mode, background):
+    from PIL import Image
+
+    for file in sorted((photographs / "images").iterdir())[3:4]:
+        Image.open(file).convert(mode).save(file)
+    dataset = load(photographs)
+    assert completed(config(), dataset).data.background == background
+    given = config().model_copy(
+        update={"data": config().data.model_copy(update={"background": "white"})}
+    )
+    assert completed(given, dataset).data.background == "white"
+
+
+@pytest.mark.parametrize(
+    ("scale", "near"), [(1, 0.2), (1.5, 0.2), (1000, 200), (1e-9, 1e-9), (1e12, 1e9)]
+)
+def test_the_near_plane_follows_from_the_cameras(scale, near):
+    dataset = dataset_of(views_from(AROUND, scale=scale))
+    assert completed(config(), dataset).model.near == near
+    given = completed(config(model={"near": 1e-9}), dataset)
+    assert given.model.near == 1e-9
+
+
+def test_a_near_plane_behind_what_the_cameras_look_at_is_refused():
+    near = dataset_of(views_from(AROUND, scale=0.01))
+    with pytest.raises(UserError) as error:
+        completed(config(model={"near": 0.2}), near)
+    assert str(error.value) == (
+        "model.near must be less than half of the distance from the cameras to what they look at, "
+        "0.0403, got 0.2; model.near=null lets it follow from the cameras"
+    )
+
+
+def test_what_is_decided_is_written_down():
+    """So that it is the same when the configuration of a fit is used again."""
+    dataset = dataset_of(views_from(AROUND), 1.3)
+    decided = completed(config(), dataset)
+    assert (decided.model.near, decided.data.background) == (0.2, "white")
+    assert completed(decided, dataset) == decided
+
+
+def test_photographs_are_scaled_down_to_the_references_width_unless_a_size_is_given(photographs):
+    from PIL import Image
+    from support.datasets import edit
+
+    for file in (photographs / "images").iterdir():
+        Image.open(file).resize((2000, 4)).save(file)
+    edit(
+        photographs / "transforms.json",
+        lambda meta: meta.update(w=2000, h=4, fl_x=2000, fl_y=2000),
+    )
+    assert load(photographs).train[0].width == 1600
+    assert load(photographs, image_size=10_000).train[0].width == 2000

@@ -1,0 +1,234 @@
+"""``mpiexec -n K python -m drgs.fit``: one voice, one folder, and nobody who waits for ever."""
+
+import csv
+import json
+import os
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+from support import together
+
+CONFIG = """
+data: {{path: {data}, image_size: 50}}
+iterations: {iterations}
+init: {{num_points: 300}}
+model: {{antialiased: true}}
+optimizer: {{views_per_step: {views}}}
+densify: {{budget: {{gaussians: 600}}}}
+output: {{report: false, save_renders: false, checkpoint_every: 20, history_every: 20}}
+"""
+
+
+@pytest.fixture
+def config(tmp_path):
+    """Writes a configuration: config(iterations)."""
+
+    def write(iterations=60, views=4):
+        path = tmp_path / "fit.yml"
+        data = together.REPOSITORY / "scenes" / "lego"
+        path.write_text(CONFIG.format(data=data, iterations=iterations, views=views))
+        return path
+
+    return write
+
+
+def command(*words):
+    return ["-m", "drgs.fit", *words]
+
+
+def result(folder):
+    with (folder / "history.csv").open(newline="") as file:
+        rows = [{k: v for k, v in row.items() if k != "wall_s"} for row in csv.DictReader(file)]
+    names = ("point_cloud.ply", "point_cloud_viewers.ply")
+    return [(folder / name).read_bytes() for name in names], rows
+
+
+def assert_all_end(word):
+    """The launcher may have ended a moment before its processes."""
+    end = time.monotonic() + 10
+    while together.ranks_of(str(word)):
+        assert time.monotonic() < end
+        time.sleep(0.05)
+
+
+def test_a_fit_that_is_shared_is_the_same(config, tmp_path):
+    path = config()
+    status, output, errors = together.run(2, command(path, "--out", tmp_path / "two"))
+    assert status == 0, errors
+    assert output.count("written: ") == 1 and "Traceback" not in errors
+    assert together.run(1, command(path, "--out", tmp_path / "one"))[0] == 0
+    assert result(tmp_path / "two") == result(tmp_path / "one")
+    metrics = json.loads((tmp_path / "two" / "metrics.json").read_text())
+    assert metrics["config"]["optimizer"]["views_per_step"] == 4
+
+
+def test_too_many_processes_are_refused_once(config, tmp_path):
+    status, _, errors = together.run(3, command(config(views=2), "--out", tmp_path / "out"))
+    assert status == 2
+    assert errors.count("error: ") == 1
+    assert "optimizer.views_per_step must be at least the number of processes (3)" in errors
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--set", "optimizer.views_per_step=101"], "at most the number of training views (100)"),
+        (["--set", "densify.prune.to=1"], "2 processes cannot share 1 Gaussians"),
+        (["--variant", "cuda_ad_rgb"], "--variant cuda_ad_rgb: not usable here"),
+        (["--threads", "100000"], "--threads"),
+        (["--view"], "--view: shows the fit of one process alone"),
+        (["--set", "densify.budget.prune_opacity=0.999"], "every Gaussian would be pruned"),
+    ],
+)
+def test_what_cannot_be_shared_or_done_is_refused_once(config, tmp_path, words, message):
+    status, _, errors = together.run(2, command(config(), "--out", tmp_path / "out", *words))
+    assert (status, errors.count("error: ")) == (2, 1), errors
+    assert message in errors
+
+
+def test_a_wrong_command_line_is_refused_once(tmp_path):
+    status, _, errors = together.run(2, command("nothing.yml", "--out", tmp_path / "out"))
+    assert status == 2 and errors.count("error: ") == 1
+
+
+MISSING = "ModuleNotFoundError('No module named mpi4py', name='mpi4py')"
+
+
+@pytest.mark.parametrize(
+    ("on_second", "message"),
+    [
+        ("export DRJIT_LIBLLVM_PATH=/nonexistent.so", "process 1: error: --variant llvm_ad_rgb"),
+        (MISSING, "process 1: error: mpiexec: needs mpi4py"),
+        ("exit 3", "error: mpiexec: a process of this machine has ended before MPI has started"),
+    ],
+    ids=["behind the start", "before the start", "before Python"],
+)
+def test_a_process_that_fails_alone_is_heard_once_and_ends_all(
+    config, tmp_path, on_second, message
+):
+    if on_second is MISSING:
+        on_second = together.failing_import(tmp_path, "mpi4py", MISSING)
+    words, start = command(config(), "--out", tmp_path / "out"), time.monotonic()
+    status, _, errors = together.run(2, words, on_second=on_second)
+    assert (status, errors.count("error: ")) == (2, 1), errors
+    assert message in errors and "Traceback" not in errors and "Fatal" not in errors
+    assert time.monotonic() - start < 60  # 4 to 8 s; without an end, for ever
+    assert_all_end(tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_an_unexpected_error_of_one_process_is_traced_once_and_ends_all(config, tmp_path):
+    failing = together.failing_import(
+        tmp_path, "drgs.training.parallel.shards", "RuntimeError('a bug')"
+    )
+    words = command(config(), "--out", tmp_path / "out")
+    status, _, errors = together.run(2, words, on_second=failing)
+    assert status == 1, errors
+    assert errors.startswith("process 1: Traceback") and errors.count("Traceback") == 1
+    assert errors.endswith("RuntimeError: a bug\n")
+
+
+def test_a_command_of_one_process_is_refused_once(tmp_path):
+    model = together.REPOSITORY / "scenes" / "shapes" / "knot.ply"
+    words = ["-m", "drgs.export", model, "--out", tmp_path / "a.spz"]
+    status, _, errors = together.run(2, words)
+    assert (status, errors.count("error: ")) == (2, 1), errors
+    assert "mpiexec: processes can share fit and render" in errors
+    assert not (tmp_path / "a.spz").exists()
+    assert together.run(1, words)[0] == 0 and (tmp_path / "a.spz").exists()
+
+
+@pytest.mark.slow
+def test_ctrl_c_while_everybody_is_busy_with_something_else_ends_all(config, tmp_path):
+    """In a rehearsal: nothing is to be saved, and nobody is left behind."""
+    path, out = config(iterations=100_000), tmp_path / "out"
+    process = together.start(2, command(path, "--out", out, "--budget", "1h"))
+    end = time.monotonic() + 60
+    while len(together.ranks_of(str(out))) < 2:
+        assert process.poll() is None and time.monotonic() < end
+        time.sleep(0.05)
+    time.sleep(2.5)
+    process.send_signal(signal.SIGINT)
+    _, errors = process.communicate(timeout=60)
+    assert process.returncode == 130, errors
+    assert "Traceback" not in errors
+    assert_all_end(out)
+
+
+def started(path, out, size=2):
+    """A fit that has saved a checkpoint and goes on."""
+    process = together.start(size, command(path, "--out", out))
+    end = time.monotonic() + 60
+    while not (out / "checkpoint.npz").exists():
+        assert process.poll() is None and time.monotonic() < end
+        time.sleep(0.1)
+    return process
+
+
+@pytest.mark.slow
+def test_ctrl_c_saves_and_another_number_goes_on(config, tmp_path):
+    path = config(iterations=800)
+    process = started(path, tmp_path / "out")
+    process.send_signal(signal.SIGINT)
+    output, _ = process.communicate(timeout=60)
+    assert process.returncode == 130 and "stopped; continue with" in output
+    assert together.run(3, command("--resume", tmp_path / "out"))[0] == 0
+    assert together.run(1, command(path, "--out", tmp_path / "whole"))[0] == 0
+    assert result(tmp_path / "out") == result(tmp_path / "whole")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(3))
+def test_a_process_that_dies_takes_the_others_along(config, tmp_path, seed):
+    """At any moment; the checkpoint is whole, and others go on with it."""
+    out, rng = tmp_path / "out", random.Random(seed)
+    process = started(config(iterations=800), out, 3)
+    time.sleep(2 * rng.random())
+    ranks = together.ranks_of(str(out))
+    assert len(ranks) == 3
+    os.kill(rng.choice(ranks), signal.SIGKILL)
+    process.communicate(timeout=30)
+    assert process.returncode != 0
+    assert_all_end(out)
+    assert together.run(2, command("--resume", out))[0] == 0
+    assert (out / "metrics.json").exists()
+
+
+ON_A_SMALL_DISK = """
+disk=$1 kept=$2
+shift 2
+mount -t tmpfs -o size=600k none "$disk" || exit 77
+"$@"
+status=$?
+cp -r "$disk" "$kept"
+exit $status
+"""
+
+
+@pytest.mark.slow
+def test_a_full_disk_ends_all_and_others_go_on(config, tmp_path):
+    """One checkpoint has room, and not another one beside it, as it is written."""
+    if os.geteuid() != 0 or shutil.which("unshare") is None:
+        pytest.skip("only root can mount a small disk")
+    path, disk, kept = config(iterations=800), tmp_path / "disk", tmp_path / "kept"
+    disk.mkdir()
+    words = [together.mpiexec(), "-n", "2", sys.executable, *command(path, "--out", disk / "out")]
+    done = subprocess.run(
+        ["unshare", "--mount", "sh", "-c", ON_A_SMALL_DISK, "-", disk, kept, *words],
+        cwd=together.REPOSITORY,
+        env=together.environment(),
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+    if done.returncode == 77:
+        pytest.skip("no small disk can be mounted")
+    assert done.returncode == 2
+    assert done.stderr.count("error: ") == 1 and "No space left" in done.stderr
+    assert together.run(3, command("--resume", kept / "out"))[0] == 0

@@ -1,0 +1,137 @@
+"""Pictures that somebody asks for: what they show, and with which approximations."""
+
+from dataclasses import replace
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from support.small_capture import RADIUS, blobs, pose_around
+
+from drgs.config.approximations import Approximations
+from drgs.config.schema import ModelConfig
+from drgs.core.errors import UserError
+from drgs.integrator.scene import make_scene, render_views
+from drgs.viewer.controls import LENSES
+from drgs.viewer.frames import BACKDROP, MOST_ACCURATE, SHOWN, FrameRequest, LiveScene
+from drgs.viewer.optics import Eye, FisheyeLens, OpenCVLens, Orthographic, Pinhole, ThinLens
+
+WHITE = (1.0, 1.0, 1.0)
+EYE = Eye(pose_around(0.4, 0.3), 40.0, RADIUS)
+REQUEST = FrameRequest(EYE, 48, 32)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def variant():
+    mi.set_variant("llvm_ad_rgb")
+
+
+@pytest.fixture
+def scene():
+    return LiveScene(blobs(), ModelConfig(), WHITE)
+
+
+def reference_picture(**approximations):
+    scene = make_scene(blobs(), ModelConfig(**approximations), WHITE)
+    (picture,) = render_views(scene, [EYE.viewpoint(48, 32)])
+    return picture
+
+
+def test_colors_are_those_of_the_usual_rendering_in_eight_bits(scene):
+    frame = scene.frame(REQUEST)
+    assert frame.pixels.dtype == np.uint8 and frame.seconds > 0
+    assert np.array_equal(frame.pixels, np.round(255 * reference_picture()))
+
+
+@pytest.mark.parametrize("others", [{"projection": "exact"}, {"order": "pixel"}, {"low_pass": 0.0}])
+def test_approximations_are_switched_and_switched_back(scene, others):
+    first = scene.frame(REQUEST).pixels
+    values = {**vars(scene.approximations), **others}
+    switched = scene.frame(replace(REQUEST, approximations=Approximations(**values))).pixels
+    assert np.array_equal(switched, np.round(255 * reference_picture(**others)))
+    assert not np.array_equal(switched, first)
+    assert np.array_equal(scene.frame(REQUEST).pixels, first)
+
+
+def test_smaller_pictures_show_the_same(scene):
+    small = scene.frame(REQUEST.smaller(2)).pixels
+    assert small.shape == (16, 24, 3)
+    means = scene.frame(REQUEST).pixels.reshape(16, 2, 24, 2, 3).mean(axis=(1, 3))
+    assert np.abs(small - means).mean() < 6  # of 255: a pixel's centre, or the mean of four
+
+
+def test_depths_are_colored_from_near_to_far(scene):
+    frame = scene.frame(replace(REQUEST, shows="depth"))
+    near, far = (float(word) for word in frame.note.split() if word[0].isdigit())
+    assert RADIUS - 1.1 < near < far < RADIUS + 1.1  # the blobs are within a unit of the focus
+    opacity = scene.frame(replace(REQUEST, shows="opacity")).pixels
+    empty = opacity.max(axis=2) == 0
+    assert 0.3 < empty.mean() < 1
+    assert (frame.pixels[empty] == round(255 * BACKDROP)).all()
+    red, _, blue = frame.pixels[opacity.min(axis=2) > 200].astype(int).T
+    assert (red > blue).any() and (blue > red).any()
+
+
+def test_normals_point_to_the_camera(scene):
+    pixels = scene.frame(replace(REQUEST, shows="normals")).pixels
+    opaque = scene.frame(replace(REQUEST, shows="opacity")).pixels.min(axis=2) > 250
+    normals = pixels[opaque] / 255 * 2 - 1
+    assert np.linalg.norm(normals, axis=1) == pytest.approx(1, abs=0.05)  # eight bits, alpha
+    # A sum of unit vectors that point to the camera, seen at most 30 degrees from the axis.
+    assert (normals @ EYE.camera_to_world[:3, 2]).max() < 0.5
+
+
+def test_the_error_is_the_difference_from_the_most_accurate_picture(scene):
+    best = {"projection": "exact", **MOST_ACCURATE}
+    shown, accurate = reference_picture(), reference_picture(**best)
+    frame = scene.frame(replace(REQUEST, shows="error"))
+    expected = np.round(255 * np.clip(0.5 + 5 * (shown - accurate), 0, 1))
+    assert np.abs(frame.pixels - expected).max() <= 1  # halves are rounded in single precision
+    psnr = -10 * np.log10(np.mean((shown - accurate) ** 2))
+    assert f"{psnr:.1f} dB" in frame.note
+    values = Approximations(**{**vars(scene.approximations), **best})
+    frame = scene.frame(replace(REQUEST, shows="error", approximations=values))
+    assert (frame.pixels == 128).all() and "the same as" in frame.note
+
+
+def test_what_no_kernel_can_do_is_refused_in_words(scene):
+    values = Approximations(**{**vars(scene.approximations), "projection": "exact"})
+    with pytest.raises(UserError, match="exact"):
+        scene.frame(replace(REQUEST, optics=FisheyeLens(), approximations=values))
+
+
+THROUGH = {
+    "pinhole": Pinhole(),
+    "opencv": OpenCVLens({"k1": 0.1}),
+    "fisheye": FisheyeLens({"k1": 0.1}),
+    "orthographic": Orthographic(),
+    "thin lens": ThinLens(0.03),
+}
+
+
+@pytest.mark.parametrize("lens", LENSES)
+def test_everything_is_shown_through_every_lens(scene, lens):
+    """But for the projection ``exact``, which only pinholes and thin lenses have."""
+    optics, refused = THROUGH[lens], set()
+    for projection, order in (("ewa", "center"), ("unscented", "pixel"), ("exact", "pixel")):
+        approximations = replace(scene.approximations, projection=projection, order=order)
+        for shows in SHOWN:
+            request = FrameRequest(EYE, 12, 8, optics, shows, approximations)
+            try:
+                assert scene.frame(request).pixels.shape == (8, 12, 3)
+            except UserError:
+                refused.add(projection)
+    assert refused == ({"exact"} if lens in ("opencv", "fisheye", "orthographic") else set())
+
+
+def test_the_error_through_parallel_rays_is_that_of_the_order():
+    """Of ``ewa``, which is exact there: with the most accurate order there is none."""
+    scene = LiveScene(blobs(), ModelConfig(**MOST_ACCURATE), WHITE)
+    parallel = replace(REQUEST, optics=Orthographic(), shows="error")
+    assert (scene.frame(parallel).pixels == 128).all()
+    assert (scene.frame(replace(parallel, optics=Pinhole())).pixels != 128).any()
+
+
+def test_nothing_to_see_has_no_depth(scene):
+    away = Eye(pose_around(0.4, 0.3) @ np.diag([-1.0, 1, -1, 1]), 40.0, RADIUS)
+    frame = scene.frame(replace(REQUEST, eye=away, shows="depth"))
+    assert frame.note == "nothing is seen" and np.ptp(frame.pixels) == 0

@@ -1,0 +1,282 @@
+"""What browsers may send to a page: invalid messages change nothing, and print nothing."""
+
+import contextlib
+import gc
+import http.client
+import re
+import socket
+import subprocess
+import sys
+import threading
+import time
+from types import SimpleNamespace
+
+import mitsuba as mi
+import pytest
+
+pytest.importorskip("viser", reason="viser is not installed (the extra viewer)")
+
+import msgspec
+from conftest import REPOSITORY
+from support.fit_command import write_scene
+from support.hostile_client import (
+    CAMERA,
+    CLICK,
+    VALUES,
+    connect_to,
+    hostile_messages,
+    labels_of_controls,
+    send_all,
+)
+from support.small_fits import everything_of, make_trainer, true_dataset
+from websockets.exceptions import ConnectionClosed, InvalidStatus, WebSocketException
+
+from drgs.config.approximations import Approximations
+from drgs.training.budget import AllIterations
+from drgs.training.history import History
+from drgs.training.loop import iterations
+from drgs.viewer.fit_page import FitPage, watch
+from drgs.viewer.messages import MAX_CONNECTIONS, MAX_MESSAGE_BYTES, is_valid, offers
+from drgs.viewer.page import StartView
+from drgs.viewer.requests import Wishes
+from drgs.viewer.server import serving
+
+STOPPING = ("Pause", "End and write results")
+"""Buttons that any client may press."""
+
+NAN, INF = float("nan"), float("inf")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def variant():
+    mi.set_variant("llvm_ad_rgb")
+
+
+@pytest.fixture
+def server():
+    with serving("127.0.0.1", None, ("", "")) as server:
+        yield server
+
+
+def controls_of(server):
+    return server.gui._gui_input_handle_from_uuid
+
+
+def uuids_that_stop_nothing(server):
+    controls = controls_of(server).items()
+    return [uuid for uuid, control in controls if getattr(control, "label", "") not in STOPPING]
+
+
+def wait_until(condition, seconds=10):
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+
+
+@pytest.mark.parametrize(
+    ("control", "accepted", "rejected"),
+    [
+        ({"value": "a", "options": ("a", "b")}, ["a", "b"], ["c", "", 0, True, NAN]),
+        ({"value": 1.0, "min": 0.0, "max": 2.0}, [0, 2, 0.5], [-1, 2.1, NAN, INF, "1", True]),
+        ({"value": 1.0, "min": 0.0, "max": None}, [1e9], [-1, NAN, INF]),
+        ({"value": True}, [True, False], [1, 0.0, "True", "evil"]),
+    ],
+)
+def test_a_control_has_the_values_that_it_offers(control, accepted, rejected):
+    control = SimpleNamespace(**control)
+    assert all(offers(control, value) for value in accepted)
+    assert not any(offers(control, value) for value in rejected)
+
+
+def test_a_camera_has_finite_numbers_and_a_direction():
+    def valid(message, **changes):
+        return is_valid(msgspec.msgpack.encode(message | changes), {}.get)
+
+    assert valid(CAMERA) and valid(CLICK)
+    assert valid(CAMERA, image_width=812.5, fov=1)  # JavaScript has one type of number
+    for name in CAMERA:
+        assert not valid(CAMERA, **{name: NAN})
+        assert not valid(CAMERA, **{name: None})
+    for wrong in ({"wxyz": (0.0,) * 4}, {"position": (0.0,) * 4}, {"position": (1e300, 0.0, 0.0)}):
+        assert not valid(CAMERA, **wrong)
+    assert not valid(CAMERA, image_height=-1) and not valid(CAMERA, image_width=2**40)
+    assert not valid(CAMERA, type="ShareUrlRequest")
+
+
+def test_a_thousand_invalid_messages_change_nothing_and_print_nothing(server, capfd):
+    FitPage(server, Wishes(), StartView.of(true_dataset().train), Approximations())
+    uuids = uuids_that_stop_nothing(server)
+    before = {uuid: control.value for uuid, control in controls_of(server).items()}
+    callbacks = {uuid: len(c._impl.update_cb) for uuid, c in controls_of(server).items()}
+    send_all(server.get_port(), hostile_messages(1, 1000, uuids))
+    assert {uuid: len(c._impl.update_cb) for uuid, c in controls_of(server).items()} == callbacks
+    for uuid, control in controls_of(server).items():
+        assert control.value == before[uuid] or offers(control, control.value)
+    label = next(c for c in controls_of(server).values() if getattr(c, "label", "") == "Show")
+    seen = []
+
+    @label.on_update
+    async def _(event):
+        seen.append(event.target.value)
+
+    with connect_to(server.get_port()) as connection:  # is still served
+        connection.send(msgspec.msgpack.encode(CAMERA))
+        for value in [*VALUES, "depth"]:
+            update = {"uuid": label._impl.uuid, "updates": {"value": value}}
+            connection.send(msgspec.msgpack.encode({"type": "GuiUpdateMessage"} | update))
+        wait_until(lambda: "depth" in seen)
+    assert set(seen) <= {"color", "depth"}
+    gc.collect()  # tasks that failed are reported now
+    assert capfd.readouterr() == ("", "")
+
+
+def test_a_message_that_is_too_long_ends_its_connection_only(server, capfd):
+    with connect_to(server.get_port()) as connection, connect_to(server.get_port()) as other:
+        connection.send(bytes(MAX_MESSAGE_BYTES + 1))
+        with pytest.raises(ConnectionClosed):
+            while True:
+                connection.recv(timeout=5)
+        assert other.recv(timeout=5)
+    assert capfd.readouterr() == ("", "")
+
+
+def is_closed(connection):
+    """Whether the server has closed a connection to which it sends nothing."""
+    try:
+        return connection.recv(1) == b""
+    except BlockingIOError:
+        return False
+    except ConnectionError:
+        return True
+
+
+def test_a_flood_of_connections_leaves_room_for_files_and_for_clients(server, capfd):
+    address = "127.0.0.1", server.get_port()
+    flood = [socket.create_connection(address) for _ in range(3 * MAX_CONNECTIONS)]
+    for connection in flood:
+        connection.setblocking(False)
+    wait_until(lambda: sum(map(is_closed, flood)) == 2 * MAX_CONNECTIONS)
+    for connection in flood:
+        connection.close()
+
+    def is_served():
+        try:
+            with connect_to(server.get_port()) as connection:
+                return bool(connection.recv(timeout=5))
+        except (OSError, EOFError, WebSocketException):
+            return False
+
+    wait_until(is_served)
+    assert capfd.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        *("/../../../../../../etc/passwd", "/%2e%2e/%2e%2e/_viser.py", "/..%5c..%5c_viser.py"),
+        *("//etc/passwd", "/C:/Windows/win.ini", "/C%3A/x", "/%00", "/x" * 3000, "/assets"),
+    ],
+)
+def test_nothing_but_the_page_is_read(server, path, capfd):
+    connection = http.client.HTTPConnection("127.0.0.1", server.get_port(), timeout=5)
+    connection.request("GET", path)
+    assert connection.getresponse().status >= 400
+    assert capfd.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize(
+    "request_bytes",
+    [
+        b"POST / HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n",
+        b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\nHost: elsewhere.org\r\n\r\n",
+        b"GET / HTTP/1.1\r\nHost: [\r\n\r\n",
+        b"GET / HTTP/1.1\r\nX: " + b"x" * 100_000 + b"\r\n\r\n",
+        b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\nUpgrade: a\r\nUpgrade: b\r\n\r\n",
+        b"\x16\x03\x01\x02\x00\x01\x00\x01\xfc\x03\x03",  # TLS
+        b"\0" * 100,
+        b"",
+    ],
+)
+def test_requests_that_are_none_print_nothing(server, request_bytes, capfd):
+    with socket.create_connection(("127.0.0.1", server.get_port()), timeout=5) as connection:
+        connection.sendall(request_bytes)
+        connection.shutdown(socket.SHUT_WR)
+        try:
+            answer = connection.recv(100)
+        except ConnectionError:
+            answer = b""
+    assert not answer.startswith(b"HTTP/1.1 200")
+    assert capfd.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize("protocol", ["viser-v0.0.1", "chat"])
+def test_a_page_of_another_version_is_refused_without_a_word(server, protocol, capfd):
+    with pytest.raises(InvalidStatus, match="403"):
+        connect_to(server.get_port(), protocol)
+    assert capfd.readouterr() == ("", "")
+
+
+def test_a_fit_among_hostile_clients_has_the_bytes_of_one_alone(server, capfd):
+    settings = {"iterations": 40, "densify__start": 2, "densify__stop": 30, "densify__every": 5}
+    dataset = true_dataset()
+    alone, watched = (make_trainer(dataset, **settings) for _ in range(2))
+    for _ in iterations(alone, History(), AllIterations()):
+        pass
+    watching, length = watch(server, watched, dataset, AllIterations())
+    served, history = [], History()
+    show = watching._screen.show
+    watching._screen.show = lambda *frame: (served.append(frame), show(*frame))
+    uuids, is_over = uuids_that_stop_nothing(server), threading.Event()
+
+    def attack():
+        seed = 0
+        while not is_over.is_set():
+            seed += 1
+            send_all(server.get_port(), hostile_messages(seed, 100, uuids))
+
+    attacker = threading.Thread(target=attack)
+    attacker.start()
+    try:
+        with connect_to(server.get_port()) as honest:
+            for done in iterations(watched, history, length):
+                honest.send(msgspec.msgpack.encode(CAMERA))
+                time.sleep(0.05)
+                watching.after(watched, history, done, lambda: False)
+    finally:
+        is_over.set()
+        attacker.join()
+    assert len(served) >= 10
+    expected, got = everything_of(alone), everything_of(watched)
+    assert expected.keys() == got.keys()
+    assert not [name for name, value in expected.items() if got[name] != value]
+    gc.collect()
+    assert capfd.readouterr() == ("", "")
+
+
+@pytest.mark.slow
+def test_the_command_writes_the_same_bytes_among_hostile_clients(tmp_path):
+    config = write_scene(tmp_path, iterations=150, densify={"start": 1, "stop": 100})
+    words = [sys.executable, "-m", "drgs", "fit", config, "--set", "output.report=false"]
+    alone, watched, log = tmp_path / "alone", tmp_path / "watched", tmp_path / "log"
+    subprocess.run([*words, "--out", alone], cwd=REPOSITORY, check=True, capture_output=True)
+    with log.open("w") as output:
+        fit = subprocess.Popen(
+            [*words, "--out", watched, "--view"], cwd=REPOSITORY, stdout=output, stderr=output
+        )
+    try:
+        wait_until(lambda: fit.poll() is not None or "look on at" in log.read_text(), 120)
+        port, seed = int(re.search(r"http://\S+:(\d+)", log.read_text())[1]), 0
+        labels = labels_of_controls(port, "As fitted")
+        uuids = [uuid for uuid, label in labels.items() if label not in STOPPING]
+        while fit.poll() is None:
+            seed += 1
+            with contextlib.suppress(OSError, WebSocketException):
+                send_all(port, hostile_messages(seed, 100, uuids))
+    finally:
+        fit.kill()
+        fit.wait()
+    assert seed > 1 and fit.returncode == 0, log.read_text()
+    assert "Traceback" not in log.read_text()
+    clouds = [(folder / "point_cloud.ply").read_bytes() for folder in (alone, watched)]
+    assert clouds[0] == clouds[1]

@@ -1,0 +1,110 @@
+"""Lenses to look through: where things come to the picture, and how sharp they are."""
+
+import math
+from dataclasses import replace
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from support.small_capture import RADIUS, blobs, pose_around
+from support.usual_rule import USUAL
+
+from drgs.cameras.fisheye import Fisheye
+from drgs.cameras.radial_tangential import RadialTangential
+from drgs.config.schema import ModelConfig
+from drgs.datasets.types import Viewpoint
+from drgs.gaussians.parameters import Gaussians
+from drgs.integrator.scene import make_scene, render_views
+from drgs.viewer.frames import FrameRequest, LiveScene
+from drgs.viewer.optics import Eye, FisheyeLens, OpenCVLens, Orthographic, Pinhole, ThinLens
+
+WIDTH, HEIGHT, FOV = 60, 40, 50.0
+BACKGROUND = (0.25, 0.5, 0.75)
+EYE = Eye(pose_around(0.4, 0.3), FOV, RADIUS)
+FOCAL = HEIGHT / 2 / math.tan(math.radians(FOV) / 2)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def variant():
+    mi.set_variant("llvm_ad_rgb")
+
+
+def seen(optics, gaussians):
+    scene = LiveScene(gaussians, ModelConfig(**USUAL), BACKGROUND)
+    return scene.picture(FrameRequest(EYE, WIDTH, HEIGHT, optics))[0]
+
+
+def viewpoint(focal=FOCAL, lens=None):
+    size = WIDTH / 2, HEIGHT / 2, WIDTH, HEIGHT
+    return Viewpoint("", EYE.camera_to_world, focal, focal, *size, lens=lens)
+
+
+@pytest.mark.parametrize(
+    ("optics", "view"),
+    [
+        (Pinhole(), viewpoint()),
+        (
+            OpenCVLens({"k1": -0.3, "p1": 0.02}),
+            viewpoint(lens=RadialTangential.of(k1=-0.3, p1=0.02)),
+        ),
+        # The angle of the whole height on the film, so many px a radian.
+        (FisheyeLens({"k1": 0.1}), viewpoint(HEIGHT / math.radians(FOV), Fisheye.of(k1=0.1))),
+    ],
+    ids=["pinhole", "opencv", "fisheye"],
+)
+def test_pictures_are_those_of_the_same_camera_in_a_dataset(optics, view):
+    scene = make_scene(blobs(), ModelConfig(**USUAL), BACKGROUND)
+    (expected,) = render_views(scene, [view])
+    picture = np.clip(seen(optics, blobs()), 0, 1)
+    assert np.ptp(expected) > 0.3
+    # The focal length goes through an angle in degrees, in single precision: 1e-6 of it.
+    assert np.abs(picture - expected).max() < 1e-4
+
+
+def speck(x, y, z):
+    """One opaque Gaussian, much smaller than a pixel, at camera coordinates in scene units."""
+    means = EYE.camera_to_world @ [x, y, z, 1]
+    return Gaussians(
+        means=np.float32([means[:3]]),
+        quats=np.float32([[1, 0, 0, 0]]),
+        log_scales=np.full((1, 3), -7, np.float32),
+        logit_opacities=np.full(1, 3, np.float32),
+        sh0=np.full((1, 1, 3), 1.5, np.float32),
+        shN=np.zeros((1, 0, 3), np.float32),
+    )
+
+
+def place(picture):
+    """Of what differs from the background: its middle (px), and its largest difference."""
+    difference = np.abs(picture[:, :, :3] - BACKGROUND).sum(axis=2)
+    y, x = np.mgrid[:HEIGHT, :WIDTH] + 0.5
+    return (
+        (difference * x).sum() / difference.sum(),
+        (difference * y).sum() / difference.sum(),
+        difference.max(),
+    )
+
+
+@pytest.mark.parametrize("depth", [RADIUS, 1.5 * RADIUS])
+def test_parallel_rays_show_a_thing_where_the_pinhole_does_at_the_distance_of_the_focus(depth):
+    x, y, _ = place(seen(Orthographic(), speck(0.8, -0.5, depth)))
+    # The middle of a speck that is cut off at a small alpha is within a tenth of a pixel.
+    assert x == pytest.approx(WIDTH / 2 + FOCAL * 0.8 / RADIUS, abs=0.1)
+    assert y == pytest.approx(HEIGHT / 2 - FOCAL * 0.5 / RADIUS, abs=0.1)
+
+
+def test_a_closed_aperture_is_a_pinhole(capfd):
+    """Of which Mitsuba says nothing, once a picture."""
+    dot = speck(0.8, -0.5, 2 * RADIUS)
+    assert np.array_equal(seen(ThinLens(0.0), dot), seen(Pinhole(), dot))
+    assert "aperture" not in "".join(capfd.readouterr())
+
+
+def test_a_thin_lens_is_sharp_at_its_focus_and_nowhere_else():
+    for focus, depth in ((1.0, RADIUS), (1.5, 1.5 * RADIUS)):
+        lens, dot = ThinLens(0.1, focus), speck(0.8, -0.5, depth)
+        sharp = seen(Pinhole(), dot)
+        assert np.abs(seen(lens, dot) - sharp).max() < 1e-4  # roundings of the field of view
+        blurred = seen(replace(lens, focus=focus / 2), dot)
+        assert place(blurred)[2] < 0.5 * place(sharp)[2]
+        assert np.abs(np.subtract(place(blurred)[:2], place(sharp)[:2])).max() < 0.1

@@ -1,0 +1,195 @@
+"""A fit that somebody watches: the same bytes, a pause, an early end; no browser is needed."""
+
+import time
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from support.small_capture import HEIGHT, WIDTH, pose_around
+from support.small_fits import (
+    config_of,
+    disturbed_blobs,
+    everything_of,
+    make_trainer,
+    plain_dataset,
+    true_dataset,
+)
+
+from drgs.config.approximations import Approximations
+from drgs.integrator.scene import make_scene, render_views
+from drgs.training.budget import AllIterations
+from drgs.training.history import History
+from drgs.training.loop import iterations
+from drgs.training.trainer import Trainer
+from drgs.viewer.frames import SHOWN, FrameRequest
+from drgs.viewer.optics import Eye, FisheyeLens, ThinLens
+from drgs.viewer.requests import Wishes
+from drgs.viewer.training_viewer import UntilEnded, Watching
+
+EYE = Eye(pose_around(0.4, 0.3), 40.0, 4.0)
+
+EVERYTHING = {
+    "iterations": 12,
+    "model__smoothing": True,
+    "model__sh_increase_every": 4,
+    "cameras__optimise": True,
+    "colors__lr": 0.02,
+    "data__random_background": True,
+    "loss__depth_weight": 0.1,
+    "densify__start": 2,
+    "densify__stop": 9,
+    "densify__strategy": "adc",
+    "densify__adc__grad_threshold": 1e-7,
+    "densify__every": 2,
+}
+"""What a fit can have: effects, a population that changes, harmonics that grow."""
+
+
+@pytest.fixture(scope="module", autouse=True)
+def variant():
+    mi.set_variant("llvm_ad_rgb")
+
+
+class Screen:
+    """Remembers what it was given."""
+
+    def __init__(self):
+        self.frames, self.told, self.ended = [], [], None
+
+    def show(self, client, request, frame, is_whole):
+        self.frames.append(frame.pixels)
+
+    def refuse(self, client, reason):
+        raise AssertionError(reason)
+
+    def tell(self, trainer, history, total):
+        self.told.append((trainer.iteration, total))
+
+    def tell_end(self, iterations):
+        self.ended = iterations
+
+
+def run(trainer, wishes=None, dataset=None, before=lambda iteration: None, stops=lambda: False):
+    """A whole fit, watched if there are wishes; before: is called before those are served."""
+    screen, length, history = Screen(), AllIterations(), History()
+    if wishes is not None:
+        length = UntilEnded(length, wishes)
+        watching = Watching(wishes, screen, dataset, length)
+    for done in iterations(trainer, history, length):
+        if wishes is not None:
+            before(done.report.iteration)
+            watching.after(trainer, history, done, stops)
+    return screen, history
+
+
+def requests():
+    """One for each iteration: everything that can be shown, through several lenses."""
+    for k in range(100):
+        eye = Eye(pose_around(0.1 * k, 0.3), 40.0, 4.0)
+        optics = {"optics": (FisheyeLens(), ThinLens(0.05))[k % 2]} if k % 3 == 2 else {}
+        approximations = Approximations(order="pixel") if k % 4 == 3 else None
+        shows = list(SHOWN)[k % len(SHOWN)]
+        yield FrameRequest(eye, 40, 30, shows=shows, approximations=approximations, **optics)
+
+
+def test_a_watched_fit_has_the_bytes_of_one_that_is_not():
+    dataset, wishes, asked = true_dataset(), Wishes(), requests()
+    alone = make_trainer(dataset, **EVERYTHING)
+    run(alone)
+    watched = make_trainer(dataset, **EVERYTHING)
+    screen, _ = run(watched, wishes, dataset, lambda _: wishes.ask(1, next(asked)))
+    assert len(screen.frames) >= 12
+    assert len({frame.tobytes() for frame in screen.frames}) >= 12
+    assert alone.num_gaussians != disturbed_blobs().num_gaussians
+    expected, got = everything_of(alone), everything_of(watched)
+    assert expected.keys() == got.keys()
+    assert not [name for name, value in expected.items() if got[name] != value]
+
+
+def test_what_is_shown_is_the_fit_as_it_is_after_the_iteration():
+    dataset, wishes, stale = plain_dataset(), Wishes(), []
+    trainer, view = make_trainer(dataset, iterations=5), EYE.viewpoint(WIDTH, HEIGHT)
+
+    def ask(iteration):
+        stale.extend(render_views(trainer.scene, [view]))  # before the step's result is there
+        wishes.ask(1, FrameRequest(EYE, WIDTH, HEIGHT))
+
+    screen, _ = run(trainer, wishes, dataset, ask)
+    (expected,) = render_views(make_scene_of(trainer), [view])
+    assert np.array_equal(screen.frames[-1], np.round(255 * expected))
+    assert not np.array_equal(screen.frames[-1], np.round(255 * stale[-1]))
+    assert screen.told[-1] == (5, 5) and screen.ended == 5
+
+
+def make_scene_of(trainer):
+    return make_scene(trainer.gaussians(), trainer.config.model, (1.0, 1.0, 1.0))
+
+
+@pytest.mark.parametrize("end_at", [1, 5, 8])
+def test_an_early_end_is_a_fit_of_so_many_iterations(end_at):
+    """And its configuration, fitted again from the start, gives its bytes."""
+    dataset, wishes = true_dataset(), Wishes()
+    trainer = make_trainer(dataset, **EVERYTHING)
+    screen, history = run(
+        trainer, wishes, dataset, lambda iteration: iteration == end_at and wishes.end()
+    )
+    done = trainer.iteration
+    # The request came when this iteration's end was already decided.
+    assert done == end_at + 1 == trainer.config.iterations == screen.ended
+    assert history.rows[-1].iteration == done and screen.told[-1] == (done, done)
+    again = Trainer(trainer.config, dataset, disturbed_blobs())
+    run(again)
+    expected, got = everything_of(trainer), everything_of(again)
+    assert not [name for name, value in expected.items() if got[name] != value]
+
+
+def test_an_end_asked_for_too_early_or_too_late_changes_nothing():
+    dataset, wishes = plain_dataset(), Wishes()
+    wishes.end()
+    trainer = make_trainer(dataset, iterations=3)
+    assert UntilEnded(AllIterations(), wishes).goes_on(trainer)  # nothing is fitted yet
+    config = config_of(iterations=3)
+    wishes = Wishes()
+    run(trainer, wishes, dataset, lambda iteration: iteration == 3 and wishes.end())
+    assert trainer.iteration == 3 and trainer.config.iterations == config.iterations
+
+
+def test_a_pause_holds_the_fit_and_its_clock_and_shows_what_is_asked_for():
+    dataset, wishes, during = plain_dataset(), Wishes(), []
+    trainer = make_trainer(dataset, iterations=4)
+
+    class Watcher(Screen):
+        """Asks for more, and then lets the fit go on."""
+
+        def show(self, client, request, frame, is_whole):
+            super().show(client, request, frame, is_whole)
+            during.append(trainer.iteration)
+            time.sleep(0.1)
+            if len(during) < 5:
+                wishes.ask(1, FrameRequest(EYE, 8 + len(during), 8))
+            else:
+                wishes.pause(False)
+
+    screen, history = Watcher(), History()
+    watching = Watching(wishes, screen, dataset, AllIterations())
+    for done in iterations(trainer, history, AllIterations()):
+        if done.report.iteration == 2:
+            wishes.pause(True)
+            wishes.ask(1, FrameRequest(EYE, 8, 8))
+            before = history.wall_s
+            watching.after(trainer, history, done, lambda: False)
+            assert history.wall_s - before < 0.2  # of at least 0.5 s
+    assert during == [2] * 5
+    assert [frame.shape[1] for frame in screen.frames] == [8, 9, 10, 11, 12]
+    assert trainer.iteration == 4
+
+
+def test_ctrl_c_and_an_early_end_are_heard_in_a_pause():
+    dataset = plain_dataset()
+    for end in (False, True):
+        wishes, trainer = Wishes(), make_trainer(dataset, iterations=3)
+        wishes.pause(True)
+        if end:
+            wishes.end()
+        run(trainer, wishes, dataset, stops=lambda end=end: not end)
+        assert trainer.iteration == (1 if end else 3)
