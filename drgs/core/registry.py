@@ -1,0 +1,159 @@
+"""Registries of extensions: implementations by name, shipped ones and those of other packages.
+
+A registry holds the implementations of one extension point. A class or function enters it by a
+decorator, with the pydantic model of its own configuration section, if it has one::
+
+    from drgs.training.density import STRATEGIES
+
+    class Settings(Section):
+        growth: float = 0.01
+
+    @STRATEGIES.register("my_strategy", section=Settings)
+    class MyStrategy(DensityStrategy): ...
+
+Shipped implementations enter by the same decorator; their modules are imported when they are used.
+An installed package makes its extensions known by an entry point of the group ``drgs``, whose value
+is the module that contains the decorators. A configuration names extensions and can set their
+sections under ``extensions``; it cannot name modules, so that reading one runs no code.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from importlib import import_module
+from importlib.metadata import EntryPoint, entry_points
+from typing import TYPE_CHECKING, Any, Generic, TypeVar
+
+from drgs.core.errors import UserError, did_you_mean, one_line
+
+if TYPE_CHECKING:
+    from pydantic import BaseModel
+
+ENTRY_POINT_GROUP = "drgs"
+"""Group of the entry points whose modules register extensions."""
+
+T = TypeVar("T")
+Registered = TypeVar("Registered")
+
+
+class ExtensionError(UserError):
+    """An error that an extension raised, reported with its name."""
+
+
+@dataclass(frozen=True)
+class Extension(Generic[T]):
+    """A registered implementation."""
+
+    kind: str  # of its registry, such as "density strategy"
+    name: str
+    value: T  # the class or function that was decorated
+    section: type[BaseModel] | None  # model of its configuration section
+    module: str  # that defines it
+
+    @contextmanager
+    def reporting(self) -> Iterator[None]:
+        """Within the block, raise errors of the extension as :class:`ExtensionError`.
+
+        Errors of extensions that drgs ships, and every ``UserError``, pass unchanged.
+        """
+        try:
+            yield
+        except UserError:
+            raise
+        except Exception as error:
+            if self.module.partition(".")[0] == "drgs":
+                raise
+            cause = one_line(f"{type(error).__name__}: {error}")
+            raise ExtensionError(f'{self.kind} "{self.name}" ({self.module}): {cause}') from error
+
+
+class Registry(Generic[T]):
+    """The implementations of one extension point, by name."""
+
+    def __init__(self, kind: str, shipped: Mapping[str, str] | None = None) -> None:
+        """kind: of the extensions, for messages; shipped: module of each shipped one, by name."""
+        self.kind = kind
+        self._shipped = dict(shipped or {})
+        self._extensions: dict[str, Extension[T]] = {}
+
+    def register(
+        self, name: str, section: type[BaseModel] | None = None
+    ) -> Callable[[Registered], Registered]:
+        """Return a decorator that registers a class or function under ``name``.
+
+        section: model of its configuration section, which a configuration sets under
+        ``extensions.NAME``.
+
+        Raises ValueError if another module has registered the name.
+        """
+
+        def decorate(value: Registered) -> Registered:
+            module = getattr(value, "__module__", type(value).__module__)
+            before = self._extensions.get(name)
+            owner = self._shipped.get(name) if before is None else before.module
+            if owner not in (None, module):
+                raise ValueError(f'{self.kind} "{name}" is registered by {owner} already')
+            self._extensions[name] = Extension(self.kind, name, value, section, module)
+            return value
+
+        return decorate
+
+    def names(self) -> list[str]:
+        """Return the names of all extensions, those of installed packages included, sorted."""
+        load_installed()
+        return sorted({*self._shipped, *self._extensions})
+
+    def get(self, name: str, place: str = "") -> Extension[T]:
+        """Return the extension of this name, importing what defines it.
+
+        place: of the name, such as ``scenes/lego.yml: densify.strategy``, for the message.
+
+        Raises :class:`UserError` for an unknown name; it lists those that exist.
+        """
+        if name not in self._extensions and name in self._shipped:
+            import_module(self._shipped[name])
+        if name not in self._extensions:
+            load_installed()
+        if name not in self._extensions:
+            known = self.names()
+            start = f"{place}: " if place else ""
+            raise UserError(
+                f'{start}no {self.kind} is called "{name}"{did_you_mean(name, known)}; there are '
+                f"{', '.join(known) or 'none'}. Others come with packages that have an entry point "
+                f'of the group "{ENTRY_POINT_GROUP}"'
+            )
+        return self._extensions[name]
+
+    def installed(self) -> list[Extension[T]]:
+        """Return the extensions that drgs does not ship, by name."""
+        load_installed()
+        return [e for name, e in sorted(self._extensions.items()) if name not in self._shipped]
+
+
+_loaded: set[str] = set()
+"""Entry points whose modules have been imported: they register at import, once."""
+
+
+def load_installed() -> None:
+    """Import the modules of the entry points of the group ``drgs``.
+
+    Raises :class:`ExtensionError` naming the entry point if one cannot be imported.
+    """
+    for point in entry_points(group=ENTRY_POINT_GROUP):
+        if point.value not in _loaded:
+            _load(point)
+            _loaded.add(point.value)
+
+
+def _load(point: EntryPoint) -> Any:
+    try:
+        return point.load()
+    except Exception as error:
+        package = "" if point.dist is None else f" of the package {point.dist.name}"
+        cause = one_line(f"{type(error).__name__}: {error}")
+        raise ExtensionError(
+            f'cannot load the extension "{point.name}"{package} ({point.value}): {cause}; repair '
+            "or uninstall it"
+        ) from error

@@ -1,0 +1,77 @@
+"""Extensions by name: what registers them, and what messages say."""
+
+import sys
+from importlib.metadata import EntryPoint
+
+import pytest
+
+from drgs.core import registry
+from drgs.core.errors import UserError
+from drgs.core.registry import ExtensionError, Registry
+
+
+def entry_point(monkeypatch, tmp_path, source):
+    """A module outside of drgs, known by an entry point of an installed package."""
+    (tmp_path / "outside_extension.py").write_text(source)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "outside_extension", raising=False)
+    point = EntryPoint("outside", "outside_extension", registry.ENTRY_POINT_GROUP)
+    monkeypatch.setattr(registry, "entry_points", lambda group: [point])
+    monkeypatch.setattr(registry, "_loaded", set())
+
+
+def test_shipped_extensions_are_imported_when_used(monkeypatch, tmp_path):
+    (tmp_path / "shipped_later.py").write_text(
+        "from support_registry import KINDS\n@KINDS.register('later')\nclass Later: pass\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    kinds = Registry("kind", {"later": "shipped_later"})
+    monkeypatch.setitem(sys.modules, "support_registry", type(sys)("support_registry"))
+    sys.modules["support_registry"].KINDS = kinds
+    assert kinds.names() == ["later"]
+    assert "shipped_later" not in sys.modules
+    found = kinds.get("later")
+    assert (found.name, found.value.__name__, found.module) == ("later", "Later", "shipped_later")
+    assert kinds.installed() == []
+    del sys.modules["shipped_later"]
+
+
+def test_an_installed_package_registers_by_its_entry_point(monkeypatch, tmp_path):
+    kinds = Registry("kind")
+    monkeypatch.setattr(registry, "KINDS_OF_TEST", kinds, raising=False)
+    source = (
+        "from drgs.core.registry import KINDS_OF_TEST\n"
+        "@KINDS_OF_TEST.register('mine')\ndef mine(): raise KeyError('oh')\n"
+    )
+    entry_point(monkeypatch, tmp_path, source)
+    assert kinds.names() == ["mine"]
+    assert [each.name for each in kinds.installed()] == ["mine"]
+    extension = kinds.get("mine")
+    with pytest.raises(ExtensionError, match=r'^kind "mine" \(outside_extension\): KeyError: '):
+        with extension.reporting():
+            extension.value()
+
+
+def test_an_unknown_name_lists_those_that_exist():
+    kinds = Registry("kind")
+    kinds.register("adc")(object())
+    with pytest.raises(UserError) as caught:
+        kinds.get("adq", "a.yml: densify.strategy")
+    message = str(caught.value)
+    assert message.startswith('a.yml: densify.strategy: no kind is called "adq"; did you mean adc?')
+    assert "there are adc" in message
+    assert 'entry point of the group "drgs"' in message
+
+
+def test_a_package_that_cannot_be_imported_is_named(monkeypatch, tmp_path):
+    entry_point(monkeypatch, tmp_path, "import no_such_module\n")
+    with pytest.raises(
+        ExtensionError, match='extension "outside" .*outside_extension.*no_such_mod'
+    ):
+        Registry("kind").names()
+
+
+def test_a_name_of_another_module_is_not_replaced():
+    kinds = Registry("kind", {"taken": "drgs.somewhere"})
+    with pytest.raises(ValueError, match="registered by drgs.somewhere already"):
+        kinds.register("taken")(test_an_unknown_name_lists_those_that_exist)
