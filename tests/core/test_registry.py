@@ -47,31 +47,33 @@ def test_an_installed_package_registers_by_its_entry_point(monkeypatch, tmp_path
     assert kinds.names() == ["mine"]
     assert [each.name for each in kinds.installed()] == ["mine"]
     extension = kinds.get("mine")
-    with pytest.raises(ExtensionError, match=r'^kind "mine" \(outside_extension\): KeyError: '):
-        with extension.reporting():
-            extension.value()
+    start = r'^kind "mine" \(outside_extension\): KeyError: '
+    with pytest.raises(ExtensionError, match=start), extension.reporting():
+        extension.value()
 
 
 def test_an_unknown_name_lists_those_that_exist():
     kinds = Registry("kind")
-    kinds.register("adc")(object())
+    kinds.register("adaptive")(object())
     with pytest.raises(UserError) as caught:
-        kinds.get("adq", "a.yml: densify.strategy")
+        kinds.get("adaptve", "a.yml: densify.strategy")
     message = str(caught.value)
-    assert message.startswith('a.yml: densify.strategy: no kind is called "adq"; did you mean adc?')
-    assert "there are adc" in message
+    assert message.startswith(
+        'a.yml: densify.strategy: no kind is called "adaptve"; did you mean adaptive?'
+    )
+    assert "there are adaptive" in message
     assert 'entry point of the group "drgs"' in message
 
 
 def test_a_package_that_cannot_be_imported_is_named(monkeypatch, tmp_path):
     entry_point(monkeypatch, tmp_path, "import no_such_module\n")
     with pytest.raises(
-        ExtensionError, match='extension "outside" .*outside_extension.*no_such_mod'
+        ExtensionError, match=r'extension "outside" .*outside_extension.*no_such_mod'
     ):
         Registry("kind").names()
 
 
 def test_a_name_of_another_module_is_not_replaced():
     kinds = Registry("kind", {"taken": "drgs.somewhere"})
-    with pytest.raises(ValueError, match="registered by drgs.somewhere already"):
+    with pytest.raises(ValueError, match=r"registered by drgs\.somewhere already"):
         kinds.register("taken")(test_an_unknown_name_lists_those_that_exist)
