@@ -432,9 +432,7 @@ class SplatsIntegrator(mi.CppADIntegrator):
         is what ``SceneParameters.set_dirty`` announces.
         """
         if keys != ["background"]:
-            self.memory.rendered.clear()
-            if self.last is not None:
-                self.last = replace(self.last, frames=[])
+            self.forget_frames()
             self._gathered = None
         if not self._has_own:
             return
@@ -448,6 +446,12 @@ class SplatsIntegrator(mi.CppADIntegrator):
         others = self._scene_has_shapes or self._is_object or self.objects
         if not (self._sh_degree_is_given or others):
             check_degree(self.sh_degree, self._own)
+
+    def forget_frames(self) -> None:
+        """Render the next image anew, also if no parameter has changed."""
+        self.memory.rendered.clear()
+        if self.last is not None:
+            self.last = replace(self.last, frames=[])
 
     def become_object(self, name: str) -> None:
         """Leave rendering to the integrator that this one is nested in.

@@ -173,8 +173,8 @@ class Trainer:
             self.optimizer.step()
         self._update_effects(step)
         report = self._control_density(step)
-        for view in self.gradients.own_views():
-            step.stage.seen(view.view)
+        for place in losses:
+            step.stage.seen(step.views[place].view)
         means_lr = self.rates.means(step.last)
         return StepReport(step.last, self.num_gaussians, means_lr, report, tuple(views))
 

@@ -291,6 +291,7 @@ class ViewExchange:
         for each in self._views:
             if each.renderer == self.comm.rank:
                 self._current = each
+                self.integrator.forget_frames()  # splats of other ranks arrive anew
                 yield each.view
 
     def end_view(self, weights: Mapping[str, Any]) -> None:
