@@ -17,6 +17,7 @@ import csv
 import math
 import re
 import time
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -24,9 +25,10 @@ from pathlib import Path
 
 from drgs.config.changes import changed, with_iterations
 from drgs.config.schema import FitConfig
-from drgs.core.errors import UserError
+from drgs.core.errors import UserError, UserNote
 from drgs.datasets.types import Dataset
 from drgs.gaussians.parameters import Gaussians
+from drgs.results.report import seconds_of_curves, seconds_of_results
 from drgs.training.trainer import Trainer
 
 CURVES = Path(__file__).parent / "training_curves.csv"
@@ -45,6 +47,14 @@ REVISED_EVERY = 0.1
 
 LONGEST = 7 * 24 * 3600.0
 """Seconds."""
+
+MAX_PICTURES_SHARE = 0.33
+"""Of the time that ``--budget`` leaves after the start: pictures that take more are left out."""
+
+_NO_PICTURES = (
+    "--budget: the time is needed for iterations: no report, orbit and pictures are written "
+    "(output.report, output.save_renders); python -m drgs.render OUT_DIR --out DIR makes pictures"
+)
 
 WARM_UP, TIMED = 6, 20
 """Iterations: the first compile kernels and fill the allocator's pools."""
@@ -289,21 +299,42 @@ def rehearse(
     return Rehearsal(trainer, (time.perf_counter() - start) / (timed * views_per_step))
 
 
+def plan_fit(
+    config: FitConfig,
+    dataset: Dataset,
+    gaussians: Gaussians,
+    end: float,
+    make_trainer: Callable[[FitConfig, Dataset, Gaussians], Trainer] = Trainer,
+) -> tuple[float, Plan]:
+    """Return when the iterations are to end, and a plan until then.
+
+    end: of everything, by ``time.perf_counter``.
+    """
+    rehearsal = rehearse(config, dataset, gaussians, make_trainer)
+    num_points, most = gaussians.num_gaussians, target_of(config) or 0
+    scene, degree = rehearsal.trainer.scene_of_all(), config.model.sh_degree
+    results = seconds_of_results(scene, dataset, max(num_points, most), degree)
+    pictures = results.renders if config.output.save_renders else 0.0
+    pictures += results.report + seconds_of_curves() if config.output.report else 0.0
+    if pictures > MAX_PICTURES_SHARE * (end - time.perf_counter()):
+        warnings.warn(UserNote(_NO_PICTURES), stacklevel=2)
+        config = changed(config, {"output.report": False, "output.save_renders": False})
+    else:
+        end -= pictures
+    has_one_file = config.model.approximations.are_usual
+    end -= results.measuring * (1 if has_one_file else 2)
+    if not has_one_file:
+        from drgs.training.viewers import TIME_SHARE
+
+        end -= TIME_SHARE * max(0.0, end - time.perf_counter())
+    side = min(min(view.width, view.height) for view in dataset.train)
+    seconds, start_s = end - time.perf_counter(), rehearsal.iteration_s
+    return end, make_plan(config, num_points, side, seconds, start_s, load_curves())
+
+
 # ----------------------------------------------------------------------------------------------
 # The end of a fit
 # ----------------------------------------------------------------------------------------------
-
-
-class AllIterations:
-    """A fit ends when the iterations of its configuration are done."""
-
-    def goes_on(self, trainer: Trainer) -> bool:
-        """Whether there is another iteration."""
-        return trainer.iteration < trainer.config.iterations
-
-    def total(self, trainer: Trainer) -> int:
-        """Iterations in all."""
-        return trainer.config.iterations
 
 
 class Deadline:
@@ -321,7 +352,7 @@ class Deadline:
         self._next = self._start + REVISED_EVERY * (end - self._start)
         self._densify_share = config.densify.stop / config.iterations
 
-    def goes_on(self, trainer: Trainer) -> bool:
+    def should_continue(self, trainer: Trainer) -> bool:
         """Whether there is time for another iteration; revises the trainer's configuration."""
         now, done = time.perf_counter(), trainer.iteration
         if now >= self._end and done > 0:
@@ -329,11 +360,11 @@ class Deadline:
             return False
         if now >= self._next and done > 0:
             self._next = now + REVISED_EVERY * (self._end - self._start)
-            total = self.total(trainer)
+            total = self.num_iterations(trainer)
             trainer.replan(total, self._densify_stop(trainer, total))
         return True
 
-    def total(self, trainer: Trainer) -> int:
+    def num_iterations(self, trainer: Trainer) -> int:
         """Iterations in all: as planned, later as the curve and the time so far say."""
         now, done = time.perf_counter(), trainer.iteration
         if done == 0:

@@ -8,7 +8,6 @@ import pytest
 from support.fit_command import assert_fits, write_project
 from support.small_fits import config_of, plain_dataset, true_blobs
 
-from drgs import fit
 from drgs.config.changes import changed
 from drgs.core.errors import UserNote
 from drgs.results.files import (
@@ -22,6 +21,7 @@ from drgs.results.files import (
     VIEWER,
 )
 from drgs.results.report import Seconds
+from drgs.training import budget
 from drgs.training.viewers import TIME_SHARE
 
 
@@ -29,14 +29,16 @@ from drgs.training.viewers import TIME_SHARE
 def planned(monkeypatch):
     """When iterations end, and for which configuration, by a clock that says 0."""
     rehearsal = SimpleNamespace(trainer=SimpleNamespace(scene_of_all=lambda: None), iteration_s=0.1)
-    monkeypatch.setattr(fit, "rehearse", lambda *_: rehearsal)
-    monkeypatch.setattr(fit, "seconds_of_results", lambda *_: Seconds(6.0, renders=1.0, report=1.0))
-    monkeypatch.setattr(fit, "seconds_of_curves", lambda: 2.0)
-    monkeypatch.setattr(fit, "make_plan", lambda *arguments: arguments)
-    monkeypatch.setattr(fit, "time", SimpleNamespace(perf_counter=lambda: 0.0))
+    monkeypatch.setattr(budget, "rehearse", lambda *_: rehearsal)
+    monkeypatch.setattr(
+        budget, "seconds_of_results", lambda *_: Seconds(6.0, renders=1.0, report=1.0)
+    )
+    monkeypatch.setattr(budget, "seconds_of_curves", lambda: 2.0)
+    monkeypatch.setattr(budget, "make_plan", lambda *arguments: arguments)
+    monkeypatch.setattr(budget, "time", SimpleNamespace(perf_counter=lambda: 0.0))
 
     def plan(config, seconds):
-        end, (planned, *_) = fit.planned(config, plain_dataset(), true_blobs(), seconds)
+        end, (planned, *_) = budget.plan_fit(config, plain_dataset(), true_blobs(), seconds)
         return end, planned
 
     return plan
