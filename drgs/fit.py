@@ -1,27 +1,9 @@
 """``python -m drgs.fit CONFIG.yml|FOLDER``: fit Gaussians to photographs.
 
 Reads the configuration, or makes one that suits the folder, and runs
-:class:`drgs.training.session.FitSession`, which writes the output folder:
-
-- ``point_cloud.ply``: the Gaussians, in the layout of the 3DGS reference implementation
-- ``point_cloud_viewers.ply``: the same for other viewers, where these render otherwise than the fit
-- ``metrics.json``: quality on the test views, time, population, versions, machine, command
-- ``history.csv``: loss, PSNR, population and rate over the iterations, now and then test PSNR,
-  for the report's curve
-- ``density.csv``: what was added to the population and removed from it, where anything was
-- ``renders/<split>/*.png``: the test views as fitted
-- ``side_by_side/<split>/*.png``: fitted, photograph and difference
-- ``curves.png``, ``orbit.webp``, ``orbit.gif``
-- ``report.html``: all of it on one page that needs no other file (``output.report: false``
-  leaves out this page and what is made for it: comparisons, curves, orbits, ``viewer.html``)
-- ``viewer.html``: the Gaussians to walk around in, in a browser, unless they are too many
-- ``config.yml``: every value that the fit used
-- ``views.json``: the cameras of the training views, for orbits
-- ``colors.json``, ``cameras.json``: colour transforms and refined cameras of the training views
-- ``plan.txt``: with ``--budget``, what was planned and why
-- ``tensorboard/``: with ``--tensorboard``, the history as TensorBoard reads it
-
-While it runs there is also ``checkpoint.npz``, from which ``--resume`` continues.
+:class:`drgs.training.session.FitSession`, which writes the output folder
+(``drgs.results.files``). While it runs there is ``checkpoint.npz``, from which ``--resume``
+continues.
 """
 
 from __future__ import annotations
@@ -46,7 +28,7 @@ from drgs.core.processes import process_number, start_mpi
 from drgs.datasets.folders import config_for
 from drgs.results.files import CONFIG, EVENTS
 from drgs.results.folder import load_moved_config
-from drgs.training.budget import parse_duration
+from drgs.training.budget import Budget, parse_duration
 from drgs.training.fit_folder import FitFolder
 from drgs.training.session import Console, FitSession, MakeTrainer
 from drgs.training.trainer import Trainer
@@ -152,16 +134,15 @@ def run_with(args: argparse.Namespace, make_trainer: MakeTrainer) -> None:
         config, out = what_to_fit(args)
         session = FitSession(
             config,
-            folder=FitFolder(out, args.resume is not None, args.overwrite),
+            folder=FitFolder(out, args.command, args.resume is not None, args.overwrite),
             console=Console(),
             variant=args.variant,
-            budget_s=args.budget,
-            started=started,
-            on_start=partial(add_observers, args, server, blocks),
+            budget=None if args.budget is None else Budget(args.budget, started + args.budget),
             check_ranges=check_ranges,
+            on_start=partial(add_observers, args, server, blocks),
             make_trainer=make_trainer,
         )
-        finished = session.run(args.command)
+        finished = session.run()
     if not finished:
         print(f"stopped; continue with: {args.prog} --resume {out}")
         sys.exit(INTERRUPTED_STATUS)

@@ -12,6 +12,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from datetime import datetime
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import drjit as dr
 import mitsuba as mi
@@ -31,8 +32,10 @@ from drgs.results.files import (
     CHECKPOINT,
     DENSITY,
     GAUSSIANS,
+    GAUSSIANS_FOR_VIEWERS,
     HISTORY,
     METRICS,
+    REPORT,
     VIEWS,
 )
 from drgs.results.folder import (
@@ -47,16 +50,21 @@ from drgs.results.folder import (
     seal_run,
     write_run_config,
 )
-from drgs.results.metrics import FitMetrics, Quality, SplitMetrics
+from drgs.results.history import write_density, write_history
+from drgs.results.metrics import FitMetrics, SplitMetrics, mean_of, mean_quality
 from drgs.results.refined_cameras import write_views
+from drgs.results.report import Fitted, write_pictures, write_results
 from drgs.results.viewer import Shown, shows_as_fitted
 from drgs.training.checkpoint import (
     Checkpoint,
     load_checkpoint,
     remove_checkpoint,
 )
-from drgs.training.history import History, write_density, write_history
+from drgs.training.history import History
 from drgs.training.trainer import Trainer
+
+if TYPE_CHECKING:  # imported where it is needed
+    from drgs.training.viewers import ForViewers
 
 
 @dataclass(eq=False)
@@ -64,6 +72,7 @@ class FitFolder:
     """The output folder of one fit, which the session alone writes to."""
 
     path: Path
+    command: str = ""  # the line that was typed, for the report
     resumes: bool = False  # a fit that was stopped, whatever its configuration
     overwrites: bool = False  # the run that the folder holds
 
@@ -79,14 +88,14 @@ class FitFolder:
             return False
         return has_results(self.path) if self.resumes else is_finished(self.path, config)
 
-    def checkpoint_for(self, config: FitConfig, has_deadline: bool) -> Checkpoint | None:
+    def checkpoint_for(self, config: FitConfig, has_budget: bool) -> Checkpoint | None:
         """Return the checkpoint to continue from, if there is one.
 
         Raises ``UserError`` where the folder belongs to another fit. Nothing is written.
         """
         if self.overwrites:
             return None
-        if has_deadline:
+        if has_budget:
             require_no_run(self.path)
         elif not self.resumes:
             check_output_folder(self.path, config)
@@ -118,17 +127,61 @@ class FitFolder:
             "rates (--set optimizer.means_lr=..., and so on) may avoid it"
         )
 
-    def write_fit(
-        self, trainer: Trainer, dataset: Dataset, history: History, gaussians: Gaussians
-    ) -> None:
-        """Write what the fit has found: Gaussians, effects, history, cameras, configuration."""
-        saved_gaussians(gaussians, trainer.config).save(self.path / GAUSSIANS)
+    def write_results(
+        self,
+        trainer: Trainer,
+        dataset: Dataset,
+        history: History,
+        gaussians: Gaussians,
+        for_viewers: ForViewers | None,
+        wall_s: float,
+    ) -> FitMetrics:
+        """Write the results of a finished fit, and measure them; return ``metrics.json``.
+
+        gaussians: what ``trainer.gaussians()`` returned; for_viewers: None where other viewers
+        render as the fit does; wall_s: spent on iterations.
+        """
+        out, config, render = self.path, trainer.config, trainer.pictures
+        saved_gaussians(gaussians, config).save(out / GAUSSIANS)
         for effect in trainer.effects:
-            effect.write(self.path, dataset)
-        write_history(self.path / HISTORY, history.rows)
-        write_density(self.path / DENSITY, history.density)
-        write_views(self.path / VIEWS, dataset)
-        write_run_config(self.path, trainer.config)
+            effect.write(out, dataset)
+        write_history(out / HISTORY, history.rows)
+        write_density(out / DENSITY, history.density)
+        write_views(out / VIEWS, dataset)
+        write_run_config(out, config)
+        output, split = config.output, dataset.test_split
+        scores = write_pictures(out, dataset, render, output.save_renders, output.report)
+        test = {**vars(mean_of(scores)), "split": split}
+        metrics = fit_metrics(config, gaussians.num_gaussians, wall_s, test, self.command)
+        other, approximations = None, config.model.approximations
+        if for_viewers is not None:
+            other = for_viewers.gaussians
+            other.save(out / GAUSSIANS_FOR_VIEWERS)
+            images = zip(for_viewers.pictures(dataset.test), dataset.test, strict=True)
+            quality = mean_quality((image, view.image, view.mask) for image, view in images)
+            metrics["viewers"] = {**vars(quality), "split": split}
+        if output.report:
+            shown = gaussians_on_page(gaussians, approximations, other)
+            fitted = Fitted(trainer.scene_of_all(), gaussians, render, shown)
+            write_results(out, dataset, fitted, scores, history, metrics)
+        self.finish(metrics)
+        return metrics
+
+    def describe(self, metrics: FitMetrics) -> str:
+        """Return the results in a few lines, and where they are."""
+        test, viewers = metrics["test"], metrics.get("viewers")
+        lines = [
+            f"{test['num_views']} {test['split']} views: PSNR {test['psnr']:.2f} dB, "
+            f"SSIM {test['ssim']:.4f}; {metrics['num_gaussians']:,} Gaussians; "
+            f"{metrics['iterations']} iterations in {metrics['wall_s']:.0f} s"
+        ]
+        if viewers is not None:
+            path = self.path / GAUSSIANS_FOR_VIEWERS
+            lines.append(f"as other viewers show {path}: PSNR {viewers['psnr']:.2f} dB")
+        lines.append(f"written: {self.path}")
+        if metrics["config"]["output"]["report"]:
+            lines.append(f"open {self.path / REPORT}")
+        return "\n".join(lines)
 
     def finish(self, metrics: FitMetrics | None = None) -> None:
         """Write ``metrics.json`` (None: it is there), and end the run: no checkpoint is left."""
@@ -171,19 +224,14 @@ def _without_filter(gaussians: Gaussians) -> Gaussians:
 
 
 def fit_metrics(
-    config: FitConfig,
-    dataset: Dataset,
-    num_gaussians: int,
-    wall_s: float,
-    quality: Quality,
-    command: str,
+    config: FitConfig, num_gaussians: int, wall_s: float, test: SplitMetrics, command: str
 ) -> FitMetrics:
     """Return the contents of ``metrics.json``."""
     return {
         "iterations": config.iterations,
         "num_gaussians": num_gaussians,
         "wall_s": round(wall_s, 2),
-        "test": split_metrics(quality, dataset),
+        "test": test,
         "seed": config.seed,
         "versions": {
             "drgs": drgs.__version__,
@@ -200,8 +248,3 @@ def fit_metrics(
         "command": command,
         "config": config.model_dump(mode="json"),
     }
-
-
-def split_metrics(quality: Quality, dataset: Dataset) -> SplitMetrics:
-    """Return the quality of the test views, as ``metrics.json`` contains it."""
-    return {**vars(quality), "split": dataset.test_split}

@@ -36,17 +36,21 @@ class HeldOutQuality:
     def after(
         self, trainer: Trainer, history: History, done: Iteration, stops: Callable[[], bool]
     ) -> None:
-        """Add the mean PSNR to the last row of the history, where that is due."""
+        """Measure where that is due, if there is to be a report."""
         del stops
         config = trainer.config
         if done.row is None or not config.output.report:
             return
         if measurement_is_due(history.rows, config.iterations):
-            start = time.perf_counter()
-            trainer.show()
-            pairs = zip(trainer.pictures(self._views), self._views, strict=True)
-            mean = np.mean([psnr(image, view.image, view.mask) for image, view in pairs])
-            history.add_test_psnr(float(mean), time.perf_counter() - start)
+            self.measure(trainer, history)
+
+    def measure(self, trainer: Trainer, history: History) -> None:
+        """Add the mean PSNR to the last row of the history, which is of this moment."""
+        start = time.perf_counter()
+        trainer.show()
+        pairs = zip(trainer.pictures(self._views), self._views, strict=True)
+        mean = np.mean([psnr(image, view.image, view.mask) for image, view in pairs])
+        history.add_test_psnr(float(mean), time.perf_counter() - start)
 
 
 def measured_views(views: Sequence[View]) -> tuple[View, ...]:

@@ -12,8 +12,9 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import mitsuba as mi
 
@@ -33,24 +34,18 @@ from drgs.initialization.defaults import completed
 from drgs.initialization.start import description_of_start, gaussians_at, start_of
 from drgs.integrator.scene import check_lenses
 from drgs.integrator.summary import described
-from drgs.results.files import GAUSSIANS_FOR_VIEWERS, REPORT
-from drgs.results.metrics import Quality, mean_of
-from drgs.results.report import Fitted, score, write_pictures, write_results
-from drgs.training.budget import Deadline, Plan, plan_fit
+from drgs.training.budget import Budget, Deadline, Plan, plan_fit
 from drgs.training.checkpoint import Checkpoint, check_fits, check_same_data, save_checkpoint
 from drgs.training.finite_checks import NonFiniteError
-from drgs.training.fit_folder import (
-    FitFolder,
-    fit_metrics,
-    gaussians_on_page,
-    saved_gaussians,
-    split_metrics,
-)
+from drgs.training.fit_folder import FitFolder, saved_gaussians
 from drgs.training.history import History, HistoryRow, smoother
 from drgs.training.loop import AllIterations, Iteration, Observer, StopCriterion, iterations
 from drgs.training.quality import HeldOutQuality
 from drgs.training.summary import summary_of_fit
 from drgs.training.trainer import StepReport, Trainer
+
+if TYPE_CHECKING:  # imported where it is needed
+    from drgs.training.viewers import ForViewers
 
 MakeTrainer = Callable[[FitConfig, Dataset, Gaussians], Trainer]
 """From the configuration, the photographs and the initial Gaussians."""
@@ -111,103 +106,83 @@ class ShownProgress:
             self._progress.update(row.iteration, self._criterion.num_iterations(trainer), status)
 
 
+@dataclass(eq=False)
 class FitSession:
-    """One fit; ``trainer``, ``history`` and ``criterion`` exist once it is prepared."""
+    """One fit. What is not given is made by :meth:`prepare`."""
 
-    trainer: Trainer
-    history: History
-    criterion: StopCriterion
+    config: FitConfig
+    dataset: Dataset | None = None  # None: that of the configuration
+    folder: FitFolder | None = None  # for results and checkpoints
+    console: Console | Silence = field(default_factory=Silence)
+    variant: str | None = None  # of Mitsuba; None: the active one
+    budget: Budget | None = None  # the time for which the fit is planned
+    check_ranges: Callable[[], None] = lambda: None  # called after each iteration
+    on_start: Callable[[FitSession], None] = lambda session: None  # before the first iteration
+    make_trainer: MakeTrainer = Trainer
+    trainer: Trainer = field(init=False)
+    history: History = field(init=False)
+    criterion: StopCriterion = field(init=False, default_factory=AllIterations)
+    observers: list[Observer] = field(init=False, default_factory=list)
 
-    def __init__(
-        self,
-        config: FitConfig,
-        dataset: Dataset | None = None,
-        *,
-        folder: FitFolder | None = None,
-        console: Console | Silence | None = None,
-        variant: str | None = None,
-        budget_s: float | None = None,
-        started: float = 0.0,
-        on_start: Callable[[FitSession], None] | None = None,
-        check_ranges: Callable[[], None] = lambda: None,
-        make_trainer: MakeTrainer = Trainer,
-    ) -> None:
-        """dataset: by default that of the configuration; folder: for results and checkpoints.
-
-        variant: of Mitsuba, by default the active one; budget_s: the fit is planned to be done,
-        results written, so many seconds after ``started``, by ``time.perf_counter``; on_start:
-        called before the first iteration, to add ``observers`` or replace ``criterion``;
-        check_ranges: called after each iteration, raises ``UserError``.
-        """
-        self.config, self.dataset, self.folder = config, dataset, folder
-        self.console = Silence() if console is None else console
-        self.observers: list[Observer] = []
-        self._budget_s, self._end = budget_s, started + (budget_s or 0.0)
-        self._variant, self._on_start = variant, on_start
-        self._check_ranges, self._make_trainer = check_ranges, make_trainer
-        self._plan: Plan | None = None
-
-    def run(self, command: str) -> bool:
-        """Fit, and write the results to the folder; False if Ctrl-C stopped it, its state saved.
-
-        command: the line that was typed, for the report.
-        """
+    def run(self) -> bool:
+        """Fit, and write the results; False if Ctrl-C stopped the fit, with its state saved."""
         folder = self.folder
-        with folder.locked():
-            if folder.is_finished(self.config):
+        with nullcontext() if folder is None else folder.locked():
+            if folder is not None and folder.is_finished(self.config):
                 folder.finish()  # a process that was killed after its last file has not
                 self.console.say(f"{folder.path}: this fit is finished; --overwrite does it again")
                 return True
-            self.prepare()
-            folder.take(self.config, self.dataset)
-            if self._plan is not None:
-                folder.write_plan(f"--budget {self._budget_s:g}s\n{self._plan.reasons}\n")
-                self.criterion = Deadline(self.trainer, self._end, self._plan.curve)
-            if self._on_start is not None:
-                self._on_start(self)
+            plan = self.prepare()
+            if folder is not None:
+                folder.take(self.config, self.dataset)
+            if plan is not None:
+                self._follow(plan)
+            self.on_start(self)
             try:
                 if not self.iterate():
                     return False
-                wall_s, gaussians = self.history.wall_s, self.trainer.gaussians()
+                self._finish(self.history.wall_s, self.trainer.gaussians())
             except NonFiniteError as error:
-                raise UserError(f"{error}; {folder.remedy}") from None
-            self._write_results(gaussians, wall_s, command)
+                remedy = "" if folder is None else f"; {folder.remedy}"
+                raise UserError(f"{error}{remedy}") from None
         return True
 
-    def prepare(self) -> None:
-        """Load the data, initialize the Gaussians, plan, make the trainer; writes nothing.
+    def prepare(self) -> Plan | None:
+        """Load the data, initialize the Gaussians, make the trainer; return the plan, if any.
 
-        Input that cannot be used raises ``UserError`` here.
+        Input that cannot be used raises ``UserError`` here; nothing is written.
         """
-        checkpoint = None
-        if self.folder is not None:
-            checkpoint = self.folder.checkpoint_for(self.config, self._budget_s is not None)
+        folder, given, checkpoint = self.folder, self.dataset, None
+        if folder is not None:
+            checkpoint = folder.checkpoint_for(self.config, self.budget is not None)
         config = self.config if checkpoint is None else checkpoint.config
-        place = "train()" if self.dataset is not None else config.data.path
-        if self.dataset is None:
-            self.dataset = load_dataset(config.data_for_training)
-        self._fingerprint = None if self.folder is None else fingerprint_of(self.dataset)
+        self.dataset = load_dataset(config.data_for_training) if given is None else given
+        self._fingerprint = None if folder is None else fingerprint_of(self.dataset)
         if checkpoint is not None:
-            path = self.folder.path
-            check_same_data(path, config.data.path, checkpoint.data, self._fingerprint)
+            before = checkpoint.data
+            check_same_data(folder.path, config.data.path, before, self._fingerprint)
         self.config = completed(config, self.dataset)
-        self._select_variant()
-        gaussians = self._initial_gaussians(f"{place}: ")
-        if self._budget_s is not None:
-            self._end, self._plan = plan_fit(
-                self.config, self.dataset, gaussians, self._end, self._make_trainer
-            )
-            self.config = self._plan.config
-            self.console.say(self._plan.reasons)
-        self.trainer = self._make_trainer(self.config, self.dataset, gaussians)
+        if self.variant is not None or mi.variant() is None:
+            select_variant(self.variant or VARIANTS[0])
+        place = config.data.path if given is None else "train()"
+        gaussians, plan = self._initial_gaussians(f"{place}: "), None
+        if self.budget is not None:
+            make_trainer, end = self.make_trainer, self.budget.end
+            plan = plan_fit(self.config, self.dataset, gaussians, end, make_trainer)
+            self.config = plan.config
+            self.console.say(plan.reasons)
+        self.trainer = self.make_trainer(self.config, self.dataset, gaussians)
         self.dataset = self.trainer.dataset  # of which others may have a part
-        self.history, self.criterion = History(), AllIterations()
+        self.history = History()  # whose clock begins
         if checkpoint is not None:
             self._restore(checkpoint)
+        return plan
 
-    def _select_variant(self) -> None:
-        if self._variant is not None or mi.variant() is None:
-            select_variant(self._variant or VARIANTS[0])
+    def _follow(self, plan: Plan) -> None:
+        """End the fit when the time of its plan is up."""
+        self.criterion = Deadline(self.trainer, plan.end, plan.chosen.curve)
+        if self.folder is not None:
+            self.folder.write_plan(f"--budget {self.budget.seconds:g}s\n{plan.reasons}\n")
 
     def _initial_gaussians(self, place: str) -> Gaussians:
         """Describe the data, the start and what is simulated; return the Gaussians to start from.
@@ -247,7 +222,7 @@ class FitSession:
             observers = [ShownProgress(progress, criterion), HeldOutQuality(self.dataset.test)]
             observers += self.observers
             for done in iterations(trainer, self.history, criterion):
-                self._check_ranges()
+                self.check_ranges()
                 for observer in observers:
                     observer.after(trainer, self.history, done, lambda: stop.requested)
                 if stop.requested or self._is_checkpoint_due(done):
@@ -262,55 +237,35 @@ class FitSession:
 
     def _save_checkpoint(self) -> None:
         state, history = self.trainer.state(), self.history
-        rows, changes = history.as_array(), history.density_array()
-        checkpoint = Checkpoint(state, rows, history.wall_s, self._fingerprint, changes)
-        save_checkpoint(self.folder.path, self.trainer.config, checkpoint)
+        if self.folder is not None:
+            rows, changes = history.as_array(), history.density_array()
+            checkpoint = Checkpoint(state, rows, history.wall_s, self._fingerprint, changes)
+            save_checkpoint(self.folder.path, self.trainer.config, checkpoint)
 
-    def _write_results(self, gaussians: Gaussians, wall_s: float, command: str) -> None:
-        """Measure what was fitted, write it, and say so."""
-        trainer, dataset, folder, say = self.trainer, self.dataset, self.folder, self.console.say
-        config, output = trainer.config, trainer.config.output
-        _warn_if_not_pruned(trainer)
+    def _finish(self, wall_s: float, gaussians: Gaussians) -> None:
+        """Fit the file for other viewers, if one is needed; measure and write the results."""
+        _warn_if_not_pruned(self.trainer)
         release_unused_memory()  # encoding the orbit's frames takes as much as iterations do
-        scene, render, out = trainer.scene_of_all(), trainer.pictures, folder.path
-        folder.write_fit(trainer, dataset, self.history, gaussians)
-        scores = write_pictures(out, dataset, render, output.save_renders, output.report)
-        quality = mean_of(scores)
-        metrics = fit_metrics(config, dataset, gaussians.num_gaussians, wall_s, quality, command)
+        self.trainer.scene_of_all()
         for_viewers = None
-        if not config.model.approximations.are_usual:
-            for_viewers, as_seen = self._fit_for_viewers(gaussians)
-            metrics["viewers"] = split_metrics(as_seen, dataset)
-        if output.report:
-            shown = gaussians_on_page(gaussians, config.model.approximations, for_viewers)
-            fitted = Fitted(scene, gaussians, render, shown)
-            write_results(out, dataset, fitted, scores, self.history, metrics)
-        folder.finish(metrics)
-        say(
-            f"{quality.num_views} {dataset.test_split} views: PSNR {quality.psnr:.2f} dB, "
-            f"SSIM {quality.ssim:.4f}; {gaussians.num_gaussians:,} Gaussians; "
-            f"{config.iterations} iterations in {wall_s:.0f} s"
-        )
-        if for_viewers is not None:
-            seen_at = out / GAUSSIANS_FOR_VIEWERS
-            say(f"as other viewers show {seen_at}: PSNR {as_seen.psnr:.2f} dB")
-        say(f"written: {out}")
-        if output.report:
-            say(f"open {out / REPORT}")
+        if not self.trainer.config.model.approximations.are_usual:
+            for_viewers = self._fit_for_viewers(gaussians)
+        if self.folder is not None:
+            metrics = self.folder.write_results(
+                self.trainer, self.dataset, self.history, gaussians, for_viewers, wall_s
+            )
+            self.console.say(self.folder.describe(metrics))
 
-    def _fit_for_viewers(self, gaussians: Gaussians) -> tuple[Gaussians, Quality]:
-        """Write the Gaussians for other viewers; return them, and how these show the test views.
+    def _fit_for_viewers(self, gaussians: Gaussians) -> ForViewers:
+        """Return Gaussians for other viewers.
 
         The trainer is released by it, and goes on rendering what it has fitted.
         """
         from drgs.training.viewers import for_viewers, num_iterations
 
-        total, views = num_iterations(self.trainer.config), self.dataset.test
+        total = num_iterations(self.trainer.config)
         with self.console.progress("iteration for viewers", total) as shown:
-            found = for_viewers(self.trainer, gaussians, lambda done: shown.update(done, total))
-        found.gaussians.save(self.folder.path / GAUSSIANS_FOR_VIEWERS)
-        scores = [score(i, v) for i, v in zip(found.pictures(views), views, strict=True)]
-        return found.gaussians, mean_of(scores)
+            return for_viewers(self.trainer, gaussians, lambda done: shown.update(done, total))
 
 
 def _warn_if_not_pruned(trainer: Trainer) -> None:

@@ -12,7 +12,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from drgs.core.errors import listed
-from drgs.training.density.strategy import DENSITY_COLUMNS
+from drgs.results.history import DENSITY_COLUMNS
 
 MEANS = "means.value"
 """The array that says how many Gaussians there are."""

@@ -16,7 +16,7 @@ from drgs import fit, render
 from drgs.cli.execution import executing
 from drgs.core.errors import UserError
 from drgs.gaussians.parameters import Gaussians
-from drgs.training import session
+from drgs.training import fit_folder
 from drgs.training.trainer import Trainer
 
 DEBUG = dr.JitFlag.Debug
@@ -171,7 +171,7 @@ def in_every_step(monkeypatch):
         return report
 
     monkeypatch.setattr(Trainer, "step", step_and_act)
-    monkeypatch.setattr(session, "write_results", lambda *arguments: None)
+    monkeypatch.setattr(fit_folder, "write_results", lambda *arguments: None)
     return acts
 
 

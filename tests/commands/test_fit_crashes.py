@@ -66,7 +66,9 @@ def quick(monkeypatch):
     without_pictures(monkeypatch)
 
     def plan(config, *_):
-        return 0.0, SimpleNamespace(config=config, reasons="planned", curve=None)
+        return SimpleNamespace(
+            config=config, reasons="planned", chosen=SimpleNamespace(curve=None), end=0.0
+        )
 
     monkeypatch.setattr(session, "plan_fit", plan)
     monkeypatch.setattr(session, "Deadline", Revised)

@@ -2,6 +2,7 @@
 
 import csv
 import json
+from dataclasses import dataclass
 from types import SimpleNamespace
 
 import pytest
@@ -9,6 +10,7 @@ from support.fit_command import assert_fits, write_project
 from support.small_fits import config_of, plain_dataset, true_blobs
 
 from drgs.config.changes import changed
+from drgs.config.schema import FitConfig
 from drgs.core.errors import UserNote
 from drgs.results.files import (
     CURVES,
@@ -25,6 +27,12 @@ from drgs.training import budget
 from drgs.training.viewers import TIME_SHARE
 
 
+@dataclass(frozen=True)
+class Planned:
+    config: FitConfig
+    end: float = 0.0
+
+
 @pytest.fixture
 def planned(monkeypatch):
     """When iterations end, and for which configuration, by a clock that says 0."""
@@ -34,12 +42,12 @@ def planned(monkeypatch):
         budget, "seconds_of_results", lambda *_: Seconds(6.0, renders=1.0, report=1.0)
     )
     monkeypatch.setattr(budget, "seconds_of_curves", lambda: 2.0)
-    monkeypatch.setattr(budget, "make_plan", lambda *arguments: arguments)
+    monkeypatch.setattr(budget, "make_plan", lambda config, *_: Planned(config))
     monkeypatch.setattr(budget, "time", SimpleNamespace(perf_counter=lambda: 0.0))
 
     def plan(config, seconds):
-        end, (planned, *_) = budget.plan_fit(config, plain_dataset(), true_blobs(), seconds)
-        return end, planned
+        plan = budget.plan_fit(config, plain_dataset(), true_blobs(), seconds)
+        return plan.end, plan.config
 
     return plan
 

@@ -6,7 +6,7 @@ import pytest
 import yaml
 
 from drgs import fit
-from drgs.training import session
+from drgs.training import fit_folder
 from drgs.training.trainer import Trainer
 from support.commands import Outcome, assert_ends_well, assert_refused, run_in_process
 from support.small_capture import make_dataset, write_dataset
@@ -58,7 +58,7 @@ def without_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
     def write_page(out: Path, *_: object) -> None:
         (out / "report.html").write_text("")
 
-    monkeypatch.setattr(session, "write_results", write_page)
+    monkeypatch.setattr(fit_folder, "write_results", write_page)
 
 
 def stop_after(monkeypatch: pytest.MonkeyPatch, iteration: int) -> None:

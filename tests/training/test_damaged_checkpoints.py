@@ -12,7 +12,7 @@ from support.fit_command import write_scene
 
 from drgs import fit
 from drgs.core.errors import UserError
-from drgs.training import session
+from drgs.training import fit_folder
 from drgs.training.trainer import Trainer
 
 
@@ -162,7 +162,7 @@ def test_a_damaged_checkpoint_is_refused_and_kept(checkpoint, damage, message):
 
 
 def test_a_checkpoint_that_is_whole_is_continued(checkpoint, monkeypatch):
-    monkeypatch.setattr(session, "write_results", lambda *arguments: None)
+    monkeypatch.setattr(fit_folder, "write_results", lambda *arguments: None)
     outcome = run_in_process(fit.main, "--resume", checkpoint.parent)
     assert outcome.returncode == 0, outcome.stderr
     assert "continues at iteration 2" in outcome.stdout

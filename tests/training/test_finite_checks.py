@@ -18,7 +18,7 @@ from support.trainers import make_trainer
 from drgs import fit
 from drgs.gaussians.parameters import PARAMETER_NAMES
 from drgs.splatting import rendering
-from drgs.training import session
+from drgs.training import fit_folder, session
 from drgs.training.finite_checks import GradientWatch, NonFiniteError, check_values
 from drgs.training.optimizer import replace_values
 from drgs.training.stages import view_of
@@ -351,7 +351,7 @@ def configuration(tmp_path):
 @pytest.fixture
 def saved(monkeypatch):
     """The bytes of every checkpoint, as they were written; there are no reports."""
-    monkeypatch.setattr(session, "write_results", lambda *arguments: None)
+    monkeypatch.setattr(fit_folder, "write_results", lambda *arguments: None)
     saved, save = [], session.save_checkpoint
 
     def save_and_remember(folder, *rest):

@@ -10,7 +10,7 @@ import drgs
 from drgs import fit
 from drgs.config.load import load_config
 from drgs.core.errors import UserError
-from drgs.training import session
+from drgs.training import fit_folder
 
 CONFIG = {
     "data": {"path": "data"},
@@ -28,7 +28,7 @@ def folder(tmp_path, monkeypatch):
     write_dataset(tmp_path / "data", make_dataset(train=4, test=1))
     (tmp_path / "a.yml").write_text(yaml.safe_dump(CONFIG))
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(session, "write_results", lambda *arguments: None)
+    monkeypatch.setattr(fit_folder, "write_results", lambda *arguments: None)
     return tmp_path
 
 
