@@ -9,6 +9,7 @@ continues.
 from __future__ import annotations
 
 import argparse
+import signal
 import sys
 import time
 from collections.abc import Sequence
@@ -30,8 +31,8 @@ from drgs.results.files import CONFIG, EVENTS
 from drgs.results.folder import load_moved_config
 from drgs.training.budget import Budget, parse_duration
 from drgs.training.fit_folder import FitFolder
-from drgs.training.session import Console, FitSession, MakeTrainer
-from drgs.training.trainer import Trainer
+from drgs.training.parallel.communicator import Communicator
+from drgs.training.session import Console, FitSession
 
 if TYPE_CHECKING:  # imported with --view
     from drgs.viewer.server import LocalServer
@@ -115,37 +116,45 @@ def _add_looking_on(parser: CommandParser) -> None:
 
 def run(args: argparse.Namespace) -> None:
     """Fit what the command line names; end the process with status 130 if Ctrl-C stopped it."""
-    if process_number() is None:
-        run_with(args, Trainer)
-        return
-    start_mpi()
-    from drgs.training.parallel.fitting import run_together
-
-    run_together(args, partial(run_with, args))
-
-
-def run_with(args: argparse.Namespace, make_trainer: MakeTrainer) -> None:
-    """Run the command on the process that reads, decides, writes and prints."""
     started = time.perf_counter() - LOADING_SECONDS
+    comm = communicator(args)
+    budget = None if args.budget is None else Budget(args.budget, started + args.budget)
     with executing(args.threads, args.debug) as check_ranges, ExitStack() as blocks:
+        common = {
+            "variant": args.variant,
+            "budget": budget,
+            "check_ranges": check_ranges,
+            "comm": comm,
+        }
+        if not comm.is_root:
+            FitSession(None, **common).run()
+            return
         server = blocks.enter_context(page_server(args))
         if args.tensorboard:
             required("tensorboardX", "tensorboard", "--tensorboard")
         config, out = what_to_fit(args)
-        session = FitSession(
-            config,
-            folder=FitFolder(out, args.command, args.resume is not None, args.overwrite),
-            console=Console(),
-            variant=args.variant,
-            budget=None if args.budget is None else Budget(args.budget, started + args.budget),
-            check_ranges=check_ranges,
-            on_start=partial(add_observers, args, server, blocks),
-            make_trainer=make_trainer,
-        )
+        folder = FitFolder(out, args.command, args.resume is not None, args.overwrite)
+        start = partial(add_observers, args, server, blocks)
+        session = FitSession(config, folder=folder, console=Console(), on_start=start, **common)
         finished = session.run()
     if not finished:
         print(f"stopped; continue with: {args.prog} --resume {out}")
         sys.exit(INTERRUPTED_STATUS)
+
+
+def communicator(args: argparse.Namespace) -> Communicator:
+    """Return the processes that share the fit: this one, or those that ``mpiexec`` has started."""
+    if process_number() is None:
+        return Communicator()
+    start_mpi()
+    comm = Communicator.world()
+    if args.threads is None:
+        args.threads = comm.num_own_cores
+    if args.view:
+        raise UserError("--view: shows the fit of one process alone; leave it out, or mpiexec")
+    if not comm.is_root:
+        signal.signal(signal.SIGINT, signal.SIG_IGN)  # rank 0 decides when to stop
+    return comm
 
 
 def add_observers(

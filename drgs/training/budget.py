@@ -18,7 +18,7 @@ import math
 import re
 import time
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
@@ -29,6 +29,8 @@ from drgs.core.errors import UserError, UserNote
 from drgs.datasets.types import Dataset
 from drgs.gaussians.parameters import Gaussians
 from drgs.results.report import seconds_of_curves, seconds_of_results
+from drgs.training.parallel.communicator import Communicator
+from drgs.training.parallel.inputs import share_inputs
 from drgs.training.trainer import Trainer
 
 CURVES = Path(__file__).parent / "training_curves.csv"
@@ -250,19 +252,23 @@ class Rehearsal:
 
 
 def rehearse(
-    config: FitConfig,
-    dataset: Dataset,
+    config: FitConfig | None,
+    dataset: Dataset | None,
     gaussians: Gaussians,
-    make_trainer: Callable[[FitConfig, Dataset, Gaussians], Trainer] = Trainer,
+    comm: Communicator | None = None,
 ) -> Rehearsal:
-    """Time a few iterations on a few of the views."""
-    views_per_step = config.optimizer.views_per_step
-    count = max(REHEARSAL_VIEWS, views_per_step)
-    views = dataset.train[:: max(1, len(dataset.train) // count)]
-    few = replace(dataset, train=views[:count])
-    never = config.iterations + (WARM_UP + TIMED) * views_per_step
-    still = {"densify.start": never, "densify.stop": never + 1, "densify.prune.to": None}
-    trainer = make_trainer(changed(config, {"coarse": [], **still}), few, gaussians)
+    """Time a few iterations on a few of the views.
+
+    comm: the processes that share the fit; others than rank 0 give no configuration and dataset.
+    """
+    comm = comm or Communicator()
+    if comm.is_root:
+        config, dataset = _first_iterations(config, dataset)
+    config, dataset = share_inputs(comm, config, dataset)
+    trainer, views_per_step = (
+        Trainer(config, dataset, gaussians, comm),
+        config.optimizer.views_per_step,
+    )
     # Steps of several views are fewer.
     warm_up, timed = (max(2, math.ceil(n / views_per_step)) for n in (WARM_UP, TIMED))
     for count in (warm_up, timed):
@@ -273,17 +279,25 @@ def rehearse(
     return Rehearsal(trainer, (time.perf_counter() - start) / (timed * views_per_step))
 
 
+def _first_iterations(config: FitConfig, dataset: Dataset) -> tuple[FitConfig, Dataset]:
+    """Return a configuration without changes of the population, and a few of the views."""
+    views_per_step = config.optimizer.views_per_step
+    count = max(REHEARSAL_VIEWS, views_per_step)
+    views = dataset.train[:: max(1, len(dataset.train) // count)]
+    never = config.iterations + (WARM_UP + TIMED) * views_per_step
+    still = {"densify.start": never, "densify.stop": never + 1, "densify.prune.to": None}
+    return changed(config, {"coarse": [], **still}), replace(dataset, train=views[:count])
+
+
 def plan_fit(
-    config: FitConfig,
-    dataset: Dataset,
-    gaussians: Gaussians,
-    end: float,
-    make_trainer: Callable[[FitConfig, Dataset, Gaussians], Trainer] = Trainer,
+    config: FitConfig, dataset: Dataset, gaussians: Gaussians, end: float, rehearsal: Rehearsal
 ) -> Plan:
-    """Plan a fit, results included, until ``end``, by ``time.perf_counter``."""
-    rehearsal = rehearse(config, dataset, gaussians, make_trainer)
+    """Plan a fit, results included, until ``end``, by ``time.perf_counter``.
+
+    rehearsal: of the fit; ``full_scene()`` of its trainer has been called.
+    """
     num_points, most = gaussians.num_gaussians, target_of(config) or 0
-    scene, degree = rehearsal.trainer.scene_of_all(), config.model.sh_degree
+    scene, degree = rehearsal.trainer.full_scene(), config.model.sh_degree
     results = seconds_of_results(scene, dataset, max(num_points, most), degree)
     pictures = results.renders if config.output.save_renders else 0.0
     pictures += results.report + seconds_of_curves() if config.output.report else 0.0
@@ -323,12 +337,12 @@ class Deadline:
         """Whether there is time for another iteration; revises the trainer's configuration."""
         now, done = time.perf_counter(), trainer.iteration
         if now >= self._end and done > 0:
-            trainer.replan(done, trainer.config.densify.stop)
+            trainer.reschedule(done, trainer.config.densify.stop)
             return False
         if now >= self._next and done > 0:
             self._next = now + REVISED_EVERY * (self._end - self._start)
             total = self.num_iterations(trainer)
-            trainer.replan(total, self._densify_stop(trainer, total))
+            trainer.reschedule(total, self._densify_stop(trainer, total))
         return True
 
     def num_iterations(self, trainer: Trainer) -> int:

@@ -141,7 +141,7 @@ class FitFolder:
         gaussians: what ``trainer.gaussians()`` returned; for_viewers: None where other viewers
         render as the fit does; wall_s: spent on iterations.
         """
-        out, config, render = self.path, trainer.config, trainer.pictures
+        out, config, render = self.path, trainer.config, trainer.images
         saved_gaussians(gaussians, config).save(out / GAUSSIANS)
         for effect in trainer.effects:
             effect.write(out, dataset)
@@ -162,7 +162,7 @@ class FitFolder:
             metrics["viewers"] = {**vars(quality), "split": split}
         if output.report:
             shown = gaussians_on_page(gaussians, approximations, other)
-            fitted = Fitted(trainer.scene_of_all(), gaussians, render, shown)
+            fitted = Fitted(trainer.full_scene(), gaussians, render, shown)
             write_results(out, dataset, fitted, scores, history, metrics)
         self.finish(metrics)
         return metrics

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from drgs.training.history import History, HistoryRow
+from drgs.training.parallel.communicator import Communicator
 from drgs.training.trainer import StepReport, Trainer
 
 
@@ -30,6 +31,30 @@ class AllIterations:
     def num_iterations(self, trainer: Trainer) -> int:
         """See :class:`StopCriterion`."""
         return trainer.config.iterations
+
+
+@dataclass(frozen=True)
+class RootDecides:
+    """Ends a fit, and revises it, on all ranks as the criterion of rank 0 does there."""
+
+    criterion: StopCriterion  # of other ranks: is not consulted
+    comm: Communicator
+
+    def should_continue(self, trainer: Trainer) -> bool:
+        """See :class:`StopCriterion`."""
+        before, continues = trainer.config, True
+        if self.comm.is_root:
+            continues = self.criterion.should_continue(trainer)
+        config, is_revised = trainer.config, trainer.config is not before
+        decision = continues, is_revised, config.iterations, config.densify.stop
+        continues, is_revised, *plan = map(int, self.comm.of_root(decision))
+        if is_revised and not self.comm.is_root:
+            trainer.reschedule(*plan)
+        return bool(continues)
+
+    def num_iterations(self, trainer: Trainer) -> int:
+        """See :class:`StopCriterion`."""
+        return self.criterion.num_iterations(trainer)
 
 
 @dataclass(frozen=True)

@@ -30,7 +30,7 @@ class HeldOutQuality:
     """Measures some of the test views for the report: see :class:`drgs.training.loop.Observer`."""
 
     def __init__(self, views: Sequence[View]) -> None:
-        """views: those of the test split."""
+        """views: those of the test split; none on other ranks than 0."""
         self._views = measured_views(views)
 
     def after(
@@ -47,9 +47,10 @@ class HeldOutQuality:
     def measure(self, trainer: Trainer, history: History) -> None:
         """Add the mean PSNR to the last row of the history, which is of this moment."""
         start = time.perf_counter()
-        trainer.show()
-        pairs = zip(trainer.pictures(self._views), self._views, strict=True)
-        mean = np.mean([psnr(image, view.image, view.mask) for image, view in pairs])
+        trainer.sync_scene()
+        pairs = zip(trainer.images(self._views), self._views, strict=True)
+        scores = [psnr(image, view.image, view.mask) for image, view in pairs]
+        mean = trainer.comm.of_root(np.mean(scores) if scores else np.nan)
         history.add_test_psnr(float(mean), time.perf_counter() - start)
 
 

@@ -27,28 +27,34 @@ from drgs.core.errors import UserError, UserNote
 from drgs.core.memory import release_unused_memory
 from drgs.core.variants import VARIANTS
 from drgs.datasets import Dataset, load_dataset
-from drgs.datasets.fingerprint import fingerprint_of
+from drgs.datasets.fingerprint import Fingerprint, fingerprint_of
 from drgs.datasets.folders import config_for
 from drgs.gaussians.parameters import Gaussians
 from drgs.initialization.defaults import completed
 from drgs.initialization.start import description_of_start, gaussians_at, start_of
 from drgs.integrator.scene import check_lenses
 from drgs.integrator.summary import described
-from drgs.training.budget import Budget, Deadline, Plan, plan_fit
+from drgs.training.budget import Budget, Deadline, Plan, plan_fit, rehearse
 from drgs.training.checkpoint import Checkpoint, check_fits, check_same_data, save_checkpoint
 from drgs.training.finite_checks import NonFiniteError
 from drgs.training.fit_folder import FitFolder, saved_gaussians
 from drgs.training.history import History, HistoryRow, smoother
-from drgs.training.loop import AllIterations, Iteration, Observer, StopCriterion, iterations
+from drgs.training.loop import (
+    AllIterations,
+    Iteration,
+    Observer,
+    RootDecides,
+    StopCriterion,
+    iterations,
+)
+from drgs.training.parallel.communicator import Communicator
+from drgs.training.parallel.inputs import share_gaussians, share_inputs
 from drgs.training.quality import HeldOutQuality
 from drgs.training.summary import summary_of_fit
 from drgs.training.trainer import StepReport, Trainer
 
 if TYPE_CHECKING:  # imported where it is needed
     from drgs.training.viewers import ForViewers
-
-MakeTrainer = Callable[[FitConfig, Dataset, Gaussians], Trainer]
-"""From the configuration, the photographs and the initial Gaussians."""
 
 
 class Console:
@@ -108,9 +114,12 @@ class ShownProgress:
 
 @dataclass(eq=False)
 class FitSession:
-    """One fit. What is not given is made by :meth:`prepare`."""
+    """One fit, by one process or several, which all run the same session.
 
-    config: FitConfig
+    Rank 0 alone is given a configuration, a folder and a console, and decides when to stop.
+    """
+
+    config: FitConfig | None
     dataset: Dataset | None = None  # None: that of the configuration
     folder: FitFolder | None = None  # for results and checkpoints
     console: Console | Silence = field(default_factory=Silence)
@@ -118,19 +127,18 @@ class FitSession:
     budget: Budget | None = None  # the time for which the fit is planned
     check_ranges: Callable[[], None] = lambda: None  # called after each iteration
     on_start: Callable[[FitSession], None] = lambda session: None  # before the first iteration
-    make_trainer: MakeTrainer = Trainer
+    comm: Communicator = field(default_factory=Communicator)
     trainer: Trainer = field(init=False)
     history: History = field(init=False)
     criterion: StopCriterion = field(init=False, default_factory=AllIterations)
     observers: list[Observer] = field(init=False, default_factory=list)
+    _fingerprint: Fingerprint | None = field(init=False, default=None)
 
     def run(self) -> bool:
         """Fit, and write the results; False if Ctrl-C stopped the fit, with its state saved."""
         folder = self.folder
         with nullcontext() if folder is None else folder.locked():
-            if folder is not None and folder.is_finished(self.config):
-                folder.finish()  # a process that was killed after its last file has not
-                self.console.say(f"{folder.path}: this fit is finished; --overwrite does it again")
+            if self._is_finished():
                 return True
             plan = self.prepare()
             if folder is not None:
@@ -147,35 +155,61 @@ class FitSession:
                 raise UserError(f"{error}{remedy}") from None
         return True
 
+    def _is_finished(self) -> bool:
+        finished = self.folder is not None and self.folder.is_finished(self.config)
+        if finished:
+            self.folder.finish()  # a process that was killed after its last file has not
+            path = self.folder.path
+            self.console.say(f"{path}: this fit is finished; --overwrite does it again")
+        return bool(self.comm.of_root(finished))
+
     def prepare(self) -> Plan | None:
         """Load the data, initialize the Gaussians, make the trainer; return the plan, if any.
 
         Input that cannot be used raises ``UserError`` here; nothing is written.
         """
-        folder, given, checkpoint = self.folder, self.dataset, None
+        comm, checkpoint, gaussians, plan = self.comm, None, None, None
+        if comm.is_root:
+            checkpoint = self._load()
+        if self.variant is not None or mi.variant() is None:
+            select_variant(self.variant or VARIANTS[0])
+        if comm.is_root:
+            gaussians = self._initial_gaussians()
+        gaussians = share_gaussians(comm, gaussians)
+        if self.budget is not None:
+            plan = self._plan(gaussians)
+        self.config, self.dataset = share_inputs(comm, self.config, self.dataset)
+        self.trainer = Trainer(self.config, self.dataset, gaussians, comm)
+        self.history = History()  # whose clock begins
+        if comm.of_root(checkpoint is not None):
+            self._restore(checkpoint)
+        return plan
+
+    def _load(self) -> Checkpoint | None:
+        """Load the dataset and complete the configuration; return the checkpoint, if any."""
+        folder, checkpoint = self.folder, None
         if folder is not None:
             checkpoint = folder.checkpoint_for(self.config, self.budget is not None)
         config = self.config if checkpoint is None else checkpoint.config
-        self.dataset = load_dataset(config.data_for_training) if given is None else given
-        self._fingerprint = None if folder is None else fingerprint_of(self.dataset)
+        if self.dataset is None:
+            self.dataset = load_dataset(config.data_for_training)
+        if folder is not None:
+            self._fingerprint = fingerprint_of(self.dataset)
         if checkpoint is not None:
             before = checkpoint.data
             check_same_data(folder.path, config.data.path, before, self._fingerprint)
         self.config = completed(config, self.dataset)
-        if self.variant is not None or mi.variant() is None:
-            select_variant(self.variant or VARIANTS[0])
-        place = config.data.path if given is None else "train()"
-        gaussians, plan = self._initial_gaussians(f"{place}: "), None
-        if self.budget is not None:
-            make_trainer, end = self.make_trainer, self.budget.end
-            plan = plan_fit(self.config, self.dataset, gaussians, end, make_trainer)
-            self.config = plan.config
-            self.console.say(plan.reasons)
-        self.trainer = self.make_trainer(self.config, self.dataset, gaussians)
-        self.dataset = self.trainer.dataset  # of which others may have a part
-        self.history = History()  # whose clock begins
-        if checkpoint is not None:
-            self._restore(checkpoint)
+        return checkpoint
+
+    def _plan(self, gaussians: Gaussians) -> Plan | None:
+        """Plan the fit, and make the plan its configuration; None on other ranks than 0."""
+        rehearsal = rehearse(self.config, self.dataset, gaussians, self.comm)
+        rehearsal.trainer.full_scene()  # gathered from all ranks
+        if not self.comm.is_root:
+            return None
+        plan = plan_fit(self.config, self.dataset, gaussians, self.budget.end, rehearsal)
+        self.config = plan.config
+        self.console.say(plan.reasons)
         return plan
 
     def _follow(self, plan: Plan) -> None:
@@ -184,10 +218,10 @@ class FitSession:
         if self.folder is not None:
             self.folder.write_plan(f"--budget {self.budget.seconds:g}s\n{plan.reasons}\n")
 
-    def _initial_gaussians(self, place: str) -> Gaussians:
+    def _initial_gaussians(self) -> Gaussians:
         """Describe the data, the start and what is simulated; return the Gaussians to start from.
 
-        place: precedes errors about lenses that the projection cannot render.
+        Raises ``UserError`` for lenses that the projection cannot render.
         """
         config, dataset, say = self.config, self.dataset, self.console.say
         say(dataset.description)
@@ -200,14 +234,18 @@ class FitSession:
         say(description_of_start(config, start))
         say(described(summary_of_fit(config, dataset)))
         views, remedy = (*dataset.train, *dataset.test), "set data.ignore_distortion"
-        check_lenses(config.model, views, place, remedy)
+        check_lenses(config.model, views, f"{config.data.path}: ", remedy)
         return gaussians_at(start, config)
 
-    def _restore(self, checkpoint: Checkpoint) -> None:
-        check_fits(self.folder.path, checkpoint, self.trainer.state())
-        self.trainer.restore(checkpoint.trainer)
+    def _restore(self, checkpoint: Checkpoint | None) -> None:
+        """Continue from the checkpoint of rank 0."""
+        start, state = self.trainer.state(), {}
+        if checkpoint is not None:
+            check_fits(self.folder.path, checkpoint, start)
+            state, past = checkpoint.trainer, (checkpoint.history, checkpoint.wall_s)
+            self.history = History.from_array(*past, checkpoint.density)
+        self.trainer.restore(state)
         self.console.say(f"continues at iteration {self.trainer.iteration}")
-        self.history = History.from_array(checkpoint.history, checkpoint.wall_s, checkpoint.density)
 
     def iterate(self) -> bool:
         """Run the iterations that are left, with checkpoints; False if Ctrl-C stopped them.
@@ -215,7 +253,8 @@ class FitSession:
         The state is saved then, and after the last iteration: from then on the configuration
         specifies what was done, which half-written results belong to.
         """
-        trainer, criterion, console = self.trainer, self.criterion, self.console
+        trainer, console, comm = self.trainer, self.console, self.comm
+        criterion = RootDecides(self.criterion, comm)
         total = criterion.num_iterations(trainer)
         shown = console.progress("iteration", total, trainer.iteration)
         with shown as progress, console.stop_request() as stop:
@@ -225,9 +264,10 @@ class FitSession:
                 self.check_ranges()
                 for observer in observers:
                     observer.after(trainer, self.history, done, lambda: stop.requested)
-                if stop.requested or self._is_checkpoint_due(done):
+                stops = bool(comm.of_root(stop.requested))
+                if stops or self._is_checkpoint_due(done):
                     self._save_checkpoint()
-                if stop.requested:
+                if stops:
                     return False
         return True
 
@@ -244,9 +284,10 @@ class FitSession:
 
     def _finish(self, wall_s: float, gaussians: Gaussians) -> None:
         """Fit the file for other viewers, if one is needed; measure and write the results."""
-        _warn_if_not_pruned(self.trainer)
+        if self.comm.is_root:
+            _warn_if_not_pruned(self.trainer)
         release_unused_memory()  # encoding the orbit's frames takes as much as iterations do
-        self.trainer.scene_of_all()
+        self.trainer.full_scene()  # gathered from all ranks
         for_viewers = None
         if not self.trainer.config.model.approximations.are_usual:
             for_viewers = self._fit_for_viewers(gaussians)
@@ -285,7 +326,7 @@ class FitResult:
 
     gaussians: Gaussians  # numpy arrays: what ``point_cloud.ply`` of the command contains
     history: tuple[HistoryRow, ...]  # as in ``history.csv``
-    trainer: Trainer  # goes on from here with ``trainer.step()``, renders with ``pictures(views)``
+    trainer: Trainer  # goes on from here with ``trainer.step()``, renders with ``images(views)``
 
 
 def train(

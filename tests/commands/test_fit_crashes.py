@@ -5,6 +5,7 @@ The clock of a fit with a budget is replaced: its plan is revised after iteratio
 
 import os
 from types import SimpleNamespace
+from unittest.mock import Mock
 
 import pytest
 from support.fit_command import (
@@ -51,9 +52,9 @@ class Revised:
     def should_continue(self, trainer):
         done = trainer.iteration
         if done in PLANS:
-            trainer.replan(PLANS[done], trainer.config.densify.stop)
+            trainer.reschedule(PLANS[done], trainer.config.densify.stop)
         if done == LAST:
-            trainer.replan(done, trainer.config.densify.stop)
+            trainer.reschedule(done, trainer.config.densify.stop)
         return done < LAST
 
     def num_iterations(self, trainer):
@@ -71,6 +72,7 @@ def quick(monkeypatch):
         )
 
     monkeypatch.setattr(session, "plan_fit", plan)
+    monkeypatch.setattr(session, "rehearse", lambda *_: Mock())
     monkeypatch.setattr(session, "Deadline", Revised)
 
 

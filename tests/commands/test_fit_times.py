@@ -36,8 +36,7 @@ class Planned:
 @pytest.fixture
 def planned(monkeypatch):
     """When iterations end, and for which configuration, by a clock that says 0."""
-    rehearsal = SimpleNamespace(trainer=SimpleNamespace(scene_of_all=lambda: None), iteration_s=0.1)
-    monkeypatch.setattr(budget, "rehearse", lambda *_: rehearsal)
+    rehearsal = SimpleNamespace(trainer=SimpleNamespace(full_scene=lambda: None), iteration_s=0.1)
     monkeypatch.setattr(
         budget, "seconds_of_results", lambda *_: Seconds(6.0, renders=1.0, report=1.0)
     )
@@ -46,7 +45,7 @@ def planned(monkeypatch):
     monkeypatch.setattr(budget, "time", SimpleNamespace(perf_counter=lambda: 0.0))
 
     def plan(config, seconds):
-        plan = budget.plan_fit(config, plain_dataset(), true_blobs(), seconds)
+        plan = budget.plan_fit(config, plain_dataset(), true_blobs(), seconds, rehearsal)
         return plan.end, plan.config
 
     return plan

@@ -6,9 +6,8 @@ import pytest
 from support.small_capture import decibels
 from support.small_fits import everything_of, make_trainer, steps, true_dataset
 
-from drgs.results.history import write_density, write_history
+from drgs.results.history import DENSITY_COLUMNS, DensityReport, write_density, write_history
 from drgs.training import quality
-from drgs.training.density.strategy import DENSITY_COLUMNS, DensityReport
 from drgs.training.history import History, HistoryRow
 
 
@@ -59,8 +58,8 @@ def test_measuring_changes_nothing_that_comes():
         quality.HeldOutQuality(dataset.test).measure(watched, history)
     assert everything_of(watched) == everything_of(plain)
 
-    plain.show()
-    views = zip(plain.pictures(dataset.test), dataset.test, strict=True)
+    plain.sync_scene()
+    views = zip(plain.images(dataset.test), dataset.test, strict=True)
     expected = np.mean([decibels(image, view.image) for image, view in views])
     assert history.rows[-1].test_psnr == pytest.approx(expected, abs=1e-4)
     assert len({row.test_psnr for row in history.rows}) == 4

@@ -39,7 +39,7 @@ def test_room_is_given_to_those_that_see_most_of_the_errors():
     before = values(optimizer)
     # Half of the way from 6 to 9 after a quarter of the time: 6 + 3 sqrt(1 / 4) = 7.5, even: 8.
     growth = strategy(optimizer, [1, 5, 3, 0, 4, 2], budget={"gaussians": 9})
-    report = growth.act(rows_of(optimizer), 325)
+    report = growth.refine(rows_of(optimizer), 325)
     assert (report.num_gaussians, report.split, report.pruned, report.refused) == (8, 2, 0, 0)
     after = values(optimizer)
     assert np.array_equal(after["sh0"][:4], before["sh0"][[0, 2, 3, 5]])
@@ -51,11 +51,11 @@ def test_equal_errors_are_split_by_index_and_none_without_errors():
     optimizer = make([0.1] * 5, [0.5] * 5)
     before = values(optimizer)["sh0"]
     growth = strategy(optimizer, [0, 2, 2, 2, 0], budget={"gaussians": 7})
-    assert growth.act(rows_of(optimizer), 1000).split == 2
+    assert growth.refine(rows_of(optimizer), 1000).split == 2
     assert np.array_equal(values(optimizer)["sh0"][3:5], before[[1, 2]])
     optimizer = make([0.1] * 5, [0.5] * 5)
     growth = strategy(optimizer, np.zeros(5), budget={"gaussians": 50})
-    assert growth.act(rows_of(optimizer), 1000).num_gaussians == 5
+    assert growth.refine(rows_of(optimizer), 1000).num_gaussians == 5
 
 
 def test_the_transparent_are_removed_and_their_room_is_used():
@@ -63,7 +63,7 @@ def test_the_transparent_are_removed_and_their_room_is_used():
     optimizer = make(scales, opacities)
     before = values(optimizer)["sh0"]
     growth = strategy(optimizer, [1, 9, 9, 2, 0.5], budget={"gaussians": 5})
-    report = growth.act(rows_of(optimizer), 500)
+    report = growth.refine(rows_of(optimizer), 500)
     assert (report.num_gaussians, report.split, report.pruned) == (5, 2, 2)
     after = values(optimizer)["sh0"]
     assert np.array_equal(after, before[[4, 0, 3, 0, 3]])
@@ -97,7 +97,7 @@ def test_survivors_keep_their_moments_and_halves_start_without():
     optimizer = make([0.1] * 4, [0.5] * 4)
     moments = {name: np.array(optimizer.state[name][3][1]) for name in PARAMETER_NAMES}
     steps = {name: np.array(optimizer.state[name][3][0]) for name in PARAMETER_NAMES}
-    strategy(optimizer, [0, 1, 0, 0], budget={"gaussians": 5}).act(rows_of(optimizer), 1000)
+    strategy(optimizer, [0, 1, 0, 0], budget={"gaussians": 5}).refine(rows_of(optimizer), 1000)
     for name in PARAMETER_NAMES:
         value, _, _, (step, first, second, _) = optimizer.state[name]
         got = np.array(first).reshape(5, -1)
@@ -124,7 +124,7 @@ def test_neither_the_curve_nor_the_cap_is_exceeded(seed, num, target, cap, itera
         max_gaussians=cap,
     )
     try:
-        report = growth.act(rows_of(optimizer), iteration)
+        report = growth.refine(rows_of(optimizer), iteration)
     except UserError:
         return
     u = (iteration - 100) / 900
@@ -139,14 +139,14 @@ def test_the_last_change_is_at_the_end_of_growth_and_reaches_the_number():
     """Wherever the intervals between the others lead."""
     optimizer = make([0.1] * 6, [0.5] * 6)
     growth = strategy(optimizer, [1, 5, 3, 0, 4, 2], budget={"gaussians": 9}, stop=325)
-    assert [k for k in range(1, 500) if growth.acts(k)] == [150, 200, 250, 300, 325]
-    assert growth.act(rows_of(optimizer), 325).num_gaussians == 9
+    assert [k for k in range(1, 500) if growth.is_due(k)] == [150, 200, 250, 300, 325]
+    assert growth.refine(rows_of(optimizer), 325).num_gaussians == 9
 
 
 def test_a_population_that_would_vanish_is_refused():
     optimizer = make([0.1] * 3, [0.001] * 3)
     with pytest.raises(UserError, match=r"every Gaussian would be pruned .*budget\.prune_opacity"):
-        strategy(optimizer, [1, 1, 1], budget={"gaussians": 5}).act(rows_of(optimizer), 500)
+        strategy(optimizer, [1, 1, 1], budget={"gaussians": 5}).refine(rows_of(optimizer), 500)
 
 
 # ---- in a fit
@@ -167,8 +167,11 @@ GROWING = {
 def test_errors_are_gathered_in_the_iterations_that_say_so(variant):
     trainer = make_trainer(densify=GROWING)
     gathered = []
-    original = trainer.density.gather
-    trainer.density.gather = lambda step: (gathered.append(step.iteration), original(step))
+    original = trainer.density.update_statistics
+    trainer.density.update_statistics = lambda step: (
+        gathered.append(step.iteration),
+        original(step),
+    )
     for _ in range(30):
         trainer.step()
     assert gathered == [3, 6, 9, 12, 15, 18, 21]
@@ -181,8 +184,8 @@ def test_each_change_has_seen_errors(every, stop, error_every):
     config = DensifyConfig(start=1, stop=stop, every=every, budget=budget)
     growth, seen = GrowthToNumber(config), 0
     for iteration in range(1, stop + 5):
-        seen += growth.gathers(iteration)
-        if growth.acts(iteration):
+        seen += growth.needs_statistics(iteration)
+        if growth.is_due(iteration):
             assert seen > 0
             seen = 0
     assert seen == 0

@@ -29,7 +29,7 @@ def strategy(max_gaussians=1_000_000, **mcmc):
 
 
 def act(optimizer, iteration=600, seed=0, **config):
-    return strategy(**config).act(rows_of(optimizer, seed), iteration)
+    return strategy(**config).refine(rows_of(optimizer, seed), iteration)
 
 
 # ---- what copies look like
@@ -204,7 +204,7 @@ def test_equal_seeds_give_equal_bytes():
 
 def test_it_acts_between_start_and_stop():
     chain = strategy()
-    acting = [i for i in range(1, 20_000) if chain.acts(i)]
+    acting = [i for i in range(1, 20_000) if chain.is_due(i)]
     assert acting == list(range(600, 15_000, 100))
 
 
