@@ -13,7 +13,7 @@ import signal
 import sys
 import time
 from collections.abc import Sequence
-from contextlib import AbstractContextManager, ExitStack, nullcontext
+from contextlib import AbstractContextManager, ExitStack, closing, nullcontext
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -165,7 +165,7 @@ def add_observers(
         from drgs.training.event_log import EventLog
 
         log = EventLog(session.folder.path / EVENTS, session.history)
-        session.observers.append(blocks.enter_context(log))
+        session.observers.append(blocks.enter_context(closing(log)))
     if server is not None:
         from drgs.viewer.fit_page import watch
         from drgs.viewer.server import url
