@@ -98,7 +98,7 @@ class Strategy:
 
 def target_of(config: FitConfig) -> int | None:
     """The number of Gaussians that a fit grows to; None: its strategy knows none."""
-    section = getattr(config.densify, config.densify.strategy)
+    section = getattr(config.densify, config.densify.strategy, None)
     number = getattr(section, "gaussians", None)
     return None if number is None else min(number, config.densify.max_gaussians)
 

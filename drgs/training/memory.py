@@ -27,7 +27,7 @@ from drgs.datasets.types import Dataset, View, Viewpoint
 from drgs.gaussians.parameters import Gaussians
 from drgs.splatting.grid import MICRO, TILE
 from drgs.splatting.slots import BAND_SLOTS
-from drgs.training.density.called_for import density_strategy
+from drgs.training.density.registry import density_strategy
 
 PROCESS_BYTES = 290_000_000
 """Interpreter, libraries and compiled kernels; and results, as far as they come on top. Compiling

@@ -2,7 +2,7 @@
 
 Each iteration, :class:`drgs.training.trainer.Trainer` tells the strategy what it has seen
 (:class:`StepInfo`) and lets it act on the rows of the optimizer (:class:`Population`).
-``drgs.training.density.called_for`` says which strategy a configuration calls for.
+``drgs.training.density.registry`` makes the strategy that a configuration chooses.
 
 Iterations are counted from 1. A strategy is a function of the configuration and of
 :meth:`DensityStrategy.state`: where a plan is revised, another one is made and given the state.
@@ -17,7 +17,9 @@ from typing import Any, Protocol
 import drjit as dr
 import numpy as np
 
+from drgs.config.schema import FitConfig
 from drgs.core.arrays import from_host, types_of
+from drgs.datasets.types import Dataset
 from drgs.gaussians.parameters import Gaussians
 from drgs.gaussians.quaternions import quat_to_rotation
 from drgs.results.history import DensityReport
@@ -183,6 +185,17 @@ class DensityStrategy(Protocol):
     Where several processes have some of the rows each, so do their strategies, of which each takes
     note of its own; whoever acts asks for :meth:`Population.of_all`, and all decide alike.
     """
+
+    @classmethod
+    def from_config(cls, config: FitConfig, dataset: Dataset | None, section: Any) -> Any:
+        """Return the strategy of a fit.
+
+        section: the section that the strategy has registered, with the values of the
+        configuration, or the model's defaults; by default the only argument of the class. None:
+        the strategy has no section. dataset: None where only :meth:`most_gaussians` is called.
+        """
+        del config, dataset
+        return cls() if section is None else cls(section)
 
     by_row: Sequence[str] = ()
     """Names in :meth:`state` of what has a row for each Gaussian."""

@@ -12,8 +12,8 @@ from support.trainers import make_trainer
 from drgs.config.density import DensifyConfig
 from drgs.config.schema import FitConfig
 from drgs.training import trainer as trainer_module
-from drgs.training.density.called_for import density_strategy
 from drgs.training.density.phases import Phases
+from drgs.training.density.registry import density_strategy
 from drgs.training.density.strategy import DensityReport, DensityStrategy
 from drgs.training.optimizer import set_values
 from drgs.training.rates import revised_stops
