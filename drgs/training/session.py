@@ -10,7 +10,7 @@ written; the trainer is called alike with and without them.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -36,6 +36,8 @@ from drgs.integrator.scene import check_lenses
 from drgs.integrator.summary import described
 from drgs.training.budget import Budget, Deadline, Plan, plan_fit, rehearse
 from drgs.training.checkpoint import Checkpoint, check_fits, check_same_data, save_checkpoint
+from drgs.training.density.strategy import DensityStrategy
+from drgs.training.effects.base import TrainingEffect
 from drgs.training.finite_checks import NonFiniteError
 from drgs.training.fit_folder import FitFolder, saved_gaussians
 from drgs.training.history import History, HistoryRow, smoother
@@ -47,6 +49,7 @@ from drgs.training.loop import (
     StopCriterion,
     iterations,
 )
+from drgs.training.losses import Loss
 from drgs.training.parallel.communicator import Communicator
 from drgs.training.parallel.inputs import share_gaussians, share_inputs
 from drgs.training.quality import HeldOutQuality
@@ -128,6 +131,9 @@ class FitSession:
     check_ranges: Callable[[], None] = lambda: None  # called after each iteration
     on_start: Callable[[FitSession], None] = lambda session: None  # before the first iteration
     comm: Communicator = field(default_factory=Communicator)
+    strategy: DensityStrategy | None = None  # of density; None: that of the configuration
+    effects: Sequence[TrainingEffect] = ()  # besides those of the configuration
+    loss: Loss | None = None  # None: that of the configuration
     trainer: Trainer = field(init=False)
     history: History = field(init=False)
     criterion: StopCriterion = field(init=False, default_factory=AllIterations)
@@ -179,7 +185,8 @@ class FitSession:
         if self.budget is not None:
             plan = self._plan(gaussians)
         self.config, self.dataset = share_inputs(comm, self.config, self.dataset)
-        self.trainer = Trainer(self.config, self.dataset, gaussians, comm)
+        objects = self.strategy, self.effects, self.loss
+        self.trainer = Trainer(self.config, self.dataset, gaussians, comm, *objects)
         self.history = History()  # whose clock begins
         if comm.of_root(checkpoint is not None):
             self._restore(checkpoint)
@@ -333,6 +340,10 @@ def train(
     config: FitConfig | Mapping[str, object] | str | Path,
     dataset: Dataset | None = None,
     callback: Callable[[StepReport], bool | None] | None = None,
+    *,
+    strategy: DensityStrategy | None = None,
+    effects: Sequence[TrainingEffect] = (),
+    loss: Loss | None = None,
 ) -> FitResult:
     """Fit Gaussians to photographs, in memory: the bytes that ``drgs fit`` writes to its PLY file.
 
@@ -342,6 +353,10 @@ def train(
     the splats, by default those of the configuration's section ``data``; callback: called after
     each iteration with what it did, a :class:`drgs.training.trainer.StepReport`; the fit ends early
     where it returns True.
+
+    strategy: changes the population, instead of ``densify.strategy``; effects: take part in the
+    fit besides those of the configuration; loss: of an image and its photograph, instead of
+    ``loss``.
 
     Where no Mitsuba variant is active, ``llvm_ad_rgb`` is made so. Nothing is written.
 
@@ -353,7 +368,7 @@ def train(
         config = config_for(Path(config))[0] if is_folder else load_config(config)
     elif not isinstance(config, FitConfig):
         config = config_from(config, "train(): config")
-    session = FitSession(config, dataset)
+    session = FitSession(config, dataset, strategy=strategy, effects=effects, loss=loss)
     session.prepare()
     trainer, history = session.trainer, session.history
     for done in iterations(trainer, history, session.criterion):
