@@ -36,7 +36,7 @@ _MODULES = {
     "Gaussians": "drgs.gaussians.parameters",
     "load_dataset": "drgs.datasets",
     "rasterization": "drgs.rasterizing",
-    "train": "drgs.training.loop",
+    "train": "drgs.training.session",
 }
 
 

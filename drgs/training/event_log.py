@@ -9,7 +9,6 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from pathlib import Path
-from types import TracebackType
 
 from tensorboardX.proto.event_pb2 import Event
 from tensorboardX.record_writer import RecordWriter
@@ -33,10 +32,10 @@ TAGS = {
 
 
 class EventLog:
-    """Writes a row of the history when it is there: see ``drgs.training.loop.Observer``.
+    """Writes new rows of the history: see ``drgs.training.loop.Observer``.
 
-    A context manager. The file begins with the rows that there are already, so that a fit that was
-    stopped and resumed is one curve.
+    The file begins with the rows that there are already, so that a fit that was stopped and resumed
+    is one curve.
     """
 
     def __init__(self, path: Path, history: History) -> None:
@@ -48,16 +47,7 @@ class EventLog:
             self._write(row, history)
         self._writer.flush()
 
-    def __enter__(self) -> EventLog:
-        """The file is open."""
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def close(self) -> None:
         """Close the file."""
         self._writer.close()
 

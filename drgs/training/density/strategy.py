@@ -11,7 +11,7 @@ Iterations are counted from 1. A strategy is a function of the configuration and
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any, Protocol
 
 import drjit as dr
@@ -22,6 +22,7 @@ from drgs.core.arrays import from_host, types_of
 from drgs.datasets.types import Dataset
 from drgs.gaussians.parameters import Gaussians
 from drgs.gaussians.quaternions import quat_to_rotation
+from drgs.results.history import DensityReport
 from drgs.training.optimizer import (
     LeanAdam,
     edit_rows,
@@ -30,23 +31,6 @@ from drgs.training.optimizer import (
     set_values,
     take_rows,
 )
-
-
-@dataclass(frozen=True)
-class DensityReport:
-    """What one call of :meth:`DensityStrategy.refine` did to the rows."""
-
-    num_gaussians: int  # afterwards
-    num_added: int = 0  # rows on top of those before, parents of a split not counted
-    cloned: int = 0  # Gaussians that were copied
-    split: int = 0  # Gaussians that were replaced by several
-    relocated: int = 0  # rows that became copies of others
-    pruned: int = 0  # rows that were removed, parents of a split not counted
-    refused: int = 0  # Gaussians that were to be cloned or split, but there was no room
-
-
-DENSITY_COLUMNS = ("iteration", *(field.name for field in fields(DensityReport)))
-"""Of the table of what all calls did."""
 
 
 @dataclass(frozen=True)
