@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING
 from drgs.cli.commands import MAX_PORT, CommandParser, at_least, file_or_folder, run_command
 from drgs.cli.execution import add_execution_arguments, executing
 from drgs.cli.interrupts import INTERRUPTED_STATUS
+from drgs.config.extensions import describe_extensions
 from drgs.config.load import load_config
 from drgs.config.schema import FitConfig
 from drgs.core.errors import UserError
@@ -55,6 +56,7 @@ def add_arguments(parser: CommandParser) -> None:
         "%(prog)s scenes/photos.yml --data DIR --out out/mine",
         "%(prog)s --resume out/mine",
     )
+    parser.end_help_with(describe_extensions)
     what = parser.add_mutually_exclusive_group(required=True)
     what.add_argument(
         "config",

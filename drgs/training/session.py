@@ -25,6 +25,7 @@ from drgs.config.load import config_from, load_config
 from drgs.config.schema import FitConfig
 from drgs.core.errors import UserError, UserNote
 from drgs.core.memory import release_unused_memory
+from drgs.core.registry import reporting_extensions
 from drgs.core.variants import VARIANTS
 from drgs.datasets import Dataset, load_dataset
 from drgs.datasets.fingerprint import Fingerprint, fingerprint_of
@@ -369,10 +370,11 @@ def train(
     elif not isinstance(config, FitConfig):
         config = config_from(config, "train(): config")
     session = FitSession(config, dataset, strategy=strategy, effects=effects, loss=loss)
-    session.prepare()
-    trainer, history = session.trainer, session.history
-    for done in iterations(trainer, history, session.criterion):
-        if callback is not None and callback(done.report):
-            break
+    with reporting_extensions():
+        session.prepare()
+        trainer, history = session.trainer, session.history
+        for done in iterations(trainer, history, session.criterion):
+            if callback is not None and callback(done.report):
+                break
     gaussians = saved_gaussians(trainer.gaussians(), trainer.config)
     return FitResult(gaussians, tuple(history.rows), trainer)
