@@ -1,4 +1,4 @@
-"""``python -m drgs.bench light SCENE``: light between splats and surfaces, its price and its error.
+"""Measure the time and the error of light between splats and surfaces.
 
 A fitted model is rendered with a mirror ball behind it, a glossy ring there, and a white plinth
 under it that lies in its shadow, each alone; and in the scene of a file, ``scenes/hybrid.xml``.
@@ -20,11 +20,11 @@ from typing import TYPE_CHECKING
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from fits import SCENES
 
+import drgs  # noqa: F401  (registers the integrator)
 from drgs.bench.accuracy import add_scene
-from drgs.bench.output import add_out, machine, markdown_table, write_csv
-from drgs.cli.commands import CommandParser
-from drgs.core.errors import UserError
+from drgs.bench.output import machine, markdown_table
 from drgs.gaussians.parameters import Gaussians
 from drgs.io.figures import new_figure, write_figure
 from drgs.io.scenes import load_scene_file
@@ -34,10 +34,10 @@ from drgs.results.files import GAUSSIANS
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-PATHS, QUICK_PATHS = (1, 4, 16, 64), (1, 4)
+PATHS, QUICK_PATHS = (1, 4, 16, 64), (1,)
 """Per pixel."""
 
-MANY, QUICK_MANY = 512, 8
+MANY, QUICK_MANY = 512, 4
 """Paths of the pictures that are compared."""
 
 AT_ONCE = 64
@@ -92,48 +92,6 @@ class Measurement:
     seconds: float  # of the whole picture; median
     factor: float  # times as long as without light
     psnr: float  # dB, against many paths of rays
-
-
-def add_arguments(parser: CommandParser) -> None:
-    """Add the arguments of the command."""
-    parser.show_examples("%(prog)s out/lego")
-    add_out(parser, run, "light.csv", "light.png", "light_pictures.png")
-    add_scene(parser)
-    parser.add_argument(
-        "--file",
-        type=Path,
-        default=Path("scenes/hybrid.xml"),
-        metavar="XML",
-        help="a scene with the parameters and objects of this one (default: scenes/hybrid.xml)",
-    )
-    parser.add_argument("--quick", action="store_true", help="few paths and rounds")
-
-
-def run(args: argparse.Namespace) -> None:
-    """Measure all stages; write table, CSV, plot and pictures."""
-    mi.set_variant("llvm_ad_rgb")
-    path = Path(args.scene)
-    ply = path / GAUSSIANS if path.is_dir() else path
-    for file in (ply, args.file, args.file.parent / RING):
-        if not file.exists():
-            raise UserError(
-                f"{file}: not there; expected a fit's PLY file, a scene file, and a ring beside it"
-            )
-    counts = (QUICK_PATHS, QUICK_MANY, QUICK_ROUNDS) if args.quick else (PATHS, MANY, ROUNDS)
-    print(f"{machine()}\n{ply}, {SIZE[0]}x{SIZE[1]}", flush=True)
-    results: list[Measurement] = []
-    pictures: list[tuple[str, list[np.ndarray]]] = []
-    for stage in stages(ply, args.file):
-        found, shown = measure(stage, *counts)
-        results += found
-        pictures += shown
-        print(f"\n{table(found)}", flush=True)
-    columns = list(Measurement.__dataclass_fields__)
-    write_csv(args.out / "light.csv", columns, [list(vars(m).values()) for m in results])
-    write_figure(args.out / "light.png", plot(results))
-    write_figure(args.out / "light_pictures.png", show(pictures))
-    names = ("light.csv", "light.png", "light_pictures.png")
-    print(f"\nwritten: {', '.join(str(args.out / name) for name in names)}")
 
 
 # ----------------------------------------------------------------------------------------------
@@ -370,3 +328,31 @@ def show(pictures: Sequence[tuple[str, list[np.ndarray]]]) -> Figure:
     for axis, title in zip(axes[0], titles, strict=True):
         axis.set_title(title, fontsize=8)
     return figure
+
+
+def main() -> None:
+    """Measure all stages; write a plot and pictures."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    add_scene(parser)
+    parser.add_argument("--quick", action="store_true", help="few paths and rounds")
+    parser.add_argument("--out", type=Path, default=Path("out/studies/light"))
+    args = parser.parse_args()
+    mi.set_variant("llvm_ad_rgb")
+    path = Path(args.scene)
+    ply = path / GAUSSIANS if path.is_dir() else path
+    counts = (QUICK_PATHS, QUICK_MANY, QUICK_ROUNDS) if args.quick else (PATHS, MANY, ROUNDS)
+    results: list[Measurement] = []
+    pictures: list[tuple[str, list[np.ndarray]]] = []
+    for stage in stages(ply, SCENES / "hybrid.xml"):
+        found, shown = measure(stage, *counts)
+        results += found
+        pictures += shown
+        print(f"\n{table(found)}", flush=True)
+    args.out.mkdir(parents=True, exist_ok=True)
+    write_figure(args.out / "light.png", plot(results))
+    write_figure(args.out / "light_pictures.png", show(pictures))
+    print(f"\n{machine()}; plot and pictures: {args.out}")
+
+
+if __name__ == "__main__":
+    main()

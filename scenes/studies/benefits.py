@@ -1,4 +1,4 @@
-"""``python -m drgs.bench benefits``: what effects are good for.
+"""Fit spoiled images with the effect that is made for it, and without.
 
 The shipped scene is fitted at a small size to pictures that were spoiled in a known way, with the
 effect that is made for it and without: other exposures, something before the lens that a mask
@@ -17,12 +17,13 @@ from typing import TYPE_CHECKING
 
 import mitsuba as mi
 import numpy as np
+from fits import SCENES
+from recipes import LEGO, PAPERS, config_of
 from scipy.spatial.transform import Rotation
 
-from drgs.bench.ingredients import LEGO, PAPERS, config_of
-from drgs.bench.output import add_out, machine, markdown_table, write_csv
+import drgs  # noqa: F401  (registers the integrator)
+from drgs.bench.output import machine, markdown_table
 from drgs.capture.path_tracing import first_hits, load_scene
-from drgs.cli.commands import CommandParser
 from drgs.config.changes import changed, with_iterations
 from drgs.config.schema import FitConfig
 from drgs.datasets import load_dataset
@@ -38,7 +39,6 @@ from drgs.training.trainer import Trainer
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-SCENES = Path(__file__).parents[2] / "scenes"
 GENERATOR = SCENES / "brick_crane.py"
 
 SCENE = LEGO
@@ -47,7 +47,7 @@ SCENE = LEGO
 SIZE = 100
 """px: width and height of the pictures that are fitted."""
 
-ITERATIONS, QUICK_ITERATIONS = 3000, 60
+ITERATIONS = 3000
 
 NUM_POINTS = 20_000
 
@@ -82,39 +82,6 @@ class Result:
     name: str
     quantity: str
     value: float
-
-
-def add_arguments(parser: CommandParser) -> None:
-    """Add the arguments of the command."""
-    parser.show_examples("%(prog)s --only masks")
-    add_out(parser, run, "benefits.csv", "antialiasing.png")
-    parser.add_argument("--quick", action="store_true", help="a few iterations each")
-    parser.add_argument("--only", nargs="+", metavar="EFFECT", help="such as masks")
-
-
-def run(args: argparse.Namespace) -> None:
-    """Fit all cases; write a table and CSV, and renderings at several sizes."""
-    mi.set_variant("llvm_ad_rgb")
-    config = base_config(QUICK_ITERATIONS if args.quick else ITERATIONS)
-    results, shown = [], {}
-    for case in CASES:
-        if args.only and case.effect not in args.only:
-            continue
-        trainer, dataset, spoiled = fit_case(case, config)
-        found = (case.measure or quality)(trainer, dataset, spoiled)
-        if case.measure is at_sizes:
-            shown[case.name] = seen_at_sizes(trainer)
-        results += [Result(case.effect, case.name, k, v) for k, v in found.items()]
-        numbers = ", ".join(f"{k} {v:.4g}" for k, v in found.items())
-        print(f"{case.effect}, {case.name}: {numbers}", flush=True)
-    print(f"\n{machine()}; {SIZE}x{SIZE}, {config.iterations} iterations\n\n{table(results)}")
-    rows = [list(vars(result).values()) for result in results]
-    write_csv(args.out / "benefits.csv", list(Result.__dataclass_fields__), rows)
-    print(f"\nwritten: {args.out / 'benefits.csv'}")
-    if shown:
-        shown = {"photograph": photographs_at_sizes(config)} | shown
-        write_figure(args.out / "antialiasing.png", plot(shown))
-        print(f"written: {args.out / 'antialiasing.png'}")
 
 
 def base_config(iterations: int) -> FitConfig:
@@ -411,3 +378,31 @@ def plot(rows: dict[str, list[np.ndarray]]) -> Figure:
     for axes, name in zip(grid[0], SIZES, strict=True):
         axes.set_title(name)
     return figure
+
+
+def main() -> None:
+    """Fit all cases; print a table, and write renderings at several sizes."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--only", nargs="+", metavar="EFFECT", help="such as masks")
+    parser.add_argument("--iterations", type=int, default=ITERATIONS, metavar="N")
+    parser.add_argument("--out", type=Path, default=Path("out/studies/benefits"))
+    args = parser.parse_args()
+    mi.set_variant("llvm_ad_rgb")
+    config = base_config(args.iterations)
+    results, shown = [], {}
+    for case in (case for case in CASES if not args.only or case.effect in args.only):
+        trainer, dataset, spoiled = fit_case(case, config)
+        found = (case.measure or quality)(trainer, dataset, spoiled)
+        if case.measure is at_sizes:
+            shown[case.name] = seen_at_sizes(trainer)
+        results += [Result(case.effect, case.name, k, v) for k, v in found.items()]
+        print(f"{case.effect}, {case.name}", flush=True)
+    print(f"\n{machine()}\n\n{table(results)}")
+    if shown:
+        args.out.mkdir(parents=True, exist_ok=True)
+        shown = {"photograph": photographs_at_sizes(config)} | shown
+        write_figure(args.out / "antialiasing.png", plot(shown))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,4 +1,4 @@
-"""``python -m drgs.bench volprim SCENE``: what sets Mitsuba's ``volprim_rf_basic`` apart.
+"""Compare the approximations of Mitsuba's ``volprim_rf_basic`` with those of 3DGS, one by one.
 
 The float64 numpy reference makes that integrator's choices: splats are evaluated along each pixel's
 ray, end at 3 standard deviations, are ordered by where the ray enters them, and those that are
@@ -21,10 +21,11 @@ from pathlib import Path
 import mitsuba as mi
 import numpy as np
 
+import drgs  # noqa: F401  (registers the integrator)
 from drgs.bench.accuracy import Subject, add_scene, load_subject
-from drgs.bench.output import add_out, markdown_table, write_csv
-from drgs.bench.peers import SHELL, sensor_of, volprim_scene
-from drgs.cli.commands import CommandParser
+from drgs.bench.output import markdown_table
+from drgs.bench.peers import SHELL, volprim_scene
+from drgs.bench.scenes import mitsuba_sensor
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 from drgs.reference import rays as reference_rays
 from drgs.reference import splatting as reference
@@ -69,28 +70,6 @@ class Row:
     largest_error: float
 
 
-def add_arguments(parser: CommandParser) -> None:
-    """Add the arguments of the command."""
-    parser.show_examples("%(prog)s out/lego")
-    add_out(parser, run, "volprim.csv")
-    add_scene(parser)
-
-
-def run(args: argparse.Namespace) -> None:
-    """Measure; write table and CSV."""
-    mi.set_variant("llvm_ad_rgb")
-    subject = load_subject(Path(args.scene), 1)
-    rows = []
-    for factor in FACTORS:
-        rows += compare(enlarged(subject, factor), factor)
-        print(f"lengths x {factor}: {rows[-len(CHANGES)].psnr:.1f} dB", flush=True)
-    print(f"\n{table(rows)}")
-    write_csv(
-        args.out / "volprim.csv", list(Row.__dataclass_fields__), [vars(r).values() for r in rows]
-    )
-    print(f"\nwritten: {args.out / 'volprim.csv'}")
-
-
 def enlarged(subject: Subject, factor: int) -> Subject:
     """The same scene with all lengths multiplied by ``factor``."""
     gaussians = subject.gaussians
@@ -128,7 +107,12 @@ def _row(factor: int, what: str, image: np.ndarray, other: np.ndarray) -> Row:
 
 def volprim_image(gaussians: Gaussians, camera: reference.Camera) -> np.ndarray:
     """(H, W, 3) display space, on black, each pixel at its centre; fx and fy must agree."""
-    sensor = sensor_of(camera, camera.near, {"type": "stratified", "jitter": False})
+    sensor = mitsuba_sensor(camera) | {
+        "near_clip": camera.near,
+        "sampler": {"type": "stratified", "jitter": False, "sample_count": 1},
+        "principal_point_offset_x": 0.5 - camera.cx / camera.width,
+        "principal_point_offset_y": 0.5 - camera.cy / camera.height,
+    }
     scene = mi.load_dict({**volprim_scene(gaussians, "ellipsoids", 4096), "sensor": sensor})
     return np.array(mi.render(scene, spp=1), np.float64)
 
@@ -142,3 +126,18 @@ def table(rows: Sequence[Row]) -> str:
         found = {row.factor: row.psnr for row in rows if row.what == what}
         lines.append([what, *(f"{found[factor]:.1f} dB" for factor in factors)])
     return markdown_table(header, lines)
+
+
+def main() -> None:
+    """Measure all changes at all scales."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    add_scene(parser)
+    args = parser.parse_args()
+    mi.set_variant("llvm_ad_rgb")
+    subject = load_subject(Path(args.scene), 1)
+    rows = [row for f in FACTORS for row in compare(enlarged(subject, f), f)]
+    print(table(rows))
+
+
+if __name__ == "__main__":
+    main()
