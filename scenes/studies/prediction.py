@@ -149,7 +149,8 @@ class Task:
     views: int = 8
 
 
-OBJECT, STREET = Task(100_000, 1, 400), Task(3_000_000, 5, 1600, views=4)
+CORE_TASKS = Task(100_000, 1, 400), Task(1_000_000, 1, 1265)
+MACHINE_TASKS = Task(100_000, 1, 400), Task(3_000_000, 5, 1600, views=4)
 QUICK = Task(2000, 1, 64, views=2)
 
 
@@ -331,16 +332,18 @@ def main() -> None:
     mi.set_variant("llvm_ad_rgb")
     dr.set_thread_count(1)
     print(machine())
-    for task in (QUICK,) if args.quick else (OBJECT, STREET):
-        name = f"{task.gaussians:,} Gaussians, {task.size_px}x{task.size_px}"
-        if task.boxes == 1:
-            scene = Scene("bench", make_boxes(task), bench_camera(task.size_px))
-            print(f"\n{name}: bound of the speed-up\n\n{cores_table(scene)}", flush=True)
+    for task in (QUICK,) if args.quick else CORE_TASKS:
+        scene = Scene("bench", make_boxes(task), bench_camera(task.size_px))
+        print(f"\n{title(task)}: bounds of the speed-up\n\n{cores_table(scene)}", flush=True)
+    for task in (QUICK,) if args.quick else MACHINE_TASKS:
         costs = measure_costs(task)
-        print(f"\n{name}, of which a view sees 1 / {task.boxes}\n\n{costs_table(costs)}")
-        print(
-            f"\n{costs.splats:,.0f} splats of a view travel\n\n{machines_table(costs)}", flush=True
-        )
+        print(f"\n{title(task)}, of which a view sees 1 / {task.boxes}\n\n{costs_table(costs)}")
+        print(f"\n{costs.splats:,.0f} splats of a view travel\n\n{machines_table(costs)}")
+
+
+def title(task: Task) -> str:
+    """Describe a scene."""
+    return f"{task.gaussians:,} Gaussians, {task.size_px}x{task.size_px}"
 
 
 if __name__ == "__main__":
