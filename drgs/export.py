@@ -25,8 +25,8 @@ from drgs.datasets.orbits import up_of
 from drgs.datasets.viewpoints import near_one
 from drgs.effects.smoothing import baked
 from drgs.gaussians.cleaning import Selection, taken, turned_towards
-from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
-from drgs.io.formats import FORMATS, Format, format_of
+from drgs.gaussians.parameters import Gaussians
+from drgs.io.formats import OTHER_FORMATS, FileFormat, file_formats, format_for
 from drgs.io.morton import morton_order
 from drgs.results.files import CONFIG, GAUSSIANS, GAUSSIANS_FOR_VIEWERS, VIEWS
 from drgs.results.folder import load_run_config
@@ -84,21 +84,20 @@ class Target:
     honoured: Honoured | None = None  # None: nothing is
 
 
-def _usd(source: Source) -> bytes:
-    from drgs.io.usd import encode
+def targets() -> dict[str, Target]:
+    """Return what ``--format`` takes, by name: the file formats, and the page."""
+    found = {each.name: _format_target(each.name, each.value) for each in file_formats()}
+    return {**found, "html": PAGE}
 
-    g = source.gaussians
-    return encode({name: getattr(g, name) for name in PARAMETER_NAMES}, g.origin)
 
-
-def _of_format(each: Format) -> Target:
+def _format_target(name: str, chosen: type[FileFormat]) -> Target:
     return Target(
-        each.suffix,
-        each.text,
-        lambda source: source.gaussians.to_bytes(each.name),
-        Z_UP if each.y_up else Y_DOWN,
-        has_axes=each.y_up,
-        honoured=_honoured_by_playcanvas if each.name == PLAYCANVAS else None,
+        chosen.suffix,
+        chosen.description,
+        lambda source: source.gaussians.to_bytes(name),
+        Y_DOWN if chosen.up is None else Z_UP,
+        has_axes=chosen.up is not None,
+        honoured=_honoured_by_playcanvas if name == PLAYCANVAS else None,
     )
 
 
@@ -118,20 +117,13 @@ def _page(source: Source) -> bytes:
     return viewer_page(title, shown, standpoint, background)
 
 
-TARGETS = {
-    **{each.name: _of_format(each) for each in FORMATS},
-    "usd": Target(
-        ".usdc", "OpenUSD's ParticleField3DGaussianSplat (extra usd)", _usd, Z_UP, has_axes=True
-    ),
-    "html": Target(
-        ".html",
-        "a page to walk around in, for any browser",
-        _page,
-        Z_UP,
-        honoured=lambda _: HONOURED,
-    ),
-}
-"""By the name that ``--format`` takes."""
+PAGE = Target(
+    ".html",
+    "a page to walk around in, for any browser",
+    _page,
+    Z_UP,
+    honoured=lambda _: HONOURED,
+)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -153,7 +145,7 @@ def add_arguments(parser: CommandParser) -> None:
         metavar="OUT_DIR|MODEL",
         help="the output folder of a fit, or a file of Gaussians",
     )
-    names = "; ".join(f"{name}: {target.text}" for name, target in TARGETS.items())
+    names = "; ".join(f"{name}: {target.text}" for name, target in targets().items())
     parser.add_argument(
         "--format", metavar="NAME", help=f"{names} (default: what the suffix of --out says)"
     )
@@ -199,7 +191,7 @@ def _add_cleaning(parser: CommandParser) -> None:
 def run(args: argparse.Namespace) -> None:
     """Export what the command line names."""
     name, out = _destination(args)
-    target = TARGETS[name]
+    target = targets()[name]
     selection = _selection(args)
     source = load_source(args.what, target.honoured)
     if out.resolve() == source.path.resolve():
@@ -274,13 +266,14 @@ def _destination(args: argparse.Namespace) -> tuple[str, Path]:
     name = args.format
     if name is None and args.out is not None:
         name = _target_of(args.out)
-    if name not in TARGETS:
-        got = f"got {one_line(name, 40)}{did_you_mean(name, TARGETS)}" if name else "got none"
-        raise UserError(f"--format: must be one of {', '.join(TARGETS)}, {got}")
-    suffix = TARGETS[name].suffix
+    known = targets()
+    if name not in known:
+        got = f"got {one_line(name, 40)}{did_you_mean(name, known)}" if name else "got none"
+        raise UserError(f"--format: must be one of {', '.join(known)}, {got}; {OTHER_FORMATS}")
+    suffix = known[name].suffix
     if args.out is None:
-        known = format_of(args.what)
-        stem = args.what.name[: -len(known.suffix)] if known else args.what.resolve().name
+        read_as = format_for(args.what)
+        stem = args.what.name[: -len(read_as.value.suffix)] if read_as else args.what.resolve().name
         return name, args.what.resolve().with_name(f"{stem}{suffix}")
     if not args.out.name.lower().endswith(suffix):
         raise UserError(f"--out {args.out}: the name of a {name} file must end in {suffix}")
@@ -291,8 +284,9 @@ def _destination(args: argparse.Namespace) -> tuple[str, Path]:
 
 def _target_of(path: Path) -> str | None:
     """The target with the longest suffix that the file's name ends in."""
-    found = [n for n, target in TARGETS.items() if path.name.lower().endswith(target.suffix)]
-    return max(found, key=lambda name: len(TARGETS[name].suffix), default=None)
+    found = {n: each.suffix for n, each in targets().items()}
+    fitting = [name for name, suffix in found.items() if path.name.lower().endswith(suffix)]
+    return max(fitting, key=lambda name: len(found[name]), default=None)
 
 
 # ----------------------------------------------------------------------------------------------

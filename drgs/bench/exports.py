@@ -22,12 +22,13 @@ from drgs.cli.commands import CommandParser
 from drgs.config.load import load_config
 from drgs.config.schema import ModelConfig
 from drgs.core.errors import UserError
+from drgs.core.registry import Extension
 from drgs.core.variants import VARIANTS
 from drgs.datasets import Dataset, load_dataset
 from drgs.export import load_source
 from drgs.gaussians.parameters import Gaussians
 from drgs.integrator.scene import make_scene, render_views
-from drgs.io.formats import FORMATS, Format
+from drgs.io.formats import readable_formats
 from drgs.results import metrics
 from drgs.results.files import CONFIG
 
@@ -75,7 +76,7 @@ def run(args: argparse.Namespace) -> None:
 
 
 def measure(folder: Path) -> list[Measurement]:
-    """All formats, in the order of their declaration; folder: of a fit."""
+    """Measure all formats that can be read; folder: of a fit."""
     gaussians = replace(load_source(folder).gaussians, rendered_with=None)
     config = load_config(folder / CONFIG)
     dataset = load_dataset(config.data)
@@ -83,7 +84,7 @@ def measure(folder: Path) -> list[Measurement]:
     before = pictures(gaussians, dataset, model)
     quality = _psnr(before, dataset)
     found = []
-    for each in FORMATS:
+    for each in readable_formats():
         read, *numbers = round_trip(gaussians, each)
         after = pictures(read, dataset, model)
         psnr, moved = _psnr(after, dataset), float(np.mean(list(map(metrics.psnr, after, before))))
@@ -97,10 +98,10 @@ def measure(folder: Path) -> list[Measurement]:
     return found
 
 
-def round_trip(gaussians: Gaussians, each: Format) -> tuple[Gaussians, int, float, float]:
+def round_trip(gaussians: Gaussians, each: Extension) -> tuple[Gaussians, int, float, float]:
     """What is read, the bytes of the file, and the seconds of writing and reading."""
     with TemporaryDirectory() as folder:
-        path = Path(folder) / f"model{each.suffix}"
+        path = Path(folder) / f"model{each.value.suffix}"
         start = time.perf_counter()
         path.write_bytes(gaussians.to_bytes(each.name))
         written = time.perf_counter()
@@ -121,7 +122,7 @@ def _psnr(images: Sequence[np.ndarray], dataset: Dataset) -> float:
 
 def table(found: Sequence[Measurement]) -> str:
     """A row for each format."""
-    whole = found[0].megabytes
+    whole = next(m.megabytes for m in found if m.format == "ply")
     header = ["format", "MB", "of PLY", "PSNR [dB]", "lost [dB]", "against before [dB]"]
     header += ["write, read [s]"]
     rows = [

@@ -25,8 +25,15 @@ import numpy as np
 from drgs.core.constants import SH_C0
 from drgs.core.errors import UserError
 from drgs.core.memory import require_memory
+from drgs.io.formats import FORMATS, FileFormat, Scalar
 from drgs.io.morton import morton_order
-from drgs.io.ply import NUM_REST, Scalar, encode_elements, properties_of, read_elements
+from drgs.io.ply import (
+    NUM_REST,
+    encode_elements,
+    has_packed_vertices,
+    properties_of,
+    read_elements,
+)
 from drgs.io.quantized import (
     gaussians_bytes,
     logits_of,
@@ -55,12 +62,6 @@ BOUNDED = {"position": ("x", "y", "z"), "scale": ("scale_x", "scale_y", "scale_z
 COLORS = ("r", "g", "b")
 MAX_LOG_SCALE = 20.0
 """Larger ones are cut off, as PlayCanvas does: viewers compute with their exponentials."""
-
-
-def is_compressed(path: str | Path) -> bool:
-    """Whether a PLY file has packed vertices. Raises as :func:`drgs.io.ply.properties_of` does."""
-    elements = properties_of(path)
-    return "chunk" in elements and PACKED[0] in elements["vertex"]
 
 
 # ----------------------------------------------------------------------------------------------
@@ -291,3 +292,18 @@ def _harmonics(path: str | Path, sh: np.ndarray | None, num: int) -> np.ndarray:
     values = ((parts - 0.5) * (2 * SH_RANGE)).astype(np.float32)
     rest = values[np.column_stack([sh[name] for name in names])]
     return rest.reshape(num, 3, -1).transpose(0, 2, 1)
+
+
+@FORMATS.register("compressed-ply")
+class CompressedPly(FileFormat):
+    """PlayCanvas's compressed PLY."""
+
+    suffix = ".compressed.ply"
+    description = "PlayCanvas's compressed PLY, for SuperSplat and PlayCanvas"
+    metadata = None
+    read = staticmethod(read_gaussians)
+    encode = staticmethod(encode)
+
+    def recognizes(self, path: Path) -> bool:
+        """Return whether the vertices are packed."""
+        return has_packed_vertices(path)

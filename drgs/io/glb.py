@@ -27,9 +27,9 @@ from drgs.core.constants import SH_C0
 from drgs.core.errors import Place, UserError
 from drgs.core.files import read_bytes
 from drgs.core.memory import UNASKED_FILE_BYTES, readable, require_memory
-from drgs.core.origin import WORLD
+from drgs.core.origin import WORLD, near_means
+from drgs.io.formats import FORMATS, ORIGIN, FileFormat, Scalar, pop_origin
 from drgs.io.glb_document import EXTENSION, OURS, Document, read_document
-from drgs.io.ply import ORIGIN, Scalar, near_means, origin_among
 from drgs.io.quantized import (
     gaussians_bytes,
     log_scales_of,
@@ -79,7 +79,7 @@ def encode(
     the node.
     """
     attributes, said = _attributes(gaussians), dict(rendered_with or {})
-    origin = origin_among("rendered_with", said)
+    origin = pop_origin("rendered_with", said)
     document = _document(attributes, {OURS: said} if said else None)
     if origin != WORLD:
         document["nodes"][0]["translation"] = list(origin)
@@ -322,3 +322,15 @@ class _Attributes:
                 f"{Place(self._path, 'byte', first)}, row {bad[0][0]:,}: {name} must be {words}, "
                 f"got {values[tuple(bad[0])]}"
             )
+
+
+@FORMATS.register("glb")
+class Glb(FileFormat):
+    """Binary glTF."""
+
+    suffix = ".glb"
+    description = "binary glTF with KHR_gaussian_splatting, in full precision"
+    up = "y"
+    metadata = None
+    read = staticmethod(read_gaussians)
+    encode = staticmethod(encode)

@@ -15,7 +15,8 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from pydantic.alias_generators import to_camel
 
 from drgs.core.errors import UserError, listed, one_line
-from drgs.io.ply import MAX_ORIGIN, STATEMENT, Scalar
+from drgs.io.formats import MAX_ORIGIN, Scalar
+from drgs.io.ply import STATEMENT
 
 EXTENSION = "KHR_gaussian_splatting"
 

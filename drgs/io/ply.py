@@ -37,7 +37,8 @@ from plyfile import PlyData, PlyElement, PlyListProperty
 from drgs.core.errors import UserError, UserNote, listed, one_line
 from drgs.core.files import open_regular
 from drgs.core.memory import require_memory
-from drgs.core.origin import WORLD, Origin, near_origin
+from drgs.core.origin import WORLD, near_means
+from drgs.io.formats import FORMATS, ORIGIN, FileFormat, Scalar, pop_origin
 from drgs.io.quantized import LARGEST_LOGIT, SMALLEST_LOGIT
 
 POSITION = ("x", "y", "z")
@@ -49,12 +50,6 @@ ROTATION = ("rot_0", "rot_1", "rot_2", "rot_3")
 SMOOTHING = ("filter_3D",)
 COLOR = ("red", "green", "blue")
 
-ORIGIN = ("origin_x", "origin_y", "origin_z")
-"""In comments: world coordinates of what positions are relative to."""
-
-MAX_ORIGIN = 1e12
-"""World units."""
-
 NUM_REST = {3 * ((degree + 1) ** 2 - 1): degree for degree in range(4)}
 """Number of ``f_rest`` properties -> degree: 0, 9, 24, 45 -> 0, 1, 2, 3."""
 
@@ -63,8 +58,6 @@ ROWS_AND_COPIES = 3
 
 MAX_HEADER_BYTES = 1 << 20
 """The header of 62 properties takes 1.5 kB; the rest is room for comments."""
-
-Scalar = bool | int | float | str
 
 STATEMENT = re.compile(r"drgs ([a-z][a-z_]{0,39}) ([!-~]{1,40})")
 """A comment of ours: a name and its value. Others are somebody else's."""
@@ -208,7 +201,7 @@ def read_points(path: str | Path) -> tuple[np.ndarray, np.ndarray | None]:
     """
     vertex, statements = _read_vertices(path)
     _require(path, vertex, POSITION, "points")
-    positions = _columns(vertex, POSITION, np.float64) + origin_among(path, statements)
+    positions = _columns(vertex, POSITION, np.float64) + pop_origin(path, statements)
     if not set(COLOR) <= set(vertex.dtype.names):
         return positions, None
     _require(path, vertex, COLOR, "coloured points")
@@ -236,6 +229,15 @@ def properties_of(path: str | Path) -> dict[str, tuple[str, ...]]:
         return {e.name: tuple(p.name for p in e.properties) for e in layout.elements}
 
     return _read(path, names)
+
+
+def has_packed_vertices(path: str | Path) -> bool:
+    """Return whether a PLY file is one of :mod:`drgs.io.compressed_ply`.
+
+    Raises :class:`UserError` as :func:`properties_of` does.
+    """
+    elements = properties_of(path)
+    return "chunk" in elements and "packed_position" in elements["vertex"]
 
 
 def read_elements(
@@ -491,35 +493,6 @@ def _rest(num_rest: int) -> tuple[str, ...]:
     return tuple(f"f_rest_{i}" for i in range(num_rest))
 
 
-def origin_among(path: str | Path, statements: dict[str, Scalar]) -> Origin:
-    """Take the coordinates of the origin out of a header's statements.
-
-    Raises :class:`UserError` where some are missing, or are no numbers.
-    """
-    values = [statements.pop(name, None) for name in ORIGIN]
-    if values == [None, None, None]:
-        return WORLD
-    if not all(type(value) in (int, float) and abs(value) <= MAX_ORIGIN for value in values):
-        got = ", ".join("nothing" if value is None else str(value) for value in values)
-        raise UserError(
-            f"{path}: {', '.join(ORIGIN)} must be three numbers of at most {MAX_ORIGIN:g} in size, "
-            f"got {one_line(got, 80)}; correct the header, or remove them"
-        )
-    x, y, z = map(float, values)
-    return x, y, z
-
-
-def near_means(means: np.ndarray) -> tuple[np.ndarray, Origin]:
-    """Positions (N, 3) float64, and the origin that they are relative to.
-
-    means: (N, 3) float64, world, relative to another origin than the world's where most of them
-    are far away from that.
-    """
-    middle = np.median(means, axis=0)
-    origin = near_origin(middle, float(np.median(np.linalg.norm(means - middle, axis=1))))
-    return means - origin, origin
-
-
 def _columns(vertex: np.ndarray, names: tuple[str, ...], kind: type = np.float32) -> np.ndarray:
     """(N, len(names)) of a float type, a copy."""
     rows = np.empty((len(vertex), len(names)), kind)
@@ -527,3 +500,20 @@ def _columns(vertex: np.ndarray, names: tuple[str, ...], kind: type = np.float32
         for column, name in enumerate(names):
             rows[:, column] = vertex[name]
     return rows
+
+
+@FORMATS.register("ply")
+class Ply(FileFormat):
+    """The 3DGS reference's PLY."""
+
+    suffix = ".ply"
+    description = "the 3DGS reference's PLY, which every program reads"
+    has_smoothing = True
+    allows_nonfinite = True
+    metadata = None
+    read = staticmethod(read_gaussians)
+    encode = staticmethod(encode)
+
+    def recognizes(self, path: Path) -> bool:
+        """Return whether the vertices are not packed."""
+        return not has_packed_vertices(path)

@@ -17,7 +17,7 @@ from drgs.core.constants import SH_C0
 from drgs.core.errors import Place, UserError
 from drgs.core.files import read_bytes
 from drgs.core.memory import require_memory
-from drgs.io.ply import Scalar
+from drgs.io.formats import FORMATS, FileFormat, Scalar
 from drgs.io.quantized import (
     gaussians_bytes,
     log_scales_of,
@@ -103,3 +103,14 @@ def read_gaussians(path: str | Path) -> tuple[dict[str, np.ndarray], dict[str, S
         "shN": np.zeros((len(rows), 0, 3)),
     }
     return {name: values.astype(np.float32) for name, values in arrays.items()}, {}
+
+
+@FORMATS.register("splat")
+class Splat(FileFormat):
+    """antimatter15's format."""
+
+    suffix = ".splat"
+    description = "antimatter15's .splat, for old viewers: no harmonics"
+    has_harmonics = False
+    read = staticmethod(read_gaussians)
+    encode = staticmethod(encode)

@@ -35,7 +35,7 @@ from drgs.core.errors import Place, UserError, UserNote
 from drgs.core.extras import required
 from drgs.core.files import read_bytes
 from drgs.core.memory import require_memory
-from drgs.io.ply import Scalar
+from drgs.io.formats import FORMATS, FileFormat, Scalar
 from drgs.io.quantized import (
     gaussians_bytes,
     logits_of,
@@ -402,3 +402,15 @@ def _unpacked_stream(path: Path, start: int, packed: bytes, expected: int) -> np
     if len(data) != expected:
         raise UserError(f"{place}: {expected:,} bytes were expected, got {len(data):,}")
     return np.frombuffer(data, np.uint8)
+
+
+@FORMATS.register("spz")
+class Spz(FileFormat):
+    """Niantic's SPZ."""
+
+    suffix = ".spz"
+    description = "Niantic's SPZ, the smallest"
+    up = "y"
+    metadata = frozenset({"antialiased"})
+    read = staticmethod(read_gaussians)
+    encode = staticmethod(encode)
