@@ -35,7 +35,7 @@ tracebacks.show_causes_last()
 _MODULES = {
     "Gaussians": "drgs.gaussians.parameters",
     "load_dataset": "drgs.datasets",
-    "rasterization": "drgs.rasterizing",
+    "rasterization": "drgs.rasterization",
     "train": "drgs.training.loop",
 }
 
