@@ -8,17 +8,13 @@ from __future__ import annotations
 
 import ctypes
 import errno
-import os
 import re
 import sys
 from pathlib import Path
 
-from drgs.core.errors import UserError, one_line
+import psutil
 
-try:
-    import resource
-except ImportError:  # Windows
-    resource = None
+from drgs.core.errors import UserError, one_line
 
 FREE_MEMORY = (
     "close other programs, raise the limit (ulimit -v, or the container's), or use smaller input"
@@ -61,7 +57,8 @@ def available_memory() -> int:
 
     The least of what the machine, the process's control groups and its own limit leave it.
     """
-    return max(0, min(_of_machine(), _of_control_groups(), _of_process()))
+    machine = psutil.virtual_memory().available
+    return max(0, min(machine, _of_control_groups(), _of_process()))
 
 
 def release_unused_memory() -> None:
@@ -74,8 +71,8 @@ def release_unused_memory() -> None:
 
 
 def resident_memory() -> int:
-    """Bytes that this process has; 0 where the system does not say."""
-    return _pages(1)
+    """Bytes of memory that this process has."""
+    return psutil.Process().memory_info().rss
 
 
 def readable(count: float) -> str:
@@ -171,31 +168,13 @@ def _three_digits(number: float) -> str:
 # ----------------------------------------------------------------------------------------------
 
 
-def _of_machine() -> int:
-    """What the kernel could give without swapping; elsewhere than on Linux, all there is."""
-    for line in _lines(_PROC / "meminfo"):
-        if line.startswith("MemAvailable:"):
-            return 1024 * int(line.split()[1])
-    try:
-        return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-    except (AttributeError, ValueError, OSError):
-        return _UNLIMITED
-
-
 def _of_process() -> int:
-    """What ``ulimit -v`` leaves."""
-    if resource is None:
+    """Bytes that ``ulimit -v`` leaves."""
+    process = psutil.Process()
+    if not hasattr(psutil, "RLIMIT_AS"):  # not Linux
         return _UNLIMITED
-    limit, _ = resource.getrlimit(resource.RLIMIT_AS)
-    if limit == resource.RLIM_INFINITY:
-        return _UNLIMITED
-    return limit - _pages(0)
-
-
-def _pages(column: int) -> int:
-    """Bytes of a column of the process's numbers of pages: 0, of addresses; 1, that it has."""
-    numbers = next(iter(_lines(_PROC / "self" / "statm")), "0 0").split()
-    return int(numbers[column]) * os.sysconf("SC_PAGE_SIZE") if int(numbers[column]) else 0
+    limit, _ = process.rlimit(psutil.RLIMIT_AS)
+    return _UNLIMITED if limit == psutil.RLIM_INFINITY else limit - process.memory_info().vms
 
 
 def _of_control_groups() -> int:
