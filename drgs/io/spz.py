@@ -22,6 +22,7 @@ A flag says that Gaussians were fitted with compensated opacities, ``antialiased
 from __future__ import annotations
 
 import gzip
+import io
 import struct
 import warnings
 import zlib
@@ -31,7 +32,7 @@ from pathlib import Path
 
 import numpy as np
 
-from drgs.core.errors import Place, UserError, UserNote
+from drgs.core.errors import Place, UserError, UserNote, one_line
 from drgs.core.extras import required
 from drgs.core.files import read_bytes
 from drgs.core.memory import require_memory
@@ -296,60 +297,31 @@ def _check_room(path: Path, header: _Header, size: int) -> None:
 
 
 def _read_gzip(path: Path, content: bytes) -> tuple[_Header, list[np.ndarray]]:
-    """Versions 2 and 3."""
-    stream = _GzipStream(path, content)
-    header = _checked_header(path, HEADER.unpack(stream.take(HEADER.size)), (2, 3))
-    expected = sum(header.sizes)
-    _check_room(path, header, len(content))
-    body = stream.take(expected)
-    stream.check_end(more_may_follow=bool(header.flags & EXTENSIONS))
-    cuts = np.cumsum(header.sizes)[:-1]
-    return header, np.split(np.frombuffer(body, np.uint8), cuts)
+    """Read versions 2 and 3."""
+    with gzip.open(io.BytesIO(content)) as stream:
+        header = _checked_header(path, HEADER.unpack(_take(path, stream, HEADER.size)), (2, 3))
+        _check_room(path, header, len(content))
+        body = _take(path, stream, sum(header.sizes))
+        most = MAX_EXTENSIONS if header.flags & EXTENSIONS else 0
+        _take(path, stream, 0, most)  # to the end, where the checksum is
+    return header, np.split(np.frombuffer(body, np.uint8), np.cumsum(header.sizes)[:-1])
 
 
-class _GzipStream:
-    """Unpacked from its beginning to its end, no more than is asked for at a time."""
-
-    def __init__(self, path: Path, content: bytes) -> None:
-        self._path, self._rest, self._at = path, content, 0
-        self._unpack = zlib.decompressobj(wbits=16 + zlib.MAX_WBITS)
-
-    @property
-    def _place(self) -> str:
-        return f"{Place(self._path, 'byte', self._at)} of the unpacked stream"
-
-    def _next(self, most: int) -> bytes:
-        """At most so many bytes, fewer only at the end."""
-        try:
-            data = self._unpack.decompress(self._rest, most)
-        except zlib.error as error:
-            raise UserError(f"{self._place}: the gzip stream is damaged: {error}") from None
-        self._rest = self._unpack.unconsumed_tail
-        return data
-
-    def take(self, size: int) -> bytes:
-        """The next ``size`` bytes."""
-        data = self._next(size) if size else b""
-        if len(data) < size:
-            raise UserError(
-                f"{self._place}: {size:,} bytes were expected, and it ends after {len(data):,}; "
-                "the file is damaged, or was cut off"
-            )
-        self._at += size
-        return data
-
-    def check_end(self, more_may_follow: bool) -> None:
-        """Read on to the end, where the checksum is."""
-        last = self._at + (MAX_EXTENSIONS if more_may_follow else 0)
-        while data := self._next(1 << 20):
-            self._at += len(data)
-            if self._at > last:
-                raise UserError(f"{self._place}: the end was expected, and more follows")
-        if not self._unpack.eof or self._unpack.unused_data:
-            raise UserError(
-                f"{self._place}: the file must end with the stream's checksum; it is damaged, or "
-                "was cut off"
-            )
+def _take(path: Path, stream: gzip.GzipFile, size: int, end: int | None = None) -> bytes:
+    """Return the next ``size`` bytes; end: most bytes that may follow, None: any number."""
+    place = f"{Place(path, 'byte', stream.tell())} of the unpacked stream"
+    try:
+        data = stream.read(size if end is None else size + end + 1)
+    except (OSError, EOFError, zlib.error) as error:
+        raise UserError(f"{place}: the gzip stream is damaged: {one_line(error)}") from None
+    if len(data) < size:
+        raise UserError(
+            f"{place}: {size:,} bytes were expected, and it ends after {len(data):,}; the file is "
+            "damaged, or was cut off"
+        )
+    if end is not None and len(data) > size + end:
+        raise UserError(f"{place}: the end was expected, and more follows")
+    return data
 
 
 def _read_streams(path: Path, content: bytes) -> tuple[_Header, list[np.ndarray]]:
