@@ -20,14 +20,14 @@ from drgs.config.approximations import DECLARED, Approximations, said_by
 from drgs.core.constants import LOW_PASS
 from drgs.core.errors import UserError, UserNote, did_you_mean, one_line
 from drgs.core.files import atomic_path
-from drgs.core.records import FolderRecord
+from drgs.core.folders import FolderRecord
 from drgs.datasets.orbits import up_of
 from drgs.datasets.viewpoints import near_one
 from drgs.effects.smoothing import baked
 from drgs.gaussians.cleaning import Selection, taken, turned_towards
 from drgs.gaussians.parameters import Gaussians
 from drgs.io.formats import OTHER_FORMATS, FileFormat, file_formats, format_for
-from drgs.io.morton import morton_order
+from drgs.io.quantization import morton_order
 from drgs.results.files import CONFIG, GAUSSIANS, GAUSSIANS_FOR_VIEWERS, VIEWS
 from drgs.results.folder import load_run_config
 from drgs.results.refined_cameras import training_cameras

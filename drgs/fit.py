@@ -54,11 +54,10 @@ from drgs.config.approximations import Approximations
 from drgs.config.changes import changed
 from drgs.config.load import load_config
 from drgs.config.schema import FitConfig
+from drgs.core.environment import processor, required
 from drgs.core.errors import UserError, UserNote
-from drgs.core.extras import required
 from drgs.core.files import atomic_path
-from drgs.core.locks import sole_writer
-from drgs.core.machine import processor
+from drgs.core.folders import sole_writer
 from drgs.core.memory import release_unused_memory
 from drgs.core.private import llvm_version
 from drgs.core.processes import process_number, start_mpi

@@ -43,10 +43,10 @@ from drgs.config.changes import is_open
 from drgs.config.load import load_config
 from drgs.config.schema import NAMED_COLORS, FitConfig, ModelConfig
 from drgs.core.constants import SHUTTER_SAMPLES
+from drgs.core.environment import VARIANTS
 from drgs.core.errors import PluginError, UserError, one_line, reason_of_mitsuba
 from drgs.core.files import atomic_path, open_regular, shortened
 from drgs.core.processes import process_number, start_mpi
-from drgs.core.variants import VARIANTS
 from drgs.datasets import Dataset, load_dataset
 from drgs.datasets.orbits import near_plane_of, orbit_of_gaussians, orbit_of_views, orbit_size
 from drgs.datasets.types import Viewpoint

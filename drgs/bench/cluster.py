@@ -28,8 +28,8 @@ from drgs.bench.output import add_out, machine, markdown_table, write_csv
 from drgs.bench.parts import Measured, Task
 from drgs.bench.processes import launcher
 from drgs.cli.commands import CommandParser
+from drgs.core.environment import required
 from drgs.core.errors import UserError
-from drgs.core.extras import required
 from drgs.io.figures import new_figure, write_figure
 
 if TYPE_CHECKING:

@@ -21,9 +21,9 @@ from drgs.bench.output import add_out, machine, markdown_table, write_csv
 from drgs.cli.commands import CommandParser
 from drgs.config.load import load_config
 from drgs.config.schema import ModelConfig
+from drgs.core.environment import VARIANTS
 from drgs.core.errors import UserError
 from drgs.core.registry import Extension
-from drgs.core.variants import VARIANTS
 from drgs.datasets import Dataset, load_dataset
 from drgs.export import load_source
 from drgs.gaussians.parameters import Gaussians

@@ -31,7 +31,7 @@ from drgs import fit
 from drgs.bench.output import add_out, machine, markdown_table, write_csv
 from drgs.cli.commands import CommandParser, at_least, file_or_folder
 from drgs.config.schema import FitConfig
-from drgs.core.extras import required
+from drgs.core.environment import required
 from drgs.core.files import atomic_path
 from drgs.datasets import layout_name, load_dataset
 from drgs.datasets.colmap import model_folder, picture_folder

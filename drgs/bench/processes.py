@@ -19,8 +19,8 @@ from pathlib import Path
 
 from drgs.bench.output import add_out, machine, markdown_table, write_csv
 from drgs.cli.commands import CommandParser, at_least
+from drgs.core.environment import required
 from drgs.core.errors import UserError
-from drgs.core.extras import required
 from drgs.results.files import GAUSSIANS
 
 STEPS, ROUNDS = 4, 3

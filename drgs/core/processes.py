@@ -22,8 +22,8 @@ from typing import NoReturn
 
 import psutil
 
+from drgs.core.environment import required
 from drgs.core.errors import UserError, one_line
-from drgs.core.extras import required
 
 LAUNCHERS = (
     ("PMI_RANK", "PMI_SIZE"),  # MPICH

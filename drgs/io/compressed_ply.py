@@ -26,7 +26,6 @@ from drgs.core.constants import SH_C0
 from drgs.core.errors import UserError
 from drgs.core.memory import require_memory
 from drgs.io.formats import FORMATS, FileFormat, Scalar
-from drgs.io.morton import morton_order
 from drgs.io.ply import (
     NUM_REST,
     encode_elements,
@@ -34,9 +33,10 @@ from drgs.io.ply import (
     properties_of,
     read_elements,
 )
-from drgs.io.quantized import (
+from drgs.io.quantization import (
     gaussians_bytes,
     logits_of,
+    morton_order,
     opacities_of,
     rounded,
     unit_quaternions,

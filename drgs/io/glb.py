@@ -34,7 +34,7 @@ from drgs.core.memory import UNASKED_FILE_BYTES, readable, require_memory
 from drgs.core.origin import WORLD, near_means
 from drgs.io.formats import FORMATS, MAX_ORIGIN, ORIGIN, FileFormat, Scalar, pop_origin
 from drgs.io.ply import STATEMENT
-from drgs.io.quantized import (
+from drgs.io.quantization import (
     gaussians_bytes,
     log_scales_of,
     logits_of,

@@ -39,7 +39,7 @@ from drgs.core.files import open_regular
 from drgs.core.memory import require_memory
 from drgs.core.origin import WORLD, near_means
 from drgs.io.formats import FORMATS, ORIGIN, FileFormat, Scalar, pop_origin
-from drgs.io.quantized import LARGEST_LOGIT, SMALLEST_LOGIT
+from drgs.io.quantization import LARGEST_LOGIT, SMALLEST_LOGIT
 
 POSITION = ("x", "y", "z")
 NORMAL = ("nx", "ny", "nz")

@@ -18,7 +18,7 @@ from drgs.core.errors import Place, UserError
 from drgs.core.files import read_bytes
 from drgs.core.memory import require_memory
 from drgs.io.formats import FORMATS, FileFormat, Scalar
-from drgs.io.quantized import (
+from drgs.io.quantization import (
     gaussians_bytes,
     log_scales_of,
     logits_of,

@@ -32,12 +32,12 @@ from pathlib import Path
 
 import numpy as np
 
+from drgs.core.environment import required
 from drgs.core.errors import Place, UserError, UserNote, one_line
-from drgs.core.extras import required
 from drgs.core.files import read_bytes
 from drgs.core.memory import require_memory
 from drgs.io.formats import FORMATS, FileFormat, Scalar
-from drgs.io.quantized import (
+from drgs.io.quantization import (
     gaussians_bytes,
     logits_of,
     opacities_of,

@@ -14,11 +14,11 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
+from drgs.core.environment import required
 from drgs.core.errors import UserError
-from drgs.core.extras import required
 from drgs.core.origin import WORLD
 from drgs.io.formats import FORMATS, ORIGIN, FileFormat, Scalar, pop_origin
-from drgs.io.quantized import opacities_of, unit_quaternions
+from drgs.io.quantization import opacities_of, unit_quaternions
 
 PRIM = "/Gaussians"
 

@@ -14,7 +14,7 @@ from support.fit_command import (
 from support.folders import contents
 
 from drgs import fit
-from drgs.core.locks import sole_writer
+from drgs.core.folders import sole_writer
 
 MESSAGE = (
     "out: another command is writing to this folder; wait until it has ended, or choose another"
