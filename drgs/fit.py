@@ -420,7 +420,7 @@ def planned(
     rehearsal = rehearse(config, dataset, gaussians, make_trainer)
     num_points, num_gaussians = gaussians.num_gaussians, target_of(config) or 0
     results = seconds_of_results(
-        rehearsal.trainer.scene_of_all(),
+        rehearsal.trainer.full_scene(),
         dataset,
         max(num_points, num_gaussians),
         config.model.sh_degree,
@@ -473,7 +473,7 @@ def fit_and_write(
     write_history(out / HISTORY, log.rows)
     write_density(out / DENSITY, log.density)
     write_views(out / VIEWS, dataset)
-    config, render = trainer.config, trainer.pictures
+    config, render = trainer.config, trainer.images
     write_run_config(out, config)
     output = config.output
     scores = write_pictures(out, dataset, render, output.save_renders, output.report)
@@ -485,7 +485,7 @@ def fit_and_write(
         metrics["viewers"] = measured_split(seen, dataset)
     if output.report:
         shown = shown_on_page(gaussians, config.model.approximations, for_viewers)
-        fitted = Fitted(trainer.scene_of_all(), gaussians, render, shown)
+        fitted = Fitted(trainer.full_scene(), gaussians, render, shown)
         write_results(out, dataset, fitted, scores, log, metrics)
     with atomic_path(out / METRICS) as temporary:
         temporary.write_text(json.dumps(metrics, indent=2) + "\n")
@@ -512,7 +512,7 @@ def write_for_viewers(
 ) -> tuple[Quality, Gaussians]:
     """Write the Gaussians for other viewers; how these show the test views, and the Gaussians.
 
-    trainer: is retired by it, and goes on rendering what it has fitted; gaussians: that.
+    trainer: is released by it, and goes on rendering what it has fitted; gaussians: that.
     """
     from drgs.training.viewers import for_viewers, num_iterations
 

@@ -67,8 +67,8 @@ PLACE = "splats: to_world"
 
 
 @dataclass(frozen=True)
-class LastBackward:
-    """What a backward pass knows of the splats on the film and ``mi.render`` cannot return.
+class BackwardResult:
+    """Results of a backward pass that ``mi.render`` cannot return; N Gaussians.
 
     Dr.Jit traverses it with the integrator and resolves annotations, whatever variant is active.
     """
@@ -76,6 +76,17 @@ class LastBackward:
     means2d_grad: Any  # TensorXf (N, 2): derivative of the loss, per px on the film
     visible: Any  # Bool (N,): the Gaussian's extent touches the film
     first_fault: Any  # UInt32 (1,): of the gradients, for rendering.decode_fault
+    frames: list[rendering.Frame]  # of the last view; none once a parameter has changed
+
+    def weighted_sums(self, plane: Any) -> Any:
+        """Return the sum over pixels of each Gaussian's weight times ``plane``: Float (N,).
+
+        plane: Float (H * W,). The weight is alpha times transmittance, as composited; its mean over
+        samples, and over the times at which the shutter was open. To be called before a parameter
+        changes.
+        """
+        sums = [rendering.weighted_sums(frame, plane) for frame in self.frames]
+        return sum(sums[1:], sums[0]) / sum(frame.bins.grid.samples for frame in self.frames)
 
 
 class SplatsIntegrator(mi.CppADIntegrator):
@@ -305,8 +316,8 @@ class SplatsIntegrator(mi.CppADIntegrator):
     As with Mitsuba's other integrators, a backward pass differentiates the scene as it is then:
     a parameter that was changed after ``mi.render()`` is differentiated at its new value. After
     the pass, the attribute ``last`` holds the derivatives with respect to the splats' positions
-    on the film, which of them were visible, and the first Gaussian whose derivatives are not
-    finite, if there is one. The attribute ``sh_degree`` may be changed from
+    on the film, which of them were visible, the first Gaussian whose derivatives are not finite,
+    if there is one, and how much each was seen of. The attribute ``sh_degree`` may be changed from
     one rendering to the next.
 
     .. note:: Not differentiated: visibility, the order of the splats, the cut-offs of alpha and
@@ -376,8 +387,8 @@ class SplatsIntegrator(mi.CppADIntegrator):
         refuse_unknown(props, KNOWN)
         self._check_columns()
 
-        self.last: LastBackward | None = None
-        self.source: rendering.Source | None = None  # of the splats; None: they are projected here
+        self.last: BackwardResult | None = None
+        self._projection: rendering.ProjectionStage = rendering.Projected()
         self.memory = Memory()
         self._lock = threading.RLock()  # of the memory, and of what a picture leaves in the film
         self._last_sensor: mi.Sensor | None = None  # that was rendered
@@ -421,7 +432,7 @@ class SplatsIntegrator(mi.CppADIntegrator):
         is what ``SceneParameters.set_dirty`` announces.
         """
         if keys != ["background"]:
-            self.memory.rendered.clear()
+            self.forget_frames()
             self._gathered = None
         if not self._has_own:
             return
@@ -435,6 +446,12 @@ class SplatsIntegrator(mi.CppADIntegrator):
         others = self._scene_has_shapes or self._is_object or self.objects
         if not (self._sh_degree_is_given or others):
             check_degree(self.sh_degree, self._own)
+
+    def forget_frames(self) -> None:
+        """Render the next image anew, also if no parameter has changed."""
+        self.memory.rendered.clear()
+        if self.last is not None:
+            self.last = replace(self.last, frames=[])
 
     def become_object(self, name: str) -> None:
         """Leave rendering to the integrator that this one is nested in.
@@ -582,7 +599,11 @@ class SplatsIntegrator(mi.CppADIntegrator):
         pipeline = pipeline_of(self.approximations, self.sh_degree, features=features)
         if self._gathered is not None and self._gathered.gaussians.smoothing is not None:
             pipeline = replace(pipeline, of_smoothing=True)  # which grows with an object
-        return pipeline if self.source is None else replace(pipeline, source=self.source)
+        return replace(pipeline, source=self._projection)
+
+    def use_projection(self, stage: rendering.ProjectionStage) -> None:
+        """Project the Gaussians by another stage, such as one that several processes share."""
+        self._projection = stage
 
     def aov_names(self) -> list[str]:
         """Of the channels besides colour and alpha."""
@@ -660,7 +681,7 @@ class SplatsIntegrator(mi.CppADIntegrator):
         """Accumulate the derivatives of the loss into the attached parameters.
 
         grad_in: derivative of the loss with respect to the developed image. Leaves
-        :class:`LastBackward` in ``self.last``.
+        :class:`BackwardResult` in ``self.last``.
         """
         _refuse_recording()
         sensor = _resolve_sensor(scene, sensor)
@@ -668,10 +689,11 @@ class SplatsIntegrator(mi.CppADIntegrator):
         with self._lock, dr.suspend_grad():
             self._gather(scene)
             gradients = Picture.of(self, scene, sensor, seed, spp).backward(params, grad_in)
-            self.last = LastBackward(
+            self.last = BackwardResult(
                 means2d_grad=_rows(gradients.means2d),
                 visible=gradients.visible,
                 first_fault=gradients.first_fault,
+                frames=[f for of_time in self.memory.rendered[0].frames for f in of_time],
             )
             if gradients.parameters is not None:
                 with dr.resume_grad():

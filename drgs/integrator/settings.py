@@ -14,7 +14,7 @@ import mitsuba as mi
 from drgs.config.approximations import Approximations
 from drgs.gaussians.parameters import Gaussians
 from drgs.integrator.cache import Memory
-from drgs.splatting.rendering import Pipeline, Source
+from drgs.splatting.rendering import Pipeline
 
 
 class SplatsSettings(Protocol):
@@ -37,7 +37,6 @@ class SplatsSettings(Protocol):
     unseen: str  # what rays meet that probes do not see
     shadows: Sequence[str]  # ids of the shapes that cast some on splats
     exposure: float  # factor of the splats' radiance, where surfaces see it
-    source: Source | None  # of the splats; None: the Gaussians, projected
     memory: Memory
 
     @property

@@ -154,7 +154,7 @@ class CenterOrder:
         return composite_tangent(bins, records, layers, tangents)
 
 
-class Source(Protocol):
+class ProjectionStage(Protocol):
     """Where the splats of a frame come from, and where their derivatives go."""
 
     def footprints(self, gaussians: Gaussians, camera: Camera, pipeline: Pipeline) -> Footprints:
@@ -202,7 +202,7 @@ class Pipeline:
     low_pass: float = LOW_PASS  # px^2
     model: ImageModel = DEFAULT
     order: Order = CenterOrder()
-    source: Source = Projected()
+    source: ProjectionStage = Projected()
     of_smoothing: bool = False  # whether derivatives include those of a smoothing filter
 
     def differentiated(self, rows: GaussianRows) -> GaussianRows:

@@ -325,12 +325,12 @@ class Deadline:
         """Whether there is time for another iteration; revises the trainer's configuration."""
         now, done = time.perf_counter(), trainer.iteration
         if now >= self._end and done > 0:
-            trainer.replan(done, trainer.config.densify.stop)
+            trainer.reschedule(done, trainer.config.densify.stop)
             return False
         if now >= self._next and done > 0:
             self._next = now + REVISED_EVERY * (self._end - self._start)
             total = self.total(trainer)
-            trainer.replan(total, self._densify_stop(trainer, total))
+            trainer.reschedule(total, self._densify_stop(trainer, total))
         return True
 
     def total(self, trainer: Trainer) -> int:

@@ -41,7 +41,7 @@ def measurement_is_due(rows: Sequence[HistoryRow], iterations: int) -> bool:
 def measure(trainer: Trainer, history: History, views: tuple[View, ...]) -> None:
     """Add the mean PSNR of ``views`` to the last row of ``history``, which is of this moment."""
     start = time.perf_counter()
-    trainer.show()
-    pairs = zip(trainer.pictures(views), views, strict=True)
+    trainer.sync_scene()
+    pairs = zip(trainer.images(views), views, strict=True)
     mean = np.mean([psnr(image, view.image, view.mask) for image, view in pairs])
     history.add_test_psnr(float(mean), time.perf_counter() - start)

@@ -106,31 +106,3 @@ def _make_target(view: View, config: FitConfig, effects: Sequence[TrainingEffect
 
 def _counted(view: View) -> float:
     return 1.0 if view.mask is None else max(float(np.asarray(view.mask).mean()), 1e-10)
-
-
-def step_of(iteration: int, views_per_step: int, iterations: int) -> range:
-    """The iterations of the step that this one is part of; iterations: of the fit.
-
-    The last step of a fit may have fewer views than others.
-    """
-    first = (iteration - 1) // views_per_step * views_per_step + 1
-    end = first + views_per_step
-    if iteration > iterations:  # somebody goes on with a fit that is done
-        return range(max(first, iterations + 1), end)
-    return range(first, min(end, iterations + 1))
-
-
-def view_of(iteration: int, num_views: int, seed: int, views_per_step: int = 1) -> int:
-    """Which view an iteration trains on: every round visits all views in an order of its own.
-
-    With B views a step, the b-th iteration of each step draws from the views b, b + B, ... alone,
-    in rounds of these: who computes it needs no other photographs.
-
-    A function of its arguments alone, so that a fit can be resumed at any iteration.
-    """
-    which_step, place = divmod(iteration - 1, views_per_step)
-    own = range(place % num_views, num_views, views_per_step)
-    which_round, position = divmod(which_step, len(own))
-    key = [seed, which_round, place] if views_per_step > 1 else [seed, which_round]
-    order = np.random.default_rng(key).permutation(len(own))
-    return own[int(order[position])]

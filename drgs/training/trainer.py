@@ -1,17 +1,17 @@
 """The training loop: photographs in, Gaussians out.
 
-Everything between two optimizer steps is visible in :meth:`Trainer.step`. The picture and its
-gradients come from ``mi.render`` with the ``splats`` integrator, the steps from ``drjit.opt.Adam``,
-changes of the population from a strategy of ``drgs.training.density``.
+Everything between two optimizer steps is visible in :meth:`Trainer.step`, which reads as Mitsuba's
+tutorials do: ``mi.render`` with the ``splats`` integrator, ``dr.backward``, ``drjit.opt.Adam``.
+Changes of the population come from a strategy of ``drgs.training.density``. All processes of a fit
+run the same loop; a communicator tells a process which views and which Gaussians are its own.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 import mitsuba as mi
@@ -24,98 +24,94 @@ from drgs.datasets.types import Dataset, View
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 from drgs.initialization.defaults import completed
 from drgs.integrator.scene import make_scene, render_views
-from drgs.integrator.weights import weighted_sums_of_last
-from drgs.splatting.rendering import SeenSplats, sum_of_views
-from drgs.training.deferred import VIEWS_AT_ONCE, Deferred
+from drgs.splatting.rendering import NO_FAULT
 from drgs.training.density.called_for import density_strategy
-from drgs.training.density.strategy import DensityReport, DensityStrategy, Population, SeenStep
+from drgs.training.density.strategy import DensityReport, DensityStrategy, StepInfo
+from drgs.training.effects.base import FitState
 from drgs.training.effects.called_for import integrator_settings, training_effects
 from drgs.training.finite_checks import GradientWatch, check_values, check_view_values
-from drgs.training.losses import PhotometricLoss, Target
-from drgs.training.memory import ALONE, Share, room_for_targets
+from drgs.training.gradients import ViewGradients, ViewLoss, WholeGradients
+from drgs.training.losses import PhotometricLoss
+from drgs.training.memory import Share, room_for_targets
 from drgs.training.optimizer import (
     make_optimizer,
     optimizer_state,
     pending_gradients,
     restore_optimizer,
 )
-from drgs.training.rates import learning_rates, rates_over_time, revised_aims, revised_stops
-from drgs.training.stages import (
-    KEPT_BYTES,
-    Stage,
-    bytes_on_device,
-    make_stages,
-    step_of,
-    view_of,
+from drgs.training.parallel.communicator import Communicator
+from drgs.training.parallel.population import (
+    check_can_be_shared,
+    local_gaussians,
+    make_population,
 )
+from drgs.training.rates import learning_rates, rates_over_time, revised_aims, revised_stops
+from drgs.training.stages import KEPT_BYTES, bytes_on_device, make_stages
 from drgs.training.state_checks import DENSITY
+from drgs.training.steps import Step, StepView, plan_step
 from drgs.training.views import TrainingView
 
+if TYPE_CHECKING:  # imported for steps of several views
+    from drgs.training.parallel.exchange import ViewExchange
+
 PREFIX = "integrator."
-"""What precedes a parameter's name when the scene is traversed."""
-
-
-@dataclass(frozen=True)
-class SeenView:
-    """What an iteration found of its view."""
-
-    loss: Any  # Float, one entry
-    squared_error: Any  # Float, one entry: mean over pixels and channels
-    counted: float  # share of the pixels that count
-
-
-@dataclass(frozen=True)
-class Waiting:
-    """A view whose derivatives are to be taken from its splats to the Gaussians."""
-
-    iteration: int
-    loss: Any  # Float, one entry
-    seen: Sequence[SeenSplats]  # by time; none: its derivatives have been added
-    first_fault: Any  # UInt32, one entry; of a view whose derivatives have been added
+"""Precedes a parameter's name when the scene is traversed."""
 
 
 @dataclass(frozen=True)
 class StepReport:
-    """What a step did; numbers that cost a wait for the device are read on demand."""
+    """The results of a step; numbers that cost a wait for the device are read on demand."""
 
     iteration: int  # the last one
     num_gaussians: int
     means_lr: float
-    density: DensityReport | None  # None: rows are what they were
-    seen: tuple[SeenView, ...]  # by iteration
+    density: DensityReport | None  # None: rows have not changed
+    views: tuple[ViewLoss, ...]  # by iteration
 
     @property
     def loss(self) -> float:
         """The mean loss of the step's views."""
-        return float(np.mean([float(view.loss[0]) for view in self.seen]))
+        return float(np.mean([float(view.loss[0]) for view in self.views]))
 
     @property
     def psnr(self) -> float:
         """dB, the mean of the step's views, before the step."""
-        errors = [float(view.squared_error[0]) / view.counted for view in self.seen]
+        errors = [float(view.squared_error[0]) / view.counted for view in self.views]
         return float(np.mean([-10 * math.log10(max(error, 1e-10)) for error in errors]))
 
     def passes(self, every: int) -> bool:
-        """Whether an iteration of this step is a multiple of ``every``."""
-        return self.iteration % every < len(self.seen)
+        """Return whether an iteration of this step is a multiple of ``every``."""
+        return self.iteration % every < len(self.views)
 
 
 class Trainer:
     """Fits ``gaussians`` to the training views of ``dataset``."""
 
-    def __init__(self, config: FitConfig, dataset: Dataset, gaussians: Gaussians) -> None:
+    def __init__(
+        self,
+        config: FitConfig,
+        dataset: Dataset,
+        gaussians: Gaussians,
+        comm: Communicator | None = None,
+    ) -> None:
+        """gaussians: all of them, on each process; comm: the processes; None: this one."""
         config = completed(config, dataset)
         self.config, self.dataset, self.extent = config, dataset, dataset.extent
+        self.comm = comm = comm or Communicator()
+        check_can_be_shared(config, comm.size, gaussians.num_gaussians)
         self.effects = training_effects(config, dataset)
-        room = self._room(gaussians)
-        settings = integrator_settings(self.effects)
-        self.scene = make_scene(gaussians, config.model, dataset.background, **settings)
+        room = comm.collective(lambda: self._room_for_targets(gaussians))
+        self.scene = make_scene(
+            local_gaussians(gaussians, comm),
+            config.model,
+            dataset.background,
+            **integrator_settings(self.effects),
+        )
         self.integrator = self.scene.integrator()
         self.params = mi.traverse(self.scene)
         self.params.keep([PREFIX + name for name in PARAMETER_NAMES])
-        initial = {key.removeprefix(PREFIX): value for key, value in self.params.items()}
         self.optimizer = make_optimizer(
-            initial,
+            {key.removeprefix(PREFIX): value for key, value in self.params.items()},
             learning_rates(config.optimizer, self.extent),
             prefix=PREFIX,
             beta_1=config.optimizer.beta_1**config.optimizer.views_per_step,
@@ -126,113 +122,97 @@ class Trainer:
         self.loss = PhotometricLoss(config.loss.dssim_weight)
         self.white_background = tuple(dataset.background) == (1.0, 1.0, 1.0)
         self.stages = make_stages(dataset.train, config, self.effects, room)
-        self.population = self._population()
+        self.gradients = self._make_gradients()
+        population = self.optimizer, PREFIX, self.extent, config.seed
+        self.population = make_population(*population, comm, gaussians.num_gaussians)
         self.density = self._density_from({})
-        self._not_gathered: SeenStep | None = None
         self.watch = GradientWatch()
-        self.iteration = 0
+        self.iteration = 0  # the last one that is done
+        self._gathered: tuple[int, mi.Scene | None] | None = None  # see full_scene
 
-    def _room(self, gaussians: Gaussians, share: Share = ALONE) -> int:
-        """Bytes of targets that may stay on the device."""
-        of_pixel, most = bytes_on_device(self.effects), KEPT_BYTES
-        return room_for_targets(self.config, self.dataset, gaussians, of_pixel, most, share)
+    def _room_for_targets(self, gaussians: Gaussians) -> int:
+        """Return the number of bytes of targets that may stay on the device."""
+        share = Share(self.comm.size, self.comm.num_on_machine)
+        limits = bytes_on_device(self.effects), KEPT_BYTES
+        return room_for_targets(self.config, self.dataset, gaussians, *limits, share)
 
-    def _population(self) -> Population:
-        return Population(self.optimizer, PREFIX, self.extent, self.config.seed)
+    def _make_gradients(self) -> WholeGradients | ViewExchange:
+        """Return what collects the gradients of a step's views."""
+        views_per_step = self.config.optimizer.views_per_step
+        if views_per_step == 1:
+            return WholeGradients(self.integrator)
+        from drgs.training.parallel.exchange import ViewExchange
+
+        return ViewExchange(self.comm, self.integrator, self.params, PREFIX, views_per_step)
+
+    # ------------------------------------------------------------------------------------------
+    # A step
+    # ------------------------------------------------------------------------------------------
 
     def step(self) -> StepReport:
-        """An iteration for each view of a step, the step, now and then a change of the rows.
+        """Render the views of a step, and change the Gaussians along their mean gradient.
 
-        An iteration renders one view. Of several views of a step (``views_per_step``), all see the
-        same Gaussians, and the optimizer steps along their mean gradient.
+        An iteration renders one view. All views of a step (``views_per_step``) see the same
+        Gaussians. With several processes, each renders some of the views.
         """
-        iterations = self._begin()
-        seen = self._differentiate(iterations)
-        if self.ends_step:
-            self._set_rates()
-            self.optimizer.step()
-        self._end_views(iterations)
-        self._gather()
-        report = self._control_density()
-        for iteration in self._own(iterations):
-            self.stage.seen(self.view_at(iteration))
-        return StepReport(
-            iteration=self.iteration,
-            num_gaussians=self.num_gaussians,
-            means_lr=self.means_lr,
-            density=report,
-            seen=tuple(seen),
-        )
-
-    def _begin(self) -> range:
-        """Prepare a step, and return its iterations."""
-        former, iterations = self.stage, self._step_of(self.iteration + 1)
-        self.iteration = iterations[0]
-        if self.stage is not former:
-            former.end()
-        self.integrator.sh_degree = self.sh_degree
-        self.params.update(self.optimizer)
-        for effect in self.effects:
-            effect.begin(self)
-        return iterations
-
-    def _own(self, iterations: range) -> Sequence[int]:
-        """Those whose views are rendered here: all of them, unless there are other processes."""
-        return iterations
-
-    def _differentiate(self, iterations: range) -> list[SeenView]:
-        """Add up the derivatives of the mean loss of a step's views; ends at the last iteration."""
-        seen, waiting = [], []
-        penalties = self._go_back_penalties(len(iterations))
-        for iteration in iterations:
-            self._gather()  # of the view before, whose frames make room
-            self.iteration, view = iteration, self.view_at(iteration)
+        step = self._begin_step()
+        penalties = self._differentiate_penalties(step)
+        losses: dict[int, ViewLoss] = {}
+        for view in self.gradients.own_views():
+            fit = self._fit_state(step, view.iteration)
             for effect in self.effects:
-                effect.before(self, view)
-            self.integrator.source = source = Deferred()
-            image, loss, error = self.compared(self._rendered(view), view)
-            self._backward(loss)
-            self.integrator.source = None
-            image, loss = dr.detach(image), dr.detach(sum(penalties, loss))
-            if self.density.gathers(iteration):
-                self._not_gathered = self._seen_step(image, view.target)
-            seen.append(SeenView(loss, error, view.counted))
-            last = self.integrator.last
-            waiting.append(Waiting(iteration, loss, source.taken(), last.first_fault))
-            if len(waiting) == VIEWS_AT_ONCE or iteration == iterations[-1]:
-                self._add(waiting)
-                waiting.clear()
-        return seen
+                effect.before(fit, view.view)
+            image = mi.render(self.scene, self.params, sensor=view.view.sensor, spp=1)
+            image, loss, error = self.compare(image, view.view)
+            dr.backward(loss / step.num_averaged if step.num_averaged > 1 else loss)
+            losses[view.place] = ViewLoss(dr.detach(loss), error, view.view.counted)
+            self.gradients.end_view(self._pixel_weights(view, dr.detach(image)))
+        views = self._end_views(step, losses, penalties)
+        if step.is_update:
+            self._set_learning_rates(step)
+            self.optimizer.step()
+        self._update_effects(step)
+        report = self._control_density(step)
+        for place in losses:
+            step.stage.seen(step.views[place].view)
+        means_lr = self.rates.means(step.last)
+        return StepReport(step.last, self.num_gaussians, means_lr, report, tuple(views))
 
-    def _go_back_penalties(self, count: int) -> list[Any]:
-        """Terms of the strategy of density; their derivatives are added for so many views."""
-        terms = list(self.density.penalties(self.parameters, self.num_gaussians))
+    def _begin_step(self) -> Step:
+        """Plan the next step, and bring the scene to where the optimizer is."""
+        before, step = self.plan(self.iteration), self.plan(self.iteration + 1)
+        if step.stage is not before.stage:
+            before.stage.end()
+        self.iteration = step.last
+        self.integrator.sh_degree = self.sh_degree_at(step.iterations[0])
+        self.params.update(self.optimizer)
+        fit = self._fit_state(step, step.iterations[0])
+        for effect in self.effects:
+            effect.begin(fit)
+        self.gradients.begin(step.views, lambda view: self._place(fit, view))
+        return step
+
+    def _place(self, fit: FitState, view: StepView) -> None:
+        """Put the sensor of a view that another process renders where effects have it."""
+        for effect in self.effects:
+            if effect.moves_sensors:
+                effect.before(fit, view.view)
+
+    def _differentiate_penalties(self, step: Step) -> list[Any]:
+        """Add the derivatives of the strategy's terms of the loss; return the terms."""
+
+        def penalties(parameters: Mapping[str, Any]) -> list[Any]:
+            return list(self.density.penalties(parameters, self.num_gaussians))
+
+        terms = penalties(self.parameters)
         if terms:
-            weight = self.num_averaged / count
+            weight = step.num_averaged / len(step.iterations)
             total = sum(terms[1:], terms[0])
             dr.backward(total / weight if weight > 1 else total)
-        return [dr.detach(term) for term in terms]
+        return self.population.terms_of_all(terms, penalties)
 
-    def _add(self, waiting: Sequence[Waiting]) -> None:
-        """Add the derivatives of some views to those of the step."""
-        deferred = [view for view in waiting if view.seen]
-        faults = {view.iteration: view.first_fault for view in waiting}
-        if deferred:
-            with dr.suspend_grad():
-                gaussians = dr.detach(self.integrator.gaussians)
-                total, found = sum_of_views(gaussians, [view.seen for view in deferred])
-                with dr.resume_grad():
-                    self.integrator.accumulate(self.scene, total)
-            faults |= {view.iteration: f for view, f in zip(deferred, found, strict=True)}
-        for view in waiting:
-            self._watch(view.iteration, view.loss, faults[view.iteration])
-
-    def _rendered(self, view: TrainingView) -> Any:
-        """The Gaussians as the view's sensor sees them, with derivatives."""
-        return mi.render(self.scene, self.params, sensor=view.sensor, spp=1)
-
-    def compared(self, image: Any, view: TrainingView) -> tuple[Any, Any, Any]:
-        """What a rendering is as a photograph of the view would be, its loss and squared error."""
+    def compare(self, image: Any, view: TrainingView) -> tuple[Any, Any, Any]:
+        """Return the image as a photograph of the view would be, its loss and squared error."""
         for effect in self.effects:
             image = effect.adjust(image, view)
         loss, error = self.loss.with_squared_error(image, view.target)
@@ -241,146 +221,223 @@ class Trainer:
                 loss = loss + penalty
         return image, loss, error
 
-    def _gather(self) -> None:
-        """Tell the strategy of density what was seen last, if it asks and was not told."""
-        step, self._not_gathered = self._not_gathered, None
-        if step is not None:
-            self.density.gather(step)
+    def _pixel_weights(self, view: StepView, image: Any) -> dict[str, Any]:
+        """Return the planes by which the strategy weighs what it sees of Gaussians; by name."""
+        if not self.density.needs_statistics(view.iteration):
+            return {}
+        weights = self.density.pixel_weights(view.iteration)
+        return {name: weigh(image, view.view.target.image) for name, weigh in weights.items()}
 
-    def _end_views(self, iterations: range) -> None:
-        """Let effects take the steps of their own."""
-        for view in map(self.view_at, iterations):
+    def _end_views(
+        self, step: Step, losses: Mapping[int, ViewLoss], penalties: Sequence[Any]
+    ) -> list[ViewLoss]:
+        """Complete the gradients of all views, and tell the strategy of density about them."""
+        density = self.density
+        needed = [density.needs_statistics(i) for i in step.iterations]
+        names = [
+            tuple(density.pixel_weights(i)) if need else ()
+            for i, need in zip(step.iterations, needed, strict=True)
+        ]
+        found = self.gradients.finish(names)
+        shared = self.gradients.share_losses(losses)
+        results = []
+        for view, gradients, loss, need in zip(step.views, found, shared, needed, strict=True):
+            total = sum(penalties, loss.loss)
+            self._watch(view, total, gradients.first_fault)
+            results.append(replace(loss, loss=total))
+            if need:
+                density.update_statistics(_step_info(step, view, gradients))
+        return results
+
+    def _watch(self, view: StepView, loss: Any, first_fault: Any) -> None:
+        """Remember what may not be finite: see :class:`GradientWatch`."""
+        effects = self.effects
+        numbers = {f"{e.name}.{k}": v for e in effects for k, v in e.numbers_of(view.view).items()}
+        if first := self.population.first_row * len(PARAMETER_NAMES):
+            first = dr.opaque(mi.UInt32, first)
+            first_fault = dr.select(first_fault == NO_FAULT, first_fault, first_fault + first)
+        self.watch.add(view.iteration, view.view.name, loss, first_fault, numbers)
+
+    def _set_learning_rates(self, step: Step) -> None:
+        """Set the rates of a step, times the factors of the strategy."""
+        rates, initial = self.rates(step.last), self.rates.others
+        for name, factor in self.density.rate_factors(step.last).items():
+            rates[name] = factor * (rates[name] if name in rates else initial[name])
+        state = self.optimizer.state  # shN is not in it, where the degree is 0
+        rates = {PREFIX + name: rate for name, rate in rates.items() if PREFIX + name in state}
+        self.optimizer.set_learning_rate(rates)
+
+    def _update_effects(self, step: Step) -> None:
+        """Let effects take their own steps."""
+        fit = self._fit_state(step, step.last)
+        for view in step.views:
             for effect in self.effects:
-                derivatives = {name: dr.grad(v) for name, v in effect.leaves(view).items()}
-                effect.after(self, view, derivatives)
+                derivatives = {
+                    name: self.gradients.share(view, dr.grad(leaf))
+                    for name, leaf in effect.leaves(view.view).items()
+                }
+                effect.after(fit, view.view, derivatives)
 
-    def _backward(self, loss: Any) -> None:
-        """Add the derivatives of a view's part of the mean."""
-        dr.backward(loss / self.num_averaged if self.num_averaged > 1 else loss)
+    def _control_density(self, step: Step) -> DensityReport | None:
+        """Let the strategy change the rows; returns the last report of a step."""
+        density, report = self.density, None
+        if step.is_update:
+            density.perturb(self.population, step.last, self.rates.means(step.last))
+        for iteration in filter(density.is_due, step.iterations):
+            self.check()
+            found = density.refine(self.population, iteration)
+            if found is not None:
+                report = found
+                for effect in self.effects:
+                    effect.repopulated(self._fit_state(step, iteration))
+                # Freed arrays of sizes that will not come again would stay with Dr.Jit's allocator.
+                dr.flush_malloc_cache()
+        return report
 
-    def _watch(self, iteration: int, loss: Any, first_fault: Any) -> None:
-        """Write down what may not be finite; see :class:`GradientWatch`."""
-        view = self.view_at(iteration)
-        numbers = {f"{e.name}.{k}": v for e in self.effects for k, v in e.numbers_of(view).items()}
-        self.watch.add(iteration, view.name, loss, first_fault, numbers)
+    def plan(self, iteration: int) -> Step:
+        """Return the step that an iteration is part of."""
+        return plan_step(iteration, self.config, self.rates, self.stages)
 
-    def _seen_step(self, image: Any, target: Target) -> SeenStep:
-        """For the strategy of density; image: (H, W, 3), as compared."""
-        last, (height, width, _) = self.integrator.last, image.shape
-        # Of the view alone: what was averaged is a part of it.
-        count, of_mean = self.num_averaged, last.means2d_grad
-        gradients = of_mean * count if count > 1 else of_mean, last.visible
-        weigh = partial(weighted_sums_of_last, self.integrator)
-        return SeenStep(self.iteration, width, height, *gradients, image, target.image, weigh)
+    def _fit_state(self, step: Step, iteration: int) -> FitState:
+        """Return what effects may know."""
+        return FitState(
+            iteration=iteration,
+            iterations_of_step=step.iterations,
+            begins_stage=step.begins_stage,
+            rate_decay=self.rates.means(iteration) / self.rates.means.initial,
+            integrator=self.integrator,
+            means=self.optimizer[PREFIX + "means"],
+            views=step.stage.views,
+            effects=self.effects,
+        )
 
-    @property
-    def stage(self) -> Stage:
-        """Pictures of the size in use, which is that of the first iteration of a step."""
-        return next(stage for stage in self.stages if self._first <= stage.until)
-
-    @property
-    def views(self) -> list[TrainingView]:
-        """The training views, at the size in use."""
-        return self.stage.views
-
-    @property
-    def begins_stage(self) -> bool:
-        """Whether the pictures have other sizes than in the step before."""
-        before = self._first - self.config.optimizer.views_per_step
-        return any(before <= stage.until < self._first for stage in self.stages)
-
-    @property
-    def rate_decay(self) -> float:
-        """What the means' learning rate has fallen to, relative to where it began."""
-        return self.means_lr / self.rates.means.initial
-
-    @property
-    def means_lr(self) -> float:
-        """The means' learning rate of this iteration, world units."""
-        return self.rates.means(self.iteration)
-
-    @property
-    def num_averaged(self) -> int:
-        """How many iterations' gradients are averaged for a step of the optimizer."""
-        return max(self._late_views, len(self.iterations_of_step))
-
-    @property
-    def ends_step(self) -> bool:
-        """Whether the gradient is that of all iterations of a step of the optimizer."""
-        late = self._late_views
-        is_whole = late <= self.config.optimizer.views_per_step
-        return is_whole or self.iteration % late == 0
-
-    @property
-    def _late_views(self) -> int:
-        """Iterations of a step late in the fit, see ``optimizer.views``; 1: it is not late."""
-        config = self.config
-        is_late = self.rates.means.progress(self._first) > config.optimizer.views_from
-        is_settled = self._first >= config.densify.settled_from(config.iterations)
-        return config.optimizer.views if is_late and is_settled else 1
-
-    @property
-    def iterations_of_step(self) -> range:
-        """Those of the step that is under way, or was the last."""
-        return self._step_of(self.iteration)
-
-    @property
-    def _first(self) -> int:
-        return self.iterations_of_step.start
-
-    def _step_of(self, iteration: int) -> range:
-        """The iterations of its step."""
-        return step_of(iteration, self.config.optimizer.views_per_step, self.config.iterations)
-
-    def place_all(self) -> None:
-        """Put all sensors where effects have them now, without derivatives."""
-        for effect in self.effects:
-            for view in self.views:
-                effect.place(view)
-
-    @property
-    def view(self) -> TrainingView:
-        """What this iteration trains on."""
-        return self.view_at(self.iteration)
-
-    def view_at(self, iteration: int) -> TrainingView:
-        """What an iteration of the stage in use trains on."""
-        config, count = self.config, len(self.views)
-        views_per_step = config.optimizer.views_per_step
-        return self.views[view_of(iteration, count, config.seed, views_per_step)]
+    # ------------------------------------------------------------------------------------------
+    # What it has fitted
+    # ------------------------------------------------------------------------------------------
 
     @property
     def parameters(self) -> dict[str, Any]:
-        """Raw values by name, as the optimizer has them."""
+        """Raw values by name, as the optimizer has them: the rows of this process."""
         return {key.removeprefix(PREFIX): value for key, value in self.optimizer.items()}
-
-    @property
-    def means(self) -> Any:
-        """The means at the moment, (N, 3)."""
-        return self.optimizer[PREFIX + "means"]
-
-    @property
-    def sh_degree(self) -> int:
-        """The degree in use: one more every ``model.sh_increase_every`` iterations."""
-        model = self.config.model
-        return min(model.sh_degree, self.iteration // model.sh_increase_every)
 
     @property
     def num_gaussians(self) -> int:
         """N at the moment."""
-        return self.means.shape[0]
+        return self.population.num_rows
 
-    def replan(self, iterations: int, densify_stop: int) -> None:
-        """End the fit, and changes of the population, at another iteration; only what is ahead.
+    @property
+    def views(self) -> list[TrainingView]:
+        """The training views, at the image size that is in use."""
+        return self.plan(self.iteration).stage.views
 
-        What was done is what a fit does whose configuration is, from the start, as this one is now.
+    @property
+    def means_lr(self) -> float:
+        """The means' learning rate of the last iteration, world units."""
+        return self.rates.means(self.iteration)
+
+    @property
+    def sh_degree(self) -> int:
+        """The degree in use."""
+        return self.sh_degree_at(self.iteration)
+
+    def sh_degree_at(self, iteration: int) -> int:
+        """Return the degree of an iteration: one more every ``model.sh_increase_every``."""
+        model = self.config.model
+        return min(model.sh_degree, iteration // model.sh_increase_every)
+
+    def gaussians(self) -> Gaussians:
+        """Return all Gaussians as numpy arrays; on other ranks than 0, those of the rank."""
+        self.check()
+        self.sync_scene()
+        own = replace(dr.detach(self.integrator.gaussians).numpy(), origin=self.dataset.origin)
+        return self.population.gather_gaussians(own)
+
+    def sync_scene(self) -> None:
+        """Bring the scene to where the fit is; the coming iterations do not depend on it."""
+        self.params.update(self.optimizer)
+        fit = self._fit_state(self.plan(self.iteration), self.iteration)
+        for effect in self.effects:
+            effect.finish(fit)
+
+    def full_scene(self) -> mi.Scene | None:
+        """Return a scene of all Gaussians, as synchronised last; None on other ranks than 0."""
+        if self.comm.size == 1:
+            return self.scene
+        if self._gathered is None or self._gathered[0] != self.iteration:
+            gaussians, scene = self.gaussians(), None
+            if self.comm.is_root:
+                scene = make_scene(gaussians, self.config.model, self.dataset.background)
+                scene.integrator().sh_degree = self.integrator.sh_degree
+            self._gathered = self.iteration, scene
+        return self._gathered[1]
+
+    def images(self, views: tuple[View, ...]) -> Iterator[np.ndarray]:
+        """Yield images (H, W, 3) of views that were not trained on, display space, in [0, 1]."""
+        for effect in self.effects:
+            views = effect.measured(views)
+        return render_views(self.full_scene(), views)
+
+    def sensors(self) -> list[mi.Sensor]:
+        """Return the sensors of the training views, where effects have them now."""
+        return self._fit_state(self.plan(self.iteration), self.iteration).sensors()
+
+    def check_iterations(self) -> None:
+        """Raise ``NonFiniteError`` if a loss or a gradient of an iteration so far is not finite.
+
+        Waits for the device; all processes raise the same.
+        """
+        self.comm.collective(self.watch.check)
+
+    def check(self) -> None:
+        """Raise ``NonFiniteError`` if a loss, a gradient or a value is not; waits for the device.
+
+        Called before anything that saves, returns or edits the state.
+        """
+        self.comm.collective(self._check_own)
+
+    def _check_own(self) -> None:
+        self.watch.check()
+        first_row = self.population.first_row
+        check_values(self.iteration, self.parameters, first_row)
+        check_values(self.iteration, self.density.state(), first_row)
+        of_views = {f"{e.name}.{k}": v for e in self.effects for k, v in e.values().items()}
+        check_view_values(self.iteration, of_views, [view.name for view in self.views])
+
+    # ------------------------------------------------------------------------------------------
+    # Other fits, and other times
+    # ------------------------------------------------------------------------------------------
+
+    def spawn(self, config: FitConfig, gaussians: Gaussians) -> Trainer:
+        """Return a trainer with the same photographs; config: of another fit."""
+        return Trainer(config, self.dataset, gaussians, self.comm)
+
+    def warm_start(self, former: Trainer) -> None:
+        """Begin after the iterations of another trainer, with what its effects have found."""
+        before, views_per_step = former.config.iterations, former.config.optimizer.views_per_step
+        self.iteration = -(-before // views_per_step) * views_per_step  # a step begins after it
+        found = {effect.name: effect.state() for effect in former.effects}
+        self._restore_effects({f"{name}/{k}": v for name in found for k, v in found[name].items()})
+
+    def release(self) -> None:
+        """Free what only further iterations need, of which there will be none: targets, moments.
+
+        Its scene still renders what was fitted last.
+        """
+        self.plan(self.iteration).stage.end()
+        self.optimizer.state.clear()
+        release_unused_memory()
+
+    def reschedule(self, iterations: int, densify_stop: int) -> None:
+        """End the fit, and changes of the population, at other iterations that are ahead.
+
+        The fit so far is that of a configuration which, from the start, is as this one is now.
 
         Raises ValueError where it would not be.
         """
         config, now = self.config, self.iteration
         if densify_stop != config.densify.stop and now >= min(densify_stop, config.densify.stop):
             raise ValueError(
-                f"Trainer.replan(): densify.stop cannot change from {config.densify.stop} to "
+                f"Trainer.reschedule(): densify.stop cannot change from {config.densify.stop} to "
                 f"{densify_stop} after iteration {now}"
             )
         aims = revised_aims(config, now, iterations)
@@ -395,140 +452,76 @@ class Trainer:
         self.rates = rates_over_time(self.config, self.extent)
         self.density = self._density_from(self.density.state())
 
-    @property
-    def first_row(self) -> int:
-        """The number of the first Gaussian in the optimizer here."""
-        return 0
-
-    def check_iterations(self) -> None:
-        """Raise ``NonFiniteError`` if a loss or a gradient of an iteration so far is not finite.
-
-        Waits for the device.
-        """
-        self.watch.check()
-
-    def check(self) -> None:
-        """Raise ``NonFiniteError`` if a loss, a gradient or a value is not; waits for the device.
-
-        Called before anything that saves, returns or edits the state.
-        """
-        self.watch.check()
-        check_values(self.iteration, self.parameters, self.first_row)
-        check_values(self.iteration, self.density.state(), self.first_row)
-        of_views = {f"{e.name}.{k}": v for e in self.effects for k, v in e.values().items()}
-        check_view_values(self.iteration, of_views, [view.name for view in self.views])
-
-    def gaussians(self) -> Gaussians:
-        """The Gaussians as numpy arrays."""
-        self.check()
-        self.show()
-        return replace(dr.detach(self.integrator.gaussians).numpy(), origin=self.dataset.origin)
-
-    def show(self) -> None:
-        """Bring the scene to where the fit is; the coming iterations do not depend on it."""
-        self.params.update(self.optimizer)
-        for effect in self.effects:
-            effect.finish(self)
-
-    def another(self, config: FitConfig, gaussians: Gaussians) -> Trainer:
-        """A trainer with the same photographs; config: that of another fit."""
-        return Trainer(config, self.dataset, gaussians)
-
-    def take_over(self, former: Trainer) -> None:
-        """Begin behind the iterations of another trainer, with what its effects have found."""
-        before, views_per_step = former.config.iterations, former.config.optimizer.views_per_step
-        self.iteration = -(-before // views_per_step) * views_per_step  # a step begins behind it
-        found = {effect.name: effect.state() for effect in former.effects}
-        for effect in self.effects:
-            effect.repopulated(self)
-            effect.restore(found[effect.name])
-
-    def retire(self) -> None:
-        """Free what only further iterations need, of which there will be none: targets, moments.
-
-        Its scene still renders what was fitted last.
-        """
-        self.stage.end()
-        self.optimizer.state.clear()
-        release_unused_memory()
-
-    def pictures(self, views: tuple[View, ...]) -> Iterator[np.ndarray]:
-        """Pictures (H, W, 3) of views that were not trained on, display space, in [0, 1]."""
-        for effect in self.effects:
-            views = effect.measured(views)
-        return render_views(self.scene_of_all(), views)
-
-    def scene_of_all(self) -> mi.Scene:
-        """A scene of all Gaussians, as they were shown last: see :meth:`show`."""
-        return self.scene
-
     def state(self) -> dict[str, np.ndarray]:
-        """Everything that the coming iterations depend on, as numpy arrays.
+        """Return everything that the coming iterations depend on, as numpy arrays.
 
-        Random numbers are functions of seed and iteration: they have no state.
+        Random numbers are functions of seed and iteration: they have no state. Arrays of rows are
+        whole on rank 0 alone.
         """
         self.check()
-        return {
+        is_update = self.plan(self.iteration).is_update
+        state = {
             "iteration": np.array(self.iteration),
             **{f"{DENSITY}{name}": values for name, values in self.density.state().items()},
             **optimizer_state(self.optimizer, PREFIX),
-            **({} if self.ends_step else pending_gradients(self.optimizer, PREFIX)),
+            **({} if is_update else pending_gradients(self.optimizer, PREFIX)),
             **{f"{e.name}/{k}": v for e in self.effects for k, v in e.state().items()},
         }
+        return self.population.gather_state(state, self._is_by_row)
 
-    def restore(self, state: dict[str, np.ndarray]) -> None:
-        """Continue where :meth:`state` was taken, to the same bytes."""
+    def restore(self, state: Mapping[str, np.ndarray]) -> None:
+        """Continue where :meth:`state` was called, to the same bytes, on any number of processes.
+
+        state: of rank 0; other ranks may give an empty one.
+        """
+        state = self.population.scatter_state(state, self._is_by_row)
         self.iteration = int(state["iteration"])
         self.integrator.sh_degree = self.sh_degree
         restore_optimizer(self.optimizer, state, PREFIX)
         self.density = self._density_from(_part(state, DENSITY))
-        for effect in self.effects:
-            effect.repopulated(self)
-            effect.restore(_part(state, f"{effect.name}/"))
+        self._restore_effects(state)
         self.watch = GradientWatch()
         self.params.update(self.optimizer)
 
-    def _density_from(self, state: dict[str, np.ndarray]) -> DensityStrategy:
-        """The strategy of the configuration, with its state; empty: at the beginning."""
+    def _restore_effects(self, state: Mapping[str, np.ndarray]) -> None:
+        fit = self._fit_state(self.plan(self.iteration), self.iteration)
+        for effect in self.effects:
+            effect.repopulated(fit)
+            effect.restore(_part(state, f"{effect.name}/"))
+
+    def _is_by_row(self, name: str) -> bool:
+        """Return whether an array of the state has a row for each Gaussian."""
+        others = {f"{effect.name}/{key}" for effect in self.effects for key in effect.by_row}
+        others |= {f"{DENSITY}{key}" for key in self.density.by_row}
+        parameter, _, kind = name.partition(".")
+        return name in others or (parameter in PARAMETER_NAMES and kind != "t")
+
+    def _density_from(self, state: Mapping[str, np.ndarray]) -> DensityStrategy:
+        """Return the strategy of the configuration with its state; empty: at the beginning."""
         density = density_strategy(self.config, self.white_background)
         density.begin(self.population)
         if state:
             density.restore(state)
         return density
 
-    def _set_rates(self) -> None:
-        """Those of this iteration, and what the strategy does to them."""
-        rates = self.rates(self.iteration)
-        at_first = self.rates.others
-        for name, factor in self.density.rate_factors(self.iteration).items():
-            rates[name] = factor * (rates[name] if name in rates else at_first[name])
-        there = self.optimizer.state  # shN is not, where the degree is 0
-        rates = {PREFIX + name: rate for name, rate in rates.items() if PREFIX + name in there}
-        self.optimizer.set_learning_rate(rates)
 
-    def _control_density(self) -> DensityReport | None:
-        """Let the strategy act; of several reports of a step, the last."""
-        density, report = self.density, None
-        if self.ends_step:
-            density.perturb(self.population, self.iteration, self.means_lr)
-        for iteration in filter(density.acts, self.iterations_of_step):
-            self.check()
-            found = density.act(self.population, iteration)
-            if found is not None:
-                report = found
-                for effect in self.effects:
-                    effect.repopulated(self)
-                # Freed arrays of sizes that will not come again would stay with Dr.Jit's allocator.
-                dr.flush_malloc_cache()
-        return report
+def _step_info(step: Step, view: StepView, gradients: ViewGradients) -> StepInfo:
+    """Return what the strategy of density is told about a view."""
+    means2d_grad = gradients.means2d_grad
+    if step.num_averaged > 1:  # it is a part of a mean
+        means2d_grad = means2d_grad * step.num_averaged
+    size = view.view.width, view.view.height
+    found = means2d_grad, gradients.visible, gradients.weighted_sums
+    return StepInfo(view.iteration, *size, *found)
 
 
 def _prune_window(
     config: FitConfig, now: int, iterations: int, densify_stop: int
 ) -> dict[str, int | None]:
-    """Where a last phase of pruning is in a fit of other iterations: where it was, if it has begun.
+    """Return where the last phase of pruning is in a fit of other iterations.
 
-    Else what is given of it keeps its share of the iterations, of those that are ahead.
+    It stays if it has begun. Else what is given of it keeps its share of the iterations that are
+    ahead.
     """
     prune, names = config.densify.prune, ("densify.prune.start", "densify.prune.stop")
     window = config.densify.prune_window(config.iterations)
@@ -545,6 +538,6 @@ def _prune_window(
     return dict(zip(names, (start, stop), strict=True))
 
 
-def _part(state: dict[str, np.ndarray], prefix: str) -> dict[str, np.ndarray]:
-    """What of a state belongs to somebody whose names begin so, without that beginning."""
+def _part(state: Mapping[str, np.ndarray], prefix: str) -> dict[str, np.ndarray]:
+    """Return the entries whose names begin with ``prefix``, without it."""
     return {k.removeprefix(prefix): v for k, v in state.items() if k.startswith(prefix)}

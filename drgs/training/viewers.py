@@ -91,8 +91,8 @@ def for_viewers(
 ) -> ForViewers:
     """Fit a copy of a fit's Gaussians as viewers render; the same bytes in every run.
 
-    trainer: has ended, and is retired: see :meth:`drgs.training.trainer.Trainer.retire`. gaussians:
-    what ``trainer.gaussians()`` gave. watch: is called after each iteration with their number.
+    trainer: has ended, and is released: see :meth:`drgs.training.trainer.Trainer.release`.
+    gaussians: what ``trainer.gaussians()`` gave. watch: is called after each iteration with their number.
 
     Where that cannot be, as where a number is not finite, the closed form is what is given, with a
     :class:`UserNote`.
@@ -102,10 +102,10 @@ def for_viewers(
     said = {
         name: DECLARED[name].default for name in config.model.approximations.others_than_default
     }
-    trainer.retire()
+    trainer.release()
     further = tuning(config)
     try:
-        tuned = _tuned(trainer.another(further, start), trainer, watch)
+        tuned = _tuned(trainer.spawn(further, start), trainer, watch)
     except UserError as error:  # numbers that are not finite, or too little memory by now
         note = f"the Gaussians for viewers are not fitted any further: {error}"
         warnings.warn(UserNote(note), stacklevel=2)
@@ -118,7 +118,7 @@ def for_viewers(
 def _tuned(tuner: Trainer, trainer: Trainer, watch: Callable[[int], None]) -> Gaussians:
     """After the iterations that follow those of ``trainer``."""
     before = trainer.config.iterations
-    tuner.take_over(trainer)
+    tuner.warm_start(trainer)
     while tuner.iteration < tuner.config.iterations:
         if tuner.step().passes(tuner.config.output.history_every):
             tuner.check_iterations()
@@ -128,8 +128,7 @@ def _tuned(tuner: Trainer, trainer: Trainer, watch: Callable[[int], None]) -> Ga
 
 def _started(trainer: Trainer, gaussians: Gaussians) -> Gaussians:
     """In closed form, by the training cameras as the fit has them."""
-    trainer.place_all()
-    states = (read_sensor(view.sensor, trainer.integrator.near) for view in trainer.views)
+    states = (read_sensor(sensor, trainer.integrator.near) for sensor in trainer.sensors())
     on_device = baked(gaussians).to(mi.TensorXf)
     with dr.suspend_grad():
         cameras = map(camera_from_sensor, states)

@@ -56,7 +56,7 @@ class UntilEnded:
         """Whether there is another iteration; if not by request, revises the configuration."""
         done = trainer.iteration
         if self._wishes.ended and 0 < done < trainer.config.iterations:
-            trainer.replan(done, trainer.config.densify.stop)
+            trainer.reschedule(done, trainer.config.densify.stop)
             return False
         return self._length.goes_on(trainer)
 
@@ -109,7 +109,7 @@ class Watching:
             start = time.perf_counter()
             dr.sync_thread()  # the iteration's kernels may still be running
             self._of_fit += time.perf_counter() - start
-            trainer.show()
+            trainer.sync_scene()
             gaussians = dr.detach(trainer.integrator.gaussians)
             model, degree = trainer.config.model, trainer.sh_degree
             scene = LiveScene(gaussians, model, self._background, sh_degree=degree)

@@ -34,7 +34,6 @@ import drgs  # noqa: F401  (registers the plugin)
 from drgs.accuracy.sample_points import SamplePoints
 from drgs.gaussians.parameters import PARAMETER_NAMES
 from drgs.integrator.sampling import PIXELS_PER_PASS, SAMPLES_PER_KERNEL, DrawnSamples
-from drgs.integrator.weights import weighted_sums_of_last
 from drgs.reference import rays as reference_rays
 from drgs.reference import splatting as reference
 from drgs.splatting import rendering

@@ -156,20 +156,20 @@ def main() -> None:
 
     mi.set_variant("llvm_ad_rgb")
     dr.set_thread_count(1)
-    from drgs.training.parallel.ranks import Ranks
-    from drgs.training.parallel.trainer import DistributedTrainer
+    from drgs.training.parallel.communicator import Communicator
+    from drgs.training.trainer import Trainer
     from support import small_fits as fits
 
     task = json.loads(sys.argv[1])
     dataset = DATASETS[task["data"]]()
-    ranks = Ranks.world()
+    comm = Communicator.world()
     config = fits.config_of(**task["changes"])
-    trainer = DistributedTrainer(config, dataset, fits.disturbed_blobs(), ranks)
+    trainer = Trainer(config, dataset, fits.disturbed_blobs(), comm)
     if "spoiled" in task:
         found = spoiled(trainer, task["spoiled"])
     else:
         found = found_by(trainer, task["steps"])
-    if ranks.is_first:
+    if comm.is_root:
         print(json.dumps(found))
 
 
@@ -181,7 +181,7 @@ def spoiled(trainer: Any, row: int) -> str:
     from drgs.training.finite_checks import NonFiniteError
 
     logits = trainer.population.value("logit_opacities")
-    here = row - trainer.first_row
+    here = row - trainer.population.first_row
     changed = dr.select(
         dr.arange(dr.uint32_array_t(type(logits)), len(logits)) == here, dr.nan, logits
     )
@@ -190,9 +190,8 @@ def spoiled(trainer: Any, row: int) -> str:
         trainer.check()
     except NonFiniteError as error:
         said = str(error)
-    if hasattr(trainer, "ranks"):
-        same = trainer.ranks.told(np.array([hash_of(said)]))
-        assert (same == same[0]).all()
+    same = trainer.comm.all_gather(np.array([hash_of(said)]))
+    assert (same == same[0]).all()
     return said
 
 

@@ -26,7 +26,7 @@ from drgs.training.density.strategy import (
     DensityReport,
     DensityStrategy,
     Population,
-    SeenStep,
+    StepInfo,
     displaced,
 )
 
@@ -58,28 +58,27 @@ class AdaptiveDensityControl(DensityStrategy):
     white_background: bool
     statistics: DensityStatistics | None = None  # until it begins
     by_row = ("gradient_norms", "views")
-    looks_at_pictures = False
 
     def begin(self, population: Population) -> None:
         """Start with the statistics of no views."""
         float_type = type(population.value("means").array)
         self.statistics = DensityStatistics.zeros(float_type, population.num_own)
 
-    def gathers(self, iteration: int) -> bool:
-        """See :func:`gathers_statistics`."""
-        return gathers_statistics(self.config, iteration)
+    def needs_statistics(self, iteration: int) -> bool:
+        """See :func:`needs_statistics`."""
+        return needs_statistics(self.config, iteration)
 
-    def gather(self, step: SeenStep) -> None:
+    def update_statistics(self, step: StepInfo) -> None:
         """Add the gradients of one more view."""
         self.statistics = accumulate(
             self.statistics, step.means2d_grad, step.visible, step.width, step.height
         )
 
-    def acts(self, iteration: int) -> bool:
+    def is_due(self, iteration: int) -> bool:
         """Whether the population changes, or opacities are reset."""
         return should_densify(self.config, iteration) or self._resets(iteration)
 
-    def act(self, population: Population, iteration: int) -> DensityReport | None:
+    def refine(self, population: Population, iteration: int) -> DensityReport | None:
         """Clone, split and prune, then lower opacities, each where it is due."""
         report = None
         if should_densify(self.config, iteration):
@@ -133,7 +132,7 @@ def accumulate(
     return updated
 
 
-def gathers_statistics(config: DensifyConfig, iteration: int) -> bool:
+def needs_statistics(config: DensifyConfig, iteration: int) -> bool:
     """Whether the gradients of this iteration can still lead to a change."""
     return iteration < config.stop
 

@@ -36,8 +36,10 @@ from drgs.core.errors import UserError
 from drgs.training.density.strategy import (
     DensityReport,
     DensityStrategy,
+    PixelWeight,
     Population,
-    SeenStep,
+    StepInfo,
+    absolute_errors,
     displaced,
 )
 
@@ -70,7 +72,7 @@ class GrowthToNumber(DensityStrategy):
         self.first = self.first or population.num_rows
         self.errors = dr.zeros(float_type, population.num_own)
 
-    def gathers(self, iteration: int) -> bool:
+    def needs_statistics(self, iteration: int) -> bool:
         """Every so many views, as long as the errors can still lead to a change.
 
         Where there was none since the last change, the view of the change itself.
@@ -79,20 +81,25 @@ class GrowthToNumber(DensityStrategy):
         if iteration < stop and iteration % every == 0:
             return True
         last_change = (iteration - 1) // self.config.every * self.config.every
-        return self.acts(iteration) and (iteration - 1) // every * every <= last_change
+        return self.is_due(iteration) and (iteration - 1) // every * every <= last_change
 
-    def gather(self, step: SeenStep) -> None:
+    def pixel_weights(self, iteration: int) -> Mapping[str, PixelWeight]:
+        """Return the absolute errors of the pixels."""
+        del iteration
+        return {"errors": absolute_errors}
+
+    def update_statistics(self, step: StepInfo) -> None:
         """Add the errors of one more view."""
-        self.errors = self.errors + step.errors_seen()
+        self.errors = self.errors + step.weighted_sums["errors"]
         dr.eval(self.errors)
 
-    def acts(self, iteration: int) -> bool:
+    def is_due(self, iteration: int) -> bool:
         """Whether the population changes after this iteration."""
         config = self.config
         turn = iteration % config.every == 0 or iteration == config.stop
         return config.start < iteration <= config.stop and turn
 
-    def act(self, population: Population, iteration: int) -> DensityReport:
+    def refine(self, population: Population, iteration: int) -> DensityReport:
         """Remove what is transparent, and split where errors are."""
         before, least = population.num_rows, self.config.budget.prune_opacity
         keep = expit(population.host("logit_opacities")) >= least  # NaN counts as transparent

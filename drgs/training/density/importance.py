@@ -19,7 +19,13 @@ import numpy as np
 from drgs.config.schema import FitConfig
 from drgs.core.arrays import from_host
 from drgs.training.density.pruning import PruneSchedule, best_rows, keep_best
-from drgs.training.density.strategy import DensityReport, DensityStrategy, Population, SeenStep
+from drgs.training.density.strategy import (
+    DensityReport,
+    DensityStrategy,
+    PixelWeight,
+    Population,
+    StepInfo,
+)
 
 
 class Importance(DensityStrategy):
@@ -37,21 +43,25 @@ class Importance(DensityStrategy):
         float_type = type(population.value("means").array)
         self.scores = dr.zeros(float_type, population.num_own)
 
-    def gathers(self, iteration: int) -> bool:
+    def needs_statistics(self, iteration: int) -> bool:
         """Weights count in the iterations of the phase."""
         return self.schedule.contains(iteration)
 
-    def gather(self, step: SeenStep) -> None:
-        """Add the weights of a picture."""
-        of_all_pixels = dr.opaque(type(self.scores), 1, step.width * step.height)
-        self.scores = self.scores + step.weighted_sums(of_all_pixels)
+    def pixel_weights(self, iteration: int) -> Mapping[str, PixelWeight]:
+        """Return ones: all pixels count alike."""
+        del iteration
+        return {"coverage": _ones}
+
+    def update_statistics(self, step: StepInfo) -> None:
+        """Add the weights of an image."""
+        self.scores = self.scores + step.weighted_sums["coverage"]
         dr.eval(self.scores)
 
-    def acts(self, iteration: int) -> bool:
+    def is_due(self, iteration: int) -> bool:
         """As the schedule says."""
-        return self.schedule.acts(iteration)
+        return self.schedule.is_due(iteration)
 
-    def act(self, population: Population, iteration: int) -> DensityReport | None:
+    def refine(self, population: Population, iteration: int) -> DensityReport | None:
         """Remove as many as the schedule says."""
         before = population.num_rows
         self.begun_with = self.begun_with or before
@@ -73,3 +83,9 @@ class Importance(DensityStrategy):
         """Continue from :meth:`state`."""
         self.begun_with = int(state["pruned_from"])
         self.scores = from_host(type(self.scores), state["weights"])
+
+
+def _ones(image: Any, photograph: Any) -> Any:
+    del photograph
+    height, width, _ = image.shape
+    return dr.opaque(type(image.array), 1, height * width)

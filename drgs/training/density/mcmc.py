@@ -89,12 +89,12 @@ class MarkovChain(DensityStrategy):
         moved = dr.select(dr.isfinite(shift), mean + shift, mean)  # scales may have no square
         population.set_values("means", type(means)(dr.ravel(moved), means.shape))
 
-    def acts(self, iteration: int) -> bool:
+    def is_due(self, iteration: int) -> bool:
         """Every so many iterations between start and stop."""
         config = self.config
         return config.start < iteration < config.stop and iteration % config.every == 0
 
-    def act(self, population: Population, iteration: int) -> DensityReport | None:
+    def refine(self, population: Population, iteration: int) -> DensityReport | None:
         """Relocate transparent Gaussians, and let the population grow.
 
         Those that are too transparent are gone, and copies of others take their places, and those

@@ -12,7 +12,13 @@ from typing import Any
 
 import numpy as np
 
-from drgs.training.density.strategy import DensityReport, DensityStrategy, Population, SeenStep
+from drgs.training.density.strategy import (
+    DensityReport,
+    DensityStrategy,
+    PixelWeight,
+    Population,
+    StepInfo,
+)
 
 
 @dataclass(frozen=True)
@@ -29,25 +35,25 @@ class Phases(DensityStrategy):
         """Those of all of them."""
         return [name for phase in self.phases for name in phase.by_row]
 
-    @property
-    def looks_at_pictures(self) -> bool:
-        """Whether any of them does."""
-        return any(phase.looks_at_pictures for phase in self.phases)
-
     def begin(self, population: Population) -> None:
         """Start with the statistics of no views."""
         for phase in self.phases:
             phase.begin(population)
 
-    def gathers(self, iteration: int) -> bool:
+    def needs_statistics(self, iteration: int) -> bool:
         """Whether any of them does."""
-        return any(phase.gathers(iteration) for phase in self.phases)
+        return any(phase.needs_statistics(iteration) for phase in self.phases)
 
-    def gather(self, step: SeenStep) -> None:
+    def pixel_weights(self, iteration: int) -> Mapping[str, PixelWeight]:
+        """Return the planes of the phases that need statistics."""
+        needed = [phase for phase in self.phases if phase.needs_statistics(iteration)]
+        return {k: v for phase in needed for k, v in phase.pixel_weights(iteration).items()}
+
+    def update_statistics(self, step: StepInfo) -> None:
         """Tell those of them that gather."""
         for phase in self.phases:
-            if phase.gathers(step.iteration):
-                phase.gather(step)
+            if phase.needs_statistics(step.iteration):
+                phase.update_statistics(step)
 
     def penalties(self, parameters: Mapping[str, Any], num_rows: int) -> Iterator[Any]:
         """Those of all of them."""
@@ -66,17 +72,17 @@ class Phases(DensityStrategy):
         for phase in self.phases:
             phase.perturb(population, iteration, means_lr)
 
-    def acts(self, iteration: int) -> bool:
+    def is_due(self, iteration: int) -> bool:
         """Whether any of them does."""
-        return any(phase.acts(iteration) for phase in self.phases)
+        return any(phase.is_due(iteration) for phase in self.phases)
 
-    def act(self, population: Population, iteration: int) -> DensityReport | None:
+    def refine(self, population: Population, iteration: int) -> DensityReport | None:
         """Those of them that act, one after the other."""
         reports = []
         for phase in self.phases:
-            if not phase.acts(iteration):
+            if not phase.is_due(iteration):
                 continue
-            report = phase.act(population, iteration)
+            report = phase.refine(population, iteration)
             if report is not None:
                 reports.append(report)
                 for other in self.phases:

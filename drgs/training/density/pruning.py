@@ -34,7 +34,7 @@ class PruneSchedule:
         """Whether an iteration belongs to the phase."""
         return self.start < iteration <= self.stop
 
-    def acts(self, iteration: int) -> bool:
+    def is_due(self, iteration: int) -> bool:
         """Whether something changes after an iteration."""
         due = iteration % self.every == 0 or iteration == self.stop
         return self.contains(iteration) and due

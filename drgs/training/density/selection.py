@@ -37,12 +37,12 @@ class NaturalSelection(DensityStrategy):
         under_pressure = self.left > self.schedule.to and self.schedule.contains(iteration)
         return {"logit_opacities": self.prune.opacity_rate if under_pressure else 1.0}
 
-    def acts(self, iteration: int) -> bool:
+    def is_due(self, iteration: int) -> bool:
         """As the schedule says, until few enough are left."""
         is_over = 0 < self.left <= self.schedule.to
-        return self.schedule.acts(iteration) and not is_over
+        return self.schedule.is_due(iteration) and not is_over
 
-    def act(self, population: Population, iteration: int) -> DensityReport | None:
+    def refine(self, population: Population, iteration: int) -> DensityReport | None:
         """Lower all logits, and remove what is then below the threshold.
 
         By how much follows from how many are to be left now: so many are below, unless others are

@@ -1,7 +1,7 @@
 """What the trainer asks of a strategy that changes the population, and what it hands to it.
 
 Each iteration, :class:`drgs.training.trainer.Trainer` tells the strategy what it has seen
-(:class:`SeenStep`) and lets it act on the rows of the optimizer (:class:`Population`).
+(:class:`StepInfo`) and lets it act on the rows of the optimizer (:class:`Population`).
 ``drgs.training.density.called_for`` says which strategy a configuration calls for.
 
 Iterations are counted from 1. A strategy is a function of the configuration and of
@@ -18,6 +18,7 @@ import drjit as dr
 import numpy as np
 
 from drgs.core.arrays import from_host, types_of
+from drgs.gaussians.parameters import Gaussians
 from drgs.gaussians.quaternions import quat_to_rotation
 from drgs.training.optimizer import (
     LeanAdam,
@@ -31,7 +32,7 @@ from drgs.training.optimizer import (
 
 @dataclass(frozen=True)
 class DensityReport:
-    """What one call of :meth:`DensityStrategy.act` did to the rows."""
+    """What one call of :meth:`DensityStrategy.refine` did to the rows."""
 
     num_gaussians: int  # afterwards
     num_added: int = 0  # rows on top of those before, parents of a split not counted
@@ -47,8 +48,8 @@ DENSITY_COLUMNS = ("iteration", *(field.name for field in fields(DensityReport))
 
 
 @dataclass(frozen=True)
-class SeenStep:
-    """What an iteration tells a strategy; nothing of it is differentiated.
+class StepInfo:
+    """What a strategy learns from an iteration; nothing of it is differentiated.
 
     N are the rows that :meth:`Population.value` has.
     """
@@ -58,18 +59,17 @@ class SeenStep:
     height: int
     means2d_grad: Any  # d loss / d mean2d, per px: Array2f, or a tensor (N, 2)
     visible: Any  # Bool (N,)
-    image: Any  # tensor (H, W, 3), what was compared with the photograph, display space
-    photograph: Any  # tensor (H, W, 3), display space
-    weighted_sums: Callable[[Any], Any]  # see drgs.splatting.rendering.weighted_sums
+    weighted_sums: Mapping[str, Any]  # Float (N,): see DensityStrategy.pixel_weights
 
-    def errors(self) -> Any:
-        """Of each pixel, the mean absolute difference of its channels: Float (H W,)."""
-        difference = dr.abs(dr.detach(self.image) - self.photograph)
-        return dr.mean(difference, axis=2).array
 
-    def errors_seen(self) -> Any:
-        """Of each Gaussian, the sum of errors over pixels, times its weight there: Float (N,)."""
-        return self.weighted_sums(self.errors())
+PixelWeight = Callable[[Any, Any], Any]
+"""Computes a plane, Float (H W,), from what was rendered and the photograph: tensors (H, W, 3) in
+display space."""
+
+
+def absolute_errors(image: Any, photograph: Any) -> Any:
+    """Return the mean absolute difference of each pixel's channels: Float (H W,)."""
+    return dr.mean(dr.abs(image - photograph), axis=2).array
 
 
 @dataclass(frozen=True)
@@ -94,6 +94,37 @@ class Population:
     def num_own(self) -> int:
         """How many of them :meth:`value` has: all, where no other process has some."""
         return self.num_rows
+
+    @property
+    def first_row(self) -> int:
+        """The number of the first row that this process has."""
+        return 0
+
+    def terms_of_all(self, terms: list[Any], compute: Callable[[Any], list[Any]]) -> list[Any]:
+        """Return terms of the loss that were computed from the rows here, for all rows.
+
+        compute: computes them from parameters by name.
+        """
+        del compute
+        return [dr.detach(term) for term in terms]
+
+    def gather_gaussians(self, own: Gaussians) -> Gaussians:
+        """Return all Gaussians, from those of this process."""
+        return own
+
+    def gather_state(
+        self, state: dict[str, np.ndarray], is_by_row: Callable[[str], bool]
+    ) -> dict[str, np.ndarray]:
+        """Return a trainer's state with all rows, from that of this process."""
+        del is_by_row
+        return state
+
+    def scatter_state(
+        self, state: Mapping[str, np.ndarray], is_by_row: Callable[[str], bool]
+    ) -> Mapping[str, np.ndarray]:
+        """Return the part of a whole state that this process has."""
+        del is_by_row
+        return state
 
     def value(self, name: str) -> Any:
         """A parameter as it is at the moment, on the device."""
@@ -172,9 +203,6 @@ class DensityStrategy(Protocol):
     by_row: Sequence[str] = ()
     """Names in :meth:`state` of what has a row for each Gaussian."""
 
-    looks_at_pictures: bool = True
-    """Whether :meth:`gather` asks for anything that a picture has to be kept for."""
-
     def begin(self, population: Population) -> None:
         """Start with the statistics of no views.
 
@@ -182,12 +210,21 @@ class DensityStrategy(Protocol):
         """
         del population
 
-    def gathers(self, iteration: int) -> bool:
-        """Whether :meth:`gather` is to be told of this iteration."""
+    def needs_statistics(self, iteration: int) -> bool:
+        """Whether :meth:`update_statistics` is to be told of this iteration."""
         del iteration
         return False
 
-    def gather(self, step: SeenStep) -> None:
+    def pixel_weights(self, iteration: int) -> Mapping[str, PixelWeight]:
+        """Return the planes, by name, that this iteration sums over the pixels of each Gaussian.
+
+        ``StepInfo.weighted_sums`` has, for each Gaussian, the sum over pixels of the plane times
+        the Gaussian's weight there: alpha times transmittance.
+        """
+        del iteration
+        return {}
+
+    def update_statistics(self, step: StepInfo) -> None:
         """Take note of an iteration, after its optimizer step."""
         del step
 
@@ -214,15 +251,16 @@ class DensityStrategy(Protocol):
         """
         del population, iteration, means_lr
 
-    def acts(self, iteration: int) -> bool:
-        """Whether :meth:`act` is to be called after this iteration, when all is known to be finite.
+    def is_due(self, iteration: int) -> bool:
+        """Return whether :meth:`refine` is called after this iteration.
 
-        It is called behind :meth:`gather` and :meth:`perturb`.
+        It is called after :meth:`update_statistics` and :meth:`perturb`, when all is known to be
+        finite.
         """
         del iteration
         return False
 
-    def act(self, population: Population, iteration: int) -> DensityReport | None:
+    def refine(self, population: Population, iteration: int) -> DensityReport | None:
         """Change rows or values; None: it was no change of the population."""
         del population, iteration
 

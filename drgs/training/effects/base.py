@@ -7,7 +7,8 @@ dataset call for, and imports them.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -16,43 +17,28 @@ import numpy as np
 
 from drgs.core.arrays import from_host
 from drgs.datasets.types import Dataset, View
-from drgs.integrator.settings import SplatsSettings
 from drgs.training.views import TrainingView
 
 
-class FitState(Protocol):
-    """What an effect may know of the fit that it takes part in."""
+@dataclass(frozen=True)
+class FitState:
+    """What an effect may know of the fit that it takes part in, at one iteration."""
 
-    @property
-    def iteration(self) -> int:
-        """The one that runs; the first is 1."""
+    iteration: int  # from 1
+    iterations_of_step: range
+    begins_stage: bool  # whether the images have other sizes than in the step before
+    rate_decay: float  # the means' learning rate, relative to the initial one
+    integrator: Any  # splats, which renders the fit
+    means: Any  # TensorXf (N, 3), world
+    views: list[TrainingView]  # the training views, at the image size that is in use
+    effects: Sequence[TrainingEffect]
 
-    @property
-    def iterations_of_step(self) -> range:
-        """Those of the step that is under way."""
-
-    @property
-    def rate_decay(self) -> float:
-        """What the means' learning rate has fallen to, relative to where it began."""
-
-    @property
-    def begins_stage(self) -> bool:
-        """Whether the pictures have other sizes than in the step before."""
-
-    @property
-    def integrator(self) -> SplatsSettings:
-        """The integrator ``splats`` that renders the fit."""
-
-    @property
-    def means(self) -> Any:
-        """The means at the moment, TensorXf (N, 3), world."""
-
-    @property
-    def views(self) -> list[TrainingView]:
-        """The training views, at the size in use."""
-
-    def place_all(self) -> None:
-        """Put all sensors where effects have them now, without derivatives."""
+    def sensors(self) -> list[mi.Sensor]:
+        """Return the sensors of all training views, placed by the effects without derivatives."""
+        for effect in self.effects:
+            for view in self.views:
+                effect.place(view)
+        return [view.sensor for view in self.views]
 
 
 class TrainingEffect(Protocol):

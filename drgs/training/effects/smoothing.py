@@ -36,8 +36,7 @@ class TrainingSmoothing(TrainingEffect):
 
     @staticmethod
     def _found(fit: FitState) -> mi.Float:
-        fit.place_all()
-        states = (read_sensor(view.sensor, fit.integrator.near) for view in fit.views)
+        states = (read_sensor(sensor, fit.integrator.near) for sensor in fit.sensors())
         return smoothing_of(fit.means, map(camera_from_sensor, states))
 
     def repopulated(self, fit: FitState) -> None:

@@ -1,28 +1,36 @@
-"""What one process projects and another composites.
+"""Gradients of a step of several views, which one process computes or several share.
 
-Each process has some of the Gaussians' rows, and renders some of a step's views. It projects its
-rows for the cameras of all views; what of them is on a view's film goes, as rows of numbers, to
-whoever renders that view, who bins and composites them as if they were his own. The derivatives
-with respect to these splats go back, and every process takes those of its rows on through the
-projection. So 14 numbers of a splat travel, and 9 come back, where a Gaussian has 59; and since
-rows lie one behind the other in the order of the processes, nothing depends on how many there are.
+Every rank has some rows of the Gaussians, and renders some views of a step. It projects its rows
+for the cameras of all views; the splats that are on a view's film go to the rank that renders it,
+which bins and composites them behind one another, as if they were its own. The derivatives with
+respect to these splats go back, and every rank takes those of its rows through the projection. So
+14 numbers of a splat travel, and 9 come back, where a Gaussian has 59; and since rows are ordered
+by rank, and each rank adds up the views in their order, the bytes do not depend on the number of
+ranks. A rank that is alone sends nothing: its splats stay on the device.
+
+Going back from splats to Gaussians reads and writes all of their numbers. For views that see the
+same Gaussians, one kernel does it for :data:`VIEWS_AT_ONCE` of them.
 """
 
 from __future__ import annotations
 
-from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import reduce
+from operator import add, or_
 from typing import Any
 
 import drjit as dr
+import mitsuba as mi
 import numpy as np
-from mpi4py import MPI
 
-from drgs.cameras.camera import Camera
-from drgs.core.arrays import Rows, block_widths, empty_on_host, types_of, wrapped
+from drgs.cameras.camera import Camera, cameras_in_time
+from drgs.core.arrays import Rows, block_widths, empty_on_host, from_host, types_of, wrapped
 from drgs.core.constants import MAX_SHUTTER_SAMPLES
+from drgs.effects.compose import composed, ignoring
 from drgs.gaussians.parameters import Gaussians
+from drgs.integrator.sensors import camera_from_sensor, read_sensor
+from drgs.integrator.view import accumulate_in_sensor
 from drgs.splatting.rasterize import SplatGradients
 from drgs.splatting.rendering import (
     NO_FAULT,
@@ -31,19 +39,35 @@ from drgs.splatting.rendering import (
     Pipeline,
     SeenSplats,
     footprints_seen_by,
+    gradients_by_row,
+    sum_of_gradients,
+    sum_of_views,
+    weighted_sums,
 )
 from drgs.splatting.tiles import Footprints
-from drgs.training.parallel.ranks import Ranks, wait
+from drgs.training.gradients import ViewGradients, ViewLoss
+from drgs.training.parallel.communicator import Communicator, wait
+from drgs.training.parallel.population import renderer_of
+from drgs.training.steps import StepView
+
+VIEWS_AT_ONCE = 4
+"""Views whose derivatives one kernel adds up; it is longer, and takes longer to compile, with each.
+"""
 
 Blocks = list[np.ndarray]
 """Rows of numbers as they travel: (M, columns) for each block of :class:`drgs.core.arrays.Rows`."""
 
-BOX = 4
+BOX_NUMBERS = 4
 """Numbers of a splat's box of tiles: see :class:`drgs.splatting.tiles.Footprints`."""
 
 
-@dataclass(frozen=True, eq=False)
-class Layout:
+# ----------------------------------------------------------------------------------------------
+# Splats that travel
+# ----------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class SplatLayout:
     """Which numbers of a splat travel."""
 
     num_stored: int  # geometry, features, keys
@@ -52,157 +76,425 @@ class Layout:
 
     @property
     def num_gradients(self) -> int:
-        """With respect to geometry and features."""
+        """Numbers of the derivatives with respect to geometry and features."""
         return self.num_stored - self.num_keys
 
     @property
     def widths(self) -> tuple[int, ...]:
-        """Of the blocks of a splat: its box, what is stored, its depth."""
-        return (BOX, *block_widths(self.num_stored), 1)
+        """Columns of the blocks of a splat: its box, what is stored, its depth."""
+        return (BOX_NUMBERS, *block_widths(self.num_stored), 1)
 
 
 @dataclass(frozen=True, eq=False)
-class Sight:
-    """What one camera sees of the rows of this process."""
+class LocalProjection:
+    """This rank's rows as one camera sees them at one time."""
 
     camera: Camera
     pipeline: Pipeline  # composed for the camera
-    layout: Layout
-    float_type: type
-    num_rows: int  # of this process
-    of_camera: bool  # whether derivatives with respect to the camera are asked for
-    rows: Any  # UInt32 (M,): those on the film, ascending
-    count: int  # M
-    _blocks: Blocks  # of these rows
-
-    def taken_blocks(self) -> Blocks:
-        """The rows as they travel, which are not kept here."""
-        blocks = self._blocks[:]
-        self._blocks.clear()
-        return blocks
+    layout: SplatLayout
+    boxes: Rows  # of tiles, of all rows of this rank
 
     @staticmethod
-    def of(gaussians: Gaussians, camera: Camera, pipeline: Pipeline, of_camera: bool) -> Sight:
-        """Project, and pack what is on the film. The host reads how many there are."""
-        found = footprints_seen_by(gaussians, camera, pipeline)
-        layout = Layout(found.rows.width, found.num_features, found.num_keys)
-        t, num_rows = types_of(type(found.depths)), dr.width(found.depths)
-        tiles = found.boxes.load(dr.arange(t.UInt32, num_rows))[-1]
-        rows = dr.compress(tiles > 0)
-        count, blocks = dr.width(rows), empty_blocks(0, layout.widths, t.Float)
+    def from_footprints(camera: Camera, pipeline: Pipeline, found: Footprints) -> LocalProjection:
+        """Remember what derivatives need of projected splats."""
+        layout = SplatLayout(found.rows.width, found.num_features, found.num_keys)
+        return LocalProjection(camera, pipeline, layout, found.boxes)
+
+    @property
+    def num_rows(self) -> int:
+        """Rows of this rank."""
+        return dr.width(self.boxes.blocks[0]) // BOX_NUMBERS
+
+    @property
+    def visible(self) -> Any:
+        """Bool by row: its box has tiles of the film."""
+        t = types_of(self.boxes.Float)
+        return self.boxes.load(dr.arange(t.UInt32, self.num_rows))[-1] > 0
+
+    def view_splats(self, gradients: SplatGradients) -> SeenSplats:
+        """Return the derivatives with what they depend on."""
+        return SeenSplats(self.camera, self.pipeline, gradients)
+
+
+@dataclass(frozen=True, eq=False)
+class PackedProjection:
+    """This rank's rows that are on the film of a view that another rank renders."""
+
+    local: LocalProjection
+    rows: Any  # UInt32 (M,), ascending
+    count: int  # M
+    blocks: Blocks  # of these rows; empty once they are sent
+
+    @staticmethod
+    def from_footprints(local: LocalProjection, found: Footprints) -> PackedProjection:
+        """Pack what is on the film. The host reads the number of splats."""
+        rows = dr.compress(local.visible)
+        count, float_type = dr.width(rows), found.rows.Float
+        blocks = _empty_blocks(0, local.layout.widths, float_type)
         if count > 0:
             boxes, stored = (Rows.of(each.load(rows)) for each in (found.boxes, found.rows))
-            depths = dr.gather(t.Float, found.depths, rows)
+            depths = dr.gather(float_type, found.depths, rows)
             dr.eval(boxes, stored, depths)
             flat = [*boxes.blocks, *stored.blocks, depths]
             blocks = [each.numpy().reshape(count, -1) for each in flat]
-        kind = layout, t.Float, num_rows, of_camera
-        return Sight(camera, pipeline, *kind, rows, count, blocks)
+        return PackedProjection(local, rows, count, blocks)
 
-    def of_rows(self, blocks: Blocks, width: int) -> list[Any]:
-        """Columns of all rows of this process, of numbers of those on the film; else 0."""
-        t = types_of(self.float_type)
+    def unpack(self, blocks: Blocks, width: int) -> list[Any]:
+        """Return columns for all rows of this rank: numbers of those on the film, 0 for others."""
+        t = types_of(self.local.boxes.Float)
+        num_rows = self.local.num_rows
         if self.count == 0:
-            return [dr.zeros(t.Float, self.num_rows) for _ in range(width)]
+            return [dr.zeros(t.Float, num_rows) for _ in range(width)]
         nowhere = 0xFFFFFFFF
-        place = dr.full(t.UInt32, nowhere, self.num_rows)
+        place = dr.full(t.UInt32, nowhere, num_rows)
         dr.scatter(place, dr.arange(t.UInt32, self.count), self.rows)
         dr.eval(place)
         rows = Rows(tuple(wrapped(t.Float, block) for block in blocks), width)
         return rows.load(place, place != nowhere)
 
-    def seen_splats(self, blocks: Blocks) -> SeenSplats:
-        """All rows of this process, with the derivatives of those that came back."""
-        columns = self.of_rows(blocks, self.layout.num_gradients)
-        of_geometry = len(columns) - self.layout.num_features
-        gradients = SplatGradients(columns[:of_geometry], columns[of_geometry:])
-        return SeenSplats(self.camera, self.pipeline, gradients)
 
-
-def joined(blocks: Blocks, layout: Layout, float_type: type) -> Footprints:
-    """The splats of several processes, behind one another in each block."""
-    if len(blocks[0]) == 0:  # Dr.Jit does not compute with empty arrays: one that is not visible
-        blocks = empty_blocks(1, layout.widths, float_type)
-        for block in blocks:
-            block[:] = 0
-        blocks[-1][:] = np.inf
-    box, *stored, depths = (wrapped(float_type, block) for block in blocks)
-    rows = Rows(tuple(stored), layout.num_stored)
-    return Footprints(Rows((box,), BOX), rows, depths, layout.num_features, layout.num_keys)
-
-
-def empty_blocks(count: int, widths: Sequence[int], float_type: type) -> Blocks:
-    """Memory for rows that are received, aligned as Dr.Jit's is."""
+def _empty_blocks(count: int, widths: Sequence[int], float_type: type) -> Blocks:
+    """Return memory for rows to receive, aligned as Dr.Jit's is."""
     return [empty_on_host(float_type, (count, width)) for width in widths]
 
 
-class Post:
-    """Messages about the views of a step, told apart by place in the step and time."""
+def _concatenate(parts: Sequence[Footprints]) -> Footprints:
+    """Return the splats of several ranks behind one another."""
+    if len(parts) == 1:
+        return parts[0]
+    boxes, rows = (
+        Rows(
+            tuple(dr.concat(list(blocks)) for blocks in zip(*(e.blocks for e in each))),  # noqa: B905
+            each[0].width,
+        )
+        for each in ([part.boxes for part in parts], [part.rows for part in parts])
+    )
+    depths = dr.concat([part.depths for part in parts])
+    return Footprints(boxes, rows, depths, parts[0].num_features, parts[0].num_keys)
 
-    def __init__(self, ranks: Ranks) -> None:
-        self.ranks = ranks
-        self._sending: list[tuple[list[MPI.Request], Blocks]] = []  # and what is on its way
-        self._staying: dict[tuple[int, int], deque[Blocks]] = {}  # from this process to itself
+
+def _footprints_of_blocks(blocks: Blocks, layout: SplatLayout, float_type: type) -> Footprints:
+    """Return received splats without copying them."""
+    box, *stored, depths = (wrapped(float_type, block) for block in blocks)
+    rows = Rows(tuple(stored), layout.num_stored)
+    box = Rows((box,), BOX_NUMBERS)
+    return Footprints(box, rows, depths, layout.num_features, layout.num_keys)
+
+
+class ViewMessages:
+    """Messages between ranks about the views of a step, told apart by place in the step and time.
+
+    Messages about the same view and time arrive in the order in which they are sent.
+    """
+
+    def __init__(self, comm: Communicator) -> None:
+        self.comm = comm
+        self._sending: list[tuple[list[Any], Blocks]] = []  # requests, and what they send
 
     def send(self, blocks: Blocks, to: int, place: int, time: int) -> None:
-        """Begin to send rows to a process."""
-        if to == self.ranks.rank:
-            self._staying.setdefault((place, time), deque()).append(blocks)
-            return
+        """Begin to send rows to a rank."""
         tag = place * MAX_SHUTTER_SAMPLES + time
-        self._sending.append(([self.ranks.send(block, to, tag) for block in blocks], blocks))
+        self._sending.append(([self.comm.send(block, to, tag) for block in blocks], blocks))
 
-    def receive(self, into: Blocks, of: int, place: int, time: int) -> None:
-        """Wait for the next rows that a process sends."""
-        if of == self.ranks.rank:
-            own = self._staying[place, time].popleft()
-            for block, rows in zip(into, own, strict=True):
-                block[:] = rows
-            return
+    def receive(self, into: Blocks, source: int, place: int, time: int) -> None:
+        """Wait for the next rows that a rank sends."""
         tag = place * MAX_SHUTTER_SAMPLES + time
-        with self.ranks.exchanging():
-            wait(*(self.ranks.receive(block, of, tag) for block in into))
-
-    def forget_received(self) -> None:
-        """Free what has arrived."""
-        arrived = [MPI.Request.Testall(requests) for requests, _ in self._sending]
-        self._sending = [s for s, done in zip(self._sending, arrived, strict=True) if not done]
+        with self.comm.exchanging():
+            wait(*(self.comm.receive(block, source, tag) for block in into))
 
     def finish(self) -> None:
         """Wait until all has been sent."""
-        with self.ranks.exchanging():
+        with self.comm.exchanging():
             wait(*(request for requests, _ in self._sending for request in requests))
         self._sending.clear()
 
 
-@dataclass(eq=False)
-class Received:
-    """Splats that others have projected, as a source of frames; one for each time of a view."""
+# ----------------------------------------------------------------------------------------------
+# A step
+# ----------------------------------------------------------------------------------------------
 
-    footprints_in_time: list[Footprints]
-    gradients_in_time: list[SplatGradients] = field(default_factory=list)
+
+@dataclass(eq=False)
+class _View:
+    """A view of the step: what this rank knows of it."""
+
+    view: StepView
+    renderer: int  # the rank that renders it
+    counts: Any = None  # (ranks, times): splats that each rank sends to the renderer
+    packed: list[PackedProjection] = field(default_factory=list)  # by time, for another renderer
+    local: list[LocalProjection] = field(default_factory=list)  # by time
+    rows: list[int] = field(default_factory=list)  # by time, splats that are composited here
+    frames: list[Frame] = field(default_factory=list)  # by time, until the backward pass has ended
+    gradients: list[SplatGradients] = field(default_factory=list)  # by time, of own rows
+    sums: dict[str, Any] = field(default_factory=dict)  # see StepView.weights
+    needs_camera: bool = False
+    first_fault: Any = None
+
+    def num_splats(self, rank: int, time: int) -> int:
+        """Return the number of splats that a rank contributes to the rendered view."""
+        own = self.local[time].num_rows if time < len(self.local) else 0
+        return own if rank == self.renderer else int(self.counts[rank, time])
+
+
+class ViewExchange:
+    """The projection of a step's views, and the way back of their derivatives.
+
+    It is the integrator's projection stage (:class:`drgs.splatting.rendering.ProjectionStage`).
+    """
+
+    def __init__(
+        self,
+        comm: Communicator,
+        integrator: Any,
+        params: mi.SceneParameters,
+        prefix: str,
+        views_per_step: int,
+    ) -> None:
+        """params: hold those of the Gaussians, after ``prefix``."""
+        self.comm, self.integrator, self.params, self.prefix = comm, integrator, params, prefix
+        self.views_per_step, self.messages = views_per_step, ViewMessages(comm)
+        self._views: list[_View] = []
+        self._num_added = 0  # views whose derivatives are in the parameters
+        integrator.use_projection(self)
+
+    # What the trainer calls ---------------------------------------------------------------------
+
+    def begin(self, views: Sequence[StepView], place: Callable[[StepView], None]) -> None:
+        """Project the rows of this rank for the views that others render.
+
+        place: puts the sensor of such a view where it is now.
+        """
+        size, num = self.comm.size, self.views_per_step
+        self._views = [_View(view, renderer_of(view.place, num, size)) for view in views]
+        self._num_added = 0
+        if size == 1:
+            return
+        for each in self._views:
+            if each.renderer != self.comm.rank:
+                place(each.view)
+        cameras = [self._cameras(each.view) for each in self._views]
+        for each, in_time in zip(self._views, cameras, strict=True):
+            if each.renderer != self.comm.rank:
+                self._project(each, in_time)
+        own = [[p.count for p in v.packed] or [0] * len(t) for v, t in zip(self._views, cameras)]  # noqa: B905
+        counts = self.comm.all_gather(np.array([count for of_view in own for count in of_view]))
+        ends = np.cumsum([len(of_view) for of_view in own])
+        for each, of_view in zip(self._views, np.split(counts, ends[:-1], axis=1), strict=True):
+            each.counts = of_view
+            for time, packed in enumerate(each.packed):
+                blocks = packed.blocks[:]
+                packed.blocks.clear()
+                self.messages.send(blocks, each.renderer, each.view.place, time)
+
+    def own_views(self) -> Iterator[StepView]:
+        """Yield the views that this rank renders; each is rendered before the next is asked for."""
+        for each in self._views:
+            if each.renderer == self.comm.rank:
+                self._current = each
+                self.integrator.forget_frames()  # splats of other ranks arrive anew
+                yield each.view
+
+    def end_view(self, weights: Mapping[str, Any]) -> None:
+        """End the backward pass of a view; weights: planes for weighted sums, by name."""
+        each = self._current
+        for name, plane in weights.items():
+            sums = []
+            for time, frame in enumerate(each.frames):
+                own = self._divide(each, time, [weighted_sums(frame, plane)])
+                sums.append(own[0])
+            each.sums[name] = sum(sums[1:], sums[0]) / len(sums)
+        each.frames.clear()
+        self._add_ready_views(is_end=False)
+
+    def finish(self, names: Sequence[Sequence[str]]) -> list[ViewGradients]:
+        """Return what is known of all views, whose derivatives are in the parameters now.
+
+        names: of each view's planes for weighted sums.
+        """
+        for each, weights in zip(self._views, names, strict=True):
+            if each.renderer != self.comm.rank:
+                self._receive(each, weights)
+        self._add_ready_views(is_end=True)
+        self.messages.finish()
+        return [self._result(each) for each in self._views]
+
+    def share_losses(self, losses: Mapping[int, ViewLoss]) -> list[ViewLoss]:
+        """Return the losses of all views, by place in the step; losses: of views rendered here."""
+        if self.comm.size == 1:
+            return list(losses.values())
+        numbers = np.zeros((len(self._views), 3))
+        for place, found in losses.items():
+            numbers[place] = float(found.loss[0]), float(found.squared_error[0]), found.counted
+        numbers = self.comm.all_gather(numbers).sum(axis=0)  # the others' are 0
+        loss, error = numbers[:, :2].astype(np.float32).T
+        rows = zip(loss[:, None], error[:, None], numbers[:, 2], strict=True)
+        return [ViewLoss(*row) for row in rows]
+
+    def share(self, view: StepView, value: Any) -> Any:
+        """Return an array of the rank that renders a view; others give one of the same size."""
+        if self.comm.size == 1:
+            return value
+        renderer = self._views[view.place].renderer
+        return type(value)(self.comm.broadcast(np.array(value, np.float32), renderer))
+
+    # What the integrator calls ------------------------------------------------------------------
 
     def footprints(self, gaussians: Gaussians, camera: Camera, pipeline: Pipeline) -> Footprints:
-        """Those of the next time."""
-        del gaussians, camera, pipeline
-        return self.footprints_in_time.pop(0)
+        """Return the splats of all ranks, behind one another, as ``camera`` sees them."""
+        each, time = self._current, len(self._current.local)
+        own = footprints_seen_by(gaussians, camera, pipeline)
+        local = LocalProjection.from_footprints(camera, pipeline, own)
+        each.local.append(local)
+        parts = []
+        for rank in range(self.comm.size):
+            if rank == self.comm.rank:
+                parts.append(own)
+            elif (count := int(each.counts[rank, time])) > 0:
+                blocks = _empty_blocks(count, local.layout.widths, own.rows.Float)
+                self.messages.receive(blocks, rank, each.view.place, time)
+                parts.append(_footprints_of_blocks(blocks, local.layout, own.rows.Float))
+        return _concatenate(parts)
 
     def gradients(
         self, gaussians: Gaussians, frame: Frame, of_splats: SplatGradients, of_camera: bool
     ) -> GaussianGradients:
-        """Keep them, for those who have projected the splats, and find those of the camera."""
-        del gaussians, frame, of_camera
-        self.gradients_in_time.append(of_splats)
-        t = types_of(type(of_splats.geometry[0]))
-        nothing = dr.zeros(t.Array2f), t.Bool(False), t.UInt32(NO_FAULT)  # here; at any time
-        return GaussianGradients(None, *nothing)
+        """Return derivatives with respect to splats to the ranks that have projected them."""
+        del gaussians
+        each, time = self._current, len(self._current.gradients)
+        columns = self._divide(each, time, [*of_splats.geometry, *of_splats.features])
+        each.gradients.append(_splat_gradients(columns, each.local[time].layout))
+        each.frames.append(frame)
+        each.needs_camera = of_camera
+        t = types_of(type(of_splats.opacities))
+        return GaussianGradients(None, dr.zeros(t.Array2f), t.Bool(False), t.UInt32(NO_FAULT))
 
-    def blocks(self) -> list[Blocks]:
-        """Of each time the derivatives of its splats; waits for the device."""
-        rows = [Rows.of([*g.geometry, *g.features]) for g in self.gradients_in_time]
+    # Splats ---------------------------------------------------------------------------------------
+
+    def _cameras(self, view: StepView) -> list[Camera]:
+        """Return what is simulated of the view's camera, by time, detached."""
+        state = read_sensor(view.view.sensor, self.integrator.near)
+        camera = ignoring(camera_from_sensor(state.detached()), self.integrator.ignore)
+        return cameras_in_time(camera)
+
+    def _project(self, each: _View, cameras: Sequence[Camera]) -> None:
+        """Project the rows of this rank for a view that another renders."""
+        each.needs_camera = read_sensor(each.view.view.sensor, self.integrator.near).is_attached
+        with dr.suspend_grad():
+            gaussians, pipeline = dr.detach(self.integrator.gaussians), self.integrator.pipeline
+            for camera in cameras:
+                of_camera = composed(pipeline, gaussians, camera)
+                found = footprints_seen_by(gaussians, camera, of_camera)
+                each.local.append(LocalProjection.from_footprints(camera, of_camera, found))
+                each.packed.append(PackedProjection.from_footprints(each.local[-1], found))
+
+    def _divide(self, each: _View, time: int, columns: list[Any]) -> list[Any]:
+        """Send numbers of a rendered view's splats to their ranks; return those of this rank."""
+        if self.comm.size == 1:
+            return columns
+        ranks = range(self.comm.size)
+        ends = np.cumsum([each.num_splats(rank, time) for rank in ranks])
+        rows = Rows.of(columns)
         dr.eval(rows)
-        return [[b.numpy().reshape(-1, w) for b, w in _by_width(each)] for each in rows]
+        widths = block_widths(rows.width)
+        blocks = [b.numpy().reshape(-1, w) for b, w in zip(rows.blocks, widths, strict=True)]
+        starts = [0, *ends[:-1]]
+        for rank, start, end in zip(ranks, starts, ends, strict=True):
+            if rank != self.comm.rank and end > start:
+                part = [block[start:end] for block in blocks]
+                self.messages.send(part, rank, each.view.place, time)
+        index_type = types_of(rows.Float).UInt32
+        first = dr.opaque(index_type, int(starts[self.comm.rank]))
+        return rows.load(dr.arange(index_type, each.local[time].num_rows) + first)
+
+    def _receive(self, each: _View, weights: Sequence[str]) -> None:
+        """Receive what another rank has found out about the rows of this one."""
+        place, source = each.view.place, each.renderer
+        for time, packed in enumerate(each.packed):
+            layout = packed.local.layout
+            columns = self._receive_columns(packed, source, place, time, layout.num_gradients)
+            each.gradients.append(_splat_gradients(columns, layout))
+        for name in weights:
+            sums = [
+                self._receive_columns(packed, source, place, time, 1)[0]
+                for time, packed in enumerate(each.packed)
+            ]
+            each.sums[name] = sum(sums[1:], sums[0]) / len(sums)
+
+    def _receive_columns(
+        self, packed: PackedProjection, source: int, place: int, time: int, width: int
+    ) -> list[Any]:
+        blocks = _empty_blocks(packed.count, block_widths(width), packed.local.boxes.Float)
+        if packed.count > 0:
+            self.messages.receive(blocks, source, place, time)
+        return packed.unpack(blocks, width)
+
+    # Gaussians ------------------------------------------------------------------------------------
+
+    def _add_ready_views(self, is_end: bool) -> None:
+        """Add the derivatives of the next groups of views whose derivatives are all here.
+
+        Those of cameras take all ranks, and wait for the end of the step.
+        """
+        while self._num_added < len(self._views):
+            group = self._views[self._num_added :][:VIEWS_AT_ONCE]
+            is_whole = len(group) == VIEWS_AT_ONCE or is_end
+            if not (is_whole and all(each.gradients for each in group)):
+                return
+            if any(each.needs_camera for each in group):
+                if not is_end:
+                    return
+                for each in group:
+                    self._add_with_camera(each)
+            else:
+                self._add(group)
+            self._num_added += len(group)
+
+    def _add(self, group: Sequence[_View]) -> None:
+        """Add the derivatives of some views to those of the step."""
+        with dr.suspend_grad():
+            gaussians = dr.detach(self.integrator.gaussians)
+            seen = [[*map(LocalProjection.view_splats, v.local, v.gradients)] for v in group]
+            total, faults = sum_of_views(gaussians, seen)
+        self._accumulate(total)
+        for each, fault in zip(group, faults, strict=True):
+            each.first_fault = fault
+
+    def _add_with_camera(self, each: _View) -> None:
+        """Add the derivatives of a view, and those of its camera, which its renderer sums.
+
+        Each rank adds the terms of its rows, which are summed as if one rank had them all.
+        """
+        with dr.suspend_grad():
+            gaussians, found, of_cameras = dr.detach(self.integrator.gaussians), [], []
+            for local, gradients in zip(each.local, each.gradients, strict=True):
+                of_view, of_rows = gradients_by_row(
+                    gaussians, local.camera, local.pipeline, gradients, of_camera=True
+                )
+                found.append(of_view)
+                rows = np.stack([np.array(column) for column in of_rows], axis=1)
+                rows = self.comm.gather_rows(rows, each.renderer)
+                if rows is not None:
+                    sums = [dr.sum(from_host(type(of_rows[0]), column)) for column in rows.T]
+                    of_cameras.append(sums)
+            total = reduce(sum_of_gradients, found)
+        self._accumulate(total.parameters)
+        each.first_fault = total.first_fault
+        if of_cameras:
+            state = read_sensor(each.view.view.sensor, self.integrator.near)
+            accumulate_in_sensor(self.integrator, state, of_cameras)
+
+    def _accumulate(self, gradients: Gaussians) -> None:
+        for key, parameter in self.params.items():
+            dr.accum_grad(parameter, getattr(gradients, key.removeprefix(self.prefix)))
+
+    @staticmethod
+    def _result(each: _View) -> ViewGradients:
+        """Return what is known of a view, of the rows of this rank."""
+        means2d = reduce(add, (gradients.means2d for gradients in each.gradients))
+        visible = reduce(or_, (local.visible for local in each.local))
+        return ViewGradients(means2d, visible, each.sums, each.first_fault)
 
 
-def _by_width(rows: Rows) -> Iterator[tuple[Any, int]]:
-    return zip(rows.blocks, block_widths(rows.width), strict=True)
+def _splat_gradients(columns: list[Any], layout: SplatLayout) -> SplatGradients:
+    num_geometry = len(columns) - layout.num_features
+    return SplatGradients(columns[:num_geometry], columns[num_geometry:])

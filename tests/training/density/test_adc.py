@@ -15,7 +15,7 @@ from drgs.training.density.adc import (
     DensityStatistics,
     accumulate,
     densify_and_prune,
-    gathers_statistics,
+    needs_statistics,
     prunes_large,
     reset_opacities,
     should_densify,
@@ -79,7 +79,7 @@ def test_schedule_is_that_of_the_reference_training_loop(white):
             reset = i % 60 == 0 or (white and i == 20)
         assert should_densify(config, i) == densify, i
         assert should_reset(config, i, white) == reset, i
-        assert gathers_statistics(config, i) == (i < 200), i
+        assert needs_statistics(config, i) == (i < 200), i
         assert prunes_large(config, i) == (i > 60), i
 
 

@@ -39,7 +39,7 @@ def test_room_is_given_to_those_that_see_most_of_the_errors():
     before = values(optimizer)
     # Half of the way from 6 to 9 after a quarter of the time: 6 + 3 sqrt(1 / 4) = 7.5, even: 8.
     growth = strategy(optimizer, [1, 5, 3, 0, 4, 2], budget={"gaussians": 9})
-    report = growth.act(rows_of(optimizer), 325)
+    report = growth.refine(rows_of(optimizer), 325)
     assert (report.num_gaussians, report.split, report.pruned, report.refused) == (8, 2, 0, 0)
     after = values(optimizer)
     assert np.array_equal(after["sh0"][:4], before["sh0"][[0, 2, 3, 5]])
@@ -51,11 +51,11 @@ def test_equal_errors_are_split_by_index_and_none_without_errors():
     optimizer = make([0.1] * 5, [0.5] * 5)
     before = values(optimizer)["sh0"]
     growth = strategy(optimizer, [0, 2, 2, 2, 0], budget={"gaussians": 7})
-    assert growth.act(rows_of(optimizer), 1000).split == 2
+    assert growth.refine(rows_of(optimizer), 1000).split == 2
     assert np.array_equal(values(optimizer)["sh0"][3:5], before[[1, 2]])
     optimizer = make([0.1] * 5, [0.5] * 5)
     growth = strategy(optimizer, np.zeros(5), budget={"gaussians": 50})
-    assert growth.act(rows_of(optimizer), 1000).num_gaussians == 5
+    assert growth.refine(rows_of(optimizer), 1000).num_gaussians == 5
 
 
 def test_the_transparent_are_removed_and_their_room_is_used():
@@ -63,7 +63,7 @@ def test_the_transparent_are_removed_and_their_room_is_used():
     optimizer = make(scales, opacities)
     before = values(optimizer)["sh0"]
     growth = strategy(optimizer, [1, 9, 9, 2, 0.5], budget={"gaussians": 5})
-    report = growth.act(rows_of(optimizer), 500)
+    report = growth.refine(rows_of(optimizer), 500)
     assert (report.num_gaussians, report.split, report.pruned) == (5, 2, 2)
     after = values(optimizer)["sh0"]
     assert np.array_equal(after, before[[4, 0, 3, 0, 3]])
@@ -124,7 +124,7 @@ def test_neither_the_curve_nor_the_cap_is_exceeded(seed, num, target, cap, itera
         max_gaussians=cap,
     )
     try:
-        report = growth.act(rows_of(optimizer), iteration)
+        report = growth.refine(rows_of(optimizer), iteration)
     except UserError:
         return
     u = (iteration - 100) / 900
@@ -139,8 +139,8 @@ def test_the_last_change_is_at_the_end_of_growth_and_reaches_the_number():
     """Wherever the intervals between the others lead."""
     optimizer = make([0.1] * 6, [0.5] * 6)
     growth = strategy(optimizer, [1, 5, 3, 0, 4, 2], budget={"gaussians": 9}, stop=325)
-    assert [k for k in range(1, 500) if growth.acts(k)] == [150, 200, 250, 300, 325]
-    assert growth.act(rows_of(optimizer), 325).num_gaussians == 9
+    assert [k for k in range(1, 500) if growth.is_due(k)] == [150, 200, 250, 300, 325]
+    assert growth.refine(rows_of(optimizer), 325).num_gaussians == 9
 
 
 def test_a_population_that_would_vanish_is_refused():
@@ -181,8 +181,8 @@ def test_each_change_has_seen_errors(every, stop, error_every):
     config = DensifyConfig(start=1, stop=stop, every=every, budget=budget)
     growth, seen = GrowthToNumber(config), 0
     for iteration in range(1, stop + 5):
-        seen += growth.gathers(iteration)
-        if growth.acts(iteration):
+        seen += growth.needs_statistics(iteration)
+        if growth.is_due(iteration):
             assert seen > 0
             seen = 0
     assert seen == 0

@@ -204,7 +204,7 @@ def test_equal_seeds_give_equal_bytes():
 
 def test_it_acts_between_start_and_stop():
     chain = strategy()
-    acting = [i for i in range(1, 20_000) if chain.acts(i)]
+    acting = [i for i in range(1, 20_000) if chain.is_due(i)]
     assert acting == list(range(600, 15_000, 100))
 
 

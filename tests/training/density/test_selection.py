@@ -41,14 +41,14 @@ def test_the_phase_follows_growth_and_leaves_half_of_what_is_left():
     assert (schedule.start, schedule.stop) == (2000, 3000)
     reference = PruneSchedule.of(FitConfig(data={"path": "."}, densify={"prune": {"to": 9}}))
     assert (reference.start, reference.stop) == (15_000, 22_500)
-    acting = [i for i in range(5000) if schedule.acts(i)]
+    acting = [i for i in range(5000) if schedule.is_due(i)]
     assert acting == list(range(2050, 3001, 50))
 
 
 def test_the_phase_can_be_named_and_comes_after_growth_wherever_that_ends():
     config = config_of(to=100, start=2500, stop=2730, every=100)
     schedule = PruneSchedule.of(config)
-    assert [i for i in range(5000) if schedule.acts(i)] == [2600, 2700, 2730]
+    assert [i for i in range(5000) if schedule.is_due(i)] == [2600, 2700, 2730]
     later = PruneSchedule.of(changed(config, {"densify.stop": 2600}))
     assert (later.start, later.stop) == (2600, 2730)
 
@@ -81,7 +81,7 @@ def test_as_many_fall_below_the_threshold_as_are_to_go():
     before = values(optimizer)
     former = moments(optimizer, "logit_opacities")
     phase = NaturalSelection(config_of(to=50))
-    report = phase.act(rows_of(optimizer), 2500)
+    report = phase.refine(rows_of(optimizer), 2500)
     left = round(200 * 0.25**0.5)
     assert (report.pruned, report.num_gaussians) == (200 - left, left)
     kept = np.sort(np.argsort(-opacities)[:left])
@@ -99,7 +99,7 @@ def test_as_many_fall_below_the_threshold_as_are_to_go():
 def test_pressure_has_a_limit_and_then_nobody_goes():
     optimizer = make([SIZE] * 20, 0.5)
     phase = NaturalSelection(config_of(to=5))
-    assert phase.act(rows_of(optimizer), 2050) is None
+    assert phase.refine(rows_of(optimizer), 2050) is None
     logits = values(optimizer)["logit_opacities"]
     np.testing.assert_allclose(logits, -LARGEST_PRESSURE, rtol=1e-6)
 
@@ -109,18 +109,18 @@ def test_in_the_end_exactly_so_many_are_left():
     optimizer = make([SIZE] * 20, opacities)
     before = values(optimizer)["means"]
     phase = NaturalSelection(config_of(to=5))
-    report = phase.act(rows_of(optimizer), 3000)
+    report = phase.refine(rows_of(optimizer), 3000)
     assert report.num_gaussians == 5
     np.testing.assert_array_equal(values(optimizer)["means"], before[15:])
-    assert not any(phase.acts(i) for i in range(5000))
+    assert not any(phase.is_due(i) for i in range(5000))
 
 
 def test_fewer_than_that_are_left_alone():
     optimizer = make([SIZE] * 4, 0.5)
     before = values(optimizer)
     phase = NaturalSelection(config_of(to=5))
-    assert phase.act(rows_of(optimizer), 2050) is None
-    assert not phase.acts(2100)
+    assert phase.refine(rows_of(optimizer), 2050) is None
+    assert not phase.is_due(2100)
     for name, value in values(optimizer).items():
         np.testing.assert_array_equal(value, before[name])
 
@@ -133,9 +133,9 @@ def test_opacities_are_faster_while_they_are_under_pressure():
         return [phase.rate_factors(i)["logit_opacities"] for i in (1000, 2060, 2999, 3001)]
 
     assert factors() == [1, 1, 1, 1]
-    phase.act(rows_of(optimizer), 2050)
+    phase.refine(rows_of(optimizer), 2050)
     assert factors() == [1, 4, 4, 1]
-    phase.act(rows_of(optimizer), 3000)
+    phase.refine(rows_of(optimizer), 3000)
     assert factors() == [1, 1, 1, 1]
 
 
@@ -149,10 +149,10 @@ def test_random_populations_end_with_the_number(seed):
     rows, left = rows_of(optimizer), num
     phase.begin(rows)
     for iteration in range(2000, 3001):
-        if phase.acts(iteration):
-            if phase.gathers(iteration):
+        if phase.is_due(iteration):
+            if phase.needs_statistics(iteration):
                 phase.gather(Step(random.random(rows.num_rows)))
-            report = phase.act(rows, iteration)
+            report = phase.refine(rows, iteration)
             assert min(num, to) <= rows.num_rows <= left
             assert report is None or report.pruned == left - rows.num_rows
             left = rows.num_rows
@@ -169,10 +169,10 @@ def test_those_that_show_least_in_the_phase_go():
     phase.begin(rows)
     phase.gather(Step([5, 0, 1, 2, 0, 3, 2, 1]))
     phase.gather(Step([0, 9, 0, 0, 8, 0, 0, 0]))
-    assert phase.act(rows, 2500).num_gaussians == 4
+    assert phase.refine(rows, 2500).num_gaussians == 4
     np.testing.assert_array_equal(values(optimizer)["means"], before[[0, 1, 4, 5]])
     phase.gather(Step([2, 0, 0, 6]))
-    assert phase.act(rows, 3000).num_gaussians == 2
+    assert phase.refine(rows, 3000).num_gaussians == 2
     np.testing.assert_array_equal(values(optimizer)["means"], before[[1, 5]])
     assert np.array(phase.scores).tolist() == [9, 9]
 
@@ -183,9 +183,9 @@ def test_a_phase_goes_on_from_its_state(method):
         phase = method(config_of(to=2))
         optimizer = make([SIZE] * 8, np.linspace(0.01, 0.6, 8))
         phase.begin(rows_of(optimizer))
-        if phase.gathers(2050):
+        if phase.needs_statistics(2050):
             phase.gather(Step(np.arange(8)))
-        phase.act(rows_of(optimizer), 2050)
+        phase.refine(rows_of(optimizer), 2050)
         return phase, optimizer
 
     first, optimizer = begun()
@@ -194,9 +194,9 @@ def test_a_phase_goes_on_from_its_state(method):
     other.restore(first.state())
     for phase, opt in ((first, optimizer), (other, again)):
         for iteration in (2500, 2900):
-            if phase.gathers(iteration):
+            if phase.needs_statistics(iteration):
                 phase.gather(Step(np.arange(rows_of(opt).num_rows)[::-1].copy()))
-            phase.act(rows_of(opt), iteration)
+            phase.refine(rows_of(opt), iteration)
     for name, value in values(optimizer).items():
         np.testing.assert_array_equal(value, values(again)[name])
 

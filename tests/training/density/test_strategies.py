@@ -43,10 +43,10 @@ class Recorded(DensityStrategy):
     def begin(self, population):
         self.calls.append(("begin", population.num_rows))
 
-    def gathers(self, iteration):
+    def needs_statistics(self, iteration):
         return iteration != 3
 
-    def gather(self, step):
+    def update_statistics(self, step):
         shapes = step.image.shape, step.photograph.shape
         assert shapes == ((step.height, step.width, 3),) * 2 and dr.width(step.visible) == 40
         self.calls.append(("gather", step.iteration))
@@ -54,10 +54,10 @@ class Recorded(DensityStrategy):
     def perturb(self, population, iteration, means_lr):
         self.calls.append(("perturb", iteration, means_lr))
 
-    def acts(self, iteration):
+    def is_due(self, iteration):
         return iteration % 2 == 0
 
-    def act(self, population, iteration):
+    def refine(self, population, iteration):
         self.calls.append(("act", iteration))
 
 
@@ -161,10 +161,10 @@ class Phase(DensityStrategy):
     def begin(self, population):
         self.seen = 0
 
-    def gathers(self, iteration):
+    def needs_statistics(self, iteration):
         return iteration <= max(self.when)
 
-    def gather(self, step):
+    def update_statistics(self, step):
         self.seen += 1
 
     def rate_factors(self, iteration):
@@ -173,10 +173,10 @@ class Phase(DensityStrategy):
     def penalties(self, parameters, num_rows):
         yield self.name
 
-    def acts(self, iteration):
+    def is_due(self, iteration):
         return iteration in self.when
 
-    def act(self, population, iteration):
+    def refine(self, population, iteration):
         return DensityReport(self.num, num_added=self.num, cloned=2, pruned=1)
 
     def state(self):
@@ -197,18 +197,18 @@ class Seen:
 def test_phases_are_one_strategy_and_begin_anew_where_others_change_rows():
     first, last = Phase("first", {2, 4}), Phase("last", {4, 6}, num=7)
     phases = Phases((first, last))
-    assert [i for i in range(1, 9) if phases.acts(i)] == [2, 4, 6]
-    assert [i for i in range(1, 9) if phases.gathers(i)] == [1, 2, 3, 4, 5, 6]
+    assert [i for i in range(1, 9) if phases.is_due(i)] == [2, 4, 6]
+    assert [i for i in range(1, 9) if phases.needs_statistics(i)] == [1, 2, 3, 4, 5, 6]
     assert phases.rate_factors(1) == {"means": 4.0, "first": 3.0, "last": 3.0}
     assert list(phases.penalties({}, 5)) == ["first", "last"]
     assert phases.most_gaussians(100, 8) == 117
     for iteration in range(1, 6):
-        phases.gather(Seen(iteration))
+        phases.update_statistics(Seen(iteration))
     assert (first.seen, last.seen) == (4, 5)
-    assert phases.act(None, 2) == DensityReport(10, num_added=10, cloned=2, pruned=1)
+    assert phases.refine(None, 2) == DensityReport(10, num_added=10, cloned=2, pruned=1)
     assert (first.seen, last.seen) == (4, 0)
-    assert phases.act(None, 4) == DensityReport(7, num_added=17, cloned=4, pruned=2)
-    assert phases.act(None, 5) is None
+    assert phases.refine(None, 4) == DensityReport(7, num_added=17, cloned=4, pruned=2)
+    assert phases.refine(None, 5) is None
     first.seen, last.seen = 5, 6
     again = Phases((Phase("first", {2}), Phase("last", {2})))
     again.restore(phases.state())

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from drgs.core.processes import LAUNCHERS, process_count, process_number
-from drgs.training.stages import view_of
+from drgs.training.steps import view_of
 
 
 @pytest.fixture
