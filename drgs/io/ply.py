@@ -25,11 +25,12 @@ from __future__ import annotations
 import io
 import re
 import warnings
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Collection, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
-from typing import IO, TypeVar
+from typing import IO
 
 import numpy as np
 from plyfile import PlyData, PlyElement, PlyListProperty
@@ -220,15 +221,12 @@ def read_points(path: str | Path) -> tuple[np.ndarray, np.ndarray | None]:
 
 
 def properties_of(path: str | Path) -> dict[str, tuple[str, ...]]:
-    """Names of the properties of each element, as the header has them.
+    """Return the names of the properties of each element, as the header has them.
 
     Raises :class:`UserError` as :func:`read_gaussians` does for a header.
     """
-
-    def names(file: IO[bytes], layout: _Layout) -> dict[str, tuple[str, ...]]:
+    with _opened(path) as (_, layout):
         return {e.name: tuple(p.name for p in e.properties) for e in layout.elements}
-
-    return _read(path, names)
 
 
 def has_packed_vertices(path: str | Path) -> bool:
@@ -243,44 +241,33 @@ def has_packed_vertices(path: str | Path) -> bool:
 def read_elements(
     path: str | Path, names: Collection[str]
 ) -> tuple[dict[str, np.ndarray], dict[str, Scalar]]:
-    """The rows of some elements of a binary file, and what the header's comments say.
+    """Return the rows of some elements of a binary file, and the values in the header's comments.
 
     names: of elements that are there, among them ``vertex``. The rows are structured arrays of
     numbers.
 
     Raises :class:`UserError` as :func:`read_gaussians` does, and for a text file.
     """
-
-    def rows(file: IO[bytes], layout: _Layout) -> tuple[dict[str, np.ndarray], dict[str, Scalar]]:
+    with _opened(path) as (file, layout):
         if layout.text:
             raise UserError(f"{path}: the file must be binary, got text; convert it")
         return _rows(path, file, layout, names), layout.statements
 
-    return _read(path, rows)
-
 
 def _read_vertices(path: str | Path) -> tuple[np.ndarray, dict[str, Scalar]]:
-    """The rows of element ``vertex``, at least one, and what the header's comments say.
-
-    The rows are a structured array of numbers.
-    """
-
-    def rows(file: IO[bytes], layout: _Layout) -> tuple[np.ndarray, dict[str, Scalar]]:
+    """Return the rows of element ``vertex``, at least one, and the values in the comments."""
+    with _opened(path) as (file, layout):
         if layout.text:
             return _text_rows(path, file, layout), layout.statements
         return _rows(path, file, layout, ["vertex"])["vertex"], layout.statements
 
-    return _read(path, rows)
 
-
-T = TypeVar("T")
-
-
-def _read(path: str | Path, read: Callable[[IO[bytes], _Layout], T]) -> T:
-    """What ``read`` makes of the file and its header; whatever fails is a :class:`UserError`."""
+@contextmanager
+def _opened(path: str | Path) -> Iterator[tuple[IO[bytes], _Layout]]:
+    """Within the block, a file and its header; whatever fails there is a :class:`UserError`."""
     try:
         with open_regular(path) as file:
-            return read(file, _read_layout(path, file))
+            yield file, _read_layout(path, file)
     except (UserError, MemoryError):
         raise
     except OSError as error:
@@ -445,19 +432,15 @@ def _check_end(path: str | Path, layout: _Layout, more: int) -> None:
 
 
 def _finite_logits(path: str | Path, logits: np.ndarray) -> np.ndarray:
-    """With infinite ones at the ends of what sigmoids in float32 tell apart."""
-    count = np.count_nonzero(np.isinf(logits))
-    if count:
-        warnings.warn(
-            UserNote(
-                f"{path}: {count:,} of {len(logits):,} opacities are infinite logits, as formats "
-                f"of 8 bits leave them for 1 and 0; read as {LARGEST_LOGIT:.2f} and "
-                f"{SMALLEST_LOGIT:.2f}"
-            ),
-            stacklevel=2,
+    """Logits with infinite ones at the ends of what sigmoids in float32 tell apart."""
+    if count := np.count_nonzero(np.isinf(logits)):
+        note = (
+            f"{path}: {count:,} of {len(logits):,} opacities are infinite logits, as formats of 8 "
+            f"bits leave them for 1 and 0; read as {LARGEST_LOGIT:.2f} and {SMALLEST_LOGIT:.2f}"
         )
+        warnings.warn(UserNote(note), stacklevel=2)
     ends = {"posinf": np.float32(LARGEST_LOGIT), "neginf": np.float32(SMALLEST_LOGIT)}
-    return np.nan_to_num(logits, copy=False, nan=np.nan, **ends)
+    return np.nan_to_num(logits, nan=np.nan, **ends)
 
 
 def _require(
