@@ -54,15 +54,12 @@ UNSUPPORTED_GSPLAT_ARGUMENTS = {
     "far_plane": "leave out the Gaussians beyond it",
     "radius_clip": "leave it out: small splats cost little",
     "packed": "leave it out: results have a row for each Gaussian",
-    "tile_size": "leave it out: a tile has 16 x 16 px",
-    "channel_chunk": "leave it out: all channels are composited at once",
     "sparse_grad": "leave it out: gradients have a row for each Gaussian",
     "absgrad": "leave it out: gradients are summed with their signs",
-    "distributed": "leave it out: there is one device",
-    "segmented": "leave it out: Gaussians are sorted once for all tiles",
     "covars": "give quats and scales",
     "with_ut": 'give projection="unscented"',
     "with_eval3d": 'give projection="exact"',
+    **dict.fromkeys(("tile_size", "channel_chunk", "distributed", "segmented"), "leave it out"),
     **dict.fromkeys(
         (
             "camera_model",

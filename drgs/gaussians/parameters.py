@@ -201,7 +201,7 @@ class Gaussians:
 
     def _turned(self, rotation: np.ndarray) -> Gaussians:
         """Numpy arrays turned as a whole; float32."""
-        from drgs.gaussians.turning import as_float32, turned
+        from drgs.gaussians.rotation import as_float32, turned
 
         parts = turned(self.means, self.quats, self.shN, rotation)
         names = ("means", "quats", "shN")

@@ -12,7 +12,7 @@ import numpy as np
 
 from drgs.core.errors import PluginError
 from drgs.gaussians.parameters import Gaussians
-from drgs.gaussians.turning import as_float32, turned
+from drgs.gaussians.rotation import as_float32, turned
 
 TOLERANCE = 1e-4
 """Of A^T A / s^2 - I: numbers written with five digits are a rotation, a shear by a pixel in ten

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from drgs.gaussians.sh_rotation import (
+from drgs.gaussians.rotation import (
     rotated,
     sh_rotation_generators,
     sh_rotation_matrices,

@@ -12,7 +12,7 @@ from conftest import REPOSITORY
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from drgs.gaussians.sh_rotation import rotated
+from drgs.gaussians.rotation import rotated
 
 SCENES = REPOSITORY / "scenes"
 MODEL = SCENES / "shapes" / "knot.ply"
