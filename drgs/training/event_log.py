@@ -1,7 +1,9 @@
 """The history of a fit as TensorBoard reads it, written as the fit goes.
 
-Imported with ``--tensorboard``; tensorboardX, of the extra of that name, knows the format: records
-with checksums, each an event of TensorFlow's ``event.proto``.
+Imported with ``--tensorboard``; tensorboardX, of the extra of that name, writes the format: records
+with checksums, each an event of TensorFlow's ``event.proto``. Its ``SummaryWriter`` names files
+after the time and the host, and writes them from a thread; the file of a fit has one name, which
+the folder's record knows, and is complete after each row.
 """
 
 from __future__ import annotations
@@ -9,7 +11,6 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from pathlib import Path
-from types import TracebackType
 
 from tensorboardX.proto.event_pb2 import Event
 from tensorboardX.record_writer import RecordWriter
@@ -52,12 +53,7 @@ class EventLog:
         """The file is open."""
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         """Close the file."""
         self._writer.close()
 
