@@ -36,10 +36,10 @@ from drgs.results.viewer import HONOURED, Shown, Standpoint, viewer_page
 COMMAND = "export"
 
 Z_UP = np.array([0.0, 0.0, 1.0])
-"""Of datasets, and of what ``Gaussians.save`` expects for formats with axes of their own."""
+"""Up in datasets, and in what ``Gaussians.save`` expects for formats with axes of their own."""
 
 Y_DOWN = np.array([0.0, -1.0, 0.0])
-"""What programs take for up in formats that do not say: that of COLMAP's worlds, in which the 3DGS
+"""Up in formats that define none, as programs take it: that of COLMAP's worlds, in which the 3DGS
 reference fits."""
 
 PLAYCANVAS = "compressed-ply"
@@ -53,7 +53,7 @@ SNAPPED = np.cos(np.radians(5))
 
 @dataclass(frozen=True)
 class Source:
-    """What is exported."""
+    """Gaussians to export."""
 
     gaussians: Gaussians  # numpy, without a smoothing filter
     path: Path  # of the file
@@ -74,7 +74,7 @@ def _honoured_by_playcanvas(fitted: Approximations) -> frozenset[str]:
 
 @dataclass(frozen=True)
 class Target:
-    """What it is exported to."""
+    """A format that ``--format`` names."""
 
     suffix: str  # of files, in small letters
     text: str  # what it is, one phrase
@@ -102,7 +102,7 @@ def _format_target(name: str, chosen: type[FileFormat]) -> Target:
 
 
 def _page(source: Source) -> bytes:
-    """With the first view and the background of the fit, or before black where there is none."""
+    """Encode a page with the first view and the background of the fit; black if there is none."""
     gaussians, folder = source.gaussians, source.folder
     background = (0.0, 0.0, 0.0) if folder is None else load_run_config(folder).data.background_rgb
     cameras = (
@@ -245,7 +245,7 @@ def load_source(what: Path, honoured: Honoured | None = None) -> Source:
 
 
 def _shows_own(folder: Path, honoured: Honoured) -> bool:
-    """Whether a fit's own Gaussians are there, and need no other approximations."""
+    """Return whether a fit's own Gaussians are there, and need no other approximations."""
     if honoured is None or not (folder / GAUSSIANS).is_file():
         return False
     fitted = load_run_config(folder).model.approximations
@@ -304,7 +304,7 @@ def _selection(args: argparse.Namespace) -> Selection:
 
 
 def _selected(source: Source, selection: Selection) -> Gaussians:
-    """Those that are kept, with a line of how many that are."""
+    """Return the Gaussians that are kept, and print their number."""
     gaussians = source.gaussians
     kept_by = selection.kept_by(gaussians)
     if not kept_by:

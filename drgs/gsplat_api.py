@@ -401,7 +401,7 @@ class _Planes(dr.CustomOp):
 
 
 class _View:
-    """What one camera renders, and its derivatives."""
+    """Planes of one camera, and their derivatives."""
 
     def __init__(
         self, film: _Film, pipeline: Pipeline, inputs: Mapping[str, Any], index: int

@@ -21,23 +21,23 @@ class UserError(ValueError):
 
 
 class UserNote(UserWarning):
-    """What a user should know of an input that is used all the same; commands print its text."""
+    """A note about an input that is used all the same; commands print its text."""
 
 
 class PluginError(UserError):
-    """What a scene asks of a plugin and cannot have; the message begins with the plugin's name."""
+    """A parameter or scene that a plugin cannot use; the message begins with the plugin's name."""
 
 
 class PluginTypeError(PluginError, TypeError):
-    """The same, where something is of another type than it must be."""
+    """A :class:`PluginError` about a value of the wrong type."""
 
 
 class UnsupportedError(PluginError, NotImplementedError):
-    """The same, where the plugin has no code for it."""
+    """A :class:`PluginError` about something that the plugin has no code for."""
 
 
 class Place(NamedTuple):
-    """Where something stands in a file, as messages say it."""
+    """A place in a file, as messages write it."""
 
     path: Path
     unit: str  # byte, or line
@@ -92,7 +92,7 @@ def did_you_mean(name: str, candidates: Iterable[str], cutoff: float = 0.7) -> s
 
 
 def show_causes_last() -> None:
-    """From now on, repeat a user's error after the traceback of what was raised because of it.
+    """Print a user's error once more after the traceback of what was raised because of it.
 
     Dr.Jit raises errors of a picture, a loop or a frozen function again, as a RuntimeError whose
     text is "see above", which may be pages away. In scripts and, where this is called from one, in

@@ -21,14 +21,14 @@ from drgs.core.errors import UserError, listed
 from drgs.core.files import atomic_path, open_regular, read_text, remove_temporaries_of
 
 MAX_BYTES = 1 << 26
-"""Of a record: 67 MB, two hundred bytes for each of a third of a million files."""
+"""Largest record: 67 MB, two hundred bytes for each of a third of a million files."""
 
 _CHUNK = 1 << 20
 
 
 @dataclass(frozen=True)
 class _Content:
-    """Of the file. Names are relative to the folder, with slashes."""
+    """Content of the file. Names are relative to the folder, with slashes."""
 
     files: dict[str, str | None] = field(default_factory=dict)  # digests; None: being written
     paths: dict[str, str] = field(default_factory=dict)  # relative, by key of a configuration
@@ -48,11 +48,11 @@ class FolderRecord:
 
     @property
     def paths(self) -> Mapping[str, str]:
-        """What was kept besides: paths relative to the folder, by key of a configuration."""
+        """Paths that were kept besides, relative to the folder, by key of a configuration."""
         return self._content.paths
 
     def strangers(self, names: Iterable[str]) -> list[str]:
-        """Those of ``names`` (relative to the folder) that are there and somebody else's."""
+        """Return the ``names`` (relative to the folder) of files that belong to others."""
         return [name for name in names if self._is_strange(name)]
 
     def check(self, names: Iterable[str], earlier: Collection[str] = ()) -> None:
@@ -115,7 +115,7 @@ class FolderRecord:
 
 
 def digest(path: Path) -> str:
-    """SHA-256 of a file's bytes, as text; :class:`UserError` where it cannot be read."""
+    """Return the SHA-256 of a file's bytes, as text; :class:`UserError` where it cannot be read."""
     found = hashlib.sha256()
     try:
         with open_regular(path) as file:

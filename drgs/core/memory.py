@@ -1,4 +1,4 @@
-"""How much memory there is, and what is refused because it cannot be held.
+"""Available memory, and refusals of what it cannot hold.
 
 Linux ends a process that takes more than there is, without a word. What may become large is
 therefore estimated before it is allocated.
@@ -29,14 +29,14 @@ MAX_LANES = 2**32 - 1
 """Entries of an array of Dr.Jit, which counts them in 32 bits."""
 
 PICTURE_BYTES = 250
-"""About what rendering takes for a pixel: splats in its tile, planes, the film's block, the picture
-and its copy on the host."""
+"""Bytes for a pixel, about: splats in its tile, planes, the film's block, the image, its copy on
+the host."""
 
 SAMPLE_BYTES = 80
-"""The same for each further sample of a pixel, whose planes are kept as well."""
+"""Bytes for each further sample of a pixel, whose planes are kept as well."""
 
 CHANNEL_BYTES = 24
-"""The same for each channel of the film besides colour: its plane, and its part of the block, of
+"""Bytes for each channel of the film besides colour: its plane, and its part of the block, of
 the picture and of the copy."""
 
 UNASKED_FILE_BYTES = 1 << 24
@@ -178,7 +178,7 @@ def _of_process() -> int:
 
 
 def _of_control_groups() -> int:
-    """What the limits of the control groups leave that the process is in; both versions."""
+    """Bytes that the limits of the process's control groups leave; both versions."""
     rooms = [_UNLIMITED]
     for line in _lines(_PROC / "self" / "cgroup"):
         _, controllers, path = line.split(":", 2)
@@ -196,7 +196,7 @@ def _of_control_groups() -> int:
 
 
 def _room(group: Path, limit: str, usage: str, reclaimable: str) -> int:
-    """What a control group has left; files that it keeps in memory make room when asked to."""
+    """Bytes that a control group has left; files that it keeps in memory can be dropped."""
     most, used = (next(iter(_lines(group / name)), "") for name in (limit, usage))
     if not most.isdigit() or not used.isdigit() or int(most) >= _UNLIMITED:
         return _UNLIMITED
@@ -207,7 +207,7 @@ def _room(group: Path, limit: str, usage: str, reclaimable: str) -> int:
 
 
 def _lines(path: Path) -> list[str]:
-    """Of a file of the kernel; none where there is no such file."""
+    """Lines of a file of the kernel; none where there is no such file."""
     try:
         return path.read_text().splitlines()
     except OSError:

@@ -201,11 +201,11 @@ class Gaussians:
 
     def _turned(self, rotation: np.ndarray) -> Gaussians:
         """Numpy arrays turned as a whole; float32."""
-        from drgs.gaussians.rotation import as_float32, turned
+        from drgs.gaussians.rotation import rotate_gaussians, to_float32
 
-        parts = turned(self.means, self.quats, self.shN, rotation)
+        parts = rotate_gaussians(self.means, self.quats, self.shN, rotation)
         names = ("means", "quats", "shN")
-        means, quats, shN = (as_float32(n, p) for n, p in zip(names, parts, strict=True))
+        means, quats, shN = (to_float32(n, p) for n, p in zip(names, parts, strict=True))
         x, y, z = (rotation @ self.origin).tolist()
         return replace(self, means=means, quats=quats, shN=shN, origin=(x, y, z))
 

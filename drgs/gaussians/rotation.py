@@ -20,8 +20,8 @@ MAX_QUATERNION = 1e30
 """Components of larger ones might leave float32 when they are turned."""
 
 
-def as_float32(name: str, values: np.ndarray) -> np.ndarray:
-    """The numbers in single precision.
+def to_float32(name: str, values: np.ndarray) -> np.ndarray:
+    """Return the numbers in single precision.
 
     Raises :class:`UserError` where finite ones are beyond it.
     """
@@ -34,13 +34,13 @@ def as_float32(name: str, values: np.ndarray) -> np.ndarray:
     return values.astype(np.float32)
 
 
-def turned(
+def rotate_gaussians(
     means: np.ndarray,
     quats: np.ndarray,
     shN: np.ndarray,
     rotation: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Positions, quaternions and harmonics after x' = R x; float64, of the same shapes.
+    """Return positions, quaternions and harmonics after x' = R x; float64, of the same shapes.
 
     means: (N, 3); quats: (N, 4) wxyz, of any norm, which they keep up to 1e30; shN: (N, K - 1, 3)
     of degree 1 and above; rotation: R (3, 3), orthonormal, determinant 1.
@@ -49,12 +49,12 @@ def turned(
     sizes = np.abs(quats).max(axis=1, keepdims=True, initial=MAX_QUATERNION)
     return (
         means @ rotation.T,
-        quats / (sizes / MAX_QUATERNION) @ left_product(rotation).T,
-        rotated(shN.astype(np.float64), rotation),
+        quats / (sizes / MAX_QUATERNION) @ left_multiplication_matrix(rotation).T,
+        rotate_sh(shN.astype(np.float64), rotation),
     )
 
 
-def left_product(rotation: np.ndarray) -> np.ndarray:
+def left_multiplication_matrix(rotation: np.ndarray) -> np.ndarray:
     """(4, 4): Hamilton's product with a rotation's quaternion from the left, of wxyz.
 
     rotation: (3, 3), orthonormal, determinant 1.
@@ -73,7 +73,7 @@ well conditioned as the functions are orthogonal."""
 
 
 def sh_rotation_matrices(rotation: np.ndarray, degree: int) -> list[np.ndarray]:
-    """For each degree l from 1 to ``degree``, the matrix D (2 l + 1, 2 l + 1) with c' = D c.
+    """Return for each degree l from 1 to ``degree`` the matrix D (2 l + 1, 2 l + 1) with c' = D c.
 
     rotation: R (3, 3), x' = R x. With c' for c, the function's value in a direction R d is what it
     was in d: sum_k Y_k(d') c'_k = sum_k Y_k(R^T d') c_k for all unit d'. float64.
@@ -84,7 +84,7 @@ def sh_rotation_matrices(rotation: np.ndarray, degree: int) -> list[np.ndarray]:
 
 @cache
 def sh_rotation_generators(degree: int) -> list[list[np.ndarray]]:
-    """For rotations about x, y and z, derivatives of :func:`sh_rotation_matrices` at the identity.
+    """Return derivatives of :func:`sh_rotation_matrices` at the identity, about x, y and z.
 
     A rotation by the small vector w turns c into c + sum_a w_a G_a c: the function's value at d is
     then that at d - w x d, differentiated here by a complex step, which is exact for polynomials.
@@ -102,8 +102,8 @@ def _projected(values: np.ndarray, degree: int) -> list[np.ndarray]:
     return [np.linalg.lstsq(basis[:, b], values[:, b], rcond=None)[0] for b in bands]
 
 
-def rotated(coefficients: np.ndarray, rotation: np.ndarray) -> np.ndarray:
-    """Coefficients (N, K - 1, 3) of degree 1 and above, rotated; K = (degree + 1)^2."""
+def rotate_sh(coefficients: np.ndarray, rotation: np.ndarray) -> np.ndarray:
+    """Return rotated coefficients (N, K - 1, 3) of degree 1 and above; K = (degree + 1)^2."""
     degree = round(np.sqrt(coefficients.shape[1] + 1)) - 1
     turned, start = [coefficients[:, :0]], 0
     for matrix in sh_rotation_matrices(rotation, degree):

@@ -32,7 +32,7 @@ import numpy as np
 from drgs.core.arrays import from_host
 from drgs.core.errors import PluginError
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
-from drgs.gaussians.rotation import left_product
+from drgs.gaussians.rotation import left_multiplication_matrix
 from drgs.gaussians.similarity import Similarity
 from drgs.integrator.gathering import columns, interleaved
 from drgs.integrator.harmonics import Turn, number_of
@@ -294,7 +294,7 @@ class _Numbers:
             "linear": place.scale * place.rotation,
             "inverse": place.rotation.T / place.scale,
             "translation": place.translation,
-            "quaternion": left_product(place.rotation),
+            "quaternion": left_multiplication_matrix(place.rotation),
             "scale": np.array([place.scale, np.log(place.scale)]),
         }
         on_device = {name: from_host(mi.Float, values) for name, values in numbers.items()}

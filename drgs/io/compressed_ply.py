@@ -34,14 +34,14 @@ from drgs.io.ply import (
     read_elements,
 )
 from drgs.io.quantization import (
-    gaussians_bytes,
-    logits_of,
+    decoding_bytes,
+    drop_largest_component,
+    logits_from_opacities,
     morton_order,
-    opacities_of,
-    rounded,
-    unit_quaternions,
-    with_largest,
-    without_largest,
+    normalize_quaternions,
+    opacities_from_logits,
+    restore_largest_component,
+    round_to_uint32,
 )
 
 CHUNK = 256
@@ -86,7 +86,7 @@ def encode(
     }
     bounds = {name: _bounds(v) for name, v in values.items()}
     parts = {name: _parts(v, *bounds[name]) for name, v in values.items()}
-    colors = np.column_stack([parts["color"], opacities_of(g["logit_opacities"])])
+    colors = np.column_stack([parts["color"], opacities_from_logits(g["logit_opacities"])])
     vertex = {
         "packed_position": _packed(parts["position"], VECTOR_BITS),
         "packed_rotation": _packed_rotations(g["quats"]),
@@ -137,12 +137,14 @@ def _packed(parts: np.ndarray, bits: tuple[int, ...]) -> np.ndarray:
     """Numbers from 0 to 1 (N, len(bits)) in as many bits each, the first in the highest."""
     word = np.zeros(len(parts), np.uint32)
     for column, count in enumerate(bits):
-        word = word << np.uint32(count) | rounded(parts[:, column] * (2**count - 1), 2**count - 1)
+        word = word << np.uint32(count) | round_to_uint32(
+            parts[:, column] * (2**count - 1), 2**count - 1
+        )
     return word
 
 
 def _packed_rotations(quats: np.ndarray) -> np.ndarray:
-    index, others = without_largest(unit_quaternions(quats))
+    index, others = drop_largest_component(normalize_quaternions(quats))
     parts = others / (2 * QUATERNION_RANGE) + 0.5
     return index.astype(np.uint32) << np.uint32(30) | _packed(parts, QUATERNION_BITS)
 
@@ -170,7 +172,7 @@ def read_gaussians(path: str | Path) -> tuple[dict[str, np.ndarray], dict[str, S
     rows, statements = read_elements(path, [n for n in ("chunk", "vertex", "sh") if n in there])
     vertex = rows["vertex"]
     harmonics = 1 + len(rows["sh"].dtype.names) // 3 if "sh" in rows else 1
-    needed = gaussians_bytes(len(vertex), harmonics)
+    needed = decoding_bytes(len(vertex), harmonics)
     require_memory(path, needed, f"a scene of {len(vertex):,} Gaussians")
     bounds = _checked_bounds(path, rows, colors="min_r" in there["chunk"])
     _check_unsigned(path, "vertex", vertex, PACKED, 4)
@@ -187,7 +189,9 @@ def read_gaussians(path: str | Path) -> tuple[dict[str, np.ndarray], dict[str, S
         "means": position,
         "quats": _unpacked_rotations(vertex["packed_rotation"]),
         "log_scales": scale,
-        "logit_opacities": logits_of(_unpacked(vertex["packed_color"], COLOR_BITS)[:, 3]),
+        "logit_opacities": logits_from_opacities(
+            _unpacked(vertex["packed_color"], COLOR_BITS)[:, 3]
+        ),
         "sh0": ((color - 0.5) / SH_C0)[:, None, :],
         "shN": _harmonics(path, rows.get("sh"), len(vertex)),
     }
@@ -273,7 +277,7 @@ def _unpacked(words: np.ndarray, bits: tuple[int, ...]) -> np.ndarray:
 
 def _unpacked_rotations(words: np.ndarray) -> np.ndarray:
     others = (_unpacked(words, QUATERNION_BITS) - 0.5) * (2 * QUATERNION_RANGE)
-    return with_largest((words >> np.uint32(30)).astype(np.intp), others)
+    return restore_largest_component((words >> np.uint32(30)).astype(np.intp), others)
 
 
 def _harmonics(path: str | Path, sh: np.ndarray | None, num: int) -> np.ndarray:

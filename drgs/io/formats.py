@@ -70,13 +70,13 @@ class FileFormat:
     """Axis that the format defines as up, ``"y"`` or ``"z"``; None: it defines none."""
 
     has_harmonics = True
-    """Whether files hold harmonics above degree 0."""
+    """Harmonics above degree 0 are kept."""
 
     has_smoothing = False
-    """Whether files hold the smoothing filter of each Gaussian."""
+    """The smoothing filter of each Gaussian is kept."""
 
     allows_nonfinite = False
-    """Whether numbers that are not finite are written as they are."""
+    """Numbers that are not finite are written as they are."""
 
     metadata: frozenset[str] | None = frozenset()
     """Names of ``rendered_with`` that files hold; None: all. The user is told of others."""
@@ -186,7 +186,7 @@ def encode(
 
 @contextmanager
 def _reporting(extension: Extension[Any], path: str | Path) -> Iterator[None]:
-    """Within the block, raise errors of an extension with its name and that of the file."""
+    """Raise errors of the block with the name of the extension and that of the file."""
     try:
         with extension.reporting():
             yield

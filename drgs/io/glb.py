@@ -35,26 +35,26 @@ from drgs.core.origin import WORLD, near_means
 from drgs.io.formats import FORMATS, MAX_ORIGIN, ORIGIN, FileFormat, Scalar, pop_origin
 from drgs.io.ply import STATEMENT
 from drgs.io.quantization import (
-    gaussians_bytes,
-    log_scales_of,
-    logits_of,
-    opacities_of,
-    rounded,
-    unit_quaternions,
+    decoding_bytes,
+    log_scales_from_scales,
+    logits_from_opacities,
+    normalize_quaternions,
+    opacities_from_logits,
+    round_to_uint32,
 )
 
 EXTENSION = "KHR_gaussian_splatting"
 REQUIRED = ("POSITION", *(f"{EXTENSION}:{name}" for name in ("ROTATION", "SCALE", "OPACITY")))
 
 MAX_RATIO = 64
-"""How many times more memory a scene may take than its file has bytes: those with a byte for each
-number take 10 times."""
+"""Largest ratio of a scene's memory to its file's bytes: files with a byte for each number have
+10."""
 
 MAX_JSON_BYTES = 1 << 24
 """Limit of the JSON part, which takes up to 30 times as much memory."""
 
 MAX_BYTES = (1 << 32) - 1
-"""Of a file: its length is a number of 32 bits."""
+"""Largest file: its length is a number of 32 bits."""
 
 HEADER = struct.Struct("<4sII")
 CHUNK = struct.Struct("<I4s")
@@ -68,12 +68,12 @@ ARRAY_BUFFER = 34962
 POINTS = 0
 
 COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5126: "<f4"}
-"""By number, the types of components that splats may have."""
+"""Types of components that splats may have, by number."""
 
 NOT_NEGATIVE = "linear, so not negative (drafts of the extension had logarithms)"
 
 KINDS = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
-"""By number of components."""
+"""Types of accessors, by number of components."""
 
 
 OURS = "drgs"
@@ -112,15 +112,15 @@ def encode(
 
 
 def _attributes(g: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """By name, arrays of float32 or bytes, each a multiple of 4 bytes long."""
-    opacities = opacities_of(g["logit_opacities"])
+    """Return arrays of float32 or bytes by name, each a multiple of 4 bytes long."""
+    opacities = opacities_from_logits(g["logit_opacities"])
     colors = 0.5 + SH_C0 * g["sh0"][:, 0].astype(np.float64)
     limits = np.finfo(np.float32)
     scales = np.exp(np.clip(g["log_scales"].astype(np.float64), -200, np.log(float(limits.max))))
     attributes = {
         "POSITION": g["means"],
-        "COLOR_0": rounded(np.column_stack([colors, opacities]) * 255, 255).astype("u1"),
-        f"{EXTENSION}:ROTATION": np.roll(unit_quaternions(g["quats"]), -1, axis=1),
+        "COLOR_0": round_to_uint32(np.column_stack([colors, opacities]) * 255, 255).astype("u1"),
+        f"{EXTENSION}:ROTATION": np.roll(normalize_quaternions(g["quats"]), -1, axis=1),
         f"{EXTENSION}:SCALE": scales,
         f"{EXTENSION}:OPACITY": opacities[:, None],
     }
@@ -221,8 +221,8 @@ def read_gaussians(path: str | Path) -> tuple[dict[str, np.ndarray], dict[str, S
     arrays = {
         "means": means,
         "quats": np.roll(document.values(f"{EXTENSION}:ROTATION", 4), 1, axis=1),
-        "log_scales": log_scales_of(scales),
-        "logit_opacities": logits_of(opacities[:, 0]),
+        "log_scales": log_scales_from_scales(scales),
+        "logit_opacities": logits_from_opacities(opacities[:, 0]),
         "sh0": harmonics[:, :1],
         "shN": harmonics[:, 1:],
     }
@@ -239,7 +239,7 @@ def _check_memory(path: Path, document: _Document, harmonics: int, size: int) ->
     Attributes may lie in the same bytes.
     """
     num = document.count
-    needed, what = gaussians_bytes(num, harmonics, turned=True), f"a scene of {num:,} Gaussians"
+    needed, what = decoding_bytes(num, harmonics, turned=True), f"a scene of {num:,} Gaussians"
     if needed > MAX_RATIO * size and needed > UNASKED_FILE_BYTES:
         raise UserError(
             f"{path}: {document.place}: {what} takes about {readable(needed)} of memory, and a "
@@ -292,7 +292,7 @@ class _Part(BaseModel):
 
 
 class _Accessor(_Part):
-    """How numbers lie in a part of the buffer."""
+    """Layout of numbers in a part of the buffer."""
 
     buffer_view: Index | None = None
     byte_offset: Index = 0
@@ -364,7 +364,7 @@ class _Document:
 
     @property
     def rendered_with(self) -> dict[str, Scalar]:
-        """What the primitive's extras say of it; nothing, where they are somebody else's."""
+        """Our values in the primitive's extras; none if another program wrote them."""
         extras = self.primitive.extras
         if not isinstance(extras, dict) or OURS not in extras:
             return {}

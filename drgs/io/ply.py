@@ -163,7 +163,7 @@ def _statement(name: str, value: Scalar) -> str:
 
 
 def _statements(path: str | Path, lines: list[bytes]) -> dict[str, Scalar]:
-    """What the comments of a header say; lines: of the header."""
+    """Return the values in the comments of a header; lines: of the header."""
     found: dict[str, str] = {}
     for line in lines:
         match = STATEMENT.fullmatch(
@@ -264,7 +264,7 @@ def _read_vertices(path: str | Path) -> tuple[np.ndarray, dict[str, Scalar]]:
 
 @contextmanager
 def _opened(path: str | Path) -> Iterator[tuple[IO[bytes], _Layout]]:
-    """Within the block, a file and its header; whatever fails there is a :class:`UserError`."""
+    """Open a file and read its header; whatever fails in the block becomes a :class:`UserError`."""
     try:
         with open_regular(path) as file:
             yield file, _read_layout(path, file)
@@ -279,7 +279,7 @@ def _opened(path: str | Path) -> Iterator[tuple[IO[bytes], _Layout]]:
 
 @dataclass(frozen=True)
 class _Layout:
-    """What a header says. The elements have no rows; ``counts`` says how many are promised."""
+    """Content of a header. The elements have no rows; ``counts`` has their promised numbers."""
 
     elements: tuple[PlyElement, ...]
     counts: tuple[int, ...]
@@ -364,7 +364,7 @@ def _lists(element: PlyElement) -> list[str]:
 def _rows(
     path: str | Path, file: IO[bytes], layout: _Layout, names: Collection[str]
 ) -> dict[str, np.ndarray]:
-    """Of some elements of a binary file. What stands behind an element with lists is not read."""
+    """Read some elements of a binary file. What follows an element with lists is not read."""
     position, places = layout.start, {}
     for element, count in zip(layout.elements, layout.counts, strict=True):
         if _lists(element):  # behind the vertices: where these end, nobody knows
@@ -392,7 +392,7 @@ def _rows(
 
 
 def _text_rows(path: str | Path, file: IO[bytes], layout: _Layout) -> np.ndarray:
-    """Of a text file, where each row is a line."""
+    """Read the vertices of a text file, in which each row is a line."""
     file.seek(layout.start)
     lines = io.TextIOWrapper(file, "ascii")
     rows = None

@@ -19,11 +19,11 @@ SMALLEST_LOG_SCALE = -126 * math.log(2)
 """Logarithm of the smallest normal float32: what a scale of 0 becomes."""
 
 _OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
-"""By the index of one of four components: those of the other three."""
+"""Indices of the other three components, by the index of one of four."""
 
 
-def gaussians_bytes(count: int, harmonics: int, turned: bool = False) -> int:
-    """About the memory that decoding so many Gaussians takes.
+def decoding_bytes(count: int, harmonics: int, turned: bool = False) -> int:
+    """Return about the bytes of memory that decoding so many Gaussians takes.
 
     harmonics: coefficients of each; turned: whether a format's axes are turned to ours afterwards.
     Measured: 276 bytes at degree 0, 808 at degree 3, and 1,372 where they are turned.
@@ -31,33 +31,33 @@ def gaussians_bytes(count: int, harmonics: int, turned: bool = False) -> int:
     return count * (240 + (72 if turned else 36) * harmonics)
 
 
-def rounded(values: np.ndarray, largest: int) -> np.ndarray:
-    """The nearest whole numbers from 0 to ``largest``, as uint32."""
+def round_to_uint32(values: np.ndarray, largest: int) -> np.ndarray:
+    """Return the nearest whole numbers from 0 to ``largest``."""
     return np.clip(np.floor(np.asarray(values, np.float64) + 0.5), 0, largest).astype(np.uint32)
 
 
-def opacities_of(logits: np.ndarray) -> np.ndarray:
-    """Opacities (N,) float64 of logits (N,)."""
+def opacities_from_logits(logits: np.ndarray) -> np.ndarray:
+    """Return opacities (N,) float64."""
     return 1 / (1 + np.exp(-np.clip(logits.astype(np.float64), -700, 700)))
 
 
-def logits_of(opacities: np.ndarray) -> np.ndarray:
-    """Finite logits (N,) float32 of opacities (N,) in [0, 1], as sigmoids tell them apart."""
+def logits_from_opacities(opacities: np.ndarray) -> np.ndarray:
+    """Return finite logits (N,) float32 of opacities (N,) in [0, 1]."""
     opacities = opacities.astype(np.float64)
     with np.errstate(divide="ignore"):
         logits = np.log(opacities) - np.log1p(-opacities)
     return np.clip(logits, SMALLEST_LOGIT, LARGEST_LOGIT).astype(np.float32)
 
 
-def log_scales_of(scales: np.ndarray) -> np.ndarray:
-    """Finite logarithms (N, 3) float32 of standard deviations (N, 3) >= 0."""
+def log_scales_from_scales(scales: np.ndarray) -> np.ndarray:
+    """Return finite logarithms (N, 3) float32 of standard deviations (N, 3) >= 0."""
     with np.errstate(divide="ignore"):
         logarithms = np.log(scales.astype(np.float64))
     return np.maximum(logarithms, SMALLEST_LOG_SCALE).astype(np.float32)
 
 
-def unit_quaternions(quats: np.ndarray) -> np.ndarray:
-    """Quaternions (N, 4) of length 1, float64; one of length 0 is the identity, as in rendering.
+def normalize_quaternions(quats: np.ndarray) -> np.ndarray:
+    """Return quaternions (N, 4) float64 of length 1; one of length 0 is the identity.
 
     quats: (N, 4) wxyz.
     """
@@ -67,8 +67,8 @@ def unit_quaternions(quats: np.ndarray) -> np.ndarray:
     return np.where(usable, quats, [1.0, 0, 0, 0]) / np.where(usable, lengths, 1)
 
 
-def without_largest(quats: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Index (N,) of the largest component, and the other three (N, 3), in their order.
+def drop_largest_component(quats: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the index (N,) of the largest component, and the other three (N, 3), in their order.
 
     The sign, which a rotation leaves open, is the one that makes the largest positive. quats:
     (N, 4) of length 1.
@@ -79,8 +79,8 @@ def without_largest(quats: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return index, sign[:, None] * quats[rows[:, None], _OTHERS[index]]
 
 
-def with_largest(index: np.ndarray, others: np.ndarray) -> np.ndarray:
-    """Quaternions (N, 4) float64 of length 1: what :func:`without_largest` leaves of them."""
+def restore_largest_component(index: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """Return quaternions (N, 4) float64 of length 1: see :func:`drop_largest_component`."""
     rows = np.arange(len(index))
     quats = np.empty((len(index), 4))
     quats[rows[:, None], _OTHERS[index]] = others
@@ -120,7 +120,7 @@ def morton_order(positions: np.ndarray) -> np.ndarray:
 
 
 def _spread(values: np.ndarray) -> np.ndarray:
-    """Two zero bits before each bit but the first."""
+    """Insert two zero bits before each bit but the first."""
     for shift, mask in _SPREAD:
         values = (values | values << np.uint64(shift)) & np.uint64(mask)
     return values

@@ -38,17 +38,17 @@ from drgs.core.files import read_bytes
 from drgs.core.memory import require_memory
 from drgs.io.formats import FORMATS, FileFormat, Scalar
 from drgs.io.quantization import (
-    gaussians_bytes,
-    logits_of,
-    opacities_of,
-    rounded,
-    unit_quaternions,
-    with_largest,
-    without_largest,
+    decoding_bytes,
+    drop_largest_component,
+    logits_from_opacities,
+    normalize_quaternions,
+    opacities_from_logits,
+    restore_largest_component,
+    round_to_uint32,
 )
 
 MAX_BYTES = 1 << 32
-"""Of a file: 4.3 GB, more than 60 million Gaussians."""
+"""Largest file: 4.3 GB, more than 60 million Gaussians."""
 
 MAGIC = b"NGSP"
 GZIP_MAGIC = b"\x1f\x8b"
@@ -112,9 +112,9 @@ def encode(
     flags = ANTIALIASED if (rendered_with or {}).get("antialiased") else 0
     parts = (
         _packed_positions(g["means"], bits),
-        rounded(opacities_of(g["logit_opacities"]) * 255, 255),
-        rounded((g["sh0"].astype(np.float64) * COLOR_SCALE + 0.5) * 255, 255),
-        rounded((g["log_scales"].astype(np.float64) - LOG_SCALE_LOW) * SCALE_STEPS, 255),
+        round_to_uint32(opacities_from_logits(g["logit_opacities"]) * 255, 255),
+        round_to_uint32((g["sh0"].astype(np.float64) * COLOR_SCALE + 0.5) * 255, 255),
+        round_to_uint32((g["log_scales"].astype(np.float64) - LOG_SCALE_LOW) * SCALE_STEPS, 255),
         _packed_rotations(g["quats"]),
         _packed_harmonics(g["shN"]),
     )
@@ -161,8 +161,8 @@ def _packed_positions(means: np.ndarray, bits: int) -> np.ndarray:
 
 def _packed_rotations(quats: np.ndarray) -> np.ndarray:
     """(N, 4) bytes, the lowest first."""
-    index, others = without_largest(unit_quaternions(quats)[:, XYZW])
-    sizes = rounded(np.abs(others) * np.sqrt(2) * QUATERNION_LEVELS, QUATERNION_LEVELS)
+    index, others = drop_largest_component(normalize_quaternions(quats)[:, XYZW])
+    sizes = round_to_uint32(np.abs(others) * np.sqrt(2) * QUATERNION_LEVELS, QUATERNION_LEVELS)
     word = index.astype(np.uint32)
     for size, negative in zip(sizes.T, (others < 0).T, strict=True):
         word = word << np.uint32(10) | negative.astype(np.uint32) << np.uint32(9) | size
@@ -186,7 +186,7 @@ def _packed_harmonics(sh: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class _Header:
-    """What stands before the numbers."""
+    """Content of the header, before the numbers."""
 
     version: int
     num: int
@@ -237,7 +237,7 @@ def _decoded(header: _Header, parts: list[np.ndarray]) -> dict[str, np.ndarray]:
         "means": _unpacked_positions(positions) / 2.0**header.fractional_bits,
         "quats": _unpacked_rotations(rotations, header.version),
         "log_scales": scales / SCALE_STEPS + LOG_SCALE_LOW,
-        "logit_opacities": logits_of(opacities[:, 0] / 255),
+        "logit_opacities": logits_from_opacities(opacities[:, 0] / 255),
         "sh0": ((colors / 255 - 0.5) / COLOR_SCALE)[:, None, :],
         "shN": (harmonics.astype(np.float32).reshape(header.num, -1, 3) - 128) / 128,
     }
@@ -261,7 +261,7 @@ def _unpacked_rotations(rows: np.ndarray, version: int) -> np.ndarray:
     fields = words[:, None] >> np.array([20, 10, 0], np.uint32)
     sizes = (fields & np.uint32(QUATERNION_LEVELS)) / (QUATERNION_LEVELS * np.sqrt(2))
     others = np.where(fields & np.uint32(512), -sizes, sizes)
-    xyzw = with_largest((words >> np.uint32(30)).astype(np.intp), others)
+    xyzw = restore_largest_component((words >> np.uint32(30)).astype(np.intp), others)
     return xyzw[:, np.argsort(XYZW)]
 
 
@@ -284,7 +284,7 @@ def _checked_header(path: Path, fields: tuple, versions: tuple[int, ...]) -> _He
 
 
 def _check_room(path: Path, header: _Header, size: int) -> None:
-    """Before memory is allocated for what the header promises."""
+    """Refuse what the header promises before memory is allocated for it."""
     unpacked = sum(header.sizes)
     if unpacked > MAX_RATIO * size:
         raise UserError(
@@ -292,7 +292,7 @@ def _check_room(path: Path, header: _Header, size: int) -> None:
             f"when unpacked, for which a file of {size:,} bytes has no room: at most {MAX_RATIO} "
             "times as many; it is damaged, or was cut off"
         )
-    needed = gaussians_bytes(header.num, (header.degree + 1) ** 2, turned=True)
+    needed = decoding_bytes(header.num, (header.degree + 1) ** 2, turned=True)
     require_memory(path, needed, f"a scene of {header.num:,} Gaussians")
 
 

@@ -18,7 +18,7 @@ from drgs.core.environment import required
 from drgs.core.errors import UserError
 from drgs.core.origin import WORLD
 from drgs.io.formats import FORMATS, ORIGIN, FileFormat, Scalar, pop_origin
-from drgs.io.quantization import opacities_of, unit_quaternions
+from drgs.io.quantization import normalize_quaternions, opacities_from_logits
 
 PRIM = "/Gaussians"
 
@@ -61,7 +61,7 @@ def encode(
     orientations = Vt.QuatfArray.FromNumpy(_float32(_imaginary_first(g["quats"])))
     splats.CreateOrientationsAttr(orientations)
     splats.CreateScalesAttr(Vt.Vec3fArray.FromNumpy(scales))
-    opacities = _float32(opacities_of(g["logit_opacities"]))
+    opacities = _float32(opacities_from_logits(g["logit_opacities"]))
     splats.CreateOpacitiesAttr(Vt.FloatArray.FromNumpy(opacities))
     splats.CreateRadianceSphericalHarmonicsDegreeAttr(round(np.sqrt(harmonics.shape[1])) - 1)
     coefficients = Vt.Vec3fArray.FromNumpy(_float32(harmonics.reshape(-1, 3)))
@@ -77,7 +77,7 @@ def encode(
 
 def _imaginary_first(quats: np.ndarray) -> np.ndarray:
     """(N, 4) unit quaternions as OpenUSD keeps them in memory: xyzw."""
-    return np.roll(unit_quaternions(quats), -1, axis=1)
+    return np.roll(normalize_quaternions(quats), -1, axis=1)
 
 
 def _float32(values: object) -> np.ndarray:
