@@ -196,14 +196,7 @@ def read_gaussians(path: str | Path) -> tuple[dict[str, np.ndarray], dict[str, S
         "shN": _harmonics(path, rows.get("sh"), len(vertex)),
     }
     with np.errstate(over="ignore"):  # harmonics are 3.5 times as large as colours
-        singles = {n: np.ascontiguousarray(v, np.float32) for n, v in arrays.items()}
-    bad = np.flatnonzero(~np.isfinite(singles["sh0"]).all(axis=(1, 2)))
-    if len(bad):
-        raise UserError(
-            f"{path}: element chunk, row {group[bad[0]]}: colours of the bounds must leave finite "
-            f"float32 harmonics, got {color[bad[0]].tolist()}"
-        )
-    return singles, statements
+        return {n: np.ascontiguousarray(v, np.float32) for n, v in arrays.items()}, statements
 
 
 def _checked_bounds(path: str | Path, rows: Mapping[str, np.ndarray], colors: bool) -> np.ndarray:

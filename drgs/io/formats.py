@@ -96,6 +96,13 @@ class FileFormat:
         """
         raise UserError("files of this format can be read, but not written")
 
+    def __init_subclass__(cls) -> None:
+        """Raise TypeError for a format without a suffix or a description."""
+        if not getattr(cls, "suffix", "").startswith(".") or cls.suffix != cls.suffix.lower():
+            raise TypeError(f"{cls.__name__}.suffix must be a suffix in small letters, as .npz")
+        if not getattr(cls, "description", ""):
+            raise TypeError(f"{cls.__name__}.description must be a phrase for help texts")
+
     @classmethod
     def holds(cls, name: str) -> bool:
         """Return whether files hold this value of ``rendered_with``."""
@@ -131,10 +138,14 @@ def readable_formats() -> list[Extension[type[FileFormat]]]:
 
 
 def format_for(path: str | Path) -> Extension[type[FileFormat]] | None:
-    """Return the format with the longest suffix that a file's name ends in; None: there is none."""
-    name = Path(path).name.lower()
+    """Return the format with the longest suffix that a file's name ends in; None: there is none.
+
+    Of several with one suffix, it is the one that drgs ships.
+    """
+    name, installed = Path(path).name.lower(), FORMATS.installed()
     found = [each for each in file_formats() if name.endswith(each.value.suffix)]
-    return max(found, key=lambda each: len(each.value.suffix), default=None)
+    order = {each.name: (len(each.value.suffix), each not in installed) for each in found}
+    return max(found, key=lambda each: order[each.name], default=None)
 
 
 def read_gaussians(

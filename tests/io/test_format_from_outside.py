@@ -117,6 +117,31 @@ def test_what_it_raises_is_reported_with_its_name(installed, tmp_path, content, 
         Gaussians.load(tmp_path / "a.npz")
 
 
+def test_what_it_raises_when_it_writes_ends_a_command_with_a_line(installed, tmp_path):
+    module = installed / "npz_format.py"
+    module.write_text(module.read_text().replace("return content.getvalue()", "return 1 / 0"))
+    blobs().save(tmp_path / "a.ply")
+    status, text = drgs(installed, "export", tmp_path / "a.ply", "--format", "npz")
+    assert status == 2
+    assert 'error: file format "npz" (npz_format): ZeroDivisionError: division by zero' in text
+    assert "Traceback" not in text and not (tmp_path / "a.npz").exists()
+
+
+def test_a_format_without_a_suffix_is_refused_with_its_package(installed):
+    module = installed / "npz_format.py"
+    module.write_text(module.read_text().replace('suffix = ".npz"', 'suffix = "npz"'))
+    reason = r"package drgs-npz \(npz_format\): TypeError: Npz\.suffix must be a suffix in small"
+    with pytest.raises(UserError, match=f'cannot load the extension "npz" of the {reason}'):
+        formats.format_for("a.npz")
+
+
+def test_a_suffix_that_drgs_has_stays_its_own(installed):
+    module = installed / "npz_format.py"
+    module.write_text(module.read_text().replace('suffix = ".npz"', 'suffix = ".ply"'))
+    assert formats.format_for("a.ply").name == "ply"
+    assert {each.name for each in formats.file_formats()} >= {"npz", "ply"}
+
+
 def test_numbers_that_are_not_finite_are_refused(installed, tmp_path):
     means = ARRAYS["means"].copy()
     means[3, 1] = np.nan

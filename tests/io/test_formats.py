@@ -169,5 +169,5 @@ def test_bounds_of_a_compressed_file_leave_finite_numbers_or_are_refused(tmp_pat
         assert np.isfinite(read.means).all() and np.isfinite(read.log_scales).all()
     rows["chunk"]["min_r"], rows["chunk"]["max_r"] = -3e38, 3e38
     path.write_bytes(encode_elements(rows))
-    with pytest.raises(UserError, match=r"element chunk, row 0: colours of the bounds must leave"):
+    with pytest.raises(UserError, match=r"numbers must be finite: sh0 of Gaussian 0 is "):
         Gaussians.load(path)
