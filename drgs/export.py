@@ -262,7 +262,7 @@ def _note_rendering(path: Path, others: dict[str, object]) -> None:
 
 
 def _destination(args: argparse.Namespace) -> tuple[str, Path]:
-    """The name of the target, and the file."""
+    """Return the name of the target, and the file."""
     name = args.format
     if name is None and args.out is not None:
         name = _target_of(args.out)
@@ -275,18 +275,20 @@ def _destination(args: argparse.Namespace) -> tuple[str, Path]:
         read_as = format_for(args.what)
         stem = args.what.name[: -len(read_as.value.suffix)] if read_as else args.what.resolve().name
         return name, args.what.resolve().with_name(f"{stem}{suffix}")
-    if not args.out.name.lower().endswith(suffix):
-        raise UserError(f"--out {args.out}: the name of a {name} file must end in {suffix}")
-    if _target_of(args.out) != name:  # as a.compressed.ply is no name for a plain PLY
-        raise UserError(f"--out {args.out}: the name is that of a {_target_of(args.out)} file")
+    if (found := _target_of(args.out)) != name:  # as a.compressed.ply is no name for a plain PLY
+        raise UserError(
+            f"--out {args.out}: the name of a {name} file must end in {suffix}, got that of "
+            f"{f'a {found}' if found else 'no known'} file"
+        )
     return name, args.out
 
 
 def _target_of(path: Path) -> str | None:
-    """The target with the longest suffix that the file's name ends in."""
-    found = {n: each.suffix for n, each in targets().items()}
-    fitting = [name for name, suffix in found.items() if path.name.lower().endswith(suffix)]
-    return max(fitting, key=lambda name: len(found[name]), default=None)
+    """Return the target that a file's name ends in."""
+    if path.name.lower().endswith(PAGE.suffix):
+        return "html"
+    found = format_for(path)
+    return None if found is None else found.name
 
 
 # ----------------------------------------------------------------------------------------------
