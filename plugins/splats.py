@@ -18,8 +18,8 @@ import mitsuba as mi
 from drgs.accuracy.pipeline import pipeline_of
 from drgs.core.arrays import interleave
 from drgs.core.constants import NEAR
+from drgs.core.environment import check_variant
 from drgs.core.errors import PluginError, UnsupportedError
-from drgs.core.variants import check_variant
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 from drgs.integrator.cache import Memory
 from drgs.integrator.limits import check_columns

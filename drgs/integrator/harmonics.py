@@ -11,8 +11,8 @@ import mitsuba as mi
 import numpy as np
 
 from drgs.core.arrays import from_host, types_of
+from drgs.gaussians.rotation import sh_rotation_generators, sh_rotation_matrices
 from drgs.gaussians.sh import num_coefficients
-from drgs.gaussians.sh_rotation import sh_rotation_generators, sh_rotation_matrices
 
 PER_DEGREE = {num_coefficients(degree): degree for degree in range(4)}
 
