@@ -32,8 +32,7 @@ from drgs.core.arrays import interleave
 from drgs.core.errors import PluginError
 from drgs.gaussians.parameters import Gaussians
 from drgs.gaussians.sh import num_coefficients
-from drgs.integrator.gathering import columns, interleaved
-from drgs.integrator.harmonics import PER_DEGREE, Turn
+from drgs.integrator.gathering import PER_DEGREE, Turn, columns, interleaved
 
 DATA = 10
 """Numbers of a row of ``data``: centre, standard deviations, quaternion xyzw."""

@@ -15,11 +15,13 @@ from typing import Any, Protocol
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
-from drgs.core.arrays import interleave, types_of
+from drgs.core.arrays import from_host, interleave, tangent_of, types_of
 from drgs.core.private import same_variables
 from drgs.gaussians.parameters import Gaussians
 from drgs.gaussians.sh import num_coefficients
+from drgs.gaussians.sh_rotation import sh_rotation_generators, sh_rotation_matrices
 
 
 class Values(Protocol):
@@ -104,11 +106,6 @@ def gather(parts: Sequence[Part], last: Gathered | None) -> Gathered:
     gaussians = _joined(converted, max(part.sh_degree for part in converted))
     dr.eval(gaussians)
     return Gathered(parts, gaussians)
-
-
-def tangent_of(parameter: Any) -> Any:
-    """The gradient set on a parameter; an empty one is its own, as dr.grad drops its shape."""
-    return dr.grad(parameter) if dr.width(parameter) > 0 else parameter
 
 
 def _joined(parts: Sequence[Gaussians], degree: int) -> Gaussians:
@@ -216,3 +213,51 @@ def _array_or_zeros(values: Any, part: Gaussians, width: int) -> Any:
 def _concatenated(arrays: list[Any]) -> Any:
     filled = [array for array in arrays if dr.width(array) > 0]  # dr.concat takes no others
     return dr.concat(filled) if len(filled) > 1 else (filled or arrays)[0]
+
+
+# ----------------------------------------------------------------------------------------------
+# Spherical harmonics
+# ----------------------------------------------------------------------------------------------
+
+PER_DEGREE = {num_coefficients(degree): degree for degree in range(4)}
+
+
+@dataclass(frozen=True, eq=False)
+class Turn:
+    """A linear map of the coefficients of degree 1 to 3 by one matrix per degree."""
+
+    matrices: Any  # Float (9 + 25 + 49,)
+
+    @staticmethod
+    def by(rotation: np.ndarray) -> Turn:
+        """The rotation of spherical harmonics; rotation: (3, 3), x' = R x."""
+        return Turn._from(sh_rotation_matrices(rotation, 3))
+
+    @staticmethod
+    def generators() -> list[Turn]:
+        """Derivatives of turned coefficients along rotations about x, y and z."""
+        return [Turn._from(matrices) for matrices in sh_rotation_generators(3)]
+
+    @staticmethod
+    def _from(matrices: Sequence[np.ndarray]) -> Turn:
+        return Turn(from_host(mi.Float, np.concatenate([matrix.ravel() for matrix in matrices])))
+
+    def of(self, columns: list[Any], transposed: bool = False) -> list[Any]:
+        """Columns of the coefficients of degree 1 and above, three a coefficient; turned."""
+        turned, start = [], 0
+        for degree in range(1, PER_DEGREE[len(columns) // 3 + 1] + 1):
+            size = 2 * degree + 1
+            band = columns[3 * (degree**2 - 1) :][: 3 * size]
+            for k in range(size):
+                cells = [j * size + k if transposed else k * size + j for j in range(size)]
+                row = [number_of(self.matrices, start + cell) for cell in cells]
+                for c in range(3):
+                    terms = [a * x for a, x in zip(row, band[c::3], strict=True)]
+                    turned.append(sum(terms[1:], terms[0]))
+            start += size * size
+        return turned
+
+
+def number_of(flat: Any, index: int) -> Any:
+    """One entry of an array, in no kernel: other numbers need no other one."""
+    return dr.gather(type(flat), flat, types_of(type(flat)).UInt32(index))

@@ -34,8 +34,7 @@ from drgs.core.errors import PluginError
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 from drgs.gaussians.similarity import Similarity
 from drgs.gaussians.turning import left_product
-from drgs.integrator.gathering import columns, interleaved
-from drgs.integrator.harmonics import Turn, number_of
+from drgs.integrator.gathering import Turn, columns, interleaved, number_of
 
 TO_WORLD = "to_world"
 

@@ -68,6 +68,15 @@ def is_batch(sensor: mi.Sensor) -> bool:
     return sensor.class_name() == "BatchSensor"
 
 
+def sensors_of(sensor: mi.Sensor) -> list[mi.Sensor]:
+    """Those of a batch, or the one."""
+    if not is_batch(sensor):
+        return [sensor]
+    from drgs.integrator.batch import SideBySide
+
+    return SideBySide.of(sensor).sensors
+
+
 def read_sensor(sensor: mi.Sensor, near: float) -> SensorState:
     """Collect a sensor's state without reading anything back from the device.
 

@@ -26,9 +26,9 @@ from drgs.core.constants import SH_C0
 from drgs.core.private import same_variables
 from drgs.gaussians.parameters import Gaussians
 from drgs.gaussians.quaternions import quat_to_rotation
-from drgs.integrator.light import ray_splats_of
-from drgs.integrator.limits import check_ids
-from drgs.integrator.settings import SplatsSettings
+from drgs.integrator.checks import check_ids
+from drgs.integrator.ray_transport import ray_splats_of
+from drgs.integrator.state import SplatsState
 from drgs.integrator.surfaces import Surfaces, scene_of
 from drgs.integrator.transparency import StraightRays, has_transparent_parts
 from drgs.light.walk import RaySplats, Segment
@@ -57,29 +57,28 @@ class Shadows:
     gaussians: Gaussians
     made_of: tuple[Gaussians, Surfaces, tuple[str, ...]]  # detached: held, see same_variables
 
-    @staticmethod
-    def of(
-        integrator: SplatsSettings, gaussians: Gaussians, scene: mi.Scene, last: Shadows | None
-    ) -> Shadows:
-        """Of the integrator's objects on ``gaussians``, or ``last`` if all is as it was.
 
-        Raises PluginError for the name of an object that the scene does not have.
-        """
-        gaussians, names = dr.detach(gaussians), tuple(integrator.shadows)
-        surfaces = integrator.memory.surfaces = Surfaces.of(scene, integrator.memory.surfaces)
-        if (
-            last is not None
-            and last.made_of[1:] == (surfaces, names)
-            and same_variables(last.made_of[0], gaussians)
-        ):
-            return last
+def shade(splats: SplatsState, scene: mi.Scene) -> None:
+    """Shade the Gaussians by the objects that cast shadows, unless all is as it was.
+
+    Raises PluginError for the name of an object that the scene does not have.
+    """
+    gaussians, names = dr.detach(splats.unshaded_gaussians), tuple(splats.shadows)
+    last, splats.cache.shadows = splats.cache.shadows, None
+    surfaces = splats.cache.surfaces = Surfaces.of(scene, splats.cache.surfaces)
+    if (
+        last is None
+        or last.made_of[1:] != (surfaces, names)
+        or not same_variables(last.made_of[0], gaussians)
+    ):
         estimate = _Estimate(
             scene=_rays_through(surfaces.objects),
             without=_rays_through(_without(surfaces.objects, names)),
-            splats=ray_splats_of(gaussians, integrator.approximations, degree=0),
+            splats=ray_splats_of(gaussians, splats.approximations, degree=0),
         )
-        ratio = estimate.ratios(gaussians)
-        return Shadows(_darkened(gaussians, ratio), (gaussians, surfaces, names))
+        darkened = _darkened(gaussians, estimate.ratios(gaussians))
+        last = Shadows(darkened, (gaussians, surfaces, names))
+    splats.cache.shadows = last
 
 
 def _without(objects: Sequence[mi.Object], names: Sequence[str]) -> list[mi.Object]:

@@ -16,7 +16,9 @@ import mitsuba as mi
 from drgs.cameras.camera import Camera, Lens, Pinhole
 from drgs.datasets.types import Viewpoint
 from drgs.effects.compose import ignoring
-from drgs.integrator.settings import SplatsSettings
+from drgs.integrator.checks import surfaces_in
+from drgs.integrator.sensors import camera_from_sensor, read_sensor, sensors_of
+from drgs.integrator.state import SplatsState
 
 AS_THE_FILE_SAYS = "as the file says"
 """Why something is simulated that the header of the Gaussians' file asks for."""
@@ -51,8 +53,16 @@ def described(effects: Sequence[SimulatedEffect]) -> str:
     return "simulated:\n" + "\n".join(lines)
 
 
+def summary_of_scene(splats: SplatsState, scene: mi.Scene, sensors: Sequence[mi.Sensor]) -> str:
+    """Return the summary of the integrator ``splats``, whose Gaussians are gathered."""
+    alone = [one for sensor in sensors for one in sensors_of(sensor)]
+    cameras = [camera_from_sensor(read_sensor(one, splats.near).detached()) for one in alone]
+    count = len(surfaces_in(scene))
+    return described(summary_of_sensors(splats, cameras, scene.environment(), count))
+
+
 def summary_of_sensors(
-    integrator: SplatsSettings,
+    splats: SplatsState,
     cameras: Sequence[Camera],
     environment: mi.Emitter | None,
     num_surfaces: int = 0,
@@ -62,7 +72,7 @@ def summary_of_sensors(
     cameras: as the sensors have them, so that what the integrator ignores of them can be named;
     num_surfaces: shapes of the scene that are no Gaussians.
     """
-    left = [ignoring(camera, integrator.ignore) for camera in cameras]
+    left = [ignoring(camera, splats.ignore) for camera in cameras]
 
     def effect(name: str, words: Callable[[Camera], str | None]) -> SimulatedEffect:
         """words: what a camera has of it, or None."""
@@ -83,16 +93,16 @@ def summary_of_sensors(
     )
     light = SimulatedEffect(
         "light between splats and surfaces",
-        None if integrator.light == "none" else "along rays of surfaces",
+        None if splats.light == "none" else "along rays of surfaces",
         "the integrator's light",
     )
     of_surfaces = [surfaces, light] if num_surfaces else [surfaces]
-    said = integrator.said_by_file
-    return [*_summary_of_integrator(integrator, environment, of_cameras, said), *of_surfaces]
+    said = splats.header
+    return [*_summary_of_integrator(splats, environment, of_cameras, said), *of_surfaces]
 
 
 def summary_of_views(
-    integrator: SplatsSettings, views: Sequence[Viewpoint], said: Collection[str] = ()
+    splats: SplatsState, views: Sequence[Viewpoint], said: Collection[str] = ()
 ) -> list[SimulatedEffect]:
     """The same for views or viewpoints, with nothing behind but the integrator's background.
 
@@ -100,37 +110,37 @@ def summary_of_views(
     """
     count = f"{len(views)} cameras"
     of_cameras = [
-        effect_of(views, count).unless(word in integrator.ignore)
+        effect_of(views, count).unless(word in splats.ignore)
         for effect_of, word in ((lens_effect, "distortion"), (motion_effect, "motion"))
     ]
-    return _summary_of_integrator(integrator, None, of_cameras, said)
+    return _summary_of_integrator(splats, None, of_cameras, said)
 
 
 def _summary_of_integrator(
-    integrator: SplatsSettings,
+    splats: SplatsState,
     environment: mi.Emitter | None,
     of_cameras: Sequence[SimulatedEffect],
     said: Collection[str],
 ) -> list[SimulatedEffect]:
     background = SimulatedEffect("background", "a constant colour", "the integrator's background")
-    if environment is not None and not integrator.hide_emitters:
+    if environment is not None and not splats.hide_emitters:
         background = SimulatedEffect("background", "an environment", "the scene's emitter")
-    elif isinstance(integrator.background, mi.Texture):
+    elif isinstance(splats.background, mi.Texture):
         background = SimulatedEffect("background", "a picture", "the integrator's background")
-    smooth = integrator.gaussians.smoothing is not None
+    smooth = splats.gaussians.smoothing is not None
     antialiased = AS_THE_FILE_SAYS if "antialiased" in said else "antialiased"
     effects = [
-        view_dependence_effect(integrator.sh_degree, "the Gaussians' coefficients"),
+        view_dependence_effect(splats.sh_degree, "the Gaussians' coefficients"),
         background,
         *of_cameras,
         antialiasing_effect(
-            antialiased if integrator.approximations.antialiased else None,
+            antialiased if splats.approximations.antialiased else None,
             "the Gaussians' filter" if smooth else None,
         ),
     ]
-    if integrator.has_smoothing and not smooth:
+    if splats.has_smoothing and not smooth:
         effects.append(SimulatedEffect("smoothing filter", None, ignored=True))
-    others = integrator.approximations.others_than_default
+    others = splats.approximations.others_than_default
     values = [f"{k} = {v}" for k, v in others.items() if k in said and k != "antialiased"]
     if values:
         effects.append(SimulatedEffect("approximations", ", ".join(values), AS_THE_FILE_SAYS))

@@ -42,7 +42,7 @@ from drgs.integrator.derivatives import (
 )
 from drgs.integrator.film import Channels, develop_pixels, film_map, num_colors
 from drgs.integrator.film import pixels_adjoint as film_adjoint
-from drgs.integrator.settings import LitIntegrator
+from drgs.integrator.path_segment import passes_splats
 from drgs.integrator.transparency import StraightRays, has_transparent_parts
 from drgs.integrator.visible_surfaces import Layers, rest_behind
 
@@ -404,7 +404,7 @@ class Hybrid:
 def _depth_reduced(integrator: mi.Integrator, count: int) -> Iterator[None]:
     """Shorten paths by ``count`` bounces, where they are bounded by an attribute of Python."""
     depth = getattr(integrator, "max_depth", None)
-    counts_windows = not isinstance(integrator, LitIntegrator)
+    counts_windows = not passes_splats(integrator)
     is_bounded = counts_windows and isinstance(depth, int) and depth < UNBOUNDED
     if is_bounded:
         integrator.max_depth = max(depth - count, 0)

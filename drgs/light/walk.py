@@ -60,8 +60,8 @@ class Segment:
 
 
 @dataclass(frozen=True)
-class Passed:
-    """What segments pass."""
+class SegmentRadiance:
+    """Composited splats of segments."""
 
     color: Any  # Array3f, display space: sum of w_i c_i
     transmittance: Any  # Float
@@ -116,8 +116,8 @@ class RaySplats:
         dr.eval(shapes, colors, ellipsoids)
         return RaySplats(shapes, colors, build_grid(ellipsoids), sh_degree, cutoffs)
 
-    def passed(self, segment: Segment) -> Passed:
-        """Colour and transmittance of segments."""
+    def composite_segment(self, segment: Segment) -> SegmentRadiance:
+        """Composite the splats along segments, in the order of their peaks."""
         walk = _Walk.along(self, segment)
         t = types_of(self.shapes.Float)
         basis = sh_basis(walk.direction, self.sh_degree)
@@ -140,7 +140,7 @@ class RaySplats:
             cond=lambda at, last, T, color: (T > 0) & walk.goes_on(at),
             body=body,
         )
-        return Passed(t.Array3f(color), dr.abs(T))
+        return SegmentRadiance(t.Array3f(color), dr.abs(T))
 
     def sampled(self, segment: Segment, seed: Any, count: int) -> Sampled:
         """Draw ``count`` splats that segments show, with their weights.

@@ -139,7 +139,7 @@ def test_an_unchanged_scene_is_not_rendered_again():
     loaded = Scene().load()
     dr.eval(mi.render(loaded))
     assert kernels_of(lambda: dr.eval(mi.render(loaded))) <= 2
-    loaded.integrator().memory.rendered.clear()
+    loaded.integrator().state.cache.frames.clear()
     assert kernels_of(lambda: dr.eval(mi.render(loaded))) > 10
 
 
@@ -267,7 +267,7 @@ def test_approximations_are_parameters(approximations):
     scene = Scene()
     integrator = mi.load_dict({"type": "splats", **tensors(scene.gaussians), **approximations})
     values = {k: float(v) if k == "low_pass" else v for k, v in approximations.items()}
-    assert integrator.approximations == Approximations(**values)
+    assert integrator.state.approximations == Approximations(**values)
     for name, value in values.items():
         if value != getattr(Approximations(), name):
             assert f"  {name} = {value}" in str(integrator)
@@ -315,7 +315,7 @@ def test_a_new_view_needs_no_new_kernel():
 def test_a_stale_frame_is_not_kept():
     loaded = Scene().load()
     mi.render(loaded)
-    frame = weakref.ref(loaded.integrator().memory.rendered[0].frames[0][0])
+    frame = weakref.ref(loaded.integrator().state.cache.frames[0].frames[0][0])
     params = mi.traverse(loaded)
     params["integrator.means"] = params["integrator.means"] + 1
     params.update()

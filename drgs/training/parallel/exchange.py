@@ -29,8 +29,8 @@ from drgs.core.arrays import Rows, block_widths, empty_on_host, from_host, types
 from drgs.core.constants import MAX_SHUTTER_SAMPLES
 from drgs.effects.compose import composed, ignoring
 from drgs.gaussians.parameters import Gaussians
+from drgs.integrator.sensor_render import accumulate_in_sensor
 from drgs.integrator.sensors import camera_from_sensor, read_sensor
-from drgs.integrator.view import accumulate_in_sensor
 from drgs.splatting.rasterize import SplatGradients
 from drgs.splatting.rendering import (
     NO_FAULT,
@@ -481,7 +481,7 @@ class ViewExchange:
         each.first_fault = total.first_fault
         if of_cameras:
             state = read_sensor(each.view.view.sensor, self.integrator.near)
-            accumulate_in_sensor(self.integrator, state, of_cameras)
+            accumulate_in_sensor(self.integrator.ignore, state, of_cameras)
 
     def _accumulate(self, gradients: Gaussians) -> None:
         for key, parameter in self.params.items():

@@ -4,9 +4,9 @@ Imported where a scene asks for it. A probe stands in the middle of an object of
 shape, or of an emitter. Rays that start at the object look there; so do rays to an emitter that has
 one, from shapes that have none, as far as their transmittance goes. All others pass no splats.
 
-What a ray meets where a probe does not know is said by another light: nothing (:class:`Unlit`), or,
-where an object is so close to splats that its middle sees others than its surface does, what rays
-pass of the splats themselves.
+Where a probe does not know what a ray meets, another transport is used: none
+(:class:`drgs.integrator.path_segment.NoSplats`), or, where an object is so close to splats that its
+middle sees others than its surface does, that of rays.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ from drgs.accuracy.pipeline import pipeline_of
 from drgs.core.errors import PluginError
 from drgs.core.private import same_variables
 from drgs.gaussians.parameters import Gaussians
-from drgs.integrator.legs import Leg, Light
-from drgs.integrator.limits import check_ids
+from drgs.integrator.checks import check_ids
+from drgs.integrator.path_segment import PathSegment, SplatTransport
 from drgs.integrator.sensors import SensorState, camera_from_sensor, read_sensor
-from drgs.integrator.settings import SplatsSettings
+from drgs.integrator.state import SplatsState
 from drgs.light.probe import LEVELS, LOW_PASS, SIZE, Probes, Seen
 from drgs.splatting.rendering import color_features, depth_feature
 
@@ -45,7 +45,7 @@ NOBODY = 0xFFFFFFFF
 
 
 @dataclass(frozen=True, eq=False)
-class LightOfProbes:
+class ProbeTransport:
     """What probes see of a scene's splats."""
 
     probes: Probes
@@ -55,16 +55,16 @@ class LightOfProbes:
     emitters: dict[int, mi.EmitterPtr]  # likewise
     flat: dict[int, int]  # numbers of the mirrors, by that of the probe
     num_paths: mi.Float  # (1,): of a pixel
-    unseen: Light  # for rays of which probes do not know what they meet
+    unseen: SplatTransport  # for rays of which probes do not know what they meet
 
     @staticmethod
     def of(
-        integrator: SplatsSettings,
+        splats: SplatsState,
         scene: mi.Scene,
         num_paths: int,
         sensors: Sequence[mi.Sensor],
-        unseen: Light,
-    ) -> LightOfProbes:
+        unseen: SplatTransport,
+    ) -> ProbeTransport:
         """Those of an integrator's objects, or the last ones if nothing has changed.
 
         sensors: those that flat mirrors are seen by.
@@ -72,14 +72,14 @@ class LightOfProbes:
         Raises PluginError for the name of an object that the scene does not have, and for an
         emitter that is nowhere.
         """
-        objects = _objects(scene, integrator.probes)
+        objects = _objects(scene, splats.probes)
         shapes = {k: node for k, node in enumerate(objects) if isinstance(node, mi.Shape)}
         emitters = {k: shapes[k].emitter() if k in shapes else o for k, o in enumerate(objects)}
-        mirrors = _mirrors(integrator, scene, shapes, sensors)
-        return LightOfProbes(
-            _probes(integrator, objects, mirrors),
+        mirrors = _mirrors(splats, scene, shapes, sensors)
+        return ProbeTransport(
+            _probes(splats, objects, mirrors),
             mirrors.pictures,
-            dr.opaque(mi.Float, integrator.exposure),
+            dr.opaque(mi.Float, splats.exposure),
             {k: mi.ShapePtr(shape) for k, shape in shapes.items()},
             {k: mi.EmitterPtr(node) for k, node in emitters.items() if node},
             {k: number for number, k in enumerate(mirrors.delta_mirrors)},
@@ -87,41 +87,43 @@ class LightOfProbes:
             unseen,
         )
 
-    def passed(self, leg: Leg, sample: mi.Float, active: mi.Bool) -> tuple[mi.Color3f, mi.Float]:
-        """See :meth:`drgs.integrator.legs.Light.passed`."""
-        seen, is_asked, is_reversed = self._look(leg, active)
+    def composite_segment(
+        self, segment: PathSegment, sample: mi.Float, active: mi.Bool
+    ) -> tuple[mi.Color3f, mi.Float]:
+        """See :meth:`drgs.integrator.path_segment.SplatTransport.composite_segment`."""
+        seen, is_asked, is_reversed = self._look(segment, active)
         is_known = is_asked & seen.is_known
-        radiance, T = self.unseen.passed(leg, sample, is_asked & ~seen.is_known)
+        radiance, T = self.unseen.composite_segment(segment, sample, is_asked & ~seen.is_known)
         color = mi.Color3f(seen.color)
-        color = dr.select(leg.is_open, _over_black(color, seen.coverage), color)
+        color = dr.select(segment.is_open, _over_black(color, seen.coverage), color)
         radiance = dr.select(is_known, self.exposure * color, radiance)
         # An emitter knows how much of its light arrives, but not how splats look from elsewhere.
         radiance = dr.select(is_reversed, 0, radiance)
         return radiance, dr.select(is_known, 1 - seen.coverage, T)
 
-    def transmittance(self, leg: Leg, sample: mi.Float, active: mi.Bool) -> mi.Float:
-        """See :meth:`drgs.integrator.legs.Light.transmittance`; 1 where that is not known."""
-        seen, is_asked, _ = self._look(leg, active)
+    def transmittance(self, segment: PathSegment, sample: mi.Float, active: mi.Bool) -> mi.Float:
+        """Return the transmittance along segments; 1 where it is not known."""
+        seen, is_asked, _ = self._look(segment, active)
         return dr.select(is_asked & seen.is_known, 1 - seen.coverage, 1)
 
-    def _look(self, leg: Leg, active: mi.Bool) -> tuple[Seen, mi.Bool, mi.Bool]:
+    def _look(self, segment: PathSegment, active: mi.Bool) -> tuple[Seen, mi.Bool, mi.Bool]:
         """What a probe sees; whether there is one to ask; whether it is that of the other end."""
         probe, other = mi.UInt32(NOBODY), mi.UInt32(NOBODY)
         for k, shape in self.shapes.items():
-            probe = dr.select(leg.start == shape, mi.UInt32(k), probe)
+            probe = dr.select(segment.start == shape, mi.UInt32(k), probe)
         for k, emitter in self.emitters.items():
-            other = dr.select(leg.end == emitter, mi.UInt32(k), other)
+            other = dr.select(segment.end == emitter, mi.UInt32(k), other)
         is_reversed = active & (probe == NOBODY) & (other != NOBODY)
         is_asked = active & ((probe != NOBODY) | is_reversed)
-        mirrored = self._look_in_mirrors(probe, leg, is_asked)
-        ray, far = leg.ray, leg.ray.maxt
+        mirrored = self._look_in_mirrors(probe, segment, is_asked)
+        ray, far = segment.ray, segment.ray.maxt
         back = dr.select(is_reversed, far, 0)
         seen = self.probes.look(
             dr.select(is_reversed, other, probe),
             mi.Vector3f(ray.o + back * ray.d),
             mi.Vector3f(dr.select(is_reversed, -ray.d, ray.d)),
             mi.Float(far),
-            dr.select(is_reversed, 0, self._level(leg.pdf)),
+            dr.select(is_reversed, 0, self._level(segment.pdf)),
             is_asked & ~mirrored.is_known,
         )
         seen = Seen(
@@ -131,14 +133,14 @@ class LightOfProbes:
         )
         return seen, is_asked, is_reversed
 
-    def _look_in_mirrors(self, probe: mi.UInt32, leg: Leg, active: mi.Bool) -> Seen:
-        """Look up legs that leave flat mirrors; probe: that of the shape they leave."""
+    def _look_in_mirrors(self, probe: mi.UInt32, segment: PathSegment, active: mi.Bool) -> Seen:
+        """Look up segments that leave flat mirrors; probe: that of the shape they leave."""
         if self.mirrors is None:
             return Seen(mi.Color3f(0), mi.Float(0), mi.Bool(False))
         mirror = mi.UInt32(NOBODY)
         for k, number in self.flat.items():
             mirror = dr.select(probe == k, mi.UInt32(number), mirror)
-        return self.mirrors.look(mirror, leg, active & (mirror != NOBODY))
+        return self.mirrors.look(mirror, segment, active & (mirror != NOBODY))
 
     def _level(self, pdf: mi.Float) -> mi.UInt32:
         """Of the cube whose texels are as large as what a path of a pixel stands for."""
@@ -147,33 +149,31 @@ class LightOfProbes:
         return mi.UInt32(dr.clip(level + 0.5, 0, LEVELS - 1))
 
 
-def _probes(
-    integrator: SplatsSettings, objects: Sequence[mi.Object], mirrors: _KeptMirrors
-) -> Probes:
+def _probes(splats: SplatsState, objects: Sequence[mi.Object], mirrors: _KeptMirrors) -> Probes:
     """Render the probes of objects, or return the last ones if all is the same.
 
     Logs a warning for objects that are too close to splats, the first time that one is.
     """
-    gaussians, degree = dr.detach(integrator.gaussians), integrator.sh_degree
+    gaussians, degree = dr.detach(splats.gaussians), splats.sh_degree
     centers, planes = _places(objects, mirrors)
     how = (
-        integrator.approximations,
+        splats.approximations,
         degree,
-        integrator.near,
-        integrator.probes,
+        splats.near,
+        splats.probes,
         centers.tolist(),
         planes.tolist(),
     )
-    last = integrator.memory.probes
+    last = splats.cache.probes
     if last is not None and last.how == how and same_variables(last.gaussians, gaussians):
         return last.probes
-    approximations = replace(integrator.approximations, projection="exact", low_pass=LOW_PASS)
+    approximations = replace(splats.approximations, projection="exact", low_pass=LOW_PASS)
     pipeline = pipeline_of(approximations, degree, (color_features, depth_feature))
     if gaussians.smoothing is not None:
         from drgs.effects.smoothing import smoothed
 
         pipeline = replace(pipeline, rows=smoothed)
-    probes = Probes.of(gaussians, pipeline, centers, integrator.near, _decoded, planes)
+    probes = Probes.of(gaussians, pipeline, centers, splats.near, _decoded, planes)
     known = frozenset() if last is None else last.close
     seen_mirrored = {k for k, m in mirrors.flat.items() if m.has_delta or m.is_specular}
     close = {
@@ -185,7 +185,7 @@ def _probes(
     }
     for name in sorted(close - known):
         mi.Log(mi.LogLevel.Warn, TOO_CLOSE.format(name))
-    integrator.memory.probes = _KeptProbes(how, gaussians, probes, known | close)
+    splats.cache.probes = _KeptProbes(how, gaussians, probes, known | close)
     return probes
 
 
@@ -239,7 +239,7 @@ class _KeptMirrors:
 
 
 def _mirrors(
-    integrator: SplatsSettings,
+    splats: SplatsState,
     scene: mi.Scene,
     shapes: dict[int, mi.Shape],
     sensors: Sequence[mi.Sensor],
@@ -250,12 +250,12 @@ def _mirrors(
     """
     from drgs.integrator.mirrors import FlatMirror, Mirrors
 
-    gaussians, degree = dr.detach(integrator.gaussians), integrator.sh_degree
-    memory, approximations = integrator.memory, integrator.approximations
-    states = [read_sensor(sensor, integrator.near).detached() for sensor in sensors]
+    gaussians, degree = dr.detach(splats.gaussians), splats.sh_degree
+    cache, approximations = splats.cache, splats.approximations
+    states = [read_sensor(sensor, splats.near).detached() for sensor in sensors]
     how = approximations, degree
-    found = _KeptMirrors(memory.surfaces, tuple(integrator.probes), how, gaussians, states)
-    last = memory.mirrors
+    found = _KeptMirrors(cache.surfaces, tuple(splats.probes), how, gaussians, states)
+    last = cache.mirrors
     if last is not None and found.same_pictures(last):
         return last
     if last is not None and found.same_shapes(last):
@@ -263,12 +263,12 @@ def _mirrors(
     else:
         every = {k: FlatMirror.of(shape) for k, shape in shapes.items()}
         flat = {k: mirror for k, mirror in every.items() if mirror is not None}
-    found = memory.mirrors = replace(found, flat=flat)
+    found = cache.mirrors = replace(found, flat=flat)
     if found.delta_mirrors:
-        traced = memory.surfaces.traced(scene)
+        traced = cache.surfaces.traced(scene)
         delta_mirrors = list(found.delta_mirrors.values())
         pictures = Mirrors.of(delta_mirrors, states, traced, gaussians, approximations, degree)
-        found = memory.mirrors = replace(found, pictures=pictures)
+        found = cache.mirrors = replace(found, pictures=pictures)
     return found
 
 
