@@ -485,7 +485,7 @@ class SplatsIntegrator(mi.CppADIntegrator):
             self._gather(scene)
             render = ImageRender.of(self.state, scene, sensor, seed, spp)
             gradients = render.backward(params, grad_in)
-            means2d, frames = gradients.means2d, self.state.cache.frames[0].frames
+            means2d, frames = gradients.means2d, self.state.cache.frames[0].value
             self.last = BackwardResult(
                 mi.TensorXf(interleave(list(means2d)), (dr.width(means2d), 2)),
                 gradients.visible,

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import drjit as dr
@@ -22,12 +22,10 @@ import numpy as np
 
 from drgs.accuracy.pipeline import pipeline_of
 from drgs.core.errors import PluginError
-from drgs.core.private import same_variables
-from drgs.gaussians.parameters import Gaussians
 from drgs.integrator.checks import check_ids
 from drgs.integrator.path_segment import PathSegment, SplatTransport
 from drgs.integrator.sensors import SensorState, camera_from_sensor, read_sensor
-from drgs.integrator.state import SplatsState
+from drgs.integrator.state import Cached, SplatsState
 from drgs.light.probe import LEVELS, LOW_PASS, SIZE, Probes, Seen
 from drgs.splatting.rendering import color_features, depth_feature
 
@@ -75,14 +73,16 @@ class ProbeTransport:
         objects = _objects(scene, splats.probes)
         shapes = {k: node for k, node in enumerate(objects) if isinstance(node, mi.Shape)}
         emitters = {k: shapes[k].emitter() if k in shapes else o for k, o in enumerate(objects)}
-        mirrors = _mirrors(splats, scene, shapes, sensors)
+        states = [read_sensor(sensor, splats.near).detached() for sensor in sensors]
+        flat = _flat_mirrors(splats, shapes)
+        delta_mirrors = {k: mirror for k, mirror in flat.items() if mirror.has_delta}
         return ProbeTransport(
-            _probes(splats, objects, mirrors),
-            mirrors.pictures,
+            _probes(splats, objects, flat, states[0]),
+            _mirror_images(splats, scene, list(delta_mirrors.values()), states),
             dr.opaque(mi.Float, splats.exposure),
             {k: mi.ShapePtr(shape) for k, shape in shapes.items()},
             {k: mi.EmitterPtr(node) for k, node in emitters.items() if node},
-            {k: number for number, k in enumerate(mirrors.delta_mirrors)},
+            {k: number for number, k in enumerate(delta_mirrors)},
             dr.opaque(mi.Float, num_paths),
             unseen,
         )
@@ -149,139 +149,88 @@ class ProbeTransport:
         return mi.UInt32(dr.clip(level + 0.5, 0, LEVELS - 1))
 
 
-def _probes(splats: SplatsState, objects: Sequence[mi.Object], mirrors: _KeptMirrors) -> Probes:
+def _probes(
+    splats: SplatsState, objects: Sequence[mi.Object], flat: dict[int, Any], sensor: SensorState
+) -> Probes:
     """Render the probes of objects, or return the last ones if all is the same.
 
-    Logs a warning for objects that are too close to splats, the first time that one is.
+    flat: mirrors by the probe's number; sensor: that sees them.
     """
-    gaussians, degree = dr.detach(splats.gaussians), splats.sh_degree
-    centers, planes = _places(objects, mirrors)
-    how = (
-        splats.approximations,
-        degree,
-        splats.near,
-        splats.probes,
-        centers.tolist(),
-        planes.tolist(),
-    )
-    last = splats.cache.probes
-    if last is not None and last.how == how and same_variables(last.gaussians, gaussians):
-        return last.probes
-    approximations = replace(splats.approximations, projection="exact", low_pass=LOW_PASS)
-    pipeline = pipeline_of(approximations, degree, (color_features, depth_feature))
-    if gaussians.smoothing is not None:
-        from drgs.effects.smoothing import smoothed
+    gaussians, last = dr.detach(splats.gaussians), splats.cache.probes
+    centers, planes = _places(objects, flat, sensor)
+    places = centers.tolist(), planes.tolist()
+    settings = splats.approximations, splats.sh_degree, splats.near, places
+    if last is None or not last.matches(settings, gaussians):
+        approximations = replace(splats.approximations, projection="exact", low_pass=LOW_PASS)
+        pipeline = pipeline_of(approximations, splats.sh_degree, (color_features, depth_feature))
+        if gaussians.smoothing is not None:
+            from drgs.effects.smoothing import smoothed
 
-        pipeline = replace(pipeline, rows=smoothed)
-    probes = Probes.of(gaussians, pipeline, centers, splats.near, _decoded, planes)
-    known = frozenset() if last is None else last.close
-    seen_mirrored = {k for k, m in mirrors.flat.items() if m.has_delta or m.is_specular}
+            pipeline = replace(pipeline, rows=smoothed)
+        probes = Probes.of(gaussians, pipeline, centers, splats.near, _decoded, planes)
+        last = splats.cache.probes = Cached(probes, settings, gaussians)
+        _warn_of_close(splats, objects, flat, probes)
+    return last.value
+
+
+def _warn_of_close(
+    splats: SplatsState, objects: Sequence[mi.Object], flat: dict[int, Any], probes: Probes
+) -> None:
+    """Log a warning for each shape that is too close to splats, the first time that it is."""
     close = {
         node.id()
         for k, node in enumerate(objects)
         if isinstance(node, mi.Shape)
-        and k not in seen_mirrored
-        and _is_close(node, probes.nearest[k])
+        and not (k in flat and (flat[k].has_delta or flat[k].is_specular))
+        and probes.nearest[k] < CLOSE * float(dr.max(node.bbox().extents())) / 2
     }
-    for name in sorted(close - known):
+    for name in sorted(close - splats.cache.too_close):
         mi.Log(mi.LogLevel.Warn, TOO_CLOSE.format(name))
-    splats.cache.probes = _KeptProbes(how, gaussians, probes, known | close)
-    return probes
+    splats.cache.too_close |= close
 
 
-def _is_close(shape: mi.Shape, nearest: float) -> bool:
-    """Tell whether splats, the nearest that far from its middle, are close for a shape's size."""
-    return nearest < CLOSE * float(dr.max(shape.bbox().extents())) / 2
+def _flat_mirrors(splats: SplatsState, shapes: dict[int, mi.Shape]) -> dict[int, Any]:
+    """Find the shapes that are flat mirrors; shapes, mirrors: by the probe's number."""
+    from drgs.integrator.mirrors import FlatMirror
 
-
-@dataclass(frozen=True, eq=False)
-class _KeptProbes:
-    """Probes, and everything that they depend on."""
-
-    how: tuple[object, ...]
-    gaussians: Gaussians  # detached: holding them keeps their indices
-    probes: Probes
-    close: frozenset[str]  # ids of objects of which a warning was given
-
-
-@dataclass(frozen=True, eq=False)
-class _KeptMirrors:
-    """The flat mirrors of a scene, and everything that their pictures depend on."""
-
-    surfaces: Any  # drgs.integrator.surfaces.Surfaces
-    names: tuple[str, ...]
-    how: tuple[object, ...]
-    gaussians: Gaussians  # detached: holding them keeps their indices
-    sensors: list[SensorState]
-    flat: dict[int, Any] = field(
-        default_factory=dict
-    )  # drgs.integrator.mirrors.FlatMirror by probe
-    pictures: Any = None  # drgs.integrator.mirrors.Mirrors; None: there are none
-
-    @property
-    def delta_mirrors(self) -> dict[int, Any]:
-        """Mirrors that have pictures."""
-        return {k: mirror for k, mirror in self.flat.items() if mirror.has_delta}
-
-    def same_shapes(self, other: _KeptMirrors) -> bool:
-        """Tell whether both are of the same shapes."""
-        return self.surfaces is other.surfaces and self.names == other.names
-
-    def same_pictures(self, other: _KeptMirrors) -> bool:
-        """Tell whether both have the same pictures."""
-        return (
-            self.same_shapes(other)
-            and self.how == other.how
-            and same_variables(self.gaussians, other.gaussians)
-            and len(self.sensors) == len(other.sensors)
-            and all(a.same_as(b) for a, b in zip(self.sensors, other.sensors, strict=True))
-        )
-
-
-def _mirrors(
-    splats: SplatsState,
-    scene: mi.Scene,
-    shapes: dict[int, mi.Shape],
-    sensors: Sequence[mi.Sensor],
-) -> _KeptMirrors:
-    """Find the shapes that are flat mirrors, and render their pictures unless all is the same.
-
-    shapes: by the probe's number.
-    """
-    from drgs.integrator.mirrors import FlatMirror, Mirrors
-
-    gaussians, degree = dr.detach(splats.gaussians), splats.sh_degree
-    cache, approximations = splats.cache, splats.approximations
-    states = [read_sensor(sensor, splats.near).detached() for sensor in sensors]
-    how = approximations, degree
-    found = _KeptMirrors(cache.surfaces, tuple(splats.probes), how, gaussians, states)
-    last = cache.mirrors
-    if last is not None and found.same_pictures(last):
-        return last
-    if last is not None and found.same_shapes(last):
-        flat = last.flat
-    else:
+    settings, last = (splats.cache.surfaces,), splats.cache.flat_mirrors
+    if last is None or not last.matches(settings, ()):
         every = {k: FlatMirror.of(shape) for k, shape in shapes.items()}
         flat = {k: mirror for k, mirror in every.items() if mirror is not None}
-    found = cache.mirrors = replace(found, flat=flat)
-    if found.delta_mirrors:
-        traced = cache.surfaces.traced(scene)
-        delta_mirrors = list(found.delta_mirrors.values())
-        pictures = Mirrors.of(delta_mirrors, states, traced, gaussians, approximations, degree)
-        found = cache.mirrors = replace(found, pictures=pictures)
-    return found
+        last = splats.cache.flat_mirrors = Cached(flat, settings, ())
+    return last.value
 
 
-def _places(objects: Sequence[mi.Object], mirrors: _KeptMirrors) -> tuple[np.ndarray, np.ndarray]:
+def _mirror_images(
+    splats: SplatsState, scene: mi.Scene, mirrors: list[Any], states: list[SensorState]
+) -> Any:
+    """Render what sensors see in flat mirrors, or reuse it; None where there are no mirrors."""
+    from drgs.integrator.mirrors import Mirrors
+
+    gaussians, cache = dr.detach(splats.gaussians), splats.cache
+    how = splats.approximations, splats.sh_degree
+    settings = (cache.surfaces, *how, *(state.settings for state in states))
+    arrays, last = (gaussians, [state.device for state in states]), cache.mirrors
+    if last is None or not last.matches(settings, arrays):
+        images = None
+        if mirrors:
+            images = Mirrors.of(mirrors, states, cache.surfaces.traced(scene), gaussians, *how)
+        last = cache.mirrors = Cached(images, settings, arrays)
+    return last.value
+
+
+def _places(
+    objects: Sequence[mi.Object], flat: dict[int, Any], sensor: SensorState
+) -> tuple[np.ndarray, np.ndarray]:
     """Find where the probes of objects are, (P, 3), and planes beyond which they see, (P, 4).
 
     That of a specular flat mirror is where the first camera is in it: rays of the camera that it
     reflects pass close by.
     """
     centers, planes = np.array(list(map(_center, objects))), np.zeros((len(objects), 4))
-    specular = {k: mirror for k, mirror in mirrors.flat.items() if mirror.is_specular}
+    specular = {k: mirror for k, mirror in flat.items() if mirror.is_specular}
     if specular:
-        camera = np.array(camera_from_sensor(mirrors.sensors[0]).center, np.float64).ravel()
+        camera = np.array(camera_from_sensor(sensor).center, np.float64).ravel()
         for k, mirror in specular.items():
             centers[k], planes[k] = mirror.behind(camera)
     return centers, planes

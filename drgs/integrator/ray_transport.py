@@ -23,18 +23,17 @@ without bias as well. For rays that meet black at last, a draw is black with the
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
 
 from drgs.accuracy.pipeline import pipeline_of
 from drgs.config.approximations import Approximations
-from drgs.core.private import same_variables
 from drgs.gaussians.parameters import Gaussians
 from drgs.integrator.path_segment import NoSplats, PathSegment
 from drgs.integrator.sensor_render import decode
-from drgs.integrator.state import SplatsState
+from drgs.integrator.state import Cached, SplatsState
 from drgs.light.walk import RaySplats, Segment
 from drgs.splatting.projection import load_rows
 
@@ -60,26 +59,17 @@ class RayTransport:
     splats: RaySplats
     exposure: mi.Float  # (1,): factor of the splats' radiance
     num_samples: int  # splats that are drawn; 0: all are composited
-    made_of: tuple[Gaussians, Approximations, int]  # detached: holding them keeps their indices
 
     @staticmethod
     def of(splats: SplatsState) -> RayTransport:
-        """That of an integrator's Gaussians, or the last one if they are the same."""
-        gaussians, degree = dr.detach(splats.gaussians), splats.sh_degree
-        approximations, last = splats.approximations, splats.cache.transport
+        """Return the transport of an integrator's Gaussians."""
+        gaussians = dr.detach(splats.gaussians)
+        settings, last = (splats.approximations, splats.sh_degree), splats.cache.ray_splats
+        if last is None or not last.matches(settings, gaussians):
+            last = Cached(ray_splats_of(gaussians, *settings), settings, gaussians)
+            splats.cache.ray_splats = last
         exposure = dr.opaque(mi.Float, splats.exposure)
-        if (
-            last is not None
-            and last.made_of[1:] == (approximations, degree)
-            and same_variables(last.made_of[0], gaussians)
-        ):
-            found = replace(last, exposure=exposure, num_samples=splats.light_samples)
-        else:
-            rays = ray_splats_of(gaussians, approximations, degree)
-            made_of = (gaussians, approximations, degree)
-            found = RayTransport(rays, exposure, splats.light_samples, made_of)
-        splats.cache.transport = found
-        return found
+        return RayTransport(last.value, exposure, splats.light_samples)
 
     def composite_segment(
         self, segment: PathSegment, sample: mi.Float, active: mi.Bool

@@ -21,7 +21,7 @@ from drgs.effects.compose import composed, ignoring
 from drgs.gaussians.parameters import Gaussians
 from drgs.integrator.film import Channels
 from drgs.integrator.sensors import SensorState, camera_from_sensor, read_sensor
-from drgs.integrator.state import CachedFrame, SplatsState, TracedSurfaces
+from drgs.integrator.state import Cached, SplatsState
 from drgs.splatting import rendering
 from drgs.splatting.image_model import Positions
 
@@ -113,8 +113,9 @@ class SensorRender:
         constant: the background, where it is a colour; display space.
         """
         behind = self._behind(constant)
-        traced = self.splats.cache.frames[self.index].traced
-        seen = repeat(repeat(None)) if traced is None else traced.seen
+        seen = repeat(repeat(None))
+        if self.hybrid is not None:
+            seen = self.splats.cache.traced[self.index].value
         by_time = zip(planes, seen, behind.colors, behind.radiance, strict=False)
         channels = [
             [self._channels_of(behind, *sample) for sample in zip(*time, strict=False)]
@@ -216,42 +217,40 @@ class SensorRender:
         One list for each time at which the shutter is open, of a frame for each pass.
         """
         pipeline, gaussians = self.splats.pipeline, dr.detach(self.splats.gaussians)
-        state = self._state().detached()
+        state, kept = self._state().detached(), self.splats.cache.frames
         traced = None if self.hybrid is None else self._traced_surfaces(state)
-        key = pipeline, self.key, state, gaussians, traced
-        rendered = self.splats.cache.frames
-        last = rendered.get(self.index)
+        key = (pipeline, self.key, *state.settings, traced), (gaussians, state.device)
+        last = kept.get(self.index)
         if last is None or not last.matches(*key):
-            seen = repeat(None) if traced is None else traced.seen
+            seen = repeat(None) if traced is None else traced.value
             frames = [
                 _render(gaussians, camera, pipeline, self.positions, of_time)
                 for camera, of_time in zip(self._cameras(state), seen, strict=False)
             ]
-            last = rendered[self.index] = CachedFrame(frames, *key)
-        return last.frames
+            last = kept[self.index] = Cached(frames, *key)
+        return last.value
 
-    def _traced_surfaces(self, state: SensorState) -> TracedSurfaces:
-        """What is seen of the scene's surfaces, traced unless the last time was the same."""
+    def _traced_surfaces(self, state: SensorState) -> Cached:
+        """Trace the scene's surfaces, or reuse the last ones: Layers by time and by pass."""
         from drgs.integrator.visible_surfaces import trace_surfaces
 
-        surfaces, kept = self.hybrid.surfaces, self.splats.cache.traced
-        settings = self.key, self.splats.hide_emitters, self.sensor.far_clip()
-        key = surfaces, settings, state
+        kept, sensor, hides = self.splats.cache.traced, self.sensor, self.splats.hide_emitters
+        settings = self.hybrid.surfaces, self.key, hides, sensor.far_clip(), *state.settings
         last = kept.get(self.index)
-        if last is None or not last.matches(*key):
+        if last is None or not last.matches(settings, state.device):
             seen = trace_surfaces(
                 self.hybrid.rays,
-                self.sensor,
+                sensor,
                 self._cameras(state),
                 self.within,
                 with_normals="normal" in self.splats.aovs.values(),
             )
-            last = kept[self.index] = TracedSurfaces(*key, seen)
+            last = kept[self.index] = Cached(seen, settings, state.device)
         return last
 
     def num_surfaces(self) -> int:
         """Number of surfaces that are seen one through the other."""
-        return len(self._traced_surfaces(self._state().detached()).seen[0][0])
+        return len(self._traced_surfaces(self._state().detached()).value[0][0])
 
     def _state(self) -> SensorState:
         return read_sensor(self.sensor, self.splats.near)

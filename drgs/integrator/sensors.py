@@ -12,7 +12,6 @@ import mitsuba as mi
 from drgs.cameras.camera import Camera
 from drgs.core.arrays import types_of
 from drgs.core.errors import PluginTypeError
-from drgs.core.private import same_variables
 
 
 @dataclass(frozen=True)
@@ -35,13 +34,10 @@ class SensorState:
         """The same without derivatives."""
         return replace(self, device=dr.detach(self.device))
 
-    def same_as(self, other: SensorState) -> bool:
-        """Whether both give the same camera."""
-        return (
-            self.make == other.make
-            and self.host == other.host
-            and same_variables(self.device, other.device)
-        )
+    @property
+    def settings(self) -> tuple[object, ...]:
+        """All besides the device's numbers, compared by ==."""
+        return self.make, self.host
 
 
 @runtime_checkable

@@ -23,12 +23,11 @@ import drjit as dr
 import mitsuba as mi
 
 from drgs.core.constants import SH_C0
-from drgs.core.private import same_variables
 from drgs.gaussians.parameters import Gaussians
 from drgs.gaussians.quaternions import quat_to_rotation
 from drgs.integrator.checks import check_ids
 from drgs.integrator.ray_transport import ray_splats_of
-from drgs.integrator.state import SplatsState
+from drgs.integrator.state import Cached, SplatsState
 from drgs.integrator.surfaces import Surfaces, scene_of
 from drgs.integrator.transparency import StraightRays, has_transparent_parts
 from drgs.light.walk import RaySplats, Segment
@@ -50,35 +49,23 @@ AHEAD = 3.0
 for: its own alpha does not count."""
 
 
-@dataclass(frozen=True, eq=False)
-class Shadows:
-    """Splats with shadows on them, and all that these depend on."""
-
-    gaussians: Gaussians
-    made_of: tuple[Gaussians, Surfaces, tuple[str, ...]]  # detached: held, see same_variables
-
-
 def shade(splats: SplatsState, scene: mi.Scene) -> None:
     """Shade the Gaussians by the objects that cast shadows, unless all is as it was.
 
     Raises PluginError for the name of an object that the scene does not have.
     """
-    gaussians, names = dr.detach(splats.unshaded_gaussians), tuple(splats.shadows)
-    last, splats.cache.shadows = splats.cache.shadows, None
-    surfaces = splats.cache.surfaces = Surfaces.of(scene, splats.cache.surfaces)
-    if (
-        last is None
-        or last.made_of[1:] != (surfaces, names)
-        or not same_variables(last.made_of[0], gaussians)
-    ):
+    gaussians, cache = dr.detach(splats.unshaded_gaussians), splats.cache
+    surfaces = cache.surfaces = Surfaces.of(scene, cache.surfaces)
+    last, cache.shaded = cache.shaded, None
+    if last is None or not last.matches((surfaces,), gaussians):
         estimate = _Estimate(
             scene=_rays_through(surfaces.objects),
-            without=_rays_through(_without(surfaces.objects, names)),
+            without=_rays_through(_without(surfaces.objects, splats.shadows)),
             splats=ray_splats_of(gaussians, splats.approximations, degree=0),
         )
         darkened = _darkened(gaussians, estimate.ratios(gaussians))
-        last = Shadows(darkened, (gaussians, surfaces, names))
-    splats.cache.shadows = last
+        last = Cached(darkened, (surfaces,), gaussians)
+    cache.shaded = last
 
 
 def _without(objects: Sequence[mi.Object], names: Sequence[str]) -> list[mi.Object]:

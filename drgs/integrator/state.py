@@ -29,7 +29,6 @@ from drgs.integrator.checks import (
     check_shapes,
     ellipsoids_in,
 )
-from drgs.integrator.sensors import SensorState
 from drgs.splatting import rendering
 
 if TYPE_CHECKING:  # imported where a scene has other Gaussians than the integrator's, unmoved
@@ -64,70 +63,45 @@ class BackwardResult:
         return sum(sums[1:], sums[0]) / sum(frame.bins.grid.samples for frame in self.frames)
 
 
-@dataclass(frozen=True)
-class CachedFrame:
-    """The last frames of a view, and everything that they depend on."""
-
-    frames: list[list[rendering.Frame]]  # by time; one for each pass
-    pipeline: rendering.Pipeline
-    samples: object  # key of the film's samples: see drgs.integrator.film.FilmSamples
-    sensor: SensorState
-    gaussians: Gaussians  # detached: holding them keeps their variable indices from being reused
-    traced: TracedSurfaces | None  # surfaces between the splats
-
-    def matches(
-        self,
-        pipeline: rendering.Pipeline,
-        samples: object,
-        sensor: SensorState,
-        gaussians: Gaussians,
-        traced: TracedSurfaces | None,
-    ) -> bool:
-        """Return whether rendering these would give the same frames."""
-        return (
-            self.pipeline == pipeline
-            and self.samples == samples
-            and self.sensor.same_as(sensor)
-            and same_variables(self.gaussians, gaussians)
-            and self.traced is traced
-        )
-
-
 @dataclass(frozen=True, eq=False)
-class TracedSurfaces:
-    """A scene's surfaces as a sensor saw them, and everything that this depends on."""
+class Cached:
+    """A value, and everything that it depends on.
 
-    surfaces: Any  # drgs.integrator.surfaces.Surfaces
-    settings: tuple[object, ...]  # of samples, integrator and sensor
-    sensor: SensorState
-    seen: list[list[Any]]  # by time and by pass: drgs.integrator.visible_surfaces.Layers
+    Holding the arrays keeps the indices of their variables from being reused: equal indices mean
+    equal values.
+    """
 
-    def matches(self, surfaces: Any, settings: tuple[object, ...], sensor: SensorState) -> bool:
-        """Return whether tracing these would give the same."""
-        same = self.surfaces is surfaces and self.settings == settings
-        return same and self.sensor.same_as(sensor)
+    value: Any
+    settings: tuple[object, ...]  # compared by ==
+    arrays: Any  # a PyTree, detached: compared by variables
+
+    def matches(self, settings: tuple[object, ...], arrays: Any) -> bool:
+        """Return whether the value is that of these settings and arrays."""
+        return self.settings == settings and same_variables(self.arrays, arrays)
 
 
 @dataclass
 class RenderCache:
-    """Intermediate results of the last renderings; views are known by their numbers."""
+    """Intermediate results of the last renderings; sensors are known by their places in a batch."""
 
-    frames: dict[int, CachedFrame] = field(default_factory=dict)
-    traced: dict[int, TracedSurfaces] = field(default_factory=dict)
+    frames: dict[int, Cached] = field(default_factory=dict)  # by time, one for each pass
+    traced: dict[int, Cached] = field(default_factory=dict)  # visible_surfaces.Layers, likewise
     film_maps: dict[str, np.ndarray] = field(default_factory=dict)  # see drgs.integrator.film
     gathered: Any = None  # drgs.integrator.gathering.Gathered; None: the own Gaussians, unmoved
     has_ellipsoids: bool = False  # whether the last scene has shapes that are Gaussians
     instances: list[Any] = field(default_factory=list)  # mi.Shape: of the last scene, checked
     sensor: Any = None  # mi.Sensor that was rendered last
     surfaces: Any = None  # drgs.integrator.surfaces.Surfaces of the last scene that had some
-    transport: Any = None  # drgs.integrator.ray_transport.RayTransport
-    probes: Any = None  # see drgs.integrator.probe_transport
-    mirrors: Any = None  # the same of flat mirrors
-    shadows: Any = None  # drgs.integrator.shadows.Shadows
+    ray_splats: Cached | None = None  # drgs.light.walk.RaySplats
+    probes: Cached | None = None  # drgs.light.probe.Probes
+    too_close: frozenset[str] = frozenset()  # ids of objects that a warning was logged for
+    flat_mirrors: Cached | None = None  # by probe: drgs.integrator.mirrors.FlatMirror
+    mirrors: Cached | None = None  # drgs.integrator.mirrors.Mirrors
+    shaded: Cached | None = None  # Gaussians in the shadow of surfaces
     summary: str = ""  # that was logged last
 
     def forget_view(self, index: int) -> None:
-        """Drop a view that will not be rendered again."""
+        """Drop a sensor that will not be rendered again."""
         self.frames.pop(index, None)
         self.traced.pop(index, None)
 
@@ -274,8 +248,8 @@ class SplatsState:
         Detached where they are moved, or of several parts. Those of a scene's shapes are among them
         once it was rendered.
         """
-        shadows = self.cache.shadows
-        return self.unshaded_gaussians if shadows is None else shadows.gaussians
+        shaded = self.cache.shaded
+        return self.unshaded_gaussians if shaded is None else shaded.value
 
     @property
     def unshaded_gaussians(self) -> Gaussians:

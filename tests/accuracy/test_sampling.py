@@ -437,7 +437,7 @@ def outcome(name, samples=3) -> tuple[dict[str, np.ndarray], int]:
     integrator.render_backward(loaded, params, weights, sensor, 5, samples)
     gradients = {key: np.array(dr.grad(value)) for key, value in values.items()}
     assert all(np.abs(gradient).max() > 0 for gradient in gradients.values())
-    (frames, *_) = integrator.state.cache.frames[0].frames
+    (frames, *_) = integrator.state.cache.frames[0].value
     return {"image": np.array(image), "tangent": np.array(tangent), **gradients}, len(frames)
 
 
@@ -492,7 +492,8 @@ def test_more_samples_of_a_small_film_need_no_more_kernels():
 def test_weights_are_means_over_the_samples_of_all_passes(monkeypatch):
     def weights() -> np.ndarray:
         loaded = scene_with()
-        dr.eval(loaded.integrator().render(loaded, spp=3))
+        gradient = dr.zeros(mi.TensorXf, loaded.integrator().render(loaded, spp=3).shape)
+        loaded.integrator().render_backward(loaded, None, gradient, spp=3)
         plane = dr.arange(mi.Float, FEW.view.width * FEW.view.height)
         return np.array(loaded.integrator().last.weighted_sums(plane))
 

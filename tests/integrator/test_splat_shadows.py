@@ -113,14 +113,14 @@ def test_shadows_are_kept_until_something_changes():
         discs(np.zeros((4, 3))), "lid", lid=disc(1.0, 1.0), sky=SKY, floor=disc(-0.05, 50.0)
     )
     mi.render(scene)
-    first = scene.integrator().state.cache.shadows
+    first = scene.integrator().state.cache.shaded
     mi.render(scene)
-    assert scene.integrator().state.cache.shadows is first
+    assert scene.integrator().state.cache.shaded is first
     params = mi.traverse(scene)
     params["lid.to_world"] = mi.Transform4f().translate([5, 0, 1]).scale(0.1)
     params.update()
     mi.render(scene)
-    assert scene.integrator().state.cache.shadows is not first
+    assert scene.integrator().state.cache.shaded is not first
 
 
 def test_unknown_shapes_and_derivatives_are_refused():
