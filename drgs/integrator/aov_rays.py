@@ -87,11 +87,6 @@ class ImageRays:
         dr.eval([(p.x, p.y) for p in positions])
         return ImageRays(ray, count, positions)
 
-    @property
-    def within(self) -> tuple[tuple[Any, Any], ...]:
-        """Starting points by pass: x and y from their pixels' upper left corners, px."""
-        return tuple((p.x, p.y) for p in self.positions)
-
     def channels(
         self,
         splats: SplatsState,
@@ -110,7 +105,6 @@ class ImageRays:
             index=NESTED,
             sensor=sensor,
             positions=times * self.positions,
-            within=times * self.within,
             key=self,
             has_alpha=True,
             hybrid=hybrid,

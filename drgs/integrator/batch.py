@@ -43,12 +43,6 @@ class SideBySide:
             for p in positions
         )
 
-    def within(self, places: Sequence[tuple[Any, Any]], index: int) -> list[tuple[Any, Any]]:
-        """The same as pairs of numbers or of planes."""
-        return [
-            tuple(self._cut(v, index) if dr.is_array_v(v) else v for v in place) for place in places
-        ]
-
     def cut(self, passes: Sequence[Channels], index: int) -> list[Channels]:
         """The part of one picture of what the film gets, by pass."""
         return [[self._cut(plane, index) for plane in channels] for channels in passes]

@@ -47,7 +47,7 @@ HIDDEN = -1e4
 
 @dataclass(frozen=True)
 class Ellipsoids:
-    """The arrays in which a shape keeps its Gaussians; see ``gathering.Values``."""
+    """The arrays in which a shape keeps its Gaussians."""
 
     data: Any  # Float (10 N,)
     opacities: Any  # Float (N,)

@@ -22,7 +22,7 @@ import mitsuba as mi
 
 from drgs.gaussians.parameters import Gaussians
 from drgs.integrator.checks import check_image
-from drgs.integrator.film import CenterSamples, FilmSamples
+from drgs.integrator.film import CenterSamples
 from drgs.integrator.path_segment import passes_splats
 from drgs.integrator.sensor_render import Planes, SensorRender, constant_background
 from drgs.integrator.sensors import is_batch, num_poses, sensors_of
@@ -39,7 +39,7 @@ class ImageRender:
     """One picture of a sensor, by view."""
 
     views: list[SensorRender]
-    samples: FilmSamples
+    samples: CenterSamples
     hybrid: Hybrid | None  # None: there are splats alone
     batch: SideBySide | None = None  # for several views
 
@@ -74,7 +74,6 @@ class ImageRender:
             index=0,
             sensor=sensor,
             positions=samples.positions,
-            within=samples.within,
             key=samples.key,
             has_alpha=mi.has_flag(film.flags(), mi.FilmFlags.Alpha),
             hybrid=hybrid,
@@ -90,7 +89,6 @@ class ImageRender:
                 index=index,
                 sensor=one,
                 positions=batch.positions(whole.positions, index),
-                within=batch.within(whole.within, index),
             )
             for index, one in enumerate(batch.sensors)
         ]

@@ -41,7 +41,7 @@ TO_WORLD = "to_world"
 
 @dataclass(frozen=True)
 class PlacedGaussians:
-    """Gaussians in the space of their object, and its place; see ``gathering.Values``."""
+    """Gaussians in the space of their object, and its place."""
 
     gaussians: Gaussians
     to_world: Any  # Matrix4f, of one lane

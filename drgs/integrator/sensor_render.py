@@ -19,7 +19,7 @@ import mitsuba as mi
 from drgs.cameras.camera import Camera, cameras_in_time
 from drgs.effects.compose import composed, ignoring
 from drgs.gaussians.parameters import Gaussians
-from drgs.integrator.film import Channels
+from drgs.integrator.film import Channels, offsets_of
 from drgs.integrator.sensors import SensorState, camera_from_sensor, read_sensor
 from drgs.integrator.state import Cached, SplatsState
 from drgs.splatting import rendering
@@ -51,8 +51,7 @@ class SensorRender:
     index: int  # of the view, in the cache
     sensor: mi.Sensor
     positions: Sequence[Positions]  # by pass
-    within: Sequence[tuple[Any, Any]]  # the same, px from the pixels' upper left corners
-    key: object  # of these: see drgs.integrator.film.FilmSamples
+    key: object  # of these: see drgs.integrator.film.CenterSamples
     has_alpha: bool
     hybrid: Hybrid | None  # the part of surfaces, if there are any
 
@@ -202,7 +201,7 @@ class SensorRender:
         cameras = [of_time[0].camera for of_time in self._frames()]
         if state.is_attached:
             cameras = self._attached_cameras(state)
-        colors = radiance = seen_by(self.sensor.film(), behind, cameras, self.within)
+        colors = radiance = seen_by(self.sensor.film(), behind, cameras, self._offsets)
         if environment is None or not splats.srgb_primitives:
             colors = [[mi.math.linear_to_srgb(color) for color in of_time] for of_time in colors]
         return _Behind(colors, environment is not None, radiance)
@@ -242,7 +241,7 @@ class SensorRender:
                 self.hybrid.rays,
                 sensor,
                 self._cameras(state),
-                self.within,
+                self._offsets,
                 with_normals="normal" in self.splats.aovs.values(),
             )
             last = kept[self.index] = Cached(seen, settings, state.device)
@@ -251,6 +250,10 @@ class SensorRender:
     def num_surfaces(self) -> int:
         """Number of surfaces that are seen one through the other."""
         return len(self._traced_surfaces(self._state().detached()).value[0][0])
+
+    @property
+    def _offsets(self) -> list[tuple[Any, Any]]:
+        return [offsets_of(positions) for positions in self.positions]
 
     def _state(self) -> SensorState:
         return read_sensor(self.sensor, self.splats.near)

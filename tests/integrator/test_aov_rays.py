@@ -204,7 +204,9 @@ def test_rays_of_another_sensor_are_refused():
         return sensor.sample_ray_differential(0, 0, place, mi.Point2f(0.5))[0]
 
     found = ImageRays.of(first, 0.01, rays(first))
-    np.testing.assert_allclose(np.array(found.within), 0.5, rtol=0, atol=1e-4)
+    np.testing.assert_allclose(
+        np.array([(p.x, p.y) for p in found.positions]), 0.5, rtol=0, atol=1e-4
+    )
     moved = mi.ScalarTransform4f().translate([0.05, 0, 0])
     turned = mi.ScalarTransform4f().rotate([0, 1, 0], 3)
     for change in (moved, turned):
