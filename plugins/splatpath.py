@@ -186,7 +186,7 @@ class SplatPathIntegrator(RBIntegrator):
         arrives: mi.Spectrum,
         primal: bool,
     ) -> mi.Spectrum:
-        """Of the emitter that a path has met."""
+        """Return the radiance of the emitter that a path has met."""
         shows = path.active & ~((path.depth == 0) & ~si.is_valid() & self.hide_emitters)
         ds = mi.DirectionSample3f(scene, si=si, ref=path.last_si)
         pdf = scene.pdf_emitter_direction(path.last_si, ds, ~path.last_is_delta)
@@ -204,7 +204,7 @@ class SplatPathIntegrator(RBIntegrator):
         active: mi.Bool,
         primal: bool,
     ) -> mi.Spectrum:
-        """Of an emitter that the vertex samples."""
+        """Return the radiance of an emitter that the vertex samples."""
         bsdf = si.bsdf(path.ray)
         active = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
         rays, numbers = StraightRays(scene, False, self.sees_through), sampler.next_2d()
@@ -231,7 +231,7 @@ class SplatPathIntegrator(RBIntegrator):
         si: mi.SurfaceInteraction3f,
         arrives: mi.Spectrum,
     ) -> _Step:
-        """Where a path goes on, if it does."""
+        """Sample the step to the next vertex, if the path goes on."""
         has_bounces = path.depth + 1 < self.max_depth
         may_pass = mi.Bool(self.sees_through)
         active = path.active & si.is_valid() & (has_bounces | may_pass)
@@ -279,7 +279,7 @@ class SplatPathIntegrator(RBIntegrator):
         return path.throughput * radiance, path.throughput * let_through
 
     def _let_through(self, segment: PathSegment, sampler: mi.Sampler, active: mi.Bool) -> mi.Float:
-        """Of the light of an emitter."""
+        """Return the transmittance of splats to an emitter."""
         if self._transport is None:
             return mi.Float(1)
         return self._transport.transmittance(segment, sampler.next_1d(), active)
@@ -330,7 +330,7 @@ class _Path:
         return PathSegment(ray, self.last_hit.shape, emitter, pdf, is_open)
 
     def vertex(self, attached: bool) -> mi.SurfaceInteraction3f:
-        """Where the path is; attached: to the surfaces of this vertex and the one before."""
+        """Return the vertex; attached: to the surfaces of this vertex and the one before."""
         si = self.hit.compute_surface_interaction(self.ray, ray_flags=mi.RayFlags.All)
         if attached:
             last = self.last_hit.compute_surface_interaction(
@@ -365,7 +365,7 @@ class _Path:
 
 @dataclass(frozen=True)
 class _Step:
-    """From a vertex to the next one."""
+    """A step of a path to its next vertex."""
 
     ray: mi.Ray3f
     hit: mi.PreliminaryIntersection3f

@@ -390,7 +390,7 @@ class SplatsIntegrator(mi.CppADIntegrator):
 
     @property
     def srgb_primitives(self) -> bool:
-        """Whether the image is linear radiance; the name is that of ``volprim_rf_basic``."""
+        """True if the image is linear radiance; ``volprim_rf_basic`` has the same attribute."""
         return self.state.srgb_primitives
 
     @property

@@ -95,7 +95,7 @@ class ImageRays:
         sampler: mi.Sampler,
         active: mi.Bool,
     ) -> Channels:
-        """What the rays see, each Float (H * W * count,): colour, alpha, AOVs of the splats."""
+        """Return colour, alpha and AOVs of the rays, each Float (H * W * count,)."""
         hybrid = hybrid_of(splats, scene, sensor, 0, 1)
         # With a single sample, what is seen of edges would be the mean over their pixels.
         times = 2 if self.count == 1 and hybrid is not None else 1
@@ -140,7 +140,7 @@ class ImageRays:
 
 
 def _look_back(camera: Camera, ray: mi.Ray3f) -> tuple[mi.Point2f, mi.Bool]:
-    """Where on the film rays start, px; whether they belong to this camera."""
+    """Return where on the film rays start, px; whether they belong to this camera."""
     offset = camera.rotation @ mi.Vector3f(ray.o - mi.Point3f(camera.center))
     direction = camera.rotation @ mi.Vector3f(ray.d)
     place, radius = camera.place_of_ray(offset, direction)

@@ -1,4 +1,4 @@
-"""What is seen past the splats that is no constant: an environment, a texture.
+"""Backgrounds that are no constant: an environment, a texture.
 
 Imported when a scene has an environment emitter or the background is a texture. Both are linear
 radiance, evaluated where the pixels are, and differentiated by Dr.Jit. Derivatives of an image's
@@ -24,7 +24,7 @@ as so many pictures of itself."""
 
 
 class Background(Protocol):
-    """What is seen past the splats."""
+    """A background that varies over the film."""
 
     def radiance(self, film: mi.Film, camera: Camera, place: mi.Point2f) -> mi.Color3f:
         """At places in the crop window, px."""

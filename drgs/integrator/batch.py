@@ -20,7 +20,7 @@ from drgs.splatting.image_model import PixelCenters, Positions
 
 @dataclass(frozen=True)
 class SideBySide:
-    """Where the pictures stand; all have one size, px."""
+    """The sensors of a batch, whose images of one size (px) stand side by side."""
 
     sensors: list[mi.Sensor]  # the same one, perhaps, at several places
     width: int

@@ -74,7 +74,7 @@ class Ellipsoids:
 
 
 def read(shape: mi.Shape) -> Ellipsoids:
-    """What the shape holds now, attached. Raises PluginError that names what does not fit."""
+    """Read the shape's arrays, attached. Raises PluginError that names what does not fit."""
     values = mi.traverse(shape)
     where = f"splats: the {_name(shape)}"
     missing = [name for name in ("opacities", "sh_coeffs") if name not in values]
@@ -106,7 +106,7 @@ def _name(shape: mi.Shape) -> str:
 
 @dataclass(frozen=True, eq=False)
 class Conversion:
-    """From what a shape holds to raw parameters of its Gaussians, and derivatives of that.
+    """The conversion of a shape's arrays to raw parameters of Gaussians, and its derivatives.
 
     See :class:`drgs.integrator.gathering.Part`.
     """

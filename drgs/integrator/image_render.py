@@ -36,7 +36,7 @@ if TYPE_CHECKING:  # imported where a scene calls for them
 
 @dataclass(frozen=True, eq=False)
 class ImageRender:
-    """One picture of a sensor, by view."""
+    """An image of a sensor: of one, or of several side by side."""
 
     views: list[SensorRender]
     samples: CenterSamples
@@ -51,7 +51,7 @@ class ImageRender:
         seed: int | mi.UInt32,
         spp: int,
     ) -> ImageRender:
-        """Where the sensor's pixels are evaluated, and how its film develops them.
+        """Choose where the sensor's pixels are evaluated, and how its film develops them.
 
         seed, spp: as ``mi.render`` has them; 0 samples per pixel: those of the sensor's sampler.
         """
@@ -103,14 +103,14 @@ class ImageRender:
         return replace(self, views=[replace(v, hybrid=hybrid) for v in self.views], hybrid=hybrid)
 
     def image(self) -> mi.TensorXf:
-        """The developed picture."""
+        """Return the developed image."""
         image = self._image_of_splats()
         if self.hybrid is None:
             return image
         return self.hybrid.insertion.develop(image, self.hybrid.pictures())
 
     def backward(self, params: object, grad_in: mi.TensorXf) -> rendering.GaussianGradients:
-        """Derivatives with respect to the Gaussians; all others are accumulated.
+        """Return derivatives with respect to the Gaussians; accumulate all others.
 
         params: as ``mi.render`` has them; grad_in: derivative of the loss with respect to the
         image.
@@ -128,7 +128,7 @@ class ImageRender:
         return reduce(rendering.sum_of_gradients, gradients)
 
     def tangent(self, params: object, tangents: Gaussians) -> mi.TensorXf:
-        """Directional derivative of the image.
+        """Return the directional derivative of the image.
 
         tangents: of the Gaussians; those of all other parameters are set on them.
         """
@@ -154,7 +154,7 @@ class ImageRender:
         return self.hybrid.insertion.tangent(dr.detach(image), nested, d_image, d_nested)
 
     def _image_of_splats(self) -> mi.TensorXf:
-        """For a hybrid picture, with the channels that the insertion needs."""
+        """Return the image of the splats, with the channels that surfaces need."""
         constant = constant_background(self.views[0].splats)
         return self._developed([view.planes() for view in self.views], constant)
 
@@ -172,7 +172,7 @@ def hybrid_of(
     seed: int | mi.UInt32,
     spp: int,
 ) -> Hybrid | None:
-    """The part that surfaces take in a picture; None where there are none."""
+    """Return the surfaces' part of an image; None where there are none."""
     if all(shape.is_ellipsoids() for shape in scene.shapes()):
         return None
     from drgs.integrator.surfaces import Hybrid, Insertion, Surfaces

@@ -64,7 +64,7 @@ class PlacedGaussians:
 
 @dataclass(frozen=True, eq=False)
 class Placement:
-    """From a splat object to the scene; see :class:`drgs.integrator.gathering.Part`."""
+    """The move of an object into the scene; see :class:`drgs.integrator.gathering.Part`."""
 
     values: PlacedGaussians
     name: str  # of the parameter to_world, in messages
@@ -247,7 +247,7 @@ class _Columns(NamedTuple):
 
     @staticmethod
     def of(tensors: Mapping[str, Any]) -> _Columns:
-        """From (N, ...) tensors by name."""
+        """Split (N, ...) tensors by name into columns."""
         found = (tensors[name] for name in _Columns._fields)
         return _Columns(*(columns(t.array, math.prod(t.shape[1:])) for t in found))
 

@@ -44,7 +44,7 @@ NOBODY = 0xFFFFFFFF
 
 @dataclass(frozen=True, eq=False)
 class ProbeTransport:
-    """What probes see of a scene's splats."""
+    """Transport along rays that are looked up in probes."""
 
     probes: Probes
     mirrors: Any  # drgs.integrator.mirrors.Mirrors of the shapes that are some; None: none is
@@ -63,7 +63,7 @@ class ProbeTransport:
         sensors: Sequence[mi.Sensor],
         unseen: SplatTransport,
     ) -> ProbeTransport:
-        """Those of an integrator's objects, or the last ones if nothing has changed.
+        """Return the transport by the probes of an integrator's objects.
 
         sensors: those that flat mirrors are seen by.
 
@@ -107,7 +107,7 @@ class ProbeTransport:
         return dr.select(is_asked & seen.is_known, 1 - seen.coverage, 1)
 
     def _look(self, segment: PathSegment, active: mi.Bool) -> tuple[Seen, mi.Bool, mi.Bool]:
-        """What a probe sees; whether there is one to ask; whether it is that of the other end."""
+        """Look up segments: result, whether they have a probe, whether it is that of their end."""
         probe, other = mi.UInt32(NOBODY), mi.UInt32(NOBODY)
         for k, shape in self.shapes.items():
             probe = dr.select(segment.start == shape, mi.UInt32(k), probe)
@@ -143,7 +143,7 @@ class ProbeTransport:
         return self.mirrors.look(mirror, segment, active & (mirror != NOBODY))
 
     def _level(self, pdf: mi.Float) -> mi.UInt32:
-        """Of the cube whose texels are as large as what a path of a pixel stands for."""
+        """Return the level whose texels are as large as the solid angle of one path."""
         texel = 4 * math.pi / (6 * SIZE**2)
         level = 0.5 * dr.log2(dr.rcp(dr.maximum(pdf * self.num_paths * texel, 1e-20)))
         return mi.UInt32(dr.clip(level + 0.5, 0, LEVELS - 1))

@@ -1,4 +1,4 @@
-"""What a scene description tells the plugins: properties, read and checked.
+"""Properties of scene descriptions, read and checked for the plugins.
 
 The readers of single values serve both plugins, the others ``splats``. All raise
 :class:`drgs.core.errors.PluginError` with the plugin's name, that of the property, what was
@@ -110,7 +110,7 @@ def read_state(
 
 
 def light_of(props: mi.Properties, nested: mi.Integrator | None) -> str:
-    """How light passes between splats and surfaces, of :data:`LIGHTS`."""
+    """Return ``light``, one of :data:`LIGHTS`."""
     light = one_of(props, "light", LIGHTS)
     if light != LIGHTS[0] and nested is not None and not passes_splats(nested):
         raise PluginError(
@@ -121,7 +121,7 @@ def light_of(props: mi.Properties, nested: mi.Integrator | None) -> str:
 
 
 def ids_of(props: mi.Properties, name: str) -> tuple[str, ...]:
-    """Ids of objects of the scene, separated by commas."""
+    """Return a list of ids from a text with commas."""
     return tuple(part.strip() for part in props.get(name, "").split(",") if part.strip())
 
 
@@ -202,7 +202,7 @@ def to_world_of(props: mi.Properties) -> mi.AffineTransform4f:
 
 
 def turns_of_shapes(props: mi.Properties) -> dict[str, Turn]:
-    """By ids of shapes, and under "" for all others: how their spherical harmonics turn."""
+    """Return rotations of spherical harmonics by ids of shapes, and under "" for all others."""
     names = [name for name in props.keys() if name.startswith(SHAPES_TO_WORLD)]  # noqa: SIM118
     if not names:
         return {}
@@ -236,7 +236,7 @@ def background_of(props: mi.Properties) -> mi.Color3f | mi.Texture:
 
 
 def ignored_effects(props: mi.Properties) -> tuple[str, ...]:
-    """What is called for and not to be simulated."""
+    """Return the effects that are not simulated."""
     words = [word.strip() for word in str(props.get("ignore", "")).split(",") if word.strip()]
     for word in words:
         if word not in IGNORABLE:
@@ -247,7 +247,7 @@ def ignored_effects(props: mi.Properties) -> tuple[str, ...]:
 
 
 def aovs_of(props: mi.Properties, kinds: Sequence[str]) -> dict[str, str]:
-    """By name: what is put out, one of ``kinds``."""
+    """Return types of AOVs by name, each of ``kinds``."""
     aovs = {}
     for item in str(props.get("aovs", "")).split(","):
         if not item.strip():
@@ -340,7 +340,7 @@ def approximations_of(props: mi.Properties, said: Mapping[str, Value]) -> Approx
 
 
 def _approximation(props: mi.Properties, name: str, declared: Declared) -> Value:
-    """One of them, of the type that it is declared with."""
+    """Return one approximation, of the type that it is declared with."""
     value = props[name]
     if declared.kind is float and type(value) is int:
         value = float(value)
@@ -420,7 +420,7 @@ def _number(props: mi.Properties, name: str, default: float, expected: str) -> f
 
 
 def one_of(props: mi.Properties, name: str, known: Sequence[str]) -> str:
-    """One of several words, the first of which is the default."""
+    """Return one of several words, the first of which is the default."""
     value = props.get(name, known[0])
     if value not in known:
         message = _message(props, name, f"one of {', '.join(known)}", value)

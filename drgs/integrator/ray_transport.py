@@ -54,7 +54,7 @@ few splats make a ray dark, and many more are behind them."""
 
 @dataclass(frozen=True, eq=False)
 class RayTransport:
-    """What rays pass of the splats themselves."""
+    """Transport along rays that pass the splats themselves."""
 
     splats: RaySplats
     exposure: mi.Float  # (1,): factor of the splats' radiance

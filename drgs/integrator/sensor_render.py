@@ -44,7 +44,7 @@ compilers take longer than proportionally to a kernel's length."""
 
 @dataclass(frozen=True, eq=False)
 class SensorRender:
-    """What one sensor sees of a picture: all of it, unless it is one of a batch."""
+    """The image of one sensor: all of it, unless it is one of a batch."""
 
     splats: SplatsState
     scene: mi.Scene
@@ -56,11 +56,11 @@ class SensorRender:
     hybrid: Hybrid | None  # the part of surfaces, if there are any
 
     def planes(self) -> Planes:
-        """Of all frames, unevaluated."""
+        """Return the planes of all frames, unevaluated."""
         return [[frame.planes() for frame in of_time] for of_time in self._frames()]
 
     def plane_tangents(self, tangents: Gaussians) -> Planes:
-        """Along tangents of the Gaussians, and those set on the sensor."""
+        """Return tangents of planes along those of the Gaussians and of the sensor."""
         frames = self._frames()
         with dr.resume_grad():
             d_cameras = self._camera_tangents(len(frames))
@@ -70,7 +70,7 @@ class SensorRender:
         ]
 
     def backward(self, d_channels: Passes) -> rendering.GaussianGradients:
-        """Derivatives with respect to the Gaussians; all others are accumulated."""
+        """Return derivatives with respect to the Gaussians; accumulate all others."""
         planes, constant = self.planes(), constant_background(self.splats)
         with dr.resume_grad():
             of_background = constant is not None and dr.grad_enabled(self.splats.background)
@@ -185,7 +185,7 @@ class SensorRender:
         return channels
 
     def _behind(self, constant: mi.Color3f | None) -> _Behind:
-        """What is seen past the splats, in the space of the channels."""
+        """Evaluate the background, in the space of the channels."""
         splats = self.splats
         environment = None if splats.hide_emitters else self.scene.environment()
         if environment is None and constant is not None:
@@ -259,15 +259,15 @@ class SensorRender:
         return read_sensor(self.sensor, self.splats.near)
 
     def _cameras(self, state: SensorState) -> list[Camera]:
-        """What is simulated of the sensor's camera, detached; of each time."""
+        """Return the camera at each time, detached, without what is ignored."""
         return cameras_in_time(ignoring(camera_from_sensor(state), self.splats.ignore))
 
     def _attached_cameras(self, state: SensorState) -> list[Camera]:
-        """The same, attached to the sensor's parameters."""
+        """Return the cameras, attached to the sensor's parameters."""
         return _attached_cameras(self.splats.ignore, state)
 
     def _camera_tangents(self, count: int) -> list[list[mi.Float] | None]:
-        """Of each time's camera, derivatives of its numbers along those set on the sensor."""
+        """Return the derivatives of each time's camera numbers along those set on the sensor."""
         state = self._state()
         if not state.is_attached:
             return [None] * count
@@ -277,7 +277,7 @@ class SensorRender:
 
 
 def _mean(passes: Sequence[Passes]) -> Passes:
-    """Of what the film gets at several times, summed in their order."""
+    """Return the mean over several times, summed in their order."""
     total: list[Passes] = []
     for first in range(0, len(passes), PASSES_PER_KERNEL):
         dr.eval(total)
@@ -293,7 +293,7 @@ def _mean(passes: Sequence[Passes]) -> Passes:
 
 @dataclass(frozen=True)
 class _Behind:
-    """What is seen past the splats."""
+    """The background of an image, at each sample."""
 
     colors: Iterable[Iterable[mi.Color3f]]  # by time and by pass; display space, or see below
     is_radiance: bool  # of an environment: it covers the film, and its colours are linear where
@@ -317,7 +317,7 @@ def _render(
     positions: Sequence[Positions],
     surfaces: Sequence[Layers] | None,
 ) -> list[rendering.Frame]:
-    """A frame for each pass; surfaces: what is seen of them at each."""
+    """Render a frame for each pass; surfaces: the visible ones of each."""
     pipeline = composed(pipeline, gaussians, camera)
     models = [replace(pipeline.model, positions=points) for points in positions]
     if surfaces is not None:

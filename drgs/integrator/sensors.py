@@ -1,4 +1,4 @@
-"""From Mitsuba's sensors to the cameras that the projection knows."""
+"""Cameras of the projection from Mitsuba's sensors."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ class SensorState:
 
     @property
     def is_attached(self) -> bool:
-        """Whether derivatives with respect to one of the sensor's parameters are asked for."""
+        """True if one of the sensor's parameters is attached."""
         return any(dr.grad_enabled(value) for value in self.device.values())
 
     def detached(self) -> SensorState:
-        """The same without derivatives."""
+        """Return a detached copy."""
         return replace(self, device=dr.detach(self.device))
 
     @property
@@ -60,12 +60,12 @@ def num_poses(sensor: mi.Sensor) -> int:
 
 
 def is_batch(sensor: mi.Sensor) -> bool:
-    """Whether it is one of Mitsuba's type ``batch``, which has no type in Python."""
+    """Return whether a sensor is a ``batch``, which has no type in Python."""
     return sensor.class_name() == "BatchSensor"
 
 
 def sensors_of(sensor: mi.Sensor) -> list[mi.Sensor]:
-    """Those of a batch, or the one."""
+    """Return the sensors of a batch, or the one."""
     if not is_batch(sensor):
         return [sensor]
     from drgs.integrator.batch import SideBySide
@@ -111,7 +111,7 @@ def camera_from_sensor(state: SensorState) -> Camera:
 
 
 def _perspective(state: SensorState) -> Camera:
-    """Of type ``perspective``; a thin lens has no offsets of the principal point."""
+    """Return the camera of a ``perspective``; a thin lens has no offsets of the principal point."""
     width, height, *_ = host = opaque_host(state)
     device = state.device
     # x_fov is the horizontal field of view of the whole film, whatever 'fov_axis' was given.
@@ -123,7 +123,7 @@ def _perspective(state: SensorState) -> Camera:
 
 
 def _thin_lens(state: SensorState) -> Camera:
-    """Of type ``thinlens``: what is not at the focus distance is blurred."""
+    """Return the camera of a ``thinlens``, which blurs points out of focus."""
     from drgs.cameras.thin_lens import RoundAperture
 
     device = state.device
@@ -135,7 +135,7 @@ def _thin_lens(state: SensorState) -> Camera:
 
 
 def _orthographic(state: SensorState) -> Camera:
-    """Of type ``orthographic``: its film is 2 units of its own wide."""
+    """Return the camera of an ``orthographic``, whose film is 2 of its units wide."""
     from drgs.cameras.orthographic import Orthographic
 
     width, height, *_ = host = opaque_host(state)

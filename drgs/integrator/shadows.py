@@ -111,7 +111,7 @@ class _Estimate:
         normals: mi.Vector3f,
         let_through: Callable[[mi.Ray3f, mi.Float], mi.Float],
     ) -> tuple[mi.Color3f, mi.Color3f]:
-        """What arrives, and what the objects hold off; let_through: by the splats, on a ray."""
+        """Return the irradiance, and that which the objects block; let_through: by the splats."""
         sampler = mi.load_dict({"type": "independent"})
         sampler.seed(0, dr.width(points))
         place = dr.zeros(mi.SurfaceInteraction3f, dr.width(points))
@@ -149,7 +149,7 @@ class _Estimate:
 
 
 def _unhindered(ray: mi.Ray3f, sample: mi.Float) -> mi.Float:
-    """As if there were no splats."""
+    """Return full transmittance."""
     del ray, sample
     return mi.Float(1)
 

@@ -171,7 +171,7 @@ class SplatsState:
 
     @property
     def has_smoothing(self) -> bool:
-        """Whether Gaussians have a smoothing filter, be it ignored."""
+        """True if Gaussians have a smoothing filter, be it ignored."""
         return any(one.gaussians.smoothing is not None for one in self.objects.values())
 
     @property
@@ -253,7 +253,7 @@ class SplatsState:
 
     @property
     def unshaded_gaussians(self) -> Gaussians:
-        """The same without the shadows of surfaces."""
+        """All rendered Gaussians, without the shadows of surfaces."""
         if self.cache.gathered is None and (self.own.is_moved or self.nested_objects):
             self.cache.gathered = _gather_parts(self._placements(), None)
         gathered = self.cache.gathered
@@ -282,7 +282,7 @@ class SplatsState:
 
     @property
     def _is_placed(self) -> bool:
-        """Whether Gaussians are moved, or are to be differentiated along a move."""
+        """True if Gaussians are moved, or are to be differentiated along a move."""
         is_moved = self.own.is_moved or dr.grad_enabled(self.own.to_world)
         return bool(self.nested_objects) or is_moved
 

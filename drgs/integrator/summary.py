@@ -1,4 +1,4 @@
-"""What is simulated of a scene, what asked for each effect, and what is not simulated.
+"""Summary of the simulated effects of a scene, of what asked for each, and of the others.
 
 An effect is composed in when the dataset, the sensor or the configuration calls for it. What is not
 called for is not imported. Commands print such a summary at their start, one line an effect:
@@ -67,7 +67,7 @@ def summary_of_sensors(
     environment: mi.Emitter | None,
     num_surfaces: int = 0,
 ) -> list[SimulatedEffect]:
-    """What the integrator ``splats`` simulates for sensors in front of an environment.
+    """Return the effects that ``splats`` simulates for sensors in front of an environment.
 
     cameras: as the sensors have them, so that what the integrator ignores of them can be named;
     num_surfaces: shapes of the scene that are no Gaussians.
@@ -104,7 +104,7 @@ def summary_of_sensors(
 def summary_of_views(
     splats: SplatsState, views: Sequence[Viewpoint], said: Collection[str] = ()
 ) -> list[SimulatedEffect]:
-    """The same for views or viewpoints, with nothing behind but the integrator's background.
+    """Return the effects for views or viewpoints before the integrator's background.
 
     said: names of the approximations that the Gaussians' file has decided.
     """
@@ -155,7 +155,7 @@ def _lens_words(lens: Lens) -> str | None:
 
 
 def antialiasing_effect(opacities: str | None, smoothing: str | None) -> SimulatedEffect:
-    """By what asked for compensated opacities and for the smoothing filter; None: nothing."""
+    """Return the effect, from what asked for compensated opacities and the smoothing filter."""
     what = joined(
         "opacities compensated for the low-pass filter" if opacities else None,
         "3D smoothing filter" if smoothing else None,
@@ -184,5 +184,5 @@ def motion_effect(views: Sequence[Viewpoint], of: str = "the dataset's cameras")
 
 
 def joined(*parts: str | None) -> str | None:
-    """Those parts that there are, as a list; None if there is none."""
+    """Join the parts that are not None by commas; None if there is none."""
     return ", ".join(part for part in parts if part) or None

@@ -64,7 +64,7 @@ UNBOUNDED = 0xFFFFFFFF
 
 @dataclass(frozen=True, eq=False)
 class Surfaces:
-    """What of a scene light is traced through, and all that this depends on.
+    """The surfaces of a scene, and all that they depend on.
 
     It holds no scene that has the integrator, which keeps it: neither would ever be freed.
     """
@@ -76,7 +76,7 @@ class Surfaces:
 
     @staticmethod
     def of(scene: mi.Scene, last: Surfaces | None) -> Surfaces:
-        """Those of a scene, or ``last`` if they are still the same."""
+        """Find the surfaces of a scene, or return ``last`` if they are still the same."""
         objects, parameters = _surroundings(scene)
         has_gaussians = any(shape.is_ellipsoids() for shape in scene.shapes())
         if (
@@ -90,7 +90,7 @@ class Surfaces:
         return Surfaces(objects, dr.detach(parameters), apart, has_transparent_parts(scene))
 
     def traced(self, scene: mi.Scene) -> mi.Scene:
-        """What the nested integrator renders; scene: the one that these are of."""
+        """Return the scene that the nested integrator renders; scene: the one that these are of."""
         return scene if self.apart is None else self.apart
 
 
@@ -114,13 +114,13 @@ def _surroundings(scene: mi.Scene) -> tuple[list[mi.Object], list[Any]]:
 
 
 def _same(parameters: list[Any], others: list[Any]) -> bool:
-    """Whether arrays are the same variables, and everything else has the same value."""
+    """Return whether arrays are the same variables, and everything else has the same value."""
     on_host = [[v for v in of if not dr.is_array_v(v)] for of in (parameters, others)]
     return on_host[0] == on_host[1] and same_variables(parameters, dr.detach(others))
 
 
 def scene_of(objects: list[mi.Object]) -> mi.Scene:
-    """Of the same objects, so that their parameters are those of the user's scene, and names."""
+    """Build a scene of the same objects, which keep their parameters and names."""
     names = [node.id() for node in objects]
     scene = mi.load_dict({"type": "scene", **{f"object_{k}": o for k, o in enumerate(objects)}})
     for node, name in zip(objects, names, strict=True):
@@ -213,7 +213,7 @@ class Insertion:
         return develop_pixels(self.film, tangents, self.aovs)
 
     def _inserted(self, planes: list[mi.Float], nested: list[list[mi.Float]]) -> Channels:
-        """What the film gets."""
+        """Return the channels for the film."""
         to_developed, to_rgb = self._color_maps()
         count = len(to_developed)
         rest, own = planes[count : -len(self.channels)], planes[-len(self.channels) :]
@@ -247,7 +247,7 @@ class Insertion:
         return list(weight * mi.math.linear_to_srgb(mean))
 
     def _color_maps(self) -> tuple[np.ndarray, np.ndarray]:
-        """From linear RGB to what the film makes of it (RGB, XYZ, luminance), and back.
+        """Return the maps from linear RGB to the film's colours (RGB, XYZ, luminance), and back.
 
         Of luminance there is no way back but to some colour that has it.
         """
