@@ -27,7 +27,7 @@ from drgs.accuracy.peak_depths import BoundedDepths
 from drgs.accuracy.pipeline import pipeline_of
 from drgs.cameras.camera import Camera, Lens, Pinhole
 from drgs.config.approximations import Approximations
-from drgs.effects.compose import composed
+from drgs.effects.compose import with_effects
 from drgs.gaussians.parameters import Gaussians
 from drgs.integrator.path_segment import PathSegment
 from drgs.integrator.sensors import SensorState, camera_from_sensor
@@ -320,7 +320,7 @@ def _picture(
     camera = plane.mirror(camera)
     dr.make_opaque(plane, camera)
     nearest, farthest, ends = _trace(camera, plane, scene)
-    pipeline = composed(pipeline, gaussians, camera)
+    pipeline = with_effects(pipeline, gaussians, camera)
     depths = BoundedDepths(pipeline.order.depths, nearest, farthest)
     order = replace(pipeline.order, depths=depths)
     frame = rendering.render(gaussians, camera, replace(pipeline, order=order))

@@ -17,7 +17,7 @@ import drjit as dr
 import mitsuba as mi
 
 from drgs.cameras.camera import Camera, cameras_in_time
-from drgs.effects.compose import composed, ignoring
+from drgs.effects.compose import with_effects, without_effects
 from drgs.gaussians.parameters import Gaussians
 from drgs.integrator.film import Channels, offsets_of
 from drgs.integrator.sensors import SensorState, camera_from_sensor, read_sensor
@@ -260,7 +260,7 @@ class SensorRender:
 
     def _cameras(self, state: SensorState) -> list[Camera]:
         """Return the camera at each time, detached, without what is ignored."""
-        return cameras_in_time(ignoring(camera_from_sensor(state), self.splats.ignore))
+        return cameras_in_time(without_effects(camera_from_sensor(state), self.splats.ignore))
 
     def _attached_cameras(self, state: SensorState) -> list[Camera]:
         """Return the cameras, attached to the sensor's parameters."""
@@ -318,7 +318,7 @@ def _render(
     surfaces: Sequence[Layers] | None,
 ) -> list[rendering.Frame]:
     """Render a frame for each pass; surfaces: the visible ones of each."""
-    pipeline = composed(pipeline, gaussians, camera)
+    pipeline = with_effects(pipeline, gaussians, camera)
     models = [replace(pipeline.model, positions=points) for points in positions]
     if surfaces is not None:
         from drgs.effects.occlusion import occluded_by
@@ -359,7 +359,7 @@ def accumulate_in_sensor(
 
 def _attached_cameras(ignored: Collection[str], state: SensorState) -> list[Camera]:
     dr.make_opaque(state.device)  # or each value of a literal would be a new kernel
-    return cameras_in_time(ignoring(state.make(state), ignored))
+    return cameras_in_time(without_effects(state.make(state), ignored))
 
 
 def _accumulate_through(values: list[list[Any]], gradients: list[list[mi.Float]]) -> None:

@@ -15,7 +15,7 @@ import mitsuba as mi
 
 from drgs.cameras.camera import Camera, Lens, Pinhole
 from drgs.datasets.types import Viewpoint
-from drgs.effects.compose import ignoring
+from drgs.effects.compose import without_effects
 from drgs.integrator.checks import surfaces_in
 from drgs.integrator.sensors import camera_from_sensor, read_sensor, sensors_of
 from drgs.integrator.state import SplatsState
@@ -72,7 +72,7 @@ def summary_of_sensors(
     cameras: as the sensors have them, so that what the integrator ignores of them can be named;
     num_surfaces: shapes of the scene that are no Gaussians.
     """
-    left = [ignoring(camera, splats.ignore) for camera in cameras]
+    left = [without_effects(camera, splats.ignore) for camera in cameras]
 
     def effect(name: str, words: Callable[[Camera], str | None]) -> SimulatedEffect:
         """words: what a camera has of it, or None."""
