@@ -26,7 +26,6 @@ from drgs.splatting import rendering
 from drgs.splatting.image_model import Positions
 
 if TYPE_CHECKING:  # imported where a scene calls for them
-    from drgs.integrator.background import Background
     from drgs.integrator.surfaces import Hybrid
     from drgs.integrator.visible_surfaces import Layers
 
@@ -191,17 +190,15 @@ class SensorRender:
         if environment is None and constant is not None:
             nothing = repeat(repeat(None))
             return _Behind(repeat(repeat(constant)), is_radiance=False, radiance=nothing)
-        from drgs.integrator.background import Environment, StretchedTexture, seen_by
+        from drgs.integrator.background import background_radiance
 
-        if environment is not None:
-            behind: Background = Environment(environment)
-        else:
-            behind = StretchedTexture(splats.background)
+        behind = splats.background if environment is None else environment
         state = self._state()
         cameras = [of_time[0].camera for of_time in self._frames()]
         if state.is_attached:
             cameras = self._attached_cameras(state)
-        colors = radiance = seen_by(self.sensor.film(), behind, cameras, self._offsets)
+        film = self.sensor.film()
+        colors = radiance = background_radiance(film, behind, cameras, self._offsets)
         if environment is None or not splats.srgb_primitives:
             colors = [[mi.math.linear_to_srgb(color) for color in of_time] for of_time in colors]
         return _Behind(colors, environment is not None, radiance)
