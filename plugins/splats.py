@@ -255,8 +255,8 @@ class SplatsIntegrator(mi.CppADIntegrator):
     a parameter that was changed after ``mi.render()`` is differentiated at its new value. After
     the pass, the attribute ``last`` holds the derivatives with respect to the splats' positions
     on the film, which of them were visible, the first Gaussian whose derivatives are not finite,
-    if there is one, and how much each was seen of. The attribute ``sh_degree`` may be changed from
-    one rendering to the next.
+    if there is one, and how much each was seen of. The attributes ``sh_degree``, ``nested_spp`` and
+    ``smoothing`` may be set from one rendering to the next.
 
     .. note:: Not differentiated: visibility, the order of the splats, the cut-offs of alpha and
         transmittance; the depth and the silhouette of surfaces. Among surfaces that show splats

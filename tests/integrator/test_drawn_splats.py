@@ -44,7 +44,7 @@ class Fog:
         means = rng.normal(0, self.spread, (self.count, 3))
         splats = gaussians(means, self.radius, self.opacity, colors)
         cutoffs = Cutoffs(transmittance_stop=0.0)
-        return RayTransport(splats_of(splats, FLOAT32, cutoffs), mi.Float(1), num_samples, None)
+        return RayTransport(splats_of(splats, FLOAT32, cutoffs), mi.Float(1), num_samples)
 
 
 FOGS = [
