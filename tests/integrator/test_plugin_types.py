@@ -57,6 +57,15 @@ def test_the_integrator_splats_is_known_by_its_state():
     assert is_splats(splats()) and not is_splats(mi.load_dict({"type": "path"}))
 
 
+def test_the_samples_of_surfaces_may_be_set_and_other_settings_not():
+    integrator = splats()
+    integrator.nested_spp = 3
+    assert integrator.nested_spp == 3 and "nested_spp = 3" in str(integrator)
+    for name in ("near", "ignore", "srgb_primitives", "gaussians", "pipeline"):
+        with pytest.raises(AttributeError):
+            setattr(integrator, name, getattr(integrator, name))
+
+
 def test_messages_have_names_for_lenses():
     assert (Pinhole.label, Fisheye.label) == ("Pinhole", "Fisheye")
     assert "lens = Pinhole" in str(mi.load_dict({"type": "calibrated"}))

@@ -245,11 +245,6 @@ def test_a_changed_degree_is_rendered_again(renderings):
     assert np.array_equal(after, fresh_image(replace(scene, sh_degree=0)))
 
 
-def test_settings_are_read_once():
-    with pytest.raises(AttributeError):
-        Scene().load().integrator().near = 0.25
-
-
 @pytest.mark.parametrize(
     "approximations",
     [
