@@ -61,7 +61,7 @@ from drgs.effects.compose import IGNORABLE
 from drgs.gaussians.parameters import Gaussians
 from drgs.initialization.defaults import completed
 from drgs.integrator.scene import check_lenses, check_sizes, make_scene, render_views
-from drgs.integrator.settings import SummarisingIntegrator
+from drgs.integrator.state import is_splats
 from drgs.integrator.summary import described, summary_of_views
 from drgs.io.formats import OTHER_FORMATS, format_for, readable_formats
 from drgs.io.pictures import (
@@ -125,7 +125,7 @@ class Model:
         if "distortion" not in self.ignored:
             check_lenses(self.settings, views, where="", remedy="give --ignore distortion")
         scene = self.scene()
-        print(described(summary_of_views(scene.integrator(), views, self.said)), flush=True)
+        print(described(summary_of_views(scene.integrator().state, views, self.said)), flush=True)
         names = [*(f"{view.name}.png" for view in views), *others]
         return claiming(out, names, self.render(scene, views), self.keep)
 
@@ -432,7 +432,7 @@ def render_mitsuba_scene(
     if scene.integrator() is None or not scene.sensors():
         raise UserError(f"{path}: the scene must hold an integrator and at least one sensor")
     linear = _is_linear(scene.integrator())
-    if isinstance(scene.integrator(), SummarisingIntegrator):
+    if is_splats(scene.integrator()):
         _print_summary(path, scene)
     count = len(scene.sensors())
     stem = shortened(path.stem)

@@ -34,15 +34,14 @@ from drgs.core.errors import PluginError
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 from drgs.gaussians.rotation import left_multiplication_matrix
 from drgs.gaussians.similarity import Similarity
-from drgs.integrator.gathering import columns, interleaved
-from drgs.integrator.harmonics import Turn, number_of
+from drgs.integrator.gathering import Turn, columns, interleaved, number_of
 
 TO_WORLD = "to_world"
 
 
 @dataclass(frozen=True)
 class PlacedGaussians:
-    """Gaussians in the space of their object, and its place; see ``gathering.Values``."""
+    """Gaussians in the space of their object, and its place."""
 
     gaussians: Gaussians
     to_world: Any  # Matrix4f, of one lane
@@ -65,7 +64,7 @@ class PlacedGaussians:
 
 @dataclass(frozen=True, eq=False)
 class Placement:
-    """From a splat object to the scene; see :class:`drgs.integrator.gathering.Part`."""
+    """The move of an object into the scene; see :class:`drgs.integrator.gathering.Part`."""
 
     values: PlacedGaussians
     name: str  # of the parameter to_world, in messages
@@ -248,7 +247,7 @@ class _Columns(NamedTuple):
 
     @staticmethod
     def of(tensors: Mapping[str, Any]) -> _Columns:
-        """From (N, ...) tensors by name."""
+        """Split (N, ...) tensors by name into columns."""
         found = (tensors[name] for name in _Columns._fields)
         return _Columns(*(columns(t.array, math.prod(t.shape[1:])) for t in found))
 

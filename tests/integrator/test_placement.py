@@ -125,7 +125,7 @@ def test_the_identity_costs_nothing(later):
     np.testing.assert_array_equal(image_of(loaded), image_of(load(scene, model, None)))
     integrator = loaded.integrator()
     for name in PARAMETER_NAMES:
-        assert getattr(integrator.gaussians, name) is getattr(integrator, name)
+        assert getattr(integrator.gaussians, name) is getattr(integrator.state.own.gaussians, name)
 
 
 def surfaces(scene) -> dict:
