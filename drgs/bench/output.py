@@ -11,10 +11,10 @@ from typing import Any
 
 import drjit as dr
 
+from drgs.core.environment import processor
 from drgs.core.files import atomic_path
-from drgs.core.machine import processor
+from drgs.core.folders import FolderRecord
 from drgs.core.private import llvm_version
-from drgs.core.records import FolderRecord
 
 COMMAND = "bench"
 

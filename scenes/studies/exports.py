@@ -21,19 +21,20 @@ import drgs  # noqa: F401  (registers the integrator)
 from drgs.bench.output import machine, markdown_table
 from drgs.config.load import load_config
 from drgs.config.schema import ModelConfig
+from drgs.core.registry import Extension
 from drgs.datasets import Dataset, load_dataset
 from drgs.export import load_source
 from drgs.gaussians.parameters import Gaussians
 from drgs.integrator.scene import make_scene, render_views
-from drgs.io.formats import FORMATS, Format
+from drgs.io.formats import readable_formats
 from drgs.results import metrics
 from drgs.results.files import CONFIG
 
 
-def round_trip(gaussians: Gaussians, each: Format) -> tuple[Gaussians, int, float, float]:
+def round_trip(gaussians: Gaussians, each: Extension) -> tuple[Gaussians, int, float, float]:
     """Return what is read, the bytes of the file, and the seconds of writing and reading."""
     with TemporaryDirectory() as folder:
-        path = Path(folder) / f"model{each.suffix}"
+        path = Path(folder) / f"model{each.value.suffix}"
         start = time.perf_counter()
         path.write_bytes(gaussians.to_bytes(each.name))
         written = time.perf_counter()
@@ -64,7 +65,7 @@ def main() -> None:
 
     before = render(gaussians)
     quality, rows, ply_bytes = mean_psnr(before, dataset), [], 0
-    for each in FORMATS:
+    for each in readable_formats():
         read, size, writing, reading = round_trip(gaussians, each)
         ply_bytes = ply_bytes or size
         after = render(read)

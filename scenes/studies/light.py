@@ -173,8 +173,8 @@ def _stage(place: mi.ScalarTransform4f, integrator: dict[str, object]) -> dict[s
 
 def mask_of(scene: mi.Scene, name: str) -> np.ndarray:
     """(H, W) bool: pixels whose middle shows a shape of a scene, and no splats before it."""
-    from drgs.integrator.legs import Leg
-    from drgs.integrator.light import LightOfSplats
+    from drgs.integrator.path_segment import PathSegment
+    from drgs.integrator.ray_transport import RayTransport
 
     sensor, integrator = scene.sensors()[0], scene.integrator()
     width, height = sensor.film().crop_size()
@@ -185,8 +185,10 @@ def mask_of(scene: mi.Scene, name: str) -> np.ndarray:
     hit = scene.ray_intersect_preliminary(ray)
     shape = next(shape for shape in scene.shapes() if shape.id() == name)
     ray.maxt = dr.select(hit.is_valid(), hit.t, dr.inf)
-    leg = Leg(ray, hit.shape, hit.shape.emitter(), mi.Float(dr.inf), is_open=mi.Bool(False))
-    T = LightOfSplats.of(integrator).transmittance(leg, mi.Float(0), mi.Bool(True))
+    segment = PathSegment(
+        ray, hit.shape, hit.shape.emitter(), mi.Float(dr.inf), is_open=mi.Bool(False)
+    )
+    T = RayTransport.of(integrator.state).transmittance(segment, mi.Float(0), mi.Bool(True))
     shows = hit.is_valid() & (hit.shape == mi.ShapePtr(shape)) & (T > LIT)
     return np.array(shows).reshape(height, width)
 

@@ -27,7 +27,7 @@ from fits import add_only, fit_words, make_parser
 import drgs  # noqa: F401  (registers the integrator)
 from drgs.bench.output import machine, markdown_table
 from drgs.config.schema import FitConfig
-from drgs.core.extras import required
+from drgs.core.environment import required
 from drgs.datasets import layout_name, load_dataset
 from drgs.datasets.colmap import model_folder, picture_folder
 from drgs.datasets.folders import config_for

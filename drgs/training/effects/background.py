@@ -8,7 +8,10 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from drgs.datasets.types import View
+from drgs.config.extensions import EFFECTS
+from drgs.config.schema import FitConfig
+from drgs.core.errors import UserError
+from drgs.datasets.types import Dataset, View
 from drgs.training.effects.base import FitState, TrainingEffect, as_tensor
 from drgs.training.losses import prepare_target
 from drgs.training.views import TrainingView
@@ -17,6 +20,14 @@ STREAM = 71
 """Tells the random numbers of backgrounds from others of the same seed."""
 
 
+def set_background(integrator: mi.Integrator, color: np.ndarray) -> None:
+    """Set the colour behind the splats, display space."""
+    params = mi.traverse(integrator)
+    params["background"] = mi.Color3f(*map(float, color))
+    params.update()
+
+
+@EFFECTS.register("background")
 class RandomBackground(TrainingEffect):
     """Another colour behind each picture: nothing but an opaque splat can look like what is there.
 
@@ -26,6 +37,17 @@ class RandomBackground(TrainingEffect):
 
     name = "background"
     upload_bytes = 12
+
+    @classmethod
+    def from_config(cls, config: FitConfig, dataset: Dataset, section: None) -> RandomBackground:
+        """Return the effect of a fit."""
+        del section
+        if any(view.alpha is None for view in dataset.train):
+            raise UserError(
+                "data.random_background: the photographs must be transparent where the background "
+                "is to be seen, got opaque ones"
+            )
+        return cls(config.seed, dataset.background, config.loss.window, config.loss.sigma)
 
     def __init__(
         self, seed: int, background: tuple[float, float, float], window: int, sigma: float
@@ -47,7 +69,7 @@ class RandomBackground(TrainingEffect):
         """Put a colour behind the splats and behind the photograph."""
         rng = np.random.default_rng([self.seed, STREAM, fit.iteration])
         color = rng.uniform(size=3)
-        fit.integrator.background = mi.Color3f(*map(float, color))
+        set_background(fit.integrator, color)
         # No literal, or every colour would be a new kernel.
         shift = mi.Color3f(*map(float, color - self.background))
         dr.make_opaque(shift)
@@ -60,5 +82,5 @@ class RandomBackground(TrainingEffect):
     def after(self, fit: FitState, view: TrainingView, derivatives: dict[str, Any]) -> None:
         """Put the dataset's background back."""
         del derivatives
-        fit.integrator.background = mi.Color3f(*map(float, self.background))
+        set_background(fit.integrator, self.background)
         view.replacement = None

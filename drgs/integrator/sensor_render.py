@@ -1,13 +1,13 @@
-"""What one sensor sees of a picture: frames, their planes, and the channels of its film.
+"""An image of one sensor: frames, their planes, and the channels of its film.
 
-A view renders the frames of its camera (``drgs.splatting.rendering``), or takes those of the last
-picture where nothing has changed. It puts what is behind the splats behind them, and adds what is
-seen of surfaces. ``drgs.integrator.picture`` asks for a picture, its derivatives or its tangent.
+A :class:`SensorRender` renders the frames of its camera (``drgs.splatting.rendering``), or reuses
+those of the last image where nothing has changed. It composites them over the background, and adds
+the surfaces.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import reduce
 from itertools import chain, repeat
@@ -17,17 +17,15 @@ import drjit as dr
 import mitsuba as mi
 
 from drgs.cameras.camera import Camera, cameras_in_time
-from drgs.effects.compose import composed, ignoring
+from drgs.effects.compose import with_effects, without_effects
 from drgs.gaussians.parameters import Gaussians
-from drgs.integrator.cache import Rendered, TracedSurfaces
-from drgs.integrator.film import Channels
+from drgs.integrator.film import Channels, offsets_of
 from drgs.integrator.sensors import SensorState, camera_from_sensor, read_sensor
-from drgs.integrator.settings import SplatsSettings
+from drgs.integrator.state import Cached, SplatsState
 from drgs.splatting import rendering
 from drgs.splatting.image_model import Positions
 
 if TYPE_CHECKING:  # imported where a scene calls for them
-    from drgs.integrator.background import Background
     from drgs.integrator.surfaces import Hybrid
     from drgs.integrator.visible_surfaces import Layers
 
@@ -44,38 +42,37 @@ compilers take longer than proportionally to a kernel's length."""
 
 
 @dataclass(frozen=True, eq=False)
-class View:
-    """What one sensor sees of a picture: all of it, unless it is one of a batch."""
+class SensorRender:
+    """The image of one sensor: all of it, unless it is one of a batch."""
 
-    integrator: SplatsSettings
+    splats: SplatsState
     scene: mi.Scene
-    index: int  # of the view, in the integrator's memory
+    index: int  # of the view, in the cache
     sensor: mi.Sensor
     positions: Sequence[Positions]  # by pass
-    within: Sequence[tuple[Any, Any]]  # the same, px from the pixels' upper left corners
-    key: object  # of these: see drgs.integrator.film.FilmSamples
+    key: object  # of these: see drgs.integrator.film.CenterSamples
     has_alpha: bool
     hybrid: Hybrid | None  # the part of surfaces, if there are any
 
     def planes(self) -> Planes:
-        """Of all frames, unevaluated."""
+        """Return the planes of all frames, unevaluated."""
         return [[frame.planes() for frame in of_time] for of_time in self._frames()]
 
     def plane_tangents(self, tangents: Gaussians) -> Planes:
-        """Along tangents of the Gaussians, and those set on the sensor."""
+        """Return tangents of planes along those of the Gaussians and of the sensor."""
         frames = self._frames()
         with dr.resume_grad():
             d_cameras = self._camera_tangents(len(frames))
         return [
-            rendering.frames_tangent(self.integrator.gaussians, of_time, tangents, d_camera)
+            rendering.frames_tangent(self.splats.gaussians, of_time, tangents, d_camera)
             for of_time, d_camera in zip(frames, d_cameras, strict=True)
         ]
 
     def backward(self, d_channels: Passes) -> rendering.GaussianGradients:
-        """Derivatives with respect to the Gaussians; all others are accumulated."""
-        planes, constant = self.planes(), constant_background(self.integrator)
+        """Return derivatives with respect to the Gaussians; accumulate all others."""
+        planes, constant = self.planes(), constant_background(self.splats)
         with dr.resume_grad():
-            of_background = constant is not None and dr.grad_enabled(self.integrator.background)
+            of_background = constant is not None and dr.grad_enabled(self.splats.background)
         # Colour conversion and background are a few operations per pixel, traced again and
         # differentiated by Dr.Jit.
         with dr.resume_grad():
@@ -97,15 +94,15 @@ class View:
             state = self._state()
             of_camera = state.is_attached
         by_time = [
-            rendering.frames_adjoint(self.integrator.gaussians, *of_time, of_camera)
+            rendering.frames_adjoint(self.splats.gaussians, *of_time, of_camera)
             for of_time in zip(self._frames(), d_planes, strict=True)
         ]
         with dr.resume_grad():
             if of_background:
-                dr.accum_grad(self.integrator.background, d_constant)
+                dr.accum_grad(self.splats.background, d_constant)
             of_cameras = [gradients.camera for gradients in by_time if gradients.camera]
             if of_cameras:
-                accumulate_in_sensor(self.integrator, state, of_cameras)
+                accumulate_in_sensor(self.splats.ignore, state, of_cameras)
         return reduce(rendering.sum_of_gradients, by_time)
 
     def channels(self, planes: Planes, constant: mi.Color3f | None) -> Passes:
@@ -114,8 +111,9 @@ class View:
         constant: the background, where it is a colour; display space.
         """
         behind = self._behind(constant)
-        traced = self.integrator.memory.rendered[self.index].traced
-        seen = repeat(repeat(None)) if traced is None else traced.seen
+        seen = repeat(repeat(None))
+        if self.hybrid is not None:
+            seen = self.splats.cache.traced[self.index].value
         by_time = zip(planes, seen, behind.colors, behind.radiance, strict=False)
         channels = [
             [self._channels_of(behind, *sample) for sample in zip(*time, strict=False)]
@@ -165,7 +163,7 @@ class View:
         """
         transmittance, red, green, blue, *others = planes
         color, alpha = mi.Color3f(red, green, blue), 1 - transmittance
-        if not self.integrator.srgb_primitives:
+        if not self.splats.srgb_primitives:
             color = dr.fma(transmittance, color_behind, color)
         elif behind.is_radiance:
             color = dr.fma(transmittance, color_behind, decode(color, whole - transmittance))
@@ -174,11 +172,11 @@ class View:
         channels = list(color)
         if self.has_alpha:
             channels.append(dr.full(mi.Float, 1, dr.width(alpha)) if behind.is_radiance else alpha)
-        for kind in self.integrator.aovs.values():
+        for kind in self.splats.aovs.values():
             if kind == "alpha":
                 channels.append(alpha)
                 continue
-            values = [others.pop(0) for _ in self.integrator.channels_of(kind)]
+            values = [others.pop(0) for _ in self.splats.channels_of(kind)]
             more = of_surfaces(kind)
             if more is not None:
                 values = [a + b for a, b in zip(values, more, strict=True)]
@@ -186,24 +184,22 @@ class View:
         return channels
 
     def _behind(self, constant: mi.Color3f | None) -> _Behind:
-        """What is seen past the splats, in the space of the channels."""
-        integrator = self.integrator
-        environment = None if integrator.hide_emitters else self.scene.environment()
+        """Evaluate the background, in the space of the channels."""
+        splats = self.splats
+        environment = None if splats.hide_emitters else self.scene.environment()
         if environment is None and constant is not None:
             nothing = repeat(repeat(None))
             return _Behind(repeat(repeat(constant)), is_radiance=False, radiance=nothing)
-        from drgs.integrator.background import Environment, StretchedTexture, seen_by
+        from drgs.integrator.background import background_radiance
 
-        if environment is not None:
-            behind: Background = Environment(environment)
-        else:
-            behind = StretchedTexture(integrator.background)
+        behind = splats.background if environment is None else environment
         state = self._state()
         cameras = [of_time[0].camera for of_time in self._frames()]
         if state.is_attached:
             cameras = self._attached_cameras(state)
-        colors = radiance = seen_by(self.sensor.film(), behind, cameras, self.within)
-        if environment is None or not integrator.srgb_primitives:
+        film = self.sensor.film()
+        colors = radiance = background_radiance(film, behind, cameras, self._offsets)
+        if environment is None or not splats.srgb_primitives:
             colors = [[mi.math.linear_to_srgb(color) for color in of_time] for of_time in colors]
         return _Behind(colors, environment is not None, radiance)
 
@@ -216,57 +212,59 @@ class View:
 
         One list for each time at which the shutter is open, of a frame for each pass.
         """
-        pipeline, gaussians = self.integrator.pipeline, dr.detach(self.integrator.gaussians)
-        state = self._state().detached()
+        pipeline, gaussians = self.splats.pipeline, dr.detach(self.splats.gaussians)
+        state, kept = self._state().detached(), self.splats.cache.frames
         traced = None if self.hybrid is None else self._traced_surfaces(state)
-        key = pipeline, self.key, state, gaussians, traced
-        rendered = self.integrator.memory.rendered
-        last = rendered.get(self.index)
+        key = (pipeline, self.key, *state.settings, traced), (gaussians, state.device)
+        last = kept.get(self.index)
         if last is None or not last.matches(*key):
-            seen = repeat(None) if traced is None else traced.seen
+            seen = repeat(None) if traced is None else traced.value
             frames = [
                 _render(gaussians, camera, pipeline, self.positions, of_time)
                 for camera, of_time in zip(self._cameras(state), seen, strict=False)
             ]
-            last = rendered[self.index] = Rendered(frames, *key)
-        return last.frames
+            last = kept[self.index] = Cached(frames, *key)
+        return last.value
 
-    def _traced_surfaces(self, state: SensorState) -> TracedSurfaces:
-        """What is seen of the scene's surfaces, traced unless the last time was the same."""
+    def _traced_surfaces(self, state: SensorState) -> Cached:
+        """Trace the scene's surfaces, or reuse the last ones: Layers by time and by pass."""
         from drgs.integrator.visible_surfaces import trace_surfaces
 
-        surfaces, kept = self.hybrid.surfaces, self.integrator.memory.traced
-        settings = self.key, self.integrator.hide_emitters, self.sensor.far_clip()
-        key = surfaces, settings, state
+        kept, sensor, hides = self.splats.cache.traced, self.sensor, self.splats.hide_emitters
+        settings = self.hybrid.surfaces, self.key, hides, sensor.far_clip(), *state.settings
         last = kept.get(self.index)
-        if last is None or not last.matches(*key):
+        if last is None or not last.matches(settings, state.device):
             seen = trace_surfaces(
                 self.hybrid.rays,
-                self.sensor,
+                sensor,
                 self._cameras(state),
-                self.within,
-                with_normals="normal" in self.integrator.aovs.values(),
+                self._offsets,
+                with_normals="normal" in self.splats.aovs.values(),
             )
-            last = kept[self.index] = TracedSurfaces(*key, seen)
+            last = kept[self.index] = Cached(seen, settings, state.device)
         return last
 
     def num_surfaces(self) -> int:
         """Number of surfaces that are seen one through the other."""
-        return len(self._traced_surfaces(self._state().detached()).seen[0][0])
+        return len(self._traced_surfaces(self._state().detached()).value[0][0])
+
+    @property
+    def _offsets(self) -> list[tuple[Any, Any]]:
+        return [offsets_of(positions) for positions in self.positions]
 
     def _state(self) -> SensorState:
-        return read_sensor(self.sensor, self.integrator.near)
+        return read_sensor(self.sensor, self.splats.near)
 
     def _cameras(self, state: SensorState) -> list[Camera]:
-        """What is simulated of the sensor's camera, detached; of each time."""
-        return cameras_in_time(ignoring(camera_from_sensor(state), self.integrator.ignore))
+        """Return the camera at each time, detached, without what is ignored."""
+        return cameras_in_time(without_effects(camera_from_sensor(state), self.splats.ignore))
 
     def _attached_cameras(self, state: SensorState) -> list[Camera]:
-        """The same, attached to the sensor's parameters."""
-        return _attached_cameras(self.integrator, state)
+        """Return the cameras, attached to the sensor's parameters."""
+        return _attached_cameras(self.splats.ignore, state)
 
     def _camera_tangents(self, count: int) -> list[list[mi.Float] | None]:
-        """Of each time's camera, derivatives of its numbers along those set on the sensor."""
+        """Return the derivatives of each time's camera numbers along those set on the sensor."""
         state = self._state()
         if not state.is_attached:
             return [None] * count
@@ -276,7 +274,7 @@ class View:
 
 
 def _mean(passes: Sequence[Passes]) -> Passes:
-    """Of what the film gets at several times, summed in their order."""
+    """Return the mean over several times, summed in their order."""
     total: list[Passes] = []
     for first in range(0, len(passes), PASSES_PER_KERNEL):
         dr.eval(total)
@@ -292,7 +290,7 @@ def _mean(passes: Sequence[Passes]) -> Passes:
 
 @dataclass(frozen=True)
 class _Behind:
-    """What is seen past the splats."""
+    """The background of an image, at each sample."""
 
     colors: Iterable[Iterable[mi.Color3f]]  # by time and by pass; display space, or see below
     is_radiance: bool  # of an environment: it covers the film, and its colours are linear where
@@ -316,8 +314,8 @@ def _render(
     positions: Sequence[Positions],
     surfaces: Sequence[Layers] | None,
 ) -> list[rendering.Frame]:
-    """A frame for each pass; surfaces: what is seen of them at each."""
-    pipeline = composed(pipeline, gaussians, camera)
+    """Render a frame for each pass; surfaces: the visible ones of each."""
+    pipeline = with_effects(pipeline, gaussians, camera)
     models = [replace(pipeline.model, positions=points) for points in positions]
     if surfaces is not None:
         from drgs.effects.occlusion import occluded_by
@@ -332,47 +330,33 @@ def _render(
     return [frame, *(rendering.render_again(frame, model) for model in others)]
 
 
-def constant_background(integrator: SplatsSettings) -> mi.Color3f | None:
+def constant_background(splats: SplatsState) -> mi.Color3f | None:
     """The background without gradients, if it is a colour; display space.
 
     No literal, or every colour would be a new kernel.
     """
-    if isinstance(integrator.background, mi.Texture):
+    if isinstance(splats.background, mi.Texture):
         return None
-    constant = mi.Color3f(dr.detach(integrator.background))
+    constant = mi.Color3f(dr.detach(splats.background))
     dr.make_opaque(constant)
     return constant
 
 
-def feature_of(kind: str) -> rendering.Feature:
-    """What is composited for an AOV of this kind, other than alpha."""
-    if kind == "depth":
-        return rendering.depth_feature
-    from drgs.effects.features import NamedFeature, normal_features
-
-    return normal_features if kind == "normal" else NamedFeature(kind)
-
-
-def accumulate(parameter: Any, gradient: Any) -> None:
-    """Add to a parameter's gradient, if it has one."""
-    if dr.width(parameter) > 0 and dr.grad_enabled(parameter):
-        dr.accum_grad(parameter, gradient)
-
-
 def accumulate_in_sensor(
-    integrator: SplatsSettings, state: SensorState, gradients: list[list[Any]]
+    ignored: Collection[str], state: SensorState, gradients: list[list[Any]]
 ) -> None:
     """Accumulate derivatives of a sensor's cameras into what its parameters were computed from.
 
-    state: attached; gradients: by time, of ``Camera.numbers()``.
+    ignored: effects that are not simulated; state: attached; gradients: by time, of
+    ``Camera.numbers()``.
     """
-    numbers = [camera.numbers() for camera in _attached_cameras(integrator, state)]
+    numbers = [camera.numbers() for camera in _attached_cameras(ignored, state)]
     _accumulate_through(numbers, gradients)
 
 
-def _attached_cameras(integrator: SplatsSettings, state: SensorState) -> list[Camera]:
+def _attached_cameras(ignored: Collection[str], state: SensorState) -> list[Camera]:
     dr.make_opaque(state.device)  # or each value of a literal would be a new kernel
-    return cameras_in_time(ignoring(state.make(state), integrator.ignore))
+    return cameras_in_time(without_effects(state.make(state), ignored))
 
 
 def _accumulate_through(values: list[list[Any]], gradients: list[list[mi.Float]]) -> None:

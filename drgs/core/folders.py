@@ -1,16 +1,19 @@
-"""Which files of a folder a command has written: no command replaces any other.
+"""Folders that commands write into: one writer at a time, and no file of others is replaced.
 
 The record is a hidden file in the folder itself, so that it moves with it. It names a file before
 the file is written, and says by a digest what the file was when the command had ended. A file that
-is in the way and that the record does not name, or that has other bytes, is somebody else's.
+is in the way and that the record does not name, or that has other bytes, belongs to others. A lock
+keeps a folder for one process and ends with it, however that ends.
 """
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import json
 import os
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
@@ -18,14 +21,14 @@ from drgs.core.errors import UserError, listed
 from drgs.core.files import atomic_path, open_regular, read_text, remove_temporaries_of
 
 MAX_BYTES = 1 << 26
-"""Of a record: 67 MB, two hundred bytes for each of a third of a million files."""
+"""Largest record: 67 MB, two hundred bytes for each of a third of a million files."""
 
 _CHUNK = 1 << 20
 
 
 @dataclass(frozen=True)
 class _Content:
-    """Of the file. Names are relative to the folder, with slashes."""
+    """Content of the file. Names are relative to the folder, with slashes."""
 
     files: dict[str, str | None] = field(default_factory=dict)  # digests; None: being written
     paths: dict[str, str] = field(default_factory=dict)  # relative, by key of a configuration
@@ -45,11 +48,11 @@ class FolderRecord:
 
     @property
     def paths(self) -> Mapping[str, str]:
-        """What was kept besides: paths relative to the folder, by key of a configuration."""
+        """Paths that were kept besides, relative to the folder, by key of a configuration."""
         return self._content.paths
 
     def strangers(self, names: Iterable[str]) -> list[str]:
-        """Those of ``names`` (relative to the folder) that are there and somebody else's."""
+        """Return the ``names`` (relative to the folder) of files that belong to others."""
         return [name for name in names if self._is_strange(name)]
 
     def check(self, names: Iterable[str], earlier: Collection[str] = ()) -> None:
@@ -112,7 +115,7 @@ class FolderRecord:
 
 
 def digest(path: Path) -> str:
-    """SHA-256 of a file's bytes, as text; :class:`UserError` where it cannot be read."""
+    """Return the SHA-256 of a file's bytes, as text; :class:`UserError` where it cannot be read."""
     found = hashlib.sha256()
     try:
         with open_regular(path) as file:
@@ -137,3 +140,59 @@ def _read(path: Path) -> _Content:
             "it; remove it if those files are no longer needed, or choose another folder"
         ) from None
     return content
+
+
+# ----------------------------------------------------------------------------------------------
+# One writer
+# ----------------------------------------------------------------------------------------------
+
+
+@contextmanager
+def sole_writer(folder: Path) -> Iterator[Callable[[], bool]]:
+    """Keep ``folder`` for the block: at once if it is there, else when it is made.
+
+    Yields a function that makes the folder and keeps it, before anything is written into it, and
+    returns whether it is kept. The lock (``flock``) is on the folder itself: there is no file that
+    a killed process could leave behind. Where the system has no such locks, or the folder cannot
+    be made or opened, nothing is kept, and what writes to the folder says why it cannot.
+
+    Raises :class:`UserError` while another process, or another block of this one, keeps it; so does
+    the function.
+    """
+    descriptor: int | None = None
+
+    def keep() -> bool:
+        nonlocal descriptor
+        with suppress(OSError):
+            folder.mkdir(parents=True, exist_ok=True)
+        if descriptor is None:
+            descriptor = _locked(folder)
+        return descriptor is not None
+
+    try:
+        descriptor = _locked(folder)
+        yield keep
+    finally:
+        if descriptor is not None:
+            os.close(descriptor)
+
+
+def _locked(folder: Path) -> int | None:
+    """A descriptor of the folder that holds its lock; None where that cannot be had."""
+    try:
+        import fcntl
+
+        descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    except (ImportError, OSError):  # Windows; missing
+        return None
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError as error:
+        os.close(descriptor)
+        if error.errno not in (errno.EWOULDBLOCK, errno.EACCES):
+            return None  # a file system without locks
+        raise UserError(
+            f"{folder}: another command is writing to this folder; wait until it has ended, or "
+            "choose another folder"
+        ) from None
+    return descriptor

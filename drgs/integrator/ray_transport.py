@@ -23,18 +23,17 @@ without bias as well. For rays that meet black at last, a draw is black with the
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
 
 from drgs.accuracy.pipeline import pipeline_of
 from drgs.config.approximations import Approximations
-from drgs.core.private import same_variables
 from drgs.gaussians.parameters import Gaussians
-from drgs.integrator.legs import Leg, Unlit
-from drgs.integrator.settings import SplatsSettings
-from drgs.integrator.view import decode
+from drgs.integrator.path_segment import NoSplats, PathSegment
+from drgs.integrator.sensor_render import decode
+from drgs.integrator.state import Cached, SplatsState
 from drgs.light.walk import RaySplats, Segment
 from drgs.splatting.projection import load_rows
 
@@ -54,38 +53,30 @@ few splats make a ray dark, and many more are behind them."""
 
 
 @dataclass(frozen=True, eq=False)
-class LightOfSplats:
-    """What rays pass of the splats themselves."""
+class RayTransport:
+    """Transport along rays that pass the splats themselves."""
 
     splats: RaySplats
     exposure: mi.Float  # (1,): factor of the splats' radiance
     num_samples: int  # splats that are drawn; 0: all are composited
-    made_of: tuple[Gaussians, Approximations, int]  # detached: holding them keeps their indices
 
     @staticmethod
-    def of(integrator: SplatsSettings) -> LightOfSplats:
-        """That of an integrator's Gaussians, or the last one if they are the same."""
-        gaussians, degree = dr.detach(integrator.gaussians), integrator.sh_degree
-        approximations, last = integrator.approximations, integrator.memory.light
-        exposure = dr.opaque(mi.Float, integrator.exposure)
-        if (
-            last is not None
-            and last.made_of[1:] == (approximations, degree)
-            and same_variables(last.made_of[0], gaussians)
-        ):
-            found = replace(last, exposure=exposure, num_samples=integrator.light_samples)
-        else:
-            splats = ray_splats_of(gaussians, approximations, degree)
-            made_of = (gaussians, approximations, degree)
-            found = LightOfSplats(splats, exposure, integrator.light_samples, made_of)
-        integrator.memory.light = found
-        return found
+    def of(splats: SplatsState) -> RayTransport:
+        """Return the transport of an integrator's Gaussians."""
+        gaussians = dr.detach(splats.gaussians)
+        settings, last = (splats.approximations, splats.sh_degree), splats.cache.ray_splats
+        if last is None or not last.matches(settings, gaussians):
+            last = Cached(ray_splats_of(gaussians, *settings), settings, gaussians)
+            splats.cache.ray_splats = last
+        exposure = dr.opaque(mi.Float, splats.exposure)
+        return RayTransport(last.value, exposure, splats.light_samples)
 
-    def passed(self, leg: Leg, sample: mi.Float, active: mi.Bool) -> tuple[mi.Color3f, mi.Float]:
-        """See :meth:`drgs.integrator.legs.Light.passed`."""
-        segment = _segment(leg.ray, active)
+    def composite_segment(
+        self, segment: PathSegment, sample: mi.Float, active: mi.Bool
+    ) -> tuple[mi.Color3f, mi.Float]:
+        """See :meth:`drgs.integrator.path_segment.SplatTransport.composite_segment`."""
         look = self._sampled if self.num_samples else self._composited
-        color, coverage = look(segment, leg.is_open, sample)
+        color, coverage = look(_segment(segment.ray, active), segment.is_open, sample)
         return dr.select(active, self.exposure * color, 0), dr.select(active, 1 - coverage, 1)
 
     def _composited(
@@ -93,9 +84,9 @@ class LightOfSplats:
     ) -> tuple[mi.Color3f, mi.Float]:
         """Linear colour, times coverage, and coverage."""
         del sample
-        passed = self.splats.passed(segment)
-        coverage = 1 - passed.transmittance
-        return decode(mi.Color3f(passed.color), dr.select(is_open, 1, coverage)), coverage
+        found = self.splats.composite_segment(segment)
+        coverage = 1 - found.transmittance
+        return decode(mi.Color3f(found.color), dr.select(is_open, 1, coverage)), coverage
 
     def _sampled(
         self, segment: Segment, is_open: mi.Bool, sample: mi.Float
@@ -116,14 +107,14 @@ class LightOfSplats:
         whole = dr.select(is_open, 1, coverage)
         return whole * (a * mean + b * square + c * cube), coverage
 
-    def transmittance(self, leg: Leg, sample: mi.Float, active: mi.Bool) -> mi.Float:
-        """An estimate of that of the splats along legs.
+    def transmittance(self, segment: PathSegment, sample: mi.Float, active: mi.Bool) -> mi.Float:
+        """An estimate of that of the splats along segments.
 
         Below :data:`ROULETTE`, Russian roulette: a ray that lets through less than ``sample`` (in
         0..1) times that is dark, and all others let through as much as that.
         """
         least = sample * ROULETTE
-        T = self.splats.transmittance(_segment(leg.ray, active), least)
+        T = self.splats.transmittance(_segment(segment.ray, active), least)
         T = dr.select(least > T, 0, dr.maximum(T, ROULETTE))
         return dr.select(active, T, 1)
 
@@ -138,25 +129,25 @@ def ray_splats_of(gaussians: Gaussians, approximations: Approximations, degree: 
     return RaySplats.of(rows, degree, pipeline_of(approximations, degree).model.cutoffs)
 
 
-def lit(
-    integrator: SplatsSettings, scene: mi.Scene, num_paths: int, sensors: Sequence[mi.Sensor]
+def nested_with_transport(
+    splats: SplatsState, scene: mi.Scene, num_paths: int, sensors: Sequence[mi.Sensor]
 ) -> mi.Integrator:
     """The nested integrator, with the splats of the one that it is nested in.
 
     num_paths: of a pixel; sensors: whose picture is rendered.
     """
-    nested = integrator.nested
+    nested = splats.nested
     if nested is None:
-        settings = {"type": "splatpath", "hide_emitters": integrator.hide_emitters}
+        settings = {"type": "splatpath", "hide_emitters": splats.hide_emitters}
         nested = mi.load_dict(settings)
-    if integrator.light == "rays":
-        nested.light = LightOfSplats.of(integrator)
+    if splats.light == "rays":
+        nested.use_transport(RayTransport.of(splats))
     else:
-        from drgs.integrator.probes import LightOfProbes
+        from drgs.integrator.probe_transport import ProbeTransport
 
-        traces = integrator.unseen == "rays"
-        unseen = LightOfSplats.of(integrator) if traces else Unlit()
-        nested.light = LightOfProbes.of(integrator, scene, num_paths, sensors, unseen)
+        traces = splats.unseen == "rays"
+        unseen = RayTransport.of(splats) if traces else NoSplats()
+        nested.use_transport(ProbeTransport.of(splats, scene, num_paths, sensors, unseen))
     return nested
 
 
