@@ -51,7 +51,7 @@ if TYPE_CHECKING:
 
 ROUNDS, QUICK_ROUNDS = 9, 3
 SLOW_ROUNDS = 2
-"""Of rungs that need more than ``SLOW`` seconds."""
+"""Rounds of rungs that need more than ``SLOW`` seconds."""
 
 SLOW = 1.0
 
@@ -62,7 +62,7 @@ CROP = 8
 """px: side of the crops on which every splat is evaluated at every pixel."""
 
 LEAST_ALPHA = 1e-6
-"""Of the most accurate form."""
+"""Smallest alpha of the most accurate form."""
 
 UNCUT = {"alpha_cut": 0.0, "transmittance_stop": 0.0}
 EXACT_PIXEL = {"projection": "exact", "order": "pixel"}
@@ -109,7 +109,7 @@ RUNGS = (
 
 @dataclass(frozen=True)
 class Subject:
-    """Gaussians and the cameras that they are seen by."""
+    """Gaussians and their cameras."""
 
     name: str
     gaussians: Gaussians  # numpy
@@ -397,7 +397,7 @@ def pareto_front(results: Sequence[Measurement]) -> list[Measurement]:
 
 
 def table(results: Sequence[Measurement]) -> str:
-    """As the page of results holds it; times relative to the first."""
+    """Format all rungs; times relative to the first."""
     first, front = results[0], pareto_front(results)
     header = [
         results[0].scene, "forward", "forward + backward", "operations", "PSNR", "SSIM",

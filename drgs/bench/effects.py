@@ -195,7 +195,7 @@ class Renderer:
         dr.sync_thread()
 
     def both(self) -> None:
-        """And its derivatives."""
+        """Render a picture and its derivatives."""
         for name in self.differentiated:
             dr.clear_grad(self.params[name])
         dr.backward(dr.sum(self._render() * self.weights, axis=None))
@@ -247,7 +247,7 @@ class Fitter:
         self.trainer = trainer_of(scene, case.changes, {name: _extra(name) for name in case.view})
 
     def forward(self) -> None:
-        """There is no half iteration."""
+        """Do nothing: there is no half iteration."""
 
     def both(self) -> None:
         """One iteration."""
@@ -256,7 +256,7 @@ class Fitter:
 
 
 def _extra(name: str) -> np.ndarray:
-    """What the data has of a view besides colours; depth: that of the box's middle."""
+    """Return a mask, or the depth of the box's middle."""
     values = np.ones((SIZE, SIZE), np.float32)
     if name == "depth":
         return 4 * values
@@ -270,7 +270,7 @@ def _extra(name: str) -> np.ndarray:
 
 
 class Measured(Protocol):
-    """What is timed, ready to run."""
+    """A case that is ready to run."""
 
     def forward(self) -> None:
         """Render a picture."""
@@ -285,7 +285,7 @@ AnyCase = TypeVar("AnyCase", "Case", "FittingCase")
 def measure(
     cases: Sequence[AnyCase], make: Callable[[AnyCase], Measured], rounds: int
 ) -> list[Price]:
-    """Each case and the first one in turns."""
+    """Time each case and the first one in turns."""
     base, prices = make(cases[0]), []
     base_operations = operations(base)
     for case in cases:
@@ -320,7 +320,7 @@ def _ratio(times: list[float], base_times: list[float]) -> float:
 
 
 def operations(subject: Measured) -> int:
-    """In all kernels of a picture and its derivatives, or of an iteration; warms up."""
+    """Count the operations of a picture and its derivatives, or of an iteration; warms up."""
     for _ in range(2):
         subject.forward()
         subject.both()
@@ -332,7 +332,7 @@ def operations(subject: Measured) -> int:
 
 
 def table(prices: list[Price], forward: str, both: str) -> str:
-    """As the page of results holds it; without a name for pictures, there is no column of them."""
+    """Format times and operations; without a name for pictures, they have no column."""
     header = ["effect", "", *([forward, "ratio"] if forward else []), both, "ratio"]
     rows = []
     for p in prices:
@@ -345,7 +345,7 @@ def table(prices: list[Price], forward: str, both: str) -> str:
 
 
 def plot(rendered: list[Price], fitted: list[Price]) -> Figure:
-    """What each effect adds to the time, by bar."""
+    """Draw a bar for what each effect adds to the time."""
     parts = {"picture and derivatives": rendered[1:], "training iteration": fitted[1:]}
     heights = [len(prices) for prices in parts.values()]
     figure = new_figure(8, 0.28 * sum(heights) + 1.5)

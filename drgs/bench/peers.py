@@ -36,7 +36,7 @@ class Renderer:
 
 @dataclass(frozen=True)
 class Problem:
-    """What every implementation is given."""
+    """The input of every implementation."""
 
     gaussians: Gaussians  # numpy
     camera: reference.Camera

@@ -59,13 +59,13 @@ class Point:
     scale: float = 1.0  # of the Gaussians
 
     def x(self) -> int:
-        """What the sweep varies."""
+        """Return the number that the sweep varies."""
         return {"pixels": self.size**2, "threads": self.threads}.get(self.sweep, self.count)
 
 
 @dataclass(frozen=True)
 class Result:
-    """What one process measured."""
+    """The measurement of one process."""
 
     point: Point
     milliseconds: float  # of an iteration, median

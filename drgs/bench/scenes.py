@@ -158,7 +158,7 @@ def trainer_of(
 
 
 def bench_config(gaussians: Gaussians) -> FitConfig:
-    """Of a fit of these Gaussians that renders as 3DGS does and leaves the population as it is."""
+    """Return the configuration of a fit that renders as 3DGS and keeps the population."""
     model = ModelConfig(sh_degree=gaussians.sh_degree, sh_increase_every=1).of_file()
     return FitConfig(
         data={"path": "."},
@@ -169,7 +169,7 @@ def bench_config(gaussians: Gaussians) -> FitConfig:
 
 
 def stress_scene(size: int, seed: int = 0) -> tuple[Gaussians, list[reference.Camera]]:
-    """What the affine approximation and one order for all pixels are bad at.
+    """Return a scene that is hard for the affine approximation and one order for all pixels.
 
     A lens of 110 degrees; two layers of flat discs that cross in the middle of the picture; large,
     faint splats before the camera; a shell of splats around everything.

@@ -242,7 +242,7 @@ def _root_mean_square(values: list[float]) -> float:
 
 
 def _stored(gaussians: reference.Gaussians, camera: reference.Camera) -> Scene:
-    """As single precision stores them."""
+    """Round a scene to single precision."""
 
     def single(values: np.ndarray) -> np.ndarray:
         return np.asarray(values, dtype=np.float32).astype(np.float64)

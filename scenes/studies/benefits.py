@@ -52,13 +52,13 @@ ITERATIONS = 3000
 NUM_POINTS = 20_000
 
 DARK = 0.65
-"""Of the colours as they are, where exposures are to vary."""
+"""Factor of all colours, where exposures are to vary."""
 
 FEW = 8
 """Pictures, where depth is to help."""
 
 SIZES = {"2x": 2.0, "1x": 1.0, "1/2": 0.5, "1/4": 0.25}
-"""Of renderings, times that of the fit."""
+"""Sizes of renderings, relative to that of the fit."""
 
 Measure = Callable[[Trainer, Dataset, Dataset], dict[str, float]]
 
@@ -76,7 +76,7 @@ class Case:
 
 @dataclass(frozen=True)
 class Result:
-    """What a fit was measured to be."""
+    """A quantity that was measured of a fit."""
 
     effect: str
     name: str
@@ -115,7 +115,7 @@ def _each_train(dataset: Dataset, change: Callable[[View], View]) -> Dataset:
 
 
 def darken(dataset: Dataset, rng: np.random.Generator) -> Dataset:
-    """All pictures are so dark that no gain of :func:`spoil_exposure` cuts off a colour."""
+    """Darken all pictures, so that no gain of :func:`spoil_exposure` clips a colour."""
     del rng
 
     def dark(view: View) -> View:
@@ -125,7 +125,7 @@ def darken(dataset: Dataset, rng: np.random.Generator) -> Dataset:
 
 
 def spoil_exposure(dataset: Dataset, rng: np.random.Generator) -> Dataset:
-    """Each training picture has gains of its own, for each colour; their mean is 1."""
+    """Give each training picture its own gain for each colour; their mean is 1."""
     gains = rng.uniform(0.6, 1.4, (len(dataset.train), 3))
     gains = iter(gains / gains.mean(axis=0))
     return _each_train(
@@ -134,7 +134,7 @@ def spoil_exposure(dataset: Dataset, rng: np.random.Generator) -> Dataset:
 
 
 def spoil_parts(dataset: Dataset, rng: np.random.Generator) -> Dataset:
-    """A red square hides a sixth of each training picture."""
+    """Hide a sixth of each training picture with a red square."""
 
     def hidden(view: View) -> View:
         mask, side = np.ones((view.height, view.width), np.float32), round(0.4 * view.width)
@@ -167,7 +167,7 @@ def depth_of(scene: mi.Scene, view: View) -> np.ndarray:
 
 
 def move_cameras(dataset: Dataset, rng: np.random.Generator) -> Dataset:
-    """The data says that training cameras are somewhere else, by a degree and 0.04 units."""
+    """Move the training cameras by a degree and 0.04 units."""
 
     def moved(view: View) -> View:
         pose = view.camera_to_world.copy()
@@ -180,7 +180,7 @@ def move_cameras(dataset: Dataset, rng: np.random.Generator) -> Dataset:
 
 
 def stretch_lenses(dataset: Dataset, rng: np.random.Generator) -> Dataset:
-    """The data says that focal lengths are 4 % longer than they are."""
+    """Make focal lengths 4 % longer than they are."""
     del rng
     return _each_train(dataset, lambda view: replace(view, fx=1.04 * view.fx, fy=1.04 * view.fy))
 
@@ -195,13 +195,13 @@ def _with_image(view: View, image: np.ndarray) -> View:
 
 
 def quality(trainer: Trainer, dataset: Dataset, spoiled: Dataset) -> dict[str, float]:
-    """On the test views."""
+    """Return the PSNR of the test views."""
     del spoiled
     return {"PSNR, dB": _psnr(trainer, dataset.test)}
 
 
 def quality_as_exposed(trainer: Trainer, dataset: Dataset, spoiled: Dataset) -> dict[str, float]:
-    """On test views as dark as the training views are on average.
+    """Return the PSNR of test views as dark as the training views are on average.
 
     Also with each picture's colours fitted to the photograph's by an affine transform: what is lost
     besides the exposure.
@@ -223,7 +223,7 @@ def fitted_colors(image: np.ndarray, target: np.ndarray) -> np.ndarray:
 
 
 def at_sizes(trainer: Trainer, dataset: Dataset, spoiled: Dataset) -> dict[str, float]:
-    """On the test views at other sizes than that of the fit."""
+    """Return the PSNR of the test views at several sizes."""
     del dataset, spoiled
     views = views_at_sizes(trainer.config)
     return {f"PSNR at {name}, dB": _psnr(trainer, resized) for name, resized in views.items()}
@@ -250,7 +250,7 @@ def photographs_at_sizes(config: FitConfig) -> list[np.ndarray]:
 
 
 def cameras(trainer: Trainer, dataset: Dataset, spoiled: Dataset) -> dict[str, float]:
-    """How far the training cameras are from the true ones, and what they see from their pictures.
+    """Compare the training cameras with the true ones, and what they see with their pictures.
 
     What all have in common (a similarity) is undone first. *Shift* is how far the picture of a
     point at the middle of the scene, or a tenth of the distance around it, is from its place.
@@ -351,7 +351,7 @@ CASES = (
 
 
 def without(dataset: Dataset, name: str) -> Dataset:
-    """The data without what it says besides colours."""
+    """Remove masks or depths of the training views."""
     return _each_train(dataset, lambda view: replace(view, **{name: None}))
 
 

@@ -52,12 +52,12 @@ RING = Path("shapes/ring.ply")
 """Beside the scene file."""
 
 LIT = 0.98
-"""Of an object's light that the splats before a pixel let through, at least."""
+"""Smallest transmittance of the splats before a pixel that counts as showing an object."""
 
 
 @dataclass(frozen=True)
 class Way:
-    """How light passes."""
+    """Settings of ``light``."""
 
     name: str
     settings: dict[str, str]
@@ -250,7 +250,7 @@ def _times(scenes: dict[str, mi.Scene], paths: int, rounds: int) -> dict[str, fl
 
 
 def _seconds(scene: mi.Scene, paths: int) -> float:
-    """Of a picture from another place, so that no splats are known."""
+    """Time a picture from another place, so that no splats are known."""
     params = mi.traverse(scene.sensors()[0])
     params["to_world"] = mi.Transform4f(params["to_world"].matrix + dr.opaque(mi.Float, 0))
     params.update()
@@ -277,7 +277,7 @@ def _cropped(picture: np.ndarray, mask: np.ndarray, border: int = 8) -> np.ndarr
 
 
 def table(results: Sequence[Measurement]) -> str:
-    """As the page of results holds it: times by those without light, errors."""
+    """Format times, relative to those without light, and errors."""
     counts = sorted({m.paths for m in results})
     header = ["object, pixels", "light", *(f"{n} paths" for n in counts)]
     rows = []

@@ -26,7 +26,7 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
 AGGRESSIVE, POSITION_INDEPENDENT, SMALL = 3, 2, 3
-"""Of LLVM's C interface: level of code generation, relocation and size of addresses (Core.h and
+"""Constants of LLVM's C interface: level of code generation, relocation and size of addresses (Core.h and
 TargetMachine.h of LLVM 17 to 22)."""
 
 PASSES = b"default<O2>"
@@ -61,7 +61,7 @@ def assembly(ir: str) -> str:
 
 
 class _Pointer(ctypes.c_void_p):
-    """Of a type of its own, which ctypes passes on as it is, where it makes void pointers ints."""
+    """A pointer that ctypes passes on as it is; void pointers become ints."""
 
 
 @cache
@@ -231,7 +231,7 @@ def _innermost(edges: np.ndarray, members: np.ndarray) -> list[list[int]]:
 
 @dataclass(frozen=True)
 class Operations:
-    """How many instructions of which kind.
+    """Numbers of instructions by kind.
 
     An instruction whose operand lies in memory is a load, or a store, besides what it computes with
     it; one that adds to memory is both. A gather of a vector is one load.
@@ -276,7 +276,7 @@ ONLY_MOVES = r"v?mov|v?pmov|vextract|v?pextr|vscatter|vpscatter|vcompress|vpcomp
 
 
 def _writes_memory(line: str) -> bool:
-    """Whether the last operand, where AT&T's syntax has the destination, lies in memory."""
+    """Return whether the last operand, the destination in AT&T's syntax, lies in memory."""
     return _last_is_memory(line) and re.match(ONLY_COMPARES, line) is None
 
 

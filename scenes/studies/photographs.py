@@ -42,7 +42,7 @@ from drgs.results.metrics import mean_of
 from drgs.results.report import score
 
 JPEG_QUALITY = 95
-"""Of the pictures that undistorting writes."""
+"""Quality of the pictures that undistorting writes."""
 
 
 @dataclass(frozen=True)

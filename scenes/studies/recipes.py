@@ -79,7 +79,7 @@ PAPER: Values = {
 
 @dataclass(frozen=True)
 class Scene:
-    """What is fitted, and the numbers that suit it."""
+    """A dataset, and the numbers that suit it."""
 
     name: str
     title: str
@@ -190,7 +190,7 @@ INGREDIENTS = (
     ),
     Ingredient("higher degrees early", _harmonics),
 )
-"""Of the whole recipe; no two change the same value."""
+"""The parts of the whole recipe; no two change the same value."""
 
 EXTRAS = (
     Ingredient(
@@ -205,7 +205,7 @@ EXTRAS = (
     Ingredient("3D smoothing filter", lambda scene: {"model.smoothing": True}),
     Ingredient("mcmc instead of growth", lambda scene: {"densify.strategy": "mcmc"}),
 )
-"""What else was tried in the whole recipe."""
+"""Further changes that were tried in the whole recipe."""
 
 
 # ----------------------------------------------------------------------------------------------
@@ -223,7 +223,7 @@ class Case:
     varied: Ingredient | None = None  # what makes the difference to that; None: everything
 
     def concerns(self, scene: Scene) -> bool:
-        """Whether it is another recipe than the one it is compared with."""
+        """Return whether it is another recipe than the one it is compared with."""
         return self.varied is None or bool(self.varied.changes(scene))
 
 
@@ -265,7 +265,7 @@ def config_of(case: Case, scene: Scene, data: Path | None = None) -> FitConfig:
 # ----------------------------------------------------------------------------------------------
 
 VIEWS_PER_STEP, COMPARED = (1, 2, 4, 8, 16), (4, 16)
-"""With the rule that is built in, and with the others."""
+"""Views a step with the rule that is built in, and with the others."""
 
 RATES = ("means_lr", "means_lr_final", "sh0_lr", "shN_lr", "opacities_lr", "scales_lr", "quats_lr")
 

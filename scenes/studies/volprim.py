@@ -57,12 +57,12 @@ CHANGES: dict[str, dict[str, object]] = {
 }
 
 FACTORS = (1, 16, 64)
-"""By which all lengths are multiplied."""
+"""Factors of all lengths."""
 
 
 @dataclass(frozen=True)
 class Row:
-    """How far two pictures are apart."""
+    """The difference of two pictures."""
 
     factor: int  # by which all lengths are multiplied
     what: str
