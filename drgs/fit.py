@@ -24,8 +24,8 @@ from drgs.cli.interrupts import INTERRUPTED_STATUS
 from drgs.config.extensions import describe_extensions
 from drgs.config.load import load_config
 from drgs.config.schema import FitConfig
+from drgs.core.environment import required
 from drgs.core.errors import UserError
-from drgs.core.extras import required
 from drgs.core.processes import process_number, start_mpi
 from drgs.datasets.folders import config_for
 from drgs.results.files import CONFIG, EVENTS

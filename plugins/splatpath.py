@@ -13,14 +13,14 @@ import drjit as dr
 import mitsuba as mi
 from mitsuba.ad.integrators.common import RBIntegrator, mis_weight, solid_angle_to_area_jacobian
 
+from drgs.core.environment import check_variant
 from drgs.core.errors import UnsupportedError
-from drgs.core.variants import check_variant
-from drgs.integrator.legs import Leg
+from drgs.integrator.path_segment import PathSegment
 from drgs.integrator.properties import boolean, integer, refuse_unknown
 from drgs.integrator.transparency import StraightRays, has_transparent_parts
 
 if TYPE_CHECKING:
-    from drgs.integrator.legs import Light
+    from drgs.integrator.path_segment import SplatTransport
 
 KNOWN = ("max_depth", "rr_depth", "hide_emitters")
 """Names of its properties."""
@@ -99,7 +99,11 @@ class SplatPathIntegrator(RBIntegrator):
         if "max_depth" not in props:
             self.max_depth = UNBOUNDED
         self.sees_through = False  # whether anything in the scene lets light pass straight on
-        self.light: Light | None = None  # of the integrator that this one is nested in
+        self._transport: SplatTransport | None = None
+
+    def use_transport(self, transport: SplatTransport | None) -> None:
+        """Let paths pass the splats of the integrator that this one is nested in; None: of none."""
+        self._transport = transport
 
     @dr.syntax
     def sample(
@@ -182,7 +186,7 @@ class SplatPathIntegrator(RBIntegrator):
         arrives: mi.Spectrum,
         primal: bool,
     ) -> mi.Spectrum:
-        """Of the emitter that a path has met."""
+        """Return the radiance of the emitter that a path has met."""
         shows = path.active & ~((path.depth == 0) & ~si.is_valid() & self.hide_emitters)
         ds = mi.DirectionSample3f(scene, si=si, ref=path.last_si)
         pdf = scene.pdf_emitter_direction(path.last_si, ds, ~path.last_is_delta)
@@ -200,15 +204,15 @@ class SplatPathIntegrator(RBIntegrator):
         active: mi.Bool,
         primal: bool,
     ) -> mi.Spectrum:
-        """Of an emitter that the vertex samples."""
+        """Return the radiance of an emitter that the vertex samples."""
         bsdf = si.bsdf(path.ray)
         active = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
         rays, numbers = StraightRays(scene, False, self.sees_through), sampler.next_2d()
         ds, weight = scene.sample_emitter_direction(si, numbers, not rays.sees_through, active)
         active &= ds.pdf != 0
         ray = si.spawn_ray_to(ds.p)
-        leg = Leg(ray, si.shape, ds.emitter, ds.pdf, is_open=mi.Bool(False))
-        let_through = self._let_through(leg, sampler, active)
+        segment = PathSegment(ray, si.shape, ds.emitter, ds.pdf, is_open=mi.Bool(False))
+        let_through = self._let_through(segment, sampler, active)
         if dr.hint(rays.sees_through, mode="scalar"):
             let_through *= rays.transmittance(ray, active)
         with dr.resume_grad(when=not primal):
@@ -227,7 +231,7 @@ class SplatPathIntegrator(RBIntegrator):
         si: mi.SurfaceInteraction3f,
         arrives: mi.Spectrum,
     ) -> _Step:
-        """Where a path goes on, if it does."""
+        """Sample the step to the next vertex, if the path goes on."""
         has_bounces = path.depth + 1 < self.max_depth
         may_pass = mi.Bool(self.sees_through)
         active = path.active & si.is_valid() & (has_bounces | may_pass)
@@ -264,21 +268,21 @@ class SplatPathIntegrator(RBIntegrator):
         self, scene: mi.Scene, path: _Path, sampler: mi.Sampler
     ) -> tuple[mi.Spectrum, mi.Spectrum]:
         """Return the radiance of splats up to the vertex, and the path's throughput past them."""
-        if self.light is None:
+        if self._transport is None:
             return mi.Spectrum(0), mi.Spectrum(path.throughput)
-        radiance, let_through = self.light.passed(
-            path.leg(scene), sampler.next_1d(), path.active & ~path.straight
+        radiance, let_through = self._transport.composite_segment(
+            path.segment(scene), sampler.next_1d(), path.active & ~path.straight
         )
         # Within glass of index n, radiance is n^2 times what arrives outside: so is that of splats,
         # or they would be darker there.
         radiance *= dr.square(path.eta)
         return path.throughput * radiance, path.throughput * let_through
 
-    def _let_through(self, leg: Leg, sampler: mi.Sampler, active: mi.Bool) -> mi.Float:
-        """Of the light of an emitter."""
-        if self.light is None:
+    def _let_through(self, segment: PathSegment, sampler: mi.Sampler, active: mi.Bool) -> mi.Float:
+        """Return the transmittance of splats to an emitter."""
+        if self._transport is None:
             return mi.Float(1)
-        return self.light.transmittance(leg, sampler.next_1d(), active)
+        return self._transport.transmittance(segment, sampler.next_1d(), active)
 
     # ------------------------------------------------------------------------------------------
     # Surfaces
@@ -314,8 +318,8 @@ class _Path:
     last_pdf: mi.Float  # of the direction
     last_is_delta: mi.Bool
 
-    def leg(self, scene: mi.Scene) -> Leg:
-        """That has led here."""
+    def segment(self, scene: mi.Scene) -> PathSegment:
+        """Return the segment that has led here."""
         ray, hits = mi.Ray3f(self.ray), self.hit.is_valid()
         ray.o = self.origin
         ray.maxt = dr.select(hits, self.length + self.hit.t, dr.inf)
@@ -323,10 +327,10 @@ class _Path:
         emitter = dr.select(hits, self.hit.shape.emitter(), environment)
         pdf = dr.select(self.last_is_delta, dr.inf, self.last_pdf)
         is_open = mi.Bool(False) if environment is not None else ~hits
-        return Leg(ray, self.last_hit.shape, emitter, pdf, is_open)
+        return PathSegment(ray, self.last_hit.shape, emitter, pdf, is_open)
 
     def vertex(self, attached: bool) -> mi.SurfaceInteraction3f:
-        """Where the path is; attached: to the surfaces of this vertex and the one before."""
+        """Return the vertex; attached: to the surfaces of this vertex and the one before."""
         si = self.hit.compute_surface_interaction(self.ray, ray_flags=mi.RayFlags.All)
         if attached:
             last = self.last_hit.compute_surface_interaction(
@@ -361,7 +365,7 @@ class _Path:
 
 @dataclass(frozen=True)
 class _Step:
-    """From a vertex to the next one."""
+    """A step of a path to its next vertex."""
 
     ray: mi.Ray3f
     hit: mi.PreliminaryIntersection3f

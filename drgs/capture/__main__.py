@@ -68,9 +68,9 @@ from drgs.cli.execution import add_variant_argument, select_variant
 from drgs.cli.progress import RunProgress
 from drgs.core.errors import UserError, one_line
 from drgs.core.files import atomic_path, read_text, remove_stale_temporaries, why_refused
-from drgs.core.locks import sole_writer
+from drgs.core.folders import sole_writer
 from drgs.core.memory import why_too_large
-from drgs.integrator.settings import SummarisingIntegrator
+from drgs.integrator.state import is_splats
 from drgs.io.pictures import write_png
 
 MANIFEST = "capture.json"
@@ -241,7 +241,7 @@ def refuse_splats(path: Path, scene: mi.Scene) -> None:
     """Raise :class:`UserError` for a scene whose pictures by path tracing would lack its splats."""
     integrator = scene.integrator()
     nested = [] if integrator is None else mi.traverse(integrator).hierarchy  # itself included
-    if any(isinstance(one, SummarisingIntegrator) for one in nested):
+    if any(map(is_splats, nested)):
         found = "its integrator is splats"
     elif any("Ellipsoids" in node.class_name() for node in mi.traverse(scene).hierarchy):
         found = "it has shapes of type ellipsoids"

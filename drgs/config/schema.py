@@ -1,6 +1,6 @@
 """The typed configuration of a fit: YAML -> :class:`FitConfig`.
 
-The defaults are a recipe that was chosen by measurement (``python -m drgs.bench recipes``);
+The defaults are a recipe that was chosen by measurement (``scenes/studies/recipes.py``);
 ``scenes/lego_paper.yml`` spells out that of the paper (Kerbl et al. 2023, section 7, and its
 released code). Each field names its unit and range. A configuration is frozen: what a run used is
 what :func:`dump_config` writes.

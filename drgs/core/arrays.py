@@ -368,3 +368,8 @@ def planes_of(image: Any) -> list[Any]:
 def image_of(planes: list[Any], like: Any) -> Any:
     """The tensor (H, W, C) of these channels; like: an image of H x W pixels."""
     return type(like)(interleave(planes), (*like.shape[:2], len(planes)))
+
+
+def tangent_of(parameter: Any) -> Any:
+    """Return the gradient set on a parameter; an empty one's own, as dr.grad drops its shape."""
+    return dr.grad(parameter) if dr.width(parameter) > 0 else parameter

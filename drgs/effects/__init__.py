@@ -1,4 +1,4 @@
-"""What a scene may call for besides splats before a pinhole, each imported when it does.
+"""Effects besides splats before a pinhole, each imported when a scene uses it.
 
 May import ``splatting``, ``config``, ``gaussians``, ``cameras`` and ``core``.
 """

@@ -10,8 +10,8 @@ from drgs.gaussians.parameters import Gaussians
 from drgs.splatting.rendering import Pipeline
 
 
-def composed(pipeline: Pipeline, gaussians: Gaussians, camera: Camera) -> Pipeline:
-    """``pipeline`` with what the Gaussians and the camera call for.
+def with_effects(pipeline: Pipeline, gaussians: Gaussians, camera: Camera) -> Pipeline:
+    """Return ``pipeline`` with the effects that the Gaussians and the camera need.
 
     An aperture blurs and dims splats; a smoothing filter widens Gaussians before they are
     projected. A camera that moves needs nothing here: its shutter is an object that
@@ -33,8 +33,8 @@ IGNORABLE = ("distortion", "defocus", "motion", "smoothing")
 """What a sensor or a file calls for and one may decide not to simulate; the last is no camera's."""
 
 
-def ignoring(camera: Camera, ignored: Collection[str]) -> Camera:
-    """A camera of which some is not simulated: ``distortion``, ``defocus``, ``motion``."""
+def without_effects(camera: Camera, ignored: Collection[str]) -> Camera:
+    """Return the camera without ignored effects: ``distortion``, ``defocus``, ``motion``."""
     if "distortion" in ignored and camera.lens.distorts:
         camera = replace(camera, lens=Pinhole())
     if "defocus" in ignored:

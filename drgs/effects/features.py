@@ -1,4 +1,4 @@
-"""What may be composited besides colour and depth: normals, and features that the user names.
+"""Composited features besides colour and depth: normals, and features that the user names.
 
 Imported when it is asked for.
 """

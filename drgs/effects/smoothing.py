@@ -58,7 +58,7 @@ def smoothing_of(means: Any, cameras: Iterable[Camera]) -> Any:
 
 
 def _rates(points: Any, camera: Camera) -> Any:
-    """Of one camera, px per scene unit; 0 where it does not see a point."""
+    """Return the rates of one camera, px per scene unit; 0 where it does not see a point."""
     lens = camera.lens
     seen, position, depth = lens.look(camera, camera.rotation @ (points - camera.center))
     film = lens.film_point(camera, position)
@@ -70,7 +70,7 @@ def _rates(points: Any, camera: Camera) -> Any:
 
 
 def baked(gaussians: Gaussians) -> Gaussians:
-    """The same Gaussians (numpy) with the filter in their scales and opacities.
+    """Return the Gaussians (numpy) with the filter in their scales and opacities.
 
     For viewers that know nothing of it. Opacities are rounded to below 1.
     """

@@ -25,11 +25,11 @@ from drgs.cameras.camera import Camera
 from drgs.core.arrays import interleave
 from drgs.core.errors import UnsupportedError
 from drgs.integrator.film import Channels, pixel_corners
-from drgs.integrator.picture import hybrid_of
+from drgs.integrator.image_render import hybrid_of
 from drgs.integrator.sampling import by_sample, in_passes
+from drgs.integrator.sensor_render import SensorRender, constant_background
 from drgs.integrator.sensors import camera_from_sensor, is_batch, read_sensor
-from drgs.integrator.settings import SplatsSettings
-from drgs.integrator.view import View, constant_background
+from drgs.integrator.state import SplatsState
 
 if TYPE_CHECKING:  # imported where a scene has surfaces
     from drgs.integrator.surfaces import Hybrid
@@ -50,7 +50,7 @@ ROUNDING = 1e-5
 
 
 @dataclass(frozen=True, eq=False)
-class PictureRays:
+class ImageRays:
     """Rays of a whole picture, and where they start. Equality is identity."""
 
     ray: Any  # RayDifferential3f (H * W * count,): those of a pixel are neighbours
@@ -58,7 +58,7 @@ class PictureRays:
     positions: tuple[SamplePoints, ...]  # by pass
 
     @staticmethod
-    def of(sensor: mi.Sensor | None, near: float, ray: mi.RayDifferential3f) -> PictureRays:
+    def of(sensor: mi.Sensor | None, near: float, ray: mi.RayDifferential3f) -> ImageRays:
         """Find where in their pixels the rays start.
 
         sensor: of which a picture was rendered last, None if there was none; near: near plane of
@@ -85,32 +85,26 @@ class PictureRays:
         within = dr.clip(within, 0, 1 - dr.epsilon(mi.Float))
         positions = in_passes(within, count, width * height)
         dr.eval([(p.x, p.y) for p in positions])
-        return PictureRays(ray, count, positions)
-
-    @property
-    def within(self) -> tuple[tuple[Any, Any], ...]:
-        """Starting points by pass: x and y from their pixels' upper left corners, px."""
-        return tuple((p.x, p.y) for p in self.positions)
+        return ImageRays(ray, count, positions)
 
     def channels(
         self,
-        integrator: SplatsSettings,
+        splats: SplatsState,
         scene: mi.Scene,
         sensor: mi.Sensor,
         sampler: mi.Sampler,
         active: mi.Bool,
     ) -> Channels:
-        """What the rays see, each Float (H * W * count,): colour, alpha, AOVs of the integrator."""
-        hybrid = hybrid_of(integrator, scene, sensor, 0, 1)
+        """Return colour, alpha and AOVs of the rays, each Float (H * W * count,)."""
+        hybrid = hybrid_of(splats, scene, sensor, 0, 1)
         # With a single sample, what is seen of edges would be the mean over their pixels.
         times = 2 if self.count == 1 and hybrid is not None else 1
-        view = View(
-            integrator=integrator,
+        view = SensorRender(
+            splats=splats,
             scene=scene,
             index=NESTED,
             sensor=sensor,
             positions=times * self.positions,
-            within=times * self.within,
             key=self,
             has_alpha=True,
             hybrid=hybrid,
@@ -118,8 +112,8 @@ class PictureRays:
         if hybrid is not None:
             hybrid = hybrid.with_surfaces(view.num_surfaces())
             view = replace(view, hybrid=hybrid)
-        channels = self._gathered(view.channels(view.planes(), constant_background(integrator)))
-        integrator.memory.forget_view(NESTED)
+        channels = self._gathered(view.channels(view.planes(), constant_background(splats)))
+        splats.cache.forget_view(NESTED)
         if hybrid is not None:
             channels = self._with_surfaces(channels, hybrid, sampler, active)
         return channels
@@ -146,7 +140,7 @@ class PictureRays:
 
 
 def _look_back(camera: Camera, ray: mi.Ray3f) -> tuple[mi.Point2f, mi.Bool]:
-    """Where on the film rays start, px; whether they belong to this camera."""
+    """Return where on the film rays start, px; whether they belong to this camera."""
     offset = camera.rotation @ mi.Vector3f(ray.o - mi.Point3f(camera.center))
     direction = camera.rotation @ mi.Vector3f(ray.d)
     place, radius = camera.place_of_ray(offset, direction)

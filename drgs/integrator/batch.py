@@ -20,7 +20,7 @@ from drgs.splatting.image_model import PixelCenters, Positions
 
 @dataclass(frozen=True)
 class SideBySide:
-    """Where the pictures stand; all have one size, px."""
+    """The sensors of a batch, whose images of one size (px) stand side by side."""
 
     sensors: list[mi.Sensor]  # the same one, perhaps, at several places
     width: int
@@ -42,12 +42,6 @@ class SideBySide:
             else replace(p, x=self._cut(p.x, index), y=self._cut(p.y, index))
             for p in positions
         )
-
-    def within(self, places: Sequence[tuple[Any, Any]], index: int) -> list[tuple[Any, Any]]:
-        """The same as pairs of numbers or of planes."""
-        return [
-            tuple(self._cut(v, index) if dr.is_array_v(v) else v for v in place) for place in places
-        ]
 
     def cut(self, passes: Sequence[Channels], index: int) -> list[Channels]:
         """The part of one picture of what the film gets, by pass."""

@@ -14,7 +14,9 @@ import drjit as dr
 import mitsuba as mi
 
 from drgs.core.errors import UnsupportedError, listed
-from drgs.integrator.settings import LitIntegrator, SplatsSettings
+from drgs.integrator.checks import ellipsoids_in
+from drgs.integrator.path_segment import passes_splats
+from drgs.integrator.state import SplatsState
 
 ATTACHED = ("PathIntegrator", "DirectIntegrator")
 """Classes of Mitsuba's integrators whose samples move with parameters."""
@@ -72,21 +74,19 @@ class Parameter:
 
 
 def check_derivatives(
-    integrator: SplatsSettings,
+    splats: SplatsState,
     scene: mi.Scene,
     sensor: mi.Sensor,
     mode: dr.ADMode,
-    has_gaussians: bool,
 ) -> None:
     """Raise UnsupportedError for a parameter whose derivative would be wrong.
 
-    scene: with surfaces; has_gaussians: whether derivatives with respect to these are asked for.
+    scene: with surfaces.
     """
-    shown = integrator.light != "none" or integrator.shadows
-    if has_gaussians and shown:
+    if (splats.light != "none" or splats.shadows) and _has_attached_gaussians(splats, scene):
         raise UnsupportedError(
-            f"splats: with light '{integrator.light}' and shadows "
-            f"'{', '.join(integrator.shadows)}', the Gaussians are not differentiated, as surfaces "
+            f"splats: with light '{splats.light}' and shadows "
+            f"'{', '.join(splats.shadows)}', the Gaussians are not differentiated, as surfaces "
             "show and shade them; detach their parameters, or set light to 'none' and leave out "
             "shadows"
         )
@@ -98,7 +98,7 @@ def check_derivatives(
             )
     parameters, reasons = list(attached_parameters(scene)), {}
     for parameter in parameters:
-        reason = _why_not(parameter, integrator)
+        reason = _why_not(parameter, splats)
         if reason is None and mode == dr.ADMode.Forward and _is_padded(parameter):
             reason = "forward mode does not reach its texels; use dr.backward"
         if reason is not None:
@@ -109,6 +109,12 @@ def check_derivatives(
             f"splats: {listed(names)} {are} not differentiated, as {reason}; or detach "
             f"{'it' if are == 'is' else 'them'}"
         )
+
+
+def _has_attached_gaussians(splats: SplatsState, scene: mi.Scene) -> bool:
+    parts = splats.parts(ellipsoids_in(scene))
+    values = [value for part in parts for value in part.values.parameters().values()]
+    return any(dr.grad_enabled(value) for value in values)
 
 
 def attached_parameters(scene: mi.Scene) -> Iterator[Parameter]:
@@ -137,7 +143,7 @@ def parameter_value(params: mi.SceneParameters, name: str) -> Any:
 
 def type_of(integrator: mi.Integrator) -> str:
     """Name of its class; those that are written in Python have one name for Mitsuba."""
-    if isinstance(integrator, LitIntegrator):
+    if passes_splats(integrator):
         return SPLATPATH
     name = integrator.class_name()
     return type(integrator).__name__ if name == "SamplingIntegrator" else name
@@ -153,12 +159,12 @@ def _is_padded(parameter: Parameter) -> bool:
     return parameter.owners[0].class_name() == "EnvironmentMapEmitter" and parameter.key == "data"
 
 
-def _why_not(parameter: Parameter, integrator: SplatsSettings) -> str | None:
+def _why_not(parameter: Parameter, splats: SplatsState) -> str | None:
     """Why a derivative would be wrong, and what to do; None: it is right."""
-    nested, owner = integrator.nested, parameter.owners[0]
+    nested, owner = splats.nested, parameter.owners[0]
     kind = SPLATPATH if nested is None else type_of(nested)
     is_of_emitter = any(isinstance(node, mi.Emitter) for node in parameter.owners)
-    if integrator.shadows and (is_of_emitter or parameter.is_geometry):
+    if splats.shadows and (is_of_emitter or parameter.is_geometry):
         return "how surfaces shade splats, which changes with it, is not; leave out shadows"
     if parameter.bsdfs:
         return _why_not_of_bsdf(parameter, kind)
@@ -167,7 +173,7 @@ def _why_not(parameter: Parameter, integrator: SplatsSettings) -> str | None:
     if isinstance(owner, mi.Emitter) and parameter.key in ("position", "to_world"):
         if kind in (ATTACHED if owner.is_environment() else REPLAYED):
             return f"{kind} does not follow a lamp that moves; {TO_SPLATPATH}"
-        if integrator.light != "none" and not owner.is_environment():
+        if splats.light != "none" and not owner.is_environment():
             return "the shadows that splats throw move with it; set light to 'none'"
     return None
 

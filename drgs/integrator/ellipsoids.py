@@ -6,7 +6,7 @@ per row K coefficients of red, green, blue). :class:`Conversion` makes raw param
 
     log_scales = ln |scales|    logit_opacities = ln(o / (1 - o))    shN = D sh_coeffs
 
-with D the rotation by which a shape was turned (:mod:`drgs.gaussians.sh_rotation`), as Mitsuba
+with D the rotation by which a shape was turned (:mod:`drgs.gaussians.rotation`), as Mitsuba
 turns centres and quaternions but no coefficients. Derivatives take the way back by gathers alone:
 nothing is added atomically, and they are the same to the last bit in every run.
 
@@ -32,8 +32,7 @@ from drgs.core.arrays import interleave
 from drgs.core.errors import PluginError
 from drgs.gaussians.parameters import Gaussians
 from drgs.gaussians.sh import num_coefficients
-from drgs.integrator.gathering import columns, interleaved
-from drgs.integrator.harmonics import PER_DEGREE, Turn
+from drgs.integrator.gathering import PER_DEGREE, Turn, columns, interleaved
 
 DATA = 10
 """Numbers of a row of ``data``: centre, standard deviations, quaternion xyzw."""
@@ -48,7 +47,7 @@ HIDDEN = -1e4
 
 @dataclass(frozen=True)
 class Ellipsoids:
-    """The arrays in which a shape keeps its Gaussians; see ``gathering.Values``."""
+    """The arrays in which a shape keeps its Gaussians."""
 
     data: Any  # Float (10 N,)
     opacities: Any  # Float (N,)
@@ -75,7 +74,7 @@ class Ellipsoids:
 
 
 def read(shape: mi.Shape) -> Ellipsoids:
-    """What the shape holds now, attached. Raises PluginError that names what does not fit."""
+    """Read the shape's arrays, attached. Raises PluginError that names what does not fit."""
     values = mi.traverse(shape)
     where = f"splats: the {_name(shape)}"
     missing = [name for name in ("opacities", "sh_coeffs") if name not in values]
@@ -107,7 +106,7 @@ def _name(shape: mi.Shape) -> str:
 
 @dataclass(frozen=True, eq=False)
 class Conversion:
-    """From what a shape holds to raw parameters of its Gaussians, and derivatives of that.
+    """The conversion of a shape's arrays to raw parameters of Gaussians, and its derivatives.
 
     See :class:`drgs.integrator.gathering.Part`.
     """

@@ -1,14 +1,13 @@
 """Samples of a film: where pixels are evaluated, and how an image comes of the values.
 
-Between the integrator and Mitsuba's films. There are two :class:`FilmSamples`.
-:class:`CenterSamples` evaluates each pixel once, at its centre; ``drgs.integrator.sampling`` has
-the other, for several samples per pixel.
+Between the integrator and Mitsuba's films. :class:`CenterSamples` evaluates each pixel once, at its
+centre; ``drgs.integrator.sampling`` derives from it for several samples per pixel.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, Protocol
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -47,26 +46,16 @@ def samples_in(film: mi.Film, x: Any) -> int:
     return max(dr.width(x) // dr.prod(film.crop_size()), 1)
 
 
-class FilmSamples(Protocol):
-    """The samples of a picture, in passes of one or several for each pixel."""
-
-    positions: Sequence[Positions]  # by pass
-    within: Sequence[tuple[Any, Any]]  # the same: x and y from the pixels' upper left corners, px
-    key: object  # equal for equal positions; None: pixel centres
-
-    def develop(self, passes: Sequence[Channels]) -> mi.TensorXf:
-        """The image, from the channels of each pass."""
-
-    def adjoint(self, grad_in: mi.TensorXf) -> list[Channels]:
-        """Derivatives of the loss with respect to the channels, given those of the image."""
+def offsets_of(positions: Positions) -> tuple[Any, Any]:
+    """Return x and y of sample positions from their pixels' upper left corners, px."""
+    return (0.5, 0.5) if isinstance(positions, PixelCenters) else (positions.x, positions.y)
 
 
 class CenterSamples:
-    """Each pixel is evaluated once, at its centre. Exact for films whose filter is a box."""
+    """One sample per pixel, at its centre. Exact for films whose filter is a box."""
 
-    positions = (PixelCenters(),)
-    within = ((0.5, 0.5),)
-    key = None
+    positions: Sequence[Positions] = (PixelCenters(),)  # by pass
+    key: object = None  # equal for equal positions
 
     def __init__(
         self, film: mi.Film, maps: dict[str, np.ndarray], aovs: Sequence[str] = ()
@@ -75,12 +64,12 @@ class CenterSamples:
         self.film, self.maps, self.aovs = film, maps, list(aovs)
 
     def develop(self, passes: Sequence[Channels]) -> mi.TensorXf:
-        """The image of one pass."""
+        """Return the image, from the channels of each pass."""
         (channels,) = passes
         return develop_pixels(self.film, channels, self.aovs)
 
     def adjoint(self, grad_in: mi.TensorXf) -> list[Channels]:
-        """Derivatives of the loss with respect to the channels, given those of the image."""
+        """Return derivatives with respect to the channels, given those of the image."""
         return [pixels_adjoint(self.film, self.maps, grad_in, self.aovs)]
 
 

@@ -15,32 +15,20 @@ from typing import Any, Protocol
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
-from drgs.core.arrays import interleave, types_of
+from drgs.core.arrays import from_host, interleave, tangent_of, types_of
 from drgs.core.private import same_variables
-from drgs.gaussians.parameters import Gaussians
+from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
+from drgs.gaussians.rotation import sh_rotation_generators, sh_rotation_matrices
 from drgs.gaussians.sh import num_coefficients
-
-
-class Values(Protocol):
-    """Arrays of some Gaussians as they are stored; a PyTree."""
-
-    @property
-    def num_gaussians(self) -> int:
-        """N."""
-
-    @property
-    def sh_degree(self) -> int:
-        """Highest spherical-harmonics degree stored: 0 to 3."""
-
-    def parameters(self) -> dict[str, Any]:
-        """Differentiable arrays by name."""
 
 
 class Part(Protocol):
     """Conversion of stored Gaussians to raw parameters in world space, and its derivatives."""
 
-    values: Values  # in a gathered part detached: holding it keeps its indices from being reused
+    values: Any  # PyTree with num_gaussians, sh_degree and parameters(), by name; in a gathered
+    # part detached: holding it keeps its indices from being reused
 
     @property
     def fixed(self) -> object:
@@ -106,65 +94,71 @@ def gather(parts: Sequence[Part], last: Gathered | None) -> Gathered:
     return Gathered(parts, gaussians)
 
 
-def tangent_of(parameter: Any) -> Any:
-    """The gradient set on a parameter; an empty one is its own, as dr.grad drops its shape."""
-    return dr.grad(parameter) if dr.width(parameter) > 0 else parameter
-
-
-def _joined(parts: Sequence[Gaussians], degree: int) -> Gaussians:
-    """The rows of all parts; coefficients and features that a part lacks are zeros."""
-    parts = [part for part in parts if part.num_gaussians > 0]
-    num = sum(part.num_gaussians for part in parts)
-    rows = {**_ROWS, "shN": (num_coefficients(degree) - 1, 3)}
-    tensors = {
-        name: mi.TensorXf(
-            _concatenated([_widened(getattr(part, name), row) for part in parts]), (num, *row)
-        )
-        for name, row in rows.items()
-    }
-    widths = {k: v.shape[1] for part in parts for k, v in (part.features or {}).items()}
-    features = {
-        name: mi.TensorXf(
-            _concatenated(
-                [_array_or_zeros((part.features or {}).get(name), part, width) for part in parts]
-            ),
-            (num, width),
-        )
-        for name, width in widths.items()
-    }
-    smoothing = None
-    if any(part.smoothing is not None for part in parts):
-        smoothing = _concatenated([_array_or_zeros(part.smoothing, part, 1) for part in parts])
-    logits = _concatenated([part.logit_opacities for part in parts])
-    return Gaussians(
-        **tensors, logit_opacities=logits, smoothing=smoothing, features=features or None
-    )
-
-
-_ROWS = {"means": (3,), "quats": (4,), "log_scales": (3,), "sh0": (1, 3)}
+_ROWS = {
+    **{"means": (3,), "quats": (4,), "log_scales": (3,), "sh0": (1, 3)},
+    **{"logit_opacities": (), "smoothing": ()},
+}
 """Shapes of the rows that do not depend on the degree."""
 
 
+def _joined(parts: Sequence[Gaussians], degree: int) -> Gaussians:
+    """Concatenate the rows of all parts."""
+    parts = [part for part in parts if part.num_gaussians > 0]
+    found, rows = [_arrays(part) for part in parts], _row_shapes(degree)
+    rows |= {k: v.shape[1:] for arrays in found for k, v in arrays.items() if k not in rows}
+    whole = {}
+    for name in dict.fromkeys(name for arrays in found for name in arrays):
+        blocks = [
+            _block(arrays.get(name), 0, part.num_gaussians, part.num_gaussians, rows[name])
+            for arrays, part in zip(found, parts, strict=True)
+        ]
+        filled = [block for block in blocks if dr.width(block) > 0]  # dr.concat takes no others
+        whole[name] = dr.concat(filled) if len(filled) > 1 else (filled or blocks)[0]
+    return _gaussians(whole, rows, sum(part.num_gaussians for part in parts))
+
+
 def _rows(gaussians: Gaussians, start: int, num: int, degree: int) -> Gaussians:
-    """``num`` rows from row ``start`` on, with the coefficients that ``degree`` has."""
-    rows = {**_ROWS, "shN": (num_coefficients(degree) - 1, 3)}
-    tensors = {
-        name: _block(getattr(gaussians, name), start, num, row) for name, row in rows.items()
+    """Return ``num`` rows from row ``start`` on, with the coefficients that ``degree`` has."""
+    arrays, rows = _arrays(gaussians), _row_shapes(degree)
+    rows |= {k: v.shape[1:] for k, v in arrays.items() if k not in rows}
+    blocks = {
+        name: _block(values, start, num, gaussians.num_gaussians, rows[name])
+        for name, values in arrays.items()
     }
-    features = {
-        name: _block(value, start, num, value.shape[1:])
-        for name, value in (gaussians.features or {}).items()
-    }
-    logits, smoothing = (
-        None if flat is None else _block(mi.TensorXf(flat, (dr.width(flat), 1)), start, num, (1,))
-        for flat in (gaussians.logit_opacities, gaussians.smoothing)
-    )
-    return Gaussians(
-        **tensors,
-        logit_opacities=logits.array,
-        smoothing=None if smoothing is None else smoothing.array,
-        features=features or None,
-    )
+    return _gaussians(blocks, rows, num)
+
+
+def _row_shapes(degree: int) -> dict[str, tuple[int, ...]]:
+    return {**_ROWS, "shN": (num_coefficients(degree) - 1, 3)}
+
+
+def _arrays(part: Gaussians) -> dict[str, Any]:
+    """Return all arrays that a part has, by name."""
+    named = {name: getattr(part, name) for name in (*PARAMETER_NAMES, "smoothing")}
+    return {k: v for k, v in {**named, **(part.features or {})}.items() if v is not None}
+
+
+def _gaussians(arrays: dict[str, Any], rows: dict[str, tuple[int, ...]], num: int) -> Gaussians:
+    """Return Gaussians of flat arrays; rows: shapes of their rows."""
+    shaped = {k: mi.TensorXf(v, (num, *rows[k])) if rows[k] else v for k, v in arrays.items()}
+    names = [name for name in shaped if name not in (*_ROWS, "shN")]
+    features = {name: shaped.pop(name) for name in names}
+    return Gaussians(**shaped, features=features or None)
+
+
+def _block(values: Any, start: int, num: int, total: int, row: tuple[int, ...]) -> Any:
+    """Return ``num`` rows of ``total``, flat: cut to ``row``, or filled with zeros."""
+    flat = mi.Float() if values is None else values.array  # an array is its own
+    kept, width = math.prod(row), dr.width(flat) // total
+    if width == kept and num == total:
+        return flat
+    if num * kept == 0 or width == 0:
+        return dr.zeros(mi.Float, num * kept)
+    UInt32 = types_of(type(flat)).UInt32
+    index, first = dr.arange(UInt32, num * kept), dr.opaque(UInt32, start)  # in no kernel
+    at = index // kept
+    column = index - at * kept
+    return dr.gather(type(flat), flat, (at + first) * width + column, column < width)
 
 
 def columns(flat: Any, width: int) -> list[Any]:
@@ -181,38 +175,49 @@ def interleaved(values: list[Any]) -> Any:
     return interleave(values) if values else mi.Float()
 
 
-def _block(tensor: Any, start: int, num: int, row: tuple[int, ...]) -> Any:
-    """Rows from ``start`` on, of each the first numbers, as many as ``row`` has."""
-    flat, width, kept = tensor.array, math.prod(tensor.shape[1:]), math.prod(row)
-    if num * kept == 0:
-        return dr.zeros(mi.TensorXf, (num, *row))
-    UInt32 = types_of(type(flat)).UInt32
-    index, first = dr.arange(UInt32, num * kept), dr.opaque(UInt32, start)  # in no kernel
-    at = index // kept
-    cells = (at + first) * width + (index - at * kept)
-    return mi.TensorXf(dr.gather(type(flat), flat, cells), (num, *row))
+# ----------------------------------------------------------------------------------------------
+# Spherical harmonics
+# ----------------------------------------------------------------------------------------------
+
+PER_DEGREE = {num_coefficients(degree): degree for degree in range(4)}
 
 
-def _widened(tensor: Any, row: tuple[int, ...]) -> Any:
-    """Flat rows of more numbers, zeros behind those that there are."""
-    flat, width, wider = tensor.array, math.prod(tensor.shape[1:]), math.prod(row)
-    if width == wider:
-        return flat
-    if width == 0:
-        return dr.zeros(type(flat), tensor.shape[0] * wider)
-    index = dr.arange(types_of(type(flat)).UInt32, tensor.shape[0] * wider)
-    at = index // wider
-    column = index - at * wider
-    return dr.gather(type(flat), flat, at * width + column, column < width)
+@dataclass(frozen=True, eq=False)
+class Turn:
+    """A linear map of the coefficients of degree 1 to 3 by one matrix per degree."""
+
+    matrices: Any  # Float (9 + 25 + 49,)
+
+    @staticmethod
+    def by(rotation: np.ndarray) -> Turn:
+        """The rotation of spherical harmonics; rotation: (3, 3), x' = R x."""
+        return Turn._from(sh_rotation_matrices(rotation, 3))
+
+    @staticmethod
+    def generators() -> list[Turn]:
+        """Derivatives of turned coefficients along rotations about x, y and z."""
+        return [Turn._from(matrices) for matrices in sh_rotation_generators(3)]
+
+    @staticmethod
+    def _from(matrices: Sequence[np.ndarray]) -> Turn:
+        return Turn(from_host(mi.Float, np.concatenate([matrix.ravel() for matrix in matrices])))
+
+    def of(self, columns: list[Any], transposed: bool = False) -> list[Any]:
+        """Columns of the coefficients of degree 1 and above, three a coefficient; turned."""
+        turned, start = [], 0
+        for degree in range(1, PER_DEGREE[len(columns) // 3 + 1] + 1):
+            size = 2 * degree + 1
+            band = columns[3 * (degree**2 - 1) :][: 3 * size]
+            for k in range(size):
+                cells = [j * size + k if transposed else k * size + j for j in range(size)]
+                row = [number_of(self.matrices, start + cell) for cell in cells]
+                for c in range(3):
+                    terms = [a * x for a, x in zip(row, band[c::3], strict=True)]
+                    turned.append(sum(terms[1:], terms[0]))
+            start += size * size
+        return turned
 
 
-def _array_or_zeros(values: Any, part: Gaussians, width: int) -> Any:
-    """A flat array; rows of ``width`` zeros where a part has none."""
-    if values is None:
-        return dr.zeros(type(part.logit_opacities), part.num_gaussians * width)
-    return values.array if dr.is_tensor_v(values) else values
-
-
-def _concatenated(arrays: list[Any]) -> Any:
-    filled = [array for array in arrays if dr.width(array) > 0]  # dr.concat takes no others
-    return dr.concat(filled) if len(filled) > 1 else (filled or arrays)[0]
+def number_of(flat: Any, index: int) -> Any:
+    """One entry of an array, in no kernel: other numbers need no other one."""
+    return dr.gather(type(flat), flat, types_of(type(flat)).UInt32(index))

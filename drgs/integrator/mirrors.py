@@ -27,9 +27,9 @@ from drgs.accuracy.peak_depths import BoundedDepths
 from drgs.accuracy.pipeline import pipeline_of
 from drgs.cameras.camera import Camera, Lens, Pinhole
 from drgs.config.approximations import Approximations
-from drgs.effects.compose import composed
+from drgs.effects.compose import with_effects
 from drgs.gaussians.parameters import Gaussians
-from drgs.integrator.legs import Leg
+from drgs.integrator.path_segment import PathSegment
 from drgs.integrator.sensors import SensorState, camera_from_sensor
 from drgs.integrator.transparency import StraightRays, has_transparent_parts
 from drgs.light.probe import LOW_PASS, Seen
@@ -206,9 +206,9 @@ class Mirrors:
         dr.make_opaque(every, views)
         return Mirrors(every, views)
 
-    def look(self, mirror: mi.UInt32, leg: Leg, active: mi.Bool) -> Seen:
-        """Look up what legs meet that leave a mirror; mirror: its number, of each leg."""
-        plane, ray = self.planes.at(mirror, active), leg.ray
+    def look(self, mirror: mi.UInt32, segment: PathSegment, active: mi.Bool) -> Seen:
+        """Look up the splats along segments that leave a mirror; mirror: its number, of each."""
+        plane, ray = self.planes.at(mirror, active), segment.ray
         origin = ray.o - 2 * plane.height(ray.o) * plane.normal
         direction = ray.d - 2 * dr.dot(plane.normal, ray.d) * plane.normal
         color, coverage, is_known = mi.Color3f(0), mi.Float(0), mi.Bool(False)
@@ -320,7 +320,7 @@ def _picture(
     camera = plane.mirror(camera)
     dr.make_opaque(plane, camera)
     nearest, farthest, ends = _trace(camera, plane, scene)
-    pipeline = composed(pipeline, gaussians, camera)
+    pipeline = with_effects(pipeline, gaussians, camera)
     depths = BoundedDepths(pipeline.order.depths, nearest, farthest)
     order = replace(pipeline.order, depths=depths)
     frame = rendering.render(gaussians, camera, replace(pipeline, order=order))

@@ -1,4 +1,4 @@
-"""What a scene description tells the plugins: properties, read and checked.
+"""Properties of scene descriptions, read and checked for the plugins.
 
 The readers of single values serve both plugins, the others ``splats``. All raise
 :class:`drgs.core.errors.PluginError` with the plugin's name, that of the property, what was
@@ -11,7 +11,6 @@ import math
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from numbers import Integral
 from typing import TYPE_CHECKING
 
 import drjit as dr
@@ -19,18 +18,17 @@ import mitsuba as mi
 import numpy as np
 
 from drgs.config.approximations import DECLARED, Approximations, Declared, Value, said_by
-from drgs.core.constants import MAX_INT
+from drgs.core.constants import MAX_INT, NEAR
 from drgs.core.errors import PluginError, PluginTypeError, UserNote, did_you_mean
 from drgs.core.origin import WORLD, shown_origin
 from drgs.effects.compose import IGNORABLE
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
-from drgs.integrator.settings import LitIntegrator
+from drgs.integrator.checks import check_shapes, degree_of
+from drgs.integrator.path_segment import passes_splats
+from drgs.integrator.state import AOVS, SplatObject, SplatsState, feature_widths
 
 if TYPE_CHECKING:  # imported where the ``to_world`` of shapes is given
-    from drgs.integrator.harmonics import Turn
-
-AOVS = {"depth": ("T",), "alpha": ("I",), "normal": ("X", "Y", "Z")}
-"""What may be put out besides colour, and the names of its channels as Mitsuba has them."""
+    from drgs.integrator.gathering import Turn
 
 FEATURE = "feature_"
 """What the names of parameters begin with that hold numbers of the user's own."""
@@ -69,10 +67,52 @@ UNSEEN = ("none", "rays")
 """What probes do not see."""
 
 
+def read_state(
+    props: mi.Properties, objects: Mapping[str, SplatObject], nested: mi.Integrator | None
+) -> SplatsState:
+    """Return the state of ``splats``; objects: nested ones, nested: the integrator of surfaces."""
+    gaussians = load_gaussians(props)
+    file, header = str(props.get("filename", "")), header_of(props, gaussians)
+    own = SplatObject(gaussians, to_world_of(props), "to_world" in props, file, header)
+    if own.is_moved:
+        own.check_to_world()
+    features = feature_widths({"": own} | {f"{name}.": one for name, one in objects.items()})
+    degrees = [one.gaussians.sh_degree for one in (own, *objects.values())]
+    files = {one.file: one.header for one in (own, *objects.values()) if one.file}
+    header, light = agreed(props, files), light_of(props, nested)
+    state = SplatsState(
+        own=own,
+        nested_objects=dict(objects),
+        has_own=gaussians.num_gaussians > 0,
+        turns=turns_of_shapes(props),
+        background=background_of(props),
+        nested=nested,
+        default_degree=max(degrees),
+        given_degree=degree_of(props["sh_degree"]) if "sh_degree" in props else None,
+        approximations=approximations_of(props, header),
+        header=header,
+        near=positive(props, "near", NEAR),
+        aovs=aovs_of(props, [*AOVS, *features]),
+        ignore=ignored_effects(props),
+        hide_emitters=boolean(props, "hide_emitters", False),
+        srgb_primitives=boolean(props, "srgb_primitives", True),
+        nested_spp=integer(props, "nested_spp", 0, least=0),
+        light=light,
+        light_samples=integer(props, "light_samples", LIGHT_SAMPLES, 0, MAX_LIGHT_SAMPLES),
+        probes=probes_of(props, light),
+        unseen=one_of(props, "unseen", UNSEEN),
+        shadows=ids_of(props, "shadows"),
+        exposure=positive(props, "exposure", 1.0),
+    )
+    refuse_unknown(props, KNOWN)
+    state.check_columns()
+    return state
+
+
 def light_of(props: mi.Properties, nested: mi.Integrator | None) -> str:
-    """How light passes between splats and surfaces, of :data:`LIGHTS`."""
+    """Return ``light``, one of :data:`LIGHTS`."""
     light = one_of(props, "light", LIGHTS)
-    if light != LIGHTS[0] and nested is not None and not isinstance(nested, LitIntegrator):
+    if light != LIGHTS[0] and nested is not None and not passes_splats(nested):
         raise PluginError(
             f"splats: with light '{light}', the nested integrator must be splatpath, got "
             f"{nested.class_name()}; it takes max_depth, rr_depth and hide_emitters as path does"
@@ -81,7 +121,7 @@ def light_of(props: mi.Properties, nested: mi.Integrator | None) -> str:
 
 
 def ids_of(props: mi.Properties, name: str) -> tuple[str, ...]:
-    """Ids of objects of the scene, separated by commas."""
+    """Return a list of ids from a text with commas."""
     return tuple(part.strip() for part in props.get(name, "").split(",") if part.strip())
 
 
@@ -162,12 +202,12 @@ def to_world_of(props: mi.Properties) -> mi.AffineTransform4f:
 
 
 def turns_of_shapes(props: mi.Properties) -> dict[str, Turn]:
-    """By ids of shapes, and under "" for all others: how their spherical harmonics turn."""
+    """Return rotations of spherical harmonics by ids of shapes, and under "" for all others."""
     names = [name for name in props.keys() if name.startswith(SHAPES_TO_WORLD)]  # noqa: SIM118
     if not names:
         return {}
     from drgs.gaussians.similarity import Similarity
-    from drgs.integrator.harmonics import Turn
+    from drgs.integrator.gathering import Turn
 
     turns = {}
     for name in names:
@@ -196,7 +236,7 @@ def background_of(props: mi.Properties) -> mi.Color3f | mi.Texture:
 
 
 def ignored_effects(props: mi.Properties) -> tuple[str, ...]:
-    """What is called for and not to be simulated."""
+    """Return the effects that are not simulated."""
     words = [word.strip() for word in str(props.get("ignore", "")).split(",") if word.strip()]
     for word in words:
         if word not in IGNORABLE:
@@ -207,7 +247,7 @@ def ignored_effects(props: mi.Properties) -> tuple[str, ...]:
 
 
 def aovs_of(props: mi.Properties, kinds: Sequence[str]) -> dict[str, str]:
-    """By name: what is put out, one of ``kinds``."""
+    """Return types of AOVs by name, each of ``kinds``."""
     aovs = {}
     for item in str(props.get("aovs", "")).split(","):
         if not item.strip():
@@ -285,8 +325,8 @@ def agreed(props: mi.Properties, files: Mapping[str, Mapping[str, Value]]) -> di
     return {name: said[name] for said in files.values() for name in names if name in said}
 
 
-def said_by_file(props: mi.Properties, gaussians: Gaussians) -> dict[str, Value]:
-    """The approximations that the file ``filename`` says and that no property gives."""
+def header_of(props: mi.Properties, gaussians: Gaussians) -> dict[str, Value]:
+    """Return the approximations that the file's header sets and no property gives."""
     values = gaussians.rendered_with or {}
     return said_by(
         str(props.get("filename", "")), {n: v for n, v in values.items() if n not in props}
@@ -300,7 +340,7 @@ def approximations_of(props: mi.Properties, said: Mapping[str, Value]) -> Approx
 
 
 def _approximation(props: mi.Properties, name: str, declared: Declared) -> Value:
-    """One of them, of the type that it is declared with."""
+    """Return one approximation, of the type that it is declared with."""
     value = props[name]
     if declared.kind is float and type(value) is int:
         value = float(value)
@@ -380,7 +420,7 @@ def _number(props: mi.Properties, name: str, default: float, expected: str) -> f
 
 
 def one_of(props: mi.Properties, name: str, known: Sequence[str]) -> str:
-    """One of several words, the first of which is the default."""
+    """Return one of several words, the first of which is the default."""
     value = props.get(name, known[0])
     if value not in known:
         message = _message(props, name, f"one of {', '.join(known)}", value)
@@ -399,59 +439,3 @@ def matrix(props: mi.Properties, name: str) -> np.ndarray:
 
 def _message(props: mi.Properties, name: str, expected: str, got: object) -> str:
     return f"{props.plugin_name()}: {name} must be {expected}, got {got!r}"
-
-
-# ----------------------------------------------------------------------------------------------
-# Gaussians
-# ----------------------------------------------------------------------------------------------
-
-
-def check_shapes(gaussians: Gaussians) -> None:
-    """Raise PluginError unless all parameters have rows for the same Gaussians."""
-    num = next(iter(gaussians.means.shape), 1)
-    if num == 0:
-        raise PluginError("splats: at least one Gaussian is needed, got none")
-    rows = {
-        "means": [(3,)],
-        "quats": [(4,)],
-        "log_scales": [(3,)],
-        "logit_opacities": [()],
-        "sh0": [(1, 3)],
-        "shN": [((degree + 1) ** 2 - 1, 3) for degree in range(4)],
-    }
-    for name, allowed in rows.items():
-        got = tuple(getattr(gaussians, name).shape)
-        if got not in [(num, *row) for row in allowed]:
-            expected = " or ".join(f"({', '.join(map(str, ('N', *row)))})" for row in allowed)
-            raise PluginError(
-                f"splats: {name} must have the shape {expected}, with N = {num} the rows of "
-                f"means, got {got}"
-            )
-    for name, tensor in (gaussians.features or {}).items():
-        if len(tensor.shape) != 2 or tensor.shape[0] != num or tensor.shape[1] == 0:
-            raise PluginError(
-                f"splats: {name} must have the shape (N, C), with N = {num} the rows of means and "
-                f"C at least 1, got {tuple(tensor.shape)}"
-            )
-    if gaussians.smoothing is not None and dr.width(gaussians.smoothing) != num:
-        raise PluginError(
-            f"splats: smoothing must have the shape (N), with N = {num} the rows of means, got "
-            f"({dr.width(gaussians.smoothing)},)"
-        )
-
-
-def degree_of(value: object) -> int:
-    """A degree of spherical harmonics that Gaussians may have."""
-    is_integer = isinstance(value, Integral) and not isinstance(value, bool)
-    if not is_integer or value not in range(4):
-        raise PluginError(f"splats: sh_degree must be an integer from 0 to 3, got {value!r}")
-    return int(value)
-
-
-def check_degree(degree: int, gaussians: Gaussians) -> None:
-    """Raise PluginError for a degree of spherical harmonics that the Gaussians do not have."""
-    if degree > gaussians.sh_degree:
-        raise PluginError(
-            f"splats: sh_degree must be an integer from 0 to {gaussians.sh_degree}, the degree of "
-            f"the Gaussians, got {degree}"
-        )

@@ -21,6 +21,7 @@ from drgs.accuracy.sample_points import SamplePoints
 from drgs.core.arrays import divide, repeat_array
 from drgs.core.private import same_variables
 from drgs.integrator.film import (
+    CenterSamples,
     Channels,
     develop_pixels,
     num_colors,
@@ -79,7 +80,7 @@ class HeldSeed:
     __hash__ = None
 
 
-class DrawnSamples:
+class DrawnSamples(CenterSamples):
     """``spp`` samples per pixel, drawn by a copy of the sensor's sampler."""
 
     def __init__(
@@ -90,8 +91,7 @@ class DrawnSamples:
         maps: dict[str, np.ndarray],
         aovs: Sequence[str] = (),
     ) -> None:
-        """maps: remembers the linear maps of films, by their description; aovs: channels' names."""
-        self.film, self.maps, self.aovs = sensor.film(), maps, list(aovs)
+        super().__init__(sensor.film(), maps, aovs)
         sampler = sensor.sampler().clone()
         sampler.set_sample_count(spp)
         spp = sampler.sample_count()  # some round it up
@@ -101,12 +101,11 @@ class DrawnSamples:
         sampler.seed(seed, num_pixels * spp)
         points = sampler.next_2d()
         self.positions = in_passes(points, spp, num_pixels)
-        self.within = tuple((p.x, p.y) for p in self.positions)
-        dr.eval(self.within)
+        dr.eval([(p.x, p.y) for p in self.positions])
         self.key = (HeldSeed(seed) if dr.is_jit_v(seed) else seed, spp, str(sensor.sampler()))
 
     def develop(self, passes: Sequence[Channels]) -> mi.TensorXf:
-        """The image of all passes."""
+        """Return the image, from the channels of each pass."""
         film = self.film
         if film.rfilter().is_box_filter():
             count = sum(point.samples for point in self.positions)
@@ -127,7 +126,7 @@ class DrawnSamples:
         return film.develop()
 
     def adjoint(self, grad_in: mi.TensorXf) -> list[Channels]:
-        """Derivatives of the loss with respect to the channels, given those of the image."""
+        """Return derivatives with respect to the channels, given those of the image."""
         if self.film.rfilter().is_box_filter():
             count = sum(point.samples for point in self.positions)
             averaged = pixels_adjoint(self.film, self.maps, grad_in, self.aovs)

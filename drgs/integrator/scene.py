@@ -1,4 +1,4 @@
-"""From a dataset to Mitsuba objects: sensors for the views, a scene with the integrator.
+"""Mitsuba objects from a dataset: sensors for the views, a scene with the integrator.
 
 The trainer and the commands reach the integrator through these dictionaries, as any Mitsuba scene
 would.

@@ -1,4 +1,4 @@
-"""From Mitsuba's sensors to the cameras that the projection knows."""
+"""Cameras of the projection from Mitsuba's sensors."""
 
 from __future__ import annotations
 
@@ -12,7 +12,6 @@ import mitsuba as mi
 from drgs.cameras.camera import Camera
 from drgs.core.arrays import types_of
 from drgs.core.errors import PluginTypeError
-from drgs.core.private import same_variables
 
 
 @dataclass(frozen=True)
@@ -28,20 +27,17 @@ class SensorState:
 
     @property
     def is_attached(self) -> bool:
-        """Whether derivatives with respect to one of the sensor's parameters are asked for."""
+        """True if one of the sensor's parameters is attached."""
         return any(dr.grad_enabled(value) for value in self.device.values())
 
     def detached(self) -> SensorState:
-        """The same without derivatives."""
+        """Return a detached copy."""
         return replace(self, device=dr.detach(self.device))
 
-    def same_as(self, other: SensorState) -> bool:
-        """Whether both give the same camera."""
-        return (
-            self.make == other.make
-            and self.host == other.host
-            and same_variables(self.device, other.device)
-        )
+    @property
+    def settings(self) -> tuple[object, ...]:
+        """All besides the device's numbers, compared by ==."""
+        return self.make, self.host
 
 
 @runtime_checkable
@@ -64,8 +60,17 @@ def num_poses(sensor: mi.Sensor) -> int:
 
 
 def is_batch(sensor: mi.Sensor) -> bool:
-    """Whether it is one of Mitsuba's type ``batch``, which has no type in Python."""
+    """Return whether a sensor is a ``batch``, which has no type in Python."""
     return sensor.class_name() == "BatchSensor"
+
+
+def sensors_of(sensor: mi.Sensor) -> list[mi.Sensor]:
+    """Return the sensors of a batch, or the one."""
+    if not is_batch(sensor):
+        return [sensor]
+    from drgs.integrator.batch import SideBySide
+
+    return SideBySide.of(sensor).sensors
 
 
 def read_sensor(sensor: mi.Sensor, near: float) -> SensorState:
@@ -106,7 +111,7 @@ def camera_from_sensor(state: SensorState) -> Camera:
 
 
 def _perspective(state: SensorState) -> Camera:
-    """Of type ``perspective``; a thin lens has no offsets of the principal point."""
+    """Return the camera of a ``perspective``; a thin lens has no offsets of the principal point."""
     width, height, *_ = host = opaque_host(state)
     device = state.device
     # x_fov is the horizontal field of view of the whole film, whatever 'fov_axis' was given.
@@ -118,7 +123,7 @@ def _perspective(state: SensorState) -> Camera:
 
 
 def _thin_lens(state: SensorState) -> Camera:
-    """Of type ``thinlens``: what is not at the focus distance is blurred."""
+    """Return the camera of a ``thinlens``, which blurs points out of focus."""
     from drgs.cameras.thin_lens import RoundAperture
 
     device = state.device
@@ -130,7 +135,7 @@ def _thin_lens(state: SensorState) -> Camera:
 
 
 def _orthographic(state: SensorState) -> Camera:
-    """Of type ``orthographic``: its film is 2 units of its own wide."""
+    """Return the camera of an ``orthographic``, whose film is 2 of its units wide."""
     from drgs.cameras.orthographic import Orthographic
 
     width, height, *_ = host = opaque_host(state)

@@ -23,12 +23,11 @@ import drjit as dr
 import mitsuba as mi
 
 from drgs.core.constants import SH_C0
-from drgs.core.private import same_variables
 from drgs.gaussians.parameters import Gaussians
 from drgs.gaussians.quaternions import quat_to_rotation
-from drgs.integrator.light import ray_splats_of
-from drgs.integrator.limits import check_ids
-from drgs.integrator.settings import SplatsSettings
+from drgs.integrator.checks import check_ids
+from drgs.integrator.ray_transport import ray_splats_of
+from drgs.integrator.state import Cached, SplatsState
 from drgs.integrator.surfaces import Surfaces, scene_of
 from drgs.integrator.transparency import StraightRays, has_transparent_parts
 from drgs.light.walk import RaySplats, Segment
@@ -50,36 +49,23 @@ AHEAD = 3.0
 for: its own alpha does not count."""
 
 
-@dataclass(frozen=True, eq=False)
-class Shadows:
-    """Splats with shadows on them, and all that these depend on."""
+def shade(splats: SplatsState, scene: mi.Scene) -> None:
+    """Shade the Gaussians by the objects that cast shadows, unless all is as it was.
 
-    gaussians: Gaussians
-    made_of: tuple[Gaussians, Surfaces, tuple[str, ...]]  # detached: held, see same_variables
-
-    @staticmethod
-    def of(
-        integrator: SplatsSettings, gaussians: Gaussians, scene: mi.Scene, last: Shadows | None
-    ) -> Shadows:
-        """Of the integrator's objects on ``gaussians``, or ``last`` if all is as it was.
-
-        Raises PluginError for the name of an object that the scene does not have.
-        """
-        gaussians, names = dr.detach(gaussians), tuple(integrator.shadows)
-        surfaces = integrator.memory.surfaces = Surfaces.of(scene, integrator.memory.surfaces)
-        if (
-            last is not None
-            and last.made_of[1:] == (surfaces, names)
-            and same_variables(last.made_of[0], gaussians)
-        ):
-            return last
+    Raises PluginError for the name of an object that the scene does not have.
+    """
+    gaussians, cache = dr.detach(splats.unshaded_gaussians), splats.cache
+    surfaces = cache.surfaces = Surfaces.of(scene, cache.surfaces)
+    last, cache.shaded = cache.shaded, None
+    if last is None or not last.matches((surfaces,), gaussians):
         estimate = _Estimate(
             scene=_rays_through(surfaces.objects),
-            without=_rays_through(_without(surfaces.objects, names)),
-            splats=ray_splats_of(gaussians, integrator.approximations, degree=0),
+            without=_rays_through(_without(surfaces.objects, splats.shadows)),
+            splats=ray_splats_of(gaussians, splats.approximations, degree=0),
         )
-        ratio = estimate.ratios(gaussians)
-        return Shadows(_darkened(gaussians, ratio), (gaussians, surfaces, names))
+        darkened = _darkened(gaussians, estimate.ratios(gaussians))
+        last = Cached(darkened, (surfaces,), gaussians)
+    cache.shaded = last
 
 
 def _without(objects: Sequence[mi.Object], names: Sequence[str]) -> list[mi.Object]:
@@ -125,7 +111,7 @@ class _Estimate:
         normals: mi.Vector3f,
         let_through: Callable[[mi.Ray3f, mi.Float], mi.Float],
     ) -> tuple[mi.Color3f, mi.Color3f]:
-        """What arrives, and what the objects hold off; let_through: by the splats, on a ray."""
+        """Return the irradiance, and that which the objects block; let_through: by the splats."""
         sampler = mi.load_dict({"type": "independent"})
         sampler.seed(0, dr.width(points))
         place = dr.zeros(mi.SurfaceInteraction3f, dr.width(points))
@@ -163,7 +149,7 @@ class _Estimate:
 
 
 def _unhindered(ray: mi.Ray3f, sample: mi.Float) -> mi.Float:
-    """As if there were no splats."""
+    """Return full transmittance."""
     del ray, sample
     return mi.Float(1)
 

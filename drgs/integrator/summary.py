@@ -1,4 +1,4 @@
-"""What is simulated of a scene, what asked for each effect, and what is not simulated.
+"""Summary of the simulated effects of a scene, of what asked for each, and of the others.
 
 An effect is composed in when the dataset, the sensor or the configuration calls for it. What is not
 called for is not imported. Commands print such a summary at their start, one line an effect:
@@ -15,8 +15,10 @@ import mitsuba as mi
 
 from drgs.cameras.camera import Camera, Lens, Pinhole
 from drgs.datasets.types import Viewpoint
-from drgs.effects.compose import ignoring
-from drgs.integrator.settings import SplatsSettings
+from drgs.effects.compose import without_effects
+from drgs.integrator.checks import surfaces_in
+from drgs.integrator.sensors import camera_from_sensor, read_sensor, sensors_of
+from drgs.integrator.state import SplatsState
 
 AS_THE_FILE_SAYS = "as the file says"
 """Why something is simulated that the header of the Gaussians' file asks for."""
@@ -51,18 +53,26 @@ def described(effects: Sequence[SimulatedEffect]) -> str:
     return "simulated:\n" + "\n".join(lines)
 
 
+def summary_of_scene(splats: SplatsState, scene: mi.Scene, sensors: Sequence[mi.Sensor]) -> str:
+    """Return the summary of the integrator ``splats``, whose Gaussians are gathered."""
+    alone = [one for sensor in sensors for one in sensors_of(sensor)]
+    cameras = [camera_from_sensor(read_sensor(one, splats.near).detached()) for one in alone]
+    count = len(surfaces_in(scene))
+    return described(summary_of_sensors(splats, cameras, scene.environment(), count))
+
+
 def summary_of_sensors(
-    integrator: SplatsSettings,
+    splats: SplatsState,
     cameras: Sequence[Camera],
     environment: mi.Emitter | None,
     num_surfaces: int = 0,
 ) -> list[SimulatedEffect]:
-    """What the integrator ``splats`` simulates for sensors in front of an environment.
+    """Return the effects that ``splats`` simulates for sensors in front of an environment.
 
     cameras: as the sensors have them, so that what the integrator ignores of them can be named;
     num_surfaces: shapes of the scene that are no Gaussians.
     """
-    left = [ignoring(camera, integrator.ignore) for camera in cameras]
+    left = [without_effects(camera, splats.ignore) for camera in cameras]
 
     def effect(name: str, words: Callable[[Camera], str | None]) -> SimulatedEffect:
         """words: what a camera has of it, or None."""
@@ -83,54 +93,54 @@ def summary_of_sensors(
     )
     light = SimulatedEffect(
         "light between splats and surfaces",
-        None if integrator.light == "none" else "along rays of surfaces",
+        None if splats.light == "none" else "along rays of surfaces",
         "the integrator's light",
     )
     of_surfaces = [surfaces, light] if num_surfaces else [surfaces]
-    said = integrator.said_by_file
-    return [*_summary_of_integrator(integrator, environment, of_cameras, said), *of_surfaces]
+    said = splats.header
+    return [*_summary_of_integrator(splats, environment, of_cameras, said), *of_surfaces]
 
 
 def summary_of_views(
-    integrator: SplatsSettings, views: Sequence[Viewpoint], said: Collection[str] = ()
+    splats: SplatsState, views: Sequence[Viewpoint], said: Collection[str] = ()
 ) -> list[SimulatedEffect]:
-    """The same for views or viewpoints, with nothing behind but the integrator's background.
+    """Return the effects for views or viewpoints before the integrator's background.
 
     said: names of the approximations that the Gaussians' file has decided.
     """
     count = f"{len(views)} cameras"
     of_cameras = [
-        effect_of(views, count).unless(word in integrator.ignore)
+        effect_of(views, count).unless(word in splats.ignore)
         for effect_of, word in ((lens_effect, "distortion"), (motion_effect, "motion"))
     ]
-    return _summary_of_integrator(integrator, None, of_cameras, said)
+    return _summary_of_integrator(splats, None, of_cameras, said)
 
 
 def _summary_of_integrator(
-    integrator: SplatsSettings,
+    splats: SplatsState,
     environment: mi.Emitter | None,
     of_cameras: Sequence[SimulatedEffect],
     said: Collection[str],
 ) -> list[SimulatedEffect]:
     background = SimulatedEffect("background", "a constant colour", "the integrator's background")
-    if environment is not None and not integrator.hide_emitters:
+    if environment is not None and not splats.hide_emitters:
         background = SimulatedEffect("background", "an environment", "the scene's emitter")
-    elif isinstance(integrator.background, mi.Texture):
+    elif isinstance(splats.background, mi.Texture):
         background = SimulatedEffect("background", "a picture", "the integrator's background")
-    smooth = integrator.gaussians.smoothing is not None
+    smooth = splats.gaussians.smoothing is not None
     antialiased = AS_THE_FILE_SAYS if "antialiased" in said else "antialiased"
     effects = [
-        view_dependence_effect(integrator.sh_degree, "the Gaussians' coefficients"),
+        view_dependence_effect(splats.sh_degree, "the Gaussians' coefficients"),
         background,
         *of_cameras,
         antialiasing_effect(
-            antialiased if integrator.approximations.antialiased else None,
+            antialiased if splats.approximations.antialiased else None,
             "the Gaussians' filter" if smooth else None,
         ),
     ]
-    if integrator.has_smoothing and not smooth:
+    if splats.has_smoothing and not smooth:
         effects.append(SimulatedEffect("smoothing filter", None, ignored=True))
-    others = integrator.approximations.others_than_default
+    others = splats.approximations.others_than_default
     values = [f"{k} = {v}" for k, v in others.items() if k in said and k != "antialiased"]
     if values:
         effects.append(SimulatedEffect("approximations", ", ".join(values), AS_THE_FILE_SAYS))
@@ -145,7 +155,7 @@ def _lens_words(lens: Lens) -> str | None:
 
 
 def antialiasing_effect(opacities: str | None, smoothing: str | None) -> SimulatedEffect:
-    """By what asked for compensated opacities and for the smoothing filter; None: nothing."""
+    """Return the effect, from what asked for compensated opacities and the smoothing filter."""
     what = joined(
         "opacities compensated for the low-pass filter" if opacities else None,
         "3D smoothing filter" if smoothing else None,
@@ -174,5 +184,5 @@ def motion_effect(views: Sequence[Viewpoint], of: str = "the dataset's cameras")
 
 
 def joined(*parts: str | None) -> str | None:
-    """Those parts that there are, as a list; None if there is none."""
+    """Join the parts that are not None by commas; None if there is none."""
     return ", ".join(part for part in parts if part) or None

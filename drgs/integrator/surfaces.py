@@ -10,7 +10,7 @@ far as surfaces let them through (``drgs.effects.occlusion``),
     A D(C / A) + sum_k T_k L_k + T (1 - sum_k p_k) B.
 
 With N_k the nested picture of what is behind the first k surfaces, times what these let through
-(``drgs.integrator.windows``), L_k = N_(k - 1) - N_k. Behind the last surface there is only the
+(``drgs.integrator.transparency``), L_k = N_(k - 1) - N_k. Behind the last surface there is only the
 background: where the nested integrator shows it, N_k is there (1 - sum_k p_k) B, and else 0. Light
 does not pass from one to the other: splats neither light surfaces nor are lit by them, and cast no
 shadows (``light`` and ``shadows`` do that).
@@ -42,8 +42,13 @@ from drgs.integrator.derivatives import (
 )
 from drgs.integrator.film import Channels, develop_pixels, film_map, num_colors
 from drgs.integrator.film import pixels_adjoint as film_adjoint
-from drgs.integrator.settings import LitIntegrator
-from drgs.integrator.transparency import StraightRays, has_transparent_parts
+from drgs.integrator.path_segment import passes_splats
+from drgs.integrator.transparency import (
+    RaysBehind,
+    StraightRays,
+    has_transparent_parts,
+    sensor_behind,
+)
 from drgs.integrator.visible_surfaces import Layers, rest_behind
 
 INDEPENDENT = ("does not depend", "nothing that a path meets changes")
@@ -59,7 +64,7 @@ UNBOUNDED = 0xFFFFFFFF
 
 @dataclass(frozen=True, eq=False)
 class Surfaces:
-    """What of a scene light is traced through, and all that this depends on.
+    """The surfaces of a scene, and all that they depend on.
 
     It holds no scene that has the integrator, which keeps it: neither would ever be freed.
     """
@@ -71,7 +76,7 @@ class Surfaces:
 
     @staticmethod
     def of(scene: mi.Scene, last: Surfaces | None) -> Surfaces:
-        """Those of a scene, or ``last`` if they are still the same."""
+        """Find the surfaces of a scene, or return ``last`` if they are still the same."""
         objects, parameters = _surroundings(scene)
         has_gaussians = any(shape.is_ellipsoids() for shape in scene.shapes())
         if (
@@ -85,7 +90,7 @@ class Surfaces:
         return Surfaces(objects, dr.detach(parameters), apart, has_transparent_parts(scene))
 
     def traced(self, scene: mi.Scene) -> mi.Scene:
-        """What the nested integrator renders; scene: the one that these are of."""
+        """Return the scene that the nested integrator renders; scene: the one that these are of."""
         return scene if self.apart is None else self.apart
 
 
@@ -109,13 +114,13 @@ def _surroundings(scene: mi.Scene) -> tuple[list[mi.Object], list[Any]]:
 
 
 def _same(parameters: list[Any], others: list[Any]) -> bool:
-    """Whether arrays are the same variables, and everything else has the same value."""
+    """Return whether arrays are the same variables, and everything else has the same value."""
     on_host = [[v for v in of if not dr.is_array_v(v)] for of in (parameters, others)]
     return on_host[0] == on_host[1] and same_variables(parameters, dr.detach(others))
 
 
 def scene_of(objects: list[mi.Object]) -> mi.Scene:
-    """Of the same objects, so that their parameters are those of the user's scene, and names."""
+    """Build a scene of the same objects, which keep their parameters and names."""
     names = [node.id() for node in objects]
     scene = mi.load_dict({"type": "scene", **{f"object_{k}": o for k, o in enumerate(objects)}})
     for node, name in zip(objects, names, strict=True):
@@ -208,7 +213,7 @@ class Insertion:
         return develop_pixels(self.film, tangents, self.aovs)
 
     def _inserted(self, planes: list[mi.Float], nested: list[list[mi.Float]]) -> Channels:
-        """What the film gets."""
+        """Return the channels for the film."""
         to_developed, to_rgb = self._color_maps()
         count = len(to_developed)
         rest, own = planes[count : -len(self.channels)], planes[-len(self.channels) :]
@@ -242,7 +247,7 @@ class Insertion:
         return list(weight * mi.math.linear_to_srgb(mean))
 
     def _color_maps(self) -> tuple[np.ndarray, np.ndarray]:
-        """From linear RGB to what the film makes of it (RGB, XYZ, luminance), and back.
+        """Return the maps from linear RGB to the film's colours (RGB, XYZ, luminance), and back.
 
         Of luminance there is no way back but to some colour that has it.
         """
@@ -295,8 +300,6 @@ class Hybrid:
         self, ray: mi.RayDifferential3f, sampler: mi.Sampler, active: mi.Bool
     ) -> list[mi.Color3f]:
         """Return N_0, N_1, ... along single rays."""
-        from drgs.integrator.windows import RaysBehind
-
         found = []
         for count in range(self.insertion.num_surfaces):
             behind, weight = mi.RayDifferential3f(ray), mi.Float(1)
@@ -370,8 +373,6 @@ class Hybrid:
             with _sample_count_kept(self.sensor):
                 yield self.sensor
             return
-        from drgs.integrator.windows import RaysBehind, sensor_behind
-
         for count in range(self.insertion.num_surfaces):
             behind = RaysBehind(self.rays, count)
             sensor = sensor_behind(self.sensor, self.sensors, behind)
@@ -404,7 +405,7 @@ class Hybrid:
 def _depth_reduced(integrator: mi.Integrator, count: int) -> Iterator[None]:
     """Shorten paths by ``count`` bounces, where they are bounded by an attribute of Python."""
     depth = getattr(integrator, "max_depth", None)
-    counts_windows = not isinstance(integrator, LitIntegrator)
+    counts_windows = not passes_splats(integrator)
     is_bounded = counts_windows and isinstance(depth, int) and depth < UNBOUNDED
     if is_bounded:
         integrator.max_depth = max(depth - count, 0)

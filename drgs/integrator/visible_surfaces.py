@@ -171,7 +171,7 @@ class _Tracer:
         return VisibleSurface(dr.select(valid, depth, FAR_AWAY), coverage, normal)
 
     def trace_with_edges(self, camera: Camera, film: mi.Film, x: Any, y: Any) -> Layers:
-        """The same at one place of each pixel, or at several where coverage changes next to it.
+        """Trace at one place of each pixel, or at several where coverage changes next to it.
 
         Around the crop window is a row of pixels more, so that its edges are those of the film.
         The host reads how many of the latter there are.

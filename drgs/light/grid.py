@@ -1,4 +1,4 @@
-"""Where a ray finds the Gaussians whose peaks lie on it: nested grids of cells.
+"""Nested grids of cells, in which a ray finds the Gaussians whose peaks lie on it.
 
 A cube around most of the Gaussians is cut into R^3 cells, and so is one twice as wide around it,
 and another one, until all are inside: far away, where there is little, cells are large. A point
@@ -45,7 +45,7 @@ STEP = 1 / 1024
 
 @dataclass(frozen=True)
 class Ellipsoids:
-    """Where N Gaussians show."""
+    """The ellipsoids in which N Gaussians show."""
 
     centers: Any  # Array3f, world
     axes: list[Any]  # three Array3f, world: principal half axes, as far as the Gaussian shows
@@ -58,7 +58,7 @@ class Ellipsoids:
 
 @dataclass(frozen=True)
 class Cell:
-    """Where rays are, one a lane."""
+    """The cells of rays, one a lane."""
 
     first: Any  # UInt32: first entry of its list
     last: Any  # UInt32: one behind the last
@@ -83,7 +83,7 @@ class SplatGrid:
         return self.size * dr.exp2(Float(self.num_levels) - 1)
 
     def span(self, origin: Any, direction: Any) -> tuple[Any, Any]:
-        """Where rays enter and leave the outermost cube; the first is larger where they miss it."""
+        """Return where rays enter and leave the outermost cube; the first is larger for misses."""
         first, last = -dr.inf, dr.inf
         for o, d, c in zip(origin, direction, self.center, strict=True):
             inverse = 1 / d
@@ -254,7 +254,7 @@ class _Boxes:
         return dr.gather(t.UInt32, row, kept), dr.gather(t.UInt32, cell, kept)
 
     def _touches(self, place: list[Any], row: Any, level: int, resolution: int) -> Any:
-        """Whether no principal axis of an ellipsoid tells it from a cell."""
+        """Return whether no principal axis of an ellipsoid tells it from a cell."""
         Float = type(self.ellipsoids.centers.x)
         t = types_of(Float)
         cell = dr.opaque(Float, float(self.size * 2.0 ** (level + 1) / resolution))

@@ -63,7 +63,7 @@ MARGIN = 0.98
 
 @dataclass(frozen=True)
 class Seen:
-    """What rays see."""
+    """Results of looking along rays."""
 
     color: Any  # Array3f: times the coverage
     coverage: Any  # Float
@@ -124,7 +124,7 @@ class Probes:
     def look(
         self, probe: Any, origin: Any, direction: Any, far: Any, level: Any, active: Any
     ) -> Seen:
-        """What rays see up to ``far``.
+        """Look along rays up to ``far``.
 
         probe, level: UInt32, of each ray; direction: unit vectors.
         """
@@ -148,7 +148,7 @@ class Probes:
         return Seen(color, dr.select(shows, coverage, 0), is_known)
 
     def _search(self, line: _Line, cube: _Cube, active: Any) -> tuple[Any, Any, Any]:
-        """Where lines meet the splats, or end; whether they meet any; whether that is known."""
+        """Find where lines meet the splats, or end; whether they meet any; is that known."""
         t = types_of(type(line.end))
 
         def look(u: Any, active: Any) -> tuple[Any, Any, Any]:
@@ -284,7 +284,7 @@ def _place_on_cube(v: Any) -> tuple[Any, Any, Any]:
 
 @dataclass(frozen=True)
 class _Face:
-    """One of the pictures."""
+    """One of the cube's images."""
 
     center: np.ndarray
     number: int  # +x, -x, +y, ...

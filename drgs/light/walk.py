@@ -1,4 +1,4 @@
-"""What a ray passes of the splats: their light, and what they let through of the light behind them.
+"""Splats along rays: their radiance, and their transmittance.
 
 A ray o + t d, with d of unit length, meets a Gaussian at its peak (Moenne-Loccoz et al. 2024, "3D
 Gaussian Ray Tracing", section 4): with o' = W (o - m) and d' = W d in the coordinates in which it
@@ -60,8 +60,8 @@ class Segment:
 
 
 @dataclass(frozen=True)
-class Passed:
-    """What segments pass."""
+class SegmentRadiance:
+    """Composited splats of segments."""
 
     color: Any  # Array3f, display space: sum of w_i c_i
     transmittance: Any  # Float
@@ -116,8 +116,8 @@ class RaySplats:
         dr.eval(shapes, colors, ellipsoids)
         return RaySplats(shapes, colors, build_grid(ellipsoids), sh_degree, cutoffs)
 
-    def passed(self, segment: Segment) -> Passed:
-        """Colour and transmittance of segments."""
+    def composite_segment(self, segment: Segment) -> SegmentRadiance:
+        """Composite the splats along segments, in the order of their peaks."""
         walk = _Walk.along(self, segment)
         t = types_of(self.shapes.Float)
         basis = sh_basis(walk.direction, self.sh_degree)
@@ -140,7 +140,7 @@ class RaySplats:
             cond=lambda at, last, T, color: (T > 0) & walk.goes_on(at),
             body=body,
         )
-        return Passed(t.Array3f(color), dr.abs(T))
+        return SegmentRadiance(t.Array3f(color), dr.abs(T))
 
     def sampled(self, segment: Segment, seed: Any, count: int) -> Sampled:
         """Draw ``count`` splats that segments show, with their weights.
@@ -249,7 +249,7 @@ class RaySplats:
 
 @dataclass
 class _Place:
-    """Where rays are: in a cell, and in its list. Not frozen: Dr.Jit assigns a loop's state."""
+    """The place of rays: a cell, and an entry of its list. Not frozen: Dr.Jit assigns to it."""
 
     start: Any  # Float: where the ray enters the cell
     end: Any  # Float: where it leaves it
@@ -265,7 +265,7 @@ class _Place:
         return _Place(start, type(start)(start), *(dr.zeros(UInt32, size) for _ in range(4)))
 
     def has_entry(self) -> Any:
-        """Whether the list goes on, and the others' rays need not find another cell first."""
+        """Return whether the list goes on, and other rays need not find another cell first."""
         return (self.entry < self.last) & (self.turn < TURNS)
 
     def back(self, goes_back: Any) -> _Place:
@@ -291,11 +291,11 @@ class _Walk:
         return _Walk(splats, origin, segment.direction, end - start)
 
     def goes_on(self, at: _Place) -> Any:
-        """Whether there is another entry, or another cell."""
+        """Return whether there is another entry, or another cell."""
         return (at.entry < at.last) | (at.end < self.stop)
 
     def find(self, at: _Place) -> _Place:
-        """The same place, or where the list is at its end, the next cell that has one."""
+        """Return the place, moved to the next cell with a list where this one is at its end."""
         grid = self.splats.grid
 
         def body(at: _Place) -> tuple[_Place]:
@@ -320,7 +320,7 @@ class _Walk:
         return behind, row, peak, log2_alpha
 
     def meet(self, row: Any, active: Any) -> tuple[Any, Any]:
-        """Where a ray meets a Gaussian, and the base-2 logarithm of its alpha, -inf outside."""
+        """Return where a ray meets a Gaussian, and the base-2 logarithm of alpha, -inf outside."""
         Array3f = types_of(self.splats.shapes.Float).Array3f
         numbers = self.splats.shapes.load(row, active)
         mean, log2_opacity = Array3f(numbers[:3]), numbers[_SHAPE - 1]

@@ -266,7 +266,7 @@ def render(gaussians: Gaussians, camera: Camera, pipeline: Pipeline) -> Frame:
     """Render ``gaussians`` as seen by ``camera``. Parameters may be attached; they are detached.
 
     An aperture and a smoothing filter must have been composed into the pipeline: see
-    :func:`drgs.effects.compose.composed`. The host reads one value, the number of (splat, tile)
+    :func:`drgs.effects.compose.with_effects`. The host reads one value, the number of (splat, tile)
     entries.
     """
     model = pipeline.model.seen_by(camera)

@@ -1,7 +1,7 @@
 """A fit for a given time: what to choose, how many iterations, and when to end.
 
-``python -m drgs.bench training`` measures quality over time on the shipped scene: one curve for
-each :class:`Strategy`, some points on it for numbers of iterations. A point's time is counted in
+``scenes/studies/training.py`` measures quality over time on the shipped scene: one curve for each
+:class:`Strategy`, some points on it for numbers of iterations. A point's time is counted in
 iterations as they are at the start of a fit, with full pictures and the first Gaussians. A few
 iterations of a fit that is to be planned, timed where it will run, turn these into seconds. What is
 planned is the strategy whose curve is highest where the time is up.
@@ -34,7 +34,7 @@ from drgs.training.parallel.inputs import share_inputs
 from drgs.training.trainer import Trainer
 
 CURVES = Path(__file__).parent / "training_curves.csv"
-"""What ``drgs.bench training`` wrote."""
+"""Curves that ``scenes/studies/training.py`` measured."""
 
 MIN_ITERATIONS = 50
 """Fewer fit nothing."""

@@ -1,7 +1,9 @@
 """The history of a fit as TensorBoard reads it, written as the fit goes.
 
-Imported with ``--tensorboard``; tensorboardX, of the extra of that name, knows the format: records
-with checksums, each an event of TensorFlow's ``event.proto``.
+Imported with ``--tensorboard``; tensorboardX, of the extra of that name, writes the format: records
+with checksums, each an event of TensorFlow's ``event.proto``. Its ``SummaryWriter`` names files
+after the time and the host, and writes them from a thread; the file of a fit has one name, which
+the folder's record knows, and is complete after each row.
 """
 
 from __future__ import annotations

@@ -21,9 +21,9 @@ import numpy as np
 import drgs
 from drgs.config.approximations import Approximations
 from drgs.config.schema import FitConfig
+from drgs.core.environment import processor
 from drgs.core.files import atomic_path
-from drgs.core.locks import sole_writer
-from drgs.core.machine import processor
+from drgs.core.folders import sole_writer
 from drgs.core.private import llvm_version
 from drgs.datasets.types import Dataset
 from drgs.gaussians.parameters import Gaussians

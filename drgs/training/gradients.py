@@ -59,7 +59,7 @@ class WholeGradients:
         """Return what is known of the view."""
         del names
         last = self.integrator.last
-        return [ViewGradients(last.means2d_grad, last.visible, self._sums, last.first_fault)]
+        return [ViewGradients(last.means2d_grad, last.visible, self._sums, last.first_nonfinite)]
 
     def share_losses(self, losses: Mapping[int, ViewLoss]) -> list[ViewLoss]:
         """Return the losses of all views, by place in the step."""

@@ -23,10 +23,10 @@ from drgs.cli.interrupts import StopRequest
 from drgs.cli.progress import RunProgress
 from drgs.config.load import config_from, load_config
 from drgs.config.schema import FitConfig
+from drgs.core.environment import VARIANTS
 from drgs.core.errors import UserError, UserNote
 from drgs.core.memory import release_unused_memory
 from drgs.core.registry import reporting_extensions
-from drgs.core.variants import VARIANTS
 from drgs.datasets import Dataset, load_dataset
 from drgs.datasets.fingerprint import Fingerprint, fingerprint_of
 from drgs.datasets.folders import config_for

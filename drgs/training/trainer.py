@@ -222,7 +222,8 @@ class Trainer:
         if terms:
             weight = step.num_averaged / len(step.iterations)
             total = sum(terms[1:], terms[0])
-            dr.backward(total / weight if weight > 1 else total)
+            flags = dr.ADFlag.Default | dr.ADFlag.AllowNoGrad  # a term of weight 0 has none
+            dr.backward(total / weight if weight > 1 else total, flags=flags)
         return self.population.terms_of_all(terms, penalties)
 
     def compare(self, image: Any, view: TrainingView) -> tuple[Any, Any, Any]:

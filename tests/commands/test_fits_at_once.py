@@ -13,7 +13,7 @@ from support.fit_command import (
 )
 from support.folders import contents
 
-from drgs.core.locks import sole_writer
+from drgs.core.folders import sole_writer
 from drgs.training import session
 
 MESSAGE = (

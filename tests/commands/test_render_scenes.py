@@ -133,7 +133,7 @@ def test_the_shipped_scene_shows_objects_among_splats(tmp_path):
     run(path, *definitions, "--out", tmp_path)
     shown = np.array(read_exr(tmp_path / "hybrid.exr"))
     scene = mi.load_file(str(path), **values)
-    objects = np.array(mi.render(scene, integrator=scene.integrator().nested, spp=4))
+    objects = np.array(mi.render(scene, integrator=scene.integrator().state.nested, spp=4))
     # The file has half precision: 11 bits.
     agree = np.all(np.abs(shown - objects) <= 1e-3 * (1 + objects), axis=-1)
     assert 0.3 < agree.mean() < 0.9

@@ -10,7 +10,7 @@ from support.helpers import FLOAT32, Case, device_camera, device_gaussians
 
 from drgs.accuracy.exact import RayResponse, exact_shape
 from drgs.cameras.thin_lens import RoundAperture
-from drgs.effects.compose import composed, ignoring
+from drgs.effects.compose import with_effects, without_effects
 from drgs.effects.defocus import Defocused, DimmedResponse
 from drgs.effects.smoothing import smoothed
 from drgs.splatting import rendering
@@ -28,13 +28,13 @@ def scene():
 def test_what_is_not_called_for_leaves_the_pipeline_as_it_is(scene):
     gaussians, camera = scene
     pipeline = rendering.Pipeline(0)
-    assert composed(pipeline, gaussians, camera) is pipeline
+    assert with_effects(pipeline, gaussians, camera) is pipeline
 
 
 def test_an_aperture_wraps_the_projection_and_the_response(scene):
     gaussians, camera = scene
     pipeline = rendering.Pipeline(0, shape=exact_shape, model=ImageModel(response=RayResponse()))
-    found = composed(pipeline, gaussians, replace(camera, aperture=APERTURE))
+    found = with_effects(pipeline, gaussians, replace(camera, aperture=APERTURE))
     assert found.shape == Defocused(exact_shape)
     assert found.model.response == DimmedResponse(RayResponse())
     assert replace(found, shape=exact_shape, model=pipeline.model) == pipeline
@@ -44,21 +44,21 @@ def test_a_filter_changes_the_gaussians_first(scene):
     gaussians, camera = scene
     filtered = replace(gaussians, smoothing=llvm.Float(0.1) + 0 * gaussians.logit_opacities)
     pipeline = rendering.Pipeline(0)
-    assert composed(pipeline, filtered, camera) == replace(pipeline, rows=smoothed)
+    assert with_effects(pipeline, filtered, camera) == replace(pipeline, rows=smoothed)
 
 
 def test_what_is_ignored_is_not_composed(scene):
     gaussians, camera = scene
     pipeline = rendering.Pipeline(0)
     blurred = replace(camera, aperture=APERTURE)
-    assert composed(pipeline, gaussians, ignoring(blurred, ["motion"])) != pipeline
-    assert composed(pipeline, gaussians, ignoring(blurred, ["defocus"])) is pipeline
+    assert with_effects(pipeline, gaussians, without_effects(blurred, ["motion"])) != pipeline
+    assert with_effects(pipeline, gaussians, without_effects(blurred, ["defocus"])) is pipeline
 
 
 def test_adjoint_and_tangent_replay_what_was_composed(scene):
     gaussians, camera = scene
     camera = replace(camera, aperture=APERTURE)
-    pipeline = composed(rendering.Pipeline(0), gaussians, camera)
+    pipeline = with_effects(rendering.Pipeline(0), gaussians, camera)
     assert rendering.render(gaussians, camera, pipeline).pipeline is pipeline
 
 

@@ -170,7 +170,7 @@ def default_of(plugin, name):
             return getattr(Approximations(), name)
         known = {"hide_emitters", "near", "nested_spp", "srgb_primitives"}
         integrator = mi.load_dict({"type": "splats", **tensors(Scene(count=8).gaussians)})
-        return getattr(integrator, name) if name in known else None
+        return getattr(integrator.state, name) if name in known else None
     sensor = mi.load_dict({"type": "calibrated"})
     known = {"lens": "pinhole", "near_clip": sensor.near_clip(), "far_clip": sensor.far_clip()}
     known |= {"shutter": sensor.shutter, "shutter_samples": sensor.shutter_samples}

@@ -10,7 +10,7 @@ from drgs import render
 from drgs.config.schema import FitConfig
 from drgs.core import constants, memory
 from drgs.datasets import transforms
-from drgs.integrator import limits
+from drgs.integrator import checks
 from drgs.io import pictures
 from drgs.reference import splatting
 
@@ -109,7 +109,7 @@ def test_the_limits_are_those_of_the_program():
     stated = {
         "a photograph": pictures.MAX_PIXELS,
         "a rendered picture": memory.PICTURE_BYTES,
-        "samples of a pixel": limits.MAX_SAMPLES,
+        "samples of a pixel": checks.MAX_SAMPLES,
         "AOVs": constants.MAX_FEATURES,
         "Gaussians": largest,
         "frames of an orbit": render.MAX_FRAMES,

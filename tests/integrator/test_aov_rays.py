@@ -194,7 +194,7 @@ def test_rays_that_are_not_those_of_a_film_are_refused(case):
 
 def test_rays_of_another_sensor_are_refused():
     """As what is not a picture may have as many rays as one."""
-    from drgs.integrator.aov_rays import PictureRays
+    from drgs.integrator.aov_rays import ImageRays
 
     first = mi.load_dict(VIEWS[1].sensor())
     pixel = dr.arange(mi.UInt32, 37 * 23)
@@ -203,17 +203,19 @@ def test_rays_of_another_sensor_are_refused():
     def rays(sensor, place=place):
         return sensor.sample_ray_differential(0, 0, place, mi.Point2f(0.5))[0]
 
-    found = PictureRays.of(first, 0.01, rays(first))
-    np.testing.assert_allclose(np.array(found.within), 0.5, rtol=0, atol=1e-4)
+    found = ImageRays.of(first, 0.01, rays(first))
+    np.testing.assert_allclose(
+        np.array([(p.x, p.y) for p in found.positions]), 0.5, rtol=0, atol=1e-4
+    )
     moved = mi.ScalarTransform4f().translate([0.05, 0, 0])
     turned = mi.ScalarTransform4f().rotate([0, 1, 0], 3)
     for change in (moved, turned):
         to_world = VIEWS[1].sensor()["to_world"] @ change
         other = mi.load_dict(VIEWS[1].sensor() | {"to_world": to_world})
         with pytest.raises(NotImplementedError, match="inside 'aov'"):
-            PictureRays.of(first, 0.01, rays(other))
+            ImageRays.of(first, 0.01, rays(other))
     mirrored = mi.Point2f(1 - place.x, place.y)
     with pytest.raises(NotImplementedError, match="inside 'aov'"):
-        PictureRays.of(first, 0.01, rays(first, mirrored))
+        ImageRays.of(first, 0.01, rays(first, mirrored))
     with pytest.raises(NotImplementedError, match="inside 'aov'"):
-        PictureRays.of(first, 0.01, dr.gather(mi.Ray3f, mi.Ray3f(rays(first)), pixel[:-1]))
+        ImageRays.of(first, 0.01, dr.gather(mi.Ray3f, mi.Ray3f(rays(first)), pixel[:-1]))

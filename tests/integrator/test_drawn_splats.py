@@ -11,8 +11,8 @@ from support.lit_scenes import gaussians
 from support.rays import Rays, splats_of
 
 import drgs  # noqa: F401  (registers the plugin)
-from drgs.integrator.legs import Leg
-from drgs.integrator.light import DECODED_WITHIN, DECODING, ROULETTE, LightOfSplats
+from drgs.integrator.path_segment import PathSegment
+from drgs.integrator.ray_transport import DECODED_WITHIN, DECODING, ROULETTE, RayTransport
 from drgs.light.walk import _hashes
 from drgs.splatting.cutoffs import Cutoffs
 
@@ -44,7 +44,7 @@ class Fog:
         means = rng.normal(0, self.spread, (self.count, 3))
         splats = gaussians(means, self.radius, self.opacity, colors)
         cutoffs = Cutoffs(transmittance_stop=0.0)
-        return LightOfSplats(splats_of(splats, FLOAT32, cutoffs), mi.Float(1), num_samples, None)
+        return RayTransport(splats_of(splats, FLOAT32, cutoffs), mi.Float(1), num_samples)
 
 
 FOGS = [
@@ -103,7 +103,7 @@ def assert_mean(values, expected, missed):
 def test_light_of_drawn_splats_is_that_of_all_on_average(fog, num_samples):
     """The same polynomial decodes both, which is sRGB's curve within its distance."""
     light = fog.light(num_samples)
-    seen = light.splats.passed(segments(1))
+    seen = light.splats.composite_segment(segments(1))
     coverage = 1 - rows(seen.transmittance)[:, None]
     color = rows(seen.color) / np.maximum(coverage, 1e-9)
     assert coverage.max() > fog.opacity / 2
@@ -118,13 +118,13 @@ def test_light_of_drawn_splats_is_that_of_all_on_average(fog, num_samples):
 
 def test_roulette_lets_as_much_light_through_to_an_emitter():
     light = Fog(40, 0.12, True).light(4)
-    T = rows(light.splats.passed(segments(1)).transmittance)[:, None]
+    T = rows(light.splats.composite_segment(segments(1)).transmittance)[:, None]
     assert T.min() < ROULETTE / 2 and T.max() > ROULETTE, T
     found = segments(PATHS)
     ray = mi.Ray3f(mi.Point3f(found.origin), found.direction)
     ends = dr.zeros(mi.ShapePtr), dr.zeros(mi.EmitterPtr)
-    leg = Leg(ray, *ends, mi.Float(1), is_open=mi.Bool(False))
-    assert_mean(rows(light.transmittance(leg, samples(), mi.Bool(True))), T, 0)
+    segment = PathSegment(ray, *ends, mi.Float(1), is_open=mi.Bool(False))
+    assert_mean(rows(light.transmittance(segment, samples(), mi.Bool(True))), T, 0)
 
 
 @pytest.mark.parametrize("apart", [1, 2, 255])

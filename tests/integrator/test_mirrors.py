@@ -170,7 +170,8 @@ def test_pictures_are_kept_until_something_changes(monkeypatch):
         params.update()
         kept = np.array(mi.render(found, seed=2))
         assert len(counts) == number, name
-        found.integrator().memory.mirrors = found.integrator().memory.probes = None
+        cache = found.integrator().state.cache
+        cache.mirrors = cache.probes = None
         np.testing.assert_array_equal(mi.render(found, seed=2), kept, err_msg=name)
         counts.pop()
 

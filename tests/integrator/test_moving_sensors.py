@@ -120,7 +120,7 @@ def test_poses_that_kernels_share_change_no_byte(variant, monkeypatch):
     weights = np.random.default_rng(1).normal(0, 1, (21, 26, 4))
     results = []
     for poses in (16, 2):
-        monkeypatch.setattr("drgs.integrator.view.PASSES_PER_KERNEL", poses)
+        monkeypatch.setattr("drgs.integrator.sensor_render.PASSES_PER_KERNEL", poses)
         gradients = gradients_of(splats_scene(sensor, gaussians), weights, PARAMETER_NAMES)
         results.append({"image": image_of(splats_scene(sensor, gaussians)), **gradients})
     for name, expected in results[0].items():

@@ -122,7 +122,9 @@ def test_features_of_objects_without_them_are_zeros():
 def test_a_nested_integrator_of_another_kind_renders_surfaces():
     objects = nested() | {"inner": {"type": "path", "max_depth": 2}}
     integrator = load(objects).integrator()
-    assert integrator.nested.class_name() == "PathIntegrator" and list(integrator.objects) == [
+    assert integrator.state.nested.class_name() == "PathIntegrator" and list(
+        integrator.objects
+    ) == [
         "lego",
         "fox",
     ]
@@ -175,9 +177,11 @@ def test_files_that_say_different_things_are_refused_unless_the_integrator_decid
         "low_pass": 0.2,
         **{n: {"type": "splats"} | p for n, p in paths.items()},
     }
-    assert mi.load_dict(given).approximations.low_pass == 0.2
+    assert mi.load_dict(given).state.approximations.low_pass == 0.2
     agreeing = mi.load_dict({"type": "splats", "a": {"type": "splats"} | paths["lego"]})
-    assert agreeing.approximations.low_pass == 0.1 and agreeing.said_by_file == ("low_pass",)
+    assert agreeing.state.approximations.low_pass == 0.1 and list(agreeing.state.header) == [
+        "low_pass"
+    ]
 
 
 def test_forward_mode_is_the_transpose_for_one_object_of_two():

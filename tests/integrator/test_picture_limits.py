@@ -9,8 +9,8 @@ from support.walls import WALL
 import drgs
 from drgs.core.constants import MAX_FEATURES, MAX_INT
 from drgs.core.errors import PluginError
-from drgs.integrator import limits
-from drgs.integrator.limits import MAX_SAMPLES
+from drgs.integrator import checks
+from drgs.integrator.checks import MAX_SAMPLES
 
 SCENE = Scene(VIEWS[1], count=8)  # 37 x 23 px
 
@@ -107,7 +107,7 @@ def test_memory_is_compared_with_what_there_is(monkeypatch):
 def test_samples_of_surfaces_that_cannot_be_held_or_counted_are_refused(
     monkeypatch, available, most
 ):
-    monkeypatch.setattr(limits, "available_memory", lambda: available)
+    monkeypatch.setattr(checks, "available_memory", lambda: available)
     integrator = SCENE.settings | tensors(SCENE.gaussians) | {"nested_spp": 10**9}
     wall = WALL.shape(SCENE.view.camera)
     scene = mi.load_dict(

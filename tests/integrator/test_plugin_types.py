@@ -8,7 +8,7 @@ from drgs.cameras.camera import Pinhole
 from drgs.cameras.fisheye import Fisheye
 from drgs.core.errors import PluginError, PluginTypeError, UnsupportedError, UserError
 from drgs.integrator.sensors import CameraSensor, is_batch, read_sensor
-from drgs.integrator.settings import SummarisingIntegrator
+from drgs.integrator.state import is_splats
 
 
 @pytest.fixture(autouse=True)
@@ -53,9 +53,17 @@ def test_sensors_are_told_apart_by_what_they_can():
     assert is_batch(batch) and not is_batch(perspective) and not is_batch(calibrated)
 
 
-def test_integrators_that_say_what_they_simulate_are_known():
-    assert isinstance(splats(), SummarisingIntegrator)
-    assert not isinstance(mi.load_dict({"type": "path"}), SummarisingIntegrator)
+def test_the_integrator_splats_is_known_by_its_state():
+    assert is_splats(splats()) and not is_splats(mi.load_dict({"type": "path"}))
+
+
+def test_the_samples_of_surfaces_may_be_set_and_other_settings_not():
+    integrator = splats()
+    integrator.nested_spp = 3
+    assert integrator.nested_spp == 3 and "nested_spp = 3" in str(integrator)
+    for name in ("near", "ignore", "srgb_primitives", "gaussians", "pipeline"):
+        with pytest.raises(AttributeError):
+            setattr(integrator, name, getattr(integrator, name))
 
 
 def test_messages_have_names_for_lenses():

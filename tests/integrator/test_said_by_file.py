@@ -49,7 +49,7 @@ def test_a_property_wins_and_leaves_the_others_as_the_file_says(file):
     given = image_of(scene_of(tensors(SCENE.gaussians), antialiased=True, low_pass=0.3))
     assert np.array_equal(by_file, given)
     integrator = scene_of({"filename": str(file)}, low_pass=0.3).integrator()
-    assert integrator.said_by_file == ("antialiased",)
+    assert tuple(integrator.state.header) == ("antialiased",)
 
 
 def test_the_default_can_be_asked_for(file):
@@ -60,7 +60,7 @@ def test_the_default_can_be_asked_for(file):
 def test_gaussians_that_are_moved_are_rendered_as_the_file_says(file):
     still = mi.ScalarTransform4f().translate([0, 0, 0])
     integrator = scene_of({"filename": str(file)}, to_world=still).integrator()
-    assert integrator.approximations.others_than_default == SAID
+    assert integrator.state.approximations.others_than_default == SAID
 
 
 def test_the_summary_says_what_the_file_has_decided(file):
@@ -99,4 +99,4 @@ def test_shapes_of_gaussians_ignore_the_header(file):
     )
     mi.render(scene)
     assert scene.integrator().gaussians.num_gaussians == 40
-    assert scene.integrator().approximations.others_than_default == {}
+    assert scene.integrator().state.approximations.others_than_default == {}

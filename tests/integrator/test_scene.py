@@ -255,9 +255,9 @@ def test_approximations_reach_the_integrator():
     assert set(values) == {field.name for field in fields(Approximations)}
     gaussians = bench_gaussians(5)
     scene = make_scene(gaussians, ModelConfig(**values), (1.0, 1.0, 1.0))
-    assert scene.integrator().approximations == Approximations(**values)
+    assert scene.integrator().state.approximations == Approximations(**values)
     scene = make_scene(gaussians, ModelConfig(**USUAL), (1.0, 1.0, 1.0))
-    assert scene.integrator().approximations == Approximations()
+    assert scene.integrator().state.approximations == Approximations()
     default = {name: getattr(ModelConfig(**USUAL), name) for name in values}
     default["extent"] = math.inf
     for name, value in vars(Approximations()).items():

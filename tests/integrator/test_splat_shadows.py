@@ -57,9 +57,10 @@ def factors(scene):
     """By which colours of 0.5 + 0.282 sh0 were multiplied, and harmonics."""
     integrator = scene.integrator()
     mi.render(scene)
-    before = 0.5 + splatting.C_00 * np.array(integrator.sh0)[:, 0]
+    own = integrator.state.own.gaussians
+    before = 0.5 + splatting.C_00 * np.array(own.sh0)[:, 0]
     after = 0.5 + splatting.C_00 * np.array(integrator.gaussians.sh0)[:, 0]
-    higher = np.array(integrator.gaussians.shN) / np.array(integrator.shN)
+    higher = np.array(integrator.gaussians.shN) / np.array(own.shN)
     return after / before, higher
 
 
@@ -112,14 +113,14 @@ def test_shadows_are_kept_until_something_changes():
         discs(np.zeros((4, 3))), "lid", lid=disc(1.0, 1.0), sky=SKY, floor=disc(-0.05, 50.0)
     )
     mi.render(scene)
-    first = scene.integrator().memory.shadows
+    first = scene.integrator().state.cache.shaded
     mi.render(scene)
-    assert scene.integrator().memory.shadows is first
+    assert scene.integrator().state.cache.shaded is first
     params = mi.traverse(scene)
     params["lid.to_world"] = mi.Transform4f().translate([5, 0, 1]).scale(0.1)
     params.update()
     mi.render(scene)
-    assert scene.integrator().memory.shadows is not first
+    assert scene.integrator().state.cache.shaded is not first
 
 
 def test_unknown_shapes_and_derivatives_are_refused():

@@ -128,7 +128,7 @@ def test_tensors_without_higher_coefficients_are_of_degree_zero():
     values = tensors(Scene(degree=0).gaussians)
     del values["shN"]
     integrator = mi.load_dict({"type": "splats", **values})
-    assert integrator.sh_degree == 0 and integrator.shN.shape == (40, 0, 3)
+    assert integrator.sh_degree == 0 and integrator.gaussians.shN.shape == (40, 0, 3)
 
 
 @pytest.mark.parametrize("shape", [(40,), (40, 1)])
@@ -155,7 +155,7 @@ def test_logit_opacities_may_be_flat_or_a_column(shape, kind):
 def test_a_background_may_be_given_as_any_rgb(background):
     values = tensors(Scene().gaussians)
     integrator = mi.load_dict({"type": "splats", "background": background, **values})
-    assert np.array_equal(np.array(integrator.background).ravel(), [0.5, 0.5, 0.5])
+    assert np.array_equal(np.array(integrator.state.background).ravel(), [0.5, 0.5, 0.5])
 
 
 def test_a_scenes_parameters_are_not_the_callers_arrays():
@@ -172,7 +172,7 @@ def test_a_scenes_parameters_are_not_the_callers_arrays():
     params.update()
     for name in PARAMETER_NAMES:
         assert np.array_equal(np.array(values[name]), before[name]), name
-        other = np.array(getattr(loaded[1].integrator(), name))
+        other = np.array(getattr(loaded[1].integrator().gaussians, name))
         assert np.array_equal(other, before[name]), name
 
 

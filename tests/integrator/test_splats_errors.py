@@ -222,8 +222,8 @@ def test_every_documented_parameter_can_be_meant():
 def test_tensors_of_other_types_are_converted(kind):
     means = np.arange(24).reshape(8, 3)
     integrator = mi.load_dict({"type": "splats", **valid(), "means": kind(means)})
-    assert type(integrator.means) is mi.TensorXf
-    np.testing.assert_array_equal(integrator.means.numpy(), means)
+    assert type(integrator.gaussians.means) is mi.TensorXf
+    np.testing.assert_array_equal(integrator.gaussians.means.numpy(), means)
 
 
 def test_parameters_are_assigned_numpy_arrays():
@@ -232,7 +232,7 @@ def test_parameters_are_assigned_numpy_arrays():
     means = np.arange(24, dtype=np.float64).reshape(8, 3)
     params["means"] = means
     params.update()
-    np.testing.assert_array_equal(integrator.means.numpy(), means)
+    np.testing.assert_array_equal(integrator.gaussians.means.numpy(), means)
 
 
 def test_numpy_arrays_are_refused_by_mitsuba_with_what_to_do():

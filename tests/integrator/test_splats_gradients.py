@@ -84,7 +84,7 @@ def test_a_derivative_that_is_not_a_number_reaches_the_parameters():
     loaded = scene.load()
     actual = gradients_of(loaded, weights)
     assert not np.isfinite(actual["means"]).all()
-    fault = rendering.decode_fault(int(loaded.integrator().last.first_fault[0]))
+    fault = rendering.decode_fault(int(loaded.integrator().last.first_nonfinite[0]))
     assert fault is not None and fault[1] in PARAMETER_NAMES
 
 

@@ -29,7 +29,7 @@ MODULES = (
     "cameras.distortion", "cameras.fisheye", "cameras.motion", "cameras.orthographic",
     "cameras.polynomials", "cameras.radial_tangential", "cameras.thin_lens",
     "cameras.thin_prism_fisheye", "effects.defocus", "effects.features", "effects.occlusion",
-    "effects.smoothing", "integrator.background", "integrator.light", "integrator.shadows",
+    "effects.smoothing", "integrator.background", "integrator.ray_transport", "integrator.shadows",
     "integrator.surfaces",
     "light.grid", "light.walk",
     "training.effects.background", "training.effects.cameras", "training.effects.colors",
@@ -185,7 +185,7 @@ def rich_scene(**settings):
 
 def test_the_plan_of_views_regards_all_of_them():
     views = rich_dataset().train
-    assert described(summary_of_views(rich_scene(), views[1:])) == (
+    assert described(summary_of_views(rich_scene().state, views[1:])) == (
         "simulated:\n"
         "  view dependence: spherical harmonics up to degree 1 (the Gaussians' coefficients)\n"
         "  background: a constant colour (the integrator's background)\n"
@@ -197,13 +197,13 @@ def test_the_plan_of_views_regards_all_of_them():
 
 def test_the_plan_of_views_names_what_they_have_and_is_ignored():
     integrator = rich_scene(ignore="distortion, motion, defocus, smoothing")
-    assert described(summary_of_views(integrator, rich_dataset().train)).splitlines()[-1] == (
+    assert described(summary_of_views(integrator.state, rich_dataset().train)).splitlines()[-1] == (
         "  not simulated: lens distortion (ignored), motion (ignored), antialiasing, "
         "smoothing filter (ignored)"
     )
-    assert described(summary_of_views(integrator, fits.plain_dataset().train)).splitlines()[-1] == (
-        "  not simulated: lens distortion, motion, antialiasing, smoothing filter (ignored)"
-    )
+    assert described(summary_of_views(integrator.state, fits.plain_dataset().train)).splitlines()[
+        -1
+    ] == ("  not simulated: lens distortion, motion, antialiasing, smoothing filter (ignored)")
 
 
 def cameras_of_sensors():
@@ -222,7 +222,7 @@ def cameras_of_sensors():
 
 def test_the_plan_of_sensors_regards_all_of_them():
     cameras = cameras_of_sensors()
-    assert described(summary_of_sensors(rich_scene(), cameras, None)).splitlines()[3:] == [
+    assert described(summary_of_sensors(rich_scene().state, cameras, None)).splitlines()[3:] == [
         "  lens: Orthographic and RadialTangential (k1) (2 of 4 sensors)",
         "  depth of field: a thin lens (1 of 4 sensors)",
         "  motion: blurred (1 of 4 sensors)",
@@ -230,15 +230,15 @@ def test_the_plan_of_sensors_regards_all_of_them():
         "  not simulated: surfaces",
     ]
     ignoring = rich_scene(ignore="distortion, motion, defocus")
-    assert described(summary_of_sensors(ignoring, cameras, None)).splitlines()[3:] == [
+    assert described(summary_of_sensors(ignoring.state, cameras, None)).splitlines()[3:] == [
         "  lens: Orthographic (1 of 4 sensors)",
         "  antialiasing: 3D smoothing filter (the Gaussians' filter)",
         "  not simulated: lens (ignored), depth of field (ignored), motion (ignored), surfaces",
     ]
-    plan = summary_of_sensors(rich_scene(), cameras[:1], None, num_surfaces=2)
+    plan = summary_of_sensors(rich_scene().state, cameras[:1], None, num_surfaces=2)
     line = "  surfaces: a nested integrator's picture, between the splats (2 of the scene's shapes)"
     assert line in described(plan).splitlines()
-    assert described(summary_of_sensors(ignoring, cameras[:1], None)).splitlines()[-1] == (
+    assert described(summary_of_sensors(ignoring.state, cameras[:1], None)).splitlines()[-1] == (
         "  not simulated: lens, depth of field, motion, surfaces"
     )
 
@@ -277,7 +277,7 @@ def test_nothing_takes_part_in_a_plain_fit():
     assert training_effects(config_of(), fits.plain_dataset()) == []
     assert integrator_settings([]) == {}
     trainer = fits.make_trainer(fits.plain_dataset())
-    assert trainer.effects == [] and trainer.integrator.aovs == {}
+    assert trainer.effects == [] and trainer.integrator.state.aovs == {}
     assert all(view.uploads == {} and view.target is view.photograph for view in trainer.views)
     assert {type(view.sensor).__name__ for view in trainer.views} == {"ProjectiveCamera"}
 
@@ -500,7 +500,7 @@ def test_each_effect_imports_its_own_modules(run_python, tmp_path):
         ],
         "thin lens": ["drgs.cameras.thin_lens", "drgs.effects.defocus"],
         "surface": ["drgs.effects.occlusion", "drgs.integrator.surfaces"],
-        "light": ["drgs.integrator.light", "drgs.light.grid", "drgs.light.walk"],
+        "light": ["drgs.integrator.ray_transport", "drgs.light.grid", "drgs.light.walk"],
     }
 
 

@@ -370,8 +370,8 @@ def test_numbers_of_the_host_count_too():
     params["lamp_1.sampling_weight"] = 0.0
     params.update()
     after = image_of(loaded)
-    loaded.integrator().memory.surfaces = None
-    loaded.integrator().memory.traced.clear()
+    loaded.integrator().state.cache.surfaces = None
+    loaded.integrator().state.cache.traced.clear()
     np.testing.assert_array_equal(after, image_of(loaded))
     assert np.abs(after - before).max() > 0.01
 

@@ -50,7 +50,7 @@ def random_rays(count, seed=1) -> Rays:
 
 
 def passed(splats, rays, precision):
-    found = splats.passed(rays.segments(precision))
+    found = splats.composite_segment(rays.segments(precision))
     transmittance = splats.transmittance(rays.segments(precision), precision.array([1e-4]))
     return rows(found.color), rows(found.transmittance), rows(transmittance)
 

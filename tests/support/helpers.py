@@ -13,7 +13,7 @@ import pytest
 from drgs.bench import scenes
 from drgs.cameras.camera import Camera
 from drgs.core.arrays import from_host
-from drgs.effects.compose import composed
+from drgs.effects.compose import with_effects
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 from drgs.reference import splatting as reference
 from drgs.splatting import rendering
@@ -239,7 +239,7 @@ def clear(case):
 
 def render_composed(gaussians, camera, pipeline):
     """A frame with what the Gaussians and the camera call for."""
-    return rendering.render(gaussians, camera, composed(pipeline, gaussians, camera))
+    return rendering.render(gaussians, camera, with_effects(pipeline, gaussians, camera))
 
 
 def device_gaussians(gaussians: reference.Gaussians, precision: Precision) -> Gaussians:

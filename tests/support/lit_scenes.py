@@ -83,7 +83,7 @@ def pixel_rays(sensor):
 def along_rays(scene, origins, directions):
     """What the nested integrator finds with one path a ray."""
     mi.render(scene)  # it gets to know the splats
-    nested, sampler = scene.integrator().nested, mi.load_dict({"type": "independent"})
+    nested, sampler = scene.integrator().state.nested, mi.load_dict({"type": "independent"})
     sampler.seed(0, len(origins))
     ray = mi.Ray3f(mi.Point3f(*_columns(origins)), mi.Vector3f(*_columns(directions)))
     radiance, *_ = nested.sample(dr.ADMode.Primal, scene, sampler, ray, mi.Bool(True), δL=None)

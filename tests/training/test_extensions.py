@@ -183,7 +183,7 @@ def test_the_summary_and_the_help_name_extensions():
     assert "vignetting: effect: Renderings are darkened" in text and "extensions.vignetting" in text
     assert "halving: density strategy: Keeps the more" in text
     assert "(densify.strategy: halving)" in text
-    parser = CommandParser("drgs fit")
+    parser = CommandParser(prog="drgs fit")
     add_arguments(parser)
     text = " ".join(parser.format_help().split())
     assert "installed extensions: loss term binary_opacity: The mean of o (1 - o)" in text

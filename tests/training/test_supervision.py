@@ -278,7 +278,7 @@ def test_the_penaltys_gradient_is_a_difference_of_the_reference():
 )
 def test_without_a_weight_or_depths_nothing_is_put_out(dataset, weight):
     trainer = fits.make_trainer(dataset(), loss__depth_weight=weight)
-    assert trainer.effects == [] and trainer.integrator.aovs == {}
+    assert trainer.effects == [] and trainer.integrator.state.aovs == {}
     image = rendered(trainer, trainer.views[0])
     assert image.shape == (HEIGHT, WIDTH, 3)
     plain = fits.make_trainer(fits.plain_dataset(), loss__depth_weight=0.0)
@@ -401,7 +401,7 @@ def random_trainer(dataset=None, **changes):
 
 
 def color_of(trainer) -> np.ndarray:
-    return np.array(trainer.integrator.background).astype(np.float64).ravel()
+    return np.array(trainer.integrator.state.background).astype(np.float64).ravel()
 
 
 def colors(trainer, count):

@@ -20,6 +20,13 @@ STREAM = 71
 """Tells the random numbers of backgrounds from others of the same seed."""
 
 
+def set_background(integrator: mi.Integrator, color: np.ndarray) -> None:
+    """Set the colour behind the splats, display space."""
+    params = mi.traverse(integrator)
+    params["background"] = mi.Color3f(*map(float, color))
+    params.update()
+
+
 @EFFECTS.register("background")
 class RandomBackground(TrainingEffect):
     """Another colour behind each picture: nothing but an opaque splat can look like what is there.
@@ -62,7 +69,7 @@ class RandomBackground(TrainingEffect):
         """Put a colour behind the splats and behind the photograph."""
         rng = np.random.default_rng([self.seed, STREAM, fit.iteration])
         color = rng.uniform(size=3)
-        fit.integrator.background = mi.Color3f(*map(float, color))
+        set_background(fit.integrator, color)
         # No literal, or every colour would be a new kernel.
         shift = mi.Color3f(*map(float, color - self.background))
         dr.make_opaque(shift)
@@ -75,5 +82,5 @@ class RandomBackground(TrainingEffect):
     def after(self, fit: FitState, view: TrainingView, derivatives: dict[str, Any]) -> None:
         """Put the dataset's background back."""
         del derivatives
-        fit.integrator.background = mi.Color3f(*map(float, self.background))
+        set_background(fit.integrator, self.background)
         view.replacement = None

@@ -27,10 +27,10 @@ import numpy as np
 from drgs.cameras.camera import Camera, cameras_in_time
 from drgs.core.arrays import Rows, block_widths, empty_on_host, from_host, types_of, wrapped
 from drgs.core.constants import MAX_SHUTTER_SAMPLES
-from drgs.effects.compose import composed, ignoring
+from drgs.effects.compose import with_effects, without_effects
 from drgs.gaussians.parameters import Gaussians
+from drgs.integrator.sensor_render import accumulate_in_sensor
 from drgs.integrator.sensors import camera_from_sensor, read_sensor
-from drgs.integrator.view import accumulate_in_sensor
 from drgs.splatting.rasterize import SplatGradients
 from drgs.splatting.rendering import (
     NO_FAULT,
@@ -382,7 +382,7 @@ class ViewExchange:
     def _cameras(self, view: StepView) -> list[Camera]:
         """Return what is simulated of the view's camera, by time, detached."""
         state = read_sensor(view.view.sensor, self.integrator.near)
-        camera = ignoring(camera_from_sensor(state.detached()), self.integrator.ignore)
+        camera = without_effects(camera_from_sensor(state.detached()), self.integrator.ignore)
         return cameras_in_time(camera)
 
     def _project(self, each: _View, cameras: Sequence[Camera]) -> None:
@@ -391,7 +391,7 @@ class ViewExchange:
         with dr.suspend_grad():
             gaussians, pipeline = dr.detach(self.integrator.gaussians), self.integrator.pipeline
             for camera in cameras:
-                of_camera = composed(pipeline, gaussians, camera)
+                of_camera = with_effects(pipeline, gaussians, camera)
                 found = footprints_seen_by(gaussians, camera, of_camera)
                 each.local.append(LocalProjection.from_footprints(camera, of_camera, found))
                 each.packed.append(PackedProjection.from_footprints(each.local[-1], found))
@@ -490,7 +490,7 @@ class ViewExchange:
         each.first_fault = total.first_fault
         if of_cameras:
             state = read_sensor(each.view.view.sensor, self.integrator.near)
-            accumulate_in_sensor(self.integrator, state, of_cameras)
+            accumulate_in_sensor(self.integrator.ignore, state, of_cameras)
 
     def _accumulate(self, gradients: Gaussians) -> None:
         for key, parameter in self.params.items():

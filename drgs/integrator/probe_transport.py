@@ -1,0 +1,265 @@
+"""Light between splats and surfaces, looked up in probes (:mod:`drgs.light.probe`).
+
+Imported where a scene asks for it. A probe stands in the middle of an object of the scene: of a
+shape, or of an emitter. Rays that start at the object look there; so do rays to an emitter that has
+one, from shapes that have none, as far as their transmittance goes. All others pass no splats.
+
+Where a probe does not know what a ray meets, another transport is used: none
+(:class:`drgs.integrator.path_segment.NoSplats`), or, where an object is so close to splats that its
+middle sees others than its surface does, that of rays.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from drgs.accuracy.pipeline import pipeline_of
+from drgs.core.errors import PluginError
+from drgs.integrator.checks import check_ids
+from drgs.integrator.path_segment import PathSegment, SplatTransport
+from drgs.integrator.sensors import SensorState, camera_from_sensor, read_sensor
+from drgs.integrator.state import Cached, SplatsState
+from drgs.light.probe import LEVELS, LOW_PASS, SIZE, Probes, Seen
+from drgs.splatting.rendering import color_features, depth_feature
+
+CLOSE = 1.25
+"""Distance of splats from an object's middle, in halves of its size, below which its surface sees
+others."""
+
+TOO_CLOSE = (
+    "splats: splats are so close to '{}' for its size that its surface sees others than its middle "
+    "does, where its probe is: its picture may be far from that of light 'rays'"
+)
+
+NOBODY = 0xFFFFFFFF
+"""In place of a probe's number."""
+
+
+@dataclass(frozen=True, eq=False)
+class ProbeTransport:
+    """Transport along rays that are looked up in probes."""
+
+    probes: Probes
+    mirrors: Any  # drgs.integrator.mirrors.Mirrors of the shapes that are some; None: none is
+    exposure: mi.Float  # (1,): factor of the splats' radiance
+    shapes: dict[int, mi.ShapePtr]  # that have a probe, by its number
+    emitters: dict[int, mi.EmitterPtr]  # likewise
+    flat: dict[int, int]  # numbers of the mirrors, by that of the probe
+    num_paths: mi.Float  # (1,): of a pixel
+    unseen: SplatTransport  # for rays of which probes do not know what they meet
+
+    @staticmethod
+    def of(
+        splats: SplatsState,
+        scene: mi.Scene,
+        num_paths: int,
+        sensors: Sequence[mi.Sensor],
+        unseen: SplatTransport,
+    ) -> ProbeTransport:
+        """Return the transport by the probes of an integrator's objects.
+
+        sensors: those that flat mirrors are seen by.
+
+        Raises PluginError for the name of an object that the scene does not have, and for an
+        emitter that is nowhere.
+        """
+        objects = _objects(scene, splats.probes)
+        shapes = {k: node for k, node in enumerate(objects) if isinstance(node, mi.Shape)}
+        emitters = {k: shapes[k].emitter() if k in shapes else o for k, o in enumerate(objects)}
+        states = [read_sensor(sensor, splats.near).detached() for sensor in sensors]
+        flat = _flat_mirrors(splats, shapes)
+        delta_mirrors = {k: mirror for k, mirror in flat.items() if mirror.has_delta}
+        return ProbeTransport(
+            _probes(splats, objects, flat, states[0]),
+            _mirror_images(splats, scene, list(delta_mirrors.values()), states),
+            dr.opaque(mi.Float, splats.exposure),
+            {k: mi.ShapePtr(shape) for k, shape in shapes.items()},
+            {k: mi.EmitterPtr(node) for k, node in emitters.items() if node},
+            {k: number for number, k in enumerate(delta_mirrors)},
+            dr.opaque(mi.Float, num_paths),
+            unseen,
+        )
+
+    def composite_segment(
+        self, segment: PathSegment, sample: mi.Float, active: mi.Bool
+    ) -> tuple[mi.Color3f, mi.Float]:
+        """See :meth:`drgs.integrator.path_segment.SplatTransport.composite_segment`."""
+        seen, is_asked, is_reversed = self._look(segment, active)
+        is_known = is_asked & seen.is_known
+        radiance, T = self.unseen.composite_segment(segment, sample, is_asked & ~seen.is_known)
+        color = mi.Color3f(seen.color)
+        color = dr.select(segment.is_open, _over_black(color, seen.coverage), color)
+        radiance = dr.select(is_known, self.exposure * color, radiance)
+        # An emitter knows how much of its light arrives, but not how splats look from elsewhere.
+        radiance = dr.select(is_reversed, 0, radiance)
+        return radiance, dr.select(is_known, 1 - seen.coverage, T)
+
+    def transmittance(self, segment: PathSegment, sample: mi.Float, active: mi.Bool) -> mi.Float:
+        """Return the transmittance along segments; 1 where it is not known."""
+        seen, is_asked, _ = self._look(segment, active)
+        return dr.select(is_asked & seen.is_known, 1 - seen.coverage, 1)
+
+    def _look(self, segment: PathSegment, active: mi.Bool) -> tuple[Seen, mi.Bool, mi.Bool]:
+        """Look up segments: result, whether they have a probe, whether it is that of their end."""
+        probe, other = mi.UInt32(NOBODY), mi.UInt32(NOBODY)
+        for k, shape in self.shapes.items():
+            probe = dr.select(segment.start == shape, mi.UInt32(k), probe)
+        for k, emitter in self.emitters.items():
+            other = dr.select(segment.end == emitter, mi.UInt32(k), other)
+        is_reversed = active & (probe == NOBODY) & (other != NOBODY)
+        is_asked = active & ((probe != NOBODY) | is_reversed)
+        mirrored = self._look_in_mirrors(probe, segment, is_asked)
+        ray, far = segment.ray, segment.ray.maxt
+        back = dr.select(is_reversed, far, 0)
+        seen = self.probes.look(
+            dr.select(is_reversed, other, probe),
+            mi.Vector3f(ray.o + back * ray.d),
+            mi.Vector3f(dr.select(is_reversed, -ray.d, ray.d)),
+            mi.Float(far),
+            dr.select(is_reversed, 0, self._level(segment.pdf)),
+            is_asked & ~mirrored.is_known,
+        )
+        seen = Seen(
+            dr.select(mirrored.is_known, mirrored.color, seen.color),
+            dr.select(mirrored.is_known, mirrored.coverage, seen.coverage),
+            seen.is_known | mirrored.is_known,
+        )
+        return seen, is_asked, is_reversed
+
+    def _look_in_mirrors(self, probe: mi.UInt32, segment: PathSegment, active: mi.Bool) -> Seen:
+        """Look up segments that leave flat mirrors; probe: that of the shape they leave."""
+        if self.mirrors is None:
+            return Seen(mi.Color3f(0), mi.Float(0), mi.Bool(False))
+        mirror = mi.UInt32(NOBODY)
+        for k, number in self.flat.items():
+            mirror = dr.select(probe == k, mi.UInt32(number), mirror)
+        return self.mirrors.look(mirror, segment, active & (mirror != NOBODY))
+
+    def _level(self, pdf: mi.Float) -> mi.UInt32:
+        """Return the level whose texels are as large as the solid angle of one path."""
+        texel = 4 * math.pi / (6 * SIZE**2)
+        level = 0.5 * dr.log2(dr.rcp(dr.maximum(pdf * self.num_paths * texel, 1e-20)))
+        return mi.UInt32(dr.clip(level + 0.5, 0, LEVELS - 1))
+
+
+def _probes(
+    splats: SplatsState, objects: Sequence[mi.Object], flat: dict[int, Any], sensor: SensorState
+) -> Probes:
+    """Render the probes of objects, or return the last ones if all is the same.
+
+    flat: mirrors by the probe's number; sensor: that sees them.
+    """
+    gaussians, last = dr.detach(splats.gaussians), splats.cache.probes
+    centers, planes = _places(objects, flat, sensor)
+    places = centers.tolist(), planes.tolist()
+    settings = splats.approximations, splats.sh_degree, splats.near, places
+    if last is None or not last.matches(settings, gaussians):
+        approximations = replace(splats.approximations, projection="exact", low_pass=LOW_PASS)
+        pipeline = pipeline_of(approximations, splats.sh_degree, (color_features, depth_feature))
+        if gaussians.smoothing is not None:
+            from drgs.effects.smoothing import smoothed
+
+            pipeline = replace(pipeline, rows=smoothed)
+        probes = Probes.of(gaussians, pipeline, centers, splats.near, _decoded, planes)
+        last = splats.cache.probes = Cached(probes, settings, gaussians)
+        _warn_of_close(splats, objects, flat, probes)
+    return last.value
+
+
+def _warn_of_close(
+    splats: SplatsState, objects: Sequence[mi.Object], flat: dict[int, Any], probes: Probes
+) -> None:
+    """Log a warning for each shape that is too close to splats, the first time that it is."""
+    close = {
+        node.id()
+        for k, node in enumerate(objects)
+        if isinstance(node, mi.Shape)
+        and not (k in flat and (flat[k].has_delta or flat[k].is_specular))
+        and probes.nearest[k] < CLOSE * float(dr.max(node.bbox().extents())) / 2
+    }
+    for name in sorted(close - splats.cache.too_close):
+        mi.Log(mi.LogLevel.Warn, TOO_CLOSE.format(name))
+    splats.cache.too_close |= close
+
+
+def _flat_mirrors(splats: SplatsState, shapes: dict[int, mi.Shape]) -> dict[int, Any]:
+    """Find the shapes that are flat mirrors; shapes, mirrors: by the probe's number."""
+    from drgs.integrator.mirrors import FlatMirror
+
+    settings, last = (splats.cache.surfaces,), splats.cache.flat_mirrors
+    if last is None or not last.matches(settings, ()):
+        every = {k: FlatMirror.of(shape) for k, shape in shapes.items()}
+        flat = {k: mirror for k, mirror in every.items() if mirror is not None}
+        last = splats.cache.flat_mirrors = Cached(flat, settings, ())
+    return last.value
+
+
+def _mirror_images(
+    splats: SplatsState, scene: mi.Scene, mirrors: list[Any], states: list[SensorState]
+) -> Any:
+    """Render what sensors see in flat mirrors, or reuse it; None where there are no mirrors."""
+    from drgs.integrator.mirrors import Mirrors
+
+    gaussians, cache = dr.detach(splats.gaussians), splats.cache
+    how = splats.approximations, splats.sh_degree
+    settings = (cache.surfaces, *how, *(state.settings for state in states))
+    arrays, last = (gaussians, [state.device for state in states]), cache.mirrors
+    if last is None or not last.matches(settings, arrays):
+        images = None
+        if mirrors:
+            images = Mirrors.of(mirrors, states, cache.surfaces.traced(scene), gaussians, *how)
+        last = cache.mirrors = Cached(images, settings, arrays)
+    return last.value
+
+
+def _places(
+    objects: Sequence[mi.Object], flat: dict[int, Any], sensor: SensorState
+) -> tuple[np.ndarray, np.ndarray]:
+    """Find where the probes of objects are, (P, 3), and planes beyond which they see, (P, 4).
+
+    That of a specular flat mirror is where the first camera is in it: rays of the camera that it
+    reflects pass close by.
+    """
+    centers, planes = np.array(list(map(_center, objects))), np.zeros((len(objects), 4))
+    specular = {k: mirror for k, mirror in flat.items() if mirror.is_specular}
+    if specular:
+        camera = np.array(camera_from_sensor(sensor).center, np.float64).ravel()
+        for k, mirror in specular.items():
+            centers[k], planes[k] = mirror.behind(camera)
+    return centers, planes
+
+
+def _objects(scene: mi.Scene, names: Sequence[str]) -> list[mi.Object]:
+    nodes = [*scene.emitters(), *scene.shapes()]
+    check_ids("probes must be ids of the scene's shapes and emitters", names, nodes)
+    known = {node.id(): node for node in nodes}
+    return [known[name] for name in names]
+
+
+def _center(node: mi.Object) -> list[float]:
+    """World."""
+    box = node.bbox()
+    if not box.valid():
+        raise PluginError(
+            f"splats: probes must be ids of shapes and emitters that are somewhere, got "
+            f"{node.id()!r}, which is infinitely far away"
+        )
+    return np.array(box.center(), np.float64).ravel().tolist()
+
+
+def _over_black(color: mi.Color3f, coverage: mi.Float) -> mi.Color3f:
+    """D(C), of A D(C / A) and A: with black as the last splat."""
+    display = mi.math.linear_to_srgb(color / dr.select(coverage > 0, coverage, 1))
+    return mi.math.srgb_to_linear(coverage * display)
+
+
+def _decoded(color: list[mi.Float]) -> list[mi.Float]:
+    """Linear radiance."""
+    return [mi.math.srgb_to_linear(channel) for channel in color]

@@ -1,0 +1,369 @@
+"""An image of one sensor: frames, their planes, and the channels of its film.
+
+A :class:`SensorRender` renders the frames of its camera (``drgs.splatting.rendering``), or reuses
+those of the last image where nothing has changed. It composites them over the background, and adds
+the surfaces.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterable, Sequence
+from dataclasses import dataclass, replace
+from functools import reduce
+from itertools import chain, repeat
+from typing import TYPE_CHECKING, Any
+
+import drjit as dr
+import mitsuba as mi
+
+from drgs.cameras.camera import Camera, cameras_in_time
+from drgs.effects.compose import with_effects, without_effects
+from drgs.gaussians.parameters import Gaussians
+from drgs.integrator.film import Channels, offsets_of
+from drgs.integrator.sensors import SensorState, camera_from_sensor, read_sensor
+from drgs.integrator.state import Cached, SplatsState
+from drgs.splatting import rendering
+from drgs.splatting.image_model import Positions
+
+if TYPE_CHECKING:  # imported where a scene calls for them
+    from drgs.integrator.surfaces import Hybrid
+    from drgs.integrator.visible_surfaces import Layers
+
+Passes = list[Channels]
+"""Channels by pass: of one sample per pixel or, on a small film, of several."""
+
+Planes = list[list[list[Any]]]
+"""Planes of frames, each Float (samples * H * W,), by time and by pass."""
+
+
+PASSES_PER_KERNEL = 16
+"""Passes, or times at which the shutter is open, after which planes and sums are evaluated:
+compilers take longer than proportionally to a kernel's length."""
+
+
+@dataclass(frozen=True, eq=False)
+class SensorRender:
+    """The image of one sensor: all of it, unless it is one of a batch."""
+
+    splats: SplatsState
+    scene: mi.Scene
+    index: int  # of the view, in the cache
+    sensor: mi.Sensor
+    positions: Sequence[Positions]  # by pass
+    key: object  # of these: see drgs.integrator.film.CenterSamples
+    has_alpha: bool
+    hybrid: Hybrid | None  # the part of surfaces, if there are any
+
+    def planes(self) -> Planes:
+        """Return the planes of all frames, unevaluated."""
+        return [[frame.planes() for frame in of_time] for of_time in self._frames()]
+
+    def plane_tangents(self, tangents: Gaussians) -> Planes:
+        """Return tangents of planes along those of the Gaussians and of the sensor."""
+        frames = self._frames()
+        with dr.resume_grad():
+            d_cameras = self._camera_tangents(len(frames))
+        return [
+            rendering.frames_tangent(self.splats.gaussians, of_time, tangents, d_camera)
+            for of_time, d_camera in zip(frames, d_cameras, strict=True)
+        ]
+
+    def backward(self, d_channels: Passes) -> rendering.GaussianGradients:
+        """Return derivatives with respect to the Gaussians; accumulate all others."""
+        planes, constant = self.planes(), constant_background(self.splats)
+        with dr.resume_grad():
+            of_background = constant is not None and dr.grad_enabled(self.splats.background)
+        # Colour conversion and background are a few operations per pixel, traced again and
+        # differentiated by Dr.Jit.
+        with dr.resume_grad():
+            dr.enable_grad(planes)
+            if of_background:
+                dr.enable_grad(constant)
+            channels = self.channels(planes, constant)
+            dr.accum_grad(channels, d_channels)
+            dr.enqueue(dr.ADMode.Backward, channels)
+            # Other views, the nested integrator, and other pictures of the same pass go back along
+            # what textures were computed from again.
+            dr.traverse(dr.ADMode.Backward, flags=dr.ADFlag.ClearVertices)
+            d_planes = dr.grad(planes)
+            d_constant = dr.grad(constant) if of_background else None
+        d_passes = list(chain(*d_planes))
+        for first in range(0, len(d_passes), PASSES_PER_KERNEL):
+            dr.eval(d_passes[first : first + PASSES_PER_KERNEL], d_constant)
+        with dr.resume_grad():
+            state = self._state()
+            of_camera = state.is_attached
+        by_time = [
+            rendering.frames_adjoint(self.splats.gaussians, *of_time, of_camera)
+            for of_time in zip(self._frames(), d_planes, strict=True)
+        ]
+        with dr.resume_grad():
+            if of_background:
+                dr.accum_grad(self.splats.background, d_constant)
+            of_cameras = [gradients.camera for gradients in by_time if gradients.camera]
+            if of_cameras:
+                accumulate_in_sensor(self.splats.ignore, state, of_cameras)
+        return reduce(rendering.sum_of_gradients, by_time)
+
+    def channels(self, planes: Planes, constant: mi.Color3f | None) -> Passes:
+        """Return the channels of each pass for the film: the mean over the times.
+
+        constant: the background, where it is a colour; display space.
+        """
+        behind = self._behind(constant)
+        seen = repeat(repeat(None))
+        if self.hybrid is not None:
+            seen = self.splats.cache.traced[self.index].value
+        by_time = zip(planes, seen, behind.colors, behind.radiance, strict=False)
+        channels = [
+            [self._channels_of(behind, *sample) for sample in zip(*time, strict=False)]
+            for time in by_time
+        ]
+        return channels[0] if len(channels) == 1 else _mean(channels)
+
+    def _channels_of(
+        self,
+        behind: _Behind,
+        planes: list[Any],
+        layers: Layers | None,
+        color: mi.Color3f,
+        radiance: mi.Color3f | None,
+    ) -> Channels:
+        """Channels of one sample; layers: surfaces that it sees, None where there are none."""
+        if layers is None:
+            return self._composited(planes, mi.Float(1), behind, color)
+        from drgs.integrator.visible_surfaces import rest_behind
+
+        planes, fronts = planes[: -len(layers)], planes[-len(layers) :]
+        pairs = list(zip(layers, fronts, strict=True))
+        whole = mi.Float(1)
+        for surface, front in pairs:
+            whole = whole - surface.share(front)
+
+        def of_surfaces(kind: str) -> Channels | None:
+            values = [surface.aov_values(kind, front) for surface, front in pairs]
+            return None if values[0] is None else list(map(sum, zip(*values, strict=True)))
+
+        past = [rest_behind(layers) * planes[0], *planes[1:]]
+        own = self._composited(past, whole, behind, color, of_surfaces)
+        return own + self.hybrid.insertion.values(layers, fronts, radiance)
+
+    def _composited(
+        self,
+        planes: list[Any],
+        whole: mi.Float,
+        behind: _Behind,
+        color_behind: mi.Color3f,
+        of_surfaces: Callable[[str], Channels | None] = lambda kind: None,
+    ) -> Channels:
+        """Planes of pixels: red, green, blue, perhaps alpha, AOVs.
+
+        whole: sum of the weights of splats and background, 1 less the shares of surfaces;
+        of_surfaces: what surfaces contribute to the channels of an AOV of this kind.
+        """
+        transmittance, red, green, blue, *others = planes
+        color, alpha = mi.Color3f(red, green, blue), 1 - transmittance
+        if not self.splats.srgb_primitives:
+            color = dr.fma(transmittance, color_behind, color)
+        elif behind.is_radiance:
+            color = dr.fma(transmittance, color_behind, decode(color, whole - transmittance))
+        else:  # the background is the last splat
+            color = decode(dr.fma(transmittance, color_behind, color), whole)
+        channels = list(color)
+        if self.has_alpha:
+            channels.append(dr.full(mi.Float, 1, dr.width(alpha)) if behind.is_radiance else alpha)
+        for kind in self.splats.aovs.values():
+            if kind == "alpha":
+                channels.append(alpha)
+                continue
+            values = [others.pop(0) for _ in self.splats.channels_of(kind)]
+            more = of_surfaces(kind)
+            if more is not None:
+                values = [a + b for a, b in zip(values, more, strict=True)]
+            channels += values
+        return channels
+
+    def _behind(self, constant: mi.Color3f | None) -> _Behind:
+        """Evaluate the background, in the space of the channels."""
+        splats = self.splats
+        environment = None if splats.hide_emitters else self.scene.environment()
+        if environment is None and constant is not None:
+            nothing = repeat(repeat(None))
+            return _Behind(repeat(repeat(constant)), is_radiance=False, radiance=nothing)
+        from drgs.integrator.background import background_radiance
+
+        behind = splats.background if environment is None else environment
+        state = self._state()
+        cameras = [of_time[0].camera for of_time in self._frames()]
+        if state.is_attached:
+            cameras = self._attached_cameras(state)
+        film = self.sensor.film()
+        colors = radiance = background_radiance(film, behind, cameras, self._offsets)
+        if environment is None or not splats.srgb_primitives:
+            colors = [[mi.math.linear_to_srgb(color) for color in of_time] for of_time in colors]
+        return _Behind(colors, environment is not None, radiance)
+
+    # ------------------------------------------------------------------------------------------
+    # Frames
+    # ------------------------------------------------------------------------------------------
+
+    def _frames(self) -> list[list[rendering.Frame]]:
+        """Render, or reuse the last frames if nothing that they depend on has changed.
+
+        One list for each time at which the shutter is open, of a frame for each pass.
+        """
+        pipeline, gaussians = self.splats.pipeline, dr.detach(self.splats.gaussians)
+        state, kept = self._state().detached(), self.splats.cache.frames
+        traced = None if self.hybrid is None else self._traced_surfaces(state)
+        key = (pipeline, self.key, *state.settings, traced), (gaussians, state.device)
+        last = kept.get(self.index)
+        if last is None or not last.matches(*key):
+            seen = repeat(None) if traced is None else traced.value
+            frames = [
+                _render(gaussians, camera, pipeline, self.positions, of_time)
+                for camera, of_time in zip(self._cameras(state), seen, strict=False)
+            ]
+            last = kept[self.index] = Cached(frames, *key)
+        return last.value
+
+    def _traced_surfaces(self, state: SensorState) -> Cached:
+        """Trace the scene's surfaces, or reuse the last ones: Layers by time and by pass."""
+        from drgs.integrator.visible_surfaces import trace_surfaces
+
+        kept, sensor, hides = self.splats.cache.traced, self.sensor, self.splats.hide_emitters
+        settings = self.hybrid.surfaces, self.key, hides, sensor.far_clip(), *state.settings
+        last = kept.get(self.index)
+        if last is None or not last.matches(settings, state.device):
+            seen = trace_surfaces(
+                self.hybrid.rays,
+                sensor,
+                self._cameras(state),
+                self._offsets,
+                with_normals="normal" in self.splats.aovs.values(),
+            )
+            last = kept[self.index] = Cached(seen, settings, state.device)
+        return last
+
+    def num_surfaces(self) -> int:
+        """Number of surfaces that are seen one through the other."""
+        return len(self._traced_surfaces(self._state().detached()).value[0][0])
+
+    @property
+    def _offsets(self) -> list[tuple[Any, Any]]:
+        return [offsets_of(positions) for positions in self.positions]
+
+    def _state(self) -> SensorState:
+        return read_sensor(self.sensor, self.splats.near)
+
+    def _cameras(self, state: SensorState) -> list[Camera]:
+        """Return the camera at each time, detached, without what is ignored."""
+        return cameras_in_time(without_effects(camera_from_sensor(state), self.splats.ignore))
+
+    def _attached_cameras(self, state: SensorState) -> list[Camera]:
+        """Return the cameras, attached to the sensor's parameters."""
+        return _attached_cameras(self.splats.ignore, state)
+
+    def _camera_tangents(self, count: int) -> list[list[mi.Float] | None]:
+        """Return the derivatives of each time's camera numbers along those set on the sensor."""
+        state = self._state()
+        if not state.is_attached:
+            return [None] * count
+        numbers = [camera.numbers() for camera in self._attached_cameras(state)]
+        dr.forward_to(numbers, flags=dr.ADFlag.ClearEdges)
+        return dr.grad(numbers)
+
+
+def _mean(passes: Sequence[Passes]) -> Passes:
+    """Return the mean over several times, summed in their order."""
+    total: list[Passes] = []
+    for first in range(0, len(passes), PASSES_PER_KERNEL):
+        dr.eval(total)
+        terms = [*total, *passes[first : first + PASSES_PER_KERNEL]]
+        total = [
+            [
+                [sum(values[1:], values[0]) for values in zip(*of_sample, strict=True)]
+                for of_sample in zip(*terms, strict=True)
+            ]
+        ]
+    return [[value / len(passes) for value in of_sample] for of_sample in total[0]]
+
+
+@dataclass(frozen=True)
+class _Behind:
+    """The background of an image, at each sample."""
+
+    colors: Iterable[Iterable[mi.Color3f]]  # by time and by pass; display space, or see below
+    is_radiance: bool  # of an environment: it covers the film, and its colours are linear where
+    # the channels are
+    radiance: Iterable[Iterable[mi.Color3f | None]]  # linear, of an environment or a texture
+
+
+def decode(color: mi.Color3f, coverage: mi.Float) -> mi.Color3f:
+    """Return the linear radiance of splats, A D(C / A), where something else may be behind them.
+
+    color: C, display space, premultiplied; coverage: A, the sum of the weights.
+    """
+    covered = coverage > 0
+    return coverage * mi.math.srgb_to_linear(color / dr.select(covered, coverage, 1))
+
+
+def _render(
+    gaussians: Gaussians,
+    camera: Camera,
+    pipeline: rendering.Pipeline,
+    positions: Sequence[Positions],
+    surfaces: Sequence[Layers] | None,
+) -> list[rendering.Frame]:
+    """Render a frame for each pass; surfaces: the visible ones of each."""
+    pipeline = with_effects(pipeline, gaussians, camera)
+    models = [replace(pipeline.model, positions=points) for points in positions]
+    if surfaces is not None:
+        from drgs.effects.occlusion import occluded_by
+
+        models = [
+            occluded_by(model, layers, camera)
+            for model, layers in zip(models, surfaces, strict=True)
+        ]
+        pipeline = replace(pipeline, features=(*pipeline.features, rendering.depth_feature))
+    first, *others = models
+    frame = rendering.render(gaussians, camera, replace(pipeline, model=first))
+    return [frame, *(rendering.render_again(frame, model) for model in others)]
+
+
+def constant_background(splats: SplatsState) -> mi.Color3f | None:
+    """The background without gradients, if it is a colour; display space.
+
+    No literal, or every colour would be a new kernel.
+    """
+    if isinstance(splats.background, mi.Texture):
+        return None
+    constant = mi.Color3f(dr.detach(splats.background))
+    dr.make_opaque(constant)
+    return constant
+
+
+def accumulate_in_sensor(
+    ignored: Collection[str], state: SensorState, gradients: list[list[Any]]
+) -> None:
+    """Accumulate derivatives of a sensor's cameras into what its parameters were computed from.
+
+    ignored: effects that are not simulated; state: attached; gradients: by time, of
+    ``Camera.numbers()``.
+    """
+    numbers = [camera.numbers() for camera in _attached_cameras(ignored, state)]
+    _accumulate_through(numbers, gradients)
+
+
+def _attached_cameras(ignored: Collection[str], state: SensorState) -> list[Camera]:
+    dr.make_opaque(state.device)  # or each value of a literal would be a new kernel
+    return cameras_in_time(without_effects(state.make(state), ignored))
+
+
+def _accumulate_through(values: list[list[Any]], gradients: list[list[mi.Float]]) -> None:
+    """Accumulate into what the values were computed from."""
+    pairs = zip(chain(*values), chain(*gradients), strict=True)
+    attached = [(value, gradient) for value, gradient in pairs if dr.grad_enabled(value)]
+    for value, gradient in attached:
+        dr.accum_grad(value, gradient)
+    dr.enqueue(dr.ADMode.Backward, [value for value, _ in attached])
+    dr.traverse(dr.ADMode.Backward, flags=dr.ADFlag.ClearVertices)

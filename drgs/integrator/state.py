@@ -1,0 +1,367 @@
+"""The state of the integrator ``splats``: what it was given, and what it keeps between renderings.
+
+The plugin owns one :class:`SplatsState`; the functions of this package take it as an argument.
+``mi.render`` has Dr.Jit traverse the integrator with its state, which resolves annotations in
+whatever variant is active: types that are imported on demand, or belong to one variant, are ``Any``
+here and named beside it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from drgs.accuracy.pipeline import pipeline_of
+from drgs.config.approximations import Approximations, Value
+from drgs.core.arrays import tangent_of
+from drgs.core.errors import PluginError
+from drgs.core.private import same_variables
+from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
+from drgs.integrator.checks import (
+    check_columns,
+    check_degree,
+    check_instances,
+    check_shapes,
+    ellipsoids_in,
+)
+from drgs.splatting import rendering
+
+if TYPE_CHECKING:  # imported where a scene has other Gaussians than the integrator's, unmoved
+    from drgs.integrator.gathering import Gathered, Part
+
+AOVS = {"depth": ("T",), "alpha": ("I",), "normal": ("X", "Y", "Z")}
+"""Outputs besides colour, and the names of their channels as in Mitsuba's ``aov``."""
+
+
+# ----------------------------------------------------------------------------------------------
+# Results and cache
+# ----------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class BackwardResult:
+    """Results of a backward pass that ``mi.render`` cannot return; N Gaussians."""
+
+    means2d_grad: Any  # TensorXf (N, 2): derivative of the loss, per px on the film
+    visible: Any  # Bool (N,): the Gaussian's extent touches the film
+    first_nonfinite: Any  # UInt32 (1,): of all derivatives, for rendering.decode_fault
+    frames: list[rendering.Frame]  # of the last view; none once a parameter has changed
+
+    def weighted_sums(self, plane: Any) -> Any:
+        """Return the sum over pixels of each Gaussian's weight times ``plane``: Float (N,).
+
+        plane: Float (H * W,). The weight is alpha times transmittance, as composited; its mean over
+        samples, and over the times at which the shutter was open. To be called before a parameter
+        changes.
+        """
+        sums = [rendering.weighted_sums(frame, plane) for frame in self.frames]
+        return sum(sums[1:], sums[0]) / sum(frame.bins.grid.samples for frame in self.frames)
+
+
+@dataclass(frozen=True, eq=False)
+class Cached:
+    """A value, and everything that it depends on.
+
+    Holding the arrays keeps the indices of their variables from being reused: equal indices mean
+    equal values.
+    """
+
+    value: Any
+    settings: tuple[object, ...]  # compared by ==
+    arrays: Any  # a PyTree, detached: compared by variables
+
+    def matches(self, settings: tuple[object, ...], arrays: Any) -> bool:
+        """Return whether the value is that of these settings and arrays."""
+        return self.settings == settings and same_variables(self.arrays, arrays)
+
+
+@dataclass
+class RenderCache:
+    """Intermediate results of the last renderings; sensors are known by their places in a batch."""
+
+    frames: dict[int, Cached] = field(default_factory=dict)  # by time, one for each pass
+    traced: dict[int, Cached] = field(default_factory=dict)  # visible_surfaces.Layers, likewise
+    film_maps: dict[str, np.ndarray] = field(default_factory=dict)  # see drgs.integrator.film
+    gathered: Any = None  # drgs.integrator.gathering.Gathered; None: the own Gaussians, unmoved
+    has_ellipsoids: bool = False  # whether the last scene has shapes that are Gaussians
+    instances: list[Any] = field(default_factory=list)  # mi.Shape: of the last scene, checked
+    sensor: Any = None  # mi.Sensor that was rendered last
+    surfaces: Any = None  # drgs.integrator.surfaces.Surfaces of the last scene that had some
+    ray_splats: Cached | None = None  # drgs.light.walk.RaySplats
+    probes: Cached | None = None  # drgs.light.probe.Probes
+    too_close: frozenset[str] = frozenset()  # ids of objects that a warning was logged for
+    flat_mirrors: Cached | None = None  # by probe: drgs.integrator.mirrors.FlatMirror
+    mirrors: Cached | None = None  # drgs.integrator.mirrors.Mirrors
+    shaded: Cached | None = None  # Gaussians in the shadow of surfaces
+    summary: str = ""  # that was logged last
+
+    def forget_view(self, index: int) -> None:
+        """Drop a sensor that will not be rendered again."""
+        self.frames.pop(index, None)
+        self.traced.pop(index, None)
+
+
+# ----------------------------------------------------------------------------------------------
+# State
+# ----------------------------------------------------------------------------------------------
+
+
+@dataclass
+class SplatObject:
+    """Gaussians that one ``to_world`` places: the integrator's own, or those of a nested one."""
+
+    gaussians: Gaussians  # in the space of the object; Mitsuba assigns to its arrays in place
+    to_world: Any  # AffineTransform4f
+    is_moved: bool  # whether it moves them
+    file: str = ""
+    header: dict[str, Value] = field(default_factory=dict)  # approximations of the file's header
+
+    def check_to_world(self) -> None:
+        """Raise PluginError for a ``to_world`` that is no similarity; find whether it moves."""
+        from drgs.integrator.placement import similarity_of
+
+        place = similarity_of(self.to_world.matrix, "splats: to_world")
+        self.is_moved = not place.is_identity
+
+
+@dataclass
+class SplatsState:
+    """Gaussians, settings as the plugin documents them, and a cache."""
+
+    own: SplatObject
+    nested_objects: dict[str, SplatObject]  # by name
+    has_own: bool  # whether ``own`` has Gaussians
+    turns: dict[str, Any]  # drgs.integrator.gathering.Turn by shapes' ids; "": of all others
+    background: Any  # Color3f, display space; or mi.Texture, linear
+    nested: Any  # mi.Integrator of surfaces, or None
+    default_degree: int  # of spherical harmonics, where the scene has no other Gaussians
+    given_degree: int | None  # None: the highest that the Gaussians have
+    approximations: Approximations
+    header: dict[str, Value]  # those of them that files' headers have set
+    near: float  # scene units
+    aovs: dict[str, str]  # types by name
+    ignore: Sequence[str]
+    hide_emitters: bool
+    srgb_primitives: bool
+    nested_spp: int  # 0: as many as of the splats
+    light: str
+    light_samples: int
+    probes: Sequence[str]
+    unseen: str
+    shadows: Sequence[str]
+    exposure: float
+    cache: RenderCache = field(default_factory=RenderCache)
+    projection: rendering.ProjectionStage = field(default_factory=rendering.Projected)
+
+    @property
+    def objects(self) -> dict[str, SplatObject]:
+        """All objects that have Gaussians, by the prefix of their parameters' names."""
+        own = {"": self.own} if self.has_own else {}
+        return own | {f"{name}.": one for name, one in self.nested_objects.items()}
+
+    @property
+    def feature_widths(self) -> dict[str, int]:
+        """Columns of features, by name."""
+        return feature_widths(self.objects)
+
+    @property
+    def has_smoothing(self) -> bool:
+        """True if Gaussians have a smoothing filter, be it ignored."""
+        return any(one.gaussians.smoothing is not None for one in self.objects.values())
+
+    @property
+    def sh_degree(self) -> int:
+        """Highest spherical harmonics degree that is evaluated."""
+        if self.given_degree is not None:
+            return self.given_degree
+        if self.cache.gathered is not None:
+            return self.cache.gathered.gaussians.sh_degree
+        return self.default_degree
+
+    @property
+    def pipeline(self) -> rendering.Pipeline:
+        """Stages that the settings select."""
+        others = [feature_of(kind) for kind in self.aovs.values() if kind != "alpha"]
+        features = (rendering.color_features, *others)
+        pipeline = pipeline_of(self.approximations, self.sh_degree, features=features)
+        gathered = self.cache.gathered
+        if gathered is not None and gathered.gaussians.smoothing is not None:
+            pipeline = replace(pipeline, of_smoothing=True)  # which grows with an object
+        return replace(pipeline, source=self.projection)
+
+    def aov_names(self) -> list[str]:
+        """Return the names of the channels besides colour and alpha."""
+        return [f"{name}.{c}" for name, kind in self.aovs.items() for c in self.channels_of(kind)]
+
+    def channels_of(self, kind: str) -> Sequence[int | str]:
+        """Return the suffixes of an AOV's channels."""
+        return AOVS[kind] if kind in AOVS else range(self.feature_widths[kind])
+
+    def check_columns(self) -> None:
+        """Raise PluginError for AOVs of too many channels."""
+        check_columns({n: len(self.channels_of(k)) for n, k in self.aovs.items() if k != "alpha"})
+
+    # ------------------------------------------------------------------------------------------
+    # Parameters
+    # ------------------------------------------------------------------------------------------
+
+    def parameters_changed(self, keys: list[str], is_object: bool) -> None:
+        """Check that the own parameters fit together; keys: names, none for all.
+
+        is_object: whether another integrator renders them.
+        """
+        if keys != ["background"]:
+            self.cache.frames.clear()
+            self.cache.gathered = None
+        if not self.has_own:
+            return
+        own = self.own
+        if dr.width(own.gaussians.shN) == 0:  # not exposed, so that its rows could not be set
+            num = next(iter(own.gaussians.means.shape), 0)
+            own.gaussians = replace(own.gaussians, shN=dr.zeros(mi.TensorXf, (num, 0, 3)))
+        if not keys or "to_world" in keys:
+            own.check_to_world()
+        check_shapes(self.rendered_part_of(own, with_all_features=True))
+        self.check_columns()
+        others = self.cache.has_ellipsoids or is_object or self.nested_objects
+        if self.given_degree is None and not others:
+            check_degree(self.sh_degree, own.gaussians)
+
+    def rendered_part_of(self, one: SplatObject, with_all_features: bool = False) -> Gaussians:
+        """Return an object's Gaussians, in its own space, without what is not rendered."""
+        found, features = one.gaussians, one.gaussians.features or {}
+        if "smoothing" in self.ignore:
+            found = replace(found, smoothing=None)
+        if not with_all_features:  # load only those that an AOV uses
+            features = {k: v for k, v in features.items() if k in self.aovs.values()}
+        return replace(found, features=features or None)
+
+    @property
+    def gaussians(self) -> Gaussians:
+        """All rendered Gaussians, world space: the parameters, whose arrays may be attached.
+
+        Detached where they are moved, or of several parts. Those of a scene's shapes are among them
+        once it was rendered.
+        """
+        shaded = self.cache.shaded
+        return self.unshaded_gaussians if shaded is None else shaded.value
+
+    @property
+    def unshaded_gaussians(self) -> Gaussians:
+        """All rendered Gaussians, without the shadows of surfaces."""
+        if self.cache.gathered is None and (self.own.is_moved or self.nested_objects):
+            self.cache.gathered = _gather_parts(self._placements(), None)
+        gathered = self.cache.gathered
+        return self.rendered_part_of(self.own) if gathered is None else gathered.gaussians
+
+    def gather(self, scene: mi.Scene) -> None:
+        """Find the scene's Gaussians, and convert them if they have changed."""
+        cache = self.cache
+        for one in self.objects.values():  # rows that an update was refused for are not read
+            check_shapes(self.rendered_part_of(one))
+        cache.instances = check_instances(scene, cache.instances)
+        shapes = ellipsoids_in(scene)
+        cache.has_ellipsoids = bool(shapes)
+        with dr.resume_grad():
+            is_alone = not shapes and not set(self.turns) - {""} and not self._is_placed
+            parts = [] if is_alone else self.parts(shapes)
+        cache.gathered = None if is_alone else _gather_parts(parts, cache.gathered)
+        gaussians = self.unshaded_gaussians
+        if gaussians.num_gaussians == 0:
+            raise PluginError(
+                "splats: there are no Gaussians: give the integrator 'filename' or tensors "
+                f"{', '.join(PARAMETER_NAMES)}, or the scene a shape of type ellipsoids or "
+                "ellipsoidsmesh"
+            )
+        check_degree(self.sh_degree, gaussians)
+
+    @property
+    def _is_placed(self) -> bool:
+        """True if Gaussians are moved, or are to be differentiated along a move."""
+        is_moved = self.own.is_moved or dr.grad_enabled(self.own.to_world)
+        return bool(self.nested_objects) or is_moved
+
+    def parts(self, shapes: Sequence[mi.Shape]) -> list[Part]:
+        """Return Gaussians of objects and shapes, attached, in the order of rendering."""
+        parts = self._placements()
+        if shapes or self.turns:
+            from drgs.integrator.ellipsoids import conversions_of
+
+            parts += conversions_of(shapes, self.turns)
+        return parts
+
+    def _placements(self) -> list[Part]:
+        from drgs.integrator.placement import PlacedGaussians, Placement
+
+        return [
+            Placement(
+                PlacedGaussians(self.rendered_part_of(one), one.to_world.matrix),
+                f"splats: {prefix}to_world",
+            )
+            for prefix, one in self.objects.items()
+        ]
+
+    def accumulate(self, scene: mi.Scene, gradients: Gaussians) -> None:
+        """Add derivatives with respect to :attr:`gaussians` to those of the parameters."""
+        if self.cache.gathered is not None:
+            self.cache.gathered.accumulate(self.parts(ellipsoids_in(scene)), gradients)
+            return
+        own = self.own.gaussians
+        for name in PARAMETER_NAMES:
+            accumulate(getattr(own, name), getattr(gradients, name))
+        for name, gradient in (gradients.features or {}).items():
+            accumulate(own.features[name], gradient)
+
+    def tangents(self, scene: mi.Scene) -> Gaussians:
+        """Return derivatives of :attr:`gaussians` along those set on the parameters."""
+        if self.cache.gathered is not None:
+            return self.cache.gathered.tangents(self.parts(ellipsoids_in(scene)))
+        own = self.rendered_part_of(self.own)
+        return Gaussians(
+            **{name: tangent_of(getattr(own, name)) for name in PARAMETER_NAMES},
+            features=own.features and {k: tangent_of(v) for k, v in own.features.items()},
+        )
+
+
+def is_splats(node: object) -> bool:
+    """Return whether an object of Mitsuba is the integrator ``splats``."""
+    return isinstance(getattr(node, "state", None), SplatsState)
+
+
+def feature_widths(objects: dict[str, SplatObject]) -> dict[str, int]:
+    """Return the columns of features by name; PluginError where objects differ."""
+    found: dict[str, int] = {}
+    for prefix, one in objects.items():
+        for name, value in (one.gaussians.features or {}).items():
+            if found.setdefault(name, value.shape[1]) != value.shape[1]:
+                raise PluginError(
+                    f"splats: {prefix}{name} must have the {found[name]} columns of the other "
+                    f"objects' {name}, got {value.shape[1]}"
+                )
+    return found
+
+
+def feature_of(kind: str) -> rendering.Feature:
+    """Return the composited feature of an AOV of this kind, other than alpha."""
+    if kind == "depth":
+        return rendering.depth_feature
+    from drgs.effects.features import NamedFeature, normal_features
+
+    return normal_features if kind == "normal" else NamedFeature(kind)
+
+
+def accumulate(parameter: Any, gradient: Any) -> None:
+    """Add to a parameter's gradient, if it has one."""
+    if dr.width(parameter) > 0 and dr.grad_enabled(parameter):
+        dr.accum_grad(parameter, gradient)
+
+
+def _gather_parts(parts: Sequence[Part], last: Gathered | None) -> Gathered:
+    from drgs.integrator.gathering import gather
+
+    return gather(parts, last)
