@@ -19,7 +19,7 @@ from __future__ import annotations
 import importlib
 
 from drgs import _registration
-from drgs.core import llvm, tracebacks
+from drgs.core import errors, llvm
 
 __version__ = "0.1.0"
 
@@ -30,13 +30,13 @@ llvm.select_newest_llvm()
 llvm.check_llvm_variants()
 _registration.map_sibling_plugins()
 _registration.register_plugins()
-tracebacks.show_causes_last()
+errors.show_causes_last()
 
 _MODULES = {
     "Gaussians": "drgs.gaussians.parameters",
     "load_dataset": "drgs.datasets",
-    "rasterization": "drgs.rasterizing",
-    "train": "drgs.training.loop",
+    "rasterization": "drgs.gsplat_api",
+    "train": "drgs.training.session",
 }
 
 

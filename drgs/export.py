@@ -20,14 +20,14 @@ from drgs.config.approximations import DECLARED, Approximations, said_by
 from drgs.core.constants import LOW_PASS
 from drgs.core.errors import UserError, UserNote, did_you_mean, one_line
 from drgs.core.files import atomic_path
-from drgs.core.records import FolderRecord
+from drgs.core.folders import FolderRecord
 from drgs.datasets.orbits import up_of
 from drgs.datasets.viewpoints import near_one
 from drgs.effects.smoothing import baked
 from drgs.gaussians.cleaning import Selection, taken, turned_towards
-from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
-from drgs.io.formats import FORMATS, Format, format_of
-from drgs.io.morton import morton_order
+from drgs.gaussians.parameters import Gaussians
+from drgs.io.formats import OTHER_FORMATS, FileFormat, file_formats, format_for
+from drgs.io.quantization import morton_order
 from drgs.results.files import CONFIG, GAUSSIANS, GAUSSIANS_FOR_VIEWERS, VIEWS
 from drgs.results.folder import load_run_config
 from drgs.results.refined_cameras import training_cameras
@@ -36,10 +36,10 @@ from drgs.results.viewer import HONOURED, Shown, Standpoint, viewer_page
 COMMAND = "export"
 
 Z_UP = np.array([0.0, 0.0, 1.0])
-"""Of datasets, and of what ``Gaussians.save`` expects for formats with axes of their own."""
+"""Up in datasets, and in what ``Gaussians.save`` expects for formats with axes of their own."""
 
 Y_DOWN = np.array([0.0, -1.0, 0.0])
-"""What programs take for up in formats that do not say: that of COLMAP's worlds, in which the 3DGS
+"""Up in formats that define none, as programs take it: that of COLMAP's worlds, in which the 3DGS
 reference fits."""
 
 PLAYCANVAS = "compressed-ply"
@@ -53,7 +53,7 @@ SNAPPED = np.cos(np.radians(5))
 
 @dataclass(frozen=True)
 class Source:
-    """What is exported."""
+    """Gaussians to export."""
 
     gaussians: Gaussians  # numpy, without a smoothing filter
     path: Path  # of the file
@@ -74,7 +74,7 @@ def _honoured_by_playcanvas(fitted: Approximations) -> frozenset[str]:
 
 @dataclass(frozen=True)
 class Target:
-    """What it is exported to."""
+    """A format that ``--format`` names."""
 
     suffix: str  # of files, in small letters
     text: str  # what it is, one phrase
@@ -84,26 +84,25 @@ class Target:
     honoured: Honoured | None = None  # None: nothing is
 
 
-def _usd(source: Source) -> bytes:
-    from drgs.io.usd import encode
+def targets() -> dict[str, Target]:
+    """Return what ``--format`` takes, by name: the file formats, and the page."""
+    found = {each.name: _format_target(each.name, each.value) for each in file_formats()}
+    return {**found, "html": PAGE}
 
-    g = source.gaussians
-    return encode({name: getattr(g, name) for name in PARAMETER_NAMES}, g.origin)
 
-
-def _of_format(each: Format) -> Target:
+def _format_target(name: str, chosen: type[FileFormat]) -> Target:
     return Target(
-        each.suffix,
-        each.text,
-        lambda source: source.gaussians.to_bytes(each.name),
-        Z_UP if each.y_up else Y_DOWN,
-        has_axes=each.y_up,
-        honoured=_honoured_by_playcanvas if each.name == PLAYCANVAS else None,
+        chosen.suffix,
+        chosen.description,
+        lambda source: source.gaussians.to_bytes(name),
+        Y_DOWN if chosen.up is None else Z_UP,
+        has_axes=chosen.up is not None,
+        honoured=_honoured_by_playcanvas if name == PLAYCANVAS else None,
     )
 
 
 def _page(source: Source) -> bytes:
-    """With the first view and the background of the fit, or before black where there is none."""
+    """Encode a page with the first view and the background of the fit; black if there is none."""
     gaussians, folder = source.gaussians, source.folder
     background = (0.0, 0.0, 0.0) if folder is None else load_run_config(folder).data.background_rgb
     cameras = (
@@ -118,20 +117,13 @@ def _page(source: Source) -> bytes:
     return viewer_page(title, shown, standpoint, background)
 
 
-TARGETS = {
-    **{each.name: _of_format(each) for each in FORMATS},
-    "usd": Target(
-        ".usdc", "OpenUSD's ParticleField3DGaussianSplat (extra usd)", _usd, Z_UP, has_axes=True
-    ),
-    "html": Target(
-        ".html",
-        "a page to walk around in, for any browser",
-        _page,
-        Z_UP,
-        honoured=lambda _: HONOURED,
-    ),
-}
-"""By the name that ``--format`` takes."""
+PAGE = Target(
+    ".html",
+    "a page to walk around in, for any browser",
+    _page,
+    Z_UP,
+    honoured=lambda _: HONOURED,
+)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -153,7 +145,7 @@ def add_arguments(parser: CommandParser) -> None:
         metavar="OUT_DIR|MODEL",
         help="the output folder of a fit, or a file of Gaussians",
     )
-    names = "; ".join(f"{name}: {target.text}" for name, target in TARGETS.items())
+    names = "; ".join(f"{name}: {target.text}" for name, target in targets().items())
     parser.add_argument(
         "--format", metavar="NAME", help=f"{names} (default: what the suffix of --out says)"
     )
@@ -199,7 +191,7 @@ def _add_cleaning(parser: CommandParser) -> None:
 def run(args: argparse.Namespace) -> None:
     """Export what the command line names."""
     name, out = _destination(args)
-    target = TARGETS[name]
+    target = targets()[name]
     selection = _selection(args)
     source = load_source(args.what, target.honoured)
     if out.resolve() == source.path.resolve():
@@ -253,7 +245,7 @@ def load_source(what: Path, honoured: Honoured | None = None) -> Source:
 
 
 def _shows_own(folder: Path, honoured: Honoured) -> bool:
-    """Whether a fit's own Gaussians are there, and need no other approximations."""
+    """Return whether a fit's own Gaussians are there, and need no other approximations."""
     if honoured is None or not (folder / GAUSSIANS).is_file():
         return False
     fitted = load_run_config(folder).model.approximations
@@ -270,29 +262,33 @@ def _note_rendering(path: Path, others: dict[str, object]) -> None:
 
 
 def _destination(args: argparse.Namespace) -> tuple[str, Path]:
-    """The name of the target, and the file."""
+    """Return the name of the target, and the file."""
     name = args.format
     if name is None and args.out is not None:
         name = _target_of(args.out)
-    if name not in TARGETS:
-        got = f"got {one_line(name, 40)}{did_you_mean(name, TARGETS)}" if name else "got none"
-        raise UserError(f"--format: must be one of {', '.join(TARGETS)}, {got}")
-    suffix = TARGETS[name].suffix
+    known = targets()
+    if name not in known:
+        got = f"got {one_line(name, 40)}{did_you_mean(name, known)}" if name else "got none"
+        raise UserError(f"--format: must be one of {', '.join(known)}, {got}; {OTHER_FORMATS}")
+    suffix = known[name].suffix
     if args.out is None:
-        known = format_of(args.what)
-        stem = args.what.name[: -len(known.suffix)] if known else args.what.resolve().name
+        read_as = format_for(args.what)
+        stem = args.what.name[: -len(read_as.value.suffix)] if read_as else args.what.resolve().name
         return name, args.what.resolve().with_name(f"{stem}{suffix}")
-    if not args.out.name.lower().endswith(suffix):
-        raise UserError(f"--out {args.out}: the name of a {name} file must end in {suffix}")
-    if _target_of(args.out) != name:  # as a.compressed.ply is no name for a plain PLY
-        raise UserError(f"--out {args.out}: the name is that of a {_target_of(args.out)} file")
+    if (found := _target_of(args.out)) != name:  # as a.compressed.ply is no name for a plain PLY
+        raise UserError(
+            f"--out {args.out}: the name of a {name} file must end in {suffix}, got that of "
+            f"{f'a {found}' if found else 'no known'} file"
+        )
     return name, args.out
 
 
 def _target_of(path: Path) -> str | None:
-    """The target with the longest suffix that the file's name ends in."""
-    found = [n for n, target in TARGETS.items() if path.name.lower().endswith(target.suffix)]
-    return max(found, key=lambda name: len(TARGETS[name].suffix), default=None)
+    """Return the target that a file's name ends in."""
+    if path.name.lower().endswith(PAGE.suffix):
+        return "html"
+    found = format_for(path)
+    return None if found is None else found.name
 
 
 # ----------------------------------------------------------------------------------------------
@@ -310,7 +306,7 @@ def _selection(args: argparse.Namespace) -> Selection:
 
 
 def _selected(source: Source, selection: Selection) -> Gaussians:
-    """Those that are kept, with a line of how many that are."""
+    """Return the Gaussians that are kept, and print their number."""
     gaussians = source.gaussians
     kept_by = selection.kept_by(gaussians)
     if not kept_by:

@@ -43,10 +43,10 @@ from drgs.config.changes import is_open
 from drgs.config.load import load_config
 from drgs.config.schema import NAMED_COLORS, FitConfig, ModelConfig
 from drgs.core.constants import SHUTTER_SAMPLES
+from drgs.core.environment import VARIANTS
 from drgs.core.errors import PluginError, UserError, one_line, reason_of_mitsuba
 from drgs.core.files import atomic_path, open_regular, shortened
 from drgs.core.processes import process_number, start_mpi
-from drgs.core.variants import VARIANTS
 from drgs.datasets import Dataset, load_dataset
 from drgs.datasets.orbits import near_plane_of, orbit_of_gaussians, orbit_of_views, orbit_size
 from drgs.datasets.types import Viewpoint
@@ -63,7 +63,7 @@ from drgs.initialization.defaults import completed
 from drgs.integrator.scene import check_lenses, check_sizes, make_scene, render_views
 from drgs.integrator.state import is_splats
 from drgs.integrator.summary import described, summary_of_views
-from drgs.io.formats import FORMATS, format_of
+from drgs.io.formats import OTHER_FORMATS, format_for, readable_formats
 from drgs.io.pictures import (
     MITSUBA_FORMATS,
     check_animation,
@@ -499,15 +499,15 @@ def _check(args: argparse.Namespace) -> None:
         reason = "is not used with a Mitsuba scene, which brings its own cameras and settings"
         _check_unused(args, reason, (*PLACING, *OF_CAMERAS, *OF_GAUSSIANS))
         _check_variant(args, mi.variants())
-    elif format_of(args.what) is not None or args.what.is_dir():
+    elif format_for(args.what) is not None or args.what.is_dir():
         _check_unused(args, "is for the parameters of a Mitsuba scene (.xml)", ("define",))
         _check_variant(args, VARIANTS)
         _check_cameras(args)
     else:
-        suffixes = ", ".join(each.suffix for each in FORMATS)
+        suffixes = ", ".join(each.value.suffix for each in readable_formats())
         raise UserError(
             f"{args.what}: must be a file of Gaussians ({suffixes}), a Mitsuba scene (.xml) or the "
-            "output folder of a fit"
+            f"output folder of a fit; {OTHER_FORMATS}"
         )
 
 

@@ -22,8 +22,8 @@ from drgs.cli.commands import (
 )
 from drgs.cli.execution import add_execution_arguments, executing, select_variant
 from drgs.cli.interrupts import StopRequest
+from drgs.core.environment import required
 from drgs.core.errors import UserError
-from drgs.core.extras import required
 from drgs.datasets.orbits import orbit_of_gaussians
 from drgs.datasets.types import Viewpoint
 from drgs.datasets.viewpoints import FIELD_OF_VIEW

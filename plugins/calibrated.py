@@ -15,8 +15,8 @@ import numpy as np
 
 from drgs.cameras.camera import Camera, Lens, Pinhole
 from drgs.core.constants import MAX_SHUTTER_SAMPLES, SHUTTER_SAMPLES
+from drgs.core.environment import check_variant
 from drgs.core.errors import PluginError, UserError
-from drgs.core.variants import check_variant
 from drgs.integrator.properties import (
     integer,
     matrix,

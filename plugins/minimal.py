@@ -13,7 +13,7 @@ import mitsuba as mi
 
 from drgs.cameras.camera import Camera
 from drgs.core.constants import NEAR
-from drgs.core.variants import check_variant
+from drgs.core.environment import check_variant
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 from drgs.integrator.film import develop_pixels, pixels_adjoint
 from drgs.integrator.sensors import camera_from_sensor, read_sensor

@@ -13,8 +13,8 @@ import drjit as dr
 import mitsuba as mi
 from mitsuba.ad.integrators.common import RBIntegrator, mis_weight, solid_angle_to_area_jacobian
 
+from drgs.core.environment import check_variant
 from drgs.core.errors import UnsupportedError
-from drgs.core.variants import check_variant
 from drgs.integrator.path_segment import PathSegment
 from drgs.integrator.properties import boolean, integer, refuse_unknown
 from drgs.integrator.transparency import StraightRays, has_transparent_parts

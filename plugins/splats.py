@@ -17,8 +17,8 @@ import drjit as dr
 import mitsuba as mi
 
 from drgs.core.arrays import interleave
+from drgs.core.environment import check_variant
 from drgs.core.errors import UnsupportedError
-from drgs.core.variants import check_variant
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 from drgs.integrator.checks import degree_of, surfaces_in
 from drgs.integrator.image_render import ImageRender

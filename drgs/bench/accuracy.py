@@ -15,8 +15,7 @@ from __future__ import annotations
 
 import argparse
 import statistics
-import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -27,8 +26,9 @@ import numpy as np
 
 from drgs.accuracy.pipeline import pipeline_of
 from drgs.accuracy.sample_points import SamplePoints
-from drgs.bench.output import add_out, machine, markdown_table, write_csv
+from drgs.bench.output import add_out, machine, markdown_table, write_rows
 from drgs.bench.scenes import bench_camera, device_camera, stress_scene
+from drgs.bench.timing import seconds
 from drgs.cameras.camera import Camera
 from drgs.cli.commands import CommandParser
 from drgs.config.approximations import Approximations
@@ -174,10 +174,8 @@ def run(args: argparse.Namespace) -> None:
         found = measure(subject, accurate, RUNGS, QUICK_ROUNDS if args.quick else ROUNDS)
         results += found
         print(table(found), flush=True)
-    columns = list(Measurement.__dataclass_fields__)
-    write_csv(args.out / "accuracy.csv", columns, [list(vars(m).values()) for m in results])
+    write_rows(args.out / "accuracy.csv", Measurement, results)
     write_figure(args.out / "accuracy.png", plot(results))
-    print(f"\nwritten: {args.out / 'accuracy.csv'}, {args.out / 'accuracy.png'}")
 
 
 # ----------------------------------------------------------------------------------------------
@@ -345,7 +343,7 @@ def measure(
     operations = [renderer.operations() for renderer in renderers]  # compiles the kernels
     for renderer in renderers:
         renderer.forward_backward()
-    slow = [_seconds(renderer.frames) > SLOW for renderer in renderers]
+    slow = [seconds(renderer.frames) > SLOW for renderer in renderers]
     times: list[list[tuple[float, float]]] = [[] for _ in rungs]
     rng = np.random.default_rng(0)
     for turn in range(rounds):
@@ -353,7 +351,7 @@ def measure(
         for k in rng.permutation(len(rungs)):
             if turn < SLOW_ROUNDS or not slow[k]:
                 renderer = renderers[k]
-                times[k].append((_seconds(renderer.frames), _seconds(renderer.forward_backward)))
+                times[k].append((seconds(renderer.frames), seconds(renderer.forward_backward)))
     results = []
     for rung, count, spent in zip(rungs, operations, times, strict=True):
         images = [Renderer.of(rung, subject, camera).image() for camera in subject.cameras]
@@ -379,12 +377,6 @@ def measure(
             )
         )
     return results
-
-
-def _seconds(function: Callable[[], object]) -> float:
-    started = time.perf_counter()
-    function()
-    return time.perf_counter() - started
 
 
 def pareto_front(results: Sequence[Measurement]) -> list[Measurement]:

@@ -11,7 +11,6 @@ from __future__ import annotations
 import argparse
 import math
 import statistics
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Protocol, TypeVar
@@ -20,8 +19,16 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from drgs.bench.output import add_out, machine, markdown_table, write_csv
-from drgs.bench.scenes import Scene, bench_camera, bench_gaussians, trainer_of
+from drgs.bench.output import add_out, machine, markdown_table, write_rows
+from drgs.bench.scenes import (
+    Scene,
+    bench_camera,
+    bench_gaussians,
+    mitsuba_pose,
+    mitsuba_sensor,
+    trainer_of,
+)
+from drgs.bench.timing import seconds
 from drgs.cli.commands import CommandParser
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 from drgs.io.figures import new_figure, write_figure
@@ -88,10 +95,8 @@ def run(args: argparse.Namespace) -> None:
     fitted = measure(fitting_cases(), lambda case: Fitter(case, gaussians), rounds)
     print(f"\n{table(fitted, '', 'training iteration')}")
     fitted = [replace(p, forward_ms=math.nan, forward_ratio=math.nan) for p in fitted]
-    rows = [list(vars(price).values()) for price in [*rendered, *fitted]]
-    write_csv(args.out / "effects.csv", list(Price.__dataclass_fields__), rows)
+    write_rows(args.out / "effects.csv", Price, [*rendered, *fitted])
     write_figure(args.out / "effects.png", plot(rendered, fitted))
-    print(f"\nwritten: {args.out / 'effects.csv'}, {args.out / 'effects.png'}")
 
 
 # ----------------------------------------------------------------------------------------------
@@ -101,9 +106,10 @@ def run(args: argparse.Namespace) -> None:
 
 def rendering_cases() -> list[Case]:
     """The first is what the others are compared with, unless they say otherwise."""
-    focal = bench_camera(SIZE).fx
+    camera = bench_camera(SIZE)
+    focal = camera.fx
     calibrated = {"type": "calibrated", "fx": focal, "fy": focal}
-    moving = calibrated | {"to_world_close": to_world(0.02)}
+    moving = calibrated | {"to_world_close": mitsuba_pose(camera, 0.02)}
     fox = {"k1": 0.0578421, "k2": -0.0805099, "p1": -0.000980296, "p2": 0.00015575}
     rational = fox | {"k3": 0.01, "k4": 0.02, "k5": -0.01, "k6": 0.005}
     fisheye = {"k1": 0.03, "k2": -0.01}
@@ -131,12 +137,13 @@ def rendering_cases() -> list[Case]:
         Case(
             "lens",
             "orthographic",
-            {"type": "orthographic", "to_world": to_world(0.0) @ wide},
+            {"type": "orthographic", "to_world": mitsuba_pose(camera) @ wide},
         ),
         Case(
             "depth of field",
             "thin lens",
-            perspective() | {"type": "thinlens", "aperture_radius": 0.05, "focus_distance": 3.2},
+            mitsuba_sensor(camera)
+            | {"type": "thinlens", "aperture_radius": 0.05, "focus_distance": 3.2},
         ),
         Case("motion", "blur, 8 times", moving | {"shutter_samples": 8}),
         Case("motion", "rolling shutter", moving | {"shutter": "rolling"}),
@@ -144,21 +151,6 @@ def rendering_cases() -> list[Case]:
         Case("antialiasing", "3D smoothing filter", smoothing=True),
         Case("camera refinement", "pose and focal lengths", calibrated, of_camera=True),
     ]
-
-
-def to_world(shift: float) -> mi.ScalarTransform4f:
-    """Of the bench camera, moved to its right; world units."""
-    camera, pose = bench_camera(SIZE), np.eye(4)
-    pose[:3, :3] = camera.rotation.T * [-1, -1, 1]  # Mitsuba's x is to the left, its y up
-    pose[:3, 3] = camera.center + shift * camera.rotation[0]
-    return mi.ScalarTransform4f(pose)
-
-
-def perspective() -> dict[str, object]:
-    """A sensor as the bench camera, without a pose and a film."""
-    camera = bench_camera(SIZE)
-    fov = float(np.degrees(2 * np.arctan(SIZE / 2 / camera.fx)))
-    return {"type": "perspective", "fov": fov, "fov_axis": "x"}
 
 
 def _bitmap() -> mi.Bitmap:
@@ -170,18 +162,9 @@ class Renderer:
 
     def __init__(self, case: Case, gaussians: Gaussians) -> None:
         """gaussians: numpy, SH of degree 3."""
-        sensor = {
-            "to_world": to_world(0.0),
-            "film": {
-                "type": "hdrfilm",
-                "width": SIZE,
-                "height": SIZE,
-                "pixel_format": "rgb",
-                "rfilter": {"type": "box"},
-            },
-            "sampler": {"type": "independent", "sample_count": 1},
-            **(case.sensor or perspective()),
-        }
+        sensor = mitsuba_sensor(bench_camera(SIZE))
+        if case.sensor:
+            sensor = {name: sensor[name] for name in ("to_world", "film", "sampler")} | case.sensor
         uploaded = gaussians.to(mi.TensorXf)
         integrator = {
             "type": "splats",
@@ -311,8 +294,8 @@ def measure(
         times: dict[str, list[float]] = {k: [] for k in ("f", "b", "base f", "base b")}
         for _ in range(rounds):
             for prefix, measured in (("base ", base), ("", subject)):
-                times[f"{prefix}f"].append(_seconds(measured.forward))
-                times[f"{prefix}b"].append(_seconds(measured.both))
+                times[f"{prefix}f"].append(seconds(measured.forward))
+                times[f"{prefix}b"].append(seconds(measured.both))
         forward_ratio, both_ratio = (_ratio(times[k], times[f"base {k}"]) for k in ("f", "b"))
         prices.append(
             Price(
@@ -346,12 +329,6 @@ def operations(subject: Measured) -> int:
         subject.both()
         kernels = dr.kernel_history()
     return sum(k["operation_count"] for k in kernels if k["type"] == dr.KernelType.JIT)
-
-
-def _seconds(function: Callable[[], None]) -> float:
-    started = time.perf_counter()
-    function()
-    return time.perf_counter() - started
 
 
 def table(prices: list[Price], forward: str, both: str) -> str:

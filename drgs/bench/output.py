@@ -1,19 +1,20 @@
-"""What every measurement writes: a table on the screen and in Markdown, CSV."""
+"""Output of every measurement: a table on the screen and in Markdown, CSV, a plot."""
 
 from __future__ import annotations
 
 import argparse
 import csv
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import fields
 from pathlib import Path
+from typing import Any
 
 import drjit as dr
 
+from drgs.core.environment import processor
 from drgs.core.files import atomic_path
-from drgs.core.machine import processor
+from drgs.core.folders import FolderRecord
 from drgs.core.private import llvm_version
-from drgs.core.records import FolderRecord
 
 COMMAND = "bench"
 
@@ -21,10 +22,9 @@ COMMAND = "bench"
 def add_out(
     parser: argparse.ArgumentParser, run: Callable[[argparse.Namespace], None], *names: str
 ) -> None:
-    """Add ``--out``, and have ``run`` measure with the files ``names`` of that folder for itself.
+    """Add ``--out``; ``run`` writes the files ``names`` of that folder.
 
-    A file that no measurement has written is not replaced: it is refused before anything is
-    measured.
+    A file that no measurement has written is not replaced: UserError before anything is measured.
     """
     parser.add_argument(
         "--out",
@@ -34,28 +34,19 @@ def add_out(
         help="output folder (default: out/bench)",
     )
 
-    def run_with_own_files(args: argparse.Namespace) -> None:
-        with own_files(args.out, names):
+    def run_and_record(args: argparse.Namespace) -> None:
+        FolderRecord(args.out, COMMAND).claim(names)
+        try:
             run(args)
+        finally:
+            FolderRecord(args.out, COMMAND).seal()
+        print(f"\nwritten: {', '.join(str(args.out / name) for name in names)}")
 
-    parser.set_defaults(run=run_with_own_files)
-
-
-@contextmanager
-def own_files(folder: Path, names: Sequence[str]) -> Iterator[None]:
-    """A block that may write the files ``names`` of a folder.
-
-    Raises :class:`UserError` before it begins where one is there that no measurement has written.
-    """
-    FolderRecord(folder, COMMAND).claim(names)
-    try:
-        yield
-    finally:
-        FolderRecord(folder, COMMAND).seal()
+    parser.set_defaults(run=run_and_record)
 
 
 def machine() -> str:
-    """One line: processor, threads, LLVM."""
+    """Describe processor, threads and LLVM in one line."""
     version = ".".join(map(str, llvm_version()))
     return f"{processor()}, {dr.thread_count()} threads, LLVM {version}"
 
@@ -69,7 +60,13 @@ def write_csv(path: Path, header: Sequence[str], rows: Iterable[Sequence[object]
         writer.writerows(rows)
 
 
+def write_rows(path: Path, row_type: Any, rows: Iterable[Any]) -> None:
+    """Write instances of the dataclass ``row_type``, a column for each field."""
+    names = [field.name for field in fields(row_type)]
+    write_csv(path, names, [[getattr(row, name) for name in names] for row in rows])
+
+
 def markdown_table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """A table as the page of results holds it."""
+    """Format a table as the page of results has it."""
     lines = [header, ["---"] * len(header), *rows]
     return "\n".join(f"| {' | '.join(map(str, line))} |" for line in lines)

@@ -9,12 +9,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from importlib.util import find_spec
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from drgs.bench.scenes import mitsuba_sensor
 from drgs.config.schema import ModelConfig
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 from drgs.integrator.scene import make_scene
@@ -82,7 +82,7 @@ def _mitsuba_renderer(
     name: str, scene: mi.Scene, problem: Problem, prefix: str, seconds: float
 ) -> Renderer:
     camera = problem.camera
-    sensor = mi.load_dict(sensor_of(camera, 1e-3, {"type": "independent"}))
+    sensor = mi.load_dict(mitsuba_sensor(camera) | {"near_clip": 1e-3})
     params = mi.traverse(scene)
     names = ("means", "quats", "log_scales", "logit_opacities", "sh0", "shN")
     names += ("data", "opacities", "sh_coeffs")
@@ -112,33 +112,6 @@ def _mitsuba_renderer(
     return Renderer(name, forward, forward_backward, seconds)
 
 
-def sensor_of(
-    camera: reference.Camera, near_clip: float, sampler: dict[str, object]
-) -> dict[str, object]:
-    """Mitsuba's sensor, with a film of single precision and box filter; fx and fy must agree."""
-    to_world = np.eye(4)
-    to_world[:3, :3] = camera.rotation.T * [-1, -1, 1]  # Mitsuba's x is to the left, its y up
-    to_world[:3, 3] = camera.center
-    return {
-        "type": "perspective",
-        "fov": float(np.degrees(2 * np.arctan(camera.width / 2 / camera.fx))),
-        "fov_axis": "x",
-        "principal_point_offset_x": 0.5 - camera.cx / camera.width,
-        "principal_point_offset_y": 0.5 - camera.cy / camera.height,
-        "near_clip": near_clip,
-        "to_world": mi.ScalarTransform4f(to_world),
-        "film": {
-            "type": "hdrfilm",
-            "width": camera.width,
-            "height": camera.height,
-            "pixel_format": "rgb",
-            "component_format": "float32",
-            "rfilter": {"type": "box"},
-        },
-        "sampler": {**sampler, "sample_count": 1},
-    }
-
-
 def reference_renderer(problem: Problem) -> Renderer:
     """The float64 numpy reference."""
     fields = [getattr(problem.gaussians, name) for name in PARAMETER_NAMES]
@@ -154,15 +127,3 @@ def reference_renderer(problem: Problem) -> Renderer:
 
     seconds = 6e-4 * len(gaussians.means)
     return Renderer("numpy reference, float64", forward, forward_backward, seconds)
-
-
-def why_no_gsplat() -> str:
-    """Why gsplat's PyTorch implementation, which its tests compare with, is not measured.
-
-    Version 1.5 lists the (pixel, Gaussian) pairs by a CUDA kernel even there
-    (``rasterize_to_indices_in_range``), and composites them with the package nerfacc.
-    """
-    missing = [name for name in ("torch", "gsplat", "nerfacc") if find_spec(name) is None]
-    if missing:
-        return f"gsplat's PyTorch code: not measured, {' and '.join(missing)} not installed"
-    return "gsplat's PyTorch code: not measured, it needs a CUDA kernel of its own to rasterize"

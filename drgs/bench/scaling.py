@@ -1,8 +1,7 @@
 """``python -m drgs.bench scaling``: time and memory against Gaussians, pixels and threads.
 
 Each point is a training iteration (render, loss, gradients, optimizer) on a scene of its own,
-measured in a fresh process, so that its peak of memory is its own. Threads go up to the cores that
-there are, since more say nothing; what more cores could do is counted (:mod:`drgs.bench.amdahl`).
+measured in a fresh process, so that its peak of memory is its own.
 """
 
 from __future__ import annotations
@@ -13,44 +12,37 @@ import multiprocessing
 import os
 import resource
 import statistics
-import time
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field, replace
-from functools import partial
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 import drgs  # noqa: F401  (registers the plugin, in the fresh process too)
-from drgs.bench.amdahl import CORES, Speedups, count_blocks
 from drgs.bench.output import add_out, machine, markdown_table, write_csv
-from drgs.bench.pairs import Work, count_work
-from drgs.bench.profile import STAGES
-from drgs.bench.scenes import Scene, bench_camera, bench_gaussians, frame_of, trainer_of
-from drgs.bench.speed import clocked_step
+from drgs.bench.scenes import Scene, bench_camera, bench_gaussians, frame_of
+from drgs.bench.timing import (
+    STAGES,
+    Work,
+    clocked_step,
+    count_work,
+    seconds,
+    steps,
+    warm_trainer,
+)
 from drgs.cli.commands import CommandParser
 from drgs.core.private import clear_memory_peak, memory_peak
 from drgs.io.figures import new_figure, write_figure
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
     from pathlib import Path
 
     from matplotlib.figure import Figure
     from matplotlib.ticker import LogLocator
 
-T = TypeVar("T")
-
 STEPS, QUICK_STEPS = 12, 4
-
-MORE_CORES = ((100_000, 400), (1_000_000, 1265))
-QUICK_MORE_CORES = ((30_000, 219),)
-"""(Gaussians, px) whose blocks are counted."""
-
-LEAST_SHARE = 0.02
-"""Of an iteration on one thread; kernels that take less are not listed."""
 
 DENSITY = 100_000 / 400**2
 """Gaussians per pixel of the bench scene, which the sweep over N keeps."""
@@ -86,17 +78,17 @@ class Result:
 def add_arguments(parser: CommandParser) -> None:
     """Add the arguments of the command."""
     parser.show_examples("%(prog)s --quick")
-    add_out(parser, run, "scaling.csv", "scaling_stages.csv", "scaling_blocks.csv", "scaling.png")
+    add_out(parser, run, "scaling.csv", "scaling_stages.csv", "scaling.png")
     parser.add_argument("--quick", action="store_true", help="fewer and smaller problems")
 
 
 def run(args: argparse.Namespace) -> None:
     """Measure, fit exponents, write table, CSV and plot."""
-    steps = QUICK_STEPS if args.quick else STEPS
+    num_steps = QUICK_STEPS if args.quick else STEPS
     print(machine())
     results: dict[str, list[Result]] = {}
     for point in points(args.quick):
-        result = in_a_new_process(partial(measure, point, steps))
+        result = measure_in_new_process(point, num_steps)
         results.setdefault(point.sweep, []).append(result)
         print(
             f"{point.sweep}: {point.count:,} Gaussians, {point.size} px, {point.threads} threads: "
@@ -106,16 +98,10 @@ def run(args: argparse.Namespace) -> None:
     for name, found in results.items():
         print(f"\n{name}{_exponents(found)}\n{_table(found)}")
     print(f"\n{_stage_table(results['threads'])}", flush=True)
-    speedups = {}
-    for count, size in QUICK_MORE_CORES if args.quick else MORE_CORES:
-        found = in_a_new_process(partial(measure_blocks, count, size, steps))
-        speedups[f"{count:,} Gaussians, {size}x{size}"] = found
-        print(f"\n{count:,} Gaussians, {size}x{size}, more cores\n{_bounds(found)}")
-        print(f"\n{_blocks(found)}", flush=True)
-    _write(args.out, results, speedups)
+    _write(args.out, results)
 
 
-def _write(out: Path, results: dict[str, list[Result]], speedups: dict[str, Speedups]) -> None:
+def _write(out: Path, results: dict[str, list[Result]]) -> None:
     fields = ("milliseconds", "device_bytes", "process_bytes")
     rows = [
         [*vars(r.point).values(), *(getattr(r, f) for f in fields), *vars(r.work).values()]
@@ -129,19 +115,7 @@ def _write(out: Path, results: dict[str, list[Result]], speedups: dict[str, Spee
         ["threads", "iteration_ms", *STAGES],
         [[r.point.threads, r.milliseconds, *r.stage_ms.values()] for r in results["threads"]],
     )
-    write_csv(
-        out / "scaling_blocks.csv",
-        ["scene", "stage", "type", "size", "ms", *(f"blocks_{c}" for c in CORES)]
-        + [f"share_{c}" for c in CORES],
-        [
-            [name, k.stage, k.type, k.size, k.milliseconds, *k.blocks.values(), *k.share.values()]
-            for name, found in speedups.items()
-            for k in found.kernels
-        ],
-    )
     write_figure(out / "scaling.png", plot(results))
-    names = ("scaling.csv", "scaling_stages.csv", "scaling_blocks.csv", "scaling.png")
-    print(f"\nwritten: {', '.join(str(out / name) for name in names)}")
 
 
 def points(quick: bool) -> list[Point]:
@@ -162,31 +136,25 @@ def points(quick: bool) -> list[Point]:
     return found
 
 
-def in_a_new_process(measurement: Callable[[], T]) -> T:
+def measure_in_new_process(point: Point, num_steps: int) -> Result:
     """Measure where nothing else was ever allocated."""
     with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:
-        return pool.submit(measurement).result()
+        return pool.submit(measure, point, num_steps).result()
 
 
-def measure(point: Point, steps: int) -> Result:
-    """Time ``steps`` iterations of one problem, after a few to warm up."""
+def measure(point: Point, num_steps: int) -> Result:
+    """Time ``num_steps`` iterations of one problem, after a few to warm up."""
     dr.set_thread_count(point.threads)
     mi.set_variant("llvm_ad_rgb")
-    scene = _bench_scene(point.count, point.size, point.scale)
+    gaussians = bench_gaussians(point.count)
+    shrunk = gaussians.log_scales + np.float32(math.log(point.scale))
+    scene = Scene("bench", replace(gaussians, log_scales=shrunk), bench_camera(point.size))
     work = count_work(frame_of(scene))
-    trainer = trainer_of(scene)
-    for _ in range(3):
-        trainer.step()
-    dr.sync_thread()
+    trainer = warm_trainer(scene)
     clear_memory_peak()
-    times = []
-    for _ in range(steps):
-        started = time.perf_counter()
-        trainer.step()
-        dr.sync_thread()
-        times.append(time.perf_counter() - started)
+    times = [seconds(lambda: steps(trainer, 1)) for _ in range(num_steps)]
     device_bytes = memory_peak()
-    clocks = [clocked_step(trainer) for _ in range(steps)]
+    clocks = [clocked_step(trainer) for _ in range(num_steps)]
     return Result(
         point=point,
         milliseconds=1e3 * statistics.median(times),
@@ -195,19 +163,6 @@ def measure(point: Point, steps: int) -> Result:
         work=work,
         stage_ms={s: statistics.median(clock.kernel_ms[s] for clock in clocks) for s in STAGES},
     )
-
-
-def measure_blocks(count: int, size: int, rounds: int) -> Speedups:
-    """Blocks of an iteration's kernels, of the bench scene with as many entries a Gaussian as at
-    100,000 and 400 px."""
-    mi.set_variant("llvm_ad_rgb")
-    return count_blocks(_bench_scene(count, size, math.sqrt(100_000 / count)), rounds)
-
-
-def _bench_scene(count: int, size: int, scale: float) -> Scene:
-    gaussians = bench_gaussians(count)
-    shrunk = gaussians.log_scales + np.float32(math.log(scale))
-    return Scene("bench", replace(gaussians, log_scales=shrunk), bench_camera(size))
 
 
 # ----------------------------------------------------------------------------------------------
@@ -265,37 +220,6 @@ def _stage_table(results: list[Result]) -> str:
 def _times_of(milliseconds: list[float]) -> list[str]:
     first, *others = milliseconds
     return [f"{first:.1f} ms", *(f"{value:.1f} ms, {first / value:.2f}x" for value in others)]
-
-
-def _bounds(found: Speedups) -> str:
-    """Bounds of the speed-up by cores: of the iteration, and of each stage."""
-    alone = found.host_ms + sum(kernel.milliseconds for kernel in found.kernels)
-    stages = [[stage, found.milliseconds(stage), stage] for stage in STAGES]
-    rows = [["a training iteration", alone, None], *stages]
-    table = [
-        [name, f"{spent:.1f} ms", *(f"{found.bound(stage, cores):.1f}x" for cores in CORES)]
-        for name, spent, stage in rows
-    ]
-    table.append(["no kernel", f"{found.host_ms:.1f} ms", *("1.0x" for _ in CORES)])
-    return markdown_table(["at most", "1 core", *(f"{cores} cores" for cores in CORES)], table)
-
-
-def _blocks(found: Speedups) -> str:
-    """Blocks of the kernels that take long."""
-    least = LEAST_SHARE * sum(kernel.milliseconds for kernel in found.kernels)
-    rows = [
-        [
-            kernel.stage,
-            kernel.type,
-            f"{kernel.size:,}",
-            f"{kernel.milliseconds:.1f} ms",
-            *(f"{kernel.blocks[c]}, {1 / kernel.share[c]:.1f}x" for c in CORES),
-        ]
-        for kernel in found.kernels
-        if kernel.milliseconds >= least
-    ]
-    cores = (f"blocks, {cores} cores" for cores in CORES)
-    return markdown_table(["stage", "kernel", "size", "1 core", *cores], rows)
 
 
 def _short(number: int) -> str:

@@ -1,4 +1,4 @@
-"""Scenes that measurements share.
+"""Scenes, cameras and trainers that measurements share.
 
 Cameras are :class:`drgs.reference.splatting.Camera`: plain numbers, from which
 :func:`device_camera` makes the kernels' camera in any precision.
@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import drjit.llvm.ad as llvm
+import mitsuba as mi
 import numpy as np
 
 from drgs.cameras.axes import OPENCV_TO_OPENGL
@@ -73,6 +74,33 @@ def bench_camera(size: int) -> reference.Camera:
         width=size,
         height=size,
     )
+
+
+def mitsuba_pose(camera: reference.Camera, shift: float = 0.0) -> mi.ScalarTransform4f:
+    """Return a camera's ``to_world``; shift: to its right, world units."""
+    pose = np.eye(4)
+    pose[:3, :3] = camera.rotation.T * [-1, -1, 1]  # Mitsuba's x is to the left, its y up
+    pose[:3, 3] = camera.center + shift * camera.rotation[0]
+    return mi.ScalarTransform4f(pose)
+
+
+def mitsuba_sensor(camera: reference.Camera) -> dict[str, object]:
+    """Return a perspective sensor with a box filter; the camera's fx and fy must agree."""
+    return {
+        "type": "perspective",
+        "fov": float(np.degrees(2 * np.arctan(camera.width / 2 / camera.fx))),
+        "fov_axis": "x",
+        "to_world": mitsuba_pose(camera),
+        "film": {
+            "type": "hdrfilm",
+            "width": camera.width,
+            "height": camera.height,
+            "pixel_format": "rgb",
+            "component_format": "float32",
+            "rfilter": {"type": "box"},
+        },
+        "sampler": {"type": "independent", "sample_count": 1},
+    }
 
 
 def device_camera(camera: reference.Camera, float_type: type) -> Camera:
@@ -200,11 +228,7 @@ def stress_scene(size: int, seed: int = 0) -> tuple[Gaussians, list[reference.Ca
         "shN": rng.normal(0, 0.05, (count, 15, 3)),
     }
     gaussians = Gaussians(**{name: value.astype(np.float32) for name, value in values.items()})
-    return gaussians, [_camera_at_origin(size, field_of_view=110)]
-
-
-def _camera_at_origin(size: int, field_of_view: float) -> reference.Camera:
-    """Square pictures; field_of_view: degrees."""
-    focal = float(np.float32(size / 2 / np.tan(np.radians(field_of_view) / 2)))
-    middle = size / 2
-    return reference.Camera(np.eye(3), np.zeros(3), focal, focal, middle, middle, size, size)
+    focal = float(np.float32(size / 2 / np.tan(np.radians(110) / 2)))
+    principal_point = size / 2, size / 2
+    camera = reference.Camera(np.eye(3), np.zeros(3), focal, focal, *principal_point, size, size)
+    return gaussians, [camera]

@@ -90,7 +90,6 @@ def run(args: argparse.Namespace) -> None:
     write_csv(args.out / "stability.csv", ["sweep", *columns], rows)
     write_figure(args.out / "stability.png", plot(results))
     print(f"\nall of it in short\n{_summary(results)}")
-    print(f"\nwritten: {args.out / 'stability.csv'}, {args.out / 'stability.png'}")
 
 
 # ----------------------------------------------------------------------------------------------

@@ -68,7 +68,7 @@ from drgs.cli.execution import add_variant_argument, select_variant
 from drgs.cli.progress import RunProgress
 from drgs.core.errors import UserError, one_line
 from drgs.core.files import atomic_path, read_text, remove_stale_temporaries, why_refused
-from drgs.core.locks import sole_writer
+from drgs.core.folders import sole_writer
 from drgs.core.memory import why_too_large
 from drgs.integrator.state import is_splats
 from drgs.io.pictures import write_png

@@ -19,6 +19,7 @@ from drgs.core.constants import MAX_INT
 from drgs.core.errors import UserError, did_you_mean, one_line
 from drgs.core.files import check_path
 from drgs.core.processes import ending_together, one_voice, process_count
+from drgs.core.registry import reporting_extensions
 
 MAX_ERROR = 500
 """Characters of what is wrong with a command line, which may quote all of it."""
@@ -44,6 +45,16 @@ class CommandParser(argparse.ArgumentParser):
         super().__init__(formatter_class=argparse.RawDescriptionHelpFormatter, **settings)
         self._module = module
         self._subcommands: tuple[str, ...] = ()
+        self._more_help: Callable[[], str] = str
+
+    def end_help_with(self, text: Callable[[], str]) -> None:
+        """End the help with what ``text`` returns, called when the help is shown."""
+        self._more_help = text
+
+    def format_help(self) -> str:
+        """Return the help."""
+        more = self._more_help()
+        return super().format_help() + (f"\n{more}\n" if more else "")
 
     def show_examples(self, *lines: str) -> None:
         """End the help with command lines; ``%(prog)s`` in them stands for the command."""
@@ -117,7 +128,8 @@ def run_command(
             raise UserError(
                 "mpiexec: processes can share fit and render, no other command; leave it out"
             )
-        args.run(args)
+        with reporting_extensions():
+            args.run(args)
 
 
 def at_least(minimum: int, maximum: int = MAX_INT, reason: str = "") -> Callable[[str], int]:

@@ -18,9 +18,9 @@ import mitsuba as mi
 from drgs.cli.commands import at_least
 from drgs.cli.interrupts import importing
 from drgs.core.denormals import denormals_flushed
+from drgs.core.environment import VARIANTS
 from drgs.core.errors import UserError, one_line
 from drgs.core.memory import why_out_of_memory
-from drgs.core.variants import VARIANTS
 
 MAX_THREADS = 4096
 """Dr.Jit starts a thread for each, whatever there is to do."""

@@ -6,10 +6,11 @@ Each strategy has a section of its own in it; what all of them share stands besi
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import Field, field_validator, model_validator
+from pydantic import AfterValidator, Field, field_validator, model_validator
 
+from drgs.config.extensions import check_strategy
 from drgs.config.section import Count, Section
 
 REFERENCE_START, REFERENCE_STOP = 500, 15_000
@@ -155,11 +156,12 @@ class StopAim(Section):
 class DensifyConfig(Section):
     """How the number of Gaussians changes."""
 
-    strategy: Literal["adc", "budget", "mcmc"] = Field(
+    strategy: Annotated[str, AfterValidator(check_strategy)] = Field(
         "budget",
         description="What changes the population. adc: adaptive density control, as in the paper "
         "(Kerbl et al. 2023); budget: growth to a number of Gaussians, where errors are; mcmc: "
-        "relocation and noise, up to a number of Gaussians (Kheradmand et al. 2024).",
+        "relocation and noise, up to a number of Gaussians (Kheradmand et al. 2024). Or the name "
+        "of an extension.",
     )
     start: Count | None = Field(
         REFERENCE_START,

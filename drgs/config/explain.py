@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
+import math
+
+import yaml
 from pydantic_core import ErrorDetails
+
+from drgs.core.errors import one_line
 
 _RELATIONS = {"ge": ">=", "gt": ">", "le": "<=", "lt": "<"}
 
@@ -30,3 +35,14 @@ def expectation(error: ErrorDetails) -> str:
     if kind == "literal_error":
         return f"must be one of {limits['expected']}"
     return f"must be {_EXPECTED.get(kind.split('_')[0], error['msg'])}"
+
+
+def shown_value(value: object) -> str:
+    """Return the value as YAML writes it, on one line and shortened."""
+    if isinstance(value, str):
+        return one_line(repr(value), limit=60)
+    try:
+        text = yaml.safe_dump(value, default_flow_style=True, width=math.inf)
+    except ValueError:  # Python writes no integer of more than 4300 digits
+        return "a number of thousands of digits"
+    return one_line(text.removesuffix("\n").removesuffix("\n..."), limit=60)

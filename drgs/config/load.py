@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
@@ -13,7 +12,8 @@ from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
 from drgs.config.density import EARLIER_KEYS
-from drgs.config.explain import expectation
+from drgs.config.explain import expectation, shown_value
+from drgs.config.extensions import extension_keys
 from drgs.config.schema import FitConfig
 from drgs.core.errors import UserError, did_you_mean, listed, one_line
 from drgs.core.files import atomic_path, check_path, read_text
@@ -102,7 +102,7 @@ def dump_config(config: FitConfig, path: str | Path) -> None:
 
 
 def known_keys() -> list[str]:
-    """Dotted names of every section and every value, such as ``densify.every``."""
+    """Return dotted names of every section and value, such as ``densify.every``."""
     return [key for key, _ in _fields(FitConfig)]
 
 
@@ -178,7 +178,7 @@ def _read_yaml(path: Path) -> dict:
         reason = one_line(error) or type(error).__name__
         raise UserError(f"{path}: not valid YAML: {reason}") from None
     if not isinstance(values, dict):
-        raise UserError(f"{path}: must hold sections such as 'data:', got {_show(values)}")
+        raise UserError(f"{path}: must hold sections such as 'data:', got {shown_value(values)}")
     return values
 
 
@@ -187,8 +187,9 @@ def _parse_override(override: str) -> tuple[str, object]:
     key = key.strip()
     if not equals or not key:
         raise UserError(f"--set {override}: must be KEY=VALUE, as in densify.every=200")
-    if key not in known_keys() and key not in EARLIER_KEYS:
-        raise UserError(f"--set {key}: unknown key {key}{did_you_mean(key, known_keys())}")
+    known = extension_keys() if key.startswith("extensions.") else known_keys()
+    if key not in known and key not in EARLIER_KEYS:
+        raise UserError(f"--set {key}: unknown key {key}{did_you_mean(key, known)}")
     if key in PATH_KEYS:
         return key, None if text == "null" else _absolute(Path(), text, f"--set {key}")
     try:
@@ -248,10 +249,10 @@ def _absolute(folder: Path, text: str, where: str) -> str:
         check_path(path)
         path.encode()  # what UTF-8 cannot express could not be written to config.yml
     except UnicodeEncodeError:
-        raise UserError(f"{where} must be a path in UTF-8, got {_show(text)}") from None
+        raise UserError(f"{where} must be a path in UTF-8, got {shown_value(text)}") from None
     except (OSError, ValueError, RuntimeError) as error:  # of these, RuntimeError: no such user
         raise UserError(
-            f"{where} must be a path, got {_show(text)} ({one_line(error, 100)})"
+            f"{where} must be a path, got {shown_value(text)} ({one_line(error, 100)})"
         ) from None
     return path
 
@@ -265,6 +266,8 @@ def _explain(file: str, item: ErrorDetails, key: str, overridden: set[str]) -> s
     given = [k for k in overridden if key == k or key.startswith(f"{k}.")]
     where = f"--set {given[0]}" if given else file
     kind, limits = item["type"], item.get("ctx", {})
+    if kind == "extension":
+        return f"{where}: {limits['text']}"
     if kind in ("extra_forbidden", "invalid_key"):
         return f"{where}: unknown key {key}{did_you_mean(key, known_keys())}"
     if kind == "missing":
@@ -273,7 +276,7 @@ def _explain(file: str, item: ErrorDetails, key: str, overridden: set[str]) -> s
         # A relation between values that may come from the file and from the command line.
         origin = f"{file} with --set {' '.join(sorted(overridden))}" if overridden else file
         return f"{origin}: {limits['error']}"
-    return f"{where}: {key} {expectation(item)}, got {_show(item['input'])}"
+    return f"{where}: {key} {expectation(item)}, got {shown_value(item['input'])}"
 
 
 def _description(key: str) -> str:
@@ -283,14 +286,3 @@ def _description(key: str) -> str:
         model = _section(model.model_fields[section].annotation)
     field = model.model_fields[leaf]
     return field.description or field.annotation.__doc__
-
-
-def _show(value: object) -> str:
-    """The value as YAML writes it, on one line and shortened."""
-    if isinstance(value, str):
-        return one_line(repr(value), limit=60)
-    try:
-        text = yaml.safe_dump(value, default_flow_style=True, width=math.inf)
-    except ValueError:  # Python writes no integer of more than 4300 digits
-        return "a number of thousands of digits"
-    return one_line(text.removesuffix("\n").removesuffix("\n..."), limit=60)

@@ -1,6 +1,6 @@
 """The typed configuration of a fit: YAML -> :class:`FitConfig`.
 
-The defaults are a recipe that was chosen by measurement (``python -m drgs.bench recipes``);
+The defaults are a recipe that was chosen by measurement (``scenes/studies/recipes.py``);
 ``scenes/lego_paper.yml`` spells out that of the paper (Kerbl et al. 2023, section 7, and its
 released code). Each field names its unit and range. A configuration is frozen: what a run used is
 what :func:`dump_config` writes.
@@ -14,10 +14,13 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from pydantic import (
+    AfterValidator,
     BaseModel,
+    BeforeValidator,
     Field,
     PlainSerializer,
     PlainValidator,
+    SerializeAsAny,
     ValidationInfo,
     create_model,
     field_validator,
@@ -32,6 +35,7 @@ from drgs.config.density import (
     STOP_SHARES,
     DensifyConfig,
 )
+from drgs.config.extensions import check_loss, check_sections
 from drgs.config.section import Count, Rate, Section, Weight
 from drgs.core.constants import MAX_SHUTTER_SAMPLES, SHUTTER_SAMPLES
 
@@ -372,6 +376,9 @@ class OptimizerConfig(Section):
 class LossConfig(Section):
     """(1 - w) L1 + w (1 - SSIM), in display space."""
 
+    type: Annotated[str, AfterValidator(check_loss)] = Field(
+        "photometric", description="photometric, or the name of an extension."
+    )
     dssim_weight: float = Field(0.2, ge=0, le=1, description="w; 0 leaves D-SSIM out.")
     window: int = Field(11, ge=3, le=17, description="px: width of SSIM's Gaussian window; odd.")
     sigma: float = Field(1.5, ge=0.1, le=1000, description="px: its standard deviation.")
@@ -478,6 +485,13 @@ class FitConfig(Section):
         "none, as in the paper.",
     )
     seed: Count = Field(0, ge=0, description="Seed of everything random.")
+    extensions: Annotated[
+        dict[str, SerializeAsAny[BaseModel] | None], BeforeValidator(check_sections)
+    ] = Field(
+        default_factory=dict,
+        description="Sections of extensions, by name. An effect or a term of the loss takes part "
+        "if it has one, be it empty.",
+    )
 
     @property
     def data_for_training(self) -> DataConfig:
@@ -504,10 +518,10 @@ class FitConfig(Section):
         changes, first = {}, densify.start
         if _is_open(densify, "stop"):
             least = 1 if _is_open(densify, "start") else first + 1
-            share = STOP_SHARES[densify.strategy]
+            share = STOP_SHARES.get(densify.strategy, 1 / 2)
             changes["stop"] = max(least, min(REFERENCE_STOP, round(share * n)))
         if _is_open(densify, "start"):
-            first = max(1, round(START_SHARES[densify.strategy] * n))
+            first = max(1, round(START_SHARES.get(densify.strategy, 1 / 20) * n))
             changes["start"] = min(REFERENCE_START, first, changes.get("stop", densify.stop) // 2)
         self._complete("densify", changes)
         return self

@@ -8,9 +8,12 @@ from __future__ import annotations
 
 import difflib
 import re
+import sys
+import traceback
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from types import TracebackType
+from typing import Any, NamedTuple
 
 
 class UserError(ValueError):
@@ -18,23 +21,23 @@ class UserError(ValueError):
 
 
 class UserNote(UserWarning):
-    """What a user should know of an input that is used all the same; commands print its text."""
+    """A note about an input that is used all the same; commands print its text."""
 
 
 class PluginError(UserError):
-    """What a scene asks of a plugin and cannot have; the message begins with the plugin's name."""
+    """A parameter or scene that a plugin cannot use; the message begins with the plugin's name."""
 
 
 class PluginTypeError(PluginError, TypeError):
-    """The same, where something is of another type than it must be."""
+    """A :class:`PluginError` about a value of the wrong type."""
 
 
 class UnsupportedError(PluginError, NotImplementedError):
-    """The same, where the plugin has no code for it."""
+    """A :class:`PluginError` about something that the plugin has no code for."""
 
 
 class Place(NamedTuple):
-    """Where something stands in a file, as messages say it."""
+    """A place in a file, as messages write it."""
 
     path: Path
     unit: str  # byte, or line
@@ -86,3 +89,40 @@ def did_you_mean(name: str, candidates: Iterable[str], cutoff: float = 0.7) -> s
         leaf = difflib.get_close_matches(name.rpartition(".")[2], by_leaf, n=1, cutoff=cutoff)
         nearest = [by_leaf[leaf[0]]] if leaf else []
     return f"; did you mean {nearest[0]}?" if nearest else ""
+
+
+def show_causes_last() -> None:
+    """Print a user's error once more after the traceback of what was raised because of it.
+
+    Dr.Jit raises errors of a picture, a loop or a frozen function again, as a RuntimeError whose
+    text is "see above", which may be pages away. In scripts and, where this is called from one, in
+    notebooks.
+    """
+    if getattr(sys.excepthook, "shows_cause", False):
+        return
+    show_before = sys.excepthook
+
+    def show(kind: type[BaseException], error: BaseException, tb: TracebackType | None) -> None:
+        show_before(kind, error, tb)
+        _show_cause(error)
+
+    show.shows_cause = True
+    sys.excepthook = show
+    if "IPython" in sys.modules and (shell := sys.modules["IPython"].get_ipython()) is not None:
+        shell.set_custom_exc((RuntimeError,), _show_in_notebook)
+
+
+def _show_in_notebook(
+    shell: Any, kind: type, error: BaseException, tb: Any, tb_offset: int | None = None
+) -> None:
+    """The handler of a notebook's RuntimeErrors, as IPython calls it."""
+    shell.showtraceback((kind, error, tb), tb_offset=tb_offset)
+    _show_cause(error)
+
+
+def _show_cause(error: BaseException) -> None:
+    cause = error
+    while cause is not None and not isinstance(cause, UserError):
+        cause = cause.__cause__ or cause.__context__
+    if cause is not None and cause is not error:
+        print(*traceback.format_exception_only(cause), sep="", end="", file=sys.stderr)

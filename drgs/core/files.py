@@ -17,6 +17,8 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO, TYPE_CHECKING
 
+import psutil
+
 from drgs.core.errors import UserError, one_line
 from drgs.core.memory import require_memory
 
@@ -183,7 +185,7 @@ def _check_sizes(file: IO[bytes]) -> None:
                 raise ValueError(f"{part.filename} is not as large as its header claims")
 
 
-_TEMPORARY_NAME = re.compile(r"\.(.*)\.(\d+)\.tmp(\.[^.]*)?")
+_TEMPORARY_NAME = re.compile(r"\.(.*)\.(\d{1,9})\.tmp(\.[^.]*)?")
 """Names that :func:`atomic_path` makes: .STEM.PROCESS.tmp.SUFFIX."""
 
 
@@ -226,22 +228,9 @@ def remove_temporaries_of(folder: Path, names: Iterable[str]) -> None:
     wanted = {(shortened(path.stem), path.suffix) for path in map(Path, names)}
     for path in folder.glob(".*.tmp*"):
         found = _TEMPORARY_NAME.fullmatch(path.name)
-        if found and (found[1], found[3] or "") in wanted and not _is_running(int(found[2])):
+        if found and (found[1], found[3] or "") in wanted and not psutil.pid_exists(int(found[2])):
             with suppress(OSError):
                 path.unlink()
-
-
-def _is_running(process: int) -> bool:
-    """Return whether a process of this number runs on this machine; True where that is unknown."""
-    if os.name != "posix":  # where signal 0 is Ctrl-C
-        return True
-    try:
-        os.kill(process, 0)
-    except (ProcessLookupError, OverflowError):
-        return False
-    except PermissionError:  # of another user
-        pass
-    return True
 
 
 def is_temporary(name: str) -> bool:

@@ -1,4 +1,4 @@
-"""How much memory there is, and what is refused because it cannot be held.
+"""Available memory, and refusals of what it cannot hold.
 
 Linux ends a process that takes more than there is, without a word. What may become large is
 therefore estimated before it is allocated.
@@ -8,17 +8,13 @@ from __future__ import annotations
 
 import ctypes
 import errno
-import os
 import re
 import sys
 from pathlib import Path
 
-from drgs.core.errors import UserError, one_line
+import psutil
 
-try:
-    import resource
-except ImportError:  # Windows
-    resource = None
+from drgs.core.errors import UserError, one_line
 
 FREE_MEMORY = (
     "close other programs, raise the limit (ulimit -v, or the container's), or use smaller input"
@@ -33,14 +29,14 @@ MAX_LANES = 2**32 - 1
 """Entries of an array of Dr.Jit, which counts them in 32 bits."""
 
 PICTURE_BYTES = 250
-"""About what rendering takes for a pixel: splats in its tile, planes, the film's block, the picture
-and its copy on the host."""
+"""Bytes for a pixel, about: splats in its tile, planes, the film's block, the image, its copy on
+the host."""
 
 SAMPLE_BYTES = 80
-"""The same for each further sample of a pixel, whose planes are kept as well."""
+"""Bytes for each further sample of a pixel, whose planes are kept as well."""
 
 CHANNEL_BYTES = 24
-"""The same for each channel of the film besides colour: its plane, and its part of the block, of
+"""Bytes for each channel of the film besides colour: its plane, and its part of the block, of
 the picture and of the copy."""
 
 UNASKED_FILE_BYTES = 1 << 24
@@ -61,7 +57,8 @@ def available_memory() -> int:
 
     The least of what the machine, the process's control groups and its own limit leave it.
     """
-    return max(0, min(_of_machine(), _of_control_groups(), _of_process()))
+    machine = psutil.virtual_memory().available
+    return max(0, min(machine, _of_control_groups(), _of_process()))
 
 
 def release_unused_memory() -> None:
@@ -74,8 +71,8 @@ def release_unused_memory() -> None:
 
 
 def resident_memory() -> int:
-    """Bytes that this process has; 0 where the system does not say."""
-    return _pages(1)
+    """Bytes of memory that this process has."""
+    return psutil.Process().memory_info().rss
 
 
 def readable(count: float) -> str:
@@ -171,35 +168,17 @@ def _three_digits(number: float) -> str:
 # ----------------------------------------------------------------------------------------------
 
 
-def _of_machine() -> int:
-    """What the kernel could give without swapping; elsewhere than on Linux, all there is."""
-    for line in _lines(_PROC / "meminfo"):
-        if line.startswith("MemAvailable:"):
-            return 1024 * int(line.split()[1])
-    try:
-        return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-    except (AttributeError, ValueError, OSError):
-        return _UNLIMITED
-
-
 def _of_process() -> int:
-    """What ``ulimit -v`` leaves."""
-    if resource is None:
+    """Bytes that ``ulimit -v`` leaves."""
+    process = psutil.Process()
+    if not hasattr(psutil, "RLIMIT_AS"):  # not Linux
         return _UNLIMITED
-    limit, _ = resource.getrlimit(resource.RLIMIT_AS)
-    if limit == resource.RLIM_INFINITY:
-        return _UNLIMITED
-    return limit - _pages(0)
-
-
-def _pages(column: int) -> int:
-    """Bytes of a column of the process's numbers of pages: 0, of addresses; 1, that it has."""
-    numbers = next(iter(_lines(_PROC / "self" / "statm")), "0 0").split()
-    return int(numbers[column]) * os.sysconf("SC_PAGE_SIZE") if int(numbers[column]) else 0
+    limit, _ = process.rlimit(psutil.RLIMIT_AS)
+    return _UNLIMITED if limit == psutil.RLIM_INFINITY else limit - process.memory_info().vms
 
 
 def _of_control_groups() -> int:
-    """What the limits of the control groups leave that the process is in; both versions."""
+    """Bytes that the limits of the process's control groups leave; both versions."""
     rooms = [_UNLIMITED]
     for line in _lines(_PROC / "self" / "cgroup"):
         _, controllers, path = line.split(":", 2)
@@ -217,7 +196,7 @@ def _of_control_groups() -> int:
 
 
 def _room(group: Path, limit: str, usage: str, reclaimable: str) -> int:
-    """What a control group has left; files that it keeps in memory make room when asked to."""
+    """Bytes that a control group has left; files that it keeps in memory can be dropped."""
     most, used = (next(iter(_lines(group / name)), "") for name in (limit, usage))
     if not most.isdigit() or not used.isdigit() or int(most) >= _UNLIMITED:
         return _UNLIMITED
@@ -228,7 +207,7 @@ def _room(group: Path, limit: str, usage: str, reclaimable: str) -> int:
 
 
 def _lines(path: Path) -> list[str]:
-    """Of a file of the kernel; none where there is no such file."""
+    """Lines of a file of the kernel; none where there is no such file."""
     try:
         return path.read_text().splitlines()
     except OSError:

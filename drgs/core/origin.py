@@ -37,6 +37,17 @@ def near_origin(middle: Sequence[float], size: float) -> Origin:
     return x, y, z
 
 
+def near_means(means: np.ndarray) -> tuple[np.ndarray, Origin]:
+    """Return positions (N, 3) float64, and the origin that they are relative to.
+
+    means: (N, 3) float64, world, relative to another origin than the world's where most of them
+    are far away from that.
+    """
+    middle = np.median(means, axis=0)
+    origin = near_origin(middle, float(np.median(np.linalg.norm(means - middle, axis=1))))
+    return means - origin, origin
+
+
 def shown_origin(origin: Origin) -> str:
     """The origin as messages write it."""
     return f"({', '.join(f'{value:.15g}' for value in origin)})"

@@ -18,11 +18,12 @@ import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager, redirect_stderr, redirect_stdout, suppress
 from importlib import import_module
-from pathlib import Path
 from typing import NoReturn
 
+import psutil
+
+from drgs.core.environment import required
 from drgs.core.errors import UserError, one_line
-from drgs.core.extras import required
 
 LAUNCHERS = (
     ("PMI_RANK", "PMI_SIZE"),  # MPICH
@@ -185,28 +186,22 @@ def _others_watched() -> Iterator[None]:
         os.waitpid(watcher, 0)
 
 
-def _launcher_of_mpich() -> Path | None:
-    """The file that lists the processes that it has started on this machine (Linux)."""
+def _launcher_of_mpich() -> psutil.Process | None:
+    """Return the parent of the processes that MPICH has started on this machine."""
     if not {MPICH_SOCKET, MPICH_LOCAL_COUNT} <= os.environ.keys():
         return None
-    process = os.getppid()
-    with suppress(OSError, IndexError, ValueError):  # another system, or out of sight
-        while process > 1:
-            folder = Path("/proc") / str(process)
-            if (folder / "comm").read_text().strip() == MPICH_LAUNCHER:
-                children = folder / "task" / str(process) / "children"
-                return children if children.exists() else None
-            process = int((folder / "stat").read_text().rpartition(")")[2].split()[1])
+    with suppress(psutil.Error):  # out of sight
+        return next((p for p in psutil.Process().parents() if p.name() == MPICH_LAUNCHER), None)
     return None
 
 
-def _watch(launcher: Path, waiting: int) -> None:
+def _watch(launcher: psutil.Process, waiting: int) -> None:
     """Wait until a process of this machine is missing; then end the job for ``waiting``.
 
     A process of ours that has failed is there until it has spoken.
     """
     count = int(os.environ[MPICH_LOCAL_COUNT])
-    while os.getppid() == waiting and len(launcher.read_text().split()) >= count:
+    while os.getppid() == waiting and len(launcher.children()) >= count:
         time.sleep(WATCH_S)
     time.sleep(_patience(process_number() or 0))
     if os.getppid() == waiting:

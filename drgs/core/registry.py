@@ -24,15 +24,19 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
+from traceback import walk_tb
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
-from drgs.core.errors import UserError, did_you_mean, one_line
+from drgs.core.errors import UserError, did_you_mean, one_line, root_cause
 
 if TYPE_CHECKING:
     from pydantic import BaseModel
 
 ENTRY_POINT_GROUP = "drgs"
 """Group of the entry points whose modules register extensions."""
+
+HOW_TO_INSTALL = 'others come with installed packages that have an entry point of the group "drgs"'
+"""Completes messages that list the extensions that exist."""
 
 T = TypeVar("T")
 Registered = TypeVar("Registered")
@@ -52,6 +56,21 @@ class Extension(Generic[T]):
     section: type[BaseModel] | None  # model of its configuration section
     module: str  # that defines it
 
+    @property
+    def is_shipped(self) -> bool:
+        """True if it is a part of drgs."""
+        return self.module.partition(".")[0] == "drgs"
+
+    @property
+    def summary(self) -> str:
+        """The first line of its documentation."""
+        return (getattr(self.value, "__doc__", None) or self.name).strip().splitlines()[0]
+
+    def error(self, cause: BaseException) -> ExtensionError:
+        """Return an error that reports another with the name of the extension."""
+        text = one_line(f"{type(cause).__name__}: {cause}")
+        return ExtensionError(f'{self.kind} "{self.name}" ({self.module}): {text}')
+
     @contextmanager
     def reporting(self) -> Iterator[None]:
         """Within the block, raise errors of the extension as :class:`ExtensionError`.
@@ -63,10 +82,9 @@ class Extension(Generic[T]):
         except UserError:
             raise
         except Exception as error:
-            if self.module.partition(".")[0] == "drgs":
+            if self.is_shipped:
                 raise
-            cause = one_line(f"{type(error).__name__}: {error}")
-            raise ExtensionError(f'{self.kind} "{self.name}" ({self.module}): {cause}') from error
+            raise self.error(error) from error
 
 
 class Registry(Generic[T]):
@@ -77,6 +95,7 @@ class Registry(Generic[T]):
         self.kind = kind
         self._shipped = dict(shipped or {})
         self._extensions: dict[str, Extension[T]] = {}
+        _registries.append(self)
 
     def register(
         self, name: str, section: type[BaseModel] | None = None
@@ -121,8 +140,7 @@ class Registry(Generic[T]):
             start = f"{place}: " if place else ""
             raise UserError(
                 f'{start}no {self.kind} is called "{name}"{did_you_mean(name, known)}; there are '
-                f"{', '.join(known) or 'none'}. Others come with packages that have an entry point "
-                f'of the group "{ENTRY_POINT_GROUP}"'
+                f"{', '.join(known) or 'none'} ({HOW_TO_INSTALL})"
             )
         return self._extensions[name]
 
@@ -130,6 +148,43 @@ class Registry(Generic[T]):
         """Return the extensions that drgs does not ship, by name."""
         load_installed()
         return [e for name, e in sorted(self._extensions.items()) if name not in self._shipped]
+
+    @property
+    def shipped(self) -> list[str]:
+        """The names of the extensions that drgs ships, in their order."""
+        return list(self._shipped)
+
+
+_registries: list[Registry] = []
+"""All registries: what is registered is global by its nature."""
+
+
+def all_extensions() -> list[Extension]:
+    """Return the extensions that drgs does not ship, of all kinds, by name."""
+    found = [extension for registry in _registries for extension in registry.installed()]
+    return sorted(found, key=lambda extension: extension.name)
+
+
+@contextmanager
+def reporting_extensions() -> Iterator[None]:
+    """Within the block, report errors that come from an installed extension with its name.
+
+    An error comes from an extension if a function of the extension's module is on its traceback.
+    """
+    try:
+        yield
+    except UserError:
+        raise
+    except Exception as error:
+        registered = {e.module: e for r in _registries for e in r._extensions.values()}
+        cause: BaseException | None = error
+        while cause is not None:
+            for frame, _ in walk_tb(cause.__traceback__):
+                extension = registered.get(frame.f_globals.get("__name__"))
+                if extension is not None and not extension.is_shipped:
+                    raise extension.error(root_cause(error)) from error
+            cause = cause.__cause__ or cause.__context__
+        raise
 
 
 _loaded: set[str] = set()

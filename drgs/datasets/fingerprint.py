@@ -12,7 +12,7 @@ from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from drgs.core.records import digest
+from drgs.core.folders import digest
 from drgs.datasets.transforms import in_parallel
 from drgs.datasets.types import Dataset, Keeps, View, all_of_them
 

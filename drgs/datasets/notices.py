@@ -13,7 +13,7 @@ import numpy as np
 
 from drgs.core.errors import UserNote, listed, one_line
 from drgs.core.files import open_regular
-from drgs.core.records import digest
+from drgs.core.folders import digest
 from drgs.datasets.types import View
 from drgs.io.pictures import unused_content
 

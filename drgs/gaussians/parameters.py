@@ -58,13 +58,12 @@ class Gaussians:
 
         Raises ``drgs.core.errors.UserError`` (a ValueError) naming the file and what is wrong.
         """
-        from drgs.io.formats import Z_TO_Y, read_gaussians
-        from drgs.io.ply import origin_among
+        from drgs.io.formats import Z_TO_Y, pop_origin, read_gaussians
 
-        found, arrays, rendered_with = read_gaussians(path)
-        origin = origin_among(path, rendered_with)
+        extension, arrays, rendered_with = read_gaussians(path)
+        origin = pop_origin(path, rendered_with)
         gaussians = Gaussians(**arrays, rendered_with=rendered_with or None, origin=origin)
-        return gaussians._turned(Z_TO_Y.T) if found.y_up else gaussians
+        return gaussians._turned(Z_TO_Y.T) if extension.value.up == "y" else gaussians
 
     def save(self, path: str | Path) -> None:
         """Write a file, atomically, in the format that its suffix names: see ``drgs.io.formats``.
@@ -76,37 +75,36 @@ class Gaussians:
         Raises ``drgs.core.errors.UserError`` (a ValueError) for another suffix, or where the format
         cannot hold them.
         """
-        from drgs.io.formats import FORMATS, format_of
+        from drgs.io.formats import OTHER_FORMATS, file_formats, format_for
 
-        chosen = format_of(path)
+        chosen = format_for(path)
         if chosen is None:
-            suffixes = ", ".join(each.suffix for each in FORMATS)
-            raise UserError(f"{path}: the name must end in one of {suffixes}")
+            suffixes = ", ".join(each.value.suffix for each in file_formats())
+            raise UserError(f"{path}: the name must end in one of {suffixes}; {OTHER_FORMATS}")
         content = self.to_bytes(chosen.name)
         with atomic_path(path) as temporary:
             temporary.write_bytes(content)
 
     def to_bytes(self, name: str) -> bytes:
-        """The content of a file in the format of that name, one of ``drgs.io.formats.FORMATS``.
+        """Return the content of a file in the format ``name`` of ``drgs.io.formats.FORMATS``.
 
         As ``save`` writes it, which see.
         """
-        from drgs.io.formats import Z_TO_Y, format_named
-        from drgs.io.ply import ORIGIN
+        from drgs.io.formats import FORMATS, ORIGIN, Z_TO_Y, encode
 
-        chosen, host = format_named(name), self.numpy()
-        lost = [*(["harmonics"] if self.sh_degree > 0 and not chosen.has_harmonics else [])]
-        lost += [f"{name} {value}" for name, value in chosen.unsaid(self.rendered_with).items()]
-        if self.origin != WORLD and not chosen.has_origin:
+        chosen, host = FORMATS.get(name).value, self.numpy()
+        values = dict(self.rendered_with or {})
+        lost = ["harmonics"] if self.sh_degree > 0 and not chosen.has_harmonics else []
+        lost += [f"{key} {value}" for key, value in values.items() if not chosen.holds(key)]
+        if self.origin != WORLD and not chosen.holds(ORIGIN[0]):
             lost.append(f"the origin {shown_origin(self.origin)} of its coordinates")
         if lost:
-            note = f"the format {chosen.name} has no room for {', '.join(lost)}: left out"
+            note = f"the format {name} has no room for {', '.join(lost)}: left out"
             warnings.warn(UserNote(note), stacklevel=2)
-        host = host._turned(Z_TO_Y) if chosen.y_up else host
-        said = dict(self.rendered_with or {})
+        host = host._turned(Z_TO_Y) if chosen.up == "y" else host
         if self.origin != WORLD:
-            said |= dict(zip(ORIGIN, host.origin, strict=True))
-        return chosen.encode({n: getattr(host, n) for n in host._names}, said or None)
+            values |= dict(zip(ORIGIN, host.origin, strict=True))
+        return encode(name, {n: getattr(host, n) for n in host._names}, values)
 
     @staticmethod
     def from_numpy(
@@ -203,11 +201,11 @@ class Gaussians:
 
     def _turned(self, rotation: np.ndarray) -> Gaussians:
         """Numpy arrays turned as a whole; float32."""
-        from drgs.gaussians.turning import as_float32, turned
+        from drgs.gaussians.rotation import rotate_gaussians, to_float32
 
-        parts = turned(self.means, self.quats, self.shN, rotation)
+        parts = rotate_gaussians(self.means, self.quats, self.shN, rotation)
         names = ("means", "quats", "shN")
-        means, quats, shN = (as_float32(n, p) for n, p in zip(names, parts, strict=True))
+        means, quats, shN = (to_float32(n, p) for n, p in zip(names, parts, strict=True))
         x, y, z = (rotation @ self.origin).tolist()
         return replace(self, means=means, quats=quats, shN=shN, origin=(x, y, z))
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from drgs.core.errors import PluginError
 from drgs.gaussians.parameters import Gaussians
-from drgs.gaussians.turning import as_float32, turned
+from drgs.gaussians.rotation import rotate_gaussians, to_float32
 
 TOLERANCE = 1e-4
 """Of A^T A / s^2 - I: numbers written with five digits are a rotation, a shear by a pixel in ten
@@ -56,7 +56,7 @@ class Similarity:
         Their origin is rotated and scaled, and the translation is added to the means.
         """
         g = gaussians
-        means, quats, shN = turned(g.means, g.quats, g.shN, self.rotation)
+        means, quats, shN = rotate_gaussians(g.means, g.quats, g.shN, self.rotation)
         g = replace(
             g,
             means=self.scale * means + self.translation,
@@ -68,4 +68,4 @@ class Similarity:
         if g.smoothing is not None:
             g = replace(g, smoothing=(g.smoothing * self.scale).astype(np.float32))
         names = ("means", "quats", "log_scales", "shN")
-        return replace(g, **{name: as_float32(name, getattr(g, name)) for name in names})
+        return replace(g, **{name: to_float32(name, getattr(g, name)) for name in names})

@@ -76,7 +76,7 @@ def _numbers_of_gaussians(config: FitConfig, dataset: Dataset) -> dict[str, obje
     """At the start and in the end, those of them that are not given."""
     changes: dict[str, object] = {}
     densify, at_start = config.densify, REFERENCE_POINTS
-    if densify.strategy != "adc":
+    if densify.strategy in ("budget", "mcmc"):
         goal = getattr(densify, densify.strategy).gaussians
         if goal is None:
             goal = max(_suitable_number(dataset), config.init.num_points or 0)

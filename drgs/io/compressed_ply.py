@@ -25,16 +25,23 @@ import numpy as np
 from drgs.core.constants import SH_C0
 from drgs.core.errors import UserError
 from drgs.core.memory import require_memory
-from drgs.io.morton import morton_order
-from drgs.io.ply import NUM_REST, Scalar, encode_elements, properties_of, read_elements
-from drgs.io.quantized import (
-    gaussians_bytes,
-    logits_of,
-    opacities_of,
-    rounded,
-    unit_quaternions,
-    with_largest,
-    without_largest,
+from drgs.io.formats import FORMATS, FileFormat, Scalar
+from drgs.io.ply import (
+    NUM_REST,
+    encode_elements,
+    has_packed_vertices,
+    properties_of,
+    read_elements,
+)
+from drgs.io.quantization import (
+    decoding_bytes,
+    drop_largest_component,
+    logits_from_opacities,
+    morton_order,
+    normalize_quaternions,
+    opacities_from_logits,
+    restore_largest_component,
+    round_to_uint32,
 )
 
 CHUNK = 256
@@ -55,12 +62,6 @@ BOUNDED = {"position": ("x", "y", "z"), "scale": ("scale_x", "scale_y", "scale_z
 COLORS = ("r", "g", "b")
 MAX_LOG_SCALE = 20.0
 """Larger ones are cut off, as PlayCanvas does: viewers compute with their exponentials."""
-
-
-def is_compressed(path: str | Path) -> bool:
-    """Whether a PLY file has packed vertices. Raises as :func:`drgs.io.ply.properties_of` does."""
-    elements = properties_of(path)
-    return "chunk" in elements and PACKED[0] in elements["vertex"]
 
 
 # ----------------------------------------------------------------------------------------------
@@ -85,7 +86,7 @@ def encode(
     }
     bounds = {name: _bounds(v) for name, v in values.items()}
     parts = {name: _parts(v, *bounds[name]) for name, v in values.items()}
-    colors = np.column_stack([parts["color"], opacities_of(g["logit_opacities"])])
+    colors = np.column_stack([parts["color"], opacities_from_logits(g["logit_opacities"])])
     vertex = {
         "packed_position": _packed(parts["position"], VECTOR_BITS),
         "packed_rotation": _packed_rotations(g["quats"]),
@@ -136,12 +137,14 @@ def _packed(parts: np.ndarray, bits: tuple[int, ...]) -> np.ndarray:
     """Numbers from 0 to 1 (N, len(bits)) in as many bits each, the first in the highest."""
     word = np.zeros(len(parts), np.uint32)
     for column, count in enumerate(bits):
-        word = word << np.uint32(count) | rounded(parts[:, column] * (2**count - 1), 2**count - 1)
+        word = word << np.uint32(count) | round_to_uint32(
+            parts[:, column] * (2**count - 1), 2**count - 1
+        )
     return word
 
 
 def _packed_rotations(quats: np.ndarray) -> np.ndarray:
-    index, others = without_largest(unit_quaternions(quats))
+    index, others = drop_largest_component(normalize_quaternions(quats))
     parts = others / (2 * QUATERNION_RANGE) + 0.5
     return index.astype(np.uint32) << np.uint32(30) | _packed(parts, QUATERNION_BITS)
 
@@ -169,7 +172,7 @@ def read_gaussians(path: str | Path) -> tuple[dict[str, np.ndarray], dict[str, S
     rows, statements = read_elements(path, [n for n in ("chunk", "vertex", "sh") if n in there])
     vertex = rows["vertex"]
     harmonics = 1 + len(rows["sh"].dtype.names) // 3 if "sh" in rows else 1
-    needed = gaussians_bytes(len(vertex), harmonics)
+    needed = decoding_bytes(len(vertex), harmonics)
     require_memory(path, needed, f"a scene of {len(vertex):,} Gaussians")
     bounds = _checked_bounds(path, rows, colors="min_r" in there["chunk"])
     _check_unsigned(path, "vertex", vertex, PACKED, 4)
@@ -186,19 +189,14 @@ def read_gaussians(path: str | Path) -> tuple[dict[str, np.ndarray], dict[str, S
         "means": position,
         "quats": _unpacked_rotations(vertex["packed_rotation"]),
         "log_scales": scale,
-        "logit_opacities": logits_of(_unpacked(vertex["packed_color"], COLOR_BITS)[:, 3]),
+        "logit_opacities": logits_from_opacities(
+            _unpacked(vertex["packed_color"], COLOR_BITS)[:, 3]
+        ),
         "sh0": ((color - 0.5) / SH_C0)[:, None, :],
         "shN": _harmonics(path, rows.get("sh"), len(vertex)),
     }
     with np.errstate(over="ignore"):  # harmonics are 3.5 times as large as colours
-        singles = {n: np.ascontiguousarray(v, np.float32) for n, v in arrays.items()}
-    bad = np.flatnonzero(~np.isfinite(singles["sh0"]).all(axis=(1, 2)))
-    if len(bad):
-        raise UserError(
-            f"{path}: element chunk, row {group[bad[0]]}: colours of the bounds must leave finite "
-            f"float32 harmonics, got {color[bad[0]].tolist()}"
-        )
-    return singles, statements
+        return {n: np.ascontiguousarray(v, np.float32) for n, v in arrays.items()}, statements
 
 
 def _checked_bounds(path: str | Path, rows: Mapping[str, np.ndarray], colors: bool) -> np.ndarray:
@@ -272,7 +270,7 @@ def _unpacked(words: np.ndarray, bits: tuple[int, ...]) -> np.ndarray:
 
 def _unpacked_rotations(words: np.ndarray) -> np.ndarray:
     others = (_unpacked(words, QUATERNION_BITS) - 0.5) * (2 * QUATERNION_RANGE)
-    return with_largest((words >> np.uint32(30)).astype(np.intp), others)
+    return restore_largest_component((words >> np.uint32(30)).astype(np.intp), others)
 
 
 def _harmonics(path: str | Path, sh: np.ndarray | None, num: int) -> np.ndarray:
@@ -291,3 +289,18 @@ def _harmonics(path: str | Path, sh: np.ndarray | None, num: int) -> np.ndarray:
     values = ((parts - 0.5) * (2 * SH_RANGE)).astype(np.float32)
     rest = values[np.column_stack([sh[name] for name in names])]
     return rest.reshape(num, 3, -1).transpose(0, 2, 1)
+
+
+@FORMATS.register("compressed-ply")
+class CompressedPly(FileFormat):
+    """PlayCanvas's compressed PLY."""
+
+    suffix = ".compressed.ply"
+    description = "PlayCanvas's compressed PLY, for SuperSplat and PlayCanvas"
+    metadata = None
+    read = staticmethod(read_gaussians)
+    encode = staticmethod(encode)
+
+    def recognizes(self, path: Path) -> bool:
+        """Return whether the vertices are packed."""
+        return has_packed_vertices(path)

@@ -1,162 +1,247 @@
-"""The file formats of Gaussians, declared once: what each is called, holds and loses.
+"""File formats of Gaussians: an extension point, and reading and writing through it.
 
-A format is a module with two functions, imported when it is used::
+A format is a subclass of :class:`FileFormat`, registered under its name::
 
-    read_gaussians(path) -> (arrays by the names of Gaussians' fields, what it is rendered with)
-    encode(gaussians, rendered_with) -> bytes
+    @FORMATS.register("npz")
+    class Npz(FileFormat): ...
 
-with arrays as :mod:`drgs.io.ply` has them, in the axes of the file. Where means are relative to an
-origin (:mod:`drgs.core.origin`), its coordinates stand among the values of ``rendered_with``, by
-the names :data:`drgs.io.ply.ORIGIN`.
+``Gaussians.load`` and ``save``, the plugins' ``filename``, and the commands choose a format by the
+suffix of a file's name. :func:`read_gaussians` and :func:`encode` check what goes in and comes out,
+so that a format need not.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
-from importlib import import_module
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from drgs.core.errors import UserError
-from drgs.io.ply import Scalar
+from drgs.core.errors import UserError, one_line
+from drgs.core.files import open_regular
+from drgs.core.origin import WORLD, Origin
+from drgs.core.registry import ENTRY_POINT_GROUP, Extension, ExtensionError, Registry
+
+Scalar = bool | int | float | str
+
+SHAPES = {
+    "means": [(3,)],
+    "quats": [(4,)],
+    "log_scales": [(3,)],
+    "logit_opacities": [()],
+    "sh0": [(1, 3)],
+    "shN": [(0, 3), (3, 3), (8, 3), (15, 3)],
+    "smoothing": [()],
+}
+"""Shapes that a Gaussian's part of each array can have; ``smoothing`` may be missing."""
+
+Arrays = Mapping[str, np.ndarray]
+"""Float32 arrays by the names of the fields of ``Gaussians``: ``means`` (N, 3), ``quats`` (N, 4)
+wxyz, ``log_scales`` (N, 3), ``logit_opacities`` (N,), ``sh0`` (N, 1, 3), ``shN`` (N, K - 1, 3), and
+``smoothing`` (N,) where there is a smoothing filter."""
+
+ORIGIN = ("origin_x", "origin_y", "origin_z")
+"""Names in ``rendered_with``: world coordinates that the means are relative to."""
+
+MAX_ORIGIN = 1e12
+"""World units."""
 
 Z_TO_Y = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
-"""From our worlds, where datasets have z up, to files of formats that have y up: x' = R x."""
+"""Rotation from our worlds, in which z is up, to files in which y is up: x' = R x."""
 
 
-@dataclass(frozen=True)
-class Format:
-    """One of them."""
+class FileFormat:
+    """Base class of file formats: class attributes state what a file can hold.
 
-    name: str  # as options have it
-    suffix: str  # of files, in small letters
-    module: str  # reads and writes it
-    text: str  # what it is, one phrase
-    y_up: bool = False  # whether y is up, as the format is specified; None of the others says
-    has_harmonics: bool = True  # above degree 0
-    has_smoothing: bool = False  # the filter of each Gaussian
-    keeps: frozenset[str] | None = None  # what it can say of rendering, by name; None: everything
-    any_number: bool = False  # whether what is no finite number is written as it is
+    ``rendered_with`` contains by name the approximations that Gaussians are to be rendered with
+    (:class:`drgs.config.approximations.Approximations`), and their origin (:data:`ORIGIN`) if it is
+    not the world's.
+    """
 
-    @property
-    def has_origin(self) -> bool:
-        """True where the format can record what means are relative to."""
-        return self.keeps is None
+    suffix: str
+    """End of file names, in small letters, such as ``.npz``."""
 
-    def encode(
-        self, gaussians: Mapping[str, np.ndarray], rendered_with: Mapping[str, Scalar] | None
-    ) -> bytes:
-        """A file of Gaussians; equal ones give equal bytes. What has no room is left out.
+    description: str
+    """One phrase, for help texts."""
 
-        gaussians: by the names of the fields of ``Gaussians``, in the axes of the file.
+    up: str | None = None
+    """Axis that the format defines as up, ``"y"`` or ``"z"``; None: it defines none."""
 
-        Raises :class:`UserError` where the format cannot hold them.
+    has_harmonics = True
+    """Harmonics above degree 0 are kept."""
+
+    has_smoothing = False
+    """The smoothing filter of each Gaussian is kept."""
+
+    allows_nonfinite = False
+    """Numbers that are not finite are written as they are."""
+
+    metadata: frozenset[str] | None = frozenset()
+    """Names of ``rendered_with`` that files hold; None: all. The user is told of others."""
+
+    def recognizes(self, path: Path) -> bool:
+        """Return whether the content is of this format; asked where several share a suffix."""
+        return True
+
+    def read(self, path: Path) -> tuple[Arrays, Mapping[str, Scalar]]:
+        """Return the Gaussians of a file, in its axes, and their ``rendered_with``."""
+        raise UserError(f"{path}: files of this format can be written, but not read")
+
+    def encode(self, gaussians: Arrays, rendered_with: Mapping[str, Scalar]) -> bytes:
+        """Return the content of a file; equal Gaussians give equal bytes.
+
+        gaussians: in the axes of the file; rendered_with: only what :attr:`metadata` names.
         """
-        if "smoothing" in gaussians and not self.has_smoothing:
-            raise UserError(
-                f"the format {self.name} has no room for the smoothing of Gaussians: bake it into "
-                "them first, with drgs.effects.smoothing.baked or drgs export"
-            )
-        if not self.any_number:
-            check_finite(gaussians, self.name)
-        said = {
-            name: value
-            for name, value in (rendered_with or {}).items()
-            if self.keeps is None or name in self.keeps
-        }
-        return import_module(self.module).encode(gaussians, said)
+        raise UserError("files of this format can be read, but not written")
 
-    def unsaid(self, rendered_with: Mapping[str, Scalar] | None) -> dict[str, Scalar]:
-        """What the format cannot say of how Gaussians are rendered."""
-        said = rendered_with or {}
-        return {k: v for k, v in said.items() if self.keeps is not None and k not in self.keeps}
+    def __init_subclass__(cls) -> None:
+        """Raise TypeError for a format without a suffix or a description."""
+        if not getattr(cls, "suffix", "").startswith(".") or cls.suffix != cls.suffix.lower():
+            raise TypeError(f"{cls.__name__}.suffix must be a suffix in small letters, as .npz")
+        if not getattr(cls, "description", ""):
+            raise TypeError(f"{cls.__name__}.description must be a phrase for help texts")
+
+    @classmethod
+    def holds(cls, name: str) -> bool:
+        """Return whether files hold this value of ``rendered_with``."""
+        return cls.metadata is None or name in cls.metadata
 
 
-FORMATS = (
-    Format(
-        "ply",
-        ".ply",
-        "drgs.io.ply",
-        "the 3DGS reference's PLY, which every program reads",
-        has_smoothing=True,
-        any_number=True,
-    ),
-    Format(
-        "compressed-ply",
-        ".compressed.ply",
-        "drgs.io.compressed_ply",
-        "PlayCanvas's compressed PLY, for SuperSplat and PlayCanvas",
-    ),
-    Format(
-        "spz",
-        ".spz",
-        "drgs.io.spz",
-        "Niantic's SPZ, the smallest",
-        y_up=True,
-        keeps=frozenset({"antialiased"}),
-    ),
-    Format(
-        "glb",
-        ".glb",
-        "drgs.io.glb",
-        "binary glTF with KHR_gaussian_splatting, in full precision",
-        y_up=True,
-    ),
-    Format(
-        "splat",
-        ".splat",
-        "drgs.io.splat",
-        "antimatter15's .splat, for old viewers: no harmonics",
-        has_harmonics=False,
-        keeps=frozenset(),
-    ),
+FORMATS: Registry[type[FileFormat]] = Registry(
+    "file format",
+    {
+        "ply": "drgs.io.ply",
+        "compressed-ply": "drgs.io.compressed_ply",
+        "spz": "drgs.io.spz",
+        "glb": "drgs.io.glb",
+        "splat": "drgs.io.splat",
+        "usd": "drgs.io.usd",
+    },
 )
-"""All that are read and written."""
+
+OTHER_FORMATS = (
+    f'other formats come with packages that have an entry point of the group "{ENTRY_POINT_GROUP}"'
+)
+"""Remedy in messages."""
 
 
-def format_named(name: str) -> Format:
-    """The format of that name, which must be one of :data:`FORMATS`."""
-    return next(each for each in FORMATS if each.name == name)
+def file_formats() -> list[Extension[type[FileFormat]]]:
+    """Return all formats, by name."""
+    return [FORMATS.get(name) for name in FORMATS.names()]
 
 
-def format_of(path: str | Path) -> Format | None:
-    """The format that a file's name says; None: no known one."""
-    name = Path(path).name.lower()
-    found = [each for each in FORMATS if name.endswith(each.suffix)]
-    return max(found, key=lambda each: len(each.suffix), default=None)
+def readable_formats() -> list[Extension[type[FileFormat]]]:
+    """Return the formats whose files can be read."""
+    return [each for each in file_formats() if each.value.read is not FileFormat.read]
+
+
+def format_for(path: str | Path) -> Extension[type[FileFormat]] | None:
+    """Return the format with the longest suffix that a file's name ends in; None: there is none.
+
+    Of several with one suffix, it is the one that drgs ships.
+    """
+    name, installed = Path(path).name.lower(), FORMATS.installed()
+    found = [each for each in file_formats() if name.endswith(each.value.suffix)]
+    order = {each.name: (len(each.value.suffix), each not in installed) for each in found}
+    return max(found, key=lambda each: order[each.name], default=None)
 
 
 def read_gaussians(
     path: str | Path,
-) -> tuple[Format, dict[str, np.ndarray], dict[str, Scalar]]:
-    """The format of a file, its Gaussians as numpy float32 arrays, and what they are rendered with.
+) -> tuple[Extension[type[FileFormat]], dict[str, np.ndarray], dict[str, Scalar]]:
+    """Return a file's format, its Gaussians in the axes of the file, and their ``rendered_with``.
 
-    A name that says no known format is that of a PLY file. Of PLY files, the content says whether
-    they are compressed.
+    A file with an unknown suffix is read as PLY. Where formats share the last part of a suffix, the
+    content decides.
 
     Raises :class:`UserError` naming the file, the place and what is wrong there.
     """
-    found = format_of(path) or format_named("ply")
-    if found.suffix.endswith(".ply"):
-        from drgs.io.compressed_ply import is_compressed
+    open_regular(path).close()
+    named = format_for(path) or FORMATS.get("ply")
+    last = "." + named.value.suffix.rpartition(".")[2]
+    others = [each for each in file_formats() if each.value.suffix.endswith(last)]
+    for extension in (named, *(each for each in others if each is not named)):
+        with _reporting(extension, path):
+            if not extension.value().recognizes(Path(path)):
+                continue
+            arrays, rendered_with = extension.value().read(Path(path))
+            return extension, _checked(path, arrays), dict(rendered_with)
+    raise UserError(f"{path}: not a {named.name} file")
 
-        found = format_named("compressed-ply" if is_compressed(path) else "ply")
-    return found, *import_module(found.module).read_gaussians(path)
 
+def encode(
+    name: str, gaussians: Arrays, rendered_with: Mapping[str, Scalar] | None = None
+) -> bytes:
+    """Return the content of a file in the format ``name``; what it cannot hold is left out.
 
-def check_finite(gaussians: Mapping[str, np.ndarray], name: str) -> None:
-    """Refuse what formats have no code for: what is not finite, and nothing at all.
+    gaussians, rendered_with: as for :meth:`FileFormat.encode`.
 
-    gaussians: by the names of the fields of ``Gaussians``; name: of the format.
+    Raises :class:`UserError` where the format cannot hold the Gaussians.
     """
-    if not len(gaussians["means"]):
-        raise UserError(f"the format {name} needs at least one Gaussian, got none")
+    extension = FORMATS.get(name)
+    if "smoothing" in gaussians and not extension.value.has_smoothing:
+        raise UserError(
+            f"the format {name} has no room for the smoothing of Gaussians: bake it into them "
+            "first, with drgs.effects.smoothing.baked or drgs export"
+        )
+    if not extension.value.allows_nonfinite:
+        if not len(gaussians["means"]):
+            raise UserError(f"the format {name} needs at least one Gaussian, got none")
+        _check_finite(gaussians, f"the format {name} holds finite numbers: ")
+    kept = {k: v for k, v in (rendered_with or {}).items() if extension.value.holds(k)}
+    with extension.reporting():
+        return extension.value().encode(gaussians, kept)
+
+
+@contextmanager
+def _reporting(extension: Extension[Any], path: str | Path) -> Iterator[None]:
+    """Raise errors of the block with the name of the extension and that of the file."""
+    try:
+        with extension.reporting():
+            yield
+    except ExtensionError as error:
+        raise ExtensionError(f"{path}: {error}") from error.__cause__
+
+
+def _checked(path: str | Path, arrays: Arrays) -> dict[str, np.ndarray]:
+    """Return what a format has read as float32; raise ValueError where it is not :data:`Arrays`."""
+    if set(arrays) - {"smoothing"} != set(SHAPES) - {"smoothing"}:
+        raise ValueError(f"arrays must be {', '.join(SHAPES)}, got {', '.join(arrays)}")
+    num = len(arrays["means"])
+    for name, values in arrays.items():
+        expected = [(num, *shape) for shape in SHAPES[name]]
+        if not num or np.shape(values) not in expected:
+            listed = " or ".join(map(str, SHAPES[name]))
+            raise ValueError(f"{name}: {listed} per Gaussian expected, got {np.shape(values)}")
+    found = {name: np.asarray(values, np.float32) for name, values in arrays.items()}
+    _check_finite(found, f"{path}: numbers must be finite: ")
+    return found
+
+
+def _check_finite(gaussians: Arrays, start: str) -> None:
     for field, values in gaussians.items():
         bad = np.argwhere(~np.isfinite(values))
         if len(bad):
             raise UserError(
-                f"the format {name} holds finite numbers: {field} of Gaussian {bad[0][0]} is "
-                f"{values[tuple(bad[0])]}; remove it"
+                f"{start}{field} of Gaussian {bad[0][0]} is {values[tuple(bad[0])]}; remove it"
             )
+
+
+def pop_origin(path: str | Path, rendered_with: dict[str, Scalar]) -> Origin:
+    """Remove the coordinates of the origin from ``rendered_with``, and return them.
+
+    Raises :class:`UserError` where some are missing, or are no numbers.
+    """
+    values = [rendered_with.pop(name, None) for name in ORIGIN]
+    if values == [None, None, None]:
+        return WORLD
+    if not all(type(value) in (int, float) and abs(value) <= MAX_ORIGIN for value in values):
+        got = ", ".join("nothing" if value is None else str(value) for value in values)
+        raise UserError(
+            f"{path}: {', '.join(ORIGIN)} must be three numbers of at most {MAX_ORIGIN:g} in size, "
+            f"got {one_line(got, 80)}; correct the header, or remove them"
+        )
+    x, y, z = map(float, values)
+    return x, y, z

@@ -14,7 +14,6 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import imageio.v3 as iio
 import numpy as np
 from PIL import ExifTags, Image, ImageCms, UnidentifiedImageError
 
@@ -303,7 +302,7 @@ def _opened(path: Path) -> Iterator[Image.Image]:
         raise UserError(f"{path}: cannot read the image: {reason}") from None
 
 
-# Writing: by imageio, but for the palette that all frames of a GIF share
+# Writing
 
 
 def to_uint8(image: np.ndarray) -> np.ndarray:
@@ -329,9 +328,17 @@ def write_exr(path: Path, bitmap: mi.Bitmap) -> None:
 
 
 def encode(image: np.ndarray, suffix: str, **options: float) -> bytes:
-    """The picture as a file with ``suffix``, png or webp; options: of Pillow's writer."""
+    """Return a file with ``suffix``, png or webp, of an image or the frames of an animation.
+
+    options: of Pillow's writer.
+    """
     pixels = image if image.dtype == np.uint8 else to_uint8(image)
-    return iio.imwrite("<bytes>", pixels, extension=f".{suffix}", plugin="pillow", **options)
+    first, *rest = map(Image.fromarray, pixels if pixels.ndim == 4 else [pixels])
+    if rest:
+        options |= {"save_all": True, "append_images": rest}
+    content = io.BytesIO()
+    first.save(content, suffix, **options)
+    return content.getvalue()
 
 
 def check_animation(frames: int, width: int, height: int) -> None:

@@ -25,11 +25,12 @@ from __future__ import annotations
 import io
 import re
 import warnings
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Collection, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
-from typing import IO, TypeVar
+from typing import IO
 
 import numpy as np
 from plyfile import PlyData, PlyElement, PlyListProperty
@@ -37,8 +38,9 @@ from plyfile import PlyData, PlyElement, PlyListProperty
 from drgs.core.errors import UserError, UserNote, listed, one_line
 from drgs.core.files import open_regular
 from drgs.core.memory import require_memory
-from drgs.core.origin import WORLD, Origin, near_origin
-from drgs.io.quantized import LARGEST_LOGIT, SMALLEST_LOGIT
+from drgs.core.origin import WORLD, near_means
+from drgs.io.formats import FORMATS, ORIGIN, FileFormat, Scalar, pop_origin
+from drgs.io.quantization import LARGEST_LOGIT, SMALLEST_LOGIT
 
 POSITION = ("x", "y", "z")
 NORMAL = ("nx", "ny", "nz")
@@ -49,12 +51,6 @@ ROTATION = ("rot_0", "rot_1", "rot_2", "rot_3")
 SMOOTHING = ("filter_3D",)
 COLOR = ("red", "green", "blue")
 
-ORIGIN = ("origin_x", "origin_y", "origin_z")
-"""In comments: world coordinates of what positions are relative to."""
-
-MAX_ORIGIN = 1e12
-"""World units."""
-
 NUM_REST = {3 * ((degree + 1) ** 2 - 1): degree for degree in range(4)}
 """Number of ``f_rest`` properties -> degree: 0, 9, 24, 45 -> 0, 1, 2, 3."""
 
@@ -63,8 +59,6 @@ ROWS_AND_COPIES = 3
 
 MAX_HEADER_BYTES = 1 << 20
 """The header of 62 properties takes 1.5 kB; the rest is room for comments."""
-
-Scalar = bool | int | float | str
 
 STATEMENT = re.compile(r"drgs ([a-z][a-z_]{0,39}) ([!-~]{1,40})")
 """A comment of ours: a name and its value. Others are somebody else's."""
@@ -169,7 +163,7 @@ def _statement(name: str, value: Scalar) -> str:
 
 
 def _statements(path: str | Path, lines: list[bytes]) -> dict[str, Scalar]:
-    """What the comments of a header say; lines: of the header."""
+    """Return the values in the comments of a header; lines: of the header."""
     found: dict[str, str] = {}
     for line in lines:
         match = STATEMENT.fullmatch(
@@ -208,7 +202,7 @@ def read_points(path: str | Path) -> tuple[np.ndarray, np.ndarray | None]:
     """
     vertex, statements = _read_vertices(path)
     _require(path, vertex, POSITION, "points")
-    positions = _columns(vertex, POSITION, np.float64) + origin_among(path, statements)
+    positions = _columns(vertex, POSITION, np.float64) + pop_origin(path, statements)
     if not set(COLOR) <= set(vertex.dtype.names):
         return positions, None
     _require(path, vertex, COLOR, "coloured points")
@@ -227,58 +221,53 @@ def read_points(path: str | Path) -> tuple[np.ndarray, np.ndarray | None]:
 
 
 def properties_of(path: str | Path) -> dict[str, tuple[str, ...]]:
-    """Names of the properties of each element, as the header has them.
+    """Return the names of the properties of each element, as the header has them.
 
     Raises :class:`UserError` as :func:`read_gaussians` does for a header.
     """
-
-    def names(file: IO[bytes], layout: _Layout) -> dict[str, tuple[str, ...]]:
+    with _opened(path) as (_, layout):
         return {e.name: tuple(p.name for p in e.properties) for e in layout.elements}
 
-    return _read(path, names)
+
+def has_packed_vertices(path: str | Path) -> bool:
+    """Return whether a PLY file is one of :mod:`drgs.io.compressed_ply`.
+
+    Raises :class:`UserError` as :func:`properties_of` does.
+    """
+    elements = properties_of(path)
+    return "chunk" in elements and "packed_position" in elements["vertex"]
 
 
 def read_elements(
     path: str | Path, names: Collection[str]
 ) -> tuple[dict[str, np.ndarray], dict[str, Scalar]]:
-    """The rows of some elements of a binary file, and what the header's comments say.
+    """Return the rows of some elements of a binary file, and the values in the header's comments.
 
     names: of elements that are there, among them ``vertex``. The rows are structured arrays of
     numbers.
 
     Raises :class:`UserError` as :func:`read_gaussians` does, and for a text file.
     """
-
-    def rows(file: IO[bytes], layout: _Layout) -> tuple[dict[str, np.ndarray], dict[str, Scalar]]:
+    with _opened(path) as (file, layout):
         if layout.text:
             raise UserError(f"{path}: the file must be binary, got text; convert it")
         return _rows(path, file, layout, names), layout.statements
 
-    return _read(path, rows)
-
 
 def _read_vertices(path: str | Path) -> tuple[np.ndarray, dict[str, Scalar]]:
-    """The rows of element ``vertex``, at least one, and what the header's comments say.
-
-    The rows are a structured array of numbers.
-    """
-
-    def rows(file: IO[bytes], layout: _Layout) -> tuple[np.ndarray, dict[str, Scalar]]:
+    """Return the rows of element ``vertex``, at least one, and the values in the comments."""
+    with _opened(path) as (file, layout):
         if layout.text:
             return _text_rows(path, file, layout), layout.statements
         return _rows(path, file, layout, ["vertex"])["vertex"], layout.statements
 
-    return _read(path, rows)
 
-
-T = TypeVar("T")
-
-
-def _read(path: str | Path, read: Callable[[IO[bytes], _Layout], T]) -> T:
-    """What ``read`` makes of the file and its header; whatever fails is a :class:`UserError`."""
+@contextmanager
+def _opened(path: str | Path) -> Iterator[tuple[IO[bytes], _Layout]]:
+    """Open a file and read its header; whatever fails in the block becomes a :class:`UserError`."""
     try:
         with open_regular(path) as file:
-            return read(file, _read_layout(path, file))
+            yield file, _read_layout(path, file)
     except (UserError, MemoryError):
         raise
     except OSError as error:
@@ -290,7 +279,7 @@ def _read(path: str | Path, read: Callable[[IO[bytes], _Layout], T]) -> T:
 
 @dataclass(frozen=True)
 class _Layout:
-    """What a header says. The elements have no rows; ``counts`` says how many are promised."""
+    """Content of a header. The elements have no rows; ``counts`` has their promised numbers."""
 
     elements: tuple[PlyElement, ...]
     counts: tuple[int, ...]
@@ -375,7 +364,7 @@ def _lists(element: PlyElement) -> list[str]:
 def _rows(
     path: str | Path, file: IO[bytes], layout: _Layout, names: Collection[str]
 ) -> dict[str, np.ndarray]:
-    """Of some elements of a binary file. What stands behind an element with lists is not read."""
+    """Read some elements of a binary file. What follows an element with lists is not read."""
     position, places = layout.start, {}
     for element, count in zip(layout.elements, layout.counts, strict=True):
         if _lists(element):  # behind the vertices: where these end, nobody knows
@@ -403,7 +392,7 @@ def _rows(
 
 
 def _text_rows(path: str | Path, file: IO[bytes], layout: _Layout) -> np.ndarray:
-    """Of a text file, where each row is a line."""
+    """Read the vertices of a text file, in which each row is a line."""
     file.seek(layout.start)
     lines = io.TextIOWrapper(file, "ascii")
     rows = None
@@ -443,19 +432,15 @@ def _check_end(path: str | Path, layout: _Layout, more: int) -> None:
 
 
 def _finite_logits(path: str | Path, logits: np.ndarray) -> np.ndarray:
-    """With infinite ones at the ends of what sigmoids in float32 tell apart."""
-    count = np.count_nonzero(np.isinf(logits))
-    if count:
-        warnings.warn(
-            UserNote(
-                f"{path}: {count:,} of {len(logits):,} opacities are infinite logits, as formats "
-                f"of 8 bits leave them for 1 and 0; read as {LARGEST_LOGIT:.2f} and "
-                f"{SMALLEST_LOGIT:.2f}"
-            ),
-            stacklevel=2,
+    """Logits with infinite ones at the ends of what sigmoids in float32 tell apart."""
+    if count := np.count_nonzero(np.isinf(logits)):
+        note = (
+            f"{path}: {count:,} of {len(logits):,} opacities are infinite logits, as formats of 8 "
+            f"bits leave them for 1 and 0; read as {LARGEST_LOGIT:.2f} and {SMALLEST_LOGIT:.2f}"
         )
+        warnings.warn(UserNote(note), stacklevel=2)
     ends = {"posinf": np.float32(LARGEST_LOGIT), "neginf": np.float32(SMALLEST_LOGIT)}
-    return np.nan_to_num(logits, copy=False, nan=np.nan, **ends)
+    return np.nan_to_num(logits, nan=np.nan, **ends)
 
 
 def _require(
@@ -491,35 +476,6 @@ def _rest(num_rest: int) -> tuple[str, ...]:
     return tuple(f"f_rest_{i}" for i in range(num_rest))
 
 
-def origin_among(path: str | Path, statements: dict[str, Scalar]) -> Origin:
-    """Take the coordinates of the origin out of a header's statements.
-
-    Raises :class:`UserError` where some are missing, or are no numbers.
-    """
-    values = [statements.pop(name, None) for name in ORIGIN]
-    if values == [None, None, None]:
-        return WORLD
-    if not all(type(value) in (int, float) and abs(value) <= MAX_ORIGIN for value in values):
-        got = ", ".join("nothing" if value is None else str(value) for value in values)
-        raise UserError(
-            f"{path}: {', '.join(ORIGIN)} must be three numbers of at most {MAX_ORIGIN:g} in size, "
-            f"got {one_line(got, 80)}; correct the header, or remove them"
-        )
-    x, y, z = map(float, values)
-    return x, y, z
-
-
-def near_means(means: np.ndarray) -> tuple[np.ndarray, Origin]:
-    """Positions (N, 3) float64, and the origin that they are relative to.
-
-    means: (N, 3) float64, world, relative to another origin than the world's where most of them
-    are far away from that.
-    """
-    middle = np.median(means, axis=0)
-    origin = near_origin(middle, float(np.median(np.linalg.norm(means - middle, axis=1))))
-    return means - origin, origin
-
-
 def _columns(vertex: np.ndarray, names: tuple[str, ...], kind: type = np.float32) -> np.ndarray:
     """(N, len(names)) of a float type, a copy."""
     rows = np.empty((len(vertex), len(names)), kind)
@@ -527,3 +483,20 @@ def _columns(vertex: np.ndarray, names: tuple[str, ...], kind: type = np.float32
         for column, name in enumerate(names):
             rows[:, column] = vertex[name]
     return rows
+
+
+@FORMATS.register("ply")
+class Ply(FileFormat):
+    """The 3DGS reference's PLY."""
+
+    suffix = ".ply"
+    description = "the 3DGS reference's PLY, which every program reads"
+    has_smoothing = True
+    allows_nonfinite = True
+    metadata = None
+    read = staticmethod(read_gaussians)
+    encode = staticmethod(encode)
+
+    def recognizes(self, path: Path) -> bool:
+        """Return whether the vertices are not packed."""
+        return not has_packed_vertices(path)

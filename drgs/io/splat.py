@@ -17,21 +17,21 @@ from drgs.core.constants import SH_C0
 from drgs.core.errors import Place, UserError
 from drgs.core.files import read_bytes
 from drgs.core.memory import require_memory
-from drgs.io.ply import Scalar
-from drgs.io.quantized import (
-    gaussians_bytes,
-    log_scales_of,
-    logits_of,
-    opacities_of,
-    rounded,
-    unit_quaternions,
+from drgs.io.formats import FORMATS, FileFormat, Scalar
+from drgs.io.quantization import (
+    decoding_bytes,
+    log_scales_from_scales,
+    logits_from_opacities,
+    normalize_quaternions,
+    opacities_from_logits,
+    round_to_uint32,
 )
 
 MAX_BYTES = 1 << 33
-"""Of a file: 8.6 GB."""
+"""Largest file: 8.6 GB."""
 
 MAX_NUMBER = 1e12
-"""Of a position or scale, in size: letters, read as numbers, are larger. There is no other sign by
+"""Largest position or scale: letters, read as numbers, are larger. There is no other sign by
 which a file of another kind could be told."""
 
 ROW = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("quat", "u1", 4)])
@@ -54,15 +54,15 @@ def encode(
             f"the format splat holds positions of at most {MAX_NUMBER:g}, got {extent:g}; crop or "
             "scale the scene"
         )
-    opacities = opacities_of(g["logit_opacities"])
+    opacities = opacities_from_logits(g["logit_opacities"])
     log_scales = g["log_scales"].astype(np.float64)
     importance = log_scales.sum(axis=1) + np.log(opacities)
     rows = np.empty(len(opacities), ROW)
     rows["mean"] = g["means"]
     rows["scale"] = np.exp(np.minimum(log_scales, np.log(MAX_NUMBER))).astype(np.float32)
     colors = 0.5 + SH_C0 * g["sh0"][:, 0].astype(np.float64)
-    rows["rgba"] = rounded(np.column_stack([colors, opacities]) * 255, 255)
-    rows["quat"] = rounded(unit_quaternions(g["quats"]) * 128 + 128, 255)
+    rows["rgba"] = round_to_uint32(np.column_stack([colors, opacities]) * 255, 255)
+    rows["quat"] = round_to_uint32(normalize_quaternions(g["quats"]) * 128 + 128, 255)
     return rows[np.argsort(-importance, kind="stable")].tobytes()
 
 
@@ -82,7 +82,7 @@ def read_gaussians(path: str | Path) -> tuple[dict[str, np.ndarray], dict[str, S
             "each Gaussian, at least one; it is damaged, or was cut off"
         )
     rows = np.frombuffer(content, ROW)
-    require_memory(path, gaussians_bytes(len(rows), 1), f"a scene of {len(rows):,} Gaussians")
+    require_memory(path, decoding_bytes(len(rows), 1), f"a scene of {len(rows):,} Gaussians")
     for name, least in (("mean", -MAX_NUMBER), ("scale", 0)):
         values = rows[name]
         bad = np.argwhere(~((values >= least) & (values <= MAX_NUMBER)))
@@ -97,9 +97,20 @@ def read_gaussians(path: str | Path) -> tuple[dict[str, np.ndarray], dict[str, S
     arrays = {
         "means": rows["mean"],
         "quats": rows["quat"].astype(np.float64) / 128 - 1,
-        "log_scales": log_scales_of(rows["scale"]),
-        "logit_opacities": logits_of(rows["rgba"][:, 3] / 255),
+        "log_scales": log_scales_from_scales(rows["scale"]),
+        "logit_opacities": logits_from_opacities(rows["rgba"][:, 3] / 255),
         "sh0": ((colors - 0.5) / SH_C0)[:, None, :],
         "shN": np.zeros((len(rows), 0, 3)),
     }
     return {name: values.astype(np.float32) for name, values in arrays.items()}, {}
+
+
+@FORMATS.register("splat")
+class Splat(FileFormat):
+    """antimatter15's format."""
+
+    suffix = ".splat"
+    description = "antimatter15's .splat, for old viewers: no harmonics"
+    has_harmonics = False
+    read = staticmethod(read_gaussians)
+    encode = staticmethod(encode)

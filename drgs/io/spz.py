@@ -22,6 +22,7 @@ A flag says that Gaussians were fitted with compensated opacities, ``antialiased
 from __future__ import annotations
 
 import gzip
+import io
 import struct
 import warnings
 import zlib
@@ -31,23 +32,23 @@ from pathlib import Path
 
 import numpy as np
 
-from drgs.core.errors import Place, UserError, UserNote
-from drgs.core.extras import required
+from drgs.core.environment import required
+from drgs.core.errors import Place, UserError, UserNote, one_line
 from drgs.core.files import read_bytes
 from drgs.core.memory import require_memory
-from drgs.io.ply import Scalar
-from drgs.io.quantized import (
-    gaussians_bytes,
-    logits_of,
-    opacities_of,
-    rounded,
-    unit_quaternions,
-    with_largest,
-    without_largest,
+from drgs.io.formats import FORMATS, FileFormat, Scalar
+from drgs.io.quantization import (
+    decoding_bytes,
+    drop_largest_component,
+    logits_from_opacities,
+    normalize_quaternions,
+    opacities_from_logits,
+    restore_largest_component,
+    round_to_uint32,
 )
 
 MAX_BYTES = 1 << 32
-"""Of a file: 4.3 GB, more than 60 million Gaussians."""
+"""Largest file: 4.3 GB, more than 60 million Gaussians."""
 
 MAGIC = b"NGSP"
 GZIP_MAGIC = b"\x1f\x8b"
@@ -111,9 +112,9 @@ def encode(
     flags = ANTIALIASED if (rendered_with or {}).get("antialiased") else 0
     parts = (
         _packed_positions(g["means"], bits),
-        rounded(opacities_of(g["logit_opacities"]) * 255, 255),
-        rounded((g["sh0"].astype(np.float64) * COLOR_SCALE + 0.5) * 255, 255),
-        rounded((g["log_scales"].astype(np.float64) - LOG_SCALE_LOW) * SCALE_STEPS, 255),
+        round_to_uint32(opacities_from_logits(g["logit_opacities"]) * 255, 255),
+        round_to_uint32((g["sh0"].astype(np.float64) * COLOR_SCALE + 0.5) * 255, 255),
+        round_to_uint32((g["log_scales"].astype(np.float64) - LOG_SCALE_LOW) * SCALE_STEPS, 255),
         _packed_rotations(g["quats"]),
         _packed_harmonics(g["shN"]),
     )
@@ -160,8 +161,8 @@ def _packed_positions(means: np.ndarray, bits: int) -> np.ndarray:
 
 def _packed_rotations(quats: np.ndarray) -> np.ndarray:
     """(N, 4) bytes, the lowest first."""
-    index, others = without_largest(unit_quaternions(quats)[:, XYZW])
-    sizes = rounded(np.abs(others) * np.sqrt(2) * QUATERNION_LEVELS, QUATERNION_LEVELS)
+    index, others = drop_largest_component(normalize_quaternions(quats)[:, XYZW])
+    sizes = round_to_uint32(np.abs(others) * np.sqrt(2) * QUATERNION_LEVELS, QUATERNION_LEVELS)
     word = index.astype(np.uint32)
     for size, negative in zip(sizes.T, (others < 0).T, strict=True):
         word = word << np.uint32(10) | negative.astype(np.uint32) << np.uint32(9) | size
@@ -185,7 +186,7 @@ def _packed_harmonics(sh: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class _Header:
-    """What stands before the numbers."""
+    """Content of the header, before the numbers."""
 
     version: int
     num: int
@@ -236,7 +237,7 @@ def _decoded(header: _Header, parts: list[np.ndarray]) -> dict[str, np.ndarray]:
         "means": _unpacked_positions(positions) / 2.0**header.fractional_bits,
         "quats": _unpacked_rotations(rotations, header.version),
         "log_scales": scales / SCALE_STEPS + LOG_SCALE_LOW,
-        "logit_opacities": logits_of(opacities[:, 0] / 255),
+        "logit_opacities": logits_from_opacities(opacities[:, 0] / 255),
         "sh0": ((colors / 255 - 0.5) / COLOR_SCALE)[:, None, :],
         "shN": (harmonics.astype(np.float32).reshape(header.num, -1, 3) - 128) / 128,
     }
@@ -260,7 +261,7 @@ def _unpacked_rotations(rows: np.ndarray, version: int) -> np.ndarray:
     fields = words[:, None] >> np.array([20, 10, 0], np.uint32)
     sizes = (fields & np.uint32(QUATERNION_LEVELS)) / (QUATERNION_LEVELS * np.sqrt(2))
     others = np.where(fields & np.uint32(512), -sizes, sizes)
-    xyzw = with_largest((words >> np.uint32(30)).astype(np.intp), others)
+    xyzw = restore_largest_component((words >> np.uint32(30)).astype(np.intp), others)
     return xyzw[:, np.argsort(XYZW)]
 
 
@@ -283,7 +284,7 @@ def _checked_header(path: Path, fields: tuple, versions: tuple[int, ...]) -> _He
 
 
 def _check_room(path: Path, header: _Header, size: int) -> None:
-    """Before memory is allocated for what the header promises."""
+    """Refuse what the header promises before memory is allocated for it."""
     unpacked = sum(header.sizes)
     if unpacked > MAX_RATIO * size:
         raise UserError(
@@ -291,65 +292,36 @@ def _check_room(path: Path, header: _Header, size: int) -> None:
             f"when unpacked, for which a file of {size:,} bytes has no room: at most {MAX_RATIO} "
             "times as many; it is damaged, or was cut off"
         )
-    needed = gaussians_bytes(header.num, (header.degree + 1) ** 2, turned=True)
+    needed = decoding_bytes(header.num, (header.degree + 1) ** 2, turned=True)
     require_memory(path, needed, f"a scene of {header.num:,} Gaussians")
 
 
 def _read_gzip(path: Path, content: bytes) -> tuple[_Header, list[np.ndarray]]:
-    """Versions 2 and 3."""
-    stream = _GzipStream(path, content)
-    header = _checked_header(path, HEADER.unpack(stream.take(HEADER.size)), (2, 3))
-    expected = sum(header.sizes)
-    _check_room(path, header, len(content))
-    body = stream.take(expected)
-    stream.check_end(more_may_follow=bool(header.flags & EXTENSIONS))
-    cuts = np.cumsum(header.sizes)[:-1]
-    return header, np.split(np.frombuffer(body, np.uint8), cuts)
+    """Read versions 2 and 3."""
+    with gzip.open(io.BytesIO(content)) as stream:
+        header = _checked_header(path, HEADER.unpack(_take(path, stream, HEADER.size)), (2, 3))
+        _check_room(path, header, len(content))
+        body = _take(path, stream, sum(header.sizes))
+        most = MAX_EXTENSIONS if header.flags & EXTENSIONS else 0
+        _take(path, stream, 0, most)  # to the end, where the checksum is
+    return header, np.split(np.frombuffer(body, np.uint8), np.cumsum(header.sizes)[:-1])
 
 
-class _GzipStream:
-    """Unpacked from its beginning to its end, no more than is asked for at a time."""
-
-    def __init__(self, path: Path, content: bytes) -> None:
-        self._path, self._rest, self._at = path, content, 0
-        self._unpack = zlib.decompressobj(wbits=16 + zlib.MAX_WBITS)
-
-    @property
-    def _place(self) -> str:
-        return f"{Place(self._path, 'byte', self._at)} of the unpacked stream"
-
-    def _next(self, most: int) -> bytes:
-        """At most so many bytes, fewer only at the end."""
-        try:
-            data = self._unpack.decompress(self._rest, most)
-        except zlib.error as error:
-            raise UserError(f"{self._place}: the gzip stream is damaged: {error}") from None
-        self._rest = self._unpack.unconsumed_tail
-        return data
-
-    def take(self, size: int) -> bytes:
-        """The next ``size`` bytes."""
-        data = self._next(size) if size else b""
-        if len(data) < size:
-            raise UserError(
-                f"{self._place}: {size:,} bytes were expected, and it ends after {len(data):,}; "
-                "the file is damaged, or was cut off"
-            )
-        self._at += size
-        return data
-
-    def check_end(self, more_may_follow: bool) -> None:
-        """Read on to the end, where the checksum is."""
-        last = self._at + (MAX_EXTENSIONS if more_may_follow else 0)
-        while data := self._next(1 << 20):
-            self._at += len(data)
-            if self._at > last:
-                raise UserError(f"{self._place}: the end was expected, and more follows")
-        if not self._unpack.eof or self._unpack.unused_data:
-            raise UserError(
-                f"{self._place}: the file must end with the stream's checksum; it is damaged, or "
-                "was cut off"
-            )
+def _take(path: Path, stream: gzip.GzipFile, size: int, end: int | None = None) -> bytes:
+    """Return the next ``size`` bytes; end: most bytes that may follow, None: any number."""
+    place = f"{Place(path, 'byte', stream.tell())} of the unpacked stream"
+    try:
+        data = stream.read(size if end is None else size + end + 1)
+    except (OSError, EOFError, zlib.error) as error:
+        raise UserError(f"{place}: the gzip stream is damaged: {one_line(error)}") from None
+    if len(data) < size:
+        raise UserError(
+            f"{place}: {size:,} bytes were expected, and it ends after {len(data):,}; the file is "
+            "damaged, or was cut off"
+        )
+    if end is not None and len(data) > size + end:
+        raise UserError(f"{place}: the end was expected, and more follows")
+    return data
 
 
 def _read_streams(path: Path, content: bytes) -> tuple[_Header, list[np.ndarray]]:
@@ -402,3 +374,15 @@ def _unpacked_stream(path: Path, start: int, packed: bytes, expected: int) -> np
     if len(data) != expected:
         raise UserError(f"{place}: {expected:,} bytes were expected, got {len(data):,}")
     return np.frombuffer(data, np.uint8)
+
+
+@FORMATS.register("spz")
+class Spz(FileFormat):
+    """Niantic's SPZ."""
+
+    suffix = ".spz"
+    description = "Niantic's SPZ, the smallest"
+    up = "y"
+    metadata = frozenset({"antialiased"})
+    read = staticmethod(read_gaussians)
+    encode = staticmethod(encode)

@@ -14,11 +14,11 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
+from drgs.core.environment import required
 from drgs.core.errors import UserError
-from drgs.core.extras import required
-from drgs.core.origin import WORLD, Origin
-from drgs.io.formats import check_finite
-from drgs.io.quantized import opacities_of, unit_quaternions
+from drgs.core.origin import WORLD
+from drgs.io.formats import FORMATS, ORIGIN, FileFormat, Scalar, pop_origin
+from drgs.io.quantization import normalize_quaternions, opacities_from_logits
 
 PRIM = "/Gaussians"
 
@@ -29,15 +29,16 @@ EXTENT = 3.0
 """Standard deviations of a Gaussian that count for the extent."""
 
 
-def encode(gaussians: Mapping[str, np.ndarray], origin: Origin = WORLD) -> bytes:
+def encode(
+    gaussians: Mapping[str, np.ndarray], rendered_with: Mapping[str, Scalar] | None = None
+) -> bytes:
     """A binary USD file of Gaussians. Equal Gaussians give equal bytes.
 
-    gaussians: by the names that :func:`drgs.io.ply.read_gaussians` gives, with z up; origin: of
-    their means, becomes the translation of the prim.
+    gaussians: by the names that :func:`drgs.io.ply.read_gaussians` gives, with z up;
+    rendered_with: only the origin has a place, as the translation of the prim.
 
-    Raises :class:`UserError` where OpenUSD is not installed or too old, or a number is not finite.
+    Raises :class:`UserError` where OpenUSD is not installed or too old.
     """
-    check_finite(gaussians, "usd")
     required("pxr", "usd", "USD")
     from pxr import Sdf, Usd, UsdGeom, UsdVol, Vt
 
@@ -49,6 +50,7 @@ def encode(gaussians: Mapping[str, np.ndarray], origin: Origin = WORLD) -> bytes
     UsdGeom.SetStageMetersPerUnit(stage, 1.0)
     splats = UsdVol.ParticleField3DGaussianSplat.Define(stage, Sdf.Path(PRIM))
     stage.SetDefaultPrim(splats.GetPrim())
+    origin = pop_origin("rendered_with", dict(rendered_with or {}))
     if origin != WORLD:
         UsdGeom.Xformable(splats).AddTranslateOp(UsdGeom.XformOp.PrecisionDouble).Set(origin)
     Usd.ColorSpaceAPI.Apply(splats.GetPrim()).CreateColorSpaceNameAttr(COLOR_SPACE)
@@ -59,7 +61,7 @@ def encode(gaussians: Mapping[str, np.ndarray], origin: Origin = WORLD) -> bytes
     orientations = Vt.QuatfArray.FromNumpy(_float32(_imaginary_first(g["quats"])))
     splats.CreateOrientationsAttr(orientations)
     splats.CreateScalesAttr(Vt.Vec3fArray.FromNumpy(scales))
-    opacities = _float32(opacities_of(g["logit_opacities"]))
+    opacities = _float32(opacities_from_logits(g["logit_opacities"]))
     splats.CreateOpacitiesAttr(Vt.FloatArray.FromNumpy(opacities))
     splats.CreateRadianceSphericalHarmonicsDegreeAttr(round(np.sqrt(harmonics.shape[1])) - 1)
     coefficients = Vt.Vec3fArray.FromNumpy(_float32(harmonics.reshape(-1, 3)))
@@ -75,8 +77,19 @@ def encode(gaussians: Mapping[str, np.ndarray], origin: Origin = WORLD) -> bytes
 
 def _imaginary_first(quats: np.ndarray) -> np.ndarray:
     """(N, 4) unit quaternions as OpenUSD keeps them in memory: xyzw."""
-    return np.roll(unit_quaternions(quats), -1, axis=1)
+    return np.roll(normalize_quaternions(quats), -1, axis=1)
 
 
 def _float32(values: object) -> np.ndarray:
     return np.ascontiguousarray(values, np.float32)
+
+
+@FORMATS.register("usd")
+class Usd(FileFormat):
+    """OpenUSD's particle fields."""
+
+    suffix = ".usdc"
+    description = "OpenUSD's ParticleField3DGaussianSplat (extra usd), written only"
+    up = "z"
+    metadata = frozenset(ORIGIN)
+    encode = staticmethod(encode)

@@ -24,11 +24,10 @@ import numpy as np
 from PIL import ExifTags, Image
 
 from drgs.core.child_process import ChildEndedError, DeferredInterrupts, run_in_child
+from drgs.core.environment import required
 from drgs.core.errors import UserError, UserNote, listed, one_line
-from drgs.core.extras import required
 from drgs.core.files import why_refused
-from drgs.core.locks import sole_writer
-from drgs.core.records import FolderRecord
+from drgs.core.folders import FolderRecord, sole_writer
 from drgs.datasets.colmap import LENSES, model_folder
 from drgs.datasets.images import read_mask
 from drgs.datasets.mask_names import masks_of, without_masks

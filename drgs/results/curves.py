@@ -5,15 +5,15 @@ The panel of the population also shows how many Gaussians were added and removed
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from drgs.io.figures import new_figure, write_figure
-from drgs.results.population import DensityChange
+from drgs.results.history import FitHistory
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -27,50 +27,6 @@ NUM_PANELS = 6
 
 PAGE_DPI = 160
 """Of a curve in the page, 3.7 inches wide: what fine screens can show."""
-
-
-class CurvePoint(Protocol):
-    """What the curves show of an iteration: a row of ``history.csv``."""
-
-    @property
-    def iteration(self) -> int:
-        """The first is 1."""
-
-    @property
-    def loss(self) -> float:
-        """Of the training view."""
-
-    @property
-    def psnr(self) -> float:
-        """Of the training view, dB."""
-
-    @property
-    def num_gaussians(self) -> int:
-        """N."""
-
-    @property
-    def means_lr(self) -> float:
-        """The learning rate of the means, world units."""
-
-    @property
-    def wall_s(self) -> float:
-        """Seconds spent so far."""
-
-    @property
-    def test_psnr(self) -> float | None:
-        """Mean of some test views, dB; None where it was not measured."""
-
-
-class FitHistory(Protocol):
-    """What a fit has written down."""
-
-    @property
-    def rows(self) -> Sequence[CurvePoint]:
-        """Of ``history.csv``."""
-
-    @property
-    def density(self) -> Sequence[DensityChange]:
-        """Of ``density.csv``."""
 
 
 def write_curves(path: Path, history: FitHistory) -> None:

@@ -20,7 +20,7 @@ from drgs.config.load import dump_config, load_config
 from drgs.config.schema import FitConfig
 from drgs.core.errors import UserError, UserNote, listed, one_line
 from drgs.core.files import is_temporary, read_text, remove_stale_temporaries, why_refused
-from drgs.core.records import FolderRecord
+from drgs.core.folders import FolderRecord
 from drgs.results.files import (
     CHECKPOINT,
     CONFIG,

@@ -12,8 +12,7 @@ from typing import TypeVar
 
 from drgs.core.errors import UserError, listed
 from drgs.core.files import read_text
-from drgs.core.locks import sole_writer
-from drgs.core.records import FolderRecord
+from drgs.core.folders import FolderRecord, sole_writer
 from drgs.results.files import METRICS, ORBIT, ORBIT_GIF
 
 COMMAND = "render"
@@ -52,7 +51,7 @@ def claiming(
 def sealing(out: Path) -> Iterator[Callable[[], object]]:
     """After the block, note what the pictures in ``out`` are; also where Ctrl-C ended it.
 
-    Yields what keeps the folder from other commands: see :func:`drgs.core.locks.sole_writer`.
+    Yields what keeps the folder from other commands: see :func:`drgs.core.folders.sole_writer`.
     """
     with sole_writer(out) as keep:
         try:

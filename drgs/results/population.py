@@ -3,50 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Protocol
 
-
-class DensityChange(Protocol):
-    """What the strategy did to the rows after an iteration: a row of ``density.csv``."""
-
-    @property
-    def iteration(self) -> int:
-        """The first is 1."""
-
-    @property
-    def num_gaussians(self) -> int:
-        """Afterwards."""
-
-    @property
-    def num_added(self) -> int:
-        """Rows on top of those before."""
-
-    @property
-    def cloned(self) -> int:
-        """Gaussians that were copied."""
-
-    @property
-    def split(self) -> int:
-        """Gaussians that were replaced by several."""
-
-    @property
-    def relocated(self) -> int:
-        """Rows that became copies of others."""
-
-    @property
-    def pruned(self) -> int:
-        """Rows that were removed."""
-
-    @property
-    def refused(self) -> int:
-        """Gaussians for whose copies there was no room."""
-
+from drgs.results.history import DensityRow
 
 ALWAYS, WHERE_ANY = ("pruned", "refused"), ("cloned", "split", "relocated")
 """Counts that the story states."""
 
 
-def story_of(strategy: str, changes: Sequence[DensityChange]) -> str | None:
+def story_of(strategy: str, changes: Sequence[DensityRow]) -> str | None:
     """One line: from how many to how many Gaussians, and by what; None: nothing has changed.
 
     strategy: ``densify.strategy``.

@@ -37,7 +37,6 @@ from drgs.io.pictures import encode, write_animation, write_png
 from drgs.results.curves import (
     NUM_PANELS,
     THEMES,
-    FitHistory,
     Panel,
     draw_curve,
     panels_of,
@@ -53,6 +52,7 @@ from drgs.results.files import (
     SIDE_BY_SIDE,
     VIEWER,
 )
+from drgs.results.history import FitHistory
 from drgs.results.metrics import FitMetrics, psnr, ssim
 from drgs.results.population import story_of
 from drgs.results.viewer import Shown, seconds_of_page, write_viewer

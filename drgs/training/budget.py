@@ -1,7 +1,7 @@
 """A fit for a given time: what to choose, how many iterations, and when to end.
 
-``python -m drgs.bench training`` measures quality over time on the shipped scene: one curve for
-each :class:`Strategy`, some points on it for numbers of iterations. A point's time is counted in
+``scenes/studies/training.py`` measures quality over time on the shipped scene: one curve for each
+:class:`Strategy`, some points on it for numbers of iterations. A point's time is counted in
 iterations as they are at the start of a fit, with full pictures and the first Gaussians. A few
 iterations of a fit that is to be planned, timed where it will run, turn these into seconds. What is
 planned is the strategy whose curve is highest where the time is up.
@@ -17,20 +17,24 @@ import csv
 import math
 import re
 import time
-from collections.abc import Callable, Mapping, Sequence
+import warnings
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 
 from drgs.config.changes import changed, with_iterations
 from drgs.config.schema import FitConfig
-from drgs.core.errors import UserError
+from drgs.core.errors import UserError, UserNote
 from drgs.datasets.types import Dataset
 from drgs.gaussians.parameters import Gaussians
+from drgs.results.report import seconds_of_curves, seconds_of_results
+from drgs.training.parallel.communicator import Communicator
+from drgs.training.parallel.inputs import share_inputs
 from drgs.training.trainer import Trainer
 
 CURVES = Path(__file__).parent / "training_curves.csv"
-"""What ``drgs.bench training`` wrote."""
+"""Curves that ``scenes/studies/training.py`` measured."""
 
 MIN_ITERATIONS = 50
 """Fewer fit nothing."""
@@ -43,16 +47,26 @@ REHEARSAL_VIEWS = 8
 REVISED_EVERY = 0.1
 """Of the time."""
 
-LONGEST = 7 * 24 * 3600.0
-"""Seconds."""
+MAX_SECONDS = 7 * 24 * 3600.0
+
+MAX_PICTURES_SHARE = 0.33
+"""Of the time that ``--budget`` leaves after the start: pictures that take more are left out."""
+
+_NO_PICTURES = (
+    "--budget: the time is needed for iterations: no report, orbit and pictures are written "
+    "(output.report, output.save_renders); python -m drgs.render OUT_DIR --out DIR makes pictures"
+)
 
 WARM_UP, TIMED = 6, 20
 """Iterations: the first compile kernels and fill the allocator's pools."""
 
 
-# ----------------------------------------------------------------------------------------------
-# What can be chosen
-# ----------------------------------------------------------------------------------------------
+@dataclass(frozen=True)
+class Budget:
+    """The time that a fit may take, results included."""
+
+    seconds: float  # as the user gave it
+    end: float  # by time.perf_counter
 
 
 @dataclass(frozen=True)
@@ -60,26 +74,21 @@ class Strategy:
     """What a plan chooses besides the number of iterations."""
 
     name: str  # of its curve
-    coarse: tuple[tuple[float, int], ...] | None = None  # (end, share of all iterations; factor)
+    half_size: float | None = None  # share of the iterations, at the start, with small pictures
     share: float | None = None  # of the number of Gaussians; None: as configured
 
-    def concerns(self, config: FitConfig) -> bool:
-        """Whether there is something for it to change.
-
-        Coarse stages that there are stay; a share needs a number of Gaussians to be taken of.
-        """
-        if self.coarse is not None and config.coarse:
+    def applies_to(self, config: FitConfig) -> bool:
+        """Whether it changes something: coarse stages that there are stay."""
+        if self.half_size is not None and config.coarse:
             return False
         return self.share is None or target_of(config) is not None
 
     def applied(self, config: FitConfig, num_points: int) -> FitConfig:
         """``config`` with this strategy; num_points: Gaussians at the start, the fewest."""
         changes: dict[str, object] = {}
-        if self.coarse is not None:
-            changes["coarse"] = [
-                {"until": max(k + 1, round(share * config.iterations)), "factor": factor}
-                for k, (share, factor) in enumerate(self.coarse)
-            ]
+        if self.half_size is not None:
+            until = max(1, round(self.half_size * config.iterations))
+            changes["coarse"] = [{"until": until, "factor": 2}]
         if self.share is not None:
             least = max(num_points, config.init.num_points or 0)
             number = max(least, round(self.share * target_of(config)))
@@ -89,22 +98,17 @@ class Strategy:
 
 def target_of(config: FitConfig) -> int | None:
     """The number of Gaussians that a fit grows to; None: its strategy knows none."""
-    section = getattr(config.densify, config.densify.strategy)
+    section = getattr(config.densify, config.densify.strategy, None)
     number = getattr(section, "gaussians", None)
     return None if number is None else min(number, config.densify.max_gaussians)
 
 
 STRATEGIES = (
     Strategy("as shipped"),
-    Strategy("half size for the first quarter", coarse=((0.25, 2),)),
+    Strategy("half size for the first quarter", half_size=0.25),
     Strategy("half as many Gaussians", share=0.5),
     Strategy("no more Gaussians than at the start", share=0.0),
 )
-
-
-# ----------------------------------------------------------------------------------------------
-# Curves
-# ----------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -120,17 +124,17 @@ class Curve:
     psnr: tuple[float, ...]  # dB, test views of the shipped scene
 
     def iterations_in(self, time: float) -> int:
-        """How many iterations ``time`` is enough for."""
+        """Return the number of iterations that take ``time``."""
         log_n = _interpolated(math.log(time), _logs(self.time), _logs(self.iterations))
         return math.floor(math.exp(log_n) + 1e-9)
 
     def time_of(self, iterations: int) -> float:
-        """What so many iterations take."""
+        """Return the time of a number of iterations."""
         log_n = math.log(iterations)
         return math.exp(_interpolated(log_n, _logs(self.iterations), _logs(self.time)))
 
     def psnr_at(self, iterations: int) -> float:
-        """What so many iterations reach on the shipped scene."""
+        """Return the PSNR after a number of iterations."""
         return _interpolated(math.log(iterations), _logs(self.iterations), self.psnr)
 
 
@@ -145,9 +149,9 @@ def _interpolated(x: float, xs: Sequence[float], ys: Sequence[float]) -> float:
     return y0 + (x - x0) / (x1 - x0) * (y1 - y0)
 
 
-def load_curves(path: Path = CURVES) -> dict[str, Curve]:
-    """The curves of all strategies, by name."""
-    with path.open(newline="") as file:
+def load_curves() -> dict[str, Curve]:
+    """Read the curves of all strategies, by name."""
+    with CURVES.open(newline="") as file:
         rows = list(csv.DictReader(file))
     curves = {}
     for name in (strategy.name for strategy in STRATEGIES):
@@ -156,14 +160,8 @@ def load_curves(path: Path = CURVES) -> dict[str, Curve]:
             for r in rows
             if r["choice"] == name
         )
-        if len(points) > 1:
-            curves[name] = Curve(*zip(*points, strict=True))
+        curves[name] = Curve(*zip(*points, strict=True))
     return curves
-
-
-# ----------------------------------------------------------------------------------------------
-# Plans
-# ----------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -171,6 +169,7 @@ class Candidate:
     """A strategy, and what a given time is enough for."""
 
     strategy: Strategy
+    curve: Curve
     iterations: int
     psnr: float  # dB, on the shipped scene
 
@@ -184,14 +183,15 @@ class Plan:
     candidates: tuple[Candidate, ...]
     seconds: float  # for the iterations
     start_s: float  # of an iteration at the start
-    curve: Curve  # of what was chosen
     most: int  # Gaussians
+    end: float = math.inf  # of the iterations, by time.perf_counter
 
     @property
     def reasons(self) -> str:
         """What was chosen and why, as text."""
         coarse = self.config.coarse
         stages = [f"1/{s.factor} size until iteration {s.until:,}" for s in coarse]
+        sizes = ", ".join([*stages, "then full size"]) if stages else "full size"
         lines = [
             f"An iteration takes {1e3 * self.start_s:.0f} ms at the start here.",
             f"By the curves of the shipped scene, {self.seconds:.0f} s are enough for",
@@ -200,10 +200,8 @@ class Plan:
                 + (" (chosen)" if c == self.chosen else "")
                 for c in self.candidates
             ),
-            f"Planned: {self.config.iterations:,} iterations; "
-            f"{', '.join([*stages, 'then full size']) if stages else 'full size'}; at most "
-            f"{self.most:,} Gaussians; the "
-            f"population changes until iteration {self.config.densify.stop:,}.",
+            f"Planned: {self.config.iterations:,} iterations; {sizes}; at most {self.most:,} "
+            f"Gaussians; the population changes until iteration {self.config.densify.stop:,}.",
         ]
         return "\n".join(lines)
 
@@ -216,22 +214,22 @@ def make_plan(
     start_s: float,
     curves: Mapping[str, Curve],
 ) -> Plan:
-    """The best plan for ``seconds`` of iterations, of which one takes ``start_s`` at the start.
+    """Return the best plan for ``seconds`` of iterations, one of which takes ``start_s``.
 
-    config: completed. num_points: Gaussians at the start. side: px, the shortest of the training
-    pictures.
+    config: completed. start_s: of the first iterations. num_points: Gaussians at the start. side:
+    px, the shortest of the training images.
 
     Raises :class:`UserError` if the time is too short for anything.
     """
     candidates = []
     for strategy in STRATEGIES:
-        smallest = side / max((factor for _, factor in strategy.coarse or ()), default=1)
-        fits = smallest >= MIN_SIDE or not strategy.coarse
-        if strategy.name in curves and fits and strategy.concerns(config):
+        fits = strategy.half_size is None or side / 2 >= MIN_SIDE
+        if strategy.name in curves and fits and strategy.applies_to(config):
             curve = curves[strategy.name]
             iterations = curve.iterations_in(seconds / start_s) if seconds > 0 else 0
             if iterations >= MIN_ITERATIONS:
-                candidates.append(Candidate(strategy, iterations, curve.psnr_at(iterations)))
+                psnr = curve.psnr_at(iterations)
+                candidates.append(Candidate(strategy, curve, iterations, psnr))
     if not candidates:
         raise UserError(
             f"--budget: must leave time for {MIN_ITERATIONS} iterations, got "
@@ -241,43 +239,35 @@ def make_plan(
     chosen = max(candidates, key=lambda candidate: candidate.psnr)
     planned = with_iterations(config, chosen.iterations)
     planned = chosen.strategy.applied(planned, num_points)
-    curve = curves[chosen.strategy.name]
     most = max(num_points, target_of(planned) or planned.densify.max_gaussians)
-    return Plan(planned, chosen, tuple(candidates), seconds, start_s, curve, most)
+    return Plan(planned, chosen, tuple(candidates), seconds, start_s, most)
 
 
 @dataclass(frozen=True)
 class Rehearsal:
-    """The beginning of a fit, to be thrown away."""
+    """The first iterations of a fit, to be thrown away."""
 
     trainer: Trainer
     iteration_s: float  # of an iteration: full pictures, the first Gaussians
 
 
 def rehearse(
-    config: FitConfig,
-    dataset: Dataset,
+    config: FitConfig | None,
+    dataset: Dataset | None,
     gaussians: Gaussians,
-    make_trainer: Callable[[FitConfig, Dataset, Gaussians], Trainer] = Trainer,
+    comm: Communicator | None = None,
 ) -> Rehearsal:
-    """Time a few iterations on a few of the views."""
-    views_per_step = config.optimizer.views_per_step
-    count = max(REHEARSAL_VIEWS, views_per_step)
-    views = dataset.train[:: max(1, len(dataset.train) // count)]
-    few = replace(dataset, train=views[:count])
-    never = config.iterations + (WARM_UP + TIMED) * views_per_step
-    trainer = make_trainer(
-        changed(
-            config,
-            {
-                "coarse": [],
-                "densify.start": never,
-                "densify.stop": never + 1,
-                "densify.prune.to": None,
-            },
-        ),
-        few,
-        gaussians,
+    """Time a few iterations on a few of the views.
+
+    comm: the processes that share the fit; others than rank 0 give no configuration and dataset.
+    """
+    comm = comm or Communicator()
+    if comm.is_root:
+        config, dataset = _first_iterations(config, dataset)
+    config, dataset = share_inputs(comm, config, dataset)
+    trainer, views_per_step = (
+        Trainer(config, dataset, gaussians, comm),
+        config.optimizer.views_per_step,
     )
     # Steps of several views are fewer.
     warm_up, timed = (max(2, math.ceil(n / views_per_step)) for n in (WARM_UP, TIMED))
@@ -289,21 +279,43 @@ def rehearse(
     return Rehearsal(trainer, (time.perf_counter() - start) / (timed * views_per_step))
 
 
-# ----------------------------------------------------------------------------------------------
-# The end of a fit
-# ----------------------------------------------------------------------------------------------
+def _first_iterations(config: FitConfig, dataset: Dataset) -> tuple[FitConfig, Dataset]:
+    """Return a configuration without changes of the population, and a few of the views."""
+    views_per_step = config.optimizer.views_per_step
+    count = max(REHEARSAL_VIEWS, views_per_step)
+    views = dataset.train[:: max(1, len(dataset.train) // count)]
+    never = config.iterations + (WARM_UP + TIMED) * views_per_step
+    still = {"densify.start": never, "densify.stop": never + 1, "densify.prune.to": None}
+    return changed(config, {"coarse": [], **still}), replace(dataset, train=views[:count])
 
 
-class AllIterations:
-    """A fit ends when the iterations of its configuration are done."""
+def plan_fit(
+    config: FitConfig, dataset: Dataset, gaussians: Gaussians, end: float, rehearsal: Rehearsal
+) -> Plan:
+    """Plan a fit, results included, until ``end``, by ``time.perf_counter``.
 
-    def goes_on(self, trainer: Trainer) -> bool:
-        """Whether there is another iteration."""
-        return trainer.iteration < trainer.config.iterations
+    rehearsal: of the fit; ``full_scene()`` of its trainer has been called.
+    """
+    num_points, most = gaussians.num_gaussians, target_of(config) or 0
+    scene, degree = rehearsal.trainer.full_scene(), config.model.sh_degree
+    results = seconds_of_results(scene, dataset, max(num_points, most), degree)
+    pictures = results.renders if config.output.save_renders else 0.0
+    pictures += results.report + seconds_of_curves() if config.output.report else 0.0
+    if pictures > MAX_PICTURES_SHARE * (end - time.perf_counter()):
+        warnings.warn(UserNote(_NO_PICTURES), stacklevel=2)
+        config = changed(config, {"output.report": False, "output.save_renders": False})
+    else:
+        end -= pictures
+    has_one_file = config.model.approximations.are_usual
+    end -= results.measuring * (1 if has_one_file else 2)
+    if not has_one_file:
+        from drgs.training.viewers import TIME_SHARE
 
-    def total(self, trainer: Trainer) -> int:
-        """Iterations in all."""
-        return trainer.config.iterations
+        end -= TIME_SHARE * max(0.0, end - time.perf_counter())
+    side = min(min(view.width, view.height) for view in dataset.train)
+    seconds, start_s = end - time.perf_counter(), rehearsal.iteration_s
+    plan = make_plan(config, num_points, side, seconds, start_s, load_curves())
+    return replace(plan, end=end)
 
 
 class Deadline:
@@ -321,7 +333,7 @@ class Deadline:
         self._next = self._start + REVISED_EVERY * (end - self._start)
         self._densify_share = config.densify.stop / config.iterations
 
-    def goes_on(self, trainer: Trainer) -> bool:
+    def should_continue(self, trainer: Trainer) -> bool:
         """Whether there is time for another iteration; revises the trainer's configuration."""
         now, done = time.perf_counter(), trainer.iteration
         if now >= self._end and done > 0:
@@ -329,11 +341,11 @@ class Deadline:
             return False
         if now >= self._next and done > 0:
             self._next = now + REVISED_EVERY * (self._end - self._start)
-            total = self.total(trainer)
+            total = self.num_iterations(trainer)
             trainer.reschedule(total, self._densify_stop(trainer, total))
         return True
 
-    def total(self, trainer: Trainer) -> int:
+    def num_iterations(self, trainer: Trainer) -> int:
         """Iterations in all: as planned, later as the curve and the time so far say."""
         now, done = time.perf_counter(), trainer.iteration
         if done == 0:
@@ -349,22 +361,19 @@ class Deadline:
         return max(round(self._densify_share * total), done + 1, config.start + 1)
 
 
-_DURATION = re.compile(
-    r"(?=.)(?:(?P<h>\d+(?:\.\d+)?)h)?(?:(?P<m>\d+(?:\.\d+)?)m)?(?:(?P<s>\d+(?:\.\d+)?)s?)?",
-    re.ASCII,
-)
+_NUMBER = r"(\d+(?:\.\d+)?)"
+
+_DURATION = re.compile(f"(?:{_NUMBER}h)?(?:{_NUMBER}m)?(?:{_NUMBER}s)?|{_NUMBER}", re.ASCII)
 
 
 def parse_duration(text: str) -> float:
-    """Seconds of ``90``, ``90s``, ``5m``, ``1m30s``, ``1h30m``.
+    """Return the seconds of ``90``, ``90s``, ``5m``, ``1m30s``, ``1h30m``.
 
-    Raises ValueError for anything else. That includes ``1h30`` and ``5m5``: what has several parts
-    has a unit for each.
+    Raises ValueError for anything else, such as ``1h30``: each of several parts has a unit.
     """
     match = _DURATION.fullmatch(text.strip())
-    parts = match.groupdict(default="0") if match else {"h": "0", "m": "0", "s": "0"}
-    seconds = 3600 * float(parts["h"]) + 60 * float(parts["m"]) + float(parts["s"])
-    unclear = re.search(r"[hm][\d.]+$", text.strip())
-    if unclear or not 0 < seconds <= LONGEST:
+    parts = match.groups(default="0") if match else ()
+    seconds = sum(scale * float(part) for scale, part in zip((3600, 60, 1, 1), parts, strict=False))
+    if not 0 < seconds <= MAX_SECONDS:
         raise ValueError(f"must be a time such as 90s, 5m or 1h30m, a week at most, got {text!r}")
     return seconds

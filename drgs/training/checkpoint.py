@@ -24,7 +24,7 @@ from drgs.core.files import atomic_path, read_arrays, why_refused
 from drgs.datasets.fingerprint import Fingerprint
 from drgs.results.files import CHECKPOINT, CONFIG
 from drgs.results.folder import load_run_config, write_run_config
-from drgs.training.state_checks import check_density, check_history, check_state
+from drgs.training.state_checks import check_state, check_tables
 
 PLACES = ("data.path", "data.source", "init.point_cloud")
 """Values that say where something is: a project that was moved has others. The start point is
@@ -99,9 +99,7 @@ def load_checkpoint(folder: Path, config: FitConfig) -> Checkpoint | None:
             config=own,
             trainer=_named_as_now(arrays),
         )
-        check_history(checkpoint.history, checkpoint.wall_s)
-        if checkpoint.density is not None:
-            check_density(checkpoint.density)
+        check_tables(checkpoint.history, checkpoint.density, checkpoint.wall_s)
     except UserError as error:
         raise UserError(f"{error}; {_remedy(path)}") from None
     except (ValueError, KeyError, TypeError, RecursionError) as error:

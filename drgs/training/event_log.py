@@ -1,7 +1,9 @@
 """The history of a fit as TensorBoard reads it, written as the fit goes.
 
-Imported with ``--tensorboard``; tensorboardX, of the extra of that name, knows the format: records
-with checksums, each an event of TensorFlow's ``event.proto``.
+Imported with ``--tensorboard``; tensorboardX, of the extra of that name, writes the format: records
+with checksums, each an event of TensorFlow's ``event.proto``. Its ``SummaryWriter`` names files
+after the time and the host, and writes them from a thread; the file of a fit has one name, which
+the folder's record knows, and is complete after each row.
 """
 
 from __future__ import annotations
@@ -9,7 +11,6 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from pathlib import Path
-from types import TracebackType
 
 from tensorboardX.proto.event_pb2 import Event
 from tensorboardX.record_writer import RecordWriter
@@ -33,10 +34,10 @@ TAGS = {
 
 
 class EventLog:
-    """Writes a row of the history when it is there: see ``drgs.training.loop.Observer``.
+    """Writes new rows of the history: see ``drgs.training.loop.Observer``.
 
-    A context manager. The file begins with the rows that there are already, so that a fit that was
-    stopped and resumed is one curve.
+    The file begins with the rows that there are already, so that a fit that was stopped and resumed
+    is one curve.
     """
 
     def __init__(self, path: Path, history: History) -> None:
@@ -48,16 +49,7 @@ class EventLog:
             self._write(row, history)
         self._writer.flush()
 
-    def __enter__(self) -> EventLog:
-        """The file is open."""
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def close(self) -> None:
         """Close the file."""
         self._writer.close()
 

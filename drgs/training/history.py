@@ -2,53 +2,32 @@
 
 from __future__ import annotations
 
-import csv
 import math
 import time
-from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Iterable
+from dataclasses import asdict, replace
 from itertools import accumulate
-from pathlib import Path
 
 import numpy as np
 
-from drgs.core.files import atomic_path
-from drgs.training.density.strategy import DENSITY_COLUMNS, DensityReport
+from drgs.results.history import (
+    DENSITY_COLUMNS,
+    DensityReport,
+    DensityRow,
+    FitHistory,
+    HistoryRow,
+)
 from drgs.training.trainer import StepReport
 
 SMOOTHING = 0.9
 """Weight of the past in the PSNR of training views, each of which is another photograph."""
 
 
-@dataclass(frozen=True)
-class HistoryRow:
-    """One line of ``history.csv``."""
-
-    iteration: int
-    loss: float
-    psnr: float  # dB, of the iteration's training view
-    num_gaussians: int
-    means_lr: float
-    wall_s: float  # since the first iteration
-    test_psnr: float | None = None  # dB, mean of some test views; None: not measured here
-
-
-@dataclass(frozen=True, kw_only=True)
-class DensityRow(DensityReport):
-    """One line of ``density.csv``: what the strategy did after an iteration."""
-
-    iteration: int  # the first is 1
-
-
-class History:
-    """Rows of ``history.csv`` and ``density.csv``, and the time spent.
-
-    Also before an interruption.
-    """
+class History(FitHistory):
+    """The tables of a fit that runs, and the time spent, also before an interruption."""
 
     def __init__(self) -> None:
-        self.rows: list[HistoryRow] = []
-        self.density: list[DensityRow] = []
+        super().__init__()
         self._before = 0.0
         self._started = time.perf_counter()
 
@@ -123,25 +102,3 @@ def smoother(past: float | None, value: float) -> float:
 def smoothed(values: Iterable[float]) -> np.ndarray:
     """Exponential mean of the past, (n,) float64."""
     return np.fromiter(accumulate(values, smoother), np.float64)
-
-
-def write_history(path: Path, history: Sequence[HistoryRow]) -> None:
-    """Write ``history.csv``."""
-    rows = [
-        [f"{v:.6g}" if isinstance(v, float) else v for v in vars(row).values()] for row in history
-    ]
-    _write_table(path, HistoryRow.__dataclass_fields__, rows)
-
-
-def write_density(path: Path, changes: Sequence[DensityRow]) -> None:
-    """Write ``density.csv``, or nothing where there are no changes."""
-    if changes:
-        rows = [[getattr(change, name) for name in DENSITY_COLUMNS] for change in changes]
-        _write_table(path, DENSITY_COLUMNS, rows)
-
-
-def _write_table(path: Path, columns: Iterable[str], rows: Iterable[Iterable[object]]) -> None:
-    with atomic_path(path) as temporary, temporary.open("w", newline="") as file:
-        writer = csv.writer(file)
-        writer.writerow(columns)
-        writer.writerows(rows)

@@ -19,11 +19,14 @@ from __future__ import annotations
 
 import math
 import sys
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
 
+from drgs.config.extensions import LOSS_TERMS, LOSSES, extensions_in_use, section_of
+from drgs.config.schema import FitConfig
 from drgs.core.arrays import is_float64, types_of
 
 C1 = 0.01**2
@@ -84,8 +87,57 @@ def prepare_target(image: Any, window: int = 11, sigma: float = 1.5) -> Target:
     return Target(height, width, weights, values, means, mean_squares)
 
 
+class Loss:
+    """A loss of a rendered image and a photograph; subclasses define :meth:`__call__`."""
+
+    @classmethod
+    def from_config(cls, config: FitConfig, section: Any) -> Loss:
+        """Return the loss of a fit; section: see ``TrainingEffect.from_config``."""
+        del config
+        return cls() if section is None else cls(section)
+
+    def __call__(self, image: Any, target: Target) -> Any:
+        """Return the loss, a ``Float`` of one value; image: (H, W, 3) tensor, display space.
+
+        ``target.image`` is the photograph. Differentiated in the image.
+        """
+        raise NotImplementedError
+
+    def with_squared_error(self, image: Any, target: Target) -> tuple[Any, Any]:
+        """Return the loss, and the mean over pixels and channels of (x - y)^2: Floats of one value.
+
+        Not differentiated: the squared error.
+        """
+        error = dr.mean(dr.square(dr.detach(image).array - target.image.array))
+        return self(image, target), error
+
+
+class LossTerm:
+    """A term that is added to the loss; subclasses define one of its methods, or both."""
+
+    @classmethod
+    def from_config(cls, config: FitConfig, section: Any) -> LossTerm:
+        """Return the term of a fit; section: see ``TrainingEffect.from_config``."""
+        del config
+        return cls() if section is None else cls(section)
+
+    def of_image(self, image: Any, target: Target) -> Any:
+        """Return a ``Float`` of one value, or None; see :class:`Loss` for the arguments."""
+        del image, target
+
+    def of_gaussians(self, parameters: Mapping[str, Any], num_rows: int) -> Any:
+        """Return a ``Float`` of one value, or None.
+
+        parameters: raw values by name, attached, of ``num_rows`` Gaussians in all. If several
+        processes fit, each has some of the rows: a sum over them, divided by ``num_rows``, is
+        right for any number of processes.
+        """
+        del parameters, num_rows
+
+
+@LOSSES.register("photometric")
 @dataclass(frozen=True)
-class PhotometricLoss:
+class PhotometricLoss(Loss):
     """L = (1 - w) L1 + w (1 - SSIM), means over all pixels and channels (3DGS, equation 7).
 
     SSIM's window is the one that the target was prepared with. Windows reach beyond the image
@@ -95,6 +147,12 @@ class PhotometricLoss:
     """
 
     dssim_weight: float = 0.2  # w, in [0, 1]
+
+    @classmethod
+    def from_config(cls, config: FitConfig, section: None) -> PhotometricLoss:
+        """Return the loss of the section ``loss``."""
+        del section
+        return cls(config.loss.dssim_weight)
 
     def __post_init__(self) -> None:
         """Refuse weights that do not interpolate."""
@@ -126,6 +184,18 @@ class PhotometricLoss:
         operands = {"image": image, "target": target, "weight": self.dssim_weight}
         loss, error = dr.custom(_PhotometricOp, **operands)
         return loss, dr.detach(error)
+
+
+def make_loss(config: FitConfig) -> Loss:
+    """Return the loss of a configuration."""
+    loss = LOSSES.get(config.loss.type, "loss.type")
+    return loss.value.from_config(config, section_of(loss, config.extensions))
+
+
+def make_loss_terms(config: FitConfig) -> list[LossTerm]:
+    """Return the terms of the loss that a configuration has sections for."""
+    used = extensions_in_use(config.extensions, LOSS_TERMS)
+    return [each.value.from_config(config, section_of(each, config.extensions)) for each in used]
 
 
 def l1_loss(image: Any, target: Any) -> Any:

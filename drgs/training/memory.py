@@ -14,7 +14,7 @@ ones may take more.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -27,7 +27,7 @@ from drgs.datasets.types import Dataset, View, Viewpoint
 from drgs.gaussians.parameters import Gaussians
 from drgs.splatting.grid import MICRO, TILE
 from drgs.splatting.slots import BAND_SLOTS
-from drgs.training.density.called_for import density_strategy
+from drgs.training.density.registry import density_strategy
 
 PROCESS_BYTES = 290_000_000
 """Interpreter, libraries and compiled kernels; and results, as far as they come on top. Compiling
@@ -223,44 +223,34 @@ def _refusal(
     usable: int,
     share: Share,
 ) -> str:
-    start, train = gaussians.num_gaussians, dataset.train
-    count = most_gaussians(config, start)
-    parts = [
-        f"{readable(memory.photographs)} for {len({*train, *dataset.test}):,} photographs",
-        f"{readable(memory.gaussians)} for {_part(share)}{count:,} Gaussians",
-        f"{readable(memory.splats + memory.pixels)} for a picture of them",
-    ]
-    width = max(view.width for view in train)
+    train, start = dataset.train, gaussians.num_gaussians
+    count, width = most_gaussians(config, start), max(view.width for view in train)
 
-    def fits(config: FitConfig, scale: float = 1.0) -> bool:
-        return estimate(config, dataset, gaussians, 0, scale, share).needed <= 0.95 * usable
+    def fits(most: int, scale: float = 1.0) -> bool:
+        densify = config.densify.model_copy(update={"max_gaussians": most})
+        smaller = config.model_copy(update={"densify": densify})
+        return estimate(smaller, dataset, gaussians, 0, scale, share).needed <= 0.95 * usable
 
-    shares = [0.95**k for k in range(1, 100)]
-    fewer = (_rounded(share * count) for share in shares if share * count > start)
-    narrower = (_rounded(share * width) for share in shares if share * width >= MIN_WIDTH)
-    most = next((most for most in fewer if fits(_with_at_most(config, most))), None)
-    size = next((size for size in narrower if fits(config, size / width)), None)
+    most = next(filter(fits, _smaller(count, start)), None)
+    size = next((s for s in _smaller(width, MIN_WIDTH) if fits(count, s / width)), None)
     remedies = [f"densify.max_gaussians={most}"] if most else []
     remedies += [f"data.image_size={size}"] if size else []
     advice = f"set {' or '.join(remedies)}" if remedies else "use fewer views and Gaussians"
     who = "the fit" if share == ALONE else "a process of the fit"
+    part = "" if share.processes == 1 else f"1/{share.processes} of "
     return (
-        f"memory: {who} needs about {readable(memory.needed)} ({', '.join(parts)}), and "
-        f"may take {readable(usable)}, nine tenths of what is available; {advice}"
+        f"memory: {who} needs about {readable(memory.needed)} "
+        f"({readable(memory.photographs)} for {len({*train, *dataset.test}):,} photographs, "
+        f"{readable(memory.gaussians)} for {part}{count:,} Gaussians, "
+        f"{readable(memory.splats + memory.pixels)} for a picture of them), and may take "
+        f"{readable(usable)}, nine tenths of what is available; {advice}"
     )
 
 
-def _part(share: Share) -> str:
-    return "" if share.processes == 1 else f"1/{share.processes} of "
-
-
-def _with_at_most(config: FitConfig, most: int) -> FitConfig:
-    densify = config.densify.model_copy(update={"max_gaussians": most})
-    return config.model_copy(update={"densify": densify})
-
-
-def _rounded(number: float) -> int:
-    """Down to two digits."""
-    number = int(number)
-    digits = 10 ** max(0, len(str(number)) - 2)
-    return number // digits * digits
+def _smaller(number: int, least: int) -> Iterator[int]:
+    """Yield numbers of two digits and zeros, from ``number`` down to ``least``."""
+    smaller = 0.95 * number
+    while smaller >= least:
+        digits = 10 ** max(0, len(str(int(smaller))) - 2)
+        yield int(smaller) // digits * digits
+        smaller *= 0.95

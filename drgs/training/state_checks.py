@@ -7,12 +7,12 @@ types and shapes, but for the number of Gaussians.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
 from drgs.core.errors import listed
-from drgs.training.density.strategy import DENSITY_COLUMNS
+from drgs.results.history import DENSITY_COLUMNS
 
 MEANS = "means.value"
 """The array that says how many Gaussians there are."""
@@ -54,29 +54,25 @@ def check_state(
         raise ValueError(f"iteration must be between 0 and {iterations:,}, got {iteration:,}")
 
 
-def check_history(rows: np.ndarray, wall_s: float) -> None:
-    """Raise ValueError where these cannot be the history of a fit, and the seconds it took."""
-    if rows.ndim != 2 or rows.shape[1] not in HISTORY_COLUMNS or rows.dtype != np.float64:
-        raise ValueError(
-            f"history must be rows of {HISTORY_COLUMNS[-1]} float64 numbers, got shape "
-            f"{rows.shape} of {rows.dtype}"
-        )
-    if not np.isfinite(rows[:, : HISTORY_COLUMNS[0]]).all():
+def check_tables(history: np.ndarray, density: np.ndarray | None, wall_s: float) -> None:
+    """Raise ValueError unless these can be the tables of a fit, and the seconds it took."""
+    _check_table("history", history, HISTORY_COLUMNS, np.dtype(np.float64))
+    if not np.isfinite(history[:, : HISTORY_COLUMNS[0]]).all():
         raise ValueError("history must hold finite numbers")
+    if density is not None:
+        _check_table("density", density, (len(DENSITY_COLUMNS),), np.dtype(np.int64))
+        if (density < 0).any():
+            raise ValueError("density must hold counts, got a negative number")
     if not 0 <= wall_s < math.inf:
         raise ValueError(f"wall_s must be a number of seconds, got {wall_s:g}")
 
 
-def check_density(rows: np.ndarray) -> None:
-    """Raise ValueError where these cannot be changes of a population."""
-    columns = len(DENSITY_COLUMNS)
-    if rows.ndim != 2 or rows.shape[1] != columns or rows.dtype != np.int64:
+def _check_table(name: str, rows: np.ndarray, widths: Sequence[int], dtype: np.dtype) -> None:
+    if rows.ndim != 2 or rows.shape[1] not in widths or rows.dtype != dtype:
         raise ValueError(
-            f"density must be rows of {columns} int64 numbers, got shape {rows.shape} of "
+            f"{name} must be rows of {widths[-1]} {dtype} numbers, got shape {rows.shape} of "
             f"{rows.dtype}"
         )
-    if (rows < 0).any():
-        raise ValueError("density must hold counts, got a negative number")
 
 
 def _shape(name: str, like: Mapping[str, np.ndarray], num: int) -> tuple[int, ...]:

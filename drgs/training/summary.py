@@ -8,6 +8,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
+from drgs.config.extensions import (
+    EFFECTS,
+    LOSS_TERMS,
+    LOSSES,
+    STRATEGIES,
+    extensions_in_use,
+)
 from drgs.config.schema import FitConfig
 from drgs.datasets.types import Dataset
 from drgs.integrator.summary import (
@@ -49,7 +56,29 @@ def summary_of_fit(config: FitConfig, dataset: Dataset) -> list[SimulatedEffect]
             _refined(config) if config.cameras.optimise else None,
             "cameras.optimise",
         ),
+        *_extensions(config),
     ]
+
+
+def _extensions(config: FitConfig) -> list[SimulatedEffect]:
+    """Return the extensions that take part, with the key that asks for each."""
+    used = [
+        (extension, f"extensions.{extension.name}")
+        for registry in (EFFECTS, LOSS_TERMS)
+        for extension in extensions_in_use(config.extensions, registry)
+    ]
+    chosen = (
+        (STRATEGIES, config.densify.strategy, "densify.strategy"),
+        (
+            LOSSES,
+            config.loss.type,
+            "loss.type",
+        ),
+    )
+    for registry, name, key in chosen:
+        if name not in registry.shipped:
+            used.append((registry.get(name), f"{key}: {name}"))
+    return [SimulatedEffect(e.name, f"{e.kind}: {e.summary}", why) for e, why in used]
 
 
 def _background(config: FitConfig) -> SimulatedEffect:

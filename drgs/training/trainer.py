@@ -25,13 +25,13 @@ from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 from drgs.initialization.defaults import completed
 from drgs.integrator.scene import make_scene, render_views
 from drgs.splatting.rendering import NO_FAULT
-from drgs.training.density.called_for import density_strategy
+from drgs.training.density.registry import density_strategy
 from drgs.training.density.strategy import DensityReport, DensityStrategy, StepInfo
-from drgs.training.effects.base import FitState
-from drgs.training.effects.called_for import integrator_settings, training_effects
+from drgs.training.effects.base import FitState, TrainingEffect
+from drgs.training.effects.registry import integrator_settings, training_effects
 from drgs.training.finite_checks import GradientWatch, check_values, check_view_values
 from drgs.training.gradients import ViewGradients, ViewLoss, WholeGradients
-from drgs.training.losses import PhotometricLoss
+from drgs.training.losses import Loss, make_loss, make_loss_terms
 from drgs.training.memory import Share, room_for_targets
 from drgs.training.optimizer import (
     make_optimizer,
@@ -93,13 +93,19 @@ class Trainer:
         dataset: Dataset,
         gaussians: Gaussians,
         comm: Communicator | None = None,
+        strategy: DensityStrategy | None = None,
+        effects: Sequence[TrainingEffect] = (),
+        loss: Loss | None = None,
     ) -> None:
-        """gaussians: all of them, on each process; comm: the processes; None: this one."""
+        """gaussians: all of them, on each process; comm: the processes; None: this one.
+
+        strategy, loss: None: those of the configuration; effects: besides the configuration's.
+        """
         config = completed(config, dataset)
         self.config, self.dataset, self.extent = config, dataset, dataset.extent
         self.comm = comm = comm or Communicator()
         check_can_be_shared(config, comm.size, gaussians.num_gaussians)
-        self.effects = training_effects(config, dataset)
+        self.effects = training_effects(config, dataset, effects)
         room = comm.collective(lambda: self._room_for_targets(gaussians))
         self.scene = make_scene(
             local_gaussians(gaussians, comm),
@@ -119,8 +125,9 @@ class Trainer:
             epsilon=config.optimizer.epsilon,
         )
         self.rates = rates_over_time(config, self.extent)
-        self.loss = PhotometricLoss(config.loss.dssim_weight)
-        self.white_background = tuple(dataset.background) == (1.0, 1.0, 1.0)
+        self.loss = loss or make_loss(config)
+        self.terms = make_loss_terms(config)
+        self._strategy = strategy
         self.stages = make_stages(dataset.train, config, self.effects, room)
         self.gradients = self._make_gradients()
         population = self.optimizer, PREFIX, self.extent, config.seed
@@ -206,13 +213,17 @@ class Trainer:
         """Add the derivatives of the strategy's terms of the loss; return the terms."""
 
         def penalties(parameters: Mapping[str, Any]) -> list[Any]:
-            return list(self.density.penalties(parameters, self.num_gaussians))
+            count = self.num_gaussians
+            terms = [term.of_gaussians(parameters, count) for term in self.terms]
+            terms = [term for term in terms if term is not None]
+            return [*self.density.penalties(parameters, count), *terms]
 
         terms = penalties(self.parameters)
         if terms:
             weight = step.num_averaged / len(step.iterations)
             total = sum(terms[1:], terms[0])
-            dr.backward(total / weight if weight > 1 else total)
+            flags = dr.ADFlag.Default | dr.ADFlag.AllowNoGrad  # a term of weight 0 has none
+            dr.backward(total / weight if weight > 1 else total, flags=flags)
         return self.population.terms_of_all(terms, penalties)
 
     def compare(self, image: Any, view: TrainingView) -> tuple[Any, Any, Any]:
@@ -220,9 +231,11 @@ class Trainer:
         for effect in self.effects:
             image = effect.adjust(image, view)
         loss, error = self.loss.with_squared_error(image, view.target)
-        for effect in self.effects:
-            for penalty in effect.penalties(view):
-                loss = loss + penalty
+        terms = [term.of_image(image, view.target) for term in self.terms]
+        terms += [penalty for effect in self.effects for penalty in effect.penalties(view)]
+        for term in terms:
+            if term is not None:
+                loss = loss + term
         return image, loss, error
 
     def _pixel_weights(self, view: StepView, image: Any) -> dict[str, Any]:
@@ -509,7 +522,7 @@ class Trainer:
 
     def _density_from(self, state: Mapping[str, np.ndarray]) -> DensityStrategy:
         """Return the strategy of the configuration with its state; empty: at the beginning."""
-        density = density_strategy(self.config, self.white_background)
+        density = density_strategy(self.config, self.dataset, self._strategy)
         density.begin(self.population)
         if state:
             density.restore(state)

@@ -38,6 +38,7 @@ from drgs.gaussians.parameters import Gaussians
 from drgs.integrator.scene import make_scene, render_views
 from drgs.integrator.sensors import camera_from_sensor, read_sensor
 from drgs.training.effects.base import TrainingEffect
+from drgs.training.parallel.inputs import share_gaussians
 from drgs.training.trainer import Trainer
 
 SHARE = 0.08
@@ -106,7 +107,8 @@ def for_viewers(
     trainer.release()
     further = tuning(config)
     try:
-        tuned = _tuned(trainer.spawn(further, start), trainer, watch)
+        shared = share_gaussians(trainer.comm, start)
+        tuned = _tuned(trainer.spawn(further, shared), trainer, watch)
     except UserError as error:  # numbers that are not finite, or too little memory by now
         note = f"the Gaussians for viewers are not fitted any further: {error}"
         warnings.warn(UserNote(note), stacklevel=2)

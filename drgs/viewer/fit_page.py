@@ -9,7 +9,7 @@ import numpy as np
 
 from drgs.datasets.types import Dataset
 from drgs.training.history import History, HistoryRow, smoothed
-from drgs.training.loop import Length
+from drgs.training.loop import StopCriterion
 from drgs.training.trainer import Trainer
 from drgs.viewer.page import Page, StartView
 from drgs.viewer.requests import Wishes
@@ -126,14 +126,14 @@ class FitPage(Page):
 
 
 def watch(
-    server: viser.ViserServer, trainer: Trainer, dataset: Dataset, length: Length
-) -> tuple[Watching, Length]:
-    """Put a fit on the server's page; who serves that page, and how long the fit then is."""
+    server: viser.ViserServer, trainer: Trainer, dataset: Dataset, criterion: StopCriterion
+) -> tuple[Watching, StopCriterion]:
+    """Put a fit on the server's page; return who serves that page, and when the fit then ends."""
     wishes, start = Wishes(), StartView.of(dataset.train).from_farther(STEP_BACK)
-    length = UntilEnded(length, wishes)
+    criterion = UntilEnded(criterion, wishes)
     page = FitPage(server, wishes, start, trainer.config.model.approximations)
     page.add_cameras(dataset.train, visible=True)
-    return Watching(wishes, page, dataset, length), length
+    return Watching(wishes, page, dataset, criterion), criterion
 
 
 def curves_of(rows: Sequence[HistoryRow]) -> list[Curve]:

@@ -14,7 +14,7 @@ import drjit as dr
 
 from drgs.datasets.types import Dataset
 from drgs.training.history import History
-from drgs.training.loop import Iteration, Length
+from drgs.training.loop import Iteration, StopCriterion
 from drgs.training.trainer import Trainer
 from drgs.viewer.frames import LiveScene
 from drgs.viewer.requests import Wishes
@@ -44,32 +44,34 @@ class FitScreen(Screen, Protocol):
 
 
 class UntilEnded:
-    """A fit ends as ``length`` says, or behind the iteration in which somebody asks for its end.
+    """A fit ends as ``criterion`` decides, or when a viewer client ends it.
 
     Its configuration then says what was done.
     """
 
-    def __init__(self, length: Length, wishes: Wishes) -> None:
-        self._length, self._wishes = length, wishes
+    def __init__(self, criterion: StopCriterion, wishes: Wishes) -> None:
+        self._criterion, self._wishes = criterion, wishes
 
-    def goes_on(self, trainer: Trainer) -> bool:
+    def should_continue(self, trainer: Trainer) -> bool:
         """Whether there is another iteration; if not by request, revises the configuration."""
         done = trainer.iteration
         if self._wishes.ended and 0 < done < trainer.config.iterations:
             trainer.reschedule(done, trainer.config.densify.stop)
             return False
-        return self._length.goes_on(trainer)
+        return self._criterion.should_continue(trainer)
 
-    def total(self, trainer: Trainer) -> int:
+    def num_iterations(self, trainer: Trainer) -> int:
         """Iterations in all."""
-        return self._length.total(trainer)
+        return self._criterion.num_iterations(trainer)
 
 
 class Watching:
     """Serves those who look on at a fit: see ``drgs.training.loop.Observer``."""
 
-    def __init__(self, wishes: Wishes, screen: FitScreen, dataset: Dataset, length: Length) -> None:
-        self._wishes, self._screen, self._length = wishes, screen, length
+    def __init__(
+        self, wishes: Wishes, screen: FitScreen, dataset: Dataset, criterion: StopCriterion
+    ) -> None:
+        self._wishes, self._screen, self._criterion = wishes, screen, criterion
         self._background = dataset.background
         self._spectators = Spectators(wishes, screen, _refreshed_after)
         self._scene: tuple[int, LiveScene] | None = None  # and the iteration that it is of
@@ -98,7 +100,7 @@ class Watching:
 
     def _tell(self, trainer: Trainer, history: History) -> None:
         self._said = time.monotonic()
-        self._screen.tell(trainer, history, self._length.total(trainer))
+        self._screen.tell(trainer, history, self._criterion.num_iterations(trainer))
 
     def _serve(self, trainer: Trainer) -> bool:
         return self._spectators.serve(lambda: self._scene_of(trainer))

@@ -12,7 +12,7 @@ from support.helpers import FLOAT32 as SINGLE
 from support.helpers import Case, clear, device_camera, device_gaussians
 
 from drgs.bench import __main__ as bench
-from drgs.bench import limits, pairs, peers, profile, scaling, scenes, speed, stability
+from drgs.bench import peers, scaling, scenes, speed, stability, timing
 from drgs.reference import splatting as reference
 from drgs.splatting import rendering
 
@@ -64,7 +64,7 @@ def test_useful_pairs_are_those_that_the_reference_composites():
         device_gaussians(case.gaussians, SINGLE), device_camera(case.camera, SINGLE),
         rendering.Pipeline(0),
     )  # fmt: skip
-    work = pairs.count_work(frame)
+    work = timing.count_work(frame)
     splats = reference.project(case.gaussians, case.camera)
     order = reference._depth_order(splats.depths, splats.visible)
     y, x = np.mgrid[: case.height, : case.width] + 0.5
@@ -98,20 +98,18 @@ def test_every_kernel_of_an_iteration_belongs_to_a_stage(small_scene):
     trainer = scenes.trainer_of(small_scene)
     trainer.step()
     before = rendering.bin_footprints
-    with profile.stage_clock() as clock:
-        report = trainer.step()
-        dr.eval([view.loss for view in report.seen])
-        clock.end("optimizer and statistics")
+    clock = timing.clocked_step(trainer)
     assert rendering.bin_footprints is before
-    assert set(clock.kernel_ms) == set(profile.STAGES)
+    assert set(clock.kernel_ms) == set(timing.STAGES)
     assert all(spent > 0 for spent in clock.kernel_ms.values())
 
 
-def test_an_iteration_is_profiled_and_its_shares_are_shares(small_scene):
-    limit = limits.MachineLimits(multiply_adds=1e12, bytes_moved=1e11, width=8, threads=2)
-    report = speed.profile_training(small_scene, limit, rounds=2)
+def test_an_iteration_is_profiled(small_scene):
+    report = speed.profile_training(small_scene, rounds=2)
     assert report.wall_ms > 0 and report.kernel_ms > 0
-    assert all(0 < share < 1 for share in report.vector_share.values())
+    assert set(report.num_kernels) == set(timing.STAGES)
+    assert all(count > 0 for count in report.num_kernels.values())
+    assert report.work.useful > 0
 
 
 def test_renderers_do_not_reuse_a_frame(small_scene):
@@ -132,7 +130,7 @@ def test_renderers_do_not_reuse_a_frame(small_scene):
 
 
 def test_exponents_are_those_of_a_power_law():
-    work = pairs.Work(1, 1, 1, 1)
+    work = timing.Work(1, 1, 1, 1)
     found = [
         scaling.Result(scaling.Point("Gaussians", n, 400, 2), 3e-3 * n**1.5, 7 * n, 0, work)
         for n in (1000, 5000, 20_000)
@@ -151,5 +149,5 @@ def test_gaussians_keep_their_entries_as_their_number_grows():
         scene = scenes.Scene(
             "", replace(gaussians, log_scales=shrunk), scenes.bench_camera(point.size)
         )
-        ratios.append(pairs.count_work(scenes.frame_of(scene)).entries / point.count)
+        ratios.append(timing.count_work(scenes.frame_of(scene)).entries / point.count)
     assert len(ratios) >= 2 and max(ratios) / min(ratios) < 1.1

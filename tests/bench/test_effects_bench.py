@@ -111,7 +111,7 @@ def test_prices_are_medians_against_the_first_case(monkeypatch):
             return 3 * self.cost
 
     cases = [effects.FittingCase("none", "none"), effects.FittingCase("slow", "x")]
-    monkeypatch.setattr(effects, "_seconds", lambda function: function())
+    monkeypatch.setattr(effects, "seconds", lambda function: function())
     monkeypatch.setattr(effects, "operations", lambda subject: int(100 * subject.cost))
     prices = effects.measure(cases, lambda case: Subject(1.0 + (case.effect == "slow")), rounds=3)
     assert [(p.forward_ratio, p.both_ratio) for p in prices] == [(1, 1), (2, 2)]

@@ -44,12 +44,8 @@ def test_what_a_measurement_would_write_is_refused_before_it_begins(name, tmp_pa
     module = importlib.import_module(f"drgs.bench.{name}")
     parser = CommandParser()
     module.add_arguments(parser)
-    of_their_own = ("batches", "photographs", "population", "recipes", "training")
-    folder = tmp_path / name if name in of_their_own else tmp_path
-    folder.mkdir(exist_ok=True)
-    (folder / f"{name}.csv").write_text("mine")
-    what = [str(tmp_path)] if name in ("photographs", "processes") else []
-    args = parser.parse_args(["--out", str(tmp_path), *what])
+    (tmp_path / f"{name}.csv").write_text("mine")
+    args = parser.parse_args(["--out", str(tmp_path)])
     with pytest.raises(UserError, match=rf"holds .*{name}\.csv"):
         args.run(args)
-    assert [p.name for p in folder.iterdir() if p.is_file()] == [f"{name}.csv"]
+    assert [p.name for p in tmp_path.iterdir()] == [f"{name}.csv"]

@@ -16,6 +16,8 @@ from drgs import fit, render
 from drgs.cli.execution import executing
 from drgs.core.errors import UserError
 from drgs.gaussians.parameters import Gaussians
+from drgs.training import fit_folder
+from drgs.training.trainer import Trainer
 
 DEBUG = dr.JitFlag.Debug
 
@@ -160,7 +162,7 @@ def scene(tmp_path_factory):
 @pytest.fixture
 def in_every_step(monkeypatch):
     """Calls of ``Trainer.step`` call these, with the trainer, when they are done."""
-    acts, step = [], fit.Trainer.step
+    acts, step = [], Trainer.step
 
     def step_and_act(trainer):
         report = step(trainer)
@@ -168,8 +170,8 @@ def in_every_step(monkeypatch):
             act(trainer)
         return report
 
-    monkeypatch.setattr(fit.Trainer, "step", step_and_act)
-    monkeypatch.setattr(fit, "write_results", lambda *arguments: None)
+    monkeypatch.setattr(Trainer, "step", step_and_act)
+    monkeypatch.setattr(fit_folder, "write_results", lambda *arguments: None)
     return acts
 
 

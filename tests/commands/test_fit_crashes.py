@@ -5,6 +5,7 @@ The clock of a fit with a budget is replaced: its plan is revised after iteratio
 
 import os
 from types import SimpleNamespace
+from unittest.mock import Mock
 
 import pytest
 from support.fit_command import (
@@ -16,8 +17,8 @@ from support.fit_command import (
 )
 from support.folders import visible
 
-from drgs import fit
 from drgs.config.load import load_config
+from drgs.training import session
 
 PLANS = {2: 10, 3: 9, 5: 8}
 """By iteration: how many there will be, as the plan is revised to; the clock ends it after 7."""
@@ -48,7 +49,7 @@ class Revised:
     def __init__(self, *_):
         pass
 
-    def goes_on(self, trainer):
+    def should_continue(self, trainer):
         done = trainer.iteration
         if done in PLANS:
             trainer.reschedule(PLANS[done], trainer.config.densify.stop)
@@ -56,7 +57,7 @@ class Revised:
             trainer.reschedule(done, trainer.config.densify.stop)
         return done < LAST
 
-    def total(self, trainer):
+    def num_iterations(self, trainer):
         return trainer.config.iterations
 
 
@@ -66,10 +67,13 @@ def quick(monkeypatch):
     without_pictures(monkeypatch)
 
     def plan(config, *_):
-        return 0.0, SimpleNamespace(config=config, reasons="planned", curve=None)
+        return SimpleNamespace(
+            config=config, reasons="planned", chosen=SimpleNamespace(curve=None), end=0.0
+        )
 
-    monkeypatch.setattr(fit, "planned", plan)
-    monkeypatch.setattr(fit, "Deadline", Revised)
+    monkeypatch.setattr(session, "plan_fit", plan)
+    monkeypatch.setattr(session, "rehearse", lambda *_: Mock())
+    monkeypatch.setattr(session, "Deadline", Revised)
 
 
 @pytest.fixture(scope="module")

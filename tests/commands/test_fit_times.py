@@ -2,14 +2,15 @@
 
 import csv
 import json
+from dataclasses import dataclass
 from types import SimpleNamespace
 
 import pytest
 from support.fit_command import assert_fits, write_project
 from support.small_fits import config_of, plain_dataset, true_blobs
 
-from drgs import fit
 from drgs.config.changes import changed
+from drgs.config.schema import FitConfig
 from drgs.core.errors import UserNote
 from drgs.results.files import (
     CURVES,
@@ -22,22 +23,30 @@ from drgs.results.files import (
     VIEWER,
 )
 from drgs.results.report import Seconds
+from drgs.training import budget
 from drgs.training.viewers import TIME_SHARE
+
+
+@dataclass(frozen=True)
+class Planned:
+    config: FitConfig
+    end: float = 0.0
 
 
 @pytest.fixture
 def planned(monkeypatch):
     """When iterations end, and for which configuration, by a clock that says 0."""
-    rehearsal = SimpleNamespace(trainer=SimpleNamespace(scene_of_all=lambda: None), iteration_s=0.1)
-    monkeypatch.setattr(fit, "rehearse", lambda *_: rehearsal)
-    monkeypatch.setattr(fit, "seconds_of_results", lambda *_: Seconds(6.0, renders=1.0, report=1.0))
-    monkeypatch.setattr(fit, "seconds_of_curves", lambda: 2.0)
-    monkeypatch.setattr(fit, "make_plan", lambda *arguments: arguments)
-    monkeypatch.setattr(fit, "time", SimpleNamespace(perf_counter=lambda: 0.0))
+    rehearsal = SimpleNamespace(trainer=SimpleNamespace(full_scene=lambda: None), iteration_s=0.1)
+    monkeypatch.setattr(
+        budget, "seconds_of_results", lambda *_: Seconds(6.0, renders=1.0, report=1.0)
+    )
+    monkeypatch.setattr(budget, "seconds_of_curves", lambda: 2.0)
+    monkeypatch.setattr(budget, "make_plan", lambda config, *_: Planned(config))
+    monkeypatch.setattr(budget, "time", SimpleNamespace(perf_counter=lambda: 0.0))
 
     def plan(config, seconds):
-        end, (planned, *_) = fit.planned(config, plain_dataset(), true_blobs(), seconds)
-        return end, planned
+        plan = budget.plan_fit(config, plain_dataset(), true_blobs(), seconds, rehearsal)
+        return plan.end, plan.config
 
     return plan
 

@@ -22,6 +22,8 @@ from drgs.gaussians.parameters import Gaussians
 from drgs.integrator.scene import make_scene, make_sensors, render_views
 from drgs.results.files import GAUSSIANS, GAUSSIANS_FOR_VIEWERS, METRICS
 from drgs.results.folder import remove_run
+from drgs.training import session
+from drgs.training.fit_folder import gaussians_on_page
 
 OTHERWISE = {"antialiased": True, "low_pass": 0.1}
 
@@ -92,7 +94,7 @@ def test_a_fit_that_goes_on_gives_the_same_bytes(fitted, tmp_path, monkeypatch):
     config = write_project(tmp_path, model={**VALUES["model"], **OTHERWISE})
     without_pictures(monkeypatch)
     with monkeypatch.context() as broken:
-        broken.setattr(fit, "write_for_viewers", lambda *_: sys.exit(7))
+        broken.setattr(session.FitSession, "_fit_for_viewers", lambda *_: sys.exit(7))
         with pytest.raises(SystemExit):
             fit.main([str(config), "--out", str(tmp_path / "out")])
     assert not (tmp_path / "out" / GAUSSIANS_FOR_VIEWERS).exists()
@@ -136,7 +138,7 @@ def test_a_file_of_somebody_else_is_not_replaced(tmp_path, monkeypatch):
 )
 def test_the_page_shows_the_fits_own_where_it_can(approximations, shown):
     own, other = true_blobs(), disturbed_blobs()
-    found = fit.shown_on_page(own, approximations, other)
+    found = gaussians_on_page(own, approximations, other)
     if shown == "the fit's own":
         assert found.gaussians is own and found.approximations == approximations
     else:
@@ -146,7 +148,7 @@ def test_the_page_shows_the_fits_own_where_it_can(approximations, shown):
 def test_the_page_shows_what_a_smoothing_filter_makes_of_gaussians():
     own = true_blobs()
     own = replace(own, smoothing=np.full(own.num_gaussians, 0.2, np.float32))
-    found = fit.shown_on_page(own, Approximations(), None).gaussians
+    found = gaussians_on_page(own, Approximations(), None).gaussians
     assert found.smoothing is None
     expected = np.sqrt(np.square(own.scales.astype(np.float64)) + 0.2**2)
     np.testing.assert_allclose(found.scales, expected, rtol=1e-5)  # float32 logarithms

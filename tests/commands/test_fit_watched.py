@@ -18,6 +18,7 @@ from support.fit_command import (
 from support.small_capture import HEIGHT, WIDTH, pose_around
 
 from drgs import fit
+from drgs.training import fit_folder
 from drgs.viewer import fit_page
 from drgs.viewer.frames import FrameRequest
 from drgs.viewer.optics import Eye
@@ -115,7 +116,9 @@ def test_a_fit_that_was_ended_and_then_killed_writes_its_results_when_resumed(
     config, out = write_project(tmp_path), tmp_path / "out"
     looked_on(end_at=4)
     with monkeypatch.context() as patch:
-        patch.setattr(fit, "write_pictures", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+        patch.setattr(
+            fit_folder, "write_pictures", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt)
+        )
         assert run_in_process(fit.main, config, "--out", out, "--view").returncode == 130
     assert_fits("--resume", out)
     assert json.loads((out / "metrics.json").read_text())["iterations"] == 5

@@ -13,8 +13,8 @@ from support.fit_command import (
 )
 from support.folders import contents
 
-from drgs import fit
-from drgs.core.locks import sole_writer
+from drgs.core.folders import sole_writer
+from drgs.training import session
 
 MESSAGE = (
     "out: another command is writing to this folder; wait until it has ended, or choose another"
@@ -42,13 +42,13 @@ def test_a_folder_that_another_fit_writes_to_is_refused(project, tmp_path, monke
 
 def test_of_two_that_begin_at_once_the_second_is_refused(project, tmp_path, monkeypatch):
     """The first makes the folder while the second reads its data."""
-    out, load_dataset = tmp_path / "out", fit.load_dataset
+    out, load_dataset = tmp_path / "out", session.load_dataset
     with ExitStack() as first:
 
         def load(config):
             first.enter_context(sole_writer(out))()
             return load_dataset(config)
 
-        monkeypatch.setattr(fit, "load_dataset", load)
+        monkeypatch.setattr(session, "load_dataset", load)
         assert MESSAGE in run_fit(project, "--out", out).stderr
     assert contents(out) == {}

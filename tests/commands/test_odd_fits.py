@@ -12,6 +12,8 @@ from support.commands import run_in_process
 from support.fit_command import write_scene
 
 from drgs import fit
+from drgs.training import fit_folder
+from drgs.training.trainer import Trainer
 
 
 @pytest.fixture
@@ -24,7 +26,7 @@ def scene(tmp_path):
 def interrupts(monkeypatch):
     """How often Ctrl-C is pressed during the second iteration."""
     before = signal.getsignal(signal.SIGINT)
-    counts, step = [1], fit.Trainer.step
+    counts, step = [1], Trainer.step
 
     def step_and_interrupt(trainer):
         report = step(trainer)
@@ -32,7 +34,7 @@ def interrupts(monkeypatch):
             signal.raise_signal(signal.SIGINT)
         return report
 
-    monkeypatch.setattr(fit.Trainer, "step", step_and_interrupt)
+    monkeypatch.setattr(Trainer, "step", step_and_interrupt)
     yield counts
     signal.signal(signal.SIGINT, before)
 
@@ -61,7 +63,7 @@ def rename_view(folder, split, name):
 
 
 def test_pictures_with_long_names_are_fitted_and_shown_under_shorter_ones(scene, monkeypatch):
-    monkeypatch.setattr(fit, "write_results", lambda *arguments: None)
+    monkeypatch.setattr(fit_folder, "write_results", lambda *arguments: None)
     for split in ("train", "test"):
         rename_view(scene, split, "\u4e2d" * 83)  # 249 bytes
     outcome = run_in_process(fit.main, scene / "a.yml", "--out", scene / "out")
@@ -94,7 +96,7 @@ def test_folders_whose_names_are_not_utf_8_are_refused_before_the_fit(scene, opt
 
 def test_a_start_cloud_of_points_in_one_place_and_points_far_away_is_fitted(scene, monkeypatch):
     """Without a line of NumPy's about scales that are beyond float32."""
-    monkeypatch.setattr(fit, "write_results", lambda *arguments: None)
+    monkeypatch.setattr(fit_folder, "write_results", lambda *arguments: None)
     points = np.zeros(18, [(axis, "f4") for axis in "xyz"])
     points[17] = (3e38, -1e30, 1)
     PlyData([PlyElement.describe(points, "vertex")]).write(str(scene / "points.ply"))

@@ -16,6 +16,7 @@ from drgs import fit
 from drgs.config.load import load_config
 from drgs.config.schema import FitConfig
 from drgs.core.errors import UserError
+from drgs.training import fit_folder
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -112,7 +113,7 @@ def scene(tmp_path_factory):
 def test_a_fit_takes_every_number_at_its_limits_or_says_what_is_wrong(
     scene, tmp_path, monkeypatch, key, ends
 ):
-    monkeypatch.setattr(fit, "write_results", lambda *arguments: None)
+    monkeypatch.setattr(fit_folder, "write_results", lambda *arguments: None)
     for value in (*ends, 1e-300, 1e300):
         if math.isfinite(value):
             arguments = ("--out", tmp_path / f"{value}", "--set", f"{key}={value}")

@@ -7,7 +7,7 @@ import signal
 import pytest
 
 from drgs.core.errors import UserError
-from drgs.core.locks import sole_writer
+from drgs.core.folders import sole_writer
 
 
 def test_a_folder_has_one_writer(tmp_path):

@@ -8,7 +8,7 @@ import sys
 import pytest
 
 from drgs.core.errors import UserError
-from drgs.core.records import FolderRecord, digest
+from drgs.core.folders import FolderRecord, digest
 
 
 def record(folder, command="render"):

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from drgs.gaussians.sh_rotation import (
-    rotated,
+from drgs.gaussians.rotation import (
+    rotate_sh,
     sh_rotation_generators,
     sh_rotation_matrices,
 )
@@ -32,7 +32,7 @@ def test_a_rotated_function_has_the_values_of_the_directions_turned_back(rotatio
     # d @ R is R^T d for the rows d.
     before = np.concatenate([sh0, shN], axis=1)
     expected = np.einsum("dk,nkc->ndc", reference.sh_basis(d @ rotation, degree), before)
-    after = np.concatenate([sh0, rotated(shN, rotation)], axis=1)
+    after = np.concatenate([sh0, rotate_sh(shN, rotation)], axis=1)
     actual = np.einsum("dk,nkc->ndc", reference.sh_basis(d, degree), after)
     np.testing.assert_allclose(actual, expected, atol=ROUNDING * 16)
     if degree > 0:

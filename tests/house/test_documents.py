@@ -26,7 +26,11 @@ PAGES = (
     *(f"docs/{path.name}" for path in sorted((REPOSITORY / "docs").glob("*.md"))),
 )
 
-each_page = pytest.mark.parametrize("page", PAGES)
+STUDIES = sorted(
+    f"scenes/studies/{path.name}" for path in (REPOSITORY / "scenes" / "studies").glob("*.md")
+)
+
+each_page = pytest.mark.parametrize("page", (*PAGES, *STUDIES))
 
 
 def text_of(page) -> str:

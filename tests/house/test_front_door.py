@@ -12,7 +12,7 @@ PUBLIC = {"Gaussians", "load_dataset", "rasterization", "train"}
 LAZILY = """
 import sys
 import drgs
-heavy = {{"drgs.gaussians", "drgs.datasets", "drgs.training", "drgs.rasterizing", "plyfile"}}
+heavy = {{"drgs.gaussians", "drgs.datasets", "drgs.training", "drgs.gsplat_api", "plyfile"}}
 assert not heavy & set(sys.modules), heavy & set(sys.modules)
 drgs.{name}
 assert "{name}" in vars(drgs)

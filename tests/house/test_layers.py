@@ -35,12 +35,12 @@ MAY_IMPORT = {
     "plugins": {"integrator", *INTEGRATOR},
     "_registration": {"plugins", *GROUND},
     "": {"_registration", "core"},  # drgs/__init__.py; what it offers is imported when it is used
-    "rasterizing": {"accuracy", "effects", "splatting", "config", *METHOD},
+    "gsplat_api": {"accuracy", "effects", "splatting", "config", *METHOD},
     "viewer": {"training", *TRAINING},
     "commands": {"viewer", "training", "cli", "plugins", *TRAINING},
     "bench": {
         "commands",
-        "rasterizing",
+        "gsplat_api",
         "training",
         "cli",
         "reference",

@@ -1,6 +1,7 @@
 """Undocumented functions of Dr.Jit and Mitsuba are called in one module."""
 
 import ast
+import re
 import subprocess
 import sys
 
@@ -9,7 +10,6 @@ import numpy as np
 from conftest import REPOSITORY
 from drjit.llvm.ad import Float, UInt32
 
-from drgs.bench.limits import vector_width
 from drgs.core import private
 
 FILES = [path for f in ("drgs", "plugins") for path in sorted((REPOSITORY / f).rglob("*.py"))]
@@ -48,6 +48,15 @@ def test_variables_are_the_same_or_have_equal_values():
 
 def test_the_library_has_a_version():
     assert private.llvm_version()[0] > 10
+
+
+def vector_width() -> int:
+    """Read the number of 32-bit numbers in a vector from the code that Dr.Jit generates."""
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
+        dr.kernel_history_clear()
+        dr.eval(dr.arange(Float, 64) * dr.opaque(Float, 2))
+        (kernel,) = dr.kernel_history([dr.KernelType.JIT])
+    return int(re.search(r"<(\d+) x float>", kernel["ir"].getvalue())[1])
 
 
 PROGRAM = """

@@ -292,7 +292,7 @@ print(json.dumps([kernels, [] if blocked else loaded_modules]))
 
 MODULES = (
     *("integrator.ellipsoids", "integrator.gathering", "integrator.placement"),
-    *("gaussians.similarity", "gaussians.sh_rotation"),
+    *("gaussians.similarity", "gaussians.rotation"),
 )
 
 

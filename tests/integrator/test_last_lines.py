@@ -11,7 +11,7 @@ from functools import cache
 import pytest
 from conftest import REPOSITORY
 
-from drgs.core import tracebacks
+from drgs.core import errors
 from drgs.core.errors import PluginError
 
 SCENES = """
@@ -175,7 +175,7 @@ def test_a_notebook_shows_the_cause_last(capsys):
             print(f"RuntimeError: {exc_tuple[1]}", file=sys.stderr)
 
     error = wrapped(PluginError("splats: the reason"))
-    tracebacks._show_in_notebook(Shell(), type(error), error, None)
+    errors._show_in_notebook(Shell(), type(error), error, None)
     lines = capsys.readouterr().err.splitlines()
     assert lines == [
         "RuntimeError: (see above)",

@@ -16,8 +16,8 @@ from support.views import Scene, gradient, gradients_of, image_of, tensors
 
 import drgs  # noqa: F401  (registers the plugin)
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
+from drgs.gaussians.rotation import rotate_gaussians
 from drgs.gaussians.similarity import Similarity
-from drgs.gaussians.turning import turned
 from drgs.reference import splatting as reference
 
 MATRIX = np.eye(4)
@@ -35,7 +35,9 @@ def variant():
 def moved_by(matrix, gaussians) -> reference.Gaussians:
     """Gaussians moved in double precision."""
     place = Similarity.of(matrix, "the test's matrix")
-    means, quats, shN = turned(gaussians.means, gaussians.quats, gaussians.shN, place.rotation)
+    means, quats, shN = rotate_gaussians(
+        gaussians.means, gaussians.quats, gaussians.shN, place.rotation
+    )
     return replace(
         gaussians,
         means=place.scale * means + place.translation,
@@ -261,7 +263,9 @@ def test_raw_parameters_have_derivatives_in_the_objects_space():
     world = reference.render_gradients(moved_by(MATRIX, model), *_cotangents(scene), None, 3, False)
     found = gradients_of(load(scene, model), scene.weights(), PARAMETER_NAMES)
     back = Similarity.of(np.linalg.inv(MATRIX), "it")
-    means, quats, shN = turned(world["means"], world["quats"], world["shN"], back.rotation)
+    means, quats, shN = rotate_gaussians(
+        world["means"], world["quats"], world["shN"], back.rotation
+    )
     expected = world | {"means": SCALE * means, "quats": quats, "shN": shN}
     expected = {name: expected[name] for name in PARAMETER_NAMES}
     assert_arrays_agree(found, expected, GRADIENTS)

@@ -22,7 +22,7 @@ from drgs.integrator.sensors import camera_from_sensor, read_sensor
 from drgs.integrator.summary import SimulatedEffect, described, summary_of_sensors, summary_of_views
 from drgs.training import history
 from drgs.training.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
-from drgs.training.effects.called_for import integrator_settings, training_effects
+from drgs.training.effects.registry import integrator_settings, training_effects
 from drgs.training.summary import summary_of_fit
 
 MODULES = (
@@ -419,7 +419,7 @@ sys.path.insert(0, {tests!r})
 import drgs, mitsuba as mi, numpy as np
 mi.set_variant("llvm_ad_rgb")
 from dataclasses import replace
-from drgs.training.effects.called_for import training_effects
+from drgs.training.effects.registry import training_effects
 from drgs.training.summary import summary_of_fit
 from support import small_capture as capture
 from support.usual_rule import USUAL

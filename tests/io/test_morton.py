@@ -1,22 +1,22 @@
 import numpy as np
 import pytest
 
-from drgs.io.morton import BITS, morton_order
+from drgs.io.quantization import MORTON_BITS, morton_order
 
 
 def interleaved(cell):
     """Bit by bit, in whole numbers of any size."""
     return sum(
         (int(value) >> bit & 1) << (3 * bit + axis)
-        for bit in range(BITS)
+        for bit in range(MORTON_BITS)
         for axis, value in enumerate(cell)
     )
 
 
 def test_points_are_in_the_order_of_their_interleaved_bits():
     rng = np.random.default_rng(0)
-    cells = rng.integers(0, 2**BITS, (300, 3))
-    cells[:2] = [[0, 0, 0], [2**BITS - 1] * 3]  # the box that cells are counted in
+    cells = rng.integers(0, 2**MORTON_BITS, (300, 3))
+    cells[:2] = [[0, 0, 0], [2**MORTON_BITS - 1] * 3]  # the box that cells are counted in
     cells[-1] = cells[-2]
     codes = [interleaved(cell) for cell in cells]
     expected = sorted(range(300), key=lambda index: (codes[index], index))

@@ -83,12 +83,9 @@ def test_a_small_translation_of_a_gltf_node_is_added_to_the_means(tmp_path):
 
 def test_usd_has_the_origin_as_the_translation_of_its_prim(tmp_path):
     pxr = pytest.importorskip("pxr")
-    from drgs.gaussians.parameters import PARAMETER_NAMES
-    from drgs.io.usd import PRIM, encode
+    from drgs.io.usd import PRIM
 
-    (tmp_path / "a.usdc").write_bytes(
-        encode({name: getattr(blobs(), name) for name in PARAMETER_NAMES}, EARTH)
-    )
+    replace(blobs(), origin=EARTH).save(tmp_path / "a.usdc")
     from pxr import UsdGeom
 
     stage = pxr.Usd.Stage.Open(str(tmp_path / "a.usdc"))

@@ -14,7 +14,7 @@ from support.datasets import load
 
 from drgs.core.child_process import ChildEndedError
 from drgs.core.errors import UserError, UserNote
-from drgs.core.locks import sole_writer
+from drgs.core.folders import sole_writer
 from drgs.poses import structure_from_motion as sfm
 from drgs.poses.structure_from_motion import Search, pictures_in, place
 

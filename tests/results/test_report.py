@@ -21,10 +21,10 @@ from drgs.datasets.orbits import orbit_of_views
 from drgs.datasets.viewpoints import field_of_view
 from drgs.integrator.scene import make_scene, render_views
 from drgs.results import curves, report
+from drgs.results.history import DensityRow, HistoryRow
 from drgs.results.metrics import ssim
 from drgs.results.population import story_of
 from drgs.results.viewer import Shown
-from drgs.training.history import DensityRow, HistoryRow
 
 KINDS = ("still", "moving")
 VOID = {"meta", "link", "img", "source", "br", "input"}

@@ -12,7 +12,7 @@ from conftest import REPOSITORY
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from drgs.gaussians.sh_rotation import rotated
+from drgs.gaussians.rotation import rotate_sh
 
 SCENES = REPOSITORY / "scenes"
 MODEL = SCENES / "shapes" / "knot.ply"
@@ -98,7 +98,7 @@ def test_harmonics_are_rotated_as_on_the_host(relight):
     matrix = relight.sh_rotation(mi.Matrix3f(rotation), 3)
     actual = np.array(matrix @ mi.TensorXf(coefficients))
     # Some tens of float32 products of numbers of size one.
-    np.testing.assert_allclose(actual, rotated(coefficients, rotation), atol=1e-5)
+    np.testing.assert_allclose(actual, rotate_sh(coefficients, rotation), atol=1e-5)
 
 
 @pytest.mark.parametrize(

@@ -6,6 +6,8 @@ import pytest
 import yaml
 
 from drgs import fit
+from drgs.training import fit_folder
+from drgs.training.trainer import Trainer
 from support.commands import Outcome, assert_ends_well, assert_refused, run_in_process
 from support.small_capture import make_dataset, write_dataset
 from support.usual_rule import USUAL
@@ -56,16 +58,16 @@ def without_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
     def write_page(out: Path, *_: object) -> None:
         (out / "report.html").write_text("")
 
-    monkeypatch.setattr(fit, "write_results", write_page)
+    monkeypatch.setattr(fit_folder, "write_results", write_page)
 
 
 def stop_after(monkeypatch: pytest.MonkeyPatch, iteration: int) -> None:
     """Ctrl-C, without anything being saved, when so many iterations are done."""
-    step = fit.Trainer.step
+    step = Trainer.step
 
-    def step_and_stop(trainer: fit.Trainer):
+    def step_and_stop(trainer: Trainer):
         if trainer.iteration == iteration:
             raise KeyboardInterrupt
         return step(trainer)
 
-    monkeypatch.setattr(fit.Trainer, "step", step_and_stop)
+    monkeypatch.setattr(Trainer, "step", step_and_stop)

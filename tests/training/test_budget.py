@@ -213,7 +213,7 @@ LINEAR = Curve((100, 200), (100.0, 200.0), (20.0, 21.0))
 
 def until_the_end(trainer, seconds):
     deadline = Deadline(trainer, trainer.clock.now + seconds, LINEAR)
-    while deadline.goes_on(trainer):
+    while deadline.should_continue(trainer):
         trainer.step()
     return trainer
 
@@ -237,7 +237,7 @@ def test_a_fit_that_becomes_slower_is_revised(clock):
     trainer = FakeTrainer(clock, 0.05)
     deadline = Deadline(trainer, clock.now + 100, LINEAR)
     rates = []
-    while deadline.goes_on(trainer):
+    while deadline.should_continue(trainer):
         trainer.second = 0.05 if trainer.iteration < 600 else 0.2
         trainer.step()
         rates.append(trainer.rates.means(trainer.iteration))
@@ -252,10 +252,10 @@ def test_a_fit_that_becomes_slower_is_revised(clock):
 def test_the_expected_end_follows_the_clock(clock):
     trainer = FakeTrainer(clock, 0.2)
     deadline = Deadline(trainer, clock.now + 100, LINEAR)
-    assert deadline.total(trainer) == 1000
+    assert deadline.num_iterations(trainer) == 1000
     for _ in range(10):
         trainer.step()
-    assert deadline.total(trainer) == 500
+    assert deadline.num_iterations(trainer) == 500
 
 
 def test_the_end_of_changes_is_never_before_their_start(clock):

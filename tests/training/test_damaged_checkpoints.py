@@ -12,6 +12,8 @@ from support.fit_command import write_scene
 
 from drgs import fit
 from drgs.core.errors import UserError
+from drgs.training import fit_folder
+from drgs.training.trainer import Trainer
 
 
 @pytest.fixture(scope="module")
@@ -27,7 +29,7 @@ def stopped(tmp_path_factory):
         densify={"stop": 100},  # the population stays
         output={"checkpoint_every": 1, "history_every": 1},
     )
-    step = fit.Trainer.step
+    step = Trainer.step
 
     def step_or_stop(trainer):
         if trainer.iteration == 2:
@@ -35,7 +37,7 @@ def stopped(tmp_path_factory):
         return step(trainer)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(fit.Trainer, "step", step_or_stop)
+        patch.setattr(Trainer, "step", step_or_stop)
         outcome = run_in_process(fit.main, folder / "a.yml", "--out", folder / "out")
     assert outcome.stderr == "error: stopped\n"
     return folder / "out"
@@ -160,7 +162,7 @@ def test_a_damaged_checkpoint_is_refused_and_kept(checkpoint, damage, message):
 
 
 def test_a_checkpoint_that_is_whole_is_continued(checkpoint, monkeypatch):
-    monkeypatch.setattr(fit, "write_results", lambda *arguments: None)
+    monkeypatch.setattr(fit_folder, "write_results", lambda *arguments: None)
     outcome = run_in_process(fit.main, "--resume", checkpoint.parent)
     assert outcome.returncode == 0, outcome.stderr
     assert "continues at iteration 2" in outcome.stdout

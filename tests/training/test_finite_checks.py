@@ -18,6 +18,7 @@ from support.trainers import make_trainer
 from drgs import fit
 from drgs.gaussians.parameters import PARAMETER_NAMES
 from drgs.splatting import rendering
+from drgs.training import fit_folder, session
 from drgs.training.finite_checks import GradientWatch, NonFiniteError, check_values
 from drgs.training.optimizer import replace_values
 from drgs.training.steps import view_of
@@ -350,20 +351,20 @@ def configuration(tmp_path):
 @pytest.fixture
 def saved(monkeypatch):
     """The bytes of every checkpoint, as they were written; there are no reports."""
-    monkeypatch.setattr(fit, "write_results", lambda *arguments: None)
-    saved, save = [], fit.save_checkpoint
+    monkeypatch.setattr(fit_folder, "write_results", lambda *arguments: None)
+    saved, save = [], session.save_checkpoint
 
     def save_and_remember(folder, *rest):
         save(folder, *rest)
         saved.append((folder / "checkpoint.npz").read_bytes())
 
-    monkeypatch.setattr(fit, "save_checkpoint", save_and_remember)
+    monkeypatch.setattr(session, "save_checkpoint", save_and_remember)
     return saved
 
 
 def spoil_photograph(monkeypatch, iteration):
     """The photograph that the fit visits first in that iteration is NaN in one pixel."""
-    spoilt, load = view_of(iteration, 4, seed=0), fit.load_dataset
+    spoilt, load = view_of(iteration, 4, seed=0), session.load_dataset
 
     def load_and_spoil(config):
         dataset = load(config)
@@ -373,13 +374,13 @@ def spoil_photograph(monkeypatch, iteration):
         train[spoilt] = replace(train[spoilt], image=image)
         return replace(dataset, train=tuple(train))
 
-    monkeypatch.setattr(fit, "load_dataset", load_and_spoil)
+    monkeypatch.setattr(session, "load_dataset", load_and_spoil)
     return f"iteration {iteration}, view r_{spoilt}: the loss is nan"
 
 
 def spoil_value(monkeypatch, iteration):
     """After that iteration a scale is infinite."""
-    step = fit.Trainer.step
+    step = Trainer.step
 
     def step_and_spoil(trainer):
         report = step(trainer)
@@ -387,7 +388,7 @@ def spoil_value(monkeypatch, iteration):
             poison_value(trainer, "log_scales", np.inf)
         return report
 
-    monkeypatch.setattr(fit.Trainer, "step", step_and_spoil)
+    monkeypatch.setattr(Trainer, "step", step_and_spoil)
     return f"after iteration 4: log_scales is inf in row {ROW}"
 
 
@@ -421,8 +422,8 @@ def test_fit_stops_keeps_the_last_good_checkpoint_and_resumes(
 
 def test_fit_stops_at_the_next_row_of_its_history(monkeypatch, capsys, tmp_path, configuration):
     expected = spoil_photograph(monkeypatch, iteration=4)
-    steps, step = [], fit.Trainer.step
-    monkeypatch.setattr(fit.Trainer, "step", lambda self: steps.append(self) or step(self))
+    steps, step = [], Trainer.step
+    monkeypatch.setattr(Trainer, "step", lambda self: steps.append(self) or step(self))
     arguments = ("--set", "output.checkpoint_every=null")
     message = fails(capsys, configuration, "--out", tmp_path / "out", *arguments)
     assert message.startswith(expected)

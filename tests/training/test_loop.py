@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import drjit as dr
+import mitsuba as mi
+import numpy as np
 import pytest
 import yaml
 from support.small_capture import make_dataset, write_dataset
@@ -10,6 +13,10 @@ import drgs
 from drgs import fit
 from drgs.config.load import load_config
 from drgs.core.errors import UserError
+from drgs.training import fit_folder
+from drgs.training.density.strategy import DensityStrategy
+from drgs.training.effects.base import TrainingEffect
+from drgs.training.losses import Loss
 
 CONFIG = {
     "data": {"path": "data"},
@@ -27,7 +34,7 @@ def folder(tmp_path, monkeypatch):
     write_dataset(tmp_path / "data", make_dataset(train=4, test=1))
     (tmp_path / "a.yml").write_text(yaml.safe_dump(CONFIG))
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(fit, "write_results", lambda *arguments: None)
+    monkeypatch.setattr(fit_folder, "write_results", lambda *arguments: None)
     return tmp_path
 
 
@@ -58,6 +65,41 @@ def test_a_callback_sees_each_iteration_and_may_end_the_fit(folder):
     assert result.gaussians.num_gaussians == reports[3].num_gaussians
     result.trainer.step()
     assert result.trainer.iteration == 5
+
+
+class Still(DensityStrategy):
+    """Leaves the population as it is."""
+
+
+class Blue(TrainingEffect):
+    """Renderings are compared without red and green."""
+
+    name = "blue"
+
+    def adjust(self, image, view):
+        return image * type(image)(mi.Float([0.0, 0.0, 1.0]), (1, 1, 3))
+
+
+class Squares(Loss):
+    """The mean squared error."""
+
+    def __call__(self, image, target):
+        return dr.mean(dr.square(image.array - target.image.array))
+
+
+def test_objects_take_the_place_of_what_a_configuration_names(folder):
+    reports = []
+    plain = drgs.train(CONFIG)
+    assert plain.gaussians.num_gaussians != 40
+    objects = {"strategy": Still(), "effects": [Blue()], "loss": Squares()}
+    found = drgs.train(CONFIG, None, reports.append, **objects)
+    assert found.gaussians.num_gaussians == 40
+    (view,) = found.trainer.views[-1:]
+    image = dr.zeros(mi.TensorXf, (view.height, view.width, 3)) + 0.5
+    adjusted, loss, _ = found.trainer.compare(image, view)
+    expected = np.array([0, 0, 0.5]) - np.array(view.target.image)
+    assert np.array(adjusted)[0, 0].tolist() == [0, 0, 0.5]
+    assert float(loss[0]) == pytest.approx(np.square(expected).mean(), rel=1e-5)
 
 
 def test_a_folder_is_fitted_as_the_command_does(folder):

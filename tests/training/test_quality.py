@@ -6,9 +6,9 @@ import pytest
 from support.small_capture import decibels
 from support.small_fits import everything_of, make_trainer, steps, true_dataset
 
+from drgs.results.history import DENSITY_COLUMNS, DensityReport, write_density, write_history
 from drgs.training import quality
-from drgs.training.density.strategy import DENSITY_COLUMNS, DensityReport
-from drgs.training.history import History, HistoryRow, write_density, write_history
+from drgs.training.history import History, HistoryRow
 
 
 def row(iteration, test_psnr=None):
@@ -55,7 +55,7 @@ def test_measuring_changes_nothing_that_comes():
     for count in (2, 3, 4, 5):
         report = [watched.step() for _ in range(count)][-1]
         history.add(report)
-        quality.measure(watched, history, dataset.test)
+        quality.HeldOutQuality(dataset.test).measure(watched, history)
     assert everything_of(watched) == everything_of(plain)
 
     plain.sync_scene()

@@ -16,7 +16,7 @@ from drgs.config.load import load_config
 from drgs.datasets import load_dataset
 from drgs.initialization.defaults import completed
 from drgs.results.metrics import mean_quality
-from drgs.training.loop import train
+from drgs.training.session import train
 
 CONFIGURATIONS = sorted(path.stem for path in (REPOSITORY / "scenes").glob("*.yml"))
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from drgs.core.errors import UserError
-from drgs.viewer import scheduler, wishes
+from drgs.viewer import requests, scheduler
 from drgs.viewer.frames import Frame, FrameRequest
 from drgs.viewer.optics import Eye
 from drgs.viewer.requests import Wishes
@@ -28,7 +28,7 @@ class Clock(SimpleNamespace):
 def clock(monkeypatch):
     clock = Clock()
     monkeypatch.setattr(scheduler, "time", clock)
-    monkeypatch.setattr(wishes, "time", clock)
+    monkeypatch.setattr(requests, "time", clock)
     return clock
 
 

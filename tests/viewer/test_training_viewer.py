@@ -17,9 +17,8 @@ from support.small_fits import (
 
 from drgs.config.approximations import Approximations
 from drgs.integrator.scene import make_scene, render_views
-from drgs.training.budget import AllIterations
 from drgs.training.history import History
-from drgs.training.loop import iterations
+from drgs.training.loop import AllIterations, iterations
 from drgs.training.trainer import Trainer
 from drgs.viewer.frames import SHOWN, FrameRequest
 from drgs.viewer.optics import Eye, FisheyeLens, ThinLens
@@ -147,7 +146,7 @@ def test_an_end_asked_for_too_early_or_too_late_changes_nothing():
     dataset, wishes = plain_dataset(), Wishes()
     wishes.end()
     trainer = make_trainer(dataset, iterations=3)
-    assert UntilEnded(AllIterations(), wishes).goes_on(trainer)  # nothing is fitted yet
+    assert UntilEnded(AllIterations(), wishes).should_continue(trainer)  # nothing is fitted yet
     config = config_of(iterations=3)
     wishes = Wishes()
     run(trainer, wishes, dataset, lambda iteration: iteration == 3 and wishes.end())

@@ -19,9 +19,11 @@ import drjit as dr
 import numpy as np
 from scipy.special import expit
 
-from drgs.config.schema import DensifyConfig
+from drgs.config.extensions import STRATEGIES
+from drgs.config.schema import DensifyConfig, FitConfig
 from drgs.core.arrays import from_host, types_of
 from drgs.core.errors import UserError
+from drgs.datasets.types import Dataset
 from drgs.training.density.strategy import (
     DensityReport,
     DensityStrategy,
@@ -50,6 +52,7 @@ class DensityStatistics:
         return sums / np.maximum(views, 1)
 
 
+@STRATEGIES.register("adc")
 @dataclass
 class AdaptiveDensityControl(DensityStrategy):
     """Clones and splits where gradients are large, prunes what is transparent or too large."""
@@ -58,6 +61,15 @@ class AdaptiveDensityControl(DensityStrategy):
     white_background: bool
     statistics: DensityStatistics | None = None  # until it begins
     by_row = ("gradient_norms", "views")
+
+    @classmethod
+    def from_config(
+        cls, config: FitConfig, dataset: Dataset | None, section: None
+    ) -> AdaptiveDensityControl:
+        """Return the strategy of the section ``densify``."""
+        del section
+        is_white = dataset is not None and tuple(dataset.background) == (1.0, 1.0, 1.0)
+        return cls(config.densify, is_white)
 
     def begin(self, population: Population) -> None:
         """Start with the statistics of no views."""

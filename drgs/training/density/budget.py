@@ -30,9 +30,11 @@ import numpy as np
 from scipy.special import expit, logit
 
 from drgs.config.density import DensifyConfig
-from drgs.config.schema import CoarseStage
+from drgs.config.extensions import STRATEGIES
+from drgs.config.schema import CoarseStage, FitConfig
 from drgs.core.arrays import from_host, types_of
 from drgs.core.errors import UserError
+from drgs.datasets.types import Dataset
 from drgs.training.density.strategy import (
     DensityReport,
     DensityStrategy,
@@ -56,6 +58,7 @@ OPACITY_RANGE = 1e-4, 1 - 1e-4
 """Of the halves, so that logits stay small."""
 
 
+@STRATEGIES.register("budget")
 @dataclass
 class GrowthToNumber(DensityStrategy):
     """Splits those that see most of the errors, as many as there is room for."""
@@ -65,6 +68,14 @@ class GrowthToNumber(DensityStrategy):
     errors: Any = None  # Float (N,): sum over views of s; None until it begins
     first: int = 0  # Gaussians at the start
     by_row = ("errors",)
+
+    @classmethod
+    def from_config(
+        cls, config: FitConfig, dataset: Dataset | None, section: None
+    ) -> GrowthToNumber:
+        """Return the strategy of the section ``densify``."""
+        del dataset, section
+        return cls(config.densify, config.coarse or ())
 
     def begin(self, population: Population) -> None:
         """Start with the errors of no views."""

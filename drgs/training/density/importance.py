@@ -16,8 +16,10 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
+from drgs.config.extensions import STRATEGIES
 from drgs.config.schema import FitConfig
 from drgs.core.arrays import from_host
+from drgs.datasets.types import Dataset
 from drgs.training.density.pruning import PruneSchedule, best_rows, keep_best
 from drgs.training.density.strategy import (
     DensityReport,
@@ -28,10 +30,17 @@ from drgs.training.density.strategy import (
 )
 
 
+@STRATEGIES.register("importance")
 class Importance(DensityStrategy):
     """Removes Gaussians by what they contribute to pictures."""
 
     by_row = ("weights",)
+
+    @classmethod
+    def from_config(cls, config: FitConfig, dataset: Dataset | None, section: None) -> Importance:
+        """Return the phase of the section ``densify.prune``."""
+        del dataset, section
+        return cls(config)
 
     def __init__(self, config: FitConfig) -> None:
         self.schedule = PruneSchedule.of(config)

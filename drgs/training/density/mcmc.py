@@ -20,8 +20,11 @@ import numpy as np
 from scipy.special import comb, expit, logit
 
 from drgs.config.density import DensifyConfig
+from drgs.config.extensions import STRATEGIES
+from drgs.config.schema import FitConfig
 from drgs.core.arrays import from_host, types_of
 from drgs.core.errors import UserError
+from drgs.datasets.types import Dataset
 from drgs.gaussians.quaternions import quat_to_rotation
 from drgs.training.density.draws import in_proportion, normals
 from drgs.training.density.strategy import DensityReport, DensityStrategy, Population, displaced
@@ -37,12 +40,19 @@ NOISE_STEEPNESS = 100.0
 """Noise fades out over some 0.05 of opacity: the paper's equation 8."""
 
 
+@STRATEGIES.register("mcmc")
 @dataclass
 class MarkovChain(DensityStrategy):
     """Relocates what is transparent, and adds noise to where it is."""
 
     config: DensifyConfig
     extent: float = math.nan  # of the scene, world units; known when it begins
+
+    @classmethod
+    def from_config(cls, config: FitConfig, dataset: Dataset | None, section: None) -> MarkovChain:
+        """Return the strategy of the section ``densify``."""
+        del dataset, section
+        return cls(config.densify)
 
     def begin(self, population: Population) -> None:
         """Know the scene's extent, in which noise and scales are measured."""

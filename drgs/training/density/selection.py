@@ -15,8 +15,10 @@ from collections.abc import Mapping
 import drjit as dr
 import numpy as np
 
+from drgs.config.extensions import STRATEGIES
 from drgs.config.schema import FitConfig
 from drgs.core.arrays import types_of
+from drgs.datasets.types import Dataset
 from drgs.training.density.pruning import PruneSchedule, keep_best
 from drgs.training.density.strategy import DensityReport, DensityStrategy, Population
 
@@ -25,8 +27,17 @@ LARGEST_PRESSURE = 1.0
 iterations at four times the usual rate."""
 
 
+@STRATEGIES.register("selection")
 class NaturalSelection(DensityStrategy):
     """Lowers opacities alike, and removes what becomes transparent."""
+
+    @classmethod
+    def from_config(
+        cls, config: FitConfig, dataset: Dataset | None, section: None
+    ) -> NaturalSelection:
+        """Return the phase of the section ``densify.prune``."""
+        del dataset, section
+        return cls(config)
 
     def __init__(self, config: FitConfig) -> None:
         self.schedule, self.prune = PruneSchedule.of(config), config.densify.prune

@@ -2,7 +2,7 @@
 
 Each iteration, :class:`drgs.training.trainer.Trainer` tells the strategy what it has seen
 (:class:`StepInfo`) and lets it act on the rows of the optimizer (:class:`Population`).
-``drgs.training.density.called_for`` says which strategy a configuration calls for.
+``drgs.training.density.registry`` makes the strategy that a configuration chooses.
 
 Iterations are counted from 1. A strategy is a function of the configuration and of
 :meth:`DensityStrategy.state`: where a plan is revised, another one is made and given the state.
@@ -11,15 +11,18 @@ Iterations are counted from 1. A strategy is a function of the configuration and
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any, Protocol
 
 import drjit as dr
 import numpy as np
 
+from drgs.config.schema import FitConfig
 from drgs.core.arrays import from_host, types_of
+from drgs.datasets.types import Dataset
 from drgs.gaussians.parameters import Gaussians
 from drgs.gaussians.quaternions import quat_to_rotation
+from drgs.results.history import DensityReport
 from drgs.training.optimizer import (
     LeanAdam,
     edit_rows,
@@ -28,23 +31,6 @@ from drgs.training.optimizer import (
     set_values,
     take_rows,
 )
-
-
-@dataclass(frozen=True)
-class DensityReport:
-    """What one call of :meth:`DensityStrategy.refine` did to the rows."""
-
-    num_gaussians: int  # afterwards
-    num_added: int = 0  # rows on top of those before, parents of a split not counted
-    cloned: int = 0  # Gaussians that were copied
-    split: int = 0  # Gaussians that were replaced by several
-    relocated: int = 0  # rows that became copies of others
-    pruned: int = 0  # rows that were removed, parents of a split not counted
-    refused: int = 0  # Gaussians that were to be cloned or split, but there was no room
-
-
-DENSITY_COLUMNS = ("iteration", *(field.name for field in fields(DensityReport)))
-"""Of the table of what all calls did."""
 
 
 @dataclass(frozen=True)
@@ -199,6 +185,17 @@ class DensityStrategy(Protocol):
     Where several processes have some of the rows each, so do their strategies, of which each takes
     note of its own; whoever acts asks for :meth:`Population.of_all`, and all decide alike.
     """
+
+    @classmethod
+    def from_config(cls, config: FitConfig, dataset: Dataset | None, section: Any) -> Any:
+        """Return the strategy of a fit.
+
+        section: the section that the strategy has registered, with the values of the
+        configuration, or the model's defaults; by default the only argument of the class. None:
+        the strategy has no section. dataset: None where only :meth:`most_gaussians` is called.
+        """
+        del config, dataset
+        return cls() if section is None else cls(section)
 
     by_row: Sequence[str] = ()
     """Names in :meth:`state` of what has a row for each Gaussian."""

@@ -8,7 +8,10 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from drgs.datasets.types import View
+from drgs.config.extensions import EFFECTS
+from drgs.config.schema import FitConfig
+from drgs.core.errors import UserError
+from drgs.datasets.types import Dataset, View
 from drgs.training.effects.base import FitState, TrainingEffect, as_tensor
 from drgs.training.losses import prepare_target
 from drgs.training.views import TrainingView
@@ -24,6 +27,7 @@ def set_background(integrator: mi.Integrator, color: np.ndarray) -> None:
     params.update()
 
 
+@EFFECTS.register("background")
 class RandomBackground(TrainingEffect):
     """Another colour behind each picture: nothing but an opaque splat can look like what is there.
 
@@ -33,6 +37,17 @@ class RandomBackground(TrainingEffect):
 
     name = "background"
     upload_bytes = 12
+
+    @classmethod
+    def from_config(cls, config: FitConfig, dataset: Dataset, section: None) -> RandomBackground:
+        """Return the effect of a fit."""
+        del section
+        if any(view.alpha is None for view in dataset.train):
+            raise UserError(
+                "data.random_background: the photographs must be transparent where the background "
+                "is to be seen, got opaque ones"
+            )
+        return cls(config.seed, dataset.background, config.loss.window, config.loss.sigma)
 
     def __init__(
         self, seed: int, background: tuple[float, float, float], window: int, sigma: float

@@ -1,8 +1,8 @@
 """What a scene calls for between rendering and the loss: composed into a fit, or not there.
 
 A :class:`TrainingEffect` takes part in each iteration of a fit, of which it knows a
-:class:`FitState`. ``drgs.training.effects.called_for`` says which ones a configuration and a
-dataset call for, and imports them.
+:class:`FitState`. ``drgs.training.effects.registry`` chooses those that a configuration and a
+dataset use, and imports them.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from typing import Any, Protocol
 import mitsuba as mi
 import numpy as np
 
+from drgs.config.schema import FitConfig
 from drgs.core.arrays import from_host
 from drgs.datasets.types import Dataset, View
 from drgs.training.views import TrainingView
@@ -46,6 +47,16 @@ class TrainingEffect(Protocol):
 
     As it is here, an effect does nothing. Images are tensors (H, W, C) in display space.
     """
+
+    @classmethod
+    def from_config(cls, config: FitConfig, dataset: Dataset, section: Any) -> Any:
+        """Return the effect of a fit.
+
+        section: the section that the effect has registered, with the values of the configuration;
+        by default the only argument of the class. None: the effect has no section.
+        """
+        del config, dataset
+        return cls() if section is None else cls(section)
 
     name = ""  # of its part of a checkpoint, and of what it uploads
     moves_sensors = False  # whether it changes the parameters of sensors

@@ -20,7 +20,8 @@ import numpy as np
 
 from drgs.cameras.axes import OPENCV_TO_MITSUBA
 from drgs.cameras.motion import rotation_matrix
-from drgs.config.schema import CamerasConfig
+from drgs.config.extensions import EFFECTS
+from drgs.config.schema import CamerasConfig, FitConfig
 from drgs.core.errors import UserError
 from drgs.core.files import atomic_path
 from drgs.datasets.types import Dataset, View
@@ -46,11 +47,18 @@ class _Start:
     size: mi.Vector2f  # px
 
 
+@EFFECTS.register("cameras")
 class CameraRefinement(TrainingEffect):
     """Poses of all training views, and what their lenses share."""
 
     name = "cameras"
     moves_sensors = True
+
+    @classmethod
+    def from_config(cls, config: FitConfig, dataset: Dataset, section: None) -> CameraRefinement:
+        """Return the effect of a fit."""
+        del section
+        return cls(config.cameras, len(dataset.train), dataset.extent)
 
     def __init__(self, config: CamerasConfig, num_views: int, extent: float) -> None:
         """num_views: of the training split; extent: world units."""

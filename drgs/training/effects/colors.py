@@ -20,7 +20,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from drgs.config.schema import ColorConfig
+from drgs.config.extensions import EFFECTS
+from drgs.config.schema import ColorConfig, FitConfig
 from drgs.core.arrays import from_host
 from drgs.core.files import atomic_path
 from drgs.datasets.types import Dataset, View
@@ -34,11 +35,18 @@ IDENTITY = np.eye(3, 4).reshape(1, 12)
 """Row by row."""
 
 
+@EFFECTS.register("colors")
 class ColorCorrection(TrainingEffect):
     """One 3 x 4 transform a view."""
 
     name = "colors"
     upload_bytes = 12
+
+    @classmethod
+    def from_config(cls, config: FitConfig, dataset: Dataset, section: None) -> ColorCorrection:
+        """Return the effect of a fit."""
+        del section
+        return cls(config.colors, len(dataset.train))
 
     def __init__(self, config: ColorConfig, num_views: int) -> None:
         """num_views: of the training split."""

@@ -8,13 +8,16 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
+from drgs.config.extensions import EFFECTS
+from drgs.config.schema import FitConfig
 from drgs.core.arrays import from_host
-from drgs.datasets.types import View
+from drgs.datasets.types import Dataset, View
 from drgs.training.effects.base import TrainingEffect
 from drgs.training.image_ops import depth_error, split
 from drgs.training.views import TrainingView
 
 
+@EFFECTS.register("depth")
 class DepthSupervision(TrainingEffect):
     """Penalises the difference between the composited depth and that of the data.
 
@@ -27,6 +30,12 @@ class DepthSupervision(TrainingEffect):
     name = "depth"
     aovs = "depth:depth, alpha:alpha"
     upload_bytes = 8
+
+    @classmethod
+    def from_config(cls, config: FitConfig, dataset: Dataset, section: None) -> DepthSupervision:
+        """Return the effect of a fit."""
+        del section
+        return cls(config.loss.depth_weight, dataset.extent)
 
     def __init__(self, weight: float, extent: float) -> None:
         """weight: of the term, per scene extent."""

@@ -6,11 +6,13 @@ from typing import Any
 
 import numpy as np
 
+from drgs.config.extensions import EFFECTS
 from drgs.datasets.types import View
 from drgs.training.effects.base import TrainingEffect, as_tensor
 from drgs.training.views import TrainingView
 
 
+@EFFECTS.register("masks")
 class Masks(TrainingEffect):
     """Pixels that a mask leaves out are black in what is rendered and in what it is compared with.
 

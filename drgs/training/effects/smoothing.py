@@ -5,6 +5,7 @@ from __future__ import annotations
 import mitsuba as mi
 import numpy as np
 
+from drgs.config.extensions import EFFECTS
 from drgs.effects.smoothing import smoothing_of
 from drgs.integrator.sensors import camera_from_sensor, read_sensor
 from drgs.training.effects.base import FitState, TrainingEffect
@@ -14,6 +15,7 @@ EVERY = 100
 of the population."""
 
 
+@EFFECTS.register("smoothing")
 class TrainingSmoothing(TrainingEffect):
     """The filter of ``drgs.effects.smoothing``, from the training cameras at the size in use."""
 

@@ -23,7 +23,7 @@ from drgs.core.errors import UserError, listed
 from drgs.core.private import llvm_vector_width, llvm_version
 from drgs.datasets.fingerprint import Fingerprint, fingerprint_of
 from drgs.datasets.types import Dataset, Viewpoint
-from drgs.training.parallel.ranks import Ranks
+from drgs.training.parallel.communicator import Communicator
 
 
 def versions() -> dict[str, str]:
@@ -52,18 +52,18 @@ def check_versions(first: Mapping[str, str]) -> None:
             )
 
 
-def send_fingerprint(ranks: Ranks, dataset: Dataset) -> None:
-    """Send the others what :func:`check_views` compares, from the first process."""
-    ranks.text_of(0, fingerprint_of(replace(dataset, test=())).to_bytes().decode())
+def send_fingerprint(comm: Communicator, dataset: Dataset) -> None:
+    """Send other ranks what :func:`check_views` compares, from rank 0."""
+    comm.broadcast_text(fingerprint_of(replace(dataset, test=())).to_bytes().decode())
 
 
-def check_views(ranks: Ranks, dataset: Dataset, own: Collection[str], path: Path) -> None:
+def check_views(comm: Communicator, dataset: Dataset, own: Collection[str], path: Path) -> None:
     """Raise ``UserError`` unless training views are those that the first process has read.
 
     own: names of the views whose files this process reads; path: the dataset's, for the message.
     """
     here = fingerprint_of(replace(dataset, test=()), own.__contains__)
-    first = Fingerprint.from_bytes(ranks.text_of(0, "").encode())
+    first = Fingerprint.from_bytes(comm.broadcast_text("").encode())
     if found := first.other_files(dataset.train, here) or first.differences(here):
         raise UserError(
             f"{path}: not the same on {platform.node()} as for process 0: {listed(found)}; all "
@@ -72,7 +72,7 @@ def check_views(ranks: Ranks, dataset: Dataset, own: Collection[str], path: Path
 
 
 def check_pictures(
-    ranks: Ranks, scene: mi.Scene, views: Sequence[Viewpoint], files: Mapping[str, object]
+    comm: Communicator, scene: mi.Scene, views: Sequence[Viewpoint], files: Mapping[str, object]
 ) -> None:
     """Raise ``UserError`` unless the scene and its views are those of the first process.
 
@@ -80,7 +80,7 @@ def check_pictures(
     Called by all processes; returns when all have agreed.
     """
     own = {**versions(), **_digests(scene), "cameras": _digest_of_cameras(views)}
-    first = json.loads(ranks.text_of(0, json.dumps(own)))
+    first = json.loads(comm.broadcast_text(json.dumps(own)))
     check_versions({name: first[name] for name in versions()})
     if other := [name for name in {**first, **own} if first.get(name) != own.get(name)]:
         file = files.get(other[0].partition(".")[0]) or files["model"]
@@ -88,7 +88,7 @@ def check_pictures(
             f"{file}: not the same on {platform.node()} as for process 0: {listed(other)}; all "
             "processes must see the same files and options"
         )
-    ranks.told(np.array(True))
+    comm.all_gather(np.array(True))
 
 
 def _digests(scene: mi.Scene) -> dict[str, str]:

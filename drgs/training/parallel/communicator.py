@@ -135,6 +135,10 @@ class Communicator:
         self.times.sent_bytes += rows.nbytes * (self.size - 1)
         return gathered
 
+    def of_root(self, numbers: Any) -> np.ndarray:
+        """Return the numbers of rank 0; other ranks give as many, of the same type."""
+        return self.all_gather(np.array(numbers))[0]
+
     def gather_rows(self, rows: np.ndarray, root: int = 0) -> np.ndarray | None:
         """Return the rows of all ranks on rank ``root``, None on the others."""
         rows = np.ascontiguousarray(rows)

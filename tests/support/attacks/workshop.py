@@ -168,7 +168,7 @@ def sketched_results() -> Iterator[None]:
             with atomic_path(out / name) as temporary:
                 temporary.write_text("a sketch")
 
-    with patch("drgs.fit.write_results", write):
+    with patch("drgs.training.fit_folder.write_results", write):
         yield
 
 

@@ -10,10 +10,11 @@ from support.populations import make, rows_of
 from support.trainers import make_trainer
 
 from drgs.config.density import DensifyConfig
+from drgs.config.extensions import GROWTH
 from drgs.config.schema import FitConfig
 from drgs.training import trainer as trainer_module
-from drgs.training.density.called_for import density_strategy
 from drgs.training.density.phases import Phases
+from drgs.training.density.registry import density_strategy
 from drgs.training.density.strategy import DensityReport, DensityStrategy
 from drgs.training.optimizer import set_values
 from drgs.training.rates import revised_stops
@@ -25,7 +26,7 @@ def variant():
 
 
 def trainer_with(monkeypatch, strategy, **changes):
-    monkeypatch.setattr(trainer_module, "density_strategy", lambda config, white: strategy)
+    monkeypatch.setattr(trainer_module, "density_strategy", lambda *_: strategy)
     return make_trainer(**changes)
 
 
@@ -230,10 +231,10 @@ def test_phases_are_one_strategy_and_begin_anew_where_others_change_rows():
 
 def test_each_strategy_of_the_configuration_is_made():
     made = set()
-    for name in DensifyConfig.model_fields["strategy"].annotation.__args__:
+    for name in GROWTH:
         config = FitConfig(data={"path": "."}, densify={"strategy": name})
         made.add(type(density_strategy(config)))
-    assert len(made) == len(DensifyConfig.model_fields["strategy"].annotation.__args__)
+    assert len(made) == len(GROWTH) == 3
 
 
 @pytest.mark.parametrize(

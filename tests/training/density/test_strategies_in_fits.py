@@ -136,7 +136,8 @@ def replanned(trainer):
 
 
 def test_what_is_not_chosen_is_not_imported(monkeypatch):
-    from drgs.training.density.called_for import density_strategy
+    from drgs.config.extensions import STRATEGIES
+    from drgs.training.density.registry import density_strategy
 
     names = {f"drgs.training.density.{module}" for module in MODULES}
     for strategy, expected in (
@@ -146,6 +147,7 @@ def test_what_is_not_chosen_is_not_imported(monkeypatch):
     ):
         for name in names & set(sys.modules):
             monkeypatch.delitem(sys.modules, name)
+        monkeypatch.setattr(STRATEGIES, "_extensions", {})
         density_strategy(FitConfig(data={"path": "."}, densify={"strategy": strategy}))
         imported = {name.rpartition(".")[2] for name in names & set(sys.modules)}
         assert imported == expected

@@ -96,9 +96,9 @@ def test_views_are_compared_with_those_of_the_first_process(
 ):
     monkeypatch.chdir(copies[0])
     first = fingerprint_of(load(copies[0])).model_copy(update={"test": []})
-    ranks = SimpleNamespace(text_of=lambda rank, text: first.to_bytes().decode())
+    comm = SimpleNamespace(broadcast_text=lambda text: first.to_bytes().decode())
     edit(copies[0] / "transforms_train.json", lambda meta: change(meta["frames"]))
-    check = partial(agreement.check_views, ranks, load(copies[0]), {"r_1"}, copies[0])
+    check = partial(agreement.check_views, comm, load(copies[0]), {"r_1"}, copies[0])
     if not message:
         check()
         return

@@ -125,7 +125,7 @@ def test_a_process_that_fails_alone_is_heard_once_and_ends_all(
 
 def test_an_unexpected_error_of_one_process_is_traced_once_and_ends_all(config, tmp_path):
     failing = together.failing_import(
-        tmp_path, "drgs.training.parallel.shards", "RuntimeError('a bug')"
+        tmp_path, "drgs.training.parallel.exchange", "RuntimeError('a bug')"
     )
     words = command(config(), "--out", tmp_path / "out")
     status, _, errors = together.run(2, words, on_second=failing)

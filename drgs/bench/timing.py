@@ -1,0 +1,189 @@
+"""Measure computations: seconds, the stages of a training iteration, and its work.
+
+Dr.Jit's kernel history names no stages. :class:`StageClock` waits for the device at the borders of
+the stages and reads the history there, so that whatever ran since the last border belongs to the
+stage that ends. Stages end where functions of the product are called, which are wrapped for as long
+as the clock runs; the computation itself is untouched. Waiting costs overlap: the sum of the stages
+is a little more than the computation takes without a clock.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field
+from typing import Any
+from unittest.mock import patch
+
+import drjit as dr
+
+from drgs.bench.scenes import Scene, trainer_of
+from drgs.core.arrays import types_of
+from drgs.splatting import rasterize, rendering, tiles
+from drgs.splatting.grid import PIXELS
+from drgs.splatting.lanes import Entries, load_lane_row, make_lanes
+from drgs.training.trainer import Trainer
+
+STAGES = (
+    "projection and SH",
+    "binning",
+    "compositing",
+    "image and loss",
+    "adjoint",
+    "reduction",
+    "projection and SH, adjoint",
+    "optimizer and statistics",
+)
+
+COPIES = ("Memset", "Memcpy")
+"""Entries of the kernel history that are no kernels."""
+
+WARM_UP = 3
+"""Iterations before one is measured."""
+
+
+def seconds(function: Callable[[], object]) -> float:
+    """Time one call."""
+    started = time.perf_counter()
+    function()
+    return time.perf_counter() - started
+
+
+# ----------------------------------------------------------------------------------------------
+# Stages
+# ----------------------------------------------------------------------------------------------
+
+
+@dataclass
+class StageClock:
+    """Milliseconds of each stage, and the entries of the kernel history."""
+
+    kernel_ms: dict[str, float] = field(default_factory=dict)
+    wall_ms: dict[str, float] = field(default_factory=dict)
+    history: list[tuple[str, dict[str, Any]]] = field(default_factory=list)  # (stage, entry)
+    started: float = field(default_factory=time.perf_counter)
+
+    def end(self, stage: str) -> None:
+        """Assign all kernels since the last call to ``stage``."""
+        dr.sync_thread()
+        passed = 1e3 * (time.perf_counter() - self.started)
+        entries = dr.kernel_history()
+        self.history += [(stage, entry) for entry in entries]
+        spent = sum(entry["execution_time"] for entry in entries)
+        self.kernel_ms[stage] = self.kernel_ms.get(stage, 0.0) + spent
+        self.wall_ms[stage] = self.wall_ms.get(stage, 0.0) + passed
+        self.started = time.perf_counter()  # reading the history does not count
+
+    def num_kernels(self, stage: str) -> int:
+        """Count the kernels that were launched."""
+        return sum(s == stage and e["type"].name not in COPIES for s, e in self.history)
+
+
+@contextmanager
+def stage_clock() -> Iterator[StageClock]:
+    """Run a clock that ends stages wherever the renderer's own stages do.
+
+    The caller ends what precedes the first stage, and what follows the last.
+    """
+    clock = StageClock()
+
+    def wrapped(function: Callable, before: str | None, after: str | None) -> Callable:
+        def timed(*arguments: object, **keywords: object) -> object:
+            if before:
+                clock.end(before)
+            result = function(*arguments, **keywords)
+            dr.eval(result)
+            if after:
+                clock.end(after)
+            return result
+
+        return timed
+
+    borders = [
+        (tiles, "_store_rows", None, "projection and SH"),
+        (rendering, "bin_footprints", None, "binning"),
+        (rendering, "composite", None, "compositing"),
+        (rendering, "composite_adjoint", "image and loss", None),
+        (rasterize, "sum_entries", "adjoint", "reduction"),
+        (rasterize, "splat_gradients", None, "reduction"),
+        (rendering, "_as_tensors", None, "projection and SH, adjoint"),
+    ]
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory), ExitStack() as patches:
+        dr.sync_thread()
+        dr.kernel_history_clear()
+        for module, name, before, after in borders:
+            timed = wrapped(getattr(module, name), before, after)
+            patches.enter_context(patch.object(module, name, timed))
+        yield clock
+
+
+def steps(trainer: Trainer, count: int) -> None:
+    """Run ``count`` training iterations; returns when the device has finished."""
+    for _ in range(count):
+        trainer.step()
+    dr.sync_thread()
+
+
+def warm_trainer(scene: Scene) -> Trainer:
+    """Return a trainer whose kernels have been compiled."""
+    trainer = trainer_of(scene)
+    steps(trainer, WARM_UP)
+    return trainer
+
+
+def clocked_step(trainer: Trainer) -> StageClock:
+    """Run a training iteration, stage by stage."""
+    with stage_clock() as clock:
+        report = trainer.step()
+        dr.eval([(view.loss, view.squared_error) for view in report.views])
+        clock.end("optimizer and statistics")
+    return clock
+
+
+# ----------------------------------------------------------------------------------------------
+# Work
+# ----------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Work:
+    """The pairs that the compositing kernels visit, and how many of them contribute."""
+
+    entries: int  # (Gaussian, tile)
+    micro_entries: int  # (Gaussian, micro-tile)
+    evaluated: int  # (pixel, Gaussian) pairs whose alpha compositing computes
+    useful: int  # pairs with alpha >= 1/255 at a pixel that is not finished
+
+
+def count_work(frame: rendering.Frame) -> Work:
+    """Walk the entries once more and count them."""
+    bins, layers = frame.bins, frame.layers
+    t = types_of(bins.rows.Float)
+    lanes = make_lanes(t.Float, bins.grid)
+    stop = dr.gather(t.UInt32, layers.stop, lanes.micro_tile)
+    entries = Entries(bins, lanes, stop)
+    ends = load_lane_row(layers.ends, lanes.micro_tile, 1)
+    model = bins.model.bind(lanes, bins.grid)
+
+    def body(cursor: Any, visited: Any, useful: Any) -> tuple:
+        entry, active = entries.current(cursor)
+        geometry, _ = frame.records.load(entry, active)
+        footprint = model.footprint(geometry, lanes, active)
+        for pixel, alpha in enumerate(model.alphas(geometry, footprint)):
+            useful = useful + dr.select((alpha.value > 0) & (entry < ends[pixel]), t.UInt32(1), 0)
+        return entries.advance(cursor), visited + dr.select(active, t.UInt32(1), 0), useful
+
+    zero = dr.zeros(t.UInt32, dr.width(lanes.tile))
+    _, visited, useful = dr.while_loop(
+        state=(entries.begin(), zero, t.UInt32(zero)),
+        cond=lambda cursor, visited, useful: entries.pending(cursor),
+        body=body,
+    )
+    dr.eval(visited, useful)
+    return Work(
+        entries=bins.num_entries,
+        micro_entries=int(dr.sum(dr.popcnt(bins.masks))[0]),
+        evaluated=int(dr.sum(visited)[0]) * PIXELS,
+        useful=int(dr.sum(useful)[0]),
+    )

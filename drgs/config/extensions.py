@@ -1,0 +1,141 @@
+"""Extension points of a fit, and the section ``extensions`` of a configuration.
+
+``extensions`` contains the sections of extensions by name, each checked by the pydantic model that
+the extension has registered. An effect and a term of the loss take part in a fit if their section
+is there, be it empty. A strategy is chosen by ``densify.strategy``, a loss by ``loss.type``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from pydantic import BaseModel, ValidationError
+from pydantic_core import PydanticCustomError
+
+from drgs.config.explain import expectation, shown_value
+from drgs.core.errors import did_you_mean
+from drgs.core.registry import HOW_TO_INSTALL, Extension, Registry, all_extensions
+
+STRATEGIES: Registry[type] = Registry(
+    "density strategy",
+    {
+        "adc": "drgs.training.density.adc",
+        "budget": "drgs.training.density.budget",
+        "mcmc": "drgs.training.density.mcmc",
+        "importance": "drgs.training.density.importance",
+        "selection": "drgs.training.density.selection",
+    },
+)
+"""Subclasses of :class:`drgs.training.density.strategy.DensityStrategy`."""
+
+EFFECTS: Registry[type] = Registry(
+    "effect",
+    {
+        # In the order in which they act. The filter places all sensors: after it, cameras place
+        # the one that is rendered, with derivatives.
+        "depth": "drgs.training.effects.depth",
+        "colors": "drgs.training.effects.colors",
+        "background": "drgs.training.effects.background",
+        "masks": "drgs.training.effects.masks",
+        "smoothing": "drgs.training.effects.smoothing",
+        "cameras": "drgs.training.effects.cameras",
+    },
+)
+"""Subclasses of :class:`drgs.training.effects.base.TrainingEffect`."""
+
+LOSSES: Registry[type] = Registry("loss", {"photometric": "drgs.training.losses"})
+"""Subclasses of :class:`drgs.training.losses.Loss`."""
+
+LOSS_TERMS: Registry[type] = Registry("loss term")
+"""Subclasses of :class:`drgs.training.losses.LossTerm`."""
+
+GROWTH = ("adc", "budget", "mcmc")
+"""Shipped strategies for ``densify.strategy``; the others prune after them."""
+
+
+def check_strategy(name: str) -> str:
+    """Return the name of a strategy; raises ValueError if there is none of this name."""
+    return _check_name(name, GROWTH, STRATEGIES)
+
+
+def check_loss(name: str) -> str:
+    """Return the name of a loss; raises ValueError if there is none of this name."""
+    return _check_name(name, ("photometric",), LOSSES)
+
+
+def _check_name(name: str, shipped: tuple[str, ...], registry: Registry) -> str:
+    if name not in shipped:
+        known = [*shipped, *(extension.name for extension in registry.installed())]
+        if name not in known:
+            quoted = ", ".join(f"'{each}'" for each in known)
+            raise ValueError(
+                f"must be one of {quoted}{did_you_mean(name, known)} ({HOW_TO_INSTALL})"
+            )
+    return name
+
+
+def check_sections(sections: Any) -> dict[str, BaseModel | None]:
+    """Return the sections of extensions, each as the extension's model; None: it has none."""
+    if not isinstance(sections, Mapping):
+        raise ValueError("must contain sections by the names of extensions")
+    return {name: _check_section(str(name), values) for name, values in sections.items()}
+
+
+def _check_section(name: str, values: Any) -> BaseModel | None:
+    known = {extension.name: extension for extension in all_extensions()}
+    if name not in known:
+        there_are = f"there are {', '.join(known)}" if known else "none is installed"
+        raise _error(
+            f"extensions.{name}: no extension has this name{did_you_mean(name, known)}; "
+            f"{there_are} ({HOW_TO_INSTALL})"
+        )
+    section = known[name].section
+    if section is None:
+        if values:
+            raise _error(f"extensions.{name} must be empty: it has no settings")
+        return None
+    if isinstance(values, BaseModel):
+        values = values.model_dump()
+    try:
+        return section.model_validate({} if values is None else values)
+    except ValidationError as error:
+        first = error.errors()[0]
+        key = ".".join(["extensions", name, *map(str, first["loc"])])
+        if first["type"] == "extra_forbidden":
+            fields = did_you_mean(str(first["loc"][-1]), section.model_fields)
+            raise _error(f"unknown key {key}{fields}") from None
+        raise _error(f"{key} {expectation(first)}, got {shown_value(first['input'])}") from None
+
+
+def _error(text: str) -> PydanticCustomError:
+    return PydanticCustomError("extension", "{text}", {"text": text})
+
+
+def extension_keys() -> list[str]:
+    """Return the keys of sections of registered extensions, such as ``extensions.mine.rate``."""
+    keys = []
+    for extension in all_extensions():
+        keys.append(f"extensions.{extension.name}")
+        fields = extension.section.model_fields if extension.section else ()
+        keys += [f"extensions.{extension.name}.{name}" for name in fields]
+    return keys
+
+
+def section_of(extension: Extension, sections: Mapping[str, BaseModel | None]) -> BaseModel | None:
+    """Return the section of an extension, with defaults where there is none; None: it has none."""
+    section = sections.get(extension.name)
+    return extension.section() if section is None and extension.section else section
+
+
+def extensions_in_use(
+    sections: Mapping[str, BaseModel | None], registry: Registry
+) -> list[Extension]:
+    """Return the extensions of a registry that a configuration has a section for."""
+    return [each for each in registry.installed() if each.name in sections]
+
+
+def describe_extensions() -> str:
+    """Return a line for each installed extension: kind, name, first line of its docstring."""
+    lines = [f"  {each.kind} {each.name}: {each.summary}" for each in all_extensions()]
+    return "\n".join(["installed extensions:", *(lines or ["  none"])])

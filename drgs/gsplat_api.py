@@ -1,0 +1,518 @@
+"""Pictures of Gaussians as one function of arrays, with gsplat's names and conventions.
+
+No Mitsuba: :func:`rasterization` composes the stages of ``drgs.splatting`` for cameras given as
+matrices, and hands their adjoint and tangent to Dr.Jit as a custom operation.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, replace
+from typing import Any
+
+import drjit as dr
+import numpy as np
+
+from drgs.accuracy.pipeline import pipeline_of
+from drgs.cameras.camera import Camera
+from drgs.config.approximations import Approximations
+from drgs.core.arrays import from_host, interleave, types_of
+from drgs.core.constants import ALPHA_CUT, LOW_PASS, MAX_FEATURES
+from drgs.core.errors import did_you_mean
+from drgs.core.llvm import ensure_usable_llvm
+from drgs.core.memory import why_too_large
+from drgs.effects.features import NamedFeature
+from drgs.gaussians.parameters import Gaussians
+from drgs.splatting.projection import GaussianRows, load_rows
+from drgs.splatting.rendering import (
+    Feature,
+    Pipeline,
+    color_features,
+    depth_feature,
+    frames_adjoint,
+    frames_tangent,
+    render,
+)
+
+RENDER_MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
+RASTERIZE_MODES = ("classic", "antialiased")
+
+LEAST_ALPHA = 1e-10
+"""Smallest divisor of expected depths, as in gsplat."""
+
+MAX_SKEW = 1e-6
+"""Rounding, relative to the largest number in K, where a pinhole without skew has 0."""
+
+LEAST_SCALE = 1e-18
+"""World units: a smaller standard deviation is taken as this one, whose square float32 holds."""
+
+OPAQUE_LOGIT = 100.0
+"""Its sigmoid is 1 in float64: the opacity is then what it is multiplied by."""
+
+UNSUPPORTED_GSPLAT_ARGUMENTS = {
+    "far_plane": "leave out the Gaussians beyond it",
+    "radius_clip": "leave it out: small splats cost little",
+    "packed": "leave it out: results have a row for each Gaussian",
+    "sparse_grad": "leave it out: gradients have a row for each Gaussian",
+    "absgrad": "leave it out: gradients are summed with their signs",
+    "covars": "give quats and scales",
+    "with_ut": 'give projection="unscented"',
+    "with_eval3d": 'give projection="exact"',
+    **dict.fromkeys(("tile_size", "channel_chunk", "distributed", "segmented"), "leave it out"),
+    **dict.fromkeys(
+        (
+            "camera_model",
+            "radial_coeffs",
+            "tangential_coeffs",
+            "thin_prism_coeffs",
+            "ftheta_coeffs",
+            "rolling_shutter",
+            "viewmats_rs",
+        ),
+        "leave it out for pinholes at rest; other cameras are Mitsuba's sensors, which mi.render "
+        "takes with the integrator splats",
+    ),
+}
+"""Parameters of gsplat that there are not, and what to do instead."""
+
+
+def rasterization(
+    means: Any,
+    quats: Any,
+    scales: Any,
+    opacities: Any,
+    colors: Any,
+    viewmats: Any,
+    Ks: Any,
+    width: int,
+    height: int,
+    *,
+    near_plane: float = 0.01,
+    eps2d: float = LOW_PASS,
+    sh_degree: int | None = None,
+    backgrounds: Any = None,
+    render_mode: str = "RGB",
+    rasterize_mode: str = "classic",
+    **approximations: str | float,
+) -> tuple[Any, Any, dict[str, Any]]:
+    """Pictures of N Gaussians as C pinhole cameras see them: (colors, alphas, meta).
+
+    Names, defaults, conventions and the order of results are those of gsplat 1.x. Arrays are numpy
+    arrays (results then are) or Dr.Jit tensors; all is computed in the type of ``means``, float32
+    or float64.
+
+    means: (N, 3) world; quats: (N, 4) wxyz, of any norm; scales: (N, 3) standard deviations, world
+    units; opacities: (N,) in 0..1; colors: (N, D) or, for each camera, (C, N, D), D up to 64; with
+    ``sh_degree`` coefficients (N, K, 3) or (C, N, K, 3), K at least (sh_degree + 1)^2, whose colour
+    is max(0, SH + 0.5); viewmats: (C, 4, 4) world to camera, x right, y down, z forward; Ks:
+    (C, 3, 3), px, pixel centres at (i + 0.5, j + 0.5), no skew; width, height: px.
+
+    near_plane: z in the camera, scene units, below which means are not seen; eps2d: px^2 added to
+    the projected covariance; backgrounds: (C, D) behind the splats, None: 0; render_mode: ``RGB``,
+    ``D`` (the sum of alpha-weighted depths), ``ED`` (that divided by alpha), ``RGB+D``, ``RGB+ED``;
+    rasterize_mode: ``classic`` or ``antialiased`` (opacities are scaled such that the low-pass
+    keeps a splat's integral); approximations: other values of
+    :class:`drgs.config.approximations.Approximations`, such as ``projection="exact"`` or
+    ``order="pixel"``.
+
+    Returns pictures (C, H, W, X), X = D, 1 or D + 1 with the depth last; alphas (C, H, W, 1); and a
+    dictionary with ``means2d`` (C, N, 2) px, ``depths`` (C, N), ``conics`` (C, N, 3), the numbers
+    a, b, c of exp(-(a dx^2 + 2 b dx dy + c dy^2) / 2), ``opacities`` (C, N), ``radii`` (C, N, 2)
+    px, integers, 0 where a splat is not seen, ``width``, ``height`` and ``n_cameras``.
+
+    Differentiable by Dr.Jit, forward and in reverse, in means, quats, scales, opacities, colors,
+    viewmats, Ks and backgrounds, to the same bytes in every run. Not differentiated: the
+    dictionary, visibility, the order of the splats, the decisions of compositing; and
+    ``sh_direction="pixel"`` in viewmats and Ks.
+
+    In PyTorch, through ``dr.wrap`` (which converts positional arguments)::
+
+        @dr.wrap(source="torch", target="drjit")
+        def rasterize(means, quats, scales, opacities, colors, viewmats, Ks):
+            pictures, alphas, _ = drgs.rasterization(
+                means, quats, scales, opacities, colors, viewmats, Ks, width=640, height=480
+            )
+            return pictures, alphas
+
+        pictures, alphas = rasterize(means, quats, scales, opacities, colors, viewmats, Ks)
+        torch.nn.functional.l1_loss(pictures, photographs).backward()
+
+    Raises TypeError and ValueError, naming the parameter, what was expected and what was got.
+    """
+    selected = _approximations(approximations, eps2d, rasterize_mode, sh_degree)
+    _require(render_mode in RENDER_MODES, "render_mode", f"one of {RENDER_MODES}", render_mode)
+    _require(width >= 1 and height >= 1, "width and height", "1 px or more", (width, height))
+    why = why_too_large(int(width), int(height))
+    _require(why is None, "width and height", f"smaller: {why}", (width, height))
+    given = {
+        "means": means,
+        "quats": quats,
+        "scales": scales,
+        "opacities": opacities,
+        "colors": colors,
+        "viewmats": viewmats,
+        "Ks": Ks,
+        "backgrounds": backgrounds,
+    }
+    tensor_type = _tensor_type(means)
+    if "llvm" in tensor_type.__module__:
+        ensure_usable_llvm()
+    inputs = {
+        name: _tensor(name, value, tensor_type)
+        for name, value in given.items()
+        if value is not None
+    }
+    _check_shapes(inputs, sh_degree)
+    _check_cameras(*(np.array(inputs[name], np.float64) for name in ("viewmats", "Ks")))
+    features = () if render_mode in ("D", "ED") else (_color_feature(sh_degree),)
+    features += () if render_mode == "RGB" else (depth_feature,)
+    pipeline = replace(pipeline_of(selected, sh_degree or 0, features), rows=activated)
+    is_camera_attached = any(dr.grad_enabled(inputs[name]) for name in ("viewmats", "Ks"))
+    film = _Film(int(width), int(height), float(near_plane), sh_degree, is_camera_attached)
+    detached = dr.detach(inputs)
+    views = [_View(film, pipeline, detached, k) for k in range(inputs["viewmats"].shape[0])]
+    images, alphas = _images(views, inputs, render_mode)
+    meta = _meta(views)
+    if dr.is_array_v(means):
+        return images, alphas, meta
+    meta = {k: v.numpy() if dr.is_array_v(v) else v for k, v in meta.items()}
+    return images.numpy(), alphas.numpy(), meta
+
+
+# ----------------------------------------------------------------------------------------------
+# What is given
+# ----------------------------------------------------------------------------------------------
+
+
+def _require(holds: bool, name: str, expected: str, got: object) -> None:
+    if not holds:
+        raise ValueError(f"rasterization(): {name} must be {expected}, got {got!r}")
+
+
+def _approximations(
+    others: Mapping[str, str | float], eps2d: float, rasterize_mode: str, sh_degree: int | None
+) -> Approximations:
+    _require(
+        rasterize_mode in RASTERIZE_MODES,
+        "rasterize_mode",
+        f"one of {RASTERIZE_MODES}",
+        rasterize_mode,
+    )
+    _require(sh_degree in (None, 0, 1, 2, 3), "sh_degree", "None or 0 to 3", sh_degree)
+    known = {f.name for f in fields(Approximations)} - {"low_pass", "antialiased"}
+    for name in others:
+        if name in UNSUPPORTED_GSPLAT_ARGUMENTS:
+            raise TypeError(
+                f"rasterization(): {name} is a parameter of gsplat's that drgs does not have; "
+                f"{UNSUPPORTED_GSPLAT_ARGUMENTS[name]}"
+            )
+        if name not in known:
+            raise TypeError(
+                f"rasterization(): there is no parameter {name}{did_you_mean(name, known)}"
+            )
+    if others.get("sh_direction", "mean") != "mean" and sh_degree is None:
+        raise ValueError(
+            "rasterization(): sh_direction is of spherical harmonics; give sh_degree, and colors "
+            "of shape (N, K, 3)"
+        )
+    antialiased = rasterize_mode == "antialiased"
+    try:
+        return Approximations(low_pass=eps2d, antialiased=antialiased, **others)
+    except ValueError as error:
+        reason = str(error).replace("low_pass", "eps2d")
+        raise ValueError(f"rasterization(): {reason}") from None
+
+
+def _tensor_type(means: Any) -> type:
+    """The type of all tensors: that of ``means``."""
+    if dr.is_tensor_v(means) and dr.is_float_v(means):
+        return type(means)
+    if dr.is_array_v(means):
+        raise TypeError(
+            f"rasterization(): means must be a tensor (N, 3) of floats, got {type(means).__name__}"
+        )
+    from drjit import llvm
+
+    return llvm.ad.TensorXf64 if np.asarray(means).dtype == np.float64 else llvm.ad.TensorXf
+
+
+def _tensor(name: str, value: Any, tensor_type: type) -> Any:
+    """``value`` as a tensor, still attached."""
+    if type(value) is tensor_type:
+        return value
+    flat_type = dr.array_t(tensor_type)
+    if not dr.is_array_v(value):
+        values = np.asarray(value)
+        return tensor_type(from_host(flat_type, values), values.shape)
+    if dr.is_tensor_v(value):
+        return tensor_type(flat_type(value.array), value.shape)
+    if dr.depth_v(value) == 1:
+        return tensor_type(flat_type(value), (dr.width(value),))
+    raise TypeError(f"rasterization(): {name} must be a tensor, got {type(value).__name__}")
+
+
+def _check_shapes(inputs: Mapping[str, Any], sh_degree: int | None) -> None:
+    """Raise ValueError for a shape that does not fit."""
+    for name, rest, letters, what in (
+        ("means", (3,), "(N, 3)", "Gaussian"),
+        ("viewmats", (4, 4), "(C, 4, 4)", "camera"),
+    ):
+        got = inputs[name].shape
+        _require(len(got) > 0 and got[1:] == rest, name, f"of shape {letters}", got)
+        _require(got[0] >= 1, name, f"of one {what} at least", got)
+    num, views = inputs["means"].shape[0], inputs["viewmats"].shape[0]
+    shape = inputs["colors"].shape
+    expected = {
+        "quats": (num, 4),
+        "scales": (num, 3),
+        "opacities": (num,),
+        "Ks": (views, 3, 3),
+    }
+    for name, wanted in expected.items():
+        _require(inputs[name].shape == wanted, name, f"of shape {wanted}", inputs[name].shape)
+    if sh_degree is None:
+        fits, wanted = shape[:-1] in ((num,), (views, num)), f"({num}, D) or ({views}, {num}, D)"
+    else:
+        least = (sh_degree + 1) ** 2
+        fits = shape[:-2] in ((num,), (views, num)) and shape[-1] == 3 and shape[-2] >= least
+        wanted = f"({num}, K, 3) or ({views}, {num}, K, 3), K >= {least}, for sh_degree {sh_degree}"
+    _require(fits, "colors", f"of shape {wanted}", shape)
+    width = shape[-1]
+    _require(width <= MAX_FEATURES, "colors", f"of at most {MAX_FEATURES} channels", width)
+    if "backgrounds" in inputs:
+        wanted, got = (views, shape[-1]), inputs["backgrounds"].shape
+        _require(got == wanted, "backgrounds", f"of shape {wanted}", got)
+
+
+def _check_cameras(viewmats: np.ndarray, Ks: np.ndarray) -> None:
+    """Raise ValueError for a matrix that is no pinhole's, or that has no inverse."""
+    for index, (viewmat, K) in enumerate(zip(viewmats, Ks, strict=True)):
+        pinhole = np.array([[K[0, 0], 0, K[0, 2]], [0, K[1, 1], K[1, 2]], [0, 0, 1]])
+        fits = np.abs(K - pinhole).max() <= MAX_SKEW * np.abs(K).max() or np.isnan(K).any()
+        expected = "((fx, 0, cx), (0, fy, cy), (0, 0, 1)), without skew"
+        _require(fits, f"Ks[{index}]", expected, K.tolist())
+        is_regular = np.isfinite(viewmat).all() and np.linalg.matrix_rank(viewmat[:3, :3]) == 3
+        expected = "matrices of a rotation and a translation, of finite numbers"
+        _require(is_regular, f"viewmats[{index}]", expected, viewmat.tolist())
+
+
+def activated(rows: GaussianRows) -> GaussianRows:
+    """Gaussians whose scales and opacities are given as they are, among their features."""
+    t = types_of(type(rows.logit_opacities))
+    sizes = [dr.abs(scale) for scale in rows.features["scales"]]
+    logs = [dr.log(dr.select(size > LEAST_SCALE, size, LEAST_SCALE)) for size in sizes]
+    return replace(rows, log_scales=t.Array3f(logs), dimming=rows.features["opacities"][0])
+
+
+def _color_feature(sh_degree: int | None) -> Feature:
+    return NamedFeature("colors") if sh_degree is None else color_features
+
+
+# ----------------------------------------------------------------------------------------------
+# Images
+# ----------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _Film:
+    width: int
+    height: int
+    near: float
+    sh_degree: int | None  # None: colours are given
+    is_camera_attached: bool  # whether derivatives with respect to cameras are needed
+
+
+def _images(views: list[_View], inputs: Mapping[str, Any], mode: str) -> tuple[Any, Any]:
+    """Return images (C, H, W, X) and alphas (C, H, W, 1), attached to ``inputs``."""
+    images, alphas = [], []
+    all_planes, backgrounds = dr.custom(_Planes, views, inputs)
+    for transmittance, *features in all_planes:
+        count = len(features) - (mode != "RGB")
+        channels, depths = features[:count], features[count:]
+        if backgrounds:
+            behind, backgrounds = backgrounds[:count], backgrounds[count:]
+            channels = [dr.fma(transmittance, b, c) for b, c in zip(behind, channels, strict=True)]
+        alpha = 1 - transmittance
+        if mode.endswith("ED"):
+            depths = [
+                depth / dr.select(alpha > LEAST_ALPHA, alpha, LEAST_ALPHA) for depth in depths
+            ]
+        channels += depths
+        images.append(channels[0] if len(channels) == 1 else interleave(channels))
+        alphas.append(alpha)
+    dr.eval(images, alphas)
+    shape = (len(views), views[0].film.height, views[0].film.width)
+    return _stacked(images, shape), _stacked(alphas, shape)
+
+
+def _stacked(parts: list[Any], shape: tuple[int, ...]) -> Any:
+    """Return one flat array per camera as a tensor of this shape and one axis more."""
+    flat = parts[0] if len(parts) == 1 else dr.concat(parts)
+    return types_of(type(flat)).TensorXf(flat, (*shape, dr.width(flat) // math.prod(shape)))
+
+
+class _Planes(dr.CustomOp):
+    """Planes of all cameras (transmittance, features), and each number of the backgrounds."""
+
+    def eval(self, views: list[_View], inputs: dict[str, Any]) -> tuple[list[list[Any]], list[Any]]:
+        """Return what the views have rendered from ``inputs``, detached."""
+        self.views, self.inputs = views, inputs
+        planes = [view.frame.planes() for view in views]
+        dr.eval(planes)  # or storing them would run the kernels once for each
+        return planes, self._entries(inputs)
+
+    def forward(self) -> None:
+        """Hand on tangents of the inputs."""
+        directions = self.grad_in("inputs")
+        tangents = [view.tangents(directions) for view in self.views]
+        self.set_grad_out((tangents, self._entries(directions)))
+
+    def backward(self) -> None:
+        """Hand back derivatives with respect to the inputs."""
+        all_d_planes, d_backgrounds = self.grad_out()
+        found: dict[str, list[Any]] = {name: [] for name in self.inputs}
+        for view, d_planes in zip(self.views, all_d_planes, strict=True):
+            for name, gradient in view.gradients(d_planes).items():
+                found[name].append(gradient)
+            dr.eval(found)
+        if d_backgrounds:
+            found["backgrounds"] = d_backgrounds
+        gradients = {}
+        for name, parts in found.items():
+            shape, flat = self.inputs[name].shape, [dr.ravel(part) for part in parts]
+            is_shared = dr.width(flat[0]) == math.prod(shape)
+            total = sum(flat[1:], flat[0]) if is_shared else dr.concat(flat)
+            gradients[name] = type(self.inputs[name])(total, shape)
+        self.set_grad_in("inputs", gradients)
+
+    def _entries(self, values: Mapping[str, Any]) -> list[Any]:
+        """Each number of the backgrounds, Float (1,)."""
+        if "backgrounds" not in values:
+            return []
+        flat = values["backgrounds"].array
+        # Opaque, or each would be in a kernel of its own.
+        places = [dr.opaque(types_of(type(flat)).UInt32, k) for k in range(dr.width(flat))]
+        return [dr.gather(type(flat), flat, place) for place in places]
+
+    def name(self) -> str:
+        """Return the name for Dr.Jit."""
+        return "rasterization"
+
+
+class _View:
+    """Planes of one camera, and their derivatives."""
+
+    def __init__(
+        self, film: _Film, pipeline: Pipeline, inputs: Mapping[str, Any], index: int
+    ) -> None:
+        """Render; inputs: detached; index: of the camera among them."""
+        self.film, self.pipeline, self.inputs, self.index = film, pipeline, inputs, index
+        self.types = types_of(type(inputs["means"].array))
+        # The few numbers of a camera are read to the host: its centre is found in float64 there.
+        self.viewmat = np.array(inputs["viewmats"], np.float64)[index]
+        self.center = -np.linalg.solve(self.viewmat[:3, :3], self.viewmat[:3, 3])
+        rotation, K = self.viewmat[:3, :3], np.array(inputs["Ks"], np.float64)[index]
+        size = film.width, film.height
+        camera = Camera.create(self.types.Float, rotation, self.center, K, *size, film.near)
+        self.gaussians = self._gaussians(inputs)
+        self.frame = render(self.gaussians, camera, pipeline)
+
+    def tangents(self, directions: Mapping[str, Any]) -> list[Any]:
+        """Return directional derivatives of the planes along tangents of the inputs."""
+        d_gaussians = self._gaussians(directions)
+        d_camera = self._camera_tangents(directions) if self.film.is_camera_attached else None
+        (d_planes,) = frames_tangent(self.gaussians, [self.frame], d_gaussians, d_camera)
+        dr.eval(d_planes)
+        return d_planes
+
+    def gradients(self, d_planes: list[Any]) -> dict[str, Any]:
+        """Return derivatives with respect to the inputs from those with respect to the planes."""
+        dr.eval(d_planes)
+        found = frames_adjoint(
+            self.gaussians, [self.frame], [d_planes], self.film.is_camera_attached
+        )
+        d, t = found.parameters, self.types
+        gradients = {
+            "means": d.means,
+            "quats": d.quats,
+            "scales": d.features["scales"],
+            "opacities": d.features["opacities"],
+            "colors": d.features["colors"] if self.film.sh_degree is None else d.sh,
+            "viewmats": dr.zeros(t.Float, 16),
+            "Ks": dr.zeros(t.Float, 9),
+        }
+        if self.film.is_camera_attached:
+            gradients |= self._camera_gradients(np.array([number[0] for number in found.camera]))
+        return gradients
+
+    def _gaussians(self, values: Mapping[str, Any]) -> Gaussians:
+        """Values, or tangents, of the Gaussians that the kernels see."""
+        num, t, colors = values["means"].shape[0], self.types, values["colors"]
+        if len(colors.shape) == (3 if self.film.sh_degree is None else 4):
+            colors = colors[self.index]
+        features = {
+            "scales": values["scales"],
+            "opacities": t.TensorXf(values["opacities"].array, (num, 1)),
+        }
+        if self.film.sh_degree is None:
+            features["colors"], colors = colors, dr.zeros(t.TensorXf, (num, 1, 3))
+        return Gaussians(
+            means=values["means"],
+            quats=values["quats"],
+            log_scales=dr.zeros(t.TensorXf, (num, 3)),
+            logit_opacities=dr.full(t.Float, OPAQUE_LOGIT, num),
+            sh0=colors[:, :1],
+            shN=colors[:, 1:],
+            features=features,
+        )
+
+    def _camera_gradients(self, numbers: np.ndarray) -> dict[str, Any]:
+        """Return derivatives with respect to the matrices from those of a camera's numbers.
+
+        The centre is c = -R^-1 t, hence dc = -R^-1 (dt + dR c).
+        """
+        rotation, d_center, focal, principal = np.split(numbers, [9, 12, 14])
+        d_translation = -np.linalg.solve(self.viewmat[:3, :3].T, d_center)
+        d_viewmat, d_K = np.zeros((4, 4)), np.zeros((3, 3))
+        d_viewmat[:3, :3] = rotation.reshape(3, 3) + np.outer(d_translation, self.center)
+        d_viewmat[:3, 3] = d_translation
+        d_K[[0, 1], [0, 1]], d_K[[0, 1], [2, 2]] = focal, principal
+        Float = self.types.Float
+        return {"viewmats": from_host(Float, d_viewmat), "Ks": from_host(Float, d_K)}
+
+    def _camera_tangents(self, directions: Mapping[str, Any]) -> list[Any]:
+        """Return tangents of a camera's numbers."""
+        d_viewmat = np.array(directions["viewmats"], np.float64)[self.index]
+        d_K = np.array(directions["Ks"], np.float64)[self.index]
+        moved = d_viewmat[:3, 3] + d_viewmat[:3, :3] @ self.center
+        d_center = -np.linalg.solve(self.viewmat[:3, :3], moved)
+        film = [d_K[0, 0], d_K[1, 1], d_K[0, 2], d_K[1, 2]]
+        # Opaque: each value of a literal would be a new kernel.
+        numbers = (*d_viewmat[:3, :3].ravel(), *d_center, *film)
+        return [dr.opaque(self.types.Float, float(x)) for x in numbers]
+
+
+def _meta(views: list[_View]) -> dict[str, Any]:
+    """Return the intermediate values of each splat, by gsplat's names."""
+    columns: dict[str, list[Any]] = {}
+    for view in views:
+        rows = load_rows(view.gaussians, view.pipeline.sh_degree)
+        splats = view.pipeline.project(rows, view.frame.camera)
+        brightness = dr.log(splats.opacities / ALPHA_CUT)
+        radii = dr.ceil(dr.sqrt(2 * brightness * splats.variances))
+        found = {
+            "means2d": list(splats.means2d),
+            "depths": [splats.depths],
+            "conics": list(splats.conics),
+            "opacities": [splats.opacities],
+            "radii": [dr.select(splats.visible, r, 0) for r in radii],
+        }
+        for name, values in found.items():
+            columns.setdefault(name, []).append(interleave(values))
+    dr.eval(columns)
+    film, num = views[0].film, views[0].gaussians.num_gaussians
+    meta = {name: _stacked(flat, (len(views), num)) for name, flat in columns.items()}
+    meta |= {name: meta[name][:, :, 0] for name in ("depths", "opacities")}
+    meta["radii"] = dr.int32_array_t(type(meta["radii"]))(meta["radii"])
+    return {**meta, "width": film.width, "height": film.height, "n_cameras": len(views)}

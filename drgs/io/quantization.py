@@ -1,0 +1,126 @@
+"""Numbers rounded to bits, as several file formats hold them, and the order of Gaussians in files.
+
+Arrays are of numpy, a row per Gaussian.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+LARGEST_LOGIT = 23 * math.log(2)
+"""Logit of the largest opacity below 1 that a sigmoid in float32 gives: 1 / (1 + 2^-23)."""
+
+SMALLEST_LOGIT = -125 * math.log(2)
+"""Logit of about the smallest opacity that it gives: exp of less is no number in float32."""
+
+SMALLEST_LOG_SCALE = -126 * math.log(2)
+"""Logarithm of the smallest normal float32: what a scale of 0 becomes."""
+
+_OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
+"""Indices of the other three components, by the index of one of four."""
+
+
+def decoding_bytes(count: int, harmonics: int, turned: bool = False) -> int:
+    """Return about the bytes of memory that decoding so many Gaussians takes.
+
+    harmonics: coefficients of each; turned: whether a format's axes are turned to ours afterwards.
+    Measured: 276 bytes at degree 0, 808 at degree 3, and 1,372 where they are turned.
+    """
+    return count * (240 + (72 if turned else 36) * harmonics)
+
+
+def round_to_uint32(values: np.ndarray, largest: int) -> np.ndarray:
+    """Return the nearest whole numbers from 0 to ``largest``."""
+    return np.clip(np.floor(np.asarray(values, np.float64) + 0.5), 0, largest).astype(np.uint32)
+
+
+def opacities_from_logits(logits: np.ndarray) -> np.ndarray:
+    """Return opacities (N,) float64."""
+    return 1 / (1 + np.exp(-np.clip(logits.astype(np.float64), -700, 700)))
+
+
+def logits_from_opacities(opacities: np.ndarray) -> np.ndarray:
+    """Return finite logits (N,) float32 of opacities (N,) in [0, 1]."""
+    opacities = opacities.astype(np.float64)
+    with np.errstate(divide="ignore"):
+        logits = np.log(opacities) - np.log1p(-opacities)
+    return np.clip(logits, SMALLEST_LOGIT, LARGEST_LOGIT).astype(np.float32)
+
+
+def log_scales_from_scales(scales: np.ndarray) -> np.ndarray:
+    """Return finite logarithms (N, 3) float32 of standard deviations (N, 3) >= 0."""
+    with np.errstate(divide="ignore"):
+        logarithms = np.log(scales.astype(np.float64))
+    return np.maximum(logarithms, SMALLEST_LOG_SCALE).astype(np.float32)
+
+
+def normalize_quaternions(quats: np.ndarray) -> np.ndarray:
+    """Return quaternions (N, 4) float64 of length 1; one of length 0 is the identity.
+
+    quats: (N, 4) wxyz.
+    """
+    quats = quats.astype(np.float64)
+    lengths = np.linalg.norm(quats, axis=1, keepdims=True)
+    usable = lengths > 0
+    return np.where(usable, quats, [1.0, 0, 0, 0]) / np.where(usable, lengths, 1)
+
+
+def drop_largest_component(quats: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the index (N,) of the largest component, and the other three (N, 3), in their order.
+
+    The sign, which a rotation leaves open, is the one that makes the largest positive. quats:
+    (N, 4) of length 1.
+    """
+    rows = np.arange(len(quats))
+    index = np.argmax(np.abs(quats), axis=1)
+    sign = np.where(quats[rows, index] < 0, -1.0, 1.0)
+    return index, sign[:, None] * quats[rows[:, None], _OTHERS[index]]
+
+
+def restore_largest_component(index: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """Return quaternions (N, 4) float64 of length 1: see :func:`drop_largest_component`."""
+    rows = np.arange(len(index))
+    quats = np.empty((len(index), 4))
+    quats[rows[:, None], _OTHERS[index]] = others
+    quats[rows, index] = np.sqrt(np.maximum(0, 1 - np.square(others).sum(axis=1)))
+    return quats
+
+
+# ----------------------------------------------------------------------------------------------
+# Order
+# ----------------------------------------------------------------------------------------------
+
+
+MORTON_BITS = 21
+"""Per axis: three of them in 63 bits. A cell is half a millionth of the box's longest side."""
+
+_SPREAD = (
+    (32, 0x1F00000000FFFF),
+    (16, 0x1F0000FF0000FF),
+    (8, 0x100F00F00F00F00F),
+    (4, 0x10C30C30C30C30C3),
+    (2, 0x1249249249249249),
+)
+
+
+def morton_order(positions: np.ndarray) -> np.ndarray:
+    """Return indices (N,) that sort positions (N, 3) along the Z-order curve; ties by index.
+
+    Morton 1966, "A computer oriented geodetic data base": the bits of the three coordinates in
+    turn.
+    """
+    positions = positions.astype(np.float64)
+    low = positions.min(axis=0, initial=np.inf)
+    side = (positions - low).max(initial=0) or 1.0
+    cells = ((positions - low) / side * (2**MORTON_BITS - 1)).astype(np.uint64)
+    x, y, z = (_spread(cells[:, axis]) for axis in range(3))
+    return np.argsort(x | y << np.uint64(1) | z << np.uint64(2), kind="stable")
+
+
+def _spread(values: np.ndarray) -> np.ndarray:
+    """Insert two zero bits before each bit but the first."""
+    for shift, mask in _SPREAD:
+        values = (values | values << np.uint64(shift)) & np.uint64(mask)
+    return values

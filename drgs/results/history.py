@@ -1,0 +1,77 @@
+"""The tables of a fit: ``history.csv`` and ``density.csv``."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+
+from drgs.core.files import atomic_path
+
+
+@dataclass(frozen=True)
+class HistoryRow:
+    """One line of ``history.csv``."""
+
+    iteration: int  # the first is 1
+    loss: float
+    psnr: float  # dB, of the iteration's training view
+    num_gaussians: int
+    means_lr: float  # world units
+    wall_s: float  # since the first iteration
+    test_psnr: float | None = None  # dB, mean of some test views; None: not measured here
+
+
+@dataclass(frozen=True)
+class DensityReport:
+    """What one call of a strategy of density did to the rows."""
+
+    num_gaussians: int  # afterwards
+    num_added: int = 0  # rows on top of those before, parents of a split not counted
+    cloned: int = 0  # Gaussians that were copied
+    split: int = 0  # Gaussians that were replaced by several
+    relocated: int = 0  # rows that became copies of others
+    pruned: int = 0  # rows that were removed, parents of a split not counted
+    refused: int = 0  # Gaussians that were to be cloned or split, but there was no room
+
+
+@dataclass(frozen=True, kw_only=True)
+class DensityRow(DensityReport):
+    """One line of ``density.csv``: what the strategy did after an iteration."""
+
+    iteration: int  # the first is 1
+
+
+DENSITY_COLUMNS = ("iteration", *(field.name for field in fields(DensityReport)))
+"""Of ``density.csv``."""
+
+
+@dataclass(eq=False)
+class FitHistory:
+    """The rows of both tables."""
+
+    rows: list[HistoryRow] = field(default_factory=list)
+    density: list[DensityRow] = field(default_factory=list)
+
+
+def write_history(path: Path, history: Sequence[HistoryRow]) -> None:
+    """Write ``history.csv``."""
+    rows = [
+        [f"{v:.6g}" if isinstance(v, float) else v for v in vars(row).values()] for row in history
+    ]
+    _write_table(path, HistoryRow.__dataclass_fields__, rows)
+
+
+def write_density(path: Path, changes: Sequence[DensityRow]) -> None:
+    """Write ``density.csv``, or nothing where there are no changes."""
+    if changes:
+        rows = [[getattr(change, name) for name in DENSITY_COLUMNS] for change in changes]
+        _write_table(path, DENSITY_COLUMNS, rows)
+
+
+def _write_table(path: Path, columns: Iterable[str], rows: Iterable[Iterable[object]]) -> None:
+    with atomic_path(path) as temporary, temporary.open("w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(columns)
+        writer.writerows(rows)

@@ -1,0 +1,250 @@
+"""The output folder of a fit: what is read from it before the fit, and written to it after.
+
+``drgs.results.folder`` decides whose folder it is; ``drgs.results.files`` names the files.
+"""
+
+from __future__ import annotations
+
+import json
+import platform
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from datetime import datetime
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+import drgs
+from drgs.config.approximations import Approximations
+from drgs.config.schema import FitConfig
+from drgs.core.environment import processor
+from drgs.core.files import atomic_path
+from drgs.core.folders import sole_writer
+from drgs.core.private import llvm_version
+from drgs.datasets.types import Dataset
+from drgs.gaussians.parameters import Gaussians
+from drgs.results.files import (
+    BUDGET_PLAN,
+    CHECKPOINT,
+    DENSITY,
+    GAUSSIANS,
+    GAUSSIANS_FOR_VIEWERS,
+    HISTORY,
+    METRICS,
+    REPORT,
+    VIEWS,
+)
+from drgs.results.folder import (
+    check_output_folder,
+    claim_output_folder,
+    continue_run,
+    has_results,
+    is_finished,
+    pictures_of,
+    remove_run,
+    require_no_run,
+    seal_run,
+    write_run_config,
+)
+from drgs.results.history import write_density, write_history
+from drgs.results.metrics import FitMetrics, SplitMetrics, mean_of, mean_quality
+from drgs.results.refined_cameras import write_views
+from drgs.results.report import Fitted, write_pictures, write_results
+from drgs.results.viewer import Shown, shows_as_fitted
+from drgs.training.checkpoint import (
+    Checkpoint,
+    load_checkpoint,
+    remove_checkpoint,
+)
+from drgs.training.history import History
+from drgs.training.trainer import Trainer
+
+if TYPE_CHECKING:  # imported where it is needed
+    from drgs.training.viewers import ForViewers
+
+
+@dataclass(eq=False)
+class FitFolder:
+    """The output folder of one fit, which the session alone writes to."""
+
+    path: Path
+    command: str = ""  # the line that was typed, for the report
+    resumes: bool = False  # a fit that was stopped, whatever its configuration
+    overwrites: bool = False  # the run that the folder holds
+
+    @contextmanager
+    def locked(self) -> Iterator[None]:
+        """Keep other commands from writing to the folder, from when it exists."""
+        with sole_writer(self.path) as self._keep:
+            yield
+
+    def is_finished(self, config: FitConfig) -> bool:
+        """Whether the folder holds all results of the fit already."""
+        if self.overwrites:
+            return False
+        return has_results(self.path) if self.resumes else is_finished(self.path, config)
+
+    def checkpoint_for(self, config: FitConfig, has_budget: bool) -> Checkpoint | None:
+        """Return the checkpoint to continue from, if there is one.
+
+        Raises ``UserError`` where the folder belongs to another fit. Nothing is written.
+        """
+        if self.overwrites:
+            return None
+        if has_budget:
+            require_no_run(self.path)
+        elif not self.resumes:
+            check_output_folder(self.path, config)
+        return load_checkpoint(self.path, config)
+
+    def take(self, config: FitConfig, dataset: Dataset) -> None:
+        """Make the folder that of the fit, or raise ``UserError`` and leave it as it is."""
+        self._keep()
+        images = pictures_of(dataset.test_split, [view.name for view in dataset.test])
+        if self.overwrites:
+            remove_run(self.path, images)
+        if self.resumes:
+            continue_run(self.path, config, images)
+        else:
+            claim_output_folder(self.path, config, images)
+
+    def write_plan(self, text: str) -> None:
+        """Write what was planned and why."""
+        with atomic_path(self.path / BUDGET_PLAN) as temporary:
+            temporary.write_text(text)
+
+    @property
+    def remedy(self) -> str:
+        """Advice after numbers that are not finite."""
+        has_checkpoint = (self.path / CHECKPOINT).exists()
+        kept = "the last checkpoint is kept" if has_checkpoint else "nothing was saved yet"
+        return (
+            f"{kept}. --resume {self.path} --debug repeats this with range checks; lower learning "
+            "rates (--set optimizer.means_lr=..., and so on) may avoid it"
+        )
+
+    def write_results(
+        self,
+        trainer: Trainer,
+        dataset: Dataset,
+        history: History,
+        gaussians: Gaussians,
+        for_viewers: ForViewers | None,
+        wall_s: float,
+    ) -> FitMetrics:
+        """Write the results of a finished fit, and measure them; return ``metrics.json``.
+
+        gaussians: what ``trainer.gaussians()`` returned; for_viewers: None where other viewers
+        render as the fit does; wall_s: spent on iterations.
+        """
+        out, config, render = self.path, trainer.config, trainer.images
+        saved_gaussians(gaussians, config).save(out / GAUSSIANS)
+        for effect in trainer.effects:
+            effect.write(out, dataset)
+        write_history(out / HISTORY, history.rows)
+        write_density(out / DENSITY, history.density)
+        write_views(out / VIEWS, dataset)
+        write_run_config(out, config)
+        output, split = config.output, dataset.test_split
+        scores = write_pictures(out, dataset, render, output.save_renders, output.report)
+        test = {**vars(mean_of(scores)), "split": split}
+        metrics = fit_metrics(config, gaussians.num_gaussians, wall_s, test, self.command)
+        other, approximations = None, config.model.approximations
+        if for_viewers is not None:
+            other = for_viewers.gaussians
+            other.save(out / GAUSSIANS_FOR_VIEWERS)
+            images = zip(for_viewers.pictures(dataset.test), dataset.test, strict=True)
+            quality = mean_quality((image, view.image, view.mask) for image, view in images)
+            metrics["viewers"] = {**vars(quality), "split": split}
+        if output.report:
+            shown = gaussians_on_page(gaussians, approximations, other)
+            fitted = Fitted(trainer.full_scene(), gaussians, render, shown)
+            write_results(out, dataset, fitted, scores, history, metrics)
+        self.finish(metrics)
+        return metrics
+
+    def describe(self, metrics: FitMetrics) -> str:
+        """Return the results in a few lines, and where they are."""
+        test, viewers = metrics["test"], metrics.get("viewers")
+        lines = [
+            f"{test['num_views']} {test['split']} views: PSNR {test['psnr']:.2f} dB, "
+            f"SSIM {test['ssim']:.4f}; {metrics['num_gaussians']:,} Gaussians; "
+            f"{metrics['iterations']} iterations in {metrics['wall_s']:.0f} s"
+        ]
+        if viewers is not None:
+            path = self.path / GAUSSIANS_FOR_VIEWERS
+            lines.append(f"as other viewers show {path}: PSNR {viewers['psnr']:.2f} dB")
+        lines.append(f"written: {self.path}")
+        if metrics["config"]["output"]["report"]:
+            lines.append(f"open {self.path / REPORT}")
+        return "\n".join(lines)
+
+    def finish(self, metrics: FitMetrics | None = None) -> None:
+        """Write ``metrics.json`` (None: it is there), and end the run: no checkpoint is left."""
+        if metrics is not None:
+            with atomic_path(self.path / METRICS) as temporary:
+                temporary.write_text(json.dumps(metrics, indent=2) + "\n")
+        remove_checkpoint(self.path)
+        seal_run(self.path)
+
+
+def saved_gaussians(gaussians: Gaussians, config: FitConfig) -> Gaussians:
+    """Return what ``point_cloud.ply`` contains: with ``output.bake_smoothing``, no filter.
+
+    Its header records the approximations that are not the default. gaussians: what
+    ``trainer.gaussians()`` returned.
+    """
+    others = config.model.approximations.others_than_default
+    gaussians = replace(gaussians, rendered_with=others or None)
+    return _without_filter(gaussians) if config.output.bake_smoothing else gaussians
+
+
+def gaussians_on_page(
+    gaussians: Gaussians, approximations: Approximations, for_viewers: Gaussians | None
+) -> Shown:
+    """Return what ``viewer.html`` shows: the fit's own, if it renders their approximations.
+
+    for_viewers: what it shows otherwise; None: there are none.
+    """
+    if for_viewers is not None and not shows_as_fitted(approximations):
+        return Shown(for_viewers, Approximations())
+    return Shown(_without_filter(gaussians), approximations)
+
+
+def _without_filter(gaussians: Gaussians) -> Gaussians:
+    if gaussians.smoothing is None:
+        return gaussians
+    from drgs.effects.smoothing import baked
+
+    return baked(gaussians)
+
+
+def fit_metrics(
+    config: FitConfig, num_gaussians: int, wall_s: float, test: SplitMetrics, command: str
+) -> FitMetrics:
+    """Return the contents of ``metrics.json``."""
+    return {
+        "iterations": config.iterations,
+        "num_gaussians": num_gaussians,
+        "wall_s": round(wall_s, 2),
+        "test": test,
+        "seed": config.seed,
+        "versions": {
+            "drgs": drgs.__version__,
+            "mitsuba": mi.__version__,
+            "drjit": dr.__version__,
+            "numpy": np.__version__,
+            "python": platform.python_version(),
+            "llvm": ".".join(map(str, llvm_version())),
+        },
+        "variant": mi.variant(),
+        "threads": dr.thread_count(),
+        "processor": processor(),
+        "date": datetime.now().astimezone().isoformat(timespec="minutes"),
+        "command": command,
+        "config": config.model_dump(mode="json"),
+    }

@@ -1,0 +1,360 @@
+"""Measure the time and the error of light between splats and surfaces.
+
+A fitted model is rendered with a mirror ball behind it, a glossy ring there, and a white plinth
+under it that lies in its shadow, each alone; and in the scene of a file, ``scenes/hybrid.xml``.
+Every way of passing light is compared with the rays' picture of many paths, over the pixels that
+show the object and no splats before it. So an error is the sum of what is approximated and of the
+noise of the paths; that of as many paths as the compared picture has is nearly free of noise.
+"""
+
+from __future__ import annotations
+
+import argparse
+import statistics
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from fits import SCENES
+
+import drgs  # noqa: F401  (registers the integrator)
+from drgs.bench.accuracy import add_scene
+from drgs.bench.output import machine, markdown_table
+from drgs.gaussians.parameters import Gaussians
+from drgs.io.figures import new_figure, write_figure
+from drgs.io.scenes import load_scene_file
+from drgs.results import metrics
+from drgs.results.files import GAUSSIANS
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+PATHS, QUICK_PATHS = (1, 4, 16, 64), (1,)
+"""Per pixel."""
+
+MANY, QUICK_MANY = 512, 4
+"""Paths of the pictures that are compared."""
+
+AT_ONCE = 64
+"""Paths of one picture; more are means of several."""
+
+SIZE = (300, 200)
+"""px: width, height."""
+
+ROUNDS, QUICK_ROUNDS = 5, 1
+
+RING = Path("shapes/ring.ply")
+"""Beside the scene file."""
+
+LIT = 0.98
+"""Of an object's light that the splats before a pixel let through, at least."""
+
+
+@dataclass(frozen=True)
+class Way:
+    """How light passes."""
+
+    name: str
+    settings: dict[str, str]
+
+
+WAYS = (
+    Way("none", {"light": "none"}),
+    Way("probe", {"light": "probe"}),
+    Way("probe, unseen by rays", {"light": "probe", "unseen": "rays"}),
+    Way("rays", {"light": "rays"}),
+)
+
+
+@dataclass(frozen=True)
+class Stage:
+    """A model among objects."""
+
+    name: str
+    load: Callable[..., mi.Scene]  # by the settings of a way
+    subjects: Sequence[str]  # ids of shapes
+
+
+@dataclass(frozen=True)
+class Measurement:
+    """One way of passing light, seen on one object."""
+
+    stage: str
+    subject: str
+    share: float  # of the picture's pixels
+    light: str
+    paths: int
+    seconds: float  # of the whole picture; median
+    factor: float  # times as long as without light
+    psnr: float  # dB, against many paths of rays
+
+
+# ----------------------------------------------------------------------------------------------
+# Scenes
+# ----------------------------------------------------------------------------------------------
+
+
+def stages(ply: Path, file: Path) -> list[Stage]:
+    """A model with one object at a time, and the scene of a file, beside which a ring is."""
+    means = np.asarray(Gaussians.load(ply).means)
+    low, high = np.quantile(means, [0.02, 0.98], axis=0)
+    center, radius = ((low + high) / 2).tolist(), float((high - low).max() / 2)
+    T = mi.ScalarTransform4f
+    place = T().translate(center).scale(radius)
+    objects = {
+        "mirror ball": {
+            "type": "sphere",
+            "to_world": place @ T().translate([-1.15, 0.9, 0.15]).scale(0.5),
+            "bsdf": {"type": "conductor", "material": "none"},
+        },
+        "glossy ring": {
+            "type": "ply",
+            "filename": str(file.parent / RING),
+            "to_world": place @ T().translate([-1.15, 0.9, 0.15]).rotate([1, 1, 0], 75).scale(0.6),
+            "bsdf": {"type": "roughconductor", "material": "Au", "alpha": 0.1},
+        },
+        "shaded plinth": {
+            "type": "rectangle",
+            "to_world": T().translate([*center[:2], float(low[2])]).scale(2 * radius),
+            "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.8}},
+        },
+    }
+
+    def load(name: str) -> Callable[..., mi.Scene]:
+        def loaded(**settings: str) -> mi.Scene:
+            integrator: dict[str, object] = {"filename": str(ply), **settings}
+            if settings["light"] == "probe":
+                integrator["probes"] = "lamp" if name == "shaded plinth" else name
+            return mi.load_dict(_stage(place, integrator) | {name: objects[name] | {"id": name}})
+
+        return loaded
+
+    def load_file(**settings: str) -> mi.Scene:
+        size = {"width": str(SIZE[0]), "height": str(SIZE[1])}
+        return load_scene_file(file, model=str(ply.resolve()), shadows="", **size, **settings)
+
+    alone = [Stage(ply.parent.name, load(name), [name]) for name in objects]
+    return [*alone, Stage(file.stem, load_file, ["ring", "ball", "globe", "plinth"])]
+
+
+def _stage(place: mi.ScalarTransform4f, integrator: dict[str, object]) -> dict[str, object]:
+    """All but the object: splats, camera, a lamp and the sky."""
+    T = mi.ScalarTransform4f
+    view = mi.ScalarPoint3f(1.7, -4, 1.7), mi.ScalarPoint3f(0, 0, -0.1)
+    film = {"type": "hdrfilm", "width": SIZE[0], "height": SIZE[1], "rfilter": {"type": "box"}}
+    return {
+        "type": "scene",
+        "integrator": {
+            "type": "splats",
+            "nested": {"type": "splatpath", "max_depth": 8},
+            **integrator,
+        },
+        "sensor": {
+            "type": "perspective",
+            "fov": 40,
+            "to_world": T().look_at(*(place @ point for point in view), [0, 0, 1]),
+            "film": film | {"pixel_format": "rgb"},
+            "sampler": {"type": "multijitter", "sample_count": 1},
+        },
+        "lamp": {
+            "type": "rectangle",
+            "id": "lamp",
+            "to_world": place @ T().look_at([-2, -3, 5], [0, 0, 0], [0, 0, 1]).scale(0.6),
+            "emitter": {"type": "area", "radiance": {"type": "rgb", "value": 40.0}},
+        },
+        "sky": {"type": "constant", "radiance": {"type": "rgb", "value": 0.4}},
+    }
+
+
+def mask_of(scene: mi.Scene, name: str) -> np.ndarray:
+    """(H, W) bool: pixels whose middle shows a shape of a scene, and no splats before it."""
+    from drgs.integrator.path_segment import PathSegment
+    from drgs.integrator.ray_transport import RayTransport
+
+    sensor, integrator = scene.sensors()[0], scene.integrator()
+    width, height = sensor.film().crop_size()
+    index = dr.arange(mi.UInt32, width * height)
+    x, y = index % width, index // width
+    place = mi.Point2f((mi.Float(x) + 0.5) / width, (mi.Float(y) + 0.5) / height)
+    ray, _ = sensor.sample_ray(0.0, 0.5, place, mi.Point2f(0.5))
+    hit = scene.ray_intersect_preliminary(ray)
+    shape = next(shape for shape in scene.shapes() if shape.id() == name)
+    ray.maxt = dr.select(hit.is_valid(), hit.t, dr.inf)
+    segment = PathSegment(
+        ray, hit.shape, hit.shape.emitter(), mi.Float(dr.inf), is_open=mi.Bool(False)
+    )
+    T = RayTransport.of(integrator.state).transmittance(segment, mi.Float(0), mi.Bool(True))
+    shows = hit.is_valid() & (hit.shape == mi.ShapePtr(shape)) & (T > LIT)
+    return np.array(shows).reshape(height, width)
+
+
+# ----------------------------------------------------------------------------------------------
+# Measuring
+# ----------------------------------------------------------------------------------------------
+
+
+def measure(
+    stage: Stage, paths: Sequence[int], many: int, rounds: int
+) -> tuple[list[Measurement], list[tuple[str, list[np.ndarray]]]]:
+    """All ways and numbers of paths, in turns; and by object, its pictures of many paths.
+
+    The last number of paths is the many, with other random numbers than what is compared.
+    """
+    scenes = {way.name: stage.load(**way.settings) for way in WAYS}
+    accurate = _mean(scenes["rays"], many, first=1000)
+    masks = {name: mask_of(scenes["none"], name) for name in stage.subjects}
+    results, shown = [], {name: [] for name in stage.subjects}
+    for n in (*paths, many):
+        seconds = _times(scenes, n, rounds)
+        for way, scene in scenes.items():
+            picture = _mean(scene, n, first=0)
+            for name, mask in masks.items():
+                error = metrics.psnr(picture, accurate, mask.astype(np.float64))
+                factor = seconds[way] / seconds["none"]
+                results.append(
+                    Measurement(stage.name, name, mask.mean(), way, n, seconds[way], factor, error)
+                )
+                if n == many:
+                    shown[name].append(_cropped(picture, mask))
+    return results, [(f"{stage.name}: {name}", pictures) for name, pictures in shown.items()]
+
+
+def _picture(scene: mi.Scene, paths: int, seed: int) -> mi.TensorXf:
+    """(H, W, 3) linear."""
+    scene.integrator().nested_spp = paths
+    return mi.render(scene, seed=seed)
+
+
+def _mean(scene: mi.Scene, paths: int, first: int) -> np.ndarray:
+    """(H, W, 3) display space, of as many pictures as have ``paths`` together."""
+    seeds, each = range(first, first + max(1, paths // AT_ONCE)), min(paths, AT_ONCE)
+    linear = np.mean([np.array(_picture(scene, each, seed)) for seed in seeds], axis=0)
+    return np.array(mi.math.linear_to_srgb(mi.Float(linear.ravel()))).reshape(linear.shape)
+
+
+def _times(scenes: dict[str, mi.Scene], paths: int, rounds: int) -> dict[str, float]:
+    """Seconds of a picture, medians; in turns. Of many paths: of as many pictures as it takes."""
+    each, spent = min(paths, AT_ONCE), {name: [] for name in scenes}
+    for scene in scenes.values():
+        for _ in range(2):  # compiles the kernels of the first picture, and of others
+            _seconds(scene, each)
+    for _ in range(rounds if each < AT_ONCE else 1):
+        for name, scene in scenes.items():
+            spent[name].append(_seconds(scene, each))
+    return {name: statistics.median(s) * max(1, paths // each) for name, s in spent.items()}
+
+
+def _seconds(scene: mi.Scene, paths: int) -> float:
+    """Of a picture from another place, so that no splats are known."""
+    params = mi.traverse(scene.sensors()[0])
+    params["to_world"] = mi.Transform4f(params["to_world"].matrix + dr.opaque(mi.Float, 0))
+    params.update()
+    dr.eval(params["to_world"])
+    dr.sync_thread()
+    started = time.perf_counter()
+    dr.eval(_picture(scene, paths, 0))
+    dr.sync_thread()
+    return time.perf_counter() - started
+
+
+def _cropped(picture: np.ndarray, mask: np.ndarray, border: int = 8) -> np.ndarray:
+    """To what surrounds a mask."""
+    rows, columns = (np.nonzero(mask.any(axis=axis))[0] for axis in (1, 0))
+    return picture[
+        max(rows[0] - border, 0) : rows[-1] + border,
+        max(columns[0] - border, 0) : columns[-1] + border,
+    ]
+
+
+# ----------------------------------------------------------------------------------------------
+# Output
+# ----------------------------------------------------------------------------------------------
+
+
+def table(results: Sequence[Measurement]) -> str:
+    """As the page of results holds it: times by those without light, errors."""
+    counts = sorted({m.paths for m in results})
+    header = ["object, pixels", "light", *(f"{n} paths" for n in counts)]
+    rows = []
+    for subject in dict.fromkeys(m.subject for m in results):
+        for way in WAYS:
+            found = {m.paths: m for m in results if (m.subject, m.light) == (subject, way.name)}
+            cells = [
+                f"{m.factor:.2f}x, {m.psnr:.1f} dB"
+                for n, m in sorted(found.items())
+                if n != counts[-1]
+            ]
+            last = found[counts[-1]]
+            rows.append([f"{subject}, {last.share:.0%}", way.name, *cells, f"{last.psnr:.1f} dB"])
+    return markdown_table(header, rows)
+
+
+def plot(results: Sequence[Measurement]) -> Figure:
+    """Error over time, one panel an object."""
+    panels = list(dict.fromkeys((m.stage, m.subject) for m in results))
+    figure = new_figure(11, 3.2 * -(-len(panels) // 4))
+    axes = figure.subplots(-(-len(panels) // 4), 4, squeeze=False).ravel()
+    for axis, panel in zip(axes, panels, strict=False):
+        for way in WAYS:
+            found = [m for m in results if (m.stage, m.subject) == panel and m.light == way.name]
+            axis.plot([m.seconds for m in found], [m.psnr for m in found], ".-", label=way.name)
+        axis.set_xscale("log")
+        axis.set_title(": ".join(panel), fontsize=9)
+        axis.set_xlabel("seconds a picture")
+        axis.grid(alpha=0.3)
+    for axis in axes[len(panels) :]:
+        axis.axis("off")
+    axes[0].set_ylabel("PSNR against rays [dB]")
+    axes[0].legend(fontsize=7)
+    return figure
+
+
+def show(pictures: Sequence[tuple[str, list[np.ndarray]]]) -> Figure:
+    """A row an object: by each way, and four times the error of all but the last."""
+    names = [way.name for way in WAYS]
+    titles = [*names, *(f"error x4: {name}" for name in names[:-1])]
+    figure = new_figure(2 * len(titles), 1.6 * len(pictures))
+    axes = figure.subplots(len(pictures), len(titles), squeeze=False)
+    for row, (name, by_way) in zip(axes, pictures, strict=True):
+        errors = [4 * np.abs(picture - by_way[-1]) for picture in by_way[:-1]]
+        for axis, picture in zip(row, [*by_way, *errors], strict=True):
+            axis.imshow(np.clip(picture, 0, 1), interpolation="nearest")
+            axis.set_xticks([])
+            axis.set_yticks([])
+        row[0].set_ylabel(name, fontsize=7)
+    for axis, title in zip(axes[0], titles, strict=True):
+        axis.set_title(title, fontsize=8)
+    return figure
+
+
+def main() -> None:
+    """Measure all stages; write a plot and pictures."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    add_scene(parser)
+    parser.add_argument("--quick", action="store_true", help="few paths and rounds")
+    parser.add_argument("--out", type=Path, default=Path("out/studies/light"))
+    args = parser.parse_args()
+    mi.set_variant("llvm_ad_rgb")
+    path = Path(args.scene)
+    ply = path / GAUSSIANS if path.is_dir() else path
+    counts = (QUICK_PATHS, QUICK_MANY, QUICK_ROUNDS) if args.quick else (PATHS, MANY, ROUNDS)
+    results: list[Measurement] = []
+    pictures: list[tuple[str, list[np.ndarray]]] = []
+    for stage in stages(ply, SCENES / "hybrid.xml"):
+        found, shown = measure(stage, *counts)
+        results += found
+        pictures += shown
+        print(f"\n{table(found)}", flush=True)
+    args.out.mkdir(parents=True, exist_ok=True)
+    write_figure(args.out / "light.png", plot(results))
+    write_figure(args.out / "light_pictures.png", show(pictures))
+    print(f"\n{machine()}; plot and pictures: {args.out}")
+
+
+if __name__ == "__main__":
+    main()

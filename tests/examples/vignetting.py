@@ -1,0 +1,57 @@
+"""An effect of a fit: the lens darkens the corners of photographs, by a factor that is fitted."""
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from pydantic import Field
+
+from drgs.config.extensions import EFFECTS
+from drgs.config.section import Section
+from drgs.training.effects.base import TrainingEffect, as_tensor
+from drgs.training.effects.view_parameters import ViewParameters
+
+
+class VignettingSection(Section):
+    """The section ``extensions.vignetting``."""
+
+    lr: float = Field(0.01, gt=0, description="First rate of the strength; falls as the means'.")
+
+
+@EFFECTS.register("vignetting", section=VignettingSection)
+class Vignetting(TrainingEffect):
+    """Renderings are darkened towards the corners, as the photographs are."""
+
+    name = "vignetting"
+
+    def __init__(self, section: VignettingSection) -> None:
+        strength = {"strength": np.zeros((1, 1))}  # one for all views
+        self.parameters = ViewParameters(strength, {"strength": section.lr})
+
+    def upload(self, view):
+        """Return half of the squared distance from the middle, (H, W, 3); 1 in the corners."""
+        y, x = np.mgrid[: view.height, : view.width] + 0.5
+        x, y = 2 * x / view.width - 1, 2 * y / view.height - 1
+        return as_tensor(np.repeat(((x**2 + y**2) / 2)[:, :, None], 3, axis=2))
+
+    def adjust(self, image, view):
+        """Return the rendering as the camera would have taken it."""
+        strength = self.leaves(view)["strength"]
+        falloff = 1 - strength * view.uploads[self.name].array
+        return mi.TensorXf(image.array * falloff, image.shape)
+
+    def leaves(self, view):
+        """Return the numbers that are fitted."""
+        return self.parameters.leaves(view.index)
+
+    def after(self, fit, view, derivatives):
+        """Take a step of Adam."""
+        dr.set_grad(self.leaves(view), derivatives)
+        self.parameters.step(view.index, fit.rate_decay)
+
+    def state(self):
+        """Return what a checkpoint has to hold."""
+        return self.parameters.state()
+
+    def restore(self, state):
+        """Continue from a checkpoint."""
+        self.parameters.restore(state)

@@ -1,0 +1,154 @@
+"""A file format in one file outside of drgs works wherever a shipped one does."""
+
+import os
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from support.small_capture import blobs
+
+from drgs.core import registry
+from drgs.core.errors import UserError
+from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
+from drgs.io import formats
+
+ROOT = Path(__file__).parents[2]
+EXAMPLE = ROOT / "tests" / "examples" / "npz_format.py"
+
+
+@pytest.fixture
+def installed(monkeypatch, tmp_path):
+    """A folder on Python's path with the example and the entry point of an installed package."""
+    folder = tmp_path / "site"
+    about = folder / "drgs_npz-1.0.dist-info"
+    about.mkdir(parents=True)
+    (folder / EXAMPLE.name).write_bytes(EXAMPLE.read_bytes())
+    (about / "METADATA").write_text("Metadata-Version: 2.1\nName: drgs-npz\nVersion: 1.0\n")
+    (about / "entry_points.txt").write_text("[drgs]\nnpz = npz_format\n")
+    formats.file_formats()  # imports those that are shipped
+    monkeypatch.syspath_prepend(folder)
+    monkeypatch.setattr(registry, "_loaded", set())
+    monkeypatch.setattr(formats.FORMATS, "_extensions", dict(formats.FORMATS._extensions))
+    monkeypatch.delitem(sys.modules, "npz_format", raising=False)
+    yield folder
+    sys.modules.pop("npz_format", None)
+
+
+def drgs(folder, *arguments):
+    """The output of a command, as a user runs it."""
+    environment = {**os.environ, "PYTHONPATH": f"{folder}{os.pathsep}{ROOT}"}
+    command = [sys.executable, "-m", "drgs", *map(str, arguments)]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True)
+    return done.returncode, done.stdout + done.stderr
+
+
+def test_gaussians_are_saved_and_loaded(installed, tmp_path):
+    given = replace(blobs(), origin=(4e6, 0.0, 1e6), rendered_with={"low_pass": 0.1})
+    given.save(tmp_path / "a.npz")
+    read = Gaussians.load(tmp_path / "a.npz")
+    assert (read.origin, read.rendered_with) == (given.origin, given.rendered_with)
+    for name in ("means", "quats", "log_scales", "logit_opacities", "sh0", "shN"):
+        np.testing.assert_array_equal(getattr(read, name), getattr(given, name))
+
+
+def test_a_plugin_renders_the_file(installed, tmp_path):
+    mi.set_variant("llvm_ad_rgb")
+    images = []
+    for name in ("a.npz", "a.ply"):
+        blobs().save(tmp_path / name)
+        scene = {
+            "type": "scene",
+            "integrator": {"type": "splats", "filename": str(tmp_path / name)},
+            "sensor": {
+                "type": "perspective",
+                "to_world": mi.ScalarTransform4f().look_at([3, 3, 2], [0, 0, 0], [0, 0, 1]),
+                "film": {"type": "hdrfilm", "width": 24, "height": 16},
+            },
+        }
+        images.append(np.array(mi.render(mi.load_dict(scene))))
+    assert images[0].max() > 0.1
+    np.testing.assert_array_equal(*images)
+
+
+def test_commands_export_and_render_it(installed, tmp_path):
+    blobs().save(tmp_path / "a.ply")
+    status, text = drgs(installed, "export", tmp_path / "a.ply", "--format", "npz")
+    assert (status, f"written: {tmp_path / 'a.npz'} (" in text) == (0, True), text
+    assert np.array_equal(np.load(tmp_path / "a.npz")["means"], blobs().means)
+    options = ["--orbit", 2, "--size", 16, 16, "--out", tmp_path / "out"]
+    status, text = drgs(installed, "render", tmp_path / "a.npz", *options)
+    assert status == 0, text
+    assert list((tmp_path / "out").glob("**/*.png"))
+
+
+def test_helps_and_messages_list_it(installed, tmp_path):
+    _, text = drgs(installed, "export", "--help")
+    assert "npz: NumPy's archive of arrays" in " ".join(text.split())
+    (tmp_path / "a.obj").touch()
+    _, text = drgs(installed, "render", tmp_path / "a.obj", "--out", tmp_path)
+    assert ".npz" in text and 'entry point of the group "drgs"' in text
+    with pytest.raises(UserError, match=r"in one of .*\.npz, .*entry point of the group"):
+        blobs().save(tmp_path / "a.obj")
+    with pytest.raises(UserError, match=r'"npzz"; did you mean npz\?; there are .*entry point'):
+        blobs().to_bytes("npzz")
+
+
+ARRAYS = {name: getattr(blobs(), name) for name in PARAMETER_NAMES}
+
+
+@pytest.mark.parametrize(
+    ("content", "reason"),
+    [
+        (ARRAYS, r"KeyError: '.*rendered_with"),
+        ({"means": ARRAYS["means"], "rendered_with": "{}"}, "ValueError: arrays must be means, q"),
+        (
+            {**ARRAYS, "quats": ARRAYS["means"], "rendered_with": "{}"},
+            r"ValueError: quats: \(4,\) per Gaussian expected, got \(30, 3\)",
+        ),
+    ],
+)
+def test_what_it_raises_is_reported_with_its_name(installed, tmp_path, content, reason):
+    np.savez(tmp_path / "a.npz", **content)
+    with pytest.raises(UserError, match=rf'a\.npz: file format "npz" \(npz_format\): {reason}'):
+        Gaussians.load(tmp_path / "a.npz")
+
+
+def test_what_it_raises_when_it_writes_ends_a_command_with_a_line(installed, tmp_path):
+    module = installed / "npz_format.py"
+    module.write_text(module.read_text().replace("return content.getvalue()", "return 1 / 0"))
+    blobs().save(tmp_path / "a.ply")
+    status, text = drgs(installed, "export", tmp_path / "a.ply", "--format", "npz")
+    assert status == 2
+    assert 'error: file format "npz" (npz_format): ZeroDivisionError: division by zero' in text
+    assert "Traceback" not in text and not (tmp_path / "a.npz").exists()
+
+
+def test_a_format_without_a_suffix_is_refused_with_its_package(installed):
+    module = installed / "npz_format.py"
+    module.write_text(module.read_text().replace('suffix = ".npz"', 'suffix = "npz"'))
+    reason = r"package drgs-npz \(npz_format\): TypeError: Npz\.suffix must be a suffix in small"
+    with pytest.raises(UserError, match=f'cannot load the extension "npz" of the {reason}'):
+        formats.format_for("a.npz")
+
+
+def test_a_suffix_that_drgs_has_stays_its_own(installed):
+    module = installed / "npz_format.py"
+    module.write_text(module.read_text().replace('suffix = ".npz"', 'suffix = ".ply"'))
+    assert formats.format_for("a.ply").name == "ply"
+    assert {each.name for each in formats.file_formats()} >= {"npz", "ply"}
+
+
+def test_numbers_that_are_not_finite_are_refused(installed, tmp_path):
+    means = ARRAYS["means"].copy()
+    means[3, 1] = np.nan
+    np.savez(tmp_path / "a.npz", **{**ARRAYS, "means": means, "rendered_with": "{}"})
+    with pytest.raises(UserError, match=r"a\.npz: .*means of Gaussian 3 is nan"):
+        Gaussians.load(tmp_path / "a.npz")
+
+
+def test_the_documented_example_is_the_file():
+    assert f"```python\n{EXAMPLE.read_text()}```" in (ROOT / "docs" / "developing.md").read_text()

@@ -1,0 +1,70 @@
+"""``FitSession``: a fit without a command, and the decisions of rank 0."""
+
+from types import SimpleNamespace
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from support.fit_command import VALUES, write_project
+from support.folders import contents
+from support.trainers import make_trainer
+
+import drgs
+from drgs.config.load import load_config
+from drgs.core.errors import UserError
+from drgs.training.budget import Budget
+from drgs.training.loop import RootDecides, iterations
+from drgs.training.session import FitSession
+
+
+@pytest.fixture(autouse=True)
+def variant():
+    mi.set_variant("llvm_ad_rgb")
+
+
+def test_a_session_without_a_folder_runs_to_its_end_and_writes_and_prints_nothing(tmp_path, capsys):
+    config = load_config(write_project(tmp_path))
+    before, session = contents(tmp_path), FitSession(config)
+    assert session.run()
+    assert session.trainer.iteration == VALUES["iterations"] == session.history.rows[-1].iteration
+    assert contents(tmp_path) == before and capsys.readouterr().out == ""
+    fitted = drgs.train(config).gaussians
+    np.testing.assert_array_equal(session.trainer.gaussians().means, fitted.means)
+
+
+def test_a_time_that_is_too_short_is_refused_before_the_trainer_is_made(tmp_path):
+    config = load_config(write_project(tmp_path))
+    session = FitSession(config, budget=Budget(seconds=1.0, end=0.0))
+    with pytest.warns(), pytest.raises(UserError, match="--budget: must leave time for 50"):
+        session.run()
+    assert not hasattr(session, "trainer")
+
+
+class Revises:
+    """Of rank 0: another end after the second iteration, and the end there."""
+
+    def should_continue(self, trainer):
+        if trainer.iteration == 2:
+            trainer.reschedule(5, 4)
+        return trainer.iteration < trainer.config.iterations
+
+    def num_iterations(self, trainer):
+        return trainer.config.iterations
+
+
+def test_other_ranks_end_and_revise_a_fit_as_rank_0_does():
+    told = []
+
+    def ask(numbers):
+        told.append(numbers)
+        return np.array(numbers)
+
+    root = SimpleNamespace(is_root=True, of_root=ask)
+    other = SimpleNamespace(is_root=False, of_root=lambda numbers: np.array(told.pop(0)))
+    trainers = [make_trainer(iterations=50, densify={"start": 3, "stop": 30}) for _ in range(2)]
+    for trainer, comm in zip(trainers, (root, other), strict=True):
+        criterion = RootDecides(Revises() if comm.is_root else None, comm)
+        history = SimpleNamespace(add=lambda report: None, add_density=lambda *_: None)
+        assert len(list(iterations(trainer, history, criterion))) == 5
+    assert trainers[0].config == trainers[1].config and not told
+    assert trainers[1].config.iterations == 5 and trainers[1].config.densify.stop == 4
