@@ -50,7 +50,8 @@ from typing import Any, ClassVar
 
 import drjit as dr
 
-from drgs.cameras.camera import Camera, Pinhole
+from drgs.cameras.camera import Camera
+from drgs.cameras.lens import Pinhole
 from drgs.core.arrays import types_of
 from drgs.core.constants import WHITENING_SCALE
 from drgs.core.errors import UnsupportedError
@@ -90,7 +91,7 @@ def exact_shape(rows: GaussianRows, camera: Camera, position: Any, low_pass: flo
     where the anchor is, which makes no difference.
     """
     m0, m1, _ = film_axes(rows, camera, position, camera.lens.true_slopes(camera, position))
-    film = whiten(camera.lens.film_point(camera, position), [*m0], [*m1], low_pass)
+    film = whiten(camera.lens.project_point(camera, position), [*m0], [*m1], low_pass)
     mean = dr.detach(film.means2d)
     anchor = closest_on_film(camera, *mean)
     slopes = list((anchor - camera.principal) / camera.focal)
@@ -125,7 +126,7 @@ def _seen_along(
 ) -> tuple[Any, tuple[Any, Any], Any]:
     """U, kappa and h of a Gaussian that is projected along the ray with the given slopes."""
     m0, m1, n = film_axes(rows, camera, position, slopes)
-    film = whiten(camera.lens.film_point(camera, position), [*m0], [*m1], low_pass)
+    film = whiten(camera.lens.project_point(camera, position), [*m0], [*m1], low_pass)
     p, _, s = film.whitening
     # kappa and h by minors (Binet-Cauchy), free of the cancellation in p k_x + r k_y and in
     # w - |kappa|^2. The rows are scaled first, or giants overflow.
@@ -174,7 +175,7 @@ class RayResponse(AffineResponse):
         """
         if not isinstance(camera.lens, Pinhole):
             raise UnsupportedError(
-                f"splats: projection 'exact' needs a pinhole, got {camera.lens.label}; "
+                f"splats: projection 'exact' needs a pinhole, got {type(camera.lens).__name__}; "
                 "use 'unscented', or 'ewa', which is exact for parallel rays"
             )
         return RayResponse(camera)

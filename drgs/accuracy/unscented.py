@@ -16,7 +16,8 @@ from typing import Any
 
 import drjit as dr
 
-from drgs.cameras.camera import Camera, Lens, Pinhole
+from drgs.cameras.camera import Camera
+from drgs.cameras.lens import Lens, Pinhole
 from drgs.core.arrays import types_of
 from drgs.splatting.projection import (
     FilmShape,
@@ -58,7 +59,7 @@ def unscented_shape(
         for axis, mu in zip(points.offsets, points.mean, strict=True)
     ]
     shift = types_of(type(position.z)).Array2f(points.mean)
-    means2d = camera.lens.film_point(camera, position) + shift
+    means2d = camera.lens.project_point(camera, position) + shift
     affine = ewa(rows, camera, position, low_pass)
     return dr.select(points.usable, whiten(means2d, *columns, low_pass), affine)
 
@@ -93,15 +94,17 @@ class _SigmaPoints:
 @singledispatch
 def _sigma_points(lens: Lens, rows: GaussianRows, camera: Camera, position: Any) -> _SigmaPoints:
     """Through any lens: as it projects points."""
-    center, slopes = lens.film_point(camera, position), lens.true_slopes(camera, position)
-    not_nearer = replace(camera, near=NEAREST * lens.look(camera, position)[2])
+    center, slopes = lens.project_point(camera, position), lens.true_slopes(camera, position)
+    not_nearer = replace(camera, near=NEAREST * lens.visibility(camera, position)[2])
     usable = _same(slopes, lens.clamped_slopes(camera, position))
     offsets = [[], []]
     for axis in world_axes(rows):
         for c in (SPREAD, -SPREAD):
-            seen, point, _ = lens.look(not_nearer, position + c * (camera.rotation @ axis))
+            seen, point, _ = lens.visibility(not_nearer, position + c * (camera.rotation @ axis))
             usable &= seen
-            for side, offset in zip(offsets, lens.film_point(camera, point) - center, strict=True):
+            for side, offset in zip(
+                offsets, lens.project_point(camera, point) - center, strict=True
+            ):
                 side.append(offset)
     return _SigmaPoints(offsets, [WEIGHT * sum(o[1:], o[0]) for o in offsets], usable)
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Collection
 from dataclasses import replace
 
-from drgs.cameras.camera import Camera, Pinhole
+from drgs.cameras.camera import Camera
+from drgs.cameras.lens import Pinhole
 from drgs.gaussians.parameters import Gaussians
 from drgs.splatting.rendering import Pipeline
 

@@ -175,7 +175,7 @@ def project(
     Differentiable in ``rows`` and in the camera's numbers. Not differentiated: visibility.
     """
     offset = rows.means - camera.center
-    seen, position, depth = camera.lens.look(camera, camera.rotation @ offset)
+    seen, position, depth = camera.lens.visibility(camera, camera.rotation @ offset)
     low_pass = max(low_pass, LEAST_LOW_PASS)
     film = (shape or ewa)(rows, camera, position, low_pass)
     opacities = opacity_rule(
@@ -213,7 +213,7 @@ def ewa(rows: GaussianRows, camera: Camera, position: Any, low_pass: float) -> F
     """
     lens = camera.lens
     m0, m1, _ = film_axes(rows, camera, position, lens.clamped_slopes(camera, position))
-    return whiten(lens.film_point(camera, position), [*m0], [*m1], low_pass)
+    return whiten(lens.project_point(camera, position), [*m0], [*m1], low_pass)
 
 
 def whiten(means2d: Any, m0: Sequence[Any], m1: Sequence[Any], low_pass: float) -> FilmShape:
@@ -281,14 +281,14 @@ def film_axes(
     """The half axes of a Gaussian as rows of two matrices: on the film, and in depth.
 
     The first two are those of M = J R_camera R(q) diag(s), px; the third the same for the depth
-    divided by that of the mean. slopes: see :meth:`drgs.cameras.camera.Pinhole.film_directions`.
+    divided by that of the mean. slopes: see :meth:`drgs.cameras.lens.Lens.projection_jacobian`.
     """
     world_from_splat, scales = quat_to_rotation(rows.quats), dr.exp(rows.log_scales)
 
     def along(direction: Any) -> Any:
         return (world_from_splat.T @ direction) * scales
 
-    m0, m1 = map(along, camera.lens.film_directions(camera, position, slopes))
+    m0, m1 = map(along, camera.lens.projection_jacobian(camera, position, slopes))
     return m0, m1, along(camera.lens.depth_direction(camera, position))
 
 

@@ -12,9 +12,10 @@ NAMES = Counter(path.stem for path in FILES if path.stem.startswith("test_"))
 
 MOST_LINES = 600
 
-OTHER_FOLDERS = {"support", "references", "commands", "scenes", "house"}
+OTHER_FOLDERS = {"support", "references", "commands", "scenes", "house", "examples"}
 """Beside those that are named like a package: ``support`` is what tests share, ``references`` are
-stored pictures, ``commands`` run the programs, ``scenes`` are the shipped ones, ``house`` is about
+stored pictures, ``commands`` run the programs, ``scenes`` are the shipped ones, ``examples`` are
+extensions that the documents show, ``house`` is about
 the repository itself."""
 
 
