@@ -1,6 +1,6 @@
 """Depths of splats' peaks along the ray of each pixel: what the order of each pixel compares.
 
-:class:`RayDepths` where the response finds the peak anyway (``drgs.accuracy.exact``, whose formulas
+:class:`RayDepths` where the falloff finds the peak anyway (``drgs.accuracy.exact``, whose formulas
 these are), :class:`AffineDepths` where it does not, :class:`ParallelDepths` where rays do not meet.
 :class:`BoundedDepths` are those of one of them where each pixel sees a part of its ray.
 """
@@ -16,17 +16,24 @@ from drgs.accuracy.exact import RayFootprint, closest_on_film, ray_denominator
 from drgs.accuracy.pixel_lists import PeakDepths
 from drgs.cameras.camera import Camera
 from drgs.core.constants import WHITENING_SCALE
+from drgs.splatting.footprint import Falloff, Footprint, flat_columns
 from drgs.splatting.grid import Lanes, TileGrid
-from drgs.splatting.image_model import Footprint, Response, flat_columns
 from drgs.splatting.lanes import load_pixels
-from drgs.splatting.projection import Splats2D
+from drgs.splatting.projection import (
+    FilmShape,
+    GaussianRows,
+    Projection,
+    RayTerms,
+    Splats2D,
+    film_axes,
+)
 
 
 @dataclass(frozen=True)
 class AffineDepths:
-    """Depths at a pixel for a response that does not know them: stores what they depend on."""
+    """Depths at a pixel for a falloff that does not know them: stores what they depend on."""
 
-    def seen_by(self, camera: Camera) -> AffineDepths:
+    def for_camera(self, camera: Camera) -> AffineDepths:
         """For one camera, whose rays may be parallel."""
         return ParallelDepths() if camera.lens.parallel else self
 
@@ -36,10 +43,10 @@ class AffineDepths:
         return [ray.tilt_x / scale, ray.tilt_y / scale, ray.spread / scale**2, splats.depths]
 
     def at(
-        self, response: Response, geometry: list[Any], keys: list[Any], x: Any, y: Any
+        self, falloff: Falloff, geometry: list[Any], keys: list[Any], x: Any, y: Any
     ) -> tuple[Any, Any]:
         """a and D of a splat at a point of the film, px."""
-        return self._at(keys, *response.coordinates(geometry, x, y))
+        return self._at(keys, *falloff.coordinates(geometry, x, y))
 
     def bind(self, lanes: Lanes, grid: TileGrid) -> AffineDepths:
         """For the lanes of one kernel: nothing has to be loaded."""
@@ -59,6 +66,26 @@ class AffineDepths:
 
 
 @dataclass(frozen=True)
+class WithAffineDepth:
+    """A projection, and what :class:`AffineDepths` need: the affine covariance with the depth."""
+
+    shape: Projection
+
+    def __call__(
+        self, rows: GaussianRows, camera: Camera, position: Any, low_pass: float
+    ) -> FilmShape:
+        """Project; h is not negative. Where slopes are clamped, the splat is the affine one."""
+        film = self.shape(rows, camera, position, low_pass)
+        slopes = camera.lens.clamped_slopes(camera, position)
+        m0, m1, n = film_axes(rows, camera, position, slopes)
+        p, r, s = film.whitening
+        kx, ky = dr.dot(m0, n), dr.dot(m1, n)
+        kx, ky = dr.fma(p, kx, r * ky), s * ky
+        h = dr.squared_norm(n) - dr.fma(kx, kx, ky * ky)
+        return replace(film, ray=RayTerms(kx, ky, dr.select(h > 0, h, 0)))
+
+
+@dataclass(frozen=True)
 class ParallelDepths(AffineDepths):
     """The same for rays that are parallel."""
 
@@ -70,11 +97,11 @@ class ParallelDepths(AffineDepths):
 
 @dataclass(frozen=True)
 class RayDepths:
-    """Depths at a pixel for ``RayResponse``, which computes them."""
+    """Depths at a pixel for ``RayFalloff``, which computes them."""
 
     camera: Camera | None = None  # whose film has the anchors
 
-    def seen_by(self, camera: Camera) -> RayDepths:
+    def for_camera(self, camera: Camera) -> RayDepths:
         """For one camera."""
         return replace(self, camera=camera)
 
@@ -83,11 +110,11 @@ class RayDepths:
         return [splats.depths * splats.ray.scale]
 
     def at(
-        self, response: Response, geometry: list[Any], keys: list[Any], x: Any, y: Any
+        self, falloff: Falloff, geometry: list[Any], keys: list[Any], x: Any, y: Any
     ) -> tuple[Any, Any]:
         """a and D of a splat at a point of the film, px."""
         del keys
-        u, v = response.coordinates(geometry, x, y)
+        u, v = falloff.coordinates(geometry, x, y)
         anchor = closest_on_film(self.camera, *geometry[:2])
         _, a, denominator = ray_denominator(geometry, u, v, x - anchor.x, y - anchor.y)
         return a, denominator
@@ -112,19 +139,19 @@ class BoundedDepths:
     farthest: Any  # the same
     bounds: list[tuple[Any, Any]] = field(default_factory=list)  # the 16 of each lane
 
-    def seen_by(self, camera: Camera) -> BoundedDepths:
+    def for_camera(self, camera: Camera) -> BoundedDepths:
         """For one camera."""
-        return replace(self, depths=self.depths.seen_by(camera))
+        return replace(self, depths=self.depths.for_camera(camera))
 
     def keys(self, splats: Splats2D) -> list[Any]:
         """Columns that the depths are computed from."""
         return self.depths.keys(splats)
 
     def at(
-        self, response: Response, geometry: list[Any], keys: list[Any], x: Any, y: Any
+        self, falloff: Falloff, geometry: list[Any], keys: list[Any], x: Any, y: Any
     ) -> tuple[Any, Any]:
         """a and D of a splat at a point of the film, px, wherever its peak is."""
-        return self.depths.at(response, geometry, keys, x, y)
+        return self.depths.at(falloff, geometry, keys, x, y)
 
     def bind(self, lanes: Lanes, grid: TileGrid) -> BoundedDepths:
         """For the lanes of one kernel: loads the bounds."""

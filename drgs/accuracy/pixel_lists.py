@@ -13,8 +13,8 @@ import drjit as dr
 
 from drgs.cameras.camera import Camera
 from drgs.core.arrays import types_of
+from drgs.splatting.footprint import Falloff, Footprint
 from drgs.splatting.grid import GRID, MICRO, MICROS, TILE, Lanes, TileGrid
-from drgs.splatting.image_model import Footprint, Response
 from drgs.splatting.projection import Splats2D
 from drgs.splatting.rasterize import (
     Records,
@@ -28,7 +28,7 @@ FARTHEST = 4.0
 class PeakDepths(Protocol):
     """Who knows the depth of a splat's peak along a pixel's ray."""
 
-    def seen_by(self, camera: Camera) -> PeakDepths:
+    def for_camera(self, camera: Camera) -> PeakDepths:
         """For one camera."""
         ...
 
@@ -37,7 +37,7 @@ class PeakDepths(Protocol):
         ...
 
     def at(
-        self, response: Response, geometry: list[Any], keys: list[Any], x: Any, y: Any
+        self, falloff: Falloff, geometry: list[Any], keys: list[Any], x: Any, y: Any
     ) -> tuple[Any, Any]:
         """a and D at a point of the film, px: the depth is a / D in the unit, if a is positive."""
         ...
@@ -163,7 +163,7 @@ class _Items:
         def body(masks: Any, item: Any) -> tuple:
             micro = dr.tzcnt(masks)
             middle = x + t.Float(micro % GRID) * MICRO, y + t.Float(micro // GRID) * MICRO
-            a, denominator = depths.at(bins.model.response, geometry, keys, *middle)
+            a, denominator = depths.at(bins.model.falloff, geometry, keys, *middle)
             # Where there is no peak, there may be one at a neighbour.
             along = dr.select(a > 0, a / denominator, 1)
             along = dr.select(along < 1 / FARTHEST, 1 / FARTHEST, along)

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from typing import Any, ClassVar
 
 from drgs.core.arrays import types_of
+from drgs.splatting.footprint import total
 from drgs.splatting.grid import MICRO, Lanes, TileGrid
-from drgs.splatting.image_model import total
 from drgs.splatting.lanes import load_pixels
 
 

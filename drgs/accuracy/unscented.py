@@ -18,11 +18,12 @@ import drjit as dr
 
 from drgs.cameras.camera import Camera
 from drgs.cameras.lens import Lens, Pinhole
+from drgs.config.approximations import PROJECTIONS
 from drgs.core.arrays import types_of
 from drgs.splatting.projection import (
     FilmShape,
     GaussianRows,
-    RayTerms,
+    ProjectionModel,
     ewa,
     film_axes,
     whiten,
@@ -64,22 +65,11 @@ def unscented_shape(
     return dr.select(points.usable, whiten(means2d, *columns, low_pass), affine)
 
 
-def unscented_with_depth(
-    rows: GaussianRows, camera: Camera, position: Any, low_pass: float
-) -> FilmShape:
-    """As :func:`unscented_shape`, and what is needed for the depth at a pixel.
+@PROJECTIONS.register("unscented")
+class Unscented(ProjectionModel):
+    """The unscented transform."""
 
-    The Gaussian's covariance with the depth is the affine one, and h is not negative.
-    """
-    film = unscented_shape(rows, camera, position, low_pass)
-    # Where they are clamped, the splat is the affine one.
-    slopes = camera.lens.clamped_slopes(camera, position)
-    m0, m1, n = film_axes(rows, camera, position, slopes)
-    p, r, s = film.whitening
-    kx, ky = dr.dot(m0, n), dr.dot(m1, n)
-    kx, ky = dr.fma(p, kx, r * ky), s * ky
-    h = dr.squared_norm(n) - dr.fma(kx, kx, ky * ky)
-    return replace(film, ray=RayTerms(kx, ky, dr.select(h > 0, h, 0)))
+    shape = staticmethod(unscented_shape)
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 
 from pydantic import BaseModel
 
-from drgs.core.registry import Extension, Registry
+from drgs.core.registry import Extension, Registry, load_installed
 
 Class = TypeVar("Class", bound=type)
 
@@ -35,6 +35,16 @@ class ClassRegistry(Registry[Any]):
 
         return register_class
 
+    def words(self) -> tuple[str, ...]:
+        """Return all names, shipped ones first."""
+        return (*self._shipped, *(extension.name for extension in self.installed()))
+
+    def __contains__(self, name: object) -> bool:
+        """Return whether there is a class of this name; installed packages are asked last."""
+        if name not in self._shipped and name not in self._extensions:
+            load_installed()
+        return name in self._shipped or name in self._extensions
+
 
 def _report_errors(cls: type, extension: Extension[Any]) -> None:
     """Wrap the methods that ``cls`` itself defines in :meth:`Extension.reporting`."""
@@ -42,6 +52,8 @@ def _report_errors(cls: type, extension: Extension[Any]) -> None:
         is_called = not name.startswith("__") or name in ("__call__", "__post_init__")
         if is_called and isinstance(method, FunctionType):
             setattr(cls, name, _reporting(method, extension))
+        elif isinstance(method, staticmethod):
+            setattr(cls, name, staticmethod(_reporting(method.__func__, extension)))
 
 
 def _reporting(method: FunctionType, extension: Extension[Any]) -> Callable[..., Any]:

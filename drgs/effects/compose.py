@@ -19,9 +19,9 @@ def composed(pipeline: Pipeline, gaussians: Gaussians, camera: Camera) -> Pipeli
     :meth:`drgs.cameras.camera.Camera.seeing` asks.
     """
     if camera.aperture is not None:
-        from drgs.effects.defocus import Defocused, DimmedResponse
+        from drgs.effects.defocus import Defocused, DimmedFalloff
 
-        model = replace(pipeline.model, response=DimmedResponse(pipeline.model.response))
+        model = replace(pipeline.model, falloff=DimmedFalloff(pipeline.model.falloff))
         pipeline = replace(pipeline, shape=Defocused(pipeline.shape), model=model)
     if gaussians.smoothing is not None:
         from drgs.effects.smoothing import smoothed

@@ -18,7 +18,7 @@ from typing import Any
 
 import drjit as dr
 
-from drgs.splatting.image_model import FeatureGroup
+from drgs.splatting.footprint import FeatureGroup
 from drgs.splatting.rasterize import ONE_SAMPLE, Layers, Records, SplatGradients
 from drgs.splatting.tiles import TileBins
 
@@ -61,7 +61,7 @@ class InGroups:
 
     def records(self, bins: TileBins) -> tuple[Records, ...]:
         """Records of each group."""
-        geometry, end = bins.model.response.num_geometry, bins.num_features
+        geometry, end = bins.model.falloff.num_geometry, bins.num_features
 
         def numbers(group: FeatureGroup, rank: Any, active: Any) -> list[Any]:
             row = bins.rows.load(rank, active)

@@ -14,11 +14,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations
-from typing import Any, Protocol
+from typing import Any, ClassVar, Protocol
 
 import drjit as dr
 
 from drgs.cameras.camera import Camera
+from drgs.config.approximations import PROJECTIONS
 from drgs.core.arrays import load_columns, types_of
 from drgs.core.constants import LEAST_LOW_PASS, LOW_PASS, NEGLIGIBLE_ALPHA
 from drgs.gaussians import sh
@@ -98,6 +99,21 @@ class Projection(Protocol):
     ) -> FilmShape:
         """Project; position: Array3f, camera axes, the mean; low_pass: px^2."""
         ...
+
+
+class ProjectionModel:
+    """A projection as ``model.projection`` of a configuration names it.
+
+    A subclass has a :class:`Projection` as its static method ``shape``, and enters ``PROJECTIONS``.
+    """
+
+    falloff: ClassVar[type | None] = None  # a Falloff of its own; None: as is configured
+    shape_with_depth: ClassVar[Projection | None] = None  # whose shapes have RayTerms
+
+    @staticmethod
+    def shape(rows: GaussianRows, camera: Camera, position: Any, low_pass: float) -> FilmShape:
+        """Project; see :class:`Projection`."""
+        raise NotImplementedError
 
 
 class OpacityRule(Protocol):
@@ -214,6 +230,13 @@ def ewa(rows: GaussianRows, camera: Camera, position: Any, low_pass: float) -> F
     lens = camera.lens
     m0, m1, _ = film_axes(rows, camera, position, lens.clamped_slopes(camera, position))
     return whiten(lens.project_point(camera, position), [*m0], [*m1], low_pass)
+
+
+@PROJECTIONS.register("ewa")
+class Ewa(ProjectionModel):
+    """The affine approximation at the mean."""
+
+    shape = staticmethod(ewa)
 
 
 def whiten(means2d: Any, m0: Sequence[Any], m1: Sequence[Any], low_pass: float) -> FilmShape:

@@ -22,16 +22,18 @@ from typing import Any, Protocol
 import drjit as dr
 
 from drgs.cameras.camera import Camera
+from drgs.config.approximations import ORDERS, Approximations
 from drgs.core.arrays import first_numbers, repeat_array, store_columns, types_of
 from drgs.core.constants import LOW_PASS
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 from drgs.splatting.feature_groups import in_groups
+from drgs.splatting.footprint import DEFAULT, FootprintModel
 from drgs.splatting.grid import TileGrid
-from drgs.splatting.image_model import DEFAULT, ImageModel
 from drgs.splatting.projection import (
     GaussianRows,
     OpacityRule,
     Projection,
+    ProjectionModel,
     SplatColor,
     Splats2D,
     color_at_mean,
@@ -75,12 +77,23 @@ def depth_feature(splats: Splats2D, rows: GaussianRows, camera: Camera) -> list[
 class Order(Protocol):
     """In which order a pixel composites its splats."""
 
-    def seen_by(self, camera: Camera) -> Order:
+    @classmethod
+    def create(
+        cls, projection: type[ProjectionModel], approximations: Approximations
+    ) -> tuple[Projection, Order]:
+        """Return the function that projects, with what the order needs to know, and the order."""
+        ...
+
+    def for_camera(self, camera: Camera) -> Order:
         """For one camera."""
         ...
 
     def keys(self, splats: Splats2D) -> list[Any]:
         """Columns that compositing needs for the order, besides the order of the entries."""
+        ...
+
+    def sort_depths(self, splats: Splats2D) -> Any:
+        """Float (N,) by which the entries are sorted, the smallest first."""
         ...
 
     def records(self, bins: TileBins) -> Any:
@@ -111,11 +124,20 @@ class Order(Protocol):
         ...
 
 
+@ORDERS.register("center")
 @dataclass(frozen=True)
 class CenterOrder:
     """One order of the splats for the whole image: by the depth of their means."""
 
-    def seen_by(self, camera: Camera) -> CenterOrder:
+    @classmethod
+    def create(
+        cls, projection: type[ProjectionModel], approximations: Approximations
+    ) -> tuple[Projection, Order]:
+        """Return the projection as it is, and the order."""
+        del approximations
+        return projection.shape, cls()
+
+    def for_camera(self, camera: Camera) -> CenterOrder:
         """For any camera."""
         del camera
         return self
@@ -124,6 +146,10 @@ class CenterOrder:
         """Columns that compositing needs for the order, besides the order of the entries."""
         del splats
         return []
+
+    def sort_depths(self, splats: Splats2D) -> Any:
+        """Return the depths of the means."""
+        return splats.depths
 
     def records(self, bins: TileBins) -> Records:
         """All numbers of each entry's splat."""
@@ -200,7 +226,7 @@ class Pipeline:
     shape: Projection = ewa  # how a Gaussian's mean and covariance come to the film
     color: SplatColor = color_at_mean  # what is stored of a splat's colour
     low_pass: float = LOW_PASS  # px^2
-    model: ImageModel = DEFAULT
+    model: FootprintModel = DEFAULT
     order: Order = CenterOrder()
     source: ProjectionStage = Projected()
     of_smoothing: bool = False  # whether derivatives include those of a smoothing filter
@@ -269,10 +295,10 @@ def render(gaussians: Gaussians, camera: Camera, pipeline: Pipeline) -> Frame:
     :func:`drgs.effects.compose.composed`. The host reads one value, the number of (splat, tile)
     entries.
     """
-    model = pipeline.model.seen_by(camera)
+    model = pipeline.model.for_camera(camera)
     grid = TileGrid(camera.width, camera.height, model.positions.samples)
     bins = bin_footprints(pipeline.source.footprints(gaussians, camera, pipeline), grid, model)
-    order = in_groups(pipeline.order.seen_by(camera), bins)
+    order = in_groups(pipeline.order.for_camera(camera), bins)
     records = order.records(bins)
     layers = order.composite(bins, records)
     return Frame(pipeline, camera, order, bins, records, layers)
@@ -283,18 +309,20 @@ def footprints_seen_by(gaussians: Gaussians, camera: Camera, pipeline: Pipeline)
     rows = load_rows(gaussians, pipeline.sh_degree)
     splats = pipeline.project(rows, camera)
     columns = pipeline.feature_columns(splats, rows, camera)
-    grid, model = TileGrid(camera.width, camera.height), pipeline.model.seen_by(camera)
-    return footprints_of(splats, grid, columns, model, pipeline.order.seen_by(camera).keys(splats))
+    grid, model = TileGrid(camera.width, camera.height), pipeline.model.for_camera(camera)
+    order = pipeline.order.for_camera(camera)
+    keys, splats = order.keys(splats), replace(splats, depths=order.sort_depths(splats))
+    return footprints_of(splats, grid, columns, model, keys)
 
 
-def render_again(frame: Frame, model: ImageModel) -> Frame:
+def render_again(frame: Frame, model: FootprintModel) -> Frame:
     """The same splats, in the same tiles, with another image model.
 
     model: that of the frame's pipeline, but for points of the pixels within the same margin, or
     for features that are composited of the same stored numbers.
     """
     grid = replace(frame.bins.grid, samples=model.positions.samples)
-    bins = replace(frame.bins, grid=grid, model=model.seen_by(frame.camera))
+    bins = replace(frame.bins, grid=grid, model=model.for_camera(frame.camera))
     return replace(frame, bins=bins, layers=frame.order.composite(bins, frame.records))
 
 
@@ -418,7 +446,7 @@ def _back_to_rows(
     of_camera: bool = False,
 ) -> tuple[GaussianRows, Any, list[Any]]:
     """Derivatives per lane, which of them are visible, and derivatives of the camera's numbers."""
-    response, numbers = pipeline.model.seen_by(camera).response, []
+    falloff, numbers = pipeline.model.for_camera(camera).falloff, []
     if of_camera:
         pipeline.model.check_differentiable_in_camera()
         camera = camera.by_lane(dr.width(rows.logit_opacities))
@@ -426,7 +454,7 @@ def _back_to_rows(
     with dr.resume_grad():
         dr.enable_grad(pipeline.differentiated(rows), numbers)
         splats = pipeline.project(rows, camera)
-        outputs = response.differentiable(splats)
+        outputs = falloff.differentiable(splats)
         outputs += pipeline.feature_columns(splats, rows, camera)
         cotangents = of_splats.geometry + of_splats.features
         for output, cotangent in zip(outputs, cotangents, strict=True):
@@ -533,15 +561,15 @@ def _splat_tangents(
         dr.set_grad(differentiated, frame.pipeline.differentiated(d_rows))
         for number, tangent in zip(numbers, camera_tangents or [], strict=True):
             dr.set_grad(number, tangent)
-        response = frame.bins.model.response
-        outputs = response.differentiable(splats)
+        falloff = frame.bins.model.falloff
+        outputs = falloff.differentiable(splats)
         outputs += frame.pipeline.feature_columns(splats, rows, camera)
         # Some outputs (depths, p of the whitening) are inputs of others: the default would clear
         # the derivatives of such interior variables on the way.
         dr.forward_to(outputs, flags=dr.ADFlag.ClearEdges)
         columns = [dr.grad(output) for output in outputs]
     dr.eval(columns)
-    count = response.num_geometry
+    count = falloff.num_geometry
     return SplatGradients(geometry=columns[:count], features=columns[count:])
 
 

@@ -19,7 +19,7 @@ from drjit.llvm.ad import Array4f, Float, UInt32
 
 from drgs.bench import amdahl, blocks, costs, machine_code, pairs, profile, scenes, speed, traffic
 from drgs.bench.limits import vector_width
-from drgs.splatting import slots
+from drgs.splatting import reduction
 
 LANES = 1000
 
@@ -314,7 +314,7 @@ def test_the_bound_is_amdahls():
 def test_every_stage_has_kernels_and_bytes_and_its_loops_have_pairs(code, band_slots, monkeypatch):
     """Also where the adjoint and its sums go from band to band."""
     mi.set_variant("llvm_ad_rgb")
-    monkeypatch.setattr(slots, "BAND_SLOTS", band_slots)
+    monkeypatch.setattr(reduction, "BAND_SLOTS", band_slots)
     scene = scenes.Scene("small", scenes.bench_gaussians(500), scenes.bench_camera(48))
     launches = profile.counted_launches(
         lambda: partial(speed.clocked_step, speed.warm_trainer(scene))

@@ -18,13 +18,13 @@ from drgs.cameras import (
     thin_prism_fisheye,
 )
 from drgs.effects import defocus, features, occlusion
-from drgs.splatting import image_model, projection, rendering
+from drgs.splatting import footprint, projection, rendering
 
 CLASSES = {
-    image_model.Response: (image_model.AffineResponse, exact.RayResponse, defocus.DimmedResponse),
-    image_model.Positions: (image_model.PixelCenters, SamplePoints),
-    image_model.Features: (
-        image_model.SplatFeatures,
+    footprint.Falloff: (footprint.GaussianFalloff, exact.RayFalloff, defocus.DimmedFalloff),
+    footprint.Positions: (footprint.PixelCenters, SamplePoints),
+    footprint.CompositedFeatures: (
+        footprint.SplatFeatures,
         occlusion.OccludedFeatures,
         ray_colors.RayColors,
     ),
@@ -55,7 +55,7 @@ FUNCTIONS = {
         exact.exact_shape,
         exact.ewa_with_depth,
         unscented.unscented_shape,
-        unscented.unscented_with_depth,
+        peak_depths.WithAffineDepth(unscented.unscented_shape),
         defocus.Defocused(projection.ewa),
     ),
     projection.OpacityRule: (projection.plain_opacity, projection.compensated_opacity),
@@ -116,4 +116,4 @@ def test_what_is_missing_is_found():
     assert "view_direction" in missing(lens.Lens, thin_lens.RoundAperture)
     assert missing(lens.Lens, lens.Perspective) == ["project_point", "projection_jacobian"]
     assert "camera_of" in missing(camera.Shutter, motion.Motion)
-    assert "at" in missing(pixel_lists.PeakDepths, image_model.SplatFeatures)
+    assert "at" in missing(pixel_lists.PeakDepths, footprint.SplatFeatures)

@@ -10,8 +10,8 @@ import pytest
 from drgs.reference import splatting as reference
 from drgs.splatting import rasterize
 from drgs.splatting.cutoffs import Cutoffs
+from drgs.splatting.footprint import FootprintModel
 from drgs.splatting.grid import TileGrid
-from drgs.splatting.image_model import ImageModel
 from drgs.splatting.projection import Splats2D
 from drgs.splatting.rasterize import (
     SplatGradients,
@@ -141,7 +141,7 @@ class FlatScene:
 
     def composite(self, precision):
         columns = [precision.array(column) for column in self.features.T]
-        grid, model = TileGrid(self.width, self.height), ImageModel(cutoffs=self.cutoffs)
+        grid, model = TileGrid(self.width, self.height), FootprintModel(cutoffs=self.cutoffs)
         bins = bin_splats(self.splats(precision), grid, columns, model)
         records = rasterize.Records.of(bins, bins.rows.load)
         return bins, records, composite(bins, records)

@@ -1,13 +1,13 @@
 """What a splat is at the 16 pixels of a micro-tile: the image model of the kernels.
 
-An :class:`ImageModel` names what tiles and compositing have to agree on, each an object that the
+A :class:`FootprintModel` names what tiles and compositing have to agree on, each an object that the
 kernels' Python code calls while Dr.Jit traces it. A protocol says what such an object must have.
 The types here are the defaults, those of the 3DGS paper; the others are in modules of their own,
 which are imported when they are chosen:
 
-- *response*: how alpha falls off around a splat (:class:`Response`: :class:`AffineResponse`)
+- *falloff*: how alpha falls off around a splat (:class:`Falloff`: :class:`GaussianFalloff`)
 - *positions*: where in a pixel it is evaluated (:class:`Positions`: :class:`PixelCenters`)
-- *features*: what is composited of a splat (:class:`Features`: :class:`SplatFeatures`)
+- *features*: what is composited of a splat (:class:`CompositedFeatures`: :class:`SplatFeatures`)
 - *cutoffs*: where splats and pixels end (:class:`drgs.splatting.cutoffs.Cutoffs`)
 """
 
@@ -22,6 +22,7 @@ from typing import Any, ClassVar, Protocol
 import drjit as dr
 
 from drgs.cameras.camera import Camera
+from drgs.config.approximations import FALLOFFS
 from drgs.core.arrays import is_float64, types_of
 from drgs.core.constants import WHITENING_SCALE
 from drgs.splatting.cutoffs import Cutoffs
@@ -216,7 +217,7 @@ Offsets = Callable[[Any, Any], tuple[list, list]]
 """From a point of the film, x and y (px), to grids of offsets from it to the 16 pixels."""
 
 
-class Response(Protocol):
+class Falloff(Protocol):
     """How alpha falls off around a splat.
 
     *Geometry* are the numbers of a splat that decide its alpha; the first are mean x, y (px) and p,
@@ -234,7 +235,7 @@ class Response(Protocol):
         """Sums over pixels, by splat."""
         ...
 
-    def seen_by(self, camera: Camera) -> Response:
+    def for_camera(self, camera: Camera) -> Falloff:
         """For one camera."""
         ...
 
@@ -292,8 +293,9 @@ class Response(Protocol):
         ...
 
 
+@FALLOFFS.register("gaussian")
 @dataclass(frozen=True)
-class AffineResponse:
+class GaussianFalloff:
     """The projected Gaussian is a Gaussian on the film: alpha = o exp(-|U d|^2 / 2).
 
     Geometry: mean x, y (px); then p, r, s of U and log2_opacity, scaled such that log2_alpha =
@@ -303,7 +305,7 @@ class AffineResponse:
     num_geometry: ClassVar[int] = 6
     num_moments: ClassVar[int] = 6
 
-    def seen_by(self, camera: Camera) -> AffineResponse:
+    def for_camera(self, camera: Camera) -> GaussianFalloff:
         """For one camera: nothing depends on it."""
         del camera
         return self
@@ -426,10 +428,10 @@ class FeatureGroup:
 
     stored: list[int]  # places of the numbers that they need among all that are stored
     planes: list[int]  # places of their planes among all; one may be of several groups
-    features: Features
+    features: CompositedFeatures
 
 
-class Features(Protocol):
+class CompositedFeatures(Protocol):
     """What is composited of a splat, from the numbers that are stored of it."""
 
     def groups(self, num_stored: int, size: int) -> list[FeatureGroup]:
@@ -440,7 +442,7 @@ class Features(Protocol):
         """Planes that come of ``num_stored`` numbers per splat."""
         ...
 
-    def seen_by(self, camera: Camera) -> Features:
+    def for_camera(self, camera: Camera) -> CompositedFeatures:
         """For one camera."""
         ...
 
@@ -448,7 +450,7 @@ class Features(Protocol):
         """Raise NotImplementedError if they depend on the camera but through what is stored."""
         ...
 
-    def bind(self, lanes: Lanes, positions: Positions) -> Features:
+    def bind(self, lanes: Lanes, positions: Positions) -> CompositedFeatures:
         """For the lanes of one kernel: loads what they need. The rest is called of the result."""
         ...
 
@@ -501,7 +503,7 @@ class SplatFeatures:
         """Planes that come of ``num_stored`` numbers per splat."""
         return num_stored
 
-    def seen_by(self, camera: Camera) -> SplatFeatures:
+    def for_camera(self, camera: Camera) -> SplatFeatures:
         """For one camera: nothing depends on it."""
         del camera
         return self
@@ -551,31 +553,31 @@ class SplatFeatures:
 
 
 @dataclass(frozen=True)
-class ImageModel:
+class FootprintModel:
     """What tiles and compositing share; see the module's description."""
 
-    response: Response = field(default_factory=AffineResponse)
+    falloff: Falloff = field(default_factory=GaussianFalloff)
     positions: Positions = field(default_factory=PixelCenters)
-    features: Features = field(default_factory=SplatFeatures)
+    features: CompositedFeatures = field(default_factory=SplatFeatures)
     cutoffs: Cutoffs = field(default_factory=Cutoffs)
 
-    def seen_by(self, camera: Camera) -> ImageModel:
+    def for_camera(self, camera: Camera) -> FootprintModel:
         """This model for one camera."""
         return replace(
             self,
-            response=self.response.seen_by(camera),
-            features=self.features.seen_by(camera),
+            falloff=self.falloff.for_camera(camera),
+            features=self.features.for_camera(camera),
         )
 
     def check_differentiable_in_camera(self) -> None:
         """Raise UnsupportedError if pixels depend on the camera but through the splats."""
         self.features.check_differentiable_in_camera()
 
-    def bind(self, lanes: Lanes, grid: TileGrid) -> ImageModel:
+    def bind(self, lanes: Lanes, grid: TileGrid) -> FootprintModel:
         """This model for the lanes of one kernel: loads what a lane needs before its loop."""
         positions = self.positions.bind(lanes, grid)
-        return ImageModel(
-            response=self.response,
+        return FootprintModel(
+            falloff=self.falloff,
             positions=positions,
             features=self.features.bind(lanes, positions),
             cutoffs=self.cutoffs,
@@ -583,12 +585,12 @@ class ImageModel:
 
     def footprint(self, geometry: list[Any], lanes: Lanes, active: Any) -> Footprint:
         """A splat at the pixels of each lane."""
-        return self.response.footprint(geometry, partial(self.positions.offsets, lanes), active)
+        return self.falloff.footprint(geometry, partial(self.positions.offsets, lanes), active)
 
     def alphas(self, geometry: list[Any], footprint: Footprint) -> list[Alpha]:
         """Alpha at the 16 pixels."""
-        floor = self.response.log2_floor(geometry, self.cutoffs)
+        floor = self.falloff.log2_floor(geometry, self.cutoffs)
         return [Alpha.at(x, floor, self.cutoffs.alpha_max) for x in footprint.log2_alpha]
 
 
-DEFAULT = ImageModel()
+DEFAULT = FootprintModel()
