@@ -9,6 +9,7 @@ import examples.compact_falloff  # noqa: F401  (registers)
 import mitsuba as mi
 import numpy as np
 import pytest
+from conftest import REPOSITORY
 from support.usual_rule import USUAL
 
 from drgs.accuracy.exact import ewa_with_depth
@@ -186,3 +187,9 @@ def test_what_an_approximation_raises_has_its_name(monkeypatch):
 
     with pytest.raises(ExtensionError, match=r'projection "broken" .*: ZeroDivisionError: no area'):
         planes_of(values(), projection="broken")
+
+
+def test_the_documents_have_the_example_as_it_is():
+    example = (REPOSITORY / "tests" / "examples" / "compact_falloff.py").read_text()
+    assert example in (REPOSITORY / "docs" / "developing.md").read_text()
+    assert 20 <= len(example.splitlines()) <= 60

@@ -9,6 +9,7 @@ import imageio.v3 as iio
 import mitsuba as mi
 import numpy as np
 import pytest
+from conftest import REPOSITORY
 from examples.unified_camera import UnifiedCamera
 from support.datasets import load, view_at
 
@@ -182,3 +183,9 @@ def test_photographs_that_such_a_lens_took_are_loaded(tmp_path):
     (tmp_path / "transforms.json").write_text(json.dumps(meta))
     views = load(tmp_path).train
     assert [view.lens for view in views] == [UnifiedCamera(XI)] * len(views)
+
+
+def test_the_documents_have_the_example_as_it_is():
+    example = (REPOSITORY / "tests" / "examples" / "unified_camera.py").read_text()
+    assert example in (REPOSITORY / "docs" / "developing.md").read_text()
+    assert 20 <= len(example.splitlines()) <= 60
