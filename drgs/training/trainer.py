@@ -167,11 +167,15 @@ class Trainer:
             dr.backward(loss / step.num_averaged if step.num_averaged > 1 else loss)
             losses[view.place] = ViewLoss(dr.detach(loss), error, view.view.counted)
             self.gradients.end_view(self._pixel_weights(view, dr.detach(image)))
-        views = self._end_views(step, losses, penalties)
+        found = self.gradients.finish(self._weight_names(step))
+        views = self._total_losses(step, found, losses, penalties)
         if step.is_update:
             self._set_learning_rates(step)
             self.optimizer.step()
         self._update_effects(step)
+        for view, gradients in zip(step.views, found, strict=True):
+            if self.density.needs_statistics(view.iteration):
+                self.density.update_statistics(_step_info(step, view, gradients))
         report = self._control_density(step)
         for place in losses:
             step.stage.seen(step.views[place].view)
@@ -180,7 +184,7 @@ class Trainer:
 
     def _begin_step(self) -> Step:
         """Plan the next step, and bring the scene to where the optimizer is."""
-        before, step = self.plan(self.iteration), self.plan(self.iteration + 1)
+        before, step = self.last_step, self.plan(self.iteration + 1)
         if step.stage is not before.stage:
             before.stage.end()
         self.iteration = step.last
@@ -228,25 +232,24 @@ class Trainer:
         weights = self.density.pixel_weights(view.iteration)
         return {name: weigh(image, view.view.target.image) for name, weigh in weights.items()}
 
-    def _end_views(
-        self, step: Step, losses: Mapping[int, ViewLoss], penalties: Sequence[Any]
+    def _weight_names(self, step: Step) -> list[tuple[str, ...]]:
+        """Return the names of the planes of :meth:`_pixel_weights`, of each view."""
+        needs, weights = self.density.needs_statistics, self.density.pixel_weights
+        return [tuple(weights(i)) if needs(i) else () for i in step.iterations]
+
+    def _total_losses(
+        self,
+        step: Step,
+        found: Sequence[ViewGradients],
+        losses: Mapping[int, ViewLoss],
+        penalties: Sequence[Any],
     ) -> list[ViewLoss]:
-        """Complete the gradients of all views, and tell the strategy of density about them."""
-        density = self.density
-        needed = [density.needs_statistics(i) for i in step.iterations]
-        names = [
-            tuple(density.pixel_weights(i)) if need else ()
-            for i, need in zip(step.iterations, needed, strict=True)
-        ]
-        found = self.gradients.finish(names)
-        shared = self.gradients.share_losses(losses)
-        results = []
-        for view, gradients, loss, need in zip(step.views, found, shared, needed, strict=True):
+        """Return the losses of all views with the strategy's terms, and remember to check them."""
+        shared, results = self.gradients.share_losses(losses), []
+        for view, gradients, loss in zip(step.views, found, shared, strict=True):
             total = sum(penalties, loss.loss)
             self._watch(view, total, gradients.first_fault)
             results.append(replace(loss, loss=total))
-            if need:
-                density.update_statistics(_step_info(step, view, gradients))
         return results
 
     def _watch(self, view: StepView, loss: Any, first_fault: Any) -> None:
@@ -298,8 +301,11 @@ class Trainer:
         """Return the step that an iteration is part of."""
         return plan_step(iteration, self.config, self.rates, self.stages)
 
+    def fit_state(self) -> FitState:
+        """Return what effects may know after the last step."""
+        return self._fit_state(self.last_step, self.iteration)
+
     def _fit_state(self, step: Step, iteration: int) -> FitState:
-        """Return what effects may know."""
         return FitState(
             iteration=iteration,
             iterations_of_step=step.iterations,
@@ -326,9 +332,14 @@ class Trainer:
         return self.population.num_rows
 
     @property
+    def last_step(self) -> Step:
+        """The step that is done."""
+        return self.plan(self.iteration)
+
+    @property
     def views(self) -> list[TrainingView]:
         """The training views, at the image size that is in use."""
-        return self.plan(self.iteration).stage.views
+        return self.last_step.stage.views
 
     @property
     def means_lr(self) -> float:
@@ -355,7 +366,7 @@ class Trainer:
     def sync_scene(self) -> None:
         """Bring the scene to where the fit is; the coming iterations do not depend on it."""
         self.params.update(self.optimizer)
-        fit = self._fit_state(self.plan(self.iteration), self.iteration)
+        fit = self.fit_state()
         for effect in self.effects:
             effect.finish(fit)
 
@@ -379,7 +390,7 @@ class Trainer:
 
     def sensors(self) -> list[mi.Sensor]:
         """Return the sensors of the training views, where effects have them now."""
-        return self._fit_state(self.plan(self.iteration), self.iteration).sensors()
+        return self.fit_state().sensors()
 
     def check_iterations(self) -> None:
         """Raise ``NonFiniteError`` if a loss or a gradient of an iteration so far is not finite.
@@ -423,7 +434,7 @@ class Trainer:
 
         Its scene still renders what was fitted last.
         """
-        self.plan(self.iteration).stage.end()
+        self.last_step.stage.end()
         self.optimizer.state.clear()
         release_unused_memory()
 
@@ -459,7 +470,7 @@ class Trainer:
         whole on rank 0 alone.
         """
         self.check()
-        is_update = self.plan(self.iteration).is_update
+        is_update = self.last_step.is_update
         state = {
             "iteration": np.array(self.iteration),
             **{f"{DENSITY}{name}": values for name, values in self.density.state().items()},
@@ -484,7 +495,7 @@ class Trainer:
         self.params.update(self.optimizer)
 
     def _restore_effects(self, state: Mapping[str, np.ndarray]) -> None:
-        fit = self._fit_state(self.plan(self.iteration), self.iteration)
+        fit = self.fit_state()
         for effect in self.effects:
             effect.repopulated(fit)
             effect.restore(_part(state, f"{effect.name}/"))

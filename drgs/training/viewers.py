@@ -92,7 +92,8 @@ def for_viewers(
     """Fit a copy of a fit's Gaussians as viewers render; the same bytes in every run.
 
     trainer: has ended, and is released: see :meth:`drgs.training.trainer.Trainer.release`.
-    gaussians: what ``trainer.gaussians()`` gave. watch: is called after each iteration with their number.
+    gaussians: the result of ``trainer.gaussians()``. watch: is called after each iteration with
+    the number of iterations so far.
 
     Where that cannot be, as where a number is not finite, the closed form is what is given, with a
     :class:`UserNote`.

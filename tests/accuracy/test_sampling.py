@@ -492,9 +492,12 @@ def test_more_samples_of_a_small_film_need_no_more_kernels():
 def test_weights_are_means_over_the_samples_of_all_passes(monkeypatch):
     def weights() -> np.ndarray:
         loaded = scene_with()
-        dr.eval(loaded.integrator().render(loaded, spp=3))
+        params = mi.traverse(loaded)
+        dr.enable_grad(params["integrator.sh0"])
+        params.update()
+        dr.backward(dr.sum(mi.render(loaded, params, spp=3).array))
         plane = dr.arange(mi.Float, FEW.view.width * FEW.view.height)
-        return np.array(weighted_sums_of_last(loaded.integrator(), plane))
+        return np.array(loaded.integrator().last.weighted_sums(plane))
 
     found = weights()
     monkeypatch.setattr("drgs.integrator.sampling.PIXELS_PER_PASS", 1)

@@ -51,9 +51,9 @@ class Revised:
     def goes_on(self, trainer):
         done = trainer.iteration
         if done in PLANS:
-            trainer.replan(PLANS[done], trainer.config.densify.stop)
+            trainer.reschedule(PLANS[done], trainer.config.densify.stop)
         if done == LAST:
-            trainer.replan(done, trainer.config.densify.stop)
+            trainer.reschedule(done, trainer.config.densify.stop)
         return done < LAST
 
     def total(self, trainer):

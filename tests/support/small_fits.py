@@ -166,14 +166,14 @@ def assert_no_new_kernels(trainer: Trainer, warm=7, count=5) -> None:
 def end_view(effect: TrainingEffect, trainer: Trainer, view) -> None:
     """Let an effect take its step, as the trainer does."""
     derivatives = {name: dr.grad(leaf) for name, leaf in effect.leaves(view).items()}
-    effect.after(trainer, view, derivatives)
+    effect.after(trainer.fit_state(), view, derivatives)
 
 
 def gradients_of_loss(trainer: Trainer, view) -> dict[str, np.ndarray]:
     """Of the Gaussians' parameters, through what the effects do; no step is taken."""
     trainer.params.update(trainer.optimizer)
     image = mi.render(trainer.scene, trainer.params, sensor=view.sensor, spp=1)
-    _, loss, _ = trainer.compared(image, view)
+    _, loss, _ = trainer.compare(image, view)
     dr.set_grad(trainer.optimizer, 0)
     dr.backward(loss)
     return {

@@ -182,7 +182,7 @@ class Clock:
 class FakeTrainer:
     """A trainer's count of iterations; an iteration takes ``second``."""
 
-    replan = Trainer.replan
+    reschedule = Trainer.reschedule
 
     def __init__(self, clock, second, **changes):
         self.clock, self.second, self.iteration = clock, second, 0
@@ -267,9 +267,9 @@ def test_a_change_of_what_has_happened_is_refused():
     trainer = make_trainer(densify={"start": 2, "stop": 5})
     for _ in range(4):
         trainer.step()
-    trainer.replan(50, 9)
+    trainer.reschedule(50, 9)
     with pytest.raises(ValueError, match="cannot change from 9 to 4 after iteration 4"):
-        trainer.replan(50, 4)
+        trainer.reschedule(50, 4)
 
 
 # ----------------------------------------------------------------------------------------------

@@ -99,7 +99,7 @@ def test_the_sensor_is_the_camera_moved_in_numpy():
     trainer.iteration = 1
     for index in (0, 5):
         view = trainer.views[index]
-        effect_of(trainer).before(trainer, view)
+        effect_of(trainer).before(trainer.fit_state(), view)
         expected = moved(fits.plain_dataset().train[index], **row_of(random_numbers(), index))
         params = mi.traverse(view.sensor)
         to_world = np.array(params["to_world"].matrix)[..., 0]
@@ -142,11 +142,11 @@ def test_derivatives_of_the_loss_are_differences_in_numpy(index):
     photo, row = fits.plain_dataset().train[index], row_of(numbers, index)
     picture = fits.photograph(fits.double(start), moved(photo, **row))
     assert not picture.near_threshold.any() and picture.image.max() <= 1
-    effect.before(trainer, view)
+    effect.before(trainer.fit_state(), view)
     leaves = effect.parameters.leaves(view.index)
     trainer.params.update(trainer.optimizer)
     image = mi.render(trainer.scene, trainer.params, sensor=view.sensor, spp=1)
-    _, loss, _ = trainer.compared(image, view)
+    _, loss, _ = trainer.compare(image, view)
     dr.backward(loss)
     fits.end_view(effect, trainer, view)
     gaussians, step = fits.double(start), 1e-7
@@ -198,7 +198,7 @@ def test_only_the_view_that_was_seen_and_what_all_share_move():
     for iteration in range(1, 9):
         before = effect.state()
         trainer.iteration = iteration
-        index = trainer.view.index
+        index = trainer.last_step.views[-1].view.index
         trainer.iteration = iteration - 1
         trainer.step()
         after = effect.state()
@@ -379,7 +379,7 @@ def test_other_views_are_measured_through_the_lens_that_was_found():
         np.testing.assert_array_equal(view.camera_to_world, other.camera_to_world)
         for name in ("fx", "fy", "cx", "cy"):
             assert getattr(view, name) == pytest.approx(getattr(other, name), rel=1e-7)
-    pictures = trainer.pictures(dataset.test)
+    pictures = trainer.images(dataset.test)
     for picture, other in zip(pictures, render_views(trainer.scene, expected), strict=True):
         np.testing.assert_allclose(picture, other, atol=1e-5)
 
@@ -495,7 +495,7 @@ def test_a_camera_that_moves_while_it_exposes_is_refined_as_well():
     numbers = {"turns": [[0.01, 0.02, -0.01]], "moves": [[0.1, -0.2, 0.05]]}
     with_numbers(trainer, **numbers)
     trainer.iteration = 1
-    effect_of(trainer).before(trainer, trainer.views[0])
+    effect_of(trainer).before(trainer.fit_state(), trainer.views[0])
     params = mi.traverse(trainer.views[0].sensor)
     first, last = (
         np.array(params[name].matrix)[..., 0] @ np.diag([-1, -1, 1, 1])
@@ -527,7 +527,7 @@ def test_derivatives_of_a_camera_that_does_not_move_are_those_of_one_that_may():
         trainer = make_trainer(replace(dataset, train=(replace(photo, motion=motion),)))
         trainer.iteration = 1
         effect, view = effect_of(trainer), trainer.views[0]
-        effect.before(trainer, view)
+        effect.before(trainer.fit_state(), view)
         leaves = effect.parameters.leaves(view.index)
         fits.gradients_of_loss(trainer, view)
         fits.end_view(effect, trainer, view)

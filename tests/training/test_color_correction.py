@@ -112,8 +112,8 @@ def test_loss_and_derivatives_of_a_transform_are_those_of_numpy():
     (effect,) = trainer.effects
     image, target = small_image(), fits.plain_dataset().train[2].image.astype(np.float64)
     view, matrix = trainer.views[2], single(random_matrices()[2])
-    effect.before(trainer, view)
-    _, loss, _ = trainer.compared(mi.TensorXf(image.astype(np.float32)), view)
+    effect.before(trainer.fit_state(), view)
+    _, loss, _ = trainer.compare(mi.TensorXf(image.astype(np.float32)), view)
     assert float(loss[0]) == pytest.approx(numpy_loss(image, matrix, target, weight), rel=2e-6)
     dr.backward(loss)
     actual = np.array(dr.grad(effect.parameters.leaves(2)["matrices"])).astype(np.float64)
@@ -139,7 +139,7 @@ def test_the_penalty_pulls_to_the_identity():
     (effect,) = trainer.effects
     view, start = trainer.views[1], random_matrices()[1]
     for iteration in range(60):
-        effect.before(trainer, view)
+        effect.before(trainer.fit_state(), view)
         (penalty,) = effect.penalties(view)
         if iteration == 0:
             expected = 0.1 * np.square(start - IDENTITY).mean()
@@ -168,7 +168,7 @@ def test_only_the_view_that_was_seen_moves():
     for _ in range(8):
         before = effect.state()
         trainer.iteration += 1
-        index = trainer.view.index
+        index = trainer.last_step.views[-1].view.index
         trainer.iteration -= 1
         trainer.step()
         after = effect.state()
@@ -233,7 +233,7 @@ def test_where_a_photograph_is_transparent_the_background_stays():
     trainer = with_matrices(make_trainer(dataset), random_matrices())
     (effect,) = trainer.effects
     image, matrix, view = small_image(), random_matrices()[2], trainer.views[2]
-    effect.before(trainer, view)
+    effect.before(trainer.fit_state(), view)
     actual = np.array(dr.detach(effect.adjust(mi.TensorXf(image.astype(np.float32)), view)))
     alpha = dataset.train[2].alpha[:, :, None]
     assert (alpha == 0).any() and (alpha > 0.9).any()

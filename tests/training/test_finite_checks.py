@@ -20,7 +20,7 @@ from drgs.gaussians.parameters import PARAMETER_NAMES
 from drgs.splatting import rendering
 from drgs.training.finite_checks import GradientWatch, NonFiniteError, check_values
 from drgs.training.optimizer import replace_values
-from drgs.training.stages import view_of
+from drgs.training.steps import view_of
 from drgs.training.trainer import PREFIX, Trainer
 
 ROW = 17

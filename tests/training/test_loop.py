@@ -71,7 +71,7 @@ def test_a_folder_is_fitted_as_the_command_does(folder):
 def test_pictures_of_what_was_fitted(folder):
     result = drgs.train(CONFIG)
     (view,) = drgs.load_dataset("data").test
-    (picture,) = result.trainer.pictures((view,))
+    (picture,) = result.trainer.images((view,))
     assert picture.shape == view.image.shape
 
 

@@ -58,8 +58,8 @@ def test_measuring_changes_nothing_that_comes():
         quality.measure(watched, history, dataset.test)
     assert everything_of(watched) == everything_of(plain)
 
-    plain.show()
-    views = zip(plain.pictures(dataset.test), dataset.test, strict=True)
+    plain.sync_scene()
+    views = zip(plain.images(dataset.test), dataset.test, strict=True)
     expected = np.mean([decibels(image, view.image) for image, view in views])
     assert history.rows[-1].test_psnr == pytest.approx(expected, abs=1e-4)
     assert len({row.test_psnr for row in history.rows}) == 4

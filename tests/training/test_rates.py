@@ -64,7 +64,7 @@ def test_a_revised_plan_keeps_the_rates_of_the_past():
     for _ in range(30):
         trainer.step()
         past.append(rates_of(trainer))
-    trainer.replan(40, trainer.config.densify.stop)
+    trainer.reschedule(40, trainer.config.densify.stop)
     replayed = make_trainer(**trainer.config.model_dump(mode="json"))
     for expected in past:
         replayed.step()
@@ -131,5 +131,5 @@ def test_views_are_put_together_only_when_the_population_is_what_it_will_be():
     counts = []
     for iteration in range(1, 51):
         trainer.iteration = iteration
-        counts.append(trainer.num_averaged)
+        counts.append(trainer.last_step.num_averaged)
     assert counts == [1] * 30 + [4] * 20  # at 30, rows may change for the last time

@@ -74,8 +74,8 @@ def images_and_result(case: str, dataset: Dataset):
         **CASES[case],
     }
     result = drgs.train(config, dataset)
-    result.trainer.show()
-    return np.stack(list(result.trainer.pictures(dataset.test))), result.gaussians
+    result.trainer.sync_scene()
+    return np.stack(list(result.trainer.images(dataset.test))), result.gaussians
 
 
 @cache

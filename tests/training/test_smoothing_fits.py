@@ -74,7 +74,7 @@ def test_a_fit_keeps_one_filter_for_each_gaussian():
 
 def test_a_fit_renders_with_the_filter_that_it_found():
     """The loss of the first iteration is that of the widened Gaussians."""
-    from drgs.training.stages import view_of
+    from drgs.training.steps import view_of
 
     loss = make_trainer(loss={"dssim_weight": 0.0}).step().loss
     dataset, start = capture.make_dataset(4, 1), capture.blobs(40)

@@ -29,7 +29,7 @@ def made(trainer):
 def test_nothing_is_made_before_it_is_needed():
     trainer = make_trainer()
     assert made(trainer) == [set()]
-    view = fits.steps(trainer, 1).view
+    view = fits.steps(trainer, 1).last_step.views[-1].view
     assert made(trainer) == [{view.index}]
     target = view.photograph
     assert view.photograph is target is view.target
@@ -40,7 +40,7 @@ def test_targets_stay_while_there_is_room(monkeypatch):
     trainer, seen = make_trainer(), []
     for _ in range(8):  # two rounds of four views
         trainer.step()
-        seen += [trainer.view.index]
+        seen += [trainer.last_step.views[-1].view.index]
         assert made(trainer) == [set(seen[:2])]
 
 
@@ -64,7 +64,7 @@ def test_what_a_view_takes_is_counted():
     """Effects say what they upload of a pixel."""
     changes = {"loss__depth_weight": 0.2, "data__random_background": True, "colors__lr": 0.02}
     trainer = fits.make_trainer(fits.true_dataset(), **changes)
-    view = fits.steps(trainer, 1).view
+    view = fits.steps(trainer, 1).last_step.views[-1].view
     arrays = [view.photograph.values, view.photograph.means, view.photograph.mean_squares]
     arrays += [view.uploads["colors"].array, view.uploads["background"].array]
     arrays += view.uploads["depth"]
@@ -80,4 +80,4 @@ def test_a_stage_that_ends_leaves_nothing_on_the_device():
     fits.steps(trainer, 1)
     coarse, full = made(trainer)
     assert not coarse and len(full) == 1
-    assert np.shape(trainer.view.photograph.image) == (16, 20, 3)
+    assert np.shape(trainer.last_step.views[-1].view.photograph.image) == (16, 20, 3)

@@ -14,7 +14,7 @@ from drgs.gaussians.parameters import PARAMETER_NAMES
 from drgs.reference import splatting as reference
 from drgs.results.metrics import ssim
 from drgs.training.effects.called_for import training_effects
-from drgs.training.stages import view_of
+from drgs.training.steps import view_of
 
 # Values of order 1 in single precision: sums of 2304 numbers, SSIM's windows.
 VALUE = 2e-6
@@ -74,7 +74,7 @@ def test_the_loss_is_that_of_the_masked_pictures(weight):
     for index in (0, 3):
         view, photo = trainer.views[index], masked_dataset().train[index]
         image = random_image(index, HEIGHT, WIDTH, 3)
-        shown, loss, _ = trainer.compared(mi.TensorXf(image), view)
+        shown, loss, _ = trainer.compare(mi.TensorXf(image), view)
         mask = mask_of(index)[..., None]
         expected = numpy_loss(image * mask, photo.image * mask, weight)
         assert float(loss[0]) == pytest.approx(expected, rel=VALUE)
@@ -90,7 +90,7 @@ def test_pixels_that_are_left_out_have_no_derivative(weight):
     trainer = fits.make_trainer(masked_dataset(), loss__dssim_weight=weight)
     for index in (0, 3):
         image = attached(random_image(index, HEIGHT, WIDTH, 3))
-        _, loss, _ = trainer.compared(image, trainer.views[index])
+        _, loss, _ = trainer.compare(image, trainer.views[index])
         dr.backward(loss)
         gradient = np.array(dr.grad(image))
         left_out = mask_of(index) == 0
@@ -104,7 +104,7 @@ def test_derivatives_of_a_masked_loss_are_central_differences():
     view, photo, mask = trainer.views[2], masked_dataset().train[2], mask_of(2)[..., None]
     values = random_image(2, HEIGHT, WIDTH, 3)
     image = attached(values)
-    _, loss, _ = trainer.compared(image, view)
+    _, loss, _ = trainer.compare(image, view)
     dr.backward(loss)
     gradient = np.array(dr.grad(image)).astype(np.float64)
     rng, step = np.random.default_rng(0), 1e-6
@@ -220,7 +220,7 @@ def test_the_penalty_is_that_of_the_integrators_depth_and_alpha():
         expected = numpy_loss(channels[..., :3], photo.image) + penalty_in_numpy(
             channels[..., 3], channels[..., 4], photo, dataset.extent
         )
-        shown, loss, _ = trainer.compared(image, view)
+        shown, loss, _ = trainer.compare(image, view)
         assert float(loss[0]) == pytest.approx(expected, rel=10 * VALUE)
         np.testing.assert_array_equal(np.array(shown), channels[..., :3])
         photometric = numpy_loss(channels[..., :3], photo.image)
@@ -435,7 +435,7 @@ def test_colors_fill_the_cube():
     found = []
     for iteration in range(1, 401):
         trainer.iteration = iteration
-        effect.before(trainer, trainer.views[0])
+        effect.before(trainer.fit_state(), trainer.views[0])
         found.append(color_of(trainer))
     fits.end_view(effect, trainer, trainer.views[0])
     found = np.array(found)
@@ -457,7 +457,7 @@ def test_the_target_is_the_transparent_picture_over_the_color():
     for iteration, index in ((1, 0), (2, 3)):
         view, photo = trainer.views[index], dataset.train[index]
         trainer.iteration = iteration
-        effect.before(trainer, view)
+        effect.before(trainer.fit_state(), view)
         color = color_of(trainer)
         assert np.abs(color - GREY).max() > 0.1
         premultiplied = fits.photograph(blobs, photo, (0, 0, 0)).image
@@ -508,7 +508,7 @@ def test_what_masks_leave_out_stays_black_over_any_color():
     assert names == ["background", "masks"]
     trainer.iteration = 1
     view = trainer.views[3]
-    trainer.effects[0].before(trainer, view)
+    trainer.effects[0].before(trainer.fit_state(), view)
     left_out = mask_of(3) == 0
     assert left_out.any() and (target_of(view)[left_out] == 0).all()
     expected = trainer.views[2]

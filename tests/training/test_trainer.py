@@ -20,7 +20,7 @@ def variant():
 
 
 def test_views_come_in_a_new_random_order_every_round():
-    from drgs.training.stages import view_of
+    from drgs.training.steps import view_of
 
     rounds = np.array([view_of(i, 10, seed=3) for i in range(1, 51)]).reshape(5, 10)
     assert np.array_equal(np.sort(rounds, axis=1), np.tile(np.arange(10), (5, 1)))
@@ -90,7 +90,7 @@ def test_each_parameter_moves_by_its_rate_in_the_first_step():
 
 
 def test_reported_loss_and_psnr_are_those_of_the_view_before_the_step():
-    from drgs.training.stages import view_of
+    from drgs.training.steps import view_of
 
     trainer = make_trainer(loss={"dssim_weight": 0.0})
     report = trainer.step()
@@ -172,8 +172,9 @@ def test_coarse_stages_come_first_and_end_where_they_say():
     sizes, names = [], []
     for iteration in range(1, 9):
         trainer.iteration = iteration
-        sizes.append((trainer.view.width, trainer.view.height))
-        names.append(trainer.view.name)
+        view = trainer.last_step.views[-1].view
+        sizes.append((view.width, view.height))
+        names.append(view.name)
     assert sizes == [(5, 4)] * 2 + [(10, 8)] * 3 + [(20, 16)] * 3
     assert sorted(names[:4]) == sorted(names[4:]) == ["v0", "v1", "v2", "v3"]
 

@@ -42,7 +42,7 @@ def shown_by_viewers(gaussians, dataset):
 def test_iterations_bring_viewers_nearer_to_the_photographs(monkeypatch):
     monkeypatch.setattr(viewers, "SHARE", 1.0)
     trainer, dataset, gaussians = ended_fit()
-    before = list(trainer.pictures(dataset.test))
+    before = list(trainer.images(dataset.test))
     closed = viewers._started(trainer, gaussians)
     counted = []
     found = for_viewers(trainer, gaussians, counted.append)
@@ -52,7 +52,7 @@ def test_iterations_bring_viewers_nearer_to_the_photographs(monkeypatch):
     )
     assert tuned > max(as_it_is, in_closed_form) + 0.2
     # What the fit itself has found is shown as before.
-    for image, again in zip(before, trainer.pictures(dataset.test), strict=True):
+    for image, again in zip(before, trainer.images(dataset.test), strict=True):
         np.testing.assert_array_equal(image, again)
     pairs = zip(found.pictures(dataset.test), dataset.test, strict=True)
     assert np.mean([decibels(image, view.image) for image, view in pairs]) == pytest.approx(

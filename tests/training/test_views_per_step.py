@@ -10,7 +10,7 @@ from pydantic import ValidationError
 from support import small_fits as fits
 
 from drgs.gaussians.parameters import PARAMETER_NAMES
-from drgs.training.stages import step_of, view_of
+from drgs.training.steps import step_of, view_of
 
 PREFIX = "integrator."
 
@@ -57,8 +57,9 @@ def test_a_step_is_adams_along_the_mean_gradient_with_scaled_rates_and_decays():
         gradients = []
         trainer.integrator.sh_degree = 1
         for iteration in iterations:
+            (view,) = (v.view for v in trainer.plan(iteration).views if v.iteration == iteration)
             trainer.iteration = iteration
-            gradients.append(fits.gradients_of_loss(trainer, trainer.view))
+            gradients.append(fits.gradients_of_loss(trainer, view))
         trainer.iteration = iterations[0] - 1
         dr.set_grad(trainer.optimizer, 0)
         report = trainer.step()
@@ -142,8 +143,8 @@ def test_pictures_change_their_size_with_the_first_step_behind_a_stage():
     widths, begun = [], []
     for _ in range(4):
         report = trainer.step()
-        widths.append(trainer.view.width)
-        begun.append(trainer.begins_stage)
+        widths.append(trainer.last_step.views[-1].view.width)
+        begun.append(trainer.last_step.begins_stage)
         assert trainer.iteration == report.iteration
     whole = fits.plain_dataset().train[0].width
     assert widths == [whole // 2, whole // 2, whole, whole]
@@ -211,7 +212,7 @@ def test_late_steps_are_made_of_whole_ones():
     trainer.optimizer.step = lambda: (steps.append(trainer.iteration), step())
     for _ in range(6):
         trainer.step()
-        counts.append(trainer.num_averaged)
+        counts.append(trainer.last_step.num_averaged)
     assert counts == [6] * 6 and steps == [306, 312]
 
 

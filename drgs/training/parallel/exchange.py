@@ -37,6 +37,7 @@ from drgs.splatting.rendering import (
     Frame,
     GaussianGradients,
     Pipeline,
+    Projected,
     SeenSplats,
     footprints_seen_by,
     gradients_by_row,
@@ -254,6 +255,7 @@ class ViewExchange:
         self.comm, self.integrator, self.params, self.prefix = comm, integrator, params, prefix
         self.views_per_step, self.messages = views_per_step, ViewMessages(comm)
         self._views: list[_View] = []
+        self._current: _View | None = None  # is rendered now; None: between two steps
         self._num_added = 0  # views whose derivatives are in the parameters
         integrator.use_projection(self)
 
@@ -293,6 +295,7 @@ class ViewExchange:
                 self._current = each
                 self.integrator.forget_frames()  # splats of other ranks arrive anew
                 yield each.view
+        self._current = None
 
     def end_view(self, weights: Mapping[str, Any]) -> None:
         """End the backward pass of a view; weights: planes for weighted sums, by name."""
@@ -340,8 +343,13 @@ class ViewExchange:
     # What the integrator calls ------------------------------------------------------------------
 
     def footprints(self, gaussians: Gaussians, camera: Camera, pipeline: Pipeline) -> Footprints:
-        """Return the splats of all ranks, behind one another, as ``camera`` sees them."""
-        each, time = self._current, len(self._current.local)
+        """Return the splats of all ranks, behind one another, as ``camera`` sees them.
+
+        Between two steps, those of this rank.
+        """
+        if (each := self._current) is None:
+            return footprints_seen_by(gaussians, camera, pipeline)
+        time = len(each.local)
         own = footprints_seen_by(gaussians, camera, pipeline)
         local = LocalProjection.from_footprints(camera, pipeline, own)
         each.local.append(local)
@@ -359,8 +367,9 @@ class ViewExchange:
         self, gaussians: Gaussians, frame: Frame, of_splats: SplatGradients, of_camera: bool
     ) -> GaussianGradients:
         """Return derivatives with respect to splats to the ranks that have projected them."""
-        del gaussians
-        each, time = self._current, len(self._current.gradients)
+        if (each := self._current) is None:
+            return Projected().gradients(gaussians, frame, of_splats, of_camera)
+        time = len(each.gradients)
         columns = self._divide(each, time, [*of_splats.geometry, *of_splats.features])
         each.gradients.append(_splat_gradients(columns, each.local[time].layout))
         each.frames.append(frame)

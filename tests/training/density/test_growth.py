@@ -97,7 +97,7 @@ def test_survivors_keep_their_moments_and_halves_start_without():
     optimizer = make([0.1] * 4, [0.5] * 4)
     moments = {name: np.array(optimizer.state[name][3][1]) for name in PARAMETER_NAMES}
     steps = {name: np.array(optimizer.state[name][3][0]) for name in PARAMETER_NAMES}
-    strategy(optimizer, [0, 1, 0, 0], budget={"gaussians": 5}).act(rows_of(optimizer), 1000)
+    strategy(optimizer, [0, 1, 0, 0], budget={"gaussians": 5}).refine(rows_of(optimizer), 1000)
     for name in PARAMETER_NAMES:
         value, _, _, (step, first, second, _) = optimizer.state[name]
         got = np.array(first).reshape(5, -1)
@@ -146,7 +146,7 @@ def test_the_last_change_is_at_the_end_of_growth_and_reaches_the_number():
 def test_a_population_that_would_vanish_is_refused():
     optimizer = make([0.1] * 3, [0.001] * 3)
     with pytest.raises(UserError, match=r"every Gaussian would be pruned .*budget\.prune_opacity"):
-        strategy(optimizer, [1, 1, 1], budget={"gaussians": 5}).act(rows_of(optimizer), 500)
+        strategy(optimizer, [1, 1, 1], budget={"gaussians": 5}).refine(rows_of(optimizer), 500)
 
 
 # ---- in a fit
@@ -167,8 +167,11 @@ GROWING = {
 def test_errors_are_gathered_in_the_iterations_that_say_so(variant):
     trainer = make_trainer(densify=GROWING)
     gathered = []
-    original = trainer.density.gather
-    trainer.density.gather = lambda step: (gathered.append(step.iteration), original(step))
+    original = trainer.density.update_statistics
+    trainer.density.update_statistics = lambda step: (
+        gathered.append(step.iteration),
+        original(step),
+    )
     for _ in range(30):
         trainer.step()
     assert gathered == [3, 6, 9, 12, 15, 18, 21]

@@ -29,7 +29,7 @@ def strategy(max_gaussians=1_000_000, **mcmc):
 
 
 def act(optimizer, iteration=600, seed=0, **config):
-    return strategy(**config).act(rows_of(optimizer, seed), iteration)
+    return strategy(**config).refine(rows_of(optimizer, seed), iteration)
 
 
 # ---- what copies look like

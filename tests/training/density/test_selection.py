@@ -25,14 +25,8 @@ def config_of(iterations=4000, grows_until=2000, **prune):
 class Step:
     """What an importance may know of an iteration."""
 
-    width, height = 5, 3
-
     def __init__(self, weights):
-        self._weights = weights
-
-    def weighted_sums(self, plane):
-        assert (np.array(plane) == np.ones(15)).all()
-        return Float(self._weights)
+        self.weighted_sums = {"coverage": Float(weights)}
 
 
 # ---- schedule
@@ -151,7 +145,7 @@ def test_random_populations_end_with_the_number(seed):
     for iteration in range(2000, 3001):
         if phase.is_due(iteration):
             if phase.needs_statistics(iteration):
-                phase.gather(Step(random.random(rows.num_rows)))
+                phase.update_statistics(Step(random.random(rows.num_rows)))
             report = phase.refine(rows, iteration)
             assert min(num, to) <= rows.num_rows <= left
             assert report is None or report.pruned == left - rows.num_rows
@@ -167,11 +161,11 @@ def test_those_that_show_least_in_the_phase_go():
     phase = Importance(config_of(to=2))
     rows = rows_of(optimizer)
     phase.begin(rows)
-    phase.gather(Step([5, 0, 1, 2, 0, 3, 2, 1]))
-    phase.gather(Step([0, 9, 0, 0, 8, 0, 0, 0]))
+    phase.update_statistics(Step([5, 0, 1, 2, 0, 3, 2, 1]))
+    phase.update_statistics(Step([0, 9, 0, 0, 8, 0, 0, 0]))
     assert phase.refine(rows, 2500).num_gaussians == 4
     np.testing.assert_array_equal(values(optimizer)["means"], before[[0, 1, 4, 5]])
-    phase.gather(Step([2, 0, 0, 6]))
+    phase.update_statistics(Step([2, 0, 0, 6]))
     assert phase.refine(rows, 3000).num_gaussians == 2
     np.testing.assert_array_equal(values(optimizer)["means"], before[[1, 5]])
     assert np.array(phase.scores).tolist() == [9, 9]
@@ -184,7 +178,7 @@ def test_a_phase_goes_on_from_its_state(method):
         optimizer = make([SIZE] * 8, np.linspace(0.01, 0.6, 8))
         phase.begin(rows_of(optimizer))
         if phase.needs_statistics(2050):
-            phase.gather(Step(np.arange(8)))
+            phase.update_statistics(Step(np.arange(8)))
         phase.refine(rows_of(optimizer), 2050)
         return phase, optimizer
 
@@ -195,7 +189,7 @@ def test_a_phase_goes_on_from_its_state(method):
     for phase, opt in ((first, optimizer), (other, again)):
         for iteration in (2500, 2900):
             if phase.needs_statistics(iteration):
-                phase.gather(Step(np.arange(rows_of(opt).num_rows)[::-1].copy()))
+                phase.update_statistics(Step(np.arange(rows_of(opt).num_rows)[::-1].copy()))
             phase.refine(rows_of(opt), iteration)
     for name, value in values(optimizer).items():
         np.testing.assert_array_equal(value, values(again)[name])

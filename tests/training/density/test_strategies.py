@@ -34,6 +34,12 @@ def trainer_with(monkeypatch, strategy, **changes):
 # ----------------------------------------------------------------------------------------------
 
 
+def red(image, photograph):
+    height, width, _ = image.shape
+    assert photograph.shape == image.shape
+    return dr.gather(mi.Float, image.array, 3 * dr.arange(mi.UInt32, height * width))
+
+
 @dataclass
 class Recorded(DensityStrategy):
     """Writes down what it is asked, and acts after each second iteration."""
@@ -46,9 +52,11 @@ class Recorded(DensityStrategy):
     def needs_statistics(self, iteration):
         return iteration != 3
 
+    def pixel_weights(self, iteration):
+        return {"red": red}
+
     def update_statistics(self, step):
-        shapes = step.image.shape, step.photograph.shape
-        assert shapes == ((step.height, step.width, 3),) * 2 and dr.width(step.visible) == 40
+        assert dr.width(step.visible) == dr.width(step.weighted_sums["red"]) == 40
         self.calls.append(("gather", step.iteration))
 
     def perturb(self, population, iteration, means_lr):
@@ -243,7 +251,7 @@ def test_a_plan_that_was_revised_is_one_from_the_start(densify):
     for iteration in range(1, 18):
         revised.step()
         if iteration in (6, 11):
-            revised.replan(45, {6: 36, 11: 16}[iteration])
+            revised.reschedule(45, {6: 36, 11: 16}[iteration])
     assert revised.num_gaussians > 40
     again = make_trainer(**revised.config.model_dump())
     for _ in range(17):

@@ -100,11 +100,11 @@ def test_mcmc_learns():
 def test_a_revised_plan_leaves_a_phase_that_has_begun_where_it_was():
     trainer = fits.steps(make_trainer("selection", densify__prune__stop=None), 17)
     assert trainer.config.densify.prune_window(30) == (14, 22)
-    trainer.replan(60, 14)
+    trainer.reschedule(60, 14)
     assert trainer.config.densify.prune_window(60) == (14, 22)
     assert fits.steps(trainer, 5).num_gaussians == 20
     early = fits.steps(make_trainer("selection", densify__prune__stop=24), 5)
-    early.replan(60, 30)
+    early.reschedule(60, 30)
     assert early.config.densify.prune_window(60) == (30, 48)
 
 
@@ -115,7 +115,7 @@ def test_a_revised_plan_is_one_from_the_start_with_a_phase_ahead():
     for iteration in range(1, 25):
         revised.step()
         if iteration == 18:
-            revised.replan(24, 14)
+            revised.reschedule(24, 14)
     assert revised.config.densify.prune_window(24)[0] == 18
     again = fits.steps(replanned(revised), 24)
     assert {k: v.tobytes() for k, v in again.state().items()} == {
@@ -125,7 +125,7 @@ def test_a_revised_plan_is_one_from_the_start_with_a_phase_ahead():
 
 def test_a_phase_for_which_there_is_no_time_does_not_take_place():
     trainer = fits.steps(make_trainer("selection", densify__prune__start=20), 16)
-    trainer.replan(16, 14)
+    trainer.reschedule(16, 14)
     again = fits.steps(replanned(trainer), 16)
     assert again.num_gaussians == trainer.num_gaussians > 20
 
@@ -156,5 +156,5 @@ def test_steps_of_several_views_come_when_rows_do_not_change_any_more():
     views = []
     for _ in range(27):
         trainer.step()
-        views.append(trainer.num_averaged)
+        views.append(trainer.last_step.num_averaged)
     assert views == [1] * 24 + [5] * 3
