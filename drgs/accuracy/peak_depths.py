@@ -13,10 +13,9 @@ from typing import Any
 import drjit as dr
 
 from drgs.accuracy.exact import RayFootprint, closest_on_film, ray_denominator
-from drgs.accuracy.pixel_lists import PeakDepths
 from drgs.cameras.camera import Camera
 from drgs.core.constants import WHITENING_SCALE
-from drgs.splatting.footprint import Falloff, Footprint, flat_columns
+from drgs.splatting.footprint import Footprint, GaussianFalloff, flat_columns
 from drgs.splatting.grid import Lanes, TileGrid
 from drgs.splatting.lanes import load_pixels
 from drgs.splatting.projection import (
@@ -31,21 +30,27 @@ from drgs.splatting.projection import (
 
 @dataclass(frozen=True)
 class AffineDepths:
-    """Depths at a pixel for a falloff that does not know them: stores what they depend on."""
+    """Depths at a pixel for a falloff that does not know them: stores what they depend on.
+
+    The base of all classes of depths.
+    """
 
     def for_camera(self, camera: Camera) -> AffineDepths:
         """For one camera, whose rays may be parallel."""
         return ParallelDepths() if camera.lens.parallel else self
 
     def keys(self, splats: Splats2D) -> list[Any]:
-        """kappa, h (scaled to base 2), and the depth of the mean."""
+        """Return columns from which depths are computed; last, their unit.
+
+        Here kappa, h (scaled to base 2), and the depth of the mean.
+        """
         ray, scale = splats.ray, WHITENING_SCALE
         return [ray.tilt_x / scale, ray.tilt_y / scale, ray.spread / scale**2, splats.depths]
 
     def at(
-        self, falloff: Falloff, geometry: list[Any], keys: list[Any], x: Any, y: Any
+        self, falloff: GaussianFalloff, geometry: list[Any], keys: list[Any], x: Any, y: Any
     ) -> tuple[Any, Any]:
-        """a and D of a splat at a point of the film, px."""
+        """Return a and D at a point of the film, px: the depth is a / D in the unit, if a > 0."""
         return self._at(keys, *falloff.coordinates(geometry, x, y))
 
     def bind(self, lanes: Lanes, grid: TileGrid) -> AffineDepths:
@@ -54,7 +59,7 @@ class AffineDepths:
         return self
 
     def along(self, footprint: Footprint, keys: list[Any]) -> list[Any]:
-        """Depths at the 16 pixels, divided by the mean's; not positive where there is none."""
+        """Return depths in the unit at the 16 pixels; not positive where there is none."""
         coordinates = zip(flat_columns(footprint.u), flat_columns(footprint.v), strict=True)
         return [a / denominator for a, denominator in (self._at(keys, *e) for e in coordinates)]
 
@@ -96,7 +101,7 @@ class ParallelDepths(AffineDepths):
 
 
 @dataclass(frozen=True)
-class RayDepths:
+class RayDepths(AffineDepths):
     """Depths at a pixel for ``RayFalloff``, which computes them."""
 
     camera: Camera | None = None  # whose film has the anchors
@@ -110,7 +115,7 @@ class RayDepths:
         return [splats.depths * splats.ray.scale]
 
     def at(
-        self, falloff: Falloff, geometry: list[Any], keys: list[Any], x: Any, y: Any
+        self, falloff: GaussianFalloff, geometry: list[Any], keys: list[Any], x: Any, y: Any
     ) -> tuple[Any, Any]:
         """a and D of a splat at a point of the film, px."""
         del keys
@@ -119,11 +124,6 @@ class RayDepths:
         _, a, denominator = ray_denominator(geometry, u, v, x - anchor.x, y - anchor.y)
         return a, denominator
 
-    def bind(self, lanes: Lanes, grid: TileGrid) -> RayDepths:
-        """For the lanes of one kernel: nothing has to be loaded."""
-        del lanes, grid
-        return self
-
     def along(self, footprint: RayFootprint, keys: list[Any]) -> list[Any]:
         """Depths at the 16 pixels, divided by the key; not positive where there is none."""
         del keys
@@ -131,10 +131,10 @@ class RayDepths:
 
 
 @dataclass(frozen=True)
-class BoundedDepths:
+class BoundedDepths(AffineDepths):
     """Depths of peaks between two bounds of each pixel: there are no others."""
 
-    depths: PeakDepths
+    depths: AffineDepths
     nearest: Any  # Float (H * W,), scene units
     farthest: Any  # the same
     bounds: list[tuple[Any, Any]] = field(default_factory=list)  # the 16 of each lane
@@ -148,7 +148,7 @@ class BoundedDepths:
         return self.depths.keys(splats)
 
     def at(
-        self, falloff: Falloff, geometry: list[Any], keys: list[Any], x: Any, y: Any
+        self, falloff: GaussianFalloff, geometry: list[Any], keys: list[Any], x: Any, y: Any
     ) -> tuple[Any, Any]:
         """a and D of a splat at a point of the film, px, wherever its peak is."""
         return self.depths.at(falloff, geometry, keys, x, y)

@@ -11,7 +11,7 @@ from dataclasses import replace
 from drgs.config.approximations import FALLOFFS, ORDERS, PROJECTIONS, Approximations
 from drgs.core.errors import UnsupportedError
 from drgs.splatting.cutoffs import Cutoffs
-from drgs.splatting.footprint import DEFAULT, Falloff, FootprintModel, GaussianFalloff
+from drgs.splatting.footprint import DEFAULT, FootprintModel, GaussianFalloff
 from drgs.splatting.projection import (
     ProjectionModel,
     color_at_mean,
@@ -61,7 +61,7 @@ def pipeline_of(
 
 def _own_falloff(
     approximations: Approximations, projection: type[ProjectionModel]
-) -> type[Falloff]:
+) -> type[GaussianFalloff]:
     """Return the falloff of a projection that has one of its own."""
     if approximations.falloff != FALLOFFS.words()[0]:
         raise UnsupportedError(

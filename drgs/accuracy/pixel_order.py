@@ -31,7 +31,7 @@ import drjit as dr
 
 from drgs.accuracy.exact import RayFalloff, ewa_with_depth
 from drgs.accuracy.peak_depths import AffineDepths, RayDepths, WithAffineDepth
-from drgs.accuracy.pixel_lists import PeakDepths, PixelLists
+from drgs.accuracy.pixel_lists import PixelLists
 from drgs.cameras.camera import Camera
 from drgs.config.approximations import ORDERS, Approximations
 from drgs.core.arrays import Rows, scatter_rows, types_of
@@ -70,7 +70,7 @@ class PixelOrder(CenterOrder):
     """
 
     window: int
-    depths: PeakDepths
+    depths: AffineDepths
 
     @classmethod
     def create(

@@ -4,62 +4,20 @@ A :class:`Camera` is what projection reads. Its numbers are Dr.Jit scalars that 
 so that kernels are compiled once for all views, and a Mitsuba sensor's transform is never read back
 to the host.
 
-A camera has a *lens* (``drgs.cameras.lens``) and may have an *aperture*, which blurs, and a
-*shutter*, while which it moves: two protocols. Both are implemented in modules
-of their own, imported when a sensor has one.
+A camera has a *lens* (``drgs.cameras.lens``). It may have an *aperture*, which blurs, and a
+*shutter*, during which it moves: they are imported when a sensor has one.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, is_dataclass, replace
-from typing import Any, ClassVar, Protocol
+from typing import Any
 
 import drjit as dr
 import numpy as np
 
 from drgs.cameras.lens import PINHOLE, Lens
 from drgs.core.arrays import types_of
-
-
-class Aperture(Protocol):
-    """Of a lens that blurs what is not in focus: rays of one place start all over it."""
-
-    @property
-    def radius(self) -> Any:
-        """Float, scene units."""
-        ...
-
-    def variance(self, camera: Camera, depth: Any) -> Any:
-        """Float, px^2: along either axis, of the place on the film of a point at ``depth``."""
-        ...
-
-    def rays(self, camera: Camera, x: Any, y: Any, count: int) -> tuple[Any, Any]:
-        """See :meth:`Camera.view_directions`."""
-        ...
-
-    def in_focus(self, origin: Any, direction: Any) -> Any:
-        """The point of a ray (Array3f, camera axes) that is in focus."""
-        ...
-
-
-class Shutter(Protocol):
-    """How a camera moves while it is open, from time 0, where it is as it says, to 1."""
-
-    label: ClassVar[str]
-    """What messages call it."""
-
-    def cameras(self, camera: Camera) -> list[Camera]:
-        """Those whose pictures are averaged."""
-        ...
-
-    def pose(self, camera: Camera, time: Any) -> Camera:
-        """Where ``camera`` is at a time; it does not move."""
-        ...
-
-    def camera_of(self, means: Any, camera: Camera) -> Camera:
-        """Where ``camera`` is when it sees means (Array3f, world), one a lane."""
-        ...
-
 
 MISSED = 0.01
 """px: how far from its place a ray's point may be seen."""
@@ -83,8 +41,8 @@ class Camera:
     width: int
     height: int
     lens: Lens = PINHOLE
-    aperture: Aperture | None = None  # of a lens that blurs
-    shutter: Shutter | None = None  # of a camera that moves while it is open
+    aperture: Any = None  # drgs.cameras.thin_lens.RoundAperture, of a lens that blurs
+    shutter: Any = None  # drgs.cameras.motion.Motion, of a camera that moves while it is open
 
     @staticmethod
     def create(

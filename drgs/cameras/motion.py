@@ -23,10 +23,13 @@ SLOWEST = 1e-4
 
 @dataclass(frozen=True)
 class Motion:
-    """From the first pose to the second."""
+    """From the first pose to the second; its subclasses are shutters.
 
-    label: ClassVar[str]
-    """What messages call it."""
+    ``cameras`` of a shutter are those whose images are averaged, ``camera_of`` the camera, without
+    a shutter, that sees each of some means.
+    """
+
+    label: ClassVar[str]  # for messages
 
     travel: Any  # Array3f, world: of the centre
     turn: Any  # Array3f, camera axes: axis times angle (radians), below half a turn

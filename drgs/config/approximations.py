@@ -74,12 +74,12 @@ PROJECTIONS = ClassRegistry(
 """Classes derived from ``drgs.splatting.projection.ProjectionModel``."""
 
 FALLOFFS = ClassRegistry("falloff", {"gaussian": "drgs.splatting.footprint"})
-"""Classes that implement ``drgs.splatting.footprint.Falloff``."""
+"""Classes derived from ``drgs.splatting.footprint.GaussianFalloff``."""
 
 ORDERS = ClassRegistry(
     "order", {"center": "drgs.splatting.rendering", "pixel": "drgs.accuracy.pixel_order"}
 )
-"""Classes that implement ``drgs.splatting.rendering.Order``."""
+"""Classes derived from ``drgs.splatting.rendering.CenterOrder``."""
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ import drjit as dr
 from drgs.cameras.camera import Camera
 from drgs.core.constants import NEGLIGIBLE_ALPHA
 from drgs.splatting.cutoffs import Cutoffs
-from drgs.splatting.footprint import Falloff, Footprint, Offsets, Positions
+from drgs.splatting.footprint import Footprint, GaussianFalloff, Offsets, Positions
 from drgs.splatting.projection import FilmShape, GaussianRows, Projection, Splats2D
 
 
@@ -47,14 +47,14 @@ class Defocused:
 
 
 @dataclass(frozen=True)
-class DimmedFalloff:
+class DimmedFalloff(GaussianFalloff):
     """A falloff whose splats end where they would without dimming.
 
     *Geometry* is that of the falloff, then the base-2 logarithm of the dimming. It has no
     derivatives: the cut is a decision.
     """
 
-    of: Falloff
+    of: GaussianFalloff
 
     @property
     def num_geometry(self) -> int:

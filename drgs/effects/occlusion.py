@@ -27,7 +27,7 @@ from typing import Any
 import drjit as dr
 
 from drgs.cameras.camera import Camera
-from drgs.splatting.footprint import CompositedFeatures, FeatureGroup, FootprintModel, Positions
+from drgs.splatting.footprint import FeatureGroup, FootprintModel, Positions, SplatFeatures
 from drgs.splatting.grid import PIXELS, Lanes, TileGrid
 from drgs.splatting.lanes import load_pixels
 
@@ -41,14 +41,14 @@ class Surface:
 
 
 @dataclass(frozen=True)
-class OccludedFeatures:
-    """CompositedFeatures of splats that surfaces may hide.
+class OccludedFeatures(SplatFeatures):
+    """SplatFeatures of splats that surfaces may hide.
 
     The last stored number is the splat's depth; the last planes are the sums of the weights in
     front of each surface.
     """
 
-    features: CompositedFeatures
+    features: SplatFeatures
     surfaces: tuple[Surface, ...]  # nearest first
     grid: TileGrid
     bound: list[Any] = field(default_factory=list)  # at the 16 pixels of a lane: (z, rest behind)

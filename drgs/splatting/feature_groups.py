@@ -30,7 +30,7 @@ FEATURES_AT_ONCE = {4: 32, 8: 8}
 def in_groups(order: Any, bins: TileBins) -> Any:
     """``order``, or one that composites in groups where there are many features.
 
-    Each is a :class:`drgs.splatting.rendering.Order`.
+    Each is a :class:`drgs.splatting.rendering.CenterOrder`.
     """
     return InGroups(order) if len(_groups(bins)) > 1 else order
 
@@ -57,7 +57,7 @@ class GroupedLayers:
 class InGroups:
     """Composites in another order, group by group."""
 
-    order: Any  # drgs.splatting.rendering.Order: of each group
+    order: Any  # drgs.splatting.rendering.CenterOrder: of each group
 
     def records(self, bins: TileBins) -> tuple[Records, ...]:
         """Records of each group."""

@@ -49,7 +49,7 @@ from typing import Any
 import drjit as dr
 
 from drgs.core.arrays import Rows, divide, quotient, scatter_rows, types_of
-from drgs.splatting.footprint import Alpha, CompositedFeatures
+from drgs.splatting.footprint import Alpha, SplatFeatures
 from drgs.splatting.grid import GRID, MICRO, MICROS, PIXELS, TILE, TileGrid
 from drgs.splatting.lanes import (
     Cursor,
@@ -357,7 +357,7 @@ def _adjoint_step(
     alphas: list[Alpha],
     composited: list[Any],
     stored: list[Any],
-    features: CompositedFeatures,
+    features: SplatFeatures,
     pixels: list[list[Any]],
     g: list[list[Any]],
 ) -> tuple[list, list, list]:

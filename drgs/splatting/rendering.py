@@ -74,66 +74,19 @@ def depth_feature(splats: Splats2D, rows: GaussianRows, camera: Camera) -> list[
     return [splats.depths]
 
 
-class Order(Protocol):
-    """In which order a pixel composites its splats."""
-
-    @classmethod
-    def create(
-        cls, projection: type[ProjectionModel], approximations: Approximations
-    ) -> tuple[Projection, Order]:
-        """Return the function that projects, with what the order needs to know, and the order."""
-        ...
-
-    def for_camera(self, camera: Camera) -> Order:
-        """For one camera."""
-        ...
-
-    def keys(self, splats: Splats2D) -> list[Any]:
-        """Columns that compositing needs for the order, besides the order of the entries."""
-        ...
-
-    def sort_depths(self, splats: Splats2D) -> Any:
-        """Float (N,) by which the entries are sorted, the smallest first."""
-        ...
-
-    def records(self, bins: TileBins) -> Any:
-        """Copies of the numbers that compositing loads of each sorted entry, evaluated."""
-        ...
-
-    def composite(self, bins: TileBins, records: Any) -> Layers:
-        """See :func:`drgs.splatting.rasterize.composite`."""
-        ...
-
-    def adjoint(
-        self,
-        bins: TileBins,
-        records: Records,
-        layers: Layers,
-        d_features: list[Any],
-        d_transmittance: Any,
-        samples: range = ONE_SAMPLE,
-        before: SplatGradients | None = None,
-    ) -> SplatGradients:
-        """See :func:`drgs.splatting.rasterize.composite_adjoint`."""
-        ...
-
-    def tangent(
-        self, bins: TileBins, records: Records, layers: Layers, tangents: SplatGradients
-    ) -> Layers:
-        """See :func:`drgs.splatting.rasterize.composite_tangent`."""
-        ...
-
-
 @ORDERS.register("center")
 @dataclass(frozen=True)
 class CenterOrder:
-    """One order of the splats for the whole image: by the depth of their means."""
+    """In which order a pixel composites its splats: here, all by the depth of their means.
+
+    The base of all orders.
+    """
 
     @classmethod
     def create(
         cls, projection: type[ProjectionModel], approximations: Approximations
-    ) -> tuple[Projection, Order]:
-        """Return the projection as it is, and the order."""
+    ) -> tuple[Projection, CenterOrder]:
+        """Return the function that projects, with what the order needs to know, and the order."""
         del approximations
         return projection.shape, cls()
 
@@ -143,16 +96,16 @@ class CenterOrder:
         return self
 
     def keys(self, splats: Splats2D) -> list[Any]:
-        """Columns that compositing needs for the order, besides the order of the entries."""
+        """Return columns that compositing needs besides the order of the entries."""
         del splats
         return []
 
     def sort_depths(self, splats: Splats2D) -> Any:
-        """Return the depths of the means."""
+        """Return the depths by which the entries are sorted, Float (N,), the smallest first."""
         return splats.depths
 
     def records(self, bins: TileBins) -> Records:
-        """All numbers of each entry's splat."""
+        """Return copies of the numbers that compositing loads of each sorted entry, evaluated."""
         return Records.of(bins, bins.rows.load)
 
     def composite(self, bins: TileBins, records: Records) -> Layers:
@@ -227,7 +180,7 @@ class Pipeline:
     color: SplatColor = color_at_mean  # what is stored of a splat's colour
     low_pass: float = LOW_PASS  # px^2
     model: FootprintModel = DEFAULT
-    order: Order = CenterOrder()
+    order: CenterOrder = CenterOrder()
     source: ProjectionStage = Projected()
     of_smoothing: bool = False  # whether derivatives include those of a smoothing filter
 
@@ -264,7 +217,7 @@ class Frame:
 
     pipeline: Pipeline
     camera: Camera
-    order: Order  # the pipeline's, for this camera
+    order: CenterOrder  # the pipeline's, for this camera
     bins: TileBins
     records: Any  # of that order
     layers: Layers  # of that order

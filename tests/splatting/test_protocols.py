@@ -4,14 +4,12 @@ import inspect
 
 import pytest
 
-from drgs.accuracy import exact, peak_depths, pixel_lists, pixel_order, ray_colors, unscented
+from drgs.accuracy import exact, peak_depths, pixel_order, ray_colors, unscented
 from drgs.accuracy.sample_points import SamplePoints
 from drgs.cameras import (
-    camera,
     distortion,
     fisheye,
     lens,
-    motion,
     orthographic,
     radial_tangential,
     thin_lens,
@@ -21,18 +19,17 @@ from drgs.effects import defocus, features, occlusion
 from drgs.splatting import footprint, projection, rendering
 
 CLASSES = {
-    footprint.Falloff: (footprint.GaussianFalloff, exact.RayFalloff, defocus.DimmedFalloff),
+    footprint.GaussianFalloff: (exact.RayFalloff, defocus.DimmedFalloff),
     footprint.Positions: (footprint.PixelCenters, SamplePoints),
-    footprint.CompositedFeatures: (
-        footprint.SplatFeatures,
+    footprint.SplatFeatures: (
         occlusion.OccludedFeatures,
         ray_colors.RayColors,
     ),
-    rendering.Order: (rendering.CenterOrder, pixel_order.PixelOrder),
-    pixel_lists.PeakDepths: (
-        peak_depths.AffineDepths,
+    rendering.CenterOrder: (pixel_order.PixelOrder,),
+    peak_depths.AffineDepths: (
         peak_depths.ParallelDepths,
         peak_depths.RayDepths,
+        peak_depths.BoundedDepths,
     ),
     lens.Lens: (
         lens.Pinhole,
@@ -45,8 +42,6 @@ CLASSES = {
         radial_tangential.RadialTangential,
         thin_prism_fisheye.ThinPrismFisheye,
     ),
-    camera.Aperture: (thin_lens.RoundAperture,),
-    camera.Shutter: (motion.MotionBlur, motion.RollingShutter),
 }
 
 FUNCTIONS = {
@@ -115,5 +110,4 @@ def test_a_function_takes_what_its_protocol_says(protocol, function):
 def test_what_is_missing_is_found():
     assert "view_direction" in missing(lens.Lens, thin_lens.RoundAperture)
     assert missing(lens.Lens, lens.Perspective) == ["project_point", "projection_jacobian"]
-    assert "camera_of" in missing(camera.Shutter, motion.Motion)
-    assert "at" in missing(pixel_lists.PeakDepths, footprint.SplatFeatures)
+    assert "at" in missing(peak_depths.AffineDepths, footprint.SplatFeatures)
