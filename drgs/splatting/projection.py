@@ -5,16 +5,16 @@ plain arithmetic, so Dr.Jit differentiates it. The equations are those of Zwicke
 splatting") as used in section 4 of the 3DGS paper, written so that they do not cancel in single
 precision.
 
-How a Gaussian's shape comes to the film is a :class:`Projection`: :func:`ewa` or one of another
+A :data:`Projection` is what brings a Gaussian's shape to the film: :func:`ewa` or one of another
 module (``drgs.accuracy.unscented``, ``drgs.accuracy.exact``).
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import combinations
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar
 
 import drjit as dr
 
@@ -91,45 +91,31 @@ class FilmShape:
         return dr.abs(p * s)
 
 
-class Projection(Protocol):
-    """How a Gaussian's mean and covariance come to the film."""
-
-    def __call__(
-        self, rows: GaussianRows, camera: Camera, position: Any, low_pass: float
-    ) -> FilmShape:
-        """Project; position: Array3f, camera axes, the mean; low_pass: px^2."""
-        ...
+Projection = Callable[["GaussianRows", Camera, Any, float], FilmShape]
+"""From rows, camera, means (Array3f, camera axes) and low-pass (px^2) to shapes on the film."""
 
 
 class ProjectionModel:
     """A projection as ``model.projection`` of a configuration names it.
 
-    A subclass has a :class:`Projection` as its static method ``shape``, and enters ``PROJECTIONS``.
+    A subclass has a :data:`Projection` as its static method ``shape``, and enters ``PROJECTIONS``.
     """
 
-    falloff: ClassVar[type | None] = None  # a Falloff of its own; None: as is configured
+    falloff: ClassVar[type | None] = None  # one of its own; None: as is configured
     shape_with_depth: ClassVar[Projection | None] = None  # whose shapes have RayTerms
 
     @staticmethod
     def shape(rows: GaussianRows, camera: Camera, position: Any, low_pass: float) -> FilmShape:
-        """Project; see :class:`Projection`."""
+        """Project; see :data:`Projection`."""
         raise NotImplementedError
 
 
-class OpacityRule(Protocol):
-    """How low-pass filtering affects opacity."""
+OpacityRule = Callable[[Any, Any, Any], Any]
+"""From an opacity and the two determinants of :class:`FilmShape` to an opacity, Float each."""
 
-    def __call__(self, opacity: Any, determinant: Any, added_determinant: Any) -> Any:
-        """Float; for the determinants see :class:`FilmShape`."""
-        ...
-
-
-class SplatColor(Protocol):
-    """What is stored of a splat's colour."""
-
-    def __call__(self, rows: GaussianRows, direction: Any, sh_degree: int) -> Sequence[Any]:
-        """Float each; direction: Array3f, world, of any length, in which the mean is seen."""
-        ...
+SplatColor = Callable[["GaussianRows", Any, int], Sequence[Any]]
+"""From rows, directions in which means are seen (Array3f, world, of any length) and SH degree to
+what is stored of a splat's colour, Float each."""
 
 
 @dataclass(frozen=True)

@@ -156,7 +156,7 @@ class Records:
 def composite(bins: TileBins, records: Records) -> Layers:
     """Composite the features of all splats.
 
-    bins: from ``bin_splats``; records: ``Records.of(bins, bins.rows.load)``.
+    bins: from ``bin_footprints``; records: ``Records.of(bins, bins.rows.load)``.
     """
     t = types_of(bins.rows.Float)
     lanes = make_lanes(t.Float, bins.grid)
@@ -254,11 +254,6 @@ class SplatGradients:
     def means2d(self) -> Any:
         """Array2f, loss per px."""
         return types_of(type(self.geometry[0])).Array2f(self.geometry[:2])
-
-    @property
-    def whitening(self) -> Any:
-        """Array3f."""
-        return types_of(type(self.geometry[0])).Array3f(self.geometry[2:5])
 
     @property
     def opacities(self) -> Any:

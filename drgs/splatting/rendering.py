@@ -53,13 +53,8 @@ from drgs.splatting.rasterize import (
 )
 from drgs.splatting.tiles import Footprints, TileBins, bin_footprints, footprints_of
 
-
-class Feature(Protocol):
-    """Something that is composited of each splat."""
-
-    def __call__(self, splats: Splats2D, rows: GaussianRows, camera: Camera) -> list[Any]:
-        """Columns, Float (N,) each, one for each plane."""
-        ...
+Feature = Callable[[Splats2D, GaussianRows, Camera], list[Any]]
+"""Something that is composited of each splat: columns, Float (N,) each, one for each plane."""
 
 
 def color_features(splats: Splats2D, rows: GaussianRows, camera: Camera) -> list[Any]:
@@ -533,22 +528,27 @@ def _columns_of(d_rows: GaussianRows, gaussians: Gaussians, visible: Any) -> dic
     SH coefficients above the pipeline's degree.
     """
     t = types_of(type(d_rows.logit_opacities))
-    higher = [component for vector in d_rows.sh[1:] for component in vector]
-    missing = 3 * gaussians.shN.shape[1] - len(higher)
-    columns = {
-        "means": d_rows.means,
-        "quats": d_rows.quats,
-        "log_scales": d_rows.log_scales,
-        "logit_opacities": [d_rows.logit_opacities],
-        "sh0": d_rows.sh[0],
-        "shN": [*higher, *[t.Float(0)] * missing] if higher else [],
-        "smoothing": [] if d_rows.smoothing is None else [d_rows.smoothing],
-        **(d_rows.features or {}),
-    }
+    columns = _parameter_columns(d_rows)
+    missing = 3 * gaussians.shN.shape[1] - len(columns["shN"])
+    columns["shN"] += [t.Float(0)] * missing if columns["shN"] else []
+    columns["smoothing"] = [] if d_rows.smoothing is None else [d_rows.smoothing]
+    columns |= d_rows.features or {}
     return {
         name: [dr.select(visible, column, t.Float(0)) for column in own]
         for name, own in columns.items()
         if len(own)
+    }
+
+
+def _parameter_columns(rows: GaussianRows) -> dict[str, list[Any]]:
+    """The columns of ``PARAMETER_NAMES``, as far as they were loaded."""
+    return {
+        "means": rows.means,
+        "quats": rows.quats,
+        "log_scales": rows.log_scales,
+        "logit_opacities": [rows.logit_opacities],
+        "sh0": rows.sh[0],
+        "shN": [component for vector in rows.sh[1:] for component in vector],
     }
 
 
@@ -579,15 +579,7 @@ def _faults(d_rows: GaussianRows, visible: Any) -> Any:
     """UInt32 (N,): row * 6 + number of the first parameter at fault there, or ``NO_FAULT``."""
     UInt32 = types_of(type(d_rows.logit_opacities)).UInt32
     row = dr.arange(UInt32, dr.width(d_rows.logit_opacities))
-    higher = [component for vector in d_rows.sh[1:] for component in vector]
-    columns = {
-        "means": d_rows.means,
-        "quats": d_rows.quats,
-        "log_scales": d_rows.log_scales,
-        "logit_opacities": [d_rows.logit_opacities],
-        "sh0": d_rows.sh[0],
-        "shN": higher,
-    }
+    columns = _parameter_columns(d_rows)
     faults = UInt32(NO_FAULT)
     for number, name in reversed(list(enumerate(PARAMETER_NAMES))):
         squared_norm = sum(dr.square(component) for component in columns[name])

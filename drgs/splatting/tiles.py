@@ -78,20 +78,6 @@ class Footprints:
     num_keys: int
 
 
-def bin_splats(
-    splats: Splats2D,
-    grid: TileGrid,
-    features: Sequence[Any] = (),
-    model: FootprintModel = DEFAULT,
-    keys: Sequence[Any] = (),
-) -> TileBins:
-    """Distribute the visible ``splats`` over the tiles of ``grid``, front to back.
-
-    For the arguments see :func:`footprints_of`, for errors :func:`bin_footprints`.
-    """
-    return bin_footprints(footprints_of(splats, grid, features, model, keys), grid, model)
-
-
 def footprints_of(
     splats: Splats2D,
     grid: TileGrid,
@@ -122,7 +108,7 @@ def bin_footprints(footprints: Footprints, grid: TileGrid, model: FootprintModel
     t = types_of(type(depths))
     if dr.width(depths) > 1 << _RANK_BITS:
         raise UserError(
-            f"bin_splats(): at most {1 << _RANK_BITS:,} Gaussians can be told apart in a tile, got "
+            f"at most {1 << _RANK_BITS:,} Gaussians can be told apart in a tile, got "
             f"{dr.width(depths):,}; render them in parts, or prune them"
         )
     # A stable sort: equal depths stay in the order of the Gaussians.
@@ -257,7 +243,7 @@ def _pack(rank: Any, tile: Any, mask: Any) -> list[Any]:
     """An entry in two words, as it is read in no order: 26 bits of rank, 22 of tile, 16 of mask.
 
     2^22 tiles have 2^30 pixels, whose four planes are more numbers than an array of Dr.Jit holds;
-    more ranks are refused by :func:`bin_splats`.
+    more ranks are refused by :func:`bin_footprints`.
     """
     return [rank | ((tile >> MICROS) << _RANK_BITS), mask | (tile << MICROS)]
 

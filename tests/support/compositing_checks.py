@@ -19,12 +19,12 @@ from drgs.splatting.rasterize import (
     composite_adjoint,
     composite_tangent,
 )
-from drgs.splatting.tiles import bin_splats
 from support.helpers import (
     FLOAT32,
     FLOAT64,
     NEAR_THRESHOLD,
     assert_arrays_agree,
+    bin_splats,
     rows,
     single,
 )
@@ -173,7 +173,7 @@ class FlatScene:
 def as_arrays(gradients: SplatGradients) -> dict[str, np.ndarray]:
     return {
         "means2d": rows(gradients.means2d),
-        "whitening": rows(gradients.whitening),
+        "whitening": rows(gradients.geometry[2:5]),
         "opacities": rows(gradients.opacities),
         "features": np.stack([rows(column) for column in gradients.features], axis=-1),
     }
