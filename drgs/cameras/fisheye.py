@@ -55,11 +55,6 @@ class Fisheye(Lens):
     min_cosine: Any
 
     @classmethod
-    def coefficient_names(cls) -> tuple[str, ...]:
-        """Return the names that OpenCV and COLMAP give to the coefficients."""
-        return cls.names
-
-    @classmethod
     def from_coefficients(cls, **coefficients: float) -> Fisheye:
         """Return the lens with OpenCV's ``k1`` to ``k4``; what is not given is zero."""
         terms = up_to_the_last(cls.names, usable_coefficients(coefficients))

@@ -58,6 +58,7 @@ class Lens:
     """
 
     kind: ClassVar[str] = ""  # name in LENSES
+    names: ClassVar[tuple[str, ...]] = ()  # of the coefficients; none: those of the fields
     distorts: ClassVar[bool] = True  # whether a pinhole could take its place
     parallel: ClassVar[bool] = False  # whether its rays are, instead of meeting in the camera
 
@@ -122,8 +123,8 @@ class Lens:
 
     @classmethod
     def coefficient_names(cls) -> tuple[str, ...]:
-        """Return the names of all coefficients: those of the fields."""
-        return tuple(field.name for field in fields(cls))
+        """Return the names of all coefficients."""
+        return cls.names or tuple(field.name for field in fields(cls))
 
     @classmethod
     def from_coefficients(cls, **coefficients: float) -> Lens:

@@ -57,11 +57,6 @@ class RadialTangential(PlaneDistortion, Perspective):
     on_film: Any = None  # (2) Array2f: the least and the largest slopes on the film
 
     @classmethod
-    def coefficient_names(cls) -> tuple[str, ...]:
-        """Return the names that OpenCV gives to the coefficients."""
-        return cls.names
-
-    @classmethod
     def from_coefficients(cls, **coefficients: float) -> RadialTangential:
         """Return the lens with OpenCV's ``k1`` to ``k6``, ``p1``, ``p2``; others are zero."""
         names, coefficients = cls.names, usable_coefficients(coefficients)

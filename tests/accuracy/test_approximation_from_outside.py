@@ -10,18 +10,21 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from conftest import REPOSITORY
+from support.small_fits import plain_dataset
 from support.usual_rule import USUAL
 
 from drgs.accuracy.exact import ewa_with_depth
 from drgs.accuracy.pipeline import pipeline_of
 from drgs.cameras.camera import Camera
 from drgs.config.approximations import FALLOFFS, ORDERS, PROJECTIONS, Approximations
+from drgs.config.load import config_from
 from drgs.config.schema import ModelConfig
 from drgs.core.errors import UnsupportedError
 from drgs.core.registry import ExtensionError
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 from drgs.splatting.projection import ProjectionModel, ewa
 from drgs.splatting.rendering import CenterOrder, frames_adjoint, frames_tangent, render
+from drgs.training.summary import summary_of_fit
 
 K = np.array([[30.0, 0, 14], [0, 33, 11], [0, 0, 1]])
 WIDTH, HEIGHT, STEP = 28, 22, 1e-6
@@ -193,3 +196,9 @@ def test_the_documents_have_the_example_as_it_is():
     example = (REPOSITORY / "tests" / "examples" / "compact_falloff.py").read_text()
     assert example in (REPOSITORY / "docs" / "developing.md").read_text()
     assert 20 <= len(example.splitlines()) <= 60
+
+
+def test_a_fit_says_that_it_is_simulated():
+    config = config_from({"data": {"path": "."}, "model": {"falloff": "compact"}}, "x")
+    (line,) = [e for e in summary_of_fit(config, plain_dataset()) if e.name == "approximations"]
+    assert (line.what, line.why) == ("compact", "model.falloff")
