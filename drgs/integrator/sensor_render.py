@@ -23,7 +23,7 @@ from drgs.integrator.film import Channels, offsets_of
 from drgs.integrator.sensors import SensorState, camera_from_sensor, read_sensor
 from drgs.integrator.state import Cached, SplatsState
 from drgs.splatting import rendering
-from drgs.splatting.image_model import Positions
+from drgs.splatting.footprint import Positions
 
 if TYPE_CHECKING:  # imported where a scene calls for them
     from drgs.integrator.surfaces import Hybrid
