@@ -135,7 +135,7 @@ class Model:
             raise UserError(
                 f"{option}: needs photographs: give the configuration of a fit (--scene CONFIG.yml)"
             )
-        dataset = load_dataset(self.config.data_for_rendering)
+        dataset = load_dataset(self.config.data_for_rendering, sections=self.config.extensions)
         dataset = dataset.relative_to(self.gaussians.origin)
         if self.folder is None or not (path := self.folder / CAMERAS).is_file():
             return dataset
@@ -332,7 +332,9 @@ def _load_config(path: Path, args: argparse.Namespace) -> FitConfig:
     config = load_config(path, overrides)
     config = config.model_copy(update={"model": config.model.of_file()})
     if is_open(config):  # not a fit's own, which says what was used
-        config = completed(config, load_dataset(config.data_for_rendering))
+        config = completed(
+            config, load_dataset(config.data_for_rendering, sections=config.extensions)
+        )
     return config
 
 

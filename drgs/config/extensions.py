@@ -50,6 +50,16 @@ LOSSES: Registry[type] = Registry("loss", {"photometric": "drgs.training.losses"
 LOSS_TERMS: Registry[type] = Registry("loss term")
 """Subclasses of :class:`drgs.training.losses.LossTerm`."""
 
+READERS: Registry[type] = Registry(
+    "dataset reader",
+    {
+        "nerf_synthetic": "drgs.datasets.nerf_synthetic",
+        "nerfstudio": "drgs.datasets.nerfstudio",
+        "colmap": "drgs.datasets.colmap",
+    },
+)
+"""Subclasses of :class:`drgs.datasets.reader.DatasetReader`."""
+
 GROWTH = ("adc", "budget", "mcmc")
 """Shipped strategies for ``densify.strategy``; the others prune after them."""
 
@@ -62,6 +72,11 @@ def check_strategy(name: str) -> str:
 def check_loss(name: str) -> str:
     """Return the name of a loss; raises ValueError if there is none of this name."""
     return _check_name(name, ("photometric",), LOSSES)
+
+
+def check_reader(name: str) -> str:
+    """Return the name of a dataset reader, or ``auto``; raises ValueError if there is none."""
+    return _check_name(name, ("auto", *READERS.shipped), READERS)
 
 
 def _check_name(name: str, shipped: tuple[str, ...], registry: Registry) -> str:

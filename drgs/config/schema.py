@@ -35,7 +35,7 @@ from drgs.config.density import (
     STOP_SHARES,
     DensifyConfig,
 )
-from drgs.config.extensions import check_loss, check_sections
+from drgs.config.extensions import check_loss, check_reader, check_sections
 from drgs.config.section import Count, Rate, Section, Weight
 from drgs.core.constants import MAX_SHUTTER_SAMPLES, SHUTTER_SAMPLES
 
@@ -93,7 +93,7 @@ class DataConfig(Section):
     source: str = Field(
         "", description="Where to get the data: printed in the error if the folder is missing."
     )
-    type: Literal["auto", "nerf_synthetic", "nerfstudio", "colmap"] = Field(
+    type: Annotated[str, AfterValidator(check_reader)] = Field(
         "auto",
         description="Layout of the folder. auto: nerf_synthetic if there is a "
         "transforms_train.json, nerfstudio if there is a transforms.json, colmap if there is a "

@@ -6,51 +6,56 @@ May import ``io``, ``config``, ``gaussians``, ``cameras`` and ``core``.
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping
 from dataclasses import replace
-from importlib import import_module
 from pathlib import Path
-from typing import Protocol
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from drgs.config.extensions import READERS, section_of
 from drgs.config.load import config_from
 from drgs.config.schema import DataConfig
 from drgs.core.errors import UserError
 from drgs.core.origin import WORLD, near_origin, shown_origin
 from drgs.datasets.types import Dataset, Keeps, View, Viewpoint, all_of_them
 
+if TYPE_CHECKING:
+    from drgs.datasets.reader import DatasetReader
+
 __all__ = ["Dataset", "View", "Viewpoint", "load_dataset"]
 
+MARKERS = ("transforms_train.json", "transforms.json")
+"""Files by which folders of the layouts NeRF-synthetic and nerfstudio are recognized."""
 
-class Layout(Protocol):
-    """What reads folders of a kind."""
-
-    def load(self, config: DataConfig, keeps: Keeps = all_of_them) -> Dataset:
-        """All views, some of them perhaps without their pictures."""
-
-    def picture_files(self, config: DataConfig) -> Sequence[Path]:
-        """The files of those to train on, or of all."""
+NO_SECTIONS: Mapping[str, Any] = MappingProxyType({})
+"""No extension has a section."""
 
 
-LAYOUTS = {"nerf_synthetic": "transforms_train.json", "nerfstudio": "transforms.json", "colmap": ""}
-"""By name, which is that of a module: the file that a folder is recognised by."""
+def reader_of(
+    config: DataConfig, sections: Mapping[str, Any] = NO_SECTIONS
+) -> tuple[str, DatasetReader]:
+    """Return the name and the reader of the folder of a dataset: see :func:`reader_name`.
 
-
-def layout_of(config: DataConfig) -> Layout:
-    """What reads the folder of the dataset, as :func:`layout_name` says."""
-    return import_module(f"drgs.datasets.{layout_name(config)}")
+    sections: those of extensions, by name.
+    """
+    extension = READERS.get(reader_name(config), "data.type")
+    return extension.name, extension.value.from_config(section_of(extension, sections))
 
 
 def load_dataset(
-    source: str | Path | DataConfig, keeps: Keeps = all_of_them, **settings: object
+    source: str | Path | DataConfig,
+    keeps: Keeps = all_of_them,
+    sections: Mapping[str, Any] = NO_SECTIONS,
+    **settings: object,
 ) -> Dataset:
     """All views of a dataset: photographs with their cameras, to train on and to measure on.
 
     source: the folder, in the layout of NeRF-synthetic, of nerfstudio / instant-ngp or of COLMAP,
-    or the section ``data`` of a configuration; keeps: of which views pictures are kept, by name;
-    settings: other values of that section, such as
-    ``image_size=400`` (px) or ``background="black"``.
+    or of a reader of another package, or the section ``data`` of a configuration; keeps: of which
+    views pictures are kept, by name; sections: of extensions, by name; settings: other values of
+    the section ``data``, such as ``image_size=400`` (px) or ``background="black"``.
 
     Where the cameras are far from the world's origin, their positions are relative to the
     dataset's ``origin``, the middle of the training cameras.
@@ -61,7 +66,7 @@ def load_dataset(
     if settings or not isinstance(source, DataConfig):
         given = source.model_dump() if isinstance(source, DataConfig) else {"path": source}
         source = config_from({"data": {**given, **settings}}, "load_dataset()").data
-    return _near(layout_of(source).load(source, keeps))
+    return _near(reader_of(source, sections)[1].load(source, keeps))
 
 
 def _near(dataset: Dataset) -> Dataset:
@@ -76,8 +81,11 @@ def _near(dataset: Dataset) -> Dataset:
     return replace(dataset.relative_to(origin), description=dataset.description + note)
 
 
-def layout_name(config: DataConfig) -> str:
-    """Of :data:`LAYOUTS`. Raises :class:`UserError` for a folder that is none, with what to do."""
+def reader_name(config: DataConfig) -> str:
+    """Return the name of the reader of a folder: ``data.type``, or the one that recognizes it.
+
+    Raises :class:`UserError` for a folder that no reader recognizes, with what to do.
+    """
     try:
         names = os.listdir(config.path)
     except FileNotFoundError:
@@ -96,12 +104,9 @@ def layout_name(config: DataConfig) -> str:
         ) from None
     if config.type != "auto":
         return config.type
-    markers = [marker for marker in LAYOUTS.values() if marker]
-    for layout, marker in LAYOUTS.items():
-        if marker in names:
-            return layout
-    from drgs.datasets.recognition import has_colmap_model, what_is_there
+    for extension in [*map(READERS.get, READERS.shipped), *READERS.installed()]:
+        if extension.value.from_config(section_of(extension, {})).recognizes(config.path, names):
+            return extension.name
+    from drgs.datasets.recognition import what_is_there
 
-    if has_colmap_model(config.path):
-        return "colmap"
-    raise UserError(f"{config.path}: {what_is_there(config.path, markers)}")
+    raise UserError(f"{config.path}: {what_is_there(config.path, MARKERS)}")

@@ -12,9 +12,11 @@ the size that COLMAP saw; the size of the picture that is there decides what the
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
 
+from drgs.config.extensions import READERS
 from drgs.config.schema import DataConfig
 from drgs.core.errors import UserError, listed, one_line
 from drgs.datasets.file_names import (
@@ -27,6 +29,7 @@ from drgs.datasets.file_names import (
 from drgs.datasets.images import is_scaled
 from drgs.datasets.mask_names import masks_of
 from drgs.datasets.photographs import MAX_WIDTH, Photographs, dataset_of
+from drgs.datasets.reader import DatasetReader
 from drgs.datasets.recognition import COLMAP_FOLDERS, colmap_dataset
 from drgs.datasets.splits import lists_by_folders, lists_in_files
 from drgs.datasets.transforms import Frame, FrameValues
@@ -242,3 +245,21 @@ def _size_as_calibrated(
 
 SIDEWAYS = 5
 """EXIF's numbers from this one exchange width and height."""
+
+
+@READERS.register("colmap")
+class ColmapReader(DatasetReader):
+    """Reads a model of COLMAP and its photographs."""
+
+    def recognizes(self, folder: Path, names: Collection[str]) -> bool:
+        """See :class:`DatasetReader`."""
+        del names
+        return colmap_dataset(folder) is not None
+
+    def load(self, config: DataConfig, keeps: Keeps = all_of_them) -> Dataset:
+        """See :class:`DatasetReader`."""
+        return load(config, keeps)
+
+    def image_files(self, config: DataConfig) -> list[Path]:
+        """See :class:`DatasetReader`."""
+        return picture_files(config)

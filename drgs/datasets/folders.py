@@ -8,7 +8,7 @@ from pathlib import Path
 
 from drgs.config.load import config_from
 from drgs.config.schema import FitConfig
-from drgs.datasets import layout_name, layout_of
+from drgs.datasets import reader_of
 from drgs.datasets.images import downscaled_size
 from drgs.io.pictures import image_size
 
@@ -35,8 +35,8 @@ def config_for(folder: Path, overrides: Iterable[str] = ()) -> tuple[FitConfig, 
     """
     overrides, where = list(overrides), str(folder)
     given = config_from({"data": {"path": folder}}, where, overrides)
-    layout = layout_name(given.data)
-    sizes = [image_size(file) for file in layout_of(given.data).picture_files(given.data)]
+    layout, reader = reader_of(given.data, given.extensions)
+    sizes = [image_size(file) for file in reader.image_files(given.data)]
     width, height = max(sizes, key=lambda size: (math.prod(size), size[1]))
     data = {"path": folder, "type": layout, "image_size": _max_width(width, height, sizes)}
     values = {"data": data, "iterations": ITERATIONS[layout]}
@@ -46,7 +46,8 @@ def config_for(folder: Path, overrides: Iterable[str] = ()) -> tuple[FitConfig, 
         which = "" if len(set(sizes)) == 1 else ", the largest,"
         size = f"scaled from {width} x {height} px{which} to a width of {config.data.image_size}"
     return config, (
-        f"no configuration is given, so that it follows from the folder: {NAMES[layout]}, {size}; "
+        "no configuration is given, so that it follows from the folder: "
+        f"{NAMES.get(layout, layout)}, {size}; "
         f"{config.iterations:,} iterations (--set changes any value, --budget 10m sets the time)"
     )
 

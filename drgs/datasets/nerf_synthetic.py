@@ -12,16 +12,19 @@ Frames may have a lens, a second pose, a mask and depths, as there: see
 from __future__ import annotations
 
 import os
+from collections.abc import Collection
 from pathlib import Path
 
 import numpy as np
 
+from drgs.config.extensions import READERS
 from drgs.config.schema import DataConfig
 from drgs.core.errors import UserError
 from drgs.datasets.frame_extras import ignored, notes, optics_of
 from drgs.datasets.frame_files import frames_with_files
 from drgs.datasets.images import check_room, threads_for
 from drgs.datasets.notices import Notices
+from drgs.datasets.reader import DatasetReader
 from drgs.datasets.reading import READ, SIZES_ALONE
 from drgs.datasets.transforms import (
     Frame,
@@ -174,3 +177,21 @@ def _check_promises(image: np.ndarray, size: tuple[int, int], file: Path, first:
             f"{file}: must be {size[0]} x {size[1]} px, as {first.name} is, got "
             f"{width} x {height}; scale the images of a split to one size"
         )
+
+
+@READERS.register("nerf_synthetic")
+class NerfSyntheticReader(DatasetReader):
+    """Reads folders of NeRF-synthetic."""
+
+    def recognizes(self, folder: Path, names: Collection[str]) -> bool:
+        """See :class:`DatasetReader`."""
+        del folder
+        return "transforms_train.json" in names
+
+    def load(self, config: DataConfig, keeps: Keeps = all_of_them) -> Dataset:
+        """See :class:`DatasetReader`."""
+        return load(config, keeps)
+
+    def image_files(self, config: DataConfig) -> list[Path]:
+        """See :class:`DatasetReader`."""
+        return picture_files(config)

@@ -11,12 +11,15 @@ fisheye's rays have unit length.
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from pathlib import Path
 
+from drgs.config.extensions import READERS
 from drgs.config.schema import DataConfig
 from drgs.datasets.frame_files import frames_with_files, point_cloud_of
 from drgs.datasets.mask_names import note_unnamed_masks
 from drgs.datasets.photographs import Photographs, dataset_of
+from drgs.datasets.reader import DatasetReader
 from drgs.datasets.splits import Lists, listed_frames, lists_by_folders, lists_in_files
 from drgs.datasets.transforms import TransformsFile, note_unread, read_transforms
 from drgs.datasets.types import Dataset, Keeps, all_of_them
@@ -60,3 +63,21 @@ def picture_files(config: DataConfig) -> list[Path]:
     """The photographs of all frames."""
     meta = read_transforms(config.path / "transforms.json")
     return [frame.files["image"] for frame in frames_with_files(config, meta, [])]
+
+
+@READERS.register("nerfstudio")
+class NerfstudioReader(DatasetReader):
+    """Reads folders of nerfstudio and instant-ngp."""
+
+    def recognizes(self, folder: Path, names: Collection[str]) -> bool:
+        """See :class:`DatasetReader`."""
+        del folder
+        return "transforms.json" in names
+
+    def load(self, config: DataConfig, keeps: Keeps = all_of_them) -> Dataset:
+        """See :class:`DatasetReader`."""
+        return load(config, keeps)
+
+    def image_files(self, config: DataConfig) -> list[Path]:
+        """See :class:`DatasetReader`."""
+        return picture_files(config)

@@ -206,6 +206,33 @@ class Frame:
     path: Path
     files: Mapping[str, Path] = field(default_factory=dict)  # found: image, mask, depth
 
+    @staticmethod
+    def from_camera(
+        source: Path,
+        index: int,
+        image: Path,
+        camera_to_world: np.ndarray,
+        focal: tuple[float, float],
+        principal: tuple[float, float] | None = None,
+    ) -> Frame:
+        """Return the frame of a photograph by a pinhole camera.
+
+        source: the file or folder that has the pose, for messages; index: among the frames;
+        camera_to_world: (4, 4), OpenCV axes; focal, principal: px of the photograph (None: its
+        middle).
+
+        Raises :class:`UserError` for a pose that is not rigid and finite.
+        """
+        opengl = np.asarray(camera_to_world, np.float64) * [1, -1, -1, 1]
+        values = {"fl_x": focal[0], "fl_y": focal[1], "file_path": image.name}
+        if principal is not None:
+            values |= {"cx": principal[0], "cy": principal[1]}
+        try:
+            own = FrameValues.model_validate({**values, "transform_matrix": opengl.tolist()})
+        except ValidationError as error:
+            raise UserError(f"{source}: frame {index}: {_explained(error.errors()[0])}") from None
+        return Frame(own, own, index, source, {"image": image})
+
     @property
     def numbers_are_as_stored(self) -> bool:
         """Whether they are known to be for the picture as it is stored, if that has its size."""

@@ -200,7 +200,7 @@ class FitSession:
             checkpoint = folder.checkpoint_for(self.config, self.budget is not None)
         config = self.config if checkpoint is None else checkpoint.config
         if self.dataset is None:
-            self.dataset = load_dataset(config.data_for_training)
+            self.dataset = load_dataset(config.data_for_training, sections=config.extensions)
         if folder is not None:
             self._fingerprint = fingerprint_of(self.dataset)
         if checkpoint is not None:

@@ -3,6 +3,7 @@
 Nothing is fetched: the build tools and the dependencies are those of this environment.
 """
 
+import json
 import os
 import shutil
 import subprocess
@@ -15,7 +16,9 @@ import numpy as np
 import pytest
 from conftest import REPOSITORY
 from PIL import Image
-from support.small_capture import blobs
+from support.small_capture import blobs, make_dataset
+
+from drgs.io.pictures import write_png
 
 pytestmark = [
     pytest.mark.slow,
@@ -135,3 +138,101 @@ def test_mitsuba_finds_the_plugins_by_the_entry_point(scripts, model, tmp_path):
     (tmp_path / "scene.xml").write_text(SCENE)
     shown = run(scripts / "python", "-c", program, cwd=tmp_path)
     assert shown.startswith("(24, 32, ") and str(scripts.parent) in shown
+
+
+CONFIGURATION = """
+data: {path: photographs, type: numpy_poses, test_every: 4}
+iterations: 12
+init: {num_points: 60, half_extent: 0.5}
+model: {falloff: compact}
+densify: {strategy: halving}
+loss: {type: charbonnier}
+output: {report: false}
+extensions:
+  numpy_poses: {unit: 1.0}
+  halving: {after: 8}
+  vignetting: {lr: 0.02}
+  binary_opacity: {weight: 0.1}
+"""
+
+PROGRAM = """
+import drgs
+import mitsuba as mi
+mi.set_variant("llvm_ad_rgb")
+from drgs.config.load import load_config
+from charbonnier import Charbonnier, CharbonnierSection
+from halving import Halving, HalvingSection
+from vignetting import Vignetting, VignettingSection
+
+config = load_config("fit.yml", ["densify.strategy=budget", "loss.type=photometric"])
+config = config.model_copy(update={"extensions": {
+    name: section for name, section in config.extensions.items() if name != "vignetting"
+}})
+result = drgs.train(
+    config,
+    strategy=Halving(HalvingSection(after=8)),
+    effects=[Vignetting(VignettingSection(lr=0.02))],
+    loss=Charbonnier(CharbonnierSection()),
+)
+result.gaussians.save("python.npz")
+"""
+
+
+@pytest.fixture
+def photographs(tmp_path):
+    """Photographs in the layout of the example's reader, and the same through its lens."""
+    views = make_dataset(train=5, test=0).train
+    (tmp_path / "photographs" / "images").mkdir(parents=True)
+    for index, view in enumerate(views):
+        write_png(tmp_path / "photographs" / "images" / f"{index}.png", np.asarray(view.image))
+    np.save(tmp_path / "photographs" / "poses.npy", [view.camera_to_world for view in views])
+    camera = {name: getattr(views[0], name) for name in ("fx", "fy", "cx", "cy")}
+    (tmp_path / "photographs" / "intrinsics.json").write_text(json.dumps(camera))
+    shutil.copytree(tmp_path / "photographs" / "images", tmp_path / "bent" / "images")
+    frames = [
+        {
+            "file_path": f"images/{index}.png",
+            "transform_matrix": (view.camera_to_world @ np.diag([1, -1, -1, 1])).tolist(),
+        }
+        for index, view in enumerate(views)
+    ]
+    lens = {"camera_model": "unified", "xi": 0.25}
+    numbers = {"fl_x": 1.25 * camera["fx"], "fl_y": 1.25 * camera["fy"]}
+    numbers |= {"cx": camera["cx"], "cy": camera["cy"]}
+    content = json.dumps({**lens, **numbers, "frames": frames})
+    (tmp_path / "bent" / "transforms.json").write_text(content)
+    return tmp_path
+
+
+def test_a_package_beside_the_wheel_adds_to_every_extension_point(scripts, photographs):
+    """A strategy, effect, loss, term, lens, falloff, file format and reader; no file of drgs."""
+    folder = photographs
+    source = shutil.copytree(REPOSITORY / "tests" / "examples", folder / "source")
+    pip = (sys.executable, "-m", "pip", "--disable-pip-version-check", "--no-input")
+    offline = ("--quiet", "--no-deps", "--no-index")
+    run(*pip, "wheel", *offline, "--no-build-isolation", "-w", folder, source, cwd=folder)
+    (wheel,) = folder.glob("drgs_examples-*.whl")
+    run(*pip, "--python", scripts / "python", "install", *offline, wheel, cwd=folder)
+    shutil.rmtree(source)
+    (folder / "fit.yml").write_text(CONFIGURATION)
+    shown = run(scripts / "drgs", "fit", "fit.yml", "--out", "out", cwd=folder)
+    for line in ("halving: density strategy", "vignetting: effect", "charbonnier: loss"):
+        assert line in shown
+    assert "binary_opacity: loss term" in shown and "(numpy_poses layout)" in shown
+    assert "compact" in shown
+    run(scripts / "drgs", "export", "out", "--format", "npz", "--out", "yaml.npz", cwd=folder)
+    run(scripts / "python", "-c", PROGRAM, cwd=folder)
+    with np.load(folder / "yaml.npz") as named, np.load(folder / "python.npz") as given:
+        assert len(named["means"]) == 30
+        np.testing.assert_array_equal(named["means"], given["means"])
+    short = ("--set", "iterations=4", "--set", "init.num_points=60", "--set", "output.report=false")
+    shown = run(scripts / "drgs", "fit", "bent", *short, "--out", "bent_out", cwd=folder)
+    assert "unified" in shown and "unified" in (folder / "bent_out" / "views.json").read_text()
+    help_text = " ".join(run(scripts / "drgs", "fit", "--help", cwd=folder).split())
+    for name in (
+        "dataset reader numpy_poses",
+        "file format npz",
+        "lens unified",
+        "falloff compact",
+    ):
+        assert name in help_text

@@ -60,7 +60,7 @@ def _read_own_photographs(config: FitConfig, names: list[str], comm: Communicato
     """Return the dataset with the training views of these names, and no views to measure on."""
     own = own_views(len(names), config.optimizer.views_per_step, comm.rank, comm.size)
     rendered = {names[index] for index in own}
-    dataset = load_dataset(config.data_for_training, keeps=rendered.__contains__)
+    dataset = load_dataset(config.data_for_training, rendered.__contains__, config.extensions)
     chosen = set(names)
     dataset = replace(dataset, train=tuple(view for view in dataset.train if view.name in chosen))
     check_views(comm, dataset, rendered, config.data.path)

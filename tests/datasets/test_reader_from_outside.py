@@ -1,0 +1,102 @@
+"""A dataset reader that lives outside of drgs."""
+
+import importlib
+import json
+import sys
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from support import small_capture as capture
+from support import small_fits as fits
+
+import drgs
+from drgs.config.load import config_from
+from drgs.core import registry
+from drgs.core.errors import UserError
+from drgs.datasets import load_dataset, reader_name
+from drgs.io.pictures import write_png
+
+EXAMPLE = Path(__file__).resolve().parent.parent / "examples" / "numpy_poses.py"
+
+
+@pytest.fixture(autouse=True)
+def example(monkeypatch):
+    """The module of the example, found as that of an installed package is."""
+    monkeypatch.syspath_prepend(EXAMPLE.parent)
+    point = registry.EntryPoint("numpy_poses", "numpy_poses", registry.ENTRY_POINT_GROUP)
+    monkeypatch.setattr(registry, "entry_points", lambda group: [point])
+    yield importlib.import_module("numpy_poses")
+    for each in registry._registries:
+        each._extensions.pop("numpy_poses", None)
+    registry._loaded.discard("numpy_poses")
+    sys.modules.pop("numpy_poses", None)
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """The photographs of a small capture in the layout of the example."""
+    views = capture.make_dataset(train=5, test=0).train
+    (tmp_path / "images").mkdir()
+    for index, view in enumerate(views):
+        write_png(tmp_path / "images" / f"{index}.png", np.asarray(view.image))
+    np.save(tmp_path / "poses.npy", [view.camera_to_world for view in views])
+    camera = {name: getattr(views[0], name) for name in ("fx", "fy", "cx", "cy")}
+    (tmp_path / "intrinsics.json").write_text(json.dumps(camera))
+    return tmp_path, views
+
+
+def test_the_page_shows_the_example():
+    text = (EXAMPLE.parent.parent.parent / "docs" / "developing.md").read_text()
+    assert f"```python\n{EXAMPLE.read_text()}```" in text
+    assert len(EXAMPLE.read_text().splitlines()) <= 60
+
+
+@pytest.mark.parametrize("kind", ["auto", "numpy_poses"])
+def test_cameras_and_images_are_those_of_the_folder(folder, kind):
+    path, views = folder
+    dataset = load_dataset(path, type=kind, test_every=4)
+    found = {view.name: view for view in (*dataset.train, *dataset.test)}
+    assert sorted(found) == [str(index) for index in range(5)]
+    for index, view in enumerate(views):
+        own = found[str(index)]
+        np.testing.assert_allclose(own.camera_to_world, view.camera_to_world, atol=1e-12)
+        assert (own.fx, own.fy, own.cx, own.cy) == (view.fx, view.fy, view.cx, view.cy)
+        np.testing.assert_allclose(np.asarray(own.image), np.asarray(view.image), atol=0.5 / 255)
+
+
+def test_its_section_is_set_by_the_configuration(folder):
+    path, views = folder
+    mi.set_variant("llvm_ad_rgb")
+    values = fits.config_of().model_dump() | {"data": {"path": str(path)}, "iterations": 2}
+    values |= {"init": {"num_points": 30}, "extensions": {"numpy_poses": {"unit": 2.0}}}
+    trainer = drgs.train(config_from(values, "x.yml")).trainer
+    centers = {view.name: view.center for view in trainer.dataset.train}
+    expected = {str(index): 2 * view.center for index, view in enumerate(views)}
+    for name, center in centers.items():
+        np.testing.assert_allclose(center, expected[name], rtol=1e-6)
+
+
+def test_an_unknown_reader_lists_those_that_exist(folder):
+    with pytest.raises(UserError, match=r"data\.type must be one of 'auto', .*'numpy_poses'; did"):
+        load_dataset(folder[0], type="numpy_pose")
+
+
+def test_what_it_finds_wrong_is_reported(folder):
+    path, _ = folder
+    (path / "images" / "9.png").write_bytes(b"")
+    with pytest.raises(UserError, match=r"poses\.npy: must have a pose for each of the 6 files"):
+        load_dataset(path)
+    poses = np.load(path / "poses.npy")
+    (path / "images" / "9.png").unlink()
+    poses[2, 0, 0] = np.nan
+    np.save(path / "poses.npy", poses)
+    with pytest.raises(UserError, match=r"poses\.npy: frame 2: "):
+        load_dataset(path)
+
+
+def test_shipped_readers_come_first(folder, tmp_path):
+    path, _ = folder
+    (path / "transforms.json").write_text("{}")
+    assert reader_name(config_from({"data": {"path": str(path)}}, "x").data) == "nerfstudio"
