@@ -13,7 +13,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from drgs.cameras.camera import Camera, Lens, Pinhole
+from drgs.cameras.camera import Camera
+from drgs.cameras.lens import LENSES, Lens
 from drgs.core.constants import MAX_SHUTTER_SAMPLES, SHUTTER_SAMPLES
 from drgs.core.environment import check_variant
 from drgs.core.errors import PluginError, UserError
@@ -33,11 +34,12 @@ from drgs.integrator.sensors import (
     read_sensor,
 )
 
-LENSES = ("pinhole", "opencv", "fisheye", "thin_prism_fisheye")
 SHUTTERS = ("global", "rolling")
-ALL_COEFFICIENTS = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2", "sx1", "sy1")
+COEFFICIENTS = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2", "sx1", "sy1")
+"""Coefficients of the shipped lenses; other lenses have others."""
+
 KNOWN = (
-    *("to_world", "to_world_close", "fx", "fy", "cx", "cy", "lens", *ALL_COEFFICIENTS),
+    *("to_world", "to_world_close", "fx", "fy", "cx", "cy", "lens", *COEFFICIENTS),
     *("near_clip", "far_clip", "shutter", "shutter_open", "shutter_close", "shutter_samples"),
 )
 """Names of the properties, but for the film, the sampler and what else Mitsuba's sensors have."""
@@ -74,7 +76,8 @@ class CalibratedSensor(mi.Sensor):
        - |string|
        - ``pinhole``; ``opencv``, radial and tangential distortion; ``fisheye``, by the angle from
          the axis (Kannala and Brandt 2006); ``thin_prism_fisheye``, one with tangential and thin
-         prism terms (COLMAP's THIN_PRISM_FISHEYE). (Default: ``pinhole``)
+         prism terms (COLMAP's THIN_PRISM_FISHEYE); or the name of a lens that another package
+         registers, whose coefficients are parameters as well. (Default: ``pinhole``)
 
      * - k1, k2, k3, k4, k5, k6, p1, p2, sx1, sy1
        - |float|
@@ -150,7 +153,7 @@ class CalibratedSensor(mi.Sensor):
         self.cx = mi.Float(number(props, "cx", width / 2))
         self.cy = mi.Float(number(props, "cy", height / 2))
         self.lens = _lens(props)
-        self.coefficients = {k: mi.Float(v) for k, v in self.lens.named().items()}
+        self.coefficients = {k: mi.Float(v) for k, v in self.lens.coefficients().items()}
         self.near, self.far = positive(props, "near_clip", 0.01), positive(props, "far_clip", 1e4)
         if self.near >= self.far:
             raise PluginError(
@@ -164,7 +167,7 @@ class CalibratedSensor(mi.Sensor):
         self.shutter_samples = integer(
             props, "shutter_samples", SHUTTER_SAMPLES, least=1, most=MAX_SHUTTER_SAMPLES
         )
-        refuse_unknown(props, KNOWN)
+        refuse_unknown(props, (*KNOWN, *self.lens.coefficient_names()))
 
     # ------------------------------------------------------------------------------------------
     # Parameters
@@ -197,7 +200,7 @@ class CalibratedSensor(mi.Sensor):
 
     def to_string(self) -> str:
         """One line a setting."""
-        lens = ", ".join([self.lens.label, *map(str, self.coefficients)])
+        lens = ", ".join([type(self.lens).__name__, *map(str, self.coefficients)])
         return (
             f"CalibratedSensor[\n  fx = {self.fx}, fy = {self.fy},\n  cx = {self.cx}, "
             f"cy = {self.cy},\n  lens = {lens},\n  to_world = {self.m_to_world},\n"
@@ -216,7 +219,7 @@ class CalibratedSensor(mi.Sensor):
     def camera_from_state(self, state: SensorState) -> Camera:
         """The camera with these parameters."""
         camera = self._pinhole(state)
-        return camera.with_lens(self.lens.with_named(state.device))
+        return camera.with_lens(self.lens.with_coefficients(state.device))
 
     def num_poses(self) -> int:
         """Poses whose pictures are averaged: 1 unless motion blurs them."""
@@ -248,7 +251,7 @@ class CalibratedSensor(mi.Sensor):
         place = sample2 * mi.Vector2f(self.film().crop_size())
         state = read_sensor(self, 0.0)
         camera = self._pinhole(state)
-        lens = self.lens.with_named(state.device).upload(mi.Float)
+        lens = self.lens.with_coefficients(state.device).upload(mi.Float)
         camera = replace(camera, lens=lens)
         _, direction, seen = camera.look_through(place.x, place.y)
 
@@ -298,29 +301,16 @@ class CalibratedSensor(mi.Sensor):
         return mi.ScalarBoundingBox3f()
 
 
-def _lens_type(kind: str) -> type[Lens]:
-    """The class of one of :data:`LENSES`, imported when it is chosen."""
-    if kind == "opencv":
-        from drgs.cameras.radial_tangential import RadialTangential
-
-        return RadialTangential
-    if kind == "fisheye":
-        from drgs.cameras.fisheye import Fisheye
-
-        return Fisheye
-    if kind == "thin_prism_fisheye":
-        from drgs.cameras.thin_prism_fisheye import ThinPrismFisheye
-
-        return ThinPrismFisheye
-    return Pinhole
-
-
 def _lens(props: mi.Properties) -> Lens:
-    """The lens and those of its coefficients that are given."""
-    kind = one_of(props, "lens", LENSES)
-    model = _lens_type(kind)
-    names = () if model is Pinhole else model.names
-    given = {name: number(props, name, 0.0) for name in ALL_COEFFICIENTS if name in props}
+    """Return the lens with those of its coefficients that are given."""
+    kind = str(props.get("lens", "pinhole"))
+    try:
+        model = LENSES.get(kind, "calibrated: lens").value
+    except UserError as error:
+        raise PluginError(str(error)) from error
+    names = model.coefficient_names()
+    known = dict.fromkeys((*COEFFICIENTS, *names))
+    given = {name: number(props, name, 0.0) for name in known if name in props}
     for name in given:
         if name not in names:
             raise PluginError(
@@ -328,14 +318,14 @@ def _lens(props: mi.Properties) -> Lens:
                 f"{'the coefficients ' + ', '.join(names) if names else 'no coefficients'}, "
                 f"got {name}"
             )
-    return _with_coefficients(model, given) if names else model()
+    return _with_coefficients(model, given)
 
 
 def _with_coefficients(model: type[Lens], coefficients: dict[str, float]) -> Lens:
     try:
-        return model.of(**coefficients)
+        return model.from_coefficients(**coefficients)
     except UserError as error:
-        raise PluginError(f"calibrated: {error}") from None
+        raise PluginError(f"calibrated: {error}") from error
 
 
 mi.register_sensor("calibrated", lambda props: CalibratedSensor(props))

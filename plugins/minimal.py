@@ -17,8 +17,8 @@ from drgs.core.environment import check_variant
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 from drgs.integrator.film import develop_pixels, pixels_adjoint
 from drgs.integrator.sensors import camera_from_sensor, read_sensor
+from drgs.splatting.footprint import DEFAULT
 from drgs.splatting.grid import TileGrid
-from drgs.splatting.image_model import DEFAULT
 from drgs.splatting.projection import load_rows
 from drgs.splatting.rasterize import Layers, Records, composite, composite_adjoint
 from drgs.splatting.rendering import Pipeline, gradients_of

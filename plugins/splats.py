@@ -165,6 +165,11 @@ class SplatsIntegrator(mi.CppADIntegrator):
          ``unscented``: by the mean and covariance of projected sigma points; ``exact``: by its peak
          along each pixel's ray. (Default: ``ewa``)
 
+     * - falloff
+       - |string|
+       - How alpha falls off around a splat. ``gaussian``: as the projected Gaussian does.
+         (Default: ``gaussian``)
+
      * - order
        - |string|
        - In which splats are composited. ``center``: by the depth of their means; ``pixel``: by that

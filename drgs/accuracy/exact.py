@@ -16,7 +16,7 @@ Projecting along the pixel's ray instead of the mean's changes the 2x3 projectio
 A - d e_z^T / z_mean, and so the projected covariance from C to C - d k^T - k d^T + w d d^T, whose
 inverse (Sherman-Morrison, twice) gives d^T (...)^-1 d = |e|^2 / D. (The affine approximation is the
 first order in the size of the splat; D = 1 there.) The peak is behind the camera where a <= 0: no
-response.
+falloff.
 
 The low-pass widens the Gaussian parallel to the film, which changes C and neither k nor w.
 
@@ -38,7 +38,7 @@ at z = z_mean (1 + kappa . e) (linear regression), and there is the peak.
 
 **Extent.** With t = |U d|^2 the smallest exponent that shows, |e|^2 <= t D is |e| <= sqrt(q) a with
 q = t / (1 - t h): a conic section with a focus in the mean and the eccentricity sqrt(q) |kappa|. If
-that is below 1 it is an ellipse, which :meth:`RayResponse.outline` finds; otherwise the splat
+that is below 1 it is an ellipse, which :meth:`RayFalloff.outline` finds; otherwise the splat
 reaches around the camera and is taken to be everywhere.
 """
 
@@ -50,13 +50,15 @@ from typing import Any, ClassVar
 
 import drjit as dr
 
-from drgs.cameras.camera import Camera, Pinhole
+from drgs.cameras.camera import Camera
+from drgs.cameras.lens import Pinhole
+from drgs.config.approximations import PROJECTIONS
 from drgs.core.arrays import types_of
 from drgs.core.constants import WHITENING_SCALE
 from drgs.core.errors import UnsupportedError
-from drgs.splatting.image_model import (
-    AffineResponse,
+from drgs.splatting.footprint import (
     Footprint,
+    GaussianFalloff,
     Offsets,
     Positions,
     flat_columns,
@@ -64,6 +66,7 @@ from drgs.splatting.image_model import (
 from drgs.splatting.projection import (
     FilmShape,
     GaussianRows,
+    ProjectionModel,
     RayTerms,
     Splats2D,
     ewa,
@@ -84,13 +87,13 @@ LARGEST_EXPONENT = 1e4
 
 
 def exact_shape(rows: GaussianRows, camera: Camera, position: Any, low_pass: float) -> FilmShape:
-    """The shape that :class:`RayResponse` evaluates; the slopes of its Jacobian are not clamped.
+    """The shape that :class:`RayFalloff` evaluates; the slopes of its Jacobian are not clamped.
 
     Its whitening is U / a_c, and ``ray`` holds g / |a_c|, h, and 1 / |a_c|. Not differentiated:
     where the anchor is, which makes no difference.
     """
     m0, m1, _ = film_axes(rows, camera, position, camera.lens.true_slopes(camera, position))
-    film = whiten(camera.lens.film_point(camera, position), [*m0], [*m1], low_pass)
+    film = whiten(camera.lens.project_point(camera, position), [*m0], [*m1], low_pass)
     mean = dr.detach(film.means2d)
     anchor = closest_on_film(camera, *mean)
     slopes = list((anchor - camera.principal) / camera.focal)
@@ -125,7 +128,7 @@ def _seen_along(
 ) -> tuple[Any, tuple[Any, Any], Any]:
     """U, kappa and h of a Gaussian that is projected along the ray with the given slopes."""
     m0, m1, n = film_axes(rows, camera, position, slopes)
-    film = whiten(camera.lens.film_point(camera, position), [*m0], [*m1], low_pass)
+    film = whiten(camera.lens.project_point(camera, position), [*m0], [*m1], low_pass)
     p, _, s = film.whitening
     # kappa and h by minors (Binet-Cauchy), free of the cancellation in p k_x + r k_y and in
     # w - |kappa|^2. The rows are scaled first, or giants overflow.
@@ -154,10 +157,10 @@ class RayFootprint(Footprint):
 
 
 @dataclass(frozen=True)
-class RayResponse(AffineResponse):
+class RayFalloff(GaussianFalloff):
     """alpha = o exp(-rho^2 / 2), with rho^2 the smallest along the pixel's ray.
 
-    Geometry: that of :class:`AffineResponse`, then g (2), h; all as :func:`exact_shape` gives
+    Geometry: that of :class:`GaussianFalloff`, then g (2), h; all as :func:`exact_shape` gives
     them, U and h scaled to base 2.
     """
 
@@ -166,7 +169,7 @@ class RayResponse(AffineResponse):
 
     camera: Camera | None = None
 
-    def seen_by(self, camera: Camera) -> RayResponse:
+    def for_camera(self, camera: Camera) -> RayFalloff:
         """For one camera, whose film has the anchors.
 
         Raises UnsupportedError for lenses that are no pinholes: their rays are not straight on
@@ -174,10 +177,10 @@ class RayResponse(AffineResponse):
         """
         if not isinstance(camera.lens, Pinhole):
             raise UnsupportedError(
-                f"splats: projection 'exact' needs a pinhole, got {camera.lens.label}; "
+                f"splats: projection 'exact' needs a pinhole, got {type(camera.lens).__name__}; "
                 "use 'unscented', or 'ewa', which is exact for parallel rays"
             )
-        return RayResponse(camera)
+        return RayFalloff(camera)
 
     def geometry(self, splats: Splats2D) -> list[Any]:
         """Columns, one value per Gaussian."""
@@ -341,6 +344,14 @@ class RayResponse(AffineResponse):
             d_f = dr.fma(-b * b, d_h, 2 * change)
             result.append(dr.fma(-math.log(2), d_f, d_log_opacity))
         return result
+
+
+@PROJECTIONS.register("exact")
+class Exact(ProjectionModel):
+    """The peak along each pixel's ray."""
+
+    falloff = RayFalloff
+    shape = shape_with_depth = staticmethod(exact_shape)
 
 
 def ray_denominator(geometry: list[Any], u: Any, v: Any, x: Any, y: Any) -> tuple[Any, Any, Any]:

@@ -1,6 +1,6 @@
 """Depths of splats' peaks along the ray of each pixel: what the order of each pixel compares.
 
-:class:`RayDepths` where the response finds the peak anyway (``drgs.accuracy.exact``, whose formulas
+:class:`RayDepths` where the falloff finds the peak anyway (``drgs.accuracy.exact``, whose formulas
 these are), :class:`AffineDepths` where it does not, :class:`ParallelDepths` where rays do not meet.
 :class:`BoundedDepths` are those of one of them where each pixel sees a part of its ray.
 """
@@ -13,33 +13,45 @@ from typing import Any
 import drjit as dr
 
 from drgs.accuracy.exact import RayFootprint, closest_on_film, ray_denominator
-from drgs.accuracy.pixel_lists import PeakDepths
 from drgs.cameras.camera import Camera
 from drgs.core.constants import WHITENING_SCALE
+from drgs.splatting.footprint import Footprint, GaussianFalloff, flat_columns
 from drgs.splatting.grid import Lanes, TileGrid
-from drgs.splatting.image_model import Footprint, Response, flat_columns
 from drgs.splatting.lanes import load_pixels
-from drgs.splatting.projection import Splats2D
+from drgs.splatting.projection import (
+    FilmShape,
+    GaussianRows,
+    Projection,
+    RayTerms,
+    Splats2D,
+    film_axes,
+)
 
 
 @dataclass(frozen=True)
 class AffineDepths:
-    """Depths at a pixel for a response that does not know them: stores what they depend on."""
+    """Depths at a pixel for a falloff that does not know them: stores what they depend on.
 
-    def seen_by(self, camera: Camera) -> AffineDepths:
+    The base of all classes of depths.
+    """
+
+    def for_camera(self, camera: Camera) -> AffineDepths:
         """For one camera, whose rays may be parallel."""
         return ParallelDepths() if camera.lens.parallel else self
 
     def keys(self, splats: Splats2D) -> list[Any]:
-        """kappa, h (scaled to base 2), and the depth of the mean."""
+        """Return columns from which depths are computed; last, their unit.
+
+        Here kappa, h (scaled to base 2), and the depth of the mean.
+        """
         ray, scale = splats.ray, WHITENING_SCALE
         return [ray.tilt_x / scale, ray.tilt_y / scale, ray.spread / scale**2, splats.depths]
 
     def at(
-        self, response: Response, geometry: list[Any], keys: list[Any], x: Any, y: Any
+        self, falloff: GaussianFalloff, geometry: list[Any], keys: list[Any], x: Any, y: Any
     ) -> tuple[Any, Any]:
-        """a and D of a splat at a point of the film, px."""
-        return self._at(keys, *response.coordinates(geometry, x, y))
+        """Return a and D at a point of the film, px: the depth is a / D in the unit, if a > 0."""
+        return self._at(keys, *falloff.coordinates(geometry, x, y))
 
     def bind(self, lanes: Lanes, grid: TileGrid) -> AffineDepths:
         """For the lanes of one kernel: nothing has to be loaded."""
@@ -47,7 +59,7 @@ class AffineDepths:
         return self
 
     def along(self, footprint: Footprint, keys: list[Any]) -> list[Any]:
-        """Depths at the 16 pixels, divided by the mean's; not positive where there is none."""
+        """Return depths in the unit at the 16 pixels; not positive where there is none."""
         coordinates = zip(flat_columns(footprint.u), flat_columns(footprint.v), strict=True)
         return [a / denominator for a, denominator in (self._at(keys, *e) for e in coordinates)]
 
@@ -56,6 +68,26 @@ class AffineDepths:
         kx, ky, h = keys[:3]
         a = dr.fma(-kx, u, dr.fma(-ky, v, 1))
         return a, dr.fma(a, a, h * dr.fma(u, u, v * v))
+
+
+@dataclass(frozen=True)
+class WithAffineDepth:
+    """A projection, and what :class:`AffineDepths` need: the affine covariance with the depth."""
+
+    shape: Projection
+
+    def __call__(
+        self, rows: GaussianRows, camera: Camera, position: Any, low_pass: float
+    ) -> FilmShape:
+        """Project; h is not negative. Where slopes are clamped, the splat is the affine one."""
+        film = self.shape(rows, camera, position, low_pass)
+        slopes = camera.lens.clamped_slopes(camera, position)
+        m0, m1, n = film_axes(rows, camera, position, slopes)
+        p, r, s = film.whitening
+        kx, ky = dr.dot(m0, n), dr.dot(m1, n)
+        kx, ky = dr.fma(p, kx, r * ky), s * ky
+        h = dr.squared_norm(n) - dr.fma(kx, kx, ky * ky)
+        return replace(film, ray=RayTerms(kx, ky, dr.select(h > 0, h, 0)))
 
 
 @dataclass(frozen=True)
@@ -69,12 +101,12 @@ class ParallelDepths(AffineDepths):
 
 
 @dataclass(frozen=True)
-class RayDepths:
-    """Depths at a pixel for ``RayResponse``, which computes them."""
+class RayDepths(AffineDepths):
+    """Depths at a pixel for ``RayFalloff``, which computes them."""
 
     camera: Camera | None = None  # whose film has the anchors
 
-    def seen_by(self, camera: Camera) -> RayDepths:
+    def for_camera(self, camera: Camera) -> RayDepths:
         """For one camera."""
         return replace(self, camera=camera)
 
@@ -83,19 +115,14 @@ class RayDepths:
         return [splats.depths * splats.ray.scale]
 
     def at(
-        self, response: Response, geometry: list[Any], keys: list[Any], x: Any, y: Any
+        self, falloff: GaussianFalloff, geometry: list[Any], keys: list[Any], x: Any, y: Any
     ) -> tuple[Any, Any]:
         """a and D of a splat at a point of the film, px."""
         del keys
-        u, v = response.coordinates(geometry, x, y)
+        u, v = falloff.coordinates(geometry, x, y)
         anchor = closest_on_film(self.camera, *geometry[:2])
         _, a, denominator = ray_denominator(geometry, u, v, x - anchor.x, y - anchor.y)
         return a, denominator
-
-    def bind(self, lanes: Lanes, grid: TileGrid) -> RayDepths:
-        """For the lanes of one kernel: nothing has to be loaded."""
-        del lanes, grid
-        return self
 
     def along(self, footprint: RayFootprint, keys: list[Any]) -> list[Any]:
         """Depths at the 16 pixels, divided by the key; not positive where there is none."""
@@ -104,27 +131,27 @@ class RayDepths:
 
 
 @dataclass(frozen=True)
-class BoundedDepths:
+class BoundedDepths(AffineDepths):
     """Depths of peaks between two bounds of each pixel: there are no others."""
 
-    depths: PeakDepths
+    depths: AffineDepths
     nearest: Any  # Float (H * W,), scene units
     farthest: Any  # the same
     bounds: list[tuple[Any, Any]] = field(default_factory=list)  # the 16 of each lane
 
-    def seen_by(self, camera: Camera) -> BoundedDepths:
+    def for_camera(self, camera: Camera) -> BoundedDepths:
         """For one camera."""
-        return replace(self, depths=self.depths.seen_by(camera))
+        return replace(self, depths=self.depths.for_camera(camera))
 
     def keys(self, splats: Splats2D) -> list[Any]:
         """Columns that the depths are computed from."""
         return self.depths.keys(splats)
 
     def at(
-        self, response: Response, geometry: list[Any], keys: list[Any], x: Any, y: Any
+        self, falloff: GaussianFalloff, geometry: list[Any], keys: list[Any], x: Any, y: Any
     ) -> tuple[Any, Any]:
         """a and D of a splat at a point of the film, px, wherever its peak is."""
-        return self.depths.at(response, geometry, keys, x, y)
+        return self.depths.at(falloff, geometry, keys, x, y)
 
     def bind(self, lanes: Lanes, grid: TileGrid) -> BoundedDepths:
         """For the lanes of one kernel: loads the bounds."""

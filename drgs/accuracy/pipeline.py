@@ -7,22 +7,18 @@ costs nothing.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
-from drgs.config.approximations import Approximations
+from drgs.config.approximations import FALLOFFS, ORDERS, PROJECTIONS, Approximations
+from drgs.core.errors import UnsupportedError
 from drgs.splatting.cutoffs import Cutoffs
-from drgs.splatting.image_model import DEFAULT, ImageModel
+from drgs.splatting.footprint import DEFAULT, FootprintModel, GaussianFalloff
 from drgs.splatting.projection import (
-    Projection,
+    ProjectionModel,
     color_at_mean,
     compensated_opacity,
-    ewa,
     plain_opacity,
 )
-from drgs.splatting.rendering import CenterOrder, Feature, Pipeline, color_features
-
-if TYPE_CHECKING:
-    from drgs.accuracy.pixel_lists import PeakDepths
+from drgs.splatting.rendering import Feature, Pipeline, color_features
 
 LEAST_STOP = 1e-30
 """Where no stop is asked for: past it float32 has no transmittance to go back from."""
@@ -38,21 +34,15 @@ def pipeline_of(
     cutoffs = Cutoffs(
         approximations.alpha_max, approximations.alpha_cut, stop, approximations.extent
     )
-    model = DEFAULT if cutoffs == Cutoffs() else ImageModel(cutoffs=cutoffs)
-    shape, order, color = ewa, CenterOrder(), color_at_mean
-    if approximations.projection == "exact":
-        from drgs.accuracy.exact import RayResponse, exact_shape
-
-        shape, model = exact_shape, replace(model, response=RayResponse())
-    elif approximations.projection == "unscented":
-        from drgs.accuracy.unscented import unscented_shape
-
-        shape = unscented_shape
-    if approximations.order == "pixel":
-        from drgs.accuracy.pixel_order import PixelOrder
-
-        shape, depths = _with_depths(approximations, shape)
-        order = PixelOrder(approximations.order_window, depths)
+    model = DEFAULT if cutoffs == Cutoffs() else FootprintModel(cutoffs=cutoffs)
+    projection = PROJECTIONS.get(approximations.projection).value
+    falloff = FALLOFFS.get(approximations.falloff).value
+    if projection.falloff is not None:
+        falloff = _own_falloff(approximations, projection)
+    if falloff is not GaussianFalloff:
+        model = replace(model, falloff=falloff())
+    shape, order = ORDERS.get(approximations.order).value.create(projection, approximations)
+    color = color_at_mean
     if approximations.sh_direction == "pixel":
         from drgs.accuracy.ray_colors import RayColors, stored_coefficients
 
@@ -69,17 +59,13 @@ def pipeline_of(
     )
 
 
-def _with_depths(
-    approximations: Approximations, shape: Projection
-) -> tuple[Projection, PeakDepths]:
-    """A projection that knows depths at a pixel, and who computes them."""
-    from drgs.accuracy.exact import ewa_with_depth
-    from drgs.accuracy.peak_depths import AffineDepths, RayDepths
-
-    if approximations.projection == "exact":
-        return shape, RayDepths()
-    if approximations.projection == "unscented":
-        from drgs.accuracy.unscented import unscented_with_depth
-
-        return unscented_with_depth, AffineDepths()
-    return ewa_with_depth, AffineDepths()
+def _own_falloff(
+    approximations: Approximations, projection: type[ProjectionModel]
+) -> type[GaussianFalloff]:
+    """Return the falloff of a projection that has one of its own."""
+    if approximations.falloff != FALLOFFS.words()[0]:
+        raise UnsupportedError(
+            f"splats: projection '{approximations.projection}' has a falloff of its own, got "
+            f"falloff '{approximations.falloff}'; use another projection, or no falloff"
+        )
+    return projection.falloff

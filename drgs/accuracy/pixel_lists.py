@@ -7,15 +7,13 @@ in the order of their means; those of a list are nearly in that of its pixels.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import drjit as dr
 
-from drgs.cameras.camera import Camera
+from drgs.accuracy.peak_depths import AffineDepths
 from drgs.core.arrays import types_of
-from drgs.splatting.grid import GRID, MICRO, MICROS, TILE, Lanes, TileGrid
-from drgs.splatting.image_model import Footprint, Response
-from drgs.splatting.projection import Splats2D
+from drgs.splatting.grid import GRID, MICRO, MICROS, TILE, Lanes
 from drgs.splatting.rasterize import (
     Records,
 )
@@ -23,32 +21,6 @@ from drgs.splatting.tiles import TileBins, lower_bounds, stable_order
 
 FARTHEST = 4.0
 """Between this and its inverse is the depth by which a list is sorted, relative to the mean's."""
-
-
-class PeakDepths(Protocol):
-    """Who knows the depth of a splat's peak along a pixel's ray."""
-
-    def seen_by(self, camera: Camera) -> PeakDepths:
-        """For one camera."""
-        ...
-
-    def keys(self, splats: Splats2D) -> list[Any]:
-        """Columns, one value per Gaussian: what depths are computed from; last, their unit."""
-        ...
-
-    def at(
-        self, response: Response, geometry: list[Any], keys: list[Any], x: Any, y: Any
-    ) -> tuple[Any, Any]:
-        """a and D at a point of the film, px: the depth is a / D in the unit, if a is positive."""
-        ...
-
-    def bind(self, lanes: Lanes, grid: TileGrid) -> PeakDepths:
-        """For the lanes of one kernel: loads what they need. The result knows :meth:`along`."""
-        ...
-
-    def along(self, footprint: Footprint, keys: list[Any]) -> list[Any]:
-        """Depths in the unit at the 16 pixels; not positive where there is none."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -78,7 +50,7 @@ class PixelLists:
         return places
 
     @staticmethod
-    def of(bins: TileBins, records: Records, depths: PeakDepths) -> PixelLists:
+    def of(bins: TileBins, records: Records, depths: AffineDepths) -> PixelLists:
         """Make the lists. The host reads one value, the number of items."""
         t = types_of(bins.rows.Float)
         # Entries as they are made, and one behind the last.
@@ -137,7 +109,7 @@ class _Items:
     def of(
         bins: TileBins,
         records: Records,
-        depths: PeakDepths,
+        depths: AffineDepths,
         entry: Any,
         masks: Any,
         item: Any,
@@ -163,7 +135,7 @@ class _Items:
         def body(masks: Any, item: Any) -> tuple:
             micro = dr.tzcnt(masks)
             middle = x + t.Float(micro % GRID) * MICRO, y + t.Float(micro // GRID) * MICRO
-            a, denominator = depths.at(bins.model.response, geometry, keys, *middle)
+            a, denominator = depths.at(bins.model.falloff, geometry, keys, *middle)
             # Where there is no peak, there may be one at a neighbour.
             along = dr.select(a > 0, a / denominator, 1)
             along = dr.select(along < 1 / FARTHEST, 1 / FARTHEST, along)

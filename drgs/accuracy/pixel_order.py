@@ -29,13 +29,16 @@ from typing import Any
 
 import drjit as dr
 
-from drgs.accuracy.pixel_lists import PeakDepths, PixelLists
+from drgs.accuracy.exact import RayFalloff, ewa_with_depth
+from drgs.accuracy.peak_depths import AffineDepths, RayDepths, WithAffineDepth
+from drgs.accuracy.pixel_lists import PixelLists
 from drgs.cameras.camera import Camera
+from drgs.config.approximations import ORDERS, Approximations
 from drgs.core.arrays import Rows, scatter_rows, types_of
+from drgs.splatting.footprint import Alpha, Footprint, FootprintModel, flat_columns
 from drgs.splatting.grid import PIXELS, Lanes
-from drgs.splatting.image_model import Alpha, Footprint, ImageModel, flat_columns
 from drgs.splatting.lanes import grouped_by_work, load_lane_row, load_pixels, make_lanes, pixels_of
-from drgs.splatting.projection import Splats2D
+from drgs.splatting.projection import Projection, ProjectionModel, Splats2D, ewa
 from drgs.splatting.rasterize import (
     ONE_SAMPLE,
     Layers,
@@ -46,7 +49,8 @@ from drgs.splatting.rasterize import (
     pack_tangents,
     splat_gradients,
 )
-from drgs.splatting.slots import sum_runs
+from drgs.splatting.reduction import sum_runs
+from drgs.splatting.rendering import CenterOrder
 from drgs.splatting.tiles import TileBins
 
 UNORDERED_ALPHA = 1e-4
@@ -57,27 +61,36 @@ the faint rims of large splats, whose peaks are far from everything else, would 
 uncut, a fitted scene is 52.4 dB from the true order with 16 places, and 51.3 dB with 1e-6 here."""
 
 
+@ORDERS.register("pixel")
 @dataclass(frozen=True)
-class PixelOrder:
+class PixelOrder(CenterOrder):
     """Composites by the depth of the peak along each pixel's ray.
 
     window: K, how many splats a pixel keeps waiting.
     """
 
     window: int
-    depths: PeakDepths
+    depths: AffineDepths
 
-    def seen_by(self, camera: Camera) -> PixelOrder:
+    @classmethod
+    def create(
+        cls, projection: type[ProjectionModel], approximations: Approximations
+    ) -> tuple[Projection, PixelOrder]:
+        """Return the projection with what depths at a pixel depend on, and the order."""
+        shape, depths = projection.shape_with_depth, AffineDepths()
+        if projection.falloff is RayFalloff:
+            depths = RayDepths()
+        elif projection.shape is ewa:
+            shape = ewa_with_depth
+        return shape or WithAffineDepth(projection.shape), cls(approximations.order_window, depths)
+
+    def for_camera(self, camera: Camera) -> PixelOrder:
         """For one camera."""
-        return replace(self, depths=self.depths.seen_by(camera))
+        return replace(self, depths=self.depths.for_camera(camera))
 
     def keys(self, splats: Splats2D) -> list[Any]:
         """Columns that the depth at a pixel depends on."""
         return self.depths.keys(splats)
-
-    def records(self, bins: TileBins) -> Records:
-        """All numbers of each entry's splat, with what the depth at a pixel depends on."""
-        return Records.of(bins, bins.rows.load)
 
     def composite(self, bins: TileBins, records: Records) -> _OrderedLayers:
         """See :func:`drgs.splatting.rasterize.composite`."""
@@ -131,7 +144,7 @@ class _WalkInputs:
     lists: PixelLists
     order: PixelOrder
     lanes: Lanes
-    model: ImageModel  # bound to the lanes
+    model: FootprintModel  # bound to the lanes
     samples: range  # of the lanes
 
     @staticmethod
@@ -413,7 +426,7 @@ def _sum_pixels(inputs: _WalkInputs, pairs: list[Any], g: list[list[Any]]) -> Ro
         for pixel, weight in enumerate(weights):
             g_pixel = [plane[pixel] for plane in g]
             d_stored = model.features.add_derivatives(d_stored, features, pixel, weight, g_pixel)
-        moments = model.response.moments(footprint, d_log_alpha, model.positions)
+        moments = model.falloff.moments(footprint, d_log_alpha, model.positions)
         partials.store(moments + d_stored, own)
         return (place + 1,)
 
@@ -472,7 +485,7 @@ def _tangent(
 
     def carry(met: _Met, pixel: int) -> list[Any]:
         d_geometry, d_features = d_records.load(met.entry, met.active)
-        d_log_alpha = model.response.tangent(met.geometry, met.footprint, d_geometry)[pixel]
+        d_log_alpha = model.falloff.tangent(met.geometry, met.footprint, d_geometry)[pixel]
         alpha = met.alphas[pixel]
         return [
             dr.select(alpha.smooth, alpha.value * d_log_alpha, 0),

@@ -16,8 +16,8 @@ from drgs.cameras.camera import Camera
 from drgs.core.constants import COLOR_MIN
 from drgs.core.errors import UnsupportedError
 from drgs.gaussians.sh import num_coefficients, sh_basis
+from drgs.splatting.footprint import Positions, SplatFeatures
 from drgs.splatting.grid import Lanes
-from drgs.splatting.image_model import Positions, SplatFeatures
 from drgs.splatting.projection import GaussianRows
 
 CHANNELS = 3
@@ -49,7 +49,7 @@ class RayColors(SplatFeatures):
         """Planes that come of ``num_stored`` numbers per splat."""
         return num_stored - self.num_coefficients + CHANNELS
 
-    def seen_by(self, camera: Camera) -> RayColors:
+    def for_camera(self, camera: Camera) -> RayColors:
         """For one camera, whose pixels' rays are the directions."""
         return replace(self, camera=camera)
 

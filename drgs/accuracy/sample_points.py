@@ -11,20 +11,19 @@ from dataclasses import dataclass
 from typing import Any, ClassVar
 
 from drgs.core.arrays import types_of
+from drgs.splatting.footprint import Positions
 from drgs.splatting.grid import MICRO, Lanes, TileGrid
-from drgs.splatting.image_model import total
 from drgs.splatting.lanes import load_pixels
 
 
 @dataclass(frozen=True)
-class SamplePoints:
+class SamplePoints(Positions):
     """One point in each pixel, for each of some samples.
 
     Equality is identity of the arrays: those of another pass are another model.
     """
 
     margin: ClassVar[float] = 0.5
-    """px: how far from its centre a pixel may be evaluated."""
 
     x: Any = None  # Float (samples * H * W,) in [0, 1): from the pixel's left border, px
     y: Any = None  # the same, from its upper border
@@ -52,27 +51,6 @@ class SamplePoints:
         dy = [first_y + (pixel // MICRO) + in_y for pixel, in_y in enumerate(self.bound[1])]
         return _grid(dx), _grid(dy)
 
-    def sum(self, values: list[Any]) -> Any:
-        """Of 16 values."""
-        return total(values)
-
-    def sum_dx(self, values: list[Any], dx: list) -> Any:
-        """Of values times dx."""
-        return total(_products(values, dx))
-
-    def sum_dy(self, values: list[Any], dy: list) -> Any:
-        """Of values times dy."""
-        return total(_products(values, dy))
-
-    def sum_dy_dy(self, values: list[Any], dy: list) -> Any:
-        """Of values times dy^2."""
-        return total(_products(_products(values, dy), dy))
-
 
 def _grid(values: list[Any]) -> list[list[Any]]:
     return [values[MICRO * j : MICRO * j + MICRO] for j in range(MICRO)]
-
-
-def _products(values: list[Any], grid: list[list[Any]]) -> list[Any]:
-    flat = [value for row in grid for value in row]
-    return [a * b for a, b in zip(values, flat, strict=True)]

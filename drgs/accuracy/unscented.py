@@ -16,12 +16,14 @@ from typing import Any
 
 import drjit as dr
 
-from drgs.cameras.camera import Camera, Lens, Pinhole
+from drgs.cameras.camera import Camera
+from drgs.cameras.lens import Lens, Pinhole
+from drgs.config.approximations import PROJECTIONS
 from drgs.core.arrays import types_of
 from drgs.splatting.projection import (
     FilmShape,
     GaussianRows,
-    RayTerms,
+    ProjectionModel,
     ewa,
     film_axes,
     whiten,
@@ -58,27 +60,16 @@ def unscented_shape(
         for axis, mu in zip(points.offsets, points.mean, strict=True)
     ]
     shift = types_of(type(position.z)).Array2f(points.mean)
-    means2d = camera.lens.film_point(camera, position) + shift
+    means2d = camera.lens.project_point(camera, position) + shift
     affine = ewa(rows, camera, position, low_pass)
     return dr.select(points.usable, whiten(means2d, *columns, low_pass), affine)
 
 
-def unscented_with_depth(
-    rows: GaussianRows, camera: Camera, position: Any, low_pass: float
-) -> FilmShape:
-    """As :func:`unscented_shape`, and what is needed for the depth at a pixel.
+@PROJECTIONS.register("unscented")
+class Unscented(ProjectionModel):
+    """The unscented transform."""
 
-    The Gaussian's covariance with the depth is the affine one, and h is not negative.
-    """
-    film = unscented_shape(rows, camera, position, low_pass)
-    # Where they are clamped, the splat is the affine one.
-    slopes = camera.lens.clamped_slopes(camera, position)
-    m0, m1, n = film_axes(rows, camera, position, slopes)
-    p, r, s = film.whitening
-    kx, ky = dr.dot(m0, n), dr.dot(m1, n)
-    kx, ky = dr.fma(p, kx, r * ky), s * ky
-    h = dr.squared_norm(n) - dr.fma(kx, kx, ky * ky)
-    return replace(film, ray=RayTerms(kx, ky, dr.select(h > 0, h, 0)))
+    shape = staticmethod(unscented_shape)
 
 
 @dataclass(frozen=True)
@@ -93,15 +84,17 @@ class _SigmaPoints:
 @singledispatch
 def _sigma_points(lens: Lens, rows: GaussianRows, camera: Camera, position: Any) -> _SigmaPoints:
     """Through any lens: as it projects points."""
-    center, slopes = lens.film_point(camera, position), lens.true_slopes(camera, position)
-    not_nearer = replace(camera, near=NEAREST * lens.look(camera, position)[2])
+    center, slopes = lens.project_point(camera, position), lens.true_slopes(camera, position)
+    not_nearer = replace(camera, near=NEAREST * lens.visibility(camera, position)[2])
     usable = _same(slopes, lens.clamped_slopes(camera, position))
     offsets = [[], []]
     for axis in world_axes(rows):
         for c in (SPREAD, -SPREAD):
-            seen, point, _ = lens.look(not_nearer, position + c * (camera.rotation @ axis))
+            seen, point, _ = lens.visibility(not_nearer, position + c * (camera.rotation @ axis))
             usable &= seen
-            for side, offset in zip(offsets, lens.film_point(camera, point) - center, strict=True):
+            for side, offset in zip(
+                offsets, lens.project_point(camera, point) - center, strict=True
+            ):
                 side.append(offset)
     return _SigmaPoints(offsets, [WEIGHT * sum(o[1:], o[0]) for o in offsets], usable)
 

@@ -44,7 +44,7 @@ from drgs.reference import splatting as reference
 from drgs.results import metrics
 from drgs.results.files import CONFIG, GAUSSIANS, GAUSSIANS_FOR_VIEWERS
 from drgs.splatting import rendering
-from drgs.splatting.image_model import PixelCenters, Positions
+from drgs.splatting.footprint import PixelCenters, Positions
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

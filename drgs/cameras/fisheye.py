@@ -7,14 +7,14 @@ Imported when a sensor or a dataset has one. Coefficients and what lies beyond t
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import drjit as dr
 import numpy as np
 
-from drgs.cameras.camera import Camera, Lens, uploaded, with_unseen_on_axis
+from drgs.cameras.lens import LENSES, CameraParameters, Lens
 from drgs.cameras.polynomials import (
     derivative,
     first_root,
@@ -37,6 +37,7 @@ AXIS_TERMS = {False: 8, True: 16}
 """Terms of these series in single and in double precision: 0.1^n is below their roundings."""
 
 
+@LENSES.register("fisheye")
 @dataclass(frozen=True)
 class Fisheye(Lens):
     """A point at the angle theta from the axis is seen at a distance from the principal point of
@@ -48,75 +49,47 @@ class Fisheye(Lens):
     angle has a cosine below ``min_cosine`` are not seen.
     """
 
-    label: ClassVar[str] = "Fisheye"
-    distorts: ClassVar[bool] = True
-    kind: ClassVar[str] = "fisheye"
     names: ClassVar[tuple[str, ...]] = ("k1", "k2", "k3", "k4")
 
-    coefficients: tuple[Any, ...]
+    radial_terms: tuple[Any, ...]  # k1 up to the last that is given
     min_cosine: Any
 
-    @staticmethod
-    def of(**coefficients: float) -> Fisheye:
-        """From OpenCV's names, ``k1`` to ``k4``; what is not given is zero."""
-        assert set(coefficients) <= set(Fisheye.names)
-        kept = up_to_the_last(Fisheye.names, usable_coefficients(coefficients))
-        growth = [1.0, *((2 * n + 3) * k for n, k in enumerate(kept))]
+    @classmethod
+    def from_coefficients(cls, **coefficients: float) -> Fisheye:
+        """Return the lens with OpenCV's ``k1`` to ``k4``; what is not given is zero."""
+        terms = up_to_the_last(cls.names, usable_coefficients(coefficients))
+        growth = [1.0, *((2 * n + 3) * k for n, k in enumerate(terms))]
         turn = math.sqrt(first_root(np.array(growth)))
-        return Fisheye(kept, math.cos(min(turn, MAX_ANGLE)))
+        return cls(terms, math.cos(min(turn, MAX_ANGLE)))
 
-    def upload(self, float_type: type) -> Fisheye:
-        """For kernels of this precision."""
-        return uploaded(self, float_type)
+    def coefficients(self) -> dict[str, Any]:
+        """Return the coefficients that are not left out."""
+        return dict(zip(self.names, self.radial_terms, strict=False))
 
-    def named(self) -> dict[str, Any]:
-        """The coefficients that are not left out, by OpenCV's names."""
-        return dict(zip(self.names, self.coefficients, strict=False))
+    def with_coefficients(self, values: Mapping[str, Any]) -> Fisheye:
+        """Return other numbers for the same coefficients; where the model ends stays as it is."""
+        names = self.names[: len(self.radial_terms)]
+        return replace(self, radial_terms=tuple(values[name] for name in names))
 
-    def with_named(self, values: dict[str, Any]) -> Fisheye:
-        """Other numbers for the same coefficients; where the model ends stays as it is."""
-        names = self.names[: len(self.coefficients)]
-        return replace(self, coefficients=tuple(values[name] for name in names))
+    def shows(self, position: Any) -> Any:
+        """Return whether a point's angle from the axis is within the model, Bool."""
+        return position.z > self.min_cosine * dr.norm(position)
 
-    # What kernels call: see ``drgs.cameras.camera``.
-
-    def look(self, camera: Camera, position: Any) -> tuple[Any, Any, Any]:
-        """Whether a mean is seen, its position, and its distance."""
-        distance = dr.norm(position)
-        seen = (distance >= camera.near) & (position.z > self.min_cosine * distance)
-        _, position, _ = with_unseen_on_axis(position, seen)
-        return seen, position, dr.norm(position)
-
-    def true_slopes(self, camera: Camera, position: Any) -> None:
-        """None: the projection is linearised at the mean, wherever it is."""
-        del camera, position
-
-    clamped_slopes = true_slopes
-
-    def film_point(self, camera: Camera, position: Any) -> Any:
-        """Where a point is on the film, Array2f, px."""
-        place = types_of(type(position.x)).Array2f(*place_of(position, self.coefficients))
+    def project_point(self, camera: CameraParameters, position: Any) -> Any:
+        """Return the place of a point on the film, Array2f, px."""
+        place = types_of(type(position.x)).Array2f(*place_of(position, self.radial_terms))
         return camera.focal * place + camera.principal
 
-    def film_directions(self, camera: Camera, position: Any, slopes: None) -> list[Any]:
-        """Derivatives of the place on the film, two Array3f, world."""
+    def projection_jacobian(
+        self, camera: CameraParameters, position: Any, slopes: None = None
+    ) -> list[Any]:
+        """Return the derivatives of the place on the film, two Array3f, world."""
         del slopes
-        directions = place_directions(camera, position, self.coefficients)
+        directions = place_directions(camera, position, self.radial_terms)
         return [f * direction for f, direction in zip(camera.focal, directions, strict=True)]
 
-    def depth_direction(self, camera: Camera, position: Any) -> Any:
-        """Derivative of the distance divided by the distance, Array3f, world."""
-        right, down, forward = camera.rotation
-        x, y, z = position / dr.squared_norm(position)
-        return x * right + y * down + z * forward
-
-    def ray_range(self, direction: Any, near: Any, far: Any) -> tuple[Any, Any]:
-        """Where a ray of unit ``direction`` reaches two depths."""
-        del direction
-        return near, far
-
-    def ray(self, camera: Camera, x: Any, y: Any) -> Any:
-        """Through a point of the film (px), Array3f, camera axes."""
+    def ray(self, camera: CameraParameters, x: Any, y: Any) -> Any:
+        """Return the direction of the ray through a place of the film (px), Array3f."""
         t = types_of(type(x))
         film = (t.Array2f(x, y) - camera.principal) / camera.focal
         squared = dr.squared_norm(film)
@@ -135,7 +108,7 @@ class Fisheye(Lens):
     def _distorted_angle(self, angle: Any) -> tuple[Any, Any]:
         """theta_d of an angle, and its derivative."""
         squared = angle * angle
-        h, dh = polynomial(self.coefficients, squared), derivative(self.coefficients, squared)
+        h, dh = polynomial(self.radial_terms, squared), derivative(self.radial_terms, squared)
         return h * angle, h + 2 * dh * squared
 
 
@@ -147,7 +120,9 @@ def place_of(position: Any, coefficients: Sequence[Any] = ()) -> tuple[Any, Any]
     return scale * x, scale * y
 
 
-def place_directions(camera: Camera, position: Any, coefficients: Sequence[Any] = ()) -> list[Any]:
+def place_directions(
+    camera: CameraParameters, position: Any, coefficients: Sequence[Any] = ()
+) -> list[Any]:
     """Derivatives of that place, two Array3f, world: per scene unit.
 
     With rho^2 = x^2 + y^2, n^2 = rho^2 + z^2, a = theta / rho, b = (d a / d rho) / rho, and

@@ -23,10 +23,13 @@ SLOWEST = 1e-4
 
 @dataclass(frozen=True)
 class Motion:
-    """From the first pose to the second."""
+    """From the first pose to the second; its subclasses are shutters.
 
-    label: ClassVar[str]
-    """What messages call it."""
+    ``cameras`` of a shutter are those whose images are averaged, ``camera_of`` the camera, without
+    a shutter, that sees each of some means.
+    """
+
+    label: ClassVar[str]  # for messages
 
     travel: Any  # Array3f, world: of the centre
     turn: Any  # Array3f, camera axes: axis times angle (radians), below half a turn
@@ -106,12 +109,12 @@ class RollingShutter(Motion):
         """One step of Newton's method, and whether the time is on the film."""
         at = self.pose(camera, time)
         offset = means - at.center
-        seen, position, _ = at.lens.look(at, at.rotation @ offset)
+        seen, position, _ = at.lens.visibility(at, at.rotation @ offset)
         height = camera.film_end.y - camera.film_start.y
-        row = (at.lens.film_point(at, position).y - camera.film_start.y) / height
+        row = (at.lens.project_point(at, position).y - camera.film_start.y) / height
         with dr.suspend_grad():
             slopes = at.lens.true_slopes(at, position)
-            _, down = at.lens.film_directions(at, position, slopes)
+            _, down = at.lens.projection_jacobian(at, position, slopes)
             rate = dr.dot(down, self.velocity(at, offset)) / height
             # Where rows run away from the reader as fast as it reads, no time is the right one.
             rate = dr.select(seen & (rate < 0.5), rate, 0)

@@ -12,9 +12,8 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
+from drgs.cameras.lens import check_coefficients
 from drgs.core.arrays import types_of
-from drgs.core.constants import MAX_COEFFICIENT
-from drgs.core.errors import UserError
 
 NEGLIGIBLE_COEFFICIENT = 1e-30
 """A smaller one is as good as 0: at a slope of 1e4, k3 r^6 is 1e-6. Roots of polynomials with
@@ -94,14 +93,9 @@ def _between(low: Any, high: Any) -> Any:
 def usable_coefficients(given: Mapping[str, float]) -> dict[str, float]:
     """Return the same coefficients with 0 for negligible ones.
 
-    Raises :class:`UserError` naming the first that is larger than :data:`MAX_COEFFICIENT`.
+    Raises :class:`UserError` naming the first that is larger than ``MAX_COEFFICIENT``.
     """
-    for name, value in given.items():
-        if not abs(value) <= MAX_COEFFICIENT:
-            raise UserError(
-                f"{name} must be a coefficient of at most {MAX_COEFFICIENT:g} in size, got "
-                f"{value:g}; calibrate the camera again"
-            )
+    check_coefficients(given)
     return {n: v if abs(v) >= NEGLIGIBLE_COEFFICIENT else 0.0 for n, v in given.items()}
 
 

@@ -1,7 +1,7 @@
 """OpenCV's lens with radial and tangential distortion.
 
 Imported when a sensor or a dataset has one. Coefficients are numbers of the host, or Dr.Jit scalars
-after :meth:`RadialTangential.upload`; one that is not given is left out (of a polynomial, those
+after :meth:`Lens.upload`; one that is not given is left out (of a polynomial, those
 behind the last one that is; or both tangential ones), so that nothing is computed for it.
 
 Outside the part of the film's plane that the model is made for, its polynomials turn around and
@@ -11,13 +11,14 @@ at which the model first turns, in whatever direction, is not seen at all.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import drjit as dr
 
-from drgs.cameras.camera import Camera, Perspective, uploaded, with_unseen_on_axis
 from drgs.cameras.distortion import PlaneDistortion, largest_squared_radius, steepest_fall
+from drgs.cameras.lens import LENSES, CameraParameters, Perspective, with_unseen_on_axis
 from drgs.cameras.polynomials import (
     UNBOUNDED,
     derivative,
@@ -34,6 +35,7 @@ MISSED = 1e-6
 """Squared, of slopes: how far Newton's method may end from the point that it looked for."""
 
 
+@LENSES.register("opencv")
 @dataclass(frozen=True)
 class RadialTangential(PlaneDistortion, Perspective):
     """OpenCV's lens: slopes (x, y) are distorted before they come to the film.
@@ -46,9 +48,6 @@ class RadialTangential(PlaneDistortion, Perspective):
     is beyond ``max_squared_radius`` are not seen.
     """
 
-    label: ClassVar[str] = "RadialTangential"
-    distorts: ClassVar[bool] = True
-    kind: ClassVar[str] = "opencv"
     names: ClassVar[tuple[str, ...]] = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 
     numerator: tuple[Any, ...]  # k1, k2, k3
@@ -57,16 +56,14 @@ class RadialTangential(PlaneDistortion, Perspective):
     max_squared_radius: Any  # of the slopes
     on_film: Any = None  # (2) Array2f: the least and the largest slopes on the film
 
-    @staticmethod
-    def of(**coefficients: float) -> RadialTangential:
-        """From OpenCV's names, ``k1`` to ``k6``, ``p1``, ``p2``; what is not given is zero."""
-        names = RadialTangential.names
-        assert set(coefficients) <= set(names)
-        coefficients = usable_coefficients(coefficients)
+    @classmethod
+    def from_coefficients(cls, **coefficients: float) -> RadialTangential:
+        """Return the lens with OpenCV's ``k1`` to ``k6``, ``p1``, ``p2``; others are zero."""
+        names, coefficients = cls.names, usable_coefficients(coefficients)
         p1, p2 = (float(coefficients.get(name, 0.0)) for name in names[6:])
         numerator = up_to_the_last(names[:3], coefficients)
         denominator = up_to_the_last(names[3:6], coefficients)
-        return RadialTangential(
+        return cls(
             numerator=numerator,
             denominator=denominator,
             tangential=(p1, p2) if set(coefficients) & set(names[6:]) else (),
@@ -75,19 +72,15 @@ class RadialTangential(PlaneDistortion, Perspective):
             ),
         )
 
-    def upload(self, float_type: type) -> RadialTangential:
-        """For kernels of this precision."""
-        return uploaded(self, float_type)
-
-    def named(self) -> dict[str, Any]:
-        """The coefficients that are not left out, by OpenCV's names."""
+    def coefficients(self) -> dict[str, Any]:
+        """Return the coefficients that are not left out."""
         names = (*self.names[: len(self.numerator)], *self.names[3 : 3 + len(self.denominator)])
         names += self.names[6:] if self.tangential else ()
         values = (*self.numerator, *self.denominator, *self.tangential)
         return dict(zip(names, values, strict=True))
 
-    def with_named(self, values: dict[str, Any]) -> RadialTangential:
-        """Other numbers for the same coefficients; where the model ends stays as it is."""
+    def with_coefficients(self, values: Mapping[str, Any]) -> RadialTangential:
+        """Return other numbers for the same coefficients; where the model ends stays as it is."""
         k, p = self.names[:6], self.names[6:]
         return replace(
             self,
@@ -107,22 +100,22 @@ class RadialTangential(PlaneDistortion, Perspective):
         change = change - self.radial(squared) * derivative(self.denominator, squared)
         return change / denominator
 
-    # What kernels call: see ``drgs.cameras.camera``.
-
-    def look(self, camera: Camera, position: Any) -> tuple[Any, Any, Any]:
-        """Whether a mean is seen, its position, and its depth."""
+    def visibility(self, camera: CameraParameters, position: Any) -> tuple[Any, Any, Any]:
+        """Return whether a point is seen, its position, and its depth."""
         x, y, z = position
         # Not divided by z, which may be zero.
         limit = self.max_squared_radius * z * z
         return with_unseen_on_axis(position, (z >= camera.near) & (x * x + y * y < limit))
 
-    def film_point(self, camera: Camera, position: Any) -> Any:
-        """Where a point is on the film, Array2f, px."""
+    def project_point(self, camera: CameraParameters, position: Any) -> Any:
+        """Return the place of a point on the film, Array2f, px."""
         slopes = self.distort(*self.true_slopes(camera, position))
         return camera.focal * types_of(type(position.z)).Array2f(*slopes) + camera.principal
 
-    def film_directions(self, camera: Camera, position: Any, slopes: list[Any]) -> list[Any]:
-        """Derivatives of the place on the film, two Array3f, world."""
+    def projection_jacobian(
+        self, camera: CameraParameters, position: Any, slopes: list[Any]
+    ) -> list[Any]:
+        """Return the derivatives of the place on the film, two Array3f, world."""
         xx, xy, yx, yy = self.distortion_jacobian(*slopes)
         right, down, forward = camera.rotation
         dx, dy = (
@@ -131,23 +124,23 @@ class RadialTangential(PlaneDistortion, Perspective):
         )
         return [camera.focal.x * (xx * dx + xy * dy), camera.focal.y * (yx * dx + yy * dy)]
 
-    def fitted(self, camera: Camera) -> RadialTangential:
-        """The lens that knows what the film of ``camera`` sees."""
+    def for_camera(self, camera: CameraParameters) -> RadialTangential:
+        """Return the lens that knows what the film of ``camera`` sees."""
         return replace(self, on_film=_slopes_on_border(self, camera))
 
-    def frustum(self, camera: Camera) -> tuple[Any, Any]:
-        """The least and the largest slopes on the film."""
+    def frustum(self, camera: CameraParameters) -> tuple[Any, Any]:
+        """Return the least and the largest slopes on the film."""
         del camera
         return self.on_film
 
-    def ray(self, camera: Camera, x: Any, y: Any) -> Any:
-        """Through a point of the film (px), Array3f, camera axes."""
+    def ray(self, camera: CameraParameters, x: Any, y: Any) -> Any:
+        """Return the direction of the ray through a place of the film (px), Array3f."""
         t = types_of(type(x))
         film = (t.Array2f(x, y) - camera.principal) / camera.focal
         return t.Array3f(*self.undistort(film.x, film.y), 1)
 
 
-def _slopes_on_border(lens: RadialTangential, camera: Camera) -> tuple[Any, Any]:
+def _slopes_on_border(lens: RadialTangential, camera: CameraParameters) -> tuple[Any, Any]:
     """The box around the slopes of points on the film's border.
 
     Where the lens does not see all of them, the box says nothing about what it sees: then only the

@@ -13,9 +13,9 @@ from typing import Any, ClassVar
 
 import drjit as dr
 
-from drgs.cameras.camera import Camera
 from drgs.cameras.distortion import PlaneDistortion, largest_squared_radius, steepest_fall
 from drgs.cameras.fisheye import MAX_ANGLE, Fisheye, place_directions, place_of
+from drgs.cameras.lens import LENSES, CameraParameters
 from drgs.cameras.polynomials import derivative, polynomial, up_to_the_last, usable_coefficients
 from drgs.core.arrays import types_of
 
@@ -23,6 +23,7 @@ RADIAL, TANGENTIAL, PRISM = ("k1", "k2", "k3", "k4"), ("p1", "p2"), ("sx1", "sy1
 """Names of coefficients."""
 
 
+@LENSES.register("thin_prism_fisheye")
 @dataclass(frozen=True)
 class ThinPrismFisheye(PlaneDistortion, Fisheye):
     """A fisheye whose elements are not quite centred and not quite upright.
@@ -39,34 +40,31 @@ class ThinPrismFisheye(PlaneDistortion, Fisheye):
     COLMAP itself shows nothing beside and behind the camera.
     """
 
-    label: ClassVar[str] = "ThinPrismFisheye"
-    kind: ClassVar[str] = "thin_prism_fisheye"
     names: ClassVar[tuple[str, ...]] = (*RADIAL, *TANGENTIAL, *PRISM)
 
     tangential: tuple[Any, ...] = ()  # p1, p2; or none
     prism: tuple[Any, ...] = ()  # sx1, sy1; or none
 
-    @staticmethod
-    def of(**coefficients: float) -> ThinPrismFisheye:
-        """From COLMAP's names, ``k1`` to ``k4``, ``p1``, ``p2``, ``sx1``, ``sy1``; others are 0."""
-        assert set(coefficients) <= set(ThinPrismFisheye.names)
+    @classmethod
+    def from_coefficients(cls, **coefficients: float) -> ThinPrismFisheye:
+        """Return the lens with COLMAP's coefficients; what is not given is zero."""
         coefficients = usable_coefficients(coefficients)
         kept = up_to_the_last(RADIAL, coefficients)
         tangential, prism = (_both_or_none(names, coefficients) for names in (TANGENTIAL, PRISM))
         fall = steepest_fall(tangential or (0.0, 0.0), prism or (0.0, 0.0))
         angle = min(math.sqrt(largest_squared_radius(kept, (), fall)), MAX_ANGLE)
-        return ThinPrismFisheye(kept, math.cos(angle), tangential, prism)
+        return cls(kept, math.cos(angle), tangential, prism)
 
-    def named(self) -> dict[str, Any]:
-        """The coefficients that are not left out, by COLMAP's names."""
+    def coefficients(self) -> dict[str, Any]:
+        """Return the coefficients that are not left out."""
         tangential = dict(zip(TANGENTIAL, self.tangential, strict=False))
         prism = dict(zip(PRISM, self.prism, strict=False))
-        return {**super().named(), **tangential, **prism}
+        return {**super().coefficients(), **tangential, **prism}
 
-    def with_named(self, values: dict[str, Any]) -> ThinPrismFisheye:
-        """Other numbers for the same coefficients; where the model ends stays as it is."""
+    def with_coefficients(self, values: Mapping[str, Any]) -> ThinPrismFisheye:
+        """Return other numbers for the same coefficients; where the model ends stays as it is."""
         return replace(
-            super().with_named(values),
+            super().with_coefficients(values),
             tangential=tuple(values[name] for name in TANGENTIAL if self.tangential),
             prism=tuple(values[name] for name in PRISM if self.prism),
         )
@@ -78,11 +76,11 @@ class ThinPrismFisheye(PlaneDistortion, Fisheye):
 
     def radial(self, squared: Any) -> Any:
         """L at r^2."""
-        return polynomial(self.coefficients, squared)
+        return polynomial(self.radial_terms, squared)
 
     def radial_derivative(self, squared: Any) -> Any:
         """d L / d r^2."""
-        return derivative(self.coefficients, squared)
+        return derivative(self.radial_terms, squared)
 
     def is_radial(self) -> bool:
         """Whether places are moved along their radius alone."""
@@ -104,22 +102,22 @@ class ThinPrismFisheye(PlaneDistortion, Fisheye):
         sx1, sy1 = self.prism
         return xx + 2 * sx1 * x, xy + 2 * sx1 * y, yx + 2 * sy1 * x, yy + 2 * sy1 * y
 
-    # What kernels call, where it is not what a fisheye does: see ``drgs.cameras.camera``.
-
-    def film_point(self, camera: Camera, position: Any) -> Any:
-        """Where a point is on the film, Array2f, px."""
+    def project_point(self, camera: CameraParameters, position: Any) -> Any:
+        """Return the place of a point on the film, Array2f, px."""
         place = types_of(type(position.x)).Array2f(*self.distort(*place_of(position)))
         return camera.focal * place + camera.principal
 
-    def film_directions(self, camera: Camera, position: Any, slopes: None) -> list[Any]:
-        """Derivatives of the place on the film, two Array3f, world."""
+    def projection_jacobian(
+        self, camera: CameraParameters, position: Any, slopes: None = None
+    ) -> list[Any]:
+        """Return the derivatives of the place on the film, two Array3f, world."""
         del slopes
         xx, xy, yx, yy = self.distortion_jacobian(*place_of(position))
         dx, dy = place_directions(camera, position)
         return [camera.focal.x * (xx * dx + xy * dy), camera.focal.y * (yx * dx + yy * dy)]
 
-    def ray(self, camera: Camera, x: Any, y: Any) -> Any:
-        """Through a point of the film (px), Array3f, camera axes, of unit length."""
+    def ray(self, camera: CameraParameters, x: Any, y: Any) -> Any:
+        """Return the unit direction of the ray through a place of the film (px), Array3f."""
         t = types_of(type(x))
         film = (t.Array2f(x, y) - camera.principal) / camera.focal
         u, v = self.undistort(film.x, film.y)

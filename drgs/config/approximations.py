@@ -16,8 +16,10 @@ from typing import Annotated, Literal, get_args, get_type_hints
 
 import numpy as np
 
+from drgs.core.class_registry import ClassRegistry
 from drgs.core.constants import ALPHA_CUT, ALPHA_MAX, LOW_PASS, TRANSMITTANCE_STOP
 from drgs.core.errors import UserError, UserNote, did_you_mean, listed, one_line
+from drgs.core.registry import ENTRY_POINT_GROUP
 
 Value = bool | int | float | str
 
@@ -61,6 +63,25 @@ class Unrounded:
     value: float
 
 
+PROJECTIONS = ClassRegistry(
+    "projection",
+    {
+        "ewa": "drgs.splatting.projection",
+        "unscented": "drgs.accuracy.unscented",
+        "exact": "drgs.accuracy.exact",
+    },
+)
+"""Classes derived from ``drgs.splatting.projection.ProjectionModel``."""
+
+FALLOFFS = ClassRegistry("falloff", {"gaussian": "drgs.splatting.footprint"})
+"""Classes derived from ``drgs.splatting.footprint.GaussianFalloff``."""
+
+ORDERS = ClassRegistry(
+    "order", {"center": "drgs.splatting.rendering", "pixel": "drgs.accuracy.pixel_order"}
+)
+"""Classes derived from ``drgs.splatting.rendering.CenterOrder``."""
+
+
 @dataclass(frozen=True)
 class Approximations:
     """The approximations that a picture is made with; the defaults are those of 3DGS.
@@ -71,13 +92,20 @@ class Approximations:
     """
 
     projection: Annotated[
-        Literal["ewa", "unscented", "exact"],
+        str,
+        PROJECTIONS,
         "How a Gaussian comes to the film. ewa: by the affine approximation at its mean; "
         "unscented: by the mean and covariance of projected sigma points; exact: by its peak along "
         "each pixel's ray.",
     ] = "ewa"
+    falloff: Annotated[
+        str,
+        FALLOFFS,
+        "How alpha falls off around a splat. gaussian: as the projected Gaussian does.",
+    ] = "gaussian"
     order: Annotated[
-        Literal["center", "pixel"],
+        str,
+        ORDERS,
         "In which splats are composited. center: by the depth of their means; pixel: by that of "
         "their peaks along each pixel's ray.",
     ] = "center"
@@ -158,21 +186,31 @@ class Declared:
     kind: type  # bool, int, float or str
     default: Value
     description: str
-    words: tuple[str, ...] = ()  # of a str: those that it may be
+    given_words: tuple[str, ...] = ()  # of a str: those that it may be
+    registry: ClassRegistry | None = None  # of a str: whose names it may be
     limits: Limits | None = None  # of a number
     unrounded: float | None = None  # the default, where configurations write another number
+
+    @property
+    def words(self) -> tuple[str, ...]:
+        """What a text may be; those of installed packages included."""
+        return self.given_words if self.registry is None else self.registry.words()
 
     @property
     def expected(self) -> str:
         """What messages ask for, behind "must be"."""
         if self.limits is not None:
             return self.limits.words
-        return f"one of {', '.join(self.words)}" if self.words else "true or false"
+        others = f' or of a package with an entry point of the group "{ENTRY_POINT_GROUP}"'
+        others = others if self.registry else ""
+        return f"one of {', '.join(self.words)}{others}" if self.words else "true or false"
 
     def allows(self, value: Value) -> bool:
         """Whether a value of this kind is within the limits."""
         if self.limits is not None:
             return self.limits.hold_for(value)
+        if self.registry is not None:
+            return value in self.registry
         return not self.words or value in self.words
 
 
@@ -207,15 +245,16 @@ def _declared() -> dict[str, Declared]:
     """Read the annotations."""
     hints, result = get_type_hints(Approximations, include_extras=True), {}
     for field in fields(Approximations):
-        kind, description, *extras = get_args(hints[field.name])
+        kind, *extras = get_args(hints[field.name])
         words = get_args(kind)
         found = {type(extra): extra for extra in extras}
         unrounded = found.get(Unrounded)
         result[field.name] = Declared(
             kind=str if words else kind,
             default=field.default,
-            description=description,
-            words=words,
+            description=found[str],
+            given_words=words,
+            registry=found.get(ClassRegistry),
             limits=found.get(Limits),
             unrounded=None if unrounded is None else unrounded.value,
         )

@@ -27,7 +27,7 @@ from pydantic import (
     model_validator,
 )
 
-from drgs.config.approximations import DECLARED, Approximations, Declared
+from drgs.config.approximations import DECLARED, Approximations, Declared, Value
 from drgs.config.density import (
     REFERENCE_START,
     REFERENCE_STOP,
@@ -245,7 +245,7 @@ pictures of views that were not trained on. What was fitted says so in its file.
 def _as_field(name: str, declared: Declared) -> tuple[Any, Any]:
     """An approximation as a configuration has it; YAML has no infinity, which is null there."""
     default, description = FITTED_WITH.get(name, declared.default), declared.description
-    kind = Literal[declared.words] if declared.words else declared.kind
+    kind = Literal[declared.given_words] if declared.given_words else declared.kind
     if declared.unrounded is not None:
         default = declared.unrounded
     elif default == math.inf:
@@ -271,10 +271,10 @@ class ModelConfig(_ModelWithApproximations):
         "at other sizes (the 3D filter of Mip-Splatting, Yu et al. 2024).",
     )
 
-    @field_validator(*(name for name, declared in DECLARED.items() if declared.limits))
+    @field_validator(*(name for name, d in DECLARED.items() if d.limits or d.registry))
     @classmethod
-    def _check_in_single_precision(cls, value: float | None, field: ValidationInfo) -> float | None:
-        """A number may be rounded onto a limit."""
+    def _check(cls, value: Value | None, field: ValidationInfo) -> Value | None:
+        """Check names, and numbers in single precision: they may be rounded onto a limit."""
         declared = DECLARED[field.field_name]
         if value is not None and not declared.allows(value):
             raise ValueError(f"must be {declared.expected}")

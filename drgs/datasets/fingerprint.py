@@ -91,8 +91,8 @@ def fingerprint_of(dataset: Dataset, reads: Keeps = all_of_them) -> Fingerprint:
 def _print_of(view: View, digests: dict[Path, str]) -> ViewPrint:
     camera, kinds = [*view.camera_to_world.ravel(), view.fx, view.fy, view.cx, view.cy], []
     if view.lens is not None:
-        kinds.append(f"{view.lens.kind} {' '.join(view.lens.named())}")
-        camera += view.lens.named().values()
+        kinds.append(f"{view.lens.kind} {' '.join(view.lens.coefficients())}")
+        camera += view.lens.coefficients().values()
     if view.motion is not None:
         kinds.append(view.motion.shutter)
         camera += [*view.motion.close_to_world.ravel()]

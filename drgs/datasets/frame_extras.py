@@ -12,7 +12,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from drgs.cameras.camera import Lens
+from drgs.cameras.lens import Lens
 from drgs.config.schema import DataConfig
 from drgs.core.errors import UserError
 from drgs.datasets.images import downscale_depth, downscale_mask, is_array, read_depth, read_mask
@@ -93,7 +93,7 @@ def notes(config: DataConfig, frames: Sequence[Frame]) -> str:
     """What frames have of it, and what is left out, for a dataset's description."""
     left_out, text = ignored(config, frames), ""
     lenses = filter(None, map(lens_of, frames))
-    if found := sorted({f"{lens.kind} ({', '.join(lens.named())})" for lens in lenses}):
+    if found := sorted({f"{lens.kind} ({', '.join(lens.coefficients())})" for lens in lenses}):
         text += f"; lens {' and '.join(found)}"
         text += " ignored" if "distortion" in left_out else ""
     if "masks" in left_out:

@@ -23,13 +23,12 @@ from drgs.config.explain import expectation
 from drgs.core.constants import MAX_COEFFICIENT
 from drgs.core.errors import UserError, listed, one_line
 from drgs.core.files import read_text, shortened
+from drgs.core.registry import ENTRY_POINT_GROUP
 from drgs.datasets.types import Motion
 from drgs.io.pictures import MAX_SIDE
 
 if TYPE_CHECKING:
-    from drgs.cameras.camera import Lens
-    from drgs.cameras.fisheye import Fisheye
-    from drgs.cameras.radial_tangential import RadialTangential
+    from drgs.cameras.lens import Lens
 
 MAX_BYTES = 1 << 28
 """Of a transforms file: 268 MB, a thousand bytes for each of a quarter of a million views."""
@@ -62,12 +61,10 @@ RATIONAL_MODEL = "FULL_OPENCV"
 THIN_PRISM_MODEL = "THIN_PRISM_FISHEYE"
 """The model of a fisheye that has more than k1 to k4."""
 
-FISHEYE_MODELS = (
-    "SIMPLE_RADIAL_FISHEYE",
-    "RADIAL_FISHEYE",
-    "OPENCV_FISHEYE",
-    THIN_PRISM_MODEL,
-)
+PLANE_MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", RATIONAL_MODEL)
+FISHEYE_MODELS = ("SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "OPENCV_FISHEYE", THIN_PRISM_MODEL)
+COLMAP_MODELS = (*PLANE_MODELS, *FISHEYE_MODELS)
+"""COLMAP's models that are read."""
 """The others are a pinhole camera apart from their distortion."""
 
 WITHOUT_EFFECT = frozenset(
@@ -122,6 +119,20 @@ def _opencv_pose(rows: list[list[float]]) -> np.ndarray:
     return between_opencv_and_opengl(matrix)
 
 
+def _known_model(model: str) -> str:
+    """A model of COLMAP or the name of a lens."""
+    if model not in COLMAP_MODELS:
+        from drgs.cameras.lens import LENSES
+
+        if model not in LENSES.names():
+            raise ValueError(
+                f"must be one of {', '.join(COLMAP_MODELS)}, or a lens: "
+                f"{', '.join(LENSES.names())}; others come with packages that have an entry point "
+                f'of the group "{ENTRY_POINT_GROUP}"'
+            )
+    return model
+
+
 Number = Annotated[float, Field(allow_inf_nan=False)]
 Coefficient = Annotated[float, Field(ge=-MAX_COEFFICIENT, le=MAX_COEFFICIENT)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
@@ -130,12 +141,16 @@ Angle = Annotated[Number, AfterValidator(_angle)]
 Text = Annotated[str, Field(min_length=1)]
 Rows = list[list[Annotated[Number, AfterValidator(_coordinate)]]]
 Pose = Annotated[Rows, AfterValidator(_opencv_pose)]
+Model = Annotated[str, AfterValidator(_known_model)]
 
 
 class CameraValues(BaseModel):
-    """What may stand at the top of a file, for all frames, or in a frame. None: it does not."""
+    """What may stand at the top of a file, for all frames, or in a frame. None: it does not.
 
-    model_config = ConfigDict(strict=True, frozen=True)
+    Other keys may be coefficients of a lens that drgs does not ship.
+    """
+
+    model_config = ConfigDict(strict=True, frozen=True, extra="allow")
 
     camera_angle_x: Angle | None = None  # radians, across the picture's width
     camera_angle_y: Angle | None = None
@@ -155,21 +170,7 @@ class CameraValues(BaseModel):
     p2: Coefficient | None = None
     sx1: Coefficient | None = None
     sy1: Coefficient | None = None
-    camera_model: (
-        Literal[
-            "SIMPLE_PINHOLE",
-            "PINHOLE",
-            "SIMPLE_RADIAL",
-            "RADIAL",
-            "OPENCV",
-            "FULL_OPENCV",
-            "SIMPLE_RADIAL_FISHEYE",
-            "RADIAL_FISHEYE",
-            "OPENCV_FISHEYE",
-            "THIN_PRISM_FISHEYE",
-        ]
-        | None
-    ) = None  # as nerfstudio writes it
+    camera_model: Model | None = None  # as nerfstudio writes it, or the name of a lens
     is_fisheye: Annotated[bool | None, Strict(False)] = None  # as instant-ngp does
     shutter: Literal["global", "rolling"] | None = None  # all pixels at once, or row after row
     mask_path: Text | None = None
@@ -217,7 +218,9 @@ class Frame:
 
     def where(self, key: str) -> str:
         """The key as messages name it, with the file and the frame that holds it, if one does."""
-        in_frame = getattr(self.own, key) is not None or key not in CameraValues.model_fields
+        is_inherited = getattr(self.own, key, None) is None and hasattr(self.values, key)
+        in_frame = key in FrameValues.model_fields.keys() - CameraValues.model_fields.keys()
+        in_frame = in_frame or not is_inherited
         return f"{self.path}: frames[{self.index}].{key}" if in_frame else f"{self.path}: {key}"
 
 
@@ -259,15 +262,30 @@ def note_unread(path: Path, keys: Sequence[str]) -> str:
 
 def _unread(content: Mapping[str, object]) -> list[str]:
     """Sorted; those of frames as ``frames[].key``."""
-    top = content.keys() - Transforms.model_fields.keys() - WITHOUT_EFFECT
-    in_frames = set().union(*content["frames"]) - FrameValues.model_fields.keys() - WITHOUT_EFFECT
+    frames = content["frames"]
+    models = {values.get("camera_model") for values in (content, *frames)}
+    without_effect = WITHOUT_EFFECT.union(*(_coefficients(model) for model in models))
+    top = content.keys() - Transforms.model_fields.keys() - without_effect
+    in_frames = set().union(*frames) - FrameValues.model_fields.keys() - without_effect
     keys = [*sorted(top), *(f"frames[].{key}" for key in sorted(in_frames))]
     return [one_line(key, 60) for key in keys]
 
 
+def _coefficients(model: str | None) -> tuple[str, ...]:
+    """Return the names of the coefficients of a lens, if ``model`` is none of COLMAP's."""
+    if model in (None, *COLMAP_MODELS):
+        return ()
+    from drgs.cameras.lens import LENSES
+
+    return LENSES.get(model).value.coefficient_names()
+
+
 def _inherited(own: FrameValues, meta: Transforms) -> FrameValues:
-    missing = [name for name in CameraValues.model_fields if getattr(own, name) is None]
-    return own.model_copy(update={name: getattr(meta, name) for name in missing})
+    inherited = {name: getattr(meta, name) for name in CameraValues.model_fields}
+    inherited |= meta.model_extra
+    return own.model_copy(
+        update={k: v for k, v in inherited.items() if getattr(own, k, None) is None}
+    )
 
 
 def _explained(error: ErrorDetails) -> str:
@@ -321,39 +339,49 @@ def principal_point(value: float, where: str, size: int) -> float:
 
 
 def lens_of(frame: Frame) -> Lens | None:
-    """The lens that a frame names, with its coefficients; None for a pinhole."""
-    is_fisheye = frame.values.camera_model in FISHEYE_MODELS or bool(frame.values.is_fisheye)
-    given = {name: getattr(frame.values, name) for name in DISTORTION}
-    coefficients = {name: value for name, value in given.items() if value}
+    """Return the lens that a frame names, with its coefficients; None for a pinhole."""
+    model, values = frame.values.camera_model, frame.values
+    if model not in (None, *COLMAP_MODELS):
+        return _lens_by_name(frame, model)
+    is_fisheye = model in FISHEYE_MODELS or bool(values.is_fisheye)
+    coefficients = {name: value for name in DISTORTION if (value := getattr(values, name))}
     if not is_fisheye and not coefficients:
         return None
     _check_fourth(frame, coefficients, is_fisheye)
-    kind = _lens_type(frame.values.camera_model, is_fisheye, coefficients)
-    for name in coefficients:
-        if name not in kind.names:
+    return _with_coefficients(frame, _lens_name(model, is_fisheye, coefficients), coefficients)
+
+
+def _lens_by_name(frame: Frame, name: str) -> Lens | None:
+    """Return a lens of the registry, with the coefficients that the frame has by name."""
+    given = {n: v for n in _coefficients(name) if (v := getattr(frame.values, n, None)) is not None}
+    for key, value in given.items():
+        if type(value) not in (int, float) or not math.isfinite(value):
+            raise UserError(f"{frame.where(key)} must be a finite number, got {_show(value)}")
+    return None if name == "pinhole" else _with_coefficients(frame, name, given)
+
+
+def _with_coefficients(frame: Frame, name: str, coefficients: Mapping[str, float]) -> Lens:
+    from drgs.cameras.lens import LENSES
+
+    lens = LENSES.get(name).value
+    for key in coefficients:
+        if key not in lens.coefficient_names():
             raise UserError(
-                f"{frame.where(name)}: a lens of the kind {kind.kind} has the coefficients "
-                f"{', '.join(kind.names)}, got {name} = {coefficients[name]:g}; set camera_model "
-                f"to the model that was calibrated, or leave {name} out"
+                f"{frame.where(key)}: a lens of the kind {name} has the coefficients "
+                f"{', '.join(lens.coefficient_names())}, got {key} = {coefficients[key]:g}; set "
+                f"camera_model to the model that was calibrated, or leave {key} out"
             )
-    return kind.of(**coefficients)
+    try:
+        return lens.from_coefficients(**coefficients)
+    except UserError as error:
+        raise UserError(f"{frame.where('camera_model')}: {error}") from error
 
 
-def _lens_type(
-    model: str | None, is_fisheye: bool, coefficients: Mapping[str, float]
-) -> type[RadialTangential] | type[Fisheye]:
-    """Imported when a frame has it, with the coefficients that are not zero."""
+def _lens_name(model: str | None, is_fisheye: bool, coefficients: Mapping[str, float]) -> str:
+    """Return the name of the lens with these coefficients that are not zero."""
     if model == THIN_PRISM_MODEL and not set(coefficients) <= {"k1", "k2", "k3", "k4"}:
-        from drgs.cameras.thin_prism_fisheye import ThinPrismFisheye
-
-        return ThinPrismFisheye
-    if is_fisheye:
-        from drgs.cameras.fisheye import Fisheye
-
-        return Fisheye
-    from drgs.cameras.radial_tangential import RadialTangential
-
-    return RadialTangential
+        return "thin_prism_fisheye"
+    return "fisheye" if is_fisheye else "opencv"
 
 
 def _check_fourth(frame: Frame, coefficients: dict[str, float], is_fisheye: bool) -> None:

@@ -14,7 +14,7 @@ from drgs.core.origin import WORLD, Origin
 from drgs.datasets.lazy_image import Pixels
 
 if TYPE_CHECKING:
-    from drgs.cameras.camera import Lens
+    from drgs.cameras.lens import Lens
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Collection
 from dataclasses import replace
 
-from drgs.cameras.camera import Camera, Pinhole
+from drgs.cameras.camera import Camera
+from drgs.cameras.lens import Pinhole
 from drgs.gaussians.parameters import Gaussians
 from drgs.splatting.rendering import Pipeline
 
@@ -18,9 +19,9 @@ def with_effects(pipeline: Pipeline, gaussians: Gaussians, camera: Camera) -> Pi
     :meth:`drgs.cameras.camera.Camera.seeing` asks.
     """
     if camera.aperture is not None:
-        from drgs.effects.defocus import Defocused, DimmedResponse
+        from drgs.effects.defocus import Defocused, DimmedFalloff
 
-        model = replace(pipeline.model, response=DimmedResponse(pipeline.model.response))
+        model = replace(pipeline.model, falloff=DimmedFalloff(pipeline.model.falloff))
         pipeline = replace(pipeline, shape=Defocused(pipeline.shape), model=model)
     if gaussians.smoothing is not None:
         from drgs.effects.smoothing import smoothed

@@ -18,7 +18,7 @@ import drjit as dr
 from drgs.cameras.camera import Camera
 from drgs.core.constants import NEGLIGIBLE_ALPHA
 from drgs.splatting.cutoffs import Cutoffs
-from drgs.splatting.image_model import Footprint, Offsets, Positions, Response
+from drgs.splatting.footprint import Footprint, GaussianFalloff, Offsets, Positions
 from drgs.splatting.projection import FilmShape, GaussianRows, Projection, Splats2D
 
 
@@ -47,14 +47,14 @@ class Defocused:
 
 
 @dataclass(frozen=True)
-class DimmedResponse:
-    """A response whose splats end where they would without dimming.
+class DimmedFalloff(GaussianFalloff):
+    """A falloff whose splats end where they would without dimming.
 
-    *Geometry* is that of the response, then the base-2 logarithm of the dimming. It has no
+    *Geometry* is that of the falloff, then the base-2 logarithm of the dimming. It has no
     derivatives: the cut is a decision.
     """
 
-    of: Response
+    of: GaussianFalloff
 
     @property
     def num_geometry(self) -> int:
@@ -66,9 +66,9 @@ class DimmedResponse:
         """Sums over pixels, by splat."""
         return self.of.num_moments
 
-    def seen_by(self, camera: Camera) -> DimmedResponse:
+    def for_camera(self, camera: Camera) -> DimmedFalloff:
         """For one camera."""
-        return replace(self, of=self.of.seen_by(camera))
+        return replace(self, of=self.of.for_camera(camera))
 
     def log2_opacity(self, geometry: list[Any]) -> Any:
         """The base-2 logarithm of the opacity, dimmed."""

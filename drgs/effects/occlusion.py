@@ -27,8 +27,8 @@ from typing import Any
 import drjit as dr
 
 from drgs.cameras.camera import Camera
+from drgs.splatting.footprint import FeatureGroup, FootprintModel, Positions, SplatFeatures
 from drgs.splatting.grid import PIXELS, Lanes, TileGrid
-from drgs.splatting.image_model import FeatureGroup, Features, ImageModel, Positions
 from drgs.splatting.lanes import load_pixels
 
 
@@ -41,14 +41,14 @@ class Surface:
 
 
 @dataclass(frozen=True)
-class OccludedFeatures:
-    """Features of splats that surfaces may hide.
+class OccludedFeatures(SplatFeatures):
+    """SplatFeatures of splats that surfaces may hide.
 
     The last stored number is the splat's depth; the last planes are the sums of the weights in
     front of each surface.
     """
 
-    features: Features
+    features: SplatFeatures
     surfaces: tuple[Surface, ...]  # nearest first
     grid: TileGrid
     bound: list[Any] = field(default_factory=list)  # at the 16 pixels of a lane: (z, rest behind)
@@ -70,9 +70,9 @@ class OccludedFeatures:
         """Planes that come of ``num_stored`` numbers per splat."""
         return self.features.num_planes(num_stored - 1) + len(self.surfaces)
 
-    def seen_by(self, camera: Camera) -> OccludedFeatures:
+    def for_camera(self, camera: Camera) -> OccludedFeatures:
         """For one camera."""
-        return replace(self, features=self.features.seen_by(camera))
+        return replace(self, features=self.features.for_camera(camera))
 
     def check_differentiable_in_camera(self) -> None:
         """Check the features; surfaces stay where they are."""
@@ -154,7 +154,9 @@ class OccludedFeatures:
         return [dr.select(depth <= z, value, 0) for z, _ in self.bound[pixel]]
 
 
-def occluded_by(model: ImageModel, surfaces: Sequence[Surface], camera: Camera) -> ImageModel:
+def occluded_by(
+    model: FootprintModel, surfaces: Sequence[Surface], camera: Camera
+) -> FootprintModel:
     """Return an image model of splats that the surfaces may hide; nearest surface first."""
     grid = TileGrid(camera.width, camera.height)
     return replace(model, features=OccludedFeatures(model.features, tuple(surfaces), grid))

@@ -60,8 +60,8 @@ def smoothing_of(means: Any, cameras: Iterable[Camera]) -> Any:
 def _rates(points: Any, camera: Camera) -> Any:
     """Return the rates of one camera, px per scene unit; 0 where it does not see a point."""
     lens = camera.lens
-    seen, position, depth = lens.look(camera, camera.rotation @ (points - camera.center))
-    film = lens.film_point(camera, position)
+    seen, position, depth = lens.visibility(camera, camera.rotation @ (points - camera.center))
+    film = lens.project_point(camera, position)
     margin = FILM_MARGIN * (camera.film_end - camera.film_start)
     beside = (film < camera.film_start - margin) | (film > camera.film_end + margin)
     # Written such that NaN is not seen.

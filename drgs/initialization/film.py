@@ -1,4 +1,4 @@
-"""Where points of the world are in a view's picture, in numpy: before there is anything to render.
+"""Where points of the world are in a view's picture: before there is anything to render.
 
 For start points, of which a million are looked at in hundreds of pictures. No matrix products,
 whose rounding depends on how many threads a library of linear algebra has.
@@ -7,25 +7,22 @@ whose rounding depends on how many threads a library of linear algebra has.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
+import drjit as dr
+import drjit.llvm.ad as llvm
 import numpy as np
 
-from drgs.cameras.polynomials import polynomial
+from drgs.cameras.camera import Camera
+from drgs.core.arrays import from_host, types_of
 from drgs.datasets.types import Viewpoint
-
-if TYPE_CHECKING:
-    from drgs.cameras.fisheye import Fisheye
-    from drgs.cameras.radial_tangential import RadialTangential
-    from drgs.cameras.thin_prism_fisheye import ThinPrismFisheye
 
 Columns = Sequence[np.ndarray]
 """Of coordinates: x, y, z, each (N,)."""
 
 
 def is_projectable(view: Viewpoint) -> bool:
-    """Whether a point has one place in the picture: its camera stands still, its lens is known."""
-    return view.motion is None and (view.lens is None or view.lens.kind in _PLACES)
+    """Return whether a point has one place in the picture: its camera stands still."""
+    return view.motion is None
 
 
 def to_camera(view: Viewpoint, points: Columns, dtype: type = np.float64) -> list[np.ndarray]:
@@ -40,55 +37,29 @@ def to_camera(view: Viewpoint, points: Columns, dtype: type = np.float64) -> lis
 
 
 def to_film(view: Viewpoint, position: Columns) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Places u, v (N,) on the film, px, and depths (N,), scene units; 0: the lens does not see it.
+    """Return places u, v (N,) on the film, px, and depths (N,), scene units.
 
-    position: in the camera's axes. What is seen may lie off the film; places of what is not seen
-    are finite and mean nothing. The equations, and what depth is, are those of ``drgs.cameras``.
+    position: in the camera's axes. The depth is 0 where the lens does not see a point. What is seen
+    may lie off the film; places of what is not seen are finite and mean nothing.
     """
-    place = _PLACES[None if view.lens is None else view.lens.kind]
-    x, y, depth = place(view.lens, *position)
-    fx, fy, cx, cy = map(float, (view.fx, view.fy, view.cx, view.cy))
-    return fx * x + cx, fy * y + cy, depth
+    if view.lens is None:
+        return _through_pinhole(view, *position)
+    Float = {4: llvm.Float, 8: llvm.Float64}[position[0].itemsize]
+    point = types_of(Float).Array3f(*(from_host(Float, column) for column in position))
+    K = np.array([[view.fx, 0, view.cx], [0, view.fy, view.cy], [0, 0, 1]])
+    nearest = float(np.finfo(position[0].dtype).tiny)
+    size = view.width, view.height
+    camera = Camera.create(Float, np.eye(3), np.zeros(3), K, *size, nearest)
+    lens = view.lens.upload(Float)
+    seen, point, depth = lens.visibility(camera, point)
+    film, depth = lens.project_point(camera, point), dr.select(seen, depth, 0)
+    dr.eval(film, depth)
+    return film.x.numpy(), film.y.numpy(), depth.numpy()
 
 
-def _through_pinhole(_lens: None, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> Columns:
+def _through_pinhole(view: Viewpoint, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> Columns:
     seen = z > 0
     inverse = 1 / np.where(seen, z, 1)
-    return x * inverse, y * inverse, np.where(seen, z, 0)
-
-
-def _through_opencv(lens: RadialTangential, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> Columns:
-    x, y, depth = _through_pinhole(None, x, y, z)
-    seen = (depth > 0) & lens.is_within(x, y)
-    return *lens.distort(np.where(seen, x, 0), np.where(seen, y, 0)), np.where(seen, depth, 0)
-
-
-def _through_fisheye(lens: Fisheye, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> Columns:
-    return _by_angle(lens, lens.coefficients, (x, y, z))
-
-
-def _through_thin_prism_fisheye(
-    lens: ThinPrismFisheye, x: np.ndarray, y: np.ndarray, z: np.ndarray
-) -> Columns:
-    u, v, distance = _by_angle(lens, (), (x, y, z))
-    return *lens.distort(u, v), distance
-
-
-def _by_angle(lens: Fisheye, coefficients: Sequence[float], position: Columns) -> Columns:
-    x, y, z = position
-    radius = np.hypot(x, y)
-    distance = np.hypot(radius, z)
-    angle = np.arctan2(radius, z)
-    distorted = angle * polynomial(coefficients, angle * angle)
-    scale = distorted / np.where(radius > 0, radius, 1)  # times 0 on the axis
-    seen = z > lens.min_cosine * distance
-    return *(np.where(seen, scale * c, 0) for c in (x, y)), np.where(seen, distance, 0)
-
-
-_PLACES = {
-    None: _through_pinhole,
-    "opencv": _through_opencv,
-    "fisheye": _through_fisheye,
-    "thin_prism_fisheye": _through_thin_prism_fisheye,
-}
-"""By kind of lens: the film's plane at distance 1 where a point is shown, and its depth."""
+    u = float(view.fx) * (x * inverse) + float(view.cx)
+    v = float(view.fy) * (y * inverse) + float(view.cy)
+    return u, v, np.where(seen, z, 0)

@@ -15,7 +15,7 @@ import mitsuba as mi
 
 from drgs.core.errors import PluginError
 from drgs.integrator.film import Channels
-from drgs.splatting.image_model import PixelCenters, Positions
+from drgs.splatting.footprint import PixelCenters, Positions
 
 
 @dataclass(frozen=True)

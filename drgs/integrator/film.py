@@ -15,7 +15,7 @@ import numpy as np
 
 from drgs.core.arrays import divide, from_host, interleave, quotient
 from drgs.core.errors import UnsupportedError
-from drgs.splatting.image_model import PixelCenters, Positions
+from drgs.splatting.footprint import PixelCenters, Positions
 
 Channels = list[Any]
 """Channels of one pass for a film, each Float (samples * H * W,): red, green, blue, perhaps alpha,

@@ -205,5 +205,4 @@ def hybrid_of(
     )
     traced, count = surfaces.traced(scene), splats.nested_spp or spp
     rays = StraightRays(traced, hide_emitters, hide_emitters or surfaces.is_transparent)
-    sensors = sensors_of(sensor)
-    return Hybrid(traced, surfaces, nested, adjoint, sensor, sensors, seed, count, insertion, rays)
+    return Hybrid(surfaces, nested, adjoint, sensor, seed, count, insertion, rays)

@@ -25,7 +25,8 @@ import numpy as np
 
 from drgs.accuracy.peak_depths import BoundedDepths
 from drgs.accuracy.pipeline import pipeline_of
-from drgs.cameras.camera import Camera, Lens, Pinhole
+from drgs.cameras.camera import Camera
+from drgs.cameras.lens import Lens, Pinhole
 from drgs.config.approximations import Approximations
 from drgs.effects.compose import with_effects
 from drgs.gaussians.parameters import Gaussians
@@ -349,7 +350,7 @@ def _trace(camera: Camera, plane: Plane, scene: mi.Scene) -> tuple[mi.Float, mi.
 
     def depth(far: mi.Float, exists: mi.Bool) -> mi.Float:
         point = camera.rotation @ (mi.Vector3f(start) + far * direction - camera.center)
-        return dr.select(exists, camera.lens.look(camera, point)[2], dr.inf)
+        return dr.select(exists, camera.lens.visibility(camera, point)[2], dr.inf)
 
     off = mi.math.RayEpsilon * (1 + dr.max(dr.abs(start)))  # as Mitsuba does
     rays = StraightRays(scene, False, has_transparent_parts(scene))

@@ -67,10 +67,10 @@ def check_lenses(model: ModelConfig, views: Iterable[Viewpoint], where: str, rem
     """
     bent = next((view for view in views if view.lens is not None), None)
     if model.projection == "exact" and bent is not None:
+        names = ", ".join(bent.lens.coefficients())
         raise UserError(
             f"{where}model.projection must be ewa or unscented for lenses that are no pinholes, "
-            f"such as that of view {bent.name} ({bent.lens.kind}: {', '.join(bent.lens.named())}), "
-            f"got exact; or {remedy}"
+            f"such as that of view {bent.name} ({bent.lens.kind}: {names}), got exact; or {remedy}"
         )
 
 
@@ -125,7 +125,7 @@ def _sensor(view: Viewpoint, calibrated: bool) -> dict[str, object]:
         return pose | _perspective(view)
     intrinsics = {name: getattr(view, name) for name in ("fx", "fy", "cx", "cy")}
     if view.lens is not None:
-        intrinsics |= {"lens": view.lens.kind, **view.lens.named()}
+        intrinsics |= {"lens": view.lens.kind, **view.lens.coefficients()}
     if view.motion is not None:
         pose["to_world_close"] = _to_world(view.motion.close_to_world)
         pose["shutter"] = view.motion.shutter

@@ -23,7 +23,7 @@ from drgs.integrator.film import Channels, offsets_of
 from drgs.integrator.sensors import SensorState, camera_from_sensor, read_sensor
 from drgs.integrator.state import Cached, SplatsState
 from drgs.splatting import rendering
-from drgs.splatting.image_model import Positions
+from drgs.splatting.footprint import Positions
 
 if TYPE_CHECKING:  # imported where a scene calls for them
     from drgs.integrator.surfaces import Hybrid
@@ -196,7 +196,7 @@ class SensorRender:
         state = self._state()
         cameras = [of_time[0].camera for of_time in self._frames()]
         if state.is_attached:
-            cameras = self._attached_cameras(state)
+            cameras = _attached_cameras(self.splats.ignore, state)
         film = self.sensor.film()
         colors = radiance = background_radiance(film, behind, cameras, self._offsets)
         if environment is None or not splats.srgb_primitives:
@@ -259,16 +259,12 @@ class SensorRender:
         """Return the camera at each time, detached, without what is ignored."""
         return cameras_in_time(without_effects(camera_from_sensor(state), self.splats.ignore))
 
-    def _attached_cameras(self, state: SensorState) -> list[Camera]:
-        """Return the cameras, attached to the sensor's parameters."""
-        return _attached_cameras(self.splats.ignore, state)
-
     def _camera_tangents(self, count: int) -> list[list[mi.Float] | None]:
         """Return the derivatives of each time's camera numbers along those set on the sensor."""
         state = self._state()
         if not state.is_attached:
             return [None] * count
-        numbers = [camera.numbers() for camera in self._attached_cameras(state)]
+        numbers = [camera.numbers() for camera in _attached_cameras(self.splats.ignore, state)]
         dr.forward_to(numbers, flags=dr.ADFlag.ClearEdges)
         return dr.grad(numbers)
 
@@ -355,6 +351,7 @@ def accumulate_in_sensor(
 
 
 def _attached_cameras(ignored: Collection[str], state: SensorState) -> list[Camera]:
+    """Return the camera at each time, attached to the sensor's parameters."""
     dr.make_opaque(state.device)  # or each value of a literal would be a new kernel
     return cameras_in_time(without_effects(state.make(state), ignored))
 

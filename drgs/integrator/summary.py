@@ -13,7 +13,8 @@ from dataclasses import dataclass, replace
 
 import mitsuba as mi
 
-from drgs.cameras.camera import Camera, Lens, Pinhole
+from drgs.cameras.camera import Camera
+from drgs.cameras.lens import Lens, Pinhole
 from drgs.datasets.types import Viewpoint
 from drgs.effects.compose import without_effects
 from drgs.integrator.checks import surfaces_in
@@ -150,8 +151,8 @@ def _summary_of_integrator(
 def _lens_words(lens: Lens) -> str | None:
     if isinstance(lens, Pinhole):
         return None
-    names = ", ".join(lens.named())
-    return lens.label + (f" ({names})" if names else "")
+    names = ", ".join(lens.coefficients())
+    return type(lens).__name__ + (f" ({names})" if names else "")
 
 
 def antialiasing_effect(opacities: str | None, smoothing: str | None) -> SimulatedEffect:
@@ -172,7 +173,7 @@ def view_dependence_effect(degree: int, why: str) -> SimulatedEffect:
 def lens_effect(views: Sequence[Viewpoint], of: str = "the dataset's cameras") -> SimulatedEffect:
     """Lenses that are no pinholes; of: whose."""
     bent = [view.lens for view in views if view.lens is not None]
-    kinds = sorted({f"{lens.kind} ({', '.join(lens.named())})" for lens in bent})
+    kinds = sorted({f"{lens.kind} ({', '.join(lens.coefficients())})" for lens in bent})
     return SimulatedEffect("lens distortion", " and ".join(kinds) or None, f"{len(bent)} of {of}")
 
 

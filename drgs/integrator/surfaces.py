@@ -43,6 +43,7 @@ from drgs.integrator.derivatives import (
 from drgs.integrator.film import Channels, develop_pixels, film_map, num_colors
 from drgs.integrator.film import pixels_adjoint as film_adjoint
 from drgs.integrator.path_segment import passes_splats
+from drgs.integrator.sensors import sensors_of
 from drgs.integrator.transparency import (
     RaysBehind,
     StraightRays,
@@ -274,16 +275,14 @@ def _mapped(matrix: np.ndarray, planes: list[mi.Float]) -> list[mi.Float]:
 class Hybrid:
     """One rendering of splats and surfaces: the part of the surfaces."""
 
-    scene: mi.Scene  # what the nested integrator is given
     surfaces: Surfaces
     integrator: mi.Integrator  # of the picture
     adjoint_integrator: mi.Integrator  # of its derivatives
     sensor: mi.Sensor
-    sensors: list[mi.Sensor]  # those of a batch, or the same
     seed: int | mi.UInt32
     spp: int  # of the nested integrator; 0: as the sensor's sampler has it
     insertion: Insertion
-    rays: StraightRays  # through the scene
+    rays: StraightRays  # through the scene that the nested integrator renders
 
     def with_surfaces(self, count: int) -> Hybrid:
         """Return the same for so many surfaces that are seen one through the other."""
@@ -292,7 +291,7 @@ class Hybrid:
     def pictures(self) -> list[mi.TensorXf]:
         """Return N_0, N_1, ..., developed. Leaves the film with the last."""
         return [
-            self.integrator.render(self.scene, sensor=sensor, seed=self.seed, spp=self.spp)
+            self.integrator.render(self.rays.scene, sensor=sensor, seed=self.seed, spp=self.spp)
             for sensor in self._sensors()
         ]
 
@@ -308,7 +307,7 @@ class Hybrid:
             with _depth_reduced(self.integrator, count):
                 # Of the base class, as integrators written in Python have another signature.
                 radiance, *_ = mi.SamplingIntegrator.sample(
-                    self.integrator, self.scene, sampler, behind, None, active
+                    self.integrator, self.rays.scene, sampler, behind, None, active
                 )
             found.append(weight * mi.Color3f(radiance))
         return found
@@ -319,7 +318,7 @@ class Hybrid:
 
         def add(sensor: mi.Sensor) -> None:
             self.adjoint_integrator.render_backward(
-                self.scene, params, next(gradients), sensor, self.seed, self.spp
+                self.rays.scene, params, next(gradients), sensor, self.seed, self.spp
             )
 
         with self._differentiating() as parameters:
@@ -331,7 +330,7 @@ class Hybrid:
 
         def along(sensor: mi.Sensor) -> mi.TensorXf:
             return self.adjoint_integrator.render_forward(
-                self.scene, params, sensor, self.seed, self.spp
+                self.rays.scene, params, sensor, self.seed, self.spp
             )
 
         found = [None] * len(pictures)
@@ -375,7 +374,7 @@ class Hybrid:
             return
         for count in range(self.insertion.num_surfaces):
             behind = RaysBehind(self.rays, count)
-            sensor = sensor_behind(self.sensor, self.sensors, behind)
+            sensor = sensor_behind(self.sensor, sensors_of(self.sensor), behind)
             with (
                 _sample_count_kept(self.sensor),
                 _depth_reduced(self.integrator, count),
@@ -390,7 +389,7 @@ class Hybrid:
         Its errors, which are about variables, are raised again with the parameters' names.
         """
         with dr.resume_grad(), _sample_count_kept(self.sensor):
-            parameters = list(attached_parameters(self.scene))
+            parameters = list(attached_parameters(self.rays.scene))
             try:
                 yield parameters
             except Exception as error:

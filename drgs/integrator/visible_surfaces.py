@@ -163,7 +163,7 @@ class _Tracer:
         """Return what has been hit."""
         valid = coverage > 0
         point = ray.o + dr.select(valid, hit.t, 1) * ray.d
-        _, _, depth = camera.lens.look(camera, camera.rotation @ (point - camera.center))
+        _, _, depth = camera.lens.visibility(camera, camera.rotation @ (point - camera.center))
         normal = None
         if self.with_normals:
             frame = hit.compute_surface_interaction(ray, mi.RayFlags.ShadingFrame, valid).sh_frame

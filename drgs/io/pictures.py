@@ -14,6 +14,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import imageio.v3 as iio
 import numpy as np
 from PIL import ExifTags, Image, ImageCms, UnidentifiedImageError
 
@@ -302,7 +303,7 @@ def _opened(path: Path) -> Iterator[Image.Image]:
         raise UserError(f"{path}: cannot read the image: {reason}") from None
 
 
-# Writing
+# Writing: by imageio, but for the palette that all frames of a GIF share
 
 
 def to_uint8(image: np.ndarray) -> np.ndarray:
@@ -333,12 +334,7 @@ def encode(image: np.ndarray, suffix: str, **options: float) -> bytes:
     options: of Pillow's writer.
     """
     pixels = image if image.dtype == np.uint8 else to_uint8(image)
-    first, *rest = map(Image.fromarray, pixels if pixels.ndim == 4 else [pixels])
-    if rest:
-        options |= {"save_all": True, "append_images": rest}
-    content = io.BytesIO()
-    first.save(content, suffix, **options)
-    return content.getvalue()
+    return iio.imwrite("<bytes>", pixels, extension=f".{suffix}", plugin="pillow", **options)
 
 
 def check_animation(frames: int, width: int, height: int) -> None:

@@ -24,7 +24,7 @@ MODELS = {
     "fisheye": "OPENCV_FISHEYE",
     "thin_prism_fisheye": "THIN_PRISM_FISHEYE",
 }
-"""Of cameras, by the kind of their lens."""
+"""COLMAP's names of lenses; others have the name under which they are registered."""
 
 
 @dataclass(frozen=True)
@@ -138,7 +138,8 @@ def _lens_and_motion(view: View) -> dict[str, object]:
     """What ``transforms.json`` says of a camera besides its pose and intrinsics."""
     values: dict[str, object] = {}
     if view.lens is not None:
-        values |= {"camera_model": MODELS[view.lens.kind], **view.lens.named()}
+        model = MODELS.get(view.lens.kind, view.lens.kind)
+        values |= {"camera_model": model, **view.lens.coefficients()}
     if view.motion is not None:
         values[CLOSE] = between_opencv_and_opengl(view.motion.close_to_world).tolist()
         values["shutter"] = view.motion.shutter

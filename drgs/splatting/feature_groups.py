@@ -18,7 +18,7 @@ from typing import Any
 
 import drjit as dr
 
-from drgs.splatting.image_model import FeatureGroup
+from drgs.splatting.footprint import FeatureGroup
 from drgs.splatting.rasterize import ONE_SAMPLE, Layers, Records, SplatGradients
 from drgs.splatting.tiles import TileBins
 
@@ -30,7 +30,7 @@ FEATURES_AT_ONCE = {4: 32, 8: 8}
 def in_groups(order: Any, bins: TileBins) -> Any:
     """``order``, or one that composites in groups where there are many features.
 
-    Each is a :class:`drgs.splatting.rendering.Order`.
+    Each is a :class:`drgs.splatting.rendering.CenterOrder`.
     """
     return InGroups(order) if len(_groups(bins)) > 1 else order
 
@@ -57,11 +57,11 @@ class GroupedLayers:
 class InGroups:
     """Composites in another order, group by group."""
 
-    order: Any  # drgs.splatting.rendering.Order: of each group
+    order: Any  # drgs.splatting.rendering.CenterOrder: of each group
 
     def records(self, bins: TileBins) -> tuple[Records, ...]:
         """Records of each group."""
-        geometry, end = bins.model.response.num_geometry, bins.num_features
+        geometry, end = bins.model.falloff.num_geometry, bins.num_features
 
         def numbers(group: FeatureGroup, rank: Any, active: Any) -> list[Any]:
             row = bins.rows.load(rank, active)

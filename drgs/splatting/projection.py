@@ -5,20 +5,21 @@ plain arithmetic, so Dr.Jit differentiates it. The equations are those of Zwicke
 splatting") as used in section 4 of the 3DGS paper, written so that they do not cancel in single
 precision.
 
-How a Gaussian's shape comes to the film is a :class:`Projection`: :func:`ewa` or one of another
+A :data:`Projection` is what brings a Gaussian's shape to the film: :func:`ewa` or one of another
 module (``drgs.accuracy.unscented``, ``drgs.accuracy.exact``).
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import combinations
-from typing import Any, Protocol
+from typing import Any, ClassVar
 
 import drjit as dr
 
 from drgs.cameras.camera import Camera
+from drgs.config.approximations import PROJECTIONS
 from drgs.core.arrays import load_columns, types_of
 from drgs.core.constants import LEAST_LOW_PASS, LOW_PASS, NEGLIGIBLE_ALPHA
 from drgs.gaussians import sh
@@ -90,30 +91,31 @@ class FilmShape:
         return dr.abs(p * s)
 
 
-class Projection(Protocol):
-    """How a Gaussian's mean and covariance come to the film."""
-
-    def __call__(
-        self, rows: GaussianRows, camera: Camera, position: Any, low_pass: float
-    ) -> FilmShape:
-        """Project; position: Array3f, camera axes, the mean; low_pass: px^2."""
-        ...
+Projection = Callable[["GaussianRows", Camera, Any, float], FilmShape]
+"""From rows, camera, means (Array3f, camera axes) and low-pass (px^2) to shapes on the film."""
 
 
-class OpacityRule(Protocol):
-    """How low-pass filtering affects opacity."""
+class ProjectionModel:
+    """A projection as ``model.projection`` of a configuration names it.
 
-    def __call__(self, opacity: Any, determinant: Any, added_determinant: Any) -> Any:
-        """Float; for the determinants see :class:`FilmShape`."""
-        ...
+    A subclass has a :data:`Projection` as its static method ``shape``, and enters ``PROJECTIONS``.
+    """
+
+    falloff: ClassVar[type | None] = None  # one of its own; None: as is configured
+    shape_with_depth: ClassVar[Projection | None] = None  # whose shapes have RayTerms
+
+    @staticmethod
+    def shape(rows: GaussianRows, camera: Camera, position: Any, low_pass: float) -> FilmShape:
+        """Project; see :data:`Projection`."""
+        raise NotImplementedError
 
 
-class SplatColor(Protocol):
-    """What is stored of a splat's colour."""
+OpacityRule = Callable[[Any, Any, Any], Any]
+"""From an opacity and the two determinants of :class:`FilmShape` to an opacity, Float each."""
 
-    def __call__(self, rows: GaussianRows, direction: Any, sh_degree: int) -> Sequence[Any]:
-        """Float each; direction: Array3f, world, of any length, in which the mean is seen."""
-        ...
+SplatColor = Callable[["GaussianRows", Any, int], Sequence[Any]]
+"""From rows, directions in which means are seen (Array3f, world, of any length) and SH degree to
+what is stored of a splat's colour, Float each."""
 
 
 @dataclass(frozen=True)
@@ -175,7 +177,7 @@ def project(
     Differentiable in ``rows`` and in the camera's numbers. Not differentiated: visibility.
     """
     offset = rows.means - camera.center
-    seen, position, depth = camera.lens.look(camera, camera.rotation @ offset)
+    seen, position, depth = camera.lens.visibility(camera, camera.rotation @ offset)
     low_pass = max(low_pass, LEAST_LOW_PASS)
     film = (shape or ewa)(rows, camera, position, low_pass)
     opacities = opacity_rule(
@@ -213,7 +215,14 @@ def ewa(rows: GaussianRows, camera: Camera, position: Any, low_pass: float) -> F
     """
     lens = camera.lens
     m0, m1, _ = film_axes(rows, camera, position, lens.clamped_slopes(camera, position))
-    return whiten(lens.film_point(camera, position), [*m0], [*m1], low_pass)
+    return whiten(lens.project_point(camera, position), [*m0], [*m1], low_pass)
+
+
+@PROJECTIONS.register("ewa")
+class Ewa(ProjectionModel):
+    """The affine approximation at the mean."""
+
+    shape = staticmethod(ewa)
 
 
 def whiten(means2d: Any, m0: Sequence[Any], m1: Sequence[Any], low_pass: float) -> FilmShape:
@@ -281,14 +290,14 @@ def film_axes(
     """The half axes of a Gaussian as rows of two matrices: on the film, and in depth.
 
     The first two are those of M = J R_camera R(q) diag(s), px; the third the same for the depth
-    divided by that of the mean. slopes: see :meth:`drgs.cameras.camera.Pinhole.film_directions`.
+    divided by that of the mean. slopes: see :meth:`drgs.cameras.lens.Lens.projection_jacobian`.
     """
     world_from_splat, scales = quat_to_rotation(rows.quats), dr.exp(rows.log_scales)
 
     def along(direction: Any) -> Any:
         return (world_from_splat.T @ direction) * scales
 
-    m0, m1 = map(along, camera.lens.film_directions(camera, position, slopes))
+    m0, m1 = map(along, camera.lens.projection_jacobian(camera, position, slopes))
     return m0, m1, along(camera.lens.depth_direction(camera, position))
 
 

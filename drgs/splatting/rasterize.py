@@ -37,7 +37,7 @@ a lane of the adjoint writes is contiguous.
 
 **No atomics.** In the adjoint, a lane sums each splat's partial derivatives over its 16 pixels
 and writes them into a slot that belongs to this (splat, micro-tile) alone: see
-:mod:`drgs.splatting.slots`.
+:mod:`drgs.splatting.reduction`.
 """
 
 from __future__ import annotations
@@ -49,8 +49,8 @@ from typing import Any
 import drjit as dr
 
 from drgs.core.arrays import Rows, divide, quotient, scatter_rows, types_of
+from drgs.splatting.footprint import Alpha, SplatFeatures
 from drgs.splatting.grid import GRID, MICRO, MICROS, PIXELS, TILE, TileGrid
-from drgs.splatting.image_model import Alpha, Features
 from drgs.splatting.lanes import (
     Cursor,
     Entries,
@@ -62,7 +62,7 @@ from drgs.splatting.lanes import (
     make_lanes,
     pixels_of,
 )
-from drgs.splatting.slots import (
+from drgs.splatting.reduction import (
     CompositedPairs,
     Slots,
     assign_slots,
@@ -136,7 +136,7 @@ class Records:
         """
         rows = Rows.of(numbers(bins.ranks, bins.masks != 0))
         dr.eval(rows)
-        return Records(rows, bins.model.response.num_geometry, bins.num_features)
+        return Records(rows, bins.model.falloff.num_geometry, bins.num_features)
 
     def load(self, entry: Any, active: Any) -> tuple[list[Any], list[Any]]:
         """Geometry and features of a sorted entry."""
@@ -156,7 +156,7 @@ class Records:
 def composite(bins: TileBins, records: Records) -> Layers:
     """Composite the features of all splats.
 
-    bins: from ``bin_splats``; records: ``Records.of(bins, bins.rows.load)``.
+    bins: from ``bin_footprints``; records: ``Records.of(bins, bins.rows.load)``.
     """
     t = types_of(bins.rows.Float)
     lanes = make_lanes(t.Float, bins.grid)
@@ -240,7 +240,7 @@ ONE_SAMPLE = range(1)
 class SplatGradients:
     """Derivatives of the loss with respect to the 2D splats, in the order of the Gaussians."""
 
-    geometry: list[Any]  # Float each: mean x, y (per px), p, r, s, opacity, more of the response's
+    geometry: list[Any]  # Float each: mean x, y (per px), p, r, s, opacity, more of the falloff's
     features: list[Any]  # Float each
 
     def plus(self, other: SplatGradients) -> SplatGradients:
@@ -254,11 +254,6 @@ class SplatGradients:
     def means2d(self) -> Any:
         """Array2f, loss per px."""
         return types_of(type(self.geometry[0])).Array2f(self.geometry[:2])
-
-    @property
-    def whitening(self) -> Any:
-        """Array3f."""
-        return types_of(type(self.geometry[0])).Array3f(self.geometry[2:5])
 
     @property
     def opacities(self) -> Any:
@@ -332,7 +327,7 @@ def _partials(
         pixels, d_log_alpha, d_features = _adjoint_step(
             alphas, composited, features, model.features, pixels, g
         )
-        moments = model.response.moments(footprint, d_log_alpha, model.positions)
+        moments = model.falloff.moments(footprint, d_log_alpha, model.positions)
         return entries.advance(cursor), slot, pixels, moments + d_features, active
 
     size = dr.width(lanes.tile)
@@ -357,7 +352,7 @@ def _adjoint_step(
     alphas: list[Alpha],
     composited: list[Any],
     stored: list[Any],
-    features: Features,
+    features: SplatFeatures,
     pixels: list[list[Any]],
     g: list[list[Any]],
 ) -> tuple[list, list, list]:
@@ -393,15 +388,15 @@ def splat_gradients(
     totals: from ranks and a sample to moments, and derivatives of the features; before: what the
     samples' derivatives are added to, in their order.
     """
-    t, response = types_of(bins.rows.Float), bins.model.response
+    t, falloff = types_of(bins.rows.Float), bins.model.falloff
     size = dr.width(bins.order)
-    rank, count = dr.arange(t.UInt32, size), response.num_geometry
+    rank, count = dr.arange(t.UInt32, size), falloff.num_geometry
     geometry = bins.rows.load(rank)[:count]
 
     def terms(sample: Any) -> list[Any]:
         sums = totals(rank, sample)
-        columns = response.derivatives(geometry, sums[: response.num_moments])
-        return columns + sums[response.num_moments :]
+        columns = falloff.derivatives(geometry, sums[: falloff.num_moments])
+        return columns + sums[falloff.num_moments :]
 
     def add(sample: Any, columns: list[Any]) -> tuple[Any, list[Any]]:
         return sample + 1, [total + x for total, x in zip(columns, terms(sample), strict=True)]
@@ -454,7 +449,7 @@ def composite_tangent(
         geometry, features = records.load(entry, active)
         footprint = model.footprint(geometry, lanes, active)
         d_geometry, d_features = d_records.load(entry, active)
-        d_log_alpha = model.response.tangent(geometry, footprint, d_geometry)
+        d_log_alpha = model.falloff.tangent(geometry, footprint, d_geometry)
         T, dT, dC = list(T), list(dT), [list(c) for c in dC]
         for pixel, alpha in enumerate(model.alphas(geometry, footprint)):
             before, d_before = dr.abs(T[pixel]), dT[pixel]
@@ -493,15 +488,15 @@ def composite_tangent(
 
 
 def pack_tangents(bins: TileBins, tangents: SplatGradients) -> Records:
-    """The records' tangents: of the geometry as the response wants it, and of the features."""
+    """The records' tangents: of the geometry as the falloff wants it, and of the features."""
     t = types_of(bins.rows.Float)
     rank = dr.arange(t.UInt32, dr.width(bins.order))
 
     def by_rank(columns: list[Any]) -> list[Any]:
         return [dr.gather(t.Float, column, bins.order) for column in columns]
 
-    geometry = bins.rows.load(rank)[: bins.model.response.num_geometry]
-    numbers = bins.model.response.pack_tangents(geometry, by_rank(tangents.geometry))
+    geometry = bins.rows.load(rank)[: bins.model.falloff.num_geometry]
+    numbers = bins.model.falloff.pack_tangents(geometry, by_rank(tangents.geometry))
     numbers += by_rank(tangents.features)
     numbers += [dr.zeros(t.Float, dr.width(rank))] * bins.num_keys  # they have no derivatives
     rows = Rows.of(numbers)

@@ -22,16 +22,18 @@ from typing import Any, Protocol
 import drjit as dr
 
 from drgs.cameras.camera import Camera
+from drgs.config.approximations import ORDERS, Approximations
 from drgs.core.arrays import first_numbers, repeat_array, store_columns, types_of
 from drgs.core.constants import LOW_PASS
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 from drgs.splatting.feature_groups import in_groups
+from drgs.splatting.footprint import DEFAULT, FootprintModel
 from drgs.splatting.grid import TileGrid
-from drgs.splatting.image_model import DEFAULT, ImageModel
 from drgs.splatting.projection import (
     GaussianRows,
     OpacityRule,
     Projection,
+    ProjectionModel,
     SplatColor,
     Splats2D,
     color_at_mean,
@@ -51,13 +53,8 @@ from drgs.splatting.rasterize import (
 )
 from drgs.splatting.tiles import Footprints, TileBins, bin_footprints, footprints_of
 
-
-class Feature(Protocol):
-    """Something that is composited of each splat."""
-
-    def __call__(self, splats: Splats2D, rows: GaussianRows, camera: Camera) -> list[Any]:
-        """Columns, Float (N,) each, one for each plane."""
-        ...
+Feature = Callable[[Splats2D, GaussianRows, Camera], list[Any]]
+"""Something that is composited of each splat: columns, Float (N,) each, one for each plane."""
 
 
 def color_features(splats: Splats2D, rows: GaussianRows, camera: Camera) -> list[Any]:
@@ -72,61 +69,38 @@ def depth_feature(splats: Splats2D, rows: GaussianRows, camera: Camera) -> list[
     return [splats.depths]
 
 
-class Order(Protocol):
-    """In which order a pixel composites its splats."""
-
-    def seen_by(self, camera: Camera) -> Order:
-        """For one camera."""
-        ...
-
-    def keys(self, splats: Splats2D) -> list[Any]:
-        """Columns that compositing needs for the order, besides the order of the entries."""
-        ...
-
-    def records(self, bins: TileBins) -> Any:
-        """Copies of the numbers that compositing loads of each sorted entry, evaluated."""
-        ...
-
-    def composite(self, bins: TileBins, records: Any) -> Layers:
-        """See :func:`drgs.splatting.rasterize.composite`."""
-        ...
-
-    def adjoint(
-        self,
-        bins: TileBins,
-        records: Records,
-        layers: Layers,
-        d_features: list[Any],
-        d_transmittance: Any,
-        samples: range = ONE_SAMPLE,
-        before: SplatGradients | None = None,
-    ) -> SplatGradients:
-        """See :func:`drgs.splatting.rasterize.composite_adjoint`."""
-        ...
-
-    def tangent(
-        self, bins: TileBins, records: Records, layers: Layers, tangents: SplatGradients
-    ) -> Layers:
-        """See :func:`drgs.splatting.rasterize.composite_tangent`."""
-        ...
-
-
+@ORDERS.register("center")
 @dataclass(frozen=True)
 class CenterOrder:
-    """One order of the splats for the whole image: by the depth of their means."""
+    """In which order a pixel composites its splats: here, all by the depth of their means.
 
-    def seen_by(self, camera: Camera) -> CenterOrder:
+    The base of all orders.
+    """
+
+    @classmethod
+    def create(
+        cls, projection: type[ProjectionModel], approximations: Approximations
+    ) -> tuple[Projection, CenterOrder]:
+        """Return the function that projects, with what the order needs to know, and the order."""
+        del approximations
+        return projection.shape, cls()
+
+    def for_camera(self, camera: Camera) -> CenterOrder:
         """For any camera."""
         del camera
         return self
 
     def keys(self, splats: Splats2D) -> list[Any]:
-        """Columns that compositing needs for the order, besides the order of the entries."""
+        """Return columns that compositing needs besides the order of the entries."""
         del splats
         return []
 
+    def sort_depths(self, splats: Splats2D) -> Any:
+        """Return the depths by which the entries are sorted, Float (N,), the smallest first."""
+        return splats.depths
+
     def records(self, bins: TileBins) -> Records:
-        """All numbers of each entry's splat."""
+        """Return copies of the numbers that compositing loads of each sorted entry, evaluated."""
         return Records.of(bins, bins.rows.load)
 
     def composite(self, bins: TileBins, records: Records) -> Layers:
@@ -200,8 +174,8 @@ class Pipeline:
     shape: Projection = ewa  # how a Gaussian's mean and covariance come to the film
     color: SplatColor = color_at_mean  # what is stored of a splat's colour
     low_pass: float = LOW_PASS  # px^2
-    model: ImageModel = DEFAULT
-    order: Order = CenterOrder()
+    model: FootprintModel = DEFAULT
+    order: CenterOrder = CenterOrder()
     source: ProjectionStage = Projected()
     of_smoothing: bool = False  # whether derivatives include those of a smoothing filter
 
@@ -238,7 +212,7 @@ class Frame:
 
     pipeline: Pipeline
     camera: Camera
-    order: Order  # the pipeline's, for this camera
+    order: CenterOrder  # the pipeline's, for this camera
     bins: TileBins
     records: Any  # of that order
     layers: Layers  # of that order
@@ -269,10 +243,10 @@ def render(gaussians: Gaussians, camera: Camera, pipeline: Pipeline) -> Frame:
     :func:`drgs.effects.compose.with_effects`. The host reads one value, the number of (splat, tile)
     entries.
     """
-    model = pipeline.model.seen_by(camera)
+    model = pipeline.model.for_camera(camera)
     grid = TileGrid(camera.width, camera.height, model.positions.samples)
     bins = bin_footprints(pipeline.source.footprints(gaussians, camera, pipeline), grid, model)
-    order = in_groups(pipeline.order.seen_by(camera), bins)
+    order = in_groups(pipeline.order.for_camera(camera), bins)
     records = order.records(bins)
     layers = order.composite(bins, records)
     return Frame(pipeline, camera, order, bins, records, layers)
@@ -283,18 +257,20 @@ def footprints_seen_by(gaussians: Gaussians, camera: Camera, pipeline: Pipeline)
     rows = load_rows(gaussians, pipeline.sh_degree)
     splats = pipeline.project(rows, camera)
     columns = pipeline.feature_columns(splats, rows, camera)
-    grid, model = TileGrid(camera.width, camera.height), pipeline.model.seen_by(camera)
-    return footprints_of(splats, grid, columns, model, pipeline.order.seen_by(camera).keys(splats))
+    grid, model = TileGrid(camera.width, camera.height), pipeline.model.for_camera(camera)
+    order = pipeline.order.for_camera(camera)
+    keys, splats = order.keys(splats), replace(splats, depths=order.sort_depths(splats))
+    return footprints_of(splats, grid, columns, model, keys)
 
 
-def render_again(frame: Frame, model: ImageModel) -> Frame:
+def render_again(frame: Frame, model: FootprintModel) -> Frame:
     """The same splats, in the same tiles, with another image model.
 
     model: that of the frame's pipeline, but for points of the pixels within the same margin, or
     for features that are composited of the same stored numbers.
     """
     grid = replace(frame.bins.grid, samples=model.positions.samples)
-    bins = replace(frame.bins, grid=grid, model=model.seen_by(frame.camera))
+    bins = replace(frame.bins, grid=grid, model=model.for_camera(frame.camera))
     return replace(frame, bins=bins, layers=frame.order.composite(bins, frame.records))
 
 
@@ -418,7 +394,7 @@ def _back_to_rows(
     of_camera: bool = False,
 ) -> tuple[GaussianRows, Any, list[Any]]:
     """Derivatives per lane, which of them are visible, and derivatives of the camera's numbers."""
-    response, numbers = pipeline.model.seen_by(camera).response, []
+    falloff, numbers = pipeline.model.for_camera(camera).falloff, []
     if of_camera:
         pipeline.model.check_differentiable_in_camera()
         camera = camera.by_lane(dr.width(rows.logit_opacities))
@@ -426,7 +402,7 @@ def _back_to_rows(
     with dr.resume_grad():
         dr.enable_grad(pipeline.differentiated(rows), numbers)
         splats = pipeline.project(rows, camera)
-        outputs = response.differentiable(splats)
+        outputs = falloff.differentiable(splats)
         outputs += pipeline.feature_columns(splats, rows, camera)
         cotangents = of_splats.geometry + of_splats.features
         for output, cotangent in zip(outputs, cotangents, strict=True):
@@ -533,15 +509,15 @@ def _splat_tangents(
         dr.set_grad(differentiated, frame.pipeline.differentiated(d_rows))
         for number, tangent in zip(numbers, camera_tangents or [], strict=True):
             dr.set_grad(number, tangent)
-        response = frame.bins.model.response
-        outputs = response.differentiable(splats)
+        falloff = frame.bins.model.falloff
+        outputs = falloff.differentiable(splats)
         outputs += frame.pipeline.feature_columns(splats, rows, camera)
         # Some outputs (depths, p of the whitening) are inputs of others: the default would clear
         # the derivatives of such interior variables on the way.
         dr.forward_to(outputs, flags=dr.ADFlag.ClearEdges)
         columns = [dr.grad(output) for output in outputs]
     dr.eval(columns)
-    count = response.num_geometry
+    count = falloff.num_geometry
     return SplatGradients(geometry=columns[:count], features=columns[count:])
 
 
@@ -552,22 +528,27 @@ def _columns_of(d_rows: GaussianRows, gaussians: Gaussians, visible: Any) -> dic
     SH coefficients above the pipeline's degree.
     """
     t = types_of(type(d_rows.logit_opacities))
-    higher = [component for vector in d_rows.sh[1:] for component in vector]
-    missing = 3 * gaussians.shN.shape[1] - len(higher)
-    columns = {
-        "means": d_rows.means,
-        "quats": d_rows.quats,
-        "log_scales": d_rows.log_scales,
-        "logit_opacities": [d_rows.logit_opacities],
-        "sh0": d_rows.sh[0],
-        "shN": [*higher, *[t.Float(0)] * missing] if higher else [],
-        "smoothing": [] if d_rows.smoothing is None else [d_rows.smoothing],
-        **(d_rows.features or {}),
-    }
+    columns = _parameter_columns(d_rows)
+    missing = 3 * gaussians.shN.shape[1] - len(columns["shN"])
+    columns["shN"] += [t.Float(0)] * missing if columns["shN"] else []
+    columns["smoothing"] = [] if d_rows.smoothing is None else [d_rows.smoothing]
+    columns |= d_rows.features or {}
     return {
         name: [dr.select(visible, column, t.Float(0)) for column in own]
         for name, own in columns.items()
         if len(own)
+    }
+
+
+def _parameter_columns(rows: GaussianRows) -> dict[str, list[Any]]:
+    """The columns of ``PARAMETER_NAMES``, as far as they were loaded."""
+    return {
+        "means": rows.means,
+        "quats": rows.quats,
+        "log_scales": rows.log_scales,
+        "logit_opacities": [rows.logit_opacities],
+        "sh0": rows.sh[0],
+        "shN": [component for vector in rows.sh[1:] for component in vector],
     }
 
 
@@ -598,15 +579,7 @@ def _faults(d_rows: GaussianRows, visible: Any) -> Any:
     """UInt32 (N,): row * 6 + number of the first parameter at fault there, or ``NO_FAULT``."""
     UInt32 = types_of(type(d_rows.logit_opacities)).UInt32
     row = dr.arange(UInt32, dr.width(d_rows.logit_opacities))
-    higher = [component for vector in d_rows.sh[1:] for component in vector]
-    columns = {
-        "means": d_rows.means,
-        "quats": d_rows.quats,
-        "log_scales": d_rows.log_scales,
-        "logit_opacities": [d_rows.logit_opacities],
-        "sh0": d_rows.sh[0],
-        "shN": higher,
-    }
+    columns = _parameter_columns(d_rows)
     faults = UInt32(NO_FAULT)
     for number, name in reversed(list(enumerate(PARAMETER_NAMES))):
         squared_norm = sum(dr.square(component) for component in columns[name])

@@ -25,8 +25,8 @@ import drjit as dr
 from drgs.core.arrays import Rows, interleave, types_of
 from drgs.core.errors import UserError
 from drgs.core.private import bucket_order
+from drgs.splatting.footprint import DEFAULT, FootprintModel
 from drgs.splatting.grid import GRID, MICRO, MICROS, TILE, TileGrid
-from drgs.splatting.image_model import DEFAULT, ImageModel
 from drgs.splatting.projection import Splats2D
 
 WORD = 32
@@ -55,12 +55,12 @@ class TileBins:
     tile_start: Any  # UInt32 (tiles + 1,): tile -> first sorted entry
     num_entries: int  # M
     grid: TileGrid
-    model: ImageModel
+    model: FootprintModel
 
     @property
     def num_sums(self) -> int:
         """Numbers that the adjoint sums for each splat: moments, and derivatives of features."""
-        return self.model.response.num_moments + self.num_features
+        return self.model.falloff.num_moments + self.num_features
 
 
 @dataclass(frozen=True)
@@ -78,25 +78,11 @@ class Footprints:
     num_keys: int
 
 
-def bin_splats(
-    splats: Splats2D,
-    grid: TileGrid,
-    features: Sequence[Any] = (),
-    model: ImageModel = DEFAULT,
-    keys: Sequence[Any] = (),
-) -> TileBins:
-    """Distribute the visible ``splats`` over the tiles of ``grid``, front to back.
-
-    For the arguments see :func:`footprints_of`, for errors :func:`bin_footprints`.
-    """
-    return bin_footprints(footprints_of(splats, grid, features, model, keys), grid, model)
-
-
 def footprints_of(
     splats: Splats2D,
     grid: TileGrid,
     features: Sequence[Any] = (),
-    model: ImageModel = DEFAULT,
+    model: FootprintModel = DEFAULT,
     keys: Sequence[Any] = (),
 ) -> Footprints:
     """What is to be binned of ``splats``, evaluated.
@@ -109,7 +95,7 @@ def footprints_of(
     return Footprints(boxes, rows, depths, len(features), len(keys))
 
 
-def bin_footprints(footprints: Footprints, grid: TileGrid, model: ImageModel) -> TileBins:
+def bin_footprints(footprints: Footprints, grid: TileGrid, model: FootprintModel) -> TileBins:
     """Distribute splats over the tiles of ``grid``, front to back.
 
     Not differentiated: integer work. The host reads one value, the number of entries.
@@ -122,7 +108,7 @@ def bin_footprints(footprints: Footprints, grid: TileGrid, model: ImageModel) ->
     t = types_of(type(depths))
     if dr.width(depths) > 1 << _RANK_BITS:
         raise UserError(
-            f"bin_splats(): at most {1 << _RANK_BITS:,} Gaussians can be told apart in a tile, got "
+            f"at most {1 << _RANK_BITS:,} Gaussians can be told apart in a tile, got "
             f"{dr.width(depths):,}; render them in parts, or prune them"
         )
     # A stable sort: equal depths stay in the order of the Gaussians.
@@ -165,33 +151,33 @@ def bin_footprints(footprints: Footprints, grid: TileGrid, model: ImageModel) ->
 
 
 def _store_rows(
-    splats: Splats2D, grid: TileGrid, stored: Sequence[Any], model: ImageModel
+    splats: Splats2D, grid: TileGrid, stored: Sequence[Any], model: FootprintModel
 ) -> tuple[Rows, Rows, Any]:
     """By Gaussian, evaluated at once: boxes of tiles, all other numbers, depths to sort by."""
-    geometry = model.response.geometry(splats)
+    geometry = model.falloff.geometry(splats)
     boxes, rows = Rows.of(_tile_box(splats, geometry, grid, model)), Rows.of([*geometry, *stored])
     depths = dr.select(splats.visible, splats.depths, dr.inf)
     dr.eval(boxes, rows, depths)
     return boxes, rows, depths
 
 
-def _reach(geometry: list[Any], grid: TileGrid, model: ImageModel) -> Any:
+def _reach(geometry: list[Any], grid: TileGrid, model: FootprintModel) -> Any:
     """What |U d|^2 may be (base 2) where a splat ends, and a margin for rounding.
 
     For the default cut-offs, sqrt(2 ln(opacity / alpha_cut)) standard deviations: the
     opacity-aware radius, instead of 3.
     """
     t = types_of(type(geometry[0]))
-    floor = model.response.log2_floor(geometry, model.cutoffs)
-    return model.response.log2_opacity(geometry) - floor + dr.opaque(t.Float, grid.cull_margin)
+    floor = model.falloff.log2_floor(geometry, model.cutoffs)
+    return model.falloff.log2_opacity(geometry) - floor + dr.opaque(t.Float, grid.cull_margin)
 
 
 def _tile_box(
-    splats: Splats2D, geometry: list[Any], grid: TileGrid, model: ImageModel
+    splats: Splats2D, geometry: list[Any], grid: TileGrid, model: FootprintModel
 ) -> list[Any]:
     """First column and row, columns, and number of tiles: whole numbers, exact up to 2^24."""
     t = types_of(type(splats.depths))
-    center, radius = model.response.bounds(splats, geometry, _reach(geometry, grid, model))
+    center, radius = model.falloff.bounds(splats, geometry, _reach(geometry, grid, model))
     radius = radius + model.positions.margin
     size = t.Array2f(dr.opaque(t.Float, grid.width), dr.opaque(t.Float, grid.height))
     # The first and last pixel whose centre lies within the radius, clamped to the film while
@@ -211,7 +197,12 @@ def _tile_box(
 
 
 def _make_entries(
-    first_entry: Any, boxes: Rows, rows: Rows, num_entries: int, grid: TileGrid, model: ImageModel
+    first_entry: Any,
+    boxes: Rows,
+    rows: Rows,
+    num_entries: int,
+    grid: TileGrid,
+    model: FootprintModel,
 ) -> tuple[Any, Any]:
     """Of each entry its tile; and two words: see :func:`_pack`.
 
@@ -235,7 +226,7 @@ def _make_entries(
     tile_x = tile_x + (local - row * columns)
     tile_y = tile_y + row
     tile = dr.fma(tile_y, dr.opaque(t.UInt32, grid.columns), tile_x)
-    geometry = rows.load(rank)[: model.response.num_geometry]
+    geometry = rows.load(rank)[: model.falloff.num_geometry]
     mask = _touched_micros(geometry, tile_x, tile_y, grid, model)
     exists = entry < dr.opaque(t.UInt32, num_entries)
     tile = dr.select(exists, tile, dr.opaque(t.UInt32, grid.num_tiles - 1))
@@ -252,7 +243,7 @@ def _pack(rank: Any, tile: Any, mask: Any) -> list[Any]:
     """An entry in two words, as it is read in no order: 26 bits of rank, 22 of tile, 16 of mask.
 
     2^22 tiles have 2^30 pixels, whose four planes are more numbers than an array of Dr.Jit holds;
-    more ranks are refused by :func:`bin_splats`.
+    more ranks are refused by :func:`bin_footprints`.
     """
     return [rank | ((tile >> MICROS) << _RANK_BITS), mask | (tile << MICROS)]
 
@@ -273,7 +264,7 @@ def stable_order(keys: Any, bound: int) -> Any:
 
 
 def _touched_micros(
-    geometry: list[Any], tile_x: Any, tile_y: Any, grid: TileGrid, model: ImageModel
+    geometry: list[Any], tile_x: Any, tile_y: Any, grid: TileGrid, model: FootprintModel
 ) -> Any:
     """Bit m is set where the ellipse alpha >= cut reaches a pixel centre of micro-tile m.
 
@@ -282,7 +273,7 @@ def _touched_micros(
     and the best other coordinate is clamped to the rectangle.
     """
     reach = _reach(geometry, grid, model)
-    mean_x, mean_y, p, r, s = model.response.outline(geometry, reach)
+    mean_x, mean_y, p, r, s = model.falloff.outline(geometry, reach)
     t = types_of(type(mean_x))
     margin = model.positions.margin
     dx_per_dy = -r / p

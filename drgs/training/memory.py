@@ -26,7 +26,7 @@ from drgs.core.memory import available_memory, readable, resident_memory
 from drgs.datasets.types import Dataset, View, Viewpoint
 from drgs.gaussians.parameters import Gaussians
 from drgs.splatting.grid import MICRO, TILE
-from drgs.splatting.slots import BAND_SLOTS
+from drgs.splatting.reduction import BAND_SLOTS
 from drgs.training.density.registry import density_strategy
 
 PROCESS_BYTES = 290_000_000

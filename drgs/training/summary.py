@@ -41,6 +41,7 @@ def summary_of_fit(config: FitConfig, dataset: Dataset) -> list[SimulatedEffect]
             "model.antialiased" if model.antialiased else None,
             "model.smoothing" if model.smoothing else None,
         ),
+        *_approximations(config),
         SimulatedEffect(
             "exposure and white balance",
             None if config.colors.lr is None else "a colour transform for each training photograph",
@@ -69,16 +70,20 @@ def _extensions(config: FitConfig) -> list[SimulatedEffect]:
     ]
     chosen = (
         (STRATEGIES, config.densify.strategy, "densify.strategy"),
-        (
-            LOSSES,
-            config.loss.type,
-            "loss.type",
-        ),
+        (LOSSES, config.loss.type, "loss.type"),
     )
     for registry, name, key in chosen:
         if name not in registry.shipped:
             used.append((registry.get(name), f"{key}: {name}"))
     return [SimulatedEffect(e.name, f"{e.kind}: {e.summary}", why) for e, why in used]
+
+
+def _approximations(config: FitConfig) -> list[SimulatedEffect]:
+    """Return the approximations that are chosen by name and not the default, if there are any."""
+    chosen = config.model.approximations.others_than_default
+    values = {k: v for k, v in chosen.items() if k in ("projection", "falloff", "order")}
+    words, keys = (", ".join(each) for each in (values.values(), [f"model.{k}" for k in values]))
+    return [SimulatedEffect("approximations", words, keys)] if values else []
 
 
 def _background(config: FitConfig) -> SimulatedEffect:

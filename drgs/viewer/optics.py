@@ -14,7 +14,7 @@ import mitsuba as mi
 import numpy as np
 
 from drgs.cameras.axes import OPENCV_TO_MITSUBA
-from drgs.cameras.camera import Lens
+from drgs.cameras.lens import Lens
 from drgs.datasets.types import Viewpoint
 from drgs.datasets.viewpoints import pinhole
 from drgs.integrator.scene import NEAR_CLIP, film_of, make_sensors
@@ -69,7 +69,9 @@ class OpenCVLens(Optics):
         """See :class:`Optics`."""
         from drgs.cameras.radial_tangential import RadialTangential
 
-        return _through(RadialTangential.of(**self.coefficients), eye.viewpoint(width, height))
+        return _through(
+            RadialTangential.from_coefficients(**self.coefficients), eye.viewpoint(width, height)
+        )
 
 
 @dataclass(frozen=True)
@@ -86,7 +88,7 @@ class FisheyeLens(Optics):
 
         focal = height / math.radians(eye.fov)
         view = replace(eye.viewpoint(width, height), fx=focal, fy=focal)
-        return _through(Fisheye.of(**self.coefficients), view)
+        return _through(Fisheye.from_coefficients(**self.coefficients), view)
 
 
 @dataclass(frozen=True)

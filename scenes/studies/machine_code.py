@@ -26,8 +26,8 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
 AGGRESSIVE, POSITION_INDEPENDENT, SMALL = 3, 2, 3
-"""Constants of LLVM's C interface (Core.h and TargetMachine.h of LLVM 17 to 22): level of code
-generation, relocation, size of addresses."""
+"""Constants of LLVM's C interface: level of code generation, relocation and size of addresses
+(Core.h and TargetMachine.h of LLVM 17 to 22)."""
 
 PASSES = b"default<O2>"
 

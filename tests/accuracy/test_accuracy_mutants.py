@@ -1,4 +1,4 @@
-"""Mutation check of the approximations' derivatives: exact response, order and colours of pixels.
+"""Mutation check of the approximations' derivatives: exact falloff, order and colours of pixels.
 
 As in ``test_adjoint_mutants``: every partial derivative is scaled by 1.01 and changes its sign, and
 a check of the suite must notice it.
@@ -20,7 +20,7 @@ from drgs.splatting import rendering
 
 _REASONS = {
     (
-        "exact.RayResponse.footprint",
+        "exact.RayFalloff.footprint",
         "squared < LARGEST_EXPONENT * denominator",
         (AT_EQUALITY, ALWAYS),
     ): "beyond it alpha is 2^-10000 = 0: it keeps the factors of that 0 from overflowing",
@@ -28,7 +28,7 @@ _REASONS = {
         "pixel_order._walk",
         "along > 0",
         (AT_EQUALITY,),
-    ): "an alpha at a depth of exactly 0; that it shows nothing is tested for RayResponse",
+    ): "an alpha at a depth of exactly 0; that it shows nothing is tested for RayFalloff",
     (
         "pixel_order._walk",
         "alpha >= UNORDERED_ALPHA",
@@ -48,21 +48,21 @@ EQUIVALENT = {
 class Copies:
     """Of classes and a function, instrumented."""
 
-    response: type
+    falloff: type
     order: type
     colors: type
     add_product: Callable
 
     @staticmethod
     def of(board: Switchboard) -> "Copies":
-        response = Instrumented(
+        falloff = Instrumented(
             board,
             exact,
             derivatives=[
-                f"RayResponse.{name}"
+                f"RayFalloff.{name}"
                 for name in ("moments", "derivatives", "pack_tangents", "tangent")
             ],
-            forward=["RayResponse.footprint", "RayResponse.geometry", "RayResponse.bounds"],
+            forward=["RayFalloff.footprint", "RayFalloff.geometry", "RayFalloff.bounds"],
         )
         order = Instrumented(
             board,
@@ -77,7 +77,7 @@ class Copies:
             forward=["RayColors.at", "RayColors.bind"],
         )
         return Copies(
-            response=response["RayResponse"],
+            falloff=falloff["RayFalloff"],
             order=order["PixelOrder"],
             colors=colors["RayColors"],
             add_product=order["_add_product"],
@@ -87,8 +87,8 @@ class Copies:
         """The frame, whose forward pass is that of the package, with derivatives of the copies."""
         model, order = frame.bins.model, frame.order
         features = model.features
-        if isinstance(model.response, exact.RayResponse):
-            model = replace(model, response=self.response(model.response.camera))
+        if isinstance(model.falloff, exact.RayFalloff):
+            model = replace(model, falloff=self.falloff(model.falloff.camera))
         if isinstance(features, ray_colors.RayColors):
             model = replace(model, features=self.colors(features.sh_degree, features.camera))
         if isinstance(order, pixel_order.PixelOrder):
@@ -111,7 +111,7 @@ def outcome():
 
         def run():
             with pytest.MonkeyPatch.context() as patch:
-                patch.setattr(exact, "RayResponse", copies.response)
+                patch.setattr(exact, "RayFalloff", copies.falloff)
                 patch.setattr(ray_colors, "RayColors", copies.colors)
                 patch.setattr(pixel_order, "_add_product", copies.add_product)
                 check()
@@ -159,9 +159,9 @@ def outcome():
 class TestApproximations(MutationChecks):
     equivalent = EQUIVALENT
     derivatives = """
-        exact.RayResponse.moments
-        exact.RayResponse.derivatives exact.RayResponse.tangent
-        exact.RayResponse.pack_tangents pixel_order._adjoint pixel_order._add_product
+        exact.RayFalloff.moments
+        exact.RayFalloff.derivatives exact.RayFalloff.tangent
+        exact.RayFalloff.pack_tangents pixel_order._adjoint pixel_order._add_product
         pixel_order._totals pixel_order._pairs pixel_order._sum_pixels pixel_order._tangent
         ray_colors.RayColors.add_derivatives ray_colors.RayColors.tangents
     """

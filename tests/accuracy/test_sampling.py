@@ -462,7 +462,7 @@ def test_passes_of_several_samples_give_the_bytes_of_single_ones(name, monkeypat
         assert check() == 1
     width, height = SCENES[name]().sensors()[0].film().crop_size()
     monkeypatch.setattr("drgs.integrator.sampling.PIXELS_PER_PASS", 2 * width * height)
-    monkeypatch.setattr("drgs.splatting.slots.BAND_SLOTS", 16)
+    monkeypatch.setattr("drgs.splatting.reduction.BAND_SLOTS", 16)
     assert check() == 2
 
 

@@ -60,22 +60,22 @@ from drgs.splatting.projection import ewa
     ],
 )
 def test_coefficients_that_are_not_given_are_left_out(given, named):
-    lens = RadialTangential.of(**given)
-    assert lens.named() == named
+    lens = RadialTangential.from_coefficients(**given)
+    assert lens.coefficients() == named
     values = {name: -value for name, value in named.items()}
-    assert lens.with_named(values).named() == values
-    assert lens.with_named(values).max_squared_radius == lens.max_squared_radius
+    assert lens.with_coefficients(values).coefficients() == values
+    assert lens.with_coefficients(values).max_squared_radius == lens.max_squared_radius
 
 
 def test_a_fisheye_leaves_out_what_is_not_given():
-    assert fisheye.Fisheye.of().named() == {}
-    assert fisheye.Fisheye.of(k2=0.5).named() == {"k1": 0.0, "k2": 0.5}
-    assert fisheye.Fisheye.of(k1=0.0).named() == {"k1": 0.0}
-    lens = fisheye.Fisheye.of(k1=0.5, k2=0.25)
-    assert lens.with_named({"k1": 0.25, "k2": 0.125, "fx": 1.0}).named() == {
+    assert fisheye.Fisheye.from_coefficients().coefficients() == {}
+    assert fisheye.Fisheye.from_coefficients(k2=0.5).coefficients() == {"k1": 0.0, "k2": 0.5}
+    assert fisheye.Fisheye.from_coefficients(k1=0.0).coefficients() == {"k1": 0.0}
+    lens = fisheye.Fisheye.from_coefficients(k1=0.5, k2=0.25)
+    assert lens.with_coefficients({"k1": 0.25, "k2": 0.125, "fx": 1.0}).coefficients() == {
         "k1": 0.25, "k2": 0.125
     }  # fmt: skip
-    assert orthographic.Orthographic().named() == {}
+    assert orthographic.Orthographic().coefficients() == {}
 
 
 @pytest.mark.parametrize(
@@ -92,11 +92,11 @@ def test_a_fisheye_leaves_out_what_is_not_given():
     ],
 )
 def test_a_thin_prism_fisheye_leaves_out_what_is_not_given(given, named):
-    lens = KernelThinPrism.of(**given)
-    assert lens.named() == named
+    lens = KernelThinPrism.from_coefficients(**given)
+    assert lens.coefficients() == named
     values = {name: -value for name, value in named.items()}
-    assert lens.with_named({**values, "fx": 1.0}).named() == values
-    assert lens.with_named(values).min_cosine == lens.min_cosine
+    assert lens.with_coefficients({**values, "fx": 1.0}).coefficients() == values
+    assert lens.with_coefficients(values).min_cosine == lens.min_cosine
 
 
 @every_lens

@@ -18,7 +18,8 @@ from support.colmap_models import (
 )
 from support.datasets import load, load_noting, refusal
 
-from drgs.cameras.camera import Camera, Pinhole
+from drgs.cameras.camera import Camera
+from drgs.cameras.lens import Pinhole
 from drgs.config.schema import FitConfig, InitConfig
 from drgs.core.errors import UserError
 from drgs.datasets.colmap import LENSES
@@ -106,7 +107,7 @@ def test_every_lens_that_can_be_rendered_is(tmp_path, name):
     view = load(tmp_path).train[0]
     coefficients = dict(zip(MODELS[name][1], PARAMETERS[name], strict=True))
     named = {k: v for k, v in coefficients.items() if k[0] in "kps"}
-    assert ({} if view.lens is None else view.lens.named()) == pytest.approx(named)
+    assert ({} if view.lens is None else view.lens.coefficients()) == pytest.approx(named)
     kind = None if view.lens is None else view.lens.kind
     fisheye = "thin_prism_fisheye" if "PRISM" in name else "fisheye"
     assert kind == (fisheye if "FISHEYE" in name else None if "PINHOLE" in name else "opencv")
@@ -118,7 +119,7 @@ def film_points(view, points):
     K = np.array([[view.fx, 0, view.cx], [0, view.fy, view.cy], [0, 0, 1]])
     lens = Pinhole() if view.lens is None else view.lens
     camera = Camera.create(Float64, np.eye(3), np.zeros(3), K, view.width, view.height, 0.1, lens)
-    return np.array(camera.lens.film_point(camera, Array3f64(points.T))).T
+    return np.array(camera.lens.project_point(camera, Array3f64(points.T))).T
 
 
 @pytest.mark.parametrize("name", sorted(LENSES))

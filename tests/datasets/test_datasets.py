@@ -287,7 +287,7 @@ def test_lens_distortion_is_read(photographs, place):
     # Frames are in reverse order of their names: the first is the last view.
     edit(path, lambda m: (m if place == "top" else m["frames"][0]).update(coefficients))
     dataset = load(photographs)
-    assert dataset.train[-1].lens == RadialTangential.of(k1=0.1, p1=-0.02)
+    assert dataset.train[-1].lens == RadialTangential.from_coefficients(k1=0.1, p1=-0.02)
     assert dataset.train[0].lens == (dataset.train[-1].lens if place == "top" else None)
     assert dataset.description.endswith("; lens opencv (k1, p1, p2)")
     dataset = load(photographs, ignore_distortion=True)
@@ -299,15 +299,18 @@ def test_lens_distortion_is_read(photographs, place):
 def test_a_fisheye_lens_is_read(photographs, says):
     edit(photographs / "transforms.json", lambda m: m.update(k1=0.1, k4=-0.01, **says))
     dataset = load(photographs)
-    assert dataset.train[0].lens == Fisheye.of(k1=0.1, k4=-0.01)
+    assert dataset.train[0].lens == Fisheye.from_coefficients(k1=0.1, k4=-0.01)
     assert dataset.description.endswith("; lens fisheye (k1, k2, k3, k4)")
 
 
 @pytest.mark.parametrize(
     ("says", "lens"),
     [
-        ({"p2": 0.01, "sy1": -0.02}, ThinPrismFisheye.of(k1=0.1, p2=0.01, sy1=-0.02)),
-        ({"p1": 0, "sx1": 0.0}, Fisheye.of(k1=0.1)),  # which costs less
+        (
+            {"p2": 0.01, "sy1": -0.02},
+            ThinPrismFisheye.from_coefficients(k1=0.1, p2=0.01, sy1=-0.02),
+        ),
+        ({"p1": 0, "sx1": 0.0}, Fisheye.from_coefficients(k1=0.1)),  # which costs less
     ],
 )
 def test_a_thin_prism_fisheye_is_read(photographs, says, lens):
@@ -320,13 +323,15 @@ def test_a_thin_prism_fisheye_is_read(photographs, says, lens):
 def test_a_fourth_coefficient_that_is_opencvs_is_read(photographs, says):
     edit(photographs / "transforms.json", lambda m: m.update(k1=0.1, k4=0.25, **says))
     given = {k: v for k, v in says.items() if k == "k5"}
-    assert load(photographs).train[0].lens == RadialTangential.of(k1=0.1, k4=0.25, **given)
+    assert load(photographs).train[0].lens == RadialTangential.from_coefficients(
+        k1=0.1, k4=0.25, **given
+    )
 
 
 def test_coefficients_do_not_depend_on_the_size_of_the_picture(photographs):
     edit(photographs / "transforms.json", lambda m: m.update(k1=0.1))
     view = load(photographs, image_size=4).train[0]
-    assert view.lens == RadialTangential.of(k1=0.1) and view.fx == 4.5
+    assert view.lens == RadialTangential.from_coefficients(k1=0.1) and view.fx == 4.5
 
 
 def test_distortion_coefficients_of_zero_are_accepted(photographs):
@@ -348,9 +353,11 @@ def test_distortion_coefficients_of_zero_are_accepted(photographs):
         (lambda m: m.update(cx="4"), 'cx must be a number, got "4"'),
         (
             lambda m: m.update(camera_model="EQUIRECTANGULAR"),
-            "camera_model must be one of 'SIMPLE_PINHOLE', 'PINHOLE', 'SIMPLE_RADIAL', 'RADIAL', "
-            "'OPENCV', 'FULL_OPENCV', 'SIMPLE_RADIAL_FISHEYE', 'RADIAL_FISHEYE', "
-            "'OPENCV_FISHEYE' or 'THIN_PRISM_FISHEYE', got \"EQUIRECTANGULAR\"",
+            "camera_model must be one of SIMPLE_PINHOLE, PINHOLE, SIMPLE_RADIAL, RADIAL, OPENCV, "
+            "FULL_OPENCV, SIMPLE_RADIAL_FISHEYE, RADIAL_FISHEYE, OPENCV_FISHEYE, "
+            "THIN_PRISM_FISHEYE, or a lens: fisheye, opencv, pinhole, thin_prism_fisheye; others "
+            'come with packages that have an entry point of the group "drgs", got '
+            '"EQUIRECTANGULAR"',
         ),
         (
             lambda m: m.update(is_fisheye=True, p1=0.5),

@@ -442,7 +442,7 @@ def test_frames_of_the_synthetic_layout_may_have_the_same(blender):
     assert dataset.description.endswith(
         "; lens opencv (k1) ignored; masks of 2 of 6 photographs; depth in units of 1"
     )
-    assert load(folder).train[1].lens == RadialTangential.of(k1=0.1)
+    assert load(folder).train[1].lens == RadialTangential.from_coefficients(k1=0.1)
     for views in (dataset.train, dataset.test):
         np.testing.assert_array_equal(views[1].mask, mask)
         np.testing.assert_array_equal(views[1].depth, np.arange(24.0).reshape(4, 6))

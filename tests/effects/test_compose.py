@@ -8,13 +8,13 @@ import pytest
 from conftest import REPOSITORY
 from support.helpers import FLOAT32, Case, device_camera, device_gaussians
 
-from drgs.accuracy.exact import RayResponse, exact_shape
+from drgs.accuracy.exact import RayFalloff, exact_shape
 from drgs.cameras.thin_lens import RoundAperture
 from drgs.effects.compose import with_effects, without_effects
-from drgs.effects.defocus import Defocused, DimmedResponse
+from drgs.effects.defocus import Defocused, DimmedFalloff
 from drgs.effects.smoothing import smoothed
 from drgs.splatting import rendering
-from drgs.splatting.image_model import ImageModel
+from drgs.splatting.footprint import FootprintModel
 
 CASE = Case("compose", 16, 12, 0, count=12)
 APERTURE = RoundAperture(llvm.Float(0.1), llvm.Float(2.0))
@@ -33,10 +33,10 @@ def test_what_is_not_called_for_leaves_the_pipeline_as_it_is(scene):
 
 def test_an_aperture_wraps_the_projection_and_the_response(scene):
     gaussians, camera = scene
-    pipeline = rendering.Pipeline(0, shape=exact_shape, model=ImageModel(response=RayResponse()))
+    pipeline = rendering.Pipeline(0, shape=exact_shape, model=FootprintModel(falloff=RayFalloff()))
     found = with_effects(pipeline, gaussians, replace(camera, aperture=APERTURE))
     assert found.shape == Defocused(exact_shape)
-    assert found.model.response == DimmedResponse(RayResponse())
+    assert found.model.falloff == DimmedFalloff(RayFalloff())
     assert replace(found, shape=exact_shape, model=pipeline.model) == pipeline
 
 

@@ -29,8 +29,8 @@ from drgs.effects.occlusion import OccludedFeatures, Surface
 from drgs.gaussians.parameters import PARAMETER_NAMES
 from drgs.reference.effects import render_with_surfaces
 from drgs.splatting import feature_groups, rendering
+from drgs.splatting.footprint import DEFAULT
 from drgs.splatting.grid import TileGrid
-from drgs.splatting.image_model import DEFAULT
 
 # As in test_rendering.
 PICTURE = {name: limit for name, limit in (("Float64", 1e-12), ("Float", 2e-5))}

@@ -200,7 +200,7 @@ def test_defaults_and_types_are_those_of_the_table(plugin):
             if name != "nested_spp":  # in words: as many as of the splats
                 assert written(row.defaults[name]) == pytest.approx(value), name
             checked.add(name)
-    assert len(checked) == {"splats": 13, "calibrated": 5}[plugin]
+    assert len(checked) == {"splats": 14, "calibrated": 5}[plugin]
 
 
 def test_every_row_has_a_default_or_is_one_of_several_ways_to_give_gaussians():

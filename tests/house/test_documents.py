@@ -98,7 +98,7 @@ def test_links_lead_somewhere(page):
 
 
 FOLDERS = ("drgs", "plugins", "scenes", "tests", "docs")
-OF_WORKED_EXAMPLES = {"drgs/effects/fog.py", "drgs/cameras/stereographic.py"}
+OF_WORKED_EXAMPLES = {"drgs/effects/fog.py"}
 
 
 @each_page

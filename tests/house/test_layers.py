@@ -22,7 +22,7 @@ MAY_IMPORT = {
     "gaussians": {"io", *GROUND},
     "cameras": GROUND,
     "cli": GROUND,
-    "splatting": METHOD,
+    "splatting": {"config", *METHOD},
     "io": GROUND,
     "accuracy": {"splatting", "config", *METHOD},
     "effects": {"splatting", "config", *METHOD},

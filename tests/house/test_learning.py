@@ -48,8 +48,9 @@ def identifiers(*paths):
 
 def test_the_papers_symbols_have_names_in_the_code():
     kernels = (
-        *("drgs/splatting/projection.py", "drgs/splatting/image_model.py"),
-        *("drgs/cameras/camera.py", "drgs/gaussians/parameters.py", "drgs/gaussians/sh.py"),
+        *("drgs/splatting/projection.py", "drgs/splatting/footprint.py"),
+        *("drgs/cameras/camera.py", "drgs/cameras/lens.py"),
+        *("drgs/gaussians/parameters.py", "drgs/gaussians/sh.py"),
     )
     known = identifiers(REFERENCE), identifiers(*kernels)
     rows = list(rows_of_symbols())

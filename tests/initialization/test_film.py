@@ -20,9 +20,12 @@ THIN_PRISM = {**FISHEYE, "p1": 0.004, "p2": -0.002, "sx1": -0.01, "sy1": 0.02}
 
 LENSES = {
     "pinhole": (None, reference.Pinhole()),
-    "opencv": (RadialTangential.of(**OPENCV), reference.OpenCV(**OPENCV)),
-    "fisheye": (Fisheye.of(**FISHEYE), reference.Fisheye(**FISHEYE)),
-    "thin prism": (ThinPrismFisheye.of(**THIN_PRISM), reference.ThinPrismFisheye(**THIN_PRISM)),
+    "opencv": (RadialTangential.from_coefficients(**OPENCV), reference.OpenCV(**OPENCV)),
+    "fisheye": (Fisheye.from_coefficients(**FISHEYE), reference.Fisheye(**FISHEYE)),
+    "thin prism": (
+        ThinPrismFisheye.from_coefficients(**THIN_PRISM),
+        reference.ThinPrismFisheye(**THIN_PRISM),
+    ),
 }
 
 

@@ -312,7 +312,7 @@ def test_fox_is_read(fox_folder):
     dataset = load(fox_folder)
     assert (len(dataset.train), len(dataset.test)) == (43, 7)
     assert (dataset.train[0].width, dataset.train[0].height) == (270, 480)
-    named = dataset.train[0].lens.named()
+    named = dataset.train[0].lens.coefficients()
     assert named == {
         "k1": 0.0578421, "k2": -0.0805099, "p1": -0.000980296, "p2": 0.00015575
     }  # fmt: skip

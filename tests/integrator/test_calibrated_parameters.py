@@ -187,13 +187,15 @@ def test_gradients_of_a_picture_reach_the_calibration(sensor):
 REFUSED = {
     "lens": (
         {"lens": "opencvv"},
-        "PluginError: calibrated: lens must be one of pinhole, opencv, fisheye, "
-        "thin_prism_fisheye, got 'opencvv'; did you mean opencv?",
+        'PluginError: calibrated: lens: no lens is called "opencvv"; did you mean opencv?; '
+        "there are fisheye, opencv, pinhole, thin_prism_fisheye. Others come with packages that "
+        'have an entry point of the group "drgs"',
     ),
     "lens that is no name": (
         {"lens": 3},
-        "PluginError: calibrated: lens must be one of pinhole, opencv, fisheye, "
-        "thin_prism_fisheye, got 3",
+        'PluginError: calibrated: lens: no lens is called "3"; there are fisheye, opencv, '
+        "pinhole, thin_prism_fisheye. Others come with packages that have an entry point of the "
+        'group "drgs"',
     ),
     "coefficient of another lens": (
         {"lens": "fisheye", "k5": 0.1},

@@ -14,8 +14,9 @@ from support.views import View as Perspective
 from support.views import image_of, pose, splats_before
 
 from drgs.bench.scenes import bench_gaussians
-from drgs.cameras.camera import Pinhole, cameras_in_time
+from drgs.cameras.camera import cameras_in_time
 from drgs.cameras.fisheye import Fisheye
+from drgs.cameras.lens import Pinhole
 from drgs.cameras.radial_tangential import RadialTangential
 from drgs.cameras.thin_prism_fisheye import ThinPrismFisheye
 from drgs.config.approximations import Approximations
@@ -116,9 +117,9 @@ def test_views_of_one_size_share_a_film():
     "lens",
     [
         None,
-        RadialTangential.of(k1=-0.2, p2=0.01),
-        Fisheye.of(k1=0.1),
-        ThinPrismFisheye.of(k1=0.1, sx1=0.01),
+        RadialTangential.from_coefficients(k1=-0.2, p2=0.01),
+        Fisheye.from_coefficients(k1=0.1),
+        ThinPrismFisheye.from_coefficients(k1=0.1, sx1=0.01),
     ],
 )
 def test_what_mitsubas_sensors_cannot_express_is_a_calibrated_camera(lens):
@@ -131,8 +132,8 @@ def test_what_mitsubas_sensors_cannot_express_is_a_calibrated_camera(lens):
     assert actual["center"] == pytest.approx(view.center, rel=1e-7)
     assert actual["focal"].tolist() == [30, 33]
     assert actual["principal"].tolist() == [20.5, 9.25]
-    expected = {} if lens is None else lens.named()
-    named = {name: float(value[0]) for name, value in camera.lens.named().items()}
+    expected = {} if lens is None else lens.coefficients()
+    named = {name: float(value[0]) for name, value in camera.lens.coefficients().items()}
     assert named == pytest.approx(expected, rel=1e-7)
     assert type(camera.lens) is (Pinhole if lens is None else type(lens))
 

@@ -127,7 +127,8 @@ REFUSED = {
     ),
     "an unknown projection": (
         {"projection": "affine"},
-        "PluginError: splats: projection must be one of ewa, unscented, exact, got 'affine'",
+        "PluginError: splats: projection must be one of ewa, unscented, exact or of a package with "
+        "an entry point of the group \"drgs\", got 'affine'",
     ),
     "a low-pass below zero": (
         {"low_pass": -1},

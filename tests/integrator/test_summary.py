@@ -12,8 +12,8 @@ from support.usual_rule import USUAL
 from support.views import VIEWS, Scene, tensors
 
 import drgs  # noqa: F401  (registers the plugins)
-from drgs.cameras.camera import Pinhole
 from drgs.cameras.fisheye import Fisheye
+from drgs.cameras.lens import Pinhole
 from drgs.cameras.radial_tangential import RadialTangential
 from drgs.config.changes import changed
 from drgs.config.schema import FitConfig
@@ -98,8 +98,8 @@ def rich_dataset():
     dataset = fits.true_dataset()
     first, second, third, *others = dataset.train
     mask = np.ones((first.height, first.width), np.float32)
-    first = replace(first, lens=RadialTangential.of(k1=0.1, k2=0.01), mask=mask)
-    second = replace(second, lens=Fisheye.of(k1=0.1), mask=mask)
+    first = replace(first, lens=RadialTangential.from_coefficients(k1=0.1, k2=0.01), mask=mask)
+    second = replace(second, lens=Fisheye.from_coefficients(k1=0.1), mask=mask)
     third = replace(third, motion=Motion(first.camera_to_world, "rolling"))
     return replace(dataset, train=(first, second, third, *others))
 

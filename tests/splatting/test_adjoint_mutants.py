@@ -43,7 +43,7 @@ from support.mutants import ALWAYS, AT_EQUALITY, NEGATED, NEVER, SCALED, Switchb
 
 from drgs.gaussians.parameters import PARAMETER_NAMES
 from drgs.reference import splatting as reference
-from drgs.splatting import image_model, rasterize, rendering, slots
+from drgs.splatting import footprint, rasterize, reduction, rendering
 from drgs.splatting.cutoffs import Cutoffs
 from drgs.training import losses
 
@@ -191,7 +191,7 @@ def _detectors(at_thresholds):
 @pytest.fixture(scope="module")
 def outcome():
     board = Switchboard()
-    sums = Instrumented(board, slots, derivatives=["CompositedPairs.of", *SUMS[1:]], forward=[])
+    sums = Instrumented(board, reduction, derivatives=["CompositedPairs.of", *SUMS[1:]], forward=[])
     kernels = Instrumented(
         board,
         rasterize,
@@ -207,20 +207,20 @@ def outcome():
     )
     model = Instrumented(
         board,
-        image_model,
+        footprint,
         derivatives=[
-            "ImageModel.footprint",
-            "ImageModel.alphas",
-            *(f"AffineResponse.{name}" for name in RESPONSE_DERIVATIVES),
+            "FootprintModel.footprint",
+            "FootprintModel.alphas",
+            *(f"GaussianFalloff.{name}" for name in RESPONSE_DERIVATIVES),
             *(f"PixelCenters.{name}" for name in ("sum", "sum_dx", "sum_dy", "sum_dy_dy")),
             *(f"SplatFeatures.{name}" for name in ("add_derivatives", "tangents")),
         ],
-        forward=["ImageModel.footprint", "ImageModel.alphas"],
+        forward=["FootprintModel.footprint", "FootprintModel.alphas"],
     )
 
     def on_instrumented_model(name):
         def run(bins, *arguments):
-            copy = model["ImageModel"](cutoffs=bins.model.cutoffs)
+            copy = model["FootprintModel"](cutoffs=bins.model.cutoffs)
             return kernels[name](replace(bins, model=copy), *arguments)
 
         return run
@@ -291,11 +291,11 @@ def _remembered(board, function):
 @pytest.mark.slow
 class TestDefault(MutationChecks):
     derivatives = """
-        rasterize._partials rasterize._adjoint_step slots.sum_entries slots.sum_runs
-        rasterize.composite_tangent rasterize.pack_tangents image_model.AffineResponse.moments
-        image_model.AffineResponse.derivatives image_model.AffineResponse.tangent
-        image_model.AffineResponse.pack_tangents image_model.SplatFeatures.add_derivatives
-        image_model.PixelCenters.sum_dx rendering._splat_tangents
+        rasterize._partials rasterize._adjoint_step reduction.sum_entries reduction.sum_runs
+        rasterize.composite_tangent rasterize.pack_tangents footprint.GaussianFalloff.moments
+        footprint.GaussianFalloff.derivatives footprint.GaussianFalloff.tangent
+        footprint.GaussianFalloff.pack_tangents footprint.SplatFeatures.add_derivatives
+        footprint.PixelCenters.sum_dx rendering._splat_tangents
         rendering.gradients_of rendering._back_to_rows
         rendering.gradients_by_row rendering._as_tensors
         losses._ssim_and_partials losses._assemble_gradient losses._PhotometricOp.backward

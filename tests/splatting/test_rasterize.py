@@ -28,12 +28,12 @@ from support.helpers import (
 
 from drgs.core.constants import WHITENING_SCALE
 from drgs.reference import splatting as reference
-from drgs.splatting import image_model
+from drgs.splatting import footprint
 from drgs.splatting import lanes as lanes_module
-from drgs.splatting import slots as slots_module
+from drgs.splatting import reduction as slots_module
 from drgs.splatting.grid import MICROS, TileGrid
 from drgs.splatting.rasterize import ONE_SAMPLE, composite_adjoint
-from drgs.splatting.slots import CompositedPairs, assign_slots, bands_of
+from drgs.splatting.reduction import CompositedPairs, assign_slots, bands_of
 
 # float64: some hundred terms of the size of the result. float32: an exponent of up to 8 carries
 # 1e-6, so alpha 1e-6 and a pixel a few of them; measured 1e-6. In the adjoint, S is the
@@ -257,7 +257,7 @@ def test_memory_that_was_never_written_is_never_read(precision):
 def test_short_exp2_is_accurate_to_single_precision():
     x = np.linspace(-126, 127, 2_000_001).astype(np.float32)
     x = np.concatenate([x, np.float32([-126, -0.5, 0.5, 0, 127, -1e-30, -125.5])])
-    actual = np.array(image_model.exp2_short(FLOAT32.Float(x))).astype(np.float64)
+    actual = np.array(footprint.exp2_short(FLOAT32.Float(x))).astype(np.float64)
     exact = np.exp2(x.astype(np.float64))
     assert np.abs(actual / exact - 1).max() < 2.2e-7
 

@@ -8,6 +8,7 @@ import pytest
 from support.helpers import (
     FLOAT32,
     Case,
+    bin_splats,
     both_precisions,
     device_camera,
     device_gaussians,
@@ -21,7 +22,7 @@ from drgs.reference import splatting as reference
 from drgs.splatting import tiles
 from drgs.splatting.grid import GRID, MICRO, MICROS, TILE, TileGrid
 from drgs.splatting.projection import compensated_opacity, load_rows, plain_opacity, project
-from drgs.splatting.tiles import WORD, bin_splats
+from drgs.splatting.tiles import WORD
 
 CASES = [
     Case("37x29", 37, 29, 0),

@@ -309,8 +309,8 @@ def check_a_peak_in_the_plane_of_the_camera_shows_nothing():
     def offsets_from(x, y):
         return [[i + 0.5 - x for i in range(4)]] * 4, [[j + 0.5 - y] * 4 for j in range(4)]
 
-    response = exact.RayResponse().seen_by(camera)
-    footprint = response.footprint(geometry, offsets_from, number(0) == 0)
+    falloff = exact.RayFalloff().for_camera(camera)
+    footprint = falloff.footprint(geometry, offsets_from, number(0) == 0)
     shows = np.array([float(x[0]) > -math.inf for x in footprint.log2_alpha]).reshape(4, 4)
     assert shows[:, 0].all() and not shows[:, 1:].any()
 
@@ -318,9 +318,9 @@ def check_a_peak_in_the_plane_of_the_camera_shows_nothing():
 def check_a_splat_without_opacity_has_no_derivatives():
     """An opacity that underflows to zero has the logarithm - inf."""
     number = FLOAT64.Float
-    response = exact.RayResponse()
+    falloff = exact.RayFalloff()
     geometry = [number(x) for x in (0.5, 0.5, 1, 0, 1, -math.inf, -1, 0, 0.5)]
-    derivatives = response.derivatives(geometry, [number(0)] * response.num_moments)
+    derivatives = falloff.derivatives(geometry, [number(0)] * falloff.num_moments)
     assert [float(d[0]) for d in derivatives] == [0] * 9
 
 

@@ -81,7 +81,7 @@ def picture_of(
     if lens is not None:
         from drgs.cameras.radial_tangential import RadialTangential
 
-        host = RadialTangential.of(**{k: v for k, v in vars(lens).items() if v})
+        host = RadialTangential.from_coefficients(**{k: v for k, v in vars(lens).items() if v})
     return View(
         name, pose, focal, focal, middle, middle, size, size, host,
         image=image.astype(np.float32), alpha=alpha[..., 0].astype(np.float32),

@@ -10,8 +10,8 @@ import pytest
 from drgs.reference import splatting as reference
 from drgs.splatting import rasterize
 from drgs.splatting.cutoffs import Cutoffs
+from drgs.splatting.footprint import FootprintModel
 from drgs.splatting.grid import TileGrid
-from drgs.splatting.image_model import ImageModel
 from drgs.splatting.projection import Splats2D
 from drgs.splatting.rasterize import (
     SplatGradients,
@@ -19,12 +19,12 @@ from drgs.splatting.rasterize import (
     composite_adjoint,
     composite_tangent,
 )
-from drgs.splatting.tiles import bin_splats
 from support.helpers import (
     FLOAT32,
     FLOAT64,
     NEAR_THRESHOLD,
     assert_arrays_agree,
+    bin_splats,
     rows,
     single,
 )
@@ -141,7 +141,7 @@ class FlatScene:
 
     def composite(self, precision):
         columns = [precision.array(column) for column in self.features.T]
-        grid, model = TileGrid(self.width, self.height), ImageModel(cutoffs=self.cutoffs)
+        grid, model = TileGrid(self.width, self.height), FootprintModel(cutoffs=self.cutoffs)
         bins = bin_splats(self.splats(precision), grid, columns, model)
         records = rasterize.Records.of(bins, bins.rows.load)
         return bins, records, composite(bins, records)
@@ -173,7 +173,7 @@ class FlatScene:
 def as_arrays(gradients: SplatGradients) -> dict[str, np.ndarray]:
     return {
         "means2d": rows(gradients.means2d),
-        "whitening": rows(gradients.whitening),
+        "whitening": rows(gradients.geometry[2:5]),
         "opacities": rows(gradients.opacities),
         "features": np.stack([rows(column) for column in gradients.features], axis=-1),
     }

@@ -17,7 +17,9 @@ from drgs.effects.compose import with_effects
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 from drgs.reference import splatting as reference
 from drgs.splatting import rendering
+from drgs.splatting.footprint import DEFAULT
 from drgs.splatting.projection import compensated_opacity, plain_opacity
+from drgs.splatting.tiles import bin_footprints, footprints_of
 
 NEAR_THRESHOLD = 1e-4
 """Relative distance from a threshold at which float32 may decide otherwise. A mean at p px carries
@@ -409,3 +411,8 @@ def bitwise(tree) -> list[bytes]:
     values = tree.values() if isinstance(tree, dict) else tree
     dr.eval(*[v for v in values if dr.is_array_v(v)])
     return [np.array(value).tobytes() for value in values]
+
+
+def bin_splats(splats, grid, features=(), model=DEFAULT):
+    """From projected splats to tiles, without keys."""
+    return bin_footprints(footprints_of(splats, grid, features, model), grid, model)

@@ -56,10 +56,14 @@ def kernel_lens(lens: effects.Lens) -> object:
     """The kernels' lens with the coefficients of the reference's that are not zero."""
     given = {name: value for name, value in asdict(lens).items() if value != 0}
     if isinstance(lens, OpenCV):
-        return RadialTangential.of(**given)
+        return RadialTangential.from_coefficients(**given)
     if isinstance(lens, ThinPrismFisheye):
-        return thin_prism_fisheye.ThinPrismFisheye.of(**given)
-    return fisheye.Fisheye.of(**given) if isinstance(lens, Fisheye) else orthographic.Orthographic()
+        return thin_prism_fisheye.ThinPrismFisheye.from_coefficients(**given)
+    return (
+        fisheye.Fisheye.from_coefficients(**given)
+        if isinstance(lens, Fisheye)
+        else orthographic.Orthographic()
+    )
 
 
 def lens_camera(camera: reference.Camera, lens: effects.Lens, precision: Precision) -> Camera:

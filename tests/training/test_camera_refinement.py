@@ -344,10 +344,10 @@ def test_refined_cameras_make_better_pictures():
 
 LENSES = {
     "pinhole": None,
-    "opencv": RadialTangential.of(k1=0.1, p2=-0.02),
-    "rational": RadialTangential.of(k1=0.1, k4=0.25),
-    "fisheye": Fisheye.of(k1=0.05, k2=-0.01),
-    "thin prism": ThinPrismFisheye.of(k1=0.05, p2=-0.01, sx1=0.02),
+    "opencv": RadialTangential.from_coefficients(k1=0.1, p2=-0.02),
+    "rational": RadialTangential.from_coefficients(k1=0.1, k4=0.25),
+    "fisheye": Fisheye.from_coefficients(k1=0.05, k2=-0.01),
+    "thin prism": ThinPrismFisheye.from_coefficients(k1=0.05, p2=-0.01, sx1=0.02),
 }
 
 

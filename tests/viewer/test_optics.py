@@ -45,10 +45,13 @@ def viewpoint(focal=FOCAL, lens=None):
         (Pinhole(), viewpoint()),
         (
             OpenCVLens({"k1": -0.3, "p1": 0.02}),
-            viewpoint(lens=RadialTangential.of(k1=-0.3, p1=0.02)),
+            viewpoint(lens=RadialTangential.from_coefficients(k1=-0.3, p1=0.02)),
         ),
         # The angle of the whole height on the film, so many px a radian.
-        (FisheyeLens({"k1": 0.1}), viewpoint(HEIGHT / math.radians(FOV), Fisheye.of(k1=0.1))),
+        (
+            FisheyeLens({"k1": 0.1}),
+            viewpoint(HEIGHT / math.radians(FOV), Fisheye.from_coefficients(k1=0.1)),
+        ),
     ],
     ids=["pinhole", "opencv", "fisheye"],
 )

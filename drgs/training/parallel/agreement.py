@@ -105,7 +105,7 @@ def _digests(scene: mi.Scene) -> dict[str, str]:
 def _digest_of_cameras(views: Sequence[Viewpoint]) -> str:
     cameras = [
         [view.name, view.width, view.height, view.K.tolist(), view.camera_to_world.tolist()]
-        + ([] if view.lens is None else [view.lens.kind, str(view.lens.named())])
+        + ([] if view.lens is None else [view.lens.kind, str(view.lens.coefficients())])
         + ([] if view.motion is None else [view.motion.close_to_world.tolist()])
         for view in views
     ]

@@ -1,13 +1,12 @@
 """What a splat is at the 16 pixels of a micro-tile: the image model of the kernels.
 
-An :class:`ImageModel` names what tiles and compositing have to agree on, each an object that the
-kernels' Python code calls while Dr.Jit traces it. A protocol says what such an object must have.
-The types here are the defaults, those of the 3DGS paper; the others are in modules of their own,
-which are imported when they are chosen:
+A :class:`FootprintModel` holds what tiles and compositing have to agree on, each an object that the
+kernels' Python code calls while Dr.Jit traces it. The classes here are the bases, and the defaults,
+those of the 3DGS paper; others are in modules of their own, imported when they are chosen:
 
-- *response*: how alpha falls off around a splat (:class:`Response`: :class:`AffineResponse`)
+- *falloff*: how alpha falls off around a splat (:class:`GaussianFalloff`)
 - *positions*: where in a pixel it is evaluated (:class:`Positions`: :class:`PixelCenters`)
-- *features*: what is composited of a splat (:class:`Features`: :class:`SplatFeatures`)
+- *features*: what is composited of a splat (:class:`SplatFeatures`)
 - *cutoffs*: where splats and pixels end (:class:`drgs.splatting.cutoffs.Cutoffs`)
 """
 
@@ -17,11 +16,12 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar
 
 import drjit as dr
 
 from drgs.cameras.camera import Camera
+from drgs.config.approximations import FALLOFFS
 from drgs.core.arrays import is_float64, types_of
 from drgs.core.constants import WHITENING_SCALE
 from drgs.splatting.cutoffs import Cutoffs
@@ -83,53 +83,50 @@ class Alpha:
 # ----------------------------------------------------------------------------------------------
 
 
-class Positions(Protocol):
+class Positions:
     """Where in a pixel splats are evaluated. Grids of 16 values are lists of 4 rows of 4."""
 
-    @property
-    def margin(self) -> float:
-        """px: how far from its centre a pixel may be evaluated, along either axis."""
-        ...
-
-    @property
-    def samples(self) -> int:
-        """How many times each pixel is evaluated."""
-        ...
+    margin: ClassVar[float] = 0.0  # px: distance from a pixel's centre to its point, at most
+    samples: int = 1  # times that each pixel is evaluated
 
     def bind(self, lanes: Lanes, grid: TileGrid) -> Positions:
-        """For the lanes of one kernel: loads what they need. The rest is called of the result."""
-        ...
+        """Load what the lanes of one kernel need; the other methods are called of the result."""
+        del lanes, grid
+        return self
 
     def points(self, lanes: Lanes, Float: type) -> list[tuple[Any, Any]]:
-        """x and y (px) of the 16 pixels."""
-        ...
+        """Return x and y (px) of the 16 pixels."""
+        raise NotImplementedError
 
     def offsets(self, lanes: Lanes, x: Any, y: Any) -> tuple[list, list]:
-        """Grids of x and y, from a point of the film to the pixels, px."""
-        ...
+        """Return grids of x and y, from a point of the film to the pixels, px."""
+        raise NotImplementedError
 
     def sum(self, values: list[Any]) -> Any:
-        """Of 16 values."""
-        ...
+        """Sum 16 values."""
+        return total(values)
 
     def sum_dx(self, values: list[Any], dx: list) -> Any:
-        """Of values times dx, a grid of :meth:`offsets`."""
-        ...
+        """Sum values times dx, a grid of :meth:`offsets`."""
+        return total(_products(values, dx))
 
     def sum_dy(self, values: list[Any], dy: list) -> Any:
-        """Of values times dy."""
-        ...
+        """Sum values times dy."""
+        return total(_products(values, dy))
 
     def sum_dy_dy(self, values: list[Any], dy: list) -> Any:
-        """Of values times dy^2."""
-        ...
+        """Sum values times dy^2."""
+        return total(_products(_products(values, dy), dy))
+
+
+def _products(values: list[Any], grid: list[list[Any]]) -> list[Any]:
+    return [a * b for a, b in zip(values, flat_columns(grid), strict=True)]
 
 
 @dataclass(frozen=True)
-class PixelCenters:
+class PixelCenters(Positions):
     """Every pixel is evaluated at its centre: offsets are shared by rows and columns."""
 
-    margin: ClassVar[float] = 0.0
     samples: ClassVar[int] = 1
 
     def points(self, lanes: Lanes, Float: type) -> list[tuple[Any, Any]]:
@@ -162,11 +159,6 @@ class PixelCenters:
         """Of values times dy^2."""
         dy = _first_of_rows(dy)
         return _dot([a * b for a, b in zip(self._rows(values), dy, strict=True)], dy)
-
-    def bind(self, lanes: Lanes, grid: TileGrid) -> PixelCenters:
-        """For the lanes of one kernel: nothing has to be loaded."""
-        del lanes, grid
-        return self
 
     @staticmethod
     def _rows(values: list[Any]) -> list[Any]:
@@ -216,94 +208,21 @@ Offsets = Callable[[Any, Any], tuple[list, list]]
 """From a point of the film, x and y (px), to grids of offsets from it to the 16 pixels."""
 
 
-class Response(Protocol):
-    """How alpha falls off around a splat.
-
-    *Geometry* are the numbers of a splat that decide its alpha; the first are mean x, y (px) and p,
-    r, s of U (1 / px, base 2). *Moments* are sums over pixels, weighted by d loss / d ln(alpha),
-    that give the derivatives of what :meth:`differentiable` lists.
-    """
-
-    @property
-    def num_geometry(self) -> int:
-        """Numbers of a splat."""
-        ...
-
-    @property
-    def num_moments(self) -> int:
-        """Sums over pixels, by splat."""
-        ...
-
-    def seen_by(self, camera: Camera) -> Response:
-        """For one camera."""
-        ...
-
-    def geometry(self, splats: Splats2D) -> list[Any]:
-        """Columns, one value per Gaussian."""
-        ...
-
-    def differentiable(self, splats: Splats2D) -> list[Any]:
-        """What :meth:`derivatives` are with respect to: as many columns as the geometry has."""
-        ...
-
-    def log2_opacity(self, geometry: list[Any]) -> Any:
-        """The base-2 logarithm of the opacity."""
-        ...
-
-    def log2_floor(self, geometry: list[Any], cutoffs: Cutoffs) -> Any:
-        """The base-2 logarithm of the smallest alpha of a splat."""
-        ...
-
-    def bounds(self, splats: Splats2D, geometry: list[Any], reach: Any) -> tuple[Any, Any]:
-        """Centre and half sizes (Array2f, px) of a box around all that shows.
-
-        reach: by how much log2_alpha may be below log2_opacity.
-        """
-        ...
-
-    def outline(self, geometry: list[Any], reach: Any) -> list[Any]:
-        """Mean x, y, p, r, s of an ellipse |U d|^2 <= ``reach`` that holds all that shows."""
-        ...
-
-    def coordinates(self, geometry: list[Any], x: Any, y: Any) -> tuple[Any, Any]:
-        """U d at a point of the film, px."""
-        ...
-
-    def footprint(self, geometry: list[Any], offsets_from: Offsets, active: Any) -> Footprint:
-        """Evaluate the exponent; on a lane that is not active every alpha is below any floor."""
-        ...
-
-    def moments(self, footprint: Footprint, weights: list[Any], positions: Positions) -> list[Any]:
-        """Moments of one micro-tile; weights: d loss / d ln(alpha) at the 16 pixels."""
-        ...
-
-    def derivatives(self, geometry: list[Any], totals: list[Any]) -> list[Any]:
-        """From moments, summed over all micro-tiles, to derivatives."""
-        ...
-
-    def pack_tangents(self, geometry: list[Any], tangents: list[Any]) -> list[Any]:
-        """Tangents of the geometry, from those of what :meth:`differentiable` lists."""
-        ...
-
-    def tangent(
-        self, geometry: list[Any], footprint: Footprint, d_geometry: list[Any]
-    ) -> list[Any]:
-        """Tangent of ln(alpha) at the 16 pixels; d_geometry: of :meth:`pack_tangents`."""
-        ...
-
-
+@FALLOFFS.register("gaussian")
 @dataclass(frozen=True)
-class AffineResponse:
+class GaussianFalloff:
     """The projected Gaussian is a Gaussian on the film: alpha = o exp(-|U d|^2 / 2).
 
-    Geometry: mean x, y (px); then p, r, s of U and log2_opacity, scaled such that log2_alpha =
-    log2_opacity - |U d|^2.
+    The base of all falloffs. *Geometry* are the numbers of a splat that decide its alpha: mean
+    x, y (px); then p, r, s of U and log2_opacity, scaled such that log2_alpha = log2_opacity -
+    |U d|^2; a falloff may have others besides. *Moments* are sums over pixels, weighted by
+    d loss / d ln(alpha), that give the derivatives of what :meth:`differentiable` lists.
     """
 
-    num_geometry: ClassVar[int] = 6
-    num_moments: ClassVar[int] = 6
+    num_geometry: ClassVar[int] = 6  # numbers of a splat
+    num_moments: ClassVar[int] = 6  # sums over pixels, by splat
 
-    def seen_by(self, camera: Camera) -> AffineResponse:
+    def for_camera(self, camera: Camera) -> GaussianFalloff:
         """For one camera: nothing depends on it."""
         del camera
         return self
@@ -314,11 +233,14 @@ class AffineResponse:
         return [*splats.means2d, p, r, s, dr.log2(splats.opacities)]
 
     def differentiable(self, splats: Splats2D) -> list[Any]:
-        """What :meth:`derivatives` are with respect to."""
+        """Return what :meth:`derivatives` are with respect to: as many columns as geometry."""
         return [*splats.means2d, *splats.whitening, splats.opacities]
 
     def bounds(self, splats: Splats2D, geometry: list[Any], reach: Any) -> tuple[Any, Any]:
-        """Centre and half sizes (Array2f, px) of the box around |U d|^2 <= ``reach``."""
+        """Return centre and half sizes (Array2f, px) of a box around all that shows.
+
+        reach: by how much log2_alpha may be below log2_opacity; here, of |U d|^2.
+        """
         del geometry
         return splats.means2d, dr.sqrt(2 * math.log(2) * reach * splats.variances)
 
@@ -426,61 +348,15 @@ class FeatureGroup:
 
     stored: list[int]  # places of the numbers that they need among all that are stored
     planes: list[int]  # places of their planes among all; one may be of several groups
-    features: Features
-
-
-class Features(Protocol):
-    """What is composited of a splat, from the numbers that are stored of it."""
-
-    def groups(self, num_stored: int, size: int) -> list[FeatureGroup]:
-        """Divide the features into groups of about ``size`` planes."""
-        ...
-
-    def num_planes(self, num_stored: int) -> int:
-        """Planes that come of ``num_stored`` numbers per splat."""
-        ...
-
-    def seen_by(self, camera: Camera) -> Features:
-        """For one camera."""
-        ...
-
-    def check_differentiable_in_camera(self) -> None:
-        """Raise NotImplementedError if they depend on the camera but through what is stored."""
-        ...
-
-    def bind(self, lanes: Lanes, positions: Positions) -> Features:
-        """For the lanes of one kernel: loads what they need. The rest is called of the result."""
-        ...
-
-    def at(self, stored: list[Any], pixel: int) -> list[Any]:
-        """The splat's features at a pixel."""
-        ...
-
-    def add(self, planes: list[Any], stored: list[Any], pixel: int, weight: Any) -> list[Any]:
-        """A pixel's ``planes`` with this splat's share; weight: T alpha."""
-        ...
-
-    def feature_gradient(self, stored: list[Any], pixel: int, g: list[Any]) -> Any:
-        """c . g, with the features c at a pixel and the loss's derivatives g there."""
-        ...
-
-    def add_derivatives(
-        self, totals: list[Any], stored: list[Any], pixel: int, weight: Any, g: list[Any]
-    ) -> list[Any]:
-        """``totals`` and one pixel's share of the derivatives with respect to ``stored``.
-
-        weight: T alpha; g: derivatives of the loss with respect to the pixel's planes.
-        """
-        ...
-
-    def tangents(self, stored: list[Any], d_stored: list[Any], pixel: int) -> list[Any]:
-        """Tangents of the features at a pixel."""
-        ...
+    features: SplatFeatures
 
 
 @dataclass(frozen=True)
 class SplatFeatures:
-    """A splat's features are the same at every pixel: what is stored is what is composited."""
+    """What is composited of a splat, from the numbers that are stored of it.
+
+    Here its features are the same at every pixel: what is stored is what is composited.
+    """
 
     def groups(self, num_stored: int, size: int) -> list[FeatureGroup]:
         """Divide the features into groups of at most ``size`` planes.
@@ -501,13 +377,13 @@ class SplatFeatures:
         """Planes that come of ``num_stored`` numbers per splat."""
         return num_stored
 
-    def seen_by(self, camera: Camera) -> SplatFeatures:
+    def for_camera(self, camera: Camera) -> SplatFeatures:
         """For one camera: nothing depends on it."""
         del camera
         return self
 
     def check_differentiable_in_camera(self) -> None:
-        """They do not depend on the camera."""
+        """Raise UnsupportedError if they depend on the camera but through what is stored."""
 
     def weighing(self) -> SplatFeatures:
         """What has the weights of compositing as derivatives of the first number that is stored."""
@@ -538,7 +414,10 @@ class SplatFeatures:
     def add_derivatives(
         self, totals: list[Any], stored: list[Any], pixel: int, weight: Any, g: list[Any]
     ) -> list[Any]:
-        """``totals`` and one pixel's share of the derivatives with respect to ``stored``."""
+        """Return ``totals`` with one pixel's share of the derivatives with respect to ``stored``.
+
+        weight: T alpha; g: derivatives of the loss with respect to the pixel's planes.
+        """
         del stored, pixel
         return [
             dr.fma(weight, derivative, total) for derivative, total in zip(g, totals, strict=True)
@@ -551,31 +430,31 @@ class SplatFeatures:
 
 
 @dataclass(frozen=True)
-class ImageModel:
+class FootprintModel:
     """What tiles and compositing share; see the module's description."""
 
-    response: Response = field(default_factory=AffineResponse)
+    falloff: GaussianFalloff = field(default_factory=GaussianFalloff)
     positions: Positions = field(default_factory=PixelCenters)
-    features: Features = field(default_factory=SplatFeatures)
+    features: SplatFeatures = field(default_factory=SplatFeatures)
     cutoffs: Cutoffs = field(default_factory=Cutoffs)
 
-    def seen_by(self, camera: Camera) -> ImageModel:
+    def for_camera(self, camera: Camera) -> FootprintModel:
         """This model for one camera."""
         return replace(
             self,
-            response=self.response.seen_by(camera),
-            features=self.features.seen_by(camera),
+            falloff=self.falloff.for_camera(camera),
+            features=self.features.for_camera(camera),
         )
 
     def check_differentiable_in_camera(self) -> None:
         """Raise UnsupportedError if pixels depend on the camera but through the splats."""
         self.features.check_differentiable_in_camera()
 
-    def bind(self, lanes: Lanes, grid: TileGrid) -> ImageModel:
+    def bind(self, lanes: Lanes, grid: TileGrid) -> FootprintModel:
         """This model for the lanes of one kernel: loads what a lane needs before its loop."""
         positions = self.positions.bind(lanes, grid)
-        return ImageModel(
-            response=self.response,
+        return FootprintModel(
+            falloff=self.falloff,
             positions=positions,
             features=self.features.bind(lanes, positions),
             cutoffs=self.cutoffs,
@@ -583,12 +462,12 @@ class ImageModel:
 
     def footprint(self, geometry: list[Any], lanes: Lanes, active: Any) -> Footprint:
         """A splat at the pixels of each lane."""
-        return self.response.footprint(geometry, partial(self.positions.offsets, lanes), active)
+        return self.falloff.footprint(geometry, partial(self.positions.offsets, lanes), active)
 
     def alphas(self, geometry: list[Any], footprint: Footprint) -> list[Alpha]:
         """Alpha at the 16 pixels."""
-        floor = self.response.log2_floor(geometry, self.cutoffs)
+        floor = self.falloff.log2_floor(geometry, self.cutoffs)
         return [Alpha.at(x, floor, self.cutoffs.alpha_max) for x in footprint.log2_alpha]
 
 
-DEFAULT = ImageModel()
+DEFAULT = FootprintModel()

@@ -1,0 +1,321 @@
+"""Lenses: where points are on the film, and along which ray a place of the film looks.
+
+A lens is a frozen dataclass derived from :class:`Lens`, whose fields are its coefficients. It is
+known by the name under which it enters :data:`LENSES`: as ``lens`` of the sensor ``calibrated`` and
+as ``camera_model`` of a ``transforms.json``. :class:`Pinhole` is the default; the other lenses are
+in modules of their own, which are imported when a camera has one.
+
+Conventions: camera axes are OpenCV's (x right, y down, z forward); places on the film are in pixels
+from its upper left corner; lengths are in scene units. Positions are Dr.Jit arrays, one a lane.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, replace
+from typing import Any, ClassVar, Protocol
+
+import drjit as dr
+
+from drgs.core.arrays import types_of
+from drgs.core.class_registry import ClassRegistry
+from drgs.core.constants import MAX_COEFFICIENT, TAN_CLAMP
+from drgs.core.errors import UserError
+
+LENSES = ClassRegistry(
+    "lens",
+    {
+        "pinhole": "drgs.cameras.lens",
+        "opencv": "drgs.cameras.radial_tangential",
+        "fisheye": "drgs.cameras.fisheye",
+        "thin_prism_fisheye": "drgs.cameras.thin_prism_fisheye",
+    },
+)
+"""Lenses by name."""
+
+NEWTON_STEPS = 24
+"""Steps of the search for a ray: most need 5; those that would leave the lens are halved."""
+
+
+class CameraParameters(Protocol):
+    """Parameters of a ``drgs.cameras.camera.Camera`` that a lens may use: Dr.Jit scalars."""
+
+    rotation: Any  # Matrix3f, world to camera: its rows are the camera's axes in the world
+    focal: Any  # Array2f (fx, fy), px
+    principal: Any  # Array2f (cx, cy), px
+    film_start: Any  # Array2f, px: upper left corner of the whole film
+    film_end: Any  # Array2f, px: its lower right corner
+    near: Any  # Float, scene units
+
+
+@dataclass(frozen=True)
+class Lens:
+    """A lens whose rays meet in the camera's centre, and may come from beside and behind it.
+
+    A subclass defines :meth:`project_point`, :meth:`projection_jacobian` and, unless it leaves that
+    to Newton's method, :meth:`ray`. All other methods have the meaning that most lenses give them;
+    :class:`Perspective` is the base of lenses that see what is in front of them only.
+    """
+
+    kind: ClassVar[str] = ""  # name in LENSES
+    names: ClassVar[tuple[str, ...]] = ()  # of the coefficients; none: those of the fields
+    distorts: ClassVar[bool] = True  # whether a pinhole could take its place
+    parallel: ClassVar[bool] = False  # whether its rays are, instead of meeting in the camera
+
+    # ------------------------------------------------------------------------------------------
+    # To be defined
+    # ------------------------------------------------------------------------------------------
+
+    def project_point(self, camera: CameraParameters, position: Any) -> Any:
+        """Return the place of a point on the film, Array2f, px; position: Array3f, camera axes."""
+        raise NotImplementedError
+
+    def projection_jacobian(
+        self, camera: CameraParameters, position: Any, slopes: list[Any] | None = None
+    ) -> list[Any]:
+        """Return the derivatives of x and of y on the film, two Array3f, world: px per scene unit.
+
+        slopes: of the ray along
+        which the point is projected, see :meth:`clamped_slopes`; None for most lenses.
+        """
+        raise NotImplementedError
+
+    def ray(self, camera: CameraParameters, x: Any, y: Any) -> Any:
+        """Return the direction of the ray through a place of the film (px).
+
+        It is an Array3f in camera axes, of any length. Here it is found by Newton's method on the
+        sphere of directions, from the axis. The search is not differentiated, but its last step: a
+        step from the solution has the solution's derivative (the implicit function theorem).
+        """
+        t = types_of(type(x))
+        axes = replace(camera, rotation=dr.identity(t.Matrix3f))
+
+        def step(direction: Any, factor: Any = 1) -> Any:
+            """Return where ``factor`` of the shortest step of a linear projection leads."""
+            missed = t.Array2f(x, y) - self.project_point(axes, direction)
+            with dr.suspend_grad():
+                slopes = self.true_slopes(axes, direction)
+                dx, dy = self.projection_jacobian(axes, direction, slopes)
+                xx, xy, yy = dr.dot(dx, dx), dr.dot(dx, dy), dr.dot(dy, dy)
+                per_determinant = factor / (xx * yy - xy * xy)
+            along_x = (yy * missed.x - xy * missed.y) * per_determinant
+            along_y = (xx * missed.y - xy * missed.x) * per_determinant
+            return dr.normalize(direction + along_x * dx + along_y * dy)
+
+        def body(count: Any, direction: Any, factor: Any) -> tuple[Any, Any, Any]:
+            following = step(direction, factor)
+            shown = self.shows(following)
+            factor = dr.select(shown, dr.minimum(2 * factor, 1), factor / 2)
+            return count + 1, dr.select(shown, following, direction), factor
+
+        with dr.suspend_grad():
+            _, direction, _ = dr.while_loop(
+                state=(t.UInt32(0), t.Array3f(0, 0, 1), t.Float(1)),
+                cond=lambda count, direction, factor: count < NEWTON_STEPS,
+                body=body,
+                labels=("count", "direction", "factor"),
+            )
+        return step(direction)
+
+    # ------------------------------------------------------------------------------------------
+    # Coefficients
+    # ------------------------------------------------------------------------------------------
+
+    @classmethod
+    def coefficient_names(cls) -> tuple[str, ...]:
+        """Return the names of all coefficients."""
+        return cls.names or tuple(field.name for field in fields(cls))
+
+    @classmethod
+    def from_coefficients(cls, **coefficients: float) -> Lens:
+        """Return the lens with these coefficients.
+
+        Raises :class:`UserError` if one that has no default is missing, or is too large.
+        """
+        check_coefficients(coefficients)
+        try:
+            return cls(**{name: float(value) for name, value in coefficients.items()})
+        except TypeError:
+            names = ", ".join(cls.coefficient_names())
+            got = ", ".join(coefficients) or "none"
+            raise UserError(f"lens {cls.kind} has the coefficients {names}; got {got}") from None
+
+    def coefficients(self) -> dict[str, Any]:
+        """Return the coefficients by name."""
+        return {name: getattr(self, name) for name in self.coefficient_names()}
+
+    def with_coefficients(self, values: Mapping[str, Any]) -> Lens:
+        """Return the lens with other numbers for its coefficients; other names are left out."""
+        return replace(self, **{name: values[name] for name in self.coefficients()})
+
+    def upload(self, float_type: type) -> Lens:
+        """Return the lens with Dr.Jit scalars for its numbers: kernels are the same for all."""
+
+        def opaque(value: Any) -> Any:
+            if isinstance(value, tuple):
+                return tuple(opaque(item) for item in value)
+            return dr.opaque(float_type, value) if isinstance(value, float) else value
+
+        return replace(self, **{f.name: opaque(getattr(self, f.name)) for f in fields(self)})
+
+    def for_camera(self, camera: CameraParameters) -> Lens:
+        """Return the lens that knows what the film of ``camera`` sees."""
+        del camera
+        return self
+
+    # ------------------------------------------------------------------------------------------
+    # Derived: visibility, depth, and which rays are met
+    # ------------------------------------------------------------------------------------------
+
+    def shows(self, position: Any) -> Any:
+        """Return whether the lens sees a point (Array3f, camera axes) at any distance, Bool.
+
+        Points that it does not see need no place on the film: they are moved to the axis first.
+        """
+        return position.z > 0
+
+    def visibility(self, camera: CameraParameters, position: Any) -> tuple[Any, Any, Any]:
+        """Return whether a point is seen, its position, and its depth (scene units).
+
+        Depth is the distance from the centre. The position and the depth of a point that is not
+        seen are replaced: a masked lane must not divide by zero, as 0 * inf would poison the
+        gradient of its neighbours.
+        """
+        seen = (dr.norm(position) >= camera.near) & self.shows(position)
+        _, position, _ = with_unseen_on_axis(position, seen)
+        return seen, position, dr.norm(position)
+
+    def true_slopes(self, camera: CameraParameters, position: Any) -> list[Any] | None:
+        """Return x / z and y / z of a point; None if the projection is linearised at the point."""
+        del camera, position
+        return None
+
+    def clamped_slopes(self, camera: CameraParameters, position: Any) -> list[Any] | None:
+        """Return the same, but not far outside the film: see ``constants.TAN_CLAMP``."""
+        del camera, position
+        return None
+
+    def depth_direction(self, camera: CameraParameters, position: Any) -> Any:
+        """Return the derivative of the depth divided by the depth, Array3f, world."""
+        right, down, forward = camera.rotation
+        x, y, z = position / dr.squared_norm(position)
+        return x * right + y * down + z * forward
+
+    def ray_range(self, direction: Any, near: Any, far: Any) -> tuple[Any, Any]:
+        """Return where a ray of unit ``direction`` (camera axes) reaches two depths."""
+        del direction
+        return near, far
+
+    def view_direction(self, camera: CameraParameters, offset: Any) -> Any:
+        """Return the direction in which a point is seen, Array3f, world, of any length.
+
+        offset: from the camera's centre to the point, Array3f, world.
+        """
+        del camera
+        return offset
+
+    def origin(self, camera: CameraParameters, x: Any, y: Any) -> Any:
+        """Return where the ray through a place of the film (px) begins, Array3f, camera axes."""
+        del camera, y
+        return types_of(type(x)).Array3f(0, 0, 0)
+
+    def place_of_ray(self, camera: CameraParameters, origin: Any, direction: Any) -> Any:
+        """Return the place on the film of a ray (Array3f, camera axes), Array2f, px."""
+        del origin
+        return self.project_point(camera, direction)
+
+
+class Perspective(Lens):
+    """A lens that sees what is in front of it, and whose depth is z."""
+
+    def visibility(self, camera: CameraParameters, position: Any) -> tuple[Any, Any, Any]:
+        """Return whether a point is seen, its position, and its depth."""
+        x, y, z = position
+        seen = z >= camera.near
+        z = dr.select(seen, z, 1)
+        return seen, type(position)(x, y, z), z
+
+    def true_slopes(self, camera: CameraParameters, position: Any) -> list[Any]:
+        """Return x / z and y / z of a point."""
+        del camera
+        return [position.x / position.z, position.y / position.z]
+
+    def clamped_slopes(self, camera: CameraParameters, position: Any) -> list[Any]:
+        """Return the same, but not far outside the film: see ``constants.TAN_CLAMP``."""
+        start, end = self.frustum(camera)
+        margin = TAN_CLAMP * (end - start) / 2
+        slopes = self.true_slopes(camera, position)
+        bounds = zip(slopes, start - margin, end + margin, strict=True)
+        return [dr.select(s < lo, lo, dr.select(s > hi, hi, s)) for s, lo, hi in bounds]
+
+    def depth_direction(self, camera: CameraParameters, position: Any) -> Any:
+        """Return the derivative of the depth divided by the depth, Array3f, world."""
+        return camera.rotation[2] / position.z
+
+    def ray_range(self, direction: Any, near: Any, far: Any) -> tuple[Any, Any]:
+        """Return where a ray of unit ``direction`` reaches two depths."""
+        return near / direction.z, far / direction.z
+
+    def frustum(self, camera: CameraParameters) -> tuple[Any, Any]:
+        """Return the least and the largest slopes on the film, Array2f."""
+        # Of the whole film: a crop window is a part of the same picture.
+        start = (camera.film_start - camera.principal) / camera.focal
+        end = (camera.film_end - camera.principal) / camera.focal
+        return start, end
+
+
+@LENSES.register("pinhole")
+@dataclass(frozen=True)
+class Pinhole(Perspective):
+    """A point (x, y, z) is seen at focal (x, y) / z + principal."""
+
+    distorts: ClassVar[bool] = False
+
+    def project_point(self, camera: CameraParameters, position: Any) -> Any:
+        """Return the place of a point on the film, Array2f, px."""
+        x, y, z = position
+        return camera.focal * types_of(type(z)).Array2f(x, y) / z + camera.principal
+
+    def projection_jacobian(
+        self, camera: CameraParameters, position: Any, slopes: list[Any]
+    ) -> list[Any]:
+        """Return the derivatives of the place on the film, two Array3f, world: px per scene unit.
+
+        J's rows are focal / z (e_axis - slope e_z), with the ``slopes`` of a mean at ``position``,
+        or of another ray.
+        """
+        right, down, forward = camera.rotation
+        return [
+            (axis - slope * forward) * (focal / position.z)
+            for axis, focal, slope in zip((right, down), camera.focal, slopes, strict=True)
+        ]
+
+    def ray(self, camera: CameraParameters, x: Any, y: Any) -> Any:
+        """Return the direction of the ray through a place of the film (px), Array3f."""
+        t = types_of(type(x))
+        film = (t.Array2f(x, y) - camera.principal) / camera.focal
+        return t.Array3f(film.x, film.y, 1)
+
+
+PINHOLE = Pinhole()
+
+
+def check_coefficients(given: Mapping[str, float]) -> None:
+    """Raise :class:`UserError` naming the first that is larger than :data:`MAX_COEFFICIENT`."""
+    for name, value in given.items():
+        if not abs(value) <= MAX_COEFFICIENT:
+            raise UserError(
+                f"{name} must be a coefficient of at most {MAX_COEFFICIENT:g} in size, got "
+                f"{value:g}; calibrate the camera again"
+            )
+
+
+def with_unseen_on_axis(position: Any, seen: Any) -> tuple[Any, Any, Any]:
+    """Return ``seen``, positions with those on the axis that are not seen, and their z.
+
+    position: Array3f, camera axes; seen: Bool. A mean that is not seen is put at (0, 0, 1), where
+    every lens is differentiable.
+    """
+    x, y, z = position
+    z = dr.select(seen, z, 1)
+    return seen, type(position)(dr.select(seen, x, 0), dr.select(seen, y, 0), z), z

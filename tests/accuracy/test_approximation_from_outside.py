@@ -1,0 +1,204 @@
+"""An approximation that another package registers is chosen by name, as a shipped one."""
+
+import math
+from dataclasses import replace
+from functools import partial
+
+import drjit.llvm.ad as llvm
+import examples.compact_falloff  # noqa: F401  (registers)
+import mitsuba as mi
+import numpy as np
+import pytest
+from conftest import REPOSITORY
+from support.small_fits import plain_dataset
+from support.usual_rule import USUAL
+
+from drgs.accuracy.exact import ewa_with_depth
+from drgs.accuracy.pipeline import pipeline_of
+from drgs.cameras.camera import Camera
+from drgs.config.approximations import FALLOFFS, ORDERS, PROJECTIONS, Approximations
+from drgs.config.load import config_from
+from drgs.config.schema import ModelConfig
+from drgs.core.errors import UnsupportedError
+from drgs.core.registry import ExtensionError
+from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
+from drgs.splatting.projection import ProjectionModel, ewa
+from drgs.splatting.rendering import CenterOrder, frames_adjoint, frames_tangent, render
+from drgs.training.summary import summary_of_fit
+
+K = np.array([[30.0, 0, 14], [0, 33, 11], [0, 0, 1]])
+WIDTH, HEIGHT, STEP = 28, 22, 1e-6
+UNCUT = {"alpha_cut": 0.0, "transmittance_stop": 0.0, "low_pass": 0.5}
+COMPACT = FALLOFFS._extensions.pop("compact")  # not there in other tests
+
+
+@pytest.fixture(autouse=True)
+def registered(monkeypatch):
+    monkeypatch.setitem(FALLOFFS._extensions, "compact", COMPACT)
+
+
+def values(number=12):
+    rng = np.random.default_rng(3)
+    means = np.column_stack([rng.uniform(-1, 1, (number, 2)), rng.uniform(2, 4, number)])
+    return {
+        "means": means,
+        "quats": rng.normal(size=(number, 4)),
+        "log_scales": rng.normal(size=(number, 3)) * 0.4 - 1.5,
+        "logit_opacities": rng.normal(size=number),
+        "sh0": rng.normal(size=(number, 1, 3)),
+        "shN": np.zeros((number, 0, 3)),
+    }
+
+
+def gaussians_of(arrays):
+    return Gaussians(**arrays).to(llvm.TensorXf64)
+
+
+CAMERA = Camera.create(llvm.Float64, np.eye(3), np.zeros(3), K, WIDTH, HEIGHT, 0.1)
+
+
+def planes_of(arrays, **approximations):
+    pipeline = pipeline_of(Approximations(**UNCUT, **approximations), 0)
+    return [np.array(plane) for plane in render(gaussians_of(arrays), CAMERA, pipeline).planes()]
+
+
+def compact_image(arrays):
+    """The falloff's equation in numpy, splat after splat: transmittance, red, green, blue."""
+    order = np.argsort(arrays["means"][:, 2])
+    x, y = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
+    image, passed = np.zeros((3, HEIGHT, WIDTH)), np.ones((HEIGHT, WIDTH))
+    for row in order:
+        w, i, j, k = arrays["quats"][row] / np.linalg.norm(arrays["quats"][row])
+        rotation = np.array([
+            [1 - 2 * (j * j + k * k), 2 * (i * j - w * k), 2 * (i * k + w * j)],
+            [2 * (i * j + w * k), 1 - 2 * (i * i + k * k), 2 * (j * k - w * i)],
+            [2 * (i * k - w * j), 2 * (j * k + w * i), 1 - 2 * (i * i + j * j)],
+        ])  # fmt: skip
+        m = arrays["means"][row]
+        J = np.diag([30, 33]) @ np.array([[1, 0, -m[0] / m[2]], [0, 1, -m[1] / m[2]]]) / m[2]
+        half = J @ rotation * np.exp(arrays["log_scales"][row])
+        conic = np.linalg.inv(half @ half.T + UNCUT["low_pass"] * np.eye(2))
+        dx, dy = x - (30 * m[0] / m[2] + 14), y - (33 * m[1] / m[2] + 11)
+        t = conic[0, 0] * dx**2 + 2 * conic[0, 1] * dx * dy + conic[1, 1] * dy**2
+        opacity = 1 / (1 + math.exp(-arrays["logit_opacities"][row]))
+        alpha = opacity * np.where(t < 9, 1 - t / 9, 0) ** 4.5
+        color = np.maximum(0, 0.5 + 0.28209479177387814 * arrays["sh0"][row, 0])
+        image += color[:, None, None] * alpha * passed
+        passed = passed * (1 - alpha)
+    return [passed.ravel(), *image.reshape(3, -1)]
+
+
+def test_the_picture_is_that_of_the_equation():
+    found, expected = planes_of(values(), falloff="compact"), compact_image(values())
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-12)
+    assert np.abs(np.array(found) - planes_of(values())).max() > 0.01
+
+
+@pytest.mark.parametrize("order", ["center", "pixel"])
+def test_the_gradients_are_those_of_the_picture(order):
+    """Against central differences, and the tangent against the adjoint."""
+    rng, arrays = np.random.default_rng(4), values()
+    weights = rng.normal(size=(4, WIDTH * HEIGHT))
+    chosen = {"falloff": "compact", "order": order}
+    gaussians, pipeline = gaussians_of(arrays), pipeline_of(Approximations(**UNCUT, **chosen), 0)
+    frame = render(gaussians, CAMERA, pipeline)
+    found = frames_adjoint(gaussians, [frame], [[llvm.Float64(w) for w in weights]]).parameters
+    direction = {name: rng.normal(size=array.shape) for name, array in arrays.items()}
+    along = sum(
+        (np.array(getattr(found, name)).reshape(direction[name].shape) * direction[name]).sum()
+        for name in PARAMETER_NAMES
+    )
+    tangent = frames_tangent(gaussians, [frame], gaussians_of(direction))[0]
+    assert (weights * [np.array(plane) for plane in tangent]).sum() == pytest.approx(along)
+
+    def loss(step):
+        moved = {name: array + step * direction[name] for name, array in arrays.items()}
+        return (weights * planes_of(moved, **chosen)).sum()
+
+    assert (loss(STEP) - loss(-STEP)) / (2 * STEP) == pytest.approx(along, rel=1e-5)
+
+
+def test_the_plugin_and_a_configuration_have_it_by_name():
+    mi.set_variant("llvm_ad_rgb")
+    tensors = {name: mi.TensorXf(array) for name, array in values().items()}
+    found = mi.load_dict({"type": "splats", "falloff": "compact", **tensors}).approximations
+    assert found == Approximations(falloff="compact")
+    assert ModelConfig(falloff="compact", **USUAL).approximations == found
+    with pytest.raises(ValueError, match=r"falloff\n.*must be one of gaussian, compact or"):
+        ModelConfig(falloff="compcat")
+
+
+def test_a_projection_with_a_falloff_of_its_own_takes_no_other():
+    with pytest.raises(UnsupportedError, match="projection 'exact' has a falloff of its own"):
+        pipeline_of(Approximations(projection="exact", falloff="compact"), 0)
+
+
+def twofold(rows, camera, position, low_pass, of=ewa):
+    """Splats of twice the size."""
+    rows = replace(rows, log_scales=rows.log_scales + math.log(2))
+    return of(rows, camera, position, low_pass)
+
+
+class Twofold(ProjectionModel):
+    shape = staticmethod(twofold)
+    shape_with_depth = staticmethod(partial(twofold, of=ewa_with_depth))
+
+
+class FarFirst(CenterOrder):
+    """Back to front."""
+
+    def sort_depths(self, splats):
+        return -splats.depths
+
+
+@pytest.fixture
+def others(monkeypatch):
+    for registry in (PROJECTIONS, ORDERS):
+        monkeypatch.setattr(registry, "_extensions", dict(registry._extensions))
+    PROJECTIONS.register("twofold")(Twofold)
+    ORDERS.register("far_first")(FarFirst)
+
+
+@pytest.mark.parametrize("order", ["center", "pixel"])
+def test_a_projection_is_found_by_name_under_both_orders(others, order):
+    doubled = values()
+    doubled["log_scales"] = doubled["log_scales"] + math.log(2)
+    found = planes_of(values(), projection="twofold", order=order)
+    np.testing.assert_allclose(found, planes_of(doubled, order=order), rtol=0, atol=1e-6)
+
+
+def test_an_order_is_found_by_name(others):
+    """Seen from behind, as it were: the same as with the depths the other way round."""
+    found = planes_of(values(), order="far_first")
+    arrays = values()
+    middle = arrays["means"][:, 2:].copy()
+    assert np.abs(np.array(found) - planes_of(arrays)).max() > 0.01
+    scale = (6 - middle) / middle  # the same pictures of the splats, at 6 - z
+    arrays["means"] = arrays["means"] * scale
+    arrays["log_scales"] = arrays["log_scales"] + np.log(scale)
+    np.testing.assert_allclose(found, planes_of(arrays), rtol=0, atol=1e-12)
+
+
+def test_what_an_approximation_raises_has_its_name(monkeypatch):
+    monkeypatch.setattr(PROJECTIONS, "_extensions", dict(PROJECTIONS._extensions))
+
+    @PROJECTIONS.register("broken")
+    class Broken(ProjectionModel):
+        @staticmethod
+        def shape(rows, camera, position, low_pass):
+            raise ZeroDivisionError("no area")
+
+    with pytest.raises(ExtensionError, match=r'projection "broken" .*: ZeroDivisionError: no area'):
+        planes_of(values(), projection="broken")
+
+
+def test_the_documents_have_the_example_as_it_is():
+    example = (REPOSITORY / "tests" / "examples" / "compact_falloff.py").read_text()
+    assert example in (REPOSITORY / "docs" / "developing.md").read_text()
+    assert 20 <= len(example.splitlines()) <= 60
+
+
+def test_a_fit_says_that_it_is_simulated():
+    config = config_from({"data": {"path": "."}, "model": {"falloff": "compact"}}, "x")
+    (line,) = [e for e in summary_of_fit(config, plain_dataset()) if e.name == "approximations"]
+    assert (line.what, line.why) == ("compact", "model.falloff")
