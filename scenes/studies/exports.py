@@ -64,10 +64,10 @@ def main() -> None:
         return list(render_views(scene, dataset.test))
 
     before = render(gaussians)
-    quality, rows, ply_bytes = mean_psnr(before, dataset), [], 0
+    quality, rows = mean_psnr(before, dataset), []
+    ply_bytes = len(gaussians.to_bytes("ply"))
     for each in readable_formats():
         read, size, writing, reading = round_trip(gaussians, each)
-        ply_bytes = ply_bytes or size
         after = render(read)
         psnr = mean_psnr(after, dataset)
         change = float(np.mean(list(map(metrics.psnr, after, before))))
