@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Any, ClassVar
 
 from drgs.core.arrays import types_of
-from drgs.splatting.footprint import Positions
+from drgs.splatting.footprint import Positions, flat_columns, total
 from drgs.splatting.grid import MICRO, Lanes, TileGrid
 from drgs.splatting.lanes import load_pixels
 
@@ -50,6 +50,26 @@ class SamplePoints(Positions):
         dx = [first_x + (pixel % MICRO) + in_x for pixel, in_x in enumerate(self.bound[0])]
         dy = [first_y + (pixel // MICRO) + in_y for pixel, in_y in enumerate(self.bound[1])]
         return _grid(dx), _grid(dy)
+
+    def sum(self, values: list[Any]) -> Any:
+        """Sum 16 values."""
+        return total(values)
+
+    def sum_dx(self, values: list[Any], dx: list) -> Any:
+        """Sum values times dx."""
+        return total(_products(values, dx))
+
+    def sum_dy(self, values: list[Any], dy: list) -> Any:
+        """Sum values times dy."""
+        return total(_products(values, dy))
+
+    def sum_dy_dy(self, values: list[Any], dy: list) -> Any:
+        """Sum values times dy^2."""
+        return total(_products(_products(values, dy), dy))
+
+
+def _products(values: list[Any], grid: list[list[Any]]) -> list[Any]:
+    return [a * b for a, b in zip(values, flat_columns(grid), strict=True)]
 
 
 def _grid(values: list[Any]) -> list[list[Any]]:

@@ -243,6 +243,7 @@ def test_approximations_reach_the_integrator():
     """All of them; and the defaults of the configuration are those of the kernels."""
     values = {
         "projection": "exact",
+        "falloff": "gaussian",
         "order": "pixel",
         "order_window": 6,
         "sh_direction": "pixel",
