@@ -10,19 +10,25 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, Field, field_validator, model_validator
 
-from drgs.config.extensions import check_strategy
+from drgs.config.extensions import STRATEGIES, check_strategy
 from drgs.config.section import Count, Section
 
 REFERENCE_START, REFERENCE_STOP = 500, 15_000
 """Iterations: the reference's schedule, for 30,000."""
 
-START_SHARES = {"adc": 1 / 2, "budget": 1 / 20, "mcmc": 1 / 20}
-"""Of the iterations, the latest first change. It is at half of the way to the last one, at the
-latest."""
+SCHEDULE_SHARES = {"adc": (1 / 2, 5 / 7), "budget": (1 / 20, 1 / 2), "mcmc": (1 / 20, 5 / 7)}
+"""Shares of the iterations by shipped strategy: see ``DensityStrategy.start_share``. Of 7,000
+iterations, adc leaves 2,000 for the last opacities to settle."""
 
-STOP_SHARES = {"adc": 5 / 7, "budget": 1 / 2, "mcmc": 5 / 7}
-"""Of the iterations, the last change of fits that are shorter than the reference's schedule. Of
-7,000 iterations, adc leaves 2,000 for the last opacities to settle."""
+DEFAULT_SCHEDULE_SHARES = (1 / 20, 1 / 2)
+
+
+def schedule_shares(strategy: str) -> tuple[float, float]:
+    """Return ``start_share`` and ``stop_share`` of a strategy; no shipped one is imported."""
+    if strategy in SCHEDULE_SHARES:
+        return SCHEDULE_SHARES[strategy]
+    extension = STRATEGIES.get(strategy).value
+    return extension.start_share, extension.stop_share
 
 
 class AdcConfig(Section):

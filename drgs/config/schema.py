@@ -31,9 +31,8 @@ from drgs.config.approximations import DECLARED, Approximations, Declared, Value
 from drgs.config.density import (
     REFERENCE_START,
     REFERENCE_STOP,
-    START_SHARES,
-    STOP_SHARES,
     DensifyConfig,
+    schedule_shares,
 )
 from drgs.config.extensions import check_loss, check_reader, check_sections
 from drgs.config.section import Count, Rate, Section, Weight
@@ -515,13 +514,13 @@ class FitConfig(Section):
         if self.optimizer.decay is None:
             decay = 1.0 if densify.strategy == "adc" else LAST_RATE
             self._complete("optimizer", {"decay": decay})
+        start_share, stop_share = schedule_shares(densify.strategy)
         changes, first = {}, densify.start
         if _is_open(densify, "stop"):
             least = 1 if _is_open(densify, "start") else first + 1
-            share = STOP_SHARES.get(densify.strategy, 1 / 2)
-            changes["stop"] = max(least, min(REFERENCE_STOP, round(share * n)))
+            changes["stop"] = max(least, min(REFERENCE_STOP, round(stop_share * n)))
         if _is_open(densify, "start"):
-            first = max(1, round(START_SHARES.get(densify.strategy, 1 / 20) * n))
+            first = max(1, round(start_share * n))
             changes["start"] = min(REFERENCE_START, first, changes.get("stop", densify.stop) // 2)
         self._complete("densify", changes)
         return self

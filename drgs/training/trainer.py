@@ -93,13 +93,13 @@ class Trainer:
         dataset: Dataset,
         gaussians: Gaussians,
         comm: Communicator | None = None,
-        strategy: DensityStrategy | None = None,
+        density: DensityStrategy | None = None,
         effects: Sequence[TrainingEffect] = (),
         loss: Loss | None = None,
     ) -> None:
         """gaussians: all of them, on each process; comm: the processes; None: this one.
 
-        strategy, loss: None: those of the configuration; effects: besides the configuration's.
+        density, loss: None: those of the configuration; effects: besides the configuration's.
         """
         config = completed(config, dataset)
         self.config, self.dataset, self.extent = config, dataset, dataset.extent
@@ -127,7 +127,7 @@ class Trainer:
         self.rates = rates_over_time(config, self.extent)
         self.loss = loss or make_loss(config)
         self.terms = make_loss_terms(config)
-        self._strategy = strategy
+        self._given_density = density
         self.stages = make_stages(dataset.train, config, self.effects, room)
         self.gradients = self._make_gradients()
         population = self.optimizer, PREFIX, self.extent, config.seed
@@ -522,7 +522,7 @@ class Trainer:
 
     def _density_from(self, state: Mapping[str, np.ndarray]) -> DensityStrategy:
         """Return the strategy of the configuration with its state; empty: at the beginning."""
-        density = density_strategy(self.config, self.dataset, self._strategy)
+        density = density_strategy(self.config, self.dataset, self._given_density)
         density.begin(self.population)
         if state:
             density.restore(state)

@@ -95,6 +95,29 @@ def test_an_unknown_strategy_lists_the_installed_ones():
         config_from({"data": {"path": "."}, "densify": {"strategy": "halvin"}}, "x.yml")
 
 
+def test_a_strategy_provides_the_shares_of_its_schedule(examples, monkeypatch):
+    values = {"data": {"path": "."}, "iterations": 1000, "densify": {"strategy": "halving"}}
+    densify = config_from(values, "x.yml").densify
+    assert (densify.start, densify.stop) == (50, 500)
+    monkeypatch.setattr(examples["halving"].Halving, "start_share", 0.25)
+    monkeypatch.setattr(examples["halving"].Halving, "stop_share", 0.8)
+    densify = config_from(values, "x.yml").densify
+    assert (densify.start, densify.stop) == (250, 800)
+
+
+def test_a_trainer_takes_a_density_strategy(examples):
+    """The object changes rows, not the strategy of the configuration."""
+    config = configured()
+    values = config.model_dump() | {"densify": {}}
+    strategy = examples["halving"].Halving(config.extensions["halving"])
+    config = config_from(values, "x.yml")
+    start = fits.disturbed_blobs()
+    trainer = fits.Trainer(config, fits.plain_dataset(), start, density=strategy)
+    for _ in range(6):
+        trainer.step()
+    assert trainer.num_gaussians == start.num_gaussians - start.num_gaussians // 2
+
+
 def test_a_fit_uses_what_its_configuration_names():
     result = drgs.train(configured(), fits.plain_dataset())
     trainer = result.trainer

@@ -19,6 +19,7 @@ import drjit as dr
 import numpy as np
 from scipy.special import expit
 
+from drgs.config.density import SCHEDULE_SHARES
 from drgs.config.extensions import STRATEGIES
 from drgs.config.schema import DensifyConfig, FitConfig
 from drgs.core.arrays import from_host, types_of
@@ -61,6 +62,7 @@ class AdaptiveDensityControl(DensityStrategy):
     white_background: bool
     statistics: DensityStatistics | None = None  # until it begins
     by_row = ("gradient_norms", "views")
+    start_share, stop_share = SCHEDULE_SHARES["adc"]
 
     @classmethod
     def from_config(

@@ -29,7 +29,7 @@ import drjit as dr
 import numpy as np
 from scipy.special import expit, logit
 
-from drgs.config.density import DensifyConfig
+from drgs.config.density import SCHEDULE_SHARES, DensifyConfig
 from drgs.config.extensions import STRATEGIES
 from drgs.config.schema import CoarseStage, FitConfig
 from drgs.core.arrays import from_host, types_of
@@ -68,6 +68,7 @@ class GrowthToNumber(DensityStrategy):
     errors: Any = None  # Float (N,): sum over views of s; None until it begins
     first: int = 0  # Gaussians at the start
     by_row = ("errors",)
+    start_share, stop_share = SCHEDULE_SHARES["budget"]
 
     @classmethod
     def from_config(

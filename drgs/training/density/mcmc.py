@@ -19,7 +19,7 @@ import drjit as dr
 import numpy as np
 from scipy.special import comb, expit, logit
 
-from drgs.config.density import DensifyConfig
+from drgs.config.density import SCHEDULE_SHARES, DensifyConfig
 from drgs.config.extensions import STRATEGIES
 from drgs.config.schema import FitConfig
 from drgs.core.arrays import from_host, types_of
@@ -47,6 +47,7 @@ class MarkovChain(DensityStrategy):
 
     config: DensifyConfig
     extent: float = math.nan  # of the scene, world units; known when it begins
+    start_share, stop_share = SCHEDULE_SHARES["mcmc"]
 
     @classmethod
     def from_config(cls, config: FitConfig, dataset: Dataset | None, section: None) -> MarkovChain:

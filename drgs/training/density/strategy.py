@@ -17,6 +17,7 @@ from typing import Any, Protocol
 import drjit as dr
 import numpy as np
 
+from drgs.config.density import DEFAULT_SCHEDULE_SHARES
 from drgs.config.schema import FitConfig
 from drgs.core.arrays import from_host, types_of
 from drgs.datasets.types import Dataset
@@ -199,6 +200,10 @@ class DensityStrategy(Protocol):
 
     by_row: Sequence[str] = ()
     """Names in :meth:`state` of what has a row for each Gaussian."""
+
+    start_share, stop_share = DEFAULT_SCHEDULE_SHARES
+    """Shares of the iterations, for schedules that are not given: ``densify.start`` is at most the
+    first (and half of stop), ``densify.stop`` at most the second."""
 
     def begin(self, population: Population) -> None:
         """Start with the statistics of no views.
