@@ -14,6 +14,7 @@ from pydantic import BaseModel, ValidationError
 from pydantic_core import PydanticCustomError
 
 from drgs.config.explain import expectation, shown_value
+from drgs.config.section import Section
 from drgs.core.errors import did_you_mean
 from drgs.core.registry import HOW_TO_INSTALL, Extension, Registry, all_extensions
 
@@ -59,6 +60,8 @@ READERS: Registry[type] = Registry(
     },
 )
 """Subclasses of :class:`drgs.datasets.reader.DatasetReader`."""
+
+SECTION = f"{Section.__module__}.{Section.__name__}"
 
 GROWTH = ("adc", "budget", "mcmc")
 """Shipped strategies for ``densify.strategy``; the others prune after them."""
@@ -110,6 +113,8 @@ def _check_section(name: str, values: Any) -> BaseModel | None:
         if values:
             raise _error(f"extensions.{name} must be empty: it has no settings")
         return None
+    if not issubclass(section, Section):
+        raise _error(f"extensions.{name}: the extension's section must be a subclass of {SECTION}")
     if isinstance(values, BaseModel):
         values = values.model_dump()
     try:

@@ -114,6 +114,9 @@ class Registry(Generic[T]):
             owner = self._shipped.get(name) if before is None else before.module
             if owner not in (None, module):
                 raise ValueError(f'{self.kind} "{name}" is registered by {owner} already')
+            others = (r for r in _registries if r is not self and name in r._extensions)
+            if name not in self._shipped and (other := next(others, None)) is not None:
+                raise ValueError(f'a {other.kind} is called "{name}" already: names are sections')
             self._extensions[name] = Extension(self.kind, name, value, section, module)
             return value
 

@@ -121,7 +121,8 @@ def test_the_gradients_are_those_of_the_picture(order):
 def test_the_plugin_and_a_configuration_have_it_by_name():
     mi.set_variant("llvm_ad_rgb")
     tensors = {name: mi.TensorXf(array) for name, array in values().items()}
-    found = mi.load_dict({"type": "splats", "falloff": "compact", **tensors}).approximations
+    found = mi.load_dict({"type": "splats", "falloff": "compact", **tensors})
+    found = found.state.approximations
     assert found == Approximations(falloff="compact")
     assert ModelConfig(falloff="compact", **USUAL).approximations == found
     with pytest.raises(ValueError, match=r"falloff\n.*must be one of gaussian, compact or"):

@@ -77,3 +77,12 @@ def test_a_name_of_another_module_is_not_replaced():
     kinds = Registry("kind", {"taken": "drgs.somewhere"})
     with pytest.raises(ValueError, match=r"registered by drgs\.somewhere already"):
         kinds.register("taken")(test_an_unknown_name_lists_those_that_exist)
+
+
+def test_two_kinds_cannot_share_a_name():
+    """Both would read one section of a configuration."""
+    first = Registry("kind")
+    first.register("shared_by_two")(test_an_unknown_name_lists_those_that_exist)
+    with pytest.raises(ValueError, match='a kind is called "shared_by_two" already'):
+        Registry("other kind").register("shared_by_two")(object)
+    first._extensions.clear()

@@ -188,14 +188,14 @@ REFUSED = {
     "lens": (
         {"lens": "opencvv"},
         'PluginError: calibrated: lens: no lens is called "opencvv"; did you mean opencv?; '
-        "there are fisheye, opencv, pinhole, thin_prism_fisheye. Others come with packages that "
-        'have an entry point of the group "drgs"',
+        "there are fisheye, opencv, pinhole, thin_prism_fisheye (others come with installed "
+        'packages that have an entry point of the group "drgs")',
     ),
     "lens that is no name": (
         {"lens": 3},
         'PluginError: calibrated: lens: no lens is called "3"; there are fisheye, opencv, '
-        "pinhole, thin_prism_fisheye. Others come with packages that have an entry point of the "
-        'group "drgs"',
+        "pinhole, thin_prism_fisheye (others come with installed packages that have an entry "
+        'point of the group "drgs")',
     ),
     "coefficient of another lens": (
         {"lens": "fisheye", "k5": 0.1},

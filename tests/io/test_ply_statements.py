@@ -107,7 +107,12 @@ def test_values_that_contradict_each_other_are_refused(tmp_path):
         ("order_window", "4.0", "from 1 to 64, got 4.0"),
         ("antialiased", "yes", "true or false, got yes"),
         ("antialiased", "1", "true or false, got 1"),
-        ("projection", "fish", "one of ewa, unscented, exact, got fish"),
+        (
+            "projection",
+            "fish",
+            "one of ewa, unscented, exact or of a package with an entry point of the group "
+            '"drgs", got fish',
+        ),
         ("alpha_max", "0.99999999999", "above 0 and below 1 in float32, got 0.99999999999"),
     ],
 )

@@ -17,6 +17,7 @@ from dataclasses import dataclass, field
 from importlib import import_module
 from pathlib import Path
 
+from drgs.__main__ import COMMANDS
 from support.attacks.attack import Attack
 from support.attacks.observer import Changes, Killed, observed
 from support.attacks.workshop import Workshop, contents, sketched_results, standing_in
@@ -82,7 +83,7 @@ def trial(attack: Attack, workshop: Workshop) -> list[str]:
 
 def run(attack: Attack, words: tuple[str, ...], with_fault: bool = True) -> Outcome:
     """Call the command as its process would be; in the current folder."""
-    main = import_module(f"drgs.{attack.command}").main
+    main = import_module(COMMANDS[attack.command].module).main
     outcome, fault = Outcome(), attack.fault if with_fault else None
     drawings = nullcontext() if attack.draws else sketched_results()
     with (

@@ -6,6 +6,7 @@ import argparse
 from collections.abc import Iterator, Sequence
 from importlib import import_module
 
+from drgs.__main__ import COMMANDS
 from drgs.cli.commands import CommandParser
 from drgs.config.load import known_keys
 from support.attacks.attack import Attack
@@ -246,7 +247,7 @@ COSTLY = {
 def options_of(command: str) -> list[argparse.Action]:
     """The options of a command and its positional argument, without those that take no value."""
     parser = CommandParser(prog=command)
-    import_module(f"drgs.{command}").add_arguments(parser)
+    import_module(COMMANDS[command].module).add_arguments(parser)
     return [action for action in parser._actions if action.nargs != 0]
 
 
