@@ -193,7 +193,7 @@ class Declared:
 
     @property
     def words(self) -> tuple[str, ...]:
-        """What a text may be; those of installed packages included."""
+        """The texts that a value may be, those of installed packages included."""
         return self.given_words if self.registry is None else self.registry.words()
 
     @property

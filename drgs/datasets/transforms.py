@@ -145,7 +145,7 @@ Model = Annotated[str, AfterValidator(_known_model)]
 
 
 class CameraValues(BaseModel):
-    """What may stand at the top of a file, for all frames, or in a frame. None: it does not.
+    """Values at the top of a file, for all frames, or in a frame. None: not given.
 
     Other keys may be coefficients of a lens that drgs does not ship.
     """

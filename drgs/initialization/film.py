@@ -1,4 +1,4 @@
-"""Where points of the world are in a view's picture: before there is anything to render.
+"""Projection of world points to a view's image, before there is anything to render.
 
 For start points, of which a million are looked at in hundreds of pictures. No matrix products,
 whose rounding depends on how many threads a library of linear algebra has.

@@ -25,7 +25,7 @@ class HistoryRow:
 
 @dataclass(frozen=True)
 class DensityReport:
-    """What one call of a strategy of density did to the rows."""
+    """Changes that one call of a strategy of density made to the rows."""
 
     num_gaussians: int  # afterwards
     num_added: int = 0  # rows on top of those before, parents of a split not counted

@@ -349,7 +349,7 @@ class FeatureGroup:
 
 @dataclass(frozen=True)
 class SplatFeatures:
-    """What is composited of a splat, from the numbers that are stored of it.
+    """The composited features of a splat, from the numbers that are stored of it.
 
     Here its features are the same at every pixel: what is stored is what is composited.
     """

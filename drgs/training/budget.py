@@ -50,7 +50,7 @@ REVISED_EVERY = 0.1
 MAX_SECONDS = 7 * 24 * 3600.0
 
 MAX_PICTURES_SHARE = 0.33
-"""Of the time that ``--budget`` leaves after the start: pictures that take more are left out."""
+"""Share of the time that ``--budget`` leaves: images that take more are left out."""
 
 _NO_PICTURES = (
     "--budget: the time is needed for iterations: no report, orbit and pictures are written "
@@ -78,7 +78,7 @@ class Strategy:
     share: float | None = None  # of the number of Gaussians; None: as configured
 
     def applies_to(self, config: FitConfig) -> bool:
-        """Whether it changes something: coarse stages that there are stay."""
+        """Return whether it changes something: coarse stages that there are stay."""
         if self.half_size is not None and config.coarse:
             return False
         return self.share is None or target_of(config) is not None

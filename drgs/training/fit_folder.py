@@ -83,7 +83,7 @@ class FitFolder:
             yield
 
     def is_finished(self, config: FitConfig) -> bool:
-        """Whether the folder holds all results of the fit already."""
+        """Return whether the folder holds all results of the fit already."""
         if self.overwrites:
             return False
         return has_results(self.path) if self.resumes else is_finished(self.path, config)

@@ -1,7 +1,7 @@
-"""Gradients of a step: what the backward passes of its views leave for density control.
+"""Gradients of a step, and what the backward passes of its views leave for density control.
 
-A step of one view has its gradients in the parameters after ``dr.backward``. Steps of several views
-are the business of ``drgs.training.parallel.exchange``.
+A step of one view has its gradients in the parameters after ``dr.backward``; steps of several views
+use ``drgs.training.parallel.exchange``.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ class ViewGradients:
 
 @dataclass(frozen=True)
 class ViewLoss:
-    """What an iteration found about its view."""
+    """Loss and error of the view of an iteration."""
 
     loss: Any  # one entry
     squared_error: Any  # one entry: mean over pixels and channels

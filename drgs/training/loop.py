@@ -15,7 +15,7 @@ class StopCriterion(Protocol):
     """Decides when a fit ends."""
 
     def should_continue(self, trainer: Trainer) -> bool:
-        """Whether to run another iteration; may revise the trainer's configuration."""
+        """Return whether to run another iteration; may revise the trainer's configuration."""
 
     def num_iterations(self, trainer: Trainer) -> int:
         """The number of iterations of the whole fit, as expected now."""

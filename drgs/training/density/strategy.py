@@ -36,7 +36,7 @@ from drgs.training.optimizer import (
 
 @dataclass(frozen=True)
 class StepInfo:
-    """What a strategy learns from an iteration; nothing of it is differentiated.
+    """Statistics of an iteration, for a strategy; nothing of it is differentiated.
 
     N are the rows that :meth:`Population.value` has.
     """
@@ -213,7 +213,7 @@ class DensityStrategy(Protocol):
         del population
 
     def needs_statistics(self, iteration: int) -> bool:
-        """Whether :meth:`update_statistics` is to be told of this iteration."""
+        """Return whether :meth:`update_statistics` is called for this iteration."""
         del iteration
         return False
 

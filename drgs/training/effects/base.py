@@ -23,7 +23,7 @@ from drgs.training.views import TrainingView
 
 @dataclass(frozen=True)
 class FitState:
-    """What an effect may know of the fit that it takes part in, at one iteration."""
+    """State of a fit at one iteration, as effects may know it."""
 
     iteration: int  # from 1
     iterations_of_step: range

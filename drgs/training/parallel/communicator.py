@@ -30,7 +30,7 @@ T = TypeVar("T")
 
 
 class SingleProcess:
-    """What is used of ``mpi4py.MPI.Comm``, for a process that is alone: sends are copies."""
+    """The used part of ``mpi4py.MPI.Comm``, for a process that is alone: sends are copies."""
 
     def Get_rank(self) -> int:  # noqa: N802 (mpi4py's names)
         """Return 0."""

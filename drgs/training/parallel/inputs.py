@@ -1,4 +1,4 @@
-"""What several processes fit: the configuration and the Gaussians of rank 0, and photographs.
+"""Inputs of a fit by several processes: configuration and Gaussians of rank 0, photographs.
 
 Rank 0 reads the whole dataset. Each other rank reads the photographs of the views that it renders
 by itself, and of other views the cameras and sizes, from files' headers.
