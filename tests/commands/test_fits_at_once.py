@@ -45,9 +45,9 @@ def test_of_two_that_begin_at_once_the_second_is_refused(project, tmp_path, monk
     out, load_dataset = tmp_path / "out", session.load_dataset
     with ExitStack() as first:
 
-        def load(config):
+        def load(config, **others):
             first.enter_context(sole_writer(out))()
-            return load_dataset(config)
+            return load_dataset(config, **others)
 
         monkeypatch.setattr(session, "load_dataset", load)
         assert MESSAGE in run_fit(project, "--out", out).stderr

@@ -201,7 +201,8 @@ def test_a_wrong_value_is_refused_with_file_key_expected_and_got(load, text, mes
         ),
         (
             "data: {path: x, type: llff}",
-            "data.type must be one of 'auto', 'nerf_synthetic', 'nerfstudio' or 'colmap', got "
+            "data.type must be one of 'auto', 'nerf_synthetic', 'nerfstudio', 'colmap' (others "
+            'come with installed packages that have an entry point of the group "drgs"), got '
             "'llff'",
         ),
         ("data: {}", "data.path is missing: Dataset folder; relative to the configuration file."),

@@ -366,8 +366,8 @@ def spoil_photograph(monkeypatch, iteration):
     """The photograph that the fit visits first in that iteration is NaN in one pixel."""
     spoilt, load = view_of(iteration, 4, seed=0), session.load_dataset
 
-    def load_and_spoil(config):
-        dataset = load(config)
+    def load_and_spoil(config, **others):
+        dataset = load(config, **others)
         image = np.array(dataset.train[spoilt].image)
         image[12, 16, 0] = np.nan
         train = list(dataset.train)
