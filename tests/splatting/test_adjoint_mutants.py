@@ -301,7 +301,15 @@ class TestDefault(MutationChecks):
         losses._ssim_and_partials losses._assemble_gradient losses._PhotometricOp.backward
         losses._PhotometricOp.forward losses.l1_loss
     """
-    elsewhere = {  # noqa: RUF012
+    elsewhere = {
+        f"losses.Loss.with_squared_error{site}": "test_extensions: a loss from outside"
+        for site in (
+            "error = dr.mean(dr.square(dr.detach(image).array - target.image.array))",
+            "term dr.detach(image).array of dr.detach(image).array - target.image.array",
+            "term target.image.array of dr.detach(image).array - target.image.array",
+            "self(image, target)",
+        )
+    } | {
         site: "test_placement: a smoothing filter that grows with an object"
         for site in (
             "rendering.Pipeline.differentiated"

@@ -6,9 +6,11 @@ import ast
 import importlib
 import inspect
 from collections.abc import Iterable
+from contextlib import contextmanager
 from types import ModuleType
 from typing import Any
 
+from drgs.core import registry
 from support.mutants import (
     _COMPARISONS,
     _HAND_OVERS,
@@ -17,6 +19,16 @@ from support.mutants import (
     Site,
     Switchboard,
 )
+
+
+@contextmanager
+def registered_classes_kept():
+    """What registers within the block, such as a copy of a module, is not found by its name."""
+    before = [(each, dict(each._extensions)) for each in registry._registries]
+    yield
+    for each, extensions in before:
+        each._extensions.clear()
+        each._extensions.update(extensions)
 
 
 class Instrumented:
@@ -50,7 +62,8 @@ class Instrumented:
                 _Instrumenter(switchboard.sites, label, node, package, is_derivative)
         ast.fix_missing_locations(tree)
         self.namespace["__switchboard__"] = switchboard
-        exec(compile(tree, "sample" if is_source else module.__file__, "exec"), self.namespace)
+        with registered_classes_kept():
+            exec(compile(tree, "sample" if is_source else module.__file__, "exec"), self.namespace)
         self.namespace.update(names)
 
     def __getitem__(self, name: str) -> Any:

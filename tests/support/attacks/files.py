@@ -156,8 +156,14 @@ LEFT_OUT = [
 ]
 """One of several files that are named: the others are fitted."""
 
-MAY_BE_READ = [*MAY_BE_MISSING, *LEFT_OUT, ("gaussians.splat", "its first half")]
-"""The latter has whole rows, and no header that says how many there were."""
+MAY_BE_READ = [
+    *MAY_BE_MISSING,
+    *LEFT_OUT,
+    ("gaussians.splat", "its first half"),
+    ("run/config.yml", "its first half"),
+]
+"""The last two: whole rows without a header that says how many there were, and YAML that may end
+between two values."""
 
 
 def _archive() -> bytes:
