@@ -166,14 +166,7 @@ class Trainer:
         penalties = self._differentiate_penalties(step)
         losses: dict[int, ViewLoss] = {}
         for view in self.gradients.own_views():
-            fit = self._fit_state(step, view.iteration)
-            for effect in self.effects:
-                effect.before(fit, view.view)
-            image = mi.render(self.scene, self.params, sensor=view.view.sensor, spp=1)
-            image, loss, error = self.compare(image, view.view)
-            dr.backward(loss / step.num_averaged if step.num_averaged > 1 else loss)
-            losses[view.place] = ViewLoss(dr.detach(loss), error, view.view.counted)
-            self.gradients.end_view(self._pixel_weights(view, dr.detach(image)))
+            losses[view.place] = self._differentiate(step, view)
         found = self.gradients.finish(self._weight_names(step))
         views = self._total_losses(step, found, losses, penalties)
         if step.is_update:
@@ -188,6 +181,17 @@ class Trainer:
             step.stage.seen(step.views[place].view)
         means_lr = self.rates.means(step.last)
         return StepReport(step.last, self.num_gaussians, means_lr, report, tuple(views))
+
+    def _differentiate(self, step: Step, view: StepView) -> ViewLoss:
+        """Render a view, and add the derivatives of its loss to those of the step."""
+        fit = self._fit_state(step, view.iteration)
+        for effect in self.effects:
+            effect.before(fit, view.view)
+        image = mi.render(self.scene, self.params, sensor=view.view.sensor, spp=1)
+        image, loss, error = self.compare(image, view.view)
+        dr.backward(loss / step.num_averaged if step.num_averaged > 1 else loss)
+        self.gradients.end_view(self._pixel_weights(view, dr.detach(image)))
+        return ViewLoss(dr.detach(loss), error, view.view.counted)
 
     def _begin_step(self) -> Step:
         """Plan the next step, and bring the scene to where the optimizer is."""
