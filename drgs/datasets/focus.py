@@ -15,7 +15,7 @@ their angle to a common direction. Below this (1.8 degrees) their nearest point 
 
 
 def focus_of(views: Sequence[Viewpoint]) -> tuple[np.ndarray, float]:
-    """What the cameras look at: (3,) the point nearest to all optical axes, and the distance.
+    """Return the point (3,) nearest to all optical axes, and its distance from the cameras.
 
     Minimises sum_i |(I - d_i d_i^T)(p - c_i)|^2 over p, with c_i the centres and d_i the axes;
     the distance is the median of |p - c_i|.

@@ -17,7 +17,7 @@ from drgs.core.arrays import from_host, types_of
 from drgs.datasets.types import Viewpoint
 
 Columns = Sequence[np.ndarray]
-"""Of coordinates: x, y, z, each (N,)."""
+"""Coordinates x, y, z, each (N,)."""
 
 
 def is_projectable(view: Viewpoint) -> bool:

@@ -44,7 +44,7 @@ class DensityRow(DensityReport):
 
 
 DENSITY_COLUMNS = ("iteration", *(field.name for field in fields(DensityReport)))
-"""Of ``density.csv``."""
+"""Columns of ``density.csv``."""
 
 
 @dataclass(eq=False)

@@ -86,7 +86,7 @@ def step_of(iteration: int, views_per_step: int, iterations: int) -> range:
 
 
 def view_of(iteration: int, num_views: int, seed: int, views_per_step: int = 1) -> int:
-    """Which view an iteration trains on: every round visits all views in an order of its own.
+    """Return the view of an iteration: every round visits all views in an order of its own.
 
     With B views a step, the b-th iteration of each step draws from the views b, b + B, ... alone,
     in rounds of these: who computes it needs no other photographs.

@@ -69,7 +69,7 @@ BOX_NUMBERS = 4
 
 @dataclass(frozen=True)
 class SplatLayout:
-    """Which numbers of a splat travel."""
+    """The numbers of a splat that travel."""
 
     num_stored: int  # geometry, features, keys
     num_features: int
@@ -224,10 +224,11 @@ class _View:
     counts: Any = None  # (ranks, times): splats that each rank sends to the renderer
     packed: list[PackedProjection] = field(default_factory=list)  # by time, for another renderer
     local: list[LocalProjection] = field(default_factory=list)  # by time
-    rows: list[int] = field(default_factory=list)  # by time, splats that are composited here
     frames: list[Frame] = field(default_factory=list)  # by time, until the backward pass has ended
-    gradients: list[SplatGradients] = field(default_factory=list)  # by time, of own rows
-    sums: dict[str, Any] = field(default_factory=dict)  # see StepView.weights
+    gradients: list[SplatGradients] = field(default_factory=list)  # by time, of own rows; until
+    # they are added
+    means2d: Any = None  # Array2f, derivatives with respect to own rows' places on the film
+    sums: dict[str, Any] = field(default_factory=dict)  # by name: see DensityStrategy.pixel_weights
     needs_camera: bool = False
     first_fault: Any = None
 
@@ -456,6 +457,10 @@ class ViewExchange:
                     self._add_with_camera(each)
             else:
                 self._add(group)
+            for each in group:
+                each.means2d = reduce(add, (gradients.means2d for gradients in each.gradients))
+                dr.eval(each.means2d)  # or it would hold all that came with it
+                each.gradients.clear()
             self._num_added += len(group)
 
     def _add(self, group: Sequence[_View]) -> None:
@@ -499,9 +504,8 @@ class ViewExchange:
     @staticmethod
     def _result(each: _View) -> ViewGradients:
         """Return what is known of a view, of the rows of this rank."""
-        means2d = reduce(add, (gradients.means2d for gradients in each.gradients))
         visible = reduce(or_, (local.visible for local in each.local))
-        return ViewGradients(means2d, visible, each.sums, each.first_fault)
+        return ViewGradients(each.means2d, visible, each.sums, each.first_fault)
 
 
 def _splat_gradients(columns: list[Any], layout: SplatLayout) -> SplatGradients:
