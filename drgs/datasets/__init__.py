@@ -40,7 +40,7 @@ def reader_of(
 
     sections: those of extensions, by name.
     """
-    extension = READERS.get(reader_name(config), "data.type")
+    extension = READERS.get(reader_name(config, sections), "data.type")
     return extension.name, extension.value.from_config(section_of(extension, sections))
 
 
@@ -81,8 +81,10 @@ def _near(dataset: Dataset) -> Dataset:
     return replace(dataset.relative_to(origin), description=dataset.description + note)
 
 
-def reader_name(config: DataConfig) -> str:
+def reader_name(config: DataConfig, sections: Mapping[str, Any] = NO_SECTIONS) -> str:
     """Return the name of the reader of a folder: ``data.type``, or the one that recognizes it.
+
+    sections: those of extensions, by name.
 
     Raises :class:`UserError` for a folder that no reader recognizes, with what to do.
     """
@@ -105,7 +107,9 @@ def reader_name(config: DataConfig) -> str:
     if config.type != "auto":
         return config.type
     for extension in [*map(READERS.get, READERS.shipped), *READERS.installed()]:
-        if extension.value.from_config(section_of(extension, {})).recognizes(config.path, names):
+        if extension.value.from_config(section_of(extension, sections)).recognizes(
+            config.path, names
+        ):
             return extension.name
     from drgs.datasets.recognition import what_is_there
 

@@ -23,7 +23,7 @@ from drgs.config.explain import expectation
 from drgs.core.constants import MAX_COEFFICIENT
 from drgs.core.errors import UserError, listed, one_line
 from drgs.core.files import read_text, shortened
-from drgs.core.registry import ENTRY_POINT_GROUP
+from drgs.core.registry import HOW_TO_INSTALL
 from drgs.datasets.types import Motion
 from drgs.io.pictures import MAX_SIDE
 
@@ -127,8 +127,7 @@ def _known_model(model: str) -> str:
         if model not in LENSES.names():
             raise ValueError(
                 f"must be one of {', '.join(COLMAP_MODELS)}, or a lens: "
-                f"{', '.join(LENSES.names())}; others come with packages that have an entry point "
-                f'of the group "{ENTRY_POINT_GROUP}"'
+                f"{', '.join(LENSES.names())}; {HOW_TO_INSTALL}"
             )
     return model
 

@@ -135,7 +135,10 @@ def test_a_file_has_the_lens_by_name_and_what_is_written_is_read_again(tmp_path)
     [
         ({"xi": "far"}, 'xi must be a finite number, got "far"'),
         ({"xi": 1e9}, "camera_model: xi must be a coefficient of at most 1e\\+06 in size"),
-        ({"camera_model": "unifed"}, 'or a lens: .*unified; others come with packages .*"drgs"'),
+        (
+            {"camera_model": "unifed"},
+            'or a lens: .*unified; others come with installed packages .*"drgs"',
+        ),
     ],
 )
 def test_a_file_that_is_wrong_is_refused_with_file_and_key(tmp_path, values, message):
