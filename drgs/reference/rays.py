@@ -41,9 +41,11 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, fields
 from math import inf, isfinite
-from typing import Any, Literal, get_args, get_type_hints
+from typing import Any, Literal
 
 import numpy as np
+import pydantic
+from pydantic import Field
 
 from drgs.reference import splatting as reference
 from drgs.reference.splatting import Camera, Gaussians, Picture
@@ -68,7 +70,7 @@ OPEN_CONE = 1e-6
 # ----------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
+@pydantic.dataclasses.dataclass(frozen=True)
 class ImageModel:
     """How a picture comes of Gaussians: the defaults are those of 3DGS and ``reference``.
 
@@ -84,54 +86,32 @@ class ImageModel:
     transmittance_stop, which is then not composited, or ``"after"`` it. step: of order ``"entry"``;
     a ray that has entered a splat goes on so far behind the entry, and passes over what it enters
     on the way.
+
+    Raises ValueError for unknown choices and numbers out of range.
     """
 
     projection: Literal["ewa", "unscented", "exact"] = "ewa"
     order: Literal["center", "pixel", "entry"] = "center"
     sh_direction: Literal["mean", "pixel"] = "mean"
     stop: Literal["before", "after"] = "before"
-    alpha_max: float = reference.ALPHA_MAX  # upper clamp of alpha; 1: none
-    alpha_cut: float = reference.ALPHA_CUT  # a smaller alpha does not exist; 0: none
-    transmittance_stop: float = reference.TRANSMITTANCE_STOP  # 0: none
-    extent: float = inf  # standard deviations beyond which a splat does not exist
-    step: float = 0.0  # world units along the ray
-    low_pass: float = reference.LOW_PASS  # px^2; 0: none
+    alpha_max: float = Field(reference.ALPHA_MAX, gt=0, le=1)  # upper clamp of alpha; 1: none
+    alpha_cut: float = Field(reference.ALPHA_CUT, ge=0, lt=1)  # a smaller alpha does not exist
+    transmittance_stop: float = Field(reference.TRANSMITTANCE_STOP, ge=0, lt=1)  # 0: none
+    extent: float = Field(inf, gt=0)  # standard deviations beyond which a splat does not exist
+    step: float = Field(0.0, ge=0, lt=inf)  # world units along the ray
+    low_pass: float = Field(reference.LOW_PASS, ge=0, lt=inf)  # px^2; 0: none
     antialiased: bool = False  # opacities compensate for the low-pass (Mip-Splatting)
     sh_degree: int | None = None  # None: all that is stored
 
     def __post_init__(self) -> None:
-        """Refuse unknown names, numbers out of range, and an entry that nothing defines."""
-        choices = get_type_hints(ImageModel)
-        for name in ("projection", "order", "sh_direction", "stop"):
-            known, value = get_args(choices[name]), getattr(self, name)
-            if value not in known:
-                raise ValueError(
-                    f"reference_rays.ImageModel: {name} must be one of {', '.join(known)}, "
-                    f"got {value!r}"
-                )
-        ranges = {
-            "alpha_max": ("in (0, 1]", 0 < self.alpha_max <= 1),
-            "alpha_cut": ("in [0, 1)", 0 <= self.alpha_cut < 1),
-            "transmittance_stop": ("in [0, 1)", 0 <= self.transmittance_stop < 1),
-            "extent": ("> 0", self.extent > 0),
-            "low_pass": (">= 0 and finite", 0 <= self.low_pass < inf),
-            "step": (">= 0 and finite", 0 <= self.step < inf),
-        }
-        for name, (expected, holds) in ranges.items():
-            if not holds:
-                raise ValueError(
-                    f"reference_rays.ImageModel: {name} must be {expected}, "
-                    f"got {getattr(self, name)}"
-                )
+        """Refuse an entry that nothing defines."""
         if self.order == "entry" and not (self.projection == "exact" and isfinite(self.extent)):
-            raise ValueError(
-                "reference_rays.ImageModel: order 'entry' needs projection 'exact' and a finite "
-                f"extent, got projection {self.projection!r} and extent {self.extent}"
-            )
+            raise ValueError("order 'entry' needs projection 'exact' and a finite extent")
         if self.step > 0 and self.order != "entry":
-            raise ValueError(
-                f"reference_rays.ImageModel: a step needs order 'entry', got {self.order!r}"
-            )
+            raise ValueError("a step needs order 'entry'")
+
+
+DEFAULT_MODEL = ImageModel()
 
 
 @dataclass(frozen=True)
@@ -191,7 +171,7 @@ def render(
     gaussians: Gaussians,
     camera: Camera,
     background: np.ndarray = (0.0, 0.0, 0.0),
-    model: ImageModel = ImageModel(),
+    model: ImageModel = DEFAULT_MODEL,
     region: tuple[slice, slice] | None = None,
     positions: np.ndarray | None = None,
     threshold_width: float = reference.THRESHOLD_WIDTH,
@@ -207,15 +187,10 @@ def render(
 
     ``Picture.depth`` sums the means' camera z for order ``"center"``, else that of the peaks.
 
-    Raises ValueError for a shape or region that does not fit the film.
     """
-    rows, columns = _checked_region(region, camera)
-    positions = _checked_positions(positions, camera)[rows, columns]
+    positions = pixel_centers(camera) if positions is None else np.asarray(positions, np.float64)
+    positions = positions if region is None else positions[region]
     background = np.asarray(background, dtype=np.float64)
-    if background.shape != (3,):
-        raise ValueError(
-            f"reference_rays.render: background must have shape (3,), got {background.shape}"
-        )
     splats = _splats(gaussians, camera, model)
     boxes = _boxes(splats, model, positions, threshold_width)
 
@@ -696,34 +671,7 @@ def _rows(data: Any, chosen: np.ndarray) -> Any:
     return type(data)(**{field.name: getattr(data, field.name)[chosen] for field in fields(data)})
 
 
-def _checked_region(region: tuple[slice, slice] | None, camera: Camera) -> tuple[slice, slice]:
-    """Return the region's rows and columns with explicit ends, the whole film for None."""
-    if region is None:
-        return slice(0, camera.height), slice(0, camera.width)
-    if len(region) != 2 or not all(isinstance(part, slice) for part in region):
-        raise ValueError(
-            f"reference_rays.render: region must be a slice of rows and one of columns, "
-            f"got {region!r}"
-        )
-    for part, size in zip(region, (camera.height, camera.width), strict=True):
-        if part.step not in (None, 1) or part.indices(size)[1] < part.indices(size)[0]:
-            raise ValueError(
-                f"reference_rays.render: region must have slices of step 1 in ascending order, "
-                f"got {part}"
-            )
-    return slice(*region[0].indices(camera.height)), slice(*region[1].indices(camera.width))
-
-
-def _checked_positions(positions: np.ndarray | None, camera: Camera) -> np.ndarray:
-    """Return where each pixel of the film is evaluated (height, width, 2), px, (x, y)."""
-    if positions is None:
-        x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
-        return np.stack([x, y], axis=-1)
-    positions = np.asarray(positions, dtype=np.float64)
-    expected = (camera.height, camera.width, 2)
-    if positions.shape != expected:
-        raise ValueError(
-            f"reference_rays.render: positions must have shape {expected}, that of the film even "
-            f"where a region is given, got {positions.shape}"
-        )
-    return positions
+def pixel_centers(camera: Camera) -> np.ndarray:
+    """Return the centres (height, width, 2), px, (x, y), of the film's pixels."""
+    x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
+    return np.stack([x, y], axis=-1)
