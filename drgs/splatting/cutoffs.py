@@ -7,11 +7,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
 
 import drjit as dr
 
 from drgs.core.constants import ALPHA_CUT, ALPHA_MAX, NEGLIGIBLE_ALPHA, TRANSMITTANCE_STOP
+from drgs.core.types import Float
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,7 @@ class Cutoffs:
         """``alpha_cut``; where that is 0, an alpha too small to change any sum."""
         return max(self.alpha_cut, NEGLIGIBLE_ALPHA)
 
-    def log2_floor(self, log2_opacity: Any) -> Any:
+    def log2_floor(self, log2_opacity: Float) -> Float | float:
         """The base-2 logarithm of the smallest alpha of a splat."""
         least = math.log2(self.least_alpha)
         if math.isinf(self.extent):

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 from drgs.core.constants import CULL_MARGIN, CULL_MARGIN_PER_PX
+from drgs.core.types import UInt32
 
 MICRO = 4
 """Pixels on a micro-tile's side. A micro-tile is one SIMD lane of the compositing kernels."""
@@ -69,9 +69,9 @@ class TileGrid:
 class Lanes:
     """One lane per micro-tile, in the order in which Dr.Jit starts them."""
 
-    micro_tile: Any  # UInt32: tile among those of all samples * 16 + micro-tile within the tile
-    micro: Any  # UInt32: micro-tile within the tile
-    tile: Any  # UInt32: on the film
-    sample: Any  # UInt32
-    x: Any  # UInt32: first pixel column
-    y: Any  # UInt32: first pixel row
+    micro_tile: UInt32  # tile among those of all samples * 16 + micro-tile within the tile
+    micro: UInt32  # micro-tile within the tile
+    tile: UInt32  # on the film
+    sample: UInt32
+    x: UInt32  # first pixel column
+    y: UInt32  # first pixel row
