@@ -116,7 +116,7 @@ class ProjectionModel:
 OpacityRule = Callable[[Float, Float, Float], Float]
 """From an opacity and the two determinants of :class:`FilmShape` to an opacity, Float each."""
 
-SplatColor = Callable[["GaussianRows", Array3f, int], "Array3f | Sequence[Float]"]
+SplatColor = Callable[["GaussianRows", Array3f, int], Array3f | Sequence[Float]]
 """From rows, directions in which means are seen (Array3f, world, of any length) and SH degree to
 what is stored of a splat's colour, Float each."""
 

@@ -19,7 +19,7 @@ import drjit as dr
 import numpy as np
 
 from drgs.core.arrays import Rows, divide, interleave, repeat_array, types_of
-from drgs.core.types import Array2u, Float, UInt32
+from drgs.core.types import Array2u, Bool, Float, UInt32
 from drgs.splatting.grid import MICROS
 from drgs.splatting.lanes import Entries
 from drgs.splatting.tiles import WORD, TileBins, transpose_masks
