@@ -16,7 +16,7 @@ from drgs.core.types import Float
 
 @dataclass(frozen=True)
 class Cutoffs:
-    """Where a splat, and a pixel, ends. Numbers of the host: each value makes its own kernels.
+    """Limits at which splats and pixels end. Host numbers: each value compiles its own kernels.
 
     None of these decisions is differentiated.
     """

@@ -29,7 +29,7 @@ FEATURES_AT_ONCE = {4: 32, 8: 8}
 
 
 def in_groups(order: Any, bins: TileBins) -> Any:
-    """``order``, or one that composites in groups where there are many features.
+    """Return ``order``, or one that composites in groups if there are many features.
 
     Each is a :class:`drgs.splatting.rendering.CenterOrder`.
     """
@@ -55,7 +55,7 @@ class GroupedLayers:
 
 @dataclass(frozen=True)
 class InGroups:
-    """Composites in another order, group by group."""
+    """Composite group by group, in the order of another object."""
 
     order: Any  # drgs.splatting.rendering.CenterOrder: of each group
 
@@ -148,6 +148,6 @@ def _groups(bins: TileBins) -> tuple[FeatureGroup, ...]:
 
 
 def _only(group: FeatureGroup, bins: TileBins) -> TileBins:
-    """The bins as if there were no other features."""
+    """Return the bins with the features of one group."""
     model = replace(bins.model, features=group.features)
     return replace(bins, num_features=len(group.stored), model=model)

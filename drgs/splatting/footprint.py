@@ -1,4 +1,4 @@
-"""What a splat is at the 16 pixels of a micro-tile: the image model of the kernels.
+"""The footprint of a splat at the 16 pixels of a micro-tile: the image model of the kernels.
 
 A :class:`FootprintModel` holds what tiles and compositing have to agree on, each an object that the
 kernels' Python code calls while Dr.Jit traces it. The classes here are the bases, and the defaults,
@@ -85,7 +85,7 @@ class Alpha:
 
 
 class Positions:
-    """Where in a pixel splats are evaluated. Grids of 16 values are lists of 4 rows of 4."""
+    """Points of the pixels at which splats are evaluated. Grids of 16 values: 4 rows of 4."""
 
     margin: ClassVar[float] = 0.0  # px: distance from a pixel's centre to its point, at most
     samples: ClassVar[int] = 1  # times that each pixel is evaluated
@@ -122,7 +122,7 @@ class Positions:
 
 @dataclass(frozen=True)
 class PixelCenters(Positions):
-    """Every pixel is evaluated at its centre: offsets are shared by rows and columns."""
+    """The pixels' centres: rows and columns share their offsets."""
 
     samples: ClassVar[int] = 1
 
@@ -140,20 +140,20 @@ class PixelCenters(Positions):
         return [dx] * MICRO, [[d] * MICRO for d in dy]
 
     def sum(self, values: list[Float]) -> Float:
-        """Of 16 values."""
+        """Sum 16 values."""
         return total(self._rows(values))
 
     def sum_dx(self, values: list[Float], dx: list) -> Float:
-        """Of values times dx: dx is shared by a column, so columns are summed first."""
+        """Sum values times dx: a column shares dx, so columns are summed first."""
         columns = [total([values[MICRO * j + i] for j in range(MICRO)]) for i in range(MICRO)]
         return _dot(columns, dx[0])
 
     def sum_dy(self, values: list[Float], dy: list) -> Float:
-        """Of values times dy, shared by a row."""
+        """Sum values times dy, which a row shares."""
         return _dot(self._rows(values), _first_of_rows(dy))
 
     def sum_dy_dy(self, values: list[Float], dy: list) -> Float:
-        """Of values times dy^2."""
+        """Sum values times dy^2."""
         dy = _first_of_rows(dy)
         return _dot([a * b for a, b in zip(self._rows(values), dy, strict=True)], dy)
 
@@ -167,7 +167,7 @@ def _first_of_rows(rows: list) -> list[Float]:
 
 
 def total(values: list[Float]) -> Float:
-    """Pairwise: the shortest chain of dependent additions."""
+    """Sum pairwise: the shortest chain of dependent additions."""
     while len(values) > 1:
         values = [a + b for a, b in zip(values[::2], values[1::2], strict=True)]
     return values[0]
@@ -220,7 +220,7 @@ class GaussianFalloff:
     num_moments: ClassVar[int] = 6  # sums over pixels, by splat
 
     def for_camera(self, camera: Camera) -> GaussianFalloff:
-        """For one camera: nothing depends on it."""
+        """Return this falloff for one camera; here, nothing depends on it."""
         del camera
         return self
 
@@ -295,7 +295,7 @@ class GaussianFalloff:
         ]
 
     def derivatives(self, geometry: list[Float], totals: list[Float]) -> list[Float]:
-        """From moments to the derivatives of mean x, y, p, r, s (unscaled), and opacity.
+        """Return the derivatives of mean x, y, p, r, s (unscaled), and opacity, from moments.
 
         log2_alpha = log2_opacity - u^2 - (s dy)^2, u = p dx + r dy, dx = x - mean: hence
         d ln(alpha) / d(anything) = ln(2) * d log2_alpha / d(anything).
@@ -387,7 +387,7 @@ class SplatFeatures:
         """Raise UnsupportedError if they depend on the camera but through what is stored."""
 
     def weighing(self) -> SplatFeatures:
-        """What has the weights of compositing as derivatives of the first number that is stored."""
+        """Return features whose derivatives with respect to the first number are weights."""
         return self
 
     def bind(self, lanes: Lanes, positions: Positions) -> SplatFeatures:
@@ -434,7 +434,7 @@ class SplatFeatures:
 
 @dataclass(frozen=True)
 class FootprintModel:
-    """What tiles and compositing share; see the module's description."""
+    """The footprint of splats, as tiles and compositing see it; see the module's description."""
 
     falloff: GaussianFalloff = field(default_factory=GaussianFalloff)
     positions: Positions = field(default_factory=PixelCenters)

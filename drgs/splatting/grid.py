@@ -1,4 +1,4 @@
-"""How the film is cut: tiles, their micro-tiles, and the lanes of kernels that have one each."""
+"""Tiles of the film, their micro-tiles, and the lanes of kernels: one lane per micro-tile."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ class TileGrid:
 
     @property
     def cull_margin(self) -> float:
-        """What rounding may take from an exponent (base 2) on this film."""
+        """Largest rounding error of an exponent (base 2) on this film."""
         return CULL_MARGIN + CULL_MARGIN_PER_PX * max(self.width, self.height)
 
 

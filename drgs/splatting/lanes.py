@@ -23,7 +23,7 @@ T = TypeVar("T", Float, UInt32)
 def make_lanes(
     Float: type, grid: TileGrid, order: UInt32 | None = None, tiles: range | None = None
 ) -> Lanes:
-    """Lanes such that neighbours in time are far apart on the film.
+    """Make lanes such that neighbours in time are far apart on the film.
 
     Dr.Jit cuts a small launch into few blocks of consecutive lanes. Tiles are visited with a
     stride near the golden section, so that each block gets its share of the busy centre.
@@ -55,9 +55,9 @@ def make_lanes(
 
 
 def grouped_by_work(Float: type, grid: TileGrid, work: UInt32, tiles: range | None = None) -> Lanes:
-    """Those of :func:`make_lanes`, in each block ordered by how many splats they visit, roughly.
+    """Make lanes that are ordered, within each block, by roughly their number of splats.
 
-    work: UInt32, of each of those lanes.
+    work: UInt32, the number of splats of each lane of :func:`make_lanes`.
     """
     level = work // 4
     level = dr.select(level < _LEVELS, level, _LEVELS - 1)
@@ -65,7 +65,7 @@ def grouped_by_work(Float: type, grid: TileGrid, work: UInt32, tiles: range | No
 
 
 def _in_blocks(level: UInt32) -> UInt32:
-    """Lanes ordered by level in each block; which of equals comes first is left to chance.
+    """Return the lanes ordered by level in each block; the order of equal lanes is arbitrary.
 
     Nothing depends on it but which lanes share a vector. (The host would wait for the order of
     Dr.Jit's sorting functions, and the device for the host, which has not traced what comes next.)
@@ -99,7 +99,7 @@ def _coprime_stride(count: int) -> int:
 
 @dataclass
 class Cursor:
-    """Walks the set bits of a micro-tile's words: the splats that touch it.
+    """A place among the set bits of a micro-tile's words: the splats that touch it.
 
     Not frozen: Dr.Jit assigns the fields of a loop's state.
     """
@@ -128,7 +128,7 @@ class Entries:
         return self._open(self.first, True)
 
     def pending(self, cursor: Cursor) -> Bool:
-        """Whether entries may be left."""
+        """Return lanes that may have entries left."""
         return (cursor.word != 0) | (cursor.group < self.last)
 
     @staticmethod
@@ -164,7 +164,7 @@ class EntriesBackToFront(Entries):
         return self._open(self.last, True)
 
     def pending(self, cursor: Cursor) -> Bool:
-        """Whether entries may be left."""
+        """Return lanes that may have entries left."""
         return (cursor.word != 0) | (cursor.group > self.first)
 
     @staticmethod
@@ -180,7 +180,7 @@ class EntriesBackToFront(Entries):
 
 
 def count_entries(entries: Entries) -> UInt32:
-    """How many entries each lane has."""
+    """Count the entries of each lane."""
 
     def body(group: UInt32, count: UInt32) -> tuple[UInt32, UInt32]:
         return group + 1, count + dr.popcnt(entries._open(group, True).word)
@@ -206,7 +206,7 @@ def load_pixels(plane: Float, lanes: Lanes, grid: TileGrid) -> list[Float]:
 
 
 def pixels_of(lanes: Lanes, grid: TileGrid) -> list[tuple[UInt32, Bool]]:
-    """For the 16 pixels of each micro-tile: row-major index, and whether it is on the film.
+    """Return row-major index and on-film mask of the 16 pixels of each micro-tile.
 
     The index is that in a plane of all samples.
     """

@@ -31,7 +31,7 @@ from drgs.splatting.cutoffs import Cutoffs
 
 @dataclass(frozen=True)
 class RayTerms:
-    """What the peak along a pixel's ray depends on: see ``drgs.accuracy.exact``."""
+    """Parameters of the peak along a pixel's ray: see ``drgs.accuracy.exact``."""
 
     tilt_x: Float  # how the peak's depth changes across the film, kappa or g / |a_c|
     tilt_y: Float
@@ -39,7 +39,7 @@ class RayTerms:
     scale: Float | None = None  # 1 / |a_c|, what the whitening is multiplied by; None: 1
 
     def numbers(self) -> list[Float]:
-        """Those that there are, Float each."""
+        """All numbers that are set."""
         numbers = [self.tilt_x, self.tilt_y, self.spread]
         return numbers if self.scale is None else [*numbers, self.scale]
 
@@ -64,7 +64,7 @@ class Splats2D:
     )  # display space; or whatever else :func:`project`'s ``color`` gave
     variances: Array2f  # px^2: diagonal of the projected covariance, low-pass included
     visible: Bool  # in front of the near plane, above the alpha cut, finite
-    ray: RayTerms | None = None  # only where something asks for them
+    ray: RayTerms | None = None  # only where something needs them
     dimming: Float | None = None  # factor of the opacity, where the camera is out of focus
 
     @property
@@ -76,7 +76,7 @@ class Splats2D:
 
 @dataclass(frozen=True)
 class FilmShape:
-    """What a Gaussian's mean and covariance are on the film."""
+    """The mean and covariance of a Gaussian on the film."""
 
     means2d: Array2f  # px
     whitening: Array3f  # (p, r, s), 1 / px
@@ -87,7 +87,7 @@ class FilmShape:
     dimming: Float | None = None  # factor of the opacity; None: 1
 
     def root_determinant(self) -> Float:
-        """Float, 1 / px^2: sqrt(det(conic)) at the mean."""
+        """The square root of det(conic) at the mean, 1 / px^2."""
         p, _, s = self.whitening
         if self.ray is not None and self.ray.scale is not None:
             p, s = p / self.ray.scale, s / self.ray.scale
@@ -99,7 +99,7 @@ Projection = Callable[["GaussianRows", Camera, Array3f, float], FilmShape]
 
 
 class ProjectionModel:
-    """A projection as ``model.projection`` of a configuration names it.
+    """A projection that ``model.projection`` of a configuration can name.
 
     A subclass has a :data:`Projection` as its static method ``shape``, and enters ``PROJECTIONS``.
     """

@@ -104,7 +104,7 @@ class Layers:
 
 
 def composite_step(transmittance: Float, alpha: Float, stop: float) -> tuple[Float, Float, Bool]:
-    """Composite one alpha: (weight, next transmittance, whether the pixel goes on).
+    """Composite one alpha; return its weight, the next transmittance, and unfinished pixels.
 
     stop: the last transmittance that a pixel may have.
 
@@ -119,7 +119,7 @@ def composite_step(transmittance: Float, alpha: Float, stop: float) -> tuple[Flo
 
 @dataclass(frozen=True)
 class Records:
-    """What compositing loads for each sorted entry: its splat's geometry and features.
+    """The rows that compositing loads, one per sorted entry: its splat's geometry and features.
 
     A splat that touches several tiles is stored several times, so that the lanes of a tile read
     memory in order instead of jumping from splat to splat.
@@ -131,7 +131,7 @@ class Records:
 
     @staticmethod
     def of(bins: TileBins, numbers: Callable[[UInt32, Bool], list[Float]]) -> Records:
-        """Copies, evaluated, of each rank's ``numbers``, such as those of ``bins.rows.load``.
+        """Copy each rank's ``numbers``, such as those of ``bins.rows.load``, and evaluate them.
 
         numbers: given ranks, and which lanes are active. Entries that touch nothing have zeros.
         """
@@ -213,7 +213,7 @@ def composite(bins: TileBins, records: Records) -> Layers:
 
 
 def any_unfinished(transmittances: list[Float]) -> Bool:
-    """Whether a transmittance has no negative sign: the bits that all share tell."""
+    """Return lanes with a transmittance that is not negative, from the bits that all share."""
     Int: Any = dr.int_array_t(type(transmittances[0]))
     shared = reinterpret(Int, transmittances[0])
     for T in transmittances[1:]:
@@ -245,7 +245,7 @@ class SplatGradients:
     features: list[Float]
 
     def plus(self, other: SplatGradients) -> SplatGradients:
-        """The sum."""
+        """Add other derivatives of the same splats."""
         return SplatGradients(
             geometry=[a + b for a, b in zip(self.geometry, other.geometry, strict=True)],
             features=[a + b for a, b in zip(self.features, other.features, strict=True)],
@@ -253,12 +253,12 @@ class SplatGradients:
 
     @property
     def means2d(self) -> Array2f:
-        """Array2f, loss per px."""
+        """Derivatives of the means on the film, loss per px."""
         return types_of(type(self.geometry[0])).Array2f(self.geometry[:2])
 
     @property
     def opacities(self) -> Float:
-        """Float."""
+        """Derivatives of the opacities."""
         return self.geometry[5]
 
 
@@ -271,7 +271,7 @@ def composite_adjoint(
     samples: range = ONE_SAMPLE,
     before: SplatGradients | None = None,
 ) -> SplatGradients:
-    """Derivatives with respect to the splats, given those with respect to the planes.
+    """Return derivatives with respect to the splats, given those with respect to the planes.
 
     layers: what :func:`composite` returned for the same bins and records; d_features: C planes
     (samples * H * W,); d_transmittance: plane (samples * H * W,); samples: those of the layers that
@@ -300,7 +300,7 @@ def _partials(
     d_features: list[Float],
     d_transmittance: Float,
 ) -> Rows:
-    """By slot: moments, and derivatives of the features, summed over 16 pixels; evaluated."""
+    """Return, by slot, moments and features' derivatives summed over 16 pixels; evaluated."""
     t, tiles = types_of(bins.rows.Float), slots.band.tiles
     lanes = make_lanes(t.Float, bins.grid, tiles=tiles)
     stop = dr.gather(t.UInt32, layers.stop, lanes.micro_tile)
@@ -357,7 +357,7 @@ def _adjoint_step(
     pixels: list[list[Float]],
     g: list[list[Float]],
 ) -> tuple[list, list, list]:
-    """One splat at 16 pixels: T and b before it, d loss / d ln(alpha), d loss / d stored (summed).
+    """Return T and b before a splat at 16 pixels, d loss / d ln(alpha), and d loss / d stored.
 
     composited: whether each pixel was still unfinished; stored: what is stored of the splat, and
     features: what they are at a pixel; pixels: T and b of each, past the splat; g: [plane][pixel]
@@ -384,7 +384,7 @@ def splat_gradients(
     num_samples: int,
     before: SplatGradients | None,
 ) -> SplatGradients:
-    """From each splat's sums, by rank, to its derivatives, by Gaussian.
+    """Return the derivatives of each splat, by Gaussian, from its sums, by rank.
 
     totals: from ranks and a sample to moments, and derivatives of the features; before: what the
     samples' derivatives are added to, in their order.
@@ -432,7 +432,7 @@ def splat_gradients(
 def composite_tangent(
     bins: TileBins, records: Records, layers: Layers, tangents: SplatGradients
 ) -> Layers:
-    """Directional derivatives of the planes along ``tangents`` of the 2D splats.
+    """Return directional derivatives of the planes along ``tangents`` of the 2D splats.
 
     tangents: the same fields as the gradients, holding the direction. Returns the tangents of
     the planes that :func:`composite` made. Not differentiated: the order, the decisions.
@@ -489,7 +489,7 @@ def composite_tangent(
 
 
 def pack_tangents(bins: TileBins, tangents: SplatGradients) -> Records:
-    """The records' tangents: of the geometry as the falloff wants it, and of the features."""
+    """Return the tangents of the records: geometry, in the falloff's form, and features."""
     t = types_of(bins.rows.Float)
     rank = dr.arange(t.UInt32, dr.width(bins.order))
 

@@ -45,7 +45,7 @@ class CompositedPairs:
 
     @staticmethod
     def of(bins: TileBins, stop: UInt32, samples: range) -> CompositedPairs:
-        """Those before each micro-tile's ``stop``, see :class:`drgs.splatting.rasterize.Layers`."""
+        """Find the pairs before each micro-tile's ``stop``; see :class:`.Layers`."""
         t, count = types_of(bins.rows.Float), len(samples)
         padded, num_entries = dr.width(bins.masks), bins.num_entries
         _, entry = divide(dr.arange(t.UInt32, count * padded), padded, count)
@@ -73,13 +73,13 @@ class CompositedPairs:
 
     @property
     def num_rows(self) -> int:
-        """Entries that are seen. Waits for the device."""
+        """Number of entries that are seen; waits for the device."""
         return int(self.row[dr.width(self.row) - 1])
 
 
 @dataclass(frozen=True)
 class Band:
-    """Consecutive tiles, their sorted entries, and how many slots these have."""
+    """Consecutive tiles, their sorted entries, and the number of slots of these."""
 
     tiles: range  # of all samples of the layers
     entries: range  # of all samples of the pairs
@@ -93,7 +93,7 @@ class Band:
 
 
 def bands_of(bins: TileBins, pairs: CompositedPairs) -> list[Band]:
-    """The film of each sample in bands. The host reads how many slots and entries each tile has."""
+    """Cut the film of each sample into bands; the host reads the slots and entries of each tile."""
     t, count = types_of(bins.rows.Float), len(pairs.samples)
     running = dr.cumsum(dr.popcnt(pairs.masks))
     starts = repeat_array(bins.tile_start, count, dr.width(bins.masks))
@@ -111,14 +111,14 @@ def bands_of(bins: TileBins, pairs: CompositedPairs) -> list[Band]:
 
 
 def _without_inner_ends(column: UInt32, count: int) -> np.ndarray:
-    """Starts of all tiles and the end of the last, of ``count`` columns with an end each."""
+    """Return the starts of all tiles and the last end, from ``count`` columns with an end each."""
     columns = np.array(column, np.int64).reshape(count, -1)
     return np.append(columns[:, :-1], columns[-1, -1])
 
 
 @dataclass(frozen=True)
 class Slots:
-    """Where each composited (entry, micro-tile) pair of a band stores its partial derivatives.
+    """Places for the partial derivatives of each composited (entry, micro-tile) pair of a band.
 
     First come the pairs of all tiles' first micro-tiles, in the order of the sorted entries, then
     those of the second ones, and so on: what a lane writes is contiguous. (In the order in which
@@ -133,7 +133,7 @@ class Slots:
     groups_of_sample: int
 
     def at(self, group: UInt32, micro: UInt32, active: Bool | bool = True) -> Array2u:
-        """First slot of a group of entries in a micro-tile, and the word of its composited bits.
+        """Return the first slot of a group of entries in a micro-tile, and its composited bits.
 
         group: among those of all samples of the pairs.
         """
@@ -141,13 +141,13 @@ class Slots:
         return dr.gather(types_of(type(group)).Array2u, self.pairs, index, active)
 
     def end(self, entries: Entries) -> UInt32:
-        """Where each lane's slots end."""
+        """Return the end of each lane's slots."""
         last = self._first_of_sample(entries) + entries.last
         first, word = self.at(last, entries.micro, entries.head != 0)
         return first + dr.popcnt(word & entries.tail)
 
     def number(self, entries: Entries) -> UInt32:
-        """How many slots each lane has."""
+        """Return the number of slots of each lane."""
         occupied = entries.head != 0
         first_group = self._first_of_sample(entries) + entries.first
         first, word = self.at(first_group, entries.micro, occupied)

@@ -1,8 +1,8 @@
 """The stages composed: from Gaussians and a camera to planes of pixels, and back.
 
-A :class:`Pipeline` says what a scene calls for: which SH degree, which opacity rule, which features
-are composited, which approximations are made. It does so by naming functions and objects, and
-Dr.Jit traces only what is called: what is not composed in leaves no instruction in any kernel.
+A :class:`Pipeline` holds the SH degree, the opacity rule, the features that are composited and the
+approximations, as functions and objects. Dr.Jit traces only what is called, so that a stage that is
+not composed in leaves no instruction in any kernel.
 ``drgs.config.approximations`` makes a pipeline from names.
 
 The chain is  Gaussians -> ``project`` -> Splats2D -> ``footprints_of`` -> Footprints
@@ -73,7 +73,7 @@ def depth_feature(splats: Splats2D, rows: GaussianRows, camera: Camera) -> list[
 @ORDERS.register("center")
 @dataclass(frozen=True)
 class CenterOrder:
-    """In which order a pixel composites its splats: here, all by the depth of their means.
+    """The order in which a pixel composites its splats: by the depth of their means.
 
     The base of all orders.
     """
@@ -87,7 +87,7 @@ class CenterOrder:
         return projection.shape, cls()
 
     def for_camera(self, camera: Camera) -> CenterOrder:
-        """For any camera."""
+        """Return this order for one camera; here, nothing depends on it."""
         del camera
         return self
 
@@ -130,22 +130,22 @@ class CenterOrder:
 
 
 class ProjectionStage(Protocol):
-    """Where the splats of a frame come from, and where their derivatives go."""
+    """The source of a frame's splats, and the destination of their derivatives."""
 
     def footprints(self, gaussians: Gaussians, camera: Camera, pipeline: Pipeline) -> Footprints:
-        """The splats as ``camera`` sees them."""
+        """Return the splats of the Gaussians for ``camera``."""
         ...
 
     def gradients(
         self, gaussians: Gaussians, frame: Frame, of_splats: SplatGradients, of_camera: bool
     ) -> GaussianGradients:
-        """Derivatives of the loss, from those with respect to the splats of a frame."""
+        """Return derivatives of the loss, from those with respect to the splats of a frame."""
         ...
 
 
 @dataclass(frozen=True)
 class Projected:
-    """The Gaussians that are to be rendered, projected."""
+    """Project the Gaussians that are rendered, and go back through the projection."""
 
     def footprints(self, gaussians: Gaussians, camera: Camera, pipeline: Pipeline) -> Footprints:
         """Project them."""
@@ -160,13 +160,13 @@ class Projected:
 
 
 def as_loaded(rows: GaussianRows) -> GaussianRows:
-    """The Gaussians as they are."""
+    """Return the Gaussians unchanged."""
     return rows
 
 
 @dataclass(frozen=True)
 class Pipeline:
-    """What is rendered, and how; see the module's description."""
+    """The stages and approximations of a rendering; see the module's description."""
 
     sh_degree: int = 3
     opacity_rule: OpacityRule = plain_opacity
@@ -254,7 +254,7 @@ def render(gaussians: Gaussians, camera: Camera, pipeline: Pipeline) -> Frame:
 
 
 def footprints_seen_by(gaussians: Gaussians, camera: Camera, pipeline: Pipeline) -> Footprints:
-    """What compositing needs of ``gaussians``, from projection; see :func:`render`."""
+    """Project ``gaussians`` and store what compositing needs; see :func:`render`."""
     rows = load_rows(gaussians, pipeline.sh_degree)
     splats = pipeline.project(rows, camera)
     columns = pipeline.feature_columns(splats, rows, camera)
@@ -265,7 +265,7 @@ def footprints_seen_by(gaussians: Gaussians, camera: Camera, pipeline: Pipeline)
 
 
 def render_again(frame: Frame, model: FootprintModel) -> Frame:
-    """The same splats, in the same tiles, with another image model.
+    """Composite the same splats, in the same tiles, with another footprint model.
 
     model: that of the frame's pipeline, but for points of the pixels within the same margin, or
     for features that are composited of the same stored numbers.
@@ -281,7 +281,7 @@ def frames_adjoint(
     d_planes: list[list[Float]],
     of_camera: bool = False,
 ) -> GaussianGradients:
-    """Derivatives of a loss with respect to all parameters.
+    """Return derivatives of a loss with respect to all parameters.
 
     The loss depends on several frames of the same splats and one camera.
 
@@ -316,9 +316,9 @@ def gradients_of(
     of_splats: SplatGradients,
     of_camera: bool = False,
 ) -> GaussianGradients:
-    """From the derivatives of the 2D splats to those of the parameters, by Dr.Jit.
+    """Return derivatives of the parameters, from those of the 2D splats, by Dr.Jit.
 
-    As :func:`frames_adjoint`; ``visible`` is what projection says, without regard to the film.
+    See :func:`frames_adjoint`; ``visible`` is that of projection, without regard to the film.
     """
     found, of_rows = gradients_by_row(gaussians, camera, pipeline, of_splats, of_camera)
     # In an order that is the same in every run.
@@ -332,9 +332,9 @@ def gradients_by_row(
     of_splats: SplatGradients,
     of_camera: bool,
 ) -> tuple[GaussianGradients, list[Float]]:
-    """As :func:`gradients_of`, with what each Gaussian adds to the derivatives of the camera.
+    """Return :func:`gradients_of`, and each Gaussian's share of the camera's derivatives.
 
-    These are evaluated: Float (N,) of each of ``camera.numbers()``, none if not ``of_camera``.
+    The shares are evaluated: (N,) of each of ``camera.numbers()``, none if not ``of_camera``.
     """
     rows = load_rows(gaussians, pipeline.sh_degree)
     d_rows, visible, d_numbers = _back_to_rows(rows, camera, pipeline, of_splats, of_camera)
@@ -354,7 +354,7 @@ def gradients_by_row(
 
 @dataclass(frozen=True)
 class SeenSplats:
-    """What one camera saw of Gaussians, and derivatives with respect to it."""
+    """The derivatives of the splats that one camera sees."""
 
     camera: Camera
     pipeline: Pipeline
@@ -364,9 +364,9 @@ class SeenSplats:
 def sum_of_views(
     gaussians: Gaussians, views: Sequence[Sequence[SeenSplats]]
 ) -> tuple[Gaussians, list[UInt32]]:
-    """The sum of what :func:`gradients_of` gives for several views, by one kernel.
+    """Sum :func:`gradients_of` over several views, in one kernel.
 
-    views: what is seen at each time of each view, in which order they are added. What the views
+    views: the derivatives at each time of each view, which are added in this order. What the views
     share is computed once, and the sum stays in registers.
 
     Returns the derivatives, and the first fault of each view.
@@ -396,7 +396,7 @@ def _back_to_rows(
     of_splats: SplatGradients,
     of_camera: bool = False,
 ) -> tuple[GaussianRows, Bool, list[Float]]:
-    """Derivatives per lane, which of them are visible, and derivatives of the camera's numbers."""
+    """Return derivatives per lane, the visible lanes, and derivatives of the camera's numbers."""
     falloff, numbers = pipeline.model.for_camera(camera).falloff, []
     if of_camera:
         pipeline.model.check_differentiable_in_camera()
@@ -417,7 +417,7 @@ def _back_to_rows(
 
 
 def weighted_sums(frame: Frame, plane: Float) -> Float:
-    """Of each Gaussian, the sum over pixels of its weight times ``plane``: Float (N,).
+    """Return, for each Gaussian, the sum over pixels of its weight times ``plane``: (N,).
 
     plane: x, Float (H * W,), the same for all samples. A plane of the frame is C = sum_i w_i c_i,
     so that the adjoint's derivative with respect to c_i is sum w_i g over pixels: here g is x for
@@ -435,7 +435,7 @@ def weighted_sums(frame: Frame, plane: Float) -> Float:
 
 
 def sum_of_gradients(a: GaussianGradients, b: GaussianGradients) -> GaussianGradients:
-    """Those of a loss that depends on what several cameras see."""
+    """Add the derivatives of a loss that depends on several cameras."""
     total = GaussianGradients(
         parameters=a.parameters and b.parameters and _sum_of(a.parameters, b.parameters),
         means2d=a.means2d + b.means2d,
@@ -497,7 +497,7 @@ def _splat_tangents(
     tangents: Gaussians,
     camera_tangents: list[Float] | None = None,
 ) -> SplatGradients:
-    """From a direction of the parameters to that of the 2D splats, by Dr.Jit."""
+    """Return the direction of the 2D splats, from that of the parameters, by Dr.Jit."""
     rows = load_rows(gaussians, frame.pipeline.sh_degree)
     camera, numbers = frame.camera, []
     if camera_tangents is not None:
@@ -527,7 +527,7 @@ def _splat_tangents(
 def _columns_of(
     d_rows: GaussianRows, gaussians: Gaussians, visible: Bool
 ) -> dict[str, list[Float]]:
-    """Per-lane derivatives by parameter, as many columns as it has.
+    """Return per-lane derivatives by parameter, as many columns as it has.
 
     Rows that are not visible have zero gradient, also where their values are not finite; so have
     SH coefficients above the pipeline's degree.
@@ -594,7 +594,7 @@ def _faults(d_rows: GaussianRows, visible: Bool) -> UInt32:
 
 
 def on_film(bins: TileBins) -> Bool:
-    """Bool per Gaussian: it has entries."""
+    """Return the Gaussians that have entries."""
     t = types_of(bins.rows.Float)
     rank = dr.arange(t.UInt32, dr.width(bins.order))
     first, end = (dr.gather(t.UInt32, bins.first_entry, rank + k) for k in (0, 1))

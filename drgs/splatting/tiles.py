@@ -65,7 +65,7 @@ class TileBins:
 
 @dataclass(frozen=True)
 class Footprints:
-    """What tiles and compositing need to know of splats, stored: a row each.
+    """The stored splats that tiles and compositing read: a row each.
 
     Splats of several of these, put behind one another, are binned as if they had been projected
     together, since every number depends on one splat alone.
@@ -85,7 +85,7 @@ def footprints_of(
     model: FootprintModel = DEFAULT,
     keys: Sequence[Float] = (),
 ) -> Footprints:
-    """What is to be binned of ``splats``, evaluated.
+    """Store ``splats`` for binning, evaluated.
 
     features: columns, one value per Gaussian, that compositing will read beside the geometry;
     keys: more of them, that it will not composite. Neither they nor the splats need to be
@@ -153,7 +153,7 @@ def bin_footprints(footprints: Footprints, grid: TileGrid, model: FootprintModel
 def _store_rows(
     splats: Splats2D, grid: TileGrid, stored: Sequence[Float], model: FootprintModel
 ) -> tuple[Rows, Rows, Float]:
-    """By Gaussian, evaluated at once: boxes of tiles, all other numbers, depths to sort by."""
+    """Return, by Gaussian, boxes of tiles, all other numbers, and depths to sort by; evaluated."""
     geometry = model.falloff.geometry(splats)
     boxes, rows = Rows.of(_tile_box(splats, geometry, grid, model)), Rows.of([*geometry, *stored])
     depths = dr.select(splats.visible, splats.depths, dr.inf)
@@ -162,7 +162,7 @@ def _store_rows(
 
 
 def _reach(geometry: list[Float], grid: TileGrid, model: FootprintModel) -> Float:
-    """What |U d|^2 may be (base 2) where a splat ends, and a margin for rounding.
+    """Return |U d|^2 (base 2) at which a splat ends, with a margin for rounding.
 
     For the default cut-offs, sqrt(2 ln(opacity / alpha_cut)) standard deviations: the
     opacity-aware radius, instead of 3.
@@ -204,7 +204,7 @@ def _make_entries(
     grid: TileGrid,
     model: FootprintModel,
 ) -> tuple[UInt32, Array2u]:
-    """Of each entry its tile; and two words: see :func:`_pack`.
+    """Return the tile of each entry, and two words: see :func:`_pack`.
 
     Entries of the padding touch nothing, in the last tile: a stable sort leaves them at the end.
     """
@@ -240,7 +240,7 @@ _RANK_BITS = 26
 
 
 def _pack(rank: UInt32, tile: UInt32, mask: UInt32) -> list[UInt32]:
-    """An entry in two words, as it is read in no order: 26 bits of rank, 22 of tile, 16 of mask.
+    """Pack an entry into two words: 26 bits of rank, 22 of tile, 16 of mask.
 
     2^22 tiles have 2^30 pixels, whose four planes are more numbers than an array of Dr.Jit holds;
     more ranks are refused by :func:`bin_footprints`.
@@ -303,13 +303,13 @@ def _touched_micros(
 
 
 def _clamp(x: Float, lo: Float, hi: Float) -> Float:
-    """Unlike dr.clip this maps to two vector instructions; a NaN becomes ``lo`` or stays NaN."""
+    """Clamp in two vector instructions, unlike dr.clip; a NaN becomes ``lo`` or stays NaN."""
     x = dr.select(x < lo, lo, x)
     return dr.select(x > hi, hi, x)
 
 
 def transpose_masks(masks: UInt32) -> UInt32:
-    """From 16 bits per entry to 32 bits per (group of 32 entries, micro-tile).
+    """Transpose 16 bits per entry to 32 bits per (group of 32 entries, micro-tile).
 
     Two 16x16 bit matrices side by side in each word, transposed by exchanging ever smaller
     blocks (Warren, "Hacker's Delight", 2nd ed., section 7-3).
@@ -330,7 +330,7 @@ def transpose_masks(masks: UInt32) -> UInt32:
 
 
 def lower_bounds(sorted_tiles: UInt32, num_entries: int, num_tiles: int) -> UInt32:
-    """(num_tiles + 1,): the first sorted position whose tile is not smaller; binary search."""
+    """Return the first sorted position of each tile, (num_tiles + 1,), by binary search."""
     UInt32 = type(sorted_tiles)
     tile = dr.arange(UInt32, num_tiles + 1)
 
