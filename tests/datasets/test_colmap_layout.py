@@ -27,7 +27,7 @@ from drgs.datasets.images import is_scaled
 from drgs.datasets.mask_names import masks_of
 from drgs.initialization.defaults import completed
 from drgs.initialization.start import _read_cloud, start_of
-from drgs.io.colmap_records import MODELS
+from drgs.io.colmap import MODELS
 
 REAL = SHARED_DATA / "colmap_robothead"
 
