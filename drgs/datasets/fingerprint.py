@@ -13,7 +13,7 @@ from pathlib import Path
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from drgs.core.folders import digest
-from drgs.datasets.transforms import in_parallel
+from drgs.datasets.reader import in_parallel
 from drgs.datasets.types import Dataset, Keeps, View, all_of_them
 
 TOLERANCE = 1e-9

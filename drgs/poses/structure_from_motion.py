@@ -28,10 +28,10 @@ from drgs.core.environment import required
 from drgs.core.errors import UserError, UserNote, listed, one_line
 from drgs.core.files import why_refused
 from drgs.core.folders import FolderRecord, sole_writer
-from drgs.datasets.colmap import LENSES, model_folder
+from drgs.datasets.colmap import LENSES, find_model, model_folder
+from drgs.datasets.files import is_image, masks_of, without_masks
+from drgs.datasets.folders import explain_photographs
 from drgs.datasets.images import read_mask
-from drgs.datasets.mask_names import masks_of, without_masks
-from drgs.datasets.recognition import folders_of_pictures, has_colmap_model, is_picture
 from drgs.io.pictures import check_readable, image_size, write_png
 
 CAMERA_MODELS = tuple(LENSES)
@@ -128,13 +128,13 @@ def pictures_in(folder: Path) -> tuple[Path, list[str]]:
             found = [pictures / name for name in os.listdir(pictures)]
     except OSError as error:
         raise UserError(f"{folder}: cannot open the folder: {error.strerror or error}") from None
-    found = without_masks([p for p in found if is_picture(p.name) and p.is_file()])
+    found = without_masks([p for p in found if is_image(p.name) and p.is_file()])
     found.sort(key=_as_counted)
     files = [path for path in found if path.suffix.lower() in READ]
     others = [path.relative_to(pictures) for path in found if path.suffix.lower() not in READ]
     if not files:
-        below = folders_of_pictures(folder)
-        got = f"some only {below}" if below else "none"
+        below = explain_photographs(folder)
+        got = f"one that {below}" if below else "none"
         if others:
             got = f"{listed(others)}, which COLMAP does not read; convert them to JPEG"
         raise UserError(
@@ -197,7 +197,7 @@ def _check_free(folder: Path, model: Path, replace: bool) -> None:
         if os.path.lexists(path) and not path.is_dir():
             raise UserError(f"{path}: must be a folder, got something else; move it away")
     record = FolderRecord(model, COMMAND)
-    if not replace and has_colmap_model(folder):
+    if not replace and find_model(folder):
         there = model_folder(folder)
         does = f"--overwrite writes {model}, which is then used instead"
         if there == model:

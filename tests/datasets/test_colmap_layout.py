@@ -23,8 +23,8 @@ from drgs.cameras.lens import Pinhole
 from drgs.config.schema import FitConfig, InitConfig
 from drgs.core.errors import UserError
 from drgs.datasets.colmap import LENSES
+from drgs.datasets.files import masks_of
 from drgs.datasets.images import is_scaled
-from drgs.datasets.mask_names import masks_of
 from drgs.initialization.defaults import completed
 from drgs.initialization.start import _read_cloud, start_of
 from drgs.io.colmap import MODELS
@@ -54,15 +54,6 @@ def test_views_have_poses_and_intrinsics_of_the_model(tmp_path, below, write):
         assert level == pytest.approx(40 * NAMES.index(name), abs=3)
     assert "(COLMAP layout): 2 train views" in dataset.description
     assert dataset.background == (0.0, 0.0, 0.0)
-
-
-def test_other_models_beside_the_first_are_named(tmp_path):
-    write_dataset(tmp_path)
-    assert "; model" not in load(tmp_path).description
-    for below in ("sparse/10", "sparse/2"):
-        write_dataset(tmp_path, below=below)
-    (tmp_path / "sparse" / "3").mkdir()
-    assert "; model sparse/0 (others are there: 2, 10)" in load(tmp_path).description
 
 
 def test_folders_may_be_called_in_another_case(tmp_path):
@@ -413,7 +404,7 @@ def test_a_picture_that_is_not_there_is_left_out_unless_most_are(tmp_path):
     for name in NAMES[2:]:
         (tmp_path / "images" / name).unlink()
     message = refusal(tmp_path)
-    assert "image b.jpg: there is no picture" in message and "images/b.jpg" in message
+    assert "image b.jpg: there is no image" in message and "images/b.jpg" in message
     assert message.endswith("; not there: 3 of 4 photographs")
 
 
@@ -470,8 +461,8 @@ def test_folders_without_pictures_and_models_without_folders_are_explained(tmp_p
     write_dataset(tmp_path)
     (tmp_path / "images").rename(tmp_path / "originals")
     assert "there is no folder images (or images_2, images_4, images_8)" in refusal(tmp_path)
-    assert "is a model of COLMAP (0/cameras.bin) without photographs" in refusal(
-        tmp_path / "sparse"
+    assert "nor a model of COLMAP in sparse/0 with its photographs in" in (
+        refusal(tmp_path / "sparse")
     )
     assert "there is no model of COLMAP in sparse/0" in refusal(
         tmp_path / "originals", type="colmap"

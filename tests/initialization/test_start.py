@@ -13,6 +13,7 @@ from support.datasets import dataset_of, edit, load, refusal, view_at
 from drgs.config.schema import FitConfig
 from drgs.core.errors import UserError
 from drgs.datasets.focus import focus_of
+from drgs.datasets.folders import GUIDE
 from drgs.datasets.images import downscale
 from drgs.initialization.start import (
     initial_gaussians,
@@ -36,8 +37,8 @@ def test_a_missing_folder_is_an_error_that_says_where_to_get_the_data(tmp_path):
 
 def test_a_folder_of_neither_layout_is_refused(tmp_path):
     assert refusal(tmp_path) == (
-        f"{tmp_path}: neither transforms_train.json nor transforms.json is there; data.path must "
-        "be a folder in the layout of NeRF-synthetic, of nerfstudio / instant-ngp or of COLMAP"
+        f"{tmp_path}: neither transforms_train.json nor transforms.json is there, nor a model of "
+        f"COLMAP in sparse/0 with its photographs in images; see {GUIDE}"
     )
 
 

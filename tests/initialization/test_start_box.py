@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from support.datasets import dataset_of, load, view_at
+from support.datasets import dataset_of, load, load_noting, view_at
 from support.photographs import write_points
 
 from drgs.config.schema import FitConfig, InitConfig
@@ -121,9 +121,9 @@ def test_a_point_cloud_that_is_missing_leaves_random_points(photographs):
     from support.datasets import edit
 
     edit(photographs / "transforms.json", lambda meta: meta.update(ply_file_path="gone.ply"))
-    dataset = load(photographs)
+    dataset, (note,) = load_noting(photographs)
     assert dataset.point_cloud is None
-    assert "gone.ply is not there" in dataset.description
+    assert note.endswith("not there: 1 of 1 point cloud (gone.ply); the fit starts without")
 
 
 def test_points_that_are_all_black_get_the_colours_of_the_pictures(tmp_path):
