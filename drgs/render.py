@@ -59,7 +59,7 @@ from drgs.datasets.viewpoints import (
 )
 from drgs.effects.compose import IGNORABLE
 from drgs.gaussians.parameters import Gaussians
-from drgs.initialization.defaults import completed
+from drgs.initialization.defaults import resolve_defaults
 from drgs.integrator.scene import check_lenses, check_sizes, make_scene, render_views
 from drgs.integrator.state import is_splats
 from drgs.integrator.summary import described, summary_of_views
@@ -332,7 +332,7 @@ def _load_config(path: Path, args: argparse.Namespace) -> FitConfig:
     config = load_config(path, overrides)
     config = config.model_copy(update={"model": config.model.of_file()})
     if is_open(config):  # not a fit's own, which says what was used
-        config = completed(
+        config = resolve_defaults(
             config, load_dataset(config.data_for_rendering, sections=config.extensions)
         )
     return config

@@ -10,9 +10,8 @@ import numpy as np
 
 from drgs.config.schema import NEAR_LIMITS, REFERENCE_NEAR
 from drgs.core.errors import UserError
-from drgs.datasets.focus import focus_of
 from drgs.datasets.types import Viewpoint
-from drgs.datasets.viewpoints import look_at, near_one, pinhole, shown
+from drgs.datasets.viewpoints import focus_of, look_at, near_one, pinhole, shown
 from drgs.gaussians.parameters import Gaussians
 
 ELEVATION = math.radians(30)

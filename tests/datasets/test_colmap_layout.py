@@ -25,7 +25,7 @@ from drgs.core.errors import UserError
 from drgs.datasets.colmap import LENSES
 from drgs.datasets.files import masks_of
 from drgs.datasets.images import is_scaled
-from drgs.initialization.defaults import completed
+from drgs.initialization.defaults import resolve_defaults
 from drgs.initialization.start import _read_cloud, start_of
 from drgs.io.colmap import MODELS
 
@@ -239,7 +239,7 @@ def test_a_fit_starts_from_the_models_points(tmp_path):
     model = write_dataset(tmp_path)
     dataset = load(tmp_path)
     assert dataset.point_cloud == tmp_path / "sparse" / "0" / "points3D.bin"
-    config = completed(FitConfig(data={"path": tmp_path}, init={"num_points": 9}), dataset)
+    config = resolve_defaults(FitConfig(data={"path": tmp_path}, init={"num_points": 9}), dataset)
     start = start_of(config, dataset)
     positions, colors, *_ = (np.array(column) for column in zip(*model.points, strict=True))
     np.testing.assert_allclose(start.means, positions, rtol=1e-6)
@@ -254,7 +254,9 @@ def test_points_of_large_errors_and_of_few_observations_are_left_out(tmp_path):
     positions, _, errors, lengths = (np.array(column) for column in zip(*model.points, strict=True))
 
     def start(**init):
-        return start_of(completed(FitConfig(data={"path": tmp_path}, init=init), dataset), dataset)
+        return start_of(
+            resolve_defaults(FitConfig(data={"path": tmp_path}, init=init), dataset), dataset
+        )
 
     error, length = float(np.sort(errors)[-3]), int(np.median(lengths))
     for init, kept in (

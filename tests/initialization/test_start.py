@@ -12,9 +12,9 @@ from support.datasets import dataset_of, edit, load, refusal, view_at
 
 from drgs.config.schema import FitConfig
 from drgs.core.errors import UserError
-from drgs.datasets.focus import focus_of
 from drgs.datasets.folders import GUIDE
 from drgs.datasets.images import downscale
+from drgs.datasets.viewpoints import focus_of
 from drgs.initialization.start import (
     initial_gaussians,
     mean_squared_neighbour_distance,
@@ -284,7 +284,7 @@ def test_one_camera_determines_no_box():
         initial_gaussians(config(), dataset_of([view_at((4, 0, 0), (0, 0, 0))]))
     assert str(error.value) == (
         "init.half_extent: no start box can be derived from one training camera, which does not "
-        "tell how far away it looks; train on more views, or set init.half_extent, or give a point "
+        "tell how far away it looks; set init.half_extent, or give a point "
         "cloud (init.point_cloud)"
     )
 
