@@ -11,7 +11,7 @@ import numpy as np
 from drgs.config.schema import NEAR_LIMITS, REFERENCE_NEAR
 from drgs.core.errors import UserError
 from drgs.datasets.types import Viewpoint
-from drgs.datasets.viewpoints import focus_of, look_at, near_one, pinhole, shown
+from drgs.datasets.viewpoints import focus_of, look_at, pinhole, shown
 from drgs.gaussians.parameters import Gaussians
 
 ELEVATION = math.radians(30)
@@ -118,11 +118,11 @@ def orbit_of_gaussians(gaussians: Gaussians, up: np.ndarray, fov: float) -> Orbi
     up: (3,) world, any length; fov: degrees.
     """
     up = np.asarray(up, np.float64)
-    length = np.linalg.norm(near_one(up))
-    if not length > 0:
-        raise UserError(f"camera: up must not be zero, got {shown(up)}")
+    length = np.linalg.norm(up)
+    if not 0 < length < np.inf:
+        raise UserError(f"camera: up must not be zero or infinite, got {shown(up)}")
     focus, spread = _middle(gaussians)
-    up = near_one(up) / length
+    up = up / length
     start, _ = _level_axes(up, np.array([0.0, -1.0, 0.0]))
     radius = spread / math.sin(math.radians(fov) / 2)
     return Orbit(focus, up, start, radius, ELEVATION, half_arc=None)

@@ -25,7 +25,6 @@ from pydantic_core import ErrorDetails
 from drgs.cameras.axes import between_opencv_and_opengl
 from drgs.config.explain import expectation
 from drgs.config.schema import DataConfig
-from drgs.core.constants import MAX_COEFFICIENT
 from drgs.core.errors import UserError, listed, one_line
 from drgs.core.files import read_text, shortened
 from drgs.core.registry import HOW_TO_INSTALL
@@ -59,13 +58,16 @@ SMALLEST_ANGLE, LARGEST_ANGLE = (2 * math.atan(0.5 / focal) for focal in reverse
 
 DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2", "sx1", "sy1")
 
-RATIONAL_MODEL, THIN_PRISM_MODEL = "FULL_OPENCV", "THIN_PRISM_FISHEYE"
-"""The models of a camera that has k4 to k6, and of a fisheye that has more than k1 to k4."""
+RATIONAL_MODEL = "FULL_OPENCV"
+"""The model of a camera that has k4 to k6."""
 
-PLANE_MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", RATIONAL_MODEL)
-FISHEYE_MODELS = ("SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "OPENCV_FISHEYE", THIN_PRISM_MODEL)
-COLMAP_MODELS = (*PLANE_MODELS, *FISHEYE_MODELS)
-"""COLMAP's models that are read; other values of ``camera_model`` are names of lenses."""
+LENS_OF_MODEL = {
+    **dict.fromkeys(("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV"), "opencv"),
+    RATIONAL_MODEL: "opencv",
+    **dict.fromkeys(("SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "OPENCV_FISHEYE"), "fisheye"),
+    "THIN_PRISM_FISHEYE": "thin_prism_fisheye",
+}
+"""Lenses of COLMAP's models; other values of ``camera_model`` are names of lenses."""
 
 WITHOUT_EFFECT = frozenset(
     {
@@ -129,20 +131,18 @@ def _opencv_pose(rows: list[list[float]]) -> np.ndarray:
 
 
 def _known_model(model: str) -> str:
-    """A model of COLMAP or the name of a lens."""
-    if model not in COLMAP_MODELS:
+    if model not in LENS_OF_MODEL:
         from drgs.cameras.lens import LENSES
 
         if model not in LENSES.names():
             raise ValueError(
-                f"must be one of {', '.join(COLMAP_MODELS)}, or a lens: "
+                f"must be one of {', '.join(LENS_OF_MODEL)}, or a lens: "
                 f"{', '.join(LENSES.names())}; {HOW_TO_INSTALL}"
             )
     return model
 
 
 Number = Annotated[float, Field(allow_inf_nan=False)]
-Coefficient = Annotated[float, Field(ge=-MAX_COEFFICIENT, le=MAX_COEFFICIENT)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 Side = Annotated[float, Field(ge=1, le=MAX_SIDE)]
 Angle = Annotated[Number, AfterValidator(_angle)]
@@ -155,7 +155,7 @@ Model = Annotated[str, AfterValidator(_known_model)]
 class CameraValues(BaseModel):
     """Values at the top of a file, for all frames, or in a frame. None: not given.
 
-    Other keys may be coefficients of a lens that drgs does not ship.
+    Other keys may be coefficients of a lens: see :func:`lens_of`.
     """
 
     model_config = ConfigDict(strict=True, frozen=True, extra="allow")
@@ -168,16 +168,6 @@ class CameraValues(BaseModel):
     cy: Number | None = None
     w: Side | None = None  # px
     h: Side | None = None
-    k1: Coefficient | None = None
-    k2: Coefficient | None = None
-    k3: Coefficient | None = None
-    k4: Coefficient | None = None
-    k5: Coefficient | None = None
-    k6: Coefficient | None = None
-    p1: Coefficient | None = None
-    p2: Coefficient | None = None
-    sx1: Coefficient | None = None
-    sy1: Coefficient | None = None
     camera_model: Model | None = None  # as nerfstudio writes it, or the name of a lens
     is_fisheye: Annotated[bool | None, Strict(False)] = None  # as instant-ngp does
     shutter: Literal["global", "rolling"] | None = None  # all pixels at once, or row after row
@@ -291,17 +281,17 @@ def _unread(content: Mapping[str, object]) -> list[str]:
     """Return sorted keys; those of frames as ``frames[].key``."""
     frames = content["frames"]
     models = {values.get("camera_model") for values in (content, *frames)}
-    without_effect = WITHOUT_EFFECT.union(*(_coefficients(model) for model in models))
-    top = content.keys() - Transforms.model_fields.keys() - without_effect
-    in_frames = set().union(*frames) - FrameValues.model_fields.keys() - without_effect
+    known = WITHOUT_EFFECT.union(*map(_coefficients, models))
+    top = content.keys() - Transforms.model_fields.keys() - known
+    in_frames = set().union(*frames) - FrameValues.model_fields.keys() - known
     keys = [*sorted(top), *(f"frames[].{key}" for key in sorted(in_frames))]
     return [one_line(key, 60) for key in keys]
 
 
 def _coefficients(model: str | None) -> tuple[str, ...]:
-    """Return the names of the coefficients of a lens, if ``model`` is none of COLMAP's."""
-    if model in (None, *COLMAP_MODELS):
-        return ()
+    """Return the names of the coefficients of a lens."""
+    if model is None or model in LENS_OF_MODEL:
+        return DISTORTION
     from drgs.cameras.lens import LENSES
 
     return LENSES.get(model).value.coefficient_names()
@@ -403,51 +393,43 @@ def principal_point(value: float, where: str, size: int) -> float:
 def lens_of(frame: Frame) -> Lens | None:
     """Return the lens that a frame names, with its coefficients; None for a pinhole.
 
-    Raises :class:`UserError` for a k4 that may be OpenCV's, the first coefficient of a denominator,
-    or nerfstudio's, the fourth of the polynomial. Files that have k5 or k6 mean OpenCV's.
+    Raises :class:`UserError` for coefficients that the lens does not have, and for a k4 that may be
+    OpenCV's, the first coefficient of a denominator, or nerfstudio's, the fourth of the polynomial.
+    Files that have k5 or k6 mean OpenCV's.
     """
+    from drgs.cameras.lens import LENSES
+
     model, values = frame.values.camera_model, frame.values
-    if model not in (None, *COLMAP_MODELS):
-        return _lens_by_name(frame, model)
-    coefficients = {name: value for name in DISTORTION if (value := getattr(values, name))}
-    name = "opencv"
-    if model in FISHEYE_MODELS or values.is_fisheye:
-        is_prism = model == THIN_PRISM_MODEL and not coefficients.keys() <= {"k1", "k2", "k3", "k4"}
-        name = "thin_prism_fisheye" if is_prism else "fisheye"
-    elif not coefficients:
-        return None
-    elif "k4" in coefficients and model != RATIONAL_MODEL and not {"k5", "k6"} & set(coefficients):
-        raise UserError(
-            f"{frame.where('k4')} is read as OpenCV's, of a denominator 1 + k4 r^2, where "
-            f"camera_model is {RATIONAL_MODEL}; nerfstudio's, of a term k4 r^8, is not supported. "
-            f"Got k4 = {coefficients['k4']:g} and camera_model {model or 'PINHOLE'}: set "
-            "camera_model, or calibrate without k4"
-        )
-    return _with_coefficients(frame, name, coefficients)
-
-
-def _lens_by_name(frame: Frame, name: str) -> Lens | None:
-    """Return a lens of the registry, with the coefficients that the frame has by name."""
-    given = {n: v for n in _coefficients(name) if (v := getattr(frame.values, n, None)) is not None}
+    name, is_of_colmap = LENS_OF_MODEL.get(model, model), model is None or model in LENS_OF_MODEL
+    given = {k: v for k in _coefficients(model) if (v := getattr(values, k, None)) is not None}
     for key, value in given.items():
         if type(value) not in (int, float) or not math.isfinite(value):
             raise UserError(f"{frame.where(key)} must be a finite number, got {_show(value)}")
-    return None if name == "pinhole" else _with_coefficients(frame, name, given)
-
-
-def _with_coefficients(frame: Frame, name: str, coefficients: Mapping[str, float]) -> Lens:
-    from drgs.cameras.lens import LENSES
-
+    if is_of_colmap:
+        given = {key: value for key, value in given.items() if value}
+        if name in (None, "opencv"):
+            name = "fisheye" if values.is_fisheye else "opencv" if given else "pinhole"
+        elif given.keys() <= {"k1", "k2", "k3", "k4"}:  # thin prisms of zero
+            name = "fisheye"
+    if name == "pinhole":
+        return None
+    is_rational = model == RATIONAL_MODEL or {"k5", "k6"} & given.keys()
+    if is_of_colmap and name == "opencv" and "k4" in given and not is_rational:
+        raise UserError(
+            f"{frame.where('k4')} is read as OpenCV's, of a denominator 1 + k4 r^2, where "
+            f"camera_model is {RATIONAL_MODEL}; nerfstudio's, of a term k4 r^8, is not supported. "
+            f"Got k4 = {given['k4']:g} and camera_model {model or 'PINHOLE'}: set "
+            "camera_model, or calibrate without k4"
+        )
     lens = LENSES.get(name).value
-    for key in coefficients:
-        if key not in lens.coefficient_names():
-            raise UserError(
-                f"{frame.where(key)}: a lens of the kind {name} has the coefficients "
-                f"{', '.join(lens.coefficient_names())}, got {key} = {coefficients[key]:g}; set "
-                f"camera_model to the model that was calibrated, or leave {key} out"
-            )
+    for key in sorted(given.keys() - set(lens.coefficient_names())):
+        raise UserError(
+            f"{frame.where(key)}: a lens of the kind {name} has the coefficients "
+            f"{', '.join(lens.coefficient_names())}, got {key} = {given[key]:g}; set "
+            f"camera_model to the model that was calibrated, or leave {key} out"
+        )
     try:
-        return lens.from_coefficients(**coefficients)
+        return lens.from_coefficients(**given)
     except UserError as error:
         raise UserError(f"{frame.where('camera_model')}: {error}") from error
 

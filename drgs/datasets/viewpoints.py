@@ -56,24 +56,18 @@ def look_at(origin: np.ndarray, target: np.ndarray, up: np.ndarray) -> np.ndarra
                 f"camera: the coordinates of {name} must be at most {MAX_COORDINATE:g} in size, "
                 f"got {shown(place)}; scale the scene down"
             )
-    given, up = up, near_one(up)
     forward = target - origin
     right = np.cross(forward, up)
     scale = np.linalg.norm(forward) * np.linalg.norm(up)
     if not np.linalg.norm(right) > 1e-6 * scale:
         raise UserError(
             f"camera: the direction from origin {shown(origin)} to target {shown(target)} must "
-            f"not be zero or parallel to up {shown(given)}"
+            f"not be zero or parallel to up {shown(up)}"
         )
     forward, right = (v / np.linalg.norm(v) for v in (forward, right))
     pose = np.eye(4)
     pose[:3] = np.stack([right, np.cross(forward, right), forward, origin], axis=1)
     return pose
-
-
-def near_one(vector: np.ndarray) -> np.ndarray:
-    """Return the vector times a power of two, exact, whose square is finite."""
-    return np.ldexp(vector, -np.frexp(np.abs(vector).max())[1])
 
 
 def field_of_view(views: Sequence[Viewpoint]) -> float:
