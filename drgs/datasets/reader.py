@@ -218,16 +218,11 @@ def as_calibrated(pixels: np.ndarray, frame: Frame) -> np.ndarray:
     if fits_turned and not fits:
         return turned
     height, width = pixels.shape[:2]
-    if not fits:
-        raise UserError(
-            f"{frame.where('w' if values.w is not None else 'h')} must be the image's size, "
-            f"{width} x {height} px ({file}), or as EXIF's orientation {orientation} turns it; "
-            "scale the intrinsics or the images"
-        )
     raise UserError(
         f"{file}: has the EXIF orientation {orientation}, and w and h do not tell whether the "
-        "camera's numbers are for the image as it is stored or as that turns it; save the "
-        "image as the camera's numbers have it, without the orientation"
+        f"camera's numbers ({frame.where('w')}) are for the image as it is stored, {width} x "
+        f"{height} px, or as that turns it; save the image as the camera's numbers have it, "
+        "without the orientation"
     )
 
 

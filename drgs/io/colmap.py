@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 import struct
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path, PurePosixPath
@@ -19,7 +19,6 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from drgs.core.constants import MAX_COEFFICIENT
 from drgs.core.errors import Place, UserError, did_you_mean, one_line
 from drgs.core.files import read_bytes, read_text
 from drgs.io.pictures import MAX_SIDE
@@ -185,11 +184,11 @@ def _records(path: Path) -> Iterator[tuple]:
 def _cameras(records: Iterable[tuple]) -> dict[int, ColmapCamera]:
     cameras: dict[int, ColmapCamera] = {}
     for place, number, model, width, height, values in records:
-        for name, side in (("width", width), ("height", height)):
-            if not 1 <= side <= MAX_SIDE:
-                raise UserError(
-                    f"{place}: {name} must be between 1 and {MAX_SIDE:,} px, got {side:,}"
-                )
+        if not (1 <= width <= MAX_SIDE and 1 <= height <= MAX_SIDE):
+            raise UserError(
+                f"{place}: width and height must be between 1 and {MAX_SIDE:,} px, got {width:,} "
+                f"and {height:,}"
+            )
         if model not in MODELS:
             raise UserError(
                 f"{place}: a camera model of COLMAP was expected, got {one_line(model, 40)}"
@@ -201,9 +200,7 @@ def _cameras(records: Iterable[tuple]) -> dict[int, ColmapCamera]:
                 f"{place}: a camera of the model {model} has {len(names)} parameters "
                 f"({', '.join(names)}), got {len(values)}"
             )
-        for name, value in zip(names, values, strict=True):
-            is_length = name in ("f", "fx", "fy", "cx", "cy", "w", "h")
-            _check_number(place, name, value, MAX_NUMBER if is_length else MAX_COEFFICIENT)
+        _check_numbers(place, names, values)
         if number in cameras:
             raise UserError(f"{place}: each camera must be there once, got a second one {number}")
         cameras[number] = ColmapCamera(number, model, width, height, tuple(values))
@@ -226,8 +223,7 @@ def _images(
             raise UserError(
                 f"{place}: the length of a rotation's quaternion must be 1, got {length:g}"
             )
-        for axis, value in zip("xyz", pose[4:], strict=True):
-            _check_number(place, f"a translation's {axis}", value)
+        _check_numbers(place, ("TX", "TY", "TZ"), pose[4:])
         if camera not in cameras:
             raise UserError(f"{place}: the number of a camera was expected, got {camera}")
         images[name] = ColmapImage(name, camera, tuple(pose[:4]), tuple(pose[4:]))
@@ -237,8 +233,7 @@ def _images(
 def _points(records: Iterable[tuple]) -> ColmapPoints:
     def rows() -> Iterator[tuple]:
         for place, position, color, error, track_length in records:
-            for name, value in (*zip("xyz", position, strict=True), ("an error", error)):
-                _check_number(place, name, value)
+            _check_numbers(place, ("X", "Y", "Z", "ERROR"), (*position, error))
             if not 0 <= min(color) <= max(color) <= 255:
                 raise UserError(f"{place}: colours must be 0 to 255, got {tuple(color)}")
             yield tuple(position), tuple(color), error, track_length
@@ -247,11 +242,12 @@ def _points(records: Iterable[tuple]) -> ColmapPoints:
     return ColmapPoints(*(np.ascontiguousarray(table[name]) for name in _POINT.names))
 
 
-def _check_number(place: Place, name: str, value: float, most: float = MAX_NUMBER) -> None:
-    if not abs(value) <= most:
-        raise UserError(
-            f"{place}: {name} must be a number of at most {most:g} in size, got {value:g}"
-        )
+def _check_numbers(place: Place, names: Sequence[str], values: Sequence[float]) -> None:
+    for name, value in zip(names, values, strict=True):
+        if not abs(value) <= MAX_NUMBER:
+            raise UserError(
+                f"{place}: {name} must be a number of at most {MAX_NUMBER:g} in size, got {value:g}"
+            )
 
 
 # Binary files: little-endian numbers without padding
