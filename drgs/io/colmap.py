@@ -174,8 +174,10 @@ def read_points3d(path: str | Path) -> ColmapPoints:
 
 
 def _records(path: Path) -> Iterator[tuple]:
-    kind = _KINDS[path.stem]
-    return _text_records(path, kind) if path.suffix == ".txt" else _binary_records(path, kind)
+    take, parse, form = _KINDS[path.stem]
+    return (
+        _text_records(path, parse, form) if path.suffix == ".txt" else _binary_records(path, take)
+    )
 
 
 # Checks
@@ -270,32 +272,20 @@ class _BinaryFile:
         """Number of bytes that follow."""
         return len(self._data) - self._at
 
-    def take(self, layout: str) -> tuple:
-        """Return the next numbers, in a layout of :mod:`struct`."""
-        size = struct.calcsize(f"<{layout}")
+    def skip(self, size: int) -> None:
+        """Skip bytes."""
         if size > self.left:
             raise UserError(
-                f"{self.place}: {size} bytes were expected, got the end of the file; it was cut off"
+                f"{self.place}: {size:,} bytes were expected, and {self.left:,} are left; the file "
+                "is damaged, or was cut off"
             )
         self._at += size
-        return struct.unpack_from(f"<{layout}", self._data, self._at - size)
 
-    def count(self, least_bytes: int) -> int:
-        """Return the number of the records that follow, each of at least so many bytes."""
-        place, (count,) = self.place, self.take("Q")
-        room = self.left // least_bytes
-        if count > room:
-            raise UserError(
-                f"{place}: a number of records was expected, at most {room:,} as the file is so "
-                f"long, got {count:,}; it is damaged, or was cut off"
-            )
-        return count
-
-    def skip(self, record_bytes: int) -> int:
-        """Skip records whose number comes first, and return that."""
-        count = self.count(record_bytes)
-        self._at += record_bytes * count
-        return count
+    def take(self, layout: str) -> tuple:
+        """Return the next numbers, in a layout of :mod:`struct`."""
+        start = self._at
+        self.skip(struct.calcsize(f"<{layout}"))
+        return struct.unpack_from(f"<{layout}", self._data, start)
 
     def name(self) -> str:
         """Return the next text, which a zero byte ends."""
@@ -312,10 +302,10 @@ class _BinaryFile:
         )
 
 
-def _binary_records(path: Path, kind: _Kind) -> Iterator[tuple]:
+def _binary_records(path: Path, take: Callable[[_BinaryFile], tuple]) -> Iterator[tuple]:
     file = _BinaryFile(path)
-    for _ in range(file.count(kind.least_bytes)):
-        yield file.place, *kind.take(file)
+    for _ in range(*file.take("Q")):
+        yield file.place, *take(file)
     if file.left:
         raise UserError(
             f"{file.place}: the end of the file was expected after its last record, got "
@@ -332,31 +322,30 @@ def _take_camera(file: _BinaryFile) -> tuple:
 
 def _take_image(file: _BinaryFile) -> tuple:
     _, *pose, camera = file.take("I7dI")
-    name = file.name()
-    file.skip(OBSERVATION_BYTES)
+    name, (num_observations,) = file.name(), file.take("Q")
+    file.skip(OBSERVATION_BYTES * num_observations)
     return name, camera, pose
 
 
 def _take_point(file: _BinaryFile) -> tuple:
-    _, x, y, z, red, green, blue, error = file.take("Q3d3Bd")
-    return (x, y, z), (red, green, blue), error, file.skip(TRACK_BYTES)
+    _, x, y, z, red, green, blue, error, track_length = file.take("Q3d3BdQ")
+    file.skip(TRACK_BYTES * track_length)
+    return (x, y, z), (red, green, blue), error, track_length
 
 
 # Text files: a record a line, ``#`` before comments
 
 
-def _text_records(path: Path, kind: _Kind) -> Iterator[tuple]:
+def _text_records(path: Path, parse: Callable[[str], tuple], form: str) -> Iterator[tuple]:
     text = read_text(path, "file", MAX_FILE_BYTES, TEXT_MEMORY_RATIO)
     lines = enumerate(text.split("\n"), 1)
     for number, line in _without_observations(path, lines) if path.stem == "images" else lines:
         if _is_record(line):
             place = Place(path, "line", number)
             try:
-                record = kind.parse(line)
+                record = parse(line)
             except ValueError:
-                raise UserError(
-                    f"{place}: {kind.form} was expected, got {one_line(line, 60)}"
-                ) from None
+                raise UserError(f"{place}: {form} was expected, got {one_line(line, 60)}") from None
             yield place, *record
 
 
@@ -410,24 +399,15 @@ def _parse_point(line: str) -> tuple:
     return (float(x), float(y), float(z)), color, float(error), len(track) // 2
 
 
-@dataclass(frozen=True)
-class _Kind:
-    """Records of a file. Both readers return the same tuples."""
-
-    take: Callable[[_BinaryFile], tuple]
-    least_bytes: int
-    parse: Callable[[str], tuple]
-    form: str  # of a line
-
-
 _KINDS = {
-    "cameras": _Kind(
-        _take_camera, 24, _parse_camera, "a camera (CAMERA_ID MODEL WIDTH HEIGHT PARAMS)"
+    "cameras": (_take_camera, _parse_camera, "a camera (CAMERA_ID MODEL WIDTH HEIGHT PARAMS)"),
+    "images": (
+        *(_take_image, _parse_image),
+        "an image (IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME)",
     ),
-    "images": _Kind(
-        _take_image, 73, _parse_image, "an image (IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME)"
-    ),
-    "points3D": _Kind(
-        _take_point, 51, _parse_point, "a point (POINT3D_ID X Y Z R G B ERROR, pairs of a track)"
+    "points3D": (
+        *(_take_point, _parse_point),
+        "a point (POINT3D_ID X Y Z R G B ERROR, pairs of a track)",
     ),
 }
+"""Readers of the same records from binary and from text files, and the form of a line."""

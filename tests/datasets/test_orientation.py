@@ -96,8 +96,6 @@ def test_an_orientation_that_may_or_may_not_count_is_refused(tmp_path, orientati
 
 def test_a_wrong_size_of_a_turned_picture_names_both(tmp_path):
     dataset(tmp_path, 6, w=7, h=8)
-    message = (
-        r"w and h do not tell .* \(.*json: w\) are for .* stored, 8 x 6 px, or as that turns it"
-    )
+    message = r"w and h do not tell .* \(.*json: w\) are for .* stored, 8 x 6 px, or as"
     with pytest.raises(UserError, match=message):
         load(tmp_path)

@@ -146,20 +146,20 @@ IMAGES = 8  # byte: the first image
 @pytest.mark.parametrize(
     ("file", "at", "data", "message"),
     [
-        ("cameras", 0, struct.pack("<Q", 9), "byte 0: a number of records was expected, at"),
+        ("cameras", 0, struct.pack("<Q", 9), "byte 152: 24 bytes were expected, and 0 are"),
         ("cameras", CAMERAS + 4, struct.pack("<i", 18), "byte 8: a camera model of COLMAP was"),
         ("cameras", CAMERAS + 8, struct.pack("<Q", 0), "byte 8: width and height must be"),
         ("cameras", CAMERAS + 16, struct.pack("<Q", 2**40), "byte 8: width and height must be"),
         ("cameras", CAMERAS + 24, struct.pack("<d", np.nan), "byte 8: fx must be a number"),
         ("cameras", CAMERAS + 112, struct.pack("<d", 2e12), "byte 64: k1 must be a number of at"),
         ("cameras", CAMERAS + 56, struct.pack("<I", 7), "byte 64: each camera must be there once"),
-        ("images", 0, struct.pack("<Q", 2**62), "byte 0: a number of records was expected"),
+        ("images", 0, struct.pack("<Q", 2**62), "byte 320: 64 bytes were expected, and 0"),
         ("images", IMAGES + 4, bytes(32), "byte 8: the length of a rotation's quaternion"),
         ("images", IMAGES + 36, struct.pack("<d", np.inf), "byte 8: TX must be a number of at"),
         ("images", IMAGES + 60, struct.pack("<I", 5), "byte 8: the number of a camera was"),
         ("images", IMAGES + 64, b"\xff", "byte 72: a name in UTF-8 of less than"),
         ("points3D", 16, struct.pack("<d", np.nan), "byte 8: X must be a number of at most"),
-        ("points3D", 51, struct.pack("<Q", 2**50), "byte 51: a number of records was expected"),
+        ("points3D", 51, struct.pack("<Q", 2**50), "byte 59: 9,007,199,254,740,992 bytes were expected"),
     ],
 )  # fmt: skip
 def test_a_wrong_number_in_a_binary_file_is_refused(tmp_path, model, file, at, data, message):
