@@ -23,7 +23,7 @@ from drgs.datasets.files import FileKind, find_files, images_in, key_of, masks_o
 from drgs.datasets.images import is_scaled
 from drgs.datasets.reader import MAX_WIDTH, DatasetReader, Photographs
 from drgs.datasets.splits import unlisted_splits
-from drgs.datasets.transforms import Frame, FrameValues
+from drgs.datasets.transforms import LENS_OF_MODEL, Frame, FrameValues
 from drgs.io.colmap import ColmapCamera, ColmapImage, ColmapModel, model_files, read_model
 from drgs.io.pictures import MAX_SIDE, image_orientation, image_size
 
@@ -38,22 +38,6 @@ FACTORS = {"images": 1, "images_2": 2, "images_4": 4, "images_8": 8}
 
 SIDEWAYS = 5
 """EXIF's orientations from this one exchange width and height."""
-
-LENSES = {
-    "SIMPLE_PINHOLE": "PINHOLE",
-    "PINHOLE": "PINHOLE",
-    "SIMPLE_RADIAL": "OPENCV",
-    "RADIAL": "OPENCV",
-    "OPENCV": "OPENCV",
-    "FULL_OPENCV": "FULL_OPENCV",
-    "SIMPLE_FISHEYE": "OPENCV_FISHEYE",
-    "FISHEYE": "OPENCV_FISHEYE",
-    "SIMPLE_RADIAL_FISHEYE": "OPENCV_FISHEYE",
-    "RADIAL_FISHEYE": "OPENCV_FISHEYE",
-    "OPENCV_FISHEYE": "OPENCV_FISHEYE",
-    "THIN_PRISM_FISHEYE": "THIN_PRISM_FISHEYE",
-}
-"""Camera models that can be rendered, and what their coefficients are read as."""
 
 PHOTOGRAPHS = FileKind("photographs", remedy="put the photographs there that COLMAP saw")
 
@@ -191,11 +175,10 @@ def _values(
     camera: ColmapCamera, image: ColmapImage, file: Path, mask: Path | None, folder: Path
 ) -> FrameValues:
     """Return the values of a frame in a transforms file, for the size of ``file``."""
-    model = LENSES.get(camera.model)
-    if model is None:
+    if camera.model not in LENS_OF_MODEL:
         raise UserError(
             f"{folder}: camera {camera.number} is of the model {camera.model}, which cannot be "
-            f"rendered (those that can: {', '.join(LENSES)}); undistort the pictures "
+            f"rendered (those that can: {', '.join(LENS_OF_MODEL)}); undistort the pictures "
             "(colmap image_undistorter), or have COLMAP find another model"
         )
     width, height = _size_as_calibrated(file, camera, image, folder)
@@ -212,7 +195,7 @@ def _values(
         cy=scale_y * named.pop("cy"),
         w=width,
         h=height,
-        camera_model=model,
+        camera_model=camera.model,
         **named,
     )
 

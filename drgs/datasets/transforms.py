@@ -38,8 +38,9 @@ if TYPE_CHECKING:
 MAX_BYTES = 1 << 28
 """Largest transforms file: a thousand bytes for each of a quarter of a million views."""
 
-RIGID_TOLERANCE = 1e-4
-"""Largest entry of |R R^T - I|: eighty times what files written with float32 show (1.3e-6)."""
+RIGID_TOLERANCE, LAST_ROW = 1e-4, (0, 0, 0, 1)
+"""Largest entry of |R R^T - I|, eighty times that of files written with float32 (1.3e-6), and error
+of the last row."""
 
 MEMORY_RATIO = 30
 """Memory that JSON takes as Python's objects, in bytes of the text."""
@@ -61,10 +62,14 @@ DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2", "sx1", "sy1")
 RATIONAL_MODEL = "FULL_OPENCV"
 """The model of a camera that has k4 to k6."""
 
+PLANE_MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", RATIONAL_MODEL)
+FISHEYE_MODELS = (
+    *("SIMPLE_FISHEYE", "FISHEYE"),
+    *("SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "OPENCV_FISHEYE"),
+)
 LENS_OF_MODEL = {
-    **dict.fromkeys(("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV"), "opencv"),
-    RATIONAL_MODEL: "opencv",
-    **dict.fromkeys(("SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "OPENCV_FISHEYE"), "fisheye"),
+    **dict.fromkeys(PLANE_MODELS, "opencv"),
+    **dict.fromkeys(FISHEYE_MODELS, "fisheye"),
     "THIN_PRISM_FISHEYE": "thin_prism_fisheye",
 }
 """Lenses of COLMAP's models; other values of ``camera_model`` are names of lenses."""
@@ -113,20 +118,17 @@ def _coordinate(value: float) -> float:
 def _opencv_pose(rows: list[list[float]]) -> np.ndarray:
     """(4, 4) float64 camera to world in OpenCV axes, from the file's in OpenGL's."""
     if [len(row) for row in rows] != [4] * 4:
-        lengths = " or ".join(map(str, sorted({len(row) for row in rows})[:3]))
-        raise ValueError(f"must be 4 x 4 numbers ({len(rows)} rows of {lengths or 0})")
+        raise ValueError("must be 4 x 4 numbers")
     matrix = np.array(rows, np.float64)
     rotation = matrix[:3, :3]
-    error = np.abs(rotation @ rotation.T - np.eye(3)).max()
+    error = max(np.abs(rotation @ rotation.T - np.eye(3)).max(), np.abs(matrix[3] - LAST_ROW).max())
     with np.errstate(all="ignore"):  # NumPy takes logarithms, of a determinant of 0 as well
         sign = np.linalg.det(rotation)
     if error > RIGID_TOLERANCE or sign < 0:
         raise ValueError(
-            f"must be rigid (rotation and translation) to {RIGID_TOLERANCE:g}: "
-            f"|R R^T - I| is {error:.2g}, det R is {sign:.2g}"
+            f"must be rigid (rotation, translation, row 0 0 0 1) to {RIGID_TOLERANCE:g}: "
+            f"off by {error:.2g}, det R is {sign:.2g}"
         )
-    if np.abs(matrix[3] - [0, 0, 0, 1]).max() > RIGID_TOLERANCE:
-        raise ValueError("must end in the row 0 0 0 1")
     return between_opencv_and_opengl(matrix)
 
 

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar, TypeVar
 
 import numpy as np
-from numpy.lib.mixins import NDArrayOperatorsMixin
 
 from drgs.core.constants import SHUTTER_SAMPLES
 from drgs.core.origin import WORLD, Origin
@@ -18,10 +17,8 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, eq=False)
-class LazyImage(NDArrayOperatorsMixin):
-    """An image whose numbers are computed at each access: by ``np.asarray``, an index, arithmetic
-    or a function of numpy.
-    """
+class LazyImage:
+    """An image whose numbers are computed at each access: by ``np.asarray`` or an index."""
 
     shape: tuple[int, ...]  # of the array: (H, W) or (H, W, 3), float32
     compute: Callable[[], np.ndarray]
@@ -34,13 +31,6 @@ class LazyImage(NDArrayOperatorsMixin):
         if copy is False:
             raise ValueError("a lazy image becomes an array only by a copy")
         return np.asarray(self.compute(), dtype)
-
-    def __array_ufunc__(
-        self, ufunc: np.ufunc, method: str, *inputs: object, **options: object
-    ) -> object:
-        """Apply a function of numpy to the numbers."""
-        arrays = [np.asarray(x) if isinstance(x, LazyImage) else x for x in inputs]
-        return getattr(ufunc, method)(*arrays, **options)
 
     def __getitem__(self, index: object) -> np.ndarray:
         """Return some of the numbers."""

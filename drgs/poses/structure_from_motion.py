@@ -28,13 +28,14 @@ from drgs.core.environment import required
 from drgs.core.errors import UserError, UserNote, listed, one_line
 from drgs.core.files import why_refused
 from drgs.core.folders import FolderRecord, sole_writer
-from drgs.datasets.colmap import LENSES, find_model
+from drgs.datasets.colmap import find_model
 from drgs.datasets.files import is_image, masks_of, without_masks
 from drgs.datasets.folders import explain_photographs
 from drgs.datasets.images import read_mask
+from drgs.datasets.transforms import LENS_OF_MODEL
 from drgs.io.pictures import check_readable, image_size, write_png
 
-CAMERA_MODELS = tuple(LENSES)
+CAMERA_MODELS = tuple(LENS_OF_MODEL)
 
 SIMPLE = "SIMPLE_RADIAL"
 """The model with the fewest parameters that suits photographs."""

@@ -172,7 +172,7 @@ WRONG_INPUTS = {
     ),
     "matrix 3x4": (
         edit_transforms(lambda m: m["frames"][1]["transform_matrix"].pop()),
-        "transforms_train.json: frames[1].transform_matrix must be 4 x 4 numbers (3 rows",
+        "transforms_train.json: frames[1].transform_matrix must be 4 x 4 numbers",
     ),
     "matrix not finite": (
         edit_transforms(lambda m: m["frames"][1]["transform_matrix"][0].__setitem__(3, np.nan)),

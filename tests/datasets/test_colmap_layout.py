@@ -22,9 +22,9 @@ from drgs.cameras.camera import Camera
 from drgs.cameras.lens import Pinhole
 from drgs.config.schema import FitConfig, InitConfig
 from drgs.core.errors import UserError
-from drgs.datasets.colmap import LENSES
 from drgs.datasets.files import masks_of
 from drgs.datasets.images import is_scaled
+from drgs.datasets.transforms import LENS_OF_MODEL
 from drgs.initialization.defaults import resolve_defaults
 from drgs.initialization.start import _read_cloud, start_of
 from drgs.io.colmap import MODELS
@@ -91,7 +91,7 @@ def test_the_largest_pictures_there_are_may_be_smaller_than_what_is_asked_for(tm
     assert load(tmp_path).train[0].width == 160
 
 
-@pytest.mark.parametrize("name", sorted(LENSES))
+@pytest.mark.parametrize("name", sorted(LENS_OF_MODEL))
 def test_every_lens_that_can_be_rendered_is(tmp_path, name):
     """Without undistorting; the coefficients are those of the file."""
     write_dataset(tmp_path, [name])
@@ -113,7 +113,7 @@ def film_points(view, points):
     return np.array(camera.lens.project_point(camera, Array3f64(points.T))).T
 
 
-@pytest.mark.parametrize("name", sorted(LENSES))
+@pytest.mark.parametrize("name", sorted(LENS_OF_MODEL))
 def test_points_are_seen_where_colmap_projects_them(tmp_path, name):
     """In double precision, over the picture and somewhat beyond, to a few roundings of 1,000 px."""
     pycolmap = pytest.importorskip("pycolmap")
@@ -148,7 +148,7 @@ def test_real_points_are_seen_where_they_were_observed():
     assert np.mean(ours) == pytest.approx(np.mean(stored), rel=1e-3)
 
 
-@pytest.mark.parametrize("name", sorted(set(PARAMETERS) - set(LENSES)))
+@pytest.mark.parametrize("name", sorted(set(PARAMETERS) - set(LENS_OF_MODEL)))
 def test_other_lenses_are_refused_by_name(tmp_path, name):
     write_dataset(tmp_path, [name])
     message = refusal(tmp_path)

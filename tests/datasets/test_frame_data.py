@@ -392,8 +392,8 @@ def test_wrong_motion_is_refused_with_the_key(photographs):
     where = f"{photographs / 'transforms.json'}: frames[{index_of(photographs)}]."
     give(photographs, transform_matrix_close=np.diag([2, 2, 2, 1]).tolist())
     assert refusal(photographs) == (
-        f"{where}transform_matrix_close must be rigid (rotation and translation) to 0.0001: "
-        "|R R^T - I| is 3, det R is 8, got "
+        f"{where}transform_matrix_close must be rigid (rotation, translation, row 0 0 0 1) to "
+        "0.0001: off by 3, det R is 8, got "
         "[[2, 0, 0, 0], [0, 2, 0, 0], [0, 0, 2, 0], [0, 0, 0, 1]]"
     )
     give(photographs, transform_matrix_close=np.eye(4).tolist(), shutter="curtain")
