@@ -356,7 +356,8 @@ def test_distortion_coefficients_of_zero_are_accepted(photographs):
             "camera_model must be one of SIMPLE_PINHOLE, PINHOLE, SIMPLE_RADIAL, RADIAL, OPENCV, "
             "FULL_OPENCV, SIMPLE_FISHEYE, FISHEYE, SIMPLE_RADIAL_FISHEYE, RADIAL_FISHEYE, "
             "OPENCV_FISHEYE, THIN_PRISM_FISHEYE, or a lens: fisheye, opencv, pinhole, "
-            'thin_prism_fisheye; others come with installed packages that have an entry point of the group "drgs", got '
+            "thin_prism_fisheye; others come with installed packages that have an entry point of "
+            'the group "drgs", got '
             '"EQUIRECTANGULAR"',
         ),
         (
