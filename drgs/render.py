@@ -67,7 +67,7 @@ from drgs.io.formats import OTHER_FORMATS, format_for, readable_formats
 from drgs.io.pictures import (
     MITSUBA_FORMATS,
     check_animation,
-    image_format,
+    read_header,
     read_pixels,
     write_animation,
     write_exr,
@@ -601,7 +601,7 @@ def _background(args: argparse.Namespace) -> tuple[float, float, float] | Path:
 def _background_picture(path: Path) -> Path:
     """``path``, if Mitsuba can read the picture; else say what is wrong with it."""
     read_pixels(path)
-    if (name := image_format(path)) not in MITSUBA_FORMATS:
+    if (name := read_header(path).format) not in MITSUBA_FORMATS:
         raise UserError(
             f"--background: {path} must be a PNG, JPEG, BMP, PPM or TGA picture, got {name}; "
             "convert it"

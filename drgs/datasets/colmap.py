@@ -25,7 +25,7 @@ from drgs.datasets.reader import MAX_WIDTH, DatasetReader, Photographs
 from drgs.datasets.splits import unlisted_splits
 from drgs.datasets.transforms import LENS_OF_MODEL, Frame, FrameValues
 from drgs.io.colmap import ColmapCamera, ColmapImage, ColmapModel, model_files, read_model
-from drgs.io.pictures import MAX_SIDE, image_orientation, image_size
+from drgs.io.pictures import MAX_SIDE, read_header
 
 MODEL_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0")
 """Where COLMAP's models lie in the folders of datasets."""
@@ -208,10 +208,10 @@ def _size_as_calibrated(
     COLMAP reads photographs as they are stored; one that was turned since, as EXIF says, is turned
     here.
     """
-    width, height = image_size(file)
-    seen = camera.width, camera.height
+    header = read_header(file)
+    (width, height), seen = header.size, (camera.width, camera.height)
     sizes = [(width, height)]
-    if image_orientation(file) >= SIDEWAYS:
+    if header.orientation >= SIDEWAYS:
         sizes.append((height, width))
     if seen in sizes:
         return seen

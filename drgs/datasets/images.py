@@ -21,11 +21,9 @@ from drgs.io.pictures import (
     MAX_16_BITS,
     MAX_BYTES,
     as_numbers,
-    has_alpha,
-    image_mode,
     image_size,
+    read_header,
     read_image,
-    stored_shape,
 )
 
 MAX_PIXELS_AT_ONCE, MAX_THREADS = 1 << 25, 8
@@ -84,7 +82,7 @@ def read_depth(path: Path, unit: float, size: tuple[int, int]) -> np.ndarray:
         with np.errstate(over="ignore"):  # becomes infinite, and so is not known
             depth = (depth.astype(np.float64) * unit).astype(np.float32)
     else:
-        mode = image_mode(path)
+        mode = read_header(path).mode
         if BITS.get(mode) != 16:  # of 8 bits, all depths would be 257 times as large
             raise UserError(
                 f"{path}: must be a grey picture of 16 bits or an .npy file, got one of Pillow's "
@@ -268,9 +266,11 @@ def check_room(files: Sequence[Path], max_width: int | None) -> None:
     """
     needed = 0
     for file in files:
-        width, height, channels, depth = stored_shape(file)
+        header = read_header(file)
+        (width, height), channels = header.size, 4 if header.has_alpha else 3
         new_width, new_height = downscaled_size(width, height, max_width)
-        new_size, size = channels * new_width * new_height, channels * depth * width * height
+        new_size = channels * new_width * new_height
+        size = channels * width * height * BITS.get(header.mode, 8) // 8
         is_fractional = width % new_width or height % new_height
         needed += min(4 * new_size, 2 * new_size if is_fractional else size)
     if needed > (available := available_memory()):
@@ -292,8 +292,8 @@ def threads_for(files: Sequence[Path]) -> int:
 
 def placeholder_pixels(file: Path) -> np.ndarray:
     """Return an array of an image's shape, from its header, that takes no memory."""
-    width, height = image_size(file)
-    return np.broadcast_to(np.uint8(0), (height, width, 4 if has_alpha(file) else 3))
+    header = read_header(file)
+    return np.broadcast_to(np.uint8(0), (*header.size[::-1], 4 if header.has_alpha else 3))
 
 
 def unread_image(shape: tuple[int, ...], name: object) -> LazyImage:

@@ -49,7 +49,7 @@ from drgs.datasets.transforms import (
     unique_names,
 )
 from drgs.datasets.types import Dataset, Keeps, View, all_of_them
-from drgs.io.pictures import has_alpha, image_orientation, read_pixels, upright
+from drgs.io.pictures import read_header, read_pixels, upright
 
 __all__ = ["READERS", "DatasetReader", "Frame", "Photographs", "dataset_of"]
 
@@ -118,7 +118,7 @@ def dataset_of(config: DataConfig, photographs: Photographs, keeps: Keeps = all_
     split = split_of(config, photographs.source, photographs.lists, names, photographs.notes)
     changes: dict[str, object] = {}
     if config.background is None:
-        is_any_transparent = any(has_alpha(frame.files["image"]) for frame in frames)
+        is_any_transparent = any(read_header(f.files["image"]).has_alpha for f in frames)
         changes["background"] = "white" if is_any_transparent else "black"
     if config.image_size is None:
         changes["image_size"] = MAX_WIDTH
@@ -207,7 +207,7 @@ def as_calibrated(pixels: np.ndarray, frame: Frame) -> np.ndarray:
     Raises :class:`UserError` where it does not tell.
     """
     file, values = frame.files["image"], frame.values
-    orientation = image_orientation(file)
+    orientation = read_header(file).orientation
     turned = upright(pixels, orientation)
     fits, fits_turned = (
         values.w in (None, image.shape[1]) and values.h in (None, image.shape[0])

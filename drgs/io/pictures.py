@@ -11,6 +11,7 @@ from __future__ import annotations
 import io
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -92,45 +93,40 @@ colours of its palette become the background's."""
 # Reading: by Pillow itself, which tells an image's mode and size before it is decoded
 
 
+@dataclass(frozen=True)
+class ImageHeader:
+    """Properties of an image before it is decoded."""
+
+    size: tuple[int, int]  # width and height as stored, px
+    format: str  # Pillow's name: see MITSUBA_FORMATS
+    mode: str  # Pillow's: see BITS
+    has_alpha: bool  # of read_pixels
+    orientation: int  # EXIF's, 1 to 8; 1: upright or unknown
+
+
+def read_header(path: Path) -> ImageHeader:
+    """Return the header of an image; raises :class:`UserError` for a file that is none."""
+    with _opened(path) as image:
+        alpha, orientation = _has_alpha(image), _orientation(image)
+        return ImageHeader(_stored_size(image), image.format, image.mode, alpha, orientation)
+
+
 def image_size(path: Path) -> tuple[int, int]:
-    """(width, height) in px, from the file's header."""
+    """Return (width, height) as stored, px, from the file's header."""
     with _opened(path) as image:
         return _stored_size(image)
 
 
-def stored_shape(path: Path) -> tuple[int, int, int, int]:
-    """Return width and height in px, channels, and bytes of each, of :func:`read_pixels`.
-
-    From the file's header; refused modes count as RGB of 8 bits.
-    """
-    with _opened(path) as image:
-        is_transparent = image.mode in ("LA", "RGBA", "P") or _has_alpha(image)
-        bits = BITS.get(image.mode, 8)
-        return *_stored_size(image), 4 if is_transparent else 3, bits // 8
-
-
-def image_mode(path: Path) -> str:
-    """Return Pillow's mode of an image, from the file's header: see :data:`BITS`."""
-    with _opened(path) as image:
-        return image.mode
-
-
-def image_format(path: Path) -> str:
-    """Return Pillow's name of the file's format, from its header: see :data:`MITSUBA_FORMATS`."""
-    with _opened(path) as image:
-        return image.format
-
-
-def image_orientation(path: Path) -> int:
-    """Return EXIF's orientation, 1 to 8; 1: upright or unknown."""
-    with _opened(path) as image:
-        if image.format == "PNG" and "exif" not in image.info:
-            return 1  # Pillow would decode the image to look behind it
-        return _orientation(image)
+def _stored_size(image: Image.Image) -> tuple[int, int]:
+    if image.format == "TIFF":  # Pillow's is that of the upright image
+        tags = ExifTags.Base
+        return image.tag_v2[tags.ImageWidth], image.tag_v2[tags.ImageLength]
+    return image.size
 
 
 def _orientation(image: Image.Image) -> int:
-    """Return the orientation of an image that is not yet decoded."""
+    if image.format == "PNG" and "exif" not in image.info:
+        return 1  # Pillow would decode the image to look behind it
     try:
         number = image.getexif().get(ExifTags.Base.Orientation, 1)
     except Exception:  # Pillow raises many types for broken EXIF, which says nothing
@@ -138,12 +134,9 @@ def _orientation(image: Image.Image) -> int:
     return number if number in ORIENTATIONS else 1
 
 
-def _stored_size(image: Image.Image) -> tuple[int, int]:
-    """(width, height) in px; Pillow's is that of the upright image for a TIFF."""
-    if image.format == "TIFF":
-        tags = ExifTags.Base
-        return image.tag_v2[tags.ImageWidth], image.tag_v2[tags.ImageLength]
-    return image.size
+def _has_alpha(image: Image.Image) -> bool:
+    has_color = image.mode in ("P", "L", "RGB", "1") and "transparency" in image.info
+    return image.mode in ("LA", "RGBA") or has_color
 
 
 def upright(pixels: np.ndarray, orientation: int) -> np.ndarray:
@@ -151,18 +144,6 @@ def upright(pixels: np.ndarray, orientation: int) -> np.ndarray:
     for turn in ORIENTATIONS[orientation]:
         pixels = turn(pixels)
     return pixels
-
-
-def has_alpha(path: Path) -> bool:
-    """Return whether :func:`read_image` gives an alpha channel, from the file's header."""
-    with _opened(path) as image:
-        return _has_alpha(image)
-
-
-def _has_alpha(image: Image.Image) -> bool:
-    """Return whether an image has alpha before it is decoded, or a transparent colour."""
-    has_color = image.mode in ("P", "L", "RGB", "1") and "transparency" in image.info
-    return image.mode in ("LA", "RGBA") or has_color
 
 
 def unused_content(path: Path) -> list[str]:
@@ -173,9 +154,6 @@ def unused_content(path: Path) -> list[str]:
             found.append(f"of {_bits(image)} bits a channel, of which 8 are used")
         if profile := _colour_profile(image.info.get("icc_profile")):
             found.append(f"with the colour profile {profile}, which is not applied")
-        gamma = image.info.get("gamma")
-        if gamma and not profile and abs(gamma - 1 / 2.2) > 0.02:
-            found.append(f"of gamma {gamma:.3g}, which is taken for sRGB")
         # The other images of an MPO are smaller ones, or for bright displays.
         if image.format != "MPO" and getattr(image, "n_frames", 1) > 1:
             found.append("with several pictures each, of which the first is used")
@@ -235,7 +213,7 @@ def read_pixels(path: Path) -> np.ndarray:
         require_memory(path, needed, f"a picture of {image.width} x {image.height} px")
         # Pillow turns TIFFs, and no others.
         turn, decoded = _orientation(image) if image.format == "TIFF" else 1, image
-        if image.mode != "RGBA" and image.mode != "LA" and _has_alpha(image):
+        if image.mode not in ("RGBA", "LA") and _has_alpha(image):
             decoded = image.convert("RGBA")
         elif image.mode == "P":
             decoded = image.convert("RGB")
