@@ -22,7 +22,6 @@ from drgs.core.errors import UserError, UserNote, did_you_mean, one_line
 from drgs.core.files import atomic_path
 from drgs.core.folders import FolderRecord
 from drgs.datasets.orbits import up_of
-from drgs.datasets.viewpoints import near_one
 from drgs.effects.smoothing import baked
 from drgs.gaussians.cleaning import Selection, taken, turned_towards
 from drgs.gaussians.parameters import Gaussians
@@ -345,11 +344,11 @@ def _direction(words: Sequence[str]) -> np.ndarray:
         up = np.array([float(word) for word in words])
     except ValueError:
         up = np.zeros(0)
-    if up.shape != (3,) or not np.isfinite(up).all() or not up.any():
+    length = np.linalg.norm(up)
+    if up.shape != (3,) or not 0 < length < np.inf:
         got = one_line(" ".join(words), 60)
         raise UserError(f"--up: must be cameras, or three numbers not all zero, got {got}")
-    up = near_one(up)
-    return up / np.linalg.norm(up)
+    return up / length
 
 
 def _snapped(up: np.ndarray) -> np.ndarray:

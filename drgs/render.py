@@ -59,7 +59,7 @@ from drgs.datasets.viewpoints import (
 )
 from drgs.effects.compose import IGNORABLE
 from drgs.gaussians.parameters import Gaussians
-from drgs.initialization.defaults import completed
+from drgs.initialization.defaults import resolve_defaults
 from drgs.integrator.scene import check_lenses, check_sizes, make_scene, render_views
 from drgs.integrator.state import is_splats
 from drgs.integrator.summary import described, summary_of_views
@@ -67,7 +67,7 @@ from drgs.io.formats import OTHER_FORMATS, format_for, readable_formats
 from drgs.io.pictures import (
     MITSUBA_FORMATS,
     check_animation,
-    image_format,
+    read_header,
     read_pixels,
     write_animation,
     write_exr,
@@ -332,7 +332,7 @@ def _load_config(path: Path, args: argparse.Namespace) -> FitConfig:
     config = load_config(path, overrides)
     config = config.model_copy(update={"model": config.model.of_file()})
     if is_open(config):  # not a fit's own, which says what was used
-        config = completed(
+        config = resolve_defaults(
             config, load_dataset(config.data_for_rendering, sections=config.extensions)
         )
     return config
@@ -601,7 +601,7 @@ def _background(args: argparse.Namespace) -> tuple[float, float, float] | Path:
 def _background_picture(path: Path) -> Path:
     """``path``, if Mitsuba can read the picture; else say what is wrong with it."""
     read_pixels(path)
-    if (name := image_format(path)) not in MITSUBA_FORMATS:
+    if (name := read_header(path).format) not in MITSUBA_FORMATS:
         raise UserError(
             f"--background: {path} must be a PNG, JPEG, BMP, PPM or TGA picture, got {name}; "
             "convert it"

@@ -1,146 +1,134 @@
-"""What a dataset is, in short: enough to say later whether, and in what, another one differs.
+"""Fingerprints of datasets, by which another dataset and its differences are recognized.
 
-Of each view: its name, size and camera as the configuration has them, and a digest of each file
-that it was read from. Where the dataset lies is no part of it.
+For each view: name, size and camera as configured, and digests of its files. The dataset's folder
+is no part of it.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
+import numpy as np
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from drgs.core.folders import digest
-from drgs.datasets.transforms import in_parallel
+from drgs.datasets.reader import in_parallel
 from drgs.datasets.types import Dataset, Keeps, View, all_of_them
 
 TOLERANCE = 1e-9
-"""Relative and absolute, of a camera's numbers: what another machine's mathematics may change."""
+"""Relative and absolute, of a camera's numbers: rounding of another machine's mathematics."""
 
-PICTURES = {"image": "the picture", "mask": "the mask", "depth": "the depth"}
-"""What messages call the files of a view."""
+FILE_NAMES = {"image": "the picture", "mask": "the mask", "depth": "the depth"}
 
 
-class _Print(BaseModel):
+class ViewPrint(BaseModel):
+    """The fingerprint of a view."""
+
     model_config = ConfigDict(frozen=True)
-
-
-class ViewPrint(_Print):
-    """Of one view."""
 
     name: str
     size: tuple[int, int]  # px, width and height, as configured
     camera: list[float]  # pose, intrinsics, lens, second pose
     kind: str  # of lens and shutter
-    files: dict[str, str]  # digests, by what is in the file; empty: not read, equal to any
+    files: dict[str, str]  # digests by image, mask, depth; empty: not read, equal to any
+
+    @staticmethod
+    def from_view(view: View, digests: dict[Path, str]) -> ViewPrint:
+        """Return the fingerprint of a view, from digests of its files that were read."""
+        camera, kinds = [*view.camera_to_world.ravel(), view.fx, view.fy, view.cx, view.cy], []
+        if view.lens is not None:
+            kinds.append(f"{view.lens.kind} {' '.join(view.lens.coefficients())}")
+            camera += view.lens.coefficients().values()
+        if view.motion is not None:
+            kinds.append(view.motion.shutter)
+            camera += [*view.motion.close_to_world.ravel()]
+        return ViewPrint(
+            name=view.name,
+            size=(view.width, view.height),
+            camera=[float(number) for number in camera],
+            kind=", ".join(kinds),
+            files={what: digests.get(path, "") for what, path in view.files.items()},
+        )
+
+    def changes(self, now: ViewPrint) -> Iterator[str]:
+        """Yield the parts of a view that are different ``now``."""
+        if self.size != now.size:
+            sizes = ("x".join(map(str, view.size)) for view in (self, now))
+            yield "the size ({}, now {})".format(*sizes)
+        elif (self.kind, len(self.camera)) != (now.kind, len(now.camera)) or not np.allclose(
+            self.camera, now.camera, rtol=TOLERANCE, atol=TOLERANCE
+        ):
+            yield "the camera"
+        for what in {**self.files, **now.files}:
+            if _is_different(self.files.get(what), now.files.get(what)):
+                yield FILE_NAMES.get(what, what)
 
 
-class Fingerprint(_Print):
-    """Of the views to train on and of those to measure on, in their order."""
+class Fingerprint(BaseModel):
+    """The fingerprint of a dataset, with views in its order."""
+
+    model_config = ConfigDict(frozen=True)
 
     train: list[ViewPrint]
     test: list[ViewPrint]
 
     def to_bytes(self) -> bytes:
-        """For a file."""
+        """Return the content of a file."""
         return self.model_dump_json().encode()
 
     @staticmethod
     def from_bytes(content: bytes) -> Fingerprint:
-        """What :meth:`to_bytes` gave; ValueError for anything else."""
+        """Return the fingerprint of a file; ValueError for other content."""
         try:
             return Fingerprint.model_validate_json(content)
         except ValidationError:
             raise ValueError("no fingerprint of data") from None
 
     def differences(self, now: Fingerprint) -> list[str]:
-        """What is different ``now``, in words; nothing: the data is the same."""
+        """Describe what is different ``now``; empty: the data is the same."""
         pairs = ((self.train, now.train, "training"), (self.test, now.test, "test"))
         return [text for pair in pairs for text in _differences(*pair)]
 
     def other_files(self, views: Iterable[View], now: Fingerprint) -> list[Path]:
-        """Files of training views (all of them, in the order of ``now``) that are different."""
-        was = {view.name: view.files for view in self.train}
+        """Return files of training views (all, in the order of ``now``) that are different."""
+        before = {view.name: view.files for view in self.train}
         return [
             path
-            for view, is_now in zip(views, now.train, strict=True)
+            for view, print_now in zip(views, now.train, strict=True)
             for what, path in view.files.items()
-            if _is_other(was.get(view.name, {}).get(what), is_now.files[what])
+            if _is_different(before.get(view.name, {}).get(what), print_now.files[what])
         ]
 
 
 def fingerprint_of(dataset: Dataset, reads: Keeps = all_of_them) -> Fingerprint:
-    """Reads the files of the views, which were in memory a moment ago.
+    """Return the fingerprint of a dataset, for which the files of its views are read.
 
-    reads: of which views, by name; the files of others have empty digests.
+    reads: accepts views by name; the files of others have empty digests.
 
     Raises :class:`drgs.core.errors.UserError` where one is gone.
     """
     views = [view for view in (*dataset.train, *dataset.test) if reads(view.name)]
-    files = {path for view in views for path in view.files.values()}
-    ordered = sorted(files)
-    digests = dict(zip(ordered, in_parallel(digest, ordered), strict=True))
+    files = sorted({path for view in views for path in view.files.values()})
+    digests = dict(zip(files, in_parallel(digest, files), strict=True))
     train, test = (
-        [_print_of(view, digests) for view in views] for views in (dataset.train, dataset.test)
+        [ViewPrint.from_view(view, digests) for view in views]
+        for views in (dataset.train, dataset.test)
     )
     return Fingerprint(train=train, test=test)
-
-
-def _print_of(view: View, digests: dict[Path, str]) -> ViewPrint:
-    camera, kinds = [*view.camera_to_world.ravel(), view.fx, view.fy, view.cx, view.cy], []
-    if view.lens is not None:
-        kinds.append(f"{view.lens.kind} {' '.join(view.lens.coefficients())}")
-        camera += view.lens.coefficients().values()
-    if view.motion is not None:
-        kinds.append(view.motion.shutter)
-        camera += [*view.motion.close_to_world.ravel()]
-    return ViewPrint(
-        name=view.name,
-        size=(view.width, view.height),
-        camera=[float(number) for number in camera],
-        kind=", ".join(kinds),
-        files={what: digests.get(path, "") for what, path in view.files.items()},
-    )
 
 
 def _differences(
     before: Sequence[ViewPrint], now: Sequence[ViewPrint], split: str
 ) -> Iterator[str]:
-    was, is_now = ({view.name: view for view in views} for views in (before, now))
-    for name in was:
-        if name not in is_now:
-            yield f"{split} view {name} is missing"
-    for name in is_now:
-        if name not in was:
-            yield f"{split} view {name} is new"
-    if was.keys() == is_now.keys() and list(was) != list(is_now):
+    old, new = ({view.name: view for view in views} for views in (before, now))
+    yield from (f"{split} view {name} is missing" for name in old if name not in new)
+    yield from (f"{split} view {name} is new" for name in new if name not in old)
+    if old.keys() == new.keys() and list(old) != list(new):
         yield f"the {split} views are in another order"
-    for name in filter(is_now.__contains__, was):
-        yield from (f"{what} of {split} view {name}" for what in _changes(was[name], is_now[name]))
+    for name in filter(new.__contains__, old):
+        yield from (f"{what} of {split} view {name}" for what in old[name].changes(new[name]))
 
 
-def _changes(was: ViewPrint, now: ViewPrint) -> Iterator[str]:
-    if was.size != now.size:
-        yield f"the size ({_size(was)}, now {_size(now)})"
-    elif was.kind != now.kind or not _close(was.camera, now.camera):
-        yield "the camera"
-    for what in {**was.files, **now.files}:
-        if _is_other(was.files.get(what), now.files.get(what)):
-            yield PICTURES.get(what, what)
-
-
-def _is_other(was: str | None, now: str | None) -> bool:
-    return was != now and "" not in (was, now)
-
-
-def _size(view: ViewPrint) -> str:
-    return "x".join(map(str, view.size))
-
-
-def _close(was: Sequence[float], now: Sequence[float]) -> bool:
-    return len(was) == len(now) and all(
-        math.isclose(a, b, rel_tol=TOLERANCE, abs_tol=TOLERANCE)
-        for a, b in zip(was, now, strict=True)
-    )
+def _is_different(before: str | None, now: str | None) -> bool:
+    return before != now and "" not in (before, now)

@@ -1,19 +1,27 @@
-"""A configuration for a folder that has none: what suits its pictures, and a laptop."""
+"""Folders of datasets: their readers, configurations for them, explanations of other folders."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+import os
+import shlex
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
+from typing import Any
 
+from drgs.config.extensions import READERS, section_of
 from drgs.config.load import config_from
-from drgs.config.schema import FitConfig
-from drgs.datasets import reader_of
+from drgs.config.schema import DataConfig, FitConfig
+from drgs.core.errors import UserError, listed
+from drgs.datasets.colmap import find_model, folders_in
+from drgs.datasets.files import images_in
 from drgs.datasets.images import downscaled_size
+from drgs.datasets.reader import DatasetReader
 from drgs.io.pictures import image_size
 
 MAX_PIXELS = 600_000
-"""Of a picture that is fitted, as 894 x 671. The width of larger ones is divided by the smallest
+"""Of an image that is fitted, as 894 x 671. The width of larger ones is divided by the smallest
 whole number that brings them there, and rounded down."""
 
 ITERATIONS = {"nerf_synthetic": 4500, "nerfstudio": 4000, "colmap": 4000}
@@ -25,21 +33,63 @@ NAMES = {
     "colmap": "photographs with the cameras of COLMAP's model",
 }
 
+MARKERS = ("transforms_train.json", "transforms.json")
+"""Files by which folders of the layouts NeRF-synthetic and nerfstudio are recognized."""
+
+GUIDE = 'docs/guide.md, "From photographs to a dataset"'
+
+
+NO_SECTIONS: Mapping[str, Any] = MappingProxyType({})
+"""Sections of extensions where none has one."""
+
+
+def find_reader(
+    config: DataConfig, sections: Mapping[str, Any] = NO_SECTIONS
+) -> tuple[str, DatasetReader]:
+    """Return the name and the reader of ``data.type``, or of the first that recognizes the folder.
+
+    sections: those of extensions, by name.
+
+    Raises :class:`UserError` for a folder that no reader recognizes, with what to do.
+    """
+    try:
+        names = os.listdir(config.path)
+    except FileNotFoundError:
+        source = f", or get it from {config.source}" if config.source else ""
+        raise UserError(
+            f"data.path: there is no folder {config.path}; say where it is (--data DIR){source}"
+        ) from None
+    except OSError as error:
+        raise UserError(
+            f"data.path: cannot open the folder {config.path}: {error.strerror}"
+        ) from None
+    is_auto = config.type == "auto"
+    candidates = (
+        [READERS.get(config.type, "data.type")]
+        if not is_auto
+        else [*map(READERS.get, READERS.shipped), *READERS.installed()]
+    )
+    for extension in candidates:
+        reader = extension.value.from_config(section_of(extension, sections))
+        if not is_auto or reader.recognizes(config.path, names):
+            return extension.name, reader
+    raise UserError(f"{config.path}: {explain(config.path)}")
+
 
 def config_for(folder: Path, overrides: Iterable[str] = ()) -> tuple[FitConfig, str]:
-    """A configuration for the dataset in ``folder``, and why it is that one, as text.
+    """Return a configuration for the dataset in ``folder``, and the reasons for it, as text.
 
-    overrides: as for :func:`drgs.config.load.load_config`; what they give is not chosen.
+    overrides: as for :func:`drgs.config.load.load_config`; these values are not chosen.
 
     Raises :class:`UserError` for a folder that is no dataset, with what to do.
     """
     overrides, where = list(overrides), str(folder)
     given = config_from({"data": {"path": folder}}, where, overrides)
-    layout, reader = reader_of(given.data, given.extensions)
+    layout, reader = find_reader(given.data, given.extensions)
     sizes = [image_size(file) for file in reader.image_files(given.data)]
     width, height = max(sizes, key=lambda size: (math.prod(size), size[1]))
     data = {"path": folder, "type": layout, "image_size": _max_width(width, height, sizes)}
-    values = {"data": data, "iterations": ITERATIONS[layout]}
+    values = {"data": data, "iterations": ITERATIONS.get(layout, 4000)}
     config = config_from(values, where, overrides)
     size = "as they are"
     if (config.data.image_size or width) < width:
@@ -53,9 +103,37 @@ def config_for(folder: Path, overrides: Iterable[str] = ()) -> tuple[FitConfig, 
 
 
 def _max_width(width: int, height: int, sizes: Sequence[tuple[int, int]]) -> int:
-    """px, for pictures of ``sizes``, of which ``width`` x ``height`` is the largest."""
+    """Return px, for images of ``sizes``, of which ``width`` x ``height`` is the largest."""
     if width * height <= MAX_PIXELS:
         return max(each for each, _ in sizes)
     widths = (width // factor for factor in range(2, width + 1))
     small = (w for w in widths if math.prod(downscaled_size(width, height, w)) <= MAX_PIXELS)
     return next(small, 1)
+
+
+def explain(folder: Path) -> str:
+    """Explain why a folder is no dataset, and what to do; without the folder's name."""
+    for below in folders_in(folder):
+        if any((below / marker).is_file() for marker in MARKERS) or find_model(below):
+            return f"holds a dataset in its folder {below.name}; give {shlex.quote(str(below))}"
+    return explain_photographs(folder) or (
+        f"neither {' nor '.join(MARKERS)} is there, nor a model of COLMAP in sparse/0 with its "
+        f"photographs in images; see {GUIDE}"
+    )
+
+
+def explain_photographs(folder: Path) -> str:
+    """Explain how photographs in a folder, or in folders below, get cameras; "": there are none."""
+    images = folder / "images"
+    places = [p for p in (folder, *folders_in(folder), *folders_in(images)) if images_in(p)]
+    if not places:
+        return ""
+    first, given, move = places[0], folder, ""
+    if first.parent == folder and first != images:
+        given = first if len(places) == 1 else folder
+        move = "" if len(places) == 1 else f"move those of one scene into {images}, and "
+    there = listed([str(place.relative_to(folder.parent)) for place in places])
+    return (
+        f"holds photographs ({there}), but no cameras: {move}find out where each was taken: "
+        f"drgs poses {shlex.quote(str(given))}; see {GUIDE}"
+    )

@@ -1,4 +1,8 @@
-"""Photographs, masks and depths of a dataset: read, composited, and scaled to the wanted size."""
+"""Images of views: read, composited over a background, scaled, and kept in little memory.
+
+A photograph of three times 8 bits becomes four times as large as float32. So what the file contains
+is kept, and the numbers are computed at each access.
+"""
 
 from __future__ import annotations
 
@@ -11,64 +15,53 @@ import numpy as np
 from drgs.core.errors import UserError, one_line
 from drgs.core.files import open_regular
 from drgs.core.memory import available_memory, readable, require_memory
-from drgs.datasets.lazy_image import KeptPicture, Pixels
-from drgs.datasets.types import View
+from drgs.datasets.types import LazyImage, Pixels, View
 from drgs.io.pictures import (
     BITS,
     MAX_16_BITS,
     MAX_BYTES,
     as_numbers,
-    image_mode,
     image_size,
+    read_header,
     read_image,
-    stored_shape,
 )
 
-NUMBERS_AT_ONCE, MOST_THREADS = 1 << 25, 8
-"""Pixels of photographs that are being read: of 40 bytes each, at most."""
+MAX_PIXELS_AT_ONCE, MAX_THREADS = 1 << 25, 8
+"""Pixels of photographs that are read at a time: of 40 bytes each, at most."""
 
-NEITHER, MOST_EDGES = 0.8, 0.1
-"""Middle part of brightness that is neither black nor white; and how many of a mask's pixels
-may be so, at the edges of what it leaves out."""
+WHOLE = 1 - 1e-4
+"""Share of a pixel's area that counts as all of it, up to rounding."""
 
-ALL = 1 - 1e-4
-"""Of an area, up to rounding."""
+DEPTH_BYTES = 24
+"""Memory for a depth of an ``.npy`` file while it is converted."""
+
+
+# Masks and depths
 
 
 def read_mask(path: Path, size: tuple[int, int]) -> np.ndarray:
-    """(H, W) float32: 1 where the picture is brighter than half, 0 elsewhere; size: W, H.
+    """(H, W) float32: 1 where a mask is opaque and brighter than half, 0 elsewhere; size: W, H.
 
     A mask for a larger photograph of the same shape will do: a pixel counts where all that it
     covers does.
     """
-    width, height = image_size(path)
-    is_larger = width > size[0] and is_scaled(size, (width, height))
+    stored = image_size(path)
+    is_larger = stored[0] > size[0] and is_scaled(size, stored)
     if not is_larger:
-        _check_size(path, (width, height), size)  # before memory is taken for it
-    mask = pixels_that_count(path).astype(np.float32)
-    return _counting(_resized(mask, *size)) if is_larger else mask
-
-
-def pixels_that_count(path: Path) -> np.ndarray:
-    """(H, W) bool: where a mask is opaque, and its brightest channel is above half.
-
-    A photograph that is cut out, not black and white, is a mask by its alpha channel alone.
-    """
+        _check_size(path, stored, size)  # before memory is taken for it
     image = read_image(path)
-    brightness = image[:, :, :3].max(axis=2)
-    if image.shape[2] == 3 or (image[:, :, 3] > 0.5).all():
-        return brightness > 0.5
-    opaque = image[:, :, 3] > 0.5
-    is_photograph = np.mean(np.abs(brightness[opaque] - 0.5) < NEITHER / 2) > MOST_EDGES
-    return opaque if is_photograph else opaque & (brightness > 0.5)
+    counts = image[:, :, :3].max(axis=2) > 0.5
+    if image.shape[2] == 4:
+        counts &= image[:, :, 3] > 0.5
+    mask = counts.astype(np.float32)
+    return _whole(_resized(mask, *size)) if is_larger else mask
 
 
 def is_scaled(size: tuple[int, int], original: tuple[int, int]) -> bool:
-    """Whether a picture of ``size`` may be one of the size ``original``, scaled; each W, H, px.
+    """Return whether an image of ``size`` may be one of ``original``, scaled; each W, H, px.
 
     Sides are whole numbers: each is less than 1 px away from the product of the factor and the
-    original's. A picture with one side of the original and another one beside is cropped, not
-    scaled.
+    original's. An image with one side of the original and another one beside is cropped.
     """
     (width, height), (full_width, full_height) = size, original
     if width == full_width or height == full_height:
@@ -78,10 +71,9 @@ def is_scaled(size: tuple[int, int], original: tuple[int, int]) -> bool:
 
 
 def read_depth(path: Path, unit: float, size: tuple[int, int]) -> np.ndarray:
-    """(H, W) float32, scene units, 0 where not known.
+    """(H, W) float32, scene units, 0 where not known: not finite or not positive.
 
-    unit: scene units that a number of the ``.npy`` file, or a step of the 16 bit picture, counts;
-    size: W, H. What is not finite or not positive is not known.
+    unit: scene units per number of the ``.npy`` file, or step of the 16 bit image; size: W, H.
     """
     if is_array(path):
         depth = _stored_depth(path)
@@ -90,7 +82,7 @@ def read_depth(path: Path, unit: float, size: tuple[int, int]) -> np.ndarray:
         with np.errstate(over="ignore"):  # becomes infinite, and so is not known
             depth = (depth.astype(np.float64) * unit).astype(np.float32)
     else:
-        mode = image_mode(path)
+        mode = read_header(path).mode
         if BITS.get(mode) != 16:  # of 8 bits, all depths would be 257 times as large
             raise UserError(
                 f"{path}: must be a grey picture of 16 bits or an .npy file, got one of Pillow's "
@@ -101,12 +93,8 @@ def read_depth(path: Path, unit: float, size: tuple[int, int]) -> np.ndarray:
     return np.where(np.isfinite(depth) & (depth > 0), depth, 0).astype(np.float32)
 
 
-DEPTH_BYTES = 24
-"""About what a depth of an ``.npy`` file takes while it is converted."""
-
-
 def is_array(path: Path) -> bool:
-    """Return whether depths are stored as an array, not as a picture; by the name."""
+    """Return whether depths are stored as an array, not as an image; by the name."""
     return path.suffix.lower() == ".npy"
 
 
@@ -121,13 +109,12 @@ def _stored_depth(path: Path) -> np.ndarray:
     except Exception as error:  # numpy raises many types for a broken header
         reason = one_line(error) or type(error).__name__
         raise UserError(f"{path}: cannot read the depth: {reason}") from None
-    if not isinstance(depth, np.ndarray) or depth.dtype.kind not in "fiu":
-        kind = depth.dtype if isinstance(depth, np.ndarray) else "several arrays"
-        raise UserError(f"{path}: depth must be one array of real numbers, got {one_line(kind)}")
-    depth = depth.squeeze(-1) if depth.ndim == 3 and depth.shape[2] == 1 else depth
-    if depth.ndim != 2:
-        raise UserError(f"{path}: depth must be (height, width), got shape {depth.shape}")
-    return depth
+    is_real = isinstance(depth, np.ndarray) and depth.dtype.kind in "fiu"
+    shape = depth.shape if is_real else ()
+    if len(shape) == 2 or (len(shape) == 3 and shape[2] == 1):
+        return depth.reshape(shape[:2])
+    got = f"shape {shape}" if is_real else one_line(getattr(depth, "dtype", "several arrays"))
+    raise UserError(f"{path}: depth must be (height, width) real numbers, got {got}")
 
 
 def _check_size(path: Path, got: tuple[int, int], size: tuple[int, int]) -> None:
@@ -136,6 +123,9 @@ def _check_size(path: Path, got: tuple[int, int], size: tuple[int, int]) -> None
             f"{path}: must be {size[0]} x {size[1]} px, as the photograph is, got {got[0]} x "
             f"{got[1]}; resize it, or leave it out of the frame"
         )
+
+
+# Scaling
 
 
 def composite(image: np.ndarray, background: tuple[float, float, float]) -> np.ndarray:
@@ -147,102 +137,68 @@ def composite(image: np.ndarray, background: tuple[float, float, float]) -> np.n
 
 
 def downscale(image: np.ndarray, max_width: int | None) -> np.ndarray:
-    """The image at width ``max_width`` if it is wider, else as it is; the height in proportion.
+    """Return the image at width ``max_width`` if it is wider; the height in proportion.
 
-    Each new pixel is the exact average over its area: a mean of whole pixels where the factor is
-    an integer, with partly covered pixels weighted by their coverage where it is not. Applied
-    after compositing, which gives what scaling premultiplied colours and alpha would.
+    Each new pixel is the exact average over its area, in which partly covered pixels have the
+    weights of their coverage. Applied after compositing, which gives what scaling premultiplied
+    colours and alpha would.
     """
     height, width = image.shape[:2]
     new_width, new_height = downscaled_size(width, height, max_width)
-    if new_width == width:
-        return image
-    return _resized(image, new_width, new_height)
+    return image if new_width == width else _resized(image, new_width, new_height)
 
 
 def downscaled_size(width: int, height: int, max_width: int | None) -> tuple[int, int]:
-    """Width and height of what :func:`downscale` makes of a picture of ``width`` x ``height``."""
+    """Return width and height of a downscaled image: see :func:`downscale`."""
     if max_width is None or width <= max_width:
         return width, height
     return max_width, max(1, round(height * max_width / width))
 
 
-def kept_photograph(
-    pixels: np.ndarray, background: tuple[float, float, float], max_width: int | None
-) -> tuple[Pixels, Pixels | None]:
-    """``image`` and ``alpha`` of a :class:`View`, kept in a form that takes little memory.
-
-    As the file has it; where that is scaled down to less than half, as numbers, which take less;
-    and where it is scaled by no whole factor, which takes long, as numbers rounded to 16 bits.
-
-    pixels: what :func:`drgs.io.pictures.read_pixels` gave; background: behind transparent pixels,
-    display space; max_width: see :func:`downscale`.
-    """
-    height, width, channels = pixels.shape
-    new_width, new_height = downscaled_size(width, height, max_width)
-
-    def image() -> np.ndarray:
-        return downscale(composite(as_numbers(pixels), background), max_width)
-
-    def alpha() -> np.ndarray:
-        return downscale(as_numbers(pixels[:, :, 3]), max_width)
-
-    if 4 * new_width * new_height * channels < pixels.nbytes:
-        return image(), alpha() if channels == 4 else None
-    if width % new_width or height % new_height:
-        return kept_rounded(image()), kept_rounded(alpha()) if channels == 4 else None
-    shape = (new_height, new_width)
-    opaqueness = KeptPicture(shape, alpha, 0) if channels == 4 else None
-    return KeptPicture((*shape, 3), image, pixels.nbytes), opaqueness
+def downscale_mask(mask: np.ndarray, max_width: int | None) -> np.ndarray:
+    """(H, W) of 1 and 0: a pixel counts where all that it covers does."""
+    return _whole(downscale(mask, max_width))
 
 
-def kept_rounded(numbers: np.ndarray) -> KeptPicture:
-    """Numbers in 0..1, kept in 16 bits each."""
-    kept = np.round(numbers * np.float32(MAX_16_BITS)).astype(np.uint16)
-    return KeptPicture(kept.shape, lambda: as_numbers(kept), kept.nbytes)
+def _whole(share: np.ndarray) -> np.ndarray:
+    return (share > WHOLE).astype(np.float32)
 
 
-def check_room(files: Sequence[Path], max_width: int | None) -> None:
-    """Raise :class:`UserError` where photographs do not fit into memory as they would be kept.
-
-    Before any is decoded, from the files' headers; max_width: see :func:`downscale`.
-    """
-    needed = numbers = 0
-    for file in files:
-        width, height, channels, depth = stored_shape(file)
-        new_width, new_height = downscaled_size(width, height, max_width)
-        new_size, size = channels * new_width * new_height, channels * depth * width * height
-        is_scaled = width % new_width or height % new_height
-        needed += min(4 * new_size, 2 * new_size if is_scaled else size)
-        numbers += 4 * new_size
-    if needed <= (available := available_memory()):
-        return
-    widest = max(downscaled_size(*image_size(file), max_width)[0] for file in files)
-    fitting = max(1, int(widest * (0.5 * available / numbers) ** 0.5))
-    raise UserError(
-        f"{files[0].parent}: {len(files):,} photographs take {readable(needed)} of memory as they "
-        f"are kept, and {readable(available)} are available; set data.image_size={fitting}, or use "
-        "fewer of them"
-    )
+def downscale_depth(depth: np.ndarray, max_width: int | None) -> np.ndarray:
+    """(H, W): the mean depth where all that a pixel covers has one, else 0."""
+    known = downscale((depth > 0).astype(np.float32), max_width)
+    return np.where(known > WHOLE, downscale(depth, max_width), 0).astype(np.float32)
 
 
-def threads_for(files: Sequence[Path]) -> int:
-    """How many photographs to read at once, so that numbers of all of them do not fill memory."""
-    width, height = image_size(files[0])
-    return max(1, min(MOST_THREADS, NUMBERS_AT_ONCE // (width * height)))
+def _resized(image: np.ndarray, width: int, height: int) -> np.ndarray:
+    rows = _average_rows(image, height)
+    return np.ascontiguousarray(_average_rows(rows.swapaxes(0, 1), width).swapaxes(0, 1))
+
+
+def _average_rows(image: np.ndarray, count: int) -> np.ndarray:
+    """(count, ...) float32: area average along the first axis."""
+    length = image.shape[0]
+    if length % count == 0:
+        return image.reshape(count, length // count, *image.shape[1:]).mean(axis=1)
+    edges = np.arange(count + 1) * (length / count)
+    pixel = np.arange(length)
+    upper = np.minimum(edges[1:, None], pixel[None, :] + 1)
+    lower = np.maximum(edges[:-1, None], pixel[None, :])
+    weights = np.maximum(upper - lower, 0) * (count / length)
+    return np.tensordot(weights.astype(np.float32), image, axes=1)
 
 
 def smaller_view(view: View, factor: int) -> View:
-    """The same camera with pixels ``factor`` times as large, each the average over its area."""
+    """Return the same camera with pixels ``factor`` times as large, each an average."""
     new_width = max(1, round(view.width / factor))
     width, height = downscaled_size(view.width, view.height, new_width)
     x, y = width / view.width, height / view.height
 
-    def smaller(picture: Pixels | None, scaled: Callable = downscale) -> KeptPicture | None:
-        if picture is None:
+    def smaller(image: Pixels | None, scale: Callable = downscale) -> LazyImage | None:
+        if image is None:
             return None
-        shape = (height, width, *picture.shape[2:])
-        return KeptPicture(shape, lambda: scaled(np.asarray(picture), new_width), 0)
+        shape = (height, width, *image.shape[2:])
+        return LazyImage(shape, lambda: scale(np.asarray(image), new_width), 0)
 
     return replace(
         view,
@@ -259,36 +215,98 @@ def smaller_view(view: View, factor: int) -> View:
     )
 
 
-def downscale_mask(mask: np.ndarray, max_width: int | None) -> np.ndarray:
-    """(H, W) of 1 and 0: a pixel counts where all that it covers does."""
-    return _counting(downscale(mask, max_width))
+# Keeping
 
 
-def _counting(share: np.ndarray) -> np.ndarray:
-    """1 where all of a pixel's area counts, 0 elsewhere."""
-    return (share > ALL).astype(np.float32)
+def compact_photograph(
+    pixels: np.ndarray, background: tuple[float, float, float], max_width: int | None
+) -> tuple[Pixels, Pixels | None]:
+    """Return ``image`` and ``alpha`` of a :class:`View` in a form that takes little memory.
+
+    The pixels of the file; numbers, where they take less; and where the photograph is scaled by no
+    whole factor, which takes long, numbers rounded to 16 bits.
+
+    pixels: of :func:`drgs.io.pictures.read_pixels`; background: behind transparent pixels, display
+    space; max_width: see :func:`downscale`.
+    """
+    height, width, channels = pixels.shape
+    new_width, new_height = downscaled_size(width, height, max_width)
+
+    def image() -> np.ndarray:
+        return downscale(composite(as_numbers(pixels), background), max_width)
+
+    def alpha() -> np.ndarray:
+        return downscale(as_numbers(pixels[:, :, 3]), max_width)
+
+    if 4 * new_width * new_height * channels < pixels.nbytes:
+        return image(), alpha() if channels == 4 else None
+    if width % new_width or height % new_height:
+        return _rounded(image()), _rounded(alpha()) if channels == 4 else None
+    shape = (new_height, new_width)
+    lazy_alpha = LazyImage(shape, alpha, 0) if channels == 4 else None
+    return LazyImage((*shape, 3), image, pixels.nbytes), lazy_alpha
 
 
-def downscale_depth(depth: np.ndarray, max_width: int | None) -> np.ndarray:
-    """(H, W): the mean depth where all that a pixel covers has one, else 0."""
-    known = downscale((depth > 0).astype(np.float32), max_width)
-    return np.where(known > ALL, downscale(depth, max_width), 0).astype(np.float32)
+def _rounded(numbers: np.ndarray) -> LazyImage:
+    """Return numbers in 0..1 that are kept in 16 bits each."""
+    kept = np.round(numbers * np.float32(MAX_16_BITS)).astype(np.uint16)
+    return LazyImage(kept.shape, lambda: as_numbers(kept), kept.nbytes)
 
 
-def _resized(image: np.ndarray, width: int, height: int) -> np.ndarray:
-    """Averages over the areas of (height, width) pixels."""
-    rows = _average_rows(image, height)
-    return np.ascontiguousarray(_average_rows(rows.swapaxes(0, 1), width).swapaxes(0, 1))
+def compact_mask(mask: np.ndarray) -> LazyImage:
+    """Return a mask (H, W) of 1 and 0 that is kept in a byte each."""
+    kept = mask.astype(np.uint8)
+    return LazyImage(mask.shape, lambda: kept.astype(np.float32), kept.nbytes)
 
 
-def _average_rows(image: np.ndarray, count: int) -> np.ndarray:
-    """(count, ...) float32: area average along the first axis."""
-    length = image.shape[0]
-    if length % count == 0:
-        return image.reshape(count, length // count, *image.shape[1:]).mean(axis=1)
-    edges = np.arange(count + 1) * (length / count)
-    pixel = np.arange(length)
-    upper = np.minimum(edges[1:, None], pixel[None, :] + 1)
-    lower = np.maximum(edges[:-1, None], pixel[None, :])
-    weights = np.maximum(upper - lower, 0) * (count / length)
-    return np.tensordot(weights.astype(np.float32), image, axes=1)
+def check_room(files: Sequence[Path], max_width: int | None) -> None:
+    """Raise :class:`UserError` where photographs do not fit into memory as they would be kept.
+
+    Before any is decoded, from the files' headers; max_width: see :func:`downscale`.
+    """
+    needed = 0
+    for file in files:
+        header = read_header(file)
+        (width, height), channels = header.size, 4 if header.has_alpha else 3
+        new_width, new_height = downscaled_size(width, height, max_width)
+        new_size = channels * new_width * new_height
+        size = channels * width * height * BITS.get(header.mode, 8) // 8
+        is_fractional = width % new_width or height % new_height
+        needed += min(4 * new_size, 2 * new_size if is_fractional else size)
+    if needed > (available := available_memory()):
+        raise UserError(
+            f"{files[0].parent}: {len(files):,} photographs take {readable(needed)} of memory as "
+            f"they are kept, and {readable(available)} are available; set a smaller "
+            "data.image_size, or use fewer of them"
+        )
+
+
+def threads_for(files: Sequence[Path]) -> int:
+    """Return how many photographs to read at a time, so that their numbers do not fill memory."""
+    width, height = image_size(files[0])
+    return max(1, min(MAX_THREADS, MAX_PIXELS_AT_ONCE // (width * height)))
+
+
+# Images of views that other processes render
+
+
+def placeholder_pixels(file: Path) -> np.ndarray:
+    """Return an array of an image's shape, from its header, that takes no memory."""
+    header = read_header(file)
+    return np.broadcast_to(np.uint8(0), (*header.size[::-1], 4 if header.has_alpha else 3))
+
+
+def unread_image(shape: tuple[int, ...], name: object) -> LazyImage:
+    """Return an image that raises if its numbers are read."""
+
+    def refuse() -> np.ndarray:
+        raise RuntimeError(f"{name}: another process has its image")
+
+    return LazyImage(shape, refuse, nbytes=0)
+
+
+def without_images(view: View) -> View:
+    """Return the view as if another process had read its images."""
+    there = {name: getattr(view, name) for name in ("image", "alpha", "mask", "depth")}
+    unread = {name: unread_image(p.shape, view.name) for name, p in there.items() if p is not None}
+    return replace(view, **unread)

@@ -1,10 +1,9 @@
-"""Notes for the user on the photographs of a dataset, a line for each kind."""
+"""Notes for the user on the photographs of a dataset, a line for each kind of finding."""
 
 from __future__ import annotations
 
 import os
 import warnings
-import zlib
 from collections.abc import Callable, Iterable, Sequence
 from functools import cache
 from pathlib import Path
@@ -12,43 +11,37 @@ from pathlib import Path
 import numpy as np
 
 from drgs.core.errors import UserNote, listed, one_line
-from drgs.core.files import open_regular
 from drgs.core.folders import digest
 from drgs.datasets.types import View
 from drgs.io.pictures import unused_content
 
-SAMPLE_BYTES = 1 << 12
-"""Bytes from the middle of a file: files that differ there are not the same."""
-
-
-MAX_NOTE_LENGTH = 1000
-"""Characters of a note."""
+MAX_NOTE_CHARACTERS = 1000
 
 
 class Notices:
-    """Collects what is found while photographs are read, on several threads."""
+    """Collects findings while photographs are read, on several threads."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
         self._transparent: list[str] = []
         self._unused: dict[str, list[str]] = {}
 
-    def look_at(self, file: Path, pixels: np.ndarray) -> None:
-        """Remember what is special of a photograph; pixels: (H, W, C), as they were read."""
+    def inspect(self, file: Path, pixels: np.ndarray) -> None:
+        """Record findings on a photograph; pixels: (H, W, C), as they were read."""
         name = self._name(file)
         if pixels.shape[2] == 4 and not pixels[:, :, 3].any():
             self._transparent.append(name)
         for what in unused_content(file):
             self._unused.setdefault(what, []).append(name)
 
-    def say(
+    def emit(
         self,
         notes: Sequence[str],
         train: Sequence[View],
         test: Sequence[View],
         cloud: Path | None = None,
     ) -> None:
-        """Say ``notes``, and what was found, each once: as a :class:`UserNote`."""
+        """Emit ``notes`` and the findings, each as a :class:`UserNote`."""
         files = {path for view in (*train, *test) for path in view.files.values()}
         own = [f"photographs {what}: {_listed(names)}" for what, names in self._unused.items()]
         if self._transparent:
@@ -57,7 +50,7 @@ class Notices:
             own.append(f"files from outside of the folder: {_listed(outside)}")
         own += self._equal(train, test)
         for note in (*notes, *(f"{self._folder}: {text}" for text in own)):
-            warnings.warn(UserNote(one_line(note, MAX_NOTE_LENGTH)), stacklevel=2)
+            warnings.warn(UserNote(one_line(note, MAX_NOTE_CHARACTERS)), stacklevel=2)
 
     def _name(self, file: Path) -> str:
         try:
@@ -66,22 +59,20 @@ class Notices:
             return str(file)
 
     def _outside(self, files: Iterable[Path]) -> list[str]:
-        """Files that lie elsewhere, by their names or by links."""
-        root, folders = os.path.realpath(self._folder), {}
+        """Return files that lie elsewhere, by their names or by links."""
+        root, folder_of = os.path.realpath(self._folder), cache(os.path.realpath)
         found = []
         for file in files:
-            if file.parent not in folders:
-                folders[file.parent] = os.path.realpath(file.parent)
-            there = os.path.join(folders[file.parent], file.name)
-            real = os.path.realpath(file) if file.is_symlink() else there
+            real = os.path.join(folder_of(file.parent), file.name)
+            real = os.path.realpath(file) if file.is_symlink() else real
             if os.path.commonpath([root, real]) != root:
                 found.append(real)
         return found
 
     def _equal(self, train: Sequence[View], test: Sequence[View]) -> list[str]:
-        """A note on photographs that are there more than once, or none."""
+        """Return a note on photographs that are there more than once, or none."""
         groups = [[*train, *test]]
-        for key in (_sample, digest):
+        for key in (os.path.getsize, digest):
             groups = [part for group in groups for part in _grouped(group, cache(key))]
         if not groups:
             return []
@@ -99,16 +90,8 @@ def _listed(names: Sequence[str]) -> str:
 
 
 def _grouped(views: Sequence[View], key: Callable[[Path], object]) -> list[list[View]]:
-    """Views whose photographs have the same key, where it is that of more than one."""
+    """Return groups of several views whose photographs have the same key."""
     groups: dict[object, list[View]] = {}
     for view in views:
         groups.setdefault(key(view.files["image"]), []).append(view)
     return [group for group in groups.values() if len(group) > 1]
-
-
-def _sample(file: Path) -> tuple[int, int]:
-    """The size of a file, and a checksum of its middle."""
-    with open_regular(file, "image") as stream:
-        size = stream.seek(0, os.SEEK_END)
-        stream.seek(max(0, (size - SAMPLE_BYTES) // 2))
-        return size, zlib.crc32(stream.read(SAMPLE_BYTES))

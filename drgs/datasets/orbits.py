@@ -10,48 +10,32 @@ import numpy as np
 
 from drgs.config.schema import NEAR_LIMITS, REFERENCE_NEAR
 from drgs.core.errors import UserError
-from drgs.datasets.focus import focus_of
 from drgs.datasets.types import Viewpoint
-from drgs.datasets.viewpoints import look_at, near_one, pinhole, shown
+from drgs.datasets.viewpoints import focus_of, look_at, pinhole, shown
 from drgs.gaussians.parameters import Gaussians
 
-ELEVATION = math.radians(30)
-"""Of an orbit around Gaussians whose cameras are unknown."""
+ELEVATION, MAX_ELEVATION = math.radians(30), math.radians(80)
+"""Of an orbit around Gaussians whose cameras are unknown; and of any: beyond, it spins in place."""
 
+SCALE_LIMITS = np.finfo(np.float32).tiny, 1e9
+"""Scene units: distances that are taken from standard deviations."""
 
-LENGTHS = np.finfo(np.float32).tiny, 1e9
-"""Scene units, from which and up to which a distance is taken from standard deviations."""
+MAX_ORBIT_SIDE_PX = 400
 
-
-MAX_ELEVATION = math.radians(80)
-"""Beyond this an orbit is a spin on the spot."""
-
-
-ORBIT_SIZE = 400
-"""px: the longer side of an orbit's pictures, at most."""
-
-
-OPAQUE = 0.5
-"""Gaussians with at least this opacity decide where an orbit without cameras looks."""
-
-
-SPREAD = 0.98
-"""Part of those Gaussians that such an orbit keeps in the picture; the rest may be outliers."""
-
+OPAQUE, SPREAD = 0.5, 0.98
+"""Opacity from which Gaussians decide where an orbit without cameras looks; and the share of them
+that it keeps in the image. The others may be outliers."""
 
 LARGEST_GAP = math.radians(100)
-"""Azimuth that may lie between two neighbouring cameras of a capture from all sides: behind
-anything larger is what no photograph shows."""
-
+"""Azimuth between two neighbouring cameras of a capture from all sides. What is beyond a larger gap
+was not photographed."""
 
 AMPLITUDE = 0.8
-"""Of the cameras' own arc, for the sway of an orbit that must not go all the way round."""
-
+"""Share of the cameras' arc of an orbit that sways instead of going all the way round."""
 
 NEAR_RANGE, NEAR_SHARE = (0.01, 0.5), 0.1
-"""Shares of the median distance of Gaussians from their middle: where the reference's plane suits
-them, and what does where it does not."""
-
+"""Shares of the median distance of Gaussians from their middle: the range of the reference's near
+plane, and the near plane outside of it."""
 
 TILT_WEIGHT = 1e-3
 """Weight of the mean of the cameras' up vectors where their right vectors leave ``up`` open."""
@@ -73,7 +57,7 @@ class Orbit:
     half_arc: float | None  # radians
 
     def viewpoints(self, count: int, width: int, height: int, fov: float) -> list[Viewpoint]:
-        """``count`` cameras in equal steps of time; fov: degrees, horizontal."""
+        """Return ``count`` cameras in equal steps of time; fov: degrees, horizontal."""
         side = np.cross(self.up, self.start)
         views = []
         for index in range(count):
@@ -87,9 +71,9 @@ class Orbit:
 
 
 def orbit_of_views(views: Sequence[Viewpoint], gaussians: Gaussians) -> Orbit:
-    """The orbit at the cameras' mean height and median distance around what they look at.
+    """Return the orbit at the cameras' mean height and median distance around their focus.
 
-    Where their optical axes meet nowhere, what they look at is the middle of ``gaussians``.
+    Where their optical axes do not meet, it is around the middle of ``gaussians``.
     """
     centers = np.stack([view.center for view in views])
     try:
@@ -114,23 +98,23 @@ def orbit_of_views(views: Sequence[Viewpoint], gaussians: Gaussians) -> Orbit:
 
 
 def orbit_of_gaussians(gaussians: Gaussians, up: np.ndarray, fov: float) -> Orbit:
-    """The orbit from which all but outliers of the opaque Gaussians are in a square picture.
+    """Return the orbit that shows all but outliers of the opaque Gaussians in a square image.
 
     up: (3,) world, any length; fov: degrees.
     """
     up = np.asarray(up, np.float64)
-    length = np.linalg.norm(near_one(up))
-    if not length > 0:
-        raise UserError(f"camera: up must not be zero, got {shown(up)}")
+    length = np.linalg.norm(up)
+    if not 0 < length < np.inf:
+        raise UserError(f"camera: up must not be zero or infinite, got {shown(up)}")
     focus, spread = _middle(gaussians)
-    up = near_one(up) / length
+    up = up / length
     start, _ = _level_axes(up, np.array([0.0, -1.0, 0.0]))
     radius = spread / math.sin(math.radians(fov) / 2)
     return Orbit(focus, up, start, radius, ELEVATION, half_arc=None)
 
 
 def near_plane_of(gaussians: Gaussians) -> float:
-    """The near plane, scene units, for Gaussians of which no fit says one."""
+    """Return the near plane, scene units, for Gaussians without a configuration."""
     size, (low, high) = _middle(gaussians, share=0.5)[1], NEAR_RANGE
     if low * size <= REFERENCE_NEAR <= high * size:
         return REFERENCE_NEAR
@@ -138,7 +122,7 @@ def near_plane_of(gaussians: Gaussians) -> float:
 
 
 def up_of(views: Sequence[Viewpoint]) -> np.ndarray:
-    """(3,) unit: the world's up direction, as the photographers held their cameras.
+    """(3,) unit: the world's up direction, estimated from how cameras were held.
 
     Minimises mean((r_i . u)^2) over unit vectors, r_i the cameras' right vectors: a camera that
     is tilted but not rolled keeps it horizontal. A small term draws u to the mean of the cameras'
@@ -152,16 +136,16 @@ def up_of(views: Sequence[Viewpoint]) -> np.ndarray:
 
 
 def orbit_size(views: Sequence[Viewpoint]) -> tuple[int, int]:
-    """Width and height in px: the shape of the first photograph, at most 400 px on either side."""
+    """Return width and height, px: those of the first photograph, scaled to at most 400 px."""
     first = views[0]
-    scale = min(1.0, ORBIT_SIZE / max(first.width, first.height))
+    scale = min(1.0, MAX_ORBIT_SIDE_PX / max(first.width, first.height))
     return max(1, round(scale * first.width)), max(1, round(scale * first.height))
 
 
 def _middle(gaussians: Gaussians, share: float = SPREAD) -> tuple[np.ndarray, float]:
-    """(3,) the median position of the opaque Gaussians, and the distance within which a share is.
+    """Return the opaque Gaussians' median position (3,) and the distance of a ``share`` of them.
 
-    Where they all are at one place, the distance is the largest standard deviation.
+    The distance is the largest standard deviation where all are at one place.
     """
     g = gaussians.numpy()
     means = g.means.astype(np.float64)
@@ -169,11 +153,11 @@ def _middle(gaussians: Gaussians, share: float = SPREAD) -> tuple[np.ndarray, fl
     means = opaque if len(opaque) else means
     middle = np.median(means, axis=0)
     distance = float(np.quantile(np.linalg.norm(means - middle, axis=1), share))
-    return middle, distance or float(np.clip(g.scales.max(), *LENGTHS))
+    return middle, distance or float(np.clip(g.scales.max(), *SCALE_LIMITS))
 
 
 def _level_axes(up: np.ndarray, towards: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Two unit vectors that complete ``up``: the level part of ``towards``, and up x that."""
+    """Return two unit vectors that complete ``up``: the level part of ``towards``, and up x it."""
     level = towards - (towards @ up) * up
     if np.linalg.norm(level) <= 1e-6 * np.linalg.norm(towards):
         level = np.eye(3)[np.argmin(np.abs(up))]
@@ -183,7 +167,7 @@ def _level_axes(up: np.ndarray, towards: np.ndarray) -> tuple[np.ndarray, np.nda
 
 
 def _covered_arc(azimuths: np.ndarray) -> tuple[float, float | None]:
-    """Where an orbit starts, and how far it may sway: None if there are cameras all around."""
+    """Return the azimuth at which an orbit starts, and how far it sways: None if all around."""
     azimuths = np.sort(azimuths)
     gaps = np.diff(azimuths, append=azimuths[0] + 2 * math.pi)
     widest = int(np.argmax(gaps))

@@ -15,12 +15,11 @@ from pathlib import Path
 from drgs.config.schema import DataConfig
 from drgs.core.errors import UserError, did_you_mean, listed, one_line
 from drgs.core.files import read_text
-from drgs.datasets.file_names import LEAST_SHARE, PICTURE_FOLDERS, key_of, parts_of, stem_of
+from drgs.datasets.files import IMAGE_FOLDERS, LEAST_SHARE, key_of, parts_of, stem_of
 
 SPLITS = ("train", "val", "test")
 
-MAX_BYTES = 1 << 26
-"""Largest list of names."""
+MAX_LIST_BYTES = 1 << 26
 
 
 @dataclass(frozen=True)
@@ -28,7 +27,7 @@ class Lists:
     """Names of the photographs of each split."""
 
     names: Mapping[str, Collection[str]]  # by SPLITS: those of frames; at least one
-    where: str  # for the description: what has the lists
+    where: str  # for the description: what contains the lists
 
 
 @dataclass(frozen=True)
@@ -37,14 +36,14 @@ class Split:
 
     train: Sequence[int]
     test: Sequence[int]
-    name: str  # of what ``test`` is
+    name: str  # of the split that ``test`` is
     how: str  # it was chosen, for the description
 
 
 def listed_frames(
     source: Path, key: str, listing: Sequence[str], names: Sequence[str], notes: list[str]
 ) -> set[str]:
-    """Return the ``names``, which frames have, that a list has.
+    """Return those of ``names``, of frames, that a list contains.
 
     source, key: of the list, for messages. A name may differ in its suffix, in case and by the
     folder of the photographs, where only one frame has such a name.
@@ -64,7 +63,7 @@ def listed_frames(
 
 
 def _matched(listing: Sequence[str], names: Sequence[str]) -> tuple[set[str], list[str]]:
-    """Return the ``names`` that a list has, and what it has besides, for messages."""
+    """Return the ``names`` that a list contains, and its other names, for messages."""
     exact = {"/".join(parts_of(name)): name for name in names}
     loose: dict[str, set[str]] = {}
     for name in names:
@@ -81,24 +80,27 @@ def _matched(listing: Sequence[str], names: Sequence[str]) -> tuple[set[str], li
 
 
 def _loose(name: str) -> str:
-    """Without the picture's suffix and the folder of photographs, in any case."""
+    """Return a name without the image's suffix and the folder of photographs, in any case."""
     parts = [key_of(part) for part in parts_of(name)] or [""]
-    if len(parts) > 1 and parts[0] in PICTURE_FOLDERS:
+    if len(parts) > 1 and parts[0] in IMAGE_FOLDERS:
         del parts[0]
     return "/".join([*parts[:-1], stem_of(parts[-1])])
 
 
-def lists_in_files(folders: Sequence[Path], names: Sequence[str], notes: list[str]) -> Lists | None:
-    """Read the lists in the first of ``folders`` with ``test.txt``, ``val.txt`` or ``train.txt``.
+def unlisted_splits(
+    folders: Sequence[Path], names: Sequence[str], notes: list[str]
+) -> Lists | None:
+    """Return the splits of a layout without lists of its own, by files or by folders.
 
-    A file that has no name of a frame is another's: a note says that it is not read. Other files
-    that may be lists are noted as well, where there is none.
+    That of the first of ``folders`` with ``test.txt``, ``val.txt`` or ``train.txt``; a file without
+    a name of a frame is another program's. Else each photograph must lie in a folder of a split,
+    not all in ``train``.
     """
     for folder in folders:
         found = {}
         for split in SPLITS:
             if (file := folder / f"{split}.txt").is_file():
-                lines = map(str.strip, read_text(file, "list of names", MAX_BYTES).split("\n"))
+                lines = map(str.strip, read_text(file, "list of names", MAX_LIST_BYTES).split("\n"))
                 listing = [line for line in lines if line and not line.startswith("#")]
                 if _matched(listing, names)[0]:
                     found[split] = listed_frames(folder, file.name, listing, names, notes)
@@ -106,31 +108,22 @@ def lists_in_files(folders: Sequence[Path], names: Sequence[str], notes: list[st
                     notes.append(f"{file}: lists no photograph, and is not read")
         if found:
             return Lists(found, " and ".join(f"{split}.txt" for split in found))
-    suffixes = (".json", ".txt", ".csv")
-    for file in sorted(f for f in folders[-1].glob("*split*") if f.suffix in suffixes):
-        notes.append(
-            f"{file}: is not read; test.txt can list what is to be measured on, a name a line"
-        )
-    return None
-
-
-def lists_by_folders(names: Sequence[str]) -> Lists | None:
-    """Return lists where each photograph lies in a folder of a split, not all in ``train``."""
-    found: dict[str, set[str]] = {}
+    found = {}
     for name in names:
-        folders = [part for part in map(key_of, parts_of(name)[:-1]) if part in SPLITS]
-        if not folders:
+        below = [part for part in map(key_of, parts_of(name)[:-1]) if part in SPLITS]
+        if not below:
             return None
-        found.setdefault(folders[-1], set()).add(name)
+        found.setdefault(below[-1], set()).add(name)
     return Lists(found, "folders") if len(found) > 1 and "train" in found else None
 
 
 def split_of(
     config: DataConfig, source: Path, lists: Lists | None, names: Sequence[str], notes: list[str]
 ) -> Split:
-    """How views of frames called ``names``, in this order, are to train on and to measure on.
+    """Divide views of frames called ``names``, in this order.
 
     Without lists, those at indices 0, n, 2n, ... are to measure on, n being ``data.test_every``.
+
     Raises :class:`UserError` where there is no split as configured, nothing to train or to measure
     on, or a photograph for both.
     """
@@ -140,8 +133,7 @@ def split_of(
         )
     if lists is None:
         return _every_nth(config, source, len(names))
-    name = _measured(config, source, lists)
-    train, test = _members(lists, name, set(names))
+    name, train, test = _members(config, source, lists, set(names))
     both = sorted(train & test)
     if both and name != "train":
         raise UserError(
@@ -149,12 +141,11 @@ def split_of(
             f"have {len(both):,} in both train and {name}: {one_line(listed(both))}; take them out "
             "of one"
         )
-    for split, members in (("train", train), (name, test)):
-        if not members:
-            raise UserError(
-                f"{source}: at least 1 view of the split {split} is needed, and {lists.where} "
-                "leave none"
-            )
+    if not (train and test):
+        raise UserError(
+            f"{source}: at least 1 view of the splits train and {name} is needed, and "
+            f"{lists.where} leave none"
+        )
     left = [n for n in names if n not in set().union(train, test, *lists.names.values())]
     if left:
         notes.append(
@@ -165,24 +156,22 @@ def split_of(
     return Split(trained, measured, name, f"split {name}, by {lists.where}")
 
 
-def _measured(config: DataConfig, source: Path, lists: Lists) -> str:
-    """The split to measure on."""
-    name = config.test_split
-    if name is None:
-        return "val" if "val" in lists.names and "test" not in lists.names else "test"
-    if name not in (*lists.names, "train"):
+def _members(
+    config: DataConfig, source: Path, lists: Lists, names: set[str]
+) -> tuple[str, set[str], set[str]]:
+    """Return the split to measure on, and ``names`` to train on and to measure on.
+
+    Photographs of a split without a list are those in no other list.
+    """
+    is_val = "val" in lists.names and "test" not in lists.names
+    name = config.test_split or ("val" if is_val else "test")
+    if config.test_split and name not in (*lists.names, "train"):
         there = " and ".join(lists.names)
         raise UserError(f"{source}: there is no split {name}, only {there}; set data.test_split")
-    return name
-
-
-def _members(lists: Lists, name: str, names: set[str]) -> tuple[set[str], set[str]]:
-    """Divide ``names`` into those to train on and to measure on; without a list, all others."""
     for_others = [chosen for split, chosen in lists.names.items() if split != "train"]
     train = names.intersection(lists.names.get("train", names.difference(*for_others)))
-    if name == "train":
-        return train, train
-    return train, names.intersection(lists.names.get(name, names - train))
+    test = train if name == "train" else names.intersection(lists.names.get(name, names - train))
+    return name, train, test
 
 
 def _every_nth(config: DataConfig, source: Path, num_views: int) -> Split:

@@ -1,18 +1,22 @@
-"""Reading ``transforms*.json`` files: what the NeRF-synthetic and nerfstudio layouts share.
+"""Files ``transforms*.json`` of the NeRF-synthetic and nerfstudio layouts, and their frames.
 
 Both store camera-to-world matrices in OpenGL axes (x right, y up, z backward). A file is checked as
 a whole against :class:`Transforms`; keys that it does not name are not read (``unread``).
+
+``mask_path`` names an image that is black where pixels do not count. ``depth_file_path`` names an
+image of 16 bits or an ``.npy`` file; ``depth_unit_scale_factor`` is the number of scene units of
+one of its numbers. But for poses, values at the top of a file are those of every frame without its
+own.
 """
 
 from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
-from typing import TYPE_CHECKING, Annotated, Literal, TypeVar
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, Strict, ValidationError
@@ -20,10 +24,11 @@ from pydantic_core import ErrorDetails
 
 from drgs.cameras.axes import between_opencv_and_opengl
 from drgs.config.explain import expectation
-from drgs.core.constants import MAX_COEFFICIENT
+from drgs.config.schema import DataConfig
 from drgs.core.errors import UserError, listed, one_line
 from drgs.core.files import read_text, shortened
 from drgs.core.registry import HOW_TO_INSTALL
+from drgs.datasets.files import FileKind, find_files
 from drgs.datasets.types import Motion
 from drgs.io.pictures import MAX_SIDE
 
@@ -31,24 +36,23 @@ if TYPE_CHECKING:
     from drgs.cameras.lens import Lens
 
 MAX_BYTES = 1 << 28
-"""Of a transforms file: 268 MB, a thousand bytes for each of a quarter of a million views."""
+"""Largest transforms file: a thousand bytes for each of a quarter of a million views."""
 
-RIGID_TOLERANCE = 1e-4
-"""Largest entry of |R R^T - I|: eighty times what files written with float32 show (1.3e-6), far
-below any shear or scale that matters."""
+RIGID_TOLERANCE, LAST_ROW = 1e-4, (0, 0, 0, 1)
+"""Largest entry of |R R^T - I|, eighty times that of files written with float32 (1.3e-6), and error
+of the last row."""
 
 MEMORY_RATIO = 30
 """Memory that JSON takes as Python's objects, in bytes of the text."""
 
 MAX_COORDINATE = 1e9
-"""Scene units, of a camera's position: far beyond what float32 can tell apart within a scene."""
+"""Scene units, of a camera's position: far beyond what float32 resolves within a scene."""
 
 FOCAL_RANGE = (1e-2, 1e4)
-"""Focal lengths, in image sizes, that a pinhole camera can have: full angles of view from 178
-degrees down to 0.006."""
+"""Focal lengths, in image sizes: full angles of view from 178 degrees down to 0.006."""
 
 MAX_OFFSET = 100
-"""Image sizes: how far the principal point may lie from the picture."""
+"""Image sizes: how far the principal point may lie from the image."""
 
 SMALLEST_ANGLE, LARGEST_ANGLE = (2 * math.atan(0.5 / focal) for focal in reversed(FOCAL_RANGE))
 """Radians: the same as full angles of view."""
@@ -58,14 +62,17 @@ DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2", "sx1", "sy1")
 RATIONAL_MODEL = "FULL_OPENCV"
 """The model of a camera that has k4 to k6."""
 
-THIN_PRISM_MODEL = "THIN_PRISM_FISHEYE"
-"""The model of a fisheye that has more than k1 to k4."""
-
 PLANE_MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", RATIONAL_MODEL)
-FISHEYE_MODELS = ("SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "OPENCV_FISHEYE", THIN_PRISM_MODEL)
-COLMAP_MODELS = (*PLANE_MODELS, *FISHEYE_MODELS)
-"""COLMAP's models that are read."""
-"""The others are a pinhole camera apart from their distortion."""
+FISHEYE_MODELS = (
+    *("SIMPLE_FISHEYE", "FISHEYE"),
+    *("SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "OPENCV_FISHEYE"),
+)
+LENS_OF_MODEL = {
+    **dict.fromkeys(PLANE_MODELS, "opencv"),
+    **dict.fromkeys(FISHEYE_MODELS, "fisheye"),
+    "THIN_PRISM_FISHEYE": "thin_prism_fisheye",
+}
+"""Lenses of COLMAP's models; other values of ``camera_model`` are names of lenses."""
 
 WITHOUT_EFFECT = frozenset(
     {
@@ -78,13 +85,22 @@ WITHOUT_EFFECT = frozenset(
 """Keys that change nothing of what is read here: none is missed."""
 
 CLOSE = "transform_matrix_close"
-"""Of a frame: where its camera was when the shutter closed, as ``transform_matrix`` is where it was
-when the shutter opened."""
+"""A frame's camera pose when the shutter closed; ``transform_matrix``: when it opened."""
 
-T = TypeVar("T")
+IMAGE = FileKind("photographs", remedy="put them there, or take their frames out of the file")
+MASK = FileKind(
+    "masks", "their photographs are left out", "put them there, or set data.ignore_masks"
+)
+DEPTH = FileKind(
+    "files of depth",
+    "their photographs have no depth",
+    "put them there, or set data.ignore_depth",
+    frozenset(),
+)
+POINT_CLOUD = FileKind("point cloud", "the fit starts without", "", frozenset(), is_needed=False)
 
 
-# What a file may say
+# Content of a file
 
 
 def _angle(value: float) -> float:
@@ -102,38 +118,33 @@ def _coordinate(value: float) -> float:
 def _opencv_pose(rows: list[list[float]]) -> np.ndarray:
     """(4, 4) float64 camera to world in OpenCV axes, from the file's in OpenGL's."""
     if [len(row) for row in rows] != [4] * 4:
-        lengths = " or ".join(map(str, sorted({len(row) for row in rows})[:3]))
-        raise ValueError(f"must be 4 x 4 numbers ({len(rows)} rows of {lengths or 0})")
+        raise ValueError("must be 4 x 4 numbers")
     matrix = np.array(rows, np.float64)
     rotation = matrix[:3, :3]
-    error = np.abs(rotation @ rotation.T - np.eye(3)).max()
+    error = max(np.abs(rotation @ rotation.T - np.eye(3)).max(), np.abs(matrix[3] - LAST_ROW).max())
     with np.errstate(all="ignore"):  # NumPy takes logarithms, of a determinant of 0 as well
         sign = np.linalg.det(rotation)
     if error > RIGID_TOLERANCE or sign < 0:
         raise ValueError(
-            f"must be rigid (rotation and translation) to {RIGID_TOLERANCE:g}: "
-            f"|R R^T - I| is {error:.2g}, det R is {sign:.2g}"
+            f"must be rigid (rotation, translation, row 0 0 0 1) to {RIGID_TOLERANCE:g}: "
+            f"off by {error:.2g}, det R is {sign:.2g}"
         )
-    if np.abs(matrix[3] - [0, 0, 0, 1]).max() > RIGID_TOLERANCE:
-        raise ValueError("must end in the row 0 0 0 1")
     return between_opencv_and_opengl(matrix)
 
 
 def _known_model(model: str) -> str:
-    """A model of COLMAP or the name of a lens."""
-    if model not in COLMAP_MODELS:
+    if model not in LENS_OF_MODEL:
         from drgs.cameras.lens import LENSES
 
         if model not in LENSES.names():
             raise ValueError(
-                f"must be one of {', '.join(COLMAP_MODELS)}, or a lens: "
+                f"must be one of {', '.join(LENS_OF_MODEL)}, or a lens: "
                 f"{', '.join(LENSES.names())}; {HOW_TO_INSTALL}"
             )
     return model
 
 
 Number = Annotated[float, Field(allow_inf_nan=False)]
-Coefficient = Annotated[float, Field(ge=-MAX_COEFFICIENT, le=MAX_COEFFICIENT)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 Side = Annotated[float, Field(ge=1, le=MAX_SIDE)]
 Angle = Annotated[Number, AfterValidator(_angle)]
@@ -146,7 +157,7 @@ Model = Annotated[str, AfterValidator(_known_model)]
 class CameraValues(BaseModel):
     """Values at the top of a file, for all frames, or in a frame. None: not given.
 
-    Other keys may be coefficients of a lens that drgs does not ship.
+    Other keys may be coefficients of a lens: see :func:`lens_of`.
     """
 
     model_config = ConfigDict(strict=True, frozen=True, extra="allow")
@@ -159,16 +170,6 @@ class CameraValues(BaseModel):
     cy: Number | None = None
     w: Side | None = None  # px
     h: Side | None = None
-    k1: Coefficient | None = None
-    k2: Coefficient | None = None
-    k3: Coefficient | None = None
-    k4: Coefficient | None = None
-    k5: Coefficient | None = None
-    k6: Coefficient | None = None
-    p1: Coefficient | None = None
-    p2: Coefficient | None = None
-    sx1: Coefficient | None = None
-    sy1: Coefficient | None = None
     camera_model: Model | None = None  # as nerfstudio writes it, or the name of a lens
     is_fisheye: Annotated[bool | None, Strict(False)] = None  # as instant-ngp does
     shutter: Literal["global", "rolling"] | None = None  # all pixels at once, or row after row
@@ -178,7 +179,7 @@ class CameraValues(BaseModel):
 
 
 class FrameValues(CameraValues):
-    """What a frame says; poses are checked, and in OpenCV axes."""
+    """Values of a frame; poses are in OpenCV axes."""
 
     transform_matrix: Pose
     transform_matrix_close: Pose | None = None
@@ -186,7 +187,7 @@ class FrameValues(CameraValues):
 
 
 class Transforms(CameraValues):
-    """A file."""
+    """Content of a file."""
 
     frames: Annotated[list[FrameValues], Field(min_length=1)]
     ply_file_path: Text | None = None
@@ -197,12 +198,13 @@ class Transforms(CameraValues):
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """A view of a file: what its frame says, and where it says nothing, the file's top."""
+    """A photograph's camera, and its files."""
 
-    values: FrameValues
-    own: FrameValues  # without what it inherits
-    index: int
-    path: Path
+    values: FrameValues  # with those at the top of the file where the frame has none
+    path: Path  # the file or folder that contains the values, for messages
+    place: str  # in that, with the separator before a key: ``frames[3].``
+    inherited: Collection[str] = ()  # keys that the frame itself does not have
+    is_as_stored: bool = False  # the camera's values are for the image without EXIF's orientation
     files: Mapping[str, Path] = field(default_factory=dict)  # found: image, mask, depth
 
     @staticmethod
@@ -230,35 +232,22 @@ class Frame:
             own = FrameValues.model_validate({**values, "transform_matrix": opengl.tolist()})
         except ValidationError as error:
             raise UserError(f"{source}: frame {index}: {_explained(error.errors()[0])}") from None
-        return Frame(own, own, index, source, {"image": image})
-
-    @property
-    def numbers_are_as_stored(self) -> bool:
-        """Whether they are known to be for the picture as it is stored, if that has its size."""
-        return False
-
-    @property
-    def moves(self) -> bool:
-        """Whether it says where its camera was when the shutter closed."""
-        return self.own.transform_matrix_close is not None
+        return Frame(own, source, f"frames[{index}].", files={"image": image})
 
     def where(self, key: str) -> str:
-        """The key as messages name it, with the file and the frame that holds it, if one does."""
-        is_inherited = getattr(self.own, key, None) is None and hasattr(self.values, key)
-        in_frame = key in FrameValues.model_fields.keys() - CameraValues.model_fields.keys()
-        in_frame = in_frame or not is_inherited
-        return f"{self.path}: frames[{self.index}].{key}" if in_frame else f"{self.path}: {key}"
+        """Return the file and the key, with the frame if that contains it, for messages."""
+        return f"{self.path}: {'' if key in self.inherited else self.place}{key}"
 
 
 @dataclass(frozen=True, eq=False)
 class TransformsFile:
-    """A file as it was read."""
+    """A file and its frames."""
 
     path: Path
     frames: Sequence[Frame]  # at least one
-    point_cloud: str | None  # what ply_file_path names
-    lists: Mapping[str, Sequence[str]]  # file names of train, val, test: those that it has
-    unread: Sequence[str]  # keys that are passed over
+    point_cloud: str | None  # ply_file_path
+    lists: Mapping[str, Sequence[str]]  # file names of train, val, test, where the file has them
+    unread: Sequence[str]  # keys that are not read
 
 
 def read_transforms(path: Path) -> TransformsFile:
@@ -269,13 +258,17 @@ def read_transforms(path: Path) -> TransformsFile:
     text = read_text(path, "file", MAX_BYTES, MEMORY_RATIO)
     try:
         content = json.loads(text)
-    except (ValueError, RecursionError) as error:
-        raise UserError(f"{path}: not valid JSON: {one_line(error)}") from None
-    try:
         meta = Transforms.model_validate(content)
     except ValidationError as error:
         raise UserError(f"{path}: {_explained(error.errors()[0])}") from None
-    frames = [Frame(_inherited(own, meta), own, i, path) for i, own in enumerate(meta.frames)]
+    except (ValueError, RecursionError) as error:
+        raise UserError(f"{path}: not valid JSON: {one_line(error)}") from None
+    top = {name: getattr(meta, name) for name in CameraValues.model_fields} | meta.model_extra
+    frames = []
+    for index, own in enumerate(meta.frames):
+        inherited = {key: value for key, value in top.items() if getattr(own, key, None) is None}
+        values = own.model_copy(update=inherited)
+        frames.append(Frame(values, path, f"frames[{index}].", inherited.keys()))
     names = {split: getattr(meta, f"{split}_filenames") for split in ("train", "val", "test")}
     lists = {split: listing for split, listing in names.items() if listing}
     return TransformsFile(path, frames, meta.ply_file_path, lists, _unread(content))
@@ -287,66 +280,101 @@ def note_unread(path: Path, keys: Sequence[str]) -> str:
 
 
 def _unread(content: Mapping[str, object]) -> list[str]:
-    """Sorted; those of frames as ``frames[].key``."""
+    """Return sorted keys; those of frames as ``frames[].key``."""
     frames = content["frames"]
     models = {values.get("camera_model") for values in (content, *frames)}
-    without_effect = WITHOUT_EFFECT.union(*(_coefficients(model) for model in models))
-    top = content.keys() - Transforms.model_fields.keys() - without_effect
-    in_frames = set().union(*frames) - FrameValues.model_fields.keys() - without_effect
+    known = WITHOUT_EFFECT.union(*map(_coefficients, models))
+    top = content.keys() - Transforms.model_fields.keys() - known
+    in_frames = set().union(*frames) - FrameValues.model_fields.keys() - known
     keys = [*sorted(top), *(f"frames[].{key}" for key in sorted(in_frames))]
     return [one_line(key, 60) for key in keys]
 
 
 def _coefficients(model: str | None) -> tuple[str, ...]:
-    """Return the names of the coefficients of a lens, if ``model`` is none of COLMAP's."""
-    if model in (None, *COLMAP_MODELS):
-        return ()
+    """Return the names of the coefficients of a lens."""
+    if model is None or model in LENS_OF_MODEL:
+        return DISTORTION
     from drgs.cameras.lens import LENSES
 
     return LENSES.get(model).value.coefficient_names()
 
 
-def _inherited(own: FrameValues, meta: Transforms) -> FrameValues:
-    inherited = {name: getattr(meta, name) for name in CameraValues.model_fields}
-    inherited |= meta.model_extra
-    return own.model_copy(
-        update={k: v for k, v in inherited.items() if getattr(own, k, None) is None}
-    )
-
-
 def _explained(error: ErrorDetails) -> str:
-    """One of pydantic's errors: the key, what was expected, and what was got."""
+    """Return the key, the expectation and the value of one of pydantic's errors."""
     parts = [f"[{part}]" if isinstance(part, int) else f".{part}" for part in error["loc"]]
     key = "".join(parts).removeprefix(".")
     if error["type"] == "missing":
-        remedy = "; it must be a list of objects, one per view" if key == "frames" else ""
-        return f"{key} is missing{remedy}"
-    got = f"got {_show(error['input'])}"
-    if not key:
-        return f"must hold an object with frames, {got}"
-    if key == "frames":
-        expected = "must be a list of objects" if error["input"] else "must have at least one view"
-        return f"{key} {expected}, {got}"
-    if error["type"] == "model_type":
-        return f"{key} must be an object, {got}"
-    return f"{key} {expectation(error)}, {got}"
+        return f"{key} is missing"
+    own = {"model_type": "must be an object", "too_short": "must have at least one entry"}
+    expected = own.get(error["type"]) or expectation(error)
+    return f"{key or 'the content'} {expected}, got {_show(error['input'])}"
 
 
 def _show(value: object) -> str:
-    """The value as JSON writes it, shortened."""
+    """Return the value as JSON writes it, shortened."""
     return one_line(json.dumps(value), limit=60)
 
 
-# What follows from it
+# Files of frames
+
+
+def frames_with_files(config: DataConfig, meta: TransformsFile, notes: list[str]) -> list[Frame]:
+    """Return the frames whose files are there, with the paths of those that are not ignored.
+
+    notes: on files that are taken under another name, and on missing ones, are added here.
+
+    Raises :class:`UserError` where fewer than half of the files of a kind are there.
+    """
+    if nameless := [frame for frame in meta.frames if frame.values.file_path is None]:
+        raise UserError(f"{nameless[0].where('file_path')} is missing")
+    frames = _with_files(config.path, meta.frames, "image", "file_path", IMAGE, notes)
+    if not config.ignore_masks:
+        frames = _with_files(config.path, frames, "mask", "mask_path", MASK, notes)
+    if not config.ignore_depth:
+        frames = _with_files(config.path, frames, "depth", "depth_file_path", DEPTH, notes)
+    return frames
+
+
+def _with_files(
+    folder: Path, frames: Sequence[Frame], what: str, key: str, kind: FileKind, notes: list[str]
+) -> list[Frame]:
+    """Return frames with a file of this kind, and others where they name or need none."""
+    naming = [frame for frame in frames if getattr(frame.values, key) is not None]
+    if not naming:
+        return list(frames)
+    names = [getattr(frame.values, key) for frame in naming]
+    found = find_files(
+        folder, frames[0].path, names, kind, lambda index: naming[index].where(key), notes
+    )
+    kept = []
+    for frame in frames:
+        name = getattr(frame.values, key)
+        if name in found:
+            kept.append(replace(frame, files={**frame.files, what: found[name]}))
+        elif name is None or what == "depth":
+            kept.append(frame)
+    return kept
+
+
+def find_point_cloud(config: DataConfig, meta: TransformsFile, notes: list[str]) -> Path | None:
+    """Return the point cloud that the file names, if it is there and not ignored."""
+    if meta.point_cloud is None or config.ignore_points:
+        return None
+    names = [meta.point_cloud]
+    found = find_files(config.path, meta.path, names, POINT_CLOUD, lambda _: "", notes)
+    return found.get(meta.point_cloud)
+
+
+# Optics
 
 
 def focal_from_angle(angle: float, size: int) -> float:
-    """Focal length in px from a full field of view in radians across ``size`` px."""
+    """Return the focal length, px, of a full field of view in radians across ``size`` px."""
     return 0.5 * size / math.tan(0.5 * angle)
 
 
 def focal_length(focal: float, where: str, size: int) -> float:
-    """``focal``, px, if a picture of ``size`` px can have it; where: the key."""
+    """Return ``focal``, px, if an image of ``size`` px can have it; where: the key."""
     low, high = (size * factor for factor in FOCAL_RANGE)
     if not low <= focal <= high:
         raise UserError(
@@ -356,7 +384,7 @@ def focal_length(focal: float, where: str, size: int) -> float:
 
 
 def principal_point(value: float, where: str, size: int) -> float:
-    """``value``, px, if it is not too far from a picture of ``size`` px; where: the key."""
+    """Return ``value``, px, if it is not too far from an image of ``size`` px; where: the key."""
     if abs(value) > MAX_OFFSET * size:
         raise UserError(
             f"{where} must be within {MAX_OFFSET * size} px of the picture, got {value:g}"
@@ -365,82 +393,60 @@ def principal_point(value: float, where: str, size: int) -> float:
 
 
 def lens_of(frame: Frame) -> Lens | None:
-    """Return the lens that a frame names, with its coefficients; None for a pinhole."""
+    """Return the lens that a frame names, with its coefficients; None for a pinhole.
+
+    Raises :class:`UserError` for coefficients that the lens does not have, and for a k4 that may be
+    OpenCV's, the first coefficient of a denominator, or nerfstudio's, the fourth of the polynomial.
+    Files that have k5 or k6 mean OpenCV's.
+    """
+    from drgs.cameras.lens import LENSES
+
     model, values = frame.values.camera_model, frame.values
-    if model not in (None, *COLMAP_MODELS):
-        return _lens_by_name(frame, model)
-    is_fisheye = model in FISHEYE_MODELS or bool(values.is_fisheye)
-    coefficients = {name: value for name in DISTORTION if (value := getattr(values, name))}
-    if not is_fisheye and not coefficients:
-        return None
-    _check_fourth(frame, coefficients, is_fisheye)
-    return _with_coefficients(frame, _lens_name(model, is_fisheye, coefficients), coefficients)
-
-
-def _lens_by_name(frame: Frame, name: str) -> Lens | None:
-    """Return a lens of the registry, with the coefficients that the frame has by name."""
-    given = {n: v for n in _coefficients(name) if (v := getattr(frame.values, n, None)) is not None}
+    name, is_of_colmap = LENS_OF_MODEL.get(model, model), model is None or model in LENS_OF_MODEL
+    given = {k: v for k in _coefficients(model) if (v := getattr(values, k, None)) is not None}
     for key, value in given.items():
         if type(value) not in (int, float) or not math.isfinite(value):
             raise UserError(f"{frame.where(key)} must be a finite number, got {_show(value)}")
-    return None if name == "pinhole" else _with_coefficients(frame, name, given)
-
-
-def _with_coefficients(frame: Frame, name: str, coefficients: Mapping[str, float]) -> Lens:
-    from drgs.cameras.lens import LENSES
-
+    if is_of_colmap:
+        given = {key: value for key, value in given.items() if value}
+        if name in (None, "opencv"):
+            name = "fisheye" if values.is_fisheye else "opencv" if given else "pinhole"
+        elif given.keys() <= {"k1", "k2", "k3", "k4"}:  # thin prisms of zero
+            name = "fisheye"
+    if name == "pinhole":
+        return None
+    is_rational = model == RATIONAL_MODEL or {"k5", "k6"} & given.keys()
+    if is_of_colmap and name == "opencv" and "k4" in given and not is_rational:
+        raise UserError(
+            f"{frame.where('k4')} is read as OpenCV's, of a denominator 1 + k4 r^2, where "
+            f"camera_model is {RATIONAL_MODEL}; nerfstudio's, of a term k4 r^8, is not supported. "
+            f"Got k4 = {given['k4']:g} and camera_model {model or 'PINHOLE'}: set "
+            "camera_model, or calibrate without k4"
+        )
     lens = LENSES.get(name).value
-    for key in coefficients:
-        if key not in lens.coefficient_names():
-            raise UserError(
-                f"{frame.where(key)}: a lens of the kind {name} has the coefficients "
-                f"{', '.join(lens.coefficient_names())}, got {key} = {coefficients[key]:g}; set "
-                f"camera_model to the model that was calibrated, or leave {key} out"
-            )
+    for key in sorted(given.keys() - set(lens.coefficient_names())):
+        raise UserError(
+            f"{frame.where(key)}: a lens of the kind {name} has the coefficients "
+            f"{', '.join(lens.coefficient_names())}, got {key} = {given[key]:g}; set "
+            f"camera_model to the model that was calibrated, or leave {key} out"
+        )
     try:
-        return lens.from_coefficients(**coefficients)
+        return lens.from_coefficients(**given)
     except UserError as error:
         raise UserError(f"{frame.where('camera_model')}: {error}") from error
 
 
-def _lens_name(model: str | None, is_fisheye: bool, coefficients: Mapping[str, float]) -> str:
-    """Return the name of the lens with these coefficients that are not zero."""
-    if model == THIN_PRISM_MODEL and not set(coefficients) <= {"k1", "k2", "k3", "k4"}:
-        return "thin_prism_fisheye"
-    return "fisheye" if is_fisheye else "opencv"
-
-
-def _check_fourth(frame: Frame, coefficients: dict[str, float], is_fisheye: bool) -> None:
-    """Raise UserError for a k4 of which one cannot know what it multiplies.
-
-    In OpenCV it is the first coefficient of a denominator, in nerfstudio the fourth of the
-    polynomial. Files that have k5 or k6 mean OpenCV's.
-    """
-    model = frame.values.camera_model or "PINHOLE"
-    if is_fisheye or model == RATIONAL_MODEL or {"k5", "k6"} & set(coefficients):
-        return
-    if "k4" in coefficients:
-        raise UserError(
-            f"{frame.where('k4')} is read as OpenCV's, of a denominator 1 + k4 r^2, where "
-            f"camera_model is {RATIONAL_MODEL}; nerfstudio's, of a term k4 r^8, is not supported. "
-            f"Got k4 = {coefficients['k4']:g} and camera_model {model}: set camera_model, or "
-            "calibrate without k4"
-        )
-
-
 def motion_of(frame: Frame, samples: int) -> Motion | None:
-    """Of a frame that says where its camera was when the shutter closed.
+    """Return the camera's motion while the shutter was open; None: it stands still.
 
     samples: times at which what a global shutter blurs is rendered.
     """
-    if not frame.moves:
-        return None
-    shutter = frame.values.shutter or "global"
-    return Motion(frame.own.transform_matrix_close, shutter, samples)
+    close = frame.values.transform_matrix_close
+    return None if close is None else Motion(close, frame.values.shutter or "global", samples)
 
 
 def unique_names(files: Sequence[str]) -> list[str]:
-    """A name for the outputs of each ``file_path``: the file's, with its folders where needed.
+    """Return a name for the outputs of each ``file_path``: the file's, with folders where needed.
 
     Where that is not enough, or too long for a file's name, numbers precede it.
     """
@@ -452,11 +458,3 @@ def unique_names(files: Sequence[str]) -> list[str]:
     if len(set(names)) < len(names) or any(name != shortened(name) for name in names):
         names = [f"{index:04d}_{shortened(name)}" for index, name in enumerate(names)]
     return names
-
-
-def in_parallel(
-    function: Callable[..., T], *arguments: Sequence[object], threads: int | None = None
-) -> tuple[T, ...]:
-    """``map`` on threads, in order: decoding images releases Python's lock."""
-    with ThreadPoolExecutor(threads) as pool:
-        return tuple(pool.map(function, *arguments))

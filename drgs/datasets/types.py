@@ -1,34 +1,62 @@
-"""Cameras, photographs and datasets: what every loader returns."""
+"""Cameras, photographs and datasets, as every reader returns them."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, ClassVar, TypeVar
 
 import numpy as np
 
 from drgs.core.constants import SHUTTER_SAMPLES
 from drgs.core.origin import WORLD, Origin
-from drgs.datasets.lazy_image import Pixels
 
 if TYPE_CHECKING:
     from drgs.cameras.lens import Lens
 
 
 @dataclass(frozen=True, eq=False)
-class Motion:
-    """Of a camera while its shutter was open."""
+class LazyImage:
+    """An image whose numbers are computed at each access: by ``np.asarray`` or an index."""
 
-    close_to_world: np.ndarray  # (4, 4) float64, OpenCV axes: where the camera was in the end
+    shape: tuple[int, ...]  # of the array: (H, W) or (H, W, 3), float32
+    compute: Callable[[], np.ndarray]
+    nbytes: int  # that are kept; 0: those of another image
+
+    dtype: ClassVar = np.dtype(np.float32)
+
+    def __array__(self, dtype: np.dtype | None = None, copy: bool | None = None) -> np.ndarray:
+        """Return the numbers."""
+        if copy is False:
+            raise ValueError("a lazy image becomes an array only by a copy")
+        return np.asarray(self.compute(), dtype)
+
+    def __getitem__(self, index: object) -> np.ndarray:
+        """Return some of the numbers."""
+        return self.compute()[index]
+
+    def __len__(self) -> int:
+        """Return the number of rows."""
+        return self.shape[0]
+
+
+Pixels = np.ndarray | LazyImage
+"""An image of a view; ``np.asarray`` makes an array of either."""
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """Motion of a camera while its shutter is open."""
+
+    close_to_world: np.ndarray  # (4, 4) float64, OpenCV axes: the pose at the end
     shutter: str  # global: all pixels were open all the time; rolling: row after row
     samples: int = SHUTTER_SAMPLES  # global: times at which the picture is rendered
 
 
 @dataclass(frozen=True, eq=False)
 class Viewpoint:
-    """A camera in the world, and the size of its picture."""
+    """A camera in the world, and the size of its image."""
 
     name: str  # unique among those rendered together; a file name without folders or suffix
     camera_to_world: np.ndarray  # (4, 4) float64, rigid, OpenCV axes: x right, y down, z forward
@@ -53,14 +81,14 @@ class Viewpoint:
 
     @property
     def viewmat(self) -> np.ndarray:
-        """(4, 4) float64, world to camera, OpenCV axes: what ``drgs.rasterization`` takes."""
+        """(4, 4) float64, world to camera, OpenCV axes, as ``drgs.rasterization`` takes it."""
         rotation = self.camera_to_world[:3, :3].T
         viewmat = np.eye(4)
         viewmat[:3] = np.column_stack([rotation, -rotation @ self.center])
         return viewmat
 
     def moved(self: V, offset: np.ndarray) -> V:
-        """The same camera with ``offset`` (3,) added to its position."""
+        """Return the same camera with ``offset`` (3,) added to its position."""
         if not np.any(offset):
             return self
         motion = self.motion
@@ -88,21 +116,21 @@ def _translated(pose: np.ndarray, offset: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class View(Viewpoint):
-    """One photograph and the camera that took it; its pictures become arrays by ``np.asarray``."""
+    """A photograph and the camera that took it; its images become arrays by ``np.asarray``."""
 
     image: Pixels  # (height, width, 3) float32, display space 0..1, opaque
-    alpha: Pixels | None = None  # (height, width) float32: how opaque the picture was
+    alpha: Pixels | None = None  # (height, width) float32: opacity
     mask: Pixels | None = None  # (height, width) float32: 1 where a pixel counts, else 0
     depth: Pixels | None = None  # (height, width) float32, scene units; 0 where not known
-    files: Mapping[str, Path] = field(default_factory=dict)  # it was read from: image, mask, depth
+    files: Mapping[str, Path] = field(default_factory=dict)  # of image, mask, depth
 
 
 Keeps = Callable[[str], bool]
-"""Whether the pictures of the view of this name are read; of others there are sizes."""
+"""Accepts a view by its name if its images are to be read; others have only sizes."""
 
 
 def all_of_them(name: str) -> bool:
-    """Read the pictures of all views."""
+    """Accept all views."""
     del name
     return True
 
@@ -116,9 +144,9 @@ class Dataset:
     test_split: str  # name of the split that ``test`` is
     background: tuple[float, float, float]  # display space, what the images were composited over
     start_half_extent: float | None  # of the layout's own start box [-h, h]^3; None: it has none
-    description: str  # one line: what was read, and what was assumed
-    ignored: tuple[str, ...] = ()  # that frames have and the configuration leaves out: see extras
-    rendered: bool = False  # the pictures are another renderer's, not photographs
+    description: str  # one line: source and assumptions
+    ignored: tuple[str, ...] = ()  # that frames have and ``data.ignore_*`` leaves out
+    rendered: bool = False  # the images are another renderer's, not photographs
     point_cloud: Path | None = None  # that the dataset names, to start from: a PLY file
     origin: Origin = WORLD  # world: what the positions of the views are relative to
 
@@ -132,7 +160,7 @@ class Dataset:
         return _spread(self.train) or _spread((*self.train, *self.test)) or 1.0
 
     def relative_to(self, origin: Origin) -> Dataset:
-        """The same views with positions relative to ``origin``, world."""
+        """Return the same views with positions relative to ``origin``, world."""
         offset = np.subtract(self.origin, origin)
         train, test = (
             tuple(view.moved(offset) for view in views) for views in (self.train, self.test)

@@ -1,4 +1,4 @@
-"""Cameras without photographs: where new pictures of a scene are taken from.
+"""Cameras without photographs, for new images of a scene; and the point that cameras look at.
 
 Read from a file of poses, placed by hand with :func:`look_at`, or on an orbit that follows from the
 cameras of a dataset or from the Gaussians alone (``drgs.datasets.orbits``).
@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -28,12 +28,16 @@ from drgs.datasets.transforms import (
 )
 from drgs.datasets.types import Viewpoint
 
+PARALLEL_AXES = 1e-3
+"""Smallest eigenvalue of mean(I - d d^T), d the optical axes: about the mean squared sine of
+their angle to a common direction. Below this (1.8 degrees) their nearest point is noise."""
+
 FIELD_OF_VIEW = 40.0
 """Degrees, horizontal: that of the NeRF-synthetic cameras, rounded."""
 
 
 def pinhole(name: str, pose: np.ndarray, width: int, height: int, fov: float) -> Viewpoint:
-    """A camera with its principal point in the middle; fov: degrees, horizontal."""
+    """Return a camera with its principal point in the middle; fov: degrees, horizontal."""
     focal = 0.5 * width / math.tan(math.radians(fov) / 2)
     return Viewpoint(name, pose, focal, focal, width / 2, height / 2, width, height)
 
@@ -52,24 +56,18 @@ def look_at(origin: np.ndarray, target: np.ndarray, up: np.ndarray) -> np.ndarra
                 f"camera: the coordinates of {name} must be at most {MAX_COORDINATE:g} in size, "
                 f"got {shown(place)}; scale the scene down"
             )
-    given, up = up, near_one(up)
     forward = target - origin
     right = np.cross(forward, up)
     scale = np.linalg.norm(forward) * np.linalg.norm(up)
     if not np.linalg.norm(right) > 1e-6 * scale:
         raise UserError(
             f"camera: the direction from origin {shown(origin)} to target {shown(target)} must "
-            f"not be zero or parallel to up {shown(given)}"
+            f"not be zero or parallel to up {shown(up)}"
         )
     forward, right = (v / np.linalg.norm(v) for v in (forward, right))
     pose = np.eye(4)
     pose[:3] = np.stack([right, np.cross(forward, right), forward, origin], axis=1)
     return pose
-
-
-def near_one(vector: np.ndarray) -> np.ndarray:
-    """The vector times a power of two, which rounds nothing, so that its square is a number."""
-    return np.ldexp(vector, -np.frexp(np.abs(vector).max())[1])
 
 
 def field_of_view(views: Sequence[Viewpoint]) -> float:
@@ -80,23 +78,22 @@ def field_of_view(views: Sequence[Viewpoint]) -> float:
 def read_viewpoints(
     path: Path, size: tuple[int, int] | None, shutter_samples: int = SHUTTER_SAMPLES
 ) -> list[Viewpoint]:
-    """The cameras of a file in the layout of ``transforms.json``, without its pictures.
+    """Return the cameras of a file in the layout of ``transforms.json``, without its images.
 
     ``camera_angle_x``, or ``fl_x`` in pixels of ``w`` (and ``fl_y`` and ``cy`` of ``h``, ``cx`` of
     ``w``), and lens distortion, at the top or, overriding that, in a frame; a second pose in a
-    frame. size: width and height, px; None for those that the file gives. shutter_samples: times at
-    which what motion blurs is rendered.
+    frame. size: width and height, px; None for those of the file. shutter_samples: times at which
+    motion blur is rendered.
 
     Raises :class:`UserError` naming the file, the key, what was expected and what was got.
     """
     meta = read_transforms(path)
     if meta.unread:
         warnings.warn(UserNote(note_unread(meta.path, meta.unread)), stacklevel=2)
-    frames = meta.frames
-    digits = len(str(len(frames) - 1))
+    digits = len(str(len(meta.frames) - 1))
     return [
         _viewpoint_of(frame, f"camera_{index:0{digits}d}", size, shutter_samples)
-        for index, frame in enumerate(frames)
+        for index, frame in enumerate(meta.frames)
     ]
 
 
@@ -104,36 +101,66 @@ def _viewpoint_of(
     frame: Frame, name: str, size: tuple[int, int] | None, shutter_samples: int
 ) -> Viewpoint:
     values = frame.values
+
+    def value_of(key: str, remedy: str) -> float:
+        if (value := getattr(values, key)) is None:
+            raise UserError(f"{frame.where(key)} is missing; {remedy}")
+        return value
+
     if size is None:
-        missing = [key for key in ("w", "h") if getattr(values, key) is None]
-        if missing:
-            where = frame.where(missing[0])
-            raise UserError(f"{where} is missing; give --size WIDTH HEIGHT instead")
-        size = max(1, round(values.w)), max(1, round(values.h))
+        given = (value_of(side, "give --size WIDTH HEIGHT instead") for side in ("w", "h"))
+        size = tuple(max(1, round(side)) for side in given)
     width, height = size
 
-    def scaled(value: float, given: str, to: int) -> float:
-        """From px of the file's picture to px of the one that is wanted."""
-        if (of := getattr(values, given)) is None:
-            raise UserError(f"{frame.where(given)} is missing; the file's other numbers need it")
-        return to * value / of
+    def scaled(key: str, side: str, check: Callable[[float, str, int], float]) -> float:
+        """Return px of the wanted image from px of the file's."""
+        pixels = width if side == "w" else height
+        of = value_of(side, "the file's other numbers need it")
+        return check(pixels * getattr(values, key) / of, frame.where(key), pixels)
 
+    cx, cy = width / 2, height / 2
     if values.fl_x is not None:
-        focal = focal_length(scaled(values.fl_x, "w", width), frame.where("fl_x"), width)
-    elif values.camera_angle_x is not None:
-        focal = focal_from_angle(values.camera_angle_x, width)
+        focal = scaled("fl_x", "w", focal_length)
     else:
-        raise UserError(f"{frame.where('camera_angle_x')} (or fl_x with w) is missing")
-    focal_y, cx, cy = focal, width / 2, height / 2
-    if values.fl_x is not None and values.fl_y is not None:
-        focal_y = focal_length(scaled(values.fl_y, "h", height), frame.where("fl_y"), height)
+        focal = focal_from_angle(value_of("camera_angle_x", "or give fl_x with w"), width)
+    has_fl_y = values.fl_x is not None and values.fl_y is not None
+    focal_y = scaled("fl_y", "h", focal_length) if has_fl_y else focal
     if values.cx is not None and values.cy is not None:
-        cx = principal_point(scaled(values.cx, "w", width), frame.where("cx"), width)
-        cy = principal_point(scaled(values.cy, "h", height), frame.where("cy"), height)
+        cx, cy = (scaled(key, side, principal_point) for key, side in (("cx", "w"), ("cy", "h")))
     pose, lens, motion = values.transform_matrix, lens_of(frame), motion_of(frame, shutter_samples)
     return Viewpoint(name, pose, focal, focal_y, cx, cy, width, height, lens, motion)
 
 
 def shown(vector: np.ndarray) -> str:
-    """A vector as messages write it."""
+    """Return a vector as messages write it."""
     return f"({', '.join(f'{v:g}' for v in vector)})"
+
+
+def focus_of(views: Sequence[Viewpoint]) -> tuple[np.ndarray, float]:
+    """Return the point (3,) nearest to all optical axes, and its distance from the cameras.
+
+    Minimises sum_i |(I - d_i d_i^T)(p - c_i)|^2 over p, with c_i the centres and d_i the axes;
+    the distance is the median of |p - c_i|.
+
+    Raises :class:`UserError` where the axes do not determine it or diverge.
+    """
+    centers = np.stack([view.center for view in views])
+    axes = np.stack([view.camera_to_world[:3, 2] for view in views])
+    projectors = np.eye(3) - axes[:, :, None] * axes[:, None, :]
+    normal = projectors.mean(axis=0)
+    if len(views) == 1:
+        raise _no_focus("one training camera, which does not tell how far away it looks")
+    if np.linalg.eigvalsh(normal)[0] < PARALLEL_AXES:
+        raise _no_focus("the cameras, whose optical axes are parallel")
+    focus = np.linalg.solve(normal, np.einsum("nij,nj->i", projectors, centers) / len(views))
+    depths = np.einsum("ni,ni->n", focus - centers, axes)
+    if np.median(depths) <= 1e-6 * np.abs(centers - focus).max():
+        raise _no_focus("the cameras, which look away from each other")
+    return focus, float(np.median(np.linalg.norm(focus - centers, axis=1)))
+
+
+def _no_focus(cameras: str) -> UserError:
+    return UserError(
+        f"init.half_extent: no start box can be derived from {cameras}; set init.half_extent, or "
+        "give a point cloud (init.point_cloud)"
+    )

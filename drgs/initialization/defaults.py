@@ -1,4 +1,4 @@
-"""What a configuration leaves to the dataset: values that are null until it has been read."""
+"""Defaults that follow from the dataset: values of a configuration that are null until then."""
 
 from __future__ import annotations
 
@@ -9,41 +9,41 @@ import numpy as np
 from drgs.config.changes import changed
 from drgs.config.schema import NAMED_COLORS, REFERENCE_NEAR, FitConfig
 from drgs.core.errors import UserError
-from drgs.datasets.focus import focus_of
-from drgs.datasets.types import Dataset, View
+from drgs.datasets.types import Dataset
+from drgs.datasets.viewpoints import focus_of
 
 NEAR_SHARE = 0.04
-"""Of the cameras' distance to what they look at, rounded to one digit: the near plane. It gives the
-reference's 0.2 for NeRF-synthetic scenes, whose distance is 4.03, as well as for distances of 4 to
-6, which photographs often have in COLMAP's unit of length."""
+"""Share of the cameras' distance to what they look at, rounded to one digit: the near plane. It
+gives the reference's 0.2 for NeRF-synthetic scenes, whose distance is 4.03, as well as for
+distances of 4 to 6, which photographs often have in COLMAP's unit of length."""
 
 NEAR_RANGE = (1e-9, 1e9)
-"""Scene units: what a configuration accepts."""
+"""Scene units that a configuration accepts."""
 
-FARTHEST_NEAR = 0.5
-"""Of that distance: a near plane beyond it would cut into what is looked at."""
+MAX_NEAR_SHARE = 0.5
+"""Share of that distance beyond which a near plane would cut into what is looked at."""
 
 GAUSSIANS_PER_PIXEL_OF_SIDE = 250
-"""Numbers of Gaussians that strategies grow to are in proportion to the pictures' sides."""
+"""Numbers of Gaussians that strategies grow to are in proportion to the images' sides."""
 
 SHARE_AT_START, REFERENCE_POINTS = 0.4, 100_000
-"""Of such a number, how many a fit starts with; and how many where there is no such number."""
+"""Share of such a number that a fit starts with; and its number where there is no such number."""
 
 COARSE_SHARE = 0.35
-"""Of a fit's iterations, those that see photographs at half their size: see ``bench recipes``."""
+"""Share of a fit's iterations with photographs at half their size: see ``bench recipes``."""
 
-LEAST_SIDE = 100
-"""px: of photographs that are made smaller still. SSIM's window is 11 px wide."""
+LEAST_COARSE_SIDE_PX = 100
+"""Smallest side of photographs that are made smaller still. SSIM's window is 11 px wide."""
 
-ALPHA_LOOKED_AT = 15
-"""Pictures, at most, that tell whether a dataset's are cut out."""
+NUM_ALPHA_VIEWS = 15
+"""Images, at most, by which a dataset is judged to be cut out."""
 
 
-def completed(config: FitConfig, dataset: Dataset) -> FitConfig:
-    """``config`` with background, near plane, numbers and coarse stages as ``dataset`` has them.
+def resolve_defaults(config: FitConfig, dataset: Dataset) -> FitConfig:
+    """Return ``config`` with background, near plane, numbers and coarse stages from ``dataset``.
 
-    Those that are given stay. Raises :class:`UserError` for a near plane behind which there is
-    nothing left to look at, and for steps of more views than there are.
+    Given values stay. Raises :class:`UserError` for a near plane too close to what the cameras look
+    at, and for steps of more views than there are.
     """
     count = len(dataset.train)
     if 0 < count < config.optimizer.views_per_step:
@@ -56,30 +56,32 @@ def completed(config: FitConfig, dataset: Dataset) -> FitConfig:
         names = {color: name for name, color in NAMED_COLORS.items()}
         background = tuple(map(float, dataset.background))
         changes["data.background"] = names.get(background, background)
+    distance = _viewing_distance(dataset)
     if config.model.near is None:
-        changes["model.near"] = _near_plane(dataset)
-    else:
-        _check_near_plane(config.model.near, dataset)
+        near = float(f"{np.clip(NEAR_SHARE * distance, *NEAR_RANGE):.1g}")
+        changes["model.near"] = near if count else REFERENCE_NEAR
+    elif count and config.model.near > MAX_NEAR_SHARE * distance:
+        raise UserError(
+            f"model.near must be less than half of the distance from the cameras to what they look "
+            f"at, {distance:.3g}, got {config.model.near:g}; model.near=null lets it follow from "
+            "the cameras"
+        )
     changes |= _numbers_of_gaussians(config, dataset)
     if config.coarse is None:
         changes["coarse"] = _coarse_stages(config, dataset)
     return changed(config, changes) if changes else config
 
 
-def _near_plane(dataset: Dataset) -> float:
-    if not dataset.train:
-        return REFERENCE_NEAR
-    return float(f"{np.clip(NEAR_SHARE * _viewing_distance(dataset), *NEAR_RANGE):.1g}")
-
-
 def _numbers_of_gaussians(config: FitConfig, dataset: Dataset) -> dict[str, object]:
-    """At the start and in the end, those of them that are not given."""
+    """Return the numbers at the start and in the end that are not given."""
     changes: dict[str, object] = {}
     densify, at_start = config.densify, REFERENCE_POINTS
     if densify.strategy in ("budget", "mcmc"):
         goal = getattr(densify, densify.strategy).gaussians
         if goal is None:
-            goal = max(_suitable_number(dataset), config.init.num_points or 0)
+            sides = [math.sqrt(view.width * view.height) for view in dataset.train]
+            suitable = round(GAUSSIANS_PER_PIXEL_OF_SIDE * float(np.mean(sides or [1])))
+            goal = max(4, suitable, config.init.num_points or 0)
             changes[f"densify.{densify.strategy}.gaussians"] = goal
         at_start = max(4, round(SHARE_AT_START * goal))
     if config.init.num_points is None:
@@ -87,51 +89,33 @@ def _numbers_of_gaussians(config: FitConfig, dataset: Dataset) -> dict[str, obje
     return changes
 
 
-def _suitable_number(dataset: Dataset) -> int:
-    sides = [math.sqrt(view.width * view.height) for view in dataset.train]
-    return max(4, round(GAUSSIANS_PER_PIXEL_OF_SIDE * float(np.mean(sides or [1]))))
-
-
 def _coarse_stages(config: FitConfig, dataset: Dataset) -> list[dict[str, int]]:
-    """Photographs are fitted coarse first: what is far off begins anywhere.
+    """Return coarse stages for photographs, in which distant Gaussians begin anywhere.
 
-    What is cut out of its pictures begins where it is.
+    None for what is cut out of its images, which begins where it is.
     """
     until = round(COARSE_SHARE * config.iterations)
     sides = [min(view.width, view.height) for view in dataset.train]
-    is_small = min(sides, default=0) < LEAST_SIDE
+    is_small = min(sides, default=0) < LEAST_COARSE_SIDE_PX
     if config.densify.strategy == "adc" or until < 1 or is_small or _is_cut_out(dataset):
         return []
     return [{"until": until, "factor": 2}]
 
 
 def _is_cut_out(dataset: Dataset) -> bool:
-    """Whether most of some pictures are transparent where there is nothing to fit."""
-    some = dataset.train[:: -(-len(dataset.train) // ALPHA_LOOKED_AT) or 1]
-    return sum(map(_is_transparent, some)) > len(some) / 2
-
-
-def _is_transparent(view: View) -> bool:
-    if view.alpha is None:
-        return False
+    """Return whether most of some images are transparent in part."""
     from drgs.initialization.visual_hull import LEAST_TRANSPARENT, TRANSPARENT
 
-    return float(np.mean(np.asarray(view.alpha) <= TRANSPARENT)) >= LEAST_TRANSPARENT
-
-
-def _check_near_plane(near: float, dataset: Dataset) -> None:
-    if not dataset.train:
-        return
-    distance = _viewing_distance(dataset)
-    if near > FARTHEST_NEAR * distance:
-        raise UserError(
-            f"model.near must be less than half of the distance from the cameras to what they look "
-            f"at, {distance:.3g}, got {near:g}; model.near=null lets it follow from the cameras"
-        )
+    some = dataset.train[:: -(-len(dataset.train) // NUM_ALPHA_VIEWS) or 1]
+    alphas = [np.asarray(view.alpha) for view in some if view.alpha is not None]
+    shares = [float(np.mean(alpha <= TRANSPARENT)) for alpha in alphas]
+    return sum(share >= LEAST_TRANSPARENT for share in shares) > len(some) / 2
 
 
 def _viewing_distance(dataset: Dataset) -> float:
-    """From the cameras to what they look at; the scene's extent where they look nowhere."""
+    """Return the cameras' distance to what they look at; without a focus, the scene's extent."""
+    if not dataset.train:
+        return 1.0
     try:
         return focus_of(dataset.train)[1]
     except UserError:

@@ -1,4 +1,4 @@
-"""The Gaussians that a fit starts from: on a visual hull, of a point cloud, or at random points."""
+"""Initial Gaussians of a fit: on a visual hull, of a point cloud, or at random points."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from drgs.core.denormals import denormals_kept
 from drgs.core.errors import UserError
 from drgs.datasets.types import Dataset
 from drgs.gaussians.parameters import Gaussians
-from drgs.initialization.defaults import completed
+from drgs.initialization.defaults import resolve_defaults
 from drgs.initialization.start_box import (
     FARTHEST,
     LEAST_LOOKING,
@@ -39,80 +39,81 @@ their middle. The 3DGS reference has 3.2e-4 world units, for scenes of about tha
 
 NUM_NEIGHBOURS = 3
 
-POINTS_OF_COLMAP = ("points3D.bin", "points3D.txt")
-"""Names of files that hold not only positions and colours."""
+COLMAP_POINT_FILES = ("points3D.bin", "points3D.txt")
+"""Names of files with errors and observations of points besides positions and colours."""
 
 
 @dataclass(frozen=True, eq=False)
 class Start:
-    """Where a fit starts."""
+    """Initial points of a fit."""
 
     means: np.ndarray  # (N, 3) world
     colors: np.ndarray | None  # (N, 3) display space 0..1; None: not known
-    description: str  # what they are, for the user
+    description: str  # for the user
 
 
 def initial_gaussians(config: FitConfig, dataset: Dataset) -> Gaussians:
-    """Gaussians at iteration 0, numpy float32, with the SH degree of ``config.model``.
+    """Return Gaussians at iteration 0, numpy float32, with the SH degree of ``config.model``.
 
     At the points of :func:`start_of`, with the opacity and the scale of ``config.init``.
     """
-    config = completed(config, dataset)
+    config = resolve_defaults(config, dataset)
     return replace(gaussians_at(start_of(config, dataset), config), origin=dataset.origin)
 
 
 def gaussians_at(start: Start, config: FitConfig) -> Gaussians:
-    """Those of :func:`initial_gaussians`."""
+    """Return the Gaussians of :func:`initial_gaussians` at given points."""
     init, degree = config.init, config.model.sh_degree
     return gaussians_from_points(start.means, start.colors, init.opacity, degree, init.scale)
 
 
 def start_of(config: FitConfig, dataset: Dataset) -> Start:
-    """The points that a fit starts from, as ``config.init`` says. The same seed gives the same.
+    """Return the points that a fit starts from, by ``config.init``. The same seed gives the same.
 
-    config: completed.
+    config: with resolved defaults.
 
     By default: ``init.point_cloud``; else uniform in [-h, h]^3 with ``init.half_extent``; else on
-    the visual hull, where nearly all pictures are partly transparent; else the point cloud that the
+    the visual hull, where nearly all images are partly transparent; else the point cloud that the
     dataset names; else uniform in a box that follows from the layout and the cameras
     (``drgs.initialization.start_box``). Points on the hull, and those of a cloud without
-    colours, are coloured from the pictures. Where masks contradict each other, the
-    description says so, and the fit starts as without them.
+    colours, are coloured from the images. Where masks contradict each other, the fit starts as
+    without them, and the description says so.
 
     Raises :class:`UserError` for points that the cameras do not see, and for masks or a point cloud
-    that are asked for and not there.
+    that ``init.start`` requires and that are not there.
     """
     init, note = config.init, ""
     is_open = init.start == "auto" and init.point_cloud is None and init.half_extent is None
     if init.start == "masks" or (is_open and any(v.alpha is not None for v in dataset.train)):
-        from drgs.initialization.visual_hull import are_masks, silhouettes_of
+        from drgs.initialization.visual_hull import are_masks, num_transparent, silhouettes_of
 
         silhouettes = silhouettes_of(dataset.train)
         if are_masks(silhouettes, dataset.train):
-            if (start := _on_the_hull(config, dataset, silhouettes)) is not None:
+            if (start := _on_hull(config, dataset, silhouettes)) is not None:
                 _check_unfiltered(init, start.description)
                 return start
             note = f" (the masks of {len(silhouettes)} pictures have no hull to start from)"
         elif init.start == "masks":
             raise UserError(
                 "init.start: masks needs nearly all training pictures to be transparent where "
-                f"there is nothing, but {_transparent(silhouettes, dataset)}; cut out what is to "
-                "be fitted, or set init.start=auto"
+                "there is nothing, from cameras that stand still, but only "
+                f"{num_transparent(silhouettes)} are; cut out what is to be fitted, or set "
+                "init.start=auto"
             )
     cloud = _cloud_of(init, dataset)
-    if cloud is None or cloud.name not in POINTS_OF_COLMAP:
+    if cloud is None or cloud.name not in COLMAP_POINT_FILES:
         _check_unfiltered(init, "random points" if cloud is None else str(cloud))
     start = _random_points(config, dataset) if cloud is None else _of_cloud(config, dataset, cloud)
     return replace(start, description=start.description + note)
 
 
 def description_of_start(config: FitConfig, start: Start) -> str:
-    """What a fit starts from and where its near plane is, one line; config: completed."""
+    """Describe a start and the near plane in one line; config: with resolved defaults."""
     return f"starts from {start.description}; near plane at {config.model.near:g}"
 
 
 def _cloud_of(init: InitConfig, dataset: Dataset) -> Path | None:
-    """The file that a fit starts from; None: random points."""
+    """Return the file that a fit starts from; None: random points."""
     if init.start == "random":
         return None
     if init.point_cloud is not None or init.half_extent is not None:
@@ -126,19 +127,19 @@ def _cloud_of(init: InitConfig, dataset: Dataset) -> Path | None:
 
 
 def _check_unfiltered(init: InitConfig, start: str) -> None:
-    """Raise :class:`UserError` where COLMAP's points are to be filtered; start: what is used."""
+    """Raise :class:`UserError` where COLMAP's points are to be filtered, but are not used."""
     for name in ("max_point_error", "min_track_length"):
         if getattr(init, name) is not None:
             raise UserError(
-                f"init.{name}: only COLMAP's points ({' or '.join(POINTS_OF_COLMAP)}) say that, "
+                f"init.{name}: only COLMAP's points ({' or '.join(COLMAP_POINT_FILES)}) have that, "
                 f"and the fit starts from {start}; leave it out"
             )
 
 
-def _on_the_hull(
+def _on_hull(
     config: FitConfig, dataset: Dataset, silhouettes: Sequence[Silhouette]
 ) -> Start | None:
-    """On the visual hull of the masks; None: they have none."""
+    """Return points on the visual hull of the masks; None: it is empty."""
     from drgs.initialization.visual_hull import hull_points
 
     try:
@@ -151,11 +152,10 @@ def _on_the_hull(
     if len(means) <= NUM_NEIGHBOURS:
         return None
     what = f"{len(means):,} points on the hull of {len(silhouettes)} masks"
-    return _coloured(Start(means.astype(np.float32), None, what), dataset)
+    return _colored(Start(means.astype(np.float32), None, what), dataset)
 
 
 def _of_cloud(config: FitConfig, dataset: Dataset, cloud: Path) -> Start:
-    """The points of a file."""
     means, colors, num_read = _read_cloud(config.init, cloud)
     means = (means - dataset.origin).astype(np.float32)
     if colors is not None and not np.any(colors):
@@ -163,12 +163,12 @@ def _of_cloud(config: FitConfig, dataset: Dataset, cloud: Path) -> Start:
     _check_cloud(cloud, means, config.densify.max_gaussians, dataset)
     kept = "the" if len(means) == num_read else f"{len(means):,} of {num_read:,}"
     start = Start(means, colors, f"{kept} points of {cloud}")
-    return _coloured(start, dataset) if colors is None else start
+    return _colored(start, dataset) if colors is None else start
 
 
 def _read_cloud(init: InitConfig, cloud: Path) -> tuple[np.ndarray, np.ndarray | None, int]:
     """Positions (N, 3) float64, world, colours (N, 3) float32, 0..1, and the number read."""
-    if cloud.name not in POINTS_OF_COLMAP:
+    if cloud.name not in COLMAP_POINT_FILES:
         positions, colors = read_points(cloud)
         return positions, colors, len(positions)
     from drgs.io.colmap import read_points3d
@@ -191,7 +191,7 @@ def _read_cloud(init: InitConfig, cloud: Path) -> tuple[np.ndarray, np.ndarray |
 
 
 def _random_points(config: FitConfig, dataset: Dataset) -> Start:
-    """In a box, or in what the cameras see."""
+    """Return random points in a box, or in all that the cameras see."""
     init, rng = config.init, np.random.default_rng(config.seed)
     box = box_to_start_in(init, dataset)
     if box is not None:
@@ -205,8 +205,8 @@ def _random_points(config: FitConfig, dataset: Dataset) -> Start:
     return Start(means, None, what)
 
 
-def _coloured(start: Start, dataset: Dataset) -> Start:
-    """With the colours that the pictures show, if they show any of the points."""
+def _colored(start: Start, dataset: Dataset) -> Start:
+    """Return the start with the colours of the images, if they show any of the points."""
     from drgs.initialization.point_colors import colors_from_pictures
 
     spacing = np.sqrt(mean_squared_neighbour_distance(start.means))
@@ -216,16 +216,6 @@ def _coloured(start: Start, dataset: Dataset) -> Start:
     return replace(start, colors=colors, description=f"{start.description}, coloured")
 
 
-def _transparent(silhouettes: Sequence[Silhouette], dataset: Dataset) -> str:
-    """How many of the pictures are, for a message."""
-    from drgs.initialization.visual_hull import LEAST_TRANSPARENT, looked_at, num_transparent
-
-    return (
-        f"only {num_transparent(silhouettes)} of {len(looked_at(dataset.train))} are to "
-        f"{100 * LEAST_TRANSPARENT:g} % or more, from a camera that stands still"
-    )
-
-
 def gaussians_from_points(
     means: np.ndarray,
     colors: np.ndarray | None,
@@ -233,7 +223,7 @@ def gaussians_from_points(
     sh_degree: int,
     scale: float = 1.0,
 ) -> Gaussians:
-    """Isotropic Gaussians at ``means`` (N, 3), N >= 4, as large as the gaps between them.
+    """Return isotropic Gaussians at ``means`` (N, 3), N >= 4, as large as the gaps between them.
 
     The standard deviation is ``scale`` times the root mean square distance to the 3 nearest other
     points, which is that of the 3DGS reference (``distCUDA2``). ``colors`` (N, 3) in display space
@@ -243,7 +233,7 @@ def gaussians_from_points(
     means = np.ascontiguousarray(means, np.float32)
     colors = np.full((num, 3), 0.5) if colors is None else colors
     spacing = np.sqrt(mean_squared_neighbour_distance(means))
-    spacing = np.maximum(spacing, MIN_SPACING * _size_of(means))
+    spacing = np.maximum(spacing, MIN_SPACING * _median_radius(means))
     log_scales = np.repeat(np.log(scale * spacing)[:, None], 3, axis=1)
     sh0 = (np.asarray(colors, np.float64) - 0.5) / SH_C0
     return Gaussians(
@@ -256,8 +246,8 @@ def gaussians_from_points(
     )
 
 
-def _size_of(points: np.ndarray) -> float:
-    """The median distance of points (N, 3) from their middle, or the largest where that is 0."""
+def _median_radius(points: np.ndarray) -> float:
+    """Return the median distance of points (N, 3) from their middle; the largest if that is 0."""
     points = points.astype(np.float64)
     distances = np.linalg.norm(points - np.median(points, axis=0), axis=1)
     return float(np.median(distances) or distances.max())
@@ -274,7 +264,7 @@ def mean_squared_neighbour_distance(points: np.ndarray) -> np.ndarray:
 
 
 def _check_cloud(file: Path, points: np.ndarray, max_gaussians: int, dataset: Dataset) -> None:
-    """Refuse a cloud (N, 3) of too few or too many points, or that is not what is photographed."""
+    """Raise UserError for too few or too many points (N, 3), or those of another scene."""
     num, views = len(points), dataset.train
     if num <= NUM_NEIGHBOURS:
         raise UserError(f"{file}: at least {NUM_NEIGHBOURS + 1} points, got {num}")

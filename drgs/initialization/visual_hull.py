@@ -1,12 +1,13 @@
-"""Points on the visual hull: what no picture shows empty, from how opaque the pictures are.
+"""Points on the visual hull of the images' silhouettes, from their alpha channels.
 
-The visual hull (Laurentini 1994) is the largest body with the pictures' silhouettes. An octree
-finds its surface as in Szeliski, "Rapid octree construction from image sequences" (1993): a cube is
-outside if some picture shows only transparent pixels at its place, and inside if no picture shows
-one; what is neither is on the surface, and divided.
+The visual hull (Laurentini 1994) is the largest body with these silhouettes. An octree finds its
+surface as in Szeliski, "Rapid octree construction from image sequences" (1993): a cube is outside
+if some image shows only transparent pixels at its place, inside if no image shows one, and else on
+the surface, and divided.
 
-A cube's place in a picture is a box of pixels that holds all of it, so that no part of the hull is
-lost however thin it is. What is opaque in such a box is counted by a summed-area table (Crow 1984).
+A cube's place in an image is a box of pixels that contains all of it, so that no part of the hull
+is lost however thin it is. Opaque pixels in such a box are counted by a summed-area table (Crow
+1984).
 """
 
 from __future__ import annotations
@@ -24,61 +25,44 @@ from drgs.initialization.film import Columns, is_projectable, to_camera, to_film
 from drgs.initialization.start_box import Box
 
 TRANSPARENT = 4 / 255
-"""Alpha: what is no more opaque than this is empty. Mattes have noise."""
+"""Alpha up to which a pixel is empty. Mattes have noise."""
 
 SOLID = 0.5
-"""Alpha: what is less opaque is mostly beside what there is. A point in there would be too far out;
-parts that are nowhere more opaque are found as those are that are too thin to be hit."""
+"""Least alpha of pixels that show points: others are mostly beside what there is. Parts that are
+nowhere more opaque are found as thin parts are."""
 
 LEAST_TRANSPARENT = 0.02
-"""Of a picture whose alpha is a mask. Corners that are empty since distortion was removed are less
-of most."""
+"""Transparent share of an image whose alpha is a mask. Corners that are empty since distortion was
+removed are less of most."""
 
-NEARLY_ALL = 0.95
-"""Of the pictures, those that must have a mask."""
+LEAST_MASKED, LEAST_VIEWS = 0.95, 3
+"""Share and number of the views that must have a mask. With fewer, a hull is mostly the cones that
+they see."""
 
-LEAST_VIEWS = 3
-"""With fewer, a hull is mostly the cones that they see."""
-
-MOST_VIEWS = 120
-"""Whose silhouettes are looked at: more say little more about a hull, and take as long again."""
-
-MOST_PIXELS = 512
-"""Width and height of a silhouette: of a larger picture, pixels are taken together."""
+MAX_VIEWS, MAX_SIDE = 120, 512
+"""Number of silhouettes, and pixels along their sides: of larger images, pixels are merged."""
 
 LEAST_SEEN = 0.5
-"""Of the views, those that must see a cube: what the others do not see, they cannot show empty."""
+"""Share of the views that must see a cube: others cannot show it empty."""
 
 ROOTS = 16
 """Cubes along the longest side of the box that is divided first."""
 
-COARSE = 4000
-"""Cubes on the surface that are enough to know the hull's box, and its area to a few per cent."""
+COARSE_CUBES, COARSE_LEVELS = 4000, 7
+"""Cubes on the surface that are enough to know the hull's box, and its area to a few per cent; and
+divisions, at most, to find so many: of a box 2,048 times as wide as the hull."""
 
-COARSE_LEVELS = 7
-"""Divisions, at most, to find so many: of a box 2,048 times as wide as what is in it."""
+SPARE, MAX_CUBES = 1.25, 3
+"""In wanted numbers of points: the number promised by the first division, as some are left out; and
+cubes that are divided into eight, at most. Silhouettes of noise have a surface everywhere."""
 
-SPARE = 1.25
-"""Of the wanted number of points: what the first division promises, as some are left out."""
+SHELL, MARGIN = 1.2, 1.6
+"""Edge of a cube around a point on the surface, some pixel of which an image shows empty, in point
+distances; and how far cubes are widened so that half-empty ones contain all of that shell."""
 
-MOST_CUBES = 3
-"""Of the wanted number of points: cubes that are divided into eight, at most. Silhouettes of noise
-have a surface everywhere."""
-
-SHELL = 1.2
-"""Of the points' distance to each other: edge of a cube around a point on the surface, which some
-picture shows half empty."""
-
-MARGIN = 1.6
-"""Times the edge of a cube: all of the shell is in cubes that are half empty when they are widened
-by this."""
-
-THIN = 1.5
-"""Edges of a cube: one so far from all points of the hull is a part of it too thin to be hit."""
-
-THIN_LEVELS = 3
-"""Divisions of such a cube, after which it is known well enough whether there is one; fewer where
-there are many, which are noise."""
+THIN, THIN_LEVELS = 1.5, 3
+"""Edges of a cube: one so far from all points of the hull is a part of it too thin to be hit; and
+divisions, at most, that tell whether it is one. Where there are many, they are noise."""
 
 CHUNK = 1 << 15
 """Cubes that are projected at once: their numbers stay in the processor's cache."""
@@ -86,17 +70,17 @@ CHUNK = 1 << 15
 
 @dataclass(frozen=True, eq=False)
 class Silhouette:
-    """Which pixels of a view show something; the pixels are ``scale`` px of the view's wide."""
+    """Opaque pixels of a view; ``scale`` of the view's pixels wide."""
 
     view: View
     scale: int
     solid: np.ndarray  # (rows, columns) bool: opaque to a half at least
     table: np.ndarray  # (rows + 1, columns + 1) int32: opaque pixels above and to the left
-    transparent: float  # part of the picture
+    transparent: float  # share of the image
 
 
 def silhouettes_of(views: Sequence[View]) -> list[Silhouette]:
-    """Those of the views that are looked at and have alpha, and whose camera stands still.
+    """Return silhouettes of views that have alpha and whose camera stands still.
 
     A pixel that a mask leaves out is not known to be empty, and so is part of the silhouette.
     """
@@ -106,7 +90,7 @@ def silhouettes_of(views: Sequence[View]) -> list[Silhouette]:
 
 def looked_at(views: Sequence[View]) -> Sequence[View]:
     """All of them, or every n-th of many."""
-    return views[:: -(-len(views) // MOST_VIEWS) or 1]
+    return views[:: -(-len(views) // MAX_VIEWS) or 1]
 
 
 def _silhouette(view: View) -> Silhouette:
@@ -117,7 +101,7 @@ def _silhouette(view: View) -> Silhouette:
         unknown = np.asarray(view.mask) == 0
         opaque |= unknown
         solid |= unknown
-    scale = -(-max(opaque.shape) // MOST_PIXELS)
+    scale = -(-max(opaque.shape) // MAX_SIDE)
     opaque, solid = (_any_of(pixels, scale) for pixels in (opaque, solid))
     table = np.zeros((opaque.shape[0] + 1, opaque.shape[1] + 1), np.int32)
     np.cumsum(opaque, axis=0, dtype=np.int32, out=table[1:, 1:])
@@ -126,26 +110,26 @@ def _silhouette(view: View) -> Silhouette:
 
 
 def _any_of(pixels: np.ndarray, scale: int) -> np.ndarray:
-    """Whether any pixel is set in squares of ``scale``; the last ones may be smaller."""
+    """Return whether any pixel is set in squares of ``scale``; the last ones may be smaller."""
     for axis in (0, 1):
         pixels = np.logical_or.reduceat(pixels, np.arange(0, pixels.shape[axis], scale), axis)
     return pixels
 
 
 def num_transparent(silhouettes: Sequence[Silhouette]) -> int:
-    """How many are those of a picture that is partly transparent."""
+    """Return how many are of images that are partly transparent."""
     return sum(s.transparent >= LEAST_TRANSPARENT for s in silhouettes)
 
 
 def are_masks(silhouettes: Sequence[Silhouette], views: Sequence[View]) -> bool:
-    """Whether the alpha of the pictures, whose views are ``views``, says what is to be fitted."""
-    wanted = NEARLY_ALL * len(looked_at(views))
+    """Return whether the alpha of nearly all ``views`` cuts out what is to be fitted."""
+    wanted = LEAST_MASKED * len(looked_at(views))
     return num_transparent(silhouettes) >= max(LEAST_VIEWS, wanted)
 
 
 @dataclass(frozen=True, eq=False)
 class Cubes:
-    """Some cubes of a grid along the world's axes."""
+    """Cubes of a grid along the world's axes."""
 
     low: np.ndarray  # (3,) float64, world: the corner of cube (0, 0, 0)
     edge: float  # scene units
@@ -153,7 +137,7 @@ class Cubes:
 
     @staticmethod
     def filling(low: np.ndarray, high: np.ndarray, edge: float) -> Cubes:
-        """All that are needed to fill the box from ``low`` to ``high``."""
+        """Return the cubes that fill the box from ``low`` to ``high``."""
         counts = np.maximum(1, np.ceil((high - low) / edge - 1e-6)).astype(np.int64)
         low = (low + high - edge * counts) / 2
         return Cubes(low, edge, np.argwhere(np.ones(counts, bool)))
@@ -166,13 +150,13 @@ class Cubes:
         return self.low + self.edge * (self.index + 0.5)
 
     def divided(self) -> Cubes:
-        """Eight in the place of each."""
+        """Return eight cubes in the place of each."""
         eighths = np.argwhere(np.ones((2, 2, 2), bool))
         index = (2 * self.index[:, None] + eighths).reshape(-1, 3)
         return Cubes(self.low, self.edge / 2, index)
 
     def chosen(self, rows: np.ndarray) -> Cubes:
-        """Some of them; rows: a mask or indices."""
+        """Return some of the cubes; rows: a mask or indices."""
         return Cubes(self.low, self.edge, self.index[rows])
 
 
@@ -180,12 +164,12 @@ def hull_points(silhouettes: Sequence[Silhouette], box: Box, count: int, seed: i
     """(M, 3) float64, world: points on the surface of the visual hull within ``box``.
 
     At most ``count``, about evenly spread, each at a random place within a cube of its own: M is
-    about ``count``, unless pictures contradict each other and there is no hull, which is M = 0.
+    about ``count``, unless images contradict each other and there is no hull, which is M = 0.
     The same seed gives the same points.
     """
     corners = box.center - box.half_extent, box.center + box.half_extent
     coarse = Cubes.filling(*corners, 2 * box.half_extent / ROOTS)
-    coarse = _surface(silhouettes, coarse, COARSE_LEVELS, COARSE)
+    coarse = _surface(silhouettes, coarse, COARSE_LEVELS, COARSE_CUBES)
     points = _points_in(silhouettes, coarse, seed)
     if not len(points):
         return points
@@ -194,7 +178,7 @@ def hull_points(silhouettes: Sequence[Silhouette], box: Box, count: int, seed: i
     low, high = (c + s * coarse.edge / 2 for c, s in ((centers.min(0), -1), (centers.max(0), 1)))
     levels = max(0, int(np.ceil(np.log2((high - low).max() / (ROOTS * edge)))))
     cubes = Cubes.filling(low, high, edge * 2**levels)
-    cubes = _surface(silhouettes, cubes, levels, MOST_CUBES * count)
+    cubes = _surface(silhouettes, cubes, levels, MAX_CUBES * count)
     points = _points_in(silhouettes, cubes, seed)
     points = points[(np.abs(points - box.center) <= box.half_extent).all(axis=1)]
     chosen = np.random.Generator(np.random.Philox(key=seed)).permutation(len(points))[:count]
@@ -202,7 +186,7 @@ def hull_points(silhouettes: Sequence[Silhouette], box: Box, count: int, seed: i
 
 
 def _surface(silhouettes: Sequence[Silhouette], cubes: Cubes, levels: int, enough: int) -> Cubes:
-    """Those on the surface, after ``levels`` divisions, or as soon as there are ``enough``."""
+    """Return cubes on the surface after ``levels`` divisions, or when there are ``enough``."""
     for level in range(levels + 1):
         centers, edge = cubes.centers(), MARGIN * cubes.edge
         shown = np.flatnonzero(_shown_by_all(silhouettes, centers, edge))
@@ -244,7 +228,7 @@ def _thin_points(silhouettes: Sequence[Silhouette], cubes: Cubes) -> np.ndarray:
 def _shown_by_all(
     silhouettes: Sequence[Silhouette], centers: np.ndarray, edge: float
 ) -> np.ndarray:
-    """Which cubes (N,) no picture shows empty, of those that enough of the pictures show.
+    """(N,) bool: cubes that no image shows empty, and that enough of the images show.
 
     centers: (N, 3) world; edge 0: points.
     """
@@ -264,7 +248,7 @@ def _shown_by_all(
 
 
 def _half_empty(silhouettes: Sequence[Silhouette], centers: np.ndarray, edge: float) -> np.ndarray:
-    """Which cubes (N,) some picture shows with a transparent pixel; centers: (N, 3) world."""
+    """(N,) bool: cubes that some image shows with a transparent pixel; centers: (N, 3) world."""
     columns = [np.ascontiguousarray(c) for c in centers.T]
     rows, result = np.arange(len(centers)), np.zeros(len(centers), bool)
     for silhouette in silhouettes:
@@ -282,7 +266,7 @@ def _chunks(rows: np.ndarray) -> list[np.ndarray]:
 def _look_at_points(
     silhouette: Silhouette, centers: Columns, rows: np.ndarray, _edge: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Whether points are in the picture; whether it shows them beside what is solid."""
+    """Return whether points are in the image, and whether it shows them beside solid pixels."""
     view, (height, width) = silhouette.view, silhouette.solid.shape
     u, v, depth = to_film(view, to_camera(view, [c[rows] for c in centers], np.float32))
     u, v = np.floor(u / silhouette.scale), np.floor(v / silhouette.scale)
@@ -294,7 +278,7 @@ def _look_at_points(
 def _look_at_cubes(
     silhouette: Silhouette, centers: Columns, rows: np.ndarray, edge: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Whether some of each cube is in the picture; whether it shows that there is nothing."""
+    """Return whether some of each cube is in the image, and whether that shows it empty."""
     whole, opaque, area = _opaque_pixels(silhouette, centers, rows, edge)
     return area > 0, whole & (opaque == 0)
 
@@ -302,9 +286,9 @@ def _look_at_cubes(
 def _opaque_pixels(
     silhouette: Silhouette, centers: Columns, rows: np.ndarray, edge: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Of cubes: whether all of one is in the picture; opaque pixels at its place; all pixels there.
+    """Return whether all of each cube is in the image; its opaque pixels; all pixels at its place.
 
-    centers: (N,) each; rows: which of them are asked for.
+    centers: (N,) each; rows: of the cubes.
 
     A pinhole shows p + d at a distance from p of at most |J d| z / (z - d_z), with J the derivative
     at p, which differences bound in the same way.

@@ -1,58 +1,94 @@
-"""Models of COLMAP: cameras, images with their poses, and points, in binary or in text files.
+"""COLMAP models: cameras, images with their poses, and points, in binary or in text files.
 
-The formats are those of COLMAP's documentation ("Output Format") and of its
-``reconstruction_io``; ``drgs.io.colmap_binary`` and ``drgs.io.colmap_text`` read the records. What
-images observe of the points is skipped; rigs and frames, which newer versions write beside them,
-say nothing that images do not.
+The formats are those of COLMAP's documentation ("Output Format") and of its ``reconstruction_io``.
+Observations are skipped, and so are rigs and frames, which repeat what images contain.
 
-Files are not trusted: each record is checked before anything is made of it, and an error names the
-file, the byte or the line, what was expected and what was got.
+Each record is checked, and an error names the file, the byte or the line, what was expected and
+what was got.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+import struct
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path, PurePosixPath
-from types import ModuleType
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from drgs.core.constants import MAX_COEFFICIENT
-from drgs.core.errors import Place, UserError, one_line
-from drgs.io.colmap_records import MODELS, CameraRecord, ImageRecord, PointRecord
+from drgs.core.errors import Place, UserError, did_you_mean, one_line
+from drgs.core.files import read_bytes, read_text
 from drgs.io.pictures import MAX_SIDE
 
+_BROWN = ("k1", "k2", "p1", "p2")
+_ONE, _TWO = ("f", "cx", "cy"), ("fx", "fy", "cx", "cy")
+
+MODELS: Mapping[str, tuple[int, tuple[str, ...]]] = {
+    "SIMPLE_PINHOLE": (0, _ONE),
+    "PINHOLE": (1, _TWO),
+    "SIMPLE_RADIAL": (2, (*_ONE, "k1")),
+    "RADIAL": (3, (*_ONE, "k1", "k2")),
+    "OPENCV": (4, (*_TWO, *_BROWN)),
+    "OPENCV_FISHEYE": (5, (*_TWO, "k1", "k2", "k3", "k4")),
+    "FULL_OPENCV": (6, (*_TWO, *_BROWN, "k3", "k4", "k5", "k6")),
+    "FOV": (7, (*_TWO, "omega")),
+    "SIMPLE_RADIAL_FISHEYE": (8, (*_ONE, "k1")),
+    "RADIAL_FISHEYE": (9, (*_ONE, "k1", "k2")),
+    "THIN_PRISM_FISHEYE": (10, (*_TWO, *_BROWN, "k3", "k4", "sx1", "sy1")),
+    "RAD_TAN_THIN_PRISM_FISHEYE": (
+        11,
+        (*_TWO, *(f"k{i}" for i in range(6)), "p0", "p1", *(f"s{i}" for i in range(4))),
+    ),
+    "SIMPLE_DIVISION": (12, (*_ONE, "k")),
+    "DIVISION": (13, (*_TWO, "k")),
+    "SIMPLE_FISHEYE": (14, _ONE),
+    "FISHEYE": (15, _TWO),
+    "EUCM": (16, (*_TWO, "alpha", "beta")),
+    "EQUIRECTANGULAR": (17, ("w", "h")),
+}
+"""Camera models by name: COLMAP's number of each, and its parameters in their order."""
+
+MODEL_NAMES = {number: name for name, (number, _) in MODELS.items()}
+
 MAX_NUMBER = 1e12
-"""Of any parameter or coordinate, in size."""
+"""Largest magnitude of a parameter or a coordinate."""
 
 QUATERNION_RANGE = (1e-6, 1e6)
-"""Its length; COLMAP writes 1."""
+"""Lengths of accepted quaternions; COLMAP writes 1."""
+
+MAX_FILE_BYTES = 1 << 33
+
+BINARY_MEMORY_RATIO, TEXT_MEMORY_RATIO = 4, 8
+"""Memory that reading takes, in bytes of the file."""
+
+MAX_NAME_BYTES = 4096
+
+OBSERVATION_BYTES, TRACK_BYTES = 24, 8
 
 
 @dataclass(frozen=True)
 class ColmapCamera:
     """The intrinsics of some of the images."""
 
-    number: int  # which images name
+    number: int  # by which images refer to it
     model: str  # of MODELS
     width: int  # px
     height: int  # px
-    values: tuple[float, ...]  # as MODELS names them; px, and coefficients of distortion
+    values: tuple[float, ...]  # in the order of MODELS; px, and coefficients of distortion
 
     def named(self) -> dict[str, float]:
-        """The values by name."""
+        """Return the values by name."""
         return dict(zip(MODELS[self.model][1], self.values, strict=True))
 
 
 @dataclass(frozen=True, eq=False)
 class ColmapImage:
-    """A picture, and where it was taken."""
+    """A photograph and its pose."""
 
-    name: str  # of its file below the folder of pictures, with ``/`` between folders
+    name: str  # of its file below the folder of photographs, with ``/`` between folders
     camera: int  # the number of its camera
     quaternion: tuple[float, ...]  # w, x, y, z: world to camera
     translation: tuple[float, ...]  # x, y, z: world to camera, scene units
@@ -70,12 +106,17 @@ class ColmapImage:
 
 @dataclass(frozen=True, eq=False)
 class ColmapPoints:
-    """What structure from motion found, N points."""
+    """Points of structure from motion, N points."""
 
     positions: np.ndarray  # (N, 3) float64, world
     colors: np.ndarray  # (N, 3) uint8
     errors: np.ndarray  # (N,) float64, px: mean distance of its observations; -1: not known
-    track_lengths: np.ndarray  # (N,) int64: how often it is observed
+    track_lengths: np.ndarray  # (N,) int64: number of its observations
+
+
+_POINT = np.dtype(
+    [("position", "<f8", 3), ("color", "u1", 3), ("error", "<f8"), ("track_length", "<i8")]
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,25 +124,25 @@ class ColmapModel:
     """A reconstruction."""
 
     cameras: Mapping[int, ColmapCamera]  # by number
-    images: tuple[ColmapImage, ...]  # as the file has them
+    images: tuple[ColmapImage, ...]  # in the order of the file
     points_file: Path | None  # None: it has no points
 
     @property
     def has_points(self) -> bool:
-        """Whether there are any, from the first record."""
+        """Whether there is at least one point."""
         file = self.points_file
-        return file is not None and next(_records_of(file).points(file), None) is not None
+        return file is not None and next(iter(_records(file)), None) is not None
 
     @cached_property
     def points(self) -> ColmapPoints:
-        """Read when they are first asked for; errors as in :func:`read_model`."""
-        return _points(iter(())) if self.points_file is None else read_points3d(self.points_file)
+        """The points, read at the first access; errors as in :func:`read_model`."""
+        return _points(()) if self.points_file is None else read_points3d(self.points_file)
 
 
 def model_files(folder: Path) -> dict[str, Path] | None:
-    """The files ``cameras``, ``images`` and, if it is there, ``points3D``; None: no model.
+    """Return the files ``cameras``, ``images`` and, if it exists, ``points3D``; None: no model.
 
-    Binary ones where there are both.
+    Binary files are preferred.
     """
     for suffix in (".bin", ".txt"):
         files = {name: folder / f"{name}{suffix}" for name in ("cameras", "images", "points3D")}
@@ -112,7 +153,7 @@ def model_files(folder: Path) -> dict[str, Path] | None:
 
 
 def read_model(folder: str | Path) -> ColmapModel:
-    """The model in ``folder``, of whose points nothing is read yet.
+    """Return the model in ``folder``, whose points are read later.
 
     Raises :class:`UserError` naming the file, the byte or the line, what was expected and what was
     got.
@@ -123,45 +164,45 @@ def read_model(folder: str | Path) -> ColmapModel:
             f"{folder}: is no model of COLMAP: there are neither cameras.bin and images.bin nor "
             "cameras.txt and images.txt"
         )
-    records = _records_of(files["cameras"])
-    cameras = _cameras(records.cameras(files["cameras"]))
-    images = _images(records.images(files["images"]), cameras)
-    return ColmapModel(cameras, images, files.get("points3D"))
+    cameras = _cameras(_records(files["cameras"]))
+    return ColmapModel(cameras, _images(_records(files["images"]), cameras), files.get("points3D"))
 
 
 def read_points3d(path: str | Path) -> ColmapPoints:
-    """The points of ``points3D.bin`` or ``points3D.txt``; errors as in :func:`read_model`."""
-    return _points(_records_of(Path(path)).points(Path(path)))
+    """Return the points of ``points3D.bin`` or ``.txt``; errors as in :func:`read_model`."""
+    return _points(_records(Path(path)))
 
 
-def _records_of(path: Path) -> ModuleType:
-    """What reads files of this kind."""
-    if path.suffix == ".txt":
-        from drgs.io import colmap_text
-
-        return colmap_text
-    from drgs.io import colmap_binary
-
-    return colmap_binary
+def _records(path: Path) -> Iterator[tuple]:
+    take, parse, form = _KINDS[path.stem]
+    return (
+        _text_records(path, parse, form) if path.suffix == ".txt" else _binary_records(path, take)
+    )
 
 
-def _cameras(records: Iterator[CameraRecord]) -> dict[int, ColmapCamera]:
+# Checks
+
+
+def _cameras(records: Iterable[tuple]) -> dict[int, ColmapCamera]:
     cameras: dict[int, ColmapCamera] = {}
     for place, number, model, width, height, values in records:
-        for name, side in (("width", width), ("height", height)):
-            if not 1 <= side <= MAX_SIDE:
-                raise UserError(
-                    f"{place}: {name} must be between 1 and {MAX_SIDE:,} px, got {side:,}"
-                )
+        if not (1 <= width <= MAX_SIDE and 1 <= height <= MAX_SIDE):
+            raise UserError(
+                f"{place}: width and height must be between 1 and {MAX_SIDE:,} px, got {width:,} "
+                f"and {height:,}"
+            )
+        if model not in MODELS:
+            raise UserError(
+                f"{place}: a camera model of COLMAP was expected, got {one_line(model, 40)}"
+                f"{did_you_mean(model, MODELS)}"
+            )
         names = MODELS[model][1]
         if len(values) != len(names):
             raise UserError(
                 f"{place}: a camera of the model {model} has {len(names)} parameters "
                 f"({', '.join(names)}), got {len(values)}"
             )
-        for name, value in zip(names, values, strict=True):
-            is_length = name in ("f", "fx", "fy", "cx", "cy", "w", "h")
-            _check_number(place, name, value, MAX_NUMBER if is_length else MAX_COEFFICIENT)
+        _check_numbers(place, names, values)
         if number in cameras:
             raise UserError(f"{place}: each camera must be there once, got a second one {number}")
         cameras[number] = ColmapCamera(number, model, width, height, tuple(values))
@@ -169,51 +210,204 @@ def _cameras(records: Iterator[CameraRecord]) -> dict[int, ColmapCamera]:
 
 
 def _images(
-    records: Iterator[ImageRecord], cameras: Mapping[int, ColmapCamera]
+    records: Iterable[tuple], cameras: Mapping[int, ColmapCamera]
 ) -> tuple[ColmapImage, ...]:
     images: dict[str, ColmapImage] = {}
     for place, name, camera, pose in records:
-        if not name or name in images:
-            got = "an empty one" if not name else f"{one_line(name, 100)} a second time"
-            raise UserError(f"{place}: each image must have a name of its own, got {got}")
         path = PurePosixPath(name)
-        if path.is_absolute() or ".." in path.parts:
+        if not name or name in images or path.is_absolute() or ".." in path.parts:
             raise UserError(
-                f"{place}: a name must be that of a file below the folder of pictures, got "
-                f"{one_line(name, 100)}"
+                f"{place}: each image must have a name of its own, that of a file below the folder "
+                f"of photographs, got {one_line(name, 100) or 'an empty one'}"
             )
         length = math.hypot(*pose[:4])
         if not QUATERNION_RANGE[0] <= length <= QUATERNION_RANGE[1]:
             raise UserError(
                 f"{place}: the length of a rotation's quaternion must be 1, got {length:g}"
             )
-        for axis, value in zip("xyz", pose[4:], strict=True):
-            _check_number(place, f"a translation's {axis}", value)
+        _check_numbers(place, ("TX", "TY", "TZ"), pose[4:])
         if camera not in cameras:
             raise UserError(f"{place}: the number of a camera was expected, got {camera}")
         images[name] = ColmapImage(name, camera, tuple(pose[:4]), tuple(pose[4:]))
     return tuple(images.values())
 
 
-_POINT = np.dtype(
-    [("position", "<f8", 3), ("color", "u1", 3), ("error", "<f8"), ("track_length", "<i8")]
-)
-
-
-def _points(records: Iterator[PointRecord]) -> ColmapPoints:
-    def checked(records: Iterator[PointRecord]) -> Iterator[tuple[object, ...]]:
+def _points(records: Iterable[tuple]) -> ColmapPoints:
+    def rows() -> Iterator[tuple]:
         for place, position, color, error, track_length in records:
-            for axis, value in zip("xyz", position, strict=True):
-                _check_number(place, axis, value)
-            _check_number(place, "an error", error)
+            _check_numbers(place, ("X", "Y", "Z", "ERROR"), (*position, error))
+            if not 0 <= min(color) <= max(color) <= 255:
+                raise UserError(f"{place}: colours must be 0 to 255, got {tuple(color)}")
             yield tuple(position), tuple(color), error, track_length
 
-    table = np.fromiter(checked(records), _POINT)
+    table = np.fromiter(rows(), _POINT)
     return ColmapPoints(*(np.ascontiguousarray(table[name]) for name in _POINT.names))
 
 
-def _check_number(place: Place, name: str, value: float, most: float = MAX_NUMBER) -> None:
-    if not abs(value) <= most:
+def _check_numbers(place: Place, names: Sequence[str], values: Sequence[float]) -> None:
+    for name, value in zip(names, values, strict=True):
+        if not abs(value) <= MAX_NUMBER:
+            raise UserError(
+                f"{place}: {name} must be a number of at most {MAX_NUMBER:g} in size, got {value:g}"
+            )
+
+
+# Binary files: little-endian numbers without padding
+
+
+class _BinaryFile:
+    """A file that is read from its beginning to its end."""
+
+    def __init__(self, path: Path) -> None:
+        self._path, self._at = path, 0
+        self._data = read_bytes(path, "file", MAX_FILE_BYTES, BINARY_MEMORY_RATIO)
+
+    @property
+    def place(self) -> Place:
+        """The next byte."""
+        return Place(self._path, "byte", self._at)
+
+    @property
+    def left(self) -> int:
+        """Number of bytes that follow."""
+        return len(self._data) - self._at
+
+    def skip(self, size: int) -> None:
+        """Skip bytes."""
+        if size > self.left:
+            raise UserError(
+                f"{self.place}: {size:,} bytes were expected, and {self.left:,} are left; the file "
+                "is damaged, or was cut off"
+            )
+        self._at += size
+
+    def take(self, layout: str) -> tuple:
+        """Return the next numbers, in a layout of :mod:`struct`."""
+        start = self._at
+        self.skip(struct.calcsize(f"<{layout}"))
+        return struct.unpack_from(f"<{layout}", self._data, start)
+
+    def name(self) -> str:
+        """Return the next text, which a zero byte ends."""
+        place, end = self.place, self._data.find(b"\0", self._at, self._at + MAX_NAME_BYTES)
+        encoded, self._at = self._data[self._at : end], end + 1
+        try:
+            if end >= 0:
+                return encoded.decode()
+        except UnicodeDecodeError:
+            pass
         raise UserError(
-            f"{place}: {name} must be a number of at most {most:g} in size, got {value:g}"
+            f"{place}: a name in UTF-8 of less than {MAX_NAME_BYTES:,} bytes was expected; the "
+            "file is damaged, or was cut off"
         )
+
+
+def _binary_records(path: Path, take: Callable[[_BinaryFile], tuple]) -> Iterator[tuple]:
+    file = _BinaryFile(path)
+    for _ in range(*file.take("Q")):
+        yield file.place, *take(file)
+    if file.left:
+        raise UserError(
+            f"{file.place}: the end of the file was expected after its last record, got "
+            f"{file.left:,} bytes more"
+        )
+
+
+def _take_camera(file: _BinaryFile) -> tuple:
+    number, model_number, width, height = file.take("IiQQ")
+    model = MODEL_NAMES.get(model_number, f"number {model_number}")
+    values = file.take(f"{len(MODELS[model][1])}d") if model in MODELS else ()
+    return number, model, width, height, values
+
+
+def _take_image(file: _BinaryFile) -> tuple:
+    _, *pose, camera = file.take("I7dI")
+    name, (num_observations,) = file.name(), file.take("Q")
+    file.skip(OBSERVATION_BYTES * num_observations)
+    return name, camera, pose
+
+
+def _take_point(file: _BinaryFile) -> tuple:
+    _, x, y, z, red, green, blue, error, track_length = file.take("Q3d3BdQ")
+    file.skip(TRACK_BYTES * track_length)
+    return (x, y, z), (red, green, blue), error, track_length
+
+
+# Text files: a record a line, ``#`` before comments
+
+
+def _text_records(path: Path, parse: Callable[[str], tuple], form: str) -> Iterator[tuple]:
+    text = read_text(path, "file", MAX_FILE_BYTES, TEXT_MEMORY_RATIO)
+    lines = enumerate(text.split("\n"), 1)
+    for number, line in _without_observations(path, lines) if path.stem == "images" else lines:
+        if _is_record(line):
+            place = Place(path, "line", number)
+            try:
+                record = parse(line)
+            except ValueError:
+                raise UserError(f"{place}: {form} was expected, got {one_line(line, 60)}") from None
+            yield place, *record
+
+
+def _is_record(line: str) -> bool:
+    return line.strip()[:1] not in ("", "#")
+
+
+def _without_observations(
+    path: Path, lines: Iterable[tuple[int, str]]
+) -> Iterator[tuple[int, str]]:
+    """Drop the second line of each image, which may be empty; some programs write none."""
+    follows_image = False
+    for number, line in lines:
+        if not follows_image or _is_image(line):
+            follows_image = _is_record(line)
+            yield number, line
+        elif len(line.split()) % 3:
+            raise UserError(
+                f"{Place(path, 'line', number)}: observations (X Y POINT3D_ID of each point) were "
+                "expected; each image has two lines, of which the second may be empty"
+            )
+        else:
+            follows_image = False
+
+
+def _is_image(line: str) -> bool:
+    """Return whether a line is as long as an image's first and ends in a name, not a number."""
+    words = line.split()
+    try:
+        float(words[-1] if len(words) > 9 else "0")
+    except ValueError:
+        return True
+    return False
+
+
+def _parse_camera(line: str) -> tuple:
+    number, model, width, height, *values = line.split()
+    return int(number), model, int(width), int(height), [float(value) for value in values]
+
+
+def _parse_image(line: str) -> tuple:
+    _, w, x, y, z, tx, ty, tz, camera, name = line.split(maxsplit=9)
+    return name.rstrip(), int(camera), [float(value) for value in (w, x, y, z, tx, ty, tz)]
+
+
+def _parse_point(line: str) -> tuple:
+    _, x, y, z, red, green, blue, error, *track = line.split()
+    if len(track) % 2:
+        raise ValueError("a track has pairs of numbers")
+    color = int(red), int(green), int(blue)
+    return (float(x), float(y), float(z)), color, float(error), len(track) // 2
+
+
+_KINDS = {
+    "cameras": (_take_camera, _parse_camera, "a camera (CAMERA_ID MODEL WIDTH HEIGHT PARAMS)"),
+    "images": (
+        *(_take_image, _parse_image),
+        "an image (IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME)",
+    ),
+    "points3D": (
+        *(_take_point, _parse_point),
+        "a point (POINT3D_ID X Y Z R G B ERROR, pairs of a track)",
+    ),
+}
+"""Readers of the same records from binary and from text files, and the form of a line."""

@@ -1,7 +1,7 @@
-"""Pictures from files and to files; all that drgs reads or writes goes through here.
+"""Images from files and to files; all that drgs reads or writes goes through here.
 
 Read: 8 bits, with and without alpha, and grey of 16 bits; of colours of 16 bits, the upper 8.
-Written: 8-bit PNG and WebP, animations as WebP and GIF, Mitsuba's bitmaps as EXR. Pictures are
+Written: 8-bit PNG and WebP, animations as WebP and GIF, Mitsuba's bitmaps as EXR. Images are
 (H, W, C) in display space, rounded to 8 bits and clamped to [0, 1] here; files are written whole or
 not at all.
 """
@@ -11,6 +11,7 @@ from __future__ import annotations
 import io
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -25,32 +26,29 @@ from drgs.core.memory import require_memory
 if TYPE_CHECKING:
     import mitsuba as mi
 
-MAX_PIXELS = 1 << 26
-"""67 million, as 8192 x 8192: 0.8 GB once decoded to float32."""
-
-PIXEL_BYTES = 16
-"""About what decoding takes for a pixel, with the copies that are made of it."""
+MAX_PIXELS, PIXEL_BYTES = 1 << 26, 16
+"""Of an image, as 8192 x 8192: 0.8 GB once decoded to float32; and memory for a pixel while it is
+decoded and copied."""
 
 MAX_SIDE = 2**24
-"""px: of a larger picture, float32 does not tell neighbouring pixels apart."""
+"""px: in a larger image, float32 does not resolve pixels."""
 
 MAX_BYTES = 1 << 30
 """Of a file: twice what so many pixels of 64 bits take when they are not compressed."""
 
 BITS = {"L": 8, "LA": 8, "RGB": 8, "RGBA": 8, "I;16": 16, "I;16B": 16, "I": 16}
-"""Of a channel, by those of Pillow's modes that are read. ``I`` holds 32, but is what some versions
-of Pillow make of a grey PNG of 16."""
-
+"""Bits of a channel, by Pillow's modes that are read. ``I`` has 32, but is what some versions of
+Pillow make of a grey PNG of 16."""
 
 MAX_16_BITS = 2**16 - 1
+
+MITSUBA_FORMATS = ("PNG", "JPEG", "MPO", "BMP", "PPM", "TGA")
+"""Pillow's names of the formats that Mitsuba reads as well. MPO is a JPEG with several images."""
 
 
 def _transposed(pixels: np.ndarray) -> np.ndarray:
     return pixels.swapaxes(0, 1)
 
-
-MITSUBA_FORMATS = ("PNG", "JPEG", "MPO", "BMP", "PPM", "TGA")
-"""Pillow's names of the formats that Mitsuba reads as well. MPO is a JPEG with several pictures."""
 
 ORIENTATIONS = {
     1: (),
@@ -62,85 +60,73 @@ ORIENTATIONS = {
     7: (_transposed, np.flipud, np.fliplr),
     8: (_transposed, np.flipud),
 }
-"""What makes a picture upright, by EXIF's number of how it is stored."""
+"""Turns that make an image upright, by EXIF's orientation."""
 
-UNDONE_BY = {6: 8, 8: 6}
-"""The orientation that turns an upright picture into one that is stored so; others are their
-own."""
+INVERSE_ORIENTATIONS = {6: 8, 8: 6}
+"""Other orientations are their own inverses."""
 
-WEBP_SIDE = 16_383
+MAX_WEBP_SIDE = 16_383
 """px: the largest width and height that the format can express."""
 
-ANIMATION_BYTES = 2 << 30
+MAX_FRAMES_BYTES = 2 << 30
 """Of all frames of an animation, which are held until it is written."""
 
 FRAME_MS = 70
 """Duration of a frame: 60 frames turn once in 4.2 s. A multiple of GIF's unit of 10 ms."""
 
-WEBP_QUALITIES = (80, 60, 40, 20)
-"""The first that keeps an animation within ``WEBP_BYTES``, or else the last."""
+WEBP_QUALITIES, WEBP_BYTES = (80, 60, 40, 20), 1_500_000
+"""The first quality is used that keeps an animation within so many bytes, or else the last."""
 
-WEBP_BYTES = 1_500_000
-
-FLAT_WEBP_BYTES = 4_000_000
-"""The most that an animation may need that is coded without loss."""
-
-FLAT_SHARE = 0.1
-"""Of all pixels: an animation has a flat background if one colour has as many of them."""
+FLAT_SHARE, FLAT_WEBP_BYTES = 0.1, 4_000_000
+"""An animation has a flat background if one colour has this share of all pixels; it is then coded
+without loss, in so many bytes at most."""
 
 FLAT_STEP = 255 / 31
 """Levels of 255 between two values of a channel before a flat background: a smaller error than
 that of lossy coding, which halves the resolution of colours, and two thirds of the bytes."""
 
-GIF_WIDTH = 300
-"""px: a GIF needs about five times the bytes of a WebP of the same size."""
-
-NEAR_BACKGROUND = 8
-"""Levels of 255: colours of a GIF's palette that differ less become the background's."""
+GIF_WIDTH, NEAR_BACKGROUND = 300, 8
+"""px: a GIF needs about five times the bytes of a WebP of the same size; and levels of 255: nearer
+colours of its palette become the background's."""
 
 
-# Reading: by Pillow itself, which tells a picture's mode and size before it is decoded
+# Reading: by Pillow itself, which tells an image's mode and size before it is decoded
+
+
+@dataclass(frozen=True)
+class ImageHeader:
+    """Properties of an image before it is decoded."""
+
+    size: tuple[int, int]  # width and height as stored, px
+    format: str  # Pillow's name: see MITSUBA_FORMATS
+    mode: str  # Pillow's: see BITS
+    has_alpha: bool  # of read_pixels
+    orientation: int  # EXIF's, 1 to 8; 1: upright or unknown
+
+
+def read_header(path: Path) -> ImageHeader:
+    """Return the header of an image; raises :class:`UserError` for a file that is none."""
+    with _opened(path) as image:
+        alpha, orientation = _has_alpha(image), _orientation(image)
+        return ImageHeader(_stored_size(image), image.format, image.mode, alpha, orientation)
 
 
 def image_size(path: Path) -> tuple[int, int]:
-    """(width, height) in px, from the file's header."""
+    """Return (width, height) as stored, px, from the file's header."""
     with _opened(path) as image:
         return _stored_size(image)
 
 
-def stored_shape(path: Path) -> tuple[int, int, int, int]:
-    """Width and height in px, channels, and bytes of each that :func:`read_pixels` would give.
-
-    From the file's header; what it refuses counts as RGB of 8 bits.
-    """
-    with _opened(path) as image:
-        is_transparent = image.mode in ("LA", "RGBA", "P") or _has_alpha(image)
-        bits = BITS.get(image.mode, 8)
-        return *_stored_size(image), 4 if is_transparent else 3, bits // 8
-
-
-def image_mode(path: Path) -> str:
-    """Pillow's name of what a pixel holds, from the file's header: see :data:`BITS`."""
-    with _opened(path) as image:
-        return image.mode
-
-
-def image_format(path: Path) -> str:
-    """Pillow's name of the file's format, from its header: see :data:`MITSUBA_FORMATS`."""
-    with _opened(path) as image:
-        return image.format
-
-
-def image_orientation(path: Path) -> int:
-    """EXIF's number of how a picture is stored: 1, upright or unknown, to 8."""
-    with _opened(path) as image:
-        if image.format == "PNG" and "exif" not in image.info:
-            return 1  # Pillow would decode the picture to look behind it
-        return _orientation(image)
+def _stored_size(image: Image.Image) -> tuple[int, int]:
+    if image.format == "TIFF":  # Pillow's is that of the upright image
+        tags = ExifTags.Base
+        return image.tag_v2[tags.ImageWidth], image.tag_v2[tags.ImageLength]
+    return image.size
 
 
 def _orientation(image: Image.Image) -> int:
-    """Before it is decoded."""
+    if image.format == "PNG" and "exif" not in image.info:
+        return 1  # Pillow would decode the image to look behind it
     try:
         number = image.getexif().get(ExifTags.Base.Orientation, 1)
     except Exception:  # Pillow raises many types for broken EXIF, which says nothing
@@ -148,57 +134,34 @@ def _orientation(image: Image.Image) -> int:
     return number if number in ORIENTATIONS else 1
 
 
-def _stored_size(image: Image.Image) -> tuple[int, int]:
-    """(width, height) in px; of a TIFF, Pillow says the size of the upright picture."""
-    if image.format == "TIFF":
-        tags = ExifTags.Base
-        return image.tag_v2[tags.ImageWidth], image.tag_v2[tags.ImageLength]
-    return image.size
-
-
-def _turned_by_pillow(image: Image.Image) -> int:
-    """The orientation that Pillow applies, of TIFFs alone, when it decodes the image."""
-    return _orientation(image) if image.format == "TIFF" else 1
+def _has_alpha(image: Image.Image) -> bool:
+    has_color = image.mode in ("P", "L", "RGB", "1") and "transparency" in image.info
+    return image.mode in ("LA", "RGBA") or has_color
 
 
 def upright(pixels: np.ndarray, orientation: int) -> np.ndarray:
-    """(H, W, C) as EXIF's ``orientation`` has it seen; a view of ``pixels``."""
+    """(H, W, C) turned by EXIF's ``orientation``; a view of ``pixels``."""
     for turn in ORIENTATIONS[orientation]:
         pixels = turn(pixels)
     return pixels
 
 
-def has_alpha(path: Path) -> bool:
-    """Whether :func:`read_image` gives an alpha channel, from the file's header."""
-    with _opened(path) as image:
-        return _has_alpha(image)
-
-
-def _has_alpha(image: Image.Image) -> bool:
-    """Before it is decoded; a PNG may name a colour that is transparent."""
-    has_colour = image.mode in ("P", "L", "RGB", "1") and "transparency" in image.info
-    return image.mode in ("LA", "RGBA") or has_colour
-
-
 def unused_content(path: Path) -> list[str]:
-    """Describe content of a picture that :func:`read_pixels` does not use; from its header."""
+    """Describe content of an image that :func:`read_pixels` does not use; from its header."""
     with _opened(path) as image:
         found = []
         if _bits(image) > BITS.get(image.mode, 8):
             found.append(f"of {_bits(image)} bits a channel, of which 8 are used")
         if profile := _colour_profile(image.info.get("icc_profile")):
             found.append(f"with the colour profile {profile}, which is not applied")
-        gamma = image.info.get("gamma")
-        if gamma and not profile and abs(gamma - 1 / 2.2) > 0.02:
-            found.append(f"of gamma {gamma:.3g}, which is taken for sRGB")
-        # The other pictures of an MPO are smaller ones, or say how bright a display may be.
+        # The other images of an MPO are smaller ones, or for bright displays.
         if image.format != "MPO" and getattr(image, "n_frames", 1) > 1:
             found.append("with several pictures each, of which the first is used")
         return found
 
 
 def _bits(image: Image.Image) -> int:
-    """Bits of a channel in the file; Pillow decodes colours to 8."""
+    """Return bits of a channel in the file; Pillow decodes colours to 8."""
     if image.format == "TIFF":
         return max(image.tag_v2.get(ExifTags.Base.BitsPerSample, (8,)))
     if image.format == "JPEG2000" or not image.tile:
@@ -211,7 +174,7 @@ def _bits(image: Image.Image) -> int:
 
 
 def _colour_profile(profile: bytes | None) -> str:
-    """The name of a profile of other colours than sRGB; "": there is none."""
+    """Return the name of a profile of other colours than sRGB; "": there is none."""
     if not profile:
         return ""
     try:
@@ -227,12 +190,12 @@ def read_image(path: Path) -> np.ndarray:
 
 
 def as_numbers(pixels: np.ndarray) -> np.ndarray:
-    """Float32 in 0..1 of what :func:`read_pixels` gave."""
+    """Return float32 in 0..1 for pixels of :func:`read_pixels`."""
     return pixels.astype(np.float32) / np.float32(255 if pixels.dtype == np.uint8 else MAX_16_BITS)
 
 
 def check_readable(path: Path) -> None:
-    """Raise :class:`UserError` for what :func:`read_pixels` refuses, as far as a header tells."""
+    """Raise :class:`UserError` as :func:`read_pixels` does, as far as a header tells."""
     with _opened(path) as image:
         _check(path, image)
 
@@ -242,20 +205,21 @@ def read_pixels(path: Path) -> np.ndarray:
 
     C is 3, or 4 with straight (not premultiplied) alpha; grey images become RGB.
 
-    Raises :class:`UserError` for a file that is no such picture.
+    Raises :class:`UserError` for a file that is no such image.
     """
     with _opened(path) as image:
         _check(path, image)  # before memory is allocated for it
         needed = image.width * image.height * PIXEL_BYTES
         require_memory(path, needed, f"a picture of {image.width} x {image.height} px")
-        turn, decoded = _turned_by_pillow(image), image
-        if image.mode != "RGBA" and image.mode != "LA" and _has_alpha(image):
+        # Pillow turns TIFFs, and no others.
+        turn, decoded = _orientation(image) if image.format == "TIFF" else 1, image
+        if image.mode not in ("RGBA", "LA") and _has_alpha(image):
             decoded = image.convert("RGBA")
         elif image.mode == "P":
             decoded = image.convert("RGB")
         elif image.mode == "1":
             decoded = image.convert("L")
-        pixels = upright(np.asarray(decoded), UNDONE_BY.get(turn, turn))
+        pixels = upright(np.asarray(decoded), INVERSE_ORIENTATIONS.get(turn, turn))
         if image.mode == "I" and not 0 <= pixels.min() <= pixels.max() <= MAX_16_BITS:
             raise UserError(
                 f"{path}: must have values of 16 bits, 0 to {MAX_16_BITS}, got {pixels.min()} to "
@@ -269,7 +233,7 @@ def read_pixels(path: Path) -> np.ndarray:
 
 
 def _check(path: Path, image: Image.Image) -> None:
-    """Raise :class:`UserError` for pictures that are too large, or of another kind."""
+    """Raise :class:`UserError` for images that are too large, or of another mode."""
     if image.width * image.height > MAX_PIXELS:
         raise UserError(
             f"{path}: must have at most {MAX_PIXELS:,} pixels, got {image.width} x "
@@ -284,7 +248,7 @@ def _check(path: Path, image: Image.Image) -> None:
 
 @contextmanager
 def _opened(path: Path) -> Iterator[Image.Image]:
-    """The image before decoding; errors of the file, also within the block, are the user's."""
+    """Open an image without decoding it; errors within the block become the user's."""
     try:
         with open_regular(path, "image", MAX_BYTES) as file, Image.open(file) as image:
             yield image
@@ -295,11 +259,8 @@ def _opened(path: Path) -> Iterator[Image.Image]:
             f"{path}: cannot read the image: it is of no format that is read, such as PNG, JPEG, "
             "TIFF or WebP; convert it"
         ) from None
-    except OSError as error:
-        reason = error.strerror or one_line(error) or type(error).__name__
-        raise UserError(f"{path}: cannot read the image: {reason}") from None
     except Exception as error:  # Pillow raises many types for a broken file
-        reason = one_line(error) or type(error).__name__
+        reason = getattr(error, "strerror", None) or one_line(error) or type(error).__name__
         raise UserError(f"{path}: cannot read the image: {reason}") from None
 
 
@@ -307,12 +268,12 @@ def _opened(path: Path) -> Iterator[Image.Image]:
 
 
 def to_uint8(image: np.ndarray) -> np.ndarray:
-    """The picture rounded to 8 bits."""
+    """Return the image rounded to 8 bits."""
     return np.round(np.clip(image, 0, 1) * 255).astype(np.uint8)
 
 
 def write_png(path: Path, image: np.ndarray) -> None:
-    """Write one picture: (H, W, 3) or, with straight alpha, (H, W, 4), in 0..1 or uint8."""
+    """Write one image: (H, W, 3) or, with straight alpha, (H, W, 4), in 0..1 or uint8."""
     _write(path, encode(image, "png"))
 
 
@@ -339,14 +300,14 @@ def encode(image: np.ndarray, suffix: str, **options: float) -> bytes:
 
 def check_animation(frames: int, width: int, height: int) -> None:
     """Raise :class:`UserError` where :func:`write_animation` cannot write so many, or so large."""
-    if max(width, height) > WEBP_SIDE:
+    if max(width, height) > MAX_WEBP_SIDE:
         raise UserError(
-            f"an animation (WebP) must be at most {WEBP_SIDE:,} px wide and high, got {width} x "
-            f"{height}; choose a smaller size"
+            f"an animation (WebP) must be at most {MAX_WEBP_SIDE:,} px wide and high, got "
+            f"{width} x {height}; choose a smaller size"
         )
-    if frames * width * height * 3 > ANIMATION_BYTES:
+    if frames * width * height * 3 > MAX_FRAMES_BYTES:
         raise UserError(
-            f"the frames of an animation must take at most {ANIMATION_BYTES / 1e9:.1f} GB, got "
+            f"the frames of an animation must take at most {MAX_FRAMES_BYTES / 1e9:.1f} GB, got "
             f"{frames:,} of {width} x {height} px: {frames * width * height * 3 / 1e9:.1f} GB; "
             "choose fewer, or a smaller size"
         )
@@ -370,7 +331,7 @@ def write_animation(path: Path, frames: Iterable[np.ndarray]) -> None:
 
 
 def _before_flat_background(frames: np.ndarray) -> bytes | None:
-    """A WebP coded without loss; None without a flat background, or where it would be too large.
+    """Return a WebP without loss; None without a flat background, or where it is too large.
 
     Lossy coding leaves a haze around what stands before such a background.
     """
@@ -387,7 +348,7 @@ def _before_flat_background(frames: np.ndarray) -> bytes | None:
 
 
 def _coarser(frame: np.ndarray, background: np.ndarray) -> np.ndarray:
-    """uint8 in steps of :data:`FLAT_STEP`, but for the background, which stays as it is."""
+    """Return uint8 in steps of :data:`FLAT_STEP`, but for the background."""
     levels = np.arange(256)
     is_near = np.abs(levels[:, None] - background) <= FLAT_STEP / 2  # (256, 3)
     coarse = np.round(np.round(levels / FLAT_STEP) * FLAT_STEP).astype(np.uint8)[frame]
@@ -420,7 +381,7 @@ def _shrink(frame: Image.Image) -> Image.Image:
 
 
 def _common_palette(frames: Sequence[Image.Image]) -> Image.Image:
-    """256 colours for all frames; the commonest, which is the background, is kept exactly.
+    """Return 256 colours for all frames; the commonest, the background, is kept exactly.
 
     Pillow looks colours up in cells of 4 levels, so that any palette colour near the background's
     would be taken for it: those are replaced by it.

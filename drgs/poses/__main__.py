@@ -26,7 +26,7 @@ from drgs.cli.commands import CommandParser, file_or_folder, run_command
 from drgs.cli.progress import RunProgress
 from drgs.config.schema import DataConfig
 from drgs.core.errors import listed
-from drgs.datasets import reader_name
+from drgs.datasets.folders import find_reader
 from drgs.poses.structure_from_motion import (
     ALL_PAIRS,
     CAMERA_MODELS,
@@ -94,7 +94,7 @@ def run(args: argparse.Namespace) -> None:
 def fit_command(folder: Path) -> str:
     """What to type next; other cameras that lie there would be taken first."""
     words = ["drgs", "fit", str(folder)]
-    if reader_name(DataConfig(path=folder)) != "colmap":
+    if find_reader(DataConfig(path=folder))[0] != "colmap":
         words += ["--set", "data.type=colmap"]
     return shlex.join(words)
 

@@ -1,8 +1,8 @@
-"""Where photographs were taken: structure from motion, by COLMAP.
+"""Camera poses of photographs by structure from motion, with COLMAP.
 
 COLMAP (Schoenberger and Frahm 2016) finds features in each photograph, matches them between pairs
-of photographs, and puts together cameras and points from there. It runs through pycolmap, in a
-process of its own: there, neither Ctrl-C nor what it may abort for can take this one with it.
+of photographs, and reconstructs cameras and points. It runs through pycolmap, in a process of its
+own, so that neither Ctrl-C nor an abort of COLMAP ends this one.
 """
 
 from __future__ import annotations
@@ -28,35 +28,33 @@ from drgs.core.environment import required
 from drgs.core.errors import UserError, UserNote, listed, one_line
 from drgs.core.files import why_refused
 from drgs.core.folders import FolderRecord, sole_writer
-from drgs.datasets.colmap import LENSES, model_folder
+from drgs.datasets.colmap import find_model
+from drgs.datasets.files import is_image, masks_of, without_masks
+from drgs.datasets.folders import explain_photographs
 from drgs.datasets.images import read_mask
-from drgs.datasets.mask_names import masks_of, without_masks
-from drgs.datasets.recognition import folders_of_pictures, has_colmap_model, is_picture
+from drgs.datasets.transforms import LENS_OF_MODEL
 from drgs.io.pictures import check_readable, image_size, write_png
 
-CAMERA_MODELS = tuple(LENSES)
-"""Those that can be looked for: all that can be rendered."""
+CAMERA_MODELS = tuple(LENS_OF_MODEL)
 
 SIMPLE = "SIMPLE_RADIAL"
-"""The one with the fewest numbers to find that suits photographs."""
+"""The model with the fewest parameters that suits photographs."""
 
-READ = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp"})
-"""Suffixes of the pictures that COLMAP reads and that can be fitted."""
+SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp"})
+"""Suffixes of images that COLMAP reads and that can be fitted."""
 
 ALL_PAIRS = 100
-"""Photographs, at most, of which every two are compared where nothing is said."""
+"""Most photographs of which every two are compared by default."""
 
 NEIGHBOURS, STRIDE = 10, 8
-"""Of more: each with so many that follow it by name and those at distances of powers of two, and
-every so many-th with each other."""
+"""Of more photographs: each is compared with so many that follow it by name and those at distances
+of powers of two, and every so many-th with each other."""
 
-AT_ONCE = 8
-"""Photographs whose features are looked for in a call of COLMAP; it uses all cores within one."""
+PHOTOGRAPHS_AT_ONCE, PAIRS_AT_ONCE = 8, 64
+"""Per call of COLMAP, which uses all cores within one."""
 
-PAIRS_AT_ONCE = 64
-
-MAX_SIDE = 3200
-"""px: features are looked for in photographs scaled down to this, which is COLMAP's default."""
+MAX_SIDE_PX = 3200
+"""Features are extracted from photographs scaled down to this, which is COLMAP's default."""
 
 LEAST_PLACED = 3
 """Photographs with which there is a model at all."""
@@ -67,7 +65,7 @@ MODEL_FILES = ("cameras.bin", "frames.bin", "points3D.bin", "rigs.bin", "images.
 """In the order in which they are put in place: without the last there is no model."""
 
 TEMPORARY = ".drgs-poses-"
-"""Names of folders begin so that are removed in the end, or by the next run."""
+"""Beginning of the names of temporary folders."""
 
 SEED = 0
 
@@ -75,23 +73,23 @@ REMEDY = "if memory or the disk is full, free some of it, or take fewer or small
 """Where COLMAP gives up: it does not always tell the reason."""
 
 Watch = Callable[[str, int, int], None]
-"""Is called with what is counted, how many are done, and of how many."""
+"""Takes the name of what is counted, the number done, and the total."""
 
 
 @dataclass(frozen=True)
 class Search:
-    """How cameras are looked for."""
+    """Settings of structure from motion."""
 
     camera_model: str = "OPENCV"  # of CAMERA_MODELS
     compare: str = "auto"  # pairs: all, neighbours by name, or auto: by ALL_PAIRS
     share: str = "alike"  # a camera for all of the same size and EXIF (alike), for one, for each
 
     def compares_all(self, count: int) -> bool:
-        """Whether every two of ``count`` photographs are compared."""
+        """Return whether every two of ``count`` photographs are compared."""
         return self.compare == "all" or (self.compare == "auto" and count <= ALL_PAIRS)
 
     def others(self, count: int) -> str:
-        """Options that search otherwise, and may find more in ``count`` photographs, as text."""
+        """Return options that may place more of ``count`` photographs, as text."""
         options = {
             "--compare all": not self.compares_all(count),
             "--share one": self.share != "one",
@@ -103,18 +101,18 @@ class Search:
 
 @dataclass(frozen=True)
 class Placed:
-    """What was found."""
+    """Result of structure from motion."""
 
     names: tuple[str, ...]  # of the photographs that have a camera
     missing: tuple[str, ...]  # of the others
-    cameras: tuple[str, ...]  # their models and numbers, as text
+    cameras: tuple[str, ...]  # their models and parameters, as text
     num_points: int
-    error: float  # px: mean distance of points from where they were observed
-    num_models: int  # that do not hang together; the largest is this
+    error: float  # px: mean reprojection error
+    num_models: int  # unconnected ones; the largest is this
 
 
 def pictures_in(folder: Path) -> tuple[Path, list[str]]:
-    """The folder of photographs, ``folder/images`` or ``folder`` itself, and their names there.
+    """Return the folder of photographs, ``folder/images`` or ``folder``, and their names there.
 
     Those that COLMAP does not read are left out, with a :class:`UserNote`. Raises
     :class:`UserError` where there are no others, or one that cannot be fitted.
@@ -122,38 +120,32 @@ def pictures_in(folder: Path) -> tuple[Path, list[str]]:
     below = folder / "images"
     pictures = below if below.is_dir() else folder
     try:
-        if pictures == below:
-            found = [Path(root, name) for root, _, names in os.walk(below) for name in names]
-        else:
-            found = [pictures / name for name in os.listdir(pictures)]
+        found = list(pictures.rglob("*") if pictures == below else pictures.iterdir())
     except OSError as error:
         raise UserError(f"{folder}: cannot open the folder: {error.strerror or error}") from None
-    found = without_masks([p for p in found if is_picture(p.name) and p.is_file()])
-    found.sort(key=_as_counted)
-    files = [path for path in found if path.suffix.lower() in READ]
-    others = [path.relative_to(pictures) for path in found if path.suffix.lower() not in READ]
+    found = without_masks([p for p in found if is_image(p.name) and p.is_file()])
+    found.sort(key=_numeric_order)
+    files = [path for path in found if path.suffix.lower() in SUFFIXES]
+    others = listed([path.relative_to(pictures) for path in found if path not in set(files)])
     if not files:
-        below = folders_of_pictures(folder)
-        got = f"some only {below}" if below else "none"
-        if others:
-            got = f"{listed(others)}, which COLMAP does not read; convert them to JPEG"
+        got = f"{others}, which COLMAP does not read; convert them to JPEG" if others else "none"
+        if not others and (below := explain_photographs(folder)):
+            got = f"one that {below}"
         raise UserError(
             f"{folder}: must hold photographs, or have them in a folder images, got {got}"
         )
     if others:
-        note = f"{pictures}: left out, as COLMAP does not read them: {listed(others)}"
+        note = f"{pictures}: left out, as COLMAP does not read them: {others}"
         warnings.warn(UserNote(note), stacklevel=2)
     for file in files:
         check_readable(file)  # what a fit refuses is refused before hours of work
-    names = [file.relative_to(pictures).as_posix() for file in files]
-    for name in names:
-        if os.fsencode(name) != name.encode(errors="replace"):
-            raise UserError(f"{pictures / name}: COLMAP knows names in UTF-8 only; rename it")
-    return pictures, names
+        if os.fsencode(file) != str(file).encode(errors="replace"):
+            raise UserError(f"{file}: COLMAP knows names in UTF-8 only; rename it")
+    return pictures, [file.relative_to(pictures).as_posix() for file in files]
 
 
-def _as_counted(file: Path) -> list[tuple[int, str]]:
-    """An order in which ``frame 10`` follows ``frame 9``."""
+def _numeric_order(file: Path) -> list[tuple[int, str]]:
+    """Return a key by which ``frame 10`` follows ``frame 9``."""
     parts = re.split(r"([0-9]+)", str(file))
     return [(int(part[:18]), part) if part.isdecimal() else (0, part) for part in parts]
 
@@ -174,7 +166,9 @@ def place(folder: Path, search: Search, replace: bool, watch: Watch) -> Placed:
         try:
             if keep():
                 _remove_left_behind(folder, model)
-            with tempfile.TemporaryDirectory(prefix=TEMPORARY, dir=_place_of(model)) as temporary:
+            # On the disk to which the files are moved.
+            parent = next(path for path in (model, *model.parents) if path.is_dir())
+            with tempfile.TemporaryDirectory(prefix=TEMPORARY, dir=parent) as temporary:
                 found = run_in_child(
                     _find, search, pictures, folder, names, Path(temporary),
                     watch=watch, interrupts=interrupts,
@@ -196,21 +190,13 @@ def _check_free(folder: Path, model: Path, replace: bool) -> None:
     for path in (model.parent, model):
         if os.path.lexists(path) and not path.is_dir():
             raise UserError(f"{path}: must be a folder, got something else; move it away")
-    record = FolderRecord(model, COMMAND)
-    if not replace and has_colmap_model(folder):
-        there = model_folder(folder)
-        does = f"--overwrite writes {model}, which is then used instead"
-        if there == model:
-            is_own = not record.strangers(MODEL_FILES)
-            does = "--overwrite replaces it" if is_own else "for another, move it away"
+    if not replace and (found := find_model(folder)) is not None:
         fit = shlex.join(["drgs", "fit", str(folder)])
-        raise UserError(f"{there}: is there already; {fit} uses it, {does}")
-    record.check(MODEL_FILES)
-
-
-def _place_of(model: Path) -> Path:
-    """The folder for temporary files: the one to which they are moved, or the next above it."""
-    return next(path for path in (model, *model.parents) if path.is_dir())
+        raise UserError(
+            f"{found[1]}: is there already; {fit} uses it, --overwrite writes {model}, which is "
+            "then used instead"
+        )
+    FolderRecord(model, COMMAND).check(MODEL_FILES)
 
 
 def _remove_left_behind(folder: Path, model: Path) -> None:
@@ -231,25 +217,18 @@ def _put(written: Path, model: Path) -> None:
     for name in MODEL_FILES:
         (written / name).replace(model / name)
     record.seal()
-    if stale := sorted(path.name for path in model.glob("*.txt") if path.stem in _STEMS):
-        note = (
-            f"{model}: {listed(stale)} of another model stay there; what reads both takes the "
-            "binary files, which are new"
-        )
-        warnings.warn(UserNote(note), stacklevel=2)
-
-
-_STEMS = frozenset(Path(name).stem for name in MODEL_FILES)
 
 
 def _find(
     search: Search, pictures: Path, dataset: Path, names: Sequence[str], folder: Path, watch: Watch
 ) -> Placed:
-    """Write ``folder/model``: what runs in a process of its own."""
+    """Write ``folder/model``: the function of the child process."""
     pycolmap = required("pycolmap", "colmap", "structure from motion")
-    pycolmap.logging.minloglevel = 3  # what goes wrong is said below
+    pycolmap.logging.minloglevel = 3  # errors are reported below
     try:
-        found, count = _Work(pycolmap, folder, pictures, dataset, names, search, watch).model()
+        found, count = _Reconstruction(
+            pycolmap, folder, pictures, dataset, names, search, watch
+        ).largest()
         written = folder / "model"
         written.mkdir()
         found.write_binary(written)
@@ -264,17 +243,17 @@ def _find(
 
 
 @dataclass
-class _Work:
+class _Reconstruction:
     pycolmap: ModuleType
-    folder: Path  # for what is written on the way
+    folder: Path  # for intermediate files
     pictures: Path
     dataset: Path  # which may have masks
     names: Sequence[str]
     search: Search
     watch: Watch
 
-    def model(self) -> tuple[Any, int]:
-        """The largest reconstruction, and of how many."""
+    def largest(self) -> tuple[Any, int]:
+        """Return the largest reconstruction, and the number of all."""
         if len(self.names) < LEAST_PLACED:
             raise UserError(
                 f"{self.pictures}: at least {LEAST_PLACED} photographs, got {len(self.names)}; "
@@ -282,29 +261,42 @@ class _Work:
             )
         self._extract()
         self._match()
-        models = self._reconstruct()
+        models = self._map()
         if not models or max(m.num_reg_images() for m in models) < LEAST_PLACED:
-            raise UserError(f"{self.pictures}: {self._why_none()}")
+            raise UserError(
+                f"{self.pictures}: no cameras were found; take more photographs, neither blurred "
+                "nor of something plain, each showing most of what its neighbours show, while "
+                "walking around (not turning on the spot), or try "
+                f"{self.search.others(len(self.names))}"
+            )
         return max(models, key=lambda m: (m.num_reg_images(), m.num_points3D())), len(models)
 
     @property
     def database(self) -> Path:
         return self.folder / "database.db"
 
+    def _chunks(
+        self, what: str, items: Sequence[Any], size: int, done: int, total: int
+    ) -> Iterator:
+        """Yield ``items`` in chunks of ``size``, counted from ``done`` of ``total``."""
+        for start in range(0, len(items), size):
+            self.watch(what, done + start, total)
+            yield items[start : start + size]
+        self.watch(what, done + len(items), total)
+
     def _extract(self) -> None:
-        """Features of all photographs, and which of them share a camera."""
+        """Extract features of all photographs, groups of which share a camera."""
         pycolmap, done = self.pycolmap, 0
         options = pycolmap.FeatureExtractionOptions()
-        options.max_image_size = MAX_SIDE
+        options.max_image_size = MAX_SIDE_PX
         masks = self._masks_for_all()
         for group in self._groups():
             reader = pycolmap.ImageReaderOptions()
             reader.camera_model = self.search.camera_model
             if masks is not None:
                 reader.mask_path = masks
-            for start in range(0, len(group), AT_ONCE):
-                chunk = group[start : start + AT_ONCE]
-                self.watch("photograph", done, len(self.names))
+            sizes = PHOTOGRAPHS_AT_ONCE, done, len(self.names)
+            for chunk in self._chunks("photograph", group, *sizes):
                 pycolmap.extract_features(
                     self.database,
                     self.pictures,
@@ -314,27 +306,26 @@ class _Work:
                     extraction_options=options,
                 )
                 reader.existing_camera_id = self._camera_of(chunk)
-                done += len(chunk)
-        self.watch("photograph", done, len(self.names))
+            done += len(group)
 
     def _groups(self) -> list[list[str]]:
-        """Names of photographs that share a camera."""
-        groups: dict[object, list[str]] = {}
-        sizes = {image_size(self.pictures / name) for name in self.names}
+        """Return groups of the names of photographs that share a camera."""
+        sizes = sorted({image_size(self.pictures / name) for name in self.names})
         if self.search.share == "one" and len(sizes) > 1:
-            (w, h), (other_w, other_h), *_ = sorted(sizes)
+            (w, h), (other_w, other_h), *_ = sizes
             raise UserError(
                 f"{self.pictures}: photographs that share one camera must have one size, got "
                 f"{w} x {h} and {other_w} x {other_h} px; use --share alike"
             )
+        groups: dict[object, list[str]] = {}
         for name in self.names:
             key = {"one": 0, "each": name}.get(self.search.share)
-            key = _taken_with(self.pictures / name) if key is None else key
+            key = _size_and_lens(self.pictures / name) if key is None else key
             groups.setdefault(key, []).append(name)
         return list(groups.values())
 
     def _camera_of(self, names: Sequence[str]) -> int:
-        """The number of the camera that photographs share, now that they have been read."""
+        """Return the number of the camera that photographs share, after they have been read."""
         with self.pycolmap.Database.open(self.database) as database:
             cameras = {image.name: image.camera_id for image in database.read_all_images()}
         if missing := [name for name in names if name not in cameras]:
@@ -345,54 +336,43 @@ class _Work:
         return cameras[names[0]]
 
     def _masks_for_all(self) -> Path | None:
-        """A folder with a mask for each photograph, white for those without; None: there are none.
+        """Return a folder with a mask for each photograph, as a fit reads it; None: there are none.
 
-        Of the photographs' sizes, as a fit reads them. COLMAP leaves out photographs whose mask is
-        missing.
+        White for photographs without a mask, which COLMAP would leave out.
         """
-        given = dict(
-            zip(self.names, masks_of(self.dataset, self.names, [], self.pictures), strict=True)
-        )
-        if not any(given.values()):
+        masks = masks_of(self.dataset, self.names, [], self.pictures)
+        if not any(masks):
             return None
         folder = self.folder / "masks"
-        for name in self.names:
+        for name, file in zip(self.names, masks, strict=True):
             target = folder / f"{name}.png"
             target.parent.mkdir(parents=True, exist_ok=True)
-            width, height = image_size(self.pictures / name)
-            mask = np.ones((height, width), np.float32)
-            if (file := given[name]) is not None:
-                mask = read_mask(file, (width, height))
-            write_png(target, mask)
+            size = image_size(self.pictures / name)
+            write_png(target, np.ones(size[::-1]) if file is None else read_mask(file, size))
         return folder
 
     def _match(self) -> None:
-        """Compare pairs, some at a time.
+        """Compare pairs.
 
         COLMAP's lists of pairs have spaces between names, which may hold some themselves: for as
         long as they are compared, photographs are called by their numbers.
         """
         pycolmap, pairs = self.pycolmap, list(self._pairs())
-        listing = self.folder / "pairs.txt"
         options = pycolmap.ImportedPairingOptions()
-        options.match_list_path = listing
-        self._rename(str)
-        for start in range(0, len(pairs), PAIRS_AT_ONCE):
-            chunk = pairs[start : start + PAIRS_AT_ONCE]
-            self.watch("pair of photographs", start, len(pairs))
-            listing.write_text("".join(f"{a} {b}\n" for a, b in chunk))
+        options.match_list_path = self.folder / "pairs.txt"
+        numbers = list(map(str, range(len(self.names))))
+        self._rename(self.names, numbers)
+        for chunk in self._chunks("pair of photographs", pairs, PAIRS_AT_ONCE, 0, len(pairs)):
+            options.match_list_path.write_text("".join(f"{a} {b}\n" for a, b in chunk))
             pycolmap.match_image_pairs(self.database, pairing_options=options)
-        self.watch("pair of photographs", len(pairs), len(pairs))
-        self._rename(lambda index: self.names[index])
+        self._rename(numbers, self.names)
 
-    def _rename(self, name_of: Callable[[int], str]) -> None:
-        """Call photographs in the database by what ``name_of`` makes of their places in names."""
+    def _rename(self, old: Sequence[str], new: Sequence[str]) -> None:
         with self.pycolmap.Database.open(self.database) as database:
             images = {image.name: image for image in database.read_all_images()}
-            for index, name in enumerate(self.names):
-                image = images[name] if name in images else images[str(index)]
-                image.name = name_of(index)
-                database.update_image(image)
+            for name, new_name in zip(old, new, strict=True):
+                images[name].name = new_name
+                database.update_image(images[name])
 
     def _pairs(self) -> Iterator[tuple[int, int]]:
         count = len(self.names)
@@ -402,67 +382,39 @@ class _Work:
             if compares_all or j - i in steps or (i % STRIDE == 0 and j % STRIDE == 0):
                 yield i, j
 
-    def _reconstruct(self) -> list[Any]:
+    def _map(self) -> list[Any]:
+        """Reconstruct cameras and points."""
         options = self.pycolmap.IncrementalPipelineOptions()
         options.random_seed = SEED
-        placed = 0
+        total, placed = len(self.names), 0
 
-        def begin() -> None:
+        def count(number: int) -> None:
             nonlocal placed
-            placed = 2
-            self.watch("camera", placed, len(self.names))
-
-        def count() -> None:
-            nonlocal placed
-            placed = min(placed + 1, len(self.names))
-            self.watch("camera", placed, len(self.names))
+            placed = min(number, total)
+            self.watch("camera", placed, total)
 
         found = self.pycolmap.incremental_mapping(
             self.database,
             self.pictures,
             self.folder / "models",
             options=options,
-            initial_image_pair_callback=begin,
-            next_image_callback=count,
+            initial_image_pair_callback=lambda: count(2),
+            next_image_callback=lambda: count(placed + 1),
         )
         return list(found.values())
 
-    def _why_none(self) -> str:
-        with self.pycolmap.Database.open(self.database) as database:
-            features = [
-                database.num_keypoints_for_image(image.image_id)
-                for image in database.read_all_images()
-            ]
-            verified = database.num_verified_image_pairs()
-        few = sum(number < FEW_FEATURES for number in features)
-        found = (
-            f"{few} of {len(features)} photographs have hardly any features (blurred, dark, or of "
-            "something plain)"
-            if few > len(features) / 2
-            else f"only {verified} pairs of photographs show the same, as far as one can tell"
-        )
-        return (
-            f"no cameras were found: {found}; take more photographs, each showing most of what "
-            "its neighbours show, while walking around (not turning on the spot), or try "
-            f"{self.search.others(len(features))}"
-        )
 
-
-FEW_FEATURES = 100
-
-
-def _taken_with(file: Path) -> tuple[object, ...]:
-    """The same for photographs of the same size and, as far as EXIF says, the same lens."""
-    size = image_size(file)
+def _size_and_lens(file: Path) -> tuple[object, ...]:
+    """Return the same for photographs of one size and, as far as EXIF says, one lens."""
     tags = ExifTags.Base
     try:
         with Image.open(file) as image:
             exif = image.getexif()
             details = exif.get_ifd(ExifTags.IFD.Exif)
-            told = (exif.get(tags.Make), exif.get(tags.Model), details.get(tags.FocalLength))
+            lens = (exif.get(tags.Make), exif.get(tags.Model), details.get(tags.FocalLength))
     except Exception:  # Pillow raises many types for broken EXIF, which says nothing
-        told = ()
-    return *size, *map(str, told)
+        lens = ()
+    return *image_size(file), *map(str, lens)
 
 
 def _described(found: Any, names: Sequence[str], num_models: int) -> Placed:

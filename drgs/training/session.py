@@ -31,7 +31,7 @@ from drgs.datasets import Dataset, load_dataset
 from drgs.datasets.fingerprint import Fingerprint, fingerprint_of
 from drgs.datasets.folders import config_for
 from drgs.gaussians.parameters import Gaussians
-from drgs.initialization.defaults import completed
+from drgs.initialization.defaults import resolve_defaults
 from drgs.initialization.start import description_of_start, gaussians_at, start_of
 from drgs.integrator.scene import check_lenses
 from drgs.integrator.summary import described
@@ -206,7 +206,7 @@ class FitSession:
         if checkpoint is not None:
             before = checkpoint.data
             check_same_data(folder.path, config.data.path, before, self._fingerprint)
-        self.config = completed(config, self.dataset)
+        self.config = resolve_defaults(config, self.dataset)
         return checkpoint
 
     def _plan(self, gaussians: Gaussians) -> Plan | None:

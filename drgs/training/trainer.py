@@ -22,7 +22,7 @@ from drgs.config.schema import FitConfig
 from drgs.core.memory import release_unused_memory
 from drgs.datasets.types import Dataset, View
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
-from drgs.initialization.defaults import completed
+from drgs.initialization.defaults import resolve_defaults
 from drgs.integrator.scene import make_scene, render_views
 from drgs.splatting.rendering import NO_FAULT
 from drgs.training.density.registry import density_strategy
@@ -101,7 +101,7 @@ class Trainer:
 
         density, loss: None: those of the configuration; effects: besides the configuration's.
         """
-        config = completed(config, dataset)
+        config = resolve_defaults(config, dataset)
         self.config, self.dataset, self.extent = config, dataset, dataset.extent
         self.comm = comm = comm or Communicator()
         check_can_be_shared(config, comm.size, gaussians.num_gaussians)

@@ -16,10 +16,9 @@ from scipy.spatial.transform import Rotation
 
 from drgs.config.approximations import Approximations
 from drgs.core.errors import UserError, one_line
-from drgs.datasets.focus import focus_of
 from drgs.datasets.orbits import up_of
 from drgs.datasets.types import Viewpoint
-from drgs.datasets.viewpoints import look_at
+from drgs.datasets.viewpoints import focus_of, look_at
 from drgs.viewer.controls import LookControls
 from drgs.viewer.frames import Frame, FrameRequest
 from drgs.viewer.optics import Eye

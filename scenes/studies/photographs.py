@@ -28,9 +28,9 @@ import drgs  # noqa: F401  (registers the integrator)
 from drgs.bench.output import machine, markdown_table
 from drgs.config.schema import FitConfig
 from drgs.core.environment import required
-from drgs.datasets import load_dataset, reader_name
+from drgs.datasets import load_dataset
 from drgs.datasets.colmap import model_folder, picture_folder
-from drgs.datasets.folders import config_for
+from drgs.datasets.folders import config_for, find_reader
 from drgs.gaussians.parameters import Gaussians
 from drgs.integrator.scene import make_scene, render_views
 from drgs.io.colmap import read_model
@@ -140,7 +140,7 @@ def main() -> None:
     print(reasons)
     rows = []
     for case in (CASES[k - 1] for k in args.only):
-        if case.needs_model and reader_name(config.data) != "colmap":
+        if case.needs_model and find_reader(config.data)[0] != "colmap":
             print(f"{case.name}: left out, as {args.data} has no model of COLMAP")
             continue
         folder = args.out / args.data.resolve().name / case.name.replace(" ", "_")

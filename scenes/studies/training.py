@@ -26,7 +26,7 @@ from drgs.config.changes import changed, with_iterations
 from drgs.config.load import load_config
 from drgs.config.schema import FitConfig
 from drgs.datasets import load_dataset
-from drgs.initialization.defaults import completed
+from drgs.initialization.defaults import resolve_defaults
 from drgs.initialization.start import initial_gaussians
 from drgs.training.budget import STRATEGIES, Strategy, rehearse
 
@@ -66,7 +66,7 @@ class Point:
 def fit_curves(out: Path, only: list[int], threads: int | None) -> None:
     """Fit each choice with each number of iterations; write table, CSV and plot."""
     shipped = load_config(CONFIG)
-    shipped = completed(shipped, load_dataset(shipped.data_for_training))
+    shipped = resolve_defaults(shipped, load_dataset(shipped.data_for_training))
     start_s, points = seconds_at_start(), []
     for iterations in NUM_ITERATIONS:
         config = with_iterations(shipped, iterations)
@@ -100,7 +100,7 @@ def seconds_at_start() -> float:
     config = load_config(CONFIG)
     dataset = load_dataset(config.data_for_training)
     gaussians = initial_gaussians(config, dataset)
-    config = completed(config, dataset)
+    config = resolve_defaults(config, dataset)
     rehearsals = [rehearse(config, dataset, gaussians).iteration_s for _ in range(REHEARSALS)]
     return round(statistics.median(rehearsals), 5)
 

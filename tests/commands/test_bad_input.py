@@ -150,8 +150,8 @@ WRONG_INPUTS = {
     "unknown key": (edit_settings(sed=3), "a.yml: unknown key sed; did you mean seed?"),
     "wrong value": (edit_settings(iterations=0), "a.yml: iterations must be >= 1, got 0"),
     "data missing": (edit_settings(data={"path": "none"}), "data.path: there is no folder"),
-    "data is a file": (edit_settings(data={"path": "a.yml"}), "a.yml is a file; give the folder"),
-    "data of no layout": (edit_settings(data={"path": "train"}), "but no cameras: where each was"),
+    "data is a file": (edit_settings(data={"path": "a.yml"}), "cannot open the folder"),
+    "data of no layout": (edit_settings(data={"path": "train"}), "but no cameras: find out where"),
     "transforms is a folder": (
         put_folder_in_place_of("transforms_train.json"),
         "transforms_train.json: cannot read the file: Is a directory",
@@ -161,15 +161,18 @@ WRONG_INPUTS = {
         write("transforms_train.json", b"[" * 10**5),
         "transforms_train.json: not valid JSON",
     ),
-    "transforms a list": (write("transforms_train.json", b"[]"), "train.json: must hold an object"),
+    "transforms a list": (
+        write("transforms_train.json", b"[]"),
+        "train.json: the content must be an object",
+    ),
     "no frames": (edit_transforms(lambda m: m.pop("frames")), "train.json: frames is missing"),
     "frames empty": (
         edit_transforms(lambda m: m["frames"].clear()),
-        "frames must have at least one view",
+        "frames must have at least one entry",
     ),
     "matrix 3x4": (
         edit_transforms(lambda m: m["frames"][1]["transform_matrix"].pop()),
-        "transforms_train.json: frames[1].transform_matrix must be 4 x 4 numbers (3 rows",
+        "transforms_train.json: frames[1].transform_matrix must be 4 x 4 numbers",
     ),
     "matrix not finite": (
         edit_transforms(lambda m: m["frames"][1]["transform_matrix"][0].__setitem__(3, np.nan)),

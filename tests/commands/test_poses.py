@@ -22,7 +22,7 @@ def run(tmp_path, monkeypatch, capsys):
             return found
 
         monkeypatch.setattr(poses, "place", place)
-        monkeypatch.setattr(poses, "reader_name", lambda config: "colmap")
+        monkeypatch.setattr(poses, "find_reader", lambda config: ("colmap", None))
         poses.main([str(tmp_path), *options])
         return asked[0], capsys.readouterr().out.splitlines()
 

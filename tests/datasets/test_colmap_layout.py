@@ -22,12 +22,12 @@ from drgs.cameras.camera import Camera
 from drgs.cameras.lens import Pinhole
 from drgs.config.schema import FitConfig, InitConfig
 from drgs.core.errors import UserError
-from drgs.datasets.colmap import LENSES
+from drgs.datasets.files import masks_of
 from drgs.datasets.images import is_scaled
-from drgs.datasets.mask_names import masks_of
-from drgs.initialization.defaults import completed
+from drgs.datasets.transforms import LENS_OF_MODEL
+from drgs.initialization.defaults import resolve_defaults
 from drgs.initialization.start import _read_cloud, start_of
-from drgs.io.colmap_records import MODELS
+from drgs.io.colmap import MODELS
 
 REAL = SHARED_DATA / "colmap_robothead"
 
@@ -54,15 +54,6 @@ def test_views_have_poses_and_intrinsics_of_the_model(tmp_path, below, write):
         assert level == pytest.approx(40 * NAMES.index(name), abs=3)
     assert "(COLMAP layout): 2 train views" in dataset.description
     assert dataset.background == (0.0, 0.0, 0.0)
-
-
-def test_other_models_beside_the_first_are_named(tmp_path):
-    write_dataset(tmp_path)
-    assert "; model" not in load(tmp_path).description
-    for below in ("sparse/10", "sparse/2"):
-        write_dataset(tmp_path, below=below)
-    (tmp_path / "sparse" / "3").mkdir()
-    assert "; model sparse/0 (others are there: 2, 10)" in load(tmp_path).description
 
 
 def test_folders_may_be_called_in_another_case(tmp_path):
@@ -100,7 +91,7 @@ def test_the_largest_pictures_there_are_may_be_smaller_than_what_is_asked_for(tm
     assert load(tmp_path).train[0].width == 160
 
 
-@pytest.mark.parametrize("name", sorted(LENSES))
+@pytest.mark.parametrize("name", sorted(LENS_OF_MODEL))
 def test_every_lens_that_can_be_rendered_is(tmp_path, name):
     """Without undistorting; the coefficients are those of the file."""
     write_dataset(tmp_path, [name])
@@ -122,7 +113,7 @@ def film_points(view, points):
     return np.array(camera.lens.project_point(camera, Array3f64(points.T))).T
 
 
-@pytest.mark.parametrize("name", sorted(LENSES))
+@pytest.mark.parametrize("name", sorted(LENS_OF_MODEL))
 def test_points_are_seen_where_colmap_projects_them(tmp_path, name):
     """In double precision, over the picture and somewhat beyond, to a few roundings of 1,000 px."""
     pycolmap = pytest.importorskip("pycolmap")
@@ -157,7 +148,7 @@ def test_real_points_are_seen_where_they_were_observed():
     assert np.mean(ours) == pytest.approx(np.mean(stored), rel=1e-3)
 
 
-@pytest.mark.parametrize("name", sorted(set(PARAMETERS) - set(LENSES)))
+@pytest.mark.parametrize("name", sorted(set(PARAMETERS) - set(LENS_OF_MODEL)))
 def test_other_lenses_are_refused_by_name(tmp_path, name):
     write_dataset(tmp_path, [name])
     message = refusal(tmp_path)
@@ -248,7 +239,7 @@ def test_a_fit_starts_from_the_models_points(tmp_path):
     model = write_dataset(tmp_path)
     dataset = load(tmp_path)
     assert dataset.point_cloud == tmp_path / "sparse" / "0" / "points3D.bin"
-    config = completed(FitConfig(data={"path": tmp_path}, init={"num_points": 9}), dataset)
+    config = resolve_defaults(FitConfig(data={"path": tmp_path}, init={"num_points": 9}), dataset)
     start = start_of(config, dataset)
     positions, colors, *_ = (np.array(column) for column in zip(*model.points, strict=True))
     np.testing.assert_allclose(start.means, positions, rtol=1e-6)
@@ -263,7 +254,9 @@ def test_points_of_large_errors_and_of_few_observations_are_left_out(tmp_path):
     positions, _, errors, lengths = (np.array(column) for column in zip(*model.points, strict=True))
 
     def start(**init):
-        return start_of(completed(FitConfig(data={"path": tmp_path}, init=init), dataset), dataset)
+        return start_of(
+            resolve_defaults(FitConfig(data={"path": tmp_path}, init=init), dataset), dataset
+        )
 
     error, length = float(np.sort(errors)[-3]), int(np.median(lengths))
     for init, kept in (
@@ -413,7 +406,7 @@ def test_a_picture_that_is_not_there_is_left_out_unless_most_are(tmp_path):
     for name in NAMES[2:]:
         (tmp_path / "images" / name).unlink()
     message = refusal(tmp_path)
-    assert "image b.jpg: there is no picture" in message and "images/b.jpg" in message
+    assert "image b.jpg: there is no image" in message and "images/b.jpg" in message
     assert message.endswith("; not there: 3 of 4 photographs")
 
 
@@ -470,8 +463,8 @@ def test_folders_without_pictures_and_models_without_folders_are_explained(tmp_p
     write_dataset(tmp_path)
     (tmp_path / "images").rename(tmp_path / "originals")
     assert "there is no folder images (or images_2, images_4, images_8)" in refusal(tmp_path)
-    assert "is a model of COLMAP (0/cameras.bin) without photographs" in refusal(
-        tmp_path / "sparse"
+    assert "nor a model of COLMAP in sparse/0 with its photographs in" in (
+        refusal(tmp_path / "sparse")
     )
     assert "there is no model of COLMAP in sparse/0" in refusal(
         tmp_path / "originals", type="colmap"

@@ -28,16 +28,19 @@ WRONG = {
     "of more than there is": (lambda p: p.write_bytes(header((2**40, 2**40))), "cannot read the"),
     "cut off": (lambda p: p.write_bytes(header((4, 6)) + bytes(80)), "cannot read the depth"),
     "of another size": (lambda p: np.save(p, np.ones((6, 4))), "must be 6 x 4 px"),
-    "of text": (lambda p: np.save(p, np.full((4, 6), "x")), "depth must be one array of"),
-    "complex": (lambda p: np.save(p, np.ones((4, 6), complex)), "depth must be one array of"),
+    "of text": (lambda p: np.save(p, np.full((4, 6), "x")), "depth must be (height, width)"),
+    "complex": (
+        lambda p: np.save(p, np.ones((4, 6), complex)),
+        "depth must be (height, width)",
+    ),
     "of records": (
         lambda p: np.save(p, np.ones((4, 6), [("a", "f4")])),
-        "depth must be one array of",
+        "depth must be (height, width)",
     ),
     "of objects": (lambda p: np.save(p, np.full((4, 6), None)), "cannot read the depth"),
     "of several arrays": (
         of_several,
-        "depth must be one array of",
+        "depth must be (height, width)",
     ),
     "no numbers": (lambda p: p.write_bytes(b"hello"), "cannot read the depth"),
     "empty": (lambda p: p.write_bytes(b""), "cannot read the depth"),

@@ -8,7 +8,7 @@ from PIL import ExifTags, Image, ImageOps
 from support.datasets import load, look_at
 
 from drgs.core.errors import UserError
-from drgs.io.pictures import image_orientation, image_size, read_pixels, stored_shape, upright
+from drgs.io.pictures import image_size, read_header, read_pixels, upright
 
 STORED = np.random.default_rng(0).integers(0, 256, (6, 8, 3), np.uint8)
 
@@ -35,7 +35,7 @@ def dataset(folder, orientation, pixels=STORED, **size):
 def test_pictures_are_turned_as_pillow_turns_them(tmp_path, orientation, suffix):
     path = tmp_path / f"a.{suffix}"
     save(path, orientation)
-    found = image_orientation(path)
+    found = read_header(path).orientation
     assert found == orientation
     with Image.open(path) as image:
         expected = np.asarray(ImageOps.exif_transpose(image).convert("RGB"))
@@ -50,13 +50,13 @@ def test_tiffs_are_read_as_they_are_stored_as_colmap_reads_them(tmp_path, orient
     save(path, orientation, compression=compression)
     np.testing.assert_array_equal(read_pixels(path), STORED)
     np.testing.assert_array_equal(pycolmap.Bitmap.read(str(path), True).to_array(), STORED)
-    assert image_size(path) == stored_shape(path)[:2] == (8, 6)
+    assert image_size(path) == read_header(path).size == (8, 6)
 
 
 @pytest.mark.parametrize("orientation", [0, 9, 65535])
 def test_numbers_that_mean_nothing_are_none(tmp_path, orientation):
     save(tmp_path / "a.jpg", orientation)
-    assert image_orientation(tmp_path / "a.jpg") == 1
+    assert read_header(tmp_path / "a.jpg").orientation == 1
 
 
 @pytest.mark.parametrize("orientation", [5, 6, 7, 8])
@@ -96,6 +96,6 @@ def test_an_orientation_that_may_or_may_not_count_is_refused(tmp_path, orientati
 
 def test_a_wrong_size_of_a_turned_picture_names_both(tmp_path):
     dataset(tmp_path, 6, w=7, h=8)
-    message = r"w must be the image's size, 8 x 6 px \(.*\), or as EXIF's orientation 6 turns it"
+    message = r"w and h do not tell .* \(.*json: w\) are for .* stored, 8 x 6 px, or as"
     with pytest.raises(UserError, match=message):
         load(tmp_path)

@@ -15,7 +15,8 @@ import drgs
 from drgs.config.load import config_from
 from drgs.core import registry
 from drgs.core.errors import UserError
-from drgs.datasets import load_dataset, reader_name
+from drgs.datasets import load_dataset
+from drgs.datasets.folders import find_reader
 from drgs.io.pictures import write_png
 
 EXAMPLE = Path(__file__).resolve().parent.parent / "examples" / "numpy_poses.py"
@@ -99,4 +100,4 @@ def test_what_it_finds_wrong_is_reported(folder):
 def test_shipped_readers_come_first(folder, tmp_path):
     path, _ = folder
     (path / "transforms.json").write_text("{}")
-    assert reader_name(config_from({"data": {"path": str(path)}}, "x").data) == "nerfstudio"
+    assert find_reader(config_from({"data": {"path": str(path)}}, "x").data)[0] == "nerfstudio"

@@ -9,7 +9,7 @@ from support.datasets import look_at
 
 from drgs.config.schema import DataConfig
 from drgs.datasets import load_dataset
-from drgs.datasets.reading import without_pictures
+from drgs.datasets.images import without_images
 
 RNG = np.random.default_rng(3)
 SIZE = 12, 8
@@ -55,14 +55,14 @@ def test_pictures_of_others_are_not_read(folder):
                 np.testing.assert_array_equal(np.asarray(picture), np.asarray(of_all))
                 continue
             assert picture.nbytes == 0
-            with pytest.raises(RuntimeError, match="another process has its picture"):
+            with pytest.raises(RuntimeError, match="another process has its image"):
                 np.asarray(picture)
 
 
 def test_pictures_that_were_read_can_be_left_to_others(folder):
     view = load_dataset(DataConfig(path=folder, ignore_depth=True)).train[0]
-    without = without_pictures(view)
+    without = without_images(view)
     assert without.depth is None and without.mask.shape == view.mask.shape
     assert without.image.shape == view.image.shape and without.image.nbytes == 0
-    with pytest.raises(RuntimeError, match="another process has its picture"):
+    with pytest.raises(RuntimeError, match="another process has its image"):
         np.asarray(without.image)

@@ -83,7 +83,7 @@ def test_splits_that_are_not_there_or_empty_are_refused(photographs):
         refusal(photographs, test_split="val")
     )
     give(photographs, test_filenames=IMAGES)
-    assert "at least 1 view of the split train is needed, and test_filenames" in (
+    assert "at least 1 view of the splits train and test is needed, and test_filenames" in (
         refusal(photographs)
     )
     give(photographs, test_filenames=["a", 3])
@@ -101,10 +101,3 @@ def test_a_list_in_a_file_counts_as_well(photographs):
     dataset, notes = load_noting(photographs)
     assert names(dataset.test) == [3, 5] and len(dataset.train) == 8
     assert notes == [f"{photographs}/train.txt: lists no photograph, and is not read"]
-
-
-def test_files_that_may_be_lists_are_said_not_to_be_read(photographs):
-    (photographs / "train_test_split_3.json").write_text("{}")
-    dataset, (note,) = load_noting(photographs)
-    assert names(dataset.test) == [0, 8]
-    assert note.startswith(f"{photographs}/train_test_split_3.json: is not read; ")

@@ -114,7 +114,7 @@ def test_the_limits_are_those_of_the_program():
         "AOVs": constants.MAX_FEATURES,
         "Gaussians": largest,
         "frames of an orbit": render.MAX_FRAMES,
-        "an animated WebP": pictures.WEBP_SIDE,
+        "an animated WebP": pictures.MAX_WEBP_SIDE,
         "arrays": memory.MAX_LANES,
         "coordinates of cameras": int(transforms.MAX_COORDINATE),
     }

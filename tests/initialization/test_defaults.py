@@ -8,7 +8,7 @@ from support.datasets import dataset_of, view_at
 
 from drgs.config.changes import changed, decided_as, with_iterations
 from drgs.config.schema import FitConfig
-from drgs.initialization.defaults import completed
+from drgs.initialization.defaults import resolve_defaults
 
 CONFIG = FitConfig(data={"path": "unused"}, iterations=1000)
 
@@ -39,7 +39,7 @@ def left_of(size):
 
 
 def stages(config, dataset):
-    return [(stage.until, stage.factor) for stage in completed(config, dataset).coarse]
+    return [(stage.until, stage.factor) for stage in resolve_defaults(config, dataset).coarse]
 
 
 def test_photographs_are_fitted_at_half_their_size_first(photographs):
@@ -73,6 +73,6 @@ def test_what_is_given_stays(photographs):
 
 def test_it_stays_open_until_there_is_a_dataset(photographs):
     assert with_iterations(CONFIG, 200).coarse is None
-    known = completed(CONFIG, photographs)
+    known = resolve_defaults(CONFIG, photographs)
     assert decided_as(CONFIG, known) == known
     assert stages(with_iterations(known, 200), photographs) == [(70, 2)]

@@ -12,8 +12,9 @@ from support.datasets import dataset_of, edit, load, refusal, view_at
 
 from drgs.config.schema import FitConfig
 from drgs.core.errors import UserError
-from drgs.datasets.focus import focus_of
+from drgs.datasets.folders import GUIDE
 from drgs.datasets.images import downscale
+from drgs.datasets.viewpoints import focus_of
 from drgs.initialization.start import (
     initial_gaussians,
     mean_squared_neighbour_distance,
@@ -36,8 +37,8 @@ def test_a_missing_folder_is_an_error_that_says_where_to_get_the_data(tmp_path):
 
 def test_a_folder_of_neither_layout_is_refused(tmp_path):
     assert refusal(tmp_path) == (
-        f"{tmp_path}: neither transforms_train.json nor transforms.json is there; data.path must "
-        "be a folder in the layout of NeRF-synthetic, of nerfstudio / instant-ngp or of COLMAP"
+        f"{tmp_path}: neither transforms_train.json nor transforms.json is there, nor a model of "
+        f"COLMAP in sparse/0 with its photographs in images; see {GUIDE}"
     )
 
 
@@ -283,7 +284,7 @@ def test_one_camera_determines_no_box():
         initial_gaussians(config(), dataset_of([view_at((4, 0, 0), (0, 0, 0))]))
     assert str(error.value) == (
         "init.half_extent: no start box can be derived from one training camera, which does not "
-        "tell how far away it looks; train on more views, or set init.half_extent, or give a point "
+        "tell how far away it looks; set init.half_extent, or give a point "
         "cloud (init.point_cloud)"
     )
 

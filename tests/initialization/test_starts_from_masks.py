@@ -127,8 +127,8 @@ def test_masks_and_clouds_that_are_not_there_are_refused(masks, opaque):
     few = replace(opaque, train=(*masks.train[:2], *opaque.train[2:]))
     assert refusal(few, start="masks") == (
         "init.start: masks needs nearly all training pictures to be transparent where there is "
-        "nothing, but only 2 of 12 are to 2 % or more, from a camera that stands still; cut out "
-        "what is to be fitted, or set init.start=auto"
+        "nothing, from cameras that stand still, but only 2 are; cut out what is to be fitted, or "
+        "set init.start=auto"
     )
     assert refusal(masks, start="points") == (
         "init.start: points needs a point cloud, and the dataset names none that may be used "

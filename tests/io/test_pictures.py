@@ -1,6 +1,5 @@
 import io
 import struct
-import zlib
 
 import drjit as dr
 import mitsuba as mi
@@ -164,13 +163,13 @@ def test_a_colour_that_a_png_names_is_transparent(tmp_path):
     pixels[0, 1] = 9, 8, 7
     for array, key in ((pixels, (9, 8, 7)), (pixels[:, :, 0], 9)):
         Image.fromarray(array).save(tmp_path / "a.png", transparency=key)
-        assert pictures.has_alpha(tmp_path / "a.png")
-        assert pictures.stored_shape(tmp_path / "a.png") == (3, 2, 4, 1)
+        header = pictures.read_header(tmp_path / "a.png")
+        assert header.has_alpha and header.size == (3, 2)
         alpha = pictures.read_pixels(tmp_path / "a.png")[:, :, 3]
         np.testing.assert_array_equal(alpha == 0, pixels[:, :, 0] == 9)
 
 
-def test_profiles_gammas_and_further_pictures_are_said(tmp_path):
+def test_profiles_and_further_pictures_are_said(tmp_path):
     grey = Image.new("RGB", (3, 2), (90, 90, 90))
     lab, srgb = (
         ImageCms.ImageCmsProfile(ImageCms.createProfile(name)).tobytes() for name in ("LAB", "sRGB")
@@ -186,12 +185,6 @@ def test_profiles_gammas_and_further_pictures_are_said(tmp_path):
         for name in ("a.jpg", "a.png", "a.tif"):
             grey.save(tmp_path / name, **options)
             assert pictures.unused_content(tmp_path / name) == said
-    grey.save(tmp_path / "a.png")
-    content = (tmp_path / "a.png").read_bytes()
-    chunk = b"gAMA" + struct.pack(">I", 100_000)
-    chunk = struct.pack(">I", 4) + chunk + struct.pack(">I", zlib.crc32(chunk))
-    (tmp_path / "a.png").write_bytes(content[:33] + chunk + content[33:])
-    assert pictures.unused_content(tmp_path / "a.png") == ["of gamma 1, which is taken for sRGB"]
     for name in ("a.tif", "a.gif", "a.webp", "b.png"):
         grey.save(tmp_path / name, save_all=True, append_images=[Image.new("RGB", (3, 2))])
         several = "with several pictures each, of which the first is used"

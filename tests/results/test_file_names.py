@@ -10,7 +10,6 @@ from drgs.results import files
 NAMES = {files.CONFIG, *files.RESULTS}
 
 KNOWN = {
-    "drgs/datasets/recognition.py": {files.CONFIG, files.GAUSSIANS, files.CHECKPOINT},
     "drgs/fit.py": {files.TENSORBOARD},
 }
 """Modules below ``results`` recognise a fit's folder by names that they write out themselves; the

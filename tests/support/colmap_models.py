@@ -7,7 +7,7 @@ import numpy as np
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from drgs.io.colmap_records import MODELS
+from drgs.io.colmap import MODELS
 
 
 def _values(names):

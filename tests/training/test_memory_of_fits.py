@@ -16,8 +16,7 @@ from drgs.cameras.axes import between_opencv_and_opengl
 from drgs.config.changes import changed
 from drgs.config.schema import FitConfig
 from drgs.core.errors import UserError
-from drgs.datasets.lazy_image import KeptPicture
-from drgs.datasets.types import Dataset, Motion, View
+from drgs.datasets.types import Dataset, LazyImage, Motion, View
 from drgs.datasets.viewpoints import look_at, pinhole
 from drgs.initialization.start import initial_gaussians
 from drgs.integrator.scene import make_scene, make_sensors
@@ -36,7 +35,7 @@ def dataset_of(width, height, count, channels=3):
         azimuth = 2 * np.pi * 0.618 * index
         origin = 4 * np.array([np.cos(azimuth) * 0.87, np.sin(azimuth) * 0.87, 0.48])
         camera = pinhole(f"v{index}", look_at(origin, (0, 0, 0), (0, 0, 1)), width, height, 40.0)
-        image = KeptPicture((height, width, 3), None, width * height * channels)
+        image = LazyImage((height, width, 3), None, width * height * channels)
         return View(**vars(camera), image=image)
 
     views = tuple(view(index) for index in range(count + 2))

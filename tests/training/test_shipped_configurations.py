@@ -14,7 +14,7 @@ from support.photographs import moved
 from drgs.config.changes import changed, with_iterations
 from drgs.config.load import load_config
 from drgs.datasets import load_dataset
-from drgs.initialization.defaults import completed
+from drgs.initialization.defaults import resolve_defaults
 from drgs.results.metrics import mean_quality
 from drgs.training.session import train
 
@@ -50,7 +50,7 @@ def configured(name, folder):
     dataset = load_dataset(config.data_for_training)
     if name == "lego_paper":  # it says for how many iterations its schedule is
         config = with_iterations(config, ITERATIONS)
-    return completed(config, dataset), dataset
+    return resolve_defaults(config, dataset), dataset
 
 
 @pytest.mark.parametrize("kind", ["blender", "photographs"])

@@ -13,7 +13,7 @@ import numpy as np
 
 from drgs.config.schema import FitConfig
 from drgs.datasets import load_dataset
-from drgs.datasets.reading import without_pictures
+from drgs.datasets.images import without_images
 from drgs.datasets.types import Dataset
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 from drgs.training.parallel.agreement import (
@@ -52,7 +52,7 @@ def share_inputs(
 def _with_own_photographs(dataset: Dataset, views_per_step: int, comm: Communicator) -> Dataset:
     """Return the dataset without the photographs of views that other ranks render."""
     own = own_views(len(dataset.train), views_per_step, comm.rank, comm.size)
-    train = (v if i in own else without_pictures(v) for i, v in enumerate(dataset.train))
+    train = (v if i in own else without_images(v) for i, v in enumerate(dataset.train))
     return replace(dataset, train=tuple(train))
 
 
