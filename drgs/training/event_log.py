@@ -16,8 +16,8 @@ from tensorboardX.proto.event_pb2 import Event
 from tensorboardX.record_writer import RecordWriter
 from tensorboardX.summary import scalar
 
-from drgs.training.history import History, HistoryRow
-from drgs.training.loop import Iteration
+from drgs.results.history import HistoryRow
+from drgs.training.loop import History, Iteration
 from drgs.training.trainer import Trainer
 
 VERSION = "brain.Event:2"

@@ -60,7 +60,7 @@ from drgs.training.checkpoint import (
     load_checkpoint,
     remove_checkpoint,
 )
-from drgs.training.history import History
+from drgs.training.loop import History
 from drgs.training.trainer import Trainer
 
 if TYPE_CHECKING:  # imported where it is needed

@@ -35,25 +35,27 @@ from drgs.initialization.defaults import completed
 from drgs.initialization.start import description_of_start, gaussians_at, start_of
 from drgs.integrator.scene import check_lenses
 from drgs.integrator.summary import described
+from drgs.results.history import HistoryRow
 from drgs.training.budget import Budget, Deadline, Plan, plan_fit, rehearse
 from drgs.training.checkpoint import Checkpoint, check_fits, check_same_data, save_checkpoint
 from drgs.training.density.strategy import DensityStrategy
 from drgs.training.effects.base import TrainingEffect
 from drgs.training.finite_checks import NonFiniteError
 from drgs.training.fit_folder import FitFolder, saved_gaussians
-from drgs.training.history import History, HistoryRow, smoother
 from drgs.training.loop import (
     AllIterations,
+    HeldOutQuality,
+    History,
     Iteration,
     Observer,
     RootDecides,
     StopCriterion,
     iterations,
+    smoother,
 )
 from drgs.training.losses import Loss
 from drgs.training.parallel.communicator import Communicator
 from drgs.training.parallel.inputs import share_gaussians, share_inputs
-from drgs.training.quality import HeldOutQuality
 from drgs.training.summary import summary_of_fit
 from drgs.training.trainer import StepReport, Trainer
 
@@ -250,8 +252,8 @@ class FitSession:
         start, state = self.trainer.state(), {}
         if checkpoint is not None:
             check_fits(self.folder.path, checkpoint, start)
-            state, past = checkpoint.trainer, (checkpoint.history, checkpoint.wall_s)
-            self.history = History.from_array(*past, checkpoint.density)
+            past = checkpoint.history, checkpoint.density, checkpoint.wall_s
+            state, self.history = checkpoint.trainer, History.from_arrays(*past)
         self.trainer.restore(state)
         self.console.say(f"continues at iteration {self.trainer.iteration}")
 
@@ -286,8 +288,8 @@ class FitSession:
     def _save_checkpoint(self) -> None:
         state, history = self.trainer.state(), self.history
         if self.folder is not None:
-            rows, changes = history.as_array(), history.density_array()
-            checkpoint = Checkpoint(state, rows, history.wall_s, self._fingerprint, changes)
+            past = *history.arrays(), history.wall_s
+            checkpoint = Checkpoint(state, *past, self._fingerprint)
             save_checkpoint(self.folder.path, self.trainer.config, checkpoint)
 
     def _finish(self, wall_s: float, gaussians: Gaussians) -> None:

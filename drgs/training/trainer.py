@@ -10,8 +10,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
+from copy import deepcopy
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -26,11 +27,15 @@ from drgs.initialization.defaults import completed
 from drgs.integrator.scene import make_scene, render_views
 from drgs.splatting.rendering import NO_FAULT
 from drgs.training.density.registry import density_strategy
-from drgs.training.density.strategy import DensityReport, DensityStrategy, StepInfo
+from drgs.training.density.strategy import (
+    DensityReport,
+    DensityStrategy,
+    PixelWeight,
+    StepInfo,
+)
 from drgs.training.effects.base import FitState, TrainingEffect
 from drgs.training.effects.registry import integrator_settings, training_effects
 from drgs.training.finite_checks import GradientWatch, check_values, check_view_values
-from drgs.training.gradients import ViewGradients, ViewLoss, WholeGradients
 from drgs.training.losses import Loss, make_loss, make_loss_terms
 from drgs.training.memory import Share, room_for_targets
 from drgs.training.optimizer import (
@@ -46,16 +51,24 @@ from drgs.training.parallel.population import (
     make_population,
 )
 from drgs.training.rates import learning_rates, rates_over_time, revised_aims, revised_stops
-from drgs.training.stages import KEPT_BYTES, bytes_on_device, make_stages
-from drgs.training.state_checks import DENSITY
-from drgs.training.steps import Step, StepView, plan_step
+from drgs.training.steps import (
+    KEPT_BYTES,
+    Step,
+    StepView,
+    ViewGradients,
+    ViewLoss,
+    WholeGradients,
+    bytes_on_device,
+    make_stages,
+    plan_step,
+)
 from drgs.training.views import TrainingView
-
-if TYPE_CHECKING:  # imported for steps of several views
-    from drgs.training.parallel.exchange import ViewExchange
 
 PREFIX = "integrator."
 """Precedes a parameter's name when the scene is traversed."""
+
+DENSITY = "density/"
+"""Precedes the names of the strategy's state: a row for each Gaussian, or single numbers."""
 
 
 @dataclass(frozen=True)
@@ -102,10 +115,12 @@ class Trainer:
         density, loss: None: those of the configuration; effects: besides the configuration's.
         """
         config = completed(config, dataset)
+        views_per_step = config.optimizer.views_per_step
         self.config, self.dataset, self.extent = config, dataset, dataset.extent
         self.comm = comm = comm or Communicator()
         check_can_be_shared(config, comm.size, gaussians.num_gaussians)
         self.effects = training_effects(config, dataset, effects)
+        self._given_density, self._given_effects, self._given_loss = density, effects, loss
         room = comm.collective(lambda: self._room_for_targets(gaussians))
         self.scene = make_scene(
             local_gaussians(gaussians, comm),
@@ -120,37 +135,33 @@ class Trainer:
             {key.removeprefix(PREFIX): value for key, value in self.params.items()},
             learning_rates(config.optimizer, self.extent),
             prefix=PREFIX,
-            beta_1=config.optimizer.beta_1**config.optimizer.views_per_step,
-            beta_2=config.optimizer.beta_2**config.optimizer.views_per_step,
+            beta_1=config.optimizer.beta_1**views_per_step,
+            beta_2=config.optimizer.beta_2**views_per_step,
             epsilon=config.optimizer.epsilon,
         )
         self.rates = rates_over_time(config, self.extent)
         self.loss = loss or make_loss(config)
         self.terms = make_loss_terms(config)
-        self._given_density = density
         self.stages = make_stages(dataset.train, config, self.effects, room)
-        self.gradients = self._make_gradients()
+        self.gradients: WholeGradients | ViewExchange = WholeGradients(self.integrator)
+        if views_per_step > 1:
+            from drgs.training.parallel.exchange import ViewExchange
+
+            self.gradients = ViewExchange(
+                comm, self.integrator, self.params, PREFIX, views_per_step
+            )
         population = self.optimizer, PREFIX, self.extent, config.seed
         self.population = make_population(*population, comm, gaussians.num_gaussians)
         self.density = self._density_from({})
         self.watch = GradientWatch()
         self.iteration = 0  # the last one that is done
-        self._gathered: tuple[int, mi.Scene | None] | None = None  # see full_scene
+        self._full_scene: tuple[int, mi.Scene | None] | None = None  # with its iteration
 
     def _room_for_targets(self, gaussians: Gaussians) -> int:
         """Return the number of bytes of targets that may stay on the device."""
         share = Share(self.comm.size, self.comm.num_on_machine)
         limits = bytes_on_device(self.effects), KEPT_BYTES
         return room_for_targets(self.config, self.dataset, gaussians, *limits, share)
-
-    def _make_gradients(self) -> WholeGradients | ViewExchange:
-        """Return what collects the gradients of a step's views."""
-        views_per_step = self.config.optimizer.views_per_step
-        if views_per_step == 1:
-            return WholeGradients(self.integrator)
-        from drgs.training.parallel.exchange import ViewExchange
-
-        return ViewExchange(self.comm, self.integrator, self.params, PREFIX, views_per_step)
 
     # ------------------------------------------------------------------------------------------
     # A step
@@ -167,7 +178,7 @@ class Trainer:
         losses: dict[int, ViewLoss] = {}
         for view in self.gradients.own_views():
             losses[view.place] = self._differentiate(step, view)
-        found = self.gradients.finish(self._weight_names(step))
+        found = self.gradients.finish([tuple(self._pixel_weights(i)) for i in step.iterations])
         views = self._total_losses(step, found, losses, penalties)
         if step.is_update:
             self._set_learning_rates(step)
@@ -178,7 +189,7 @@ class Trainer:
                 self.density.update_statistics(_step_info(step, view, gradients))
         report = self._control_density(step)
         for place in losses:
-            step.stage.seen(step.views[place].view)
+            step.stage.keep_or_free(step.views[place].view)
         means_lr = self.rates.means(step.last)
         return StepReport(step.last, self.num_gaussians, means_lr, report, tuple(views))
 
@@ -190,7 +201,7 @@ class Trainer:
         image = mi.render(self.scene, self.params, sensor=view.view.sensor, spp=1)
         image, loss, error = self.compare(image, view.view)
         dr.backward(loss / step.num_averaged if step.num_averaged > 1 else loss)
-        self.gradients.end_view(self._pixel_weights(view, dr.detach(image)))
+        self.gradients.end_view(self._weight_planes(view, dr.detach(image)))
         return ViewLoss(dr.detach(loss), error, view.view.counted)
 
     def _begin_step(self) -> Step:
@@ -242,17 +253,14 @@ class Trainer:
                 loss = loss + term
         return image, loss, error
 
-    def _pixel_weights(self, view: StepView, image: Any) -> dict[str, Any]:
+    def _weight_planes(self, view: StepView, image: Any) -> dict[str, Any]:
         """Return the planes by which the strategy weighs what it sees of Gaussians; by name."""
-        if not self.density.needs_statistics(view.iteration):
-            return {}
-        weights = self.density.pixel_weights(view.iteration)
+        weights = self._pixel_weights(view.iteration)
         return {name: weigh(image, view.view.target.image) for name, weigh in weights.items()}
 
-    def _weight_names(self, step: Step) -> list[tuple[str, ...]]:
-        """Return the names of the planes of :meth:`_pixel_weights`, of each view."""
-        needs, weights = self.density.needs_statistics, self.density.pixel_weights
-        return [tuple(weights(i)) if needs(i) else () for i in step.iterations]
+    def _pixel_weights(self, iteration: int) -> Mapping[str, PixelWeight]:
+        needs_statistics = self.density.needs_statistics(iteration)
+        return self.density.pixel_weights(iteration) if needs_statistics else {}
 
     def _total_losses(
         self,
@@ -263,20 +271,19 @@ class Trainer:
     ) -> list[ViewLoss]:
         """Return the losses of all views with the strategy's terms, and remember to check them."""
         shared, results = self.gradients.share_losses(losses), []
+        first_row = self.population.first_row * len(PARAMETER_NAMES)
         for view, gradients, loss in zip(step.views, found, shared, strict=True):
-            total = sum(penalties, loss.loss)
-            self._watch(view, total, gradients.first_fault)
+            total, fault = sum(penalties, loss.loss), gradients.first_fault
+            if first_row:
+                fault = dr.select(fault == NO_FAULT, fault, fault + dr.opaque(mi.UInt32, first_row))
+            numbers = {
+                f"{effect.name}.{name}": values
+                for effect in self.effects
+                for name, values in effect.numbers_of(view.view).items()
+            }
+            self.watch.add(view.iteration, view.view.name, total, fault, numbers)
             results.append(replace(loss, loss=total))
         return results
-
-    def _watch(self, view: StepView, loss: Any, first_fault: Any) -> None:
-        """Remember what may not be finite: see :class:`GradientWatch`."""
-        effects = self.effects
-        numbers = {f"{e.name}.{k}": v for e in effects for k, v in e.numbers_of(view.view).items()}
-        if first := self.population.first_row * len(PARAMETER_NAMES):
-            first = dr.opaque(mi.UInt32, first)
-            first_fault = dr.select(first_fault == NO_FAULT, first_fault, first_fault + first)
-        self.watch.add(view.iteration, view.view.name, loss, first_fault, numbers)
 
     def _set_learning_rates(self, step: Step) -> None:
         """Set the rates of a step, times the factors of the strategy."""
@@ -359,11 +366,6 @@ class Trainer:
         return self.last_step.stage.views
 
     @property
-    def means_lr(self) -> float:
-        """The means' learning rate of the last iteration, world units."""
-        return self.rates.means(self.iteration)
-
-    @property
     def sh_degree(self) -> int:
         """The degree in use."""
         return self.sh_degree_at(self.iteration)
@@ -391,13 +393,13 @@ class Trainer:
         """Return a scene of all Gaussians, as synchronised last; None on other ranks than 0."""
         if self.comm.size == 1:
             return self.scene
-        if self._gathered is None or self._gathered[0] != self.iteration:
+        if self._full_scene is None or self._full_scene[0] != self.iteration:
             gaussians, scene = self.gaussians(), None
             if self.comm.is_root:
                 scene = make_scene(gaussians, self.config.model, self.dataset.background)
                 scene.integrator().sh_degree = self.integrator.sh_degree
-            self._gathered = self.iteration, scene
-        return self._gathered[1]
+            self._full_scene = self.iteration, scene
+        return self._full_scene[1]
 
     def images(self, views: tuple[View, ...]) -> Iterator[np.ndarray]:
         """Yield images (H, W, 3) of views that were not trained on, display space, in [0, 1]."""
@@ -436,8 +438,12 @@ class Trainer:
     # ------------------------------------------------------------------------------------------
 
     def spawn(self, config: FitConfig, gaussians: Gaussians) -> Trainer:
-        """Return a trainer with the same photographs; config: of another fit."""
-        return Trainer(config, self.dataset, gaussians, self.comm)
+        """Return a trainer with the same photographs, and copies of the given effects and loss.
+
+        config: of another fit, which decides about its population.
+        """
+        effects, loss = deepcopy((self._given_effects, self._given_loss))
+        return Trainer(config, self.dataset, gaussians, self.comm, effects=effects, loss=loss)
 
     def warm_start(self, former: Trainer) -> None:
         """Begin after the iterations of another trainer, with what its effects have found."""

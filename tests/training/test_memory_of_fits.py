@@ -248,7 +248,7 @@ MEASURED = """
 import sys
 from drgs import fit
 from drgs.training import memory
-from drgs.training.stages import KEPT_BYTES
+from drgs.training.steps import KEPT_BYTES
 peaks, estimate = [], memory.estimate
 memory.estimate = lambda *a, **k: peaks.append(estimate(*a, **k)) or peaks[-1]
 fit.main(sys.argv[1:])

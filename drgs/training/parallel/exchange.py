@@ -46,10 +46,9 @@ from drgs.splatting.rendering import (
     weighted_sums,
 )
 from drgs.splatting.tiles import Footprints
-from drgs.training.gradients import ViewGradients, ViewLoss
 from drgs.training.parallel.communicator import Communicator, wait
 from drgs.training.parallel.population import renderer_of
-from drgs.training.steps import StepView
+from drgs.training.steps import StepView, ViewGradients, ViewLoss
 
 VIEWS_AT_ONCE = 4
 """Views whose derivatives one kernel adds up; it is longer, and takes longer to compile, with each.
