@@ -123,7 +123,7 @@ def estimate(
     """
     train, views = dataset.train, {*dataset.train, *dataset.test}
     start = gaussians.num_gaussians
-    count = most_gaussians(config, start)
+    count = max_num_gaussians(config, start)
     pixels = scale**2 * max(view.width * view.height for view in train)
     measured = scale**2 * max((view.width * view.height for view in dataset.test), default=0)
     times = max(_times(view) for view in train)
@@ -143,9 +143,9 @@ def estimate(
     )
 
 
-def most_gaussians(config: FitConfig, start: int) -> int:
+def max_num_gaussians(config: FitConfig, start: int) -> int:
     """How many a fit can have that starts with ``start``: see its strategy of density."""
-    return density_strategy(config).most_gaussians(start, config.iterations)
+    return density_strategy(config).max_num_gaussians(start, config.iterations)
 
 
 def _kept_bytes(view: View, scale: float) -> float:
@@ -224,7 +224,7 @@ def _refusal(
     share: Share,
 ) -> str:
     train, start = dataset.train, gaussians.num_gaussians
-    count, width = most_gaussians(config, start), max(view.width for view in train)
+    count, width = max_num_gaussians(config, start), max(view.width for view in train)
 
     def fits(most: int, scale: float = 1.0) -> bool:
         densify = config.densify.model_copy(update={"max_gaussians": most})

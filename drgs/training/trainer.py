@@ -239,7 +239,7 @@ class Trainer:
             total = sum(terms[1:], terms[0])
             flags = dr.ADFlag.Default | dr.ADFlag.AllowNoGrad  # a term of weight 0 has none
             dr.backward(total / weight if weight > 1 else total, flags=flags)
-        return self.population.terms_of_all(terms, penalties)
+        return self.population.gather_terms(terms, penalties)
 
     def compare(self, image: Any, view: TrainingView) -> tuple[Any, Any, Any]:
         """Return the image as a photograph of the view would be, its loss and squared error."""

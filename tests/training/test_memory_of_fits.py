@@ -143,7 +143,7 @@ def test_each_time_of_a_shutter_counts():
 )
 def test_a_population_grows_to_its_cap_if_there_is_time(changes, expected):
     config = config_of(500, 10**6, **changes)
-    assert memory.most_gaussians(config, 1000) == expected
+    assert memory.max_num_gaussians(config, 1000) == expected
 
 
 # ----------------------------------------------------------------------------------------------

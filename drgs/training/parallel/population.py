@@ -123,15 +123,15 @@ class ShardedPopulation(Population):
         return self.shard.own.start
 
     @property
-    def num_own(self) -> int:
+    def num_local_rows(self) -> int:
         """How many of them this process has."""
         return num_rows(self.optimizer, self.prefix)
 
-    def of_all(self, values: Any) -> np.ndarray:
-        """Values for the rows of all processes: see ``Population.of_all``."""
+    def gather(self, values: Any) -> np.ndarray:
+        """Values for the rows of all processes: see ``Population.gather``."""
         return self.comm.all_gather_rows(np.array(values)).astype(np.float64)
 
-    def own(self, values: np.ndarray) -> np.ndarray:
+    def local(self, values: np.ndarray) -> np.ndarray:
         """Of values for all rows, those of this process."""
         return values[self.shard.own]
 
@@ -139,7 +139,7 @@ class ShardedPopulation(Population):
         """Of the rows that :meth:`value` has: UInt32."""
         index_type = dr.uint32_array_t(type(self.value("means").array))
         first = dr.opaque(index_type, self.shard.own.start)
-        return dr.arange(index_type, self.num_own) + first
+        return dr.arange(index_type, self.num_local_rows) + first
 
     def take(self, rows: Any) -> dict[str, Any]:
         """Copies of some of all rows, of every parameter by name."""
@@ -164,8 +164,8 @@ class ShardedPopulation(Population):
         self._replace(moved, own)
         self.shard.total = after.total
 
-    def terms_of_all(self, terms: list[Any], compute: Callable[[Any], list[Any]]) -> list[Any]:
-        """Return terms of the loss over all rows: see ``Population.terms_of_all``.
+    def gather_terms(self, terms: list[Any], compute: Callable[[Any], list[Any]]) -> list[Any]:
+        """Return terms of the loss over all rows: see ``Population.gather_terms``.
 
         They are computed again: the sum of what the ranks have would be rounded otherwise.
         """
@@ -186,7 +186,7 @@ class ShardedPopulation(Population):
         """Return a trainer's state with the rows of all ranks on rank 0."""
         for name in filter(is_by_row, state):
             array = state[name]
-            rows = self.comm.gather_rows(array.reshape(self.num_own, -1))
+            rows = self.comm.gather_rows(array.reshape(self.num_local_rows, -1))
             if rows is not None:
                 shape = (-1,) if array.ndim == 1 else (self.num_rows, *array.shape[1:])
                 state[name] = rows.reshape(shape)
@@ -236,7 +236,7 @@ class ShardedPopulation(Population):
         for key in self._keys:
             value, _, _, (_, first, second, _) = self.optimizer.state[key]
             for arrays, flat in zip(found, (dr.detach(value), first, second), strict=True):
-                arrays.append(np.array(flat).reshape(self.num_own, self._width(key)))
+                arrays.append(np.array(flat).reshape(self.num_local_rows, self._width(key)))
         return [np.concatenate(arrays, axis=1) for arrays in found]
 
     def _replace(self, kept: np.ndarray, appended: np.ndarray) -> None:
