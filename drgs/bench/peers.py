@@ -44,19 +44,19 @@ class Problem:
 
 
 def drgs_renderer(problem: Problem) -> Renderer:
-    """The ``splats`` integrator through ``mi.render``, as a user of Mitsuba calls it."""
+    """Return the ``splats`` integrator through ``mi.render``, as a user of Mitsuba calls it."""
     scene = make_scene(problem.gaussians, ModelConfig().of_file(), (1.0, 1.0, 1.0))
     return _mitsuba_renderer("drgs", scene, problem, "integrator.", 0.1)
 
 
 def volprim_renderer(problem: Problem, shape: str, seconds: float) -> Renderer:
-    """Mitsuba's ``volprim_rf_basic`` on ``ellipsoids`` or ``ellipsoidsmesh``."""
+    """Return Mitsuba's ``volprim_rf_basic`` on ``ellipsoids`` or ``ellipsoidsmesh``."""
     scene = mi.load_dict(volprim_scene(problem.gaussians, shape, 256))
     return _mitsuba_renderer(f"volprim_rf_basic, {shape}", scene, problem, "shapes.", seconds)
 
 
 def volprim_scene(gaussians: Gaussians, shape: str, max_depth: int) -> dict[str, object]:
-    """A scene of ``ellipsoids`` or ``ellipsoidsmesh``, without a sensor, in display space."""
+    """Return ``ellipsoids`` or ``ellipsoidsmesh`` as a scene without sensor, in display space."""
     quats_xyzw = gaussians.quats / np.linalg.norm(gaussians.quats, axis=1, keepdims=True)
     quats_xyzw = np.roll(quats_xyzw, -1, axis=1)
     sh = np.concatenate([gaussians.sh0, gaussians.shN], axis=1)
@@ -66,13 +66,10 @@ def volprim_scene(gaussians: Gaussians, shape: str, max_depth: int) -> dict[str,
         "sh_coeffs": sh.reshape(len(sh), -1),
     }
     tensors = {name: mi.TensorXf(v.astype(np.float32)) for name, v in attributes.items()}
+    integrator = {"type": "volprim_rf_basic", "srgb_primitives": False, "max_depth": max_depth}
     return {
         "type": "scene",
-        "integrator": {
-            "type": "volprim_rf_basic",
-            "srgb_primitives": False,
-            "max_depth": max_depth,
-        },
+        "integrator": integrator,
         "emitter": {"type": "constant"},
         "shapes": {"type": shape, "extent": SHELL, **tensors},
     }
@@ -84,9 +81,8 @@ def _mitsuba_renderer(
     camera = problem.camera
     sensor = mi.load_dict(mitsuba_sensor(camera) | {"near_clip": 1e-3})
     params = mi.traverse(scene)
-    names = ("means", "quats", "log_scales", "logit_opacities", "sh0", "shN")
-    names += ("data", "opacities", "sh_coeffs")
-    params.keep([prefix + name for name in names if prefix + name in params])
+    names = [prefix + name for name in (*PARAMETER_NAMES, "data", "opacities", "sh_coeffs")]
+    names = [name for name in names if name in params]
     weights = mi.TensorXf(problem.weights.astype(np.float32) / (camera.width * camera.height))
     integrator = scene.integrator()
 
@@ -98,22 +94,20 @@ def _mitsuba_renderer(
 
     def forward_backward() -> None:
         integrator.parameters_changed([])
-        for key in params.keys():  # noqa: SIM118  (not a dictionary)
-            dr.enable_grad(params[key])
-            dr.clear_grad(params[key])
+        values = [params[name] for name in names]
+        dr.enable_grad(values)
+        dr.clear_grad(values)
         image = mi.render(scene, params, sensor=sensor, spp=1)
         dr.backward(dr.sum(image * weights, axis=None))
-        gradients = [dr.grad(params[key]) for key in params.keys()]  # noqa: SIM118
-        dr.eval(gradients)
+        dr.eval(dr.grad(values))
         dr.sync_thread()
-        for key in params.keys():  # noqa: SIM118
-            dr.disable_grad(params[key])
+        dr.disable_grad(values)
 
     return Renderer(name, forward, forward_backward, seconds)
 
 
 def reference_renderer(problem: Problem) -> Renderer:
-    """The float64 numpy reference."""
+    """Return the float64 numpy reference."""
     fields = [getattr(problem.gaussians, name) for name in PARAMETER_NAMES]
     gaussians, white = reference.Gaussians(*fields), np.ones(3)
     d_image = problem.weights / problem.weights[..., 0].size

@@ -76,6 +76,11 @@ class IterationReport:
         """The sum over all stages."""
         return sum(self.stage_ms.values())
 
+    @property
+    def rest_ms(self) -> float:
+        """The time in no kernel."""
+        return self.wall_ms - self.kernel_ms
+
 
 def add_arguments(parser: CommandParser) -> None:
     """Add the arguments of the command."""
@@ -140,11 +145,6 @@ def make_scenes(trained: Path, quick: bool) -> list[Scene]:
     return scenes
 
 
-# ----------------------------------------------------------------------------------------------
-# Measuring
-# ----------------------------------------------------------------------------------------------
-
-
 def measure_scene(scene: Scene, rounds: int) -> list[Timing]:
     """Time every implementation in turns."""
     rng = np.random.default_rng(0)
@@ -162,9 +162,13 @@ def measure_scene(scene: Scene, rounds: int) -> list[Timing]:
         if renderer.seconds < VERY_SLOW_S:
             renderer.forward_backward()
             renderer.forward()
+    num_rounds = {
+        r.name: 1 if r.seconds > VERY_SLOW_S else SLOW_ROUNDS if r.seconds > SLOW_S else rounds
+        for r in renderers
+    }
     for turn in range(rounds):
         for renderer in renderers:
-            if turn < _num_rounds(renderer, rounds):
+            if turn < num_rounds[renderer.name]:
                 times[renderer.name].append(
                     (seconds(renderer.forward), seconds(renderer.forward_backward))
                 )
@@ -172,12 +176,6 @@ def measure_scene(scene: Scene, rounds: int) -> list[Timing]:
         Timing(scene.name, name, *map(statistics.median, zip(*pairs, strict=True)), len(pairs))
         for name, pairs in times.items()
     ]
-
-
-def _num_rounds(renderer: peers.Renderer, rounds: int) -> int:
-    if renderer.seconds > VERY_SLOW_S:
-        return 1
-    return SLOW_ROUNDS if renderer.seconds > SLOW_S else rounds
 
 
 def profile_training(scene: Scene, rounds: int) -> IterationReport:
@@ -198,26 +196,16 @@ def profile_training(scene: Scene, rounds: int) -> IterationReport:
     )
 
 
-# ----------------------------------------------------------------------------------------------
-# Output
-# ----------------------------------------------------------------------------------------------
-
-
 def comparison_table(timings: list[Timing]) -> str:
     """Format times of all implementations, and their ratios to the first one's."""
     ours = timings[0]
     header = ["400x400", "forward", "forward + backward", "ratio", "ratio, both", "rounds"]
-    rows = [
-        [
-            timing.renderer,
-            _milliseconds(timing.forward),
-            _milliseconds(timing.forward_backward),
-            f"{timing.forward / ours.forward:.1f}",
-            f"{timing.forward_backward / ours.forward_backward:.1f}",
-            str(timing.rounds),
-        ]
-        for timing in timings
-    ]
+    rows = []
+    for timing in timings:
+        forward, both = timing.forward, timing.forward_backward
+        ratios = f"{forward / ours.forward:.1f}", f"{both / ours.forward_backward:.1f}"
+        times = _milliseconds(forward), _milliseconds(both)
+        rows.append([timing.renderer, *times, *ratios, timing.rounds])
     return markdown_table(header, rows)
 
 
@@ -228,9 +216,9 @@ def _milliseconds(duration: float) -> str:
 def stage_table(report: IterationReport) -> str:
     """Format the stages of a training iteration."""
     rows = [[s, f"{report.stage_ms[s]:.1f} ms", f"{report.num_kernels[s]}"] for s in STAGES]
-    rows.append(["rest of wall time", f"{report.wall_ms - report.kernel_ms:.1f} ms", ""])
+    rows.append(["rest of wall time", f"{report.rest_ms:.1f} ms", ""])
     total = sum(report.num_kernels.values())
-    rows.append(["a training iteration", f"{report.wall_ms:.1f} ms", str(total)])
+    rows.append(["a training iteration", f"{report.wall_ms:.1f} ms", total])
     return markdown_table(["stage", "time", "kernels"], rows)
 
 
@@ -255,7 +243,7 @@ def plot(timings: list[Timing], reports: list[IterationReport]) -> Figure:
         values = np.array([report.stage_ms[stage] for report in reports])
         right.bar(labels, values, bottom=bottoms, label=stage)
         bottoms += values
-    rest = np.array([max(report.wall_ms - report.kernel_ms, 0) for report in reports])
+    rest = [max(report.rest_ms, 0) for report in reports]
     right.bar(labels, rest, bottom=bottoms, label="rest of wall time", color="0.8")
     right.set(ylabel="ms", title="a training iteration")
     right.legend(fontsize=8, loc="upper left", bbox_to_anchor=(1.02, 1))
