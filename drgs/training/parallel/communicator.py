@@ -6,6 +6,8 @@ blocks in C: a process that waits polls, so that it sees Ctrl-C, and leaves the 
 machine to the others.
 """
 
+# ruff: noqa: N802 (mpi4py's names)
+
 from __future__ import annotations
 
 import os
@@ -20,7 +22,7 @@ import numpy as np
 from drgs.core.errors import UserError
 from drgs.training.finite_checks import NonFiniteError
 
-SPINS, LONGEST_NAP_S = 50, 1e-3
+NUM_SPINS, MAX_PAUSE_S = 50, 1e-3
 """Polls without a pause, for messages that have nearly arrived; the longest pause between polls."""
 
 NEVER = 2**62
@@ -32,28 +34,24 @@ T = TypeVar("T")
 class SingleProcess:
     """The used part of ``mpi4py.MPI.Comm``, for a process that is alone: sends are copies."""
 
-    def Get_rank(self) -> int:  # noqa: N802 (mpi4py's names)
+    def Get_rank(self) -> int:
         """Return 0."""
         return 0
 
-    def Get_size(self) -> int:  # noqa: N802
+    def Get_size(self) -> int:
         """Return 1."""
         return 1
 
-    def Iallgather(self, sent: np.ndarray, received: np.ndarray) -> None:  # noqa: N802
-        """Copy the numbers."""
-        received[:] = sent
-
-    def Ibcast(self, array: np.ndarray, root: int) -> None:  # noqa: N802
+    def Ibcast(self, array: np.ndarray, root: int) -> None:
         """Leave the array as it is."""
 
-    def Iallgatherv(self, sent: Any, received: Any, root: int = 0) -> None:  # noqa: N802
-        """Copy the rows: ``sent`` and ``received`` are arrays of bytes or begin with one."""
+    def Iallgather(self, sent: Any, received: Any, root: int = 0) -> None:
+        """Copy the numbers: ``sent`` and ``received`` are arrays, or lists that begin with one."""
         del root
         sent, received = (b[0] if isinstance(b, list) else b for b in (sent, received))
         received[:] = sent
 
-    Igatherv = Iscatterv = Ialltoallv = Iallgatherv
+    Iallgatherv = Igatherv = Iscatterv = Ialltoallv = Iallgather
 
 
 @dataclass
@@ -180,14 +178,14 @@ class Communicator:
             words[:] = np.frombuffer(text.encode(), np.uint8)
         return self.broadcast(words, root).tobytes().decode()
 
-    def exchange_rows(self, parts: Sequence[np.ndarray], dtype: Any, width: int) -> list:
-        """Send rows (M_k, width) to each rank k, and return those from each rank."""
+    def exchange_rows(self, parts: Sequence[np.ndarray]) -> list[np.ndarray]:
+        """Send rows to each rank, and return those from each rank."""
         counts = self.all_gather(np.array([len(part) for part in parts]))[:, self.rank]
-        own = np.concatenate([part.reshape(-1, width).astype(dtype, copy=False) for part in parts])
-        received = np.empty((int(counts.sum()), width), dtype)
-        row = width * own.itemsize
-        sizes = [len(part) * row for part in parts]
-        wait(self.comm.Ialltoallv(_parts(own, sizes), _parts(received, counts * row)))
+        sent = np.concatenate(parts)
+        received = np.empty((int(counts.sum()), *sent.shape[1:]), sent.dtype)
+        sizes = [part.nbytes for part in parts]
+        received_sizes = counts * _row_bytes(sent)
+        wait(self.comm.Ialltoallv(_parts(sent, sizes), _parts(received, received_sizes)))
         return np.split(received, np.cumsum(counts)[:-1])
 
     def collective(self, call: Callable[[], T]) -> T:
@@ -195,15 +193,13 @@ class Communicator:
 
         If several ranks raise one, it is that of the earliest iteration, on the lowest rank.
         """
+        if self.size == 1:
+            return call()
         result, error = None, None
         try:
             result = call()
         except UserError as caught:
-            if self.size == 1:
-                raise
             error = caught
-        if self.size == 1:
-            return result
         iteration = NEVER if error is None else getattr(error, "iteration", 0)
         errors = self.all_gather(np.array([iteration, isinstance(error, NonFiniteError)]))
         first = int(errors[:, 0].argmin())
@@ -232,8 +228,8 @@ def wait(*requests: Any) -> None:
     pending, polls = [request for request in requests if request is not None], 0
     while not all([request.Test() for request in pending]):
         polls += 1
-        if polls > SPINS:
-            time.sleep(min(LONGEST_NAP_S, 1e-6 * polls))
+        if polls > NUM_SPINS:
+            time.sleep(min(MAX_PAUSE_S, 1e-6 * polls))
 
 
 def _bytes(array: np.ndarray) -> np.ndarray:
