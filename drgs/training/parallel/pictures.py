@@ -19,8 +19,8 @@ from drgs.integrator.scene import render_views
 from drgs.training.parallel.communicator import Communicator, wait
 from drgs.training.parallel.inputs import check_scene
 
-Render = Callable[[mi.Scene, Sequence[Viewpoint]], Iterator[np.ndarray]]
-"""Renders images (H, W, 3) of a scene."""
+Render = Callable[..., Iterator[np.ndarray]]
+"""Renders images (H, W, 3) of a scene and views."""
 
 
 def run_together(args: argparse.Namespace, work: Callable[[Render], None]) -> None:
