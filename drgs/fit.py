@@ -33,7 +33,7 @@ from drgs.results.folder import load_moved_config
 from drgs.training.budget import Budget, parse_duration
 from drgs.training.fit_folder import FitFolder
 from drgs.training.parallel.communicator import Communicator
-from drgs.training.session import Console, FitSession
+from drgs.training.session import FitSession
 
 if TYPE_CHECKING:  # imported with --view
     from drgs.viewer.server import LocalServer
@@ -137,7 +137,7 @@ def run(args: argparse.Namespace) -> None:
         config, out = what_to_fit(args)
         folder = FitFolder(out, args.command, args.resume is not None, args.overwrite)
         start = partial(add_observers, args, server, blocks)
-        session = FitSession(config, folder=folder, console=Console(), on_start=start, **common)
+        session = FitSession(config, folder=folder, uses_terminal=True, on_start=start, **common)
         finished = session.run()
     if not finished:
         print(f"stopped; continue with: {args.prog} --resume {out}")

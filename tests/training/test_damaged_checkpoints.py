@@ -113,7 +113,7 @@ DAMAGE = {
     ),
     "fewer rows": (edit("trainer.quats.value", lambda a: a[1:]), "quats.value must be of shape"),
     "no rows": (edit("trainer.means.value", lambda a: a[:0]), "1 to 1,000,000 Gaussians, got 0"),
-    "no array": (edit("trainer.means.value", lambda a: a[0, 0]), "means.value must be of shape"),
+    "no array": (edit("trainer.means.value", lambda a: a[0, 0]), "must be of shape"),
     "a moment of others": (edit("trainer.shN.m", lambda a: a[9:]), "shN.m must be of shape"),
     "another type": (edit("trainer.sh0.value", lambda a: a.astype("f8")), "type float32, got"),
     "text": (edit("trainer.sh0.value", lambda a: a.astype("U")), "type float32, got"),

@@ -156,7 +156,8 @@ def available(monkeypatch):
     """Sets how much memory a fit may take."""
 
     def set_to(count):
-        monkeypatch.setattr(memory, "available_memory", lambda: math.ceil(count / memory.USABLE))
+        available = math.ceil(count / memory.USABLE_SHARE)
+        monkeypatch.setattr(memory, "available_memory", lambda: available)
         monkeypatch.setattr(memory, "resident_memory", lambda: 0)
 
     return set_to

@@ -123,11 +123,12 @@ def check_scene(
     Called by all processes; returns when all have agreed.
     """
     integrator = scene.integrator()
-    own = {**versions(), "settings": str(integrator), "cameras": _digest_of_cameras(views)}
+    own = versions()
     parameters = {**mi.traverse(integrator), "smoothing": integrator.smoothing}
     for name, value in parameters.items():
         array = np.asarray(value)  # an object, where it is no array
         own[name] = str(value) if array.dtype == object else _digest(array)
+    own |= {"settings": str(integrator), "cameras": _digest_of_cameras(views)}
     first = json.loads(comm.broadcast_text(json.dumps(own)))
     check_versions({name: first[name] for name in versions()})
     if other := [name for name in {**first, **own} if first.get(name) != own.get(name)]:
