@@ -33,8 +33,12 @@ from drgs.training.density.strategy import (
     PixelWeight,
     StepInfo,
 )
-from drgs.training.effects.base import FitState, TrainingEffect
-from drgs.training.effects.registry import integrator_settings, training_effects
+from drgs.training.effects.base import (
+    FitState,
+    TrainingEffect,
+    integrator_settings,
+    training_effects,
+)
 from drgs.training.finite_checks import GradientWatch, check_values, check_view_values
 from drgs.training.losses import Loss, make_loss, make_loss_terms
 from drgs.training.memory import Share, room_for_targets

@@ -22,7 +22,7 @@ from drgs.datasets.types import Motion
 from drgs.integrator.sensors import camera_from_sensor, read_sensor
 from drgs.integrator.summary import SimulatedEffect, described, summary_of_sensors, summary_of_views
 from drgs.training.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
-from drgs.training.effects.registry import integrator_settings, training_effects
+from drgs.training.effects.base import integrator_settings, training_effects
 from drgs.training.loop import History
 from drgs.training.summary import summary_of_fit
 
@@ -35,7 +35,7 @@ MODULES = (
     "light.grid", "light.walk",
     "training.effects.background", "training.effects.cameras", "training.effects.colors",
     "training.effects.depth", "training.effects.masks", "training.effects.smoothing",
-    "training.effects.view_parameters", "training.image_ops",
+    "training.effects.view_parameters",
 )  # fmt: skip
 """Of effects, and of nothing else."""
 
@@ -420,7 +420,7 @@ sys.path.insert(0, {tests!r})
 import drgs, mitsuba as mi, numpy as np
 mi.set_variant("llvm_ad_rgb")
 from dataclasses import replace
-from drgs.training.effects.registry import training_effects
+from drgs.training.effects.base import training_effects
 from drgs.training.summary import summary_of_fit
 from support import small_capture as capture
 from support.usual_rule import USUAL
@@ -488,7 +488,6 @@ def test_each_effect_imports_its_own_modules(run_python, tmp_path):
         "colors": [
             "drgs.training.effects.colors",
             "drgs.training.effects.view_parameters",
-            "drgs.training.image_ops",
         ],
         "cameras": ["drgs.cameras.motion", "drgs.training.effects.cameras"],
         "calibrated": [],
