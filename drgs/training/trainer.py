@@ -1,9 +1,8 @@
 """The training loop: photographs in, Gaussians out.
 
-Everything between two optimizer steps is visible in :meth:`Trainer.step`, which reads as Mitsuba's
-tutorials do: ``mi.render`` with the ``splats`` integrator, ``dr.backward``, ``drjit.opt.Adam``.
-Changes of the population come from a strategy of ``drgs.training.density``. All processes of a fit
-run the same loop; a communicator tells a process which views and which Gaussians are its own.
+:meth:`Trainer.step` reads as Mitsuba's tutorials do: ``mi.render`` with the ``splats`` integrator,
+``dr.backward``, ``drjit.opt.Adam``. Changes of the population come from a strategy of
+``drgs.training.density``. All processes of a fit run the same loop on their views and Gaussians.
 """
 
 from __future__ import annotations
@@ -18,7 +17,6 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from drgs.config.changes import changed
 from drgs.config.schema import FitConfig
 from drgs.core.memory import release_unused_memory
 from drgs.datasets.types import Dataset, View
@@ -39,7 +37,12 @@ from drgs.training.effects.base import (
     integrator_settings,
     training_effects,
 )
-from drgs.training.finite_checks import GradientWatch, check_values, check_view_values
+from drgs.training.finite_checks import (
+    GradientWatch,
+    WatchedIteration,
+    check_values,
+    check_view_values,
+)
 from drgs.training.losses import Loss, make_loss, make_loss_terms
 from drgs.training.memory import Share, room_for_targets
 from drgs.training.optimizer import (
@@ -54,7 +57,7 @@ from drgs.training.parallel.population import (
     local_gaussians,
     make_population,
 )
-from drgs.training.rates import learning_rates, rates_over_time, revised_aims, revised_stops
+from drgs.training.rates import learning_rates, rates_over_time, revised_plan
 from drgs.training.steps import (
     KEPT_BYTES,
     Step,
@@ -114,7 +117,7 @@ class Trainer:
         effects: Sequence[TrainingEffect] = (),
         loss: Loss | None = None,
     ) -> None:
-        """gaussians: all of them, on each process; comm: the processes; None: this one.
+        """gaussians: all, on each process; comm: the processes; None: this one.
 
         density, loss: None: those of the configuration; effects: besides the configuration's.
         """
@@ -125,7 +128,9 @@ class Trainer:
         check_can_be_shared(config, comm.size, gaussians.num_gaussians)
         self.effects = training_effects(config, dataset, effects)
         self._given_density, self._given_effects, self._given_loss = density, effects, loss
-        room = comm.collective(lambda: self._room_for_targets(gaussians))
+        share = Share(comm.size, comm.num_on_machine)
+        limits = bytes_on_device(self.effects), KEPT_BYTES, share
+        room = comm.collective(lambda: room_for_targets(config, dataset, gaussians, *limits))
         self.scene = make_scene(
             local_gaussians(gaussians, comm),
             config.model,
@@ -160,16 +165,6 @@ class Trainer:
         self.watch = GradientWatch()
         self.iteration = 0  # the last one that is done
         self._full_scene: tuple[int, mi.Scene | None] | None = None  # with its iteration
-
-    def _room_for_targets(self, gaussians: Gaussians) -> int:
-        """Return the number of bytes of targets that may stay on the device."""
-        share = Share(self.comm.size, self.comm.num_on_machine)
-        limits = bytes_on_device(self.effects), KEPT_BYTES
-        return room_for_targets(self.config, self.dataset, gaussians, *limits, share)
-
-    # ------------------------------------------------------------------------------------------
-    # A step
-    # ------------------------------------------------------------------------------------------
 
     def step(self) -> StepReport:
         """Render the views of a step, and change the Gaussians along their mean gradient.
@@ -219,14 +214,14 @@ class Trainer:
         fit = self._fit_state(step, step.iterations[0])
         for effect in self.effects:
             effect.begin(fit)
-        self.gradients.begin(step.views, lambda view: self._place(fit, view))
-        return step
 
-    def _place(self, fit: FitState, view: StepView) -> None:
-        """Put the sensor of a view that another process renders where effects have it."""
-        for effect in self.effects:
-            if effect.moves_sensors:
-                effect.before(fit, view.view)
+        def place(view: StepView) -> None:
+            for effect in self.effects:
+                if effect.moves_sensors:
+                    effect.before(fit, view.view)
+
+        self.gradients.begin(step.views, place)
+        return step
 
     def _differentiate_penalties(self, step: Step) -> list[Any]:
         """Add the derivatives of the strategy's terms of the loss; return the terms."""
@@ -285,7 +280,8 @@ class Trainer:
                 for effect in self.effects
                 for name, values in effect.numbers_of(view.view).items()
             }
-            self.watch.add(view.iteration, view.view.name, total, fault, numbers)
+            watched = view.iteration, view.view.name, total, fault, numbers
+            self.watch.add(WatchedIteration(*watched))
             results.append(replace(loss, loss=total))
         return results
 
@@ -345,10 +341,6 @@ class Trainer:
             effects=self.effects,
         )
 
-    # ------------------------------------------------------------------------------------------
-    # What it has fitted
-    # ------------------------------------------------------------------------------------------
-
     @property
     def parameters(self) -> dict[str, Any]:
         """Raw values by name, as the optimizer has them: the rows of this process."""
@@ -361,7 +353,7 @@ class Trainer:
 
     @property
     def last_step(self) -> Step:
-        """The step that is done."""
+        """The last step that is done."""
         return self.plan(self.iteration)
 
     @property
@@ -437,10 +429,6 @@ class Trainer:
         of_views = {f"{e.name}.{k}": v for e in self.effects for k, v in e.values().items()}
         check_view_values(self.iteration, of_views, [view.name for view in self.views])
 
-    # ------------------------------------------------------------------------------------------
-    # Other fits, and other times
-    # ------------------------------------------------------------------------------------------
-
     def spawn(self, config: FitConfig, gaussians: Gaussians) -> Trainer:
         """Return a trainer with the same photographs, and copies of the given effects and loss.
 
@@ -457,10 +445,7 @@ class Trainer:
         self._restore_effects({f"{name}/{k}": v for name in found for k, v in found[name].items()})
 
     def release(self) -> None:
-        """Free what only further iterations need, of which there will be none: targets, moments.
-
-        Its scene still renders what was fitted last.
-        """
+        """Free what only further iterations need; the scene still renders what was fitted last."""
         self.last_step.stage.end()
         self.optimizer.state.clear()
         release_unused_memory()
@@ -478,15 +463,7 @@ class Trainer:
                 f"Trainer.reschedule(): densify.stop cannot change from {config.densify.stop} to "
                 f"{densify_stop} after iteration {now}"
             )
-        aims = revised_aims(config, now, iterations)
-        changes = {
-            "iterations": iterations,
-            "densify.stop": densify_stop,
-            **_prune_window(config, now, iterations, densify_stop),
-            "densify.stop_aims": revised_stops(config, now, densify_stop),
-            "optimizer.means_lr_aims": [{"after": after, "end": end} for after, end in aims],
-        }
-        self.config = changed(config, changes)
+        self.config = revised_plan(config, now, iterations, densify_stop)
         self.rates = rates_over_time(self.config, self.extent)
         self.density = self._density_from(self.density.state())
 
@@ -551,29 +528,6 @@ def _step_info(step: Step, view: StepView, gradients: ViewGradients) -> StepInfo
     size = view.view.width, view.view.height
     found = means2d_grad, gradients.visible, gradients.weighted_sums
     return StepInfo(view.iteration, *size, *found)
-
-
-def _prune_window(
-    config: FitConfig, now: int, iterations: int, densify_stop: int
-) -> dict[str, int | None]:
-    """Return where the last phase of pruning is in a fit of other iterations.
-
-    It stays if it has begun. Else what is given of it keeps its share of the iterations that are
-    ahead.
-    """
-    prune, names = config.densify.prune, ("densify.prune.start", "densify.prune.stop")
-    window = config.densify.prune_window(config.iterations)
-    if prune.to is None or now > window[0]:
-        return {} if prune.to is None else dict(zip(names, window, strict=True))
-    start, stop = (
-        None if given is None else round(given * iterations / config.iterations)
-        for given in (prune.start, prune.stop)
-    )
-    if start is not None:
-        start = max(1, start, now)
-    if stop is not None:
-        stop = max(stop, densify_stop + 1, (start or 0) + 1)
-    return dict(zip(names, (start, stop), strict=True))
 
 
 def _part(state: Mapping[str, np.ndarray], prefix: str) -> dict[str, np.ndarray]:
