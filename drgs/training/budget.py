@@ -17,6 +17,7 @@ import math
 import re
 import time
 import warnings
+from argparse import ArgumentTypeError
 from collections.abc import Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, replace
@@ -356,11 +357,13 @@ _DURATION = re.compile(f"(?:{_NUMBER}h)?(?:{_NUMBER}m)?(?:{_NUMBER}s)?|{_NUMBER}
 def parse_duration(text: str) -> float:
     """Return the seconds of ``90``, ``90s``, ``5m``, ``1m30s``, ``1h30m``.
 
-    Raises ValueError for anything else, such as ``1h30``: each of several parts has a unit.
+    Raises ``argparse.ArgumentTypeError`` for anything else, such as ``1h30``.
     """
     match = _DURATION.fullmatch(text.strip())
     parts = match.groups(default="0") if match else ()
     seconds = sum(scale * float(part) for scale, part in zip((3600, 60, 1, 1), parts, strict=False))
     if not 0 < seconds <= MAX_SECONDS:
-        raise ValueError(f"must be a time such as 90s, 5m or 1h30m, a week at most, got {text!r}")
+        raise ArgumentTypeError(
+            f"must be a time such as 90s, 5m or 1h30m, a week at most, got {text!r}"
+        )
     return seconds

@@ -40,7 +40,7 @@ _CHANNELS = 3
 
 @dataclass(frozen=True)
 class Target:
-    """A photograph y and the two blurs of SSIM that depend on it alone: detached, flat, in tiles."""
+    """A photograph y and the two blurs of SSIM that depend on it alone; detached, in tiles."""
 
     height: int
     width: int

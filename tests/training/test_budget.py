@@ -1,6 +1,7 @@
 """Fits for a given time: what is planned, when they end, and that their plans can be repeated."""
 
 import time
+from argparse import ArgumentTypeError
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -44,7 +45,7 @@ def test_durations(text, seconds):
     ["", "0", "m", "5 minutes", "-3s", "nan", "1m2h", "0s", "1h30", "5m5", "\u0665m", "9" * 400],
 )
 def test_what_is_no_duration_is_refused(text):
-    with pytest.raises(ValueError, match="must be a time such as 90s, 5m or 1h30m"):
+    with pytest.raises(ArgumentTypeError, match="must be a time such as 90s, 5m or 1h30m"):
         parse_duration(text)
 
 

@@ -1,9 +1,7 @@
 """The processes that share a fit, and the arrays that they exchange.
 
-Arrays travel by MPI's functions for buffers, through the part of mpi4py's interface that
-:class:`SingleProcess` has, too: with it, the same code runs on one process, without MPI. No call
-blocks in C: a process that waits polls, so that it sees Ctrl-C, and leaves the cores of a crowded
-machine to the others.
+Arrays travel by MPI's functions for buffers. No call blocks in C: a process that waits polls, so
+that it sees Ctrl-C, and leaves the cores of a crowded machine to the others.
 """
 
 # ruff: noqa: N802 (mpi4py's names)
@@ -96,7 +94,7 @@ class Communicator:
 
     @property
     def num_own_cores(self) -> int:
-        """Cores for this process, where those of a machine are shared by all processes on it."""
+        """Cores for this process, of those that all processes on its machine share."""
         has_affinity = hasattr(os, "sched_getaffinity")  # Linux
         cores = len(os.sched_getaffinity(0)) if has_affinity else os.cpu_count() or 1
         return max(1, cores // self.num_on_machine)
@@ -109,9 +107,7 @@ class Communicator:
         waited = self.times.waiting - waited
         self.times.exchanging += time.perf_counter() - start - waited
 
-    # ------------------------------------------------------------------------------------------
-    # Collective calls: all ranks make them, in the same order
-    # ------------------------------------------------------------------------------------------
+    # All ranks make these collective calls, in the same order.
 
     def all_gather(self, numbers: np.ndarray) -> np.ndarray:
         """Return the numbers of each rank: (size, ...), from arrays of one shape."""
@@ -209,10 +205,6 @@ class Communicator:
         text = self.broadcast_text("" if error is None else str(error), first)
         raise NonFiniteError(text, int(iteration)) if is_non_finite else UserError(text)
 
-    # ------------------------------------------------------------------------------------------
-    # From one rank to another
-    # ------------------------------------------------------------------------------------------
-
     def send(self, array: np.ndarray, to: int, tag: int) -> Any:
         """Begin to send an array, which must not change until the returned request is done."""
         self.times.sent_bytes += array.nbytes
@@ -233,12 +225,12 @@ def wait(*requests: Any) -> None:
 
 
 def _bytes(array: np.ndarray) -> np.ndarray:
-    """The memory of an array, for MPI; more than 2^31 bytes take MPI 4."""
+    """Return the memory of an array, for MPI; more than 2^31 bytes take MPI 4."""
     return array.reshape(-1).view(np.uint8)
 
 
 def _parts(array: np.ndarray, sizes: Sequence[int]) -> list[Any]:
-    """The memory of an array, divided among ranks; sizes: bytes."""
+    """Return the memory of an array, divided among ranks; sizes: bytes."""
     return [_bytes(array), [int(size) for size in sizes], None, "B"]
 
 
