@@ -58,7 +58,7 @@ class EventLog:
         del trainer, stops
         if done.row is not None:
             start = time.perf_counter()
-            self._write(done.row, history)
+            self._write(history.rows[-1], history)  # with what was measured since
             self._writer.flush()
             history.leave_out(time.perf_counter() - start)
 

@@ -11,7 +11,6 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Callable, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
@@ -53,29 +52,19 @@ class SingleProcess:
 
 
 @dataclass
-class Times:
-    """Seconds that a process has spent on communication."""
-
-    waiting: float = 0.0  # for ranks that were not ready
-    exchanging: float = 0.0  # copying, packing and sending
-    sent_bytes: int = 0
-
-
-@dataclass
 class Communicator:
     """The processes of a fit, numbered by ``rank`` from 0; by default this one alone."""
 
     comm: Any = field(default_factory=SingleProcess)  # mpi4py.MPI.Comm
     num_on_machine: int = 1  # of the processes, those on this machine
-    times: Times = field(default_factory=Times)
 
-    @staticmethod
-    def world() -> Communicator:
+    @classmethod
+    def world(cls) -> Communicator:
         """Return all processes that ``mpiexec`` has started."""
         from mpi4py import MPI
 
         here = MPI.COMM_WORLD.Split_type(MPI.COMM_TYPE_SHARED)
-        return Communicator(MPI.COMM_WORLD.Dup(), here.Get_size())
+        return cls(MPI.COMM_WORLD.Dup(), here.Get_size())
 
     @property
     def rank(self) -> int:
@@ -99,23 +88,13 @@ class Communicator:
         cores = len(os.sched_getaffinity(0)) if has_affinity else os.cpu_count() or 1
         return max(1, cores // self.num_on_machine)
 
-    @contextmanager
-    def exchanging(self):
-        """Count the time of a block."""
-        waited, start = self.times.waiting, time.perf_counter()
-        yield
-        waited = self.times.waiting - waited
-        self.times.exchanging += time.perf_counter() - start - waited
-
     # All ranks make these collective calls, in the same order.
 
     def all_gather(self, numbers: np.ndarray) -> np.ndarray:
         """Return the numbers of each rank: (size, ...), from arrays of one shape."""
         numbers = np.asarray(numbers, order="C")
         gathered = np.empty((self.size, *numbers.shape), numbers.dtype)
-        start = time.perf_counter()
         wait(self.comm.Iallgather(numbers, gathered))
-        self.times.waiting += time.perf_counter() - start
         return gathered
 
     def all_gather_rows(self, rows: np.ndarray) -> np.ndarray:
@@ -123,10 +102,8 @@ class Communicator:
         rows = np.ascontiguousarray(rows)
         counts = self.all_gather(np.array(len(rows)))
         gathered = np.empty((int(counts.sum()), *rows.shape[1:]), rows.dtype)
-        with self.exchanging():
-            sizes = counts * _row_bytes(rows)
-            wait(self.comm.Iallgatherv(_bytes(rows), _parts(gathered, sizes)))
-        self.times.sent_bytes += rows.nbytes * (self.size - 1)
+        sizes = counts * _row_bytes(rows)
+        wait(self.comm.Iallgatherv(_bytes(rows), _parts(gathered, sizes)))
         return gathered
 
     def of_root(self, numbers: Any) -> np.ndarray:
@@ -141,10 +118,7 @@ class Communicator:
         if root == self.rank:
             gathered = np.empty((int(counts.sum()), *rows.shape[1:]), rows.dtype)
             into = _parts(gathered, counts * _row_bytes(rows))
-        else:
-            self.times.sent_bytes += rows.nbytes
-        with self.exchanging():
-            wait(self.comm.Igatherv(_bytes(rows), into, root=root))
+        wait(self.comm.Igatherv(_bytes(rows), into, root=root))
         return gathered
 
     def scatter_rows(self, rows: np.ndarray | None, like: np.ndarray) -> np.ndarray:
@@ -160,10 +134,7 @@ class Communicator:
     def broadcast(self, array: np.ndarray, root: int = 0) -> np.ndarray:
         """Return the array of rank ``root``; other ranks pass one of its shape and type."""
         array = np.ascontiguousarray(array)
-        with self.exchanging():
-            wait(self.comm.Ibcast(_bytes(array), root=root))
-        if root == self.rank:
-            self.times.sent_bytes += array.nbytes * (self.size - 1)
+        wait(self.comm.Ibcast(_bytes(array), root=root))
         return array
 
     def broadcast_text(self, text: str, root: int = 0) -> str:
@@ -207,7 +178,6 @@ class Communicator:
 
     def send(self, array: np.ndarray, to: int, tag: int) -> Any:
         """Begin to send an array, which must not change until the returned request is done."""
-        self.times.sent_bytes += array.nbytes
         return self.comm.Isend(_bytes(array), dest=to, tag=tag)
 
     def receive(self, into: np.ndarray, source: int, tag: int) -> Any:

@@ -181,13 +181,11 @@ class ViewMessages:
     def receive(self, into: Blocks, source: int, place: int, time: int) -> None:
         """Wait for the next rows that a rank sends."""
         tag = place * MAX_SHUTTER_SAMPLES + time
-        with self.comm.exchanging():
-            wait(*(self.comm.receive(block, source, tag) for block in into))
+        wait(*(self.comm.receive(block, source, tag) for block in into))
 
     def finish(self) -> None:
         """Wait until all has been sent."""
-        with self.comm.exchanging():
-            wait(*(request for requests, _ in self._sending for request in requests))
+        wait(*(request for requests, _ in self._sending for request in requests))
         self._sending.clear()
 
 

@@ -182,8 +182,7 @@ class ShardedPopulation(Population):
         wanted = sources[goals == after.rank]
 
         def move(rows: np.ndarray) -> np.ndarray:
-            with self.comm.exchanging():
-                parts = self.comm.exchange_rows([rows[local[to == r]] for r in range(after.size)])
+            parts = self.comm.exchange_rows([rows[local[to == r]] for r in range(after.size)])
             result = np.empty((len(wanted), *rows.shape[1:]), rows.dtype)
             for rank, part in enumerate(parts):
                 result[wanted == rank] = part
